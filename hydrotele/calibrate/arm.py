@@ -1,10 +1,10 @@
-"""Identification of a manipulator from a calibrator's readings, without the manipulator's angles.
+"""Identification of a manipulator arm from the joint angles of an external calibrator.
 
-While link i moves, the ball joint keeps its distance p_xy from the axis of joint i and its height
-p_z along it; that are two equations per pose without the angle of joint i (Khoshzaban 1992,
-Eq. 3.25). Links are identified one after the other, the outermost first, and then all together.
-
-The machine with its calibrated arm: link positions, joint axes, sensor offsets.
+The calibrator is a sensed linkage between the arm and a ball joint on the chassis. While link i
+moves, the ball keeps its distance p_xy from the axis of joint i and its height p_z along it. These
+are two equations per pose without the angle of joint i (Khoshzaban 1992, Eq. 3.25). Links are
+identified one after the other from the outermost inwards, then optionally all together. The
+module also writes the identified lengths, axes and sensor offsets into the machine.
 """
 
 import dataclasses
@@ -25,36 +25,36 @@ from hydrotele.kinematics.serial_chain import forward, joint_axes
 from hydrotele.machine.machine import Closure, Machine, SensorError
 
 SIZES = {"m": 0.1, "rad": np.radians(5.0)}
-"""How far a parameter may be from nominal, by unit: what a tape and a protractor leave."""
+"""Expected error of a nominal parameter, by unit: the accuracy of a tape and a protractor."""
 
 LABORATORY = {"m": 1.0e-3, "rad": np.radians(0.05)}
-"""The same of the calibrator's own links, which were measured in a laboratory (K 3.6.4)."""
+"""Expected error of the calibrator's link parameters, measured in a laboratory (K 3.6.4)."""
 
 TRUNCATION = (0.05, 0.01, 1.0e-3, 1.0e-5)
-"""Shares of the largest singular value below which directions are left out: K's 5 %, lowered."""
+"""Truncation levels relative to the largest singular value: K's 5 %, lowered on convergence."""
 
 _CRITICAL = 1.959964
-_ROUNDS = 3  # of weights that depend on the parameters; the second already changes nothing by 1e-3
+_ROUNDS = 3  # reweighting iterations; the second one already changes parameters by less than 1e-3
 _FEWEST = 2  # equations per parameter
-_STILL = np.radians(2.0)  # of a sensor: it has to move by more while a link moves
+_STILL = np.radians(2.0)  # minimum range of a calibrator joint while a link moves
 
 Numbers = dict[str, float]
 
 
 @dataclass(frozen=True)
 class Stage:
-    """What one moving link told.
+    """Result of the identification of one moving link.
 
     Attributes:
         link: the moving link.
-        names: parameters that were identified, p of them.
-        told: which of the stage's candidates its poses tell.
-        fixed: name of every other candidate -> why it kept its value.
-        iterations: of Levenberg-Marquardt.
+        names: the p identified parameters.
+        told: identifiability of the candidate parameters of this stage.
+        fixed: reason why a candidate keeps its nominal value, by parameter name.
+        iterations: number of Levenberg-Marquardt iterations.
         poses: number of poses.
         rms: root mean square of both equations' residuals [m].
-        chi: the same over what the sensors' accuracy explains; 1 where nothing else disturbs.
-        condition: ratio of the singular values of the columns of the identified parameters.
+        chi: RMS residual over its value expected from sensor noise [1]; 1 without other errors.
+        condition: condition number of the normalised columns of the identified parameters.
     """
 
     link: str
@@ -70,17 +70,17 @@ class Stage:
 
 @dataclass(frozen=True)
 class ArmFit:
-    """A calibrated manipulator.
+    """Result of an arm calibration.
 
     Attributes:
-        nominal: the chain before.
+        nominal: the chain before calibration.
         loop: the chain with the identified parameters.
-        names: identified parameters, p of them, in the order of their stages.
-        values: (p,) of them [rad] or [m].
-        covariance: (p, p) of the values, sensor noise of this and of earlier stages.
-        numbers: every parameter of the chain, held angles and ball places, identified or not.
-        start: the same before the identification.
-        stages: of the moving links, the outermost first.
+        names: the p identified parameters, in the order of their stages.
+        values: (p,) identified values [rad] or [m].
+        covariance: (p, p) covariance of the values due to sensor noise of this and earlier stages.
+        numbers: all parameters after calibration, including held angles and ball positions.
+        start: all parameters before calibration.
+        stages: results of the moving links, the outermost first.
         method: `hierarchical` or `joint`.
     """
 
@@ -106,15 +106,15 @@ class ArmFit:
         return np.column_stack([self.values - reach, self.values + reach])
 
     def value(self, name: str) -> float:
-        """A parameter by its name, identified or kept."""
+        """Return a parameter by name, identified or nominal [rad] or [m]."""
         return float(self.numbers[name])
 
 
 def stage_order(loop: Loop, stages: Sequence[Poses]) -> list[Poses]:
-    """Stages from the outermost link inwards.
+    """Sort stages from the outermost moving link inwards.
 
     Raises:
-        InputError: a link is none that moves, is there twice, or its readings tell nothing.
+        InputError: a link cannot be calibrated, or two stages move the same link.
     """
     links = loop.links[: loop.moved]
     for poses in stages:
@@ -125,19 +125,19 @@ def stage_order(loop: Loop, stages: Sequence[Poses]) -> list[Poses]:
     for name in names:
         if names.count(name) > 1:
             twice = [poses.source for poses in stages if poses.link == name]
-            raise InputError(twice[1], f"moves {name} like {twice[0]}: keep one of them")
+            raise InputError(twice[1], f"moves {name}, as does {twice[0]}: keep one of them")
     return sorted(stages, key=lambda poses: -links.index(poses.link))
 
 
 def candidates(loop: Loop, link: str) -> list[str]:
-    """Parameters that the poses of a moving link may tell, the most wanted first.
+    """Return the parameters that the poses of a moving link may identify, in order of preference.
 
     Args:
         loop: the chain.
         link: the moving link.
 
     Returns:
-        Names; of parameters that show only together the first one is identified.
+        Parameter names. If only a combination is identifiable, its first parameter is identified.
     """
     place = loop.links.index(link)
     first = [f"p_xy.{link}", f"p_z.{link}"]
@@ -158,7 +158,7 @@ def candidates(loop: Loop, link: str) -> list[str]:
 
 
 def size_of(loop: Loop, name: str) -> float:
-    """How far a parameter may be from where it starts [rad] or [m]."""
+    """Return the expected error of a parameter's start value [rad] or [m]."""
     kind, _, link = name.partition(".")
     known = loop.links[loop.moved + 1 :]
     if link in known and not (kind == "offset" and link != known[-1]):
@@ -167,10 +167,10 @@ def size_of(loop: Loop, name: str) -> float:
 
 
 class Equations:
-    """The two equations per pose of one stage."""
+    """The two residual equations per pose of one stage."""
 
     FLOOR = 1.0e-4
-    """Standard deviation [m] below which no pose counts, where its readings do not show at all."""
+    """Minimum standard deviation [m] of an equation; bounds the weight of insensitive poses."""
 
     def __init__(self, loop: Loop, poses: Poses) -> None:
         self.loop, self.poses = loop, poses
@@ -178,9 +178,10 @@ class Equations:
         self.outer = loop.links[self.place :]
 
     def seen(self, numbers: Mapping[str, float]) -> tuple[Loop, np.ndarray]:
-        """The chain with numbers, and the angles (M, links - 1) of the joints beyond the moving.
+        """Return the chain with given parameters, and the joint angles beyond the moving link.
 
-        The moving link's own d keeps its nominal value: only p_z less it can be told.
+        The angles have shape (M, number of links beyond the moving one) [rad]. The moving link's
+        own d keeps its nominal value, because only the difference p_z - d is identifiable.
         """
         loop, poses = self.loop, self.poses
         values = np.array([[numbers[f"{kind}.{link}"] for kind in KINDS] for link in loop.links])
@@ -204,12 +205,17 @@ class Equations:
         return error - self.poses.drift.ball[:, :2] if self.poses.drift else error
 
     def residual(self, numbers: Mapping[str, float]) -> np.ndarray:
-        """Residual (M, 2) [m]."""
+        """Return the residuals of both equations (M, 2) [m]."""
         loop, theta = self.seen(numbers)
         return self._error(ball_place(loop, self.place, theta), numbers)
 
     def at(self, numbers: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Residual (M, 2) [m], derivative (M, 2, links, 5), the same by the S readings."""
+        """Return residuals and their derivatives.
+
+        Returns:
+            (residuals (M, 2) [m], derivatives by link parameters (M, 2, links, 5),
+            derivatives by the S calibrator readings (M, 2, S) [m/rad]).
+        """
         loop, theta = self.seen(numbers)
         s, by = ball_from(loop, self.place, theta)
         way = s[:, :2] / np.hypot(s[:, :1], s[:, 1:2])
@@ -218,9 +224,9 @@ class Equations:
         return self._error(s, numbers), rows, rows[:, :, loop.moved - self.place :, 0]
 
     def columns(self, by: np.ndarray, names: Sequence[str], own_d: bool = False) -> np.ndarray:
-        """(M, 2, p) derivative by named parameters; zero by those that do not appear.
+        """Return the derivatives (M, 2, p) by named parameters; zero for parameters without effect.
 
-        The moving link's d appears only where `own_d` says so.
+        The column of the moving link's d is zero unless `own_d` is set.
         """
         out = np.zeros((*by.shape[:2], len(names)))
         for column, name in enumerate(names):
@@ -240,24 +246,24 @@ class Equations:
         return out
 
     def whitening(self, sensed: np.ndarray) -> np.ndarray:
-        """(M, 2, 2) upper factors that give both equations of a pose unit covariance."""
+        """Return upper factors (M, 2, 2) that give both equations of a pose unit covariance."""
         spread = sensed * self.poses.sigma[..., None, :]
         covariance = spread @ spread.transpose(0, 2, 1) + self.FLOOR**2 * np.eye(2)
         return np.linalg.cholesky(np.linalg.inv(covariance)).transpose(0, 2, 1)
 
 
 def start_numbers(loop: Loop, stages: Sequence[Poses]) -> Numbers:
-    """Every parameter where the identification starts.
+    """Return start values of all parameters.
 
-    Held angles are the manipulator's own readings where it has sensors, else those at home; the
-    ball's places follow from the readings of each stage with the nominal chain.
+    Held angles are the median readings of the manipulator's sensors if it has any, otherwise the
+    home angles. The ball positions are computed from each stage's readings and the nominal chain.
 
     Args:
         loop: the nominal chain.
         stages: the poses.
 
     Returns:
-        Name -> [rad] or [m].
+        Parameter values by name [rad] or [m].
     """
     numbers = {name: loop.value(name) for name in loop.names}
     for k, link in enumerate(loop.links[: loop.moved]):
@@ -279,20 +285,20 @@ def identify_arm(
     loop: Loop, stages: Sequence[Poses], *, weighted: bool = True,
     chosen: Mapping[str, Sequence[str]] | None = None,
 ) -> ArmFit:  # fmt: skip
-    """Identify link by link, from the outermost of the stages inwards.
+    """Identify the arm link by link, from the outermost stage inwards.
 
     Args:
         loop: the nominal chain.
-        stages: poses of one or more links; links that are missing keep their nominal parameters.
-        weighted: give each equation the weight of its sensors' errors; False for Khoshzaban's plain
-            least squares, whose intervals are too optimistic.
-        chosen: link -> parameters to identify instead of those that are found to be told.
+        stages: poses of one or more links; links without poses keep their nominal parameters.
+        weighted: weight each equation by its sensor noise; False for Khoshzaban's unweighted least
+            squares, whose intervals are too narrow.
+        chosen: parameters to identify by link, instead of those found to be identifiable.
 
     Returns:
-        The fit, with the covariance that sensor noise leaves in this and all earlier stages.
+        The fit, with the covariance due to sensor noise in this and all earlier stages.
 
     Raises:
-        InputError: poses that do not suffice; names file, link, and what to do.
+        InputError: the poses are insufficient; the message names file, link and remedy.
 
     Source: Khoshzaban 1992, sections 3.6.3 and 3.6.4.
     """
@@ -318,7 +324,7 @@ def identify_arm(
 
 
 def what_is_told(equations: Equations, numbers: Numbers, names: Sequence[str]) -> Identifiability:
-    """What the poses of a stage tell of its candidates, about the given numbers."""
+    """Classify the candidate parameters of a stage by identifiability, at given parameters."""
     loop = equations.loop
     _, by, sensed = equations.at(numbers)
     matrix = equations.whitening(sensed) @ equations.columns(by, names, own_d=True)
@@ -331,31 +337,31 @@ def identify_stage(
     covariance: np.ndarray, told: Identifiability, wanted: Sequence[str], weighted: bool = True,
     near: bool = False,
 ) -> tuple[Stage, Numbers, np.ndarray]:  # fmt: skip
-    """Identify what one stage tells.
+    """Identify the parameters of one stage.
 
     Args:
-        equations: of the stage.
-        numbers: every parameter, where the search starts.
+        equations: equations of the stage.
+        numbers: all parameters, the start of the search.
         own: p parameters to identify.
-        earlier: q parameters that earlier stages identified.
-        covariance: (q, q) of these.
-        told: what the poses tell of the candidates.
-        wanted: the candidates.
-        weighted: as `identify_arm`.
-        near: whether the start is near, so that no singular value has to be left out.
+        earlier: q parameters identified by earlier stages.
+        covariance: (q, q) covariance of the earlier parameters.
+        told: identifiability of the candidate parameters.
+        wanted: the candidate parameters.
+        weighted: as in `identify_arm`.
+        near: whether the start is close to the solution, so that no truncation is needed.
 
     Returns:
-        (the stage, all numbers, covariance (q + p, q + p) of earlier and own parameters).
+        (the stage, all parameters, covariance (q + p, q + p) of earlier and own parameters).
 
     Raises:
-        InputError: too few poses.
+        InputError: there are too few poses.
     """
     poses, loop = equations.poses, equations.loop
     if 2 * len(poses) < _FEWEST * len(own):
         raise InputError(
             poses.source,
             f"{len(poses)} poses of {poses.link} are too few for {len(own)} parameters:"
-            f" record {len(own) * _FEWEST} or more, better 200",
+            f" record {len(own) * _FEWEST} or more, preferably 200",
         )
     sizes = [size_of(loop, name) for name in own]
     start = np.array([numbers[name] for name in own])
@@ -402,20 +408,20 @@ def identify_stage(
 
 
 def _reason(told: Identifiability, name: str, loop: Loop) -> str:
-    """Why a candidate keeps its value, in a few words."""
+    """Return a short reason why a candidate keeps its value."""
     kind, _, link = name.partition(".")
     if link in loop.links[loop.moved + 1 :] and size_of(loop, name) == LABORATORY[unit_of(name)]:
         if told.status[told.names.index(name)] != "unidentifiable":
-            return "known better from the laboratory"
+            return "known more accurately from the laboratory"
     column = told.combination[:, told.names.index(name)]
     partners = [told.names[told.base[k]] for k in np.flatnonzero(column)]
     if told.status[told.names.index(name)] == "unidentifiable" or not partners:
-        return "shows in no pose"
-    return f"shows only together with {', '.join(partners)}"
+        return "has no effect in any pose"
+    return f"identifiable only together with {', '.join(partners)}"
 
 
 def arm_fit(loop, numbers, start, names, covariance, stages, method) -> ArmFit:
-    """The fit of identified numbers, with the ball's place where the first link told it."""
+    """Assemble the fit; update the ball position if the innermost stage identified it."""
     values = {name: numbers[name] for name in loop.names}
     calibrated = loop.with_values(values)
     first = loop.links[0]
@@ -432,13 +438,13 @@ def arm_fit(loop, numbers, start, names, covariance, stages, method) -> ArmFit:
 
 
 def identify_jointly(fit: ArmFit, stages: Sequence[Poses]) -> ArmFit:
-    """Identify all stages together, from where the hierarchical identification ended.
+    """Identify all stages together, starting from the hierarchical fit.
 
-    Every parameter takes part in all stages in which it appears; the ball's places are each
-    stage's own. The Jacobian is sparse: a stage's rows know no parameter of the links inside.
+    A parameter enters the equations of every stage that depends on it; each stage has its own ball
+    position. The Jacobian is sparse: a stage does not depend on links inside its moving link.
 
     Args:
-        fit: the hierarchical one.
+        fit: the hierarchical fit.
         stages: the same poses.
 
     Returns:
@@ -489,7 +495,7 @@ def identify_jointly(fit: ArmFit, stages: Sequence[Poses]) -> ArmFit:
     for poses in order:
         parts.append(rows[kept : kept + 2 * len(poses)])
         kept += 2 * len(poses)
-    # misfit beyond the sensors' (held links that drift) widens the intervals stage by stage
+    # residuals above sensor noise (drift of held links) enlarge the intervals stage by stage
     chi = [max(1.0, float(np.sqrt(np.mean(p**2)))) for p in parts]
     inverse = np.linalg.pinv(matrix)
     scaled = inverse * np.concatenate([np.full(len(p), c) for p, c in zip(parts, chi, strict=True)])
@@ -504,7 +510,7 @@ def identify_jointly(fit: ArmFit, stages: Sequence[Poses]) -> ArmFit:
 
 
 def check_poses(loop: Loop, poses: Poses) -> None:
-    """Refuse readings that are not finite, or poses that are one and the same."""
+    """Raise an error for readings that are not finite, or for poses that are all the same."""
     bad = np.argwhere(~np.isfinite(poses.theta))
     if len(bad):
         row, column = bad[0]
@@ -514,21 +520,21 @@ def check_poses(loop: Loop, poses: Poses) -> None:
     if np.all(spread < _STILL):
         raise InputError(
             poses.source,
-            f"shows one pose of {poses.link} again and again: no calibrator joint moves by more"
+            f"contains only one pose of {poses.link}: no calibrator joint moves by more"
             f" than {np.degrees(spread.max()):.2g} deg; move the link through its range",
         )
 
 
 def stage_residuals(loop: Loop, poses: Poses, numbers: Mapping[str, float]) -> np.ndarray:
-    """Residuals of a stage's equations in units of their sensors' errors.
+    """Return the residuals of a stage in units of their standard deviations from sensor noise.
 
     Args:
         loop: the nominal chain.
-        poses: of the stage.
-        numbers: of a fit.
+        poses: poses of the stage.
+        numbers: parameters of a fit.
 
     Returns:
-        (M, 2) of unit variance where only the sensors err.
+        (M, 2) whitened residuals, of unit variance if sensor noise is the only error.
     """
     equations = Equations(loop, poses)
     error, _, sensed = equations.at(numbers)
@@ -536,18 +542,18 @@ def stage_residuals(loop: Loop, poses: Poses, numbers: Mapping[str, float]) -> n
 
 
 def machine_with_loop(machine: Machine, nominal: Loop, loop: Loop) -> Machine:
-    """A machine whose links and joints are those of a chain.
+    """Return a machine with the link positions and joint axes of a chain.
 
-    Joint zeros stay the machine's: a changed offset of a chain is a sensor's matter. Cylinder pins
-    keep their places on their links.
+    The joint zeros of the machine are kept; a changed offset in the chain is a sensor error.
+    Cylinder pins keep their positions on their links.
 
     Args:
         machine: the machine.
-        nominal: its own chain.
-        loop: a chain with other numbers.
+        nominal: the chain of this machine.
+        loop: the chain with changed parameters.
 
     Returns:
-        The machine with the chain's lengths and twists, and the ball joint at its place.
+        The machine with the chain's lengths, twists and ball joint position.
     """
     rest = nominal.values[:, 0]
     points, ways = joint_axes(link_chain(loop.values), rest[None])
@@ -600,7 +606,7 @@ def _in_tree_order(machine: Machine) -> list[str]:
 
 
 def _with_tip(machine: Machine, before: Mapping, origin: Mapping) -> Machine:
-    """Move the arm's tip with the link that hangs there."""
+    """Move the arm's tip together with the link that is attached to it."""
     if machine.arm is None:
         return machine
     tip = machine.arm.tip
@@ -613,17 +619,17 @@ def _with_tip(machine: Machine, before: Mapping, origin: Mapping) -> Machine:
 
 
 def calibrated_machine(machine: Machine, fit: ArmFit, stages: Sequence[Poses]) -> Machine:
-    """The machine with everything that a calibration found.
+    """Return the machine with all results of a calibration.
 
     Args:
         machine: the nominal machine.
-        fit: of its arm.
-        stages: the poses; where the manipulator has sensors, the angles at which links were held
-            tell the sensors' offsets.
+        fit: the calibrated arm.
+        stages: the poses; the manipulator's own readings, if any, at the identified held angles
+            give the offsets of its sensors.
 
     Returns:
-        The machine: lengths, twists, ball joint, and `sensor_errors` of the calibrator's sensors
-        and of the manipulator's.
+        The machine with calibrated lengths, twists and ball joint, and with `sensor_errors` of
+        calibrator and manipulator sensors.
     """
     loop, nominal = fit.loop, fit.nominal
     made = machine_with_loop(machine, nominal, loop)

@@ -1,4 +1,4 @@
-"""Logs of a calibrator as poses: which link moved, which rows count, how good the sensors are."""
+"""Conversion of calibrator logs to poses: moving link, valid rows and sensor accuracy."""
 
 import math
 from collections.abc import Sequence
@@ -14,11 +14,11 @@ from hydrotele.logs.log import Log, load_logs
 from hydrotele.machine.machine import IDEAL, Machine, noise_rms, sensor_set
 
 POSES = 300
-"""Poses that are taken of a log, evenly spread; Khoshzaban's figures show 300 to 400."""
+"""Maximum number of poses taken from a log, evenly spaced; Khoshzaban's figures show 300 to 400."""
 
-_SETTLED = np.radians(1.0)  # a link that is held drifts by less while another is moved
+_SETTLED = np.radians(1.0)  # maximum drift of a held link while another link moves
 _LINEAR = 2.0e-3 / math.sqrt(3.0)  # m, of a linear transducer, K 2.5
-_RESOLVER = np.radians(0.1) / math.sqrt(3.0)  # of sensors of which nothing is said, K 2.5
+_RESOLVER = np.radians(0.1) / math.sqrt(3.0)  # default of a sensor without stated accuracy, K 2.5
 
 
 def read_stages(
@@ -29,16 +29,16 @@ def read_stages(
     Args:
         path: folder of logs, or one log.
         machine: the machine with its calibrator.
-        loop: its chain.
-        poses: to take of each log at most.
-        accuracy: standard deviation of an angle reading [rad]; by default that of the sensors that
-            the logs name, or of Khoshzaban's resolvers.
+        loop: the closed chain of this machine.
+        poses: maximum number of poses per log.
+        accuracy: standard deviation of an angle reading [rad]; by default that of the sensors named
+            in the log, or of Khoshzaban's resolvers.
 
     Returns:
-        The stages, as the files are ordered.
+        The stages, in the order of the files.
 
     Raises:
-        InputError: a log lacks a channel, is of another machine, or does not say which link moved.
+        InputError: a channel is missing, the machine differs, or the moving link is unknown.
     """
     logs = load_logs(path, required=loop.channels[loop.moved :])
     return [stage_of(log, machine, loop, poses, accuracy) for log in logs]
@@ -47,20 +47,20 @@ def read_stages(
 def stage_of(
     log: Log, machine: Machine, loop: Loop, poses: int = POSES, accuracy: float | None = None
 ) -> Poses:
-    """One log as a stage.
+    """Convert one log to the poses of a stage.
 
     Args:
-        log: of one moving link.
+        log: log of one moving link.
         machine: the machine with its calibrator.
-        loop: its chain.
-        poses: to take at most.
-        accuracy: standard deviation of an angle reading [rad], or None.
+        loop: the closed chain of this machine.
+        poses: maximum number of poses.
+        accuracy: standard deviation of an angle reading [rad], or None as in `read_stages`.
 
     Returns:
-        The poses, evenly spread over the rows that count.
+        The poses, evenly spaced over the valid rows.
 
     Raises:
-        InputError: as `read_stages`.
+        InputError: as in `read_stages`.
     """
     of = log.metadata.get("machine", machine.name)
     if of != machine.name:
@@ -72,7 +72,7 @@ def stage_of(
     if "valid" in log:
         rows = rows[log["valid"] > 0.5]
     if len(rows) < 2:
-        raise InputError(f"{log.source}, column valid", "leaves no rows: mark rows that count by 1")
+        raise InputError(f"{log.source}, column valid", "leaves no rows: mark valid rows with 1")
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(poses, len(rows))).round().astype(int))]
     link = moving_link(log, loop)
     sensed = loop.channels[loop.moved :]
@@ -88,7 +88,7 @@ def stage_of(
 
 
 def _deviation(log: Log, machine: Machine, channel: str, accuracy: float | None) -> float:
-    """Standard deviation of a channel's readings [rad]."""
+    """Return the standard deviation of a channel's readings [rad]."""
     if accuracy is not None:
         return accuracy
     name = log.metadata.get("sensors", "")
@@ -99,19 +99,19 @@ def _deviation(log: Log, machine: Machine, channel: str, accuracy: float | None)
 
 
 def moving_link(log: Log, loop: Loop) -> str:
-    """The powered link that moves in a log while the others are held.
+    """Return the name of the powered link that moves in a log while the others are held.
 
-    Its joint angle shows it, else its cylinder's length or its command, else the file's name.
+    It is found from joint angles, else from cylinder lengths or commands, else from the file name.
 
     Args:
         log: the log.
         loop: the chain.
 
     Returns:
-        Its name.
+        The name of the link.
 
     Raises:
-        InputError: no link moves, several do, or nothing in the log shows one.
+        InputError: no link or more than one link moves, or the log does not determine the link.
 
     >>> from hydrotele.machine.machine_file import load_machine
     >>> from hydrotele.calibrate.loop import loop_of
@@ -141,14 +141,14 @@ def moving_link(log: Log, loop: Loop) -> str:
 
 
 def held_out(stages: Sequence[Poses], every: int = 5) -> tuple[list[Poses], list[Poses]]:
-    """Poses to fit, and every n-th pose of each stage to judge on.
+    """Split the poses of each stage into a fitting set and a validation set.
 
     Args:
         stages: all poses.
-        every: n; 0 for none to judge on.
+        every: every n-th pose of a stage is used for validation; 0 for no validation set.
 
     Returns:
-        (stages to fit, stages to judge on).
+        (stages for fitting, stages for validation).
     """
     if every <= 1:
         return list(stages), []
@@ -158,16 +158,16 @@ def held_out(stages: Sequence[Poses], every: int = 5) -> tuple[list[Poses], list
 
 
 def strokes_of(log: Log, machine: Machine, axes: Sequence[str], poses: int = 0) -> list[Strokes]:
-    """Angles and cylinder displacements of the axes that move in a log.
+    """Return joint angles and cylinder displacements of the axes that move in a log.
 
     Args:
-        log: with `angle.AXIS` and `length.AXIS`.
+        log: log with channels `angle.AXIS` and `length.AXIS`.
         machine: the machine.
-        axes: to look for.
-        poses: samples to take at most; 0 for all.
+        axes: names of the axes to search.
+        poses: maximum number of samples; 0 for all.
 
     Returns:
-        One per axis that moves by 5 deg or more.
+        One item per axis that moves by at least 5 deg.
     """
     found = []
     rows = np.flatnonzero(log["valid"] > 0.5) if "valid" in log else np.arange(len(log))
@@ -187,7 +187,7 @@ def strokes_of(log: Log, machine: Machine, axes: Sequence[str], poses: int = 0) 
 
 
 def _length_deviation(log: Log, machine: Machine, channel: str) -> float:
-    """Standard deviation of a displacement's reading [m]."""
+    """Return the standard deviation of a displacement reading [m]."""
     name = log.metadata.get("sensors", "")
     if name in machine.sensors and name != IDEAL:
         return noise_rms(machine, sensor_set(machine, name), channel) or _LINEAR

@@ -1,4 +1,4 @@
-"""Poses of a manipulator that a calibrator measured while one link moved."""
+"""Poses of a manipulator, measured by a calibrator while one link moves."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -10,12 +10,13 @@ from hydrotele.calibrate.loop import Loop, frame_of
 
 
 class Drift(NamedTuple):
-    """How held links move while another link is measured.
+    """Motion of the held links while another link is measured.
 
     Attributes:
-        held: link -> (M,) deviation from its mean angle, of links beyond the moving one [rad].
-        ball: (M, 3) how the ball moves away from, along and around the moving joint's axis [m],
-            because links inside it drift.
+        held: (M,) deviation of each held link beyond the moving one from its mean angle [rad],
+            by link name.
+        ball: (M, 3) displacement of the ball away from, along and around the moving joint's axis
+            [m], caused by drift of the links inside the moving one.
     """
 
     held: Mapping[str, np.ndarray]
@@ -24,18 +25,18 @@ class Drift(NamedTuple):
 
 @dataclass(frozen=True)
 class Poses:
-    """Readings while one link moved and the others were held; K's signs.
+    """Readings while one link moves and the others are held, with K's signs.
 
     Attributes:
         link: the moving link.
         theta: (M, S) readings of the calibrator's sensors, without offsets [rad].
-        sigma: (S,), or (M, S) where it depends on the pose: standard deviation of a reading [rad].
-        manipulator: link -> (M,) reading of the manipulator's own joint sensor, where there is one
-            [rad]; the identification itself does not use it.
+        sigma: (S,), or (M, S) if it depends on the pose: standard deviation of a reading [rad].
+        manipulator: (M,) readings of the manipulator's own joint sensors, if any, by link [rad];
+            the identification itself does not use them.
         manipulator_sigma: standard deviation of such a reading [rad].
-        source: where the readings come from, for messages.
+        source: origin of the readings, for messages.
         rows: (M,) rows of the source.
-        drift: of the held links, None to take them as fixed.
+        drift: drift of the held links; None if they are fixed.
     """
 
     link: str
@@ -52,7 +53,7 @@ class Poses:
         return len(self.theta)
 
     def only(self, kept: np.ndarray) -> "Poses":
-        """The poses of an index or mask."""
+        """Return the poses selected by an index array or mask."""
         rows = np.arange(len(self)) if self.rows is None else self.rows
         drift = self.drift and Drift(
             {name: values[kept] for name, values in self.drift.held.items()}, self.drift.ball[kept]
@@ -64,21 +65,21 @@ class Poses:
         )  # fmt: skip
 
 
-_TREND = 2  # degree of the polynomial over the poses: leakage slows down while pressures settle
+_TREND = 2  # polynomial degree over the poses: leakage decreases while pressures settle
 
 
 def with_drift(loop: Loop, poses: Poses) -> Poses:
-    """Poses with the drift of held links, as a smooth trend of the manipulator's own sensors.
+    """Add the drift of held links, a smooth trend of the manipulator's own sensors, to poses.
 
-    Sensors of a manipulator may have any offset: only changes are used. What the drift of links
-    inside the moving one does to the ball's place is taken from the nominal chain.
+    Only changes of the readings are used, so sensor offsets have no effect. The ball displacement
+    caused by drift of links inside the moving one is computed with the nominal chain.
 
     Args:
         loop: the nominal chain.
-        poses: with readings of the manipulator's sensors.
+        poses: poses with readings of the manipulator's sensors.
 
     Returns:
-        The poses with their drift; without such sensors as they are.
+        The poses with their drift; unchanged if there are no such readings.
     """
     place = loop.links.index(poses.link)
     u = np.linspace(-1.0, 1.0, len(poses))

@@ -1,9 +1,9 @@
-"""Corrupted readings of a calibrator: where they are, which joint's they are, without them anew.
+"""Detection and removal of corrupted calibrator readings.
 
-The manipulator's side predicts what the calibrator's sensors have to read. With the moving joint's
-own sensor a pose gives three equations: the ball's distance from the moving axis, its height, and
-its angle about the axis. A stretch of poses in which they do not hold is a region; the joint whose
-error alone explains it is responsible.
+The fitted chain predicts the readings of the calibrator's sensors. With the moving joint's own
+sensor, each pose gives three equations: the ball's distance from the moving axis, its height along
+the axis, and its angle about the axis. A region is a sequence of poses with significantly large
+residuals. The faulty joint is the one whose sensor error explains most of these residuals.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,30 +28,30 @@ from hydrotele.calibrate.arm_poses import Poses
 from hydrotele.calibrate.loop import Loop, ball_from
 
 FALSE_ALARM = 0.005
-"""Probability that a whole measurement without corruption shows a region."""
+"""Probability of finding a region in a complete measurement without corruption."""
 
 _ROUNDS = 8
-_CORE = 0.6  # of the poses that the first, robust fit of a stage trusts
-_EXCESS = 2.0  # times the usual size: what counts towards a region
+_CORE = 0.6  # fraction of the poses used by the first, robust fit of a stage
+_EXCESS = 2.0  # squared residual over its expected value, above which a pose adds to a region
 _FLOOR = 1.0e-4  # m, as in `arm`
-_FREE = 1.0e3  # times its noise: the third equation's zero is not known
-_FAR = 16.0  # squared residual of a pose, over the usual one, from which on it does not count
-_RULED_OUT = 20.0  # difference of chi-squares: one in 20 000 that the truth lies behind by so much
-_MOST = 0.7  # of a stage's poses that may be left out
+_FREE = 1.0e3  # prior standard deviation over noise of the third equation's unknown zero
+_FAR = 16.0  # squared residual over its typical value, above which a pose is an outlier
+_RULED_OUT = 20.0  # chi-square difference that excludes a joint: probability of 1 in 20 000
+_MOST = 0.7  # maximum fraction of a stage's poses that may be left out
 
 
 class Region(NamedTuple):
-    """A stretch of poses of a stage with corrupted readings.
+    """Sequence of poses of a stage with corrupted readings.
 
     Attributes:
         link: the moving link.
         first: first pose.
         last: last pose, included.
-        joint: the joint whose sensor is wrong; empty where it is the moving link's own sensor.
+        joint: the joint whose sensor is wrong; empty for the moving link's own sensor.
         size: root mean square of its error [rad].
-        explained: part of the region's squared residual that this joint explains [1].
-        possible: every joint that the poses do not rule out, the most likely first; joints whose
-            axes are parallel in all poses of a region cannot be told apart.
+        explained: fraction of the region's squared residual that this joint explains [1].
+        possible: all joints that the poses do not exclude, the most likely first; joints whose
+            axes are parallel in all poses of a region cannot be distinguished.
     """
 
     link: str
@@ -64,12 +64,12 @@ class Region(NamedTuple):
 
 
 class Cleaned(NamedTuple):
-    """An identification without corrupted poses.
+    """Result of an identification without corrupted poses.
 
     Attributes:
-        fit: hierarchical, of the poses that are left.
-        stages: those poses.
-        regions: what was left out.
+        fit: hierarchical fit of the remaining poses.
+        stages: the remaining poses.
+        regions: the poses that were left out.
     """
 
     fit: ArmFit
@@ -78,12 +78,12 @@ class Cleaned(NamedTuple):
 
 
 class Misfit(NamedTuple):
-    """Equations of every pose of a stage, of unit variance where only the sensors err.
+    """Whitened equations of all poses of a stage, of unit variance if only sensor noise acts.
 
     Attributes:
-        rows: (M, E) residuals; E is 3 with the moving joint's sensor, else 2.
-        sensed: (M, E, S) derivative by the calibrator's readings [1/rad].
-        own: (M, E) derivative by the moving joint's reading [1/rad], zero for E = 2.
+        rows: (M, E) residuals; E is 3 with the moving joint's sensor, otherwise 2.
+        sensed: (M, E, S) derivatives by the calibrator's readings [1/rad].
+        own: (M, E) derivatives by the moving joint's reading [1/rad], zero for E = 2.
     """
 
     rows: np.ndarray
@@ -92,7 +92,7 @@ class Misfit(NamedTuple):
 
 
 class Known(NamedTuple):
-    """How well parameters are known: p names and their covariance (p, p)."""
+    """Names of p parameters and their covariance (p, p)."""
 
     names: tuple[str, ...]
     covariance: np.ndarray
@@ -101,17 +101,16 @@ class Known(NamedTuple):
 def misfit(
     loop: Loop, poses: Poses, numbers: Mapping[str, float], known: Known | None = None
 ) -> Misfit:
-    """Residuals of a stage with the manipulator's side.
+    """Return the whitened residuals of a stage, with the angle equation if it is measured.
 
-    The third equation takes no part in the identification. What the parameters' remaining
-    uncertainty makes of it is taken off: the parameters move within their covariance to where most
-    poses agree.
+    The angle equation is not part of the identification. Residuals due to parameter uncertainty
+    are removed: the parameters are moved within their covariance to fit the majority of the poses.
 
     Args:
         loop: the nominal chain.
-        poses: of the stage.
-        numbers: of a fit.
-        known: its parameters' uncertainty, None to take them as exact.
+        poses: poses of the stage.
+        numbers: parameters of a fit.
+        known: uncertainty of its parameters; None to take them as exact.
 
     Returns:
         Residuals and derivatives, whitened.
@@ -148,10 +147,10 @@ def misfit(
 
 
 def _absorbed(rows: np.ndarray, slopes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Residuals (M, E) after parameters moved within their covariance, without poses far off."""
+    """Return residuals (M, E) after parameters moved within their covariance, without outliers."""
     root = np.linalg.cholesky(covariance + 1.0e-18 * np.eye(len(covariance)))
     scaled = slopes @ root
-    if rows.shape[1] == 3:  # the third equation's zero
+    if rows.shape[1] == 3:  # the zero of the third equation is unknown
         third = np.zeros((*rows.shape, 1))
         third[:, 2, 0] = _FREE
         scaled = np.concatenate([scaled, third], axis=2)
@@ -171,16 +170,16 @@ def find_regions(
     false_alarm: float = FALSE_ALARM,
     known: Known | None = None,
 ) -> list[Region]:  # fmt: skip
-    """Stretches of poses whose residuals are too large to be chance.
+    """Find sequences of poses whose residuals are too large to be sensor noise.
 
-    The sum of squares less twice its usual size is followed along the poses; its largest rises are
-    regions if they exceed what noise reaches once in 1/`false_alarm` measurements (the extreme
-    value of a random walk with negative drift).
+    The cumulative sum of squared residuals less twice their expected value is followed along the
+    poses. Its largest rises are regions if they exceed the level that noise reaches in a fraction
+    `false_alarm` of the measurements (extreme value of a random walk with negative drift).
 
     Args:
         loop: the nominal chain.
-        poses: of a stage, all of them.
-        numbers: of a fit.
+        poses: all poses of a stage.
+        numbers: parameters of a fit.
         total: number of poses of the whole measurement.
         false_alarm: probability of a region in a measurement without corruption.
         known: uncertainty of the fit's parameters.
@@ -205,7 +204,7 @@ def find_regions(
 
 
 def _rises(score: np.ndarray, threshold: float) -> list[tuple[int, int]]:
-    """Disjoint stretches with the largest sums, each above a threshold."""
+    """Return disjoint index ranges with the largest sums, each above a threshold."""
     found: list[tuple[int, int]] = []
     waiting = [(0, len(score))]
     while waiting:
@@ -218,7 +217,7 @@ def _rises(score: np.ndarray, threshold: float) -> list[tuple[int, int]]:
 
 
 def _largest(score: np.ndarray) -> tuple[float, int, int]:
-    """Sum, first and last place of the stretch with the largest sum."""
+    """Return sum, first and last index of the contiguous range with the largest sum."""
     best, first, last = -np.inf, 0, -1
     run, begin = 0.0, 0
     for k, value in enumerate(score):
@@ -231,7 +230,7 @@ def _largest(score: np.ndarray) -> tuple[float, int, int]:
 
 
 def _blamed(loop: Loop, poses: Poses, found: Misfit, first: int, last: int) -> Region:
-    """The joint whose error explains most of a region."""
+    """Return a region with the joint whose sensor error explains most of its residuals."""
     inside = slice(first, last + 1)
     rows = found.rows[inside]
     whole = float(np.sum(rows**2))
@@ -248,7 +247,7 @@ def _blamed(loop: Loop, poses: Poses, found: Misfit, first: int, last: int) -> R
     left = {name: whole * (1.0 - part) for name, part in explained.items()}
     best = min((n for n in left if n), key=lambda name: left[name])
     if left.get("", np.inf) < left[best] - _RULED_OUT:
-        best = ""  # only a clear case: it is the calibrator that is examined
+        best = ""  # only if clear, because the calibrator is under test
     usual = max(1.0, left[best] / max(1, rows.size - len(rows)))
     order = sorted(left, key=lambda name: left[name])
     possible = tuple(n for n in order if n and left[n] - left[best] < _RULED_OUT * usual)
@@ -259,11 +258,11 @@ def _blamed(loop: Loop, poses: Poses, found: Misfit, first: int, last: int) -> R
 def identify_without_bad_data(
     loop: Loop, stages: Sequence[Poses], false_alarm: float = FALSE_ALARM
 ) -> Cleaned:
-    """Identify link by link, and leave out corrupted regions of each link before the next.
+    """Identify link by link, leaving out the corrupted regions of each link before the next one.
 
-    A stage begins with the poses that agree best with each other, so that corrupted ones do not
-    hide behind a fit to them. Regions in which only the manipulator's own sensor is wrong stay: the
-    identification does not use it.
+    A stage with regions is refitted to its most consistent poses first, so that a fit to corrupted
+    poses does not mask them. Regions in which only the manipulator's own sensor is wrong are kept,
+    because the identification does not use that sensor.
 
     Args:
         loop: the nominal chain.
@@ -271,10 +270,10 @@ def identify_without_bad_data(
         false_alarm: probability of a region in a measurement without corruption.
 
     Returns:
-        The fit, the poses that are left, and the regions.
+        The fit, the remaining poses, and the regions.
 
     Raises:
-        InputError: as `identify_arm`.
+        InputError: as in `identify_arm`.
     """
     order = stage_order(loop, stages)
     for poses in order:
@@ -316,7 +315,7 @@ def identify_without_bad_data(
 
 
 def _settled(loop, poses, solve, found, total, false_alarm, names, own):
-    """Repeat fit and search from the best-agreeing poses until the regions stay the same."""
+    """Repeat fit and search, starting from the most consistent poses, until regions are stable."""
     for _ in range(3):
         known = Known(names, found[2])
         square = np.sum(misfit(loop, poses, found[1], known).rows ** 2, axis=1)
@@ -336,7 +335,7 @@ def _settled(loop, poses, solve, found, total, false_alarm, names, own):
 
 
 def _outside(regions: Sequence[Region], count: int) -> np.ndarray:
-    """(count,) whether a pose is in none of the regions of a calibrator's joint."""
+    """Return a mask (count,) of the poses outside all regions of calibrator joints."""
     kept = np.ones(count, bool)
     for region in regions:
         if region.joint:
@@ -345,16 +344,16 @@ def _outside(regions: Sequence[Region], count: int) -> np.ndarray:
 
 
 def predicted_readings(loop: Loop, poses: Poses, numbers: Mapping[str, float]) -> np.ndarray:
-    """What each sensor of the calibrator had to read, from the manipulator's side and the others.
+    """Return the expected reading of each calibrator sensor, given the other sensors' readings.
 
     Args:
         loop: the nominal chain.
-        poses: of a stage.
-        numbers: of a fit.
+        poses: poses of a stage.
+        numbers: parameters of a fit.
 
     Returns:
-        (M, S) readings [rad]: for each sensor alone the value that satisfies the pose's equations
-        best while the others read what they do.
+        (M, S) readings [rad]: for each sensor the value that best satisfies the pose's equations
+        while the other sensors keep their readings.
     """
     found = misfit(loop, poses, numbers)
     length = np.maximum(np.sum(found.sensed**2, axis=1), 1.0e-12)

@@ -1,15 +1,11 @@
-"""Designs of a calibrator: which lengths and which place of the ball joint tell an arm best.
+"""Design of calibrators and selection of measurement poses by information.
 
-Khoshzaban 1992, section 5.3, asks for it. The information of a whole measurement, in which one link
-sweeps and held ones drift, is that of its equations' Jacobian over the sensors' errors; what counts
-is how well the tip of the calibrated arm is known over its workspace, and that the calibrator
-reaches the poses at all.
-
-Which poses to measure, and how well a calibration predicts those that it has not seen.
-
-Poses are chosen by the information matrix of the parameters: its determinant (D) or one of the
-observability indices O1 to O5 of robot calibration. The search adds poses one by one and then
-exchanges them while that helps.
+A calibrator design (link lengths, ball joint position) is evaluated by the weighted Jacobian of a
+complete measurement, in which one link sweeps while the others are held (Khoshzaban 1992,
+section 5.3). The criteria are the accuracy of the calibrated arm's tip over its workspace and the
+fraction of poses within reach. Poses are selected by the parameters' information matrix: its
+determinant (D) or an observability index O1 to O5. The search adds poses one by one, then exchanges
+poses until no exchange improves the criterion.
 """
 
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
@@ -27,16 +23,16 @@ from hydrotele.kinematics.serial_chain import forward_and_rates
 
 
 class Sweep(NamedTuple):
-    """How one link is moved there and back while the others are held [deg, K's signs].
+    """Reciprocating motion of one link while the others are held [deg, K's signs].
 
     Attributes:
         moving: range of the moving link.
-        held: link -> where it stands.
-        drift: link -> by how much it has drifted when the last pose is taken.
-        wander: by how much the grapple is turned about the place where it points at the ball.
+        held: angle of each held link, by name.
+        drift: drift of each held link until the last pose, by name.
+        wander: amplitude of the grapple's rotation about the angle at which it points at the ball.
         poses: number of poses.
-        cycles: how often the moving link goes there and back.
-        phase: of the first pose within a cycle, 0 at the lower end [rad].
+        cycles: number of back-and-forth cycles of the moving link.
+        phase: phase of the first pose within a cycle, 0 at the lower end [rad].
     """
 
     moving: tuple[float, float]
@@ -56,21 +52,21 @@ SWEEPS: Mapping[str, Sweep] = {
     "swing": Sweep((-95.0, 60.0), {"boom": -26.8, "stick": 81.0, "pitch": 42.9},
                    {"boom": -0.4, "stick": 0.8}, 10.0, 400),
 }  # fmt: skip
-"""Ranges, drifts and numbers of poses of Khoshzaban 1992 Figs 16 to 18, and of link 4 alike (A)."""
+"""Ranges, drifts and numbers of poses of Khoshzaban 1992 Figs 16 to 18; link 4 is an assumption."""
 
 _HELD = {"swing": 0.0, "boom": -27.8, "stick": 80.6, "pitch": 42.9}  # K Table 2
 
 STILL = {name: sweep._replace(drift={}, held=_HELD) for name, sweep in SWEEPS.items()}
-"""The same with held links that stay where they are from the first stage to the last."""
+"""The same sweeps without drift, with each held link at one angle in all stages."""
 
 
 class Clean(NamedTuple):
-    """Poses of a stage without any error.
+    """Error-free poses of a stage.
 
     Attributes:
         link: moving link.
         theta: (M, N) true angles with offsets [rad].
-        reached: part of the asked poses that the calibrator reaches [1].
+        reached: fraction of the requested poses that the calibrator reaches [1].
     """
 
     link: str
@@ -79,13 +75,13 @@ class Clean(NamedTuple):
 
 
 def sweep_poses(loop: Loop, link: str, sweep: Sweep, seed: int = 0) -> Clean:
-    """True poses while a link sweeps its range and held links drift.
+    """Generate true poses while a link sweeps its range and held links drift.
 
     Args:
         loop: the true chain.
         link: moving link.
         sweep: its trajectory.
-        seed: of the grapple's wandering.
+        seed: seed of the grapple's random rotation.
 
     Returns:
         The poses that the calibrator reaches.
@@ -112,36 +108,36 @@ def sweep_poses(loop: Loop, link: str, sweep: Sweep, seed: int = 0) -> Clean:
 
 
 def _pointing(loop: Loop, theta: np.ndarray) -> np.ndarray:
-    """Grapple's angle at which its yoke's axis is square to the line towards the ball."""
+    """Return the grapple angle at which its yoke axis is perpendicular to the line to the ball."""
     place, turn = frame_of(loop, loop.moved, theta)
     x, y, _ = np.einsum("mji,mj->im", turn, loop.ball - place)
     return np.arctan2(y, x)
 
 
 ARMS = np.linspace(2.0, 4.8, 8)
-"""Lengths of the calibrator's arm that are looked at [m]."""
+"""Grid of calibrator arm lengths [m]."""
 
 FOREARMS = np.linspace(2.4, 4.8, 7)
-"""Lengths of its forearm that are looked at [m]."""
+"""Grid of calibrator forearm lengths [m]."""
 
 _POSES = 60  # per link
-_REACH = 0.98  # of the poses that a design has to reach
+_REACH = 0.98  # minimum fraction of poses that a design must reach
 _TIP = ((-0.8, 0.9), (-0.5, 1.4), (-0.1, 1.9), (-0.1, 0.7), (-0.8, 2.2))  # boom, stick [rad, K]
-_OUT = 1.0e3  # m: what stands for the tip's error of a design that does not reach
+_OUT = 1.0e3  # m: tip error assigned to a design that does not reach its poses
 
 
 class Design(NamedTuple):
-    """A calibrator and what it tells.
+    """Calibrator design and its figures of merit.
 
     Attributes:
         arm: length from yoke to elbow, d of the twist joint [m].
         forearm: length from elbow to ball, a of the elbow [m].
-        ball_x: place of the ball joint in front of the swing axis [m].
-        ball_z: its height above the boom's pin [m].
+        ball_x: position of the ball joint in front of the swing axis [m].
+        ball_z: height of the ball joint above the boom pin [m].
         tip_error: RMS standard deviation of the calibrated arm's tip over its workspace [m].
-        information: log of the determinant of the information about the arm's parameters, each
-            over its expected size.
-        reached: part of the measurement's poses that the calibrator reaches [1].
+        information: log determinant of the information matrix of the arm's parameters, normalised
+            by their expected errors.
+        reached: fraction of the measurement's poses that the calibrator reaches [1].
     """
 
     arm: float
@@ -154,7 +150,7 @@ class Design(NamedTuple):
 
 
 class Survey(NamedTuple):
-    """Designs over the lengths of both arms, and the present one."""
+    """Designs over a grid of arm and forearm lengths, and the present design."""
 
     designs: tuple[Design, ...]
     present: Design
@@ -163,18 +159,18 @@ class Survey(NamedTuple):
 def design_of(
     loop: Loop, arm: float, forearm: float, ball_x: float, ball_z: float, accuracy: float
 ) -> Design:
-    """What a calibrator of these dimensions would tell.
+    """Evaluate a calibrator of given dimensions.
 
     Args:
         loop: the nominal chain.
         arm: length from yoke to elbow [m].
         forearm: length from elbow to ball [m].
-        ball_x: of the ball joint in front of the swing axis [m].
-        ball_z: above the boom's pin [m].
+        ball_x: position of the ball joint in front of the swing axis [m].
+        ball_z: height of the ball joint above the boom pin [m].
         accuracy: bound of a sensor's uniform error [rad].
 
     Returns:
-        The design with its figures.
+        The design with its figures of merit.
     """
     values = loop.values.copy()
     values[-2, 3], values[-1, 2] = arm, forearm
@@ -202,7 +198,7 @@ def design_of(
 
 
 def _whole_jacobian(loop: Loop, stages: list[Poses]) -> tuple[list[str], np.ndarray]:
-    """Identifiable parameters of all stages, and the weighted Jacobian of all equations."""
+    """Return the identifiable parameters and the weighted Jacobian of all stages."""
     numbers = start_numbers(loop, stages)
     names: list[str] = []
     parts = []
@@ -219,7 +215,7 @@ def _whole_jacobian(loop: Loop, stages: list[Poses]) -> tuple[list[str], np.ndar
 
 
 def _tip_error(loop: Loop, names: list[str], covariance: np.ndarray) -> float:
-    """RMS standard deviation of the last moved link's inner pin over some arm poses [m]."""
+    """Return the RMS standard deviation of the arm's tip over a set of arm poses [m]."""
     count = loop.moved - 1
     chain = link_chain(loop.values[:count])
     total = 0.0
@@ -237,14 +233,14 @@ def _tip_error(loop: Loop, names: list[str], covariance: np.ndarray) -> float:
 
 
 def look_over_designs(loop: Loop, accuracy: float) -> Survey:
-    """Designs over a grid of both arms' lengths, with the ball joint where it is.
+    """Evaluate designs over a grid of both lengths, with the ball joint at its present position.
 
     Args:
         loop: the nominal chain.
         accuracy: bound of a sensor's uniform error [rad].
 
     Returns:
-        The designs, forearm by forearm, and the present one.
+        The designs, ordered by forearm length, and the present design.
     """
     x, z = float(loop.ball[0]), float(loop.ball[2])
     grid = [design_of(loop, float(a), float(f), x, z, accuracy) for f in FOREARMS for a in ARMS]
@@ -254,16 +250,16 @@ def look_over_designs(loop: Loop, accuracy: float) -> Survey:
 
 
 def best_design(loop: Loop, survey: Survey, accuracy: float) -> Design:
-    """The design with the best-known tip that reaches its poses, lengths and ball joint free.
+    """Find the reachable design with minimum tip error; lengths and ball joint are free.
 
     Args:
         loop: the nominal chain.
-        survey: where the search starts.
+        survey: grid of designs, the best of which starts the search.
         accuracy: bound of a sensor's uniform error [rad].
 
     Returns:
         The design; the ball joint stays on the chassis, 1.0 to 2.6 m in front of the swing axis
-        and 1.3 to 0.6 m below the boom's pin.
+        and 1.3 to 0.6 m below the boom pin.
     """
     reaching = [d for d in (*survey.designs, survey.present) if d.reached >= _REACH]
     start = min(reaching or [survey.present], key=lambda d: d.tip_error)
@@ -283,7 +279,7 @@ def best_design(loop: Loop, survey: Survey, accuracy: float) -> Design:
 
 
 Criterion = Literal["D", "O1", "O2", "O3", "O4", "O5"]
-_RIDGE = 1e-9  # of the mean information, so that the first poses have a determinant
+_RIDGE = 1e-9  # times the mean information, so that the first poses have a nonzero determinant
 
 Key = TypeVar("Key", bound=Hashable)
 Fitted = TypeVar("Fitted")
@@ -291,12 +287,12 @@ Fitted = TypeVar("Fitted")
 
 @dataclass(frozen=True)
 class Selection:
-    """Chosen poses.
+    """Selected poses.
 
     Attributes:
-        chosen: places of the poses among the candidates.
-        index: the criterion's value, larger is better.
-        exchanges: that the second part of the search made.
+        chosen: indices of the poses among the candidates.
+        index: value of the criterion; larger is better.
+        exchanges: number of exchanges made by the search.
     """
 
     chosen: tuple[int, ...]
@@ -305,19 +301,19 @@ class Selection:
 
 
 def observability(information: np.ndarray, criterion: Criterion, equations: int) -> float:
-    """How well a set of equations tells scaled parameters; larger is better.
+    """Return an observability index of scaled parameters; larger is better.
 
     With singular values s1 >= ... >= sp of the scaled identification Jacobian of m equations:
     D = O1 = (s1 ... sp)^(1/p) / sqrt(m), O2 = sp / s1, O3 = sp, O4 = sp^2 / s1,
     O5 = 1 / (1/s1 + ... + 1/sp).
 
     Args:
-        information: (p, p) J'J of parameters in units of their sizes.
-        criterion: which.
+        information: (p, p) information matrix J'J of parameters in units of their scales.
+        criterion: name of the index.
         equations: m, number of equations.
 
     Returns:
-        The index; 0 where a direction is not told.
+        The index; 0 if the information matrix is singular.
 
     Source: Borm and Menq 1991 (O1); Driels and Pathre 1990 (O2); Nahvi, Hollerbach and Hayward 1994
     (O3); Nahvi and Hollerbach 1996 (O4); Sun and Hollerbach 2008 (O5, comparison).
@@ -343,27 +339,27 @@ def select_poses(
     jacobians: np.ndarray, count: int, criterion: Criterion = "D",
     prior: np.ndarray | None = None,
 ) -> Selection:  # fmt: skip
-    """Poses whose measurements tell the parameters best.
+    """Select the poses whose measurements are most informative about the parameters.
 
     Args:
-        jacobians: (n, k, p) derivatives of the k equations of every candidate by identifiable
-            parameters in units of their sizes, over the equations' standard deviations.
-        count: number of poses to choose.
+        jacobians: (n, k, p) derivatives of the k equations of each candidate by identifiable
+            parameters in units of their scales, divided by the equations' standard deviations.
+        count: number of poses to select.
         criterion: `D` or an observability index.
-        prior: (p, p) information that is there already, such as that of poses measured before.
+        prior: (p, p) information already available, for example from earlier poses.
 
     Returns:
-        The poses, found by adding and exchanging; no exchange of one pose improves them.
+        The poses, found by addition and exchange; no exchange of one pose improves the criterion.
 
     Raises:
-        InputError: fewer candidates than poses, or too few equations for the parameters.
+        InputError: there are fewer candidates than poses, or too few equations.
 
     Source: Fedorov 1972 (exchange); Daney, Papegay and Madeline 2005 (robot calibration).
     """
     rows = np.asarray(jacobians, float)
     n, k, p = rows.shape
     if not 0 < count <= n:
-        raise InputError("poses", f"{count} of {n} candidates cannot be chosen")
+        raise InputError("poses", f"cannot select {count} poses from {n} candidates")
     if prior is None and count * k < p:
         raise InputError(
             "poses", f"{count} poses give {count * k} equations for {p} parameters: choose more"
@@ -403,7 +399,7 @@ def select_poses(
 
 
 def _gains(total: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Growth of log det by every candidate's (n, k, p) rows: log det(I + J P J')."""
+    """Return the increase of log det from each candidate's (n, k, p) rows: log det(I + J P J')."""
     factor = np.linalg.cholesky(total)
     half = np.linalg.solve(
         factor, np.swapaxes(rows, 1, 2).transpose(1, 0, 2).reshape(len(total), -1)
@@ -417,15 +413,15 @@ def leave_one_out(
     groups: Iterable[Key], fit: Callable[[Sequence[Key]], Fitted],
     judge: Callable[[Fitted, Key], float],
 ) -> dict[Key, float]:  # fmt: skip
-    """Errors of predictions of every group by a fit to all others.
+    """Return the prediction error of each group by a fit to all other groups.
 
     Args:
-        groups: names of poses or groups of poses that are left out together.
-        fit: of groups to what is fitted.
-        judge: error of a fit on a group.
+        groups: names of poses, or of groups of poses that are left out together.
+        fit: function from groups to a fit.
+        judge: function that returns the error of a fit on a group.
 
     Returns:
-        Group -> error.
+        Error by group.
 
     >>> data = {"a": 1.0, "b": 2.0, "c": 6.0}
     >>> mean = lambda names: sum(data[name] for name in names) / len(names)

@@ -1,9 +1,9 @@
-"""Nonlinear least squares for calibration: scaled parameters, priors, identifiable set, intervals.
+"""Nonlinear least squares for calibration: scaled parameters, priors, identifiability, intervals.
 
-The search is `scipy.optimize.least_squares` on parameters that are divided by their expected sizes.
-Parameters that the equations do not tell are found first and keep their start values; those that
-are told in combination only are represented by one of them. Levenberg-Marquardt with truncated
-singular values, which SciPy has not, is here, too.
+Parameters are divided by their expected sizes (scales). `scipy.optimize.least_squares` or
+Levenberg-Marquardt with truncated singular values performs the search. Unidentifiable parameters
+are found first and keep their start values; each identifiable combination is represented by one of
+its parameters.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,26 +29,26 @@ Jacobian = Callable[[np.ndarray], np.ndarray | scipy.sparse.spmatrix]
 Selection = Literal["structure", "noise", "none"]
 
 TRUNCATION = (0.05, 0.01, 0.002, 4e-4, 8e-5, 1.6e-5, 3.2e-6)
-"""Shares of the largest singular value: 5 % to begin with, lowered on convergence."""
+"""Truncation levels relative to the largest singular value: 5 % first, lowered on convergence."""
 
 _WHERE = "calibration"
-_COMPLEX_STEP = 1e-30  # times a parameter's size; no difference is formed, so nothing is lost
+_COMPLEX_STEP = 1e-30  # times a scale; complex steps have no cancellation error
 _CENTRAL = np.finfo(float).eps ** (1.0 / 3.0)  # balances rounding and the third derivative
-_CONVERGED = 1e-10  # of a step in units of the sizes
+_CONVERGED = 1e-10  # of a step in units of the scales
 _HALVINGS = 12
-_NOISE_ROUNDS, _NOISE_KNOWN = 30, 1e-4  # repeats until the noise changes by less than this share
-_EXACT = 1e-100  # a residual that is zero
+_NOISE_ROUNDS, _NOISE_KNOWN = 30, 1e-4  # maximum rounds, relative tolerance of the noise estimate
+_EXACT = 1e-100  # a residual that counts as zero
 _NORMAL95 = 1.959964
-_UNSETTLED = "noise and prior do not agree: give sigma"
+_UNSETTLED = "noise and prior estimates do not converge: give sigma"
 
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of p parameters before the measurement.
+    """Normal prior of p parameters.
 
     Attributes:
-        mean: (p,) in the parameters' units.
-        std: (p,) standard deviations; infinite for parameters of which nothing is known.
+        mean: (p,) means in the parameters' units.
+        std: (p,) standard deviations; infinite for parameters without prior.
     """
 
     mean: np.ndarray
@@ -57,26 +57,26 @@ class Prior:
 
 @dataclass(frozen=True)
 class ParameterFit:
-    """Fitted parameters; p of them from m equations.
+    """Result of a fit of p parameters to m equations.
 
     Attributes:
         names: the p parameters.
-        values: (p,) fitted; those that the equations do not tell as they were at the start.
-        scales: (p,) their expected sizes.
-        covariance: (p, p) of the values; rows and columns of held parameters are zero.
+        values: (p,) fitted values; unidentifiable parameters keep their start values.
+        scales: (p,) expected sizes of the parameters.
+        covariance: (p, p) covariance of the values; zero for held parameters.
         held: (p,) whether a parameter kept its start value.
-        residual: (m,) at the solution, not weighted.
-        noise: standard deviation of one equation's error, estimated from the residual.
-        chi: estimated over given standard deviation; near 1 where `sigma` is right, 1 without it.
-        freedom: degrees of freedom, equations less (effective) parameters.
-        rank: number of directions that were fitted.
-        iterations: evaluations of the Jacobian.
-        evaluations: evaluations of the residual, without those for differences.
-        converged: whether the search ended by its tolerances.
-        status: how it ended and, if badly, what to do about it.
-        told: which parameters the data (without the prior) tell.
-        jacobian: (m, p) at the solution, not weighted.
-        critical: quantile by which standard deviations make 95 % intervals.
+        residual: (m,) unweighted residuals at the solution.
+        noise: standard deviation of one equation's error, estimated from the residuals.
+        chi: estimated over given standard deviation; near 1 if `sigma` is correct, 1 without it.
+        freedom: degrees of freedom, equations minus (effective) parameters.
+        rank: number of fitted directions.
+        iterations: number of Jacobian evaluations.
+        evaluations: number of residual evaluations, without those for finite differences.
+        converged: whether the search met its tolerances.
+        status: how the search ended and, if it failed, the remedy.
+        told: identifiability of the parameters from the data without the prior.
+        jacobian: (m, p) unweighted Jacobian at the solution.
+        critical: quantile that converts standard deviations to 95 % intervals.
     """
 
     names: tuple[str, ...]
@@ -99,12 +99,12 @@ class ParameterFit:
 
     @property
     def deviations(self) -> np.ndarray:
-        """(p,) standard deviations; infinite for held parameters, of which nothing was learnt."""
+        """(p,) standard deviations; infinite for held parameters."""
         return np.where(self.held, np.inf, np.sqrt(np.maximum(np.diag(self.covariance), 0.0)))
 
     @property
     def intervals(self) -> np.ndarray:
-        """(p, 2) 95 % intervals; of a combination's representative, with the others held."""
+        """(p, 2) 95 % intervals; for a combination's representative, with the others held."""
         reach = self.critical * self.deviations
         return np.column_stack([self.values - reach, self.values + reach])
 
@@ -114,7 +114,7 @@ class ParameterFit:
         return float(np.sqrt(np.mean(self.residual**2)))
 
     def value(self, name: str) -> float:
-        """One parameter by its name."""
+        """Return the fitted value of a parameter by name."""
         return float(self.values[self.names.index(name)])
 
 
@@ -128,33 +128,33 @@ def least_squares(
 ) -> ParameterFit:  # fmt: skip
     """Fit parameters to equations `residual(x) = noise`.
 
-    Without `sigma` the noise is one standard deviation for all equations, estimated from the
-    residuals; with a prior this is repeated until it agrees with the weight that the prior had.
+    Without `sigma`, all equations have the same standard deviation, estimated from the residuals.
+    With a prior, this estimate is repeated until it is consistent with the weight of the prior.
 
     Args:
-        residual: (p,) parameters to (m,) residuals; for `jac="cs"` it accepts complex ones.
-        start: (p,) where the search begins.
+        residual: maps (p,) parameters to (m,) residuals; must accept complex values for `jac="cs"`.
+        start: (p,) start values.
         names: the p parameters.
-        scales: (p,) their expected sizes, positive: a millimetre, a milliradian.
-        sigma: standard deviation of the equations' errors, one or (m,); None to estimate it.
-        prior: what was known before.
+        scales: (p,) expected sizes, positive, for example 1 mm or 1 mrad.
+        sigma: standard deviation of the equations' errors, one value or (m,); None to estimate it.
+        prior: prior of the parameters, or None.
         jac: function of (p,) to (m, p), dense or sparse; `cs` for complex steps; None for central
             differences.
         sparsity: (m, p), nonzero where a residual depends on a parameter, for differences.
-        truncation: shares of the largest singular value below which directions of a step are left
-            out, one after the other, each until convergence: `TRUNCATION`. None for SciPy's trust
-            region.
-        select: which parameters are held: those that the equations do not tell at all
-            (`structure`), also those whose effect is below the noise (`noise`), or `none`.
-        first: parameters that shall stand for a combination if they can.
-        max_iterations: of the search.
+        truncation: decreasing thresholds, relative to the largest singular value, below which
+            directions of a step are omitted; each is used until convergence (`TRUNCATION`). None
+            for SciPy's Levenberg-Marquardt search.
+        select: which parameters are held: those without any effect (`structure`), also those whose
+            effect is below the noise (`noise`), or `none`.
+        first: parameters preferred as representatives of combinations.
+        max_iterations: maximum number of iterations.
 
     Returns:
         The fit.
 
     Raises:
-        InputError: shapes do not fit, sizes are not positive, a residual is not finite, there are
-            too few equations, or they tell nothing.
+        InputError: shapes do not match, scales are not positive, a residual is not finite, there
+            are too few equations, or no parameter is identifiable.
 
     >>> x = np.linspace(0.0, 1.0, 50)
     >>> y = 2.0 + 3.0 * x
@@ -164,7 +164,7 @@ def least_squares(
     ([2.0, 3.0, 0.0], 'a + c')
 
     Source: Khoshzaban 1992, 3.37-3.43 (truncation, 5 % lowered on convergence); Khalil and Gautier
-    1991 (parameters that equations tell); Nocedal and Wright 2006, chapter 10.
+    1991 (identifiable parameters); Nocedal and Wright 2006, chapter 10.
     """
     problem = _Problem(residual, start, names, scales, jac, sparsity)
     begin = problem.start
@@ -211,22 +211,22 @@ def identifiable(
     jacobian: np.ndarray, names: Sequence[str], scales: Sequence[float] | np.ndarray, *,
     sigma: float | np.ndarray | None = None, first: Sequence[str] = (),
 ) -> Identifiability:  # fmt: skip
-    """Which parameters equations tell: each by itself, in combination with others, or not at all.
+    """Classify parameters: identifiable alone, only in a combination, or not at all.
 
-    Without noise a direction counts as not told if its singular value is below 1e-8 of the largest
-    of columns of length 1, the square root of rounding. With noise a parameter is told if it comes
-    out with a standard deviation below half of its expected size: otherwise the measurement adds
-    nothing to what was known before.
+    Without noise, a direction is unidentifiable if its singular value is below 1e-8 of the largest
+    one, with columns of length 1; 1e-8 is the square root of rounding. With noise, a parameter is
+    identifiable if its standard deviation is below half of its expected size. Otherwise the
+    measurement adds no information to what was known before.
 
     Args:
         jacobian: (m, p) derivatives of the equations.
         names: the p parameters.
-        scales: (p,) their expected sizes.
-        sigma: standard deviation of the equations' errors, one or (m,); None for no noise.
-        first: parameters that shall stand for a combination if they can.
+        scales: (p,) expected sizes of the parameters.
+        sigma: standard deviation of the equations' errors, one value or (m,); None for no noise.
+        first: parameters preferred as representatives of combinations.
 
     Returns:
-        The classification; `told_in_words` writes it out.
+        The classification; `told_in_words` converts it to text.
     """
     matrix = np.asarray(jacobian, float)
     sizes = np.asarray(scales, float)
@@ -239,14 +239,14 @@ def identifiable(
 
 
 def told_in_words(told: Identifiability) -> dict[str, list[str]]:
-    """A classification written out.
+    """Return lists of identifiable parameters, combinations and unidentifiable parameters.
 
     Args:
-        told: of the parameters.
+        told: identifiability of the parameters.
 
     Returns:
-        `identifiable`: parameters told by themselves. `combinations`: what is told only together,
-        each written out. `unknown`: parameters that are not told at all.
+        `identifiable`: parameters identifiable alone. `combinations`: identifiable combinations as
+        text. `unknown`: unidentifiable parameters.
 
     >>> matrix = np.array([[1.0, 2.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1.0, 2.0, 1.0, 0.0]])
     >>> told_in_words(identifiable(matrix, ["a", "b", "c", "d"], [1.0] * 4))
@@ -265,14 +265,14 @@ def told_in_words(told: Identifiability) -> dict[str, list[str]]:
 
 @dataclass(frozen=True)
 class Combination:
-    """What the data tell of parameters: one by itself, or some together.
+    """Estimate of one identifiable parameter or combination of parameters.
 
     Attributes:
-        text: the combination written out, such as `a + 2 b`.
-        value: estimated.
+        text: the combination as text, such as `a + 2 b`.
+        value: estimated value.
         std: its standard deviation.
-        low: end of the 95 % interval.
-        high: its other end.
+        low: lower bound of the 95 % interval.
+        high: upper bound of the 95 % interval.
     """
 
     text: str
@@ -283,16 +283,16 @@ class Combination:
 
 
 def told_combinations(fit: ParameterFit) -> tuple[Combination, ...]:
-    """Everything that the data tell, with intervals.
+    """Return all identifiable combinations with their intervals.
 
-    A parameter that is told with others only has no interval of its own: how a combination is split
-    follows from the prior, or from which parameters were held.
+    A parameter that is identifiable only in a combination has no separate interval: its part of the
+    combination depends on the prior, or on the held parameters.
 
     Args:
         fit: the fit.
 
     Returns:
-        One combination per direction that is told.
+        One combination per identifiable direction.
     """
     order = [fit.names.index(name) for name in fit.told.names]
     values, covariance = fit.values[order], fit.covariance[np.ix_(order, order)]
@@ -306,7 +306,7 @@ def told_combinations(fit: ParameterFit) -> tuple[Combination, ...]:
 
 @dataclass(frozen=True)
 class _Searched:
-    """Where a search ended."""
+    """State of a search at its end."""
 
     x: np.ndarray
     iterations: int = 0
@@ -317,7 +317,7 @@ class _Searched:
 
 
 class _Problem:
-    """Residual and Jacobian of all parameters, checked."""
+    """Residual and Jacobian of all parameters, with input checks."""
 
     def __init__(self, residual, start, names, scales, jac, sparsity) -> None:
         self.start, self.scales = np.array(start, float), np.array(scales, float)
@@ -327,32 +327,32 @@ class _Problem:
         if self.start.shape != (p,) or self.scales.shape != (p,):
             raise InputError(
                 _WHERE,
-                f"{p} names, start {self.start.shape} and scales {self.scales.shape} must fit",
+                f"{p} names, start {self.start.shape} and scales {self.scales.shape} must match",
             )
         bad = [n for n, s in zip(names, self.scales, strict=True) if not 0.0 < s < np.inf]
         if bad:
-            raise InputError(_WHERE, f"the sizes of {', '.join(bad)} must be positive and finite")
+            raise InputError(_WHERE, f"the scales of {', '.join(bad)} must be positive and finite")
         self.groups = np.arange(p) if self.hits is None else _groups(self.hits)
 
     def rows(self, x: np.ndarray) -> np.ndarray:
-        """(m,) residual."""
+        """Return the residual (m,)."""
         rows = np.asarray(self.residual(x))
         if np.iscomplexobj(x):
             return rows
         rows = np.asarray(rows, float)
         if rows.ndim != 1:
-            raise InputError(_WHERE, f"the residual must be (m,), is {rows.shape}")
+            raise InputError(_WHERE, f"the residual must be (m,), got {rows.shape}")
         if not np.isfinite(rows).all():
             where = int(np.flatnonzero(~np.isfinite(rows))[0])
             raise InputError(_WHERE, f"equation {where + 1} of {len(rows)} is not finite")
         return rows
 
     def at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(m,) residual and (m, p) Jacobian."""
+        """Return the residual (m,) and the Jacobian (m, p)."""
         return self.rows(x), self.matrix(x)
 
     def matrix(self, x: np.ndarray) -> np.ndarray:
-        """(m, p) Jacobian, dense."""
+        """Return the dense Jacobian (m, p)."""
         if callable(self.jac):
             return _dense(self.jac(x))
         if self.jac == "cs":
@@ -365,7 +365,7 @@ class _Problem:
         return self._differences(x)
 
     def _differences(self, x: np.ndarray) -> np.ndarray:
-        """Central differences; parameters that share no equation are moved together."""
+        """Return central differences; parameters without a common equation are moved together."""
         steps = _CENTRAL * np.maximum(np.abs(x), self.scales)
         columns: list[np.ndarray] = [np.empty(0)] * len(x)
         for group in range(self.groups.max() + 1):
@@ -382,7 +382,7 @@ def _dense(matrix) -> np.ndarray:
 
 
 def _groups(hits: np.ndarray) -> np.ndarray:
-    """(p,) number of the group of columns of (m, p) that share no row, found greedily."""
+    """Return the group number (p,) of each column; columns of a group have no row in common."""
     groups: list[int] = []
     taken: list[np.ndarray] = []
     for column in hits.T:
@@ -395,7 +395,7 @@ def _groups(hits: np.ndarray) -> np.ndarray:
 
 
 class _Search:
-    """A weighted problem in its free parameters, in units of their sizes, with the prior's rows."""
+    """A weighted problem in its free, scaled parameters, with one extra row per prior."""
 
     def __init__(self, problem: _Problem, weight, prior: Prior | None, free) -> None:
         self.problem, self.weight, self.free = problem, weight, np.flatnonzero(free)
@@ -409,29 +409,29 @@ class _Search:
         self.drawn = self.pull > 0.0
 
     def full(self, base: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """(p,) parameters from a base and the free ones' distances from it."""
+        """Return all parameters (p,) from base values and scaled steps of the free parameters."""
         x = base.copy()
         x[self.free] += u * self.scales
         return x
 
     def rows(self, x: np.ndarray) -> np.ndarray:
-        """Weighted residual and what the prior adds."""
+        """Return the weighted residuals followed by the prior's residuals."""
         away = self.pull * (x[self.free] - self.mean) / self.scales
         return np.concatenate([self.problem.rows(x) * self.weight, away[self.drawn]])
 
     def matrix(self, matrix: np.ndarray) -> np.ndarray:
-        """Jacobian of `rows` by the scaled free parameters, from the problem's."""
+        """Return the Jacobian of `rows` by the scaled free parameters."""
         weighted = matrix[:, self.free] * self.weight[:, None] * self.scales
         return np.vstack([weighted, np.diag(self.pull)[self.drawn]])
 
     def effective(self, matrix: np.ndarray) -> float:
-        """Parameters that the equations, not the prior, decide."""
+        """Return the effective number of parameters determined by the equations, not the prior."""
         whole = self.matrix(matrix)
         q = np.linalg.qr(whole)[0][: len(matrix)]
         return float(np.sum(q**2))
 
     def run(self, begin: _Searched, truncation: Sequence[float] | None, most: int) -> _Searched:
-        """Search from where another one ended."""
+        """Continue the search from the end of a previous one."""
         found = (
             _truncated(self, begin, truncation, most)
             if truncation
@@ -440,7 +440,7 @@ class _Search:
         return replace(found, rounds=begin.rounds + 1)
 
     def covariance(self, matrix: np.ndarray, truncation) -> tuple[np.ndarray, int]:
-        """(p, p) of all parameters, held ones zero; and the rank."""
+        """Return the covariance (p, p), zero for held parameters, and the rank."""
         whole = self.matrix(matrix)
         _, s, v = np.linalg.svd(whole, full_matrices=False)
         cut = truncation[-1] if truncation else len(self.free) * np.finfo(float).eps
@@ -452,7 +452,7 @@ class _Search:
 
 
 def _trust_region(search: _Search, begin: _Searched, most: int) -> _Searched:
-    """SciPy's trust-region search; it ends at rounding, or after `most` Jacobians."""
+    """Run SciPy's Levenberg-Marquardt search, limited to 10 `most` residual evaluations."""
     base, problem = begin.x, search.problem
     found = scipy.optimize.least_squares(
         lambda u: search.rows(search.full(base, u)), np.zeros(len(search.free)),
@@ -468,10 +468,10 @@ def _trust_region(search: _Search, begin: _Searched, most: int) -> _Searched:
 
 
 def _truncated(search: _Search, begin: _Searched, shares: Sequence[float], most: int) -> _Searched:
-    """Gauss-Newton steps without the smallest singular values, whose share is lowered.
+    """Run Gauss-Newton steps with truncated singular values; the threshold is lowered in steps.
 
-    A step that does not reduce the residual is halved; where that does not help, or a step is
-    small, the next share follows.
+    A step that does not reduce the residual is halved. If halving fails, or a step is small, the
+    next threshold follows.
     """
     x, problem = begin.x, search.problem
     rows = search.rows(x)
@@ -509,7 +509,7 @@ def _weights(sigma: float | np.ndarray | None, m: int) -> np.ndarray:
 
 
 def _places(told: Identifiability) -> np.ndarray:
-    """(p,) whether a parameter stands for a combination."""
+    """Return (p,) whether each parameter represents an identifiable combination."""
     return np.isin(np.arange(len(told.names)), told.base)
 
 
@@ -517,7 +517,7 @@ def _structure(matrix: np.ndarray, problem: _Problem, first: Sequence[str]) -> I
     told = identifiable(matrix, problem.names, problem.scales, first=first)
     if not len(told.base):
         raise InputError(
-            _WHERE, f"the data tell none of {', '.join(problem.names)}: vary the poses"
+            _WHERE, f"none of {', '.join(problem.names)} is identifiable: vary the poses"
         )
     return told
 
@@ -526,14 +526,14 @@ def _in_noise(matrix: np.ndarray, problem: _Problem, told: Identifiability) -> I
     found = identifiable_in_noise(matrix, problem.names, problem.scales, _places(told))
     if not len(found.base):
         raise InputError(
-            _WHERE, f"the noise hides all of {', '.join(problem.names)}: record more and"
-            " more different poses"
+            _WHERE, f"the effects of {', '.join(problem.names)} are all below the noise: record"
+            " more poses that differ more"
         )  # fmt: skip
     return found
 
 
 def _unscaled(told: Identifiability, sizes: np.ndarray) -> Identifiability:
-    """A classification of parameters in units of their sizes, in the parameters themselves."""
+    """Convert a classification of scaled parameters to one of unscaled parameters."""
     combination = told.combination * sizes[told.base][:, None] / sizes
     return Identifiability(
         told.names, told.status, told.base, combination, told.condition, told.gap
@@ -544,5 +544,6 @@ def _check_count(equations: int, unknowns: int, prior: bool, known: bool) -> Non
     needed = 1 if prior else unknowns + (0 if known else 1)
     if equations < needed:
         raise InputError(
-            _WHERE, f"{equations} equations do not tell {unknowns} parameters: record more poses"
+            _WHERE,
+            f"{equations} equations are too few for {unknowns} parameters: record more poses",
         )

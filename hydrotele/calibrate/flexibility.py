@@ -1,9 +1,9 @@
-"""Flexible calibrator joints as a noise model that is estimated with the arm's parameters.
+"""Noise model of flexible calibrator joints, estimated together with the arm's parameters.
 
-A loaded joint bends, and its sensor reads another angle than the one between its links. The error
+A loaded joint bends, so that its sensor reading differs from the angle between its links. The error
 of joint k has the variance `sigma_k^2 + (f_k l_k)^2`. The load l_k is the horizontal distance from
-the joint to the ball as a fraction of its largest value; the bending moment of the links between
-them is proportional to it. The f_k are those of maximum likelihood.
+the joint to the ball as a fraction of its maximum; the bending moment is proportional to it. The
+f_k are maximum-likelihood estimates.
 
 Source: Khoshzaban 1992, sections 3.7.3 (p. 60) and 5.3 (p. 124), which proposes such a noise model.
 """
@@ -19,9 +19,9 @@ from hydrotele.calibrate.arm import ArmFit, Equations
 from hydrotele.calibrate.arm_poses import Poses
 from hydrotele.calibrate.loop import Loop, ball_place, frame_of
 
-_ROUNDS = 3  # of noise model and parameters in turn; the third changes the f_k by less than 1 %
-_MAX_FLEXIBILITY = np.radians(10.0)  # rad at full load: far beyond what a calibrator may bend
-_START = np.radians(0.2)  # rad at full load, where the search starts
+_ROUNDS = 3  # alternations of noise model and parameters; the third changes the f_k by below 1 %
+_MAX_FLEXIBILITY = np.radians(10.0)  # rad at full load: far above that of any calibrator
+_START = np.radians(0.2)  # rad at full load, start of the search
 
 Refit = Callable[[Sequence[Poses]], ArmFit]
 
@@ -30,9 +30,9 @@ class Flexibility(NamedTuple):
     """Estimated flexibility of the calibrator's joints.
 
     Attributes:
-        joints: names, S of them.
+        joints: names of the S joints.
         at_full_load: (S,) standard deviation of the angle error at full load [rad].
-        gain: log likelihood over that of sensors without flexibility [1].
+        gain: increase in log likelihood over a model without flexibility [1].
     """
 
     joints: tuple[str, ...]
@@ -41,7 +41,7 @@ class Flexibility(NamedTuple):
 
 
 def joint_loads(loop: Loop, poses: Poses, fit: ArmFit) -> np.ndarray:
-    """Loads (M, S) of the calibrator's joints, 0 .. 1, in the poses of a stage."""
+    """Return the loads (M, S) of the calibrator's joints, 0 .. 1, in the poses of a stage."""
     equations = Equations(loop, poses)
     chain, theta = equations.seen(fit.numbers)
     place = equations.place
@@ -64,21 +64,21 @@ def joint_loads(loop: Loop, poses: Poses, fit: ArmFit) -> np.ndarray:
 
 
 def with_flexibility(loop: Loop, poses: Poses, fit: ArmFit, flexibility: np.ndarray) -> Poses:
-    """Poses whose sensors have the standard deviations (M, S) of the noise model."""
+    """Return the poses with sensor standard deviations (M, S) that include joint flexibility."""
     loads = joint_loads(loop, poses, fit)
     return replace(poses, sigma=np.hypot(poses.sigma, flexibility * loads))
 
 
 def estimate_flexibility(loop: Loop, stages: Sequence[Poses], fit: ArmFit) -> Flexibility:
-    """Maximum likelihood of the joints' flexibility, with the arm's parameters as they are.
+    """Estimate the joints' flexibility by maximum likelihood, with fixed arm parameters.
 
     Args:
         loop: the nominal chain.
         stages: poses with the sensors' own standard deviations (S,).
-        fit: of these poses.
+        fit: fit of these poses.
 
     Returns:
-        The flexibility; 0 for joints whose errors are those of their sensors.
+        The flexibility; 0 for joints whose errors are explained by sensor noise.
     """
     errors, sensed, loads, sigma = [], [], [], []
     for poses in stages:
@@ -112,16 +112,16 @@ def estimate_flexibility(loop: Loop, stages: Sequence[Poses], fit: ArmFit) -> Fl
 def refit_with_flexibility(
     loop: Loop, stages: Sequence[Poses], fit: ArmFit, refit: Refit
 ) -> tuple[ArmFit, Flexibility]:
-    """Estimate flexibility and parameters in turn.
+    """Estimate flexibility and arm parameters alternately.
 
     Args:
         loop: the nominal chain.
         stages: poses with the sensors' own standard deviations.
-        fit: of these poses, where the search starts.
+        fit: fit of these poses, the start of the search.
         refit: identification of poses, hierarchical or joint.
 
     Returns:
-        The fit whose equations have the weights of the noise model, and the flexibility.
+        The fit weighted by the noise model, and the flexibility.
     """
     found = estimate_flexibility(loop, stages, fit)
     for _ in range(_ROUNDS):

@@ -1,11 +1,11 @@
-"""Kinematic calibration of a hybrid robot from measured platform poses.
+"""Kinematic calibration of a serial-parallel (hybrid) robot from measured platform poses.
 
-The residual is that of the document: readings of the legs less those that the error model predicts
-from the measured pose and the carriage's readings. It is whitened by what legs, carriage and pose
-sensors add to it, so that least squares, differential evolution and MCMC share one likelihood.
+The residual is the measured leg readings minus the readings that the error model predicts from the
+measured pose and the carriage joints. It is whitened with the covariance of leg, carriage and pose
+sensors, so that least squares, differential evolution and MCMC use the same likelihood.
 
 Source: Wang 2012, sections 3.1.2 and 3.1.3 (Eq. 29 and its sum of squares); Khalil and Gautier 1991
-(parameters that equations tell).
+(identifiable parameters).
 """
 
 from collections.abc import Sequence
@@ -35,25 +35,25 @@ from hydrotele.kinematics.hybrid import (
     predicted_readings,
 )
 
-_STEP = 1e-2  # of a parameter's size, for central differences: errors are of its square
-_LEFT_OUT = 200  # poses that are left out one by one at most
-_MOST_OUT = 0.2  # share of poses that may be left out as wrong
-_WRONG = 1e-6  # probability under which a pose's residual is no noise
-_LARGE = 20.0  # sizes of an error of manufacture, beyond which it is none
-_UNLIKELY = 1e-4  # probability of residuals so large under the stated noise
-_BETTER = 0.95  # share of the other model's error at which a model is preferred
-_STILL = 1e-3  # m or rad: a joint that moves by less stands still
-_LOADING = 1e-4  # share in a null direction that counts as taking part
+_STEP = 1e-2  # of a parameter's scale, for central differences of second-order accuracy
+_LEFT_OUT = 200  # maximum number of poses left out one by one
+_MOST_OUT = 0.2  # maximum fraction of poses left out as inconsistent
+_WRONG = 1e-6  # probability below which a pose's residual is not noise
+_LARGE = 20.0  # scales above which an error cannot be due to manufacturing
+_UNLIKELY = 1e-4  # probability below which the stated noise does not explain the residuals
+_BETTER = 0.95  # ratio to the other model's error below which a model is preferred
+_STILL = 1e-3  # m or rad: minimum range of a joint that moves
+_LOADING = 1e-4  # minimum component of a null direction for a parameter to be part of it
 
 
 @dataclass(frozen=True)
 class Equations:
-    """Whitened equations of a measurement: N poses, six each, for some of p parameters.
+    """Whitened equations of a measurement: N poses, six each, for q of p parameters.
 
     Attributes:
         model: error model.
-        measurement: poses.
-        names: the q parameters that are free; all others are zero.
+        measurement: measured poses.
+        names: the q free parameters; all others are zero.
         whitening: (N, 6, 6) inverse Cholesky factors of the residuals' covariances.
     """
 
@@ -64,24 +64,24 @@ class Equations:
 
     @property
     def scales(self) -> np.ndarray:
-        """(q,) sizes of the free parameters."""
+        """(q,) scales of the free parameters."""
         return self.model.scales[self.model.index(self.names)]
 
     def full(self, values: np.ndarray) -> np.ndarray:
-        """(..., p) errors from (..., q) free ones."""
+        """Expand (..., q) free errors to errors of all parameters (..., p)."""
         values = np.asarray(values, float)
         whole = np.zeros((*values.shape[:-1], len(self.model.names)))
         whole[..., self.model.index(self.names)] = values
         return whole
 
     def residuals(self, values: np.ndarray) -> np.ndarray:
-        """Whitened residuals of many parameter sets.
+        """Return the whitened residuals of many parameter sets.
 
         Args:
-            values: (W, q).
+            values: (W, q) free errors.
 
         Returns:
-            (W, 6 N), of standard deviation 1 where the noise is known.
+            (W, 6 N), of unit standard deviation if the noise is known.
         """
         m = self.measurement
         away = predicted_readings(
@@ -91,11 +91,11 @@ class Equations:
         return np.matmul(self.whitening, away[..., None])[..., 0].reshape(len(away), -1)
 
     def misfit(self, values: np.ndarray) -> np.ndarray:
-        """(W,) half the sum of squared whitened residuals: minus the log likelihood."""
+        """Return half the sum of squared whitened residuals (W,), minus the log likelihood."""
         return 0.5 * np.einsum("wr,wr->w", *(2 * [self.residuals(values)]))
 
     def jacobian(self, values: np.ndarray) -> np.ndarray:
-        """(6 N, q) derivatives of the whitened residuals by central differences."""
+        """Return the derivatives (6 N, q) of the whitened residuals by central differences."""
         steps = np.diag(_STEP * self.scales)
         both = self.residuals(np.vstack([values + steps, values - steps]))
         q = len(self.names)
@@ -105,15 +105,15 @@ class Equations:
 def equations(
     model: ErrorModel, measurement: Measurement, names: Sequence[str] | None = None
 ) -> Equations:
-    """The equations of a measurement.
+    """Build the equations of a measurement.
 
     Args:
         model: error model.
-        measurement: poses.
+        measurement: measured poses.
         names: free parameters; by default all.
 
     Raises:
-        InputError: no parameter of a name.
+        InputError: a parameter name is unknown.
     """
     names = tuple(names or model.names)
     model.index(names)
@@ -122,17 +122,16 @@ def equations(
 
 
 class Redundancy(NamedTuple):
-    """Which parameters cannot be told apart.
+    """Redundant parameters of an error model for a given measurement.
 
     Attributes:
         rank: number of independent parameters, from the singular values of the Jacobian.
-        held: names of parameters that are left out for it, by QR with pivots.
-        directions: (null, p) combinations of parameters, in units of their sizes, that change no
-            reading.
-        takes_part: names of parameters with a share in those.
-        words: what this means.
-        singular: (p,) singular values of the Jacobian with columns of length 1, over the largest.
-        told: names of parameters that this noise tells better than half of their sizes.
+        held: names of the parameters left out to reach this rank, by pivoted QR.
+        directions: (null, p) combinations of scaled parameters without effect on any reading.
+        takes_part: names of the parameters with a component in these directions.
+        words: explanations of the redundancy.
+        singular: (p,) singular values of the Jacobian with unit columns, relative to the largest.
+        told: names of the parameters whose standard deviation is below half of their scale.
     """
 
     rank: int
@@ -145,14 +144,14 @@ class Redundancy(NamedTuple):
 
 
 def redundancy(eq: Equations, values: np.ndarray | None = None) -> Redundancy:
-    """Redundant parameters of equations, from singular values and QR of the Jacobian.
+    """Find redundant parameters of equations from singular values and QR of the Jacobian.
 
     Args:
         eq: the equations.
-        values: (q,) where the Jacobian is taken; zero by default.
+        values: (q,) errors at which the Jacobian is evaluated; zero by default.
 
     Returns:
-        What they are.
+        The redundant parameters.
 
     Source: Khalil and Gautier 1991; Wang 2012, section 2.1 (minimality).
     """
@@ -178,7 +177,7 @@ def redundancy(eq: Equations, values: np.ndarray | None = None) -> Redundancy:
 
 
 def null_directions(told: Identifiability) -> np.ndarray:
-    """(null, p) orthonormal parameter changes that change no base parameter."""
+    """Return orthonormal parameter changes (null, p) that leave all base parameters unchanged."""
     _, s, v = np.linalg.svd(told.combination, full_matrices=True)
     return v[int(np.sum(s > 1e-9 * s[0])) :] if len(told.base) else np.eye(len(told.names))
 
@@ -189,20 +188,20 @@ def _in_words(eq: Equations, told: Identifiability, held, partners) -> tuple[str
     for row, base in enumerate(told.base):
         others = [k for k in np.flatnonzero(told.combination[row]) if k != base]
         if others:
-            words.append(f"only together: {told.text(row)}")
+            words.append(f"identifiable only together: {told.text(row)}")
     carriage = [n for n in partners if n in model.names[: model.carriage_count]]
     own = {f"{part}{last}" for part in ("theta", "d", "a", "alpha")}
     if carriage and model.kind == "dh" and set(carriage) <= own and held:
         if all(n[0] == "a" for n in partners if n not in carriage):
             words.insert(
-                0, f"{', '.join(carriage)} place the connecting platform behind the last joint:"
-                f" a common displacement of the universal joints A1 to A6 does the same"
+                0, f"{', '.join(carriage)} position the connecting platform after the last joint:"
+                f" a common displacement of the universal joints A1 to A6 has the same effect"
                 f" ({len(held)} redundant parameters)",
             )  # fmt: skip
     still = np.ptp(eq.measurement.joints, axis=0)
     for joint, moved in zip(model.nominal.joints, still, strict=True):
         if moved < _STILL:
-            words.append(f"joint {joint} never moves: its axis cannot be told; move it")
+            words.append(f"joint {joint} never moves: its axis is not identifiable; move it")
     return tuple(words)
 
 
@@ -218,7 +217,7 @@ class Errors(NamedTuple):
     orientation: np.ndarray
 
     def summary(self) -> dict[str, float]:
-        """RMS and largest, in mm and mrad."""
+        """Return RMS and maximum errors in mm and mrad."""
         return {
             "position_rms_mm": 1e3 * float(np.sqrt(np.mean(self.position**2))),
             "position_max_mm": 1e3 * float(self.position.max()),
@@ -228,14 +227,14 @@ class Errors(NamedTuple):
 
 
 def pose_errors(robot: Hybrid, measurement: Measurement) -> Errors:
-    """Forward kinematics of the readings against the measured poses.
+    """Compare the forward kinematics of the readings with the measured poses.
 
     Args:
-        robot: nominal or calibrated.
-        measurement: poses.
+        robot: nominal or calibrated robot.
+        measurement: measured poses.
 
     Raises:
-        InputError: a pose has no solution.
+        InputError: the forward kinematics of a pose have no solution.
     """
     try:
         found = forward(robot, measurement.joints, measurement.legs, measurement.pose)
@@ -247,18 +246,18 @@ def pose_errors(robot: Hybrid, measurement: Measurement) -> Errors:
 
 @dataclass(frozen=True)
 class Calibration:
-    """A calibrated hybrid robot.
+    """Result of the calibration of a hybrid robot.
 
     Attributes:
         model: error model.
-        equations: from which it was identified.
-        fit: least squares of the free parameters.
-        redundancy: of the free parameters.
-        robot: with the errors built in.
+        equations: equations from which the errors were identified.
+        fit: least-squares fit of the free parameters.
+        redundancy: redundancy of the free parameters.
+        robot: calibrated robot.
         before: errors of the nominal robot at the poses.
-        after: of the calibrated one.
-        wrong: rows of poses that were left out because they fit nothing.
-        warnings: what is suspicious about the result, and what to do.
+        after: errors of the calibrated robot at the poses.
+        wrong: rows of the poses left out as inconsistent.
+        warnings: possible problems of the result, with remedies.
     """
 
     model: ErrorModel
@@ -273,12 +272,12 @@ class Calibration:
 
     @cached_property
     def left_out(self) -> Errors:
-        """Errors of robots that are calibrated without the pose that they predict."""
+        """Errors of each pose predicted by a calibration without this pose."""
         return _left_out(self.equations, self.fit)
 
     @property
     def errors(self) -> np.ndarray:
-        """(p,) identified errors of all parameters, zero for those that were held."""
+        """(p,) identified errors of all parameters, zero for held parameters."""
         return self.equations.full(self.fit.values)
 
 
@@ -288,21 +287,21 @@ def calibrate(
 ) -> Calibration:  # fmt: skip
     """Identify the errors of a hybrid robot by least squares.
 
-    Parameters that the poses do not tell keep their nominal values. Poses whose residuals cannot be
-    noise are left out, at most a fifth of them, and named.
+    Unidentifiable parameters keep their nominal values. Poses whose residuals cannot be noise are
+    left out, at most 20 % of them, and are reported.
 
     Args:
-        robot: nominal.
-        measurement: poses.
-        kind: of the error model.
-        names: free parameters; by default all of the model.
-        prior: of the free parameters; by default none.
+        robot: nominal robot.
+        measurement: measured poses.
+        kind: kind of error model.
+        names: free parameters; by default all parameters of the model.
+        prior: prior of the free parameters; by default none.
 
     Returns:
-        The calibrated robot.
+        The calibration.
 
     Raises:
-        InputError: too few different poses.
+        InputError: there are too few different poses.
     """
     model = error_model(robot, kind)
     eq = equations(model, measurement, names)
@@ -326,17 +325,18 @@ def calibrate(
 
 def best(robot: Hybrid, measurement: Measurement, names: Sequence[str] | None = None
          ) -> Calibration:  # fmt: skip
-    """Calibrate with both error models; the one that predicts left-out poses better.
+    """Calibrate with both error models; return the one that predicts left-out poses better.
 
-    `dh` wins a tie of 5 %. Where the robot is stated by its axes there is only `poe`.
+    `dh` is preferred unless `poe` is better by more than 5 %. A robot specified by its axes has the
+    `poe` model only.
 
     Args:
-        robot: nominal.
-        measurement: poses.
-        names: free parameters, of the `dh` model; by default all.
+        robot: nominal robot.
+        measurement: measured poses.
+        names: free parameters of the `dh` model; by default all.
 
     Raises:
-        InputError: as `calibrate`.
+        InputError: as in `calibrate`.
     """
     if not robot.facts.carriage:
         return calibrate(robot, measurement, "poe", names)
@@ -358,15 +358,16 @@ def _warnings(eq: Equations, fit: ParameterFit) -> tuple[str, ...]:
             for k in large[:6]
         )
         said.append(
-            f"{which}: these are no errors of manufacture; the data are of another robot, a sensor"
-            " has another zero, or a frame differs from the nominal robot's"
+            f"{which}: too large for manufacturing errors; the data are of another robot, a sensor"
+            " has another zero, or a frame differs from that of the nominal robot"
         )
     if eq.measurement.stated:
         freedom = max(fit.freedom, 1.0)
         if scipy.stats.chi2.sf(freedom * fit.chi**2, freedom) < _UNLIKELY:
             said.append(
-                f"residuals are {fit.chi:.2f} times what the stated noise makes: it is larger than"
-                " stated, or this error model (or choice of parameters) does not describe the robot"
+                f"residuals are {fit.chi:.2f} times as large as the stated noise predicts: the"
+                " noise is larger than stated, or the error model (or its selected parameters)"
+                " does not describe the robot"
             )
     if not fit.converged:
         said.append(fit.status)
@@ -383,25 +384,25 @@ def _fit(eq: Equations, prior: Prior | None) -> ParameterFit:
 
 
 def _check_poses(eq: Equations) -> None:
-    """Refuse as many equations as they have independent parameters, or fewer."""
+    """Raise an error if there are not more equations than independent parameters."""
     m, q = eq.measurement, len(eq.names)
     matrix = eq.jacobian(np.zeros(q)) * eq.scales
     rank = len(identifiable(matrix, eq.names, np.ones(q)).base)
     if LEGS * m.distinct <= rank:
-        same = "" if m.distinct == len(m) else f" ({len(m)} rows, of which many are the same pose)"
+        same = "" if m.distinct == len(m) else f" ({len(m)} rows, many of them the same pose)"
         raise InputError(
             m.source,
             f"{m.distinct} different poses{same} give {LEGS * m.distinct} equations for"
-            f" {q} parameters: measure at least {q // LEGS + 1} different poses, better twice as"
-            " many, or identify fewer parameters (--parameters document)",
+            f" {q} parameters: measure at least {q // LEGS + 1} different poses, preferably twice"
+            " as many, or identify fewer parameters (--parameters document)",
         )
 
 
 def _suspect(eq: Equations, fit: ParameterFit) -> int | None:
-    """Place of the pose whose residual is least likely to be noise, None if all may be.
+    """Return the index of the pose whose residual is not noise, or None.
 
-    Each pose's six residuals are freed of the pull that they had on the fit; their square follows
-    F(6, rest) under the noise of the others.
+    The influence of each pose on the fit is removed from its six residuals. Relative to the noise
+    of the other poses, their mean square follows an F(6, rest) distribution.
     """
     n = len(eq.measurement)
     residual = fit.residual.reshape(n, LEGS)
@@ -421,7 +422,7 @@ def _suspect(eq: Equations, fit: ParameterFit) -> int | None:
     )  # fmt: skip
     total = float(np.sum(residual**2))
     left = np.maximum(total - squares, 1e-300)
-    if total < 1e-12:  # no noise at all: rounding
+    if total < 1e-12:  # residuals are rounding errors
         return None
     ratio = (squares / LEGS) / (left / rest)
     worst = int(np.argmax(ratio))
@@ -429,11 +430,11 @@ def _suspect(eq: Equations, fit: ParameterFit) -> int | None:
 
 
 def _left_out(eq: Equations, fit: ParameterFit) -> Errors:
-    """Prediction errors of every pose by a calibration without it; of 200 if there are more.
+    """Return each pose's prediction error by a calibration without it, for at most 200 poses.
 
-    Parameters change by less than their standard deviations, over which the equations are straight:
-    with the Jacobian Q R, the six rows Q_k and residuals r_k of the pose, the change is
-    R^-1 Q_k' (1 - Q_k Q_k')^-1 r_k. Poses that the calibration cannot do without are left away.
+    The equations are linear over changes smaller than the parameters' standard deviations. With
+    the Jacobian Q R, the six rows Q_k and the residuals r_k of the pose, the change of parameters
+    is R^-1 Q_k' (1 - Q_k Q_k')^-1 r_k. Poses without which the rank drops are skipped.
     """
     free = np.flatnonzero(~fit.held)
     n = len(eq.measurement)
@@ -450,7 +451,7 @@ def _left_out(eq: Equations, fit: ParameterFit) -> Errors:
         robot = corrected(eq.model, eq.full(values))
         try:
             found = pose_errors(robot, eq.measurement.subset(np.array([k])))
-        except InputError:  # without this pose the calibration is worth nothing there
+        except InputError:  # without this pose, the calibration is not valid there
             continue
         result[:, k] = found.position[0], found.orientation[0]
     known = ~np.isnan(result[0])
@@ -458,7 +459,7 @@ def _left_out(eq: Equations, fit: ParameterFit) -> Errors:
 
 
 def subset(calibration: Calibration) -> Equations:
-    """The equations of a calibration with its fitted parameters alone."""
+    """Return the equations of a calibration restricted to its fitted parameters."""
     eq, held = calibration.equations, calibration.fit.held
     return replace(eq, names=tuple(n for n, h in zip(eq.names, held, strict=True) if not h))
 
@@ -466,16 +467,16 @@ def subset(calibration: Calibration) -> Equations:
 def informative_poses(
     model: ErrorModel, candidates: Measurement, count: int, criterion: Criterion = "D"
 ) -> np.ndarray:
-    """Poses whose measurement tells the parameters best, among candidates.
+    """Select the most informative poses from candidates.
 
     Args:
         model: error model.
-        candidates: poses as the nominal robot would be measured there, with their covariances.
-        count: how many to choose.
+        candidates: poses as measured on the nominal robot, with their covariances.
+        count: number of poses to select.
         criterion: `D` or an observability index `O1` to `O5`.
 
     Returns:
-        (count,) places of the poses.
+        (count,) indices of the poses.
 
     Raises:
         InputError: there are too few candidates or poses.

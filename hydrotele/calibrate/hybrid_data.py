@@ -1,6 +1,6 @@
-"""Measured poses of a hybrid robot: a folder with a table of poses, what measured them, and noise.
+"""Reading and writing of measured poses of a hybrid robot.
 
-The folder holds
+A measurement is a folder with
 
 - `poses.csv` or `poses.parquet`, one row per pose, units in the header (`leg.1 [mm]`) or in the
   Parquet field metadata (without one: m, rad): `joint.<name>` of every carriage joint, `leg.1` to
@@ -10,7 +10,7 @@ The folder holds
   triangle of each pose's covariance in SI, of position and rotation vector in frame 0;
 - `measurement.yaml`: `robot` (its name), `wires` (anchors and points, for `wire.*`), `noise`
   (standard deviations `leg`, `slide`, `turn`, `wire`, `position`, `orientation`), all optional;
-- optionally `heldout.csv` or `.parquet` of the same form, to judge on, and `robot.yaml`, the
+- optionally `heldout.csv` or `.parquet` of the same form, for validation, and `robot.yaml`, the
   nominal robot.
 """
 
@@ -44,22 +44,22 @@ COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
 COVARIANCE = tuple(f"covariance.{a}.{b}" for a, b in combinations_with_replacement(COORDINATES, 2))
 POSES, HELDOUT, FACTS = "poses", "heldout", "measurement.yaml"
 _KINDS = (".csv", ".parquet")
-_MARGIN = 0.2  # of a joint's range, that a reading may lie beyond it
-_FAR = 0.05  # m: legs that differ by more from the nominal robot are of another one
-_WIRE = 1e-4  # m: of a wire where nothing is stated; only its ratio to the other errors counts
-_SAME = 1e-5  # m or rad: poses that differ by less are one pose, measured again
+_MARGIN = 0.2  # fraction of a joint's range by which a reading may exceed it
+_FAR = 0.05  # m: median leg difference from the nominal robot above which it is another robot
+_WIRE = 1e-4  # m: default of a wire's deviation; only its ratio to the other errors matters
+_SAME = 1e-5  # m or rad: resolution at which poses count as repeated
 
 
 class Noise(Facts):
-    """Standard deviations; None where nothing is known.
+    """Standard deviations of the sensors; None if unknown.
 
     Attributes:
-        leg: of a leg's reading [m].
-        slide: of a prismatic carriage joint's [m].
-        turn: of a revolute one's [rad].
-        wire: of a wire's length [m].
+        leg: of a leg reading [m].
+        slide: of a prismatic carriage joint [m].
+        turn: of a revolute carriage joint [rad].
+        wire: of a wire length [m].
         position: of a measured pose's coordinates [m].
-        orientation: of its rotation vector's [rad].
+        orientation: of a measured pose's rotation vector [rad].
     """
 
     leg: Positive | None = None
@@ -71,7 +71,7 @@ class Noise(Facts):
 
 
 class MeasurementFacts(Facts):
-    """What `measurement.yaml` states."""
+    """Contents of `measurement.yaml`."""
 
     robot: str = ""
     wires: Wires | None = None
@@ -84,12 +84,12 @@ class Measurement:
 
     Attributes:
         source: the file.
-        rows: (N,) rows of the table that they are, from 0.
-        joints: (N, n) carriage [m] or [rad].
-        legs: (N, 6) readings [m].
-        pose: measured, of the moving platform in frame 0.
-        covariance: (N, 6, 6) of the legs' readings less those predicted from measured pose and
-            carriage [m^2]; up to one factor where `stated` is false.
+        rows: (N,) row numbers in the table, from 0.
+        joints: (N, n) carriage readings [m] or [rad].
+        legs: (N, 6) leg readings [m].
+        pose: measured pose of the moving platform in frame 0.
+        covariance: (N, 6, 6) covariance of the leg readings minus those predicted from measured
+            pose and carriage [m^2]; known up to a factor if `stated` is false.
         stated: whether the noise is known.
     """
 
@@ -102,11 +102,11 @@ class Measurement:
     stated: bool
 
     def __len__(self) -> int:
-        """Number of poses."""
+        """Return the number of poses."""
         return len(self.legs)
 
     def subset(self, places: np.ndarray) -> "Measurement":
-        """Some of the poses, by their places or a mask."""
+        """Return the poses selected by an index array or mask."""
         return replace(
             self, rows=self.rows[places], joints=self.joints[places], legs=self.legs[places],
             pose=Pose(self.pose.rotation[places], self.pose.position[places]),
@@ -115,7 +115,7 @@ class Measurement:
 
     @property
     def distinct(self) -> int:
-        """Number of poses that are no repetition of another."""
+        """Number of different poses."""
         whole = np.hstack([self.joints, self.legs])
         return len(np.unique(np.round(whole / _SAME), axis=0))
 
@@ -124,20 +124,20 @@ def measurement_of_wires(
     robot: Hybrid, joints: np.ndarray, legs: np.ndarray, lengths: np.ndarray, wires: Wires,
     noise: Mapping[str, float], source: str,
 ) -> Measurement:  # fmt: skip
-    """A measurement from readings of carriage, legs and wires.
+    """Build a measurement from readings of carriage, legs and wires.
 
     Args:
-        robot: nominal; its forward kinematics select among the solutions of the wires.
-        joints: (N, n) [m] or [rad].
-        legs: (N, 6) [m].
-        lengths: (N, 6) of the wires [m].
-        wires: where they are.
+        robot: nominal robot; its forward kinematics select the solution of the wire equations.
+        joints: (N, n) carriage readings [m] or [rad].
+        legs: (N, 6) leg readings [m].
+        lengths: (N, 6) wire lengths [m].
+        wires: geometry of the wires.
         noise: standard deviations by the names of `Noise`, in SI.
-        source: what to call it.
+        source: name of the measurement, for messages.
 
     Raises:
         NoIntersection: the wires do not meet.
-        Unreachable: legs are not of this robot.
+        Unreachable: the legs do not fit this robot.
     """
     pose = pose_of_wires(wires, lengths, forward(robot, joints, legs))
     stated = Noise(**noise)
@@ -148,7 +148,7 @@ def measurement_of_wires(
 
 
 def robot_file(folder: Path) -> Path | None:
-    """The nominal robot that lies in a folder of measurements, None without one."""
+    """Return the path of the nominal robot in a measurement folder, or None."""
     path = folder / "robot.yaml"
     return path if path.is_file() else None
 
@@ -157,29 +157,29 @@ def read_measurement(folder: Path, robot: Hybrid) -> tuple[Measurement, Measurem
     """Read a folder of measurements.
 
     Args:
-        folder: of the form that the module describes.
-        robot: nominal.
+        folder: folder in the format of this module's docstring.
+        robot: nominal robot.
 
     Returns:
-        (poses to calibrate from, poses to judge on or None).
+        (poses for calibration, poses for validation or None).
 
     Raises:
-        InputError: names file, column, row and what to do.
+        InputError: a file is invalid; the message names file, column, row and remedy.
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise InputError(folder, f"is no folder: name one with {POSES}.csv or {POSES}.parquet")
+        raise InputError(folder, f"is not a folder: give one with {POSES}.csv or {POSES}.parquet")
     file = _table(folder, POSES)
     if file is None:
-        raise InputError(folder, f"holds neither {POSES}.csv nor {POSES}.parquet")
+        raise InputError(folder, f"contains neither {POSES}.csv nor {POSES}.parquet")
     facts = MeasurementFacts()
     if (folder / FACTS).is_file():
         data, lines = read_yaml(folder / FACTS)
         facts = parse(MeasurementFacts, data, str(folder / FACTS), lines)
     if facts.robot and facts.robot != robot.name:
         raise InputError(
-            folder / FACTS, f"is a measurement of the robot {facts.robot!r}, the model is"
-            f" {robot.name!r}: give that robot with --robot",
+            folder / FACTS, f"is a measurement of the robot {facts.robot!r}, but the model is"
+            f" {robot.name!r}: select that robot with --robot",
         )  # fmt: skip
     heldout = _table(folder, HELDOUT)
     return _measurement(file, facts, robot), _measurement(
@@ -195,7 +195,7 @@ def _measurement(file: Path, facts: MeasurementFacts, robot: Hybrid) -> Measurem
     table = read_table(file)
     columns = _columns(table, robot, facts)
     if not len(table.values) or not len(table.values[0]):
-        raise InputError(file, "holds no pose: write one line per pose")
+        raise InputError(file, "contains no pose: write one line per pose")
     joints = np.column_stack([columns[f"joint.{name}"] for name in robot.joints])
     legs = np.column_stack([columns[f"leg.{k}"] for k in range(1, LEGS + 1)])
     _check_ranges(table, robot, joints, legs)
@@ -218,7 +218,7 @@ def _measurement(file: Path, facts: MeasurementFacts, robot: Hybrid) -> Measurem
 
 
 def _columns(table: Table, robot: Hybrid, facts: MeasurementFacts) -> dict[str, np.ndarray]:
-    """Columns by name in SI, checked for names, units and numbers."""
+    """Return the columns by name in SI units, after checks of names, units and values."""
     joints = dict(zip((f"joint.{n}" for n in robot.joints), robot.kinds, strict=True))
     legs, wires = ([f"{what}.{k}" for k in range(1, LEGS + 1)] for what in ("leg", "wire"))
     poses = [f"pose.{c}" for c in COORDINATES]
@@ -227,10 +227,10 @@ def _columns(table: Table, robot: Hybrid, facts: MeasurementFacts) -> dict[str, 
     columns: dict[str, np.ndarray] = {}
     for name, values, unit in zip(table.names, table.values, table.units, strict=True):
         if name not in known:
-            raise InputError(table.where(name), f"is no column of {robot.name}: "
+            raise InputError(table.where(name), f"is not a column of {robot.name}: "
                              f"{suggest(name, known[:-21])}, covariance.x.x ...")  # fmt: skip
         if name in columns:
-            raise InputError(table.where(name), "is there twice")
+            raise InputError(table.where(name), "occurs twice")
         wrong = np.flatnonzero(~np.isfinite(values))
         if len(wrong):
             said = f"is {values[wrong[0]]}: remove the row or measure the pose again"
@@ -239,13 +239,13 @@ def _columns(table: Table, robot: Hybrid, facts: MeasurementFacts) -> dict[str, 
         si, factor = to_si(unit) if unit else (needed, 1.0)
         if si != needed and name not in COVARIANCE:
             like = "rad, deg or mrad" if needed == "rad" else "m or mm"
-            raise InputError(table.where(name), f"has the unit {unit!r}, it needs {like}")
+            raise InputError(table.where(name), f"has the unit {unit!r}, but needs {like}")
         columns[name] = np.asarray(values, float) * (1.0 if name in COVARIANCE else factor)
     for group in ((*joints, *legs), wires if "wire.1" in columns else poses):
         missing = [name for name in group if name not in columns]
         if missing:
             either = " (or wire.1 to wire.6)" if group is poses else ""
-            raise InputError(table.source, f"lacks {', '.join(missing)}{either}")
+            raise InputError(table.source, f"has no column {', '.join(missing)}{either}")
     if "wire.1" in columns and facts.wires is None:
         raise InputError(
             Path(table.source).with_name(FACTS), "must state `wires`: anchors and points"
@@ -266,9 +266,9 @@ def _check_ranges(table: Table, robot: Hybrid, joints: np.ndarray, legs: np.ndar
                              if k == REVOLUTE}  # fmt: skip
             unit, other = ("rad", "deg") if angle else ("m", "mm")
             raise InputError(
-                table.where(name, row), f"is {values[row]:.6g} {unit}, the robot {robot.name} goes"
-                f" from {low:.6g} to {high:.6g}: correct the value, state the unit in the header"
-                f" ('{name} [{other}]') or give the robot it is of",
+                table.where(name, row), f"is {values[row]:.6g} {unit}, but robot {robot.name}"
+                f" has the range {low:.6g} to {high:.6g}: correct the value, state the unit in the"
+                f" header ('{name} [{other}]') or select the correct robot",
             )  # fmt: skip
 
 
@@ -279,7 +279,7 @@ def _pose_from_wires(table, columns, facts, robot, joints, legs) -> Pose:
         return pose_of_wires(facts.wires, lengths, near)
     except (Unreachable, NoIntersection) as error:
         raise InputError(
-            table.source, f"{error}: check the wires' order and units in it and in {FACTS}"
+            table.source, f"{error}: check the order and units of the wires in it and in {FACTS}"
         ) from None
 
 
@@ -288,7 +288,7 @@ def _pose_covariance(table, columns, noise, count) -> tuple[np.ndarray, bool]:
     if present:
         if len(present) < len(COVARIANCE):
             missing = [name for name in COVARIANCE if name not in columns]
-            raise InputError(table.source, f"lacks {', '.join(missing[:6])}: give all 21 or none")
+            raise InputError(table.source, f"has no {', '.join(missing[:6])}: give all 21 or none")
         result, at = np.empty((count, 6, 6)), np.triu_indices(6)
         result[:, at[0], at[1]] = np.column_stack([columns[name] for name in COVARIANCE])
         result[:, at[1], at[0]] = result[:, at[0], at[1]]
@@ -303,7 +303,7 @@ def _pose_covariance(table, columns, noise, count) -> tuple[np.ndarray, bool]:
 
 
 def _covariance(robot: Hybrid, joints, pose: Pose, of_pose: np.ndarray, noise: Noise):
-    """(N, 6, 6) covariance of readings less predictions: legs, measured pose, carriage sensors."""
+    """Return the covariance (N, 6, 6) of leg readings minus predictions, from all sensors."""
     by_pose = leg_jacobian(robot, joints, pose)
     by_joint = np.empty((len(joints), LEGS, len(robot.joints)))
     for k in range(len(robot.joints)):
@@ -321,7 +321,7 @@ def _covariance(robot: Hybrid, joints, pose: Pose, of_pose: np.ndarray, noise: N
 
 
 def _check_robot(table: Table, robot: Hybrid, joints, legs, pose: Pose) -> None:
-    """Refuse a table whose legs are not those of the nominal robot at the measured poses."""
+    """Raise an error if the leg readings do not fit the nominal robot at the measured poses."""
     away = np.abs(leg_readings(robot, joints, pose) - legs)
     if np.median(away) > _FAR:
         row = int(np.argmax(away.max(axis=1)))
@@ -336,16 +336,16 @@ def save_measurement(
     folder: Path, stem: str, robot: Hybrid, joints: np.ndarray, legs: np.ndarray,
     pose: Pose | None = None, wires: np.ndarray | None = None,
 ) -> None:  # fmt: skip
-    """Write a table of poses in mm and degrees, as `read_measurement` reads it.
+    """Write a table of poses in mm and degrees, in the format of `read_measurement`.
 
     Args:
-        folder: there already.
+        folder: existing folder.
         stem: `POSES` or `HELDOUT`.
-        robot: whose joints they are.
-        joints: (N, n) [m] or [rad].
-        legs: (N, 6) [m].
-        pose: measured poses, or
-        wires: (N, 6) lengths [m].
+        robot: robot that has these joints.
+        joints: (N, n) carriage readings [m] or [rad].
+        legs: (N, 6) leg readings [m].
+        pose: measured poses, or None.
+        wires: (N, 6) wire lengths [m], or None.
     """
     columns: dict[str, np.ndarray] = {}
     for name, kind, values in zip(robot.joints, robot.kinds, joints.T, strict=True):
@@ -366,11 +366,11 @@ def save_measurement(
 
 
 def measurement_text(robot: str, wires: Wires | None, noise: Mapping[str, float]) -> str:
-    """The text of `measurement.yaml`: lengths in mm, angles in degrees.
+    """Return the text of `measurement.yaml`, with lengths in mm and angles in degrees.
 
     Args:
-        robot: its name.
-        wires: where they are.
+        robot: name of the robot.
+        wires: geometry of the wires.
         noise: standard deviations by the names of `Noise`, in SI.
     """
     import yaml

@@ -1,7 +1,10 @@
-"""Cylinder linkages from joint angles and piston displacements (Khoshzaban 1992, 3.4.4, 3.8.3).
+"""Identification of cylinder linkages from joint angles and piston displacements.
 
-`l_p = sqrt(l_l^2 + l_u^2 - 2 l_l l_u cos(theta + theta_off)) - l_c` (K Eqs 3.26 and 3.27) with the
-angle measured by the joint's own sensor, or identified from the calibrator.
+The closed form is `l_p = sqrt(l_l^2 + l_u^2 - 2 l_l l_u cos(theta + theta_off)) - l_c`
+(K Eqs 3.26 and 3.27). The angle is measured by the joint's own sensor, or identified from the
+calibrator.
+
+Source: Khoshzaban 1992, sections 3.4.4 and 3.8.3.
 """
 
 from collections.abc import Sequence
@@ -26,22 +29,22 @@ NAMES = ("theta_off", "l_l", "l_c", "l_u")
 """Offset of the included angle [rad], lower pin distance, closed length, upper pin distance [m]."""
 
 _SIZES = np.array([np.radians(10.0), 0.2, 0.2, 0.2])
-_SPAN = np.radians(5.0)  # by which the joint must move
-_EVERY = 5  # every fifth sample is judged on, not fitted
+_SPAN = np.radians(5.0)  # minimum range of the joint angle
+_EVERY = 5  # every fifth sample is used for validation
 _ROUNDS = 3
 
 
 @dataclass(frozen=True)
 class Strokes:
-    """Angles and displacements of one axis.
+    """Joint angles and piston displacements of one axis.
 
     Attributes:
         axis: name of the axis.
-        angle: (n,) joint angle, machine's sign [rad].
-        length: (n,) piston displacement [m].
+        angle: (n,) joint angles, machine's sign [rad].
+        length: (n,) piston displacements [m].
         angle_sigma: standard deviation of an angle [rad].
         length_sigma: standard deviation of a displacement [m].
-        angles: where the angles come from.
+        angles: origin of the angles.
         source: the file.
     """
 
@@ -56,20 +59,20 @@ class Strokes:
 
 @dataclass(frozen=True)
 class LinkageFit:
-    """A calibrated linkage.
+    """Result of the calibration of one linkage.
 
     Attributes:
         axis: name of the axis.
-        angles: where the angles came from.
-        nominal: (4,) parameters before, in the order of `NAMES`.
-        fit: of the parameters.
-        fixed: names of those that were held.
-        direction: +1 if the cylinder extends as the angle grows, else -1.
-        rms: root mean square error of the displacement on samples that were not fitted [m].
-        vaf: variance of these that the linkage accounts for [%].
-        rms_before: with the nominal parameters [m].
-        samples: number of samples, fitted and judged.
-        residual: (n,) error of every sample [m].
+        angles: origin of the angles.
+        nominal: (4,) nominal parameters, in the order of `NAMES`.
+        fit: fit of the free parameters.
+        fixed: names of the fixed parameters.
+        direction: +1 if the cylinder extends as the angle increases, otherwise -1.
+        rms: root mean square displacement error of the validation samples [m].
+        vaf: variance of these samples accounted for by the linkage [%].
+        rms_before: RMS error with the nominal parameters [m].
+        samples: number of samples, fitted and validation.
+        residual: (n,) displacement error of each sample [m].
         angle: (n,) the angles [rad].
     """
 
@@ -88,7 +91,7 @@ class LinkageFit:
 
 
 def displacement(values: np.ndarray, direction: int, angle: np.ndarray) -> np.ndarray:
-    """Piston displacement [m], (n,), of parameters in the order of `NAMES` at angles (n,) [rad]."""
+    """Return the piston displacement (n,) [m] for parameters as `NAMES`, at angles (n,) [rad]."""
     offset, lower, closed, upper = values
     return TwoBar(lower, upper, offset, direction).length(angle) - closed
 
@@ -96,16 +99,17 @@ def displacement(values: np.ndarray, direction: int, angle: np.ndarray) -> np.nd
 def identify_linkage(
     machine: Machine, strokes: Strokes, fixed: Sequence[str] | None = None
 ) -> LinkageFit:
-    """Identify a cylinder's triangle.
+    """Identify the triangle of a cylinder linkage.
 
     Args:
         machine: the nominal machine.
         strokes: angles and displacements.
-        fixed: parameters that keep their nominal values; by default none with measured angles, and
-            the longer of the two pin distances with identified ones, as Khoshzaban 1992 Table 11.
+        fixed: parameters that keep their nominal values. The default is none for measured angles
+            and the longer of the two pin distances for identified angles, as in Khoshzaban 1992
+            Table 11.
 
     Returns:
-        The fit, judged on every fifth sample, which it does not use.
+        The fit, validated on every fifth sample, which is not fitted.
 
     Raises:
         InputError: the axis has no triangle, or does not move enough.
@@ -118,8 +122,8 @@ def identify_linkage(
         moved = np.degrees(np.ptp(strokes.angle))
         raise InputError(
             strokes.source,
-            f"{strokes.axis} moves by {moved:.2g} deg only: move it through its range, by 5 deg or"
-            " more; theta_off, l_l, l_c and l_u stay unknown",
+            f"{strokes.axis} moves by {moved:.2g} deg only: move it through its range, by at least"
+            " 5 deg; theta_off, l_l, l_c and l_u are not identifiable",
         )
     nominal = np.array([linkage.angle_offset, linkage.lower, cylinder.closed_length, linkage.upper])
     if fixed is None:
@@ -157,7 +161,7 @@ def identify_linkage(
 
 
 def values_of(found: LinkageFit) -> np.ndarray:
-    """(4,) parameters in the order of `NAMES`, held ones nominal."""
+    """Return all parameters (4,) in the order of `NAMES`; fixed ones are nominal."""
     values = found.nominal.copy()
     for name, value in zip(found.fit.names, found.fit.values, strict=True):
         values[NAMES.index(name)] = value
@@ -165,13 +169,14 @@ def values_of(found: LinkageFit) -> np.ndarray:
 
 
 def machine_with_linkage(machine: Machine, found: LinkageFit) -> Machine:
-    """The machine with an identified triangle: pins at its distances and angle, closed length.
+    """Return a machine with the identified pin distances, pin angle and closed length.
 
-    The base pin keeps its direction from the joint, the rod pin turns by the change of the offset.
+    The base pin keeps its direction from the joint. The rod pin is rotated about the joint axis by
+    the change of the angle offset.
 
     Args:
         machine: the machine.
-        found: of one axis.
+        found: fit of one axis.
 
     Returns:
         The machine.
@@ -203,17 +208,17 @@ def machine_with_linkage(machine: Machine, found: LinkageFit) -> Machine:
 
 
 def identified_angles(fit: ArmFit, poses: Poses) -> np.ndarray:
-    """Angle of the moving joint from the calibrator's readings alone.
+    """Compute the angle of the moving joint from the calibrator's readings alone.
 
-    The ball's direction about the joint's axis turns against the joint; where it stands at angle
-    zero is known up to the links inside, which the triangle's own offset takes up.
+    The ball's direction relative to the joint's axis rotates opposite to the joint. Its zero is
+    known up to the parameters of the links inside; the linkage's angle offset absorbs this error.
 
     Args:
-        fit: of the arm.
-        poses: of the link's stage.
+        fit: fit of the arm.
+        poses: poses of the link's stage.
 
     Returns:
-        (M,) angles, machine's sign [rad]; their mean is that of the nominal chain at home.
+        (M,) angles, machine's sign [rad], on the branch nearest to the nominal home angle.
     """
     loop = fit.nominal
     equations = Equations(loop, poses)

@@ -1,10 +1,10 @@
-"""The closed chain of a manipulator and a calibrator, in the Denavit-Hartenberg form of Khoshzaban.
+"""Closed kinematic chain of a manipulator and a calibrator, in Khoshzaban's D-H convention.
 
-The chain runs from the chassis over the manipulator's powered joints, over the sensed joints of the
-calibrator, to a ball joint on the chassis. Link k is `A_k = Tz(d) Rz(theta) Tx(a) Rx(alpha)
-Ry(beta)` (K Eq. 3.8); the origin of the last frame is the ball. K's signs hold in this room: z axes
-point along the dominant positive direction of the machine's frame, so that a boom's or stick's
-angle is the negative of the machine's.
+The chain runs from the chassis through the manipulator's powered joints and the calibrator's sensed
+joints to a ball joint on the chassis. Link k is `A_k = Tz(d) Rz(theta) Tx(a) Rx(alpha)
+Ry(beta)` (K Eq. 3.8); the origin of the last frame is the ball. Signs are those of K: each z axis
+points along the dominant positive direction of the machine's frame, so that boom and stick angles
+are the negatives of the machine's.
 """
 
 import functools
@@ -18,9 +18,9 @@ from hydrotele.kinematics.serial_chain import Element, SerialChain, forward, for
 from hydrotele.machine.machine import Machine
 
 KINDS = ("offset", "alpha", "a", "d", "beta")
-"""Kinds of a link's parameters; `offset` is theta at the zero of the joint's sensor."""
+"""Kinds of link parameters; `offset` is theta at the zero of the joint's sensor."""
 
-_PARALLEL = 0.05  # rad within which neighbouring axes count as nominally parallel
+_PARALLEL = 0.05  # rad, maximum angle between nominally parallel neighbouring axes
 _DOF = {kind: k for k, kind in enumerate(KINDS)}
 
 
@@ -29,13 +29,13 @@ class Loop:
     """A closed chain of N links with its ball joint.
 
     Attributes:
-        joints: names of the joints, (N) texts, from the chassis outwards.
-        channels: channel of each joint's sensor, (N) texts.
-        links: what the tables call each link: the axis' name of a driven joint, else the joint's.
-        signs: (N,) machine's joint angle -> K's.
-        moved: number n of powered joints of the manipulator; the others are the calibrator's.
-        values: (N, 5) offset [rad], alpha [rad], a [m], d [m], beta [rad] of every link.
-        ball: (3,) place of the ball in frame 0, x towards it where the swing is 0 [m].
+        joints: (N,) names of the joints, from the chassis outwards.
+        channels: (N,) log channel of each joint's sensor.
+        links: (N,) name of each link: the axis name of a driven joint, otherwise the joint name.
+        signs: (N,) factors from the machine's joint angles to K's.
+        moved: number n of powered manipulator joints; the others belong to the calibrator.
+        values: (N, 5) offset [rad], alpha [rad], a [m], d [m], beta [rad] of each link.
+        ball: (3,) position of the ball in frame 0, whose x axis points to it at zero swing [m].
         base: (3,) origin of frame 0 in the machine's frame [m].
         parallel: (N,) whether a link's axis is nominally parallel to the next one.
         home: (N,) angles with offsets at the machine's home position [rad].
@@ -59,20 +59,21 @@ class Loop:
         return len(self.joints)
 
     def place(self, name: str) -> tuple[int, int]:
-        """Row and column in `values` of a parameter such as `a.boom`.
+        """Return row and column in `values` of a parameter such as `a.boom`.
 
         Raises:
-            KeyError: there is no such parameter.
+            KeyError: the kind of parameter is unknown.
+            ValueError: the link is unknown.
         """
         kind, _, link = name.partition(".")
         return self.links.index(link), _DOF[kind]
 
     def value(self, name: str) -> float:
-        """A parameter by its name, [rad] or [m]."""
+        """Return a parameter by name [rad] or [m]."""
         return float(self.values[self.place(name)])
 
     def with_values(self, numbers: dict[str, float]) -> "Loop":
-        """The loop with some parameters replaced."""
+        """Return the chain with some parameters replaced."""
         values = self.values.copy()
         for name, number in numbers.items():
             values[self.place(name)] = number
@@ -80,23 +81,23 @@ class Loop:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Every parameter's name, link by link."""
+        """Names of all parameters, link by link."""
         return tuple(f"{kind}.{link}" for link in self.links for kind in KINDS)
 
 
 def unit_of(name: str) -> str:
-    """Unit of a parameter: `m` of a, d, p_xy and p_z, else `rad`."""
+    """Return the unit of a parameter: `m` for a, d, p_xy and p_z, otherwise `rad`."""
     return "m" if name.partition(".")[0] in ("a", "d", "p_xy", "p_z") else "rad"
 
 
 def link_chain(values: np.ndarray) -> SerialChain:
-    """The serial chain of consecutive links; its joint coordinates hold the offsets.
+    """Return the serial chain of consecutive links; its joint coordinates include the offsets.
 
     Args:
         values: (k, 5) rows of `Loop.values`; the offsets are not used.
 
     Returns:
-        k joints, 5 parameters a link in the order of `KINDS`, but for d, which comes second.
+        A chain of k joints with 5 parameters per link: offset, d, a, alpha, beta.
     """
     return _chain_of(len(values), values.tobytes())
 
@@ -113,15 +114,15 @@ def _chain_of(count: int, numbers: bytes) -> SerialChain:
     return SerialChain(tuple(map(str, range(count))), tuple(elements))
 
 
-_ORDER = [0, 3, 2, 1, 4]  # of offset, d, a, alpha, beta in a chain, as KINDS
+_ORDER = [0, 3, 2, 1, 4]  # from chain order (offset, d, a, alpha, beta) to the order of KINDS
 
 
 def frame_of(loop: Loop, count: int, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The frame behind the first links.
+    """Return the frame at the end of the first links.
 
     Args:
         loop: the chain.
-        count: of links.
+        count: number of links.
         theta: (M, N) angles with offsets [rad].
 
     Returns:
@@ -131,25 +132,25 @@ def frame_of(loop: Loop, count: int, theta: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def ball_place(loop: Loop, first: int, theta: np.ndarray) -> np.ndarray:
-    """The ball's place of `ball_from` alone, (M, 3) [m]; the arguments are the same."""
+    """Return the ball position (M, 3) [m] as `ball_from` does, without derivatives."""
     angles = np.concatenate([np.zeros((len(theta), 1)), theta], axis=1)
     return forward(link_chain(loop.values[first:]), angles).position
 
 
 def ball_from(loop: Loop, first: int, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Place of the ball seen from a joint's axis, without that joint's own angle, and derivatives.
+    """Return the ball position relative to a joint axis, without that joint's angle, and its rates.
 
     `s = Tx(a_i) Rx(alpha_i) Ry(beta_i) A_(i+1) ... A_N [0 0 0 1]'` of K Eqs 3.23 and 3.24, with
     `d_i` added to its z.
 
     Args:
         loop: the chain.
-        first: place of link i in the chain, from 0.
+        first: index of link i in the chain, from 0.
         theta: (M, N - first - 1) angles of the joints beyond it, with their offsets [rad].
 
     Returns:
-        (s (M, 3) [m], ds (M, 3, N - first, 5) by offset, alpha, a, d, beta of links i .. N; that by
-        the offset of link i itself is that by a turn of the joint i.)
+        (s (M, 3) [m], ds (M, 3, N - first, 5) derivatives by offset, alpha, a, d, beta of links
+        i .. N; the derivative by the offset of link i is that by a rotation of joint i.)
     """
     angles = np.concatenate([np.zeros((len(theta), 1)), theta], axis=1)
     found = forward_and_rates(link_chain(loop.values[first:]), angles)
@@ -158,14 +159,14 @@ def ball_from(loop: Loop, first: int, theta: np.ndarray) -> tuple[np.ndarray, np
 
 
 def closure(loop: Loop, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where the chain ends less where the ball is, and the derivative by every joint.
+    """Return the closure error of the chain and its derivatives by the joint angles.
 
     Args:
         loop: the chain.
         theta: (M, N) joint angles with their offsets [rad], K's signs.
 
     Returns:
-        (gaps (M, 3) in frame 0 [m], d(gap)/d(theta) (M, 3, N) [m/rad]).
+        (end of chain minus ball (M, 3) in frame 0 [m], derivatives (M, 3, N) [m/rad]).
     """
     place, by = ball_from(loop, 0, theta[:, 1:])
     ct, st = np.cos(theta[:, 0]), np.sin(theta[:, 0])
@@ -178,16 +179,16 @@ def closure(loop: Loop, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def close(
     loop: Loop, theta: np.ndarray, free: Sequence[int], start: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Angles of three joints that close the chain, by Newton's method along the poses.
+    """Find the angles of three joints that close the chain, by Newton's method.
 
     Args:
         loop: the chain.
         theta: (M, N) angles [rad]; those of `free` are not used.
-        free: places of the three joints.
-        start: (3,) or (M, 3) angles near the solution: of the first pose, or of every one [rad].
+        free: indices of the three joints.
+        start: (3,) start angles of the first pose, or (M, 3) of all poses, near the solution [rad].
 
     Returns:
-        (theta (M, N) closed to 1e-12 m, reached (M,) whether each one closes).
+        (theta (M, N) closed to 1e-9 m, reached (M,) whether each pose closes).
     """
     theta, free = theta.copy(), list(free)
     if np.ndim(start) == 2:
@@ -206,7 +207,7 @@ def close(
 
 
 def _newton(loop: Loop, theta: np.ndarray, free: list[int]) -> np.ndarray:
-    """Close every row in place; whether each one closes."""
+    """Close all rows in place; return whether each row closes."""
     for _ in range(40):
         gap, by = closure(loop, theta)
         if np.abs(gap).max() < 1.0e-12:
@@ -221,20 +222,20 @@ def _newton(loop: Loop, theta: np.ndarray, free: list[int]) -> np.ndarray:
 
 
 def loop_of(machine: Machine) -> Loop:
-    """The closed chain of a machine with a calibrator, from its links and joints.
+    """Build the closed chain of a machine with a calibrator from its links and joints.
 
     Args:
-        machine: with `sensed_joints` and a closure between the calibrator's end and the chassis.
+        machine: machine with `sensed_joints` and a closure between calibrator and chassis.
 
     Returns:
-        The chain with the machine's nominal numbers.
+        The chain with the machine's nominal parameters.
 
     Raises:
         InputError: the machine has no such chain.
     """
     where = f"machine {machine.name}"
     if not machine.sensed_joints:
-        message = "has no sensed_joints: give a machine with a calibrator, such as calibrator"
+        message = "has no sensed_joints: use a machine with a calibrator, such as calibrator"
         raise InputError(where, message)
     last = machine.link_of(machine.sensed_joints[-1])
     ends = [
@@ -255,7 +256,7 @@ def loop_of(machine: Machine) -> Loop:
     links = tuple(axes.get(joint, joint) for joint in joints)
     moved = joints.index(machine.sensed_joints[0])
     if joints[moved:] != machine.sensed_joints:
-        raise InputError(where, "sensed_joints must be the chain's last ones, in its order")
+        raise InputError(where, "sensed_joints must be the last joints of the chain, in its order")
     if stray := [j for j in joints[:moved] if j not in axes]:
         raise InputError(where, f"{stray[0]} in the chain is neither driven nor sensed: lock it")
     ways = np.array([machine.joints[joint].axis for joint in joints])
@@ -285,7 +286,7 @@ def _ancestors(machine: Machine, link: str) -> list[str]:
 def _denavit_hartenberg(
     ways: np.ndarray, points: np.ndarray, tip: np.ndarray, parallel: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Parameters (N, 5) of lines through points along ways, and the origin of frame 0 (3,)."""
+    """Return parameters (N, 5) of axes through points, and the origin of frame 0 (3,)."""
     count = len(ways)
     values = np.zeros((count, 5))
     foot, _ = _feet(points[0], ways[0], points[1], ways[1])
@@ -296,7 +297,7 @@ def _denavit_hartenberg(
         if k == count - 1:
             centre, along = tip, None
         elif parallel[k]:
-            height = z @ (points[k + 1] - foot)  # K: d keeps its nominal value
+            height = z @ (points[k + 1] - foot)  # as K: d keeps its nominal value
             nearby, along = points[k + 1], ways[k + 1]
             centre = nearby + along * ((foot + z * height - nearby) @ z) / (along @ z)
         else:
@@ -327,7 +328,7 @@ def _denavit_hartenberg(
 
 
 def _across(way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """X of the machine made perpendicular to a way (z where they are parallel), and the third."""
+    """Return two unit vectors perpendicular to a direction: one near the machine's x, and y."""
     x = np.array([1.0, 0.0, 0.0]) if abs(way[0]) < 0.9 else np.array([0.0, 0.0, 1.0])
     x = x - way * (way @ x)
     x /= np.linalg.norm(x)
@@ -335,7 +336,7 @@ def _across(way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _feet(p, u, q, v) -> tuple[np.ndarray, np.ndarray]:
-    """Feet of the common normal of the lines p + s u and q + t v."""
+    """Return the feet of the common normal of the lines p + s u and q + t v."""
     between, cosine = q - p, u @ v
     square = 1.0 - cosine**2
     s = (between @ u - cosine * (between @ v)) / square
@@ -344,10 +345,10 @@ def _feet(p, u, q, v) -> tuple[np.ndarray, np.ndarray]:
 
 
 def calibrator_angles(loop: Loop, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Angles of the last three joints that close the chain, on the branch of an elbow that hangs.
+    """Find the last three joint angles that close the chain, with a hanging elbow.
 
-    A closed form for a yoke, a twist and an elbow whose axes cross at right angles is the start of
-    Newton's method for the chain as it is.
+    The closed-form solution for a yoke, twist and elbow with axes that intersect at right angles is
+    the start of Newton's method for the actual chain.
 
     Args:
         loop: the chain; its last three links are yoke, twist and elbow.

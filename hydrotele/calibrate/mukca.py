@@ -1,21 +1,17 @@
-"""Closed-chain calibration of a serial robot from joint angles alone: its ball sits in sockets.
+"""Closed-chain calibration of a serial robot from joint angles, with its ball in sockets.
 
-With the ball in a socket the robot moves in its null space, and all postures must put the ball at
-one place. Unknown are six errors in front of every joint, the ball in the last link, and the
-sockets' places, which leave the equations as means; known is the distance of two sockets in the
-tool that holds them, which gives the scale. Sizes of the errors and the noise are estimated with
-them; joints that yield under gravity and encoders that are not centred are added where they
-predict places better that they were not fitted to.
+While the ball is in a socket, the robot moves in its null space and all postures must put the ball
+at one position. Unknown are six errors in front of every joint, the ball position in the last link,
+and the socket positions, which are eliminated as means. The known distance of two sockets of one
+tool gives the scale.
+
+Parameters of one kind (lengths, tilts, joint offsets ...) have a normal prior with a common
+standard deviation. These standard deviations and the noise maximise the evidence, so that no
+regularisation weight has to be chosen. Joint deflection under gravity and encoder eccentricity are
+added if they improve the cross-validated prediction.
 
 Source: Khoshzaban 1992, chapter 3 (closed chain with a passive end point); Franzese, Spahn, Kober
 and Della Santina 2025, MUKCa (ball and sockets).
-
-How strongly to hold parameters near their nominal values, from the measurements themselves.
-
-Parameters of one kind (lengths, tilts, joint offsets ...) are errors of manufacture of one size.
-That size and the noise are those that make the measurements most probable, so that no weight of a
-regularisation has to be chosen; a kind that the measurements do not ask for gets the size zero.
-Rival models are judged by predicting parts of the measurements that they were not fitted to.
 """
 
 from collections.abc import Sequence
@@ -39,20 +35,20 @@ from hydrotele.kinematics.serial_robot import (
     shipped_robots,
 )
 
-_SMALLEST = 1e-7  # of a size, over its start: a kind that is not there
+_SMALLEST = 1e-7  # minimum size relative to its start: the kind has no errors
 _LARGEST = 1e3
 _ROUNDS, _SETTLED = 200, 1e-4
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """Standard deviations of kinds of parameters and of the noise.
+    """Standard deviations of the parameters by kind, and of the noise.
 
     Attributes:
-        std: (p,) of every parameter, by its kind.
+        std: (p,) prior standard deviation of each parameter.
         noise: standard deviation of an equation's error.
-        effective: number of parameters that the equations decide.
-        rounds: of the iteration.
+        effective: effective number of parameters determined by the equations.
+        rounds: number of iterations.
     """
 
     std: np.ndarray
@@ -66,25 +62,25 @@ def estimate_sizes(
     freedom: float, noise: float, known: np.ndarray | None = None,
     known_rest: np.ndarray | None = None, finest: float = 0.0,
 ) -> Sizes:  # fmt: skip
-    """Sizes of kinds of parameters by maximum evidence.
+    """Estimate the standard deviation of each kind of parameters by maximum evidence.
 
-    For `rest = matrix x + error` with x ~ N(0, s_kind^2) the fixed point of
+    For `rest = matrix x + error` with x ~ N(0, s_kind^2), iterates the fixed point
     `s^2 = sum x^2 / sum g`, `noise^2 = |error|^2 / (freedom - sum g)` with `g = 1 - S_ii / s^2`,
-    the share of a parameter that the measurements decide, and S its covariance.
+    the fraction of a parameter determined by the measurements, and S its covariance.
 
     Args:
         matrix: (m, p) equations with the unknown noise.
-        rest: (m,) what they have to explain.
-        kinds: (p,) name of every parameter's kind; "" for one whose size stays at the start.
-        start: (p,) sizes to begin with.
+        rest: (m,) right-hand side of these equations.
+        kinds: (p,) kind of each parameter; "" for a parameter with a fixed size.
+        start: (p,) initial standard deviations.
         freedom: degrees of freedom of the m equations before parameters are fitted.
-        noise: standard deviation to begin with.
-        known: (r, p) equations whose error has the standard deviation 1, if there are any.
-        known_rest: (r,) what these have to explain.
-        finest: the least that the noise may be.
+        noise: initial standard deviation of the noise.
+        known: (r, p) equations whose error has the standard deviation 1, or None.
+        known_rest: (r,) right-hand side of the known equations.
+        finest: lower bound of the noise.
 
     Returns:
-        The sizes.
+        The standard deviations.
 
     Source: MacKay 1992, Bayesian interpolation; Tipping 2001 (sizes that vanish).
     """
@@ -97,7 +93,7 @@ def estimate_sizes(
     groups = {kind: np.flatnonzero([k == kind for k in kinds]) for kind in set(kinds) - {""}}
     decided = np.zeros(len(std))
     for rounds in range(1, _ROUNDS + 1):  # noqa: B007 - reported
-        # In units of sizes and noise; singular values, so that a small noise loses no digits.
+        # scaled by size and noise, solved by SVD, so that small noise causes no rounding errors
         scaled = np.vstack([triangle / noise, known]) * std
         wanted = np.concatenate([inside / noise, known_rest])
         u, s, v = np.linalg.svd(scaled, full_matrices=False)
@@ -121,13 +117,13 @@ def estimate_sizes(
 def prediction_error(
     matrix: np.ndarray, rest: np.ndarray, folds: np.ndarray, sizes: Sizes
 ) -> float:
-    """RMS of equations predicted by fits that had not seen their part of the measurements.
+    """Return the RMS error of equations predicted by cross-validation.
 
     Args:
         matrix: (m, p) equations, linear in the parameters.
-        rest: (m,) what they have to explain.
-        folds: (m,) part that an equation belongs to.
-        sizes: of parameters and noise, kept for all fits.
+        rest: (m,) right-hand side of the equations.
+        folds: (m,) fold of each equation.
+        sizes: standard deviations of parameters and noise, the same for all folds.
 
     Returns:
         The error, in the unit of the equations.
@@ -157,27 +153,27 @@ MODELS = {
     "eccentricity": (False, True),
     "both": (True, True),
 }
-"""Model of the joints -> whether they yield under gravity, and whether encoders err once a turn."""
+"""Joint models: (deflection under gravity, encoder errors once per turn) by name."""
 
-_SIZE = 1e-3  # m and rad to begin with, a usual tolerance
-_SAG_SIZE = 1e-4  # rad s^2/m^2 to begin with: a milliradian by a kilogram at a metre
-_BALL = 0.3  # m by which the ball may be elsewhere in the last link
-_FINEST = 1e-8  # m of noise: below it rounding decides what the data tell
+_SIZE = 1e-3  # m and rad, initial size: a typical tolerance
+_SAG_SIZE = 1e-4  # rad s^2/m^2, initial size: 1 mrad per kilogram at 1 m
+_BALL = 0.3  # m, prior standard deviation of the ball position in the last link
+_FINEST = 1e-8  # m, minimum noise: below it rounding determines the result
 _PASSES, _SAME_NOISE = 6, 1e-3
 _MEDIAN_CHI3 = 1.5382  # median length of three standard normal errors
-_FALSE_ALARM = 1e-3  # chance that normal noise alone makes an outlier of any row of a data set
-_WRONG_ROBOT = 30e-3  # m of a nominal robot's spread: no joint errs by so much
+_FALSE_ALARM = 1e-3  # probability that normal noise causes an outlier in any row of a data set
+_WRONG_ROBOT = 30e-3  # m, scatter of the ball above which the nominal robot is another robot
 _KINDS = {"t": "length", "r": "tilt"}
 
 
 @dataclass(frozen=True)
 class Options:
-    """What a user may choose.
+    """Options of a socket calibration.
 
     Attributes:
-        distance: of the sockets of one tool [m]; None where it is not known.
+        distance: distance of neighbouring sockets of one tool [m]; None if unknown.
         accuracy: standard deviation of that distance [m].
-        model: of the joints, a key of `MODELS`; None to choose it.
+        model: joint model, a key of `MODELS`; None to select it by cross-validation.
     """
 
     distance: float | None = 0.050
@@ -187,12 +183,12 @@ class Options:
 
 @dataclass(frozen=True)
 class Outlier:
-    """A row whose ball is not where the other rows of its socket put it.
+    """A row whose ball position disagrees with the other rows of its socket.
 
     Attributes:
         socket: name of the socket.
-        line: in its file.
-        distance: of the ball from the others' mean [m].
+        line: line number in its file.
+        distance: distance of the ball from the mean of the other rows [m].
     """
 
     socket: str
@@ -202,15 +198,15 @@ class Outlier:
 
 @dataclass(frozen=True)
 class Judged:
-    """How consistently a robot predicts sockets.
+    """Prediction errors of a robot at sockets.
 
     Attributes:
         rms: root mean square distance of the predicted balls from their sockets' means [m].
-        rms_without_outliers: the same without the rows named in `outliers`.
-        sockets: socket -> its own root mean square [m].
-        distances: place -> distance of its sockets' means, the first two [m].
-        outliers: rows apart from the rest of their socket.
-        rows: socket -> distance of every row's ball from the socket's mean [m].
+        rms_without_outliers: the same without the rows in `outliers`.
+        sockets: root mean square distance [m] by socket.
+        distances: distance of the means of the first two sockets [m] by place.
+        outliers: rows that disagree with the other rows of their socket.
+        rows: distance of each row's ball from the socket's mean [m] by socket.
     """
 
     rms: float
@@ -223,20 +219,20 @@ class Judged:
 
 @dataclass(frozen=True)
 class SocketCalibration:
-    """A calibrated robot.
+    """Result of a socket calibration.
 
     Attributes:
-        nominal: as given.
-        robot: calibrated.
-        model: of the joints, a key of `MODELS`.
-        rivals: model -> RMS error [m] of a coordinate at places, or sockets, not fitted.
-        fit: of all parameters.
-        sizes: kind of parameter -> standard deviation [m], [rad] or [rad s^2/m^2].
+        nominal: the given robot.
+        robot: the calibrated robot.
+        model: joint model, a key of `MODELS`.
+        rivals: cross-validated RMS error of a coordinate [m] by joint model.
+        fit: fit of all parameters.
+        sizes: standard deviation [m], [rad] or [rad s^2/m^2] by kind of parameter.
         noise: standard deviation of one coordinate of the ball [m].
-        before: the nominal robot with its ball fitted, on the fitted sockets.
-        after: the calibrated robot on them.
+        before: errors of the nominal robot with its ball fitted, at all sockets.
+        after: errors of the calibrated robot at all sockets.
         outliers: rows that were not fitted.
-        options: that were used.
+        options: options of the calibration.
     """
 
     nominal: Robot
@@ -254,14 +250,14 @@ class SocketCalibration:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """One place, or socket, predicted by a calibration that has not seen it.
+    """Prediction of one place, or socket, by calibrations on all others.
 
     Attributes:
-        name: of the place or socket.
-        given: of the nominal robot with the ball where its file says.
-        nominal: of the nominal robot with the ball fitted to all others.
-        calibrated: of the robot calibrated on all others.
-        model: of the joints, chosen without it.
+        name: name of the place or socket.
+        given: errors of the nominal robot with the ball position of its file.
+        nominal: errors of the nominal robot with the ball fitted to all others.
+        calibrated: errors of the robot calibrated on all others.
+        model: joint model, selected without this place.
     """
 
     name: str
@@ -272,7 +268,7 @@ class LeftOut:
 
 
 class _Problem:
-    """Equations of sockets for a robot with corrections of its joints."""
+    """Equations of sockets for a robot with joint corrections."""
 
     def __init__(self, robot: Robot, sockets: Sequence[Socket], extra: Sequence[str], options):
         self.robot, self.sockets, self.extra = robot, tuple(sockets), tuple(extra)
@@ -288,34 +284,34 @@ class _Problem:
 
     @property
     def freedom(self) -> int:
-        """Coordinates less the sockets' unknown places."""
+        """Number of ball coordinates minus that of the unknown socket positions."""
         return 3 * (len(self.joints) - len(self.sockets))
 
     def means(self, values: np.ndarray) -> np.ndarray:
-        """Mean of rows (n, ...) over every socket."""
+        """Return the mean of rows (n, ...) over every socket."""
         total = np.zeros((len(self.count), *values.shape[1:]))
         np.add.at(total, self.index, values)
         return total / self.count.reshape(-1, *[1] * (values.ndim - 1))
 
     def balls(self, x: np.ndarray) -> np.ndarray:
-        """(n, 3) predicted places of the ball."""
+        """Return the predicted ball positions (n, 3)."""
         p = len(self.chain.nominal)
         joints = self.joints + self.basis @ x[p:] if self.extra else self.joints
         return forward(self.chain, joints, x[:p]).position
 
     def apart(self, balls: np.ndarray) -> np.ndarray:
-        """(n, 3) balls less their socket's mean."""
+        """Return the balls (n, 3) relative to their socket's mean."""
         return balls - self.means(balls)[self.index]
 
     def residual(self, x: np.ndarray) -> np.ndarray:
-        """All coordinates apart from their means, then errors of the sockets' distances [m]."""
+        """Return the balls relative to their means, then the socket distance errors [m]."""
         balls = self.balls(x)
         means = self.means(balls)
         gaps = [np.linalg.norm(means[a] - means[b]) - self.options.distance for a, b in self.pairs]
         return np.concatenate([(balls - means[self.index]).ravel(), gaps])
 
     def jacobian(self, x: np.ndarray) -> np.ndarray:
-        """Derivatives of `residual`."""
+        """Return the derivatives of `residual`."""
         p = len(self.chain.nominal)
         joints = self.joints + self.basis @ x[p:] if self.extra else self.joints
         rates = forward_and_rates(self.chain, joints, x[:p])
@@ -331,24 +327,24 @@ class _Problem:
         return np.vstack(rows)
 
     def sigma(self, noise: float) -> np.ndarray:
-        """Standard deviation of every equation."""
+        """Return the standard deviation of every equation."""
         means = [1.0 / self.count[a] + 1.0 / self.count[b] for a, b in self.pairs]
         gaps = np.sqrt(self.options.accuracy**2 + noise**2 * np.array(means))
         return np.concatenate([np.full(3 * len(self.joints), noise), gaps])
 
 
 def choose_robot(sockets: Sequence[Socket], options: Options) -> tuple[Robot, dict[str, float]]:
-    """The shipped robot whose nominal chain keeps the ball together best.
+    """Select the shipped robot whose nominal chain has the smallest scatter of the ball.
 
     Args:
         sockets: the measurements.
-        options: of the calibration.
+        options: options of the calibration.
 
     Returns:
-        The robot and every candidate's RMS spread [m] with its ball fitted.
+        The robot, and the median scatter [m] of every candidate with its ball fitted.
 
     Raises:
-        InputError: no shipped robot has that number of joints, or none keeps the ball together.
+        InputError: no shipped robot has this number of joints, or all have a large scatter.
     """
     count, folder = sockets[0].joints.shape[1], sockets[0].path.parent
     spreads: dict[str, float] = {}
@@ -360,28 +356,28 @@ def choose_robot(sockets: Sequence[Socket], options: Options) -> tuple[Robot, di
             spreads[name] = _nominal_spread(robot, sockets)
     if not spreads:
         raise InputError(
-            folder, f"has {count} columns and no shipped robot has {count} joints:"
+            folder, f"has {count} columns, but no shipped robot has {count} joints:"
             f" give --robot FILE (YAML, URDF or MJCF)"
         )  # fmt: skip
     best = min(spreads, key=lambda name: spreads[name])
     if spreads[best] > _WRONG_ROBOT:
         said = ", ".join(f"{name} {1e3 * spread:.0f} mm" for name, spread in spreads.items())
         raise InputError(
-            folder, f"no shipped robot keeps the ball together (RMS spread: {said}):"
+            folder, f"no shipped robot fits the measurements (median scatter of the ball: {said}):"
             f" give --robot FILE (YAML, URDF or MJCF){_degrees_hint(robots, sockets)}"
         )  # fmt: skip
     return robots[best], spreads
 
 
 def check_robot(robot: Robot, sockets: Sequence[Socket]) -> None:
-    """Refuse measurements that do not belong to a robot.
+    """Raise an error if the measurements do not fit a robot.
 
     Args:
-        robot: nominal.
+        robot: nominal robot.
         sockets: the measurements.
 
     Raises:
-        InputError: all files, or one of them, put the ball at places centimetres apart.
+        InputError: the ball positions of all files, or of one file, scatter by centimetres.
     """
     problem = _Problem(robot, sockets, (), Options(distance=None))
     apart = problem.apart(problem.balls(_with_ball(problem)))
@@ -391,15 +387,15 @@ def check_robot(robot: Robot, sockets: Sequence[Socket]) -> None:
     usual = float(np.median(typical))
     if usual > _WRONG_ROBOT:
         raise InputError(
-            sockets[0].path.parent, f"robot {robot.name} spreads the ball by {1e3 * usual:.0f} mm:"
-            f" another robot, another order or sign of joints"
+            sockets[0].path.parent, f"the ball of robot {robot.name} scatters by"
+            f" {1e3 * usual:.0f} mm: another robot, another order or sign of joints"
             f"{_degrees_hint({robot.name: robot}, sockets)}"
         )  # fmt: skip
     for socket, spread in zip(sockets, typical, strict=True):
         if spread > max(_WRONG_ROBOT, 5.0 * usual):
             raise InputError(
-                socket.path, f"robot {robot.name} spreads the ball by {1e3 * spread:.0f} mm, in the"
-                f" other files by {1e3 * usual:.1f} mm: a file of another robot or unit, or"
+                socket.path, f"the ball of robot {robot.name} scatters by {1e3 * spread:.0f} mm, in"
+                f" the other files by {1e3 * usual:.1f} mm: a file of another robot or unit, or"
                 " postures with the ball outside the socket"
             )  # fmt: skip
 
@@ -407,18 +403,18 @@ def check_robot(robot: Robot, sockets: Sequence[Socket]) -> None:
 def calibrate_sockets(
     robot: Robot, sockets: Sequence[Socket], options: Options | None = None
 ) -> SocketCalibration:
-    """Calibrate a robot.
+    """Calibrate a robot from postures with its ball in sockets.
 
     Args:
-        robot: nominal.
-        sockets: at one place or more.
-        options: what is known and chosen.
+        robot: nominal robot.
+        sockets: sockets at one or more places.
+        options: options of the calibration.
 
     Returns:
         The calibration.
 
     Raises:
-        InputError: there are fewer equations than parameters that rows could tell.
+        InputError: there are fewer equations than parameters.
     """
     options = options or Options()
     problem = _Problem(robot, sockets, (), options)
@@ -456,14 +452,14 @@ def calibrate_sockets(
 
 
 def judge(robot: Robot, sockets: Sequence[Socket]) -> Judged:
-    """How consistently a robot, as it is, predicts sockets.
+    """Evaluate the predictions of a robot at sockets, without any fit.
 
     Args:
-        robot: nominal or calibrated, with its corrections.
-        sockets: at any places.
+        robot: nominal or calibrated robot, with its corrections.
+        sockets: sockets at any places.
 
     Returns:
-        RMS distances from the means, distances of the sockets, and rows that stand apart.
+        RMS distances from the means, distances of the sockets, and outliers.
     """
     problem = _Problem(robot, sockets, tuple(robot.corrections), Options(distance=None))
     x = np.concatenate([problem.chain.nominal, list(robot.corrections.values())])
@@ -473,19 +469,19 @@ def judge(robot: Robot, sockets: Sequence[Socket]) -> Judged:
 def leave_out(
     robot: Robot, sockets: Sequence[Socket], names: Sequence[str], options: Options | None = None
 ) -> tuple[LeftOut, ...]:
-    """Predict places, or sockets, by calibrations that have not seen them.
+    """Predict each named place, or socket, by a calibration on all others.
 
     Args:
-        robot: nominal.
-        sockets: all of them.
-        names: places, or sockets by their names, each left out in turn.
-        options: of the calibrations.
+        robot: nominal robot.
+        sockets: all sockets.
+        names: names of places or sockets, each left out in turn.
+        options: options of the calibrations.
 
     Returns:
-        One per name.
+        One prediction per name.
 
     Raises:
-        InputError: nothing is left to calibrate on.
+        InputError: there is no such place, or no other place to calibrate on.
     """
     return tuple(hold_out(robot, sockets, name, options)[0] for name in names)
 
@@ -493,27 +489,27 @@ def leave_out(
 def hold_out(
     robot: Robot, sockets: Sequence[Socket], name: str, options: Options | None = None
 ) -> tuple[LeftOut, SocketCalibration]:
-    """Predict one place, or socket, by a calibration that has not seen it.
+    """Predict one place, or socket, by a calibration on all others.
 
     Args:
-        robot: nominal.
-        sockets: all of them.
-        name: of the place, or of a socket.
-        options: of the calibration.
+        robot: nominal robot.
+        sockets: all sockets.
+        name: name of the place or socket.
+        options: options of the calibration.
 
     Returns:
-        How well it is predicted, and the calibration on all others.
+        The prediction, and the calibration on all others.
 
     Raises:
-        InputError: there is no such place, or nothing is left to calibrate on.
+        InputError: there is no such place, or no other place to calibrate on.
     """
     own = tuple(s for s in sockets if name in (s.place, s.name))
     rest = tuple(s for s in sockets if name not in (s.place, s.name))
     if not own:
         known = (*places_of(sockets), *(s.name for s in sockets))
-        raise InputError(f"--heldout {name}", f"is no place of the data; {suggest(name, known)}")
+        raise InputError(f"--heldout {name}", f"is not a place of the data; {suggest(name, known)}")
     if not rest:
-        raise InputError(f"--heldout {name}", "is all there is; record another place")
+        raise InputError(f"--heldout {name}", "is the only place; record another one")
     found = calibrate_sockets(robot, rest, options)
     problem = _Problem(robot, rest, (), Options(distance=None))
     values = dict(zip(problem.names, _with_ball(problem).tolist(), strict=True))
@@ -524,7 +520,7 @@ def hold_out(
 
 
 def parts_to_leave_out(sockets: Sequence[Socket]) -> tuple[str, ...]:
-    """Places where there are several, else sockets where there are several, else nothing."""
+    """Return the places if there are several, else the sockets if several, else nothing."""
     places = places_of(sockets)
     if len(places) > 1:
         return places
@@ -533,14 +529,14 @@ def parts_to_leave_out(sockets: Sequence[Socket]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class _State:
-    """Values with sizes and noise."""
+    """Parameter values with sizes and noise."""
 
     x: np.ndarray
     sizes: Sizes
 
 
 def _settled(problem: _Problem, begin: _State | None) -> _State:
-    """Parameters, sizes and noise that agree with each other."""
+    """Iterate parameters, sizes and noise until they are consistent."""
     kinds = _kinds(problem)
     if begin is None:
         start = np.array([_SAG_SIZE if k.startswith("sag") else _SIZE for k in kinds])
@@ -571,7 +567,7 @@ def _settled(problem: _Problem, begin: _State | None) -> _State:
 
 
 def _fit(problem: _Problem, state: _State) -> ParameterFit:
-    """The final fit with intervals, and what the data tell in the noise that there is."""
+    """Return the final fit with intervals and identifiability at the estimated noise."""
     sigma = problem.sigma(state.sizes.noise)
     fit = least_squares(
         problem.residual, state.x, problem.names, np.maximum(state.sizes.std, 1e-12), sigma=sigma,
@@ -586,7 +582,7 @@ def _fit(problem: _Problem, state: _State) -> ParameterFit:
 
 
 def _standing(name: str) -> int:
-    """Which parameters stand for combinations first: the ball, joint offsets, lengths, tilts."""
+    """Return a parameter's rank as representative: ball, joint offsets, lengths, then tilts."""
     kind, _, place = name.partition(".")
     if place == "tool":
         return 0
@@ -595,13 +591,13 @@ def _standing(name: str) -> int:
 
 
 def _expected(problem: _Problem, state: _State) -> np.ndarray:
-    """Sizes by which a parameter counts as told: the estimated one, or a tolerance if none is."""
+    """Return the scales that decide identifiability: estimated sizes with a lower bound."""
     sag = np.array([name.startswith("sag") for name in problem.names])
     return np.maximum(state.sizes.std, np.where(sag, 0.1 * _SAG_SIZE, 0.1 * _SIZE))
 
 
 def _kinds(problem: _Problem) -> list[str]:
-    """Kind of every parameter: errors of one kind are of one size. The ball has none."""
+    """Return the kind of every parameter, empty for the ball; each kind has one size."""
     kinds = []
     for name in problem.names:
         first, _, joint = name.partition(".")
@@ -622,7 +618,7 @@ def _axial(robot: Robot, joint: str) -> str:
 
 
 def _with_ball(problem: _Problem) -> np.ndarray:
-    """Start values with the ball where the nominal chain keeps it together best."""
+    """Return start values, with the ball position that minimises its scatter."""
     x = problem.start.copy()
     places = [problem.names.index(f"{c}.tool") for c in "xyz"]
     rates = forward_and_rates(problem.chain, problem.joints, problem.chain.nominal)
@@ -631,7 +627,7 @@ def _with_ball(problem: _Problem) -> np.ndarray:
     matrix = (ball - problem.means(ball)[problem.index]).reshape(-1, 3)
     weight = np.ones(len(matrix) // 3)
     step = np.zeros(3)
-    for _ in range(30):  # least absolute distances, which a few wrong rows do not move
+    for _ in range(30):  # least absolute distances, robust against outliers
         rows = np.repeat(weight, 3)
         step = np.linalg.lstsq(matrix * rows[:, None], -apart * rows, rcond=1e-6)[0]
         left = np.linalg.norm((apart + matrix @ step).reshape(-1, 3), axis=1)
@@ -641,7 +637,7 @@ def _with_ball(problem: _Problem) -> np.ndarray:
 
 
 def _nominal_spread(robot: Robot, sockets: Sequence[Socket]) -> float:
-    """Median over sockets of the median distance from the mean [m], with the ball fitted."""
+    """Return the median over sockets of the median distance from the mean [m], ball fitted."""
     problem = _Problem(robot, sockets, (), Options(distance=None))
     apart = np.linalg.norm(problem.apart(problem.balls(_with_ball(problem))), axis=1)
     return float(np.median([np.median(apart[problem.index == k]) for k in range(len(sockets))]))
@@ -653,14 +649,14 @@ def _degrees_hint(robots: dict[str, Robot], sockets: Sequence[Socket]) -> str:
         spread = _nominal_spread(robot, radians)
         if spread < _WRONG_ROBOT:
             return (
-                f"; read as degrees, {name} spreads it by {1e3 * spread:.1f} mm:"
+                f"; read as degrees, the ball of {name} scatters by {1e3 * spread:.1f} mm:"
                 " convert the angles to radians or give --unit deg"
             )
     return ""
 
 
 def _chosen(problem: _Problem, state: _State) -> tuple[str, dict[str, float]]:
-    """The model of the joints that predicts best what it was not fitted to, and all errors."""
+    """Select the joint model with the smallest cross-validated error; also return all errors."""
     wanted = problem.options.model
     if wanted is not None and wanted not in MODELS:
         raise InputError(f"--model {wanted}", f"is not known: {', '.join(MODELS)}")
@@ -688,14 +684,14 @@ def _chosen(problem: _Problem, state: _State) -> tuple[str, dict[str, float]]:
 
 
 def _extended(problem: _Problem, state: _State) -> _State:
-    """A state of the rigid model for one with corrections of the joints."""
+    """Extend a state of the rigid model to a problem with joint corrections."""
     more = [_SAG_SIZE if name.startswith("sag") else _SIZE for name in problem.extra]
     sizes = Sizes(np.append(state.sizes.std, more), state.sizes.noise, state.sizes.effective, 0)
     return _State(np.append(state.x, np.zeros(len(more))), sizes)
 
 
 def _limit(noise: float, rows: int) -> float:
-    """Distance [m] beyond which no row of normal noise lies, but for once in a thousand sets."""
+    """Return the distance [m] that any row exceeds in one of a thousand data sets."""
     return noise * float(np.sqrt(scipy.stats.chi2.isf(_FALSE_ALARM / rows, 3)))
 
 
@@ -707,7 +703,7 @@ def _outlying(
 
 
 def _apart_rows(problem: _Problem, balls: np.ndarray, noise: float) -> list[Outlier]:
-    """Rows beyond the limit from the mean of their socket's other rows within it."""
+    """Return rows that are beyond the limit from the mean of the other rows of their socket."""
     found = []
     limit = _limit(noise, len(balls))
     for k, socket in enumerate(problem.sockets):
@@ -724,7 +720,7 @@ def _apart_rows(problem: _Problem, balls: np.ndarray, noise: float) -> list[Outl
 
 
 def _without_gross(problem: _Problem) -> tuple[tuple[Socket, ...], set[tuple[str, int]]]:
-    """Sockets without rows that are far away already with the nominal robot."""
+    """Remove rows that are outliers already with the nominal robot."""
     balls = problem.balls(_with_ball(problem))
     away = np.empty(len(balls))
     for k in range(len(problem.sockets)):
@@ -777,7 +773,7 @@ def _judged(problem: _Problem, balls: np.ndarray) -> Judged:
 
 
 def _pairs(sockets: Sequence[Socket]) -> list[tuple[int, int]]:
-    """Neighbouring sockets of one tool."""
+    """Return index pairs of neighbouring sockets of one tool."""
     return [
         (k, k + 1) for k in range(len(sockets) - 1)
         if sockets[k].place == sockets[k + 1].place and sockets[k + 1].hole == sockets[k].hole + 1
@@ -790,6 +786,6 @@ def _check_count(problem: _Problem) -> None:
         raise InputError(
             problem.sockets[0].path.parent,
             f"{len(problem.joints)} rows in {len(problem.sockets)} sockets give"
-            f" {problem.freedom} equations, the robot's geometry has {needed} parameters and more:"
-            " record 20 postures or more per socket",
+            f" {problem.freedom} equations, but the robot's geometry has at least {needed}"
+            " parameters: record 20 postures or more per socket",
         )

@@ -1,9 +1,9 @@
 """Number of kinematic parameters of serial and parallel mechanisms: formulas and numerical rank.
 
-The formulas count what a calibration can identify when the pose of one body is measured. The
-numerical rank is independent of them: every link of a mechanism with arbitrary dimensions gets an
-error in all six directions, and the rank of the identification Jacobian is what a calibration can
-identify.
+The formulas count the parameters that a calibration can identify if the pose of one body is
+measured. The numerical rank is an independent check: every link of a mechanism with arbitrary
+dimensions gets an error in all six directions, and the rank of the identification Jacobian is the
+number of identifiable parameters.
 
 Source: Wang 2012, Eqs 4 and 5 (pages 23 and 24), after Mooring, Roth and Driels 1991 and Vischer
 1996; P. Vischer and R. Clavel, Kinematic calibration of the parallel Delta robot, Robotica 16
@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 JointKind = Literal["revolute", "prismatic", "spherical"]
 MAX_CLOSURE_ERROR = 1e-12  # m and rad: rounding of a product of seven transforms of order 1
-MIN_SINGULAR_VALUE = 1e-7  # of the largest: far above rounding, far below the smallest of full rank
+MIN_SINGULAR_VALUE = 1e-7  # relative to the largest: far above rounding, far below full rank's
 _SUBSPACES = {
     "revolute": np.eye(6)[:, 2:3], "prismatic": np.eye(6)[:, 5:6], "spherical": np.eye(6)[:, :3]
 }  # fmt: skip
@@ -78,8 +78,8 @@ class Joint(NamedTuple):
     """A joint of a chain.
 
     Attributes:
-        name: joints with the same name in several chains are one joint.
-        kind: of the joint.
+        name: name of the joint; joints with the same name in several chains are one joint.
+        kind: kind of the joint.
         measured: whether it has an encoder.
     """
 
@@ -89,7 +89,7 @@ class Joint(NamedTuple):
 
 
 class Chain(NamedTuple):
-    """Links and joints in turn, from the fixed frame to the frame of the measured body.
+    """Alternating links and joints, from the fixed frame to the frame of the measured body.
 
     Attributes:
         links: n + 1 names; links with the same name in several chains are one link.
@@ -105,8 +105,8 @@ class Mechanism:
     """A mechanism whose chains all end at the measured body.
 
     Attributes:
-        name: such as `6-UPS`.
-        chains: at least one.
+        name: name of the mechanism, such as `6-UPS`.
+        chains: at least one chain.
         straight: names of links that place the next joint on the z axis of the joint before, with
             parallel axes; all others have arbitrary dimensions.
     """
@@ -145,9 +145,9 @@ def hexapod_mechanism(
     """Build a hexapod of six equal legs whose prismatic joints are measured.
 
     Args:
-        name: of the mechanism.
+        name: name of the mechanism.
         kinds: joints of a leg, from the base to the platform.
-        straight: numbers of a leg's links that are straight.
+        straight: indices of a leg's links that are straight.
 
     Returns:
         The mechanism.
@@ -178,18 +178,18 @@ def identifiable_rank(
     mechanism: Mechanism, rng: np.random.Generator, poses: int = 60, motion: float = 0.4,
     unmoved: frozenset[str] = frozenset(),
 ) -> int:  # fmt: skip
-    """Return the number of parameters that measured poses and encoders identify.
+    """Return the number of parameters identifiable from measured poses and encoders.
 
     At each pose the errors of links x and of passive joints y satisfy P x + Q y = e, six equations
-    per chain, where e are errors of the measured pose. The columns of y are eliminated; the rank of
-    what remains of P, stacked over the poses, is the number of identifiable parameters.
+    per chain, where e are errors of the measured pose. The columns of y are eliminated. The rank of
+    the remaining P, stacked over the poses, is the number of identifiable parameters.
 
     Args:
-        mechanism: whose links have dimensions of about 1 m.
-        rng: of dimensions and poses.
+        mechanism: mechanism; its links get dimensions of about 1 m.
+        rng: random generator of dimensions and poses.
         poses: number of poses.
-        motion: largest random motion of a joint [m] or [rad], before the loops are closed.
-        unmoved: names of joints that stay where they are, a poor choice of poses.
+        motion: maximum random motion of a joint [m] or [rad], before the loops are closed.
+        unmoved: names of joints that do not move, to test a poor choice of poses.
 
     Returns:
         The rank.
@@ -211,7 +211,7 @@ def identifiable_rank(
 def _arbitrary_geometry(
     mechanism: Mechanism, rng: np.random.Generator
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Links (4, 4) and joint positions (4, 4) by name for which all loops are closed."""
+    """Return links (4, 4) and joint positions (4, 4) by name for which all loops are closed."""
     links, state = {}, {}
     for name, joint in mechanism.joints.items():
         state[name] = _exponential(_SUBSPACES[joint.kind] @ _random(rng, joint.kind, 1.0))
@@ -241,7 +241,7 @@ def _move_joints(mechanism, state, rng, motion, unmoved) -> dict[str, np.ndarray
 
 
 def _close_loops(mechanism, links, state, unmoved) -> dict[str, np.ndarray]:
-    """Close the loops by Gauss-Newton steps of all joints that may move."""
+    """Close the loops by Gauss-Newton steps of all movable joints."""
     free = [name for name in mechanism.joints if name not in unmoved]
     first = mechanism.chains[0]
     for _ in range(60):
@@ -274,7 +274,7 @@ def _end_jacobians(
     mechanism: Mechanism, links: Mapping, state: Mapping, link_names: list[str],
     joint_names: list[str],
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Twists of the chains' ends in the fixed frame, six rows per chain, by links and by joints."""
+    """Return the Jacobians of the chain ends' twists, six rows per chain, by links and joints."""
     joints = mechanism.joints
     sizes = [_SUBSPACES[joints[name].kind].shape[1] for name in joint_names]
     start = dict(zip(joint_names, np.cumsum(sizes) - sizes, strict=True))
@@ -298,13 +298,13 @@ def _end_jacobians(
 
 
 def _pose_error(pose: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    """Twist in the fixed frame that moves `goal` to `pose`, to first order."""
+    """Return the twist in the fixed frame that moves `goal` to `pose`, to first order."""
     away = pose @ np.linalg.inv(goal)
     return np.r_[Rotation.from_matrix(away[:3, :3]).as_rotvec(), away[:3, 3]]
 
 
 def _adjoint(pose: np.ndarray) -> np.ndarray:
-    """(6, 6) twists (rotation, translation) in the fixed frame by twists in a body's frame."""
+    """Return the (6, 6) transform of twists (rotation, translation) from body to fixed frame."""
     x, y, z = pose[:3, 3]
     result = np.zeros((6, 6))
     result[:3, :3] = result[3:, 3:] = pose[:3, :3]
@@ -313,7 +313,7 @@ def _adjoint(pose: np.ndarray) -> np.ndarray:
 
 
 def _exponential(twist: np.ndarray) -> np.ndarray:
-    """(4, 4) rotation by the first three elements and translation by the last three."""
+    """Return a pose (4, 4): rotation by the first three elements, translation by the last three."""
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_rotvec(twist[:3]).as_matrix()
     pose[:3, 3] = twist[3:]

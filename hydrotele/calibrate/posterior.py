@@ -1,8 +1,8 @@
-"""Search by differential evolution, and posteriors by MCMC with differential-evolution moves.
+"""Differential evolution, and MCMC sampling with differential-evolution moves.
 
 Both take a function of many parameter sets at once. The sampler is emcee's ensemble with DEMove and
-DESnookerMove; what it drew is judged by autocorrelation time, split R-hat and effective sample
-size before anything is concluded from it.
+DESnookerMove. Its convergence is assessed by autocorrelation time, split R-hat and effective sample
+size.
 
 Source: Storn and Price 1997; ter Braak 2006, ter Braak and Vrugt 2008 (moves); Foreman-Mackey et
 al. 2013 (emcee); Gelman et al., Bayesian Data Analysis, 3rd ed., 11.4 (split R-hat); Sokal 1997.
@@ -17,22 +17,22 @@ from scipy.optimize import differential_evolution
 from hydrotele.core.errors import InputError
 
 Cost = Callable[[np.ndarray], np.ndarray]  # (S, p) -> (S,)
-_RHAT = 1.05  # above it chains have not mixed
-_LENGTHS = 50.0  # autocorrelation times that a chain must have, as emcee asks
-_JUMP = 0.1  # share of DE moves with the full difference, which leap between modes
+_RHAT = 1.05  # maximum split R-hat of mixed chains
+_LENGTHS = 50.0  # minimum chain length in autocorrelation times, as recommended by emcee
+_JUMP = 0.1  # fraction of DE moves with the full difference, which jump between modes
 
 
 @dataclass(frozen=True)
 class Evolution:
-    """What a search by differential evolution found.
+    """Result of a search by differential evolution.
 
     Attributes:
         values: (p,) best parameters.
-        cost: its cost.
-        generations: made.
-        evaluations: number of parameter sets whose cost was computed.
-        converged: whether the population agreed before `generations` ran out.
-        history: (generations,) best cost of each.
+        cost: cost of the best parameters.
+        generations: number of generations.
+        evaluations: number of evaluated parameter sets.
+        converged: whether the population converged before the maximum number of generations.
+        history: (generations,) best cost of each generation.
     """
 
     values: np.ndarray
@@ -47,25 +47,25 @@ def evolve(
     cost: Cost, low: np.ndarray, high: np.ndarray, *, seed: int = 0, population: int = 6,
     generations: int = 20000, agreement: float = 1e-5,
 ) -> Evolution:  # fmt: skip
-    """Minimise by differential evolution; no gradient, no start.
+    """Minimise a function by differential evolution, without gradient or start values.
 
-    `randtobest1bin` with crossover 0.95 and a mutation that varies: errors of a calibration are
-    strongly correlated, so that most coordinates must change together, and a population that only
-    follows its best member agrees too early. The search ends when the costs of the population
+    The strategy is `randtobest1bin` with crossover 0.95 and a varying mutation. Calibration errors
+    are strongly correlated, so most coordinates must change together, and a population that only
+    follows its best member converges prematurely. The search ends when the costs of the population
     differ by less than `agreement`.
 
     Args:
-        cost: of (S, p) parameter sets, such as half the sum of squared weighted residuals.
-        low: (p,) bounds.
-        high: (p,) bounds.
-        seed: of the random numbers.
-        population: members per parameter.
-        generations: at most.
-        agreement: spread of costs in the population that ends the search; with a cost in units of
-            log likelihood the best is then within some 1e-2 of the minimum.
+        cost: function of (S, p) parameter sets, such as half the weighted sum of squares.
+        low: (p,) lower bounds.
+        high: (p,) upper bounds.
+        seed: seed of the random generator.
+        population: population size per parameter.
+        generations: maximum number of generations.
+        agreement: range of the population's costs at which the search ends. If the cost is minus a
+            log likelihood, the best cost is then within about 1e-2 of the minimum.
 
     Returns:
-        What was found, without a gradient search at the end.
+        The best parameters, without a final gradient search.
 
     >>> found = evolve(lambda x: np.sum((x - 1.0) ** 2, axis=1), np.zeros(3) - 5, np.zeros(3) + 5)
     >>> bool(np.abs(found.values - 1.0).max() < 0.02), found.converged
@@ -76,7 +76,7 @@ def evolve(
     evaluations = 0
 
     def batch(x: np.ndarray) -> np.ndarray:
-        nonlocal evaluations  # SciPy counts a whole population as one
+        nonlocal evaluations  # SciPy counts a whole population as one evaluation
         evaluations += x.shape[1] if x.ndim == 2 else 1
         found = cost(np.ascontiguousarray(x.T) if x.ndim == 2 else x[None])
         return found if x.ndim == 2 else found[0]
@@ -97,20 +97,20 @@ def evolve(
 
 @dataclass(frozen=True)
 class Posterior:
-    """A sample of a posterior, with what tells whether it has converged.
+    """Posterior sample with convergence diagnostics.
 
     Attributes:
         names: the p parameters.
-        sample: (draws, walkers, p) after the burn-in, every `thin`-th.
-        log_probability: (draws, walkers).
-        acceptance: mean share of accepted moves.
+        sample: (draws, walkers, p) every `thin`-th step after the burn-in.
+        log_probability: (draws, walkers) log probability of the sample.
+        acceptance: mean fraction of accepted moves.
         autocorrelation: (p,) integrated autocorrelation times [steps of the chain].
         rhat: (p,) split R-hat over walkers.
         effective: (p,) effective sample sizes.
-        steps: made after the burn-in.
-        evaluations: of the log probability.
+        steps: number of steps after the burn-in.
+        evaluations: number of evaluations of the log probability.
         converged: whether all R-hat are below 1.05 and the chain has 50 autocorrelation times.
-        status: this in words.
+        status: the convergence diagnostics as text.
     """
 
     names: tuple[str, ...]
@@ -127,7 +127,7 @@ class Posterior:
 
     @property
     def flat(self) -> np.ndarray:
-        """(draws times walkers, p)."""
+        """(draws times walkers, p) sample without the chain structure."""
         return self.sample.reshape(-1, self.sample.shape[-1])
 
     @property
@@ -156,19 +156,19 @@ def sample_posterior(
     steps: int = 6000, burn: int | None = None, walkers: int | None = None, seed: int = 0,
     thin: int = 10,
 ) -> Posterior:  # fmt: skip
-    """Draw from a posterior with emcee's DEMove (80 %) and DESnookerMove (20 %).
+    """Sample a posterior with emcee's DEMove (80 %) and DESnookerMove (20 %).
 
     Args:
-        log_probability: of (S, p) parameter sets; -inf outside the prior.
-        start: (p,) where the walkers begin, or (walkers, p).
-        spread: (p,) or (p, p) standard deviations or covariance of the walkers' begin.
+        log_probability: function of (S, p) parameter sets; -inf outside the prior.
+        start: (p,) mean of the walkers' start, or (walkers, p) start of each walker.
+        spread: (p,) standard deviations or (p, p) covariance of the walkers' start.
         names: the p parameters.
-        steps: of every walker after the burn-in.
-        burn: steps that are thrown away; by default half of `steps`.
-        walkers: number of chains; by default 4 p: each half moves along differences of
-            the other, which must span all directions.
-        seed: of the random numbers.
-        thin: of the steps that are kept.
+        steps: steps of every walker after the burn-in.
+        burn: number of burn-in steps; by default half of `steps`.
+        walkers: number of chains; by default 4 p, because each half moves along differences of
+            the other half, which must span all directions.
+        seed: seed of the random generator.
+        thin: every `thin`-th step is kept.
 
     Returns:
         The sample with its diagnostics.
@@ -189,7 +189,7 @@ def sample_posterior(
     else:
         begin = start + np.asarray(spread) * rng.normal(size=(count, p))
     if not np.isfinite(log_probability(begin)).all():
-        raise InputError("posterior", "the start lies outside the prior: begin nearer to it")
+        raise InputError("posterior", "the start is outside the prior: start closer to it")
     full = emcee.moves.DEMove(gamma0=1.0)
     usual = emcee.moves.DEMove(gamma0=2.38 / np.sqrt(2.0 * p))
     moves = [(usual, 0.8 - _JUMP), (full, _JUMP), (emcee.moves.DESnookerMove(), 0.2)]
@@ -211,18 +211,18 @@ def judged(
     names: Sequence[str], chain: np.ndarray, log_probability: np.ndarray, acceptance: float,
     evaluations: int, thin: int = 1,
 ) -> Posterior:  # fmt: skip
-    """A chain with its diagnostics.
+    """Compute the convergence diagnostics of a chain.
 
     Args:
         names: the p parameters.
-        chain: (draws, walkers, p) after the burn-in, every `thin`-th step.
-        log_probability: (draws, walkers).
-        acceptance: share of accepted moves.
-        evaluations: of the log probability.
+        chain: (draws, walkers, p) every `thin`-th step after the burn-in.
+        log_probability: (draws, walkers) log probability of the chain.
+        acceptance: fraction of accepted moves.
+        evaluations: number of evaluations of the log probability.
         thin: steps between draws.
 
     Returns:
-        The sample.
+        The sample with its diagnostics.
     """
     tau, rhat = autocorrelation_time(chain), split_rhat(chain)
     effective = chain.shape[0] * chain.shape[1] / tau
@@ -241,16 +241,16 @@ def judged(
 
 
 def split_rhat(chain: np.ndarray) -> np.ndarray:
-    """Split R-hat: whether the halves of all chains tell the same.
+    """Compute split R-hat, a convergence measure that compares the halves of all chains.
 
     With within-chain variance W and between-chain variance B of the 2 m half chains of length n:
     R = sqrt(((n - 1) / n W + B / n) / W).
 
     Args:
-        chain: (steps, walkers, p).
+        chain: (steps, walkers, p) the chains.
 
     Returns:
-        (p,) 1 where they do; above 1.05 they have not mixed.
+        (p,) R-hat, 1 for equal halves; above 1.05 the chains have not mixed.
 
     Source: Gelman et al., Bayesian Data Analysis, 3rd ed., 11.4.
 
@@ -266,13 +266,13 @@ def split_rhat(chain: np.ndarray) -> np.ndarray:
 
 
 def autocorrelation_time(chain: np.ndarray) -> np.ndarray:
-    """Integrated autocorrelation time of an ensemble, with Sokal's automatic window.
+    """Compute the integrated autocorrelation time of an ensemble with Sokal's automatic window.
 
     Args:
-        chain: (steps, walkers, p).
+        chain: (steps, walkers, p) the chains.
 
     Returns:
-        (p,) [steps], at least 1.
+        (p,) autocorrelation times [steps], at least 1.
     """
     import emcee
 

@@ -1,8 +1,8 @@
-"""Link lengths and joint offsets of a planar two-joint arm from measured positions of its end.
+"""Calibration of a planar two-joint arm (SCARA) from measured positions of its end.
 
-The example by which Wang explains calibration: error model, measurement, least squares, corrected
-model. Equation 2 has the two length errors; joint offsets are added where they predict positions
-better that they were not fitted to.
+This is Wang's introductory example: error model, measurement, least squares, corrected model. The
+error model of Eq. 2 has two length errors; joint offsets are added if they improve the prediction
+of left-out positions.
 
 Source: Wang 2012, section 1.1, Eqs 1-3.
 """
@@ -22,7 +22,7 @@ from hydrotele.kinematics.serial_chain import Element, SerialChain, forward, for
 
 MEASURED, NOMINAL = "measured.csv", "nominal.yaml"
 COLUMNS = ("theta", "phi", "u", "v")
-_SCALES = {"length": 1e-3, "offset": 1e-3}  # m and rad: usual tolerances
+_SCALES = {"length": 1e-3, "offset": 1e-3}  # m and rad: typical tolerances
 _TURN = 2.0 * np.pi + 0.2  # rad
 
 
@@ -39,7 +39,7 @@ class Positions:
 
     Attributes:
         joints: (n, 2) theta of the first and phi of the second joint [rad].
-        ends: (n, 2) measured u, v [m].
+        ends: (n, 2) measured end positions u, v [m].
     """
 
     joints: np.ndarray
@@ -48,14 +48,14 @@ class Positions:
 
 @dataclass(frozen=True)
 class ScaraCalibration:
-    """A calibrated arm.
+    """Result of the calibration of an arm.
 
     Attributes:
-        fit: of length errors and, with them, joint offsets.
+        fit: fit of the lengths and, if `offsets`, the joint offsets.
         offsets: whether joint offsets were fitted.
-        rivals: model -> RMS distance [m] of poses predicted without having been fitted.
-        nominal_rms: of the nominal arm [m].
-        heldout_rms: of the poses of `heldout`, or of every pose left out in turn [m].
+        rivals: RMS distance [m] of poses predicted by fits without them, by model.
+        nominal_rms: RMS distance of the nominal arm [m].
+        heldout_rms: RMS distance of the validation poses, or of each pose left out in turn [m].
     """
 
     fit: ParameterFit
@@ -66,7 +66,7 @@ class ScaraCalibration:
 
 
 def scara_chain(nominal: ScaraFacts) -> SerialChain:
-    """The arm of Eq. 2 with the offsets of both joints."""
+    """Return the arm of Eq. 2 with offsets of both joints."""
     return SerialChain(
         ("theta", "phi"),
         (
@@ -82,13 +82,14 @@ def load_scara(folder: Path) -> tuple[ScaraFacts, Positions]:
     """Read nominal lengths and measured poses.
 
     Args:
-        folder: with `nominal.yaml` and `measured.csv` (theta, phi [rad], u, v [m], with a head).
+        folder: folder with `nominal.yaml` and `measured.csv` (theta, phi [rad], u, v [m], with a
+            header line).
 
     Returns:
         The lengths and the poses.
 
     Raises:
-        InputError: names file, row and column of what is not usable.
+        InputError: a file is invalid; the message names file, row and column.
     """
     data, lines = read_yaml(folder / NOMINAL)
     nominal = parse(ScaraFacts, data, str(folder / NOMINAL), lines)
@@ -107,14 +108,14 @@ def load_scara(folder: Path) -> tuple[ScaraFacts, Positions]:
                 good = False
             if not good:
                 raise InputError(
-                    f"{path}: row {number}, column {name}", f"{word!r} is no finite number"
+                    f"{path}: row {number}, column {name}", f"{word!r} is not a finite number"
                 )
         values.append([float(word) for word in words])
     if len(values) < 4:
-        raise InputError(path, f"has {len(values)} poses; measure 4 different ones at least")
+        raise InputError(path, f"has {len(values)} poses; measure at least 4 different ones")
     table = np.array(values)
     if np.abs(table[:, :2]).max() > _TURN:
-        raise InputError(path, "angles beyond a turn: they must be in rad, positions in m")
+        raise InputError(path, "angles exceed one turn: they must be in rad, positions in m")
     reach = 1.5 * (nominal.length_a + nominal.length_b)
     if np.abs(table[:, 2:]).max() > reach:
         raise InputError(path, f"positions beyond the arm's reach of {reach / 1.5:g} m: in mm?")
@@ -124,18 +125,19 @@ def load_scara(folder: Path) -> tuple[ScaraFacts, Positions]:
 def calibrate_scara(
     nominal: ScaraFacts, measured: Positions, heldout: Sequence[int] = ()
 ) -> ScaraCalibration:
-    """Fit the arm by least squares on the squared distances of Eq. 3.
+    """Fit the arm by least squares on the distances of Eq. 3.
 
     Args:
-        nominal: lengths.
-        measured: poses.
-        heldout: places of poses to judge on, not fitted; none to leave every pose out in turn.
+        nominal: nominal lengths.
+        measured: measured poses.
+        heldout: indices of validation poses, which are not fitted; if empty, every pose is left out
+            in turn.
 
     Returns:
         The calibration.
 
     Raises:
-        InputError: the poses tell nothing.
+        InputError: no parameter is identifiable, or there are too few poses.
     """
     chain = scara_chain(nominal)
     everything = range(len(measured.joints))
@@ -168,16 +170,16 @@ def fit_scara(
     """Fit lengths, or lengths and offsets, to some poses.
 
     Args:
-        chain: of the nominal arm.
-        measured: poses.
-        poses: places of those to fit.
-        offsets: whether joint offsets are fitted, too.
+        chain: chain of the nominal arm.
+        measured: measured poses.
+        poses: indices of the poses to fit.
+        offsets: whether joint offsets are also fitted.
 
     Returns:
         The fit.
 
     Raises:
-        InputError: the poses tell nothing, or there are too few.
+        InputError: no parameter is identifiable, or there are too few poses.
     """
     names = [n for n in chain.parameters if offsets or n.startswith("length")]
     places = [chain.parameters.index(name) for name in names]
@@ -197,15 +199,15 @@ def fit_scara(
 
 
 def best_poses(nominal: ScaraFacts, measured: Positions, count: int) -> Selection:
-    """The poses whose measurements tell lengths and offsets best (D-optimal).
+    """Select the poses that are most informative about lengths and offsets (D-optimal).
 
     Args:
-        nominal: lengths.
-        measured: candidates.
-        count: how many to choose.
+        nominal: nominal lengths.
+        measured: candidate poses.
+        count: number of poses to select.
 
     Returns:
-        Their places.
+        The selection.
     """
     chain = scara_chain(nominal)
     rates = forward_and_rates(chain, measured.joints).position_by_parameter[:, :2]
@@ -215,14 +217,14 @@ def best_poses(nominal: ScaraFacts, measured: Positions, count: int) -> Selectio
 def simulated_scara(
     nominal: ScaraFacts, errors: Sequence[float], poses: int, noise: float, seed: int
 ) -> Positions:
-    """Measured poses of an arm with errors.
+    """Simulate measured poses of an arm with errors.
 
     Args:
-        nominal: lengths.
-        errors: (4,) of theta's offset [rad], a [m], phi's offset [rad], b [m].
-        poses: number of them.
+        nominal: nominal lengths.
+        errors: (4,) errors of theta's offset [rad], a [m], phi's offset [rad], b [m].
+        poses: number of poses.
         noise: standard deviation of u and v [m].
-        seed: of poses and noise.
+        seed: seed of poses and noise.
 
     Returns:
         The poses.

@@ -1,10 +1,9 @@
-"""Joint angles recorded while the ball at a robot's end sat in sockets: folders of CSV files.
+"""Joint angles of a robot with its ball in sockets: files and simulated measurements.
 
-`PLACE/hole_0.csv`, `PLACE/hole_1.csv`, ...: one folder per place of the tool that holds the
-sockets, one file per socket, one row per posture, one column per joint, without or with a head
-line. Files of the folder itself are one place.
-
-Simulated calibration measurements of serial robots: robots with errors, balls in sockets.
+A measurement is a folder with `PLACE/hole_0.csv`, `PLACE/hole_1.csv`, ...: one folder per place of
+the tool that holds the sockets, one file per socket, one row per posture, one column per joint,
+with or without a header line. Files in the folder itself are one place. Simulated measurements use
+robots with random geometric errors.
 """
 
 import math
@@ -27,8 +26,8 @@ from hydrotele.kinematics.serial_robot import (
 
 _FILE = re.compile(r"hole_?(\d+)\.(csv|txt)", re.IGNORECASE)
 _SEPARATOR = re.compile(r"[,;\t ]\s*|\s+")
-_SAME = 1e-6  # rad or m: a posture that is recorded twice
-_FEWEST = 3  # postures that have a mean and a spread
+_SAME = 1e-6  # rad or m: postures that differ by less count as repeated
+_FEWEST = 3  # postures, minimum for a mean and a scatter
 
 
 @dataclass(frozen=True)
@@ -38,9 +37,9 @@ class Socket:
     Attributes:
         place: name of the tool's place.
         hole: number of the socket.
-        path: of the file.
+        path: path of the file.
         joints: (n, k) joint angles [rad], or positions [m].
-        lines: (n,) where the rows stand in the file, from 1.
+        lines: (n,) line numbers of the rows in the file, from 1.
     """
 
     place: str
@@ -51,7 +50,7 @@ class Socket:
 
     @property
     def name(self) -> str:
-        """`PLACE/hole_0`."""
+        """Name of the socket, `PLACE/hole_0`."""
         return f"{self.place}/hole_{self.hole}"
 
 
@@ -59,23 +58,23 @@ def load_sockets(folder: str | Path, degrees: bool = False) -> tuple[tuple[Socke
     """Read all sockets of a folder.
 
     Args:
-        folder: with places or files.
+        folder: folder with places or files.
         degrees: whether the angles are in degrees; they are converted.
 
     Returns:
-        The sockets, by place and number, and notes on what was left out.
+        The sockets by place and number, and notes on rows that were left out.
 
     Raises:
-        InputError: names file, row and column of what is not usable.
+        InputError: a file is invalid; the message names file, row and column.
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise InputError(folder, "is no folder")
+        raise InputError(folder, "is not a folder")
     paths = sorted(p for p in (*folder.glob("*"), *folder.glob("*/*")) if _FILE.fullmatch(p.name))
     if not paths:
         inside = ", ".join(sorted(p.name for p in folder.iterdir())[:6]) or "nothing"
         raise InputError(
-            folder, f"holds no PLACE/hole_0.csv, PLACE/hole_1.csv, ... (it holds {inside})"
+            folder, f"contains no PLACE/hole_0.csv, PLACE/hole_1.csv, ... (it contains {inside})"
         )
     sockets, notes = [], []
     for path in paths:
@@ -91,24 +90,24 @@ def load_sockets(folder: str | Path, degrees: bool = False) -> tuple[tuple[Socke
     for path, count in columns.items():
         if count != usual:
             raise InputError(
-                path, f"has {count} columns, the other files have {usual}: one per joint"
+                path, f"has {count} columns, but the other files have {usual}: one per joint"
             )
     return tuple(sockets), notes
 
 
 def places_of(sockets: Sequence[Socket]) -> tuple[str, ...]:
-    """Names of the places, in order."""
+    """Return the names of the places, in order."""
     return tuple(dict.fromkeys(socket.place for socket in sockets))
 
 
 def idle_joints(sockets: Sequence[Socket]) -> list[int]:
-    """Columns that have one value in all files: joints that never move."""
+    """Return the columns with one value in all files: joints that never move."""
     joints = np.vstack([socket.joints for socket in sockets])
     return [int(k) for k in np.flatnonzero(np.ptp(joints, axis=0) < _SAME)]
 
 
 def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """(n, k) numbers and the (n,) lines on which they stand."""
+    """Return the numbers (n, k) of a file and their line numbers (n,)."""
     rows, lines = [], []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         line = line.strip().lstrip("\ufeff")
@@ -117,21 +116,23 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
         words = _SEPARATOR.split(line)
         values = [_number(word) for word in words]
         if not rows and all(value is None for value in values):
-            continue  # names of the columns
+            continue  # header line
         for column, (word, value) in enumerate(zip(words, values, strict=True), start=1):
             if value is None or not math.isfinite(value):
                 raise InputError(
-                    f"{path}: row {number}, column {column}", f"{word!r} is no finite number"
+                    f"{path}: row {number}, column {column}", f"{word!r} is not a finite number"
                 )
         if rows and len(values) != len(rows[0]):
             raise InputError(
-                f"{path}: row {number}", f"has {len(values)} columns, rows before {len(rows[0])}"
+                f"{path}: row {number}",
+                f"has {len(values)} columns, but the rows before have {len(rows[0])}",
             )
         rows.append(values)
         lines.append(number)
     if len(rows) < _FEWEST:
         raise InputError(
-            path, f"has {len(rows)} rows; record {_FEWEST} different postures at least, better 20"
+            path,
+            f"has {len(rows)} rows; record at least {_FEWEST} different postures, preferably 20",
         )
     return np.array(rows, float), np.array(lines)
 
@@ -144,7 +145,7 @@ def _number(word: str) -> float | None:
 
 
 def _distinct(socket: Socket, notes: list[str]) -> Socket:
-    """A socket without postures that are there already."""
+    """Return a socket without repeated postures."""
     kept: list[int] = []
     for row in range(len(socket.joints)):
         away = np.abs(socket.joints[kept] - socket.joints[row]).max(axis=1)
@@ -153,8 +154,8 @@ def _distinct(socket: Socket, notes: list[str]) -> Socket:
     if len(kept) < _FEWEST:
         raise InputError(
             socket.path,
-            f"repeats one posture: {len(socket.joints)} rows hold {len(kept)} different ones;"
-            f" record {_FEWEST} at least, better 20",
+            f"repeats one posture: {len(socket.joints)} rows contain {len(kept)} different ones;"
+            f" record at least {_FEWEST}, preferably 20",
         )
     if len(kept) < len(socket.joints):
         gone = sorted(set(range(len(socket.joints))) - set(kept))
@@ -171,15 +172,15 @@ _IDLE = 0.3  # rad
 
 @dataclass(frozen=True)
 class Errors:
-    """Standard deviations of a robot's errors, and of what its measurement adds.
+    """Standard deviations of a robot's geometric errors and of its measurement.
 
     Attributes:
         length: displacements of joint frames [m].
         tilt: rotations of joint frames across the joint's axis [rad].
         offset: joint offsets [rad].
-        ball: the ball in the last link [m].
+        ball: position of the ball in the last link [m].
         encoder: noise of a joint's reading [rad] or [m].
-        play: of the ball in its socket, each coordinate [m].
+        play: play of the ball in its socket, each coordinate [m].
     """
 
     length: float = 3.0e-4
@@ -194,13 +195,13 @@ def robot_with_errors(
     robot: Robot, errors: Errors, rng: np.random.Generator,
     corrections: Mapping[str, float] | None = None,
 ) -> tuple[Robot, dict[str, float]]:  # fmt: skip
-    """A robot as it might come from the factory.
+    """Return a robot with random geometric errors.
 
     Args:
-        robot: nominal.
-        errors: their sizes.
-        rng: random numbers.
-        corrections: deviations of its joints, as from `deflection_names`.
+        robot: nominal robot.
+        errors: standard deviations of the errors.
+        rng: random generator.
+        corrections: joint corrections, with names as from `deflection_names`.
 
     Returns:
         The robot and its true parameters, named as those of `robot_chain`.
@@ -221,18 +222,18 @@ def simulated_sockets(
     rng: np.random.Generator, distance: float = 0.050, limit: float = 2.8,
     idle: int | None = None,
 ) -> tuple[Socket, ...]:  # fmt: skip
-    """Postures of a robot with its ball in two sockets at every place.
+    """Simulate postures of a robot with its ball in two sockets at every place.
 
     Args:
-        robot: true, with errors.
-        places: name -> (3,) place of the first socket in the base frame [m]; the second one lies
-            beside it in y.
+        robot: true robot, with errors.
+        places: (3,) position of the first socket in the base frame [m] by place; the second socket
+            is displaced in y.
         rows: postures per socket.
         errors: noise of the encoders and play of the ball.
-        rng: random numbers.
-        distance: of the two sockets [m].
-        limit: of the joints' angles to either side [rad].
-        idle: column of a joint that stays at 0.3 rad; None for none.
+        rng: random generator.
+        distance: distance of the two sockets [m].
+        limit: maximum absolute joint angle [rad].
+        idle: column of a joint that stays at 0.3 rad, or None.
 
     Returns:
         The sockets.
@@ -265,7 +266,7 @@ def _postures(
     robot: Robot, middle: np.ndarray, rows: int, errors: Errors, rng: np.random.Generator,
     limit: float, place: str, idle: int | None,
 ) -> np.ndarray:  # fmt: skip
-    """(rows, k) encoder readings that bring the ball into a socket."""
+    """Return encoder readings (rows, k) of postures that put the ball into a socket."""
     found: list[np.ndarray] = []
     for _ in range(_TRIES):
         start = rng.uniform(-limit, limit, (4 * rows, len(robot.joints)))

@@ -1,1 +1,1 @@
-"""Closed forms used on both sides of the wall: arm kinematics and cylinder linkages."""
+"""Kinematics of arms, cylinder linkages, serial robots and serial-parallel robots."""

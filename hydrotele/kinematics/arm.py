@@ -1,14 +1,14 @@
-"""Arm of an excavator in closed form: joint angles to pose, pose to joint angles, Jacobians.
+"""Closed-form kinematics of an excavator arm: forward, inverse and Jacobians.
 
-World z up, x forward. Swing is positive about +z; boom, stick and tool are positive where they
-raise the outboard end, the boom measured from the horizontal, the stick from the boom, the tool
-from the stick. The arm moves in a vertical plane which lies beside the swing axis by
-`lateral_offset`, so the azimuth of the controlled point depends on its radius.
+World z is up, x forward. Swing is positive about +z. Boom, stick and tool are positive if they
+raise the outboard end; the boom is measured from the horizontal, the stick from the boom, the tool
+from the stick. The arm moves in a vertical plane at the distance `lateral_offset` from the swing
+axis, so that the azimuth of the controlled point depends on its radius.
 
 A pose is (r, theta, z, phi): radius [m], azimuth [rad] and height [m] of the controlled point and
 attitude of the tool [rad], the sum of boom, stick and tool angles. An arm without a tool joint has
-q = (swing, boom, stick) and pose (r, theta, z). Everything here takes and returns plain floats with
-the math module: the controller asks 200 times a second.
+q = (swing, boom, stick) and pose (r, theta, z). All functions use plain floats and the math module,
+because the controller calls them 200 times per second.
 
 Source: Zhu 1994, section 2.2, Eqs 2.2-2.6. Zhu's d2 is -lateral_offset: his z axis of the boom
 joint points to the right.
@@ -20,11 +20,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-_ROUNDING = 1e-12  # [m], so that a stretched pose just computed by `forward` can be inverted
+_ROUNDING = 1e-12  # [m], so that a stretched pose computed by `forward` can be inverted
 
 
 class Unreachable(ValueError):
-    """No joint angles bring the controlled point to the pose asked."""
+    """No joint angles bring the controlled point to the requested pose."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,15 +32,15 @@ class ArmGeometry:
     """Dimensions of the arm, from the swing axis outwards.
 
     Attributes:
-        base_radius: boom pin ahead of the swing axis, a1 [m].
+        base_radius: distance of the boom pin ahead of the swing axis, a1 [m].
         lateral_offset: y of the arm plane in the swing frame, d2 with sign, left positive [m].
         boom_length: boom pin to stick pin, a2 [m], > 0.
         stick_length: stick pin to tool pin, a3 [m], > 0.
-        boom_pin_height: height of the boom pin where z is counted from [m]; 0 counts z from the
+        boom_pin_height: height of the boom pin above the origin of z [m]; 0 puts the origin at the
             boom pin.
         tool_offset: controlled point in the frame of the last link, from the tool pin, (along, up)
             [m].
-        tool_joint: whether the tool turns on the stick; if not, its frame is parallel to the
+        tool_joint: whether the tool rotates on the stick; if not, its frame is parallel to the
             stick's.
     """
 
@@ -53,7 +53,7 @@ class ArmGeometry:
     tool_joint: bool = True
 
     def __post_init__(self) -> None:
-        """Refuse links without length."""
+        """Raise ValueError for links without length."""
         if not (self.boom_length > 0 and self.stick_length > 0):
             raise ValueError(
                 f"boom_length {self.boom_length} and stick_length {self.stick_length} must be > 0"
@@ -61,7 +61,7 @@ class ArmGeometry:
 
 
 def forward(geometry: ArmGeometry, q: Sequence[float]) -> tuple[float, ...]:
-    """Pose of the controlled point in cylindrical coordinates.
+    """Compute the pose of the controlled point in cylindrical coordinates.
 
     x = a1 + a2 cos(q2) + a3 cos(q2 + q3) + tool, z likewise with sines; r = sqrt(x^2 + d2^2),
     theta = q1 + atan2(d2, x), phi = q2 + q3 + q4.
@@ -86,7 +86,9 @@ def forward(geometry: ArmGeometry, q: Sequence[float]) -> tuple[float, ...]:
 
 
 def forward_cartesian(geometry: ArmGeometry, q: Sequence[float]) -> tuple[float, float, float]:
-    """Position of the controlled point, (x, y) = Rot(q1) (x of the arm plane, d2) (Zhu Eq. 2.2).
+    """Compute the Cartesian position of the controlled point (Zhu Eq. 2.2).
+
+    (x, y) = Rot(q1) (x of the arm plane, d2).
 
     Args:
         geometry: the arm.
@@ -107,17 +109,17 @@ def forward_cartesian(geometry: ArmGeometry, q: Sequence[float]) -> tuple[float,
 
 
 def inverse(geometry: ArmGeometry, pose: Sequence[float], elbow: int = 1) -> tuple[float, ...]:
-    """Joint angles for a pose (Zhu Eqs 2.3-2.6, the tool offset taken off inside the arm plane).
+    """Compute the joint angles for a pose (Zhu Eqs 2.3-2.6).
 
-    x = sqrt(r^2 - d2^2), q1 = theta - atan2(d2, x). The tool offset turned by phi is subtracted.
+    x = sqrt(r^2 - d2^2), q1 = theta - atan2(d2, x). The tool offset, rotated by phi, is subtracted.
     With l the distance from boom pin to tool pin, A = (a2 + a3)^2 - l^2, B = l^2 - (a2 - a3)^2:
     q3 = -atan2(2 sqrt(A B), B - A), q2 = direction of the tool pin minus direction of
     (a2 + a3 cos(q3), a3 sin(q3)), q4 = phi - q2 - q3. Without a tool joint the stick and the fixed
-    tool make one straight bar from the stick pin to the controlled point.
+    tool are one straight bar from the stick pin to the controlled point.
 
-    Angles come back within 1e-10 rad while boom and stick are more than 1e-4 rad from one line and
-    the point is 0.1 m or more ahead of the swing axis. The pose itself is the limit, not the
-    formula: rounding r or z by 1e-15 m is worth 1e-15 / sin(q3) of elbow, 1e-8 rad at full stretch.
+    The error is below 1e-10 rad if boom and stick are more than 1e-4 rad from collinear and the
+    point is at least 0.1 m ahead of the swing axis. The error is a property of the pose: rounding r
+    or z by 1e-15 m changes the elbow by 1e-15 / sin(q3), 1e-8 rad at full stretch.
 
     Args:
         geometry: the arm.
@@ -131,7 +133,7 @@ def inverse(geometry: ArmGeometry, pose: Sequence[float], elbow: int = 1) -> tup
         and tool not wrapped.
 
     Raises:
-        Unreachable: the pose is out of reach; the message gives the distance asked and the
+        Unreachable: the pose is out of reach; the message gives the requested distance and the
             reachable interval.
 
     >>> cat215 = ArmGeometry(
@@ -161,7 +163,9 @@ def inverse(geometry: ArmGeometry, pose: Sequence[float], elbow: int = 1) -> tup
 
 
 def jacobian(geometry: ArmGeometry, q: Sequence[float]) -> np.ndarray:
-    """Derivative of `forward`: dr = (x/r) dx, dtheta = dq1 - (d2/r^2) dx, dz and dphi.
+    """Compute the Jacobian of `forward`.
+
+    dr = (x/r) dx, dtheta = dq1 - (d2/r^2) dx; dz and dphi are the derivatives of z and phi.
 
     Args:
         geometry: the arm.
@@ -172,7 +176,7 @@ def jacobian(geometry: ArmGeometry, q: Sequence[float]) -> np.ndarray:
         [1].
 
     Raises:
-        ZeroDivisionError: the controlled point is on the swing axis, where theta has no meaning.
+        ZeroDivisionError: the controlled point is on the swing axis, where theta is undefined.
 
     >>> cat215 = ArmGeometry(
     ...     base_radius=0.340, lateral_offset=-0.110, boom_length=5.180, stick_length=1.800
@@ -188,7 +192,7 @@ def jacobian(geometry: ArmGeometry, q: Sequence[float]) -> np.ndarray:
 
 
 def cartesian_jacobian(geometry: ArmGeometry, q: Sequence[float]) -> np.ndarray:
-    """Derivative of `forward_cartesian`; its transpose turns a force into joint torques.
+    """Compute the Jacobian of `forward_cartesian`; its transpose maps a force to joint torques.
 
     Args:
         geometry: the arm.
@@ -219,7 +223,7 @@ def cartesian_jacobian(geometry: ArmGeometry, q: Sequence[float]) -> np.ndarray:
 def _plane_chain(
     geometry: ArmGeometry, q: Sequence[float]
 ) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
-    """Controlled point (x from the swing axis, z from the boom pin), dx/dq and dz/dq, q[1:]."""
+    """Return the point (x from swing axis, z from boom pin), and dx/dq and dz/dq for q[1:]."""
     if len(q) != 3 + geometry.tool_joint:
         raise ValueError(f"this arm has {3 + geometry.tool_joint} joints, got {len(q)} angles")
     along, up = geometry.tool_offset
@@ -240,9 +244,9 @@ def _plane_chain(
 
 
 def tool_pin(geometry: ArmGeometry, pose: Sequence[float]) -> tuple[float, float, float, float]:
-    """Where a pose puts the end of the outer bar, as seen from the boom pin in the arm plane.
+    """Compute the end of the outer bar for a pose, relative to the boom pin in the arm plane.
 
-    The outer bar is the stick; without a tool joint it runs on to the controlled point.
+    The outer bar is the stick; without a tool joint it extends to the controlled point.
 
     Args:
         geometry: the arm.
@@ -272,11 +276,11 @@ def tool_pin(geometry: ArmGeometry, pose: Sequence[float]) -> tuple[float, float
 
 
 def _plane_x(geometry: ArmGeometry, r: float) -> float:
-    """Distance of the controlled point ahead of the swing axis, in the arm plane."""
+    """Return the distance of the controlled point ahead of the swing axis, in the arm plane."""
     side = abs(geometry.lateral_offset)
     if not r >= side:
         raise Unreachable(
-            f"radius {r:.6g} m asked, the arm plane passes the swing axis at {side:.6g} m: "
+            f"radius {r:.6g} m requested, the arm plane passes the swing axis at {side:.6g} m: "
             f"reachable is [{side:.6g}, inf) m"
         )
     return math.sqrt((r - side) * (r + side))

@@ -1,14 +1,14 @@
-"""Arm of a feller-buncher in closed form: swing, boom, stick, tilt and head.
+"""Closed-form kinematics of a feller-buncher arm: swing, boom, stick, tilt and head.
 
-World z up, x forward. Swing turns about +z; boom, stick and tilt move in a vertical plane through
-the swing axis and are positive where they raise the outboard end, each measured from the link
-before. The head turns about an axis in that plane, perpendicular to the tilt link and pointing to
-its lower side; head angle 0 lays the tool's X axis along the tilt link, a positive one turns it to
-the right of the plane.
+World z is up, x forward. Swing rotates about +z. Boom, stick and tilt move in a vertical plane
+through the swing axis and are positive if they raise the outboard end, each measured from the link
+before. The head rotates about an axis in that plane, perpendicular to the tilt link and pointing to
+its lower side. At head angle 0 the tool's X axis is along the tilt link; a positive angle rotates
+it to the right of the plane.
 
-A pose is what the five joints can choose: position (x, y, z) of the tool [m], attitude of the tilt
-link above the horizontal, the sum of boom, stick and tilt angles [rad], and head angle [rad]. The
-tool's yaw follows from them.
+A pose consists of the coordinates that the five joints can choose: position (x, y, z) of the tool
+[m], attitude of the tilt link above the horizontal, the sum of boom, stick and tilt angles [rad],
+and head angle [rad]. The tool's yaw follows from them.
 
 Source: Zhu 1994, section 2.3 and Table 2.2.
 """
@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-_ROUNDING = 1e-9  # [m] or [1], by which a pose just computed may miss the workspace
+_ROUNDING = 1e-9  # [m] or [1], tolerance for poses computed by `forward`
 _PARALLEL = 1e-9  # sine below which a direction counts as perpendicular to the arm's plane
 
 
@@ -29,8 +29,8 @@ class FellerGeometry:
     """Denavit-Hartenberg lengths of the arm [m].
 
     Attributes:
-        base_radius: boom pin ahead of the swing axis, a1.
-        base_height: boom pin above the origin, d1.
+        base_radius: distance of the boom pin ahead of the swing axis, a1.
+        base_height: height of the boom pin above the origin, d1.
         boom_length: boom pin to stick pin, a2, > 0.
         stick_length: stick pin to tilt pin, a3, > 0.
         tilt_length: tilt pin to head axis, a4.
@@ -47,7 +47,7 @@ class FellerGeometry:
     head_depth: float
 
     def __post_init__(self) -> None:
-        """Refuse what is no arm."""
+        """Raise ValueError for lengths that are not finite, or not positive."""
         if not all(math.isfinite(getattr(self, one.name)) for one in fields(self)):
             raise ValueError(f"lengths must be finite: {self}")
         if not (self.boom_length > 0 and self.stick_length > 0):
@@ -71,8 +71,8 @@ class Reached(NamedTuple):
 
     Attributes:
         q: swing, boom, stick, tilt, head [rad].
-        clamped: whether the pose was out of reach, and the nearest one along the line from the boom
-            pin, or from the swing axis, was taken.
+        clamped: whether the pose was out of reach and replaced by the nearest reachable one on the
+            line from the boom pin, or from the swing axis.
     """
 
     q: tuple[float, float, float, float, float]
@@ -80,7 +80,7 @@ class Reached(NamedTuple):
 
 
 def forward(geometry: FellerGeometry, q: Sequence[float]) -> FellerPose:
-    """Pose of the tool.
+    """Compute the pose of the tool.
 
     Args:
         geometry: the arm.
@@ -112,7 +112,7 @@ def forward(geometry: FellerGeometry, q: Sequence[float]) -> FellerPose:
 
 
 def tool_direction(q: Sequence[float]) -> np.ndarray:
-    """Direction (3,) of the tool's X axis for joint angles (5,) [rad]."""
+    """Return the direction (3,) of the tool's X axis for joint angles (5,) [rad]."""
     swing, head, attitude = q[0], q[4], q[1] + q[2] + q[3]
     ahead = math.cos(head) * math.cos(attitude)
     c, s, aside = math.cos(swing), math.sin(swing), math.sin(head)
@@ -122,16 +122,16 @@ def tool_direction(q: Sequence[float]) -> np.ndarray:
 
 
 def inverse(geometry: FellerGeometry, pose: FellerPose) -> Reached:
-    """Joint angles for position, attitude and head angle, with the stick hanging below.
+    """Compute the joint angles for position, attitude and head angle, with the stick hanging down.
 
-    The tool lies beside the arm's plane by what the head's angle makes of its radius, so that the
-    plane's azimuth solves `A cos + B sin = C`. Of its two solutions one has the arm reach backwards
-    through its own axis and is discarded. Out of reach the nearest reachable pose is taken, which
-    moves continuously with the one that was asked for.
+    The tool is offset from the arm's plane by head radius times sine of the head angle, so that the
+    plane's azimuth solves `A cos + B sin = C`. The solution in which the arm reaches backwards over
+    its own axis is discarded. An unreachable pose is replaced by the nearest reachable pose, which
+    depends continuously on the requested one.
 
     Args:
         geometry: the arm.
-        pose: of the tool.
+        pose: pose of the tool.
 
     Returns:
         The joint angles, and whether they were clamped. Swing is within +-pi.
@@ -151,18 +151,19 @@ def inverse(geometry: FellerGeometry, pose: FellerPose) -> Reached:
 def inverse_directed(
     geometry: FellerGeometry, position: Sequence[float], direction: Sequence[float]
 ) -> tuple[Reached, ...]:
-    """All joint angles that put the tool to a position with its X axis along a direction.
+    """Compute all joint angles for a tool position and a direction of its X axis.
 
-    Two azimuths, the arm reaching ahead or back over its own axis, with two head angles each.
+    There are two azimuths, with the arm reaching ahead or back over its own axis, and two head
+    angles for each.
 
     Args:
         geometry: the arm.
-        position: of the tool (3,) [m].
-        direction: of its X axis (3,), of any length but 0.
+        position: position of the tool (3,) [m].
+        direction: direction of its X axis (3,), of any nonzero length.
 
     Returns:
-        The solutions in reach, those that reach ahead first; none where there is none. Where the
-        direction is perpendicular to the arm's plane any attitude would do, and 0 is taken.
+        The reachable solutions, those that reach ahead first; may be empty. If the direction is
+        perpendicular to the arm's plane, the attitude is arbitrary and set to 0.
 
     Raises:
         ValueError: the direction has no length.
@@ -195,14 +196,14 @@ def inverse_directed(
 
 
 def jacobian(geometry: FellerGeometry, q: Sequence[float]) -> np.ndarray:
-    """Derivatives (5, 5) of (x, y, z, attitude, head) by the joint angles.
+    """Compute the derivatives (5, 5) of (x, y, z, attitude, head) by the joint angles.
 
     Args:
         geometry: the arm.
         q: joint angles (5,) [rad].
 
     Returns:
-        [m/rad] and [1].
+        The derivatives [m/rad] and [1].
     """
     swing, boom, stick, tilt, head = q
     pose, g = forward(geometry, q), geometry
@@ -231,7 +232,7 @@ def jacobian(geometry: FellerGeometry, q: Sequence[float]) -> np.ndarray:
 def _in_plane(
     geometry: FellerGeometry, r: float, z: float, attitude: float, head: float
 ) -> Reached:
-    """Boom, stick and tilt for radius and height of the tool in the arm's plane; swing 0."""
+    """Compute boom, stick and tilt for the tool's radius and height in the arm plane; swing 0."""
     g = geometry
     out = g.tilt_length + g.head_radius * math.cos(head)
     across = r - g.base_radius - out * math.cos(attitude) - g.head_depth * math.sin(attitude)

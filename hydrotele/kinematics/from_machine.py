@@ -1,4 +1,4 @@
-"""Closed-form geometry of a Machine: its arm, and the linkage between each drive and its joint."""
+"""Closed-form geometry of a machine: arm dimensions and the linkage between drive and joint."""
 
 import math
 from collections.abc import Sequence
@@ -14,24 +14,24 @@ from hydrotele.kinematics.linkages import FourBar, LoopOpen, TwoBar, two_bar_fro
 from hydrotele.machine.drives import Axis
 from hydrotele.machine.machine import Machine
 
-_PLAY = 2.0e-3  # m: joint ranges are given in whole degrees
-_EXACT = 1.0e-9  # m or 1: rounding of a 10 m machine, far below any length that matters
+_PLAY = 2.0e-3  # m: tolerance of the stroke, because joint ranges are given in whole degrees
+_EXACT = 1.0e-9  # m or 1: rounding of a 10 m machine, far below any relevant length
 
 
 @dataclass(frozen=True)
 class Direct:
-    """A drive that acts on its joint itself: the drive coordinate is the joint coordinate."""
+    """A drive that acts on its joint directly: drive and joint coordinate are equal."""
 
     def length(self, theta: Any) -> Any:
-        """Drive coordinate, [rad] or [m], same shape as theta."""
+        """Return the drive coordinate, [rad] or [m], same shape as theta."""
         return theta
 
     def rate(self, theta: Any) -> Any:
-        """d(drive)/d(joint) = 1, same shape as theta."""
+        """Return d(drive)/d(joint) = 1, same shape as theta."""
         return 0.0 * theta + 1.0
 
     def angle(self, length: Any) -> Any:
-        """Joint coordinate, [rad] or [m], same shape as length."""
+        """Return the joint coordinate, [rad] or [m], same shape as length."""
         return length
 
 
@@ -41,22 +41,22 @@ class Slider:
 
     Attributes:
         along: distance of the pins along the joint axis at joint position 0 [m].
-        across: their distance across the axis [m].
+        across: distance of the pins perpendicular to the axis [m].
     """
 
     along: float
     across: float
 
     def length(self, theta: Any) -> Any:
-        """Pin-to-pin length [m] at joint position theta [m], any shape."""
+        """Return the pin-to-pin length [m] at joint position theta [m], any shape."""
         return np.hypot(theta + self.along, self.across)
 
     def rate(self, theta: Any) -> Any:
-        """d(length)/d(position) [-], any shape."""
+        """Return d(length)/d(position) [-], any shape."""
         return (theta + self.along) / self.length(theta)
 
     def angle(self, length: Any) -> Any:
-        """Joint position [m] at a pin-to-pin length [m], on the extended side, any shape."""
+        """Return the joint position [m] at a length [m], on the extended side, any shape."""
         return np.sqrt(length**2 - self.across**2) - self.along
 
 
@@ -64,7 +64,7 @@ DriveLinkage = TwoBar | FourBar | Slider | Direct
 
 
 def axis_linkage(machine: Machine, name: str) -> DriveLinkage:
-    """Linkage between an axis' drive and its joint.
+    """Return the linkage between an axis' drive and its joint.
 
     Args:
         machine: the machine.
@@ -111,10 +111,10 @@ def axis_linkage(machine: Machine, name: str) -> DriveLinkage:
 
 
 def has_ball_ends(machine: Machine, name: str) -> bool:
-    """Return whether an axis' cylinder ends in ball joints, as its pins lie in no common plane.
+    """Return whether an axis' cylinder has ball joints at its ends.
 
-    Between pins that are parallel to the joint's axis a cylinder moves in one plane across it. Pins
-    that are apart along the axis would bend it.
+    A cylinder between pins parallel to the joint's axis moves in a plane perpendicular to it. Pins
+    with an offset along the axis would bend the cylinder, so it has ball ends.
 
     Source: Khoshzaban 1992, section 3.4.4 (p. 43).
     """
@@ -126,7 +126,7 @@ def has_ball_ends(machine: Machine, name: str) -> bool:
 
 
 def range_at_drive(machine: Machine, name: str) -> tuple[float, float] | None:
-    """The range of an axis' joint in the coordinate of its drive.
+    """Return the range of an axis' joint in the coordinate of its drive.
 
     Args:
         machine: the machine.
@@ -134,8 +134,8 @@ def range_at_drive(machine: Machine, name: str) -> tuple[float, float] | None:
 
     Returns:
         (low, high) piston displacement [m], or joint coordinate [rad] or [m] of a drive without a
-        cylinder; None where the joint has no range, or the linkage has no closed form or turns back
-        within it.
+        cylinder. None if the joint has no range, or the linkage has no closed form or is not
+        monotonic within the range.
     """
     axis = machine.axes[name]
     limits = machine.joints[axis.joint].range
@@ -149,20 +149,20 @@ def range_at_drive(machine: Machine, name: str) -> tuple[float, float] | None:
         if linkage.rate(limits[0]) * linkage.rate(limits[1]) <= 0.0:
             return None
         first, second = (float(linkage.length(q)) - axis.cylinder.closed_length for q in limits)
-    except LoopOpen:  # it cannot go as far as its range
+    except LoopOpen:  # the linkage cannot reach the ends of the range
         return None
     return min(first, second), max(first, second)
 
 
 def drive_travel(machine: Machine, name: str) -> tuple[float, float] | None:
-    """Where the travel of an axis' drive ends: its stroke, and its joint's range inside it.
+    """Return the limits of an axis' drive: its stroke, restricted to its joint's range.
 
     Args:
         machine: the machine.
         name: axis name.
 
     Returns:
-        (low, high) of the drive's coordinate [m] or [rad]; None where it has no ends.
+        (low, high) of the drive's coordinate [m] or [rad]; None if it is unlimited.
     """
     cylinder, limits = machine.axes[name].cylinder, range_at_drive(machine, name)
     if cylinder is None:
@@ -203,27 +203,28 @@ def _plane(point) -> tuple[float, float]:
 
 
 def pin_axis(machine: Machine, name: str) -> tuple[float, float, float]:
-    """Direction of a cylinder's pins in the frame of the link at its base pin.
+    """Return the direction of a cylinder's pins in the frame of the link at its base pin.
 
     Args:
         machine: the machine.
         name: axis name.
 
     Returns:
-        Unit vector (3,): the axis of the joint that the cylinder turns; -y for a slide.
+        Unit vector (3,): the axis of the joint that the cylinder drives; -y for a slide.
     """
     joint = machine.joints[machine.axes[name].joint]
     return joint.axis if joint.type == "hinge" else (0.0, -1.0, 0.0)
 
 
 def check_strokes(machine: Machine) -> None:
-    """Refuse a cylinder whose stroke does not span the range of its joint.
+    """Raise an error if a cylinder's stroke does not span the range of its joint.
 
     Args:
         machine: the machine; joints without a range are not checked.
 
     Raises:
-        InputError: names axis, end of the range, piston displacement and stroke.
+        InputError: a stroke is too short; the message names axis, joint position, piston
+            displacement and stroke.
     """
     for name, axis in machine.axes.items():
         limits = machine.joints[axis.joint].range
@@ -241,7 +242,7 @@ def check_strokes(machine: Machine) -> None:
 
 
 def arm_geometry(machine: Machine) -> ArmGeometry:
-    """Dimensions of the machine's arm, heights counted from the ground.
+    """Return the dimensions of the machine's arm, with heights above the ground.
 
     Args:
         machine: a machine with an `arm`.
@@ -250,8 +251,8 @@ def arm_geometry(machine: Machine) -> ArmGeometry:
         The geometry of `kinematics.arm`.
 
     Raises:
-        InputError: the machine has no arm, or one with a head, which is that of
-            `feller_geometry`.
+        InputError: the machine has no arm, or an arm with a head, for which `feller_geometry`
+            applies.
     """
     arm = machine.arm
     if arm is None:
@@ -259,8 +260,8 @@ def arm_geometry(machine: Machine) -> ArmGeometry:
     if arm.head:
         raise InputError(
             f"machine {machine.name}",
-            f"has a head ({arm.head}) on its tool: its arm of five joints is that of"
-            " kinematics.five_dof, see feller_geometry",
+            f"has a head ({arm.head}) on its tool: use feller_geometry and kinematics.five_dof"
+            " for its arm of five joints",
         )
     joints = (arm.swing, arm.boom, arm.stick)
     swing, boom, stick = (machine.links[machine.link_of(j)] for j in joints)
@@ -282,7 +283,7 @@ def arm_geometry(machine: Machine) -> ArmGeometry:
 
 
 def arm_is_plane(machine: Machine) -> bool:
-    """Whether swing, boom and stick turn about z and -y exactly, as the closed forms take it."""
+    """Return whether swing, boom and stick rotate about z and -y, as the closed forms require."""
     assert machine.arm
     wanted = ((0, 0, 1), (0, -1, 0), (0, -1, 0))
     joints = (machine.arm.swing, machine.arm.boom, machine.arm.stick)
@@ -293,14 +294,14 @@ def arm_is_plane(machine: Machine) -> bool:
 
 
 def tip_place(machine: Machine, joints: np.ndarray) -> np.ndarray:
-    """Where the arm's tip is.
+    """Compute the position of the arm's tip.
 
     Args:
         machine: a machine with an `arm`.
-        joints: (3,) swing, boom and stick [rad]; other joints stand at zero.
+        joints: (3,) swing, boom and stick [rad]; other joints are at zero.
 
     Returns:
-        (3,) place in the world [m].
+        (3,) position in the world [m].
     """
     assert machine.arm
     names = (machine.arm.swing, machine.arm.boom, machine.arm.stick)
@@ -318,15 +319,15 @@ def tip_place(machine: Machine, joints: np.ndarray) -> np.ndarray:
 
 
 def joints_for_tip(machine: Machine, place: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Joint angles that bring the tip to a place, for any joint axes.
+    """Compute joint angles for a tip position, for any joint axes, by Newton's method.
 
     Args:
         machine: a machine with an `arm` of three joints.
-        place: (3,) of the tip [m].
+        place: (3,) position of the tip [m].
         start: (3,) swing, boom and stick near the solution [rad].
 
     Returns:
-        (3,) angles, by Newton's method [rad].
+        (3,) angles [rad].
     """
     joints, step = np.array(start, float), 1.0e-6
     for _ in range(8):
@@ -342,7 +343,7 @@ def joints_for_tip(machine: Machine, place: np.ndarray, start: np.ndarray) -> np
 
 
 def feller_geometry(machine: Machine) -> FellerGeometry:
-    """Dimensions of a feller-buncher's arm, heights counted from the ground.
+    """Return the dimensions of a feller-buncher's arm, with heights above the ground.
 
     Args:
         machine: a machine with an `arm` that has a head.
@@ -351,9 +352,9 @@ def feller_geometry(machine: Machine) -> FellerGeometry:
         The geometry of `kinematics.five_dof`.
 
     Raises:
-        InputError: the arm has no head, or its joints are not those of `kinematics.five_dof`: all
-            pins in one plane through the swing axis, the links along x, the head's axis along -z
-            of the tilt link.
+        InputError: the arm has no head, or its joints do not have the form of
+            `kinematics.five_dof`: all pins in one plane through the swing axis, the links along x,
+            the head's axis along -z of the tilt link.
     """
     arm = machine.arm
     if arm is None or arm.head is None or arm.tool is None:
@@ -375,16 +376,18 @@ def feller_geometry(machine: Machine) -> FellerGeometry:
 
 
 def _expect_feller(machine: Machine, joints: Sequence[str], aside: Sequence[float]) -> None:
-    """Refuse an arm whose pins or axes `kinematics.five_dof` has no numbers for."""
+    """Raise an error if an arm's pins or axes do not have the form of `kinematics.five_dof`."""
     where = f"machine {machine.name}: arm"
     axes = ((0, 0, 1), (0, -1, 0), (0, -1, 0), (0, -1, 0), (0, 0, -1))
     for name, axis in zip(joints, axes, strict=True):
         if np.abs(np.subtract(machine.joints[name].axis, axis)).max() > _EXACT:
-            raise InputError(where, f"{name} must turn about {axis} of its link")
+            raise InputError(where, f"{name} must rotate about {axis} of its link")
     chain = [machine.links[machine.link_of(name)].parent for name in joints[1:]]
     if chain != [machine.link_of(name) for name in joints[:-1]]:
         raise InputError(where, "each joint must carry the next: swing, boom, stick, tool, head")
     if machine.arm and machine.arm.tip.link != machine.link_of(joints[-1]):
         raise InputError(where, f"its tip must be on the head, not on {machine.arm.tip.link}")
     if np.abs(aside).max() > _EXACT:
-        raise InputError(where, "its pins must be in the plane y = 0, each on the x axis before it")
+        raise InputError(
+            where, "each pin must be in the plane y = 0, on the x axis of the link before"
+        )

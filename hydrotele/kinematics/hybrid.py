@@ -1,31 +1,29 @@
-"""Serial-parallel hybrid robots: a carriage of revolute and prismatic joints carries a hexapod.
+"""Kinematics and error models of serial-parallel robots: a carriage that carries a hexapod.
 
-Six legs of variable length join universal joints A_i on the carriage's last link, the connecting
-platform, to spherical joints B_i on the moving platform. Frame 0 is the measurement's; frame n the
-connecting platform's (4 for four joints); frame 5 of the document, the moving platform's, is the
-end-effector's.
+Six legs of variable length connect universal joints A_i on the carriage's last link, the connecting
+platform, to spherical joints B_i on the moving platform. Frame 0 is that of the measurement, frame
+n that of the connecting platform (4 for four joints). Frame 5 of the document, that of the moving
+platform, is the end effector's.
 
-The carriage is a chain of constant transforms with a motion about or along z between them:
-T(q) = C_0 M(q_1) C_1 M(q_2) ... C_n. D-H rows give C_0 = 1 and C_i = Rz(theta) Tz(d) Tx(a)
-Rx(alpha); lines of axes with the frame F_i of each give C_0 = F_1, C_i = F_i^-1 F_{i+1},
-C_n = F_n^-1, which is the product of exponentials exp(xi_1 q_1) ... exp(xi_n q_n). Both error
-models are therefore one computation.
-
-Source: Wang 2012, sections 3.1.1 and 3.2.1, Eqs 6 to 11; Park and Okamura 1994 (exponentials).
-
-Error models say what its geometry may differ by from the nominal one.
+The carriage of revolute and prismatic joints is a chain of constant transforms with a motion about
+or along z between them: T(q) = C_0 M(q_1) C_1 M(q_2) ... C_n. D-H rows give C_0 = 1 and C_i =
+Rz(theta) Tz(d) Tx(a) Rx(alpha). Axis lines with the frame F_i of each give C_0 = F_1, C_i = F_i^-1
+F_{i+1}, C_n = F_n^-1, the product of exponentials exp(xi_1 q_1) ... exp(xi_n q_n). Both error
+models therefore use the same computation.
 
 `dh`: errors of the carriage's D-H rows and vector-chain errors of the hexapod. Each revolute joint
 has four (theta, d, a, alpha), each prismatic joint two (theta, alpha); each leg has seven: the
-coordinates of A_i and B_i and the offset of its length. Four joints P P R R and six legs make 54.
+coordinates of A_i and B_i and the offset of its length. Four joints P P R R and six legs have 54.
 
-`poe`: product of exponentials. Each revolute axis may turn about and shift along two directions
-across itself, each prismatic one may only turn; the legs as above. This makes 54, too, and they are
-others: axes are lines in the measurement's frame, so that it need not be the carriage's frame 0.
+`poe`: product of exponentials. Each revolute axis has a rotation and a displacement error in two
+directions perpendicular to it, each prismatic axis rotation errors only; the legs are as above.
+These are also 54 parameters, but different ones: axes are lines in the frame of the measurement,
+which may differ from the carriage's frame 0.
 
-Errors enter exactly, not by their first order; `first_order` is the document's linear form.
+Errors enter exactly, not linearised; `first_order` is the document's linear form.
 
-Source: Wang 2012, sections 3.1.2 (Eqs 12 to 29) and 3.2; Mooring et al. 1991 (4R + 2P + T).
+Source: Wang 2012, sections 3.1.1 and 3.2.1, Eqs 6 to 11, sections 3.1.2 (Eqs 12 to 29) and 3.2;
+Park and Okamura 1994 (exponentials); Mooring et al. 1991 (4R + 2P + T).
 """
 
 from collections.abc import Sequence
@@ -49,16 +47,16 @@ LEGS = 6
 PRISMATIC, REVOLUTE = 0, 1
 _KINDS = {"prismatic": PRISMATIC, "revolute": REVOLUTE}
 SHIPPED = ("iwr",)
-_CONVERGED = 1e-12  # m and rad, of a Newton step
+_CONVERGED = 1e-12  # m and rad, tolerance of a Newton step
 _STEPS = 50
 
 
 class Unreachable(ValueError):
-    """No pose of the platform has the legs' lengths, or Newton's method does not find it."""
+    """No pose of the platform has these leg lengths, or Newton's method does not find it."""
 
 
 class DhRow(Facts):
-    """A carriage joint with its D-H row (Wang, Table 1): lengths [m], angles [rad]."""
+    """A carriage joint given by its D-H row (Wang, Table 1): lengths [m], angles [rad]."""
 
     joint: str
     kind: Literal["prismatic", "revolute"]
@@ -70,9 +68,9 @@ class DhRow(Facts):
 
 
 class AxisRow(Facts):
-    """A carriage joint by the line of its axis in frame 0 with all joints at zero.
+    """A carriage joint given by the line of its axis in frame 0 with all joints at zero.
 
-    `direction` is a vector along it, `point` [m] lies on it (of no effect for a prismatic joint).
+    `direction` is a vector along the axis, `point` [m] a point on it (unused for prismatic joints).
     """
 
     joint: str
@@ -89,7 +87,7 @@ class AxisRow(Facts):
 
 
 class PlatformFrame(Facts):
-    """Connecting platform in frame 0, joints at zero: origin [m] and rotation vector [rad]."""
+    """Connecting platform with joints at zero: origin [m] and rotation vector [rad] in frame 0."""
 
     position: Vector
     rotation: Vector
@@ -99,10 +97,10 @@ _Six = Annotated[tuple[Vector, ...], Field(min_length=LEGS, max_length=LEGS)]
 
 
 class HybridFacts(Facts):
-    """A hybrid robot as its file states it.
+    """Contents of the file of a hybrid robot.
 
-    `carriage` holds D-H rows, whose last frame is the connecting platform's; `axes` lines of the
-    joints' axes instead, with the connecting platform's frame where all joints are at zero.
+    `carriage` holds D-H rows; the last frame is that of the connecting platform. `axes` holds axis
+    lines instead, with the connecting platform's frame when all joints are at zero.
     """
 
     name: str
@@ -121,10 +119,10 @@ class HybridFacts(Facts):
         if bool(self.carriage) == bool(self.axes):
             raise ValueError("give either `carriage` (D-H rows) or `axes` (lines of the axes)")
         if bool(self.axes) != (self.platform_at_zero is not None):
-            raise ValueError("`platform_at_zero` belongs to `axes`, and is needed there")
+            raise ValueError("`platform_at_zero` is required with `axes`, and only there")
         names = [row.joint for row in self.carriage or self.axes]
         if twice := {n for n in names if names.count(n) > 1}:
-            raise ValueError(f"the joint {min(twice)!r} is there twice")
+            raise ValueError(f"the joint {min(twice)!r} occurs twice")
         return self
 
 
@@ -132,8 +130,8 @@ class Pose(NamedTuple):
     """Poses of the moving platform in frame 0.
 
     Attributes:
-        rotation: (..., 3, 3) from its frame to frame 0.
-        position: (..., 3) of its origin [m].
+        rotation: (..., 3, 3) rotation from the platform's frame to frame 0.
+        position: (..., 3) position of the platform's origin [m].
     """
 
     rotation: np.ndarray
@@ -142,20 +140,20 @@ class Pose(NamedTuple):
 
 @dataclass(frozen=True)
 class Hybrid:
-    """A hybrid robot with n carriage joints; what forward and inverse kinematics use.
+    """Kinematic model of a hybrid robot with n carriage joints.
 
     Attributes:
-        name: of the robot.
+        name: name of the robot.
         joints: names of the carriage joints.
         kinds: (n,) PRISMATIC or REVOLUTE.
         constants: (n + 1, 4, 4) transforms C_0 to C_n.
         universal: (6, 3) joints A_i in the connecting platform's frame [m].
         spherical: (6, 3) joints B_i in the moving platform's frame [m].
-        offsets: (6,) what is added to the legs' readings [m].
-        joint_range: (n, 2) [m] or [rad].
-        leg_range: shortest and longest reading of a leg [m].
-        home: (3,) moving platform in the connecting platform's frame where the model stands [m].
-        facts: the file's content.
+        offsets: (6,) leg lengths minus leg readings [m].
+        joint_range: (n, 2) joint ranges [m] or [rad].
+        leg_range: minimum and maximum reading of a leg [m].
+        home: (3,) home position of the moving platform in the connecting platform's frame [m].
+        facts: contents of the file.
     """
 
     name: str
@@ -175,11 +173,11 @@ def load_hybrid(name: str | Path) -> Hybrid:
     """Read a hybrid robot.
 
     Args:
-        name: a shipped one, a file of the form of `models/iwr/iwr.yaml`, or a folder with
-            `robot.yaml`, such as one that a calibration wrote.
+        name: a shipped robot, a file in the format of `models/iwr/iwr.yaml`, or a folder with
+            `robot.yaml`, such as the output of a calibration.
 
     Raises:
-        InputError: there is none of that name, or the file is not of that form.
+        InputError: there is no such robot, or the file is invalid.
 
     >>> load_hybrid("iwr").joints
     ('d1', 'd2', 'theta3', 'theta4')
@@ -191,19 +189,19 @@ def load_hybrid(name: str | Path) -> Hybrid:
         path = path / "robot.yaml"
     elif not path.is_file():
         raise InputError(
-            f"hybrid robot {str(name)!r}", f"{suggest(name, SHIPPED)}; or a file of their form"
+            f"hybrid robot {str(name)!r}", f"{suggest(name, SHIPPED)}; or give a file or folder"
         )
     data, lines = read_yaml(path)
     return hybrid_of(parse(HybridFacts, data, str(path), lines))
 
 
 def save_hybrid(robot: Hybrid, path: str | Path, note: str = "") -> None:
-    """Write a hybrid robot as a file that `load_hybrid` reads; numbers in SI with all digits.
+    """Write a hybrid robot to a file in SI units with all digits; `load_hybrid` reads it.
 
     Args:
         robot: the robot.
-        path: of the file, `.yaml`.
-        note: comment in its first line.
+        path: path of the file, `.yaml`.
+        note: comment for its first line.
 
     Raises:
         InputError: the file cannot be written.
@@ -215,7 +213,7 @@ def save_hybrid(robot: Hybrid, path: str | Path, note: str = "") -> None:
 
 
 def hybrid_of(facts: HybridFacts) -> Hybrid:
-    """The kinematics of a hybrid robot from what its file states."""
+    """Build the kinematic model of a hybrid robot from the contents of its file."""
     rows = facts.carriage or facts.axes
     if facts.carriage:
         table = np.array([(r.theta, r.d, r.a, r.alpha) for r in facts.carriage])
@@ -231,16 +229,16 @@ def hybrid_of(facts: HybridFacts) -> Hybrid:
 
 
 def dh_transform(theta, d, a, alpha) -> np.ndarray:
-    """D-H transforms Rz(theta) Tz(d) Tx(a) Rx(alpha) (Wang Eq. 6).
+    """Return D-H transforms Rz(theta) Tz(d) Tx(a) Rx(alpha) (Wang Eq. 6).
 
     Args:
-        theta: (...) [rad].
-        d: (...) [m].
-        a: (...) [m].
-        alpha: (...) [rad].
+        theta: (...) joint angle [rad].
+        d: (...) joint distance [m].
+        a: (...) link length [m].
+        alpha: (...) link twist [rad].
 
     Returns:
-        (..., 4, 4).
+        (..., 4, 4) homogeneous transforms.
 
     >>> dh_transform(0.0, 0.3, 0.5, 0.0)[:3, 3].tolist()
     [0.5, 0.0, 0.3]
@@ -254,7 +252,7 @@ def dh_transform(theta, d, a, alpha) -> np.ndarray:
 
 
 def axis_frames(axes: Sequence[AxisRow]) -> np.ndarray:
-    """(n, 4, 4) frames F_i with z along each axis and the origin on it, in frame 0."""
+    """Return frames F_i (n, 4, 4) in frame 0, with z along each axis and the origin on it."""
     frames = np.tile(np.eye(4), (len(axes), 1, 1))
     for frame, row in zip(frames, axes, strict=True):
         z = np.array(row.direction) / np.linalg.norm(row.direction)
@@ -266,7 +264,7 @@ def axis_frames(axes: Sequence[AxisRow]) -> np.ndarray:
 
 
 def _at_zero(facts: HybridFacts) -> np.ndarray:
-    """(4, 4) connecting platform in frame 0 with all joints at zero."""
+    """Return the connecting platform's frame (4, 4) in frame 0 with all joints at zero."""
     assert facts.platform_at_zero is not None
     frame = np.eye(4)
     frame[:3, :3] = Rotation.from_rotvec(facts.platform_at_zero.rotation).as_matrix()
@@ -275,11 +273,11 @@ def _at_zero(facts: HybridFacts) -> np.ndarray:
 
 
 def constants_of_axes(frames: np.ndarray, at_zero: np.ndarray) -> np.ndarray:
-    """Constants C_0 to C_n of a product of exponentials, from the frames of its axes.
+    """Return the constants C_0 to C_n of a product of exponentials from its axis frames.
 
     Args:
-        frames: (..., n, 4, 4) F_i.
-        at_zero: (4, 4) connecting platform, joints at zero.
+        frames: (..., n, 4, 4) axis frames F_i.
+        at_zero: (4, 4) frame of the connecting platform with joints at zero.
 
     Returns:
         (..., n + 1, 4, 4): F_1, F_i^-1 F_{i+1}, F_n^-1 times the platform's frame.
@@ -291,7 +289,7 @@ def constants_of_axes(frames: np.ndarray, at_zero: np.ndarray) -> np.ndarray:
 
 
 def inverse_transform(transform: np.ndarray) -> np.ndarray:
-    """(..., 4, 4) inverse of homogeneous transforms."""
+    """Return the inverse of homogeneous transforms (..., 4, 4)."""
     turned = np.swapaxes(transform[..., :3, :3], -1, -2)
     result = np.zeros_like(transform)
     result[..., :3, :3], result[..., 3, 3] = turned, 1.0
@@ -300,10 +298,10 @@ def inverse_transform(transform: np.ndarray) -> np.ndarray:
 
 
 def zero_frames(robot: Hybrid) -> tuple[np.ndarray, np.ndarray]:
-    """Frames of the joints' axes and of the connecting platform in frame 0, all joints at zero.
+    """Return frames of the joint axes and the connecting platform in frame 0, joints at zero.
 
     Returns:
-        ((n, 4, 4) with each joint's axis along z, (4, 4) connecting platform).
+        ((n, 4, 4) frames with each joint's axis along z, (4, 4) frame of the connecting platform).
     """
     frame, frames = np.eye(4), []
     for constant in robot.constants[:-1]:
@@ -313,7 +311,7 @@ def zero_frames(robot: Hybrid) -> tuple[np.ndarray, np.ndarray]:
 
 
 def with_axes(robot: Hybrid) -> Hybrid:
-    """The same robot stated by the lines of its axes at zero in place of D-H rows.
+    """Return the same robot, given by axis lines instead of D-H rows.
 
     >>> same = with_axes(load_hybrid("iwr"))
     >>> q = np.array([0.3, 0.1, 0.4, -0.2])
@@ -336,14 +334,14 @@ def with_axes(robot: Hybrid) -> Hybrid:
 
 
 def carriage_pose(robot: Hybrid, joints: np.ndarray) -> np.ndarray:
-    """Poses of the connecting platform.
+    """Compute the poses of the connecting platform.
 
     Args:
         robot: the robot.
-        joints: (..., n) positions [m] or [rad].
+        joints: (..., n) joint positions [m] or [rad].
 
     Returns:
-        (..., 4, 4) in frame 0.
+        (..., 4, 4) poses in frame 0.
     """
     joints = np.asarray(joints, float)
     result = np.broadcast_to(robot.constants[0], (*joints.shape[:-1], 4, 4))
@@ -361,15 +359,15 @@ def carriage_pose(robot: Hybrid, joints: np.ndarray) -> np.ndarray:
 
 
 def leg_vectors(robot: Hybrid, joints: np.ndarray, pose: Pose) -> np.ndarray:
-    """Vectors from A_i to B_i in the connecting platform's frame (Wang Eqs 8 and 10).
+    """Compute the vectors from A_i to B_i in the connecting platform's frame (Wang Eqs 8 and 10).
 
     Args:
         robot: the robot.
-        joints: (..., n) positions of the carriage [m] or [rad].
-        pose: of the moving platform, (...).
+        joints: (..., n) positions of the carriage joints [m] or [rad].
+        pose: (...) poses of the moving platform.
 
     Returns:
-        (..., 6, 3) [m].
+        (..., 6, 3) vectors [m].
     """
     carriage = carriage_pose(robot, joints)
     ends = np.einsum("...ij,kj->...ki", pose.rotation, robot.spherical)
@@ -378,60 +376,60 @@ def leg_vectors(robot: Hybrid, joints: np.ndarray, pose: Pose) -> np.ndarray:
 
 
 def leg_readings(robot: Hybrid, joints: np.ndarray, pose: Pose) -> np.ndarray:
-    """Inverse kinematics of the legs (Wang Eq. 11): what the leg sensors read at a pose.
+    """Compute the readings of the leg sensors at a pose (Wang Eq. 11).
 
     Args:
         robot: the robot.
-        joints: (..., n) positions of the carriage [m] or [rad].
-        pose: of the moving platform, (...).
+        joints: (..., n) positions of the carriage joints [m] or [rad].
+        pose: (...) poses of the moving platform.
 
     Returns:
-        (..., 6) distance of A_i and B_i less the leg's offset [m].
+        (..., 6) distance of A_i and B_i minus the leg's offset [m].
     """
     return np.linalg.norm(leg_vectors(robot, joints, pose), axis=-1) - robot.offsets
 
 
 def inverse(robot: Hybrid, pose: Pose, joints: np.ndarray) -> np.ndarray:
-    """Inverse kinematics: leg readings for a pose with the carriage where it is put.
+    """Compute leg readings for a pose with given carriage positions, within the legs' range.
 
-    The robot is redundant: ten joints for six coordinates. The carriage's joints are chosen first,
-    the legs follow.
+    The robot is redundant: ten joints for six coordinates. The carriage positions are chosen first
+    and determine the leg readings.
 
     Args:
         robot: the robot.
-        pose: of the moving platform, (...).
-        joints: (..., n) positions of the carriage [m] or [rad].
+        pose: (...) poses of the moving platform.
+        joints: (..., n) positions of the carriage joints [m] or [rad].
 
     Returns:
         (..., 6) readings [m].
 
     Raises:
-        Unreachable: a leg would be shorter or longer than it can be.
+        Unreachable: a leg reading is out of range.
     """
     readings = leg_readings(robot, joints, pose)
     low, high = robot.leg_range
     if not ((readings >= low) & (readings <= high)).all():
         worst = readings.flat[np.argmax(np.maximum(low - readings, readings - high))]
-        raise Unreachable(f"a leg would read {worst:.4f} m, it goes from {low:g} to {high:g} m")
+        raise Unreachable(f"a leg would read {worst:.4f} m, its range is {low:g} to {high:g} m")
     return readings
 
 
 def home_pose(robot: Hybrid, joints: np.ndarray) -> Pose:
-    """Moving platform at its home over the connecting platform, for carriage positions (..., n)."""
+    """Return the home pose of the moving platform for carriage positions (..., n)."""
     carriage = carriage_pose(robot, joints)
     place = np.einsum("...ij,j->...i", carriage[..., :3, :3], robot.home)
     return Pose(carriage[..., :3, :3], place + carriage[..., :3, 3])
 
 
 def leg_jacobian(robot: Hybrid, joints: np.ndarray, pose: Pose) -> np.ndarray:
-    """Derivatives of the leg readings by the pose: position [m], then rotation vector [rad].
+    """Compute the derivatives of the leg readings by position [m] and rotation vector [rad].
 
     The rotation is that of exp(w) R in frame 0.
 
     Args:
         robot: the robot.
-        joints: (..., n) positions of the carriage [m] or [rad].
-        pose: of the moving platform, (...).
+        joints: (..., n) positions of the carriage joints [m] or [rad].
+        pose: (...) poses of the moving platform.
 
     Returns:
         (..., 6, 6): row k is (u_k, (R b_k) x u_k), u_k the direction of leg k in frame 0.
@@ -447,15 +445,15 @@ def leg_jacobian(robot: Hybrid, joints: np.ndarray, pose: Pose) -> np.ndarray:
 def forward(
     robot: Hybrid, joints: np.ndarray, readings: np.ndarray, start: Pose | None = None
 ) -> Pose:
-    """Forward kinematics by Newton's method on the six leg lengths.
+    """Compute forward kinematics by Newton's method on the six leg lengths.
 
-    Of the up to 40 poses with the same lengths the one on the start's branch is found.
+    Up to 40 poses have the same lengths; the result is the one on the start's branch.
 
     Args:
         robot: the robot.
-        joints: (N, n) or (n,) positions of the carriage [m] or [rad].
-        readings: (N, 6) or (6,) of the legs [m].
-        start: poses to begin with; the home poses by default.
+        joints: (N, n) or (n,) positions of the carriage joints [m] or [rad].
+        readings: (N, 6) or (6,) leg readings [m].
+        start: start poses; the home poses by default.
 
     Returns:
         The poses, (N,) or a single one.
@@ -476,7 +474,7 @@ def forward(
         except np.linalg.LinAlgError:
             raise Unreachable("the hexapod is in a singular pose") from None
         turn = np.linalg.norm(step[..., 3:], axis=-1, keepdims=True)
-        step = step * np.minimum(1.0, 0.5 / np.maximum(turn, 1e-300))  # rad: stays on the branch
+        step = step * np.minimum(1.0, 0.5 / np.maximum(turn, 1e-300))  # rad: same branch
         position = position + step[..., :3]
         turned = Rotation.from_rotvec(step[..., 3:].reshape(-1, 3)).as_matrix()
         rotation = turned.reshape(*step.shape[:-1], 3, 3) @ rotation
@@ -494,19 +492,19 @@ def forward_evolution(
     robot: Hybrid, joints: np.ndarray, readings: np.ndarray, seed: int = 0,
     reach: float = 0.35, turn: float = 0.6, polish: bool = False,
 ) -> Pose:  # fmt: skip
-    """Forward kinematics by differential evolution: no start, no Jacobian.
+    """Compute forward kinematics by differential evolution, without start or Jacobian.
 
     The sum of squared errors of the leg lengths is minimised over position and rotation vector in
     a box about the home pose.
 
     Args:
         robot: the robot.
-        joints: (n,) positions of the carriage [m] or [rad].
-        readings: (6,) of the legs [m].
-        seed: of the random numbers.
+        joints: (n,) positions of the carriage joints [m] or [rad].
+        readings: (6,) leg readings [m].
+        seed: seed of the random generator.
         reach: half the box's edge in position [m].
         turn: half the box's edge in the rotation vector [rad].
-        polish: end with a gradient search.
+        polish: whether to end with a gradient search.
 
     Returns:
         The pose.
@@ -535,13 +533,13 @@ def forward_evolution(
 
 
 def rotation_of_euler(angles: np.ndarray) -> np.ndarray:
-    """Rotation Rz(gamma) Ry(beta) Rx(alpha) of Z-Y-X Euler angles (Wang Eq. 9).
+    """Return the rotation Rz(gamma) Ry(beta) Rx(alpha) of Z-Y-X Euler angles (Wang Eq. 9).
 
     Args:
         angles: (..., 3) about x, y, z: alpha, beta, gamma [rad].
 
     Returns:
-        (..., 3, 3).
+        (..., 3, 3) rotations.
     """
     angles = np.asarray(angles, float)
     turned = Rotation.from_euler("ZYX", angles.reshape(-1, 3)[:, ::-1]).as_matrix()
@@ -549,7 +547,7 @@ def rotation_of_euler(angles: np.ndarray) -> np.ndarray:
 
 
 def euler_of_rotation(rotation: np.ndarray) -> np.ndarray:
-    """(..., 3) Z-Y-X Euler angles about x, y, z [rad] of rotations (..., 3, 3).
+    """Return Z-Y-X Euler angles (..., 3) about x, y, z [rad] of rotations (..., 3, 3).
 
     >>> euler_of_rotation(rotation_of_euler([0.1, -0.2, 0.3])).round(12).tolist()
     [0.1, -0.2, 0.3]
@@ -560,7 +558,7 @@ def euler_of_rotation(rotation: np.ndarray) -> np.ndarray:
 
 
 def pose_difference(found: Pose, true: Pose) -> np.ndarray:
-    """(..., 6) found less true: position [m] and rotation vector [rad], both in frame 0."""
+    """Return position [m] and rotation vector [rad] (..., 6) from `true` to `found`, in frame 0."""
     turned = found.rotation @ np.swapaxes(true.rotation, -1, -2)
     vector = Rotation.from_matrix(turned.reshape(-1, 3, 3)).as_rotvec()
     return np.concatenate(
@@ -570,17 +568,17 @@ def pose_difference(found: Pose, true: Pose) -> np.ndarray:
 
 @compiled
 def batch_readings(constants, kinds, universal, spherical, offsets, joints, rotation, position):
-    """Leg readings of W robots at N poses each; what least squares, DE and MCMC evaluate.
+    """Compute leg readings of W robots at N poses each, for least squares, DE and MCMC.
 
     Args:
         constants: (W, n + 1, 4, 4) transforms of each robot's carriage.
         kinds: (n,) PRISMATIC or REVOLUTE.
-        universal: (W, 6, 3) [m].
-        spherical: (W, 6, 3) [m].
-        offsets: (W, 6) [m].
-        joints: (N, n) [m] or [rad].
-        rotation: (N, 3, 3) of the moving platform.
-        position: (N, 3) [m].
+        universal: (W, 6, 3) universal joints A_i [m].
+        spherical: (W, 6, 3) spherical joints B_i [m].
+        offsets: (W, 6) leg offsets [m].
+        joints: (N, n) carriage positions [m] or [rad].
+        rotation: (N, 3, 3) rotations of the moving platform.
+        position: (N, 3) positions of the moving platform [m].
 
     Returns:
         (W, N, 6) readings [m], as `leg_readings`.
@@ -618,7 +616,7 @@ def batch_readings(constants, kinds, universal, spherical, offsets, joints, rota
                 square = 0.0
                 bx, by, bz = spherical[w, leg, 0], spherical[w, leg, 1], spherical[w, leg, 2]
                 ax, ay, az = universal[w, leg, 0], universal[w, leg, 1], universal[w, leg, 2]
-                for i in range(3):  # the same length in frame 0: no transposed product
+                for i in range(3):  # length in frame 0, which needs no transposed product
                     away = position[k, i] - t[i, 3]
                     away += rotation[k, i, 0] * bx + rotation[k, i, 1] * by + rotation[k, i, 2] * bz
                     away -= t[i, 0] * ax + t[i, 1] * ay + t[i, 2] * az
@@ -628,7 +626,7 @@ def batch_readings(constants, kinds, universal, spherical, offsets, joints, rota
 
 
 Kind = Literal["dh", "poe"]
-LENGTH_SIZE, ANGLE_SIZE = 1.0e-3, 1.0e-3  # m, rad: errors of manufacture, which scale the searches
+LENGTH_SIZE, ANGLE_SIZE = 1.0e-3, 1.0e-3  # m, rad: typical manufacturing errors, search scales
 _DH = ("theta", "d", "a", "alpha")
 _DH_WORDS = {
     "theta": "joint angle offset", "d": "joint distance", "a": "link length", "alpha": "link twist"
@@ -651,15 +649,15 @@ class Parts(NamedTuple):
 
 @dataclass(frozen=True)
 class ErrorModel:
-    """The parameters of an error model about a nominal robot.
+    """Parameters of an error model about a nominal robot.
 
     Attributes:
         kind: `dh` or `poe`.
-        nominal: the robot without errors; for `poe` stated by its axes.
-        names: p parameters, such as theta4, a4, a1x, b6z, l3 for `dh`.
-        words: each in words.
-        units: `m` or `rad` each.
-        scales: (p,) size of an error of manufacture [units].
+        nominal: the robot without errors; for `poe` given by its axes.
+        names: the p parameters, such as theta4, a4, a1x, b6z, l3 for `dh`.
+        words: description of each parameter.
+        units: `m` or `rad` for each parameter.
+        scales: (p,) typical manufacturing errors [units].
     """
 
     kind: Kind
@@ -670,10 +668,10 @@ class ErrorModel:
     scales: np.ndarray
 
     def index(self, names) -> np.ndarray:
-        """Places of parameters by their names.
+        """Return the indices of parameters by their names.
 
         Raises:
-            InputError: there is none of a name.
+            InputError: a name is unknown.
         """
         for name in names:
             if name not in self.names:
@@ -682,19 +680,19 @@ class ErrorModel:
 
     @property
     def carriage_count(self) -> int:
-        """Number of the carriage's parameters; the legs' 42 follow."""
+        """Number of carriage parameters; the 42 parameters of the legs follow."""
         return len(self.names) - 7 * LEGS
 
 
 def error_model(robot: Hybrid, kind: Kind) -> ErrorModel:
-    """The error model of a kind about a robot.
+    """Build an error model about a robot.
 
     Args:
         robot: the nominal robot.
-        kind: `dh` needs a robot that is stated by D-H rows.
+        kind: `dh` or `poe`; `dh` needs a robot given by D-H rows.
 
     Raises:
-        InputError: it is not, or there is no such kind.
+        InputError: the kind is unknown, or the robot has no D-H rows.
 
     >>> from hydrotele.kinematics.hybrid import load_hybrid
     >>> [len(error_model(load_hybrid("iwr"), kind).names) for kind in ("dh", "poe")]
@@ -703,7 +701,7 @@ def error_model(robot: Hybrid, kind: Kind) -> ErrorModel:
     if kind not in ("dh", "poe"):
         raise InputError(f"error model {kind!r}", "valid: dh, poe")
     if kind == "dh" and not robot.facts.carriage:
-        raise InputError(f"robot {robot.name}", "is stated by `axes`: use the error model poe")
+        raise InputError(f"robot {robot.name}", "is given by `axes`: use the error model poe")
     names, words, units = [], [], []
     for number, (joint, turning) in enumerate(
         zip(robot.joints, robot.kinds == REVOLUTE, strict=True), 1
@@ -730,25 +728,26 @@ def error_model(robot: Hybrid, kind: Kind) -> ErrorModel:
 
 
 def document_parameters(model: ErrorModel) -> tuple[str, ...]:
-    """The 36 of Wang's refined model: the carriage's 12, B_i and the legs' offsets, but no A_i.
+    """Return the 36 parameters of Wang's refined model: carriage, B_i and leg offsets, no A_i.
 
-    The chapter that lists them is not in the published text we have. 54 less 18 is what is left
-    without A_i, the captions of Figs 12 to 17 correlate carriage parameters with coordinates of A_i
-    only, and that of Fig. 18 (36 parameters) names a4, theta4, b1x, b6z.
+    The chapter that lists them is not in the available text; this choice is inferred. Without the
+    18 coordinates of A_i, 36 of 54 parameters remain. The captions of Figs 12 to 17 correlate
+    carriage parameters with coordinates of A_i only. That of Fig. 18 (36 parameters) names a4,
+    theta4, b1x, b6z.
     """
     legs = model.names[model.carriage_count :]
     return model.names[: model.carriage_count] + tuple(n for n in legs if n[0] != "a")
 
 
 def parts_of(model: ErrorModel, errors: np.ndarray) -> Parts:
-    """Geometries with errors.
+    """Build geometries with errors.
 
     Args:
         model: the error model.
-        errors: (W, p) [model.units].
+        errors: (W, p) errors [model.units].
 
     Returns:
-        What `batch_readings` takes.
+        The arguments of `batch_readings`.
     """
     errors = np.atleast_2d(errors)
     robot, count = model.nominal, model.carriage_count
@@ -766,17 +765,17 @@ def predicted_readings(
     model: ErrorModel, errors: np.ndarray, joints: np.ndarray, rotation: np.ndarray,
     position: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Leg readings at measured poses with errors (Wang Eq. 29).
+    """Compute leg readings at measured poses for given errors (Wang Eq. 29).
 
     Args:
         model: the error model.
-        errors: (W, p) or (p,) [model.units].
-        joints: (N, n) carriage [m] or [rad].
-        rotation: (N, 3, 3) measured.
-        position: (N, 3) measured [m].
+        errors: (W, p) or (p,) errors [model.units].
+        joints: (N, n) carriage positions [m] or [rad].
+        rotation: (N, 3, 3) measured rotations.
+        position: (N, 3) measured positions [m].
 
     Returns:
-        (W, N, 6) [m].
+        (W, N, 6) readings [m].
     """
     parts = parts_of(model, errors)
     return batch_readings(
@@ -787,11 +786,11 @@ def predicted_readings(
 
 
 def corrected(model: ErrorModel, errors: np.ndarray) -> Hybrid:
-    """The robot with errors built in: the calibrated robot, or a true one in simulation.
+    """Return a robot with given errors: a calibrated robot, or the true robot of a simulation.
 
     Args:
         model: the error model.
-        errors: (p,) [model.units].
+        errors: (p,) errors [model.units].
 
     Returns:
         A robot of the same form, D-H rows for `dh`, axes for `poe`.
@@ -821,15 +820,15 @@ def corrected(model: ErrorModel, errors: np.ndarray) -> Hybrid:
 
 
 def first_order(robot: Hybrid, errors: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """Carriage pose by the document's linear error model (Wang Eqs 12 to 26).
+    """Compute the carriage pose by the document's linear error model (Wang Eqs 12 to 26).
 
     dT = sum_i (0T_{i-1}) (d Ai) (iT4), with d Ai = A_i delta_i and delta_i = D_theta dtheta + D_d
     dd + D_a da + D_alpha dalpha (Eq. 18).
 
     Args:
-        robot: stated by D-H rows.
-        errors: (carriage parameters,) of the `dh` model.
-        joints: (N, n) [m] or [rad].
+        robot: robot given by D-H rows.
+        errors: (carriage parameters,) errors of the `dh` model.
+        joints: (N, n) carriage positions [m] or [rad].
 
     Returns:
         (N, 4, 4) nominal pose plus its first-order change.
@@ -865,7 +864,7 @@ def _points(points: np.ndarray) -> tuple:
 
 
 def _dh_errors(robot: Hybrid, errors: np.ndarray) -> np.ndarray:
-    """(W, n, 4) errors of theta, d, a, alpha of every row; those that are none are zero."""
+    """Return the errors (W, n, 4) of theta, d, a, alpha of every row; zero if not modelled."""
     table, at = np.zeros((len(errors), len(robot.kinds), 4)), 0
     for i, kind in enumerate(robot.kinds):
         columns = [0, 1, 2, 3] if kind == REVOLUTE else [0, 3]
@@ -883,7 +882,7 @@ def _dh_constants(robot: Hybrid, errors: np.ndarray) -> np.ndarray:
 
 
 def _poe_frames(robot: Hybrid, errors: np.ndarray) -> np.ndarray:
-    """(W, n, 4, 4) frames of the axes with errors, at zero."""
+    """Return the frames (W, n, 4, 4) of the axes with errors, joints at zero."""
     nominal = axis_frames(robot.facts.axes)
     motion, at = np.zeros((len(errors), len(nominal), 4, 4)), 0
     motion[..., 3, 3] = 1.0

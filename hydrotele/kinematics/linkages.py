@@ -1,21 +1,15 @@
-"""Cylinder linkages in the plane of the arm: joint angle to pin-to-pin cylinder length and back.
+"""Kinematics of cylinder linkages: joint angle to pin-to-pin cylinder length and back.
 
-Two kinds with one small interface: `length(theta)` [m], `rate(theta)` = d(length)/d(theta) [m/rad]
-and `angle(length)` [rad]. The plane is x-z with z up; angles are counter-clockwise in that picture,
-so a positive angle raises the outboard end. Angles and lengths are floats (math module, fast) or
+`TwoBar` is a cylinder across one joint. `FourBar` is a cylinder that rotates a bucket through
+rocker and coupler. Both have `length(theta)` [m], `rate(theta)` = d(length)/d(theta) [m/rad] and
+`angle(length)` [rad]. The plane is x-z with z up; angles are counter-clockwise in this plane, so
+that a positive angle raises the outboard end. Angles and lengths are floats (math module, fast) or
 arrays of any shape (NumPy); the result has the same shape.
 
-By virtual work a cylinder force F [N], positive when it pushes, makes the joint torque
+By virtual work a cylinder force F [N], positive when it pushes, causes the joint torque
 F * rate(theta) [N m], and the cylinder moves with the velocity rate(theta) * d(theta)/dt.
-
-A cylinder across one joint: joint angle to pin-to-pin length and back.
-
-A cylinder that turns a bucket through rocker and coupler: output angle to length and back.
-
-Plane triangles of bars: the formulas under every cylinder linkage, for floats and for arrays.
-
-They take differences of lengths before they multiply, so that nothing is lost where a triangle is
-nearly flat.
+The triangle formulas subtract lengths before they multiply, so that nearly flat triangles cause no
+cancellation errors.
 """
 
 import math
@@ -31,11 +25,11 @@ Point = tuple[Scalar, Scalar]
 
 
 class LoopOpen(ValueError):
-    """The pins of a linkage cannot be joined at the angle or the length asked."""
+    """The pins of a linkage cannot be joined at the requested angle or length."""
 
 
 def library(value: Scalar) -> ModuleType:
-    """Module whose functions fit the value: NumPy for an array, the faster math for a float.
+    """Return the module for a value: NumPy for an array, the faster math module for a float.
 
     Args:
         value: any shape [any unit].
@@ -51,7 +45,7 @@ def library(value: Scalar) -> ModuleType:
 
 
 def minus(a: Point, b: Point) -> Point:
-    """Vector a - b in the plane.
+    """Return the vector a - b in the plane.
 
     Args:
         a: (x, z), coordinates of any one shape [m].
@@ -67,7 +61,7 @@ def minus(a: Point, b: Point) -> Point:
 
 
 def cross(a: Point, b: Point) -> Scalar:
-    """Cross product a_x b_z - a_z b_x: positive if b lies to the left (counter-clockwise) of a.
+    """Return the cross product a_x b_z - a_z b_x, positive if b is to the left of a.
 
     Args:
         a: (x, z), coordinates of any one shape [m].
@@ -83,7 +77,9 @@ def cross(a: Point, b: Point) -> Scalar:
 
 
 def apex_angle(left: float, right: float, opposite: Scalar) -> Scalar:
-    """Angle between two sides of a triangle, tan(B/2)^2 = (c^2 - (a - b)^2) / ((a + b)^2 - c^2).
+    """Return the angle between two sides of a triangle.
+
+    tan(B/2)^2 = (c^2 - (a - b)^2) / ((a + b)^2 - c^2).
 
     Args:
         left: length a of one side [m], > 0.
@@ -94,7 +90,7 @@ def apex_angle(left: float, right: float, opposite: Scalar) -> Scalar:
         Angle B, shape of opposite [rad], in [0, pi].
 
     Raises:
-        LoopOpen: a length lies outside [|a - b|, a + b].
+        LoopOpen: a length is outside [|a - b|, a + b].
 
     >>> round(math.degrees(apex_angle(3.0, 4.0, 5.0)), 9)
     90.0
@@ -107,17 +103,17 @@ def apex_angle(left: float, right: float, opposite: Scalar) -> Scalar:
 
 
 def third_pin(near: Point, far: Point, near_bar: Scalar, far_bar: Scalar, side: int) -> Point:
-    """Pin that two bars share: the circles about `near` and `far` cut each other there.
+    """Return the pin that joins two bars, an intersection of the circles about `near` and `far`.
 
-    With D = |far - near|, the pin lies (n^2 - f^2 + D^2) / (2 D) along the way and twice the
-    triangle's area (Heron) / D beside it.
+    With D = |far - near|, the pin is at (n^2 - f^2 + D^2) / (2 D) along the line from `near` to
+    `far`, at the distance 2 A / D from it, with the triangle's area A (Heron).
 
     Args:
         near: (x, z), coordinates of any one shape [m].
-        far: (x, z), coordinates of any one shape [m], not at `near`.
+        far: (x, z), coordinates of any one shape [m], different from `near`.
         near_bar: length n of the bar from `near`, any one shape [m], > 0.
         far_bar: length f of the bar from `far`, any one shape [m], > 0.
-        side: +1 for the pin to the left of the way from `near` to `far`, -1 to the right [-].
+        side: +1 for the pin to the left of the line from `near` to `far`, -1 to the right [-].
 
     Returns:
         (x, z) of the shared pin [m].
@@ -140,19 +136,19 @@ def third_pin(near: Point, far: Point, near_bar: Scalar, far_bar: Scalar, side: 
 
 
 def closing(value: Scalar, low: Scalar, high: Scalar, what: str) -> Scalar:
-    """Pass a length on if the bars allow it; 1e-12 m too much is rounding and is cut off.
+    """Return a length clipped to the range of the bars; an excess above 1e-12 m raises an error.
 
     Args:
-        value: length asked, any shape [m].
-        low: shortest length the bars allow, scalar or shape of value [m].
-        high: longest length the bars allow, scalar or shape of value [m].
+        value: requested length, any shape [m].
+        low: minimum length that the bars allow, scalar or shape of value [m].
+        high: maximum length that the bars allow, scalar or shape of value [m].
         what: name of the length for the message [-].
 
     Returns:
         The length, within [low, high] [m].
 
     Raises:
-        LoopOpen: a length lies outside [low, high] or is no number.
+        LoopOpen: a length is outside [low, high] or NaN.
 
     >>> closing(2.0 + 1e-15, 1.0, 2.0, "cylinder length")
     2.0
@@ -165,16 +161,16 @@ def closing(value: Scalar, low: Scalar, high: Scalar, what: str) -> Scalar:
         return np.clip(value, low, high)
     first = ~np.atleast_1d(inside)
     value, low, high = (np.broadcast_to(v, first.shape)[first][0] for v in (value, low, high))
-    raise LoopOpen(f"{what} {value:.6g} m asked, the bars allow [{low:.6g}, {high:.6g}] m")
+    raise LoopOpen(f"{what} {value:.6g} m requested, the bars allow [{low:.6g}, {high:.6g}] m")
 
 
 @dataclass(frozen=True)
 class TwoBar:
     """A cylinder across one joint with included angle B = direction * theta + angle_offset.
 
-    Where the pins lie in one plane across the joint's axis, the linkage is a plane triangle. Where
-    they do not, the cylinder ends in ball joints and the triangle is spatial: both pins move on
-    circles about the axis, whose planes are `axial_offset` apart.
+    If the pins are in one plane perpendicular to the joint's axis, the linkage is a plane triangle.
+    Otherwise the cylinder has ball ends and the triangle is spatial: both pins move on circles
+    about the axis, in planes at the distance `axial_offset`.
 
     Valid for B in (0, pi); at 0 and pi the moment arm is zero and the cylinder cannot hold.
     Source: Khoshzaban 1992 Eq. 3.26 and section 3.4.4 (p. 43), Zhu 1994 Eq. 6.13.
@@ -183,7 +179,7 @@ class TwoBar:
         lower: joint axis to cylinder pin on the inboard link [m], > 0.
         upper: joint axis to cylinder pin on the outboard link [m], > 0.
         angle_offset: included angle at theta = 0 [rad].
-        direction: +1 if the cylinder extends as theta grows, -1 if it retracts [-].
+        direction: +1 if the cylinder extends as theta increases, -1 if it retracts [-].
         axial_offset: distance of the pins along the joint's axis [m].
     """
 
@@ -194,7 +190,7 @@ class TwoBar:
     axial_offset: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse bars without length and a direction that is no sign."""
+        """Raise ValueError for bars without length or an invalid direction."""
         if self.lower <= 0 or self.upper <= 0:
             raise ValueError(
                 f"two-bar lengths must be positive, got lower={self.lower} upper={self.upper}"
@@ -203,7 +199,9 @@ class TwoBar:
             raise ValueError(f"two-bar direction must be +1 or -1, got {self.direction}")
 
     def length(self, theta: Scalar) -> Scalar:
-        """Pin-to-pin length c = sqrt((a - b)^2 + h^2 + 4 a b sin(B/2)^2), K Eq. 3.26 for h = 0.
+        """Return the pin-to-pin length c = sqrt((a - b)^2 + h^2 + 4 a b sin(B/2)^2).
+
+        For h = 0 this is K Eq. 3.26.
 
         Args:
             theta: joint angle, any shape [rad].
@@ -221,13 +219,13 @@ class TwoBar:
         return m.sqrt(constant + self.lower * self.upper * chord**2)
 
     def rate(self, theta: Scalar) -> Scalar:
-        """Signed moment arm dc/dtheta = direction a b sin(B) / c (Zhu Eq. 6.13).
+        """Return the signed moment arm dc/dtheta = direction a b sin(B) / c (Zhu Eq. 6.13).
 
         Args:
             theta: joint angle, any shape [rad].
 
         Returns:
-            Moment arm, shape of theta [m/rad]; positive if the cylinder extends as theta grows.
+            Moment arm, shape of theta [m/rad]; positive if the cylinder extends as theta increases.
 
         >>> round(TwoBar(0.625, 2.000, math.radians(78.6), 1).rate(math.radians(27.8)), 6)
         0.531173
@@ -237,10 +235,10 @@ class TwoBar:
         return self.direction * self.lower * self.upper * m.sin(included) / self.length(theta)
 
     def angle(self, length: Scalar) -> Scalar:
-        """Joint angle, theta = direction (B - angle_offset), on the branch B in [0, pi].
+        """Return the joint angle theta = direction (B - angle_offset), on the branch B in [0, pi].
 
-        tan(B/2)^2 = (p^2 - (a - b)^2) / ((a + b)^2 - p^2) of the length p = sqrt(c^2 - h^2) in the
-        plane across the axis, which needs no arc cosine.
+        tan(B/2)^2 = (p^2 - (a - b)^2) / ((a + b)^2 - p^2) with the length p = sqrt(c^2 - h^2) in
+        the plane perpendicular to the axis; this needs no arc cosine.
 
         Args:
             length: pin-to-pin length c, any shape [m], with p in [|a - b|, a + b].
@@ -249,7 +247,7 @@ class TwoBar:
             Joint angle, shape of length [rad].
 
         Raises:
-            LoopOpen: a length lies outside [|a - b|, a + b].
+            LoopOpen: a length is outside [|a - b|, a + b].
 
         >>> boom = TwoBar(0.625, 2.000, math.radians(78.6), 1)
         >>> round(math.degrees(boom.angle(2.2575379)), 4)
@@ -264,10 +262,10 @@ class TwoBar:
 def two_bar_from_points(
     base_pin: Point, rod_pin: Point, working_angle: float = 0.0, axial_offset: float = 0.0
 ) -> TwoBar:
-    """Two-bar linkage from its two cylinder pins, seen from the joint.
+    """Build a two-bar linkage from its two cylinder pins, relative to the joint.
 
-    B = |polar(rod) + theta - polar(base)|; the sign of the difference at the working angle is the
-    direction.
+    B = |polar(rod) + theta - polar(base)|; the direction is the sign of the difference at the
+    working angle.
 
     Args:
         base_pin: (x, z) of one cylinder pin in the inboard link's axes, from the joint [m].
@@ -279,8 +277,8 @@ def two_bar_from_points(
         The linkage, with B in (0, pi) at the working angle.
 
     Raises:
-        ValueError: the joint and both pins are in line at the working angle, so the direction is
-            open.
+        ValueError: the joint and both pins are collinear at the working angle, so that the
+            direction is undetermined.
 
     >>> two_bar_from_points((-2.0, 0.0), (0.0, 0.5), working_angle=-0.5)
     TwoBar(lower=2.0, upper=0.5, angle_offset=1.5707963267948966, direction=-1, axial_offset=0.0)
@@ -302,7 +300,7 @@ def two_bar_from_points(
 
 
 class FourBarPose(NamedTuple):
-    """Where the bars of a four-bar are.
+    """Angles and cylinder length of a four-bar.
 
     Attributes:
         rocker_angle: direction from rocker pivot to rod pin in the ground link's frame [rad].
@@ -318,21 +316,21 @@ class FourBarPose(NamedTuple):
 
 @dataclass(frozen=True)
 class FourBar:
-    """A cylinder that turns the output link (bucket) through a rocker and a coupler.
+    """A cylinder that rotates the output link (bucket) through a rocker and a coupler.
 
     The rod pin R joins cylinder, rocker and coupler. Every point is (x, z) [m]: x along the link, z
-    up. Output angle theta = 0 where the output frame is parallel to the ground link's frame (Zhu
+    up. At the output angle theta = 0 the output frame is parallel to the ground link's frame (Zhu
     1994 Fig. 6.36, Table 6.5).
 
     Attributes:
-        output_pivot: O, about which the output link turns, in the ground link's frame.
+        output_pivot: O, pivot of the output link, in the ground link's frame.
         rocker_pivot: P, in the ground link's frame.
         cylinder_base: B, in the ground link's frame.
         rocker: length P to R [m], > 0.
         coupler: length Q to R [m], > 0.
-        output_arm: Q as seen from O in the output link's frame.
-        assembly: +1 if R lies to the left of the way from P to Q, -1 if to the right [-].
-        working_angle: any output angle inside the working range [rad]; chooses the branches of
+        output_arm: Q relative to O in the output link's frame.
+        assembly: +1 if R is to the left of the line from P to Q, -1 if to the right [-].
+        working_angle: any output angle inside the working range [rad]; selects the branches of
             `angle`.
     """
 
@@ -346,14 +344,14 @@ class FourBar:
     working_angle: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse bars without length and an assembly that is no sign."""
+        """Raise ValueError for bars without length or an invalid assembly."""
         if self.rocker <= 0 or self.coupler <= 0 or math.hypot(*self.output_arm) <= 0:
             raise ValueError("four-bar rocker, coupler and output arm must have a positive length")
         if self.assembly not in (1, -1):
             raise ValueError(f"four-bar assembly must be +1 or -1, got {self.assembly}")
 
     def pins(self, theta: Scalar) -> tuple[Point, Point]:
-        """Pin Q of the output link and rod pin R, by intersecting the circles about P and Q.
+        """Return pin Q of the output link and rod pin R, by intersecting circles about P and Q.
 
         Args:
             theta: output angle, any shape [rad].
@@ -363,7 +361,7 @@ class FourBar:
             theta.
 
         Raises:
-            LoopOpen: rocker and coupler cannot meet at an angle asked.
+            LoopOpen: rocker and coupler cannot meet at a requested angle.
 
         >>> bucket = FourBar((1.8, 0.0), (1.5, 0.1), (-0.1, 0.2), 0.55, 0.48, (-0.2, 0.35))
         >>> q, r = bucket.pins(-1.0)
@@ -377,7 +375,7 @@ class FourBar:
         return q, third_pin(self.rocker_pivot, q, self.rocker, self.coupler, self.assembly)
 
     def pose(self, theta: Scalar) -> FourBarPose:
-        """Rocker angle, coupler angle and cylinder length.
+        """Return rocker angle, coupler angle and cylinder length.
 
         Args:
             theta: output angle, any shape [rad].
@@ -386,7 +384,7 @@ class FourBar:
             rocker_angle [rad], coupler_angle [rad], length [m], each with the shape of theta.
 
         Raises:
-            LoopOpen: rocker and coupler cannot meet at an angle asked.
+            LoopOpen: rocker and coupler cannot meet at a requested angle.
 
         >>> bucket = FourBar((1.8, 0.0), (1.5, 0.1), (-0.1, 0.2), 0.55, 0.48, (-0.2, 0.35))
         >>> [round(v, 4) for v in bucket.pose(-1.0)]
@@ -403,7 +401,7 @@ class FourBar:
         )
 
     def length(self, theta: Scalar) -> Scalar:
-        """Pin-to-pin length c = |R - B|.
+        """Return the pin-to-pin length c = |R - B|.
 
         Args:
             theta: output angle, any shape [rad].
@@ -412,7 +410,7 @@ class FourBar:
             Pin-to-pin length, shape of theta [m].
 
         Raises:
-            LoopOpen: rocker and coupler cannot meet at an angle asked.
+            LoopOpen: rocker and coupler cannot meet at a requested angle.
 
         >>> bucket = FourBar((1.8, 0.0), (1.5, 0.1), (-0.1, 0.2), 0.55, 0.48, (-0.2, 0.35))
         >>> round(bucket.length(-1.0), 4)
@@ -421,20 +419,20 @@ class FourBar:
         return self.pose(theta).length
 
     def rate(self, theta: Scalar) -> Scalar:
-        """Signed moment arm dc/dtheta = ratio ((R - P) x (R - B)) / c.
+        """Return the signed moment arm dc/dtheta = ratio ((R - P) x (R - B)) / c.
 
-        ratio = d(rocker angle)/dtheta = ((Q - O) x (R - Q)) / ((R - P) x (R - Q)), since the
+        ratio = d(rocker angle)/dtheta = ((Q - O) x (R - Q)) / ((R - P) x (R - Q)), because the
         coupler keeps its length.
 
         Args:
             theta: output angle, any shape [rad].
 
         Returns:
-            Moment arm, shape of theta [m/rad]; infinite where rocker and coupler are in line (a
-            dead point).
+            Moment arm, shape of theta [m/rad]; infinite if rocker and coupler are collinear (a dead
+            point).
 
         Raises:
-            LoopOpen: rocker and coupler cannot meet at an angle asked.
+            LoopOpen: rocker and coupler cannot meet at a requested angle.
 
         >>> bucket = FourBar((1.8, 0.0), (1.5, 0.1), (-0.1, 0.2), 0.55, 0.48, (-0.2, 0.35))
         >>> round(bucket.rate(-1.0), 4)
@@ -447,9 +445,9 @@ class FourBar:
         return ratio * cross(rocker, rod) / library(theta).sqrt(rod[0] ** 2 + rod[1] ** 2)
 
     def angle(self, length: Scalar) -> Scalar:
-        """Output angle: the triangle B-P-R gives R, then the triangle O-R-Q gives Q.
+        """Return the output angle: triangle B-P-R gives R, then triangle O-R-Q gives Q.
 
-        Of the two solutions of each, the one of the working angle is taken.
+        Of the two solutions of each triangle, the one on the branch of the working angle is used.
 
         Args:
             length: pin-to-pin length, any shape [m].
@@ -458,8 +456,8 @@ class FourBar:
             Output angle, shape of length [rad], within pi of the working angle.
 
         Raises:
-            LoopOpen: a length is out of reach of the rocker, or the rocker then out of reach of the
-                output arm, or rocker and coupler would have passed their dead point.
+            LoopOpen: the rocker cannot reach the length, the output arm cannot reach the rocker, or
+                rocker and coupler would have passed their dead point.
 
         >>> bucket = FourBar((1.8, 0.0), (1.5, 0.1), (-0.1, 0.2), 0.55, 0.48, (-0.2, 0.35))
         >>> round(bucket.angle(bucket.length(-1.0)), 9)

@@ -3,7 +3,8 @@
 A chain is a product of elementary transforms: translations along and rotations about x, y, z, each
 by a constant, a joint coordinate or both, and fixed transforms between them. Denavit-Hartenberg
 rows with Hayati's angle, the origins of a URDF and local products of exponentials are all written
-so, and the constants are the parameters that calibration finds. The cost is linear in the poses.
+in this form. The constants are the parameters of a calibration. The cost is linear in the number
+of poses.
 
 Source: Corke 2007, A simple and systematic approach to assigning Denavit-Hartenberg parameters
 (elementary transforms); Haviland and Corke 2023, Manipulator differential kinematics; Hayati 1983.
@@ -27,8 +28,8 @@ class Element:
         kind: translation `tx`, `ty`, `tz` [m], rotation `rx`, `ry`, `rz` [rad], or `fixed`.
         parameter: name of its constant, "" for none.
         value: nominal constant [m] or [rad].
-        joint: column of the joint coordinate that is added, None for none.
-        ratio: by which the joint coordinate is multiplied.
+        joint: column of the joint coordinate that is added, or None.
+        ratio: factor of the joint coordinate.
         matrix: (4, 4) homogeneous transform of a `fixed` element.
     """
 
@@ -51,12 +52,12 @@ class PosesAndRates(NamedTuple):
     """Poses with derivatives; n poses, p parameters, k joints.
 
     Attributes:
-        position: (n, 3) of the end [m].
-        rotation: (n, 3, 3) of the end.
-        position_by_parameter: (n, 3, p) [m/m] or [m/rad].
+        position: (n, 3) position of the end [m].
+        rotation: (n, 3, 3) rotation of the end.
+        position_by_parameter: (n, 3, p) derivative of the position [m/m] or [m/rad].
         rotation_by_parameter: (n, 3, p) rotation vector in the base frame [rad/m] or [1].
-        position_by_joint: (n, 3, k).
-        rotation_by_joint: (n, 3, k).
+        position_by_joint: (n, 3, k) derivative of the position.
+        rotation_by_joint: (n, 3, k) rotation vector in the base frame.
     """
 
     position: np.ndarray
@@ -72,22 +73,22 @@ class SerialChain:
     """A chain from its base to its end.
 
     Attributes:
-        joints: names, in the order of the columns of joint coordinates.
-        elements: from base to end.
+        joints: names of the joints, in the order of the columns of joint coordinates.
+        elements: elementary transforms from base to end.
     """
 
     joints: tuple[str, ...]
     elements: tuple[Element, ...]
 
     def __post_init__(self) -> None:
-        """Refuse what is no chain."""
+        """Raise ValueError for repeated parameter names or joints without effect."""
         names = self.parameters
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise ValueError(f"parameters must have names of their own: {', '.join(twice)}")
+            raise ValueError(f"parameter names must be unique: {', '.join(twice)}")
         used = {element.joint for element in self.elements} - {None}
         if used != set(range(len(self.joints))):
-            raise ValueError(f"every one of {len(self.joints)} joints must move an element")
+            raise ValueError(f"each of the {len(self.joints)} joints must move an element")
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -101,17 +102,17 @@ class SerialChain:
 
     @property
     def angular(self) -> np.ndarray:
-        """(p,) whether a constant is an angle [rad], not a length [m]."""
+        """(p,) whether a constant is an angle [rad] rather than a length [m]."""
         return np.array([e.kind[0] == "r" for e in self.elements if e.parameter], bool)
 
 
 def forward(chain: SerialChain, joints: np.ndarray, parameters: np.ndarray | None = None) -> Poses:
-    """Poses of the end; complex arguments give complex poses, for complex steps.
+    """Compute poses of the end; accepts complex arguments for complex-step derivatives.
 
     Args:
-        chain: of k joints and p parameters.
+        chain: chain with k joints and p parameters.
         joints: (n, k) joint coordinates [rad] or [m].
-        parameters: (p,) constants, None for the nominal ones.
+        parameters: (p,) constants; None for the nominal ones.
 
     Returns:
         n poses.
@@ -134,16 +135,16 @@ def forward(chain: SerialChain, joints: np.ndarray, parameters: np.ndarray | Non
 def forward_and_rates(
     chain: SerialChain, joints: np.ndarray, parameters: np.ndarray | None = None
 ) -> PosesAndRates:
-    """Poses of the end with exact derivatives by constants and joint coordinates.
+    """Compute poses of the end with exact derivatives by constants and joint coordinates.
 
-    An element turns or shifts all that lies beyond it about or along its own axis u through its
-    own origin o: a rotation moves the end by u x (p - o) and turns it by u, a translation moves it
+    An element rotates or translates everything beyond it about or along its axis u through its
+    origin o: a rotation moves the end by u x (p - o) and rotates it by u, a translation moves it
     by u.
 
     Args:
-        chain: of k joints and p parameters.
+        chain: chain with k joints and p parameters.
         joints: (n, k) joint coordinates [rad] or [m].
-        parameters: (p,) constants, None for the nominal ones.
+        parameters: (p,) constants; None for the nominal ones.
 
     Returns:
         n poses and their derivatives.
@@ -187,12 +188,12 @@ def forward_and_rates(
 def joint_axes(
     chain: SerialChain, joints: np.ndarray, parameters: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where the joints' axes are.
+    """Compute the positions and directions of the joint axes.
 
     Args:
-        chain: of k joints, each with one element.
+        chain: chain of k joints, each with one element.
         joints: (n, k) joint coordinates [rad] or [m].
-        parameters: (p,) constants, None for the nominal ones.
+        parameters: (p,) constants; None for the nominal ones.
 
     Returns:
         (n, k, 3) points on the axes [m] and (n, k, 3) their directions, in the base frame.
@@ -216,11 +217,11 @@ class DhRow:
 
     Attributes:
         theta: offset of the joint angle [rad].
-        d: along the joint's axis [m].
-        a: between the axes [m].
-        alpha: from this axis to the next [rad].
-        beta: Hayati's angle [rad], for the case that the next axis is parallel; None for none. d is
-            then no parameter.
+        d: distance along the joint's axis [m].
+        a: distance between the axes [m].
+        alpha: angle from this axis to the next [rad].
+        beta: Hayati's angle [rad] if the next axis is parallel, so that d is not a parameter; None
+            otherwise.
         prismatic: whether the joint coordinate is added to d.
     """
 
@@ -235,18 +236,18 @@ class DhRow:
 def chain_from_dh(
     rows: Sequence[DhRow], names: Sequence[str], tool: Sequence[float] | None = None
 ) -> SerialChain:
-    """A chain whose parameters are Denavit-Hartenberg constants.
+    """Build a chain whose parameters are Denavit-Hartenberg constants.
 
     Args:
-        rows: one per joint.
-        names: of the joints; parameters are called `theta.NAME`, `d.NAME` and so on.
+        rows: one row per joint.
+        names: names of the joints; parameters are called `theta.NAME`, `d.NAME` and so on.
         tool: (3,) point in the last frame [m], whose coordinates `x.tool`, `y.tool`, `z.tool` are
-            parameters, too; None for the last frame itself.
+            also parameters; None for the last frame itself.
 
     Returns:
         The chain.
 
-    Source: Denavit and Hartenberg 1955; Hayati 1983 (beta where axes are parallel).
+    Source: Denavit and Hartenberg 1955; Hayati 1983 (beta for parallel axes).
 
     >>> scara = chain_from_dh([DhRow(a=0.4, beta=0.0), DhRow(a=0.3)], ["a", "b"])
     >>> scara.parameters
@@ -272,18 +273,18 @@ def chain_from_frames(
     frames: Sequence[np.ndarray], axes: Sequence[Kind], names: Sequence[str],
     tool: Sequence[float] | None = None,
 ) -> SerialChain:  # fmt: skip
-    """A chain with six small errors in front of every joint: a local product of exponentials.
+    """Build a chain with six small errors in front of every joint (local product of exponentials).
 
-    Joint i turns about or slides along `axes[i]` of a frame that lies at `frames[i]` in the frame
-    behind joint i - 1. Its errors are `tx.NAME`, `ty.NAME`, `tz.NAME` [m] and `rx.NAME`, `ry.NAME`,
+    Joint i rotates about or translates along `axes[i]` of a frame at `frames[i]` in the frame after
+    joint i - 1. Its errors are `tx.NAME`, `ty.NAME`, `tz.NAME` [m] and `rx.NAME`, `ry.NAME`,
     `rz.NAME` [rad] in that frame, nominally zero. The form is complete and continuous for any
-    geometry, parallel axes included, and redundant: two of the six of a revolute joint can be told
-    only together with others.
+    geometry, parallel axes included, and redundant: two of the six errors of a revolute joint are
+    identifiable only in combinations.
 
     Args:
         frames: one (4, 4) per joint, and one more for the tool frame.
         axes: `rx` to `rz` for revolute, `tx` to `tz` for prismatic joints.
-        names: of the joints.
+        names: names of the joints.
         tool: (3,) nominal point in the tool frame [m], whose coordinates are parameters `x.tool`,
             `y.tool`, `z.tool`; None for the tool frame without errors.
 
@@ -293,7 +294,7 @@ def chain_from_frames(
     Source: Chen, Yang, Tan and Yeo 2001, Local POE model for robot kinematic calibration.
     """
     if len(frames) != len(names) + 1 or len(axes) != len(names):
-        raise ValueError(f"{len(names)} joints need as many axes and one frame more")
+        raise ValueError(f"{len(names)} joints need as many axes and one more frame")
     kinds: tuple[Kind, ...] = ("tx", "ty", "tz", "rx", "ry", "rz")
     elements = []
     for k, (frame, axis, name) in enumerate(zip(frames[:-1], axes, names, strict=True)):
@@ -306,10 +307,10 @@ def chain_from_frames(
 
 
 def exponential(twist: np.ndarray) -> np.ndarray:
-    """Motion of a screw, complex-safe: rotation by |w| about w with the pitch and point of v.
+    """Return the motion of a screw, a rotation by |w| about w with pitch and point of v.
 
     Args:
-        twist: (..., 6) v [m] and w [rad] of the screw, as exponents.
+        twist: (..., 6) v [m] and w [rad] of the screw, real or complex.
 
     Returns:
         (..., 4, 4) homogeneous transforms.
@@ -340,7 +341,7 @@ def exponential(twist: np.ndarray) -> np.ndarray:
 
 
 def product_of_exponentials(twists: np.ndarray, home: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """Poses exp(t1 q1) ... exp(tk qk) home; complex-safe.
+    """Return the poses exp(t1 q1) ... exp(tk qk) home, for real or complex arguments.
 
     Args:
         twists: (k, 6) v, w of the joints' screws in the base frame.
@@ -372,14 +373,14 @@ def _point(tool: Sequence[float] | None) -> list[Element]:
 def _checked(chain: SerialChain, joints: np.ndarray, constants: np.ndarray) -> np.ndarray:
     joints = np.atleast_2d(np.asarray(joints))
     if joints.ndim != 2 or joints.shape[1] != len(chain.joints):
-        raise ValueError(f"joints must be (n, {len(chain.joints)}), are {joints.shape}")
+        raise ValueError(f"joints must be (n, {len(chain.joints)}), got {joints.shape}")
     if constants.shape != (len(chain.parameters),):
-        raise ValueError(f"parameters must be ({len(chain.parameters)},), are {constants.shape}")
+        raise ValueError(f"parameters must be ({len(chain.parameters)},), got {constants.shape}")
     return joints
 
 
 def _amounts(chain: SerialChain, joints: np.ndarray, constants: np.ndarray):
-    """Every element with its coordinate, a number or (n,)."""
+    """Yield every element with its coordinate, a number or (n,)."""
     place = 0
     for element in chain.elements:
         amount = element.value
@@ -392,7 +393,7 @@ def _amounts(chain: SerialChain, joints: np.ndarray, constants: np.ndarray):
 
 
 def _moved(element: Element, amount, position: np.ndarray, rotation: np.ndarray):
-    """Position (n, 3) and rotation (n, 3, 3) behind an element."""
+    """Return position (n, 3) and rotation (n, 3, 3) after an element."""
     if element.kind == "fixed":
         assert element.matrix is not None
         return position + rotation @ element.matrix[:3, 3], rotation @ element.matrix[:3, :3]
@@ -408,7 +409,7 @@ def _moved(element: Element, amount, position: np.ndarray, rotation: np.ndarray)
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(n, 3) cross products; `np.cross` takes five times as long."""
+    """Return cross products (n, 3), five times faster than `np.cross`."""
     return np.stack(
         [a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1], a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2],
          a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]], axis=1,

@@ -1,13 +1,11 @@
-"""Serial robots: joints with origins and axes, kinematic errors, poses, inverse kinematics.
+"""Serial robots: files, joint corrections, forward and inverse kinematics.
 
-A robot is a chain of joints with an origin each, as in a URDF: joint i turns about, or slides
-along, its axis in a frame that lies at its origin behind joint i - 1. Joints may deviate from what
-their encoders say: they yield under gravity, and an encoder that is not centred errs once per turn.
+A robot is a chain of joints, each with an origin as in a URDF: joint i rotates about, or translates
+along, its axis in a frame at its origin after joint i - 1. Joint positions may deviate from the
+encoder readings: joints deflect under gravity, and an eccentric encoder has an error once per turn.
 
-Serial robots as files: read from YAML, URDF or MJCF, and written back with corrections.
-
-A YAML file adds what URDF has no words for: where gravity points, and how joints deviate from what
-their encoders say.
+Robots are read from YAML, URDF or MJCF, and written with corrections. A YAML file adds the
+direction of gravity and the joint corrections, which URDF cannot express.
 """
 
 import math
@@ -33,20 +31,20 @@ from hydrotele.kinematics.serial_chain import (
 )
 
 GRAVITY = (0.0, 0.0, -9.81)
-"""Of a robot that stands upright [m/s^2]."""
+"""Gravity of an upright robot in its base frame [m/s^2]."""
 
-_SAME = 1e-12  # by which an axis may miss a coordinate axis
-_SILENT = 1e-5  # N m of a kilogram: rounding
+_SAME = 1e-12  # tolerance for an axis that is parallel to a coordinate axis
+_SILENT = 1e-5  # N m per kilogram: rounding
 
 
 @dataclass(frozen=True)
 class RobotJoint:
-    """One joint.
+    """One joint of a robot.
 
     Attributes:
-        name: as in the robot's file.
+        name: name in the robot's file.
         kind: `revolute` or `prismatic`.
-        origin: (4, 4) its frame in the frame behind the joint before [m].
+        origin: (4, 4) its frame in the frame after the joint before [m].
         axis: (3,) unit vector in that frame.
     """
 
@@ -61,13 +59,13 @@ class Robot:
     """A serial robot with a ball at its end.
 
     Attributes:
-        name: of the robot.
-        joints: from the base on.
-        tool: (4, 4) frame of the ball behind the last joint [m].
-        gravity: (3,) in the base frame [m/s^2].
-        corrections: parameters of joint corrections, name -> value [rad/m] or [rad], which
-            `hydrotele.calibrate.joint_corrections` explains.
-        source: file it came from.
+        name: name of the robot.
+        joints: joints, starting at the base.
+        tool: (4, 4) frame of the ball after the last joint [m].
+        gravity: (3,) gravity in the base frame [m/s^2].
+        corrections: parameters of joint corrections by name, [rad s^2/m^2] or [rad], as defined in
+            `deflection_names`.
+        source: file that it was read from.
     """
 
     name: str
@@ -84,14 +82,15 @@ class Robot:
 
 
 def robot_chain(robot: Robot) -> SerialChain:
-    """The chain of a robot with six errors in front of every joint and the ball's coordinates.
+    """Build the chain of a robot with six errors in front of every joint and the ball position.
 
     Args:
-        robot: with joints along any axes.
+        robot: robot with joints along any axes.
 
     Returns:
-        The chain; every joint turns about or slides along z of its frame, so that `rz.JOINT` is the
-        offset of a revolute joint's angle, and `x.tool`, `y.tool`, `z.tool` place the ball.
+        The chain; every joint rotates about or translates along z of its frame, so that `rz.JOINT`
+        is the offset of a revolute joint's angle. `x.tool`, `y.tool`, `z.tool` are the ball
+        position.
     """
     frames, back = [], np.eye(4)
     for joint in robot.joints:
@@ -99,7 +98,7 @@ def robot_chain(robot: Robot) -> SerialChain:
         turn[:3, :3] = _from_z(joint.axis)
         frames.append(back @ joint.origin @ turn)
         back = turn.T
-    # The ball's place is a parameter, so the last frame only turns.
+    # The ball position is a parameter, so the last frame has no translation.
     end = back.copy()
     tool = robot.tool
     frames.append(end)
@@ -110,15 +109,15 @@ def robot_chain(robot: Robot) -> SerialChain:
 def corrected_robot(
     robot: Robot, values: Mapping[str, float], corrections: Mapping[str, float]
 ) -> Robot:
-    """A robot whose origins and ball contain calibrated parameters.
+    """Return a robot whose origins and ball position include calibrated parameters.
 
     Args:
-        robot: that was calibrated.
-        values: parameters of `robot_chain`, name -> value.
-        corrections: of its joints, name -> value.
+        robot: the robot that was calibrated.
+        values: parameters of `robot_chain` by name.
+        corrections: joint corrections by name.
 
     Returns:
-        The robot; `robot_chain` of it gives the poses of the calibrated chain without errors.
+        The robot; its `robot_chain` gives the poses of the calibrated chain at zero errors.
     """
     joints = []
     for joint in robot.joints:
@@ -135,16 +134,17 @@ def corrected_robot(
 
 
 def deflection_names(robot: Robot, gravity: bool, eccentricity: bool) -> tuple[str, ...]:
-    """Parameters by which a robot's joints may deviate from their encoders.
+    """Return the names of a robot's joint correction parameters.
 
     Args:
         robot: the robot.
-        gravity: joints that yield: `sag.JOINT.PLACE` for a mass at a joint beyond, or at the ball
-            (`tool`), whose weight turns the joint: compliance times mass [rad s^2/m^2].
-        eccentricity: `sine.JOINT` and `cosine.JOINT`, errors once per turn [rad].
+        gravity: include joint deflection under gravity: `sag.JOINT.PLACE` for a mass at a joint
+            beyond, or at the ball (`tool`); compliance times mass [rad s^2/m^2].
+        eccentricity: include `sine.JOINT` and `cosine.JOINT`, encoder errors once per turn [rad].
 
     Returns:
-        The names. Masses that turn a joint alike count once, those that never turn it not at all.
+        The names. Of masses with the same torque on a joint one is included; masses without torque
+        are not included.
     """
     names: list[str] = []
     if gravity:
@@ -173,20 +173,20 @@ def deflection_names(robot: Robot, gravity: bool, eccentricity: bool) -> tuple[s
 
 
 def deflections(robot: Robot, joints: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """How much joints deviate from their encoders per unit of parameters.
+    """Return the deviations of joints from their encoder readings per unit of each parameter.
 
-    A mass m at r turns a joint at o with axis u by c m u . (r - o) x g.
+    A mass m at r rotates a joint at o with axis u by c m u . (r - o) x g.
 
     Args:
-        robot: the robot; its geometry need not be calibrated for that.
+        robot: the robot; nominal geometry is sufficient.
         joints: (n, k) encoder readings [rad] or [m].
-        names: of the e parameters, as from `deflection_names`.
+        names: names of the e parameters, as from `deflection_names`.
 
     Returns:
         (n, k, e) derivatives of the joints' deviations.
 
     Raises:
-        ValueError: a parameter names a joint or a kind that there is not.
+        ValueError: a parameter name has an unknown joint or kind.
     """
     made = np.zeros((len(joints), len(robot.joints), len(names)))
     if not names:
@@ -199,12 +199,12 @@ def deflections(robot: Robot, joints: np.ndarray, names: Sequence[str]) -> np.nd
         kind, _, rest = name.partition(".")
         joint = next((n for n in robot.names if rest == n or rest.startswith(f"{n}.")), None)
         if joint is None or kind not in ("sag", "sine", "cosine"):
-            raise ValueError(f"{name!r} is no correction of a joint of {robot.name}")
+            raise ValueError(f"{name!r} is not a joint correction of {robot.name}")
         i = order[joint]
         if kind == "sag":
             place = rest.removeprefix(f"{joint}.")
             if place not in order:
-                raise ValueError(f"{name!r}: there is no place {place!r} in {robot.name}")
+                raise ValueError(f"{name!r}: {robot.name} has no place {place!r}")
             weight = np.cross(places[:, order[place]] - points[:, i], robot.gravity)
             made[:, i, e] = np.sum(ways[:, i] * weight, axis=1)
         else:
@@ -213,10 +213,10 @@ def deflections(robot: Robot, joints: np.ndarray, names: Sequence[str]) -> np.nd
 
 
 def robot_poses(robot: Robot, joints: np.ndarray) -> Poses:
-    """Poses of the ball with all corrections of a robot.
+    """Compute poses of the ball with all corrections of a robot.
 
     Args:
-        robot: nominal or calibrated.
+        robot: nominal or calibrated robot.
         joints: (n, k) encoder readings [rad] or [m].
 
     Returns:
@@ -226,7 +226,7 @@ def robot_poses(robot: Robot, joints: np.ndarray) -> Poses:
 
 
 class Reached(NamedTuple):
-    """Joint coordinates for places; `missed` is what is left [m]."""
+    """Joint coordinates for ball positions; `missed` is the remaining distance [m]."""
 
     joints: np.ndarray
     missed: np.ndarray
@@ -236,20 +236,20 @@ def joints_for_places(
     robot: Robot, places: np.ndarray, start: np.ndarray, iterations: int = 50,
     idle: int | None = None,
 ) -> Reached:  # fmt: skip
-    """Encoder readings that bring the ball to places: resolved motion to the end.
+    """Compute encoder readings that bring the ball to given positions, by resolved motion.
 
-    Every step is the one of least norm that closes the gap, by the robot's Jacobian with a damping
-    that vanishes with the gap.
+    Every step is a damped minimum-norm step with the robot's Jacobian; the damping vanishes with
+    the remaining distance.
 
     Args:
-        robot: nominal or calibrated.
-        places: (n, 3) in the base frame [m].
-        start: (n, k) where the joints are.
-        iterations: most steps.
-        idle: column of a joint that does not move; None for none.
+        robot: nominal or calibrated robot.
+        places: (n, 3) ball positions in the base frame [m].
+        start: (n, k) start of the joints.
+        iterations: maximum number of steps.
+        idle: column of a joint that does not move, or None.
 
     Returns:
-        (n, k) readings and (n,) distances that are left.
+        (n, k) readings and (n,) remaining distances.
 
     Source: Wampler 1986 (damped least squares).
     """
@@ -279,7 +279,10 @@ def _deviated(robot: Robot, joints: np.ndarray) -> np.ndarray:
 
 
 def frame(position: Sequence[float], rpy: Sequence[float] = (0.0, 0.0, 0.0)) -> np.ndarray:
-    """(4, 4) transform of a place [m] and roll, pitch, yaw [rad]: Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Return the transform (4, 4) of a position [m] and roll, pitch, yaw [rad].
+
+    The rotation is Rz(yaw) Ry(pitch) Rx(roll).
+    """
     made = np.eye(4)
     made[:3, :3] = _about("z", rpy[2]) @ _about("y", rpy[1]) @ _about("x", rpy[0])
     made[:3, 3] = position
@@ -287,7 +290,7 @@ def frame(position: Sequence[float], rpy: Sequence[float] = (0.0, 0.0, 0.0)) -> 
 
 
 def rpy_of(rotation: np.ndarray) -> np.ndarray:
-    """Roll, pitch, yaw [rad] of a rotation (3, 3); yaw is 0 where the pitch is a right angle."""
+    """Return roll, pitch, yaw [rad] of a rotation (3, 3); yaw is 0 if the pitch is +-pi/2."""
     sine = -rotation[2, 0]
     cosine = math.hypot(rotation[2, 1], rotation[2, 2])
     pitch = math.atan2(sine, cosine)
@@ -308,7 +311,7 @@ def _about(axis: str, angle: float) -> np.ndarray:
 
 
 def _from_z(axis: np.ndarray) -> np.ndarray:
-    """The smallest rotation that turns z to an axis; half a turn about x for -z."""
+    """Return the smallest rotation from z to an axis; half a turn about x for -z."""
     x, y, z = axis
     if z < -1.0 + _SAME:
         return np.diag([1.0, -1.0, -1.0])
@@ -317,14 +320,14 @@ def _from_z(axis: np.ndarray) -> np.ndarray:
 
 
 ROBOTS = "robots"
-"""Folder of the shipped robots, inside the one of the models."""
+"""Folder of the shipped robots, inside the models folder."""
 
 _BALLS = ("calibrated_ball", "ball", "tcp", "tool", "tip", "ee", "end_effector", "flange", "hand")
 _MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 
 
 def shipped_robots() -> list[str]:
-    """Names of the robots that come with the package."""
+    """Return the names of the robots that are part of the package."""
     return sorted(path.stem for path in (models_folder() / ROBOTS).glob("*.yaml"))
 
 
@@ -333,13 +336,13 @@ def load_robot(name_or_path: str | Path, joints: int | None = None) -> Robot:
 
     Args:
         name_or_path: a shipped robot, or a file: YAML, URDF or MJCF (.yaml, .urdf, .xml).
-        joints: number of moving joints that the chain must have, None for the longest chain.
+        joints: number of moving joints that the chain must have; None for the longest chain.
 
     Returns:
         The robot.
 
     Raises:
-        InputError: there is no such robot, its file is wrong, or it has another number of joints.
+        InputError: there is no such robot, its file is invalid, or its number of joints differs.
     """
     path = Path(name_or_path)
     if str(name_or_path) in shipped_robots():
@@ -358,10 +361,10 @@ def load_robot(name_or_path: str | Path, joints: int | None = None) -> Robot:
         elif root.tag == "robot":
             robot = _from_urdf(path, root, joints)
         else:
-            raise InputError(path, f"is no robot: its first element is <{root.tag}>")
+            raise InputError(path, f"is not a robot file: its first element is <{root.tag}>")
     if joints is not None and len(robot.joints) != joints:
         raise InputError(
-            path, f"has {len(robot.joints)} moving joints, the data have {joints} columns"
+            path, f"has {len(robot.joints)} moving joints, but the data have {joints} columns"
         )
     return robot
 
@@ -404,11 +407,11 @@ def _from_yaml(path: Path) -> Robot:
 
 
 def robot_yaml(robot: Robot, source: str) -> str:
-    """A robot as the text of a YAML file that `load_robot` reads.
+    """Return a robot as the text of a YAML file that `load_robot` reads.
 
     Args:
-        robot: to be written; numbers keep all their digits.
-        source: a sentence that says where the numbers are from.
+        robot: the robot; numbers keep all digits.
+        source: a sentence on the source of the numbers.
 
     Returns:
         The text.
@@ -428,17 +431,17 @@ def robot_yaml(robot: Robot, source: str) -> str:
 
 
 def corrected_urdf(robot: Robot, text: str) -> str:
-    """A URDF with the origins of a calibrated robot.
+    """Return a URDF with the origins of a calibrated robot.
 
-    Fixed joints keep their origins; a moving joint takes up what the calibrated chain has in front
-    of it. The ball is the child `calibrated_ball` of the last moving link.
+    Fixed joints keep their origins; the errors in front of a moving joint are added to its origin.
+    The ball is the child `calibrated_ball` of the last moving link.
 
     Args:
-        robot: calibrated, from that URDF.
+        robot: calibrated robot, read from this URDF.
         text: the URDF.
 
     Returns:
-        The text of the new URDF, without joint corrections, for which URDF has no words.
+        The text of the new URDF, without joint corrections, which URDF cannot express.
     """
     root = ElementTree.fromstring(text)
     found = {joint.get("name"): joint for joint in root.findall("joint")}
@@ -472,7 +475,7 @@ def _from_urdf(path: Path, root: ElementTree.Element, count: int | None) -> Robo
             way.insert(0, by_child[at])
             at = _link(by_child[at], "parent")
         if len(way) > len(joints):
-            raise InputError(path, f"joints around link {link!r} make a circle")
+            raise InputError(path, f"joints around link {link!r} form a closed loop")
         ways.append(way)
 
     def moving(way: list[ElementTree.Element]) -> int:
@@ -515,7 +518,7 @@ def _from_mjcf(path: Path, count: int | None) -> Robot:
             body.explicitinertial, body.mass, body.inertia = True, 1.0, (1.0, 1.0, 1.0)
         model = spec.compile()
     except (ValueError, mujoco.FatalError) as error:
-        raise InputError(path, f"is not read by MuJoCo: {str(error).strip()}") from None
+        raise InputError(path, f"cannot be read by MuJoCo: {str(error).strip()}") from None
     data = mujoco.MjData(model)
     data.qpos[:] = 0.0
     mujoco.mj_kinematics(model, data)
@@ -567,7 +570,7 @@ def _from_mjcf(path: Path, count: int | None) -> Robot:
 def _xml(path: Path) -> ElementTree.Element:
     text = read_text(path)
     if "<!ENTITY" in text:
-        raise InputError(path, "declares XML entities, which are not read")
+        raise InputError(path, "declares XML entities, which are not supported")
     try:
         return ElementTree.fromstring(text)
     except ElementTree.ParseError as error:

@@ -1,9 +1,9 @@
-"""Task coordinates of an arm for a control loop: pose to joints and rates, compiled, both arms.
+"""Compiled task-space kinematics of an arm for control loops: poses, joint angles and rates.
 
-One set of formulas serves the excavator (swing, boom, stick, tool) and the feller-buncher (and a
-head that turns the tool aside): for a head angle h the tool lies `along + radius cos h` ahead of
-the tool pin and `side - radius sin h` beside the arm's plane. `arm` and `five_dof` hold the same
-geometry for people, with reasons for what cannot be reached; here it is a status.
+The same equations serve the excavator (swing, boom, stick, tool) and the feller-buncher, with a
+head that rotates the tool sideways. At the head angle h the tool is `along + radius cos h` ahead of
+the tool pin and `side - radius sin h` to the left of the swing axis. `arm` and `five_dof` implement
+the same geometry with error messages; these functions return a status instead.
 """
 
 import math
@@ -16,14 +16,14 @@ from hydrotele.kinematics.five_dof import FellerGeometry
 
 BASE_RADIUS, BASE_HEIGHT, SIDE, BOOM, STICK, BEND, ALONG, UP, HEAD = range(9)
 REACHED, BEYOND, SINGULAR = range(3)
-_STRAIGHT = 1e-3  # sine of the elbow below which rates are not solved for
+_STRAIGHT = 1e-3  # sine of the elbow, or radius [m], below which rates are not computed
 
 
 def arm_parameters(geometry: ArmGeometry | FellerGeometry) -> np.ndarray:
-    """Numbers (9,) of an arm for the functions below [m], [rad].
+    """Return the parameters (9,) of an arm for the functions of this module [m], [rad].
 
     Args:
-        geometry: of an excavator's arm, with or without a tool joint, or of a feller-buncher's.
+        geometry: an excavator's arm, with or without a tool joint, or a feller-buncher's arm.
 
     Returns:
         BASE_RADIUS, BASE_HEIGHT, SIDE, BOOM, STICK, BEND (angle from the stick to the outer bar),
@@ -48,13 +48,13 @@ def arm_parameters(geometry: ArmGeometry | FellerGeometry) -> np.ndarray:
 
 @compiled
 def task_forward(g, q, pose):
-    """Pose of the tip.
+    """Compute the pose of the tip.
 
     Args:
-        g: (9,) of `arm_parameters`.
+        g: (9,) output of `arm_parameters`.
         q: (k,) swing, boom, stick and, if driven, tool and head angle [rad]; k is 3, 4 or 5.
-        pose: (5,) written: r [m], theta [rad], z [m], attitude [rad], head [rad]; what the arm has
-            not is 0, but the attitude, which is that of the last link.
+        pose: (5,) written: r [m], theta [rad], z [m], attitude [rad], head [rad]; the head angle is
+            0 for an arm without a head, the attitude is that of the last link.
 
     Returns:
         Nothing.
@@ -79,13 +79,13 @@ def task_forward(g, q, pose):
 
 @compiled
 def task_inverse(g, pose, near, q):
-    """Joint angles for a pose, with the elbow above and the tip ahead.
+    """Compute the joint angles for a pose, with the elbow above and the tip ahead.
 
     Args:
-        g: (9,) of `arm_parameters`.
-        pose: (5,) as `task_forward` writes it.
-        near: swing angle of now, scalar [rad]: the turn nearest to it is taken.
-        q: (k,) written, unless the pose is out of reach [rad].
+        g: (9,) output of `arm_parameters`.
+        pose: (5,) pose as written by `task_forward`.
+        near: present swing angle, scalar [rad]; the result is within half a turn of it.
+        q: (k,) joint angles [rad], written unless the pose is out of reach.
 
     Returns:
         REACHED or BEYOND (the workspace).
@@ -121,19 +121,19 @@ def task_inverse(g, pose, near, q):
 
 @compiled
 def task_rates(g, q, pose, rate, out):
-    """Joint rates for a rate of the pose.
+    """Compute the joint rates for a rate of the pose.
 
     Args:
-        g: (9,) of `arm_parameters`.
+        g: (9,) output of `arm_parameters`.
         q: (k,) joint angles [rad].
-        pose: (5,) of these angles.
-        rate: (5,) of the pose [m/s], [rad/s].
-        out: (k,) joint rates, written unless the elbow is straight [rad/s].
+        pose: (5,) pose at these angles.
+        rate: (5,) rate of the pose [m/s], [rad/s].
+        out: (k,) joint rates [rad/s], written unless the status is SINGULAR.
 
     Returns:
-        REACHED or SINGULAR (a straight elbow, a tip on the swing axis).
+        REACHED or SINGULAR (a straight elbow, or a tip on the swing axis).
 
-    Source: derivative of `task_forward`, solved by hand.
+    Source: closed-form solution of the derivative of `task_forward`.
     """
     k = len(q)
     head, turning = (q[4], rate[4]) if k > 4 else (0.0, 0.0)
@@ -164,10 +164,10 @@ def task_rates(g, q, pose, rate, out):
 
 @compiled
 def task_jacobian(g, q, out):
-    """Derivative of `task_forward` by the joint angles.
+    """Compute the Jacobian of `task_forward`.
 
     Args:
-        g: (9,) of `arm_parameters`.
+        g: (9,) output of `arm_parameters`.
         q: (k,) joint angles [rad].
         out: (k, k) written: d (r, theta, z, attitude, head) / d q, the first k rows [m/rad], [1].
 

@@ -1,13 +1,13 @@
-"""The 3-2-1 wire method: six wires to three points of a platform measure its pose.
+"""Pose measurement by the 3-2-1 wire method: six wires to three points of a platform.
 
-Three wires end in the first point, two in the second, one in the third. The first point is the
-intersection of three spheres; with its distance to the second known, that is another one, and so is
-the third. Each has two solutions, mirrored in the plane of the centres; the one near an expected
-pose is taken.
+Three wires end at the first point, two at the second, one at the third. The first point is the
+intersection of three spheres. With the known distances between the points, the second and the third
+point are also intersections of three spheres. Each intersection has two solutions, mirrored in the
+plane of the centres; the one near an expected pose is used.
 
-Source: Wang 2012, chapter 5 (3-2-1 wire-based pose estimation, three spheres' intersection); the
-chapter is not in the published text we have, so that the equations here are those of trilateration
-by Manolakis 1996 and Thomas and Ros 2005.
+Source: Wang 2012, chapter 5 (3-2-1 wire-based pose estimation, three spheres' intersection). The
+chapter is not in the available text; the equations are those of trilateration by Manolakis 1996
+and Thomas and Ros 2005.
 """
 
 from typing import Annotated
@@ -22,10 +22,11 @@ _POINT = (0, 0, 0, 1, 1, 2)  # platform point of each wire
 
 
 class Wires(Facts):
-    """Where six wires begin and end.
+    """Geometry of six wires.
 
     Attributes:
-        anchors: of the six wires in frame 0 [m]: three of the first point, two of the second, one.
+        anchors: fixed ends of the wires in frame 0 [m]: three for the first point, two for the
+            second, one for the third.
         points: the three points in the moving platform's frame [m].
     """
 
@@ -34,25 +35,25 @@ class Wires(Facts):
 
 
 class NoIntersection(ValueError):
-    """Wires are too short to meet, or too long to reach each other."""
+    """The wires are too short to meet, or too long to reach each other."""
 
 
 def wire_lengths(wires: Wires, pose: Pose) -> np.ndarray:
-    """Lengths of the six wires at poses.
+    """Compute the lengths of the six wires at poses.
 
     Args:
-        wires: where they begin and end.
-        pose: of the moving platform, (...).
+        wires: geometry of the wires.
+        pose: (...) poses of the moving platform.
 
     Returns:
-        (..., 6) [m].
+        (..., 6) lengths [m].
     """
     ends = np.einsum("...ij,kj->...ki", pose.rotation, np.array(wires.points)[list(_POINT)])
     return np.linalg.norm(ends + pose.position[..., None, :] - np.array(wires.anchors), axis=-1)
 
 
 def trilaterate(centres: np.ndarray, radii: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Intersection of three spheres.
+    """Compute the intersection of three spheres.
 
     In the frame with x from centre 1 to 2 and y in the centres' plane, with d = |c2 - c1| and
     centre 3 at (i, j): x = (r1^2 - r2^2 + d^2) / 2d, y = (r1^2 - r3^2 + i^2 + j^2) / 2j - i x / j,
@@ -60,11 +61,11 @@ def trilaterate(centres: np.ndarray, radii: np.ndarray, near: np.ndarray) -> np.
 
     Args:
         centres: (..., 3, 3) centres, one per row [m].
-        radii: (..., 3) [m].
-        near: (..., 3) where about the point is: it selects one of the two solutions.
+        radii: (..., 3) radii [m].
+        near: (..., 3) approximate position, which selects one of the two solutions [m].
 
     Returns:
-        (..., 3) [m].
+        (..., 3) intersections [m].
 
     Raises:
         NoIntersection: the spheres do not meet.
@@ -94,18 +95,19 @@ def trilaterate(centres: np.ndarray, radii: np.ndarray, near: np.ndarray) -> np.
 
 
 def pose_of_wires(wires: Wires, lengths: np.ndarray, near: Pose) -> Pose:
-    """Pose of the platform from the six wires' lengths.
+    """Compute the pose of the platform from the lengths of the six wires.
 
     Args:
-        wires: where they begin and end.
-        lengths: (..., 6) [m].
-        near: expected poses (...), such as the nominal kinematics', which select the solutions.
+        wires: geometry of the wires.
+        lengths: (..., 6) lengths [m].
+        near: (...) expected poses, such as those of the nominal kinematics, which select the
+            solutions.
 
     Returns:
         The poses.
 
     Raises:
-        NoIntersection: the lengths do not fit together.
+        NoIntersection: the lengths are inconsistent.
     """
     lengths = np.asarray(lengths, float)
     anchors, points = np.array(wires.anchors), np.array(wires.points)
@@ -127,7 +129,7 @@ def pose_of_wires(wires: Wires, lengths: np.ndarray, near: Pose) -> Pose:
 
 
 def _triad(first, second, third) -> np.ndarray:
-    """(..., 3, 3) axes of three points: x from the first to the second, z across all of them."""
+    """Return axes (..., 3, 3) of three points: x from first to second, z normal to their plane."""
     x = second - first
     x = x / np.linalg.norm(x, axis=-1, keepdims=True)
     z = np.cross(x, third - first)
@@ -136,11 +138,11 @@ def _triad(first, second, third) -> np.ndarray:
 
 
 def wire_jacobian(wires: Wires, pose: Pose) -> np.ndarray:
-    """Derivatives of the wires' lengths by the pose, position [m] and rotation vector [rad].
+    """Compute the derivatives of the wire lengths by position [m] and rotation vector [rad].
 
     Args:
-        wires: where they begin and end.
-        pose: of the moving platform, (...).
+        wires: geometry of the wires.
+        pose: (...) poses of the moving platform.
 
     Returns:
         (..., 6, 6): row k is (u_k, (R p_k) x u_k), u_k the direction of wire k.
@@ -152,17 +154,18 @@ def wire_jacobian(wires: Wires, pose: Pose) -> np.ndarray:
 
 
 def pose_covariance(wires: Wires, pose: Pose, sigma: float) -> np.ndarray:
-    """Covariance of a pose from wires whose lengths have independent errors.
+    """Compute the covariance of poses from wires whose lengths have independent errors.
 
-    J^-1 sigma^2 J^-T with J of `wire_jacobian`: the pose is what reproduces all six lengths.
+    The covariance is J^-1 sigma^2 J^-T with J of `wire_jacobian`, because the pose reproduces all
+    six lengths.
 
     Args:
-        wires: where they begin and end.
-        pose: measured, (...).
+        wires: geometry of the wires.
+        pose: (...) measured poses.
         sigma: standard deviation of a wire's length [m].
 
     Returns:
-        (..., 6, 6) of position [m] and rotation vector [rad] in frame 0.
+        (..., 6, 6) covariance of position [m] and rotation vector [rad] in frame 0.
     """
     inverse = np.linalg.inv(wire_jacobian(wires, pose))
     return sigma**2 * inverse @ np.swapaxes(inverse, -1, -2)

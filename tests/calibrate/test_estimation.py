@@ -113,8 +113,8 @@ def test_differences_by_groups_are_those_one_by_one():
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"scales": [1.0, 0.0, 1.0]}, "sizes of b"),
-        ({"start": [1.0]}, "must fit"),
+        ({"scales": [1.0, 0.0, 1.0]}, "scales of b"),
+        ({"start": [1.0]}, "must match"),
         ({"sigma": -1.0}, "sigma"),
     ],
 )

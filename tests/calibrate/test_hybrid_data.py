@@ -91,10 +91,10 @@ def test_parquet_with_units_in_the_metadata_and_covariances(folder, copied):
         (cell(3, "leg.2", "word"), "leg.2"),
         (lambda t: [t[0].replace("leg.1 [mm]", "leg.1"), *t[1:]], r"column 'leg.1', row 0.*\[mm\]"),
         (lambda t: [t[0].replace("theta3 [deg]", "theta3"), *t[1:]], r"joint.theta3.*\[deg\]"),
-        (lambda t: [t[0].replace("leg.1 [mm]", "leg.1 [deg]"), *t[1:]], "it needs m or mm"),
+        (lambda t: [t[0].replace("leg.1 [mm]", "leg.1 [deg]"), *t[1:]], "but needs m or mm"),
         (lambda t: [t[0].replace("leg.1 [mm]", "leg_1 [mm]"), *t[1:]], "did you mean 'leg.1'"),
-        (lambda t: [x.split(",", 1)[1] for x in t], "lacks joint.d1"),
-        (lambda t: t[:1], "holds no pose"),
+        (lambda t: [x.split(",", 1)[1] for x in t], "has no column joint.d1"),
+        (lambda t: t[:1], "contains no pose"),
         (cell(2, "wire.4", "100"), "the wires do not meet at pose 3"),
     ],
 )
@@ -107,7 +107,7 @@ def test_a_wrong_table_is_refused_by_file_column_row(copied, change, message):
 def test_files_of_another_robot_are_refused(copied, tmp_path):
     text = (copied / "measurement.yaml").read_text()
     (copied / "measurement.yaml").write_text(text.replace("robot: iwr", "robot: hexa"))
-    with pytest.raises(InputError, match="of the robot 'hexa', the model is 'iwr'"):
+    with pytest.raises(InputError, match="of the robot 'hexa', but the model is 'iwr'"):
         read_measurement(copied, IWR)
     (copied / "measurement.yaml").write_text(text.replace("robot: iwr\n", ""))
     measured, _ = read_measurement(copied, IWR)
@@ -119,9 +119,9 @@ def test_files_of_another_robot_are_refused(copied, tmp_path):
     save_measurement(copied, "poses", IWR, joints, measured.legs, pose=measured.pose)
     with pytest.raises(InputError, match="it is of another robot, in other units"):
         read_measurement(copied, IWR)
-    with pytest.raises(InputError, match="is no folder"):
+    with pytest.raises(InputError, match="is not a folder"):
         read_measurement(tmp_path / "nowhere", IWR)
-    with pytest.raises(InputError, match=r"holds neither poses.csv nor poses.parquet"):
+    with pytest.raises(InputError, match=r"contains neither poses.csv nor poses.parquet"):
         read_measurement(tmp_path, IWR)
 
 
@@ -156,7 +156,7 @@ def test_simulated_measurements_repeat_by_their_seed(folder, tmp_path):
     ("arguments", "message"),
     [
         ([], "give either --data FOLDER or --simulate FOLDER"),
-        (["--data", "nowhere"], "is no folder"),
+        (["--data", "nowhere"], "is not a folder"),
         (["--data", "{}", "--model", "mdh"], "valid: auto, dh, poe"),
         (["--data", "{}", "--parameters", "a9x"], "parameter 'a9x'"),
         (["--data", "{}", "--robot", "iwrr"], "valid: iwr"),

@@ -214,9 +214,9 @@ def test_a_joint_that_never_moves_stays_unknown_by_name():
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--heldout", "nowhere"], "no place of the data"),
+        (["--heldout", "nowhere"], "not a place of the data"),
         (["--robot", "pandas"], "did you mean 'panda'"),
-        (["--robot", "ur5e"], "6 moving joints, the data have 7"),
+        (["--robot", "ur5e"], "6 moving joints, but the data have 7"),
         (["--robot", "iiwa14"], "another robot"),
         (["--unit", "turns"], "rad or deg"),
         (["--model", "soft"], "not known"),

@@ -141,7 +141,7 @@ def test_out_of_reach_says_distance_and_interval():
     """The message carries the distance asked and both ends of the reachable interval."""
     with pytest.raises(Unreachable, match=r"7\.66 m from the boom pin.*\[3\.38, 6\.98\]"):
         inverse(BARE_STICK, (8.0, 0.0, 0.0))
-    with pytest.raises(Unreachable, match=r"radius 0\.05 m asked"):
+    with pytest.raises(Unreachable, match=r"radius 0\.05 m requested"):
         inverse(CAT215, (0.05, 0.0, 0.0, 0.0))
     with pytest.raises(Unreachable):
         inverse(CAT215, (math.nan, 0.0, 0.0, 0.0))

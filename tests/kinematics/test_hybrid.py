@@ -95,7 +95,7 @@ def test_axes_and_dh_rows_are_one_robot(tmp_path):
 
 def test_what_cannot_be_reached_says_so():
     joints, legs, pose = poses(3)
-    with pytest.raises(Unreachable, match=r"a leg would read .* it goes from 0.62 to 0.98 m"):
+    with pytest.raises(Unreachable, match=r"a leg would read .* its range is 0.62 to 0.98 m"):
         inverse(IWR, Pose(pose.rotation, pose.position + 0.5), joints)
     with pytest.raises(Unreachable):
         forward(IWR, joints, legs * [0.3, 1, 1, 1, 1, 1])

@@ -253,13 +253,13 @@ def test_any_four_bar_round_trips(ground, direction, rocker, coupler, arm, assem
 
 def test_errors_name_the_length_and_the_interval():
     """Every way in which a loop can stay open is refused, for floats and inside arrays."""
-    with pytest.raises(LoopOpen, match=r"3 m asked, the bars allow \[1\.375, 2\.625\] m"):
+    with pytest.raises(LoopOpen, match=r"3 m requested, the bars allow \[1\.375, 2\.625\] m"):
         BOOM.angle(3.0)
-    with pytest.raises(LoopOpen, match=r"1 m asked"):
+    with pytest.raises(LoopOpen, match=r"1 m requested"):
         BOOM.angle(np.array([2.0, 1.0]))
     with pytest.raises(LoopOpen):
         BOOM.angle(math.nan)
-    with pytest.raises(LoopOpen, match=r"cylinder length 2\.5 m asked"):
+    with pytest.raises(LoopOpen, match=r"cylinder length 2\.5 m requested"):
         BUCKET.angle(2.5)
     short = FourBar((1.8, 0.0), (1.5, 0.1), (-0.1, 0.2), 0.2, 0.2, (-0.2, 0.35), 1, 1.8)
     with pytest.raises(LoopOpen, match="two bars join"):

@@ -275,7 +275,7 @@ def test_arm_with_a_head_is_not_taken_for_an_excavators():
     ("change", "message"),
     [
         ({"boom": "stick", "stick": "boom"}, "each joint must carry the next"),
-        ({"head": "saw"}, r"saw must turn about \(0, 0, -1\)"),
+        ({"head": "saw"}, r"saw must rotate about \(0, 0, -1\)"),
         ({"tip": CAT.arm.tip.model_copy(update={"link": "grab"})}, "tip must be on the head"),
         ({"tip": CAT.arm.tip.model_copy(update={"position": (0.3, 0.1, 0.0)})}, "plane y = 0"),
     ],
