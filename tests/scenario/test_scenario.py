@@ -459,7 +459,7 @@ def test_errors_name_file_and_line(tmp_path):
     with pytest.raises(InputError, match=rf"{path}:6: pilot.*unknown key 'zz'.*attitude"):
         load_scenario(path)
     path.write_text("name: t\nduration: 1\nduration: 2\npilot: {kind: constant}\n")
-    with pytest.raises(InputError, match=rf"{path}:3: .*'duration' stands twice"):
+    with pytest.raises(InputError, match=rf"{path}:3: .*'duration' occurs twice"):
         load_scenario(path)
     path.write_text("name: [t\n")
     with pytest.raises(InputError, match=f"{path}.*not valid YAML"):
