@@ -134,8 +134,8 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead, added
     volumes stay what they are at that end.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
-        u: place of this axis in `user`.
+        user: (nu * SLOTS,) actuator parameters.
+        u: index of the first parameter of this axis in `user`.
         opening: o, scalar [1]; of an axis with a pump of its own the speed of it [rad/s].
         p_supply: scalar [Pa].
         p_head: scalar [Pa].
@@ -227,14 +227,14 @@ def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, memory)
     exponential.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         first: index of the first hydraulic actuator.
         drives: Drives: number of hydraulic actuators, <= MAX_AXES; spool [1], spool rate [1/s] and
             pressures [Pa] of these at the start of the step, then what is remembered, see
             `parameters.extra_state_names`; of all actuators the positions at the end of the step,
             where MuJoCo's leapfrog has them [m] or [rad], the velocities over it [m/s] or [rad/s],
             and the commands, clipped here to [-1, 1] [1].
-        dt: step, scalar [s].
+        dt: time step, scalar [s].
         act_dot: (>= 4 count,) written: mean rates over the step, in the unit of `drives.act` per
             [s]; of what is remembered, the pump's alone.
         scratch: (SCRATCH,) work space.
@@ -348,13 +348,13 @@ def advance_memories(user, terms, drives, act_dot, dt, time, supply):
     """Write the rates of what terms remember over a step, once those of all activations are known.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         terms: (n,) table of the machine's terms [SI].
         drives: Drives with the activations at the start of the step, positions at its end and
             velocities over it, and the commands that arrive [SI, commands in 1].
         act_dot: (>= 4 count,) mean rates over the step; those of the terms' memories are written
             [1/s].
-        dt: step, scalar [s].
+        dt: time step, scalar [s].
         time: at the start of the step, scalar [s].
         supply: pressure at the end of the step, scalar [Pa].
 
@@ -475,7 +475,7 @@ def axis_state(user, i, supply, act, x, v, share=0.0):
     """Flows and force of one axis in a state, for logs and balances.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         i: index of the actuator.
         supply: supply pressure, scalar [Pa].
         act: (4,) spool [1], spool rate [1/s], p_head, p_rod [Pa].
@@ -517,12 +517,12 @@ def settled_friction(user, u, velocity, push, inertia, dt):
     Solves `v' = v + dt / J (F - F_f(v'))` by Newton's method inside a bracket.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
-        u: place of this actuator in `user`.
+        user: (nu * SLOTS,) actuator parameters.
+        u: index of the first parameter of this actuator in `user`.
         velocity: v at the start of the step, scalar [m/s] or [rad/s].
         push: F, all other force, scalar [N] or [N m].
         inertia: J, scalar [kg] or [kg m^2], > 0.
-        dt: step, scalar [s], > 0.
+        dt: time step, scalar [s], > 0.
 
     Returns:
         F_f(v'), scalar [N] or [N m].
@@ -558,7 +558,7 @@ def drive_state(user, i, count, act, supply, time, x, v, command, gain):
     """State of one drive, as laws of terms see it.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         i: index of the actuator.
         count: number of hydraulic axes, which come first.
         act: (>= 4 count,) spool [1], spool rate [1/s] and pressures [Pa].
@@ -592,11 +592,11 @@ def add_to_commands(user, terms, drives, dt, time, scratch, out):
     spool's lag, so that what they make of a command is off by half a step.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         terms: (n,) table of terms [SI].
         drives: Drives with the activations at the start of the step, positions at its end and
             velocities over it, and the commands that arrive [SI, commands in 1].
-        dt: step, scalar [s].
+        dt: time step, scalar [s].
         time: at the start of the step, scalar [s].
         scratch: (SCRATCH,) work space.
         out: (>= count,) written [1].

@@ -359,7 +359,7 @@ def spool_step(spool, spool_rate, command, bandwidth, damping, dt, slew_limit=0.
         command: u, scalar [1].
         bandwidth: w, natural frequency, scalar [rad/s].
         damping: z, scalar [1].
-        dt: step, scalar [s].
+        dt: time step, scalar [s].
         slew_limit: s_max, what the pilot stage can do, scalar [1/s]; 0 for no limit.
 
     Returns:
@@ -406,8 +406,8 @@ def axis_opening(user, u, spool):
     linear between its knots; beyond the last knot its last piece goes on. Without a curve `o = t`.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
-        u: place of this axis in `user`.
+        user: (nu * SLOTS,) actuator parameters.
+        u: index of the first parameter of this axis in `user`.
         spool: spool position s, scalar [1].
 
     Returns:
@@ -435,8 +435,8 @@ def inlet_gain(user, u, opening):
     """Flow gain of the edge that feeds a chamber.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
-        u: place of this axis in `user`.
+        user: (nu * SLOTS,) actuator parameters.
+        u: index of the first parameter of this axis in `user`.
         opening: o, scalar [1].
 
     Returns:
@@ -509,8 +509,8 @@ def chamber_flows(user, u, opening, p_supply, p_head, p_rod):
     grows, the pump feeds the chamber. Oil from the pump's gallery does not leak into a chamber.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
-        u: place of this axis in `user`.
+        user: (nu * SLOTS,) actuator parameters.
+        u: index of the first parameter of this axis in `user`.
         opening: o, scalar [1].
         p_supply: scalar [Pa].
         p_head: scalar [Pa].

@@ -98,7 +98,7 @@ def open_ports(user, act, spool, ports, first, count, ahead, rate):
     """Flow gain and supply-side pressure of every axis, for `supply_pressure`.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         act: (4 count,) activations; pressures [Pa].
         spool: (4 count,) array whose every fourth entry is the spool position to use [1].
         ports: (>= 4 count,) written: `k_i` [m^3/(s sqrt(Pa))], `p_i` and `d_i` [Pa], opening
@@ -132,7 +132,7 @@ def delivered_share(user, first, act):
     """Share of its largest flow that the pump gives: 1 where it follows at once, and without terms.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         first: index of the first hydraulic actuator.
         act: (>= 4 count + MEMORY,) activations, whose DELIVERY is read where there is a lag, and
             ADDED_DELIVERY where terms add to the flow [1].
@@ -153,7 +153,7 @@ def own_share(user, first, act):
     """As `delivered_share`, without what terms add.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         first: index of the first hydraulic actuator.
         act: (>= 4 count + MEMORY,) activations [1].
 
@@ -189,7 +189,7 @@ def pump_response(user, first, wanted, share, dt):
     """Share of its largest flow that the pump is set to after a time, by the exact exponential.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         first: index of the first hydraulic actuator.
         wanted: as of `demanded_share`, held, scalar [1].
         share: at the start, scalar [1].
@@ -214,7 +214,7 @@ def demanded_share(user, first, count, ports):
     over the relief or unloading valve.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
         ports: (>= 4 count,) as `open_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
@@ -233,7 +233,7 @@ def drawn_flow(user, first, count, ports, supply):
     """Flow that the valves and the pump's own leak take at a supply pressure.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
         ports: (>= 4 count,) as `open_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
@@ -258,7 +258,7 @@ def highest_supply(user, first, count, ports):
     """Supply pressure up to which the pump's flow is short: the relief's, or that of load sensing.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
         ports: (>= 4 count,) as `open_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
@@ -287,7 +287,7 @@ def circuit_supply(user, first, count, ports, share):
     load), as far as relief setting and flow allow.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
         ports: (>= 4 count,) as `open_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
@@ -313,7 +313,7 @@ def supply_coupling(user, first, count, ports, supply, out):
     beyond it where the relief has an override r; g_i is the slope of an inlet's flow with its drop.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
         ports: (>= 4 count,) as `open_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
