@@ -230,9 +230,7 @@ class Plant:
             " hydrotele.simulate.native.install_hydraulics() before stepping it."
         )
         if any(axis.command_delay for axis in self.machine.axes.values()):
-            note += (
-                " Commands act in it without the delays that hydrotele run and replay apply."
-            )
+            note += " Commands act in it without the delays that hydrotele run and replay apply."
         made = mjcf_document(root)
         return made._replace(text=made.text.replace(">", f">\n  <!-- {note} -->", 1))
 

@@ -225,7 +225,7 @@ def arriving_commands(line, axes, tick, step, steps, out):
 
 @compiled
 def _place(step, steps, tick, length):
-    """Return the ring's row with the command of a physics step; before the start, the initial one."""
+    """Return the ring's row with the command of a physics step; steps before the start map to 0."""
     return (min(max(step // steps, -1), tick) + 1) % length
 
 
