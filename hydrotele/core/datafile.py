@@ -32,10 +32,10 @@ def scale_numbers(value: Any, factor: float) -> Any:
     """Multiply a number, or every number of nested lists, by a factor; keep booleans and None.
 
     Raises:
-        ValueError: the value is a text, which cannot have a unit.
+        ValueError: the value is text, which cannot have a unit.
     """
     if isinstance(value, str):
-        raise ValueError(f"{value!r} is a text, not a number")
+        raise ValueError(f"{value!r} is text, not a number")
     if isinstance(value, list):
         return [scale_numbers(item, factor) for item in value]
     if isinstance(value, bool) or not isinstance(value, (int, float)):

@@ -15,7 +15,7 @@ from hydrotele.core.compiled import compiled
 
 @intrinsic
 def pointer(typingctx, address):
-    """Reinterpret an int64 address as void*."""
+    """Convert an int64 address to a void pointer."""
 
     def codegen(context, builder, signature, args):
         return builder.inttoptr(args[0], cgutils.voidptr_t)

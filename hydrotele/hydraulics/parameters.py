@@ -153,7 +153,7 @@ class Kind(enum.IntEnum):
 
 DELIVERY = "delivery.supply"
 ADDED_DELIVERY = "added_delivery.supply"
-MARKER = 215325.0  # CAT 215, CAT 325: arbitrary value of actuator_user[0] that marks our actuators
+MARKER = 215325.0  # arbitrary value of actuator_user[0] that marks hydrotele's actuators
 
 
 def actuator_order(machine: Machine) -> list[str]:
@@ -257,7 +257,7 @@ def longest_step(machine: Machine, name: str) -> float:
     """
     numbers = actuator_parameters(machine)[name]
     block, stroke = numbers[PUMP:], numbers[Slot.STROKE]
-    stiffness = np.zeros(2)  # at either end of the stroke
+    stiffness = np.zeros(2)  # at both ends of the stroke
     for area, volume, soft, travel in (
         (Slot.AREA_HEAD, Slot.VOLUME_HEAD, PumpSlot.COMPLIANCE_HEAD, np.array([0.0, stroke])),
         (Slot.AREA_ROD, Slot.VOLUME_ROD, PumpSlot.COMPLIANCE_ROD, np.array([stroke, 0.0])),

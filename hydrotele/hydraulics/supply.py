@@ -85,7 +85,7 @@ def supply_pressure(ports, count, smoothing, relief, pump_flow, droop=0.0, overr
             return p
         root = math.sqrt(p - floor) if p > floor else 0.0
         guess = -1.0
-        if slope > 0.0 and root > 0.0 and abs(excess) < 0.5 * last:  # else Newton may cycle
+        if slope > 0.0 and root > 0.0 and abs(excess) < 0.5 * last:  # otherwise Newton may cycle
             root -= excess / (2.0 * slope * root)
             if root > 0.0:
                 guess = floor + root * root

@@ -161,7 +161,7 @@ def _close_from_home(machine, model, data, target, linkage: _Linkage) -> None:
             _aim_cylinders(machine, model, data)
         if not _close(linkage, data, _CLOSED):
             where = ", ".join(f"{n} {v:.3f}" for n, v in zip(names, data.qpos[places], strict=True))
-            raise InputError(f"machine {machine.name}", f"its linkages do not close at {where}")
+            raise InputError(f"machine {machine.name}", f"the linkages do not close at {where}")
     lock_drives(machine, model, data)
 
 

@@ -371,5 +371,6 @@ def samples_every(rate: float, sensors: SensorSet | None) -> int:
         return 1
     ratio = rate / sensors.rate
     if abs(ratio - round(ratio)) > 1e-6:
-        raise InputError("sensors", f"sample at {sensors.rate:g} Hz, which must divide {rate:g} Hz")
+        message = f"the sampling rate of {sensors.rate:g} Hz must divide {rate:g} Hz"
+        raise InputError("sensors", message)
     return round(ratio)

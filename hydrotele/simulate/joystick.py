@@ -405,7 +405,9 @@ def joystick_spec(facts: Joystick, hand: bool = True) -> mujoco.MjSpec:
     flotor, grip = spec.body("flotor"), spec.body("hand")
     coils, joints = spec.body("coils"), {j.name: j for j in spec.joints}
     if not (flotor and grip and coils and {"x", "y", "z", "turn"} <= set(joints)):
-        raise InputError(path, "needs bodies flotor, hand and coils, joints x, y, z and turn")
+        raise InputError(
+            path, "must have bodies flotor, hand and coils, and joints x, y, z and turn"
+        )
     facts_flotor = facts.flotor
     flotor.mass, flotor.inertia = facts_flotor.mass, facts_flotor.inertia
     flotor.ipos = np.subtract(facts_flotor.com, facts_flotor.handle)

@@ -149,7 +149,9 @@ class Law:
         """
         given = dict(self.translate(parameters)) if self.translate else dict(parameters)
         for name in given.keys() - self.kinds.keys():
-            raise ValueError(f"law {self.name}: parameter {name!r}; {suggest(name, self.kinds)}")
+            raise ValueError(
+                f"law {self.name}: unknown parameter {name!r}; {suggest(name, self.kinds)}"
+            )
         given = {**self.defaults, **given}
         if missing := [name for name in self.kinds if name not in given]:
             raise ValueError(f"law {self.name}: missing parameters {', '.join(missing)}")

@@ -635,7 +635,7 @@ def test_garbage_is_refused_politely(examples, tmp_path):
 
 def test_quoted_numbers_with_units_are_refused():
     """As texts they would pass without their unit; exponents are read as in files."""
-    with pytest.raises(InputError, match="'-1.7' is a text, not a number"):
+    with pytest.raises(InputError, match="'-1.7' is text, not a number"):
         load_scenario("zhu_up", {"start.pose.attitude_deg": "'-1.7'"})
     scenario = load_scenario("zhu_up", {"start.pose.attitude_deg": "-1e2"})
     assert scenario.start.pose.attitude == pytest.approx(-1.7453292519943295, rel=1e-15)
