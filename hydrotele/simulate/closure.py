@@ -31,7 +31,7 @@ from hydrotele.simulate.mechanism import (
 _STEP = 0.2  # largest move of an independent joint between two solutions [rad] or [m]
 _TURN = 0.3  # largest move of a dependent joint in an iteration of Newton's method [rad] or [m]
 _CLOSED = 1.0e-12  # pin opening that counts as closed [m]: rounding of a 10 m machine
-_FOLLOWED = 1.0e-9  # the same for poses along a given motion [m]
+_FOLLOWED = 1.0e-9  # the same for poses that are only displayed [m]
 
 
 def following_joints(machine: Machine) -> tuple[str, ...]:

@@ -2,7 +2,7 @@
 
 A tree stands on stiff springs, which are removed when it is cut. The saw cuts while it spins: it
 then passes through the wood, which causes a torque on the saw and a feed force on the head. A log
-has contact with the ground only, and so has a tree while it is held.
+has contact with the ground only, and so has a tree once it has been held.
 
 A grab takes an object if its jaw is closed and the object lies in the pocket between the jaws. The
 friction of wood on steel is not modelled: a weld constraint connects the object to the grab's body
