@@ -76,6 +76,7 @@ class Facts(pydantic.BaseModel):
     @pydantic.model_validator(mode="before")
     @classmethod
     def _convert_units_and_refuse_unknown_keys(cls, data):
+        """Convert keys with a unit suffix to SI; raise ValueError for unknown or repeated keys."""
         if not isinstance(data, dict):
             return data
         fields = cls.model_fields
@@ -105,6 +106,7 @@ class _Loader(_BASE):
         self.deep_construct = True  # rejects an alias inside its own anchor
 
     def construct_mapping(self, node, deep=False):
+        """Construct a mapping; raise an error for a repeated key."""
         seen = set()
         for key_node, _ in node.value if isinstance(node, yaml.MappingNode) else ():
             if key_node.tag == "tag:yaml.org,2002:merge":

@@ -63,6 +63,7 @@ class Callee:
         return self._symbol_key(result)
 
     def _symbol_key(self, result: Any) -> tuple[str, str]:
+        """Register a function's symbol with numba and return its key."""
         symbol = result.fndesc.mangled_name
         if symbol not in _symbols:
             self.dispatcher.targetctx.insert_user_function(("symbol", symbol), result.fndesc)

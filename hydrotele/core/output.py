@@ -129,6 +129,7 @@ def _matches(name: str, pattern: str) -> bool:
 
 
 def _kind(folder: Path) -> str | None:
+    """Return the kind stated in a folder's `summary.json`; None if it cannot be read."""
     try:
         return read_json(folder / "summary.json").get("kind")
     except (InputError, AttributeError):
@@ -144,6 +145,7 @@ def _ours(part: Path) -> bool:
 
 
 def _alive(part: Path) -> bool:
+    """Return whether the process that created a temporary folder is another running process."""
     try:
         pid = int(_PART.findall(part.name)[0])
         os.kill(pid, 0)

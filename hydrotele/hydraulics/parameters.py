@@ -290,6 +290,7 @@ def _write_end_stop(numbers: np.ndarray, machine: Machine, name: str) -> None:
 
 
 def _write_hydraulics(numbers: np.ndarray, axis: Axis, supply: Supply) -> None:
+    """Write the parameters of an axis with a valve."""
     valve = axis.valve
     assert valve is not None
     drive = axis.hydraulic_drive
@@ -315,6 +316,7 @@ def _write_hydraulics(numbers: np.ndarray, axis: Axis, supply: Supply) -> None:
 
 
 def _write_pumped(numbers: np.ndarray, machine: Machine, name: str) -> None:
+    """Write the parameters of an axis with its own pump."""
     axis = machine.axes[name]
     cylinder, pump = axis.cylinder, axis.pump
     assert cylinder and pump

@@ -40,6 +40,7 @@ _PRIMITIVES = {
 
 
 def _size_and_alignment(node) -> tuple[int, int]:
+    """Return size and alignment of a C type [byte]."""
     if isinstance(node, ast_nodes.PointerType):
         return 8, 8
     if isinstance(node, ast_nodes.ArrayType):
@@ -60,6 +61,7 @@ def _size_and_alignment(node) -> tuple[int, int]:
 
 
 def _struct_layout(fields) -> tuple[dict[str, int], int, int]:
+    """Return field offsets, size and alignment of a C struct [byte]."""
     offsets: dict[str, int] = {}
     position, alignment = 0, 1
     for field in fields:
@@ -96,6 +98,7 @@ def struct_size(struct: str) -> int:
 
 
 def _read(address: int, dtype) -> float:
+    """Read a number of a numpy type at an address."""
     kinds = {np.float64: ctypes.c_double, np.int64: ctypes.c_int64, np.int32: ctypes.c_int32}
     kind = kinds[dtype]
     return kind.from_address(address).value

@@ -268,6 +268,7 @@ def mjcf_document(root: mjcf.RootElement) -> Mjcf:
 
 
 def _read_mjcf(machine: Machine, looks: bool) -> mjcf.RootElement:
+    """Load the machine's MJCF with attached files; without it, create an empty document."""
     if not machine.mjcf:
         return mjcf.RootElement(model=machine.name)
     path = Path(machine.folder, machine.mjcf)
@@ -322,6 +323,7 @@ def _refuse_foreign_parts(root, machine: Machine) -> None:
 
 
 def _set_options(root, machine: Machine, timestep: float) -> None:
+    """Set compiler and solver options."""
     root.compiler.angle = root.compiler.angle or "degree"  # degree: MuJoCo's default
     root.compiler.autolimits = True
     del root.compiler.boundmass, root.compiler.boundinertia  # a forgotten inertia is an error
@@ -343,6 +345,7 @@ def _body(root, name: str):
 
 
 def _write_link(root, name: str, link: Link) -> None:
+    """Write inertia, position and joint of a link; create its body if it is missing."""
     body = root.find("body", name)
     if body is None:
         parent = _body(root, link.parent)
@@ -386,6 +389,7 @@ def _set_inertial(body, mass, com, inertia) -> None:
 
 
 def _write_cylinder(root, name: str, cylinder: Cylinder, pins: Vector, timestep: float) -> None:
+    """Write tube, rod and rod pin of a cylinder."""
     tube = root.find("body", f"{name}_tube")
     if tube is None:
         base = _body(root, cylinder.base_pin.link)
@@ -426,6 +430,7 @@ def _write_travel(root, machine: Machine, name: str) -> None:
 
 
 def _connect(root, name: str, a: Pin, b: Pin, timestep: float) -> None:
+    """Add the two sites and the `connect` constraint of a pin."""
     for end, pin in (("a", a), ("b", b)):
         _body(root, pin.link).add(
             "site", name=pin_site(name, end), pos=pin.position, size=(0.03,), group=4
@@ -437,6 +442,7 @@ def _connect(root, name: str, a: Pin, b: Pin, timestep: float) -> None:
 
 
 def _write_actuators(root, machine: Machine) -> None:
+    """Add one actuator per axis, with its parameters as user data."""
     for name, numbers in actuator_parameters(machine).items():
         axis: Axis = machine.axes[name]
         actuator = root.actuator.add(
@@ -457,6 +463,7 @@ def _write_actuators(root, machine: Machine) -> None:
 
 
 def _write_scene(root, ground: bool, looks: bool) -> None:
+    """Add ground, sky and light."""
     touch = {"contype": 1, "conaffinity": 2} if ground else {"contype": 0, "conaffinity": 0}
     if ground or looks:
         root.worldbody.add(

@@ -254,6 +254,7 @@ def _callbacks(remembers):
 
     @callback(_SIGNATURE)
     def advance(m, d, i):
+        """Write the rates of all activations of the hydraulic axes (callback `mjcb_act_dyn`)."""
         if carray(pointer(m + m_nuser), (1,), np.int64)[0] != SLOTS:
             return 0.0
         i = np.int64(i)
@@ -335,6 +336,7 @@ def _callbacks(remembers):
 
     @callback(_SIGNATURE)
     def force(m, d, i):
+        """Return the bias force of actuator i after friction (callback `mjcb_act_bias`)."""
         if carray(pointer(m + m_nuser), (1,), np.int64)[0] != SLOTS:
             return 0.0
         i = np.int64(i)

@@ -579,6 +579,7 @@ def _put_things(plant: Plant, record: Record, put) -> None:
 
 
 def _put_turning(name: str, quaternions: np.ndarray, put) -> None:
+    """Add rotations, given as quaternions (n, 4), as rotation vectors [rad]."""
     vectors = np.empty((len(quaternions), 3))
     for vector, quaternion in zip(vectors, quaternions, strict=True):
         mujoco.mju_quat2Vel(vector, quaternion, 1.0)
@@ -587,6 +588,7 @@ def _put_turning(name: str, quaternions: np.ndarray, put) -> None:
 
 
 def _put_hydraulics(plant: Plant, record: Record, put) -> None:
+    """Add spools, flows, forces and supply pressure of the hydraulic axes."""
     count = plant.hydraulic
     if not count:
         return

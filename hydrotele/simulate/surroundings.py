@@ -166,6 +166,7 @@ def write_surroundings(
 
 
 def _write_plate(root, name: str, plate: Plate) -> None:
+    """Add a plate on a spring along its normal."""
     normal, thick = np.array(_NORMALS[plate.normal], float), 0.05
     middle = np.array(plate.position) - thick * normal
     body = root.worldbody.add("body", name=name, pos=middle)
@@ -194,6 +195,7 @@ def _hand(machine: Machine, grab: str) -> str:
 
 
 def _write_weld(root, machine: Machine, grab: str, name: str) -> None:
+    """Add the inactive weld between a grab and an object."""
     root.equality.add(
         "weld", name=f"{name}_held", body1=_hand(machine, grab), body2=name, active=False,
         solref=(0.01, 1.0), solimp=(0.99, 0.999, 0.001, 0.5, 2),
@@ -201,6 +203,7 @@ def _write_weld(root, machine: Machine, grab: str, name: str) -> None:
 
 
 def _write_log(root, name: str, log: LogOnGround, machine: Machine, where: str):
+    """Add a log on the ground and return its body."""
     _need_axis(machine, log.grab, f"{where}.grab")
     hand = _hand(machine, log.grab)
     pocket = root.find("site", f"{log.grab}_pocket")
@@ -228,6 +231,7 @@ def _write_log(root, name: str, log: LogOnGround, machine: Machine, where: str):
 
 
 def _draw_log(body, name: str, log: LogOnGround) -> None:
+    """Add the visual geometry of a log."""
     radius, half = log.diameter / 2.0, log.length / 2.0
     for part, size, reach, colour in (
         ("bark", radius, half - 0.01, (0.36, 0.26, 0.17, 1)),
@@ -240,6 +244,7 @@ def _draw_log(body, name: str, log: LogOnGround) -> None:
 
 
 def _write_tree(root, name: str, tree: StandingTree, machine: Machine, where: str) -> None:
+    """Add stump, stem, crown and root springs of a tree."""
     for part in ("saw", "grab"):
         _need_axis(machine, getattr(tree, part), f"{where}.{part}")
     x, y = tree.position

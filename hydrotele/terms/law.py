@@ -289,6 +289,7 @@ def formula_arguments(parameters: Mapping[str, float]) -> dict[str, list[float]]
 
 
 def _factors(text: str) -> list[list[float]]:
+    """Parse a product into its encoded factors; the product `1` has none."""
     try:
         node = ast.parse(text.strip(), mode="eval").body
     except SyntaxError:
@@ -299,12 +300,14 @@ def _factors(text: str) -> list[list[float]]:
 
 
 def _parts(node: ast.expr) -> list[ast.expr]:
+    """Return the factors of a product as syntax nodes."""
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mult):
         return [*_parts(node.left), *_parts(node.right)]
     return [node]
 
 
 def _factor(text: str, node: ast.expr) -> list[float]:
+    """Encode a factor: function, variables, constants and power."""
     power = 1
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow):
         exponent = node.right
@@ -327,12 +330,14 @@ def _factor(text: str, node: ast.expr) -> list[float]:
 
 
 def _argument(text: str, node: ast.expr) -> list[int]:
+    """Return the indices of a variable and of the variable to subtract, -1 for none."""
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub):
         return [_variable(text, node.left), _variable(text, node.right)]
     return [_variable(text, node), _NONE]
 
 
 def _variable(text: str, node: ast.expr) -> int:
+    """Return the index of a variable."""
     name = node.id if isinstance(node, ast.Name) else ast.unparse(node)
     if name not in VARIABLES:
         raise _wrong(text, f"{name!r} is not a variable; {suggest(name, VARIABLES)}")
@@ -340,6 +345,7 @@ def _variable(text: str, node: ast.expr) -> int:
 
 
 def _number(text: str, node: ast.expr) -> float:
+    """Return the value of a numeric constant."""
     try:
         value = ast.literal_eval(node)
     except ValueError:
@@ -350,6 +356,7 @@ def _number(text: str, node: ast.expr) -> float:
 
 
 def _wrong(text: str, why: str) -> ValueError:
+    """Create the error for a formula that cannot be parsed."""
     return ValueError(
         f"formula {text!r}: {why}; write '1' or a product such as 'velocity * abs(velocity)' of"
         f" variables and of {', '.join(FUNCTIONS)}"
@@ -397,6 +404,7 @@ def exponential_drift(s: DriveState, value: float, time_constant: float) -> floa
 
 
 def _check_points(given: Parameters, *names: str) -> None:
+    """Raise ValueError unless each list has at least two increasing numbers."""
     for name in names:
         points = list(given[name])
         if len(points) < 2 or any(b <= a for a, b in zip(points, points[1:], strict=False)):
