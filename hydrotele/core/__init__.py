@@ -1,1 +1,1 @@
-"""What knows no machine: errors, files, YAML with line numbers, output, compiled functions."""
+"""Machine-independent utilities: errors, file access, YAML validation, output, compilation."""

@@ -1,9 +1,9 @@
-"""Progress bar on stderr while numba compiles functions: what is compiled, and the time left.
+"""Progress bar on stderr while numba compiles functions: function name and estimated time left.
 
-The work left is estimated from the call graph: every function of this package that the compiled
-one reaches and that has no code in the cache counts with the length of its bytecode. In a terminal
-the bar is drawn on one line; elsewhere a line is written every two seconds. It is silent where the
-level of the logger `hydrotele` is above `WARNING`.
+The remaining work is estimated from the call graph: each function of this package that has to be
+compiled and is not in the cache is weighted by the length of its bytecode. In a terminal the bar is
+drawn on one line; elsewhere a line is written every two seconds. Nothing is printed if the level of
+the logger `hydrotele` is above `WARNING`.
 """
 
 import gc
@@ -20,20 +20,20 @@ from numba.core import event
 SECONDS_BEFORE_BAR = 1.0
 """Time spent compiling, in seconds, before the bar appears."""
 SECONDS_BETWEEN_LINES = 2.0
-"""Time between two lines where stderr is no terminal, in seconds."""
-_REDRAW = 0.2  # s between two drawings in a terminal
+"""Time between two lines if stderr is not a terminal, in seconds."""
+_REDRAW = 0.2  # s between two updates in a terminal
 _CONSTANT = 100  # bytes of bytecode that cost as much to compile as an empty function
 _WIDTH = 30  # characters of the bar
 _LOG = logging.getLogger("hydrotele")
 
 
 def format_bar(name: str, fraction: float, left: float | None) -> str:
-    """Return one line of progress.
+    """Return the text of the progress bar.
 
     Args:
-        name: what is compiled.
-        fraction: of the work that is done, 0 to 1.
-        left: estimated time left [s]; None where it is unknown.
+        name: name of the function that is compiled.
+        fraction: completed fraction of the work, 0 to 1.
+        left: estimated time left [s]; None if unknown.
 
     Returns:
         The line, without a line break.
@@ -44,13 +44,13 @@ def format_bar(name: str, fraction: float, left: float | None) -> str:
 
 
 class ProgressLine:
-    """A line on stderr that is redrawn in a terminal and repeated elsewhere."""
+    """A status line on stderr: redrawn in place in a terminal, printed repeatedly elsewhere."""
 
     def __init__(self) -> None:
         self._printed, self._width = 0.0, 0
 
     def show(self, text: str) -> None:
-        """Draw the line, or write it where the last one is two seconds old."""
+        """Redraw the line in a terminal; elsewhere print it if the last one is two seconds old."""
         if not _LOG.isEnabledFor(logging.WARNING):
             return
         if sys.stderr.isatty():
@@ -62,7 +62,7 @@ class ProgressLine:
         sys.stderr.flush()
 
     def clear(self) -> None:
-        """Remove the line from a terminal."""
+        """Erase the line from the terminal."""
         if self._width:
             sys.stderr.write("\r" + " " * self._width + "\r")
             sys.stderr.flush()
@@ -70,10 +70,10 @@ class ProgressLine:
 
 
 class CompileProgress(event.Listener):
-    """Follows numba's compiler and draws the bar from a thread of its own.
+    """Listener for numba's compile events that draws the progress bar from a background thread.
 
     Args:
-        is_cached: whether a function has code in the cache.
+        is_cached: predicate that returns whether a function has code in the cache.
     """
 
     def __init__(self, is_cached: Callable[[Any], bool]) -> None:
@@ -87,10 +87,10 @@ class CompileProgress(event.Listener):
         self._thread: threading.Thread | None = None
 
     def on_start(self, event: event.Event) -> None:
-        """Note that the compilation of a function has begun."""
+        """Record that the compilation of a function has started."""
         dispatcher = (event.data or {})["dispatcher"]
         if not self._names:
-            # The compiler makes millions of objects that live until it ends.
+            # The compiler creates millions of objects that all live until it ends.
             self._collecting = gc.isenabled()
             gc.disable()
             self._pending = self._find_pending(dispatcher)
@@ -102,7 +102,7 @@ class CompileProgress(event.Listener):
         self._names.append(dispatcher.py_func.__name__.strip("_"))
 
     def on_end(self, event: event.Event) -> None:
-        """Note that it has ended."""
+        """Record that the compilation of a function has ended."""
         function = (event.data or {})["dispatcher"].py_func
         self._names.pop()
         weight = self._pending.pop(function, 0)
@@ -115,7 +115,7 @@ class CompileProgress(event.Listener):
                 self._line.clear()
 
     def _find_pending(self, dispatcher: Any) -> dict[FunctionType, int]:
-        """Return the weight of every function to be compiled for one of them."""
+        """Return the weight of each function that has to be compiled for a dispatcher."""
         found, left = dict[FunctionType, int](), [dispatcher]
         while left:
             function = left.pop().py_func
@@ -126,6 +126,7 @@ class CompileProgress(event.Listener):
         return found
 
     def _draw(self) -> None:
+        """Update the progress bar periodically; runs in the background thread."""
         while True:
             time.sleep(_REDRAW)
             names = self._names[:1] + self._names[-1:]
@@ -142,7 +143,7 @@ class CompileProgress(event.Listener):
 
 
 def called_dispatchers(function: FunctionType) -> list[Any]:
-    """Return the compiled functions that a function names, directly or in a module."""
+    """Return the compiled functions that a function refers to, by name or as module attribute."""
     names = function.__code__.co_names
     scope = function.__globals__ | {
         name: cell.cell_contents

@@ -1,13 +1,14 @@
-"""How numerical functions are compiled: by numba, cached on disk, without checks for division by 0.
+"""Compilation of numerical functions with numba, with a cache on disk.
 
-numba looks only at the file of a function to see whether its cache is good. Compiled code here
-contains functions and constants of other files, so each module has a cache folder for each state
-of its own source and of all sources of the package that it imports, directly or not. A module that
-changes leaves the caches of the others alone, and checkouts with the same sources share them.
-A cache is code: it lies in the user's cache folder, and no one else may write there.
+numba checks only the file of a function to decide whether its cached code is valid. Compiled code
+here contains functions and constants of other files. Each module therefore has a separate cache
+folder for each version of its source and of all sources of the package that it imports, directly or
+indirectly. A changed module does not invalidate the caches of unrelated modules, and checkouts with
+the same sources share a cache. The cache contains executable code: it lies in the user's cache
+folder, and no other user may write to it.
 
-Compiling is slow, so one process compiles a function and others that need it meanwhile wait for
-it, and callbacks for C are compiled when their address is first asked for, not when imported.
+Only one process compiles a function; other processes that need it wait. Callbacks for C are
+compiled on first use of their address, not at import. Division by zero is not checked.
 """
 
 import atexit
@@ -37,49 +38,49 @@ from hydrotele.core.compile_progress import SECONDS_BEFORE_BAR, CompileProgress,
 from hydrotele.core.linking import Callee, LinkedCache
 from hydrotele.core.references import argument_type
 
-_CONFIG: Any = _numba_config  # its settings are made at run time
-_UNUSED = 30 * 24 * 3600.0  # s, after which the cache of other sources is removed
+_CONFIG: Any = _numba_config  # its attributes are created at run time
+_UNUSED = 30 * 24 * 3600.0  # s, after which an unused cache of an older source version is removed
 
 
 def compiled(function):
-    """Compile a function on its first call for each kind of argument, with a cache on disk.
+    """Compile a function on its first call with each argument type, with a cache on disk.
 
-    Where no folder for the cache can be written, it is compiled anew in every process. It runs
-    without Python's lock, so that threads work side by side.
+    If no cache folder is writable, every process compiles the function again. The compiled function
+    releases Python's global interpreter lock, so that threads run in parallel.
     """
     return _compile(function)
 
 
 def allocation_free(function):
-    """Like `compiled`, for a function that creates no arrays and returns none.
+    """Compile like `compiled` a function that neither creates nor returns arrays.
 
-    References to arrays are then not counted, which takes small functions half their time. A
-    function that does create or return an array is refused on its first call.
+    This omits reference counting of arrays, which takes half the run time of small functions. A
+    function that does create or return an array raises an error on its first call.
     """
     return _compile(function, _nrt=False)
 
 
 def inlined(function):
-    """Like `allocation_free`, for a small function whose code is put into that of every caller.
+    """Compile like `allocation_free` a small function that is inlined into every caller.
 
-    What a caller does not use of several results, such as a slope, is then not computed, and a
-    function whose arguments are constants there costs less.
+    Results that a caller does not use, such as a derivative, are then not computed, and constant
+    arguments are folded.
     """
     return _compile(function, _nrt=False, forceinline=True)
 
 
 def _compile(function, **options: Any):
-    """Make a dispatcher for calls from Python and one for calls from compiled functions.
+    """Create a dispatcher for calls from Python and one for calls from compiled functions.
 
-    The second has no wrapper that converts Python objects, which takes a fifth of the time to
-    compile, and most functions are never called from Python.
+    The second one has no wrapper that converts Python objects. The wrapper takes a fifth of the
+    compile time, and most functions are never called from Python.
     """
     with _caching(function.__module__) as cache:
         options |= {
             "cache": cache, "error_model": "numpy", "nogil": True,
-            "no_cfunc_wrapper": True,  # for calls by address, which takes a fifth of the time
+            "no_cfunc_wrapper": True,  # the unused wrapper takes a fifth of the compile time
         }  # fmt: skip
-        compile_with: Any = njit  # whose type states only some of its options
+        compile_with: Any = njit  # its type annotation omits some options
         made = compile_with(**options)(function)
         called = compile_with(**options, no_cpython_wrapper=True)(function)
         if cache:
@@ -92,18 +93,18 @@ def _compile(function, **options: Any):
 
 
 def callback(signature):
-    """Decorator that makes a `Callback` of a function, for C to call."""
+    """Return a decorator that turns a function into a `Callback` for C code."""
     return lambda function: Callback(function, signature)
 
 
 class Callback:
-    """A function for C to call: compiled when first asked for, cached on disk where possible."""
+    """A function that C code can call: compiled on first use, cached on disk if possible."""
 
     def __init__(self, function, signature) -> None:
         self._function, self._signature = function, signature
 
     def compile_elsewhere(self, then: str = "") -> None:
-        """Begin to compile in a process beside this one, see the function of that name.
+        """Start to compile in a background process, see the function `compile_elsewhere`.
 
         Args:
             then: Python code that the process runs afterwards.
@@ -123,20 +124,20 @@ class Callback:
 
     @property
     def address(self) -> int:
-        """Where its machine code begins."""
+        """Address of the compiled function."""
         return self._compiled.address
 
     @property
     def ctypes(self) -> Any:
-        """The same as a ctypes function."""
+        """The compiled function as a ctypes function."""
         return self._compiled.ctypes
 
 
 def compile_elsewhere(function, code: str) -> None:
-    """Begin to compile in a process beside this one, where that is still to be done.
+    """Start to compile a function in a background process, unless it is cached already.
 
     Args:
-        function: what is compiled, one of a module; or its `compiled` form.
+        function: module-level function to compile, or its `compiled` form.
         code: Python code that compiles it.
     """
     function = getattr(function, "py_func", function)
@@ -161,15 +162,15 @@ def _end(process: subprocess.Popen) -> None:
 
 
 def _index(function) -> str:
-    """Pattern of the file that lists what is compiled of a function."""
+    """Return the file pattern of numba's cache index of a function."""
     return f"*{function.__name__}-{_line(function)}.*.nbi"
 
 
 def cache_folder() -> Path | None:
-    """Folder of the compiled code, `$XDG_CACHE_HOME/hydrotele/compiled`, made for its owner only.
+    """Return the folder of the compiled code, `$XDG_CACHE_HOME/hydrotele/compiled`.
 
-    None where there is none: no home, a file system without space or for reading, or a folder that
-    somebody else owns or may write to.
+    The folder is created with access for its owner only. Returns None if there is no home folder,
+    if the folder cannot be created or written, or if another user owns it or can write to it.
     """
     home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
     if not os.path.isabs(home):
@@ -186,6 +187,7 @@ def cache_folder() -> Path | None:
 
 
 def _private(folder: Path) -> bool:
+    """Return whether a path is a folder that only this user owns and can write to."""
     found = folder.lstat()
     shared = found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
     return stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not shared
@@ -198,7 +200,7 @@ _IMPORT = re.compile(rb"^\s*(?:from|import) +(hydrotele[\w.]*)(?: +import +([^#\
 
 @functools.cache
 def _source(module: str) -> bytes | None:
-    """Source of a module of this package; None where the name is none."""
+    """Return the source of a module of this package; None if there is no such module."""
     package, *parts = module.split(".")
     if package != _PACKAGE.name:
         return None
@@ -211,7 +213,7 @@ def _source(module: str) -> bytes | None:
 
 @functools.cache
 def _imports(module: str) -> frozenset[str]:
-    """Modules of this package that a module's source imports."""
+    """Return the modules of this package that a module imports directly."""
     found = set()
     for place, names in _IMPORT.findall(_source(module) or b""):
         package = place.decode()
@@ -224,10 +226,10 @@ def _imports(module: str) -> frozenset[str]:
 
 @functools.cache
 def digest(module: str) -> str:
-    """Digest of a module's source, of what it imports, and of what compiles it and keeps the result.
+    """Return a digest of the sources of a module, of its imports and of this module.
 
-    A change of any of them asks for another cache. A law is compiled by another module than its
-    own, which need not import this one.
+    A change of any of these sources selects another cache folder. This module is always included,
+    since a module whose functions another one compiles need not import it.
     """
     open_ones = [module, __name__]
     reached = set(open_ones)
@@ -242,25 +244,25 @@ def digest(module: str) -> str:
 
 
 class Locator(UserProvidedCacheLocator):
-    """Tells numba where compiled code lies; its folder is named after the sources' content."""
+    """numba cache locator that selects the cache folder set by `_caching`."""
 
     def __init__(self, py_func, py_file):
         super().__init__(py_func, py_file)
         self._cache_path = _CONFIG.CACHE_DIR
 
     def get_source_stamp(self):
-        """The folder is of one state of the sources, so there is nothing to compare."""
+        """Return a constant stamp, because each folder belongs to one version of the sources."""
         return ""
 
 
 class _SharedCache(FunctionCache):
-    """A function's cache, in which one process at a time compiles what is missing."""
+    """Cache of a function with a lock, so that only one process compiles a missing overload."""
 
     _impl_class = LinkedCache
     _held: int | None = None
 
     def load_overload(self, sig, target_context):
-        """Compiled code of a signature; None where this process has to compile it."""
+        """Return compiled code of a signature, or None if this process has to compile it."""
         found = super().load_overload(sig, target_context)
         if found is None and self._held is None:
             self._held = _lock(self.cache_path, self._py_func)
@@ -270,7 +272,7 @@ class _SharedCache(FunctionCache):
         return found
 
     def save_overload(self, sig, data):
-        """Keep compiled code, for other processes, too."""
+        """Store compiled code and release the lock."""
         try:
             super().save_overload(sig, data)
         finally:
@@ -282,7 +284,7 @@ class _SharedCache(FunctionCache):
 
 
 class _CalledCache(_SharedCache):
-    """The same for code without a wrapper for Python."""
+    """Cache of code without a Python wrapper."""
 
     def _index_key(self, sig, codegen):
         return *super()._index_key(sig, codegen), "called"
@@ -293,7 +295,7 @@ def _line(function) -> int:
 
 
 def _lock(folder: str, function) -> int | None:
-    """Lock a function against other processes; None where that cannot be had for long."""
+    """Lock a function against other processes and return the file handle; None after a timeout."""
     try:
         path = Path(folder, f"{function.__name__}-{_line(function)}.lock")
         handle = os.open(path, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
@@ -308,7 +310,7 @@ def _lock(folder: str, function) -> int | None:
         time.sleep(0.02)
         if waited > SECONDS_BEFORE_BAR:
             name = function.__name__.strip("_")
-            line.show(f"waiting for {name}, which another process compiles ({waited:.0f} s)")
+            line.show(f"waiting for another process to compile {name} ({waited:.0f} s)")
     os.close(handle)
     return None
 
@@ -318,12 +320,12 @@ def _release(handle: int | None) -> None:
         os.close(handle)
 
 
-_PATIENT = 300.0  # s; who compiles for longer, or has failed and lives on, is not waited for
+_PATIENT = 300.0  # s, longest wait for another process, which may have failed without exiting
 
 
 @contextlib.contextmanager
 def _caching(module: str) -> Iterator[bool]:
-    """Whether there is a cache; functions of a module that are decorated meanwhile find it."""
+    """Point numba to the cache folder of a module in this context; yield whether there is one."""
     names = ("CACHE_DIR", "CACHE_LOCATOR_CLASSES")
     given = {name: getattr(_CONFIG, name, "") for name in names}
     own = _folder_of(module) if _FOLDER and _source(module) is not None else None
@@ -338,7 +340,10 @@ def _caching(module: str) -> Iterator[bool]:
 
 @functools.cache
 def _folder_of(module: str) -> Path | None:
-    """A module's folder in the cache, which is thereby in use; old ones of the module go."""
+    """Return a module's cache folder, mark it as used and delete unused folders of the module.
+
+    Returns None if the folder cannot be created.
+    """
     assert _FOLDER
     folder = _FOLDER / f"{module}_{digest(module)}"
     try:
@@ -354,7 +359,7 @@ def _folder_of(module: str) -> Path | None:
 
 
 def _is_cached(function) -> bool:
-    """Return whether any code of a function of this package lies in the cache."""
+    """Return whether the cache contains any code of a function of this package."""
     if not _FOLDER or _source(function.__module__) is None:
         return False
     folder = _folder_of(function.__module__)

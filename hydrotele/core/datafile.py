@@ -1,7 +1,7 @@
-"""YAML files into validated frozen facts: units in key names, errors that name file, line and key.
+"""Read YAML files into validated, immutable models, with errors that name file, line and key.
 
-A key may carry its unit as a suffix (`angle_deg`, `area_head_in2`, `relief_pressure_bar`); it is
-converted to SI here, at the boundary, and nowhere else.
+A key may have its unit as a suffix (`angle_deg`, `area_head_in2`, `relief_pressure_bar`). Values
+are converted to SI here and nowhere else.
 """
 
 import difflib
@@ -18,24 +18,24 @@ from hydrotele.core.errors import InputError
 from hydrotele.core.files import beyond, limit, read_text
 from hydrotele.core.units import KEY_SUFFIXES, to_si
 
-LARGEST = 1.0e20  # of any SI number of a file, so that products of a few stay finite
+LARGEST = 1.0e20  # largest magnitude of a number in SI; keeps products of a few numbers finite
 Number = Annotated[float, pydantic.Field(ge=-LARGEST, le=LARGEST)]
 Vector = tuple[Number, Number, Number]
 Positive = Annotated[float, pydantic.Field(gt=0, le=LARGEST)]
 NonNegative = Annotated[float, pydantic.Field(ge=0, le=LARGEST)]
 Name = Annotated[str, pydantic.Field(pattern=r"^[a-z][a-z0-9_]*$")]
 
-ANGULAR_FREQUENCIES = ("bandwidth",)  # in rad/s: their `_hz` counts 2 pi
+ANGULAR_FREQUENCIES = ("bandwidth",)  # in rad/s: the suffix `_hz` multiplies them by 2 pi
 
 
 def scale_numbers(value: Any, factor: float) -> Any:
-    """Multiply a number, or every number of nested lists, by a factor; leave the rest alone.
+    """Multiply a number, or every number of nested lists, by a factor; keep booleans and None.
 
     Raises:
-        ValueError: the value is a text, which no unit suits.
+        ValueError: the value is text, which cannot have a unit.
     """
     if isinstance(value, str):
-        raise ValueError(f"{value!r} is a text, not a number")
+        raise ValueError(f"{value!r} is text, not a number")
     if isinstance(value, list):
         return [scale_numbers(item, factor) for item in value]
     if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -47,7 +47,7 @@ def scale_numbers(value: Any, factor: float) -> Any:
 
 
 def split_unit(key: str) -> tuple[str, float | None]:
-    """Stem of a key and the factor of its unit suffix to SI, `None` without one.
+    """Split a key into its stem and the factor of its unit suffix to SI (`None` without suffix).
 
     >>> split_unit("accuracy_mm")
     ('accuracy', 0.001)
@@ -61,7 +61,7 @@ def split_unit(key: str) -> tuple[str, float | None]:
 
 
 def suggest(name: object, valid) -> str:
-    """A sentence with the closest valid name, if there is one, and all valid names."""
+    """Return a hint for an error message: the closest valid name, if any, and all valid names."""
     names = sorted(map(str, valid))
     close = difflib.get_close_matches(str(name), names, n=1)
     hint = f"did you mean {close[0]!r}? " if close else ""
@@ -69,13 +69,14 @@ def suggest(name: object, valid) -> str:
 
 
 class Facts(pydantic.BaseModel):
-    """Base of everything read from YAML: frozen, finite, SI, no unknown keys."""
+    """Base class of all data read from YAML: immutable, finite, in SI units, no unknown keys."""
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     @pydantic.model_validator(mode="before")
     @classmethod
     def _convert_units_and_refuse_unknown_keys(cls, data):
+        """Convert keys with a unit suffix to SI; raise ValueError for unknown or repeated keys."""
         if not isinstance(data, dict):
             return data
         fields = cls.model_fields
@@ -89,7 +90,7 @@ class Facts(pydantic.BaseModel):
             else:
                 raise ValueError(f"unknown key {key!r}; {suggest(key, fields)}")
             if name in result:
-                raise ValueError(f"{name!r} is given twice, as {key!r} and another unit")
+                raise ValueError(f"{name!r} is given twice, as {key!r} and with another unit")
             result[name] = value
         return result
 
@@ -98,23 +99,24 @@ _BASE: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml: ten times
 
 
 class _Loader(_BASE):
-    """SafeLoader that reads 28.0e6 as a number, as YAML 1.2 does, and refuses repeated keys."""
+    """SafeLoader that reads 28.0e6 as a number, as YAML 1.2 does, and rejects repeated keys."""
 
     def __init__(self, stream):
         super().__init__(stream)
-        self.deep_construct = True  # refuses an alias inside its own anchor
+        self.deep_construct = True  # rejects an alias inside its own anchor
 
     def construct_mapping(self, node, deep=False):
+        """Construct a mapping; raise an error for a repeated key."""
         seen = set()
         for key_node, _ in node.value if isinstance(node, yaml.MappingNode) else ():
             if key_node.tag == "tag:yaml.org,2002:merge":
                 continue
             key = self.construct_object(key_node, deep=True)
             if not isinstance(key, Hashable):
-                continue  # SafeLoader itself refuses it, with the line
+                continue  # SafeLoader itself rejects it and names the line
             if key in seen:
                 raise yaml.constructor.ConstructorError(
-                    None, None, f"the key {key!r} stands twice", key_node.start_mark
+                    None, None, f"the key {key!r} occurs twice", key_node.start_mark
                 )
             seen.add(key)
         return super().construct_mapping(node, deep)
@@ -128,7 +130,7 @@ _Loader.add_implicit_resolver(
 
 
 def _load(text: str) -> tuple[Any, Any]:
-    """Node and value of a YAML text, after `_check_size`."""
+    """Return the node and the value of a YAML text, after `_check_size`."""
     _check_size(text)
     loader = _Loader(text)
     try:
@@ -139,12 +141,12 @@ def _load(text: str) -> tuple[Any, Any]:
 
 
 def _check_size(text: str) -> None:
-    """Refuse what is too deep or too large once its aliases are replaced by what they stand for.
+    """Reject YAML that is nested too deeply or has too many values after alias expansion.
 
-    The parser's events come one by one, so that nothing is built for what is refused: libyaml's
-    composer has no bound of its own on either.
+    The check reads the parser's events one by one and builds no objects, because libyaml's composer
+    limits neither depth nor size.
     """
-    opened: list[tuple[str | None, int]] = []  # anchor of what is open, values before it
+    opened: list[tuple[str | None, int]] = []  # anchors of open nodes, number of values before them
     sizes: dict[str, int] = {}
     values, most_values, most_depth = 0, limit("FILE_VALUES"), limit("FILE_DEPTH")
     for event in yaml.parse(text, Loader=_BASE):
@@ -168,11 +170,11 @@ def _check_size(text: str) -> None:
 
 
 def _key_lines(root) -> dict[tuple, int]:
-    """Line of every key; what an alias repeats has the line of the key that holds the alias."""
+    """Return the line of every key; keys from an alias have the line of the key with the alias."""
     lines: dict[tuple, int] = {(): root.start_mark.line + 1}
     opened: set = set()
     waiting: list[tuple[Any, tuple]] = [(root, ())]
-    for node, path in waiting:  # grows on the way
+    for node, path in waiting:  # the list grows during iteration
         if node in opened:
             continue
         opened.add(node)
@@ -187,7 +189,7 @@ def _key_lines(root) -> dict[tuple, int]:
     return lines
 
 
-# What PyYAML's constructors raise at an explicit tag that does not suit its scalar.
+# PyYAML's constructors raise these for a value that does not match its explicit tag.
 _BAD_SCALARS = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError)
 
 
@@ -211,7 +213,7 @@ def read_yaml(path: str | Path) -> tuple[dict, dict[tuple, int]]:
         mark = getattr(error, "problem_mark", None)
         line = f":{mark.line + 1}" if mark else ""
         nested = isinstance(error, RecursionError)
-        untold = "it is nested too deeply" if nested else "a value does not suit its !!tag"
+        untold = "it is nested too deeply" if nested else "a value does not match its !!tag"
         problem = getattr(error, "problem", None) or str(error if error.args[1:] else untold)
         raise InputError(f"{path}{line}", f"is not valid YAML: {problem}") from None
     if not isinstance(data, dict) or node is None:
@@ -220,10 +222,10 @@ def read_yaml(path: str | Path) -> tuple[dict, dict[tuple, int]]:
 
 
 def read_value(text: str) -> Any:
-    """A single YAML value, read as in files.
+    """Parse a single YAML value with the same rules as for files.
 
     Raises:
-        yaml.YAMLError: the text is no YAML.
+        yaml.YAMLError: the text is not valid YAML.
     """
     return _load(text)[1]
 
@@ -232,19 +234,19 @@ Model = TypeVar("Model", bound=Facts)
 
 
 def parse(model: type[Model], data: dict, source: str, lines: dict[tuple, int]) -> Model:
-    """Validate data against a Facts class.
+    """Validate data against a subclass of `Facts`.
 
     Args:
         model: the class.
-        data: what was read.
-        source: file name for messages.
-        lines: key path -> line, as from `read_yaml`; may be empty.
+        data: the data, as returned by `read_yaml`.
+        source: file name for error messages.
+        lines: key path -> line, as returned by `read_yaml`; may be empty.
 
     Returns:
         The validated instance.
 
     Raises:
-        InputError: names file, line, key path and what is allowed.
+        InputError: the data are not valid; names file, line, key path and allowed values.
     """
     try:
         return model.model_validate(data)

@@ -1,20 +1,20 @@
-"""The one error that the user can mend."""
+"""The error raised for invalid user input."""
 
-_MOST = 400, 1400  # bytes of place and message; a file may have keys and values of any length
+_MOST = 400, 1400  # bytes of location and message; keys and values of a file can be very long
 
 
 class InputError(ValueError):
-    """Something the user gave is wrong; the command line prints it and exits with status 2.
+    """Error in user input; the command line prints it and exits with status 2.
 
     Attributes:
-        where: the place, from coarse to fine: file, then column, key, row or line.
-        message: what is wrong there and what to do about it.
+        where: location of the error, from coarse to fine: file, then column, key, row or line.
+        message: description of the error and how to correct it.
     """
 
     def __init__(self, where: object, message: str) -> None:
-        """Keep the place and the message, each cut in its middle; `where` may be a path."""
+        """Store location and message, each shortened if too long; `where` may be a path."""
         self.where, self.message = map(_shortened, (str(where), message), _MOST)
-        super().__init__(self.where, self.message)  # both in args, so that it survives pickling
+        super().__init__(self.where, self.message)  # pickling passes `args` to the constructor
 
     def __str__(self) -> str:
         """Return `where: message`."""
@@ -22,7 +22,7 @@ class InputError(ValueError):
 
 
 def _shortened(text: str, most: int) -> str:
-    """The beginning and the end of a text in at most `most` bytes, control characters escaped."""
+    """Shorten a text to `most` bytes by cutting its middle, and escape control characters."""
     if len(text) > 2 * most:
         text = f"{text[:most]} ... {text[-most:]}"
     text = "".join(c if c.isprintable() or c == "\n" else _escaped(c) for c in text)

@@ -1,12 +1,9 @@
-"""Files of users: regular ones, no larger than they may be, as bytes, text or JSON.
+"""Read user files safely: bytes, text, JSON and XML of regular files up to a size limit.
 
-What a user's file may ask for before it is refused, and before memory is used for it.
-
-Each limit can be changed by an environment variable of its name, `HYDROTELE_MAX_LOG_VALUES=1e9`.
-
-Where the shipped models and scenarios lie: inside the wheel, or beside a checkout's package.
-
-Files that an MJCF names: meshes, textures and height fields, found beside it and copied.
+`LIMITS` bounds the size of user input before memory is allocated for it. An environment variable
+changes a limit, for example `HYDROTELE_MAX_LOG_VALUES=1e9`. The module also locates the shipped
+models and scenarios, and checks and copies the asset files (meshes, textures, height fields) of an
+MJCF.
 """
 
 import contextlib
@@ -25,23 +22,23 @@ from hydrotele.core.errors import InputError
 
 LIMITS: Mapping[str, tuple[float, str]] = MappingProxyType({
     "FILE_BYTES": (32e6, "bytes of a YAML, JSON or MJCF file"),
-    "FILE_DEPTH": (100, "levels of lists, mappings or elements inside each other"),
-    "FILE_VALUES": (2e6, "values of a YAML file, those that aliases repeat included"),
+    "FILE_DEPTH": (100, "nested levels of lists, mappings or elements"),
+    "FILE_VALUES": (2e6, "values of a YAML file, after alias expansion"),
     "LOG_VALUES": (1e8, "values of a log, rows times columns"),
-    "RUN_TICKS": (2e7, "ticks of the controller in a run"),
-    "RUN_ROWS": (2e6, "rows that a run logs"),
+    "RUN_TICKS": (2e7, "controller ticks of a run"),
+    "RUN_ROWS": (2e6, "logged rows of a run"),
     "MOVES": (1e4, "moves or waypoints of a pilot"),
     "HARMONICS": (1e3, "harmonics of a joint's reference"),
     "ASSET_BYTES": (256e6, "bytes of a mesh, texture or height field"),
 })  # fmt: skip
-"""Name -> (the most that is allowed, of what)."""
+"""Name -> (largest allowed amount, description of the counted quantity)."""
 
 
 def limit(name: str) -> float:
-    """The most that is allowed of a name in `LIMITS`.
+    """Return a limit of `LIMITS`, or the value of its environment variable if that is set.
 
     Raises:
-        InputError: the environment variable is no positive number.
+        InputError: the environment variable is not a positive number.
     """
     variable = f"HYDROTELE_MAX_{name}"
     stated = os.environ.get(variable)
@@ -57,7 +54,7 @@ def limit(name: str) -> float:
 
 
 def beyond(name: str, amount: float) -> str | None:
-    """What to say of an amount that is beyond its limit, None where it is within.
+    """Return an error text for an amount above its limit, or None if the limit is respected.
 
     >>> beyond("MOVES", 3)
     >>> beyond("MOVES", 20000)
@@ -73,24 +70,25 @@ def beyond(name: str, amount: float) -> str | None:
 
 
 def check_limit(where: object, name: str, amount: float) -> None:
-    """Refuse an amount beyond its limit.
+    """Raise an error if an amount exceeds its limit.
 
     Raises:
-        InputError: it is; says how to allow it.
+        InputError: the limit is exceeded; the message names the variable that raises it.
     """
     if said := beyond(name, amount):
         raise InputError(where, f"has {said}")
 
 
 def read_bytes(path: str | Path, limit: str = "FILE_BYTES") -> bytes:
-    """The content of a regular file.
+    """Read the content of a regular file.
 
     Args:
         path: the file.
-        limit: name of its size's limit.
+        limit: name in `LIMITS` of its size limit.
 
     Raises:
-        InputError: it is a folder, pipe, device or socket, too large, or cannot be read.
+        InputError: the path is a folder, pipe, device or socket, the file is too large, or it
+            cannot be read.
     """
     with open_regular(path) as file:
         check_limit(path, limit, os.fstat(file.fileno()).st_size)
@@ -99,40 +97,40 @@ def read_bytes(path: str | Path, limit: str = "FILE_BYTES") -> bytes:
 
 @contextlib.contextmanager
 def open_regular(path: str | Path) -> Iterator[BinaryIO]:
-    """A regular file, open for reading.
+    """Open a regular file for reading.
 
     Raises:
-        InputError: it is a folder, pipe, device or socket, or cannot be read.
+        InputError: the path is a folder, pipe, device or socket, or cannot be read.
     """
     try:
         if "\0" in str(path):
-            raise InputError(path, "is no name of a file")
+            raise InputError(path, "is not a valid file name")
         handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe does not block
         with open(handle, "rb") as file:
             if not stat.S_ISREG(os.fstat(handle).st_mode):
-                raise InputError(path, "is no regular file, but a pipe or device")
+                raise InputError(path, "is not a regular file but a pipe or device")
             yield file
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror or error}") from None
 
 
 def read_text(path: str | Path) -> str:
-    """The text of a regular file in UTF-8, without a byte order mark.
+    """Read a regular file as UTF-8 text, without a byte order mark.
 
     Raises:
-        InputError: as `read_bytes`, or it is no such text.
+        InputError: as `read_bytes`, or the content is not valid UTF-8.
     """
     try:
         return read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(path, f"cannot be read as text in UTF-8: {error.reason}") from None
+        raise InputError(path, f"is not valid UTF-8 text: {error.reason}") from None
 
 
 def read_xml(path: str | Path) -> ElementTree.Element:
-    """The root of the XML in a regular file.
+    """Read a regular file as XML and return the root element.
 
     Raises:
-        InputError: as `read_bytes`, or it is no XML, or nested too deeply for MuJoCo to read.
+        InputError: as `read_bytes`, or the content is not XML or is nested too deeply for MuJoCo.
     """
     content = read_bytes(path)
     depth = deepest = 0
@@ -146,19 +144,19 @@ def read_xml(path: str | Path) -> ElementTree.Element:
             root = element if root is None else root
             depth += 1 if event == "start" else -1
             deepest = max(deepest, depth)
-    except (ElementTree.ParseError, ValueError, LookupError) as error:  # of its encoding
+    except (ElementTree.ParseError, ValueError, LookupError) as error:  # LookupError: bad encoding
         raise InputError(path, f"is not XML: {error}") from None
     if root is None:
-        raise InputError(path, "is not XML: it holds no element")
+        raise InputError(path, "is not XML: it has no element")
     check_limit(path, "FILE_DEPTH", deepest)
     return root
 
 
 def json_value(text: str | bytes) -> Any:
-    """A JSON value.
+    """Parse JSON text.
 
     Raises:
-        ValueError: it is no JSON, or nested too deeply.
+        ValueError: the text is not JSON, or is nested too deeply.
     """
     try:
         return json.loads(text)
@@ -167,10 +165,10 @@ def json_value(text: str | bytes) -> Any:
 
 
 def read_json(path: str | Path) -> Any:
-    """The JSON value in a regular file.
+    """Read a regular file as JSON.
 
     Raises:
-        InputError: as `read_text`, or it is no JSON.
+        InputError: as `read_text`, or the content is not JSON.
     """
     try:
         return json_value(read_text(path))
@@ -181,6 +179,7 @@ def read_json(path: str | Path) -> Any:
 
 
 def _folder(name: str) -> Path:
+    """Return a data folder inside the installed package, or next to the package in a checkout."""
     package = Path(__file__).resolve().parent.parent
     for base in (package, package.parent):
         if (base / name).is_dir():
@@ -189,21 +188,21 @@ def _folder(name: str) -> Path:
 
 
 def models_folder() -> Path:
-    """Folder with one folder per shipped machine."""
+    """Return the folder that has one subfolder per shipped machine."""
     return _folder("models")
 
 
 def scenarios_folder() -> Path:
-    """Folder with the shipped scenarios."""
+    """Return the folder of the shipped scenarios."""
     return _folder("scenarios")
 
 
-_FOLDERS = {"texture": "texturedir"}  # element -> compiler's attribute; others have `meshdir`
+_FOLDERS = {"texture": "texturedir"}  # element -> compiler attribute; all others use `meshdir`
 _FILES = ("file", *(f"file{side}" for side in ("right", "left", "up", "down", "front", "back")))
 
 
 def asset_files(tree: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, str, str]]:
-    """Every file that a document names: (element, attribute, path relative to the document)."""
+    """Iterate over the asset files of an MJCF: (element, attribute, path relative to the MJCF)."""
     folders: dict[str, str] = {}
     for compiler in tree.findall("compiler"):
         folders |= compiler.attrib
@@ -217,14 +216,14 @@ def asset_files(tree: ElementTree.Element) -> Iterator[tuple[ElementTree.Element
 
 
 def check_assets(tree: ElementTree.Element, mjcf: Path) -> None:
-    """Refuse files that are missing, no regular files, or too large, before they are read.
+    """Check that all asset files of an MJCF exist, are regular files and are not too large.
 
     Args:
-        tree: the document.
-        mjcf: its file, which paths are relative to.
+        tree: root element of the MJCF.
+        mjcf: file of the MJCF; asset paths are relative to it.
 
     Raises:
-        InputError: names the document, the element and the file.
+        InputError: a file fails the check; names the MJCF, the element and the file.
     """
     for element, attribute, file in asset_files(tree):
         where = f"{mjcf}: <{element.tag} {attribute}={element.get(attribute)!r}>"
@@ -236,15 +235,15 @@ def check_assets(tree: ElementTree.Element, mjcf: Path) -> None:
 
 
 def copy_mjcf(mjcf: Path, target: Path, folder: str) -> bool:
-    """Copy a document and the files that it names, so that the copies can be handed on.
+    """Copy an MJCF together with its asset files, so that the copy does not depend on the original.
 
     Args:
-        mjcf: the document.
-        target: the copy.
-        folder: name of the folder beside the copy that takes the files, where there are any.
+        mjcf: the MJCF file.
+        target: path of the copy.
+        folder: name of the folder for the asset files, created next to the copy if needed.
 
     Returns:
-        Whether it could: a document that includes others is not copied.
+        True if it was copied; False for an MJCF with `include` elements, which is not copied.
 
     Raises:
         InputError: a file is missing or too large.
@@ -261,7 +260,7 @@ def copy_mjcf(mjcf: Path, target: Path, folder: str) -> bool:
     for number, (element, attribute, file) in enumerate(files):
         source = mjcf.parent / file
         if attribute == "file" and not element.get("name"):
-            element.set("name", source.stem)  # MuJoCo's choice, which the new name would change
+            element.set("name", source.stem)  # MuJoCo's default: the file name
         copy = f"{folder}/{number}_{source.name}"
         shutil.copyfile(source, target.parent / copy)
         element.set(attribute, copy)

@@ -1,9 +1,9 @@
-"""How compiled functions call each other: large ones by symbol, small ones inlined.
+"""Separate compilation of numba functions: large callees are linked by symbol, small ones inlined.
 
-numba copies the code of every function that is called, and of those that it calls, into the caller,
-and optimises and translates all of it again. With calls ten deep this is most of the time to
-compile. Here a large function is compiled once, and its callers only name its symbol. Code from the
-cache is loaded together with the functions whose symbols it names.
+By default numba copies the code of every callee, direct or indirect, into the caller and compiles
+all of it again. With calls ten levels deep this dominates the compile time. Here a large function
+is compiled once, and its callers only refer to its symbol. Code loaded from the cache also loads
+the functions whose symbols it refers to.
 """
 
 import importlib
@@ -15,16 +15,16 @@ from numba.core.typing.templates import make_concrete_template
 from hydrotele.core.references import argument_type, check_result
 
 LINKED_BYTECODE = 300
-"""Length of a function's bytecode up to which its code becomes part of the caller [bytes]. LLVM
-would seldom inline longer ones."""
+"""Largest bytecode length of a function whose code is copied into the caller [bytes]. LLVM seldom
+inlines longer functions."""
 
 
 class Callee:
-    """A compiled function as other compiled functions call it.
+    """A compiled function that is called from other compiled functions.
 
     Attributes:
         dispatcher: numba's dispatcher that compiles it.
-        is_separate: whether callers name its symbol.
+        is_separate: whether callers link to its symbol instead of copying its code.
     """
 
     def __init__(self, dispatcher: Any, inline: bool) -> None:
@@ -39,15 +39,15 @@ class Callee:
         _callees[self.place] = self
 
     def compile(self, args: tuple) -> Any:
-        """Compile for some types of arguments, or load from the cache; numba's result."""
+        """Compile for the given argument types, or load from the cache; return numba's result."""
         self.dispatcher.compile(args)
         return self.dispatcher.overloads[args]
 
     def call_template(self, args: tuple, keywords: dict) -> tuple:
-        """Compile for a call in compiled code, as `Dispatcher.get_call_template` of numba does.
+        """Compile the callee and return its template; replaces `Dispatcher.get_call_template`.
 
-        A constant argument is taken as any number of its kind, so that no function is compiled for
-        each constant.
+        A literal argument gets its non-literal type, so that a function is not compiled for each
+        constant.
         """
         pysig, args = self.dispatcher.fold_argument_types(args, keywords)
         args = tuple(map(argument_type, args))
@@ -56,13 +56,14 @@ class Callee:
         return make_concrete_template(f"CallTemplate({name})", name, [signature]), pysig, args, {}
 
     def overload(self, args: tuple) -> Any:
-        """Key under which numba finds how to call it, as `Dispatcher.get_overload` of numba."""
+        """Return the key of the callee's entry point; replaces `Dispatcher.get_overload`."""
         result = self.dispatcher.overloads[tuple(args)]
         if not self.is_separate:
             return result.entry_point
         return self._symbol_key(result)
 
     def _symbol_key(self, result: Any) -> tuple[str, str]:
+        """Register a function's symbol with numba and return its key."""
         symbol = result.fndesc.mangled_name
         if symbol not in _symbols:
             self.dispatcher.targetctx.insert_user_function(("symbol", symbol), result.fndesc)
@@ -72,21 +73,21 @@ class Callee:
 
 _callees: dict[tuple, Callee] = {}
 _symbols: dict[str, tuple[tuple, tuple]] = {}
-"""Symbol of a function -> its place and the types of its arguments."""
+"""Symbol of a function -> its module, name and line, and the types of its arguments."""
 
 
 class LinkedCache(CompileResultCacheImpl):
-    """Keeps with compiled code which functions its symbols stand for."""
+    """Cache of compiled code that also stores which functions its external symbols refer to."""
 
     def reduce(self, cres: Any) -> Any:
-        """What is kept of compiled code."""
+        """Return the data to store for a compilation result."""
         module = cres.library._final_module
         declared = [f.name for f in module.functions if f.is_declaration]
         needed = {name: _symbols[name] for name in declared if name in _symbols}
         return needed, super().reduce(cres)
 
     def rebuild(self, target_context: Any, payload: Any) -> Any:
-        """Load compiled code and what it calls; None where a function now has another symbol."""
+        """Load compiled code and its callees; return None if a callee's symbol has changed."""
         needed, code = payload
         for symbol, (place, args) in needed.items():
             importlib.import_module(place[0])

@@ -1,6 +1,6 @@
-"""Memory by address for compiled code: arrays of numbers, and records of many addresses at once.
+"""Access to memory by address in compiled code: array views and records of addresses.
 
-Addresses are numbers, so that compiled functions can be cached on disk and called by C.
+Addresses are integers, so that compiled functions can be cached on disk and called from C.
 """
 # pyright: reportCallIssue=false, reportPrivateImportUsage=false
 # numba's intrinsics are called without their typing context, and carray is its documented API.
@@ -15,7 +15,7 @@ from hydrotele.core.compiled import compiled
 
 @intrinsic
 def pointer(typingctx, address):
-    """Reinterpret an int64 address as void*."""
+    """Convert an int64 address to a void pointer."""
 
     def codegen(context, builder, signature, args):
         return builder.inttoptr(args[0], cgutils.voidptr_t)
@@ -25,31 +25,31 @@ def pointer(typingctx, address):
 
 @compiled
 def floats(address, count):
-    """(count,) floats at an address."""
+    """Return a (count,) view of the 64-bit floats at an address."""
     return carray(pointer(address), (count,), np.float64)
 
 
 @compiled
 def rows_of(address, rows, columns):
-    """(rows, columns) floats at an address."""
+    """Return a (rows, columns) view of the 64-bit floats at an address."""
     return floats(address, rows * columns).reshape((rows, columns))
 
 
 @compiled
 def integers(address, count):
-    """(count,) 64-bit integers at an address."""
+    """Return a (count,) view of the 64-bit integers at an address."""
     return carray(pointer(address), (count,), np.int64)
 
 
 @compiled
 def copy_to(there, values):
-    """Copy numbers into the first places of an array.
+    """Copy values into the first elements of an array.
 
-    numba's own assignment compiles words for its error message with it, which takes seconds.
+    numba's slice assignment also compiles the formatting of its error message, which takes seconds.
 
     Args:
-        there: (>= n,) written.
-        values: (n,).
+        there: (>= n,) destination array; its first n elements are written.
+        values: (n,) values to copy.
 
     Returns:
         Nothing.
@@ -60,34 +60,35 @@ def copy_to(there, values):
 
 @compiled
 def short_integers(address, count):
-    """(count,) 32-bit integers at an address."""
+    """Return a (count,) view of the 32-bit integers at an address."""
     return carray(pointer(address), (count,), np.int32)
 
 
 def address_record(kind: np.dtype, arrays: dict[str, np.ndarray]) -> np.ndarray:
-    """A record of the addresses of arrays, for native code that takes many of them at once.
+    """Create a record with the addresses of arrays, for compiled code that needs many arrays.
 
-    Reading a named tuple of arrays costs numba a microsecond each, a record none.
+    To unbox a named tuple of arrays takes numba about a microsecond per array; a record avoids it.
 
     Args:
-        kind: record type with a field of 64-bit integers for every array.
-        arrays: field -> contiguous array of 64-bit floats or integers, which must outlive it.
+        kind: record type with a 64-bit integer field for every array.
+        arrays: field -> contiguous array of 64-bit floats or integers, which must outlive the
+            record.
 
     Returns:
-        (1,) record; other fields are 0.
+        (1,) record; all other fields are 0.
 
     Raises:
-        TypeError: an array is of another kind.
+        TypeError: an array is not contiguous or has another element type.
     """
     record = np.zeros(1, kind)
     for name, array in arrays.items():
         if array.dtype not in (np.float64, np.int64) or not array.flags.c_contiguous:
-            raise TypeError(f"{name} must be contiguous 64-bit numbers, not {array.dtype}")
+            raise TypeError(f"{name} must be a contiguous 64-bit array, not {array.dtype}")
         record[name] = array.ctypes.data
     return record
 
 
 @compiled
 def field(base, offset, count):
-    """(count,) floats that a struct at `base` points to with its member at `offset`."""
+    """Return a (count,) view of the floats that the pointer at `base + offset` points to."""
     return floats(carray(pointer(base + offset), (1,), np.int64)[0], count)

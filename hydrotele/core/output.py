@@ -1,4 +1,7 @@
-"""Files and folders that appear whole or not at all."""
+"""Atomic output: files and folders that are written completely or not at all.
+
+Output goes to a hidden temporary name first and is renamed when it is complete.
+"""
 
 import contextlib
 import fnmatch
@@ -40,23 +43,23 @@ OURS = {
         "runs/.*.part/*",
     ),
 }  # fmt: skip
-"""Kind of folder -> files that it holds beside `summary.json`, which states the kind."""
+"""Kind of output folder -> its files, in addition to `summary.json`, which states the kind."""
 
 
 @contextlib.contextmanager
 def whole_folder(target: str | Path, kind: str) -> Iterator[Path]:
-    """Write into a hidden folder beside the target and rename it when everything is there.
+    """Create an output folder atomically: write to a hidden folder and rename it at the end.
 
     Args:
-        target: folder to make; an older one of that name and kind is replaced.
+        target: folder to create; an existing folder of the same kind is replaced.
         kind: a key of `OURS`.
 
     Yields:
-        The folder to write into. A killed run leaves only `.NAME.*.part`, which the next run of the
-        same name removes.
+        The temporary folder to write to. A killed run leaves only `.NAME.*.part`, which the next
+        run with the same target removes.
 
     Raises:
-        InputError: as `check_target`.
+        InputError: as `check_target`, or the folder cannot be created or written.
     """
     asked, target = target, Path(target).resolve()
     check_target(asked, kind)
@@ -68,7 +71,7 @@ def whole_folder(target: str | Path, kind: str) -> Iterator[Path]:
         prefix = f".{target.name}.{os.getpid()}."
         part = Path(tempfile.mkdtemp(prefix=prefix, suffix=".part", dir=target.parent))
     except OSError as error:
-        raise InputError(asked, f"cannot be made: {error.strerror}") from None
+        raise InputError(asked, f"cannot be created: {error.strerror}") from None
     old = part.with_suffix(".old.part")
     try:
         part.chmod(0o755)
@@ -85,26 +88,26 @@ def whole_folder(target: str | Path, kind: str) -> Iterator[Path]:
             raise InputError(error.where.replace(str(part), str(asked)), error.message) from error
         if isinstance(error, OSError):
             reason = error.strerror or str(error)
-            raise InputError(asked, f"cannot be written, nothing is left: {reason}") from error
+            raise InputError(asked, f"cannot be written, output removed: {reason}") from error
         raise
 
 
 def check_target(target: str | Path, kind: str) -> None:
-    """Refuse to replace what is not ours, or to write where one cannot.
+    """Check that a folder can be created or replaced without deleting files of the user.
 
     Args:
         target: the folder to be written.
         kind: a key of `OURS`.
 
     Raises:
-        InputError: the target is a file, a folder of another kind or with other files in it, or
-            lies where no folder can be made.
+        InputError: the target is a file, a folder of another kind, a folder with unknown files, or
+            it cannot be created.
     """
     place = Path(target).resolve()
     if not place.exists():
         above = next(p for p in place.parents if p.exists())
         if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
-            raise InputError(target, f"cannot be made: {above} is no folder that can be written to")
+            raise InputError(target, f"cannot be created: {above} is not a writable folder")
         return
     if not place.is_dir():
         raise InputError(target, f"exists and was not written by a {kind}; choose another --out")
@@ -114,32 +117,35 @@ def check_target(target: str | Path, kind: str) -> None:
     patterns = ("summary.json", *OURS[kind])
     strange = [name for name in inside if not any(_matches(name, p) for p in patterns)]
     if strange:
-        message = f"holds {', '.join(strange[:3])}, which no {kind} wrote; choose another --out"
+        listed = ", ".join(strange[:3])
+        message = f"contains {listed}, not written by a {kind}; choose another --out"
         raise InputError(target, message)
 
 
 def _matches(name: str, pattern: str) -> bool:
-    """Whether a path is of a pattern, or is a folder on the way to it."""
+    """Return whether a path matches a pattern or is a parent folder of such a path."""
     parts, wanted = name.split("/"), pattern.split("/")
     return len(parts) <= len(wanted) and all(map(fnmatch.fnmatch, parts, wanted))
 
 
 def _kind(folder: Path) -> str | None:
+    """Return the kind stated in a folder's `summary.json`; None if it cannot be read."""
     try:
         return read_json(folder / "summary.json").get("kind")
     except (InputError, AttributeError):
         return None
 
 
-_PART = re.compile(r"\.(\d+)\.[a-z0-9_]{8}(?:\.old)?\.part$")  # process, letters of mkdtemp
+_PART = re.compile(r"\.(\d+)\.[a-z0-9_]{8}(?:\.old)?\.part$")  # process id, mkdtemp
 
 
 def _ours(part: Path) -> bool:
-    """Whether a killed run left this folder: a user's own is never removed."""
+    """Return whether a path is a temporary folder of this module; only these are removed."""
     return bool(_PART.search(part.name)) and part.is_dir() and not part.is_symlink()
 
 
 def _alive(part: Path) -> bool:
+    """Return whether the process that created a temporary folder is another running process."""
     try:
         pid = int(_PART.findall(part.name)[0])
         os.kill(pid, 0)
@@ -152,25 +158,25 @@ def _alive(part: Path) -> bool:
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike, suffix: str) -> Iterator[Path]:
-    """Give a path beside `path` to write to; it takes the place of `path` at the end.
+    """Write a file atomically: yield a temporary path in the same folder and rename it at the end.
 
     Args:
         path: the file to write.
-        suffix: the ending that its name must have, with the dot; "" for any.
+        suffix: required file extension, with the dot; "" for any.
 
     Yields:
-        The path to write to. A killed process leaves at most a hidden file of another name.
+        The temporary path to write to. A killed process leaves at most one hidden file.
 
     Raises:
-        InputError: the name ends otherwise, or the folder cannot be written. Nothing is left then.
+        InputError: the extension is wrong, or the folder is not writable. No file is left behind.
     """
     path = Path(path)
     if suffix and path.suffix.lower() != suffix:
-        raise InputError(path, f"give it a name that ends in {suffix}")
+        raise InputError(path, f"must have a name that ends in {suffix}")
     if not path.parent.is_dir():
         raise InputError(path, f"cannot be written: {path.parent} is not a folder")
     if not os.access(path.parent, os.W_OK | os.X_OK):
-        raise InputError(path, f"cannot be written: {path.parent} cannot be written to")
+        raise InputError(path, f"cannot be written: {path.parent} is not writable")
     part = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{path.suffix}")
     try:
         yield part
@@ -178,5 +184,5 @@ def replacing(path: str | os.PathLike, suffix: str) -> Iterator[Path]:
     except OSError as error:
         raise InputError(path, f"cannot be written: {error.strerror or error}") from error
     finally:
-        with contextlib.suppress(OSError):  # a file system that became read-only keeps it
+        with contextlib.suppress(OSError):  # fails if the file system has become read-only
             part.unlink(missing_ok=True)

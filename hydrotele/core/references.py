@@ -1,9 +1,9 @@
-"""Large named tuples are handed from one compiled function to another by their address.
+"""Pass large named tuples between compiled functions by reference.
 
-numba hands a named tuple on as one argument per number in it: seven to nine for each array, a
-thousand for the estimator's model. The time to compile a function grows with that number. Here each
-large named tuple lies in memory, and a function gets its address and reads what it uses. The memory
-belongs to the caller and does not change while the callee runs.
+numba passes a named tuple by value, as one native argument per scalar: seven to nine for each
+array, a thousand for the estimator's model. Compile time grows with this count. Here the caller
+stores a large named tuple in memory, and the callee gets its address and reads the fields that it
+uses. The memory belongs to the caller and does not change while the callee runs.
 """
 
 import functools
@@ -22,14 +22,16 @@ from numba.core.imputils import (
 from numba.extending import NativeValue, register_model, unbox
 
 MAX_ARGUMENTS_BY_VALUE = 40
-"""Native arguments of a named tuple up to which it is handed on by value, as numba does: small ones
-stay in registers."""
+"""Largest number of native arguments of a named tuple that is still passed by value. Small named
+tuples stay in registers."""
 
 _RECORDS = (types.NamedTuple, types.NamedUniTuple)
 
 
 class Reference(types.BaseNamedTuple):
-    """Type of the address of a named tuple, with the same fields; nested ones are addresses, too.
+    """numba type of a reference to a named tuple; it has the same fields as the tuple.
+
+    Nested named tuples are references, too.
 
     Attributes:
         record: numba's type of the named tuple.
@@ -45,32 +47,32 @@ class Reference(types.BaseNamedTuple):
         owner = record.instance_class
         text = f"{owner.__module__}.{owner.__qualname__} {record}"
         digest = hashlib.sha256(text.encode()).hexdigest()[:16]
-        # numba writes the name of each argument's type into that of the function.
+        # numba adds the names of the argument types to the function's symbol: keep this one short.
         super().__init__(f"{owner.__name__}_{digest}")
 
     def __getitem__(self, index: int) -> Any:
-        """Type of a field."""
+        """Return the type of a field."""
         return self.types[index]
 
     def __iter__(self) -> Any:
-        """Types of the fields."""
+        """Iterate over the types of the fields."""
         return iter(self.types)
 
     def __len__(self) -> int:
-        """Number of fields."""
+        """Return the number of fields."""
         return self.count
 
 
 @functools.cache
 def argument_type(kind: Any) -> Any:
-    """Type in which an argument reaches a compiled function.
+    """Return the type with which an argument is passed to a compiled function.
 
     Args:
-        kind: numba's type of what the caller has.
+        kind: numba's type of the argument in the caller.
 
     Returns:
-        A `Reference` for a large named tuple; for a constant the type of all numbers of its kind,
-        so that a function is not compiled for each constant; else the same type.
+        A `Reference` for a large named tuple; the non-literal type for a constant, so that a
+        function is not compiled for each constant; otherwise `kind` itself.
     """
     if isinstance(kind, _RECORDS) and count_arguments(kind) > MAX_ARGUMENTS_BY_VALUE:
         return Reference(kind)
@@ -78,37 +80,37 @@ def argument_type(kind: Any) -> Any:
 
 
 def count_arguments(kind: Any) -> int:
-    """Count the native arguments that a type becomes when it is handed on by value."""
+    """Count the native arguments of a type when it is passed by value."""
     if isinstance(kind, types.BaseTuple) and not isinstance(kind, Reference):
         return sum(count_arguments(part) for part in _parts(kind))
     return 5 + 2 * kind.ndim if isinstance(kind, types.Array) else 1
 
 
 def check_result(kind: Any, name: str) -> None:
-    """Refuse a function that returns an address, which may outlive what lies there.
+    """Reject a function that returns a reference, which could outlive the memory it points to.
 
     Args:
         kind: type of the result.
-        name: of the function.
+        name: name of the function.
 
     Raises:
-        TypingError: it is, or contains, an address.
+        TypingError: the result is or contains a reference.
     """
     if isinstance(kind, Reference):
-        raise errors.TypingError(f"{name} returns a large named tuple that it was given")
+        raise errors.TypingError(f"{name} returns a large named tuple that it got as an argument")
     if isinstance(kind, types.BaseTuple):
         for part in _parts(kind):
             check_result(part, name)
 
 
 def _parts(kind: Any) -> tuple:
-    """Types of the items of a tuple."""
+    """Return the types of the items of a tuple."""
     return tuple(kind)
 
 
 @register_model(Reference)
 class _ReferenceModel(OpaqueModel):
-    """An address."""
+    """Data model of a reference: an opaque pointer."""
 
 
 @lower_getattr_generic(Reference)
@@ -119,12 +121,12 @@ def _read_attribute(context, builder, kind, address, attr):
 
 @lower_builtin("static_getitem", Reference, types.IntegerLiteral)
 def _read_item(context, builder, sig, args):
-    """Read a field by its place; so does taking a named tuple apart."""
+    """Read a field by its index; unpacking a named tuple uses this, too."""
     return _read_field(context, builder, sig.args[0], args[0], args[1])
 
 
 def _read_field(context, builder, kind, address, index):
-    """Read a field from memory."""
+    """Emit code that reads a field from memory; return a reference for a nested named tuple."""
     memory = context.data_model_manager[kind.record].get_data_type()
     place = cgutils.gep_inbounds(builder, builder.bitcast(address, memory.as_pointer()), 0, index)
     field = kind.types[index]
@@ -134,7 +136,7 @@ def _read_field(context, builder, kind, address, index):
     found = context.data_model_manager[field].load_from_data_pointer(builder, place)
     unchanged = builder.module.add_metadata([])
     for instruction in block.instructions[begin:]:
-        if isinstance(instruction, ir.LoadInstr):  # so that LLVM takes it out of loops
+        if isinstance(instruction, ir.LoadInstr):  # lets LLVM move it out of loops
             instruction.set_metadata("invariant.load", unchanged)
     return impl_ret_borrowed(context, builder, field, found)
 
@@ -150,6 +152,7 @@ def _store(context, builder, fromty, toty, value):
 
 
 def _store_fields(context, builder, record, value, space) -> None:
+    """Emit code that stores the fields of a named tuple, nested ones included, in memory."""
     for index, field in enumerate(record):
         part = builder.extract_value(value, index)
         place = cgutils.gep_inbounds(builder, space, 0, index)
@@ -160,9 +163,9 @@ def _store_fields(context, builder, record, value, space) -> None:
 
 
 def _hide(builder, space):
-    """Hide from LLVM where an address is from.
+    """Hide the origin of an address from LLVM.
 
-    After inlining, reads that are marked as unchanged could otherwise go before the writes.
+    Otherwise LLVM could move the reads marked as invariant before the writes after inlining.
     """
     address = builder.bitcast(space, cgutils.voidptr_t)
     kind = ir.FunctionType(cgutils.voidptr_t, [cgutils.voidptr_t])
@@ -171,7 +174,7 @@ def _hide(builder, space):
 
 @unbox(Reference)
 def _unbox(kind, value, c):
-    """Read a named tuple of Python into memory."""
+    """Store a Python named tuple in memory and return its address."""
     native = c.unbox(kind.record, value)
     memory = c.context.data_model_manager[kind.record].get_data_type()
     space = cgutils.alloca_once(c.builder, memory)

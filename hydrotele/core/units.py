@@ -1,6 +1,6 @@
-"""Units: what each is in SI, how it is spelled, how keys of files name it, how people read it.
+"""Conversion of units to SI, alternative spellings, key suffixes and display units.
 
-One table for logs, YAML keys, plots and reports.
+Logs, YAML files, plots and reports all use these tables.
 """
 
 import math
@@ -51,7 +51,7 @@ UNITS: Mapping[str, tuple[str, float]] = {
     "L/min per 100 bar": ("m^3/(s Pa)", 1e-10 / 60),
     "bar per 100 L/min": ("Pa s/m^3", 6e7),
 }
-"""Unit -> (SI unit, factor to it). All are pure scalings."""
+"""Unit -> (SI unit, factor to it). All conversions are pure scalings."""
 
 _SPELLINGS = {
     "-": "1", "sec": "s", "seconds": "s", "volt": "V", "µs": "us", "s^-1": "1/s",
@@ -64,14 +64,14 @@ KEY_SUFFIXES: Mapping[str, str] = {
     "_deg": "deg", "_mm": "mm", "_in2": "in^2", "_cm2": "cm^2", "_psi": "psi", "_bar": "bar",
     "_hz": "Hz", "_l_min": "L/min", "_ms": "ms",
 }  # fmt: skip
-"""Suffix of a key in a YAML file -> unit; `Hz` is SI, but of an angular frequency."""
+"""Suffix of a key in a YAML file -> unit. For an angular frequency, Hz stands for 2 pi rad/s."""
 
 _ON_AXES: Mapping[str, str] = {
     "rad": "deg", "rad/s": "deg/s", "rad/s^2": "deg/s^2", "m": "mm", "m/s": "mm/s",
     "m/s^2": "mm/s^2", "Pa": "MPa", "m^3/s": "L/min", "N": "kN", "N m": "kN m",
 }  # fmt: skip
 
-# SI unit -> (smallest magnitude in SI, unit in reports), the largest first.
+# SI unit -> (smallest magnitude in SI, unit in reports), in descending order of magnitude.
 _IN_REPORTS: Mapping[str, tuple[tuple[float, str], ...]] = {
     "1": ((0.0, "%"),),
     "m": ((1.0, "m"), (0.0, "mm")),
@@ -95,7 +95,7 @@ _IN_REPORTS: Mapping[str, tuple[tuple[float, str], ...]] = {
 
 
 def canonical_unit(text: str) -> str:
-    """Return the spelling used here for a unit, or the stripped text itself where it is unknown.
+    """Return the canonical spelling of a unit, or the stripped text if the unit is unknown.
 
     >>> canonical_unit("Nm"), canonical_unit("l/min")
     ('N m', 'L/min')
@@ -115,7 +115,7 @@ def to_si(unit: str) -> tuple[str, float]:
 
 
 def axis_unit(unit: str) -> tuple[str, float]:
-    """Unit on the axes of plots for a SI unit, and the factor to it.
+    """Return the unit used on plot axes for an SI unit, and the factor to it.
 
     >>> axis_unit("Pa")
     ('MPa', 1e-06)
@@ -127,15 +127,15 @@ def axis_unit(unit: str) -> tuple[str, float]:
 
 
 def customary(unit: str, size: float, parameter: str = "") -> tuple[str, float]:
-    """Customary unit for numbers of a size, and the factor to it.
+    """Return the display unit for values of a given magnitude, and the factor to it.
 
     Args:
         unit: SI unit.
-        size: the largest magnitude to be shown [unit].
-        parameter: its name; a bandwidth is said in Hz.
+        size: the largest magnitude to be displayed [unit].
+        parameter: name of the parameter; a bandwidth in rad/s is displayed in Hz.
 
     Returns:
-        (customary unit, factor).
+        (display unit, factor).
 
     >>> customary("Pa", 24.5e6), customary("Pa", 6e4)
     (('MPa', 1e-06), ('bar', 1e-05))

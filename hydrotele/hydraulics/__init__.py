@@ -1,1 +1,4 @@
-"""Hydraulic laws, the circuit made of them, and a Machine's numbers for it; used on both sides."""
+"""Hydraulic laws, the circuit that combines them, and the parameters of a machine's actuators.
+
+Simulation and estimation use the same functions.
+"""

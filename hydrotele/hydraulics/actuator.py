@@ -1,16 +1,15 @@
-"""Forces of an actuator: its friction, the ends of its travel, and an axis with a pump of its own.
+"""Forces of an actuator: friction, presliding friction, end stops, and an axis with its own pump.
 
-Actuator numbers stand at `user[u + Slot]`, those of a pump drive at `user[u + PUMP + PumpSlot]`.
+Actuator parameters are at `user[u + Slot]`, those of a pump drive at `user[u + PUMP + PumpSlot]`.
 
-Presliding friction: bristles that bend like a spring until the drive breaks away.
+Presliding friction is the bristle model of Canudas de Wit et al. (LuGre):
+`F = sigma_0 z + sigma_1 z'` with the deflection rate `z' = v - sigma_0 |v| z / g(v)` and the
+sliding friction g of Coulomb and Stribeck. Without Stribeck friction and bristle damping it is
+Dahl's model. In steady sliding it equals `laws.friction` without the smoothing of the sign. The
+state of a drive is the fraction of its breakaway force that the bristles carry,
+`r = sigma_0 z / (F_c + F_s)` [1], which is of order one in any machine.
 
-The bristle model of Canudas de Wit et al. (LuGre): `F = sigma_0 z + sigma_1 z'` with the deflection
-`z' = v - sigma_0 |v| z / g(v)` and the sliding level g of Coulomb and Stribeck friction. Without
-Stribeck friction and damping it is Dahl's; sliding steadily it is `laws.friction`, without its
-smoothing of the sign. The state of a drive is the bristles' share of its breakaway force,
-`r = sigma_0 z / (F_c + F_s)` [1], which is of size one in any machine.
-
-Bristles with which a drive would swing faster than a step can follow count as softer.
+The bristle stiffness is limited so that an explicit step can resolve the resulting vibration.
 
 Source: Canudas de Wit, Olsson, Astrom and Lischinsky 1995, "A new model for control of systems with
 friction", IEEE Trans. Automatic Control 40(3), Eqs 1-4; Dahl 1968, Aerospace Corp. TOR-0158(3107).
@@ -37,11 +36,11 @@ _PUMPED = float(Kind.PUMPED)
 
 @inlined
 def actuator_friction(user, u, velocity):
-    """Friction of one actuator at a velocity.
+    """Return the friction force of an actuator at a velocity, see `laws.friction`.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
-        u: place of this actuator in `user`.
+        user: (nu * SLOTS,) actuator parameters.
+        u: index of the first parameter of this actuator in `user`.
         velocity: scalar [m/s] or [rad/s].
 
     Returns:
@@ -63,11 +62,11 @@ def actuator_friction(user, u, velocity):
 
 @allocation_free
 def actuator_friction_slope(user, u, velocity):
-    """Slope of `actuator_friction` with respect to the velocity.
+    """Return the derivative of `actuator_friction` with respect to the velocity.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
-        u: place of this actuator in `user`.
+        user: (nu * SLOTS,) actuator parameters.
+        u: index of the first parameter of this actuator in `user`.
         velocity: scalar [m/s] or [rad/s].
 
     Returns:
@@ -83,17 +82,17 @@ def actuator_friction_slope(user, u, velocity):
 
 @allocation_free
 def actuator_stop(user, u, position, velocity):
-    """Force of the ends of an actuator's travel, and its slopes.
+    """Return the force of an actuator's end stops, its stiffness and its damping.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
-        u: place of this actuator in `user`.
-        position: of the load side, scalar [m] or [rad].
-        velocity: of the load side, scalar [m/s] or [rad/s].
+        user: (nu * SLOTS,) actuator parameters.
+        u: index of the first parameter of this actuator in `user`.
+        position: position of the load side, scalar [m] or [rad].
+        velocity: velocity of the load side, scalar [m/s] or [rad/s].
 
     Returns:
         (force towards the inside [N] or [N m], its stiffness [N/m] or [N m/rad], its damping
-        [N s/m] or [N m s/rad]); all 0 inside.
+        [N s/m] or [N m s/rad]); all 0 between the stops.
 
     Source: `laws.stop_force`.
     """
@@ -106,15 +105,15 @@ def actuator_stop(user, u, position, velocity):
 
 @allocation_free
 def pumped_volumes(user, u, x):
-    """Volumes of both chambers and the oil that the piston has taken from the accumulator.
+    """Return the volumes of both chambers and the oil volume taken from the accumulator.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
-        u: place of this axis in `user`.
+        user: (nu * SLOTS,) actuator parameters.
+        u: index of the first parameter of this axis in `user`.
         x: piston displacement, scalar [m].
 
     Returns:
-        (V_A, V_B, oil taken since the piston stood retracted) [m^3].
+        (V_A, V_B, oil volume taken relative to the retracted piston) [m^3].
 
     Source: geometry of the cylinder.
     """
@@ -129,17 +128,18 @@ def pumped_volumes(user, u, x):
 
 @allocation_free
 def pumped_rates(user, u, speed, p_head, p_rod, x, v, added):
-    """`circuit.pressure_rates` of an axis with a pump of its own.
+    """Compute the pressure rates of an axis with its own pump, as `circuit.pressure_rates`.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
-        u: place of this axis in `user`.
-        speed: of its pump, signed, scalar [rad/s].
+        user: (nu * SLOTS,) actuator parameters.
+        u: index of the first parameter of this axis in `user`.
+        speed: signed speed of its pump, scalar [rad/s].
         p_head: scalar [Pa].
         p_rod: scalar [Pa].
         x: piston displacement, scalar [m].
         v: piston velocity, scalar [m/s].
-        added: as of `pump.pump_pressure_rates` [m^3/s], [m^3/(s Pa)].
+        added: flows of the terms and their slopes, see `pump.pump_pressure_rates` [m^3/s],
+            [m^3/(s Pa)].
 
     Returns:
         (p_head', p_rod' [Pa/s], d p_head'/d p_head, d p_rod'/d p_rod [1/s]).
@@ -155,17 +155,17 @@ def pumped_rates(user, u, speed, p_head, p_rod, x, v, added):
 
 @allocation_free
 def pumped_force(user, u, p_load, p_head, p_rod, v, other, dt):
-    """Force of an axis with a pump of its own, after its load cylinder and friction.
+    """Return the net force of an axis with its own pump, after load cylinder and friction.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
-        u: place of this actuator in `user`.
+        user: (nu * SLOTS,) actuator parameters.
+        u: index of the first parameter of this actuator in `user`.
         p_load: pressure in the load cylinder, scalar [Pa].
         p_head: scalar [Pa].
         p_rod: scalar [Pa].
         v: piston velocity, scalar [m/s].
-        other: what else acts on the piston, scalar [N].
-        dt: step over which friction acts, scalar [s]; see `pump_piston_friction`.
+        other: all other force on the piston, scalar [N].
+        dt: time step of the friction, scalar [s]; see `pump_piston_friction`.
 
     Returns:
         Force, scalar [N].
@@ -181,21 +181,21 @@ def pumped_force(user, u, p_load, p_head, p_rod, v, other, dt):
 
 @allocation_free
 def force_after_friction(user, u, push, other, act, velocity, dt):
-    """Force of an actuator after its friction, and the damping that this adds to an implicit step.
+    """Return the force of an actuator after friction, and the friction slope for an implicit step.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
-        u: place of this actuator in `user`.
-        push: force before friction, scalar [N] or [N m]; not read with a pump of its own.
-        other: what else acts on the drive, which friction resists, too, where it holds, as that of
-            a pump drive does, scalar [N] or [N m]; it is not in the result.
-        act: activations from those of this actuator on; read only with a pump of its own.
-        velocity: of the drive, scalar [m/s] or [rad/s].
-        dt: step over which friction acts, scalar [s].
+        user: (nu * SLOTS,) actuator parameters.
+        u: index of the first parameter of this actuator in `user`.
+        push: force before friction, scalar [N] or [N m]; not used for an axis with its own pump.
+        other: all other force on the drive, scalar [N] or [N m]. It is not part of the result; the
+            static friction of an axis with its own pump resists it.
+        act: activations from those of this actuator on; used only for an axis with its own pump.
+        velocity: velocity of the drive, scalar [m/s] or [rad/s].
+        dt: time step of the friction, scalar [s].
 
     Returns:
-        (force [N] or [N m], dF_f/dv [N s/m] or [N m s/rad]); the friction of a pump drive is that
-        at the end of the step already, and has no slope to add.
+        (force [N] or [N m], dF_f/dv [N s/m] or [N m s/rad]). For an axis with its own pump the
+        friction is that at the end of the step, and the slope is 0.
 
     Source: nominal model, "Piston force".
     """
@@ -207,12 +207,12 @@ def force_after_friction(user, u, push, other, act, velocity, dt):
 
 _STIFF, _DAMP = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE_DAMPING)
 
-_RESOLVED = 0.5  # (w dt)^2 of a drive on its bristles; an explicit step is stable up to 4
+_RESOLVED = 0.5  # largest (w dt)^2 of a drive on its bristles; the stability limit is 4
 
 
 @allocation_free
 def sliding_level(velocity, coulomb, stribeck, stribeck_velocity, asymmetry):
-    """Dry friction of a drive that slides, without smoothing of its sign.
+    """Return the dry friction of a sliding drive, without smoothing of the sign.
 
     `g = (F_c + F_s exp(-(v/v_s)^2)) s (1 + a s)` with `s = sgn v`.
 
@@ -224,7 +224,7 @@ def sliding_level(velocity, coulomb, stribeck, stribeck_velocity, asymmetry):
         asymmetry: a, scalar [1], -1 < a < 1.
 
     Returns:
-        g, scalar [N] or [N m], with the sign of the velocity; that of a positive one at rest.
+        g, scalar [N] or [N m], with the sign of the velocity; positive at rest.
 
     Source: nominal model, "Piston force".
 
@@ -238,21 +238,21 @@ def sliding_level(velocity, coulomb, stribeck, stribeck_velocity, asymmetry):
 
 @allocation_free
 def bristle_step(force, velocity, level, stiffness, dt):
-    """Force of the bristles after a time at a held velocity, by the exact exponential.
+    """Return the bristle force after a time at constant velocity, by the exact exponential.
 
     `F' = g + (F - g) exp(-sigma_0 |v| dt / |g|)`.
 
     Args:
         force: F, scalar [N] or [N m].
         velocity: v, scalar [m/s] or [rad/s].
-        level: g, as of `sliding_level`, scalar [N] or [N m].
+        level: g of `sliding_level`, scalar [N] or [N m].
         stiffness: sigma_0, scalar [N/m] or [N m/rad].
-        dt: scalar [s].
+        dt: duration, scalar [s].
 
     Returns:
         F', scalar [N] or [N m].
 
-    Source: Canudas de Wit et al. 1995, Eq. 1, solved for a held velocity.
+    Source: Canudas de Wit et al. 1995, Eq. 1, solved for constant velocity.
 
     >>> round(bristle_step(0.0, 1.0e-3, 1.0e9, 1.0e8, 1.0e-3), 3)
     100.0
@@ -268,13 +268,13 @@ def bristle_step(force, velocity, level, stiffness, dt):
 
 @allocation_free
 def _level(user, u, velocity):
-    """`sliding_level` of an actuator."""
+    """Return the `sliding_level` of an actuator."""
     return sliding_level(velocity, user[u + _FC], user[u + _FS], user[u + _VS], user[u + _AC])
 
 
 @allocation_free
 def _followed(user, u, inertia, dt):
-    """Stiffness of an actuator's bristles that a step can follow, see `bristle_rate`."""
+    """Return the bristle stiffness of an actuator, limited as described in `bristle_rate`."""
     stiffness = user[u + _STIFF]
     if inertia > 0.0 and dt > 0.0:
         stiffness = min(stiffness, _RESOLVED * inertia / (dt * dt))
@@ -283,16 +283,16 @@ def _followed(user, u, inertia, dt):
 
 @allocation_free
 def bristle_rate(user, u, share, velocity, inertia, dt):
-    """Mean rate over a step of the bristles' share of the breakaway force.
+    """Return the mean rate over a step of the breakaway force fraction carried by the bristles.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
-        u: place of this actuator in `user`.
+        user: (nu * SLOTS,) actuator parameters.
+        u: index of the first parameter of this actuator in `user`.
         share: r at the start of the step, scalar [1].
-        velocity: of the drive over the step, scalar [m/s] or [rad/s].
-        inertia: that the drive moves, scalar [kg] or [kg m^2]; bristles stiffer than half of it
-            over dt^2 count as that stiff. 0 limits nothing.
-        dt: step, scalar [s].
+        velocity: velocity of the drive over the step, scalar [m/s] or [rad/s].
+        inertia: inertia J moved by the drive, scalar [kg] or [kg m^2]. The bristle stiffness is
+            limited to 0.5 J / dt^2; 0 means no limit.
+        dt: time step, scalar [s].
 
     Returns:
         Rate, scalar [1/s].
@@ -307,17 +307,17 @@ def bristle_rate(user, u, share, velocity, inertia, dt):
 
 @allocation_free
 def bristle_friction(user, u, share, velocity, inertia, dt):
-    """Friction of a drive with bristles, and its slopes.
+    """Return the friction of a drive with bristles, and its derivatives.
 
-    `F = r (F_c + F_s) + sigma_1 z' + b v (1 + a_v t)`, the viscous part as of `laws.friction`.
+    `F = r (F_c + F_s) + sigma_1 z' + b v (1 + a_v t)`, with the viscous part of `laws.friction`.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
-        u: place of this actuator in `user`.
+        user: (nu * SLOTS,) actuator parameters.
+        u: index of the first parameter of this actuator in `user`.
         share: r, scalar [1].
         velocity: v, scalar [m/s] or [rad/s].
-        inertia: that the drive moves, as of `bristle_rate`.
-        dt: step, scalar [s]; 0 limits nothing.
+        inertia: inertia moved by the drive, see `bristle_rate`.
+        dt: time step, scalar [s]; 0 means no limit of stiffness and damping.
 
     Returns:
         (F [N] or [N m], dF/dv [N s/m] or [N m s/rad], dF/dx through the bristles [N/m] or
@@ -325,7 +325,7 @@ def bristle_friction(user, u, share, velocity, inertia, dt):
 
     Source: Canudas de Wit et al. 1995, Eqs 1-4.
     """
-    bent = 1.0  # d (deflection) / d (way), 0 where it slides
+    bent = 1.0  # d (deflection) / d (travel), 0 in steady sliding
     if velocity != 0.0:
         level = _level(user, u, velocity)
         bent = 1.0 - share * (user[u + _FC] + user[u + _FS]) / level if level != 0.0 else 0.0
@@ -342,16 +342,16 @@ def bristle_friction(user, u, share, velocity, inertia, dt):
 
 @allocation_free
 def settled_bristle_friction(user, u, share, velocity, push, inertia, dt):
-    """`bristle_friction` at the end of a step of a body that nothing else holds.
+    """Return `bristle_friction` at the end of an implicit step of a free body.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
-        u: place of this actuator in `user`.
+        user: (nu * SLOTS,) actuator parameters.
+        u: index of the first parameter of this actuator in `user`.
         share: r, scalar [1].
         velocity: at the start of the step, scalar [m/s] or [rad/s].
         push: all other force, scalar [N] or [N m].
-        inertia: of the body, scalar [kg] or [kg m^2], > 0.
-        dt: step, scalar [s], > 0.
+        inertia: inertia of the body, scalar [kg] or [kg m^2], > 0.
+        dt: time step, scalar [s], > 0.
 
     Returns:
         F, scalar [N] or [N m].

@@ -1,15 +1,14 @@
-"""The hydraulic circuit: several valves, chambers and one shared supply, advanced by one step.
+"""Time step of the hydraulic circuit: several valves and chambers with one shared supply.
 
-Pure functions on flat arrays laid out as MuJoCo keeps them, so that the native callbacks, the
-tests and an estimator run the same code. Axis `i` reads its numbers at `user[i * SLOTS + Slot]` and
-its activations `spool, spool_rate, p_head, p_rod` at `act[4 i ...]`, counted from the first
-hydraulic axis; what bristles and a slow pump remember comes after all of these. An axis with a pump
-of its own (`Kind.PUMPED`, see `pump`) has the speed of its pump and the pressure of its load
-cylinder in the places of spool and spool rate.
+Pure functions on flat arrays in MuJoCo's layout, so that the native callbacks, the tests and the
+estimator run the same code. The parameters of axis `i` are at `user[i * SLOTS + Slot]`. Its
+activations `spool, spool_rate, p_head, p_rod` are at `act[4 i ...]`, counted from the first
+hydraulic axis. The states of bristles, of a pump with a time constant and of terms follow after all
+axes. An axis with its own pump (`Kind.PUMPED`, see `pump`) has pump speed and load cylinder
+pressure instead of spool and spool rate.
 
-What the terms of a machine see and add: the state of a drive, and commands with their terms.
-
-Friction on a drive side so light that an explicit step would throw it through rest and back.
+The module also evaluates the terms of a machine in a step, and the implicit friction of a light
+drive side, for which an explicit step would oscillate about rest.
 """
 
 import math
@@ -79,10 +78,12 @@ __all__ = [
 ]  # fmt: skip
 
 ACTIVATIONS = 4
-NO_MEMORY = -1  # number of further states where none is even asked for
+NO_MEMORY = -1  # value of `memory` that skips all code of additional states
 MAX_AXES = 8
-_FACTORS = 4 * MAX_AXES  # after the ports: of the pressures, and how the supply couples them
-_FIRST = 8 * MAX_AXES  # then both chambers' softening, later their rates in the first stage
+# Layout of the work space: ports, factors of pressures and supply coupling, then the softening of
+# both chambers, later replaced by their rates of the first stage.
+_FACTORS = 4 * MAX_AXES
+_FIRST = 8 * MAX_AXES
 SCRATCH = 10 * MAX_AXES
 
 _ROS2 = 1.0 + 1.0 / math.sqrt(2.0)  # L-stable, of second order with any approximate Jacobian
@@ -107,7 +108,7 @@ _COMMAND, _SUPPLY, _PUSH = (VARIABLES[n] for n in ("command", "pressure_supply",
 
 @inlined
 def _chamber_stiffness(user, u, x, p_head, p_rod):
-    """Pressure per volume of both chambers, oil, hose and the air in the oil [Pa/m^3]."""
+    """Return the stiffness of both chambers, including hose and air in the oil [Pa/m^3]."""
     beta = user[u + _BETA]
     volume_head, volume_rod = user[u + _VH], user[u + _VR]
     if user[u + 1] == 1.0:  # Kind.CYLINDER
@@ -123,29 +124,27 @@ def _chamber_stiffness(user, u, x, p_head, p_rod):
 
 @inlined
 def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead, added):
-    """Pressure rates of both chambers and their slopes with respect to their own pressure.
+    """Return the pressure rates of both chambers, and their slopes.
 
-    The rates are those of oil that holds its air; what a chamber drawn below atmosphere makes of
-    them says `laws.pressure_with_air`.
-
-    `p_A' = (beta / V_A)(q_A - A_h v - q_l + r_A)`, `p_B' = (beta / V_B)(q_B + A_r v + q_l + r_B)`,
-    where a hose of compliance C_h counts as `beta C_h` of volume, and air in the oil as what it
-    gives (`laws.air_compliance`) times beta. Beyond an end of the stroke the
-    volumes stay what they are at that end.
+    `p_A' = (beta / V_A)(q_A - A_h v - q_l + r_A)`, `p_B' = (beta / V_B)(q_B + A_r v + q_l + r_B)`.
+    A hose of compliance C_h counts as additional volume `beta C_h`, and air bubbles in the oil as
+    beta times their compliance (`laws.air_compliance`). Beyond an end of the stroke the volumes are
+    constant. The rates are those without released air; `laws.pressure_with_air` converts pressures
+    below atmosphere.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
-        u: place of this axis in `user`.
-        opening: o, scalar [1]; of an axis with a pump of its own the speed of it [rad/s].
+        user: (nu * SLOTS,) actuator parameters.
+        u: index of the first parameter of this axis in `user`.
+        opening: o, scalar [1]; for an axis with its own pump the pump speed [rad/s].
         p_supply: scalar [Pa].
         p_head: scalar [Pa].
         p_rod: scalar [Pa].
         x: piston displacement, scalar [m] (0 for a motor, whose volumes are constant).
         v: piston velocity, scalar [m/s] or [rad/s].
-        ahead: time over which the slopes must hold, scalar [s]: a relief or make-up valve that
+        ahead: time over which the slopes are used, scalar [s]: a relief or make-up valve that
             would open within it counts as open in the slope (not in the rate).
         added: flows of the machine's terms into both chambers [m^3/s] and their slopes with
-            respect to these chambers' pressures [m^3/(s Pa)], see `terms.table.added_flows`.
+            respect to the pressures of these chambers [m^3/(s Pa)], see `terms.table.added_flows`.
 
     Returns:
         (p_head', p_rod' [Pa/s], d p_head'/d p_head, d p_rod'/d p_rod [1/s]).
@@ -177,9 +176,9 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead, added
 
 @allocation_free
 def _flows_of_terms(terms, i, user, time, x, oil, supply, drives):
-    """What the terms add to the flows of an axis, see `terms.table.added_flows`.
+    """Return the flows that terms add to the chambers of an axis, see `terms.table.added_flows`.
 
-    `oil` is its spool, spool rate and pressures.
+    `oil` contains spool, spool rate and both pressures of the axis.
     """
     if not (acts_on(terms, FLOW_HEAD, i) or acts_on(terms, FLOW_ROD, i)):
         return _NO_FLOWS
@@ -192,9 +191,9 @@ def _flows_of_terms(terms, i, user, time, x, oil, supply, drives):
 
 @allocation_free
 def _delivery_of_terms(user, first, drives, terms, time, supply, dt):
-    """Share of the pump's largest flow that the terms add after a step, scalar [1].
+    """Return the fraction of the maximum pump flow that terms add after a step, scalar [1].
 
-    The pump follows the terms, as they are at the step's start, by the exact exponential.
+    The pump follows the terms' values at the start of the step, by the exact exponential.
     """
     at = int(user[first * SLOTS + _ADDED])
     if at == 0:
@@ -217,31 +216,30 @@ def _delivery_of_terms(user, first, drives, terms, time, supply, dt):
 def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, memory):
     """Advance spools and chamber pressures of all axes that share a supply by one step.
 
-    Spools follow their exact exponential; pressures take one step of the L-stable second-order
-    Rosenbrock method ROS2, with piston velocities held over the step. Its Jacobian is diagonal but
-    for the supply, by which all fed chambers act on each other (`supply_coupling`, solved by the
-    Sherman-Morrison formula). The supply pressure is solved in both stages. Where a chamber is
-    below atmosphere, the method steps the pressure P that its oil would have if it held its air
-    (`laws.pressure_without_air`), which is linear in the volume that is missing. A pump with a time
-    constant follows the mean of what the valves draw at both ends of the step, by its exact
-    exponential.
+    Spools follow their exact exponential. Pressures take one step of the L-stable second-order
+    Rosenbrock method ROS2, with constant piston velocities over the step. Its Jacobian is diagonal
+    except for the supply, which couples all fed chambers (`supply_coupling`, solved by the
+    Sherman-Morrison formula). The supply pressure is solved in both stages. Below atmosphere the
+    method integrates the pressure P without released air (`laws.pressure_without_air`), which is
+    linear in the missing oil volume. A pump with a time constant follows the mean of the flow
+    demands at both ends of the step, by its exact exponential.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         first: index of the first hydraulic actuator.
-        drives: Drives: number of hydraulic actuators, <= MAX_AXES; spool [1], spool rate [1/s] and
-            pressures [Pa] of these at the start of the step, then what is remembered, see
-            `parameters.extra_state_names`; of all actuators the positions at the end of the step,
-            where MuJoCo's leapfrog has them [m] or [rad], the velocities over it [m/s] or [rad/s],
-            and the commands, clipped here to [-1, 1] [1].
-        dt: step, scalar [s].
+        drives: Drives: number of hydraulic actuators, <= MAX_AXES; their spool [1], spool rate
+            [1/s] and pressures [Pa] at the start of the step, followed by the additional states of
+            `parameters.extra_state_names`. For all actuators: positions at the end of the step, as
+            in MuJoCo's leapfrog [m] or [rad], velocities during the step [m/s] or [rad/s], and
+            commands, which are clipped to [-1, 1] [1].
+        dt: time step, scalar [s].
         act_dot: (>= 4 count,) written: mean rates over the step, in the unit of `drives.act` per
-            [s]; of what is remembered, the pump's alone.
+            [s]; of the additional states only those of the pump.
         scratch: (SCRATCH,) work space.
         terms: (n,) table of the machine's terms, `NO_TERMS` for none [SI].
-        time: at the start of the step, scalar [s]; only terms see it.
-        memory: number of states that follow the activations, scalar [1]; `NO_MEMORY` leaves them
-            out, and the time that it takes to ask for them.
+        time: time at the start of the step, scalar [s]; used by terms only.
+        memory: number of additional states after the activations, scalar [1]; `NO_MEMORY` skips
+            them and saves the time of the check.
 
     Returns:
         (supply pressure at the start of the step [Pa], at its end [Pa]).
@@ -345,18 +343,18 @@ def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, memory)
 
 @allocation_free
 def advance_memories(user, terms, drives, act_dot, dt, time, supply):
-    """Write the rates of what terms remember over a step, once those of all activations are known.
+    """Write the rates of the internal states of terms, after those of all other activations.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         terms: (n,) table of the machine's terms [SI].
         drives: Drives with the activations at the start of the step, positions at its end and
             velocities over it, and the commands that arrive [SI, commands in 1].
-        act_dot: (>= 4 count,) mean rates over the step; those of the terms' memories are written
-            [1/s].
-        dt: step, scalar [s].
-        time: at the start of the step, scalar [s].
-        supply: pressure at the end of the step, scalar [Pa].
+        act_dot: (>= 4 count,) mean rates over the step; those of the terms' internal states are
+            written [1/s].
+        dt: time step, scalar [s].
+        time: time at the start of the step, scalar [s].
+        supply: supply pressure at the end of the step, scalar [Pa].
 
     Returns:
         Nothing.
@@ -391,15 +389,16 @@ def advance_memories(user, terms, drives, act_dot, dt, time, supply):
 
 @allocation_free
 def _relieved(room, rate, quick, dt):
-    """Mean rate over a step in which a port relief opens that no stage has seen open [Pa/s].
+    """Return the mean pressure rate over a step in which a port relief valve opens [Pa/s].
 
-    A rate r lifts the pressure to the setting; from there on `e' = r - e q` for what is beyond it.
+    For a valve that is closed in both stages of the method. The pressure rises with the rate r up
+    to the setting; from there the excess e follows `e' = r - e q`.
 
     Args:
-        room: up to the setting, scalar [Pa].
-        rate: without the relief, scalar [Pa/s].
-        quick: q, by which the relief's flow takes the pressure back, scalar [1/s].
-        dt: scalar [s].
+        room: pressure difference up to the setting, scalar [Pa].
+        rate: r, rate without the relief valve, scalar [Pa/s].
+        quick: q, rate at which the relief flow reduces the excess, scalar [1/s].
+        dt: time step, scalar [s].
     """
     beyond = dt * rate - room
     turns = quick * beyond / rate
@@ -408,7 +407,7 @@ def _relieved(room, rate, quick, dt):
 
 @inlined
 def _rate_with_air(user, u, pressure, rate, dt):
-    """Mean rate of a pressure over a step in which it would change at a rate without air [Pa/s]."""
+    """Convert a mean pressure rate without released air to that with released air [Pa/s]."""
     release, onset = user[u + _AIR], user[u + _ONSET]
     if (pressure >= -onset and pressure + dt * rate >= -onset) or release == 0.0:
         return rate
@@ -418,7 +417,7 @@ def _rate_with_air(user, u, pressure, rate, dt):
 
 @inlined
 def _softening_ahead(user, u, pressure, rate, dt):
-    """Softening that slopes reckon with over a step: none where the step would refill a chamber."""
+    """Return the softening for the slopes of a step; 1 if the step would refill the chamber."""
     release, onset = user[u + _AIR], user[u + _ONSET]
     if pressure >= -onset or release == 0.0:
         return 1.0
@@ -429,12 +428,12 @@ def _softening_ahead(user, u, pressure, rate, dt):
 
 @allocation_free
 def _begin_coupling(user, first, count, act, length, velocity, dt, gamma_h, scratch):
-    """What a supply pressure of 1 Pa more adds to the stage rates of the fed chambers.
+    """Prepare the Sherman-Morrison solution of the stage equations that the supply couples.
 
-    Of `(I - gamma h (D + b w^T)) k = r` with D diagonal, b the rates per supply pressure and
-    w = dp_s/dp, writes `gamma h b / (1 - gamma h D)` over the common divisor
-    `1 - gamma h w^T b / (1 - gamma h D)` at place 2 of every axis' factors, negative where the rod
-    side is fed, and at place 3 w with the softening of the fed chamber.
+    The stage equations are `(I - gamma h (D + b w^T)) k = r` with D diagonal, b the rates per
+    supply pressure and w = dp_s/dp. Index 2 of the factors of every axis gets
+    `gamma h b / (1 - gamma h D)` over the common divisor `1 - gamma h w^T b / (1 - gamma h D)`,
+    negative if the rod side is fed. Index 3 gets w times the softening of the fed chamber.
     """
     divisor = 1.0
     for i in range(count):
@@ -457,7 +456,7 @@ def _begin_coupling(user, first, count, act, length, velocity, dt, gamma_h, scra
 
 @inlined
 def _couple(count, rate, scratch):
-    """Add what the supply carries from chamber to chamber to rates of independent ones."""
+    """Add the coupling through the supply to the stage rates of uncoupled chambers."""
     pull = 0.0
     for a in range(0, 4 * count, 4):
         f = _FACTORS + a
@@ -472,16 +471,16 @@ def _couple(count, rate, scratch):
 
 @allocation_free
 def axis_state(user, i, supply, act, x, v, share=0.0):
-    """Flows and force of one axis in a state, for logs and balances.
+    """Return the flows and the force of one axis in a state, for logs and balances.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         i: index of the actuator.
         supply: supply pressure, scalar [Pa].
         act: (4,) spool [1], spool rate [1/s], p_head, p_rod [Pa].
         x: piston displacement, scalar [m].
         v: piston velocity, scalar [m/s] or [rad/s].
-        share: of the breakaway force that the bristles of its friction carry, scalar [1].
+        share: fraction of the breakaway force that the bristles carry, scalar [1].
 
     Returns:
         (q_head, q_rod [m^3/s], force or torque after friction [N] or [N m]).
@@ -502,27 +501,27 @@ def axis_state(user, i, supply, act, x, v, share=0.0):
 
 
 def circuit_scratch() -> np.ndarray:
-    """Work space for `step_circuit`, shape (SCRATCH,)."""
+    """Return a work space for `step_circuit`, shape (SCRATCH,)."""
     return np.zeros(SCRATCH)
 
 
-_STEPS = 60  # bisections alone reach rounding in that many
+_STEPS = 60  # bisection alone converges to rounding errors in 60 steps
 _ROUNDING = 1.0e-13
 
 
 @allocation_free
 def settled_friction(user, u, velocity, push, inertia, dt):
-    """Friction at the end of a step of a body that nothing else holds.
+    """Return the friction at the end of an implicit step of a free body.
 
     Solves `v' = v + dt / J (F - F_f(v'))` by Newton's method inside a bracket.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
-        u: place of this actuator in `user`.
+        user: (nu * SLOTS,) actuator parameters.
+        u: index of the first parameter of this actuator in `user`.
         velocity: v at the start of the step, scalar [m/s] or [rad/s].
         push: F, all other force, scalar [N] or [N m].
-        inertia: J, scalar [kg] or [kg m^2], > 0.
-        dt: step, scalar [s], > 0.
+        inertia: J of the body, scalar [kg] or [kg m^2], > 0.
+        dt: time step, scalar [s], > 0.
 
     Returns:
         F_f(v'), scalar [N] or [N m].
@@ -530,7 +529,7 @@ def settled_friction(user, u, velocity, push, inertia, dt):
     Source: implicit Euler rule.
     """
     per_force = dt / inertia
-    free = velocity + per_force * push  # friction pulls towards rest from here
+    free = velocity + per_force * push  # velocity without friction
     low, high = min(0.0, free), max(0.0, free)
     v = free
     for _ in range(_STEPS):
@@ -555,10 +554,10 @@ _OFFSET = int(Slot.OFFSET)
 
 @allocation_free
 def drive_state(user, i, count, act, supply, time, x, v, command, gain):
-    """State of one drive, as laws of terms see it.
+    """Return the state of one drive, which is the input of the laws of terms.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         i: index of the actuator.
         count: number of hydraulic axes, which come first.
         act: (>= 4 count,) spool [1], spool rate [1/s] and pressures [Pa].
@@ -566,13 +565,13 @@ def drive_state(user, i, count, act, supply, time, x, v, command, gain):
         time: scalar [s].
         x: position of the drive, scalar [m] or [rad].
         v: its velocity, scalar [m/s] or [rad/s].
-        command: as it arrives, scalar [1] or [V].
+        command: command after its delay, scalar [1] or [V].
         gain: force per command of a force drive, scalar [N/V] or [N m/V].
 
     Returns:
         DriveState [SI].
 
-    Source: docs/effects.md, laws of one's own: the variables of a law.
+    Source: docs/effects.md, "The law".
     """
     u, a = i * SLOTS, 4 * i
     if i >= count:
@@ -586,25 +585,25 @@ def drive_state(user, i, count, act, supply, time, x, v, command, gain):
 
 @allocation_free
 def add_to_commands(user, terms, drives, dt, time, scratch, out):
-    """Commands of the valves with their terms, at the middle of a step.
+    """Add the command terms to the commands of the valves, evaluated at the middle of a step.
 
-    Positions and time are those of the middle; spools and pressures those of the start, before the
-    spool's lag, so that what they make of a command is off by half a step.
+    Positions and time are those at the middle of the step. Spools and pressures are those at its
+    start; their effect on a command is therefore late by half a step.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         terms: (n,) table of terms [SI].
         drives: Drives with the activations at the start of the step, positions at its end and
             velocities over it, and the commands that arrive [SI, commands in 1].
-        dt: step, scalar [s].
-        time: at the start of the step, scalar [s].
+        dt: time step, scalar [s].
+        time: time at the start of the step, scalar [s].
         scratch: (SCRATCH,) work space.
-        out: (>= count,) written [1].
+        out: (>= count,) commands with terms, written [1].
 
     Returns:
         Nothing.
 
-    Source: docs/effects.md, laws of one's own: the balance `command`.
+    Source: docs/effects.md, "The term": the balance `command`.
     """
     count, act, length, velocity, command = drives
     if not acts_on(terms, COMMAND, ANY):

@@ -1,15 +1,14 @@
-"""Laws of valve, orifice, chamber, supply and friction, in SI, as small compiled functions.
+"""Laws of valve, orifice, chamber, friction and end stop, in SI, as small compiled functions.
 
-They are written once here and used by the native callbacks, the tests and the identification.
-Equations: Merritt, *Hydraulic Control Systems* (1967); the set is fixed as the nominal model of
+The native callbacks, the tests and the identification use the same functions. Equations: Merritt,
+*Hydraulic Control Systems* (1967); the "nominal model" of the sources is described in
 `models/cat215/README.md`.
 
-The valve of one axis, read from its record: spool travel to opening, opening to chamber flows.
-
-The positive direction meters P-A into the head side and B-T out of the rod side, the negative one
-P-B into the rod side and A-T out of the head side. Each may have its own dead band and flow curve,
-each edge its own gain; the inlet may be pressure-compensated, and a counterbalance valve may hold
-the oil of either side.
+The valve functions read the parameters of an axis from its actuator parameters. In the positive
+direction the valve meters P-A into the head side and B-T out of the rod side, in the negative
+direction P-B into the rod side and A-T out of the head side. Each direction has its own dead band
+and flow curve, and each edge its own gain. The inlet can be pressure-compensated, and a
+counterbalance valve can hold the oil of either side.
 """
 
 import math
@@ -18,13 +17,13 @@ from hydrotele.core.compiled import allocation_free, inlined
 from hydrotele.hydraulics.parameters import CURVE, CURVE_KNOTS, Slot
 
 ATMOSPHERE = 101325.0  # Pa
-_POLYTROPIC = 1.4  # of bubbles that are squeezed too quickly to lose their heat
-_VACUUM = 0.01  # Pa absolute: what is said to be at or below it counts as this
+_POLYTROPIC = 1.4  # polytropic exponent of bubbles: adiabatic compression
+_VACUUM = 0.01  # Pa absolute, lower bound of a pressure
 
 
 @inlined
 def valve_opening(spool, deadband):
-    """Opening of a valve with overlap: 0 inside the dead band, then linear up to 1.
+    """Return the opening of a valve with overlap: 0 inside the dead band, then linear up to 1.
 
     Args:
         spool: spool position s, scalar [1], not clamped.
@@ -48,7 +47,7 @@ def valve_opening(spool, deadband):
 
 @inlined
 def orifice(pressure_drop, flow_gain, smoothing):
-    """Turbulent orifice flow, made smooth through zero pressure drop, and its slope.
+    """Return the turbulent orifice flow, smooth at zero pressure drop, and its slope.
 
     `q = k dp / (dp^2 + d^2)^(1/4)`, which is `k sgn(dp) sqrt(|dp|)` away from zero.
 
@@ -76,7 +75,7 @@ def orifice(pressure_drop, flow_gain, smoothing):
 
 @inlined
 def port_flow(pressure, port_relief, relief_gain, tank_pressure, makeup_gain):
-    """Flow into a chamber through port relief (outward) and make-up valve (inward), and its slope.
+    """Return the flow into a chamber through port relief and make-up valve, and its slope.
 
     `r = -k_r max(0, p - p_port) + k_m max(0, p_t - p)`.
 
@@ -104,22 +103,22 @@ def port_flow(pressure, port_relief, relief_gain, tank_pressure, makeup_gain):
 
 @allocation_free
 def pressure_with_air(oil, release, onset=0.0):
-    """Pressure in a chamber whose oil gives off its dissolved air below atmosphere.
+    """Return the pressure in a chamber whose oil releases dissolved air below atmosphere.
 
-    Oil drawn below atmospheric pressure gives off air in proportion to the missing pressure
-    (Henry's law), and that air takes `V a |p| / (p + p_atm)` of the chamber (Boyle's law). So the
-    pressure p of a chamber that lacks oil, which would be P without air, follows from
-    `P = p (1 + R / (p + p_atm))` with `R = a beta`, and never reaches absolute zero.
+    Oil below atmospheric pressure releases air in proportion to the pressure deficit (Henry's law).
+    The air occupies the volume `V a |p| / (p + p_atm)` of the chamber (Boyle's law). If the
+    pressure without air were P, the pressure p follows from `P = p (1 + R / (p + p_atm))` with
+    `R = a beta`. It never reaches absolute zero.
 
     Args:
-        oil: P, what the lack of oil alone would give, scalar [Pa] above atmosphere.
-        release: R = a beta with the volume a of dissolved air at atmosphere per volume of oil,
+        oil: P, pressure without released air, scalar [Pa] above atmosphere.
+        release: R = a beta, with the volume a of dissolved air at atmosphere per volume of oil,
             scalar [Pa]; 0 for oil without air.
-        onset: by how much oil must lack atmosphere before air comes out, scalar [Pa]: 0 in a
-            machine; a filter cannot tell less than the noise of its readings.
+        onset: pressure deficit at which the release starts, scalar [Pa]; 0 in a simulation, the
+            noise level of the pressure sensors in an estimator.
 
     Returns:
-        p, scalar [Pa] above atmosphere; P itself where that is not below -onset.
+        p, scalar [Pa] above atmosphere; equal to P if P >= -onset.
 
     Source: Henry's and Boyle's law in equilibrium; see "Dissolved air" of the nominal model.
 
@@ -137,19 +136,18 @@ def pressure_with_air(oil, release, onset=0.0):
 
 @allocation_free
 def air_compliance(pressure, fraction):
-    """Volume that air in the oil gives way, per volume of oil and pressure [1/Pa].
+    """Return the compliance of air bubbles in the oil, per volume of oil [1/Pa].
 
-    Bubbles that fill the share a of the volume at atmosphere follow `p V^n = const`, quickly enough
-    to keep their heat (n = 1.4), so that `a (p_atm / p)^(1/n) / (n p)` adds to the oil's 1 / beta:
-    ten times as much at 1 MPa as at 4 MPa.
+    Bubbles with the volume fraction a at atmosphere follow `p V^n = const`. Compression is
+    adiabatic (n = 1.4). The compliance `a (p_atm / p)^(1/n) / (n p)` adds to the 1 / beta of the
+    oil. It is ten times as large at 1 MPa as at 4 MPa.
 
     Args:
-        pressure: scalar [Pa] above atmosphere; below a tenth of the atmosphere, absolute, it
-            counts as that.
+        pressure: scalar [Pa] above atmosphere; limited to a tenth of the atmosphere, absolute.
         fraction: a, volume of the air at atmosphere per volume of oil, scalar [1].
 
     Returns:
-        Scalar [1/Pa].
+        Compliance, scalar [1/Pa].
 
     Source: Nykanen, Esque and Ellman 2000, Proc. Bath Workshop on Power Transmission and Motion
     Control, two-phase model without what dissolves; its isothermal form is Merritt 1967, sec. 1-4.
@@ -163,10 +161,10 @@ def air_compliance(pressure, fraction):
 
 @allocation_free
 def pressure_without_air(pressure, release, onset=0.0):
-    """What a pressure below atmosphere would be if the oil gave off no air.
+    """Return the pressure that oil would have without released air; inverts `pressure_with_air`.
 
     Args:
-        pressure: p, scalar [Pa] above atmosphere; what is below vacuum counts as nearly that.
+        pressure: p, scalar [Pa] above atmosphere; limited to slightly above vacuum.
         release: R, scalar [Pa].
         onset: scalar [Pa].
 
@@ -187,7 +185,7 @@ def pressure_without_air(pressure, release, onset=0.0):
 
 @inlined
 def softening(pressure, release, onset=0.0):
-    """How much less the pressure of oil with released air changes than that of oil alone.
+    """Return the derivative of the pressure with released air by the pressure without it.
 
     Args:
         pressure: p, scalar [Pa] above atmosphere.
@@ -195,7 +193,7 @@ def softening(pressure, release, onset=0.0):
         onset: scalar [Pa].
 
     Returns:
-        dp/dP, scalar [1]: 1 where p is not below -onset.
+        dp/dP, scalar [1]; 1 if p >= -onset.
 
     Source: derivative of `pressure_with_air`.
 
@@ -212,21 +210,24 @@ def softening(pressure, release, onset=0.0):
 
 @allocation_free
 def holding_share(pressure, pilot, setting, pilot_ratio, override):
-    """Share of the outlet that a counterbalance valve leaves open, and its slope.
+    """Return the relative opening of a counterbalance valve, and its slope.
 
-    `(p + R p_pilot - p_set) / p_o` between 0 and 1; oil into the chamber passes its check freely.
+    `(p + R p_pilot - p_set) / p_o`, limited to 0 .. 1. Flow into the chamber passes the valve's
+    check valve without resistance.
 
     Args:
         pressure: p of the held chamber, scalar [Pa].
-        pilot: p_pilot of the chamber being fed, scalar [Pa].
+        pilot: p_pilot of the opposite chamber, scalar [Pa].
         setting: p_set, scalar [Pa].
         pilot_ratio: R, scalar [1].
-        override: p_o, pressure beyond the setting that opens it fully, scalar [Pa], > 0.
+        override: p_o, pressure above the setting at which the valve is fully open, scalar [Pa],
+            > 0.
 
     Returns:
-        (share [1], d share/dp [1/Pa]).
+        (relative opening [1], its derivative with respect to p [1/Pa]).
 
-    Source: static characteristic of a pilot-assisted relief valve, as in makers' data sheets.
+    Source: static characteristic of a pilot-assisted relief valve, as in manufacturers' data
+        sheets.
 
     >>> holding_share(10.0e6, 5.0e6, 24.0e6, 3.0, 4.0e6)
     (0.25, 2.5e-07)
@@ -241,7 +242,7 @@ def holding_share(pressure, pilot, setting, pilot_ratio, override):
 
 @allocation_free
 def stop_force(position, velocity, low, high, stiffness, damping):
-    """Force of an end stop: a spring and a damper that push and never pull.
+    """Return the force of an end stop, a spring and a damper that only push, and its slopes.
 
     `F = max(0, k (x_low - x) - c v)` below the lower end, `-max(0, k (x - x_high) + c v)` above the
     upper one, 0 between.
@@ -276,19 +277,20 @@ def friction(
     velocity, coulomb, stribeck, stribeck_velocity, viscous, coulomb_velocity,
     coulomb_asymmetry=0.0, viscous_asymmetry=0.0,
 ):  # fmt: skip
-    """Coulomb, Stribeck and viscous friction that opposes a velocity.
+    """Return the sum of Coulomb, Stribeck and viscous friction at a velocity.
 
     `F_f = (F_c + F_s exp(-(v/v_s)^2)) t (1 + a_c t) + b v (1 + a_v t)` with `t = tanh(v/v_0)`.
 
     Args:
         velocity: v, scalar [m/s] or [rad/s].
         coulomb: F_c, scalar [N] or [N m].
-        stribeck: F_s, extra friction at rest, scalar [N] or [N m].
+        stribeck: F_s, additional friction at rest, scalar [N] or [N m].
         stribeck_velocity: v_s, scalar [m/s] or [rad/s], > 0.
         viscous: b, scalar [N s/m] or [N m s/rad].
         coulomb_velocity: v_0, smoothing of the sign function, scalar [m/s] or [rad/s], > 0.
-        coulomb_asymmetry: a_c, by how much the dry part is larger forwards, scalar [1].
-        viscous_asymmetry: a_v, the same of the viscous part, scalar [1].
+        coulomb_asymmetry: a_c, relative excess of the dry friction in positive direction, scalar
+            [1].
+        viscous_asymmetry: a_v, the same for the viscous friction, scalar [1].
 
     Returns:
         Friction force, scalar [N] or [N m], with the sign of the velocity.
@@ -311,7 +313,7 @@ def friction_slope(
     velocity, coulomb, stribeck, stribeck_velocity, viscous, coulomb_velocity,
     coulomb_asymmetry=0.0, viscous_asymmetry=0.0,
 ):  # fmt: skip
-    """Slope of `friction` with respect to the velocity.
+    """Return the derivative of `friction` with respect to the velocity.
 
     Args:
         velocity: v, scalar [m/s] or [rad/s].
@@ -347,11 +349,11 @@ def friction_slope(
 
 @allocation_free
 def spool_step(spool, spool_rate, command, bandwidth, damping, dt, slew_limit=0.0):
-    """One step of the spool `s'' = w^2 (u - s) - 2 z w s'`, `|s'| <= s_max`, with the command held.
+    """Advance the spool `s'' = w^2 (u - s) - 2 z w s'`, `|s'| <= s_max`, by one step.
 
-    The exact exponential is cut after its fourth power of `w dt`: for z <= 1 the error is below
-    `(w dt)^5 / 30` of `u - s` per step (1.1e-8 for 8 Hz and 1 ms). For `w dt > 0.5` the step is
-    divided.
+    The command is constant over the step. The exponential is truncated after the fourth power of
+    `w dt`: for z <= 1 the error per step is below `(w dt)^5 / 30` of `u - s` (1.1e-8 for 8 Hz and
+    1 ms). For `w dt > 0.5` the step is subdivided.
 
     Args:
         spool: s, scalar [1].
@@ -359,8 +361,8 @@ def spool_step(spool, spool_rate, command, bandwidth, damping, dt, slew_limit=0.
         command: u, scalar [1].
         bandwidth: w, natural frequency, scalar [rad/s].
         damping: z, scalar [1].
-        dt: step, scalar [s].
-        slew_limit: s_max, what the pilot stage can do, scalar [1/s]; 0 for no limit.
+        dt: time step, scalar [s].
+        slew_limit: s_max, speed limit of the pilot stage, scalar [1/s]; 0 for no limit.
 
     Returns:
         (s, s') at the end of the step.
@@ -400,20 +402,20 @@ _CURVES, _TANK_LEAK = int(Slot.CURVES), int(Slot.TANK_LEAKAGE)
 
 @inlined
 def axis_opening(user, u, spool):
-    """Opening of an axis' valve: dead band and flow curve of the direction of travel.
+    """Return the opening of an axis' valve from dead band and flow curve of its direction.
 
-    `o = c(t)` with the travel beyond the dead band `t = (|s| - db) / (1 - db)` and the curve c
-    linear between its knots; beyond the last knot its last piece goes on. Without a curve `o = t`.
+    `o = c(t)` with the travel beyond the dead band `t = (|s| - db) / (1 - db)`. The curve c is
+    linear between its knots and is extrapolated beyond the last one. Without a curve `o = t`.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
-        u: place of this axis in `user`.
+        user: (nu * SLOTS,) actuator parameters.
+        u: index of the first parameter of this axis in `user`.
         spool: spool position s, scalar [1].
 
     Returns:
         Opening o, scalar [1], with the sign of the spool.
 
-    Source: flow characteristic as valve makers tabulate it.
+    Source: flow characteristic as tabulated by valve manufacturers.
     """
     deadband, c = user[u + _DB], u + _CURVES
     if spool < 0.0:
@@ -432,11 +434,11 @@ def axis_opening(user, u, spool):
 
 @inlined
 def inlet_gain(user, u, opening):
-    """Flow gain of the edge that feeds a chamber.
+    """Return the flow gain of the metering edge that feeds a chamber.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
-        u: place of this axis in `user`.
+        user: (nu * SLOTS,) actuator parameters.
+        u: index of the first parameter of this axis in `user`.
         opening: o, scalar [1].
 
     Returns:
@@ -450,13 +452,14 @@ def inlet_gain(user, u, opening):
 
 @inlined
 def inlet_flow(drop, gain, smoothing, compensated):
-    """Flow through an inlet edge and its slope; a compensator takes up the drop beyond its setting.
+    """Return the flow through an inlet edge, which can be pressure-compensated, and its slope.
 
     Args:
         drop: pressure drop, scalar [Pa], > 0.
         gain: k, scalar [m^3/(s sqrt(Pa))].
         smoothing: d, scalar [Pa].
-        compensated: drop over the edge that the compensator holds, scalar [Pa]; 0 without one.
+        compensated: largest drop over the edge that the compensator allows, scalar [Pa]; 0 without
+            compensator.
 
     Returns:
         (q [m^3/s], dq/d(drop) [m^3/(s Pa)] >= 0).
@@ -473,14 +476,14 @@ def inlet_flow(drop, gain, smoothing, compensated):
 
 @inlined
 def _outlet_flow(user, u, holding, gain, pressure, pilot):
-    """Flow out of a chamber through the open edge to tank, and its slope."""
+    """Return the flow out of a chamber through the open edge to tank, and its slope."""
     flow, slope = orifice(pressure - user[u + _TANK], gain, user[u + _D])
     return _held_flow(user, u, holding, flow, slope, pressure, pilot)
 
 
 @inlined
 def _tank_leakage(user, u, holding, pressure, pilot):
-    """Flow out of a chamber through the spool's clearance to tank, and its slope."""
+    """Return the flow out of a chamber through the spool's clearance to tank, and its slope."""
     leak = user[u + _TANK_LEAK]
     flow = leak * (pressure - user[u + _TANK])
     return _held_flow(user, u, holding, flow, leak, pressure, pilot)
@@ -488,7 +491,7 @@ def _tank_leakage(user, u, holding, pressure, pilot):
 
 @inlined
 def _held_flow(user, u, holding, flow, slope, pressure, pilot):
-    """What the counterbalance valve of a chamber lets out of a flow to tank, and its slope."""
+    """Return a flow to tank after the chamber's counterbalance valve, and its slope."""
     if user[u + holding] == 0.0 or flow <= 0.0:
         return flow, slope
     share, steep = holding_share(
@@ -499,18 +502,19 @@ def _held_flow(user, u, holding, flow, slope, pressure, pilot):
 
 @inlined
 def chamber_flows(user, u, opening, p_supply, p_head, p_rod):
-    """Valve flows into both chambers of an axis and their slopes.
+    """Return the valve flows into both chambers of an axis, and their slopes.
 
     With o > 0 the head side is fed through its load check and the rod side drains to tank; with
-    o < 0 the other way round. From each chamber oil leaks to tank through the spool's radial
-    clearance, `c_t (p - p_t)` with any opening. A concentric spool of diameter d with the clearance
-    c over the overlap L has `c_t = pi d c^3 / (12 mu L)`. The overlap of the spool at rest counts
-    at any opening: an open edge to tank passes some thousand times as much, and where the overlap
-    grows, the pump feeds the chamber. Oil from the pump's gallery does not leak into a chamber.
+    o < 0 vice versa. From each chamber oil leaks to tank through the spool's radial clearance,
+    `c_t (p - p_t)` at any opening. A concentric spool of diameter d with clearance c over the
+    overlap L has `c_t = pi d c^3 / (12 mu L)`. The overlap is that of the spool at rest, since the
+    leakage is negligible for other openings: an open edge to tank passes about a thousand times as
+    much, and a closing edge belongs to a chamber that the pump feeds. Leakage from the pump gallery
+    into a chamber is not modelled.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
-        u: place of this axis in `user`.
+        user: (nu * SLOTS,) actuator parameters.
+        u: index of the first parameter of this axis in `user`.
         opening: o, scalar [1].
         p_supply: scalar [Pa].
         p_head: scalar [Pa].
@@ -531,7 +535,7 @@ def chamber_flows(user, u, opening, p_supply, p_head, p_rod):
 
 @inlined
 def _edge_flows(user, u, opening, p_supply, p_head, p_rod):
-    """`chamber_flows` through the open edges of the spool."""
+    """Return the `chamber_flows` through the open edges of the spool, without leakage."""
     if opening == 0.0:
         return 0.0, 0.0, 0.0, 0.0
     gain, smoothing, drop = user[u + _K] * abs(opening), user[u + _D], user[u + _DROP]

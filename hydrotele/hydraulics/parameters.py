@@ -1,6 +1,6 @@
-"""Numbers of a Machine's drives in the order in which the native hydraulics reads them.
+"""Actuator parameters of a Machine in the layout of MuJoCo's `actuator_user`.
 
-Where the numbers of an actuator stand in MuJoCo's `actuator_user`.
+`Slot` and `PumpSlot` define the index of every parameter; the native hydraulics read them there.
 """
 
 import enum
@@ -13,18 +13,17 @@ from hydrotele.machine.drives import Axis, Counterbalance, FlowCurve, LoadCylind
 from hydrotele.machine.machine import Machine, Supply
 from hydrotele.terms.table import remembering, terms_table
 
-CURVE_KNOTS = 8  # at most, of a valve's flow curve in one direction
+CURVE_KNOTS = 8  # largest number of knots of a valve's flow curve in one direction
 
 
 class Slot(enum.IntEnum):
-    """Places of an actuator's numbers in `actuator_user`, all SI; a new number is a new line.
+    """Indices of an actuator's parameters in `actuator_user`, all in SI units.
 
-    Beyond the plain valve and drive, 0 switches a law off (a metering ratio of 1 does). BRISTLE,
-    DELIVERY and ADDED_DELIVERY are places among the activations, counted from the first hydraulic
-    axis, and MEMORY is how many of them follow those of the hydraulic axes (see
-    `extra_state_names`). CURVES, the last, begins two flow curves, of the positive and of the
-    negative direction: number of knots (0: straight), CURVE_KNOTS travels and CURVE_KNOTS openings
-    each.
+    For optional effects, 0 disables the effect (for metering ratios, 1 does). BRISTLE, DELIVERY and
+    ADDED_DELIVERY are indices of activations, counted from the first hydraulic axis. MEMORY is the
+    number of additional activations after those of the hydraulic axes (see `extra_state_names`).
+    CURVES, the last, is the start of two flow curves, for the positive and the negative direction.
+    Each has the number of knots (0: linear), CURVE_KNOTS travels and CURVE_KNOTS openings.
     """
 
     @staticmethod
@@ -98,11 +97,11 @@ class Slot(enum.IntEnum):
     CURVES = enum.auto()
 
 
-CURVE = 1 + 2 * CURVE_KNOTS  # numbers of one flow curve
+CURVE = 1 + 2 * CURVE_KNOTS  # number of parameters of one flow curve
 
 
 class PumpSlot(enum.IntEnum):
-    """Places of a pump drive's numbers in its block, all SI."""
+    """Indices of a pump drive's parameters in its block, all in SI units."""
 
     DISPLACEMENT = 0
     LEAKAGE = 1
@@ -136,14 +135,14 @@ class PumpSlot(enum.IntEnum):
     LOAD_RETURN = 29
 
 
-PUMP = Slot.CURVES + 2 * CURVE  # first place of the pump drive's block
+PUMP = Slot.CURVES + 2 * CURVE  # index of the pump drive's block
 SLOTS = PUMP + len(PumpSlot)
 
 
 class Kind(enum.IntEnum):
-    """What an actuator is: a cylinder, a rotary motor or a plain force drive with friction.
+    """Kinds of actuators: cylinder, rotary motor, force drive with friction, or pump drive.
 
-    PUMPED is a cylinder with a pump of its own in the place of a valve.
+    PUMPED is a cylinder with its own pump instead of a valve.
     """
 
     CYLINDER = 1
@@ -154,20 +153,21 @@ class Kind(enum.IntEnum):
 
 DELIVERY = "delivery.supply"
 ADDED_DELIVERY = "added_delivery.supply"
-MARKER = 215325.0  # CAT 215, CAT 325: no other model writes this into actuator_user[0]
+MARKER = 215325.0  # arbitrary value of actuator_user[0] that marks hydrotele's actuators
 
 
 def actuator_order(machine: Machine) -> list[str]:
-    """Axis names in actuator order: the hydraulic ones first, as they share the supply."""
+    """Return the axis names in actuator order: hydraulic axes first, as they share the supply."""
     return [*machine.hydraulic_axes, *(n for n, a in machine.axes.items() if not a.hydraulic)]
 
 
 def extra_state_names(machine: Machine) -> list[str]:
-    """Names of the states that follow the activations of the hydraulic axes, in their order.
+    """Return the names of the additional states after the activations of the hydraulic axes.
 
-    `bristle.<axis>` of every hydraulic axis with presliding friction, `delivery.supply` of a pump
-    with a time constant, `added_delivery.supply` of one to whose flow terms add, `memory.term_<k>`
-    of every term with a memory, then `bristle.<axis>` of the force drives. None in most machines.
+    In this order: `bristle.<axis>` for every hydraulic axis with presliding friction,
+    `delivery.supply` for a pump with a time constant, `added_delivery.supply` if terms add to the
+    pump flow, `memory.term_<k>` for every term with hysteresis, and `bristle.<axis>` for the force
+    drives. Most machines have none.
     """
     supply, rubbing = machine.supply, [
         n for n in actuator_order(machine) if machine.axes[n].drive.friction.presliding
@@ -182,13 +182,13 @@ def extra_state_names(machine: Machine) -> list[str]:
 
 
 def actuator_parameters(machine: Machine) -> dict[str, np.ndarray]:
-    """`actuator_user` of every axis, in actuator order.
+    """Return the `actuator_user` parameters of every axis, in actuator order.
 
     Args:
         machine: the machine.
 
     Returns:
-        Axis name -> (SLOTS,) numbers in SI, placed as `Slot` says.
+        Axis name -> (SLOTS,) parameters in SI, with the indices of `Slot`.
     """
     count = len(machine.hydraulic_axes)
     memory = {name: 4 * count + k for k, name in enumerate(extra_state_names(machine))}
@@ -226,7 +226,7 @@ def actuator_parameters(machine: Machine) -> dict[str, np.ndarray]:
 
 
 def terms_of(machine: Machine) -> np.ndarray:
-    """The machine's terms as compiled code reads them, see `terms.table.terms_table`."""
+    """Return the machine's terms as an array for compiled code, see `terms.table.terms_table`."""
     names, first = extra_state_names(machine), 4 * len(machine.hydraulic_axes)
     own = [k for k, name in enumerate(names) if name.startswith("memory.")]
     areas = {name: machine.axes[name].hydraulic_drive.areas for name in machine.hydraulic_axes}
@@ -235,18 +235,19 @@ def terms_of(machine: Machine) -> np.ndarray:
 
 
 def longest_step(machine: Machine, name: str) -> float:
-    """Longest step that follows the piston of an axis with a pump of its own.
+    """Return the longest time step that resolves the piston motion of an axis with its own pump.
 
-    `k h^2 <= m + b h`: a radian per step of the piston on its oil, or as much of the way back to
-    its balance where friction damps it; k is the oil's stiffness where it is largest, without air,
-    and the load cylinder's. Powers of two, so that a number that is varied seldom changes it.
+    `k h^2 <= m + b h`: at most one radian of the piston's oscillation on its oil per step, or the
+    corresponding decay if it is damped. k is the largest stiffness of the oil, without air, plus
+    that of the load cylinder. Steps are powers of two, so that small parameter changes seldom
+    change the step.
 
     Args:
         machine: the machine.
-        name: the axis.
+        name: name of the axis.
 
     Returns:
-        Step [s], a power of two times 1 ms.
+        Time step [s], a power of two times 1 ms.
 
     Source: stability limit of Verlet's method, h < 2 / omega, halved.
 
@@ -256,7 +257,7 @@ def longest_step(machine: Machine, name: str) -> float:
     """
     numbers = actuator_parameters(machine)[name]
     block, stroke = numbers[PUMP:], numbers[Slot.STROKE]
-    stiffness = np.zeros(2)  # at either end of the stroke
+    stiffness = np.zeros(2)  # at both ends of the stroke
     for area, volume, soft, travel in (
         (Slot.AREA_HEAD, Slot.VOLUME_HEAD, PumpSlot.COMPLIANCE_HEAD, np.array([0.0, stroke])),
         (Slot.AREA_ROD, Slot.VOLUME_ROD, PumpSlot.COMPLIANCE_ROD, np.array([stroke, 0.0])),
@@ -289,6 +290,7 @@ def _write_end_stop(numbers: np.ndarray, machine: Machine, name: str) -> None:
 
 
 def _write_hydraulics(numbers: np.ndarray, axis: Axis, supply: Supply) -> None:
+    """Write the parameters of an axis with a valve."""
     valve = axis.valve
     assert valve is not None
     drive = axis.hydraulic_drive
@@ -314,6 +316,7 @@ def _write_hydraulics(numbers: np.ndarray, axis: Axis, supply: Supply) -> None:
 
 
 def _write_pumped(numbers: np.ndarray, machine: Machine, name: str) -> None:
+    """Write the parameters of an axis with its own pump."""
     axis = machine.axes[name]
     cylinder, pump = axis.cylinder, axis.pump
     assert cylinder and pump
@@ -387,7 +390,7 @@ def _write_curve(numbers: np.ndarray, first: int, curve: FlowCurve | None) -> No
 
 
 def _write_holding(numbers: np.ndarray, first: int, valve: Counterbalance | None) -> None:
-    """Setting, pilot ratio and override pressure, which follow each other in `Slot`."""
+    """Write setting, pilot ratio and override pressure to consecutive slots."""
     if valve:
         override = valve.override * valve.setting
         numbers[first : first + 3] = valve.setting, valve.pilot_ratio, override

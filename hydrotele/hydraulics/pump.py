@@ -1,15 +1,16 @@
-"""A pump as drive: a motor turns a pump in one direction, a switched valve picks the side.
+"""Pump drive: a motor turns a pump in one direction, and a switched valve selects the chamber.
 
-The pump draws from the other chamber, whose line also leads to a gas accumulator: it takes up what
-the two sides of the piston differ by. The command is the duty of the motor's bridge with the sign
-of the side, or, without a motor, the speed over the rated one. At command 0 the valve shuts both
-chambers, and the pump stands. A load cylinder on the same joint may push against the drive: its
-oil leaves over a relief valve, and on the way back the chamber draws without pressure.
+The pump draws from the other chamber, whose line also connects to a gas accumulator. The
+accumulator takes up the difference between the two piston areas. The command is the duty cycle of
+the motor's bridge, signed by the selected side; without a motor it is the speed relative to the
+rated speed. At command 0 the valve closes both chambers, and the pump is at rest. A load cylinder
+on the same joint can push against the drive: its oil leaves through a relief valve, and in the
+return direction the chamber refills without pressure.
 
-Of an actuator's four activations the first is here the pump's speed [rad/s] with the sign of the
-side, exactly 0 where the valve is shut (a stalled pump keeps `STALLED`), and the second the
-pressure in the load cylinder [Pa]. The numbers stand in one block, placed as `PumpSlot` says. All
-pressures are above the atmosphere's.
+The first of the actuator's four activations is the pump speed [rad/s], signed by the selected side;
+it is exactly 0 if the valve is closed (a stalled pump has the speed `STALLED`). The second is the
+pressure in the load cylinder [Pa]. `PumpSlot` defines the order of the parameters. All pressures
+are relative to the atmosphere.
 """
 
 import math
@@ -18,8 +19,8 @@ from hydrotele.core.compiled import allocation_free
 from hydrotele.hydraulics.laws import ATMOSPHERE
 from hydrotele.hydraulics.parameters import PumpSlot
 
-STALLED = 1.0e-9  # rad/s, of a pump that stands while its valve is open
-_THINNEST = 0.1 * ATMOSPHERE  # Pa absolute: below it the air is not let grow any further
+STALLED = 1.0e-9  # rad/s, speed of a pump at rest while its valve is open
+_THINNEST = 0.1 * ATMOSPHERE  # Pa absolute, lower bound of the pressure for the air's compliance
 
 _D, _LEAK, _RATED = PumpSlot.DISPLACEMENT.value, PumpSlot.LEAKAGE.value, PumpSlot.RATED_SPEED.value
 _BETA, _GAS = PumpSlot.BULK_MODULUS.value, PumpSlot.GAS_VOLUME.value
@@ -40,20 +41,21 @@ _RUB, _RETURN = PumpSlot.LOAD_FRICTION.value, PumpSlot.LOAD_RETURN.value
 
 @allocation_free
 def pump_speed_step(user, p, speed, command, p_head, p_rod, dt):
-    """Speed of the pump after a step, with the sign of the side that the valve picks.
+    """Return the pump speed after a step, signed by the side that the valve selects.
 
-    `J w' = k (u U - k w) / R - D dp (1 + l) - T_c - T_s exp(-(w/w_s)^2) - b w`, never backwards,
-    with the current at rest (`L/R` is shorter than any change of the speed) and `b w`, `k^2 w / R`
-    taken at the end of the step. Without a motor the speed is the command times the rated speed.
+    `J w' = k (u U - k w) / R - D dp (1 + l) - T_c - T_s exp(-(w/w_s)^2) - b w`, with w >= 0. The
+    current is quasi-static, because `L/R` is shorter than the time scale of the speed. `b w` and
+    `k^2 w / R` are taken at the end of the step. Without a motor the speed is the command times the
+    rated speed.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
-        p: place of the axis' pump block in `user`.
+        user: (nu * SLOTS,) actuator parameters.
+        p: index of the pump parameters of this axis in `user`.
         speed: signed speed at the start, scalar [rad/s].
-        command: u with the sign of the side, scalar [1].
+        command: u, signed by the side, scalar [1].
         p_head: scalar [Pa].
         p_rod: scalar [Pa].
-        dt: step, scalar [s].
+        dt: time step, scalar [s].
 
     Returns:
         Signed speed, scalar [rad/s]; 0 at command 0.
@@ -84,19 +86,19 @@ def pump_speed_step(user, p, speed, command, p_head, p_rod, dt):
 
 @allocation_free
 def switched_speed(speed, after):
-    """Speed of a pump at the start of a step, with the side that the valve has over the step.
+    """Return the pump speed at the start of a step, signed by the valve's side during the step.
 
-    The relays switch at the start, the pump keeps turning: only the sign changes, and a pump whose
-    valve is shut over the step moves no oil.
+    The valve switches at the start of the step while the pump keeps turning: only the sign changes.
+    If the valve is closed during the step, the pump moves no oil and the result is 0.
 
     Args:
-        speed: at the start, with the sign of the side until then, scalar [rad/s].
-        after: at the end, as `pump_speed_step` returns it, scalar [rad/s].
+        speed: speed at the start, signed by the side before switching, scalar [rad/s].
+        after: speed at the end, as returned by `pump_speed_step`, scalar [rad/s].
 
     Returns:
         Signed speed, scalar [rad/s].
 
-    Source: switched valve without travel of its own.
+    Source: ideal switching valve without spool dynamics.
 
     >>> switched_speed(40.0, -39.0), switched_speed(40.0, 0.0)
     (-40.0, 0.0)
@@ -108,14 +110,14 @@ def switched_speed(speed, after):
 
 @allocation_free
 def accumulator_pressure(pressure, gas_volume, taken):
-    """Pressure of the accumulator after oil has left it, with the gas at constant temperature.
+    """Return the accumulator pressure after oil has left it, with isothermal gas.
 
     `p = (p_0 + p_atm) V_0 / (V_0 + dV) - p_atm`.
 
     Args:
-        pressure: p_0, with nothing taken, scalar [Pa].
-        gas_volume: V_0 then, scalar [m^3].
-        taken: dV, oil that has left, scalar [m^3].
+        pressure: p_0, pressure before any oil has left, scalar [Pa].
+        gas_volume: V_0, gas volume at p_0, scalar [m^3].
+        taken: dV, oil volume that has left, scalar [m^3].
 
     Returns:
         p, scalar [Pa].
@@ -130,18 +132,18 @@ def accumulator_pressure(pressure, gas_volume, taken):
 
 @allocation_free
 def pump_flows(user, p, speed, p_head, p_rod, taken):
-    """Flows of pump and accumulator line into both chambers and their slopes.
+    """Return the flows of pump and accumulator line into both chambers, and their slopes.
 
     The pump moves `D w - k dp` from one line to the other, the accumulator adds
     `(p_a - p) / R` to the line that the pump draws from.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
-        p: place of the axis' pump block in `user`.
-        speed: signed speed, scalar [rad/s]; 0: valve shut.
+        user: (nu * SLOTS,) actuator parameters.
+        p: index of the pump parameters of this axis in `user`.
+        speed: signed speed, scalar [rad/s]; 0: valve closed.
         p_head: scalar [Pa].
         p_rod: scalar [Pa].
-        taken: oil that the piston has taken from the accumulator, scalar [m^3].
+        taken: oil volume that the piston has taken from the accumulator, scalar [m^3].
 
     Returns:
         (q_head, q_rod [m^3/s], d q_head/d p_head, d q_rod/d p_rod [m^3/(s Pa)]).
@@ -162,7 +164,7 @@ def pump_flows(user, p, speed, p_head, p_rod, taken):
 
 @allocation_free
 def oil_compliance(volume, bulk_modulus, compliance, air, pressure):
-    """Compliance of a chamber: oil, walls, and air that follows Boyle's law.
+    """Return the compliance of a chamber: oil, walls, and air that follows Boyle's law.
 
     `C = V / beta + C_w + V_air p_atm / (p + p_atm)^2`.
 
@@ -170,7 +172,7 @@ def oil_compliance(volume, bulk_modulus, compliance, air, pressure):
         volume: V, scalar [m^3].
         bulk_modulus: beta of oil without air, scalar [Pa].
         compliance: C_w of hose and walls, scalar [m^3/Pa].
-        air: V_air, at the atmosphere's pressure, scalar [m^3].
+        air: V_air, volume of the air at atmospheric pressure, scalar [m^3].
         pressure: p, scalar [Pa].
 
     Returns:
@@ -187,21 +189,21 @@ def oil_compliance(volume, bulk_modulus, compliance, air, pressure):
 
 @allocation_free
 def pump_pressure_rates(user, p, speed, p_head, p_rod, volumes, swept, leakage, added):
-    """Pressure rates of both chambers of a pump drive and their slopes with their own pressure.
+    """Return the pressure rates of both chambers of a pump drive, and their slopes.
 
     `C_A p_A' = q_A - A_h v - q_l + a_A`, `C_B p_B' = q_B + A_r v + q_l + a_B`.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
-        p: place of the axis' pump block in `user`.
+        user: (nu * SLOTS,) actuator parameters.
+        p: index of the pump parameters of this axis in `user`.
         speed: signed pump speed, scalar [rad/s].
         p_head: scalar [Pa].
         p_rod: scalar [Pa].
-        volumes: (V_A, V_B, oil taken from the accumulator) [m^3].
+        volumes: (V_A, V_B, oil volume taken from the accumulator) [m^3].
         swept: (A_h v, A_r v) [m^3/s].
-        leakage: of the piston, scalar [m^3/(s Pa)].
-        added: flows a_A, a_B of the machine's terms [m^3/s] and their slopes with these chambers'
-            pressures [m^3/(s Pa)], see `terms.table.added_flows`.
+        leakage: leakage of the piston, scalar [m^3/(s Pa)].
+        added: flows a_A, a_B of the machine's terms [m^3/s] and their slopes with respect to the
+            pressures of these chambers [m^3/(s Pa)], see `terms.table.added_flows`.
 
     Returns:
         (p_head', p_rod' [Pa/s], d p_head'/d p_head, d p_rod'/d p_rod [1/s]).
@@ -223,21 +225,22 @@ def pump_pressure_rates(user, p, speed, p_head, p_rod, volumes, swept, leakage, 
 
 @allocation_free
 def load_pressure_step(user, p, pressure, velocity, dt):
-    """Pressure in the load cylinder after a step.
+    """Return the pressure in the load cylinder after a step.
 
-    The chamber gives way by `s = d p / (p_v + p) + A p / k`: a void of width d with air at p_v in
-    it, then oil of stiffness k. The piston adds `v dt` to s; s does not fall below 0, as the
-    chamber draws oil without pressure, nor p rise above the relief's `p_s + r A max(0, v)`.
+    The chamber is compressed by `s = d p / (p_v + p) + A p / k`: a void of width d that contains
+    air at pressure p_v, in series with oil of stiffness k. The piston adds `v dt` to s. s does not
+    fall below 0, because the chamber refills without pressure. p does not exceed the relief
+    pressure `p_s + r A max(0, v)`.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
-        p: place of the axis' pump block in `user`.
+        user: (nu * SLOTS,) actuator parameters.
+        p: index of the pump parameters of this axis in `user`.
         pressure: p at the start, scalar [Pa].
         velocity: v, positive against the load, scalar [m/s].
-        dt: step, scalar [s].
+        dt: time step, scalar [s].
 
     Returns:
-        p at the end, scalar [Pa]; 0 without load cylinder.
+        p at the end of the step, scalar [Pa]; 0 without load cylinder.
 
     Source: Boyle's law and Hooke's; relief valve with linear override.
     """
@@ -250,14 +253,14 @@ def load_pressure_step(user, p, pressure, velocity, dt):
         return 0.0
     half = 0.5 * (void + per_pressure * air - pressed)
     root = math.sqrt(half * half + per_pressure * pressed * air)
-    # the root of the quadratic that has no difference of like numbers
+    # the form of the quadratic's root that avoids cancellation
     risen = (root - half) / per_pressure if half < 0.0 else pressed * air / (root + half)
     return min(risen, user[p + _TOP] + user[p + _OVERRIDE] * area * max(0.0, velocity))
 
 
 @allocation_free
 def load_force(user, p, pressure):
-    """Force of the load cylinder against extension, without its friction, scalar [N].
+    """Return the force of the load cylinder against extension, without friction, scalar [N].
 
     Source: pressure times area.
     """
@@ -266,20 +269,22 @@ def load_force(user, p, pressure):
 
 @allocation_free
 def pump_piston_friction(user, p, seal, velocity, push, load_pressure, dt):
-    """Friction at the end of a step that holds a piston fast until it is overcome.
+    """Return the friction of a pump drive's piston at the end of a step, including sticking.
 
-    Dry friction `F_c + F_s exp(-(v/v_s)^2) + m A p_load`, and `F_r` more where the load cylinder
-    moves back, resists; the velocity after the step `v' = v + dt/M (F - F_f)` is 0 where that can
-    be. With dt = 0 friction is that of the velocity now, or at rest what holds F.
+    The dry friction is `F_c + F_s exp(-(v/v_s)^2) + m A p_load`, plus `F_r` while the load cylinder
+    retracts. If the dry friction can make the velocity after the step,
+    `v' = v + dt/M (F - F_f)`, zero, it does. With dt = 0 the friction is that at the current
+    velocity; at rest it balances F as far as possible.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
-        p: place of the axis' pump block in `user`.
-        seal: (F_c, F_s [N], v_s [m/s], b [N s/m], asymmetry of F_c + F_s, asymmetry of b [1]).
+        user: (nu * SLOTS,) actuator parameters.
+        p: index of the pump parameters of this axis in `user`.
+        seal: seal friction (F_c, F_s [N], v_s [m/s], b [N s/m], asymmetry of F_c + F_s, asymmetry
+            of b [1]).
         velocity: v, scalar [m/s].
         push: F, all other force, scalar [N].
-        load_pressure: scalar [Pa].
-        dt: step, scalar [s].
+        load_pressure: pressure in the load cylinder, scalar [Pa].
+        dt: time step, scalar [s].
 
     Returns:
         F_f, scalar [N].

@@ -1,6 +1,7 @@
-"""The supply that valves share: its pressure from what they draw, and a pump that follows late.
+"""Shared hydraulic supply: pressure from the flows of the valves, and pump with a time constant.
 
-Flat arrays are laid out as in `circuit`; `ports` holds four numbers per axis, see `open_ports`.
+Flat arrays have the layout described in `circuit`; `ports` has four values per axis, see
+`open_ports`.
 """
 
 import math
@@ -10,9 +11,9 @@ from hydrotele.hydraulics.laws import axis_opening, inlet_flow, inlet_gain
 from hydrotele.hydraulics.parameters import SLOTS, Kind, Slot
 
 _NEWTON_STEPS = 60
-_FLOW_TOLERANCE = 1.0e-12  # of the pump flow: far below the flow balance of 1e-6 that is promised
-_LEAST_SHARE = 1.0e-6  # of a pump's flow that it always gives, so that its pressure is determined
-ADDED_LAG = 0.02  # s, with which a pump's flow follows what terms add: it cannot change at once
+_FLOW_TOLERANCE = 1.0e-12  # of the pump flow: far below the documented flow balance of 1e-6
+_LEAST_SHARE = 1.0e-6  # smallest fraction of the maximum pump flow; it makes the pressure unique
+ADDED_LAG = 0.02  # s, time constant with which the pump flow follows terms: it cannot jump
 
 _D, _TANK = int(Slot.ORIFICE_SMOOTHING), int(Slot.TANK_PRESSURE)
 _RELIEF, _PUMP = int(Slot.RELIEF_PRESSURE), int(Slot.PUMP_FLOW)
@@ -25,22 +26,22 @@ _KIND, _PUMPED = int(Slot.KIND), float(Kind.PUMPED)
 
 @allocation_free
 def supply_pressure(ports, count, smoothing, relief, pump_flow, droop=0.0, override=0.0):
-    """Largest pressure up to the relief setting at which the valves draw no more than the pump.
+    """Solve for the supply pressure at which the pump flow equals the flows of valves and relief.
 
     Solves `sum_i k_i g(min(p_s - p_i, d_i)) = Q_pump - c_p p_s` over the valves whose load check is
-    open, by Newton's method in `sqrt(p_s - min p_i)` inside a bracket, which is halved where Newton
-    fails. A relief valve with an override r opens at its setting p_r and lets `(p_s - p_r) / r`
-    through; without one it holds its setting.
+    open, by Newton's method in `sqrt(p_s - min p_i)` with bisection as a fallback. A relief valve
+    with an override r opens at its setting p_r and passes the flow `(p_s - p_r) / r`. Without
+    override the pressure is limited to the setting.
 
     Args:
-        ports: (>= 4 count,) per axis `k_i` [m^3/(s sqrt(Pa))], `p_i` [Pa], the drop `d_i` that
-            its compensator holds [Pa], 0 without one, and a place that is not read.
+        ports: (>= 4 count,) per axis `k_i` [m^3/(s sqrt(Pa))], `p_i` [Pa], the pressure drop `d_i`
+            set by its compensator [Pa] (0 without one), and an unused value.
         count: number of axes.
         smoothing: orifice smoothing d, scalar [Pa].
         relief: relief setting, scalar [Pa].
         pump_flow: Q_pump, scalar [m^3/s].
-        droop: c_p, by which the pump's flow falls with its pressure, scalar [m^3/(s Pa)].
-        override: r, by which the relief's pressure rises with its flow, scalar [Pa s/m^3].
+        droop: c_p, decrease of the pump flow with pressure, scalar [m^3/(s Pa)].
+        override: r, increase of the relief pressure with its flow, scalar [Pa s/m^3].
 
     Returns:
         p_s, scalar [Pa].
@@ -84,7 +85,7 @@ def supply_pressure(ports, count, smoothing, relief, pump_flow, droop=0.0, overr
             return p
         root = math.sqrt(p - floor) if p > floor else 0.0
         guess = -1.0
-        if slope > 0.0 and root > 0.0 and abs(excess) < 0.5 * last:  # else Newton may cycle
+        if slope > 0.0 and root > 0.0 and abs(excess) < 0.5 * last:  # otherwise Newton may cycle
             root -= excess / (2.0 * slope * root)
             if root > 0.0:
                 guess = floor + root * root
@@ -95,18 +96,18 @@ def supply_pressure(ports, count, smoothing, relief, pump_flow, droop=0.0, overr
 
 @inlined
 def open_ports(user, act, spool, ports, first, count, ahead, rate):
-    """Flow gain and supply-side pressure of every axis, for `supply_pressure`.
+    """Compute opening, inlet gain and fed chamber pressure of every axis for `supply_pressure`.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         act: (4 count,) activations; pressures [Pa].
-        spool: (4 count,) array whose every fourth entry is the spool position to use [1].
+        spool: (4 count,) array with the spool position of every axis at index 0 of its four [1].
         ports: (>= 4 count,) written: `k_i` [m^3/(s sqrt(Pa))], `p_i` and `d_i` [Pa], opening
             [1].
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
-        ahead: time to look ahead with `rate`, scalar [s].
-        rate: (4 count,) array with pressure rates at places 2 and 3 of every axis [Pa/s].
+        ahead: time by which the pressures are extrapolated with `rate`, scalar [s].
+        rate: (4 count,) array with pressure rates at indices 2 and 3 of every axis [Pa/s].
 
     Returns:
         Nothing; `ports` is filled.
@@ -115,7 +116,7 @@ def open_ports(user, act, spool, ports, first, count, ahead, rate):
     """
     for i in range(count):
         u = (first + i) * SLOTS
-        if user[u + _KIND] == _PUMPED:  # draws nothing from the supply
+        if user[u + _KIND] == _PUMPED:  # does not use the shared supply
             ports[4 * i], ports[4 * i + 3] = 0.0, spool[4 * i]
             continue
         opening = axis_opening(user, u, spool[4 * i])
@@ -129,16 +130,18 @@ def open_ports(user, act, spool, ports, first, count, ahead, rate):
 
 @allocation_free
 def delivered_share(user, first, act):
-    """Share of its largest flow that the pump gives: 1 where it follows at once, and without terms.
+    """Return the fraction of its maximum flow that the pump delivers, including terms.
+
+    It is 1 for a pump without time constant and without terms.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         first: index of the first hydraulic actuator.
-        act: (>= 4 count + MEMORY,) activations, whose DELIVERY is read where there is a lag, and
-            ADDED_DELIVERY where terms add to the flow [1].
+        act: (>= 4 count + MEMORY,) activations; DELIVERY is read if the pump has a time constant,
+            ADDED_DELIVERY if terms add to the flow [1].
 
     Returns:
-        Share, scalar [1].
+        Fraction, scalar [1].
 
     Source: `demanded_share`.
     """
@@ -150,15 +153,15 @@ def delivered_share(user, first, act):
 
 @allocation_free
 def own_share(user, first, act):
-    """As `delivered_share`, without what terms add.
+    """Return the fraction of its maximum flow that the pump delivers, without terms.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         first: index of the first hydraulic actuator.
         act: (>= 4 count + MEMORY,) activations [1].
 
     Returns:
-        Share, scalar [1].
+        Fraction, scalar [1].
 
     Source: `demanded_share`.
     """
@@ -170,14 +173,14 @@ def own_share(user, first, act):
 
 @allocation_free
 def with_added(share, added):
-    """Share of a pump's largest flow with what terms add to it; never none.
+    """Add the contribution of terms to a pump's flow fraction, with a positive lower bound.
 
     Args:
-        share: without them, scalar [1].
-        added: what they add, scalar [1].
+        share: flow fraction without terms, scalar [1].
+        added: flow fraction of the terms, scalar [1].
 
     Returns:
-        Share, scalar [1], > 0.
+        Fraction of the maximum flow, scalar [1], > 0.
 
     Source: a pump's displacement, bounded from below.
     """
@@ -186,17 +189,17 @@ def with_added(share, added):
 
 @allocation_free
 def pump_response(user, first, wanted, share, dt):
-    """Share of its largest flow that the pump is set to after a time, by the exact exponential.
+    """Return the pump's flow fraction after a time, by the exact exponential of its lag.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         first: index of the first hydraulic actuator.
-        wanted: as of `demanded_share`, held, scalar [1].
-        share: at the start, scalar [1].
-        dt: scalar [s].
+        wanted: demanded fraction of `demanded_share`, constant over the time, scalar [1].
+        share: fraction at the start, scalar [1].
+        dt: duration, scalar [s].
 
     Returns:
-        Share, scalar [1]: 1 where the pump follows at once.
+        Fraction of the maximum flow, scalar [1]; 1 for a pump without time constant.
 
     Source: `demanded_share`.
     """
@@ -206,15 +209,15 @@ def pump_response(user, first, wanted, share, dt):
 
 @allocation_free
 def demanded_share(user, first, count, ports):
-    """Share of its largest flow that the valves draw from a pump that follows at once.
+    """Return the fraction of the maximum pump flow that the valves demand.
 
-    `q = (sum_i q_i + c_p p_s) / Q_pump` at the pressure p_s of such a pump. One with a time
-    constant T has `T q' = q_wanted - q` and gives q Q_pump at most: while it swashes out the
-    pressure falls to where the valves draw no more; while it swashes back, what is too much goes
-    over the relief or unloading valve.
+    `q = (sum_i q_i + c_p p_s) / Q_pump` at the pressure p_s of a pump without time constant. A pump
+    with time constant T follows `T q' = q_demanded - q` and delivers at most q Q_pump. While its
+    displacement increases, the pressure drops until the valves draw no more than that. While it
+    decreases, the excess flow passes the relief or unloading valve.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
         ports: (>= 4 count,) as `open_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
@@ -230,10 +233,10 @@ def demanded_share(user, first, count, ports):
 
 @allocation_free
 def drawn_flow(user, first, count, ports, supply):
-    """Flow that the valves and the pump's own leak take at a supply pressure.
+    """Return the flow of all valves and the pump's internal leakage at a supply pressure.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
         ports: (>= 4 count,) as `open_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
@@ -255,10 +258,10 @@ def drawn_flow(user, first, count, ports, supply):
 
 @inlined
 def highest_supply(user, first, count, ports):
-    """Supply pressure up to which the pump's flow is short: the relief's, or that of load sensing.
+    """Return the upper limit of the supply pressure: relief setting or load-sensing pressure.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
         ports: (>= 4 count,) as `open_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
@@ -281,17 +284,17 @@ def highest_supply(user, first, count, ports):
 
 @inlined
 def circuit_supply(user, first, count, ports, share):
-    """Supply pressure of a circuit: what pump and relief give, or what load sensing asks for.
+    """Compute the supply pressure of a circuit from pump, relief valve and load sensing.
 
-    A load-sensing pump holds `max p_i + margin` over the open valves (tank pressure counts as a
-    load), as far as relief setting and flow allow.
+    A load-sensing pump maintains `max p_i + margin` over the open valves (tank pressure counts as a
+    load), within the limits of relief setting and flow.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
         ports: (>= 4 count,) as `open_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
-        share: of its largest flow that the pump is set to, scalar [1], > 0.
+        share: fraction of its maximum flow that the pump delivers, scalar [1], > 0.
 
     Returns:
         p_s, scalar [Pa].
@@ -306,20 +309,21 @@ def circuit_supply(user, first, count, ports, share):
 
 @allocation_free
 def supply_coupling(user, first, count, ports, supply, out):
-    """How the supply pressure follows the chambers that it feeds.
+    """Compute the derivatives of the supply pressure with respect to the fed chamber pressures.
 
-    `dp_s/dp_i` is `g_i / (sum_j g_j + c_p)` where the pump's flow is short, 1 for the largest load
-    where load sensing holds its margin, 0 at the relief setting, or `g_i / (sum_j g_j + c_p + 1/r)`
-    beyond it where the relief has an override r; g_i is the slope of an inlet's flow with its drop.
+    `dp_s/dp_i` is `g_i / (sum_j g_j + c_p)` if the pump flow limits the pressure. It is 1 for the
+    largest load if load sensing maintains its margin, 0 at the relief setting, or
+    `g_i / (sum_j g_j + c_p + 1/r)` above it if the relief valve has an override r. g_i is the
+    derivative of an inlet's flow with respect to its pressure drop.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
         ports: (>= 4 count,) as `open_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
-        supply: p_s, as of `circuit_supply`, scalar [Pa].
-        out: (>= 4 count,) written at places 2 and 3 of every axis: g_i [m^3/(s Pa)] and dp_s/dp_i
-            [1].
+        supply: p_s of `circuit_supply`, scalar [Pa].
+        out: (>= 4 count,) written at indices 2 and 3 of every axis: g_i [m^3/(s Pa)] and
+            dp_s/dp_i [1].
 
     Returns:
         Whether any dp_s/dp_i is not 0, scalar [1].

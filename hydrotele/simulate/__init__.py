@@ -1,1 +1,1 @@
-"""The machine side: hydraulics, mechanism, sensors, and their states."""
+"""Simulation of a machine in MuJoCo: mechanism, hydraulics, sensors and recorded states."""

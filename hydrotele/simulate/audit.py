@@ -1,7 +1,7 @@
-"""Books of a run: does the oil that went in come out or compress, does the work become energy.
+"""Conservation checks of a run: oil volume balance of each chamber and mechanical energy balance.
 
-The first seconds are run again at full rate with the same commands (`mujoco.rollout`, bit for bit
-the same states) and integrated by the trapezoidal rule.
+The first seconds are simulated again with the same commands (`mujoco.rollout`, bit-identical
+states), and the balances of all physics steps are integrated by the trapezoidal rule.
 """
 
 import mujoco
@@ -17,30 +17,30 @@ from hydrotele.simulate.mechanism import drive_and_load_dofs
 from hydrotele.simulate.plant import Plant, added_by_terms
 from hydrotele.simulate.record import align_positions, drive_motion, state_flows
 
-_LOOK_EVERY = 10  # steps, to see whether the machine touches something: a hit lasts longer
+_LOOK_EVERY = 10  # steps between two contact checks: a contact lasts longer
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
 
 def full_state(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """The full physics state as `mujoco.rollout` takes it, (nstate,)."""
+    """Return the full physics state (nstate,) in the format of `mujoco.rollout`."""
     state = np.empty(mujoco.mj_stateSize(model, _FULL))
     mujoco.mj_getState(model, data, state, _FULL)
     return state
 
 
 def audit(plant: Plant, start: np.ndarray, controls: np.ndarray) -> dict[str, float | None]:
-    """Balances over a stretch of a run.
+    """Compute the relative volume and energy balance errors over part of a run.
 
     Args:
         plant: the plant.
-        start: (nstate,) full physics state at the beginning.
+        start: (nstate,) full physics state at the start.
         controls: (nstep, nu) commands of every physics step.
 
     Returns:
-        `seconds`; `flow_balance`: largest |in - out - compressed| of a chamber over the volume that
-        went through it; `energy_balance`: |work of the drives - damping - change of mechanical
-        energy| over the work of all drives (None if the machine touched something, hit a limit, or
-        has drives without hydraulics).
+        `seconds`: simulated time [s]; `flow_balance`: largest |in - out - compressed| of a chamber,
+        relative to the volume that flowed through it; `energy_balance`: |work of the drives -
+        damping - change of mechanical energy|, relative to the work of all drives. It is None if
+        the machine touched something, reached a limit, or has drives without hydraulics.
     """
     model = plant.model
     data = mujoco.MjData(model)
@@ -64,7 +64,7 @@ def audit(plant: Plant, start: np.ndarray, controls: np.ndarray) -> dict[str, fl
 
 
 def _hydraulic_balance(plant, x, v, act, more, dt):
-    """Work of the drives (n,) [J] and the largest relative volume error."""
+    """Return the work of the drives (n,) [J] and the largest relative volume error."""
     user, count = plant.model.actuator_user, plant.hydraulic
     if not count:
         return np.zeros(len(x)), None
@@ -78,6 +78,7 @@ def _hydraulic_balance(plant, x, v, act, more, dt):
 
 
 def _volume_errors(plant, i, table, act, x, v, more, dt):
+    """Yield the relative volume balance error of both chambers of axis i."""
     axis = plant.machine.axes[plant.axes[i]]
     if axis.pump:
         began = _flows_after_switching(plant, i, act, x, v)
@@ -110,7 +111,7 @@ def _volume_errors(plant, i, table, act, x, v, more, dt):
 
 @compiled
 def _chamber_laws(pressure, relief, gain, tank, makeup, air, release):
-    """Port flows (n,), compliances of the air halfway (n - 1,), pressures without air (n,)."""
+    """Return port flows (n,), mid-step air compliances (n - 1,) and pressures without air (n,)."""
     n = len(pressure)
     port, bubbles, oil = np.empty(n), np.empty(n - 1), np.empty(n)
     for row in range(n):
@@ -122,7 +123,7 @@ def _chamber_laws(pressure, relief, gain, tank, makeup, air, release):
 
 
 def _flows_after_switching(plant, i, act, x, v):
-    """Table of `state_flows` at the start of every step, once the valve of axis i has switched."""
+    """Return `state_flows` at the start of every step, after the valve of axis i has switched."""
     switched, a = act.copy(), ACTIVATIONS * i
     switched[:-1, a] = [
         switched_speed(speed, after) for speed, after in zip(act[:-1, a], act[1:, a], strict=True)
@@ -131,7 +132,7 @@ def _flows_after_switching(plant, i, act, x, v):
 
 
 def _pumped_volume_errors(axis, i, table, began, act, x, v, more, dt):
-    """As `_volume_errors`, of an axis with a pump of its own, whose oil carries air."""
+    """Yield the relative volume balance errors of an axis with its own pump and aerated oil."""
     cylinder, pump = axis.cylinder, axis.pump
     p_head, p_rod = act[:, ACTIVATIONS * i + 2], act[:, ACTIVATIONS * i + 3]
     leak = cylinder.leakage * (p_head - p_rod)
@@ -155,6 +156,7 @@ def _pumped_volume_errors(axis, i, table, began, act, x, v, more, dt):
 
 
 def _energy_balance(plant, qpos, qvel, work, dt):
+    """Return the relative energy balance error; None if it is not defined (see `audit`)."""
     if plant.hydraulic < len(plant.axes):
         return None
     model = plant.model

@@ -1,6 +1,7 @@
-"""Closed loops: which joints follow, where they stand, how fast they move, what loads they carry.
+"""Closed kinematic loops of a machine: dependent joints, closed poses, velocities and loads.
 
-Names and poses of a Machine for `multibody.closures`, which closes the loops of its MuJoCo model.
+The loops of the MuJoCo model are closed with `multibody.closures`, starting from the home position
+of the Machine. Each linkage keeps the assembly mode that it has at home.
 """
 
 import dataclasses
@@ -28,13 +29,13 @@ from hydrotele.simulate.mechanism import (
 )
 
 _STEP = 0.2  # largest move of an independent joint between two solutions [rad] or [m]
-_TURN = 0.3  # largest move of a joint that follows, in a round of Newton's method [rad] or [m]
+_TURN = 0.3  # largest move of a dependent joint in an iteration of Newton's method [rad] or [m]
 _CLOSED = 1.0e-12  # pin opening that counts as closed [m]: rounding of a 10 m machine
-_FOLLOWED = 1.0e-9  # the same where only looks depend on it
+_FOLLOWED = 1.0e-9  # the same for poses that are only displayed [m]
 
 
 def following_joints(machine: Machine) -> tuple[str, ...]:
-    """Names of the joints that the closures determine: tubes, rods and undriven links in a loop."""
+    """Return the names of the dependent joints: tubes, rods and undriven links in a loop."""
     cylinders = [name for name, axis in machine.axes.items() if axis.cylinder]
     bars = [f"{name}_{part}" for name in cylinders for part in ("tube", "rod")]
     tilts = [tilt_joint(name) for name in cylinders if has_ball_ends(machine, name)]
@@ -42,7 +43,7 @@ def following_joints(machine: Machine) -> tuple[str, ...]:
 
 
 def shaping_joints(machine: Machine) -> list[str]:
-    """Names of the independent joints that a loop depends on; others, as a saw's, turn freely."""
+    """Return the names of the independent joints in a loop; others, as a saw's, affect no loop."""
     following = following_joints(machine)
     joints = [axis.joint for axis in machine.axes.values() if axis.cylinder]
     for closure in machine.closures.values():
@@ -53,29 +54,29 @@ def shaping_joints(machine: Machine) -> list[str]:
 
 
 def pin_count(model: mujoco.MjModel) -> int:
-    """Number of `connect` pins; other equalities, of what stands around, come after them."""
+    """Return the number of `connect` pins; equalities of surrounding objects come after them."""
     return int(np.count_nonzero(model.eq_type == mujoco.mjtEq.mjEQ_CONNECT))
 
 
 def pin_opening(model: mujoco.MjModel, data: mujoco.MjData) -> float:
-    """Largest distance between the two halves of a pin, with `site_xpos` as it stands [m]."""
+    """Return the largest distance between the halves of a pin in the current `site_xpos` [m]."""
     return widest_pin(data.site_xpos, *pin_sites(model))
 
 
 def pin_sites(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Sites (p,) of one half of every pin, and (p,) of its other half."""
+    """Return the site ids (p,) of the first half of every pin, and (p,) of the second half."""
     pins = model.eq_type == mujoco.mjtEq.mjEQ_CONNECT
     return model.eq_obj1id[pins], model.eq_obj2id[pins]
 
 
 @compiled
 def widest_pin(places, one, two):
-    """Largest distance between the two halves of a pin.
+    """Return the largest distance between the two halves of a pin.
 
     Args:
-        places: (nsite, 3) of all sites [m].
-        one: (p,) sites of `pin_sites`.
-        two: (p,) the others.
+        places: (nsite, 3) positions of all sites [m].
+        one: (p,) site ids of the first halves, see `pin_sites`.
+        two: (p,) site ids of the second halves.
 
     Returns:
         The distance, scalar [m]; 0 without pins.
@@ -92,7 +93,7 @@ def widest_pin(places, one, two):
 
 
 class _Linkage(NamedTuple):
-    """A model, its chain, and the places (m,) in that of the joints that follow."""
+    """A model, its kinematic chain, and the indices (m,) of the dependent joints in the chain."""
 
     model: mujoco.MjModel
     chain: Chain
@@ -105,14 +106,14 @@ def _linkage(machine: Machine, model: mujoco.MjModel) -> _Linkage:
 
 
 def closed_chain(machine: Machine, target: Mapping[str, float] | None = None) -> Chain:
-    """Chain of a machine, which starts in a position with closed loops.
+    """Return the kinematic chain of a machine, starting from a position with closed loops.
 
     Args:
         machine: the machine.
-        target: joint name -> angle [rad] or position [m]; others stand at home.
+        target: joint name -> angle [rad] or position [m]; other joints stay at home.
 
     Raises:
-        InputError: the linkages do not close there.
+        InputError: the linkages do not close at this position.
     """
     root = assemble(machine, 1.0e-3, ground=False, looks=False)
     model = mjcf_document(root).compile()
@@ -125,24 +126,25 @@ def closed_chain(machine: Machine, target: Mapping[str, float] | None = None) ->
 def close_loops(
     machine: Machine, model: mujoco.MjModel, data: mujoco.MjData, target: Mapping[str, float]
 ) -> None:
-    """Put the independent joints at their target and close every loop.
+    """Move the independent joints to their target and close every loop.
 
     Starts from the machine's home position and moves to the target in small steps, so that each
-    linkage stays on its home branch.
+    linkage keeps its assembly mode.
 
     Args:
         machine: the machine.
         model: its model.
-        data: written: `qpos`; drive sides of transmissions stand where their loads do.
+        data: `qpos` is written; drive sides of transmissions get the position of their loads.
         target: joint name -> angle [rad] or position [m]; others stay at home.
 
     Raises:
-        InputError: a loop cannot be closed there (outside the reach of a linkage).
+        InputError: a loop cannot be closed (the target is outside the reach of a linkage).
     """
     _close_from_home(machine, model, data, target, _linkage(machine, model))
 
 
 def _close_from_home(machine, model, data, target, linkage: _Linkage) -> None:
+    """Move from the home position to the target in small steps and close the loops at each step."""
     following = following_joints(machine)
     names = [n for n in machine.joints if n not in following]
     places = [model.joint(n).qposadr[0] for n in names]
@@ -159,14 +161,14 @@ def _close_from_home(machine, model, data, target, linkage: _Linkage) -> None:
             _aim_cylinders(machine, model, data)
         if not _close(linkage, data, _CLOSED):
             where = ", ".join(f"{n} {v:.3f}" for n, v in zip(names, data.qpos[places], strict=True))
-            raise InputError(f"machine {machine.name}", f"its linkages do not close at {where}")
+            raise InputError(f"machine {machine.name}", f"the linkages do not close at {where}")
     lock_drives(machine, model, data)
 
 
 def _close(linkage: _Linkage, data: mujoco.MjData, closed: float) -> bool:
-    """Close all loops from where they are, by the joints that follow; whether that worked.
+    """Close all loops by moving the dependent joints; return whether this succeeded.
 
-    Places of bodies and sites in `data` are then up to date.
+    Updates the positions of bodies and sites in `data`.
     """
     _, chain, following = linkage
     if not len(following):
@@ -185,27 +187,27 @@ def follow_loops(
     data: mujoco.MjData,
     joints: Mapping[str, np.ndarray],
 ) -> np.ndarray:
-    """Poses of the whole machine along a motion of its independent joints.
+    """Compute the poses of the whole machine along a motion of its independent joints.
 
-    The first row is closed from the home position, and so is each one after a jump; the others by
-    Newton's method from the row before. So every linkage stays on its branch.
+    The first row, and each row after a jump, is closed from the home position. The other rows are
+    closed by Newton's method from the previous row. Thus every linkage keeps its assembly mode.
 
     Args:
         machine: the machine.
         model: its model.
-        data: written: `qpos`, that of the last row.
+        data: `qpos` is written with the pose of the last row.
         joints: independent joint name -> (n,) angles [rad] or positions [m]; others stay at home.
 
     Returns:
         qpos, (n, nq), with the pins closed to 1e-9 m.
 
     Raises:
-        InputError: a joint is not an independent one, or a loop cannot be closed in some row.
+        InputError: a joint is not independent, or a loop cannot be closed in some row.
     """
     following, linkage = following_joints(machine), _linkage(machine, model)
     free = [name for name in machine.joints if name not in following]
     if strange := [name for name in joints if name not in free]:
-        raise InputError(f"joint {strange[0]}", f"cannot be set; the free ones are {free}")
+        raise InputError(f"joint {strange[0]}", f"cannot be set; the independent joints are {free}")
     values = np.stack([np.asarray(v, float) for v in joints.values()], 1) if joints else None
     if values is None or not len(values):
         _close_from_home(machine, model, data, {}, linkage)
@@ -229,7 +231,7 @@ def follow_loops(
 
 
 def _aim_cylinders(machine, model, data) -> None:
-    """Point tubes and rods at each other where the links stand, as a first guess."""
+    """Point tubes and rods at each other as a start value for Newton's method."""
     for _ in range(2):
         for name, axis in machine.axes.items():
             if not axis.cylinder:
@@ -249,9 +251,9 @@ def _aim_cylinders(machine, model, data) -> None:
 
 
 def independent_dofs(machine: Machine, model: mujoco.MjModel) -> np.ndarray:
-    """Places in `qvel` of the joints that the closures leave free, ascending.
+    """Return the indices in `qvel` of the independent joints, in ascending order.
 
-    Drive sides of transmissions are not among them: they count as locked to their loads.
+    Drive sides of transmissions are excluded: they count as locked to their loads.
     """
     dependent = [model.joint(n).dofadr[0] for n in following_joints(machine)]
     drives, _ = drive_and_load_dofs(machine, model)
@@ -259,7 +261,7 @@ def independent_dofs(machine: Machine, model: mujoco.MjModel) -> np.ndarray:
 
 
 def motion_basis(machine: Machine, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Velocities of all joints per unit velocity of each independent one.
+    """Return the velocities of all joints per unit velocity of each independent joint.
 
     Args:
         machine: the machine.
@@ -281,7 +283,7 @@ def motion_basis(machine: Machine, model: mujoco.MjModel, data: mujoco.MjData) -
 
 
 def holding_forces(machine: Machine, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Actuator forces that hold the machine still where it stands, without contact.
+    """Compute the actuator forces that hold the machine at rest in its pose, without contact.
 
     Virtual work: `N^T (qfrc_bias - passive) = N^T M_act^T F`, solved in the least-squares sense.
 

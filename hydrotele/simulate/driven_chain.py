@@ -1,4 +1,8 @@
-"""An MJCF driven by measured forces from measured states: how far it runs away from the motion."""
+"""Open-loop prediction error of a MuJoCo model that is driven by measured forces.
+
+The simulation starts from measured states at several instants and is compared with the measured
+motion after a fixed time.
+"""
 
 from collections.abc import Mapping, Sequence
 
@@ -15,12 +19,12 @@ _WHERE = "open loop"
 def set_state(
     model: mujoco.MjModel, data: mujoco.MjData, chain: Chain, position: np.ndarray, rate: np.ndarray
 ) -> None:
-    """Put a mechanism into a state.
+    """Set the joint positions and velocities of a MuJoCo model from those of its chain.
 
     Args:
-        model: compiled.
-        data: that is changed.
-        chain: the same mechanism.
+        model: compiled model.
+        data: its data; reset and written.
+        chain: kinematic chain of the same mechanism.
         position: (v,) of all joints of the chain [rad] or [m].
         rate: (v,) [rad/s] or [m/s].
 
@@ -35,7 +39,7 @@ def set_state(
         if name in where:
             data.qpos[at], data.qvel[dof] = position[where[name]], rate[where[name]]
             continue
-        if f"{name}_rx" not in where:  # an object beside the mechanism
+        if f"{name}_rx" not in where:  # an object that is not part of the mechanism
             continue
         if f"{name}_x" in where:
             places = [where[f"{name}_{letter}"] for letter in "xyz"]
@@ -47,7 +51,7 @@ def set_state(
 
 
 def _spin(angles: np.ndarray) -> np.ndarray:
-    """Angular velocity in the body's frame per rate of Cardan angles about x, y and z (3, 3)."""
+    """Return the (3, 3) matrix from rates of x-y-z Cardan angles to the body's angular velocity."""
     _, b, c = angles
     sb, cb, sc, cc = np.sin(b), np.cos(b), np.sin(c), np.cos(c)
     return np.array([[cb * cc, sc, 0.0], [-cb * sc, cc, 0.0], [sb, 0.0, 1.0]])
@@ -57,22 +61,22 @@ def open_loop_errors(
     model: mujoco.MjModel, chain: Chain, given: Sequence[str], motion: np.ndarray,
     force: np.ndarray, period: float, horizon: float = 0.25, starts: int = 30,
 ) -> Mapping[str, float]:  # fmt: skip
-    """How far a model runs away from a measured motion when the measured forces drive it.
+    """Compute the error of open-loop simulations that are driven by measured forces.
 
-    Actuators are put aside; forces act on the drives' joints as they were measured.
+    The model's actuators are disabled; the measured forces act on the joints of the drives.
 
     Args:
-        model: compiled.
-        chain: the same mechanism.
-        given: the k joints whose motion is known.
-        motion: (3, n, k) positions, rates and accelerations of these.
-        force: (n, k) of the drives [N] or [N m].
-        period: between rows [s].
-        horizon: after which the difference counts [s].
-        starts: instants from which the model starts, spread over the motion.
+        model: compiled model.
+        chain: kinematic chain of the same mechanism.
+        given: names of the k joints with known motion.
+        motion: (3, n, k) positions, rates and accelerations of these joints.
+        force: (n, k) measured forces of the drives [N] or [N m].
+        period: time between rows [s].
+        horizon: simulated time after which the positions are compared [s].
+        starts: number of start instants, equally spaced over the motion.
 
     Returns:
-        Drive -> RMS difference of its position after the horizon [rad] or [m].
+        Drive -> RMS position error after the horizon [rad] or [m].
 
     Raises:
         InputError: the motion is shorter than the horizon, or the simulation fails.
@@ -98,7 +102,7 @@ def open_loop_errors(
             data.qfrc_applied[dofs] = row
             mujoco.mj_step(model, data)
         if not np.isfinite(data.qpos).all() or data.warning.number.any():
-            raise InputError(_WHERE, "the simulation of the mechanism fails")
+            raise InputError(_WHERE, "the simulation of the mechanism became unstable")
         total += (data.qpos[places] - found.position[first + rows, drives]) ** 2
     model.opt.disableflags = flags
     return dict(zip(chain.drives, np.sqrt(total / len(firsts)).tolist(), strict=True))

@@ -1,9 +1,9 @@
-"""What the controller sees: joint positions and pressures, sampled, with error, converted, held.
+"""Sensor models: sampled joint positions and pressures with errors, quantisation and hold.
 
-Sensors: scale and offset, a random error, then an analogue-to-digital converter; runs and
-environments read them by the functions of this module. Every channel of a run draws from its own
-stream, keyed by the scenario's seed and the channel's name, so that leaving a channel out changes
-no other.
+A reading is the true value with scale, offset and random error, quantised by an
+analogue-to-digital converter. Runs and environments use the functions of this module. Each channel
+has its own random stream, seeded by the scenario's seed and the channel's name, so that removing a
+channel does not change the others.
 """
 
 import zlib
@@ -28,16 +28,16 @@ from hydrotele.simulate.stepping import Stepper, delayed_values, true_values
 
 
 def sensor_errors(sensor: Sensor, seed: int, channel: str, count: int) -> np.ndarray:
-    """Random errors of a channel for a whole run.
+    """Return the random errors of a channel for a whole run.
 
     Args:
-        sensor: its accuracy or standard deviation [channel's unit].
+        sensor: sensor with its accuracy or standard deviation [channel's unit].
         seed: the scenario's seed.
-        channel: channel name, which selects the stream.
+        channel: channel name, which selects the random stream.
         count: number of samples n.
 
     Returns:
-        (n,) errors, uniform in [-accuracy, accuracy], or normal.
+        (n,) errors, uniform in [-accuracy, accuracy], or normal if there is a standard deviation.
 
     Source: Khoshzaban 1992, section 4.4.3 (uniform error inside the sensor's bound).
     """
@@ -49,10 +49,10 @@ def sensor_errors(sensor: Sensor, seed: int, channel: str, count: int) -> np.nda
 
 @compiled
 def convert(value, step, low, high):
-    """Reading of a converter.
+    """Return the quantised and clipped reading of an analogue-to-digital converter.
 
     Args:
-        value: what comes in, scalar [channel's unit].
+        value: converter input, scalar [channel's unit].
         step: converter step, scalar [channel's unit]; 0 for none.
         low: lowest reading, scalar [channel's unit].
         high: highest reading, scalar [channel's unit].
@@ -72,6 +72,7 @@ def convert(value, step, low, high):
 
 @compiled
 def _convert_all(values, step, low, high):
+    """Apply `convert` to every value (n,)."""
     readings = np.empty(len(values))
     for row in range(len(values)):
         readings[row] = convert(values[row], step, low, high)
@@ -81,14 +82,14 @@ def _convert_all(values, step, low, high):
 def apply_sensor_errors(
     machine: Machine, truth: Mapping[str, np.ndarray], time: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """What sensors without noise read: `scale * value + offset` of the machine's sensor errors.
+    """Apply the machine's deterministic sensor errors to true values.
 
-    Before that, what a tilted or loose coupling makes of the value, see `SensorError`.
+    A tilted or loose coupling acts first (see `SensorError`), then `scale * value + offset`.
 
     Args:
         machine: the machine.
-        truth: channel -> (n,) values at the times at which they are read.
-        time: (n,) of the rows since the run's beginning [s].
+        truth: channel -> (n,) true values at the sampling times.
+        time: (n,) time of the rows since the start of the run [s].
 
     Returns:
         Channel -> (n,) values.
@@ -103,7 +104,7 @@ def apply_sensor_errors(
 
 
 def _through_coupling(error: SensorError, values: np.ndarray) -> np.ndarray:
-    """Angles (n,) behind a coupling with tilt and play; the play starts in its middle [rad]."""
+    """Return the angles (n,) behind a coupling with tilt and initially centred backlash [rad]."""
     if error.tilt:
         turned = np.arctan2(np.sin(values) * np.cos(error.tilt), np.cos(values))
         values = values + np.remainder(turned - values + np.pi, 2.0 * np.pi) - np.pi
@@ -121,23 +122,23 @@ def measure(
     machine: Machine, sensors: SensorSet | None, seed: int, truth: Mapping[str, np.ndarray],
     errors: Mapping[str, np.ndarray] | None = None, period: float = 0.0,
 ) -> dict[str, np.ndarray]:  # fmt: skip
-    """What the sensors read of true values.
+    """Simulate the sensor readings of true values.
 
     Args:
-        machine: the machine (strokes).
-        sensors: the set, None for ideal.
+        machine: the machine, with its sensor errors.
+        sensors: the sensor set; None for ideal sensors.
         seed: the scenario's seed.
-        truth: channel -> (n,) true values; where a sensor reads late, those that it reads
+        truth: channel -> (n,) true values; for a sensor with delay or lag, the delayed values
             (`record.late_channels`).
-        errors: channel -> (n,) errors already drawn; others are drawn here.
-        period: time between rows [s], for instants that jitter and sensors that drift; between rows
-            values run straight.
+        errors: channel -> (n,) random errors, if already sampled; others are sampled here.
+        period: time between rows [s], for sampling jitter and drift; values are interpolated
+            linearly between rows.
 
     Returns:
         Channel -> (n,) readings.
 
-    Source: nominal model, "Sensors": noise first, then the converter; defects (`sensor_errors` of
-        the machine, ideal sensors have them too) before both.
+    Source: nominal model, "Sensors": noise first, then the converter; the machine's `sensor_errors`
+        act before both, also on ideal sensors.
     """
     readings = {}
     time = period * np.arange(max((len(values) for values in truth.values()), default=0))
@@ -156,17 +157,17 @@ def measure(
 
 
 def _instants(sensors: SensorSet, seed: int, count: int) -> np.ndarray:
-    """(n,) by how much rows are read late [s], the same of all channels."""
+    """Return the sampling jitter (n,) of the rows [s], which is the same for all channels."""
     stream = np.random.Generator(np.random.PCG64([seed, zlib.crc32(b"jitter")]))
     return stream.normal(0.0, sensors.jitter, count)
 
 
 class Sensors(NamedTuple):
-    """What c sensors make of what they show.
+    """Parameters of c sensors.
 
     Attributes:
-        scale: (c,) [1].
-        offset: (c,) [channel's unit].
+        scale: (c,) scale factors [1].
+        offset: (c,) offsets [channel's unit].
         step: (c,) converter steps [channel's unit]; 0 for none.
         low: (c,) lowest readings [channel's unit].
         high: (c,) highest readings [channel's unit].
@@ -199,11 +200,11 @@ class Readings(NamedTuple):
 
 @compiled
 def read_sensors(sensors, values, errors):
-    """Turn what sensors show into readings: scale, offset, random error, converter.
+    """Convert true values into readings: scale, offset, random error, converter.
 
     Args:
         sensors: Sensors.
-        values: (c,) what they show, replaced by the readings [channel's unit].
+        values: (c,) true values, replaced by the readings [channel's unit].
         errors: (c,) random errors of this sample [channel's unit].
 
     Returns:
@@ -218,13 +219,13 @@ def read_sensors(sensors, values, errors):
 
 @compiled
 def hold_readings(values, hydraulic, span, readings):
-    """Take over a new sample.
+    """Store a new sample and compute the rates by finite differences.
 
     Args:
         values: (c,) readings of k positions, head and rod pressures, supply pressure.
         hydraulic: number of hydraulic axes, scalar.
         span: time since the last sample, scalar [s]; 0 for the first one, whose rates are 0.
-        readings: Readings, written but for the supply pressure.
+        readings: Readings, written except for the supply pressure.
 
     Returns:
         Supply pressure, scalar [Pa]; 0 without hydraulic axes.
@@ -239,14 +240,14 @@ def hold_readings(values, hydraulic, span, readings):
 
 
 class FeedbackTable(NamedTuple):
-    """Sensors of a controller for a whole run.
+    """Sensors of a controller and their errors for a whole run.
 
     Attributes:
         every: control ticks per sample.
         period: time between samples [s].
-        sensors: of c channels.
+        sensors: parameters of c sensors.
         errors: (samples, c) random errors and drifts [channel's unit].
-        readings: sampled and held.
+        readings: sampled and held readings.
     """
 
     every: int
@@ -285,8 +286,8 @@ class Feedback:
     """Sampled and held readings of a plant; `update` refreshes them in place.
 
     Attributes:
-        table: facts and readings, as native code takes them.
-        errors: channel -> (samples,) errors, for the log to show the same ones.
+        table: sensors, errors and readings for compiled code.
+        errors: channel -> (samples,) random errors, so that the log can use the same ones.
         every: control ticks per sample.
         period: time between samples [s].
         joint: (k,) positions [rad] or [m].
@@ -296,7 +297,7 @@ class Feedback:
     """
 
     def __init__(self, table: FeedbackTable, errors: Mapping[str, np.ndarray]) -> None:
-        """Before the first sample."""
+        """Create the feedback, before its first sample."""
         self.table, self.errors = table, errors
         self.every, self.period = table.every, table.period
         self.joint, self.rate, self.head, self.rod, self._supply = table.readings
@@ -310,8 +311,8 @@ class Feedback:
         """Take a new sample if one is due at this control tick; otherwise hold the last one.
 
         Args:
-            tick: the control tick, which is that of the stepper.
-            stepper: what steps the plant.
+            tick: the control tick, equal to that of the stepper.
+            stepper: the stepper of the plant.
         """
         sample(self.table, stepper.sim, tick, stepper.steps)
 
@@ -319,25 +320,26 @@ class Feedback:
 def feedback(
     plant: Plant, sensors: SensorSet | None, seed: int, ticks: int, control_rate: float
 ) -> Feedback:
-    """Sensors of a run's controller.
+    """Create the sensor feedback of a run's controller.
 
     Args:
         plant: the plant.
-        sensors: the set, None for ideal ones.
+        sensors: the sensor set; None for ideal sensors.
         seed: the scenario's seed.
         ticks: number of control ticks.
-        control_rate: [Hz].
+        control_rate: rate of the controller [Hz].
 
     Returns:
-        The feedback, before its first sample. Sensors slower than the controller are held.
+        The feedback, before its first sample. Readings of sensors slower than the controller are
+        held.
 
     Raises:
-        InputError: the sensors' rate does not divide the control rate.
+        InputError: the control rate is not a multiple of the sensors' rate.
     """
     every, k = samples_every(control_rate, sensors), len(plant.axes)
     names = sensed_channels(plant)[: k + 2 * plant.hydraulic + (1 if plant.hydraulic else 0)]
     kinds = {name: channel_sensor(plant.machine, sensors, name) for name in names}
-    count = ticks // every + 1  # one after the last tick, which nobody asks for
+    count = ticks // every + 1  # including the unused sample after the last tick
     errors = {name: sensor_errors(kinds[name], seed, name, count) for name in names}
     defects = [plant.machine.sensor_errors.get(name, SensorError()) for name in names]
     time = every / control_rate * np.arange(count)
@@ -356,14 +358,19 @@ def feedback(
 
 
 def samples_every(rate: float, sensors: SensorSet | None) -> int:
-    """Periods of a clock [Hz] per sample of the sensors; 1 if they are as fast or ideal.
+    """Return the number of clock periods per sensor sample; 1 for fast or ideal sensors.
+
+    Args:
+        rate: clock rate [Hz].
+        sensors: the sensor set; None for ideal sensors.
 
     Raises:
-        InputError: the sensors' rate does not divide the clock's.
+        InputError: the clock rate is not a multiple of the sensors' rate.
     """
     if sensors is None or sensors.rate >= rate:
         return 1
     ratio = rate / sensors.rate
     if abs(ratio - round(ratio)) > 1e-6:
-        raise InputError("sensors", f"sample at {sensors.rate:g} Hz, which must divide {rate:g} Hz")
+        message = f"the sampling rate of {sensors.rate:g} Hz must divide {rate:g} Hz"
+        raise InputError("sensors", message)
     return round(ratio)

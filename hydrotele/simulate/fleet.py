@@ -1,8 +1,9 @@
-"""Many simulations of one model, advanced by one native function each, on a pool of threads.
+"""Batch of simulations of one model, advanced in parallel by a compiled function on a thread pool.
 
-The C side of `mujoco.batch`, whose `mjb_apply` Python does not show: a compiled function is handed
-every simulation in turn and may step it as often as it likes, so that control, sensors and reward
-run beside the physics without Python. Results do not depend on the number of threads.
+The module calls MuJoCo's C function `mjb_apply`, which the Python module `mujoco.batch` does not
+expose. It calls a compiled function for each simulation. The function can make any number of steps,
+so that control, sensors and reward run without Python. Results do not depend on the number of
+threads.
 """
 
 import ctypes
@@ -22,21 +23,21 @@ class _Config(ctypes.Structure):
 
 
 class _Native:
-    """What MuJoCo made; it is given back when neither a fleet nor an array looks at it."""
+    """Owner of MuJoCo's batch; frees it when neither a `Fleet` nor an array refers to it."""
 
     def __init__(self, library: ctypes.CDLL, handle: int) -> None:
         self.library, self.handle, self.process = library, handle, os.getpid()
 
     def seen(self, address: int, shape: tuple[int, ...], kind: type = np.float64) -> np.ndarray:
-        """An array of its memory, which lives as long as the array does."""
+        """Return an array view of the batch's memory; the array keeps the batch alive."""
         size = int(np.prod(shape)) * np.dtype(kind).itemsize
-        kept: Any = type("_Memory", (ctypes.c_char * size,), {})  # with room for its owner
+        kept: Any = type("_Memory", (ctypes.c_char * size,), {})  # a subclass can have attributes
         memory = kept.from_address(address)
         memory.owner = self
         return np.frombuffer(memoryview(memory), dtype=kind).reshape(shape)
 
     def __del__(self) -> None:
-        if self.process == os.getpid():  # its threads are not in a forked child
+        if self.process == os.getpid():  # a forked child does not have the threads
             self.library.mjb_deleteBatch(self.handle)
 
 
@@ -46,19 +47,20 @@ class Fleet:
     Attributes:
         model: the model.
         count: number of simulations n.
-        state: (n, s) complete states, in the order of `mj_getState` with mjSTATE_INTEGRATION; live.
+        state: (n, s) view of the complete states, in the order of `mj_getState` with
+            mjSTATE_INTEGRATION.
     """
 
     def __init__(self, model: mujoco.MjModel, count: int, threads: int = 0) -> None:
-        """Make room.
+        """Allocate the simulations.
 
         Args:
             model: the model; it is copied.
             count: number of simulations.
-            threads: including the caller's; 0 for one per core.
+            threads: number of threads, including the caller's; 0 for one per core.
 
         Raises:
-            RuntimeError: MuJoCo cannot make them; its own words.
+            RuntimeError: MuJoCo cannot create the simulations; contains MuJoCo's message.
         """
         self._library = mujoco_library()
         self._native: _Native | None = None
@@ -68,42 +70,42 @@ class Fleet:
             model._address, count, ctypes.byref(_Config(threads, False)), said, len(said)
         )
         if not handle:
-            raise RuntimeError(f"{count} simulations cannot be made: {said.value.decode()}")
+            raise RuntimeError(f"cannot create {count} simulations: {said.value.decode()}")
         self._native, self.model, self.count = _Native(self._library, handle), model, count
         size = self._library.mjb_nstate(handle)
         self.state = self._native.seen(self._library.mjb_state(handle), (count, size))
 
     def expand(self, name: str) -> np.ndarray:
-        """Give a field of floats of the model a value per simulation.
+        """Give a float field of the model a separate value for each simulation.
 
         Args:
-            name: of an array of mjModel, or `opt.<name>`.
+            name: name of an array of mjModel, or `opt.<name>`.
 
         Returns:
-            (n, size) live array; what it says holds from the next call on.
+            (n, size) view of the values; changes take effect with the next call.
 
         Raises:
-            ValueError: MuJoCo cannot give this field a value per simulation.
+            ValueError: MuJoCo does not support separate values for this field.
         """
         native, size, width = self._usable(), ctypes.c_int(), ctypes.c_int()
         place = self._library.mjb_expand(
             native.handle, name.encode(), ctypes.byref(size), ctypes.byref(width)
         )
         if not place or width.value != 8:
-            raise ValueError(f"{name} cannot differ between simulations")
+            raise ValueError(f"field {name} cannot differ between simulations")
         return native.seen(place, (self.count, size.value))
 
     def apply(self, function: int, argument: int, chosen: np.ndarray | None = None) -> None:
-        """Call a C function `(mjModel*, mjData*, int simulation, void*)` for simulations.
+        """Call a C function `(mjModel*, mjData*, int simulation, void*)` for each simulation.
 
         Args:
-            function: its address.
-            argument: address of what it is given last.
-            chosen: (m,) int32 numbers of simulations, None for all.
+            function: address of the function.
+            argument: pointer passed as the last argument.
+            chosen: (m,) int32 indices of the simulations; None for all.
 
         Raises:
-            RuntimeError: they were closed, this process was forked from the one that made them, or
-                MuJoCo raised an error in one of them.
+            RuntimeError: the simulations were closed, this process was forked from the one that
+                created them, or MuJoCo reported an error in one of them.
         """
         native = self._usable()
         ids = None if chosen is None else chosen.ctypes.data
@@ -123,29 +125,30 @@ class Fleet:
         self._library.mjb_getData(self._usable().handle, number, data._address)
 
     def _usable(self) -> _Native:
+        """Return the native batch; raise an error if it is closed or of a parent process."""
         if self._native is None:
-            raise RuntimeError("the simulations were closed: make new ones")
+            raise RuntimeError("the simulations were closed: create new ones")
         if self._native.process != os.getpid():
             raise RuntimeError(
-                "this process was forked from the one that made the simulations, whose threads it"
-                " lacks: make new ones here, or start processes by spawn"
+                "this process was forked from the one that created the simulations and does not"
+                " have its threads: create new simulations here, or start processes by spawn"
             )
         return self._native
 
     def close(self) -> None:
-        """Give the memory back, once nobody holds `state` or an expanded field."""
+        """Free the memory as soon as no array refers to it."""
         self._native, self.state = None, np.empty((0, 0))
 
     def __reduce__(self):
-        """Refuse to be copied or pickled."""
+        """Raise an error: native simulations cannot be copied or pickled."""
         raise TypeError(
-            "simulations in native memory can be neither copied nor pickled: make a second"
+            "simulations in native memory can be neither copied nor pickled: create a second"
             " environment with the same options and seed"
         )
 
 
 def _declare(library: ctypes.CDLL) -> None:
-    """Tell ctypes the signatures of mjbatch.h."""
+    """Declare the function signatures of mjbatch.h to ctypes."""
     place, number = ctypes.c_void_p, ctypes.c_int
     for name, result, *arguments in (
         ("mjb_makeBatch", place, place, number, place, place, number),

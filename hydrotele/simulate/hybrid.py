@@ -1,7 +1,7 @@
-"""Hybrid robots in simulation: their closed-chain MuJoCo model, and measured poses with noise.
+"""Simulation of hybrid robots: closed-chain MuJoCo model, and simulated pose measurements.
 
-The mechanism has every joint of the robot: slides and hinges of the carriage, for each leg a
-universal joint, a slide and a ball joint. The moving platform hangs on the first leg; five
+The mechanism has every joint of the robot: slides and hinges of the carriage, and for each leg a
+universal joint, a slide and a ball joint. The moving platform is a child of the first leg; five
 `connect` constraints close the other legs.
 """
 
@@ -27,30 +27,30 @@ from hydrotele.kinematics.hybrid import (
 )
 from hydrotele.kinematics.wires import Wires, pose_covariance, wire_lengths
 
-REACH, TILT = 0.08, 0.25  # m, rad: of the platform about its home, for random poses
-_WIRES_LOSE = 20.0  # times the wires' error that a pose's coordinate may have, per m of lever
+REACH, TILT = 0.08, 0.25  # m, rad: range of random platform poses about the home pose
+_WIRES_LOSE = 20.0  # largest ratio of a pose coordinate's error [m or rad] to the wires' error [m]
 _TRIES = 200
 _CLOSED = 1e-12  # m
-_PIN = dict(solref=[0.002, 1.0], solimp=[0.9999, 0.9999, 0.001, 0.5, 2.0])  # stiff: DESIGN
+_PIN = dict(solref=[0.002, 1.0], solimp=[0.9999, 0.9999, 0.001, 0.5, 2.0])  # nearly rigid
 _COLOURS = {
     "rail": (0.35, 0.37, 0.40, 1.0), "carriage": (0.85, 0.60, 0.10, 1.0),
     "tube": (0.25, 0.30, 0.38, 1.0), "rod": (0.80, 0.82, 0.84, 1.0),
     "platform": (0.16, 0.45, 0.62, 1.0),
 }  # fmt: skip
-# Masses [kg] of links, tubes, rods and moving platform, and the servos of a model that stands.
+# Masses of links, tubes, rods and moving platform [kg].
 _MASS = {"slide": 400.0, "turn": 250.0, "tube": 18.0, "rod": 9.0, "platform": 60.0}
 
 
 class MeasuredPoses(NamedTuple):
-    """Simulated readings of N poses, and what is true.
+    """Simulated readings of N poses, and the true values.
 
     Attributes:
         joints: (N, n) carriage readings [m] or [rad].
         legs: (N, 6) leg readings [m].
         wires: (N, 6) wire readings [m].
-        true_joints: (N, n).
-        true_legs: (N, 6).
-        pose: true, of the moving platform.
+        true_joints: (N, n) true carriage positions [m] or [rad].
+        true_legs: (N, 6) true leg lengths, as readings without noise [m].
+        pose: true poses of the moving platform.
     """
 
     joints: np.ndarray
@@ -62,10 +62,11 @@ class MeasuredPoses(NamedTuple):
 
 
 def shipped_wires() -> Wires:
-    """Six wires from a hexagon on the floor around the IWR's rails to three arms of a platform.
+    """Return six wires from a hexagon around the IWR's rails to three arms of the platform.
 
-    The hexagon has a radius of 1.5 m, 1 m below frame 0, its middle at half the rails' length; the
-    arms reach 0.45 m. Of all orders of the wires this one measures best over the workspace.
+    The hexagon has a radius of 1.5 m and lies 1 m below frame 0, centred at half the length of the
+    rails. The arms have a length of 0.45 m. The order of the wires gives the smallest measurement
+    errors over the workspace among all orders.
     """
     at = np.arange(LEGS) * np.pi / 3.0
     corners = np.column_stack([np.full(LEGS, -1.0), 1.5 * np.cos(at), 1.45 + 1.5 * np.sin(at)])
@@ -80,7 +81,10 @@ def manufactured_errors(
     model: ErrorModel, rng: np.random.Generator, names: tuple[str, ...] | None = None,
     size: float = 1.0,
 ) -> np.ndarray:  # fmt: skip
-    """(p,) errors of a robot as built: normal, of `model.scales` times `size`; others zero."""
+    """Sample normal manufacturing errors (p,) with standard deviation `size` times `model.scales`.
+
+    With `names`, only the errors of these names are sampled; all others are zero.
+    """
     errors = rng.normal(size=len(model.names)) * model.scales * size
     if names is not None:
         kept = np.zeros(len(errors), bool)
@@ -93,13 +97,13 @@ def random_poses(
     robot: Hybrid, count: int, rng: np.random.Generator, wires: Wires | None = None,
     reach: float = REACH, tilt: float = TILT,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Random commands: carriage anywhere in its range, platform about its home.
+    """Sample random commands: carriage over its whole range, platform about its home pose.
 
     Args:
-        robot: nominal.
-        count: number of poses.
-        rng: of the random numbers.
-        wires: poses that they measure badly are avoided.
+        robot: nominal robot.
+        count: number of poses N.
+        rng: random generator.
+        wires: if given, poses that these wires measure with large errors are rejected.
         reach: largest displacement of the platform along each axis [m].
         tilt: largest Euler angle [rad].
 
@@ -107,7 +111,7 @@ def random_poses(
         (joints (N, n), leg readings (N, 6)), all legs within their range.
 
     Raises:
-        ValueError: the ranges leave none.
+        ValueError: too few poses are within the ranges.
     """
     low, high = robot.joint_range.T
     joints, legs = np.empty((0, len(low))), np.empty((0, LEGS))
@@ -125,25 +129,25 @@ def random_poses(
         joints, legs = np.vstack([joints, q[good]]), np.vstack([legs, readings[good]])
         if len(legs) >= count:
             return joints[:count], legs[:count]
-    raise ValueError(f"robot {robot.name}: hardly any random pose is within the legs' range")
+    raise ValueError(f"robot {robot.name}: too few random poses are within the legs' range")
 
 
 def measured_poses(
     robot: Hybrid, joints: np.ndarray, legs: np.ndarray, wires: Wires,
     noise: Mapping[str, float], rng: np.random.Generator,
 ) -> MeasuredPoses:  # fmt: skip
-    """What sensors read of a robot as built.
+    """Simulate noisy sensor readings of a robot with manufacturing errors.
 
     Args:
-        robot: as built.
-        joints: (N, n) where the carriage is [m] or [rad].
-        legs: (N, 6) the legs' true readings [m].
-        wires: where they are.
+        robot: the robot as built.
+        joints: (N, n) true carriage positions [m] or [rad].
+        legs: (N, 6) true leg readings [m].
+        wires: geometry of the measuring wires.
         noise: standard deviations `leg`, `slide`, `wire` [m], `turn` [rad].
-        rng: of the noise.
+        rng: random generator of the noise.
 
     Returns:
-        Readings with noise, and the truth.
+        Readings with noise, and the true values.
     """
     pose = forward(robot, joints, legs)
     sizes = np.where(robot.kinds == REVOLUTE, noise.get("turn", 0.0), noise.get("slide", 0.0))
@@ -156,17 +160,17 @@ def measured_poses(
 
 
 def hybrid_mechanism(robot: Hybrid) -> mujoco.MjSpec:
-    """The closed-chain mechanism of a hybrid robot, carriage at zero, platform at home.
+    """Build the closed-chain mechanism of a hybrid robot, carriage at zero, platform at home.
 
-    All bodies have frame 0's axes there; joints are named as the robot's, `leg1.roll`,
-    `leg1.pitch`, `leg1` (the slide, 0 at home) and `ball`. In the world frame 0's x is up, y to
-    the right and z along the rails.
+    In this pose all bodies have the axes of frame 0. Joints have the names of the robot's joints,
+    and `leg1.roll`, `leg1.pitch`, `leg1` (the slide, 0 at home) and `ball`. In the world, the x
+    axis of frame 0 points up, y to the right and z along the rails.
 
     Args:
-        robot: nominal or as built.
+        robot: the robot, nominal or as built.
 
     Returns:
-        The specification; `compile()` makes the model.
+        The specification; `compile()` creates the model.
     """
     spec = mujoco.MjSpec()
     spec.modelname = robot.name
@@ -215,7 +219,7 @@ def _servo(spec: mujoco.MjSpec, joint: str, stiffness: float) -> None:
 
 
 def _legs(spec, platform, lower, upper, home: Pose, robot: Hybrid) -> None:
-    """Legs between the joints, the moving platform on the first one, closures of the others."""
+    """Add the legs, the moving platform on the first leg and the closures of the other legs."""
     up = home.rotation[:, 2]
     moving = None
     for leg, (a, b) in enumerate(zip(lower, upper, strict=True), 1):
@@ -278,7 +282,7 @@ def _plate(body, middle, rotation, points, thickness, mass, colour) -> None:
 
 
 def _rails(base, robot: Hybrid) -> None:
-    """Two rails along the first joint, at the height of frame 0."""
+    """Add two rails along the first joint, at the height of frame 0."""
     low, high = robot.joint_range[0]
     for side in (-0.3, 0.3):
         base.add_geom(
@@ -288,7 +292,7 @@ def _rails(base, robot: Hybrid) -> None:
 
 
 def _carriage_shapes(links, frames, last, robot: Hybrid) -> None:
-    """Bars from axis to axis; each slide a block; a plate under the universal joints."""
+    """Add the carriage's geoms: bars between axes, blocks for slides, a plate below the legs."""
     places = [*frames[:, :3, 3], last[:3, 3]]
     for i, (body, kind) in enumerate(zip(links, robot.kinds, strict=True)):
         mass = _MASS["turn"] if kind == REVOLUTE else _MASS["slide"]
@@ -310,16 +314,16 @@ def mechanism_pose(
     model: mujoco.MjModel, data: mujoco.MjData, robot: Hybrid, joints: np.ndarray,
     legs: np.ndarray,
 ) -> Pose:  # fmt: skip
-    """Platform pose of the closed-chain model: carriage and leg slides set, loops closed by Newton.
+    """Compute the platform pose of the MuJoCo model for given carriage positions and leg readings.
 
-    Its ball joints are damped, which `multibody.chain` does not read, and what is compared are
-    MuJoCo's own positions, ball joints' quaternions included.
+    Newton's method on MuJoCo's positions closes the loops. `multibody.chain` is not used, because
+    it does not support the damped ball joints, and because MuJoCo's kinematics are to be tested.
 
     Args:
-        model: of `hybrid_mechanism(robot)`.
-        data: its data; the search starts where it stands.
+        model: model of `hybrid_mechanism(robot)`.
+        data: its data; its configuration is the start value of the iteration.
         robot: the robot.
-        joints: (n,) carriage [m] or [rad].
+        joints: (n,) carriage positions [m] or [rad].
         legs: (6,) leg readings [m].
 
     Returns:
@@ -351,7 +355,7 @@ def mechanism_pose(
 
 
 def _loop_errors(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
-    """Openings (3 pins,) [m] of all connects and their Jacobian (3 pins, nv); moves the sites."""
+    """Return the openings (3 pins,) [m] of all connects and their Jacobian (3 pins, nv)."""
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     errors, slopes = [], []
@@ -367,7 +371,7 @@ def _loop_errors(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray
 
 
 def platform_pose(data: mujoco.MjData) -> Pose:
-    """Pose of the site `frame5` in frame 0, with the data's kinematics as they stand."""
+    """Return the pose of the site `frame5` in frame 0 from the current kinematics in `data`."""
     base, site = data.body("frame0"), data.site("frame5")
     turned = base.xmat.reshape(3, 3)
     return Pose(turned.T @ site.xmat.reshape(3, 3), turned.T @ (site.xpos - base.xpos))

@@ -1,14 +1,14 @@
-"""The joystick's flotor in MuJoCo: coils push it, stops hold it, a hand or a cab may shake it.
+"""Simulation of a maglev joystick in MuJoCo: flotor, coils, stops, operator's arm, cab motion.
 
-The cab's frame is not inertial: its acceleration counts against gravity, and its turning acts on
-the flotor as force and torque. Coils are warmed by their currents, and push less where the field of
-their magnets falls off towards the ends of the gap.
+The cab's frame is not inertial: its acceleration is added to gravity, and its rotation acts on the
+flotor as force and torque. The coil currents heat the coils. The coil force decreases towards the
+ends of the gap, where the magnetic field is weaker.
 
-Steps are those of a leapfrog: places at the steps, velocities half a step before, and what changes
-between two control periods acts at the mean of before and after in the step between them; damping
-counts half by the velocity before a step and half by that after it. Places are then exact to the
-second order of the step, and a held force moves a free body exactly. The same steps without that
-mean run half a step ahead, as if the control sampled faster than it does.
+The integrator is a leapfrog with positions at the steps and velocities half a step earlier. An
+input that changes between two control periods acts in the step between them with the mean of both
+values. Damping uses the mean of the velocities before and after a step. Positions are then of
+second order in the step, and the motion of a free body under a held force is exact. Without the
+mean, the simulation would be half a step ahead, as if the control sampled faster.
 """
 # pyright: reportCallIssue=false
 # numba's intrinsics are called without their typing context.
@@ -27,9 +27,9 @@ from hydrotele.machine.joystick import Joystick, principal
 from hydrotele.simulate.layout import call_step, function_address
 
 GRAVITY = -9.81
-_COOL = 0.9  # heat below which hot coils may have their largest current again
-_STEPS = 2  # physics steps per control period of 5 ms: its stiffest spring turns over in 30 ms
-_HALVES = 15  # currents, applied forces and gravity, which change between periods
+_COOL = 0.9  # relative heat below which the largest current is allowed again after overheating
+_STEPS = 2  # physics steps per control period of 5 ms: the stiffest spring's period is 30 ms
+_HALVES = 15  # number of inputs that change between periods: 6 currents, 6 forces, 3 of gravity
 
 FLOTOR = np.dtype(
     [(name, np.int64) for name in ("mj_step", "mj_forward", "model", "data")]
@@ -41,22 +41,22 @@ FLOTOR = np.dtype(
     + [(name, np.int64) for name in ("speed", "acceleration", "half_damping", "heat")],
     align=True,
 )
-"""Record of a SimulatedFlotor."""
+"""Record type of a SimulatedFlotor for compiled code."""
 
 
 class SimulatedFlotor:
     """The simulated joystick.
 
     Attributes:
-        model: its MuJoCo model; coils are its actuators [A].
-        data: its state; `qpos` (7,) handle [m] and quaternion, `qvel` (6,) [m/s] in the stator's
-            axes and [rad/s] in the flotor's: of now before the first step, then of half a step
-            earlier.
-        hand: whether a hand holds the handle.
-        heat: (6,) of the coils, see `heat_step`.
-        record: (1,) the same for native code, see `flotor_step`.
-        weakens: whether coils lose force towards the end of their gap: `weaken_coils` then comes
-            before every period.
+        model: its MuJoCo model; the coils are its actuators [A].
+        data: its state; `qpos` (7,) handle position [m] and quaternion, `qvel` (6,) [m/s] in the
+            stator's axes and [rad/s] in the flotor's axes. After the first step `qvel` is that of
+            half a step earlier.
+        hand: whether the operator holds the handle.
+        heat: (6,) relative heat of the coils, see `heat_step`.
+        record: (1,) the simulation as a record for compiled code, see `flotor_step`.
+        weakens: whether coils lose force towards the end of their gap; `weaken_coils` must then be
+            called before every period.
     """
 
     def __init__(
@@ -66,14 +66,15 @@ class SimulatedFlotor:
         """Compile the joystick.
 
         Args:
-            facts: the joystick.
-            hand: whether a hand holds it.
-            period: of the control [s]; the joystick's own by default.
-            fine: how many times as many physics steps as for runs with a machine.
-            runge_kutta: fourth-order steps of four times the cost, for motion without stops.
+            facts: parameters of the joystick.
+            hand: whether the operator holds the handle.
+            period: control period [s]; by default that of the joystick.
+            fine: factor on the number of physics steps per period.
+            runge_kutta: use fourth-order steps of four times the cost, for motion without contact
+                with the stops.
 
         Raises:
-            InputError: its MJCF cannot be read or lacks a part.
+            InputError: its MJCF cannot be read or is incomplete.
         """
         self.facts, self.hand = facts, hand
         self.period = period or 1.0 / facts.control_rate
@@ -91,10 +92,10 @@ class SimulatedFlotor:
         self._fill_record(0.5 * _damping(self.model), not runge_kutta)
         if runge_kutta:
             self.model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
-        else:  # MuJoCo counts it by the velocity after a step
+        else:  # MuJoCo's damping uses the velocity after a step: half of it goes there
             self.model.dof_damping *= 0.5
             self.model.tendon_damping *= 0.5
-            if self.model.ntendon:  # its Euler steps do so for joints only
+            if self.model.ntendon:  # MuJoCo's Euler steps are implicit in joint damping only
                 self.model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         self._gear, self._full = self.model.actuator_gear, self.model.actuator_gear.copy()
         places = self.model.site_pos[self.model.actuator_trnid[:, 0]]
@@ -103,7 +104,7 @@ class SimulatedFlotor:
         )  # from the flotor's to the coils' frame
 
     def _fill_record(self, half_damping: np.ndarray, leaps: bool) -> None:
-        """What native code needs; the arrays whose addresses it has are kept with it."""
+        """Create the record for compiled code and keep the arrays that it points to."""
         model, data, coils = self.model, self.data, self.facts.coils
         body = model.body("flotor")
         mass, com, turn = float(body.mass[0]), body.ipos.copy(), np.zeros(9)
@@ -130,22 +131,25 @@ class SimulatedFlotor:
 
     @property
     def hottest(self) -> float:
-        """The most heat that any of the coils has had, see `heat_step`."""
+        """Largest relative heat of any coil so far, see `heat_step`."""
         return float(self.record["hottest"][0])
 
     @property
     def allowed(self) -> float:
-        """Current that the coils may have now [A].
+        """Current limit of the coils at present [A].
 
-        The largest, or, once one of them is hot and until it has cooled down, the one that they
-        bear for ever.
+        It is the maximum current, or the continuous current after a coil has become hot and until
+        it has cooled down.
         """
         return float(self.record["allowed"][0])
 
     def step(self, currents: np.ndarray, muscles: np.ndarray) -> None:
-        """Go on by one control period with held currents (6,) [A] and muscle forces (6,) [N, N m].
+        """Advance by one control period with constant currents and muscle forces.
 
-        Muscles act on the handle: force along the stator's axes, torque about them.
+        Args:
+            currents: (6,) coil currents [A].
+            muscles: (6,) force of the operator on the handle along the stator's axes [N] and torque
+                about them [N m].
         """
         if self.weakens:
             self.weaken_coils()
@@ -155,14 +159,14 @@ class SimulatedFlotor:
         self, currents: np.ndarray, muscles: np.ndarray, mount: np.ndarray, spin: float,
         spin_rate: float,
     ) -> None:  # fmt: skip
-        """Like `step`, in a cab that turns about a vertical axis.
+        """Advance like `step` in a cab that rotates about a vertical axis.
 
         Args:
-            currents: (6,) [A].
-            muscles: (6,) [N, N m].
-            mount: (3,) where the joystick stands, from the cab's axis [m].
-            spin: turning of the cab [rad/s].
-            spin_rate: its rate [rad/s^2].
+            currents: (6,) coil currents [A].
+            muscles: (6,) force and torque of the operator on the handle [N, N m].
+            mount: (3,) position of the joystick relative to the cab's axis [m].
+            spin: angular velocity of the cab [rad/s].
+            spin_rate: its angular acceleration [rad/s^2].
         """
         if self.weakens:
             self.weaken_coils()
@@ -171,7 +175,7 @@ class SimulatedFlotor:
         _shaken_step(self.record, currents, muscles, float(spin), float(spin_rate))
 
     def weaken_coils(self) -> None:
-        """Weaken the coils that leave their field, as far as the flotor stands from its centre."""
+        """Reduce the force constants of the coils according to the flotor's pose."""
         turn, handle = np.empty(9), np.array(self.facts.flotor.handle)
         mujoco.mju_quat2Mat(turn, self.data.qpos[3:7])
         turn = turn.reshape(3, 3)
@@ -181,7 +185,7 @@ class SimulatedFlotor:
         self._gear[:] = self._full * shares[:, None]
 
     def place(self, pose: np.ndarray) -> None:
-        """Put the handle to a pose at rest, (6,) displacement [m] and rotation vector [rad]."""
+        """Set the handle to a pose at rest, (6,) displacement [m] and rotation vector [rad]."""
         mujoco.mj_resetData(self.model, self.data)
         self.record["started"] = 0
         self.data.qpos[:3] = pose[:3]
@@ -191,7 +195,7 @@ class SimulatedFlotor:
 
 
 def _damping(model: mujoco.MjModel) -> np.ndarray:
-    """(nv, nv) of joints and fixed tendons."""
+    """Return the damping matrix (nv, nv) of joints and fixed tendons."""
     found, way = np.diag(model.dof_damping), np.zeros((model.ntendon, model.nv))
     for k in range(model.ntendon):
         at, many = model.tendon_adr[k], model.tendon_num[k]
@@ -202,12 +206,12 @@ def _damping(model: mujoco.MjModel) -> np.ndarray:
 
 @compiled
 def flotor_step(r, currents, muscles):
-    """Go on by one control period with held currents.
+    """Advance the flotor by one control period with constant currents.
 
     Args:
-        r: `SimulatedFlotor.record[0]`, written: heat, and what MuJoCo has of the joystick.
-        currents: (6,) [A].
-        muscles: (6,) on the handle [N], [N m].
+        r: `SimulatedFlotor.record[0]`; the heat and the MuJoCo state it points to are written.
+        currents: (6,) coil currents [A].
+        muscles: (6,) force and torque of the operator on the handle [N], [N m].
 
     Returns:
         Nothing.
@@ -222,19 +226,19 @@ def flotor_step(r, currents, muscles):
 
 @compiled
 def shaken_flotor_step(r, currents, muscles, spin, spin_rate):
-    """Like `flotor_step`, in a cab that turns about a vertical axis.
+    """Advance the flotor like `flotor_step` in a cab that rotates about a vertical axis.
 
     Args:
         r: see `flotor_step`.
-        currents: (6,) [A].
-        muscles: (6,) on the handle [N], [N m].
-        spin: turning of the cab, scalar [rad/s].
-        spin_rate: its rate, scalar [rad/s^2].
+        currents: (6,) coil currents [A].
+        muscles: (6,) force and torque of the operator on the handle [N], [N m].
+        spin: angular velocity of the cab, scalar [rad/s].
+        spin_rate: its angular acceleration, scalar [rad/s^2].
 
     Returns:
         Nothing.
 
-    Source: forces of inertia in a frame that turns.
+    Source: inertial forces in a rotating frame.
     """
     _shake(
         r.mass, floats(r.com, 3), rows_of(r.inertia, 3, 3), floats(r.mount, 3), spin, spin_rate,
@@ -245,7 +249,7 @@ def shaken_flotor_step(r, currents, muscles, spin, spin_rate):
 
 @compiled
 def _go_on(r, currents):
-    """The steps of one period with currents, and with the forces that have been loaded."""
+    """Simulate one period with constant currents; applied forces and gravity are already set."""
     ctrl, heat = floats(r.ctrl, 6), floats(r.heat, 6)
     for i in range(6):
         ctrl[i] = currents[i]
@@ -279,7 +283,7 @@ def _go_on(r, currents):
 
 @compiled
 def _keep(inputs, before):
-    """Put a period's inputs into the second row of `before` (2, 15), and what was there above."""
+    """Move the second row of `before` (2, 15) to the first and store the inputs in the second."""
     at = 0
     for part in inputs:
         for i in range(len(part)):
@@ -289,7 +293,10 @@ def _keep(inputs, before):
 
 @compiled
 def _load(inputs, before, half_damping, speed, share):
-    """Inputs of a step: this period's with a `share` of the last one's; half of the damping."""
+    """Set the inputs of a step: a weighted mean of the last and this period, and half the damping.
+
+    `share` is the weight of the last period's inputs.
+    """
     at = 0
     for part in inputs:
         for i in range(len(part)):
@@ -313,17 +320,17 @@ def _shaken_step(record, currents, muscles, spin, spin_rate):
 
 @compiled
 def heat_step(heat, currents, continuous, time_constant, period):
-    """Warm coils over a period of held currents.
+    """Update the heat of the coils over a period of constant currents.
 
-    `heat' = ((I / I_c)^2 - heat) / T`, by its exact exponential: one thermal capacity that the
-    copper loss I^2 R warms, at 1 where the continuous current leaves it in the end.
+    `heat' = ((I / I_c)^2 - heat) / T`, by its exact exponential: one thermal capacity heated by the
+    copper loss I^2 R. The steady state at the continuous current is 1.
 
     Args:
-        heat: (6,) temperature rise over that of the continuous current [1], written.
-        currents: (6,) [A].
-        continuous: I_c, scalar [A].
-        time_constant: T of the winding, scalar [s].
-        period: scalar [s].
+        heat: (6,) temperature rise relative to that at the continuous current [1], written.
+        currents: (6,) coil currents [A].
+        continuous: continuous current I_c, scalar [A].
+        time_constant: thermal time constant T of the winding, scalar [s].
+        period: duration, scalar [s].
 
     Returns:
         The largest heat, scalar [1].
@@ -340,20 +347,20 @@ def heat_step(heat, currents, continuous, time_constant, period):
 def field_shares(
     spots: np.ndarray, place: np.ndarray, turn: np.ndarray, gap: float, edge_loss: float
 ) -> np.ndarray:
-    """Share of its force per ampere that every coil has in a pose of the flotor.
+    """Return the relative force constant of every coil in a pose of the flotor.
 
     `1 - edge_loss (d / gap)^2`, with the displacement d of the coil's centre from its nominal
-    place: even about the middle of the gap, as symmetric magnets make it.
+    position. The function is even in d, because the magnets are symmetric about the gap's centre.
 
     Args:
         spots: (6, 3) centres of the coils in their frame [m].
-        place: (3,) of the coils' frame from its nominal place [m].
-        turn: (3, 3) flotor to stator.
-        gap: displacement at which a coil has lost `edge_loss` [m].
-        edge_loss: share of the force that is lost there [1].
+        place: (3,) displacement of the coils' frame from its nominal position [m].
+        turn: (3, 3) rotation matrix from flotor to stator.
+        gap: displacement at which a coil has lost the fraction `edge_loss` [m].
+        edge_loss: fraction of the force lost at this displacement [1].
 
     Returns:
-        (6,), at least 0.
+        (6,) factors on the force per ampere, at least 0 [1].
     """
     moved = place + spots @ turn.T - spots
     return np.maximum(0.0, 1.0 - edge_loss * np.sum(moved**2, axis=1) / gap**2)
@@ -361,7 +368,7 @@ def field_shares(
 
 @compiled
 def _shake(mass, com, inertia, mount, w, a, muscles, gravity, out):
-    """Gravity as it is felt at the mount, and the forces on a body in a frame that turns."""
+    """Write the apparent gravity at the mount and the inertial forces in the rotating frame."""
     gravity[0] = w * w * mount[0] + a * mount[1]
     gravity[1] = w * w * mount[1] - a * mount[0]
     gravity[2] = GRAVITY
@@ -374,17 +381,18 @@ def _shake(mass, com, inertia, mount, w, a, muscles, gravity, out):
 
 
 def joystick_spec(facts: Joystick, hand: bool = True) -> mujoco.MjSpec:
-    """The joystick's MJCF with the numbers of its facts.
+    """Load the joystick's MJCF and set its parameters.
 
     Args:
-        facts: the joystick.
-        hand: whether a hand holds it: its mass on the handle, its spring and damper to the centre.
+        facts: parameters of the joystick.
+        hand: whether the operator holds the handle; this adds the mass on the handle and a spring
+            and damper to the centre.
 
     Returns:
-        The spec, looks included.
+        The spec, including visual geometry.
 
     Raises:
-        InputError: the MJCF cannot be read or lacks a part.
+        InputError: the MJCF cannot be read or is incomplete.
     """
     path = Path(facts.folder, facts.mjcf)
     try:
@@ -397,7 +405,9 @@ def joystick_spec(facts: Joystick, hand: bool = True) -> mujoco.MjSpec:
     flotor, grip = spec.body("flotor"), spec.body("hand")
     coils, joints = spec.body("coils"), {j.name: j for j in spec.joints}
     if not (flotor and grip and coils and {"x", "y", "z", "turn"} <= set(joints)):
-        raise InputError(path, "needs bodies flotor, hand and coils, joints x, y, z and turn")
+        raise InputError(
+            path, "must have bodies flotor, hand and coils, and joints x, y, z and turn"
+        )
     facts_flotor = facts.flotor
     flotor.mass, flotor.inertia = facts_flotor.mass, facts_flotor.inertia
     flotor.ipos = np.subtract(facts_flotor.com, facts_flotor.handle)
@@ -421,24 +431,24 @@ def joystick_spec(facts: Joystick, hand: bool = True) -> mujoco.MjSpec:
 
 
 def _place_stops(spec: mujoco.MjSpec, facts: Joystick, path: Path) -> None:
-    """Put the six walls where the ball at the coils' centre has gone through the gap."""
+    """Place the six walls so that the ball at the coils' centre touches them at the gap's end."""
     ball, far = spec.geom("gap"), facts.workspace.translation
     walls = {f"gap_{axis}_{side}": (i, way) for i, axis in enumerate("xyz")
               for side, way in (("low", -1.0), ("high", 1.0))}  # fmt: skip
     missing = [name for name in walls if spec.geom(name) is None]
     if ball is None or missing:
         names = ", ".join(["gap"] * (ball is None) + missing)
-        raise InputError(path, f"has no geoms {names}, which are the stops at the coils")
+        raise InputError(path, f"has no geoms {names}, which are the end stops of the coils")
     for name, (axis, way) in walls.items():
         spec.geom(name).pos = np.negative(facts.flotor.handle)
         spec.geom(name).pos[axis] += way * (far + ball.size[0] + spec.geom(name).size[axis])
 
 
 def _hold(spec: mujoco.MjSpec, joints, facts: Joystick) -> None:
-    """Springs and dampers of the arm, and its mass beyond what hangs on the handle.
+    """Add springs, dampers and mass of the operator's arm, except the mass on the handle itself.
 
-    In the horizontal plane the short axes of its ellipses are on the slides; what the long axes
-    have more is on tendons along them, which add their stiffness, damping and armature.
+    In the horizontal plane, stiffness and mass are ellipses. The slides have the values of the
+    short axes. Tendons along the long axes add the differences as stiffness, damping and armature.
     """
     hand = facts.hand
     for name in ("x", "y", "z", "turn"):

@@ -1,12 +1,9 @@
-"""Byte offsets of mjModel and mjData fields, for native code that is handed their addresses.
+"""Memory layout of MuJoCo's structs and calls of MuJoCo's C functions from compiled code.
 
-Offsets follow from MuJoCo's own description of its structs (`mujoco.introspect`) and the C layout
-rules, and are checked against addresses and values that the bindings expose.
-
-MuJoCo's shared library, for what its Python bindings do not show.
-
-Its functions called from compiled code, by address: a number, so that what calls them can be cached
-on disk, which a function pointer of ctypes could not.
+Field offsets are computed from MuJoCo's description of its structs (`mujoco.introspect`) and the C
+layout rules, and are checked against the addresses and values of the Python bindings. C functions
+are called by their address, an integer, so that the calling code can be cached on disk. The module
+also gives access to MuJoCo's shared library.
 """
 
 import ctypes
@@ -24,10 +21,10 @@ from numba.extending import intrinsic
 
 @functools.cache
 def mujoco_library() -> ctypes.CDLL:
-    """The library that the bindings use, loaded once.
+    """Return MuJoCo's shared library, the one that the Python bindings use.
 
     Raises:
-        RuntimeError: it does not lie where the package has it.
+        RuntimeError: the `mujoco` package contains no shared library.
     """
     found = next(Path(mujoco.__file__).parent.glob("*mujoco.*[0-9]*"), None)
     if found is None:
@@ -43,6 +40,7 @@ _PRIMITIVES = {
 
 
 def _size_and_alignment(node) -> tuple[int, int]:
+    """Return size and alignment of a C type [byte]."""
     if isinstance(node, ast_nodes.PointerType):
         return 8, 8
     if isinstance(node, ast_nodes.ArrayType):
@@ -63,6 +61,7 @@ def _size_and_alignment(node) -> tuple[int, int]:
 
 
 def _struct_layout(fields) -> tuple[dict[str, int], int, int]:
+    """Return field offsets, size and alignment of a C struct [byte]."""
     offsets: dict[str, int] = {}
     position, alignment = 0, 1
     for field in fields:
@@ -76,7 +75,7 @@ def _struct_layout(fields) -> tuple[dict[str, int], int, int]:
 
 @functools.cache
 def field_offsets(struct: str) -> dict[str, int]:
-    """Offset of every field of a MuJoCo struct.
+    """Return the byte offset of every field of a MuJoCo struct.
 
     Args:
         struct: "mjModel", "mjData" or "mjContact".
@@ -85,7 +84,7 @@ def field_offsets(struct: str) -> dict[str, int]:
         Field name -> offset [byte].
 
     Raises:
-        RuntimeError: the struct holds a type that is not known here.
+        RuntimeError: the struct contains an unknown type.
 
     Source: `mujoco.introspect.structs` and the C layout rules.
     """
@@ -94,11 +93,12 @@ def field_offsets(struct: str) -> dict[str, int]:
 
 @functools.cache
 def struct_size(struct: str) -> int:
-    """Size of a MuJoCo struct in an array of them [byte]."""
+    """Return the size of a MuJoCo struct, padding included [byte]."""
     return _struct_layout(structs.STRUCTS[struct].fields)[1]
 
 
 def _read(address: int, dtype) -> float:
+    """Read a number of a numpy type at an address."""
     kinds = {np.float64: ctypes.c_double, np.int64: ctypes.c_int64, np.int32: ctypes.c_int32}
     kind = kinds[dtype]
     return kind.from_address(address).value
@@ -106,7 +106,7 @@ def _read(address: int, dtype) -> float:
 
 @functools.cache
 def option_offset(name: str) -> int:
-    """Offset of a field of `mjModel.opt` from the start of mjModel [byte]."""
+    """Return the offset of a field of `mjModel.opt` from the start of mjModel [byte]."""
     option = _struct_layout(structs.STRUCTS["mjOption"].fields)[0]
     return field_offsets("mjModel")["opt"] + option[name]
 
@@ -120,11 +120,11 @@ _PROBE = """<mujoco><option timestep="0.0123"/><custom><numeric name="n" data="1
 
 @functools.cache
 def verify_layout() -> None:
-    """Compare the computed offsets with what the bindings show of a small model.
+    """Check the computed offsets against the Python bindings on a small model.
 
     Raises:
-        RuntimeError: a field is not where it was computed to be; native hydraulics cannot run with
-            this MuJoCo.
+        RuntimeError: the offset of a field is wrong; native hydraulics cannot run with this MuJoCo
+            version.
     """
     model = mujoco.MjModel.from_xml_string(_PROBE)
     data = mujoco.MjData(model)
@@ -164,14 +164,14 @@ def verify_layout() -> None:
         wrong.append("time")
     if wrong:
         raise RuntimeError(
-            f"MuJoCo {mujoco.__version__} keeps {', '.join(wrong)} elsewhere than its own"
-            " description says; install a version in the range of pyproject.toml"
+            f"MuJoCo {mujoco.__version__} stores {', '.join(wrong)} at other offsets than"
+            " mujoco.introspect describes; install a version in the range of pyproject.toml"
         )
 
 
 @intrinsic
 def call_step(typingctx, function, model, data):
-    """`mj_step(model, data)`, or another function of these two, as `mj_forward`, by address."""
+    """Call `mj_step(model, data)`, or another function of these arguments, by its address."""
 
     def codegen(context, builder, signature, args):
         kind = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t] * 2)
@@ -185,7 +185,7 @@ def call_step(typingctx, function, model, data):
 
 @intrinsic
 def call_contact_force(typingctx, function, model, data, contact, wrench):
-    """`mj_contactForce(model, data, contact, wrench)`, all by address but the contact's number."""
+    """Call `mj_contactForce(model, data, contact, wrench)`; all are addresses except `contact`."""
 
     def codegen(context, builder, signature, args):
         place, integer = cgutils.voidptr_t, ir.IntType(32)
@@ -202,7 +202,7 @@ def call_contact_force(typingctx, function, model, data, contact, wrench):
 
 @intrinsic
 def call_set_state(typingctx, function, model, data, state, spec):
-    """`mj_setState(model, data, state, spec)`, with the address of that function."""
+    """Call `mj_setState(model, data, state, spec)`; all arguments but `spec` are addresses."""
 
     def codegen(context, builder, signature, args):
         integer = ir.IntType(32)
@@ -219,7 +219,7 @@ def call_set_state(typingctx, function, model, data, state, spec):
 
 @functools.cache
 def function_address(name: str) -> int:
-    """Address of a function of MuJoCo's library, such as `mj_step`."""
+    """Return the address of a function of MuJoCo's library, such as `mj_step`."""
     import ctypes
 
     return ctypes.cast(getattr(mujoco_library(), name), ctypes.c_void_p).value or 0

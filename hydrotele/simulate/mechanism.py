@@ -1,16 +1,16 @@
-"""From a Machine to MuJoCo: the MJCF of a run, assembled with `dm_control.mjcf`.
+"""Assemble the MuJoCo model (MJCF) of a Machine with `dm_control.mjcf`.
 
-The machine's MJCF gives the tree and the shapes, the Machine gives every number. Each cylinder
-becomes a tube (hinged to its base pin), a rod (sliding in the tube; the slide's position is the
-piston displacement x) and a `connect` constraint at the rod pin. Hundreds of geoms that touch
-nothing double the cost of a step and make assembling slow, so physics leaves out what only a
-picture needs; masses do not come from geoms here. Names of what is added have a prefix, which keeps
-them apart from the user's own.
+The machine's MJCF defines the body tree and the shapes; all parameters come from the Machine. Each
+cylinder becomes a tube (hinged to its base pin), a rod (sliding in the tube; the position of the
+slide is the piston displacement x) and a `connect` constraint at the rod pin. Visual geometry is
+omitted from the physics model, because hundreds of geoms without contact double the cost of a step.
+Masses are never derived from geoms. The names of all added elements have the prefix `hydrotele_`,
+which prevents collisions with names in user files.
 
-A transmission gives the drive a coordinate of its own beside the load's, in the same parent: a
-rotor about the joint's axis, a slide along it, or a piston in the tube. Its inertia is the armature
-of that coordinate, so that it turns with its parent without weight. A fixed tendon, drive minus
-load, with a dead band as wide as the backlash is the spring and the damper between the two.
+A transmission adds a separate coordinate for the drive, with the same parent body as the load: a
+rotor about the joint's axis, a slide along it, or a piston in the tube. The drive's inertia is the
+armature of this coordinate, so that it adds no weight. A fixed tendon (drive minus load) is the
+spring and damper between both; its dead band is the backlash.
 """
 
 import warnings
@@ -39,27 +39,27 @@ from hydrotele.scenario.scenario import SurroundingObject
 from hydrotele.simulate.surroundings import write_surroundings
 
 OWN = "hydrotele_"
-"""What the names begin with of all that no file of the user names."""
+"""Prefix of the names of all elements that are not named in user files."""
 
 GROUND = f"{OWN}ground"
-"""Name of the ground's geom, texture and material."""
+"""Name of the geom, texture and material of the ground."""
 
 TIP_SITE = f"{OWN}tip"
 """Name of the site at the arm's tip."""
 
 
 def pin_site(closure: str, end: str) -> str:
-    """Name of the site at an end, a or b, of a closure; a cylinder's is `<axis>_pin`."""
+    """Return the name of the site at end a or b of a closure; a cylinder's is `<axis>_pin`."""
     return f"{OWN}{closure}_{end}"
 
 
 class Mjcf(NamedTuple):
-    """A complete MJCF.
+    """A complete MJCF document.
 
     Attributes:
-        name: of the machine.
-        text: the document; it names its assets without folder.
-        assets: name -> content of every file that it needs.
+        name: name of the machine.
+        text: the XML text; asset files are named without folder.
+        assets: name -> content of every asset file.
     """
 
     name: str
@@ -67,10 +67,10 @@ class Mjcf(NamedTuple):
     assets: Mapping[str, bytes]
 
     def compile(self) -> mujoco.MjModel:
-        """The MuJoCo model.
+        """Compile the document to a MuJoCo model.
 
         Raises:
-            InputError: MuJoCo refuses it.
+            InputError: MuJoCo cannot compile it.
         """
         try:
             return mujoco.MjModel.from_xml_string(self.text, dict(self.assets))
@@ -79,11 +79,11 @@ class Mjcf(NamedTuple):
             raise InputError(f"machine {self.name}", f"does not compile: {message}") from None
 
     def save(self, path: Path, beside: Path | None = None) -> None:
-        """Write the document, and its assets into the folder `<stem>_assets` beside it.
+        """Write the document to a file, and its assets to the folder `<stem>_assets` next to it.
 
         Args:
             path: file to write.
-            beside: the name that the file will have in the end, if that is another one.
+            beside: final path of the file, if `path` is temporary; names the asset folder.
         """
         folder = (beside or path).with_suffix("").name + "_assets"
         text = self.text
@@ -98,7 +98,7 @@ Element = ElementTree.Element
 
 
 def without_looks(root: Element) -> None:
-    """Remove geoms that touch nothing, meshes and materials, cameras and lights, in place.
+    """Remove geoms without contact, unused meshes, materials, cameras and lights, in place.
 
     Args:
         root: the `mujoco` element of an MJCF file.
@@ -118,14 +118,14 @@ def without_looks(root: Element) -> None:
 
 
 def _asset_name(element: Element) -> str:
-    """Name of an asset; MuJoCo takes the file's where there is none."""
+    """Return the name of an asset; without a `name` attribute it is the stem of its file."""
     return element.get("name") or PurePosixPath(element.get("file", "")).stem
 
 
 def name_geoms(root: Element) -> None:
-    """Give every unnamed geom a name made of its body's, in place.
+    """Give every unnamed geom a name derived from its body, in place.
 
-    `dm_control` searches the whole document for each unnamed element that it writes.
+    For speed: `dm_control` searches the whole document for each unnamed element that it writes.
     """
     for body in root.iter("body"):
         for number, geom in enumerate(body.findall("geom")):
@@ -134,7 +134,7 @@ def name_geoms(root: Element) -> None:
 
 
 def _touching_by_class(root: Element) -> dict[str, bool]:
-    """Class name -> whether its geoms can touch something by default."""
+    """Map each default class to whether its geoms can have contacts by default."""
     table: dict[str, bool] = {}
 
     def walk(element: Element, name: str, contype: int, conaffinity: int) -> None:
@@ -153,6 +153,7 @@ def _touching_by_class(root: Element) -> dict[str, bool]:
 
 
 def _prune(body: Element, inherited: str, touching: dict[str, bool]) -> None:
+    """Remove geoms without contact, cameras and lights from a body and its children, in place."""
     childclass = body.get("childclass", inherited)
     for element in list(body):
         if element.tag == "geom":
@@ -167,15 +168,15 @@ def _prune(body: Element, inherited: str, touching: dict[str, bool]) -> None:
             _prune(element, childclass, touching)
 
 
-with warnings.catch_warnings():  # glfw warns when there is no screen, which nobody needs here
+with warnings.catch_warnings():  # glfw warns if there is no screen; none is needed here
     warnings.simplefilter("ignore")
     from dm_control import mjcf
 
-# Default softness opens the pins of a 10 t machine by decimetres. A time constant of two steps is
-# the stiffest that MuJoCo takes, and makes the softness vanish with the step.
+# With MuJoCo's default softness the pins of a 10 t machine open by decimetres. A time constant of
+# two steps is the smallest that MuJoCo allows; the softness then vanishes with the step.
 _IMPEDANCE = (0.9999, 0.9999, 0.001, 0.5, 2)
-_BEND_DAMPING = 0.01  # s: a tube of some hertz rings a few times
-_CONTACT_SOLREF = (0.02, 1.0)  # s, 1: firm soil; an impact force grows as one over the time
+_BEND_DAMPING = 0.01  # s: the bending vibration of a few hertz decays after a few periods
+_CONTACT_SOLREF = (0.02, 1.0)  # s, 1: firm soil; impact forces grow inversely with the time
 _SOIL_FRICTION = (0.3, 0.02, 0.001)  # steel sliding on loam: friction angle of some 17 deg
 
 
@@ -191,22 +192,22 @@ def assemble(
     Args:
         machine: the machine, with one tool.
         timestep: physics step [s].
-        ground: whether there is a ground to touch.
-        looks: whether to keep what only a picture needs.
-        surroundings: what stands around the machine.
+        ground: whether the ground can be touched.
+        looks: whether to include visual geometry.
+        surroundings: objects around the machine.
 
     Returns:
-        The MJCF document. `mjcf_document` writes it out.
+        The MJCF document; `mjcf_document` converts it to text.
 
     Raises:
-        InputError: the machine's MJCF cannot be read or lacks a body's parent.
+        InputError: the machine's MJCF cannot be read, or a link's parent body is missing in it.
     """
     root = _read_mjcf(machine, looks)
     try:
         return _completed(root, machine, timestep, ground, looks, surroundings)
     except InputError:
         raise
-    except ValueError as error:  # of dm_control: a name that is there twice, a size that is none
+    except ValueError as error:  # dm_control: duplicate name or invalid value
         raise InputError(f"machine {machine.name}", f"cannot be assembled: {error}") from None
 
 
@@ -214,7 +215,7 @@ def _completed(
     root, machine: Machine, timestep: float, ground: bool, looks: bool,
     surroundings: tuple[SurroundingObject, ...],
 ) -> mjcf.RootElement:  # fmt: skip
-    """The document with what the machine file, the surroundings and the scene say."""
+    """Add the elements of the machine file, the surroundings and the scene to the document."""
     root.model = machine.name
     for name in machine.removed_bodies:
         if body := root.find("body", name):
@@ -245,11 +246,11 @@ def _completed(
     return root
 
 
-_NUMERIC = 500  # numbers that MuJoCo reads of one element; it overruns its stack by more
+_NUMERIC = 500  # largest size of a `numeric` element; larger ones overflow MuJoCo's stack
 
 
 def _write_terms(root, table: np.ndarray) -> None:
-    """Add the table of terms, in elements that follow each other, as their numbers do then."""
+    """Add the table of terms as consecutive `numeric` elements; MuJoCo stores them contiguously."""
     for part, first in enumerate(range(0, len(table), _NUMERIC), start=1):
         data = table[first : first + _NUMERIC]
         name = "hydrotele_terms" + (f"_{part}" if part > 1 else "")
@@ -257,16 +258,17 @@ def _write_terms(root, table: np.ndarray) -> None:
 
 
 def add_element(parent, kind: str, **attributes):
-    """Add an MJCF element; `dm_control` makes its classes at run time, unseen by type checks."""
+    """Add an MJCF element; type checkers do not know the run-time classes of `dm_control`."""
     return parent.add(kind, **attributes)
 
 
 def mjcf_document(root: mjcf.RootElement) -> Mjcf:
-    """The MJCF document as text that MuJoCo and any other tool reads, with the files it needs."""
+    """Convert the MJCF document to text, together with its asset files."""
     return Mjcf(root.model, root.to_xml_string(precision=17), root.get_assets())
 
 
 def _read_mjcf(machine: Machine, looks: bool) -> mjcf.RootElement:
+    """Load the machine's MJCF with attached files; without it, create an empty document."""
     if not machine.mjcf:
         return mjcf.RootElement(model=machine.name)
     path = Path(machine.folder, machine.mjcf)
@@ -283,22 +285,22 @@ def _read_mjcf(machine: Machine, looks: bool) -> mjcf.RootElement:
     except InputError:
         raise
     except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
-        raise InputError(path, f"is not an MJCF that dm_control reads: {error}") from None
+        raise InputError(path, f"is not an MJCF that dm_control can read: {error}") from None
 
 
 def _attach(tree: Element, body: str, file: Path) -> None:
-    """Hang the bodies of another MJCF file on a body of a tree, in place; they bring no assets."""
+    """Attach the bodies of another MJCF file, without assets, to a body of a tree, in place."""
     place = next((element for element in tree.iter("body") if element.get("name") == body), None)
     world = read_xml(file).find("worldbody")
     if place is None or world is None:
         raise InputError(
-            file, f"cannot hang on {body!r}: no such body, or no worldbody in the file"
+            file, f"cannot be attached to {body!r}: no such body, or no worldbody in the file"
         )
     place.extend(world.findall("body"))
 
 
 def _refuse_foreign_parts(root, machine: Machine) -> None:
-    """Refuse what the machine file has to say, or what no log would show."""
+    """Reject elements that belong in the machine file or that logs would not contain."""
     known = set(machine.joints)
     for name, axis in machine.axes.items():
         known |= {f"{name}_tube", f"{name}_rod", tilt_joint(name)} if axis.cylinder else set()
@@ -321,7 +323,8 @@ def _refuse_foreign_parts(root, machine: Machine) -> None:
 
 
 def _set_options(root, machine: Machine, timestep: float) -> None:
-    root.compiler.angle = root.compiler.angle or "degree"  # MuJoCo's default, and the file's choice
+    """Set compiler and solver options."""
+    root.compiler.angle = root.compiler.angle or "degree"  # degree: MuJoCo's default
     root.compiler.autolimits = True
     del root.compiler.boundmass, root.compiler.boundinertia  # a forgotten inertia is an error
     root.option.timestep = timestep
@@ -333,14 +336,16 @@ def _set_options(root, machine: Machine, timestep: float) -> None:
     root.option.tolerance = 1.0e-8
     root.option.cone = "pyramidal"
     root.size.nuser_actuator = SLOTS
-    root.option.flag.island = "disable"  # one machine is one island: looking for it costs 10 %
+    root.option.flag.island = "disable"  # one machine is one island; the search costs 10 %
 
 
 def _body(root, name: str):
+    """Return a body of the document, or the worldbody for `world`."""
     return root.worldbody if name == "world" else root.find("body", name)
 
 
 def _write_link(root, name: str, link: Link) -> None:
+    """Write inertia, position and joint of a link; create its body if it is missing."""
     body = root.find("body", name)
     if body is None:
         parent = _body(root, link.parent)
@@ -370,7 +375,7 @@ def _write_link(root, name: str, link: Link) -> None:
 
 
 def _across(axis: Vector) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors across an axis and each other."""
+    """Return two unit vectors that are perpendicular to an axis and to each other."""
     way = np.array(axis)
     first = np.cross(way, np.eye(3)[int(np.argmin(np.abs(way)))])
     first /= np.linalg.norm(first)
@@ -384,6 +389,7 @@ def _set_inertial(body, mass, com, inertia) -> None:
 
 
 def _write_cylinder(root, name: str, cylinder: Cylinder, pins: Vector, timestep: float) -> None:
+    """Write tube, rod and rod pin of a cylinder."""
     tube = root.find("body", f"{name}_tube")
     if tube is None:
         base = _body(root, cylinder.base_pin.link)
@@ -402,7 +408,7 @@ def _write_cylinder(root, name: str, cylinder: Cylinder, pins: Vector, timestep:
 
 
 def _write_ball_end(root, name: str) -> None:
-    """Let a tube turn about a second axis at its base, across the first one and itself."""
+    """Add a second hinge at the base of a tube, perpendicular to the first one and to the tube."""
     if root.find("joint", tilt_joint(name)) is None:
         first = root.find("joint", f"{name}_tube")
         across = np.cross((1.0, 0.0, 0.0), first.axis)
@@ -412,18 +418,19 @@ def _write_ball_end(root, name: str) -> None:
 
 
 def tilt_joint(axis: str) -> str:
-    """Name of the joint by which a tube with ball ends leaves the plane across its pin."""
+    """Return the name of the joint that tilts a tube with ball ends out of its plane of motion."""
     return f"{axis}_tube_tilt"
 
 
 def _write_travel(root, machine: Machine, name: str) -> None:
-    """Ends of a cylinder's travel, at its rod alone: two stops would share the load."""
+    """Set the travel limits of a cylinder at its rod only; a second stop would share the load."""
     root.find("joint", f"{name}_rod").range = drive_travel(machine, name)
     if range_at_drive(machine, name):
         root.find("joint", machine.axes[name].joint).limited = "false"
 
 
 def _connect(root, name: str, a: Pin, b: Pin, timestep: float) -> None:
+    """Add the two sites and the `connect` constraint of a pin."""
     for end, pin in (("a", a), ("b", b)):
         _body(root, pin.link).add(
             "site", name=pin_site(name, end), pos=pin.position, size=(0.03,), group=4
@@ -435,6 +442,7 @@ def _connect(root, name: str, a: Pin, b: Pin, timestep: float) -> None:
 
 
 def _write_actuators(root, machine: Machine) -> None:
+    """Add one actuator per axis, with its parameters as user data."""
     for name, numbers in actuator_parameters(machine).items():
         axis: Axis = machine.axes[name]
         actuator = root.actuator.add(
@@ -442,7 +450,7 @@ def _write_actuators(root, machine: Machine) -> None:
             joint=drive_joint(machine, name),
         )  # fmt: skip
         if axis.hydraulic:
-            last = name == list(machine.hydraulic_axes)[-1]  # it owns what all remember
+            last = name == list(machine.hydraulic_axes)[-1]  # owns the additional states
             remembered = int(numbers[Slot.MEMORY]) if last else 0
             actuator.dyntype, actuator.actdim = "user", ACTIVATIONS + remembered
             actuator.gainprm = (0.0,)
@@ -455,6 +463,7 @@ def _write_actuators(root, machine: Machine) -> None:
 
 
 def _write_scene(root, ground: bool, looks: bool) -> None:
+    """Add ground, sky and light."""
     touch = {"contype": 1, "conaffinity": 2} if ground else {"contype": 0, "conaffinity": 0}
     if ground or looks:
         root.worldbody.add(
@@ -483,28 +492,28 @@ def _write_scene(root, ground: bool, looks: bool) -> None:
     )  # fmt: skip
 
 
-_SPECK = (1.0e-6, (1.0e-9, 1.0e-9, 1.0e-9))  # kg, kg m^2: MuJoCo takes no moving body without mass
-_SLACK = 1.0e-9  # m or rad of deflection under a static load so small that it stays inside the gap
+_SPECK = (1.0e-6, (1.0e-9, 1.0e-9, 1.0e-9))  # kg, kg m^2: MuJoCo rejects moving bodies without mass
+_SLACK = 1.0e-9  # m or rad: smaller static deflections count as no load inside the backlash
 
 
 def drive_joint(machine: Machine, axis: str) -> str:
-    """Name of the joint that the actuator of an axis acts on."""
+    """Return the name of the joint that the actuator of an axis acts on."""
     return f"{axis}_drive" if machine.axes[axis].transmission else load_joint(machine, axis)
 
 
 def load_joint(machine: Machine, axis: str) -> str:
-    """Name of the joint on the load side: the rod's slide of a cylinder, else the axis' joint."""
+    """Return the name of the load-side joint: a cylinder's rod slide, else the axis' joint."""
     facts = machine.axes[axis]
     return f"{axis}_rod" if facts.cylinder else facts.joint
 
 
 def flexible_axes(machine: Machine) -> list[str]:
-    """Names of the axes with a transmission."""
+    """Return the names of the axes with a transmission."""
     return [name for name, axis in machine.axes.items() if axis.transmission]
 
 
 def write_drive_side(root, machine: Machine, axis: str) -> None:
-    """Add the drive side of an axis with a transmission to an MJCF that has the load side.
+    """Add the drive side of an axis with a transmission to an MJCF that contains the load side.
 
     Args:
         root: the MJCF document.
@@ -512,7 +521,7 @@ def write_drive_side(root, machine: Machine, axis: str) -> None:
         axis: name of the axis.
 
     Raises:
-        InputError: a link has the name that the drive side needs.
+        InputError: a link already has the name of the drive side.
     """
     facts = machine.axes[axis].transmission
     assert facts
@@ -540,14 +549,14 @@ def write_drive_side(root, machine: Machine, axis: str) -> None:
 
 
 def lock_drives(machine: Machine, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Put every drive side where its load stands, with the spring at rest; `qpos` is written."""
+    """Set every drive side to the position of its load, with the spring at rest, in `qpos`."""
     for axis in flexible_axes(machine):
         drive, load = drive_joint(machine, axis), load_joint(machine, axis)
         data.qpos[model.joint(drive).qposadr[0]] = data.qpos[model.joint(load).qposadr[0]]
 
 
 def drive_and_load_dofs(machine: Machine, model: mujoco.MjModel) -> tuple[list[int], list[int]]:
-    """Places in `qvel` of the drive sides, and of the load sides that they belong to."""
+    """Return the indices in `qvel` of the drive sides, and of the corresponding load sides."""
     axes = flexible_axes(machine)
     drives = [int(model.joint(drive_joint(machine, a)).dofadr[0]) for a in axes]
     loads = [int(model.joint(load_joint(machine, a)).dofadr[0]) for a in axes]
@@ -557,14 +566,14 @@ def drive_and_load_dofs(machine: Machine, model: mujoco.MjModel) -> tuple[list[i
 def preload_transmissions(
     machine: Machine, model: mujoco.MjModel, data: mujoco.MjData, force: dict[str, float]
 ) -> None:
-    """Wind the transmissions up until they carry static forces.
+    """Deflect the transmissions so that they carry static forces.
 
     Args:
         machine: the machine.
         model: its model.
-        data: `qpos` of the drive sides is written, beside their loads.
-        force: axis -> force that its drive gives [N] or [N m]; none leaves it in the middle of
-            its gap.
+        data: `qpos` of the drive sides is written.
+        force: axis -> force of its drive [N] or [N m]; with zero force the drive stays in the
+            middle of the backlash.
     """
     for axis in flexible_axes(machine):
         facts = machine.axes[axis].transmission

@@ -1,14 +1,16 @@
-"""Hydraulics inside MuJoCo at native speed: the actuator callbacks.
+"""Hydraulics inside MuJoCo at native speed: compiled actuator callbacks.
 
-Every hydraulic actuator has four activations and carries its numbers in `actuator_user`
-(`parameters.Slot`). The last one advances all of them, because they share the supply (MuJoCo clears
-an actuator's rates just before it calls back for it), and owns what the bristles of all and a slow
-pump remember; a force drive with bristles has two activations of its own, these and, as MuJoCo
-gives force from the last activation, its command. The force is that of the pressures at the end of
-the step, as `actearly` does, or explicit stepping would add negative damping. The callbacks touch
-nothing but the mjModel and mjData that they are given, so they are thread-safe, and a model can be
-randomised through `actuator_user`. Actuators without the marker are left alone. The terms of a
-machine stand in custom numbers of its model, which may differ between the models of a batch, too.
+Every hydraulic actuator has four activations, and its parameters are in `actuator_user`
+(`parameters.Slot`). The callback of the last one advances all of them, because they share the
+supply, and MuJoCo clears an actuator's rates just before its callback. The last actuator also owns
+the bristle states of all axes and the state of a pump with a time constant. A force drive with
+bristles has two activations: the bristle state and the command, since MuJoCo computes the force
+from the last activation. The force uses the pressures at the end of the step, as with `actearly`;
+otherwise explicit stepping would add negative damping.
+
+The callbacks use only their arguments mjModel and mjData. They are thread-safe, and a model can be
+randomised through `actuator_user`. Actuators without the marker are ignored. The terms of a machine
+are custom numerics of its model, which may differ between the models of a batch.
 """
 # pyright: reportCallIssue=false, reportPrivateImportUsage=false
 # numba's intrinsics are called without their typing context, and carray is its documented API.
@@ -61,17 +63,17 @@ _ADDED = int(Slot.ADDED_DELIVERY)
 _FORCE, _PUMPED = float(Kind.FORCE), float(Kind.PUMPED)
 _GAINS = int(mujoco.mjNGAIN)
 _SIGNATURE = types.float64(types.int64, types.int64, types.intc)
-# Drives with bristles or a slow pump are handed on, so that others pay no more than a comparison.
+# Separate callbacks for drives with bristles or further states keep the others fast.
 _ADVANCE_REMEMBERING = types.ExternalFunction("hydrotele_advance_remembering", _SIGNATURE)
 _FORCE_REMEMBERING = types.ExternalFunction("hydrotele_force_remembering", _SIGNATURE)
 
 
-_kept: list = []  # the callbacks at the addresses of these symbols
+_kept: list = []  # keeps the callbacks behind these symbols alive
 
 
 @intrinsic
 def _stack(typingctx, size):
-    """Work space on the stack of the calling function, zero cost and private to the thread."""
+    """Return work space on the stack of the calling function, which is private to the thread."""
 
     def codegen(context, builder, signature, args):
         space = cgutils.alloca_once(builder, cgutils.voidptr_t, size=2 * SCRATCH)
@@ -82,7 +84,10 @@ def _stack(typingctx, size):
 
 @compiled
 def _passive_force(m, d, i, m_nu, m_nv, m_njnt, m_trnid, m_dofadr, d_passive):
-    """Spring and damper force on the joint of actuator i; the rest are offsets of fields."""
+    """Return the spring and damper force on the joint of actuator i.
+
+    `m` and `d` are the addresses of mjModel and mjData; all further arguments are field offsets.
+    """
     nu = carray(pointer(m + m_nu), (1,), np.int64)[0]
     nv = carray(pointer(m + m_nv), (1,), np.int64)[0]
     joints = carray(pointer(m + m_njnt), (1,), np.int64)[0]
@@ -96,14 +101,14 @@ def _passive_force(m, d, i, m_nu, m_nv, m_njnt, m_trnid, m_dofadr, d_passive):
 
 @compiled
 def _gain(m, i, m_gainprm):
-    """Drive force of a plain force drive per command, 0 for a valve."""
+    """Return the force per command of a force drive; 0 for a valve."""
     at_gain = carray(pointer(m + m_gainprm), (1,), np.int64)[0]
     return floats(at_gain + 8 * _GAINS * i, 1)[0]
 
 
 @compiled
 def _terms_of(m, m_nnumeric, m_adr, m_size, m_data):
-    """Table of the terms of a model, (n,) numbers, none without terms."""
+    """Return the table of terms of a model (n,); empty without terms."""
     count = carray(pointer(m + m_nnumeric), (1,), np.int64)[0]
     if count > 0:
         data = carray(pointer(m + m_data), (1,), np.int64)[0]
@@ -114,7 +119,7 @@ def _terms_of(m, m_nnumeric, m_adr, m_size, m_data):
             own = carray(pointer(sizes), (count,), np.int32)
             if own[k] > COUNT and floats(place, 1)[0] == TERMS:
                 size = np.int64(0)
-                for part in range(k, count):  # a long table goes on in the elements after it
+                for part in range(k, count):  # a long table continues in the next elements
                     size += own[part]
                 return floats(place, size)
     return floats(m, 0)
@@ -133,7 +138,7 @@ class _Fields(NamedTuple):
 
 @compiled
 def _state(d, at, i, user, gain, dt, nu, scratch):
-    """State of a drive with the pressures at the end of the step, and all drives' variables."""
+    """Return the DriveState of drive i with end-of-step pressures, and the Drives."""
     count, act = int(user[_COUNT]), floats(d, 0)
     lengths = floats(carray(pointer(d + at.length), (1,), np.int64)[0], nu)
     velocities = floats(carray(pointer(d + at.velocity), (1,), np.int64)[0], nu)
@@ -155,14 +160,14 @@ def _state(d, at, i, user, gain, dt, nu, scratch):
 
 @allocation_free
 def _advance_force_drive(user, u, act, rate, velocity, command, low, high, dt):
-    """Rates of the two activations of a force drive with bristles; the second is the command."""
+    """Write the rates of the two activations of a force drive: bristle state and command."""
     rate[0] = bristle_rate(user, u, act[0], velocity, user[u + _FELT], dt)
     rate[1] = (min(high, max(low, command)) - act[1]) / dt
 
 
 @allocation_free
 def _advance_with_memory(user, first, drives, dt, act_dot, scratch, terms, time, arrived):
-    """`step_circuit` of what remembers, and the rates of bristles and of terms' memories."""
+    """Run `step_circuit` and write the rates of bristles and of the internal states of terms."""
     count, act, length, velocity, _ = drives
     memory = len(act) - 4 * count
     _, supply = step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, memory)
@@ -178,10 +183,10 @@ def _advance_with_memory(user, first, drives, dt, act_dot, scratch, terms, time,
 
 @allocation_free
 def _sound(user, first, count, nu, free):
-    """Whether the numbers of a group of axes index nothing that is not there.
+    """Return whether the indices in the parameters of a group of axes are within bounds.
 
-    Anyone may write them into a model. `free` is the number of activations from the first axis' on.
-    Comparisons are such that NaN is unsound.
+    User code can change these parameters in a model. `free` is the number of activations from the
+    first axis on. The comparisons reject NaN.
     """
     if not (0 <= first and 1 <= count <= MAX_AXES and first + count <= nu):
         return False
@@ -205,7 +210,7 @@ def _sound(user, first, count, nu, free):
 
 @allocation_free
 def _given(command, k):
-    """Command of actuator k; 0 where any is NaN, as MuJoCo has it, which also warns."""
+    """Return the command of actuator k, or 0 if any command is NaN, as MuJoCo does."""
     for value in command:
         if value != value:
             return 0.0
@@ -214,7 +219,7 @@ def _given(command, k):
 
 @functools.cache
 def _compile_callbacks():
-    """Compile (or load from the cache) the dynamics and bias callbacks for this MuJoCo."""
+    """Compile the activation and force callbacks for this MuJoCo, or load them from the cache."""
     verify_layout()
     remembering = _callbacks(True)
     for symbol, function in zip(
@@ -226,7 +231,10 @@ def _compile_callbacks():
 
 
 def _callbacks(remembers):
-    """The callbacks of drives with bristles or a slow pump, or those of all drives."""
+    """Create the activation and force callbacks.
+
+    With `remembers`, they handle bristles and further states; otherwise they pass such drives on.
+    """
     model_at, data_at = field_offsets("mjModel"), field_offsets("mjData")
     m_user, m_actadr = model_at["actuator_user"], model_at["actuator_actadr"]
     m_nuser, m_timestep = model_at["nuser_actuator"], option_offset("timestep")
@@ -246,6 +254,7 @@ def _callbacks(remembers):
 
     @callback(_SIGNATURE)
     def advance(m, d, i):
+        """Write the rates of all activations of the hydraulic axes (callback `mjcb_act_dyn`)."""
         if carray(pointer(m + m_nuser), (1,), np.int64)[0] != SLOTS:
             return 0.0
         i = np.int64(i)
@@ -303,7 +312,7 @@ def _callbacks(remembers):
         scratch = carray(_stack(0), (2 * SCRATCH,), np.float64)
         given = scratch[SCRATCH:]
         for k in range(nu):
-            if command[k] != command[k]:  # MuJoCo then takes all of them as 0, and warns
+            if command[k] != command[k]:  # MuJoCo then sets all commands to 0 and warns
                 for j in range(first, first + count):
                     given[j] = 0.0
                 command = given
@@ -319,7 +328,7 @@ def _callbacks(remembers):
         if not remembers:
             step_circuit(
                 user, first, drives, dt, act_dot, scratch, terms, time,
-                np.int64(NO_MEMORY),  # numba compiles anew for a written number
+                np.int64(NO_MEMORY),  # numba would compile again for a literal
             )  # fmt: skip
         else:
             _advance_with_memory(user, first, drives, dt, act_dot, scratch, terms, time, arrived)
@@ -327,6 +336,7 @@ def _callbacks(remembers):
 
     @callback(_SIGNATURE)
     def force(m, d, i):
+        """Return the bias force of actuator i after friction (callback `mjcb_act_bias`)."""
         if carray(pointer(m + m_nuser), (1,), np.int64)[0] != SLOTS:
             return 0.0
         i = np.int64(i)
@@ -343,7 +353,7 @@ def _callbacks(remembers):
         velocity = carray(pointer(at_velocity), (nu,), np.float64)[i]
         dt = carray(pointer(m + m_timestep), (1,), np.float64)[0]
         drive, p_load, p_head, p_rod = 0.0, 0.0, 0.0, 0.0
-        if user[u + _KIND] == _FORCE:  # MuJoCo's own gain gives the drive force
+        if user[u + _KIND] == _FORCE:  # MuJoCo's gain gives the drive force
             drive = -user[u + _OFFSET]
         else:
             at_actadr = carray(pointer(m + m_actadr), (1,), np.int64)[0]
@@ -375,7 +385,7 @@ def _callbacks(remembers):
                 extra, slope = added_with_slope(terms, COMMAND, i, s, drives)
                 more += gain * extra
                 steep += gain * slope
-        if user[u + _KIND] == _PUMPED:  # friction that holds resists the terms, too
+        if user[u + _KIND] == _PUMPED:  # static friction also resists the terms
             return more + pumped_force(user, u, p_load, p_head, p_rod, velocity, more, dt)
         drive += more
         if not remembers:
@@ -398,7 +408,7 @@ def _callbacks(remembers):
         if gain != 0.0:
             at_ctrl = carray(pointer(d + d_ctrl), (1,), np.int64)[0]
             push += gain * _given(carray(pointer(at_ctrl), (nu,), np.float64), i)
-        damping = max(0.0, -steep)  # of the terms, implicit as friction is: the drive side is light
+        damping = max(0.0, -steep)  # of the terms; implicit, because the drive side is light
         inertia = user[u + _INERTIA] + dt * damping
         if not remembers:
             rubbing = settled_friction(user, u, velocity, push, inertia, dt)
@@ -410,20 +420,20 @@ def _callbacks(remembers):
 
 
 def stop_profiling_clock() -> None:
-    """Take away MuJoCo's profiling clock, which costs a step of these small models 14 %.
+    """Remove MuJoCo's profiling clock, which takes 14 % of a step of these small models.
 
-    `mjData.timer` then stays zero in this process; `mujoco.set_mjcb_time` brings a clock back.
+    `mjData.timer` then stays zero in this process; `mujoco.set_mjcb_time` sets a clock again.
     """
     if hasattr(mujoco_library(), "mjcb_time"):
         ctypes.c_void_p.in_dll(mujoco_library(), "mjcb_time").value = None
 
 
 def install_hydraulics() -> None:
-    """Install the actuator callbacks in this process; calling it again does nothing.
+    """Install the actuator callbacks in this process; further calls have no effect.
 
     Raises:
-        RuntimeError: another package has installed actuator callbacks, or MuJoCo's structs are not
-            laid out as expected.
+        RuntimeError: another package has installed actuator callbacks, or the layout of MuJoCo's
+            structs is not as expected.
     """
     advance, force = _compile_callbacks()
     ours = (advance.ctypes, force.ctypes)
@@ -433,7 +443,7 @@ def install_hydraulics() -> None:
     if any(callback is not None for callback in present):
         raise RuntimeError(
             "another package has installed mjcb_act_dyn or mjcb_act_bias in this process;"
-            " run hydrotele in a process of its own"
+            " run hydrotele in a separate process"
         )
     mujoco.set_mjcb_act_dyn(ours[0])
     mujoco.set_mjcb_act_bias(ours[1])

@@ -1,13 +1,14 @@
 """The plant: a Machine compiled to MuJoCo with its hydraulics, and its complete states.
 
-Bristles of presliding friction: an explicit step follows a drive on its bristles only as long as
-these are not too stiff for the inertia that it moves; `hydraulics.actuator.bristle_rate` limits
-them by the inertia at home that is written here.
+Presliding friction: an explicit step is stable only if the bristle stiffness is small enough for
+the inertia of the drive. This module writes the inertia at the home position into the model, and
+`hydraulics.actuator.bristle_rate` limits the stiffness with it.
 
-End stops: a limit of MuJoCo is a soft constraint whose force solves `(A + R) f = a_ref - a_0` with
-the inverse inertia A felt there. With `R = 1 / (h b)`, `a_ref = -v / h - k r / (h b)` and
-`b = c + h k` that is `f = -k r' - c v'` with depth r' and velocity v' at the end of the step h: a
-spring k and a damper c by the implicit Euler rule, stable however light the load, stiff the stop.
+End stops: a joint limit of MuJoCo is a soft constraint. Its force solves
+`(A + R) f = a_ref - a_0` with the inverse inertia A at the joint. With `R = 1 / (h b)`,
+`a_ref = -v / h - k r / (h b)` and `b = c + h k` this is `f = -k r' - c v'` with depth r' and
+velocity v' at the end of the step h. It is a spring k and a damper c integrated by the implicit
+Euler rule, which is stable for any load and stiffness.
 """
 
 import dataclasses
@@ -55,11 +56,11 @@ from hydrotele.terms.table import COMMAND, FLOW_HEAD, FLOW_ROD, FORCE, added
 
 
 def set_bristles(machine: Machine, model: mujoco.MjModel) -> None:
-    """Tell a compiled machine what its drives with presliding friction move.
+    """Write the effective inertia of each drive with presliding friction into a model.
 
     Args:
         machine: the machine.
-        model: its model; `actuator_user` is written where there are bristles.
+        model: its model; `actuator_user` is written for drives with presliding friction.
 
     Raises:
         InputError: the linkages do not close at home.
@@ -86,25 +87,25 @@ def set_bristles(machine: Machine, model: mujoco.MjModel) -> None:
 
 
 def write_bristles(root, machine: Machine, model: mujoco.MjModel) -> None:
-    """Write what `set_bristles` gave a model into the MJCF document of the same machine."""
+    """Copy the parameters written by `set_bristles` from a model to the machine's MJCF."""
     for i, name in enumerate(actuator_order(machine)):
         if machine.axes[name].drive.friction.presliding:
             root.find("actuator", name).user = model.actuator_user[i]
 
 
-_IMPEDANCE = 1.0e-4, 0.9999  # range of d that MuJoCo keeps to
-_TRANSITION = (0.001, 0.5, 2.0)  # of the impedance, which is the same at every depth
+_IMPEDANCE = 1.0e-4, 0.9999  # range to which MuJoCo clips the impedance d
+_TRANSITION = (0.001, 0.5, 2.0)  # width, midpoint, power of the impedance; unused: d is constant
 
 
 def stop_joints(machine: Machine) -> dict[str, str]:
-    """Axis -> name of the joint whose limits are the ends of its travel."""
+    """Return axis -> name of the joint whose limits are the end stops of the axis."""
     return {name: load_joint(machine, name) for name in machine.axes if machine.end_stop(name)}
 
 
 def set_stops(machine: Machine, model: mujoco.MjModel) -> None:
-    """Give the limits of a compiled machine the stiffness and damping of its end stops.
+    """Set the joint limits of a model to the stiffness and damping of the machine's end stops.
 
-    MuJoCo computes `R = (1 - d) / d A_0` from the impedance d and the inverse inertia A_0 at its
+    MuJoCo computes `R = (1 - d) / d A_0` from the impedance d and the inverse inertia A_0 at the
     reference pose, and `a_ref = -B v - K d r` from `solref = (-K d^2, -B d)`.
 
     Args:
@@ -125,14 +126,14 @@ def set_stops(machine: Machine, model: mujoco.MjModel) -> None:
 
 
 def write_stops(root, machine: Machine, model: mujoco.MjModel) -> None:
-    """Write what `set_stops` gave a model into the MJCF document of the same machine."""
+    """Copy the parameters written by `set_stops` from a model to the machine's MJCF."""
     for name in stop_joints(machine).values():
         joint, numbers = root.find("joint", name), model.joint(name).id
         joint.solreflimit = model.jnt_solref[numbers]
         joint.solimplimit = model.jnt_solimp[numbers]
 
 
-REST_PRESSURE = 2.0e6  # Pa, in the chamber that carries no load when a machine stands
+REST_PRESSURE = 2.0e6  # Pa, in the unloaded chamber of a machine at rest
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,18 +142,20 @@ class Plant:
 
     Attributes:
         machine: the machine.
-        model: its MuJoCo model; steps with `mj_step`, `mujoco.rollout` and `mujoco.batch`.
-        ground: whether there is a ground to touch.
-        surroundings: what stands around it.
+        model: its MuJoCo model; can be stepped with `mj_step`, `mujoco.rollout` and
+            `mujoco.batch`.
+        ground: whether the ground can be touched.
+        surroundings: objects around the machine.
         axes: axis names in actuator order.
-        qpos: (nu,) place of each axis' joint in `qpos`.
-        dof: (nu,) place of each axis' joint in `qvel`.
-        drive_qpos: (nu,) place of each drive's own coordinate in `qpos`: the piston displacement,
-            the rotor's angle, else that of the joint.
+        qpos: (nu,) index of each axis' joint in `qpos`.
+        dof: (nu,) index of each axis' joint in `qvel`.
+        drive_qpos: (nu,) index of each drive's coordinate in `qpos`: the piston displacement, the
+            rotor's angle, or that of the joint.
         drive_dof: (nu,) the same in `qvel`.
-        rod_qpos: (nu,) place of the piston displacement in `qpos`, -1 without cylinder.
+        rod_qpos: (nu,) index of the piston displacement in `qpos`, -1 without cylinder.
         hydraulic: number of hydraulic axes, which come first; axis i has activations 4 i .. 4 i+3.
-        memory: name of every other state, of `parameters.extra_state_names` -> its activation.
+        memory: name of each additional state (`parameters.extra_state_names`) -> its index in
+            `act`.
     """
 
     machine: Machine
@@ -169,30 +172,31 @@ class Plant:
     memory: Mapping[str, int] = dataclasses.field(default_factory=dict)
 
     def spools(self, data: mujoco.MjData) -> np.ndarray:
-        """(h,) positions of the spools, -1 to 1, in the order of `axes`; h hydraulic axes.
+        """Return the spool positions (h,) of the h hydraulic axes, -1 to 1, in the order of `axes`.
 
-        Of a drive with a pump of its own it is the pump's speed [rad/s]. See `docs/api.md` for the
+        For a drive with its own pump the value is the pump speed [rad/s]. See `docs/api.md` for the
         layout of `data.act`.
         """
         return self._activations(data)[:, 0]
 
     def pressures(self, data: mujoco.MjData) -> np.ndarray:
-        """(h, 2) pressures of head side and rod side [Pa], in the order of `axes`.
+        """Return the head-side and rod-side pressures (h, 2) [Pa], in the order of `axes`.
 
-        Of a motor they are those of its two ports.
+        For a motor they are the pressures of its two ports.
         """
         return self._activations(data)[:, 2:]
 
     def _activations(self, data: mujoco.MjData) -> np.ndarray:
+        """Return the activations of the hydraulic axes as (h, 4)."""
         count = ACTIVATIONS * self.hydraulic
         return np.array(data.act[:count]).reshape(self.hydraulic, ACTIVATIONS)
 
     def tip(self, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
-        """Where the arm's tip is.
+        """Return the pose of the arm's tip.
 
         Args:
-            data: with `mj_kinematics` or a step done; after `mj_step` the position is that at the
-                beginning of the last step.
+            data: state after `mj_kinematics` or a step; after `mj_step` the position is that at
+                the start of the last step.
 
         Returns:
             (3,) position in the world [m] and (3, 3) rotation from the tip's frame to the world.
@@ -201,7 +205,7 @@ class Plant:
             InputError: the machine has no arm.
         """
         if not self.machine.arm:
-            raise InputError(f"machine {self.machine.name}", "has no arm, and so no tip")
+            raise InputError(f"machine {self.machine.name}", "has no arm and therefore no tip")
         site = data.site(TIP_SITE)
         return site.xpos.copy(), site.xmat.reshape(3, 3).copy()
 
@@ -212,7 +216,7 @@ class Plant:
 
     @functools.cached_property
     def document(self) -> Mjcf:
-        """The complete MJCF, with looks and the `home` keyframe, made when asked for."""
+        """The complete MJCF with visual geometry and the `home` keyframe; built on first access."""
         root = assemble(
             self.machine, self.model.opt.timestep, self.ground, surroundings=self.surroundings
         )
@@ -226,9 +230,7 @@ class Plant:
             " hydrotele.simulate.native.install_hydraulics() before stepping it."
         )
         if any(axis.command_delay for axis in self.machine.axes.values()):
-            note += (
-                " Commands act in it without the delays that hydrotele run and replay give them."
-            )
+            note += " Commands act in it without the delays that hydrotele run and replay apply."
         made = mjcf_document(root)
         return made._replace(text=made.text.replace(">", f">\n  <!-- {note} -->", 1))
 
@@ -237,16 +239,16 @@ def build_plant(
     machine: Machine, timestep: float = 1.0e-3, ground: bool = True,
     surroundings: tuple[SurroundingObject, ...] = (),
 ) -> Plant:  # fmt: skip
-    """Compile a machine.
+    """Compile a machine to a MuJoCo model and install the native hydraulics in this process.
 
     Args:
         machine: the machine.
         timestep: physics step [s].
-        ground: whether there is a ground to touch.
-        surroundings: what stands around it.
+        ground: whether the ground can be touched.
+        surroundings: objects around the machine.
 
     Returns:
-        The plant; the native hydraulics are installed in this process.
+        The plant.
 
     Raises:
         InputError: the MJCF cannot be assembled.
@@ -257,7 +259,7 @@ def build_plant(
     model = mjcf_document(root).compile()
     set_stops(machine, model)
     set_bristles(machine, model)
-    if not _can_touch(model):  # then looking for contacts is a tenth of a step, for nothing
+    if not _can_touch(model):  # saves the contact search, a tenth of a step
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     axes = tuple(actuator_order(machine))
     joints = [model.joint(machine.axes[name].joint) for name in axes]
@@ -281,7 +283,10 @@ def build_plant(
 
 
 def _memory(machine: Machine, model: mujoco.MjModel) -> dict[str, int]:
-    """Activations of what `extra_state_names` lists; bristles of force drives have their own."""
+    """Map each name of `extra_state_names` to its activation index.
+
+    Bristle states of force drives are activations of their actuators.
+    """
     places, first = {}, ACTIVATIONS * len(machine.hydraulic_axes)
     for k, name in enumerate(extra_state_names(machine)):
         axis = machine.axes.get(name.partition(".")[2]) if name.startswith("bristle.") else None
@@ -291,7 +296,7 @@ def _memory(machine: Machine, model: mujoco.MjModel) -> dict[str, int]:
 
 
 def _can_touch(model: mujoco.MjModel) -> bool:
-    """Whether there are two geoms, or a declared pair, between which MuJoCo looks for contacts."""
+    """Return whether any pair of geoms in the model can have a contact."""
     makes, takes = model.geom_contype, model.geom_conaffinity
     meet = (makes[:, None] & takes[None, :]) | (takes[:, None] & makes[None, :])
     apart = model.geom_bodyid[:, None] != model.geom_bodyid[None, :]
@@ -299,7 +304,7 @@ def _can_touch(model: mujoco.MjModel) -> bool:
 
 
 def rest_state(plant: Plant, joints: Mapping[str, float] | None = None) -> mujoco.MjData:
-    """The machine standing still: loops closed, valves closed, chambers holding the load.
+    """Return the state at rest: closed loops, closed valves, pressures that carry the load.
 
     Args:
         plant: the plant.
@@ -307,11 +312,11 @@ def rest_state(plant: Plant, joints: Mapping[str, float] | None = None) -> mujoc
 
     Returns:
         A new MjData. The unloaded chamber of each axis is at REST_PRESSURE (at the accumulator's
-        behind a pump of its own), the other one carries the static load, and transmissions are
-        wound up by it.
+        pressure for an axis with its own pump). The other chamber carries the static load, and
+        transmissions are deflected by it.
 
     Raises:
-        InputError: the linkages do not close there.
+        InputError: the linkages do not close at this position.
     """
     data = mujoco.MjData(plant.model)
     close_loops(plant.machine, plant.model, data, dict(joints or {}))
@@ -336,23 +341,23 @@ def rest_state(plant: Plant, joints: Mapping[str, float] | None = None) -> mujoc
 
 
 def initial_state(plant: Plant, state: Mapping) -> mujoco.MjData:
-    """A complete state in the form of a log's `initial_state`.
+    """Create a complete state from the `initial_state` of a log.
 
     Args:
         plant: the plant.
         state: `order` (axis names) and, in that order, `angle` [rad] or [m], `velocity`, `spool`,
-            `spool_rate`, `pressure_head`, `pressure_rod`; any but `order` and `angle` may lack and
-            is then that of rest. `bristle` (axis -> part of the breakaway force that the bristles
-            of its friction carry), `delivery` and `added_delivery` (`supply` -> part of its flow
-            that a slow pump is set to, and that terms add to it) are 0 at rest. `joints` (name ->
-            value) may give undriven joints, `drive` and `drive_velocity` (axis -> value) the drive
-            sides of transmissions.
+            `spool_rate`, `pressure_head`, `pressure_rod`. All but `order` and `angle` are optional
+            and have their values at rest by default. `bristle` (axis -> fraction of the breakaway
+            force that the bristles carry), `delivery` and `added_delivery` (`supply` -> fraction
+            of the maximum flow that a pump with a time constant delivers, and that terms add) are 0
+            by default. `joints` (name -> value) sets undriven joints; `drive` and `drive_velocity`
+            (axis -> value) set the drive sides of transmissions.
 
     Returns:
         A new MjData.
 
     Raises:
-        InputError: the linkages do not close there.
+        InputError: the linkages do not close at this position.
     """
     order = list(state["order"])
     joints = {plant.machine.axes[n].joint: v for n, v in zip(order, state["angle"], strict=True)}
@@ -370,7 +375,7 @@ def initial_state(plant: Plant, state: Mapping) -> mujoco.MjData:
         for name, value in zip(order, state.get(key, ()), strict=False):
             i = plant.axes.index(name)
             if i < plant.hydraulic:
-                if key.startswith("pressure") and value <= -ATMOSPHERE:  # of oil that held its air
+                if key.startswith("pressure") and value <= -ATMOSPHERE:  # of oil without free air
                     value = pressure_with_air(value, plant.model.actuator_user[i, Slot.AIR_RELEASE])
                 data.act[ACTIVATIONS * i + column] = value
     for name, place in plant.memory.items():
@@ -383,18 +388,18 @@ def added_by_terms(
     machine: Machine, time: np.ndarray, act: np.ndarray, x: np.ndarray, v: np.ndarray,
     command: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Forces and flows that terms add in n states of a machine with nu drives.
+    """Compute the forces and flows that terms add in n states of a machine with nu drives.
 
     Args:
         machine: the machine.
-        time: (n,) [s].
+        time: (n,) time [s].
         act: (n, >= 4 count) activations.
         x: (n, nu) drive positions [m] or [rad].
         v: (n, nu) drive velocities [m/s] or [rad/s].
-        command: (n, nu) commands as they arrive [1] or [V].
+        command: (n, nu) commands after their delay [1] or [V].
 
     Returns:
-        (n, nu, 3): force [N] or [N m], with what a force drive makes of a command's terms; flows
+        (n, nu, 3): force [N] or [N m], including the effect of command terms of force drives; flows
         into the head-side and the rod-side chamber [m^3/s].
     """
     out = np.zeros((len(time), len(machine.axes), 3))
@@ -414,7 +419,7 @@ def added_by_terms(
 
 @compiled
 def _evaluate(user, terms, count, gain, time, act, x, v, command, out):
-    """Fill `out` of `added_by_terms`."""
+    """Compute `added_by_terms` for all rows and write the result to `out`."""
     scratch = np.zeros(SCRATCH)
     for row in range(len(time)):
         supply = 0.0
@@ -438,17 +443,17 @@ def _evaluate(user, terms, count, gain, time, act, x, v, command, out):
 def terms_at_rest(
     machine: Machine, data: mujoco.MjData, drive_qpos: np.ndarray, forces: np.ndarray
 ) -> np.ndarray:
-    """Forces that terms add to drives at rest, at time 0 and without commands.
+    """Compute the forces that terms add to drives at rest, at time 0 and with zero commands.
 
     Args:
         machine: the machine.
-        data: at rest.
-        drive_qpos: (nu,) places of the drives in `qpos`.
-        forces: (nu,) that hold the machine [N] or [N m]; terms that depend on pressures see them
-            carried on the head side.
+        data: state at rest.
+        drive_qpos: (nu,) indices of the drives in `qpos`.
+        forces: (nu,) forces that hold the machine [N] or [N m]; for terms that depend on pressures
+            they are carried by the head side only.
 
     Returns:
-        (nu,) [N] or [N m].
+        (nu,) forces [N] or [N m].
     """
     if not machine.terms:
         return np.zeros(len(forces))

@@ -1,12 +1,10 @@
-"""States at equal times out of MuJoCo's staggered ones, and their record over a run.
+"""Recording of a run: states aligned in time, contact forces, and the true channels of the log.
 
-MuJoCo's semi-implicit Euler step with hydraulics that use the piston velocity of the step's start
-and give the force of the step's end is a leapfrog: while the activations stand at t, the velocities
-stand at t + h/2 and the positions at t + h. Read as if they all stood at t, positions come a step
-early, which looks like half a millisecond less delay; read as here, the error is of second order
-but for friction.
-
-What a run shows: true channels from recorded states.
+MuJoCo's semi-implicit Euler step together with the hydraulics, which use the piston velocity at the
+start of the step and give the force at its end, is a leapfrog scheme. When the activations are at
+time t, the velocities are at t + h/2 and the positions at t + h. Without alignment the positions
+would be one step early. This module aligns all states to time t; the error is of second order in
+the step, except for friction.
 """
 # pyright: reportCallIssue=false
 # numba's intrinsics are called without their typing context.
@@ -40,29 +38,29 @@ from hydrotele.simulate.mechanism import TIP_SITE
 from hydrotele.simulate.plant import Plant, added_by_terms
 from hydrotele.simulate.surroundings import is_surrounding_object, object_joints
 
-_WHOLE = 1.0e-9  # of a step, by which a delay may miss a whole number of steps through rounding
+_WHOLE = 1.0e-9  # steps: rounding error up to which a delay counts as a whole number of steps
 
 
 class SimulationFailed(RuntimeError):
-    """The simulation left the finite numbers; the message holds the last states."""
+    """The simulation became unstable; the message contains the last states."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Record:
-    """States of a run at the log's rows, all at the row's time.
+    """States of a run at the log's rows, all aligned to the row's time.
 
     Attributes:
-        time: (n,) [s].
-        qpos: (n, nq).
-        qvel: (n, nv).
-        qacc: (n, nv).
-        act: (n, na).
+        time: (n,) time [s].
+        qpos: (n, nq) positions.
+        qvel: (n, nv) velocities.
+        qacc: (n, nv) accelerations.
+        act: (n, na) activations.
         command: (n, nu) mean command over the row's interval.
-        contact: (n, 3) sum of the forces on the machine of ground and things, world frame [N].
-        contact_of: name of each thing around -> (n, 3) force of this thing on the machine [N].
+        contact: (n, 3) total contact force of ground and objects on the machine, world frame [N].
+        contact_of: name of each surrounding object -> (n, 3) its force on the machine [N].
         tip: (n, 3) position of the arm's tip [m]; empty (n, 0) without an arm.
-        late: (n, c) what the sensors of `sensed_channels` show but for their errors; empty (n, 0)
-            where none is late.
+        late: (n, c) delayed and filtered values of `sensed_channels`, without sensor errors; empty
+            (n, 0) if no sensor has a delay or lag.
     """
 
     time: np.ndarray
@@ -78,12 +76,12 @@ class Record:
 
 
 def begin_leapfrog(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Take a state whose parts all stand at t to the staggered one that stepping goes on from.
+    """Convert a state at time t to the staggered state from which stepping starts.
 
     Args:
         model: the model.
-        data: `qvel` moves on by half a step, `qpos` by a whole one; accelerations, site positions
-            and contacts are those of time t.
+        data: `qvel` is advanced by half a step and `qpos` by a whole step; accelerations, site
+            positions and contacts are those of time t.
     """
     mujoco.mj_forward(model, data)
     half = 0.5 * model.opt.timestep
@@ -92,15 +90,15 @@ def begin_leapfrog(model: mujoco.MjModel, data: mujoco.MjData) -> None:
 
 
 def aligned_positions(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Positions (nq,) at the time of the activations.
+    """Return the positions (nq,) at the time of the activations.
 
-    The ball joint of a tree or the free joint of a log and what comes after it stay as they are.
+    Positions from the first ball or free joint on (trees and logs) are not aligned.
     """
     return align_positions(model, data.qpos, data.qvel)
 
 
 def align_positions(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-    """Staggered positions (..., nq) a step back along velocities (..., nv); see `Record`."""
+    """Return staggered positions (..., nq) moved back by a step with velocities (..., nv)."""
     positions = np.array(qpos)
     rows, rates = positions.reshape(-1, model.nq), qvel.reshape(-1, model.nv)
     _step_back(rows, rates, model.opt.timestep, _plain_positions(model))
@@ -116,7 +114,7 @@ def _step_back(positions, velocities, timestep, plain):
 
 
 def _plain_positions(model: mujoco.MjModel) -> int:
-    """Number of positions that can be moved by their own velocities."""
+    """Return the number of leading positions whose time derivatives are the velocities."""
     return model.nq if model.nq == model.nv else _plain_joints(model.jnt_type)
 
 
@@ -125,7 +123,7 @@ _BALL, _FREE = int(mujoco.mjtJoint.mjJNT_BALL), int(mujoco.mjtJoint.mjJNT_FREE)
 
 @compiled
 def _plain_joints(kinds):
-    """Number of joints of one degree of freedom before the first ball or free joint."""
+    """Count the joints of one degree of freedom before the first ball or free joint."""
     for k in range(len(kinds)):
         if kinds[k] == _BALL or kinds[k] == _FREE:
             return k
@@ -133,7 +131,7 @@ def _plain_joints(kinds):
 
 
 def sensed_channels(plant: Plant) -> tuple[str, ...]:
-    """Channels with a sensor: positions, head and rod pressures, supply pressure, lengths."""
+    """Return the channels with a sensor: positions, chamber pressures, supply pressure, lengths."""
     machine = plant.machine
     names = [f"{machine.position_kind(axis)}.{axis}" for axis in plant.axes]
     for axis in plant.axes[: plant.hydraulic]:
@@ -144,7 +142,7 @@ def sensed_channels(plant: Plant) -> tuple[str, ...]:
 
 
 def split_delay(delay: float, timestep: float) -> tuple[int, float]:
-    """Whole steps of a delay [s] and the fraction of a step [s] that is left, in [0, 1)."""
+    """Split a delay [s] into whole steps and the remaining fraction of a step, in [0, 1) [1]."""
     steps = math.floor(delay / timestep + _WHOLE)
     rest = delay / timestep - steps
     return steps, rest if rest > _WHOLE else 0.0
@@ -159,22 +157,22 @@ STATE_ROW = np.dtype(
     + [("groups", np.int64)],
     align=True,
 )
-"""Record of a Recorder."""
+"""Record type of a Recorder for compiled code."""
 _WARNINGS = int(mujoco.mjtWarning.mjNWARNING)
 
 
 @compiled
 def take_row(record, contacts, row, time):
-    """Write the present state into a row.
+    """Write the current state, aligned in time, to a row of the recorder's arrays.
 
     Args:
-        record: of a `Recorder`.
-        contacts: of `contact_record`.
-        row: which one, scalar.
-        time: its time, scalar [s].
+        record: record of a `Recorder`.
+        contacts: record of `contact_record`.
+        row: index of the row, scalar.
+        time: time of the row, scalar [s].
 
     Returns:
-        Whether the state is finite, and MuJoCo without warning.
+        Whether the state is finite and MuJoCo has issued no warning.
 
     Source: `Record`.
     """
@@ -204,12 +202,12 @@ class Recorder:
     """Arrays that a run fills, one row per log sample.
 
     Args:
-        plant: the plant that runs.
+        plant: the simulated plant.
         rows: number of rows.
     """
 
     def __init__(self, plant: Plant, rows: int) -> None:
-        """Make room for all rows."""
+        """Allocate all rows."""
         model = plant.model
         self.model, self._data = model, None
         self.tip_site = model.site(TIP_SITE).id if plant.machine.arm else -1
@@ -226,16 +224,16 @@ class Recorder:
     def take(
         self, row: int, time: float, data: mujoco.MjData, shown: np.ndarray | None = None
     ) -> None:
-        """Keep the present state, before the next step is made.
+        """Record the current state; must be called before the next step.
 
         Args:
-            row: which row.
-            time: its time [s].
-            data: staggered state, as `begin_leapfrog` or a step left it.
-            shown: (c,) what the sensors of `sensed_channels` show, where one of them is late.
+            row: index of the row.
+            time: time of the row [s].
+            data: staggered state after `begin_leapfrog` or a step.
+            shown: (c,) delayed values of `sensed_channels`, if a sensor has a delay or lag.
 
         Raises:
-            SimulationFailed: the state is not finite, or MuJoCo warns.
+            SimulationFailed: the state is not finite, or MuJoCo has issued a warning.
         """
         self.records(data)
         if shown is not None:
@@ -244,18 +242,18 @@ class Recorder:
             raise self.failure(row)
 
     def show(self, row: int, shown: np.ndarray) -> None:
-        """Keep what the sensors of `sensed_channels` show (c,), where one of them is late."""
+        """Record the delayed values (c,) of `sensed_channels`, if a sensor has a delay or lag."""
         if self.late.shape[1]:
             self.late[row] = shown
 
     def records(self, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
-        """For `take_row`: its own record and that of the contacts."""
+        """Return the records for `take_row`: that of the arrays and that of the contacts."""
         if data is not self._data:
             self._find(data)
         return self._row, self._contacts
 
     def _find(self, data: mujoco.MjData) -> None:
-        """Look up where everything is that is taken, and where it is put."""
+        """Create the records with the addresses of MuJoCo's data and of this recorder's arrays."""
         model, self._data = self.model, data
         self._row = address_record(
             STATE_ROW,
@@ -276,7 +274,7 @@ class Recorder:
         self._contacts = contact_record(model, data, self.around)
 
     def failure(self, row: int) -> SimulationFailed:
-        """What to raise where a row is not finite."""
+        """Create the exception for a row that is not finite, with the last states."""
         lines = [f"the simulation became unstable at {self.time[row]:.3f} s; the last states:"]
         for r in range(max(0, row - 3), row + 1):
             qpos, act = (np.array2string(a[r], precision=4) for a in (self.qpos, self.act))
@@ -284,7 +282,7 @@ class Recorder:
         return SimulationFailed("\n".join(lines))
 
     def record(self, rows: int | None = None) -> Record:
-        """All rows as a Record, or the first ones."""
+        """Return all rows, or the first `rows` rows, as a Record."""
         contact = self.contact[:rows]
         single = {name: contact[:, k] for k, name in enumerate(self.groups) if k > 0}
         return Record(
@@ -295,26 +293,26 @@ class Recorder:
 
 
 def surrounding_bodies(plant: Plant) -> np.ndarray:
-    """Whether each body (nbody,) is the ground, fixed to it or one of the things around."""
+    """Return whether each body (nbody,) is the ground, fixed to it, or a surrounding object."""
     model = plant.model
     named = [is_surrounding_object(model.body(b).name) for b in range(model.nbody)]
     return (model.body_weldid == 0) | (np.array(named) & bool(plant.surroundings))
 
 
 def surrounding_geoms(plant: Plant) -> np.ndarray:
-    """The same of each geom, (ngeom,) integers."""
+    """Return whether each geom (ngeom,) belongs to such a body, as integers 0 and 1."""
     return _of_geoms(plant.model, surrounding_bodies(plant))
 
 
 def surrounding_groups(plant: Plant) -> tuple[np.ndarray, tuple[str, ...]]:
-    """The things around, each a group of geoms whose contact forces are recorded together.
+    """Group the geoms of ground and surrounding objects for the recording of contact forces.
 
     Args:
         plant: the plant.
 
     Returns:
-        (ngeom,) number of each geom's group, 0 for the machine and k + 1 for the k-th name; and the
-        names: `ground` with what is fixed to it, then every plate, tree, stump and log.
+        (ngeom,) group of each geom, 0 for the machine and k + 1 for the k-th name; and the names:
+        `ground`, including fixed geoms, then every plate, tree, stump and log.
     """
     model, numbers, names = plant.model, surrounding_geoms(plant), ["ground"]
     for geom in np.flatnonzero(numbers):
@@ -332,12 +330,12 @@ def _of_geoms(model: mujoco.MjModel, around: np.ndarray) -> np.ndarray:
 
 
 def contact_force(model: mujoco.MjModel, data: mujoco.MjData, around: np.ndarray) -> np.ndarray:
-    """Sum of all contact forces on the machine, (3,) [N] in the world frame.
+    """Return the sum of all contact forces on the machine, (3,) [N] in the world frame.
 
     Args:
         model: the model.
-        data: with contacts and their forces.
-        around: (nbody,) of `surrounding_bodies`.
+        data: its data, with contacts and contact forces.
+        around: (nbody,) result of `surrounding_bodies`.
     """
     total, around = np.zeros(3), _of_geoms(model, around)
     sum_contact_forces(contact_record(model, data, around), total)
@@ -349,16 +347,16 @@ CONTACTS = np.dtype(
     + [(name, np.int64) for name in ("size", "frame", "geom", "around")],
     align=True,
 )
-"""Record of `contact_record`."""
+"""Record type of `contact_record`."""
 
 
 def contact_record(model: mujoco.MjModel, data: mujoco.MjData, around: np.ndarray) -> np.ndarray:
-    """Where native code finds contacts and their forces, for `sum_contact_forces`.
+    """Create the record with the addresses of contacts and forces for `sum_contact_forces`.
 
     Args:
         model: the model.
-        data: its data; it and the model must outlive the record.
-        around: (ngeom,) of `surrounding_geoms`, which must outlive it, too.
+        data: its data; model and data must outlive the record.
+        around: (ngeom,) result of `surrounding_geoms`, which must outlive the record, too.
 
     Returns:
         (1,) record.
@@ -377,10 +375,10 @@ def contact_record(model: mujoco.MjModel, data: mujoco.MjData, around: np.ndarra
 
 @compiled
 def sum_contact_forces(record, total):
-    """Sum of all contact forces on the machine.
+    """Compute the sum of all contact forces on the machine.
 
     Args:
-        record: of `contact_record`.
+        record: record of `contact_record`.
         total: (3,) written, world frame [N].
 
     Returns:
@@ -393,9 +391,9 @@ def sum_contact_forces(record, total):
 
 @compiled
 def _add_contact_forces(r, totals):
-    """Write the sums of contact forces, turned into the world, on bodies that are not around.
+    """Write the sums of the contact forces on the machine per group, in the world frame.
 
-    totals: (3 n,) written, [N]; geoms of group k add to the k-th three, groups above n to the last.
+    `totals` (3 n,) [N]: forces of group k are in the k-th triple; groups above n use the last one.
     """
     totals[:] = 0.0
     around, wrench, groups = integers(r.around, r.geoms), np.empty(6), len(totals) // 3
@@ -405,7 +403,7 @@ def _add_contact_forces(r, totals):
         geom = short_integers(contact + r.geom, 2)
         first, second = around[geom[0]], around[geom[1]]
         if (first > 0) == (second > 0):
-            continue  # the machine touching itself is no ground force
+            continue  # contact within the machine or between surrounding objects
         call_contact_force(r.function, r.model, r.data, k, wrench.ctypes.data)
         frame, sign = floats(contact + r.frame, 9), 1.0 if first > 0 else -1.0
         start = 3 * (min(max(first, second), groups) - 1)
@@ -420,12 +418,12 @@ _SPOOL = ("spool", "1"), ("spool_rate", "1/s")
 
 @compiled
 def state_supply(user, count, act, scratch):
-    """Supply pressure in a state.
+    """Compute the supply pressure in a state.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         count: number of hydraulic axes, which come first.
-        act: (>= 4 count,) activations, and what a slow pump remembers.
+        act: (>= 4 count,) activations, and the state of a pump with a time constant.
         scratch: (SCRATCH,) work space.
 
     Returns:
@@ -439,10 +437,10 @@ def state_supply(user, count, act, scratch):
 
 @compiled
 def state_flows(user, count, act, x, v):
-    """Supply pressure, valve flows and drive forces of many states.
+    """Compute supply pressure, valve flows and drive forces of n states.
 
     Args:
-        user: (nu * SLOTS,) actuator numbers.
+        user: (nu * SLOTS,) actuator parameters.
         count: number of hydraulic axes.
         act: (n, >= 4 count) activations.
         x: (n, nu) drive positions [m] or [rad].
@@ -470,11 +468,11 @@ def state_flows(user, count, act, x, v):
 
 
 def true_channels(plant: Plant, record: Record) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """All true channels of a record, measurable ones under their own names, others as `truth.*`.
+    """Compute the true values of all channels: measurable ones by name, others as `truth.*`.
 
     Args:
-        plant: the plant that ran.
-        record: its states.
+        plant: the simulated plant.
+        record: its recorded states.
 
     Returns:
         (channel -> (n,) values in SI, channel -> unit).
@@ -485,6 +483,7 @@ def true_channels(plant: Plant, record: Record) -> tuple[dict[str, np.ndarray], 
 
 
 def _measurable(plant: Plant, record: Record):
+    """Return values and units of the measurable channels: commands, positions and pressures."""
     machine, values, units = plant.machine, {}, {}
     for i, name in enumerate(plant.axes):
         axis = machine.axes[name]
@@ -497,7 +496,7 @@ def _measurable(plant: Plant, record: Record):
 
 
 def _sensed(plant: Plant, qpos: np.ndarray, act: np.ndarray) -> dict[str, np.ndarray]:
-    """Positions, lengths and chamber pressures in states (n, nq), (n, na)."""
+    """Return positions, lengths and chamber pressures from states (n, nq), (n, na)."""
     values = {}
     for i, name in enumerate(plant.axes):
         values[f"{plant.machine.position_kind(name)}.{name}"] = qpos[:, plant.qpos[i]]
@@ -513,11 +512,11 @@ def _sensed(plant: Plant, qpos: np.ndarray, act: np.ndarray) -> dict[str, np.nda
 
 
 def late_channels(plant: Plant, record: Record) -> dict[str, np.ndarray]:
-    """True values of the channels whose sensors read late, as their delay and lag let them through.
+    """Return the true values after delay and lag of the sensors that have a delay or lag.
 
     Args:
-        plant: the plant that ran.
-        record: its states, with those before.
+        plant: the simulated plant.
+        record: its recorded states.
 
     Returns:
         Channel -> (n,) values in SI; only channels with a delay or a time constant.
@@ -531,6 +530,7 @@ def late_channels(plant: Plant, record: Record) -> dict[str, np.ndarray]:
 
 
 def _hidden(plant: Plant, record: Record):
+    """Return values and units of the `truth.*` channels, which have no sensor."""
     machine, model = plant.machine, plant.model
     values: dict[str, np.ndarray] = {}
     units: dict[str, str] = {}
@@ -565,7 +565,7 @@ def _hidden(plant: Plant, record: Record):
 
 
 def _put_things(plant: Plant, record: Record, put) -> None:
-    """Where plates, trees and logs are; turning as a rotation vector."""
+    """Add the poses of plates, trees and logs; rotations are rotation vectors."""
     for joint, place in object_joints(plant.model):
         name, kind = plant.model.joint(joint).name, plant.model.jnt_type[joint]
         if kind == mujoco.mjtJoint.mjJNT_FREE:
@@ -579,6 +579,7 @@ def _put_things(plant: Plant, record: Record, put) -> None:
 
 
 def _put_turning(name: str, quaternions: np.ndarray, put) -> None:
+    """Add rotations, given as quaternions (n, 4), as rotation vectors [rad]."""
     vectors = np.empty((len(quaternions), 3))
     for vector, quaternion in zip(vectors, quaternions, strict=True):
         mujoco.mju_quat2Vel(vector, quaternion, 1.0)
@@ -587,6 +588,7 @@ def _put_turning(name: str, quaternions: np.ndarray, put) -> None:
 
 
 def _put_hydraulics(plant: Plant, record: Record, put) -> None:
+    """Add spools, flows, forces and supply pressure of the hydraulic axes."""
     count = plant.hydraulic
     if not count:
         return
@@ -608,7 +610,7 @@ def _put_hydraulics(plant: Plant, record: Record, put) -> None:
         put(f"truth.force.{name}", force, "N" if cylinder else "N m")
         if cylinder:
             put(f"truth.piston_velocity.{name}", v[:, i], "m/s")
-        if pumped:  # feeds itself
+        if pumped:  # has its own pump
             continue
         fed_head = record.act[:, ACTIVATIONS * i] > 0.0
         total += np.where(fed_head, table[:, 1 + 3 * i], table[:, 2 + 3 * i])
@@ -617,16 +619,16 @@ def _put_hydraulics(plant: Plant, record: Record, put) -> None:
 
 
 def drive_motion(plant: Plant, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Drive positions and velocities of many states.
+    """Return the drive positions and velocities of n states.
 
     Args:
         plant: the plant.
-        qpos: (n, nq).
-        qvel: (n, nv).
+        qpos: (n, nq) positions.
+        qvel: (n, nv) velocities.
 
     Returns:
-        (x (n, nu), v (n, nu)): displacement and velocity of piston or rotor, which are those of the
-        load where nothing gives.
+        (x (n, nu), v (n, nu)): displacement and velocity of piston or rotor; without a transmission
+        they are those of the load.
     """
     return (
         np.ascontiguousarray(qpos[:, plant.drive_qpos]),

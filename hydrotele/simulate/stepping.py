@@ -1,9 +1,9 @@
-"""A plant stepped natively under held commands that may arrive late, and what late sensors show.
+"""Native stepping of a plant with command delays, and values of sensors with delay and lag.
 
-Scenario runs, replays and environments step by the functions of this module. MuJoCo's own actuator
-delay does not reach the native hydraulics, which read `ctrl` itself, and would round a delay to its
-step; here a command that changes inside a step acts as its mean over the step, which is of second
-order. Whoever steps a model bare steps it without delays.
+Scenario runs, replays and environments use the functions of this module. MuJoCo's actuator delay is
+not used: the native hydraulics read `ctrl` directly, and MuJoCo rounds a delay to whole steps. Here
+a command that changes within a step acts with its mean over the step, which is of second order. A
+model that is stepped with `mj_step` alone has no delays.
 """
 # pyright: reportCallIssue=false
 # numba's intrinsics are called without their typing context.
@@ -23,12 +23,13 @@ from hydrotele.simulate.record import sensed_channels, split_delay, state_supply
 
 
 class CommandLine(NamedTuple):
-    """Commands on their way to k valves and drives.
+    """Delay line of the commands to k valves and drives.
 
     Attributes:
         ring: (length, k or more) commands of the last control ticks [1], or in the drives' units;
-            of length 0 where nothing is late.
-        delay: (k or more, 2) whole physics steps of every delay, and the rest of a step [1].
+            of length 0 without delays.
+        delay: (k or more, 2) whole physics steps of every delay, and the remaining fraction of a
+            step [1].
     """
 
     ring: np.ndarray
@@ -36,14 +37,14 @@ class CommandLine(NamedTuple):
 
 
 class SensorPast(NamedTuple):
-    """What c sensors would show after each of the last physics steps, but for their delays.
+    """Past values of c sensors after each of the last physics steps, before their delays.
 
     Attributes:
-        ring: (length, c) values behind the sensors' first-order lags [channel's unit]; of length 0
-            where no sensor is late.
+        ring: (length, c) values after the sensors' first-order lags [channel's unit]; of length 0
+            if no sensor has a delay or lag.
         before: (c,) true values after the last step [channel's unit].
-        delay: (c, 2) whole physics steps of every delay, and the rest of a step [1].
-        ratio: (c,) a step over the time constant of the lag [1]; 0 without lag.
+        delay: (c, 2) whole physics steps of every delay, and the remaining fraction of a step [1].
+        ratio: (c,) step divided by the time constant of the lag [1]; 0 without lag.
     """
 
     ring: np.ndarray
@@ -53,26 +54,26 @@ class SensorPast(NamedTuple):
 
 
 class Simulation(NamedTuple):
-    """A plant as native code sees it; k axes, of which h hydraulic ones come first.
+    """Data of a plant for compiled code; k axes, of which the h hydraulic ones come first.
 
     Attributes:
-        mj_step: address of that function.
+        mj_step: address of MuJoCo's `mj_step`.
         model: address of mjModel.
         data: address of mjData.
         qpos: (nq,) positions; staggered, see `simulate.record`.
         qvel: (nv,) velocities.
         act: (na,) activations.
-        ctrl: (nu,) commands that act.
-        timestep: of the physics [s].
-        axes: k.
-        hydraulic: h.
-        joint_qpos: (k or more,) place of every axis' joint in `qpos`.
+        ctrl: (nu,) commands after their delays.
+        timestep: physics step [s].
+        axes: number of axes k.
+        hydraulic: number of hydraulic axes h.
+        joint_qpos: (k or more,) index of every axis' joint in `qpos`.
         joint_dof: (k or more,) the same in `qvel`.
-        rod_qpos: (l,) places in `qpos` of the cylinders whose lengths are sensed.
+        rod_qpos: (l,) indices in `qpos` of the cylinders with a length sensor.
         rod_dof: (l,) the same in `qvel`.
         user: (k SLOTS,) parameters of the actuators.
-        line: commands on their way.
-        past: of the sensors.
+        line: delay line of the commands.
+        past: past values of the sensors.
     """
 
     mj_step: int
@@ -105,11 +106,11 @@ SIMULATION = np.dtype(
     + [(name, _I) for name in ("past_ring", "past_before", "past_delay", "past_ratio")],
     align=True,
 )
-"""Record of a Simulation."""
+"""Record type of a Simulation."""
 
 
 def simulation_record(sim: Simulation) -> np.ndarray:
-    """(1,) record of a Simulation whose arrays must outlive it; `simulation` reads it."""
+    """Return the (1,) record of a Simulation; the arrays must outlive the record."""
     line, past = sim.line, sim.past
     record = address_record(
         SIMULATION,
@@ -133,7 +134,7 @@ def simulation_record(sim: Simulation) -> np.ndarray:
 
 @compiled
 def simulation(r):
-    """The Simulation of a record of `simulation_record`."""
+    """Return the Simulation of a record of `simulation_record`."""
     k, c = r.axes, r.channels
     line = CommandLine(rows_of(r.line_ring, r.ticks, k), rows_of(r.line_delay, k, 2))
     past = SensorPast(
@@ -150,7 +151,7 @@ def simulation(r):
 
 @compiled
 def true_values(sim, out):
-    """What stands before the sensors, at the time of the activations.
+    """Compute the true values of the sensed channels at the time of the activations.
 
     Args:
         sim: Simulation.
@@ -177,11 +178,11 @@ def true_values(sim, out):
 
 @compiled
 def begin_past(sim, command):
-    """Let everything have stood as it stands now for all times before.
+    """Initialise the delay line and the sensors' past with the current values.
 
     Args:
-        sim: Simulation; its line and its past are written.
-        command: (nu,) in force before the first tick.
+        sim: Simulation; its `line` and `past` are written.
+        command: (nu,) commands before the first tick.
 
     Returns:
         Nothing.
@@ -198,13 +199,13 @@ def begin_past(sim, command):
 
 @compiled
 def arriving_commands(line, axes, tick, step, steps, out):
-    """Commands that act in one physics step.
+    """Compute the delayed commands that act in one physics step.
 
     Args:
-        line: CommandLine, with the command of this tick in it.
+        line: CommandLine that contains the command of this tick.
         axes: number of axes, scalar.
         tick: control tick, scalar.
-        step: physics step of the tick, scalar.
+        step: index of the physics step within the tick, scalar.
         steps: physics steps per tick, scalar.
         out: (nu,) written [1], or in the drives' units.
 
@@ -224,13 +225,13 @@ def arriving_commands(line, axes, tick, step, steps, out):
 
 @compiled
 def _place(step, steps, tick, length):
-    """Row of the ring with the command that was given for a physics step; -1 is before all."""
+    """Return the ring's row with the command of a physics step; steps before the start map to 0."""
     return (min(max(step // steps, -1), tick) + 1) % length
 
 
 @compiled
 def step_physics(sim, tick, steps, command):
-    """Step through one control tick during which a command is held.
+    """Advance the simulation by one control tick with a constant command.
 
     Args:
         sim: Simulation.
@@ -260,7 +261,7 @@ def step_physics(sim, tick, steps, command):
 
 @compiled
 def _keep(sim, number):
-    """Put what the sensors show after physics step `number` into the ring."""
+    """Store the lagged sensor values after physics step `number` in the ring."""
     past, size = sim.past, len(sim.past.before)
     now, last = number % len(past.ring), (number - 1) % len(past.ring)
     values = np.empty(size)
@@ -275,12 +276,12 @@ def _keep(sim, number):
 
 @compiled
 def delayed_values(past, number, values):
-    """Replace true values by what late sensors show, linear between two physics steps.
+    """Replace true values by delayed values, interpolated linearly between physics steps.
 
     Args:
         past: SensorPast.
-        number: physics steps made, scalar.
-        values: (c,) true values, changed where a sensor is late [channel's unit].
+        number: number of physics steps so far, scalar.
+        values: (c,) true values; replaced for sensors with delay or lag [channel's unit].
 
     Returns:
         Nothing.
@@ -301,23 +302,23 @@ def delayed_values(past, number, values):
 
 
 def command_delays(machine: Machine, axes: tuple[str, ...], timestep: float) -> np.ndarray:
-    """(k, 2) whole physics steps [s] and rest of a step of the command delays of some axes [1]."""
+    """Return the command delays of k axes as whole physics steps and fraction of a step (k, 2)."""
     return np.array([split_delay(machine.axes[n].command_delay, timestep) for n in axes], float)
 
 
 def sensor_delays(
     machine: Machine, channels: tuple[str, ...], timestep: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Delays and first-order lags of some sensors.
+    """Return the delays and first-order lags of c sensors.
 
     Args:
         machine: the machine.
-        channels: c channels.
-        timestep: of the physics [s].
+        channels: names of the c channels.
+        timestep: physics step [s].
 
     Returns:
-        (c, 2) delays as whole physics steps and rest, (c,) a step over the time constant of the
-        lag, 0 without [1].
+        (c, 2) delays as whole physics steps and fraction of a step [1], and (c,) step divided by
+        the time constant of the lag, 0 without lag [1].
     """
     errors = [machine.sensor_errors.get(name, SensorError()) for name in channels]
     delay = np.array([split_delay(e.delay, timestep) for e in errors], float).reshape(-1, 2)
@@ -326,24 +327,24 @@ def sensor_delays(
 
 
 def line_length(delays: np.ndarray, steps: int) -> int:
-    """Ticks that a CommandLine keeps for delays (..., 2), 0 without any."""
+    """Return the number of ticks that a CommandLine must store; 0 without delays."""
     if not delays.any():
         return 0
     return int(np.ceil((delays[..., 0].max() + 1) / steps)) + 2
 
 
 def past_length(delays: np.ndarray, ratios: np.ndarray) -> int:
-    """Physics steps that a SensorPast keeps for delays (..., 2) and lags, 0 without any."""
+    """Return the number of physics steps that a SensorPast must store; 0 without delay or lag."""
     return int(delays[..., 0].max()) + 2 if delays.any() or ratios.any() else 0
 
 
 def delayed_commands(plant: Plant, before: np.ndarray, held: np.ndarray, steps: int) -> np.ndarray:
-    """Commands that act in every physics step of a run.
+    """Compute the delayed commands that act in every physics step of a run.
 
     Args:
         plant: the plant, with the `command_delay` of its axes.
-        before: (nu,) commands in force before the first tick.
-        held: (ticks, nu) commands, held over a tick each.
+        before: (nu,) commands before the first tick.
+        held: (ticks, nu) commands, each constant over a tick.
         steps: physics steps per tick.
 
     Returns:
@@ -368,24 +369,24 @@ def _step(record, tick, steps, command):
 
 
 class Stepper:
-    """Advances a plant by ticks of held commands.
+    """Advances a plant tick by tick; the command is constant within a tick.
 
     Args:
         plant: the plant.
-        data: staggered state at the start, as `begin_leapfrog` left it; its `ctrl` holds the
-            commands in force before.
+        data: staggered state at the start, after `begin_leapfrog`; its `ctrl` contains the
+            commands before the start.
         steps: physics steps per tick.
 
     Attributes:
-        sim: the plant as native code sees it.
-        record: (1,) the same as a record.
+        sim: data of the plant for compiled code.
+        record: (1,) the same data as a record.
         steps: physics steps per tick.
         tick: number of the next tick.
-        late: whether a sensor shows the past.
+        late: whether any sensor has a delay or lag.
     """
 
     def __init__(self, plant: Plant, data: mujoco.MjData, steps: int) -> None:
-        """Fill the line of commands and the past of the sensors."""
+        """Initialise the delay line of the commands and the past of the sensors."""
         channels, h = sensed_channels(plant), plant.model.opt.timestep
         delay = command_delays(plant.machine, plant.axes, h)
         lag, ratio = sensor_delays(plant.machine, channels, h)
@@ -412,18 +413,18 @@ class Stepper:
             line=CommandLine(np.zeros((line_length(delay, steps), len(plant.axes))), delay),
             past=past,
         )
-        self._owners = plant.model, data  # whose memory the addresses are
+        self._owners = plant.model, data  # keeps the memory behind the addresses alive
         self.steps, self.tick, self.late = steps, 0, len(past.ring) > 0
         self.record = simulation_record(self.sim)
         begin_past(self.sim, np.array(data.ctrl))
 
     def advance(self, command: np.ndarray) -> None:
-        """Step through one tick during which a command (nu,) is held."""
+        """Advance by one tick with a constant command (nu,)."""
         _step(self.record, self.tick, self.steps, np.asarray(command, float))
         self.tick += 1
 
     def shown(self) -> np.ndarray:
-        """(c,) what sensors without error show now, in the order of `sensed_channels`."""
+        """Return the values (c,) of error-free sensors now, in the order of `sensed_channels`."""
         values = np.empty(len(self.sim.past.before))
         true_values(self.sim, values)
         delayed_values(self.sim.past, self.tick * self.steps, values)

@@ -1,15 +1,13 @@
-"""What is around a machine, in MuJoCo: plates on springs, trees that can be felled, logs.
+"""Objects around a machine in MuJoCo: spring-mounted plates, trees that can be felled, and logs.
 
-A tree stands on stiff springs in its own joints, which are cut with it. The saw cuts while it
-spins: then it passes through wood, which costs it torque and the head a little feed force. A grab
-that has closed around the stem holds it by a weld, since friction of wood on steel is not the point
-here; from then on the stem touches the ground only. A log never touches anything but the ground.
+A tree stands on stiff springs, which are removed when it is cut. The saw cuts while it spins: it
+then passes through the wood, which causes a torque on the saw and a feed force on the head. A log
+has contact with the ground only, and so has a tree once it has been held.
 
-When a grab holds a thing: its jaw has closed and the thing lies in the pocket between the jaws.
-
-Friction of wood on steel is not the point here. What is held is welded to the grab's body in the
-pose in which it was taken, so that taking it gives no jerk. The law is compiled and works on flat
-arrays, for the control loop and for native loops that step many machines.
+A grab takes an object if its jaw is closed and the object lies in the pocket between the jaws. The
+friction of wood on steel is not modelled: a weld constraint connects the object to the grab's body
+in its current pose, so that there is no jerk. `grip_step` is compiled and uses flat arrays, for
+control loops and for native loops over many machines.
 """
 
 import math
@@ -26,7 +24,7 @@ from hydrotele.scenario.scenario import LogOnGround, Plate, StandingTree, Surrou
 
 CLOSED, OPEN, LINE, STRAIGHT, CENTRE, HALF, OWN, BEFORE, BEHIND = 0, 1, 2, 3, 4, 7, 10, 11, 12
 GRIP = 13
-ROW = 11  # numbers of a weld in `eq_data`
+ROW = 11  # number of values of a weld in `eq_data`
 LET_GO, UNCHANGED, TAKEN = -1, 0, 1
 
 
@@ -34,42 +32,41 @@ def grip_parameters(
     closed: float, open: float, line: int, straight: float, centre: Sequence[float],
     half: Sequence[float], own: int, reach: tuple[float, float] = (-math.inf, math.inf),
 ) -> np.ndarray:  # fmt: skip
-    """The numbers of `grip_step`.
+    """Return the parameters of `grip_step` as an array.
 
     Args:
-        closed: the jaw holds beyond this angle [rad].
-        open: it lets go below this one [rad], at most `closed`.
-        line: axis of the grab's frame (0, 1, 2) along which things lie in its pocket.
-        straight: largest angle between this axis and the thing's [rad].
-        centre: (3,) middle of the pocket, a box in the grab's frame [m].
-        half: (3,) half its sizes [m]; that along `line` does not count.
-        own: axis of the thing's frame (0, 1, 2) along which it is long.
-        reach: where along this axis it can be held, seen from its origin [m].
+        closed: jaw angle above which an object is taken [rad].
+        open: jaw angle below which the object is released [rad], at most `closed`.
+        line: axis of the grab's frame (0, 1, 2) along which objects lie in the pocket.
+        straight: largest angle between this axis and the object's long axis [rad].
+        centre: (3,) centre of the pocket, a box in the grab's frame [m].
+        half: (3,) half sizes of the pocket [m]; the one along `line` is ignored.
+        own: long axis of the object in its own frame (0, 1, 2).
+        reach: range along this axis in which the object can be held, from its origin [m].
 
     Returns:
-        (GRIP,) numbers.
+        (GRIP,) parameters.
     """
     return np.array([closed, open, line, math.cos(straight), *centre, *half, own, *reach], float)
 
 
 @allocation_free
 def grip_step(grip, hand_position, hand_quaternion, position, quaternion, angle, held, row):
-    """Whether a grab takes or lets go of a thing, and how it is then welded to it.
+    """Decide whether a grab takes or releases an object, and set the weld that holds it.
 
-    A thing is taken if the jaw is closed and the thing's axis passes through the middle of the
-    pocket, across the jaws: within the box there, turned by no more than the given angle and within
-    the thing's length.
+    An object is taken if the jaw is closed and the object's long axis passes through the middle
+    plane of the pocket: inside the box, within the angle limit and within the object's reach.
 
     Args:
-        grip: (GRIP,) of `grip_parameters`.
-        hand_position: (3,) of the grab's body, `xpos` [m].
-        hand_quaternion: (4,) `xquat`.
-        position: (3,) of the thing's body [m].
-        quaternion: (4,) of the thing's body.
-        angle: of the jaw [rad].
-        held: whether the thing is held.
-        row: (>= ROW,) `eq_data` of the weld with the grab as `body1` and the thing as `body2`;
-            written when it is taken.
+        grip: (GRIP,) result of `grip_parameters`.
+        hand_position: (3,) position of the grab's body, `xpos` [m].
+        hand_quaternion: (4,) its orientation, `xquat`.
+        position: (3,) position of the object's body [m].
+        quaternion: (4,) orientation of the object's body.
+        angle: angle of the jaw [rad].
+        held: whether the object is held.
+        row: (>= ROW,) `eq_data` of the weld with the grab as `body1` and the object as `body2`;
+            written when the object is taken.
 
     Returns:
         TAKEN, LET_GO or UNCHANGED.
@@ -85,7 +82,7 @@ def grip_step(grip, hand_position, hand_quaternion, position, quaternion, angle,
         w, -x, -y, -z, position[0] - hand_position[0], position[1] - hand_position[1],
         position[2] - hand_position[2],
     )  # fmt: skip
-    # the thing's quaternion in the grab's frame
+    # the object's quaternion in the grab's frame
     e = w * a + x * b + y * c + z * d
     f = w * b - x * a - y * d + z * c
     g = w * c + x * d - y * a - z * b
@@ -106,7 +103,7 @@ def grip_step(grip, hand_position, hand_quaternion, position, quaternion, angle,
         )
         if k != line and not abs(at - grip[CENTRE + k]) < grip[HALF + k]:
             return UNCHANGED
-    row[0], row[1], row[2] = 0.0, 0.0, 0.0  # the point that is held: the thing's origin
+    row[0], row[1], row[2] = 0.0, 0.0, 0.0  # the anchor: the object's origin
     row[3], row[4], row[5] = to_x, to_y, to_z
     row[6], row[7], row[8], row[9] = e, f, g, h
     row[10] = 1.0  # m: torque per force of the weld, MuJoCo's default
@@ -115,7 +112,7 @@ def grip_step(grip, hand_position, hand_quaternion, position, quaternion, angle,
 
 @allocation_free
 def _turned(w, x, y, z, vx, vy, vz):
-    """A vector turned by a unit quaternion."""
+    """Rotate a vector by a unit quaternion."""
     tx, ty, tz = 2.0 * (y * vz - z * vy), 2.0 * (z * vx - x * vz), 2.0 * (x * vy - y * vx)
     return (
         vx + w * tx + y * tz - z * ty,
@@ -125,35 +122,36 @@ def _turned(w, x, y, z, vx, vy, vz):
 
 
 _PLATE_SOLREF = (0.01, 1.0)  # s, 1: firm steel on steel, stiffer than any plate's spring
-_GAP = 0.02  # m, the kerf
+_GAP = 0.02  # m, width of the saw cut
 _GRAVITY = 9.81
-_ROOT, _ROOT_TURN = 4.0e6, 6.0e5  # N/m, N m/rad of a root
-_CUTTING = 30.0  # rad/s: slower, a saw does not cut
-_HIGH = 0.15  # m by which the saw may miss the height of the kerf
+_ROOT, _ROOT_TURN = 4.0e6, 6.0e5  # N/m, N m/rad: stiffness of a tree's root
+_CUTTING = 30.0  # rad/s: lowest speed at which a saw cuts
+_HIGH = 0.15  # m: largest difference between the saw's height and that of the kerf
 _NORMALS = {"x": (1, 0, 0), "-x": (-1, 0, 0), "y": (0, 1, 0), "-y": (0, -1, 0), "z": (0, 0, 1)}
-_RIM = 0.3  # feed force per rim force
+_RIM = 0.3  # feed force per cutting force at the rim of the disc
 _STEM_POCKET = (0.325, 0.0, -0.62), (0.325, 0.35, 0.0)  # m, in front of a head, between its arms
-_LEANING = math.acos(0.9)  # rad by which a stem may lean against the head
-_ASKEW = math.radians(20.0)  # by which a log may lie askew between the jaws
-_END = 0.3  # m of a log's end that no jaw holds
-_ROLLING = 30.0  # N s/m and N m s/rad: soil under a log lets it roll for half a second
-_SINK = 1.0e-5  # m by which a log's weight presses it into the ground's soft contact
+_LEANING = math.acos(0.9)  # rad: largest angle between stem and head
+_ASKEW = math.radians(20.0)  # rad: largest angle between a log and the jaws' axis
+_END = 0.3  # m: length at a log's end at which it cannot be held
+_ROLLING = 30.0  # N s/m and N m s/rad: soil damping; a rolling log stops within half a second
+_SINK = 1.0e-5  # m: static penetration of a log into the soft contact of the ground
 _PREFIXES = ("plate_", "tree_", "log_")
 
 
 def write_surroundings(
     root, machine: Machine, things: tuple[SurroundingObject, ...], looks: bool = True
 ) -> None:
-    """Add what is around to an assembled MJCF.
+    """Add plates, trees and logs to an assembled MJCF.
 
     Args:
         root: the MJCF document of the machine.
         machine: the machine.
         things: plates, trees and logs.
-        looks: whether to write what only a picture needs, of logs.
+        looks: whether to add the visual geometry of logs.
 
     Raises:
-        InputError: the machine has no such saw or grab, or its grab has no pocket for a log.
+        InputError: the machine does not have the given saw or grab, or the grab has no pocket for
+            the log.
     """
     for number, thing in enumerate(things):
         where = f"surroundings.{number}"
@@ -168,6 +166,7 @@ def write_surroundings(
 
 
 def _write_plate(root, name: str, plate: Plate) -> None:
+    """Add a plate on a spring along its normal."""
     normal, thick = np.array(_NORMALS[plate.normal], float), 0.05
     middle = np.array(plate.position) - thick * normal
     body = root.worldbody.add("body", name=name, pos=middle)
@@ -191,11 +190,12 @@ def _need_axis(machine: Machine, axis: str, where: str) -> None:
 
 
 def _hand(machine: Machine, grab: str) -> str:
-    """Name of the body on which a grab's jaw is hinged."""
+    """Return the name of the body to which a grab's jaw is hinged."""
     return machine.links[machine.link_of(machine.axes[grab].joint)].parent
 
 
 def _write_weld(root, machine: Machine, grab: str, name: str) -> None:
+    """Add the inactive weld between a grab and an object."""
     root.equality.add(
         "weld", name=f"{name}_held", body1=_hand(machine, grab), body2=name, active=False,
         solref=(0.01, 1.0), solimp=(0.99, 0.999, 0.001, 0.5, 2),
@@ -203,14 +203,15 @@ def _write_weld(root, machine: Machine, grab: str, name: str) -> None:
 
 
 def _write_log(root, name: str, log: LogOnGround, machine: Machine, where: str):
+    """Add a log on the ground and return its body."""
     _need_axis(machine, log.grab, f"{where}.grab")
     hand = _hand(machine, log.grab)
     pocket = root.find("site", f"{log.grab}_pocket")
     if pocket is None:
-        message = f"its link {hand!r} has no box site '{log.grab}_pocket' in the MJCF, for a log"
+        message = f"link {hand!r} needs a box site '{log.grab}_pocket' in the MJCF to hold a log"
         raise InputError(f"{where}.grab", message)
     if log.diameter >= 2.0 * pocket.size[2]:
-        message = f"{log.diameter:g} m does not go between jaws {2.0 * pocket.size[2]:g} m apart"
+        message = f"{log.diameter:g} m does not fit between jaws {2.0 * pocket.size[2]:g} m apart"
         raise InputError(f"{where}.diameter", message)
     radius, half, mass = log.diameter / 2.0, log.length / 2.0, log.mass
     turn = (math.cos(log.direction / 2.0), 0.0, 0.0, math.sin(log.direction / 2.0))
@@ -230,6 +231,7 @@ def _write_log(root, name: str, log: LogOnGround, machine: Machine, where: str):
 
 
 def _draw_log(body, name: str, log: LogOnGround) -> None:
+    """Add the visual geometry of a log."""
     radius, half = log.diameter / 2.0, log.length / 2.0
     for part, size, reach, colour in (
         ("bark", radius, half - 0.01, (0.36, 0.26, 0.17, 1)),
@@ -242,6 +244,7 @@ def _draw_log(body, name: str, log: LogOnGround) -> None:
 
 
 def _write_tree(root, name: str, tree: StandingTree, machine: Machine, where: str) -> None:
+    """Add stump, stem, crown and root springs of a tree."""
     for part in ("saw", "grab"):
         _need_axis(machine, getattr(tree, part), f"{where}.{part}")
     x, y = tree.position
@@ -258,7 +261,7 @@ def _write_tree(root, name: str, tree: StandingTree, machine: Machine, where: st
         "inertial", mass=mass, pos=(0, 0, half), diaginertia=(across, across, mass * radius**2 / 2)
     )
     for axis, way in zip("xyz", np.eye(3), strict=True):
-        sag = mass * _GRAVITY / _ROOT if axis == "z" else 0.0  # its root holds it where it stands
+        sag = mass * _GRAVITY / _ROOT if axis == "z" else 0.0  # springref cancels the tree's weight
         body.add(
             "joint", name=f"{name}_{axis}", type="slide", axis=way, stiffness=_ROOT,
             damping=0.05 * _ROOT, limited="false", springref=sag,
@@ -280,7 +283,7 @@ def _write_tree(root, name: str, tree: StandingTree, machine: Machine, where: st
 
 
 def object_joints(model: mujoco.MjModel) -> list[tuple[int, int]]:
-    """(joint, its place in `qpos`) of plates, trees and logs."""
+    """Return (joint id, its index in `qpos`) of all joints of plates, trees and logs."""
     return [
         (j, int(model.jnt_qposadr[j]))
         for j in range(model.njnt)
@@ -289,21 +292,21 @@ def object_joints(model: mujoco.MjModel) -> list[tuple[int, int]]:
 
 
 def is_surrounding_object(name: str) -> bool:
-    """Whether a body or joint of this name is a plate, tree or log."""
+    """Return whether a body or joint of this name belongs to a plate, tree or log."""
     return name.startswith(_PREFIXES)
 
 
 def log_grip(model: mujoco.MjModel, log: LogOnGround) -> np.ndarray:
-    """Numbers of `grip_step` for a log.
+    """Return the parameters of `grip_step` for a log.
 
     Args:
-        model: the machine's. The box site `<grab>_pocket` is the room between the jaws: logs lie
-            along its y, between jaws on either side in z, below the head, and not deeper than the
-            tips, which its far end in x shows.
+        model: model of the machine. The box site `<grab>_pocket` is the space between the jaws:
+            logs lie along its y axis, with a jaw on either side in z. In x it extends from the head
+            to the tips of the jaws.
         log: the log.
 
     Returns:
-        (GRIP,) numbers.
+        (GRIP,) parameters.
     """
     site, radius = model.site(f"{log.grab}_pocket"), log.diameter / 2.0
     low, high = site.pos - site.size + (radius, 0, radius), site.pos + site.size - (0, 0, radius)
@@ -314,21 +317,21 @@ def log_grip(model: mujoco.MjModel, log: LogOnGround) -> np.ndarray:
 
 
 class Surroundings:
-    """Trees and logs of a run while they are cut, held and laid down; plates need nothing.
+    """Trees and logs of a run, and their cutting, gripping and release.
 
     Attributes:
-        events: (time [s], what happened).
+        events: list of (time [s], description of the event).
     """
 
     def __init__(
         self, machine: Machine, model: mujoco.MjModel, things: tuple[SurroundingObject, ...]
     ) -> None:
-        """Look up what is where.
+        """Find the objects in the model.
 
         Args:
             machine: the machine.
-            model: its MuJoCo model, with these surroundings.
-            things: the scenario's.
+            model: its MuJoCo model with these surroundings.
+            things: surrounding objects of the scenario.
         """
         self.events: list[tuple[float, str]] = []
         self._model = model
@@ -345,16 +348,16 @@ class Surroundings:
 
     @property
     def changes(self) -> bool:
-        """Whether there is anything to cut or to hold."""
+        """Whether there is any tree or log, so that `update` must be called."""
         return bool(self._trees or self._logs)
 
     def update(self, time: float, data: mujoco.MjData, period: float) -> None:
-        """Saw and hold, once per control period.
+        """Update cutting and gripping; to be called once per control period.
 
         Args:
-            time: now [s].
-            data: the plant's state; applied forces and the welds are written.
-            period: since the last time [s].
+            time: current time [s].
+            data: the plant's state; applied forces and welds are written.
+            period: time since the last call [s].
         """
         for tree in self._trees:
             self.events += [(time, said) for said in tree.update(data, period)]
@@ -366,13 +369,13 @@ class Surroundings:
                 self.events.append((time, "the grapple lets the log go"))
 
     def restore(self) -> None:
-        """Plant felled trees again: the model is as it was before the run."""
+        """Undo the changes that cutting made to the model."""
         for tree in self._trees:
             tree.plant()
 
 
 class _Grip:
-    """A grab and one thing that it may hold."""
+    """A grab and one object that it can hold."""
 
     def __init__(self, machine: Machine, model: mujoco.MjModel, name: str, grab: str, grip) -> None:
         self._hand, self._thing = model.body(_hand(machine, grab)).id, model.body(name).id
@@ -380,7 +383,7 @@ class _Grip:
         self._weld, self._rows, self._grip = model.equality(f"{name}_held").id, model.eq_data, grip
 
     def update(self, data: mujoco.MjData) -> int:
-        """Take it or let it go: TAKEN, LET_GO or UNCHANGED."""
+        """Take or release the object; return TAKEN, LET_GO or UNCHANGED."""
         hand, thing, weld = self._hand, self._thing, self._weld
         change = grip_step(
             self._grip, data.xpos[hand], data.xquat[hand], data.xpos[thing], data.xquat[thing],
@@ -420,20 +423,21 @@ class _Standing:
         self.depth, self.cut = 0.0, False
 
     def plant(self) -> None:
-        """Undo what cutting did to the model."""
+        """Undo the changes that cutting made to the model."""
         self._model.jnt_stiffness[self._joints] = self._stiffness
         self._model.dof_damping[self._dofs] = self._damping
         self._touch(True)
         self._model.geom_contype[self._stem] = self._model.geom_conaffinity[self._stem] = 3
 
     def _touch(self, on: bool) -> None:
+        """Enable or disable the contacts of the saw disc."""
         model = self._model
         model.geom_contype[self._disc], model.geom_conaffinity[self._disc] = (
             self._solid if on else (0, 0)
         )
 
     def update(self, data: mujoco.MjData, period: float) -> list[str]:
-        """Go on with sawing and holding; what has just happened."""
+        """Update cutting and gripping of the tree; return descriptions of new events."""
         said: list[str] = []
         spin = abs(float(data.qvel[self._spin]))
         data.xfrc_applied[self._saw] = 0.0
@@ -453,7 +457,7 @@ class _Standing:
         return said
 
     def _saw_on(self, data: mujoco.MjData, period: float, spin: float) -> None:
-        """Deepen the cut to where the disc's edge is; wood costs torque and feed force."""
+        """Advance the cut to the edge of the disc and apply cutting torque and feed force."""
         stem, saw = data.xpos[self._body], data.xpos[self._saw]
         axis = data.xmat[self._saw].reshape(3, 3)[:, 2]
         height = saw[2] - (axis[:2] @ (stem[:2] - saw[:2])) / max(abs(axis[2]), 0.3)
@@ -478,6 +482,7 @@ class _Standing:
         data.xfrc_applied[self._saw, 3:] = direction * torque * axis
 
     def _fell(self) -> None:
+        """Remove the root's stiffness so that the tree can fall."""
         self._model.jnt_stiffness[self._joints] = 0.0
         self._model.dof_damping[self._dofs] = (5.0, 5.0, 5.0, 50.0, 50.0, 50.0)
         self.cut = True

@@ -1,30 +1,27 @@
-"""What a law is: a small function of a drive's state, its parameters, and the library of laws.
+"""Laws and terms: functions of a drive's state that add to its force, flow or command.
 
     @law
     def quadratic_drag(s, coefficient):
         return -coefficient * s.velocity * abs(s.velocity)
 
-The first argument is the `DriveState`, the others are the parameters under their names. numba
-compiles the function when a machine that uses it is simulated, so that it may use numbers, `math`
-and other compiled functions only. A parameter is a number; annotated as `Variable` it is the name
-of a variable of the state and arrives as its index; annotated as `Numbers` it is a list and arrives
-as an array. A value that is left out is the default of the argument.
+The first argument of a law is the `DriveState`; the others are its parameters. The return value is
+added to the balance of the term: force [N] or [N m], flow into a chamber [m^3/s], or command. numba
+compiles the function when a machine that uses it is simulated; it may therefore use numbers, `math`
+and other compiled functions only. A parameter is a number by default. An argument annotated as
+`Variable` is the name of a state variable in the file and its index in the call. An argument
+annotated as `Numbers` is a list in the file and an array in the call. Default values of arguments
+apply to omitted parameters.
 
-The laws of this package that terms can use; numba compiles them, each by itself.
+A `Term` of a machine specifies which law adds to which balance of which drive.
 
-Every law is a function of a `DriveState` s and of its parameters, and returns what it adds to the
-balance of its term: force [N] or [N m], flow into a chamber [m^3/s], or command. The unit of a
-parameter follows from that.
-
-A `Term` of a machine says which law adds to which balance of which drive.
-
-Formulas in machine files: products of basic functions, each with its coefficient.
+The law `formula` evaluates sums of products of basic functions, given in machine files:
 
     parameters: {"1": 40.0, "velocity * abs(velocity)": -310.0,
                  "bump(position, 0.4, 0.05) * sign(velocity, 0.005)": -900.0}
 
-A product has factors joined by `*`, each may carry a power up to `** 6`. A factor is an argument or
-a function of one; an argument is a variable of `DriveState` or a difference of two of them.
+The factors of a product are joined by `*`, each with an optional power up to `** 6`. A factor is an
+argument or a function of an argument. An argument is a variable of `DriveState` or a difference of
+two variables.
 """
 
 import ast
@@ -42,23 +39,23 @@ from hydrotele.core.errors import InputError
 
 
 class DriveState(NamedTuple):
-    """Physical variables of one drive at an instant, all SI.
+    """Physical variables of one drive at an instant, all in SI units.
 
     Attributes:
-        time: since the run's beginning [s].
+        time: time since the start of the run [s].
         position: piston displacement or motor angle [m] or [rad].
-        velocity: of the piston or motor [m/s] or [rad/s].
-        spool: spool position [1]; 0 without a valve, as all that follow up to the supply. Of a
-            drive with a pump of its own the pump's speed [rad/s]; files call it `pump_speed`.
-        spool_rate: its rate [1/s]. Of a drive with a pump of its own the pressure in its load
-            cylinder [Pa]; files call it `pressure_load`.
-        pressure_head: of the head-side chamber, or port A of a motor [Pa].
-        pressure_rod: of the rod-side chamber, or port B [Pa].
-        pressure_supply: at the valves' inlet [Pa].
-        command: to the valve or drive, as it arrives, without the terms that add to it [1], [V].
-        force: of the oil on the piston, or of a force drive, before friction [N] or [N m].
-        played: what the term's play lets through of its variable [its unit]; 0 without a play.
-        ahead: by how much the variable is ahead of that, up to half a width to either side.
+        velocity: velocity of the piston or motor [m/s] or [rad/s].
+        spool: spool position [1]; this and the next three variables are 0 without a valve. For a
+            drive with its own pump it is the pump speed [rad/s], `pump_speed` in files.
+        spool_rate: rate of the spool [1/s]. For a drive with its own pump it is the pressure in its
+            load cylinder [Pa], `pressure_load` in files.
+        pressure_head: pressure of the head-side chamber, or port A of a motor [Pa].
+        pressure_rod: pressure of the rod-side chamber, or port B [Pa].
+        pressure_supply: pressure at the inlet of the valves [Pa].
+        command: command to the valve or drive after its delay, without terms [1], [V].
+        force: force of the oil on the piston, or of a force drive, before friction [N] or [N m].
+        played: output of the term's backlash operator (`play`) [unit of its variable]; 0 without.
+        ahead: difference between the variable and this output, at most half the backlash width.
     """
 
     time: float
@@ -76,14 +73,14 @@ class DriveState(NamedTuple):
 
 
 class Drives(NamedTuple):
-    """All drives at an instant, for laws with variables of another drive than the term's own.
+    """States of all drives at an instant, for laws that use variables of another drive.
 
     Attributes:
         count: number of hydraulic drives, which come first.
         act: (>= 4 count,) spool [1], spool rate [1/s], head- and rod-side pressure [Pa] of each.
         position: (nu,) piston displacements or motor angles [m] or [rad].
         velocity: (nu,) their rates [m/s] or [rad/s].
-        command: (nu,) commands as they arrive [1] or [V].
+        command: (nu,) commands after their delays [1] or [V].
     """
 
     count: int
@@ -94,19 +91,19 @@ class Drives(NamedTuple):
 
 
 NO_DRIVES = Drives(0, np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0))
-"""For laws that see no other drive's variables."""
+"""For laws that use no variables of other drives."""
 
 VARIABLES = {name: index for index, name in enumerate(DriveState._fields)}
-"""Variable of the state, as files name it -> its index."""
+"""Name of a state variable in files -> its index in `DriveState`."""
 VARIABLES |= {"pump_speed": VARIABLES["spool"], "pressure_load": VARIABLES["spool_rate"]}
 
 
 class Variable(int):
-    """Annotation of a law's argument: index of a variable, by its name in files."""
+    """Annotation of a law's argument: index of a state variable, given by its name in files."""
 
 
 class Numbers(np.ndarray):
-    """Annotation of a law's argument: a list of numbers, nested lists one after the other."""
+    """Annotation of a law's argument: a list of numbers; nested lists are flattened."""
 
 
 Value = float | str | tuple[float, ...] | tuple[tuple[float, ...], ...]
@@ -119,13 +116,14 @@ class Law:
     """A law that terms can use.
 
     Attributes:
-        name: fixed name, as in machine files.
+        name: name of the law in machine files.
         function: `(state, *parameters) -> float`.
         kinds: argument name -> float, Variable or Numbers, in the order of the arguments.
-        defaults: values of the arguments that may be left out.
-        check: called with the complete parameters; raises ValueError where they do not suit.
-        translate: machine file's parameters -> the arguments; None where they are the same.
-        source: file or entry point that defines it; empty for the laws of this package.
+        defaults: values of optional arguments.
+        check: called with the complete parameters; raises ValueError for invalid parameters.
+        translate: converts the parameters of a machine file to the arguments; None if they are the
+            same.
+        source: file or entry point that defines the law; empty for the laws of this package.
     """
 
     name: str
@@ -137,24 +135,26 @@ class Law:
     source: str = ""
 
     def numbers(self, parameters: Parameters) -> np.ndarray:
-        """Parameters as the numbers that the compiled law is called with.
+        """Encode parameters as the array that is passed to the compiled law.
 
         Args:
-            parameters: as in a machine file.
+            parameters: parameters as in a machine file.
 
         Returns:
-            (n,) n itself, then one number per float or Variable and the range of places per
-            Numbers, then the contents of these.
+            (n,) array: n, then one number per float or Variable and the index range per Numbers,
+            then the contents of all Numbers.
 
         Raises:
-            ValueError: a parameter is missing, unknown or of the wrong kind; lists what is valid.
+            ValueError: a parameter is missing, unknown or of the wrong kind; lists the valid ones.
         """
         given = dict(self.translate(parameters)) if self.translate else dict(parameters)
         for name in given.keys() - self.kinds.keys():
-            raise ValueError(f"law {self.name}: parameter {name!r}; {suggest(name, self.kinds)}")
+            raise ValueError(
+                f"law {self.name}: unknown parameter {name!r}; {suggest(name, self.kinds)}"
+            )
         given = {**self.defaults, **given}
         if missing := [name for name in self.kinds if name not in given]:
-            raise ValueError(f"law {self.name} needs the parameters {', '.join(missing)}, too")
+            raise ValueError(f"law {self.name}: missing parameters {', '.join(missing)}")
         if self.check:
             self.check(given)
         size = 1 + sum(2 if kind is Numbers else 1 for kind in self.kinds.values())
@@ -171,11 +171,11 @@ class Law:
 
 
 def _values(law: str, name: str, kind: type, value: Any) -> list[float]:
-    """One parameter as numbers."""
+    """Convert one parameter to a list of numbers; raise ValueError for an invalid value."""
     where = f"law {law}: parameter {name}"
     if kind is Variable:
         if value not in VARIABLES:
-            raise ValueError(f"{where}: {value!r} is no variable; {suggest(value, VARIABLES)}")
+            raise ValueError(f"{where}: {value!r} is not a variable; {suggest(value, VARIABLES)}")
         return [float(VARIABLES[value])]
     try:
         flat = np.asarray(value, float)
@@ -188,9 +188,9 @@ def _values(law: str, name: str, kind: type, value: Any) -> list[float]:
 
 
 LAWS: dict[str, Law] = {}
-"""Laws by name: those of `hydrotele.terms.law`, and what users' files and plug-ins define."""
+"""Laws by name: those of `hydrotele.terms.law`, and those of user files and plug-ins."""
 
-_reading: list[str] = []  # what defines laws at the moment: the last entry
+_reading: list[str] = []  # stack of the files and plug-ins that are defining laws
 
 
 def law(
@@ -198,18 +198,18 @@ def law(
     check: Callable[[Parameters], None] | None = None,
     translate: Callable[[Parameters], Parameters] | None = None,
 ) -> Any:  # fmt: skip
-    """Decorator that puts a law into the library under its function's name.
+    """Register a function as a law under its name; decorator.
 
     Args:
-        function: `(state, *parameters) -> float`; see the head of this module.
+        function: `(state, *parameters) -> float`; see the module docstring.
         check: see `Law`.
         translate: see `Law`.
 
     Returns:
-        The function, unchanged, so that it can be called with a `DriveState` in Python, too.
+        The unchanged function, which can also be called from Python with a `DriveState`.
 
     Raises:
-        InputError: the name is taken, or an argument has no kind that a parameter can have.
+        InputError: the name is already used, or an argument has an invalid annotation.
     """
     if function is None:
         return lambda it: law(it, check=check, translate=translate)
@@ -229,10 +229,10 @@ def law(
 
 
 class defined_by:  # noqa: N801 - a context manager, named as it is read
-    """Context in which laws are defined by a user's file or a plug-in."""
+    """Context manager that records the file or plug-in that defines laws."""
 
     def __init__(self, source: str) -> None:
-        """Name the source."""
+        """Store the name of the file or plug-in."""
         self._source = source
 
     def __enter__(self) -> None:
@@ -253,24 +253,24 @@ FUNCTIONS = {
     "sin": (8, 1, "sin(e, L) = sin(2 pi e / L)"),
     "cos": (9, 1, "cos(e, L) = cos(2 pi e / L)"),
 }
-"""Basic function -> (its code, number of constants, what it is)."""
+"""Basic function -> (its code, number of constants, its definition)."""
 
 _DIVIDES = {"sign": 0, "root": 0, "bump": 1, "rise": 0, "sin": 0, "cos": 0}
 _PLAIN, _NONE, _HIGHEST = 0, -1, 6
 
 
 def formula_arguments(parameters: Mapping[str, float]) -> dict[str, list[float]]:
-    """A formula as numbers for the law `formula`.
+    """Encode a formula as numbers for the law `formula`.
 
     Args:
         parameters: product -> coefficient.
 
     Returns:
-        `numbers`: count of products, then of each its coefficient, the count of its factors and of
-        each of these: function, variable, variable to subtract or -1, two constants, power.
+        `numbers`: number of products; for each product its coefficient and number of factors; for
+        each factor function, variable, variable to subtract or -1, two constants, power.
 
     Raises:
-        ValueError: a product is no such product; says what is allowed.
+        ValueError: a product cannot be parsed; the message describes the syntax.
 
     >>> formula_arguments({"velocity ** 2": 3.0})["numbers"]
     [1, 3.0, 1, 0, 2, -1, 0.0, 0.0, 2]
@@ -280,7 +280,7 @@ def formula_arguments(parameters: Mapping[str, float]) -> dict[str, list[float]]
     numbers: list[float] = [len(parameters)]
     for text, coefficient in parameters.items():
         if isinstance(coefficient, bool) or not isinstance(coefficient, int | float):
-            raise ValueError(f"formula {text!r}: the coefficient {coefficient!r} is no number")
+            raise ValueError(f"formula {text!r}: the coefficient {coefficient!r} is not a number")
         factors = _factors(text)
         numbers += [coefficient, len(factors)]
         for factor in factors:
@@ -289,22 +289,25 @@ def formula_arguments(parameters: Mapping[str, float]) -> dict[str, list[float]]
 
 
 def _factors(text: str) -> list[list[float]]:
+    """Parse a product into its encoded factors; the product `1` has none."""
     try:
         node = ast.parse(text.strip(), mode="eval").body
     except SyntaxError:
-        raise _wrong(text, "it cannot be read") from None
+        raise _wrong(text, "it cannot be parsed") from None
     if isinstance(node, ast.Constant) and node.value == 1:
         return []
     return [_factor(text, part) for part in _parts(node)]
 
 
 def _parts(node: ast.expr) -> list[ast.expr]:
+    """Return the factors of a product as syntax nodes."""
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mult):
         return [*_parts(node.left), *_parts(node.right)]
     return [node]
 
 
 def _factor(text: str, node: ast.expr) -> list[float]:
+    """Encode a factor: function, variables, constants and power."""
     power = 1
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow):
         exponent = node.right
@@ -315,7 +318,7 @@ def _factor(text: str, node: ast.expr) -> list[float]:
         return [_PLAIN, *_argument(text, node), 0.0, 0.0, power]
     name = node.func.id if isinstance(node.func, ast.Name) else "?"
     if name not in FUNCTIONS:
-        raise _wrong(text, f"{name!r} is no function; {suggest(name, FUNCTIONS)}")
+        raise _wrong(text, f"{name!r} is not a function; {suggest(name, FUNCTIONS)}")
     code, count, words = FUNCTIONS[name]
     if len(node.args) != 1 + count or node.keywords:
         raise _wrong(text, f"the function is {words}")
@@ -327,29 +330,33 @@ def _factor(text: str, node: ast.expr) -> list[float]:
 
 
 def _argument(text: str, node: ast.expr) -> list[int]:
+    """Return the indices of a variable and of the variable to subtract, -1 for none."""
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub):
         return [_variable(text, node.left), _variable(text, node.right)]
     return [_variable(text, node), _NONE]
 
 
 def _variable(text: str, node: ast.expr) -> int:
+    """Return the index of a variable."""
     name = node.id if isinstance(node, ast.Name) else ast.unparse(node)
     if name not in VARIABLES:
-        raise _wrong(text, f"{name!r} is no variable; {suggest(name, VARIABLES)}")
+        raise _wrong(text, f"{name!r} is not a variable; {suggest(name, VARIABLES)}")
     return VARIABLES[name]
 
 
 def _number(text: str, node: ast.expr) -> float:
+    """Return the value of a numeric constant."""
     try:
         value = ast.literal_eval(node)
     except ValueError:
         value = None
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise _wrong(text, f"{ast.unparse(node)!r} is no number")
+        raise _wrong(text, f"{ast.unparse(node)!r} is not a number")
     return float(value)
 
 
 def _wrong(text: str, why: str) -> ValueError:
+    """Create the error for a formula that cannot be parsed."""
     return ValueError(
         f"formula {text!r}: {why}; write '1' or a product such as 'velocity * abs(velocity)' of"
         f" variables and of {', '.join(FUNCTIONS)}"
@@ -358,16 +365,16 @@ def _wrong(text: str, why: str) -> ValueError:
 
 @law
 def constant(s: DriveState, value: float) -> float:
-    """A constant value."""
+    """Return a constant value."""
     return value
 
 
 @law
 def pulse(s: DriveState, size: float, start: float, duration: float, edge: float = 0.1) -> float:
-    """A value from `start` [s] for a `duration` [s].
+    """Return a pulse of height `size` from `start` [s] for a `duration` [s].
 
-    Its edges are half waves of a cosine, `edge` of the duration long and centred on its ends, so
-    that a derivative with respect to every parameter exists.
+    The edges are half cosine waves, centred on start and end; their length is the fraction `edge`
+    of the duration. The pulse is thus differentiable with respect to every parameter.
 
     >>> state = DriveState(*[0.0] * 12)
     >>> [pulse(state._replace(time=t), 8.0, 1.0, 2.0) for t in (0.8, 1.0, 2.0, 3.0, 3.2)]
@@ -386,21 +393,22 @@ def pulse(s: DriveState, size: float, start: float, duration: float, edge: float
 
 @law
 def ramp(s: DriveState, rate: float, start: float = 0.0) -> float:
-    """A value that grows by `rate` per second from `start` [s] on."""
+    """Return a value that grows by `rate` per second from `start` [s] on."""
     return rate * max(0.0, s.time - start)
 
 
 @law
 def exponential_drift(s: DriveState, value: float, time_constant: float) -> float:
-    """A value that is approached from zero as `1 - exp(-t / time_constant)`."""
+    """Return `value (1 - exp(-t / time_constant))`."""
     return value * (1.0 - math.exp(-s.time / time_constant))
 
 
 def _check_points(given: Parameters, *names: str) -> None:
+    """Raise ValueError unless each list has at least two increasing numbers."""
     for name in names:
         points = list(given[name])
         if len(points) < 2 or any(b <= a for a, b in zip(points, points[1:], strict=False)):
-            raise ValueError(f"{name} must be at least two numbers that rise, not {points}")
+            raise ValueError(f"{name} must be at least two increasing numbers, not {points}")
 
 
 def _flat(values: Any) -> list[float]:
@@ -410,7 +418,7 @@ def _flat(values: Any) -> list[float]:
 def _check_table(given: Parameters) -> None:
     _check_points(given, "points")
     if len(given["values"]) != len(given["points"]):
-        raise ValueError(f"{len(given['points'])} points need as many values")
+        raise ValueError(f"values must have as many numbers as points, {len(given['points'])}")
 
 
 def _check_table2(given: Parameters) -> None:
@@ -422,7 +430,7 @@ def _check_table2(given: Parameters) -> None:
 
 @law(check=_check_table)
 def linear_table(s: DriveState, variable: Variable, points: Numbers, values: Numbers) -> float:
-    """Linear interpolation in one variable, constant beyond the first and the last point.
+    """Interpolate linearly in one variable; constant beyond the first and the last point.
 
     >>> import numpy as np
     >>> state = DriveState(*[0.0] * 12)._replace(velocity=0.15)
@@ -450,9 +458,9 @@ def table2(
     s: DriveState, row_variable: Variable, column_variable: Variable, row_points: Numbers,
     column_points: Numbers, values: Numbers,
 ) -> float:  # fmt: skip
-    """Bilinear interpolation in two variables, constant beyond the outer points.
+    """Interpolate bilinearly in two variables; constant beyond the outer points.
 
-    `values` has a row for each of the `row_points`.
+    `values` has one row for each of the `row_points`.
 
     >>> import numpy as np
     >>> state = DriveState(*[0.0] * 12)._replace(position=0.5, velocity=9.0)
@@ -479,7 +487,7 @@ def table2(
 
 @law(translate=formula_arguments)
 def formula(s: DriveState, numbers: Numbers) -> float:
-    """A sum of coefficients times products of basic functions; see `hydrotele.terms.law`.
+    """Return a sum of coefficients times products of basic functions, see `hydrotele.terms.law`.
 
     >>> import numpy as np
     >>> state = DriveState(*[0.0] * 12)._replace(velocity=-2.0)
@@ -523,13 +531,13 @@ def formula(s: DriveState, numbers: Numbers) -> float:
 
 @law
 def quadratic_drag(s: DriveState, coefficient: float) -> float:
-    """Resistance that grows with the square of the speed, `-c v |v|`."""
+    """Return a drag force proportional to the square of the speed, `-c v |v|`."""
     return -coefficient * s.velocity * abs(s.velocity)
 
 
 @law
 def load_friction(s: DriveState, coefficient: float, smoothing_velocity: float) -> float:
-    """Dry friction in proportion to the load, `-c |F| tanh(v / v0)`: seals and guides under load.
+    """Return dry friction proportional to the load, `-c |F| tanh(v / v0)`, of seals and guides.
 
     Source: Armstrong-Helouvry, Dupont and Canudas de Wit 1994, Automatica 30(7), load dependence.
     """
@@ -540,14 +548,14 @@ def load_friction(s: DriveState, coefficient: float, smoothing_velocity: float) 
 def friction_bump(
     s: DriveState, coulomb: float, centre: float, width: float, smoothing_velocity: float
 ) -> float:
-    """Dry friction at one place of the travel, `-F exp(-(x - c)^2 / (2 w^2)) tanh(v / v0)`."""
+    """Return dry friction at one position, `-F exp(-(x - c)^2 / (2 w^2)) tanh(v / v0)`."""
     far = (s.position - centre) / width
     return -coulomb * math.exp(-0.5 * far * far) * math.tanh(s.velocity / smoothing_velocity)
 
 
 @law
 def orifice_leakage(s: DriveState, flow_gain: float, smoothing: float) -> float:
-    """Turbulent flow into the rod-side chamber, `k sgn(dp) sqrt(|dp|)` made smooth through zero.
+    """Return the turbulent leakage into the rod-side chamber, `k sgn(dp) sqrt(|dp|)` smoothed.
 
     With a negative `flow_gain` it is the flow into the head-side chamber.
 
@@ -559,9 +567,9 @@ def orifice_leakage(s: DriveState, flow_gain: float, smoothing: float) -> float:
 
 @law
 def viscous_drift(s: DriveState, viscous: float, ratio: float, time_constant: float) -> float:
-    """Change of viscous friction b v with the oil's viscosity, `-b (m(t) - 1) v`.
+    """Return the change of viscous friction b v with the oil's viscosity, `-b (m(t) - 1) v`.
 
-    The viscosity is m(t) times the first one, `m = 1 + (r - 1)(1 - exp(-t / T))`.
+    The viscosity is m(t) times the initial one, `m = 1 + (r - 1)(1 - exp(-t / T))`.
     """
     change = (ratio - 1.0) * (1.0 - math.exp(-s.time / time_constant))
     return -viscous * change * s.velocity
@@ -569,7 +577,7 @@ def viscous_drift(s: DriveState, viscous: float, ratio: float, time_constant: fl
 
 @law
 def leakage_drift(s: DriveState, leakage: float, ratio: float, time_constant: float) -> float:
-    """Change of the laminar leakage into the rod-side chamber, `k (1 / m(t) - 1) (p_A - p_B)`.
+    """Return the change of laminar leakage to the rod side, `k (1 / m(t) - 1) (p_A - p_B)`.
 
     With a negative `leakage` it is the flow into the head-side chamber; m as in `viscous_drift`.
     """
@@ -583,14 +591,14 @@ OF_A_DRIVE = (
     "position", "velocity", "spool", "spool_rate", "pump_speed", "pressure_load", "pressure_head",
     "pressure_rod", "command", "force",
 )  # fmt: skip
-"""Variables that a law may see of another drive than the one that it adds to."""
+"""Variables that a law can take from another drive."""
 
 
 class Play(Facts):
-    """A play through which a variable goes: what comes through follows half a width behind.
+    """Backlash operator of a term: its output follows the variable at most `half_width` behind.
 
-    The law sees it as `played`, beside the variable itself, and what lies between as `ahead`. It
-    begins at 0, or as near as the variable lets it.
+    The law reads the output as `played` and the difference between variable and output as `ahead`.
+    The initial output is 0, or the nearest value that the variable allows.
     """
 
     variable: str
@@ -598,11 +606,11 @@ class Play(Facts):
 
 
 class Switch(Facts):
-    """A variable that switches a law on and off, as a relay with hysteresis does.
+    """Relay with hysteresis that switches a law on and off.
 
-    The law begins to act where the variable has passed `on`, and ends where it has gone back beyond
-    `off`; each comes about over a tenth of what lies between. With `on` below `off` it acts where
-    the variable is low.
+    The law becomes active when the variable passes `on`, and inactive when it returns past `off`.
+    Each transition is a ramp over a tenth of the interval between both. With `on` below `off` the
+    law is active at low values of the variable.
     """
 
     variable: str
@@ -612,22 +620,24 @@ class Switch(Facts):
     @model_validator(mode="after")
     def _check(self):
         if self.on == self.off:
-            raise ValueError(f"on and off are both {self.on:g}; between them must lie something")
+            raise ValueError(f"on and off are both {self.on:g}; they must be different")
         return self
 
 
 class Term(Facts):
     """A law that adds to a balance of a drive.
 
-    `balance` is `force` (on the drive [N] or [N m]), `flow_head` or `flow_rod` (into a chamber
-    [m^3/s]), `command` (to valve or drive [1] or [V]) or `flow_supply` (to the flow of the pump
-    that the valves share, which follows it with a lag of 20 ms [m^3/s]). `name` says what put it
-    there, such as an effect's name. In `of` the variables that are another drive's: `{velocity:
-    swing}` lets the law see the swing's velocity as its `velocity`. In `domain` a variable's range,
-    beyond which it counts with the nearer end. With a `window` it acts only between two times [s],
-    each with 0.1 s of rise or fall around it. A `play` or a `switch` gives it a memory, in a
-    machine with hydraulic axes. The `uncertainty` is the standard deviation of what the law adds.
-    `source` is the file or plug-in that defines the law, empty for laws of hydrotele.
+    - `name`: origin of the term, such as the name of an effect.
+    - `balance`: `force` (on the drive [N] or [N m]), `flow_head` or `flow_rod` (into a chamber
+      [m^3/s]), `command` (to valve or drive [1] or [V]) or `flow_supply` (flow of the shared pump,
+      which follows with a time constant of 20 ms [m^3/s]).
+    - `of`: variables taken from another drive; with `{velocity: swing}` the variable `velocity` of
+      the law is that of the swing.
+    - `domain`: variable -> range to which it is clipped.
+    - `window`: start and stop time between which the term is active [s], each with a ramp of 0.1 s.
+    - `play`, `switch`: hysteresis of the term, in a machine with hydraulic axes.
+    - `uncertainty`: standard deviation of the value of the law.
+    - `source`: file or plug-in that defines the law; empty for laws of hydrotele.
     """
 
     name: Name
@@ -656,20 +666,25 @@ class Term(Facts):
             raise ValueError(f"law {self.law!r} is not known; {suggest(self.law, LAWS)}")
         for variable in self.of:
             if variable not in OF_A_DRIVE:
-                raise ValueError(f"of: {variable!r}; {suggest(variable, OF_A_DRIVE)}")
+                raise ValueError(
+                    f"of: {variable!r} is not a variable of a drive;"
+                    f" {suggest(variable, OF_A_DRIVE)}"
+                )
         for variable, (low, high) in self.domain.items():
             if variable not in VARIABLES:
-                raise ValueError(f"domain: {variable!r}; {suggest(variable, VARIABLES)}")
+                raise ValueError(
+                    f"domain: {variable!r} is not a variable; {suggest(variable, VARIABLES)}"
+                )
             if not low < high:
-                raise ValueError(f"domain of {variable}: [{low:g}, {high:g}] must rise")
+                raise ValueError(f"domain of {variable}: [{low:g}, {high:g}] must be increasing")
         if self.play and self.switch:
-            raise ValueError("play and switch: a term has one of them")
+            raise ValueError("play and switch: a term can have only one of them")
         for key, memory in (("play", self.play), ("switch", self.switch)):
             valid = VARIABLES.keys() - {"played", "ahead"}
             if memory and memory.variable not in valid:
                 known = suggest(memory.variable, valid)
-                raise ValueError(f"{key}: {memory.variable!r} is no variable; {known}")
+                raise ValueError(f"{key}: {memory.variable!r} is not a variable; {known}")
         if self.window and not self.window[0] < self.window[1]:
-            raise ValueError("window: [{:g}, {:g}] must rise".format(*self.window))
+            raise ValueError("window: [{:g}, {:g}] must be increasing".format(*self.window))
         LAWS[self.law].numbers(self.parameters)
         return self

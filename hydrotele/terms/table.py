@@ -1,9 +1,9 @@
-"""Terms as one array of numbers that every simulator reads, and their compiled evaluation.
+"""Encoding of terms as one array that every simulator reads, and their compiled evaluation.
 
-A law is found through a table of this process, address by address, whose place compiled code knows
-as a symbol: so neither models nor exported files hold addresses, and compiled code can be cached on
-disk. A row of terms holds the law's place in that table and a checksum of its name; where the two
-do not agree, as in a file of another process, the term adds nothing.
+Compiled code finds laws in a table of function addresses of this process, which it refers to by a
+symbol. Models and exported files therefore contain no addresses, and compiled code can be cached on
+disk. The row of a term has the law's index in that table and a checksum of its name. If both do not
+match, as in a file from another process, the term adds nothing.
 """
 # pyright: reportCallIssue=false, reportPrivateImportUsage=false, reportArgumentType=false
 # numba's intrinsics are called without their typing context.
@@ -22,12 +22,12 @@ from hydrotele.core.compiled import allocation_free, compiled
 from hydrotele.core.errors import InputError
 from hydrotele.terms.law import BALANCES, LAWS, VARIABLES, DriveState, Law, Numbers, Term, Variable
 
-# numpy's integers, since numba compiles a function anew for each of Python's that it is called with
+# numpy integers, since numba compiles a function again for every Python integer literal
 FORCE, FLOW_HEAD, FLOW_ROD, COMMAND, FLOW_SUPPLY = np.arange(len(BALANCES), dtype=np.int64)
-ANY = np.int64(-1)  # drive, where it does not matter which
-MARKER = 215326.75  # of a table of terms among other custom numbers of a model
+ANY = np.int64(-1)  # any drive
+MARKER = 215326.75  # first value of a table of terms, to find it among the custom numerics
 NO_TERMS = np.zeros(0)
-COUNT = 1  # place of the number of terms, after the marker
+COUNT = 1  # index of the number of terms, after the marker
 (
     _AXIS,
     _BALANCE,
@@ -45,29 +45,29 @@ COUNT = 1  # place of the number of terms, after the marker
     _SHIFT,
     _SCALE,
     _ROW,
-) = range(16)  # of a term
-PLAY, SWITCH = 1, 2  # ways in which a term has a memory, 0 for none
-_BAND = 0.1  # of what lies between a switch's thresholds, over which it comes about
+) = range(16)  # columns of a term's row; _ROW is their number
+PLAY, SWITCH = 1, 2  # kinds of hysteresis of a term, 0 for none
+_BAND = 0.1  # width of a switch's ramps, as a fraction of the interval between its thresholds
 _HEAD = 2
-_OTHER = 4  # numbers of a variable of another drive: variable, drive, and the drive's two areas
-_MOST = 1024  # laws in a process
-_EDGE = 0.1  # s, in which a term with a window comes and goes
-_ALWAYS = (-1.0e18, 1.0e18)  # s, finite, as models keep numbers as text
-_SPEED = 1.0e-6  # m/s or rad/s, and of the speed: difference for slopes, small against 5 mm/s
-_PRESSURE = 100.0  # Pa, the same: small against the smoothing of an orifice
+_OTHER = 4  # values of a variable of another drive: variable, drive, and the drive's two areas
+_MOST = 1024  # largest number of laws in a process
+_EDGE = 0.1  # s, duration of the ramps at the ends of a term's window
+_ALWAYS = (-1.0e18, 1.0e18)  # s, finite, because MJCF files store numbers as text
+_SPEED = 1.0e-6  # absolute [m/s or rad/s] and relative step of the velocity derivative
+_PRESSURE = 100.0  # Pa, step of pressure derivatives: small against the smoothing of an orifice
 
 _registered = np.zeros((_MOST, 2), np.int64)  # address and checksum of every law
-_kept: list = []  # the compiled functions at these addresses
+_kept: list = []  # keeps the compiled functions at these addresses alive
 _places: dict[str, tuple[Law, int]] = {}
 _lock = threading.Lock()
 binding.add_symbol("hydrotele_laws", _registered.ctypes.data)
 
 
 def law_place(name: str) -> int:
-    """Place of a law among those of this process; compiles it when it is first asked for.
+    """Return the index of a law in the law table of this process; compile it on first use.
 
     Raises:
-        InputError: the law is not known here, or numba cannot compile it.
+        InputError: the law is not known in this process, or numba cannot compile it.
     """
     with _lock:
         if name not in LAWS:
@@ -76,7 +76,7 @@ def law_place(name: str) -> int:
         law, place = _places.get(name, (None, 0))
         if law is not LAWS[name]:
             if len(_kept) == _MOST:
-                raise InputError(f"law {name}", f"is more than the {_MOST} that a process can use")
+                raise InputError(f"law {name}", f"exceeds the limit of {_MOST} laws in a process")
             called = _callable_from_c(LAWS[name])
             _registered[len(_kept)] = called.address, checksum(name)
             _kept.append(called)
@@ -86,12 +86,12 @@ def law_place(name: str) -> int:
 
 
 def checksum(name: str) -> int:
-    """A number for a law's name that a float holds exactly."""
+    """Return a checksum of a law's name that a float represents exactly."""
     return zlib.crc32(name.encode())
 
 
 def _callable_from_c(law: Law):
-    """C function `double(double *parameters, double *state)` of a law."""
+    """Compile a law to a C function `double(double *parameters, double *state)`."""
     places, arguments = 1, []
     for kind in law.kinds.values():
         if kind is Numbers:
@@ -108,11 +108,11 @@ def _callable_from_c(law: Law):
     )
     own = compiled(law.function) if not law.source else _compiled_anew(law.function)
     names = {"carray": carray, "DriveState": DriveState, "function": own}
-    exec(text, names)  # the number of arguments differs from law to law
+    exec(text, names)  # generated code, because the number of arguments differs between laws
     pointer = types.CPointer(types.float64)
     try:
         return cfunc(types.float64(pointer, pointer), error_model="numpy")(names["call"])
-    except Exception as error:  # whatever numba says of a user's function
+    except Exception as error:  # numba raises many types for an invalid user function
         if not law.source:
             raise
         why = str(error).strip().splitlines()
@@ -121,7 +121,7 @@ def _callable_from_c(law: Law):
 
 
 def _compiled_anew(function):
-    """A user's function; a cache on disk would miss changes of the files that it uses."""
+    """Compile a user's function without cache, which would miss changes of the files it uses."""
     return njit(error_model="numpy", nogil=True)(function)
 
 
@@ -129,19 +129,20 @@ def terms_table(
     terms: Sequence[Term], order: Sequence[str], memory: int = 0,
     areas: Mapping[str, Sequence[float]] | None = None,
 ) -> np.ndarray:  # fmt: skip
-    """Terms as the numbers that compiled code reads.
+    """Encode terms as an array for compiled code.
 
     Args:
-        terms: of a machine.
+        terms: terms of a machine.
         order: axis names in actuator order.
-        memory: place, among the activations, of what the first term with a memory remembers; the
-            others' follow. 0 where nothing keeps it: what those terms see has then not moved yet.
+        memory: activation index of the internal state of the first term with hysteresis; those of
+            further terms follow. 0 if there are no such activations: the internal states are
+            then 0.
         areas: hydraulic axis -> (2,) areas on which its head- and rod-side pressures act [m^2] or
-            [m^3/rad], for terms that see the force of another drive.
+            [m^3/rad], for terms that use the force of another drive.
 
     Returns:
-        (n,) numbers, none where there are no terms: marker, count, a row per term, then the laws'
-        parameters, the ranges of variables, and variables with the drives that they are of.
+        (n,) array, empty without terms: marker, number of terms, one row per term, then parameters
+        of the laws, ranges of variables, and variables of other drives.
 
     Raises:
         InputError: a law is not known in this process, or cannot be compiled.
@@ -169,12 +170,12 @@ def terms_table(
 
 
 def remembering(terms: Sequence[Term]) -> list[Term]:
-    """The terms that have a memory."""
+    """Return the terms with hysteresis, in their order."""
     return [term for term in terms if term.play or term.switch]
 
 
 def _memory_numbers(term: Term, place: int) -> tuple[float, ...]:
-    """Way, place, variable, shift and scale of a term's memory."""
+    """Return kind, activation index, variable, shift and scale of a term's hysteresis."""
     if term.play:
         return PLAY, place, VARIABLES[term.play.variable], 0.0, term.play.half_width
     if term.switch:
@@ -185,7 +186,7 @@ def _memory_numbers(term: Term, place: int) -> tuple[float, ...]:
 
 @intrinsic
 def _laws(typingctx):
-    """Address of the table of laws of this process."""
+    """Return the address of the law table of this process."""
 
     def codegen(context, builder, signature, args):
         integer, name = ir.IntType(64), "hydrotele_laws"
@@ -197,7 +198,7 @@ def _laws(typingctx):
 
 @intrinsic
 def _word(typingctx, address):
-    """The int64 at an address."""
+    """Return the int64 at an address."""
 
     def codegen(context, builder, signature, args):
         place = builder.inttoptr(args[0], ir.IntType(64).as_pointer())
@@ -208,7 +209,7 @@ def _word(typingctx, address):
 
 @intrinsic
 def _call(typingctx, function, terms, at, state):
-    """Value of the law at an address, with its parameters at a place of the table."""
+    """Call the law at an address with the parameters at an index of the table; return its value."""
 
     def codegen(context, builder, signature, args):
         function, terms, at, state = args
@@ -226,7 +227,7 @@ def _call(typingctx, function, terms, at, state):
 
 @allocation_free
 def _seen(terms, at, k, value, s, drives):
-    """A variable as the law of a term sees it: of the drive that it names, inside its domain."""
+    """Return a variable as the law of a term gets it: of the drive in `of`, clipped to `domain`."""
     first = int(terms[at + _DOMAIN])
     last = first + 3 * int(terms[at + _RANGES])
     for j in range(last, last + _OTHER * int(terms[at + _OTHERS]), _OTHER):
@@ -240,14 +241,14 @@ def _seen(terms, at, k, value, s, drives):
 
 @allocation_free
 def _held(terms, at, drives):
-    """What a term remembers, scalar [1]; 0 where nothing keeps it."""
+    """Return the internal state of a term, scalar [1]; 0 if it has no activation."""
     place = int(terms[at + _PLACE])
     return drives.act[place] if 0 < place < len(drives.act) else 0.0
 
 
 @allocation_free
 def _value(terms, at, s, drives):
-    """The variable of a term's memory as it is now, of the drive that it is of [its unit]."""
+    """Return the current value of the variable of a term's hysteresis [its unit]."""
     k = int(terms[at + _REMEMBERED])
     last = int(terms[at + _DOMAIN]) + 3 * int(terms[at + _RANGES])
     for j in range(last, last + _OTHER * int(terms[at + _OTHERS]), _OTHER):
@@ -258,16 +259,17 @@ def _value(terms, at, s, drives):
 
 @allocation_free
 def remembered(way, held, x):
-    """What a term remembers after a variable has moved.
+    """Update the internal state of a play or switch for a new value of its variable.
 
     Args:
         way: PLAY or SWITCH.
-        held: what it remembered before, scalar [1].
-        x: of a play the variable over the half width; of a switch 0 where it goes off and 1 where
-            it goes on, scalar [1].
+        held: previous internal state, scalar [1].
+        x: for a play the variable divided by the half width; for a switch the variable scaled to
+            0 at the off threshold and 1 at the on threshold, scalar [1].
 
     Returns:
-        Scalar [1]: what is seen over the half width, or the share with which the law acts.
+        New internal state, scalar [1]: the output of the play divided by the half width, or the
+        factor on the law.
 
     Source: play and relay with hysteresis, Visintin 1994, Differential Models of Hysteresis; the
         relay's jumps are ramps.
@@ -281,16 +283,16 @@ def remembered(way, held, x):
 
 @allocation_free
 def remember(terms, term, value, held):
-    """What a term remembers after its variable has come to a value.
+    """Update the internal state of a term for a new value of its variable.
 
     Args:
         terms: (n,) table of `terms_table`.
-        term: index of a term with a memory.
-        value: of its variable, scalar [its unit].
-        held: what it remembered before, scalar [1].
+        term: index of a term with hysteresis.
+        value: value of its variable, scalar [its unit].
+        held: previous internal state, scalar [1].
 
     Returns:
-        Scalar [1].
+        New internal state, scalar [1].
 
     Source: `remembered`.
     """
@@ -301,7 +303,7 @@ def remember(terms, term, value, held):
 
 @allocation_free
 def memory_of(terms, term):
-    """(place among the activations, axis, variable) of a term's memory, place 0 for none."""
+    """Return (activation index, axis, variable) of a term's hysteresis; index 0 for none."""
     at = _HEAD + _ROW * term
     axis, k = int(terms[at + _AXIS]), int(terms[at + _REMEMBERED])
     last = int(terms[at + _DOMAIN]) + 3 * int(terms[at + _RANGES])
@@ -313,7 +315,7 @@ def memory_of(terms, term):
 
 @allocation_free
 def _of_drive(terms, j, s, drives):
-    """A variable of another drive, as entry j says; what all drives share is that of the state."""
+    """Return the variable of another drive given by entry j; shared variables are those of s."""
     k, i = int(terms[j]), int(terms[j + 1])
     if i < 0 or i >= len(drives.velocity):
         return 0.0
@@ -333,7 +335,7 @@ def _of_drive(terms, j, s, drives):
 
 
 def acting(time, begin, end):
-    """Share with which a term acts at a time, or at many; of scalars it is compiled, too."""
+    """Return the factor of a term's time window, 0 to 1, at a time or an array of times [s]."""
     return np.minimum(1.0, np.maximum(0.0, 0.5 + np.minimum(time - begin, end - time) / _EDGE))
 
 
@@ -342,7 +344,7 @@ _acting = allocation_free(acting)
 
 @allocation_free
 def acts_on(terms, balance, axis):
-    """Whether a term adds to a balance of a drive: what it would see need not be known if not.
+    """Return whether any term adds to a balance of a drive, so that its inputs are needed.
 
     Args:
         terms: (n,) table of `terms_table`.
@@ -363,17 +365,17 @@ def acts_on(terms, balance, axis):
 
 @allocation_free
 def added(terms, balance, axis, s, drives):
-    """What the terms add to a balance of a drive.
+    """Return the sum of all terms of a balance of a drive.
 
     Args:
         terms: (n,) table of `terms_table`.
         balance: FORCE, FLOW_HEAD, FLOW_ROD, COMMAND or FLOW_SUPPLY.
         axis: index of the actuator.
         s: DriveState.
-        drives: Drives, for variables that are another drive's.
+        drives: Drives, for variables of other drives.
 
     Returns:
-        Their sum, scalar [N], [N m], [m^3/s], [1] or [V].
+        Sum, scalar [N], [N m], [m^3/s], [1] or [V].
     """
     total = 0.0
     if len(terms) == 0:
@@ -421,7 +423,7 @@ def added(terms, balance, axis, s, drives):
 
 @allocation_free
 def _moved(s, velocity, head, rod):
-    """The state with another velocity and other pressures."""
+    """Return the state with increments added to velocity and chamber pressures."""
     return DriveState(
         s.time, s.position, s.velocity + velocity, s.spool, s.spool_rate, s.pressure_head + head,
         s.pressure_rod + rod, s.pressure_supply, s.command, s.force, s.played,
@@ -431,7 +433,7 @@ def _moved(s, velocity, head, rod):
 
 @allocation_free
 def added_with_slope(terms, balance, axis, s, drives):
-    """What the terms add to force or command, and its slope with respect to the velocity.
+    """Return the sum of the force or command terms, and its derivative by the velocity.
 
     Args:
         terms: (n,) table of `terms_table`.
@@ -451,7 +453,7 @@ def added_with_slope(terms, balance, axis, s, drives):
 
 @allocation_free
 def added_flows(terms, axis, s, drives):
-    """What the terms add to the flows into both chambers of an axis, and slopes for a stiff step.
+    """Return the flows that terms add to both chambers of an axis, and their slopes.
 
     Args:
         terms: (n,) table of `terms_table`.
@@ -460,8 +462,8 @@ def added_flows(terms, axis, s, drives):
         drives: Drives.
 
     Returns:
-        (q_head, q_rod [m^3/s], d q_head/d p_head, d q_rod/d p_rod [m^3/(s Pa)], both <= 0), the
-        slopes by forward differences.
+        (q_head, q_rod [m^3/s], d q_head/d p_head, d q_rod/d p_rod [m^3/(s Pa)]). The slopes are
+        forward differences, limited to values <= 0 for a stable implicit step.
     """
     head = added(terms, FLOW_HEAD, axis, s, drives)
     rod = added(terms, FLOW_ROD, axis, s, drives)

@@ -252,10 +252,10 @@ def test_run_that_cannot_write_says_so_before_it_simulates(tmp_path, monkeypatch
     (tmp_path / "file").write_text("")
     monkeypatch.setattr("hydrotele.cli.running.run_scenario", None)  # must not be reached
     code, _, err = invoke("run", "zhu_up", "--out", tmp_path / "file" / "run")
-    assert code == 2 and "cannot be made" in err
+    assert code == 2 and "cannot be created" in err
     monkeypatch.setattr(os, "access", lambda *_: False)
     code, _, err = invoke("run", "zhu_up", "--out", tmp_path / "run")
-    assert code == 2 and "is no folder that can be written to" in err
+    assert code == 2 and "is not a writable folder" in err
 
 
 @pytest.mark.parametrize("broken", ["save_scenario", "save_machine", "save_log"])

@@ -44,7 +44,7 @@ def test_keeps_what_no_run_wrote(tmp_path):
     with pytest.raises(InputError, match="was not written by a replay; choose another --out"):
         check_target(tmp_path / "run", "replay")
     (tmp_path / "run" / "notes.txt").write_text("mine")
-    with pytest.raises(InputError, match="holds notes.txt, which no run wrote"):
+    with pytest.raises(InputError, match="contains notes.txt, not written by a run"):
         write(tmp_path / "run", "2")
     assert names(tmp_path / "run") == ["measured.parquet", "notes.txt", "summary.json"]
     assert (tmp_path / "run" / "measured.parquet").read_text() == "1"
@@ -90,7 +90,7 @@ def test_failure_leaves_nothing_and_the_old_one(failure, tmp_path):
 
 def test_full_disk_is_an_error_of_the_user(tmp_path):
     write(tmp_path / "run", "1")
-    with pytest.raises(InputError, match="run: cannot be written, nothing .*No space left"):
+    with pytest.raises(InputError, match="run: cannot be written, output removed: .*No space left"):
         with whole_folder(tmp_path / "run", "run") as folder:
             (folder / "measured.parquet").write_text("half")
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -118,16 +118,16 @@ def test_failing_rename_keeps_the_old_one(tmp_path, monkeypatch):
 def test_place_where_nothing_can_be_made(tmp_path):
     (tmp_path / "file").write_text("x")
     for target in (tmp_path / "file" / "run", tmp_path / "file" / "a" / "run"):
-        with pytest.raises(InputError, match="cannot be made: .*file is no folder"):
+        with pytest.raises(InputError, match="cannot be created: .*file is not a writable folder"):
             check_target(target, "run")
-        with pytest.raises(InputError, match="cannot be made"):
+        with pytest.raises(InputError, match="cannot be created"):
             write(target)
 
 
 def test_folder_without_permission(tmp_path, monkeypatch):
     """Seen before the simulation where the system tells, else when the folder is made."""
     monkeypatch.setattr(os, "access", lambda *_: False)
-    with pytest.raises(InputError, match=f"cannot be made: {tmp_path} is no folder that can be"):
+    with pytest.raises(InputError, match=f"cannot be created: {tmp_path} is not a writable folder"):
         check_target(tmp_path / "run", "run")
     monkeypatch.undo()
 
@@ -135,7 +135,7 @@ def test_folder_without_permission(tmp_path, monkeypatch):
         raise PermissionError(errno.EACCES, "Permission denied")
 
     monkeypatch.setattr("hydrotele.core.output.tempfile.mkdtemp", refuse)
-    with pytest.raises(InputError, match="run: cannot be made: Permission denied"):
+    with pytest.raises(InputError, match="run: cannot be created: Permission denied"):
         write(tmp_path / "run")
 
 

@@ -163,5 +163,5 @@ def test_notes_in_a_patched_folder_are_not_lost(site, searching):
     note = site / "gap_site" / "patched" / "notes.txt"
     note.write_text("measured by hand")
     code, _, err = invoke("gap", "--data", "site", "--no-recording")
-    assert code == 2 and "patched/notes.txt, which no gap wrote" in err
+    assert code == 2 and "patched/notes.txt, not written by a gap" in err
     assert note.read_text() == "measured by hand"

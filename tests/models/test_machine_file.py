@@ -269,7 +269,7 @@ REFUSALS = {
     ),
     "duplicate key": (
         (("    mass: 200\n", "    mass: 200\n    mass: 210\n"),),
-        r":9: .*'mass' stands twice",
+        r":9: .*'mass' occurs twice",
     ),
     "bad YAML": ((("links:\n  post", "links: ]\n  post"),), r":2: is not valid YAML"),
     "tabs": ((("  post:", "\tpost:"),), r":3: is not valid YAML"),

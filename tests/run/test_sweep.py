@@ -197,7 +197,7 @@ def test_what_a_sweep_did_not_write_is_left_alone(tmp_path, monkeypatch):
                 run_sweep(file, target, SweepSettings(fresh=fresh))
     assert (tmp_path / "mine" / "thesis.txt").read_text() == "years"
     monkeypatch.setattr(os, "access", lambda *_: False)
-    with pytest.raises(InputError, match="no folder that can be written to"):
+    with pytest.raises(InputError, match="is not a writable folder"):
         run_sweep(file, tmp_path / "new")
 
 

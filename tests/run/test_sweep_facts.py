@@ -18,7 +18,7 @@ EFFECT = "set: {effects: [{name: payload, location: tool, parameters: {mass: 100
         ("grid: {servo.lead: [.nan]}", ":2: grid.servo.lead", "nan is no finite number"),
         ("grid: {servo.lead: [2026-01-01]}", ":2: grid.servo.lead", "no finite number"),
         ("grid: {servo.lead: [0.1, 0.1]}", ":2: grid.servo.lead", "0.1 stands twice"),
-        ("grid: {servo.lead: [0], servo.lead: [1]}", ":2", "the key 'servo.lead' stands twice"),
+        ("grid: {servo.lead: [0], servo.lead: [1]}", ":2", "the key 'servo.lead' occurs twice"),
         ("grid:\n  servo.led: [1]", ":3: grid.servo.led", "did you mean 'lead'"),
         ("grid:\n  servo.lead:\n    - 0.1\n    - 7", ":5: grid.servo.lead", "7: .*less than"),
         ("grid: {servo: [{}], servo.lead: [0]}", ":1", "lies inside servo"),

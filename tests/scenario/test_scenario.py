@@ -459,7 +459,7 @@ def test_errors_name_file_and_line(tmp_path):
     with pytest.raises(InputError, match=rf"{path}:6: pilot.*unknown key 'zz'.*attitude"):
         load_scenario(path)
     path.write_text("name: t\nduration: 1\nduration: 2\npilot: {kind: constant}\n")
-    with pytest.raises(InputError, match=rf"{path}:3: .*'duration' stands twice"):
+    with pytest.raises(InputError, match=rf"{path}:3: .*'duration' occurs twice"):
         load_scenario(path)
     path.write_text("name: [t\n")
     with pytest.raises(InputError, match=f"{path}.*not valid YAML"):
@@ -635,7 +635,7 @@ def test_garbage_is_refused_politely(examples, tmp_path):
 
 def test_quoted_numbers_with_units_are_refused():
     """As texts they would pass without their unit; exponents are read as in files."""
-    with pytest.raises(InputError, match="'-1.7' is a text, not a number"):
+    with pytest.raises(InputError, match="'-1.7' is text, not a number"):
         load_scenario("zhu_up", {"start.pose.attitude_deg": "'-1.7'"})
     scenario = load_scenario("zhu_up", {"start.pose.attitude_deg": "-1e2"})
     assert scenario.start.pose.attitude == pytest.approx(-1.7453292519943295, rel=1e-15)

@@ -64,7 +64,7 @@ def test_a_moved_field_is_detected(fresh, monkeypatch, struct, field, shift):
         return {k: v + shift * (name == struct and k == field) for k, v in true(name).items()}
 
     monkeypatch.setattr(layout, "field_offsets", forged)
-    with pytest.raises(RuntimeError, match=rf"keeps .*{field}.* elsewhere"):
+    with pytest.raises(RuntimeError, match=rf"stores .*{field}.* at other offsets"):
         layout.verify_layout()
 
 

@@ -129,7 +129,7 @@ def test_a_log_needs_a_grab_with_a_pocket():
     assert error.value.where == "surroundings.0.grab"
     with pytest.raises(InputError, match="no box site 'grapple_pocket'"):
         prepare(lowered(grab="grapple"))
-    with pytest.raises(InputError, match="0.9 m does not go between jaws 0.7 m apart"):
+    with pytest.raises(InputError, match="0.9 m does not fit between jaws 0.7 m apart"):
         prepare(lowered(diameter=0.9))
 
 

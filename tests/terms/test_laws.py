@@ -173,7 +173,7 @@ def test_with_a_window_a_term_acts_for_a_while():
     at = {t: added(table, FORCE, 0, STATE._replace(time=t), NO_DRIVES)
           for t in (1.9, 1.975, 2.0, 2.5, 3.0, 3.1)}  # fmt: skip
     assert list(at.values()) == pytest.approx([0.0, 1.0, 2.0, 4.0, 2.0, 0.0])
-    with pytest.raises(ValidationError, match=r"window: \[3, 2\] must rise"):
+    with pytest.raises(ValidationError, match=r"window: \[3, 2\] must be increasing"):
         force_term("constant", {"value": 1.0}, window=(3.0, 2.0))
 
 
@@ -252,11 +252,11 @@ def test_memories_that_cannot_be_are_refused():
         {"variable": "spool", "on": 1, "off": 0},
     )
     for memory, message in (
-        ({"play": play, "switch": switch}, "a term has one of them"),
+        ({"play": play, "switch": switch}, "a term can have only one of them"),
         ({"play": play | {"half_width": 0.0}}, "greater than 0"),
-        ({"play": play | {"variable": "played"}}, "play: 'played' is no variable"),
+        ({"play": play | {"variable": "played"}}, "play: 'played' is not a variable"),
         ({"switch": switch | {"variable": "sppol"}}, "did you mean 'spool'"),
-        ({"switch": switch | {"off": 1}}, "between them must lie something"),
+        ({"switch": switch | {"off": 1}}, "they must be different"),
     ):
         with pytest.raises(ValidationError, match=message):
             force_term("constant", {"value": 1.0}, **memory)
@@ -285,25 +285,25 @@ def test_a_wrong_place_or_the_place_of_another_law_adds_nothing():
     ("law_", "parameters", "message"),
     [
         ("puls", {}, "law 'puls' is not known; did you mean 'pulse'"),
-        ("pulse", {"size": 1.0}, "needs the parameters start, duration, too"),
+        ("pulse", {"size": 1.0}, "law pulse: missing parameters start, duration"),
         ("constant", {"value": 1.0, "vlaue": 2.0}, "parameter 'vlaue'; did you mean 'value'"),
         ("constant", {"value": [1.0, 2.0]}, "must be a finite number, not"),
         ("constant", {"value": "much"}, "must be a finite number, not 'much'"),
         ("linear_table", {"variable": "speed", "points": [0, 1], "values": [0, 1]},
-         "'speed' is no variable; .*valid: ahead, command"),
+         "'speed' is not a variable; .*valid: ahead, command"),
         ("linear_table", {"variable": "velocity", "points": [0, 1, 1], "values": [0, 1, 2]},
-         "must be at least two numbers that rise"),
+         "must be at least two increasing numbers"),
         ("linear_table", {"variable": "velocity", "points": [0, 1], "values": [0, 1, 2]},
-         "2 points need as many values"),
+         "values must have as many numbers as points, 2"),
         ("table2", USED["table2"] | {"values": [1.0, 2.0]}, "must be 3 rows of 2 numbers"),
         ("formula", {}, "at least one product"),
-        ("formula", {"velocity +": 1.0}, "it cannot be read"),
-        ("formula", {"speed": 1.0}, "'speed' is no variable"),
+        ("formula", {"velocity +": 1.0}, "it cannot be parsed"),
+        ("formula", {"speed": 1.0}, "'speed' is not a variable"),
         ("formula", {"velocity ** 9": 1.0}, "whole number from 1 to 6"),
         ("formula", {"bump(position, 0.1)": 1.0}, r"the function is bump\(e, c, w\)"),
         ("formula", {"sign(velocity, 0)": 1.0}, "must be positive"),
-        ("formula", {"__import__('os')": 1.0}, "is no function; .*abs"),
-        ("formula", {"velocity": "fast"}, "the coefficient 'fast' is no number"),
+        ("formula", {"__import__('os')": 1.0}, "is not a function; .*abs"),
+        ("formula", {"velocity": "fast"}, "the coefficient 'fast' is not a number"),
     ],
 )  # fmt: skip
 def test_refused_with_what_is_valid(law_, parameters, message):
@@ -328,9 +328,9 @@ def test_a_flow_of_the_pump_needs_valves_and_a_pump_that_gives_so_much(machine, 
 
 
 def test_domains_are_checked():
-    with pytest.raises(ValidationError, match="domain: 'speed'; .*velocity"):
+    with pytest.raises(ValidationError, match="domain: 'speed' is not a variable; .*velocity"):
         force_term("constant", {"value": 1.0}, domain={"speed": (0.0, 1.0)})
-    with pytest.raises(ValidationError, match="must rise"):
+    with pytest.raises(ValidationError, match="must be increasing"):
         force_term("constant", {"value": 1.0}, domain={"velocity": (1.0, 0.0)})
 
 
