@@ -365,7 +365,8 @@ POSES = Experiment(
         ),
         Claim(
             "3-2-1 wires: pose by three spheres",
-            "Six wire lengths give the pose, with errors that agree with the propagated covariance.",
+            "Six wire lengths give the pose, with errors that agree with the propagated"
+            " covariance.",
             "section 5.1", "additional", _judge_wires, {"noise": 1.5},
             "the wires' noise is 1.5 times the assumed one",
         ),
