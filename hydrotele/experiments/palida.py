@@ -145,7 +145,7 @@ def read_settings(defaults: Changes, changes: Changes) -> dict[str, Any]:
 
 
 def draw_states() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Draw poses, rates and accelerations (100, 6) that excite all parameters, with a fixed seed."""
+    """Draw poses, rates and accelerations (100, 6) that excite all parameters, with fixed seed."""
     rng = np.random.default_rng(0)
     poses = 0.5 * (POSE_LOW + POSE_HIGH)
     poses = poses + 0.4 * (POSE_HIGH - POSE_LOW) * rng.uniform(-1.0, 1.0, (100, 6))

@@ -307,14 +307,14 @@ def judge_table_1(samples: Sequence[Sample]) -> Judgement:
             check_exact("combinations with the members and coefficients of Table 1", values["same"],
                         (10, 10), "Table 1", published=10),
         ),
-        "the null space is that of a regressor in which legs are equal and 19 inertial columns are"
-        " declared absent, because Table 1 has bodies that are symmetrical; without this"
+        "the null space is computed from a regressor with equal legs and 19 inertial columns"
+        " declared absent, because the bodies in Table 1 are symmetrical; without this"
         f" declaration the rank of the inertial columns is {values['rank, equal legs']:.0f}",
     )  # fmt: skip
 
 
 def judge_rules(samples: Sequence[Sample]) -> Judgement:
-    """Judge number and coefficients of the regrouped parameters by the null space."""
+    """Compare number and coefficients of the regrouped parameters with the null space."""
     values, checks = samples[0].values, []
     for stage in _STAGES:
         rank = values[f"rank, {stage}"]
@@ -328,7 +328,7 @@ def judge_rules(samples: Sequence[Sample]) -> Judgement:
 
 
 def judge_values(samples: Sequence[Sample]) -> Judgement:
-    """Judge the model's base parameters by the printed estimates."""
+    """Compare the model's base parameters with the printed estimates."""
     worst = float(collect(samples, "values").max())
     check = check_exact("largest difference from the estimates of Table 2", worst, (0.0, 1e-9),
                         "rounding of the decimals in the MJCF", unit="SI")  # fmt: skip
@@ -354,7 +354,7 @@ STRUCTURE = Experiment(
             " terminal bodies can be grouped to the inertial parameter of the platform according to"
             " Steiner's laws.\"",
             "section 2.1, (9) to (11)", "document", judge_rules,
-            {"platform_rule": False}, "the rule for the platform is left out",
+            {"platform_rule": False}, "the rule for the platform is not applied",
         ),
         Claim(
             "parameters of the model",

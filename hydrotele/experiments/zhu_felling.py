@@ -1,4 +1,4 @@
-"""Zhu 1994, 6.3 and 6.3.2: tree felling with the feller-buncher, and protection against tip-over."""
+"""Zhu 1994, 6.3 and 6.3.2: tree felling with the feller-buncher, and tip-over protection."""
 
 from collections.abc import Sequence
 

@@ -212,7 +212,7 @@ CONDITIONS: tuple[tuple[str, Changes, dict[str, float]], ...] = (
     ("hand twice as stiff and damped", {}, {"stiffness": 2.0, "damping": 2.0}),
     ("joystick sampled at 100 Hz", {"control_rate": "100"}, {}),
 )  # fmt: skip
-"""Conditions that may limit direct feedback: (description, scenario changes, factors of the hand)."""
+"""Conditions that may limit direct feedback: (description, changes, factors of the hand)."""
 _SEARCH = (4.0e-5, 8.0e-4)  # range of searched ratios [N/N]
 _HALVINGS = 4
 _SEARCH_ERROR = 1.2  # uncertainty factor of the limit after the halvings
