@@ -334,7 +334,7 @@ def judge_errors(samples: Sequence[Sample], path: str) -> Judgement:
             check_mean(
                 "error of linear control at the highest speed over that at the lowest",
                 collect(samples, f"{path} growth"), (1.5, np.inf),
-                '"significant decreasing accuracy": half as much error again'),
+                '"significant decreasing accuracy": at least 1.5 times the error'),
             check_mean(
                 "largest error with the nominal model over that of linear control",
                 collect(samples, f"{path} nominal"), (0.0, 1.0), '"improves always"'),

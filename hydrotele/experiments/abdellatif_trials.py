@@ -362,8 +362,8 @@ def judge_ellipsoid(samples: Sequence[Sample]) -> Judgement:
 def check_bias(quantity: str, mean: np.ndarray, covariance: np.ndarray, count: int) -> Check:
     """Return a check of an estimator's bias, in standard deviations of one estimate.
 
-    For a bias of length d, the squared mean error is noncentral chi-squared with p degrees of
-    freedom and noncentrality n d^2. The interval follows from the quantiles of this distribution.
+    For a bias of length d, n times the squared mean error has a noncentral chi-squared distribution
+    with p degrees of freedom and noncentrality n d^2. Its quantiles give the interval.
 
     Args:
         quantity: name of the bias.

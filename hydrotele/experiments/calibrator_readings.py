@@ -1,9 +1,9 @@
 """Simulate calibrator readings with sensor errors, bent joints, drift and manufacturing errors.
 
-The module uses only the kinematics of the closed chain, which is fast enough for many seeds;
-`models/calibrator` is the same chain with masses and hydraulics in MuJoCo. It also computes the tip
-error of an arm that is positioned with a nominal or a calibrated machine. Ground truth is used only
-to generate readings and to evaluate estimates.
+The module uses only the kinematics of the closed chain, which is fast enough for many seeds. The
+same chain with masses and hydraulics in MuJoCo is `models/calibrator`. The module also computes the
+tip error of an arm positioned with a nominal or a calibrated machine. Ground truth is used only to
+generate readings and to evaluate estimates.
 """
 
 from collections.abc import Mapping, Sequence
@@ -86,7 +86,7 @@ def bend_level_joints(
     """Draw errors of joints bent by gravity, as in Khoshzaban 1992, section 3.7.3 (p. 61).
 
     N(0, `degrees`) is added to the grapple and yoke angles in the poses in which gravity bends them
-    most, that is, in which the calibrator's arm is closest to horizontal.
+    most. In these poses the calibrator's arm is closest to horizontal.
 
     Args:
         loop: true chain.

@@ -346,7 +346,7 @@ EXPERIMENTS = (
         Claim("identifiable parameters of each stage",
               "link 4: offsets of joints 5 to 7, alpha, a, d of link 5, alpha, a of link 4; links 3"
               " and 2: the held angle outside, alpha, a, beta; link 1: theta_fix 2, d2, alpha 1,"
-              " a1; besides the ball's p_xy and p_z",
+              " a1; in addition, the ball's p_xy and p_z",
               "section 3.6.4, pp. 54-56", "document", judge_lists, {"wander": 0.0},
               "the grapple does not rotate"),
     ), repetitions_fixed=1),

@@ -1,7 +1,7 @@
 """PaLiDA, the hexapod of Abdellatif 2008: published parameters, simulated measurements, control.
 
-The module contains Table 2 of the document, the shipped model with its regressor, simulated
-measurements with force and encoder noise, and path tracking in MuJoCo with feedforward.
+The module contains Table 2 of the document and the shipped model with its regressor. It simulates
+measurements with force and encoder noise, and tracks paths in MuJoCo with feedforward.
 """
 
 import json

@@ -85,7 +85,7 @@ def list_relations(chain: Chain, platform_rule: bool = True) -> Iterator[Relatio
     Prismatic joint: all moments of inertia of the slider are added to the stator. Platform: the
     slider's mass acts as a point mass in the platform joint, the origin of its frame (Steiner).
     Revolute joint: mass, first moment along the axis, and equal inertias about x and y represent
-    point masses on the axis, which the joint does not move; they are added to the antecedent body.
+    point masses on the axis. The joint does not move them; they are added to the antecedent body.
     The base does not move, so that only a ring's inertia about its axis remains.
 
     Args:

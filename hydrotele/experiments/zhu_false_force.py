@@ -111,7 +111,7 @@ def measure_false_force(seed: int, changes: Changes) -> Sample:
                 waiting = (time > 0.5) & (time < moving)
                 at_rest = float(np.sqrt(np.mean(size[waiting] ** 2)))
             curves[kind] = force["z"] / 1e3
-        panels.append(Panel(f"estimated vertical force in the air, {name} [kN]", time, curves))
+        panels.append(Panel(f"estimated vertical force in free motion, {name} [kN]", time, curves))
     values |= {key: float(np.sqrt(square)) for key, square in squares.items()}
     values |= {
         "at_rest": at_rest, "share": values["dynamic"] / values["static"],

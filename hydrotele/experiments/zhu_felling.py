@@ -24,7 +24,7 @@ from hydrotele.teleop.master import tipping_share
 JUST_NOTICEABLE = 0.23
 """Just noticeable relative difference of a compliance without other cues (Tan 1995)."""
 _CONTACT = 500.0  # force of the head on the stem that counts as contact [N]
-_STANDS_OUT = 3.0  # detectable force over the force estimated in the air
+_STANDS_OUT = 3.0  # detectable force over the force estimated without contact
 _MAX_RISE = 1.0  # s; a ninth of the time axis of Fig. 6.55
 _NEVER = np.inf  # time of an event that does not occur [s]
 _MAX_LAID = -50.0  # attitude of the head at which the stem lies rather than stands [deg]
@@ -105,8 +105,8 @@ def _judge_contact(samples: Sequence[Sample]) -> Judgement:
     checks = (
         check_fraction("operators whose head presses on the stem with 0.5 kN or more before the saw"
                        " starts", collect(samples, "touched") < collect(samples, "saw")),
-        check_fraction(f"operators whose estimated force reaches {_STANDS_OUT:g} times that in the"
-                       f" air within {_MAX_RISE:g} s of the contact",
+        check_fraction(f"operators whose estimated force reaches {_STANDS_OUT:g} times that without"
+                       f" contact within {_MAX_RISE:g} s after contact",
                        collect(samples, "rise") <= _MAX_RISE),
     )  # fmt: skip
     note = (
@@ -114,7 +114,7 @@ def _judge_contact(samples: Sequence[Sample]) -> Judgement:
         f" {format_values(samples, 'stem', 1e-3)} kN on the stem, the estimated force rises within"
         f" {format_values(samples, 'rise', 1.0, 2)} s; estimated"
         f" {format_values(samples, 'contact_force', 1e-3)} kN in contact,"
-        f" {format_values(samples, 'free_force', 1e-3)} kN in the air (98th percentiles)"
+        f" {format_values(samples, 'free_force', 1e-3)} kN without contact (98th percentiles)"
     )
     explanation = (
         "the resting disc touches the stem, then the operator retracts it and starts the saw,"
@@ -129,7 +129,7 @@ def _judge_felt(samples: Sequence[Sample]) -> Judgement:
         " saw starts", collect(samples, "stiffness_change") > JUST_NOTICEABLE,
     )  # fmt: skip
     note = (
-        f"stiffness along x from {format_values(samples, 'stiffness_free', 1e-3)} N/mm in the air"
+        f"stiffness along x from {format_values(samples, 'stiffness_free', 1e-3)} N/mm without contact"
         f" to {format_values(samples, 'stiffness_contact', 1e-3)} N/mm in contact; centring force"
         f" up to {format_values(samples, 'centring')} N"
     )

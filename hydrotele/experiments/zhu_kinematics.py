@@ -156,8 +156,8 @@ def judge_reach(samples: Sequence[Sample]) -> Judgement:
 def measure_solutions(changes: Changes) -> Sample:
     """Count candidates and solutions of both approaches for the feller-buncher's tool.
 
-    A candidate is extraneous if the azimuth of the arm plane is not that of the end of the tilt
-    link (2.14, 2.32), which then lies behind the swing axis.
+    A candidate is extraneous if the end of the tilt link lies behind the swing axis. Its azimuth
+    is then not that of the arm plane (2.14, 2.32).
 
     Args:
         changes: `check`: 0 to count extraneous candidates as solutions.
