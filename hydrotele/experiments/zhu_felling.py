@@ -129,8 +129,9 @@ def _judge_felt(samples: Sequence[Sample]) -> Judgement:
         " saw starts", collect(samples, "stiffness_change") > JUST_NOTICEABLE,
     )  # fmt: skip
     note = (
-        f"stiffness along x from {format_values(samples, 'stiffness_free', 1e-3)} N/mm without contact"
-        f" to {format_values(samples, 'stiffness_contact', 1e-3)} N/mm in contact; centring force"
+        f"stiffness along x from {format_values(samples, 'stiffness_free', 1e-3)} N/mm without"
+        f" contact to {format_values(samples, 'stiffness_contact', 1e-3)} N/mm in contact; centring"
+        " force"
         f" up to {format_values(samples, 'centring')} N"
     )
     explanation = (
