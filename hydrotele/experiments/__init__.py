@@ -1,1 +1,1 @@
-"""Published experiments repeated in simulation, one module or more per document."""
+"""Repeat published experiments in simulation, with one or more modules per publication."""

@@ -1,7 +1,8 @@
-"""The experiments of Abdellatif 2008 on the hexapod PaLiDA, in simulation.
+"""Experiments of Abdellatif 2008 on the hexapod PaLiDA, repeated in simulation.
 
-Identification (sections 2 to 5.3): base parameters, excitation, data processing, estimates and
-their covariance. Control (section 5.4): feedforward of nominal and identified parameters.
+The identification experiments (sections 2 to 5.3) cover base parameters, excitation, data
+processing, estimates and their covariance. The control experiments (section 5.4) compare
+feedforward with nominal and with identified parameters.
 """
 
 from collections.abc import Callable, Sequence
@@ -66,7 +67,7 @@ HINGES = ("alpha", "beta")
 
 @cache
 def load_complete_setup() -> RegressorSetup:
-    """Setup in which every passive hinge has separate dry and viscous friction."""
+    """Return the regressor setup with separate dry and viscous friction in every passive hinge."""
     mapping, folder = load_robot().mechanism.mapping, models_folder() / "palida"
     complete = ColumnMapping(
         position=mapping.position, force=mapping.force, coordinates=mapping.coordinates,
@@ -78,21 +79,28 @@ def load_complete_setup() -> RegressorSetup:
 
 
 def build_complete_regressor(motion: np.ndarray) -> Regressor:
-    """Regressor of all friction parameters along a motion (3, n, 6) of the pose."""
+    """Return the regressor of `load_complete_setup` along a motion of the pose.
+
+    Args:
+        motion: (3, n, 6) poses, rates and accelerations.
+    """
     setup = load_complete_setup()
     return setup.table(project(setup.chain, setup.given, *motion))
 
 
 def measure_reduction(seed: int, changes: Changes) -> Sample:
-    """Reduce the friction parameters of the passive joints, from 24 to those that the data support.
+    """Remove the friction parameters of the passive joints that the data cannot identify.
+
+    The reduction starts from 24 friction parameters.
 
     Args:
-        seed: of the noise.
-        changes: `hinge_scatter`: fraction by which the dry friction of hinges of one kind differs
-            from their mean, alternately up and down.
+        seed: seed of the measurement noise.
+        changes: `hinge_scatter`: relative difference of the dry friction of each hinge from the
+            mean of its kind, with alternating sign.
 
     Returns:
-        Numbers of parameters, and whether one dry friction per kind of joint is left.
+        Counts of parameters before and after, and whether exactly one dry friction parameter per
+        kind of joint remains.
     """
     settings = read_settings({"hinge_scatter": 0.0}, changes)
     cycle = simulate_excitation()
@@ -141,7 +149,7 @@ def _is_passive(name: str) -> bool:
 
 
 def judge_reduction(samples: Sequence[Sample]) -> Judgement:
-    """Judge whether the reduction finds the document's friction model."""
+    """Check how often the reduction gives the friction model of the document."""
     check = check_fraction(
         "fraction of the data sets that lead to these 14 friction parameters",
         collect(samples, "reached") > 0.5, reason="more than half; the document had one data set",
@@ -174,15 +182,16 @@ REDUCTION = Experiment(
 
 
 def measure_design(seed: int, changes: Changes) -> Sample:
-    """Compare the designed motion with a random one that is scaled up to the same limits.
+    """Compare the designed excitation with a random one that is scaled to the same limits.
 
     Args:
-        seed: of the random motion.
-        changes: `amplitude`: factor of the designed motion.
+        seed: seed of the random excitation.
+        changes: `amplitude`: factor applied to the designed excitation.
 
     Returns:
-        `ratio`: standard deviation (geometric mean over the axes of the confidence ellipsoid) with
-        the random motion, over that with the designed one. `use`: of the tightest limit.
+        `ratio`: standard deviation with the random excitation divided by that with the designed
+        one (geometric mean over the axes of the confidence ellipsoid). `use`: utilization of the
+        most restrictive limit by the designed excitation.
     """
     settings = read_settings({"amplitude": 1.0}, changes)
     best, bounds = load_excitation(), drive_limits()
@@ -213,7 +222,7 @@ def measure_design(seed: int, changes: Changes) -> Sample:
 
 
 def find_limit_use(motion: Excitation, time: np.ndarray) -> float:
-    """Largest use of any limit of pose and drives, 1 at the limit."""
+    """Return the largest utilization of any pose or drive limit; 1 means at the limit."""
     whole = motion.motion(time)
     inside = np.clip(whole[0], POSE_LOW, POSE_HIGH)
     return float(drive_limits().use(whole, np.stack([inside, whole[1], whole[2]])).max())
@@ -227,13 +236,13 @@ def _log_information(motion: Excitation, time: np.ndarray) -> float:
 
 
 def judge_design(samples: Sequence[Sample]) -> Judgement:
-    """Judge precision and limits of the designed motion."""
+    """Check the precision and the limit utilization of the designed excitation."""
     return Judgement(
         (
             check_statistic(
                 "standard deviations with random motions over those with the designed one",
                 collect(samples, "ratio"), lambda ratios: float(np.exp(np.mean(np.log(ratios)))),
-                (1.0, np.inf), "the designed motion is the better one"),
+                (1.0, np.inf), "the designed motion is more precise"),
             check_exact("use of the tightest limit", samples[0].values["use"], (0.0, 1.0), "(25)"),
         ),
         note=f"ln det of the information {samples[0].values['designed']:.1f}; of the best random"
@@ -250,27 +259,28 @@ DESIGN = Experiment(
             '"it is recommended to opt for the D-optimal design" "for experimental identification'
             ' just a sufficiently good excitation trajectory is needed"; five harmonics',
             "Fig. 5, (22) to (26), section 5.2", "document", judge_design,
-            {"amplitude": 0.1}, "the motion is made with a tenth of its amplitude",
+            {"amplitude": 0.1}, "the amplitude of the motion is scaled by 0.1",
         ),
     ),
 )  # fmt: skip
 
 # Control, section 5.4.
 
-SPEEDS = (0.25, 0.5, 0.75, 1.0)  # m/s, of the tool; the document's axis is not in its text
+SPEEDS = (0.25, 0.5, 0.75, 1.0)  # tool speeds [m/s]; the text of the document gives none
 STRATEGIES = ("linear control", "nominal feedforward", "identified feedforward")
 PATHS: dict[str, Callable[..., np.ndarray]] = {"circle": plan_circle, "square": plan_square}
 
 
 def measure_control(seed: int, changes: Changes) -> Sample:
-    """Drive both paths at all speeds with all strategies.
+    """Track both paths at all speeds with each control strategy.
 
     Args:
-        seed: of the identification and of the encoders.
-        changes: `force_scale`: factor of the force readings in the identification.
+        seed: seed of the identification and of the encoder noise.
+        changes: `force_scale`: factor applied to the force readings in the identification.
 
     Returns:
-        RMS errors of all actuators, and of actuator 5 and of the tool at the highest speed [m].
+        Ratios of RMS actuator errors between strategies and speeds, and the RMS errors of
+        actuator 5 and of the tool at the highest speed [mm].
     """
     settings = read_settings({"force_scale": 1.0}, changes)
     trial = simulate_trials(seed, TRIAL_SETTINGS | {"trials": 1, "friction_excess": 0.0})
@@ -310,7 +320,7 @@ def measure_control(seed: int, changes: Changes) -> Sample:
 
 
 def judge_errors(samples: Sequence[Sample], path: str) -> Judgement:
-    """Judge the RMS errors of all actuators on one path."""
+    """Compare the RMS actuator errors of the three strategies on one path."""
     if collect(samples, "warnings").any():
         return Judgement(unavailable="MuJoCo warned of an unstable simulation")
     curves = samples[0].panels[[p.label for p in samples[0].panels].index(
@@ -324,7 +334,7 @@ def judge_errors(samples: Sequence[Sample], path: str) -> Judgement:
             check_mean(
                 "error of linear control at the highest speed over that at the lowest",
                 collect(samples, f"{path} growth"), (1.5, np.inf),
-                '"significant decreasing accuracy": half as much error again'),
+                '"significant decreasing accuracy": at least 1.5 times the error'),
             check_mean(
                 "largest error with the nominal model over that of linear control",
                 collect(samples, f"{path} nominal"), (0.0, 1.0), '"improves always"'),
@@ -338,17 +348,17 @@ def judge_errors(samples: Sequence[Sample], path: str) -> Judgement:
 
 
 def judge_circle(samples: Sequence[Sample]) -> Judgement:
-    """Judge the errors on the circle."""
+    """Compare the RMS actuator errors on the circle."""
     return judge_errors(samples, "circle")
 
 
 def judge_square(samples: Sequence[Sample]) -> Judgement:
-    """Judge the errors on the square."""
+    """Compare the RMS actuator errors on the square."""
     return judge_errors(samples, "square")
 
 
 def judge_fastest(samples: Sequence[Sample], quantity: str) -> Judgement:
-    """Judge an error at the highest speed, with the identified over the nominal model."""
+    """Compare an error at the highest speed between the identified and the nominal model."""
     checks, notes = [], []
     for path in PATHS:
         label = f"{quantity} on the {path} [mm]"
@@ -360,12 +370,12 @@ def judge_fastest(samples: Sequence[Sample], quantity: str) -> Judgement:
 
 
 def judge_actuator(samples: Sequence[Sample]) -> Judgement:
-    """Judge the error of actuator 5."""
+    """Compare the errors of actuator 5 between both models."""
     return judge_fastest(samples, "error of actuator 5")
 
 
 def judge_tool(samples: Sequence[Sample]) -> Judgement:
-    """Judge the error of the tool."""
+    """Compare the Cartesian errors of the tool between both models."""
     return judge_fastest(samples, "Cartesian error")
 
 
@@ -376,7 +386,7 @@ _CONTROL_QUOTE = (
     ' clearly variation 2"'
 )
 _HALF_FORCE = {"force_scale": 0.5}
-_HALF_FORCE_WORDS = "force readings of the identification are half of the forces"
+_HALF_FORCE_WORDS = "the identification reads half of the actual forces"
 
 CONTROL = Experiment(
     "control",

@@ -1,6 +1,7 @@
-"""Data processing of Abdellatif 2008: from leg lengths to the motion of the pose.
+"""Data processing of Abdellatif 2008: compute the platform's motion from measured leg lengths.
 
-Sections 4.1 and 5.2, Figs 6 and 7.
+The module compares unfiltered, time-domain and frequency-domain processing (sections 4.1 and 5.2,
+Figs 6 and 7).
 """
 
 from collections.abc import Sequence
@@ -31,21 +32,22 @@ from hydrotele.identify.motion import Processing, joint_motion, resolution
 from hydrotele.identify.record import IdentificationRecord
 
 HARMONICS = 5
-"""Of the excitation and of the window, as in section 5.2."""
+"""Number of harmonics of the excitation and of the frequency window (section 5.2)."""
 WAYS = {"raw": "raw", "zero_phase": "time domain", "periodic": "frequency domain"}
 MAX_VISIBLE_ERROR = 0.01
-"""RMS error over RMS signal that "almost no noise" allows: the width of a line in print."""
-Y_AXIS = 1  # of the pose, as in Fig. 6
-CIRCLE_SPEED, CIRCLE_RADIUS = 0.5, 0.10  # m/s and m, of the circle that no model is fitted to
+"""Largest RMS error over RMS signal that counts as "almost no noise": a printed line's width."""
+Y_AXIS = 1  # index of y in the pose; Fig. 6 shows y
+CIRCLE_SPEED, CIRCLE_RADIUS = 0.5, 0.10  # m/s and m; the circle is a validation motion
 
 
 class AveragedPeriod(NamedTuple):
-    """One period of data, ready for the regressor.
+    """One averaged period of motion and force.
 
     Attributes:
         motion: (3, n, 6) poses, rates and accelerations.
-        force: (n, 6) mean of all periods [N].
-        covariance: (6, 6) of one force reading's noise, from the periods' differences [N^2].
+        force: (n, 6) mean force over all periods [N].
+        covariance: (6, 6) noise covariance of one force reading, from the differences between
+            periods [N^2].
     """
 
     motion: np.ndarray
@@ -54,17 +56,17 @@ class AveragedPeriod(NamedTuple):
 
 
 def average_periods(record: IdentificationRecord, period: float) -> AveragedPeriod:
-    """Process repeated periods in the frequency domain.
+    """Average repeated periods and filter the pose in the frequency domain.
 
-    The leg lengths' mean over the periods goes through forward kinematics; the pose keeps its first
-    five harmonics and is differentiated with them.
+    Forward kinematics converts the mean leg lengths to poses. The first five harmonics of the pose
+    are kept and differentiated.
 
     Args:
         record: leg lengths and forces of at least two whole periods.
-        period: [s].
+        period: length of one period [s].
 
     Returns:
-        One period.
+        Motion, mean force and force noise covariance of one period.
 
     Source: Abdellatif 2008, section 4.1, (27).
     """
@@ -76,7 +78,14 @@ def average_periods(record: IdentificationRecord, period: float) -> AveragedPeri
 
 
 def average_force(force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (n, 6) of periods (p, n, 6), and covariance (6, 6) of one reading's noise [N^2]."""
+    """Return the mean over the periods, and the noise covariance of one force reading.
+
+    Args:
+        force: (p, n, 6) forces of p periods [N].
+
+    Returns:
+        ((n, 6) mean force [N], (6, 6) covariance [N^2]).
+    """
     mean = force.mean(axis=0)
     rest = (force - mean).reshape(-1, 6)
     return mean, rest.T @ rest / ((len(force) - 1) * len(mean))
@@ -85,16 +94,16 @@ def average_force(force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def process_lengths(
     record: IdentificationRecord, period: float, method: str, harmonics: int = HARMONICS
 ) -> np.ndarray:
-    """Poses, rates and accelerations (3, n, 6) of measured leg lengths.
+    """Compute poses, rates and accelerations from measured leg lengths.
 
     Args:
-        record: leg lengths.
-        period: of the motion [s].
+        record: record with the leg lengths.
+        period: period of the motion [s].
         method: `raw`, `zero_phase` (time domain) or `periodic` (frequency domain).
-        harmonics: that the window of `periodic` keeps.
+        harmonics: number of harmonics that `periodic` keeps.
 
     Returns:
-        The motion in coordinates of the pose.
+        (3, n, 6) motion in coordinates of the pose.
     """
     pose = in_coordinates(record, load_robot().setup)
     found = resolution(pose.position, pose.period, pose.position_noise)
@@ -108,7 +117,7 @@ def process_lengths(
 
 @cache
 def simulate_circle() -> RepeatedMotion:
-    """One lap of a circle at constant speed."""
+    """Simulate one lap of a horizontal circle at constant speed."""
     rows = round(2.0 * np.pi * CIRCLE_RADIUS / CIRCLE_SPEED * SAMPLE_RATE)
     angle = 2.0 * np.pi * np.arange(rows) / rows
     speed = 2.0 * np.pi * SAMPLE_RATE / rows
@@ -122,14 +131,14 @@ def simulate_circle() -> RepeatedMotion:
 
 
 def measure_processing(seed: int, changes: Changes) -> Sample:
-    """Reconstruct the motion and identify models, by three kinds of data processing.
+    """Reconstruct the motion and identify a model with each of the three processing methods.
 
     Args:
-        seed: of the noise.
-        changes: `harmonics`: width of the window in the frequency domain.
+        seed: seed of the measurement noise.
+        changes: `harmonics`: number of harmonics in the frequency-domain window.
 
     Returns:
-        Relative errors of y and its derivatives, and variances of the error of the predicted force
+        Relative RMS errors of y and its derivatives, and error variances of the force predicted
         on the circle.
     """
     settings = read_settings({"harmonics": HARMONICS}, changes)
@@ -164,7 +173,7 @@ def _draw_reconstruction(
     rebuilt: dict[str, np.ndarray], true: np.ndarray, force: np.ndarray, period: float,
     harmonics: int,
 ) -> list[Panel]:  # fmt: skip
-    """Spectra of the measured pose with the window, and signals in the time domain."""
+    """Draw the spectra of the measured pose with the window, and the reconstructed signals."""
     lines = np.arange(1, 6 * HARMONICS + 1)
     frequency = lines / period
     panels, spectrum = [], 2.0 * np.fft.rfft(rebuilt["raw"][0])[lines] / true.shape[1]
@@ -196,7 +205,7 @@ def _draw_prediction(predicted: dict[str, np.ndarray], force: np.ndarray) -> lis
 
 
 def judge_reconstruction(samples: Sequence[Sample]) -> Judgement:
-    """Judge the error of y and its derivatives after frequency-domain filtering."""
+    """Check the errors of y and its derivatives after frequency-domain filtering."""
     checks = tuple(
         check_mean(f"relative RMS error of {label.partition(' [')[0]}",
                    collect(samples, f"periodic {order}"), (0.0, MAX_VISIBLE_ERROR),
@@ -206,11 +215,11 @@ def judge_reconstruction(samples: Sequence[Sample]) -> Judgement:
     others = ", ".join(
         f"{np.mean(collect(samples, f'{way} 2')):.2g} {WAYS[way]}" for way in ("raw", "zero_phase")
     )
-    return Judgement(checks, note=f"acceleration by the other ways: {others}")
+    return Judgement(checks, note=f"acceleration by the other methods: {others}")
 
 
 def judge_prediction(samples: Sequence[Sample]) -> Judgement:
-    """Judge the order of the error variances."""
+    """Check that the error variances have the order of the document."""
     checks = tuple(
         check_statistic(
             f"error variance, {WAYS[one]} over {WAYS[other]}",
@@ -224,8 +233,8 @@ def judge_prediction(samples: Sequence[Sample]) -> Judgement:
                   for way, words in WAYS.items())
         for kind in ("variance", "true variance")
     )  # fmt: skip
-    return Judgement(checks, note=f"variance of measured less predicted force: {measured}; of true"
-                     f" less predicted force: {true}")  # fmt: skip
+    return Judgement(checks, note=f"variance of measured minus predicted force: {measured}; of true"
+                     f" minus predicted force: {true}")  # fmt: skip
 
 
 PROCESSING = Experiment(
@@ -237,7 +246,7 @@ PROCESSING = Experiment(
             '"The effectiveness of the proposed filter is obvious, since the calculated signals'
             ' exhibit almost no noise or disturbance corruption."',
             "Fig. 6, section 5.2", "document", judge_reconstruction,
-            {"harmonics": 200}, "the window is forty times too wide",
+            {"harmonics": 200}, "the window holds 200 instead of 5 harmonics",
             (*(f"amplitude of {label}" for label in (*_ORDERS, "force of drive 5 [N]")), *_ORDERS),
         ),
         Claim(
@@ -246,7 +255,7 @@ PROCESSING = Experiment(
             ' the smallest error variance σ2 . Time-domain filtering is not accurate enough to'
             ' extract all information at the relevant frequencies."',
             "Fig. 7, section 5.2", "document", judge_prediction,
-            {"harmonics": 200}, "the window is forty times too wide",
+            {"harmonics": 200}, "the window holds 200 instead of 5 harmonics",
             tuple(f"force of drive 5, {words} [N]" for words in WAYS.values()),
         ),
     ),

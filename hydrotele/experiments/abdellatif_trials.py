@@ -1,6 +1,8 @@
-"""Repeated identification of PaLiDA: estimates, their covariance, and friction that warms up.
+"""Repeated identification of PaLiDA with new force noise in every trial (Abdellatif 2008).
 
-Abdellatif 2008, sections 3, 4.2 and 5.3: Table 2, Figs 8 and 9, and the bias of least squares.
+The module compares the estimates and their covariance with Table 2, Figs 8 and 9 and the text on
+least squares (sections 3, 4.2 and 5.3). Friction can decrease over the first trials, as in a
+machine that warms up.
 """
 
 from collections.abc import Sequence
@@ -49,35 +51,44 @@ from hydrotele.experiments.palida import (
 from hydrotele.identify.estimation import estimate
 
 PERIODS = 4
-"""Repetitions of the motion in one trial; the document prints none."""
+"""Repetitions of the motion in one trial; the document gives no number."""
 TRIALS = 100
-"""Trials of one series, as in section 5.3."""
+"""Trials in one series (section 5.3)."""
 FRICTION_EXCESS = 0.03
-"""Excess of all friction parameters in the first trial, over their stationary values; assumed. The
-document says only that friction varies "at the beginning of the measurement process"."""
+"""Relative excess of all friction parameters in the first trial over their stationary values.
+
+Assumed: the document says only that friction varies "at the beginning of the measurement process".
+"""
 EXCESS_DECAY = 0.1
-"""Factor of the excess from one trial to the next; assumed. With 0.3 % left, one in seven second
-trials is outside the ellipsoid, where 5 % are expected without any excess."""
+"""Factor of the friction excess from one trial to the next; assumed.
+
+An excess of 0.3 % puts one in seven second trials outside the ellipsoid; 5 % are expected without
+excess.
+"""
 RIPPLE, RIPPLE_PITCH = 5.0, 0.03
-"""Amplitude [N] and period in leg length [m] of a repeatable force such as the magnets of linear
-motors cause; assumed, and used for an explanation only."""
+"""Amplitude [N] and period in leg length [m] of a repeatable force, such as motor cogging.
+
+Assumed; used only to explain a difference.
+"""
 MAX_EXCEPTIONS = 0.1
-"""Fraction of estimates outside their intervals that "mostly within" allows: twice the 5 % that a
-95 % interval leaves outside."""
+"""Largest fraction of estimates outside their intervals that counts as "mostly within".
+
+Twice the 5 % that are expected outside a 95 % interval.
+"""
 _PRINTED = np.array([one.value for one in TABLE])
 _STD = np.array([one.std for one in TABLE])
 _IS_FRICTION = np.array([one.column.startswith(("coulomb", "viscous")) for one in TABLE])
 
 
 class NormalEquations:
-    """Normal equations of one regressor for any forces and any covariance of the drives.
+    """Normal equations of one regressor, reusable for any forces and any drive covariance.
 
     Attributes:
         matrix: (n, 6, 24) regressor.
     """
 
     def __init__(self, matrix: np.ndarray):
-        """Multiply the columns of all pairs of drives.
+        """Precompute the products of the columns of all pairs of drives.
 
         Args:
             matrix: (n, 6, 24) regressor.
@@ -88,40 +99,45 @@ class NormalEquations:
         self._products = products.transpose(0, 2, 1, 3)
 
     def information(self, weight: np.ndarray) -> np.ndarray:
-        """(24, 24) of equations with weight (6, 6) [1/N^2]: the inverse of P in (28)."""
+        """Return the (24, 24) information matrix, the inverse of P in (28).
+
+        Args:
+            weight: (6, 6) weight of the drives, the inverse of their noise covariance [1/N^2].
+        """
         return np.tensordot(weight, self._products, axes=2)
 
     def solve(
         self, weight: np.ndarray, correlations: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-        """Estimate parameters, by (21).
+        """Estimate the parameters of t trials by weighted least squares (21).
 
         Args:
-            weight: (t, 6, 6) of the drives, or (1, 6, 6) for all.
-            correlations: (t, 6, 6, 24) with the forces.
+            weight: (t, 6, 6) weight of the drives in each trial, or (1, 6, 6) for all trials.
+            correlations: (t, 6, 6, 24) products of columns and forces; see `correlate`.
 
         Returns:
-            Estimates (t, 24) and their information (t, 24, 24).
+            Estimates (t, 24) and their information matrices (t, 24, 24).
         """
         information = np.tensordot(weight, self._products, axes=2)
         right = np.sum(weight[..., None] * correlations, axis=(1, 2))
         return np.linalg.solve(information, right[..., None])[..., 0], information
 
     def correlate(self, force: np.ndarray) -> np.ndarray:
-        """(6, 6, 24) products of every drive's columns with the force (n, 6) of every drive."""
+        """Return the (6, 6, 24) products of each drive's columns with each drive's force (n, 6)."""
         return (self._columns @ force).reshape(6, 24, 6).transpose(0, 2, 1)
 
 
 class Trials(NamedTuple):
-    """A series of t trials.
+    """Estimates of a series of t trials.
 
     Attributes:
         value: (t, 24) Gauss-Markov estimates.
         information: (t, 24, 24) inverse of their covariance P by (28).
-        warm_first: (24,) the first trial's estimate with the same noise and stationary friction.
+        warm_first: (24,) estimate of the first trial with the same noise but stationary friction.
         least_squares: (t, 24) estimates with equal weights for all drives.
-        rippled: (t, 24) estimates with a repeatable force and a covariance of residuals.
-        rippled_information: (24, 24) inverse of the covariance that is claimed for these.
+        rippled: (t, 24) estimates with an additional repeatable force, weighted by the residual
+            covariance.
+        rippled_information: (24, 24) inverse of the covariance of `rippled` by (28).
     """
 
     value: np.ndarray
@@ -136,23 +152,27 @@ TRIAL_SETTINGS = {
     "friction_excess": FRICTION_EXCESS, "claimed_noise": 1.0, "processing": "periodic",
     "trials": TRIALS,
 }  # fmt: skip
-"""Of `simulate_trials`: excess of friction in the first trial; factor of the standard deviations of
-force noise that the covariance claims; `periodic` or `raw` differences of the poses; number of
-trials."""
+"""Settings of `simulate_trials`.
+
+- `friction_excess`: relative friction excess in the first trial.
+- `claimed_noise`: force noise standard deviation used in the estimate over the actual one.
+- `processing`: `periodic` or `raw`; see `process_lengths`.
+- `trials`: number of trials.
+"""
 
 
 def simulate_trials(seed: int, settings: Changes) -> Trials:
-    """Identify the robot again and again, with new force noise in every trial.
+    """Identify the robot in a series of trials with new force noise in every trial.
 
-    The trials of a series share the noise of the leg lengths, whose effect on the estimates is
-    small: see `judge_ellipsoid`.
+    All trials of a series use the same leg length noise, whose effect on the estimates is small;
+    see `judge_ellipsoid`.
 
     Args:
-        seed: of the series.
+        seed: seed of the series.
         settings: see `TRIAL_SETTINGS`.
 
     Returns:
-        The estimates.
+        The estimates of all trials.
 
     Source: Abdellatif 2008, (21), (28), section 5.3.
     """
@@ -186,15 +206,16 @@ def simulate_trials(seed: int, settings: Changes) -> Trials:
 
 
 def measure_trials(seed: int, changes: Changes) -> Sample:
-    """Simulate one series of trials.
+    """Simulate one series of trials and summarize its estimates.
 
     Args:
-        seed: of the series.
-        changes: of `TRIAL_SETTINGS`.
+        seed: seed of the series.
+        changes: changes of `TRIAL_SETTINGS`.
 
     Returns:
-        Estimates `value` and `least_squares` (t, 24), `std` (24,), squared distances `distance`
-        (t,) from the mean of all trials after the first, and figures of the first trial.
+        Arrays `value` and `least_squares` (t, 24), `std` (24,), and `distance` (t,), the squared
+        distance from the mean of all trials after the first. The values describe the first trial
+        and the fractions of estimates inside intervals.
     """
     trials = simulate_trials(seed, read_settings(TRIAL_SETTINGS, changes))
     later = trials.value[1:]
@@ -221,7 +242,7 @@ def measure_trials(seed: int, changes: Changes) -> Sample:
 
 
 def square_distance(error: np.ndarray, information: np.ndarray) -> np.ndarray:
-    """Squared length (...) of errors (..., 24) in standard deviations, by (29)."""
+    """Return the squared Mahalanobis distance (...) of errors (..., 24), by (29)."""
     return np.einsum("...p,...pq,...q->...", error, information, error)
 
 
@@ -246,20 +267,20 @@ def _draw_distance(distance: np.ndarray) -> Panel:
 
 
 def judge_intervals(samples: Sequence[Sample]) -> Judgement:
-    """Judge the estimates by the printed intervals."""
+    """Check how many estimates lie inside the printed intervals."""
     check = check_mean(
         "fraction of the estimates within the printed 95 % intervals", collect(samples, "printed"),
-        (1.0 - MAX_EXCEPTIONS, 1.0), "at most twice the 5 % that a 95 % interval leaves outside",
+        (1.0 - MAX_EXCEPTIONS, 1.0), "at most twice the 5 % expected outside a 95 % interval",
     )  # fmt: skip
     return Judgement((check,))
 
 
 def judge_deviations(samples: Sequence[Sample]) -> Judgement:
-    """Judge the standard deviations by those of the printed intervals."""
+    """Compare the standard deviations with those of the printed intervals."""
     ratio = np.mean([sample.arrays["std"] for sample in samples], axis=0) / _STD
     low, high = int(np.argmin(ratio)), int(np.argmax(ratio))
     words = "standard deviation over the printed one, "
-    reason = "the noise and the geometry were chosen for a factor of two at most"
+    reason = "noise and geometry of the model are chosen to agree within a factor of two"
     return Judgement(
         (
             check_exact(f"{words}smallest ({SYMBOLS[low]})", ratio[low], (0.5, 2.0), reason),
@@ -270,44 +291,44 @@ def judge_deviations(samples: Sequence[Sample]) -> Judgement:
 
 
 def judge_history(samples: Sequence[Sample]) -> Judgement:
-    """Judge the estimates by their own intervals about the mean of the series."""
+    """Check how many estimates lie inside their own intervals about the mean of the series."""
     return Judgement((
         check_mean(
             "fraction of the estimates after the first trial within their intervals",
             collect(samples, "inside"), (1.0 - MAX_EXCEPTIONS, 1.0),
-            '"mostly": at most twice the 5 % that a 95 % interval leaves outside'),
+            '"mostly": at most twice the 5 % expected outside a 95 % interval'),
         check_mean(
             "fraction of the 24 estimates of the first trial outside their intervals",
             collect(samples, "first"), (MAX_EXCEPTIONS, 1.0),
-            '"exceptions": more than twice the 5 % that a 95 % interval leaves outside'),
+            '"exceptions": more than twice the 5 % expected outside a 95 % interval'),
     ))  # fmt: skip
 
 
 def judge_first_parameter(samples: Sequence[Sample]) -> Judgement:
-    """Judge whether p1 leaves its interval more often than others."""
+    """Check whether estimates of p1 are outside their intervals more often than others."""
     check = check_mean(
         "fraction of the estimates of p1 outside their intervals", collect(samples, "p1"),
         (MAX_EXCEPTIONS, 1.0),
-        '"exceptions": more than twice the 5 % that a 95 % interval leaves outside',
+        '"exceptions": more than twice the 5 % expected outside a 95 % interval',
     )  # fmt: skip
     others = 100.0 * (1.0 - float(np.mean(collect(samples, "inside"))))
     return Judgement(
         (check,),
-        f"the simulated force noise is all that changes from trial to trial, and the covariance"
-        f" holds all of it, so that p1 is no exception ({others:.1f} % of all estimates are"
-        " outside); the document's p1 is a sum of moments of inertia with a negative estimate, so"
-        " that effects without a parameter are in it",
+        f"only the simulated force noise changes from trial to trial, and the covariance includes"
+        f" all of it, so that p1 is no exception ({others:.1f} % of all estimates are"
+        " outside); in the document the sum of moments of inertia p1 has a negative estimate, which"
+        " must therefore include unmodelled effects",
     )
 
 
 def judge_first_trial(samples: Sequence[Sample]) -> Judgement:
-    """Judge whether friction that is not warm brings the first trial out of the ellipsoid."""
+    """Check whether the friction excess moves the first trial out of the ellipsoid."""
     cold, warm = (collect(samples, name) for name in ("first distance", "warm first distance"))
     return Judgement(
         (
             check_fraction("fraction of the first trials outside the ellipsoid", cold > CHI2_LIMIT,
                            reason="more than half of the series; the document had one"),
-            check_fraction("fraction outside with the same noise and friction that is warm from"
+            check_fraction("fraction outside with the same noise and stationary friction from"
                            " the start", warm > CHI2_LIMIT, (0.0, 0.5),
                            "less than half of the series: friction is the cause"),
         ),
@@ -317,7 +338,7 @@ def judge_first_trial(samples: Sequence[Sample]) -> Judgement:
 
 
 def judge_ellipsoid(samples: Sequence[Sample]) -> Judgement:
-    """Judge the fraction of the sets within the ellipsoid by the document's 99 of 99."""
+    """Compare the fraction of trials within the ellipsoid with 99 of 99 in the document."""
     distance = np.concatenate([sample.arrays["distance"][1:] for sample in samples])
     published = TRIALS - 1
     low = float(binomtest(published, published).proportion_ci(CONFIDENCE, "exact").low)
@@ -328,10 +349,10 @@ def judge_ellipsoid(samples: Sequence[Sample]) -> Judgement:
     rippled, shift = (np.mean(collect(samples, name)) for name in ("rippled", "common shift"))
     return Judgement(
         (check,),
-        f"a 95 % ellipsoid leaves 5 % outside where the covariance is that of the trials'"
-        f" differences; all {published} are then within it with a probability of"
-        f" {100 * 0.95**published:.1f} %. A covariance of residuals also holds what repeats in"
-        f" every trial: with a repeatable force of {RIPPLE:g} N in every drive,"
+        f"if the covariance is that of the differences between trials, 5 % are outside a 95 %"
+        f" ellipsoid; all {published} are then within it with a probability of"
+        f" {100 * 0.95**published:.1f} %. A covariance of residuals also includes errors that"
+        f" repeat in every trial: with a repeatable force of {RIPPLE:g} N in every drive,"
         f" {100 * rippled:.1f} % are within it",
         f"the mean of a series is {shift:.2f} standard deviations from the model's values, where"
         f" {np.sqrt(len(TABLE) / published):.2f} are expected of {published} independent trials",
@@ -339,17 +360,19 @@ def judge_ellipsoid(samples: Sequence[Sample]) -> Judgement:
 
 
 def check_bias(quantity: str, mean: np.ndarray, covariance: np.ndarray, count: int) -> Check:
-    """Check of the bias of an estimator, in standard deviations of one estimate.
+    """Return a check of an estimator's bias, in standard deviations of one estimate.
+
+    For a bias of length d, n times the squared mean error has a noncentral chi-squared distribution
+    with p degrees of freedom and noncentrality n d^2. Its quantiles give the interval.
 
     Args:
         quantity: name of the bias.
-        mean: (p,) mean of the estimates' errors.
-        covariance: (p, p) of one estimate.
+        mean: (p,) mean error of the estimates.
+        covariance: (p, p) covariance of one estimate.
         count: number of estimates n.
 
     Returns:
-        The check; n d^2 for a bias of length d is the noncentrality of a chi^2 distribution with p
-        degrees of freedom, by whose quantiles the interval is found.
+        The check of d.
     """
     degrees = len(mean)
     squared = count * float(mean @ np.linalg.solve(covariance, mean))
@@ -364,12 +387,12 @@ def check_bias(quantity: str, mean: np.ndarray, covariance: np.ndarray, count: i
     return Check(
         quantity, float(np.sqrt(max(squared - degrees, 0.0) / count)),
         bound(0.5 + CONFIDENCE / 2.0), bound(0.5 - CONFIDENCE / 2.0), (1.0, np.inf),
-        "a bias that one experiment can show: at least the standard deviation of its estimate",
+        "detectable in one experiment: at least one standard deviation of its estimate",
     )  # fmt: skip
 
 
 def judge_least_squares(samples: Sequence[Sample]) -> Judgement:
-    """Judge the bias of least squares where the forces of the drives are cross-correlated."""
+    """Check the bias of least squares for cross-correlated forces of the drives."""
     truth = load_robot().truth
     value = np.concatenate([sample.arrays["least_squares"][1:] for sample in samples])
     equations = NormalEquations(simulate_excitation().matrix)
@@ -382,8 +405,8 @@ def judge_least_squares(samples: Sequence[Sample]) -> Judgement:
                        value.mean(axis=0) - truth, covariance, len(value))  # fmt: skip
     return Judgement(
         (check,),
-        "where the regressor has no noise, least squares is free of bias for any covariance of the"
-        f" forces; it loses precision: its standard deviations are {wide:.2f} times those"
+        "if the regressor has no noise, least squares is unbiased for any covariance of the"
+        f" forces; it is only less precise: its standard deviations are {wide:.2f} times those"
         " of the Gauss-Markov estimate",
     )
 
@@ -396,14 +419,14 @@ METHODS = {
 
 
 def measure_reaction(seed: int, changes: Changes) -> Sample:
-    """Estimate where controllers bring the noise of their encoders into the forces.
+    """Estimate the parameters if controllers feed encoder noise back into the forces.
 
     Args:
-        seed: of the noise.
+        seed: seed of the measurement noise.
         changes: `length_noise`: factor of the standard deviation of a measured length.
 
     Returns:
-        Errors (24,) of the estimates by the methods of `METHODS`, in printed standard deviations.
+        Errors (24,) of the estimates by each of `METHODS`, in printed standard deviations.
     """
     settings = read_settings({"length_noise": 1.0}, changes)
     own, cycle, periods = load_robot(), simulate_excitation(), 2
@@ -425,7 +448,7 @@ def measure_reaction(seed: int, changes: Changes) -> Sample:
 
 
 def judge_reaction(samples: Sequence[Sample]) -> Judgement:
-    """Judge which methods are biased by noise that regressor and forces share."""
+    """Check which methods are biased by noise common to regressor and forces."""
     checks = []
     for name, words in METHODS.items():
         biased = name.startswith("samples")
@@ -434,14 +457,14 @@ def judge_reaction(samples: Sequence[Sample]) -> Judgement:
             np.array([sample.arrays[name] for sample in samples]),
             lambda errors: float(np.sqrt(np.mean(errors.mean(axis=0) ** 2))),
             (10.0, np.inf) if biased else (0.0, 1.0),
-            "bias prevails over chance" if biased else "a standard deviation of one experiment",
+            "bias exceeds random error" if biased else "a standard deviation of one experiment",
             unit="printed standard deviations",
         ))  # fmt: skip
     return Judgement(tuple(checks))
 
 
 _CLAIM_TOO_SMALL = {"claimed_noise": 0.5}
-_HALF_NOISE = "the covariance claims half of the noise"
+_HALF_NOISE = "the covariance assumes half of the actual noise"
 
 TRIAL_SERIES = Experiment(
     "trials",
@@ -470,7 +493,7 @@ TRIAL_SERIES = Experiment(
             "exception of the first parameter",
             '"Some exceptions are observed though, such the very small first rigid-body parameter"',
             "Fig. 8, section 5.3", "document", judge_first_parameter,
-            {"claimed_noise": 2.0}, "the covariance claims twice the noise",
+            {"claimed_noise": 2.0}, "the covariance assumes twice the actual noise",
             (f"{SYMBOLS[0]} over its mean [1]",),
         ),
         Claim(
@@ -478,7 +501,7 @@ TRIAL_SERIES = Experiment(
             '"Excepting the first trial, the set of all parameters lays clearly within the'
             ' confidence ellipsoid"; radius 36.42',
             "Fig. 9, section 5.3", "document", judge_first_trial,
-            {"friction_excess": 0.0}, "friction is warm from the start", (_DISTANCE,),
+            {"friction_excess": 0.0}, "friction is stationary from the start", (_DISTANCE,),
         ),
         Claim(
             "all other trials within the ellipsoid",
@@ -491,7 +514,7 @@ TRIAL_SERIES = Experiment(
             "bias of least squares",
             '"Neglecting this fact by applying the simple LS-method will lead to biased estimates"',
             "section 3, after (21)", "document", judge_least_squares,
-            {"friction_excess": 0.0}, "friction is warm from the start", (),
+            {"friction_excess": 0.0}, "friction is stationary from the start", (),
         ),
     ),
 )  # fmt: skip
@@ -502,7 +525,7 @@ REACTION = Experiment(
     (
         Claim(
             "bias by controllers",
-            "controllers bring the noise of their encoders into the forces; least squares and"
+            "controllers feed encoder noise back into the forces; least squares and"
             " Gauss-Markov on samples are then biased, the frequency-domain processing is not",
             "section 3, after (21)", "additional", judge_reaction,
             {"length_noise": 0.001}, "encoders without noise", (),

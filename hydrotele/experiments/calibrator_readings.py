@@ -1,8 +1,9 @@
-"""Readings of a calibrator on a simulated machine: sensors, bent joints, drift, machines as built.
+"""Simulate calibrator readings with sensor errors, bent joints, drift and manufacturing errors.
 
-The kinematics of the closed chain, for studies of many seeds (`models/calibrator` is the same chain
-with masses and hydraulics in MuJoCo), and the end point of an arm whose resolved motion uses a
-nominal or a calibrated machine. Ground truth is used to make readings and to judge estimates only.
+The module uses only the kinematics of the closed chain, which is fast enough for many seeds. The
+same chain with masses and hydraulics in MuJoCo is `models/calibrator`. The module also computes the
+tip error of an arm positioned with a nominal or a calibrated machine. Ground truth is used only to
+generate readings and to evaluate estimates.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,24 +22,24 @@ from hydrotele.scenario.scenario import Pose
 from hydrotele.simulate.mechanism import TIP_SITE, assemble, mjcf_document
 
 RESOLVER = np.radians(0.1)
-"""Bound of a resolver's error, uniform [rad]; Khoshzaban 1992 section 2.5."""
+"""Largest error of a resolver, uniformly distributed [rad]; Khoshzaban 1992, section 2.5."""
 
 
 def simulate_readings(
     loop: Loop, clean: Clean, rng: np.random.Generator | None, accuracy: float = RESOLVER,
     extra: np.ndarray | None = None,
 ) -> Poses:  # fmt: skip
-    """Simulate the readings of a stage.
+    """Simulate the sensor readings of one calibration stage.
 
     Args:
-        loop: the true chain; its offsets are those of the sensors.
+        loop: true chain; its offsets are the sensor offsets.
         clean: true poses.
-        rng: of the errors, uniform within +-accuracy; None for none.
-        accuracy: of every angle sensor [rad].
-        extra: (M, N) errors to add, such as those of bent joints [rad].
+        rng: random generator of the errors, uniform within +-accuracy; None for no errors.
+        accuracy: largest error of every angle sensor [rad].
+        extra: (M, N) additional errors, such as those of bent joints [rad].
 
     Returns:
-        The poses as they are measured.
+        The measured poses.
     """
     shown = clean.theta - loop.values[:, 0]
     if extra is not None:
@@ -56,15 +57,15 @@ def simulate_readings(
 def draw_sweeps(
     rng: np.random.Generator, drift: bool = True, share: float = 1.0
 ) -> dict[str, Sweep]:
-    """Draw how every link is moved, within the ranges of Khoshzaban 1992 Figs 16 to 18.
+    """Draw a random sweep of every link within the ranges of Khoshzaban 1992, Figs 16 to 18.
 
-    The scan does not show the motion's form in time: its number of cycles is uniform in 1 to 3, and
-    its first pose is anywhere in a cycle.
+    The scan does not show the motion over time. The number of cycles is therefore uniform in 1 to
+    3, and the phase of the first pose is uniform.
 
     Args:
-        rng: of cycles and phase.
+        rng: random generator of cycles and phase.
         drift: whether held links drift as in the figures.
-        share: of the number of poses that are used.
+        share: fraction of the document's number of poses.
 
     Returns:
         Link -> sweep.
@@ -82,18 +83,18 @@ def bend_level_joints(
     loop: Loop, clean: Clean, rng: np.random.Generator, degrees: float = 1.0, share: float = 0.35,
     lasting: bool = False,
 ) -> np.ndarray:  # fmt: skip
-    """Draw errors of bent joints as Khoshzaban 1992 section 3.7.3 (p. 61) makes them.
+    """Draw errors of joints bent by gravity, as in Khoshzaban 1992, section 3.7.3 (p. 61).
 
-    N(0, 1 deg) is added to grapple and yoke where gravity bends them most: in the poses in which
-    the calibrator's arm lies most nearly level.
+    N(0, `degrees`) is added to the grapple and yoke angles in the poses in which gravity bends them
+    most. In these poses the calibrator's arm is closest to horizontal.
 
     Args:
-        loop: the true chain.
+        loop: true chain.
         clean: true poses.
-        rng: of the errors.
-        degrees: their standard deviation.
-        share: of the poses that are bent; the document gives none.
-        lasting: whether a joint has one error in all bent poses, instead of one in each.
+        rng: random generator of the errors.
+        degrees: standard deviation of the errors [deg].
+        share: fraction of the poses in which joints bend; the document gives none.
+        lasting: whether a joint has the same error in all bent poses.
 
     Returns:
         (M, N) errors [rad].
@@ -111,16 +112,16 @@ def bend_level_joints(
 def bend_pulled_in_joints(
     loop: Loop, clean: Clean, sizes: Mapping[str, float], share: float = 0.28
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Errors of joints that bend where the stick is pulled in (Khoshzaban 1992, p. 69).
+    """Compute errors of joints that bend when the stick is retracted (Khoshzaban 1992, p. 69).
 
-    The error grows linearly with the stick's angle from zero at the edge of the region to its size
-    at the largest angle.
+    The error increases linearly with the stick angle, from zero at the edge of the bent region to
+    its largest value at the largest angle.
 
     Args:
-        loop: the true chain.
+        loop: true chain.
         clean: true poses of the stick's stage; the errors of another stage are zero.
         sizes: calibrator joint -> largest error [rad].
-        share: of the poses that are in the region.
+        share: fraction of the poses in the bent region.
 
     Returns:
         (errors (M, N) [rad], whether a pose is in the region (M,)).
@@ -140,11 +141,11 @@ def perturb_loop(
     loop: Loop, rng: np.random.Generator, length: float = 0.03, angle: float = 1.0,
     sensors: float = 0.0,
 ) -> Loop:  # fmt: skip
-    """Draw a true chain that differs from the nominal one as a machine built and worn does.
+    """Draw a true chain with manufacturing and wear errors relative to the nominal chain.
 
-    Lengths of the manipulator and the ball's place differ by N(0, length) [m], its twists and the
-    offsets of grapple, yoke and twist by N(0, angle) [deg]. The calibrator's own links, known from
-    the laboratory, do not. The manipulator's own sensors read with offsets of N(0, sensors) [deg].
+    The manipulator's lengths and the ball position get errors N(0, length) [m]. Its twists and the
+    offsets of grapple, yoke and twist get errors N(0, angle) [deg]. The manipulator's sensors get
+    offsets N(0, sensors) [deg]. The calibrator's links are known and get no errors.
     """
     values, m = loop.values.copy(), loop.moved
     for k in range(m + 1):
@@ -167,13 +168,13 @@ def true_numbers(
     """Return the true values of identified parameters.
 
     Args:
-        loop: the true chain.
-        nominal: the nominal one, whose d a stage's p_z counts from.
-        names: (p) of the parameters.
-        clean: true poses; a held angle is its mean in the stage that identifies it.
+        loop: true chain.
+        nominal: nominal chain; its d is the reference of a stage's p_z.
+        names: (p) names of the parameters.
+        clean: true poses; the true value of a held angle is its mean in its stage.
 
     Returns:
-        (p,) [rad] or [m].
+        (p,) true values [rad] or [m].
     """
     stages = {one.link: one for one in clean}
     found = []
@@ -194,23 +195,23 @@ def true_numbers(
 TARGETS = tuple(
     (r, z, theta) for r in (4.2, 5.0, 5.8) for z in (1.8, 2.6, 3.4) for theta in (-0.6, 0.5)
 )
-"""Places of the tip that are asked for: r [m], z [m] above ground, theta [rad]."""
+"""Tip target positions: r [m], z [m] above ground, theta [rad]."""
 
 
 def tip_errors(
     nominal: Machine, true: Machine, loop: Loop, stages: Sequence[Poses]
 ) -> tuple[float, float]:
-    """Return the RMS distance of the true arm's tip from where it is asked to be.
+    """Return the RMS distance of the true arm's tip from the `TARGETS`.
 
-    Resolved motion turns each place into joint angles with the machine that it knows. The joints
-    are then moved until the arm's own sensors, less the offsets that this machine knows of, show
-    these angles; where the tip is then, MuJoCo says for the true machine.
+    Resolved motion converts each target to joint angles with the nominal or the calibrated machine.
+    The true joints are set so that the sensors, corrected by the known offsets, read these angles.
+    MuJoCo then computes the tip position of the true machine.
 
     Args:
-        nominal: machine as it is believed to be.
-        true: machine as it is.
-        loop: the true chain, whose offsets are those of the sensors.
-        stages: readings to calibrate from.
+        nominal: nominal machine.
+        true: true machine.
+        loop: true chain; its offsets are the sensor offsets.
+        stages: readings used for the calibration.
 
     Returns:
         (with the nominal machine, with the calibrated one) [m].
@@ -230,7 +231,7 @@ def tip_errors(
 
 
 def _miss(machine: Machine, known: Loop, loop: Loop, model, data, target) -> float:
-    """Squared distance of the tip from a target [m^2]."""
+    """Return the squared distance of the tip from a target [m^2]."""
     r, z, theta = target
     here = {name: machine.home.get(axis.joint, 0.0) for name, axis in machine.axes.items()}
     joints = pose_to_joints(machine, Pose(r=r, z=z, theta=theta), here, "target")

@@ -1,8 +1,9 @@
-"""Compare a published experiment with its repetition in simulation.
+"""Compare published experiments with their repetition in simulation.
 
-A `Series` is a document. It holds `Experiment`s, which are repeated with other seeds, and the
-`Claim`s that are judged by their samples. A claim is judged by `Check`s: a simulated quantity
-with its 95 % confidence interval against the range of values that agree with the document.
+A `Series` represents a document. It contains `Experiment`s, which are repeated with different
+seeds, and `Claim`s, which are evaluated with the resulting `Sample`s. A claim is evaluated with
+`Check`s. A check compares a simulated quantity and its 95 % confidence interval with the range of
+values that agree with the document.
 """
 
 import multiprocessing
@@ -17,29 +18,29 @@ import numpy as np
 Kind = Literal["document", "caption", "input", "additional"]
 """Kind of a row.
 
-`document`: a sentence or figure of the document. `caption`: the document (or the part of it that is
-available) gives a title only, so that the row has a simulated value and no verdict. `input`: a
-number of the document that the model was built from, which is checked but not counted.
-`additional`: a statement that is not in the publication.
+- `document`: a sentence or figure of the document.
+- `caption`: the available text has only a caption; the row has a simulated value and no verdict.
+- `input`: a published value from which the model was built; it is checked but not counted.
+- `additional`: a statement that is not in the publication.
 """
 
 Verdict = Literal["agrees", "differs", "undecided", "cannot be computed", "no verdict"]
-"""`undecided`: the interval holds values that agree and values that do not."""
+"""`undecided`: the interval is partly inside and partly outside the accepted range."""
 
 
 class Panel(NamedTuple):
     """Curves that share their axes.
 
     Attributes:
-        label: of the vertical axis: quantity and unit, such as `tip height [m]`.
+        label: quantity and unit of the vertical axis, such as `tip height [m]`.
         x: (n,) in the unit of `x_label`.
         curves: legend -> (n,) in the unit of `label`.
-        x_label: of the horizontal axis: quantity and unit.
+        x_label: quantity and unit of the horizontal axis.
         log: whether the vertical axis is logarithmic.
         discrete: whether the points are separate measurements, which are drawn as markers.
-        errors: legend -> (n,) differences, drawn on a separate axis below; for curves that
-            coincide to the eye.
-        error_label: of that axis: quantity and unit.
+        errors: legend -> (n,) differences, drawn on a separate axis below; for curves whose
+            difference is too small to see.
+        error_label: quantity and unit of the error axis.
     """
 
     label: str
@@ -53,13 +54,13 @@ class Panel(NamedTuple):
 
 
 class Marginals(NamedTuple):
-    """A sample of a posterior, to be drawn in one and two dimensions.
+    """Samples of a posterior, drawn as one- and two-dimensional marginals.
 
     Attributes:
-        names: p parameters.
-        sample: (n, p) in `unit`.
+        names: names of the p parameters.
+        sample: (n, p) samples in `unit`.
         truth: (p,) true values in `unit`.
-        unit: of all.
+        unit: unit of all parameters.
     """
 
     names: tuple[str, ...]
@@ -69,16 +70,16 @@ class Marginals(NamedTuple):
 
 
 class Check(NamedTuple):
-    """A simulated quantity with its 95 % interval, and the values that agree with the document.
+    """A simulated quantity with its 95 % confidence interval and its accepted range.
 
     Attributes:
         quantity: name, such as `RMS error of d0`.
         value: estimate.
-        low, high: 95 % confidence interval; both equal `value` where nothing is random.
-        accepted: lowest and highest value that agree.
-        reason: where the accepted range comes from.
-        unit: of all numbers.
-        published: the document's own figure, where it has one.
+        low, high: 95 % confidence interval; both equal `value` if nothing is random.
+        accepted: lowest and highest value that agree with the document.
+        reason: source of the accepted range.
+        unit: unit of all values.
+        published: published value, if there is one.
     """
 
     quantity: str
@@ -92,7 +93,7 @@ class Check(NamedTuple):
 
     @property
     def verdict(self) -> Verdict:
-        """`agrees` where the whole interval is accepted, `differs` where none of it is."""
+        """Verdict: `agrees` if the whole interval is accepted, `differs` if no part of it is."""
         least, most = self.accepted
         if not np.isfinite(self.value):
             return "differs"
@@ -103,7 +104,7 @@ class Check(NamedTuple):
         return "undecided"
 
     def describe(self) -> str:
-        """One line: the quantity, its interval and the document's figure.
+        """Return the quantity, its interval and the published value as text.
 
         >>> Check("ratio", 1.52, 1.31, 1.8, (5.0, np.inf), "", published=11.0).describe()
         'ratio 1.52 [1.31, 1.8] (published 11)'
@@ -116,7 +117,7 @@ class Check(NamedTuple):
         return f"{text}{unit}{published}"
 
     def describe_range(self) -> str:
-        """The accepted range with its reason.
+        """Return the accepted range and its reason as text.
 
         >>> Check("ratio", 1.52, 1.31, 1.8, (5.0, np.inf), "half of 11").describe_range()
         'ratio at least 5: half of 11'
@@ -136,13 +137,13 @@ def _format(value: float) -> str:
 
 
 class Judgement(NamedTuple):
-    """The result of judging a claim by its samples.
+    """Evaluation of a claim with the samples of its experiment.
 
     Attributes:
-        checks: all of them have to agree; none where a caption is all that is published.
-        explanation: the measured reason for a difference, or the conditions of the agreement.
-        note: further simulated figures, which are not judged.
-        unavailable: why the claim cannot be judged by these samples; empty where it can.
+        checks: checks that must all agree; empty if only a caption is published.
+        explanation: measured reason for a difference, or the conditions of the agreement.
+        note: further simulated values, which do not affect the verdict.
+        unavailable: reason why the claim cannot be evaluated; empty if it can.
     """
 
     checks: tuple[Check, ...] = ()
@@ -152,7 +153,7 @@ class Judgement(NamedTuple):
 
     @property
     def verdict(self) -> Verdict:
-        """`differs` where one check differs, `agrees` where all agree, else `undecided`."""
+        """Verdict: `differs` if one check differs, `agrees` if all agree, else `undecided`."""
         if self.unavailable:
             return "cannot be computed"
         verdicts = {check.verdict for check in self.checks}
@@ -164,16 +165,16 @@ class Judgement(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """A row of the table: published result, simulated result and verdict.
+    """A row of the result table: published result, simulated result and verdict.
 
     Attributes:
-        name: short, such as `straight line up`.
+        name: short name, such as `straight line up`.
         item: table, figure, equation or section of the document, with its page.
-        published: the document's sentence or figures.
+        published: sentence or values of the document.
         kind: see `Kind`.
-        judgement: of the samples.
+        judgement: evaluation of the claim.
         panels: curves to draw.
-        marginals: a posterior to draw.
+        marginals: posterior to draw.
     """
 
     name: str
@@ -186,27 +187,27 @@ class Comparison(NamedTuple):
 
     @property
     def verdict(self) -> Verdict:
-        """Of the judgement; `no verdict` where only a caption is published."""
+        """Verdict of the judgement; `no verdict` if only a caption is published."""
         return self.judgement.verdict
 
     @property
     def simulated(self) -> str:
-        """The simulated figures with their intervals."""
+        """Simulated values with their intervals, as text."""
         parts = [check.describe() for check in self.judgement.checks]
         return "; ".join([*parts, *([self.judgement.note] if self.judgement.note else [])])
 
     @property
     def criterion(self) -> str:
-        """What counts as agreement, with the reason."""
+        """Accepted ranges of all checks with their reasons, as text."""
         return "; ".join(check.describe_range() for check in self.judgement.checks)
 
     @property
     def explanation(self) -> str:
-        """The measured reason for a difference, or why nothing can be computed."""
+        """Measured reason for a difference, or the reason why nothing can be computed."""
         return self.judgement.unavailable or self.judgement.explanation
 
     def row(self) -> dict[str, Any]:
-        """The row as `--json` prints it."""
+        """Return the row as a dictionary, as printed with `--json`."""
         checks = [
             check._asdict() | {"verdict": check.verdict} for check in self.judgement.checks
         ]  # fmt: skip
@@ -218,17 +219,17 @@ class Comparison(NamedTuple):
 
 
 Changes = Mapping[str, Any]
-"""Changes of an experiment's settings, such as scenario keys with their values."""
+"""Changes of an experiment's settings: setting or scenario key -> value."""
 
 
 class Sample(NamedTuple):
     """Measurements of one repetition of an experiment.
 
     Attributes:
-        values: name -> figure, SI.
+        values: name -> scalar result, in SI units unless its name states otherwise.
         panels: curves of the repetition.
-        arrays: name -> array, for claims that need more than single figures.
-        marginals: a posterior of the repetition.
+        arrays: name -> array result.
+        marginals: posterior samples of the repetition.
     """
 
     values: Mapping[str, float]
@@ -239,18 +240,19 @@ class Sample(NamedTuple):
 
 @dataclass(frozen=True)
 class Claim:
-    """A sentence or figure of a document, and how samples are judged by it.
+    """A statement of a document and the function that evaluates it.
 
     Attributes:
-        name: short, unique in its series.
-        quote: the document's statement; a quoted sentence is verbatim. Of an additional claim,
+        name: short name, unique in its series.
+        quote: statement of the document, verbatim if in quotation marks; for an additional claim,
             the statement of this project.
         item: table, figure, equation or section, with its page.
         kind: see `Kind`.
         judge: samples of all repetitions -> judgement.
-        broken: changes with which the claim must be judged `differs`; None where it has no verdict.
-        broken_how: those changes in words.
-        panels: which of the sample's panels the row draws, by label; all where it is None.
+        broken: fault (changed settings) for which the verdict must be `differs`; None if the claim
+            has no verdict.
+        broken_how: description of the fault.
+        panels: labels of the sample's panels to draw; None for all.
     """
 
     name: str
@@ -263,7 +265,7 @@ class Claim:
     panels: tuple[str, ...] | None = None
 
     def compare(self, samples: Sequence[Sample]) -> Comparison:
-        """Judge the claim by at least one sample; the curves are those of the first sample."""
+        """Evaluate the claim with at least one sample; the first sample provides the curves."""
         panels = tuple(panel for panel in samples[0].panels
                        if self.panels is None or panel.label in self.panels)  # fmt: skip
         return Comparison(
@@ -274,15 +276,15 @@ class Claim:
 
 @dataclass(frozen=True)
 class Experiment:
-    """A measurement that is repeated, and the claims that are judged by it.
+    """A repeated simulation and the claims that are evaluated with its samples.
 
     Attributes:
-        name: short.
+        name: short name.
         measure: (seed from 1 on, changes of its settings) -> sample.
-        claims: judged by the samples.
-        max_repetitions: largest number of repetitions that is worth its time.
-        repetitions_fixed: number of repetitions where it is no choice: 1 where nothing is random,
-            or the number of conditions; else 0.
+        claims: claims evaluated with the samples.
+        max_repetitions: upper limit of the number of repetitions, which bounds the run time.
+        repetitions_fixed: fixed number of repetitions: 1 if nothing is random, or the number of
+            conditions; 0 if the number is not fixed.
     """
 
     name: str
@@ -292,21 +294,21 @@ class Experiment:
     repetitions_fixed: int = 0
 
     def repetitions(self, requested: int) -> int:
-        """Number of repetitions where `requested` ones are requested."""
+        """Return the number of repetitions to run for a requested number."""
         return self.repetitions_fixed or min(requested, self.max_repetitions)
 
 
 @dataclass(frozen=True)
 class Series:
-    """A document with all of its tables and figures.
+    """A document with its experiments, tables and figures.
 
     Attributes:
-        name: such as `zhu1994`.
+        name: short name, such as `zhu1994`.
         title: author, title, year.
-        repetitions: usual number.
-        experiments: in the order of the document.
+        repetitions: default number of repetitions.
+        experiments: experiments in the order of the document.
         unavailable: rows that cannot be computed, each with the reason.
-        drawings: table or figure -> why it has nothing to compare, such as `photograph`.
+        drawings: table or figure without a result -> its content, such as `photograph`.
     """
 
     name: str
@@ -326,18 +328,19 @@ Progress = Callable[[str, float], None]
 """Called with the name of the finished task and the finished fraction."""
 
 BROKEN_REPETITIONS = 6
-"""Smallest number of failures in a row whose 95 % interval of the fraction is below one half."""
+"""Repetitions with a fault: the smallest n for which 0 of n successes gives a 95 % interval of the
+fraction below one half."""
 
 
 def run_series(
     series: Series, seeds: int, jobs: int | None = None, progress: Progress | None = None
 ) -> list[Comparison]:
-    """Run all experiments of a document.
+    """Run all experiments of a document and return the rows of its result table.
 
     Args:
-        series: the document.
-        seeds: repetitions of every experiment; some have a smaller limit.
-        jobs: processes; as many as there are cores by default.
+        series: document.
+        seeds: number of repetitions of every experiment; some have a smaller limit.
+        jobs: number of processes; the number of cores by default.
         progress: called after every repetition.
 
     Returns:
@@ -350,12 +353,14 @@ def compare_by_seeds(
     series: Series, counts: Sequence[int], jobs: int | None = None,
     progress: Progress | None = None,
 ) -> dict[int, list[Comparison]]:  # fmt: skip
-    """Judge a document with several numbers of repetitions, which share their first seeds.
+    """Evaluate a document for several numbers of repetitions.
+
+    The smaller numbers of repetitions use the first seeds of the largest one.
 
     Args:
-        series: the document.
+        series: document.
         counts: numbers of repetitions.
-        jobs: processes; as many as there are cores by default.
+        jobs: number of processes; the number of cores by default.
         progress: called after every repetition.
 
     Returns:
@@ -377,16 +382,16 @@ def break_series(
     series: Series, names: Sequence[str] = (), jobs: int | None = None,
     progress: Progress | None = None,
 ) -> list[tuple[Claim, Comparison]]:  # fmt: skip
-    """Judge every claim that has a verdict by runs that are deliberately broken.
+    """Evaluate claims with runs into which their fault is introduced.
 
     Args:
-        series: the document.
-        names: of the claims; all by default.
-        jobs: processes; as many as there are cores by default.
+        series: document.
+        names: names of the claims; by default all claims with a fault.
+        jobs: number of processes; the number of cores by default.
         progress: called after every repetition.
 
     Returns:
-        The claims, each with a row that should say `differs`.
+        The claims, each with a row whose verdict should be `differs`.
     """
     chosen = [(one, claim) for one in series.experiments for claim in one.claims
               if claim.broken is not None and (not names or claim.name in names)]  # fmt: skip
@@ -402,7 +407,16 @@ def measure_experiments(
     jobs: int | None = None,
     progress: Progress | None = None,
 ) -> list[list[Sample]]:
-    """Samples of every experiment, each with its changes and number of repetitions."""
+    """Run experiments and return their samples.
+
+    Args:
+        planned: (experiment, changes of its settings, number of repetitions) of each.
+        jobs: number of processes; the number of cores by default.
+        progress: called after every repetition.
+
+    Returns:
+        For each experiment, one sample per repetition.
+    """
     tasks: list[tuple[Callable[..., Any], tuple]] = [
         (one.measure, (seed, dict(changes)))
         for one, changes, count in planned
@@ -424,14 +438,14 @@ def measure_experiments(
 def run_tasks(
     tasks: Sequence[tuple[Callable[..., Any], tuple]], jobs: int | None = None
 ) -> Iterator[Any]:
-    """Yield the results of functions in order, computed by several processes.
+    """Run functions in several processes and yield their results in order.
 
     Args:
         tasks: functions with their arguments.
-        jobs: processes; as many as there are cores by default.
+        jobs: number of processes; the number of cores by default.
 
     Yields:
-        The results.
+        The result of each function.
     """
     count = jobs or os.cpu_count() or 1
     if count == 1:
@@ -446,7 +460,7 @@ def run_tasks(
 
 
 def summarize(rows: Sequence[Comparison]) -> str:
-    """Count the verdicts on the document's claims, and those of additional claims.
+    """Return a sentence that counts the verdicts of the published and the additional claims.
 
     >>> row = Comparison("a", "p. 1", "", "document", Judgement(unavailable="no text"))
     >>> summarize([row])

@@ -1,4 +1,4 @@
-"""Checks of a simulated quantity over repetitions: its estimate with a 95 % confidence interval."""
+"""Build checks from repeated simulations: estimates with 95 % confidence intervals."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -9,41 +9,44 @@ from scipy import stats
 from hydrotele.experiments.comparison import Check, Sample
 
 CONFIDENCE = 0.95
-"""Of all intervals."""
+"""Confidence level of all intervals."""
 
 MAJORITY = (0.5, 1.0)
-"""Accepted fraction of the operators: the publication had one, so that a statement agrees if it
-holds for more than half of a population of operators."""
+"""Accepted fraction of the operators.
+
+The publication had one operator; its statement agrees if it holds for more than half of a
+population of simulated operators.
+"""
 
 _NORMAL = float(stats.norm.ppf(0.5 + CONFIDENCE / 2.0))
 
 
 def collect(samples: Sequence[Sample], name: str) -> np.ndarray:
-    """(n,) of a figure over the samples."""
+    """Return the (n,) values of a named result over all samples."""
     return np.array([sample.values[name] for sample in samples])
 
 
 def check_exact(
     quantity: str, value: float, accepted: tuple[float, float], reason: str, **more: Any
 ) -> Check:
-    """Check of a quantity in which nothing is random."""
+    """Return a check of a quantity that is not random; its interval is its value."""
     return Check(quantity, float(value), float(value), float(value), accepted, reason, **more)
 
 
 def check_mean(
     quantity: str, values: np.ndarray, accepted: tuple[float, float], reason: str, **more: Any
 ) -> Check:
-    """Check of a mean over repetitions.
+    """Return a check of the mean over repetitions, with Student's confidence interval.
 
     Args:
-        quantity: its name.
-        values: (n,) one per repetition; with n = 1 the interval is unbounded.
+        quantity: name of the quantity.
+        values: (n,) one value per repetition; with n = 1 the interval is unbounded.
         accepted: lowest and highest value that agree.
-        reason: where the accepted range comes from.
-        **more: `unit`, `published`.
+        reason: source of the accepted range.
+        **more: `unit` and `published` of `Check`.
 
     Returns:
-        The check, with Student's interval of the mean.
+        The check.
     """
     values = np.asarray(values, float)
     mean, half = float(np.mean(values)), np.inf
@@ -58,17 +61,17 @@ def check_fraction(
     accepted: tuple[float, float] = MAJORITY,
     reason: str = "more than half of the operators; the publication had one", **more: Any,
 ) -> Check:  # fmt: skip
-    """Check of the fraction of repetitions in which something holds.
+    """Return a check of the fraction of repetitions that fulfil a condition.
 
     Args:
-        quantity: what holds, such as `operators who ...`.
-        successes: (n,) whether it holds.
+        quantity: name of the fraction, such as `operators who ...`.
+        successes: (n,) whether each repetition fulfils the condition.
         accepted: lowest and highest fraction that agree.
-        reason: where the accepted range comes from.
-        **more: `unit`, `published`.
+        reason: source of the accepted range.
+        **more: `unit` and `published` of `Check`.
 
     Returns:
-        The check, with the interval of Clopper and Pearson.
+        The check, with the Clopper-Pearson interval.
     """
     holds = np.asarray(successes, bool)
     found = stats.binomtest(int(holds.sum()), len(holds)).proportion_ci(CONFIDENCE, "exact")
@@ -80,19 +83,19 @@ def check_statistic(
     quantity: str, values: np.ndarray, statistic: Callable[[np.ndarray], float],
     accepted: tuple[float, float], reason: str, **more: Any,
 ) -> Check:  # fmt: skip
-    """Check of any statistic of repetitions, such as a ratio of two RMS values.
+    """Return a check of any statistic over repetitions, such as a ratio of two RMS values.
 
     Args:
-        quantity: its name.
-        values: (n, ...) one row per repetition, so that what belongs together stays together.
-        statistic: rows of repetitions -> number.
+        quantity: name of the statistic.
+        values: (n, ...) one row per repetition; rows are resampled as a whole.
+        statistic: (k, ...) rows -> value of the statistic.
         accepted: lowest and highest value that agree.
-        reason: where the accepted range comes from.
-        **more: `unit`, `published`.
+        reason: source of the accepted range.
+        **more: `unit` and `published` of `Check`.
 
     Returns:
-        The check; the interval is that of 2000 bootstrap resamples by percentiles, unbounded
-        with n = 1.
+        The check, with the percentile interval of 2000 bootstrap resamples; with n = 1 the
+        interval is unbounded.
     """
     values = np.asarray(values, float)
     value, low, high = float(statistic(values)), -np.inf, np.inf
@@ -107,19 +110,21 @@ def check_statistic(
 def check_population(
     quantity: str, values: np.ndarray, published: float, unit: str = "", log: bool = True
 ) -> Check:
-    """Check whether a published figure of one experiment is a plausible repetition of ours.
+    """Return a check whether a published value lies in the central 95 % of the repetitions.
+
+    The checked quantity is the distance d of the published value from the mean of the repetitions,
+    in standard deviations of the repetitions. It agrees within 1.96. The standard error of d is
+    sqrt(1/n + d^2 / (2 n)).
 
     Args:
-        quantity: name of the published figure.
-        values: (n,) of our repetitions, n > 2.
-        published: the document's figure, of one experiment.
-        unit: of the figures, for the text.
-        log: whether sizes are compared on a logarithmic scale, which suits positive figures.
+        quantity: name of the published value.
+        values: (n,) values of the simulated repetitions, n > 2.
+        published: published value of a single experiment.
+        unit: unit of the values, for the text.
+        log: whether logarithms are compared, which suits positive values.
 
     Returns:
-        The check of the distance of the published figure from our mean, in standard deviations of
-        our repetitions; it agrees within 1.96, where 95 % of the repetitions lie. The standard
-        error of the distance d is sqrt(1/n + d^2 / (2 n)).
+        The check of d.
     """
     values = np.asarray(values, float)
     scaled, goal = (np.log(values), np.log(published)) if log else (values, published)
@@ -130,23 +135,24 @@ def check_population(
     typical = float(np.exp(np.mean(scaled)) if log else np.mean(values))
     words = f"{quantity} {published:.3g} {unit}".strip()
     return Check(
-        f"distance of the published {words} from ours (mean {typical:.3g}) in standard deviations",
+        f"distance of the published {words} from the simulated ones (mean {typical:.3g}) in"
+        " standard deviations",
         distance, distance - half, distance + half, (-_NORMAL, _NORMAL),
-        "the central 95 % of our repetitions",
+        "the central 95 % of the repetitions",
     )  # fmt: skip
 
 
 def format_values(samples: Sequence[Sample], name: str, scale: float = 1.0, digits: int = 1) -> str:
-    """Mean of a figure over the samples with its extremes, as text.
+    """Format the mean, minimum and maximum of a named result over the samples.
 
     Args:
-        samples: at least one.
-        name: of the figure.
-        scale: by which it is multiplied.
-        digits: after the point.
+        samples: at least one sample.
+        name: name of the result.
+        scale: factor applied to the values.
+        digits: number of decimal places.
 
     Returns:
-        Such as `2.1 (1.5 to 4.7)`; the figure alone where there is one sample.
+        Text such as `2.1 (1.5 to 4.7)`; only the value if there is one sample.
     """
     values = scale * collect(samples, name)
     mean = f"{np.mean(values):.{digits}f}"

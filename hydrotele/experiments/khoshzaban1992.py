@@ -1,8 +1,8 @@
 """Khoshzaban 1992: kinematic and dynamic calibration of a hydraulic arm, repeated in simulation.
 
-Chapters 2 and 3.3 to 3.6 are in `khoshzaban_machine`, section 3.7 in `khoshzaban_arm`, section 3.8
-in `khoshzaban_experiment`, chapter 4 in `khoshzaban_dynamics`, proposals of the thesis in
-`khoshzaban_outlook`.
+Chapter 2 and sections 3.3 to 3.6 are in `khoshzaban_machine`, section 3.7 in `khoshzaban_arm` and
+section 3.8 in `khoshzaban_experiment`. Chapter 4 is in `khoshzaban_dynamics`, and the proposals of
+the thesis are in `khoshzaban_outlook`.
 """
 
 from hydrotele.experiments import (
@@ -20,7 +20,7 @@ DRAWINGS = {
     "Fig. 11": "convention of the link frames", "Fig. 12": "drawing of a cylinder's triangle",
     "Fig. 13": "drawing of the calibrator", "Fig. 14": "drawing of machine and calibrator",
 }  # fmt: skip
-"""Items that show no result."""
+"""Figures without a result."""
 
 SERIES = Series(
     "khoshzaban1992",

@@ -1,8 +1,8 @@
 """Simulated calibrations of Khoshzaban 1992, sections 3.7 and 5.1: Tables 4 to 6.
 
-Truth is the thesis' nominal machine, as in its own simulations (p. 56). The trajectories of Figs 16
-to 18 are known by their ranges and drifts only, so that every repetition draws how the links move,
-besides the sensors' errors; the figures that are published are those of one trajectory.
+The true machine is the nominal machine of the thesis, as in its own simulations (p. 56). The thesis
+gives only the ranges and drifts of the trajectories in Figs 16 to 18. Every repetition therefore
+draws new link motions and sensor errors; the published values belong to one trajectory.
 """
 
 from collections.abc import Mapping, Sequence
@@ -41,7 +41,7 @@ from hydrotele.experiments.intervals import (
 from hydrotele.machine.machine_file import load_machine
 
 MOVED = ("stick", "boom", "swing")
-"""Links whose stages the thesis simulates, in their order."""
+"""Links whose stages the thesis simulates, in its order."""
 
 LISTS = {
     "pitch": {"offset.calibrator_twist", "offset.calibrator_yoke", "offset.grapple",
@@ -50,12 +50,12 @@ LISTS = {
     "boom": {"held.stick", "alpha.boom", "a.boom", "beta.boom"},
     "swing": {"held.boom", "d.boom", "alpha.swing", "a.swing"},
 }  # fmt: skip
-"""What section 3.6.4 (pp. 55-56) lists as identifiable, besides the ball's distance and height."""
+"""Identifiable parameters of each stage by section 3.6.4 (pp. 55-56), without those of the ball."""
 
 IDENTIFIED = {
     link: (f"p_xy.{link}", f"p_z.{link}", *sorted(names)) for link, names in LISTS.items()
 }
-"""Parameters that every stage identifies."""
+"""Parameters identified in each stage, including the ball's distance and height."""
 
 LENGTHS = ("p_z.swing", "p_xy.swing", "a.swing", "a.boom", "d.boom", "a.stick")
 """Identified lengths of Tables 4 to 6; `p_z.swing` is -d0 and `p_xy.swing` is -a0."""
@@ -70,8 +70,8 @@ NOMINAL = {"p_z.swing": -0.840, "p_xy.swing": 2.160, "a.swing": 0.340, "a.boom":
            "d.boom": -0.110, "a.stick": 1.800}  # fmt: skip
 """Table 2 (p. 56) [m]."""
 
-# Identified lengths [m] of Tables 4 (p. 59), 5 and 6 (p. 61) with the signs of LENGTHS, twists
-# [deg] less those of Table 2, and iterations of links 3, 2 and 1.
+# Tables 4 (p. 59), 5 and 6 (p. 61): identified lengths [m] with the signs of LENGTHS, twists
+# minus those of Table 2 [deg], and iterations of links 3, 2 and 1.
 PUBLISHED_LENGTHS = {
     "drift": (-0.908, 2.160, 0.306, 5.188, -0.110, 1.797),
     "sensor": (-0.913, 2.161, 0.298, 5.199, -0.100, 1.796),
@@ -85,20 +85,20 @@ PUBLISHED_ITERATIONS = {"drift": (6, 11, 5), "sensor": (6, 14, 7), "flexible": (
 
 
 def published_error(case: str, name: str) -> float:
-    """Error of a length in Tables 4 to 6 against Table 2 [m]."""
+    """Return the error of a length in Tables 4 to 6 relative to Table 2 [m]."""
     return PUBLISHED_LENGTHS[case][LENGTHS.index(name)] - NOMINAL[name]
 
 
 def root_mean_square(values: np.ndarray | Sequence[float]) -> float:
-    """Root mean square of all values."""
+    """Return the root mean square of all values."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 
 def choose_settings(defaults: Mapping[str, Any], changes: Changes) -> dict[str, Any]:
-    """Settings of an experiment with some of them changed.
+    """Return the default settings of an experiment with changes applied.
 
     Raises:
-        InputError: a key is none of the settings.
+        InputError: a changed key is not a setting.
     """
     unknown = sorted(set(changes) - set(defaults))
     if unknown:
@@ -107,13 +107,13 @@ def choose_settings(defaults: Mapping[str, Any], changes: Changes) -> dict[str, 
 
 
 class Condition(NamedTuple):
-    """What disturbs a simulated calibration.
+    """Disturbances of a simulated calibration.
 
     Attributes:
         drift: whether held links drift.
-        accuracy: bound of the sensors' errors [rad].
-        bend: standard deviation of bent joints [deg].
-        lasting: whether a joint bends by the same amount in all of its bent poses.
+        accuracy: largest sensor error [rad].
+        bend: standard deviation of the errors of bent joints [deg].
+        lasting: whether a joint has the same error in all of its bent poses.
     """
 
     drift: bool
@@ -123,25 +123,31 @@ class Condition(NamedTuple):
 
 
 SETTINGS = {"drift": True, "accuracy": RESOLVER, "bend": 1.0, "bent_share": 0.35, "poses": 1.0}
-"""Of the simulations: whether held links drift, the sensors' bound [rad], standard deviation of
-bent joints [deg], share of the poses in which they bend, share of the poses that are used."""
+"""Settings of `measure_simulations`.
+
+- `drift`: whether held links drift.
+- `accuracy`: largest sensor error [rad].
+- `bend`: standard deviation of the errors of bent joints [deg].
+- `bent_share`: fraction of the poses in which joints bend.
+- `poses`: fraction of the document's number of poses.
+"""
 
 
 def identify_under(
     loop: Loop, condition: Condition, seed: int, share: float = 1.0, bent_share: float = 0.35
 ) -> dict[str, float]:
-    """Identify links 3 to 1 as Khoshzaban does, with disturbed readings of the nominal machine.
+    """Identify links 3 to 1 from disturbed readings of the nominal machine.
 
     Args:
-        loop: nominal and true chain.
-        condition: what disturbs the readings.
-        seed: of trajectories and errors; conditions of a seed share their trajectories.
-        share: of the poses.
-        bent_share: of the poses in which joints bend.
+        loop: nominal chain, which is also the true one.
+        condition: disturbances of the readings.
+        seed: seed of trajectories and errors; the trajectories depend only on the seed.
+        share: fraction of the document's number of poses.
+        bent_share: fraction of the poses in which joints bend.
 
     Returns:
-        `error.NAME` of the parameters [m] or [rad] (angles of held links against their mean) and
-        `iterations.LINK`.
+        `error.NAME` of the parameters [m] or [rad] and `iterations.LINK`. The error of a held
+        link's angle is relative to its mean.
     """
     sweeps = draw_sweeps(np.random.default_rng([19, seed]), condition.drift, share)
     clean = [sweep_poses(loop, link, sweeps[link], seed) for link in MOVED]
@@ -163,7 +169,7 @@ def identify_under(
 
 
 def measure_simulations(seed: int, changes: Changes) -> Sample:
-    """Identify with every kind of error, along the same trajectories."""
+    """Identify the arm under every condition, with the same trajectories."""
     chosen = choose_settings(SETTINGS, changes)
     loop = loop_of(load_machine("calibrator"))
     drift, accuracy = chosen["drift"], chosen["accuracy"]
@@ -191,11 +197,15 @@ def measure_simulations(seed: int, changes: Changes) -> Sample:
 
 
 START_SETTINGS = {"length": 0.2, "angle": 10.0, "starts": 4, "poses": 1.0}
-"""Of the first estimates: largest distance from nominal [m] and [deg], how many, share of poses."""
+"""Settings of `measure_starts`.
+
+`length` [m] and `angle` [deg] are the largest distances of an initial estimate from nominal,
+`starts` is the number of initial estimates, and `poses` is the fraction of the poses.
+"""
 
 
 def measure_starts(seed: int, changes: Changes) -> Sample:
-    """Identify the same readings from several first estimates."""
+    """Identify the arm from the same readings with several initial estimates."""
     chosen = choose_settings(START_SETTINGS, changes)
     loop = loop_of(load_machine("calibrator"))
     rng = np.random.default_rng([7, seed])
@@ -205,7 +215,7 @@ def measure_starts(seed: int, changes: Changes) -> Sample:
     first = identify_arm(loop, stages, weighted=False, chosen=IDENTIFIED)
     length, angle = chosen["length"], np.radians(chosen["angle"])
     moved = [n for n in first.names if n.partition(".")[0] in ("alpha", "a", "d", "beta")]
-    # The ball's height in the stick's and the boom's stage counts from the d that the start has.
+    # In the stages of stick and boom, the ball's height is relative to the initial estimate of d.
     compared = [n for n in first.names if not n.startswith("p_") or n.endswith(".swing")]
     worst = 0.0
     for _ in range(chosen["starts"]):
@@ -220,7 +230,7 @@ def measure_starts(seed: int, changes: Changes) -> Sample:
 
 
 def measure_exact(seed: int, changes: Changes) -> Sample:
-    """Identify from readings without any error."""
+    """Identify the arm from readings without errors."""
     chosen = choose_settings({"accuracy": 0.0}, changes)
     loop = loop_of(load_machine("calibrator"))
     found = identify_under(loop, Condition(False, chosen["accuracy"]), seed)
@@ -229,7 +239,7 @@ def measure_exact(seed: int, changes: Changes) -> Sample:
 
 
 def check_lengths(samples: Sequence[Sample], case: str) -> list[Check]:
-    """Whether the published errors of all lengths are plausible repetitions of ours."""
+    """Return checks whether the published length errors agree with the repetitions."""
     return [
         check_population(
             f"error of {SHORT[name]}", 1e3 * collect(samples, f"{case}.error.{name}"),
@@ -239,7 +249,7 @@ def check_lengths(samples: Sequence[Sample], case: str) -> list[Check]:
 
 
 def check_leader(samples: Sequence[Sample], case: str) -> Check:
-    """In how many trajectories d0 has the largest error of the lengths."""
+    """Return a check of the fraction of trajectories in which d0 has the largest length error."""
     leads = [abs(s.values[f"{case}.error.p_z.swing"]) >= s.values[f"{case}.largest"]
              for s in samples]  # fmt: skip
     return check_fraction(
@@ -249,7 +259,7 @@ def check_leader(samples: Sequence[Sample], case: str) -> Check:
 
 
 def describe_lengths(samples: Sequence[Sample], case: str) -> str:
-    """RMS errors of the lengths over the repetitions, as text."""
+    """Return the RMS errors of the lengths over the repetitions as text."""
     sizes = [f"{SHORT[n]} {1e3 * root_mean_square(collect(samples, f'{case}.error.{n}')):.0f}"
              for n in LENGTHS]  # fmt: skip
     return f"RMS errors in mm: {', '.join(sizes)}"
@@ -259,7 +269,7 @@ def check_rms_ratio(
     quantity: str, samples: Sequence[Sample], names: tuple[str, str], accepted: tuple[float, float],
     reason: str, published: float | None = None,
 ) -> Check:  # fmt: skip
-    """Check of the ratio of two figures' RMS values over the repetitions."""
+    """Return a check of the ratio of the RMS values of two results over the repetitions."""
     rows = np.column_stack([collect(samples, name) for name in names])
 
     def ratio(values: np.ndarray) -> float:
@@ -269,13 +279,13 @@ def check_rms_ratio(
 
 
 A3_REASON = (
-    "a3 is identified first and follows the boom's drift in the stick's stage alone, of which Fig."
-    " 16(b) gives the size only"
+    "a3 is identified first; its error depends only on the boom's drift in the stick's stage, of"
+    " which Fig. 16(b) gives only the size"
 )
 
 
 def judge_drift(samples: Sequence[Sample]) -> Judgement:
-    """Table 4."""
+    """Compare the errors under drift alone with Table 4."""
     # alpha 1 is the only twist that drift changes; it is printed as -90.0 deg.
     twist = check_population(
         "error of alpha 1", np.degrees(collect(samples, "drift.error.alpha.swing")), 0.0, "deg",
@@ -289,7 +299,7 @@ def judge_drift(samples: Sequence[Sample]) -> Judgement:
 
 
 def judge_sensors(samples: Sequence[Sample]) -> Judgement:
-    """Table 5."""
+    """Compare the errors under drift and sensor errors with Table 5."""
     twists = check_population(
         "RMS error of alpha and beta", np.degrees(collect(samples, "sensor.twists")),
         root_mean_square(PUBLISHED_TWISTS["sensor"]), "deg",
@@ -306,7 +316,7 @@ def judge_sensors(samples: Sequence[Sample]) -> Judgement:
 
 
 def judge_flexible(samples: Sequence[Sample]) -> Judgement:
-    """Table 6."""
+    """Compare the errors under drift and bent joints with Table 6."""
     largest = {case: max(abs(published_error(case, n)) for n in LENGTHS)
                for case in ("flexible", "sensor")}  # fmt: skip
     ratio = largest["flexible"] / largest["sensor"]
@@ -316,7 +326,7 @@ def judge_flexible(samples: Sequence[Sample]) -> Judgement:
         check_rms_ratio(
             "largest length error over that with sensors and drift", samples,
             ("flexible.largest", "sensor.largest"), (0.5 * ratio, 2.0 * ratio),
-            "a factor of 2 around one unrepeated draw of errors", ratio,
+            "a factor of 2 around a single sample of errors", ratio,
         ),
         check_population("RMS error of the lengths", 1e3 * collect(samples, "flexible.lengths"),
                          1e3 * lengths, "mm"),
@@ -334,30 +344,30 @@ def judge_flexible(samples: Sequence[Sample]) -> Judgement:
     twists = root_mean_square(np.degrees(collect(samples, "lasting.twists")))
     return Judgement(
         checks,
-        "errors that are drawn anew in every pose average out over 300 poses; where each joint"
-        f" keeps one draw in a stage, {lasting.describe()} and alpha and beta err by"
-        f" {twists:.1f} deg",
+        "errors that are independent in every pose average out over 300 poses; if each joint"
+        f" has one constant error in a stage, {lasting.describe()} and the RMS error of alpha and"
+        f" beta is {twists:.1f} deg",
         describe_lengths(samples, "flexible"),
     )
 
 
 def check_lasting_ratio(samples: Sequence[Sample]) -> Check:
-    """Growth of the largest error where a joint keeps one draw in all bent poses of a stage."""
+    """Return a check of the largest error if a joint has one error in all bent poses of a stage."""
     ratio = 838.0 / 73.0
     return check_rms_ratio(
         "the largest length error over that with sensors and drift", samples,
         ("lasting.largest", "sensor.largest"), (0.5 * ratio, 2.0 * ratio),
-        "a factor of 2 around one unrepeated draw of errors", ratio,
+        "a factor of 2 around a single sample of errors", ratio,
     )  # fmt: skip
 
 
 def judge_lasting(samples: Sequence[Sample]) -> Judgement:
-    """Table 6 with bends that last."""
+    """Compare the errors under drift and constantly bent joints with Table 6."""
     return Judgement((check_lasting_ratio(samples),), note=describe_lengths(samples, "lasting"))
 
 
 def judge_relative_error(samples: Sequence[Sample]) -> Judgement:
-    """Relative error of a1, p. 60."""
+    """Compare the relative error of a1 with p. 60."""
     size = NOMINAL["a.swing"]
     half = 100.0 * collect(samples, "half.error.a.swing") / size
     both = 100.0 * np.abs(collect(samples, "sensor.error.a.swing")) / size
@@ -373,7 +383,7 @@ def judge_relative_error(samples: Sequence[Sample]) -> Judgement:
 
 
 def judge_sensor_share(samples: Sequence[Sample]) -> Judgement:
-    """Part of a1's error that sensors make, p. 60."""
+    """Compare the fraction of a1's error due to the sensors with p. 60."""
     rows = np.column_stack([collect(samples, f"{case}.error.a.swing")
                             for case in ("half", "sensor", "drift")])  # fmt: skip
 
@@ -384,13 +394,13 @@ def judge_sensor_share(samples: Sequence[Sample]) -> Judgement:
     return Judgement(
         (check_statistic("error of a1 by sensors of 0.1 deg over that with drift", rows, share,
                          (0.35, 0.65), "half, to one digit", published=0.5),),
-        f"drift alone makes {alone:.2f} times the error of both, so that little is left to the"
-        " sensors; by Tables 4 and 5 themselves it makes 34 of 42 mm",
+        f"drift alone causes {alone:.2f} times the error of both, so that the sensors contribute"
+        " little; by Tables 4 and 5, drift causes 34 of 42 mm",
     )  # fmt: skip
 
 
 def judge_iterations(samples: Sequence[Sample]) -> Judgement:
-    """Iterations, p. 62."""
+    """Compare the numbers of iterations with p. 62."""
     totals = {case: sum(counts) for case, counts in PUBLISHED_ITERATIONS.items()}
     checks = []
     for case in ("sensor", "flexible"):
@@ -411,14 +421,14 @@ def judge_iterations(samples: Sequence[Sample]) -> Judgement:
                                     for link in MOVED) for case in totals]  # fmt: skip
     return Judgement(
         tuple(checks),
-        "the search lowers its truncation of singular values in four steps, each of which needs at"
-        " least one iteration, so that about 8 iterations a link come with any data",
+        "the solver reduces its truncation of singular values in four steps, each of which needs at"
+        " least one iteration, so that any data need about 8 iterations per link",
         f"links 3, 2 and 1: {'; '.join(words)}",
     )
 
 
 def judge_usual_errors(samples: Sequence[Sample]) -> Judgement:
-    """Relative errors with sensors of 0.1 deg and drift, p. 122."""
+    """Compare the relative errors under drift and sensor errors of 0.1 deg with p. 122."""
     errors = np.array([[abs(s.values[f"sensor.error.{n}"] / NOMINAL[n]) for n in LENGTHS]
                        for s in samples])  # fmt: skip
     rms = [f"{SHORT[n]} {100 * root_mean_square(errors[:, k]):.1f}" for k, n in enumerate(LENGTHS)]
@@ -430,7 +440,7 @@ def judge_usual_errors(samples: Sequence[Sample]) -> Judgement:
 
 
 def judge_starts(samples: Sequence[Sample]) -> Judgement:
-    """First estimates, pp. 62 and 121."""
+    """Check that all initial estimates give the same result (pp. 62 and 121)."""
     return Judgement((
         check_exact("largest difference of the results", float(collect(samples, "spread").max()),
                     (0.0, 5e-4), "half of the last printed digit of a length", unit="m or rad"),
@@ -438,7 +448,7 @@ def judge_starts(samples: Sequence[Sample]) -> Judgement:
 
 
 def judge_exact(samples: Sequence[Sample]) -> Judgement:
-    """No error."""
+    """Check that readings without errors give the true parameters."""
     return Judgement((
         check_exact("largest error of a parameter", float(collect(samples, "worst").max()),
                     (0.0, 1e-9), "rounding only", unit="m or rad"),
@@ -448,8 +458,8 @@ def judge_exact(samples: Sequence[Sample]) -> Judgement:
 EXPERIMENTS = (
     Experiment("exact readings", measure_exact, (
         Claim(
-            "readings without error", "every parameter comes out", "section 3.7, p. 56",
-            "additional", judge_exact, {"accuracy": 1e-6}, "sensors err within 1 urad",
+            "readings without error", "every parameter is recovered", "section 3.7, p. 56",
+            "additional", judge_exact, {"accuracy": 1e-6}, "sensor errors are within 1 urad",
         ),
     ), repetitions_fixed=1),
     Experiment("simulated calibrations", measure_simulations, (
@@ -458,14 +468,14 @@ EXPERIMENTS = (
             "The maximum error belongs to d0 (0.068 m); the drift does not contribute any"
             " significant error: a1 -34, a2 +8, a3 -3 mm, alpha and beta 0.0 deg",
             "Table 4, section 3.7.1, pp. 59-60", "document", judge_drift, {"drift": False},
-            "held links stay where they are",
+            "held links do not drift",
         ),
         Claim(
             "drift and sensors of 0.1 deg",
             '"the accuracy of the calibrator sensors proportionally altered" alpha and beta (0.1 to'
             " 0.2 deg); d0 errs by 73 mm, a1 -42, a2 +19, a3 -4 mm",
             "Table 5, section 3.7.2, pp. 60-61", "document", judge_sensors,
-            {"drift": False}, "held links stay where they are",
+            {"drift": False}, "held links do not drift",
         ),
         Claim(
             "drift and flexible joints",
@@ -477,7 +487,7 @@ EXPERIMENTS = (
         ),
         Claim(
             "drift and joints that stay bent",
-            "where each joint keeps one draw of N(0, 1 deg) in the bent poses of a stage, the"
+            "if each joint has one error, drawn from N(0, 1 deg), in all bent poses of a stage, the"
             " largest error grows as in Table 6",
             "Table 6, section 3.7.3, pp. 61-62", "additional", judge_lasting, {"bend": 0.0},
             "joints do not bend",
@@ -487,13 +497,13 @@ EXPERIMENTS = (
             '"one should expect a maximum relative error of 2.5% in a1" with sensors within 0.05'
             " deg; about 10 % with drift and 0.1 deg",
             "section 3.7.2, p. 60", "document", judge_relative_error,
-            {"accuracy": 10.0 * RESOLVER}, "sensors err ten times as much",
+            {"accuracy": 10.0 * RESOLVER}, "sensor errors are ten times as large",
         ),
         Claim(
             "share of the sensors in the error of a1",
             '"about half of the error obtained here is due to the sensor accuracy"',
             "section 3.7.2, p. 60", "document", judge_sensor_share, {"accuracy": 0.1 * RESOLVER},
-            "sensors err a tenth as much",
+            "sensor errors are a tenth as large",
         ),
         Claim(
             "iterations",
@@ -507,7 +517,7 @@ EXPERIMENTS = (
             "errors with resolvers of 0.1 deg",
             '"errors in the identified parameters to be usually less than 5%"',
             "section 5.1, p. 122", "document", judge_usual_errors, {"accuracy": 50.0 * RESOLVER},
-            "sensors err within 5 deg",
+            "sensor errors are within 5 deg",
         ),
     )),
     Experiment("first estimates", measure_starts, (

@@ -1,9 +1,9 @@
-"""The calibration of the machine in Khoshzaban 1992, section 3.8, repeated in simulation.
+"""Simulate the calibration of the machine in Khoshzaban 1992, section 3.8.
 
-Truth is the nominal machine, as in the thesis: "we consider the nominal model to behave like the
-actual system" (p. 67). The calibrator's joints 5 and 6 bend where the stick is pulled in (p. 69);
-by how much is not printed. As in the thesis, poses in which the readings differ visibly from those
-of the nominal model are left out before the arm is identified again.
+The nominal machine is the true one, as in the thesis: "we consider the nominal model to behave like
+the actual system" (p. 67). The calibrator's joints 5 and 6 bend when the stick is retracted (p.
+69); the thesis does not give the size. As in the thesis, poses whose readings differ visibly from
+the nominal model are excluded before the arm is identified again.
 """
 
 from collections.abc import Mapping
@@ -52,32 +52,40 @@ SETTINGS = {
     "bent": ("grapple", "calibrator_yoke"), "removal": True, "tape": 0.005, "transducer": 0.002,
     "built": 0.0, "poses": 1.0,
 }  # fmt: skip
-"""Whether held links drift; bound of the angle sensors' errors [rad]; range of the bends at the
-largest stick angle [deg] and which joints bend (the size is an assumption: Fig. 20, p. 68, has axes
-of 30 deg on which it is called large); whether bent poses are removed; standard deviation of the
-tape measure (an assumption) and bound of the linear transducers' errors (p. 21) [m]; standard
-deviation of the true machine's lengths from nominal [m], with 1 deg per 30 mm for its angles; share
-of the poses."""
+"""Settings of `measure_calibration` and `measure_search`.
+
+- `drift`: whether held links drift.
+- `accuracy`: largest error of the angle sensors [rad].
+- `bend`: range of the bends at the largest stick angle [deg]. Assumed: Fig. 20 (p. 68), whose axes
+  span 30 deg, shows a large one.
+- `bent`: joints that bend.
+- `removal`: whether bent poses are excluded.
+- `tape`: standard deviation of the tape measure [m], assumed.
+- `transducer`: largest error of the linear transducers (p. 21) [m].
+- `built`: standard deviation of the true machine's lengths from nominal [m]; its angles have
+  1 deg per 30 mm.
+- `poses`: fraction of the document's number of poses.
+"""
 
 NO_FAULTS = {"bend": (0.0, 0.0), "drift": False}
-"""Changes with which only the sensors err."""
+"""Changes that leave sensor noise as the only error."""
 
 ENDS = {"stick": 3, "grapple": 5}
 """End point -> number of links up to it."""
 
 SIDES = ("manipulator", "calibrator")
 VISIBLE = np.radians(1.0)
-"""Difference at the yoke from which on a pose is left out; the axes of Fig. 20 span 30 deg."""
+"""Difference at the yoke above which a pose is excluded [rad]; the axes of Fig. 20 span 30 deg."""
 
-_TAPED = 19  # distances that are measured, p. 65
+_TAPED = 19  # number of taped distances, p. 65
 
 
 class Model(NamedTuple):
-    """Parameters with which end points are computed.
+    """Kinematic parameters that determine the end points.
 
     Attributes:
         values: (N, 5) rows of `Loop.values`.
-        ball: (3,) place of the ball [m].
+        ball: (3,) position of the ball [m].
         pitch: angle at which joint 4 is held [rad].
     """
 
@@ -87,16 +95,17 @@ class Model(NamedTuple):
 
 
 class Calibration(NamedTuple):
-    """A calibration with and without the poses of bent joints.
+    """Data and results of a calibration with and without the poses of bent joints.
 
     Attributes:
-        loop: the nominal chain.
-        true: the true one.
+        loop: nominal chain.
+        true: true chain.
         clean: true poses of every stage.
-        inside: whether joints bend, (M,) of the stick's stage.
+        inside: (M,) whether joints bend in each pose of the stick's stage.
         stages: readings of every stage, with the drift of held links.
-        kept: readings without the poses that are left out.
-        fits: `identified` and `reidentified`, once they are identified.
+        kept: readings without the excluded poses.
+        fits: results `identified` (all poses) and `reidentified` (kept poses); empty before the
+            identification.
     """
 
     loop: Loop
@@ -109,7 +118,7 @@ class Calibration(NamedTuple):
 
 
 def simulate_stages(seed: int, chosen: Mapping[str, Any], rng: np.random.Generator) -> Calibration:
-    """Simulate the readings of all stages."""
+    """Simulate the readings of all calibration stages and exclude visibly bent poses."""
     loop = loop_of(load_machine("calibrator"))
     built = chosen["built"]
     true = perturb_loop(loop, rng, built, built / 0.03) if built else loop
@@ -128,7 +137,7 @@ def simulate_stages(seed: int, chosen: Mapping[str, Any], rng: np.random.Generat
 
 
 def identify_twice(done: Calibration) -> dict[str, ArmFit]:
-    """Identify the arm from all poses and from those that are kept."""
+    """Identify the arm once from all poses and once from the kept poses."""
     used = {"identified": done.stages, "reidentified": done.kept}
     return {
         name: identify_arm(done.loop, [replace(s, drift=None) for s in poses], weighted=False,
@@ -138,10 +147,10 @@ def identify_twice(done: Calibration) -> dict[str, ArmFit]:
 
 
 def leave_out_visible(loop: Loop, stage: Poses) -> Poses:
-    """Keep the poses in which all sensors agree with the nominal model to 1 deg at the yoke.
+    """Exclude poses in which the readings differ by 1 deg or more from the nominal model.
 
-    A pose is left out where the chain's gap exceeds the ball's displacement by 1 deg of the yoke.
-    In the stage of joint 4, which has no sensor, every pose is kept.
+    A pose is excluded if the closure error of the chain exceeds the displacement of the ball that a
+    yoke rotation of 1 deg causes. All poses of joint 4, which has no sensor, are kept.
     """
     if stage.link not in MOVED:
         return stage
@@ -152,7 +161,15 @@ def leave_out_visible(loop: Loop, stage: Poses) -> Poses:
 
 
 def measure_calibration(seed: int, changes: Changes) -> Sample:
-    """Calibrate the machine, remove bent poses, calibrate again, and compare end points."""
+    """Calibrate the machine with and without bent poses, and compare the results.
+
+    Args:
+        seed: seed of sweeps, bends and sensor errors.
+        changes: changes of `SETTINGS`.
+
+    Returns:
+        Errors of parameters, end points, distances and cylinder triangles, with their curves.
+    """
     chosen = choose_settings(SETTINGS, changes)
     rng = np.random.default_rng([38, seed])
     done = simulate_stages(seed, chosen, rng)
@@ -169,7 +186,16 @@ def measure_calibration(seed: int, changes: Changes) -> Sample:
 
 
 def measure_search(seed: int, changes: Changes) -> Sample:
-    """Search the readings for bent joints by the equations alone, and by the nominal model."""
+    """Detect bent joints from the closure equations alone, and with the nominal model.
+
+    Args:
+        seed: seed of sweeps, bends and sensor errors.
+        changes: changes of `SETTINGS`.
+
+    Returns:
+        `overlap` of detected and bent poses (intersection over union), `blamed` (whether only bent
+        joints are detected), and the fraction `left out` of the bent poses.
+    """
     chosen = choose_settings(SETTINGS, changes)
     done = simulate_stages(seed, chosen, np.random.default_rng([38, seed]))
     cleaned = identify_without_bad_data(done.loop, done.stages)
@@ -191,7 +217,7 @@ def measure_search(seed: int, changes: Changes) -> Sample:
 
 
 def _parameter_errors(done: Calibration, model: str, fit: ArmFit) -> dict[str, float]:
-    """Errors of the identified parameters against the truth, iterations of the stages."""
+    """Return the errors of the identified parameters and the iterations of the stages."""
     truth = dict(zip(fit.names, true_numbers(done.true, done.loop, fit.names, done.clean),
                      strict=True))  # fmt: skip
     ball = done.true.ball
@@ -210,7 +236,7 @@ def _parameter_errors(done: Calibration, model: str, fit: ArmFit) -> dict[str, f
 
 
 def _compare_sensors(done: Calibration) -> Sample:
-    """Compare the calibrator's readings with those that the manipulator's side predicts."""
+    """Compare the calibrator's readings with those predicted from the manipulator's sensors."""
     loop, inside = done.loop, done.inside
     stage = next(one for one in done.stages if one.link == "stick")
     predicted = predicted_readings(loop, stage, _nominal_numbers(loop, stage))
@@ -234,14 +260,14 @@ def _compare_sensors(done: Calibration) -> Sample:
         panels.append(Panel(
             f"joint {5 + k}, {name} [deg]", pose,
             {"sensor": np.degrees(stage.theta[:, k]), "predicted": np.degrees(predicted[:, k])},
-            "pose [1]", discrete=True, errors={"sensor less prediction": difference[:, k]},
+            "pose [1]", discrete=True, errors={"sensor minus prediction": difference[:, k]},
             error_label="difference [deg]",
         ))  # fmt: skip
     return Sample(values, tuple(panels))
 
 
 def _nominal_numbers(loop: Loop, stage: Poses) -> dict[str, float]:
-    """Numbers of a stage's equations by the nominal chain and the manipulator's own sensors."""
+    """Return a stage's parameters from the nominal chain and the manipulator's sensors."""
     theta = loop.home[None].copy()
     place = loop.links.index(stage.link)
     for k, link in enumerate(loop.links[:place]):
@@ -261,7 +287,10 @@ def _model_of(done: Calibration, name: str) -> Model:
 
 
 def _angles(loop: Loop, model: Model, stage: Poses) -> np.ndarray:
-    """(M, N) angles by all sensors with a model's offsets [rad]; joint 4 has no sensor."""
+    """Return (M, N) joint angles from all sensors with a model's offsets [rad].
+
+    Joint 4 has no sensor; its angle is that of the model.
+    """
     theta = np.empty((len(stage), len(loop)))
     for k, link in enumerate(loop.links[: loop.moved]):
         unsensed = link == "pitch"
@@ -271,14 +300,13 @@ def _angles(loop: Loop, model: Model, stage: Poses) -> np.ndarray:
 
 
 def end_place(model: Model, theta: np.ndarray, side: str, links: int) -> np.ndarray:
-    """Place of an end point and the ball relative to each other.
+    """Return the position of an end point relative to the ball.
 
     Args:
-        model: the parameters.
-        theta: (M, N) angles [rad].
-        side: `manipulator`: the end point less the ball in frame 0, from the first joints.
-            `calibrator`: the end point in the last link's frame, whose origin is the ball, from the
-            last joints.
+        model: kinematic parameters.
+        theta: (M, N) joint angles [rad].
+        side: `manipulator`: position in frame 0, computed from the first joints. `calibrator`:
+            position in the last link's frame, computed from the last joints.
         links: number of links up to the end point.
 
     Returns:
@@ -291,7 +319,7 @@ def end_place(model: Model, theta: np.ndarray, side: str, links: int) -> np.ndar
 
 
 def _compare_ends(done: Calibration) -> Sample:
-    """Compare end points with identified parameters and with the nominal ones."""
+    """Compare the end points of the identified models with those of the nominal model."""
     nominal, values, panels = _model_of(done, "nominal"), {}, []
     used = {"identified": done.stages, "reidentified": done.kept}
     for name, stages in used.items():
@@ -311,7 +339,7 @@ def _compare_ends(done: Calibration) -> Sample:
                         Panel(f"{end}'s end, {axis} [m]", pose,
                               {"nominal": both[0][:, k], "re-identified": both[1][:, k]},
                               "pose [1]", discrete=True,
-                              errors={"re-identified less nominal": error[:, k]},
+                              errors={"re-identified minus nominal": error[:, k]},
                               error_label="difference [m]")
                         for k, axis in enumerate("xyz")
                     ]  # fmt: skip
@@ -319,7 +347,7 @@ def _compare_ends(done: Calibration) -> Sample:
 
 
 def _compare_distances(done: Calibration, tape: float, rng: np.random.Generator) -> Sample:
-    """Compare distances of the end points from the ball with a tape at 19 poses."""
+    """Compare computed distances between end points and ball with tape measurements."""
     pairs = [(one, stage) for one, stage in zip(done.clean, done.stages, strict=True)
              if stage.link in MOVED]  # fmt: skip
     truth = np.concatenate([one.theta for one, _ in pairs])
@@ -353,7 +381,7 @@ def _compare_distances(done: Calibration, tape: float, rng: np.random.Generator)
 def _identify_minor_links(
     done: Calibration, chosen: Mapping[str, Any], rng: np.random.Generator
 ) -> Sample:
-    """Cylinder triangles from measured angles and from those of the re-identified arm."""
+    """Identify the cylinder triangles from measured angles and from the re-identified arm."""
     machine, values, panels = load_machine("calibrator"), {}, []
     transducer, accuracy = chosen["transducer"], chosen["accuracy"]
     sigma = max(accuracy, 1e-9) / np.sqrt(3.0), max(transducer, 1e-9) / np.sqrt(3.0)
@@ -386,7 +414,7 @@ def _identify_minor_links(
 
 
 def _true_displacement(machine: Machine, axis: str, angle: np.ndarray) -> np.ndarray:
-    """Piston displacement of the machine's own triangle at angles [m]."""
+    """Return the piston displacement of the machine's cylinder triangle at joint angles [m]."""
     linkage, cylinder = axis_linkage(machine, axis), machine.axes[axis].cylinder
     assert cylinder
     return np.asarray(linkage.length(angle)) - cylinder.closed_length

@@ -1,8 +1,8 @@
 """Chapter 4 of Khoshzaban 1992: dynamic calibration of a hydraulic machine with minor links.
 
-Forces of the complete and the reduced model (4.4.1), and which parameters can be identified
-(4.4.2). The sensors' accuracy (4.4.3) is in `khoshzaban_sensors`, the measured machine (4.6) in
-`khoshzaban_prediction`.
+The module compares forces of the complete and the reduced model (4.4.1) and classifies the
+identifiability of the parameters (4.4.2). Sensor accuracy (4.4.3) is in `khoshzaban_sensors`, and
+the measured machine (4.6) is in `khoshzaban_prediction`.
 """
 
 from collections.abc import Sequence
@@ -52,18 +52,18 @@ FORCE_SETTINGS = {
     "cylinder_scale": 1.0,  # of mass, mass moments and inertia of all tubes and rods
     "rods_beyond_pins": False,  # whether rods' centres of mass lie beyond their pins
 }
-_LARGE = 0.5  # of its peak, from which the factor between two forces means something
+_LARGE = 0.5  # fraction of the peak force above which the factor between two forces is meaningful
 
 
 def measure_forces(seed: int, changes: Changes) -> Sample:
-    """Forces of the complete and the reduced model along a motion.
+    """Compare the forces of the complete and the reduced model along a random motion.
 
     Args:
-        seed: of the motion.
-        changes: of `FORCE_SETTINGS`.
+        seed: seed of the motion.
+        changes: changes of `FORCE_SETTINGS`.
 
     Returns:
-        Factors between the forces, and their differences.
+        Factors between the forces of both models, and their RMS differences.
     """
     settings = read_settings(FORCE_SETTINGS, changes)
     motion = draw_motion(np.random.default_rng(seed))
@@ -109,20 +109,20 @@ def _force_panels(motion: Motion, complete: np.ndarray, reduced: np.ndarray) -> 
     ]
     for k, label in enumerate(FORCE_LABELS):
         curves = {"complete model": complete[:, k], "reduced model": reduced[:, k]}
-        errors = {"complete less reduced": complete[:, k] - reduced[:, k]}
+        errors = {"complete minus reduced": complete[:, k] - reduced[:, k]}
         panels.append(Panel(label, time, curves, errors=errors,
                             error_label=f"difference [{UNITS[k]}]"))  # fmt: skip
     return tuple(panels)
 
 
 def judge_factor(samples: Sequence[Sample]) -> Judgement:
-    """The factor between the models' forces has to reach two where the force is large."""
+    """Check whether the factor between the models' forces reaches two at large forces."""
     largest = np.max([collect(samples, f"factor.{drive}") for drive in DRIVES], axis=0)
     check = check_mean(
         "largest factor between both models' forces, of three drives, at instants with more than"
         " half of the peak force",
-        largest, (2.0, np.inf), '"a factor of two or more"; a factor near zero force means nothing',
-        published=2.0,
+        largest, (2.0, np.inf),
+        '"a factor of two or more"; a factor near zero force is meaningless', published=2.0,
     )  # fmt: skip
     twice = "; ".join(
         f"{d}: {format_values(samples, f'twice.{d}', 100.0, 0)} % of the time, where its force is"
@@ -132,17 +132,17 @@ def judge_factor(samples: Sequence[Sample]) -> Judgement:
     relative = ", ".join(f"{d} {format_values(samples, f'relative.{d}', 100.0)} %" for d in DRIVES)
     return Judgement(
         (check,),
-        "Table 13's cylinders, of 200 kg each beside links of 1830 and 688 kg, are too light for"
-        " it: the boom's force reaches a factor of two with cylinders eight times as heavy (2.05),"
+        "Table 13's cylinders of 200 kg each are too light compared with links of 1830 and 688 kg:"
+        " the boom's force reaches a factor of two with cylinders eight times as heavy (2.05),"
         " the swing's torque with ten times (1.99), the stick's force with twice (2.2). Rods whose"
-        " centres of mass lie beyond their pins, by the sign of mcx, give 1.35. Only"
-        " where the stick's force is small does the factor exceed two.",
+        " centres of mass lie beyond their pins, as the sign of mcx suggests, give 1.35. The factor"
+        " exceeds two only when the stick's force is small.",
         note=f"RMS difference over RMS force: {relative}; factor of two: {twice}",
     )
 
 
 def judge_proximal(samples: Sequence[Sample]) -> Judgement:
-    """The boom's force has to be wrong by more than its sensors are, and more than the stick's."""
+    """Check that the boom's force error exceeds its sensor error and the stick's force error."""
     rows = np.stack([collect(samples, f"difference.{d}") for d in ("boom", "stick")], axis=1)
     checks = (
         check_mean(
@@ -152,7 +152,7 @@ def judge_proximal(samples: Sequence[Sample]) -> Judgement:
         check_statistic(
             "the same, boom over stick", rows,
             lambda r: float(np.linalg.norm(r[:, 0]) / max(np.linalg.norm(r[:, 1]), 1e-300)),
-            (1.0, np.inf), "the proximal cylinder's error is the larger one",
+            (1.0, np.inf), "the proximal cylinder's error is larger",
         ),
     )  # fmt: skip
     sizes = ", ".join(
@@ -168,9 +168,9 @@ def judge_proximal(samples: Sequence[Sample]) -> Judgement:
 
 
 def judge_motion(samples: Sequence[Sample]) -> Judgement:
-    """Motions are drawn within the axes' ticks, which are all that is legible."""
+    """Describe the drawn motions; only the axis ticks of the published ones are legible."""
     rates = ", ".join(f"{d} {format_values(samples, f'peak_rate.{d}', digits=2)}" for d in DRIVES)
-    return Judgement(note=f"drawn anew in every repetition; largest rates {rates} rad/s")
+    return Judgement(note=f"a new random motion in every repetition; largest rates {rates} rad/s")
 
 
 FORCES = Experiment(
@@ -203,29 +203,29 @@ FORCES = Experiment(
 
 
 COUNT_SETTINGS = {
-    "ball_joints": True,  # ends of the cylinders in the document's model
-    "pins": True,  # whether the model that is compared has pins instead
-    "tilt_deg": 0.0,  # of the ground
-    "states": 300,  # random states of the regressor
+    "ball_joints": True,  # whether the cylinders of the document's model end in ball joints
+    "pins": True,  # whether the cylinders of the second model end in pins
+    "tilt_deg": 0.0,  # slope of the ground
+    "states": 300,  # number of random states in the regressor
 }
 TABLE_13 = {"deleted": 31, "combined": 24, "full": 27}
 """Unidentifiable, linearly identifiable and fully identifiable parameters of 82 (p. 107)."""
 
 PIN_COUNTS = {"deleted": 37, "combined": 25, "full": 20}
-"""The same with pins, of this project."""
+"""The same counts for cylinders with pins, computed by this project."""
 
 
 def count_parameters(told: Identifiability) -> dict[str, int]:
-    """Counts in the document's words.
+    """Count the parameters in the document's three classes.
 
-    Columns that have no effect and columns for which others can stand are deleted, and count as
-    unidentifiable. The number of the others is the rank.
+    Columns without effect and columns that depend linearly on others are deleted and count as
+    unidentifiable. The number of remaining columns is the rank.
 
     Args:
         told: classification of all parameters.
 
     Returns:
-        `deleted`, `combined` (kept, and standing for a combination), `full`.
+        Counts `deleted`, `combined` (remaining columns that represent a combination) and `full`.
 
     Source: Khoshzaban 1992, p. 100.
     """
@@ -237,11 +237,11 @@ def measure_identifiability(seed: int, changes: Changes) -> Sample:
     """Classify the 82 parameters of the complete model with ball joints and with pins.
 
     Args:
-        seed: of the random states.
-        changes: of `COUNT_SETTINGS`.
+        seed: seed of the random states.
+        changes: changes of `COUNT_SETTINGS`.
 
     Returns:
-        Counts, and how clear the rank is.
+        Counts of the classes, and the relative singular values on either side of the rank.
     """
     settings = read_settings(COUNT_SETTINGS, changes)
     states = draw_states(settings["states"], seed)
@@ -262,7 +262,7 @@ def measure_identifiability(seed: int, changes: Changes) -> Sample:
 
 
 def judge_table_13(samples: Sequence[Sample]) -> Judgement:
-    """The counts have to be those of the table."""
+    """Compare the counts with Table 13."""
     values = samples[0].values
     words = {"deleted": "unidentifiable", "combined": "linearly identifiable",
              "full": "fully identifiable"}  # fmt: skip
@@ -274,16 +274,16 @@ def judge_table_13(samples: Sequence[Sample]) -> Judgement:
     pins = "/".join(f"{values[f'pins.{name}']:.0f}" for name in TABLE_13)
     return Judgement(
         checks,
-        "The counts hold for cylinders that carry no moment about their axes (Eq. 4.23, ball"
-        " joints). With pins the moment is carried, six combinations of the tubes' and rods'"
-        " parameters and the links' inertias can no longer be separated.",
+        "The counts hold for cylinders that transmit no moment about their axes (Eq. 4.23, ball"
+        " joints). Cylinders with pins transmit this moment, so that six combinations of the tubes'"
+        " and rods' parameters and the links' inertias cannot be separated.",
         note=f"with pins {pins}; singular values on either side of the rank"
         f" {values['document.smallest']:.1g} and {values['document.next']:.0g} of the largest",
     )
 
 
 def judge_pins(samples: Sequence[Sample]) -> Judgement:
-    """With pins the counts are those of this project."""
+    """Check the counts for cylinders with pins."""
     values = samples[0].values
     return Judgement(
         tuple(
@@ -294,7 +294,7 @@ def judge_pins(samples: Sequence[Sample]) -> Judgement:
 
 
 def judge_swing(samples: Sequence[Sample]) -> Judgement:
-    """Nine of the swing's parameters have no effect, the tenth shows in a combination."""
+    """Check that nine swing parameters have no effect and the tenth appears in a combination."""
     values = samples[0].values
     return Judgement(
         (
@@ -302,7 +302,7 @@ def judge_swing(samples: Sequence[Sample]) -> Judgement:
                         "the first nine of the swing", published=9),
             check_exact("they are the first nine of the swing",
                         values["document.first_nine_lost"], (1, 1), "1: yes"),
-            check_exact("Izz of the swing shows in a combination",
+            check_exact("Izz of the swing is identifiable in a combination",
                         values["document.swing_combined"], (1, 1), "1: yes"),
         ),
     )  # fmt: skip
@@ -323,7 +323,7 @@ IDENTIFIABILITY = Experiment(
             "identifiability with pins",
             "With cylinders that end in pins, 37 of the 82 parameters are unidentifiable, 25"
             " linearly identifiable and 20 fully identifiable.",
-            "beside Table 13", "additional", judge_pins,
+            "supplement to Table 13", "additional", judge_pins,
             broken={"pins": False}, broken_how="cylinders that end in ball joints",
         ),
         Claim(
@@ -341,7 +341,7 @@ IDENTIFIABILITY = Experiment(
 
 
 EXPERIMENTS: tuple[Experiment, ...] = (FORCES, IDENTIFIABILITY, ACCURACY, NOISE, PREDICTION)
-"""Chapter 4, in its order."""
+"""Experiments of chapter 4, in the order of the document."""
 
 UNAVAILABLE: tuple[Comparison, ...] = (
     Comparison(
@@ -349,7 +349,7 @@ UNAVAILABLE: tuple[Comparison, ...] = (
         "identified parameters of the UBC hydraulic manipulator, complete and reduced model",
         "document",
         Judgement(
-            unavailable="the excavator's logs are not published, and its parameters are not known"
+            unavailable="the excavator's logs are not published, and its parameters are unknown"
         ),
     ),
 )  # fmt: skip
@@ -362,10 +362,10 @@ DRAWINGS = {
     "Fig. 29": "free-body diagram of a hydraulic actuator",
     "Fig. 34": "block diagram of measurement and identification",
 }
-"""Figures of chapter 4 that show no result."""
+"""Figures of chapter 4 without a result."""
 
 ITEMS = (
     *(f"Table {n}" for n in range(13, 18)),
     *(f"Fig. {n}" for n in range(26, 38)),
 )
-"""Tables and figures of chapter 4, from the document's lists."""
+"""All tables and figures of chapter 4."""

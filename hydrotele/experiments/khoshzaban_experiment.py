@@ -1,7 +1,7 @@
 """Claims of Khoshzaban 1992, section 3.8: Tables 7 to 10 and Figs 19 to 25.
 
-The thesis calibrates one machine once: published figures are compared as one repetition of the
-simulated calibrations (`khoshzaban_calibration`), published changes by a factor.
+The thesis calibrates one machine once. Published values are compared with the scatter of the
+simulated calibrations (`khoshzaban_calibration`); published changes are compared by their ratio.
 """
 
 from collections.abc import Sequence
@@ -41,7 +41,7 @@ from hydrotele.experiments.khoshzaban_calibration import (
 from hydrotele.machine.machine_file import load_machine
 
 # Tables 7 (p. 63) and 9 (p. 70): lengths [m] in the order and with the signs of LENGTHS, twists
-# [deg] less those of Table 2 in the order of TWISTS; theta_fix of joint 4 [deg].
+# minus those of Table 2 [deg] in the order of TWISTS.
 _PRINTED_LENGTHS = {
     "identified": (-0.623, 2.122, 0.011, 5.485, 0.001, 1.868),
     "reidentified": (-0.699, 2.122, 0.401, 5.312, -0.059, 1.848),
@@ -49,7 +49,7 @@ _PRINTED_LENGTHS = {
 _PRINTED_TWISTS = {
     "identified": (5.5, -4.7, -2.0, -3.6, -1.3), "reidentified": (3.8, -2.1, -3.4, 0.2, -2.8)
 }  # fmt: skip
-# Links 4 and 5 less Table 2, the same in both: [m], [deg], offsets of joints 5, 6 and 7 [deg].
+# Links 4 and 5 minus Table 2, equal in both tables: [m], [deg], offsets of joints 5, 6, 7 [deg].
 _PRINTED_OUTER = {"a.pitch": 0.069, "a.grapple": -0.028, "d.grapple": 0.003}
 _PRINTED_OUTER_TWISTS = {"alpha.pitch": -2.5, "alpha.grapple": 5.0}
 _PRINTED_OFFSETS = (8.6, 4.2, 0.7)
@@ -75,12 +75,12 @@ DISTANCES = {
 
 
 def printed_length_errors(model: str) -> dict[str, float]:
-    """Printed lengths less those of Table 2 [m]."""
+    """Return the printed lengths minus those of Table 2 [m]."""
     return {n: v - NOMINAL[n] for n, v in zip(LENGTHS, _PRINTED_LENGTHS[model], strict=True)}
 
 
 def changed_range(ratio: float) -> tuple[float, float]:
-    """Ratios after over before whose decrease is half to twice that of a published ratio."""
+    """Return the range of ratios whose decrease is half to twice that of a published ratio."""
     return max(0.0, 1.0 - 2.0 * (1.0 - ratio)), 1.0 - 0.5 * (1.0 - ratio)
 
 
@@ -88,7 +88,7 @@ CHANGE = "half to twice the published decrease of one measurement"
 
 
 def measure_printed(seed: int, changes: Changes) -> Sample:
-    """Compute end points with the printed parameters and the nominal ones, with exact angles."""
+    """Compare end points of the printed parameters with nominal ones for exact joint angles."""
     chosen = choose_settings({"table_9": "reidentified"}, changes)
     loop = loop_of(load_machine("calibrator"))
     theta = np.concatenate([sweep_poses(loop, link, SWEEPS[link]).theta for link in MOVED])
@@ -114,7 +114,7 @@ def measure_printed(seed: int, changes: Changes) -> Sample:
 
 
 def judge_printed(samples: Sequence[Sample]) -> Judgement:
-    """The printed parameters against the printed position errors."""
+    """Check whether the printed parameters give the printed position errors."""
     checks = []
     for (model, side), ends in POSITIONS.items():
         for end, published in ends.items():
@@ -128,14 +128,15 @@ def judge_printed(samples: Sequence[Sample]) -> Judgement:
             ))  # fmt: skip
     return Judgement(
         tuple(checks),
-        "along no sweep of one link are Table 9's parameters nearer to nominal: stick's end 0.278,"
-        " 0.299 and 0.268 m for stick, boom and swing; the zero of the grapple's end fits because"
-        " from the ball it depends on links 7 and 8 alone, whose lengths are fixed",
+        "Table 9's parameters are not closer to nominal in the sweep of any link: stick's end"
+        " 0.278, 0.299 and 0.268 m for stick, boom and swing; the error of the grapple's end is"
+        " zero, because relative to the ball it depends only on links 7 and 8, whose lengths are"
+        " fixed",
     )
 
 
 def judge_parameters(samples: Sequence[Sample]) -> Judgement:
-    """Table 7."""
+    """Compare the sizes of the parameter errors with Table 7."""
     outer = np.array([[s.values[f"identified.error.{n}"] for n in _PRINTED_OUTER] for s in samples])
     offsets = np.array([[s.values[f"identified.error.{n}"] for n in _OFFSETS] for s in samples])
     checks = (
@@ -147,16 +148,16 @@ def judge_parameters(samples: Sequence[Sample]) -> Judgement:
     )  # fmt: skip
     return Judgement(
         checks,
-        "only the stick's stage has bent joints here (p. 69), so that links 4 and 5, which are"
-        " identified before, err by sensor noise and drift alone; the thesis' offsets of 8.6 and"
-        " 4.2 deg are those of misaligned sensors. Bends of 6 to 12 deg instead of 2 to 6 deg make"
-        " 81 mm and 4.8 deg of links 0 to 3",
+        "only the stick's stage has bent joints here (p. 69), so that the errors of links 4 and 5,"
+        " which are identified before, come only from sensor noise and drift; the thesis' offsets"
+        " of 8.6 and 4.2 deg are those of misaligned sensors. Bends of 6 to 12 deg instead of 2 to"
+        " 6 deg cause errors of 81 mm and 4.8 deg in links 0 to 3",
         _describe_links(samples, "identified"),
     )
 
 
 def judge_iterations(samples: Sequence[Sample]) -> Judgement:
-    """Iterations of Table 7."""
+    """Compare the iterations of links 2 and 3 with Table 7."""
     return Judgement((check_rms_ratio(
         "iterations of link 2 over those of link 3", samples,
         ("identified.iterations.boom", "identified.iterations.stick"),
@@ -169,7 +170,7 @@ def _row_rms(rows: np.ndarray) -> np.ndarray:
 
 
 def _check_links(samples: Sequence[Sample], model: str) -> list[Check]:
-    """Whether the sizes of the errors of links 1 to 3 are plausible."""
+    """Return checks of the RMS errors of lengths and twists of links 0 to 3."""
     lengths = root_mean_square(list(printed_length_errors(model).values()))
     return [
         check_population("RMS error of the six lengths of links 0 to 3",
@@ -181,7 +182,7 @@ def _check_links(samples: Sequence[Sample], model: str) -> list[Check]:
 
 
 def _describe_links(samples: Sequence[Sample], model: str) -> str:
-    """Mean error with its spread and the published one of every parameter of links 0 to 3."""
+    """Return mean, standard deviation and published value of each parameter error as text."""
     parts = []
     for name, published in printed_length_errors(model).items():
         ours = 1e3 * collect(samples, f"{model}.error.{name}")
@@ -193,7 +194,7 @@ def _describe_links(samples: Sequence[Sample], model: str) -> str:
 
 
 def judge_reidentified(samples: Sequence[Sample]) -> Judgement:
-    """Table 9."""
+    """Compare the change of the parameter errors from Table 7 to Table 9."""
     before, after = (printed_length_errors(m) for m in ("identified", "reidentified"))
     checks = []
     for name in ("a.swing", "d.boom"):
@@ -213,18 +214,18 @@ def judge_reidentified(samples: Sequence[Sample]) -> Judgement:
         ))  # fmt: skip
     return Judgement(
         tuple(checks),
-        "without the bent poses both alpha and beta come near the truth; a1 is identified in the"
-        " swing's stage, which has no bent poses, and keeps the errors that the drift of held links"
-        " causes",
+        "without the bent poses both alpha and beta are close to the truth; a1 is identified in the"
+        " swing's stage, which has no bent poses, and keeps the errors caused by the drift of held"
+        " links",
     )
 
 
 def judge_left_errors(samples: Sequence[Sample]) -> Judgement:
-    """Sizes of Table 9."""
+    """Compare the sizes of the remaining parameter errors with Table 9."""
     return Judgement(
         tuple(_check_links(samples, "reidentified")),
-        "the removal leaves alpha and beta with the sensors' noise here; the thesis names sensor"
-        " misalignment, which is not simulated, besides bent joints (p. 65)",
+        "after the removal only sensor noise affects alpha and beta here; the thesis also names"
+        " sensor misalignment as a cause (p. 65), which is not simulated",
         _describe_links(samples, "reidentified"),
     )
 
@@ -237,7 +238,7 @@ def _printed_twists(model: str, kind: str) -> float:
 def _check_sizes(
     samples: Sequence[Sample], model: str, side: str, published: dict, name: str
 ) -> list[Check]:
-    """Whether RMS errors of both end points are plausible repetitions."""
+    """Return checks whether the published RMS errors agree with the repetitions."""
     return [
         check_population(f"{end}'s end, {model}, {side} side",
                          1e3 * collect(samples, name.format(model=model, side=side, end=end)),
@@ -252,7 +253,7 @@ _POSITION, _DISTANCE = "{model}.position.{side}.{end}", "{model}.{side}.{end}.rm
 def _check_fall(
     samples: Sequence[Sample], names: tuple[str, str], published: dict, side: str, name: str
 ) -> list[Check]:
-    """Whether errors change from one model to another as published."""
+    """Return checks whether errors decrease from one model to another as published."""
     checks = []
     for end in ENDS:
         before, after = (published[model, side][end] for model in names)
@@ -266,27 +267,27 @@ def _check_fall(
 
 
 def judge_ends(samples: Sequence[Sample]) -> Judgement:
-    """Position errors from the manipulator side, pp. 66 and 71."""
+    """Compare the position errors from the manipulator side with pp. 66 and 71."""
     return Judgement(
         tuple(check for model in ("identified", "reidentified")
               for check in _check_sizes(samples, model, "manipulator", POSITIONS, _POSITION)),
-        "the size of the bends is an assumption: bends of 6 to 12 deg instead of 2 to 6 deg make"
-        " 0.18 m (stick) and 0.14 m (grapple)",
+        "the size of the bends is an assumption: bends of 6 to 12 deg instead of 2 to 6 deg cause"
+        " errors of 0.18 m (stick) and 0.14 m (grapple)",
     )  # fmt: skip
 
 
 def judge_fall(samples: Sequence[Sample]) -> Judgement:
-    """Change of the position errors from Table 7 to Table 9."""
+    """Compare the decrease of the position errors from Table 7 to Table 9."""
     names = ("identified", "reidentified")
     return Judgement(
         tuple(_check_fall(samples, names, POSITIONS, "manipulator", _POSITION)),
-        "the drift of held links remains: with links that stay where they are the stick's"
-        " end falls from 0.076 to 0.031 m",
+        "the drift of held links remains: without drift the error of the stick's end decreases from"
+        " 0.076 to 0.031 m",
     )
 
 
 def judge_calibrator_ends(samples: Sequence[Sample]) -> Judgement:
-    """Position errors from the calibrator side, pp. 67 and 71."""
+    """Compare the position errors from the calibrator side with pp. 67 and 71."""
     models = ("identified", "reidentified")
     checks = [
         check
@@ -313,14 +314,14 @@ def judge_calibrator_ends(samples: Sequence[Sample]) -> Judgement:
     )
     return Judgement(
         tuple(checks),
-        "from the ball the stick's end depends on links 4 to 8 alone, which Table 9 leaves as they"
-        " are in Table 7: with equal poses no fall is possible, and with the printed parameters the"
-        " error is 0.154 m, not 0.542 m",
+        "relative to the ball the stick's end depends only on links 4 to 8, which are equal in"
+        " Tables 7 and 9: with equal poses the error cannot decrease, and with the printed"
+        " parameters it is 0.154 m, not 0.542 m",
     )
 
 
 def judge_distances(samples: Sequence[Sample]) -> Judgement:
-    """Table 8 and Fig. 19 from the manipulator side."""
+    """Compare the distance errors from the manipulator side with Table 8 and Fig. 19."""
     checks = [
         check
         for model in ("nominal", "identified")
@@ -328,15 +329,16 @@ def judge_distances(samples: Sequence[Sample]) -> Judgement:
     ]
     return Judgement(
         tuple(checks),
-        "truth is nominal here, so that the nominal model errs by sensors and tape alone; of a"
-        " machine with lengths N(0, 20 mm) and angles N(0, 0.7 deg) from nominal it errs by 0.032"
-        " and 0.045 m, and the identified one by 0.071 and 0.051 m",
+        "the nominal machine is the true one here, so that the nominal model has only errors of"
+        " sensors and tape; if lengths differ by N(0, 20 mm) and angles by N(0, 0.7 deg) from"
+        " nominal, its errors are 0.032 and 0.045 m, and those of the identified model 0.071 and"
+        " 0.051 m",
         _describe_vaf(samples, "manipulator"),
     )
 
 
 def judge_order(samples: Sequence[Sample]) -> Judgement:
-    """The nominal model's distances against those of the identified one, Fig. 19."""
+    """Compare the distance errors of the nominal and the identified model with Fig. 19."""
     checks = []
     for end in ENDS:
         ratio = (
@@ -348,19 +350,19 @@ def judge_order(samples: Sequence[Sample]) -> Judgement:
             (0.5 * ratio, 2.0 * ratio), "a factor of 2 around one measurement", ratio,
         ))  # fmt: skip
     checks.append(check_rms_ratio(
-        "stick's end, identified, the farther half of the poses over the nearer", samples,
+        "stick's end, identified, more distant half of the poses over the closer half", samples,
         ("identified.manipulator.stick.far", "identified.manipulator.stick.near"), (0.0, 1.0),
         "the error decreases when the manipulator stretches its arms",
     ))  # fmt: skip
     return Judgement(
         tuple(checks),
-        "the nominal model is the truth here: of a machine with lengths N(0, 20 mm) and angles N(0,"
-        " 0.7 deg) from nominal the ratios are 2.2 and 1.1",
+        "the nominal machine is the true one here; if lengths differ by N(0, 20 mm) and angles by"
+        " N(0, 0.7 deg) from nominal, the ratios are 2.2 and 1.1",
     )
 
 
 def _describe_vaf(samples: Sequence[Sample], side: str) -> str:
-    """Mean variance accounted for of all models, stick and grapple, as text."""
+    """Return the mean variance accounted for (VAF) of all models as text."""
     parts = []
     for model in ("nominal", "identified", "reidentified"):
         means = [collect(samples, f"{model}.{side}.{end}.vaf").mean() for end in ENDS]
@@ -369,7 +371,7 @@ def _describe_vaf(samples: Sequence[Sample], side: str) -> str:
 
 
 def judge_calibrator_distances(samples: Sequence[Sample]) -> Judgement:
-    """Table 8 from the calibrator side."""
+    """Compare the distance errors from the calibrator side with Table 8."""
     checks = [
         check
         for model in ("nominal", "identified")
@@ -388,24 +390,24 @@ def judge_calibrator_distances(samples: Sequence[Sample]) -> Judgement:
                               published=0.0))  # fmt: skip
     return Judgement(
         tuple(checks),
-        "the grapple's end is a matter of the elbow's angle and three laboratory lengths, so that"
-        " 38 mm are those of them and of the tape, for which 5 mm are assumed; links 4 and 5, which"
-        " decide about the stick's end, are the same in both models to sensor noise",
+        "the grapple's end depends on the elbow's angle and three laboratory lengths, so that the"
+        " published 38 mm come from these and from the tape, for which 5 mm are assumed; links 4"
+        " and 5, which determine the stick's end, are equal in both models up to sensor noise",
         _describe_vaf(samples, "calibrator"),
     )
 
 
 def judge_new_distances(samples: Sequence[Sample]) -> Judgement:
-    """Sizes of Table 10."""
+    """Compare the sizes of the distance errors with Table 10."""
     return Judgement(
         tuple(_check_sizes(samples, "reidentified", "manipulator", DISTANCES, _DISTANCE)),
-        "with the bent poses all but the drift of held links is left out here",
+        "after the bent poses are excluded, the drift of held links is the only large error here",
         _describe_vaf(samples, "manipulator"),
     )
 
 
 def judge_distance_fall(samples: Sequence[Sample]) -> Judgement:
-    """Change from Table 8 to Table 10."""
+    """Compare the change of the distance errors from Table 8 to Table 10."""
     models = ("identified", "reidentified")
     checks = _check_fall(samples, models, DISTANCES, "manipulator", _DISTANCE)
     for end in ENDS:
@@ -418,18 +420,18 @@ def judge_distance_fall(samples: Sequence[Sample]) -> Judgement:
 
 
 def judge_sensor_outputs(samples: Sequence[Sample]) -> Judgement:
-    """Figs 20 and 21."""
+    """Compare the differences between predicted and actual readings with Figs 20 and 21."""
     checks = []
     for joint in (5, 6):
         checks.append(check_rms_ratio(
-            f"difference at joint {joint}, stick pulled in over elsewhere", samples,
+            f"difference at joint {joint}, stick retracted over other poses", samples,
             (f"inside.{joint}", f"outside.{joint}"), (2.0, np.inf),
             "a large discrepancy there: at least twice",
         ))  # fmt: skip
     for joint in (7, 8):
         rows = np.column_stack([collect(samples, f"inside.{k}") for k in (joint, 5, 6)])
         checks.append(check_statistic(
-            f"difference at joint {joint} over the smaller one of joints 5 and 6, stick pulled in",
+            f"difference at joint {joint} over the smaller one of joints 5 and 6, stick retracted",
             rows, _worst_ratio, (0.0, 0.5),
             "good agreement against a large discrepancy: at most half",
         ))  # fmt: skip
@@ -438,9 +440,10 @@ def judge_sensor_outputs(samples: Sequence[Sample]) -> Judgement:
                       for k in (5, 6, 7, 8))  # fmt: skip
     return Judgement(
         tuple(checks),
-        "joints 5 and 7 have nearly parallel axes where the yoke stands near zero, so that an error"
-        " of one is predicted at the other; with a bent joint 6 alone joint 7 differs by 0.12 deg",
-        f"RMS difference in deg, stick pulled in and elsewhere, joint {sizes}",
+        "the axes of joints 5 and 7 are nearly parallel when the yoke angle is near zero, so that"
+        " an error of one is predicted at the other; if only joint 6 bends, joint 7 differs by"
+        " 0.12 deg",
+        f"RMS difference in deg, stick retracted and other poses, joint {sizes}",
     )  # fmt: skip
 
 
@@ -450,14 +453,14 @@ def _worst_ratio(rows: np.ndarray) -> float:
 
 
 def judge_search(samples: Sequence[Sample]) -> Judgement:
-    """Whether `identify_without_bad_data` finds the bent joints."""
+    """Check how often `identify_without_bad_data` finds the bent joints."""
     found = [s.values["overlap"] > 0.5 and s.values["blamed"] > 0.5 for s in samples]
     visible = collect(samples, "left out").mean()
     return Judgement(
         (check_fraction("calibrations in which the region and one of its joints are found", found,
                         (0.9, 1.0), "nine of ten, as with errors of one joint"),),
-        "bends of two joints that grow smoothly are taken up by the parameters of the stage, which"
-        f" are identified from the same poses; the nominal model shows {100 * visible:.0f} % of the"
+        "the parameters of the stage, identified from the same poses, absorb bends of two joints"
+        f" that increase smoothly; the nominal model detects {100 * visible:.0f} % of the"
         " bent poses",
     )  # fmt: skip
 
@@ -470,7 +473,7 @@ EXPERIMENTS = (
             " m (grapple) from the manipulator side, 0.542 and 0.000 m from the calibrator side;"
             " Table 9 0.153, 0.205, 0.373 and 0.000 m",
             "Tables 7 and 9, pp. 63, 66-67, 70-71", "document", judge_printed,
-            {"table_9": "identified"}, "Table 7's parameters take the place of Table 9's",
+            {"table_9": "identified"}, "Table 7's parameters replace those of Table 9",
         ),
     ), repetitions_fixed=1),
     Experiment("calibration with bent joints", measure_calibration, (
@@ -501,7 +504,7 @@ EXPERIMENTS = (
             " the errors in a1 and d2 have considerably been reduced: a1 -329 to 61 mm, d2 111 to"
             " 51 mm",
             "Table 9, section 3.8.2, p. 70", "document", judge_reidentified, {"removal": False},
-            "no pose is left out", (),
+            "no pose is excluded", (),
         ),
         Claim(
             "end points, manipulator side",
@@ -515,7 +518,7 @@ EXPERIMENTS = (
             '"the re-identified model behavior is now very similar to that of the nominal model":'
             " RMS position error 0.212 to 0.153 m (stick), 0.256 to 0.205 m (grapple)",
             "Figs 22 to 25, pp. 71-75", "document", judge_fall, {"removal": False},
-            "no pose is left out",
+            "no pose is excluded",
             tuple(f"{end}'s end, {axis} [m]" for end in ENDS for axis in "xyz"),
         ),
         Claim(
@@ -546,7 +549,7 @@ EXPERIMENTS = (
             ' 99.92, 99.91, 99.95, 99.91 %; they "appear to act in favor of the identified'
             ' parameters"',
             "Table 8, pp. 65-66", "document", judge_calibrator_distances, {"tape": 0.3},
-            "the tape errs by 0.3 m", (),
+            "the tape has errors of 0.3 m", (),
         ),
         Claim(
             "distances, re-identified",
@@ -559,7 +562,7 @@ EXPERIMENTS = (
             "manipulator side: RMS 0.162 to 0.101 m (stick) and 0.217 to 0.125 m (grapple);"
             " calibrator side: 0.021 and 0.038 m as before",
             "Tables 8 and 10, pp. 66, 71", "document", judge_distance_fall, {"removal": False},
-            "no pose is left out", (),
+            "no pose is excluded", (),
         ),
         Claim(
             "predicted and actual calibrator sensors",

@@ -1,7 +1,7 @@
 """Claims of Khoshzaban 1992, section 3.8.3: cylinder triangles, Tables 11 and 12.
 
-They are judged by the calibrations of `khoshzaban_calibration`: angles are measured by the joint's
-own sensor, or computed with the re-identified arm from the calibrator's readings.
+The claims are evaluated with the calibrations of `khoshzaban_calibration`. Joint angles are either
+measured by the joint's sensor or computed from the calibrator's readings and the re-identified arm.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from hydrotele.experiments.intervals import check_mean, check_population, check_
 from hydrotele.experiments.khoshzaban_arm import check_rms_ratio, root_mean_square
 from hydrotele.experiments.khoshzaban_calibration import NO_FAULTS
 
-# Table 11 (p. 76) less the tape's numbers [m], held parameters left out; Table 12 (p. 77) [m].
+# Table 11 (p. 76) minus the taped lengths [m], without held parameters; Table 12 (p. 77) [m].
 _MINOR = {
     ("boom", "measured"): {"l_l": 0.033, "l_c": -0.013, "l_u": -0.026},
     ("boom", "identified"): {"l_l": -0.080, "l_c": -0.237},
@@ -27,33 +27,34 @@ _MINOR_RMS = {("boom", "measured"): 0.0004, ("boom", "identified"): 0.003,
 
 
 def judge_minor(samples: Sequence[Sample], kind: str) -> Judgement:
-    """Table 11, one way to obtain the angles."""
+    """Compare the cylinder triangles from measured or computed angles with Table 11."""
     checks = []
     for axis in ("boom", "stick"):
         checks += [
-            check_population(f"{name} of the {axis} less the tape's",
+            check_population(f"{name} of the {axis} minus the taped length",
                              1e3 * collect(samples, f"{axis}.{kind}.{name}"), 1e3 * published, "mm",
                              log=False)
             for name, published in _MINOR[axis, kind].items()
         ]  # fmt: skip
     reason = (
-        "the printed deviations hold the tape's own errors at pins, of millimetres to centimetres"
+        "the printed deviations include the tape's errors at pins, of millimetres to centimetres"
         if kind == "measured" else _describe_angles(samples)
     )  # fmt: skip
     return Judgement(tuple(checks), reason, _describe_minor(samples, kind))
 
 
 def _describe_angles(samples: Sequence[Sample]) -> str:
-    """How far computed angles are from the true ones, as text."""
+    """Return the errors of the computed angles as text."""
     boom, stick = (collect(samples, f"{axis}.angle").mean() for axis in ("boom", "stick"))
     return (
-        f"computed angles err by {boom:.2f} deg (boom) and {stick:.2f} deg (stick) here, less their"
-        " means; 27 mm at the stick's lever of at most 0.72 m are 2.1 deg or more"
+        f"the standard deviations of the errors of computed angles are {boom:.2f} deg (boom) and"
+        f" {stick:.2f} deg (stick) here;"
+        " 27 mm at the stick's lever of at most 0.72 m are 2.1 deg or more"
     )
 
 
 def _describe_minor(samples: Sequence[Sample], kind: str) -> str:
-    """Mean deviations of the triangles with their 95 % intervals, as text."""
+    """Return the mean deviations of the triangles with their 95 % intervals as text."""
     parts = []
     for axis in ("boom", "stick"):
         for name in NAMES:
@@ -66,7 +67,7 @@ def _describe_minor(samples: Sequence[Sample], kind: str) -> str:
 
 
 def judge_closer(samples: Sequence[Sample]) -> Judgement:
-    """Which angles give the triangles nearer to the tape, p. 77."""
+    """Compare the triangle errors from measured and from computed angles (p. 77)."""
     checks = []
     for axis in ("boom", "stick"):
         rows = np.array([
@@ -85,13 +86,13 @@ def judge_closer(samples: Sequence[Sample]) -> Judgement:
     return Judgement(
         tuple(checks),
         "with measured angles four parameters are free, of which only three combinations are"
-        " well determined, with computed ones the longest length is held; the printed lengths of"
-        " the stick themselves contradict the sentence",
+        " well determined; with computed angles the longest length is held. The printed lengths of"
+        " the stick contradict the sentence",
     )
 
 
 def judge_minor_fit(samples: Sequence[Sample], kind: str) -> Judgement:
-    """Table 12, one way to obtain the angles."""
+    """Compare the displacement errors from measured or computed angles with Table 12."""
     checks = [
         check_statistic(f"RMS error of the {axis}", 1e3 * collect(samples, f"{axis}.{kind}.rms"),
                         root_mean_square, (0.5e3 * published, 2e3 * published),
@@ -116,9 +117,9 @@ def judge_minor_fit(samples: Sequence[Sample], kind: str) -> Judgement:
         f"{axis} {collect(samples, f'{axis}.{kind}.vaf').mean():.3f}" for axis in ("boom", "stick")
     ]
     reason = (
-        "with transducers within 0.5 mm the boom's error is 0.6 mm, most of it of the angle sensor:"
-        " the thesis' sensors of the boom erred less than its section 2.5 says; the spatial motion"
-        " that it names as the cause at the stick is not simulated"
+        "with transducer errors within 0.5 mm the boom's error is 0.6 mm, mostly from the angle"
+        " sensor: the errors of the thesis' boom sensors were smaller than section 2.5 says; the"
+        " spatial motion that it names as the cause at the stick is not simulated"
         if kind == "measured" else _describe_angles(samples)
     )  # fmt: skip
     return Judgement(tuple(checks), reason, f"VAF in %: {', '.join(vaf)}")
@@ -145,14 +146,14 @@ CLAIMS = (
         '"the identified parameters obtained using measured (sensed) joint angles are generally'
         ' closer to the actual parameters than those using computed joint angles"',
         "Table 11, p. 77", "document", judge_closer, {"transducer": 0.02},
-        "linear transducers err ten times as much", (),
+        "errors of the linear transducers are ten times as large", (),
     ),
     Claim(
         "displacement from measured angles",
         "RMS 0.4 mm and VAF 99.99 % (boom), 2 mm and 99.98 % (stick); the stick's is \"an order"
         ' of magnitude worse"',
         "Table 12, p. 77", "document", partial(judge_minor_fit, kind="measured"),
-        {"transducer": 0.02}, "linear transducers err ten times as much",
+        {"transducer": 0.02}, "errors of the linear transducers are ten times as large",
         ("boom: error of the displacement [mm]", "stick: error of the displacement [mm]"),
     ),
     Claim(

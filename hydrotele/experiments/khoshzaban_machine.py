@@ -1,6 +1,6 @@
-"""Machine and calibrator of Khoshzaban 1992, chapters 2 and 3.3 to 3.6, and how held links drift.
+"""Machine and calibrator of Khoshzaban 1992, chapters 2 and 3.3 to 3.6, and drift of held links.
 
-Rows of kind `input` check numbers of the document that the model was built from.
+Rows of kind `input` check published values from which the model was built.
 """
 
 import math
@@ -47,7 +47,15 @@ _TORQUES = {"swing": 1400.0, "boom": 5700.0, "stick": 4200.0}
 
 
 def measure_machine(seed: int, changes: Changes) -> Sample:
-    """Read the dimensions of the model; `changes` are paths of the machine with their values."""
+    """Read masses and dimensions from the machine model.
+
+    Args:
+        seed: not used.
+        changes: path in the machine file -> value.
+
+    Returns:
+        Masses, centres of mass, dimensions, mobility and force errors.
+    """
     machine = load_machine("calibrator")
     for path, value in changes.items():
         machine = changed(machine, path, value)
@@ -79,7 +87,7 @@ def measure_machine(seed: int, changes: Changes) -> Sample:
 
 
 def _plates(machine: Machine) -> dict[str, float]:
-    """Distances [m] and angles [deg] of the pins of Figs 5 and 6."""
+    """Return the distances [m] and angles [deg] between the pins of Figs 5 and 6."""
     boom_axis, stick_axis = machine.axes["boom"].cylinder, machine.axes["stick"].cylinder
     assert boom_axis and stick_axis
     stick_pin = np.array(machine.links["stick"].position)
@@ -102,7 +110,7 @@ def _angle_between(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def _links_needed(dof: int, powered: int, moving: int, task: int, wanted: int) -> int:
-    """Extra links by Eq. 3.5: l = (6 + m) - [(n - p) + d + t]."""
+    """Return the required number of extra links by Eq. 3.5: l = (6 + m) - [(n - p) + d + t]."""
     return (6 + wanted) - ((dof - powered) + moving + task)
 
 
@@ -114,7 +122,7 @@ def _check_near(
 
 
 def judge_masses(samples: Sequence[Sample]) -> Judgement:
-    """Table 1."""
+    """Compare masses and centres of mass with Table 1."""
     values = samples[0].values
     checks = [_check_near(f"mass of the {n}", values[f"mass.{n}"], v, 0.5, "last digit", "kg")
               for n, v in _MASSES.items()]  # fmt: skip
@@ -125,15 +133,15 @@ def judge_masses(samples: Sequence[Sample]) -> Judgement:
                                       "m"))  # fmt: skip
     return Judgement(
         tuple(checks),
-        note="inertias are the model's own: printed are 15400 and 600 kg m2, 3.7 and 3.2 times"
-        " those of slender rods about their centres",
+        note="the inertias are not the printed ones, because the printed 15400 and 600 kg m2 are"
+        " 3.7 and 3.2 times those of slender rods about their centres",
     )
 
 
 def judge_plates(samples: Sequence[Sample]) -> Judgement:
-    """Figs 5 and 6."""
+    """Compare the pin distances with Figs 5 and 6."""
     values, digit = samples[0].values, "last printed digit"
-    # L1 is 5.190 m in Fig. 5 and 5.180 m in Table 2, which the model follows: 9.5 mm of L3.
+    # The model uses L1 = 5.180 m of Table 2; Fig. 5 has 5.190 m, which changes L3 by 9.5 mm.
     wanted = (
         ("boom.L2", 2.000, 0.0005, digit), ("boom.gamma", 37.0, 0.05, digit),
         ("boom.L3", 3.790, 0.012,
@@ -151,7 +159,7 @@ def judge_plates(samples: Sequence[Sample]) -> Judgement:
 
 
 def judge_triangles(samples: Sequence[Sample]) -> Judgement:
-    """Figs 9 and 10, Tables 3 and 11."""
+    """Compare the cylinder triangles with Figs 9 and 10 and Tables 3 and 11."""
     checks = [
         _check_near(f"{quantity} of the {name}", samples[0].values[f"{quantity}.{name}"], published,
                     0.05 if quantity == "offset" else 0.0005, "last printed digit",
@@ -166,7 +174,7 @@ def judge_triangles(samples: Sequence[Sample]) -> Judgement:
 
 
 def judge_mobility(samples: Sequence[Sample]) -> Judgement:
-    """Eq. 3.5."""
+    """Compare the numbers of extra links and the mobility with Eq. 3.5."""
     wanted = (("extra links of the machine with grapple", "links_machine", 1.0),
               ("extra links of the excavator", "links_excavator", 3.0),
               ("mobility with one moving and four sensed links", "mobility", 2.0))  # fmt: skip
@@ -177,7 +185,7 @@ def judge_mobility(samples: Sequence[Sample]) -> Judgement:
 
 
 def judge_chain(samples: Sequence[Sample]) -> Judgement:
-    """Table 2."""
+    """Compare the Denavit-Hartenberg parameters with Table 2."""
     return Judgement((check_exact(
         "largest difference of 36 numbers", samples[0].values["table_2"], (0.0, 5e-4),
         "last printed digit of a length", unit="m or deg",
@@ -185,7 +193,7 @@ def judge_chain(samples: Sequence[Sample]) -> Judgement:
 
 
 def judge_pressures(samples: Sequence[Sample]) -> Judgement:
-    """Eq. 4.61."""
+    """Compare the errors of torque and forces with Eq. 4.61."""
     return Judgement(tuple(
         _check_near(f"error of the {name}", samples[0].values[f"torque.{name}"], published, 60.0,
                     "5747 N is printed as 5700", "N m" if name == "swing" else "N")
@@ -194,7 +202,15 @@ def judge_pressures(samples: Sequence[Sample]) -> Judgement:
 
 
 def measure_lists(seed: int, changes: Changes) -> Sample:
-    """Find the parameters that every stage identifies; the setting is the grapple's turn [deg]."""
+    """Find the parameters identified in each stage.
+
+    Args:
+        seed: not used.
+        changes: `wander`: rotation of the grapple during a stage [deg].
+
+    Returns:
+        Per stage, the number of parameters that are in only one of found list and document's list.
+    """
     chosen = choose_settings({"wander": None}, changes)
     loop = loop_of(load_machine("calibrator"))
     rng = np.random.default_rng(1)
@@ -210,19 +226,24 @@ def measure_lists(seed: int, changes: Changes) -> Sample:
 
 
 def judge_lists(samples: Sequence[Sample]) -> Judgement:
-    """Section 3.6.4."""
+    """Compare the lists of identifiable parameters with section 3.6.4."""
     return Judgement(tuple(
         check_exact(f"parameters of the {link} stage that are in one list only",
                     samples[0].values[f"different.{link}"], (0.0, 0.0), "the same lists",
                     published=0.0)
         for link in LISTS
-    ), note="links 6 to 8 count as known to 1 mm and 0.05 deg from the laboratory")  # fmt: skip
+    ), note="links 6 to 8 are assumed known to 1 mm and 0.05 deg from the laboratory")  # fmt: skip
 
 
 def measure_drift(seed: int, changes: Changes) -> Sample:
-    """Run the measurement of each link in MuJoCo.
+    """Simulate the measurement of each link in MuJoCo and record the drift of held links.
 
-    `changes` are keys of its scenario, or parameters of Table 2's chain such as `a.boom` [m].
+    Args:
+        seed: not used.
+        changes: scenario keys, or parameters of Table 2's chain such as `a.boom` [m].
+
+    Returns:
+        Largest drift of each held link [deg] and largest closure error `gap` [m].
     """
     loop = loop_of(load_machine("calibrator"))
     loop = loop.with_values({name: changes[name] for name in loop.names if name in changes})
@@ -245,7 +266,7 @@ def measure_drift(seed: int, changes: Changes) -> Sample:
 
 
 def _closure_error(loop: Loop, truth) -> float:
-    """Largest distance by which Table 2's chain fails to close on simulated angles [m]."""
+    """Return the largest closure error of Table 2's chain for simulated angles [m]."""
     angles = np.stack([truth[c] * s for c, s in zip(loop.channels, loop.signs, strict=True)], 1)
     return float(np.abs(closure(loop, angles + loop.values[:, 0])[0]).max())
 
@@ -258,11 +279,11 @@ _PUBLISHED_DRIFT = {
 
 
 def judge_drift(samples: Sequence[Sample]) -> Judgement:
-    """Figs 16 to 18."""
+    """Compare the drift of held links with Figs 16 to 18."""
     values = samples[0].values
     checks = [
         check_exact(f"drift of the {name}", values[name], (0.2, 1.6),
-                    "a factor of 2 around 0.4 to 0.8 deg, which one worn machine shows", unit="deg",
+                    "a factor of 2 around 0.4 to 0.8 deg, measured on one worn machine", unit="deg",
                     published=published)
         for name, published in _PUBLISHED_DRIFT.items()
     ]  # fmt: skip
@@ -274,18 +295,18 @@ def judge_drift(samples: Sequence[Sample]) -> Judgement:
     ]  # fmt: skip
     return Judgement(
         tuple(checks),
-        "closed spools of the scenarios leak 2.7e-14 m3/(s Pa) to tank (25 mm, 7.5 um of radial"
-        " clearance), the cylinders are tight, and a run takes 120 s; the thesis gives neither."
-        " Ten times that leakage makes 1.5 deg of the boom and 0.26 to 0.30 deg of the stick: no"
-        " coefficient that both share gives the figures, in which the stick drifts more",
+        "in the scenarios closed spools leak 2.7e-14 m3/(s Pa) to tank (25 mm, 7.5 um radial"
+        " clearance), cylinders do not leak, and a run takes 120 s; the thesis gives no values."
+        " Ten times that leakage causes a drift of 1.5 deg of the boom and 0.26 to 0.30 deg of the"
+        " stick: no common coefficient gives the figures, in which the stick drifts more",
     )
 
 
 def judge_closure(samples: Sequence[Sample]) -> Judgement:
-    """The kinematic chain against MuJoCo."""
+    """Check the closure error of the kinematic chain with angles of the MuJoCo model."""
     return Judgement((
         check_exact("largest gap", 1e6 * float(collect(samples, "gap").max()), (0.0, 10.0),
-                    "a hundredth of a millimetre, far below every error studied", unit="um"),
+                    "0.01 mm, much smaller than all errors in this study", unit="um"),
     ))  # fmt: skip
 
 
@@ -325,9 +346,9 @@ EXPERIMENTS = (
         Claim("identifiable parameters of each stage",
               "link 4: offsets of joints 5 to 7, alpha, a, d of link 5, alpha, a of link 4; links 3"
               " and 2: the held angle outside, alpha, a, beta; link 1: theta_fix 2, d2, alpha 1,"
-              " a1; besides the ball's p_xy and p_z",
+              " a1; in addition, the ball's p_xy and p_z",
               "section 3.6.4, pp. 54-56", "document", judge_lists, {"wander": 0.0},
-              "the grapple does not turn"),
+              "the grapple does not rotate"),
     ), repetitions_fixed=1),
     Experiment("held links", measure_drift, (
         Claim("held links drift while one moves",

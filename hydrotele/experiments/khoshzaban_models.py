@@ -1,8 +1,8 @@
-"""Regressors and simulated motions of chapter 4 of Khoshzaban 1992, for the CAT 215.
+"""Regressors and simulated motions of the CAT 215 for chapter 4 of Khoshzaban 1992.
 
-The complete model has 82 parameters: ten of each of seven bodies, Coulomb friction of three drives
-and six pins, three force offsets. The reduced model has the major links only: ten of each of three
-bodies, friction and offset of three drives.
+The complete model has 82 parameters: ten inertial parameters of each of seven bodies, Coulomb
+friction of three drives and six pins, and three force offsets. The reduced model contains only the
+major links: ten inertial parameters of each of three bodies, friction and offset of three drives.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,35 +23,35 @@ from hydrotele.simulate.closure import closed_chain
 DRIVES = ("swing", "boom", "stick")
 UNITS = ("N m", "N", "N")
 PERIOD = 0.02
-"""Between samples [s] (p. 21, 50 Hz)."""
+"""Sample period [s] (p. 21, 50 Hz)."""
 
 DURATION = 5.0
-"""Of the simulated motion [s] (Figs 30 to 32)."""
+"""Duration of the simulated motion [s] (Figs 30 to 32)."""
 
 _DEG = np.pi / 180.0
-# Swing, boom, stick in the project's signs, as the axes of Figs 30 to 32 enclose the curves: lowest
-# and highest start and end [deg], and largest rate [rad/s].
+# Ranges of start and end [deg] and of the largest rate [rad/s] of swing, boom and stick in this
+# project's signs, from the axis limits of Figs 30 to 32.
 _STARTS = ((-40.0, -20.0), (0.0, 10.0), (-50.0, -25.0))
 _ENDS = ((0.0, 20.0), (40.0, 50.0), (-150.0, -100.0))
 _PEAK_RATES = ((0.3, 0.4), (0.3, 0.4), (1.0, 1.5))
-_QUINTIC_PEAK = 1.875  # largest rate of a fifth-order move of unit length and duration
+_QUINTIC_PEAK = 1.875  # largest rate of a fifth-order polynomial of unit travel and duration
 
 Motion = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Positions, rates and accelerations (n, 3) of swing, boom and stick [rad], [rad/s], [rad/s^2]."""
 
 
 def read_settings(settings: Mapping[str, Any], changes: Changes) -> dict[str, Any]:
-    """Settings of an experiment with changes.
+    """Return the default settings of an experiment with changes applied.
 
     Args:
-        settings: all of them, with their usual values.
-        changes: of some.
+        settings: all settings with their default values.
+        changes: settings to change.
 
     Returns:
         The changed settings.
 
     Raises:
-        InputError: a change is of no setting.
+        InputError: a changed key is not a setting.
     """
     if strange := [name for name in changes if name not in settings]:
         raise InputError("experiment", f"no setting {strange[0]}: {', '.join(settings)}")
@@ -62,11 +62,11 @@ def read_settings(settings: Mapping[str, Any], changes: Changes) -> dict[str, An
 def document_setup(
     model: Model = "complete", ball_joints: bool = True, tilt_deg: float = 0.0
 ) -> RegressorSetup:
-    """Setup of the document's regressor.
+    """Return the setup of the document's regressor.
 
     Args:
         model: `complete` (82 parameters) or `reduced` to the major links (36).
-        ball_joints: whether the cylinders end in ball joints, as the document has it; else in pins.
+        ball_joints: whether the cylinders end in ball joints, as in the document, or in pins.
         tilt_deg: slope of the ground, about the machine's y axis.
 
     Returns:
@@ -87,24 +87,25 @@ def document_setup(
 
 
 def make_regressor(setup: RegressorSetup, motion: Motion) -> Regressor:
-    """Regressor along a motion."""
+    """Return the regressor along a motion."""
     return setup.table(setup.project(*motion))
 
 
 def stack_rows(table: Regressor) -> np.ndarray:
-    """(3 n, m) equations of a regressor."""
+    """Return the regressor of n samples as a (3 n, m) matrix."""
     return table.matrix.reshape(-1, len(table.names))
 
 
 def draw_states(count: int, seed: int = 0) -> Motion:
-    """Independent random poses, rates and accelerations, which excite whatever can be excited.
+    """Draw independent random poses, rates and accelerations that excite all parameters.
 
     Args:
         count: number n of states.
-        seed: of the draw.
+        seed: seed of the random generator.
 
     Returns:
-        Within the machine's ranges, +-1 rad/s and +-2 rad/s^2.
+        Poses within the machine's ranges, rates within +-1 rad/s, accelerations within
+        +-2 rad/s^2.
     """
     rng = np.random.default_rng(seed)
     low, high = np.array([-3.0, -0.7, -2.6]), np.array([3.0, 1.0, -0.5])
@@ -113,17 +114,17 @@ def draw_states(count: int, seed: int = 0) -> Motion:
 
 
 def draw_motion(rng: np.random.Generator) -> Motion:
-    """Draw a motion whose curves fit the axes of Figs 30 to 32.
+    """Draw a random motion within the axis limits of Figs 30 to 32.
 
     The curves are not legible in the available text. Start, end and largest rate are drawn within
-    the axes' ticks; all links move from rest to rest by polynomials of fifth order, and stand still
-    after they arrive.
+    the axis limits. All links move from rest to rest by fifth-order polynomials and then hold their
+    final position.
 
     Args:
-        rng: source of the draw.
+        rng: random generator.
 
     Returns:
-        Five seconds at 50 Hz.
+        Motion of five seconds at 50 Hz.
     """
     start, end, peak = (
         np.array([rng.uniform(*pair) for pair in pairs])
@@ -140,18 +141,18 @@ def draw_motion(rng: np.random.Generator) -> Motion:
 
 
 def join_motions(motions: Sequence[Motion]) -> Motion:
-    """One motion below the other."""
+    """Concatenate motions along time."""
     position, rate, acceleration = (np.concatenate(parts) for parts in zip(*motions, strict=True))
     return position, rate, acceleration
 
 
 def scale_cylinders(table: Regressor, scale: float, bodies: Sequence[str] | None = None):
-    """Parameters (m,) with those of tubes and rods multiplied.
+    """Return the parameters (m,) with the inertial parameters of tubes and rods scaled.
 
     Args:
-        table: the parameters.
-        scale: of mass, mass moments and inertia.
-        bodies: tubes and rods that are scaled; all by default.
+        table: regressor with the nominal parameters.
+        scale: factor of mass, mass moments and inertia.
+        bodies: tubes and rods to scale; all by default.
     """
     places = [name.partition(".")[2] for name in table.names]
     bars = [p for p in places if p.endswith(("_tube", "_rod"))] if bodies is None else bodies
@@ -165,11 +166,11 @@ class Base:
     """Base parameters of a model.
 
     Attributes:
-        setup: of the regressor.
-        told: which parameters a regressor determines.
-        names: (p,) of the parameters that stand for the base parameters.
+        setup: setup of the regressor.
+        told: identifiability of all parameters.
+        names: (p,) names of the parameters that represent the base parameters.
         truth: (p,) base parameters of Table 13's machine.
-        sizes: (p,) sizes to which errors are compared.
+        sizes: (p,) reference sizes for the errors.
     """
 
     setup: RegressorSetup
@@ -182,11 +183,12 @@ class Base:
         """Estimate the base parameters by least squares.
 
         Args:
-            motion: measured.
-            forces: (n, 3) measured torque and forces [N m], [N]; or (c, n, 3), c cases.
+            motion: measured motion.
+            forces: (n, 3) measured torque and forces [N m], [N]; or (c, n, 3) for c cases.
 
         Returns:
-            (p,), or (c, p); singular values at rounding count as zero, columns having length 1.
+            (p,) or (c, p) estimates. Columns are scaled to length 1, and singular values at
+            rounding level are treated as zero.
 
         Source: Khoshzaban 1992, p. 99, Eq. 4.58; p. 100.
         """
@@ -197,21 +199,21 @@ class Base:
         return np.linalg.lstsq(r, q.T @ right, rcond=_ROUNDING)[0].T / length
 
     def rows(self, motion: Motion) -> np.ndarray:
-        """(3 n, p) equations of the base parameters."""
+        """Return the (3 n, p) regressor of the base parameters."""
         return stack_rows(make_regressor(self.setup, motion))[:, self.told.base]
 
 
-_ROUNDING = 1e-13  # of the largest singular value: some hundred times the rounding of doubles
-_STATES = 300  # random states; each has three equations, and there are at most 82 parameters
+_ROUNDING = 1e-13  # relative to the largest singular value: some 100 times the rounding of doubles
+_STATES = 300  # random states; each gives three equations for at most 82 parameters
 
 
 @cache
 def find_base(model: Model, ball_joints: bool = True) -> Base:
-    """Base parameters of a model, by random states.
+    """Find the base parameters of a model from random states.
 
     Args:
         model: `complete` or `reduced`.
-        ball_joints: as of `document_setup`.
+        ball_joints: see `document_setup`.
 
     Returns:
         The base parameters.

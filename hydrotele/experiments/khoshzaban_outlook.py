@@ -1,7 +1,7 @@
-"""Khoshzaban 1992: proposals and open points of the thesis.
+"""Proposals of Khoshzaban 1992 for further work.
 
-The spatial linkage of a cylinder with ball joints (section 3.4.4) and a noise model for flexible
-calibrator joints (section 5.3).
+The module examines the spatial linkage of a cylinder with ball joints (section 3.4.4) and a noise
+model of flexible calibrator joints (section 5.3).
 """
 
 from collections.abc import Sequence
@@ -24,18 +24,26 @@ from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.kinematics.linkages import TwoBar
 from hydrotele.machine.machine_file import load_machine
 
-_STEP = 1.0e-6  # m or rad of a central difference
-_RANK = 1.0e-6  # of the largest singular value: far above the differences' rounding of 1e-9
+_STEP = 1.0e-6  # step of central differences [m] or [rad]
+_RANK = 1.0e-6  # relative to the largest singular value; rounding of the differences is 1e-9
 
 LINKAGE_SETTINGS = {"axial_offset": 0.05}
 """Distance of the two pins of the boom's cylinder along the joint's axis [m]."""
 
 
 def measure_linkage(seed: int, changes: Changes) -> Sample:
-    """Count the parameters of a spatial linkage that its sensors leave undetermined.
+    """Count the parameters of a spatial linkage that its sensors do not determine.
 
-    Sensors: the piston's displacement, and one or two angles of the cylinder at its base joint, in
-    the plane across the joint's axis and out of it, each with an unknown zero.
+    The sensors are the piston displacement and zero, one or two angles of the cylinder at its base
+    joint: in the plane normal to the joint axis, and out of this plane. Each angle sensor has an
+    unknown offset.
+
+    Args:
+        seed: not used.
+        changes: changes of `LINKAGE_SETTINGS`.
+
+    Returns:
+        Number of undetermined parameters per set of sensors, and `needed` angle sensors.
     """
     chosen = choose_settings(LINKAGE_SETTINGS, changes)
     machine = load_machine("cat215", "none")
@@ -77,30 +85,30 @@ def measure_linkage(seed: int, changes: Changes) -> Sample:
 
 
 def judge_linkage(samples: Sequence[Sample]) -> Judgement:
-    """Judge the number of further sensors that the parameters need."""
+    """Check the number of additional sensors that the parameters require."""
     v = samples[0].values
     check = check_exact(
-        "angle sensors needed besides the displacement", v["needed"], (2.0, 2.0),
+        "angle sensors needed in addition to the displacement", v["needed"], (2.0, 2.0),
         "the document's number", published=2.0,
     )  # fmt: skip
     return Judgement(
         (check,),
-        "the length depends on the distance h of the pins along the axis through"
-        " l_l^2 + l_u^2 + h^2 and l_l l_u alone; the ratio l_u / l_l, which one angle of the"
-        " cylinder shows, makes all of them definite",
-        f"parameters that stay undetermined: {v['length']:.0f} with the displacement alone,"
+        "the length depends on the distance h of the pins along the axis only through"
+        " l_l^2 + l_u^2 + h^2 and l_l l_u; one angle of the cylinder gives the ratio l_u / l_l,"
+        " which determines all of them",
+        f"undetermined parameters: {v['length']:.0f} with the displacement alone,"
         f" {v['one_angle']:.0f} with one angle at the cylinder's base joint,"
         f" {v['two_angles']:.0f} with two",
     )
 
 
 FLEXIBILITY_SETTINGS = {"bend": 1.0, "bent_share": 0.35, "estimated": True}
-"""Standard deviation of bent joints [deg], share of the poses in which they bend, and whether the
-noise model is estimated."""
+"""Standard deviation of the errors of bent joints [deg], fraction of the poses in which they bend,
+and whether the noise model is estimated."""
 
 
 def measure_flexibility(seed: int, changes: Changes) -> Sample:
-    """Identify an arm with bent joints by plain least squares and with the noise model."""
+    """Identify an arm with bent joints, without and with the noise model of flexible joints."""
     chosen = choose_settings(FLEXIBILITY_SETTINGS, changes)
     loop = loop_of(load_machine("calibrator"))
     rng = np.random.default_rng([124, seed])
@@ -126,22 +134,22 @@ def measure_flexibility(seed: int, changes: Changes) -> Sample:
 
 
 def judge_flexibility(samples: Sequence[Sample]) -> Judgement:
-    """Judge the ratio of the length errors, and how often the intervals hold the truth."""
+    """Check the ratio of the length errors and the coverage of the 95 % intervals."""
     squares = np.column_stack([collect(samples, f"{n}_square") for n in ("modelled", "plain")])
     ratio = check_statistic(
-        "RMS error of the lengths, noise model over sensors' errors alone", squares,
+        "RMS error of the lengths, with over without the noise model", squares,
         lambda rows: float(np.sqrt(rows[:, 0].mean() / rows[:, 1].mean())), (0.0, 0.95),
-        "improves: errors smaller by a twentieth at least",
+        "improves: errors at least 5 % smaller",
     )  # fmt: skip
     covered = check_mean(
-        "fraction of the 95 % intervals that hold the truth", collect(samples, "modelled_covered"),
-        (0.85, 1.0),
-        "95 %, less 10 %, because the simulated joints bend by another law than the modelled ones",
+        "fraction of the 95 % intervals that contain the truth",
+        collect(samples, "modelled_covered"), (0.85, 1.0),
+        "95 % minus 10 %, because the simulated joints bend by another law than the modelled ones",
     )  # fmt: skip
     plain = float(np.mean(collect(samples, "plain_covered")))
     return Judgement(
         (ratio, covered),
-        note=f"intervals without the noise model hold the truth in {100 * plain:.0f} %; estimated"
+        note=f"without the noise model {100 * plain:.0f} % of the intervals do so; estimated"
         f" flexibility at full load {np.mean(collect(samples, 'grapple')):.2f} deg (grapple) and"
         f" {np.mean(collect(samples, 'yoke')):.2f} deg (yoke)",
     )

@@ -1,7 +1,7 @@
-"""Section 4.6 of Khoshzaban 1992: identified models predict forces of an unused motion.
+"""Section 4.6 of Khoshzaban 1992: identified models predict the forces of a held-out motion.
 
-The document's excavator is not available. A simulated CAT 215 with the document's sensors takes its
-place, so that ratios between models can be compared and absolute errors cannot.
+The document's excavator is not available. A simulated CAT 215 with the document's sensors replaces
+it. Ratios between models can therefore be compared with the document, but absolute errors cannot.
 """
 
 from collections.abc import Mapping, Sequence
@@ -47,15 +47,14 @@ from hydrotele.scenario.scenario import load_scenario
 from hydrotele.simulate.closure import closed_chain
 
 FITTED = ("excitation", "excitation_boom", "excitation_stick", "excitation_swing")
-"""Scenarios to fit; the document has five sets of trajectories (p. 113), their number of rows is
-that of the document."""
+"""Scenarios for identification; the document has five sets of trajectories (p. 113)."""
 
 HELD_OUT = "excitation_fast"
 FITTED_ROWS = 1664
-"""Samples to fit (p. 113)."""
+"""Number of samples for identification (p. 113)."""
 
 HELD_OUT_ROWS = 450
-"""Samples to judge on (Figs 36 and 37, horizontal axis)."""
+"""Number of held-out samples (Figs 36 and 37, horizontal axis)."""
 
 PUBLISHED_RMS = {
     "complete": (3720.0, 5860.0, 8700.0),
@@ -67,28 +66,29 @@ PUBLISHED_RMS = {
 SETTINGS = {
     "angle_error_deg": 0.1,  # largest error of an angle, uniform (p. 107)
     "pressure_error_psi": 25.0,  # largest error of a pressure, uniform (p. 107)
-    "swing_friction": 12800.0,  # N m, Coulomb; 13200 and 14700 are identified (Tables 16 and 17)
-    "mass_error": 0.15,  # of the nominal masses and centres of mass, which are "gross estimates"
-    "nominal": "gross",  # or `exact`: the simulated machine's own numbers
+    "swing_friction": 12800.0,  # N m, Coulomb; Tables 16 and 17 identify 13200 and 14700
+    "mass_error": 0.15,  # relative, of nominal masses and centres of mass ("gross estimates")
+    "nominal": "gross",  # or `exact`: the parameters of the simulated machine
     "friction_identified": True,  # whether the identified models have columns for friction
-    "linear": False,  # whether the fitted forces are the linear model's own, without errors
+    "linear": False,  # whether the fitted forces are those of the linear model, without errors
 }
-_SKIPPED = 200  # rows at the start, in which the excitation fades in
+_SKIPPED = 200  # rows at the start, while the excitation fades in
 _PSI = 6894.757  # Pa
 
 
 def measure_prediction(seed: int, changes: Changes) -> Sample:
-    """Identify complete and reduced model from 1664 samples, and predict 450 others.
+    """Identify the complete and the reduced model, and predict the forces of a held-out motion.
 
-    Predictions are those of `hydrotele identify`. The document's method, least squares of all base
-    parameters with an optimal smoother, is reported beside them.
+    The models are identified with the method of `hydrotele identify`. For comparison they are also
+    identified with the document's method: least squares of all base parameters with an optimal
+    smoother.
 
     Args:
-        seed: of the sensors' errors and of the nominal model's errors.
-        changes: of `SETTINGS`.
+        seed: seed of the sensor errors and of the nominal model's errors.
+        changes: changes of `SETTINGS`.
 
     Returns:
-        RMS errors and shares of unrealistic parameters.
+        RMS prediction errors per model and drive, and fractions of unrealistic parameters.
     """
     settings = read_settings(SETTINGS, changes)
     rng = np.random.default_rng(seed)
@@ -137,7 +137,7 @@ def measure_prediction(seed: int, changes: Changes) -> Sample:
 def _simulate(
     swing_friction: float,
 ) -> tuple[list[IdentificationRecord], list[IdentificationRecord]]:
-    """Records without errors to fit, and the one to judge on, with the document's samples."""
+    """Simulate records without sensor errors: those for identification and the held-out one."""
     numbers = f"{{coulomb: {swing_friction}}}"
     friction = f"{{name: coulomb_friction, location: swing, parameters: {numbers}}}"
     own, files = {"sensors": "ideal", "effects": f"[{friction}]"}, []
@@ -156,7 +156,7 @@ def _cut(record: IdentificationRecord, rows: int) -> IdentificationRecord:
 def _add_errors(
     record: IdentificationRecord, settings: Mapping[str, Any], rng: np.random.Generator
 ) -> IdentificationRecord:
-    """Record with uniform errors of angles and pressures."""
+    """Add uniform errors of angles and pressures to a record."""
     machine, shape = load_machine("cat215"), record.position.shape
     angle = np.deg2rad(settings["angle_error_deg"])
     pressure = _PSI * settings["pressure_error_psi"]
@@ -172,7 +172,7 @@ def _add_errors(
 
 
 def _smooth(record: IdentificationRecord) -> Motion:
-    """Positions, rates and accelerations by the optimal smoother (p. 112)."""
+    """Compute positions, rates and accelerations with the optimal smoother (p. 112)."""
     found = smooth(record.position, record.period, record.position_noise)
     return found.value, found.rate, found.acceleration
 
@@ -180,7 +180,7 @@ def _smooth(record: IdentificationRecord) -> Motion:
 def _make_gross(
     setup: RegressorSetup, mass_error: float, rng: np.random.Generator
 ) -> RegressorSetup:
-    """Nominal model of the document: masses and centres of mass are off, friction is unknown."""
+    """Return the nominal model with errors of masses and centres of mass, without friction."""
     inertia = setup.chain.inertia.copy()
     inertia *= rng.uniform(1.0 - mass_error, 1.0 + mass_error, (len(inertia), 1))
     inertia[:, 1:4] *= rng.uniform(1.0 - mass_error, 1.0 + mass_error, (len(inertia), 1))
@@ -189,7 +189,10 @@ def _make_gross(
 
 
 def _plant_values(base: Base, swing_friction: float) -> np.ndarray:
-    """Base parameters (p,) of the simulated machine, which has friction where Table 13 has none."""
+    """Return the base parameters (p,) of the simulated machine.
+
+    Unlike Table 13, the simulated machine has Coulomb friction.
+    """
     machine = load_machine("cat215")
     dry = {
         f"coulomb.{drive}": machine.axes[axis].drive.friction.coulomb
@@ -200,7 +203,7 @@ def _plant_values(base: Base, swing_friction: float) -> np.ndarray:
 
 
 def _find_unexplained_share(motion: Motion) -> dict[str, float]:
-    """Share of the cylinders' forces that no parameters of the reduced model can reproduce."""
+    """Return the fraction of the cylinders' forces that the reduced model cannot reproduce."""
     complete, reduced = find_base("complete"), find_base("reduced")
     table = make_regressor(complete.setup, motion)
     bars = [name.endswith(("_tube", "_rod")) and "coulomb" not in name for name in table.names]
@@ -222,12 +225,12 @@ def _panels(motion, judged, force, predicted) -> tuple[Panel, ...]:
         errors = {name: predicted[name][:, k] - force[:, k] for name in chosen}
         panels.append(
             Panel(label, PERIOD * np.arange(len(force)), curves, errors=errors,
-                  error_label=f"predicted less measured [{unit}]")
+                  error_label=f"predicted minus measured [{unit}]")
         )  # fmt: skip
     return tuple(panels)
 
 
-FIT_LABEL, HELD_OUT_LABEL = "joint angles to fit [deg]", "joint angles to judge on [deg]"
+FIT_LABEL, HELD_OUT_LABEL = "joint angles to fit [deg]", "held-out joint angles [deg]"
 FORCE_LABELS = tuple(
     f"{what} of the {drive} [{unit}]"
     for what, drive, unit in zip(("torque", "force", "force"), DRIVES, UNITS, strict=True)
@@ -235,7 +238,7 @@ FORCE_LABELS = tuple(
 
 
 def _ratio_check(samples: Sequence[Sample], one: str, other: str, k: int, accepted, reason):
-    """Check of the ratio of two models' RMS errors of drive k over all repetitions."""
+    """Return a check of the ratio of two models' RMS errors of drive k over all repetitions."""
     drive = DRIVES[k]
     rows = np.array([[s.values[f"{m}.{drive}"] for m in (one, other)] for s in samples])
     return check_statistic(
@@ -246,7 +249,7 @@ def _ratio_check(samples: Sequence[Sample], one: str, other: str, k: int, accept
 
 
 def judge_complete_and_reduced(samples: Sequence[Sample]) -> Judgement:
-    """The complete model has to predict better by half of the published gain, for each drive."""
+    """Check that the complete model is better by at least half of the published gain."""
     checks = []
     for k in range(3):
         ratio = PUBLISHED_RMS["reduced"][k] / PUBLISHED_RMS["complete"][k]
@@ -260,17 +263,17 @@ def judge_complete_and_reduced(samples: Sequence[Sample]) -> Judgement:
     return Judgement(
         tuple(checks),
         "The reduced model explains these data as well as the complete one: tubes and rods move"
-        " with the links, so that parameters of the links reproduce the cylinders' forces up to a"
-        f" small share ({shares} of those forces remain), far below the sensors' noise. The"
-        " document's gain may come from effects of its machine that the further parameters fit."
-        " Plain least squares of all base parameters, which is the document's method, predicts"
-        " worse with the complete model, because its parameters follow the noise.",
+        " with the links, so that the links' parameters reproduce the cylinders' forces except for"
+        f" a small fraction ({shares} of those forces remain), far below the sensors' noise. The"
+        " document's gain may come from effects of its machine that the additional parameters fit."
+        " Plain least squares of all base parameters, the document's method, predicts worse with"
+        " the complete model, because its parameters fit the noise.",
         note=_describe_levels(samples),
     )
 
 
 def _describe_levels(samples: Sequence[Sample]) -> str:
-    """RMS errors of all models as text."""
+    """Return the RMS errors of all models as text."""
     parts = []
     for model in samples[0].values:
         name, _, drive = model.rpartition(".")
@@ -281,7 +284,7 @@ def _describe_levels(samples: Sequence[Sample]) -> str:
 
 
 def judge_identified_and_nominal(samples: Sequence[Sample]) -> Judgement:
-    """The nominal model has to be worse for every drive, by half of the smallest excess."""
+    """Check that the nominal model is worse by half of the smallest published excess."""
     ratios = np.divide(PUBLISHED_RMS["nominal"], PUBLISHED_RMS["complete"])
     checks = tuple(
         _ratio_check(
@@ -292,15 +295,15 @@ def judge_identified_and_nominal(samples: Sequence[Sample]) -> Judgement:
     )  # fmt: skip
     return Judgement(
         checks,
-        "The sizes depend on how wrong the nominal model is, which is not known of the document's:"
-        " here it lacks friction, as Table 13 does, and masses and centres of mass are off by up to"
-        " 15 %. With 30 % the boom's ratio is 5.0 instead of 2.7. The swing's ratio is that of its"
-        " friction, 12.8 kN m.",
+        "The ratios depend on the errors of the nominal model, which are unknown in the document:"
+        " here it has no friction, as in Table 13, and masses and centres of mass have errors of up"
+        " to 15 %. With 30 % the boom's ratio is 5.0 instead of 2.7. The swing's ratio is due to"
+        " its friction, 12.8 kN m.",
     )
 
 
 def judge_sensor_accuracy(samples: Sequence[Sample]) -> Judgement:
-    """The complete model's errors have to be as near to the sensors' accuracy as published."""
+    """Compare the complete model's errors with the sensors' accuracy."""
     ratios = np.divide(PUBLISHED_RMS["complete"], SENSOR_ACCURACY)
     checks = [
         check_mean(
@@ -315,11 +318,11 @@ def judge_sensor_accuracy(samples: Sequence[Sample]) -> Judgement:
 
 
 def judge_realistic(samples: Sequence[Sample]) -> Judgement:
-    """Most estimates have to be off by more than the parameter's own size."""
+    """Check that most estimates have errors above the size of the parameter."""
     check = check_mean(
-        "fraction of base parameters whose estimate is off by more than the parameter's size",
+        "fraction of base parameters with estimation errors above the parameter's size",
         np.array([s.values["unrealistic"] for s in samples]), (0.5, 1.0),
-        "most: more than half; off by its own size: not realistic",
+        "most: more than half; an error above the size is not realistic",
     )  # fmt: skip
     complete, reduced = (
         format_values(samples, f"unrealistic.{m}", 100.0, 0) for m in ("complete", "reduced")
@@ -328,7 +331,7 @@ def judge_realistic(samples: Sequence[Sample]) -> Judgement:
 
 
 def judge_caption(samples: Sequence[Sample]) -> Judgement:
-    """Motions of the document's excavator, of which the axes are legible only."""
+    """Describe the joint angles; only the axes of the published figures are legible."""
     angles = {panel.label: panel.curves for panel in samples[0].panels}
     ranges = "; ".join(
         f"{label}: " + ", ".join(f"{d} {v.min():.0f} to {v.max():.0f}" for d, v in curves.items())
@@ -353,7 +356,7 @@ PREDICTION = Experiment(
             '"Most of the estimated parameters are even far from being realistic."',
             "Tables 16 and 17, pp. 113, 115 and 116", "document", judge_realistic,
             broken={"linear": True},
-            broken_how="the fitted forces are the linear model's own, without errors", panels=(),
+            broken_how="the fitted forces are those of the linear model, without errors", panels=(),
         ),
         Claim(
             "complete model predicts better than reduced",
@@ -371,7 +374,7 @@ PREDICTION = Experiment(
             ' (nominal) model"; RMS nominal: 12200 N m, 39200 N, 14600 N',
             "Fig. 37, pp. 116 to 117", "document", judge_identified_and_nominal,
             broken={"nominal": "exact"},
-            broken_how="the nominal model has the machine's own numbers", panels=(),
+            broken_how="the nominal model has the parameters of the machine", panels=(),
         ),
         Claim(
             "prediction within the sensors' accuracy",

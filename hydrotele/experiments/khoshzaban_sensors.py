@@ -1,4 +1,4 @@
-"""Section 4.4.3 of Khoshzaban 1992: effect of the sensors' accuracy on identified parameters."""
+"""Section 4.4.3 of Khoshzaban 1992: effect of sensor accuracy on identified parameters."""
 
 from collections.abc import Sequence
 
@@ -20,31 +20,31 @@ from hydrotele.identify.smoothing import smooth
 from hydrotele.machine.machine_file import load_machine
 
 SENSOR_ACCURACY = (1400.0, 5700.0, 4200.0)
-"""Limits of the error of the swing's torque [N m] and the cylinders' forces [N] (p. 108)."""
+"""Largest errors of the swing's torque [N m] and the cylinders' forces [N] (p. 108)."""
 
 NOISE_SETTINGS = {
-    "noise": 1.0,  # of all sensors, times their accuracy
-    "residual_noise": 0.0,  # the same where the document has none
-    "pressure_gain": 5.0,  # by which the better pressure sensors are more accurate
+    "noise": 1.0,  # errors of all sensors, as a factor of their accuracy
+    "residual_noise": 0.0,  # the same factor for the case without noise
+    "pressure_gain": 5.0,  # factor by which the better pressure sensors are more accurate
     "cylinders_known": False,  # whether the complete model's cylinders are known exactly
 }
 ANGLE_ACCURACY = np.deg2rad(0.1)
-"""Limit of a resolver's error [rad] (p. 107)."""
+"""Largest error of a resolver [rad] (p. 107)."""
 
 
 def measure_errors(seed: int, changes: Changes) -> Sample:
-    """Errors of the parameters with pressure sensors of 25 psi, of 5 psi, and without errors.
+    """Compute parameter errors for pressure sensors of 25 psi, of 5 psi, and without errors.
 
-    Uniform errors of the angles and forces are added to the simulated motion and forces; rates and
-    accelerations are exact, because the document adds errors of resolvers and pressures only. The
-    better sensors have the same errors, five times smaller, and in `independent` others.
+    Uniform errors are added to the simulated angles and forces. Rates and accelerations are exact,
+    because the document adds errors only to resolvers and pressures. The better sensors have the
+    same random errors divided by five; in case `independent` they have independent errors.
 
     Args:
-        seed: of the motion and the errors.
-        changes: of `NOISE_SETTINGS`.
+        seed: seed of the motion and the errors.
+        changes: changes of `NOISE_SETTINGS`.
 
     Returns:
-        Errors of the base parameters, of the parameters' own sizes.
+        Errors of the base parameters relative to their sizes, per model and case.
     """
     settings = read_settings(NOISE_SETTINGS, changes)
     rng = np.random.default_rng(seed)
@@ -55,7 +55,7 @@ def measure_errors(seed: int, changes: Changes) -> Sample:
     scale, rest, gain = (settings[k] for k in ("noise", "residual_noise", "pressure_gain"))
     derived = smooth(motion[0] + scale * angles[0], PERIOD, ANGLE_ACCURACY / np.sqrt(3.0))
     five = scale / gain
-    # cases that share a motion: errors of its angles, and factors and numbers of the force errors
+    # (measured motion, case -> (factor of the force errors, index of their random sample))
     plans = (
         (_add_angles(motion, scale * angles[0]), {"25 psi": (scale, 0), "5 psi": (five, 0)}),
         (_add_angles(motion, scale * angles[1]), {"independent": (five, 1)}),
@@ -83,24 +83,29 @@ def _add_angles(motion: Motion, errors: np.ndarray) -> Motion:
 
 
 def _errors(samples: Sequence[Sample], name: str) -> np.ndarray:
-    """(n, p) errors of all repetitions."""
+    """Return the (n, p) errors of all repetitions."""
     return np.array([sample.arrays[name] for sample in samples])
 
 
 def _ratio_of_means(rows: np.ndarray) -> float:
-    """Median over parameters of the ratio of two geometric means over repetitions (n, 2, p)."""
+    """Return the ratio of two geometric means over repetitions (n, 2, p), median of parameters."""
     logs = np.mean(np.log(np.maximum(rows, np.finfo(float).tiny)), axis=0)
     return float(np.median(np.exp(logs[0] - logs[1])))
 
 
 def _fraction_improved(samples: Sequence[Sample], model: str, better: str) -> np.ndarray:
-    """(n,) fraction of parameters whose error falls 10 to 100 times."""
+    """Return the (n,) fraction of parameters whose error decreases by a factor of 10 to 100."""
     ratio = _errors(samples, f"{model}.25 psi") / _errors(samples, f"{model}.{better}")
     return np.mean((ratio >= 10.0) & (ratio <= 100.0), axis=1)
 
 
 def _improvement_judge(model: str, more: str = ""):
-    """Judge of the errors with 25 psi over those with 5 psi; `more` ends its note."""
+    """Return the judge of the error ratio between 25 psi and 5 psi sensors.
+
+    Args:
+        model: `complete` or `reduced`.
+        more: text appended to the note.
+    """
 
     def judge(samples: Sequence[Sample]) -> Judgement:
         pairs = {
@@ -116,19 +121,19 @@ def _improvement_judge(model: str, more: str = ""):
         checks = (
             check_statistic("error with 25 psi over error with 5 psi, median of the parameters",
                             pairs[""], _ratio_of_means, (10.0, 100.0), reason),
-            check_mean("fraction of parameters whose error falls 10 to 100 times in one run with"
-                       " independent errors", independent, (0.5, 1.0), "most parameters"),
+            check_mean("fraction of parameters whose error decreases 10 to 100 times in one run"
+                       " with independent errors", independent, (0.5, 1.0), "most parameters"),
         )  # fmt: skip
         only, smoothed = (_ratio_of_means(pairs[k]) for k in ("pressures", "differentiated"))
         return Judgement(
             checks,
-            "The estimate is linear in the forces: five times smaller pressure errors make errors"
-            f" five times smaller ({only:.3g} with exact angles), and fewer than five times where"
-            f" angles are differentiated ({smoothed:.3g}). In single runs with independent errors"
-            f" the ratio scatters: {100 * independent.mean():.0f} % of the parameters fall 10 to"
-            " 100 times; of two independent normal errors of ratio 5 it would be 26 %. The"
-            " document compares one run with one run.",
-            note=f"runs in which most parameters fall 10 to 100 times:"
+            "The estimate is linear in the forces: five times smaller pressure errors give five"
+            f" times smaller parameter errors ({only:.3g} with exact angles), and less than five"
+            f" times if angles are differentiated ({smoothed:.3g}). In single runs with independent"
+            f" errors the ratio varies: the errors of {100 * independent.mean():.0f} % of the"
+            " parameters decrease 10 to 100 times; for two independent normal errors of ratio 5 it"
+            " would be 26 %. The document compares two single runs.",
+            note=f"runs in which the errors of most parameters decrease 10 to 100 times:"
             f" {100 * np.mean(independent > 0.5):.0f} %{more}",
         )
 
@@ -136,12 +141,12 @@ def _improvement_judge(model: str, more: str = ""):
 
 
 def judge_large_errors(samples: Sequence[Sample]) -> Judgement:
-    """Almost all parameters of the complete model have to be off by their own size or more."""
+    """Check that almost all parameters of the complete model have large errors."""
     errors = _errors(samples, "complete.25 psi")
     check = check_mean(
-        "fraction of base parameters of the complete model that are off by more than half of their"
+        "fraction of base parameters of the complete model with errors above half of their"
         " size", np.mean(errors > 0.5, axis=1), (0.8, 1.0),
-        "almost all: four of five; a parameter that is off by half of its size has a large error",
+        "almost all: four of five; an error above half of the size is large",
     )  # fmt: skip
     medians = ", ".join(
         f"{m} {np.median(_errors(samples, f'{m}.25 psi')):.3g}" for m in ("complete", "reduced")
@@ -150,7 +155,7 @@ def judge_large_errors(samples: Sequence[Sample]) -> Judgement:
 
 
 def judge_without_errors(samples: Sequence[Sample]) -> Judgement:
-    """Without errors of the sensors the parameters have to come out as printed."""
+    """Check that readings without errors give the printed parameters."""
     checks = tuple(
         check_statistic(
             f"largest error over size of the {model} model, median of the runs",
@@ -163,7 +168,7 @@ def judge_without_errors(samples: Sequence[Sample]) -> Judgement:
 
 
 def judge_reduced_errors(samples: Sequence[Sample]) -> Judgement:
-    """Parameters of both models have to be less wrong in the reduced one."""
+    """Check that parameters of both models have smaller errors in the reduced model."""
     names = [find_base(model).names for model in ("complete", "reduced")]
     if samples[0].arrays["complete.none"].size == len(names[1]):
         names[0] = names[1]
@@ -176,15 +181,15 @@ def judge_reduced_errors(samples: Sequence[Sample]) -> Judgement:
         axis=1,
     )
     check = check_statistic(
-        f"error in the complete over error in the reduced model, median of {len(shared)} parameters"
-        " that both have", rows, _ratio_of_means, (2.0, np.inf), "much less: at most half",
+        f"error in the complete over error in the reduced model, median of {len(shared)} common"
+        " parameters", rows, _ratio_of_means, (2.0, np.inf), "much less: at most half",
     )  # fmt: skip
     return Judgement((check,))
 
 
 _TABLE_15 = (
-    "; of 13 entries of Table 15 that are legible and whose true value is zero, 10 fall 10 to 100"
-    " times in the document's own pair of runs"
+    "; of 13 legible entries of Table 15 whose true value is zero, 10 decrease 10 to 100 times"
+    " between the two runs of the document"
 )
 
 NOISE = Experiment(
@@ -201,14 +206,14 @@ NOISE = Experiment(
             '"The error in this case, however, is much less (10 to 100 times) than the error for'
             ' the accuracy of +-25 psi."',
             "Table 14, pp. 108, 109 and 123", "document", _improvement_judge("complete"),
-            broken={"pressure_gain": 1.0}, broken_how="the better sensors are not better",
+            broken={"pressure_gain": 1.0}, broken_how="both sensors have the same accuracy",
         ),
         Claim(
             "five times better pressure sensors, reduced model",
             '"The error in this case, however, is much less (10 to 100 times) than the error for'
             ' the accuracy of +-25 psi."',
             "Table 15, pp. 108 and 110", "document", _improvement_judge("reduced", _TABLE_15),
-            broken={"pressure_gain": 1.0}, broken_how="the better sensors are not better",
+            broken={"pressure_gain": 1.0}, broken_how="both sensors have the same accuracy",
         ),
         Claim(
             "no error without noise",
@@ -235,7 +240,7 @@ ACCURACY_SETTINGS = {"accuracy_psi": 25.0}
 
 
 def measure_accuracy(seed: int, changes: Changes) -> Sample:
-    """Largest errors of the drives' forces by those of the pressures, with the machine's areas."""
+    """Compute the largest force errors of the drives from pressure errors and piston areas."""
     pressure = 6894.757 * read_settings(ACCURACY_SETTINGS, changes)["accuracy_psi"]
     machine = load_machine("cat215")
     return Sample(
@@ -244,12 +249,12 @@ def measure_accuracy(seed: int, changes: Changes) -> Sample:
 
 
 def judge_accuracy(samples: Sequence[Sample]) -> Judgement:
-    """Errors have to round to those that are printed."""
+    """Check that the errors round to the printed ones."""
     return Judgement(
         tuple(
             check_exact(f"largest error, {drive}", samples[0].values[drive],
                         (limit - 50.0, 1.001 * (limit + 50.0)), unit=unit, published=limit,
-                        reason="printed to hundreds, with a pound force that is 0.1 % small")
+                        reason="printed to hundreds, with a pound-force that is 0.1 % too small")
             for drive, limit, unit in zip(DRIVES, SENSOR_ACCURACY, UNITS, strict=True)
         )
     )  # fmt: skip
@@ -266,4 +271,4 @@ ACCURACY = Experiment(
     ),
     repetitions_fixed=1,
 )  # fmt: skip
-"""Errors of the forces on which Tables 14 and 15 rest."""
+"""Force errors assumed in Tables 14 and 15."""

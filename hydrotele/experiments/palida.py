@@ -1,4 +1,8 @@
-"""PaLiDA, the hexapod of Abdellatif 2008: published numbers, simulated measurements and control."""
+"""PaLiDA, the hexapod of Abdellatif 2008: published parameters, simulated measurements, control.
+
+The module contains Table 2 of the document and the shipped model with its regressor. It simulates
+measurements with force and encoder noise, and tracks paths in MuJoCo with feedforward.
+"""
 
 import json
 from dataclasses import dataclass
@@ -19,18 +23,18 @@ from hydrotele.multibody.chain import cardan_angles
 from hydrotele.multibody.closures import joint_positions
 from hydrotele.multibody.inverse_dynamics import project
 
-_MAX_ROWS = 1000  # rows computed together: memory that is used again is faster than new one
+_MAX_ROWS = 1000  # rows computed together; reused memory is faster than new memory
 LEGS = range(1, 7)
-DRIVE = 4  # that figures show: actuator 5, as in Fig. 11
+DRIVE = 4  # index of the drive in figures: actuator 5, as in Fig. 11
 CHI2_LIMIT = 36.42  # 95 % quantile of chi^2 with 24 degrees of freedom, as printed (5.3)
 HOME_POSE = np.array([0.0, 0.0, 0.55, 0.0, 0.0, 0.0])
-# Assumed, as README.md of the model says: the document prints neither noise nor limits.
+# Assumed (see the model's README.md): the document gives neither noise nor limits.
 SAMPLE_RATE = 1000.0  # Hz
-FORCE_NOISE = 53.0  # of a drive, over the published standard deviation of its dry friction
+FORCE_NOISE = 53.0  # force noise over the published standard deviation of the dry friction
 LENGTH_NOISE = 10e-6  # m, standard deviation of a measured leg length
-CORRELATION = 0.6  # of the force noise of any two drives
+CORRELATION = 0.6  # correlation of the force noise of any two drives
 STROKE, MAX_SPEED, MAX_ACCELERATION = (0.60, 1.06), 1.2, 25.0  # m, m/s, m/s^2 of every drive
-POSE_LOW = np.array([-0.20, -0.20, 0.42, -0.35, -0.35, -0.25])  # of the pose [m], [rad]
+POSE_LOW = np.array([-0.20, -0.20, 0.42, -0.35, -0.35, -0.25])  # limits of the pose [m], [rad]
 POSE_HIGH = np.array([0.20, 0.20, 0.70, 0.35, 0.35, 0.25])
 
 
@@ -38,9 +42,9 @@ class Published(NamedTuple):
     """One row of the document's Table 2.
 
     Attributes:
-        symbol: as printed.
-        column: of the regressor, which stands for the combination.
-        value: identified.
+        symbol: printed symbol.
+        column: column of the regressor that represents the combination.
+        value: identified value.
         interval: 95 % confidence interval, value -+ 2 standard deviations by (30).
         prior: a-priori value; 0 for friction, which has none. That of p5 is printed without sign.
     """
@@ -53,11 +57,11 @@ class Published(NamedTuple):
 
     @property
     def std(self) -> float:
-        """Standard deviation by the printed interval.
+        """Standard deviation, computed from the printed interval.
 
-        The printed standard deviations agree with it to rounding except for p6 to p9: those four
-        are shifted cyclically by one row, so that p6 has that of p9, p7 that of p6, p8 that of p7
-        and p9 that of p8.
+        The printed standard deviations agree with it to rounding except for p6 to p9, which are
+        shifted cyclically by one row: p6 has that of p9, p7 that of p6, p8 that of p7 and p9 that
+        of p8.
         """
         return 0.25 * (self.interval[1] - self.interval[0])
 
@@ -93,14 +97,14 @@ SYMBOLS = tuple(one.symbol for one in TABLE)
 
 @dataclass(frozen=True)
 class Robot:
-    """The model, and its parameters in the order of Table 2.
+    """The model of the robot and its parameters in the order of Table 2.
 
     Attributes:
-        mechanism: as a user of `hydrotele identify --mjcf` has it: equal legs, and 19 inertial
-            parameters that are 0 by symmetry of the bodies.
-        structure: base parameters, found from the null space of the regressor's other columns.
-        order: (24,) place of every row of Table 2 among the base parameters.
-        truth: (24,) values of the model.
+        mechanism: mechanism as loaded by `hydrotele identify --mjcf`, with equal legs and 19
+            inertial parameters that are 0 by symmetry.
+        structure: base parameters, found from the null space of the regressor.
+        order: (24,) index of every row of Table 2 among the base parameters.
+        truth: (24,) parameter values of the model.
     """
 
     mechanism: Mechanism
@@ -110,11 +114,11 @@ class Robot:
 
     @property
     def setup(self) -> RegressorSetup:
-        """Of the regressor, in coordinates of the pose."""
+        """Setup of the regressor in coordinates of the pose."""
         return self.mechanism.setup
 
     def matrix(self, motion: np.ndarray) -> np.ndarray:
-        """Regressor (n, 6, 24) of Table 2's parameters along a motion (3, n, 6) of the pose."""
+        """Return the regressor (n, 6, 24) of Table 2's parameters along a motion (3, n, 6)."""
         out, start = [], None
         for first in range(0, motion.shape[1], _MAX_ROWS):
             some = motion[:, first : first + _MAX_ROWS]
@@ -124,16 +128,16 @@ class Robot:
         return np.concatenate(out)
 
     def lengths(self, motion: np.ndarray) -> np.ndarray:
-        """Leg lengths (n, 6) [m] at poses (n, 6)."""
+        """Return the leg lengths (n, 6) [m] at poses (n, 6)."""
         q = joint_positions(self.setup.chain, self.setup.given, motion)
         return q[:, [self.setup.chain.index(name) for name in self.setup.chain.drives]]
 
 
 def read_settings(defaults: Changes, changes: Changes) -> dict[str, Any]:
-    """Settings of an experiment with some of them changed.
+    """Return the default settings of an experiment with changes applied.
 
     Raises:
-        KeyError: a setting is not known.
+        KeyError: a changed key is not a setting.
     """
     if unknown := set(changes) - set(defaults):
         raise KeyError(f"{', '.join(sorted(unknown))}: valid are {', '.join(defaults)}")
@@ -141,7 +145,7 @@ def read_settings(defaults: Changes, changes: Changes) -> dict[str, Any]:
 
 
 def draw_states() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Poses, rates and accelerations (100, 6) that excite whatever can be excited, always equal."""
+    """Draw poses, rates and accelerations (100, 6) that excite all parameters, with fixed seed."""
     rng = np.random.default_rng(0)
     poses = 0.5 * (POSE_LOW + POSE_HIGH)
     poses = poses + 0.4 * (POSE_HIGH - POSE_LOW) * rng.uniform(-1.0, 1.0, (100, 6))
@@ -150,7 +154,7 @@ def draw_states() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @cache
 def load_robot() -> Robot:
-    """Load the shipped model; base parameters from the null space of 100 random states."""
+    """Load the shipped model and find its base parameters from 100 random states."""
     folder = models_folder() / "palida"
     mechanism = load_mechanism(folder / "palida.xml", folder / "columns.yaml")
     setup = mechanism.setup
@@ -163,12 +167,12 @@ def load_robot() -> Robot:
 
 
 def force_covariance() -> np.ndarray:
-    """Covariance (6, 6) of the drives' force noise [N^2], white at `SAMPLE_RATE`.
+    """Return the covariance (6, 6) of the drives' force noise [N^2], white at `SAMPLE_RATE`.
 
-    The document calls it high and cross-correlated and prints no number. Ratios of the drives are
-    those of the published standard deviations of their dry friction; the level, 10 to 19 N, and the
-    robot's geometry are chosen so that the standard deviations of the parameters are about the
-    published ones.
+    The document calls the noise high and cross-correlated but gives no value. The standard
+    deviations, 10 to 19 N, are proportional to the published ones of each drive's dry friction.
+    Their size and the robot's geometry are chosen to give about the published standard deviations
+    of the parameters.
     """
     size = FORCE_NOISE * np.array([one.std for one in TABLE[12:18]])
     return np.outer(size, size) * (CORRELATION + (1.0 - CORRELATION) * np.eye(6))
@@ -176,7 +180,7 @@ def force_covariance() -> np.ndarray:
 
 @cache
 def load_excitation() -> Excitation:
-    """Load the excitation motion, designed by `tools/studies/palida_study.py --design 1`."""
+    """Load the excitation motion designed by `tools/studies/palida_study.py --design 1`."""
     found = json.loads((models_folder() / "palida" / "excitation.json").read_text(encoding="utf-8"))
     mean, sin, cos = (np.array(found[key]) for key in ("mean", "sin", "cos"))
     return Excitation(
@@ -186,7 +190,7 @@ def load_excitation() -> Excitation:
 
 
 def drive_limits() -> DriveLimits:
-    """Limits of the drives, within which motions are designed."""
+    """Return the limits of pose and drives for the design of motions."""
     return DriveLimits(
         load_robot().setup,
         POSE_LOW,
@@ -198,10 +202,10 @@ def drive_limits() -> DriveLimits:
 
 
 class RepeatedMotion(NamedTuple):
-    """One period of a motion that is repeated; n rows.
+    """One period of a repeated motion with n rows.
 
     Attributes:
-        period: of the motion [s].
+        period: length of the period [s].
         motion: (3, n, 6) true poses, rates and accelerations.
         length: (n, 6) true leg lengths [m].
         matrix: (n, 6, 24) true regressor of Table 2's parameters.
@@ -216,7 +220,7 @@ class RepeatedMotion(NamedTuple):
 
 
 def simulate_motion(motion: np.ndarray, period: float) -> RepeatedMotion:
-    """Lengths and forces of the model along one period of a motion (3, n, 6)."""
+    """Compute leg lengths and drive forces along one period of a motion (3, n, 6)."""
     own = load_robot()
     matrix = own.matrix(motion)
     return RepeatedMotion(period, motion, own.lengths(motion[0]), matrix, matrix @ own.truth)
@@ -224,14 +228,14 @@ def simulate_motion(motion: np.ndarray, period: float) -> RepeatedMotion:
 
 @cache
 def simulate_excitation() -> RepeatedMotion:
-    """The designed motion at `SAMPLE_RATE`."""
+    """Simulate the designed excitation at `SAMPLE_RATE`."""
     motion = load_excitation()
     time = np.arange(round(motion.period * SAMPLE_RATE)) / SAMPLE_RATE
     return simulate_motion(motion.motion(time), motion.period)
 
 
 def draw_force_noise(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-    """Force noise (*shape, 6) [N] with `force_covariance`."""
+    """Draw force noise (*shape, 6) [N] with covariance `force_covariance`."""
     return rng.standard_normal((*shape, 6)) @ np.linalg.cholesky(force_covariance()).T
 
 
@@ -239,14 +243,14 @@ def simulate_measurement(
     cycle: RepeatedMotion, periods: int, rng: np.random.Generator,
     reaction: tuple[float, float] = (0.0, 0.0), length_noise: float = LENGTH_NOISE,
 ) -> IdentificationRecord:  # fmt: skip
-    """Simulate a measurement: repeated periods of true lengths and forces, with noise.
+    """Simulate a measurement of repeated periods with noise of leg lengths and drive forces.
 
     Args:
-        cycle: one period.
+        cycle: one period of the true motion.
         periods: number of repetitions.
-        rng: of the noise.
-        reaction: force of every drive per error of its measured length [N/m] and of its rate
-            [N s/m], by which a controller brings the encoder's noise into the forces.
+        rng: random generator of the noise.
+        reaction: controller gains from errors of the measured length [N/m] and of its rate
+            [N s/m] to the drive force, which feed encoder noise back into the forces.
         length_noise: standard deviation of a measured leg length [m].
 
     Returns:
@@ -265,25 +269,25 @@ def simulate_measurement(
     )  # fmt: skip
 
 
-# Control: one linear controller per drive (PID), and forces of a model along the reference.
-DRIVE_MASS, BANDWIDTH, DAMPING_RATIO = 4.0, 12.0, 0.8  # kg that a drive moves on average, Hz, 1
-INTEGRAL_RATE = 3.0  # 1/s, of the proportional part
-_START_TIME = 1.0  # s until a circle has its speed
+# Control: one PID controller per drive, and feedforward of a model's forces along the reference.
+DRIVE_MASS, BANDWIDTH, DAMPING_RATIO = 4.0, 12.0, 0.8  # mean mass per drive [kg], [Hz], [1]
+INTEGRAL_RATE = 3.0  # integral over proportional gain [1/s]
+_START_TIME = 1.0  # time to reach full speed on a circle [s]
 
 
 def control_gains() -> tuple[float, float]:
-    """Stiffness [N/m] and damping [N s/m] of every drive's controller."""
+    """Return the stiffness [N/m] and damping [N s/m] of every drive's controller."""
     turn = 2.0 * np.pi * BANDWIDTH
     return DRIVE_MASS * turn**2, 2.0 * DAMPING_RATIO * DRIVE_MASS * turn
 
 
 def plan_circle(speed: float, radius: float = 0.10, laps: float = 2.0) -> np.ndarray:
-    """A horizontal circle about the home pose, started from rest.
+    """Plan a horizontal circle about the home pose, starting from rest.
 
     Args:
-        speed: of the tool [m/s].
-        radius: [m].
-        laps: at full speed.
+        speed: tool speed [m/s].
+        radius: radius [m].
+        laps: number of laps at full speed.
 
     Returns:
         (3, n, 6) poses, rates and accelerations at `SAMPLE_RATE`.
@@ -297,17 +301,17 @@ def plan_circle(speed: float, radius: float = 0.10, laps: float = 2.0) -> np.nda
 
 
 def plan_square(speed: float, side: float = 0.16, laps: float = 2.0) -> np.ndarray:
-    """A horizontal square about the home pose, at rest in its corners.
+    """Plan a horizontal square about the home pose, with a stop at each corner.
+
+    The path along a side is a quintic polynomial of time, whose largest speed is 15/8 of the mean.
 
     Args:
-        speed: of the tool in the middle of a side [m/s].
-        side: [m].
-        laps: of it.
+        speed: tool speed in the middle of a side [m/s].
+        side: side length [m].
+        laps: number of laps.
 
     Returns:
         (3, n, 6) poses, rates and accelerations at `SAMPLE_RATE`.
-
-    Source: quintic of a side, whose largest speed is 15/8 of the mean one.
     """
     span = 15.0 / 8.0 * side / speed
     time = np.arange(0.0, 4.0 * laps * span, 1.0 / SAMPLE_RATE)
@@ -329,13 +333,13 @@ def _differentiate(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 class Tracked(NamedTuple):
-    """A path under control; n rows at `SAMPLE_RATE`.
+    """Tracking errors along a path; n rows at `SAMPLE_RATE`.
 
     Attributes:
-        time: (n,) [s].
-        error: (n, 6) reference less true leg length [m].
-        pose_error: (n, 6) reference less true pose [m], [rad].
-        warnings: that MuJoCo counted.
+        time: (n,) time [s].
+        error: (n, 6) reference minus true leg length [m].
+        pose_error: (n, 6) reference minus true pose [m], [rad].
+        warnings: number of MuJoCo warnings.
     """
 
     time: np.ndarray
@@ -345,15 +349,15 @@ class Tracked(NamedTuple):
 
 
 def track_path(motion: np.ndarray, feedforward: np.ndarray | None, seed: int = 0) -> Tracked:
-    """Drive a path in MuJoCo, with closed chains, friction and encoder noise.
+    """Track a path in MuJoCo with closed chains, friction and encoder noise.
 
     Args:
         motion: (3, n, 6) poses, rates and accelerations of the reference.
-        feedforward: (24,) parameters of a model whose forces are added; None for none.
-        seed: of the encoders' noise.
+        feedforward: (24,) parameters of the feedforward model; None for no feedforward.
+        seed: seed of the encoder noise.
 
     Returns:
-        How well the path is followed.
+        Tracking errors of legs and pose.
 
     Source: Abdellatif 2008, section 5.4.
     """

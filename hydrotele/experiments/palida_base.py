@@ -1,8 +1,7 @@
-"""Base parameters of PaLiDA: printed in Table 1, by regrouping rules, and by the null space.
+"""Base parameters of PaLiDA by three methods: Table 1, regrouping rules, and null space.
 
-Three ways to the same result. Table 1 gives ten combinations. The rules of section 2.1 regroup the
-parameters body by body from the geometry alone. The null space of the regressor needs random states
-and no rule.
+Table 1 lists ten combinations. The rules of section 2.1 regroup the parameters body by body and
+need only the geometry. The null space of the regressor needs random states and no rules.
 """
 
 from collections.abc import Iterator, Sequence
@@ -28,16 +27,19 @@ from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, Regressor, pro
 _KINDS = tuple(BODY_PARAMETERS)
 _INERTIAS = tuple(kind for kind in _KINDS if kind.startswith("inertia"))
 MAX_ROUNDING = 1e-8
-"""Largest difference of coefficients [kg m^2, kg m, kg] that counts as rounding: the places of the
-joints in the MJCF have twelve decimals, the null space takes 600 equations in double precision."""
+"""Largest difference of coefficients [kg m^2, kg m, kg] that counts as rounding.
+
+Joint positions in the MJCF have twelve decimals; the null space comes from 600 equations in double
+precision.
+"""
 
 
 class Relation(NamedTuple):
-    """A column of the regressor that is a combination of others, by (10).
+    """A regressor column that is a linear combination of other columns, by (10).
 
     Attributes:
-        parameter: whose column it is, such as `inertia_yy.stator_1`.
-        weights: parameter -> coefficient; empty where the parameter has no effect.
+        parameter: parameter of the column, such as `inertia_yy.stator_1`.
+        weights: other parameter -> coefficient; empty if the parameter has no effect.
     """
 
     parameter: str
@@ -45,14 +47,14 @@ class Relation(NamedTuple):
 
 
 def transfer_parameters(rotation: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """Matrix (10, 10) that expresses a body's inertial parameters in the frame of its carrier.
+    """Return the matrix that transforms a body's inertial parameters to its parent's frame.
 
     Args:
-        rotation: (3, 3) orientation of the body's frame in the carrier's.
-        offset: (3,) origin of the body's frame in the carrier's [m].
+        rotation: (3, 3) orientation of the body's frame in the parent's frame.
+        offset: (3,) origin of the body's frame in the parent's frame [m].
 
     Returns:
-        The matrix L of (9), whose rows and columns are in the order of `BODY_PARAMETERS`.
+        (10, 10) matrix L of (9), with rows and columns in the order of `BODY_PARAMETERS`.
 
     >>> unit = transfer_parameters(np.eye(3), np.array([0.0, 0.0, 2.0]))
     >>> dict(zip(_KINDS, unit[:, 0].tolist()))["inertia_xx"]  # Steiner: 1 kg at a distance of 2 m
@@ -78,21 +80,22 @@ def _tensor(entries: np.ndarray) -> np.ndarray:
 
 
 def list_relations(chain: Chain, platform_rule: bool = True) -> Iterator[Relation]:
-    """Relations between the parameters of the 19 bodies by the rules of section 2.1.
+    """List the relations between the parameters of the 19 bodies by the rules of section 2.1.
+
+    Prismatic joint: all moments of inertia of the slider are added to the stator. Platform: the
+    slider's mass acts as a point mass in the platform joint, the origin of its frame (Steiner).
+    Revolute joint: mass, first moment along the axis, and equal inertias about x and y represent
+    point masses on the axis. The joint does not move them; they are added to the antecedent body.
+    The base does not move, so that only a ring's inertia about its axis remains.
 
     Args:
-        chain: of the hexapod; the frames of ring, stator and slider have their joint along z.
+        chain: chain of the hexapod; joints of ring, stator and slider are along z of their frames.
         platform_rule: whether the masses of the sliders are added to the platform.
 
     Yields:
-        Relations from the sliders to the frame, so that each can use the results of those before.
+        Relations from the sliders to the base, in the order in which they must be applied.
 
-    Source: Abdellatif 2008, section 2.1, after (11). Prismatic joint: all moments of inertia of the
-    slider go to the stator. Platform: the slider's mass is a point mass in the platform joint,
-    where its frame has its origin (Steiner). Revolute joint: a mass, a first moment along the axis
-    and equal inertias about x and y are those of point masses on the axis, which the joint does not
-    move: they go to the antecedent body. The frame does not move, so that of a ring only what
-    turns about its axis is left.
+    Source: Abdellatif 2008, section 2.1, after (11).
     """
     tree = chain.tree
     for leg in LEGS:
@@ -116,20 +119,20 @@ def list_relations(chain: Chain, platform_rule: bool = True) -> Iterator[Relatio
 
 
 def _name_weights(matrix: np.ndarray, kind: str, body: str, *more: str) -> dict[str, float]:
-    """Weights of the carrier's parameters for one or a sum of parameters of the carried body."""
+    """Return the weights of the parent's parameters for a parameter, or a sum, of the body."""
     column = matrix[:, [_KINDS.index(one) for one in (kind, *more)]].sum(axis=1)
     return {f"{k}.{body}": float(c) for k, c in zip(_KINDS, column, strict=True) if abs(c) > 1e-12}
 
 
 def regroup_parameters(names: Sequence[str], relations: Iterator[Relation]) -> np.ndarray:
-    """Regrouped parameters as combinations of all parameters, by (11).
+    """Return the regrouped parameters as combinations of all parameters, by (11).
 
     Args:
-        names: the m inertial parameters.
-        relations: in the order in which they are applied.
+        names: names of the m inertial parameters.
+        relations: relations in the order of their application.
 
     Returns:
-        (m, m); rows of parameters that the relations eliminate are 0.
+        (m, m) coefficients; rows of eliminated parameters are 0.
     """
     places = {name: k for k, name in enumerate(names)}
     regrouped = np.eye(len(names))
@@ -142,10 +145,10 @@ def regroup_parameters(names: Sequence[str], relations: Iterator[Relation]) -> n
 
 
 def table_1(joints: np.ndarray) -> dict[str, dict[str, float]]:
-    """The ten combinations of Table 1 with the names of the model's first leg.
+    """Return the ten combinations of Table 1 with the parameter names of the model's first leg.
 
     Args:
-        joints: (6, 3) places of the platform joints r_B in the platform's frame [m].
+        joints: (6, 3) positions of the platform joints r_B in the platform's frame [m].
 
     Returns:
         Symbol -> parameter -> coefficient. The table prints s_y3 for p5; by I_yy2 + I_zz3 in p1 the
@@ -173,18 +176,21 @@ _STAGES = {
     "equal legs": {"absent": ()},
     "equal legs, symmetrical bodies": {},
 }
-"""Knowledge of the bodies -> changes of the model's regressor. With the last, 19 inertial
-parameters of a leg and of the platform are declared absent, as in Table 1."""
+"""Assumption about the bodies -> changes of the model's regressor.
+
+With symmetrical bodies, 19 inertial parameters of a leg and of the platform are declared absent, as
+in Table 1.
+"""
 
 
 def measure_structure(seed: int, changes: Changes) -> Sample:
-    """Find the base parameters in three ways.
+    """Find the base parameters by all three methods and compare them.
 
     Args:
-        seed: nothing is random.
-        changes: `declare_symmetry` False: no parameter is declared absent. `platform_rule` False:
-            the rule for the platform is left out. `joint_radius`: factor of the places of the
-            platform joints in Table 1.
+        seed: not used.
+        changes: `declare_symmetry`: whether parameters are declared absent; `platform_rule`:
+            whether the rule for the platform is applied; `joint_radius`: factor of the positions
+            of the platform joints in Table 1.
 
     Returns:
         Numbers of base parameters, and largest differences of coefficients.
@@ -227,7 +233,7 @@ def measure_structure(seed: int, changes: Changes) -> Sample:
 
 
 def _singular_values(matrix: np.ndarray) -> np.ndarray:
-    """Singular values over the largest, of columns (n, k, m) of unit length that are not 0."""
+    """Return relative singular values of the nonzero columns (n, k, m), scaled to unit length."""
     rows = matrix.reshape(-1, matrix.shape[2])
     length = np.linalg.norm(rows, axis=0)
     kept = length > MAX_ROUNDING
@@ -236,7 +242,7 @@ def _singular_values(matrix: np.ndarray) -> np.ndarray:
 
 
 def _reduce_inertial(table: Regressor) -> tuple[Identifiability, list[int]]:
-    """Base of the inertial columns, and their places among the regressor's."""
+    """Return the base of the inertial columns, and their indices in the regressor."""
     kept = [k for k, name in enumerate(table.names) if name.partition(".")[0] in _KINDS]
     names, units = [table.names[k] for k in kept], [table.units[k] for k in kept]
     rows = table.matrix[:, :, kept].reshape(-1, len(kept))
@@ -247,7 +253,7 @@ def _reduce_inertial(table: Regressor) -> tuple[Identifiability, list[int]]:
 def _sum_equal(
     bodies: Sequence[str], names: Sequence[str], alike: Sequence[Sequence[str]]
 ) -> np.ndarray:
-    """Parameters (190, m) of all bodies by the m that are left, where some are equal."""
+    """Return the matrix (190, m) from the m distinct parameters to those of all bodies."""
     first = {body: group[0] for group in alike for body in group}
     sums = np.zeros((len(bodies), len(names)))
     for k, name in enumerate(bodies):
@@ -259,10 +265,10 @@ def _sum_equal(
 
 
 def _largest_difference(rules: np.ndarray, structure: Identifiability) -> float:
-    """Largest difference of coefficients between rules (r, m) and null space.
+    """Return the largest difference of coefficients between rules (r, m) and null space.
 
-    The null space may name the same combinations after other members, so that the rules are first
-    solved for its representatives; infinite where the numbers of combinations differ.
+    The null space may represent the same combinations by other members, so that the rules are first
+    solved for its representatives. The result is infinite if the numbers of combinations differ.
     """
     if len(rules) != len(structure.base):
         return np.inf
@@ -273,7 +279,7 @@ def _largest_difference(rules: np.ndarray, structure: Identifiability) -> float:
 def _compare_with_print(
     structure: Identifiability, printed: dict[str, dict[str, float]]
 ) -> dict[str, float]:
-    """Numbers of parameters, and of combinations whose coefficients are those of Table 1."""
+    """Count the parameters, and the combinations whose coefficients agree with Table 1."""
     names, same = [structure.names[k] for k in structure.base], 0
     for symbol, members in printed.items():
         column = TABLE[SYMBOLS.index(symbol)].column
@@ -290,7 +296,7 @@ def _compare_with_print(
 
 
 def judge_table_1(samples: Sequence[Sample]) -> Judgement:
-    """Judge number and members of the base parameters."""
+    """Compare number and members of the base parameters with Table 1."""
     values = samples[0].values
     return Judgement(
         (
@@ -301,14 +307,14 @@ def judge_table_1(samples: Sequence[Sample]) -> Judgement:
             check_exact("combinations with the members and coefficients of Table 1", values["same"],
                         (10, 10), "Table 1", published=10),
         ),
-        "the null space is that of a regressor in which legs are equal and 19 inertial columns are"
-        " declared absent, because Table 1 has bodies that are symmetrical; without this"
+        "the null space is computed from a regressor with equal legs and 19 inertial columns"
+        " declared absent, because the bodies in Table 1 are symmetrical; without this"
         f" declaration the rank of the inertial columns is {values['rank, equal legs']:.0f}",
     )  # fmt: skip
 
 
 def judge_rules(samples: Sequence[Sample]) -> Judgement:
-    """Judge number and coefficients of the regrouped parameters by the null space."""
+    """Compare number and coefficients of the regrouped parameters with the null space."""
     values, checks = samples[0].values, []
     for stage in _STAGES:
         rank = values[f"rank, {stage}"]
@@ -322,7 +328,7 @@ def judge_rules(samples: Sequence[Sample]) -> Judgement:
 
 
 def judge_values(samples: Sequence[Sample]) -> Judgement:
-    """Judge the model's base parameters by the printed estimates."""
+    """Compare the model's base parameters with the printed estimates."""
     worst = float(collect(samples, "values").max())
     check = check_exact("largest difference from the estimates of Table 2", worst, (0.0, 1e-9),
                         "rounding of the decimals in the MJCF", unit="SI")  # fmt: skip
@@ -348,7 +354,7 @@ STRUCTURE = Experiment(
             " terminal bodies can be grouped to the inertial parameter of the platform according to"
             " Steiner's laws.\"",
             "section 2.1, (9) to (11)", "document", judge_rules,
-            {"platform_rule": False}, "the rule for the platform is left out",
+            {"platform_rule": False}, "the rule for the platform is not applied",
         ),
         Claim(
             "parameters of the model",

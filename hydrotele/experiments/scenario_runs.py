@@ -1,4 +1,4 @@
-"""Runs of shipped scenarios for experiments, and figures of their logs."""
+"""Run shipped scenarios for experiments and read quantities from their logs."""
 
 from collections.abc import Mapping
 
@@ -9,18 +9,26 @@ from hydrotele.scenario.scenario import Scenario, load_scenario
 
 
 def run_shipped(name: str, overrides: Mapping[str, str] | None = None) -> tuple[Scenario, Run]:
-    """Run a shipped scenario with some of its values changed."""
+    """Run a shipped scenario with changed values.
+
+    Args:
+        name: name of the scenario.
+        overrides: scenario key -> value.
+
+    Returns:
+        (scenario, run).
+    """
     scenario = load_scenario(name, dict(overrides or {}))
     return scenario, run_scenario(scenario)
 
 
 def true_channel(run: Run, channel: str) -> np.ndarray:
-    """(n,) of a true channel; zeros if the run has no such channel."""
+    """Return the (n,) samples of a truth channel, or zeros if the run has no such channel."""
     return run.truth.columns.get(channel, np.zeros(len(run.truth.time)))
 
 
 def cylindrical_pose(run: Run) -> dict[str, np.ndarray]:
-    """True pose of the tip: r, z [m], theta, attitude [rad], (n,) each."""
+    """Return the true tip pose: r, z [m], theta and attitude [rad], each (n,)."""
     x, y, z = (true_channel(run, f"truth.tip.{c}") for c in "xyz")
     arm = run.plant.machine.arm
     assert arm is not None
@@ -31,5 +39,9 @@ def cylindrical_pose(run: Run) -> dict[str, np.ndarray]:
 
 
 def operator_changes(seed: int) -> dict[str, str]:
-    """Changes of a scenario: an operator of the published population, and a seed for noise."""
+    """Return scenario changes that draw an operator of the published population and set the seed.
+
+    Args:
+        seed: seed of the operator and of the sensor noise.
+    """
     return {"seed": str(seed), "pilot.perception.drawn": str(seed)}

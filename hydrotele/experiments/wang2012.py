@@ -1,8 +1,8 @@
 """Wang 2012: kinematic calibration of the serial-parallel robot IWR, repeated in simulation.
 
-The text of the thesis that is available ends with section 3.1.2 (page 34). Of the tables and
-figures that follow only the captions are known, so that their rows have simulated values and no
-verdict. Dimensions, sensor noise and errors are assumptions (models/iwr/README.md).
+The available text of the thesis ends with section 3.1.2 (page 34). Only the captions of the later
+tables and figures are known; their rows have simulated values and no verdict. Dimensions, sensor
+noise and parameter errors are assumptions (models/iwr/README.md).
 """
 
 from hydrotele.experiments import wang_calibration, wang_identification, wang_models
@@ -29,4 +29,4 @@ SERIES = Series(
         "Fig. 24": "picture of the 3-2-1 wire measurement in the CAD model",
     },
 )  # fmt: skip
-"""All tables and figures of the document."""
+"""All tables and figures of Wang 2012."""

@@ -1,4 +1,8 @@
-"""Wang 2012, chapters 4 and 5: calibrations by least squares, and the 3-2-1 wire measurement."""
+"""Wang 2012, chapters 4 and 5: least-squares calibrations and the 3-2-1 wire measurement.
+
+Simulated robots have errors in the 36 parameters of the refined D-H model or in all 54 parameters.
+They are calibrated from platform poses that six wires measure.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -50,7 +54,7 @@ POSE_LABEL = "pose [1]"
 
 
 def _panel(label: str, before: np.ndarray, after: np.ndarray) -> Panel:
-    """Errors before and after at numbered poses; errors after it have a second axis."""
+    """Draw errors before and after calibration; the latter also have a separate axis."""
     return Panel(
         label, np.arange(1, len(before) + 1), {"before": 1e3 * before, "after": 1e3 * after},
         POSE_LABEL, discrete=True, errors={"after": 1e3 * after}, error_label=label,
@@ -70,7 +74,18 @@ def _describe_change(samples: Sequence[Sample], name: str, unit: str = "mm") -> 
 
 
 def measure_refined(seed: int, changes: Changes) -> Sample:
-    """Calibrate a robot with errors in the 36 parameters by least squares, from 25 poses."""
+    """Calibrate a robot with errors in the 36 parameters by least squares from 25 poses.
+
+    Args:
+        seed: seed of the robot and the noise.
+        changes: `document`: whether only the 36 parameters have errors; `noise`: factor of the
+            sensor noise; `stated_noise`: factor of the noise assumed in the fit; `exact_noise`:
+            noise factor of the measurement without noise.
+
+    Returns:
+        RMS position errors at test poses, fraction of errors inside their intervals, and largest
+        parameter error without noise.
+    """
     settings = change_settings(
         {"document": True, "noise": 1.0, "stated_noise": 1.0, "exact_noise": 0.0}, changes
     )
@@ -108,7 +123,7 @@ def _judge_minimality(samples: Sequence[Sample]) -> Judgement:
                          pairs, lambda rows: float(np.sqrt(
                              np.mean(rows[:, 0] ** 2) / np.mean(rows[:, 1] ** 2))),
                          (1.0, np.inf), '"deteriorate"'),),
-        note="robots with errors in the 36 parameters only; of the 54, 50 are identified",
+        note="only the 36 parameters have errors; 50 of the 54 are identified",
     )  # fmt: skip
 
 
@@ -118,7 +133,7 @@ def _judge_accurate_model(samples: Sequence[Sample]) -> Judgement:
         (_check_accuracy("RMS position error at 25 test poses", samples, "position after"),
          check_fraction("robots with all 25 poses within 0.1 mm", within, (0.5, 1.0),
                         "more than half of the robots; the publication had one")),
-        "The sensor noise is an assumption; errors grow in proportion to it.",
+        "The sensor noise is an assumption; errors are proportional to it.",
         f"RMS {format_values(samples, 'position before', 1e3, 2)} mm before",
     )  # fmt: skip
 
@@ -126,7 +141,7 @@ def _judge_accurate_model(samples: Sequence[Sample]) -> Judgement:
 def _judge_intervals(samples: Sequence[Sample]) -> Judgement:
     return Judgement((check_mean(
         "assumed errors within their 95 % intervals", 100.0 * collect(samples, "inside"),
-        (92.0, 98.0), "95 %; 3 % more or less are a standard deviation that is wrong by a sixth",
+        (92.0, 98.0), "95 %; a deviation of 3 % is a standard deviation wrong by one sixth",
         unit="%"),))  # fmt: skip
 
 
@@ -137,7 +152,15 @@ def _judge_exact(samples: Sequence[Sample]) -> Judgement:
 
 
 def measure_poe(seed: int, changes: Changes) -> Sample:
-    """Calibrate a robot with errors in all 54 parameters of the POE model from 25 poses."""
+    """Calibrate a robot with errors in all 54 parameters of the POE model from 25 poses.
+
+    Args:
+        seed: seed of the robot and the noise.
+        changes: `noise`: factor of the sensor noise.
+
+    Returns:
+        Rank, RMS position errors at measured and test poses, and RMS parameter errors.
+    """
     settings = change_settings({"noise": 1.0}, changes)
     nominal = load_hybrid("iwr")
     simulated = simulate_robot(900 + seed, 25, "poe", document=False, noise=settings["noise"])
@@ -166,7 +189,7 @@ def _judge_poe(samples: Sequence[Sample]) -> Judgement:
         (check_mean("independent parameters of the 54", collect(samples, "rank"), (54.0, 54.0),
                     "all: complete and minimal"),
          _check_accuracy("RMS position error at 25 test poses", samples, "test")),
-        "The sensor noise is an assumption; errors grow in proportion to it.",
+        "The sensor noise is an assumption; errors are proportional to it.",
         f"RMS at the measured poses {_describe_change(samples, 'position')}",
     )  # fmt: skip
 
@@ -174,7 +197,7 @@ def _judge_poe(samples: Sequence[Sample]) -> Judgement:
 def _describe_part(part: str):
     def describe(samples: Sequence[Sample]) -> str:
         return (f"RMS of the assumed errors {format_values(samples, f'assumed {part}', 1e3, 2)}, of"
-                f" identified less assumed {format_values(samples, f'missed {part}', 1e3, 2)}"
+                f" identified minus assumed {format_values(samples, f'missed {part}', 1e3, 2)}"
                 " (mm or mrad)")  # fmt: skip
 
     return describe
@@ -188,7 +211,15 @@ def _describe_axes(samples: Sequence[Sample]) -> str:
 
 
 def measure_wire_calibration(seed: int, changes: Changes) -> Sample:
-    """Calibrate a robot with errors in all 54 parameters from 20 poses that wires measure."""
+    """Calibrate a robot with errors in all 54 parameters from 20 poses measured with wires.
+
+    Args:
+        seed: seed of the robot and the noise.
+        changes: `noise`: factor of the sensor noise.
+
+    Returns:
+        Leg, pose and parameter errors, and errors of positions commanded by inverse kinematics.
+    """
     settings = change_settings({"noise": 1.0}, changes)
     nominal = load_hybrid("iwr")
     simulated = simulate_robot(1300 + seed, 20, document=False, noise=settings["noise"])
@@ -224,7 +255,15 @@ def measure_wire_calibration(seed: int, changes: Changes) -> Sample:
 
 
 def _reach_desired_poses(simulated: SimulatedRobot, robot: Hybrid) -> np.ndarray:
-    """(M,) position errors [m] where a robot's inverse kinematics command the true robot."""
+    """Return the position errors when a model's inverse kinematics command the true robot.
+
+    Args:
+        simulated: true robot with its test commands.
+        robot: model that computes the commands.
+
+    Returns:
+        (M,) [m].
+    """
     joints, legs = simulated.test_commands
     desired = forward(load_hybrid("iwr"), joints, legs)
     reached = forward(simulated.robot, joints, inverse(robot, desired, joints))
@@ -234,8 +273,8 @@ def _reach_desired_poses(simulated: SimulatedRobot, robot: Hybrid) -> np.ndarray
 def _judge_whole_robot(samples: Sequence[Sample]) -> Judgement:
     return Judgement(
         (_check_accuracy("RMS position error at 25 test poses", samples, "test"),),
-        "The sensor noise is an assumption; errors grow in proportion to it.",
-        f"from 20 platform poses; {format_values(samples, 'rank', digits=0)} of 54 parameters are"
+        "The sensor noise is an assumption; errors are proportional to it.",
+        f"20 platform poses; {format_values(samples, 'rank', digits=0)} of 54 parameters are"
         " identified, the others are redundant",
     )  # fmt: skip
 
@@ -243,8 +282,8 @@ def _judge_whole_robot(samples: Sequence[Sample]) -> Judgement:
 def _judge_correction(samples: Sequence[Sample]) -> Judgement:
     return Judgement(
         (_check_accuracy("RMS error of the reached position", samples, "reached after"),),
-        "The sensor noise is an assumption; errors grow in proportion to it.",
-        f"25 desired poses by the inverse kinematics; RMS"
+        "The sensor noise is an assumption; errors are proportional to it.",
+        f"25 desired poses, commanded by the inverse kinematics; RMS"
         f" {format_values(samples, 'reached before', 1e3, 2)} mm with the nominal robot",
     )  # fmt: skip
 
@@ -259,7 +298,16 @@ def _describe_range(name: str, words: str):
 
 
 def measure_wire_method(seed: int, changes: Changes) -> Sample:
-    """Compute poses from exact and from noisy wire lengths."""
+    """Compute poses from exact and from noisy wire lengths.
+
+    Args:
+        seed: seed of poses and noise.
+        changes: `noise`: factor of the wires' noise.
+
+    Returns:
+        Largest pose error with exact lengths; with noisy lengths, the normalized squared pose error
+        and median position and orientation errors.
+    """
     settings = change_settings({"noise": 1.0}, changes)
     robot, wires, rng = load_hybrid("iwr"), shipped_wires(), np.random.default_rng(seed)
     joints, legs = random_poses(robot, 100, rng, wires)
@@ -286,7 +334,7 @@ def _judge_wires(samples: Sequence[Sample]) -> Judgement:
                     (-np.inf, MAX_ROUNDING), "rounding", unit="m or rad"),
          check_mean("squared pose error over that of the propagated covariance",
                     collect(samples, "squares"), (0.9, 1.1),
-                    "1; within it standard deviations are right to 5 %")),
+                    "1; 10 % of the square are 5 % of the standard deviation")),
     )  # fmt: skip
 
 
@@ -317,9 +365,10 @@ POSES = Experiment(
         ),
         Claim(
             "3-2-1 wires: pose by three spheres",
-            "Six wire lengths give the pose, with errors as the propagated covariance states.",
+            "Six wire lengths give the pose, with errors that agree with the propagated"
+            " covariance.",
             "section 5.1", "additional", _judge_wires, {"noise": 1.5},
-            "the wires' noise is 1.5 times the stated one",
+            "the wires' noise is 1.5 times the assumed one",
         ),
         caption_claim(
             "hexagon and end-effector points", "Table 10 (p. 69)",
@@ -360,7 +409,7 @@ REFINED = Experiment(
         ),
         Claim(
             "exact measurements return the 36 assumed errors",
-            "Without noise the 36 identified errors are the assumed ones.", "section 4.2.2",
+            "Without noise the 36 identified errors equal the assumed ones.", "section 4.2.2",
             "additional", _judge_exact, {"exact_noise": 0.01},
             "1 % of the sensor noise is added", panels=(),
         ),
@@ -368,7 +417,7 @@ REFINED = Experiment(
             "intervals of the 36 parameters",
             "95 % of the assumed errors are within the 95 % intervals of least squares.",
             "section 4.2.3", "additional", _judge_intervals, {"stated_noise": 0.5},
-            "half of the true noise is stated", panels=(),
+            "the covariance assumes half of the true noise", panels=(),
         ),
     ),
 )  # fmt: skip
@@ -428,9 +477,9 @@ WIRE_CALIBRATION = Experiment(
             "identified parameters of the hybrid robot", "Table 13 (p. 72)",
             '"Nominal and identified parameters of the hybrid IWR robot (unit: mm)"',
             lambda samples: f"RMS of the assumed errors {format_values(samples, 'assumed', 1e3, 2)}"
-            " mm or mrad; of identified less assumed"
+            " mm or mrad; of identified minus assumed"
             f" {format_values(samples, 'missed', 1e3, 2)}, since A_i and the last link are"
-            " identified in combinations only",
+            " identifiable only in combinations",
         ),
         caption_claim(
             "legs before and after calibration", "Table 14, Figs 25 and 26 (p. 73, 74)",
@@ -457,4 +506,4 @@ WIRE_CALIBRATION = Experiment(
 )  # fmt: skip
 
 EXPERIMENTS = (REFINED, POE, POSES, WIRE_CALIBRATION)
-"""In the order of the document."""
+"""Experiments in the order of the document."""

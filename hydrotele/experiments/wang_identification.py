@@ -1,4 +1,4 @@
-"""Wang 2012, chapter 4: redundancy and identification by differential evolution and MCMC."""
+"""Wang 2012, chapter 4: parameter redundancy, differential evolution (DE) and MCMC."""
 
 from collections.abc import Sequence
 
@@ -31,17 +31,19 @@ from hydrotele.kinematics.hybrid import Kind, document_parameters, error_model, 
 from hydrotele.simulate.hybrid import TILT
 
 MAX_RHAT = 1.1
-"""Largest split R-hat of chains that have mixed: Gelman et al., Bayesian Data Analysis, 11.4."""
+"""Largest split R-hat of converged chains: Gelman et al., Bayesian Data Analysis, 11.4."""
 
 MAX_EXCESS = 0.5
-"""Log likelihood that DE may miss: the optimum's is changed so by one standard deviation of one
-parameter."""
+"""Largest accepted excess of DE's negative log likelihood over the optimum.
+
+A change of one parameter by one standard deviation causes an excess of 0.5.
+"""
 
 SEARCH_BOX = 5.0
-"""Half the edge of the box that DE searches, in standard deviations of the manufacturing errors."""
+"""Half the width of DE's search region, in standard deviations of the manufacturing errors."""
 
 KEPT_DRAWS = 4000
-"""Draws of a posterior that a sample keeps for its figure."""
+"""Number of posterior samples kept for figures."""
 
 CAPTIONS = {
     12: (49, ("a4", "theta4", "a1x", "a2x"), "δa4, δθ4, δa1x, δa2x"),
@@ -51,9 +53,10 @@ CAPTIONS = {
     16: (51, ("theta4", "a1z", "a2z", "a3z"), "δθ4, δa1z, δa2z, δa3z"),
     17: (52, ("alpha4", "a1z", "a2z", "a3z"), "δα4, δa1z, δa2z, δa3z"),
 }
-"""Figure -> page, parameters of this model, parameters as the caption prints them.
+"""Figure -> (page, parameters of this model, parameters as printed in the caption).
 
-The available text does not define the dd of Fig. 14, which is drawn as d4."""
+The available text does not define the dd of Fig. 14; d4 is used instead.
+"""
 
 
 def _select_draws(posterior: Posterior) -> np.ndarray:
@@ -64,9 +67,17 @@ def _select_draws(posterior: Posterior) -> np.ndarray:
 def measure_redundancy(seed: int, changes: Changes) -> Sample:
     """Sample the posterior of the 54 parameters, and compare it with the null space by QR.
 
-    The prior is normal with the standard deviations of the manufacturing errors. Along the
-    parameter direction with singular value s of the scaled Jacobian, the posterior standard
-    deviation is 1 / sqrt(1 + s^2) of the prior's.
+    The prior is normal with the standard deviations of the manufacturing errors. Along a parameter
+    direction with singular value s of the scaled Jacobian, the posterior standard deviation is
+    1 / sqrt(1 + s^2) times that of the prior.
+
+    Args:
+        seed: seed of robot, noise and chains.
+        changes: `tilt_of_jacobian`: platform tilt of the poses analysed by QR [rad], None for the
+            measured poses; `steps`: length of the chains.
+
+    Returns:
+        Ratios of standard deviations, correlations, convergence and posterior samples.
     """
     settings = change_settings({"tilt_of_jacobian": None, "steps": 4000}, changes)
     simulated = simulate_robot(400 + seed, 25, document=False)
@@ -119,21 +130,21 @@ def _draw_posterior(names: tuple[str, ...]) -> Drawing:
 
 def _check_rhat(samples: Sequence[Sample]) -> Check:
     return check_mean("largest split R-hat of a parameter", collect(samples, "rhat"),
-                      (1.0, MAX_RHAT), "chains that have mixed, Gelman et al. 11.4")  # fmt: skip
+                      (1.0, MAX_RHAT), "converged chains, Gelman et al. 11.4")  # fmt: skip
 
 
 def _judge_redundancy(samples: Sequence[Sample]) -> Judgement:
     return Judgement(
         (check_mean("posterior over prior standard deviation along the redundant directions of QR",
                     collect(samples, "posterior over prior"), (0.9, 1.1),
-                    "1: the data say nothing; 10 % is the error of a sampled standard deviation"),
+                    "1: no information; 10 % is the error of a sampled standard deviation"),
          check_mean("posterior standard deviation over that from the singular values, RMS over the"
                     " other directions", collect(samples, "posterior over theory"), (0.9, 1.1),
                     "1: both methods agree; 10 % as before"),
          _check_rhat(samples)),
         note=f"{format_values(samples, 'redundant', digits=0)} redundant parameters by QR; along"
-        f" {format_values(samples, 'weak', digits=0)} directions the data determine less than the"
-        " prior of 1 mm and 1 mrad",
+        f" {format_values(samples, 'weak', digits=0)} directions the data are less informative than"
+        " the prior of 1 mm and 1 mrad",
     )  # fmt: skip
 
 
@@ -162,7 +173,16 @@ REFINED_NAMES = ("a4", "theta4", "b1x", "b6z")
 
 
 def measure_refined_posterior(seed: int, changes: Changes) -> Sample:
-    """Sample the posterior of the 36 parameters with sensor noise, and compare least squares."""
+    """Sample the posterior of the 36 parameters, and compare it with least squares.
+
+    Args:
+        seed: seed of robot, noise and chains.
+        changes: `chain_noise`: sensor noise assumed by the chains over the true one; `steps`:
+            length of the chains.
+
+    Returns:
+        Differences from least squares, coverage, convergence and posterior samples.
+    """
     settings = change_settings({"chain_noise": 1.0, "steps": 3000}, changes)
     simulated = simulate_robot(500 + seed, 25)
     names = document_parameters(simulated.model)
@@ -198,10 +218,10 @@ def _judge_refined_posterior(samples: Sequence[Sample]) -> Judgement:
     return Judgement(
         (check_mean("largest distance of a posterior mean from least squares, in standard"
                     " deviations", collect(samples, "shift"), (-np.inf, 0.2),
-                    "an interval that is shifted so loses half a percent of its 95 %"),
+                    "this shift reduces the coverage of a 95 % interval by half a percent"),
          check_mean("posterior over least-squares standard deviation, RMS of 36",
                     collect(samples, "ratio"), (0.95, 1.05),
-                    "1; a 95 % interval that is 5 % too short holds 94 %"),
+                    "1; a 95 % interval that is 5 % too short has a coverage of 94 %"),
          _check_rhat(samples)),
         note=f"{format_values(samples, 'inside', digits=1)} of 36 assumed errors are within the"
         " central 95 %",
@@ -209,7 +229,17 @@ def _judge_refined_posterior(samples: Sequence[Sample]) -> Judgement:
 
 
 def measure_rank(seed: int, changes: Changes) -> Sample:
-    """Count independent parameters, and calibrate a robot with errors in all 54 with 36 of them."""
+    """Count independent parameters, and calibrate 36 or all parameters of a robot.
+
+    All 54 parameters of the robot have errors.
+
+    Args:
+        seed: seed of robot and noise.
+        changes: `tilt`: largest tilt of the platform [rad].
+
+    Returns:
+        Ranks, singular values, and RMS position errors at test poses.
+    """
     settings = change_settings({"tilt": TILT}, changes)
     nominal, simulated = load_hybrid("iwr"), simulate_robot(600 + seed, 25, document=False)
     measured = measure_nominal_robot(60, seed, settings["tilt"])
@@ -245,14 +275,14 @@ def _judge_rank(samples: Sequence[Sample]) -> Judgement:
         (check_mean("independent parameters of the 54", collect(samples, "rank dh"), (36.0, 36.0),
                     "the refined model has as many, and must be minimal (p. 24)",
                     published=36.0),),
-        f"Four parameters are redundant: theta4, d4, a4 and alpha4 move the connecting platform as"
-        f" a common displacement of A1 to A6 does. Only without tilt of the platform A_i and B_i"
+        f"Four parameters are redundant: theta4, d4, a4 and alpha4 have the same effect as a"
+        f" common displacement of A1 to A6. Only without tilt of the platform A_i and B_i"
         f" cannot be distinguished; then the rank is {number('rank dh without tilt')} (D-H) or"
-        f" {number('rank poe without tilt')} (POE). 36 parameters do not describe a robot with"
+        f" {number('rank poe without tilt')} (POE). 36 parameters cannot describe a robot with"
         f" errors in all 54: RMS position error {format_values(samples, 'error with 36', 1e3, 2)}"
         f" mm at test poses, {format_values(samples, 'error with 54', 1e3, 3)} mm with all"
         " independent ones.",
-        f"{number('told')} are known better than half of 1 mm or 1 mrad with this noise; the 36"
+        f"{number('told')} are determined to better than 0.5 mm or 0.5 mrad with this noise; the 36"
         f" have rank {number('rank of 36')}",
     )  # fmt: skip
 
@@ -277,25 +307,25 @@ def _measure_evolution(seed: int, changes: Changes, kind: Kind, poses: int) -> S
 
 
 def measure_evolution_dh(seed: int, changes: Changes) -> Sample:
-    """Identify the 36 parameters of the D-H model by DE from 15 poses."""
+    """Identify the 36 parameters of the D-H model by differential evolution from 15 poses."""
     return _measure_evolution(100 + seed, changes, "dh", 15)
 
 
 def measure_evolution_poe(seed: int, changes: Changes) -> Sample:
-    """Identify 36 parameters of the POE model by DE from 25 poses."""
+    """Identify 36 parameters of the POE model by differential evolution from 25 poses."""
     return _measure_evolution(200 + seed, changes, "poe", 25)
 
 
 def _judge_evolution(samples: Sequence[Sample]) -> Judgement:
     effort = np.array([(s.values["evaluations"], s.values["least squares"]) for s in samples])
     return Judgement(
-        (check_mean("negative log likelihood found by DE above that of least squares",
+        (check_mean("excess of DE's negative log likelihood over that of least squares",
                     collect(samples, "excess"), (-np.inf, MAX_EXCESS),
                     "one standard deviation of one parameter"),
          check_statistic("evaluations of the model by DE over those by least squares", effort,
                          lambda rows: float(np.sum(rows[:, 0]) / np.sum(rows[:, 1])),
                          (1.0, np.inf), '"less computation time" of the linearization, p. 25')),
-        note=f"DE begins anywhere within {SEARCH_BOX:g} standard deviations of the errors and ends"
+        note=f"DE starts within {SEARCH_BOX:g} standard deviations of the errors and stops"
         f" after {format_values(samples, 'generations', digits=0)} generations",
     )  # fmt: skip
 
@@ -392,7 +422,7 @@ REFINED_POSTERIOR = Experiment(
     (
         Claim(
             "MCMC and least squares agree on 36 parameters",
-            "Posterior means and standard deviations of the 36 parameters with sensor noise are"
+            "Posterior means and standard deviations of the 36 parameters with sensor noise equal"
             " those of least squares.", "Table 5, section 3.4", "additional",
             _judge_refined_posterior, {"chain_noise": 2.0},
             "the chain assumes twice the sensor noise", panels=(),
@@ -425,4 +455,4 @@ EVOLUTION_POE = Experiment(
 )  # fmt: skip
 
 EXPERIMENTS = (EVOLUTION_DH, REDUNDANCY, RANK, REFINED_POSTERIOR, EVOLUTION_POE)
-"""In the order of the document."""
+"""Experiments in the order of the document."""

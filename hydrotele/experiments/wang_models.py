@@ -1,4 +1,4 @@
-"""Wang 2012, chapters 2 and 3: kinematics, numbers of parameters and error models."""
+"""Wang 2012, chapters 2 and 3: kinematics, counts of parameters, and error models."""
 
 from collections.abc import Sequence
 
@@ -50,11 +50,20 @@ from hydrotele.simulate.hybrid import (
     random_poses,
 )
 
-MAX_ROUNDING = 1e-9  # m and rad: far below any sensor, far above rounding
+MAX_ROUNDING = 1e-9  # [m] or [rad]: below the resolution of any sensor, above rounding errors
 
 
 def measure_kinematics(seed: int, changes: Changes) -> Sample:
-    """Compare the product of the D-H matrices with Eq. 7, and count the errors of the model."""
+    """Compare the product of the D-H matrices with Eq. 7, and count the parameter errors.
+
+    Args:
+        seed: seed of the poses.
+        changes: `third_twist`: twist of the third link [rad]; `second_joint`: kind of the second
+            joint.
+
+    Returns:
+        Largest difference [m], and counts of parameter errors.
+    """
     settings = change_settings({"third_twist": 0.5 * np.pi, "second_joint": "prismatic"}, changes)
     robot, rng = load_hybrid("iwr"), np.random.default_rng(seed)
     joints, _ = random_poses(robot, 200, rng)
@@ -80,7 +89,7 @@ def _judge_carriage(samples: Sequence[Sample]) -> Judgement:
     return Judgement(
         (check_exact("largest difference of a coordinate", samples[0].values["difference"],
                      (0.0, MAX_ROUNDING), "rounding", unit="m"),),
-        note="200 random poses; minus signs are lost in the available text, Table 1 decides them",
+        note="200 random poses; minus signs, missing in the available text, follow from Table 1",
     )  # fmt: skip
 
 
@@ -99,10 +108,10 @@ _BALL: JointKind = "spherical"
 
 
 def carriage_with_hexapod(straight: bool) -> Mechanism:
-    """Build the IWR: a measured P P R R carriage that six S-P-S legs share.
+    """Build the IWR: a measured PPRR carriage in series with a hexapod of six S-P-S legs.
 
     Args:
-        straight: whether the slides' axes pass through both spherical joints, as in Wang Eq. 27.
+        straight: whether the slide axes pass through both spherical joints, as in Wang Eq. 27.
     """
     carriage = serial_mechanism("", (_SLIDE, _SLIDE, *_TWO)).chains[0]
     legs = hexapod_mechanism("", (_BALL, _SLIDE, _BALL), (1, 2) if straight else ())
@@ -121,10 +130,10 @@ MECHANISMS = {
     "Delta robot": delta_mechanism(),
     "IWR with 6-SPS hexapod": carriage_with_hexapod(straight=False),
 }  # fmt: skip
-"""Mechanisms with loops and arbitrary dimensions, to which Eq. 5 is applied."""
+"""Mechanisms with loops and arbitrary dimensions, for which Eq. 5 is evaluated."""
 
 STRAIGHT_HEXAPOD = hexapod_mechanism("6-SPS", (_BALL, _SLIDE, _BALL), (1, 2))
-"""The hexapod of page 34: joints are points, and slides pass through both of them."""
+"""Hexapod of page 34, whose slide axes pass through the centres of both spherical joints."""
 
 _SERIAL: dict[str, tuple[JointKind, ...]] = {
     "carriage PPRR": (_SLIDE, _SLIDE, *_TWO), "SCARA RRPR": (*_TWO, _SLIDE, "revolute"),
@@ -133,7 +142,16 @@ _SERIAL: dict[str, tuple[JointKind, ...]] = {
 
 
 def measure_parameter_counts(seed: int, changes: Changes) -> Sample:
-    """Compare counts of parameters with ranks of identification Jacobians."""
+    """Compare parameter counts by Eqs 4 and 5 with ranks of identification Jacobians.
+
+    Args:
+        seed: seed of dimensions and poses.
+        changes: `locked_joints`: number of measured joints that never move; `poses`: number of
+            poses.
+
+    Returns:
+        Count and rank of every mechanism.
+    """
     settings = change_settings({"locked_joints": 0, "poses": 30}, changes)
 
     def rank(mechanism: Mechanism) -> int:
@@ -175,14 +193,23 @@ def _judge_hexapod(samples: Sequence[Sample]) -> Judgement:
         (check_exact("independent parameters", values["hexapod"], (42, 42),
                      "as many as the error model has: complete and minimal, page 23",
                      published=42),),
-        note=f"Eq. 5 counts {MECHANISMS['6-SPS hexapod'].count_parameters()}, one more per leg, by"
-        " which the slide's axis misses the joints; with that offset zero its derivative is zero."
-        f" The IWR with such legs has {values['robot']:.0f} independent parameters",
+        note=f"Eq. 5 counts {MECHANISMS['6-SPS hexapod'].count_parameters()}, with one additional"
+        " offset per leg between slide axis and joints; if this offset is zero, its derivative is"
+        f" zero. The IWR with such legs has {values['robot']:.0f} independent parameters",
     )  # fmt: skip
 
 
 def measure_first_order(seed: int, changes: Changes) -> Sample:
-    """Measure the second-order position error of the carriage's end."""
+    """Compute the second-order position error of the carriage's end.
+
+    Args:
+        seed: seed of errors and poses.
+        changes: `error_size`: factor of the manufacturing errors; `growth`: factor of errors and
+            of dimensions in the comparison.
+
+    Returns:
+        Largest position errors of the first-order model and of the nominal model [m].
+    """
     settings = change_settings({"error_size": 1.0, "growth": 2.0}, changes)
     nominal, rng = load_hybrid("iwr"), np.random.default_rng(seed)
     joints, _ = random_poses(nominal, 100, rng)
@@ -211,7 +238,7 @@ def _judge_first_order(samples: Sequence[Sample]) -> Judgement:
     return Judgement(
         (check_mean("largest position error of the first-order model, mean over robots",
                     np.array(omitted), (-np.inf, 1e3 * REQUIRED_ACCURACY),
-                    "the accuracy that is required, page 19", unit="mm"),),
+                    "the required accuracy, page 19", unit="mm"),),
         note=f"errors of 1 mm and 1 mrad move the carriage's end by"
         f" {format_values(samples, 'moved usual', 1e3)} mm",
     )  # fmt: skip
@@ -232,7 +259,15 @@ def _judge_growth(samples: Sequence[Sample]) -> Judgement:
 
 
 def measure_proportionality(seed: int, changes: Changes) -> Sample:
-    """Tilt the second of two axes by 0.1 to 10 mrad, and measure how much parameters change."""
+    """Compute the change of D-H and POE parameters if the second of two axes is tilted.
+
+    Args:
+        seed: seed of the geometry.
+        changes: `parallel`: whether the axes are parallel before the tilt, else perpendicular.
+
+    Returns:
+        Exponents of the change over tilts of 0.1 to 10 mrad.
+    """
     settings = change_settings({"parallel": True}, changes)
     rng = np.random.default_rng(seed)
     distance, direction = rng.uniform(0.2, 0.5), rng.uniform(0.0, 2.0 * np.pi)
@@ -264,7 +299,7 @@ def _judge_proportionality(samples: Sequence[Sample]) -> Judgement:
     exponents = {name: np.array([s.values[name] for s in samples]) for name in ("dh", "poe")}
     return Judgement(
         (check_mean("exponent of the change of d (D-H) with the tilt", exponents["dh"],
-                    (-np.inf, 0.0), "not proportional: it does not vanish with the tilt"),
+                    (-np.inf, 0.0), "not proportional: it does not decrease with the tilt"),
          check_mean("exponent of the change of the axis (POE) with the tilt", exponents["poe"],
                     (0.99, 1.01), "proportional: 1, up to the second order of 10 mrad")),
         note="two parallel hinges 0.2 to 0.5 m apart, tilts of 0.1 to 10 mrad; a tilt of 1 mrad"
@@ -273,7 +308,15 @@ def _judge_proportionality(samples: Sequence[Sample]) -> Judgement:
 
 
 def measure_forward_kinematics(seed: int, changes: Changes) -> Sample:
-    """Solve the forward kinematics at one pose by DE, Newton's method and the MuJoCo mechanism."""
+    """Solve the forward kinematics at one pose by DE, Newton's method and the MuJoCo mechanism.
+
+    Args:
+        seed: seed of pose and search.
+        changes: `reach`: half the width of DE's search region.
+
+    Returns:
+        Differences of DE, MuJoCo and inverse kinematics from Newton's method.
+    """
     settings = change_settings({"reach": 0.35}, changes)
     robot, rng = load_hybrid("iwr"), np.random.default_rng(seed)
     joints, legs = random_poses(robot, 1, rng)
@@ -329,7 +372,7 @@ PARAMETER_COUNTS = Experiment(
             "number of parameters of serial robots",
             '"for the serial robot, the minimum number of geometrical parameters is given by'
             ' Mooring et al." C = 4R + 2P + T', "Eq. 4 (p. 23)", "document",
-            _judge_counts(tuple(_SERIAL), "every link may err in all six directions; T = 6"),
+            _judge_counts(tuple(_SERIAL), "every link has errors in all six directions; T = 6"),
             {"locked_joints": 1}, "the first joint never moves",
         ),
         Claim(
@@ -338,10 +381,10 @@ PARAMETER_COUNTS = Experiment(
             ' calculated by using the formula proposed by Vischer" C = 3R + P + SS + E + 6L +'
             " 6(F-1)", "Eq. 5 (p. 24)", "document",
             _judge_counts(
-                tuple(MECHANISMS), "every link may err in all six directions and has arbitrary"
+                tuple(MECHANISMS), "every link has errors in all six directions and arbitrary"
                 " dimensions; F = 2; SS counts rigid links between spherical joints. For the Delta"
-                " robot Vischer and Clavel 1998, too, give 54; six legs with the 22 parameters of"
-                " page 34 have 132, and one of the two frames makes 138"),
+                " robot Vischer and Clavel 1998 also give 54; six legs with the 22 parameters of"
+                " page 34 have 132, and 6 parameters of one of the two frames give 138"),
             {"locked_joints": 1}, "one measured joint never moves",
         ),
         Claim(
@@ -362,7 +405,7 @@ FIRST_ORDER = Experiment(
             "first-order error model",
             '"the first-order model is sufficiently accurate for most applications"',
             "Eqs 12 to 26 (p. 31 to 33)", "document", _judge_first_order, {"error_size": 10.0},
-            "errors of manufacture of 10 mm and 10 mrad",
+            "manufacturing errors of 10 mm and 10 mrad",
         ),
         Claim(
             "second-order errors grow with size and errors",
@@ -395,7 +438,7 @@ FORWARD_KINEMATICS = Experiment(
             '"the DE algorithm was employed in Publications 1, 5 and 7 to identify parameter errors'
             ' and to find numerical solutions for the robot forward kinematics"',
             "section 2.2 (p. 26), Eqs 8 and 11", "document", _judge_forward_kinematics,
-            {"reach": 0.005}, "DE searches within 5 mm of the home pose only",
+            {"reach": 0.005}, "DE searches only within 5 mm of the home pose",
         ),
     ),
     max_repetitions=10,
@@ -404,4 +447,4 @@ FORWARD_KINEMATICS = Experiment(
 EXPERIMENTS = (
     KINEMATICS, PARAMETER_COUNTS, FIRST_ORDER, PROPORTIONALITY, FORWARD_KINEMATICS
 )  # fmt: skip
-"""In the order of the document."""
+"""Experiments in the order of the document."""

@@ -1,7 +1,7 @@
-"""Simulated robots with manufacturing errors, measured by wires, for the experiments of Wang 2012.
+"""Simulated robots with manufacturing errors, measured with wires, for Wang 2012.
 
-Dimensions, noise and errors of manufacture are assumptions (models/iwr/README.md): the part of the
-thesis that is available gives none.
+Dimensions, noise and manufacturing errors are assumptions (models/iwr/README.md), because the
+available part of the thesis gives none.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -43,10 +43,10 @@ from hydrotele.simulate.hybrid import (
 )
 
 SENSOR_NOISE = {"leg": 1e-5, "slide": 1e-5, "turn": 2e-5, "wire": 2e-5}
-"""Standard deviations [m] or [rad]."""
+"""Standard deviations of the sensor noise [m] or [rad]."""
 
 REQUIRED_ACCURACY = 1e-4
-"""m: `high accuracy (±0.1 mm) for the assembly robot`, page 19."""
+"""Required position accuracy [m]: `high accuracy (±0.1 mm) for the assembly robot`, page 19."""
 
 _SEED = 2012
 
@@ -55,12 +55,11 @@ class SimulatedRobot(NamedTuple):
     """A robot with manufacturing errors, and its measurement.
 
     Attributes:
-        model: error model of the errors.
-        errors: (p,) true errors [model.units].
-        robot: with the errors.
-        measurement: poses to calibrate from.
-        test_commands: carriage positions (M, n) and leg readings (M, 6) of poses that are not used
-            in the calibration.
+        model: model of the parameter errors.
+        errors: (p,) true parameter errors [model.units].
+        robot: robot with these errors.
+        measurement: measured poses for the calibration.
+        test_commands: carriage positions (M, n) and leg readings (M, 6) of held-out poses.
     """
 
     model: ErrorModel
@@ -76,14 +75,14 @@ def simulate_robot(
     """Simulate a robot with errors of 1 mm and 1 mrad (standard deviations) and measure it.
 
     Args:
-        seed: of errors, poses and noise.
-        poses: number of poses to calibrate from.
-        kind: error model of the errors.
+        seed: seed of errors, poses and noise.
+        poses: number of poses for the calibration.
+        kind: kind of the error model.
         document: whether only the 36 parameters of the document's refined model have errors.
-        noise: factor on `SENSOR_NOISE`; 0 measures exactly.
+        noise: factor of `SENSOR_NOISE`; 0 for exact measurements.
 
     Returns:
-        The robot with 25 further poses to test it.
+        The robot, its measurement and 25 held-out poses.
     """
     rng, wires, nominal = np.random.default_rng([_SEED, seed]), shipped_wires(), load_hybrid("iwr")
     model = error_model(nominal, kind)
@@ -100,12 +99,15 @@ def simulate_robot(
 
 
 def measure_nominal_robot(poses: int, seed: int, tilt: float = TILT) -> Measurement:
-    """Measure the robot without errors exactly.
+    """Measure the nominal robot without sensor noise.
 
     Args:
         poses: number of poses.
-        seed: of the poses.
-        tilt: largest tilt of the platform against the connecting platform [rad].
+        seed: seed of the poses.
+        tilt: largest tilt of the platform relative to the connecting platform [rad].
+
+    Returns:
+        The measurement.
     """
     robot, wires = load_hybrid("iwr"), shipped_wires()
     joints, legs = random_poses(robot, poses, np.random.default_rng([_SEED, seed]), tilt=tilt)
@@ -116,7 +118,11 @@ def measure_nominal_robot(poses: int, seed: int, tilt: float = TILT) -> Measurem
 def pose_errors_at_test_poses(
     simulated: SimulatedRobot, robot: Hybrid
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Errors of a robot's forward kinematics at the test poses: (M,) [m] and (M,) [rad]."""
+    """Return the errors of a model's forward kinematics at the test poses.
+
+    Returns:
+        ((M,) position errors [m], (M,) orientation errors [rad]).
+    """
     difference = pose_difference(
         forward(robot, *simulated.test_commands), forward(simulated.robot, *simulated.test_commands)
     )
@@ -124,7 +130,11 @@ def pose_errors_at_test_poses(
 
 
 def count_covered_errors(seed: int) -> tuple[int, int]:
-    """Count true errors within the 95 % intervals of least squares: (inside, parameters)."""
+    """Count the true errors within the 95 % intervals of least squares.
+
+    Returns:
+        (number inside, number of parameters).
+    """
     simulated = simulate_robot(1000 + seed, 25)
     names = document_parameters(simulated.model)
     fit = calibrate(load_hybrid("iwr"), simulated.measurement, "dh", names).fit
@@ -133,15 +143,15 @@ def count_covered_errors(seed: int) -> tuple[int, int]:
 
 
 def root_mean_square(values: np.ndarray) -> float:
-    """RMS of an array."""
+    """Return the root mean square of an array."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 
 def change_settings(defaults: Mapping[str, Any], changes: Changes) -> dict[str, Any]:
-    """Settings of an experiment with some of them changed.
+    """Return the default settings of an experiment with changes applied.
 
     Raises:
-        InputError: no setting of a name.
+        InputError: a changed key is not a setting.
     """
     for name in changes:
         if name not in defaults:
@@ -154,12 +164,12 @@ Drawing = Callable[[Sequence[Sample]], tuple[tuple[Panel, ...], Marginals | None
 
 @dataclass(frozen=True)
 class DrawnClaim(Claim):
-    """A claim whose row draws what `draw` selects from all samples."""
+    """A claim whose curves are computed by `draw` from all samples."""
 
     draw: Drawing | None = None
 
     def compare(self, samples: Sequence[Sample]) -> Comparison:
-        """Judge the claim and draw its curves."""
+        """Evaluate the claim and draw its curves."""
         row = super().compare(samples)
         panels, marginals = self.draw(samples) if self.draw else ((), None)
         return row._replace(panels=panels, marginals=marginals)
@@ -169,14 +179,14 @@ def caption_claim(
     name: str, item: str, quote: str, note: Callable[[Sequence[Sample]], str],
     draw: Drawing | None = None,
 ) -> Claim:  # fmt: skip
-    """Build a claim about a table or figure of which only the caption is available.
+    """Return a claim for a table or figure of which only the caption is available.
 
     Args:
-        name: of the claim.
+        name: name of the claim.
         item: table or figure with its page.
-        quote: the caption, within quotation marks.
-        note: samples -> the simulated values in words.
-        draw: samples -> curves and posterior.
+        quote: caption, in quotation marks.
+        note: samples -> text with the simulated values.
+        draw: samples -> (curves, posterior).
     """
     return DrawnClaim(
         name, item=item, quote=quote, kind="caption", draw=draw,

@@ -1,8 +1,8 @@
 """Zhu 1994: force-reflecting resolved motion control of an excavator and a feller-buncher.
 
-Chapters 2 to 5 are computed from the models, the machine experiments of chapter 6 are repeated with
-simulated operators of the published population, one per repetition. The thesis had one person for
-each figure, who is not known.
+Chapters 2 to 5 are computed from the models. The machine experiments of chapter 6 are repeated with
+one simulated operator of the published population per repetition. In the thesis, each figure shows
+one operator, whose parameters are unknown.
 """
 
 from hydrotele.experiments import (
@@ -31,7 +31,7 @@ EXPERIMENTS: tuple[Experiment, ...] = (
     *zhu_false_force.FALSE_FORCE,
     *zhu_forces.LARGE_DIRECT,
 )
-"""In the order of the document."""
+"""Experiments in the order of the document."""
 
 SERIES = Series(
     "zhu1994",

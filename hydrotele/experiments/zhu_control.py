@@ -1,4 +1,4 @@
-"""Zhu 1994, chapters 1 to 5: all rows, and the figures that show no result."""
+"""Collect the experiments of Zhu 1994, chapters 1 to 5, and the figures without a result."""
 
 from hydrotele.experiments import zhu_kinematics, zhu_stiffness, zhu_transparency, zhu_two_port
 from hydrotele.experiments.comparison import Experiment

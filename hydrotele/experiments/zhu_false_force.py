@@ -1,8 +1,8 @@
-"""Zhu 1994, 6.3.3: force that a model estimates from the pressures of a machine in free motion.
+"""Zhu 1994, 6.3.3: false endpoint force that a model estimates from pressures in free motion.
 
-Both models are identified from logs of the feller-buncher's sensors: the static one by least
-squares from slow moves, as in the thesis (6.1.3), the dynamic one from excited motion. The
-identification starts from a machine whose masses and friction are wrong.
+Both models are identified from logs of the feller-buncher's sensors. The static model is identified
+by least squares from slow moves, as in the thesis (6.1.3); the dynamic model is identified from an
+excitation motion. The identification starts from a machine with wrong masses and friction.
 """
 
 import tempfile
@@ -28,15 +28,15 @@ from hydrotele.logs.log import save_log
 from hydrotele.machine.machine import Machine
 from hydrotele.simulate.closure import closed_chain
 
-_INITIAL_ERROR = 1.3  # times the masses and dry friction that the identification starts from
-_MIN_RATIO = 3.0  # times the force at rest
-_MAX_SHARE = 0.2  # of the static model's false force
+_INITIAL_ERROR = 1.3  # factor of masses and dry friction at the start of the identification
+_MIN_RATIO = 3.0  # false force in motion over that at rest
+_MAX_SHARE = 0.2  # false force of the dynamic over that of the static model
 _SENSORS = "zhu1994"
-_SEEDS = (11, 12)  # of the logs for the fit and for the validation
+_SEEDS = (11, 12)  # seeds of the logs for the fit and for the validation
 
 
 def _falsify_machine(machine: Machine) -> Machine:
-    """Return the machine with wrong masses and dry friction."""
+    """Return the machine with masses and dry friction multiplied by `_INITIAL_ERROR`."""
     for name, link in machine.links.items():
         machine = changed(machine, f"links.{name}.mass", _INITIAL_ERROR * link.mass)
     for name, axis in machine.axes.items():
@@ -51,10 +51,10 @@ def identify_models(offset: int) -> tuple[Machine, Gravity]:
     """Identify the feller-buncher and its static model from logs of simulated sensors.
 
     Args:
-        offset: added to the seeds of the logs.
+        offset: number added to the seeds of the logs.
 
     Returns:
-        (machine for the dynamic estimate, parameters of the static one).
+        (machine of the dynamic estimate, parameters of the static estimate).
     """
     _, slow = run_shipped("feller_slow_moves", {"seed": str(10 + offset)})
     start = _falsify_machine(slow.plant.machine)
@@ -74,7 +74,17 @@ def identify_models(offset: int) -> tuple[Machine, Gravity]:
 
 
 def measure_false_force(seed: int, changes: Changes) -> Sample:
-    """Estimate forces by both models in free motion, in joint and joystick steps, and at rest."""
+    """Estimate the endpoint force in free motion with the static and the dynamic model.
+
+    The machine is at rest and then follows joint steps or joystick steps.
+
+    Args:
+        seed: seed of operator and sensor noise.
+        changes: scenario keys.
+
+    Returns:
+        RMS false forces of both models [N] and their ratios.
+    """
     machine, gravity = identify_models(0)
     values, panels = {}, []
     squares = {"static": 0.0, "dynamic": 0.0}
@@ -82,7 +92,7 @@ def measure_false_force(seed: int, changes: Changes) -> Sample:
     for name, moving in (("feller_joint_steps", 1.0), ("feller_steps", 1.0)):
         if name == "feller_joint_steps":
             keys = {"seed": str(seed)} | dict(changes)
-        else:  # another pilot, so that changes of the first one's do not apply
+        else:  # this scenario has another pilot, to which changes of the first do not apply
             keys = operator_changes(seed)
             keys |= {k: v for k, v in changes.items() if not k.startswith("pilot")}
         _, run = run_shipped(name, keys)
@@ -101,7 +111,7 @@ def measure_false_force(seed: int, changes: Changes) -> Sample:
                 waiting = (time > 0.5) & (time < moving)
                 at_rest = float(np.sqrt(np.mean(size[waiting] ** 2)))
             curves[kind] = force["z"] / 1e3
-        panels.append(Panel(f"estimated vertical force in the air, {name} [kN]", time, curves))
+        panels.append(Panel(f"estimated vertical force in free motion, {name} [kN]", time, curves))
     values |= {key: float(np.sqrt(square)) for key, square in squares.items()}
     values |= {
         "at_rest": at_rest, "share": values["dynamic"] / values["static"],
@@ -114,7 +124,7 @@ def _judge_static(samples: Sequence[Sample]) -> Judgement:
     check = check_mean(
         "false force of the static model in joint steps over that at rest",
         collect(samples, "ratio"), (_MIN_RATIO, np.inf),
-        "big: three times the error that remains at rest",
+        "big: three times the error at rest",
     )  # fmt: skip
     note = (
         f"{format_values(samples, 'static_feller_joint_steps', 1e-3, 2)} kN RMS during the steps,"
@@ -159,13 +169,13 @@ FALSE_FORCE = (
         ),
         Claim(
             "feller-buncher: false force of the dynamic model",
-            "a dynamic model that was identified from logs leaves less than a fifth of the static"
-            " model's false force",
+            "the false force of a dynamic model identified from logs is less than a fifth of that"
+            " of the static model",
             "additional to p. 107",
             "additional",
             _judge_dynamic,
             {"effects": "[{name: payload, parameters: {mass: 300.0}}]"},
-            "a machine that carries 300 kg which its logs had not",
+            "the machine carries an additional load of 300 kg",
         ),
     ), 6),
 )  # fmt: skip

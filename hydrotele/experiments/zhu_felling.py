@@ -1,4 +1,4 @@
-"""Zhu 1994, 6.3 and 6.3.2: a tree felled with the feller-buncher, and a machine that could tip."""
+"""Zhu 1994, 6.3 and 6.3.2: tree felling with the feller-buncher, and tip-over protection."""
 
 from collections.abc import Sequence
 
@@ -22,21 +22,28 @@ from hydrotele.scenario.teleoperation import TeleopPilot, TipOver
 from hydrotele.teleop.master import tipping_share
 
 JUST_NOTICEABLE = 0.23
-"""Just noticeable difference of a compliance without other cues, as a fraction (Tan 1995)."""
-_CONTACT = 500.0  # N of the head on the stem
-_STANDS_OUT = 3.0  # times the force that is estimated in the air
-_MAX_RISE = 1.0  # s: a ninth of the time axis of Fig. 6.55
-_NEVER = np.inf  # s
-_MAX_LAID = -50.0  # deg of the head: a stem that lies more than it stands
-_MIN_SWING = 30.0  # deg to the side
+"""Just noticeable relative difference of a compliance without other cues (Tan 1995)."""
+_CONTACT = 500.0  # force of the head on the stem that counts as contact [N]
+_STANDS_OUT = 3.0  # detectable force over the force estimated without contact
+_MAX_RISE = 1.0  # s; a ninth of the time axis of Fig. 6.55
+_NEVER = np.inf  # time of an event that does not occur [s]
+_MAX_LAID = -50.0  # attitude of the head at which the stem lies rather than stands [deg]
+_MIN_SWING = 30.0  # swing angle to the side [deg]
 _EVENTS = {"cut": "is cut", "held": "holds", "let_go": "lets"}
 
 
 def measure_felling(seed: int, changes: Changes) -> Sample:
-    """Touch a tree, saw, grab and lay it down; record force and felt stiffness meanwhile.
+    """Simulate contact with a tree, sawing, grabbing and laying down.
 
-    `touched` is the first contact of the head with the stem of 0.5 kN or more; that with the stump
-    does not count. The saw starts by the scenario's first button of the saw.
+    `touched` is the time of the first contact of 0.5 kN or more between head and stem; contact with
+    the stump does not count. The scenario's first saw button starts the saw.
+
+    Args:
+        seed: seed of operator and sensor noise.
+        changes: scenario keys.
+
+    Returns:
+        Event times, contact forces, joystick stiffness and final pose of the stem.
     """
     scenario, run = run_shipped("fell_tree", operator_changes(seed) | dict(changes))
     pose, time, m = cylindrical_pose(run), run.truth.time, run.measured
@@ -84,22 +91,22 @@ def measure_felling(seed: int, changes: Changes) -> Sample:
 
 
 def _contact_size(run: Run, thing: str) -> np.ndarray:
-    """Size of the force between the machine and a thing around it, (n,) [N]."""
+    """Return the contact force magnitude (n,) between the machine and an object [N]."""
     parts = [true_channel(run, f"truth.object_contact.{thing}_{c}") for c in "xyz"]
     return np.linalg.norm(parts, axis=0)
 
 
 def _percentile(values: np.ndarray) -> float:
-    """98th percentile, which a single noisy sample does not set."""
+    """Return the 98th percentile, a maximum that is robust against single noisy samples."""
     return float(np.percentile(values, 98)) if values.size else np.nan
 
 
 def _judge_contact(samples: Sequence[Sample]) -> Judgement:
     checks = (
-        check_fraction("operators whose head presses on the stem by 0.5 kN or more before the saw"
+        check_fraction("operators whose head presses on the stem with 0.5 kN or more before the saw"
                        " starts", collect(samples, "touched") < collect(samples, "saw")),
-        check_fraction(f"operators whose estimated force reaches {_STANDS_OUT:g} times that in the"
-                       f" air within {_MAX_RISE:g} s of the contact",
+        check_fraction(f"operators whose estimated force reaches {_STANDS_OUT:g} times that without"
+                       f" contact within {_MAX_RISE:g} s after contact",
                        collect(samples, "rise") <= _MAX_RISE),
     )  # fmt: skip
     note = (
@@ -107,11 +114,11 @@ def _judge_contact(samples: Sequence[Sample]) -> Judgement:
         f" {format_values(samples, 'stem', 1e-3)} kN on the stem, the estimated force rises within"
         f" {format_values(samples, 'rise', 1.0, 2)} s; estimated"
         f" {format_values(samples, 'contact_force', 1e-3)} kN in contact,"
-        f" {format_values(samples, 'free_force', 1e-3)} kN in the air (98th percentiles)"
+        f" {format_values(samples, 'free_force', 1e-3)} kN without contact (98th percentiles)"
     )
     explanation = (
-        "the disc touches the stem at rest, then the operator eases off and starts the saw: pressed"
-        " on the stem a disc does not start"
+        "the resting disc touches the stem, then the operator retracts it and starts the saw,"
+        " because a disc that presses on the stem does not start"
     )
     return Judgement(checks, explanation, note)
 
@@ -122,8 +129,9 @@ def _judge_felt(samples: Sequence[Sample]) -> Judgement:
         " saw starts", collect(samples, "stiffness_change") > JUST_NOTICEABLE,
     )  # fmt: skip
     note = (
-        f"stiffness along x from {format_values(samples, 'stiffness_free', 1e-3)} N/mm in the air"
-        f" to {format_values(samples, 'stiffness_contact', 1e-3)} N/mm in contact; centring force"
+        f"stiffness along x from {format_values(samples, 'stiffness_free', 1e-3)} N/mm without"
+        f" contact to {format_values(samples, 'stiffness_contact', 1e-3)} N/mm in contact; centring"
+        " force"
         f" up to {format_values(samples, 'centring')} N"
     )
     explanation = (
@@ -156,30 +164,37 @@ def _judge_process(samples: Sequence[Sample]) -> Judgement:
         f" {format_values(samples, 'stump', 1e-3)} kN"
     )
     explanation = (
-        f"lies: the head beyond {_MAX_LAID:.0f} deg, where a stem lies more than it stands; to the"
+        f"lies: the attitude of the head is below {_MAX_LAID:.0f} deg; to the"
         f" side: more than {_MIN_SWING:.0f} deg of swing"
     )
     return Judgement(checks, explanation, note)
 
 
 _FELLER = TipOver(mass=25.0e3, edge=1.6)
-"""25 t is from the feller-buncher's data sheet; half the gauge of its tracks is assumed."""
+"""The mass of 25 t is from the feller-buncher's data sheet; half the track gauge is assumed."""
 _DEADBAND = 1.5e-3  # m, Table 6.9
 _SOIL = "[{kind: plate, position: [6.8, 0.0, 0.3], size: [1.0, 1.0], stiffness: 3.0e+5, damping: 3.0e+4}]"  # noqa: E501
 
 
 def _tipping_share(run: Run, facts: TipOver) -> np.ndarray:
-    """Fraction of the tipping moment that the contact force makes, (n,)."""
+    """Return the moment of the contact force as a fraction of the tipping moment, (n,)."""
     pose, force = cylindrical_pose(run), true_channel(run, "truth.contact_force.z")
     pairs = zip(pose["r"], force, strict=True)
     return np.array([tipping_share(facts, r, f) for r, f in pairs])
 
 
 def measure_pushing(seed: int, changes: Changes) -> Sample:
-    """Push the feller-buncher's head down with a constant force, with and without reflection.
+    """Push the feller-buncher's head down with constant hand force, with and without reflection.
 
-    The hand keeps the force that moved the handle to 3.5 mm. Further conditions: softer ground, and
-    a hand that keeps its place instead.
+    The hand keeps the force that displaces the handle by 3.5 mm. Further conditions are softer
+    ground and a stiff hand that keeps its position instead of its force.
+
+    Args:
+        seed: seed of operator and sensor noise.
+        changes: scenario keys.
+
+    Returns:
+        Largest fraction of the tipping moment and handle displacements [m] per condition.
     """
     cases = {
         "with": {"pilot.reflection": "stiffness"},
@@ -213,9 +228,9 @@ def _judge_pushed_back(samples: Sequence[Sample]) -> Judgement:
     check = check_fraction("operators whose handle is in the dead band with reflection and outside"
                            " without", pushed_back)  # fmt: skip
     note = (
-        f"a hand that keeps its force is pushed from {format_values(samples, 'with_before', 1e3)}"
+        f"a hand with constant force is pushed from {format_values(samples, 'with_before', 1e3)}"
         f" to {format_values(samples, 'with_handle', 1e3)} mm; without reflection it stays at"
-        f" {format_values(samples, 'without_handle', 1e3)} mm; a hand that keeps its place is not"
+        f" {format_values(samples, 'without_handle', 1e3)} mm; a stiff hand is not"
         f" pushed back ({format_values(samples, 'stiff_hand_handle', 1e3)} mm)"
     )
     return Judgement((check,), "dead band of 1.5 mm, Table 6.9", note)
@@ -233,14 +248,22 @@ def _judge_avoided(samples: Sequence[Sample]) -> Judgement:
         )
     )  # fmt: skip
     explanation = (
-        "the handle returns to its dead band, but the estimated force is late by 0.3 s and the"
-        " stiffness saturates at the 30 kN of Table 6.10: on hard rock the head is driven on"
+        "the handle returns to its dead band, but the force estimate has a delay of 0.3 s and the"
+        " stiffness saturates at the 30 kN of Table 6.10: on hard rock the head continues to move"
     )
     return Judgement(checks, explanation)
 
 
 def measure_protection(seed: int, changes: Changes) -> Sample:
-    """Press with an operator who aims at 60 kN, enough to tip the machine, with a spring or not."""
+    """Press with a target force of 60 kN, which tips the machine, with and without added spring.
+
+    Args:
+        seed: seed of operator and sensor noise.
+        changes: scenario keys.
+
+    Returns:
+        Largest fraction of the tipping moment and handle displacement [m] per condition.
+    """
     values, panels = {}, []
     too_large = {"pilot.operator.target.force": "[6.0e+4]"}
     for name, keys in (("spring", {}), ("bare", {"pilot.tip_over": "null"})):
@@ -263,7 +286,7 @@ def measure_protection(seed: int, changes: Changes) -> Sample:
 def _judge_protection(samples: Sequence[Sample]) -> Judgement:
     kept, bare = collect(samples, "spring_share"), collect(samples, "bare_share")
     check = check_fraction(
-        "operators who tip the machine without the spring and not with it",
+        "operators who tip the machine without the spring but not with it",
         (kept < 1.0) & (bare > 1.0), reason="a statement on most operators",
     )  # fmt: skip
     note = (
@@ -276,7 +299,7 @@ def _judge_protection(samples: Sequence[Sample]) -> Judgement:
 
 
 TIP_OVER = (
-    Experiment("hand that goes on pushing", measure_pushing, (
+    Experiment("constant hand force", measure_pushing, (
         Claim(
             "tip-over: the stick pushed back",
             '"the most effective way is via force reflection which automatically pushes the'
@@ -301,8 +324,8 @@ TIP_OVER = (
     Experiment("added spring", measure_protection, (
         Claim(
             "tip-over: an added spring",
-            "a further spring of 8 kN/m beyond half of the tipping moment keeps an operator who"
-            " aims at too large a force from tipping the machine",
+            "an additional spring of 8 kN/m beyond half of the tipping moment prevents an operator"
+            " whose target force is too large from tipping the machine",
             "additional to p. 99",
             "additional",
             _judge_protection,
@@ -321,7 +344,7 @@ FELLING = (
             "document",
             _judge_contact,
             {"pilot.buttons": "[{at: 0.0, axis: saw, command: 1.0}]"},
-            "the saw turns from the start, so that the head meets no standing stem",
+            "the saw runs from the start and cuts the stem before contact",
         ),
         Claim(
             "a tree felled: felt stiffness",

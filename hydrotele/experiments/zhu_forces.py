@@ -1,7 +1,7 @@
-"""Zhu 1994, chapter 6, in contact: a force applied by feel, direct feedback, a force tracked.
+"""Zhu 1994, chapter 6, in contact: stiffness feedback, direct force feedback, and force tracking.
 
-Contact forces are judged as the thesis measured them, estimated from pressures by the static model
-(6.6); the true ones are noted.
+Contact forces are evaluated as in the thesis, that is, as estimates of the static model (6.6) from
+pressures. True forces are given in the notes.
 """
 
 import tempfile
@@ -29,19 +29,22 @@ from hydrotele.scenario.scenario import Scenario
 from hydrotele.scenario.teleoperation import Regulate, TeleopPilot, Track
 
 _UNFILTERED = {"pilot.force": "static", "pilot.bandwidth_hz": "5.0"}
-"""The thesis takes the force from pressures by (6.6) and names no filter: the least one here."""
-_HELD = 6.0  # s before the end of a target in which it should be held
-_MAX_RIPPLE = 0.15  # of its mean, of a held force
-_MIN_UNSTABLE_RIPPLE = 0.5  # of its mean, of an unstable one
-_MAX_DEVIATION = 0.15  # of the hand's force
+"""The thesis computes the force from pressures by (6.6) and mentions no filter.
+
+5 Hz is the highest filter bandwidth available here.
+"""
+_HELD = 6.0  # last seconds of a target, in which the force is averaged [s]
+_MAX_RIPPLE = 0.15  # standard deviation over mean of a stable force
+_MIN_UNSTABLE_RIPPLE = 0.5  # standard deviation over mean of an unstable force
+_MAX_DEVIATION = 0.15  # relative to the hand force
 _DEADBAND = 1.5e-3  # m, Table 6.7
-_TASK = 25.0e3  # N, of direct feedback; read off the axis of Fig. 6.50
-_PUBLISHED = 4.5  # N, of the hand, p. 96
+_TASK = 25.0e3  # target force of direct feedback [N]; read from the axis of Fig. 6.50
+_PUBLISHED = 4.5  # hand force [N], p. 96
 _RATIO = _PUBLISHED / _TASK
 
 
 def find_task(scenario: Scenario) -> Regulate | Track:
-    """Return the operator's task, with its target."""
+    """Return the task of the scenario's operator, which contains the target force."""
     assert isinstance(scenario.pilot, TeleopPilot)
     behaviour = scenario.pilot.operator
     assert isinstance(behaviour, Regulate | Track)
@@ -62,12 +65,20 @@ def _draw_panels(scenario: Scenario, run: Run, title: str = "") -> tuple[Panel, 
 
 
 def _line_error(x: np.ndarray, force: np.ndarray, slope: np.ndarray | float) -> float:
-    """RMS distance of a force from a line through the centre, as a fraction of its own RMS."""
+    """Return the RMS deviation of a force from slope times displacement, relative to its RMS."""
     return float(np.sqrt(np.mean((force - slope * x) ** 2) / np.mean(force**2)))
 
 
 def measure_by_feel(seed: int, changes: Changes) -> Sample:
-    """Hold 20 kN, then 35 kN, by the joystick's stiffness alone."""
+    """Hold 20 kN and then 35 kN with the joystick's stiffness as the only force feedback.
+
+    Args:
+        seed: seed of operator and sensor noise.
+        changes: scenario keys.
+
+    Returns:
+        Held forces [N], relative errors, and deviations of the hand force from proportionality.
+    """
     keys = operator_changes(seed) | _UNFILTERED | dict(changes)
     scenario, run = run_shipped("press_stiffness", keys)
     m, values = run.measured, {}
@@ -93,7 +104,16 @@ def measure_by_feel(seed: int, changes: Changes) -> Sample:
 
 
 def measure_direct(ratio: float, seed: int, changes: Changes) -> Sample:
-    """Hold 25 kN with the force reflected to the hand in a given ratio [N/N]."""
+    """Hold 25 kN with direct force feedback.
+
+    Args:
+        ratio: hand force over contact force [N/N].
+        seed: seed of operator and sensor noise.
+        changes: scenario keys.
+
+    Returns:
+        Mean forces [N], ripple, and handle displacements [m] in the last 40 % of the run.
+    """
     keys = {
         "pilot.ratio": str(ratio), "pilot.operator.target.force": f"[{_TASK}]"
     } | operator_changes(seed) | _UNFILTERED | dict(changes)  # fmt: skip
@@ -116,8 +136,8 @@ def measure_direct(ratio: float, seed: int, changes: Changes) -> Sample:
 
 def _describe_held(samples: Sequence[Sample]) -> str:
     return (
-        f"{format_values(samples, 'held_20', 1e-3)} kN for 20,"
-        f" {format_values(samples, 'held_35', 1e-3)} kN for 35; error"
+        f"{format_values(samples, 'held_20', 1e-3)} kN for a target of 20 kN,"
+        f" {format_values(samples, 'held_35', 1e-3)} kN for 35 kN; error"
         f" {format_values(samples, 'error', 100.0, 0)} %, of the true force"
         f" {format_values(samples, 'true_error', 100.0, 0)} %"
     )
@@ -130,10 +150,10 @@ def _judge_by_feel(samples: Sequence[Sample]) -> Judgement:
     )
     explanation = (
         f"reasonably good: {100 * JUST_NOTICEABLE:.0f} %, the just noticeable difference of a"
-        " compliance (Tan 1995). A stiffness and a K_nom felt wrongly by that fraction are a force"
-        " wrong by 33 % at 20 kN and 29 % at 35 kN (4.1, Tables 6.7 and 6.8); the operator of the"
-        " thesis learnt the feel with the force on a screen, the simulated one knows K_nom and K_r"
-        " only"
+        " compliance (Tan 1995). Perception errors of that fraction in the stiffness and K_nom"
+        " cause force errors of 33 % at 20 kN and 29 % at 35 kN (4.1, Tables 6.7 and 6.8); the"
+        " operator of the thesis practised with the force on a screen, the simulated one only knows"
+        " K_nom and K_r"
     )
     return Judgement((check,), explanation, _describe_held(samples))
 
@@ -143,14 +163,14 @@ def _judge_targets(samples: Sequence[Sample]) -> Judgement:
         "operators within 10 % of both targets", collect(samples, "error") < 0.1,
         reason="a statement on most operators",
     )  # fmt: skip
-    return Judgement((check,), "see the force applied by feel", _describe_held(samples))
+    return Judgement((check,), "see the row on the force applied by feel", _describe_held(samples))
 
 
 def _judge_proportional(samples: Sequence[Sample]) -> Judgement:
     check = check_mean(
-        "RMS distance of the hand's force from the present stiffness times the displacement",
+        "RMS deviation of the hand's force from the current stiffness times the displacement",
         collect(samples, "line"), (0.0, _MAX_DEVIATION),
-        "proportional: damper and mass of the moving handle add to the force",
+        "proportional, except for damping and inertia of the moving handle",
     )  # fmt: skip
     note = f"from a line of fixed slope {format_values(samples, 'fixed_line', 100.0, 0)} %"
     return Judgement((check,), "the slope follows the contact force (4.1)", note)
@@ -159,12 +179,12 @@ def _judge_proportional(samples: Sequence[Sample]) -> Judgement:
 def _judge_direct(samples: Sequence[Sample]) -> Judgement:
     checks = (
         check_mean("force of the hand", collect(samples, "hand"), (-1.1 * _PUBLISHED,
-                   -0.9 * _PUBLISHED), "10 %: the ratio is known from the axis of Fig. 6.50 only",
+                   -0.9 * _PUBLISHED), "10 %: the ratio is known only from the axis of Fig. 6.50",
                    unit="N", published=-_PUBLISHED),
         check_mean("displacement of the handle from its centre",
                    1e3 * collect(samples, "displacement"), (0.0, 1e3 * _DEADBAND),
                    "almost none: inside the dead band of Table 6.7", unit="mm"),
-        check_fraction(f"operators who hold the force with less than {100 * _MAX_RIPPLE:.0f} % of"
+        check_fraction(f"operators who hold the force with less than {100 * _MAX_RIPPLE:.0f} %"
                        " ripple", collect(samples, "ripple") < _MAX_RIPPLE),
     )  # fmt: skip
     note = (
@@ -172,8 +192,9 @@ def _judge_direct(samples: Sequence[Sample]) -> Judgement:
         f" ripple {format_values(samples, 'ripple', 100.0, 0)} %"
     )
     explanation = (
-        f"the ratio makes {50e3 * _RATIO:.0f} N of 50 kN (Table 6.8), which is near the limit of"
-        " stability; the force has the least filter (5 Hz), because the thesis names none"
+        f"with this ratio 50 kN (Table 6.8) give {50e3 * _RATIO:.0f} N, which is close to the"
+        " stability limit; the force filter has the highest bandwidth (5 Hz), because the thesis"
+        " mentions no filter"
     )
     return Judgement(checks, explanation, note)
 
@@ -181,31 +202,31 @@ def _judge_direct(samples: Sequence[Sample]) -> Judgement:
 _SOFT = "[{kind: plate, position: [6.0, -0.11, 0.3], size: [0.8, 0.9], stiffness: 3.0e+5, damping: 3.0e+4}]"  # noqa: E501
 _HARD = "[{kind: plate, position: [6.0, -0.11, 0.3], size: [0.8, 0.9], stiffness: 3.0e+6, damping: 9.0e+4}]"  # noqa: E501
 CONDITIONS: tuple[tuple[str, Changes, dict[str, float]], ...] = (
-    ("as it stands (force late by 0.10 s, 1 MN/m, 0.3 m/s at the stop, 200 Hz)", {}, {}),
-    ("force without lag, as only a simulation knows it", {"pilot.force": "'true'"}, {}),
-    ("force late by 0.32 s (1.5 Hz)", {"pilot.bandwidth_hz": "1.5"}, {}),
-    ("force late by 0.68 s (0.7 Hz)", {"pilot.bandwidth_hz": "0.7"}, {}),
+    ("reference (force delay 0.10 s, 1 MN/m, 0.3 m/s at the stop, 200 Hz)", {}, {}),
+    ("true force without delay, available only in simulation", {"pilot.force": "'true'"}, {}),
+    ("force delay 0.32 s (1.5 Hz)", {"pilot.bandwidth_hz": "1.5"}, {}),
+    ("force delay 0.68 s (0.7 Hz)", {"pilot.bandwidth_hz": "0.7"}, {}),
     ("ground of 0.3 MN/m", {"surroundings": _SOFT}, {}),
     ("ground of 3 MN/m", {"surroundings": _HARD}, {}),
     ("0.1 m/s at the stop", {"pilot.coordinates.z.speed": "0.1"}, {}),
     ("hand twice as stiff and damped", {}, {"stiffness": 2.0, "damping": 2.0}),
     ("joystick sampled at 100 Hz", {"control_rate": "100"}, {}),
 )  # fmt: skip
-"""Conditions that may set the limit of direct feedback: words, changes, factors on the hand."""
-_SEARCH = (4.0e-5, 8.0e-4)  # N/N
+"""Conditions that may limit direct feedback: (description, changes, factors of the hand)."""
+_SEARCH = (4.0e-5, 8.0e-4)  # range of searched ratios [N/N]
 _HALVINGS = 4
-_SEARCH_ERROR = 1.2  # factor, after the halvings
+_SEARCH_ERROR = 1.2  # uncertainty factor of the limit after the halvings
 
 
 def search_limit(number: int, changes: Changes) -> Sample:
-    """Search the largest ratio at which a force is held, under one of `CONDITIONS`, to 20 %.
+    """Search for the largest stable ratio of direct feedback under a condition, to 20 %.
 
     Args:
-        number: of the condition, from 1 on.
-        changes: of the scenario.
+        number: number of the condition in `CONDITIONS`, from 1 on.
+        changes: scenario keys.
 
     Returns:
-        `limit` [N/N]: the largest stable ratio; 0 if none is, infinite if all are.
+        `limit`: largest stable ratio [N/N]; 0 if none is stable, infinite if all are.
     """
     _, keys, hand = CONDITIONS[number - 1]
     with tempfile.TemporaryDirectory() as folder:
@@ -224,13 +245,13 @@ def search_limit(number: int, changes: Changes) -> Sample:
 
 
 def _is_stable(ratio: float, keys: Changes) -> bool:
-    """Return whether the handle stays near its dead band in the last 40 % of the run."""
+    """Return whether the handle stays within twice its dead band in the last 40 % of the run."""
     values = measure_direct(ratio, 1, keys).values
     return values["max_displacement"] < 2.0 * _DEADBAND
 
 
 def _write_joystick(folder: Path, factors: dict[str, float]) -> str:
-    """Write a joystick file with another hand and return its name."""
+    """Write a joystick file with scaled hand parameters and return its path."""
     source = models_folder() / "joystick" / "joystick.yaml"
     facts = yaml.safe_load(source.read_text(encoding="utf-8"))
     for name, factor in factors.items():
@@ -250,9 +271,9 @@ def _judge_limits(samples: Sequence[Sample]) -> Judgement:
     checks = (
         check_exact("conditions under which direct feedback has a limit", int(exists.sum()),
                     (len(CONDITIONS), len(CONDITIONS)), "severely restricted: under all"),
-        check_exact("limit of the reflected force for 50 kN as it stands", 5e4 * limits[0],
-                    (published / _SEARCH_ERROR, np.inf),
-                    "the published 4.5 N were held, the search is exact to a factor of"
+        check_exact("limit of the reflected force for 50 kN in the reference condition",
+                    5e4 * limits[0], (published / _SEARCH_ERROR, np.inf),
+                    "the published 4.5 N were held, the search is accurate to a factor of"
                     f" {_SEARCH_ERROR:g}", unit="N", published=published),
     )  # fmt: skip
     note = "limits for 50 kN (Table 6.8): " + "; ".join(
@@ -276,7 +297,7 @@ def _describe_limit(limit: float) -> str:
 
 def _judge_unstable(samples: Sequence[Sample]) -> Judgement:
     check = check_fraction(
-        "operators whose contact force ripples by more than"
+        "operators whose contact force has a ripple of more than"
         f" {100 * _MIN_UNSTABLE_RIPPLE:.0f} % of its mean",
         collect(samples, "ripple") > _MIN_UNSTABLE_RIPPLE,
     )
@@ -289,14 +310,22 @@ def _judge_unstable(samples: Sequence[Sample]) -> Judgement:
     return Judgement((check,), note=note)
 
 
-_CONTACT_MADE = 12.0  # s: until then the head approaches the rock
-_MIN_IMPROVEMENT = 2.0  # times
+_CONTACT_MADE = 12.0  # time at which the head has reached the rock [s]
+_MIN_IMPROVEMENT = 2.0  # error ratio
 
 
 def measure_tracking(seed: int, changes: Changes) -> Sample:
-    """Track a trajectory of force on a rock with the contact force displayed on a screen.
+    """Track a force trajectory on a rock with the contact force displayed on a screen.
 
-    With and without reflection, each with the detents of Table 6.11 and without.
+    The four conditions are with and without force reflection, each with and without the detents of
+    Table 6.11.
+
+    Args:
+        seed: seed of operator and sensor noise.
+        changes: scenario keys.
+
+    Returns:
+        RMS force error of each condition [N].
     """
     values, panels = {}, []
     for detent in ("true", "false"):
@@ -331,8 +360,8 @@ def _judge_tracking(samples: Sequence[Sample]) -> Judgement:
         for key, words in (("detent", "with detents"), ("plain", "without detents"))
     )
     explanation = (
-        "an operator who sees the contact force on the screen corrects by it without a felt force:"
-        f" the errors differ by {checks[1].value:.1f} times without detents"
+        "an operator who sees the contact force on the screen corrects it even without force"
+        f" reflection: the error ratio is {checks[1].value:.1f} without detents"
     )
     return Judgement(tuple(checks), explanation, note)
 

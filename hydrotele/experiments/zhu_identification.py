@@ -24,9 +24,9 @@ from hydrotele.experiments.intervals import check_mean, check_statistic, collect
 from hydrotele.experiments.scenario_runs import run_shipped
 from hydrotele.logs.log import Log
 
-_FIRST = 50  # samples of which the document computed the initial parameters
-_CONVERGED = 0.01  # of the largest parameter
-_DRAWS = 8  # of failures per run
+_FIRST = 50  # samples from which the document computed the initial parameters
+_CONVERGED = 0.01  # relative to the largest parameter
+_DRAWS = 8  # random samples of failures per run
 _RUNS = 6  # repetitions; a run of the machine takes several seconds
 
 _MACHINES = {
@@ -36,21 +36,21 @@ _MACHINES = {
 
 
 def _scaled_error(found: np.ndarray, true: np.ndarray) -> float:
-    """Largest error of a parameter over the largest parameter."""
+    """Return the largest parameter error relative to the largest parameter."""
     return float(np.abs(found - true).max() / np.abs(true).max())
 
 
 def measure_convergence(name: str, seed: int, changes: Changes) -> Sample:
-    """Estimates of the static model's parameters over the samples.
+    """Estimate the static model's parameters recursively and record their convergence.
 
     Args:
         name: `excavator` or `feller-buncher`.
-        seed: of the sensors.
-        changes: of the scenario.
+        seed: seed of the sensor noise.
+        changes: scenario keys.
 
     Returns:
-        `late`: largest change in the second half, `error`: largest error in the end, both over the
-        largest parameter [1]; parameters and half intervals in N m as `P1`, `interval P1`.
+        `late`: largest change in the second half, and `error`: largest final error, both relative
+        to the largest parameter; parameters `P1` and interval half-widths `interval P1` [N m].
     """
     scenario, samples, _ = _MACHINES[name]
     shipped, run = run_shipped(scenario, {"seed": str(seed)} | dict(changes))
@@ -75,7 +75,7 @@ def measure_convergence(name: str, seed: int, changes: Changes) -> Sample:
 
 
 def judge_parameters(samples: Sequence[Sample]) -> Judgement:
-    """State the parameters: the document has curves, whose values the available text lacks."""
+    """Describe the parameters; the available text does not contain the published curves."""
     count = sum(name.startswith("true P") for name in samples[0].values)
     words = [
         f"P{i} {format_values(samples, f'P{i}', 1e-3)}"
@@ -86,25 +86,25 @@ def judge_parameters(samples: Sequence[Sample]) -> Judgement:
 
 
 def judge_convergence(samples: Sequence[Sample]) -> Judgement:
-    """Judge the change in the second half of the samples, and the error."""
+    """Check the change in the second half of the samples, and the final error."""
     reason = "converged to 1 % of the largest parameter"
     return Judgement((
         check_mean("largest change of a parameter in the second half of the samples, over the"
                    " largest parameter", collect(samples, "late"), (-np.inf, _CONVERGED), reason),
-        check_mean("largest error of a parameter in the end, over the largest parameter",
+        check_mean("largest final error of a parameter, over the largest parameter",
                    collect(samples, "error"), (-np.inf, 2.0 * _CONVERGED),
-                   "2 %: inertia of the slow moves and the shape of friction are left"),
+                   "2 %: the static model neglects inertia and the shape of friction"),
     ))  # fmt: skip
 
 
 def fail_sensors(log: Log, axes: Sequence[str], failures: int, rng: np.random.Generator) -> Log:
-    """Let one sensor after the other read zero for half a second to three seconds.
+    """Set readings of random sensors to zero for 0.5 to 3 s each.
 
     Args:
-        log: measured.
-        axes: whose angles and pressures may fail.
-        failures: their number.
-        rng: draws sensors and times.
+        log: measured log.
+        axes: axes whose angles and pressures may fail.
+        failures: number of failures.
+        rng: random generator of sensors and times.
 
     Returns:
         The log with the failures.
@@ -121,19 +121,19 @@ def fail_sensors(log: Log, axes: Sequence[str], failures: int, rng: np.random.Ge
 
 
 def measure_outliers(seed: int, changes: Changes) -> Sample:
-    """Errors of the excavator's parameters without failures, with them, and without outliers.
+    """Compute errors of the excavator's parameters without and with sensor failures.
 
     Args:
-        seed: of the sensors and their failures.
-        changes: `failures` per log, whether to `remove` outliers.
+        seed: seed of sensor noise and failures.
+        changes: `failures`: number per log; `remove`: whether outliers are removed.
 
     Returns:
-        `clean`, `spoilt`, `kept`: largest error over the largest parameter [1] without failures,
-        with failures, and after removing outliers, the last two as means over eight draws.
+        Largest error relative to the largest parameter: `clean` without failures, `spoilt` with
+        failures, `kept` after the removal of outliers. The last two are means over eight samples.
     """
     given = {"failures": 6, "remove": True}
     if unknown := sorted(set(changes) - set(given)):
-        raise InputError("changes", f"{', '.join(unknown)} unknown; there are: failures, remove")
+        raise InputError("changes", f"{', '.join(unknown)} unknown; valid: failures, remove")
     given |= changes
     scenario, samples, _ = _MACHINES["excavator"]
     shipped, run = run_shipped(scenario, {"seed": str(seed)})
@@ -158,7 +158,7 @@ def measure_outliers(seed: int, changes: Changes) -> Sample:
     }, (
         Panel("P1, factor of C2 [kN m]", number, {
             "no failure": clean.history[_FIRST:, 0] / 1e3,
-            "failures of sensors": spoilt[0].history[_FIRST:, 0] / 1e3,
+            "sensor failures": spoilt[0].history[_FIRST:, 0] / 1e3,
         }, "sample"),
     ))  # fmt: skip
 
@@ -172,9 +172,9 @@ def _errors(samples: Sequence[Sample], name: str) -> np.ndarray:
 
 
 def judge_effect(samples: Sequence[Sample]) -> Judgement:
-    """Judge how much failures of sensors increase the error."""
+    """Check how much sensor failures increase the error."""
     return Judgement(
-        (check_statistic("error with failures of sensors over that without",
+        (check_statistic("error with over error without sensor failures",
                          _errors(samples, "spoilt"), _ratio_of_means, (2.0, np.inf),
                          "strong: at least twice; no size is published"),),
         note=f"{format_values(samples, 'spoilt', 100.0)} % of the largest parameter against"
@@ -183,16 +183,20 @@ def judge_effect(samples: Sequence[Sample]) -> Judgement:
 
 
 def _removed_fraction(rows: np.ndarray) -> float:
-    """Of rows of error with failures, after removal, without failures."""
+    """Return the fraction of the error due to failures that the removal eliminates.
+
+    Args:
+        rows: (n, 3) errors with failures, after the removal, and without failures.
+    """
     spoilt, kept, clean = rows.mean(axis=0)
     return float((spoilt - kept) / (spoilt - clean))
 
 
 def judge_removal(samples: Sequence[Sample]) -> Judgement:
-    """Judge how much of the error that failures add is gone after outliers are removed."""
+    """Check which fraction of the error due to failures the removal of outliers eliminates."""
     rows = np.column_stack([collect(samples, name) for name in ("spoilt", "kept", "clean")])
     return Judgement(
-        (check_statistic("fraction of the error that failures add which the removal takes away",
+        (check_statistic("fraction of the error due to failures that the removal eliminates",
                          rows, _removed_fraction, (0.75, np.inf),
                          "eliminated: at least three quarters; no size is published"),),
         note=f"{format_values(samples, 'kept', 100.0)} % of the largest parameter;"
@@ -209,9 +213,9 @@ def _convergence(name: str) -> Experiment:
               f"p. {82 if name == 'excavator' else 86}, Figs {figures}", "caption", judge),
         Claim(f"{name}: convergence of the parameters",
               "the estimates converge: in the second half of the samples no parameter changes by"
-              " more than 1 % of the largest one, and none is wrong by more than 2 % of it",
-              f"beyond p. 81, Figs {figures}", "additional", judge_convergence,
-              {"duration": "20.0"}, "the machine moves for 20 s, to the first configuration only"),
+              " more than 1 % of the largest parameter, and final errors are below 2 % of it",
+              f"additional to p. 81, Figs {figures}", "additional", judge_convergence,
+              {"duration": "20.0"}, "the machine moves for 20 s, only to the first configuration"),
     )  # fmt: skip
     return Experiment(
         f"parameters of the {name}", partial(measure_convergence, name), claims, _RUNS

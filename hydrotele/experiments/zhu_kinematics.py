@@ -1,4 +1,4 @@
-"""Zhu 1994, chapter 2: inverse kinematics, resolved motion by rates, the edge of the workspace."""
+"""Zhu 1994, chapter 2: inverse kinematics, resolved-rate motion, and the workspace boundary."""
 
 import math
 from collections.abc import Sequence
@@ -44,7 +44,7 @@ _RUNS = 6  # repetitions of a scenario
 
 
 def _arm(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers (9,) of an arm and its joint ranges (k, 2) [rad]."""
+    """Return the geometric parameters (9,) of an arm and its joint ranges (k, 2) [rad]."""
     machine, tool = _MACHINES[name]
     numbers, _, ranges = arm_facts(load_machine(machine, tool) if tool else load_machine(machine))
     ranges = ranges.copy()
@@ -53,7 +53,7 @@ def _arm(name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _link(turn: float, along: float, length: float, twist: float) -> np.ndarray:
-    """Homogeneous transformation of a link by its Denavit-Hartenberg parameters."""
+    """Return the homogeneous transformation of a link with given Denavit-Hartenberg parameters."""
     ct, st, ca, sa = math.cos(turn), math.sin(turn), math.cos(twist), math.sin(twist)
     return np.array([
         [ct, -st * ca, st * sa, length * ct],
@@ -64,14 +64,14 @@ def _link(turn: float, along: float, length: float, twist: float) -> np.ndarray:
 
 
 def tool_place(g: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Place of the tool (3,) [m] by the chains of Tables 2.1 and 2.2.
+    """Return the position of the tool by the chains of Tables 2.1 and 2.2.
 
     Args:
-        g: (9,) of `kinematics.task.arm_parameters`.
+        g: (9,) parameters as in `kinematics.task.arm_parameters`.
         q: (4,) or (5,) joint angles [rad].
 
     Returns:
-        Place above the foot of the swing axis.
+        (3,) position relative to the foot of the swing axis [m].
     """
     whole = _link(q[0], g[BASE_HEIGHT], g[BASE_RADIUS], math.pi / 2.0)
     whole = whole @ _link(q[1], -g[SIDE], g[BOOM], 0.0) @ _link(q[2], 0.0, g[STICK], 0.0)
@@ -83,7 +83,14 @@ def tool_place(g: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def measure_inverse(changes: Changes) -> Sample:
-    """Pose from joints and back, by the chains of the tables, and poses out of reach."""
+    """Compare closed-form kinematics with the chains of the tables, in and out of reach.
+
+    Args:
+        changes: `stick`: factor of the stick's length in the closed form.
+
+    Returns:
+        Largest position errors [m], and the fraction of poses with the correct reachability.
+    """
     given = read_settings(changes, stick=1.0)
     rng, values = np.random.default_rng(23), {}
     for name in _MACHINES:
@@ -108,7 +115,7 @@ def measure_inverse(changes: Changes) -> Sample:
 
 
 def _is_reachable(g: np.ndarray, pose: np.ndarray) -> bool:
-    """Whether an elbow angle brings the tool pin to its distance from the boom pin, by trying."""
+    """Return whether a pose is in reach, by a search over the elbow angle."""
     head, attitude = pose[4], pose[3]
     ahead = math.sqrt(pose[0] ** 2 - (g[SIDE] - g[HEAD] * math.sin(head)) ** 2) - g[BASE_RADIUS]
     bar, rise = g[ALONG] + g[HEAD] * math.cos(head), g[UP]
@@ -120,37 +127,43 @@ def _is_reachable(g: np.ndarray, pose: np.ndarray) -> bool:
 
 
 def judge_chain(samples: Sequence[Sample]) -> Judgement:
-    """Judge the forward kinematics against the tables' chains."""
+    """Compare the forward kinematics with the chains of the tables."""
     return Judgement(tuple(
-        check_exact(f"largest difference of place, {name}", samples[0].values[f"chain {name}"],
+        check_exact(f"largest difference of position, {name}", samples[0].values[f"chain {name}"],
                     ROUNDING, "rounding", unit="m") for name in _MACHINES
     ))  # fmt: skip
 
 
 def judge_inverse(samples: Sequence[Sample]) -> Judgement:
-    """Judge the closed form in reach."""
+    """Check the closed-form solution for poses in reach."""
     return Judgement(tuple(
-        check_exact(f"largest error of place over {_POSES} poses in reach, {name}",
+        check_exact(f"largest position error over {_POSES} poses in reach, {name}",
                     samples[0].values[f"back {name}"], (0.0, 1e-6), "closed form: rounding, which"
-                    " grows at a straight elbow", unit="m") for name in _MACHINES
+                    " increases at a straight elbow", unit="m") for name in _MACHINES
     ))  # fmt: skip
 
 
 def judge_reach(samples: Sequence[Sample]) -> Judgement:
-    """Judge that solutions exist exactly where the pose is in reach."""
+    """Check that a solution exists if and only if the pose is in reach."""
     return Judgement(tuple(
         check_exact(f"fraction of {_POSES} poses, many of them out of reach, for which the closed"
                     f" form and a search over the elbow agree, {name}",
-                    samples[0].values[f"agree {name}"], (1.0, 1.0), "it exists or does not")
+                    samples[0].values[f"agree {name}"], (1.0, 1.0), "agreement for all poses")
         for name in _MACHINES
     ))  # fmt: skip
 
 
 def measure_solutions(changes: Changes) -> Sample:
-    """Candidates and solutions of both approaches for the feller-buncher's tool.
+    """Count candidates and solutions of both approaches for the feller-buncher's tool.
 
-    A candidate is extraneous if the plane's azimuth is not that of the end of the tilt link (2.14,
-    2.32), which then lies behind the swing axis.
+    A candidate is extraneous if the end of the tilt link lies behind the swing axis. Its azimuth
+    is then not that of the arm plane (2.14, 2.32).
+
+    Args:
+        changes: `check`: 0 to count extraneous candidates as solutions.
+
+    Returns:
+        Largest numbers of solutions, and mean numbers of extraneous candidates.
     """
     given = read_settings(changes, check=1.0)
     g, (numbers, ranges) = feller_geometry(load_machine("cat325")), _arm("feller-buncher")
@@ -194,12 +207,14 @@ def measure_solutions(changes: Changes) -> Sample:
 
 
 def judge_solutions(samples: Sequence[Sample]) -> Judgement:
-    """Judge the numbers of solutions and of extraneous candidates."""
+    """Compare the numbers of solutions and extraneous candidates with the document."""
     v = samples[0].values
     return Judgement((
-        check_exact("most solutions, approach 1", v["first"], (1.0, 2.0), "at most two"),
-        check_exact("most solutions, approach 2", v["second"], (1.0, 4.0), "at most four"),
-        check_exact("extraneous candidates per pose, approach 1 less approach 2",
+        check_exact("largest number of solutions, approach 1", v["first"], (1.0, 2.0),
+                    "at most two"),
+        check_exact("largest number of solutions, approach 2", v["second"], (1.0, 4.0),
+                    "at most four"),
+        check_exact("extraneous candidates per pose, approach 1 minus approach 2",
                     v["extra_first"] - v["extra_second"], (-np.inf, -1e-9), "fewer"),
     ), note=f"extraneous candidates per pose {v['extra_first']:.2f} of 2 and"
        f" {v['extra_second']:.2f} of 4")  # fmt: skip
@@ -212,7 +227,7 @@ _CYCLES = {
     "pilot.operator.path": "{z: [0, 0, 0.004, 0.004, 0, 0, -0.004, -0.004, 0, 0, 0.004, 0.004, 0,"
                            " 0, -0.004, -0.004, 0, 0]}",
 }  # fmt: skip
-"""Twice up and down, 1.4 m each way."""
+"""Scenario changes for two cycles up and down, with a travel of 1.4 m."""
 _METHODS = {
     "kinematics": {},
     "jacobian": {"pilot.resolved_motion": "inverse_jacobian"},
@@ -222,15 +237,17 @@ _METHODS = {
 
 
 def measure_methods(seed: int, changes: Changes) -> Sample:
-    """Bucket twice up and down with both methods of resolved motion, joint loops closed and open.
+    """Move the bucket twice up and down with both methods of resolved motion.
+
+    Each method is simulated with closed and with open joint loops.
 
     Args:
-        seed: of operator and sensors.
-        changes: of the scenario, made after those of the method.
+        seed: seed of operator and sensor noise.
+        changes: scenario keys, applied after those of the method.
 
     Returns:
-        Per method the largest deviation of the radius [m], the deviation of the radius of the
-        references after one and after two cycles [m].
+        Per method, the largest deviation of the radius [m], and the deviation of the reference
+        radius after one and after two cycles [m].
     """
     values, radius, time = {}, {}, np.zeros(0)
     for name, keys in _METHODS.items():
@@ -264,7 +281,7 @@ def _pairs(samples: Sequence[Sample], first: str, second: str) -> np.ndarray:
 
 
 def judge_accumulation(samples: Sequence[Sample]) -> Judgement:
-    """Judge the growth of the references' error, and the accuracy of the bucket."""
+    """Check the growth of the reference error and the accuracy of the bucket."""
     return Judgement(
         (
             check_statistic("error of the references' radius after two cycles over that after one",
@@ -276,10 +293,10 @@ def judge_accumulation(samples: Sequence[Sample]) -> Judgement:
                             "low: at least twice as much; no size is published"),
         ),
         explanation="the rates are integrated to references of closed joint loops, whose path"
-        f" strays by {format_values(samples, 'twice jacobian', 1e3, 2)} mm in two cycles, as the"
-        " Jacobian is that of the measured angles, which are late; the machine itself strays by"
-        f" {format_values(samples, 'stray kinematics', 1e3)} mm with inverse kinematics. Accuracy"
-        " is lost where the joint loops are open:"
+        f" deviates by {format_values(samples, 'twice jacobian', 1e3, 2)} mm in two cycles, because"
+        " the Jacobian is evaluated at measured angles, which are delayed; with inverse kinematics"
+        f" the machine deviates by {format_values(samples, 'stray kinematics', 1e3)} mm."
+        " Deviations are large only with open joint loops:"
         f" {format_values(samples, 'stray rates', 1e3, 0)} mm",
         note=f"{format_values(samples, 'stray jacobian', 1e3)} mm against"
         f" {format_values(samples, 'stray kinematics', 1e3)} mm",
@@ -287,15 +304,16 @@ def judge_accumulation(samples: Sequence[Sample]) -> Judgement:
 
 
 def judge_accuracy(samples: Sequence[Sample]) -> Judgement:
-    """Judge inverse kinematics with closed joint loops against joint rates alone."""
+    """Compare inverse kinematics with closed joint loops to joint rates alone."""
     return Judgement(
         (check_statistic("largest deviation of the radius by joint rates of the inverse Jacobian"
                          " alone, over that by inverse kinematics with closed joint loops",
                          _pairs(samples, "stray rates", "stray kinematics"), _ratio_of_means,
                          (2.0, np.inf), "high: at least twice as accurate; no size is published"),),
-        explanation="the closed joint loops make the difference: with open loops inverse kinematics"
-        f" strays by {format_values(samples, 'stray open', 1e3, 0)} mm, with closed loops the"
-        f" inverse Jacobian by {format_values(samples, 'stray jacobian', 1e3)} mm",
+        explanation="the closed joint loops determine the accuracy: the deviation of inverse"
+        " kinematics with open loops is"
+        f" {format_values(samples, 'stray open', 1e3, 0)} mm, that of the"
+        f" inverse Jacobian with closed loops {format_values(samples, 'stray jacobian', 1e3)} mm",
         note=f"{format_values(samples, 'stray kinematics', 1e3)} mm in 1.4 m against"
         f" {format_values(samples, 'stray rates', 1e3, 0)} mm",
     )  # fmt: skip
@@ -306,21 +324,21 @@ _EDGE = {
     "pilot.operator": "{kind: follow, time: [0, 1, 1.5, 13, 13.5, 17, 17.5],"
                       " path: {x: [0, 0, 0.004, 0.004, -0.004, -0.004, 0]}}",
 }  # fmt: skip
-_PAST, _OUTWARDS, _BACK = 10.5, 13.0, 13.5  # s: at the edge; pushed outwards until; then back
+_PAST, _OUTWARDS, _BACK = 10.5, 13.0, 13.5  # s: edge reached, end of outward command, reversed
 
 
 def measure_edge(seed: int, changes: Changes) -> Sample:
-    """The feller-buncher's head commanded outwards beyond the edge, and back.
+    """Command the feller-buncher's head beyond the edge of the workspace and back.
 
     Args:
-        seed: of operator and sensors.
-        changes: of the scenario.
+        seed: seed of operator and sensor noise.
+        changes: scenario keys.
 
     Returns:
-        `beyond`: largest distance of the head beyond the radius at which its references stop [m],
-        `height`: largest deviation of its height until the command turns [m], `edge`: that radius
-        [m], `back`: time until the references leave after the command has turned [s], `speed`:
-        largest joint rate [rad/s], `stick`: angle of the stick from straight at the edge [deg].
+        `edge`: radius at which the references stop [m]; `beyond`: largest distance of the head
+        beyond it [m]; `height`: largest height deviation until the command reverses [m]; `back`:
+        time from the reversal until the references leave the edge [s]; `speed`: largest joint
+        rate [rad/s]; `stick`: angle of the stick from straight at the edge [deg].
     """
     _, run = run_shipped("feller_steps", operator_changes(seed) | _EDGE | dict(changes))
     pose, time, m = cylindrical_pose(run), run.truth.time, run.measured
@@ -346,19 +364,19 @@ def measure_edge(seed: int, changes: Changes) -> Sample:
 
 
 def judge_edge(samples: Sequence[Sample]) -> Judgement:
-    """Judge the stop, the coordinate that is held, and the way back."""
-    way = "2 % of the way of 2.9 m, as in the rows of straight lines"
+    """Check the stop at the edge, the constant height, and the return."""
+    way = "2 % of the travel of 2.9 m, as in the rows of straight lines"
     turned = _BACK - _OUTWARDS
     return Judgement((
         check_mean("distance of the head beyond the edge", collect(samples, "beyond"),
                    (-np.inf, 0.058), way, unit="m"),
         check_mean("deviation of the height", collect(samples, "height"), (-np.inf, 0.058), way,
                    unit="m"),
-        check_fraction("operators whose references stand still at the edge and leave it before the"
-                       f" handle has turned fully, within {turned:g} s",
+        check_fraction("operators whose references stop at the edge and leave it within"
+                       f" {turned:g} s, before the handle is fully reversed",
                        [s.values["back"] < turned and s.values["moved"] < 1e-3 for s in samples]),
     ), note=f"edge at r = {format_values(samples, 'edge', 1.0, 2)} m, where the stick's range ends"
-       f" {format_values(samples, 'stick', 1.0, 0)} deg before it is straight; largest joint rate"
+       f" {format_values(samples, 'stick', 1.0, 0)} deg from straight; largest joint rate"
        f" {format_values(samples, 'speed', 1.0, 2)} rad/s")  # fmt: skip
 
 
@@ -383,13 +401,13 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         '"We can see there are at most two" (approach 1); "there are at most four solutions to this'
         ' problem" (approach 2); "approach 1 is easier than approach 2, and introduces fewer'
         ' extraneous solutions"', "p. 24, Fig. 2.9", judge_solutions, {"check": 0.0},
-        "extraneous candidates are not looked for",
+        "extraneous candidates are not rejected",
     )),
     Experiment("methods of resolved motion", measure_methods, (make_claim(
         "inverse Jacobian: error accumulates",
         '"Since position error can accumulate, the inverse Jacobian method suffers from low'
         ' accuracy."', "p. 10, Eq. 2.1", judge_accumulation,
-        {"pilot.resolved_motion": "inverse_kinematics"}, "inverse kinematics in its place",
+        {"pilot.resolved_motion": "inverse_kinematics"}, "inverse kinematics instead",
     ), make_claim(
         "inverse kinematics and closed joint loops: accuracy",
         '"It is clear from these plots that the motion accuracy is high due to the fact inverse'
@@ -399,10 +417,10 @@ EXPERIMENTS: tuple[Experiment, ...] = (
     )), _RUNS),
     Experiment("edge of the workspace", measure_edge, (Claim(
         "feller-buncher: edge of the workspace",
-        'commanded beyond the edge, the references stop there, height and attitude are held, and'
-        ' the head leaves when the command turns; the document says "Resolved motion control of the'
-        ' feller-buncher near the edge of workspace needs further study."',
-        "beyond p. 112", "additional", judge_edge, {"servo.axis_gains": "{stick: 0.0}"},
+        'if commanded beyond the edge, the references stop there, height and attitude stay'
+        ' constant, and the head leaves when the command is reversed; the document says "Resolved'
+        ' motion control of the feller-buncher near the edge of workspace needs further study."',
+        "additional to p. 112", "additional", judge_edge, {"servo.axis_gains": "{stick: 0.0}"},
         "no position loop of the stick",
     ),), _RUNS),
 )  # fmt: skip

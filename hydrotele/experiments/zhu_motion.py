@@ -1,7 +1,7 @@
-"""Zhu 1994, chapter 6, without contact: lines, rate against position, the handle's force, steps.
+"""Zhu 1994, chapter 6, without contact: straight lines, steering, handle force, and steps.
 
-Every measurement takes the seed of its operator and sensors, and changes of its scenario. Claims
-are judged by measured channels or by the true path of the tip.
+Every measurement has the seed of operator and sensor noise and the changes of scenario keys as
+arguments. Claims are evaluated with measured channels or with the true path of the tip.
 """
 
 from collections.abc import Sequence
@@ -33,9 +33,9 @@ _LINES = {
     "out": (47, "x", 1, ("z",), {"r": "4.8", "z": "1.2"}),
     "in": (48, "x", -1, ("z",), {"r": "6.2", "z": "1.2"}),
 }
-"""Direction -> figure 6.n, axis of the handle, its sign, constant coordinates, start [m]."""
-_MAX_STRAY = 0.02  # of the travel
-_MAX_ROTATION = 2.0  # degrees of the bucket
+"""Direction -> (figure 6.n, axis of the handle, its sign, constant coordinates, start [m])."""
+_MAX_STRAY = 0.02  # deviation from the line over the travel
+_MAX_ROTATION = 2.0  # rotation of the bucket [deg]
 _MIN_TRAVEL = 1.0  # m
 _VERTICAL = (
     "the bucket was commanded to go straightly up and down while keeping the bucket angle and"
@@ -48,7 +48,7 @@ _HORIZONTAL = (
 
 
 def measure_line(direction: str, seed: int, changes: Changes) -> Sample:
-    """Move the tip in a straight line under operator control: up, down, out or in."""
+    """Move the tip along a straight line under operator control: up, down, out or in."""
     _, axis, sign, held, start = _LINES[direction]
     push = 0.004 * sign
     keys = {f"start.pose.{k}": v for k, v in start.items()}
@@ -75,8 +75,8 @@ def measure_line(direction: str, seed: int, changes: Changes) -> Sample:
 def _judge_line(samples: Sequence[Sample]) -> Judgement:
     checks = (
         check_mean("travel", collect(samples, "travel"), (_MIN_TRAVEL, np.inf),
-                   "a line is long compared with the accepted stray", unit="m"),
-        check_mean("largest stray across the line over the travel",
+                   "long compared with the accepted deviation", unit="m"),
+        check_mean("largest deviation from the line over the travel",
                    collect(samples, "stray_share"), (0.0, _MAX_STRAY),
                    "constant: the width of a drawn line in a plot of this travel"),
         check_mean("largest rotation of the bucket", collect(samples, "rotation"),
@@ -84,10 +84,10 @@ def _judge_line(samples: Sequence[Sample]) -> Judgement:
                    "constant: the width of a drawn line on the plot's axis of 60 deg", unit="deg"),
     )  # fmt: skip
     note = (
-        f"strays by {format_values(samples, 'stray', 1e3, 0)} mm, sideways by"
+        f"deviates by {format_values(samples, 'stray', 1e3, 0)} mm, sideways by"
         f" {format_values(samples, 'sideways', 1e3, 0)} mm"
     )
-    return Judgement(checks, "the thesis gives no figures", note)
+    return Judgement(checks, "the thesis gives no values", note)
 
 
 def _claim_line(direction: str) -> Claim:
@@ -103,22 +103,23 @@ def _claim_line(direction: str) -> Claim:
 
 
 _GOALS = {"r": (5.8, 6.2, 6.2, 6.0), "z": (1.4, 1.4, 1.8, 1.6)}
-_HOLDS = ((2.0, 11.0), (11.0, 20.0), (20.0, 30.0))  # s
-_RESOLVED = 0.03  # m: half as much again as the operator resolves by sight
-_MAX_OVERSHOOT = 0.15  # of a step, for a motion that is called smooth
-_MIN_REVERSALS = 2  # about a goal, for a motion that is called an oscillation
-_CAUSE_OPERATORS = 5  # operators with whom the causes of an oscillation are varied
+_HOLDS = ((2.0, 11.0), (11.0, 20.0), (20.0, 30.0))  # time intervals of the goals [s]
+_RESOLVED = 0.03  # smallest counted error [m]; 1.5 times the operator's visual resolution
+_MAX_OVERSHOOT = 0.15  # overshoot over step of a smooth motion
+_MIN_REVERSALS = 2  # reversals about a goal that count as an oscillation
+_CAUSE_OPERATORS = 5  # number of operators with whom the causes of an oscillation are varied
 _FAST = "{r: {speed: 3.0, scale: 120.0}, theta: {speed: 0.75, scale: 20.0}, z: {speed: 3.0, scale: 120.0}, attitude: {speed: 2.0, scale: 5.0}}"  # noqa: E501
 
 
 def count_reversals(run: Run) -> tuple[float, int]:
-    """Return the overshoot of the tip's steps and how often it passes a goal again.
+    """Return the largest overshoot of the tip and the number of reversals about its goals.
 
     Args:
-        run: of the scenario `steer`.
+        run: run of the scenario `steer`.
 
     Returns:
-        (largest overshoot as a fraction of its step [1], reversals of more than 3 cm either side).
+        (largest overshoot over its step [1], number of changes between errors above +3 cm and
+        below -3 cm).
     """
     pose, time = cylindrical_pose(run), run.truth.time
     overshoot, count = 0.0, 0
@@ -134,10 +135,10 @@ def count_reversals(run: Run) -> tuple[float, int]:
 
 
 def measure_steering(seed: int, changes: Changes) -> Sample:
-    """Steer the tip to the same places by sight under rate and under position control.
+    """Steer the tip visually to the same goals under rate and under position control.
 
-    The operator has the same task in both. With the first operators the causes of an oscillation
-    are varied: no tremor, a machine five times as fast, a slower operator.
+    For the first operators the possible causes of an oscillation are varied: no tremor, a machine
+    five times as fast, and a slower operator.
     """
     cases = {
         "rate": {"pilot.mode": "rate"},
@@ -192,8 +193,8 @@ def _judge_steering(samples: Sequence[Sample]) -> Judgement:
 
     explanation = (
         f"smooth: overshoot below {100 * _MAX_OVERSHOOT:.0f} % and fewer than {_MIN_REVERSALS}"
-        " reversals. Rate control is not smooth for most operators, who estimate the machine's gain"
-        " and lag while they steer. Position control without tremor:"
+        " reversals. Rate control is not smooth for most operators, because they estimate the"
+        " machine's gain and lag while they steer. Position control without tremor:"
         f" {describe_case('calm')}; with a machine five times as fast: {describe_case('fast')}."
         f" Operators with a crossover of 1.5 rad/s: rate {describe_case('slow_rate')}, position"
         f" {describe_case('slow_position')}"
@@ -201,14 +202,14 @@ def _judge_steering(samples: Sequence[Sample]) -> Judgement:
     return Judgement((check,), explanation, note)
 
 
-_MAX_NONLINEARITY = 0.03  # of the largest force
+_MAX_NONLINEARITY = 0.03  # RMS deviation over the largest force
 _RAMPS = {"x": (1.0, 7.0, 4.0, 0.3, 2.0), "z": (9.0, 15.0, 4.0, 0.4, 2.0)}
-"""Axis -> start, end [s], then Kp, Kp1 [N/mm] and force drop [N] of Table 6.11."""
+"""Axis -> (start, end [s], and Kp, Kp1 [N/mm] and force drop [N] of Table 6.11)."""
 _DEADBAND_EDGE = 1.5  # mm, Table 6.9
 
 
 def measure_handle_ramp(detent: str, seed: int, changes: Changes) -> Sample:
-    """Measure the hand's force while it moves the handle slowly from its centre to its stop."""
+    """Measure the hand force while the handle moves slowly from its centre to its stop."""
     keys = {"pilot.detent": detent} | operator_changes(seed) | dict(changes)
     _, run = run_shipped("handle_ramp", keys)
     m, values, panels = run.measured, {}, []
@@ -240,11 +241,11 @@ def _judge_centring(samples: Sequence[Sample]) -> Judgement:
             "the printed digits of Table 6.9", unit="N/mm", published=kp,
         ))  # fmt: skip
         checks.append(check_mean(
-            f"RMS distance from a straight line along {axis} over the largest force",
+            f"RMS deviation from a straight line along {axis} over the largest force",
             collect(samples, f"{axis}_nonlinearity"), (0.0, _MAX_NONLINEARITY),
-            "linear: noise and friction of the measured hand force",
+            "linear, except for noise and friction of the measured hand force",
         ))  # fmt: skip
-    return Judgement(tuple(checks), "judged by the hand's force, not by the command")
+    return Judgement(tuple(checks), "evaluated with the hand's force, not with the command")
 
 
 def _judge_detent(samples: Sequence[Sample]) -> Judgement:
@@ -268,19 +269,19 @@ def _judge_detent(samples: Sequence[Sample]) -> Judgement:
 
 _JOINT_STEPS = {"boom": (1.0, 56), "stick": (11.0, 57), "tilt": (21.0, 58)}
 """Joint -> time of its step [s], figure 6.n; it steps back 5 s later."""
-_BACK = 5.0  # s
-_REST = 0.5  # s
-_MIN_PRESSURE_SWING = 0.5  # of the pressure before the step
-_MAX_JOINT_ERROR = 0.05  # of a step
-_MAX_JOINT_OVERSHOOT = 0.10  # of a step
-_MAX_RINGING = 0.02  # of a step, at rest
+_BACK = 5.0  # time from a step to the step back [s]
+_REST = 0.5  # length of an averaging interval [s]
+_MIN_PRESSURE_SWING = 0.5  # peak-to-peak pressure over the pressure before the step
+_MAX_JOINT_ERROR = 0.05  # remaining error over the step
+_MAX_JOINT_OVERSHOOT = 0.10  # overshoot over the step
+_MAX_RINGING = 0.02  # amplitude of the remaining oscillation over the step
 
 
 def measure_joint_steps(seed: int, changes: Changes) -> Sample:
-    """Step boom, stick and tilt by 0.1 rad, there and back, and record the pressures.
+    """Step boom, stick and tilt by 0.1 rad and back, and record angles and pressures.
 
-    The first repetition is simulated again with half the position gain, to see whether the servo
-    causes the oscillation.
+    The first repetition is also simulated with half the position gain, which shows whether the
+    servo causes the oscillation.
     """
     values, panels = _measure_joint_steps(seed, changes)
     if seed == 1:
@@ -318,7 +319,7 @@ def _judge_pressure(joint: str, samples: Sequence[Sample]) -> Judgement:
     check = check_mean(
         "pressure from peak to peak over the pressure before the step",
         collect(samples, f"{joint}_pressure"), (_MIN_PRESSURE_SWING, np.inf),
-        "huge: half of the pressure that carries the arm; the curves have no figures in the text",
+        "huge: half of the pressure that carries the arm; no values of the curves are legible",
     )  # fmt: skip
     note = (
         f"{format_values(samples, f'{joint}_swing', 1e-6, 0)} MPa from peak to peak on"
@@ -362,7 +363,7 @@ def _judge_following(samples: Sequence[Sample]) -> Judgement:
 
 _COORDINATES = {"r": 1.0, "theta": 6.0, "z": 11.0, "attitude": 16.0, "head": 21.0}
 """Coordinate -> time of its step [s]."""
-_MAX_CROSS = 0.1  # of the other coordinate's own step
+_MAX_CROSS = 0.1  # motion of another coordinate over the step of that coordinate
 
 
 def measure_resolved_steps(seed: int, changes: Changes) -> Sample:
@@ -400,12 +401,12 @@ def _judge_resolved(samples: Sequence[Sample]) -> Judgement:
         for key, words, limit in (
             ("overshoot", "overshoot", _MAX_JOINT_OVERSHOOT),
             ("error", "remaining error", _MAX_JOINT_ERROR),
-            ("cross", "motion of the others during the step", _MAX_CROSS),
+            ("cross", "motion of other coordinates during the step", _MAX_CROSS),
         )
     ]  # fmt: skip
     steps = ", ".join(f"{name} {format_values(samples, f'{name}_step', 1.0, 2)}"
                       for name in _COORDINATES)  # fmt: skip
-    return Judgement(tuple(checks), note=f"steps of {steps} m or rad; errors over the own step")
+    return Judgement(tuple(checks), note=f"steps of {steps} m or rad; errors relative to the step")
 
 
 _SLACK = {"servo.position_gain": "0.3", "servo.feedforward": "0.6"}
@@ -467,9 +468,9 @@ STEPS = (
         *(_claim_pressure(joint) for joint in _JOINT_STEPS),
         Claim(
             "feller-buncher: joints follow their steps",
-            "boom, stick and tilt follow a step of 0.1 rad, without overshoot or lasting"
+            "boom, stick and tilt follow a step of 0.1 rad without overshoot or sustained"
             " oscillation",
-            "additional to Fig. 6.56, whose curves have no figures in the text",
+            "additional to Fig. 6.56, whose curves have no legible values",
             "additional",
             _judge_following,
             {"servo.position_gain": "12.0", "servo.pressure_feedback": "0.0"},
@@ -479,7 +480,8 @@ STEPS = (
     Experiment("resolved steps", measure_resolved_steps, (
         Claim(
             "feller-buncher: steps of all five coordinates",
-            "the measured pose follows every step of the joystick, the other coordinates stay",
+            "the measured pose follows every step of the joystick, the other coordinates stay"
+            " constant",
             "additional to Fig. 6.56, which shows joints",
             "additional",
             _judge_resolved,

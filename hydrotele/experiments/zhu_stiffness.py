@@ -1,7 +1,7 @@
 """Zhu 1994, chapters 4 and 5: stability of stiffness feedback, and the levitated joystick.
 
-Motions `x'' + B x' + K(t) x = 0` are integrated for a unit mass. Nothing is random but the
-switching of the stiffness, which is drawn from the repetition's seed.
+Motions `x'' + B x' + K(t) x = 0` are integrated for a unit mass. Only the switching of the
+stiffness is random; it depends on the seed of the repetition.
 """
 
 from collections.abc import Sequence
@@ -25,12 +25,19 @@ from hydrotele.teleop.levitation import pose_resolution
 from hydrotele.teleop.switching import Spring, worst_growth
 
 _STEP = 1e-3  # s
-_LOWEST, _HIGHEST = 1.0, 9.0  # 1/s^2, K_min and K_max of a unit mass; B^2 > 4 K_max from B = 6 on
+_LOWEST, _HIGHEST = 1.0, 9.0  # K_min and K_max of a unit mass [1/s^2]; B^2 > 4 K_max if B > 6
 _DAMPING = 6.1  # 1/s
 
 
 def measure_counter_example(changes: Changes) -> Sample:
-    """Motion with damping that rises exponentially (4.6), and with one that rises slowly (4.7)."""
+    """Integrate motions with exponentially (4.6) and with slowly (4.7) increasing damping.
+
+    Args:
+        changes: `stiffness`: K [1/s^2].
+
+    Returns:
+        `end`: x after 12 s with the former; `slow`: |x| after 100 s with the latter.
+    """
     given = read_settings(changes, stiffness=1.0)
 
     def solve(damping, last: float) -> tuple[np.ndarray, np.ndarray]:
@@ -51,19 +58,26 @@ def measure_counter_example(changes: Changes) -> Sample:
 
 
 def judge_counter_example(samples: Sequence[Sample]) -> Judgement:
-    """Judge where both motions end."""
+    """Check the final displacement of both motions."""
     v = samples[0].values
     return Judgement((
         check_exact("x after 12 s", v["end"], (1.0 - 1e-4, 1.0 + 1e-4),
-                    "1 + exp(-12) is 6 10^-6 above 1; the rest is the integration's",
+                    "1 + exp(-12) is 6 10^-6 above 1; the remaining tolerance is for integration",
                     published=1.0),
-        check_exact("size of x after 100 s with B = 2 + t/2, which meets (4.7)", v["slow"],
-                    (0.0, 0.01), "it dies out as 1/t^2, which leaves some 10^-3 of 2"),
-    ), note="K = 1, which the printed solution 1 + exp(-t) demands")  # fmt: skip
+        check_exact("magnitude of x after 100 s with B = 2 + t/2, which satisfies (4.7)", v["slow"],
+                    (0.0, 0.01), "it decays as 1/t^2, from 2 to some 10^-3"),
+    ), note="K = 1, as required by the printed solution 1 + exp(-t)")  # fmt: skip
 
 
 def measure_worst_switching(changes: Changes) -> Sample:
-    """Growth of half a swing with a stiff spring inwards and a soft one outwards."""
+    """Compute the growth per half swing with K_max inwards and K_min outwards.
+
+    Args:
+        changes: `ratio`: damping ratio with K_max.
+
+    Returns:
+        `growth`: speed after half a swing over that before.
+    """
     given = read_settings(changes, ratio=0.02)
     ratios = np.geomspace(0.01, 1.5, 25)
     growth = [worst_growth(1.0, 2.0 * ratio * 3.0, _LOWEST, _HIGHEST) for ratio in ratios]
@@ -75,17 +89,17 @@ def measure_worst_switching(changes: Changes) -> Sample:
 
 
 def judge_worst_switching(samples: Sequence[Sample]) -> Judgement:
-    """Judge the growth."""
+    """Check that the motion grows."""
     return Judgement((
         check_exact("speed after half a swing over that before, damping ratio 0.02, K_max 9 times"
                     " K_min", samples[0].values["growth"], (1.0 + 1e-9, np.inf),
-                    "it grows, so that the system is unstable"),
+                    "the motion grows, so that the system is unstable"),
     ))  # fmt: skip
 
 
 @compiled
 def integrate_motion(damping, stiffness, place, speed, step, path):
-    """Integrate `x'' = -B x' - K(t) x`, K held over every step, by Runge and Kutta.
+    """Integrate `x'' = -B x' - K(t) x` by the Runge-Kutta method, with constant K in each step.
 
     Args:
         damping: B, scalar [1/s].
@@ -93,7 +107,7 @@ def integrate_motion(damping, stiffness, place, speed, step, path):
         place: x at the start, scalar.
         speed: x' at the start, scalar.
         step: scalar [s].
-        path: (n + 1, 2) written: x, x'.
+        path: (n + 1, 2) output: x, x'.
 
     Returns:
         Nothing.
@@ -115,7 +129,7 @@ def integrate_motion(damping, stiffness, place, speed, step, path):
 
 
 def switched_stiffness(rng: np.random.Generator, count: int) -> np.ndarray:
-    """(count,) stiffness that jumps at random times to random values between K_min and K_max."""
+    """Draw (count,) stiffness with jumps at random times to random values in [K_min, K_max]."""
     jumps = rng.random(count) < _STEP / 10.0 ** rng.uniform(-1.5, 0.5)
     jumps[0] = True
     values = rng.choice(
@@ -131,16 +145,16 @@ def _path(damping: float, stiffness: np.ndarray, start: tuple[float, float]) -> 
 
 
 def measure_theorem(seed: int, changes: Changes) -> Sample:
-    """Motions from random states with a stiffness that jumps at random.
+    """Integrate motions from random states with randomly switched stiffness.
 
     Args:
-        seed: of 20 motions.
-        changes: `damping` [1/s].
+        seed: seed of 20 motions.
+        changes: `damping`: B [1/s].
 
     Returns:
-        `crossings`: most crossings of the x axis (x' = 0) after the start; `left`: largest distance
-        from the origin after 40 s over that at the start; `outside`: largest distance by which the
-        paths from the x axis leave the region between those of K_min and K_max.
+        `crossings`: largest number of crossings of the x axis (x' = 0) after the start; `left`:
+        largest distance from the origin after 40 s over that at the start; `outside`: largest
+        distance of paths from the x axis outside the region between those of K_min and K_max.
     """
     given = read_settings(changes, damping=_DAMPING)
     damping, rng, count = given["damping"], np.random.default_rng([seed, 42]), 40_000
@@ -173,7 +187,7 @@ def measure_theorem(seed: int, changes: Changes) -> Sample:
 
 
 def _speed_at(path: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Speed at displacements, on the first way towards the origin."""
+    """Return the speed at given displacements during the first motion towards the origin."""
     turn = np.flatnonzero(np.diff(path[:, 0]) >= 0.0)
     end = int(turn[1]) if len(turn) > 1 and turn[0] == 0 else int(turn[0]) if len(turn) else None
     way = path[: end or len(path)]
@@ -181,7 +195,7 @@ def _speed_at(path: np.ndarray, grid: np.ndarray) -> np.ndarray:
 
 
 def _leaves(path: np.ndarray, bounds: dict[str, np.ndarray]) -> float:
-    """Largest distance by which a path in quadrant IV lies outside those of K_min and K_max."""
+    """Return how far a path in quadrant IV lies outside the paths of K_min and K_max."""
     grid = np.linspace(0.02, 0.98, 200)
     speed = _speed_at(path, grid)
     upper, lower = _speed_at(bounds["K_min"], grid), _speed_at(bounds["K_max"], grid)
@@ -189,22 +203,22 @@ def _leaves(path: np.ndarray, bounds: dict[str, np.ndarray]) -> float:
 
 
 def judge_theorem(samples: Sequence[Sample]) -> Judgement:
-    """Judge the end of the motions and their crossings."""
+    """Check the final distance of the motions and their crossings of the x axis."""
     return Judgement((
         check_mean("largest distance from the origin after 40 s over that at the start",
                    collect(samples, "left"), (-np.inf, 1e-2), "asymptotically stable: the slowest"
-                   " rate with K_min is 0.17 1/s, which leaves 10^-3"),
-        check_exact("most crossings of the x axis", float(collect(samples, "crossings").max()),
-                    (0.0, 1.0), "at most once"),
+                   " rate with K_min is 0.17 1/s, which gives 10^-3"),
+        check_exact("largest number of crossings of the x axis",
+                    float(collect(samples, "crossings").max()), (0.0, 1.0), "at most once"),
     ))  # fmt: skip
 
 
 def judge_bounds(samples: Sequence[Sample]) -> Judgement:
-    """Judge whether paths stay between those of K_min and K_max."""
+    """Check whether paths stay between those of K_min and K_max."""
     return Judgement((
         check_exact("largest distance by which a path lies outside",
                     float(collect(samples, "outside").max()), (0.0, 1e-3),
-                    "interpolation between steps of 1 ms"),
+                    "error of the interpolation between steps of 1 ms"),
     ))  # fmt: skip
 
 
@@ -218,7 +232,14 @@ _TABLES = {
 
 
 def measure_published_gains(changes: Changes) -> Sample:
-    """Condition (4.14) and the worst switching with the published gains."""
+    """Evaluate condition (4.14) and the worst switching with the published gains.
+
+    Args:
+        changes: `damping`: factor of the damping.
+
+    Returns:
+        `margin`: largest B^2 - 4 M K_max; `growth`: largest growth per half swing.
+    """
     given = read_settings(changes, damping=1.0)
     joystick = load_joystick()
     mass, hand = joystick.flotor.mass, joystick.hand.along(0)
@@ -233,18 +254,25 @@ def measure_published_gains(changes: Changes) -> Sample:
 
 
 def judge_published_gains(samples: Sequence[Sample]) -> Judgement:
-    """Judge margin and growth."""
+    """Check that no axis satisfies (4.14) and that the worst switching decays."""
     v = samples[0].values
     return Judgement((
-        check_exact("largest B^2 - 4 M K_max over the axes, hand on and off", v["margin"],
-                    (-np.inf, -1e-9), "no axis meets (4.14)", unit="(N s/m)^2"),
-        check_exact("largest growth of half a swing with the worst switching", v["growth"],
-                    (0.0, 1.0 - 1e-9), "below 1 every change of stiffness dies out"),
+        check_exact("largest B^2 - 4 M K_max over the axes, with and without hand", v["margin"],
+                    (-np.inf, -1e-9), "no axis satisfies (4.14)", unit="(N s/m)^2"),
+        check_exact("largest growth per half swing with the worst switching", v["growth"],
+                    (0.0, 1.0 - 1e-9), "below 1 the motion decays for any change of stiffness"),
     ), note="masses of joystick and hand are assumptions of models/joystick")  # fmt: skip
 
 
 def measure_joystick(changes: Changes) -> Sample:
-    """Condition of the coils' map, and what the diodes' resolution makes of the pose."""
+    """Compute the condition number of the coil matrix and the resolution of the pose.
+
+    Args:
+        changes: `step`: factor of the photodiodes' step; `radius`: lever that scales torques [m].
+
+    Returns:
+        Condition number, and standard deviations of position [um] and rotation [deg].
+    """
     given = read_settings(changes, step=1.0, radius=1.0)
     joystick = load_joystick()
     facts = joystick.coils
@@ -259,23 +287,23 @@ def measure_joystick(changes: Changes) -> Sample:
 
 
 def judge_condition(samples: Sequence[Sample]) -> Judgement:
-    """Judge the condition of the coils' map."""
+    """Check the condition number of the coil matrix."""
     return Judgement((
-        check_exact("condition of M, torques over the coils' radius",
+        check_exact("condition number of M, torques divided by the coils' radius",
                     samples[0].values["condition"], (1.0, 10.0),
                     "well-conditioned: within a factor of ten"),
     ))  # fmt: skip
 
 
 def judge_resolution(samples: Sequence[Sample]) -> Judgement:
-    """Judge the resolution of the pose that the diodes' steps of 1 um make."""
+    """Check the pose resolution for photodiodes with steps of 1 um."""
     v, reason = samples[0].values, "approximately: up to the printed figure"
     return Judgement((
-        check_exact("standard deviation of the place", v["translation"], (0.0, 1.0), reason,
+        check_exact("standard deviation of the position", v["translation"], (0.0, 1.0), reason,
                     unit="um", published=1.0),
         check_exact("of the rotation", v["rotation"], (0.0, 1e-3), reason, unit="deg",
                     published=1e-3),
-    ), note="three beams on diodes that read in steps of 1 um")  # fmt: skip
+    ), note="three beams on photodiodes with steps of 1 um")  # fmt: skip
 
 
 EXPERIMENTS: tuple[Experiment, ...] = (
@@ -305,18 +333,19 @@ EXPERIMENTS: tuple[Experiment, ...] = (
     ))),
     exact_experiment("published gains", measure_published_gains, make_claim(
         "published gains: worst switching dies out",
-        "no axis of Tables 6.7 and 6.9 meets the condition of theorem 4-2, but the worst switching"
-        " between their bounds dies out", "beyond p. 55, Tables 6.7, 6.9", judge_published_gains,
+        "no axis of Tables 6.7 and 6.9 satisfies the condition of theorem 4-2, but the motion with"
+        " the worst switching between their bounds decays",
+        "additional to p. 55, Tables 6.7, 6.9", judge_published_gains,
         {"damping": 0.1}, "a tenth of the damping", "additional",
     )),
     exact_experiment("levitated joystick", measure_joystick, make_claim(
         "joystick: condition of the coils' map",
         '"M is a well-conditioned 6 x 6 constant matrix"', "p. 66, Eq. 5.1", judge_condition,
-        {"radius": 100.0}, "torques counted on a lever a hundred times as long", "input",
+        {"radius": 100.0}, "torques scaled with a lever a hundred times as long", "input",
     ), make_claim(
         "joystick: resolution of the pose",
         '"approximately 1" um "for translation and 0.001" deg "for rotation"',
         "p. 65, Figs 5.31, 5.32", judge_resolution, {"step": 10.0},
-        "diodes that read in steps of 10 um", "input",
+        "photodiodes with steps of 10 um", "input",
     )),
 )  # fmt: skip

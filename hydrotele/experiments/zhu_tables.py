@@ -1,4 +1,4 @@
-"""Zhu 1994, Tables 6.3 to 6.11: the shipped machines and joystick against the printed numbers.
+"""Zhu 1994, Tables 6.3 to 6.11: compare the shipped machines and joystick with printed values.
 
 The models are built from these tables, so that the rows check inputs and are not counted.
 """
@@ -15,14 +15,14 @@ from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
 
 Entries = dict[str, tuple[float, float, float]]
-"""Name -> number of the model, printed number, half of the last printed digit, in one unit."""
+"""Name -> (value of the model, printed value, half of the last printed digit), in one unit."""
 
 _INCH = 0.0254  # m
-_KHOSHZABAN = 1.0  # mm: Khoshzaban 1992 prints the same pins with three digits
+_KHOSHZABAN = 1.0  # tolerance [mm]: Khoshzaban 1992 prints the same pins with three decimals
 
 
 def _distance(a: Sequence[float], b: Sequence[float], *axes: int) -> float:
-    """Distance of two points in mm, along the given axes [m]."""
+    """Return the distance [mm] of two points [m] in the given axes."""
     return 1e3 * math.dist([a[k] for k in axes], [b[k] for k in axes])
 
 
@@ -37,7 +37,13 @@ def _cylinder_areas(machine: Machine, printed: dict[str, tuple[float, float]]) -
 
 
 def _cylinder_diameters(machine: Machine, printed: dict[str, tuple[int, float, float]]) -> Entries:
-    """Printed: number of cylinders that the model's one stands for, head and rod diameter [mm]."""
+    """Return the entries of piston diameters.
+
+    Args:
+        machine: machine.
+        printed: axis -> (number of cylinders that the model's cylinder represents, head diameter
+            [mm], rod diameter [mm]).
+    """
     entries: Entries = {}
     for name, (count, head, rod) in printed.items():
         cylinder = machine.axes[name].cylinder
@@ -50,7 +56,15 @@ def _cylinder_diameters(machine: Machine, printed: dict[str, tuple[int, float, f
 
 
 def _two_bar(machine: Machine, name: str, a: float, b: float, half: float = 0.05) -> Entries:
-    """Distances of the pins from the joint: a on the longer side, b on the shorter one [mm]."""
+    """Return the entries of a two-bar linkage: distances of both pins from the joint.
+
+    Args:
+        machine: machine.
+        name: axis.
+        a: printed distance of one pin [mm].
+        b: printed distance of the other pin [mm].
+        half: half of the last printed digit [mm].
+    """
     axis = machine.axes[name]
     assert axis.cylinder is not None
     link = machine.link_of(axis.joint)
@@ -68,7 +82,14 @@ def _two_bar(machine: Machine, name: str, a: float, b: float, half: float = 0.05
 
 
 def _four_bar(machine: Machine, name: str, closure: str, printed: Sequence[float]) -> Entries:
-    """Printed: r1, r2, r3, r4 [mm], gamma, alpha [rad], L [mm]."""
+    """Return the entries of a four-bar linkage.
+
+    Args:
+        machine: machine.
+        name: axis.
+        closure: closure of the linkage.
+        printed: printed r1, r2, r3, r4 [mm], gamma, alpha [rad], L [mm].
+    """
     axis = machine.axes[name]
     assert axis.cylinder is not None and axis.four_bar is not None
     joint = machine.links[machine.link_of(axis.joint)].position
@@ -130,7 +151,7 @@ _EXCAVATOR_GAINS = {
     "z": (4.0, 0.6, 0.3, 0.06, 1.5), "rx": (0.1, 0.06, 0.01, 0.03, 2000.0),
     "ry": (0.1, 0.06, 0.01, 0.03, 50.0), "rz": (0.1, 0.06, 0.01, 0.03, 2000.0),
 }  # fmt: skip
-"""Axis -> Kp max, nominal, min [N/mm] or [100 N m/rad], Kd, dead band [mm] or [0.0001 rad]."""
+"""Axis -> (Kp max, nominal, min [N/mm] or [100 N m/rad], Kd, dead band [mm] or [0.0001 rad])."""
 _FELLER_GAINS = {
     "x": (8.0, 4.0, 3.0, 0.06, 1.5), "y": (4.0, 3.0, 2.0, 0.06, 1.5),
     "z": (9.0, 4.0, 3.0, 0.06, 1.5), "rx": (0.8, 0.45, 0.3, 0.04, 350.0),
@@ -152,7 +173,7 @@ def _joystick_gains(name: str, printed: dict[str, tuple[float, ...]]) -> Entries
 
 
 def _force_limits(name: str, force: float) -> Entries:
-    """Printed: force [kN] of the translations; 40 kN m of all rotations."""
+    """Return the entries of force limits: `force` [kN] in translation, 40 kN m in rotation."""
     return {
         axis: (gains.force_limit / 1e3, force if len(axis) == 1 else 40.0, 0.5)
         for axis, gains in load_joystick().gains[name].items()
@@ -196,22 +217,22 @@ _TABLES: dict[str, tuple[str, str, Callable[[], Entries]]] = {
         "p. 100, Table 6.10", "30 kN and 40 kN m", partial(_force_limits, "feller", 30.0)),
     "detent parameters": ("p. 102, Table 6.11", "force drop, Kp and Kp1 of six axes", _detents),
 }  # fmt: skip
-"""Row -> item, published quantities, entries."""
+"""Row -> (item, published quantities, function that returns the entries)."""
 
 
 def measure_tables(seed: int, changes: Changes) -> Sample:
-    """Compare the numbers of the shipped models with the printed ones.
+    """Compare parameters of the shipped models with the printed values.
 
     Args:
-        seed: has no effect.
-        changes: `factor` by which the numbers of the models are multiplied, 1 by default.
+        seed: not used.
+        changes: `factor`: factor of the model parameters, 1 by default.
 
     Returns:
-        Per row the number of entries, of those that differ and of those that differ among the
-        rotational dampings `Kd`; and the largest relative difference.
+        Per row, the numbers of all entries, of differing entries and of differing rotational
+        dampings `Kd`, and the largest relative difference.
 
     Raises:
-        InputError: `changes` holds another key.
+        InputError: `changes` has another key.
     """
     unknown = set(changes) - {"factor"}
     if unknown:
@@ -237,7 +258,7 @@ def measure_tables(seed: int, changes: Changes) -> Sample:
 def _judge_table(row: str, samples: Sequence[Sample]) -> Judgement:
     values = samples[0].values
     check = check_exact(
-        "entries that differ from the printed numbers", values[f"{row}: differ"], (0.0, 0.0),
+        "entries that differ from the printed values", values[f"{row}: differ"], (0.0, 0.0),
         "half of the last printed digit",
     )  # fmt: skip
     note = (
@@ -246,11 +267,11 @@ def _judge_table(row: str, samples: Sequence[Sample]) -> Judgement:
     )
     explanation = ""
     if row == "linkages of the excavator":
-        explanation = "pins of boom and stick within 1 mm: the model has those of Khoshzaban 1992"
+        explanation = "tolerance of 1 mm for boom and stick: the model uses Khoshzaban 1992"
     if values[f"{row}: damping"]:
         explanation = (
             f"{values[f'{row}: damping']:.0f} rotational dampings: the model has 0.25 N m s/rad,"
-            " because the printed ones are more than 200 Hz can hold on this flotor"
+            " because the printed ones are unstable on this flotor at 200 Hz"
         )
     return Judgement((check,), explanation, note)
 
@@ -259,7 +280,7 @@ TABLES = Experiment(
     "tables", measure_tables,
     tuple(
         Claim(row, words, item, "input", partial(_judge_table, row), {"factor": "1.1"},
-              "the numbers of the models are 10 % larger")
+              "the parameters of the models are 10 % larger")
         for row, (item, words, _) in _TABLES.items()
     ),
     repetitions_fixed=1,

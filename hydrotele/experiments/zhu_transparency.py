@@ -1,6 +1,6 @@
 """Zhu 1994, pages 37 to 49: transparency under position and under rate control.
 
-Computed from the two-port as in `zhu_two_port`.
+The results are computed from the two-port model, as in `zhu_two_port`.
 """
 
 import dataclasses
@@ -46,13 +46,21 @@ from hydrotele.teleop.two_port import (
 
 
 def random_impedance(rng: np.random.Generator, base: Impedance) -> Impedance:
-    """A passive impedance within a factor of ten either way of another one."""
+    """Draw a passive impedance whose parameters are 0.1 to 10 times those of another one."""
     factors = 10.0 ** rng.uniform(-1.0, 1.0, 3)
     return Impedance(*(factors * (base.mass, base.damping, base.stiffness)))
 
 
 def measure_transparency(changes: Changes) -> Sample:
-    """The four-channel structure: hybrid matrix, norm, error dynamics, random hands and tasks."""
+    """Analyse the four-channel structure under position control.
+
+    Args:
+        changes: `mass_error`: relative error of the slave's mass; `delay`: delay each way [s].
+
+    Returns:
+        Error of the hybrid matrix, scattering norm, slowest pole of the position error, and the
+        stable fraction of loops with random hands and tasks.
+    """
     given = read_settings(changes, mass_error=0.0, delay=0.0)
     case = shipped_case().with_delay(given["delay"])
     port = case.port("four_channel_position")
@@ -78,35 +86,37 @@ def measure_transparency(changes: Changes) -> Sample:
 
 
 def judge_transparency(samples: Sequence[Sample]) -> Judgement:
-    """Judge hybrid matrix and error dynamics."""
+    """Check the hybrid matrix and the error dynamics."""
     v = samples[0].values
     return Judgement((
         check_exact("largest difference of the hybrid matrix from [[0, 1], [-1, 0]], relative to"
                     " 30 N s/m", v["matrix"], ROUNDING, "rounding"),
         check_exact("slowest pole of the position error (3.31)", v["slowest"], (-np.inf, -1e-9),
-                    "asymptotic: left of the axis", unit="1/s"),
+                    "asymptotic: negative real part", unit="1/s"),
     ))  # fmt: skip
 
 
 def judge_lossless(samples: Sequence[Sample]) -> Judgement:
-    """Judge the scattering norm and the loops with random passive hands and tasks."""
+    """Check the scattering norm and the stability with random passive hands and tasks."""
     v = samples[0].values
     return Judgement((
         check_exact("largest scattering norm", v["norm"], (1.0 - 1e-9, PASSIVE_NORM), "1 (3.33)",
                     published=1.0),
         check_exact("stable fraction of 100 random passive hands and tasks", v["stable"],
-                    (1.0, 1.0), "stability is ensured with any strictly passive load"),
+                    (1.0, 1.0), "stability is ensured for any strictly passive load"),
     ))  # fmt: skip
 
 
 def intervening_port(case: Case) -> TwoPort:
-    """Four channels that need no acceleration, with an intervening impedance.
+    """Return the four-channel two-port with an intervening impedance (3.37).
+
+    Its channels need no acceleration signals.
 
     Args:
         case: master and slave with damper and spring added to their masses.
 
     Returns:
-        The two-port of (3.37).
+        The two-port.
     """
     own, held = case.master_control, case.slave_control
     return TwoPort(
@@ -116,7 +126,14 @@ def intervening_port(case: Case) -> TwoPort:
 
 
 def measure_intervening(changes: Changes) -> Sample:
-    """Felt impedance and hybrid matrix of identical sides with added damper and spring."""
+    """Compute the felt impedance for identical sides with added damper and spring.
+
+    Args:
+        changes: `slave_mass`: factor of the slave's mass.
+
+    Returns:
+        Relative error of the felt impedance, and the stable fraction of random loops.
+    """
     given = read_settings(changes, slave_mass=1.0)
     case = identical_case()
     side = Impedance(case.master.mass, 10.0, 100.0)
@@ -136,7 +153,7 @@ def measure_intervening(changes: Changes) -> Sample:
 
 
 def judge_intervening(samples: Sequence[Sample]) -> Judgement:
-    """Judge (3.39) and the stability of (3.45) and (3.47)."""
+    """Check the felt impedance (3.39) and the stability of (3.45) and (3.47)."""
     v = samples[0].values
     return Judgement((
         check_exact("largest relative difference of the felt impedance and Z_m + Z_e (3.39)",
@@ -150,14 +167,14 @@ _ERRORS = np.geomspace(1e-3, 100.0, 26)
 
 
 def smallest_force_error(case: Case) -> float:
-    """Smallest relative error of the force fed forward with which a loop is unstable.
+    """Return the smallest relative error of the force feed-forward that destabilizes the loop.
 
     Args:
-        case: the teleoperator with hand and task; four channels under position control.
+        case: teleoperator with hand and task; four channels under position control.
 
     Returns:
-        The error [1]; infinite where none up to 100 does it, 0 where the loop is unstable with the
-        smallest one, 0.1 %.
+        The error [1]; infinite if no error up to 100 destabilizes the loop, 0 if the smallest
+        one, 0.1 %, does.
     """
     port = case.port("four_channel_position")
 
@@ -172,7 +189,14 @@ def smallest_force_error(case: Case) -> float:
 
 
 def measure_force_error(changes: Changes) -> Sample:
-    """Smallest error of the force fed forward that drives the loop unstable, and its causes."""
+    """Find the smallest destabilizing error of the force feed-forward under several conditions.
+
+    Args:
+        changes: `scale`: factor of the controllers' gains.
+
+    Returns:
+        Smallest destabilizing errors; gain factor and hand stiffness factor for which 5 % suffices.
+    """
     given = read_settings(changes, scale=1.0)
     case = identical_case()
 
@@ -200,19 +224,19 @@ def measure_force_error(changes: Changes) -> Sample:
         "scale": float(enough[0]) if len(enough) else 0.0,
         "hand": float(firm[0]) if len(firm) else np.inf,
         "norm": float(scattering_norm(wrong, 1j * WIDE_FREQUENCIES, 30.0).max()),
-    }, (Panel("smallest error that is unstable [1]", scales, {"identical sides": limits},
+    }, (Panel("smallest unstable error [1]", scales, {"identical sides": limits},
               "controllers' gains over those of Table 6.7 [1]", True, True),))  # fmt: skip
 
 
 def judge_force_error(samples: Sequence[Sample]) -> Judgement:
-    """Judge the smallest error against the reported 5 %."""
+    """Compare the smallest destabilizing error with the reported 5 %."""
     v = samples[0].values
     return Judgement(
-        (check_exact("smallest relative error of the force fed forward that is unstable",
+        (check_exact("smallest relative error of the force feed-forward that is unstable",
                      v["limit"], (0.0, 0.05), "5 % is reported to be enough", published=0.05),),
-        explanation="the loop is (Z_m + C_m + Z_s + C_s)(Z_h + Z_e) - e Z_h (Z_e - Z_m - C_m): an"
-        " error e has to make e Z_h as large as both sides with their controllers, which the"
-        " hand of this case is far from. 5 % suffices where the controllers' gains are multiplied"
+        explanation="the loop is (Z_m + C_m + Z_s + C_s)(Z_h + Z_e) - e Z_h (Z_e - Z_m - C_m): to"
+        " destabilize it, e Z_h must be as large as both sides with their controllers; the hand of"
+        " this case is much softer. 5 % suffices if the controllers' gains are multiplied"
         f" by {v['scale']:.2g}, or the hand's stiffness by {v['hand']:.2g}; gains, hand and task"
         " of the reported system are not in the document. With 5 % the two-port is no longer"
         f" passive (scattering norm {v['norm']:.4f})",
@@ -224,7 +248,14 @@ def judge_force_error(samples: Sequence[Sample]) -> Judgement:
 
 
 def measure_rate_force_extremes(changes: Changes) -> Sample:
-    """Felt impedance of direct force under rate control with very stiff and very soft tasks."""
+    """Compute the felt impedance of the rate-force structure for very stiff and soft tasks.
+
+    Args:
+        changes: `structure_with_task`: 1 for the transparent four-channel structure.
+
+    Returns:
+        Relative differences from (3.50) and (3.51).
+    """
     given = read_settings(changes, structure_with_task=0.0)
     case, s = shipped_case(), 1j * HAND_FREQUENCIES
     port = case.port("four_channel_rate" if given["structure_with_task"] else "rate_force")
@@ -242,8 +273,8 @@ def measure_rate_force_extremes(changes: Changes) -> Sample:
 
 
 def judge_rate_force_extremes(samples: Sequence[Sample]) -> Judgement:
-    """Judge (3.50) and (3.51)."""
-    v, reason = samples[0].values, "the task is 10^8 times stiffer or softer, which leaves 10^-4"
+    """Compare the felt impedance with (3.50) and (3.51)."""
+    v, reason = samples[0].values, "the task is 10^8 times stiffer or softer; 10^-4 remains"
     return Judgement((
         check_exact("relative difference from (3.50), stiff task", v["stiff"], (0.0, 1e-4), reason),
         check_exact("from (3.51), soft task", v["soft"], (0.0, 1e-4), reason),
@@ -251,14 +282,14 @@ def judge_rate_force_extremes(samples: Sequence[Sample]) -> Judgement:
 
 
 def rate_port(case: Case, velocity_gain: float = 1.0) -> TwoPort:
-    """The usable four-channel structure under rate control, (3.59).
+    """Return the practical four-channel structure under rate control (3.59).
 
     Args:
         case: master and slave with damper and spring added to their masses.
         velocity_gain: slave's velocity over the master's position [1/s].
 
     Returns:
-        The two-port; of identical sides it lets the master and the task be felt.
+        The two-port. With identical sides, the felt impedance is that of master plus task.
     """
     own, held, k = case.master_control, case.slave_control, velocity_gain
     return TwoPort(
@@ -268,7 +299,14 @@ def rate_port(case: Case, velocity_gain: float = 1.0) -> TwoPort:
 
 
 def measure_rate_transparency(changes: Changes) -> Sample:
-    """Felt impedance and velocity of both four-channel structures under rate control."""
+    """Compute felt impedance and slave velocity of four channels under rate control.
+
+    Args:
+        changes: `slave_mass`: factor of the slave's mass.
+
+    Returns:
+        Relative errors of felt impedance and velocity.
+    """
     given = read_settings(changes, slave_mass=1.0)
     case, s = identical_case(), 1j * HAND_FREQUENCIES
     slave = dataclasses.replace(case.slave, mass=given["slave_mass"] * case.slave.mass)
@@ -284,7 +322,7 @@ def measure_rate_transparency(changes: Changes) -> Sample:
 
 
 def judge_rate_transparency(samples: Sequence[Sample]) -> Judgement:
-    """Judge (3.61) and (3.64)."""
+    """Compare felt impedance and velocity with (3.61) and (3.64)."""
     v = samples[0].values
     return Judgement((
         check_exact("largest relative difference of the felt impedance and Z_m + Z_e (3.61)",
@@ -295,7 +333,15 @@ def judge_rate_transparency(samples: Sequence[Sample]) -> Judgement:
 
 
 def measure_master_damping(changes: Changes) -> Sample:
-    """Roots of the master's polynomial (3.72) without and with damping."""
+    """Compute the stability of the master's polynomial (3.72) and of the whole loop.
+
+    Args:
+        changes: `damping`: damping of the master [N s/m].
+
+    Returns:
+        Unstable fraction of random polynomials, number of unstable poles, and whether a simulated
+        kick decays.
+    """
     given = read_settings(changes, damping=0.0)
     rng = np.random.default_rng(372)
     control, mass, unstable = shipped_case().master_control, shipped_case().master.mass, []
@@ -314,26 +360,36 @@ def measure_master_damping(changes: Changes) -> Sample:
 
 
 def judge_master_damping(samples: Sequence[Sample]) -> Judgement:
-    """Judge how often the polynomial without damping is unstable, and the loop without a hand."""
+    """Check the instability of the polynomial without damping and of the loop without a hand."""
     v = samples[0].values
     return Judgement((
         check_exact("unstable fraction of 200 random masters without damping", v["unstable"],
                     (1.0, 1.0), "it can not be stable"),
         check_exact("unstable poles of the whole loop without damping and without a hand",
                     v["poles"], (1.0, np.inf), "it can not be stable"),
-    ), "(3.71) is the master with the slave's channel cut, which is unstable without damping. The"
+    ), "(3.71) describes the master without the slave's channel, which is unstable without"
+       " damping. The"
        " poles of the whole loop of identical sides are the zeros of (3.69), Z_m + C_m/(K_v s) +"
        " C_s, and of Z_m + Z_h + Z_e: the slave's controller damps them",
        "a simulated kick of the whole loop, the master and the hand without damping, "
-       f"{'dies out' if v['kick'] else 'grows'}")  # fmt: skip
+       f"{'decays' if v['kick'] else 'grows'}")  # fmt: skip
 
 
-_TASKS = ((2.0, 150.0, 8000.0), (1.0, 60.0, 1500.0))  # kg, N s/m, N/m of two tasks in turn
-_LATE = 4.0  # s before a task ends, over which its stiffness is judged
+_TASKS = ((2.0, 150.0, 8000.0), (1.0, 60.0, 1500.0))  # two successive tasks [kg], [N s/m], [N/m]
+_LATE = 4.0  # last seconds of a task, in which the stiffness error is evaluated [s]
 
 
 def measure_task_identification(seed: int, changes: Changes) -> Sample:
-    """Mass, damper and spring of a task that changes, by recursive least squares."""
+    """Estimate mass, damper and spring of a changing task by recursive least squares.
+
+    Args:
+        seed: seed of motion and noise.
+        changes: `forgetting`: forgetting factor; `reset`: error over its usual size at which the
+            covariance is reset; `noise`: relative force noise.
+
+    Returns:
+        Largest relative stiffness errors before and after the task changes.
+    """
     given = read_settings(changes, forgetting=0.99, reset=8.0, noise=0.02)
     rng = np.random.default_rng([seed, 374])
     step, n = 0.02, 1000
@@ -367,8 +423,8 @@ def measure_task_identification(seed: int, changes: Changes) -> Sample:
 
 
 def judge_task_identification(samples: Sequence[Sample]) -> Judgement:
-    """Judge the stiffness of both tasks."""
-    reason = "a hand does not notice 23 % of a compliance (Tan 1995); no size is published"
+    """Check the stiffness estimates of both tasks."""
+    reason = "23 % of a compliance is not noticeable (Tan 1995); no size is published"
     return Judgement(
         tuple(
             check_mean(f"largest relative error of the stiffness in the last {_LATE:g} s"
@@ -376,8 +432,8 @@ def judge_task_identification(samples: Sequence[Sample]) -> Judgement:
                        (-np.inf, NOTICED_DIFFERENCE), reason)
             for name, words in (("before", "before"), ("after", "after"))
         ),
-        note=f"after the change {format_values(samples, 'after', 100.0)} %, forgetting 0.99 per"
-        " 20 ms and resetting at 8 times the usual error",
+        note=f"after the change {format_values(samples, 'after', 100.0)} %, with forgetting factor"
+        " 0.99 per 20 ms and resetting at 8 times the usual error",
     )  # fmt: skip
 
 

@@ -1,9 +1,8 @@
 """Zhu 1994, pages 28 to 37: the two-port, its passivity and stability, direct force.
 
-All rows but the one of a pressing excavator are computed with the numbers of
-`teleop/cat215_axis.yaml`. Sides that the document calls identical both have the master's numbers.
-Nothing is random but the cases that are drawn from a fixed seed, so that most experiments have one
-repetition.
+All rows except that of a pressing excavator use the parameters of `teleop/cat215_axis.yaml`. If the
+document assumes identical sides, both have the master's parameters. Random cases have a fixed seed,
+so that most experiments have one repetition.
 """
 
 import dataclasses
@@ -36,34 +35,34 @@ from hydrotele.teleop.two_port import (
 )
 
 ROUNDING = (0.0, 1e-9)
-"""Accepted relative error of a formula that is computed in two ways."""
-HAND_FREQUENCIES = 2.0 * np.pi * np.geomspace(0.1, 5.0, 60)  # rad/s, what a hand moves
+"""Accepted relative difference between two computations of the same quantity."""
+HAND_FREQUENCIES = 2.0 * np.pi * np.geomspace(0.1, 5.0, 60)  # rad/s, bandwidth of a human hand
 WIDE_FREQUENCIES = 2.0 * np.pi * np.geomspace(1e-3, 1e3, 2000)  # rad/s
-NOTICED_DIFFERENCE = 0.23  # relative difference of a compliance that a hand notices; Tan 1995
-PASSIVE_NORM = 1.0 + 1e-9  # scattering norm, with rounding
+NOTICED_DIFFERENCE = 0.23  # just noticeable relative difference of a compliance; Tan 1995
+PASSIVE_NORM = 1.0 + 1e-9  # largest scattering norm of a passive two-port, with rounding
 
 
 def read_settings(changes: Changes, **defaults: float) -> dict[str, float]:
-    """Settings of an experiment with its changes.
+    """Return the default settings of an experiment with changes applied.
 
     Args:
-        changes: setting -> value.
-        **defaults: all settings.
+        changes: changed setting -> value.
+        **defaults: all settings with their default values.
 
     Returns:
         Setting -> value.
 
     Raises:
-        InputError: a setting is not known.
+        InputError: a changed key is not a setting.
     """
     if unknown := sorted(set(changes) - set(defaults)):
         known = ", ".join(defaults) or "none"
-        raise InputError("changes", f"{', '.join(unknown)} unknown; there are: {known}")
+        raise InputError("changes", f"{', '.join(unknown)} unknown; valid: {known}")
     return defaults | dict(changes)
 
 
 def exact_experiment(name: str, measure: Callable[[Changes], Sample], *claims: Claim) -> Experiment:
-    """An experiment in which nothing is random."""
+    """Return an experiment without randomness, which is run once."""
     return Experiment(name, partial(_measure_once, measure), claims, repetitions_fixed=1)
 
 
@@ -72,23 +71,23 @@ def _measure_once(measure: Callable[[Changes], Sample], seed: int, changes: Chan
 
 
 def shipped_case() -> Case:
-    """The axis of `cat215_axis.yaml` without delay."""
+    """Load the teleoperator axis of `cat215_axis.yaml` without delay."""
     return load_teleop_case().case().with_delay(0.0)
 
 
 def identical_case() -> Case:
-    """The same with the master's numbers on both sides."""
+    """Return the shipped case with the master's parameters on both sides."""
     case = shipped_case()
     return dataclasses.replace(case, slave=case.master, slave_control=case.master_control)
 
 
 def constant_block(value: float) -> Callable[[np.ndarray], np.ndarray]:
-    """A transfer function that is a number."""
+    """Return a constant transfer function."""
     return lambda s: np.full_like(s, value)
 
 
 def relative_error(found: np.ndarray, expected: np.ndarray) -> float:
-    """Largest difference over the largest expected size."""
+    """Return the largest difference relative to the largest expected magnitude."""
     return float(np.abs(found - expected).max() / np.abs(expected).max())
 
 
@@ -96,7 +95,14 @@ def relative_error(found: np.ndarray, expected: np.ndarray) -> float:
 
 
 def measure_hybrid_matrix(changes: Changes) -> Sample:
-    """Hybrid matrix and felt impedance against the equations of Fig. 3.13, solved numerically."""
+    """Compare hybrid matrix and felt impedance with a numerical solution of Fig. 3.13.
+
+    Args:
+        changes: `velocity_back_sign`: sign of the returned velocity in the numerical solution.
+
+    Returns:
+        Relative errors of both formulas.
+    """
     given = read_settings(changes, velocity_back_sign=1.0)
     rng = np.random.default_rng(313)
     errors = {"matrix": 0.0, "felt": 0.0}
@@ -123,8 +129,8 @@ def measure_hybrid_matrix(changes: Changes) -> Sample:
 
 
 def judge_hybrid_matrix(samples: Sequence[Sample]) -> Judgement:
-    """Judge both formulas."""
-    values, reason = samples[0].values, "rounding: two ways to solve the same equations"
+    """Check both formulas."""
+    values, reason = samples[0].values, "rounding: two solutions of the same equations"
     return Judgement((
         check_exact("largest relative error of the hybrid matrix (3.11)", values["matrix"],
                     ROUNDING, reason),
@@ -133,7 +139,14 @@ def judge_hybrid_matrix(samples: Sequence[Sample]) -> Judgement:
 
 
 def measure_delayed_channel(changes: Changes) -> Sample:
-    """Scattering norm of a channel that only delays force and velocity."""
+    """Compute the scattering norm of a channel that only delays force and velocity.
+
+    Args:
+        changes: `wave_impedance`: 1 for a lossless transmission line instead.
+
+    Returns:
+        `least`: smallest norm over the delays; `lossless`: largest norm of the lossless line.
+    """
     given = read_settings(changes, wave_impedance=0.0)
     delays = np.array([1e-3, 1e-2, 5e-2, 0.2, 1.0, 5.0])
     s = 1j * np.geomspace(0.05, 500.0, 4001)
@@ -148,18 +161,18 @@ def measure_delayed_channel(changes: Changes) -> Sample:
         lossless.append(hybrid_scattering_norm(line).max())
         norms.append(hybrid_scattering_norm(line if given["wave_impedance"] else plain).max())
     return Sample({"least": min(norms), "lossless": max(lossless)}, (
-        Panel("largest scattering norm [1]", delays, {"force and velocity sent as they are":
+        Panel("largest scattering norm [1]", delays, {"delayed force and velocity":
               np.array(norms), "lossless line": np.array(lossless)}, "delay [s]", True, True),
     ))  # fmt: skip
 
 
 def judge_delayed_channel(samples: Sequence[Sample]) -> Judgement:
-    """Judge the smallest norm over the delays."""
+    """Check that the norm exceeds 1 for all delays."""
     values = samples[0].values
     return Judgement(
         (check_exact("smallest over six delays from 1 ms to 5 s of the largest scattering norm",
                      values["least"], (PASSIVE_NORM, np.inf), "above 1 is not passive (3.6)"),),
-        note=f"the lossless line of the same delays has {values['lossless']:.3g}",
+        note=f"a lossless line with the same delays has {values['lossless']:.3g}",
     )  # fmt: skip
 
 
@@ -167,7 +180,14 @@ _DELAYS, _FACTORS = np.array([0.0, 0.02, 0.1]), np.array([0.1, 1.0, 5.0, 30.0])
 
 
 def measure_nyquist(changes: Changes) -> Sample:
-    """Stability by the argument principle against a simulated kick, six structures."""
+    """Compare stability by the argument principle with a simulated kick for four structures.
+
+    Args:
+        changes: `simulated_task`: stiffness factor of the simulated task.
+
+    Returns:
+        `fraction` of loops that agree, and number of loops `cells`.
+    """
     given = read_settings(changes, simulated_task=1.0)
     case, right, cells = shipped_case(), 0, 0
     real = dataclasses.replace(
@@ -184,7 +204,7 @@ def measure_nyquist(changes: Changes) -> Sample:
 
 
 def judge_nyquist(samples: Sequence[Sample]) -> Judgement:
-    """Judge the fraction of the cells."""
+    """Check that criterion and simulation agree for all loops."""
     values = samples[0].values
     return Judgement((
         check_exact(f"fraction of {values['cells']:.0f} loops (four structures, three delays, four"
@@ -197,7 +217,15 @@ def judge_nyquist(samples: Sequence[Sample]) -> Judgement:
 
 
 def measure_coordinating_force(changes: Changes) -> Sample:
-    """Scattering norm of the position-position structure, and its mechanical equivalent."""
+    """Compare the position-position structure with its mechanical equivalent.
+
+    Args:
+        changes: `slave_gain`: gain of the slave's over the master's controller; `coupling_gain`:
+            factor of spring and damper of the equivalent.
+
+    Returns:
+        `norm`: largest scattering norm; `difference`: relative difference of hybrid matrices.
+    """
     given = read_settings(changes, slave_gain=1.0, coupling_gain=1.0)
     case = identical_case()
     control, k = case.master_control, given["slave_gain"]
@@ -217,7 +245,7 @@ def measure_coordinating_force(changes: Changes) -> Sample:
 
 
 def judge_passive_coupling(samples: Sequence[Sample]) -> Judgement:
-    """Judge the scattering norm."""
+    """Check the passivity by the scattering norm."""
     return Judgement((
         check_exact("largest scattering norm, 1 mHz to 1 kHz", samples[0].values["norm"],
                     (0.0, PASSIVE_NORM), "passive (3.6), with rounding"),
@@ -225,21 +253,28 @@ def judge_passive_coupling(samples: Sequence[Sample]) -> Judgement:
 
 
 def judge_mechanical_equivalent(samples: Sequence[Sample]) -> Judgement:
-    """Judge the difference of the two hybrid matrices."""
+    """Check that both hybrid matrices are equal."""
     return Judgement((
         check_exact("largest relative difference of the hybrid matrices",
                     samples[0].values["difference"], ROUNDING, "rounding"),
     ))  # fmt: skip
 
 
-_DURATION = 16.0  # s of the first target, 20 kN
+_DURATION = 16.0  # duration of the first target, 20 kN [s]
 
 
 def measure_pressing(seed: int, changes: Changes) -> Sample:
-    """Position error that a contact force causes against the noise of the measured position.
+    """Compare the position error due to a contact force with the measurement noise.
 
-    The excavator presses with 20 kN under stiffness feedback. Also the joystick's stiffness
-    against (4.1).
+    The excavator presses with 20 kN under stiffness feedback. The joystick's stiffness is also
+    compared with (4.1).
+
+    Args:
+        seed: seed of operator and sensor noise.
+        changes: scenario keys.
+
+    Returns:
+        Position error and noise [m], their ratio, contact force [N], and relative stiffness error.
     """
     keys = {"duration": str(_DURATION)} | operator_changes(seed) | dict(changes)
     scenario, run = run_shipped("press_stiffness", keys)
@@ -264,28 +299,35 @@ def measure_pressing(seed: int, changes: Changes) -> Sample:
 
 
 def judge_position_error(samples: Sequence[Sample]) -> Judgement:
-    """Judge the position error over the noise."""
+    """Check that the position error is smaller than the noise."""
     return Judgement(
-        (check_mean("position error that the contact causes over the RMS noise of the measured"
+        (check_mean("position error due to contact over the RMS noise of the measured"
                     " position", collect(samples, "ratio"), (-np.inf, 1.0),
                     "smaller than the noise"),),
         note=f"{format_values(samples, 'shift', 1e3)} mm with"
         f" {format_values(samples, 'force', 1e-3)} kN; noise {format_values(samples, 'noise', 1e3)}"
-        " mm, that of the angle sensors of khoshzaban1992",
+        " mm, from the angle sensors of khoshzaban1992",
     )  # fmt: skip
 
 
 def judge_stiffness_law(samples: Sequence[Sample]) -> Judgement:
-    """Judge the joystick's stiffness against (4.1) with the numbers of Tables 6.7 and 6.8."""
+    """Compare the joystick's stiffness with (4.1) and the values of Tables 6.7 and 6.8."""
     return Judgement((
         check_mean("RMS difference of the stiffness along z from (4.1), relative",
                    collect(samples, "law"), (-np.inf, 0.05),
-                   "force and stiffness are logged up to a period of 20 ms apart"),
+                   "log times of force and stiffness differ by up to 20 ms"),
     ))  # fmt: skip
 
 
 def measure_direct_force(changes: Changes) -> Sample:
-    """Largest factor on the reflected force for which the loop is stable."""
+    """Compute the largest stable factor of the reflected force under rate and position control.
+
+    Args:
+        changes: `task`: factor of the task's impedance.
+
+    Returns:
+        Gain margins without delay and with 20 ms each way.
+    """
     given = read_settings(changes, task=1.0)
     case, k = shipped_case(), given["task"]
     task = Impedance(0.0, k * case.task.damping, k * case.task.stiffness)
@@ -300,36 +342,43 @@ def measure_direct_force(changes: Changes) -> Sample:
 
 
 def judge_rate_force(samples: Sequence[Sample]) -> Judgement:
-    """Judge whether rate control without delay has a limit, and a smaller one than position."""
+    """Check that rate control has a limit without delay that is below that of position control."""
     v = samples[0].values
     ratio = v["rate"] / v["position"]
     return Judgement(
         (
-            check_exact("largest stable factor on the reflected force under rate control, without"
+            check_exact("largest stable factor of the reflected force under rate control, without"
                         " delay", v["rate"], (0.0, 100.0), "a limit exists; 100 times the shipped"
-                        " reflection, 450 N in the hand for 25 kN, counts as none"),
+                        " reflection, 450 N in the hand for 25 kN, counts as no limit"),
             check_exact("the same over that of position control", ratio, (0.0, 1.0 - 1e-9),
-                        "rate control is the less stable one"),
+                        "rate control is less stable"),
         ),
         note=f"with 20 ms each way {v['late_rate']:.2f} under rate control,"
-        f" {v['late_position']:.2f} under position control: with delay position control is the less"
-        " stable one at these gains",
+        f" {v['late_position']:.2f} under position control: with delay position control is less"
+        " stable at these gains",
     )  # fmt: skip
 
 
 def judge_position_force(samples: Sequence[Sample]) -> Judgement:
-    """Judge whether direct force under position control has a limit that a smaller gain keeps."""
+    """Check that position control with direct force is unstable but stable with a smaller gain."""
     v = samples[0].values
     return Judgement(
-        (check_exact("largest stable factor on the reflected force under position control, 20 ms"
+        (check_exact("largest stable factor of the reflected force under position control, 20 ms"
                      " each way", v["late_position"], (1e-9, 1.0 - 1e-9),
-                     "unstable as it is shipped, and a smaller gain makes it stable"),),
+                     "unstable with the shipped gain, stable with a smaller gain"),),
         note=f"without delay: {v['position']:.3g}",
     )  # fmt: skip
 
 
 def measure_opacity(changes: Changes) -> Sample:
-    """How far the felt impedance is from the task's, over what a hand moves."""
+    """Compute the relative difference of felt and task impedance at hand frequencies.
+
+    Args:
+        changes: `transparent`: 1 for the transparent four-channel structure.
+
+    Returns:
+        Largest relative difference of each structure.
+    """
     given = read_settings(changes, transparent=0.0)
     case, s, values, curves = shipped_case(), 1j * HAND_FREQUENCIES, {}, {}
     names = {"position_position": "position_position", "position_force": "position_force",
@@ -352,7 +401,7 @@ def _judge_opacity(*structures: str) -> Callable[[Sequence[Sample]], Judgement]:
             check_exact(
                 f"largest relative difference of the felt and the task's impedance,"
                 f" {name.replace('_', '-')}", samples[0].values[name], (NOTICED_DIFFERENCE, np.inf),
-                "a hand notices 23 % of a compliance (Tan 1995)",
+                "23 % of a compliance is noticeable (Tan 1995)",
             ) for name in structures
         ))  # fmt: skip
 
@@ -363,7 +412,7 @@ def make_claim(
     name: str, quote: str, item: str, judge: Callable[[Sequence[Sample]], Judgement],
     broken: Changes | None, broken_how: str, kind: Kind = "document",
 ) -> Claim:  # fmt: skip
-    """A claim with the arguments in the order in which a reader wants them."""
+    """Return a claim; the arguments have the order name, statement, source, evaluation, fault."""
     return Claim(name, quote, item, kind, judge, broken, broken_how)
 
 
@@ -372,20 +421,20 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         "general structure: hybrid matrix",
         '"The hybrid matrix of this two-port teleoperator system can be easily derived" (3.11,'
         " 3.12)", "p. 30, Fig. 3.13", judge_hybrid_matrix, {"velocity_back_sign": -1.0},
-        "the velocity that comes back has the wrong sign in the equations",
+        "the returned velocity has the wrong sign in the equations",
     )),
     exact_experiment("delayed channel", measure_delayed_channel, make_claim(
         "delay: not passive",
         '"It can be shown that the standard method of communicating forces and velocity between the'
         ' master and slave in a teleoperator system leads to a nonpassive system for any time'
         ' delay."', "p. 28, Eq. 3.8", judge_delayed_channel, {"wave_impedance": 1.0},
-        "a lossless line in place of the plain channel",
+        "a lossless line instead of the delayed channel",
     )),
     exact_experiment("Nyquist criterion", measure_nyquist, make_claim(
         "closed-loop stability by the loop transfer functions",
         'the Nyquist plots of LG1 and LG2 "can not encircle the critical point" for a stable'
         " system", "p. 31, Fig. 3.14", judge_nyquist, {"simulated_task": 0.01},
-        "the simulated task is a hundred times softer than the one of the criterion",
+        "the simulated task is a hundred times softer than that of the criterion",
     )),
     exact_experiment("coordinating force", measure_coordinating_force, make_claim(
         "position-position structure: passive",

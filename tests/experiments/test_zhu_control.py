@@ -63,7 +63,7 @@ def test_claims_can_be_broken_and_begin_with_their_page():
     assert len(CLAIMS) == sum(len(one.claims) for one in EXPERIMENTS)
     for _, claim in CLAIMS.values():
         additional = claim.kind == "additional"
-        assert claim.item.startswith("beyond" if additional else "p. "), claim.name
+        assert claim.item.startswith("additional" if additional else "p. "), claim.name
         if claim.kind in ("document", "additional"):
             assert claim.broken is not None and claim.broken_how, claim.name
 
@@ -91,7 +91,7 @@ def test_drawn_rows_agree_and_differ_when_broken(name):
 
 
 def test_unknown_changes_are_refused():
-    with pytest.raises(InputError, match="there are: failures, remove"):
+    with pytest.raises(InputError, match="valid: failures, remove"):
         measure_outliers(1, {"remove_outliers": True})
     with pytest.raises(InputError, match="unknown"):
         read_settings({"delay": 1.0}, damping=2.0)
