@@ -445,7 +445,7 @@ def load_script(path: str | Path) -> Script:
     """
     path = Path(path)
     if not path.is_file():
-        raise InputError(path, "not found; give a .csv or .yaml file after scripted:")
+        raise InputError(path, "no such file; give a .csv or .yaml file after scripted:")
     if path.suffix.lower() in (".yaml", ".yml"):
         data, lines = read_yaml(path)
         return parse(Script, data, str(path), lines)
