@@ -116,7 +116,7 @@ def split_and_stuck(folder):
 def test_stuck_sensor_and_files_with_unlike_clocks_are_seen(tmp_path):
     data = split_and_stuck(tmp_path)
     assert len([note for note in data.notes if "-2.5 s" in note]) == 4
-    assert any(note.startswith("fit_1: angle.boom is stuck") for note in data.notes)
+    assert any(note.startswith("fit_1: angle.boom is frozen") for note in data.notes)
     (stuck,) = [run for run in data.fit if run.name == "fit_1"]
     angle = stuck.reading[:, data.channels.index("angle.boom")]
     assert np.isnan(angle).any() and not np.isnan(angle).all()  # within the half that is fitted
