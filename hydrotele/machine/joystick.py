@@ -134,7 +134,7 @@ class HandFacts(Facts):
 
 
 class Principal(NamedTuple):
-    """Principal values of a symmetric 2 x 2 matrix, and the angle of its major axis from x [rad]."""
+    """Principal values of a symmetric 2 x 2 matrix; angle of its major axis from x [rad]."""
 
     least: float
     greatest: float

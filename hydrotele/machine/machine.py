@@ -532,7 +532,7 @@ def sensor_set(machine: Machine, name: str) -> SensorSet | None:
 
 
 def channel_sensor(machine: Machine, sensors: SensorSet | None, channel: str) -> Sensor:
-    """Return the sensor of a channel; the default span of a length is the stroke of its cylinder."""
+    """Return the sensor of a channel; the default span of a length is the cylinder's stroke."""
     if sensors is None:
         return Sensor()
     kind, _, axis = channel.partition(".")

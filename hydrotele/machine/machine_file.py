@@ -1,5 +1,4 @@
-"""Read and write machine files: `load_machine` reads machine.yaml and its MJCF, `save_machine`
-writes one.
+"""Read and write machine files (machine.yaml and its MJCF).
 
 A user machine is a folder with `machine.yaml` and usually an MJCF file; the package needs no
 change. Link data that the YAML file does not contain are taken from the MJCF body of the same name.
@@ -126,7 +125,7 @@ def save_machine(machine: Machine, path: str | Path) -> None:
 
 
 def _with_law_files(machine: Machine, folder: Path) -> Machine:
-    """Copy the files that define laws of terms into a folder; return the machine that names them."""
+    """Copy files that define laws of terms into a folder; return the machine with their names."""
     terms = []
     for term in machine.terms:
         source = LAWS[term.law].source
@@ -203,9 +202,7 @@ def _merge_tool(data: dict, tool: str, fragment: dict, path: Path, lines) -> dic
         if isinstance(entries, dict) and isinstance(data.get(section), dict):
             if section in ("links", "axes", "closures"):
                 for twice in entries.keys() & data[section]:
-                    message = (
-                        "already exists in the machine; give the entry of the tool another name"
-                    )
+                    message = "already exists in the machine; use another name in the tool"
                     raise InputError(_place(path, lines, *old, str(twice)), message)
             entries = {**data[section], **entries}
         data[section] = entries
@@ -213,7 +210,7 @@ def _merge_tool(data: dict, tool: str, fragment: dict, path: Path, lines) -> dic
 
 
 def _entries(data: dict, section: str) -> dict:
-    """Return the named entries of a section; empty if it is not a mapping, as validation reports."""
+    """Return the named entries of a section; empty if the section is not a mapping."""
     entries = data.get(section)
     if not isinstance(entries, dict):
         return {}

@@ -172,7 +172,7 @@ def parse_channel(name: str) -> Channel:
         raise ValueError(f"{kind} has no axis: write {channel_name(kind, truth=truth)}")
     if spec.axes == "free" and not _AXIS.fullmatch(axis):
         example = channel_name(kind, "boom", truth=truth)
-        raise ValueError(f"{kind} needs a lower-case axis, such as {example}, got {name!r}")
+        raise ValueError(f"{kind} needs an axis in lower case, such as {example}, got {name!r}")
     if spec.axes == "xyz" and axis not in ("x", "y", "z"):
         raise ValueError(f"{kind} has the components x, y and z, got {name!r}")
     return Channel(kind, axis, truth)
