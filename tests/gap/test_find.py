@@ -312,7 +312,7 @@ def test_effects_that_make_the_held_out_run_worse_are_taken_back_and_laws_learne
     monkeypatch.setattr(find, "hypotheses", lambda m, names: hypotheses(m, ("valve_gain",)))
     gap = find_gap(half(MEASURED / "open_04", 10.0))
     assert gap.verdict == "no_gap" and not gap.effects
-    assert sum("held-out run worse" in note for note in gap.notes) == 1
+    assert sum("increase the errors on the held-out run" in note for note in gap.notes) == 1
     gain = ["valve_gain.boom.ratio"]  # which cannot be believed: laws are tried without it, too
     assert learned_of == ([[], gain, []] if after_laws else [[]])
     assert gap.patched == gap.machine
