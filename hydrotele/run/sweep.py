@@ -651,7 +651,7 @@ def _keep(base: Base, target: Path, point: Point, outcome: Outcome) -> None:
 
 
 def _save_timings(entries: dict[int, Entry], path: Path) -> None:
-    """Write the computing times, which differ between equal runs, to a file of their own."""
+    """Write the computing times, which differ between equal runs, to a separate CSV file."""
     with replacing(path, ".csv") as part, open(part, "w", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(["run", "wall [s]"])

@@ -98,10 +98,14 @@ def test_a_partly_named_gap_says_what_is_named_learned_and_left(gap_of):
     )
     words = text_of(gap)
     for piece in (
-        "one place with an identified effect", "Without it, 63 % of the gap on run test_1 reappears",
-        "2 uncertain parameters were calibrated", "valve gain of the boom: ratio 104.00 % (model 100)",
-        "unexplained residual is in the balance of forces", "One law was learned", "With all these changes",
-    ):  # fmt: skip
+        "one place with an identified effect",
+        "Without it, 63 % of the gap on run test_1 reappears",
+        "2 uncertain parameters were calibrated",
+        "valve gain of the boom: ratio 104.00 % (model 100)",
+        "unexplained residual is in the balance of forces",
+        "One law was learned",
+        "With all these changes",
+    ):
         assert piece in words, piece
 
 
