@@ -164,7 +164,7 @@ class Closure(Facts):
 
 UNLIMITED_FLOW = 1.0e3  # m^3/s, exceeds any demand: flow of a supply without a limit
 _STOP_GIVES = 1.0e-3  # m: elongation of tube, gland and pins at the largest cylinder force
-_STOP_TURNS = 2.0e-3  # rad: compliance of a rotary drive at its largest torque
+_STOP_TURNS = 2.0e-3  # rad: deformation of a rotary drive at its largest torque
 _STOP_RETARDATION = 5.0e-3  # s: damps a 75 rad/s oscillation of a boom within two periods
 
 

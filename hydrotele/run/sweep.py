@@ -272,7 +272,7 @@ def _outcome(distributed, future, run: int) -> Outcome:
 
 KIND = "sweep"
 SCRATCH = ".scratch"
-_FREE = ("name", "description", "figures", "scenario")  # no effect on the result of a run
+_FREE = ("name", "description", "figures", "scenario")  # the digest covers the scenario content
 _MAKERS = ("mujoco", "dm-control", "numpy", "scipy", "numba")  # packages that affect results
 
 
