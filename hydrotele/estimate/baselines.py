@@ -260,8 +260,8 @@ def _samples(data: Dataset) -> tuple[_Scales, np.ndarray, np.ndarray]:
     if known.sum() < _LEAST:
         raise InputError(
             "the baseline",
-            f"has {known.sum()} samples in which all channels were read, {_LEAST} are needed:"
-            " give more runs, or logs with fewer gaps",
+            f"has {known.sum()} samples with readings of all channels, {_LEAST} are needed:"
+            " use more runs, or logs with fewer gaps",
         )
     return scales, seen[known], told[known]
 

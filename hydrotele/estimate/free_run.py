@@ -251,7 +251,7 @@ def window_starts(rows: int, period: float, seconds: float) -> np.ndarray:
     if count < 1:
         raise InputError(
             f"a horizon of {seconds:g} s",
-            f"is shorter than a row of the log: give {period:g} s or more",
+            f"is shorter than a log row: use at least {period:g} s",
         )
     last = rows - 1 - count
     first = round(SETTLE / period)

@@ -394,7 +394,7 @@ def fit_free_runs(
         InputError: the guess has no parameters, or no window fits into the runs.
     """
     if not len(guess.deviation):
-        raise InputError("the guess", "has no parameters to fit: add a hypothesis or numbers")
+        raise InputError("the hypothesis", "has no parameters to fit: add an effect or parameters")
     windows = free_run_windows(data.fit, seconds, most)
     fewer = sorted({max(1, min(k, len(windows) // _FEWEST)) for k in _LOOKS_AT}, reverse=True)
     with ThreadPoolExecutor(jobs) as pool:
@@ -455,7 +455,7 @@ def free_run_windows(
     if not found:
         raise InputError(
             "the runs to fit",
-            f"have no {LEAD + seconds:g} s in which anything moves: give longer runs, or a shorter"
+            f"contain no interval of {LEAD + seconds:g} s with motion: use longer runs or a shorter"
             " window",
         )
     every = np.linspace(0, len(found) - 1, min(most, len(found)))
@@ -552,7 +552,7 @@ def _fit(
         if after < before:
             now, scale = fresh, _scales(fresh.errors, problem.windows)
         count = len(problem.windows)
-        say(f"free runs through {count} windows: loss falls from {before:.1f} to {after:.1f}")
+        say(f"open-loop fit, {count} windows: loss decreases from {before:.1f} to {after:.1f}")
     return now, taken, converged
 
 

@@ -33,6 +33,9 @@ from hydrotele.terms.law import OF_A_DRIVE
 from hydrotele.terms.table import SWITCH
 
 _PLAYED, _AHEAD = "played ", "lead of the "  # of a variable and its play
+_FRONT_WORDS = {
+    "": "", _PLAYED: "backlash output of the ", _AHEAD: "backlash difference of the ",
+}  # fmt: skip
 _PLACES = {"tool": "at the tool", "base": "of the base", "all": "of all axes"}
 _SIDES = {"head": "head side", "rod": "rod side"}
 _COUNTS = ("no place", "one place", "two places", "three places", "four places")
@@ -52,7 +55,7 @@ _LACKS = {
     "flow_rod": "an oil flow into the {axis} rod side",
     "flow_through": "an oil flow from the {axis} head side to its rod side",
     "command": "a signal added to the {axis} command",
-    "flow_supply": "a flow of the pump",
+    "flow_supply": "an additional pump flow",
 }
 _VARIABLES = {
     "time": "time", "position": "position", "velocity": "velocity", "command": "command",
@@ -71,10 +74,10 @@ _LAWS = {
     "flow_head": "the balance of oil flows on the head side",
     "flow_rod": "the balance of oil flows on the rod side",
     "closure": "the geometry of the linkage",
-    "motion": "how the axis moves",
+    "motion": "the motion of the axis",
     "geometry": "the geometry of the linkage",
     "timing": "the timing of the signals",
-    "sensor": "what the sensors read",
+    "sensor": "the sensor readings",
 }
 
 
@@ -97,12 +100,12 @@ def variable_words(variable: str) -> str:
     """A variable of a learned law in plain words.
 
     >>> variable_words("pressure_rod.swing"), variable_words("played velocity")
-    ('rod side pressure of the swing', 'played velocity')
+    ('rod side pressure of the swing', 'backlash output of the velocity')
     """
     name, _, axis = variable.partition(".")
     front = next((front for front in (_PLAYED, _AHEAD) if name.startswith(front)), "")
     plain = name.removeprefix(front)
-    words = front + _VARIABLES.get(plain, plain.replace("_", " "))
+    words = _FRONT_WORDS[front] + _VARIABLES.get(plain, plain.replace("_", " "))
     return f"{words} of the {axis}" if axis else words
 
 
@@ -128,16 +131,16 @@ def memory_words(memory: Memory, unit: str) -> str:
     """What a learned law remembers, in a few words.
 
     >>> memory_words(Memory(1, "velocity", 0.0, 0.02), "m/s")
-    'velocity through a play of 20 mm/s to either side'
+    'with a backlash of 20 mm/s half width in the velocity'
     >>> memory_words(Memory(SWITCH, "pressure_rod.boom", 8e6, 1.2e7), "Pa")
-    'on once the rod side pressure of the boom is above 12 MPa, off again below 8 MPa'
+    'switched on when the rod side pressure of the boom is above 12 MPa, and off below 8 MPa'
     """
     what, first = variable_words(memory.variable), amount(memory.end, unit)
     if memory.way != SWITCH:
-        return f"{what} through a play of {first} to either side"
+        return f"with a backlash of {first} half width in the {what}"
     ways = ("above", "below") if memory.end > memory.begin else ("below", "above")
     last = amount(memory.begin, unit)
-    return f"on once the {what} is {ways[0]} {first}, off again {ways[1]} {last}"
+    return f"switched on when the {what} is {ways[0]} {first}, and off {ways[1]} {last}"
 
 
 def learned_title(law: LearnedLaw) -> str:
@@ -152,10 +155,10 @@ def lack_words(lack: Lack) -> str:
     """What a model lacks in one balance.
 
     >>> lack_words(Lack("flow_head", "boom", 2e-4, "m^3/s", 0.05))
-    'The model lacks an oil flow into the boom head side of 12 L/min (standard deviation).'
+    'Missing in the model: an oil flow into the boom head side of 12 L/min (standard deviation).'
     """
     what = _LACKS[lack.balance].format(axis=lack.axis)
-    return f"The model lacks {what} of {amount(lack.size, lack.unit)} (standard deviation)."
+    return f"Missing in the model: {what} of {amount(lack.size, lack.unit)} (standard deviation)."
 
 
 def number_title(key: str) -> str:
@@ -199,12 +202,12 @@ def parameter_words(name: str, estimate: Estimate) -> str:
     """A parameter with its interval and what the model has.
 
     >>> parameter_words("mass", Estimate(251.2, "kg", 247.9, 254.5, 0.0))
-    'mass 251.2 kg (95 % sure between 247.9 and 254.5 kg; the model has 0 kg)'
+    'mass 251.2 kg (95 % interval 247.9 to 254.5 kg; the model has 0 kg)'
     """
     s = in_customary_units(estimate, name)
-    sure = f"95 % sure between {s.low} and {s.high} {s.unit}"
+    sure = f"95 % interval {s.low} to {s.high} {s.unit}"
     if "-" in (s.low, s.high):
-        sure = "no interval can be given"
+        sure = "no interval available"
     model = "" if s.nominal == "-" else f"; the model has {s.nominal} {s.unit}"
     return f"{name.replace('_', ' ')} {s.value} {s.unit} ({sure}{model})"
 
@@ -242,15 +245,16 @@ def gap_closed(size: GapSize) -> float:
 def headline(gap: Gap) -> str:
     """The verdict in one line."""
     if gap.verdict == "no_gap":
-        within = " within the uncertainty of its numbers" if gap.calibration else ""
+        within = " within the uncertainty of its parameters" if gap.calibration else ""
         return f"Model and machine agree{within}"
     if gap.verdict == "partly":
-        return _capital("; ".join([*map(_brief, gap.effects), "the rest has no known cause"]))
+        remainder = "the remaining difference has no known cause"
+        return _capital("; ".join([*map(_brief, gap.effects), remainder]))
     if gap.verdict == "unknown" or not gap.effects:
         likely = (e for e in gap.effects if e.mechanism_probability > LIKELY)
         known = " and ".join(map(effect_title, likely))
-        also = f", besides {known}" if known else ""
-        return f"Model and machine disagree in a way that no known effect explains{also}"
+        also = f"apart from {known}, " if known else ""
+        return f"Model and machine differ; {also}no known effect explains the difference"
     titles = [effect_title(effect) for effect in gap.effects]
     if gap.verdict == "ambiguous":
         unsure = _unsure(gap)
@@ -264,7 +268,7 @@ def headline(gap: Gap) -> str:
 def verdict_words(gap: Gap) -> tuple[str, ...]:
     """The verdict in a few sentences, one text per thought."""
     if gap.verdict == "no_gap":
-        rest = _calibrated(gap) or ("Nothing in the model needs to change.",)
+        rest = _calibrated(gap) or ("The model needs no change.",)
         return (_agreement(gap), *rest)
     if gap.verdict == "unknown":
         return (
@@ -274,9 +278,11 @@ def verdict_words(gap: Gap) -> tuple[str, ...]:
     where = _COUNTS[count] if count < len(_COUNTS) else f"{count} places"
     first = f"The machine differs from its model in {where}."
     if gap.verdict == "ambiguous":
-        first = f"{first[:-1]}, but these data do not settle which effect it is."
+        first = f"{first[:-1]}, but these data do not determine which effect it is."
     if gap.verdict == "partly":
-        first = f"{first[:-1]} that can be named, and in a way that no known effect explains."
+        first = (
+            f"{first[:-1]} with an identified effect; the remaining difference has no known cause."
+        )
     rivals = _rivals(gap)
     rest = (*_calibrated(gap), *_shrinking(gap), *rivals, *_leftover(gap), *_experiment(gap))
     return (first, *_effects(gap), *rest)
@@ -309,7 +315,7 @@ def _effect(effect: NamedEffect, run: str) -> str:
     what = f"{effect_title(effect)} ({known.sentence})" if known else effect_title(effect)
     text = _capital(f"{what}: {facts}. Probability {probability_text(effect.probability)}.")
     if math.isfinite(effect.share):
-        text += f" Without it {share_words(effect.share)} of the gap on {run} comes back."
+        text += f" Without it, {share_words(effect.share)} of the gap on {run} reappears."
     return text
 
 
@@ -322,22 +328,22 @@ def _calibrated(gap: Gap) -> tuple[str, ...]:
         for s in [in_customary_units(gap.calibration[key], key.rpartition(".")[2])]
     ]
     count = len(gap.calibration)
-    many = f"{count} uncertain numbers were" if count > 1 else "One uncertain number was"
-    most = f"most moved: {', '.join(told)}"
-    return (f"{many} calibrated within what the machine file allows; {most}.",)
+    many = f"{count} uncertain parameters were" if count > 1 else "One uncertain parameter was"
+    most = f"largest changes: {', '.join(told)}"
+    return (f"{many} calibrated within the limits of the machine file; {most}.",)
 
 
 def _agreement(gap: Gap) -> str:
     size = gap.size
     if gap.calibration:
         return (
-            "There is no gap but for numbers that are known to a few per cent only. With these"
-            f" calibrated, the model's predictions on {_run(gap)}, which was not fitted, are off by"
+            "There is no gap except for the values of uncertain parameters. With these calibrated,"
+            f" the prediction error on {_run(gap)}, which was not fitted, is"
             f" {_times(size.after, size)} instead of {size.before:.2f}."
         )
     return (
-        f"There is no gap: on {_run(gap)}, which was not fitted, the model's predictions are off"
-        f" by {_times(size.before, size)}."
+        f"There is no gap: on {_run(gap)}, which was not fitted, the prediction error of the model"
+        f" is {_times(size.before, size)}."
     )
 
 
@@ -347,24 +353,21 @@ def _shrinking(gap: Gap) -> tuple[str, ...]:
     if not parts:
         return ()
     text = (
-        f"With {'it' if parts == 1 else 'all of this'} in the model, the prediction errors on"
-        f" {_run(gap)}, which was not fitted, go from {size.before:.2f} to"
+        f"With {'this change' if parts == 1 else 'all these changes'} of the model, the prediction"
+        f" error on {_run(gap)}, which was not fitted, changes from {size.before:.2f} to"
         f" {_times(size.after, size)}"
     )
     if size.noise_floor is None:
         return (f"{text}.",)
     if size.before - size.noise_floor < _SLIGHT:
-        return (f"{text}. The effect is weak: it hardly shows in this run.",)
+        return (f"{text}. The effect is weak: it hardly changes the predictions of this run.",)
     return (f"{text}: {100 * max(closed, 0.0):.0f} % of the gap is closed.",)
 
 
 def _times(value: float, size: GapSize) -> str:
     if size.noise_floor is None:
-        return f"{value:.2f} times the sensors' noise"
-    return (
-        f"{value:.2f} times what the sensors alone explain (a perfect model has"
-        f" {size.noise_floor:.2f})"
-    )
+        return f"{value:.2f} times the sensor noise"
+    return f"{value:.2f} times the sensor noise (a perfect model has {size.noise_floor:.2f})"
 
 
 def _rivals(gap: Gap) -> tuple[str, ...]:
@@ -377,13 +380,13 @@ def _rivals(gap: Gap) -> tuple[str, ...]:
         told = [f"{effect_title(a)} ({probability_text(a.probability)})" for a in rivals]
         others = f"{effect_title(effect)} from {_listed(told, 'or')}"
         if form:
-            text = f"Its form is open: these data do not tell {others}."
+            text = f"Its form is not identifiable: these data do not distinguish {others}."
         else:
             text = (
-                f"These data cannot tell {others}: they would look the same to the sensors there"
-                " are."
+                f"These data do not distinguish {others}, because they have the same effect on the"
+                " available sensors."
             )
-        texts.append(f"{text} The patched model has the first of them.")
+        texts.append(f"{text} The patched model contains the first of them.")
     return tuple(texts)
 
 
@@ -393,15 +396,18 @@ def _leftover(gap: Gap) -> tuple[str, ...]:
     if not failed:
         return located
     tests = "test" if len(failed) == 1 else "tests"
-    left = f"Not everything is explained: what is left fails the {tests} {_listed(failed, 'and')}."
+    left = (
+        "The explanation is incomplete: the remaining errors fail the"
+        f" {tests} {_listed(failed, 'and')}."
+    )
     return (left, *located)
 
 
 def _unknown(gap: Gap) -> tuple[str, ...]:
     size = gap.size
     first = (
-        "Model and machine disagree, and no effect that this program knows explains it: on"
-        f" {_run(gap)} the predictions are off by {_times(size.before, size)}."
+        "Model and machine differ, and no known effect explains the difference: on"
+        f" {_run(gap)} the prediction error is {_times(size.before, size)}."
     )
     return (first, *_located(gap))
 
@@ -412,14 +418,15 @@ def _located(gap: Gap) -> tuple[str, ...]:
     if unknown is None:
         return ()
     where = (
-        f"What fails is {law_words(unknown.law)}, seen most in the {channel_words(unknown.channel)}"
+        f"The unexplained residual is in {law_words(unknown.law)}, most visible in the"
+        f" {channel_words(unknown.channel)}"
     )
     if unknown.depends_on:
         on = _listed([channel_words(name) for name in unknown.depends_on], "and")
-        where += f"; it changes with the {on}"
+        where += f"; it depends on the {on}"
     count = len(gap.learned)
     many = "One law was" if count == 1 else f"{count} laws were"
-    learned = f"{many} learned from the data for it and written into the patched machine."
+    learned = f"{many} learned from the data for it and added to the patched machine."
     return (f"{where}.", unknown.description, *([learned] if gap.learned else []))
 
 
@@ -602,8 +609,8 @@ def describe(
         )
         words += [one.description for one in learned]
     if not words:
-        words = ["No balance of forces or flows explains it: look at this sensor, its mounting and"
-                 " the geometry of the linkage."]  # fmt: skip
+        words = ["No missing force or flow explains it: check this sensor, its mounting and the"
+                 " geometry of the linkage."]  # fmt: skip
     return Unknown(law, channel, depends, " ".join(words), term, _windows(after[0], channel))
 
 

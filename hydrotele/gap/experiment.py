@@ -293,47 +293,47 @@ class Motion(NamedTuple):
 MOTIONS: Mapping[str, Motion] = {
     "sweeps": Motion(
         sweeps, False,
-        "Sweep the whole stroke, ends included: an offset stays the same over it, a scale grows"
-        " with it, and a wrong pin or link bends the curve of length over angle.",
+        "Sweep the whole stroke including its ends: an offset is constant over the stroke, a scale"
+        " error grows with it, and a wrong pin or link changes the curve of length over angle.",
     ),
     "steps": Motion(
         steps, False,
-        "Sharp steps of several sizes from rest: a delay shifts the whole response, a slow spool"
-        " rounds its start, a dead band swallows the small ones, a gain scales all alike.",
+        "Command steps of several sizes from rest: a delay shifts the whole response, a slow spool"
+        " smooths its start, a dead band suppresses small steps, a gain scales all steps equally.",
     ),
     "shakes": Motion(
         shakes, False,
-        "Small reversals from slow to fast: a gap costs the same at every speed, a spring more the"
-        " faster it goes, and friction acts at the slow ones too.",
+        "Small reversals from slow to fast: the lost motion of a backlash does not depend on speed,"
+        " that of a spring grows with speed, and friction also acts at low speed.",
     ),
     "reversals": Motion(
         reversals, False,
-        "Back and forth at constant speeds from creeping to fast: Coulomb friction is equal at"
-        " all, viscous grows with speed, Stribeck shows while creeping, an asymmetry in the"
-        " difference of the directions.",
+        "Back and forth at constant speeds from very slow to fast: Coulomb friction is independent"
+        " of speed, viscous friction grows with speed, Stribeck friction acts at very low speed, an"
+        " asymmetry appears as a difference between the directions.",
     ),
     "poses": Motion(
         poses, True,
-        "Rests in folded and stretched poses with fast ways between: weight and its place show at"
-        " rest, inertia while speeding up, a pressure offset in neither alone.",
+        "Rests in folded and stretched poses with fast motions in between: mass and centre of mass"
+        " act at rest, inertia during acceleration, a pressure offset equally in both.",
     ),
     "slews": Motion(
         slews, True,
-        "The stretched arm at rest at headings all around: a tilt of the base changes sign with"
-        " the heading, no friction or offset does.",
+        "Rests of the stretched arm at headings over a full turn: the effect of a base tilt changes"
+        " sign with the heading, unlike friction or an offset.",
     ),
     "stairs": Motion(
         stairs, False,
-        "Steps with full and with empty chambers: soft oil gives with the volume, a soft hose gives"
-        " the same at every stroke.",
+        "Steps with full and with empty chambers: the compliance of oil is proportional to the"
+        " chamber volume, that of a hose does not depend on the stroke.",
     ),
     "holds": Motion(
         holds, False,
-        "Long rests under load with the valves closed: a leak keeps creeping.",
+        "Long rests under load with closed valves: a leak causes a continuous slow motion.",
     ),
     "surges": Motion(
         surges, True,
-        "All axes at once and then none: the pump's flow limits the motion, the relief valve the"
+        "All axes at once, then rest: the pump flow limits the motion, the relief valve limits the"
         " pressure at rest.",
     ),
 }  # fmt: skip

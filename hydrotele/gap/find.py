@@ -56,12 +56,12 @@ PARTLY = 0.3  # share of the gap that named effects must close for the verdict `
 _TRACE, _NEARLY_ALL = 2.0, 0.95  # times a test's limit; share of the gap, see `_failed`
 _WORSE = 1.05  # times the given model's errors on the held-out run: no patch may do more
 _REJECTED = (
-    "What the fitted runs asked for makes {} held-out run worse; it was taken back, and nothing is"
-    " named."
+    "The changes found on the fitted runs increase the errors on {} held-out run; they were"
+    " rejected, and no effect is named."
 )
 _REFUSED = (
-    "A law that the fitted runs asked for makes free runs of the held-out run worse; it was taken"
-    " back."
+    "A law learned from the fitted runs increases the errors of open-loop predictions of the"
+    " held-out run; it was rejected."
 )
 _MINOR = 0.02  # share of the gap up to which something is a detail; laws are rarely closer to a
 # machine than 15 % of what they do
@@ -118,11 +118,11 @@ def find_gap(
                 notes.append(_REJECTED.format(worse))
                 found = found.emptied()
                 evidence.set_base(found.base)
-            tell("learn laws of what no effect explains", 0.93)
+            tell("learn laws of the unexplained difference", 0.93)
             found, discovery = _learned(evidence, found)
             if discovery.refused:
                 notes.append(_REFUSED)
-        tell("judge on the held-out run", 0.96)
+        tell("evaluate on the held-out run", 0.96)
         outcome = _Outcome.of(evidence, discovery, opened, given, jobs)
         if outcome.worse:
             if (note := _REJECTED.format(outcome.worse)) not in notes:
@@ -313,7 +313,7 @@ def _worse(
 ) -> str:  # fmt: skip
     """In what a patched machine is worse on the first run, the held-out one; empty if it is not."""
     if opened and patched is not data.machine and opened.undone_by(data, patched, jobs):
-        return "free runs of the"
+        return "open-loop predictions of the"
     return "" if rms(after[:1]) <= _WORSE * rms(before[:1]) else "the"
 
 
@@ -516,8 +516,8 @@ def detail_words(effect: NamedEffect) -> str:
     )
     return (
         f"{effect.name} at {effect.location}, {told}, closes {100 * max(effect.share, 0.0):.1f} %"
-        " of the gap. The patched machine has it, but it may only make up for what else is not"
-        " right; it is not named."
+        " of the gap. The patched machine contains it, but it is not named, because it may only"
+        " compensate for other errors of the model."
     )
 
 
@@ -636,7 +636,7 @@ def _experiment(machine: Machine, verdict: Verdict, named: Sequence[NamedEffect]
         return None
     pairs = [(e.name, e.location) for e in unsure]
     pairs += [(a.name, a.location) for e in unsure for a in e.alternatives]
-    return next_experiment(machine, "these effects cannot be told apart with this data", pairs)
+    return next_experiment(machine, "these data do not distinguish the effects", pairs)
 
 
 def _jitter(data: Dataset, levels: Levels) -> tuple[float, float]:
@@ -653,32 +653,31 @@ def _notes(found: Found, data: Dataset, levels: Levels, floor: float | None) -> 
         if np.isfinite(r) and abs(r - 1.0) > _OFF
     ]  # fmt: skip
     if off:
-        notes.append(f"Noise that differs from what the machine states: {', '.join(off)}.")
+        notes.append(f"The noise differs from the machine file: {', '.join(off)}.")
     jitter, stated = _jitter(data, levels)
     if not jitter and stated:
         notes.append(
-            f"Nothing tells that rows are read at instants that jitter by {1e3 * stated:.3g} ms, as"
-            " the machine states."
+            f"The data show no sampling jitter; the machine file states {1e3 * stated:.3g} ms."
         )
     elif jitter != stated:
         notes.append(
-            f"The instants at which rows are read jitter by {1e3 * jitter:.3g} ms (standard"
-            f" deviation; stated: {1e3 * stated:.3g} ms): readings are the less sure the faster"
-            " they change, and all channels say so alike. Their noise counts it."
+            f"The sampling instants have a jitter of {1e3 * jitter:.3g} ms (standard deviation;"
+            f" stated: {1e3 * stated:.3g} ms): the error of a reading grows with its rate of"
+            " change, in all channels at once. The noise includes it."
         )
     if not known_levels(data):
         unstated = [c for c, n in zip(data.channels, data.noise, strict=True) if not np.isfinite(n)]
-        notes.append(f"The machine states no accuracy of {', '.join(unstated)}; the noise there was"
-                     " found from the readings.")  # fmt: skip
+        notes.append(f"The machine file states no accuracy of {', '.join(unstated)}; their noise"
+                     " was estimated from the readings.")  # fmt: skip
     if far := _far(found.guess):
         notes.append(
-            f"Calibrated by more than {_FAR:g} times what is stated as uncertain: {', '.join(far)}."
-            " They are as likely effects as wrong statements."
+            f"Calibrated by more than {_FAR:g} times the stated uncertainty: {', '.join(far)}."
+            " Either an effect is present or the stated uncertainty is too small."
         )
     if floor is None:
         notes.append(
-            "What a perfect model would leave cannot be told: runs made with the patched machine"
-            " itself cannot be followed. So it is not said that nothing is missing."
+            "The error of a perfect model is unknown, because the evaluation of runs simulated with"
+            " the patched machine failed. The explanation is therefore not reported as complete."
         )
     if found.weak:
         hypothesis, deviation = found.weak.guess.parts[-1]
@@ -688,7 +687,7 @@ def _notes(found: Found, data: Dataset, levels: Levels, floor: float | None) -> 
             for key, p in hypothesis.parameters.items()
         )
         notes.append(
-            f"A trace of {hypothesis.name} at {hypothesis.location}, {told}, is smaller than worth"
-            " naming and was left out."
+            f"{hypothesis.name} at {hypothesis.location}, {told}, is too small to be named and was"
+            " not added to the model."
         )
     return notes

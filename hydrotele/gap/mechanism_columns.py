@@ -171,7 +171,7 @@ def common_band(records: Sequence[IdentificationRecord], mechanism: Mechanism) -
         bands[-1] = max(bands[-1], _SLOWEST / (len(record.force) * record.period))
         moves.append(found.moves)
     if not np.any(moves):
-        raise InputError(_WHERE, "no joint moves in any run: log a motion")
+        raise InputError(_WHERE, "no joint moves in any run: record a motion")
     return min(bands)
 
 
@@ -204,7 +204,7 @@ def build_columns(
     names = parts[0][0]
     keep = [np.isfinite(p[2]).all(axis=1) for p in parts]
     if not any(rows.any() for rows in keep):
-        raise InputError(_WHERE, "no run has the forces of all drives: name them in the mapping")
+        raise InputError(_WHERE, "no run has the forces of all drives: add them to the mapping")
     starts = np.cumsum([0, *(int(rows.sum()) for rows in keep)])
 
     def stacked(place: int) -> np.ndarray:
@@ -425,25 +425,25 @@ def tilted(gravity: np.ndarray, turn: np.ndarray) -> np.ndarray:
 
 
 SENTENCES = {
-    "coulomb_friction": "another Coulomb friction of a joint",
-    "viscous_friction": "another viscous friction of a joint",
-    "stribeck_friction": "extra friction of a drive near rest",
-    "friction_asymmetry": "viscous friction that is larger in one direction of a drive",
-    "speed_dependent_force": "resistance that grows with the square of the speed",
-    "joint_spring": "a spring in a drive's joint",
-    "drive_inertia": "another inertia of a drive",
-    "payload": "a mass on a body that the model does not have there (negative: one too much)",
-    "com_offset": "a body's centre of mass lies elsewhere",
-    "inertia_error": "a body's moments of inertia about its centre of mass are others",
-    "base_tilt": "the base does not stand level",
+    "coulomb_friction": "different Coulomb friction of a joint",
+    "viscous_friction": "different viscous friction of a joint",
+    "stribeck_friction": "additional friction of a drive near zero velocity",
+    "friction_asymmetry": "viscous friction that depends on the direction of a drive",
+    "speed_dependent_force": "resistance proportional to the square of the speed",
+    "joint_spring": "a spring in the joint of a drive",
+    "drive_inertia": "different inertia of a drive",
+    "payload": "an additional mass on a body (negative: the mass of the model is too large)",
+    "com_offset": "an offset of a body's centre of mass",
+    "inertia_error": "different moments of inertia of a body about its centre of mass",
+    "base_tilt": "a tilt of the base",
     "force_offset": "a constant in a drive's force: an offset of its sensor, or a constant load",
-    "force_scale": "a force sensor with another scale",
-    "force_delay": "a force sensor that reads late",
-    "angle_offset": "a position sensor that is mounted askew",
-    "length_offset": "a position sensor with an offset",
-    "angle_delay": "a position sensor that reads late",
-    "length_delay": "a position sensor that reads late",
-    "clock_offset": "all forces read late against the positions (negative: the positions do)",
+    "force_scale": "a scale error of a force sensor",
+    "force_delay": "a delay of a force sensor",
+    "angle_offset": "an offset of an angle sensor",
+    "length_offset": "an offset of a position sensor",
+    "angle_delay": "a delay of an angle sensor",
+    "length_delay": "a delay of a position sensor",
+    "clock_offset": "a delay of all forces relative to the positions (negative: of the positions)",
 }
 TYPICAL, LEAST = 0.3, 0.01  # share of a drive's force RMS that an effect moves, typically; at least
 _MOST = 20.0  # times the typical size, where a search ends

@@ -84,19 +84,19 @@ _NORMAL95 = 1.96
 _SPOILT = -4.0  # standard deviations by which an effect may better the held-out run too little
 _WORSE = 1.02  # times the given model's errors on the held-out run: no patch may do more
 _REJECTED = (
-    "What the fitted runs asked for makes the held-out run worse; it was taken back, and nothing is"
-    " named."
+    "The changes found on the fitted runs increase the errors on the held-out run; they were"
+    " rejected, and no effect is named."
 )
 _SPOILS = (
-    "{} at {}, which the fitted runs asked for, makes the held-out run worse; it was taken back."
+    "{} at {}, found on the fitted runs, increases the errors on the held-out run; it was rejected."
 )
 _DIFFERS = (
-    "{} at {}, which the fitted runs asked for, is not the same in all parts of them ({} {} {});"
-    " it was taken back."
+    "{} at {}, found on the fitted runs, differs between parts of these runs ({} {} {}); it was"
+    " rejected."
 )
 _TURNS = 0.05  # doubt of a sign from which what is left may be the form of dry friction near rest
 _LISTED = 3  # notes of that kind
-METRIC = "RMS of the errors of the drives' forces over their noise, all drives, held-out run"
+METRIC = "RMS of the drive force errors divided by their noise, all drives, held-out run"
 
 
 @dataclass(frozen=True)
@@ -219,13 +219,13 @@ def find_mechanism_gap(
     if strange := [name for name in effects if name not in SENTENCES]:
         raise InputError(
             f"--effect {strange[0]}",
-            f"is none of a mechanism: {', '.join(sorted(SENTENCES))}",
+            f"is not an effect of mechanisms; valid: {', '.join(sorted(SENTENCES))}",
         )
     mechanism = load_mechanism(mjcf, mapping)
     band = common_band(fit, mechanism)
     nominal = nominal_parameters(mechanism)
     found = _searched(fit, mechanism, band, nominal, effects, tell)
-    tell("patch the model, judge it on the held-out run", 0.8)
+    tell("patch the model and evaluate it on the held-out run", 0.8)
     given = MechanismModel(
         mechanism.setup.chain.name, Path(mjcf).read_text(encoding="utf-8"), mechanism.mapping
     )
@@ -307,7 +307,9 @@ def _constant(found: _Found) -> tuple[_Found, list[str], np.ndarray]:
             moved = np.hypot(moved, np.sqrt(np.mean(force**2, axis=0)))
         found = _without(found, [found.fitted.effects[k].key for k in differ])
     if len(told) > _LISTED:
-        told = [*told[:_LISTED], f"So were {len(told) - _LISTED} more."]
+        told = [
+            *told[:_LISTED], f"{len(told) - _LISTED} more were rejected for the same reason."
+        ]  # fmt: skip
     return found, told, moved
 
 
@@ -340,14 +342,14 @@ def _searched(fit, mechanism, band, nominal, names, tell) -> _Found:
     known: Sequence[tuple[MechanismEffect, np.ndarray]] = ()
     found, about, shares = None, {}, _SHARES
     for turn in range(_ROUNDS):
-        tell(f"columns of all effects, round {turn + 1}", 0.2 * turn)
+        tell(f"compute the regressors of all effects, round {turn + 1}", 0.2 * turn)
         errors = sensor_errors(known, mechanism.setup.chain, mechanism.measured)
         columns = build_columns(fit, mechanism, band, errors, about)
         columns = undone(columns, applied, {one.key: one.columns[0] for one, _ in known})
         effects = mechanism_effects(mechanism.setup.chain, columns, nominal, applied)
         if names:
             effects = [one for one in effects if one.name in names]
-        tell(f"{len(effects)} effects, round {turn + 1}", 0.2 * turn + 0.15)
+        tell(f"evaluate {len(effects)} effects, round {turn + 1}", 0.2 * turn + 0.15)
         noise = find_noise(columns)
         tried = [_search(columns, noise, mechanism, one, effects, found) for one in shares]
         choice = 2.0 * np.log(max(len(effects), 1))  # of one effect among all
@@ -677,13 +679,13 @@ def _unknown(left: Left, lacks: Sequence[Lack], after: Prediction) -> Unknown:
     if own:
         told = " and ".join(channel_words(name) for name in depends)
         words.append(
-            f"Of what is left on {drives[worst]},"
-            f" {100 * float(left.share[worst]):.0f} % vary with {told}."
+            f"{100 * float(left.share[worst]):.0f} % of the remaining force on {drives[worst]}"
+            f" depend on {told}."
         )
     else:
         words.append(
-            f"What is left on {drives[worst]} does not vary with positions or rates alone: look at"
-            " the windows in which it shows."
+            f"The remaining force on {drives[worst]} does not depend on positions or velocities"
+            " alone: check the time windows in which it occurs."
         )
     return Unknown(
         "force", after.channels[worst], depends, " ".join(words), None,
@@ -716,7 +718,7 @@ def _notes(found: _Found, band: float) -> list[str]:
             for (name, p), value in zip(effect.parameters.items(), one.values[-1], strict=True)
         )
         notes.append(
-            f"A trace of {effect.name} at {effect.location}, {told}, is smaller than worth naming"
-            " and was left out."
+            f"{effect.name} at {effect.location}, {told}, is too small to be named and was not"
+            " added to the model."
         )
     return notes

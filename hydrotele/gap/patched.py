@@ -89,7 +89,7 @@ def write_effects(gap: Gap, folder: Path) -> None:
 
 
 def _head(gap: Gap) -> list[str]:
-    lines = [f"{gap.machine.name} with what `hydrotele gap` found (verdict: {gap.verdict}):"]
+    lines = [f"{gap.machine.name} with the result of `hydrotele gap` (verdict: {gap.verdict}):"]
     for effect in gap.effects:
         lines.append(f"- {effect_title(effect)}, probability {effect.probability:.3f}")
         for name, estimate in effect.parameters.items():
@@ -101,7 +101,7 @@ def _head(gap: Gap) -> list[str]:
     found, stated = gap.jitter
     if found != stated:
         lines.append(f"- jitter of the sensors: {1e3 * found:.3g} ms, was {1e3 * stated:.3g} ms")
-    return [*lines, f"Values, units and intervals for programs are in {EFFECTS_FILE}."]
+    return [*lines, f"{EFFECTS_FILE} contains values, units and intervals for programs."]
 
 
 def _found(estimate: Estimate, name: str) -> str:

@@ -275,14 +275,14 @@ def search(
         What was found.
     """
     tell = progress or (lambda text, share: None)
-    tell("find noise levels of the given model", 0.0)
+    tell("estimate the noise levels of the given model", 0.0)
     base = evidence.set_base(Guess())
     candidates = timed(candidates, base)
     grown = _begun(evidence, base, candidates, tell)
     jittered = evidence.with_jitter(grown.now)
     before, after = (judged.tracks[0].levels.jitter for judged in (grown.now, jittered))
     if abs(after - before) > _OTHER * max(after, before):  # before, what the model lacked hid it
-        tell("search again with instants that jitter", 0.03)
+        tell("repeat the search with sampling jitter", 0.03)
         evidence.set_base(jittered)
         base = evidence.set_base(evidence.judged(Guess(), reopened=True))
         grown = _begun(evidence, base, candidates, tell)
@@ -302,7 +302,7 @@ def _begun(
     evidence: Evidence, base: Judged, candidates: Sequence[Hypothesis], tell: Progress
 ) -> "_Grown":
     """A search from the given machine: how far it gets."""
-    tell("try every effect as if nothing unknown acted", 0.03)
+    tell("evaluate every effect without residual inputs", 0.03)
     bold = without_inputs(evidence, base, candidates)
     options = [option for option in bold.options if option[1] > ENTER]
     ahead, _ = min(options, key=_score, default=(base, 0.0))
@@ -350,7 +350,7 @@ def _grow(
     ranked: Sequence[Screened] | None = None  # of the present guess
     ahead: tuple[Judged | None, float] | None = None  # a calibration of the present guess
     if begin.calibrates and _wrong_everywhere(evidence, base, begin):
-        tell("calibrate the uncertain numbers", 0.06)
+        tell("calibrate the uncertain parameters", 0.06)
         ahead = other, _ = calibrated(evidence, now)
         if other and lacking(other, evidence) < _NEARLY_NOTHING * lacking(now, evidence):
             now, fit = fit_until_settled(evidence, other)
@@ -362,7 +362,7 @@ def _grow(
             options = list(early)
         else:
             if ranked is None:
-                tell(f"try every effect ({_named_so_far(now.guess)} named so far)", done)
+                tell(f"evaluate every effect ({_named_so_far(now.guess)} found so far)", done)
                 open_ones = free_of_calibration(_lacked(evidence, candidates, now), now.guess)
                 ranked = screen(evidence, now.guess, open_ones)
                 first = first if rankings else ranked
@@ -418,7 +418,7 @@ def _grow(
             and lacking(grown, evidence) > LACKING
             and (best is None or not tried or nibbled)
         ):
-            tell("calibrate the uncertain numbers", done + 0.04)
+            tell("calibrate the uncertain parameters", done + 0.04)
             tried = True
             evidence.set_base(now)
             other, gain = ahead or calibrated(evidence, now)
@@ -431,7 +431,7 @@ def _grow(
             wider = widened(now.guess, calibration=True)
             if roomy or wider.hypotheses == now.guess.hypotheses:
                 break
-            tell("calibrate with more room", done + 0.04)
+            tell("calibrate with wider bounds", done + 0.04)
             now, fit = fit_until_settled(evidence, evidence.judged(wider))
             ranked, roomy, ahead = None, True, None
             continue
@@ -472,7 +472,7 @@ def _with_teeth(
     axes = shaken(evidence, candidates, (now,))
     if not axes:
         return now, fit
-    tell("look for teeth with a gap", 0.7)
+    tell("search for backlash", 0.7)
     teeth = rattling(evidence, given_again(now.guess, axes), now, axes)
     if teeth is not None:
         other, settled = fit_until_settled(evidence, teeth)
@@ -491,7 +491,7 @@ def _sparse(
     A calibration takes two effects at once, and a few pins, each by less than it is uncertain, take
     a sensor's offset. Where nearly all numbers stay as they were, that is the unlikelier story.
     """
-    tell("search without calibration", 0.8)
+    tell("repeat the search without calibration", 0.8)
     place = next(i for i, h in enumerate(grown.now.guess.hypotheses) if h.name == CALIBRATION)
     guess, fit, now = grown.now.guess.without(place), None, base
     if guess.parts:
@@ -630,9 +630,9 @@ def _compared(evidence: Evidence, base: Judged, grown: _Grown, tell: Progress) -
     without: tuple[Judged | None, ...] = ()
     open_ended, replaced = True, False
     while open_ended:
-        tell("drop what is needless", 0.87)
+        tell("remove unnecessary effects", 0.87)
         now, fit, without = pruned(evidence, base, now, fit)
-        tell("compare rivals", 0.9)
+        tell("compare alternative effects", 0.9)
         charges, rivals = [], []
         for index, (hypothesis, _) in enumerate(now.guess.parts):
             assert fit

@@ -1,1 +1,1 @@
-"""Logs of machines, real or simulated: channels, files, cleaning, and data sets to learn from."""
+"""Machine logs: channels, files, cleaning, and data sets for identification."""

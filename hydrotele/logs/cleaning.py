@@ -1,20 +1,15 @@
-"""Takes out of the readings what no sensor in working order says; every change leaves a note.
+"""Remove faulty readings from logs; every change is recorded in a note.
 
-Channels that are refreshed more slowly than they are logged: only fresh readings are readings.
+Faulty are infinite and saturated readings, spikes, frozen sensors, duplicated rows, and values that
+a slow channel repeats between two updates. For example, a 1 kHz logger writes a pressure that
+arrives every 20 ms 20 times. If all were used, one error would count 20 times, and the age of the
+value would appear as a delay between 0 and 20 ms.
 
-A logger that runs at 1 kHz beside a bus that carries a pressure every 20 ms writes each value 20
-times. Taken for 20 readings, their one error would count as noise of its own colour, and their age
-as a delay that saws between none and 20 ms.
-
-Sensors that froze, and rows that a logger wrote twice.
-
-A noisy sensor rarely reads the same value twice in a row: with a uniform error of +-a and a
-converter step q, with probability q / 2a at most; with a normal one, whose density is at most
-1 / (sigma sqrt(2 pi)), likewise. A long repeat is then impossible by chance. That
-holds only for a sensor that is as noisy as stated; of one that is quieter, or whose noise is not
-stated, repeats at rest are the rule, and only the motion of others can convict it.
-
-Readings that no machine in working order gives: beyond the sensor, spikes, another unit.
+A noisy sensor rarely gives the same value twice in a row. With a uniform error of +-a and a
+converter step q, the probability is at most q / 2a. With a normal error the density is at most
+1 / (sigma sqrt(2 pi)), and the bound follows in the same way. A long repetition is then not random.
+This applies only to a sensor with its stated noise. Otherwise repetitions at rest are normal, and
+only the motion of other channels can prove that a sensor is frozen.
 """
 
 import math
@@ -28,18 +23,18 @@ from hydrotele.logs import cleaning as value_range
 from hydrotele.logs.rows import Rows
 from hydrotele.machine.machine import Machine, Sensor, SensorSet, channel_sensor, converter
 
-_ANGLE_PLAY = 0.35  # [rad] beyond a joint's range; zeros are set worse than ranges are known
-_LENGTH_PLAY = 0.2  # of the stroke or the range, likewise
-_VACUUM = -1.0e6  # [Pa] below it no sensor of absolute or gauge pressure reads
-_PRESSURE_PLAY = 2.0  # times the highest relief pressure; ports overshoot their relief
-_HARDEST = 500.0  # [rad/s^2] or [m/s^2]: end stops hit at full speed stay below it
+_ANGLE_PLAY = 0.35  # [rad] tolerance beyond a joint's range; sensor zeros are often inaccurate
+_LENGTH_PLAY = 0.2  # tolerance as a fraction of the stroke or range, for the same reason
+_VACUUM = -1.0e6  # [Pa] lower limit for readings of absolute or gauge pressure sensors
+_PRESSURE_PLAY = 2.0  # limit as a multiple of the highest relief pressure; ports overshoot it
+_HARDEST = 500.0  # [rad/s^2] or [m/s^2]: exceeds the acceleration at an end-stop impact
 _SPIKE = 20.0  # standard deviations of one reading
-_NEAR_CLIP = 0.1  # [s] before and after a clipped row in which readings near the end are suspect
-_WIDE = 3.46  # standard deviations of a random error, within which readings near an end are suspect
+_NEAR_CLIP = 0.1  # [s] before and after a saturated row in which nearby readings are removed
+_WIDE = 3.46  # standard deviations from the limit within which such readings are removed
 
 
 def limits(machine: Machine, channel: str) -> tuple[float, float]:
-    """Readings between which a channel must be, generously.
+    """Return the plausible range of readings of a channel, with a tolerance.
 
     Args:
         machine: the machine.
@@ -50,7 +45,7 @@ def limits(machine: Machine, channel: str) -> tuple[float, float]:
     """
     kind, _, axis = channel.partition(".")
     if kind.startswith("pressure"):
-        if machine.supply is None:  # pumps of their own, without a stated limit
+        if machine.supply is None:  # axes with individual pumps have no stated limit
             return _VACUUM, math.inf
         reliefs = [a.valve.port_relief for a in machine.hydraulic_axes.values() if a.valve]
         return _VACUUM, _PRESSURE_PLAY * max(machine.supply.relief_pressure, *reliefs)
@@ -64,17 +59,17 @@ def limits(machine: Machine, channel: str) -> tuple[float, float]:
 
 
 def check_range(machine: Machine, channel: str, reading: np.ndarray, where: str) -> None:
-    """Refuse a channel that is out of the machine's reach most of the time.
+    """Check that at least half of the readings of a channel are in the range of the machine.
 
     Args:
         machine: the machine.
         channel: channel name.
         reading: (n,) readings, NaN where missing [channel's unit].
-        where: the file.
+        where: file of the log, for the message.
 
     Raises:
-        InputError: names file and channel, what it reads, what the machine can do, and the unit
-            that would explain it.
+        InputError: the channel is out of range; the message gives both ranges and, if one fits, the
+            unit that the file probably has.
     """
     low, high = limits(machine, channel)
     values = reading[np.isfinite(reading)]
@@ -86,22 +81,23 @@ def check_range(machine: Machine, channel: str, reading: np.ndarray, where: str)
     middle = np.median(values)
     unit = next((u for u, f in factors.items() if low <= f * middle <= high), None)
     cure = f"looks like {unit}, convert it" if unit else (
-        "its zero, sign or unit is another one, or the log is of another machine")  # fmt: skip
+        "check zero, sign and unit, and whether the log is from this machine")  # fmt: skip
     raise InputError(
         f"{where}, column {channel!r}",
-        f"reads {values.min():.4g} .. {values.max():.4g}, the machine allows {low:.4g} .."
+        f"has values {values.min():.4g} .. {values.max():.4g}, the machine allows {low:.4g} .."
         f" {high:.4g}: {cure}",
     )
 
 
 def clipped(sensor: Sensor, channel: str, reading: np.ndarray, period: float) -> np.ndarray:
-    """Which readings stand at an end of the converter, or so near beside such that they may have.
+    """Find saturated readings and readings close to the limit near a saturated one.
 
-    A sensor at its end cuts half of its noise off. Leaving out only the cut readings would keep
-    those that the noise pushed inwards; near a cut reading, all within the noise of the end go.
+    Saturation cuts off half of the noise. Removing only the saturated readings would keep those
+    that the noise moved inwards and bias the channel. Therefore all readings within the noise of
+    the limit are removed near a saturated reading.
 
     Args:
-        sensor: the channel's sensor, with its span.
+        sensor: sensor of the channel, with its span.
         channel: channel name.
         reading: (n,) readings, NaN where missing [channel's unit].
         period: time between rows [s].
@@ -127,18 +123,18 @@ def clipped(sensor: Sensor, channel: str, reading: np.ndarray, period: float) ->
 def spikes(
     machine: Machine, channel: str, reading: np.ndarray, period: float, noise: float
 ) -> np.ndarray:
-    """Single readings that are physically impossible.
+    """Find single readings that are physically impossible.
 
-    Of pressures only those beyond `limits`: a pressure can jump by 10 MPa from row to row. Of
-    positions also a reading that leaves its two neighbours, which agree with each other, farther
-    than any acceleration could have moved it.
+    Pressures are checked against `limits` only, because they can change by 10 MPa within a row. A
+    position is also a spike if its two neighbours agree and it differs from them by more than any
+    acceleration can explain.
 
     Args:
         machine: the machine.
         channel: channel name.
         reading: (n,) readings, NaN where missing [channel's unit].
         period: time between rows [s].
-        noise: standard deviation of one reading [channel's unit]; NaN: taken from the readings.
+        noise: noise standard deviation [channel's unit]; NaN: estimated from the readings.
 
     Returns:
         (n,) bool.
@@ -150,7 +146,7 @@ def spikes(
         return bad
     bend = reading[1:-1] - 0.5 * (reading[:-2] + reading[2:])
     apart = np.abs(reading[2:] - reading[:-2])
-    if not math.isfinite(noise):  # bends of 0 are those of a coarse sensor between its steps
+    if not math.isfinite(noise):  # second differences of 0 come from a coarse converter
         bent = np.abs(bend[np.isfinite(bend) & (bend != 0.0)])
         noise = 1.2 * float(np.median(bent)) if len(bent) else 0.0
     allowed = max(_SPIKE * noise, 0.5 * _HARDEST * period**2)
@@ -159,25 +155,25 @@ def spikes(
     return bad
 
 
-_LEAST = 20  # changes that must be seen
-_REGULAR = 0.9  # of the values last equally long, or a whole number of times as long
-_HURRIED = 0.01  # of the values may last for one reading only
-_ONE_STEP = 0.9  # of the changes are one converter step where a coarse sensor moves slowly
-_EQUAL = 1.05  # times the least change, up to which one is as large
+_LEAST = 20  # minimum number of changes
+_REGULAR = 0.9  # minimum fraction of values with the same duration or a multiple of it
+_HURRIED = 0.01  # maximum fraction of values that last for one reading only
+_ONE_STEP = 0.9  # larger fractions of one-step changes mean a slow motion of a coarse sensor
+_EQUAL = 1.05  # changes up to this multiple of the smallest one count as one step
 
 
 def refreshed_every(reading: np.ndarray) -> float:
-    """Logged readings from one fresh value of a channel to the next; 1 where each is fresh.
+    """Return the number of logged readings per update of a channel; 1 if each is an update.
 
-    A sensor without noise repeats, too, at rest or between two steps of its converter, but for as
-    long as its motion has it, and then goes on by one step. One that is refreshed by a clock
-    repeats for a fixed number of readings, one more or less where the clocks run apart.
+    A channel with a slower clock repeats each value for a fixed number of readings, or one more or
+    less if the clocks drift. A sensor without noise also repeats values at rest or between two
+    converter steps, but for irregular times, and then changes by one step.
 
     Args:
         reading: (n,) readings, NaN where missing.
 
     Returns:
-        The mean number of readings, at least 1.
+        The mean number of readings per update, at least 1.
 
     >>> refreshed_every(np.repeat(np.random.default_rng(0).normal(size=50), 4))
     4.0
@@ -200,13 +196,13 @@ def refreshed_every(reading: np.ndarray) -> float:
 
 
 def stale(reading: np.ndarray, every: float) -> np.ndarray:
-    """Which readings only repeat the one before because no fresh one has come.
+    """Find readings that repeat the previous one because the channel was not updated.
 
-    A value that stays for longer than it takes to refresh it was refreshed and was the same.
+    A value that lasts longer than one update period was updated with the same value.
 
     Args:
         reading: (n,) readings, NaN where missing.
-        every: readings from one fresh one to the next.
+        every: number of readings per update.
 
     Returns:
         (n,) bool.
@@ -226,26 +222,28 @@ def stale(reading: np.ndarray, every: float) -> np.ndarray:
     return old
 
 
-_BY_CHANCE = 1.0e-6  # probability of convicting a sound sensor somewhere in a data set
-_SHORTEST = 0.1  # [s] a freeze has to last; shorter ones harm nobody
-_SHORTEST_QUIET = 1.0  # [s] the same without noise to judge by
-_QUIET = 0.5  # of the stated noise: below it a sensor is quieter than stated
-_WINDOW = 20  # rows in which the noise is looked at
-_PARTNER_STEPS = 20.0  # converter steps (or noises) that a motion seen elsewhere must amount to
-_PARTNER_PRESSURE = 2.0e6  # [Pa] by which the other chamber must change meanwhile
-_STRONG = 0.5  # of the largest command, beyond dead bands
-_STRONG_TIME = 1.0  # [s] of strong command in each direction
+_BY_CHANCE = 1.0e-6  # false-alarm probability per data set
+_SHORTEST = 0.1  # [s] minimum duration of a freeze; shorter ones have no effect
+_SHORTEST_QUIET = 1.0  # [s] minimum duration of a freeze of a sensor without known noise
+_QUIET = 0.5  # fraction of the stated noise below which a sensor is quieter than stated
+_WINDOW = 20  # rows per window of the noise estimate
+_PARTNER_STEPS = 20.0  # converter steps that the motion of the other sensor must exceed
+_PARTNER_PRESSURE = 2.0e6  # [Pa] minimum pressure change in the other chamber
+_STRONG = 0.5  # fraction of the command limit that exceeds dead bands
+_STRONG_TIME = 1.0  # [s] minimum time with such a command in each direction
 
 
 class Stretch(NamedTuple):
-    """Rows first .. last - 1 of one run, in which a channel repeats one value."""
+    """Rows first .. last - 1 of one run in which a channel repeats one value."""
 
     first: int
     last: int
 
 
 def repeat_probability(sensor: Sensor, channel: str) -> float | None:
-    """Largest probability that two readings of one value are equal [1]; None if noise tells none.
+    """Return the largest probability that two noisy readings of one value are equal [1].
+
+    The result is None if the noise is unknown or too small to exclude repetitions.
 
     >>> repeat_probability(Sensor(accuracy=0.002, bits=12, span=1.024), "length.boom")
     0.0625
@@ -258,7 +256,7 @@ def repeat_probability(sensor: Sensor, channel: str) -> float | None:
 
 
 def longest_repeat(probability: float, count: int) -> int:
-    """Equal readings in a row that do not happen by chance among `count` readings.
+    """Return the number of consecutive equal readings that is not random in `count` readings.
 
     >>> longest_repeat(0.1, 90_000)
     12
@@ -267,7 +265,7 @@ def longest_repeat(probability: float, count: int) -> int:
 
 
 def repeats(reading: np.ndarray, shortest: int) -> list[Stretch]:
-    """Stretches of at least `shortest` equal readings; missing ones in between count as equal.
+    """Find intervals of at least `shortest` equal readings; missing readings count as equal.
 
     >>> repeats(np.array([1.0, 2.0, 2.0, np.nan, 2.0, 3.0]), 3)
     [Stretch(first=1, last=5)]
@@ -285,7 +283,7 @@ def repeats(reading: np.ndarray, shortest: int) -> list[Stretch]:
 
 
 def saturated(reading: np.ndarray, parts: Sequence[Stretch]) -> bool:
-    """Whether a channel comes to rest at one value again and again, and never beyond it.
+    """Return whether all repetitions of a channel are at one value, its minimum or maximum.
 
     >>> reading = np.array([1.0, 2.0, 2.0, 1.5, 2.0, 2.0, 1.0])
     >>> saturated(reading, repeats(reading, 2))
@@ -293,7 +291,7 @@ def saturated(reading: np.ndarray, parts: Sequence[Stretch]) -> bool:
 
     Args:
         reading: (n,) readings of one run, NaN where missing.
-        parts: where it repeats one value.
+        parts: intervals of equal readings.
     """
     values = {float(np.nanmedian(reading[slice(*part)])) for part in parts}
     ends = {float(np.nanmin(reading)), float(np.nanmax(reading))}
@@ -301,10 +299,10 @@ def saturated(reading: np.ndarray, parts: Sequence[Stretch]) -> bool:
 
 
 def noise_floor(reading: np.ndarray) -> float:
-    """Noise [channel's unit] where the channel is most at rest, NaN if it repeats all along.
+    """Estimate the noise standard deviation of a channel at rest [channel's unit].
 
-    It is the 10th percentile, over windows of 20 rows that do not repeat throughout, of the
-    standard deviation that second differences show.
+    The estimate is the 10th percentile of the standard deviations from second differences, over
+    windows of 20 rows. Windows of constant readings are excluded; NaN if none remain.
     """
     values = reading[np.isfinite(reading)]
     bend = np.diff(values, 2)
@@ -315,12 +313,13 @@ def noise_floor(reading: np.ndarray) -> float:
 
 
 def as_noisy_as_stated(sensor: Sensor, channel: str, floors: Sequence[float]) -> bool:
-    """Whether the sensor's stated noise shows in this channel or others with the same sensor.
+    """Return whether the measured noise of a sensor is close to its stated noise.
 
     Args:
         sensor: the sensor.
         channel: channel name.
-        floors: `noise_floor` of these channels, the best witnesses first; NaN tells nothing.
+        floors: `noise_floor` of this channel and others with an equal sensor, in order of
+            preference; the first finite one is used.
     """
     stated = math.hypot(sensor.error_rms, converter(sensor, channel).step / 12**0.5)
     known = [floor for floor in floors if math.isfinite(floor)]
@@ -330,12 +329,12 @@ def as_noisy_as_stated(sensor: Sensor, channel: str, floors: Sequence[float]) ->
 def frozen_by_noise(
     reading: np.ndarray, probability: float, count: int, period: float
 ) -> list[Stretch]:
-    """Stretches that repeat longer than noise allows.
+    """Find intervals of equal readings that are longer than noise allows.
 
     Args:
         reading: (n,) readings of one run, NaN where missing.
-        probability: of `repeat_probability`.
-        count: readings in the whole data set.
+        probability: result of `repeat_probability`.
+        count: number of readings in the whole data set.
         period: time between rows [s].
     """
     shortest = max(longest_repeat(probability, count), math.ceil(_SHORTEST / period))
@@ -346,19 +345,19 @@ def frozen_by_motion(
     reading: np.ndarray, partner: np.ndarray | None, command: np.ndarray, others: np.ndarray,
     step: float, ranges: tuple[float, float], period: float,
 ) -> list[Stretch]:  # fmt: skip
-    """Stretches in which a position repeats one value while the axis must have moved.
+    """Find intervals in which a position is constant although the axis must have moved.
 
-    Either the partner (the length of an angle, the angle of a length) moved; or the axis was
-    strongly commanded in both directions, others moved, and the value is no end of the range.
+    Either the second position sensor of the axis (length or angle) changed; or the axis had large
+    commands in both directions, other axes moved, and the value is not an end of the range.
 
     Args:
         reading: (n,) positions, NaN where missing [channel's unit].
-        partner: (n,) the other sensor of the same axis, or None.
-        command: (n,) the axis' command over the largest one [1].
+        partner: (n,) readings of the second position sensor of the axis, or None.
+        command: (n,) command of the axis divided by its limit [1].
         others: (n, k) positions of other axes.
-        step: what the sensor resolves [channel's unit].
-        ranges: span of the channel and of its partner over all runs, each in its unit; a span of 0
-            is that of a channel that repeats one value for ever.
+        step: resolution of the sensor [channel's unit].
+        ranges: range of the channel and of its partner over all runs, each in its unit; 0 for a
+            channel that is constant in all runs.
         period: time between rows [s].
     """
     own, partners = ranges
@@ -386,12 +385,12 @@ def frozen_by_motion(
 def frozen_chamber(
     reading: np.ndarray, partner: np.ndarray, lowest: float, period: float
 ) -> list[Stretch]:
-    """Stretches in which one chamber repeats a pressure while the other one's changes much.
+    """Find intervals of constant pressure in one chamber while that of the other chamber changes.
 
     Args:
         reading: (n,) pressures, NaN where missing [Pa].
         partner: (n,) pressures of the other chamber [Pa].
-        lowest: pressure below which a starved chamber rests on its make-up valve [Pa].
+        lowest: pressure below which the make-up valve may keep a pressure constant [Pa].
         period: time between rows [s].
     """
     return [
@@ -403,7 +402,7 @@ def frozen_chamber(
 
 
 def _span(values: np.ndarray) -> float:
-    """Range between the 2nd and the 98th percentile, so that single readings do not count."""
+    """Return the range between the 2nd and the 98th percentile, which ignores outliers."""
     values = values[np.isfinite(values)]
     return float(np.diff(np.percentile(values, [2, 98]))[0]) if len(values) else 0.0
 
@@ -411,12 +410,12 @@ def _span(values: np.ndarray) -> float:
 def repeated_rows(
     reading: np.ndarray, probability: Sequence[float | None], count: int
 ) -> np.ndarray:
-    """Rows in which every reading equals that of the row before, which noise forbids.
+    """Find rows that repeat all readings of the previous row, which noise makes improbable.
 
     Args:
         reading: (n, c) readings, NaN where missing.
-        probability: per channel, of `repeat_probability`; None where repeats tell nothing.
-        count: readings in the whole data set.
+        probability: result of `repeat_probability` per channel; None to ignore a channel.
+        count: number of readings in the whole data set.
 
     Returns:
         (n,) bool.
@@ -431,15 +430,15 @@ def repeated_rows(
     return np.append(False, improbable & (equal == pairs).all(axis=1) & pairs.any(axis=1))
 
 
-_KEPT = 0.1  # of its readings a channel must keep in a run to be of use there
-_NEAR = 3.0  # of its noise, within which a limit of a sensor cuts off some of it
-_CLIPPED = 0.02  # of a run; a starved chamber reads 0 now and then on any machine
-_RESOLVED = 1.0e-4  # of its span: what a sensor without a stated converter resolves, at worst
-_STARVED = 0.5e6  # [Pa] above tank, where a chamber on its make-up valve may rest
+_KEPT = 0.1  # minimum fraction of readings that a channel must keep in a run
+_NEAR = 3.0  # noise standard deviations from a sensor limit within which readings are removed
+_CLIPPED = 0.02  # fraction of a run; any machine has some chamber pressures of 0
+_RESOLVED = 1.0e-4  # worst resolution of a sensor without a stated converter, relative to its span
+_STARVED = 0.5e6  # [Pa] above tank pressure, range in which a make-up valve may hold a pressure
 
 
 class _Data(NamedTuple):
-    """All runs of one machine and its sensors."""
+    """All runs of one machine, with its sensors and noise."""
 
     machine: Machine
     sensors: SensorSet | None
@@ -449,19 +448,19 @@ class _Data(NamedTuple):
     runs: dict[str, Rows]
 
     def column(self, channel: str, run: str) -> np.ndarray | None:
-        """Readings (n,) of a channel in a run; None if the channel is unknown."""
+        """Return the readings (n,) of a channel in a run; None if the channel is unknown."""
         if channel not in self.channels:
             return None
         return self.runs[run].reading[:, list(self.channels).index(channel)]
 
     def span(self, channel: str) -> float:
-        """Range of a channel over all runs [channel's unit], 0 without readings."""
+        """Return the range of a channel over all runs [channel's unit], 0 without readings."""
         every = [self.column(channel, run) for run in self.runs]
         values = np.concatenate([v[np.isfinite(v)] for v in every if v is not None] or [[]])
         return float(np.ptp(values)) if len(values) else 0.0
 
     def sensor(self, channel: str) -> Sensor:
-        """Sensor of a channel, with its span."""
+        """Return the sensor of a channel, with its span."""
         return channel_sensor(self.machine, self.sensors, channel)
 
 
@@ -469,18 +468,18 @@ def remove_faults(
     machine: Machine, sensors: SensorSet | None, axes: Sequence[str], channels: Sequence[str],
     noise: np.ndarray, runs: Mapping[str, Rows],
 ) -> tuple[dict[str, Rows], tuple[str, ...]]:  # fmt: skip
-    """Replace by NaN what is beyond a sensor, impossible, frozen or written twice.
+    """Replace saturated, impossible, frozen, repeated and duplicated readings by NaN.
 
     Args:
         machine: the machine.
-        sensors: its sensors, None if unknown.
+        sensors: sensors of the machine, None if unknown.
         axes: the nu axes, in the order of the commands.
         channels: the c channels.
-        noise: (c,) standard deviation of one reading, NaN if unknown.
+        noise: (c,) noise standard deviation of one reading, NaN if unknown.
         runs: run -> rows.
 
     Returns:
-        (run -> mended rows, notes).
+        (run -> cleaned rows, notes).
     """
     copies = {name: rows._replace(reading=rows.reading.copy()) for name, rows in runs.items()}
     data = _Data(machine, sensors, axes, channels, noise, copies)
@@ -491,7 +490,7 @@ def remove_faults(
             notes += _stale(data, run, channel)
     fresh = {name: rows.reading.copy() for name, rows in data.runs.items()}
     found = [(run, ch, _frozen(data, run, ch)) for run in data.runs for ch in channels]
-    for run, channel, parts in found:  # after all were judged: a frozen one is a poor witness
+    for run, channel, parts in found:  # after all tests, which compare channels with each other
         notes += _take_out_frozen(data, run, channel, parts)
     for run in data.runs:
         notes += _take_out_repeated_rows(data, run)
@@ -504,23 +503,23 @@ def _out_of_sensor(data: _Data, run: str, channel: str, noise: float) -> list[st
     assert reading is not None
     if bad := int(np.isinf(reading).sum()):
         reading[np.isinf(reading)] = np.nan
-        notes.append(f"{run}: {bad} infinite readings of {channel} were left out.")
+        notes.append(f"{run}: {bad} infinite readings of {channel} were removed.")
     for what, noted, rows in (
-        ("at the end of its sensor", _CLIPPED,
+        ("at the limit of the sensor", _CLIPPED,
          value_range.clipped(data.sensor(channel), channel, reading, period)),
-        ("which nothing physical explains", 0.0,
+        ("that are physically impossible", 0.0,
          value_range.spikes(data.machine, channel, reading, period, noise)),
     ):  # fmt: skip
         if rows.mean() > noted:
             first = data.runs[run].start + period * int(np.flatnonzero(rows)[0])
-            notes.append(f"{run}: {rows.sum()} readings of {channel} {what} were left out, the"
+            notes.append(f"{run}: {rows.sum()} readings of {channel} {what} were removed, the"
                          f" first at {first:.6g} s.")  # fmt: skip
         reading[rows] = np.nan
     return notes
 
 
 def _stale(data: _Data, run: str, channel: str) -> list[str]:
-    """Leave out rows that only repeat a channel's last value because it is refreshed less often."""
+    """Remove readings that repeat the last value of a channel with a slower update rate."""
     reading, period = data.column(channel, run), data.runs[run].period
     assert reading is not None
     every = refreshed_every(reading)
@@ -529,8 +528,8 @@ def _stale(data: _Data, run: str, channel: str) -> list[str]:
     step = period * float(np.median(np.diff(np.flatnonzero(np.isfinite(reading)))))
     reading[stale(reading, every)] = np.nan
     lasts = 1e3 * every * step
-    return [f"{run}: {channel} is refreshed every {lasts:.3g} ms only; the rows between repeat it"
-            " and count as missing."]  # fmt: skip
+    return [f"{run}: {channel} is updated only every {lasts:.3g} ms; the repeated values in"
+            " between count as missing."]  # fmt: skip
 
 
 def _count(data: _Data) -> int:
@@ -538,14 +537,14 @@ def _count(data: _Data) -> int:
 
 
 def _frozen(data: _Data, run: str, channel: str) -> list[Stretch]:
-    """Stretches of a run in which a channel is frozen, by the strictest test that applies."""
+    """Find the intervals in which a channel is frozen, with the strictest applicable test."""
     reading, sensor, period = data.column(channel, run), data.sensor(channel), data.runs[run].period
     assert reading is not None
     probability = repeat_probability(sensor, channel)
     if probability and as_noisy_as_stated(sensor, channel, _floors(data, run, channel)):
         return frozen_by_noise(reading, probability, _count(data), period)
     kind, _, axis = channel.partition(".")
-    if kind == "pressure_supply":  # rests at its relief for as long as it likes
+    if kind == "pressure_supply":  # may be constant at the relief pressure for any time
         return []
     if kind.startswith("pressure"):
         other = "pressure_rod" if kind == "pressure_head" else "pressure_head"
@@ -578,7 +577,7 @@ def _frozen_position(data: _Data, run: str, channel: str, axis: str) -> list[Str
 
 
 def _floors(data: _Data, run: str, channel: str) -> list[float]:
-    """Noise floors of the channel here, in other runs, and of others with an equal sensor."""
+    """Return the first finite noise floor: this run, other runs, channels with an equal sensor."""
     sensor, witnesses = data.sensor(channel), [(channel, run)]
     witnesses += [(channel, other) for other in data.runs if other != run]
     kind = channel.partition("_")[0].partition(".")[0]
@@ -598,14 +597,16 @@ def _take_out_frozen(data: _Data, run: str, channel: str, parts) -> list[str]:
     assert reading is not None
     spans = [f"from {rows.start + rows.period * a:.6g} to {rows.start + rows.period * b:.6g} s"
              for a, b in parts]  # fmt: skip
-    listed = ", ".join(spans[:3]) + (f" and {len(spans) - 3} times more" if spans[3:] else "")
+    listed = ", ".join(spans[:3]) + (f" and {len(spans) - 3} more times" if spans[3:] else "")
     value = np.nanmedian(reading[slice(*parts[0])])
-    said = f"{run}: {channel} is stuck at {value:.6g} {listed}; these readings were left out."
+    said = f"{run}: {channel} is frozen at {value:.6g} {listed}; these readings were removed."
     if saturated(reading, parts):
         noise = float(data.noise[list(data.channels).index(channel)])
         near = np.abs(reading - value) <= _NEAR * (noise if math.isfinite(noise) else 0.0)
         reading[near] = np.nan
-        said = f"{run}: {channel} does not get beyond {value:.6g}, as {listed}; left out there."
+        said = (
+            f"{run}: {channel} is saturated at {value:.6g} {listed}; these readings were removed."
+        )
     for part in parts:
         reading[slice(*part)] = np.nan
     return [said]
@@ -622,8 +623,8 @@ def _take_out_repeated_rows(data: _Data, run: str) -> list[str]:
     rows.reading[again] = np.nan
     same = np.append(False, (np.diff(rows.command, axis=0) == 0.0).all(axis=1))
     data.runs[run] = rows._replace(known=rows.known & ~(again & same))
-    return [f"{run}: {again.sum()} rows repeat all readings of the row before, which their noise"
-            " forbids; they count as missing."]  # fmt: skip
+    return [f"{run}: {again.sum()} rows are duplicates of the previous row, because noisy readings"
+            " do not repeat; they count as missing."]  # fmt: skip
 
 
 def _take_out_useless(data: _Data, run: str, before: np.ndarray) -> list[str]:
@@ -633,6 +634,6 @@ def _take_out_useless(data: _Data, run: str, before: np.ndarray) -> list[str]:
         if not 0 < has[column] < _KEPT * had[column]:
             continue
         after[:, column] = np.nan
-        notes.append(f"{run}: {channel} has too few good readings and was left out"
-                     " of this run.")  # fmt: skip
+        notes.append(f"{run}: {channel} has too few usable readings and was removed from this"
+                     " run.")  # fmt: skip
     return notes

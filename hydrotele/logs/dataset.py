@@ -1,10 +1,8 @@
-"""Logs of one machine, made ready for learning: one clock, one set of channels, gaps marked.
+"""Data sets for identification: cleaned logs of one machine with fit runs and a held-out run.
 
-What a data set measures: its channels, its sensors and their noise, and what nobody measured.
-
-Which runs are fitted and which one judges; a single run is split in time.
-
-The log behind a run of a data set: without what only a simulator knows, cut as the run was.
+`load_dataset` reads logs, resamples each run to a uniform clock, removes faulty readings, selects
+the channels that the model predicts, and determines their noise. One run is held out for
+validation; a single run is split in time. Truth channels and simulator metadata are removed.
 """
 
 import dataclasses
@@ -33,12 +31,12 @@ from hydrotele.machine.machine import (
 )
 from hydrotele.machine.signals import parse_channel
 
-_MOVES = 10.0  # standard deviations of a reading that a motion must amount to
-_UNSTATED = ("none", "", IDEAL)  # what logs with true values say of their sensors
+_MOVES = 10.0  # noise standard deviations that a position range must exceed to count as motion
+_UNSTATED = ("none", "", IDEAL)  # `sensors` metadata of logs without a known accuracy
 
 
 def predicted(machine: Machine) -> tuple[str, ...]:
-    """Every channel that the model predicts, in the order of a dataset."""
+    """Return all channels that the model predicts, in the order of a dataset."""
     order = actuator_order(machine)
     valves = [name for name in order if machine.axes[name].hydraulic]
     return (
@@ -51,17 +49,17 @@ def predicted(machine: Machine) -> tuple[str, ...]:
 
 
 def common_channels(files: Sequence[RunFiles], machine: Machine) -> tuple[str, ...]:
-    """Channels that any run has and the model predicts.
+    """Return the predicted channels that at least one run contains.
 
     Raises:
-        InputError: there is none; lists what the model predicts.
+        InputError: there is no such channel; the message lists the predicted channels.
     """
     logs = [log for run in files for log in run.logs]
     found = tuple(c for c in predicted(machine) if any(c in log for log in logs))
     if not found:
         raise InputError(
             ", ".join(run.name for run in files) or "the data",
-            f"holds nothing that the model of {machine.name} predicts; that would be"
+            f"contains no channel that the model of {machine.name} predicts; these are"
             f" {', '.join(predicted(machine))}",
         )
     return found
@@ -70,7 +68,12 @@ def common_channels(files: Sequence[RunFiles], machine: Machine) -> tuple[str, .
 def stated_sensors(
     files: Sequence[RunFiles], machine: Machine, name: str | None
 ) -> tuple[SensorSet | None, list[str]]:
-    """The sensors of all logs, None if their noise is unknown, and notes.
+    """Return the sensors of the logs (None if their noise is unknown), and notes.
+
+    Args:
+        files: the runs.
+        machine: the machine.
+        name: name of the sensor set, or None to use that of the metadata.
 
     Raises:
         InputError: the machine has no such sensors, or the logs have different ones.
@@ -82,8 +85,8 @@ def stated_sensors(
     if len(stated) > 1:
         (a, first), (b, other) = list(stated.items())[:2]
         raise InputError(
-            first, f"has the sensors {a!r}, {other} has {b!r}: name those that all logs have, or"
-            " take logs of one kind",
+            first, f"has the sensors {a!r}, {other} has {b!r}: state the sensors with --sensors, or"
+            " use logs with the same sensors",
         )  # fmt: skip
     said = next(iter(stated), None)
     if said in machine.sensors:
@@ -93,21 +96,21 @@ def stated_sensors(
     first = next(iter(machine.sensors))
     if said is not None:
         return machine.sensors[first], [
-            f"the logs have the sensors {said!r}, which {machine.name} has not; {first!r} was taken"
-            " for them."
+            f"the logs name the sensors {said!r}, which {machine.name} does not have; {first!r} is"
+            " used instead."
         ]
     return machine.sensors[first], []
 
 
 def channel_noise(machine: Machine, sensors: SensorSet | None, channel: str) -> float:
-    """Standard deviation of one reading [channel's unit], NaN without a stated accuracy."""
+    """Return the noise standard deviation of one reading [channel's unit], NaN if unknown."""
     if channel_sensor(machine, sensors, channel).error_rms == 0.0:
         return math.nan
     return noise_rms(machine, sensors, channel)
 
 
 def unknown_columns(files: Sequence[RunFiles], machine: Machine) -> list[str]:
-    """Notes on channels that no axis of the machine has, and on commands that were averaged."""
+    """Return notes on channels that the machine does not have, and on averaged commands."""
     valid = (*predicted(machine), *(f"command.{axis}" for axis in machine.axes))
     kinds = {name.partition(".")[0] for name in valid} | {"angle", "position"}
     notes = []
@@ -117,15 +120,15 @@ def unknown_columns(files: Sequence[RunFiles], machine: Machine) -> list[str]:
                          f" {suggest(channel, valid)}.")  # fmt: skip
     averaged = [r.name for r in files if r.logs[0].metadata.get("command", "held") != "held"]
     if averaged:
-        notes.append(f"{', '.join(averaged)}: a row's command is a mean over the row, not held;"
-                     " delays are known to a row at best.")  # fmt: skip
+        notes.append(f"{', '.join(averaged)}: commands are means over each row, not held values;"
+                     " delays can be estimated to within one row only.")  # fmt: skip
     return notes
 
 
 def still_channels(
     runs: Mapping[str, Rows], channels: Sequence[str], noise: np.ndarray
 ) -> list[str]:
-    """Notes on runs in which no position moves."""
+    """Return notes on runs in which no position changes."""
     notes = []
     places = [c for c, name in enumerate(channels) if not name.startswith("pressure")]
     for name, rows in runs.items():
@@ -133,38 +136,40 @@ def still_channels(
         spans = [np.nanmax(rows.reading[:, c]) - np.nanmin(rows.reading[:, c]) for c in good]
         if good and all(s <= _MOVES * np.nan_to_num(noise[c])
                         for s, c in zip(spans, good, strict=True)):  # fmt: skip
-            notes.append(f"{name}: nothing moves; friction, inertia and timing cannot be seen.")
+            notes.append(
+                f"{name}: nothing moves; friction, inertia and delays are not identifiable."
+            )
     return notes
 
 
 def blind_axes(machine: Machine, axes: Sequence[str], channels: Sequence[str]) -> list[str]:
-    """Notes on axes whose position nobody measured."""
+    """Return notes on axes without a position sensor."""
     return [
-        f"neither {machine.position_kind(axis)} nor length of {axis} is measured; what only its"
-        " position shows cannot be told."
+        f"neither {machine.position_kind(axis)} nor length of {axis} is measured; parameters that"
+        " affect only its position are not identifiable."
         for axis in axes
         if not {f"{machine.position_kind(axis)}.{axis}", f"length.{axis}"} & set(channels)
     ]
 
 
-SHORTEST = 0.5  # [s] of a run: a fast servo's stroke, of which the unknown start takes a part
-FEWEST = 50  # rows of a run
-_SHORTEST_PIECE = 10.0  # [s] of a piece of a single run, if it is to be fitted in several
-_PIECES = 3
-_SHARE = 0.15, 0.6  # of a run that was cut, which a piece that judges the others should have
-_FIT = 0.75  # of a single run
-_QUIET = 0.1  # of the commands' changes: less of them in the last quarter judges nothing
-_LEAST_FIT = 0.5  # of a single run
+SHORTEST = 0.5  # [s] minimum run length: a stroke of a fast servo and the unknown initial state
+FEWEST = 50  # minimum number of rows of a run
+_SHORTEST_PIECE = 10.0  # [s] minimum length of a fit piece of a single run
+_PIECES = 3  # maximum number of fit pieces of a single run
+_SHARE = 0.15, 0.6  # fraction of a divided run that the held-out piece should have
+_FIT = 0.75  # fraction of a single run to fit
+_QUIET = 0.1  # minimum fraction of the command changes that the held-out part must contain
+_LEAST_FIT = 0.5  # minimum fraction of a single run to fit
 _HELD_OUT = ("test", "heldout", "validation")
 
 
 class Part(NamedTuple):
-    """A run, a piece of one, or a part of a split piece.
+    """A run, a piece of a run, or a part of a piece that was split in time.
 
     Attributes:
-        name: its own name.
-        piece: name of the run or piece that it was split from; its own name if it was not.
-        rows: its rows.
+        name: name of the part.
+        piece: name of the run or piece that was split; equal to `name` without a split.
+        rows: rows of the part.
     """
 
     name: str
@@ -173,19 +178,19 @@ class Part(NamedTuple):
 
 
 class Split(NamedTuple):
-    """Runs to fit, and the run held out."""
+    """Runs to fit and the held-out run."""
 
     fit: tuple[Part, ...]
     heldout: Part
 
 
 def seconds(rows: Rows) -> float:
-    """Length of a run [s]."""
+    """Return the duration of a run [s]."""
     return len(rows.command) * rows.period
 
 
 def too_short(rows: Rows) -> str | None:
-    """What a run lacks in length, as words; None if it is long enough."""
+    """Return why a run is too short, as text for a message; None if it is long enough."""
     if seconds(rows) >= SHORTEST - 1e-9 and len(rows.command) >= FEWEST:
         return None
     return (
@@ -197,30 +202,32 @@ def too_short(rows: Rows) -> str | None:
 def split(
     runs: Mapping[str, Rows], origin: Mapping[str, str], heldout: str | None
 ) -> tuple[Split, tuple[str, ...]]:
-    """Hold one run out: the one named, else the first of the runs `test*`, `heldout*`,
-    `validation*`, else the last by name. A single run is fitted on its first three quarters, or
-    less where the machine rests after them.
+    """Split runs into fit runs and one held-out run.
+
+    The held-out run is the given one, otherwise the first of the runs `test*`, `heldout*` and
+    `validation*`, otherwise the last by name. A single run is fitted on its first three quarters,
+    or on less if the machine is at rest after them.
 
     Args:
-        runs: name of run or of piece -> rows, at least one.
-        origin: the same names -> the run as logged, of which it may be a piece.
+        runs: name of run or piece -> rows, at least one.
+        origin: the same names -> name of the logged run.
         heldout: name of a run, or None.
 
     Returns:
         (split, notes on runs that are neither fitted nor held out).
 
     Raises:
-        InputError: there is no such run, nothing is left to fit, or a single run is too short.
-    """  # noqa: D205 - the rule is one sentence
+        InputError: the run does not exist, no run remains to fit, or a single run is too short.
+    """
     names = sorted(set(origin.values()))
     if heldout is not None and heldout not in names:
-        raise InputError(f"held-out run {heldout!r}", f"is not there; {suggest(heldout, names)}")
+        raise InputError(f"held-out run {heldout!r}", f"does not exist; {suggest(heldout, names)}")
     if len(runs) == 1:
         name, rows = next(iter(runs.items()))
         if heldout is not None:
             raise InputError(
                 f"held-out run {heldout!r}",
-                "is the only run: leave the name away to split it in time, or add a run to fit",
+                "is the only run: omit the name to split it in time, or add a run to fit",
             )
         return _split_in_time(name, rows), ()
     marked = [name for name in names if name.lower().startswith(_HELD_OUT)]
@@ -233,7 +240,8 @@ def split(
     fit = [n for n in runs if n != judge and not {n, origin[n]} & aside]
     unused = [n for n in runs if n not in fit and n != judge]
     notes = (
-        (f"{', '.join(unused)}: neither fitted nor judged on; {judge} is held out.",)
+        (f"{', '.join(unused)}: not used, neither for the fit nor for validation; {judge} is held"
+         " out.",)
         if unused else ()
     )  # fmt: skip
     if not fit:
@@ -243,7 +251,7 @@ def split(
 
 
 def _last_piece(runs: Mapping[str, Rows]) -> str:
-    """Of the pieces of one run the last that is neither a scrap nor nearly all; else the last."""
+    """Return the last piece of medium length of a run (fractions `_SHARE`), or the last piece."""
     total = sum(map(seconds, runs.values()))
     low, high = _SHARE
     fair = [name for name, rows in runs.items() if low * total <= seconds(rows) <= high * total]
@@ -257,8 +265,8 @@ def _split_in_time(name: str, rows: Rows) -> Split:
     if total < least - 1e-9:
         raise InputError(
             name,
-            f"is the only run and {total:.3g} s long; its last quarter is held out, which asks for"
-            f" {least:.3g} s or more: log longer, or a second run",
+            f"is the only run and {total:.3g} s long; holding out its last quarter needs at least"
+            f" {least:.3g} s: record a longer run or a second run",
         )
     last = _fit_rows(rows)
     count = int(np.clip(last * rows.period // _SHORTEST_PIECE, 1, _PIECES))
@@ -271,10 +279,10 @@ def _split_in_time(name: str, rows: Rows) -> Split:
 
 
 def _fit_rows(rows: Rows) -> int:
-    """Rows of a single run to fit on: three quarters, or less where the machine rests after them.
+    """Return how many rows of a single run to fit: three quarters, or less if the rest is idle.
 
-    A model of a machine at rest is right whatever its numbers. Then a quarter of the commands'
-    changes is held out, and half of the run at most.
+    A machine at rest cannot validate a model. If too few command changes are in the last quarter,
+    the held-out part contains a quarter of the command changes, and at most half of the run.
     """
     n = len(rows.command)
     passed = np.cumsum(np.abs(np.diff(rows.command, axis=0, prepend=rows.command[:1])).sum(axis=1))
@@ -287,7 +295,7 @@ _SECRET = ("initial_state",)  # metadata that only a simulator can know
 
 
 def measured_only(run: RunFiles) -> RunFiles:
-    """The run without truth, in columns and in metadata."""
+    """Return the run without truth columns and without metadata that only a simulator knows."""
     logs = [
         dataclasses.replace(
             log.without_truth(),
@@ -302,19 +310,19 @@ def piece_log(
     logs: Sequence[Log], name: str, rows: Rows, axes: Sequence[str], channels: Sequence[str],
     as_logged: bool = True,
 ) -> Log:  # fmt: skip
-    """Log of a run or of a piece of it.
+    """Return the log of a run or of a piece of it.
 
     Args:
-        logs: the files of the run.
+        logs: the log files of the run.
         name: name of the run or piece.
-        rows: its rows.
+        rows: rows of the run or piece.
         axes: the nu axes.
         channels: the c channels.
-        as_logged: whether the rows stand for what was logged; False for means and masked rows.
+        as_logged: whether the rows are the logged ones; False for averaged or masked rows.
 
     Returns:
-        Of one file its rows as logged, with time stamps and all columns; else a log on the common
-        clock, with commands and channels, NaN where missing.
+        For a single file, the logged rows with their time stamps and all columns. Otherwise a log
+        on the common clock with commands and channels, NaN where missing.
     """
     first = logs[0]
     if len(logs) == 1 and as_logged:
@@ -333,26 +341,26 @@ def piece_log(
     return Log(time, columns, units, first.metadata, name)
 
 
-_MOST_MISSING = 0.3  # of the rows of a run; beyond it the commands are not known well enough
+_MOST_MISSING = 0.3  # maximum fraction of missing rows; beyond it the commands are too uncertain
 
 
 @dataclass(frozen=True)
 class RunData:
-    """One run on a uniform clock, whose period may differ from that of other runs.
+    """One run on a uniform clock; the period may differ between runs.
 
     Attributes:
-        name: the run's name.
+        name: name of the run.
         start: time of the first row [s].
         period: time between rows [s].
-        command: (n, nu) commands in actuator order, held from row to row [1], [V] or [N].
-        command_known: (n,) whether the row was in the log and may be used; a missing row repeats
-            the last command.
-        reading: (n, c) sensor readings in the dataset's channels, NaN where missing [SI].
-        log: the log as read, without truth; of a run that was averaged or is masked, its commands
-            and channels as they stand here.
-        valid: (n,) whether the model may be held against the row, False in contact and wherever
-            the log or a mask says so; None means all rows.
-        behind: (c,) logged readings of which one reading is the mean; None means one.
+        command: (n, nu) commands in actuator order, held until the next row [1], [V] or [N].
+        command_known: (n,) whether the row was logged and may be used; a missing row repeats the
+            last command.
+        reading: (n, c) sensor readings of the channels of the dataset [SI], NaN where missing.
+        log: the log without truth. For an averaged or masked run it has the commands and channels
+            of this record.
+        valid: (n,) whether the model applies to the row, False in contact and in masked rows; None
+            means all rows.
+        behind: (c,) number of logged readings averaged into one reading; None means one.
     """
 
     name: str
@@ -366,7 +374,7 @@ class RunData:
     behind: np.ndarray | None = None
 
     def part(self, first: int, last: int) -> "RunData":
-        """Rows first .. last - 1, with their own start; the log stays that of the whole run."""
+        """Return the rows first .. last - 1; the log remains that of the whole run."""
         rows = slice(first, last)
         return replace(
             self, start=self.start + first * self.period, command=self.command[rows],
@@ -377,18 +385,18 @@ class RunData:
 
 @dataclass(frozen=True)
 class Dataset:
-    """Logs of one machine.
+    """Measured runs of one machine, prepared for identification.
 
     Attributes:
         machine: the model.
         axes: the nu axes in actuator order.
-        channels: the c measured channels that any run has and the model predicts.
-        noise: (c,) standard deviation of one reading from the machine's sensors [SI]; NaN where
-            the machine states no accuracy.
-        fit: the runs to learn from.
-        heldout: the run to judge on.
-        notes: what was left out or mended, one sentence each.
-        sensors: name of the machine's sensors, or None if their noise is unknown.
+        channels: the c predicted channels that at least one run contains.
+        noise: (c,) noise standard deviation of one reading [SI], from the sensors of the machine;
+            NaN where their accuracy is unknown.
+        fit: runs to fit.
+        heldout: run for validation.
+        notes: one sentence per removed or repaired part of the data.
+        sensors: name of the sensors of the machine, or None if their noise is unknown.
     """
 
     machine: Machine
@@ -401,7 +409,7 @@ class Dataset:
     sensors: str | None = None
 
     def noise_of(self, run: RunData) -> np.ndarray:
-        """Standard deviations (c,) of one reading of a run [SI], less where readings are means."""
+        """Return the noise standard deviations (c,) of a run [SI]; averaging reduces them."""
         return self.noise if run.behind is None else self.noise / np.sqrt(run.behind)
 
 
@@ -415,25 +423,25 @@ def load_dataset(
     force: bool = False,
     mask: str | Path | None = None,
 ) -> Dataset:
-    """Read logs and put them in order; whatever is left out or mended leaves a note.
+    """Read logs and prepare them for identification; the notes list removed and repaired data.
 
-    The noise is that of the machine's sensors. A sensor without a stated accuracy has noise NaN,
-    even if its converter's step is known: a fine converter says nothing of the noise before it.
+    The noise is that of the sensors of the machine. A sensor without a stated accuracy has noise
+    NaN, even if its converter step is known, because the noise may be larger than the step.
 
     Args:
         paths: folder with logs, run folder, file, or several of them; see `files`.
         machine: the model.
-        sensors: name of the machine's sensors, or `ideal` if unknown; else what the logs'
-            metadata say, else the machine's first.
-        heldout: name of the run to judge on; see `split`.
-        aliases: the files' own column name -> channel, besides the machine's `log_columns`.
+        sensors: name of the sensors of the machine, or `ideal` if their noise is unknown. The
+            default is the metadata of the logs, or else the first sensors of the machine.
+        heldout: name of the run for validation; see `split`.
+        aliases: column name in the files -> channel, in addition to `log_columns` of the machine.
         force: accept logs whose metadata names another machine or tool.
-        mask: file of stretches that may not be used, see `rows.read_mask`; a log may also say so
-            itself, in a column `valid` or `mask`.
+        mask: file of masked intervals, see `rows.read_mask`. A log may also have a column `valid`
+            or `mask`.
 
     Raises:
-        InputError: a file is unusable, is of another machine, lacks a command, reads what the
-            machine cannot do, or there is too little; says what to do.
+        InputError: a file is invalid, is from another machine, has no command of an axis or values
+            outside the range of the machine, or the runs are too short.
     """
     several = [paths] if isinstance(paths, str | Path) else list(paths)
     names = {**machine.log_columns, **(aliases or {})}
@@ -449,17 +457,17 @@ def make_dataset(
     heldout: str | None = None,
     masks: Sequence[Masked] = (),
 ) -> Dataset:
-    """As `load_dataset`, of logs in memory; their readings may be NaN where missing.
+    """Prepare logs in memory for identification; their readings may be NaN where missing.
 
     Args:
         files: the runs, sorted by name.
         machine: the model.
-        sensors: as of `load_dataset`.
-        heldout: as of `load_dataset`.
-        masks: stretches that may not be used.
+        sensors: see `load_dataset`.
+        heldout: see `load_dataset`.
+        masks: masked intervals.
 
     Raises:
-        InputError: as `load_dataset`.
+        InputError: see `load_dataset`.
     """
     files = [measured_only(run) for run in files]
     axes, channels = tuple(actuator_order(machine)), common_channels(files, machine)
@@ -474,23 +482,23 @@ def make_dataset(
     notes += still_channels(mended, channels, noise)
     kept = np.array([any(np.isfinite(rows.reading[:, column]).any() for rows in mended.values())
                      for column in range(len(channels))])  # fmt: skip
-    notes += [f"{c} has no good reading in any run; it was dropped."
+    notes += [f"{c} has no usable reading in any run; it was removed."
               for c, keep in zip(channels, kept, strict=True) if not keep]  # fmt: skip
     if not kept.any():
         raise InputError(
-            ", ".join(mended), "no reading of any channel is usable: look at the columns, their"
-            f" units and sensors. {' '.join(notes)}",
+            ", ".join(mended), "no channel has a usable reading: check the columns, their units"
+            f" and the sensors. {' '.join(notes)}",
         )  # fmt: skip
     channels = tuple(c for c, keep in zip(channels, kept, strict=True) if keep)
     notes += blind_axes(machine, axes, channels)
     whole, behind = {}, {}
     for name, rows in mended.items():
-        # row by row in memory, as filters cross it: every other layout is compiled anew
+        # C-contiguous: compiled filters would be recompiled for another memory layout
         rows = rows._replace(reading=np.ascontiguousarray(rows.reading[:, kept]))
         whole[name], behind[name], count = averaged(rows)
         if count > 1:
-            notes.append(f"{name}: is logged at {1 / rows.period:.6g} Hz; every {count} rows were"
-                         f" averaged into one of {1 / whole[name].period:.6g} Hz.")  # fmt: skip
+            notes.append(f"{name}: is logged at {1 / rows.period:.6g} Hz; {count} rows each were"
+                         f" averaged, giving {1 / whole[name].period:.6g} Hz.")  # fmt: skip
     parts, left = split(whole, origin, heldout)
     logs = {run.name: run.logs for run in files}
     made = {}
@@ -513,7 +521,7 @@ def _runs(
     files: Sequence[RunFiles], machine: Machine, axes: Sequence[str], channels: Sequence[str],
     masks: Sequence[Masked],
 ) -> tuple[dict[str, Rows], dict[str, str], list[str]]:  # fmt: skip
-    """Runs and pieces of runs by name, the run each comes from, and notes."""
+    """Return runs and pieces by name, the logged run of each, and notes."""
     runs, origin, notes = {}, {}, []
     for run in files:
         pieces, said = run_rows(run, axes, channels, masks)
@@ -522,13 +530,14 @@ def _runs(
         for number, rows in enumerate(pieces, start=1):
             name = run.name if len(pieces) == 1 else f"{run.name}_part{number}"
             if (short := too_short(rows)) and len(pieces) == 1:
-                raise InputError(where, f"is {short}: log longer, or leave it out")
+                raise InputError(where, f"is {short}: record a longer run, or remove this one")
             if short:
-                notes.append(f"{name} is only {short}; it was left out.")
+                notes.append(f"{name} is only {short}; it was removed.")
             elif np.mean(~rows.known) > _MOST_MISSING:
                 raise InputError(
-                    where, f"lacks {100 * np.mean(~rows.known):.0f} % of its rows, and with them"
-                    f" the commands; {100 * _MOST_MISSING:.0f} % can be bridged: log every row",
+                    where, f"{100 * np.mean(~rows.known):.0f} % of the rows are missing, and with"
+                    f" them the commands; at most {100 * _MOST_MISSING:.0f} % are allowed: log"
+                    " every row",
                 )  # fmt: skip
             else:
                 for channel, reading in zip(channels, rows.reading.T, strict=True):
@@ -536,29 +545,30 @@ def _runs(
                 runs[name], origin[name] = rows, run.name
     if not runs:
         message = (
-            f"no run has {SHORTEST:g} s and {FEWEST} rows without a pause or a mask: log longer"
+            f"no run has {SHORTEST:g} s and {FEWEST} rows without a gap or a masked interval:"
+            " record longer runs"
         )
         raise InputError("the data", message)
     return runs, origin, notes
 
 
-_RATE, _PER_CYCLE = 100.0, 6.0  # Hz; rows per cycle of the fastest valve
-_SHORT = 2.0  # s, of a run that is kept as it is
-MOST_SECONDS = 150.0  # of all fitted runs together: four runs of a usual length
+_RATE, _PER_CYCLE = 100.0, 6.0  # minimum rate [Hz]; rows per cycle of the fastest valve
+_SHORT = 2.0  # s, shorter runs are not downsampled
+MOST_SECONDS = 150.0  # s, maximum total duration of the fit runs: about four typical runs
 
 
 def busiest(data: Dataset, most: float = MOST_SECONDS) -> Dataset:
-    """A dataset whose fit runs are no longer than a stated time together.
+    """Limit the total duration of the fit runs to their most exciting segments.
 
-    Every run is cut to its share, the stretch in which the commands change most, and a note says
-    which. The run that is held out stays whole.
+    Each run is cut by the same factor to the segment with the largest command changes, and a note
+    states the segment. The held-out run is not changed.
 
     Args:
         data: the dataset.
-        most: time of all fit runs [s].
+        most: maximum total duration of the fit runs [s].
 
     Returns:
-        The dataset, or the given one if it is short enough.
+        The shortened dataset, or the given one if it is short enough.
     """
     total = sum(len(run.command) * run.period for run in data.fit)
     if total <= most:
@@ -569,15 +579,17 @@ def busiest(data: Dataset, most: float = MOST_SECONDS) -> Dataset:
         cut = _stretch(run, _busiest_row(data, run, rows), rows)
         runs.append(cut)
         end = cut.start + rows * run.period
-        notes.append(f"{run.name} is long: it is fitted from {cut.start:.0f} to {end:.0f} s only.")
+        notes.append(
+            f"{run.name} is long: only the interval from {cut.start:.0f} to {end:.0f} s is fitted."
+        )
     return dataclasses.replace(data, fit=tuple(runs), notes=(*data.notes, *notes))
 
 
 def thinned(data: Dataset) -> Dataset:
-    """A dataset at no higher rate than its machine's valves answer, each row a mean of several.
+    """Downsample a dataset to a rate that resolves its valves; each row is a mean of several.
 
-    From one millisecond to the next a model and its readings can hardly disagree; what says
-    whether a machine has a mass, a friction or a leak takes longer than a valve's own lag.
+    Higher rates add little information, because effects of mass, friction and leakage on the
+    readings are slower than the valves.
     """
     bandwidths = [a.valve.bandwidth / (2.0 * np.pi) for a in data.machine.axes.values() if a.valve]
     rate = max(_RATE, _PER_CYCLE * max(bandwidths, default=0.0))
@@ -600,7 +612,7 @@ def thinned(data: Dataset) -> Dataset:
 
 
 def busiest_rows(run: RunData, rows: int) -> slice:
-    """The stretch of some rows of a run in which its commands change most; all if it is shorter."""
+    """Return the segment of `rows` rows with the largest command changes, or the whole run."""
     if rows >= len(run.command):
         return slice(0, len(run.command))
     spread = np.std(run.command, axis=0)

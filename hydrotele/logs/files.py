@@ -1,9 +1,9 @@
-"""From paths to runs: which files belong to one run, and whether they are of this machine.
+"""Find and read the log files of runs, and check that they belong to the machine.
 
-Supported: `.parquet` and `.csv` logs; folders of them; run folders as `hydrotele run` writes them
-(`measured.parquet` is read, `truth.parquet` never), and folders of such folders. A run in several
-files is told by file names `<run>.<part>.parquet`, or by the metadata `run`; either way only if no
-two of the files hold the same sensor channel, since repeated runs often share a name.
+Supported paths are `.parquet` and `.csv` files, folders of them, run folders of `hydrotele run`
+(`measured.parquet` is read, `truth.parquet` never), and folders of run folders. Files named
+`<run>.<part>.parquet`, or with the same `run` metadata, form one run. They are combined only if no
+two of them have the same sensor channel, because repeated runs often have the same name.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,12 +14,12 @@ from hydrotele.core.errors import InputError
 from hydrotele.logs.log import CommandRange, Log, load_log
 from hydrotele.machine.machine import Machine
 
-MEASURED = "measured"  # stem of the log in a run folder, beside `truth`
+MEASURED = "measured"  # stem of the measured log in a run folder
 _KINDS = (".parquet", ".csv")
 
 
 class RunFiles(NamedTuple):
-    """The logs of one run, without truth; more than one where it lies in several files."""
+    """The logs of one run without truth channels; several if the run has several files."""
 
     name: str
     logs: tuple[Log, ...]
@@ -28,26 +28,26 @@ class RunFiles(NamedTuple):
 def read_runs(
     paths: Sequence[str | Path], machine: Machine, aliases: Mapping[str, str], force: bool
 ) -> tuple[RunFiles, ...]:
-    """Read all logs and sort them into runs by name.
+    """Read all logs and group them into runs.
 
     Args:
         paths: files and folders.
-        machine: the machine they should be of.
-        aliases: a file's own column name -> channel.
+        machine: the machine that the logs must belong to.
+        aliases: column name in a file -> channel.
         force: accept logs whose metadata names another machine or tool.
 
     Returns:
         The runs, sorted by name.
 
     Raises:
-        InputError: a file is unusable, is of another machine, or a run is there twice.
+        InputError: a file is invalid or from another machine, or a run exists twice.
     """
     groups: dict[str, list[Log]] = {}
     named = [pair for path in paths for pair in _files(Path(path))]
     if not named:
-        raise InputError("the data", "no file was given: name a folder with logs, or logs")
+        raise InputError("the data", "no path was given: give log files or a folder with logs")
     if twice := {str(f) for i, (_, f) in enumerate(named) if f in [g for _, g in named[:i]]}:
-        raise InputError(min(twice), "is given twice: name it once")
+        raise InputError(min(twice), "is given twice: give it once")
     logs = []
     for name, file in named:
         log = load_log(
@@ -70,13 +70,13 @@ def read_runs(
     for i, (name, found) in enumerate(runs):
         for other, others in runs[:i]:
             if other == name:
-                message = f"run {name!r} is there twice, also as {others[0].source}: rename one"
+                message = f"run {name!r} exists twice, also as {others[0].source}: rename one"
                 raise InputError(found[0].source, message)
     return tuple(RunFiles(*run) for run in sorted(runs, key=lambda run: run[0]))
 
 
 def command_ranges(machine: Machine) -> dict[str, CommandRange]:
-    """What the command columns of a machine's logs hold, where it is no fraction in [-1, 1]."""
+    """Return the ranges of the command columns that are not fractions in [-1, 1]."""
     return {
         f"command.{name}": CommandRange(axis.command_unit, *axis.command_range)
         for name, axis in machine.axes.items()
@@ -85,13 +85,13 @@ def command_ranges(machine: Machine) -> dict[str, CommandRange]:
 
 
 def _files(path: Path) -> list[tuple[str, Path]]:
-    """(run name, file) of every log behind a path."""
+    """Return (run name, file) of every log at a path."""
     if not path.exists():
-        raise InputError(path, "is not there: name a folder with logs, or logs")
+        raise InputError(path, "does not exist: give log files or a folder with logs")
     if path.is_file():
         return [(path.stem if path.stem != MEASURED else path.resolve().parent.name, path)]
     if not path.is_dir():
-        raise InputError(path, "is neither a file nor a folder: name a folder with logs, or logs")
+        raise InputError(path, "is neither a file nor a folder: give log files or a folder")
     seen = sorted(p for p in path.iterdir() if not p.name.startswith("."))
     if record := _record(path):
         return [(path.resolve().name, record)]
@@ -99,12 +99,12 @@ def _files(path: Path) -> list[tuple[str, Path]]:
     if not files:
         files = [(p.name, f) for p in seen if p.is_dir() and (f := _record(p))]
     if not files:
-        raise InputError(path, "the folder holds no log: put .parquet or .csv files there")
+        raise InputError(path, "the folder contains no log: add .parquet or .csv files")
     return files
 
 
 def _record(folder: Path) -> Path | None:
-    """The log of a run folder; None where the folder is something else."""
+    """Return the measured log of a run folder, or None for other folders."""
     kinds = (folder / f"{MEASURED}{kind}" for kind in _KINDS)
     return next((file for file in kinds if file.is_file()), None)
 
@@ -115,7 +115,7 @@ def _sensors(log: Log) -> set[str]:
 
 
 def _apart(logs: Sequence[Log]) -> bool:
-    """Whether no two logs hold the same sensor channel, and every one holds some or commands."""
+    """Return whether no two logs have the same sensor channel."""
     channels = [channel for log in logs for channel in _sensors(log)]
     return len(channels) == len(set(channels))
 
@@ -138,22 +138,22 @@ def _check_machine(log: Log, machine: Machine) -> None:
         raise InputError(
             log.source,
             f"is a log of the machine {stated!r}, the model is {machine.name!r}: choose the model"
-            " of that machine, leave the log out, or force it if only the name differs",
+            " of that machine, remove the log, or use --force if only the name differs",
         )
     tool = log.metadata.get("tool", machine.tool)
     if tool != machine.tool:
         raise InputError(
             log.source,
-            f"was logged with the tool {tool!r}, the model carries {machine.tool!r}: load the model"
-            f" with tool {tool!r}, leave the log out, or force it if only the name differs",
+            f"was logged with the tool {tool!r}, the model has {machine.tool!r}: load the model"
+            f" with tool {tool!r}, remove the log, or use --force if only the name differs",
         )
 
 
 def check_commands(run: RunFiles, machine: Machine) -> None:
-    """Refuse a run without the command of every driven axis, or with one in another unit.
+    """Check that a run has the command of every axis in the unit of its drive.
 
     Raises:
-        InputError: names file and axis, and what to write.
+        InputError: a command is missing or has another unit; the message gives file and remedy.
     """
     for name, axis in machine.axes.items():
         channel, unit = f"command.{name}", axis.force.command_unit if axis.force else "1"
@@ -162,14 +162,14 @@ def check_commands(run: RunFiles, machine: Machine) -> None:
             has = ", ".join(dict.fromkeys(c for log in run.logs for c in log.columns))
             raise InputError(
                 ", ".join(log.source for log in run.logs),
-                f"needs the column {channel}, which drives {name}; it has {has or 'none'}. Log what"
-                f" was sent to it [{unit}], with 0 all along if it was never driven",
+                f"needs the column {channel}, the command of {name}; it has {has or 'none'}. Log"
+                f" the command [{unit}]; use 0 in all rows if the axis was not driven",
             )
         for log in holders:
             if log.units[channel] != unit:
                 raise InputError(
                     f"{log.source}, column {channel!r}",
-                    f"is in {log.units[channel]!r}, the drive takes {unit!r}: convert the column"
+                    f"is in {log.units[channel]!r}, the drive needs {unit!r}: convert the column"
                     + (
                         f", or state axes.{name}.command_unit and command_range in the machine file"
                         if axis.valve

@@ -1,11 +1,8 @@
-"""Log: time and named columns with units and provenance. The wall between running and learning.
+"""Logs of machines: time and named columns with units and metadata, read from Parquet or CSV.
 
-Parquet in and out, CSV in. Whatever is read is checked, so that a Log can be trusted: its channels
-are known, in SI, finite and of one length, and its time rises.
-
-CSV from a data logger or a spreadsheet, as a table; the checks scale its units to SI.
-
-What a file must satisfy to become a Log: names, units, finite values, time, magnitudes.
+`load_log` reads a file and checks channel names, units, finite values, increasing time and
+plausible magnitudes. CSV columns in other units are converted to SI. A `Log` therefore contains
+only known channels in SI units. `save_log` writes Parquet.
 """
 
 import io
@@ -28,13 +25,13 @@ from hydrotele.core.units import canonical_unit, to_si
 from hydrotele.machine import signals
 from hydrotele.machine.signals import allowed_units, magnitude_limits, parse_channel, usual_unit
 
-_PLAY = 0.02  # of half a command's range, by which a converter may read beyond it
-_LONGEST_STEP = 1.0  # [s] slower than any log of a hydraulic machine
-_NOTHING = 1e-2  # [Pa] no unit makes less a working pressure; a dead sensor is no unit error
+_PLAY = 0.02  # fraction of half a command range that converter readings may exceed it
+_LONGEST_STEP = 1.0  # [s] longer than any sample period of a hydraulic machine
+_NOTHING = 1e-2  # [Pa] maxima below it mean a dead sensor, not a wrong unit
 
 
 class CommandRange(NamedTuple):
-    """What a log's command column holds: `low` stands for -1 and `high` for 1, both in `unit`."""
+    """Range of a command column: `low` corresponds to -1 and `high` to 1, both in `unit`."""
 
     unit: str
     low: float
@@ -42,15 +39,15 @@ class CommandRange(NamedTuple):
 
 
 class Table(NamedTuple):
-    """A file as read, or what is to be written, before any check of names, units or values.
+    """Content of a log file without checks of names, units or values.
 
     Attributes:
-        source: the file.
-        names: one per column, as written; repeated names are kept.
+        source: name of the file.
+        names: column names as in the file; repeated names are kept.
         values: per column (n,) float64.
-        units: per column, None where the file says nothing.
-        metadata: provenance.
-        lines: (n,) line number of each row in a text file, counted from 1; None for Parquet.
+        units: per column, None where the file states no unit.
+        metadata: metadata of the file.
+        lines: (n,) line number of each row in a text file, starting at 1; None for Parquet.
     """
 
     source: str
@@ -74,7 +71,7 @@ def place(source: str, column: str, row: int | None, lines: Sequence | np.ndarra
 
 
 def with_valid(table: Table) -> Table:
-    """A column `mask`, 1 where a row may not be used, as the column `valid`, 1 where it may."""
+    """Replace the column `mask` (1 for unusable rows) by the column `valid` (1 for usable rows)."""
     values = [1.0 - column if name == "mask" else column
               for name, column in zip(table.names, table.values, strict=True)]  # fmt: skip
     names = ["valid" if name == "mask" else name for name in table.names]
@@ -82,17 +79,17 @@ def with_valid(table: Table) -> Table:
 
 
 def in_range(table: Table, ranges: Mapping[str, CommandRange]) -> Table:
-    """Commands in volts, mA, counts or whatever the machine states, as fractions in [-1, 1].
+    """Convert commands in volts, mA or counts to fractions in [-1, 1].
 
-    A column whose own unit is a fraction or percent is left to the usual conversion. Readings up
-    to 2 % beyond the range, a converter's play, count as its end.
+    Columns in percent or as a fraction are left to the conversion to SI. Readings up to 2 % beyond
+    the range, as converters give them, are clipped to it.
 
     Args:
-        table: as read, with the channels' names.
-        ranges: command channel -> what its column holds.
+        table: table with channel names.
+        ranges: command channel -> range of its column.
 
     Raises:
-        InputError: a column is in another unit or goes beyond its range; says what to correct.
+        InputError: a column has another unit or exceeds its range; the message gives the remedy.
     """
     values, units = list(table.values), list(table.units)
     for place, name in enumerate(table.names):
@@ -128,16 +125,16 @@ def in_range(table: Table, ranges: Mapping[str, CommandRange]) -> Table:
 def checked(
     table: Table, required: Sequence[str], maximum_dropped: float, missing: bool = False
 ) -> Table:
-    """Check a table and return it with every column in a SI unit, assumed where none is stated.
+    """Check a table and return it in SI units; columns without a unit get the usual one.
 
     Args:
-        table: as read.
-        required: channels that must be there.
+        table: content of a file.
+        required: channels that must be present.
         maximum_dropped: fraction of the samples that may be missing [1].
-        missing: accept NaN in every column but time.
+        missing: accept NaN in every column except time.
 
     Raises:
-        InputError: the first offence, with column and row and what to do.
+        InputError: the table is invalid; the message gives column, row and remedy.
     """
     _check_names(table, required)
     si = _in_si(table)
@@ -148,15 +145,15 @@ def checked(
 
 
 def check_values(table: Table, maximum_dropped: float, missing: bool = False) -> None:
-    """Refuse values that are not finite, and a time that does not rise or lacks samples.
+    """Check that values are finite, time increases and not too many samples are missing.
 
     Args:
-        table: in SI.
+        table: table in SI units.
         maximum_dropped: fraction of the samples that may be missing [1].
-        missing: accept NaN in every column but time.
+        missing: accept NaN in every column except time.
 
     Raises:
-        InputError: the first offence, with column and row and what to do.
+        InputError: a check fails; the message gives column, row and remedy.
     """
     _check_finite(table, missing)
     _check_time(table, maximum_dropped)
@@ -170,24 +167,24 @@ def _check_names(table: Table, required: Sequence[str]) -> None:
             raise InputError(
                 table.where(name),
                 f"{error}. Rename it, give it an alias or remove it"
-                " (log_columns in the machine file gives aliases; none leaves a column out)",
+                " (log_columns in the machine file defines aliases; the alias none skips a column)",
             ) from None
     for name, count in Counter(table.names).items():
         if count > 1:
-            raise InputError(table.where(name), f"is there {count} times: keep one")
+            raise InputError(table.where(name), f"occurs {count} times: keep one")
     missing = [name for name in ("time", *required) if name not in table.names]
     if missing:
         raise InputError(table.source, lacks(missing, table.names))
 
 
 def lacks(names: Sequence[str], present: Sequence[str] | Mapping[str, object]) -> str:
-    """Return the message for channels that are not there: what is missing, and what there is."""
+    """Return the message for missing channels, with the channels that are present."""
     columns = "columns" if len(names) > 1 else "column"
     return f"needs the {columns} {', '.join(names)}; it has {', '.join(present) or 'none'}"
 
 
 def _in_si(table: Table) -> Table:
-    """Return the table with an SI unit for every column; text is scaled to it, Parquet refused."""
+    """Return the table in SI units; CSV columns are scaled, other units in Parquet are refused."""
     columns, units = [], []
     for name, values, stated in zip(table.names, table.values, table.units, strict=True):
         if stated is None:
@@ -197,7 +194,7 @@ def _in_si(table: Table) -> Table:
         allowed = allowed_units(name)
         says = f"has the unit {stated!r}; a log needs {' or '.join(allowed)}"
         if unit not in allowed:
-            remedy = "correct the unit or move the values to a column that it fits"
+            remedy = "correct the unit, or rename the column to a channel with this unit"
             raise InputError(
                 table.where(name), f"{says}, to which it cannot be converted: {remedy}"
             )
@@ -214,7 +211,7 @@ def _check_finite(table: Table, missing: bool) -> None:
         allowed = missing and name != "time"
         bad = np.flatnonzero(np.isinf(values) if allowed else ~np.isfinite(values))
         if len(bad):
-            remedy = "remove the row or fill it in"
+            remedy = "remove the row or enter a value"
             raise InputError(table.where(name, int(bad[0])), f"is {values[bad[0]]}: {remedy}")
 
 
@@ -225,7 +222,7 @@ def _check_time(table: Table, maximum_dropped: float) -> None:
     if len(bad := np.flatnonzero(~(step > 0))):
         row, before = int(bad[0]) + 1, time[bad[0]]
         what = "repeats" if time[row] == before else "goes back"
-        remedy = "sort the rows by time and keep each time once"
+        remedy = "sort the rows by time and keep one row per time"
         raise InputError(
             table.where("time", row), f"{what} from {before:.10g} to {time[row]:.10g} s: {remedy}"
         )
@@ -236,14 +233,14 @@ def _check_time(table: Table, maximum_dropped: float) -> None:
         raise InputError(
             table.where("time", row),
             f"the step is {step[row - 1]:.4g} s, the median step {np.median(step):.4g} s: "
-            f"{100 * fraction:.2g} % of the samples were dropped or come off time, "
-            f"{100 * maximum_dropped:.2g} % are allowed. Resample the run at a fixed rate, cut it "
-            "there, or allow more with maximum_dropped",
+            f"{100 * fraction:.2g} % of the samples are missing or have irregular times, "
+            f"{100 * maximum_dropped:.2g} % are allowed. Resample the run at a fixed rate, split "
+            "it there, or increase maximum_dropped",
         )
 
 
 def lost_samples(time: np.ndarray) -> np.ndarray:
-    """Return per step (n-1,) how many samples it lacks; 1 if shorter than half the median."""
+    """Return the number of missing samples per step (n-1,); 1 for steps below half the median."""
     with np.errstate(all="ignore"):
         step = np.diff(time)
         deviation = np.abs(step / np.median(step) - 1.0) if len(step) else step
@@ -253,11 +250,11 @@ def lost_samples(time: np.ndarray) -> np.ndarray:
 
 
 def _check_magnitude(table: Table, name: str, values: np.ndarray, unit: str, stated: bool) -> None:
-    """Refuse values that only another unit explains; a stated unit is believed further."""
+    """Check that magnitudes are plausible for the unit; limits are wider for a stated unit."""
     if name == "time":
         if (step := float(np.median(np.diff(values)))) >= _LONGEST_STEP:
             remedy = "looks like milliseconds or less, write seconds"
-            raise InputError(table.where(name, 1), f"rises by {step:g} per row: {remedy}")
+            raise InputError(table.where(name, 1), f"increases by {step:g} per row: {remedy}")
         return
     size = np.abs(values[np.isfinite(values)])
     if not len(size):
@@ -265,14 +262,14 @@ def _check_magnitude(table: Table, name: str, values: np.ndarray, unit: str, sta
     if name == "valid" and len(bad := np.flatnonzero((values != 0.0) & (values != 1.0))):
         if not np.isnan(values[bad]).all():
             row = int(bad[~np.isnan(values[bad])][0])
-            remedy = "write 1 where the row may be used and 0 where not"
+            remedy = "write 1 for usable rows and 0 for others"
             raise InputError(table.where(name, row), f"is {values[row]:g}: {remedy}")
     limits = magnitude_limits(name, unit, stated=stated)
     target = unit if stated else f"{unit} and state the unit"
     if unit == "1":
         axis = name.partition(".")[2]
         target = (
-            "values in [-1, 1], or state in the machine file what they are, such as"
+            "values in [-1, 1], or state unit and range in the machine file, such as"
             f" axes.{axis}: {{command_unit: V, command_range: [-10, 10]}}"
         )
     remedy = f"looks like {limits.looks_like}, write {target}"
@@ -285,28 +282,28 @@ def _check_magnitude(table: Table, name: str, values: np.ndarray, unit: str, sta
         raise InputError(table.where(name, row), f"never exceeds {size[row]:g}: {remedy}")
 
 
-_LONGEST = 1_000_000  # letters of a line
+_LONGEST = 1_000_000  # characters per line
 _HEADER = re.compile(r"(?P<name>.*?)\s*(\[(?P<unit>[^\[\]]*)\])?", re.DOTALL)
 
 
 def read_csv(path: Path, missing: bool = False) -> Table:
     """Read a CSV log: a header of `name` or `name [unit]`, then one line of numbers per row.
 
-    The separator is a comma, a semicolon or a tab, whichever the header has most of; decimals have
-    a point. Lines that start with `#` are comments, of which `# key: value` becomes metadata. A
-    known unit is scaled to SI by `checked`.
+    The separator is the most frequent of comma, semicolon and tab in the header. Decimals have a
+    point. Lines that start with `#` are comments; `# key: value` is read as metadata. `checked`
+    converts known units to SI.
 
     Args:
         path: the file.
         missing: read empty cells as NaN instead of refusing them.
 
     Raises:
-        InputError: not readable as UTF-8 text, empty, no header, a row of the wrong width, or a
-            cell that is not a number.
+        InputError: the file is not UTF-8 text, is empty, has no header, has a row of the wrong
+            length, or contains a cell that is not a number.
     """
     read = _Reading(str(path), missing)
     with open_regular(path) as file:
-        text = io.TextIOWrapper(file, encoding="utf-8-sig")  # line by line: a log may be large
+        text = io.TextIOWrapper(file, encoding="utf-8-sig")  # read by lines: logs may be large
         try:
             for number, line in enumerate(iter(lambda: text.readline(_LONGEST), ""), 1):
                 read.take(number, line)
@@ -322,7 +319,7 @@ def read_csv(path: Path, missing: bool = False) -> Table:
 
 
 class _Reading:
-    """What the lines of a file have brought so far."""
+    """Names, units, metadata and values read from the lines of a CSV file so far."""
 
     def __init__(self, source: str, missing: bool) -> None:
         self.source, self.missing, self.most = source, missing, limit("LOG_VALUES")
@@ -333,9 +330,10 @@ class _Reading:
         self.values, self.lines = array("d"), array("q")
 
     def take(self, number: int, line: str) -> None:
-        """Take the next line of the file, with its end."""
+        """Parse the next line of the file, including its line break."""
         if len(line) == _LONGEST:
-            raise InputError(f"{self.source}, line {number}", f"is longer than {_LONGEST} letters")
+            message = f"is longer than {_LONGEST} characters"
+            raise InputError(f"{self.source}, line {number}", message)
         line = line.rstrip("\n")
         if line.startswith("#"):
             key, colon, value = line[1:].partition(":")
@@ -359,7 +357,7 @@ class _Reading:
         self.names, self.units = _parse_header(line, self.separator)
         if any(map(_is_number, self.names)):
             remedy = "write a header of channel names above the numbers, such as"
-            message = f"the first line {line[:40]!r} holds numbers, not names: {remedy}"
+            message = f"the first line {line[:40]!r} contains numbers, not names: {remedy}"
             raise InputError(self.source, f"{message} time,angle.boom [deg]")
 
 
@@ -396,8 +394,8 @@ def _parse_row(
         column = names[min(len(cells), len(names)) - 1]
         raise InputError(
             place(source, column, number, lines),
-            f"the row has {len(cells)} cells, the header has {len(names)}: the line was cut or a "
-            f"separator ({separator!r}) is missing or superfluous",
+            f"the row has {len(cells)} cells, the header has {len(names)}: the line is incomplete "
+            f"or a separator ({separator!r}) is missing or superfluous",
         )
     return [
         _number(source, name, cell, number, lines, missing)
@@ -408,7 +406,7 @@ def _parse_row(
 def _number(
     source: str, name: str, cell: str, row: int, lines: Sequence[int], missing: bool
 ) -> float:
-    """Return the number in a cell that may be quoted."""
+    """Return the number in a cell, which may have quotation marks."""
     text = cell.strip().strip('"').strip()
     if missing and not text:
         return math.nan
@@ -419,27 +417,27 @@ def _number(
         pass
     where = place(source, name, row, lines)
     if not text:
-        raise InputError(where, "empty cell: remove the row or fill it in; NaN is not allowed")
+        raise InputError(where, "empty cell: remove the row or enter a value; NaN is not allowed")
     remedy = "write decimals with a point" if "," in text else "write a number or remove the column"
     raise InputError(where, f"{text[:40]!r} is not a number: {remedy}")
 
 
-LEFT_OUT = "none"  # the alias of columns that are no channel and not wanted
+LEFT_OUT = "none"  # alias of columns to skip
 
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """One run of a machine, measured or simulated. The arrays are copied and read-only.
+    """One measured or simulated run of a machine. The arrays are copied and read-only.
 
     Attributes:
-        time: (n,) float64 [s], strictly rising.
-        columns: channel name (see `signals`) -> (n,) float64 in the unit that `units` gives.
+        time: (n,) float64 [s], strictly increasing.
+        columns: channel name (see `signals`) -> (n,) float64 in the unit of `units`.
         units: channel name -> SI unit; the same keys as `columns`.
-        metadata: provenance; structures as JSON text.
-        source: the file it was read from, or what made it.
+        metadata: metadata such as machine and sensors; structures as JSON text.
+        source: file of the log, or the name of the program part that created it.
 
     Raises:
-        ValueError: a column is not as long as time, has no unit, is not a valid channel or has a
+        ValueError: a column has another length than time, no unit, an unknown channel name, or a
             unit that its kind does not allow.
         TypeError: a metadata key or value is not a string.
     """
@@ -451,7 +449,7 @@ class Log:
     source: str = "memory"
 
     def __post_init__(self) -> None:
-        """Copy, freeze and check."""
+        """Copy the arrays, make them read-only and check the columns."""
         object.__setattr__(self, "time", _frozen(self.time))
         object.__setattr__(self, "columns", {k: _frozen(v) for k, v in self.columns.items()})
         object.__setattr__(self, "units", dict(self.units))
@@ -473,14 +471,14 @@ class Log:
         return len(self.time)
 
     def __contains__(self, name: object) -> bool:
-        """Tell whether the channel is there."""
+        """Return whether the log has a channel."""
         return name == "time" or name in self.columns
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """Return a channel, (n,) in its unit, or `time`.
+        """Return the values (n,) of a channel in its unit, or `time`.
 
         Raises:
-            InputError: the log has no such channel; lists what it has.
+            InputError: the log does not have the channel; the message lists its channels.
         """
         if name not in self:
             raise InputError(self.source, lacks([name], self.columns))
@@ -488,27 +486,27 @@ class Log:
 
     @property
     def name(self) -> str:
-        """The run's name: the file name without its ending."""
+        """Name of the run: the file name without its ending."""
         return Path(self.source).stem
 
     @property
     def axes(self) -> tuple[str, ...]:
-        """The axes of the measured channels, in order of appearance."""
+        """Axes of the measured channels, in order of appearance."""
         channels = map(signals.parse_channel, self.columns)
         return tuple(dict.fromkeys(c.axis for c in channels if c.axis and not c.truth))
 
     @property
     def rate(self) -> float:
-        """The sample rate [Hz], from the median step."""
+        """Sample rate [Hz], from the median step."""
         return float(1.0 / np.median(np.diff(self.time)))
 
     @property
     def gaps(self) -> np.ndarray:
-        """The rows (k,) before which samples are missing, or whose time is off by half a step."""
+        """Rows (k,) before which samples are missing, or whose time is off by half a step."""
         return np.flatnonzero(lost_samples(self.time)) + 1
 
     def without_truth(self) -> "Log":
-        """Return the log with measured channels only, which is all that learning code may see."""
+        """Return the log with measured channels only, as identification code may use them."""
         kept = [name for name in self.columns if not signals.parse_channel(name).truth]
         return replace(
             self, columns={k: self.columns[k] for k in kept}, units={k: self.units[k] for k in kept}
@@ -525,24 +523,24 @@ def load_log(
     missing: bool = False,
     commands: Mapping[str, CommandRange] | None = None,
 ) -> Log:
-    """Read and check one run, `.parquet` or `.csv`.
+    """Read and check one run from a `.parquet` or `.csv` file.
 
     Args:
         path: the file.
-        aliases: the file's own column name -> channel name, with a minus before it where the sign
-            is the other way round, `a * b` stands for the product of two columns without unit, and
-            `none` for a column to leave out; names that the file lacks are ignored, and so are all
-            of them for logs that hydrotele wrote.
-        required: channels that must be there, after renaming.
-        minimum_rows: fewer rows are refused.
-        maximum_dropped: fraction of the samples [1] that may be missing or come off time by more
-            than half a step; `Log.gaps` says where they are.
-        missing: accept NaN, null and empty cells in every column but time; they become NaN.
-        commands: command channel -> what its column holds, where that is no fraction in [-1, 1];
-            ignored for logs that hydrotele wrote.
+        aliases: column name in the file -> channel name. A minus before the channel name inverts
+            the sign. The column name `a * b` means the product of two columns without unit. The
+            channel name `none` skips a column. Unknown column names are ignored. Logs written by
+            hydrotele need no aliases and ignore them.
+        required: channels that must be present after renaming.
+        minimum_rows: minimum number of rows.
+        maximum_dropped: fraction of the samples [1] that may be missing or whose time may be off
+            by more than half a step; `Log.gaps` lists them.
+        missing: accept NaN, null and empty cells in every column except time; they become NaN.
+        commands: command channel -> range of its column, for commands that are not fractions in
+            [-1, 1]; ignored for logs written by hydrotele.
 
     Raises:
-        InputError: the file cannot be used; names file, column and row, and what to do.
+        InputError: the file is invalid; the message gives file, column, row and remedy.
     """
     path = Path(path)
     table = read_table(path, missing)
@@ -588,14 +586,13 @@ def load_logs(
     minimum_rows: int = 10,
     maximum_dropped: float = 0.0,
 ) -> tuple[Log, ...]:
-    """Read one file, or every `.parquet` and `.csv` of a folder, sorted by name.
+    """Read one log file, or all `.parquet` and `.csv` files of a folder, sorted by name.
 
-    A folder without such files may hold folders of runs, whose `measured.parquet` or
-    `measured.csv` is read. The arguments are those of `load_log`.
+    If a folder has no such files, the `measured.parquet` or `measured.csv` of each subfolder is
+    read. The arguments are those of `load_log`.
 
     Raises:
-        InputError: as `load_log` for the first bad file; also for a folder without logs, or with
-            one run twice.
+        InputError: as for `load_log`; also if the folder has no logs or the same run twice.
     """
     path = Path(path)
     files = [path]
@@ -609,11 +606,11 @@ def load_logs(
             if file.suffix in (".parquet", ".csv")
         )
     if not files:
-        raise InputError(path, "the folder holds no log: put .parquet or .csv files there")
+        raise InputError(path, "the folder contains no log: add .parquet or .csv files")
     names = Counter(f.stem if f.parent == path else f.parent.name for f in files)
     for run, count in names.items():
         if count > 1:
-            raise InputError(path, f"run {run!r} is there {count} times: keep one file of it")
+            raise InputError(path, f"run {run!r} exists {count} times: keep one file of it")
     return tuple(
         load_log(
             file,
@@ -627,11 +624,11 @@ def load_logs(
 
 
 def save_log(log: Log, path: str | os.PathLike) -> None:
-    """Write a log as Parquet, all or nothing: `path` holds the old file or the whole new one.
+    """Write a log atomically as Parquet: an error leaves an existing file unchanged.
 
     Raises:
-        InputError: the values are not finite or time does not rise, the name does not end in
-            .parquet, or the folder cannot be written. Nothing is written then.
+        InputError: a value is not finite, time does not increase, the name does not end in
+            .parquet, or the folder is not writable.
     """
     path = Path(path)
     names, values = ["time", *log.columns], [log.time, *log.columns.values()]
@@ -659,21 +656,21 @@ def _parquet_bytes(table: Table) -> memoryview:
         pa.Table.from_arrays(arrays, schema=schema),
         stream,
         compression="zstd",
-        use_dictionary=False,  # measured floats hardly repeat
-        write_page_checksum=True,  # a flipped bit is then found on reading
+        use_dictionary=False,  # measured values rarely repeat
+        write_page_checksum=True,  # detects damaged files
     )
     return memoryview(stream.getvalue())
 
 
 def read_table(path: Path, missing: bool = False) -> Table:
-    """Read a log's columns as they are, without checks of their names and values.
+    """Read the columns of a log file without checks of names and values.
 
     Args:
         path: the file.
         missing: read empty cells as NaN instead of refusing them.
 
     Returns:
-        Its columns.
+        The columns.
 
     Raises:
         InputError: the file cannot be read.
@@ -695,12 +692,12 @@ def _read_parquet(path: Path, missing: bool) -> Table:
     try:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             schema, rows = file.schema_arrow, file.metadata.num_rows
-            specs = [s for s in schema if not s.name.startswith("__index_level_")]  # pandas' labels
+            specs = [s for s in schema if not s.name.startswith("__index_level_")]  # pandas index
             for spec in specs:
                 _check_numbers(path, spec)
             check_limit(path, "LOG_VALUES", rows * len(specs))
-            for spec in specs:  # one by one, so that only one is there twice
-                read = file.read(columns=[spec.name])  # and columns whose names begin so
+            for spec in specs:  # one by one, to hold only one column in memory twice
+                read = file.read(columns=[spec.name])  # may include columns with this prefix
                 column = read.column(read.schema.get_all_field_indices(spec.name)[0])
                 names.append(spec.name)
                 values.append(_numbers(f"{path}, column {spec.name!r}", column, missing))
@@ -721,16 +718,16 @@ def _check_numbers(path: Path, spec) -> None:
 
     number = pa.types.is_floating(spec.type) or pa.types.is_integer(spec.type)
     if not (number or (pa.types.is_boolean(spec.type) and spec.name in ("valid", "mask"))):
-        message = f"holds {spec.type}, not numbers: write it as float64 or remove it"
+        message = f"contains {spec.type}, not numbers: write it as float64 or remove it"
         raise InputError(f"{path}, column {spec.name!r}", message)
 
 
 def _numbers(where: str, column, missing: bool) -> np.ndarray:
-    """A Parquet column as (n,) float64, null as NaN."""
+    """Return a Parquet column as (n,) float64, with NaN for null."""
     if column.null_count and not missing:
         row = int(np.flatnonzero(column.is_null().to_numpy())[0])
-        raise InputError(f"{where}, row {row}", "is null: remove the row or fill it in")
-    with np.errstate(invalid="ignore"):  # a damaged file may hold signalling NaN
+        raise InputError(f"{where}, row {row}", "is null: remove the row or enter a value")
+    with np.errstate(invalid="ignore"):  # a damaged file may contain signalling NaN
         return column.to_numpy().astype(np.float64)
 
 

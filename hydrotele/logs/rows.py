@@ -1,14 +1,10 @@
-"""The rows of one run, from one file or several, on one uniform clock; cut where rows lack long.
+"""Put the rows of a run, from one or several log files, on one uniform clock.
 
-A file says with its column `valid` which rows may not be used, such as those in contact.
-
-The offset between the clocks of two files of one run, from the commands that both logged.
-
-Stretches of runs that may not be used: contact, maintenance, whatever the model leaves out.
-
-The clock of a log: stamps that jitter, wander or lack rows, as ticks of a uniform period.
-
-Runs logged faster than a hydraulic machine moves, averaged to a rate that filters can cross.
+`fit_clock` fits a uniform clock to time stamps with jitter, drift or missing rows. `clock_offset`
+estimates the offset between the clocks of two files from commands that both contain. `run_rows`
+merges the files, splits the run at long gaps and masked intervals, and marks unusable rows (the
+column `valid`, or a mask file), for example those in contact. `averaged` reduces the rate of runs
+that are logged faster than a hydraulic machine moves.
 """
 
 import csv
@@ -25,26 +21,26 @@ from hydrotele.core.files import read_text
 from hydrotele.logs.files import RunFiles
 from hydrotele.logs.log import Log
 
-_EVEN = 0.01  # of a step: stamps this even are one tick per row, whatever their drift
-_GAIN = 0.1  # of a stamp's deviation that the tracking clock takes over
-_NOTED = 0.02  # of a step: jitter below this is rounding
-_LOST = 0.005  # of a step over a whole run, for a round period
+_EVEN = 0.01  # of a step: with less jitter each row is one tick, even with drift
+_GAIN = 0.1  # fraction of a stamp's deviation by which the tracking clock is corrected
+_NOTED = 0.02  # of a step: smaller jitter is rounding
+_LOST = 0.005  # of a step over a whole run: tolerance for rounding the period
 _NO_CLOCK = 0.22  # RMS of a step; stamps without any clock have 1 / sqrt(12) = 0.29
-_SHARED = 0.01  # of the rows may be nearest to a tick that another row has
-_FINE = 5  # ticks per step where rows keep no common clock, so that they are off by a tenth at most
-_PACE = 0.5  # of a step by which one may be longer or shorter
-_PACED = 0.9  # of the steps must be so for a log that has a pace at least
+_SHARED = 0.01  # maximum fraction of rows that share their nearest tick with another row
+_FINE = 5  # ticks per step for irregular rows, so that the time error is at most a tenth of a step
+_PACE = 0.5  # of a step: deviation up to which a step counts as regular
+_PACED = 0.9  # minimum fraction of regular steps
 
 
 class Clock(NamedTuple):
-    """A uniform clock and where a log's rows stand on it.
+    """A uniform clock and the ticks of the rows of a log.
 
     Attributes:
         start: time of tick 0 [s].
         period: time between ticks [s].
-        row: (n,) rows of the log that are used, rising.
-        tick: (n,) their ticks, rising, the first is 0.
-        hold: ticks for which a row's command holds at most, if no other comes.
+        row: (n,) used rows of the log, increasing.
+        tick: (n,) tick of each used row, increasing, starting at 0.
+        hold: maximum number of ticks for which the command of a row is held.
     """
 
     start: float
@@ -55,23 +51,22 @@ class Clock(NamedTuple):
 
 
 def fit_clock(time: np.ndarray, where: str) -> tuple[Clock, tuple[str, ...]]:
-    """Uniform clock behind time stamps.
+    """Fit a uniform clock to time stamps.
 
-    The period is that of the rows, by least squares, so that a clock that is a little fast or slow
-    loses no row. Of two rows at one tick the nearer one is used. Stamps that only jitter about
-    their ticks are taken for inexact stamps of exact rows; where the rows wander off any common
-    clock, as those of a loop that sleeps between rows, the stamps are believed and stand on a clock
-    five times as fast, with nothing on the ticks between.
+    The period is estimated by least squares, so that a slightly fast or slow clock loses no row.
+    If two rows have the same tick, the closer one is used. Stamps with jitter about the ticks are
+    assigned to the nearest tick. Rows without a common clock, as those of a loop that sleeps
+    between rows, keep their stamps: the clock is then five times as fast, with empty ticks.
 
     Args:
-        time: (n,) rising [s].
-        where: what the stamps belong to, for messages.
+        time: (n,) increasing time stamps [s].
+        where: name of the log, for messages.
 
     Returns:
-        (clock, notes on jitter and on rows left out).
+        (clock, notes on jitter and on removed rows).
 
     Raises:
-        InputError: the stamps follow no clock.
+        InputError: the steps are too irregular.
 
     >>> clock, notes = fit_clock(np.array([5.0, 5.1, 5.2, 5.5, 5.6]), "a log")
     >>> round(clock.period, 6), clock.tick.tolist(), notes
@@ -83,7 +78,7 @@ def fit_clock(time: np.ndarray, where: str) -> tuple[Clock, tuple[str, ...]]:
     else:
         tick = _tracked(time, period)
     period, start = np.polyfit(tick, time, 1)
-    for _ in range(3):  # the ticks of a line through all stamps, no longer of the first one
+    for _ in range(3):  # alternate between assigning ticks and fitting the line
         tick = np.rint((time - start) / period).astype(int)
         period, start = np.polyfit(tick, time, 1)
     period, start = float(period), float(start)
@@ -101,19 +96,19 @@ def _wandering(time: np.ndarray, where: str) -> tuple[Clock, tuple[str, ...]]:
     if paced.mean() < _PACED:
         raise InputError(
             where,
-            f"the time stamps follow no clock: {100 * np.mean(~paced):.0f} % of the steps are more"
-            f" than {100 * _PACE:.0f} % off the usual one of {period:.4g} s. Log, or resample, at a"
-            " fixed rate",
+            f"the time stamps follow no clock: {100 * np.mean(~paced):.0f} % of the steps differ by"
+            f" more than {100 * _PACE:.0f} % from the median step of {period:.4g} s. Log or"
+            " resample at a fixed rate",
         )
     fine = period / _FINE
     tick, row = np.unique(np.rint((time - time[0]) / fine).astype(int), return_index=True)
     scatter = 100 * float(np.std(step[paced] / period))
     notes = (
-        f"{where}: the rows keep no common clock, their steps scatter by {scatter:.2g} %; each"
-        f" stands at its own time on a clock of {1 / fine:.6g} Hz.",
+        f"{where}: the rows have no common clock, the standard deviation of their steps is"
+        f" {scatter:.2g} %; each row is placed at its time on a clock of {1 / fine:.6g} Hz.",
     )
     if extra := len(time) - len(row):
-        notes += (f"{where}: {extra} rows share a tick with another row and were left out.",)
+        notes += (f"{where}: {extra} rows have the same tick as another row and were removed.",)
     return Clock(float(time[0]), fine, row, tick, int((1.0 + _PACE) * _FINE) + 1), notes
 
 
@@ -125,11 +120,11 @@ def _clock(time, tick, off, start, period, where) -> tuple[Clock, tuple[str, ...
     if np.abs(off[row]).max() > _NOTED:
         rms = 100 * float(np.sqrt(np.mean(off[row] ** 2)))
         notes += (
-            f"{where}: the time stamps jitter by {rms:.2g} % of a step; every row was put on the"
-            f" nearest tick of {1 / period:.6g} Hz.",
+            f"{where}: the time stamps have a jitter of {rms:.2g} % of a step; every row was moved"
+            f" to the nearest tick of {1 / period:.6g} Hz.",
         )
     if extra := len(time) - len(row):
-        notes += (f"{where}: {extra} rows share a tick with another row and were left out.",)
+        notes += (f"{where}: {extra} rows have the same tick as another row and were removed.",)
     if np.abs(off[row]).max() <= _NOTED:
         start = float(time[row[0]])
     else:
@@ -138,7 +133,7 @@ def _clock(time, tick, off, start, period, where) -> tuple[Clock, tuple[str, ...
 
 
 def _tracked(time: np.ndarray, period: float) -> np.ndarray:
-    """Ticks (n,) from a clock that follows the stamps row by row."""
+    """Return the ticks (n,) of time stamps from a clock that is corrected row by row."""
     tick = np.zeros(len(time), dtype=int)
     at = time[0]
     for row in range(1, len(time)):
@@ -150,36 +145,36 @@ def _tracked(time: np.ndarray, period: float) -> np.ndarray:
 
 
 def _rounded(period: float, rows: int) -> float:
-    """The period of a round rate [Hz], or round period [us], if it loses no time over the rows."""
+    """Round to a whole rate [Hz] or period [us] if the time error over all rows is negligible."""
     for even in (1.0 / max(round(1.0 / period), 1), round(1e6 * period) * 1e-6):
         if abs(even - period) * rows < _LOST * period:
             return even
     return period
 
 
-_LEAST_OVERLAP = 5.0  # [s] that both must have in common
-_ALIKE = 0.95  # correlation of commands that are the same signal, sampled twice
-_EQUAL = 1.0e-6  # relative: commands that went through single precision are still the same numbers
-_SAME = 0.99  # fraction of the rows that must be equal for the same rows in two files
+_LEAST_OVERLAP = 5.0  # [s] minimum overlap of the two files
+_ALIKE = 0.95  # minimum correlation of two samplings of the same command signal
+_EQUAL = 1.0e-6  # relative: tolerance for commands stored in single precision
+_SAME = 0.99  # minimum fraction of equal rows if two files contain the same rows
 
 
 def clock_offset(
     clock: Clock, command: np.ndarray, other: Clock, other_command: np.ndarray
 ) -> float | None:
-    """What must be added to the times of the other file [s].
+    """Estimate the offset to add to the times of a second file [s].
 
-    The coarse offset is where the two command histories correlate best. If the files then hold the
-    same rows, their stamps give it exactly; else it is where the commands, joined by straight
-    lines, differ least.
+    The coarse offset maximises the correlation of the two command histories. If both files contain
+    the same rows, their stamps give the exact offset. Otherwise the offset minimises the difference
+    of the linearly interpolated commands.
 
     Args:
-        clock: (n rows) the clock that counts.
-        command: (n, k) commands of its rows.
-        other: (m rows) the clock to be set.
-        other_command: (m, k) the same commands in the other file.
+        clock: reference clock (n rows).
+        command: (n, k) commands at the rows of the reference clock.
+        other: clock of the second file (m rows).
+        other_command: (m, k) the same commands in the second file.
 
     Returns:
-        The offset [s], None where the commands do not tell (constant, or not the same signal).
+        The offset [s], None if it is not identifiable: constant commands or different signals.
     """
     step = min(clock.period, other.period)
     a, b = _held(clock, command, step), _held(other, other_command, step)
@@ -191,7 +186,7 @@ def clock_offset(
     if not best >= _ALIKE:
         return None
     near = np.flatnonzero(alike > best - 1.0e-6)
-    stated = (other.start - clock.start) / step  # of several equal offsets the smallest counts
+    stated = (other.start - clock.start) / step  # of equally good offsets use the smallest
     lag = int(lags[near[np.argmin(np.abs(lags[near] - stated))]])
     coarse = clock.start + lag * step - other.start
     exact = _same_rows(clock, command, other, other_command, coarse)
@@ -199,17 +194,17 @@ def clock_offset(
 
 
 def _held(clock: Clock, values: np.ndarray, step: float) -> np.ndarray:
-    """Values (n, k) on a uniform clock, each held until the next one."""
+    """Resample values (n, k) to a uniform step, holding each until the next one."""
     time = clock.tick * clock.period
     at = np.arange(round(time[-1] / step) + 1) * step
     return values[np.searchsorted(time, at + 1e-6 * step, side="right") - 1]
 
 
 def _correlation(a: np.ndarray, b: np.ndarray, least: int) -> tuple[np.ndarray, np.ndarray]:
-    """Correlation of a[i + lag] and b[i] over their overlap, by lag; 0 for too short overlaps."""
+    """Return the correlation of a[i + lag] and b[i] by lag; 0 where the overlap is too short."""
     columns = range(a.shape[1])
     ones_a, ones_b = np.ones(len(a)), np.ones(len(b))
-    from scipy.signal import correlate  # a second to import, and most logs are one file
+    from scipy.signal import correlate  # slow to import, and most runs have only one file
 
     product = sum(correlate(a[:, k], b[:, k], method="fft") for k in columns)
     power_a = sum(correlate(a[:, k] ** 2, ones_b, method="fft") for k in columns)
@@ -261,7 +256,7 @@ _HEADER = ("run", "begin", "end")
 
 
 class Masked(NamedTuple):
-    """From begin to end [s] of a run's own time stamps; the run "" stands for every run."""
+    """Masked interval from begin to end [s] of a run's time stamps; "" means all runs."""
 
     run: str
     begin: float
@@ -269,13 +264,13 @@ class Masked(NamedTuple):
 
 
 def read_mask(path: str | Path) -> tuple[Masked, ...]:
-    """Stretches of a CSV file with the columns `run,begin,end`, times in seconds.
+    """Read masked intervals from a CSV file with the columns `run,begin,end`, times in seconds.
 
     Args:
-        path: the file; an empty run means every run, an empty time the run's own start or end.
+        path: the file; an empty run means all runs, an empty time the start or end of the run.
 
     Raises:
-        InputError: the file is not there, or a line is no stretch; names the line.
+        InputError: the file does not exist, or a line is invalid; the message names the line.
     """
     path = Path(path)
     lines = read_text(path).splitlines()
@@ -287,7 +282,7 @@ def read_mask(path: str | Path) -> tuple[Masked, ...]:
         if not header:
             header = True
             if tuple(cells) != _HEADER:
-                raise InputError(f"{path}:{number}", "must begin with the header run,begin,end")
+                raise InputError(f"{path}:{number}", "must be the header run,begin,end")
             continue
         try:
             run, begin, end = cells
@@ -296,28 +291,28 @@ def read_mask(path: str | Path) -> tuple[Masked, ...]:
             message = f"is {','.join(cells)!r}: write run,begin,end, such as dig_1,12.5,14.0"
             raise InputError(f"{path}:{number}", message) from None
         if not stretch.begin < stretch.end:
-            raise InputError(f"{path}:{number}", f"ends at {stretch.end:g} s, before its beginning")
+            raise InputError(f"{path}:{number}", f"ends at {stretch.end:g} s, before its start")
         found.append(stretch)
     if not found:
-        raise InputError(path, "masks nothing: write run,begin,end and one stretch per line")
+        raise InputError(path, "has no interval: write run,begin,end and one interval per line")
     return tuple(found)
 
 
 def check_runs(masks: Sequence[Masked], runs: Sequence[str]) -> None:
-    """Refuse stretches of runs that are not there.
+    """Check that the runs of all masked intervals exist.
 
     Raises:
-        InputError: names the run and those that are there.
+        InputError: a run does not exist; the message lists the runs.
     """
     for mask in masks:
         if mask.run and mask.run not in runs:
             raise InputError(
-                f"mask of run {mask.run!r}", f"is not there; {suggest(mask.run, runs)}"
+                f"mask of run {mask.run!r}", f"the run does not exist; {suggest(mask.run, runs)}"
             )
 
 
 def unmasked(masks: Sequence[Masked], run: str, time: np.ndarray) -> np.ndarray:
-    """Whether each row (n,) of a run, at its time (n,) [s], is outside all stretches.
+    """Return (n,) whether rows of a run at times (n,) [s] are outside all masked intervals.
 
     >>> unmasked([Masked("", 1.0, 2.0)], "dig_1", np.array([0.5, 1.0, 1.5, 2.0])).tolist()
     [True, False, False, True]
@@ -329,11 +324,11 @@ def unmasked(masks: Sequence[Masked], run: str, time: np.ndarray) -> np.ndarray:
     return valid
 
 
-LONGEST_GAP = 1.0  # [s] without rows, after which the commands' history is lost and a run is cut
-LONGEST_MASK = 0.2  # [s] masked, after which nobody knows the state and a run is cut
-_FINEST = 5  # times as many ticks as the commands' file has rows
-_SLOW = 20.0  # [Hz] below it a row lasts as long as a valve takes
-_OFF = 0.05  # of a row's period that a reading may be off its tick
+LONGEST_GAP = 1.0  # [s] longer gaps split a run, because the command history is unknown
+LONGEST_MASK = 0.2  # [s] longer masked intervals split a run, because the state is unknown
+_FINEST = 5  # maximum number of ticks per row of the file with the commands
+_SLOW = 20.0  # [Hz] below it a row is longer than the response time of a valve
+_OFF = 0.05  # of a row's period: tolerance for the time of a reading
 
 
 class Rows(NamedTuple):
@@ -342,10 +337,10 @@ class Rows(NamedTuple):
     Attributes:
         start: time of the first row [s].
         period: time between rows [s].
-        command: (n, nu) commands, held from row to row.
+        command: (n, nu) commands, held until the next row.
         known: (n,) whether the command of the row was logged.
         reading: (n, c) readings, NaN where missing.
-        valid: (n,) whether the row may be used; its readings are NaN where not.
+        valid: (n,) whether the row may be used; readings of other rows are NaN.
     """
 
     start: float
@@ -359,20 +354,21 @@ class Rows(NamedTuple):
 def run_rows(
     run: RunFiles, axes: Sequence[str], channels: Sequence[str], masks: Sequence[Masked] = ()
 ) -> tuple[tuple[Rows, ...], tuple[str, ...]]:
-    """Put a run on one clock.
+    """Merge the files of a run on one clock and split it at gaps and masked intervals.
 
-    The file that holds the commands gives the clock. Files of other rates, or whose rows fall
-    between its rows, make the clock up to five times finer, so that every reading stands at its
-    own time; rows in between have NaN.
+    The file with the commands defines the clock. If other files have rows between its rows, the
+    clock is made up to five times finer, so that every reading keeps its time. Rows without a
+    reading are NaN.
 
     Args:
-        run: its files.
+        run: the files of the run.
         axes: the nu axes.
         channels: the c channels.
-        masks: stretches that may not be used, besides what the files say.
+        masks: masked intervals, in addition to the `valid` columns of the files.
 
     Returns:
-        (its pieces, cut where more than a second lacks or more than 0.2 s are masked; notes).
+        (pieces of the run, notes). The run is split at gaps of more than 1 s and at masked
+        intervals of more than 0.2 s.
 
     Raises:
         InputError: time stamps follow no clock.
@@ -388,8 +384,8 @@ def run_rows(
         notes += note
     period, fine, off = _common_period(clocks)
     if off > _OFF * clocks[0].period:
-        notes.append(f"{run.name}: its files share no clock; readings are up to {1e3 * off:.2g} ms"
-                     " off their time.")  # fmt: skip
+        notes.append(f"{run.name}: the files have no common clock; the times of readings are wrong"
+                     f" by up to {1e3 * off:.2g} ms.")  # fmt: skip
     ticks = [_ticks(clock, clocks[0].start, period) for clock in clocks]
     every = np.unique(np.concatenate(ticks))
     command = _spread(logs, clocks, ticks, every, commands)
@@ -401,7 +397,7 @@ def run_rows(
         np.diff(every) * period > LONGEST_GAP))  # fmt: skip
     if lost := [every[p[0]] - every[p[0] - 1] for p in pieces[1:]]:
         seconds = ", ".join(f"{n * period:.3g} s" for n in lost)
-        notes.append(f"{run.name}: nothing was logged for {seconds}; the run was cut there.")
+        notes.append(f"{run.name}: nothing was logged for {seconds}; the run was split there.")
     fine *= clocks[0].hold
     rows = tuple(
         _dense(clocks[0].start, period, fine, every[p], command[p], commanded[p], reading[p])
@@ -410,21 +406,21 @@ def run_rows(
     notes += _unread(run, logs, channels)
     if missing := sum(int((~r.known).sum()) for r in rows):
         share = 100 * missing / sum(len(r.known) for r in rows)
-        notes.append(f"{run.name}: {missing} rows ({share:.2g} %) were not logged; they count as"
-                     " missing and their commands as held.")  # fmt: skip
+        notes.append(f"{run.name}: {missing} rows ({share:.2g} %) were not logged; their readings"
+                     " are missing and their commands are held.")  # fmt: skip
     if (rate := 1.0 / clocks[0].period) < _SLOW:
-        notes.append(f"{run.name}: is logged at {rate:.3g} Hz; its commands count as held between"
-                     " rows, and delays and lags are known to a row at best.")  # fmt: skip
+        notes.append(f"{run.name}: is logged at {rate:.3g} Hz; commands are held between rows, and"
+                     " delays and lags can be estimated to within one row only.")  # fmt: skip
     rows = tuple(_masked(run, logs, clocks, piece, masks) for piece in rows)
     if masked := sum(float((~r.valid).sum()) * r.period for r in rows):
         rows = tuple(part for piece in rows for part in _cut_masked(piece))
         notes.append(f"{run.name}: {masked:.3g} s are masked; their readings are not used, and the"
-                     f" run was cut where that lasts more than {LONGEST_MASK:g} s.")  # fmt: skip
+                     f" run was split at masks of more than {LONGEST_MASK:g} s.")  # fmt: skip
     return rows, tuple(notes)
 
 
 def _masked(run: RunFiles, logs, clocks, rows: Rows, masks: Sequence[Masked]) -> Rows:
-    """Rows with the readings of those that may not be used taken out."""
+    """Set the readings of masked and invalid rows to NaN."""
     time = rows.start + rows.period * np.arange(len(rows.command))
     valid = unmasked(masks, run.name, time)
     for log, clock in zip(logs, clocks, strict=True):
@@ -437,7 +433,7 @@ def _masked(run: RunFiles, logs, clocks, rows: Rows, masks: Sequence[Masked]) ->
 
 
 def _cut_masked(rows: Rows) -> list[Rows]:
-    """Pieces of a run between its long masked stretches."""
+    """Split a run at its long masked intervals."""
     edges = np.flatnonzero(np.diff(rows.valid, prepend=True, append=True))
     begin, end = edges[::2], edges[1::2]
     long = (end - begin) * rows.period > LONGEST_MASK
@@ -447,7 +443,7 @@ def _cut_masked(rows: Rows) -> list[Rows]:
 
 
 def cut(rows: Rows, first: int, last: int) -> Rows:
-    """Rows first .. last - 1 of a run, with their own start."""
+    """Return the rows first .. last - 1 of a run."""
     part = slice(int(first), int(last))
     return Rows(
         rows.start + int(first) * rows.period, rows.period, rows.command[part], rows.known[part],
@@ -456,7 +452,7 @@ def cut(rows: Rows, first: int, last: int) -> Rows:
 
 
 def _unread(run: RunFiles, logs: Sequence[Log], channels: Sequence[str]) -> list[str]:
-    """Note on cells that hold no number."""
+    """Return a note on cells without a number."""
     counts = {
         name: int(np.isnan(log[name]).sum())
         for log in logs for name in log.columns
@@ -471,7 +467,7 @@ def _name(run: RunFiles, log: Log) -> str:
 
 
 def _offset(run: RunFiles, main: Log, clock: Clock, log: Log, other: Clock, commands):
-    """Offset of the clock of a further file [s], and what to say about it."""
+    """Return the clock offset of an additional file [s] and notes."""
     both = [name for name in commands if name in main and name in log]
     named = f"{run.name}: {log.source}"
     offset = None
@@ -481,21 +477,21 @@ def _offset(run: RunFiles, main: Log, clock: Clock, log: Log, other: Clock, comm
             other, np.column_stack([log[c] for c in both])[other.row],
         )  # fmt: skip
     if offset is None:
-        why = "its commands do not tell" if both else "it holds no command"
+        why = "its commands do not determine" if both else "it has no command to determine"
         return 0.0, [
-            f"{named}: {why} how its clock stands to that of {main.source}, which was believed; an"
-            " offset would show as one delay of all its channels."
+            f"{named}: {why} its clock offset to {main.source}; 0 is assumed. An offset would"
+            " appear as a common delay of all its channels."
         ]
     if abs(offset) <= _OFF * clock.period:
         return offset, []
     return offset, [
-        f"{named}: its clock was set by {offset:+.6g} s, which brings its commands onto those of"
-        f" {main.source}."
+        f"{named}: its clock was shifted by {offset:+.6g} s, which aligns its commands with those"
+        f" of {main.source}."
     ]
 
 
 def _common_period(clocks: Sequence[Clock]) -> tuple[float, int, float]:
-    """Longest period that has a tick for every row, the refinement, and the largest miss [s]."""
+    """Return the longest period with a tick for every row, its refinement, and the error [s]."""
     tried = []
     for fine in range(1, _FINEST + 1):
         period = clocks[0].period / fine
@@ -516,7 +512,7 @@ def _ticks(clock: Clock, start: float, period: float) -> np.ndarray:
 
 
 def _spread(logs, clocks, ticks, every, names) -> np.ndarray:
-    """Columns (n, k) of all files at the common ticks."""
+    """Return columns (n, k) of all files at the common ticks, NaN where missing."""
     values = np.full((len(every), len(names)), np.nan)
     for column, name in enumerate(names):
         holder = next((i for i, log in enumerate(logs) if name in log), None)
@@ -527,7 +523,7 @@ def _spread(logs, clocks, ticks, every, names) -> np.ndarray:
 
 
 def _dense(start, period, fine, tick, command, commanded, reading) -> Rows:
-    """Rows at every tick; a command holds, and is known, until the next row of its file is due."""
+    """Return rows at every tick; a command is held and known until the next row is due."""
     n = int(tick[-1] - tick[0]) + 1
     place = tick - tick[0]
     full = np.full((n, reading.shape[1]), np.nan)
@@ -547,24 +543,24 @@ def _dense(start, period, fine, tick, command, commanded, reading) -> Rows:
     return Rows(first, period, held, age < fine, full, np.ones(n, dtype=bool))
 
 
-FASTEST = 1000.0  # [Hz] oil and valves are slow above some 300 Hz, and filters step at 1 ms
-_SLACK = 0.1  # of a row: 1.05 kHz passes for 1 kHz
+FASTEST = 1000.0  # [Hz] hydraulic dynamics are below about 300 Hz, and filters step at 1 ms
+_SLACK = 0.1  # of a row: rates such as 1.05 kHz are not reduced
 
 
 def averaged(rows: Rows, fastest: float = FASTEST) -> tuple[Rows, np.ndarray, int]:
-    """A run at no more than a rate, each row the mean of several logged ones.
+    """Reduce the rate of a run by averaging a fixed number of logged rows into one row.
 
-    Commands are means over the new row, which they are held for. Readings are means over the
-    logged rows about the new row's time, as many before as after, so that nothing is shifted; a
-    mean over a row damps what lies above half the new rate and would be seen at another frequency.
-    Readings that repeat, as those of an encoder at rest, count once: their error is the same.
+    Commands are means over the new row, for which they are held. Readings are means over the same
+    number of logged rows before and after the time of the new row, so that they are not delayed;
+    the mean reduces aliasing. Repeated readings, as of an encoder at rest, count once in the number
+    of averaged readings, because they have the same error.
 
     Args:
         rows: the run.
-        fastest: the rate [Hz].
+        fastest: maximum rate [Hz].
 
     Returns:
-        (the run, (c,) logged readings behind one of its readings, logged rows per row).
+        (the run, (c,) effective number of logged readings per reading, logged rows per row).
     """
     count = math.ceil(1.0 / (fastest * rows.period) - _SLACK)
     ones = np.ones(rows.reading.shape[1])

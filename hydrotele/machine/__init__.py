@@ -1,1 +1,1 @@
-"""The facts of a machine: geometry, drives, sensors, joystick, and how well they are known."""
+"""Machine data: geometry, drives, sensors and joystick, with parameter uncertainties."""

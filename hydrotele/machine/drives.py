@@ -1,4 +1,8 @@
-"""Facts of the drives: cylinders, motors, force drives, their valves, friction and transmission."""
+"""Parameters of the drives of a machine, in SI units.
+
+Each `Axis` has one cylinder, motor or force drive, with its valve or pump, friction, load-holding
+valves, transmission and end stops. The classes are pydantic models of the machine file.
+"""
 
 from typing import Annotated, Literal
 
@@ -9,19 +13,19 @@ from hydrotele.core.datafile import Facts, Name, NonNegative, Positive, Vector
 
 
 class Pin(Facts):
-    """A point [m] fixed to a link (or to the world)."""
+    """A point [m] fixed to a link or to the world."""
 
     link: Name
     position: Vector
 
 
 class Friction(Facts):
-    """Friction numbers of `hydraulics.friction`: [N] or [N m], velocities [m/s] or [rad/s].
+    """Friction parameters of `hydraulics.friction`: [N] or [N m], velocities [m/s] or [rad/s].
 
-    An asymmetry a makes the dry or the viscous part (1 + a) times as large in the positive
-    direction and (1 - a) times in the negative one. With a `presliding_stiffness` [N/m] or
-    [N m/rad] the dry part is a spring below breakaway (`hydraulics.presliding`), whose damper is
-    `presliding_damping` [N s/m] or [N m s/rad], and `smoothing_velocity` smooths it no longer.
+    An asymmetry a multiplies the dry or the viscous friction by 1 + a in the positive direction
+    and by 1 - a in the negative one. With a `presliding_stiffness` [N/m] or [N m/rad], dry friction
+    is a spring below breakaway (`hydraulics.presliding`) with a damper `presliding_damping`
+    [N s/m] or [N m s/rad]; `smoothing_velocity` is then not used.
     """
 
     coulomb: NonNegative = 0.0
@@ -42,12 +46,12 @@ class Friction(Facts):
 
     @property
     def presliding(self) -> bool:
-        """Whether the dry part has bristles: a stiffness, and a force to break away from."""
+        """Whether presliding applies: a presliding stiffness and a dry friction force."""
         return self.presliding_stiffness > 0.0 and self.coulomb + self.stribeck_extra > 0.0
 
 
 class Bar(Facts):
-    """Tube or rod of a cylinder: com is its distance [m] from its own pin."""
+    """Tube or rod of a cylinder: mass [kg], com distance from its pin [m], inertia [kg m^2]."""
 
     mass: Positive
     com: float
@@ -55,9 +59,10 @@ class Bar(Facts):
 
 
 class Cylinder(Facts):
-    """A hydraulic cylinder between two pins; x = pin-to-pin length - closed_length, 0 .. stroke.
+    """A hydraulic cylinder between two pins.
 
-    `hose_compliance` [m^3/Pa] is the swelling of the hose at each chamber.
+    The piston displacement is x = pin-to-pin length - closed_length, 0 .. stroke.
+    `hose_compliance` [m^3/Pa] is the volume increase of the hose of each chamber with pressure.
     """
 
     base_pin: Pin
@@ -90,9 +95,9 @@ class Cylinder(Facts):
         return self.area_head, self.area_rod
 
     def volumes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Head and rod chamber volumes [m^3] at piston displacements x [m], any shape.
+        """Return head and rod chamber volumes [m^3] at piston displacements x [m], any shape.
 
-        Beyond an end of the stroke they stay what they are at that end.
+        Beyond an end of the stroke, the volumes are those at the end.
         """
         inside = np.clip(x, 0.0, self.stroke)
         left = self.stroke - inside
@@ -110,17 +115,17 @@ class Motor(Facts):
 
     @property
     def areas(self) -> tuple[float, float]:
-        """Displacement of port A and of port B [m^3/rad], in the place of piston areas."""
+        """Displacements of port A and port B [m^3/rad], the equivalent of piston areas."""
         return self.displacement, self.displacement
 
     def volumes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Constant chamber volumes [m^3], in the shape of the motor angles x [rad]."""
+        """Return the constant chamber volumes [m^3], in the shape of the motor angles x [rad]."""
         constant = np.full_like(x, self.dead_volume)
         return constant, constant
 
 
 class ForceDrive(Facts):
-    """A plain force or torque drive: `gain command = load + friction + offset` [N] or [N m]."""
+    """A force or torque drive: `gain command = load + friction + offset` [N] or [N m]."""
 
     gain: float
     command_unit: Literal["1", "V", "N"] = "1"
@@ -131,14 +136,14 @@ class ForceDrive(Facts):
     @model_validator(mode="after")
     def _check(self):
         if self.gain == 0.0:
-            raise ValueError("gain: 0 is a drive that no command moves; leave the axis out instead")
+            raise ValueError("gain: with 0 no command moves the drive; remove the axis instead")
         return self
 
 
 class FlowCurve(Facts):
-    """Opening [1] over spool travel beyond the dead band [1], linear between 2 to 8 knots.
+    """Valve opening [1] over spool travel beyond the dead band [1], linear between 2 to 8 knots.
 
-    Travel goes from 0 to 1; opening begins at 0, never falls, and is 1 where the rated flow is.
+    Travel increases from 0 to 1. Opening starts at 0, never decreases, and is 1 at the rated flow.
     """
 
     travel: tuple[float, ...]
@@ -153,17 +158,17 @@ class FlowCurve(Facts):
                 f" {len(opening)}"
             )
         if travel[0] != 0.0 or travel[-1] != 1.0 or np.any(np.diff(travel) <= 0.0):
-            raise ValueError(f"travel {travel} must rise from 0 to 1")
+            raise ValueError(f"travel {travel} must increase from 0 to 1")
         if opening[0] != 0.0 or np.any(np.diff(opening) < 0.0) or opening[-1] == 0.0:
-            raise ValueError(f"opening {opening} must begin at 0, never fall, and end above 0")
+            raise ValueError(f"opening {opening} must start at 0, never decrease, and end above 0")
         return self
 
 
 class Metering(Facts):
-    """One direction of a spool: its dead band, the gains of its two edges, its flow curve.
+    """One direction of spool travel: dead band, gains of the two metering edges, flow curve.
 
-    `inlet` and `outlet` [1] scale the flow gain from the pump into the fed chamber (P-A or P-B) and
-    from the other one to tank (B-T or A-T). Without a dead band of its own it has the valve's.
+    `inlet` and `outlet` [1] scale the flow gain from the pump into one chamber (P-A or P-B) and
+    from the other chamber to tank (B-T or A-T). The default dead band is that of the valve.
     """
 
     deadband: Annotated[float, Field(ge=0, lt=1)] | None = None
@@ -175,13 +180,12 @@ class Metering(Facts):
 class Valve(Facts):
     """A spool valve: rated_flow [m^3/s] at rated_pressure_drop [Pa], bandwidth [rad/s].
 
-    `slew_limit` [1/s] is the fastest that its spool can move. With `compensation: pressure` the
-    drop over the inlet edge never exceeds `compensated_drop` [Pa] (the rated one, if not given), so
-    that the flow follows the opening whatever the load, as long as the supply suffices.
-    `tank_leakage` [m^3/(s Pa)] is the laminar leakage from each work port to tank, through the
-    radial clearance of the spool (`hydraulics.laws.chamber_flows`).
-    `positive` and `negative` say how the two directions of travel differ; a positive command feeds
-    the head side.
+    `slew_limit` [1/s] is the maximum speed of the spool. With `compensation: pressure` the drop
+    over the inlet edge never exceeds `compensated_drop` [Pa] (by default the rated drop). The flow
+    is then independent of the load, as long as the supply pressure suffices. `tank_leakage`
+    [m^3/(s Pa)] is the laminar leakage from each work port to tank, through the radial clearance of
+    the spool (`hydraulics.laws.chamber_flows`). `positive` and `negative` describe the two
+    directions of travel; a positive command feeds the head side.
     """
 
     rated_flow: Positive
@@ -202,26 +206,26 @@ class Valve(Facts):
 
     @property
     def deadbands(self) -> tuple[float, float]:
-        """Dead band in the positive and in the negative direction [1]."""
+        """Dead bands in the positive and in the negative direction [1]."""
         own = (self.positive.deadband, self.negative.deadband)
         forward, backward = (self.deadband if d is None else d for d in own)
         return forward, backward
 
     @property
     def held_drop(self) -> float:
-        """Pressure drop that the compensator holds over the inlet edge [Pa], 0 without one."""
+        """Pressure drop that the compensator maintains at the inlet edge [Pa], 0 without one."""
         if self.compensation == "none":
             return 0.0
         return self.compensated_drop or self.rated_pressure_drop
 
 
 class ElectricMotor(Facts):
-    """A brushed DC motor on a bridge, and what keeps it and its pump from turning.
+    """A brushed DC motor on an H-bridge, with the drag torques of motor and pump.
 
-    `voltage` [V] of the bridge at full duty, `resistance` [ohm], `emf` [V s/rad] which is also its
-    torque per current [N m/A], `inertia` [kg m^2] of rotor and pump; drag torques [N m]: `drag`
-    always, `breakaway` more at rest, gone with `breakaway_speed` [rad/s], and `viscous`
-    [N m s/rad].
+    `voltage` [V] of the bridge at full duty, `resistance` [ohm], `emf` constant [V s/rad], equal to
+    the torque constant [N m/A], `inertia` [kg m^2] of rotor and pump. Drag torques: constant
+    `drag` [N m], additional `breakaway` [N m] at rest, which decays with `breakaway_speed` [rad/s],
+    and `viscous` [N m s/rad].
     """
 
     voltage: Positive
@@ -234,14 +238,14 @@ class ElectricMotor(Facts):
     viscous: NonNegative = 0.0
 
 
-_USUAL_PRESSURE = 2.0e7  # Pa, that a pump's own circuit stands where no motor limits it
+_USUAL_PRESSURE = 2.0e7  # Pa, pressure limit of a pump circuit that no motor limits
 
 
 class Accumulator(Facts):
-    """A gas accumulator in the place of a tank, with the cylinder fully retracted.
+    """A gas accumulator in place of a tank; values for the fully retracted cylinder.
 
-    `pressure` [Pa] above the atmosphere's, `gas_volume` [m^3] at that pressure, and the resistance
-    of its line [Pa s/m^3] while the cylinder extends and retracts.
+    `pressure` [Pa] relative to the atmosphere, `gas_volume` [m^3] at that pressure, and line
+    resistances [Pa s/m^3] for the extending and the retracting cylinder.
     """
 
     pressure: Positive
@@ -251,13 +255,13 @@ class Accumulator(Facts):
 
 
 class Pump(Facts):
-    """A pump of the axis' own, driven in one direction; a switched valve picks the side.
+    """An individual pump of one axis with one direction of rotation; a valve selects the side.
 
-    The command is the duty of the motor with the sign of the side, or, without a `motor`, the speed
-    over `rated_speed` [rad/s]. `displacement` [m^3/rad], `leakage` [m^3/(s Pa)] back to the line
-    that it draws from, `torque_loss` [1] as a part of displacement times pressure. Of the oil
+    The command is the motor duty with the sign of the side, or, without a `motor`, the speed
+    divided by `rated_speed` [rad/s]. `displacement` [m^3/rad], `leakage` [m^3/(s Pa)] to the
+    suction line, `torque_loss` [1] as a fraction of displacement times pressure. For the oil
     between pump and piston: `bulk_modulus` [Pa] without air, `compliance_head` and `compliance_rod`
-    [m^3/Pa] of hoses and walls, `air_head` and `air_rod` [m^3] at the atmosphere's pressure.
+    [m^3/Pa] of hoses and walls, `air_head` and `air_rod` [m^3] at atmospheric pressure.
     """
 
     displacement: Positive
@@ -279,9 +283,9 @@ class Pump(Facts):
 
     @property
     def stall_pressure(self) -> float:
-        """Pressure difference that holds the motor at full duty [Pa]; 20 MPa without a motor.
+        """Pressure difference that stalls the motor at full duty [Pa]; 20 MPa without a motor.
 
-        `(k U / R - drag) / (D (1 + loss))`; gear pumps of any make stand 20 MPa.
+        `(k U / R - drag) / (D (1 + loss))`; common gear pumps are rated for 20 MPa.
         """
         motor = self.motor
         if motor is None:
@@ -291,12 +295,12 @@ class Pump(Facts):
 
 
 class LoadCylinder(Facts):
-    """A cylinder that resists extension: its oil leaves over a relief valve.
+    """A cylinder that resists extension because its oil leaves through a relief valve.
 
-    `area` [m^2]; `relief_pressure` [Pa], and how much it rises with the flow, `override`
-    [Pa s/m^3]; `stiffness` [N/m] of its oil; `void` [m] of the travel in which the oil does not
-    yet fill the chamber, with air at `void_pressure` [Pa] in it. Its packings rub with `friction`
-    [1] of its force; `return_force` [N] resists on the way back besides.
+    `area` [m^2]; `relief_pressure` [Pa] and its increase with the flow, `override` [Pa s/m^3];
+    `stiffness` [N/m] of the oil; `void` [m], the travel in which oil does not yet fill the chamber,
+    with air at `void_pressure` [Pa]. Seal `friction` [1] is a fraction of the force;
+    `return_force` [N] is an additional resistance while the cylinder returns.
     """
 
     area: Positive
@@ -310,10 +314,10 @@ class LoadCylinder(Facts):
 
 
 class Counterbalance(Facts):
-    """A load-holding valve at a chamber: oil leaves only when p + pilot_ratio p_pilot > setting.
+    """A load-holding valve of a chamber: oil leaves only if p + pilot_ratio p_pilot > setting.
 
-    `setting` [Pa]; p_pilot is the pressure of the other chamber; `override` [1] is the fraction of
-    the setting beyond it at which the valve is fully open. Oil enters freely through its check.
+    `setting` [Pa]; p_pilot is the pressure of the other chamber. The valve is fully open at the
+    setting times 1 + `override` [1]. Oil enters freely through a check valve.
     """
 
     setting: Positive
@@ -322,16 +326,16 @@ class Counterbalance(Facts):
 
 
 class LoadHolding(Facts):
-    """Counterbalance valves at the head and the rod side of a drive."""
+    """Counterbalance valves of the head and the rod side of a drive."""
 
     head: Counterbalance | None = None
     rod: Counterbalance | None = None
 
 
 class EndStop(Facts):
-    """What a drive meets at the ends of its travel: a spring [N/m] or [N m/rad] and a damper.
+    """Spring [N/m] or [N m/rad] and damper [N s/m] or [N m s/rad] at both ends of travel.
 
-    The damper [N s/m] or [N m s/rad] works only while the spring is pressed, and never pulls.
+    The damper acts only while the spring is compressed, and the total force never pulls.
     """
 
     stiffness: Positive
@@ -346,12 +350,12 @@ class FourBar(Facts):
 
 
 class Transmission(Facts):
-    """What gives between drive and load: a spring with a gap, and the drive's own inertia.
+    """Flexible transmission between drive and load: drive inertia, spring, damper and backlash.
 
-    The drive acts on its own inertia [kg] or [kg m^2]; spring [N/m] or [N m/rad] and damper
-    [N s/m] or [N m s/rad] carry the force on to the load; inside the gap, `backlash` [m] or [rad]
-    wide from end to end, only the damper does. Friction and oil act on the drive side, and a
-    cylinder's length sensor reads it; the joint's own sensor reads the load.
+    The drive acts on its own inertia [kg] or [kg m^2]. Spring [N/m] or [N m/rad] and damper
+    [N s/m] or [N m s/rad] transmit the force to the load; within the backlash, of total width
+    `backlash` [m] or [rad], only the damper acts. Friction and oil act on the drive side, which a
+    cylinder's length sensor measures; the joint sensor measures the load side.
     """
 
     inertia: Positive
@@ -361,12 +365,12 @@ class Transmission(Facts):
 
 
 class Axis(Facts):
-    """One driven joint with exactly one of cylinder, motor or force.
+    """A driven joint with exactly one cylinder, motor or force drive.
 
-    `command_delay` [s] passes before a command reaches the valve or the drive. A valve's commands
-    are fractions in [-1, 1]; where logs have them in another unit, `command_range: [low, high]`
-    [command_unit] says which values stand for -1 and 1, such as [-10, 10] V or [4, 20] mA. Without
-    an `end_stop` the machine's own estimate holds (`Machine.end_stop`).
+    A command reaches the valve or the drive after `command_delay` [s]. Valve commands are fractions
+    in [-1, 1]. If logs have another unit, `command_range: [low, high]` [command_unit] gives the
+    values of -1 and 1, such as [-10, 10] V or [4, 20] mA. Without an `end_stop`, `Machine.end_stop`
+    estimates one.
     """
 
     joint: Name
@@ -391,19 +395,19 @@ class Axis(Facts):
         fed = (self.valve is not None) + (self.pump is not None)
         if fed != (self.force is None):
             raise ValueError(
-                "a cylinder or motor needs a valve or a pump of its own; a plain force drive has"
-                " none"
+                "a cylinder or motor needs either a valve or a pump; a force drive must have"
+                " neither"
             )
         if self.pump:
             self._check_pumped()
         if self.force and self.load_holding != LoadHolding():
-            raise ValueError("a plain force drive has no oil for load_holding valves to hold")
+            raise ValueError("a force drive has no oil and cannot have load_holding valves")
         if self.command_range[0] == self.command_range[1]:
-            raise ValueError("command_range must be [low, high], the commands of -1 and 1")
+            raise ValueError("command_range must be [low, high], the values for -1 and 1")
         stated = self.command_unit != "1" or self.command_range != (-1.0, 1.0)
         if stated and self.force:
             raise ValueError(
-                "command_unit and command_range are those of a valve; a plain force drive has"
+                "command_unit and command_range apply to a valve; for a force drive give"
                 " force.command_unit and force.command_limit"
             )
         if self.command_unit != "1" and self.command_range == (-1.0, 1.0):
@@ -412,14 +416,14 @@ class Axis(Facts):
                 " values, such as [-10, 10]"
             )
         if self.four_bar and not self.cylinder:
-            raise ValueError("a four_bar linkage is moved by a cylinder")
+            raise ValueError("a four_bar linkage needs a cylinder")
         return self
 
     def _check_pumped(self) -> None:
         if self.cylinder is None or self.four_bar or self.transmission:
-            raise ValueError("a pump drives a cylinder without four_bar and transmission")
+            raise ValueError("a pump can only drive a cylinder without four_bar and transmission")
         if self.load_holding != LoadHolding():
-            raise ValueError("load_holding valves stand behind a valve, not behind a pump")
+            raise ValueError("load_holding valves need a valve; an axis with a pump has none")
         if self.cylinder.hose_compliance:
             raise ValueError(
                 "give pump.compliance_head and pump.compliance_rod instead of"
@@ -427,34 +431,37 @@ class Axis(Facts):
             )
         if self.cylinder.friction.presliding_stiffness:
             raise ValueError(
-                "the friction of an axis with a pump of its own holds a piston rigidly: leave out"
+                "an axis with a pump has friction without presliding: remove"
                 " cylinder.friction.presliding_stiffness"
             )
         if self.end_stop is None:
-            raise ValueError("an axis with a pump states its end_stop: no relief pressure says it")
+            raise ValueError(
+                "an axis with a pump needs an end_stop: it cannot be estimated without a relief"
+                " pressure"
+            )
 
     @property
     def hydraulic(self) -> bool:
-        """Whether the axis has chambers: behind a valve, or behind a pump of its own."""
+        """Whether the axis is hydraulic: it has a valve or an individual pump."""
         return self.valve is not None or self.pump is not None
 
     @property
     def rated_flow(self) -> float:
-        """Flow of the valve at its rated drop, or of the axis' own pump [m^3/s]."""
+        """Flow of the valve at its rated drop, or of the individual pump [m^3/s]."""
         source = self.valve or self.pump
         assert source is not None
         return source.rated_flow
 
     @property
     def hydraulic_drive(self) -> Cylinder | Motor:
-        """The cylinder or the motor of a hydraulic axis."""
+        """Cylinder or motor of a hydraulic axis."""
         drive = self.cylinder or self.motor
         assert drive is not None
         return drive
 
     @property
     def drive(self) -> Cylinder | Motor | ForceDrive:
-        """The cylinder, the motor or the force drive."""
+        """Cylinder, motor or force drive of the axis."""
         drive = self.cylinder or self.motor or self.force
         assert drive is not None
         return drive

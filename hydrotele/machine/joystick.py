@@ -1,6 +1,7 @@
-"""Facts of a joystick: workspace, sensing, flotor, coils, the hand on it, gains. All SI, frozen.
+"""Parameters of a levitated joystick, in SI units.
 
-`models/joystick/joystick.yaml` holds the shipped one; a user's is a file of the same form.
+They describe workspace, sensing, flotor, coils, the operator's hand and the stiffness gains.
+`models/joystick/joystick.yaml` is the shipped joystick; a user joystick is a file of the same form.
 """
 
 import math
@@ -28,9 +29,10 @@ AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
 class Workspace(Facts):
-    """Way of the coils' centre in its gap, either way [m], and turning of the flotor [rad].
+    """Travel of the coil centre in the gap, each direction [m], and rotation of the flotor [rad].
 
-    The handle, which stands off the coils, turns less about itself: see `Joystick.reach`.
+    A rotation about the handle is smaller, because the handle is off the coils; see
+    `Joystick.reach`.
     """
 
     translation: Positive
@@ -38,14 +40,14 @@ class Workspace(Facts):
 
 
 class OpticalSensing(Facts):
-    """Resolution of the handle's pose: translation [m], rotation [rad]; 0 is ideal."""
+    """Resolution of the measured handle pose: translation [m], rotation [rad]; 0 means ideal."""
 
     translation: NonNegative
     rotation: NonNegative
 
 
 class FlotorFacts(Facts):
-    """The moving part in the coils' frame: mass [kg], com [m], inertia [kg m^2], handle [m]."""
+    """The flotor in the coil frame: mass [kg], com [m], inertia [kg m^2], handle position [m]."""
 
     mass: Positive
     com: Vector
@@ -54,10 +56,11 @@ class FlotorFacts(Facts):
 
 
 class CoilFacts(Facts):
-    """Three stations on a radius [m], each with two coils: [N/A], [A].
+    """Coils: three pairs on a `radius` [m], with `force_per_ampere` [N/A] and `max_current` [A].
 
-    `continuous_current` [A] is what a coil bears for ever, with the time constant `thermal_time`
-    [s] of its winding; `edge_loss` [1] the share of its force that is lost at the end of its gap.
+    `continuous_current` [A] is the permissible continuous current of a coil with the thermal time
+    constant `thermal_time` [s]. `edge_loss` [1] is the fraction of the force that is lost at the
+    end of the gap.
     """
 
     radius: Positive
@@ -69,14 +72,14 @@ class CoilFacts(Facts):
 
 
 class DiodeFacts(Facts):
-    """The position-sensing diodes: distance from the coils' centre [m], step of a reading [m]."""
+    """Position-sensing diodes: distance from the coil centre [m], resolution [m]."""
 
     distance: Positive
     step: NonNegative
 
 
 class AloneFacts(Facts):
-    """Second-order systems of the axes x, y, z, rx, ry, rz without a hand: [rad/s], ratio [1]."""
+    """Closed-loop dynamics of x, y, z, rx, ry, rz without a hand: frequency [rad/s], ratio [1]."""
 
     frequency: Annotated[tuple[Positive, ...], Field(min_length=6, max_length=6)]
     ratio: Annotated[tuple[Positive, ...], Field(min_length=6, max_length=6)]
@@ -86,9 +89,10 @@ Shape = tuple[Positive, Number, Positive]
 
 
 class HandFacts(Facts):
-    """The hand on the handle: mass [kg], damping and stiffness [N s/m], [N/m]; rotations [N m].
+    """Impedance of the operator's hand: mass [kg], damping [N s/m], stiffness [N/m].
 
-    An arm is stiffer towards its shoulder than across. In the handle's horizontal plane the mass is
+    Rotations have `rotation_damping` [N m s/rad] and `rotation_stiffness` [N m/rad]. An arm is
+    stiffer towards the shoulder than across. In the horizontal plane of the handle, the mass is
     multiplied by `mass_shape`, damping and stiffness by `stiffness_shape`: xx, xy and yy of a
     symmetric matrix [1].
     """
@@ -106,22 +110,22 @@ class HandFacts(Facts):
         for name in ("mass_shape", "stiffness_shape"):
             xx, xy, yy = getattr(self, name)
             if not xx * yy > xy * xy:
-                raise ValueError(f"{name}: xx {xx:g} times yy {yy:g} must be more than xy^2")
+                raise ValueError(f"{name}: xx {xx:g} times yy {yy:g} must exceed xy^2")
         return self
 
     @property
     def carried(self) -> float:
-        """Mass that hangs on the handle [kg]; what is more in a direction hangs on the shoulder."""
+        """Mass whose weight the handle carries [kg]: the smallest over all directions."""
         return self.mass * min(1.0, principal(self.mass_shape).least)
 
     def along(self, axis: int) -> tuple[float, float, float]:
-        """Mass, damping and stiffness along or about one axis of the handle, the others at rest.
+        """Return mass, damping and stiffness of one handle axis with the other axes at rest.
 
         Args:
-            axis: place of x, y, z, rx, ry or rz.
+            axis: index in x, y, z, rx, ry, rz.
 
         Returns:
-            [kg], [N s/m], [N/m]; of rotations 0, [N m s/rad], [N m/rad].
+            Mass [kg], damping [N s/m], stiffness [N/m]; for rotations 0, [N m s/rad], [N m/rad].
         """
         if axis > 2:
             return 0.0, self.rotation_damping, self.rotation_stiffness
@@ -130,7 +134,7 @@ class HandFacts(Facts):
 
 
 class Principal(NamedTuple):
-    """Principal values of a shape, and the angle of the greater one's axis from x [rad]."""
+    """Principal values of a symmetric 2 x 2 matrix; angle of its major axis from x [rad]."""
 
     least: float
     greatest: float
@@ -138,13 +142,13 @@ class Principal(NamedTuple):
 
 
 def principal(shape: Shape) -> Principal:
-    """Principal values of a symmetric 2 x 2 matrix, and where its long axis points.
+    """Return the principal values and the major axis of a symmetric 2 x 2 matrix.
 
     Args:
         shape: xx, xy, yy.
 
     Returns:
-        Its principal values and the long axis' angle from x [rad].
+        The principal values and the angle of the major axis from x [rad].
 
     >>> [round(v, 6) for v in principal((2.5, 0.5, 2.5))]
     [2.0, 3.0, 0.785398]
@@ -155,7 +159,7 @@ def principal(shape: Shape) -> Principal:
 
 
 class DetentFacts(Facts):
-    """Edge of the dead band that can be felt: drop [N] or [N m], slope outside [N/m]."""
+    """Perceptible edge of the dead band: force drop [N] or [N m], slope outside [N/m]."""
 
     drop: NonNegative
     outside: NonNegative
@@ -164,7 +168,7 @@ class DetentFacts(Facts):
 class AxisGains(Facts):
     """Stiffness feedback of one joystick axis, [N, m] or [N m, rad].
 
-    `force_limit` [N] or [N m] is the machine's force at which the stiffness reaches `most`.
+    `force_limit` [N] or [N m] is the machine force at which the stiffness reaches `most`.
     """
 
     nominal: Positive
@@ -179,19 +183,19 @@ class AxisGains(Facts):
     def _check(self):
         if not self.least <= self.nominal <= self.most:
             raise ValueError(
-                f"stiffnesses must be ordered, least {self.least:g} <= nominal {self.nominal:g}"
+                f"stiffnesses must satisfy least {self.least:g} <= nominal {self.nominal:g}"
                 f" <= most {self.most:g}"
             )
         if self.detent and self.detent.drop > self.nominal * self.deadband:
             raise ValueError(
-                f"a drop of {self.detent.drop:g} is more than the {self.nominal * self.deadband:g}"
-                " that the spring has at the edge of the dead band"
+                f"detent.drop {self.detent.drop:g} exceeds the spring force"
+                f" {self.nominal * self.deadband:g} at the edge of the dead band"
             )
         return self
 
 
 class Joystick(Facts):
-    """A six-DOF levitated joystick. `mount` [m] is its place in the cab, `control_rate` [Hz]."""
+    """A six-DOF levitated joystick; `mount` [m] is its position in the cab, `control_rate` [Hz]."""
 
     name: Name
     description: str = ""
@@ -211,10 +215,10 @@ class Joystick(Facts):
 
     @property
     def reach(self) -> tuple[float, ...]:
-        """How far the handle alone goes along and about each axis, (6,) [m], [rad].
+        """Travel of the handle along and about each axis separately, (6,) [m], [rad].
 
-        Turned about the handle's centre, the coils move aside by the handle's distance from the
-        axis through it, until they are at the end of their gap.
+        A rotation about the centre of the handle also moves the coils, which are at a distance from
+        it. The rotation is limited by the gap of the coils.
         """
         far, most, handle = self.workspace.translation, self.workspace.rotation, self.flotor.handle
         turns = []
@@ -232,21 +236,21 @@ class Joystick(Facts):
 
 
 def shipped_joysticks() -> list[str]:
-    """Names of the joysticks that come with the package."""
+    """Return the names of the joysticks in the package."""
     return sorted(p.parent.name for p in models_folder().glob(f"*/{JOYSTICK_FILE}"))
 
 
 def load_joystick(name_or_path: str | Path = "joystick") -> Joystick:
-    """Read a joystick.
+    """Read a joystick file.
 
     Args:
         name_or_path: `joystick` for the shipped one, a YAML file, or a folder with joystick.yaml.
 
     Returns:
-        The validated facts.
+        The validated joystick.
 
     Raises:
-        InputError: there is no such file, or names file, line and key of what is wrong.
+        InputError: the file is missing or invalid; the message gives file, line and key.
     """
     path = Path(name_or_path)
     if str(name_or_path) in shipped_joysticks():

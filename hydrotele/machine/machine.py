@@ -1,10 +1,8 @@
-"""A machine as data: links, joints, drives, valves, sensors and home position, all SI and frozen.
+"""Machine data: links, joints, drives, supply, sensors and home position, in SI units.
 
-The numbers stand in `models/<machine>/machine.yaml`, the tree and the shapes in its MJCF. A link's
-position and inertia may stand in either of them, never in both.
-
-Also which joints of its links follow from its closures, and how its sensors read: which sensor a
-channel has, its lag, its converter, its noise.
+The parameters are in `models/<machine>/machine.yaml`, the kinematic tree and the shapes in its MJCF
+file. Position and inertia of a link are in one of the two files, never in both. The module also
+provides the sensor model: sensor of a channel, converter, noise, lag and drift.
 """
 
 import math
@@ -21,10 +19,11 @@ from hydrotele.terms.law import Term
 
 
 class Sensor(Facts):
-    """A random error, then 2^bits equal steps of the span; `None` = no such defect.
+    """A sensor with a random error and a converter of 2^bits equal steps over the span.
 
-    The error is uniform in +-`accuracy`, or normal with `standard_deviation`. With neither the
-    sensor is ideal to the simulator, and of unknown noise to whoever learns from its readings.
+    The error is uniform in +-`accuracy`, or normal with `standard_deviation`. Without either, the
+    simulator treats the sensor as ideal, and identification treats its noise as unknown. `bits` and
+    `span` are None for a sensor without converter steps.
     """
 
     accuracy: NonNegative = 0.0
@@ -42,16 +41,16 @@ class Sensor(Facts):
 
     @property
     def error_rms(self) -> float:
-        """Standard deviation of the random error [channel's unit]; 0 where none is stated."""
+        """Standard deviation of the random error [channel's unit]; 0 if none is stated."""
         return self.standard_deviation or self.accuracy / math.sqrt(3.0)
 
 
 class SensorSet(Facts):
     """Sensors of a machine by kind of channel, sampled at `rate` [Hz].
 
-    The log's rows are read at instants that are off by `jitter` [s], normal, of all channels alike.
-    What `channels` says of a channel, such as `pressure_head.boom`, holds there in place of its
-    kind; an empty entry says that nothing is known of it.
+    The sampling instants of the rows have a normally distributed error with standard deviation
+    `jitter` [s], common to all channels. An entry of `channels`, such as `pressure_head.boom`,
+    replaces the sensor of its kind; an empty entry means an unknown accuracy.
     """
 
     rate: Positive = 50.0
@@ -69,19 +68,19 @@ class SensorSet(Facts):
         for name, sensor in (kinds | others).items():
             if sensor.bits is not None and sensor.span is None:
                 raise ValueError(
-                    f"{name}: {sensor.bits} bits need a span (only length has its own)"
+                    f"{name}: {sensor.bits} bits need a span (only length has a default span)"
                 )
         return self
 
 
 class SensorError(Facts):
-    """A defect of one channel: it reads `scale * y(t - delay) + offset`, delay in [s].
+    """Systematic error of one channel: the reading is `scale * y(t - delay) + offset`, delay [s].
 
     y follows the true value with a first-order lag, `time_constant dy/dt = value - y` [s]; without
-    a time constant it is the true value. The coupling of an undriven joint's sensor may be tilted
-    against its axis by `tilt` [rad], as a universal joint is, `tan(shown) = tan(y) cos(tilt)`, and
-    have a play of `backlash` [rad]. While the sensor warms up from the run's beginning on, its
-    offset changes by `drift` with the time constant `drift_time_constant` [s] (`warming_drift`).
+    a time constant it is the true value. The coupling of the sensor of an undriven joint may be
+    misaligned by `tilt` [rad], like a universal joint, `tan(reading) = tan(y) cos(tilt)`, and have
+    a `backlash` [rad]. While the sensor warms up from the start of the run, its offset changes by
+    `drift` with the time constant `drift_time_constant` [s] (`warming_drift`).
     """
 
     offset: float = 0.0
@@ -94,26 +93,27 @@ class SensorError(Facts):
     drift_time_constant: Positive = 600.0
 
     def offset_at(self, time: np.ndarray) -> np.ndarray:
-        """Offset with the drift (n,) at times (n,) since the run's beginning [s]."""
+        """Return the offset including drift (n,) at times (n,) since the start of the run [s]."""
         if self.drift == 0.0:
             return np.full_like(time, self.offset, dtype=float)
         return self.offset + warming_drift(time, self.drift, self.drift_time_constant)
 
     @property
     def coupled(self) -> bool:
-        """Whether the sensor's coupling has a tilt or a play."""
+        """Whether the coupling of the sensor has a misalignment or a backlash."""
         return self.tilt > 0.0 or self.backlash > 0.0
 
     @property
     def late(self) -> bool:
-        """Whether it shows anything but the present value."""
+        """Whether the sensor has a delay or a lag."""
         return self.delay > 0.0 or self.time_constant > 0.0
 
 
 class Joint(Facts):
     """One degree of freedom: `range` [rad] or [m], `damping` [N m s/rad] or [N s/m].
 
-    Behind a hinge the link may bend about both axes across the hinge's, `bending` [rad/(N m)].
+    `bending` [rad/(N m)] is the compliance of the link of a hinge about both axes perpendicular to
+    the hinge axis.
     """
 
     name: Name
@@ -126,7 +126,7 @@ class Joint(Facts):
     @model_validator(mode="after")
     def _check(self):
         if self.bending and self.type != "hinge":
-            raise ValueError("bending is across a hinge; a slide has none")
+            raise ValueError("bending applies to a hinge only; remove it from the slide")
         if abs(np.linalg.norm(self.axis) - 1.0) > 1e-6:
             raise ValueError(f"axis {self.axis} must have unit length")
         if self.range and self.range[0] >= self.range[1]:
@@ -135,7 +135,7 @@ class Joint(Facts):
 
 
 class Link(Facts):
-    """A rigid body in its parent's frame: position [m], mass [kg], inertia about com [kg m^2]."""
+    """A rigid body: position in the parent frame [m], mass [kg], inertia about com [kg m^2]."""
 
     parent: Name = "world"
     position: Vector = (0.0, 0.0, 0.0)
@@ -156,32 +156,32 @@ class Link(Facts):
 
 
 class Closure(Facts):
-    """A pin that closes a loop: the two points coincide."""
+    """A pin joint that closes a kinematic loop: the two points coincide."""
 
     a: Pin
     b: Pin
 
 
-UNLIMITED_FLOW = 1.0e3  # m^3/s, beyond any demand: the flow of a supply without a limit
-_STOP_GIVES = 1.0e-3  # m: what tube, gland and pins stretch under a cylinder's largest force
-_STOP_TURNS = 2.0e-3  # rad: the same of a slewing or rotating drive
-_STOP_RETARDATION = 5.0e-3  # s: 75 rad/s of a boom on its stop then decay within two swings
+UNLIMITED_FLOW = 1.0e3  # m^3/s, exceeds any demand: flow of a supply without a limit
+_STOP_GIVES = 1.0e-3  # m: elongation of tube, gland and pins at the largest cylinder force
+_STOP_TURNS = 2.0e-3  # rad: deformation of a rotary drive at its largest torque
+_STOP_RETARDATION = 5.0e-3  # s: damps a 75 rad/s oscillation of a boom within two periods
 
 
 class Supply(Facts):
     """Pump and tank shared by all valves; pressures [Pa], flow [m^3/s], bulk modulus [Pa].
 
-    `constant_flow`: the pump gives `pump_flow`; what the valves do not draw goes over the relief
-    valve. `load_sensing`: it holds the highest load pressure plus `load_sensing_margin`, as far as
-    `pump_flow` and `relief_pressure` allow. `constant_pressure`: it holds `relief_pressure`
-    whatever is drawn. `pump_droop` [m^3/(s Pa)] is by how much its flow falls with its pressure;
-    `relief_override` [Pa s/m^3] by how much the relief valve's pressure rises with its flow, beyond
-    `relief_pressure` at which it opens; only a `constant_flow` supply has one.
-    With a `time_constant` [s] the pump's displacement follows what the valves draw with a
-    first-order lag, as a swash plate does; 0: at once. `dissolved_air` is the volume of air, at
-    atmosphere, per volume of oil that the oil gives off where it is drawn below atmosphere (mineral
-    oil: 0.07 .. 0.10). `entrained_air` is the volume of the bubbles in it, at atmosphere, per
-    volume of oil: oil with air in it is soft where the pressure is low.
+    `constant_flow`: the pump delivers `pump_flow`; the surplus flows through the relief valve.
+    `load_sensing`: the pump maintains the highest load pressure plus `load_sensing_margin`, within
+    `pump_flow` and `relief_pressure`. `constant_pressure`: the pump maintains `relief_pressure` at
+    any flow. `pump_droop` [m^3/(s Pa)] is the decrease of pump flow with pressure.
+    `relief_override` [Pa s/m^3] is the increase of the relief pressure with flow, above the opening
+    pressure `relief_pressure`; only a `constant_flow` supply has one.
+    With a `time_constant` [s] the pump displacement follows the demand with a first-order lag, like
+    a swash plate; 0 means without lag. `dissolved_air` is the volume of air, at atmospheric
+    pressure, per volume of oil that is released below atmospheric pressure (mineral oil: 0.07 ..
+    0.10). `entrained_air` is the volume of bubbles, at atmospheric pressure, per volume of oil; it
+    reduces the stiffness of the oil at low pressure.
     """
 
     kind: Literal["constant_flow", "load_sensing", "constant_pressure"] = "constant_flow"
@@ -198,7 +198,7 @@ class Supply(Facts):
 
     @property
     def highest_pressure(self) -> float:
-        """With all of the pump's flow over the relief valve [Pa]."""
+        """Supply pressure with the whole pump flow through the relief valve [Pa]."""
         return self.relief_pressure + self.relief_override * self.pump_flow
 
     @model_validator(mode="after")
@@ -206,24 +206,24 @@ class Supply(Facts):
         if self.kind == "constant_pressure":
             if self.pump_flow != UNLIMITED_FLOW or self.pump_droop:
                 raise ValueError(
-                    "a constant_pressure supply has no pump_flow and no pump_droop: leave them out,"
+                    "a constant_pressure supply has no pump_flow and no pump_droop: remove them,"
                     " or choose kind constant_flow or load_sensing"
                 )
             if self.time_constant:
                 raise ValueError(
-                    "a constant_pressure supply gives any flow at once: leave out time_constant, or"
-                    " choose kind constant_flow or load_sensing"
+                    "a constant_pressure supply has no lag: remove time_constant, or choose kind"
+                    " constant_flow or load_sensing"
                 )
         elif self.pump_flow >= UNLIMITED_FLOW:
             raise ValueError(f"pump_flow is missing; a {self.kind} supply needs it")
         if self.pump_droop * self.relief_pressure >= self.pump_flow:
             raise ValueError(
-                f"pump_droop {self.pump_droop:g} m^3/(s Pa) leaves nothing of pump_flow"
-                f" {self.pump_flow:g} m^3/s at relief_pressure {self.relief_pressure:g} Pa"
+                f"pump_droop {self.pump_droop:g} m^3/(s Pa) reduces pump_flow"
+                f" {self.pump_flow:g} m^3/s to 0 below relief_pressure {self.relief_pressure:g} Pa"
             )
         if self.relief_override and self.kind != "constant_flow":
             raise ValueError(
-                f"a {self.kind} supply sends no flow over its relief valve: leave out"
+                f"a {self.kind} supply has no flow through its relief valve: remove"
                 " relief_override, or choose kind constant_flow"
             )
         if self.tank_pressure >= self.relief_pressure:
@@ -235,10 +235,10 @@ class Supply(Facts):
 
 
 class Arm(Facts):
-    """Names of the joints of a swing-boom-stick(-tool(-head)) arm and the point it moves.
+    """Joint names of a swing-boom-stick(-tool(-head)) arm, and its tip.
 
-    `tool` moves in the arm's plane as a bucket or a feller-buncher's tilt does; `head` turns on it
-    about an axis in that plane, perpendicular to it.
+    `tool` rotates in the plane of the arm, like a bucket or the tilt of a feller-buncher. `head`
+    rotates on the tool about an axis in the plane of the arm, perpendicular to the tool.
     """
 
     swing: Name
@@ -251,15 +251,15 @@ class Arm(Facts):
     @model_validator(mode="after")
     def _check(self):
         if self.head and not self.tool:
-            raise ValueError("a head turns on a tool joint: give arm.tool, such as the tilt")
+            raise ValueError("arm.head needs a tool joint: give arm.tool, for example the tilt")
         return self
 
 
 class Machine(Facts):
-    """Everything the simulator, the controller and the learning code know of a machine.
+    """Complete description of a machine for simulation, control and identification.
 
-    `sensed_joints` are the joints with a calibrator's angle sensors, from the machine outwards;
-    `attached` names MJCF files whose bodies hang on a body of `mjcf`, by that body's name.
+    `sensed_joints` are the joints with the angle sensors of a calibrator, starting at the machine.
+    `attached` maps the name of a body of `mjcf` to an MJCF file whose bodies are attached to it.
     """
 
     name: Name
@@ -293,7 +293,7 @@ class Machine(Facts):
 
     @property
     def hydraulic_axes(self) -> dict[str, Axis]:
-        """Axes with a valve, or with a pump of their own."""
+        """Axes with a valve or an individual pump."""
         return {name: axis for name, axis in self.axes.items() if axis.hydraulic}
 
     @property
@@ -302,7 +302,7 @@ class Machine(Facts):
         return {name: axis for name, axis in self.axes.items() if axis.valve}
 
     def highest_pressure(self, axis: str) -> float:
-        """What a hydraulic axis can be fed with [Pa]: the relief's setting, or its pump's stall."""
+        """Return the maximum feed pressure of an axis [Pa]: supply limit or pump stall pressure."""
         pump = self.axes[axis].pump
         if pump:
             return pump.stall_pressure
@@ -310,7 +310,7 @@ class Machine(Facts):
         return self.supply.highest_pressure
 
     def return_pressure(self, axis: str) -> float:
-        """Pressure to which a hydraulic axis' oil returns [Pa]: tank or its pump's accumulator."""
+        """Return the return pressure of a hydraulic axis [Pa]: tank or accumulator of its pump."""
         pump = self.axes[axis].pump
         if pump:
             return pump.accumulator.pressure
@@ -318,18 +318,18 @@ class Machine(Facts):
         return self.supply.tank_pressure
 
     def link_of(self, joint: str) -> str:
-        """Name of the link that a joint moves."""
+        """Return the name of the link that a joint moves."""
         return next(n for n, li in self.links.items() if li.joint and li.joint.name == joint)
 
     def position_kind(self, axis: str) -> str:
-        """`angle` for a hinge axis, `position` for a slide."""
+        """Return `angle` for a hinge axis and `position` for a slide axis."""
         return "angle" if self.joints[self.axes[axis].joint].type == "hinge" else "position"
 
     def end_stop(self, axis: str) -> EndStop | None:
-        """What the drive of an axis meets at the ends of its travel; None where it has no ends.
+        """Return the end stop of an axis, or None if its travel is unlimited.
 
-        Where the machine does not say, the drive's largest force presses the stop in by 1 mm, or
-        2 mrad, which is what tube, gland and pins of a heavy cylinder stretch under it.
+        If the machine file has none, the stiffness is the largest drive force divided by 1 mm or
+        2 mrad, the typical deformation of tube, gland and pins of a heavy cylinder at that force.
         """
         facts = self.axes[axis]
         joint = self.joints[facts.joint]
@@ -348,13 +348,13 @@ class Machine(Facts):
 
     @property
     def undriven_sensed_joints(self) -> tuple[str, ...]:
-        """Those of the sensed joints that no drive moves; a driven one has its axis' channel."""
+        """Sensed joints without a drive; the others use the channel of their axis."""
         driven = {axis.joint for axis in self.axes.values()}
         return tuple(joint for joint in self.sensed_joints if joint not in driven)
 
     @property
     def sensed_channels(self) -> tuple[str, ...]:
-        """Channels that sensors of this machine can show."""
+        """Channels that sensors of this machine can measure."""
         names = [f"{self.position_kind(axis)}.{axis}" for axis in self.axes]
         names += [f"angle.{joint}" for joint in self.undriven_sensed_joints]
         names += [f"length.{name}" for name, axis in self.axes.items() if axis.cylinder]
@@ -386,7 +386,8 @@ class Machine(Facts):
             if joints[joint].type != "hinge":
                 raise ValueError(f"sensed_joints: {joint} must be a hinge")
         if strange := [j for j in self.undriven_sensed_joints if j in self.axes]:
-            raise ValueError(f"sensed_joints: {strange[0]} is the name of another joint's axis")
+            message = f"{strange[0]} is also the name of an axis of another joint; rename one"
+            raise ValueError(f"sensed_joints: {message}")
         for joint in self.home:
             _expect(joint, joints, "home")
             low, high = joints[joint].range or (-np.inf, np.inf)
@@ -411,7 +412,7 @@ class Machine(Facts):
                 _expect(channel, self.sensed_channels, f"sensors.{name}.channels")
         for name, axis in self.axes.items():
             if axis.pump and self.joints[axis.joint].type != "slide":
-                raise ValueError(f"axes.{name}.pump: its cylinder lies along a slide joint")
+                raise ValueError(f"axes.{name}.pump: the axis must have a slide joint")
         for name in self.loads:
             _expect(name, [n for n, a in self.axes.items() if a.pump], "loads")
         if self.valve_axes and self.supply is None:
@@ -434,8 +435,8 @@ def _check_terms(terms: tuple[Term, ...], axes: dict[str, Axis], supply: Supply 
             raise ValueError(f"terms.{k}: axis {term.axis} has no chambers for a {term.balance}")
         if term.balance == "flow_supply" and not (axes[term.axis].valve and limited):
             raise ValueError(
-                f"terms.{k}: flow_supply adds to the flow of a pump that valves share: name an axis"
-                " with a valve, of a machine whose supply is constant_flow or load_sensing"
+                f"terms.{k}: flow_supply adds to the flow of a shared pump: it needs an axis with a"
+                " valve and a supply of kind constant_flow or load_sensing"
             )
         for variable, axis in term.of.items():
             _expect(axis, axes, f"terms.{k}.of.{variable}")
@@ -443,22 +444,22 @@ def _check_terms(terms: tuple[Term, ...], axes: dict[str, Axis], supply: Supply 
                 raise ValueError(f"terms.{k}.of: axis {axis} has no {variable}")
         memory = term.play or term.switch
         if memory and not any(axis.hydraulic for axis in axes.values()):
-            raise ValueError(f"terms.{k}: a memory needs a machine with hydraulic axes")
+            raise ValueError(f"terms.{k}: play or switch needs a machine with hydraulic axes")
         pushed = axes[term.of.get("force", term.axis)]
         if memory and memory.variable == "force" and not pushed.hydraulic:
-            raise ValueError(f"terms.{k}: a memory of the force is one of a hydraulic axis")
+            raise ValueError(f"terms.{k}: play or switch of the force needs a hydraulic axis")
         key = (term.name, term.axis, term.balance)
         if key in seen:
             raise ValueError(
                 f"terms.{k}: {term.name} already adds to {term.balance} of {term.axis};"
-                " give the second one another name"
+                " rename the second term"
             )
         seen.add(key)
 
 
 def _refuse_names(links: dict[str, Link]) -> None:
     if "world" in links:
-        raise ValueError("links.world: this name is that of the fixed frame; choose another one")
+        raise ValueError("links.world: world is the fixed frame; choose another name")
     owner: dict[str, str] = {}
     for name, link in links.items():
         if link.joint and (first := owner.setdefault(link.joint.name, name)) != name:
@@ -478,7 +479,7 @@ def _refuse_cycles(links: dict[str, Link]) -> None:
 
 
 def following_joints(machine: Machine) -> tuple[str, ...]:
-    """Names of the undriven joints of links that the closures determine."""
+    """Return the names of the undriven joints that the closures determine."""
     driven = {axis.joint for axis in machine.axes.values()}
     names: list[str] = []
     for closure in machine.closures.values():
@@ -490,7 +491,7 @@ def following_joints(machine: Machine) -> tuple[str, ...]:
 
 
 def links_of_loop(machine: Machine, a: str, b: str) -> list[str]:
-    """Links between two links of the tree, without their common parents."""
+    """Return the links between two links of the tree, without their common parents."""
     chains = []
     for link in (a, b):
         chain = []
@@ -514,23 +515,24 @@ _KINDS = {
 
 
 def sensor_set(machine: Machine, name: str) -> SensorSet | None:
-    """A machine's sensors by name; None for ideal ones.
+    """Return a sensor set of a machine by name; None for ideal sensors.
 
     Raises:
-        InputError: the machine has no such sensors; lists those it has.
+        InputError: the machine has no such sensor set; the message lists the valid names.
     """
     if name == IDEAL:
         return None
     if name not in machine.sensors:
         raise InputError(
             f"sensors {name!r}",
-            f"machine {machine.name} has none; {suggest(name, [IDEAL, *machine.sensors])}",
+            f"machine {machine.name} does not have them;"
+            f" {suggest(name, [IDEAL, *machine.sensors])}",
         )
     return machine.sensors[name]
 
 
 def channel_sensor(machine: Machine, sensors: SensorSet | None, channel: str) -> Sensor:
-    """Sensor of a channel with its span filled in: a length spans its cylinder's stroke."""
+    """Return the sensor of a channel; the default span of a length is the cylinder's stroke."""
     if sensors is None:
         return Sensor()
     kind, _, axis = channel.partition(".")
@@ -544,9 +546,9 @@ def channel_sensor(machine: Machine, sensors: SensorSet | None, channel: str) ->
 
 
 class Converter(NamedTuple):
-    """An analogue-to-digital converter: nearest step, kept inside low .. high [channel's unit].
+    """An analogue-to-digital converter: rounds to steps within low .. high [channel's unit].
 
-    A step of 0 passes everything unchanged.
+    A step of 0 means no rounding.
     """
 
     step: float
@@ -555,7 +557,7 @@ class Converter(NamedTuple):
 
 
 def converter(sensor: Sensor, channel: str) -> Converter:
-    """Converter of a channel: 2^bits steps of the span; lengths and pressures end at 0 and span."""
+    """Return the converter of a channel; lengths and pressures are limited to 0 .. span."""
     if sensor.bits is None or sensor.span is None:
         return Converter(0.0, -math.inf, math.inf)
     step = sensor.span / 2.0**sensor.bits
@@ -565,25 +567,24 @@ def converter(sensor: Sensor, channel: str) -> Converter:
 
 
 def noise_rms(machine: Machine, sensors: SensorSet | None, channel: str) -> float:
-    """Standard deviation of one reading [channel's unit]: random error plus converter."""
+    """Return the standard deviation of one reading [channel's unit]: random error plus rounding."""
     sensor = channel_sensor(machine, sensors, channel)
     return math.sqrt(sensor.error_rms**2 + converter(sensor, channel).step ** 2 / 12.0)
 
 
 @compiled
 def warming_drift(time, drift, time_constant):
-    """Change of a sensor's offset since it was switched on.
+    """Return the offset change of a sensor since it was switched on.
 
-    `e (1 - exp(-t / T))`: the sensor warms up as one heat capacity does, and its offset goes with
-    its temperature.
+    `e (1 - exp(-t / T))`: the offset is proportional to the temperature of a single heat capacity.
 
     Args:
         time: t, scalar or array [s].
-        drift: e, of a warm sensor, scalar [channel's unit].
+        drift: e, final change of the warm sensor, scalar [channel's unit].
         time_constant: T, scalar, positive [s].
 
     Returns:
-        As `time` [channel's unit].
+        Offset change, in the shape of `time` [channel's unit].
 
     Source: Khoshzaban 1992 p. 37 (resolvers drift with temperature, not linearly); Newton's law of
         cooling.
@@ -596,18 +597,18 @@ def warming_drift(time, drift, time_constant):
 
 @compiled
 def first_order(shown, before, now, ratio):
-    """What a first-order lag shows after a step over which its input runs straight.
+    """Return the output of a first-order lag after a time step with linearly varying input.
 
     `T dy/dt = x - y` with `x` from `before` to `now`, integrated exactly.
 
     Args:
-        shown: y at the step's start, scalar or array [channel's unit].
-        before: input at the step's start, alike.
-        now: input at the step's end, alike.
-        ratio: length of the step over the time constant T, scalar, positive [1].
+        shown: y at the start of the step, scalar or array [channel's unit].
+        before: input at the start of the step, same shape and unit.
+        now: input at the end of the step, same shape and unit.
+        ratio: step length divided by the time constant T, scalar, positive [1].
 
     Returns:
-        y at the step's end, as `shown`.
+        y at the end of the step, same shape and unit as `shown`.
 
     Source: step and ramp response of the first-order lag.
 

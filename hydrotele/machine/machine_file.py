@@ -1,8 +1,8 @@
-"""Machine files: `load_machine` reads machine.yaml and its MJCF tree, `save_machine` writes one.
+"""Read and write machine files (machine.yaml and its MJCF).
 
-A user's machine is a folder with `machine.yaml` (and usually an MJCF beside it); nothing in the
-package has to change for it. What the YAML does not say of a link is taken from the MJCF body of
-the same name; saying the same number twice is refused.
+A user machine is a folder with `machine.yaml` and usually an MJCF file; the package needs no
+change. Link data that the YAML file does not contain are taken from the MJCF body of the same name.
+A number that is in both files is an error.
 """
 
 import math
@@ -25,12 +25,12 @@ MACHINE_FILE = "machine.yaml"
 
 
 def machine_path(name_or_path: str | Path) -> Path:
-    """File of a shipped machine (by name) or of a user's (folder or YAML file).
+    """Return the file of a shipped machine (by name) or of a user machine (folder or YAML file).
 
-    A bare name means the shipped machine, whatever the working folder holds; `./name` the folder.
+    A plain name always means the shipped machine; write `./name` for a folder of the same name.
 
     Raises:
-        InputError: there is no such machine; lists those that are shipped.
+        InputError: the machine does not exist; the message lists the shipped machines.
     """
     path = Path(name_or_path)
     if path.suffix in (".yaml", ".yml"):
@@ -49,22 +49,22 @@ def machine_path(name_or_path: str | Path) -> Path:
 
 
 def shipped_machines() -> list[str]:
-    """Names of the machines that come with the package."""
+    """Return the names of the machines in the package."""
     return sorted(p.parent.name for p in models_folder().glob(f"*/{MACHINE_FILE}"))
 
 
 def load_machine(name_or_path: str | Path, tool: str | None = None) -> Machine:
-    """Read a machine and one of its tools.
+    """Read a machine with one of its tools.
 
     Args:
         name_or_path: name of a shipped machine, a folder, or a machine file.
-        tool: name of the tool; default is the file's `tool`, or `none`.
+        tool: name of the tool; the default is `tool` of the file, or `none`.
 
     Returns:
-        The frozen, validated machine, every link complete.
+        The validated machine with complete link data.
 
     Raises:
-        InputError: names file, line, key path, and what is allowed.
+        InputError: the file is invalid; the message gives file, line, key and valid values.
     """
     path = machine_path(name_or_path)
     data, lines = read_yaml(path)
@@ -90,15 +90,14 @@ def load_machine(name_or_path: str | Path, tool: str | None = None) -> Machine:
 
 
 def save_machine(machine: Machine, path: str | Path) -> None:
-    """Write a machine as one YAML file in SI, complete with its tool, readable by `load_machine`.
+    """Write a machine with its tool to one YAML file in SI units that `load_machine` can read.
 
     Args:
         machine: the machine.
-        path: file to write. A shipped MJCF is referred to by its place among the shipped models, so
-            that the file works with any installation. A user's is copied beside it as
-            `<stem>.tree.xml`, with its meshes, textures and height fields in `<stem>_assets`, so
-            that the folder can be handed on, unless it includes further documents. So is a user's
-            file that defines laws of its terms, which say so.
+        path: file to write. A shipped MJCF is referenced relative to the shipped models, so that
+            the file works with any installation. A user MJCF is copied to `<stem>.tree.xml`, with
+            meshes, textures and height fields in `<stem>_assets`, unless it includes other
+            documents. User files that define laws of terms are copied as well.
     """
     machine = _with_law_files(machine, Path(path).parent)
     data = machine.model_dump(mode="json", exclude_defaults=True)
@@ -126,7 +125,7 @@ def save_machine(machine: Machine, path: str | Path) -> None:
 
 
 def _with_law_files(machine: Machine, folder: Path) -> Machine:
-    """The machine with the sources of its terms' laws named; files are copied into the folder."""
+    """Copy files that define laws of terms into a folder; return the machine with their names."""
     terms = []
     for term in machine.terms:
         source = LAWS[term.law].source
@@ -140,10 +139,10 @@ def _with_law_files(machine: Machine, folder: Path) -> Machine:
 
 
 def _extended(data: dict, path: Path, lines) -> tuple[dict, list[dict]]:
-    """A file that says what it adds to another machine, or changes of it, as a whole machine.
+    """Merge a machine file with the machine that it extends.
 
     Returns:
-        The data, and what the other machine's unused tools would add.
+        The complete data, and the sections of the unused tools of the other machine.
     """
     base = data.pop("extends")
     where = _place(path, lines, "extends")
@@ -152,13 +151,13 @@ def _extended(data: dict, path: Path, lines) -> tuple[dict, list[dict]]:
         or not base.keys() <= {"machine", "tool"}
         or "machine" not in base
     ):
-        raise InputError(where, "must say {machine: NAME or FOLDER, tool: NAME}")
+        raise InputError(where, "must be {machine: NAME or FOLDER, tool: NAME}")
     name = str(base["machine"])
     beside = path.parent / name
     file = machine_path(beside if (beside / MACHINE_FILE).is_file() else name)
     whole, base_lines = read_yaml(file)
     if "extends" in whole:
-        raise InputError(where, f"{name} extends a machine itself; name that one")
+        raise InputError(where, f"{name} itself extends a machine; extend that machine directly")
     tools = whole.pop("tools", None) or {"none": {}}
     _check_tools(tools, file, base_lines)
     tool = base.get("tool", "none")
@@ -174,36 +173,36 @@ def _extended(data: dict, path: Path, lines) -> tuple[dict, list[dict]]:
 
 
 def _overlaid(base, new):
-    """Sections of `new` over those of `base`, mappings entry by entry."""
+    """Return `base` updated by `new`; mappings are merged recursively."""
     if not (isinstance(base, dict) and isinstance(new, dict)):
         return new
     return base | {key: _overlaid(base.get(key), value) for key, value in new.items()}
 
 
 def _place(path: Path, lines, *keys: str) -> str:
-    """File, line and key path, for messages."""
+    """Return file, line and key path as text for messages."""
     line = next((lines[keys[:k]] for k in range(len(keys), 0, -1) if keys[:k] in lines), 0)
     return f"{path}{f':{line}' if line else ''}: {'.'.join(keys)}"
 
 
 def _check_tools(tools, path: Path, lines) -> None:
     if not isinstance(tools, dict) or not all(isinstance(name, str) for name in tools):
-        raise InputError(_place(path, lines, "tools"), "must map names of tools to what they add")
+        raise InputError(_place(path, lines, "tools"), "must map tool names to their sections")
     for name, fragment in tools.items():
         if not isinstance(fragment, (dict, type(None))):
-            message = "must map sections (links, axes, home, ...) to what the tool adds"
+            message = "must map sections (links, axes, home, ...) to the entries of the tool"
             raise InputError(_place(path, lines, "tools", name), message)
 
 
 def _merge_tool(data: dict, tool: str, fragment: dict, path: Path, lines) -> dict:
-    """Add a tool's sections to the machine's; returns the lines of the result."""
+    """Add the sections of a tool to those of the machine; return the line numbers of the result."""
     for section, entries in fragment.items():
         old, new = ("tools", tool, str(section)), (str(section),)
         lines = lines | {new + p[len(old) :]: n for p, n in lines.items() if p[: len(old)] == old}
         if isinstance(entries, dict) and isinstance(data.get(section), dict):
             if section in ("links", "axes", "closures"):
                 for twice in entries.keys() & data[section]:
-                    message = "is already there without the tool; give it another name"
+                    message = "already exists in the machine; use another name in the tool"
                     raise InputError(_place(path, lines, *old, str(twice)), message)
             entries = {**data[section], **entries}
         data[section] = entries
@@ -211,7 +210,7 @@ def _merge_tool(data: dict, tool: str, fragment: dict, path: Path, lines) -> dic
 
 
 def _entries(data: dict, section: str) -> dict:
-    """A section's named entries; empty where the section is none, which validation will refuse."""
+    """Return the named entries of a section; empty if the section is not a mapping."""
     entries = data.get(section)
     if not isinstance(entries, dict):
         return {}
@@ -229,7 +228,7 @@ def _bodies_of(fragments) -> tuple[str, ...]:
 
 
 def _complete_links(data: dict, path: Path, lines) -> None:
-    """Fill in what the MJCF says of each link; refuse what stands in both."""
+    """Add link data from the MJCF file; a value that both files contain is an error."""
     if data.pop("resolved", False):
         return
     if not data.get("mjcf"):
@@ -255,7 +254,7 @@ def _complete_links(data: dict, path: Path, lines) -> None:
 
 
 def _join(link: dict, known: dict, where: str, mjcf: str) -> dict:
-    """What YAML and MJCF say of one link; a number may stand in one of them only."""
+    """Merge the YAML and MJCF data of a link; a value may be in one of them only."""
     joint, known_joint = link.get("joint"), known.get("joint")
     twice = {key for key in link if split_unit(str(key))[0] in known} - {"joint"}
     if isinstance(joint, dict) and known_joint:
@@ -263,13 +262,13 @@ def _join(link: dict, known: dict, where: str, mjcf: str) -> dict:
         known = known | {"joint": known_joint | joint}
         link = {key: value for key, value in link.items() if key != "joint"}
     if twice:
-        message = f"{', '.join(sorted(twice))} also stands in {mjcf}; keep it in one place"
+        message = f"{', '.join(sorted(twice))} is also given in {mjcf}; keep it in one file"
         raise InputError(where, message)
     return known | link
 
 
 def _facts_of_body(body, degrees: bool, where: str) -> dict:
-    """Parent, position, inertia and joint of an MJCF body, with its default classes applied."""
+    """Return parent, position, inertia and joint of an MJCF body, with default classes applied."""
     facts: dict = {"parent": body.parent.name}
     if np.any(body.pos):
         facts["position"] = body.pos.tolist()
@@ -278,12 +277,12 @@ def _facts_of_body(body, degrees: bool, where: str) -> dict:
             np.any(body.iquat[1:]) or body.ialt.type != mujoco.mjtOrientation.mjORIENTATION_QUAT
         )
         if turned or np.all(np.isfinite(body.fullinertia)):
-            raise InputError(where, "give its inertial as diaginertia in the axes of the body")
+            raise InputError(where, "the inertia must be a diaginertia in the axes of the body")
         facts |= {"mass": body.mass, "com": body.ipos.tolist(), "inertia": body.inertia.tolist()}
     if not body.joints:
         return facts
     if len(body.joints) > 1 or not body.joints[0].name:
-        raise InputError(where, f"needs one joint with a name, has {len(body.joints)} joints")
+        raise InputError(where, f"needs exactly one named joint, has {len(body.joints)} joints")
     joint = body.joints[0]
     kind = mujoco.mjtJoint(joint.type).name.removeprefix("mjJNT_").lower()
     facts["joint"] = {"name": joint.name, "type": kind, "axis": joint.axis.tolist()}
@@ -296,7 +295,7 @@ def _facts_of_body(body, degrees: bool, where: str) -> dict:
 
 
 def _resolve_drives(data: dict, path: Path, lines) -> None:
-    """Turn polar pins into points and motor torque per psi into displacement."""
+    """Convert pins in polar coordinates to points, and motor torque per psi to displacement."""
     for name, axis in _entries(data, "axes").items():
         if not isinstance(axis, dict):
             continue
@@ -314,7 +313,7 @@ def _resolve_drives(data: dict, path: Path, lines) -> None:
 
 
 def _resolve_pin(pin: dict, data: dict, where: str) -> dict:
-    """The point at `distance` and `angle` from the joint of link `from`, in the x-z plane."""
+    """Return the pin at `distance` and `angle` from the joint of link `from`, in the x-z plane."""
     if "distance" not in pin:
         return pin
     pin = dict(pin)
@@ -322,7 +321,7 @@ def _resolve_pin(pin: dict, data: dict, where: str) -> dict:
     if "from" in pin:
         child, links = pin.pop("from"), _entries(data, "links")
         if child not in list(links):
-            raise InputError(where, f"from: {child!r} is no link; {suggest(child, links)}")
+            raise InputError(where, f"from: {child!r} is not a link; {suggest(child, links)}")
         link = links[child] if isinstance(links[child], dict) else {}
         origin = link.get("position") or scale_numbers(link.get("position_mm"), 1.0e-3) or origin
         if not isinstance(origin, list) or len(origin) != 3:

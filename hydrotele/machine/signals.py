@@ -1,8 +1,8 @@
-"""Channel names, their units and their shapes.
+"""Channel names of logs and their units.
 
-A channel is `kind.axis` (`angle.boom`) or a bare `kind` (`time`, `pressure_supply`); what only a
-simulator can know starts with `truth.` (`truth.flow_head.boom`). Axis names are free lower-case
-identifiers. Every channel holds one float64 per row: shape (n,), in a SI unit that its kind allows.
+A channel name is `kind.axis` (`angle.boom`) or a bare `kind` (`time`, `pressure_supply`). Channels
+that only a simulator knows start with `truth.` (`truth.flow_head.boom`). Axis names are arbitrary
+lower-case identifiers. Every channel has one float64 per row, shape (n,), in a SI unit of its kind.
 """
 
 import difflib
@@ -16,11 +16,11 @@ _TRUTH = "truth."
 
 
 class Kind(NamedTuple):
-    """What a channel of one kind holds.
+    """Definition of one kind of channel.
 
     Attributes:
         units: allowed SI units, the usual one first.
-        description: what it means.
+        description: meaning of the values.
         axes: "free" for `kind.axis` with any axis name, "xyz" for `kind.x`, `.y` and `.z`, "none"
             for a bare name.
     """
@@ -39,23 +39,23 @@ class Channel(NamedTuple):
 
     @property
     def name(self) -> str:
-        """The name as it stands in a log."""
+        """Name of the channel in a log."""
         return channel_name(self.kind, self.axis, truth=self.truth)
 
 
 MEASURED: Mapping[str, Kind] = {
     "time": Kind(("s",), "time of the row", "none"),
     "command": Kind(("1", "V", "N"), "valve command in [-1, 1], drive voltage or force"),
-    "valid": Kind(("1",), "1 where the row may be used, 0 in contact or where it may not", "none"),
-    "reference": Kind(("rad", "m"), "what the controller was asked for"),
+    "valid": Kind(("1",), "1 if the row may be used, 0 in contact or in masked rows", "none"),
+    "reference": Kind(("rad", "m"), "position reference of the controller"),
     "handle": Kind(("m", "rad"), "displacement of the joystick's handle"),
     "hand_force": Kind(("N", "N m"), "estimated force of the hand on the handle"),
-    "handle_force": Kind(("N", "N m"), "force of the coils on the handle, weight taken off"),
+    "handle_force": Kind(("N", "N m"), "force of the coils on the handle without its weight"),
     "handle_stiffness": Kind(("N/m", "N m/rad"), "stiffness of the joystick's axis"),
     "coil_current": Kind(("A",), "current of a coil of the joystick"),
     "tip_force": Kind(("N", "N m"), "estimated force of the environment on the tip"),
     "tip_pose": Kind(("m", "rad"), "pose of the tip from the measured joints"),
-    "tip_reference": Kind(("m", "rad"), "pose of the tip that was asked for"),
+    "tip_reference": Kind(("m", "rad"), "reference pose of the tip"),
     "angle": Kind(("rad",), "joint angle, not wrapped"),
     "position": Kind(("m",), "displacement of a prismatic joint"),
     "length": Kind(("m",), "piston displacement of a cylinder"),
@@ -66,8 +66,8 @@ MEASURED: Mapping[str, Kind] = {
     "pressure_rod": Kind(("Pa",), "rod side chamber, or port B of a motor"),
     "pressure_supply": Kind(("Pa",), "pump or supply pressure", "none"),
     "speed": Kind(("rad/s",), "speed of a pump, with the sign of the side that it feeds"),
-    "speed_reference": Kind(("rad/s",), "pump speed that the controller was asked for"),
-    "current": Kind(("A", "1"), "motor current, or the count of a converter without calibration"),
+    "speed_reference": Kind(("rad/s",), "pump speed reference of the controller"),
+    "current": Kind(("A", "1"), "motor current, or uncalibrated converter counts"),
 }
 
 TRUTH: Mapping[str, Kind] = {
@@ -76,12 +76,12 @@ TRUTH: Mapping[str, Kind] = {
     "acceleration": Kind(("rad/s^2", "m/s^2"), "joint acceleration"),
     "speed": MEASURED["speed"],
     "pressure_load": Kind(("Pa",), "pressure in the load cylinder of an axis"),
-    "spool": Kind(("1",), "spool position over its stroke"),
-    "spool_rate": Kind(("1/s",), "spool speed over the spool's stroke"),
-    "bristle": Kind(("1",), "part of a drive's breakaway force that friction holds it with"),
-    "delivery": Kind(("1",), "part of its largest flow that the pump is set to", "none"),
-    "added_delivery": Kind(("1",), "part of its largest flow that terms add to a pump's", "none"),
-    "memory": Kind(("1",), "what a term remembers: played variable over half width, or 0 to 1"),
+    "spool": Kind(("1",), "spool position relative to its stroke"),
+    "spool_rate": Kind(("1/s",), "spool speed relative to the stroke"),
+    "bristle": Kind(("1",), "friction force of the bristles relative to the breakaway force"),
+    "delivery": Kind(("1",), "flow setting of the pump relative to its largest flow", "none"),
+    "added_delivery": Kind(("1",), "flow added by terms relative to the largest flow", "none"),
+    "memory": Kind(("1",), "internal state of a term: backlash over half width, or relay 0 to 1"),
     "flow_head": Kind(("m^3/s",), "valve flow into the head side chamber"),
     "flow_rod": Kind(("m^3/s",), "valve flow into the rod side chamber"),
     "flow_supply": Kind(("m^3/s",), "pump flow", "none"),
@@ -94,14 +94,14 @@ TRUTH: Mapping[str, Kind] = {
 
 
 class Limits(NamedTuple):
-    """Bounds on a channel's largest magnitude over a run, and the unit that lies behind others."""
+    """Plausible range of the maximum magnitude of a channel in a run, and the likely wrong unit."""
 
     smallest: float
     largest: float
     looks_like: str
 
 
-# SI unit -> (limits where the file states the unit, limits where it states none).
+# SI unit -> (limits if the file states the unit, limits if it states none)
 _LIMITS: Mapping[str, tuple[Limits, Limits]] = {
     unit: (Limits(low, high, looks), Limits(low_unstated, high_unstated, looks))
     for unit, low, low_unstated, high, high_unstated, looks in (
@@ -113,14 +113,14 @@ _LIMITS: Mapping[str, tuple[Limits, Limits]] = {
     )
 }
 _NO_LIMITS = Limits(0.0, math.inf, "")
-# Real loggers overshoot 1 by a float32 rounding or a few counts.
+# Loggers may exceed 1 by float32 rounding or a few counts.
 _COMMAND_LIMITS = Limits(0.0, 1.0 + 1e-3, "percent, counts or volts")
 
 
 def magnitude_limits(name: str, unit: str, *, stated: bool = True) -> Limits:
-    """Return what the largest magnitude of a channel [unit] must lie between, or the unit is wrong.
+    """Return the plausible range of the maximum magnitude of a channel [unit].
 
-    The bounds are wide where the file states the unit, narrower where it does not.
+    Values outside it indicate a wrong unit. The range is wider if the file states the unit.
 
     >>> magnitude_limits("angle.boom", "rad").looks_like
     'degrees'
@@ -142,26 +142,26 @@ def channel_name(kind: str, axis: str = "", *, truth: bool = False) -> str:
 
 
 def channel_names(kind: str, axes: Iterable[str], *, truth: bool = False) -> tuple[str, ...]:
-    """Return one name per axis, in the order of `axes`."""
+    """Return the channel name of every axis, in the order of `axes`."""
     return tuple(channel_name(kind, axis, truth=truth) for axis in axes)
 
 
 def valid_kinds() -> tuple[str, ...]:
-    """Return every form that a channel name can take, such as `angle.<axis>`, measured first."""
+    """Return all forms of channel names, such as `angle.<axis>`, measured channels first."""
     endings = {"free": ".<axis>", "xyz": ".x|y|z", "none": ""}
     measured = [kind + endings[spec.axes] for kind, spec in MEASURED.items()]
     return tuple(measured + [_TRUTH + kind + endings[spec.axes] for kind, spec in TRUTH.items()])
 
 
 def parse_channel(name: str) -> Channel:
-    """Split a channel name.
+    """Split a channel name into kind, axis and truth flag.
 
     >>> parse_channel("truth.force.boom")
     Channel(kind='force', axis='boom', truth=True)
 
     Raises:
         ValueError: the kind is unknown, or the axis is missing, superfluous or misspelt; the
-            message gives the nearest valid names.
+            message suggests similar valid names.
     """
     truth = name.startswith(_TRUTH)
     kind, dot, axis = name.removeprefix(_TRUTH).partition(".")
@@ -179,7 +179,7 @@ def parse_channel(name: str) -> Channel:
 
 
 def allowed_units(name: str) -> tuple[str, ...]:
-    """Return the SI units that the channel `name` may have, the usual one first.
+    """Return the allowed SI units of the channel `name`, the usual one first.
 
     >>> allowed_units("reference.boom")
     ('rad', 'm')
@@ -192,10 +192,10 @@ def allowed_units(name: str) -> tuple[str, ...]:
 
 
 def usual_unit(name: str, present: Iterable[str] = ()) -> str:
-    """Return the unit to assume where a file states none.
+    """Return the default unit of a channel for files that state none.
 
-    A kind that can be rotary or linear takes the linear unit where the log has a `position` of the
-    same axis.
+    If a kind can be rotary or linear, the linear unit is used if the log has a `position` channel
+    of the same axis.
 
     >>> usual_unit("reference.slide", present=["position.slide"])
     'm'
@@ -210,9 +210,9 @@ def usual_unit(name: str, present: Iterable[str] = ()) -> str:
 
 
 def close_matches(name: str, present: Iterable[str] = ()) -> list[str]:
-    """Return up to three valid channel names near `name`, nearest first.
+    """Return up to three valid channel names similar to `name`, most similar first.
 
-    `present` adds names that are known to be in use.
+    `present` adds names that occur in the data.
 
     >>> close_matches("angel.boom")[0]
     'angle.boom'

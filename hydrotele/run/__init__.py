@@ -1,1 +1,1 @@
-"""Runs of scenarios: with one clock, live, or as a replay of a log."""
+"""Simulated runs of scenarios, interactive driving, replays of logs, and parameter sweeps."""

@@ -1,15 +1,15 @@
-"""Devices that a person drives with: keyboard, gamepad, SpaceMouse, or a file in their place.
+"""Input devices for interactive driving: keyboard, gamepad, SpaceMouse, or a script file.
 
-A device says what it asks for now: six axes of the handle (x out, y left, z up, rx the head, ry the
-tool, positive curls in, rz), commands of further axes, and when to end. The viewer's window reports
-only that a key goes down, not that it comes up: so every press moves an axis on by a part of its
-range, where it stays until the space bar centres everything. Gamepad and SpaceMouse are read
-through SDL, which sees both as joysticks (pygame, the extra `drive`).
+A device returns six handle axes (x out, y left, z up, rx the head, ry the tool, positive curls in,
+rz), the commands of additional machine axes, and whether to stop. The viewer window reports only
+key presses, not releases. Each press therefore moves an axis by a fraction of its range, and the
+space bar centres all axes. Gamepad and SpaceMouse are read with pygame (the extra `drive`) through
+SDL, which treats both as joysticks.
 
-A file is CSV, with a first line of names (`time`, any of x, y, z, rx, ry, rz, and further axes of
-the machine), then a row from each time [s] on; or YAML with `time`, `axes`, `commands`, and
-`interpolate: linear` if the handle shall move evenly from row to row. Values are -1 .. 1 of the
-handle's range, or commands. The drive ends with the last time.
+A script file is CSV or YAML. CSV has a header (`time`, any of x, y, z, rx, ry, rz, and additional
+axes of the machine) and one row per time [s], valid from that time on. YAML has `time`, `axes`,
+`commands`, and `interpolate: linear` to interpolate the handle between rows. Handle values are
+-1 .. 1 of its range; the others are commands. The drive stops at the last time.
 """
 
 import bisect
@@ -28,17 +28,18 @@ from hydrotele.core.files import read_text
 from hydrotele.machine.joystick import AXES
 from hydrotele.scenario.teleoperation import JoystickAxis
 
-_FINE = 2  # decimals of an axis: finer than a hand, and short to write down
+_FINE = 2  # decimals of an axis value: finer than an operator can set, and short in a file
 
 
 class Reading(NamedTuple):
-    """What a device asks for now.
+    """Current input of a device.
 
     Attributes:
-        axes: x, y, z, rx, ry, rz of the handle, -1 .. 1 of its way.
-        commands: of the axes that the joystick does not move, -1 .. 1, in the machine's order.
-        quit: whether the drive is over.
-        said: what its user should know: unplugged, back again.
+        axes: x, y, z, rx, ry, rz of the handle, -1 .. 1 of its travel.
+        commands: commands of the axes that the joystick does not move, -1 .. 1, in the order of
+            the machine.
+        quit: whether to stop the drive.
+        said: message for the user, for example that the device was unplugged; empty without one.
     """
 
     axes: tuple[float, ...] = (0.0,) * 6
@@ -48,26 +49,26 @@ class Reading(NamedTuple):
 
 
 class Device(Protocol):
-    """A device that is open."""
+    """An open input device."""
 
     def read(self, time: float) -> Reading:
-        """What it asks for now, `time` [s] after the start of the run."""
+        """Return the current input, `time` [s] after the start of the run."""
         ...
 
     def close(self) -> None:
-        """Let go of it."""
+        """Release the device."""
         ...
 
 
 def outside(value: float, dead: float) -> float:
-    """An axis without its dead zone, whole at the end of its way.
+    """Remove the dead zone from an axis value, keeping full scale at the end of its travel.
 
     Args:
-        value: as the device says, -1 .. 1.
-        dead: dead zone.
+        value: raw axis value of the device, -1 .. 1.
+        dead: half width of the dead zone, in the same scale.
 
     Returns:
-        0 inside the dead zone; -1 .. 1, in hundredths.
+        0 inside the dead zone, otherwise -1 .. 1, rounded to hundredths.
 
     >>> outside(0.1, 0.12), outside(-1.2, 0.12), outside(0.56, 0.12)
     (0.0, -1.0, 0.5)
@@ -80,14 +81,14 @@ def outside(value: float, dead: float) -> float:
 
 
 class Switches:
-    """Commands of further axes, that buttons switch between -1, 0 and 1.
+    """Commands of additional axes that buttons switch between -1, 0 and 1.
 
     Attributes:
-        commands: of every axis.
+        commands: one command per axis.
     """
 
     def __init__(self, count: int) -> None:
-        """All off.
+        """Set all commands to 0.
 
         Args:
             count: number of axes.
@@ -95,22 +96,22 @@ class Switches:
         self.commands = [0.0] * count
 
     def up(self, number: int) -> None:
-        """One step up: from -1 to 0, or from 0 to 1."""
+        """Increase the command of an axis by one step: -1 to 0, or 0 to 1."""
         self._set(number, lambda now: min(1.0, now + 1.0))
 
     def down(self, number: int) -> None:
-        """One step down."""
+        """Decrease the command of an axis by one step: 1 to 0, or 0 to -1."""
         self._set(number, lambda now: max(-1.0, now - 1.0))
 
     def turn(self, number: int) -> None:
-        """The next of 0, 1, 0, -1: where one button has to do."""
+        """Advance the command of an axis in the cycle 0, 1, 0, -1, for a single button."""
         if number < len(self.commands):
             now = self.commands[number]
             self._next = -self._next if now else self._next
             self.commands[number] = 0.0 if now else self._next
 
     def off(self) -> None:
-        """All off."""
+        """Set all commands to 0."""
         self.commands = [0.0] * len(self.commands)
 
     _next = 1.0
@@ -120,9 +121,9 @@ class Switches:
             self.commands[number] = step(self.commands[number])
 
 
-KEY_STEP = 0.25  # of the handle's way, for one press of a key
+KEY_STEP = 0.25  # fraction of the handle's travel per key press
 
-# GLFW codes of keys that MuJoCo's viewer leaves alone -> (name, axis of the handle, way)
+# GLFW codes of keys that the MuJoCo viewer does not use -> (name, handle axis, direction)
 KEYS = {
     265: ("Up", "x", 1.0),
     264: ("Down", "x", -1.0),
@@ -135,7 +136,7 @@ KEYS = {
     260: ("Insert", "rx", 1.0),
     261: ("Delete", "rx", -1.0),
 }
-# GLFW code -> (name, number of the further axis, way)
+# GLFW code -> (name, number of the additional axis, direction)
 SWITCH_KEYS = {
     54: ("6", 0, -1.0),
     55: ("7", 0, 1.0),
@@ -146,17 +147,17 @@ CENTRE_KEY, QUIT_KEY = 32, 299  # space, F10
 
 
 class Layout(NamedTuple):
-    """How a device that SDL sees as a joystick is used.
+    """Assignment of the axes and buttons of an SDL joystick device.
 
     Attributes:
-        axes: (axis of the handle, number of the device's axis, way).
-        pairs: (axis of the handle, button that pulls it up, button that pulls it down).
-        dead: dead zone of every axis.
-        hat: whether its hat switches: up and down the first further axis, right and left the
-            second.
-        turns: buttons that switch a further axis, by its number, on, off and back.
-        stop: button that switches all off; -1 without.
-        quit: button that ends; -1 without.
+        axes: (handle axis, device axis number, direction 1 or -1).
+        pairs: (handle axis, button for +1, button for -1).
+        dead: dead zone of every axis, 0 .. 1.
+        hat: whether the hat switches the additional axes: up and down the first, right and left
+            the second.
+        turns: button per additional axis that cycles its command through 0, 1, 0, -1.
+        stop: button that sets all additional commands to 0; -1 for none.
+        quit: button that stops the drive; -1 for none.
     """
 
     axes: tuple[tuple[str, int, float], ...]
@@ -201,10 +202,10 @@ SPACEMOUSE_NAMES = ("space", "3dconnexion")
 
 
 class Keyboard:
-    """The keyboard; `press` may be called by another thread."""
+    """Keyboard input; `press` may be called from another thread."""
 
     def __init__(self, further: int) -> None:
-        """Everything is centred.
+        """Start with all axes centred.
 
         Args:
             further: number of axes that the joystick does not move.
@@ -215,11 +216,11 @@ class Keyboard:
         self._quit = False
 
     def press(self, code: int) -> None:
-        """Take note of a key that goes down, by its GLFW code."""
+        """Queue a key press, given by its GLFW code."""
         self._pressed.append(code)
 
     def read(self, time: float) -> Reading:
-        """What the keys ask for now."""
+        """Process the queued key presses and return the current input."""
         while self._pressed:
             self._take(self._pressed.popleft())
         return Reading(tuple(self._axes.values()), tuple(self._switches.commands), self._quit)
@@ -238,43 +239,42 @@ class Keyboard:
             self._quit = True
 
     def close(self) -> None:
-        """Nothing is to be let go of."""
+        """Do nothing; a keyboard holds no resources."""
 
 
 class Pad:
-    """A device that is plugged in, and may be unplugged and plugged in again."""
+    """A gamepad or SpaceMouse, which may be unplugged and reconnected during a run."""
 
     def __init__(self, kind: str, sticks: Any, further: int) -> None:
-        """Take the first device of its kind.
+        """Use the first connected device of a kind.
 
         Args:
             kind: key of `LAYOUTS`.
-            sticks: has `find(kind)`, a stick of pygame's or None, `changed()`, whether one was
-                plugged in or out since the last call, and `close()`.
+            sticks: object with the methods of `Sticks`: `find(kind)`, `changed()` and `close()`.
             further: number of axes that the joystick does not move.
 
         Raises:
-            InputError: there is none.
+            InputError: no device of this kind is connected.
         """
         self._kind, self._sticks, self._layout = kind, sticks, LAYOUTS[kind]
         self._stick = sticks.find(kind)
         if self._stick is None:
             sticks.close()
-            message = "is not connected: plug it in, or choose --device keyboard"
+            message = "is not connected: connect it, or choose --device keyboard"
             raise InputError(f"--device {kind}", message)
         self._switches, self._held = Switches(further), set()
 
     def read(self, time: float) -> Reading:
-        """What it asks for now; nothing while it is unplugged."""
+        """Return the current input; the handle is centred while the device is unplugged."""
         said = ""
         if self._sticks.changed():
             before, self._stick = self._stick, self._sticks.find(self._kind)
             if self._stick is None and before is not None:
-                said = f"the {self._kind} is unplugged: the handle goes to its centre"
+                said = f"the {self._kind} is unplugged: the handle returns to its centre"
                 self._switches.off()
                 self._held = set()
             elif before is None and self._stick is not None:
-                said = f"the {self._kind} is back"
+                said = f"the {self._kind} is connected again"
         if self._stick is None:
             return Reading(commands=tuple(self._switches.commands), said=said)
         axes = _axes(self._stick, self._layout)
@@ -282,7 +282,7 @@ class Pad:
         return Reading(axes, tuple(self._switches.commands), over, said)
 
     def _press(self, held: set[str]) -> bool:
-        """Switch what has just been pressed; whether it was the button that ends."""
+        """Apply newly pressed buttons; return whether the quit button is among them."""
         fresh, self._held = held - self._held, held
         switches, layout = self._switches, self._layout
         for way, act, number in (
@@ -302,7 +302,7 @@ class Pad:
         return str(layout.quit) in fresh
 
     def close(self) -> None:
-        """Let go of SDL."""
+        """Shut SDL down."""
         self._sticks.close()
 
 
@@ -318,7 +318,7 @@ def _axes(stick: Any, layout: Layout) -> tuple[float, ...]:
 
 
 def _held(stick: Any, layout: Layout) -> set[str]:
-    """Numbers of the buttons that are down, and ways of the hat."""
+    """Return the numbers of the pressed buttons and the directions of the hat."""
     held = {str(b) for b in range(stick.get_numbuttons()) if stick.get_button(b)}
     if layout.hat and stick.get_numhats():
         x, y = stick.get_hat(0)
@@ -328,36 +328,36 @@ def _held(stick: Any, layout: Layout) -> set[str]:
 
 
 class Sticks:
-    """All that SDL sees, through pygame."""
+    """Joystick devices that SDL detects, accessed through pygame."""
 
     def __init__(self, kind: str) -> None:
-        """Start SDL.
+        """Initialise SDL.
 
         Args:
-            kind: for the message.
+            kind: name of the requested device, for the error message.
 
         Raises:
             InputError: pygame is not installed.
         """
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         os.environ.setdefault("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")
-        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # its window is not wanted
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # events without a window
         try:
             import pygame  # pyright: ignore[reportMissingImports] - an extra
         except ImportError:
             message = "needs pygame: pip install 'hydrotele[drive]' or pip install pygame"
             raise InputError(f"--device {kind}", message) from None
         self._pygame = pygame
-        pygame.display.init()  # SDL's events come with it
+        pygame.display.init()  # SDL delivers events only with an initialised display
         pygame.joystick.init()
 
     def changed(self) -> bool:
-        """Whether something was plugged in or out; fetches the sticks' state, too."""
+        """Update the device states; return whether a device was connected or disconnected."""
         kinds = (self._pygame.JOYDEVICEADDED, self._pygame.JOYDEVICEREMOVED)
         return any(event.type in kinds for event in self._pygame.event.get())
 
     def find(self, kind: str) -> Any:
-        """The first stick of a kind, None without."""
+        """Return the first device of a kind as a pygame joystick, or None."""
         for number in range(self._pygame.joystick.get_count()):
             stick = self._pygame.joystick.Joystick(number)
             named = any(part in stick.get_name().lower() for part in SPACEMOUSE_NAMES)
@@ -366,7 +366,7 @@ class Sticks:
         return None
 
     def close(self) -> None:
-        """Stop SDL."""
+        """Shut SDL down."""
         self._pygame.quit()
 
 
@@ -374,7 +374,7 @@ _Part = Annotated[float, Field(ge=-1, le=1)]
 
 
 class Script(Facts):
-    """What is asked for over time: `axes` of the handle and `commands` of further axes."""
+    """Input over time: values of the handle `axes` and `commands` of additional axes."""
 
     time: list[NonNegative]
     axes: dict[JoystickAxis, list[_Part]] = {}
@@ -385,7 +385,7 @@ class Script(Facts):
     def _check(self):
         rising = all(a < b for a, b in zip(self.time, self.time[1:], strict=False))
         if not self.time or self.time[0] != 0.0 or not rising:
-            raise ValueError("time must start at 0 and rise")
+            raise ValueError("time must start at 0 and increase")
         for name, values in [*self.axes.items(), *self.commands.items()]:
             if len(values) != len(self.time):
                 raise ValueError(f"{name} has {len(values)} values, time has {len(self.time)}")
@@ -393,27 +393,27 @@ class Script(Facts):
 
 
 class Scripted:
-    """A device that follows a script."""
+    """A device that plays a script."""
 
     def __init__(self, script: Script, further: tuple[str, ...], where: str) -> None:
-        """Begin at its beginning.
+        """Check the axes of the script.
 
         Args:
-            script: what to do.
+            script: the input over time.
             further: axes that the joystick does not move.
-            where: its file.
+            where: file of the script, for error messages.
 
         Raises:
-            InputError: it commands an axis that is not among them.
+            InputError: the script commands an axis that is not in `further`.
         """
         for name in script.commands:
             if name not in further:
-                message = f"{name!r} is no axis that the joystick leaves alone"
+                message = f"{name!r} is not one of the axes without a joystick axis"
                 raise InputError(where, f"{message}; {suggest(name, further)}")
         self._script, self._further = script, further
 
     def read(self, time: float) -> Reading:
-        """What the script asks for at a time of the run [s]."""
+        """Return the input of the script at a time of the run [s]."""
         script = self._script
         row = max(0, bisect.bisect_right(script.time, time + 1e-9) - 1)
         commands = [script.commands[n][row] if n in script.commands else 0.0 for n in self._further]
@@ -428,11 +428,11 @@ class Scripted:
         return values[row]
 
     def close(self) -> None:
-        """Nothing is to be let go of."""
+        """Do nothing; a script holds no resources."""
 
 
 def load_script(path: str | Path) -> Script:
-    """Read a script.
+    """Read a script file.
 
     Args:
         path: a CSV or YAML file.
@@ -441,7 +441,7 @@ def load_script(path: str | Path) -> Script:
         The script.
 
     Raises:
-        InputError: names file, line and column of what is wrong.
+        InputError: the file is invalid; the message names file, line and column.
     """
     path = Path(path)
     if not path.is_file():
@@ -463,7 +463,7 @@ def _from_csv(path: Path) -> Script:
     if "time" not in names:
         raise InputError(f"{path}, line 1", f"has no column 'time'; valid: time, {', '.join(AXES)}")
     if twice := {name for name in names if names.count(name) > 1}:
-        raise InputError(f"{path}, line 1", f"names {', '.join(sorted(twice))} twice")
+        raise InputError(f"{path}, line 1", f"repeats the columns {', '.join(sorted(twice))}")
     columns: dict[str, list[float]] = {name: [] for name in names}
     for line, row in enumerate(rows[1:], start=2):
         if not any(cell.strip() for cell in row):
@@ -495,7 +495,7 @@ def _check_time(time: list[float], where: str) -> None:
     if len(time) == 1 and time[0] != 0.0:
         raise InputError(where, f"time must start at 0, not at {time[0]:g}")
     if len(time) > 1 and not time[-1] > time[-2]:
-        raise InputError(where, f"time must rise: {time[-1]:g} comes after {time[-2]:g}")
+        raise InputError(where, f"time must increase: {time[-1]:g} follows {time[-2]:g}")
 
 
 SCRIPTED = "scripted:"
@@ -503,17 +503,17 @@ NAMES = ("keyboard", *LAYOUTS, f"{SCRIPTED}FILE", "haptic:HOST:PORT")
 
 
 def open_device(name: str, further: tuple[str, ...]) -> Device:
-    """Open a device.
+    """Open an input device by name.
 
     Args:
         name: one of `NAMES`.
-        further: axes of the machine that the joystick does not move, in its order.
+        further: axes that the joystick does not move, in the order of the machine.
 
     Returns:
         The device.
 
     Raises:
-        InputError: there is no such device, it is not connected, or what it needs is not installed.
+        InputError: the name is unknown, the device is not connected, or a package is missing.
     """
     if name == "keyboard":
         return Keyboard(len(further))
@@ -522,4 +522,4 @@ def open_device(name: str, further: tuple[str, ...]) -> Device:
     if name.startswith(SCRIPTED):
         path = name.removeprefix(SCRIPTED)
         return Scripted(load_script(path), further, path)
-    raise InputError(f"--device {name}", f"is no device; {suggest(name, NAMES)}")
+    raise InputError(f"--device {name}", f"is not a known device; {suggest(name, NAMES)}")

@@ -1,7 +1,8 @@
-"""A person at the joystick: the same station as in a run, in real time, the hand led by a device.
+"""Interactive driving: run a teleoperated scenario in real time with an input device.
 
-What the device asked for is written down, so that the run's own scenario repeats it bit for bit.
-A haptic device takes the joystick's place: what it asks for, and what its line has seen.
+The input device gives the reference position of the simulated operator's hand. The input is
+recorded, and the scenario of the run repeats it bit for bit. A haptic device replaces the simulated
+joystick; its handle motion is recorded, but a repetition is not bit-identical.
 """
 
 import math
@@ -26,20 +27,20 @@ from hydrotele.simulate.record import contact_force, surrounding_bodies
 HAPTIC = "haptic"
 _ENGAGED = "the haptic device moves the machine"
 LOCAL = "127.0.0.1"
-RATE = 1000.0  # Hz of the machine's control beside a device; one physics step per tick
+RATE = 1000.0  # Hz, control rate with a haptic device; one physics step per tick
 
 
 def haptic_address(device: str) -> tuple[str, int]:
-    """Host and port of `haptic`, `haptic:HOST` or `haptic:HOST:PORT`.
+    """Parse `haptic`, `haptic:HOST` or `haptic:HOST:PORT`.
 
     Args:
-        device: as the command line has it.
+        device: value of the command-line option `--device`.
 
     Returns:
-        Host and port; this computer and the usual port where they are left out.
+        Host and port; the defaults are this computer and the standard port.
 
     Raises:
-        InputError: it is none of these.
+        InputError: the value has another form.
 
     >>> haptic_address("haptic:10.0.0.7")
     ('10.0.0.7', 5610)
@@ -54,37 +55,37 @@ def haptic_address(device: str) -> tuple[str, int]:
 
 
 class HapticHandle:
-    """The handle of a haptic device whose server runs elsewhere.
+    """The handle of a haptic device, connected to its server through the network.
 
-    Its buttons switch the axes that the joystick does not move, as those of a SpaceMouse do.
+    Its buttons switch the axes that the joystick does not move, like those of a SpaceMouse.
 
     Attributes:
-        link: the line to the server.
+        link: connection to the server.
     """
 
     def __init__(self, host: str, port: int, further: int) -> None:
-        """Open the line.
+        """Open the connection.
 
         Args:
-            host: of the server.
-            port: of the server.
+            host: host name or address of the server.
+            port: port of the server.
             further: number of axes that the joystick does not move.
 
         Raises:
-            InputError: there is no such host.
+            InputError: the host is unknown.
         """
         self.link, self._switches = Link(host, port), Switches(further)
         self._count, self._held, self._state = further, 0, "new"
 
     def attach(self, session: Session) -> None:
-        """Take the place of the simulated joystick of a session."""
+        """Replace the simulated joystick of a session."""
         assert session.station
         station = session.station
         self.link.start(station.numbers, station.master_state, station.packet.shape)
         station.attach(self.link.exchange)
 
     def read(self, time: float) -> Reading:
-        """What the buttons ask for, and whether the device has come or gone."""
+        """Return the commands of the buttons, and a message when the connection changes."""
         pose = self.link.pose()
         said = self._news(pose is not None, self.link.engaged)
         if pose:
@@ -95,78 +96,83 @@ class HapticHandle:
         return Reading(commands=tuple(self._switches.commands), said=said)
 
     def _news(self, there: bool, engaged: bool) -> str:
-        """What has changed, in a sentence; nothing where nothing has."""
+        """Return a message if the state of the connection has changed, otherwise an empty text."""
         before, self._state = self._state, "gone" if not there else "moves" if engaged else "waits"
         if self._state == before:
             return ""
         if there:
-            return _ENGAGED if engaged else "a haptic device is there: centre its handle to begin"
+            return _ENGAGED if engaged else "a haptic device is connected: centre its handle"
         if before == "new":
-            return "no haptic device answers yet: start hydrotele haptic-device"
+            return "no haptic device responds yet: start hydrotele haptic-device"
         self._switches.off()
-        return "the haptic device is silent: the machine has no command"
+        return "the haptic device does not respond: the machine gets no command"
 
     def close(self) -> None:
-        """Close the line; the device then goes limp."""
+        """Close the connection; the device then applies no force."""
         self.link.close()
 
 
-PATIENCE = 0.25  # s that simulated time may be late before it is stopped
-_TELL = 2.0  # s between two sentences that it cannot keep up
-_LED = 5  # decimals of a handle's place that is written down
-_SLOW_CLOCK = 0.002  # s: shorter sleeps cost more than they give
+PATIENCE = 0.25  # s by which the simulation may lag behind real time before it pauses
+_TELL = 2.0  # s, shortest time between two messages about lost real time
+_LED = 5  # decimals of a recorded handle position
+_SLOW_CLOCK = 0.002  # s: shorter waits are skipped, because a sleep is not that accurate
 
 
 class TimeKeeper(Protocol):
-    """Keeps simulated time to the wall clock: a `Pacer`, or the deadlines of a haptic device."""
+    """Synchronises simulated time with the wall clock.
+
+    Attributes:
+        pauses: number of times that simulated time was paused.
+        late: total duration of the pauses [s].
+    """
 
     pauses: int
     late: float
 
     def now(self) -> float:
-        """The clock [s]."""
+        """Return the wall-clock time [s]."""
         ...
 
     def wait(self, simulated: float) -> float:
-        """Wait until it is time; by how much simulated time was just set back [s]."""
+        """Wait until a simulated time is due; return the pause just inserted [s]."""
         ...
 
     def close(self) -> None:
-        """No time is kept any more."""
+        """Release the timer."""
         ...
 
 
 class Pacer:
-    """Keeps simulated time to the wall clock; where it falls behind, simulated time stands still.
+    """Synchronises simulated time with the wall clock; pauses it if the computer is too slow.
 
     Attributes:
-        pauses: how often it was late.
-        late: seconds in all.
+        pauses: number of pauses.
+        late: total duration of the pauses [s].
     """
 
     def __init__(
         self, speed: float = 1.0, now: Callable[[], float] = clock.perf_counter,
         sleep: Callable[[float], None] = clock.sleep,
     ) -> None:  # fmt: skip
-        """Begin when `wait` is called first.
+        """Prepare the timer; it starts with the first call of `wait`.
 
         Args:
-            speed: simulated per real time; 0 is as fast as it goes.
-            now: a clock [s].
-            sleep: waits for a time [s].
+            speed: simulated time per real time [1]; 0 means as fast as possible.
+            now: function that returns the wall-clock time [s].
+            sleep: function that waits for a time [s].
         """
         self.speed, self.now, self._sleep = speed, now, sleep
         self._begin: float | None = None
         self.pauses, self.late = 0, 0.0
 
     def wait(self, simulated: float) -> float:
-        """Wait until it is time.
+        """Wait until a simulated time is due.
 
         Args:
-            simulated: time that has been simulated [s].
+            simulated: simulated time so far [s].
 
         Returns:
-            By how much simulated time was just set back [s]; 0 if it keeps up.
+            The pause just inserted because the simulation was late [s]; 0 if it keeps up.
         """
         if self.speed <= 0.0:
             return 0.0
@@ -184,22 +190,22 @@ class Pacer:
         return -early
 
     def close(self) -> None:
-        """Nothing was taken that has to be given back."""
+        """Do nothing; a `Pacer` holds no resources."""
 
 
 class LiveHand:
-    """Where the device wants the handle, and what it has asked for so far.
+    """Reference position of the handle from an input device, with the recorded input.
 
     Attributes:
-        span: (2, 6) edge of the dead band and stop of every axis [m], [rad]; a device's axis goes
-            from the one to the other.
+        span: (2, 6) dead-band edge and end of travel of every axis [m], [rad]; the range of a
+            device axis is mapped to the interval between them.
     """
 
     def __init__(self, further: dict[str, float]) -> None:
-        """Begin at the centre.
+        """Start at the centre.
 
         Args:
-            further: axes that the joystick does not move, with their largest commands.
+            further: axis that the joystick does not move -> command limit.
         """
         self.span = np.zeros((2, 6))
         self._further, self._wanted = further, np.zeros(6)
@@ -208,11 +214,11 @@ class LiveHand:
         self._buttons = [Button(at=0.0, axis=name, command=0.0) for name in further]
 
     def __call__(self) -> np.ndarray:
-        """Where the handle is wanted now, (6,) [m], [rad]."""
+        """Return the current reference position of the handle, (6,) [m], [rad]."""
         return self._wanted
 
     def take(self, reading: Reading, session: Session) -> None:
-        """Follow a reading from the session's next tick on."""
+        """Apply a device reading from the next tick of the session on, and record it."""
         if reading.axes != self._before.axes:
             part, (dead, stop) = np.array(reading.axes), self.span
             dead = np.where(dead < stop, dead, 0.0)
@@ -226,10 +232,10 @@ class LiveHand:
         self._before = reading
 
     def led(self, handle: np.ndarray, time: float) -> None:
-        """Write down where a device's handle was, (6,) [m], [rad], at a time of the run [s].
+        """Record the handle position (6,) [m], [rad] of a haptic device at a run time [s].
 
-        What is written down is where a simulated hand is to hold the joystick. It follows with its
-        own arm, so that a repetition is alike, not the same bit for bit.
+        A repetition uses it as the reference of the simulated hand. The arm dynamics of that hand
+        make the repetition similar, but not bit-identical.
         """
         wanted = [round(value, _LED) for value in handle.tolist()]
         if wanted != self._wanted.tolist():
@@ -244,7 +250,7 @@ class LiveHand:
         self._path.append(tuple(wanted.tolist()))
 
     def written_down(self, scenario: Scenario, duration: float) -> Scenario:
-        """The scenario that repeats what was done, of a duration [s]."""
+        """Return the scenario that repeats the recorded input, with a duration [s]."""
         columns = zip(AXES, zip(*self._path, strict=True), strict=True)
         path = {name: list(values) for name, values in columns if any(values)}
         operator = Follow.model_validate(
@@ -255,15 +261,15 @@ class LiveHand:
 
 
 class Status(NamedTuple):
-    """What the operator is told, refreshed a few times a second.
+    """Values displayed to the operator, updated several times per second.
 
     Attributes:
-        time: simulated [s].
-        handle: (6,) displacement [m], [rad].
-        hand: (6,) force of the hand, as the joystick feels it [N], [N m].
-        tip: task coordinate -> force at the tip, as it is reflected [N], [N m].
-        contact: (3,) force of all that is touched, world frame [N].
-        commands: further axis -> command.
+        time: simulated time [s].
+        handle: (6,) displacement of the handle [m], [rad].
+        hand: (6,) force of the hand, as estimated by the joystick [N], [N m].
+        tip: task coordinate -> reflected tip force [N], [N m].
+        contact: (3,) total contact force in the world frame [N].
+        commands: additional axis -> command.
     """
 
     time: float
@@ -274,7 +280,7 @@ class Status(NamedTuple):
     commands: dict[str, float]
 
     def rows(self) -> list[tuple[str, str]]:
-        """Names and values, for a line or a table."""
+        """Return (name, formatted value) pairs for display."""
         x, y, z = (1e3 * self.handle[:3]).tolist()
         push = " ".join(f"{v:+.1f}" for v in self.hand[:3])
         forces = [f"{n} {f / 1e3:+.1f}" for n, f in self.tip.items() if n in ("r", "z")]
@@ -290,11 +296,11 @@ class Status(NamedTuple):
 
 
 Watch = Callable[[Session, Callable[[], Status], float], bool]
-"""Called after every tick with session, status and wall clock [s]; False ends the drive."""
+"""Callback after every tick: session, status function, wall-clock time [s]; False stops the run."""
 
 
 def further_axes(machine: Machine) -> dict[str, float]:
-    """Axes of a machine that the joystick does not move -> largest command."""
+    """Return the axes that the joystick does not move, with their command limits."""
     moved = arm_axes(machine)
     return {
         name: axis.force.command_limit if axis.force else 1.0
@@ -304,18 +310,18 @@ def further_axes(machine: Machine) -> dict[str, float]:
 
 
 def live(scenario: Scenario, further: Iterable[str]) -> Scenario:
-    """The scenario with a live operator instead of its own.
+    """Replace the operator of a teleoperated scenario by a live one.
 
     Args:
-        scenario: a teleoperated one.
-        further: axes that get buttons.
+        scenario: a scenario with `pilot.kind: teleop`.
+        further: axes that are commanded with buttons.
 
     Raises:
-        InputError: it has no joystick.
+        InputError: the scenario has no joystick.
     """
     pilot = scenario.pilot
     if not isinstance(pilot, TeleopPilot):
-        message = f"its pilot is {pilot.kind}, which has no joystick; `kind: teleop` has one"
+        message = f"pilot kind {pilot.kind} has no joystick; use a scenario with `kind: teleop`"
         raise InputError(f"scenario {scenario.name}", message)
     buttons = [Button(at=0.0, axis=name, command=0.0) for name in further]
     update = {"operator": Live(kind="live"), "buttons": buttons}
@@ -326,21 +332,21 @@ def drive(
     scenario: Scenario, machine: Machine, device: Device, pacer: TimeKeeper,
     watch: Watch, say: Callable[[str], None],
 ) -> Run:  # fmt: skip
-    """Let a person drive a scenario.
+    """Run a teleoperated scenario with an input device.
 
     Args:
-        scenario: of the longest duration; `live` gives it its operator.
-        machine: the scenario's.
-        device: what the person drives with.
-        pacer: keeps time.
-        watch: shows what happens.
-        say: told what the operator should know at once.
+        scenario: the scenario; its duration is the maximum duration of the run.
+        machine: machine of the scenario.
+        device: input device of the operator.
+        pacer: synchronises simulated time with the wall clock.
+        watch: callback after every tick, for display; it can stop the run.
+        say: callback for messages to the operator.
 
     Returns:
-        The run as far as it went; its scenario repeats it.
+        The run up to the stop; its scenario repeats it.
 
     Raises:
-        InputError: the scenario asks for what the machine has not, or it was too short for a log.
+        InputError: the scenario does not fit the machine, or the run is too short for a log.
         SimulationFailed: states became infinite or not a number.
     """
     further = further_axes(machine)
@@ -355,10 +361,10 @@ def drive(
     handle = station.log.master("handle")
     status, told = _status_of(session, further), _Told(session, say)
     every = station.operator.every
-    # beside a haptic device not in the ticks in which estimate of force and log row are due, too
+    # with a haptic device, read it in ticks without a force estimate and a log row
     phase = every // 2 if haptic else 0
     while session.tick < session.scenario.ticks:
-        if session.tick % every == phase or not session.tick:  # what it compiles is in no hurry
+        if session.tick % every == phase or not session.tick:  # tick 0 compiles, timing is free
             reading = device.read(session.time)
             if reading.said:
                 say(reading.said)
@@ -373,7 +379,7 @@ def drive(
             break
         if haptic and session.tick == 1:
             haptic.link.restart_figures()
-        if pacer.wait(session.time):  # begins after the first tick has compiled and shown
+        if pacer.wait(session.time):  # starts after the first tick, which compiles code
             told.late(pacer)
     seen = haptic.link.figures() if haptic else {}
     while session.tick % session.every:  # the logs hold whole rows
@@ -386,7 +392,7 @@ def drive(
 
 
 class _Told:
-    """Notes and events, each told once."""
+    """Passes on each note and event of a session once."""
 
     def __init__(self, session: Session, say: Callable[[str], None]) -> None:
         assert session.station
@@ -395,13 +401,13 @@ class _Told:
         self._due = -math.inf
 
     def late(self, pacer: TimeKeeper) -> None:
-        """Tell that simulated time was stopped, now and then."""
+        """Report pauses of simulated time, at most once every `_TELL` seconds."""
         if pacer.now() >= self._due:
             self._due = pacer.now() + _TELL
-            self._say(f"cannot keep up: paused, {pacer.late:.2f} s in all")
+            self._say(f"computer too slow for real time: paused, {pacer.late:.2f} s in total")
 
     def news(self) -> None:
-        """Tell what is new."""
+        """Report new notes and events."""
         notes, events = self._notes, self._events
         if self._count == [len(notes), len(events)]:
             return

@@ -1,4 +1,7 @@
-"""Open-loop replay: a log's commands drive the model from its initial state; how far is it off?"""
+"""Replay the commands of a log in open loop and compare the simulated with the measured channels.
+
+The model starts from the initial state of the log and receives no feedback from its readings.
+"""
 
 import dataclasses
 import math
@@ -24,15 +27,15 @@ PREDICTED = ("angle", "position", "length", "pressure_head", "pressure_rod", "pr
 
 @dataclasses.dataclass(frozen=True)
 class ChannelDifference:
-    """How far a simulated channel is from the measured one.
+    """Difference between a simulated and a measured channel.
 
     Attributes:
         rms: RMS difference [unit].
         max: largest difference [unit].
         unit: SI unit.
-        range: main relief pressure for pressures, stroke for lengths, else the span of the measured
-            values [unit].
-        noise_rms: standard deviation of one reading of the log's sensors [unit], 0 if ideal.
+        range: full scale of the channel [unit]: main relief pressure for pressures, stroke for
+            lengths, otherwise the range of the measured values.
+        noise_rms: noise standard deviation of one reading [unit], 0 for ideal sensors.
     """
 
     rms: float
@@ -44,7 +47,14 @@ class ChannelDifference:
 
 @dataclasses.dataclass(frozen=True)
 class Replay:
-    """Result of a replay: the simulated log, the differences, and how fast it went."""
+    """Result of a replay.
+
+    Attributes:
+        measured: the log that was replayed.
+        simulated: the simulated channels at the same times.
+        channels: channel name -> difference, for every channel that both logs contain.
+        realtime_factor: simulated time divided by computing time [1].
+    """
 
     measured: Log
     simulated: Log
@@ -58,37 +68,37 @@ def replay_log(
     timestep: float = 1.0e-3,
     progress: Callable[[float, float], None] | None = None,
 ) -> Replay:
-    """Drive a machine with a log's commands.
+    """Simulate a machine with the commands of a log and compare the channels.
 
-    Starts from the log's `initial_state` metadata if it has one, else from its first row: measured
-    positions, measured pressures, zero velocity, closed spools. Before it the machine stood still
-    with the commands of rest, which matters where commands are delayed. There is a ground to touch
-    only if the log's metadata says `ground: yes`, as logs of scenarios with a ground do.
+    The simulation starts from the `initial_state` metadata of the log. Without it, the first row
+    gives the positions and pressures; velocities are zero and spools are closed. Before the first
+    row the machine is assumed to be at rest with its rest commands, which matters for delayed
+    commands. The scene contains a ground only if the metadata of the log has `ground: yes`.
 
-    What is compared is what the machine's sensors would read without noise, with their offsets,
-    scales and delays; in a log of the truth, with `truth.*` columns, the true values themselves.
+    The compared values are the sensor readings without noise, including offsets, scales and delays.
+    For a log with `truth.*` columns they are the true values.
 
     Args:
-        log: the log; needs the command and the position of every axis.
+        log: the log; must contain the command and the position of every axis.
         machine: the machine.
-        timestep: largest physics step [s]; a whole number of steps fits between two rows.
-        progress: called now and then with (simulated seconds, total seconds).
+        timestep: largest physics step [s]; it is reduced to fit a whole number into one log row.
+        progress: called periodically with (simulated seconds, total seconds).
 
     Returns:
         The replay.
 
     Raises:
-        InputError: a command or position column is missing, samples are missing, something stood
-            around the machine, or the start cannot be assembled.
+        InputError: a command or position column is missing, samples are missing, the recorded scene
+            contained objects, or the initial state violates the closed loops of the machine.
         SimulationFailed: states became infinite or not a number.
     """
     if not 1e-6 <= timestep < math.inf:
         raise InputError("timestep", f"must be at least 1e-6 s, not {timestep:g}")
     if len(log.gaps):
         where = f"{log.source}, row {log.gaps[0]}"
-        raise InputError(where, "samples are missing: cut the log there")
+        raise InputError(where, "samples are missing: split the log there")
     if things := log.metadata.get("things"):
-        message = f"the machine worked beside a {things}, and a replay has nothing around it"
+        message = f"the recorded scene contained {things}, which a replay cannot simulate"
         raise InputError(log.source, message)
     period = float(log.time[-1] - log.time[0]) / (len(log) - 1)
     steps = max(1, math.ceil(period / timestep - 1e-6))
@@ -131,13 +141,13 @@ def _start(plant: Plant, log: Log) -> dict[str, Any]:
     valves = axes[: plant.hydraulic]
     names = [f"pressure_{side}.{a}" for side in ("head", "rod") for a in valves]
     if valves and all(n in log for n in names):
-        for side in ("pressure_head", "pressure_rod"):  # a lack at rest is the reading's noise
+        for side in ("pressure_head", "pressure_rod"):  # readings below 0 are sensor noise
             state[side] = [max(0.0, _first(plant, log, f"{side}.{a}")) for a in valves]
     return state
 
 
 def _first(plant: Plant, log: Log, channel: str) -> float:
-    """True value behind the first reading of a channel, as its scale and offset have it."""
+    """Return the first reading of a channel, corrected for the sensor's offset and scale."""
     error = plant.machine.sensor_errors.get(channel, SensorError())
     return (float(log[channel][0]) - error.offset) / error.scale
 
@@ -147,7 +157,7 @@ def _stated_start(plant: Plant, log: Log) -> dict[str, Any]:
         state = json_value(log.metadata["initial_state"])
         order = list(state["order"])
         if sorted(order) != sorted(plant.axes):
-            raise ValueError(f"its order {order} is not that of the axes {list(plant.axes)}")
+            raise ValueError(f"its order {order} does not list the axes {list(plant.axes)}")
         start: dict[str, Any] = {"order": order, "angle": _vector(state, "angle", len(order))}
         for key in ("velocity", "spool", "spool_rate", "pressure_head", "pressure_rod"):
             if key in state:
@@ -165,12 +175,12 @@ def _stated_start(plant: Plant, log: Log) -> dict[str, Any]:
     except (ValueError, KeyError, TypeError) as error:
         reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
         where = f"{log.source}: metadata initial_state"
-        raise InputError(where, f"is not usable: {reason}") from None
+        raise InputError(where, f"is invalid: {reason}") from None
     return start
 
 
 def _vector(state: dict, key: str, *sizes: int) -> np.ndarray:
-    """Finite numbers of a state, of one of these sizes; a scalar where no size is given."""
+    """Return a state entry as finite numbers of one of these sizes; a scalar without sizes."""
     values = np.asarray(state[key], dtype=float)
     if values.shape not in ([(size,) for size in sizes] or [()]) or not np.isfinite(values).all():
         raise ValueError(f"{key} must be {sizes[0] if sizes else 1} finite numbers")
@@ -213,7 +223,7 @@ def _differences(log: Log, simulated: Log, machine: Machine) -> dict[str, Channe
 
 
 def _span(machine: Machine, channel: str) -> float | None:
-    """Full scale: the main relief pressure for pressures, the stroke for lengths."""
+    """Return the full scale: relief pressure for pressures, stroke for lengths, otherwise None."""
     kind, _, axis = channel.partition(".")
     if kind.startswith("pressure") and machine.supply:
         return machine.supply.relief_pressure

@@ -1,13 +1,10 @@
-"""The one loop: a scenario runs, and two logs come out, `measured` and `truth`.
+"""Simulate a scenario and return the `measured` log, the `truth` log and a summary.
 
-Summary of a run: speed, pins, contact, tracking, and what produced it.
+`run_scenario` does a whole run; a `Session` advances by control ticks for interactive use. All
+arrays are allocated for the full duration of the scenario and cut if the run stops earlier.
 
-A run under way: by control ticks, for as long as whoever drives it wants.
-
-Everything a tick writes has room for the scenario's whole duration; a run that ends earlier is cut
-to the rows that it has. Ticks follow one another in native code while nothing else is to be done:
-between two, Python would push machine and joystick out of the processor's caches, and a tick in
-contact takes a fifth longer then, one of a bare plan an eighth.
+Consecutive ticks run in compiled code. Returning to Python between two ticks evicts machine and
+joystick data from the processor caches, and makes a tick 12 to 20 % slower.
 """
 
 import dataclasses
@@ -69,16 +66,16 @@ TICKS = np.dtype(
     + [(name, np.int64) for name in ("places", "one", "two", "widest")],  # addresses
     align=True,
 )
-"""Record of Ticks."""
+"""Record type of the compiled tick loop; see `ticks_of`."""
 
 
 class Ticks(NamedTuple):
-    """What native ticks need beside machine, plan and station.
+    """Arguments of the compiled tick loop, in addition to machine, plan and station.
 
     Attributes:
-        record: (1,) for native code.
-        widest: (1,) largest opening of a pin so far [m].
-        kept: arrays whose addresses the record has.
+        record: (1,) record of type `TICKS`.
+        widest: (1,) largest gap between the two points of a pin so far [m].
+        kept: arrays whose addresses are in the record; kept alive here.
     """
 
     record: np.ndarray
@@ -89,15 +86,15 @@ class Ticks(NamedTuple):
 def ticks_of(
     model: mujoco.MjModel, data: mujoco.MjData, steps: int, every: int, rows: int, period: float
 ) -> Ticks:  # fmt: skip
-    """Prepare the ticks of a run.
+    """Create the record of the compiled tick loop.
 
     Args:
-        model: the plant's.
-        data: its state.
+        model: MuJoCo model of the plant.
+        data: MuJoCo data of the plant.
         steps: physics steps per tick.
-        every: ticks per row of the logs.
-        rows: number of rows.
-        period: of a tick [s].
+        every: ticks per log row.
+        rows: number of log rows.
+        period: duration of a tick [s].
     """
     one, two = pin_sites(model)
     widest = np.zeros(1)
@@ -112,20 +109,20 @@ def ticks_of(
 
 @compiled
 def planned_ticks(ticks, simulated, planned, row, contacts, first, last, stopped):
-    """Go on along a plan.
+    """Simulate control ticks of a planned run.
 
     Args:
-        ticks: `Ticks.record`, written.
+        ticks: `Ticks.record`, modified.
         simulated: record of `simulate.stepping.simulation_record`.
         planned: record of `control.tick.planned_record`.
         row: record of a `Recorder`.
         contacts: record of `simulate.record.contact_record`.
-        first: control tick, scalar.
-        last: the one before which to stop, scalar.
-        stopped: whether all commands are 0, scalar.
+        first: first control tick, scalar.
+        last: control tick before which to stop, scalar.
+        stopped: whether all commands are set to 0, scalar.
 
     Returns:
-        The tick to go on with, scalar: `last`; or -1 less the one whose row is not finite.
+        The next tick, scalar: `last`; or -1 - k if the log row of tick k is not finite.
 
     Source: `control.tick`.
     """
@@ -141,23 +138,25 @@ def planned_ticks(ticks, simulated, planned, row, contacts, first, last, stopped
 def teleoperated_ticks(
     ticks, simulated, planned, row, contacts, station, flotor, first, last, stopped
 ):  # fmt: skip
-    """Go on with a station; stop before the physics of a tick at which it is to be looked at.
+    """Simulate control ticks of a teleoperated run until Python must process the station.
+
+    The loop stops before the physics of such a tick.
 
     Args:
-        ticks: see `planned_ticks`, written.
+        ticks: see `planned_ticks`, modified.
         simulated: see `planned_ticks`.
         planned: see `planned_ticks`.
         row: see `planned_ticks`.
         contacts: see `planned_ticks`.
         station: see `teleop.round_trip`.
         flotor: see `teleop.round_trip`.
-        first: control tick, prepared, scalar.
-        last: the one before which to stop, scalar.
-        stopped: whether the machine has been stopped for good, scalar.
+        first: first control tick, already prepared by the station, scalar.
+        last: control tick before which to stop, scalar.
+        stopped: whether the machine has been stopped permanently, scalar.
 
     Returns:
-        The tick to go on with, scalar: `last`, or the one whose physics is left to do; or -1 less
-        the one whose row is not finite.
+        The next tick, scalar: `last`, or the tick whose physics is still to be done; or -1 - k if
+        the log row of tick k is not finite.
 
     Source: `control.tick`, `teleop.round_trip`.
     """
@@ -173,7 +172,7 @@ def teleoperated_ticks(
 
 @compiled
 def _write_down(r, row, contacts, tick):
-    """Write the row that is due at a tick, if one is; whether all is well."""
+    """Write the log row of a tick, if one is due; return False if it is not finite."""
     if tick % r.every != 0 or tick // r.every >= r.rows:
         return True
     return take_row(row, contacts, tick // r.every, tick * r.period)
@@ -181,10 +180,10 @@ def _write_down(r, row, contacts, tick):
 
 @compiled
 def look_at_pins(ticks):
-    """Keep how far the pins have opened.
+    """Update the largest pin opening of the run.
 
     Args:
-        ticks: `Ticks.record`.
+        ticks: `Ticks.record`, modified.
 
     Returns:
         Nothing.
@@ -198,19 +197,26 @@ def look_at_pins(ticks):
 
 
 def compile_ahead() -> None:
-    """Begin to compile what a teleoperated run calls, in a process beside this one."""
+    """Start to compile the tick loop of a teleoperated run in a separate process."""
     compile_elsewhere(teleoperated_ticks, f"from {__name__} import compile_ticks; compile_ticks()")
 
 
 def compile_ticks() -> None:
-    """Compile what a teleoperated run calls."""
+    """Compile the tick loop of a teleoperated run."""
     records = TICKS, SIMULATION, PLANNED, STATE_ROW, CONTACTS, STATION, FLOTOR
     arguments = *(typeof(np.zeros(1, kind)) for kind in records), int64, int64, boolean
     teleoperated_ticks.compile(arguments)
 
 
 class PreparedRun(NamedTuple):
-    """A scenario before its first step."""
+    """A scenario that is ready for its first step.
+
+    Attributes:
+        plant: the simulated machine.
+        data: its MuJoCo data in the initial state.
+        plan: reference and commands over time.
+        seen: sensor feedback of the controller.
+    """
 
     plant: Plant
     data: mujoco.MjData
@@ -219,16 +225,16 @@ class PreparedRun(NamedTuple):
 
 
 class SessionResult(NamedTuple):
-    """What the ticks leave.
+    """Result of the simulated ticks of a session.
 
     Attributes:
-        plan: what was asked of every axis.
-        record: states at the log's rows.
-        commands: (n, nu) by control tick.
+        plan: reference and commands of every axis.
+        record: states at the log rows.
+        commands: (n, nu) commands by control tick.
         pins: largest pin opening [m].
-        wall: time [s] from the second control tick on, since the first one loads compiled code.
-        station: the operator's, of a teleoperated run.
-        events: (time [s], what happened around the machine).
+        wall: computing time [s] without the first tick, which loads compiled code.
+        station: operator station of a teleoperated run, otherwise None.
+        events: (time [s], description) of events in the surroundings, such as a falling tree.
     """
 
     plan: Plan
@@ -241,33 +247,33 @@ class SessionResult(NamedTuple):
 
 
 class Session:
-    """A scenario that is being run.
+    """A running simulation of a scenario.
 
     Attributes:
-        plant: what is simulated.
-        data: its state; staggered, see `simulate.record`.
-        scenario: what was asked.
-        seen: what the machine's sensors say.
-        station: the operator's, of a teleoperated run.
+        plant: the simulated machine.
+        data: its MuJoCo data, with positions and velocities staggered (`simulate.record`).
+        scenario: the scenario.
+        seen: sensor feedback of the controller.
+        station: operator station of a teleoperated run, otherwise None.
         start: full physics state before the first tick.
-        before: (nu,) commands in force before the first tick.
+        before: (nu,) commands before the first tick.
         tick: number of the next control tick.
-        every: control ticks per row of the logs.
+        every: control ticks per log row.
     """
 
     def __init__(
         self, prepared: PreparedRun, scenario: Scenario, nominal: Machine, hand: Hand | None = None
     ) -> None:
-        """Make room for the whole run.
+        """Allocate the arrays of the whole run and prepare the first tick.
 
         Args:
-            prepared: of the scenario.
-            scenario: what is asked.
-            nominal: its machine without planted effects.
-            hand: where a live operator wants the handle.
+            prepared: result of `prepare`.
+            scenario: the scenario.
+            nominal: machine of the scenario without planted effects.
+            hand: function that returns a live operator's reference position of the handle.
 
         Raises:
-            InputError: servo, forces or station do not suit the machine.
+            InputError: servo, force model or station do not fit the machine.
         """
         plant, data, plan, seen = prepared
         plan = dataclasses.replace(
@@ -316,14 +322,14 @@ class Session:
 
     @property
     def time(self) -> float:
-        """Simulated time of the next tick [s]."""
+        """Simulated time at the next tick [s]."""
         return self.tick / self.scenario.control_rate
 
     def advance(self, most: int = 1) -> None:
-        """Go on by one control tick, and by those after it that need nothing but native code.
+        """Simulate control ticks.
 
         Args:
-            most: number of ticks to go on by at most.
+            most: number of ticks.
 
         Raises:
             SimulationFailed: states became infinite or not a number.
@@ -335,7 +341,7 @@ class Session:
                 self._begin = clock.perf_counter()
 
     def _go_on(self, end: int) -> None:
-        """Go on natively until Python has something to do, or until a tick."""
+        """Run compiled ticks until a given tick, or until Python must act."""
         first, station, stepper = self.tick, self.station, self._stepper
         if self._around.changes or not first:
             end = first + 1
@@ -362,34 +368,34 @@ class Session:
             self._around.update(first * self._dt, self.data, self._dt)
 
     def set_command(self, axis: str, value: float) -> None:
-        """Command an axis that the joystick does not move, from the next tick on.
+        """Set the command of an axis without a joystick axis, from the next tick on.
 
         Args:
-            axis: one that a button of the scenario names.
-            value: the command [1], or in the drive's unit.
+            axis: name of the axis; a button of the scenario must refer to it.
+            value: the command [1], or in the unit of the drive.
         """
         self._plan.command[self.tick :, self.plant.axes.index(axis)] = value
 
     def command_of(self, tick: int) -> np.ndarray:
-        """Commands (nu,) of a tick that is over [1], or in the drives' units."""
+        """Return the commands (nu,) of a past tick [1], or in the units of the drives."""
         return self._commands[tick]
 
     @property
     def events(self) -> list[tuple[float, str]]:
-        """What has happened around the machine: (time [s], sentence)."""
+        """Events in the surroundings so far: (time [s], description)."""
         return self._around.events
 
     def finish(self) -> SessionResult:
-        """End the run here; everything is cut to its whole rows.
+        """Stop the run and return its result, cut to complete log rows.
 
         Raises:
-            InputError: there are fewer than the ten rows that a log needs.
+            InputError: the run has fewer than the ten rows that a log needs.
         """
         wall = clock.perf_counter() - self._begin
         self._around.restore()
         rows = min(self.tick // self.every, self.scenario.rows)
         if rows < 10:
-            message = f"ended after {self.time:.2f} s: too short for a log, nothing is written"
+            message = f"stopped after {self.time:.2f} s: too short for a log, nothing is written"
             raise InputError(self.scenario.name, message)
         whole = self._commands[: rows * self.every].reshape(rows, self.every, -1)
         self._recorder.command[:rows] = whole.mean(axis=1)
@@ -414,24 +420,24 @@ def _cut_plan(plan: Plan, ticks: int) -> Plan:
     )  # fmt: skip
 
 
-_VACUUM = -1.0e5  # Pa below the atmosphere, as far as pressure can fall
+_VACUUM = -1.0e5  # Pa relative to the atmosphere, the lowest physically possible pressure
 
 
 def summarise(
     plant: Plant, scenario: Scenario, plan: Plan, record: Record, pins: float, wall: float
 ) -> dict[str, Any]:
-    """What `summary.json` says, but for the balances.
+    """Return the content of `summary.json`, without the flow and energy balances.
 
     Args:
-        plant: what ran.
-        scenario: what was asked.
-        plan: what was asked of every axis.
-        record: the states at the log's rows.
-        pins: largest pin opening seen at a control tick [m].
-        wall: time that the loop took [s].
+        plant: the simulated machine.
+        scenario: the scenario.
+        plan: reference and commands of every axis.
+        record: states at the log rows.
+        pins: largest pin opening at a control tick [m].
+        wall: computing time of the tick loop [s].
 
     Returns:
-        Plain numbers and texts; units stand in the keys, or in `unit`.
+        Numbers and texts; units are part of the keys, or given by `unit`.
     """
     return {
         "kind": "run",
@@ -454,19 +460,22 @@ def summarise(
 
 
 def _doubts(plant: Plant, record: Record) -> list[str]:
-    """Sentences about states that no machine can have."""
+    """Return warnings about physically impossible states."""
     if not plant.hydraulic:
         return []
     act = record.act[:, : ACTIVATIONS * plant.hydraulic]
     pressures = act.reshape(len(record.time), -1, ACTIVATIONS)[:, :, 2:]
     lowest = pressures.min(initial=0.0)
     if lowest < _VACUUM:
-        return [f"a chamber falls to {lowest / 1e6:.1f} MPa, which oil cannot: check the machine"]
+        return [
+            f"a chamber pressure falls to {lowest / 1e6:.1f} MPa, which is physically impossible:"
+            " check the parameters of the machine"
+        ]
     return []
 
 
 def _tracking(plant: Plant, plan: Plan, record: Record) -> dict[str, Any]:
-    """Largest and RMS deviation of every followed axis, and of the tip from its desired pose."""
+    """Return RMS and maximum tracking error of every closed-loop axis and of the tip pose."""
     rows = np.searchsorted(plan.time, record.time - 1e-9)
     result: dict[str, Any] = {}
     for i, name in enumerate(plan.axes):
@@ -500,7 +509,7 @@ def _versions() -> dict[str, str]:
 
 
 def _git_commit() -> str | None:
-    """Commit of the checkout that this package runs from, with `+` if it has changes."""
+    """Return the git commit of this installation, with `+` for local changes; None without git."""
     folder = Path(hydrotele.__file__).parent.parent
     if not (folder / ".git").exists():
         return None
@@ -516,22 +525,22 @@ def _git_commit() -> str | None:
 
 AUDIT_SECONDS = 5.0
 _PROGRESS_ROWS = 50
-_DEEPEST_START = 0.05  # m: contact is soft, so a tool may rest a little in the ground
+_DEEPEST_START = 0.05  # m: contact is compliant, so a resting tool penetrates the ground a little
 Progress = Callable[[float, float], None]
 
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """Everything a run yields.
+    """Result of a simulated run.
 
     Attributes:
-        scenario: what was asked.
-        plant: what was simulated; its machine has the planted effects.
-        plan: what was asked of every axis.
-        measured: what the sensors say.
-        truth: what was true, with `initial_state` in its metadata.
-        summary: versions, speed, pins, balances, tracking.
-        station: the operator's, of a teleoperated run.
+        scenario: the scenario.
+        plant: the simulated machine, including the planted effects.
+        plan: reference and commands of every axis.
+        measured: log of the sensor readings.
+        truth: log of the true values, with `initial_state` in its metadata.
+        summary: versions, speed, pin openings, balances, tracking errors.
+        station: operator station of a teleoperated run, otherwise None.
     """
 
     scenario: Scenario
@@ -544,7 +553,7 @@ class Run:
 
 
 def scenario_model(scenario: Scenario) -> Machine:
-    """The machine of a scenario as its model has it, without the planted effects.
+    """Load the machine of a scenario without its planted effects.
 
     Raises:
         InputError: unknown machine or tool.
@@ -553,7 +562,7 @@ def scenario_model(scenario: Scenario) -> Machine:
 
 
 def scenario_machine(scenario: Scenario) -> Machine:
-    """The machine of a scenario that is simulated, with its planted effects.
+    """Load the machine of a scenario with its planted effects.
 
     Raises:
         InputError: unknown machine, tool, effect or location.
@@ -565,10 +574,10 @@ def scenario_machine(scenario: Scenario) -> Machine:
 
 
 def prepare(scenario: Scenario) -> PreparedRun:
-    """Compile the machine of a scenario, put it at its start and plan the run.
+    """Build the plant of a scenario, set its initial state and plan the run.
 
     Raises:
-        InputError: the scenario asks for what the machine has not.
+        InputError: the scenario does not fit the machine.
     """
     machine = scenario_machine(scenario)
     sensors = sensor_set(machine, scenario.sensors)
@@ -578,7 +587,10 @@ def prepare(scenario: Scenario) -> PreparedRun:
     plan = make_plan(machine, plant.axes, scenario.pilot, start, times)
     seen = feedback(plant, sensors, scenario.seed, scenario.ticks, scenario.control_rate)
     if sensors and round(scenario.control_rate / scenario.log_rate) % seen.every:
-        message = f"sample at {sensors.rate:g} Hz; log_rate {scenario.log_rate:g} Hz must divide it"
+        message = (
+            f"the sample rate {sensors.rate:g} Hz must be a multiple of log_rate"
+            f" {scenario.log_rate:g} Hz"
+        )
         raise InputError(f"sensors {scenario.sensors}", message)
     return PreparedRun(plant, data, plan, seen)
 
@@ -588,13 +600,13 @@ def run_scenario(scenario: Scenario, progress: Progress | None = None) -> Run:
 
     Args:
         scenario: the scenario.
-        progress: called now and then with (simulated seconds, total seconds).
+        progress: called periodically with (simulated seconds, total seconds).
 
     Returns:
         The run.
 
     Raises:
-        InputError: the scenario asks for what the machine has not.
+        InputError: the scenario does not fit the machine.
         SimulationFailed: states became infinite or not a number.
     """
     session = begin(scenario)
@@ -609,14 +621,14 @@ def run_scenario(scenario: Scenario, progress: Progress | None = None) -> Run:
 
 
 def begin(scenario: Scenario, hand: Hand | None = None) -> Session:
-    """Everything of a run before its first tick.
+    """Prepare a scenario and return a session at its first tick.
 
     Args:
-        scenario: what is asked.
-        hand: where a live operator wants the handle.
+        scenario: the scenario.
+        hand: function that returns a live operator's reference position of the handle.
 
     Raises:
-        InputError: the scenario asks for what the machine has not.
+        InputError: the scenario does not fit the machine.
     """
     if isinstance(scenario.pilot, TeleopPilot):
         compile_ahead()
@@ -624,14 +636,14 @@ def begin(scenario: Scenario, hand: Hand | None = None) -> Session:
 
 
 def finished(session: Session, scenario: Scenario) -> Run:
-    """The run of a session that has gone far enough.
+    """Stop a session and return its run with logs, summary and balances.
 
     Args:
-        session: after its last tick.
-        scenario: what was asked, of the duration that it went.
+        session: the session after its last tick.
+        scenario: the scenario, with the duration that was simulated.
 
     Raises:
-        InputError: it is too short for a log.
+        InputError: the run is too short for a log.
     """
     looped, plant = session.finish(), session.plant
     plan, record = looped.plan, looped.record
@@ -651,7 +663,7 @@ def finished(session: Session, scenario: Scenario) -> Run:
 
 
 def _with_station(log: Log, station: StationLog, scenario: Scenario) -> Log:
-    """A log with what the operator's station measured and made."""
+    """Return a log with the channels of the operator station added."""
     every = round(scenario.control_rate / scenario.log_rate)
     columns, units = station.channels(every, scenario.rows)
     return dataclasses.replace(
@@ -660,7 +672,7 @@ def _with_station(log: Log, station: StationLog, scenario: Scenario) -> Log:
 
 
 def _logs(plant: Plant, scenario: Scenario, record: Record, seen: Feedback) -> tuple[Log, Log]:
-    """What was true and what the sensors say; the latter with the errors that were fed back."""
+    """Return the truth log and the measured log; the latter has the errors the controller saw."""
     machine = plant.machine
     values, units = true_channels(plant, record)
     truth = _log(scenario, machine, record.time, values, units, "ideal")
@@ -685,14 +697,15 @@ def _start(plant: Plant, scenario: Scenario) -> tuple[mujoco.MjData, dict[str, f
     for name, value in scenario.start.joints.items():
         if name not in joints:
             raise InputError(
-                "start.joints", f"{name!r} is no joint of the machine; {suggest(name, joints)}"
+                "start.joints", f"{name!r} is not a joint of the machine; {suggest(name, joints)}"
             )
         joints[name] = value
     if scenario.start.pose:
         here = {a: joints[machine.axes[a].joint] for a in plant.axes}
         there = pose_to_joints(machine, scenario.start.pose, here, "start.pose")
         if twice := scenario.start.joints.keys() & {machine.axes[a].joint for a in there}:
-            raise InputError("start", f"{', '.join(sorted(twice))} follow from the pose; give one")
+            message = f"give either a pose or the joints {', '.join(sorted(twice))}, not both"
+            raise InputError("start", message)
         joints |= {machine.axes[a].joint: value for a, value in there.items()}
     for name, joint in machine.joints.items():
         if joint.range and not joint.range[0] <= joints[name] <= joint.range[1]:
@@ -704,8 +717,8 @@ def _start(plant: Plant, scenario: Scenario) -> tuple[mujoco.MjData, dict[str, f
     mujoco.mj_fwdPosition(plant.model, data)
     depth = -min((data.contact[k].dist for k in range(data.ncon)), default=0.0)
     if depth > _DEEPEST_START:
-        things = "the ground or what stands around" if plant.surroundings else "the ground"
-        raise InputError("start", f"the machine would stand {depth:.2f} m deep in {things}")
+        things = "the ground or an object" if plant.surroundings else "the ground"
+        raise InputError("start", f"the machine would penetrate {things} by {depth:.2f} m")
     return data, joints
 
 
@@ -749,7 +762,7 @@ def _initial_state(plant: Plant, record: Record) -> dict[str, Any]:
 
 
 def _remembered(plant: Plant, record: Record) -> dict[str, dict[str, float]]:
-    """What bristles and a slow pump remember at a record's start, by kind and owner."""
+    """Return the internal states of bristles, pump and terms at the start, by kind and owner."""
     found: dict[str, dict[str, float]] = {}
     for name, place in plant.memory.items():
         kind, _, owner = name.partition(".")

@@ -1,13 +1,12 @@
-"""Do a sweep: check every point, do the runs that are missing, write table and report.
+"""Execute a sweep: check every point, execute the missing runs, and write the table.
 
-The folder of a sweep is begun whole and gone on with by the same sweep, by one process at a time.
-Its table has a row per run, with a unit in every column that has one.
+An interrupted sweep continues in its folder; only one process at a time may use the folder. The
+table has one row per run and states the unit of every column that has one.
 
-Runs are done by processes of this computer, of which a killed one costs its run, not the sweep, or
-on a dask cluster, whose scheduler gives those of a lost worker to another one.
-`concurrent.futures` gives up all runs when one process dies and cannot say which was its own.
-dask's `LocalCluster` gives a lost worker's run to the next one, so a run that kills its process
-would kill several; it also needs the extra `cluster`.
+Runs execute in processes of this computer or on a dask cluster. A killed local process fails only
+its own run; dask reassigns the runs of a lost worker. Local runs do not use `concurrent.futures`,
+which aborts all runs when one process dies. They do not use dask's `LocalCluster`, which would
+restart a run that kills its process and needs the extra `cluster`.
 """
 
 import contextlib
@@ -69,13 +68,13 @@ from hydrotele.scenario.scenario import save_scenario
 
 
 class SweepTable(NamedTuple):
-    """Columns of one length, in order of the runs.
+    """Table of a sweep with one row per run.
 
     Attributes:
-        columns: name -> values; None where there is none.
-        units: name -> unit, of those that have one.
-        varied: the keys that were varied.
-        figures: the numbers of the runs.
+        columns: column name -> values; None for a missing value.
+        units: column name -> unit, for columns with a unit.
+        varied: names of the varied keys.
+        figures: names of the summary numbers.
     """
 
     columns: dict[str, list[Any]]
@@ -87,16 +86,16 @@ class SweepTable(NamedTuple):
 def make_table(
     sweep: Sweep, seed: int, entries: Mapping[int, Entry], effect_units: Mapping[str, str]
 ) -> SweepTable:
-    """The table of all runs.
+    """Create the table of all runs.
 
     Args:
-        sweep: what was asked.
-        seed: of the base scenario.
-        entries: run number -> what is known of it; all of them.
-        effect_units: varied key of an effect -> unit.
+        sweep: the sweep.
+        seed: seed of the base scenario.
+        entries: run number -> journal entry, for all runs.
+        effect_units: varied effect parameter -> unit.
 
     Returns:
-        Columns `run`, the varied keys, `seed`, `status`, `reason`, `notes`, and the numbers.
+        Table with the columns `run`, varied keys, `seed`, `status`, `reason`, `notes`, numbers.
     """
     rows = list(points(sweep))
     varied = tuple(key for key in sweep.varied if key != "seed")
@@ -114,15 +113,15 @@ def make_table(
 
 
 def save_table(table: SweepTable, name: str, path: Path) -> None:
-    """Write the table as Parquet, whole or not at all; the same runs give the same bytes.
+    """Write the table atomically as Parquet; equal runs give identical files.
 
     Args:
         table: the table.
-        name: of the sweep, for the file's metadata.
+        name: name of the sweep, for the metadata of the file.
         path: file to write.
 
     Raises:
-        InputError: it cannot be written.
+        InputError: the file cannot be written.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -143,7 +142,7 @@ def save_table(table: SweepTable, name: str, path: Path) -> None:
 
 
 def _array(pa, values: Sequence[Any]):
-    """A column: truth values, whole numbers, numbers, or text for everything else, as JSON."""
+    """Return a column as booleans, integers, floats, or JSON text for all other values."""
     kinds = {type(value) for value in values if value is not None}
     if kinds == {bool}:
         return pa.array(values, pa.bool_())
@@ -165,7 +164,7 @@ _LAST = (
 
 
 def default_figures(table: SweepTable) -> list[str]:
-    """At most six numbers that differ between runs: tracking first, then forces and balances."""
+    """Return up to six numbers that differ between runs: tracking errors, forces, balances."""
     axes = [n for n in table.figures if n.startswith("tracking.") and n.endswith(".rms")]
     followed = [n for n in _FIRST if n in axes] or axes
     ordered = dict.fromkeys([*followed, *(n for n in _LAST if n in table.figures), *axes])
@@ -173,14 +172,14 @@ def default_figures(table: SweepTable) -> list[str]:
 
 
 def _known(table: SweepTable, name: str) -> dict[int, float]:
-    """Run -> value of a number, where there is one."""
+    """Return run number -> value of a column, without missing values."""
     values = table.columns.get(name, [])
     return {run: float(v) for run, v in zip(table.columns["run"], values, strict=False)
             if v is not None}  # fmt: skip
 
 
 def spread_statistics(table: SweepTable, figures: list[str]) -> dict[str, dict[str, Any]]:
-    """Smallest, median and largest value of numbers, with the runs that have them."""
+    """Return minimum, median and maximum of numbers, with the runs of the extremes."""
     found = {}
     for name in figures:
         known = _known(table, name)
@@ -193,23 +192,23 @@ def spread_statistics(table: SweepTable, figures: list[str]) -> dict[str, dict[s
     return found
 
 
-_WAIT = 30  # s for the scheduler and the first worker
+_WAIT = 30  # s, timeout for the scheduler and the first worker
 _WHERE = "--dask"
 
 
 def cluster_outcomes(tasks: Iterable[RunTask], address: str) -> Generator[Outcome]:
-    """Do runs on a cluster, a few more at a time than it has threads.
+    """Execute runs on a dask cluster; more runs than threads are submitted at a time.
 
     Args:
         tasks: the runs; taken as workers become free.
-        address: of the scheduler, or the file that it wrote.
+        address: address of the scheduler, or the scheduler file.
 
     Yields:
-        The outcomes, in the order in which they are done. A run that several workers were lost with
-        has failed.
+        The outcomes in order of completion. A run fails if several workers were lost with it.
 
     Raises:
-        InputError: dask is not installed, the cluster does not answer or lacks hydrotele.
+        InputError: dask is not installed, the cluster does not respond, or its workers have no
+            compatible hydrotele.
     """
     try:
         from dask import distributed
@@ -217,14 +216,14 @@ def cluster_outcomes(tasks: Iterable[RunTask], address: str) -> Generator[Outcom
         message = "needs dask.distributed: pip install 'hydrotele[cluster]'"
         raise InputError(_WHERE, message) from None
     for name in list(logging.root.manager.loggerDict):
-        if name.split(".")[0] == "distributed":  # what counts is said here
+        if name.split(".")[0] == "distributed":  # errors are reported below
             logging.getLogger(name).setLevel(logging.CRITICAL)
     there = "scheduler_file" if Path(address).is_file() else "address"
     facts: dict[str, Any] = {there: address, "timeout": f"{_WAIT}s", "set_as_default": False}
     try:
         client = distributed.Client(**facts)
     except (OSError, ValueError, TypeError) as error:
-        raise InputError(_WHERE, f"no scheduler answers at {address}: {error}") from None
+        raise InputError(_WHERE, f"no scheduler responds at {address}: {error}") from None
     with client:
         try:
             client.wait_for_workers(1, timeout=_WAIT)
@@ -253,53 +252,53 @@ def _outcomes(client, distributed, waiting: Iterator[RunTask]) -> Iterator[Outco
 
 
 def _outcome(distributed, future, run: int) -> Outcome:
-    """The outcome of a task of the cluster.
+    """Return the outcome of a cluster task.
 
     Raises:
-        InputError: it is the cluster that failed.
+        InputError: the cluster failed, not the run.
     """
     if future.status == "finished":
         return future.result()
     error = None if future.status in ("cancelled", "lost") else future.exception()
     if isinstance(error, distributed.KilledWorker):
-        return failed(run, "the workers that did it were lost one after the other")
+        return failed(run, "all workers that executed it were lost")
     if isinstance(error, ImportError):
         message = f"its workers need the same hydrotele as this computer: {error}"
         raise InputError(_WHERE, message)
     said = f"{type(error).__name__}: {error}" if error else "its scheduler may be gone"
-    kept = "finished runs are kept, the same command goes on"
-    raise InputError(_WHERE, f"the cluster gave up run {run}: {said}; {kept}")
+    kept = "finished runs are kept, the same command continues the sweep"
+    raise InputError(_WHERE, f"the cluster aborted run {run}: {said}; {kept}")
 
 
 KIND = "sweep"
 SCRATCH = ".scratch"
-_FREE = ("name", "description", "figures", "scenario")  # change no run; its content counts
-_MAKERS = ("mujoco", "dm-control", "numpy", "scipy", "numba")  # what the numbers depend on
+_FREE = ("name", "description", "figures", "scenario")  # the digest covers the scenario content
+_MAKERS = ("mujoco", "dm-control", "numpy", "scipy", "numba")  # packages that affect results
 
 
 def versions() -> dict[str, str]:
-    """Versions of what a run's numbers depend on."""
+    """Return the versions of the packages that affect the results of a run."""
     return {"hydrotele": hydrotele.__version__, **{name: version(name) for name in _MAKERS}}
 
 
 def identity(base: Base, checked: Checked) -> dict[str, Any]:
-    """What must be the same for two sweeps to share their runs."""
+    """Return the data that must be equal for a sweep to continue in an existing folder."""
     facts = base.file.sweep.model_dump(mode="json", exclude=set(_FREE))
     return {"sweep": facts, "scenarios": checked.digest, "versions": versions()}
 
 
 @contextlib.contextmanager
 def sweep_folder(target: Path, base: Base, checked: Checked, fresh: bool) -> Iterator[None]:
-    """Begin the folder of a sweep or go on with it, with nobody else in it.
+    """Create the folder of a sweep or continue an existing one, with exclusive access.
 
     Args:
         target: the folder.
         base: the sweep.
-        checked: its points.
-        fresh: whether to throw away what an earlier sweep left there.
+        checked: result of `check_points`.
+        fresh: whether to delete the content of an earlier sweep.
 
     Raises:
-        InputError: the folder holds something else or another sweep, or is in use.
+        InputError: the folder has other content or another sweep, or another process uses it.
     """
     check_target(target, KIND)
     asked = identity(base, checked)
@@ -316,8 +315,8 @@ def sweep_folder(target: Path, base: Base, checked: Checked, fresh: bool) -> Ite
         there = read_json(target / "summary.json").get("identity", {})
         if found := list(_differences(there, asked)):
             more = f", and {len(found) - 4} more" if len(found) > 4 else ""
-            message = "; ".join(found[:4]) + more + "; --fresh starts anew, or choose another --out"
-            raise InputError(target, f"holds another sweep: {message}")
+            message = "; ".join(found[:4]) + more + "; use --fresh, or choose another --out"
+            raise InputError(target, f"contains another sweep: {message}")
         for left in target.glob(".*"):
             shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink()
         (target / SCRATCH).mkdir()
@@ -330,14 +329,14 @@ def sweep_folder(target: Path, base: Base, checked: Checked, fresh: bool) -> Ite
 
 
 def write_summary(folder: Path, base: Base, facts: dict[str, Any]) -> None:
-    """Write `summary.json`, which says what the folder is."""
+    """Write `summary.json` with the kind and the identity of the sweep folder."""
     summary = {"kind": KIND, "name": base.file.name, "runs": base.file.sweep.runs, **facts}
     with replacing(folder / "summary.json", ".json") as part:
         part.write_text(json.dumps(summary, indent=2) + "\n")
 
 
 def _resolved(base: Base) -> str:
-    """The sweep with every default, readable by `load_sweep` from any folder."""
+    """Return the sweep with all defaults as YAML text that `load_sweep` reads from any folder."""
     scenario = base.file.scenario()
     named = scenario == base.file.sweep.scenario and not Path(scenario).suffix
     facts = base.file.sweep.model_dump(mode="json", exclude_none=True)
@@ -348,13 +347,13 @@ def _resolved(base: Base) -> str:
 
 @contextlib.contextmanager
 def _alone(target: Path) -> Iterator[None]:
-    """Hold the folder; the lock goes with the process, however that ends."""
+    """Lock the folder; the operating system releases the lock when the process ends."""
     handle = os.open(target, os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
         os.close(handle)
-        raise InputError(target, "another hydrotele sweep works in it; wait for it") from None
+        raise InputError(target, "is in use by another hydrotele sweep; wait for it") from None
     try:
         yield
     finally:
@@ -362,7 +361,7 @@ def _alone(target: Path) -> Iterator[None]:
 
 
 def _differences(old: dict[str, Any], new: dict[str, Any]) -> Iterator[str]:
-    """Sentences on what differs between two identities; the digest only where nothing else does."""
+    """Yield the differences between two identities; the digest only without other differences."""
     before, after = (_flat({k: i.get(k) for k in ("sweep", "versions")}) for i in (old, new))
     found = False
     for key in dict.fromkeys([*before, *after]):
@@ -371,7 +370,7 @@ def _differences(old: dict[str, Any], new: dict[str, Any]) -> Iterator[str]:
             was, now = (json.dumps(d[key]) if key in d else "nothing" for d in (before, after))
             yield f"{key.partition('.')[2]} was {was}, is {now}"
     if not found and old.get("scenarios") != new.get("scenarios"):
-        yield "the base scenario, a file that it names, or the order of the keys has changed"
+        yield "the base scenario, one of its files, or the order of the keys has changed"
 
 
 def _flat(data: dict[str, Any], above: str = "") -> dict[str, Any]:
@@ -389,44 +388,44 @@ _READY = "ready"
 
 
 class _Worker:
-    """A process and the run that it does."""
+    """A worker process and its current run."""
 
     def __init__(self, context) -> None:
-        """Start the process; it says _READY when it can work."""
+        """Start the process; it sends `_READY` when it can accept runs."""
         self.connection, theirs = context.Pipe()
         self.process = context.Process(target=_work, args=(theirs,), daemon=True)
         with _starting():
             self.process.start()
-        theirs.close()  # so that its end shows here
+        theirs.close()  # otherwise the death of the process is not detected
         self.ready, self.task = False, None
 
     def give(self, task: RunTask) -> None:
-        """Let it do a run; a dead one is found out by the next wait."""
+        """Send a run to the process; the next wait detects a dead process."""
         self.task = task
         with contextlib.suppress(OSError):
             self.connection.send(task)
 
     def stop(self) -> None:
-        """End the process at once."""
+        """Kill the process."""
         self.process.kill()
         self.process.join()
         self.connection.close()
 
 
 def outcomes(tasks: Iterable[RunTask], jobs: int) -> Generator[Outcome]:
-    """Do runs in processes of their own, with one thread each.
+    """Execute runs in worker processes with one thread each.
 
     Args:
         tasks: the runs; taken as workers become free.
         jobs: number of processes.
 
     Yields:
-        The outcomes, in the order in which they are done. A run whose process dies has failed.
+        The outcomes in order of completion. A run fails if its process dies.
 
     Raises:
         InputError: the processes do not start.
     """
-    context = multiprocessing.get_context("spawn")  # forked compiled code and threads do not mix
+    context = multiprocessing.get_context("spawn")  # fork is unsafe with compiled code and threads
     waiting = iter(tasks)
     workers: list[_Worker] = []
     try:
@@ -455,28 +454,28 @@ def outcomes(tasks: Iterable[RunTask], jobs: int) -> Generator[Outcome]:
 
 
 def _heard(worker: _Worker) -> Any:
-    """What a worker says, None where it is dead."""
+    """Return the next message of a worker, None if its process is dead."""
     try:
         return worker.connection.recv()
-    except Exception:  # it may have died in the middle of a word
+    except Exception:  # the process may have died while it sent a message
         return None
 
 
 def _dead(worker: _Worker) -> Outcome:
-    """The outcome of the run whose process died."""
+    """Return the outcome of a run whose process died."""
     worker.stop()
     code = worker.process.exitcode or 0
     how = signal.Signals(-code).name if code < 0 else f"exit status {code}"
     if not worker.ready:
-        raise InputError("--jobs", f"a process for the runs did not start ({how})")
+        raise InputError("--jobs", f"a worker process did not start ({how})")
     assert worker.task
     memory = "; is there enough memory?" if code == -signal.SIGKILL else ""
-    return failed(worker.task.run, f"its process was ended by {how}{memory}")
+    return failed(worker.task.run, f"its process was killed ({how}){memory}")
 
 
 @contextlib.contextmanager
 def _starting() -> Iterator[None]:
-    """What a process inherits: one thread, and no ear for Ctrl-C, which this process answers."""
+    """Let child processes use one thread and ignore Ctrl-C, which this process handles."""
     old = {name: os.environ.get(name) for name in _THREADS}
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     os.environ.update(dict.fromkeys(_THREADS, "1"))
@@ -492,7 +491,7 @@ def _starting() -> Iterator[None]:
 
 
 def _work(connection: Connection) -> None:
-    """Do runs until the parent is gone."""
+    """Execute runs until the parent process ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     tasks: queue.SimpleQueue[RunTask] = queue.SimpleQueue()
     threading.Thread(target=_listen, args=(connection, tasks), daemon=True).start()
@@ -502,7 +501,7 @@ def _work(connection: Connection) -> None:
 
 
 def _listen(connection: Connection, tasks: queue.SimpleQueue) -> None:
-    """Take tasks; end this process, whatever it computes, when the parent is gone."""
+    """Receive tasks; exit this process immediately when the parent process ends."""
     try:
         while True:
             tasks.put(connection.recv())
@@ -514,14 +513,14 @@ Progress = Callable[[str, int, int, int], None]
 
 
 class SweepSettings(NamedTuple):
-    """How the runs of a sweep are done; nothing here changes a result.
+    """Execution settings of a sweep; they do not affect the results.
 
     Attributes:
-        jobs: processes of this computer, None for one per core.
-        dask: scheduler of a cluster instead of them: address or scheduler file.
-        fresh: throw away what an earlier sweep left in the folder.
-        retry_failed: do failed runs again.
-        keep: writes a run into a folder, where the sweep asks for logs.
+        jobs: number of local processes, None for one per core.
+        dask: address or file of a dask scheduler; if given, replaces the local processes.
+        fresh: delete the content of an earlier sweep in the folder.
+        retry_failed: repeat failed runs.
+        keep: function that writes a run into a folder, for sweeps with `logs: true`.
     """
 
     jobs: int | None = None
@@ -532,12 +531,12 @@ class SweepSettings(NamedTuple):
 
 
 class SweepResult(NamedTuple):
-    """A finished sweep.
+    """Result of a sweep.
 
     Attributes:
-        table: a row per run.
-        failed: entries of the runs that failed.
-        done: number of runs that were done now, not before.
+        table: table with one row per run.
+        failed: journal entries of the failed runs.
+        done: number of runs executed by this call.
     """
 
     table: SweepTable
@@ -551,20 +550,20 @@ def run_sweep(
     how: SweepSettings | None = None,
     progress: Progress | None = None,
 ) -> SweepResult:
-    """Do the runs of a sweep that are not done yet; write its table.
+    """Execute the missing runs of a sweep and write its table.
 
     Args:
-        file: the sweep, of `load_sweep`.
-        target: its folder; what an interrupted sweep left there is gone on with.
-        how: where and how the runs are done.
-        progress: called with what is done ("check" or "run"), how many are, of how many, and how
-            many failed.
+        file: result of `load_sweep`.
+        target: folder of the sweep; an interrupted sweep in it is continued.
+        how: execution settings.
+        progress: called with the stage ("check" or "run"), the number finished, the total number,
+            and the number of failed runs.
 
     Returns:
-        The table, also in `table.parquet`.
+        The result; its table is also in `table.parquet`.
 
     Raises:
-        InputError: a point is wrong, the folder is not this sweep's, or the cluster does not work.
+        InputError: a point is invalid, the folder contains another sweep, or the cluster failed.
         KeyboardInterrupt: on Ctrl-C; finished runs are kept.
     """
     how, base = how or SweepSettings(), open_base(file)
@@ -590,7 +589,7 @@ def run_sweep(
 
 
 def _missing(base: Base, journal: Journal, retry_failed: bool) -> dict[int, Point]:
-    """The runs to do, by number."""
+    """Return the runs to execute, by number."""
     if retry_failed:
         done = {run for run, entry in journal.entries.items() if entry.status == OK}
     else:
@@ -602,7 +601,7 @@ def _do(
     base: Base, target: Path, journal: Journal, missing: dict[int, Point], how: SweepSettings,
     checked: Checked, progress: Progress | None,
 ) -> None:  # fmt: skip
-    """Do the missing runs and write each into the journal."""
+    """Execute the missing runs and write each to the journal."""
     total, done = base.file.sweep.runs, base.file.sweep.runs - len(missing)
     failed = sum(e.status == FAILED for r, e in journal.entries.items() if r not in missing)
     tasks = (_task(base, target, how, checked, point) for point in missing.values())
@@ -624,7 +623,7 @@ def _do(
 def _task(base: Base, target: Path, how: SweepSettings, checked: Checked, point: Point) -> RunTask:
     scenario = scenario_of(base, point)
     if fingerprint(scenario) != checked.fingerprints[point.run - 1]:
-        message = "a file that it names changed while the sweep ran; the finished runs are kept"
+        message = "one of its files changed during the sweep; the finished runs are kept"
         raise InputError(base.scenario.path, message)
     keep = how.keep if base.file.sweep.logs else None
     if how.dask:
@@ -634,7 +633,7 @@ def _task(base: Base, target: Path, how: SweepSettings, checked: Checked, point:
 
 
 def _check_versions(outcome: Outcome) -> None:
-    """Refuse a result of other software: numbers of one table come from one."""
+    """Check that a worker has the same software versions, so that results are comparable."""
     ours = versions()
     for name, theirs in outcome.versions.items():
         if ours.get(name, theirs) != theirs:
@@ -642,17 +641,17 @@ def _check_versions(outcome: Outcome) -> None:
 
 
 def _keep(base: Base, target: Path, point: Point, outcome: Outcome) -> None:
-    """Write the folder of a run, whole or not at all."""
+    """Write the folder of a run atomically."""
     name = f"{point.run:0{max(4, len(str(base.file.sweep.runs)))}d}"
     with whole_folder(target / "runs" / name, "run") as folder:
         for file, content in outcome.files.items():
             (folder / file).write_bytes(content)
-        # A worker's own names its machine where only it has it.
+        # the scenario written by a worker contains machine paths of that computer
         save_scenario(placed(scenario_of(base, point), target.resolve()), folder / "scenario.yaml")
 
 
 def _save_timings(entries: dict[int, Entry], path: Path) -> None:
-    """Write what differs between runs of equal content, beside the table."""
+    """Write the computing times, which differ between equal runs, to a separate CSV file."""
     with replacing(path, ".csv") as part, open(part, "w", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(["run", "wall [s]"])

@@ -1,10 +1,9 @@
-"""A sweep file: which keys of a scenario are varied, and how; frozen, validated.
+"""Sweep files: which scenario keys are varied, and by which values.
 
-Keys are those of `hydrotele run --set key=value`, as in `servo.position_gain` or
-`effects.0.parameters.mass`. The points of a sweep, what every run varies, have an order that never
-changes. Each becomes a scenario, checked before the first run as far as that is cheap, that is
-without a compiled model: keys, values, machine, tool, effects and sensors. A start that cannot be
-reached or a plan that asks for too much shows as a failed run.
+Keys are those of `hydrotele run --set key=value`, for example `servo.position_gain` or
+`effects.0.parameters.mass`. The points of a sweep are the values of each run, in a fixed order.
+All scenarios are checked before the first run: keys, values, machine, tool, effects and sensors.
+This needs no compiled model; an unreachable start pose or an infeasible plan gives a failed run.
 """
 
 import hashlib
@@ -41,28 +40,28 @@ _WAYS = ("uniform", "log_uniform", "normal", "choice")
 
 
 def _checked_value(value: Any) -> Any:
-    """A value that can stand in a scenario.
+    """Return a value after checking that it can be written to a scenario.
 
     Raises:
-        ValueError: it is a date or the like, or not finite.
+        ValueError: the value is not finite or has no JSON form, such as a date.
     """
     try:
         json.dumps(value, allow_nan=False)
     except (ValueError, TypeError):
-        raise ValueError(f"{value!r} is no finite number, text, list or mapping") from None
+        raise ValueError(f"{value!r} is not a finite number, text, list or mapping") from None
     return value
 
 
 def _checked_values(values: list[Any]) -> list[Any]:
-    """Values of a grid.
+    """Return the values of a grid after checking them.
 
     Raises:
-        ValueError: one cannot stand in a scenario, or stands there twice.
+        ValueError: a value cannot be written to a scenario, or occurs twice.
     """
     texts = [json.dumps(_checked_value(value)) for value in values]
     for text in texts:
         if texts.count(text) > 1:
-            raise ValueError(f"{text} stands twice; for more runs of it use repeat")
+            raise ValueError(f"{text} occurs twice; use repeat for several runs of one value")
     return values
 
 
@@ -71,7 +70,7 @@ Values = Annotated[list[Any], Field(min_length=1), AfterValidator(_checked_value
 
 
 class Distribution(Facts):
-    """Where the values of a sampled key come from; exactly one of these.
+    """Distribution of a sampled key; exactly one of the four forms is given.
 
     uniform [low, high], log_uniform [low, high] with low > 0, normal [mean, standard deviation], in
     the key's unit, or choice [values], all equally likely.
@@ -98,7 +97,7 @@ class Distribution(Facts):
 
 
 class Sample(Facts):
-    """Random values: `count` samples of all `keys` together, from a random seed of their own."""
+    """Random values: `count` joint samples of all `keys`, from the random seed `seed`."""
 
     count: Annotated[int, Field(ge=1, le=MOST_RUNS)]
     seed: Annotated[int, Field(ge=0)] = 0
@@ -106,11 +105,11 @@ class Sample(Facts):
 
 
 class Sweep(Facts):
-    """Many runs of one scenario.
+    """A set of runs of one scenario with varied parameters.
 
-    `set` holds for every run. `grid` takes every combination of its values, each of them with every
-    one of the samples, and each of those `repeat` times with the scenario's seed counted up.
-    `figures` names the numbers of a run's summary that are drawn; `logs` keeps every run's folder.
+    `set` applies to every run. `grid` gives all combinations of its values. Each combination is run
+    with every sample, and each of these runs is repeated `repeat` times with increasing seed.
+    `figures` lists the numbers of the run summary to plot; `logs: true` keeps every run folder.
     """
 
     name: Name | None = None
@@ -127,19 +126,20 @@ class Sweep(Facts):
     def _check(self):
         sampled = self.sample.keys if self.sample else {}
         if not self.grid and not sampled and self.repeat == 1:
-            raise ValueError("nothing is varied; give a grid, a sample or repeat")
+            raise ValueError("no key is varied; give a grid, a sample or repeat")
         varied = [*self.grid, *sampled]
         for key in varied:
             others = [*self.set, *varied]
             if others.count(key) > 1:
-                raise ValueError(f"{key} is given twice, in set, grid or sample")
+                raise ValueError(f"{key} is given more than once in set, grid and sample")
             if below := [k for k in others if k.startswith(f"{key}.")]:
-                raise ValueError(f"{below[0]} lies inside {key}, which is varied as a whole")
+                raise ValueError(f"{below[0]} is part of {key}, which is varied as a whole")
         if self.repeat > 1 and "seed" in varied:
-            raise ValueError("repeat counts the seed up, so that seed cannot be varied, too")
+            raise ValueError("seed cannot be varied together with repeat, which increases the seed")
         if self.runs > MOST_RUNS:
             raise ValueError(
-                f"these are {self.runs} runs, more than {MOST_RUNS}; give fewer values, or a sample"
+                f"the sweep has {self.runs} runs, more than {MOST_RUNS}; give fewer values or use"
+                " a sample"
             )
         return self
 
@@ -151,17 +151,17 @@ class Sweep(Facts):
 
     @property
     def varied(self) -> tuple[str, ...]:
-        """The keys that differ between runs, but for the seed of repeated ones."""
+        """Keys that differ between runs, without the seed of repetitions."""
         return (*self.grid, *(self.sample.keys if self.sample else ()))
 
 
 class SweepFile(NamedTuple):
-    """A sweep and where it was read.
+    """A sweep and its file.
 
     Attributes:
-        path: its file.
-        sweep: what it says.
-        lines: key path -> line number from 1.
+        path: path of the file.
+        sweep: content of the file.
+        lines: key path -> line number, starting at 1.
     """
 
     path: Path
@@ -170,17 +170,17 @@ class SweepFile(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name of the sweep, that of the file where it says none."""
+        """Name of the sweep; by default the file name without its ending."""
         return self.sweep.name or self.path.stem
 
     def place(self, *keys: str | int) -> str:
-        """File, line and key path, for messages."""
+        """Return file, line and key path as text for messages."""
         found = (self.lines[keys[:k]] for k in range(len(keys), 0, -1) if keys[:k] in self.lines)
         line = next(found, None)
         return f"{self.path}{f':{line}' if line else ''}: {'.'.join(map(str, keys))}"
 
     def places(self, key: str) -> Iterator[str]:
-        """Where a scenario's key is given in this file."""
+        """Yield the places in this file that set a scenario key."""
         sample = self.sweep.sample
         if key in self.sweep.grid:
             yield self.place("grid", key)
@@ -190,10 +190,10 @@ class SweepFile(NamedTuple):
             yield self.place("set", key)
 
     def scenario(self) -> str:
-        """Shipped name or path of the base scenario.
+        """Return the name of the shipped base scenario, or the path of its file.
 
         Raises:
-            InputError: there is no such scenario, neither shipped nor beside the sweep's file.
+            InputError: the scenario is neither shipped nor in the folder of the sweep file.
         """
         asked = self.sweep.scenario
         if asked in shipped_scenarios():
@@ -201,23 +201,23 @@ class SweepFile(NamedTuple):
         beside = self.path.parent / asked
         if beside.is_file():
             return str(beside)
-        message = f"{asked!r} is neither a shipped scenario nor a file beside this one; "
+        message = f"{asked!r} is neither a shipped scenario nor a file in the same folder; "
         raise InputError(self.place("scenario"), message + suggest(asked, shipped_scenarios()))
 
 
 def shipped_sweeps() -> list[str]:
-    """Names of the sweeps that come with the package."""
+    """Return the names of the sweeps in the package."""
     return sorted(path.stem for path in (scenarios_folder() / "sweeps").glob("*.yaml"))
 
 
 def load_sweep(name_or_path: str | Path) -> SweepFile:
-    """Read a sweep file, a shipped one by its name.
+    """Read a sweep file or a shipped sweep by name.
 
     Returns:
-        The validated sweep; its points are checked by `check_points`.
+        The validated sweep; `check_points` checks its points.
 
     Raises:
-        InputError: names file, line, key path and what is allowed.
+        InputError: the file is missing or invalid; the message names line, key and valid values.
     """
     path = Path(name_or_path)
     if str(name_or_path) in shipped_sweeps():
@@ -227,18 +227,18 @@ def load_sweep(name_or_path: str | Path) -> SweepFile:
         raise InputError(f"sweep {str(name_or_path)!r}", message)
     data, lines = read_yaml(path)
     if "pilot" in data:
-        message = f"is a scenario; a sweep names it, as in `scenario: {path.name}`"
+        message = f"is a scenario; a sweep file refers to it by `scenario: {path.name}`"
         raise InputError(path, message)
     return SweepFile(path, parse(Sweep, data, str(path), lines), lines)
 
 
 class Point(NamedTuple):
-    """What one run has of its own.
+    """Varied values of one run.
 
     Attributes:
-        run: its number, from 1.
+        run: run number, starting at 1.
         values: varied key -> value.
-        copy: number of its repetition, from 0; the scenario's seed is counted up by it.
+        copy: repetition number, starting at 0; it is added to the seed of the scenario.
     """
 
     run: int
@@ -247,7 +247,7 @@ class Point(NamedTuple):
 
 
 def points(sweep: Sweep) -> Iterator[Point]:
-    """Every point of a sweep: the grid, its last key fastest; within it the samples; repeats last.
+    """Yield all points of a sweep: grid (last key fastest), then samples, then repetitions.
 
     >>> from hydrotele.run.sweep_facts import Sweep
     >>> [p.values["servo.lead"] for p in points(Sweep(scenario="a", grid={"servo.lead": [0, 0.1]}))]
@@ -264,10 +264,10 @@ def points(sweep: Sweep) -> Iterator[Point]:
 
 
 def samples(sweep: Sweep) -> list[dict[str, Any]]:
-    """The samples: varied key -> value; a single empty one where nothing is sampled.
+    """Return the samples as varied key -> value; one empty sample if no key is sampled.
 
-    Each number depends on the sample's seed, its place and its key alone, so that more samples or
-    another key leave the others as they are.
+    Each number depends only on the seed, the sample number and the key. Adding samples or keys
+    therefore leaves the other numbers unchanged.
     """
     sample = sweep.sample
     if sample is None:
@@ -292,12 +292,12 @@ def _draw(seed: int, k: int, key: str, where: Distribution) -> Any:
 
 
 def override_text(value: Any) -> str:
-    """A value as YAML text, as `--set` takes it."""
+    """Return a value as YAML text for `--set`."""
     return json.dumps(value, ensure_ascii=False)
 
 
 def overrides(sweep: Sweep, values: dict[str, Any]) -> dict[str, str]:
-    """Overrides of the base scenario: those of all runs, then those of one point."""
+    """Return the overrides of the base scenario: those of all runs, then those of one point."""
     return {key: override_text(value) for key, value in (sweep.set | values).items()}
 
 
@@ -306,12 +306,12 @@ _Machines = dict[tuple[str, str | None], Machine]
 
 
 class Base(NamedTuple):
-    """A sweep with what all its runs share.
+    """A sweep with its base scenario and user machines.
 
     Attributes:
         file: the sweep.
         scenario: file of the base scenario.
-        inputs: the machines that are the user's own.
+        inputs: user machines.
     """
 
     file: SweepFile
@@ -320,14 +320,14 @@ class Base(NamedTuple):
 
 
 class Checked(NamedTuple):
-    """What the check of all points found.
+    """Result of the check of all points.
 
     Attributes:
-        fingerprints: of the scenario of every run, in order.
-        seed: of the first run.
-        units: varied key of an effect -> its unit.
-        axes: of all machines.
-        teleoperated: whether any pilot is.
+        fingerprints: hash of the scenario of every run, in order.
+        seed: seed of the first run.
+        units: varied effect parameter -> unit.
+        axes: axes of all machines.
+        teleoperated: whether any scenario is teleoperated.
     """
 
     fingerprints: tuple[bytes, ...]
@@ -338,7 +338,7 @@ class Checked(NamedTuple):
 
     @property
     def digest(self) -> str:
-        """SHA-256 of all scenarios in their order."""
+        """SHA-256 hash of all scenarios in order."""
         return hashlib.sha256(b"".join(self.fingerprints)).hexdigest()
 
 
@@ -346,35 +346,35 @@ def open_base(file: SweepFile) -> Base:
     """Read the base scenario of a sweep.
 
     Raises:
-        InputError: there is none, or it is no YAML mapping.
+        InputError: the file is missing or is not a YAML mapping.
     """
     return Base(file, read_scenario_file(file.scenario()), Inputs())
 
 
 def scenario_of(base: Base, point: Point) -> Scenario:
-    """The scenario of a point; its own machines are named by their place in the sweep's folder.
+    """Return the scenario of a point, with the paths of user machines in the sweep folder.
 
     Raises:
-        InputError: the point is none that `hydrotele run` would take.
+        InputError: the scenario is invalid.
     """
     scenario = scenario_from(base.scenario, overrides(base.file.sweep, point.values))
     return base.inputs.named(scenario.model_copy(update={"seed": scenario.seed + point.copy}))
 
 
 def fingerprint(scenario: Scenario) -> bytes:
-    """16 bytes that tell a scenario from any other, wherever its files lie."""
+    """Return a 16-byte hash of a scenario, independent of the folder of its files."""
     return hashlib.sha256(scenario.model_dump_json().encode()).digest()[:16]
 
 
 def check_points(base: Base, progress: Progress | None = None) -> Checked:
-    """Check every point.
+    """Check the scenarios of all points of a sweep.
 
     Args:
-        base: of `open_base`.
-        progress: called now and then with (points checked, all points).
+        base: result of `open_base`.
+        progress: called periodically with (points checked, number of points).
 
     Raises:
-        InputError: the first point that is wrong, with file, line, key and what is allowed.
+        InputError: a point is invalid; the message names file, line, key and valid values.
     """
     sweep = base.file.sweep
     prints: list[bytes] = []
@@ -400,7 +400,7 @@ def check_points(base: Base, progress: Progress | None = None) -> Checked:
 
 
 def _checked(base: Base, values: dict[str, Any], machines: _Machines) -> Scenario:
-    """The scenario of some values, its machine, effects and sensors tried."""
+    """Return the scenario for some values after checking its machine, effects and sensors."""
     scenario = scenario_from(base.scenario, overrides(base.file.sweep, values))
     machine = _machine_of(scenario, machines)
     sensor_set(machine, scenario.sensors)
@@ -417,7 +417,7 @@ def _machine_of(scenario: Scenario, machines: _Machines) -> Machine:
 
 
 def _blamed(base: Base, point: Point, machines: _Machines, error: InputError) -> InputError:
-    """The error of a point, at the place in the sweep's file that is to blame."""
+    """Return the error of a point with the place in the sweep file that causes it."""
     file = base.file
     for values in ({}, *({key: value} for key, value in point.values.items())):
         try:
@@ -441,7 +441,7 @@ def _place(file: SweepFile, key: str, value: Any) -> str:
 
 
 def _said(error: InputError) -> str:
-    """What is wrong, without the overrides that the sweep itself gave."""
+    """Return the error message without the override options that the sweep generated."""
     ours = error.where.startswith("--set ") or " with --set " in error.where
     return error.message if ours else str(error)
 
@@ -449,7 +449,7 @@ def _said(error: InputError) -> str:
 def _effect_units(
     scenario: Scenario, varied: tuple[str, ...], machines: _Machines
 ) -> dict[str, str]:
-    """Units of the varied parameters of effects."""
+    """Return the units of the varied effect parameters."""
     units = {}
     for key in varied:
         parts = key.split(".")

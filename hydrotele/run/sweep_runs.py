@@ -1,9 +1,10 @@
-"""One run of a sweep in whichever process or computer it is done, and the journal of finished runs.
+"""Execute one run of a sweep in any process or computer, and keep the journal of finished runs.
 
-The files of a sweep's own machines are copied into its folder, so that they can change or travel; a
-scenario names them by their place there, as in `inputs/mine-0a1b2c3d/machine.yaml`. The journal has
-a line for every finished run, on disk before the next one counts: a process that is killed leaves
-at most half a line at the end, which the next start drops; that run is done again.
+User machine files are copied into the folder of the sweep, so that a later change of the originals
+has no effect and other computers can receive them. A scenario refers to the copies, for example
+`inputs/mine-0a1b2c3d/machine.yaml`. The journal has one line per finished run, written to disk
+before the next run is counted. A killed process leaves at most one incomplete last line; the next
+start removes it and repeats that run.
 """
 
 import hashlib
@@ -55,7 +56,7 @@ _TIP = ("tip_r", "tip_z", "tip_attitude")
 
 
 def numbers_of(summary: dict[str, Any]) -> Numbers:
-    """Dotted name -> (number, unit) of a run's summary, but for timings and versions.
+    """Flatten the summary of a run to dotted name -> (number, unit), without timings and versions.
 
     >>> numbers_of({"scenario": "a", "tracking": {"boom": {"rms": 0.1, "unit": "rad"}}})
     {'tracking.boom.rms': (0.1, 'rad')}
@@ -68,7 +69,7 @@ def _flat(part: dict[str, Any], above: str, unit: str | None):
     unit = part.get("unit", unit)
     for key, value in part.items():
         name = f"{above}{key}"
-        value = value.item() if isinstance(value, np.generic) else value  # as the journal has it
+        value = value.item() if isinstance(value, np.generic) else value  # JSON needs plain types
         if isinstance(value, dict):
             yield from _flat(value, f"{name}.", unit)
         elif value is None or isinstance(value, (bool, int, float)):
@@ -77,27 +78,28 @@ def _flat(part: dict[str, Any], above: str, unit: str | None):
 
 
 def key_unit(key: str) -> str | None:
-    """Unit of a scenario's key as far as its name tells."""
+    """Return the unit of a scenario key, derived from its name; None if unknown."""
     found = (unit for suffix, unit in KEY_SUFFIXES.items() if key.endswith(suffix))
     return next(found, None) or _SCENARIO.get(key)
 
 
 def possible_results(axes: Iterable[str], teleoperated: bool) -> list[str]:
-    """Names of all numbers that runs of machines with these axes can have."""
+    """Return the names of all summary numbers that runs with these axes can contain."""
     tracked = [f"tracking.{name}.{size}" for name in (*axes, *_TIP) for size in ("rms", "max")]
     station = [f"teleoperation.{name}" for name in _STATION] if teleoperated else []
     return [*_EVERY, *tracked, *station]
 
 
 def check_figures(figures: Iterable[str], possible: list[str], where: str) -> None:
-    """Refuse figures that no run can have.
+    """Check that every figure is the name of a summary number.
 
     Raises:
-        InputError: the first one, with the valid names.
+        InputError: a name is unknown; the message lists valid names.
     """
     for name in figures:
         if name not in possible:
-            raise InputError(where, f"{name!r} is no number of a run; {suggest(name, possible)}")
+            message = f"{name!r} is not a number in the summary of a run"
+            raise InputError(where, f"{message}; {suggest(name, possible)}")
 
 
 OK, FAILED = "ok", "failed"
@@ -105,15 +107,15 @@ JOURNAL = "journal.jsonl"
 
 
 class Entry(NamedTuple):
-    """What is kept of a run.
+    """Journal entry of a finished run.
 
     Attributes:
-        run: its number.
+        run: run number.
         status: OK or FAILED.
-        reason: why it failed, else empty.
-        numbers: of its summary.
-        notes: of its summary, joined.
-        wall_seconds: that its loop took [s], None where it failed.
+        reason: reason of a failure, otherwise empty.
+        numbers: numbers of the run's summary.
+        notes: notes of the run's summary, joined.
+        wall_seconds: computing time of the tick loop [s], None if the run failed.
     """
 
     run: int
@@ -125,19 +127,19 @@ class Entry(NamedTuple):
 
 
 def finished(path: Path) -> int:
-    """Number of runs that a journal holds."""
+    """Return the number of finished runs in a journal file."""
     lines = path.read_bytes().split(b"\n")[:-1] if path.is_file() else []
     return len({line.partition(b",")[0] for line in lines})
 
 
 class Journal:
-    """The open journal of a sweep; one process has it at a time."""
+    """The open journal of a sweep; only one process may open it at a time."""
 
     def __init__(self, path: Path) -> None:
-        """Read what is there, drop what is broken and open the file to append.
+        """Read the entries, remove incomplete lines and open the file for appending.
 
         Raises:
-            InputError: it cannot be read or written.
+            InputError: the file cannot be read or written.
         """
         self.path, self.entries = path, {}
         try:
@@ -161,10 +163,10 @@ class Journal:
         return True
 
     def add(self, entry: Entry) -> None:
-        """Write the entry of a run; it is on disk when this returns.
+        """Append the entry of a run and flush it to disk.
 
         Raises:
-            InputError: the disk is full or the folder gone.
+            InputError: the entry cannot be written, for example because the disk is full.
         """
         text = json.dumps(entry._asdict(), allow_nan=False, ensure_ascii=False)
         try:
@@ -176,7 +178,7 @@ class Journal:
         self.entries[entry.run] = entry
 
     def close(self) -> None:
-        """Close the file; all entries are on disk."""
+        """Close the file; `add` has already written all entries to disk."""
         self._file.close()
 
 
@@ -185,11 +187,12 @@ Files = dict[str, bytes]
 
 
 class Copied(NamedTuple):
-    """A machine of the user's.
+    """A user machine, copied into the folder of a sweep.
 
     Attributes:
-        name: of its machine file in the sweep's folder; its own path where it cannot be copied.
-        files: path in the sweep's folder -> content; empty where it cannot be copied.
+        name: path of the machine file in the sweep folder; the original path if the machine cannot
+            be copied.
+        files: path in the sweep folder -> content; empty if the machine cannot be copied.
     """
 
     name: str
@@ -197,17 +200,17 @@ class Copied(NamedTuple):
 
 
 class Inputs:
-    """The machines of a sweep that are not shipped, each read once."""
+    """The user machines of a sweep, each read once."""
 
     def __init__(self) -> None:
-        """Begin with none."""
+        """Start without machines."""
         self._known: dict[Path, Copied] = {}
 
     def named(self, scenario: Scenario) -> Scenario:
-        """The scenario with its own machines named by their place in the sweep's folder.
+        """Return the scenario with user machines replaced by their paths in the sweep folder.
 
         Raises:
-            InputError: a machine's file cannot be read.
+            InputError: a machine file cannot be read.
         """
         changes: dict = {"folder": ""}
         if own := own_machine(scenario):
@@ -219,26 +222,28 @@ class Inputs:
         return scenario.model_copy(update=changes)
 
     def files(self) -> Files:
-        """Path in the sweep's folder -> content, of all machines so far."""
+        """Return path in the sweep folder -> content, for all machines so far."""
         return {
             name: text for copied in self._known.values() for name, text in copied.files.items()
         }
 
     def files_of(self, scenario: Scenario) -> Files:
-        """Those of the machines that one scenario of `named` names."""
+        """Return path -> content of the machines of one scenario, a result of `named`."""
         names = {scenario.machine, scenario.servo.force_model}
         copied = [machine for machine in self._known.values() if machine.name in names]
         return {name: text for machine in copied for name, text in machine.files.items()}
 
     def refuse_bound(self, where: str) -> None:
-        """Refuse machines that other computers cannot be given.
+        """Check that all machines can be sent to other computers.
 
         Raises:
-            InputError: a machine needs further files.
+            InputError: a machine needs files in addition to its MJCF file.
         """
         for path, copied in self._known.items():
             if not copied.files:
-                message = "needs files beside its MJCF, which cannot be sent; run it without --dask"
+                message = (
+                    "needs files in addition to its MJCF, which cannot be sent; run without --dask"
+                )
                 raise InputError(where, f"machine {path} {message}")
 
     def _copied(self, path: Path) -> Copied:
@@ -266,7 +271,7 @@ def _copy(file: Path) -> Copied:
 
 
 def placed(scenario: Scenario, folder: Path) -> Scenario:
-    """A scenario of `Inputs.named` where its machines lie under a folder."""
+    """Resolve the machine paths of a scenario of `Inputs.named` relative to a folder."""
     changes: dict = {"folder": str(folder)}
     model = scenario.servo.force_model
     if model and model.startswith(f"{INPUTS}/"):
@@ -284,19 +289,20 @@ def unpack(files: Files, folder: Path) -> None:
 
 
 Keep = Callable[[Run, Path, bool], Any]
-_ONE = threading.Lock()  # a worker of a cluster may have threads; runs share MuJoCo's callbacks
+_ONE = threading.Lock()  # cluster workers may use threads, but MuJoCo callbacks are global
 
 
 class RunTask(NamedTuple):
-    """A run to do.
+    """A run to execute.
 
     Attributes:
-        run: its number.
-        scenario: of `Inputs.named`.
-        folder: where the scenario's own machines lie, None where `files` brings them.
-        files: path -> content of these machines.
-        keep: writes a run into a folder, as `cli.running.write_run`; None to keep no logs.
-        scratch: folder for that on the way; None for the system's.
+        run: run number.
+        scenario: scenario with machine paths of `Inputs.named`.
+        folder: folder that contains the user machines, None if `files` contains them.
+        files: path -> content of the user machines.
+        keep: function that writes a run into a folder, as `cli.running.write_run`; None to keep no
+            logs.
+        scratch: folder for temporary files; None for that of the system.
     """
 
     run: int
@@ -308,12 +314,12 @@ class RunTask(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What comes back of a run.
+    """Result of a run task.
 
     Attributes:
-        entry: for the journal.
-        versions: of what simulated; empty where it failed.
-        files: name -> content of the run's folder, if it is to be kept.
+        entry: journal entry.
+        versions: versions of the simulating software; empty if the run failed.
+        files: file name -> content of the run folder; empty if no logs are kept.
     """
 
     entry: Entry
@@ -322,7 +328,7 @@ class Outcome(NamedTuple):
 
 
 def perform(task: RunTask) -> Outcome:
-    """Do a run. Never raises: a run that fails says why."""
+    """Execute a run; a failure gives an outcome with its reason instead of an exception."""
     try:
         with _ONE, tempfile.TemporaryDirectory(prefix="sweep_", dir=task.scratch) as scratch:
             return _perform(task, Path(scratch))
@@ -330,12 +336,12 @@ def perform(task: RunTask) -> Outcome:
         return failed(task.run, f"simulation failed: {error}")
     except InputError as error:
         return failed(task.run, str(error))
-    except Exception as error:  # one run's trouble is not the other runs'
+    except Exception as error:  # a failed run must not stop the other runs
         return failed(task.run, f"{type(error).__name__}: {error}")
 
 
 def failed(run: int, reason: str) -> Outcome:
-    """The outcome of a run that failed; of the reason the first line."""
+    """Return the outcome of a failed run, with the first line of the reason."""
     return Outcome(Entry(run, FAILED, reason.strip().partition("\n")[0]), {}, {})
 
 

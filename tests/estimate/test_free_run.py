@@ -86,7 +86,7 @@ def test_a_model_that_leaves_the_range_counts_as_infinite(bad):
 
 
 def test_a_horizon_below_a_row_is_refused():
-    with pytest.raises(InputError, match="shorter than a row"):
+    with pytest.raises(InputError, match="shorter than a log row"):
         window_starts(500, 0.1, 0.04)
     assert len(window_starts(40, 0.1, 5.0)) == 0
 

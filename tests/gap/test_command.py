@@ -101,7 +101,7 @@ def test_the_patched_machine_runs_and_is_replayed(site, searching):
 def test_a_machine_with_a_learned_law_runs_and_is_replayed(site, searching):
     searching("partly")
     code, out, _ = invoke("gap", "--data", "site", "--no-recording")
-    assert code == 0 and "the rest has no known cause" in " ".join(out.split())
+    assert code == 0 and "the remaining difference has no known cause" in " ".join(out.split())
     patched = "gap_site/patched/"
     assert load_machine(site / patched).terms[0].name == "learned_force"
     short = ("--set", "duration=0.5", "--set", "tool=none", "--no-review")

@@ -116,7 +116,7 @@ def split_and_stuck(folder):
 def test_stuck_sensor_and_files_with_unlike_clocks_are_seen(tmp_path):
     data = split_and_stuck(tmp_path)
     assert len([note for note in data.notes if "-2.5 s" in note]) == 4
-    assert any(note.startswith("fit_1: angle.boom is stuck") for note in data.notes)
+    assert any(note.startswith("fit_1: angle.boom is frozen") for note in data.notes)
     (stuck,) = [run for run in data.fit if run.name == "fit_1"]
     angle = stuck.reading[:, data.channels.index("angle.boom")]
     assert np.isnan(angle).any() and not np.isnan(angle).all()  # within the half that is fitted
@@ -312,7 +312,7 @@ def test_effects_that_make_the_held_out_run_worse_are_taken_back_and_laws_learne
     monkeypatch.setattr(find, "hypotheses", lambda m, names: hypotheses(m, ("valve_gain",)))
     gap = find_gap(half(MEASURED / "open_04", 10.0))
     assert gap.verdict == "no_gap" and not gap.effects
-    assert sum("held-out run worse" in note for note in gap.notes) == 1
+    assert sum("increase the errors on the held-out run" in note for note in gap.notes) == 1
     gain = ["valve_gain.boom.ratio"]  # which cannot be believed: laws are tried without it, too
     assert learned_of == ([[], gain, []] if after_laws else [[]])
     assert gap.patched == gap.machine

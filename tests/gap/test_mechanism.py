@@ -140,7 +140,7 @@ def test_an_effect_that_differs_from_run_to_run_is_taken_back(tmp_path):
     logs(tmp_path, law=lambda q, v: next(turns) * v[:, 0])
     gap = found_gap(tmp_path)
     assert gap.verdict == "unknown" and not gap.effects
-    assert any("not the same in all parts" in note for note in gap.notes), gap.notes
+    assert any("differs between parts of these runs" in note for note in gap.notes), gap.notes
 
 
 def test_constants_that_differ_from_run_to_run_are_not_noise(tmp_path):

@@ -120,5 +120,5 @@ def test_long_records_are_cut_to_where_the_commands_change():
     assert len(run.command) == 6000 and short.heldout is data.heldout
     first = round((run.start - whole.start) / run.period)
     assert np.array_equal(run.reading, whole.reading[first : first + 6000])
-    assert any("fitted from" in note for note in short.notes)
+    assert any("only the interval from" in note for note in short.notes)
     assert busiest(data, 60.0) is data

@@ -26,17 +26,17 @@ def test_a_named_effect_is_said_with_size_interval_and_proof(gap_of):
     gap = gap_of("named")
     words = text_of(gap)
     assert headline(gap) == "Payload at the tool: mass 251.3 kg"
-    assert "between 247.9 and 254.6 kg; the model has 0 kg" in words
+    assert "247.9 to 254.6 kg; the model has 0 kg" in words
     assert "over 99.9 %" in words and "run test_1, which was not fitted" in words
     assert f"from {gap.size.before:.2f} to {gap.size.after:.2f} times" in words
     assert EFFECTS["payload"].sentence in words
-    assert "nan" not in words and "not everything" not in words.lower()
+    assert "nan" not in words and "explanation is incomplete" not in words
 
 
 def test_no_gap_asks_for_no_change(gap_of):
     gap = gap_of("no_gap")
     assert headline(gap) == "Model and machine agree"
-    assert "Nothing in the model needs to change" in text_of(gap)
+    assert "The model needs no change" in text_of(gap)
 
 
 def test_an_unknown_says_law_channel_and_dependence_in_plain_words(gap_of):
@@ -48,17 +48,23 @@ def test_an_unknown_says_law_channel_and_dependence_in_plain_words(gap_of):
 
 def test_beside_an_unknown_only_what_is_likely_is_said_to_be_known(gap_of):
     (effect,) = gap_of("named").effects
-    for probability, said in ((0.9, ", besides payload at the tool"), (0.006, "")):
+    for probability, said in ((0.9, "apart from payload at the tool, "), (0.006, "")):
         told = (dataclasses.replace(effect, probability=probability),)
         gap = dataclasses.replace(gap_of("unknown"), effects=told)
-        assert headline(gap).endswith(f"in a way that no known effect explains{said}")
+        assert headline(gap).endswith(f"differ; {said}no known effect explains the difference")
 
 
 def test_an_ambiguity_names_both_and_the_experiment(gap_of):
     gap = gap_of("ambiguous")
     assert headline(gap) == "Either length offset of the boom or pin offset of the boom"
     words = text_of(gap)
-    for piece in ("62 %", "(37 %)", "-6.10 mm", "patched model has the first", "Next experiment"):
+    for piece in (
+        "62 %",
+        "(37 %)",
+        "-6.10 mm",
+        "patched model contains the first",
+        "Next experiment",
+    ):
         assert piece in words
 
 
@@ -70,9 +76,11 @@ def test_a_mechanism_of_open_form_is_named_with_both_forms(gap_of):
     assert late.other_forms == (form,)
     assert late.mechanism_probability == pytest.approx(0.99)
     words = text_of(dataclasses.replace(gap_of("named"), effects=(late,)))
-    assert "do not tell angle delay of the swing from angle lag of the swing (38 %)" in words
+    assert "do not distinguish angle delay of the swing from angle lag of the swing (38 %)" in words
     sure = dataclasses.replace(late, probability=0.99)
-    assert "form is open" not in text_of(dataclasses.replace(gap_of("named"), effects=(sure,)))
+    assert "form is not identifiable" not in text_of(
+        dataclasses.replace(gap_of("named"), effects=(sure,))
+    )
     unlike = NamedEffect(
         "length_offset", "boom", 0.61, {}, (Alternative("pin_offset", "boom", 0.3),)
     )
@@ -84,27 +92,37 @@ def test_a_mechanism_of_open_form_is_named_with_both_forms(gap_of):
 
 def test_a_partly_named_gap_says_what_is_named_learned_and_left(gap_of):
     gap = gap_of("partly")
-    assert headline(gap) == "Payload at the tool: mass 251.3 kg; the rest has no known cause"
+    assert (
+        headline(gap)
+        == "Payload at the tool: mass 251.3 kg; the remaining difference has no known cause"
+    )
     words = text_of(gap)
     for piece in (
-        "one place that can be named", "Without it 63 % of the gap on run test_1 comes back",
-        "2 uncertain numbers were calibrated", "valve gain of the boom: ratio 104.00 % (model 100)",
-        "What fails is the balance of forces", "One law was learned", "With all of this",
-    ):  # fmt: skip
+        "one place with an identified effect",
+        "Without it, 63 % of the gap on run test_1 reappears",
+        "2 uncertain parameters were calibrated",
+        "valve gain of the boom: ratio 104.00 % (model 100)",
+        "unexplained residual is in the balance of forces",
+        "One law was learned",
+        "With all these changes",
+    ):
         assert piece in words, piece
 
 
 def test_numbers_off_alone_are_no_gap_but_said(gap_of):
     gap = dataclasses.replace(gap_of("no_gap"), calibration=gap_of("partly").calibration)
-    assert headline(gap) == "Model and machine agree within the uncertainty of its numbers"
+    assert headline(gap) == "Model and machine agree within the uncertainty of its parameters"
     words = text_of(gap)
-    assert "2 uncertain numbers were calibrated" in words and "Nothing in the model" not in words
+    assert (
+        "2 uncertain parameters were calibrated" in words
+        and "The model needs no change" not in words
+    )
 
 
 def test_failed_tests_are_not_kept_quiet(gap_of):
     tests = {"window means": {"value": 9.0, "limit": 4.0, "passed": False}}
     gap = dataclasses.replace(gap_of("named"), tests=tests)
-    assert "what is left fails the test window means" in text_of(gap)
+    assert "remaining errors fail the test window means" in text_of(gap)
 
 
 def test_a_gap_within_the_noise_is_called_weak(gap_of):

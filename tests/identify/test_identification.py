@@ -165,7 +165,7 @@ def test_readings_of_a_saturated_sensor_are_left_out(clean, tmp_path):
         columns[name] = np.minimum(columns[name], np.quantile(columns[name], 0.67))
         save_log(dataclasses.replace(log, columns=columns), tmp_path / file.name)
     data = load_dataset(tmp_path, load_machine("cat215"))
-    assert any("pressure_head.boom does not get beyond" in note for note in data.notes)
+    assert any("pressure_head.boom is saturated at" in note for note in data.notes)
     fit, heldout, _ = records(data)
     found = identify_dynamics(fit, heldout, clean[2])
     # chi^2 of 25 degrees of freedom exceeds 44.3 in 1 % of all cases

@@ -54,7 +54,7 @@ def csv(path, header, rows):
 def test_a_stroke_is_a_run(seconds, rate):
     data = dataset(stroke(seconds, rate, 1), stroke(seconds, rate, 2))
     assert [len(r.reading) for r in (*data.fit, data.heldout)] == [round(seconds * rate)] * 2
-    assert ("known to a row at best" in " ".join(data.notes)) == (rate == 10.0)
+    assert ("to within one row only" in " ".join(data.notes)) == (rate == 10.0)
 
 
 def test_a_single_run_of_four_strokes_is_split():
@@ -68,11 +68,11 @@ def test_one_row_and_constant_channels():
     flat = {c: np.full(len(log), v[0]) for c, v in log.columns.items()}
     still = dataclasses.replace(log, columns=flat)
     data = dataset(still, stroke(seed=1))
-    assert any("a: nothing moves" in note or "stuck" in note for note in data.notes)
+    assert any("a: nothing moves" in note or "frozen" in note for note in data.notes)
     one = dataclasses.replace(
         log, time=log.time[:2], columns={c: v[:2] for c, v in log.columns.items()}
     )
-    with pytest.raises(InputError, match="2 rows.*log longer, or leave it out"):
+    with pytest.raises(InputError, match="2 rows.*record a longer run, or remove this one"):
         dataset(one, log)
 
 
@@ -90,7 +90,7 @@ def test_ten_kilohertz_is_averaged_without_shift_and_said():
     assert error.std() == pytest.approx(1e-4 / 10**0.5, rel=0.06)  # 2998 samples, adjacent share 1
     wanted = log["command.slide"].reshape(3000, 10).mean(axis=1)
     np.testing.assert_allclose(run.command[:, 0], wanted, atol=1e-15)
-    assert "every 10 rows were averaged into one of 1000 Hz" in " ".join(data.notes)
+    assert "10 rows each were averaged, giving 1000 Hz" in " ".join(data.notes)
     assert data.noise_of(run) == pytest.approx(data.noise / 10**0.5, rel=0.03)
     assert np.array_equal(data.noise_of(data.heldout), data.noise)
     assert len(run.log) == 3000 and np.array_equal(run.log["position.slide"], run.reading[:, spot])
@@ -125,8 +125,8 @@ def test_a_channel_that_is_refreshed_slowly_counts_once(rate, held):
     read = np.isfinite(run.reading[:, spot]).sum()
     assert read == pytest.approx(len(log) / held, rel=0.01)
     assert np.isfinite(run.reading[:, 1 - spot]).all()
-    assert f"refreshed every {1e3 * held / rate:.3g} ms" in " ".join(data.notes)
-    assert "stuck" not in " ".join(data.notes)
+    assert f"updated only every {1e3 * held / rate:.3g} ms" in " ".join(data.notes)
+    assert "frozen" not in " ".join(data.notes)
     assert data.noise_of(run)[spot] == pytest.approx(data.noise[spot])
 
 
@@ -149,7 +149,7 @@ def test_a_quiet_coarse_sensor_is_not_taken_for_a_slow_one():
         log = stroke(8.0, rate, sensors=False)
         coarse = np.rint((0.25 + 0.1 * np.sin(2 * np.pi * log.time)) / 5e-3) * 5e-3
         data = dataset(with_column(log, "position.slide", coarse, "m"), stroke(seed=1))
-        assert "refreshed" not in " ".join(data.notes)
+        assert "updated" not in " ".join(data.notes)
 
 
 def test_a_log_without_any_reading_is_refused():
@@ -157,7 +157,7 @@ def test_a_log_without_any_reading_is_refused():
     empty = dataclasses.replace(log, columns={
         c: v if c.startswith("command") else np.full(len(log), np.nan)
         for c, v in log.columns.items()})  # fmt: skip
-    with pytest.raises(InputError, match="no reading of any channel is usable"):
+    with pytest.raises(InputError, match="no channel has a usable reading"):
         dataset(empty, empty)
 
 
@@ -218,12 +218,15 @@ def test_a_mask_file(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("a,1,2\n", "must begin with the header run,begin,end"),
-        ("run,begin,end\n", "masks nothing"),
+        ("a,1,2\n", "must be the header run,begin,end"),
+        ("run,begin,end\n", "has no interval"),
         ("run,begin,end\na,1\n", "mask.csv:2.*is 'a,1': write run,begin,end"),
-        ("run,begin,end\na,2,1\n", "ends at 1 s, before its beginning"),
+        ("run,begin,end\na,2,1\n", "ends at 1 s, before its start"),
         ("run,begin,end\nc,1,2\n", "mask of run 'c'.*valid: a, b"),
-        ("run,begin,end\n,,9e9\n", "no run has 0.5 s and 50 rows without a pause or a mask"),
+        (
+            "run,begin,end\n,,9e9\n",
+            "no run has 0.5 s and 50 rows without a gap or a masked interval",
+        ),
     ],
 )
 def test_masks_that_are_refused(tmp_path, text, message):
@@ -238,7 +241,7 @@ def test_masks_that_are_refused(tmp_path, text, message):
 def test_a_valid_column_that_is_none(tmp_path):
     log = with_column(stroke(), "valid", np.full(400, 2.0))
     save_log(log, tmp_path / "a.parquet")
-    with pytest.raises(InputError, match="'valid', row 0.*write 1 where the row may be used"):
+    with pytest.raises(InputError, match="'valid', row 0.*write 1 for usable rows"):
         load_dataset(tmp_path, RIG)
 
 
@@ -253,7 +256,7 @@ def test_rows_that_wander_off_any_clock_stand_at_their_own_times():
     clock, notes = fit_clock(time, "a log")
     stand = clock.start + clock.period * clock.tick
     assert len(clock.row) == 3000 and np.abs(stand - time).max() <= 0.1 * 0.0106
-    assert len(notes) == 1 and "keep no common clock" in notes[0]
+    assert len(notes) == 1 and "have no common clock" in notes[0]
     base = stroke(30.0)
     columns = {c: np.interp(time, base.time, v) for c, v in base.columns.items()}
     data = dataset(dataclasses.replace(base, time=time[:2800], columns={
@@ -272,7 +275,7 @@ def test_rows_that_wander_off_any_clock_stand_at_their_own_times():
 def test_a_log_of_two_rates_keeps_its_times():
     time = np.concatenate([np.arange(2000) * 0.013, 26.0 + np.arange(1000) * 0.01])
     clock, notes = fit_clock(time, "a log")
-    assert len(clock.row) == 3000 and "keep no common clock" in notes[0]
+    assert len(clock.row) == 3000 and "have no common clock" in notes[0]
     assert np.abs(clock.start + clock.period * clock.tick - time).max() <= 0.1 * 0.013
 
 
@@ -353,7 +356,7 @@ def test_a_log_of_hydrotele_has_fractions_already(tmp_path):
         (
             RIG,
             "command.slide [V]",
-            "is in 'V', the drive takes '1'.*command_unit and command_range",
+            "is in 'V', the drive needs '1'.*command_unit and command_range",
         ),
         (ranged("V", -4.0, 4.0), "command.slide", r"is 5 V, beyond .*command_range -4 \.\. 4 V"),
         (ranged("mA", -20.0, 20.0), "command.slide [V]", "is in 'V'.* in 'mA': correct axes.slide"),
@@ -382,7 +385,7 @@ def test_columns_that_are_no_channels_can_be_left_out(tmp_path):
         log = stroke(seed=seed)
         table = np.column_stack([log.time, *log.columns.values(), log.time])
         csv(tmp_path / f"{name}.csv", ",".join(["time", *log.columns, "Marker 1"]), table)
-    with pytest.raises(InputError, match="Marker 1.*none leaves a column out"):
+    with pytest.raises(InputError, match="Marker 1.*none skips a column"):
         load_dataset(tmp_path, RIG)
     data = load_dataset(tmp_path, RIG.model_copy(update={"log_columns": {"Marker 1": "none"}}))
     assert len(data.channels) == 2 and data.notes == ()
@@ -427,4 +430,4 @@ def test_a_coarse_fast_encoder_has_no_spikes():
     noisy = clean + np.random.default_rng(3).normal(0.0, 2e-6, len(log))
     log = with_column(log, "position.slide", np.rint(noisy / 1e-5) * 1e-5, "m")
     data = make_dataset([RunFiles("a", (log,)), RunFiles("b", (stroke(seed=1),))], RIG, "ideal")
-    assert not [note for note in data.notes if "nothing physical" in note]
+    assert not [note for note in data.notes if "physically impossible" in note]

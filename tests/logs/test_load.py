@@ -190,7 +190,7 @@ def test_jittering_stamps_are_snapped_and_said():
     # Two hundred ticks of start-up settle the phase to a tenth of the jitter.
     assert data.fit[0].period == pytest.approx(0.02, rel=1e-4)
     assert np.array_equal(data.fit[0].reading, dataset(a=log, b=made_up(2)).fit[0].reading)
-    assert len(data.notes) == 1 and "jitter by 17 %" in data.notes[0]
+    assert len(data.notes) == 1 and "a jitter of 17 %" in data.notes[0]
 
 
 def test_stamps_without_a_clock_are_refused():
@@ -212,7 +212,7 @@ def test_long_pause_cuts_the_run():
     data = dataset(a=damaged, b=made_up(2))
     assert [r.name for r in data.fit] == ["a_part1", "a_part2"]
     assert data.fit[1].start == pytest.approx(18.0)
-    assert "3.02 s" in data.notes[0] and "cut" in data.notes[0]
+    assert "3.02 s" in data.notes[0] and "split" in data.notes[0]
     assert len(data.fit[0].log) + len(data.fit[1].log) == len(damaged)
 
 
@@ -281,7 +281,7 @@ def test_file_without_commands_is_believed_and_said():
     for axis in AXES:
         pressures = changed(pressures, **{f"command_{axis}": None})
     data = dataset(a=(angles, pressures), b=made_up(2))
-    assert len(data.notes) == 2 and "believed" in data.notes[0] and "delay" in data.notes[0]
+    assert len(data.notes) == 2 and "0 is assumed" in data.notes[0] and "delay" in data.notes[0]
     assert "25 rows" in data.notes[1]  # half a second in which only one file has rows
     assert np.isnan(column(data, "a", "pressure_supply")[:25]).all()
 
@@ -323,7 +323,7 @@ def test_held_out_run(tmp_path):
     assert load_dataset(folder, CAT, heldout="a").heldout.name == "a"
     named = [folder / f"{n}.parquet" for n in ("b", "a")]
     assert load_dataset(named, CAT).heldout.name == "b"
-    with pytest.raises(InputError, match="is not there; .*valid: a, b, test_1, test_2"):
+    with pytest.raises(InputError, match="does not exist; .*valid: a, b, test_1, test_2"):
         load_dataset(folder, CAT, heldout="c")
 
 
@@ -352,8 +352,8 @@ def test_single_run_is_split_without_overlap(seconds, start):
 @pytest.mark.parametrize(
     ("logs", "message"),
     [
-        ({"only": made_up(1, 3.0)}, "only run and 3 s long.*4 s or more"),
-        ({"only": made_up(1, 1.8, 1000.0)}, "only run and 1.8 s long.*2 s or more"),
+        ({"only": made_up(1, 3.0)}, "only run and 3 s long.*at least 4 s"),
+        ({"only": made_up(1, 1.8, 1000.0)}, "only run and 1.8 s long.*at least 2 s"),
         ({"a": made_up(1), "b": made_up(2, 0.8)}, r"0.8 s long \(40 rows\); 0.5 s and 50 rows"),
         ({"a": made_up(1), "b": made_up(2, 0.4, 1000.0)}, "0.4 s long .400 rows.; 0.5 s and"),
     ],
@@ -390,7 +390,7 @@ def test_stuck_sensor_is_found_by_its_noise(channel):
     assert gone[400:600].all() and gone.sum() <= 202
     assert np.isfinite(np.delete(data.fit[0].reading, data.channels.index(name), axis=1)).all()
     assert len(data.notes) == 1
-    assert data.notes[0].startswith(f"a: {name} is stuck") and "8 to 12 s" in data.notes[0]
+    assert data.notes[0].startswith(f"a: {name} is frozen") and "8 to 12 s" in data.notes[0]
 
 
 @pytest.mark.parametrize("channel", ["angle_swing", "pressure_rod_stick"])
@@ -400,7 +400,7 @@ def test_sensor_stuck_for_ever_is_dropped(channel):
             for n, log in (("a", made_up(1)), ("b", made_up(2)))}  # fmt: skip
     data = dataset(**logs)
     assert f"{kind}.{axis}" not in data.channels and len(data.channels) == len(data.noise) == 11
-    assert any("dropped" in note and f"{kind}.{axis}" in note for note in data.notes)
+    assert any("removed" in note and f"{kind}.{axis}" in note for note in data.notes)
 
 
 def quiet(seed: int, moves: bool = True) -> Log:
@@ -435,7 +435,7 @@ def test_quieter_sensors_than_stated_may_rest():
     logs = {"a": quiet(1), "b": quiet(2)}
     logs = {n: dataclasses.replace(v, metadata={"sensors": "khoshzaban1992"})
             for n, v in logs.items()}  # fmt: skip
-    assert not [note for note in dataset(**logs).notes if "stuck" in note]
+    assert not [note for note in dataset(**logs).notes if "frozen" in note]
 
 
 def test_rows_written_twice_count_as_missing():
@@ -448,7 +448,7 @@ def test_rows_written_twice_count_as_missing():
     data = dataset(a=dataclasses.replace(log, columns=columns), b=made_up(2))
     assert np.array_equal(np.flatnonzero(np.isnan(data.fit[0].reading).all(axis=1)), twice)
     assert np.array_equal(np.flatnonzero(~data.fit[0].command_known), twice)
-    assert "4 rows repeat" in data.notes[0]
+    assert "4 rows are duplicates" in data.notes[0]
 
 
 def test_sensor_at_its_end_is_left_out():
@@ -462,7 +462,7 @@ def test_sensor_at_its_end_is_left_out():
     # What the noise pushed inwards goes too, or the mean of the rest would be 86 kPa off; at the
     # edges of the stretch one or two readings may have no cut one within 5 rows.
     assert gone[302:398].all() and not gone[:298].any() and not gone[402:].any()
-    assert "end of its sensor" in data.notes[0]
+    assert "limit of the sensor" in data.notes[0]
 
 
 def test_spikes_are_left_out_and_jumps_stay():
@@ -493,7 +493,7 @@ def test_a_run_at_rest_is_said():
              + noise_rms(CAT, SENSORS, c) * np.random.default_rng(k).uniform(-1.7, 1.7, len(log))
              for k, c in enumerate(log.columns) if c.startswith(("angle", "length"))}  # fmt: skip
     data = dataset(a=changed(log, **still), b=made_up(2))
-    assert data.notes == ("a: nothing moves; friction, inertia and timing cannot be seen.",)
+    assert data.notes == ("a: nothing moves; friction, inertia and delays are not identifiable.",)
 
 
 # What is refused, and how
@@ -533,7 +533,7 @@ def test_nan_in_the_time_is_refused_with_its_line(tmp_path):
     path = csv(log, tmp_path / "a.csv", spoil)
     with pytest.raises(InputError) as caught:
         load_dataset(path, CAT)
-    for word in (str(path), "'time'", "row 7", "line 9", "remove the row or fill it in"):
+    for word in (str(path), "'time'", "row 7", "line 9", "remove the row or enter a value"):
         assert word in str(caught.value)
 
 
@@ -588,7 +588,7 @@ def test_other_machine_and_tool_are_refused_unless_forced(tmp_path):
 
 
 def test_unknown_channels_are_said_and_empty_folders_refused(tmp_path):
-    with pytest.raises(InputError, match="holds no log"):
+    with pytest.raises(InputError, match="contains no log"):
         load_dataset(tmp_path, CAT)
     log = made_up(1)
     extra = Log(log.time, {**log.columns, "angle.bom": log["angle.boom"]},
@@ -636,6 +636,6 @@ def test_ec20():
     # A converter's step without an accuracy is no floor of the noise.
     assert np.isnan(data.noise).all() and len(data.notes) == 2
     # The record is resampled to 50 Hz, its angles change every second or third row only: 20 Hz.
-    assert all("is refreshed every 49.9 ms only" in note for note in data.notes)
+    assert all("is updated only every 49.9 ms" in note for note in data.notes)
     read = np.concatenate([np.isfinite(r.reading) for r in runs_of(data)])
     assert read.mean(axis=0) == pytest.approx([0.4, 0.4], abs=0.002)

@@ -132,7 +132,7 @@ def test_volvo_loads_though_its_joystick_passes_one():
 @needs_real
 def test_panda_lacks_samples_and_says_so():
     path = REAL / "panda" / "exciting_1.parquet"
-    assert "dropped" in refusal(path)
+    assert "missing or have irregular times" in refusal(path)
     log = load_log(path, maximum_dropped=0.05)
     assert len(log.axes) == 7
     assert len(log.gaps) > 0
@@ -249,7 +249,7 @@ def test_a_kill_in_the_middle_leaves_no_file_of_that_name(tmp_path):
     assert done.returncode == -signal.SIGKILL, done.stderr.decode()
     assert not path.exists()
     assert [name for name in os.listdir(tmp_path) if not name.startswith(".")] == []
-    with pytest.raises(InputError, match="holds no log"):
+    with pytest.raises(InputError, match="contains no log"):
         load_logs(tmp_path)
 
 
@@ -267,7 +267,7 @@ REFUSED = {
     "samples dropped": (
         {k: np.delete(v, [4, 5]) for k, v in good().items()},
         {},
-        ["'time', row 4", "dropped", "0.06 s", "0.02 s", "Resample"],
+        ["'time', row 4", "missing or have irregular times", "0.06 s", "0.02 s", "Resample"],
     ),
     "milliseconds": (good(time=20.0 * np.arange(20)), {}, ["'time'", "milliseconds"]),
     "unknown kind": (
@@ -342,9 +342,9 @@ def test_duplicate_columns_are_refused(tmp_path):
     fields = ["time", "angle.boom", "angle.boom"]
     table = pa.Table.from_arrays([pa.array(time)] * 3, names=fields)
     pq.write_table(table, tmp_path / "run.parquet")
-    assert "'angle.boom': is there 2 times" in refusal(tmp_path / "run.parquet")
+    assert "'angle.boom': occurs 2 times" in refusal(tmp_path / "run.parquet")
     path = write(tmp_path / "alias.parquet", good(q=time))
-    assert "'angle.boom': is there 2 times" in refusal(path, aliases={"q": "angle.boom"})
+    assert "'angle.boom': occurs 2 times" in refusal(path, aliases={"q": "angle.boom"})
 
 
 def test_missing_required_columns_list_what_is_there(tmp_path):
@@ -379,7 +379,7 @@ def test_a_dead_pressure_sensor_is_not_taken_for_a_wrong_unit(tmp_path):
 
 
 def test_a_folder_is_read_whole_or_not_at_all(tmp_path):
-    with pytest.raises(InputError, match="holds no log"):
+    with pytest.raises(InputError, match="contains no log"):
         load_logs(tmp_path)
     save_log(make_log(), tmp_path / "b.parquet")
     (tmp_path / "a.csv").write_text(csv_text())
@@ -387,7 +387,7 @@ def test_a_folder_is_read_whole_or_not_at_all(tmp_path):
     assert [log.name for log in load_logs(tmp_path)] == ["a", "b"]
     assert [log.name for log in load_logs(tmp_path / "b.parquet")] == ["b"]
     (tmp_path / "a.csv").rename(tmp_path / "b.csv")
-    with pytest.raises(InputError, match="'b' is there 2 times"):
+    with pytest.raises(InputError, match="'b' exists 2 times"):
         load_logs(tmp_path)
 
 
@@ -431,14 +431,14 @@ def test_csv_without_units_is_si_bit_by_bit(tmp_path):
         ("\n80,4,104", "\n80,1_0,104", ["'angle.boom', row 4 (line 9)", "'1_0'"]),
         ("\n80,4,104", "\n80,4", ["row 4 (line 9)", "2 cells", "3"]),
         ("\n80,4,104", "\n80,4,1,04", ["row 4 (line 9)", "4 cells"]),
-        ("\n80,4,104", "\n", ["'time', row 4 (line 10)", "dropped"]),
+        ("\n80,4,104", "\n", ["'time', row 4 (line 10)", "missing or have irregular times"]),
         ("\n80,4,104", "\n60,4,104", ["'time', row 4 (line 9)", "repeats"]),
         ("[deg]", "[kPa]", ["'angle.boom'", "'kPa'", "rad"]),
         ("[deg]", "[deg/s]", ["'angle.boom'", "'deg/s'", "rad"]),
         ("[deg]", "[parsec]", ["'angle.boom'", "'parsec'"]),
         (" [deg]", "", ["'angle.boom', row 13 (line 18)", "degrees", "state the unit"]),
         ("angle.boom", "angle_boom", ["'angle_boom'", "angle.boom"]),
-        ('"angle.boom [deg]"', "time", ["'time': is there 2 times"]),
+        ('"angle.boom [deg]"', "time", ["'time': occurs 2 times"]),
         ("time [ms]", "length.boom [mm]", ["column time", "length.boom"]),
         ("\n0,0,100", "\n0;0;100", ["row 0 (line 5)", "1 cells"]),
     ],

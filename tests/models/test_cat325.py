@@ -290,7 +290,7 @@ def test_a_head_needs_a_joint_that_is_there():
     facts = CAT.model_dump()
     for arm, message in (
         ({**facts["arm"], "head": "haed"}, "arm.head: 'haed' is not known; did you mean 'head'"),
-        ({**facts["arm"], "tool": None}, "a head turns on a tool joint"),
+        ({**facts["arm"], "tool": None}, "arm.head needs a tool joint"),
     ):
         with pytest.raises(ValueError, match=message):
             type(CAT).model_validate({**facts, "arm": arm})

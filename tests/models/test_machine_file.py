@@ -252,7 +252,7 @@ REFUSALS = {
     "no drive": ((("    cylinder:\n", "    valve_of:\n"),), r"'valve_of'.*cylinder"),
     "valve missing": (
         (("    valve: {rated_flow_l_min: 60, bandwidth_hz: 8}\n", ""),),
-        r"axes.jib: a cylinder or motor needs a valve",
+        r"axes.jib: a cylinder or motor needs either a valve",
     ),
     "supply missing": ((("supply: {", "description: |\n  {"),), r"valves need a supply"),
     "link named world": ((("post: {mass", "world: {mass"),), r"links.world"),
@@ -265,7 +265,7 @@ REFUSALS = {
     "tools no mapping": ((("  none: {}\n", "  none: [1]\n"),), r":31: tools.none: must map"),
     "link of a tool stands twice": (
         (("links: {hook:", "links: {jib:"),),
-        r":33: tools.hook.links.jib: is already there",
+        r":33: tools.hook.links.jib: already exists in the machine",
     ),
     "duplicate key": (
         (("    mass: 200\n", "    mass: 200\n    mass: 210\n"),),
@@ -275,7 +275,7 @@ REFUSALS = {
     "tabs": ((("  post:", "\tpost:"),), r":3: is not valid YAML"),
     "polar pin from no link": (
         (("{link: post, position: [0.3, 0.0, 1.0]}", "{link: post, from: job, distance: 1}"),),
-        r":15: axes.jib.cylinder.base_pin: from: 'job' is no link; did you mean 'jib'",
+        r":15: axes.jib.cylinder.base_pin: from: 'job' is not a link; did you mean 'jib'",
     ),
     "polar pin without number": (
         (("{link: post, position: [0.3, 0.0, 1.0]}", "{link: post, distance: far}"),),
@@ -299,19 +299,19 @@ MJCF_REFUSALS = {
     "number in both": (
         ("    mass: 200\n", "    mass: 200\n    position: [0, 0, 2]\n"),
         None,
-        r"links.jib: position also stands in crane.xml",
+        r"links.jib: position is also given in crane.xml",
     ),
     "joint number in both": (
         ("    mass: 200\n", "    mass: 200\n    joint: {range_deg: [-3, 3]}\n"),
         None,
-        r"links.jib: joint.range_deg also stands in crane.xml",
+        r"links.jib: joint.range_deg is also given in crane.xml",
     ),
     "not XML": (None, ("<worldbody>", "<worldbody"), r"mjcf: .*crane.xml cannot be read"),
     "not MJCF": (None, ("<worldbody>", "<worldboddy>"), r"mjcf: .*crane.xml cannot be read"),
     "joint without name": (
         None,
         ('name="jib" range', "range"),
-        r"body 'jib' of crane.xml: needs one joint with a name",
+        r"body 'jib' of crane.xml: needs exactly one named joint",
     ),
     "two joints": (
         None,
@@ -326,7 +326,7 @@ MJCF_REFUSALS = {
     "turned inertia": (
         None,
         ('pos="0 0 0" mass', 'pos="0 0 0" quat="1 1 0 0" mass'),
-        r"body 'post' of crane.xml: give its inertial",
+        r"body 'post' of crane.xml: the inertia must be a diaginertia",
     ),
 }
 
@@ -563,7 +563,7 @@ def test_a_drive_without_gain_is_refused(tmp_path):
     shutil.copytree(models_folder() / "emps", tmp_path / "emps")
     file = tmp_path / "emps/machine.yaml"
     file.write_text(file.read_text().replace("gain: 35.150651882", "gain: 0"))
-    with pytest.raises(InputError, match="a drive that no command moves"):
+    with pytest.raises(InputError, match="with 0 no command moves the drive"):
         load_machine(str(tmp_path / "emps"))
 
 

@@ -145,7 +145,7 @@ def test_unplugged_pad_lets_go_says_so_once_and_comes_back():
     assert pad.read(0.2).said == ""
     sticks.plug(stick)
     back = pad.read(0.3)
-    assert asked(back)["x"] == 1.0 and "is back" in back.said
+    assert asked(back)["x"] == 1.0 and "is connected again" in back.said
     pad.close()
     assert sticks.closed
 
@@ -194,13 +194,13 @@ def test_script_holds_or_runs_evenly(tmp_path):
         ("s.csv", "time,x\n0,0\n1,nan\n", "line 3, column 'x': nan is not between -1 and 1"),
         ("s.csv", "time,x\n0,1.5\n", "line 2, column 'x': 1.5 is not between"),
         ("s.csv", "time,x\n0.5,1\n", "line 2, column 'time': time must start at 0"),
-        ("s.csv", "time,x\n0,1\n0,1\n", "line 3, column 'time': time must rise"),
+        ("s.csv", "time,x\n0,1\n0,1\n", "line 3, column 'time': time must increase"),
         ("s.csv", "time,x\n0,1,2\n", "line 2: has 3 cells, not 2"),
         ("s.csv", "x\n0\n", "line 1: has no column 'time'"),
-        ("s.csv", "time,x,x\n0,1,1\n", "line 1: names x twice"),
+        ("s.csv", "time,x,x\n0,1,1\n", "line 1: repeats the columns x"),
         ("s.csv", "", "line 1: has no column 'time'"),
         ("s.csv", "time\n", "time must start at 0"),
-        ("s.csv", "time,sew\n0,1\n", "'sew' is no axis.*did you mean 'saw'"),
+        ("s.csv", "time,sew\n0,1\n", "'sew' is not one of the axes.*did you mean 'saw'"),
         ("s.yaml", "time: [0, 1]\naxes: {x: [0]}\n", "x has 1 values, time has 2"),
         ("s.yaml", "time: [0, 1]\naxes:\n  w: [0, 0]\n", r"s\.yaml:3: axes\.w"),
         ("s.yaml", "time: [0, 1]\naxes:\n  x: [0, 2]\n", r"s\.yaml:3: axes\.x\.1"),

@@ -173,7 +173,7 @@ def test_slow_computer_pauses_and_says_so():
     assert run.summary["pauses"] > 10
     assert run.summary["late_seconds"] == pytest.approx(99 * 0.095, abs=PATIENCE)
     assert len(run.measured) == 25 and not clock.slept
-    told = [sentence for sentence in said if sentence.startswith("cannot keep up: paused")]
+    told = [sentence for sentence in said if sentence.startswith("computer too slow")]
     assert 3 <= len(told) <= 6  # of 10 s, every two
 
 
@@ -215,9 +215,9 @@ def test_drive_that_ends_at_once_writes_nothing(tmp_path):
     ("changes", "message"),
     [
         ({}, "reads the keys of the viewer's window"),
-        ({"device": "mouse"}, "is no device; did you mean 'spacemouse'"),
+        ({"device": "mouse"}, "is not a known device; did you mean 'spacemouse'"),
         ({"device": "scripted:none.csv"}, "no such file"),
-        ({"scenario": "zhu_up", "device": "scripted:S"}, "its pilot is lines, which has no joy"),
+        ({"scenario": "zhu_up", "device": "scripted:S"}, "pilot kind lines has no joystick"),
         ({"device": "scripted:S", "overrides": {"machine": "rig"}}, "arm"),
         ({"device": "scripted:S", "speed": -1.0}, "--speed"),
         ({"device": "scripted:S", "speed": math.nan}, "--speed"),

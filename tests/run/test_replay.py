@@ -138,7 +138,7 @@ def test_missing_columns(excitation):
     [
         ("cat215", "bucket", "needs command.bucket, angle.bucket"),
         ("rig", None, "needs command.slide, position.slide"),
-        ("ec20", None, r"order \['swing', 'boom', 'stick'\] is not that of the axes"),
+        ("ec20", None, r"order \['swing', 'boom', 'stick'\] does not list the axes"),
     ],
 )
 def test_log_of_another_machine(machine, tool, message, excitation):
@@ -149,9 +149,9 @@ def test_log_of_another_machine(machine, tool, message, excitation):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ("{", "initial_state: is not usable"),
-        ("[1]", "is not usable"),
-        ({"order": None}, "is not usable"),
+        ("{", "initial_state: is invalid"),
+        ("[1]", "is invalid"),
+        ({"order": None}, "is invalid"),
         ({"angle": [0.0, 1.0]}, "angle must be 3 finite numbers"),
         ({"angle": [float("nan"), 0.5, -1.5]}, "angle must be 3 finite numbers"),
         ({"velocity": 0.0}, "velocity must be 3"),
@@ -159,7 +159,7 @@ def test_log_of_another_machine(machine, tool, message, excitation):
         ({"spool": [[0], [0], [0]]}, "spool must be 3"),
         ({"pressure_head": [float("inf"), 0, 0]}, "pressure_head must be 3"),
         ({"pressure_rod": ["high", 0, 0]}, "could not convert"),
-        ({"joints": 5}, "not usable"),
+        ({"joints": 5}, "is invalid"),
         ({"joints": {"boom": "up"}}, "could not convert"),
         ({"joints": {"boom": [1, 2]}}, "boom must be 1 finite"),
     ],

@@ -183,7 +183,7 @@ def test_another_sweep_is_refused_with_what_differs(done, tmp_path):
     base = open_base(load_sweep(file))
     with sweep_folder(out, base, check_points(base), fresh=True):
         assert sorted(p.name for p in out.iterdir()) == [".scratch", "summary.json", "sweep.yaml"]
-        with pytest.raises(InputError, match="another hydrotele sweep works in it"):
+        with pytest.raises(InputError, match="in use by another hydrotele sweep"):
             run_sweep(load_sweep(file), out)
 
 
@@ -235,7 +235,9 @@ def test_a_machine_with_further_files_is_refused_on_a_cluster(own, tmp_path):
     model = tmp_path / "mine" / "rig.xml"
     text = model.read_text()
     model.write_text(text.replace("<worldbody>", '<!-- mesh file="a.stl" --><worldbody>', 1))
-    with pytest.raises(InputError, match="needs files beside its MJCF, which cannot be sent"):
+    with pytest.raises(
+        InputError, match="needs files in addition to its MJCF, which cannot be sent"
+    ):
         run_sweep(load_sweep(own), tmp_path / "out", SweepSettings(dask="tcp://127.0.0.1:1"))
     assert not (tmp_path / "out").exists()
 
@@ -259,6 +261,6 @@ def test_a_killed_process_costs_its_run_alone(tmp_path):
     (process,) = multiprocessing.active_children()
     threading.Timer(0.3, os.kill, (process.pid, signal.SIGKILL)).start()
     lost, last = (outcome.entry for outcome in found)
-    assert (lost.run, lost.status) == (1, FAILED) and "ended by SIGKILL" in lost.reason
+    assert (lost.run, lost.status) == (1, FAILED) and "was killed (SIGKILL)" in lost.reason
     assert (last.run, last.status) == (2, OK)
     assert multiprocessing.active_children() == []

@@ -113,7 +113,7 @@ def test_a_cluster_gives_the_same_table(done, tmp_path):
 def test_a_cluster_that_is_not_there_is_said(tmp_path, monkeypatch):
     pytest.importorskip("distributed", reason="needs the extra 'cluster'")
     monkeypatch.setattr(cluster, "_WAIT", 1)
-    with pytest.raises(InputError, match="no scheduler answers at tcp://127.0.0.1:1"):
+    with pytest.raises(InputError, match="no scheduler responds at tcp://127.0.0.1:1"):
         run_sweep(
             load_sweep(write_sweep(tmp_path)),
             tmp_path / "o",

@@ -642,5 +642,5 @@ def test_quoted_numbers_with_units_are_refused():
 
 
 def test_a_pose_and_its_joints_are_not_given_twice():
-    with pytest.raises(InputError, match="boom follow from the pose; give one"):
+    with pytest.raises(InputError, match="either a pose or the joints boom, not both"):
         prepare(load_scenario("zhu_up", {"start.joints.boom": "0.3"}))

@@ -76,7 +76,7 @@ def test_a_plate_far_away_changes_nothing():
 
 
 def test_a_start_in_the_plate_is_refused():
-    with pytest.raises(InputError, match="deep in the ground or what stands around"):
+    with pytest.raises(InputError, match="would penetrate the ground or an object by"):
         prepare(press(position=[6.0, -0.11, 0.6]))
 
 
