@@ -459,8 +459,7 @@ class Link:
 
         Args:
             qpos: (7,) written: handle position in joystick scale [m], quaternion; NaN while no
-                device
-                is connected, or until the handle has returned to its dead bands.
+                device is connected, or until the handle has returned to its dead bands.
             packet: packet from the machine.
             share: factor on the packet.
             extra: (6,) additional force on the handle [N], [N m].

@@ -130,8 +130,7 @@ class Exchange:
         Args:
             now: current time [ns].
 
-            A device that does not answer is reported as unable and gets a zero wrench until it
-            answers.
+        A device that does not answer is reported as unable and gets a zero wrench until it answers.
         """
         whole, real = self.pose
         if self.client and whole[SEQUENCE] >= 0 and self.answered < whole[SEQUENCE]:

@@ -498,7 +498,7 @@ def first_change(right: Callable[[float], bool], points: np.ndarray) -> float | 
         right: the condition.
         points: (n,) positive ordered values that are tested before the result is refined.
 
-        Returns:
+    Returns:
         The last value at which the condition is true, refined to 0.1 %.
     """
     first, last = right(float(points[0])), float(points[0])
@@ -525,7 +525,7 @@ def stability_map(
         delays: (n,) delays in each direction [s].
         factors: (m,) factors on the return channels [1].
 
-        Returns:
+    Returns:
         (m, n), true where stable.
     """
     return np.array([

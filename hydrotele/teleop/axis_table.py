@@ -34,10 +34,10 @@ def axis_table(joystick: Joystick, pilot: TeleopPilot, coordinates: tuple[str, .
         pilot: teleoperation settings of the scenario.
         coordinates: task coordinates of the arm.
 
-        Returns:
+    Returns:
         (6, 18), columns above.
 
-        Raises:
+    Raises:
         InputError: inconsistent gains, a coordinate that the arm does not have, one joystick axis
             for two coordinates, or an operator's goal that the joystick cannot move.
     """
@@ -124,7 +124,7 @@ def flat_state(kind: type[Kind], shapes: list[tuple[int, ...]]) -> Kind:
         kind: NamedTuple type of arrays.
         shapes: shapes of the arrays, in order.
 
-        Returns:
+    Returns:
         The tuple; `flat_view` returns its memory as one array.
     """
     sizes = [int(np.prod(shape)) for shape in shapes]

@@ -78,8 +78,7 @@ class Coils:
         """Compute the coil currents for a force and torque.
 
         A wrench above the limits is scaled down as a whole, so that it keeps its direction. Coils
-        that
-        saturate one by one would twist the operator's hand.
+        that saturate one by one would twist the operator's hand.
 
         Args:
             wrench: (6,) force [N] and torque about the frame's origin [N m].
@@ -130,7 +129,7 @@ def heating(currents: np.ndarray, continuous: float) -> float:
         currents: (6,) constant or root-mean-square currents [A].
         continuous: maximum continuous current [A].
 
-        Returns:
+    Returns:
         Ratio [1]; above 1 the coils overheat.
 
     >>> heating(np.array([0.0, 3.0, -4.0, 0.0, 0.0, 0.0]), 2.0)
@@ -147,7 +146,7 @@ def seconds_until_hot(currents: np.ndarray, continuous: float, time_constant: fl
         continuous: maximum continuous current [A].
         time_constant: thermal time constant of the winding [s].
 
-        Returns:
+    Returns:
         Time [s]; infinite if they can carry the currents continuously.
 
     Source: `simulate.joystick.heat_step`.

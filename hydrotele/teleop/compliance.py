@@ -236,7 +236,7 @@ def rotation_between(first: np.ndarray, then: np.ndarray) -> tuple[float, np.nda
         first: initial orientation, quaternion (4,), scalar first.
         then: final orientation, quaternion (4,).
 
-        Returns:
+    Returns:
         Scalar part, at least 0, and vector part (3,), the same in the axes of both.
 
     Source: Zhu 1994, 5.1.3 (Euler quaternions).

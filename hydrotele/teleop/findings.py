@@ -99,7 +99,7 @@ def control_law(case: Case, structure: str, reflected: float = 1.0) -> ControlLa
         structure: name, one of `STRUCTURES`.
         reflected: factor on the return channels [1].
 
-        Returns:
+    Returns:
         Coefficients of the control law.
 
     Source: Zhu 1994, 3.9-3.62, written in the time domain.
@@ -164,10 +164,9 @@ def impulse_response(
         structure: name of the structure.
         reflected: factor on the return channels [1].
         seconds: duration, at least forty round-trip delays; the run stops earlier when the motion
-            has
-            decayed or has grown without bound.
+            has decayed or has grown without bound.
 
-        Returns:
+    Returns:
         Results of the run.
     """
     seconds = max(seconds, _TRIPS * 2.0 * case.delay)
@@ -192,7 +191,7 @@ def simulate_sine(case: Case, structure: str, frequency: float) -> complex:
         structure: name of the structure.
         frequency: frequency of the sine [rad/s].
 
-        Returns:
+    Returns:
         Force over velocity, measured over two periods [N s/m].
     """
     law, period = control_law(case, structure), 2.0 * math.pi / frequency
@@ -398,7 +397,7 @@ def sweep(case: Case, structure: str, frequencies: np.ndarray = SWEPT) -> SineSw
         structure: name of the structure.
         frequencies: (n,) [rad/s].
 
-        Returns:
+    Returns:
         Predicted and measured impedances.
     """
     port = case.port(structure)
@@ -420,7 +419,7 @@ def agreement(case: Case, structure: str, delays: np.ndarray, factors: np.ndarra
         delays: (n,) delays in each direction [s].
         factors: (m,) factors on the return channels [1].
 
-        Returns:
+    Returns:
         Predicted and simulated stability.
     """
     seen = [
@@ -486,10 +485,10 @@ def find(
             of the map.
         progress: called with the structure and the completed fraction.
 
-        Returns:
+    Returns:
         Results of all structures.
 
-        Raises:
+    Raises:
         InputError: a structure is not known, or neither master nor slave has a mass.
     """
     analyses, maps, sweeps, agreements = [], {}, [], []
@@ -516,7 +515,7 @@ def why_unstable(one: Analysis, let_go: bool = False) -> str:
         one: the analysis.
         let_go: whether to describe the released handle instead of the held one.
 
-        Returns:
+    Returns:
         Text such as `no, 2 poles`; `yes` if the structure is stable.
     """
     both = (one.unstable_poles, one.unstable_free)
@@ -686,7 +685,7 @@ def deadband_share(deadband: float, amplitude: float) -> float:
         deadband: half width d of the band, scalar [m] or [rad].
         amplitude: amplitude A of the sine, scalar [m] or [rad], > 0.
 
-        Returns:
+    Returns:
         `1 - 2/pi (asin(d/A) + d/A sqrt(1 - (d/A)^2))`, scalar [1]; 0 for a sine inside the band.
 
     Source: describing function of a dead zone; Gelb and Vander Velde 1968, appendix B.
@@ -796,7 +795,7 @@ def find_loop(name: str, case: LinearCase, task_source: str) -> ScenarioFindings
         case: linear case of the scenario.
         task_source: source of the task's parameters.
 
-        Returns:
+    Returns:
         Results of the analysis.
 
     Raises:

@@ -65,18 +65,16 @@ def identify_flotor(
         coils: coils; their map and position define frame and wrench.
         cutoff: cutoff frequency of the filter [Hz].
 
-        Returns:
+    Returns:
         The fit. Its intervals include correlated noise and the error of difference quotients
         (1e-3 of the flotor's size, 1e-6 of its mass, which gravity determines). They do not
         include errors of the coils' map.
 
-        Raises:
+    Raises:
         InputError: the record is too short, has invalid samples, or its motion does not make all
-        ten
-            parameters identifiable.
+            ten parameters identifiable.
 
-        Source: Newton and Euler about a point of the body; Atkeson, An and Hollerbach 1986 (linear
-        in
+    Source: Newton and Euler about a point of the body; Atkeson, An and Hollerbach 1986 (linear in
     ten parameters); Zhu 1994, 5.1.3 (the joystick was identified so).
     """
     ends = round(_SETTLE / period)
@@ -108,8 +106,7 @@ def flotor_equations(
     """Build the Newton-Euler regression of a body under piecewise constant wrenches.
 
     The wrench is constant between samples. A second difference of positions is therefore the mean
-    of
-    the accelerations before and after a sample, and is paired with the mean of the two wrenches.
+    of the accelerations before and after a sample, and is paired with the mean of the two wrenches.
 
     Args:
         place: (n, 3) position of the coils' frame [m].

@@ -96,10 +96,10 @@ def levitation(
         body: model of the flotor in the control; the true parameters by default.
         frozen: maximum time for which a reading may be exactly constant [s].
 
-        Returns:
+    Returns:
         Parameters of the control.
 
-        Raises:
+    Raises:
         InputError: the parameters are not physical.
     """
     f, c, alone = joystick.flotor, joystick.coils, joystick.alone
@@ -126,9 +126,8 @@ def levitation_step(
     """Run one control period: velocities by differences, wrench, currents.
 
     A reading that is not finite, or is constant for longer than noise permits, switches the coils
-    off,
-    so that an unmeasured pose causes no force. The flotor then sinks onto its stops. With valid
-    readings it rises again from rest.
+    off, so that an unmeasured pose causes no force. The flotor then sinks onto its stops. With
+    valid readings it rises again from rest.
 
     Args:
         control: parameters of the control.
@@ -188,10 +187,10 @@ def diode_readings(place: np.ndarray, turn: np.ndarray, distance: float) -> np.n
         turn: (3, 3) rotation matrix, flotor to stator.
         distance: distance of the diodes from the centre [m].
 
-        Returns:
+    Returns:
         (6,) readings: lateral and vertical position on each diode in turn [m].
 
-        Raises:
+    Raises:
         InputError: a beam does not reach its diode's side.
 
     Source: Zhu 1994, 5.1.2 (coplanar radial beams at 120 degrees); geometry of a line and a plane.
@@ -211,11 +210,11 @@ def pose_of_readings(readings: np.ndarray, distance: float) -> tuple[np.ndarray,
         readings: (6,) see `diode_readings` [m].
         distance: distance of the diodes from the centre [m].
 
-        Returns:
+    Returns:
         Position (3,) [m] and rotation matrix (3, 3), flotor to stator; NaN if a reading is not
         finite.
 
-        Raises:
+    Raises:
         InputError: no pose corresponds to these readings.
 
     Source: `diode_readings`; Newton.
@@ -239,7 +238,7 @@ def pose_resolution(distance: float, step: float) -> np.ndarray:
         distance: distance of the diodes from the centre [m].
         step: resolution of their readings [m].
 
-        Returns:
+    Returns:
         (6,) standard deviations of position [m] and rotation [rad], for errors that are uniform
         over a step.
 
@@ -311,8 +310,7 @@ class PoseSensor:
     """Measure the flotor's pose with the resolution and noise of its sensors.
 
     By default the position of the handle and the rotation vector are rounded to the resolution, as
-    in
-    `teleop.master`. With diodes, the three beams are traced instead.
+    in `teleop.master`. With diodes, the three beams are traced instead.
     """
 
     def __init__(self, joystick: Joystick, *, noise: float, diodes: bool, seed: int) -> None:
@@ -375,7 +373,7 @@ def simulate_levitation(
         push: (n, 6) forces [N] and torques [N m] on the handle.
         spoil: function that applies a sensor fault to the reading of a period.
 
-        Returns:
+    Returns:
         Time histories of the run.
     """
     control = control or levitation(joystick, frozen=FROZEN if noise > 0.0 else np.inf)

@@ -119,10 +119,10 @@ def tip_drive(
         coordinate: task coordinate of the arm.
         servo: gains of the servo.
 
-        Returns:
+    Returns:
         Parameters of the linear tip model.
 
-        Raises:
+    Raises:
         InputError: the arm has no tip force model, or does not move along the coordinate in this
         pose.
 
@@ -403,10 +403,10 @@ def linear_case(
         clocks: control and sensor periods.
         task: impedance of the environment.
 
-        Returns:
+    Returns:
         The linear case.
 
-        Raises:
+    Raises:
         InputError: no joystick axis moves the coordinate.
     """
     place = np.flatnonzero(numbers.axis[:, COORDINATE] == COORDINATES.index(tip.coordinate))
@@ -468,10 +468,10 @@ def scenario_case(
         joystick: joystick; the operator's grip, posture and co-contraction replace its hand.
         coordinate: task coordinate; by default that of the operator's force target, otherwise z.
 
-        Returns:
+    Returns:
         The case, and the contact pose and impedance.
 
-        Raises:
+    Raises:
         InputError: the scenario is not teleoperated, the arm has no such coordinate, no force is
             reflected, or the operator's grip or posture is not known.
     """

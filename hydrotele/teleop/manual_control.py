@@ -32,6 +32,8 @@ _FLOOR = 1e-24  # sum of squares below which nothing has moved
 # indices into `Loop.facts`
 STEP, DELAY, REMNANT, THRESHOLD, MEMORY, SURPRISE, MOST, FORM, PRIOR = range(9)
 ERROR_POWER, RATE_POWER, INTEGRAL, CHOSEN, BELIEVED_GAIN, NOTICED = range(6)  # in `Loop.state`
+
+
 class Loop(NamedTuple):
     """Parameters and state of a visually closed loop, with n candidate elements.
 
@@ -123,8 +125,7 @@ def learn(loop, tick, late, seen):
     """Update the fit of every candidate element with the latest hand motion and output.
 
     Hand and output pass through a third-order wash-out, so that each candidate's effect is a filter
-    of
-    the hand: `s^(3-n) / (s + a)^3 / (T s + 1)`.
+    of the hand: `s^(3-n) / (s + a)^3 / (T s + 1)`.
 
     Args:
         loop: Loop; `hand`, `seen`, `sums` and `state` are written.
@@ -178,7 +179,7 @@ def believe(loop):
     Args:
         loop: Loop; the estimated gain in `state` is written.
 
-        Returns:
+    Returns:
         The gain, scalar, in output per hand displacement (and per s, s^2).
 
     Source: normal posterior of the gain's logarithm.
@@ -257,7 +258,7 @@ def operator_response(
         frequencies: (m,) [rad/s].
         late: delay, including that of lead generation [s]; by default the operator's.
 
-        Returns:
+    Returns:
         (m,) complex hand displacement per error.
     """
     s = 1j * frequencies
@@ -289,7 +290,7 @@ def neuromuscular_matrix(frequency: float, damping: float, step: float) -> np.nd
         damping: damping ratio [1].
         step: time for which the input is held [s].
 
-        Returns:
+    Returns:
         (6,) a11, a12, b1, a21, a22, b2 of position and rate.
     """
     if frequency <= 0.0:

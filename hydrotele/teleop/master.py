@@ -142,8 +142,7 @@ def master(
 
     Raises:
         InputError: inconsistent gains, a coordinate that the arm does not have, or one joystick
-        axis
-            for two coordinates.
+            axis for two coordinates.
     """
     f, coils = joystick.flotor, joystick.coils
     com, handle, inertia = np.array(f.com), np.array(f.handle), np.diag(f.inertia)
@@ -232,8 +231,7 @@ def read_handle(numbers, qpos, period, s):
     """Measure the handle with the sensing resolution, its rate by differences, and its energy.
 
     The energy from the hand follows from the kinetic energy and the work of the coils, without the
-    lag
-    of the estimated hand force.
+    lag of the estimated hand force.
 
     Args:
         numbers: Master.

@@ -173,10 +173,10 @@ def identify_operator(
         equalisation: `gain`, `lead`, `lag` or `integral`; by default the best fit is selected.
         source: name of the record in messages.
 
-        Returns:
+    Returns:
         The fit.
 
-        Raises:
+    Raises:
         InputError: the record is too short or too slow, or the hand does not respond to the target.
     """
     if equalisation is not None and equalisation not in EQUALISATIONS:
@@ -267,8 +267,7 @@ def _instrument(
     """Estimate the part of the error that the target causes, by least squares on `kept` rows.
 
     Each part of the record uses the response that is fitted to the other parts, so that its own
-    remnant
-    is not in its instrument (jackknife instrumental variables, Angrist et al. 1999).
+    remnant is not in its instrument (jackknife instrumental variables, Angrist et al. 1999).
     """
     apart = max(1, round(_TAP / step))
     lags = np.arange(0, round(_MEMORY / step), apart)

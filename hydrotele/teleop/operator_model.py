@@ -205,8 +205,7 @@ def pull(muscles, past, tremor, handle, tick, period):
         Nothing.
 
     Source: equilibrium-point control with a delayed integral; Feldman 1986. The rest position
-    follows
-        the reference through the neuromuscular lag; McRuer and Jex 1967.
+        follows the reference through the neuromuscular lag; McRuer and Jex 1967.
     """
     rows, lag = len(past), muscles.lag
     noise = tick % len(tremor)
@@ -297,8 +296,7 @@ class OperatorModel:
             pilot: teleoperation settings of the scenario.
             joystick: joystick with the parameters of the operator's hand.
             numbers: parameters of the master's control. The operator uses the joystick's springs,
-                dead
-                bands, detents and reflection, not the machine's response.
+                dead bands, detents and reflection, not the machine's response.
             seen: observable quantities, filled tick by tick.
             ticks: number of control periods.
             period: control period [s].

@@ -148,7 +148,7 @@ def test_every_structure_has_a_margin(reflection, mode):
     ("reflection", "mode", "message"),
     [
         ("four_channel", "rate", "observed hand force.*--structure four_channel_rate"),
-        ("wave_variables", "position", "as far as energy.*--structure wave_variables --robust"),
+        ("wave_variables", "position", "as received energy.*--structure wave_variables --robust"),
         ("passivity_control", "position", "--structure passivity_control --robust"),
         ("impedance", "rate", "identified and changes; .*direct_force"),
     ],

@@ -115,7 +115,7 @@ def test_a_force_serves_where_there_is_no_hand(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda r: r._replace(time=r.time[::-1]), "does not rise"),
+        (lambda r: r._replace(time=r.time[::-1]), "does not increase"),
         (lambda r: TrackingRecord(*(v[:1000] for v in r)), "20 s are needed"),
         (lambda r: TrackingRecord(*(v[::20] for v in r)), "10 are needed"),
         (lambda r: r._replace(hand=np.zeros(len(r.time))), "is constant"),
