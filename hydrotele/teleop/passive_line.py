@@ -113,10 +113,9 @@ def wave_slave(v, total, budget, stiffness, damping, b, period, end):
 def controlled_master(v, force, budget, mass, period, end):
     """Compute the force at the master's end under passivity control.
 
-    The motion of the mass in the next period is predicted from its speed and the channel's own
-    force.
+    The motion of the mass in the next period is predicted from its speed and the channel's force.
     A hand that pushes as well can still extract too much energy. A damper dissipates this excess in
-    the next periods, by at most stopping the mass within two periods.
+    the next periods; it is limited so that it at most stops the mass in two periods.
 
     Args:
         v: mean speed of the handle over the last period, scalar [m/s].

@@ -3,7 +3,7 @@
 Under rate control the handle displacement beyond the dead band commands the rate of the task
 coordinates, under position control their position. Limits of speed and acceleration keep the
 references continuous. With four channels or a passive channel, the forces of hand or channel and of
-the task move a virtual mass, because a valve-controlled machine does not yield by itself.
+the task move a virtual mass, because a valve-controlled machine is stiff against forces.
 
 Parameters and state of the slave side are named tuples of arrays that are contiguous in memory.
 """

@@ -383,7 +383,7 @@ class Station:
         if s.flags[BLOCKED] and "edge" not in self._said:
             self._say("edge", f"resolved motion held at the edge of the workspace at {now:.2f} s")
         if s.flags[SILENT] and "silent" not in self._said:
-            self._say("silent", f"no packet came for a while at {now:.2f} s: rates set to zero")
+            self._say("silent", f"packets are missing at {now:.2f} s: rates set to zero")
         why = ""
         if s.flags[TRIPPED]:
             error = np.abs(self._seen.joint[self.columns] - s.joint)

@@ -36,7 +36,7 @@ class Impedance:
     stiffness: float = 0.0
 
     def __call__(self, s: np.ndarray) -> np.ndarray:
-        """Impedance [N s/m] at complex frequencies [rad/s]."""
+        """Return the impedance [N s/m] at complex frequencies [rad/s]."""
         return self.mass * s + self.damping + self.stiffness / s
 
 

@@ -367,7 +367,7 @@ def test_a_dead_line_stops_the_machine_softly(mode):
     rate = run.station.log.slave("rate")[:, 2]
     stopped = round((1.0 + 0.15 + SPEEDS["z"] / 1.0) / PERIOD) + 2
     assert np.all(rate[stopped:] == 0.0)
-    assert any("no packet came" in note for note in run.summary["notes"])
+    assert any("packets are missing" in note for note in run.summary["notes"])
 
 
 @pytest.mark.nightly
