@@ -422,7 +422,7 @@ def loop_gain(
 
 
 def reference(case: Case) -> float:
-    """Return a reference impedance [N s/m]: the hand at its natural frequency, 1 if it is zero."""
+    """Return the reference impedance `sqrt(B^2 + M K)` of the hand [N s/m], 1 if it is zero."""
     hand = case.hand
     return math.hypot(hand.damping, math.sqrt(hand.mass * hand.stiffness)) or 1.0
 

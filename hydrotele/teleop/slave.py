@@ -2,8 +2,8 @@
 
 Under rate control the handle displacement beyond the dead band commands the rate of the task
 coordinates, under position control their position. Limits of speed and acceleration keep the
-references continuous. With four channels or a passive channel, the forces of hand or channel and of
-the task move a virtual mass, because a valve-controlled machine is stiff against forces.
+references continuous. A valve-controlled machine does not give way to forces. With four channels or
+a passive channel, the forces of hand or channel and of the task therefore move a virtual mass.
 
 Parameters and state of the slave side are named tuples of arrays that are contiguous in memory.
 """
