@@ -1,11 +1,11 @@
 """Psychophysical experiments with the simulated operator: discrimination of stiffness and force.
 
 The method of constant stimuli with two intervals is used. In every trial the handle is a reference
-and a comparison in random order. The operator moves each to a displacement, holds it, and
-reports which was stiffer (or stronger). The displacement varies from trial to trial, so that
-neither terminal force nor work is a cue. A cumulative normal through the responses gives the just noticeable difference.
-Muscles, tremor and perception are those of the simulated runs; the experiment uses only the
-responses.
+and a comparison in random order. The operator moves each to a displacement, holds it, and reports
+which was stiffer (or stronger). The displacement varies from trial to trial, so that neither
+terminal force nor work is a cue. A cumulative normal through the responses gives the just
+noticeable difference. Muscles, tremor and perception are those of the simulated runs; the
+experiment uses only the responses.
 
 Source: Tan et al. 1995, Perception & Psychophysics 57 (roving displacement).
 """

@@ -1,8 +1,9 @@
 """Worst case of stiffness feedback: a spring that is soft outwards and stiff inwards.
 
 If a spring's stiffness may change at any time between two bounds, this switching adds the most
-energy to the motion. At every point it turns the phase-plane path outwards as far as possible. A joystick that is stable with it is stable with every contact and delay within the bounds,
-for the given mass, damper and spring of the hand. Other hands need a separate analysis.
+energy to the motion. At every point it turns the phase-plane path outwards as far as possible. A
+joystick that is stable with it is stable with every contact and delay within the bounds, for the
+given mass, damper and spring of the hand. Other hands need a separate analysis.
 """
 
 import math
