@@ -1,1 +1,1 @@
-"""Haptic devices with force output: protocol, device servers, the reflection beside a machine."""
+"""Haptic devices with force output: protocol, device drivers, servers and force reflection."""

@@ -1,23 +1,22 @@
-"""What a haptic device is to its server: read the handle, write a wrench; and three of them.
+"""Haptic devices: the interface that a server needs, and three implementations of it.
 
-The simulated device is a handle of six axes with a mass and a light friction, stops at the ends of
-its travel, and a hand on it: a mass that a spring and a damper pull to where the person wants it.
+The simulated device is a handle with six axes, a mass, viscous friction and stops at the ends of
+its travel. A simulated operator's arm holds it: a mass that a spring and a damper pull to a
+reference pose.
 
-Force Dimension devices (omega, delta, sigma, lambda) through the DHD library.
-
+Force Dimension devices (omega, delta, sigma, lambda) are driven through the DHD library.
 The Python package `forcedimension-core` binds the vendor's SDK, which the vendor gives to owners of
-a device; neither is needed unless such a device is asked for. Not tried with hardware here: the
-adapter is tested against a stand-in of the package that records the calls.
+a device. Both are optional. The adapter has not been run with hardware: it is tested against a
+stand-in of the package that records the calls.
 
-Haption devices (Virtuose) through the vendor's VirtuoseAPI, bound by ctypes.
+Haption devices (Virtuose) are driven through the vendor's VirtuoseAPI, bound by ctypes.
+The library `libVirtuoseAPI` comes from the vendor with a device and is optional. The adapter has
+not been run with hardware: it is tested against a library with the same functions that records the
+calls. Functions, arguments and codes follow the vendor's header as public programs use it; axes and
+limits also come from secondary sources. Poses are measured from the handle's pose at the start, so
+that this pose is the centre.
 
-The library `libVirtuoseAPI` comes from the vendor with a device and is not needed unless such a
-device is asked for. Not tried with hardware here: the adapter is tested against a library of the
-same functions that records the calls. Functions, their arguments and codes are those of the
-vendor's header as public programs use it; axes and limits come at second hand, too.
-
-Its place is counted from its foot, so that the centre of the handle is where it is when the server
-starts. Axes of devices of both vendors: x towards the user, y to the right, z up.
+Device axes of both vendors: x towards the user, y to the right, z up.
 """
 
 import ctypes
@@ -31,18 +30,18 @@ import numpy as np
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
 
-_HESITATION = 1.0  # s from when a machine is in control until the simulated person moves
-_FINE = 4  # steps of the simulated handle per period: its stops turn over in 6 ms
+_HESITATION = 1.0  # s from the start of control until the simulated operator moves
+_FINE = 4  # integration steps per period: the contact with a stop has a time scale of 6 ms
 
 
 class Abilities(NamedTuple):
-    """What a device can do.
+    """Travel and output limits of a device.
 
     Attributes:
-        travel: either way from the centre [m].
-        rotation: either way [rad]; 0 for a device that does not tell or make rotations.
-        force: largest [N].
-        torque: largest [N m].
+        travel: half range from the centre [m].
+        rotation: half range [rad]; 0 for a device that does not measure or drive rotations.
+        force: maximum force [N].
+        torque: maximum torque [N m].
     """
 
     travel: float
@@ -52,12 +51,12 @@ class Abilities(NamedTuple):
 
 
 class HandlePose(NamedTuple):
-    """Where a handle is.
+    """Pose and buttons of a handle.
 
     Attributes:
-        place: (3,) from its centre [m]; x away from the user, y to the left, z up.
+        place: (3,) position from its centre [m]; x away from the user, y to the left, z up.
         quaternion: (4,) scalar first.
-        buttons: one per bit.
+        buttons: bit mask, one bit per button.
     """
 
     place: np.ndarray
@@ -66,15 +65,15 @@ class HandlePose(NamedTuple):
 
 
 class HapticDevice(Protocol):
-    """A device with force output that is open."""
+    """Interface of an open device with force output."""
 
     @property
     def abilities(self) -> Abilities:
-        """Travel and limits."""
+        """Travel and output limits of the device."""
         ...
 
     def read(self) -> HandlePose:
-        """Where the handle is now.
+        """Read the current pose of the handle.
 
         Raises:
             OSError: the device does not answer.
@@ -82,11 +81,11 @@ class HapticDevice(Protocol):
         ...
 
     def write(self, wrench: np.ndarray, on: bool) -> None:
-        """Put a wrench (6,) on the handle [N], [N m] until the next one.
+        """Apply a wrench (6,) [N], [N m] to the handle until the next call.
 
         Args:
             wrench: zero while no machine is in control.
-            on: whether one is.
+            on: whether a machine is in control.
 
         Raises:
             OSError: the device does not answer.
@@ -94,19 +93,19 @@ class HapticDevice(Protocol):
         ...
 
     def close(self) -> None:
-        """Take the force off and let go of it."""
+        """Switch the force off and close the device."""
         ...
 
 
 def within_limits(wrench: np.ndarray, abilities: Abilities) -> np.ndarray:
-    """A wrench no larger than a device may give; force and torque keep their directions.
+    """Limit a wrench to the maximum force and torque of a device, keeping both directions.
 
     Args:
         wrench: (6,) [N], [N m].
-        abilities: of the device.
+        abilities: limits of the device.
 
     Returns:
-        (6,), zero where the wrench is not finite.
+        (6,), zero if an element of the wrench is not finite.
 
     >>> within_limits(np.array([30.0, 0, 40.0, 0, 0, 0.1]), Abilities(0.05, 0.5, 5.0, 0.4)).tolist()
     [3.0, 0.0, 4.0, 0.0, 0.0, 0.1]
@@ -123,17 +122,17 @@ def within_limits(wrench: np.ndarray, abilities: Abilities) -> np.ndarray:
 
 @dataclass(frozen=True)
 class SimulatedFacts:
-    """A desktop device and the hand on it; every number an assumption of a usual size.
+    """Parameters of a desktop device and the operator's arm; all values are assumed typical values.
 
     Attributes:
-        abilities: travel and limits.
-        mass: of the handle [kg], and its moment of inertia [kg m^2].
-        friction: viscous [N s/m], [N m s/rad].
-        hand_mass: [kg], [kg m^2].
-        hand_damping: [N s/m], [N m s/rad].
-        hand_stiffness: [N/m], [N m/rad].
-        motion: amplitudes of where the person wants the handle, as shares of the travel [1].
-        frequency: of x, y, z, rx, ry, rz [Hz]; no two alike.
+        abilities: travel and output limits.
+        mass: mass of the handle [kg] and its moment of inertia [kg m^2].
+        friction: viscous friction of the handle [N s/m], [N m s/rad].
+        hand_mass: mass and inertia of the arm [kg], [kg m^2].
+        hand_damping: damping of the arm [N s/m], [N m s/rad].
+        hand_stiffness: stiffness of the arm [N/m], [N m/rad].
+        motion: amplitudes of the reference motion, as fractions of the travel [1].
+        frequency: frequencies of the reference motion for x, y, z, rx, ry, rz [Hz], all different.
     """
 
     abilities: Abilities = Abilities(0.06, 0.6, 12.0, 0.4)
@@ -147,14 +146,14 @@ class SimulatedFacts:
 
 
 class SimulatedDevice:
-    """A device without hardware; one period passes with every `read`."""
+    """Simulate a device without hardware; every call of `read` advances it by one period."""
 
     def __init__(self, period: float, facts: SimulatedFacts | None = None) -> None:
-        """The handle is at rest in its centre.
+        """Start with the handle at rest in its centre.
 
         Args:
-            period: [s].
-            facts: of device and hand.
+            period: time between two calls of `read` [s].
+            facts: parameters of device and arm.
         """
         f = facts or SimulatedFacts()
         self.facts, self._period = f, period
@@ -169,16 +168,16 @@ class SimulatedDevice:
 
     @property
     def abilities(self) -> Abilities:
-        """Travel and limits."""
+        """Travel and output limits of the device."""
         return self.facts.abilities
 
     @property
     def wrench(self) -> np.ndarray:
-        """(6,) that is put on the handle now [N], [N m]."""
+        """Wrench (6,) that is currently applied to the handle [N], [N m]."""
         return self._wrench
 
     def read(self) -> HandlePose:
-        """Where the handle is after one period more."""
+        """Advance the simulation by one period and return the handle's pose."""
         wanted = self._amplitude * np.sin(self._omega * max(0.0, self._time))
         _move(self._numbers, wanted, self._wrench, self._period, self._state)
         x = self._state[0]
@@ -188,18 +187,18 @@ class SimulatedDevice:
         return HandlePose(x[:3].copy(), quaternion, 0)
 
     def write(self, wrench: np.ndarray, on: bool) -> None:
-        """Put a wrench on the handle; a second after a machine is there, the person moves it."""
+        """Apply a wrench; the simulated operator moves 1 s after a machine takes control."""
         self._wrench[:] = wrench
         self._time = self._time + self._period if on else -_HESITATION
 
     def close(self) -> None:
-        """Take the force off."""
+        """Switch the force off."""
         self._wrench[:] = 0.0
 
 
 @compiled
 def _move(numbers, wanted, wrench, period, state):
-    """One period of handle and hand, axis by axis, by semi-implicit Euler steps."""
+    """Integrate handle and arm over one period, axis by axis, with semi-implicit Euler steps."""
     mass, friction, hand_mass, hand_damping, hand_stiffness, stop = numbers
     step = period / _FINE
     for _ in range(_FINE):
@@ -209,7 +208,7 @@ def _move(numbers, wanted, wrench, period, state):
             force += hand_stiffness[i] * (wanted[i] - x) - hand_damping[i] * v
             own = mass[i] + hand_mass[i]
             beyond = abs(x) - stop[i]
-            if beyond > 0.0:  # a stop turns over in 6 ms and takes the rebound away
+            if beyond > 0.0:  # stop: time scale of 6 ms, damped against rebound
                 quick = 2.0 * np.pi / 6e-3
                 force -= own * (quick * quick * (beyond if x > 0.0 else -beyond) + quick * v)
             v += step * force / own
@@ -218,38 +217,38 @@ def _move(numbers, wanted, wrench, period, state):
 
 
 _FORCE_DIMENSION = "--kind force-dimension"
-_FROM_DHD = np.diag([-1.0, -1.0, 1.0])  # half a turn about z
-# DHD's name of a device contains: travel [m], rotation [rad], force [N], torque [N m]. Forces and
-# torques of omega.7 and sigma.7 are those in CHAI3D's driver for them, the rest are assumptions;
-# none was checked against the vendor's data sheets.
+_FROM_DHD = np.diag([-1.0, -1.0, 1.0])  # rotation by 180 degrees about z
+# Limits by a part of the device's DHD name: travel [m], rotation [rad], force [N], torque [N m].
+# Forces and torques of omega.7 and sigma.7 are those of their CHAI3D driver, all others are
+# assumed. None was checked against the vendor's data sheets.
 _DHD_DEVICES = {
     "omega.3": Abilities(0.055, 0.0, 12.0, 0.0),
-    "omega.6": Abilities(0.055, 0.0, 12.0, 0.0),  # its wrist gives no torque
+    "omega.6": Abilities(0.055, 0.0, 12.0, 0.0),  # its wrist has no torque output
     "omega.7": Abilities(0.055, 0.0, 12.0, 0.0),
     "delta.3": Abilities(0.13, 0.0, 20.0, 0.0),
     "sigma.7": Abilities(0.065, 0.6, 12.0, 0.2),
     "lambda.7": Abilities(0.085, 0.6, 20.0, 0.4),
 }
-_DHD_LEAST = Abilities(0.05, 0.0, 8.0, 0.0)  # of a device that is none of these
+_DHD_LEAST = Abilities(0.05, 0.0, 8.0, 0.0)  # for a device that is not listed
 
 
 class ForceDimension:
-    """The first Force Dimension device that is connected."""
+    """Drive the first connected Force Dimension device."""
 
     def __init__(self, dhd: Any = None) -> None:
-        """Open it, with its gravity compensation and forces on.
+        """Open the device and switch on its gravity compensation and forces.
 
         Args:
-            dhd: the binding's module `dhd`; imported by default.
+            dhd: module `dhd` of the binding; imported by default.
 
         Raises:
-            InputError: package or SDK are missing, or no device is connected.
+            InputError: the package or the SDK is missing, or no device is connected.
         """
         self._dhd = dhd = dhd or _dhd_module()
         if dhd.open() < 0:
             why = dhd.errorGetLastStr()
             raise InputError(
-                _FORCE_DIMENSION, f"no device can be opened ({why}): connect it, switch it on"
+                _FORCE_DIMENSION, f"cannot open a device ({why}): connect it, switch it on"
             )
         name = str(dhd.getSystemName() or "").lower()
         known = [a for key, a in _DHD_DEVICES.items() if key in name]
@@ -259,12 +258,12 @@ class ForceDimension:
         self._place, self._turn = [0.0] * 3, [[0.0] * 3 for _ in range(3)]
 
     def read(self) -> HandlePose:
-        """Where the handle is now.
+        """Read the current pose of the handle.
 
         Raises:
             OSError: the device does not answer.
         """
-        # 0 or a positive code is success (the device tells that nothing is new), -1 is failure
+        # 0 or a positive code is success (positive: no new data), -1 is failure
         if self._dhd.getPositionAndOrientationFrame(self._place, self._turn) < 0:
             raise OSError(self._dhd.errorGetLastStr())
         turn = _FROM_DHD @ np.array(self._turn) @ _FROM_DHD.T
@@ -272,7 +271,7 @@ class ForceDimension:
         return HandlePose(_FROM_DHD @ np.array(self._place), _quaternion(turn), buttons)
 
     def write(self, wrench: np.ndarray, on: bool) -> None:
-        """Put a wrench on the handle.
+        """Apply a wrench to the handle.
 
         Raises:
             OSError: the device does not answer.
@@ -282,26 +281,26 @@ class ForceDimension:
             raise OSError(self._dhd.errorGetLastStr())
 
     def close(self) -> None:
-        """Take the force off and let go of it."""
+        """Switch the force off and close the device."""
         self._dhd.enableForce(False)
         self._dhd.close()
 
 
 def _dhd_module() -> Any:
-    """The module `dhd` of the binding."""
+    """Import the module `dhd` of the binding."""
     try:
         from forcedimension_core import dhd  # pyright: ignore[reportMissingImports] - optional
     except ImportError as error:
         message = (
             "needs the Force Dimension SDK and its Python package: install the SDK, set FDSDK to"
-            f" its folder, then pip install forcedimension-core ({error})"
+            f" its folder, then run pip install forcedimension-core ({error})"
         )
         raise InputError(_FORCE_DIMENSION, message) from None
     return dhd
 
 
 def _quaternion(turn: np.ndarray) -> np.ndarray:
-    """(4,), scalar first, of a rotation matrix."""
+    """Convert a rotation matrix to a quaternion (4,), scalar first."""
     import mujoco
 
     out = np.empty(4)
@@ -310,13 +309,13 @@ def _quaternion(turn: np.ndarray) -> np.ndarray:
 
 
 _HAPTION = "--kind haption"
-LIBRARY = "VIRTUOSE_API"  # environment variable with the library's file
-ADDRESS = "127.0.0.1#53210"  # where the vendor's service listens on the same computer
+LIBRARY = "VIRTUOSE_API"  # environment variable with the path of the library
+ADDRESS = "127.0.0.1#53210"  # address of the vendor's service on the same computer
 _IMPEDANCE, _NO_INDEXING = 3, 2  # COMMAND_TYPE_IMPEDANCE, INDEXING_NONE
 _BUTTONS = (1, 2)
-_FROM_VIRTUOSE = np.array([-1.0, -1.0, 1.0])  # half a turn about z
-# CHAI3D's driver has 30 N, 3 N m and 0.45 m for a Virtuose 6D. A third of it is what is given here
-# for hours: an assumption, not checked against a data sheet, as is the turning.
+_FROM_VIRTUOSE = np.array([-1.0, -1.0, 1.0])  # rotation by 180 degrees about z
+# CHAI3D's driver has 30 N, 3 N m and 0.45 m for a Virtuose 6D. A third of each is assumed for
+# continuous use. Neither this nor the rotation was checked against a data sheet.
 _ABILITIES = Abilities(travel=0.15, rotation=0.6, force=10.0, torque=1.0)
 _ARGUMENTS = {
     "virtOpen": (ctypes.c_char_p,), "virtClose": (ctypes.c_void_p,),
@@ -336,26 +335,26 @@ _ARGUMENTS = {
 
 
 class Haption:
-    """A Haption device at an address."""
+    """Drive a Haption device at a network address."""
 
     abilities = _ABILITIES
 
     def __init__(self, period: float, address: str = ADDRESS, library: Any = None) -> None:
-        """Open it, with its forces on.
+        """Open the device and switch on its forces.
 
         Args:
-            period: of the server [s].
-            address: of the vendor's service or of the device, `HOST#PORT`.
-            library: the vendor's library; the one that VIRTUOSE_API names by default.
+            period: period of the server [s].
+            address: address of the vendor's service or of the device, `HOST#PORT`.
+            library: the vendor's library; by default the one that VIRTUOSE_API names.
 
         Raises:
-            InputError: the library is missing, or no device answers there.
+            InputError: the library is missing, or no device answers at the address.
         """
         self._api = api = _bound(library or _virtuose())
         self._device = api.virtOpen(address.encode())
         if not self._device:
             message = f"no device answers at {address} ({self._why(None)}): start its service"
-            raise InputError(_HAPTION, f"{message}, or name it with --kind haption:HOST#PORT")
+            raise InputError(_HAPTION, f"{message}, or give its address: --kind haption:HOST#PORT")
         self._seven, self._six = (ctypes.c_float * 7)(), (ctypes.c_float * 6)()
         self._pressed = ctypes.c_int()
         frame = (ctypes.c_float * 7)(0, 0, 0, 0, 0, 0, 1)
@@ -370,11 +369,11 @@ class Haption:
             begun = self.read()
         except OSError as error:
             api.virtClose(self._device)
-            raise InputError(_HAPTION, f"does not take its settings ({error})") from None
+            raise InputError(_HAPTION, f"the device rejects its settings ({error})") from None
         self._centre, self._turned = begun.place, begun.quaternion * [1.0, -1.0, -1.0, -1.0]
 
     def read(self) -> HandlePose:
-        """Where the handle is now.
+        """Read the current pose of the handle.
 
         Raises:
             OSError: the device does not answer.
@@ -392,7 +391,7 @@ class Haption:
         )
 
     def write(self, wrench: np.ndarray, on: bool) -> None:
-        """Put a wrench on the handle.
+        """Apply a wrench to the handle.
 
         Raises:
             OSError: the device does not answer.
@@ -401,7 +400,7 @@ class Haption:
         self._done(self._api.virtSetForce(self._device, self._six))
 
     def close(self) -> None:
-        """Take the force off and let go of it."""
+        """Switch the force off and close the device."""
         self._six[:] = [0.0] * 6
         self._api.virtSetForce(self._device, self._six)
         self._api.virtSetPowerOn(self._device, 0)
@@ -417,10 +416,10 @@ class Haption:
 
 
 def _virtuose() -> Any:
-    """The vendor's library."""
+    """Load the vendor's library."""
     name = os.environ.get(LIBRARY) or ctypes.util.find_library("VirtuoseAPI")
     if not name:
-        message = f"needs the vendor's libVirtuoseAPI: install it, or set {LIBRARY} to its file"
+        message = f"needs the vendor's libVirtuoseAPI: install it, or set {LIBRARY} to its path"
         raise InputError(_HAPTION, message)
     try:
         return ctypes.CDLL(name)
@@ -429,7 +428,7 @@ def _virtuose() -> Any:
 
 
 def _bound(library: Any) -> Any:
-    """The library with the types of what is used."""
+    """Declare the argument and return types of the library functions that are called."""
     for name, arguments in _ARGUMENTS.items():
         try:
             function = getattr(library, name)
@@ -444,7 +443,7 @@ def _bound(library: Any) -> Any:
 
 
 def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Product (4,) of two quaternions, scalar first."""
+    """Multiply two quaternions (4,), scalar first."""
     import mujoco
 
     out = np.empty(4)

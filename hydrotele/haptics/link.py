@@ -1,13 +1,13 @@
-"""The machine's end of the line to a haptic device: the joystick's reflection at the device's rate.
+"""Connection from a simulated machine to a haptic device, with force reflection at device rate.
 
-A thread of compiled code, without Python's lock, answers every pose that comes with a wrench: the
-law of the joystick (`teleop.master`) with what the machine has sent last. The machine's simulation
-goes on beside it at its own rate; the two meet in a mailbox. The device's travel is scaled to that
-of the joystick, forces are not.
+A compiled thread that does not hold Python's global lock answers every pose packet with a wrench.
+It computes the wrench with the joystick's control law (`teleop.master`) from the machine's latest
+packet. The machine simulation runs concurrently at its own rate; both exchange data through a
+mailbox. The device's travel is scaled to that of the joystick; forces are not scaled.
 
-Safety: a device that is silent for `SILENT` leaves the machine without a command until its handle
-has been in its dead bands again. A machine that is silent fades what it reflects, then gives no
-force at all; forces come back over `RAMP`.
+Safety: if no pose arrives for `SILENT`, the machine gets no command until the handle has returned
+to its dead bands. If the machine sends nothing, first the reflection is switched off (`FADED`),
+then all force (`OFF`). Forces return over `RAMP`.
 """
 
 import socket
@@ -58,41 +58,41 @@ from hydrotele.teleop.master import (
 )
 
 SILENT = 0.05  # s without a pose after which the machine gets no command
-FADED = 0.05  # s without the machine after which nothing of it is reflected
-OFF = 0.15  # s without the machine after which there is no force
-RAMP = 0.3  # s over which forces come back
-# Others estimate the hand's force from the mass of the joystick's own flotor, or keep what is on
-# the line in the state of one master.
+FADED = 0.05  # s without machine data after which nothing is reflected
+OFF = 0.15  # s without machine data after which the force is zero
+RAMP = 0.3  # s over which forces return
+# The other structures estimate the operator's force from the mass of the joystick's own flotor, or
+# keep the state of the communication channel in the state of one master.
 REFLECTIONS = ("none", "stiffness", "direct_force", "coordinating_force", "impedance")
-_ASK = 100_000_000  # ns between two requests to be served
-_WAIT = 0.005  # s that the thread waits for a pose before it looks whether it is over
-_CENTRED = 0.1  # of its reach: where an axis without a dead band counts as centred
-_SAMPLES = 700_000  # times that are kept: 11 minutes of 1 kHz
+_ASK = 100_000_000  # ns between two connection requests
+_WAIT = 0.005  # s that the thread waits for a pose before it checks the stop flag
+_CENTRED = 0.1  # dead band of an axis that has none, as a fraction of its range
+_SAMPLES = 700_000  # number of times that are kept: 11 minutes at 1 kHz
 _SENT_KEPT = 1024
 _PRIORITY = 30
 
-# places in `Line.count`
+# indices into `Line.count`
 (STOP, SESSION_OF, LAST, NEXT, TAKEN_LAST, RECEIVED, LOST, LATE, MALFORMED, STARTS, ASKED, SENT_AT,
  ANSWERS, ROUNDS, INTERVALS, CAME_AT) = range(16)  # fmt: skip
-# places in `Line.ramp`
+# indices into `Line.ramp`
 GAIN, SCALE, TURN_SCALE = range(3)
 
 
 class Line(NamedTuple):
-    """What the thread works with.
+    """Buffers, counters and recorded times of the thread.
 
     Attributes:
-        pose: (21,) the packet that came, as integers; pose_real: as reals.
-        pose_real: see above.
-        reply: (12,) the packet to send; reply_real: as reals.
-        reply_real: see above.
-        count: (16,) numbers of the line, see the places above [1], [ns].
-        ramp: (3,) share of the forces that is given, scale of places and of turns.
-        sent: (1024,) when a wrench was sent, by its sequence number [ns].
-        answers: (n,) time from a pose's arrival until its answer was sent [ns].
-        rounds: (n,) time from a wrench's sending until a pose said that it was taken [ns].
+        pose: (21,) received packet as integers.
+        pose_real: (21,) the same memory as reals.
+        reply: (12,) packet to send as integers.
+        reply_real: (12,) the same memory as reals.
+        count: (16,) counters and times, see the indices above [1], [ns].
+        ramp: (3,) factor on the forces, scale of positions, scale of rotations.
+        sent: (1024,) send time of a wrench, by its sequence number [ns].
+        answers: (n,) time from the arrival of a pose to the sending of its answer [ns].
+        rounds: (n,) time from the sending of a wrench to the first pose that acknowledges it [ns].
         intervals: (n,) time between two poses [ns].
-        reach: (2,) of the joystick [m], [rad].
+        reach: (2,) range of the joystick [m], [rad].
     """
 
     pose: np.ndarray
@@ -109,17 +109,17 @@ class Line(NamedTuple):
 
 
 class Mailbox(NamedTuple):
-    """Where thread and simulation meet; an odd turn says that its part is being written.
+    """Memory shared by thread and simulation; an odd `turn` marks a part that is being written.
 
     Attributes:
-        turn: (2,) of the handle's part and of the machine's.
-        stamp: (2,) when a part was written [ns]; 0 before.
-        handle: (8,) pose of the handle on the joystick's scale [m], quaternion, and its buttons.
-        packet: (rows, k) what came from the machine, see `teleop.master`.
-        share: (1,) of the packet that counts.
-        extra: (6,) further force on the handle [N], [N m].
+        turn: (2,) version counters of the handle's part and of the machine's.
+        stamp: (2,) time at which a part was written [ns]; 0 before the first time.
+        handle: (8,) position in joystick scale [m], quaternion, buttons.
+        packet: (rows, k) packet from the machine, see `teleop.master`.
+        share: (1,) factor on the packet.
+        extra: (6,) additional force on the handle [N], [N m].
         numbers: flat Master.
-        state: flat MasterState, the thread's own.
+        state: flat MasterState of the thread.
     """
 
     turn: np.ndarray
@@ -146,21 +146,21 @@ _MONOTONIC = clock.CLOCK_MONOTONIC
 
 @compiled
 def _now(two):
-    """The clock of `time.monotonic_ns` [ns]; the call keeps other memory from being cached."""
+    """Return the time of `time.monotonic_ns` [ns] and prevent caching of the shared memory."""
     _gettime(np.int32(_MONOTONIC), two.ctypes.data)
     return two[0] * 1_000_000_000 + two[1]
 
 
 @compiled
 def scaled_pose(place, quaternion, scale, turn_scale, out):
-    """Pose of a device's handle on the joystick's scale.
+    """Scale the pose of a device's handle to the range of the joystick.
 
     Args:
-        place: (3,) [m].
+        place: (3,) position [m].
         quaternion: (4,) scalar first.
-        scale: of places, scalar.
-        turn_scale: of the angle of turning, scalar.
-        out: (>= 7,) written: place [m] and quaternion.
+        scale: factor on the position, scalar.
+        turn_scale: factor on the rotation angle, scalar.
+        out: (>= 7,) written: position [m] and quaternion.
 
     Returns:
         Nothing.
@@ -182,16 +182,16 @@ def scaled_pose(place, quaternion, scale, turn_scale, out):
 
 @compiled
 def answer_pose(line, box, now, two):
-    """Answer a pose: the joystick's law at the device's rate.
+    """Compute the wrench that answers a pose, with the joystick's control law.
 
     Args:
-        line: Line; `pose` has come. `reply`, `count` and `ramp` are written.
+        line: Line with the received `pose`. `reply`, `count` and `ramp` are written.
         box: Mailbox; the handle's part and `state` are written.
-        now: when it came, scalar [ns].
+        now: arrival time, scalar [ns].
         two: (2,) work space of the clock.
 
     Returns:
-        Whether `reply` is to be sent.
+        Whether `reply` must be sent.
 
     Source: `teleop.master`; this module.
     """
@@ -199,7 +199,7 @@ def answer_pose(line, box, now, two):
     if pose[MAGIC] != POSE_MAGIC or not real[PERIOD] > 0.0:
         count[MALFORMED] += 1
         return False
-    if pose[SESSION] != count[SESSION_OF]:  # a server that has just started
+    if pose[SESSION] != count[SESSION_OF]:  # the server was restarted
         count[SESSION_OF], count[LAST], count[NEXT], count[TAKEN_LAST] = pose[SESSION], -1, 0, -1
         count[STARTS] += 1
         line.ramp[GAIN] = 0.0
@@ -241,7 +241,7 @@ def answer_pose(line, box, now, two):
 
 @compiled
 def _reflected(line, box, now, two, first, period):
-    """Put the pose into the mailbox, and the law's push into the thread's state."""
+    """Write the pose into the mailbox and compute the handle's force in the thread's state."""
     real = line.pose_real
     scale = line.reach[0] / real[TRAVEL] if real[TRAVEL] > 0.0 else 0.0
     turns = line.reach[1] / real[TRAVEL + 1] if real[TRAVEL + 1] > 0.0 else 0.0
@@ -256,7 +256,7 @@ def _reflected(line, box, now, two, first, period):
     box.turn[_HANDLE] += 1
     packet, state = np.empty(box.packet.shape), unpack_master_state(box.state)
     share, when = 0.0, np.int64(0)
-    for _ in range(8):  # the machine writes for a microsecond once in a millisecond
+    for _ in range(8):  # retry: the machine writes for 1 us in every 1 ms
         turn = box.turn[_MACHINE]
         _now(two)
         packet[:] = box.packet
@@ -281,7 +281,7 @@ def _answer_all(handle, line, box):
     while count[STOP] == 0:
         got = _recv(np.int32(handle), line.pose.ctypes.data, size, np.int32(0))
         now = _now(two)
-        if now - max(count[ASKED], count[CAME_AT]) > _ASK:  # nobody is there, or has forgotten us
+        if now - max(count[ASKED], count[CAME_AT]) > _ASK:  # no server, or client dropped
             line.reply[:] = 0
             line.reply[MAGIC], line.reply[SENT] = WRENCH_MAGIC, now
             count[ASKED] = now
@@ -308,15 +308,15 @@ _MACHINE_MAIL = np.dtype(
 
 @compiled
 def take_pose(mail, now, pose):
-    """Take the handle's pose out of the mailbox.
+    """Read the handle's pose from the mailbox.
 
     Args:
         mail: (1,) record of a Mailbox and of the dead bands.
-        now: scalar [ns].
-        pose: (8,) written: place on the joystick's scale [m], quaternion, buttons.
+        now: current time, scalar [ns].
+        pose: (8,) written: position in joystick scale [m], quaternion, buttons.
 
     Returns:
-        Whether there is one, not older than `SILENT`.
+        Whether the pose is finite and not older than `SILENT`.
 
     Source: this module.
     """
@@ -335,19 +335,19 @@ def take_pose(mail, now, pose):
 
 @compiled
 def meet(mail, qpos, packet, share, extra, engaged, now):
-    """The machine's turn at the mailbox: leave what is to be reflected, take the pose.
+    """Write the machine's data into the mailbox and read the handle's pose.
 
     Args:
         mail: see `take_pose`.
         qpos: (7,) written, see `Link.exchange`.
         packet: (rows, k) see `Link.exchange`.
-        share: of it that counts, scalar.
-        extra: (6,) further force on the handle [N], [N m].
+        share: factor on the packet, scalar.
+        extra: (6,) additional force on the handle [N], [N m].
         engaged: whether the handle has been in its dead bands, scalar.
-        now: scalar [ns].
+        now: current time, scalar [ns].
 
     Returns:
-        Whether it is or has been there.
+        Whether the pose is valid and the handle is or has been in its dead bands.
 
     Source: this module.
     """
@@ -369,7 +369,7 @@ def meet(mail, qpos, packet, share, extra, engaged, now):
 
 @compiled
 def _centred(pose, dead):
-    """Whether no axis of the joystick would command anything."""
+    """Return whether all axes of the joystick are in their dead bands."""
     for i in range(3):
         if not (abs(pose[i]) <= dead[i] and 2.0 * abs(pose[4 + i]) <= dead[3 + i]):
             return False
@@ -377,17 +377,17 @@ def _centred(pose, dead):
 
 
 class Link:
-    """The line to a device, open from the beginning; the thread runs from `start` to `close`."""
+    """Connect to a device; the thread answers poses from `start` until `close`."""
 
     def __init__(self, host: str, port: int) -> None:
-        """Open a socket; whether somebody is there is told later.
+        """Open a socket; the server is contacted later.
 
         Args:
             host: name or address of the device's server.
-            port: its port.
+            port: port of the server.
 
         Raises:
-            InputError: there is no such host.
+            InputError: the host does not exist.
         """
         where = f"--device haptic:{host}:{port}"
         try:
@@ -409,19 +409,19 @@ class Link:
         self._before = np.zeros(2, np.int64)
 
     def start(self, numbers: Master, like: MasterState, rows: tuple[int, ...]) -> None:
-        """Begin to answer poses.
+        """Start the thread that answers poses.
 
         Args:
-            numbers: of the master's control.
-            like: a state of it, which the thread's own is like.
+            numbers: parameters of the master's control law.
+            like: a master state; the thread's own state gets the same shapes.
             rows: shape of the machine's packets.
 
         Raises:
-            InputError: the structure needs more than a pose and the machine's packet.
+            InputError: the structure needs more data than a pose and the machine's packet.
         """
         kind = KINDS[int(numbers.kind[0])]
         if kind not in REFLECTIONS:
-            message = f"{kind!r} does not go with a haptic device; valid: {', '.join(REFLECTIONS)}"
+            message = f"{kind!r} does not support haptic devices; valid: {', '.join(REFLECTIONS)}"
             raise InputError("pilot.reflection", message)
         state = flat_state(MasterState, [part.shape for part in like])
         state.limited[:] = 1.0
@@ -435,13 +435,13 @@ class Link:
             numbers.axis[:, DEADBAND] > 0.0, numbers.axis[:, DEADBAND],
             _CENTRED * numbers.axis[:, REACH],
         )  # fmt: skip
-        self._dead[numbers.axis[:, COORDINATE] < 0.0] = np.inf  # moves nothing
+        self._dead[numbers.axis[:, COORDINATE] < 0.0] = np.inf  # axes without a command
         shared = ("turn", "stamp", "handle", "packet", "share", "extra")
         arrays = {name: getattr(self.box, name) for name in shared}
         self._mail = address_record(_MACHINE_MAIL, {**arrays, "dead": self._dead})
         self._mail["rows"], self._mail["columns"] = rows
         self.line.count[STOP] = 1
-        _answer_all(self._socket.fileno(), self.line, self.box)  # compiles
+        _answer_all(self._socket.fileno(), self.line, self.box)  # triggers compilation
         self.line.count[STOP] = 0
         seconds = int(_WAIT), round(1e6 * (_WAIT % 1.0))
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _timeval(*seconds))
@@ -455,33 +455,33 @@ class Link:
     def exchange(
         self, qpos: np.ndarray, packet: np.ndarray, share: float, extra: np.ndarray
     ) -> None:
-        """What the machine does once per tick: take the pose, leave what is to be reflected.
+        """Exchange data with the device once per tick: read the pose, send the machine's packet.
 
         Args:
-            qpos: (7,) written: the handle on the joystick's scale [m], quaternion; not a number
-                while nobody is there, or until the handle has been in its dead bands again.
-            packet: what came from the machine.
-            share: of it that counts.
-            extra: (6,) further force on the handle [N], [N m].
+            qpos: (7,) written: handle position in joystick scale [m], quaternion; NaN while no
+                device is connected, or until the handle has returned to its dead bands.
+            packet: packet from the machine.
+            share: factor on the packet.
+            extra: (6,) additional force on the handle [N], [N m].
         """
         now = clock.monotonic_ns()
         self.engaged = meet(self._mail, qpos, packet, share, extra, self.engaged, now)
 
     def pose(self) -> HandlePose | None:
-        """The handle on the joystick's scale; None while no pose comes."""
+        """Return the handle's pose in joystick scale, None while no pose arrives."""
         values = np.empty(8)
         if not take_pose(self._mail, clock.monotonic_ns(), values):
             return None
         return HandlePose(values[:3], values[3:7], int(values[7]))
 
     def restart_figures(self) -> None:
-        """Forget what the line has seen so far, such as a device that waited for the machine."""
+        """Reset the statistics, for example after the device has waited for the machine."""
         line = self.line
         line.count[[ANSWERS, ROUNDS, INTERVALS, RECEIVED, LOST, LATE, MALFORMED]] = 0
         self._before = line.pose[[MISSED, UNANSWERED]]
 
     def figures(self) -> dict[str, Any]:
-        """What the line has seen: counts, and times as of `timing.summary_of`."""
+        """Return the statistics: counts, and times as from `timing.summary_of`."""
         line, count = self.line, self.line.count
         return {
             "poses": int(count[RECEIVED]),
@@ -498,7 +498,7 @@ class Link:
         }
 
     def close(self) -> None:
-        """End the thread; the device then goes limp."""
+        """Stop the thread; the device then switches its force off."""
         self.line.count[STOP] = 1
         if self._thread:
             self._thread.join()
@@ -507,7 +507,7 @@ class Link:
 
 
 def _timeval(seconds: int, microseconds: int) -> bytes:
-    """A `struct timeval` of C."""
+    """Pack a C `struct timeval`."""
     import struct
 
     return struct.pack("@ll", seconds, microseconds)

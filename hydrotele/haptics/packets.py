@@ -1,26 +1,26 @@
 """Packets between a haptic device and a machine: UDP, words of 8 bytes, little-endian.
 
-The device's server sends a pose every period, the machine answers every pose with a wrench. Both
-carry a sequence number and the time of sending; what is older than what was taken before is
-dropped. A session number, drawn when the server starts, tells a server that was started anew from
-packets that come late.
+The device's server sends a pose every period; the machine answers every pose with a wrench. Both
+packets carry a sequence number and a send time; a packet that is older than the last accepted one
+is dropped. The server draws a session number at its start, so that late packets of an earlier
+session are recognised.
 
 | word | pose packet (21 words) | word | wrench packet (12 words) |
 | ---: | --- | ---: | --- |
 | 0 | "HTPOSE01" | 0 | "HTWRCH01" |
-| 1 | session | 1 | session that it answers, 0 to open one |
+| 1 | session | 1 | session that it answers, 0 to start one |
 | 2 | sequence | 2 | sequence |
-| 3 | time of sending, device's clock [ns] | 3 | time of sending, machine's clock [ns] |
+| 3 | send time, device's clock [ns] | 3 | send time, machine's clock [ns] |
 | 4 | buttons, one per bit | 4 | sequence of the pose that it answers |
-| 5 | sequence of the last wrench taken, -1 for none | 5 | 1: forces on, 0: the device goes limp |
+| 5 | sequence of the last accepted wrench, -1 for none | 5 | 1: forces on, 0: forces off |
 | 6 | periods that the device has missed | 6-8 | force on the handle [N] |
-| 7 | periods that began without the answer to the last pose | 9-11 | torque on it [N m] |
-| 8-10 | place of the handle from its centre [m] | | |
+| 7 | periods that started without the answer to the last pose | 9-11 | torque on it [N m] |
+| 8-10 | position of the handle from its centre [m] | | |
 | 11-14 | quaternion of its orientation, scalar first | | |
-| 15, 16 | travel either way [m], [rad]; 0 rad: no rotation | | |
-| 17, 18 | largest force [N] and torque [N m] | | |
+| 15, 16 | half range of travel [m], rotation [rad]; 0 rad: no rotation | | |
+| 17, 18 | maximum force [N] and torque [N m] | | |
 | 19 | period of the device [s] | | |
-| 20 | 1: the device gives forces, 0: it cannot now | | |
+| 20 | 1: the device applies forces, 0: it currently cannot | | |
 
 Words 0 to 7 of a pose and 0 to 5 of a wrench are signed integers, all others IEEE doubles. Axes: x
 away from the user, y to the left, z up.
@@ -33,21 +33,21 @@ import numpy as np
 POSE_MAGIC = int.from_bytes(b"HTPOSE01", "little")
 WRENCH_MAGIC = int.from_bytes(b"HTWRCH01", "little")
 POSE_WORDS, WRENCH_WORDS = 21, 12
-# words of both
+# indices of words in both packets
 MAGIC, SESSION, SEQUENCE, SENT = range(4)
-# words of a pose
+# indices of words in a pose
 BUTTONS, TAKEN, MISSED, UNANSWERED, PLACE = range(4, 9)
 QUATERNION, TRAVEL, MOST, PERIOD, ABLE = 11, 15, 17, 19, 20
-# words of a wrench
+# indices of words in a wrench
 ANSWERED, ON, WRENCH = range(4, 7)
 
 
 class Packet(NamedTuple):
-    """One packet in memory, seen in two ways.
+    """Memory of one packet with an integer and a real view.
 
     Attributes:
-        whole: (n,) int64.
-        real: (n,) float64, the same memory.
+        whole: (n,) int64 view.
+        real: (n,) float64 view of the same memory.
     """
 
     whole: np.ndarray
@@ -55,15 +55,15 @@ class Packet(NamedTuple):
 
     @property
     def raw(self) -> memoryview:
-        """The bytes, to send or to receive into."""
+        """Byte view of the packet, for sending and receiving."""
         return self.whole.data.cast("B")
 
 
 def packet(words: int) -> Packet:
-    """An empty packet.
+    """Create a packet of zeros.
 
     Args:
-        words: its length.
+        words: length in words of 8 bytes.
 
     >>> p = packet(2)
     >>> p.real[1] = 1.0

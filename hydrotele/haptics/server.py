@@ -1,9 +1,9 @@
-"""Server of a haptic device: reads the handle and writes a wrench once per period, over UDP.
+"""Server of a haptic device: reads the handle and applies a wrench once per period, over UDP.
 
-One machine at a time is served, the one that asked last while none was there. Safety lies here,
-next to the hardware: a wrench is cut to what the device may give; one that is no number, comes out
-of order, or answers a pose of long ago is not taken; and if none is taken for `WATCHDOG`, or the
-machine says that it is not in control, the device goes limp.
+It serves one machine at a time: the last one that asked while no other was connected. The safety
+checks are here, next to the hardware. A wrench is limited to the device's maximum. A wrench that is
+not finite, arrives out of order or answers an old pose is rejected. The force is switched off if no
+wrench is accepted for `WATCHDOG`, or if the machine reports that it is not in control.
 """
 
 import contextlib
@@ -53,11 +53,11 @@ from hydrotele.haptics.packets import (
 from hydrotele.haptics.timing import SPIN, load_of_machine, steady, summary_of
 
 PORT = 5610
-WATCHDOG = 0.02  # s without a wrench after which the device goes limp
-STALE = 0.02  # s: a wrench that answers an older pose is not taken
-FORGET = 1.0  # s of silence after which another machine may come
+WATCHDOG = 0.02  # s without a wrench after which the force is switched off
+STALE = 0.02  # s: a wrench that answers an older pose is rejected
+FORGET = 1.0  # s without packets after which another machine may connect
 _PRIORITY = 40
-_SAMPLES = 700_000  # times that are kept: 11 minutes of 1 kHz
+_SAMPLES = 700_000  # number of times that are kept: 11 minutes at 1 kHz
 
 _REFUSALS = ("malformed", "stranger", "session", "late", "stale")
 
@@ -65,18 +65,18 @@ Address = tuple[str, int]
 
 
 class ServerSummary(NamedTuple):
-    """What a server has seen.
+    """Statistics of a server run.
 
     Attributes:
-        periods: that it had to make.
-        missed: periods that were skipped or began more than a period late.
-        unanswered: periods that began without the answer to the pose before, while served.
-        refused: packets that were not taken, by reason.
-        limp: how often the watchdog took the force off.
-        wake: how late periods began, see `summary_of`.
-        round_trip: pose sent to its answer received, see `summary_of`.
-        priority: whether the system gave it.
-        load: of the computer, see `load_of_machine`.
+        periods: number of periods.
+        missed: number of periods that were skipped or started more than a period late.
+        unanswered: number of periods that started without the answer to the previous pose.
+        refused: number of rejected packets, by reason.
+        limp: number of times that the watchdog switched the force off.
+        wake: delay of the start of a period, see `summary_of`.
+        round_trip: time from sending a pose to receiving its answer, see `summary_of`.
+        priority: whether real-time priority was granted.
+        load: load averages of the computer, see `load_of_machine`.
     """
 
     periods: int
@@ -91,26 +91,26 @@ class ServerSummary(NamedTuple):
 
 
 class Exchange:
-    """What passes between a device and a machine; knows no socket and no clock.
+    """Protocol state between a device and a machine, independent of sockets and clocks.
 
     Attributes:
-        pose: the packet to send.
-        wrench: (6,) that the device shall give now [N], [N m].
-        client: whom it serves, None for nobody.
-        refused: packets that were not taken, by reason.
-        limp: how often the watchdog took the force off.
-        unanswered: periods that began without the answer to the pose before.
-        missed: periods that the device has missed.
-        answered: sequence number of the last pose that was answered.
+        pose: packet to send.
+        wrench: (6,) wrench that the device must apply now [N], [N m].
+        client: address of the connected machine, None without one.
+        refused: number of rejected packets, by reason.
+        limp: number of times that the watchdog switched the force off.
+        unanswered: number of periods that started without the answer to the previous pose.
+        missed: number of periods that the device has missed.
+        answered: sequence number of the last answered pose.
     """
 
     def __init__(self, device: HapticDevice, period: float, session: int) -> None:
-        """Nobody is served yet.
+        """Start without a connected machine.
 
         Args:
             device: the device.
-            period: of the server [s].
-            session: a number that no other start of a server has.
+            period: period of the server [s].
+            session: number that is unique to this start of the server.
         """
         self._device, self._a = device, device.abilities
         self.pose, self._answer = packet(POSE_WORDS), packet(WRENCH_WORDS)
@@ -125,12 +125,12 @@ class Exchange:
         self._on, self.answered = False, -1
 
     def next_pose(self, now: int) -> None:
-        """Read the handle, give the wrench; `pose` is then ready to be sent.
+        """Apply the wrench and read the handle into `pose`, which can then be sent.
 
         Args:
-            now: the clock [ns].
+            now: current time [ns].
 
-        A device that does not answer is said to be unable, and gets no wrench until it does.
+        A device that does not answer is reported as unable and gets a zero wrench until it answers.
         """
         whole, real = self.pose
         if self.client and whole[SEQUENCE] >= 0 and self.answered < whole[SEQUENCE]:
@@ -154,22 +154,22 @@ class Exchange:
         whole[MISSED], whole[UNANSWERED] = self.missed, self.unanswered
 
     def take(self, data: bytes | memoryview, sender: Address, now: int) -> bool:
-        """Take a packet of a machine, if it may be taken.
+        """Check a packet from a machine and accept it if it is valid.
 
         Args:
-            data: its bytes.
-            sender: where it came from.
-            now: the clock [ns].
+            data: bytes of the packet.
+            sender: address of the sender.
+            now: current time [ns].
 
         Returns:
-            Whether it was taken.
+            Whether the packet was accepted.
         """
         why = self._refusal(data, sender)
         if why:
             self.refused[why] += 1
             return False
         whole, real = self._answer
-        if whole[SESSION] == 0:  # asks to be served
+        if whole[SESSION] == 0:  # connection request
             self.client, self._last, self._heard = sender, -1, now
             self.answered, self._on = int(self.pose.whole[SEQUENCE]), False
             self.wrench[:] = 0.0
@@ -180,7 +180,7 @@ class Exchange:
         return True
 
     def _refusal(self, data, sender: Address) -> str:
-        """Why a packet is not taken; it is in `_answer` if it is."""
+        """Return the reason to reject a packet, or an empty string; parse it into `_answer`."""
         if len(data) != 8 * WRENCH_WORDS:
             return "malformed"
         self._answer.raw[:] = data
@@ -203,17 +203,17 @@ def serve(
     device: HapticDevice, address: Address, period: float, over: Callable[[], bool],
     opened: Callable[[Address], None] = lambda where: None,
 ) -> ServerSummary:  # fmt: skip
-    """Serve a device until it is over.
+    """Run the server of a device until `over` returns true.
 
     Args:
-        device: the device; it is limp afterwards, and still open.
-        address: to listen on; port 0 takes a free one.
-        period: [s].
-        over: asked once per period whether it is over.
-        opened: told where it listens.
+        device: the device; its force is off afterwards, and it stays open.
+        address: address to listen on; port 0 selects a free port.
+        period: period of the server [s].
+        over: called once per period; returns whether to stop.
+        opened: called with the address that the server listens on.
 
     Returns:
-        What it has seen.
+        Statistics of the run.
 
     Raises:
         InputError: the address cannot be used.
@@ -224,7 +224,7 @@ def serve(
     except OSError as error:
         line.close()
         where = f"--host {address[0]} --port {address[1]}"
-        raise InputError(where, f"cannot be listened on ({error.strerror or error})") from None
+        raise InputError(where, f"cannot be used as address ({error.strerror or error})") from None
     line.setblocking(False)
     exchange = Exchange(device, period, secrets.randbits(62) + 1)
     opened(line.getsockname())
@@ -240,7 +240,7 @@ def serve(
 def _periods(
     line: socket.socket, exchange: Exchange, period: float, over: Callable[[], bool]
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """One period after the other; how late they began and how long answers took [ns]."""
+    """Run one period after the other; return start delays [ns], answer times [ns], period count."""
     wake, trips = np.zeros(_SAMPLES, np.int64), np.zeros(_SAMPLES, np.int64)
     step, spin, now = round(1e9 * period), round(1e9 * SPIN), clock.monotonic_ns
     count = answers = 0
@@ -248,7 +248,7 @@ def _periods(
     view = memoryview(data)
     due = now() + step
     while not over():
-        while True:  # until the period begins, answers are taken as they come
+        while True:  # receive answers until the period starts
             left = due - now()
             if left <= 0:
                 break
@@ -260,7 +260,7 @@ def _periods(
         exchange.next_pose(began)
         count += 1
         if exchange.client:
-            with contextlib.suppress(OSError):  # nobody listens any more: the watchdog sees to it
+            with contextlib.suppress(OSError):  # no listener: the watchdog handles it
                 line.sendto(raw, exchange.client)
         skipped = max(0, (now() - due) // step)
         exchange.missed += skipped
@@ -269,10 +269,10 @@ def _periods(
 
 
 def _receive(line: socket.socket, exchange: Exchange, view: memoryview, trip, now) -> int:
-    """Take one packet if there is one; whether it answered the pose of this period."""
+    """Receive one packet, if any, and return whether it answered the pose of this period."""
     try:
         size, sender = line.recvfrom_into(view)
-    except OSError:  # nothing there, or the one before could not be delivered
+    except OSError:  # no packet, or the previous one could not be delivered
         return 0
     came = now()
     if not exchange.take(view[:size], sender, came):
@@ -284,7 +284,7 @@ def _receive(line: socket.socket, exchange: Exchange, view: memoryview, trip, no
 
 
 def announce(where: Address) -> None:
-    """Tell the process that waits for it, in one line of JSON, where a server listens."""
+    """Print the address of a server as one line of JSON, for the process that waits for it."""
     sys.stdout.write(json.dumps({"host": where[0], "port": where[1]}) + "\n")
     sys.stdout.flush()
 
@@ -296,14 +296,14 @@ def open_haptic(kind: str, period: float) -> HapticDevice:
     """Open a device for its server.
 
     Args:
-        kind: one of KINDS; `haption:HOST#PORT` for a device elsewhere.
-        period: of the server [s].
+        kind: one of KINDS; `haption:HOST#PORT` for a device at another address.
+        period: period of the server [s].
 
     Returns:
-        The device.
+        The open device.
 
     Raises:
-        InputError: no such kind, what it needs is not installed, or it is not connected.
+        InputError: the kind is not known, its software is missing, or no device is connected.
     """
     if kind == "simulated":
         return SimulatedDevice(period)
@@ -312,4 +312,4 @@ def open_haptic(kind: str, period: float) -> HapticDevice:
     name, _, address = kind.partition(":")
     if name == "haption":
         return Haption(period, address or ADDRESS)
-    raise InputError(f"--kind {kind}", f"is no haptic device; valid: {', '.join(KINDS)}")
+    raise InputError(f"--kind {kind}", f"is not a haptic device; valid: {', '.join(KINDS)}")

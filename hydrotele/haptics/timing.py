@@ -1,11 +1,11 @@
-"""Keeping a period of a millisecond: absolute deadlines, priority, and what was missed.
+"""Tools to keep a period of 1 ms: absolute deadlines, real-time priority, missed-tick statistics.
 
-A process that has a deadline every millisecond sleeps until shortly before it and spins over the
-rest, since a sleeping process wakes some 50 us late. Python's garbage collector is off meanwhile,
-and idle processors stay awake where the system permits it: one that sleeps, or that a virtual
-machine has handed back to its host, wakes up to milliseconds late.
-What a loop without work misses, and the time that a virtual machine's host takes from it, tell what
-the computer can hold at all.
+A process with a deadline every millisecond sleeps until shortly before it and then busy-waits,
+since a sleeping process wakes about 50 us late. Python's garbage collector is off during this time.
+Where the system permits it, idle processors are kept awake: a processor that sleeps, or that a
+virtual machine has returned to its host, wakes up to milliseconds late.
+Two measurements show the limits of the computer: the deadlines that an empty loop misses, and the
+time that the host takes from a virtual machine.
 """
 
 import contextlib
@@ -18,23 +18,23 @@ from pathlib import Path
 
 import numpy as np
 
-SPIN = 120e-6  # s before a deadline in which a process stays awake
+SPIN = 120e-6  # s before a deadline during which a process busy-waits
 PERCENTILES = (50.0, 90.0, 99.0, 99.9, 100.0)
 EDGES = (10, 20, 50, 100, 200, 500, 1000, 2000, 5000)  # us, of histograms
 _SLACK, _NO_HUGE_PAGES = 29, 41  # PR_SET_TIMERSLACK and PR_SET_THP_DISABLE of prctl
-_WAKE = Path("/dev/cpu_dma_latency")  # how long processors may take to wake, while it is open
-_STAT, _STEAL = Path("/proc/stat"), 8  # word of its first line: proc(5)
+_WAKE = Path("/dev/cpu_dma_latency")  # limits the processors' wake-up latency while it is open
+_STAT, _STEAL = Path("/proc/stat"), 8  # index of a word in its first line: proc(5)
 
 
 def summary_of(nanoseconds: np.ndarray) -> dict:
-    """Percentiles and histogram of times.
+    """Return percentiles and histogram of durations.
 
     Args:
-        nanoseconds: (n,) [ns].
+        nanoseconds: (n,) durations [ns].
 
     Returns:
-        count, percentiles [us] by name, and a histogram: [us] of the upper edges, and the counts,
-        one more for what is beyond.
+        count, percentiles [us] by name, and a histogram: upper edges [us], and the counts with an
+        additional one for values above the last edge.
 
     >>> summary_of(np.array([5_000, 15_000, 9_000_000]))["histogram"]["count"]
     [1, 1, 0, 0, 0, 0, 0, 0, 0, 1]
@@ -53,30 +53,30 @@ def summary_of(nanoseconds: np.ndarray) -> dict:
 
 
 class Deadlines:
-    """Keeps simulated time to the wall clock with a deadline for every tick.
+    """Synchronise simulated time with the wall clock, with a deadline for every tick.
 
-    What is late is made up for; where that is more than `patience`, simulated time stands still.
+    Small delays are caught up. After a delay of more than `patience`, simulated time is set back.
 
     Attributes:
-        pauses: how often simulated time was stopped.
-        late: seconds for which it stood still, in all.
-        missed: ticks that were not done in time.
-        ticks: ticks in all.
-        priority: whether the system gave it.
+        pauses: number of times that simulated time was set back.
+        late: total time by which it was set back [s].
+        missed: number of ticks that missed their deadline.
+        ticks: total number of ticks.
+        priority: whether real-time priority was granted.
     """
 
     def __init__(
         self, most: int, level: int = 0, patience: float = 0.25,
         now: Callable[[], int] = clock.monotonic_ns, sleep: Callable[[float], None] = clock.sleep,
     ) -> None:  # fmt: skip
-        """Begin when `wait` is called first: what is compiled and opened before is in no hurry.
+        """Prepare the deadlines; time starts with the first call of `wait`, after compilation.
 
         Args:
-            most: number of ticks for which there is room.
-            level: of priority from then on, see `steady`; 0 asks for none.
-            patience: by which simulated time may be late before it is stopped [s].
-            now: a clock [ns].
-            sleep: waits for a time [s].
+            most: maximum number of ticks whose delay is recorded.
+            level: real-time priority from the first tick on, see `steady`; 0 requests none.
+            patience: delay after which simulated time is set back [s].
+            now: function that returns the time [ns].
+            sleep: function that waits for a time [s].
         """
         self._now, self._sleep, self._patience = now, sleep, patience
         self._begin: int | None = None
@@ -85,17 +85,17 @@ class Deadlines:
         self.pauses, self.late, self.missed, self.ticks = 0, 0.0, 0, 0
 
     def now(self) -> float:
-        """The clock [s]."""
+        """Return the time of the clock [s]."""
         return self._now() * 1e-9
 
     def wait(self, simulated: float) -> float:
-        """Wait for the deadline of a tick whose work is done.
+        """Wait for the deadline of a tick after its work is done.
 
         Args:
             simulated: time that has been simulated [s].
 
         Returns:
-            By how much simulated time was just set back [s]; 0 if it keeps up.
+            Time by which simulated time was set back [s]; 0 if it keeps up.
         """
         due, now = round(simulated * 1e9), self._now()
         if self._begin is None:
@@ -122,11 +122,11 @@ class Deadlines:
         return 0.0
 
     def close(self) -> None:
-        """Give the priority back."""
+        """Return to normal priority."""
         self._steady.close()
 
     def lateness(self) -> np.ndarray:
-        """(n,) by how much the ticks that missed their deadline were late [ns]."""
+        """Return the delays (n,) of the ticks that missed their deadline [ns]."""
         late = self._lateness[: self.ticks]
         return late[late > 0]
 
@@ -135,14 +135,14 @@ def computer_alone(
     seconds: float, rate: float, level: int = 0, now: Callable[[], int] = clock.monotonic_ns,
     sleep: Callable[[float], None] = clock.sleep,
 ) -> dict:  # fmt: skip
-    """Deadlines that a loop without work misses: what the computer and its system take.
+    """Measure the deadlines that an empty loop misses, as a baseline of computer and system.
 
     Args:
-        seconds: for which it runs [s].
-        rate: of its deadlines [Hz].
-        level: of priority, see `steady`.
-        now: a clock [ns].
-        sleep: waits for a time [s].
+        seconds: duration [s].
+        rate: rate of the deadlines [Hz].
+        level: real-time priority, see `steady`.
+        now: function that returns the time [ns].
+        sleep: function that waits for a time [s].
 
     Returns:
         seconds, ticks, missed, late (see `summary_of`), and priority.
@@ -159,13 +159,13 @@ def computer_alone(
 
 
 def stolen_time(stat: Path = _STAT) -> float | None:
-    """Processor time that the host of a virtual machine has taken from it since it was started.
+    """Return the processor time that the host has taken from a virtual machine since its start.
 
     Args:
-        stat: the kernel's figures, in ticks of the system.
+        stat: file with the kernel's statistics, in clock ticks.
 
     Returns:
-        Sum over all processors [s]; None where the system does not tell.
+        Sum over all processors [s]; None if the system does not report it.
 
     Source: proc(5), "steal" of /proc/stat.
     """
@@ -173,12 +173,12 @@ def stolen_time(stat: Path = _STAT) -> float | None:
         with stat.open(encoding="ascii") as file:
             words = file.readline().split()
         return int(words[_STEAL]) / os.sysconf("SC_CLK_TCK")
-    except (OSError, IndexError, ValueError, AttributeError):  # no Linux, or an old one
+    except (OSError, IndexError, ValueError, AttributeError):  # not Linux, or an old kernel
         return None
 
 
 def load_of_machine() -> list[float] | None:
-    """Mean number of processes that want a core, over 1, 5 and 15 minutes; None where unknown."""
+    """Return the load averages over 1, 5 and 15 minutes, None if unknown."""
     try:
         return [round(v, 2) for v in os.getloadavg()]
     except OSError:
@@ -186,44 +186,44 @@ def load_of_machine() -> list[float] | None:
 
 
 def ask_for_priority(level: int) -> bool:
-    """Run the calling thread before all ordinary ones, where the system permits it.
+    """Request real-time priority (first-in first-out scheduling) for the calling thread.
 
     Args:
-        level: of the first-in first-out scheduler, 1 to 99.
+        level: priority of the first-in first-out scheduler, 1 to 99.
 
     Returns:
-        Whether it does.
+        Whether it was granted.
     """
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(level))
-    except (AttributeError, OSError):  # no such scheduler, or not permitted
+    except (AttributeError, OSError):  # scheduler not available, or not permitted
         return False
     return True
 
 
 @contextlib.contextmanager
 def steady(level: int) -> Iterator[bool]:
-    """No garbage collection, exact sleeps, small pages; where permitted, priority and no deep idle.
+    """Reduce timing jitter: no garbage collection, exact sleeps, small pages, real-time priority.
 
-    The first touch of a huge page of a long array, such as a log's, makes 2 MB of it: that takes
-    milliseconds.
+    Priority and a short processor wake-up time are set only where the system permits them.
+    Huge pages are off: the first access to one clears 2 MB, which takes milliseconds.
 
     Args:
-        level: see `ask_for_priority`; 0 asks for none.
+        level: see `ask_for_priority`; 0 requests none.
 
     Yields:
-        Whether there is priority.
+        Whether priority was granted.
 
     Source: Linux, Documentation/power/pm_qos_interface.
     """
-    _control(_SLACK, 1000)  # the system wakes this thread when it is time, not 50 us later
+    _control(_SLACK, 1000)  # exact timers: by default the system wakes a thread up to 50 us late
     _control(_NO_HUGE_PAGES, 1)
     gc.collect()
     gc.freeze()
     gc.disable()
     given = level > 0 and ask_for_priority(level)
     awake = contextlib.ExitStack()
-    with contextlib.suppress(OSError):  # no such system, or not permitted
+    with contextlib.suppress(OSError):  # not available, or not permitted
         awake.enter_context(_WAKE.open("r+b", buffering=0)).write(bytes(4))
     try:
         yield given
@@ -237,6 +237,6 @@ def steady(level: int) -> Iterator[bool]:
 
 
 def _control(option: int, value: int) -> None:
-    """Set an option of this process or thread, where the system knows it (Linux, prctl(2))."""
+    """Set an option of this process or thread where it exists (Linux, prctl(2))."""
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(option, value, 0, 0, 0)

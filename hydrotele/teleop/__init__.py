@@ -1,1 +1,1 @@
-"""Teleoperation: what an operator feels, and whether master, slave, hand and task are stable."""
+"""Teleoperation: stability and transparency of master, slave, operator and task."""

@@ -1,10 +1,9 @@
-"""A teleoperator's two-port with hand and task: what is felt, passivity, stability and margins.
+"""Linear analysis of a teleoperator: transparency, passivity, stability and stability margins.
 
-What a teleoperator is analysed with: its two sides, hand, task, gains and delays.
-
-A teleoperator's parameters as a YAML file: `hydrotele analyse teleop` reads it.
-
-`hydrotele/teleop/cat215_axis.yaml` is the one that is shipped, with the source of every number.
+The module describes one axis of a teleoperator (master, slave, controllers, operator's hand, task,
+gains, delays) and analyses its two-port network. The parameters come from a YAML file that
+`hydrotele analyse teleop` reads. `hydrotele/teleop/cat215_axis.yaml` is the default file; it gives
+the source of every parameter.
 """
 
 import math
@@ -37,19 +36,19 @@ from hydrotele.teleop.two_port import (
 
 @dataclass(frozen=True)
 class Case:
-    """One axis of a teleoperator, with hand and task, in one scale of lengths and forces.
+    """One axis of a teleoperator with hand and task, all in one scale of lengths and forces.
 
     Attributes:
-        master: what the hand moves.
-        slave: what the task feels.
+        master: impedance of the master, which the hand moves.
+        slave: impedance of the slave, which acts on the task.
         master_control: damper and spring of the master's controller.
-        slave_control: of the slave's.
-        hand: the operator's.
+        slave_control: damper and spring of the slave's controller.
+        hand: impedance of the operator's hand.
         task: impedance of the environment.
-        gains: of the channels.
-        delay_forward: from the master to the slave [s].
-        delay_back: from the slave to the master [s].
-        wave: impedance b of wave variables [N s/m]; 0 for the slave controller's damping.
+        gains: gains of the channels.
+        delay_forward: delay from the master to the slave [s].
+        delay_back: delay from the slave to the master [s].
+        wave: impedance b of wave variables [N s/m]; 0 selects the slave controller's damping.
     """
 
     master: Impedance
@@ -64,32 +63,32 @@ class Case:
     wave: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse controllers that hold a mass: they would need accelerations."""
+        """Raise InputError if a controller has a mass, since it would need accelerations."""
         if self.master_control.mass or self.slave_control.mass:
             raise InputError("teleoperator", "controllers are dampers and springs, without mass")
 
     @property
     def delay(self) -> float:
-        """Mean of both delays [s]; stability depends on their sum only."""
+        """Mean of both delays [s]; stability depends only on their sum."""
         return 0.5 * (self.delay_forward + self.delay_back)
 
     def with_delay(self, delay: float) -> "Case":
-        """The same with a delay [s] each way."""
+        """Return the case with a delay [s] in each direction."""
         return replace(self, delay_forward=delay, delay_back=delay)
 
     def port(self, structure: str, reflected: float = 1.0) -> TwoPort:
-        """The two-port of a structure.
+        """Return the two-port of a structure.
 
         Args:
-            structure: as of `two_port`.
-            reflected: factor on both channels that come back, C2 and C4, which is the gain of the
-                loop through hand and task [1].
+            structure: see `two_port`.
+            reflected: factor on both return channels C2 and C4, which is the gain of the loop
+                through hand and task [1].
 
         Returns:
             The two-port.
 
         Raises:
-            InputError: as of `two_port`.
+            InputError: see `two_port`.
         """
         made = two_port(
             structure, self.master, self.slave, self.master_control, self.slave_control,
@@ -119,26 +118,26 @@ Delay = Annotated[float, Field(ge=0, le=LONGEST)]
 
 
 class Side(Facts):
-    """A body, the hand or the task: mass [kg], damping [N s/m], stiffness [N/m]."""
+    """Mass [kg], damping [N s/m] and stiffness [N/m] of a body, the hand or the task."""
 
     mass: NonNegative = 0.0
     damping: NonNegative = 0.0
     stiffness: NonNegative = 0.0
 
     def impedance(self) -> Impedance:
-        """The same as a function of frequency."""
+        """Return the impedance as a function of frequency."""
         return Impedance(self.mass, self.damping, self.stiffness)
 
 
 class RigidBody(Facts):
-    """Master or slave, which have a mass [kg], and perhaps damping [N s/m], stiffness [N/m]."""
+    """Mass [kg], damping [N s/m] and stiffness [N/m] of the master or the slave."""
 
     mass: Positive
     damping: NonNegative = 0.0
     stiffness: NonNegative = 0.0
 
     def impedance(self) -> Impedance:
-        """The same as a function of frequency."""
+        """Return the impedance as a function of frequency."""
         return Impedance(self.mass, self.damping, self.stiffness)
 
 
@@ -149,12 +148,12 @@ class Controller(Facts):
     stiffness: NonNegative = 0.0
 
     def impedance(self) -> Impedance:
-        """The same as a function of frequency."""
+        """Return the impedance as a function of frequency."""
         return Impedance(0.0, self.damping, self.stiffness)
 
 
 class ChannelGains(Facts):
-    """Gains of the channels, as of `two_port.Gains`; velocity in 1/s."""
+    """Gains of the channels, see `two_port.Gains`; velocity in 1/s."""
 
     position: Positive = 1.0
     velocity: Positive = 1.0
@@ -162,14 +161,14 @@ class ChannelGains(Facts):
 
 
 class Delays(Facts):
-    """Delays [s] from the master to the slave and back."""
+    """Delays [s] from the master to the slave and from the slave to the master."""
 
     forward: Delay = 0.0
     back: Delay = 0.0
 
 
 class VaryingSpring(Facts):
-    """A joystick axis with stiffness feedback, without the hand, which is added to it."""
+    """Joystick axis with stiffness feedback, without the hand, which is added to it."""
 
     nominal: NonNegative
     least: NonNegative
@@ -187,12 +186,12 @@ class VaryingSpring(Facts):
         return self
 
     def spring(self) -> Spring:
-        """The same for the theorem."""
+        """Return the axis as input of the stability theorem."""
         return Spring(self.mass, self.damping, self.nominal, self.least, self.most)
 
 
 class MapRange(Facts):
-    """Range of the map of stability: delay each way [s], factor on what comes back [1]."""
+    """Range of the stability map: delay in each direction [s], factor on the return channels."""
 
     longest_delay: Annotated[float, Field(gt=0, le=LONGEST)] = 0.5
     least_factor: Positive = 0.01
@@ -207,7 +206,7 @@ class MapRange(Facts):
 
 
 class SideRange(Facts):
-    """Impedances that are drawn, every number log-uniform between least and most."""
+    """Range of impedances for random sampling, log-uniform between least and most."""
 
     least: Side
     most: Side
@@ -221,7 +220,7 @@ class SideRange(Facts):
 
 
 class TeleopCase(Facts):
-    """Everything that an analysis needs; one axis, all in one scale of lengths and forces."""
+    """Complete input of an analysis: one axis, all in one scale of lengths and forces."""
 
     name: Name
     master: RigidBody
@@ -245,7 +244,7 @@ class TeleopCase(Facts):
         return known_structures(names)
 
     def case(self) -> Case:
-        """The same for the two-port."""
+        """Convert the input file to a `Case` for the two-port."""
         gains = Gains(self.gains.position, self.gains.velocity, self.gains.force)
         return Case(
             self.master.impedance(), self.slave.impedance(), self.master_control.impedance(),
@@ -257,10 +256,10 @@ class TeleopCase(Facts):
 def known_structures(
     names: tuple[str, ...], known: tuple[str, ...] = STRUCTURES
 ) -> tuple[str, ...]:
-    """The same names, once each.
+    """Return the names without duplicates.
 
     Raises:
-        ValueError: one is not known.
+        ValueError: a name is not known.
     """
     for name in names:
         if name not in known:
@@ -269,35 +268,35 @@ def known_structures(
 
 
 def load_teleop_case(path: str | Path | None = None) -> TeleopCase:
-    """Read a case.
+    """Read a case from a YAML file.
 
     Args:
-        path: YAML file, None for the shipped one.
+        path: YAML file, None for the default file.
 
     Returns:
         The case.
 
     Raises:
-        InputError: names file, line, key and what is allowed.
+        InputError: the file is invalid; the message gives file, line, key and the allowed values.
     """
     path = SHIPPED if path is None else path
     data, lines = read_yaml(path)
     return parse(TeleopCase, data, str(path), lines)
 
 
-# rad/s, from slow motions to a flotor's bandwidth; not round, as poles without damping may be
+# rad/s, from slow motions to a flotor's bandwidth; round values could hit undamped poles
 FREQUENCIES = 2.0 * np.pi * np.geomspace(0.016, 160.0, 1601)
 _FREE = Impedance()
-_PASSIVE = 1.0 + 1e-6  # rounding in the inverse of a lossless port's matrix stays below
-_STEPS = 61  # tried before a margin is refined
-_REFINED = 1e-3  # of a margin
-LONGEST_TRIED = 10.0  # s each way
-MOST_TRIED = 1e3  # factor on the loop's gain
+_PASSIVE = 1.0 + 1e-6  # allows for rounding in the inverse of a lossless port's matrix
+_STEPS = 61  # number of points that are tested before a margin is refined
+_REFINED = 1e-3  # relative tolerance of a margin
+LONGEST_TRIED = 10.0  # s in each direction
+MOST_TRIED = 1e3  # factor on the loop gain
 _DELAYS = (1e-4, LONGEST_TRIED)
 
 
 class Loop(Protocol):
-    """A teleoperator with hand and task whose stability can be asked for, such as a `Case`."""
+    """Interface of a teleoperator with hand and task for stability tests, such as a `Case`."""
 
     @property
     def task(self) -> Block:
@@ -310,36 +309,38 @@ class Loop(Protocol):
         ...
 
     def with_delay(self, delay: float) -> "Loop":
-        """The same with a delay [s] each way."""
+        """Return the loop with a delay [s] in each direction."""
         ...
 
     def port(self, structure: str, reflected: float = 1.0) -> TwoPort:
-        """The two-port of a structure; `reflected` is a factor on what comes back."""
+        """Return the two-port of a structure; `reflected` is a factor on the return channels."""
         ...
 
 
 @dataclass(frozen=True)
 class Analysis:
-    """What a structure does with a case.
+    """Results of the analysis of one structure.
 
     Attributes:
-        structure: its name.
+        structure: name of the structure.
         frequencies: (n,) [rad/s].
-        hybrid: (n, 2, 2) of `[F_h, -V_e] = H [V_h, F_e]`.
-        transmitted: (n,) impedance that the operator feels [N s/m].
+        hybrid: (n, 2, 2) hybrid matrix H of `[F_h, -V_e] = H [V_h, F_e]`.
+        transmitted: (n,) impedance transmitted to the operator [N s/m].
         task: (n,) impedance of the task [N s/m].
         scattering: (n,) largest singular value of the scattering matrix [1].
         loop: (n,) gain of the loop through hand and task [1].
-        loop_free: (n,) the same without a task [1].
-        unstable_poles: with the task; None where poles lie on the axis.
-        unstable_free: the same without a task.
-        unstable_let_go: with the task and no hand on the handle.
-        unstable_let_go_free: with neither.
-        gain_margin: factor on what comes back up to which the loop stays stable; below 1 where the
-            case is unstable, 0 where no factor helps, infinite where none was found that hurts.
-        largest_delay: each way, up to which it stays stable [s]; 0 where it is unstable without,
-            infinite where it is stable with 10 s, the longest that is tried.
-        passive: whether the two-port is, so that no passive hand and task make it unstable.
+        loop_free: (n,) loop gain without a task [1].
+        unstable_poles: number of unstable poles with the task; None if poles lie on the imaginary
+            axis.
+        unstable_free: number of unstable poles without a task.
+        unstable_let_go: number of unstable poles with the task, with the handle released.
+        unstable_let_go_free: number of unstable poles without a task, with the handle released.
+        gain_margin: factor on the return channels up to which the loop stays stable. It is below 1
+            if the case is unstable, 0 if no factor stabilises it, and infinite if no tested factor
+            makes it unstable.
+        largest_delay: delay in each direction up to which the loop stays stable [s]; 0 if it is
+            unstable without delay, infinite if it is stable with the largest tested delay of 10 s.
+        passive: whether the two-port is passive, so that no passive hand and task destabilise it.
     """
 
     structure: str
@@ -360,28 +361,28 @@ class Analysis:
 
     @property
     def stable(self) -> bool:
-        """Whether it is stable with the task and without, a hand on the handle."""
+        """Whether the loop is stable with and without the task, while a hand holds the handle."""
         return self.unstable_poles == 0 and self.unstable_free == 0
 
     @property
     def stable_let_go(self) -> bool:
-        """Whether it is stable with the task and without, the handle let go."""
+        """Whether the loop is stable with and without the task, while the handle is released."""
         return self.unstable_let_go == 0 and self.unstable_let_go_free == 0
 
 
 def analyse(case: Case, structure: str, frequencies: np.ndarray = FREQUENCIES) -> Analysis:
-    """Analyse a structure.
+    """Analyse the stability, passivity and transparency of a structure.
 
     Args:
-        case: the teleoperator with hand and task.
-        structure: its name, one of `STRUCTURES`.
+        case: teleoperator with hand and task.
+        structure: name, one of `STRUCTURES`.
         frequencies: (n,) [rad/s].
 
     Returns:
-        The analysis.
+        Results of the analysis.
 
     Raises:
-        InputError: the structure is not known, or neither side has a mass.
+        InputError: the structure is not known, or neither master nor slave has a mass.
 
     Source: Zhu 1994, chapter 3.
     """
@@ -400,13 +401,13 @@ def analyse(case: Case, structure: str, frequencies: np.ndarray = FREQUENCIES) -
 def loop_gain(
     port: TwoPort, s: np.ndarray | complex, hand: Block, environment: Block
 ) -> np.ndarray:
-    """Gain of the loop from the master to the slave and back, of which -1 must not be encircled.
+    """Return the gain of the loop through master and slave; Nyquist's critical point is -1.
 
     Args:
         port: the two-port.
         s: (...) complex frequencies [rad/s].
         hand: impedance of the operator's hand.
-        environment: impedance of the task; without one this is Zhu's LG1.
+        environment: impedance of the task; with a zero impedance the result is Zhu's LG1.
 
     Returns:
         (...) `(C2 Z_e + C4)(C1 - C3 Z_h) / ((Z_m + C_m + Z_h)(Z_s + C_s + Z_e))` [1].
@@ -421,21 +422,21 @@ def loop_gain(
 
 
 def reference(case: Case) -> float:
-    """Impedance of the hand where its mass and spring cancel or would [N s/m], 1 without them."""
+    """Return the reference impedance `sqrt(B^2 + M K)` of the hand [N s/m], 1 if it is zero."""
     hand = case.hand
     return math.hypot(hand.damping, math.sqrt(hand.mass * hand.stiffness)) or 1.0
 
 
 def is_passive(port: TwoPort, unit: float = 1.0) -> bool:
-    """Whether a two-port gives no energy, whatever passive hand and task it is joined to.
+    """Return whether a two-port is passive, so that no passive hand and task destabilise it.
 
     Args:
         port: the two-port.
-        unit: impedance that terminates it in the scattering matrix [N s/m].
+        unit: reference impedance of the scattering matrix [N s/m].
 
     Returns:
-        True if the scattering matrix has no pole right of the axis, and no norm above 1 on it.
-
+        True if the scattering matrix has no pole in the right half-plane, and no norm above 1 on
+        the imaginary axis.
     Source: Anderson and Spong 1989; Zhu 1994, 3.7.
     """
     s = 2j * np.pi * np.geomspace(1e-3, 2e3, 3000)
@@ -449,7 +450,7 @@ def is_passive(port: TwoPort, unit: float = 1.0) -> bool:
 
 
 def holds(port: TwoPort, hand: Block, environment: Block) -> bool:
-    """Whether a loop is stable; a pole on the axis does not count as such."""
+    """Return whether a loop is stable; a pole on the imaginary axis counts as unstable."""
     try:
         return stable(port, hand, environment)
     except OnTheAxis:
@@ -464,7 +465,7 @@ def _counted(port: TwoPort, hand: Block, environment: Block) -> int | None:
 
 
 def gain_margin(case: Loop, structure: str) -> float:
-    """Factor on what comes back at which the loop's stability changes; see `Analysis`."""
+    """Return the factor on the return channels at which stability changes; see `Analysis`."""
 
     def right(factor: float) -> bool:
         return holds(case.port(structure, factor), case.hand, case.task)
@@ -477,7 +478,7 @@ def gain_margin(case: Loop, structure: str) -> float:
 
 
 def largest_delay(case: Loop, structure: str) -> float:
-    """Delay each way up to which the loop is stable [s]; see `Analysis`."""
+    """Return the delay in each direction up to which the loop is stable [s]; see `Analysis`."""
 
     def right(delay: float) -> bool:
         return holds(case.with_delay(delay).port(structure), case.hand, case.task)
@@ -491,14 +492,14 @@ def largest_delay(case: Loop, structure: str) -> float:
 
 
 def first_change(right: Callable[[float], bool], points: np.ndarray) -> float | None:
-    """Where an answer first differs from that at the first point; None if it never does.
+    """Return where a condition first differs from its value at the first point, None if nowhere.
 
     Args:
-        right: the question.
-        points: (n,) positive ones, in order, which are tried before the place is refined.
+        right: the condition.
+        points: (n,) positive ordered values that are tested before the result is refined.
 
     Returns:
-        The last place where the answer is yes, refined to 0.1 %.
+        The last value at which the condition is true, refined to 0.1 %.
     """
     first, last = right(float(points[0])), float(points[0])
     for point in map(float, points[1:]):
@@ -516,13 +517,13 @@ def first_change(right: Callable[[float], bool], points: np.ndarray) -> float | 
 def stability_map(
     case: Loop, structure: str, delays: np.ndarray, factors: np.ndarray
 ) -> np.ndarray:
-    """Where a structure is stable.
+    """Return where a structure is stable on a grid of delays and return gains.
 
     Args:
-        case: the teleoperator with hand and task.
-        structure: its name.
-        delays: (n,) each way [s].
-        factors: (m,) on what comes back [1].
+        case: teleoperator with hand and task.
+        structure: name of the structure.
+        delays: (n,) delays in each direction [s].
+        factors: (m,) factors on the return channels [1].
 
     Returns:
         (m, n), true where stable.

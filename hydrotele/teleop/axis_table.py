@@ -1,9 +1,9 @@
-"""Parameters of the joystick's axes: gains of joystick and scenario, and what each axis moves.
+"""Parameters of the joystick's axes, as a table with the gains of joystick and scenario.
 
-Also named tuples of arrays that lie one after the other in memory. Such a state is logged in one
-go, and handed to a compiled function as one array: what a call of a compiled function costs grows
-with the number of arrays that it is given. Next to each such type is a compiled `unpack_...` that
-shows the parts of the one array again, in their order.
+The module also provides named tuples of arrays that are contiguous in memory. Such a state is
+logged and passed to a compiled function as one array, since the call overhead of a compiled
+function grows with the number of array arguments. Each such type has a compiled `unpack_...`
+function that returns the parts of the array, in their order.
 """
 
 from typing import Any, TypeVar
@@ -17,29 +17,29 @@ from hydrotele.machine.joystick import AXES, AxisGains, Joystick
 from hydrotele.scenario.teleoperation import Coupling, Regulate, Steer, TeleopPilot, Track
 
 # columns, SI; GAIN is the rate of a coordinate per displacement beyond the dead band [1/s], or its
-# place per displacement; WAVE is the impedance b of wave variables
+# position per displacement; WAVE is the impedance b of wave variables
 (NOMINAL, LEAST, MOST, SLOPE, DAMPING, LIMIT, DEADBAND, DROP, OUTSIDE, REACH, COORDINATE, SIGN,
  GAIN, RATIO, COUPLING, COUPLING_DAMPING, REFLECTED_MOST, WAVE) = range(18)  # fmt: skip
 COLUMNS = WAVE + 1
-LEVER = 0.1  # m, a hand's: makes rotational gains of translational ones
+LEVER = 0.1  # m, lever arm of a hand: converts translational gains to rotational ones
 _SOFT = {"rate": 40.0, "position": 400.0}  # N/m, N per metre of machine or of handle
-_DAMPED = 0.1  # s, of that coupling
+_DAMPED = 0.1  # s, ratio of damping to stiffness of that coupling
 
 
 def axis_table(joystick: Joystick, pilot: TeleopPilot, coordinates: tuple[str, ...]) -> np.ndarray:
-    """Numbers of every joystick axis.
+    """Build the parameter table of all joystick axes.
 
     Args:
         joystick: the joystick.
-        pilot: the scenario's.
+        pilot: teleoperation settings of the scenario.
         coordinates: task coordinates of the arm.
 
     Returns:
         (6, 18), columns above.
 
     Raises:
-        InputError: gains that make no sense, a coordinate that the arm has not, one joystick axis
-            for two coordinates, an operator's goal that he cannot move.
+        InputError: inconsistent gains, a coordinate that the arm does not have, one joystick axis
+            for two coordinates, or an operator's goal that the joystick cannot move.
     """
     if pilot.gains not in joystick.gains:
         message = f"{pilot.gains!r}; {suggest(pilot.gains, joystick.gains)}"
@@ -51,7 +51,7 @@ def axis_table(joystick: Joystick, pilot: TeleopPilot, coordinates: tuple[str, .
     for number, name in enumerate(AXES):
         law = _gains(joystick, pilot, name)
         reach = joystick.reach[number]
-        detent = law.detent if pilot.detent and pilot.mode == "rate" else None  # no dead band else
+        detent = law.detent if pilot.detent and pilot.mode == "rate" else None  # needs a dead band
         table[number, : COORDINATE] = (
             law.nominal, law.least, law.most, (law.most - law.nominal) / law.force_limit,
             law.damping, law.force_limit, law.deadband, detent.drop if detent else 0.0,
@@ -68,7 +68,7 @@ def axis_table(joystick: Joystick, pilot: TeleopPilot, coordinates: tuple[str, .
 
 
 def _place_coordinates(pilot: TeleopPilot, table: np.ndarray, coordinates) -> None:
-    """Let every coordinate hang on its joystick axis."""
+    """Assign every coordinate to its joystick axis."""
     where = "pilot.coordinates"
     if strange := set(pilot.coordinates) - set(coordinates):
         message = f"{', '.join(sorted(strange))}: the arm has {', '.join(coordinates)}"
@@ -78,18 +78,18 @@ def _place_coordinates(pilot: TeleopPilot, table: np.ndarray, coordinates) -> No
         axis, sign = coupling.placed(coordinate)
         row = table[AXES.index(axis)]
         if row[COORDINATE] >= 0.0:
-            raise InputError(where, f"joystick axis {axis} moves two of them")
+            raise InputError(where, f"joystick axis {axis} is assigned to two coordinates")
         gain = coupling.scale
         if pilot.mode == "rate":
             if row[DEADBAND] >= row[REACH] and coordinate in pilot.coordinates:
-                message = f"the dead band of {axis} reaches beyond its stop: it cannot be moved"
+                message = f"the dead band of {axis} covers its whole range: it cannot be moved"
                 raise InputError(f"{where}.{coordinate}", message)
             gain = coupling.speed / max(row[REACH] - row[DEADBAND], 1e-9)
         row[[COORDINATE, SIGN, GAIN]] = number, sign, gain
 
 
 def _gains(joystick: Joystick, pilot: TeleopPilot, name: str) -> AxisGains:
-    """Gains of a joystick axis with what the scenario says otherwise."""
+    """Return the gains of a joystick axis, with the overrides of the scenario."""
     usual = joystick.gains[pilot.gains][name].model_dump()
     own = {str(axis): gains for axis, gains in pilot.stiffness.items()}.get(name, {})
     said = {split_unit(key)[0] for key in own}
@@ -98,7 +98,7 @@ def _gains(joystick: Joystick, pilot: TeleopPilot, name: str) -> AxisGains:
 
 
 def _check_goals(pilot: TeleopPilot, table: np.ndarray, coordinates: tuple[str, ...]) -> None:
-    """Refuse an operator whose goal is none of the arm's coordinates, or one he cannot move."""
+    """Raise InputError if the operator's goal is not a coordinate of the arm or cannot be moved."""
     goals: dict[str, str] = {}
     match pilot.operator:
         case Regulate() | Track():
@@ -111,21 +111,21 @@ def _check_goals(pilot: TeleopPilot, table: np.ndarray, coordinates: tuple[str, 
         row = table[table[:, COORDINATE] == coordinates.index(name)][0]
         if pilot.mode == "rate" and row[DEADBAND] >= row[REACH]:
             axis = AXES[int(np.flatnonzero(table[:, COORDINATE] == row[COORDINATE])[0])]
-            raise InputError(where, f"the dead band of {axis} reaches beyond its stop")
+            raise InputError(where, f"the dead band of {axis} covers its whole range")
 
 
 Kind = TypeVar("Kind", bound=tuple[Any, ...])
 
 
 def flat_state(kind: type[Kind], shapes: list[tuple[int, ...]]) -> Kind:
-    """A named tuple of zero arrays that are neighbours in memory.
+    """Create a named tuple of zero arrays that are contiguous in memory.
 
     Args:
-        kind: a NamedTuple type of arrays.
-        shapes: theirs, in order.
+        kind: NamedTuple type of arrays.
+        shapes: shapes of the arrays, in order.
 
     Returns:
-        The tuple; `flat_view` shows it as one array.
+        The tuple; `flat_view` returns its memory as one array.
     """
     sizes = [int(np.prod(shape)) for shape in shapes]
     whole = np.zeros(sum(sizes))
@@ -137,7 +137,7 @@ def flat_state(kind: type[Kind], shapes: list[tuple[int, ...]]) -> Kind:
 
 
 def flattened(parts: Kind) -> Kind:
-    """The same tuple with copies of its arrays as neighbours in memory, as floats."""
+    """Copy a tuple of arrays, as floats, into contiguous memory."""
     arrays = [np.asarray(part, float) for part in parts]
     made = flat_state(type(parts), [array.shape for array in arrays])
     for place, array in zip(made, arrays, strict=True):
@@ -146,12 +146,12 @@ def flattened(parts: Kind) -> Kind:
 
 
 def flat_view(parts: tuple[Any, ...]) -> np.ndarray:
-    """The memory of a `flat_state` as one array."""
+    """Return the memory of a `flat_state` as one array."""
     base = parts[0].base
     return base if base.ndim == 1 else base.base
 
 
 @compiled
 def split(flat, size):
-    """The first `size` numbers of an array, and the rest of it."""
+    """Split an array after its first `size` elements."""
     return flat[:size], flat[size:]

@@ -1,9 +1,9 @@
-"""Lorentz coils of a magnetically levitated joystick: currents to wrench, and back within limits.
+"""Lorentz coils of a magnetically levitated joystick: map currents to a wrench, and the inverse.
 
-A coil in its magnets' field pushes the flotor in a fixed direction, as hard as its current. Six of
-them make any force and torque: `[f; tau] = M I`.
+A coil in the field of its magnets pushes the flotor in a fixed direction, with a force that is
+proportional to its current. Six coils produce any force and torque: `[f; tau] = M I`.
 
-Currents heat the coils, which is what limits them over minutes, and what detents are for: Zhu 1994,
+The currents heat the coils, which limits them over minutes. Detents reduce this heating: Zhu 1994,
 6.3, "a stiff joystick could easily cause heating problem".
 """
 
@@ -15,11 +15,11 @@ import numpy as np
 from hydrotele.core.errors import InputError
 
 _WHERE = "coils"
-_SINGULAR = 1e6  # condition beyond which six coils do not make six directions
+_SINGULAR = 1e6  # condition number above which six coils do not span all wrenches
 
 
 class Currents(NamedTuple):
-    """Coil currents (6,) [A], and whether the wrench asked for had to be made smaller."""
+    """Coil currents (6,) [A], and whether the requested wrench was reduced to the limits."""
 
     value: np.ndarray
     limited: bool
@@ -30,10 +30,10 @@ class Coils:
     """Six coils fixed to the flotor.
 
     Attributes:
-        position: (6, 3) of the coils' centres in the flotor's frame [m].
-        direction: (6, 3) unit vectors along which they push.
-        force_per_ampere: [N/A].
-        max_current: of each coil, either way [A].
+        position: (6, 3) centres of the coils in the flotor's frame [m].
+        direction: (6, 3) unit vectors of the coil forces.
+        force_per_ampere: force per current [N/A].
+        max_current: limit of each coil in both directions [A].
     """
 
     position: np.ndarray
@@ -42,50 +42,50 @@ class Coils:
     max_current: float
 
     def __post_init__(self) -> None:
-        """Refuse other than six coils that make six independent wrenches."""
+        """Raise InputError unless there are six coils with six independent wrenches."""
         shapes = (np.shape(self.position), np.shape(self.direction))
         if shapes != ((6, 3), (6, 3)):
-            raise InputError(_WHERE, f"six positions and directions are needed, got {shapes}")
+            raise InputError(_WHERE, f"expected six positions and directions, got shapes {shapes}")
         if not np.allclose(np.linalg.norm(self.direction, axis=1), 1.0, atol=1e-9):
             raise InputError(_WHERE, "directions must have length 1")
         if not (self.force_per_ampere > 0.0 and self.max_current > 0.0):
             raise InputError(
-                _WHERE, "force per ampere and largest current must be positive:"
+                _WHERE, "force per ampere and maximum current must be positive:"
                 f" {self.force_per_ampere} N/A, {self.max_current} A",
             )  # fmt: skip
         if not self.condition < _SINGULAR:
-            raise InputError(_WHERE, "these coils do not make every force and torque")
+            raise InputError(_WHERE, "these coils cannot produce every force and torque")
 
     @property
     def wrench_map(self) -> np.ndarray:
-        """M (6, 6): force [N] and torque about the frame's origin [N m] per ampere."""
+        """Matrix M (6, 6): force [N] and torque about the frame's origin [N m] per ampere."""
         force = self.force_per_ampere * np.asarray(self.direction, float)
         return np.vstack([force.T, np.cross(self.position, force).T])
 
     @property
     def condition(self) -> float:
-        """Condition of the map, with torques counted as forces on the coils' mean distance."""
+        """Condition number of the map, with torques divided by the coils' mean distance."""
         arm = float(np.mean(np.linalg.norm(self.position, axis=1)))
         scale = np.array([1.0, 1.0, 1.0, *([1.0 / max(arm, 1e-12)] * 3)])
         return float(np.linalg.cond(scale[:, None] * self.wrench_map))
 
     def wrench(self, currents: np.ndarray) -> np.ndarray:
-        """Force and torque (6,) [N], [N m] of currents (6,) [A], cut at what coils can take."""
+        """Return the wrench (6,) [N], [N m] of currents (6,) [A], after limiting each current."""
         limit = self.max_current
         return self.wrench_map @ np.clip(np.asarray(currents, float), -limit, limit)
 
     def currents(self, wrench: np.ndarray) -> Currents:
-        """Currents for a force and torque.
+        """Compute the coil currents for a force and torque.
 
-        One that is too large is made smaller as a whole, so that it keeps its direction: coils that
-        saturate one by one would twist the hand.
+        A wrench above the limits is scaled down as a whole, so that it keeps its direction. Coils
+        that saturate one by one would twist the operator's hand.
 
         Args:
             wrench: (6,) force [N] and torque about the frame's origin [N m].
 
         Returns:
-            The currents, and whether the wrench was made smaller. Of a wrench that is not finite
-            there are none.
+            The currents, and whether the wrench was scaled down. They are zero for a wrench that is
+            not finite.
 
         Source: Zhu 1994, chapter 5 (force to coil currents).
         """
@@ -98,14 +98,14 @@ class Coils:
 
 
 def three_stations(radius: float, force_per_ampere: float, max_current: float) -> Coils:
-    """Three stations at 120 degrees, each with a coil that pushes up and one that pushes around.
+    """Create three stations at 120 degrees, each with one vertical and one tangential coil.
 
-    With torques counted on the radius its condition is the root of 2.
+    With torques divided by the radius, the condition number is the square root of 2.
 
     Args:
-        radius: of the stations [m].
-        force_per_ampere: of every coil [N/A].
-        max_current: of every coil [A].
+        radius: radius of the stations [m].
+        force_per_ampere: force per current of every coil [N/A].
+        max_current: limit of every coil [A].
 
     Returns:
         The coils.
@@ -123,14 +123,14 @@ def three_stations(radius: float, force_per_ampere: float, max_current: float) -
 
 
 def heating(currents: np.ndarray, continuous: float) -> float:
-    """Rise of the hottest coil's temperature in the end, over what it may have for ever.
+    """Return the steady-state temperature rise of the hottest coil, relative to its permitted rise.
 
     Args:
-        currents: (6,) held, or root mean squares [A].
-        continuous: largest current for ever [A].
+        currents: (6,) constant or root-mean-square currents [A].
+        continuous: maximum continuous current [A].
 
     Returns:
-        [1]; beyond 1 the coils must be let cool.
+        Ratio [1]; above 1 the coils overheat.
 
     >>> heating(np.array([0.0, 3.0, -4.0, 0.0, 0.0, 0.0]), 2.0)
     4.0
@@ -139,15 +139,15 @@ def heating(currents: np.ndarray, continuous: float) -> float:
 
 
 def seconds_until_hot(currents: np.ndarray, continuous: float, time_constant: float) -> float:
-    """Time that cold coils bear currents.
+    """Return the time for which cold coils can carry currents.
 
     Args:
-        currents: (6,) held [A].
-        continuous: largest current for ever [A].
-        time_constant: of the winding [s].
+        currents: (6,) constant currents [A].
+        continuous: maximum continuous current [A].
+        time_constant: thermal time constant of the winding [s].
 
     Returns:
-        [s]; infinite if they bear them for ever.
+        Time [s]; infinite if they can carry the currents continuously.
 
     Source: `simulate.joystick.heat_step`.
 

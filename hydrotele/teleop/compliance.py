@@ -1,7 +1,7 @@
-"""Remote centre of compliance: a levitated handle as six independent springs about a chosen point.
+"""Remote centre of compliance: a levitated handle that acts as six independent springs.
 
-The chosen point T follows its target in translation, and the flotor its target in rotation, each
-axis as a second-order system of its own, whatever the flotor's inertia couples.
+A chosen point T follows its target in translation and the flotor follows its target in rotation.
+Each axis is a separate second-order system, independent of the coupling by the flotor's inertia.
 """
 
 from collections.abc import Sequence
@@ -18,10 +18,10 @@ GRAVITY = (0.0, 0.0, -9.81)
 
 @dataclass(frozen=True)
 class Flotor:
-    """The moving part, in the coils' frame, which is fixed to it.
+    """Moving part of the joystick, in the coils' frame, which is fixed to it.
 
     Attributes:
-        mass: [kg].
+        mass: mass [kg].
         centre_of_mass: (3,) [m].
         inertia: (3, 3) about the centre of mass [kg m^2].
     """
@@ -31,10 +31,10 @@ class Flotor:
     inertia: np.ndarray
 
     def __post_init__(self) -> None:
-        """Refuse bodies that cannot exist."""
+        """Raise InputError if mass and moments of inertia are not physical."""
         values = np.linalg.eigvalsh(self.inertia)
         if not (self.mass > 0.0 and values[0] > 0.0 and values[2] <= values[0] + values[1] + 1e-12):
-            raise InputError(_WHERE, f"no body has the mass {self.mass} kg and moments {values}")
+            raise InputError(_WHERE, f"mass {self.mass} kg and moments {values} are not physical")
 
 
 @dataclass(frozen=True)
@@ -50,11 +50,11 @@ class Axes:
     ratio: np.ndarray
 
     def __post_init__(self) -> None:
-        """Refuse what is no spring and damper."""
+        """Raise InputError unless all frequencies and damping ratios are positive."""
         for name in ("frequency", "ratio"):
             values = np.asarray(getattr(self, name), float)
             if values.shape != (6,) or not np.all(values > 0.0):
-                raise InputError(_WHERE, f"{name} needs six positive numbers, got {values}")
+                raise InputError(_WHERE, f"{name} needs six positive values, got {values}")
 
 
 @dataclass(frozen=True)
@@ -62,10 +62,10 @@ class Motion:
     """Pose and velocity of the flotor.
 
     Attributes:
-        position: (3,) of the coils' frame [m].
-        quaternion: (4,) of its orientation, scalar first.
-        velocity: (3,) of its origin [m/s].
-        rate: (3,) of its turning, in its own axes [rad/s].
+        position: (3,) origin of the coils' frame [m].
+        quaternion: (4,) orientation, scalar first.
+        velocity: (3,) velocity of the origin [m/s].
+        rate: (3,) angular velocity, in its own axes [rad/s].
     """
 
     position: np.ndarray
@@ -76,7 +76,7 @@ class Motion:
 
 @compiled
 def turn_matrix(q, out):
-    """Rotation matrix of a unit quaternion.
+    """Convert a unit quaternion to a rotation matrix.
 
     Args:
         q: (4,) scalar first.
@@ -107,16 +107,16 @@ def turn_matrix(q, out):
 
 @compiled
 def driving_wrench(mass, arm, inertia, below, wanted, about, turn, rate, gravity, out):
-    """Wrench of the coils that gives the handle's point and the flotor chosen accelerations.
+    """Compute the coil wrench for given accelerations of the handle's point and the flotor.
 
     Args:
-        mass: of the flotor, scalar [kg].
-        arm: (3,) centre of mass from the handle's point, flotor axes [m].
+        mass: mass of the flotor, scalar [kg].
+        arm: (3,) centre of mass relative to the handle's point, flotor axes [m].
         inertia: (3, 3) about the centre of mass [kg m^2].
-        below: (3,) centre of mass from the coils' frame, flotor axes [m].
+        below: (3,) centre of mass relative to the coils' frame, flotor axes [m].
         wanted: (3,) acceleration of the handle's point, world axes [m/s^2].
         about: (3,) angular acceleration, flotor axes [rad/s^2].
-        turn: (3, 3) flotor to world.
+        turn: (3, 3) rotation matrix, flotor to world.
         rate: (3,) angular velocity, flotor axes [rad/s].
         gravity: (3,) world axes [m/s^2].
         out: (6,) written: force [N] and torque about the coils' frame [N m], flotor axes.
@@ -127,7 +127,7 @@ def driving_wrench(mass, arm, inertia, below, wanted, about, turn, rate, gravity
     Source: Newton and Euler; Zhu 1994, 5.1.3 (moved from the handle over the centre of mass).
     """
     w0, w1, w2 = rate[0], rate[1], rate[2]
-    # centripetal and tangential acceleration of the centre of mass against the handle's point
+    # centripetal and tangential acceleration of the centre of mass relative to the handle's point
     s0, s1, s2 = w1 * arm[2] - w2 * arm[1], w2 * arm[0] - w0 * arm[2], w0 * arm[1] - w1 * arm[0]
     d0 = about[1] * arm[2] - about[2] * arm[1] + w1 * s2 - w2 * s1
     d1 = about[2] * arm[0] - about[0] * arm[2] + w2 * s0 - w0 * s2
@@ -152,17 +152,18 @@ def driving_wrench(mass, arm, inertia, below, wanted, about, turn, rate, gravity
 
 @compiled
 def holding_wrench(mass, below, handle, push, turn, gravity, out):
-    """Wrench of the coils that acts as a force at the handle and carries the flotor's weight.
+    """Compute the coil wrench that applies a force at the handle and carries the flotor's weight.
 
-    For a hand on the handle: a spring made so turns nothing that the hand pushes straight, while
-    one that moves the flotor as if it were free (`driving_wrench`) acts through the centre of mass.
+    Use it while a hand holds the handle: a spring made this way does not rotate the flotor when the
+    hand pushes straight. A wrench for a free flotor (`driving_wrench`) acts through the centre of
+    mass.
 
     Args:
-        mass: of the flotor, scalar [kg].
-        below: (3,) centre of mass from the coils' frame, flotor axes [m].
-        handle: (3,) handle's point from the coils' frame, flotor axes [m].
+        mass: mass of the flotor, scalar [kg].
+        below: (3,) centre of mass relative to the coils' frame, flotor axes [m].
+        handle: (3,) handle's point relative to the coils' frame, flotor axes [m].
         push: (6,) force at the handle, world axes [N], and torque, flotor axes [N m].
-        turn: (3, 3) flotor to world.
+        turn: (3, 3) rotation matrix, flotor to world.
         gravity: (3,) world axes [m/s^2].
         out: (6,) written: force [N] and torque about the coils' frame [N m], flotor axes.
 
@@ -188,15 +189,15 @@ def compliance_wrench(
     flotor: Flotor, axes: Axes, centre: np.ndarray, motion: Motion, target: np.ndarray,
     turned: np.ndarray, gravity: Sequence[float] = GRAVITY,
 ) -> np.ndarray:  # fmt: skip
-    """Wrench that makes the handle behave so.
+    """Compute the coil wrench that gives the handle the six second-order systems.
 
     Args:
         flotor: the moving part.
         axes: the six second-order systems.
         centre: T in the coils' frame (3,) [m].
-        motion: of the flotor.
-        target: where T should be (3,) [m].
-        turned: quaternion (4,) of the orientation that it should have, scalar first.
+        motion: pose and velocity of the flotor.
+        target: reference position of T (3,) [m].
+        turned: reference orientation, quaternion (4,), scalar first.
         gravity: (3,) [m/s^2].
 
     Returns:
@@ -229,14 +230,14 @@ def _cross(v: np.ndarray) -> np.ndarray:
 
 
 def rotation_between(first: np.ndarray, then: np.ndarray) -> tuple[float, np.ndarray]:
-    """Rotation from one orientation to another, the shorter way.
+    """Return the rotation from one orientation to another, by at most 180 degrees.
 
     Args:
-        first: quaternion (4,), scalar first.
-        then: quaternion (4,).
+        first: initial orientation, quaternion (4,), scalar first.
+        then: final orientation, quaternion (4,).
 
     Returns:
-        Scalar part, at least 0, and vector part (3,), in the axes of either.
+        Scalar part, at least 0, and vector part (3,), the same in the axes of both.
 
     Source: Zhu 1994, 5.1.3 (Euler quaternions).
     """

@@ -1,21 +1,20 @@
-"""Everything that an analysis of a teleoperator finds, and the same as JSON.
+"""Complete analysis of a teleoperator, its check by time simulation, and the results as JSON.
 
-What the linear case of a scenario says: stability, largest reflection and delay, the theorem.
+The analysis covers several structures of one case: stability, maximum force-reflection ratio,
+maximum delay and the stability theorem of stiffness feedback. A scenario is analysed through its
+linear case. The describing function of a dead band gives its effect on the loop gain.
 
-A dead band in a loop: what share of a swing passes it.
-
-Linear predictions against the simulated two masses: what is felt, and what is stable.
-
-Two masses in time: master and slave with their channels, as differential equations with delay.
-
-A case is written as signals and coefficients. The signals are the master's position, its integral
-and derivatives, the hand's force and its integral, and the slave's position and its derivatives:
+The time simulation checks the linear predictions. It integrates two masses, master and slave with
+their channels, as differential equations with delay. A case is written as coefficients on signals.
+The signals are the master's position, its integral and derivatives, the hand's force and its
+integral, and the slave's position and its derivatives:
 
 `q = [int x, x, v, a, int F_h, F_h, y, w, w', w'']`
 
-so that a derivative moves coefficients one place. Accelerations, the hand's force and the slave's
-jerk follow from the others and from delayed signals by four linear equations, which also solves the
-algebraic loops of a structure without delay. Independent of `stability`, which it confirms.
+so that a derivative shifts the coefficients by one element. Accelerations, the hand's force and the
+slave's jerk follow from the other signals and from delayed signals by four linear equations. These
+also solve the algebraic loops of a structure without delay. The simulation does not use the
+linear stability test that it checks.
 """
 
 import math
@@ -52,26 +51,26 @@ from hydrotele.teleop.two_port import (
 INT, X, V, A, IMPULSE, FORCE, Y, W, W1, W2 = range(10)
 _KNOWN = np.array([INT, X, V, IMPULSE, Y, W])
 _SOLVED = np.array([A, FORCE, W1, W2])
-_PER_RATE = 0.2  # steps over the time constant of the fastest rate, a tenth of Adams' limit of 1
+_PER_RATE = 0.2  # steps per time constant of the fastest mode; the limit of Adams' method is 1
 _LARGEST = 5e-4  # s
-_BLOCKS = 20  # of a run, whose largest speeds are compared
-_GROWN, _GONE = 1e9, 1e-9  # of the kick, beyond which nothing changes any more
+_BLOCKS = 20  # number of parts of a run whose largest speeds are compared
+_GROWN, _GONE = 1e9, 1e-9  # factors on the initial speed beyond which a run is stopped
 _KICK = 0.1  # m/s
-_WHOLE = 1e-6  # of a step, what a quotient of delay and step rounds by
-_PERIODS = 2  # of a sine that are measured
+_WHOLE = 1e-6  # tolerance, in steps, for a delay that is a whole number of steps
+_PERIODS = 2  # number of sine periods that are measured
 _SETTLE = (20.0, 40.0, 80.0, 160.0, 320.0)  # s before a sine is measured
-_SETTLED = 1e-3  # change of what is measured, small against the 3 % that are asked for
-_TRIPS = 40  # there and back that a run lasts at least
-_FINEST = 2e-6  # s, a step below which a run takes minutes
+_SETTLED = 1e-3  # relative change of the measured impedance; the required accuracy is 3 %
+_TRIPS = 40  # minimum duration of a run in round-trip delays
+_FINEST = 2e-6  # s, minimum step; a run with a smaller one takes minutes
 
 
 class ControlLaw(NamedTuple):
-    """Coefficients on the signals (10,).
+    """Coefficients of a control law on the signals (10,).
 
     Attributes:
         own: force of the master's own controller.
-        forward: force on the slave, C1 and C3, of signals as they were a delay ago.
-        back: force on the master, C2 and C4, the same.
+        forward: force on the slave, C1 and C3, from delayed signals.
+        back: force on the master, C2 and C4, from delayed signals.
     """
 
     own: np.ndarray
@@ -80,11 +79,12 @@ class ControlLaw(NamedTuple):
 
 
 class SimulatedRun(NamedTuple):
-    """A simulated run.
+    """Results of a simulated run.
 
     Attributes:
-        largest: (20,) of master's and slave's speed together, in twentieths of the run [m/s].
-        felt: force over velocity of an imposed motion at its frequency [N s/m], else 0.
+        largest: (20,) maximum of the sum of master's and slave's speed in each twentieth of the run
+            [m/s].
+        felt: force over velocity of an imposed motion at its frequency [N s/m], otherwise 0.
     """
 
     largest: np.ndarray
@@ -92,17 +92,17 @@ class SimulatedRun(NamedTuple):
 
 
 def control_law(case: Case, structure: str, reflected: float = 1.0) -> ControlLaw:
-    """The control law of a structure in time.
+    """Return the control law of a structure in the time domain.
 
     Args:
         case: the teleoperator.
-        structure: its name, one of `STRUCTURES`.
-        reflected: factor on what comes back [1].
+        structure: name, one of `STRUCTURES`.
+        reflected: factor on the return channels [1].
 
     Returns:
-        The law.
+        Coefficients of the control law.
 
-    Source: Zhu 1994, 3.9-3.62, written in time.
+    Source: Zhu 1994, 3.9-3.62, written in the time domain.
     """
     kv, gains = case.gains.velocity, case.gains
     rate = structure in ("rate_position", "rate_force", "four_channel_rate")
@@ -126,17 +126,17 @@ def control_law(case: Case, structure: str, reflected: float = 1.0) -> ControlLa
 
 
 def on_motion(impedance: Impedance, position: int) -> np.ndarray:
-    """Coefficients (10,) of an impedance on a position and its two derivatives."""
+    """Return coefficients (10,) of an impedance on a position and its two derivatives."""
     made = np.zeros(10)
     made[position : position + 3] = impedance.stiffness, impedance.damping, impedance.mass
     return made
 
 
 def step_of(case: Case) -> float:
-    """Step that resolves the fastest rate that the masses can have together [s].
+    """Return a time step that resolves the fastest mode that the masses can have together [s].
 
     Raises:
-        InputError: that would take too long.
+        InputError: the step would be too small.
     """
     parts = (case.master, case.slave, case.master_control, case.slave_control, case.hand, case.task)
     lightest = min(part.mass for part in parts if part.mass)
@@ -148,8 +148,8 @@ def step_of(case: Case) -> float:
     step = _PER_RATE / max(rates)
     if step < _FINEST:
         raise InputError(
-            "teleoperator", f"too fast to be simulated, with rates of {max(rates):.3g} 1/s: the"
-            f" lightest mass is {lightest:g} kg; leave --confirm out or give hand and sides mass",
+            "teleoperator", f"modes are too fast to simulate: rates of {max(rates):.3g} 1/s with a"
+            f" lightest mass of {lightest:g} kg; omit --confirm or give hand and sides a mass",
         )  # fmt: skip
     return step
 
@@ -157,24 +157,24 @@ def step_of(case: Case) -> float:
 def impulse_response(
     case: Case, structure: str, reflected: float = 1.0, seconds: float = 40.0
 ) -> SimulatedRun:
-    """Simulate a kick of the hand, with hand and task in place.
+    """Simulate the response to an initial velocity of the master, with hand and task.
 
     Args:
-        case: the teleoperator with hand and task.
-        structure: its name.
-        reflected: factor on what comes back [1].
-        seconds: to simulate, and at least forty delays; it ends sooner where motion has died out
-            or has grown without bound.
+        case: teleoperator with hand and task.
+        structure: name of the structure.
+        reflected: factor on the return channels [1].
+        seconds: duration, at least forty round-trip delays; the run stops earlier when the motion
+            has decayed or has grown without bound.
 
     Returns:
-        The run.
+        Results of the run.
     """
     seconds = max(seconds, _TRIPS * 2.0 * case.delay)
     return _simulated(case, control_law(case, structure, reflected), seconds, 0.0, 0.0)
 
 
 def is_growing(run: SimulatedRun) -> bool:
-    """Whether a kick grows: speeds late in the run are larger than early ones."""
+    """Return whether the motion grows: late speeds are larger than early ones."""
     reached = run.largest[run.largest > 0.0]
     if len(reached) < _BLOCKS:
         return bool(reached[-1] > _KICK)
@@ -182,17 +182,17 @@ def is_growing(run: SimulatedRun) -> bool:
 
 
 def simulate_sine(case: Case, structure: str, frequency: float) -> complex:
-    """Impedance felt where the master's motion is an imposed sine.
+    """Return the impedance at the master while its motion is an imposed sine.
 
-    Transients are given more and more time, until that changes nothing.
+    The settling time is increased until the result no longer changes.
 
     Args:
-        case: the teleoperator with its task.
-        structure: its name.
-        frequency: [rad/s].
+        case: teleoperator with its task.
+        structure: name of the structure.
+        frequency: frequency of the sine [rad/s].
 
     Returns:
-        Force over velocity, of two periods [N s/m].
+        Force over velocity, measured over two periods [N s/m].
     """
     law, period = control_law(case, structure), 2.0 * math.pi / frequency
     felt = 0.0
@@ -208,13 +208,13 @@ def _simulated(
     case: Case, law: ControlLaw, seconds: float, frequency: float, measured: float
 ) -> SimulatedRun:
     step = step_of(case)
-    if frequency:  # a whole number of steps in a period, so that the sine's mean is 0
+    if frequency:  # a whole number of steps per period, so that the mean of the sine is 0
         step = 2.0 * math.pi / frequency / math.ceil(2.0 * math.pi / frequency / step)
-    elif case.delay_forward >= step:  # a whole number in the delay
+    elif case.delay_forward >= step:  # a whole number of steps per delay
         step = case.delay_forward / math.ceil(case.delay_forward / step)
     late = np.array([case.delay_forward, case.delay_back]) / step
     late = np.where(np.abs(late - np.round(late)) < _WHOLE, np.round(late), late)
-    late[late < 1.0] = 0.0  # less than a step counts as none
+    late[late < 1.0] = 0.0  # a delay of less than a step is neglected
     lags = int(late[0]), int(late[1])
     now, delayed = _equations(case, law, lags, bool(frequency))
     inverse = np.linalg.inv(now[:, _SOLVED])
@@ -228,10 +228,10 @@ def _simulated(
 def _equations(
     case: Case, law: ControlLaw, lags: tuple[int, int], imposed: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients (4, 10) on signals now, and on delayed ones (4, 20): forward, then back.
+    """Return coefficients (4, 10) on current and (4, 20) on delayed signals: forward, then back.
 
-    Rows: master, hand, slave, derivative of the slave's. The last is needed where the slave's jerk
-    is, and is otherwise `w'' = 0`.
+    Rows: master, hand, slave, derivative of the slave's equation. The last row is used where the
+    slave's jerk is needed, and is otherwise `w'' = 0`.
     """
     own = on_motion(case.master, X) + law.own
     own[FORCE] -= 1.0
@@ -254,7 +254,7 @@ def _equations(
 def _if_late(
     there: np.ndarray, here: np.ndarray, now: np.ndarray, lags: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Delayed coefficients; those without delay are moved to the signals of now."""
+    """Return delayed coefficients; those without delay are moved to the current signals."""
     found = []
     for part, lag in zip((there, here), lags, strict=True):
         if lag == 0:
@@ -266,7 +266,7 @@ def _if_late(
 
 @compiled
 def _march(inverse, known, delayed, lags, beyond, step, rows, measured, frequency):
-    """Largest speeds (20,), and sums of force and velocity times the measured wave (2,)."""
+    """Integrate; return largest speeds (20,) and Fourier sums of force and velocity (2,)."""
     past = np.zeros((max(lags[0], lags[1]) + 2, 10))
     largest, sums = np.zeros(_BLOCKS), np.zeros(2, np.complex128)
     q, before, late = np.zeros(10), np.zeros(10), np.zeros(20)
@@ -295,7 +295,7 @@ def _march(inverse, known, delayed, lags, beyond, step, rows, measured, frequenc
 
 @compiled
 def _recall(past, n, lags, beyond, late):
-    """Signals as they were a delay ago, between two steps where it is no whole number of them."""
+    """Interpolate the delayed signals between two steps."""
     for side in range(2):
         if lags[side] > 0 and n > lags[side]:
             row, share = n - lags[side], beyond[side]
@@ -306,7 +306,7 @@ def _recall(past, n, lags, beyond, late):
 
 @compiled
 def _solve(q, late, inverse, known, delayed, frequency):
-    """Accelerations, the hand's force and the slave's jerk."""
+    """Solve for accelerations, the hand's force and the slave's jerk."""
     for i in range(4):
         total = 0.0
         for j in range(20):
@@ -315,12 +315,12 @@ def _solve(q, late, inverse, known, delayed, frequency):
             total -= known[i, j] * q[_KNOWN[j]]
         if frequency != 0.0:
             total -= inverse[i, 1] * frequency**2 * q[X]
-        q[_SOLVED[i]] = total  # none of the known ones
+        q[_SOLVED[i]] = total  # _SOLVED and _KNOWN are disjoint
 
 
 @compiled
 def _advance(q, before, step, first):
-    """Second order: Adams-Bashforth for speeds and impulse, the trapezoid for what they move."""
+    """Advance speeds and impulse by second-order Adams-Bashforth, their integrals by trapezoids."""
     if first:
         before[:] = q
     x, v, w = q[X], q[V], q[W]
@@ -333,21 +333,21 @@ def _advance(q, before, step, first):
     q[INT] += 0.5 * step * (x + q[X])
 
 
-SWEPT = 2.0 * np.pi * np.geomspace(0.1, 5.0, 9)  # rad/s, what a hand moves
+SWEPT = 2.0 * np.pi * np.geomspace(0.1, 5.0, 9)  # rad/s, frequency range of hand motion
 
 
 @dataclass(frozen=True)
 class SineSweep:
-    """Impedance felt in a simulated sine sweep.
+    """Transmitted impedance in a simulated sine sweep.
 
     Attributes:
-        structure: its name.
-        delay_forward: from the master to the slave [s].
-        delay_back: back [s].
+        structure: name of the structure.
+        delay_forward: delay from the master to the slave [s].
+        delay_back: delay from the slave to the master [s].
         frequencies: (n,) [rad/s].
-        expected: (n,) by the formula [N s/m].
-        measured: (n,) in simulation [N s/m]; empty where a held master's slave is unstable, so that
-            nothing can be measured.
+        expected: (n,) predicted by the formula [N s/m].
+        measured: (n,) measured in simulation [N s/m]; empty if the slave is unstable while the
+            master is held, so that no measurement is possible.
     """
 
     structure: str
@@ -359,7 +359,7 @@ class SineSweep:
 
     @property
     def error(self) -> float | None:
-        """Largest relative error [1], None where nothing could be measured."""
+        """Largest relative error [1], None if no measurement is possible."""
         if not len(self.measured):
             return None
         return float(np.max(np.abs(self.measured / self.expected - 1.0)))
@@ -367,14 +367,14 @@ class SineSweep:
 
 @dataclass(frozen=True)
 class Agreement:
-    """Stability predicted and seen in simulation.
+    """Predicted and simulated stability on a grid.
 
     Attributes:
-        structure: its name.
-        delays: (n,) each way [s].
-        factors: (m,) on what comes back [1].
-        predicted: (m, n) true where stable.
-        seen: (m, n) the same in simulation.
+        structure: name of the structure.
+        delays: (n,) delays in each direction [s].
+        factors: (m,) factors on the return channels [1].
+        predicted: (m, n) true where predicted stable.
+        seen: (m, n) true where stable in simulation.
     """
 
     structure: str
@@ -385,20 +385,20 @@ class Agreement:
 
     @property
     def share(self) -> float:
-        """Share of the cells that agree [1]."""
+        """Fraction of the grid cells with equal prediction and simulation [1]."""
         return float(np.mean(self.predicted == self.seen))
 
 
 def sweep(case: Case, structure: str, frequencies: np.ndarray = SWEPT) -> SineSweep:
-    """Measure what is felt with imposed sines, and compute it.
+    """Compute the transmitted impedance and measure it with imposed sines in simulation.
 
     Args:
-        case: the teleoperator with its task.
-        structure: its name.
+        case: teleoperator with its task.
+        structure: name of the structure.
         frequencies: (n,) [rad/s].
 
     Returns:
-        Both.
+        Predicted and measured impedances.
     """
     port = case.port(structure)
     expected = transmitted(port, 1j * frequencies, case.task)
@@ -411,16 +411,16 @@ def sweep(case: Case, structure: str, frequencies: np.ndarray = SWEPT) -> SineSw
 
 
 def agreement(case: Case, structure: str, delays: np.ndarray, factors: np.ndarray) -> Agreement:
-    """Simulate a kick in every cell of a map of stability.
+    """Predict and simulate stability in every cell of a stability map.
 
     Args:
-        case: the teleoperator with hand and task.
-        structure: its name.
-        delays: (n,) each way [s].
-        factors: (m,) on what comes back [1].
+        case: teleoperator with hand and task.
+        structure: name of the structure.
+        delays: (n,) delays in each direction [s].
+        factors: (m,) factors on the return channels [1].
 
     Returns:
-        Prediction and simulation.
+        Predicted and simulated stability.
     """
     seen = [
         [
@@ -434,25 +434,25 @@ def agreement(case: Case, structure: str, delays: np.ndarray, factors: np.ndarra
 
 
 Progress = Callable[[str, float], None]
-_EVERY = 40  # frequency that goes into the JSON
+_EVERY = 40  # step of the frequencies that are written to the JSON
 
 
 @dataclass(frozen=True)
 class Findings:
-    """What was found.
+    """Results of an analysis of several structures.
 
     Attributes:
-        name: of the case.
-        case: the teleoperator with hand and task.
-        analyses: of the structures.
-        delays: (n,) each way of the map [s].
-        factors: (m,) of the map on what comes back [1].
+        name: name of the case.
+        case: teleoperator with hand and task.
+        analyses: one analysis per structure.
+        delays: (n,) delays of the map in each direction [s].
+        factors: (m,) factors of the map on the return channels [1].
         maps: structure -> (m, n), true where stable.
-        spring: the joystick axis with stiffness feedback, None without.
-        sweeps: measured in simulation, empty where not asked for.
-        agreements: the maps, simulated; empty where not asked for.
-        robust: what every structure withstands, sampled; empty where not asked for.
-        period: of that sampling [s].
+        spring: joystick axis with stiffness feedback, None without.
+        sweeps: simulated sine sweeps, empty if not requested.
+        agreements: simulated maps, empty if not requested.
+        robust: robustness of every sampled structure, empty if not requested.
+        period: sampling period [s].
     """
 
     name: str
@@ -472,24 +472,24 @@ def find(
     name: str, case: Case, structures: tuple[str, ...], delays: np.ndarray, factors: np.ndarray,
     spring: Spring | None = None, confirm: bool = False, progress: Progress | None = None,
 ) -> Findings:  # fmt: skip
-    """Analyse structures, and confirm them in simulation where that is asked for.
+    """Analyse structures and, if requested, check the results by simulation.
 
     Args:
-        name: of the case.
-        case: the teleoperator with hand and task.
-        structures: their names.
-        delays: (n,) each way of the map [s].
-        factors: (m,) of the map on what comes back [1].
-        spring: the joystick axis with stiffness feedback, None without.
-        confirm: whether to simulate sine sweeps, with the case's delays and without, and every cell
+        name: name of the case.
+        case: teleoperator with hand and task.
+        structures: names of the structures.
+        delays: (n,) delays of the map in each direction [s].
+        factors: (m,) factors of the map on the return channels [1].
+        spring: joystick axis with stiffness feedback, None without.
+        confirm: whether to simulate sine sweeps, with and without the case's delays, and every cell
             of the map.
-        progress: told the structure and the share that is done.
+        progress: called with the structure and the completed fraction.
 
     Returns:
-        What was found.
+        Results of all structures.
 
     Raises:
-        InputError: a structure is not known, or neither side has a mass.
+        InputError: a structure is not known, or neither master nor slave has a mass.
     """
     analyses, maps, sweeps, agreements = [], {}, [], []
     for n, structure in enumerate(structures):
@@ -509,14 +509,14 @@ def find(
 
 
 def why_unstable(one: Analysis, let_go: bool = False) -> str:
-    """What makes a structure unstable, in a few words.
+    """Return a short text on the stability of a structure and its unstable poles.
 
     Args:
         one: the analysis.
-        let_go: of the handle let go, not in a hand.
+        let_go: whether to describe the released handle instead of the held one.
 
     Returns:
-        Such as `no, 2 poles`, `yes` where it is stable.
+        Text such as `no, 2 poles`; `yes` if the structure is stable.
     """
     both = (one.unstable_poles, one.unstable_free)
     if let_go:
@@ -531,7 +531,7 @@ def why_unstable(one: Analysis, let_go: bool = False) -> str:
 
 
 def format_factor(margin: float) -> str:
-    """A gain margin; where none was found, the largest factor that was tried.
+    """Format a gain margin; an infinite one as more than the largest tested factor.
 
     >>> format_factor(0.17), format_factor(math.inf)
     ('x 0.17', '> x 1000')
@@ -540,7 +540,7 @@ def format_factor(margin: float) -> str:
 
 
 def format_delay(delay: float) -> str:
-    """A delay; where none was found, the longest that was tried.
+    """Format a delay; an infinite one as more than the largest tested delay.
 
     >>> format_delay(0.12345), format_delay(math.inf)
     ('123 ms', '> 10 s')
@@ -549,7 +549,7 @@ def format_delay(delay: float) -> str:
 
 
 def format_number(value: float) -> str:
-    """A number with five digits, without an exponent.
+    """Format a number with five digits, without an exponent.
 
     >>> format_number(-20026.0), format_number(0.0123456)
     ('-20026', '0.012346')
@@ -558,7 +558,7 @@ def format_number(value: float) -> str:
 
 
 def format_error(error: float | None) -> str:
-    """A relative error.
+    """Format a relative error.
 
     >>> format_error(0.0016), format_error(1e-7)
     ('0.16 %', '< 0.01 %')
@@ -569,10 +569,10 @@ def format_error(error: float | None) -> str:
 
 
 def findings_document(found: Findings) -> dict:
-    """What was found as plain data; infinite where nothing within reach changes stability.
+    """Convert the results to plain data; infinite if no tested value changes stability.
 
     Args:
-        found: the findings.
+        found: results of the analysis.
 
     Returns:
         A dictionary; complex numbers are pairs of real and imaginary part.
@@ -676,17 +676,17 @@ def _sweep(one: SineSweep) -> dict:
 
 
 def deadband_share(deadband: float, amplitude: float) -> float:
-    """Gain of a dead band for a sine about its centre, of its slope outside.
+    """Return the gain of a dead band for a centred sine, relative to its slope outside the band.
 
-    A loop with a dead band that is unstable by its slope still rests inside; it can sustain a swing
-    where this share brings its gain to the limit.
+    A loop that is unstable with the full slope still comes to rest inside the dead band. It can
+    sustain an oscillation at which this factor reduces the loop gain to the stability limit.
 
     Args:
-        deadband: half of the band d, scalar [m] or [rad].
-        amplitude: of the sine A, scalar [m] or [rad], > 0.
+        deadband: half width d of the band, scalar [m] or [rad].
+        amplitude: amplitude A of the sine, scalar [m] or [rad], > 0.
 
     Returns:
-        `1 - 2/pi (asin(d/A) + d/A sqrt(1 - (d/A)^2))`, scalar [1]; 0 for a swing inside.
+        `1 - 2/pi (asin(d/A) + d/A sqrt(1 - (d/A)^2))`, scalar [1]; 0 for a sine inside the band.
 
     Source: describing function of a dead zone; Gelb and Vander Velde 1968, appendix B.
 
@@ -708,43 +708,43 @@ _NAMES = {
 _CASE = "analyse a case file: hydrotele analyse teleop CASE.yaml --structure "
 _UNLINEAR = {
     "four_channel": (
-        "its slave moves by an observed force of the hand, which is not modelled for a machine",
+        "its slave moves by an observed hand force, which is not modelled for a machine",
         _CASE + "four_channel_{}",
     ),
     "wave_variables": (
-        "its line uses a wave only as far as energy has come",
+        "its channel transmits a wave only as far as received energy permits",
         _CASE + "wave_variables --robust",
     ),
     "passivity_control": (
-        "its line damps as much as energy is missing",
+        "its channel adds damping in proportion to the missing energy",
         _CASE + "passivity_control --robust",
     ),
     "impedance": (
-        "the stiffness that is felt is identified and changes",
+        "the displayed stiffness is identified online and changes",
         "analyse it with pilot.reflection=direct_force, or simulate it: hydrotele run",
     ),
-}  # reflection: why it has no linear case, and what to do
+}  # reflection: reason why it has no linear case, and the alternative
 _SEARCHED = 2.0 * np.pi * np.geomspace(0.02, 40.0, 4000)  # rad/s
 _STEPS, _NEWTON = 80, 8
 
 
 @dataclass(frozen=True)
 class LoopFindings:
-    """What was found of one structure.
+    """Results of the analysis of one structure of a scenario.
 
-    Attributes:
-        structure: its name.
-        own: whether it is the scenario's; else it is what a direct reflection would be instead.
-        unstable_poles: with the task; None where poles lie on the axis.
-        gain_margin: factor on what comes back up to which it is stable.
-        largest_delay: each way [s].
-        frequency: of the oscillation at the margin [Hz]; NaN without a margin.
-        pole: that oscillation's pole with the gain as it is [rad/s]; NaN without a margin.
-        largest_ratio: hand per machine force up to which it is stable [N/N]; NaN where no force is
-            reflected.
-        hand_force: at the machine's force limit with that ratio [N], [N m].
-        ratio_with_deadband: the same for a swing of the handle from stop to stop, of which the dead
-            band passes a part [N/N]; NaN where there is none.
+    structure: name of the structure.
+    own: whether it is the scenario's structure; otherwise direct force reflection replaces it.
+    unstable_poles: number of unstable poles with the task; None if poles lie on the imaginary
+        axis.
+    gain_margin: factor on the return channels up to which the loop is stable.
+    largest_delay: maximum delay in each direction [s].
+    frequency: frequency of the oscillation at the margin [Hz]; NaN without a margin.
+    pole: pole of that oscillation at the present gain [rad/s]; NaN without a margin.
+    largest_ratio: maximum stable ratio of hand force to machine force [N/N]; NaN if no force is
+        reflected.
+    hand_force: hand force at the machine's force limit with that ratio [N], [N m].
+    ratio_with_deadband: maximum stable ratio for an oscillation of the handle from stop to stop,
+        with the reduced gain of the dead band [N/N]; NaN without a dead band.
     """
 
     structure: str
@@ -760,22 +760,22 @@ class LoopFindings:
 
     @property
     def stable(self) -> bool:
-        """Whether no pole lies right of the axis."""
+        """Whether no pole lies in the right half-plane."""
         return self.unstable_poles == 0
 
 
 @dataclass(frozen=True)
 class ScenarioFindings:
-    """What was found of a scenario.
+    """Results of the analysis of a scenario.
 
     Attributes:
-        name: of the scenario.
-        case: the linear case.
-        task_source: where the task's numbers are from.
-        loop: of the scenario's structure, or of direct force in its place.
-        held: the joystick axis under stiffness feedback, with the hand.
-        free: the same let go.
-        edge_ratio: what stiffness feedback reflects at the dead band's edge [N/N].
+        name: name of the scenario.
+        case: linear case of the scenario.
+        task_source: source of the task's parameters.
+        loop: results of the scenario's structure, or of direct force reflection in its place.
+        held: joystick axis under stiffness feedback, with the hand.
+        free: joystick axis under stiffness feedback, released.
+        edge_ratio: reflection ratio of stiffness feedback at the dead band's edge [N/N].
     """
 
     name: str
@@ -788,15 +788,15 @@ class ScenarioFindings:
 
 
 def find_loop(name: str, case: LinearCase, task_source: str) -> ScenarioFindings:
-    """Analyse a scenario's linear case.
+    """Analyse the linear case of a scenario.
 
     Args:
-        name: of the scenario.
-        case: the case.
-        task_source: where the task's numbers are from.
+        name: name of the scenario.
+        case: linear case of the scenario.
+        task_source: source of the task's parameters.
 
     Returns:
-        What was found.
+        Results of the analysis.
 
     Raises:
         InputError: the structure has no linear case.
@@ -821,7 +821,7 @@ def structure_findings(case: LinearCase, structure: str, own: bool = True) -> Lo
     """Analyse one structure of a case; see `LoopFindings`.
 
     Raises:
-        InputError: the structure is not known here.
+        InputError: the structure is not known.
     """
     if structure not in STRUCTURES:
         raise InputError("structure", f"{structure!r}; known: {', '.join(STRUCTURES)}")
@@ -843,7 +843,7 @@ def structure_findings(case: LinearCase, structure: str, own: bool = True) -> Lo
 
 
 def _swing(case: LinearCase, structure: str, margin: float) -> tuple[float, complex]:
-    """Frequency [Hz] at which the loop is about to swing, and its pole at the gain as it is."""
+    """Return the oscillation frequency at the margin [Hz], and its pole at the present gain."""
     if not 0.0 < margin < math.inf:
         return math.nan, complex(math.nan, math.nan)
 
@@ -862,10 +862,10 @@ def _swing(case: LinearCase, structure: str, margin: float) -> tuple[float, comp
 
 
 def loop_document(found: ScenarioFindings) -> dict:
-    """What was found as plain data, SI; infinite or NaN where there is none.
+    """Convert the results to plain data in SI units; missing values are infinite or NaN.
 
     Args:
-        found: the findings.
+        found: results of the analysis.
 
     Returns:
         A dictionary.

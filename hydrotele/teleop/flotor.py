@@ -1,7 +1,7 @@
-"""Mass, centre of gravity and inertia of a levitated flotor from its own motion and currents.
+"""Identification of mass, centre of mass and inertia of a levitated flotor from its own motion.
 
-The coils push the flotor with a known wrench, the sensors tell where it is: Newton and Euler in the
-coils' frame are linear in ten numbers. Both sides go through the same filter.
+The coils apply a known wrench and the sensors measure the pose. The Newton-Euler equations in the
+coils' frame are linear in ten parameters. Both sides pass through the same filter.
 """
 
 from dataclasses import dataclass
@@ -16,24 +16,24 @@ from hydrotele.teleop.compliance import GRAVITY, Flotor, rotation_between, turn_
 
 NAMES = ("mass", "com_x", "com_y", "com_z", "i_xx", "i_yy", "i_zz", "i_xy", "i_xz", "i_yz")
 _WHERE = "flotor"
-_CUTOFF = 12.0  # Hz, twice the fastest tone of an excitation; differences make noise above it
-_SETTLE = 0.5  # s at either end, where the filter has no past or future
-_FROM_LIST = ((0, 3, 4), (3, 1, 5), (4, 5, 2))  # xx yy zz xy xz yz as a matrix
-_LEFT = 0.2  # of a force or torque: with more left over, noise was fitted
+_CUTOFF = 12.0  # Hz, twice the fastest excitation tone; differentiation amplifies noise above it
+_SETTLE = 0.5  # s that are discarded at both ends because of filter transients
+_FROM_LIST = ((0, 3, 4), (3, 1, 5), (4, 5, 2))  # indices of xx yy zz xy xz yz in a matrix
+_LEFT = 0.2  # maximum residual relative to the wrench; above it the fit only follows noise
 _SIGMAS = 1.96
-_HELD = 1e-3  # what differences over held periods leave of accelerations at 6 Hz: (w dt)^2 / 36
+_HELD = 1e-3  # relative error of difference quotients at 6 Hz: (w dt)^2 / 36
 
 
 @dataclass(frozen=True)
 class FlotorFit:
-    """The ten numbers that were found, in the coils' frame; order of NAMES.
+    """Ten identified parameters in the coils' frame, in the order of NAMES.
 
     Attributes:
         value: (10,) mass [kg], centre of mass [m], inertia about it [kg m^2].
-        interval: (10,) half widths of the 95 % intervals.
-        residual: (6,) root mean squares of force [N] and torque [N m] that are left.
-        condition: of the scaled equations.
-        rows: number of instants.
+        interval: (10,) half widths of the 95 % confidence intervals.
+        residual: (6,) root mean square residuals of force [N] and torque [N m].
+        condition: condition number of the scaled equations.
+        rows: number of samples.
     """
 
     value: np.ndarray
@@ -43,10 +43,10 @@ class FlotorFit:
     rows: int
 
     def body(self) -> Flotor:
-        """For the control.
+        """Return the identified body for use in the control.
 
         Raises:
-            InputError: no body can have these numbers.
+            InputError: the parameters are not physical.
         """
         return Flotor(float(self.value[0]), self.value[1:4].copy(), _matrix(self.value[4:]))
 
@@ -55,23 +55,24 @@ def identify_flotor(
     place: np.ndarray, quaternion: np.ndarray, currents: np.ndarray, period: float, coils: Coils,
     cutoff: float = _CUTOFF,
 ) -> FlotorFit:  # fmt: skip
-    """Least squares over a motion that turns and moves all axes.
+    """Identify the flotor's parameters by least squares from a motion that excites all axes.
 
     Args:
-        place: (n, 3) of the coils' frame [m].
-        quaternion: (n, 4) of its orientation, scalar first.
-        currents: (n, 6) held from each reading until the next [A].
-        period: of the readings [s].
-        coils: their map and place define frame and wrench.
-        cutoff: of the filter [Hz].
+        place: (n, 3) position of the coils' frame [m].
+        quaternion: (n, 4) orientation of the frame, scalar first.
+        currents: (n, 6) held from each sample until the next [A].
+        period: sampling period [s].
+        coils: coils; their map and position define frame and wrench.
+        cutoff: cutoff frequency of the filter [Hz].
 
     Returns:
-        The fit. Its intervals count noise, which follows itself in time, and what differences over
-        held periods leave (1e-3 of the flotor's size, 1e-6 of its mass, which gravity tells); not a
-        wrong map of the coils.
+        The fit. Its intervals include correlated noise and the error of difference quotients
+        (1e-3 of the flotor's size, 1e-6 of its mass, which gravity determines). They do not
+        include errors of the coils' map.
 
     Raises:
-        InputError: too short, readings that are no numbers, or a motion that does not tell all ten.
+        InputError: the record is too short, has invalid samples, or its motion does not make all
+            ten parameters identifiable.
 
     Source: Newton and Euler about a point of the body; Atkeson, An and Hollerbach 1986 (linear in
     ten parameters); Zhu 1994, 5.1.3 (the joystick was identified so).
@@ -80,16 +81,16 @@ def identify_flotor(
     if len(place) < 4 * ends:
         raise InputError(_WHERE, f"needs at least {4 * _SETTLE:g} s, got {len(place) * period:g} s")
     if not all(np.isfinite(part).all() for part in (place, quaternion, currents)):
-        raise InputError(_WHERE, "readings and currents must be numbers: leave out faulty parts")
+        raise InputError(_WHERE, "poses and currents must be finite: remove faulty samples")
     matrix, wrench = flotor_equations(place, quaternion, currents, period, coils)
     low = butter(4, cutoff, fs=1.0 / period, output="sos")
-    every = max(1, int(0.25 / (cutoff * period)))  # rows beyond twice the cutoff tell nothing new
+    every = max(1, int(0.25 / (cutoff * period)))  # faster sampling adds no information
     kept = slice(ends, -ends, every)
     matrix, wrench = (sosfiltfilt(low, part, axis=0)[kept] for part in (matrix, wrench))
     moving = np.sqrt(np.sum(matrix**2, axis=(0, 1))).all()
     found = estimate(matrix, wrench) if moving else None
     if found is None or (np.std(found.residual, axis=0) > _LEFT * np.std(wrench, axis=0)).any():
-        raise InputError(_WHERE, "this motion does not tell all ten numbers: turn about every axis")
+        raise InputError(_WHERE, "not all ten parameters are identifiable: rotate about every axis")
     value, slope = _about_centre(found.value)
     noise = np.diag(slope @ found.covariance @ slope.T)
     interval = np.hypot(_SIGMAS * np.sqrt(noise), _of_differences(value))
@@ -102,16 +103,16 @@ def identify_flotor(
 def flotor_equations(
     place: np.ndarray, quaternion: np.ndarray, currents: np.ndarray, period: float, coils: Coils
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Newton and Euler of a body that is pushed by held wrenches, at the inner readings.
+    """Build the Newton-Euler regression of a body under piecewise constant wrenches.
 
-    Between readings the wrench is constant; a second difference of places is then the mean of the
-    two accelerations around a reading, and goes with the mean of the two wrenches.
+    The wrench is constant between samples. A second difference of positions is therefore the mean
+    of the accelerations before and after a sample, and is paired with the mean of the two wrenches.
 
     Args:
-        place: (n, 3) of the coils' frame [m].
+        place: (n, 3) position of the coils' frame [m].
         quaternion: (n, 4) scalar first.
         currents: (n, 6) [A].
-        period: [s].
+        period: sampling period [s].
         coils: the coils.
 
     Returns:
@@ -138,21 +139,21 @@ def flotor_equations(
 
 
 def _of_differences(value: np.ndarray) -> np.ndarray:
-    """Errors (10,) of differences over held periods, for tones up to 6 Hz at 200 Hz."""
+    """Return the errors (10,) of difference quotients, for tones up to 6 Hz at 200 Hz."""
     moment = value[4:7].sum() / 2.0
     radius = float(np.sqrt(moment / value[0]))
     return _HELD * np.array([1e-3 * value[0], *[radius] * 3, *[moment] * 6])
 
 
 def _turning(first: np.ndarray, then: np.ndarray) -> np.ndarray:
-    """Rotation vector (3,) between two orientations, in the body's axes [rad]."""
+    """Return the rotation vector (3,) between two orientations, in the body's axes [rad]."""
     scalar, vector = rotation_between(first, then)
     size = float(np.linalg.norm(vector))
     return vector * (2.0 * np.arctan2(size, scalar) / size if size > 1e-12 else 2.0)
 
 
 def _cross(v: np.ndarray) -> np.ndarray:
-    """(n, 3, 3) that make cross products with (n, 3)."""
+    """Return the matrices (n, 3, 3) of the cross products of v (n, 3)."""
     out = np.zeros((len(v), 3, 3))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         out[:, k, j], out[:, j, k] = v[:, i], -v[:, i]
@@ -160,7 +161,7 @@ def _cross(v: np.ndarray) -> np.ndarray:
 
 
 def _of_inertia(v: np.ndarray) -> np.ndarray:
-    """(n, 3, 6) so that it times xx, yy, zz, xy, xz, yz is the inertia times v (n, 3)."""
+    """Return (n, 3, 6) that maps xx, yy, zz, xy, xz, yz to the inertia times v (n, 3)."""
     out = np.zeros((len(v), 3, 6))
     for row, places in enumerate(_FROM_LIST):
         for column, place in enumerate(places):
@@ -173,9 +174,9 @@ def _matrix(six: np.ndarray) -> np.ndarray:
 
 
 def _about_centre(linear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """From first moments and inertia about the coils to centre and inertia about it: value, slope.
+    """Move first moments and inertia from the coils' frame to the centre of mass.
 
-    The slope (10, 10) is that of the value by the linear numbers, by central differences.
+    Return the parameters (10,) and their Jacobian (10, 10), by central differences.
     """
 
     def moved(p: np.ndarray) -> np.ndarray:

@@ -1,17 +1,16 @@
-"""A joystick that stands alone, simulated: sensing, control and flotor in one loop.
+"""Simulation of a stand-alone levitated joystick: sensing, control and flotor in one loop.
 
-The flotor hovers, steps and wobbles without a hand; tests, the study and identification look at it
-through what is sensed and which currents flow.
+The flotor hovers, follows steps and excitation paths without a hand. Tests and identification use
+the sensed poses and the coil currents.
 
-Control of a joystick that stands alone: sensed pose to coil currents, once per period.
+The control converts a sensed pose to coil currents once per period. Every axis is a designed
+second-order system about a remote centre of compliance at the handle. With a hand on the handle,
+`teleop.master` applies springs at the handle instead.
 
-Every axis is the second-order system that was designed, about a remote centre of compliance at the
-handle. With a hand on it `teleop.master` puts springs at the handle instead.
-
-Optical sensing of a levitated flotor: three light beams on three two-axis diodes give its pose.
-
-Beams leave the flotor's centre at 120 degrees in one plane; each meets a position-sensing diode on
-the stator, which tells where: sideways and up. Six readings make the six numbers of a pose.
+Optical sensing measures the pose with three light beams on three two-axis diodes. The beams leave
+the flotor's centre at 120 degrees in one plane. Each meets a position-sensing diode on the stator,
+which measures its lateral and vertical position. Six readings determine the six coordinates of a
+pose.
 """
 
 from collections.abc import Callable
@@ -34,21 +33,21 @@ from hydrotele.teleop.compliance import (
     turn_matrix,
 )
 
-FROZEN = 0.1  # s: a reading with noise is never the same for twenty periods
+FROZEN = 0.1  # s: a reading with noise is never constant for twenty periods
 _NONE = np.zeros(6)
 
 
 @dataclass(frozen=True)
 class Levitation:
-    """Numbers of the control.
+    """Parameters of the control.
 
     Attributes:
-        body: what the control takes the flotor for, in the coils' frame.
-        axes: the designed second-order systems.
+        body: model of the flotor in the control, in the coils' frame.
+        axes: designed second-order systems.
         coils: the coils.
         handle: (3,) centre of compliance in the coils' frame [m].
-        period: of the control [s].
-        frozen: time for which a reading may stay the same to the last digit [s].
+        period: control period [s].
+        frozen: maximum time for which a reading may be exactly constant [s].
     """
 
     body: Flotor
@@ -60,11 +59,11 @@ class Levitation:
 
 
 class ControllerState(NamedTuple):
-    """What the control keeps from period to period.
+    """State of the control between periods.
 
     Attributes:
-        place: (3,) last reading of the coils' frame [m]; NaN where there was none.
-        quaternion: (4,) its orientation, scalar first.
+        place: (3,) last measured position of the coils' frame [m]; NaN if there was none.
+        quaternion: (4,) last measured orientation, scalar first.
         same: time for which the reading has not changed [s].
     """
 
@@ -74,12 +73,12 @@ class ControllerState(NamedTuple):
 
 
 class CoilOutput(NamedTuple):
-    """What the coils get.
+    """Output of the control to the coils.
 
     Attributes:
         currents: (6,) [A].
-        limited: whether they had to be made smaller.
-        blind: whether they are off because the reading is no number, or frozen.
+        limited: whether the currents were scaled down.
+        blind: whether the coils are off because the reading is not finite or is frozen.
     """
 
     currents: np.ndarray
@@ -90,18 +89,18 @@ class CoilOutput(NamedTuple):
 def levitation(
     joystick: Joystick, body: Flotor | None = None, frozen: float = FROZEN
 ) -> Levitation:
-    """Control of a joystick.
+    """Build the control parameters of a joystick.
 
     Args:
         joystick: the joystick.
-        body: what the control takes the flotor for; the true numbers by default.
-        frozen: time for which a reading may stay the same to the last digit [s].
+        body: model of the flotor in the control; the true parameters by default.
+        frozen: maximum time for which a reading may be exactly constant [s].
 
     Returns:
-        The numbers.
+        Parameters of the control.
 
     Raises:
-        InputError: numbers that make no sense.
+        InputError: the parameters are not physical.
     """
     f, c, alone = joystick.flotor, joystick.coils, joystick.alone
     own = Flotor(f.mass, np.array(f.com), np.diag(f.inertia))
@@ -116,7 +115,7 @@ def levitation(
 
 
 def initial_controller_state() -> ControllerState:
-    """What the control knows before its first reading."""
+    """Return the state of the control before its first reading."""
     return ControllerState(np.full(3, np.nan), np.full(4, np.nan), 0.0)
 
 
@@ -124,22 +123,22 @@ def levitation_step(
     control: Levitation, before: ControllerState, place: np.ndarray, quaternion: np.ndarray,
     target: np.ndarray, turned: np.ndarray,
 ) -> tuple[ControllerState, CoilOutput]:  # fmt: skip
-    """One period: velocities by differences, wrench, currents.
+    """Run one control period: velocities by differences, wrench, currents.
 
-    A reading that is no number, or has been the same for longer than noise allows, switches the
-    coils off, so that nobody is pushed by what is not measured; the flotor then sinks onto its
-    stops. With good readings it rises again, from rest.
+    A reading that is not finite, or is constant for longer than noise permits, switches the coils
+    off, so that an unmeasured pose causes no force. The flotor then sinks onto its stops. With
+    valid readings it rises again from rest.
 
     Args:
-        control: the numbers.
-        before: what was remembered.
-        place: (3,) reading of the coils' frame, from the handle's centre [m].
-        quaternion: (4,) reading of its orientation, scalar first.
-        target: (3,) where the handle should be, from its centre [m].
-        turned: (4,) orientation that the flotor should have, scalar first.
+        control: parameters of the control.
+        before: state after the previous period.
+        place: (3,) measured position of the coils' frame, from the handle's centre [m].
+        quaternion: (4,) measured orientation, scalar first.
+        target: (3,) reference position of the handle, from its centre [m].
+        turned: (4,) reference orientation of the flotor, scalar first.
 
     Returns:
-        What to remember, and the currents.
+        The new state, and the currents.
 
     Source: Zhu 1994, 5.1.3.
     """
@@ -160,12 +159,12 @@ def levitation_step(
 
 
 def coils_from_handle(handle: np.ndarray, place: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
-    """Place of the coils' frame (3,) [m].
+    """Return the position of the coils' frame (3,) [m] from the pose of the handle.
 
     Args:
         handle: (3,) the handle's point in the coils' frame [m].
-        place: (3,) of the handle [m].
-        quaternion: (4,) scalar first.
+        place: (3,) position of the handle [m].
+        quaternion: (4,) orientation, scalar first.
     """
     turn = np.empty((3, 3))
     turn_matrix(quaternion, turn)
@@ -173,26 +172,26 @@ def coils_from_handle(handle: np.ndarray, place: np.ndarray, quaternion: np.ndar
 
 
 _WHERE = "optical sensing"
-_ENOUGH, _MOST = 1e-12, 20  # m and rad of a Newton step; 4 steps do within the stops
-_ANGLES = np.pi * np.array([1.0, 3.0, 5.0]) / 3.0  # between the three stations of the coils
+_ENOUGH, _MOST = 1e-12, 20  # tolerance [m], [rad], maximum Newton steps; 4 suffice in the range
+_ANGLES = np.pi * np.array([1.0, 3.0, 5.0]) / 3.0  # halfway between the stations of the coils
 _OUT = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES), np.zeros(3)])
 _ASIDE = np.column_stack([-np.sin(_ANGLES), np.cos(_ANGLES), np.zeros(3)])
 _UP = np.array([0.0, 0.0, 1.0])
 
 
 def diode_readings(place: np.ndarray, turn: np.ndarray, distance: float) -> np.ndarray:
-    """Where the beams meet the diodes.
+    """Return the positions at which the beams meet the diodes.
 
     Args:
-        place: (3,) of the flotor's centre from its nominal place [m].
+        place: (3,) displacement of the flotor's centre from its nominal position [m].
         turn: (3, 3) rotation matrix, flotor to stator.
-        distance: of the diodes from the centre [m].
+        distance: distance of the diodes from the centre [m].
 
     Returns:
-        (6,) readings, sideways and up of one diode after the other [m].
+        (6,) readings: lateral and vertical position on each diode in turn [m].
 
     Raises:
-        InputError: a beam leaves its diode's side.
+        InputError: a beam does not reach its diode's side.
 
     Source: Zhu 1994, 5.1.2 (coplanar radial beams at 120 degrees); geometry of a line and a plane.
 
@@ -205,18 +204,18 @@ def diode_readings(place: np.ndarray, turn: np.ndarray, distance: float) -> np.n
 
 
 def pose_of_readings(readings: np.ndarray, distance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pose of the flotor from the six readings, by Newton's method from the centre.
+    """Compute the flotor's pose from the six readings, by Newton's method from the centre.
 
     Args:
-        readings: (6,) as of `diode_readings` [m].
-        distance: of the diodes from the centre [m].
+        readings: (6,) see `diode_readings` [m].
+        distance: distance of the diodes from the centre [m].
 
     Returns:
-        Place (3,) [m] and rotation matrix (3, 3), flotor to stator; NaN where a reading is no
-        number.
+        Position (3,) [m] and rotation matrix (3, 3), flotor to stator; NaN if a reading is not
+        finite.
 
     Raises:
-        InputError: no pose makes these readings.
+        InputError: no pose corresponds to these readings.
 
     Source: `diode_readings`; Newton.
     """
@@ -229,18 +228,19 @@ def pose_of_readings(readings: np.ndarray, distance: float) -> tuple[np.ndarray,
         place, turn = place + step[:3], _rotation(step[3:]) @ turn
         if np.abs(step).max() < _ENOUGH:
             return place, turn
-    raise InputError(_WHERE, f"no pose makes the readings {readings}")
+    raise InputError(_WHERE, f"no pose corresponds to the readings {readings}")
 
 
 def pose_resolution(distance: float, step: float) -> np.ndarray:
-    """What a step of the diodes leaves unknown of the pose at the centre.
+    """Return the pose uncertainty at the centre that results from the diodes' resolution.
 
     Args:
-        distance: of the diodes from the centre [m].
-        step: of their readings [m].
+        distance: distance of the diodes from the centre [m].
+        step: resolution of their readings [m].
 
     Returns:
-        (6,) standard deviations of place [m] and rotation [rad], for errors even over a step.
+        (6,) standard deviations of position [m] and rotation [rad], for errors that are uniform
+        over a step.
 
     Source: linear propagation through `diode_readings`.
     """
@@ -250,7 +250,7 @@ def pose_resolution(distance: float, step: float) -> np.ndarray:
 
 
 def _meet(place, turn, distance) -> tuple[np.ndarray, np.ndarray]:
-    """Readings (6,) and their derivatives (6, 6) by place and by a small turn of the stator's."""
+    """Return readings (6,) and Jacobian (6, 6) by position and a small rotation of the stator."""
     readings, slope = np.empty(6), np.empty((6, 6))
     for k, (out, aside) in enumerate(zip(_OUT, _ASIDE, strict=True)):
         beam = turn @ out
@@ -269,7 +269,7 @@ def _meet(place, turn, distance) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _rotation(vector: np.ndarray) -> np.ndarray:
-    """Rotation matrix of a rotation vector."""
+    """Convert a rotation vector to a rotation matrix."""
     angle = float(np.linalg.norm(vector))
     x, y, z = vector / angle if angle > 0.0 else vector
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -277,23 +277,23 @@ def _rotation(vector: np.ndarray) -> np.ndarray:
 
 
 Reading = tuple[np.ndarray, np.ndarray]
-_FINE = 2  # times the physics steps of a run; with Runge and Kutta they make no error to be seen
+_FINE = 2  # factor on the physics steps of a run, with a negligible Runge-Kutta error
 _TONES = 6
 
 
 @dataclass(frozen=True)
 class LevitationRun:
-    """What happened, one row per control period.
+    """Time histories of a run, one row per control period.
 
     Attributes:
         time: (n,) [s].
         pose: (n, 6) true displacement of the handle [m] and rotation vector [rad].
-        place: (n, 3) sensed place of the coils' frame, from the handle's centre [m].
-        quaternion: (n, 4) sensed orientation, scalar first.
-        currents: (n, 6) from this reading until the next [A].
-        limited: (n,) whether currents had to be made smaller.
-        blind: (n,) whether the coils were off for want of a reading.
-        warnings: of MuJoCo, all kinds together.
+        place: (n, 3) measured position of the coils' frame, from the handle's centre [m].
+        quaternion: (n, 4) measured orientation, scalar first.
+        currents: (n, 6) held from this reading until the next [A].
+        limited: (n,) whether the currents were scaled down.
+        blind: (n,) whether the coils were off because of an invalid reading.
+        warnings: number of MuJoCo warnings of all kinds.
     """
 
     time: np.ndarray
@@ -307,20 +307,20 @@ class LevitationRun:
 
 
 class PoseSensor:
-    """Reads the flotor's pose as its sensors do.
+    """Measure the flotor's pose with the resolution and noise of its sensors.
 
-    The simple reading rounds handle place and rotation vector to the stated resolution, as
-    `teleop.master` does; through the diodes the three beams are followed instead.
+    By default the position of the handle and the rotation vector are rounded to the resolution, as
+    in `teleop.master`. With diodes, the three beams are traced instead.
     """
 
     def __init__(self, joystick: Joystick, *, noise: float, diodes: bool, seed: int) -> None:
-        """Open it.
+        """Create the sensor.
 
         Args:
             joystick: the joystick.
-            noise: largest error before rounding, in steps of the resolution.
-            diodes: whether to follow the beams.
-            seed: of the noise.
+            noise: maximum error before rounding, in steps of the resolution.
+            diodes: whether to trace the beams.
+            seed: seed of the noise.
         """
         self._noise, self._rng = noise, np.random.default_rng(seed)
         self._handle = np.array(joystick.flotor.handle)
@@ -331,7 +331,7 @@ class PoseSensor:
             self._step = np.full(6, joystick.diodes.step)
 
     def read(self, qpos: np.ndarray) -> Reading:
-        """Place of the coils' frame, from the handle's centre (3,) [m], and its quaternion (4,)."""
+        """Return position (3,) [m] from the handle's centre and quaternion (4,) of the coils."""
         if self._distance:
             turn = np.empty((3, 3))
             turn_matrix(qpos[3:7], turn)
@@ -359,22 +359,22 @@ def simulate_levitation(
     cab: tuple[np.ndarray, np.ndarray] | None = None, push: np.ndarray | None = None,
     spoil: Callable[[int, Reading], Reading] | None = None,
 ) -> LevitationRun:  # fmt: skip
-    """Levitate the flotor along a path.
+    """Simulate the levitated flotor along a reference path.
 
     Args:
         joystick: the joystick.
-        target: (n, 6) where the handle should be [m], rotation vector [rad], per control period.
+        target: (n, 6) reference of the handle [m], rotation vector [rad], per control period.
         control: the control; the joystick's own by default.
-        start: (6,) pose at rest [m], [rad]; the centre by default.
-        noise: largest error of a reading before rounding, in steps of the resolution.
-        diodes: whether the pose is sensed by the three diodes, rather than rounded.
-        seed: of the noise.
-        cab: (n,) turning [rad/s] and (n,) its rate [rad/s^2] of the cab that it stands in.
+        start: (6,) initial pose at rest [m], [rad]; the centre by default.
+        noise: maximum error of a reading before rounding, in steps of the resolution.
+        diodes: whether the three diodes measure the pose, instead of rounding it.
+        seed: seed of the noise.
+        cab: (n,) angular velocity [rad/s] and (n,) angular acceleration [rad/s^2] of the cab.
         push: (n, 6) forces [N] and torques [N m] on the handle.
-        spoil: what a fault makes of the reading of a period.
+        spoil: function that applies a sensor fault to the reading of a period.
 
     Returns:
-        What happened.
+        Time histories of the run.
     """
     control = control or levitation(joystick, frozen=FROZEN if noise > 0.0 else np.inf)
     flotor = SimulatedFlotor(
@@ -407,24 +407,24 @@ def simulate_levitation(
 def excitation_path(
     joystick: Joystick, seconds: float, seed: int = 0, share: float = 0.5
 ) -> np.ndarray:
-    """A path that tells the flotor's numbers: every axis in its own tones between 0.4 and 6 Hz.
+    """Generate an identification path: every axis with its own tones between 0.4 and 6 Hz.
 
     Args:
         joystick: the joystick.
-        seconds: how long [s].
-        seed: of the phases.
-        share: of the workspace that the targets may use [1].
+        seconds: duration [s].
+        seed: seed of the phases.
+        share: fraction of the workspace that the targets may use [1].
 
     Returns:
         (n, 6) targets for `simulate_levitation` [m], [rad].
     """
     rng, time = np.random.default_rng(seed), np.arange(0.0, seconds, 1.0 / joystick.control_rate)
-    tones = 0.4 * 15.0 ** ((np.arange(6 * _TONES) + 0.5) / (6 * _TONES))  # no tone twice
+    tones = 0.4 * 15.0 ** ((np.arange(6 * _TONES) + 0.5) / (6 * _TONES))  # all tones differ
     path = np.empty((len(time), 6))
     for axis in range(6):
         angles = 2.0 * np.pi * np.outer(time, tones[axis::6]) + rng.uniform(0, 2 * np.pi, _TONES)
         path[:, axis] = np.sin(angles).sum(axis=1)
-    path *= np.clip(time, 0.0, 1.0)[:, None]  # rises from rest in a second
+    path *= np.clip(time, 0.0, 1.0)[:, None]  # starts from rest within 1 s
     for rows, far in ((slice(0, 3), min(joystick.reach[:3])),
                       (slice(3, 6), min(joystick.reach[3:]))):  # fmt: skip
         path[:, rows] *= share * far / np.linalg.norm(path[:, rows], axis=1).max()
@@ -432,12 +432,12 @@ def excitation_path(
 
 
 def designed_step(time: np.ndarray, frequency: float, ratio: float) -> np.ndarray:
-    """Unit step response of an underdamped second-order system.
+    """Return the unit step response of an underdamped second-order system.
 
     Args:
         time: (n,) [s].
-        frequency: natural [rad/s].
-        ratio: of damping, below 1.
+        frequency: natural frequency [rad/s].
+        ratio: damping ratio, below 1.
 
     Returns:
         (n,) from 0 to 1.
@@ -452,14 +452,14 @@ def designed_step(time: np.ndarray, frequency: float, ratio: float) -> np.ndarra
 
 
 def rotation_vector(quaternion: np.ndarray) -> np.ndarray:
-    """Rotation vector (3,) [rad] of a quaternion (4,), scalar first."""
+    """Convert a quaternion (4,), scalar first, to a rotation vector (3,) [rad]."""
     out = np.zeros(3)
     mujoco.mju_quat2Vel(out, quaternion, 1.0)
     return out
 
 
 def quaternion_of(vector: np.ndarray) -> np.ndarray:
-    """Quaternion (4,), scalar first, of a rotation vector (3,) [rad]."""
+    """Convert a rotation vector (3,) [rad] to a quaternion (4,), scalar first."""
     angle = float(np.linalg.norm(vector))
     out = np.zeros(4)
     mujoco.mju_axisAngle2Quat(out, vector / angle if angle > 0.0 else np.array([0, 0, 1.0]), angle)

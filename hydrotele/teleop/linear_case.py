@@ -1,34 +1,31 @@
-"""One axis of a teleoperated scenario as a linear loop, from the numbers that are simulated.
+"""Linear model of one axis of a teleoperated scenario, built from its simulation parameters.
 
-Hand and flotor are `(M_m + M_h) s + B_h + K_h / s`; the coils add spring and damper of the
-scenario's gains, sampled: a control period T holds them for T / 2 on average, the damper differs
-over another T. A person who answers a directly reflected force with a force lets his place go: the
-spring of his arm follows the handle, `K_h (1 - exp(-s t)) / s` with the reflex' time and half a
-decision's. Under rate control the handle beyond its dead band asks for `k_v x`, so that the tip
-follows `k_v V_h / s` (`teleop.linear_machine`); under position control its place, filtered. The
-task pushes back; the force at the tip comes back through the estimator's two filters, held for a
-sample of the sensors, through the line with its delay, times the ratio.
+Hand and flotor are `(M_m + M_h) s + B_h + K_h / s`. The coils add spring and damper of the
+scenario's gains, sampled: a control period T holds them for T / 2 on average, and the damper's
+difference quotient adds another T / 2. An operator who answers a directly reflected force with a
+force does not control the position: the spring of the arm follows the handle,
+`K_h (1 - exp(-s t)) / s`, with t the reflex time and half a decision period. Under rate control the
+handle beyond its dead band commands `k_v x`, so that the tip follows `k_v V_h / s`. Under position
+control the tip follows the filtered position. The force at the tip returns through the estimator's
+two filters, a hold of one sensor sample and the channel's delay, multiplied by the ratio.
 
-Left out: dead bands, stops, limits of force and acceleration, loss of contact, sensor noise; the
-other axes of the handle, which are at rest.
+Neglected: dead bands, stops, limits of force and acceleration, loss of contact, sensor noise, and
+the other axes of the handle, which are at rest.
 
-The linear case of a teleoperated scenario: machine in contact, joystick, servo, line, task.
-
-A valve-controlled machine as its tip feels along one task coordinate, linear about a pose.
-
+The valve-controlled machine is linearised at its tip along one task coordinate about a pose.
 Oil is a spring: at held valves a drive's force changes by `K (v_valve - v)` per second, with
-`K = beta (A_h^2 / V_A + A_r^2 / V_B)` and the velocity v_valve that the valve lets through. The
-servo asks for `v_ref + g (y_ref - y) - p (F - mean F) / K` (`control.servo`), which the valve
-follows with its lag V. For one joint that is
+`K = beta (A_h^2 / V_A + A_r^2 / V_B)` and the velocity v_valve that the valve flow produces. The
+servo commands `v_ref + g (y_ref - y) - p (F - mean F) / K` (`control.servo`), which the valve
+follows with its lag V. For one joint this is
 
     F = K / (s + p V L) [(V + g V / s) v_ref - (1 + g V / s) v],   L = T s / (T s + 1)
 
 The arm adds the compliances of its joints at the tip, each with its own lag: `1 / C_s` is the sum
 of `J_i^2 / C_i`, and the tip follows its reference by the mean of the joints' `(V + g V / s) /
-(1 + g V / s)`, weighted with what each contributes to the reference's rate.
+(1 + g V / s)`, weighted with the joints' contributions to the reference rate.
 
-Left out: dead bands, flow limits, leakage, friction, flexible transmissions, and what the other
-coordinates move meanwhile.
+Also neglected: flow limits, leakage, friction, flexible transmissions, and the motion of the other
+coordinates.
 """
 
 import math
@@ -75,17 +72,17 @@ from hydrotele.teleop.two_port import Impedance, TwoPort
 
 @dataclass(frozen=True)
 class TipDrive:
-    """What the tip of an arm of k joints is along one coordinate, linear about a pose.
+    """Linear model of the tip of an arm with k joints along one coordinate, about a pose.
 
     Attributes:
         coordinate: `r`, `theta`, `z`, `attitude` or `head`.
         mass: effective mass, `1 / (J M^-1 J')` [kg], [kg m^2].
-        compliance: (k,) of every joint at the tip, valves shut [m/N], [rad/(N m)].
-        share: (k,) of the reference's rate that every joint makes; their sum is 1.
-        gain: (k,) g of the servo [1/s].
-        bandwidth: (k,) of the valves [rad/s].
-        damping: (k,) ratios of the valves [1].
-        delay: (k,) of the commands [s].
+        compliance: (k,) of every joint at the tip, with closed valves [m/N], [rad/(N m)].
+        share: (k,) contribution of every joint to the reference rate; their sum is 1.
+        gain: (k,) servo gains g [1/s].
+        bandwidth: (k,) bandwidths of the valves [rad/s].
+        damping: (k,) damping ratios of the valves [1].
+        delay: (k,) delays of the commands [s].
     """
 
     coordinate: str
@@ -99,13 +96,13 @@ class TipDrive:
 
     @property
     def stiffness(self) -> float:
-        """Hydraulic stiffness at the tip, valves shut [N/m], [N m/rad]."""
+        """Hydraulic stiffness at the tip with closed valves [N/m], [N m/rad]."""
         return 1.0 / float(self.compliance.sum())
 
 
 @dataclass(frozen=True)
 class Clocks:
-    """When things happen: control period and period of the sensors' samples [s]."""
+    """Control period and sampling period of the sensors [s]."""
 
     control: float
     samples: float
@@ -114,19 +111,20 @@ class Clocks:
 def tip_drive(
     machine: Machine, joints: dict[str, float], coordinate: str, servo: Servo
 ) -> TipDrive:
-    """The tip of a machine along one coordinate.
+    """Linearise the tip of a machine along one coordinate.
 
     Args:
-        machine: the machine, all of whose arm's joints are driven by valves.
-        joints: axis -> position of the pose [rad]; the others stand at home.
-        coordinate: of the arm.
-        servo: gains.
+        machine: machine with valve-controlled drives in all joints of its arm.
+        joints: axis -> position of the pose [rad]; the other axes are at their home position.
+        coordinate: task coordinate of the arm.
+        servo: gains of the servo.
 
     Returns:
-        Its numbers.
+        Parameters of the linear tip model.
 
     Raises:
-        InputError: the arm cannot be felt, or does not move along the coordinate there.
+        InputError: the arm has no tip force model, or does not move along the coordinate in this
+        pose.
 
     Source: this module's docstring; effective mass after Khatib 1987.
     """
@@ -149,7 +147,7 @@ def tip_drive(
 
 
 def _inertia(arm: ArmBalance, row: int) -> tuple[float, np.ndarray, np.ndarray]:
-    """Effective mass, Jacobian row (k,), and joint rates (k,) for a unit rate of the coordinate."""
+    """Return effective mass, Jacobian row (k,), and joint rates (k,) per unit coordinate rate."""
     motion, k = arm.space.motion, len(arm.joint)
     place_mechanism(arm.model, arm.space, arm.z)
     gather_forces(arm.model.mech, motion)
@@ -163,9 +161,10 @@ def _inertia(arm: ArmBalance, row: int) -> tuple[float, np.ndarray, np.ndarray]:
 
 
 def _turning_stiffness(arm: ArmBalance, valve: int) -> float:
-    """Stiffness of a joint on its drive's oil [N m/rad], after `place`.
+    """Return the stiffness of a joint due to its drive's oil [N m/rad], after `place_mechanism`.
 
-    Without bubbles: how soft they make the oil depends on pressures, of which none are known here.
+    Air content is neglected: it lowers the stiffness in a way that depends on the unknown
+    pressures.
     """
     user = arm.model.user[valve * SLOTS : (valve + 1) * SLOTS]
     head, rod = user[Slot.VOLUME_HEAD], user[Slot.VOLUME_ROD]
@@ -180,12 +179,12 @@ def _turning_stiffness(arm: ArmBalance, valve: int) -> float:
 
 
 def drive_control(tip: TipDrive, servo: Servo, clocks: Clocks, s: np.ndarray) -> np.ndarray:
-    """C_s: force at the tip per velocity of the tip against its reference.
+    """Return C_s: force at the tip per velocity error of the tip.
 
     Args:
-        tip: the machine.
-        servo: gains.
-        clocks: periods.
+        tip: linear tip model.
+        servo: gains of the servo.
+        clocks: control and sensor periods.
         s: (...) complex frequencies [rad/s].
 
     Returns:
@@ -199,18 +198,18 @@ def drive_control(tip: TipDrive, servo: Servo, clocks: Clocks, s: np.ndarray) ->
 
 
 def drive_follows(tip: TipDrive, servo: Servo, clocks: Clocks, s: np.ndarray) -> np.ndarray:
-    """Velocity of the unloaded tip per velocity that is asked for.
+    """Return the velocity of the unloaded tip per reference velocity.
 
     Args:
-        tip: the machine.
-        servo: gains.
-        clocks: periods.
+        tip: linear tip model.
+        servo: gains of the servo.
+        clocks: control and sensor periods.
         s: (...) complex frequencies [rad/s].
 
     Returns:
         (...) [1].
 
-    Source: this module's docstring; `teleop.slave.update_references` for the look ahead.
+    Source: this module's docstring; `teleop.slave.update_references` for the phase lead.
     """
     valve, place_lag, _ = _lags(tip, servo, clocks, s)
     held = np.exp(-0.5 * clocks.control * s)
@@ -220,7 +219,7 @@ def drive_follows(tip: TipDrive, servo: Servo, clocks: Clocks, s: np.ndarray) ->
 
 
 def _lags(tip: TipDrive, servo: Servo, clocks: Clocks, s: np.ndarray):
-    """(..., k) valves with their delay, hold of the sensors, and pressure feedback [1/s]."""
+    """Return (..., k) valves with delay, hold of the sensors, and pressure feedback [1/s]."""
     at = s[..., None]
     valve = tip.bandwidth**2 / (at**2 + 2.0 * tip.damping * tip.bandwidth * at + tip.bandwidth**2)
     valve = valve * np.exp(-tip.delay * at)
@@ -230,25 +229,25 @@ def _lags(tip: TipDrive, servo: Servo, clocks: Clocks, s: np.ndarray):
 
 
 _WHERE = "linear case"
-FAST = 2.0  # of the estimate's bandwidth: that of the motion it is computed of (`station`)
+FAST = 2.0  # bandwidth of the motion estimate over that of the force estimate (`station`)
 STRUCTURES = ("rate_force", "position_force", "rate_position", "position_position")
 
 
 @dataclass(frozen=True)
 class LinearCase:
-    """A teleoperated axis with hand, machine and task; as `teleop.analysis.Case` to an analysis.
+    """Linear loop of one axis with hand, machine and task; usable like `teleop.analysis.Case`.
 
     Attributes:
-        pilot: the scenario's.
-        row: (17,) the joystick axis' numbers, as of `teleop.master.Master.axis`.
-        master: flotor [kg] or its moment about the handle [kg m^2].
-        held: the hand as mass, damper and spring.
-        tip: the machine.
-        servo: its gains.
-        clocks: control and sensors.
+        pilot: teleoperation settings of the scenario.
+        row: (17,) parameters of the joystick axis, see `teleop.master.Master.axis`.
+        master: mass of the flotor [kg] or its moment of inertia about the handle [kg m^2].
+        held: mass, damper and spring of the hand.
+        tip: linear tip model of the machine.
+        servo: gains of the servo.
+        clocks: control and sensor periods.
         task: impedance of the environment along the coordinate.
-        delay_forward: from the master to the machine [s].
-        delay_back: from the machine to the master [s].
+        delay_forward: delay from the master to the machine [s].
+        delay_back: delay from the machine to the master [s].
     """
 
     pilot: TeleopPilot
@@ -264,17 +263,17 @@ class LinearCase:
 
     @property
     def ratio(self) -> float:
-        """Of the reflected force at the hand to the machine's [N/N], [N m/(N m)]."""
+        """Ratio of the reflected force at the hand to the machine's force [N/N], [N m/(N m)]."""
         return float(self.row[RATIO])
 
     @property
     def force_limit(self) -> float:
-        """Machine's force beyond which nothing more is reflected [N], [N m]."""
+        """Machine force at which the reflected force saturates [N], [N m]."""
         return float(self.row[REFLECTED_MOST])
 
     @property
     def deadband(self) -> float:
-        """Displacement of the handle in which nothing is asked for [m], [rad]."""
+        """Displacement of the handle up to which nothing is commanded [m], [rad]."""
         return float(self.row[DEADBAND])
 
     @property
@@ -284,7 +283,7 @@ class LinearCase:
 
     @property
     def spring(self) -> Spring:
-        """The joystick axis under stiffness feedback, without the hand."""
+        """Joystick axis under stiffness feedback, without the hand."""
         r = self.row
         return Spring(
             self.master.mass, float(r[DAMPING]), float(r[NOMINAL]), float(r[LEAST]), float(r[MOST])
@@ -292,16 +291,16 @@ class LinearCase:
 
     @property
     def leans(self) -> bool:
-        """Whether the hand answers a directly reflected force with a force, not with a place."""
+        """Whether the operator controls the force, not the position, under direct reflection."""
         pressing = isinstance(self.pilot.operator, Regulate | Track)
         return pressing and self.pilot.reflection != "coordinating_force"
 
     def with_delay(self, delay: float) -> "LinearCase":
-        """The same with a delay [s] each way."""
+        """Return the case with a delay [s] in each direction."""
         return replace(self, delay_forward=delay, delay_back=delay)
 
     def hand(self, s: np.ndarray) -> np.ndarray:
-        """Impedance of the hand [N s/m], [N m s/rad] at complex frequencies [rad/s]."""
+        """Return the hand's impedance [N s/m], [N m s/rad] at complex frequencies [rad/s]."""
         if not self.leans:
             return self.held(s)
         late = REFLEX + 0.5 / DECISIONS + 0.5 * self.clocks.control
@@ -309,20 +308,20 @@ class LinearCase:
         return self.held(s) - own
 
     def port(self, structure: str, reflected: float = 1.0) -> TwoPort:
-        """The two-port of a structure with this case's numbers.
+        """Return the two-port of a structure with the parameters of this case.
 
         Args:
             structure: `rate_force`, `position_force`, `rate_position` or `position_position`.
-            reflected: factor on what comes back, and on the coupling's own part [1].
+            reflected: factor on the return channels, and on the coupling at the master [1].
 
         Returns:
             The two-port.
 
         Raises:
-            InputError: the structure is not known here.
+            InputError: the structure is not known.
         """
         if structure not in STRUCTURES:
-            raise InputError(_WHERE, f"{structure!r}; a scenario has {', '.join(STRUCTURES)}")
+            raise InputError(_WHERE, f"{structure!r}; valid structures: {', '.join(STRUCTURES)}")
         rate, feels_force = structure.startswith("rate"), structure.endswith("force")
         slave = Impedance(self.tip.mass)
 
@@ -360,28 +359,27 @@ class LinearCase:
         )  # fmt: skip
 
     def _asked(self, rate: bool, s: np.ndarray) -> np.ndarray:
-        """Velocity asked of the tip per velocity of the handle."""
+        """Return the commanded tip velocity per velocity of the handle."""
         if rate:
             return self.row[GAIN] / s
         return self.row[GAIN] * (SMOOTH / (s + SMOOTH)) ** 2
 
     def _centred(self, rate: bool, s: np.ndarray) -> np.ndarray:
-        """Spring and damper of the coils, sampled; no spring under position control."""
+        """Return the sampled spring and damper of the coils; no spring under position control."""
         held = np.exp(-0.5 * self.clocks.control * s)
         return held * ((self.row[NOMINAL] if rate else 0.0) / s + self.row[DAMPING] * held)
 
     def _coupling(self, rate: bool, s: np.ndarray, period: float | None = None) -> np.ndarray:
-        """Force on the hand per velocity of the machine that is missing, of coordinating force.
+        """Return the coordinating force on the hand per velocity difference of the machine.
 
-        It is held for a period, that of the machine's samples after that of the control if none is
-        given.
+        The force is held for `period`; by default for the sum of the control and the sensor period.
         """
         scale = 1.0 if rate else 1.0 / self.row[GAIN]
         held = np.exp(-0.5 * (period or self.clocks.control + self.clocks.samples) * s)
         return scale * held * (self.row[COUPLING] / s + self.row[COUPLING_DAMPING])
 
     def _felt(self, s: np.ndarray) -> np.ndarray:
-        """Force that is reflected per force of the task: filters, sample, and control period."""
+        """Return the reflected force per task force: filters, sensor sample, and control period."""
         held = np.exp(-0.5 * self.clocks.control * s)
         if self.pilot.force == "true":
             return held
@@ -394,19 +392,19 @@ def linear_case(
     pilot: TeleopPilot, joystick: Joystick, numbers: Master, tip: TipDrive, servo: Servo,
     clocks: Clocks, task: Impedance,
 ) -> LinearCase:  # fmt: skip
-    """The linear case of one coordinate.
+    """Build the linear case of one coordinate.
 
     Args:
-        pilot: the scenario's.
+        pilot: teleoperation settings of the scenario.
         joystick: the joystick.
-        numbers: of the master's control.
-        tip: the machine along the coordinate.
-        servo: its gains.
-        clocks: control and sensors.
-        task: what the tip presses on.
+        numbers: parameters of the master's control.
+        tip: linear tip model along the coordinate.
+        servo: gains of the servo.
+        clocks: control and sensor periods.
+        task: impedance of the environment.
 
     Returns:
-        The case.
+        The linear case.
 
     Raises:
         InputError: no joystick axis moves the coordinate.
@@ -425,11 +423,11 @@ def linear_case(
 
 
 def local_ratio(case: LinearCase, displacement: float) -> float:
-    """What stiffness feedback reflects of small changes of force at a held displacement.
+    """Return the reflection ratio of stiffness feedback for small force changes.
 
     Args:
         case: the case.
-        displacement: of the handle, scalar [m], [rad].
+        displacement: constant displacement of the handle, scalar [m], [rad].
 
     Returns:
         `K_r |x|`, hand force per machine force [N/N]; K_r is the stiffness per force.
@@ -440,18 +438,18 @@ def local_ratio(case: LinearCase, displacement: float) -> float:
     return (spring.most - spring.nominal) / float(case.row[LIMIT]) * math.fabs(displacement)
 
 
-DEFAULT_TASK = Impedance(damping=3.0e4, stiffness=1.0e6)  # stiff ground, as a plate's default
+DEFAULT_TASK = Impedance(damping=3.0e4, stiffness=1.0e6)  # stiff ground, a plate's default
 _NORMALS = {"z": ("z",), "r": ("x", "-x")}
 _PLACE = {"z": 2, "r": 0}
 
 
 class Contact(NamedTuple):
-    """Where and what the tip presses on.
+    """Contact pose and impedance of the environment.
 
     Attributes:
         joints: axis -> position [rad].
         task: impedance along the coordinate.
-        source: what it was taken from.
+        source: source of the impedance.
     """
 
     joints: dict[str, float]
@@ -462,26 +460,26 @@ class Contact(NamedTuple):
 def scenario_case(
     scenario: Scenario, machine: Machine, joystick: Joystick, coordinate: str | None = None
 ) -> tuple[LinearCase, Contact]:
-    """The linear case of a scenario, with the hand of its operator as it is simulated.
+    """Build the linear case of a scenario, with the hand of its simulated operator.
 
     Args:
-        scenario: with a teleoperated pilot.
-        machine: its machine.
-        joystick: its joystick; grip, posture and co-contraction of the operator replace its hand.
-        coordinate: of the arm; that of the operator's force target by default, else z.
+        scenario: scenario with a teleoperated pilot.
+        machine: machine of the scenario.
+        joystick: joystick; the operator's grip, posture and co-contraction replace its hand.
+        coordinate: task coordinate; by default that of the operator's force target, otherwise z.
 
     Returns:
-        The case, and where and what it touches.
+        The case, and the contact pose and impedance.
 
     Raises:
-        InputError: the scenario is not teleoperated, the arm has no such coordinate, nothing comes
-            back, the operator's grip or posture is not known.
+        InputError: the scenario is not teleoperated, the arm has no such coordinate, no force is
+            reflected, or the operator's grip or posture is not known.
     """
     pilot = scenario.pilot
     if not isinstance(pilot, TeleopPilot):
         raise InputError(f"scenario {scenario.name}", "has no teleoperated pilot to analyse")
     if not pilot.ratio > 0.0:
-        raise InputError("pilot.ratio", "nothing comes back; give a ratio, such as 1e-5")
+        raise InputError("pilot.ratio", "no force is reflected; set a ratio, such as 1e-5")
     coordinates = COORDINATES[: len(arm_axes(machine))]
     wanted = coordinate or _pressed(pilot)
     if wanted not in coordinates:
@@ -498,7 +496,7 @@ def scenario_case(
 
 
 def joystick_of(scenario: Scenario) -> str:
-    """Name or file of a scenario's joystick, counted from the scenario's file."""
+    """Return the name or file of a scenario's joystick, relative to the scenario's file."""
     name = scenario.pilot.joystick if isinstance(scenario.pilot, TeleopPilot) else "joystick"
     path = Path(scenario.folder, name)
     return str(path) if name != "joystick" and path.is_file() else name
@@ -510,7 +508,7 @@ def _pressed(pilot: TeleopPilot) -> str:
 
 
 def _contact(scenario: Scenario, machine: Machine, coordinate: str) -> Contact:
-    """Start pose, moved along the coordinate to the plate that stands in its way."""
+    """Return the contact at the start pose, moved along the coordinate to the plate."""
     joints = machine.home | scenario.start.joints
     here = {name: joints.get(axis.joint, 0.0) for name, axis in machine.axes.items()}
     pose, plate = scenario.start.pose, _plate(scenario, coordinate)
@@ -529,7 +527,7 @@ def _contact(scenario: Scenario, machine: Machine, coordinate: str) -> Contact:
 
 
 def _plate(scenario: Scenario, coordinate: str) -> Plate | None:
-    """The first plate that looks along a coordinate."""
+    """Return the first plate whose normal is along a coordinate."""
     ways = _NORMALS.get(coordinate, ())
     for thing in scenario.surroundings:
         if isinstance(thing, Plate) and thing.normal in ways:

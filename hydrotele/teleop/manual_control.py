@@ -1,11 +1,11 @@
-"""Manual control by sight: the crossover model of the human operator, and what he learns by doing.
+"""Visual manual control: the crossover model of the human operator, with online learning.
 
 Around the crossover frequency operator and controlled element together are
-`Yp Yc = omega_c e^(-tau s) / s`: he integrates where the element is a gain, acts in proportion
-where it integrates, and leads where it integrates twice. Gain, form and lag of the element are
-known to him only from what he has done and seen; the phase margin that he keeps then gives the
-crossover frequency. His error is seen late and through noise in proportion to its size (remnant),
-and his limb is a second-order lag.
+`Yp Yc = omega_c e^(-tau s) / s`. The operator integrates if the element is a gain, acts in
+proportion if it integrates once, and generates lead if it integrates twice. The operator learns the
+element's gain and lag from past actions and observations. The required phase margin then gives the
+crossover frequency. The error is observed with a delay and with noise in proportion to its size
+(remnant), and the limb is a second-order lag.
 
 Source: McRuer and Jex 1967, IEEE Trans. Human Factors in Electronics 8; Levison, Baron and Kleinman
 1969, IEEE Trans. Man-Machine Systems 10 (observation noise).
@@ -22,34 +22,35 @@ from hydrotele.teleop.operator_parameters import Operator
 
 GAIN, INTEGRATOR, DOUBLE_INTEGRATOR = range(3)
 FORMS = ("K", "K/s", "K/s^2")
-_LAGS = (0.0, 0.15, 0.3, 0.6, 1.0)  # s, first-order lags of an element that he tells apart
-_DELAYS = (0.0, 0.1, 0.2, 0.3, 0.45)  # s, and dead times
-LEAD = 2.5  # s, of what he generates for a double integrator
-_WASHOUT = 1.5  # rad/s: slower motion is drift, not an effect of his hand
-_SCATTER = 0.5  # s between errors of prediction that are independent of each other
-_VARIANCE = 5.0  # s over which he feels how large his errors are
-_FLOOR = 1e-24  # of a sum of squares: nothing has moved
-# of `Loop.facts`
+_LAGS = (0.0, 0.15, 0.3, 0.6, 1.0)  # s, first-order lags of the candidate elements
+_DELAYS = (0.0, 0.1, 0.2, 0.3, 0.45)  # s, dead times of the candidate elements
+LEAD = 2.5  # s, lead time constant of the operator for a double integrator
+_WASHOUT = 1.5  # rad/s: slower motion is drift, not an effect of the operator's input
+_SCATTER = 0.5  # s, correlation time of the prediction errors
+_VARIANCE = 5.0  # s, averaging time for the variance of the observed errors
+_FLOOR = 1e-24  # sum of squares below which nothing has moved
+# indices into `Loop.facts`
 STEP, DELAY, REMNANT, THRESHOLD, MEMORY, SURPRISE, MOST, FORM, PRIOR = range(9)
-ERROR_POWER, RATE_POWER, INTEGRAL, CHOSEN, BELIEVED_GAIN, NOTICED = range(6)  # of `Loop.state`
+ERROR_POWER, RATE_POWER, INTEGRAL, CHOSEN, BELIEVED_GAIN, NOTICED = range(6)  # in `Loop.state`
 
 
 class Loop(NamedTuple):
-    """Facts and state of a loop that an operator closes by sight, with n candidate elements.
+    """Parameters and state of a visually closed loop, with n candidate elements.
 
     Attributes:
         facts: (9,) step [s], visual delay [s], remnant [1], threshold of the error, memory [s],
-            surprise [1], largest output, number of integrations, expected gain.
+            surprise [1], maximum output, number of integrations, expected gain.
         lag: (n,) first-order lag of each candidate [s].
-        dead: (n,) dead time of each [s].
-        action: (n,) his gain with each, for an element of unit gain.
-        past: (rows, 3) error, seen output and own hand of the last steps, a ring.
-        noise: (m, 2) standard normal, of error and rate.
-        hand: (n, 4) hand behind each lag, and its three low-passes.
-        seen: (3,) low-passes of the seen output.
-        sums: (n, 4) faded sums of effect^2, effect times output, output^2, and of steps.
-        state: (6,) mean square of error and rate, integral of the output, chosen candidate, its
-            gain, error of now as he sees it without noise, 0 below the threshold.
+        dead: (n,) dead time of each candidate [s].
+        action: (n,) operator gain for each candidate, for an element of unit gain.
+        past: (rows, 3) ring buffer of error, observed output and hand displacement.
+        noise: (m, 2) standard normal noise of error and rate.
+        hand: (n, 4) hand displacement after each lag, and its three low-pass filters.
+        seen: (3,) low-pass filters of the observed output.
+        sums: (n, 4) exponentially weighted sums of effect^2, effect times output, output^2, and of
+            steps.
+        state: (6,) mean square of error and rate, integral of the output, selected candidate, its
+            gain, present noise-free observed error, 0 below the threshold.
     """
 
     facts: np.ndarray
@@ -69,21 +70,21 @@ def visual_loop(
     form: int, margin: float | None = None, threshold: float = 0.0, most: float = math.inf,
     steps: int = 2**12,
 ) -> Loop:  # fmt: skip
-    """A loop before anything has happened.
+    """Create a visually closed loop in its initial state.
 
     Args:
-        him: the operator.
-        step: between his decisions [s].
-        prior: gain that he expects.
-        rng: of his observation noise, and of how far his expectation is off.
-        form: of the element, which he has been told: a place, a rate or an acceleration.
-        margin: phase margin that he keeps [rad]; that of tracking by default.
-        threshold: error that he does not see.
-        most: largest displacement of the hand.
-        steps: of noise before it comes again.
+        him: parameters of the operator.
+        step: time between two decisions [s].
+        prior: expected gain of the element.
+        rng: random generator of the observation noise and of the error of the expected gain.
+        form: known form of the element: gain, integrator or double integrator.
+        margin: required phase margin [rad]; by default the margin of tracking.
+        threshold: error below which the operator does not act.
+        most: maximum displacement of the hand.
+        steps: number of noise samples before they repeat.
 
     Returns:
-        The loop.
+        Parameters and initial state of the loop.
     """
     off = math.exp(him.surprise * rng.standard_normal())
     late = him.visual_delay + (him.lead_delay if form == DOUBLE_INTEGRATOR else 0.0)
@@ -110,7 +111,7 @@ def visual_loop(
 
 @inlined
 def _past(past, tick, back, column):
-    """What was so many steps ago, between decisions by interpolation; 0 before the first."""
+    """Return a past value, interpolated between decisions; 0 before the first decision."""
     whole = int(back)
     if tick < whole + 1:
         return 0.0
@@ -121,16 +122,16 @@ def _past(past, tick, back, column):
 
 @compiled
 def learn(loop, tick, late, seen):
-    """Compare what the hand did with what came of it, for every candidate element.
+    """Update the fit of every candidate element with the latest hand motion and output.
 
-    Both go through a third-order wash-out, so that each candidate's effect is a finite filter of
-    the hand: `s^(3-n) / (s + a)^3 / (T s + 1)`.
+    Hand and output pass through a third-order wash-out, so that each candidate's effect is a filter
+    of the hand: `s^(3-n) / (s + a)^3 / (T s + 1)`.
 
     Args:
         loop: Loop; `hand`, `seen`, `sums` and `state` are written.
         tick: number of the decision, scalar.
-        late: steps by which what he sees is old, scalar.
-        seen: output of the element then, scalar.
+        late: age of the observation in steps, scalar.
+        seen: output of the element at that time, scalar.
 
     Returns:
         Nothing.
@@ -173,13 +174,13 @@ def learn(loop, tick, late, seen):
 
 @compiled
 def believe(loop):
-    """Gain of the element that he believes in now: experience, weighed against his expectation.
+    """Compute the operator's gain estimate: fitted gain, weighted with the expected gain.
 
     Args:
-        loop: Loop; the believed gain in `state` is written.
+        loop: Loop; the estimated gain in `state` is written.
 
     Returns:
-        The gain, scalar, in units of output per hand (and second, second^2).
+        The gain, scalar, in output per hand displacement (and per s, s^2).
 
     Source: normal posterior of the gain's logarithm.
     """
@@ -199,17 +200,17 @@ def believe(loop):
 
 @compiled
 def look_and_act(loop, tick, target, seen, hand):
-    """One decision: learn from what was seen, and choose where the hand should be.
+    """Run one decision: update the element estimate and compute the hand's reference.
 
     Args:
         loop: Loop, written.
         tick: number of the decision, scalar.
-        target: where the output should be now, scalar.
-        seen: the output now, scalar.
-        hand: displacement of the hand now, scalar.
+        target: present reference of the output, scalar.
+        seen: present output, scalar.
+        hand: present displacement of the hand, scalar.
 
     Returns:
-        Displacement of the hand that he wants, scalar; in front of the neuromuscular lag.
+        Reference displacement of the hand before the neuromuscular lag, scalar.
 
     Source: McRuer and Jex 1967; Levison, Baron and Kleinman 1969.
     """
@@ -220,7 +221,7 @@ def look_and_act(loop, tick, target, seen, hand):
     late = max(0.5, facts[DELAY] / step)
     if tick < int(late) + 3:
         return 0.0
-    middle = 0.5 if facts[FORM] == 0.0 else 0.0  # of the step over which he integrates
+    middle = 0.5 if facts[FORM] == 0.0 else 0.0  # the integrator uses the middle of its step
     error = _past(past, tick, late + middle, 0)
     rate = (_past(past, tick, late - 0.5, 0) - _past(past, tick, late + 0.5, 0)) / step
     learn(loop, tick, late, _past(past, tick, late, 1))
@@ -233,7 +234,7 @@ def look_and_act(loop, tick, target, seen, hand):
     noise = loop.noise[tick % len(loop.noise)]
     state[NOTICED] = error if abs(error) >= facts[THRESHOLD] else 0.0
     if state[NOTICED] == 0.0 and facts[THRESHOLD] > 0.0:
-        return state[INTEGRAL]  # he leaves alone what he does not see
+        return state[INTEGRAL]  # no action on an unobserved error
     error += density * np.sqrt(state[ERROR_POWER]) * noise[0]
     action = loop.action[best] / gain
     if facts[FORM] == 0.0:
@@ -249,16 +250,16 @@ def look_and_act(loop, tick, target, seen, hand):
 def operator_response(
     him: Operator, form: int, frequencies: np.ndarray, late: float | None = None
 ) -> np.ndarray:
-    """Describing function of the operator with unit gain: equalisation, delay, neuromuscular lag.
+    """Return the operator's describing function for unit gain, including the neuromuscular lag.
 
     Args:
-        him: the operator.
-        form: of the controlled element.
+        him: parameters of the operator.
+        form: form of the controlled element.
         frequencies: (m,) [rad/s].
-        late: delay, with what lead adds to it [s]; his own by default.
+        late: delay, including that of lead generation [s]; by default the operator's.
 
     Returns:
-        (m,) complex hand per error.
+        (m,) complex hand displacement per error.
     """
     s = 1j * frequencies
     if late is None:
@@ -269,7 +270,7 @@ def operator_response(
 
 
 def _action(him: Operator, form: int, lag: float, late: float, margin: float) -> float:
-    """Largest gain of his with which both margins are kept, for an element of unit gain."""
+    """Return the maximum operator gain that keeps both margins, for an element of unit gain."""
     w = np.geomspace(0.02, 60.0, 4000)
     loop = operator_response(him, form, w, late) / (1j * w) ** form / (1.0 + lag * 1j * w)
     size, phase = np.abs(loop), np.unwrap(np.angle(loop))
@@ -277,20 +278,20 @@ def _action(him: Operator, form: int, lag: float, late: float, margin: float) ->
     close = np.flatnonzero(phase >= margin - math.pi)
     turn = np.flatnonzero(phase >= -math.pi)
     at = min(w[close[-1]] if len(close) else w[turn[-1]] / 3.0, him.crossover)
-    beyond = size[turn[-1] :].max()  # the neuromuscular peak counts, too
+    beyond = size[turn[-1] :].max()  # includes the neuromuscular peak
     return float(min(1.0 / np.interp(at, w, size), him.gain_margin / beyond))
 
 
 def neuromuscular_matrix(frequency: float, damping: float, step: float) -> np.ndarray:
-    """Exact step of the neuromuscular lag `omega^2 / (s^2 + 2 zeta omega s + omega^2)`.
+    """Return the exact discrete form of the lag `omega^2 / (s^2 + 2 zeta omega s + omega^2)`.
 
     Args:
-        frequency: natural frequency [rad/s]; 0 for none.
-        damping: ratio [1].
-        step: during which the input is held [s].
+        frequency: natural frequency [rad/s]; 0 for no lag.
+        damping: damping ratio [1].
+        step: time for which the input is held [s].
 
     Returns:
-        (6,) a11, a12, b1, a21, a22, b2 of place and rate.
+        (6,) a11, a12, b1, a21, a22, b2 of position and rate.
     """
     if frequency <= 0.0:
         return np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
@@ -303,11 +304,11 @@ def neuromuscular_matrix(frequency: float, damping: float, step: float) -> np.nd
 
 
 class TrackingRecord(NamedTuple):
-    """A record of tracking.
+    """Record of a tracking task.
 
     Attributes:
         time: (n,) [s].
-        target: (n,) where the output should be.
+        target: (n,) reference of the output.
         response: (n,) output of the controlled element.
         hand: (n,) displacement (or force) of the hand.
     """
@@ -320,13 +321,13 @@ class TrackingRecord(NamedTuple):
 
 def sum_of_sines(time: np.ndarray, bandwidth: float = 1.5, duration: float = 120.0, seed: int = 0
                  ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """A target of ten sines, with amplitudes that fall to a tenth beyond its bandwidth.
+    """Generate a target of ten sines, with ten times lower amplitudes above its bandwidth.
 
     Args:
         time: (n,) [s].
-        bandwidth: of the large sines [rad/s].
-        duration: after which it comes again [s].
-        seed: of the phases.
+        bandwidth: upper frequency of the large sines [rad/s].
+        duration: period of the signal [s].
+        seed: seed of the phases.
 
     Returns:
         (n,) target of unit standard deviation, and the (10,) frequencies [rad/s].
@@ -346,7 +347,7 @@ def sum_of_sines(time: np.ndarray, bandwidth: float = 1.5, duration: float = 120
 
 @compiled
 def _simulate(loop, lag, form, gain, target, fine, hand, response):
-    """Closed loop of `track`; `hand` and `response` are written."""
+    """Simulate the closed loop of `track`; `hand` and `response` are written."""
     place, speed, output, rate = 0.0, 0.0, 0.0, 0.0
     step = loop.facts[STEP] / fine
     wanted = 0.0
@@ -373,17 +374,18 @@ def track(
     him: Operator, form: int, gain: float, target: np.ndarray, *, step: float = 0.01, fine: int = 2,
     seed: int = 0, surprised: bool = True,
 ) -> TrackingRecord:  # fmt: skip
-    """Tracking of a displayed target by this operator, with a controlled element of no machine.
+    """Simulate an operator who tracks a displayed target with a simple controlled element.
 
     Args:
-        him: the operator.
+        him: parameters of the operator.
         form: GAIN, INTEGRATOR or DOUBLE_INTEGRATOR.
-        gain: of the element, which he does not know.
-        target: (n,) at steps of `step`.
-        step: of the record [s].
-        fine: steps per decision.
-        seed: of his noise and of his expectation.
-        surprised: whether his expectation is off as far as `surprise` says; else it is exact.
+        gain: gain of the element, unknown to the operator.
+        target: (n,) at intervals of `step`.
+        step: sampling period of the record [s].
+        fine: number of steps per decision.
+        seed: seed of the noise and of the expected gain.
+        surprised: whether the expected gain has the error given by `surprise`; otherwise it is
+            exact.
 
     Returns:
         The record.
@@ -399,12 +401,12 @@ def track(
 
 
 class Crossover(NamedTuple):
-    """What an open loop `Yp Yc` looks like around its crossover frequency.
+    """Properties of an open loop `Yp Yc` around its crossover frequency.
 
     Attributes:
-        frequency: where its gain is 1 [rad/s].
+        frequency: frequency of unit gain [rad/s].
         margin: phase margin [rad].
-        slope: of its gain around there [dB per decade].
+        slope: slope of the gain around the crossover [dB per decade].
     """
 
     frequency: float
@@ -415,12 +417,12 @@ class Crossover(NamedTuple):
 def describing_function(
     records: Sequence[TrackingRecord], frequencies: np.ndarray, skip: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Describing functions at the frequencies of a sum of sines, measured from records.
+    """Measure describing functions at the frequencies of a sum of sines from records.
 
     Args:
-        records: with targets of these frequencies, of one length.
-        frequencies: (m,) [rad/s], whole multiples of one over the record's length after `skip`.
-        skip: time at the beginning that is left out [s].
+        records: records with targets of these frequencies, all of one length.
+        frequencies: (m,) [rad/s], integer multiples of 1 / (record length after `skip`).
+        skip: initial time that is discarded [s].
 
     Returns:
         (m,) complex response per error (Yp Yc) and hand per error (Yp).
@@ -439,16 +441,16 @@ def describing_function(
 
 
 def crossover_of(frequencies: np.ndarray, open_loop: np.ndarray) -> Crossover:
-    """Crossover frequency, phase margin and slope of a measured open loop.
+    """Compute crossover frequency, phase margin and slope of a measured open loop.
 
     The slope is that of a line through the points from half to twice the crossover frequency.
 
     Args:
-        frequencies: (m,) rising [rad/s].
+        frequencies: (m,) increasing [rad/s].
         open_loop: (m,) complex.
 
     Returns:
-        They; NaN where the gain does not fall through 1.
+        The crossover properties; NaN if the gain does not fall through 1.
     """
     decades, size = np.log10(frequencies), 20.0 * np.log10(np.abs(open_loop))
     phase = np.unwrap(np.angle(open_loop))
@@ -463,5 +465,5 @@ def crossover_of(frequencies: np.ndarray, open_loop: np.ndarray) -> Crossover:
     near[k] = near[k + 1] = True
     slope = float(np.polyfit(decades[near], size[near], 1)[0])
     angle = phase[k] + share * (phase[k + 1] - phase[k])
-    margin = math.remainder(math.pi + angle, 2.0 * math.pi)  # sparse sines may hide a turn
+    margin = math.remainder(math.pi + angle, 2.0 * math.pi)  # sparse sines can hide a full turn
     return Crossover(float(10.0**place), margin, slope)

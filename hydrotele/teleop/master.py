@@ -1,9 +1,9 @@
-"""The master's control: read the joystick, reflect the machine's force, drive the coils.
+"""Control of the master: measure the joystick, reflect the machine's force, drive the coils.
 
-Every axis of the joystick is a spring and damper to its centre, made by the coils about the handle
-(remote centre of compliance), whose stiffness or force follows what comes back from the machine.
-One kernel makes all structures, 200 times a second. Before the machine tips over, the handle is
-pushed back.
+The coils give every joystick axis a spring and damper to its centre, about the handle (remote
+centre of compliance). Stiffness or force follows the data from the machine. One kernel implements
+all structures at 200 Hz. A protection function pushes the handle back before the machine tips
+over.
 """
 
 import math
@@ -51,31 +51,31 @@ KINDS = (
 RATE, POSITION = range(2)
 # rows of `Packet`
 FORCE, PLACE, SPEED, WANTED, WANTED_SPEED, TASK_STIFFNESS, TASK_DAMPING, TASK_MASS = range(8)
-# the same of a passive line: sum of waves or force of the slave's controller, and its energy
+# rows for a passive channel: sum of waves or force of the slave's controller, and its energy
 TOTAL, BUDGET = WANTED, WANTED_SPEED
-_OBSERVER = 60.0  # rad/s of the hand force's estimate: a third of what 200 Hz samples
-_CHANGE = 20.0  # rad/s up to which a force or a speed is differentiated
-_HEAVIER = 0.5  # of the flotor's mass by which it may be made to feel heavier: late by _CHANGE
-SENT = END  # of a row of `MasterState.line`: what the next packet carries, and its energy
-WINDUP = 0.1  # m or rad at the machine by which four channels under rate control may be apart
+_OBSERVER = 60.0  # rad/s, bandwidth of the hand force observer, stable at 200 Hz
+_CHANGE = 20.0  # rad/s, bandwidth of the derivative of a force or speed
+_HEAVIER = 0.5  # maximum added apparent mass over the flotor's mass, because of the lag of _CHANGE
+SENT = END  # index in a row of `MasterState.line`: data of the next packet, then its energy
+WINDUP = 0.1  # m or rad at the machine, limit of the integral of the rate command
 
 
 class Master(NamedTuple):
-    """Numbers of the master's control.
+    """Parameters of the master's control.
 
     Attributes:
-        axis: (6, 18) of every joystick axis, columns above; SI. GAIN is the coordinate's rate per
-            displacement beyond the dead band [1/s], or its place per displacement.
-        mass: (1,) of the flotor [kg].
-        turning: (3,) its moments about the handle [kg m^2].
-        below: (3,) its centre of mass from the coils' frame [m].
-        handle: (3,) the handle's point from the coils' frame [m].
+        axis: (6, 18) parameters of every joystick axis, columns above; SI. GAIN is the coordinate's
+            rate per displacement beyond the dead band [1/s], or its position per displacement.
+        mass: (1,) mass of the flotor [kg].
+        turning: (3,) moments of inertia about the handle [kg m^2].
+        below: (3,) centre of mass in the coils' frame [m].
+        handle: (3,) the handle's point in the coils' frame [m].
         gravity: (3,) [m/s^2].
         to_currents: (6, 6) inverse of the coils' map [A/N], [A/(N m)].
-        most: (1,) largest current [A].
+        most: (1,) maximum current [A].
         step: (6,) resolution of the sensing [m], [rad].
-        kind: (4,) structure, mode, whether coordinating force compares with the handle, whether
-            the axes are decoupled.
+        kind: (4,) structure, mode, whether the coordinating force uses the handle's position, and
+            whether the axes are decoupled.
     """
 
     axis: np.ndarray
@@ -91,24 +91,25 @@ class Master(NamedTuple):
 
 
 class MasterState(NamedTuple):
-    """What the master knows and does, rewritten every period.
+    """State of the master's control, updated every period.
 
     Attributes:
         handle: (6,) measured displacement [m] and rotation vector [rad].
         speed: (6,) its rate.
         push: (6,) force of the coils on the handle [N], [N m].
-        stiffness: (6,) of every axis [N/m], [N m/rad].
+        stiffness: (6,) stiffness of every axis [N/m], [N m/rad].
         hand: (6,) estimated force of the hand [N], [N m].
-        momentum: (6,) of the estimate.
-        integral: (6,) of the rate asked for, for four channels under rate control [m], [rad].
-        before: (6,) slow force from the machine, for its rate of change [N], [N m]; slow speed of
-            the handle where a task's mass is felt [m/s], [rad/s].
+        momentum: (6,) momentum of the observer.
+        integral: (6,) integral of the rate command, for four channels under rate control [m],
+            [rad].
+        before: (6,) low-pass filtered force from the machine, for its derivative [N], [N m]; or
+            low-pass filtered speed of the handle when a task's mass is displayed [m/s], [rad/s].
         currents: (6,) [A].
-        extra: (6,) further force on the handle, such as that of tip-over protection [N], [N m].
-        limited: (1,) share by which the currents had to be made smaller; 1 if not, 0 where they
-            are off because the reading is no number.
-        energy: (2,) gone into the handle from the hand [J]: now, and its least so far.
-        line: (6, 10) of a passive line's end: `passive_line`, and TOTAL, BUDGET to send.
+        extra: (6,) additional force on the handle, such as tip-over protection [N], [N m].
+        limited: (1,) factor by which the currents were scaled down; 1 if not, 0 if they are off
+            because the reading is not finite.
+        energy: (2,) energy from the hand into the handle [J]: present value, and minimum so far.
+        line: (6, 10) end of a passive channel: `passive_line`, and TOTAL, BUDGET to send.
     """
 
     handle: np.ndarray
@@ -129,19 +130,19 @@ class MasterState(NamedTuple):
 def master(
     joystick: Joystick, pilot: TeleopPilot, coordinates: tuple[str, ...]
 ) -> tuple[Master, MasterState]:
-    """Numbers and first state of the master's control.
+    """Build parameters and initial state of the master's control.
 
     Args:
         joystick: the joystick.
-        pilot: the scenario's.
+        pilot: teleoperation settings of the scenario.
         coordinates: task coordinates of the arm.
 
     Returns:
-        The numbers, and a state at the centre.
+        The parameters, and a state at the centre.
 
     Raises:
-        InputError: gains that make no sense, a coordinate that the arm has not, one joystick axis
-            for two coordinates.
+        InputError: inconsistent gains, a coordinate that the arm does not have, or one joystick
+            axis for two coordinates.
     """
     f, coils = joystick.flotor, joystick.coils
     com, handle, inertia = np.array(f.com), np.array(f.handle), np.diag(f.inertia)
@@ -170,7 +171,7 @@ def master(
 
 @compiled
 def unpack_master(flat):
-    """The parts of `flat_view(Master)`.
+    """Return the parts of `flat_view(Master)`.
 
     Args:
         flat: (168,) array.
@@ -197,7 +198,7 @@ def unpack_master(flat):
 
 @compiled
 def unpack_master_state(flat):
-    """The parts of `flat_view(MasterState)`.
+    """Return the parts of `flat_view(MasterState)`.
 
     Args:
         flat: (123,) array.
@@ -227,15 +228,15 @@ def unpack_master_state(flat):
 
 @compiled
 def read_handle(numbers, qpos, period, s):
-    """Measure the handle as finely as the sensing allows, and its rate by differences.
+    """Measure the handle with the sensing resolution, its rate by differences, and its energy.
 
-    What the hand has put into it follows from the kinetic energy and the work of the coils, without
-    the lag of the hand's estimated force.
+    The energy from the hand follows from the kinetic energy and the work of the coils, without the
+    lag of the estimated hand force.
 
     Args:
         numbers: Master.
-        qpos: (7,) of the flotor: position [m] and quaternion.
-        period: since the last reading, scalar [s]; 0 for the first one.
+        qpos: (7,) flotor position [m] and quaternion.
+        period: time since the last reading, scalar [s]; 0 for the first one.
         s: MasterState; `handle`, `speed` and `energy` are written.
 
     Returns:
@@ -263,22 +264,22 @@ def read_handle(numbers, qpos, period, s):
 
 @compiled
 def _given(numbers, s, i):
-    """What coils and weight together have put on an axis of the handle since the last reading."""
+    """Return the force of coils and weight on a handle axis since the last reading."""
     given = s.limited[0] * s.push[i]
-    if i < 3:  # what is missing of the flotor's weight
+    if i < 3:  # part of the flotor's weight that the limited currents do not carry
         given += (1.0 - s.limited[0]) * numbers.mass[0] * numbers.gravity[i]
     return given
 
 
 @compiled
 def reflect(numbers, packet, fresh, period, s):
-    """Force on the handle of every axis, by the structure that was chosen.
+    """Compute the force on every axis of the handle with the selected structure.
 
     Args:
         numbers: Master.
-        packet: (8, k) what came from the machine: force on its tip, its place and speed, those of
-            its reference, stiffness, damping and mass of its task; task units.
-        fresh: share of the packet that counts, scalar: 1, falling to 0 when the line is silent.
+        packet: (8, k) data from the machine in task units: tip force, position and speed of the tip
+            and of its reference, stiffness, damping and mass of the task.
+        fresh: factor on the packet, scalar: 1, falling to 0 while the channel is silent.
         period: scalar [s].
         s: MasterState; `push`, `stiffness`, `integral`, `before` and `line` are written.
 
@@ -299,7 +300,7 @@ def reflect(numbers, packet, fresh, period, s):
                 force = 0.0
             kept = min(row[REFLECTED_MOST], max(-row[REFLECTED_MOST], force))
             if mode == POSITION and kind != STIFFNESS and kind != IMPEDANCE:
-                stiff = 0.0  # under position control the slave's place is the spring's rest
+                stiff = 0.0  # the spring's rest position is the slave's position
             if kind == STIFFNESS:
                 kept = min(row[LIMIT], max(-row[LIMIT], force))
                 stiff = min(row[MOST], max(row[LEAST], stiff - row[SLOPE] * kept * way))
@@ -317,12 +318,12 @@ def reflect(numbers, packet, fresh, period, s):
             elif kind == IMPEDANCE:
                 felt = fresh * row[RATIO] * gain
                 stiff = min(row[MOST], max(row[LEAST], stiff + felt * packet[TASK_STIFFNESS, c]))
-                rub += min(rub, felt * packet[TASK_DAMPING, c])  # more makes a sampled flotor shake
+                rub += min(rub, felt * packet[TASK_DAMPING, c])  # limited: sampling
                 own = numbers.mass[0] if i < 3 else numbers.turning[i - 3]
                 change = _CHANGE * (v - s.before[i])
                 s.before[i] += period * change
                 heavier = felt * packet[TASK_MASS, c]
-                if heavier > 0.0:  # not where it is no number
+                if heavier > 0.0:  # false for NaN
                     push -= min(_HEAVIER * own, heavier) * change
             elif kind == WAVES or kind == CONTROLLED:
                 push -= fresh * _passive_line(numbers, row, packet, period, s, i)
@@ -336,12 +337,12 @@ def reflect(numbers, packet, fresh, period, s):
         total = push - rub * v + fresh * s.extra[i]
         s.push[i] = (
             total if np.isfinite(total) else -row[NOMINAL] * x - row[DAMPING] * v
-        )  # the plain spring
+        )  # fallback: spring and damper only
 
 
 @compiled
 def _coordinating(row, mode, packet, period, s, i):
-    """Spring and damper between the machine and where the handle asks it to be."""
+    """Return the spring and damper force between the machine and its command from the handle."""
     gain, x, v, c, sign = row[GAIN], s.handle[i], s.speed[i], int(row[COORDINATE]), row[SIGN]
     place, speed = sign * packet[PLACE, c], sign * packet[SPEED, c]
     if mode == POSITION:
@@ -355,7 +356,7 @@ def _coordinating(row, mode, packet, period, s, i):
 
 @compiled
 def _passive_line(numbers, row, packet, period, s, i):
-    """Force of a passive line against the handle; what goes into the next packet is written."""
+    """Return the force of a passive channel against the handle; write the next packet's data."""
     c, sign, v, end = int(row[COORDINATE]), row[SIGN], s.speed[i], s.line[i]
     total, budget = sign * packet[TOTAL, c], packet[BUDGET, c]
     if numbers.kind[0] == WAVES:
@@ -371,7 +372,7 @@ def _passive_line(numbers, row, packet, period, s, i):
 
 @compiled
 def _four_channels(row, mode, force, packet, fresh, period, s, i):
-    """Force back and velocity back of the four-channel structures, and the master's own part.
+    """Return the reflected force and velocity of the four-channel structures.
 
     Under rate control `C2 = s / k_v` differentiates the force, below 20 rad/s.
     """
@@ -391,7 +392,7 @@ def _four_channels(row, mode, force, packet, fresh, period, s, i):
 
 @compiled
 def _decoupled(numbers, turn, s, wrench):
-    """Wrench with which every axis is a mass of its own under its push, about the handle."""
+    """Compute the wrench that makes every axis an independent mass under its force."""
     mass, arm = numbers.mass[0], numbers.below - numbers.handle
     inertia, wanted, about = np.zeros((3, 3)), np.empty(3), np.empty(3)
     square = arm[0] ** 2 + arm[1] ** 2 + arm[2] ** 2
@@ -405,13 +406,13 @@ def _decoupled(numbers, turn, s, wrench):
 
 @compiled
 def drive_coils(numbers, quaternion, period, s):
-    """Coil currents that put `push` on the handle, the flotor's weight taken off; hand's force.
+    """Compute the coil currents for `push` plus the flotor's weight, and estimate the hand force.
 
-    Currents beyond the largest make the whole wrench smaller, in its direction.
+    If a current exceeds its limit, the whole wrench is scaled down and keeps its direction.
 
     Args:
         numbers: Master.
-        quaternion: (4,) of the flotor.
+        quaternion: (4,) orientation of the flotor.
         period: scalar [s].
         s: MasterState; `currents`, `limited`, `hand` and `momentum` are written.
 
@@ -446,7 +447,7 @@ def drive_coils(numbers, quaternion, period, s):
 
 @compiled
 def _blind(s):
-    """No currents, no command, nothing learnt; the next good reading starts from rest."""
+    """Switch currents and command off; the next valid reading starts from rest."""
     for i in range(6):
         s.handle[i], s.speed[i], s.push[i] = 0.0, 0.0, 0.0
         s.hand[i], s.momentum[i], s.currents[i] = 0.0, 0.0, 0.0
@@ -455,17 +456,17 @@ def _blind(s):
 
 @compiled
 def master_step(numbers, qpos, packet, fresh, period, first, s):
-    """One period of the master: read the handle, reflect, drive the coils.
+    """Run one period of the master: read the handle, reflect, drive the coils.
 
-    A reading that is no number switches the coils off and leaves the machine without a command.
+    A reading that is not finite switches the coils off and leaves the machine without a command.
 
     Args:
         numbers: Master.
-        qpos: (7,) of the flotor: position [m] and quaternion.
+        qpos: (7,) flotor position [m] and quaternion.
         packet: (8, k) see `reflect`.
         fresh: see `reflect`, scalar.
         period: scalar [s].
-        first: whether it is the first one, scalar.
+        first: whether this is the first period, scalar.
         s: MasterState, written.
 
     Returns:
@@ -482,20 +483,20 @@ def master_step(numbers, qpos, packet, fresh, period, first, s):
 
 
 _GRAVITY = 9.81
-_FULL = 0.1  # of the tipping moment, beyond the allowed share, over which the spring builds up
+_FULL = 0.1  # range of the tipping ratio, above the allowed one, over which the spring builds up
 
 
 def tipping_share(facts: TipOver, radius: float, force: float) -> float:
-    """Share of the tipping moment that a vertical force at the tip makes up.
+    """Return the ratio of a vertical tip force's moment to the tipping moment.
 
     Args:
-        facts: of the machine.
-        radius: of the tip from the swing axis [m].
-        force: of the environment on the tip, positive up [N].
+        facts: tip-over parameters of the machine.
+        radius: distance of the tip from the swing axis [m].
+        force: force of the environment on the tip, positive up [N].
 
     Returns:
-        1 where the machine tips: backwards about its rear edge if pushed up, forwards about the
-        front one if pulled down.
+        1 if the machine tips: backwards about its rear edge if pushed up, forwards about the front
+        edge if pulled down.
 
     >>> machine = TipOver(mass=20000.0, behind=0.4, edge=1.6)
     >>> round(tipping_share(machine, 6.4, 29430.0), 3)
@@ -511,15 +512,16 @@ def push_back(
     facts: TipOver, numbers: Master, packet: np.ndarray, start: np.ndarray, handle: np.ndarray,
     speed: np.ndarray, extra: np.ndarray,
 ) -> None:  # fmt: skip
-    """Force on the handle's vertical axis that keeps the machine from tipping.
+    """Compute a force on the handle's vertical axis that keeps the machine from tipping.
 
-    A further spring to the centre, with a damper that 200 Hz needs to hold it, on the side that
-    would make it worse: the hand is back inside the dead band, and no motion is ever commanded.
+    The force is an additional spring to the centre, with the damper that a 200 Hz control needs. It
+    acts only in the direction that increases the tipping moment. It brings the handle back into the
+    dead band and never commands a motion.
 
     Args:
-        facts: of the machine.
-        numbers: of the master.
-        packet: (8, k) what came from the machine.
+        facts: tip-over parameters of the machine.
+        numbers: parameters of the master.
+        packet: (8, k) data from the machine.
         start: (5,) pose at the start.
         handle: (6,) measured displacement [m], [rad].
         speed: (6,) its rate [m/s], [rad/s].
@@ -534,7 +536,7 @@ def push_back(
         return
     for axis in range(6):
         row = numbers.axis[axis]
-        worse = -math.copysign(1.0, force) * row[SIGN]  # pressing on makes what pushes up larger
+        worse = -math.copysign(1.0, force) * row[SIGN]  # this direction increases the tip force
         if row[COORDINATE] == 2.0 and worse * handle[axis] > 0.0:
             push = facts.stiffness * handle[axis] + facts.damping * speed[axis]
             extra[axis] = -danger * push

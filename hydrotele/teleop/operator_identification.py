@@ -1,17 +1,17 @@
-"""Identification of the operator model's parameters from a record of compensatory tracking.
+"""Identification of the operator model from a record of compensatory tracking.
 
-The operator sees the error between target and response and moves his hand; his describing function
-`Yp = K (equalisation) e^(-tau s) omega^2 / (s^2 + 2 zeta omega s + omega^2)` is fitted to error and
-hand. His own noise goes round the loop, so that it is part of the error: an ordinary fit is biased.
-The part of the error that comes from the target is therefore the instrument (refined instrumental
-variables): the equations `sum dYp/dtheta e_target * W (hand - Yp error) = 0` hold at the true
-parameters whatever the remnant, and their covariance gives the standard errors. W whitens the
-remnant.
+The operator observes the error between target and response and moves the hand. The describing
+function `Yp = K (equalisation) e^(-tau s) omega^2 / (s^2 + 2 zeta omega s + omega^2)` is fitted to
+error and hand. The operator's noise passes through the loop and is part of the error, so that an
+ordinary fit is biased. The part of the error that the target causes is therefore the instrument
+(refined instrumental variables): the equations
+`sum dYp/dtheta e_target * W (hand - Yp error) = 0` hold at the true parameters for any remnant, and
+their covariance gives the standard errors. W whitens the remnant.
 
-The instrument is estimated, too: its errors come from the same remnant as what is left over, and
-where the remnant is most of the error they decide how far estimates scatter. Standard errors are
-therefore those of a jackknife that estimates instrument and parameters anew without one part of
-the record after the other.
+The instrument is estimated as well. Its errors come from the same remnant as the residual. If the
+remnant is most of the error, they determine the scatter of the estimates. Standard errors are
+therefore those of a jackknife, which estimates instrument and parameters again without each part
+of the record in turn.
 
 Source: Van den Hof and Schrama 1993 (two-stage method); Soderstrom and Stoica 1983 (instrumental
 variables); Bekker 1994 (variance with many weak instruments); form of Yp: McRuer and Jex 1967.
@@ -32,15 +32,15 @@ from hydrotele.teleop.manual_control import FORMS, TrackingRecord
 from hydrotele.teleop.operator_parameters import load_operator_file
 
 EQUALISATIONS = ("integral", "lag", "gain", "lead")
-_SLOWEST, _FASTEST = 10.0, 25.0  # Hz of the samples that are used
+_SLOWEST, _FASTEST = 10.0, 25.0  # Hz, minimum and maximum sampling rate of the analysis
 _SHORTEST = 20.0  # s
-_MISSING = 0.05  # share of the samples that may be interpolated
+_MISSING = 0.05  # maximum fraction of samples that are interpolated
 _HIGHPASS = 0.15  # rad/s: slower motion of the hand is drift
-_SETTLES = 6.0  # s until filters have forgotten what was before the record
-_MEMORY, _TAP = 3.0, 0.06  # s of the response of the error to the target, and between its taps
-_PARTS, _RANK = 6, 3e-3  # of the record; smallest singular value that counts, to the largest
+_SETTLES = 6.0  # s, settling time of the filters at the start of the record
+_MEMORY, _TAP = 3.0, 0.06  # s, length and tap spacing of the response of the error to the target
+_PARTS, _RANK = 6, 3e-3  # parts of the record; smallest relative singular value that is used
 _WHITENER = 0.6  # s of the autoregression of the remnant
-_FLOOR = 3e-2  # of the variance of the remnant, as white noise: the whitener amplifies no more
+_FLOOR = 3e-2  # white noise relative to the variance of the remnant: limits the whitener's gain
 _BOUNDS = {
     "gain": (1e-9, 1e9), "delay": (0.02, 1.0), "time_constant": (0.02, 50.0),
     "neuromuscular_frequency": (3.0, 60.0), "neuromuscular_damping": (0.03, 2.0),
@@ -48,9 +48,9 @@ _BOUNDS = {
 _UNITS = {"delay": "s", "time_constant": "s", "neuromuscular_frequency": "rad/s",
           "neuromuscular_damping": "1", "remnant": "1", "crossover": "rad/s",
           "phase_margin": "rad", "gain_margin": "1"}  # fmt: skip
-_CERTAIN = 0.5  # standard error of a logarithm beyond which a parameter is not identified
+_CERTAIN = 0.5  # maximum standard error of a logarithm for an identifiable parameter
 _JACKKNIFE = 8  # parts of the record
-_QUANTILE = 2.36  # of Student's t with the degrees of freedom that they leave, for 95 %
+_QUANTILE = 2.36  # Student's t for 95 % with _JACKKNIFE - 1 degrees of freedom
 _DRAWS = 400
 
 
@@ -59,10 +59,10 @@ class Estimate(NamedTuple):
 
     Attributes:
         value: estimate.
-        low: lower end of its 95 % interval.
-        high: upper end.
-        unit: of them.
-        identified: whether the record tells it to better than a factor of about 2.7.
+        low: lower end of the 95 % confidence interval.
+        high: upper end of the interval.
+        unit: unit of all three.
+        identified: whether the record determines the value to a factor of about 2.7.
     """
 
     value: float
@@ -73,20 +73,20 @@ class Estimate(NamedTuple):
 
 
 class OperatorFit(NamedTuple):
-    """An operator identified from a record.
+    """Operator model identified from a record.
 
     Attributes:
         equalisation: `gain`, `lead`, `lag` or `integral`.
         estimates: name -> estimate: gain (hand per error), delay, time_constant of lead or lag,
             neuromuscular_frequency, neuromuscular_damping, remnant; crossover, phase_margin and
-            gain_margin where the controlled element is one of the known forms.
-        element: form of the controlled element, as `K/s`, empty where it is none of them.
-        explained: share of the hand's variance that the model predicts from the target [1].
-        rate: of the samples that were used [Hz].
-        duration: that was used [s].
-        notes: what the user should know.
-        frequencies: (m,) at which the describing function is given [rad/s].
-        response: (m,) complex describing function Yp of the model.
+            gain_margin if the controlled element is one of the known forms.
+            element: form of the controlled element, such as `K/s`; empty if it is not a known form.
+            explained: fraction of the hand's variance that the model predicts from the target [1].
+            rate: sampling rate of the analysis [Hz].
+            duration: analysed duration [s].
+            notes: warnings for the user.
+            frequencies: (m,) frequencies of the describing function [rad/s].
+            response: (m,) complex describing function Yp of the model.
     """
 
     equalisation: str
@@ -105,20 +105,20 @@ def read_tracking(
 ) -> tuple[TrackingRecord, list[str]]:
     """Read a record of tracking from a CSV or Parquet file.
 
-    Columns are `time`, `target`, `response` and `hand`, or what `names` calls them; without a
-    `hand` a column `force` is what the operator does (a stick that does not move). A unit in the
+    Columns are `time`, `target`, `response` and `hand`, or the names in `names`. Without a column
+    `hand`, a column `force` is used as the operator's output (an isometric stick). A unit in the
     header (`time [ms]`) is converted. Samples need not be equidistant; single missing values are
     interpolated.
 
     Args:
-        path: of the file.
+        path: path of the file.
         names: `time`, `target`, `response`, `hand` -> column.
 
     Returns:
-        The record as it was sampled, and notes.
+        The record as sampled, and notes.
 
     Raises:
-        InputError: names file, column and row, and what to do.
+        InputError: the file is invalid; the message gives file, column, row and a remedy.
     """
     table = read_table(path, missing=True)
     given, notes = dict(names or {}), []
@@ -128,10 +128,10 @@ def read_tracking(
         name = given.get(key) or lower.get(key)
         if key == "hand" and name is None and "force" in lower:
             name = lower["force"]
-            notes.append("no hand: the force is taken as what the operator does")
+            notes.append("no column hand: the force is used as the operator's output")
         if name not in table.names:
             has = ", ".join(table.names)
-            message = f"has no column {name or key!r}; it has {has}; name it with --{key} COLUMN"
+            message = f"has no column {name or key!r}; columns: {has}; name it with --{key} COLUMN"
             raise InputError(path, message)
         place = table.names.index(name)
         unit, values = table.units[place], np.array(table.values[place], float)
@@ -143,23 +143,23 @@ def read_tracking(
         columns[key] = values
     time = columns.pop("time")
     if len(time) < 10:
-        raise InputError(path, f"has {len(time)} rows: a record of tracking needs {_SHORTEST:g} s")
+        raise InputError(path, f"has {len(time)} rows; a record needs at least {_SHORTEST:g} s")
     bad = np.flatnonzero(~(np.diff(time) > 0.0))
     if len(bad):
-        message = "does not rise here: sort the rows, and keep each time once"
+        message = "does not increase here: sort the rows and keep each time once"
         raise InputError(table.where("time", int(bad[0]) + 1), message)
     for key, values in columns.items():
         missing = np.isnan(values)
         if missing.mean() > _MISSING:
             share = 100.0 * missing.mean()
             row = int(np.flatnonzero(missing)[0])
-            message = f"misses {share:.0f} % of its values, {100 * _MISSING:g} % may be missing"
+            message = f"has {share:.0f} % missing values; at most {100 * _MISSING:g} % are allowed"
             raise InputError(table.where(given.get(key, key), row), message)
         if missing.any():
             notes.append(f"{int(missing.sum())} missing values of {key} were interpolated")
             columns[key] = np.interp(time, time[~missing], values[~missing])
         if np.ptp(columns[key]) == 0.0:
-            raise InputError(f"{path}, column {given.get(key, key)}", "never changes")
+            raise InputError(f"{path}, column {given.get(key, key)}", "is constant")
     return TrackingRecord(time, *(columns[k] for k in ("target", "response", "hand"))), notes
 
 
@@ -169,15 +169,15 @@ def identify_operator(
     """Fit the operator model to a record of compensatory tracking.
 
     Args:
-        record: as it was sampled.
-        equalisation: `gain`, `lead`, `lag` or `integral`; chosen by the record without one.
-        source: what messages call the record.
+        record: record as sampled.
+        equalisation: `gain`, `lead`, `lag` or `integral`; by default the best fit is selected.
+        source: name of the record in messages.
 
     Returns:
         The fit.
 
     Raises:
-        InputError: the record is too short or too slow, or shows no answer to its target.
+        InputError: the record is too short or too slow, or the hand does not respond to the target.
     """
     if equalisation is not None and equalisation not in EQUALISATIONS:
         message = f"{equalisation!r}; valid: {', '.join(EQUALISATIONS)}"
@@ -190,12 +190,12 @@ def identify_operator(
     kinds = (equalisation,) if equalisation else EQUALISATIONS
     fits = [fit for kind in kinds if (fit := _fit(data, kind)) is not None]
     if not fits:
-        raise InputError(source, "shows no answer of the hand to the target: check the columns")
+        raise InputError(source, "has no response of the hand to the target: check the columns")
     best = min(fits, key=lambda fit: (not fit.settled, fit.criterion))
     best = best._replace(covariance=_covariance(data, best))
     if not best.settled:
-        notes.append("the fit did not settle, and tells nothing: record longer, or with more motion"
-                     " of the target")  # fmt: skip
+        notes.append("the fit did not converge and is not valid: use a longer record, or a target"
+                     " with more motion")  # fmt: skip
     return _finished(best, data, signals, record, notes)
 
 
@@ -220,18 +220,18 @@ class _Fit(NamedTuple):
 
 
 def _uniform(record: TrackingRecord, source: str) -> tuple[float, dict[str, np.ndarray], list[str]]:
-    """Equidistant signals without mean, and notes."""
+    """Resample to equidistant signals without mean; also return notes."""
     time, notes = record.time, []
     spacing = float(np.median(np.diff(time)))
     if time[-1] - time[0] < _SHORTEST:
-        message = f"is {time[-1] - time[0]:.1f} s long: at least {_SHORTEST:g} s are needed"
+        message = f"is {time[-1] - time[0]:.1f} s long; at least {_SHORTEST:g} s are needed"
         raise InputError(source, message)
     if 1.0 / spacing < _SLOWEST:
-        message = f"has {1.0 / spacing:.2g} samples per second: at least {_SLOWEST:g} are needed"
+        message = f"has {1.0 / spacing:.2g} samples per second; at least {_SLOWEST:g} are needed"
         raise InputError(source, message)
     if (gap := float(np.diff(time).max())) > 0.5:
         at = float(time[int(np.argmax(np.diff(time)))])
-        message = f"has a gap of {gap:.2f} s at {at:.2f} s: cut it there, and use the longer part"
+        message = f"has a gap of {gap:.2f} s at {at:.2f} s: use only the longer part"
         raise InputError(source, message)
     if np.abs(np.diff(time) / spacing - 1.0).max() > 0.5:
         notes.append("samples are not equidistant: they were interpolated")
@@ -255,7 +255,7 @@ def _highpass(s: np.ndarray) -> np.ndarray:
 
 
 def _filter(values: np.ndarray, step: float, response) -> np.ndarray:
-    """A signal through a transfer function of s, from rest."""
+    """Filter a signal with a transfer function of s, from rest."""
     pad = len(values) + round(4.0 * _SETTLES / step)
     s = 2j * np.pi * np.fft.rfftfreq(pad, step)
     return np.fft.irfft(np.fft.rfft(values, pad) * response(s), pad)[: len(values)]
@@ -264,10 +264,10 @@ def _filter(values: np.ndarray, step: float, response) -> np.ndarray:
 def _instrument(
     target: np.ndarray, seen: np.ndarray, step: float, kept: np.ndarray | None = None
 ) -> np.ndarray:  # fmt: skip
-    """Part of the error that comes from the target: its response by least squares of `kept` rows.
+    """Estimate the part of the error that the target causes, by least squares on `kept` rows.
 
-    Each part of the record gets the response that the others have, so that the remnant of a part
-    is not in its own instrument (jackknife instrumental variables, Angrist et al. 1999).
+    Each part of the record uses the response that is fitted to the other parts, so that its own
+    remnant is not in its instrument (jackknife instrumental variables, Angrist et al. 1999).
     """
     apart = max(1, round(_TAP / step))
     lags = np.arange(0, round(_MEMORY / step), apart)
@@ -296,7 +296,7 @@ def _names(kind: str) -> tuple[str, ...]:
 
 
 def _response(kind: str, logs: np.ndarray, s: np.ndarray) -> np.ndarray:
-    """Describing function of the operator."""
+    """Return the operator's describing function."""
     p = dict(zip(_names(kind), np.exp(logs), strict=True))
     w, z = p["neuromuscular_frequency"], p["neuromuscular_damping"]
     made = p["gain"] * np.exp(-p["delay"] * s) * w**2 / (s**2 + 2.0 * z * w * s + w**2)
@@ -310,7 +310,7 @@ def _response(kind: str, logs: np.ndarray, s: np.ndarray) -> np.ndarray:
 
 
 def _slopes(kind: str, logs: np.ndarray, s: np.ndarray) -> list[np.ndarray]:
-    """Its derivatives with respect to the logarithms."""
+    """Return the derivatives of `_response` with respect to the logarithms."""
     p = dict(zip(_names(kind), np.exp(logs), strict=True))
     w, z = p["neuromuscular_frequency"], p["neuromuscular_damping"]
     whole = _response(kind, logs, s)
@@ -331,7 +331,7 @@ def _predicted(data: _Data, kind: str, logs: np.ndarray, values: np.ndarray) -> 
 
 
 def _autoregression(noise: np.ndarray, step: float) -> np.ndarray:
-    """Whitening filter of a noise: 1 and the negative coefficients of its autoregression."""
+    """Return the whitening filter of a noise: 1 and the negative autoregression coefficients."""
     from scipy.linalg import solve_toeplitz
 
     order = max(4, round(_WHITENER / step))
@@ -344,7 +344,7 @@ def _autoregression(noise: np.ndarray, step: float) -> np.ndarray:
 
 
 def _fit(data: _Data, kind: str) -> _Fit | None:
-    """Refined instrumental variables from several delays; None where nothing fits."""
+    """Fit by refined instrumental variables from several delays; None if no start fits."""
     from scipy.optimize import least_squares
     from scipy.signal import lfilter
 
@@ -394,10 +394,10 @@ def _equations(
     data: _Data, kind: str, logs: np.ndarray, sign: float, white: np.ndarray,
     instrument: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """Whitened instruments (n, m + 1), slopes (n, m + 1), and remnant (n,) at some parameters.
+    """Return whitened instruments (n, m + 1), derivatives (n, m + 1), and remnant (n,).
 
-    The last column is what a hand that was displaced at the beginning of the record leaves behind
-    the high-pass, which outlasts the rows that are left out.
+    The last column is the response of the high-pass to an initial displacement of the hand, which
+    lasts longer than the discarded rows.
     """
     from scipy.signal import lfilter
 
@@ -424,11 +424,11 @@ def _solution(z: np.ndarray, d: np.ndarray, rest: np.ndarray) -> np.ndarray:
 
 
 def _covariance(data: _Data, fit: _Fit) -> np.ndarray:
-    """Covariance of the logarithms, the larger of two for every element.
+    """Return the covariance of the logarithms, scaled up to the jackknife's variances.
 
-    One takes the whitened remnant as equally large throughout and the instrument as known. The
-    other leaves out one part of the record after the other and estimates instrument and parameters
-    anew (jackknife): the remnant grows and shrinks with the error, and is in the instrument, too.
+    The first estimate assumes a stationary whitened remnant and a known instrument. The jackknife
+    leaves out each part of the record in turn and estimates instrument and parameters again, since
+    the remnant varies with the error and is also in the instrument.
     """
     arguments = data, fit.kind, fit.logs, fit.sign, fit.white
     z, d, rest = _equations(*arguments, data.from_target)
@@ -459,7 +459,7 @@ def _finished(
     fit: _Fit, data: _Data, signals: Mapping[str, np.ndarray], record: TrackingRecord,
     notes: list[str],
 ) -> OperatorFit:  # fmt: skip
-    """Estimates with intervals, remnant, and where the loop crosses over."""
+    """Build the fit: estimates with intervals, remnant, crossover and margins."""
     errors = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
     estimates: dict[str, Estimate] = {}
     for name, log, error in zip(fit.names, fit.logs, errors, strict=True):
@@ -467,16 +467,16 @@ def _finished(
         error = error if fit.settled else math.inf
         estimates[name] = _estimate(log, error, _UNITS.get(name, "hand per error"), not at_bound)
         if at_bound or error > _CERTAIN:
-            notes.append(f"{name} cannot be told from this record")
+            notes.append(f"{name} is not identifiable from this record")
     estimates["remnant"] = _remnant(fit, data)
     if fit.sign < 0.0:
-        notes.append("the hand's sign is turned round: a positive error moves it the negative way")
+        notes.append("the sign of the hand is reversed: a positive error moves it backwards")
     first = round(_SETTLES / data.step)
     hand = fit.sign * data.hand[first:]
     rest = hand - _predicted(data, fit.kind, fit.logs, data.from_target)[first:]
     explained = 1.0 - float(np.var(rest) / np.var(hand))
     if explained < 0.3:
-        notes.append(f"only {100 * explained:.0f} % of the hand's motion come from the target")
+        notes.append(f"the target explains only {100 * explained:.0f} % of the hand's motion")
     w = np.geomspace(0.1, 30.0, 600)
     element = _close(fit, data, signals, w, estimates, notes) if fit.settled else ""
     return OperatorFit(
@@ -493,7 +493,7 @@ def _estimate(log: float, error: float, unit: str, inside: bool = True) -> Estim
 
 
 def _remnant(fit: _Fit, data: _Data) -> Estimate:
-    """Power density of the observation noise over pi times the variance of what is observed."""
+    """Return the power density of the observation noise over pi times the observed variance."""
     from scipy.signal import welch
 
     length = min(len(fit.noise), round(15.0 / data.step))
@@ -512,7 +512,7 @@ def _remnant(fit: _Fit, data: _Data) -> Estimate:
         power = (power + lead**2 * rate) / (1.0 + (lead * w[band]) ** 2)
     share = density[band] / 2.0 / bare**2 / (np.pi * power)  # two-sided
     count = max(1.0, 1.8 * len(fit.noise) / length * band.sum() * 0.6)
-    whole = _response(fit.kind, fit.logs, s)  # of gain and time constant the product counts
+    whole = _response(fit.kind, fit.logs, s)  # only the product of gain and lead time counts
     slopes = np.array([np.real(k / whole).mean() for k in _slopes(fit.kind, fit.logs, s)])
     doubt = float(slopes @ fit.covariance @ slopes)
     error = math.sqrt(1.5 / count + 4.0 * max(0.0, doubt))
@@ -523,7 +523,7 @@ def _close(
     fit: _Fit, data: _Data, signals: Mapping[str, np.ndarray], w: np.ndarray,
     estimates: dict[str, Estimate], notes: list[str],
 ) -> str:  # fmt: skip
-    """Controlled element; crossover frequency and margins of the open loop with intervals."""
+    """Identify the controlled element; add crossover and margins with intervals to `estimates`."""
     first, hand = round(_SETTLES / data.step), signals["hand"]
     best = (math.inf, 0, 1.0, 0.0)
 
@@ -543,7 +543,7 @@ def _close(
             best = min(best, (rest, form, gain, float(late)))
     rest, form, gain, late = best
     if rest > 0.2:
-        notes.append("the controlled element is none of K, K/s and K/s^2: no crossover is given")
+        notes.append("the controlled element is not K, K/s or K/s^2: no crossover is estimated")
         return ""
     rng = np.random.default_rng(1967)
     draws = rng.multivariate_normal(fit.logs, fit.covariance, _DRAWS, check_valid="ignore")
@@ -565,7 +565,7 @@ def _close(
 
 
 def _margins(w: np.ndarray, loop: np.ndarray, form: int) -> tuple[float, float, float]:
-    """Crossover frequency, phase margin, and gain where the phase is -180 degrees."""
+    """Return crossover frequency, phase margin, and gain where the phase is -180 degrees."""
     size, phase = np.log(np.abs(loop)), np.unwrap(np.angle(loop))
     phase -= 2.0 * math.pi * round((phase[0] + math.pi * (1.0 if form == 2 else 0.5)) / math.tau)
     falls = np.flatnonzero((size[:-1] >= 0.0) & (size[1:] < 0.0))
@@ -581,20 +581,20 @@ def _margins(w: np.ndarray, loop: np.ndarray, form: int) -> tuple[float, float, 
 
 
 def operator_file_of(fit: OperatorFit, name: str, source: str) -> str:
-    """The fit as a file of operator parameters, for `perception: {file: ...}` of a scenario.
+    """Convert a fit to an operator file, for `perception: {file: ...}` of a scenario.
 
-    Only what the record tells is in it; the rest stays that of the shipped file.
+    The file contains only the identifiable parameters; the others come from the default file.
 
     Args:
-        fit: of `identify_operator`.
-        name: of the operator.
-        source: of the record.
+        fit: result of `identify_operator`.
+        name: name of the operator.
+        source: description of the record.
 
     Returns:
         The YAML text.
 
     Raises:
-        InputError: the record tells none of the parameters.
+        InputError: no parameter is identifiable.
     """
     usual = load_operator_file().parameters
     lead = usual["lead_delay"].value if fit.equalisation == "lead" else 0.0
@@ -615,6 +615,6 @@ def operator_file_of(fit: OperatorFit, name: str, source: str) -> str:
             "unit": one.unit, "basis": "identified", "source": source,
         }  # fmt: skip
     if not parameters:
-        raise InputError(source, "tells none of the operator's parameters: record longer")
+        raise InputError(source, "no operator parameter is identifiable: use a longer record")
     document = {"name": name, "description": f"identified from {source}", "parameters": parameters}
     return yaml.safe_dump(document, sort_keys=False)

@@ -1,20 +1,18 @@
-"""The simulated operator: what he sees and feels, and what he wants the handle to do.
+"""Simulated operator: perception, decisions and neuromuscular dynamics in one run.
 
-He never knows the contact force nor the machine's gains: he feels what the handle does, sees the
-tip and whether it touches, in `track` a graph of the force that he is to make, and learns from his
-own pushes what they do. The joystick's own springs and the scale of what it reflects are told to
-him. He decides fifty times a second; by sight he steers as `teleop.manual_control` says, who he is
-stands in `teleop.operator_parameters`.
+The operator does not know the contact force or the machine's gains. The operator feels the handle's
+motion, sees the tip and its contact, and in `track` also a display of the reference force. The
+effect of a push is learnt from earlier pushes. The joystick's own springs and the scale of its
+reflection are known. The operator decides at 50 Hz; visual control follows
+`teleop.manual_control`, and the parameters are in `teleop.operator_parameters`.
 
-Muscles of the simulated operator: from a wanted displacement to forces on the handle.
+The neuromuscular dynamics convert a reference displacement to forces on the handle.
 
-What a hand feels: force, displacement and stiffness, each as well as a person can tell it.
-
-A force or a displacement is felt with an error in proportion to its size (Weber's law). Putting
-both together to a stiffness adds an error of its own: people resolve compliance by 22 % when they
-cannot use work or terminal force (Tan, Durlach, Beauregard and Srinivasan 1995, Perception &
-Psychophysics 57), though force alone by some 7 % (Pang, Tan and Durlach 1991, ibid. 49) and limb
-movement by 8 % (Jones, Hunter and Irwin 1992, ibid. 52). One exploration gives one impression.
+A force or a displacement is felt with an error in proportion to its size (Weber's law). Combining
+both to a stiffness adds another error: people resolve compliance by 22 % when they cannot use work
+or terminal force (Tan, Durlach, Beauregard and Srinivasan 1995, Perception & Psychophysics 57),
+though force alone by some 7 % (Pang, Tan and Durlach 1991, ibid. 49) and limb movement by 8 %
+(Jones, Hunter and Irwin 1992, ibid. 52). One exploration gives one impression.
 """
 
 import math
@@ -70,13 +68,13 @@ from hydrotele.teleop.operator_parameters import Operator, perceiving
 
 
 class Feeling(NamedTuple):
-    """Errors of what a hand feels, by decision; n decisions.
+    """Perception errors of a hand in n decisions.
 
     Attributes:
-        force: (n,) factor on a felt force.
-        displacement: (n,) factor on a felt displacement.
-        stiffness: (n,) factor of putting both together.
-        share: standard deviation of a felt stiffness, of which he knows [1].
+        force: (n,) factor on the perceived force.
+        displacement: (n,) factor on the perceived displacement.
+        stiffness: (n,) factor due to the combination of both.
+        share: relative standard deviation of a perceived stiffness, known to the operator [1].
     """
 
     force: np.ndarray
@@ -86,13 +84,13 @@ class Feeling(NamedTuple):
 
 
 def feeling(him: Operator, rng: np.random.Generator, count: int, step: float) -> Feeling:
-    """Impressions of a run, one per exploration.
+    """Draw the perception errors of a run, one set per exploration.
 
     Args:
-        him: the operator, with his Weber fractions; an exploration lasts his `dwell`.
-        rng: of the impressions.
+        him: operator with Weber fractions; an exploration lasts `dwell`.
+        rng: random generator of the errors.
         count: number of decisions.
-        step: between them [s].
+        step: time between two decisions [s].
 
     Returns:
         The errors.
@@ -107,43 +105,43 @@ def feeling(him: Operator, rng: np.random.Generator, count: int, step: float) ->
 def felt_stiffness(
     force: float, displacement: float, errors: Feeling, number: int
 ) -> float:  # fmt: skip
-    """Stiffness that a hand feels in a spring.
+    """Return the stiffness of a spring as perceived by a hand.
 
     Args:
-        force: on the hand [N].
-        displacement: of the hand [m], not 0.
-        errors: of what he feels.
-        number: of the decision.
+        force: force on the hand [N].
+        displacement: displacement of the hand [m], not 0.
+        errors: perception errors.
+        number: number of the decision.
 
     Returns:
-        The felt stiffness [N/m].
+        The perceived stiffness [N/m].
     """
     felt = force * errors.force[number] / (displacement * errors.displacement[number])
     return float(felt * errors.stiffness[number])
 
 
-_THROUGH = 1.15  # times the force at a notch's edge, to get over it
-_FINE, _FINE_TURN = 4e-4, 4e-3  # m, rad: a larger gap is a way to go, nothing to learn from
+_THROUGH = 1.15  # factor on the force at a notch's edge, to overcome it
+_FINE, _FINE_TURN = 4e-4, 4e-3  # m, rad: limit on the position error that is integrated
 
 
 class Muscles(NamedTuple):
-    """Numbers and state of the muscles.
+    """Parameters and state of the neuromuscular dynamics.
 
     Attributes:
-        wanted: (6,) displacement of the handle [m], [rad].
-        spring: (6,) what the joystick is expected to push back with [N/m], [N m/rad].
-        notch: (3, 6) of its detents: edge [m], [rad], drop [N], [N m], slope outside [N/m], < 0
+        wanted: (6,) reference displacement of the handle [m], [rad].
+        spring: (6,) expected stiffness of the joystick [N/m], [N m/rad].
+        notch: (3, 6) detents: edge [m], [rad], force drop [N], [N m], stiffness outside [N/m], < 0
             without a detent.
-        correction: (6,) what was learnt to be missing [N], [N m].
-        force: (6,) on the handle [N], [N m].
+        correction: (6,) learnt additional force [N], [N m].
+        force: (6,) force on the handle [N], [N m].
         arm: (6,) stiffness of arm and hand [N/m], [N m/rad].
-        cross: (1,) the same between x and y [N/m].
-        most: (6,) largest force [N], [N m].
-        weight: (6,) of the hand, which they carry [N], [N m].
-        gain: (1,) of the correction [1/s].
-        rest: (6,) where the neuromuscular lag has moved the arm's rest [m], [rad].
+        cross: (1,) stiffness between x and y [N/m].
+        most: (6,) maximum force [N], [N m].
+        weight: (6,) weight of the hand, which the muscles carry [N], [N m].
+        gain: (1,) integral gain of the correction [1/s].
+        rest: (6,) rest position of the arm after the neuromuscular lag [m], [rad].
         rate: (6,) its rate.
-        lag: (6,) of `neuromuscular_matrix`, for one control period.
+        lag: (6,) discrete lag of `neuromuscular_matrix`, for one control period.
     """
 
     wanted: np.ndarray
@@ -163,7 +161,7 @@ class Muscles(NamedTuple):
 
 @compiled
 def unpack_muscles(flat):
-    """The parts of `flat_view(Muscles)`.
+    """Return the parts of `flat_view(Muscles)`.
 
     Args:
         flat: (80,) array.
@@ -193,21 +191,21 @@ def unpack_muscles(flat):
 
 @compiled
 def pull(muscles, past, tremor, handle, tick, period):
-    """Forces of one period: the arm's rest moves with what is wanted, the rest is corrected late.
+    """Compute the muscle forces of one period from the reference displacement.
 
     Args:
         muscles: Muscles; `correction`, `force`, `rest` and `rate` are written.
-        past: (reflex + 1, 6) displacements of the last periods, written [m], [rad].
-        tremor: (n, 6) of the run [N], [N m].
-        handle: (6,) displacement of now [m], [rad].
+        past: (reflex + 1, 6) ring buffer of displacements, written [m], [rad].
+        tremor: (n, 6) tremor forces [N], [N m].
+        handle: (6,) present displacement [m], [rad].
         tick: number of the period, scalar.
         period: scalar [s].
 
     Returns:
         Nothing.
 
-    Source: equilibrium-point control with a late integral; Feldman 1986. The rest follows what is
-        wanted through the neuromuscular lag; McRuer and Jex 1967.
+    Source: equilibrium-point control with a delayed integral; Feldman 1986. The rest position
+        follows the reference through the neuromuscular lag; McRuer and Jex 1967.
     """
     rows, lag = len(past), muscles.lag
     noise = tick % len(tremor)
@@ -226,7 +224,7 @@ def pull(muscles, past, tremor, handle, tick, period):
             firm = muscles.arm[i] + muscles.notch[2, i]
             back = spring * muscles.notch[0, i] - muscles.notch[1, i] + muscles.notch[2, i] * beyond
             if (late if wanted > 0.0 else -late) < muscles.notch[0, i]:
-                back = _THROUGH * spring * muscles.notch[0, i]  # first over the notch's edge
+                back = _THROUGH * spring * muscles.notch[0, i]  # force to overcome the notch's edge
             known = muscles.arm[i] * wanted + (back if wanted > 0.0 else -back)
         if i < 2:
             known += muscles.cross[0] * muscles.rest[1 - i]
@@ -239,78 +237,78 @@ def pull(muscles, past, tremor, handle, tick, period):
 
 
 DECISIONS = 50.0  # Hz
-REFLEX = 0.05  # s, from where the hand is to what the muscles do: stretch reflex and cortex
-_HOLD = 0.8  # of the dead band: where a hand rests that feels without moving
-_CLOSE = 0.05  # of the target: a force error that a person leaves alone
-_LEAST_CLOSE = 0.2  # of the largest target's: for targets near nothing
-_NOTICED = 0.2  # N: a force on the hand that stands out from its own tremor and the spring's
-_PUSH = 0.3  # s of a correcting push
-_CORRECTED = 0.45  # of an error, by one push
-_LEAST_WAY = 3e-4  # m: a stiffness cannot be felt from a smaller displacement
-_LEANING = 0.3  # s in which a hand builds up a force
+REFLEX = 0.05  # s, delay from hand position to muscle force: stretch reflex and cortex
+_HOLD = 0.8  # rest position of a hand that only feels, as a fraction of the dead band
+_CLOSE = 0.05  # force error that is not corrected, relative to the target
+_LEAST_CLOSE = 0.2  # lower limit of that error, relative to its value at the largest target
+_NOTICED = 0.2  # N: noticeable force on the hand, above its tremor and the spring's variation
+_PUSH = 0.3  # s, duration of a correcting push
+_CORRECTED = 0.45  # fraction of an error that one push corrects
+_LEAST_WAY = 3e-4  # m: minimum displacement from which a stiffness can be felt
+_LEANING = 0.3  # s, time constant with which a hand builds up a force
 _TREMOR_BAND = 2.0 * math.pi * 8.0  # rad/s of a physiological tremor
-_SLOW = 2.0 * math.pi * 0.5  # rad/s of drifting judgement
-_LEVERS = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])  # m: forces of the hand into torques
-_ROUND = 2**14  # periods of tremor before it comes again
-_LOOKING = 0.67  # of the time between pushes by feel: a display is read sooner
-_FURTHEST = 20.0  # times what he expected of a push: more or less is not learnt
+_SLOW = 2.0 * math.pi * 0.5  # rad/s, bandwidth of slow judgement errors
+_LEVERS = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])  # m: converts hand forces to torques
+_ROUND = 2**14  # number of tremor periods before they repeat
+_LOOKING = 0.67  # factor on the time between pushes by feel: a display is read faster
+_FURTHEST = 20.0  # limit of the learnt effect of a push over the expected effect
 
 
 Hand = Callable[[], np.ndarray]
-"""Where a live operator wants the handle now, (6,) [m], [rad]."""
+"""Function that returns the handle reference of a live operator, (6,) [m], [rad]."""
 
 
 class Perceived(Protocol):
-    """What there was to see and feel, by tick (`StationLog`)."""
+    """Observable quantities by tick (`StationLog`)."""
 
     touching: np.ndarray
     force: np.ndarray
 
     def master(self, name: str) -> np.ndarray:
-        """(n, ...) of a field of MasterState."""
+        """Return a field of MasterState, (n, ...)."""
         ...
 
     def slave(self, name: str) -> np.ndarray:
-        """(n, ...) of a field of SlaveState."""
+        """Return a field of SlaveState, (n, ...)."""
         ...
 
 
 class OperatorModel:
-    """An operator in one run.
+    """Simulate the decisions of an operator in one run.
 
     Attributes:
-        muscles: what he wants, and his arm.
-        tremor: (n, 6) of his forces [N], [N m].
-        past: (reflex + 1, 6) where the handle has just been [m], [rad].
+        muscles: reference displacement and arm.
+        tremor: (n, 6) tremor forces [N], [N m].
+        past: (reflex + 1, 6) recent displacements of the handle [m], [rad].
         every: control ticks per decision.
-        believed: (decisions,) contact force that he believes to have [N]; NaN where he does not
-            care.
-        loops: coordinate -> what he closes by sight, and has learnt of it.
+        believed: (decisions,) contact force that the operator estimates [N]; NaN if it is not
+            relevant.
+        loops: coordinate -> visually closed loop with the learnt element.
     """
 
     def __init__(
         self, pilot: TeleopPilot, joystick: Joystick, numbers: Master, seen: Perceived, ticks: int,
         period: float, seed: int, hand: Hand | None = None, folder: str = "",
     ) -> None:  # fmt: skip
-        """Sit down.
+        """Prepare the operator for a run.
 
         Args:
-            pilot: the scenario's.
-            joystick: the joystick, with his hand's numbers.
-            numbers: of the master's control; of them he knows the joystick's springs, dead bands,
-                detents and what it reflects, not how the machine answers.
-            seen: what there will be to see and feel, filled tick by tick.
+            pilot: teleoperation settings of the scenario.
+            joystick: joystick with the parameters of the operator's hand.
+            numbers: parameters of the master's control. The operator uses the joystick's springs,
+                dead bands, detents and reflection, not the machine's response.
+            seen: observable quantities, filled tick by tick.
             ticks: number of control periods.
-            period: of the control [s].
-            seed: of the run.
-            hand: of a live operator.
-            folder: of the scenario, from which files are counted.
+            period: control period [s].
+            seed: seed of the run.
+            hand: input of a live operator.
+            folder: folder of the scenario, to which file names are relative.
 
         Raises:
-            InputError: a live operator without a hand, a file that is not usable.
+            InputError: a live operator without a hand, or an invalid file.
         """
         if isinstance(pilot.operator, Live) and hand is None:
-            message = "a live operator has to be there: hydrotele drive SCENARIO"
+            message = "a live operator needs an input device: use hydrotele drive SCENARIO"
             raise InputError("pilot.operator", message)
         self._live = hand
         self._pilot, self._behaviour = pilot, pilot.operator
@@ -355,7 +353,7 @@ class OperatorModel:
                 self._look_at(c, rng, count)
 
     def _look_at(self, c: int, rng: np.random.Generator, count: int) -> None:
-        """Prepare to move a coordinate by sight."""
+        """Prepare the visual control of a coordinate."""
         axis = _axis_of(self._numbers, c)
         row, rate, him = self._numbers.axis[axis], self._pilot.mode == "rate", self.him
         turns = COORDINATES[c] not in ("r", "z")
@@ -371,17 +369,17 @@ class OperatorModel:
         )  # fmt: skip
 
     def decide(self, tick: int) -> None:
-        """Choose what the handle should do until the next decision; `muscles` is written.
+        """Choose the handle's reference until the next decision; `muscles` is written.
 
         Args:
-            tick: the control tick, a multiple of `every`.
+            tick: number of the control tick, a multiple of `every`.
         """
         if isinstance(self._behaviour, Follow | Recorded):
             self.muscles.wanted[:] = self._path[tick // self.every]
         if self._live:
             self.muscles.wanted[:] = self._live()
         if tick == 0:
-            return  # nothing seen yet
+            return  # nothing has been observed yet
         match self._behaviour:
             case Regulate() | Track() as pressing:
                 self._press(tick, pressing.approach)
@@ -389,7 +387,7 @@ class OperatorModel:
                 self._steer(tick)
 
     def _press(self, tick: int, approach: float) -> None:
-        """Bring a contact force to its target, by display or by feel, else by imagination."""
+        """Control a contact force to its target by display, by feel or by imagination."""
         press, number = self._target, tick // self.every
         axis, row, wanted = press.axis, press.row, self.muscles.wanted
         goal = press.goal[number]
@@ -448,9 +446,10 @@ class OperatorModel:
             self.muscles.spring[axis] = stiff if way * wanted[axis] >= 0.0 else row[LEAST]
 
     def _load(self, axis: int, way: float, felt: int) -> float:
-        """Stiffness that his muscles work against, as they last met it [N/m].
+        """Return the stiffness that the muscles last worked against [N/m].
 
-        Reflexes need no judgement; how muscles scatter is in the tremor.
+        It is free of perception errors, since reflexes need no judgement; muscle noise is in the
+        tremor.
         """
         row, x = self._target.row, float(self._handle[felt, axis])
         if way * x > _LEAST_WAY:
@@ -460,7 +459,7 @@ class OperatorModel:
         return self._met
 
     def _doubt(self, row: list[float], force: float) -> float:
-        """Variance of a judged contact force as he knows it from himself [N^2]."""
+        """Return the variance of an estimated contact force as known to the operator [N^2]."""
         him, largest = self.him, self._target.close / _CLOSE
         if self._target.shown:
             return (him.sight_noise * largest) ** 2
@@ -471,7 +470,7 @@ class OperatorModel:
     def _judge(
         self, tick: int, axis: int, way: float, felt: int, looked: int, touching: bool
     ) -> float:  # fmt: skip
-        """Contact force that he now judges to have, at least 0 [N]."""
+        """Return the contact force that the operator estimates now, at least 0 [N]."""
         row, reflection, number = self._target.row, self._pilot.reflection, tick // self.every
         if self._target.shown:
             shown = self._target.side * float(self._seen.force[looked, int(row[COORDINATE])])
@@ -495,22 +494,22 @@ class OperatorModel:
         return max(0.0, (way * force - row[NOMINAL] * way * x) / max(row[RATIO], 1e-12))
 
     def _lean(self, axis: int, way: float, row: list[float], goal: float, reflex: int) -> None:
-        """Push with the force that the target would push back with, and let the handle go."""
+        """Push with the expected reaction force of the target, and let the handle move freely."""
         share = 1.0 - math.exp(-self._step / _LEANING)
         wish = way * row[RATIO] * goal
         self.muscles.correction[axis] += share * (wish - self.muscles.correction[axis])
         self.muscles.spring[axis] = 0.0
-        self.muscles.wanted[axis] = self._handle[reflex, axis]  # a force, not a place
+        self.muscles.wanted[axis] = self._handle[reflex, axis]  # force control
 
     def _acting(self, axis: int, tick: int) -> float:
-        """Displacement of the handle that moves the machine, along the coordinate."""
+        """Return the handle displacement beyond the dead band, along the coordinate."""
         row, x = self._numbers.axis[axis], float(self._handle[tick, axis])
         if self._pilot.mode == "rate":
             x = math.copysign(max(0.0, abs(x) - row[DEADBAND]), x)
         return float(row[SIGN]) * x
 
     def _steer(self, tick: int) -> None:
-        """Move the tip to where it should be, by sight."""
+        """Move the tip to its target by visual control."""
         before, number = tick - 1, tick // self.every
         for c, goals in self._goals.items():
             axis, loop = _axis_of(self._numbers, c), self.loops[c]
@@ -526,15 +525,15 @@ class OperatorModel:
 
 @dataclass
 class _Belief:
-    """A contact force and what a push does to it, as he believes.
+    """Operator's estimate of a contact force and of the effect of a push.
 
     Attributes:
-        force: mean [N].
-        variance: of the force [N^2].
-        push: change of the force by a push, per displacement and time [N/(m s)].
-        doubt: variance of the same.
+        force: mean of the force [N].
+        variance: variance of the force [N^2].
+        push: change of the force per displacement and time of a push [N/(m s)].
+        doubt: variance of `push`.
         pushed: displacement times time of the last push [m s].
-        before: what was judged before it [N].
+        before: estimated force before the last push [N].
     """
 
     force: float
@@ -548,7 +547,7 @@ class _Belief:
         self._expected = self.push
 
     def judge(self, judged: float, variance: float) -> None:
-        """Take in a judgement [N] and its variance [N^2], and what the last push did."""
+        """Update with an observed force [N], its variance [N^2] and the effect of the last push."""
         if self.pushed and math.isfinite(self.before):
             own = self.pushed**2 * self.doubt
             share = self.pushed * self.doubt / (own + 2.0 * variance)
@@ -567,22 +566,22 @@ class _Belief:
         self.before, self.pushed = judged, 0.0
 
 
-_FADES = 0.05  # of a force, by which it may change between two judgements without him
+_FADES = 0.05  # relative change of a force between two estimates without operator action
 
 
 class _Target(NamedTuple):
-    """A force to make, as he has prepared for it.
+    """Reference force, as prepared by the operator.
 
     Attributes:
-        axis: of the joystick.
-        row: its numbers.
+        axis: number of the joystick axis.
+        row: parameters of the axis.
         side: sign of the force.
-        way: of the handle, to press harder.
-        goal: (decisions,) what he aims at, as late and as rough as he sees it [N].
-        displayed: (decisions,) what he is shown [N]; NaN without.
-        close: error that he leaves alone at the largest target [N].
-        noticed: force from which he believes in a contact that he does not see [N].
-        shown: whether the contact force is displayed beside it.
+        way: direction of the handle that increases the force.
+        goal: (decisions,) reference with visual delay and noise [N].
+        displayed: (decisions,) displayed reference [N]; NaN without a display.
+        close: uncorrected error at the largest target [N].
+        noticed: force above which the operator assumes a contact that is not visible [N].
+        shown: whether the contact force is displayed as well.
     """
 
     axis: int
@@ -622,10 +621,10 @@ def _axis_of(numbers: Master, coordinate: int) -> int:
 def _muscles(
     pilot: TeleopPilot, joystick: Joystick, numbers: Master, him: Operator, period: float
 ) -> Muscles:
-    """His arm at rest.
+    """Return the operator's arm at rest.
 
-    A path that is given is that of the hand, behind the neuromuscular lag. A hand that leans on the
-    handle with a force follows it by its compliance, which is part of the arm.
+    A given path is the path of the hand itself, after the neuromuscular lag. A hand that applies a
+    force to the handle follows it by its compliance, which is part of the arm.
     """
     hand, lagging = joystick.hand, isinstance(pilot.operator, Regulate | Track | Steer)
     if not isinstance(pilot.operator, Steer) and pilot.reflection == "direct_force":
@@ -653,7 +652,7 @@ def _muscles(
 
 
 def _coloured(white: np.ndarray, band: float, period: float) -> np.ndarray:
-    """White noise (n, ...) through a first-order low-pass, of unit standard deviation."""
+    """Filter white noise (n, ...) with a first-order low-pass, to unit standard deviation."""
     share = 1.0 - math.exp(-band * period)
     scale = math.sqrt((2.0 - share) / share)
     return scale * _low_pass(white.reshape(len(white), -1), share).reshape(white.shape)
@@ -661,7 +660,7 @@ def _coloured(white: np.ndarray, band: float, period: float) -> np.ndarray:
 
 @compiled
 def _low_pass(rows, share):
-    """Each column (n, c) through `y' = y + share (x - y)`; scipy.signal takes 2 s to import."""
+    """Filter each column (n, c) by `y' = y + share (x - y)`; scipy.signal takes 2 s to import."""
     out, state = np.empty_like(rows), np.zeros(rows.shape[1])
     for n in range(len(rows)):
         for c in range(len(state)):
@@ -671,7 +670,7 @@ def _low_pass(rows, share):
 
 
 def _followed(behaviour: Follow, count: int, step: float) -> np.ndarray:
-    """Wanted displacements (n, 6) [m], [rad]."""
+    """Return the reference displacements (n, 6) of a given path [m], [rad]."""
     time, path = step * np.arange(count), np.zeros((count, 6))
     for name, values in behaviour.path.items():
         path[:, AXES.index(name)] = _at(time, behaviour.time, values, behaviour.interpolate)
@@ -679,14 +678,14 @@ def _followed(behaviour: Follow, count: int, step: float) -> np.ndarray:
 
 
 def recorded_hand(path: Path, time: np.ndarray) -> np.ndarray:
-    """Displacements of a handle that a person has moved.
+    """Read the recorded displacements of a handle.
 
     Args:
         path: CSV or Parquet file with `time` and columns `handle.<axis>` or `<axis>`.
-        time: (n,) since the record's first row, at which they are asked for [s].
+        time: (n,) output times since the record's first row [s].
 
     Returns:
-        (n, 6) displacements [m], [rad]; what the record does not reach is held.
+        (n, 6) displacements [m], [rad]; the end values are held outside the record.
 
     Raises:
         InputError: the file cannot be read or has no such column.
@@ -699,10 +698,10 @@ def recorded_hand(path: Path, time: np.ndarray) -> np.ndarray:
     if len(columns) < 2 or "time" not in columns:
         wanted = ", ".join(f"handle.{axis}" for axis in AXES)
         has = ", ".join(table.names)
-        raise InputError(path, f"needs time and a displacement ({wanted}); it has {has}")
+        raise InputError(path, f"needs time and a displacement ({wanted}); columns: {has}")
     record = columns.pop("time")
     if len(bad := np.flatnonzero(~(np.diff(record) > 0.0))):
-        message = "does not rise here: sort the rows, and keep each time once"
+        message = "does not increase here: sort the rows and keep each time once"
         raise InputError(table.where("time", int(bad[0]) + 1), message)
     made = np.zeros((len(time), 6))
     for axis, values in columns.items():
@@ -711,7 +710,7 @@ def recorded_hand(path: Path, time: np.ndarray) -> np.ndarray:
 
 
 def _steered(behaviour: Steer, count: int, step: float) -> dict[int, np.ndarray]:
-    """Coordinate -> (n,) where the tip should be [m], [rad]."""
+    """Return coordinate -> (n,) target of the tip [m], [rad]."""
     time = step * np.arange(count)
     return {
         COORDINATES.index(name): _at(time, behaviour.time, values, "hold")

@@ -1,9 +1,9 @@
-"""Parameters of the simulated operator: the file with their sources, drawn operators, the hand.
+"""Parameters of the simulated operator: operator files, sampled operators, arm and hand impedance.
 
-`hydrotele/teleop/operator.yaml` is the one that is shipped. A scenario may name a file of its own
+`hydrotele/teleop/operator.yaml` is the default file. A scenario can name another file
 (`perception: {file: my_operator.yaml}`, as `hydrotele identify-operator` writes it), which needs
-only the parameters that differ, may draw an operator from the spread (`drawn: 3`), and may set
-single parameters.
+only the parameters that differ. It can also sample an operator from the parameter ranges
+(`drawn: 3`), and set single parameters.
 """
 
 import dataclasses
@@ -25,10 +25,10 @@ SHIPPED = Path(__file__).resolve().with_name("operator.yaml")
 
 
 class OperatorParameter(Facts):
-    """A parameter of the operator: nominal value, spread from `low` to `high`, and its source.
+    """Parameter of the operator: nominal value, range from `low` to `high`, and source.
 
-    `basis` says whether a study measured it (`published`), whether a published figure is quoted
-    from memory (`recalled`), whether it was fitted to a record (`identified`), or none of these.
+    `basis` is the kind of source: measured in a study (`published`), a published value quoted from
+    memory (`recalled`), fitted to a record (`identified`), or assumed (`assumption`).
     """
 
     value: Number
@@ -52,11 +52,11 @@ Pair = tuple[Positive, Positive]
 
 
 class ArmFacts(Facts):
-    """A right arm of two links in a horizontal plane: shoulder, elbow, hand.
+    """Right arm with two links in a horizontal plane: shoulder, elbow, hand.
 
-    `length` [m], `mass` [kg] and `inertia` [kg m^2] about the links' middles; `joint_stiffness`
-    [N m/rad] of the shoulder, between both, and of the elbow; `usual` names the posture in which
-    the grips' numbers hold.
+    `length` [m], `mass` [kg] and `inertia` [kg m^2] about the links' centres; `joint_stiffness`
+    [N m/rad] of the shoulder, between both, and of the elbow; `usual` is the posture to which the
+    grips' parameters apply.
     """
 
     length: Pair
@@ -67,9 +67,9 @@ class ArmFacts(Facts):
 
 
 class OperatorFile(Facts):
-    """A file of operator parameters; `grips` of the hand, the `arm`, and its `postures`.
+    """File of operator parameters: parameters, `grips` of the hand, the `arm`, and its `postures`.
 
-    A posture is where the hand is from the shoulder: ahead and to the left [m].
+    A posture is the position of the hand relative to the shoulder: ahead and to the left [m].
     """
 
     name: Name
@@ -89,37 +89,37 @@ class OperatorFile(Facts):
 
 @dataclasses.dataclass(frozen=True)
 class Operator:
-    """One operator.
+    """Parameters of one operator.
 
     Attributes:
-        visual_delay: from seeing to moving, without the neuromuscular lag [s].
-        lead_delay: what generating lead adds to it [s].
-        crossover: largest crossover frequency that he closes a loop with [rad/s].
-        tracking_margin: phase margin that he keeps in tracking [rad].
-        placing_margin: the same when he brings the tip to a place [rad].
-        gain_margin: largest loop gain where the phase is -180 degrees [1].
+        visual_delay: delay from visual stimulus to motion, without the neuromuscular lag [s].
+        lead_delay: additional delay while generating lead [s].
+        crossover: maximum crossover frequency [rad/s].
+        tracking_margin: phase margin in tracking [rad].
+        placing_margin: phase margin in positioning the tip [rad].
+        gain_margin: maximum loop gain where the phase is -180 degrees [1].
         neuromuscular_frequency: natural frequency of limb and reflexes [rad/s].
-        neuromuscular_damping: damping ratio of the same.
-        remnant: power density of his observation noise over pi times the variance of what he
-            observes.
-        sight: how well a place is seen [m] or [rad].
-        sight_noise: of a display, as a share of its largest value.
-        touch: from feeling to acting [s].
-        force_weber: standard deviation of a felt force, as a share.
-        position_weber: of a felt displacement, as a share.
-        integration_weber: of putting both together to a stiffness, as a share.
-        tremor: of the muscles' force [N].
-        muscle: gain of the handle's position [1/s].
-        largest_force: [N].
-        cocontraction: share of the largest.
-        stiffening: arm stiffness with full co-contraction, times.
-        usual_speed: that he expects at the handle's stop [m/s], [rad/s].
-        usual_scale: that he expects under position control [m/m], [rad/rad].
-        task_stiffness: of the ground that he is used to [N/m].
-        surprise: standard deviation of the logarithm of a gain not yet experienced.
-        memory: time over which experience fades [s].
-        imagination: spread of what he believes an unfelt push to do, as a share.
-        dwell: between correcting pushes by feel [s].
+        neuromuscular_damping: damping ratio of limb and reflexes [1].
+        remnant: power density of the observation noise over pi times the variance of the observed
+            quantity.
+        sight: visual position threshold [m] or [rad].
+        sight_noise: reading noise of a display, relative to its largest value.
+        touch: delay from touch to motion [s].
+        force_weber: relative standard deviation of a felt force.
+        position_weber: relative standard deviation of a felt displacement.
+        integration_weber: additional relative standard deviation of a felt stiffness.
+        tremor: standard deviation of the muscles' force [N].
+        muscle: integral gain of the handle's position control [1/s].
+        largest_force: maximum force [N].
+        cocontraction: co-contraction, relative to its maximum.
+        stiffening: factor on the arm stiffness at full co-contraction.
+        usual_speed: expected speed with the handle at its stop [m/s], [rad/s].
+        usual_scale: expected gain under position control [m/m], [rad/rad].
+        task_stiffness: expected ground stiffness [N/m].
+        surprise: standard deviation of the logarithm of an unknown gain.
+        memory: time constant with which experience fades [s].
+        imagination: relative error of the imagined effect of a push that is not felt.
+        dwell: time between correcting pushes by feel [s].
     """
 
     visual_delay: float
@@ -164,19 +164,19 @@ def load_operator_file(path: Path = SHIPPED) -> OperatorFile:
     """Read a file of operator parameters.
 
     Args:
-        path: of the file; without one the shipped file is read.
+        path: path of the file; the default file if omitted.
 
     Returns:
-        The validated file, completed by what only the shipped one has.
+        The validated file, completed with the entries of the default file.
 
     Raises:
-        InputError: names file, line and key of what is wrong.
+        InputError: the file is invalid; the message gives file, line and key.
     """
     data, lines = read_yaml(path)
     found = parse(OperatorFile, data, str(path), lines)
     if path == SHIPPED:
         if lacking := [name for name in _NAMES if name not in found.parameters]:
-            raise InputError(path, f"lacks the parameters {', '.join(lacking)}")
+            raise InputError(path, f"has no parameters {', '.join(lacking)}")
         return found
     usual = load_operator_file()
     return found.model_copy(update={
@@ -187,12 +187,12 @@ def load_operator_file(path: Path = SHIPPED) -> OperatorFile:
 
 
 def drawn_operator(file: OperatorFile, number: int | None, **known: float) -> Operator:
-    """An operator of a file.
+    """Return the nominal or a sampled operator of a file.
 
     Args:
-        file: of `load_operator_file`.
-        number: which one to draw from the spread, the same every time; None for the nominal one.
-        known: parameters that are not drawn.
+        file: result of `load_operator_file`.
+        number: number of the sampled operator, which is reproducible; None for the nominal one.
+        known: parameters with given values, which are not sampled.
 
     Returns:
         The operator.
@@ -208,17 +208,17 @@ def drawn_operator(file: OperatorFile, number: int | None, **known: float) -> Op
 
 
 def perceiving(perception: Perception, folder: str = "") -> Operator:
-    """The operator that a scenario asks for.
+    """Return the operator that a scenario specifies.
 
     Args:
-        perception: the scenario's.
-        folder: of the scenario, from which its file is counted.
+        perception: perception settings of the scenario.
+        folder: folder of the scenario, to which its file is relative.
 
     Returns:
         The operator.
 
     Raises:
-        InputError: the file is not usable.
+        InputError: the file is invalid.
     """
     known = {name: getattr(perception, name) for name in _NAMES if hasattr(perception, name)}
     known = {name: value for name, value in known.items() if value is not None}
@@ -226,21 +226,21 @@ def perceiving(perception: Perception, folder: str = "") -> Operator:
 
 
 def held_joystick(joystick: Joystick, perception: Perception, folder: str = "") -> Joystick:
-    """The joystick with this operator's hand on it.
+    """Return the joystick with the hand of the scenario's operator.
 
-    Without `grip`, `posture` and co-contraction the hand is the joystick file's own.
+    Without `grip`, `posture` and co-contraction the hand of the joystick file is used.
 
     Args:
         joystick: the joystick.
-        perception: the scenario's.
-        folder: of the scenario, from which its file is counted.
+        perception: perception settings of the scenario.
+        folder: folder of the scenario, to which its file is relative.
 
     Returns:
-        The joystick with another hand.
+        The joystick with the operator's hand.
 
     Raises:
-        InputError: there is no such grip or posture, it is out of the arm's reach, or the file is
-            not usable.
+        InputError: the grip or posture is not known, the posture is out of the arm's reach, or the
+            file is invalid.
 
     Source: `arm_impedance` for the posture; Hogan 1984 for co-contraction.
     """
@@ -261,21 +261,21 @@ def held_joystick(joystick: Joystick, perception: Perception, folder: str = "") 
 
 
 def postured(hand: HandFacts, file: OperatorFile, posture: str) -> HandFacts:
-    """A hand with the arm's impedance of a posture.
+    """Return a hand with the arm's impedance in a posture.
 
     Args:
-        hand: with the grip's numbers.
-        file: with the arm, and the posture.
-        posture: its name.
+        hand: hand with the grip's parameters.
+        file: file with the arm and the posture.
+        posture: name of the posture.
 
     Returns:
-        The hand; up and down, and in rotation, it is the grip's.
+        The hand; its vertical and rotational impedance stays that of the grip.
 
     Raises:
         InputError: a posture is out of the arm's reach.
     """
     arm = file.arm
-    assert arm  # of the shipped file, if of no other
+    assert arm  # the default file has one
     shapes = []
     for matrix, usual in zip(
         arm_impedance(arm, file.postures[posture]),
@@ -287,17 +287,17 @@ def postured(hand: HandFacts, file: OperatorFile, posture: str) -> HandFacts:
 
 
 def arm_impedance(arm: ArmFacts, place: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Mass and stiffness that an arm shows at its hand, `J^-T A J^-1` of the joints' matrices.
+    """Return mass and stiffness of an arm at its hand, `J^-T A J^-1` of the joints' matrices.
 
     Args:
-        arm: two links, the elbow to the right of the line from the shoulder to the hand.
-        place: of the hand, ahead and to the left of the shoulder [m].
+        arm: two links, with the elbow to the right of the line from shoulder to hand.
+        place: hand position, ahead and to the left of the shoulder [m].
 
     Returns:
         (2, 2) mass [kg] and stiffness [N/m], ahead and to the left.
 
     Raises:
-        InputError: the hand cannot be there.
+        InputError: the position is out of reach.
 
     Source: Hogan 1985 (impedance in other coordinates); Mussa-Ivaldi, Hogan and Bizzi 1985.
 
@@ -328,16 +328,16 @@ def arm_impedance(arm: ArmFacts, place: tuple[float, float]) -> tuple[np.ndarray
 
 
 def stiffened(hand: HandFacts, factor: float) -> HandFacts:
-    """A hand whose stiffness is `factor` times as large, with the same damping ratio.
+    """Return a hand with `factor` times the stiffness and the same damping ratio.
 
-    Muscles that work against each other add stiffness and damping but no force (Hogan 1984).
+    Antagonist muscles that contract together add stiffness and damping but no force (Hogan 1984).
 
     Args:
         hand: mass [kg], damping [N s/m] and stiffness [N/m].
-        factor: on the stiffness.
+        factor: factor on the stiffness.
 
     Returns:
-        The hand.
+        The stiffer hand.
     """
     root = math.sqrt(factor)
     return hand.model_copy(update={

@@ -1,17 +1,18 @@
-"""Both ends of a line that gives no energy: wave variables, and time-domain passivity control.
+"""Both ends of a passive communication channel: wave variables and time-domain passivity control.
 
-One axis, one period at a time. The slave's end has a spring and damper between the reference that
-comes and the slave: their force moves the slave, and comes back to the master.
+The functions treat one axis and one period. A spring and damper at the slave's end connect the
+received reference with the slave. Their force moves the slave and is returned to the master.
 
-Wave variables carry `u = (b v + F) / sqrt(2 b)` forward and `w = (b v - F) / sqrt(2 b)` back; a
-constant delay between them is lossless. Packets carry the sums of all waves and of their energy:
-a packet that was lost leaves no offset, one that comes twice counts once, and where delays jitter
-no more energy is used than was sent.
+Wave variables transmit `u = (b v + F) / sqrt(2 b)` forward and `w = (b v - F) / sqrt(2 b)` back; a
+constant delay between them is lossless. Packets carry the sums of all waves and of their energy.
+A lost packet therefore causes no offset, a duplicate counts once, and with varying delays no more
+energy is used than was sent.
 
-Passivity control carries place forward and force back, each with the energy that has gone into the
-line at its end so far. The slave's reference and the master's force are held back so that no more
-comes out at either end than had gone in at the other, and a trickle of power, without which a
-slave that needs energy to move, and a master that gives it only to a slave that moves, both wait.
+Passivity control transmits position forward and force back, each with the energy that has entered
+the channel at its end. The slave's reference and the master's force are limited so that no more
+energy leaves at one end than has entered at the other. A small constant power is always permitted:
+otherwise a slave that needs energy to move and a master that supplies it only to a moving slave
+would both wait.
 
 Source: Niemeyer and Slotine 1991, 2004 (wave variables, wave integrals); Hannaford and Ryu 2002;
 Ryu, Artigas and Preusche 2010 (two ports with delay).
@@ -21,23 +22,23 @@ import math
 
 from hydrotele.core.compiled import compiled
 
-# state of an end, (8,): energy gone into the line [J]; of it what went in and what came out, each
-# counted by itself; sum of waves, or place, used so far; energy of the waves used so far; force put
-# on the master, or energy that the last packet told of; stretch of the slave's spring [m] or [rad];
-# place that came last
+# elements of the state of an end, (8,): energy into the channel [J]; its positive part and its
+# negative part, accumulated separately; sum of waves, or position, used so far; energy of the waves
+# used so far; force on the master, or energy reported by the last packet; deflection of the slave's
+# spring [m] or [rad]; last received position
 ENERGY, GONE_IN, GONE_OUT, USED, SPENT, PUSHED, STRETCH, GOAL = range(8)
-BUDGET_IN = PUSHED  # of the slave's end
+BUDGET_IN = PUSHED  # at the slave's end
 END = GOAL + 1
-_CATCH_UP = 2.0  # 1/s at which a reference that was held back makes up for it
+_CATCH_UP = 2.0  # 1/s, rate at which a limited reference catches up
 
 
 @compiled
 def arrived_wave(total, budget, period, end):
-    """Wave to use now: what has come and was not used yet, as far as its energy reaches.
+    """Return the received wave that is not used yet, limited by its energy.
 
     Args:
-        total: sum of all waves sent, by the newest packet, scalar [sqrt(J s)].
-        budget: their energy, scalar [J].
+        total: sum of all sent waves in the newest packet, scalar [sqrt(J s)].
+        budget: energy of these waves, scalar [J].
         period: scalar [s].
         end: (8,) state, written.
 
@@ -57,12 +58,12 @@ def arrived_wave(total, budget, period, end):
 
 @compiled
 def wave_master(v, total, budget, b, period, end):
-    """Master's end of waves.
+    """Compute force and outgoing wave at the master's end.
 
     Args:
         v: speed of the handle, scalar [m/s].
-        total: as of `arrived_wave`, scalar.
-        budget: as of `arrived_wave`, scalar.
+        total: see `arrived_wave`, scalar.
+        budget: see `arrived_wave`, scalar.
         b: wave impedance, scalar [N s/m].
         period: scalar [s].
         end: (8,) state, written.
@@ -81,14 +82,14 @@ def wave_master(v, total, budget, b, period, end):
 
 @compiled
 def wave_slave(v, total, budget, stiffness, damping, b, period, end):
-    """Slave's end of waves.
+    """Compute force and outgoing wave at the slave's end.
 
     Args:
         v: speed of the slave in the handle's scale, scalar [m/s].
-        total: as of `arrived_wave`, scalar.
-        budget: as of `arrived_wave`, scalar.
-        stiffness: of the slave's controller, scalar [N/m].
-        damping: of the same, scalar [N s/m].
+        total: see `arrived_wave`, scalar.
+        budget: see `arrived_wave`, scalar.
+        stiffness: stiffness of the slave's controller, scalar [N/m].
+        damping: damping of the slave's controller, scalar [N s/m].
         b: wave impedance, scalar [N s/m].
         period: scalar [s].
         end: (8,) state, written.
@@ -110,22 +111,22 @@ def wave_slave(v, total, budget, stiffness, damping, b, period, end):
 
 @compiled
 def controlled_master(v, force, budget, mass, period, end):
-    """Master's end of passivity control.
+    """Compute the force at the master's end under passivity control.
 
-    How far the mass will move in the next period follows from its speed and the line's own force.
-    What came out too much nevertheless, because a hand pushes too, is taken away by a damper in the
-    next ones, which at most stops the mass in two.
+    The motion of the mass in the next period is predicted from its speed and the channel's force.
+    A hand that pushes as well can still extract too much energy. A damper dissipates this excess in
+    the next periods; it is limited so that it at most stops the mass in two periods.
 
     Args:
         v: mean speed of the handle over the last period, scalar [m/s].
-        force: against the handle's motion, as it came from the slave, scalar [N].
-        budget: energy that had gone in at the slave then, scalar [J].
-        mass: of the master, scalar [kg].
+        force: received force against the handle's motion, scalar [N].
+        budget: energy that had entered at the slave at the time of sending, scalar [J].
+        mass: mass of the master, scalar [kg].
         period: scalar [s].
-        end: (8,) state, written; GONE_IN is what the next packet tells.
+        end: (8,) state, written; GONE_IN is sent in the next packet.
 
     Returns:
-        The force that is put on [N].
+        The applied force [N].
 
     Source: Hannaford and Ryu 2002, solved for the force; see this module.
     """
@@ -146,7 +147,7 @@ def controlled_master(v, force, budget, mass, period, end):
 
 @compiled
 def _damped(v, force, power, most):
-    """Force that takes a power out of a speed, or the one that came if that takes more."""
+    """Return a force that dissipates a power, or the received force if that dissipates more."""
     speed = abs(v)
     if speed == 0.0:
         return 0.0
@@ -157,17 +158,17 @@ def _damped(v, force, power, most):
 
 @compiled
 def controlled_slave(v, place, budget, stiffness, damping, trickle, period, end):
-    """Slave's end of passivity control.
+    """Compute the force at the slave's end under passivity control.
 
     Args:
         v: speed of the slave in the handle's scale, scalar [m/s].
-        place: of the handle, by the newest packet, scalar [m].
-        budget: energy that had gone in at the master then, scalar [J].
-        stiffness: of the slave's controller, scalar [N/m].
-        damping: of the same, scalar [N s/m].
-        trickle: power that it may always take, scalar [W].
+        place: position of the handle in the newest packet, scalar [m].
+        budget: energy that had entered at the master at the time of sending, scalar [J].
+        stiffness: stiffness of the slave's controller, scalar [N/m].
+        damping: damping of the slave's controller, scalar [N s/m].
+        trickle: power that is always permitted, scalar [W].
         period: scalar [s].
-        end: (8,) state, written; GONE_IN is what the next packet tells.
+        end: (8,) state, written; GONE_IN is sent in the next packet.
 
     Returns:
         Force on the slave [N].

@@ -1,10 +1,11 @@
-"""Psychophysical experiments with the simulated operator: how well he tells springs and forces.
+"""Psychophysical experiments with the simulated operator: discrimination of stiffness and force.
 
-Method of constant stimuli, two intervals: on every trial the handle is a reference and a comparison
-in either order; he moves each to a displacement that roves from trial to trial, so that neither
-terminal force nor work tells him, holds it, and says which was stiffer (or stronger). A cumulative
-normal through his answers gives the just noticeable difference. His muscles, tremor and perception
-are those of the runs; the experiment knows only his answers.
+The method of constant stimuli with two intervals is used. In every trial the handle is a reference
+and a comparison in random order. The operator moves each to a displacement, holds it, and reports
+which was stiffer (or stronger). The displacement varies from trial to trial, so that neither
+terminal force nor work is a cue. A cumulative normal through the responses gives the just
+noticeable difference. Muscles, tremor and perception are those of the simulated runs; the
+experiment uses only the responses.
 
 Source: Tan et al. 1995, Perception & Psychophysics 57 (roving displacement).
 """
@@ -27,7 +28,7 @@ _LEVELS = {
     "force": (-0.2, -0.15, -0.1, -0.05, 0.0, 0.05, 0.1, 0.15, 0.2),
 }
 ROVING = (2.0e-3, 4.5e-3)  # m, displacements of the handle
-_PERIOD, _FINE = 0.005, 10  # s of the control, steps of the handle in it
+_PERIOD, _FINE = 0.005, 10  # control period [s], integration steps of the handle per period
 _MASS, _DAMPING = 0.85, 60.0  # kg, N s/m of the joystick's handle
 _DECISION = 0.02  # s
 
@@ -35,15 +36,15 @@ Sense = Literal["stiffness", "force"]
 
 
 class Discrimination(NamedTuple):
-    """A psychometric function.
+    """Psychometric function of a discrimination experiment.
 
     Attributes:
-        levels: (n,) comparison over reference, less 1.
-        greater: (n,) share of the trials in which the comparison was said to be greater.
-        trials: of every level.
-        jnd: difference that one interval tells with d' = 1, as a share of the reference.
-        error: standard error of the same.
-        bias: level that is felt like the reference.
+        levels: (n,) comparison over reference, minus 1.
+        greater: (n,) fraction of the trials in which the comparison was reported as greater.
+        trials: number of trials per level.
+        jnd: difference with d' = 1 in one interval, relative to the reference.
+        error: standard error of `jnd`.
+        bias: level that is perceived as equal to the reference.
     """
 
     levels: np.ndarray
@@ -56,7 +57,7 @@ class Discrimination(NamedTuple):
 
 @compiled
 def _explore(muscles, past, tremor, spring, load, first, felt):
-    """Handle with `spring` and `load` for len(felt) periods; force and place there are written."""
+    """Simulate a handle with `spring` and `load`; write its force and position to `felt`."""
     mass, x, v = _MASS + muscles.weight[0], 0.0, 0.0
     step = _PERIOD / _FINE
     handle = np.zeros(6)
@@ -74,7 +75,7 @@ def _explore(muscles, past, tremor, spring, load, first, felt):
 
 
 def _arm(him: Operator, hand: HandFacts, expected: float) -> Muscles:
-    """His arm on axis 0 of a handle whose stiffness he expects to be so large [N/m]."""
+    """Return the operator's arm on axis 0 of a handle with an expected stiffness [N/m]."""
     zero = np.zeros(6)
     return flattened(Muscles(
         wanted=zero, spring=zero + expected, notch=np.full((3, 6), -1.0), correction=zero,
@@ -89,15 +90,15 @@ def discriminate(
     him: Operator, hand: HandFacts, sense: Sense = "stiffness", reference: float = 1000.0,
     trials: int = 40, seed: int = 0,
 ) -> Discrimination:  # fmt: skip
-    """Just noticeable difference of an operator.
+    """Measure the just noticeable difference of an operator.
 
     Args:
-        him: the operator.
-        hand: his hand on the handle.
-        sense: what he compares: the handle's stiffness, or a constant force against him.
-        reference: of it [N/m] or [N].
-        trials: of every level.
-        seed: of the trials.
+        him: parameters of the operator.
+        hand: parameters of the hand on the handle.
+        sense: compared quantity: the handle's stiffness, or a constant opposing force.
+        reference: reference stiffness [N/m] or force [N].
+        trials: number of trials per level.
+        seed: seed of the trials.
 
     Returns:
         The psychometric function.
@@ -126,12 +127,12 @@ def discriminate(
             felt = [feels(value) for value in pair]
             greater[k] += (felt[0] > felt[1]) == swapped
     bias, spread, error = fit_psychometric(levels, greater, trials)
-    root = math.sqrt(2.0)  # both intervals scatter
+    root = math.sqrt(2.0)  # the responses contain the noise of both intervals
     return Discrimination(levels, greater / trials, trials, spread / root, error / root, bias)
 
 
 def _judged(handle: np.ndarray, errors: Feeling, sense: Sense) -> float:
-    """What he feels in the late half of the exploration, by the decisions of a run."""
+    """Return the mean perceived quantity in the second half of the exploration."""
     felt = []
     for number in range(len(errors.force) // 2, len(errors.force)):
         force, x = (float(value) for value in handle[number])
@@ -153,16 +154,16 @@ def _shaking(rng: np.random.Generator, count: int) -> np.ndarray:
 def fit_psychometric(
     levels: np.ndarray, greater: np.ndarray, trials: int, lapse: float = 0.01
 ) -> tuple[float, float, float]:  # fmt: skip
-    """Cumulative normal through the answers, by maximum likelihood.
+    """Fit a cumulative normal to the responses by maximum likelihood.
 
     Args:
-        levels: (n,) of the comparison.
-        greater: (n,) number of trials in which it was said to be greater.
-        trials: of every level.
-        lapse: share of answers by mistake.
+        levels: (n,) levels of the comparison.
+        greater: (n,) number of trials in which it was reported as greater.
+        trials: number of trials per level.
+        lapse: fraction of accidental responses.
 
     Returns:
-        Mean, standard deviation, and standard error of the deviation.
+        Mean, standard deviation, and standard error of the standard deviation.
     """
     from scipy.optimize import minimize
     from scipy.special import ndtr

@@ -1,9 +1,9 @@
-"""What a teleoperator withstands: passive hands, drawn operators, stiff tasks, a released handle.
+"""Robustness of a teleoperator against passive hands, sampled operators, stiff tasks and release.
 
-Passivity asks that a two-port gives no energy; absolute stability asks less, that no passive hand
-and no passive task make it unstable (Llewellyn). Between both and the one operator of a case lie
-operators drawn from a spread. Z-width says between which impedances what is felt can lie, and how
-stiff a task may become.
+Passivity requires that a two-port generates no energy. Absolute stability (Llewellyn) requires
+less: that no passive hand and no passive task destabilise it. Operators sampled from an impedance
+range lie between both criteria and the single operator of a case. The Z-width gives the range of
+impedances that can be displayed, and the maximum stable stiffness of the task.
 """
 
 import math
@@ -32,21 +32,21 @@ from hydrotele.teleop.two_port import (
 
 _FREE = Impedance()
 _SEARCHED = 2.0 * np.pi * np.geomspace(1e-3, 500.0, 3000)  # rad/s
-_FELT = 2.0 * np.pi * np.geomspace(0.1, 5.0, 200)  # rad/s, what a hand moves
+_FELT = 2.0 * np.pi * np.geomspace(0.1, 5.0, 200)  # rad/s, frequency range of hand motion
 _ROUNDING = 1e-6
-_STIFFER = np.geomspace(1e-3, 1e4, 57)  # times the task's stiffness that are tried
+_STIFFER = np.geomspace(1e-3, 1e4, 57)  # tested factors on the task's stiffness
 
 
 def llewellyn(port: TwoPort, s: np.ndarray | complex) -> np.ndarray:
-    """Llewellyn's stability parameter; absolutely stable where it is nowhere below 1.
+    """Return Llewellyn's stability parameter; absolutely stable if it is nowhere below 1.
 
     Args:
         port: the two-port.
-        s: (...) points of the imaginary axis [rad/s].
+        s: (...) points on the imaginary axis [rad/s].
 
     Returns:
         (...) `(2 Re h11 Re h22 - Re h12 h21) / |h12 h21|` [1]; minus infinity where `Re h11` or
-        `Re h22` is negative, infinity where one way transmits nothing.
+        `Re h22` is negative, infinity where one direction transmits nothing.
 
     Source: Llewellyn 1952; Haykin 1970, Active network theory; with `[F_h, -V_e] = H [V_h, F_e]`.
 
@@ -66,14 +66,14 @@ def llewellyn(port: TwoPort, s: np.ndarray | complex) -> np.ndarray:
 
 
 def absolutely_stable(port: TwoPort) -> bool:
-    """Whether no passive hand and task make a two-port unstable.
+    """Return whether no passive hand and task make a two-port unstable.
 
     Args:
         port: the two-port.
 
     Returns:
-        True if its hybrid matrix has no pole right of the axis and Llewellyn's parameter is nowhere
-        below 1.
+        True if its hybrid matrix has no pole in the right half-plane and Llewellyn's parameter is
+        nowhere below 1.
     """
     if np.any(llewellyn(port, 1j * _SEARCHED) < 1.0 - _ROUNDING):
         return False
@@ -85,16 +85,16 @@ def absolutely_stable(port: TwoPort) -> bool:
 
 @dataclass(frozen=True)
 class ZWidth:
-    """Between which impedances what is felt can lie, and how stiff the task may be.
+    """Range of displayed impedances, and maximum stiffness of the task.
 
     Attributes:
         frequencies: (n,) [rad/s].
-        free: (n,) felt without a task [N s/m].
-        clamped: (n,) felt with a slave that is held fast [N s/m].
-        stiffest_held: task stiffness up to which it is stable with the hand on [N/m]; infinite if
-            none of those tried is too stiff, 0 if the softest is.
-        stiffest_let_go: the same without a hand.
-        most_tried: largest stiffness tried [N/m].
+        free: (n,) transmitted impedance without a task [N s/m].
+        clamped: (n,) transmitted impedance with a clamped slave [N s/m].
+        stiffest_held: maximum stable task stiffness with the hand on the handle [N/m]; infinite if
+            all tested values are stable, 0 if the softest is unstable.
+        stiffest_let_go: maximum stable task stiffness with the handle released.
+        most_tried: largest tested stiffness [N/m].
     """
 
     frequencies: np.ndarray
@@ -106,25 +106,25 @@ class ZWidth:
 
     @property
     def decades(self) -> float:
-        """Mean of `log10 |clamped| / |free|` over the frequencies that a hand moves [1]."""
+        """Mean of `log10 |clamped| / |free|` over the frequency range of hand motion [1]."""
         return float(np.mean(np.log10(np.abs(self.clamped) / np.abs(self.free))))
 
 
 def z_width(case: Case, structure: str, frequencies: np.ndarray = _FELT) -> ZWidth:
-    """Z-width of a structure.
+    """Compute the Z-width of a structure.
 
     Args:
-        case: the teleoperator; the task's stiffness is varied, its mass and damping kept.
+        case: the teleoperator; the task's stiffness is varied, its mass and damping are kept.
         structure: one of `two_port.STRUCTURES`.
         frequencies: (n,) [rad/s].
 
     Returns:
-        The widths.
+        The Z-width.
 
     Raises:
         InputError: the structure is not known.
 
-    Source: Colgate and Brown 1994 (Z-width); Zhu 1994, 3.4 for what is felt.
+    Source: Colgate and Brown 1994 (Z-width); Zhu 1994, 3.4 for the transmitted impedance.
     """
     port = case.port(structure)
     h = hybrid(port, 1j * frequencies)
@@ -146,17 +146,17 @@ def z_width(case: Case, structure: str, frequencies: np.ndarray = _FELT) -> ZWid
 
 
 def port_for(case: Case, structure: str, task: Impedance) -> TwoPort:
-    """The structure's two-port with another task."""
+    """Return the structure's two-port with another task."""
     return replace(case, task=task).port(structure)
 
 
 @dataclass(frozen=True)
 class ReleasedMaster:
-    """The master by itself, as its characteristic polynomial.
+    """Characteristic polynomial of the master subsystem alone.
 
     Attributes:
-        coefficients: of falling powers of s.
-        unstable: number of zeros right of the axis.
+        coefficients: coefficients of falling powers of s.
+        unstable: number of zeros in the right half-plane.
     """
 
     coefficients: np.ndarray
@@ -164,17 +164,17 @@ class ReleasedMaster:
 
 
 def released_master(case: Case, structure: str, hand: Impedance = _FREE) -> ReleasedMaster:
-    """The master subsystem without what comes back, in an operator's hand or let go.
+    """Analyse the master without the return channels, held by a hand or released.
 
-    Under position control and rate control with direct force it is `Z_m + C_m + Z_h = 0`. Where the
-    master's own controller acts on the integral, it is `Z_m + C_m / (K_v s) + Z_h = 0` and, let go,
-    `K_v M s^3 + K_v B s^2 + (K_v K + B_mc) s + K_mc = 0` with the master's own M, B and K: without
-    damping B of its own it cannot be stable. K_v of the source is one over the velocity gain here.
+    Under position control, and rate control with direct force, `Z_m + C_m + Z_h = 0`. If the
+    master's controller acts on the integral, `Z_m + C_m / (K_v s) + Z_h = 0` and, when released,
+    `K_v M s^3 + K_v B s^2 + (K_v K + B_mc) s + K_mc = 0` with the master's own M, B and K. Without
+    own damping B it cannot be stable. K_v of the source is the inverse of the velocity gain here.
 
     Args:
         case: the teleoperator.
         structure: one of `two_port.STRUCTURES`.
-        hand: on the handle; none by default.
+        hand: impedance of the hand on the handle; zero by default.
 
     Returns:
         The polynomial.
@@ -201,36 +201,38 @@ def released_master(case: Case, structure: str, hand: Impedance = _FREE) -> Rele
 
 @dataclass(frozen=True)
 class Spread:
-    """Hands and tasks that are drawn: each number log-uniform between two impedances.
+    """Ranges of hands and tasks for random sampling, log-uniform between two impedances.
 
     Attributes:
-        hand: least and most [kg], [N s/m], [N/m].
-        task: the same of the task.
+        hand: minimum and maximum impedance of the hand [kg], [N s/m], [N/m].
+        task: minimum and maximum impedance of the task.
     """
 
     hand: tuple[Impedance, Impedance]
     task: tuple[Impedance, Impedance]
 
     def draw(self, rng: np.random.Generator) -> tuple[Impedance, Impedance]:
-        """One hand and one task; a number that is 0 in either of its bounds is drawn evenly."""
+        """Sample a hand and a task; a parameter with a bound of 0 is sampled uniformly."""
         hand, task = (_between(least, most, rng) for least, most in (self.hand, self.task))
         return hand, task
 
 
-# a hand that holds loosely and one that holds firmly, near and far; orders of magnitude after
-# Mussa-Ivaldi, Hogan and Bizzi 1985 and Tsuji et al. 1995, the numbers are assumptions
+# loosely and firmly holding hand, near and far; orders of magnitude after Mussa-Ivaldi, Hogan and
+# Bizzi 1985 and Tsuji et al. 1995, the values are assumptions
 HANDS = (Impedance(0.4, 4.0, 80.0), Impedance(0.8, 17.0, 780.0))
-_TASKS = 3.0  # times softer and stiffer than the case's task
+_TASKS = 3.0  # factor between the case's task and the softest and stiffest sampled task
 
 
 def spread_of(facts: TeleopCase) -> Spread:
-    """Hands and tasks of a case file, or the usual hands and three times softer or stiffer tasks.
+    """Return the ranges of hands and tasks of a case file.
+
+    By default the hands are HANDS and the tasks are up to three times softer or stiffer.
 
     Args:
-        facts: the case.
+        facts: contents of the case file.
 
     Returns:
-        The spread.
+        The ranges.
     """
     task = facts.task.impedance()
     hands, tasks = (
@@ -260,15 +262,15 @@ def _between(least: Impedance, most: Impedance, rng: np.random.Generator) -> Imp
 
 @dataclass(frozen=True)
 class WorstCase:
-    """A structure with many hands and tasks.
+    """Stability of a structure over sampled hands and tasks.
 
     Attributes:
-        pairs: number of hands and tasks drawn.
-        unstable: of them unstable with the hand on.
-        unstable_let_go: the same tasks, handle let go.
-        rate: growth rate of the worst pair with the hand on [1/s].
-        hand: of that pair.
-        task: of that pair.
+        pairs: number of sampled pairs of hand and task.
+        unstable: number of unstable pairs with the hand on the handle.
+        unstable_let_go: number of unstable tasks with the handle released.
+        rate: growth rate of the worst pair with the hand on the handle [1/s].
+        hand: hand of the worst pair.
+        task: task of the worst pair.
     """
 
     pairs: int
@@ -282,18 +284,18 @@ class WorstCase:
 def worst_case(
     case: Case, structure: str, line: PacketAges, spread: Spread, pairs: int, seed: int = 0
 ) -> WorstCase:
-    """Stability over drawn hands and tasks, sampled and with the line's jitter.
+    """Evaluate stability over sampled hands and tasks, with sampling and the channel's jitter.
 
     Args:
         case: the teleoperator.
         structure: one of `sampled.SAMPLED_STRUCTURES`.
         line: period and ages of packets.
-        spread: of hands and tasks.
-        pairs: to draw; the same for every structure.
-        seed: of the draw.
+        spread: ranges of hands and tasks.
+        pairs: number of sampled pairs, the same for every structure.
+        seed: seed of the random generator.
 
     Returns:
-        The worst.
+        Number of unstable pairs, and the worst pair.
 
     Raises:
         InputError: the structure is not known.
@@ -313,16 +315,16 @@ def worst_case(
 
 @dataclass(frozen=True)
 class Robustness:
-    """What one structure withstands.
+    """Robustness of one structure.
 
     Attributes:
-        structure: its name.
-        absolutely_stable: as of Llewellyn; None where there is no linear two-port.
-        llewellyn: least stability parameter [1]; NaN where there is none.
-        width: Z-width, None where there is no linear two-port.
-        released: the master by itself, let go; None for waves and passivity control.
-        sampled: hand on (with the task, free), let go (with the task, free).
-        worst: over drawn hands and tasks.
+        structure: name of the structure.
+        absolutely_stable: Llewellyn's criterion; None without a linear two-port.
+        llewellyn: minimum stability parameter [1]; NaN without a linear two-port.
+        width: Z-width, None without a linear two-port.
+        released: the released master alone; None for waves and passivity control.
+        sampled: with the hand (with task, without), released (with task, without).
+        worst: results over sampled hands and tasks.
     """
 
     structure: str
@@ -337,17 +339,17 @@ class Robustness:
 def robustness(
     case: Case, structure: str, line: PacketAges, spread: Spread, pairs: int = 20
 ) -> Robustness:
-    """Find what a structure withstands.
+    """Evaluate the robustness of a structure.
 
     Args:
         case: the teleoperator.
         structure: one of `sampled.SAMPLED_STRUCTURES`.
         line: period and ages of packets.
-        spread: of hands and tasks.
-        pairs: hands and tasks to draw.
+        spread: ranges of hands and tasks.
+        pairs: number of sampled pairs of hand and task.
 
     Returns:
-        What was found.
+        Results of all criteria.
 
     Raises:
         InputError: the structure is not known.

@@ -1,10 +1,10 @@
-"""One control period of teleoperation, once around between the operator's hand and the machine.
+"""One control period of teleoperation: master, communication channel and machine.
 
-Two compiled halves, before and after the joystick moves, and the whole around the simulated
-joystick. Delay lines are rings: what is written at a tick is read as many ticks later as the ring
-is long.
+Two compiled functions run before and after the joystick's motion; a third combines them with the
+simulated joystick. Channel delays use ring buffers: a packet that is written at one tick is read
+later by its delay.
 
-Packets of a network: delays that change from one to the next, ages when they are used.
+The module also converts delays of network packets, which may vary, to the packet ages in use.
 """
 
 import csv
@@ -45,13 +45,13 @@ from hydrotele.teleop.slave import (
 
 
 def ages_of(delays: np.ndarray) -> np.ndarray:
-    """Ages of the newest packets that have arrived; those that were overtaken are dropped.
+    """Return the ages of the newest arrived packets; overtaken packets are dropped.
 
     Args:
-        delays: (n,) of the packets sent in periods 0 .. n - 1, in whole periods; below 0 lost.
+        delays: (n,) delays in periods of the packets sent in periods 0 .. n - 1; negative if lost.
 
     Returns:
-        (n,) ages in periods; the number of the period itself, plus 1, before any has arrived.
+        (n,) ages in periods; number of the period plus 1 before the first arrival.
 
     >>> ages_of(np.array([2, 0, 3, 1, 0])).tolist()  # the first and the third are overtaken
     [1, 0, 1, 2, 0]
@@ -67,14 +67,14 @@ def ages_of(delays: np.ndarray) -> np.ndarray:
 
 
 def arrivals(delays: np.ndarray) -> np.ndarray:
-    """When newer packets arrive than the one in use.
+    """Return the ages of arriving packets that are newer than the packet in use.
 
     Args:
-        delays: (n,) as of `ages_of`.
+        delays: (n,) see `ages_of`.
 
     Returns:
-        (n,) age in periods of the packet that arrives, -1 where none arrives that is newer. Before
-        the first one it is the longest delay, as of a line that carries zeros.
+        (n,) age in periods of the arriving packet, -1 if no newer packet arrives. Before the first
+        arrival it is the longest delay, as if the channel had transmitted zeros.
 
     >>> arrivals(np.array([2, 0, 3, 1, 0])).tolist()
     [3, 0, -1, -1, 0]
@@ -87,23 +87,23 @@ def arrivals(delays: np.ndarray) -> np.ndarray:
 
 
 def in_periods(delays: np.ndarray, period: float) -> np.ndarray:
-    """Delays [s] as whole periods, -1 for lost packets (NaN)."""
+    """Convert delays [s] to whole periods, -1 for lost packets (NaN)."""
     rounded = np.where(np.isnan(delays), -1.0, np.round(np.nan_to_num(delays) / period))
     return rounded.astype(int)
 
 
 def load_delays(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """Measured delays of a network.
+    """Read measured network delays.
 
     Args:
         path: CSV file with the columns `forward` and `back` [s], one row for every packet in the
-            order in which they were sent; an empty cell is a packet that was lost.
+            order of sending; an empty cell is a lost packet.
 
     Returns:
-        ((n,), (n,)) delays forward and back [s], NaN where lost.
+        ((n,), (n,)) delays forward and back [s], NaN for lost packets.
 
     Raises:
-        InputError: the file cannot be read, a column is missing, a cell is no delay.
+        InputError: the file cannot be read, a column is missing, or a cell is not a valid delay.
     """
     try:
         with Path(path).open(newline="", encoding="utf-8") as file:
@@ -111,12 +111,12 @@ def load_delays(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(path, f"cannot be read: {error}") from None
     if not rows:
-        raise InputError(path, "has no rows; give one for every packet")
+        raise InputError(path, "has no rows; give one row per packet")
     found = []
     for name in ("forward", "back"):
         if name not in rows[0]:
             have = ", ".join(map(str, rows[0]))
-            raise InputError(path, f"has no column {name!r}; it has {have}; delays are in seconds")
+            raise InputError(path, f"has no column {name!r}; columns: {have}; delays are in s")
         found.append(np.array([_delay(path, k + 2, name, row[name]) for k, row in enumerate(rows)]))
     return found[0], found[1]
 
@@ -129,22 +129,22 @@ def _delay(path: str | Path, line: int, name: str, cell: str | None) -> float:
     except ValueError:
         value = -1.0
     if not 0.0 <= value <= 10.0:
-        message = f"line {line}, {name}: {cell!r} is no delay from 0 to 10 s; leave lost ones empty"
+        message = f"line {line}, {name}: {cell!r} is not a delay (0 to 10 s, empty if lost)"
         raise InputError(path, message)
     return value
 
 
-QUIET, SHARE, PERIOD, SILENCE, FADING = range(5)  # of `line`
-CHECKED = 20  # ticks between two looks at whether all is well
+QUIET, SHARE, PERIOD, SILENCE, FADING = range(5)  # indices into `Line.state`
+CHECKED = 20  # ticks between two safety checks
 
 
 class SlaveSide(NamedTuple):
-    """The machine as teleoperation sees it; k joints of the arm among nu axes.
+    """Machine side of teleoperation; k joints of the arm among nu axes.
 
     Attributes:
-        joint: (nu,) measured [rad] or [m].
-        force: (k,) at the tip, task coordinates [N], [N m].
-        columns: (k,) places of the arm's joints among the axes.
+        joint: (nu,) measured positions [rad] or [m].
+        force: (k,) tip force in task coordinates [N], [N m].
+        columns: (k,) indices of the arm's joints among the axes.
         slave: (24 + 14 k,) Slave.
         state: (102 + 3 k,) SlaveState, written.
     """
@@ -157,16 +157,16 @@ class SlaveSide(NamedTuple):
 
 
 class Line(NamedTuple):
-    """The line between joystick and machine.
+    """Communication channel between joystick and machine.
 
     Attributes:
-        forward: (n, 3, 6) packets of the master on their way, written: displacement and rate of
-            the handle, what is left of the hand's force beyond the joystick's own spring and
-            damper; of a passive line the sum of waves or the place, and energy, in their place.
-        back: (n, 8, k) packets of the machine on their way, written.
-        packet: (8, k) the last one that the master got, written.
-        age: (ticks, 2) age of the packet that arrives then, forward and back, in ticks; below 0
-            where none arrives that is newer than the last.
+        forward: (n, 3, 6) ring buffer of the master's packets, written: displacement and rate of
+            the handle, hand force minus the joystick's own spring and damper force. A passive
+            channel replaces the last two by the sum of waves or the position, and the energy.
+        back: (n, 8, k) ring buffer of the machine's packets, written.
+        packet: (8, k) last packet received by the master, written.
+        age: (ticks, 2) age of the arriving packet, forward and back, in ticks; negative if no
+            packet arrives that is newer than the last.
         state: (5,) QUIET, SHARE, written, PERIOD, SILENCE, FADING [s].
     """
 
@@ -178,12 +178,12 @@ class Line(NamedTuple):
 
 
 class MasterSide(NamedTuple):
-    """Joystick and operator.
+    """Operator side of teleoperation: joystick and operator.
 
     Attributes:
         master: (168,) Master.
         state: (123,) MasterState, written.
-        qpos: (7,) of the flotor: position [m] and quaternion.
+        qpos: (7,) flotor position [m] and quaternion.
         muscles: (80,) Muscles, written.
         past: (reflex + 1, 6) see `pull`.
         tremor: (n, 6) see `pull`.
@@ -199,13 +199,13 @@ class MasterSide(NamedTuple):
 
 @compiled
 def to_the_hand(tick, fresh, elapsed, tripped, machine, line, operator):
-    """Report the machine to the master, reflect, pull: ends in coil currents and muscle forces.
+    """Run the first half of a tick: send the machine's packet, compute coil and muscle forces.
 
     Args:
         tick: scalar.
         fresh: whether the sensors have a new sample, scalar.
-        elapsed: since the last one, scalar [s].
-        tripped: whether the machine has been stopped for good, scalar.
+        elapsed: time since the last sample, scalar [s].
+        tripped: whether the machine has been stopped permanently, scalar.
         machine: SlaveSide.
         line: Line.
         operator: MasterSide.
@@ -234,7 +234,7 @@ def to_the_hand(tick, fresh, elapsed, tripped, machine, line, operator):
         state[QUIET] = 0.0
         come = back[(tick - late) % rows]
         for row in range(len(come)):
-            for i in range(k):  # a number that is none does not count
+            for i in range(k):  # values that are not finite are ignored
                 if np.isfinite(come[row, i]):
                     packet[row, i] = come[row, i]
     goal = 0.0 if tripped or state[QUIET] > state[SILENCE] else 1.0
@@ -253,7 +253,7 @@ def to_the_hand(tick, fresh, elapsed, tripped, machine, line, operator):
 
 @compiled
 def to_the_machine(tick, machine, line, grid, table, scale, reference, rate, drive):
-    """Take the packet that arrives, and write the references of joints and drives.
+    """Run the second half of a tick: receive the master's packet, write joint and drive references.
 
     Args:
         tick: scalar.
@@ -261,9 +261,9 @@ def to_the_machine(tick, machine, line, grid, table, scale, reference, rate, dri
         line: Line.
         grid: (nu, 2) of `drive_tables`.
         table: (nu, POINTS, 3) of `drive_tables`.
-        scale: of drive velocities, scalar.
+        scale: factor on the drive velocities, scalar.
         reference: (nu,) joint references, those of the arm written [rad] or [m].
-        rate: (nu,) the same, their rates [rad/s] or [m/s].
+        rate: (nu,) rates of the joint references [rad/s] or [m/s].
         drive: DriveReference, written.
 
     Returns:
@@ -306,12 +306,12 @@ STATION = np.dtype(
     + [(name, np.int64) for name in ("touching", "contacts")],
     align=True,
 )
-"""Record of a Station."""
+"""Sizes and addresses of the arrays of a Station."""
 
 
 @compiled
 def _sides(r):
-    """SlaveSide, Line and MasterSide of a record."""
+    """Return SlaveSide, Line and MasterSide as views of a record."""
     k, rows, back = r.joints, r.forward_rows, r.back_rows
     machine = SlaveSide(
         floats(r.joint, r.axes), floats(r.force, k), integers(r.columns, k),
@@ -332,7 +332,7 @@ def _sides(r):
 
 @compiled
 def round_trip(station, flotor, tick, tripped):
-    """Once around: to the hand, a period of the simulated joystick, to the machine, into the log.
+    """Run one tick: first half, a period of the simulated joystick, second half, logging.
 
     Args:
         station: record of a Station.
@@ -341,7 +341,7 @@ def round_trip(station, flotor, tick, tripped):
         tripped: see `to_the_hand`, scalar.
 
     Returns:
-        Whether a flag of the slave's stands: held at the edge, line silent, valves closed.
+        Whether a flag of the slave is set: held at the workspace edge, no packets, valves closed.
 
     Source: `to_the_hand`, `simulate.joystick`, `to_the_machine`.
     """

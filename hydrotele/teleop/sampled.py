@@ -1,30 +1,29 @@
-"""Stability of a sampled teleoperator whose packets arrive late and irregularly.
+"""Stability of a sampled teleoperator whose packets have variable delays.
 
 Both sides run at the same period T: coils and servo hold their force over a period, rates are
-backward differences, integrals are sums. Between samples master with hand, and slave with task, are
-masses, dampers and springs, so that one period is an exact map. A packet that is n periods old when
-it is used is the factor `q^n`, `q = 1/z`. With jitter the age changes from period to period; in the
-mean the line is then `E(q) = sum of P(age = n) q^n`. All signals are polynomials of q, and so is
-what is 0 at the poles of the whole loop: its zeros inside `|q| < exp(-sigma T)` are the motions
-that grow faster than sigma, counted by the turns of its phase along that circle. What jitter does
-beyond the mean is `jitter_gain`.
+backward differences, integrals are sums. Between samples, master with hand and slave with task are
+masses, dampers and springs, so that one period is an exact map. A packet with an age of n periods
+is the factor `q^n`, `q = 1/z`. With jitter the age changes from period to period; the mean channel
+is `E(q) = sum of P(age = n) q^n`. All signals are polynomials of q, and so is the characteristic
+function of the loop. Its zeros inside `|q| < exp(-sigma T)` are the motions that grow faster than
+sigma. They are counted by the winding of the phase along that circle. The effect of jitter beyond
+the mean is `jitter_gain`.
 
-Two structures beyond those of `two_port`, both with the slave's own controller, whose force comes
-back:
+Two structures are added to those of `two_port`. Both use the slave's own controller and return its
+force:
 
-- `wave_variables`: `u = (b v + F) / sqrt(2 b)` goes forward, `w = (b v - F) / sqrt(2 b)` comes
-  back, which makes a late line lossless (Niemeyer and Slotine 1991).
-- `passivity_control`: velocity forward, force back, and at either end a controller that lets no
-  more energy out than came in at the other end (Hannaford and Ryu 2002; with delay Ryu, Artigas and
-  Preusche 2010). Nonlinear: it is predicted stable where the line needs no control, or where the
-  slave's end by itself is stable.
+- `wave_variables`: `u = (b v + F) / sqrt(2 b)` is sent forward, `w = (b v - F) / sqrt(2 b)` is
+  returned, which makes a constant delay lossless (Niemeyer and Slotine 1991).
+- `passivity_control`: velocity is sent forward, force is returned. A controller at each end lets
+  out no more energy than has entered at the other end (Hannaford and Ryu 2002; with delay Ryu,
+  Artigas and Preusche 2010). It is nonlinear: it is predicted stable if the channel needs no
+  control, or if the slave's end alone is stable.
 
-How much damping a sampled joystick can hold: the handle as a body, its springs in a computer.
-
-The computer reads the handle once per period, takes the difference of two readings for its speed,
-and holds the coils' force until the next reading. Between readings the body moves freely, under
-the hand's own spring and damper if a hand is on it. The loop is linear, so its largest eigenvalue
-tells whether it comes to rest; `Zhu 1994, Tables 6.7 and 6.9` give the springs and dampers.
+The module also gives the maximum damping of a sampled joystick. The computer reads the handle once
+per period, computes the speed from two readings, and holds the coils' force until the next reading.
+Between readings the body moves freely, or with the spring and damper of a hand. The loop is linear,
+so that its largest eigenvalue determines stability; `Zhu 1994, Tables 6.7 and 6.9` give the springs
+and dampers.
 """
 
 import math
@@ -42,26 +41,26 @@ from hydrotele.teleop.two_port import RATE_STRUCTURES, STRUCTURES, Impedance
 WAVE, PASSIVITY = "wave_variables", "passivity_control"
 SAMPLED_STRUCTURES = (*STRUCTURES, WAVE, PASSIVITY)
 _WHERE = "sampled teleoperator"
-_TURN = 0.5  # rad by which the phase may turn from one point of the circle to the next
+_TURN = 0.5  # rad, maximum phase change between neighbouring points of the circle
 _FIRST = 400
 _MOST = 400_000
-_NEUTRAL = 1e-3  # 1/s: slower than this is drift, as of a free handle, not growth
-_FASTEST = 2e3  # 1/s of growth and decay that are told apart
-# jitter gain at which single runs grow: their power grows as the mean of its logarithm, which for
-# noise of many parts (exponentially distributed power) is the mean's logarithm less Euler's gamma
+_NEUTRAL = 1e-3  # 1/s: slower growth is drift, such as that of a free handle
+_FASTEST = 2e3  # 1/s, maximum magnitude of a growth rate
+# jitter gain above which single runs grow: their power grows with the mean of its logarithm, which
+# for exponentially distributed power is the logarithm of the mean minus Euler's gamma
 _PATHS = math.exp(np.euler_gamma)
-_REFINED = 1e-3  # 1/s, and of the rate
+_REFINED = 1e-3  # absolute [1/s] and relative tolerance of a growth rate
 
 
 @dataclass(frozen=True)
 class PacketAges:
-    """How old packets are when they are used.
+    """Distribution of the ages of packets when they are used.
 
     Attributes:
         period: T of both sides [s].
-        forward: (n,) share of the periods in which the packet from the master is 0 .. n - 1 periods
-            old [1].
-        back: (m,) the same of those from the slave.
+        forward: (n,) fraction of the periods in which the packet from the master is 0 .. n - 1
+            periods old [1].
+        back: (m,) the same for packets from the slave.
     """
 
     period: float
@@ -69,13 +68,13 @@ class PacketAges:
     back: np.ndarray
 
     def __post_init__(self) -> None:
-        """Refuse what is no distribution."""
+        """Raise InputError unless both are probability distributions."""
         if not self.period > 0.0:
             raise InputError(_WHERE, f"the period must be positive, got {self.period:g} s")
         for name in ("forward", "back"):
             share = getattr(self, name)
             if len(share) < 1 or np.any(share < 0.0) or abs(share.sum() - 1.0) > 1e-9:
-                raise InputError(_WHERE, f"the shares of ages {name} must sum to 1")
+                raise InputError(_WHERE, f"the fractions of ages {name} must sum to 1")
 
     @property
     def mean(self) -> tuple[float, float]:
@@ -86,15 +85,15 @@ class PacketAges:
 
 
 def steady_line(period: float, delay_forward: float, delay_back: float) -> PacketAges:
-    """A line with constant delays, rounded to periods.
+    """Create a channel with constant delays, rounded to periods.
 
     Args:
         period: T [s].
-        delay_forward: from the master to the slave [s].
-        delay_back: back [s].
+        delay_forward: delay from the master to the slave [s].
+        delay_back: delay from the slave to the master [s].
 
     Returns:
-        The line.
+        The packet ages.
 
     >>> steady_line(0.005, 0.01, 0.0).forward
     array([0., 0., 1.])
@@ -106,15 +105,15 @@ def steady_line(period: float, delay_forward: float, delay_back: float) -> Packe
 def jittering_line(
     period: float, delays_forward: np.ndarray, delays_back: np.ndarray
 ) -> PacketAges:
-    """A line with the delays of packets sent one after the other, once a period.
+    """Create a channel from the delays of successive packets, one per period.
 
     Args:
         period: T [s].
-        delays_forward: (n,) [s]; NaN for a packet that is lost.
+        delays_forward: (n,) [s]; NaN for a lost packet.
         delays_back: (m,) [s].
 
     Returns:
-        The line; delays are rounded to periods.
+        The packet ages; delays are rounded to periods.
     """
     return PacketAges(
         period, *(_shares(in_periods(d, period)) for d in (delays_forward, delays_back))
@@ -125,7 +124,7 @@ def _shares(delays: np.ndarray) -> np.ndarray:
     ages = ages_of(delays)
     started = np.flatnonzero(ages <= np.arange(len(ages)))
     if not len(started):
-        raise InputError(_WHERE, "no packet arrives within the delays that are given")
+        raise InputError(_WHERE, "no packet arrives within the given delays")
     ages = ages[started[0] :]
     return np.bincount(ages) / len(ages)
 
@@ -136,22 +135,22 @@ class _Side:
 
     below: np.ndarray
     place: np.ndarray
-    speed: np.ndarray  # true one
-    change: np.ndarray  # acceleration just before the force steps
+    speed: np.ndarray  # true speed
+    change: np.ndarray  # acceleration just before a step of the force
     period: float
     q: np.ndarray
 
     @property
     def rate(self) -> np.ndarray:
-        """Backward difference of the place."""
+        """Backward difference of the position."""
         return self.place * (1.0 - self.q) / self.period
 
     def digital(self, z: Impedance) -> np.ndarray:
-        """Force of a controller made of samples: acceleration, differences and places."""
+        """Return the force of a digital controller: acceleration, differences and positions."""
         return z.mass * self.change + z.damping * self.rate + z.stiffness * self.place
 
     def physical(self, z: Impedance) -> np.ndarray:
-        """Force of a body that moves along, as a sensor measures it."""
+        """Return the force of a body that moves with this side, as a sensor measures it."""
         return z.mass * self.change + z.damping * self.speed + z.stiffness * self.place
 
 
@@ -163,7 +162,7 @@ def _side(own: Impedance, held: Impedance, period: float, q: np.ndarray) -> _Sid
     step = expm(block * period)
     a, b = step[:2, :2], step[:2, 2]
     left, det = np.eye(2) - a, float(np.linalg.det(a))
-    e = 1.0 - q  # small where motions are slow: what nearly cancels there is written in it
+    e = 1.0 - q  # avoids cancellation for slow motions, where q is close to 1
     below = np.linalg.det(left) + e * (np.trace(a) - 2.0 * det) + det * e**2
     place = q * ((1.0 - q * a[1, 1]) * b[0] + q * a[0, 1] * b[1])
     speed = q * (q * a[1, 0] * b[0] + (1.0 - q * a[0, 0]) * b[1])
@@ -172,21 +171,23 @@ def _side(own: Impedance, held: Impedance, period: float, q: np.ndarray) -> _Sid
 
 
 def wave_impedance(case: Case) -> float:
-    """Impedance b of waves [N s/m]; the damping of the slave's controller if none is given."""
+    """Return the wave impedance b [N s/m]; by default the damping of the slave's controller."""
     return case.wave or case.slave_control.damping or 1.0
 
 
 def sampled_characteristic(
     case: Case, structure: str, line: PacketAges, q: np.ndarray, reflected: float = 1.0
 ) -> np.ndarray:
-    """What is 0 at the poles `z = 1/q` of the whole loop, without poles of its own.
+    """Return the characteristic function of the loop, which is 0 at the poles `z = 1/q`.
+
+    The function has no poles.
 
     Args:
-        case: the teleoperator with hand and task; its delays are not used, the line has them.
+        case: teleoperator with hand and task; its delays are replaced by those of the channel.
         structure: one of `SAMPLED_STRUCTURES`; `passivity_control` without its controllers.
-        line: period and ages.
+        line: period and ages of packets.
         q: (...) points.
-        reflected: factor on what comes back [1].
+        reflected: factor on the return channels [1].
 
     Returns:
         (...).
@@ -214,7 +215,7 @@ def sampled_characteristic(
 
 
 def _late(share: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """E(q), by Horner's rule."""
+    """Evaluate E(q) by Horner's rule."""
     total = np.zeros_like(q)
     for part in share[::-1]:
         total = total * q + part
@@ -222,12 +223,12 @@ def _late(share: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def _after_slave(line: PacketAges, q: np.ndarray) -> np.ndarray:
-    """E(q) back where the slave answers packets of the same period, after the master has acted."""
+    """Evaluate E(q) of the return channel if the slave answers packets of the same period."""
     return _late(line.back, q) - line.back[0] * (1.0 - q)
 
 
 def _master_laws(case: Case, structure: str, near: _Side) -> tuple[np.ndarray, np.ndarray]:
-    """The master's own force, and that on the slave; under rate control times `1 - q`."""
+    """Return the force on the master and that on the slave; times `1 - q` under rate control."""
     firm, own, gains = case.slave_control, case.master_control, case.gains
     if structure not in RATE_STRUCTURES:
         forward = gains.position * near.digital(firm)
@@ -248,7 +249,7 @@ def _master_laws(case: Case, structure: str, near: _Side) -> tuple[np.ndarray, n
 
 
 def _slave_law(case: Case, structure: str, far: _Side) -> np.ndarray:
-    """Force on the master of the slave's signals."""
+    """Return the force on the master from the slave's signals."""
     if structure in ("position_force", "rate_force"):
         return -case.gains.force * far.physical(case.task)
     back = far.digital(case.master_control)
@@ -263,7 +264,7 @@ def _slave_law(case: Case, structure: str, far: _Side) -> np.ndarray:
 def _serial(
     case: Case, waves: bool, near: _Side, far: _Side, ahead: np.ndarray, home: np.ndarray
 ) -> np.ndarray:
-    """Line and slave's controller in series: waves, or velocity forward and force back."""
+    """Return the loop of channel and slave controller in series, with or without waves."""
     step, firm = 1.0 - near.q, case.slave_control
     held = firm.damping * step + firm.stiffness * near.period  # C = held / step
     if not waves:
@@ -281,19 +282,19 @@ def _serial(
 
 
 def growth_rate(case: Case, structure: str, line: PacketAges, reflected: float = 1.0) -> float:
-    """Rate of the motion that grows fastest, below 0 where all decay; drift does not count.
+    """Return the growth rate of the fastest growing motion, negative if all decay, without drift.
 
     Args:
-        case: as of `sampled_characteristic`.
-        structure: the same.
-        line: period and ages.
-        reflected: factor on what comes back [1].
+        case: see `sampled_characteristic`.
+        structure: see `sampled_characteristic`.
+        line: period and ages of packets.
+        reflected: factor on the return channels [1].
 
     Returns:
         sigma of `exp(sigma t)` [1/s].
 
     Raises:
-        InputError: the structure is not known, or the phase cannot be followed.
+        InputError: the structure is not known, or a pole lies on the contour.
     """
     return _fastest(lambda q: sampled_characteristic(case, structure, line, q, reflected), line)
 
@@ -316,7 +317,7 @@ def _fastest(function, line: PacketAges) -> float:
 
 
 def _inside(function, radius: float, centre: float = 0.0) -> int:
-    """Zeros of a function without poles inside a circle about a real centre."""
+    """Count the zeros of a function without poles inside a circle with a real centre."""
     angle = np.concatenate([[0.0], np.geomspace(1e-7, math.pi, _FIRST)])
     values = function(centre + radius * np.exp(1j * angle))
     while True:
@@ -325,30 +326,30 @@ def _inside(function, radius: float, centre: float = 0.0) -> int:
             break
         between = 0.5 * (angle[wide] + angle[wide + 1])
         if len(angle) + len(wide) > _MOST or np.any(between == angle[wide]):
-            raise InputError(_WHERE, "the phase cannot be followed: a pole lies on the circle")
+            raise InputError(_WHERE, "the phase is not resolved: a pole lies on the circle")
         angle = np.insert(angle, wide + 1, between)
         values = np.insert(values, wide + 1, function(centre + radius * np.exp(1j * between)))
     return round(float(np.angle(values[1:] / values[:-1]).sum()) / math.pi)
 
 
 def _angles() -> np.ndarray:
-    """Points of the unit circle up to half the sampling rate."""
+    """Return points of the unit circle up to half the sampling rate."""
     return np.exp(-1j * np.geomspace(1e-6, math.pi, 4000))
 
 
 def passive_end(case: Case, line: PacketAges) -> bool:
-    """Whether what the line meets at the slave is passive as it is sampled.
+    """Return whether the slave's end of the channel is passive as it is sampled.
 
-    The slave's controller on its mass and task, `C / (1 + C v_s)` from the velocity that is asked
-    for to the force, must have no negative real part up to half the sampling rate, and be stable.
-    Where it is, a line that gives no energy cannot make the loop unstable.
+    The response of the slave's controller with mass and task from reference velocity to force,
+    `C / (1 + C v_s)`, must have no negative real part up to half the sampling rate, and be stable.
+    A passive channel then cannot make the loop unstable.
 
     Args:
-        case: the teleoperator with its task.
-        line: of which the period counts.
+        case: teleoperator with its task.
+        line: packet ages, of which only the period is used.
 
     Returns:
-        Whether it is.
+        Whether the slave's end is passive.
 
     Source: Colgate and Schenkel 1997 (passivity of sampled walls); passivity theorem.
     """
@@ -361,7 +362,7 @@ def passive_end(case: Case, line: PacketAges) -> bool:
 
 
 def _answers(case: Case, structure: str, line: PacketAges, q: np.ndarray, reflected: float):
-    """What master and slave send per what they receive, at points q."""
+    """Return the transfer functions of master and slave from received to sent signals."""
     near = _side(case.master, case.hand, line.period, q)
     far = _side(case.slave, case.task, line.period, q)
     if structure == WAVE:
@@ -377,22 +378,23 @@ def _answers(case: Case, structure: str, line: PacketAges, q: np.ndarray, reflec
 
 
 def jitter_gain(case: Case, structure: str, line: PacketAges, reflected: float = 1.0) -> float:
-    """How much of the noise that jitter makes comes back as noise; in the mean square.
+    """Return the mean-square loop gain of the noise that jitter causes.
 
-    A signal of frequency w through a line of random age leaves `E(q)` of it, and noise with the
-    share `1 - |E(q)|^2` of its power, white if the ages of successive packets are independent. The
-    noise goes round the loop, at either end through the closed loop's transfer functions, and makes
-    new noise: the spectral radius of that map of powers.
+    A signal of frequency w that passes a channel of random age leaves `E(q)` of it, and noise with
+    the fraction `1 - |E(q)|^2` of its power, white if the ages of successive packets are
+    independent.
+    The noise passes the closed loop's transfer functions from either end and causes new noise. The
+    result is the spectral radius of this map of powers.
 
     Args:
-        case: the teleoperator with hand and task.
-        structure: a linear one.
-        line: period and ages.
-        reflected: factor on what comes back [1].
+        case: teleoperator with hand and task.
+        structure: a linear structure.
+        line: period and ages of packets.
+        reflected: factor on the return channels [1].
 
     Returns:
-        The radius [1], which means something only where the loop is stable in the mean. Below 1 the
-        mean square dies out; single runs do so up to `exp(0.577)`, about 1.78.
+        The spectral radius [1], valid only if the mean loop is stable. Below 1 the mean square
+        decays; single runs decay up to `exp(0.577)`, about 1.78.
 
     Source: mean-square small gain, Elia 2005 (Remote stabilization over fading channels).
     """
@@ -412,11 +414,11 @@ def jitter_gain(case: Case, structure: str, line: PacketAges, reflected: float =
 
 
 def slave_characteristic(case: Case, line: PacketAges, q: np.ndarray) -> np.ndarray:
-    """What is 0 at the poles of the slave on its controller and task, with a held reference.
+    """Return the characteristic function of slave, controller and task with a held reference.
 
     Args:
-        case: the teleoperator with its task.
-        line: of which the period counts.
+        case: teleoperator with its task.
+        line: packet ages, of which only the period is used.
         q: (...) points.
 
     Returns:
@@ -428,13 +430,13 @@ def slave_characteristic(case: Case, line: PacketAges, q: np.ndarray) -> np.ndar
 
 @dataclass(frozen=True)
 class Prediction:
-    """What is predicted of a sampled structure.
+    """Predicted stability of a sampled structure.
 
     Attributes:
-        stable: whether a disturbance dies out; under passivity control, whether it stays bounded.
-        reason: `poles`, `jitter` (noise that jitter makes grows, though the mean does not), or of
+        stable: whether a disturbance decays; under passivity control, whether it stays bounded.
+        reason: `poles`, `jitter` (noise caused by jitter grows, though the mean does not), or for
             passivity control `slave alone` (its own controller is unstable), `no control needed`,
-            `passive ends`, `bounded` (the slave's end is stable and not passive).
+            `passive ends`, `bounded` (the slave's end is stable but not passive).
     """
 
     stable: bool
@@ -445,16 +447,16 @@ def predict(case: Case, structure: str, line: PacketAges, reflected: float = 1.0
     """Predict whether a sampled structure is stable.
 
     Args:
-        case: the teleoperator with hand and task.
+        case: teleoperator with hand and task.
         structure: one of `SAMPLED_STRUCTURES`.
-        line: period and ages.
-        reflected: factor on what comes back [1].
+        line: period and ages of packets.
+        reflected: factor on the return channels [1].
 
     Returns:
         The prediction.
 
     Raises:
-        InputError: the structure is not known, or the phase cannot be followed.
+        InputError: the structure is not known, or a pole lies on the contour.
     """
 
     def whole(q: np.ndarray) -> np.ndarray:
@@ -478,12 +480,12 @@ def predict(case: Case, structure: str, line: PacketAges, reflected: float = 1.0
     return Prediction(True, "passive ends" if passive_end(case, line) else "bounded")
 
 
-_UNBOUNDED = 1e6  # beyond it a damping or inertia counts as without bound
-_FINE = 1e-9  # of the bisection, relative
+_UNBOUNDED = 1e6  # larger values of damping or inertia count as unbounded
+_FINE = 1e-9  # relative tolerance of the bisection
 
 
 class Body(NamedTuple):
-    """What a handle is, in n coordinates, and what holds it without a computer.
+    """Mass matrix of a handle in n coordinates, with the spring and damper of the hand.
 
     Attributes:
         mass: (n, n) [kg], [kg m], [kg m^2].
@@ -499,16 +501,17 @@ class Body(NamedTuple):
 def tilting_body(
     mass: float, arm: float, inertia: float, hand: tuple[float, ...] = (0.0,) * 5
 ) -> Body:
-    """A handle that shifts and tilts in a vertical plane, x and ry.
+    """Create a handle that translates and tilts in a vertical plane, x and ry.
 
     Args:
-        mass: of the flotor [kg].
-        arm: its centre of mass above the handle's point, negative below [m].
-        inertia: of the flotor about its centre of mass [kg m^2].
-        hand: its mass on the handle's point [kg], damping [N s/m], stiffness [N/m], rotational
-            damping [N m s/rad] and stiffness [N m/rad].
+        mass: mass of the flotor [kg].
+        arm: height of the centre of mass above the handle's point, negative below [m].
+        inertia: inertia of the flotor about its centre of mass [kg m^2].
+        hand: mass at the handle's point [kg], damping [N s/m], stiffness [N/m], rotational damping
+            [N m s/rad] and stiffness [N m/rad] of the hand.
 
     Returns:
+        The body, in displacement and rotation of the handle's point.
         The body, in displacement and turning of the handle's point.
     """
     m, b, k, rub, spring = hand
@@ -517,12 +520,12 @@ def tilting_body(
 
 
 def spinning_body(inertia: float, damping: float = 0.0, stiffness: float = 0.0) -> Body:
-    """A handle that only turns, about its own axis.
+    """Create a handle that only rotates about its own axis.
 
     Args:
         inertia: [kg m^2].
-        damping: of the hand [N m s/rad].
-        stiffness: of the hand [N m/rad].
+        damping: damping of the hand [N m s/rad].
+        stiffness: stiffness of the hand [N m/rad].
 
     Returns:
         The body.
@@ -531,19 +534,19 @@ def spinning_body(inertia: float, damping: float = 0.0, stiffness: float = 0.0) 
 
 
 def slowest_decay(body: Body, stiffness: np.ndarray, damping: np.ndarray, period: float) -> float:
-    """Largest eigenvalue of one period of the sampled loop; below 1 the handle comes to rest.
+    """Return the largest eigenvalue of the sampled loop; below 1 the handle comes to rest.
 
     Args:
         body: handle and hand.
-        stiffness: (n,) of the joystick's springs [N/m], [N m/rad].
-        damping: (n,) of its dampers [N s/m], [N m s/rad].
-        period: of the control [s].
+        stiffness: (n,) stiffness of the joystick's springs [N/m], [N m/rad].
+        damping: (n,) damping of its dampers [N s/m], [N m s/rad].
+        period: control period [s].
 
     Returns:
-        Magnitude of the largest eigenvalue [1].
+        Magnitude of the largest eigenvalue over one period [1].
 
     Raises:
-        InputError: the body has no positive mass.
+        InputError: the mass matrix is not positive definite.
 
     Source: zero-order hold by the matrix exponential; speed as the difference of two readings.
 
@@ -560,7 +563,7 @@ def slowest_decay(body: Body, stiffness: np.ndarray, damping: np.ndarray, period
     pushed = np.vstack([none, inverse])
     moved = expm(period * np.block([[free, pushed], [np.zeros((n, 3 * n))]]))
     spring, damper = np.diag(stiffness), np.diag(damping) / period
-    law = np.hstack([-(spring + damper), none, damper])  # of place, speed and the place before
+    law = np.hstack([-(spring + damper), none, damper])  # of position, speed, previous position
     loop = np.zeros((3 * n, 3 * n))
     loop[: 2 * n, : 2 * n], loop[2 * n :, :n] = moved[: 2 * n, : 2 * n], np.eye(n)
     loop[: 2 * n] += moved[: 2 * n, 2 * n :] @ law
@@ -568,15 +571,15 @@ def slowest_decay(body: Body, stiffness: np.ndarray, damping: np.ndarray, period
 
 
 def largest_damping(inertia: float, stiffness: float, period: float) -> float:
-    """Largest damping that a spinning handle holds.
+    """Return the maximum damping for which a spinning handle is stable.
 
     Args:
         inertia: [kg m^2].
-        stiffness: of the joystick's spring [N m/rad].
-        period: [s].
+        stiffness: stiffness of the joystick's spring [N m/rad].
+        period: control period [s].
 
     Returns:
-        [N m s/rad]; 0 if none holds this spring.
+        [N m s/rad]; 0 if no damping stabilises this spring.
 
     Source: `slowest_decay`; without a spring it is 2 inertia / period.
 
@@ -601,12 +604,12 @@ def largest_damping(inertia: float, stiffness: float, period: float) -> float:
 
 
 def least_inertia(damping: float, stiffness: float, period: float) -> float:
-    """Least inertia with which a spinning handle holds a damping.
+    """Return the minimum inertia for which a spinning handle is stable with a damping.
 
     Args:
         damping: [N m s/rad].
-        stiffness: of the joystick's spring [N m/rad].
-        period: [s].
+        stiffness: stiffness of the joystick's spring [N m/rad].
+        period: control period [s].
 
     Returns:
         [kg m^2]; infinite if there is none below 1e6.

@@ -1,10 +1,10 @@
-"""A sampled teleoperator in time, packet by packet: confirms what `sampled` predicts.
+"""Time simulation of a sampled teleoperator, packet by packet, to check `sampled`.
 
-Master with hand and slave with task are integrated with many steps a period. Every period each
-side measures, sends a packet and uses the newest one that has arrived; packets have their own
-delays, may overtake each other and get lost. Independent of `sampled`: nothing here is a
-polynomial, a mean or a prediction, and waves and passivity control are the nonlinear laws that
-teleoperated scenarios use (`passive_line`).
+Master with hand and slave with task are integrated with many steps per period. In every period each
+side measures, sends a packet and uses the newest packet that has arrived. Packets have individual
+delays, may overtake each other and may be lost. The simulation uses no polynomials, means or
+predictions of `sampled`. Waves and passivity control are the nonlinear laws of the teleoperated
+scenarios (`passive_line`).
 """
 
 import math
@@ -27,26 +27,28 @@ from hydrotele.teleop.round_trip import ages_of, in_periods
 from hydrotele.teleop.sampled import PASSIVITY, WAVE, wave_impedance
 from hydrotele.teleop.two_port import RATE_STRUCTURES, Impedance
 
-# what a side measures: sum, place, difference, acceleration, sum and difference of the force on
+# signals of a side: sum, position, difference, acceleration, sum and difference of the force on
 # hand or task, that force
 SUM, X, V, A, IMPULSE, CHANGE, FORCE = range(7)
 _SIGNALS = 7
-_PER_RATE = 0.1  # integration steps over the time constant of the fastest rate
-_TRICKLE = 1e-5  # W of passivity control: in a run less than a tenth of the kick's energy
+_PER_RATE = 0.1  # integration steps per time constant of the fastest mode
+_TRICKLE = 1e-5  # W of passivity control: in one run less than a tenth of the initial energy
 _KICK = np.array([0.1, 0.03])  # m/s, of master and slave
 _BLOCKS = 40
-_GROWN, _GONE = 1e8, 1e-8  # times the kick
+_GROWN, _GONE = 1e8, 1e-8  # factors on the initial speed beyond which a run is stopped
 _LINEAR, _WAVES, _CONTROLLED = range(3)
 
 
 class Motion(NamedTuple):
-    """What a kick did.
+    """Response to initial velocities.
 
     Attributes:
-        largest: (40,) of both speeds in fortieths of the run [m/s]; 0 after it was ended.
-        grows: whether late motion is larger than early one; under passivity control, which bounds
-            motions and need not end them, whether it has more kinetic energy than the kick gave.
-        line_energy: (periods,) energy that the line has taken in, of both ends [J]; 0 of the six
+        largest: (40,) maximum of the sum of both speeds in each fortieth of the run [m/s]; 0 after
+            an early stop.
+        grows: whether late motion is larger than early motion; under passivity control, which
+            bounds motions without damping them, whether it has more kinetic energy than at the
+            start.
+        line_energy: (periods,) energy that has entered the channel at both ends [J]; 0 for the six
             structures without waves or passivity control.
     """
 
@@ -56,17 +58,17 @@ class Motion(NamedTuple):
 
     @property
     def dies_out(self) -> bool:
-        """Whether less than a thousandth of the kick is left in the end."""
+        """Whether less than a thousandth of the initial speed remains at the end."""
         return bool(self.largest[self.largest > 0.0][-1] < 1e-3 * _KICK.max())
 
 
 def laws(case: Case, structure: str, reflected: float = 1.0) -> np.ndarray:
-    """Coefficients on what a side measures.
+    """Return the coefficients of the control laws on the signals of each side.
 
     Args:
         case: the teleoperator.
         structure: one of `two_port.STRUCTURES`.
-        reflected: factor on what comes back [1].
+        reflected: factor on the return channels [1].
 
     Returns:
         (4, 7): own force of the master, force on the slave from the master's packet, own force of
@@ -107,19 +109,19 @@ def kick(
     case: Case, structure: str, period: float, delays_forward: np.ndarray, delays_back: np.ndarray,
     reflected: float = 1.0,
 ) -> Motion:  # fmt: skip
-    """Simulate a kick of master and slave.
+    """Simulate the response to initial velocities of master and slave.
 
     Args:
-        case: the teleoperator with hand and task; the delays are those given here.
+        case: teleoperator with hand and task; its delays are replaced by the given delays.
         structure: one of `sampled.SAMPLED_STRUCTURES`.
         period: T of both sides [s].
-        delays_forward: (n,) of the packets sent in every period, which tells the length of the run
-            [s]; NaN where lost.
-        delays_back: (n,) the same from the slave.
-        reflected: factor on what comes back [1].
+        delays_forward: (n,) delay of the packet sent in each of the n periods of the run [s]; NaN
+            if lost.
+        delays_back: (n,) delays of the slave's packets.
+        reflected: factor on the return channels [1].
 
     Returns:
-        What happened.
+        Speeds, growth and energy of the run.
 
     Source: this module's docstring.
     """
@@ -148,11 +150,11 @@ def _fastest_rate(bodies: np.ndarray) -> float:
     return float(max((damping / mass).max(), np.sqrt(stiffness / mass).max()))
 
 
-_GROWTH = 1.05  # of what moved before, that a drift stays below
+_GROWTH = 1.05  # ratio of late to early motion above which motion grows; drift stays below
 
 
 def _grows(largest: np.ndarray) -> bool:
-    """Whether the last quarter of the run moves more than the second one."""
+    """Return whether the last quarter of the run moves more than the second one."""
     reached = int(np.count_nonzero(largest > 0.0))
     if reached < _BLOCKS:
         return bool(largest[reached - 1] > _KICK.max())
@@ -161,19 +163,19 @@ def _grows(largest: np.ndarray) -> bool:
 
 
 def _beyond(largest: np.ndarray, given: float) -> bool:
-    """Whether late motion has more energy than the kick gave."""
+    """Return whether late motion has more energy than the initial motion."""
     late = largest[largest > 0.0][-_BLOCKS // 4 :]
     return bool(late.max() > _GROWTH * given)
 
 
 @compiled
 def _march(way, table, bodies, numbers, steps, age_forward, age_back, first):
-    """Largest speeds (40,) and kinetic energies (40,), and energy in the line (n,)."""
+    """Return largest speeds (40,) and kinetic energies (40,), and energy in the channel (n,)."""
     count = len(age_forward)
     period = numbers[0]
     largest, moving, energy = np.zeros(_BLOCKS), np.zeros(_BLOCKS), np.zeros(count)
     sent = np.zeros((2, count, _SIGNALS))
-    state = np.zeros((2, 2))  # place, speed
+    state = np.zeros((2, 2))  # position, speed
     state[0, 1], state[1, 1] = first[0], first[1]
     seen, force = np.zeros((2, _SIGNALS)), np.zeros(2)
     ends, come = np.zeros((2, END)), np.zeros((2, _SIGNALS))
@@ -184,7 +186,7 @@ def _march(way, table, bodies, numbers, steps, age_forward, age_back, first):
         if way == _LINEAR:
             sent[0, n], sent[1, n] = seen[0], seen[1]
             for side in range(2):
-                if newest[side] >= 0:  # else none has come yet
+                if newest[side] >= 0:  # otherwise no packet has arrived yet
                     come[side] = sent[side, newest[side]]
             for side in range(2):
                 force[side] = 0.0
@@ -213,7 +215,7 @@ def _march(way, table, bodies, numbers, steps, age_forward, age_back, first):
 
 @compiled
 def _measure(body, state, force, period, seen):
-    """Sensors of a side, just before its force changes."""
+    """Sample the sensors of a side just before its force changes."""
     x, v = state[0], state[1]
     mass, damping, stiffness = body[0] + body[3], body[1] + body[4], body[2] + body[5]
     a = (force - damping * v - stiffness * x) / mass
@@ -226,13 +228,13 @@ def _measure(body, state, force, period, seen):
     seen[FORCE] = held
 
 
-# of packets: sum of all waves, place of the master or force of the slave; their energy
+# elements of a packet: sum of waves, position of the master or force of the slave; their energy
 TOTAL, BUDGET = range(2)
 
 
 @compiled
 def _newest(sent, row, n):
-    """Sum or signal, and energy, of a packet; zeros before any has come."""
+    """Return sum or signal, and energy, of a packet; zeros before the first arrival."""
     if row < 0:
         return 0.0, 0.0
     return sent[min(row, n), TOTAL], sent[min(row, n), BUDGET]
@@ -240,7 +242,7 @@ def _newest(sent, row, n):
 
 @compiled
 def _waves(n, newest_forward, newest_back, numbers, seen, sent, ends, force):
-    """Both ends of waves; the master acts first, so that it knows of the slave's last period."""
+    """Run both ends of waves; the master acts first and uses the slave's previous period."""
     period, stiffness, damping, b = numbers[0], numbers[1], numbers[2], numbers[3]
     total, budget = _newest(sent[1], newest_back, n - 1)
     pushed, wave = wave_master(seen[0, V], total, budget, b, period, ends[0])
@@ -262,7 +264,7 @@ def _send(sent, n, wave, period):
 
 @compiled
 def _controlled(n, newest_forward, newest_back, numbers, mass, seen, sent, ends, force):
-    """Both ends of passivity control; the master acts first, as for waves."""
+    """Run both ends of passivity control; the master acts first, as for waves."""
     period, stiffness, damping = numbers[0], numbers[1], numbers[2]
     total, budget = _newest(sent[1], newest_back, n - 1)
     force[0] = -controlled_master(seen[0, V], total, budget, mass, period, ends[0])
@@ -276,7 +278,7 @@ def _controlled(n, newest_forward, newest_back, numbers, mass, seen, sent, ends,
 
 @compiled
 def _integrate(body, state, force, period, steps):
-    """Runge and Kutta's method of fourth order over a period with a held force."""
+    """Integrate a period with a held force by the fourth-order Runge-Kutta method."""
     mass, damping, stiffness = body[0] + body[3], body[1] + body[4], body[2] + body[5]
     h = period / steps
     x, v = state[0], state[1]

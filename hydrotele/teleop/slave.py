@@ -1,11 +1,11 @@
-"""The slave's side of teleoperation: packets of the master into joint references, safely.
+"""Slave side of teleoperation: converts the master's packets to safe joint references.
 
-Under rate control the handle beyond its dead band asks for a rate of the task coordinates, under
-position control for their place; bounds of speed and acceleration keep the references continuous.
-With four channels or a passive line a virtual mass stands between, which the hand's or the line's
-force and the task's move, because a valve-controlled machine does not yield by itself.
+Under rate control the handle displacement beyond the dead band commands the rate of the task
+coordinates, under position control their position. Limits of speed and acceleration keep the
+references continuous. A valve-controlled machine does not give way to forces. With four channels or
+a passive channel, the forces of hand or channel and of the task therefore move a virtual mass.
 
-The slave's side of teleoperation as arrays: its numbers, its state, and how they lie flat.
+Parameters and state of the slave side are named tuples of arrays that are contiguous in memory.
 """
 
 from typing import NamedTuple
@@ -57,31 +57,31 @@ from hydrotele.teleop.master import (
 )
 from hydrotele.teleop.passive_line import GONE_IN, controlled_slave, wave_slave
 
-BLOCKED, SILENT, TRIPPED, AGE = range(4)  # of `SlaveState.flags`
-JACOBIAN = 4  # of `Slave.kind`
+BLOCKED, SILENT, TRIPPED, AGE = range(4)  # indices into `SlaveState.flags`
+JACOBIAN = 4  # index into `Slave.kind`
 # columns of `Slave.table`
 (AXIS, WAY, SCALE, EDGE, STOP, SPRING, DAMPER, SHARE, LEVERAGE, FASTEST, STRONGEST,
  WAVE_IMPEDANCE) = range(12)  # fmt: skip
 WIDTH = WAVE_IMPEDANCE + 1
-SILENCE, FOLLOWING, ACCELERATION, VIRTUAL_MASS, LEAD = range(5)  # of `Slave.limits`
+SILENCE, FOLLOWING, ACCELERATION, VIRTUAL_MASS, LEAD = range(5)  # indices into `Slave.limits`
 # rows of a command packet
-HANDLE, HANDLE_SPEED, HAND = range(3)  # of a passive line: handle, sum or place, energy
+HANDLE, HANDLE_SPEED, HAND = range(3)  # with a passive channel: handle, sum or position, energy
 
 
 class Slave(NamedTuple):
-    """Numbers of the slave's side; k joints and task coordinates.
+    """Parameters of the slave side, for k joints and task coordinates.
 
     Attributes:
         arm: (9,) of `kinematics.task.arm_parameters`.
         ranges: (k, 2) joint ranges [rad].
         start: (5,) pose at the start: r [m], theta [rad], z [m], attitude [rad], head [rad].
-        table: (k, 12) of every coordinate: joystick axis (-1 without), sign, gain, dead band,
-            reach, coupling, its damping, hand per machine force, lever of the virtual mass [1] or
-            [m^2], largest speed [m/s] or [rad/s], largest force that counts [N] or [N m], wave
-            impedance [N s/m].
+        table: (k, 12) parameters of every coordinate: joystick axis (-1 without), sign, gain, dead
+            band, range, coupling stiffness, coupling damping, hand per machine force, lever of the
+            virtual mass [1] or [m^2], maximum speed [m/s] or [rad/s], limit of the reflected force
+            [N] or [N m], wave impedance [N s/m].
         limits: (5,) silence [s], following error [rad], acceleration [m/s^2] or [rad/s^2], virtual
-            mass [kg], lead of the drives [s].
-        kind: (5,) of `master.Master.kind`, then 1 where the inverse Jacobian resolves the motion.
+            mass [kg], phase lead of the drives [s].
+        kind: (5,) of `master.Master.kind`, then 1 if the inverse Jacobian resolves the motion.
     """
 
     arm: np.ndarray
@@ -93,21 +93,21 @@ class Slave(NamedTuple):
 
 
 class SlaveState(NamedTuple):
-    """What the slave's side knows and asks for.
+    """State and references of the slave side.
 
     Attributes:
-        pose: (5,) of the references [m], [rad].
-        rate: (5,) of it.
+        pose: (5,) reference pose [m], [rad].
+        rate: (5,) rate of the reference pose.
         joint: (k,) joint references [rad].
-        joint_rate: (k,) [rad/s].
-        ahead: (k,) rates as they will be by the time the valves have moved [rad/s].
+        joint_rate: (k,) rates of the joint references [rad/s].
+        ahead: (k,) joint rates with phase lead, for the delay of the valves [rad/s].
         measured: (2, 5) pose of the measured joints and its filtered rate.
-        command: (3, 6) last packet: handle, its rate, hand's force.
-        force_integral: (5,) of the hand's force, for four channels under rate control.
-        asked: (5,) integral of the rate that the handle asks for, for the same [m], [rad].
-        flags: (4,) whether it is held at the edge, the line silent, the valves closed for good; age
-            of the last packet [s].
-        line: (5, 10) as of `master.MasterState.line`, in the scale of the handle.
+        command: (3, 6) last packet: handle, its rate, hand force.
+        force_integral: (5,) integral of the hand force, for four channels under rate control.
+        asked: (5,) integral of the commanded rate, for four channels under rate control [m], [rad].
+        flags: (4,) whether the reference is held at the workspace edge, no packets arrive, the
+            valves are closed permanently; age of the last packet [s].
+        line: (5, 10) see `master.MasterState.line`, in the scale of the handle.
     """
 
     pose: np.ndarray
@@ -125,7 +125,7 @@ class SlaveState(NamedTuple):
 
 @compiled
 def unpack_slave(flat, k):
-    """The parts of `flat_view(Slave)`.
+    """Return the parts of `flat_view(Slave)`.
 
     Args:
         flat: (24 + 14 k,) array.
@@ -146,7 +146,7 @@ def unpack_slave(flat, k):
 
 @compiled
 def unpack_slave_state(flat, k):
-    """The parts of `flat_view(SlaveState)`.
+    """Return the parts of `flat_view(SlaveState)`.
 
     Args:
         flat: (102 + 3 k,) array.
@@ -173,27 +173,27 @@ def unpack_slave_state(flat, k):
     )  # fmt: skip
 
 
-SMOOTH = 15.0  # rad/s, position control: what a command of 200 Hz steps is smoothed with
-_TRICKLE = 1e-3  # W, what a hand does not notice: of passivity control
-_BRAKE = 0.8  # of the acceleration: the rest makes up for the filter's lag
-AHEAD = 0.02  # s over which the change of a rate is averaged before it is looked ahead
-_BLEND = 30.0  # rad/s, of measured task rates from held angles
+SMOOTH = 15.0  # rad/s, smoothing of the 200 Hz command steps under position control
+_TRICKLE = 1e-3  # W of passivity control, not noticeable by a hand
+_BRAKE = 0.8  # fraction of the acceleration limit; the rest compensates the filter's lag
+AHEAD = 0.02  # s, averaging time of the rate's change for the phase lead
+_BLEND = 30.0  # rad/s, bandwidth of the measured task rates
 
 
 def slave(
     machine: Machine, pilot: TeleopPilot, numbers: Master, joints: np.ndarray, lead: float = 0.0
 ) -> tuple[Slave, SlaveState]:
-    """Numbers and first state of the slave's side.
+    """Build parameters and initial state of the slave side.
 
     Args:
-        machine: the machine, with an arm.
-        pilot: the scenario's.
-        numbers: of the master.
-        joints: (k,) where its arm stands, from swing outwards [rad].
-        lead: by which the drives' velocities are asked for earlier [s].
+        machine: machine with an arm.
+        pilot: teleoperation settings of the scenario.
+        numbers: parameters of the master.
+        joints: (k,) initial positions of the arm's joints, from swing outwards [rad].
+        lead: phase lead of the drives' velocities [s].
 
     Returns:
-        Both.
+        Parameters and state.
 
     Raises:
         InputError: the machine has no arm.
@@ -226,13 +226,13 @@ def slave(
 
 @compiled
 def measure_task(numbers, joint, fresh, elapsed, s):
-    """Pose and rate of the tip from measured joint angles.
+    """Compute pose and rate of the tip from measured joint angles.
 
     Args:
         numbers: Slave.
         joint: (k,) measured [rad].
         fresh: whether there is a new sample, scalar.
-        elapsed: since the last one, scalar [s].
+        elapsed: time since the last sample, scalar [s].
         s: SlaveState; `measured` is written.
 
     Returns:
@@ -256,14 +256,14 @@ def measure_task(numbers, joint, fresh, elapsed, s):
 
 @compiled
 def update_references(numbers, packet, arrived, force, joint, period, s):
-    """Joint references of this period from what the master says.
+    """Compute the joint references of this period from the master's packet.
 
     Args:
         numbers: Slave.
         packet: (3, 6) handle's displacement [m], [rad], its rate, the hand's force [N], [N m].
-        arrived: whether a packet came this period, scalar.
-        force: (k,) of the environment on the tip, task coordinates [N], [N m].
-        joint: (k,) measured, at which an inverse Jacobian is taken [rad].
+        arrived: whether a packet arrived in this period, scalar.
+        force: (k,) force of the environment on the tip, task coordinates [N], [N m].
+        joint: (k,) measured joints, at which an inverse Jacobian is evaluated [rad].
         period: scalar [s].
         s: SlaveState; references and flags are written.
 
@@ -322,7 +322,7 @@ def update_references(numbers, packet, arrived, force, joint, period, s):
 
 @compiled
 def _wanted_rate(numbers, row, c, x, v, hand, force, period, s):
-    """Rate that the handle asks a coordinate for."""
+    """Return the rate of a coordinate that the handle commands."""
     if numbers.kind[0] == FOUR_CHANNEL:
         return _virtual_rate(numbers, row, c, x, v, hand, force, period, s)
     if numbers.kind[0] == WAVES or numbers.kind[0] == CONTROLLED:
@@ -337,9 +337,9 @@ def _wanted_rate(numbers, row, c, x, v, hand, force, period, s):
 
 @compiled
 def _placed_rate(numbers, row, c, x, period, s):
-    """Rate of a coordinate under position control: a critically damped filter of the handle.
+    """Return the rate under position control: a critically damped filter of the handle.
 
-    A long way is gone at the largest speed, and braked as the acceleration allows.
+    Over long distances it moves at maximum speed and brakes within the acceleration limit.
     """
     gap = row[SCALE] * x - (s.pose[c] - numbers.start[c])
     size = abs(gap)
@@ -354,7 +354,7 @@ def _placed_rate(numbers, row, c, x, period, s):
 
 @compiled
 def _virtual_rate(numbers, row, c, x, v, hand, force, period, s):
-    """Rate of the virtual slave of four channels, which hand, task and the master's place move.
+    """Return the rate of the four-channel virtual slave, moved by hand, task and master position.
 
     Under position control `M z'' = hand + ratio F + K (x - z) + B (x' - z')` with z = y / scale,
     under rate control `M y'' = k_v int hand + ratio F + K (k_v int x - y) + B (k_v x - y')`.
@@ -380,7 +380,7 @@ def _virtual_rate(numbers, row, c, x, v, hand, force, period, s):
 
 @compiled
 def _pulled_rate(numbers, row, c, total, budget, force, period, s):
-    """Rate of the virtual slave at a passive line, `M z'' = pull + ratio F`; z = y / scale."""
+    """Return the virtual slave's rate at a passive channel: `M z'' = pull + ratio F`."""
     gain, spring, damper, end = row[SCALE], row[SPRING], row[DAMPER], s.line[c]
     speed, mass = s.rate[c] / gain, numbers.limits[VIRTUAL_MASS] * row[LEVERAGE]
     if numbers.kind[0] == WAVES:
@@ -401,17 +401,17 @@ def _pulled_rate(numbers, row, c, total, budget, force, period, s):
 
 @compiled
 def watch(numbers, joint, s):
-    """Close the valves for good where a joint does not follow its reference.
+    """Close the valves permanently if a joint does not follow its reference.
 
     Args:
         numbers: Slave.
-        joint: (k,) measured [rad]; one that is not finite trips, too.
+        joint: (k,) measured [rad]; a value that is not finite also closes the valves.
         s: SlaveState; `flags` is written.
 
     Returns:
         Nothing.
 
-    Source: following-error monitor, as drives have it.
+    Source: following-error monitor, common in servo drives.
     """
     for i in range(len(joint)):
         if not abs(joint[i] - s.joint[i]) <= numbers.limits[FOLLOWING]:
@@ -420,13 +420,13 @@ def watch(numbers, joint, s):
 
 @compiled
 def report(numbers, force, s, packet):
-    """What the master is told: force, places and speeds against the start.
+    """Write the machine's packet: force, and positions and speeds relative to the start.
 
     Args:
         numbers: Slave.
-        force: (k,) at the tip, task coordinates [N], [N m].
+        force: (k,) tip force in task coordinates [N], [N m].
         s: SlaveState.
-        packet: (8, k) written, all but the last three rows.
+        packet: (8, k) written, except for the last three rows.
 
     Returns:
         Nothing.
@@ -449,7 +449,7 @@ def report(numbers, force, s, packet):
 
 @compiled
 def slave_step(numbers, packet, arrived, force, joint, period, s):
-    """One period of the slave's side: references of the joints, and whether they are followed.
+    """Run one period of the slave side: joint references and following-error check.
 
     Args:
         numbers: Slave.

@@ -1,10 +1,10 @@
-"""A teleoperated run: operator, joystick, line and resolved motion, one control period at a time.
+"""Closed-loop teleoperation system: operator, joystick, channel and machine, period by period.
 
-Signals go once around: the machine's sensors tell the force at its tip; a packet with it comes to
-the master, late; the joystick reflects it; the operator feels, sees and pushes; where the handle is
-goes to the machine in another packet, late; there it becomes joint references.
+In every control period the machine's sensors give the tip force. A delayed packet transmits it to
+the master, and the joystick reflects it. The operator perceives and pushes. A second delayed packet
+transmits the handle's motion to the machine, where it becomes joint references.
 
-What the operator's station saw and did, by control tick, and its channels for the logs.
+The module also records the signals of the loop by control tick, as channels for the logs.
 """
 
 import math
@@ -61,9 +61,11 @@ from hydrotele.teleop.slave import (
 )
 
 Exchange = Callable[[np.ndarray, np.ndarray, float, np.ndarray], None]
-"""What a device does once per control tick: writes where its handle is, (7,) as the flotor's [m]
-and quaternion, not a number without one; and takes the machine's packet (rows, k), the share of it
-that counts, and the further force on the handle (6,) [N], [N m]."""
+"""Function that connects a device, called once per control tick.
+
+It writes the handle's pose (7,) [m] and quaternion, NaN without a device. It receives the machine's
+packet (rows, k), the factor on it, and the additional force on the handle (6,) [N], [N m].
+"""
 
 
 _LENGTHS = ("m", "m", "m", "rad", "rad", "rad")
@@ -74,25 +76,25 @@ _TASK = {"r": ("m", "N"), "theta": ("rad", "N m"), "z": ("m", "N"), "attitude": 
 
 
 class StationLog:
-    """Arrays over the run, of n ticks.
+    """Recorded signals of a run of n ticks.
 
     Attributes:
         coordinates: k task coordinates.
-        force: (n, k) at the tip as it is felt, task coordinates [N], [N m].
+        force: (n, k) estimated tip force, task coordinates [N], [N m].
         muscles: (n, 6) forces of the operator on the handle [N], [N m].
-        touching: (n,) whether the machine touches something.
+        touching: (n,) whether the machine is in contact.
     """
 
     def __init__(
         self, ticks: int, coordinates: tuple[str, ...], m: MasterState, s: SlaveState
     ) -> None:
-        """Make room.
+        """Allocate the arrays.
 
         Args:
             ticks: number of control ticks.
             coordinates: task coordinates of the arm.
-            m: the master's state, which is kept every tick.
-            s: the slave's.
+            m: state of the master, which is recorded every tick.
+            s: state of the slave, which is recorded every tick.
         """
         self.coordinates = coordinates
         self._m, self._s, self._one, self._two = m, s, flat_view(m), flat_view(s)
@@ -102,26 +104,26 @@ class StationLog:
         self.touching = np.zeros(ticks, np.int64)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """What `round_trip` writes a row of after the operator's half of a tick."""
+        """Return the arrays to which `round_trip` writes a row per tick."""
         return {"log_master": self._master, "log_slave": self._slave, "log_force": self.force,
                 "log_muscles": self.muscles, "touching": self.touching}  # fmt: skip
 
     def cut(self, ticks: int) -> None:
-        """Keep the first ticks only."""
+        """Keep only the first ticks."""
         self._master, self._slave = self._master[:ticks], self._slave[:ticks]
         self.force, self.muscles = self.force[:ticks], self.muscles[:ticks]
         self.touching = self.touching[:ticks]
 
     def master(self, name: str) -> np.ndarray:
-        """(n, ...) of a field of MasterState, as `handle`."""
+        """Return a field of MasterState, (n, ...), such as `handle`."""
         return _field(self._master, self._m, name)
 
     def slave(self, name: str) -> np.ndarray:
-        """(n, ...) of a field of SlaveState, as `pose`."""
+        """Return a field of SlaveState, (n, ...), such as `pose`."""
         return _field(self._slave, self._s, name)
 
     def channels(self, every: int, rows: int) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-        """Channels of the measured log.
+        """Return the channels of the measured log.
 
         Args:
             every: control ticks per row.
@@ -163,36 +165,36 @@ def _field(table: np.ndarray, state, name: str) -> np.ndarray:
     raise KeyError(name)
 
 
-_FADE = 0.2  # s in which the reflected force dies out when the line is silent
+_FADE = 0.2  # s, fade-out time of the reflected force when no packets arrive
 
 
 class Station:
-    """Operator's station of a run.
+    """Closed-loop teleoperation system of one run.
 
     Attributes:
         coordinates: task coordinates of the arm.
-        log: what it saw and did, by control tick.
-        notes: what the user should know: trips, silence, edges.
-        tripped: whether the valves were closed for good.
+        log: recorded signals by control tick.
+        notes: messages for the user: trips, missing packets, workspace edge.
+        tripped: whether the valves were closed permanently.
     """
 
     def __init__(
         self, plant: Plant, data: mujoco.MjData, scenario: Scenario, plan: Plan,
         drives: DriveReferences, seen: Feedback, hand: Hand | None = None,
     ) -> None:  # fmt: skip
-        """Put everything in place.
+        """Build the loop for a run.
 
         Args:
             plant: the simulated machine.
-            data: its state.
-            scenario: with a teleoperated pilot.
+            data: state of the simulation.
+            scenario: scenario with a teleoperated pilot.
             plan: references of the run, written tick by tick.
-            drives: those of the drives, written tick by tick.
-            seen: what the machine's sensors say, refreshed before every tick.
-            hand: where a live operator wants the handle.
+            drives: references of the drives, written tick by tick.
+            seen: sensor readings of the machine, refreshed before every tick.
+            hand: input of a live operator.
 
         Raises:
-            InputError: joystick, gains or arm do not fit each other, a live operator without hand.
+            InputError: joystick, gains and arm are not compatible, or a live operator has no input.
         """
         pilot = scenario.pilot
         assert isinstance(pilot, TeleopPilot)
@@ -215,7 +217,7 @@ class Station:
         self._task, self._pose = _task(pilot, seen, self._period, len(axes)), np.zeros(5)
         self._true = pilot.force == "true"
         self._force = self._feel.force if self._feel and not self._true else np.zeros(len(axes))
-        self._owners = plant.model, surrounding_geoms(plant)  # whose memory the addresses are
+        self._owners = plant.model, surrounding_geoms(plant)  # keep the memory of addresses alive
         self._contacts = contact_record(plant.model, data, self._owners[1])
         self.log = StationLog(scenario.ticks, self.coordinates, self._m, self._s)
         self.operator = OperatorModel(
@@ -236,7 +238,7 @@ class Station:
         self._fill_record(swing, scenario.servo.feedforward)
 
     def _addressed(self, machine: Machine, drives: DriveReferences) -> dict[str, np.ndarray]:
-        """Arrays of `round_trip`."""
+        """Return the arrays whose addresses `round_trip` uses."""
         plan, data, line = self._plan, self._data, self._line
         grid, table = drive_tables(machine, plan.axes)
         assert plan.pose is not None
@@ -253,7 +255,7 @@ class Station:
         }  # fmt: skip
 
     def _fill_record(self, swing: int, scale: float) -> None:
-        """Sizes of the arrays, degree of freedom of the cab, scale of drive velocities."""
+        """Set the sizes of the arrays, the cab's degree of freedom and the drive velocity scale."""
         sizes = {name: len(array) for name, array in self._arrays.items()}
         for name, value in {
             "axes": sizes["joint"], "joints": sizes["columns"], "ticks": sizes["reference"],
@@ -270,9 +272,9 @@ class Station:
             self._record[name] = value
 
     def attach(self, exchange: Exchange) -> None:
-        """Let a device in a person's hand take the place of the simulated joystick.
+        """Replace the simulated joystick by a real device.
 
-        Its own loop reflects what comes back; here the same law runs once more, for the logs.
+        The device's own loop computes its force; here the same law runs again, for the logs.
 
         Args:
             exchange: called once per control tick, see `Exchange`.
@@ -282,29 +284,29 @@ class Station:
 
     @property
     def numbers(self) -> Master:
-        """Numbers of the master's control."""
+        """Parameters of the master's control."""
         return self._master
 
     @property
     def master_state(self) -> MasterState:
-        """State of the master's control, rewritten every tick."""
+        """State of the master's control, updated every tick."""
         return self._m
 
     @property
     def packet(self) -> np.ndarray:
-        """(rows, k) the last packet that came from the machine, see `teleop.master`."""
+        """Last packet from the machine (rows, k), see `teleop.master`."""
         return self._line.packet
 
     @property
     def span(self) -> np.ndarray:
-        """(2, 6) edge of the dead band and stop of every axis of the joystick [m], [rad]."""
+        """Dead-band edge and stop of every joystick axis (2, 6) [m], [rad]."""
         return self._master.axis[:, [DEADBAND, REACH]].T
 
     def prepare(self, tick: int) -> None:
-        """Do before `round_trip` what native code does not: feel, decide, exchange with a device.
+        """Run the Python part of a tick before `round_trip`: estimate, decide, exchange data.
 
         Args:
-            tick: the control tick.
+            tick: number of the control tick.
         """
         seen, operator, pilot = self._seen, self.operator, self._pilot
         for fault in self._faults:
@@ -326,17 +328,17 @@ class Station:
             operator.decide(tick)
 
     def until(self, tick: int) -> int:
-        """The next tick after this one that is to be prepared."""
+        """Return the next tick that needs `prepare`."""
         if self._exchange or self._every_tick:
             return tick + 1
         every = math.gcd(self.operator.every, self._seen.every)
         return tick - tick % every + every
 
     def notice(self, tick: int) -> bool:
-        """Look whether all is well, before the machine moves; whether the valves are to be closed.
+        """Run the safety checks before the machine moves; return whether to close the valves.
 
         Args:
-            tick: one of which `round_trip` says something, or a multiple of `CHECKED`.
+            tick: one for which `round_trip` returned true, or a multiple of `CHECKED`.
         """
         self._check(tick)
         return self.tripped
@@ -347,7 +349,7 @@ class Station:
         return self._record, self._flotor.record
 
     def _felt(self, fresh: bool) -> None:
-        """Force at the tip, and what the task is like if that is reflected."""
+        """Update the tip force, and the task impedance if it is reflected."""
         seen = self._seen
         if self._feel and fresh:
             self._feel.update(seen.joint, seen.head, seen.rod)
@@ -361,7 +363,7 @@ class Station:
             self._line.back[:, TASK_MASS] = self._task.mass
 
     def summary(self) -> dict[str, float | int | bool | None]:
-        """Figures of the run: energy at the handle, currents, how far it was used, trips."""
+        """Return statistics of the run: handle energy, currents, largest displacements, trips."""
         handle, energy = np.abs(self.log.master("handle")), self._m.energy
         return {
             "handle_energy_J": float(energy[0]),
@@ -376,12 +378,12 @@ class Station:
         }
 
     def _check(self, tick: int) -> None:
-        """Close the valves where something is not as it must be; say why, once."""
+        """Close the valves if a check fails, and report the reason once."""
         now, s = tick * self._period, self._s
         if s.flags[BLOCKED] and "edge" not in self._said:
-            self._say("edge", f"resolved motion stood at the edge of the workspace at {now:.2f} s")
+            self._say("edge", f"resolved motion held at the edge of the workspace at {now:.2f} s")
         if s.flags[SILENT] and "silent" not in self._said:
-            self._say("silent", f"no packet came for a while at {now:.2f} s: rates went to zero")
+            self._say("silent", f"packets are missing at {now:.2f} s: rates set to zero")
         why = ""
         if s.flags[TRIPPED]:
             error = np.abs(self._seen.joint[self.columns] - s.joint)
@@ -389,17 +391,17 @@ class Station:
             why = f"{name} does not follow its reference"
         elif self._feel and self._sensors and tick % CHECKED == 0:
             frozen = self._feel.frozen(self._pilot.safety.frozen)
-            why = f"the sensor {frozen[0]} always reads the same" if frozen else ""
+            why = f"the readings of sensor {frozen[0]} are constant" if frozen else ""
         if why and not self.tripped:
             self.tripped = True
-            self._say("trip", f"valves closed for good at {now:.2f} s: {why}")
+            self._say("trip", f"valves closed permanently at {now:.2f} s: {why}")
 
     def _say(self, key: str, sentence: str) -> None:
         self._said.add(key)
         self.notes.append(sentence)
 
     def _true_force(self) -> None:
-        """The simulator's own contact force in task coordinates, without moments of the tool."""
+        """Write the simulator's contact force in task coordinates, without moments of the tool."""
         self._force[:] = 0.0
         if not self._data.ncon:
             return
@@ -412,7 +414,7 @@ class Station:
 
 
 class _Fault:
-    """A sensor that freezes."""
+    """Freeze the reading of a sensor from a given time on."""
 
     def __init__(self, fault: Fault, axes: tuple[str, ...]) -> None:
         kind, _, axis = fault.channel.partition(".")
@@ -425,7 +427,7 @@ class _Fault:
         self._value: float | None = None
 
     def freeze(self, time: float, seen: Feedback) -> None:
-        """Put the frozen reading in the place of the live one."""
+        """Replace the live reading by the frozen one."""
         readings = getattr(seen, self._name)
         if time < self._at:
             return
@@ -444,7 +446,7 @@ def _estimator(
     period: float,
     sensors: SensorSet | None,
 ) -> EndpointForce | None:
-    """What tells the force at the tip, and that a sensor is frozen; none where neither is asked."""
+    """Create the estimator of the tip force; None if neither force nor sensor checks need it."""
     if pilot.force == "true" and sensors is None:
         return None
     kind = "static" if pilot.force == "true" else pilot.force
@@ -459,7 +461,7 @@ def _hertz(pilot: TeleopPilot) -> float:
 
 
 def _task(pilot: TeleopPilot, seen: Feedback, period: float, k: int) -> TaskImpedance | None:
-    """What identifies the task where that is reflected."""
+    """Create the estimator of the task impedance; None if it is not reflected."""
     if pilot.reflection != "impedance":
         return None
     bands = (2.0 * _hertz(pilot), _hertz(pilot))
@@ -467,17 +469,17 @@ def _task(pilot: TeleopPilot, seen: Feedback, period: float, k: int) -> TaskImpe
 
 
 def _beside(scenario: Scenario, name: str) -> str:
-    """A joystick's file, counted from the scenario's."""
+    """Return a joystick's file, relative to the scenario's folder."""
     path = Path(scenario.folder, name)
     return str(path) if name != "joystick" and path.is_file() else name
 
 
 def _line(pilot: TeleopPilot, scenario: Scenario, k: int) -> Line:
-    """Empty delay lines, and the packets that will be lost."""
+    """Create empty delay buffers, and the ages of arriving packets."""
     channel, period = pilot.channel, 1.0 / scenario.control_rate
     for name in ("delay_forward", "delay_back"):
         if (delay := getattr(channel, name)) >= scenario.duration:
-            message = f"{delay:g} s is as long as the run ({scenario.duration:g} s)"
+            message = f"{delay:g} s is not shorter than the run ({scenario.duration:g} s)"
             raise InputError(f"pilot.channel.{name}", message)
     delays = _delays(scenario, channel, period)
     rng = np.random.default_rng([scenario.seed, 404])
@@ -494,14 +496,14 @@ def _line(pilot: TeleopPilot, scenario: Scenario, k: int) -> Line:
 
 
 def _delays(scenario: Scenario, channel: Channel, period: float) -> np.ndarray:
-    """Delays of all packets in ticks (ticks, 2), forward and back; -1 for those that get lost."""
+    """Return the delays of all packets in ticks (ticks, 2), forward and back; -1 if lost."""
     ticks = scenario.ticks
     if channel.trace:
         path = Path(scenario.folder, channel.trace)
         measured = np.stack(load_delays(path), axis=1)
         found = in_periods(measured, period)
         if np.any(found.max(axis=0) < 0):
-            raise InputError(path, "all packets of one way are lost; nothing can be steered so")
+            raise InputError(path, "all packets of one direction are lost; steering is impossible")
         return np.resize(found, (ticks, 2))
     steady = np.array([channel.delay_forward, channel.delay_back])
     if not channel.jitter:

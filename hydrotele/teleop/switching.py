@@ -1,9 +1,9 @@
-"""Stiffness feedback at its worst: a spring that is soft on the way out and stiff on the way back.
+"""Worst case of stiffness feedback: a spring that is soft outwards and stiff inwards.
 
-Where a spring's stiffness may change at any time between two bounds, no change feeds the motion
-more than this one, because at every point of the phase plane it turns the path outwards most. A
-joystick that survives it survives every contact and delay that keep to the bounds, with the hand's
-mass, damper and spring as they are stated; for hands that differ it has to be asked again.
+If a spring's stiffness may change at any time between two bounds, this switching adds the most
+energy to the motion. At every point it turns the phase-plane path outwards as far as possible. A
+joystick that is stable with it is stable with every contact and delay within the bounds, for the
+given mass, damper and spring of the hand. Other hands need a separate analysis.
 """
 
 import math
@@ -16,8 +16,8 @@ from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
 from hydrotele.teleop.two_port import Impedance, stiffness_margin
 
-_PER_RATE = 0.01  # steps over the time constant of the fastest rate
-_DEAD = 1e-9  # of speed or displacement at the start of a half, below which it does not arrive
+_PER_RATE = 0.01  # integration steps per time constant of the fastest mode
+_DEAD = 1e-9  # minimum speed or displacement, relative to the start of a half swing
 _MOST_STEPS = 10_000_000
 
 
@@ -40,7 +40,7 @@ class Spring:
     most: float
 
     def __post_init__(self) -> None:
-        """Refuse what is no spring and mass."""
+        """Raise InputError unless mass, damping and stiffness range are valid."""
         if not (self.mass > 0.0 and self.damping >= 0.0):
             raise InputError("stiffness", "mass must be positive, damping not negative")
         if not 0.0 <= self.least <= self.nominal <= self.most:
@@ -50,7 +50,7 @@ class Spring:
             )  # fmt: skip
 
     def held(self, hand: Impedance) -> "Spring":
-        """The same in an operator's hand, whose mass, damper and spring add to its own."""
+        """Return the axis held by a hand, whose mass, damper and spring are added."""
         stiff = hand.stiffness
         return Spring(
             self.mass + hand.mass, self.damping + hand.damping, self.nominal + stiff,
@@ -59,15 +59,16 @@ class Spring:
 
     @property
     def margin(self) -> float:
-        """`B^2 - 4 M K_max` [(N s/m)^2]; enough if positive, and K_min too (Zhu 1994, 4.14)."""
+        """`B^2 - 4 M K_max` [(N s/m)^2]; sufficient if positive and K_min > 0 (Zhu 1994, 4.14)."""
         return stiffness_margin(self.mass, self.damping, self.most)
 
     @property
     def stable_by(self) -> str:
-        """What makes it stable: `theorem`, `switching bound`, or `nothing`.
+        """Criterion that proves stability: `theorem`, `switching bound`, or `nothing`.
 
-        Theorem 4-2 asks for `B > 0`, `K_min > 0` and `B^2 > 4 M K_max`. The switching bound asks
-        that the worst switching dies out, which is necessary as well as sufficient.
+        Theorem 4-2 requires `B > 0`, `K_min > 0` and `B^2 > 4 M K_max`. The switching bound
+        requires that the motion under the worst switching decays, which is necessary and
+        sufficient.
         """
         if self.least > 0.0 and self.damping > 0.0 and self.margin > 0.0:
             return "theorem"
@@ -75,7 +76,7 @@ class Spring:
 
     @property
     def least_damping(self) -> float:
-        """Damping at which the worst switching neither grows nor dies out [N s/m]."""
+        """Damping at which motion under the worst switching neither grows nor decays [N s/m]."""
         if self.least <= 0.0:
             return math.inf
         if self.least == self.most:
@@ -90,20 +91,20 @@ class Spring:
 
     @property
     def growth(self) -> float:
-        """Speed after half a swing over that before, by `worst_growth`."""
+        """Speed ratio over half a swing, see `worst_growth`."""
         return worst_growth(self.mass, self.damping, self.least, self.most)
 
     @property
     def enough_damping(self) -> float:
-        """Damping for which the theorem holds [N s/m]."""
+        """Minimum damping for which the theorem holds [N s/m]."""
         return 2.0 * math.sqrt(self.mass * self.most)
 
 
 def worst_growth(mass: float, damping: float, least: float, most: float) -> float:
-    """Simulate half a swing with the worst switching of the stiffness.
+    """Return the growth of the speed over half a swing under the worst switching.
 
-    The motion is linear between switches, so that every half swing grows by the same factor: below
-    1 the axis comes to rest, however the stiffness changes.
+    The motion is linear between switches, so that every half swing grows by the same factor. Below
+    1 the axis comes to rest for any change of the stiffness.
 
     Args:
         mass: M [kg].
@@ -112,8 +113,8 @@ def worst_growth(mass: float, damping: float, least: float, most: float) -> floa
         most: stiffness inwards, K_max [N/m].
 
     Returns:
-        Speed through the centre over that half a swing before [1]; 0 where it does not come back to
-        the centre, infinite where it never turns.
+        Speed through the centre relative to that half a swing earlier [1]; 0 if it does not return
+        to the centre, infinite if it never turns.
 
     Source: Zhu 1994, 4.2 (the switching that drives a spring unstable).
 
@@ -129,7 +130,7 @@ def worst_growth(mass: float, damping: float, least: float, most: float) -> floa
 
 
 def growth_map(mass: float, least: float, dampings: np.ndarray, stiffest: np.ndarray) -> np.ndarray:
-    """Growth of half a swing over damping and K_max.
+    """Compute the growth over half a swing on a grid of damping and K_max.
 
     Args:
         mass: M [kg].
@@ -138,7 +139,7 @@ def growth_map(mass: float, least: float, dampings: np.ndarray, stiffest: np.nda
         stiffest: (m,) K_max [N/m], none below K_min.
 
     Returns:
-        (m, n) as of `worst_growth`.
+        (m, n), see `worst_growth`.
     """
     return np.array([[worst_growth(mass, b, least, k) for b in dampings] for k in stiffest])
 

@@ -1,10 +1,9 @@
-"""A bilateral teleoperator as a linear two-port: what is felt, whether it is passive and stable.
+"""Bilateral teleoperator as a linear two-port: transparency, passivity and stability.
 
 Master and slave are masses, `Z = M s`, with controllers `C = B + K/s`; four channels join them:
-velocity forward C1, force back C2, force forward C3, velocity back C4. In and out go the hand's
-force and velocity and the environment's.
-
-Whether a teleoperator with hand, task and delays is stable: unstable poles by Nyquist.
+velocity forward C1, force back C2, force forward C3, velocity back C4. The ports are the hand's
+force and velocity and the environment's. The number of unstable poles of the loop with hand, task
+and delays follows from the Nyquist criterion.
 """
 
 import math
@@ -37,25 +36,25 @@ class Impedance:
     stiffness: float = 0.0
 
     def __call__(self, s: np.ndarray) -> np.ndarray:
-        """Impedance [N s/m] at complex frequencies [rad/s]."""
+        """Return the impedance [N s/m] at complex frequencies [rad/s]."""
         return self.mass * s + self.damping + self.stiffness / s
 
 
 @dataclass(frozen=True)
 class TwoPort:
-    """A teleoperator.
+    """Two-port of a teleoperator.
 
     Attributes:
         master: impedance of the master.
         slave: impedance of the slave.
-        master_control: C_m, what the master's controller makes of its own velocity.
-        slave_control: C_s.
+        master_control: C_m, the master's controller on its own velocity.
+        slave_control: C_s, the slave's controller on its own velocity.
         velocity_forward: C1.
         force_back: C2.
         force_forward: C3.
         velocity_back: C4.
-        delay_forward: from the master to the slave [s].
-        delay_back: from the slave to the master [s].
+        delay_forward: delay from the master to the slave [s].
+        delay_back: delay from the slave to the master [s].
     """
 
     master: Impedance
@@ -70,7 +69,7 @@ class TwoPort:
     delay_back: float = 0.0
 
     def channels(self, s: np.ndarray) -> tuple[np.ndarray, ...]:
-        """C1 .. C4 at complex frequencies, with their delays."""
+        """Return C1 .. C4 at complex frequencies, with their delays."""
         late, back = np.exp(-s * self.delay_forward), np.exp(-s * self.delay_back)
         return (
             self.velocity_forward(s) * late, self.force_back(s) * back,
@@ -80,12 +79,12 @@ class TwoPort:
 
 @dataclass(frozen=True)
 class Gains:
-    """Gains of a structure.
+    """Gains of the channels of a structure.
 
     Attributes:
-        position: of the slave's position over the master's [1].
-        velocity: of the slave's velocity over the master's position, k_v [1/s].
-        force: of the force that comes back over the environment's [1].
+        position: slave position per master position [1].
+        velocity: slave velocity per master position, k_v [1/s].
+        force: reflected force per environment force [1].
     """
 
     position: float = 1.0
@@ -98,28 +97,28 @@ def two_port(
     slave_control: Impedance, gains: Gains | None = None, *, delay_forward: float = 0.0,
     delay_back: float = 0.0, jerk: bool = False,
 ) -> TwoPort:  # fmt: skip
-    """A teleoperator of a known structure.
+    """Build the two-port of a teleoperator with a known structure.
 
     Args:
         structure: `position_position` (coordinating force), `position_force` (direct force),
             `four_channel_position` (transparent), and the same under rate control:
             `rate_position`, `rate_force`, `four_channel_rate`.
-        master: its mass and what rubs on it.
-        slave: the same of the slave.
+        master: mass and friction of the master.
+        slave: mass and friction of the slave.
         master_control: damper and spring of the master's controller.
         slave_control: damper and spring of the slave's controller.
-        gains: of the channels; those that a structure has not do not matter.
-        delay_forward: from the master to the slave [s].
-        delay_back: from the slave to the master [s].
+        gains: gains of the channels; those that the structure does not have are ignored.
+        delay_forward: delay from the master to the slave [s].
+        delay_back: delay from the slave to the master [s].
         jerk: whether the four-channel structure under rate control uses the master's jerk, which
-            makes it fully transparent and cannot be measured. Without, both sides' inertia is left
-            out of the channels, and of equal sides the master itself is felt, too.
+            makes it fully transparent and cannot be measured. Without jerk the channels contain no
+            inertia of either side, and for equal sides the master's inertia is displayed as well.
 
     Returns:
         The two-port.
 
     Raises:
-        InputError: the structure is not known, a gain or a delay makes no sense.
+        InputError: the structure is not known, or a gain or a delay is invalid.
 
     Source: Lawrence 1992; Zhu 1994, 3.9-3.62.
 
@@ -168,7 +167,7 @@ def two_port(
 
 
 def hybrid(port: TwoPort, s: np.ndarray | complex) -> np.ndarray:
-    """Hybrid matrix H of `[F_h, -V_e] = H [V_h, F_e]`.
+    """Return the hybrid matrix H of `[F_h, -V_e] = H [V_h, F_e]`.
 
     Args:
         port: the two-port.
@@ -187,7 +186,7 @@ def hybrid(port: TwoPort, s: np.ndarray | complex) -> np.ndarray:
 
 
 def transmitted(port: TwoPort, s: np.ndarray | complex, environment: Block) -> np.ndarray:
-    """Impedance that the operator feels.
+    """Return the impedance that is transmitted to the operator.
 
     Args:
         port: the two-port.
@@ -205,12 +204,12 @@ def transmitted(port: TwoPort, s: np.ndarray | complex, environment: Block) -> n
 
 
 def scattering_norm(port: TwoPort, s: np.ndarray | complex, unit: float = 1.0) -> np.ndarray:
-    """Largest singular value of the scattering matrix; passive where it stays at or below 1.
+    """Return the largest singular value of the scattering matrix, at most 1 for a passive port.
 
     Args:
         port: the two-port.
-        s: (...) points of the imaginary axis [rad/s].
-        unit: impedance by which forces are counted as velocities [N s/m]; passivity does not
+        s: (...) points on the imaginary axis [rad/s].
+        unit: reference impedance that scales forces to velocities [N s/m]; passivity does not
             depend on it.
 
     Returns:
@@ -222,7 +221,7 @@ def scattering_norm(port: TwoPort, s: np.ndarray | complex, unit: float = 1.0) -
 
 
 def hybrid_scattering_norm(matrix: np.ndarray, unit: float = 1.0) -> np.ndarray:
-    """`scattering_norm` of hybrid matrices (..., 2, 2)."""
+    """Return `scattering_norm` of hybrid matrices (..., 2, 2)."""
     h = matrix * np.array([[1.0 / unit, 1.0], [1.0, unit]])
     one = np.eye(2)
     scatter = np.diag([1.0, -1.0]) @ (h - one) @ np.linalg.inv(h + one)
@@ -232,7 +231,7 @@ def hybrid_scattering_norm(matrix: np.ndarray, unit: float = 1.0) -> np.ndarray:
 def characteristic(
     port: TwoPort, s: np.ndarray | complex, hand: Block, environment: Block
 ) -> np.ndarray:
-    """What is 0 at the poles of the whole loop: hand, teleoperator and task.
+    """Return the characteristic function of hand, teleoperator and task, which is 0 at the poles.
 
     Args:
         port: the two-port.
@@ -253,15 +252,15 @@ def characteristic(
 
 
 def stiffness_margin(mass: float, damping: float, stiffest: float) -> float:
-    """Margin of the theorem of stiffness feedback, `B^2 - 4 M K_max`.
+    """Return the margin of the stability theorem of stiffness feedback, `B^2 - 4 M K_max`.
 
-    `M x'' + B x' + K(t) x = 0` with a stiffness that stays between `K_min > 0` and K_max is
-    uniformly asymptotically stable if the margin and B are positive, however fast the stiffness
-    changes, and whatever delay or task changes it. With `K_min = 0` the theorem says nothing.
+    `M x'' + B x' + K(t) x = 0` with a stiffness between `K_min > 0` and K_max is uniformly
+    asymptotically stable if the margin and B are positive, for any rate of change of the stiffness,
+    and for any delay or task that causes it. The theorem does not cover `K_min = 0`.
 
     Args:
-        mass: of joystick and hand, M [kg] or [kg m^2].
-        damping: of both, B [N s/m] or [N m s/rad].
+        mass: mass of joystick and hand, M [kg] or [kg m^2].
+        damping: damping of both, B [N s/m] or [N m s/rad].
         stiffest: K_max [N/m] or [N m/rad].
 
     Returns:
@@ -279,41 +278,42 @@ def _scaled(block: Block, factor: float) -> Block:
     return lambda s: factor * block(s)
 
 
-_ORIGIN = 4  # poles at 0 that blocks with springs and integrators can have together
-_TURN = 0.3  # rad by which the phase may turn from one frequency to the next
-_FIRST = 4000  # frequencies to begin with
+_ORIGIN = 4  # maximum number of poles at 0 of blocks with springs and integrators
+_TURN = 0.3  # rad, maximum phase change between neighbouring frequencies
+_FIRST = 4000  # initial number of frequencies
 _MOST = 4_000_000
-_ASIDE = 1e-4  # of the lowest frequency, by which the contour keeps right of poles at 0
+_ASIDE = 1e-4  # distance of the contour from poles at 0, relative to the lowest frequency
 _WHERE_STABILITY = "stability"
 
 
 class OnTheAxis(InputError):
-    """A pole lies on the imaginary axis, so that turns cannot be counted."""
+    """A pole lies on the imaginary axis, so that encirclements cannot be counted."""
 
 
 def unstable_poles(
     port: TwoPort, hand: Block, environment: Block, *, lowest: float = 1e-3, highest: float = 1e4,
     masses: int = 2,
 ) -> int:  # fmt: skip
-    """Number of poles right of the imaginary axis.
+    """Return the number of poles in the right half-plane.
 
-    The characteristic function has no poles but those at 0, so that the turns of its phase along
-    the axis count its zeros. Poles at 0, such as the drift of a free slave, do not count.
+    The characteristic function has poles only at 0, so that the winding of its phase along the
+    imaginary axis counts its zeros. Poles at 0, such as the drift of a free slave, do not count.
 
     Args:
         port: the two-port.
         hand: impedance of the operator's hand.
         environment: impedance of the task.
-        lowest: frequency below which nothing is expected [rad/s].
-        highest: frequency above which masses rule [rad/s].
-        masses: that the loop must have, as the power of the frequency with which it grows.
+        lowest: frequency below which no poles are expected [rad/s].
+        highest: frequency above which the masses dominate [rad/s].
+        masses: minimum number of masses in the loop: the power of the frequency with which the
+            characteristic function grows.
 
     Returns:
         The number; for a loop whose delayed part is as strong as its masses, such as a four-channel
         structure with delay, the number below the highest frequency.
 
     Raises:
-        InputError: neither side has a mass, or the phase turns too fast to be followed.
+        InputError: a side has no mass, or the phase is not resolved.
 
     Source: argument principle; Zhu 1994, 3.13 (loop transfer functions LG1 and LG2).
     """
@@ -323,19 +323,19 @@ def unstable_poles(
 def unstable_held(
     port: TwoPort, environment: Block, *, lowest: float = 1e-3, highest: float = 1e4
 ) -> int:
-    """The same with the master's motion imposed, as by a hand of infinite impedance.
+    """Return the number of unstable poles while the master's motion is imposed.
 
     Args:
         port: the two-port.
         environment: impedance of the task.
-        lowest: as of `unstable_poles`.
-        highest: as of `unstable_poles`.
+        lowest: see `unstable_poles`.
+        highest: see `unstable_poles`.
 
     Returns:
-        The number of zeros of `Z_s + C_s + Z_e - C3 (C2 Z_e + C4)` right of the axis.
+        The number of zeros of `Z_s + C_s + Z_e - C3 (C2 Z_e + C4)` in the right half-plane.
 
     Raises:
-        InputError: as of `unstable_poles`.
+        InputError: see `unstable_poles`.
     """
 
     def whole(s: np.ndarray) -> np.ndarray:
@@ -347,12 +347,12 @@ def unstable_held(
 
 
 def stable(port: TwoPort, hand: Block, environment: Block) -> bool:
-    """Whether no pole lies right of the imaginary axis; see `unstable_poles`."""
+    """Return whether no pole lies in the right half-plane; see `unstable_poles`."""
     return unstable_poles(port, hand, environment) == 0
 
 
 def _zeros(function: Block, lowest: float, highest: float, least_order: int) -> int:
-    """Zeros right of the axis of a function that has no poles but at 0."""
+    """Count the zeros in the right half-plane of a function that has poles only at 0."""
     shift = _ASIDE * lowest
     order = _order(function, highest, least_order)
 
@@ -370,12 +370,12 @@ def _zeros(function: Block, lowest: float, highest: float, least_order: int) -> 
             break
         if len(frequency) + len(wide) > _MOST:
             raise OnTheAxis(
-                _WHERE_STABILITY, "the phase cannot be followed: a pole lies on the axis"
+                _WHERE_STABILITY, "the phase is not resolved: a pole lies on the imaginary axis"
             )
         between = 0.5 * (frequency[wide] + frequency[wide + 1])
         if np.any(between == frequency[wide]):
             raise OnTheAxis(
-                _WHERE_STABILITY, "the phase cannot be followed: a pole lies on the axis"
+                _WHERE_STABILITY, "the phase is not resolved: a pole lies on the imaginary axis"
             )
         frequency = np.insert(frequency, wide + 1, between)
         values = np.insert(values, wide + 1, turned(between))
@@ -384,12 +384,12 @@ def _zeros(function: Block, lowest: float, highest: float, least_order: int) -> 
 
 
 def _order(function: Block, highest: float, least: int) -> int:
-    """Power of s with which the function grows; delays have died out far right."""
+    """Return the power of s with which the function grows; delays vanish far to the right."""
     far = highest * np.array([1e2, 1e3], complex)
     sizes = np.abs(function(far))
     order = round(float(np.log10(sizes[1] / sizes[0])))
     if order < least:
         raise InputError(
-            _WHERE_STABILITY, "master and slave need masses, a transparent one hand or task, too"
+            _WHERE_STABILITY, "master and slave need masses, a transparent one also hand or task"
         )
     return order

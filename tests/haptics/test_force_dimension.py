@@ -82,7 +82,7 @@ def test_abilities_are_those_of_the_model_and_small_for_an_unknown_one():
 
 
 def test_no_device_and_one_that_is_lost():
-    with pytest.raises(InputError, match="no device can be opened .no device found.: connect it"):
+    with pytest.raises(InputError, match="cannot open a device .no device found.: connect it"):
         ForceDimension(Dhd(connected=False))
     dhd = Dhd()
     device = ForceDimension(dhd)

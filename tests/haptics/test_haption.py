@@ -107,7 +107,7 @@ def test_no_device_one_that_is_lost_and_no_library(monkeypatch, tmp_path):
     for act in (device.read, lambda: device.write(np.zeros(6), True)):
         with pytest.raises(OSError, match="cable is out"):
             act()
-    with pytest.raises(InputError, match="does not take its settings .cable is out"):
+    with pytest.raises(InputError, match="the device rejects its settings .cable is out"):
         Haption(1e-3, library=api)
     assert api.calls[-1] == ("Close", 42)
     monkeypatch.delenv(LIBRARY, raising=False)

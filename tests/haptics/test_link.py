@@ -200,7 +200,7 @@ def test_the_machine_has_no_command_until_the_handle_was_centred(link, monkeypat
 def test_a_structure_that_needs_more_than_a_packet_is_refused():
     pilot = load_scenario("press_stiffness", {"pilot.reflection": "four_channel"}).pilot
     made = Link("127.0.0.1", 9)
-    with pytest.raises(InputError, match="'four_channel' does not go with a haptic device; valid"):
+    with pytest.raises(InputError, match="'four_channel' does not support haptic devices; valid"):
         made.start(*master(load_joystick(), pilot, COORDINATES), PACKET)
     made.close()
 

@@ -71,7 +71,7 @@ def test_ticks_one_by_one_are_those_of_a_run(asked):
     assert same(one.truth, run.truth) and same(one.measured, run.measured)
     assert one.summary["notes"] == run.summary["notes"]
     if "pilot.safety.following_error" in asked[1]:
-        assert any("closed for good" in note for note in run.summary["notes"])
+        assert any("closed permanently" in note for note in run.summary["notes"])
 
 
 def test_measured_keeps_the_truth_apart():

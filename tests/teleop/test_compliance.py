@@ -57,7 +57,7 @@ def test_every_axis_accelerates_as_its_own_second_order_system():
 
 
 def test_bodies_and_axes_that_cannot_be_are_refused():
-    with pytest.raises(InputError, match="no body"):
+    with pytest.raises(InputError, match="not physical"):
         Flotor(0.85, np.zeros(3), np.diag([1e-3, 1e-3, 5e-3]))
     with pytest.raises(InputError, match="six positive"):
         Axes(np.full(6, 25.0), np.zeros(6))

@@ -147,8 +147,8 @@ def test_every_structure_has_a_margin(reflection, mode):
 @pytest.mark.parametrize(
     ("reflection", "mode", "message"),
     [
-        ("four_channel", "rate", "observed force of the hand.*--structure four_channel_rate"),
-        ("wave_variables", "position", "as far as energy.*--structure wave_variables --robust"),
+        ("four_channel", "rate", "observed hand force.*--structure four_channel_rate"),
+        ("wave_variables", "position", "as received energy.*--structure wave_variables --robust"),
         ("passivity_control", "position", "--structure passivity_control --robust"),
         ("impedance", "rate", "identified and changes; .*direct_force"),
     ],
@@ -164,7 +164,7 @@ def test_structures_without_a_linear_case_say_why_and_what_to_do(reflection, mod
     ("overrides", "coordinate", "message"),
     [
         ({}, "head", "no 'head'; the arm has r, theta, z, attitude"),
-        ({"pilot__ratio": "0"}, None, "nothing comes back"),
+        ({"pilot__ratio": "0"}, None, "no force is reflected"),
     ],
 )
 def test_what_cannot_be_analysed(overrides, coordinate, message):

@@ -74,7 +74,7 @@ def test_a_fit_that_did_not_settle_tells_nothing(monkeypatch):
     fit = identify_operator(record(0), "gain")
     assert not any(one.identified for one in fit.estimates.values())
     assert all(one.high > 1e6 * one.low for one in fit.estimates.values())
-    assert "did not settle" in fit.notes[0] and fit.element == ""
+    assert "did not converge" in fit.notes[0] and fit.element == ""
 
 
 def write(path, made, rate=40.0, missing=(), header="Time [ms],target,response,hand"):
@@ -115,10 +115,10 @@ def test_a_force_serves_where_there_is_no_hand(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda r: r._replace(time=r.time[::-1]), "does not rise"),
+        (lambda r: r._replace(time=r.time[::-1]), "does not increase"),
         (lambda r: TrackingRecord(*(v[:1000] for v in r)), "20 s are needed"),
         (lambda r: TrackingRecord(*(v[::20] for v in r)), "10 are needed"),
-        (lambda r: r._replace(hand=np.zeros(len(r.time))), "never changes"),
+        (lambda r: r._replace(hand=np.zeros(len(r.time))), "is constant"),
         (lambda r: TrackingRecord(*(np.delete(v, slice(500, 900)) for v in r)), "gap of"),
     ],
 )

@@ -172,7 +172,7 @@ def test_measured_delays(tmp_path):
     assert forward[0] == 0.01 and np.isnan(forward[1]) and back.tolist() == [0.02, 0.03]
     for text, message in (
         ("forward\n0.1\n", "no column 'back'"),
-        ("forward,back\n0.1,fast\n", "line 2, back: 'fast' is no delay"),
+        ("forward,back\n0.1,fast\n", "line 2, back: 'fast' is not a delay"),
         ("forward,back\n0.1,0.1\n-1,0\n", "line 3, forward"),
         ("forward,back\n", "has no rows"),
     ):

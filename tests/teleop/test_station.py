@@ -187,7 +187,7 @@ def test_a_trace_of_measured_delays(tmp_path):
         steady.station.log.slave("pose"), traced.station.log.slave("pose")
     )
     (tmp_path / "delays.csv").write_text("forward,back\n,0.1\n", "utf-8")
-    with pytest.raises(InputError, match="all packets of one way are lost"):
+    with pytest.raises(InputError, match="all packets of one direction are lost"):
         run_scenario(case)
     with pytest.raises(ValueError, match="trace has the delays"):
         scenario(channel={"trace": "delays.csv", "jitter": 0.1})
@@ -344,7 +344,7 @@ def test_frozen_sensor_closes_the_valves(channel, force):
     commands = np.column_stack([run.measured[f"command.{a}"] for a in run.plant.axes])
     moving = np.flatnonzero(np.any(commands != 0.0, axis=1))
     assert run.measured.time[moving[-1]] < 1.0 + 0.5 + 0.1 + 0.05
-    assert any("closed for good" in note for note in run.summary["notes"])
+    assert any("closed permanently" in note for note in run.summary["notes"])
 
 
 def test_frozen_ideal_angle_trips_by_its_following_error():
@@ -367,7 +367,7 @@ def test_a_dead_line_stops_the_machine_softly(mode):
     rate = run.station.log.slave("rate")[:, 2]
     stopped = round((1.0 + 0.15 + SPEEDS["z"] / 1.0) / PERIOD) + 2
     assert np.all(rate[stopped:] == 0.0)
-    assert any("no packet came" in note for note in run.summary["notes"])
+    assert any("packets are missing" in note for note in run.summary["notes"])
 
 
 @pytest.mark.nightly
@@ -424,7 +424,7 @@ BAD = {
     "coordinate": ({"coordinates": {"height": {}}}, "pilot.*coordinates.*height"),
     "lost": ({"channel": {"lost": 1.5}}, "lost"),
     "delay": ({"channel": {"delay_back": -0.1}}, "delay_back"),
-    "long delay": ({"channel": {"delay_back": 2.0}}, "delay_back: 2 s is as long as the run"),
+    "long delay": ({"channel": {"delay_back": 2.0}}, "delay_back: 2 s is not shorter than the run"),
     "joystick": ({"joystick": "mine.yaml"}, "joystick 'mine.yaml'"),
     "gains": ({"gains": "digger"}, "pilot.gains.*excavator"),
     "bandwidth": ({"bandwidth_hz": 6.0}, "bandwidth"),
