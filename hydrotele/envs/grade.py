@@ -76,7 +76,7 @@ def bed_parameters(soils: Sequence[Soil], bucket: Bucket = CAT215) -> np.ndarray
     """
     rows = [soil_parameters(soil, bucket, START, CELL) for soil in soils]
     if not 1 <= len(rows) <= SOILS_MOST or len(rows[0]) != _SHARED:
-        message = f"needs 1 to {SOILS_MOST} soils and a bucket with as many corners as the CAT 215's"
+        message = f"needs 1 to {SOILS_MOST} soils and a bucket with the corners of the CAT 215's"
         raise InputError("bed of soil", message)
     return np.concatenate([rows[0], *(row[:WIDTH] for row in rows[1:])])
 

@@ -1,8 +1,8 @@
 """The task `StraightLine`: move the tip along a straight line at constant tool attitude.
 
-The speed profile is trapezoidal. The line is straight in r and z; in some episodes the swing rotates
-in proportion to the travel. Lines are drawn at random until one lies in the workspace and does not
-exceed the rates of the drives.
+The speed profile is trapezoidal. The line is straight in r and z; in some episodes the swing
+rotates in proportion to the travel. Lines are drawn at random until one lies in the workspace and
+does not exceed the rates of the drives.
 """
 
 import math
