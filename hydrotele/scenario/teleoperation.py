@@ -234,10 +234,10 @@ class Perception(Facts):
     displacements and stiffnesses; remnant: noise-to-signal ratio of the operator's observations;
     sight: visual resolution of a position [m] or [rad]; sight_noise: noise of a displayed force, as
     a fraction of its maximum; tremor: noise of the muscle force [N]; muscle: gain of the position
-    control of the handle [1/s]; cocontraction: fraction of the maximum; imagination: relative error
-    of the expected effect of a command without force feedback; task_stiffness: stiffness that the
-    operator is used to [N/m]; dwell: time between corrective pushes [s]. `Operator` in
-    `hydrotele.teleop.operator_parameters` documents all of them.
+    control of the handle [1/s]; cocontraction: fraction of the maximum; imagination: relative
+    standard deviation of the expected effect of a command without force feedback; task_stiffness:
+    stiffness that the operator is used to [N/m]; dwell: time between corrective pushes [s].
+    `Operator` in `hydrotele.teleop.operator_parameters` documents all of them.
     """
 
     file: str | None = None
