@@ -153,7 +153,7 @@ class TaskCore:
 
     @property
     def coordinates(self) -> tuple[str, ...]:
-        """Names of what the actions control: axes, or tip coordinates and the remaining axes."""
+        """Names of the actions: axes, or tip coordinates and the axes beyond the arm."""
         setup = self.setup
         if setup.options.action != "resolved_motion":
             return setup.axes

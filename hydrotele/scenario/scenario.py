@@ -496,4 +496,4 @@ def _override(data: dict[str, Any], key: str, text: str) -> None:
     elif isinstance(where, dict):
         where[parts[-1]] = value
     else:
-        raise InputError(f"--set {key}", "there is nothing to set: the value above has no keys")
+        raise InputError(f"--set {key}", "there is nothing to set at this key")
