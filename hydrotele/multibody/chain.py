@@ -130,8 +130,8 @@ class _Joint(NamedTuple):
 def load_chain(source: str | Path | mujoco.MjModel) -> Chain:
     """Read a mechanism from an MJCF file or a compiled model.
 
-    Kinematic trees without actuator and closure, such as an object on the ground next to a machine,
-    are treated as fixed and have no joints, unless the model has no actuators and closures at all.
+    A kinematic tree without actuator and closure, such as an object on the ground next to a
+    machine, is treated as fixed and has no joints. If no tree has any, all joints are kept.
 
     Args:
         source: path of an MJCF file, or a compiled model.

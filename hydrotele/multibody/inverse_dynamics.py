@@ -1,8 +1,8 @@
 """Inverse dynamics of a closed chain: motion of all joints, drive forces, and regressor.
 
 Compiled code processes all rows of a log. It closes the loops by Newton's method from the previous
-row, computes rates and accelerations from the Jacobian of the closures, and projects the forces of
-passive joints onto the drives by virtual work.
+row. Rates and accelerations follow from the Jacobian of the closures. The forces of passive joints
+are projected on the drives by virtual work.
 
 The drive forces are linear in the inertial and friction parameters, for any chain that
 `multibody.chain` reads. Friction acts in joints and closures.

@@ -4,8 +4,8 @@ Four surfaces of the bucket press on the soil, each in its own direction: the fa
 ahead of it, pushed towards the machine), the edge (into the soil, along the floor), the underside
 of the floor and the heel (Prandtl's zones below). Each is an elastic-plastic spring that yields at
 the limit force of soil mechanics, with a damper in parallel. It supports a resting bucket and
-returns at most the energy of the spring (some joules), so its force can be held over a step of 5 ms
-on a machine of 20 t.
+returns at most the energy of the spring (some joules). Its force can therefore be held over a step
+of 5 ms on a machine of 20 t.
 
 A blade drawn through soil shears off a wedge along a plane that rises from its edge. The forces on
 this wedge (weight, cohesion and friction on the plane, adhesion and friction on the blade) give the
