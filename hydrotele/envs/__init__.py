@@ -1,9 +1,10 @@
-"""Gymnasium environments of heavy hydraulic machines, single and batched, and the same for dm_env.
+"""Gymnasium and dm_env environments for hydraulic machines, single and batched.
 
-Importing this package registers them: `gymnasium.make("hydrotele/TrackTrajectory-v0")` makes one,
-`gymnasium.make_vec(..., num_envs=1024, vectorization_mode="vector_entry_point")` many in native
-code. `gymnasium.make("hydrotele.envs:hydrotele/TrackTrajectory-v0")` imports it on the way.
-`hydrotele.envs.making.TASKS` says what the tasks are.
+Importing this package registers the environments.
+`gymnasium.make("hydrotele/TrackTrajectory-v0")` makes a single environment, and
+`gymnasium.make_vec(..., num_envs=1024, vectorization_mode="vector_entry_point")` makes a batch that
+runs in native code. `gymnasium.make("hydrotele.envs:hydrotele/TrackTrajectory-v0")` also imports
+the package. `hydrotele.envs.making.TASKS` lists the tasks.
 """
 
 from gymnasium.envs.registration import register

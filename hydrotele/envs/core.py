@@ -1,6 +1,6 @@
-"""A task that runs: n episodes side by side, stepped by one native call.
+"""Run n parallel episodes of a task, stepped by one native call.
 
-`gymnasium` and `dm_env` environments, single and batched, are views of this one class.
+The `gymnasium` and `dm_env` environments, single and batched, are wrappers around `TaskCore`.
 """
 
 import copy
@@ -34,17 +34,17 @@ from hydrotele.simulate.stepping import line_length, past_length
 
 
 def set_up(task: Task, options: Options) -> TaskSetup:
-    """A task with the user's choices: its machines, observation and clocks.
+    """Combine a task with the user's options: load its machines, observation and clocks.
 
     Args:
         task: the task.
-        options: the user's choices.
+        options: the user's options.
 
     Returns:
         The setup.
 
     Raises:
-        InputError: an option does not suit the task.
+        InputError: an option is not valid for the task.
     """
     options = dataclasses.replace(
         options, action=options.action or task.action,
@@ -62,37 +62,39 @@ def set_up(task: Task, options: Options) -> TaskSetup:
 
 
 class TaskCore:
-    """n episodes of a task.
+    """n parallel episodes of a task.
+
+    Native code updates the arrays in place.
 
     Attributes:
-        setup: the task as it was chosen.
-        count: n.
-        simulations: their states, live.
-        episodes: (n,) records of EPISODE_STATE, live.
-        observation: (n, o) float32, live.
+        setup: the task with its options.
+        count: number of episodes n.
+        simulations: the batch of simulation states.
+        episodes: (n,) records of EPISODE_STATE.
+        observation: (n, o) float32.
         final: (n, o) float32 observations before an autoreset in the same step.
-        reward: (n,) live.
-        terminated: (n,) uint8, live.
-        truncated: (n,) uint8, live.
-        measures: (n, MEASURES) figures of the step, live.
-        final_measures: (n, MEASURES) before an autoreset in the same step.
+        reward: (n,).
+        terminated: (n,) uint8.
+        truncated: (n,) uint8.
+        measures: (n, MEASURES) task measures of the step, reported in `info`.
+        final_measures: (n, MEASURES) the same before an autoreset in the same step.
     """
 
     def __init__(
         self, task: Task, options: Options, count: int = 1, threads: int = 1,
         autoreset: int = NEXT_STEP,
     ) -> None:  # fmt: skip
-        """Compile the machines and make room.
+        """Compile the machines and allocate the arrays.
 
         Args:
             task: the task.
-            options: the user's choices.
-            count: number of episodes side by side.
-            threads: that step them; 0 for one per core.
+            options: the user's options.
+            count: number of parallel episodes.
+            threads: number of threads that step the episodes; 0 for one per core.
             autoreset: NEXT_STEP, SAME_STEP or DISABLED.
 
         Raises:
-            InputError: an option does not suit the task.
+            InputError: an option is not valid for the task.
         """
         stop_profiling_clock()
         self.count, self.setup = count, set_up(task, options)
@@ -120,14 +122,14 @@ class TaskCore:
         self._before = np.zeros((n, CHANNELS))
         self._expanded = {name: self.simulations.expand(name) for name in v.fields}
         for name, live in self._expanded.items():
-            if live.shape[1] != v.fields[name].shape[1]:  # native code copies the one to the other
-                message = f"variants cannot differ in {name} of a model with meshes that touch"
+            if live.shape[1] != v.fields[name].shape[1]:  # native code copies one into the other
+                message = f"variants cannot differ in {name}: the model has colliding meshes"
                 raise InputError("randomise", message)
         same = np.tile(v.plant.model.actuator_user.ravel(), (len(v.states), 1))
         self._users = np.ascontiguousarray(v.fields.get("actuator_user", same))
 
     def _link(self) -> None:
-        """Tell the native code where everything lies."""
+        """Store the addresses of all arrays in the record that native code reads."""
         v, f = self.setup.variants, self.facts
         f["delayed_command"], f["delayed_sensor"] = self._commands.shape[1], self._sensed.shape[1]
         rows = [(v.fields[n].ctypes.data, live.ctypes.data, v.fields[n].shape[1])
@@ -151,7 +153,7 @@ class TaskCore:
 
     @property
     def coordinates(self) -> tuple[str, ...]:
-        """What every action moves: axes, or coordinates of the tip and axes beyond the arm's."""
+        """Names of the actions: axes, or tip coordinates and the axes beyond the arm."""
         setup = self.setup
         if setup.options.action != "resolved_motion":
             return setup.axes
@@ -160,7 +162,7 @@ class TaskCore:
 
     @property
     def bytes_per_environment(self) -> int:
-        """Memory that one more environment takes: its state, its records, its results [byte]."""
+        """Memory per environment: simulation state, episode record and results [byte]."""
         arrays = (
             self.episodes, self.action, self.observation, self.final, self.reward, self.terminated,
             self.truncated, self.measures, self.final_measures, self.terrain, self._commands,
@@ -169,16 +171,16 @@ class TaskCore:
         return sum(array.nbytes for array in arrays) // self.count
 
     def reset(self, seeds: np.ndarray | None = None, chosen: np.ndarray | None = None) -> None:
-        """Begin new episodes.
+        """Start new episodes.
 
         Args:
-            seeds: (m,) integers; without, every episode's random numbers go on.
-            chosen: (m,) numbers of simulations, None for all.
+            seeds: (m,) integers; None continues the random stream of each episode.
+            chosen: (m,) indices of simulations, None for all.
 
         Raises:
-            RuntimeError: without seeds, before the first seed was given; or the first reset leaves
-                some episodes out.
-            ValueError: a seed is negative or beyond 64 bits.
+            RuntimeError: no seeds have ever been given, or the first reset does not include all
+                episodes.
+            ValueError: a seed is negative or exceeds 64 bits.
         """
         place = slice(None) if chosen is None else chosen
         begun = self._begun.copy()
@@ -198,32 +200,32 @@ class TaskCore:
         """Advance all episodes by one environment step.
 
         Args:
-            action: (n, a), or (a,) for all, full at +-1; beyond they count as full.
+            action: (n, a), or (a,) for all episodes; values outside +-1 are clipped.
 
         Raises:
-            ValueError: the shape is wrong, or an action is not a number.
-            RuntimeError: there was no reset before, or the simulations were closed.
+            ValueError: the shape is wrong, or an action is not finite.
+            RuntimeError: the episodes have not been reset, or the simulations were closed.
         """
         if not self._begun.all():
             raise RuntimeError("reset before the first step")
         wanted = self.action.shape
         if np.shape(action) not in (wanted, wanted[1:]):
-            raise ValueError(f"an action has the shape {wanted}, not {np.shape(action)}")
+            raise ValueError(f"the action must have shape {wanted}, not {np.shape(action)}")
         self.action[...] = action
         if not np.isfinite(self.action).all():
-            raise ValueError("an action is not a finite number")
+            raise ValueError("all actions must be finite numbers")
         self.facts["call"] = STEP
         self.simulations.apply(advance.address, self.facts.ctypes.data)
 
     def step_one(self, action: np.ndarray) -> None:
-        """Advance the only episode; as `step`, but for an action (a,) and no other shape."""
+        """Advance a single episode; like `step`, but the action must have shape (a,)."""
         wanted = self.action.shape[1:]
         if np.shape(action) != wanted:
-            raise ValueError(f"an action has the shape {wanted}, not {np.shape(action)}")
+            raise ValueError(f"the action must have shape {wanted}, not {np.shape(action)}")
         self.step(action)
 
     def model_and_data(self, number: int = 0) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        """Model and state of one simulation, brought up to date by `mj_forward`, to look at."""
+        """Return copies of the model and data of one simulation, after `mj_forward`."""
         model = copy.copy(self.setup.variants.plant.model)
         data = mujoco.MjData(model)
         self.simulations.get_model(number, model)
@@ -232,10 +234,10 @@ class TaskCore:
         return model, data
 
     def close(self) -> None:
-        """Give the simulations' memory back."""
+        """Free the memory of the simulations."""
         self._expanded = {}
         self.simulations.close()
 
     def __reduce__(self):
-        """Refuse to be copied or pickled."""
+        """Raise TypeError: the simulations can be neither copied nor pickled."""
         return self.simulations.__reduce__()

@@ -1,4 +1,7 @@
-"""The same tasks for dm_control: `load("TrackTrajectory")` gives a `dm_env.Environment`."""
+"""Environments for dm_control: `load("TrackTrajectory")` returns a `dm_env.Environment`.
+
+The tasks are those of the gymnasium environments.
+"""
 
 import collections
 from collections.abc import Mapping
@@ -15,27 +18,29 @@ from hydrotele.envs.making import info_of, make_core
 from hydrotele.envs.stage import FREE, Camera, Stage
 from hydrotele.envs.world import Field
 
-FLAT = "observations"  # dm_control's name of the one array
+FLAT = "observations"  # dm_control's key for a flat observation
 
 
 def load(
     task_name: str, random: int | np.random.RandomState | None = None,
     flat_observation: bool = False, **options: Any,
 ) -> "MachineEnvironment":  # fmt: skip
-    """Make a task, as `dm_control.suite.load` does.
+    """Make an environment, as `dm_control.suite.load` does.
 
     Args:
-        task_name: of `hydrotele.envs.making.TASKS`.
-        random: seed of the episodes, or a state that one is drawn from; without, they are drawn
-            from the computer's own.
-        flat_observation: whether observations are one array, under the key `observations`.
+        task_name: a name in `hydrotele.envs.making.TASKS`.
+        random: seed of the episodes, or a random state from which a seed is drawn; None uses a seed
+            from the operating system.
+        flat_observation: whether to return all observations as one array under the key
+            `observations`.
         **options: fields of `hydrotele.envs.task.Options`.
 
     Returns:
-        The environment. With the same seed and actions its numbers are those of gymnasium's.
+        The environment. The same seed and actions give the same values as the gymnasium
+        environment.
 
     Raises:
-        InputError: there is no such task or option.
+        InputError: the task or an option does not exist.
 
     Example:
         >>> env = load("TrackTrajectory", random=7, variants=2)
@@ -50,7 +55,7 @@ class MachineEnvironment(dm_env.Environment):
 
     Attributes:
         core: the running task.
-        fields: key of the observation -> what its numbers are, with units.
+        fields: observation key -> names, units and bounds of its values.
     """
 
     def __init__(
@@ -77,22 +82,22 @@ class MachineEnvironment(dm_env.Environment):
         return [field.name.partition(".")[0] for field in self.core.setup.fields]
 
     def reset(self) -> dm_env.TimeStep:
-        """Begin an episode; the first one is that of the seed."""
+        """Start an episode; the first one uses the seed."""
         self.core.reset(None if self._begun else np.array([self._seed]))
         self._begun, self._over = True, False
         return dm_env.restart(self._observation())
 
     def step(self, action: np.ndarray) -> dm_env.TimeStep:
-        """Go on by one step, or begin an episode where the last one is over.
+        """Advance by one step, or start an episode if the last one is over.
 
         Args:
-            action: (a,); beyond +-1 it counts as full.
+            action: (a,); values outside +-1 are clipped.
 
         Returns:
-            The step; its discount is 0 where the task ended, and 1 where only the time did.
+            The time step; its discount is 0 if the task terminated, and 1 if it was truncated.
 
         Raises:
-            ValueError: the action has another shape, or is not a finite number.
+            ValueError: the action has the wrong shape, or is not finite.
         """
         if self._over:
             return self.reset()
@@ -108,7 +113,7 @@ class MachineEnvironment(dm_env.Environment):
         return split(self.core.observation[0], self._places)
 
     def observation_spec(self) -> collections.OrderedDict[str, specs.BoundedArray]:
-        """Bounds in SI at which readings saturate; `fields` says what each number is."""
+        """Return the bounds in SI units at which observations saturate; see `fields` for names."""
         low, high = (split(ends, self._places) for ends in (self.core.low, self.core.high))
         return collections.OrderedDict(
             (key, specs.BoundedArray(low[key].shape, np.float32, low[key], high[key], key))
@@ -116,32 +121,32 @@ class MachineEnvironment(dm_env.Environment):
         )
 
     def action_spec(self) -> specs.BoundedArray:
-        """(a,) from -1 to 1; what each number moves is in its name, between tabs."""
+        """Return the action bounds, (a,) from -1 to 1; the name lists the axes, tab-separated."""
         name, count = "\t".join(self.core.coordinates), len(self.core.coordinates)
         return specs.BoundedArray((count,), np.float32, -1.0, 1.0, name)
 
     def control_timestep(self) -> float:
-        """Time between steps [s]."""
+        """Return the time between steps [s]."""
         return 1.0 / self.core.setup.options.control_rate
 
     def figures(self) -> dict[str, Any]:
-        """What gymnasium gives as `info`: the task's figures of the last step, variant, fault."""
+        """Return the `info` of the last step: task measures, variant and fault."""
         return {name: values[0] for name, values in info_of(self.core).items()}
 
     def render(self, height: int = 240, width: int = 320, camera_id: Camera = FREE) -> np.ndarray:
-        """Draw the machine and its goal.
+        """Render the machine and its goal.
 
         Args:
             height: [pixel].
             width: [pixel].
-            camera_id: name or number of a camera of the machine, or -1 for one that shows all that
-                its arm reaches.
+            camera_id: name or number of a camera of the machine, or -1 for a free camera that shows
+                the whole workspace of the arm.
 
         Returns:
             (height, width, 3) uint8.
 
         Raises:
-            InputError: there is no such camera, or no OpenGL works (says what to do).
+            InputError: the camera does not exist, or OpenGL does not work.
         """
         return self._staged().picture(0, width, height, camera_id)
 
@@ -152,9 +157,9 @@ class MachineEnvironment(dm_env.Environment):
 
     @property
     def physics(self) -> "Physics":
-        """The machine with its looks as it stands now, for dm_control's viewer and wrappers.
+        """Current model with visual geometry, for dm_control's viewer and wrappers.
 
-        What is written there does not reach the simulation.
+        Changes to it do not affect the simulation.
         """
         stage = self._staged()
         if self._physics is None:
@@ -165,7 +170,7 @@ class MachineEnvironment(dm_env.Environment):
         return self._physics
 
     def close(self) -> None:
-        """Close what shows the simulation, and give its memory back."""
+        """Close the renderer and free the memory of the simulation."""
         if self._physics is not None:
             self._physics.free()
         if self._stage:
@@ -175,27 +180,27 @@ class MachineEnvironment(dm_env.Environment):
 
 
 class Physics(engine.Physics):
-    """The machine of an environment, which draws the goal too."""
+    """dm_control physics of an environment, whose `render` also draws the goal."""
 
     stage: Stage
 
     def render(
         self, height: int = 240, width: int = 320, camera_id: Any = FREE, **asked: Any
     ) -> np.ndarray:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Draw it as the environment does; what else is asked for, dm_control draws.
+        """Render like the environment, or with dm_control if further options are given.
 
         Args:
             height: [pixel].
             width: [pixel].
-            camera_id: as of `MachineEnvironment.render`.
-            **asked: overlays, depth, segmentation and so on, as of `dm_control.mujoco.Physics`; for
-                them MUJOCO_GL must name an OpenGL that works.
+            camera_id: see `MachineEnvironment.render`.
+            **asked: overlays, depth, segmentation and other options of
+                `dm_control.mujoco.Physics.render`; these need MUJOCO_GL to name a working OpenGL.
 
         Returns:
-            (height, width, 3) uint8, or what dm_control gives.
+            (height, width, 3) uint8, or the result of dm_control.
 
         Raises:
-            InputError: there is no such camera, or no OpenGL works (says what to do).
+            InputError: the camera does not exist, or OpenGL does not work.
         """
         if any(value not in (None, False, ()) for value in asked.values()):
             return super().render(height, width, camera_id, **asked)
@@ -203,7 +208,7 @@ class Physics(engine.Physics):
 
 
 def group(keys: list[str]) -> collections.OrderedDict[str, np.ndarray]:
-    """Places of every key in a list, keys in the order of their first places."""
+    """Return the indices of every distinct key in a list, in order of first occurrence."""
     places: collections.OrderedDict[str, list[int]] = collections.OrderedDict()
     for place, key in enumerate(keys):
         places.setdefault(key, []).append(place)
@@ -213,5 +218,5 @@ def group(keys: list[str]) -> collections.OrderedDict[str, np.ndarray]:
 def split(
     values: np.ndarray, places: Mapping[str, np.ndarray]
 ) -> collections.OrderedDict[str, np.ndarray]:
-    """Numbers by key, copied."""
+    """Return a copy of the values of every key."""
     return collections.OrderedDict((key, values[some]) for key, some in places.items())

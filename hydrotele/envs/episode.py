@@ -1,59 +1,59 @@
-"""State of an episode and parameters of a task as C-like records; random numbers of an episode.
+"""Episode state and task parameters as C-like records, and the random generator of an episode.
 
-Compiled functions get both records and read their fields by name; from Python, `state["joint"]` is
-an (n, AXES) array.
+Compiled functions receive both records and read their fields by name. In Python, `state["joint"]`
+is an (n, AXES) array. The random generator is SplitMix64, with one 64-bit state per episode.
 """
 
 import numpy as np
 
 from hydrotele.core.compiled import compiled
 
-AXES = 8  # axes of a machine at most
-ARM = 5  # of them those of the arm
-CHANNELS = 3 * AXES + 1  # sensors: positions, then head and rod of every valve, then the supply
-GOAL = 96  # numbers that a task keeps of its goal and its course
-PARAMETERS = 64  # parameters of a task at most
-MEASURES = 8  # figures of a step that a task tells in `info`
+AXES = 8  # maximum number of axes of a machine
+ARM = 5  # maximum number of arm axes among them
+CHANNELS = 3 * AXES + 1  # sensors: positions, head and rod pressures of valves, supply pressure
+GOAL = 96  # values that a task stores per episode for its goal and progress
+PARAMETERS = 64  # maximum number of task parameters
+MEASURES = 8  # maximum number of task measures per step, reported in `info`
 
-VALVE, JOINT_RATE, RESOLVED_MOTION = range(3)  # Facts.mode: what actions are
+VALVE, JOINT_RATE, RESOLVED_MOTION = range(3)  # values of `mode`: kind of actions
 ACTIONS = ("valve", "joint_rate", "resolved_motion")
-NEXT_STEP, SAME_STEP, DISABLED = range(3)  # Facts.autoreset
-STEP, RESET = range(2)  # Facts.call: what the native function is called for
+NEXT_STEP, SAME_STEP, DISABLED = range(3)  # values of `autoreset`
+STEP, RESET = range(2)  # values of `call`: purpose of the native call
 
 _F, _I, _U = np.float64, np.int64, np.uint64
 
 EPISODE_STATE = np.dtype(
     [
-        ("random", _U),  # state of the episode's own random numbers
-        ("variant", _I),  # machine and start that this episode has
-        ("episode", _I),  # number of episodes begun
+        ("random", _U),  # state of the episode's random generator
+        ("variant", _I),  # index of the machine and start of this episode
+        ("episode", _I),  # number of episodes started
         ("step", _I),  # environment steps since the start
         ("tick", _I),  # control periods since the start
         ("over", _I),  # whether the episode has ended
         ("fault", _I),  # whether the simulation became unstable
-        ("faults", _I),  # how often it did, since the beginning
-        ("last_variant", _I),  # of the episode before
-        ("last_fault", _I),
-        ("warnings", _I),  # of MuJoCo, since the beginning
-        ("saturated", _I),  # observations that lay outside their bounds, since the beginning
+        ("faults", _I),  # total number of faults
+        ("last_variant", _I),  # variant of the previous episode
+        ("last_fault", _I),  # fault of the previous episode
+        ("warnings", _I),  # total number of MuJoCo warnings
+        ("saturated", _I),  # total number of observations outside their bounds
         ("position", _F, AXES),  # true axis positions [rad], [m]
-        ("tip", _F, 3),  # true place of the tip [m], world frame
-        ("joint", _F, AXES),  # axis positions as read [rad], [m]
-        ("rate", _F, AXES),  # difference quotients of the readings [rad/s], [m/s]
-        ("head", _F, AXES),  # head-side pressures as read [Pa]
-        ("rod", _F, AXES),  # rod-side pressures as read [Pa]
-        ("supply", _F),  # supply pressure as read [Pa]
-        ("error", _F, CHANNELS),  # random errors of this reading
-        ("reference", _F, AXES),  # axis positions asked for [rad], [m]
-        ("reference_rate", _F, AXES),  # their rates [rad/s], [m/s]
-        ("sampled_reference", _F, AXES),  # references when the sensors read
-        ("pose", _F, ARM),  # of the references: r [m], theta [rad], z [m], attitude, head [rad]
+        ("tip", _F, 3),  # true tip position in the world frame [m]
+        ("joint", _F, AXES),  # measured axis positions [rad], [m]
+        ("rate", _F, AXES),  # difference quotients of the measured positions [rad/s], [m/s]
+        ("head", _F, AXES),  # measured head-side pressures [Pa]
+        ("rod", _F, AXES),  # measured rod-side pressures [Pa]
+        ("supply", _F),  # measured supply pressure [Pa]
+        ("error", _F, CHANNELS),  # random errors of the current sample
+        ("reference", _F, AXES),  # reference axis positions [rad], [m]
+        ("reference_rate", _F, AXES),  # reference axis rates [rad/s], [m/s]
+        ("sampled_reference", _F, AXES),  # references at the time of the last sensor sample
+        ("pose", _F, ARM),  # pose of the references: r [m], theta, z [m], attitude, head [rad]
         ("pose_rate", _F, ARM),  # [m/s], [rad/s]
-        ("blocked", _I),  # whether the arm stands at the edge of its workspace
-        ("load", _F, AXES),  # slow mean of the drive forces [N], [N m]
-        ("command", _F, AXES),  # to valves and drives [1], or in the drive's unit
-        ("drive", _F, (4, AXES)),  # wanted drive velocity, moment arm, chamber volumes
-        ("goal", _F, GOAL),  # the task's own
+        ("blocked", _I),  # whether the arm is at the edge of its workspace
+        ("load", _F, AXES),  # low-pass filtered drive forces [N], [N m]
+        ("command", _F, AXES),  # valve and drive commands [1], or in the drive's unit
+        ("drive", _F, (4, AXES)),  # reference drive velocity, moment arm, two chamber volumes
+        ("goal", _F, GOAL),  # values of the task
     ],
     align=True,
 )
@@ -66,50 +66,50 @@ TASK_PARAMETERS = np.dtype(
         ("mode", _I),
         ("autoreset", _I),
         ("axes", _I),  # number of actuators k
-        ("hydraulic", _I),  # of them those with valves, which come first
-        ("arm_axes", _I),  # of them those of the arm, which come first
-        ("actions", _I),  # one for every driven axis, or for every coordinate of the arm and axis
+        ("hydraulic", _I),  # number of actuators with valves, which come first
+        ("arm_axes", _I),  # number of arm axes, which come first
+        ("actions", _I),  # number of actions, one per driven axis or tip coordinate
         ("observations", _I),
-        ("horizon", _I),  # steps of an episode
+        ("horizon", _I),  # steps per episode
         ("ticks", _I),  # control periods per step
         ("substeps", _I),  # physics steps per control period
-        ("every", _I),  # control periods per reading of the sensors
-        ("noisy", _I),
-        ("timestep", _F),  # of the physics [s]
-        ("period", _F),  # of the control [s]
-        ("acceleration", _F),  # of joint rates at most [rad/s^2], [m/s^2]
-        ("axes_driven", _I),
-        ("driven_axis", _I, AXES),  # axes that actions move; those of the arm come first
-        ("locked", _I),  # action that does nothing, -1 without
-        ("qpos", _I, AXES),  # place of every axis' joint
-        ("dof", _I, AXES),
+        ("every", _I),  # control periods per sensor sample
+        ("noisy", _I),  # whether the sensors have random errors
+        ("timestep", _F),  # physics step [s]
+        ("period", _F),  # control period [s]
+        ("acceleration", _F),  # acceleration limit of joint references [rad/s^2], [m/s^2]
+        ("axes_driven", _I),  # number of driven axes
+        ("driven_axis", _I, AXES),  # indices of the driven axes; arm axes come first
+        ("locked", _I),  # index of the action without effect, -1 for none
+        ("qpos", _I, AXES),  # index of every axis in mjData.qpos
+        ("dof", _I, AXES),  # index of every axis in mjData.qvel
         ("nq", _I),
         ("nv", _I),
         ("na", _I),
         ("nbody", _I),
-        ("neq", _I),  # equalities of the model
-        ("eq_width", _I),  # numbers of each
+        ("neq", _I),  # number of equality constraints
+        ("eq_width", _I),  # number of data values per equality constraint
         ("tip_site", _I),
         ("tip_body", _I),
-        ("closed", _I, AXES),  # whether the servo drives the axis
-        ("fastest", _F, AXES),  # rates at full action [rad/s], [m/s]
-        ("fastest_pose", _F, ARM),  # the same of the pose [m/s], [rad/s]
-        ("accelerations", _F, ARM),  # of the pose [m/s^2], [rad/s^2]
+        ("closed", _I, AXES),  # whether the servo controls the axis
+        ("fastest", _F, AXES),  # axis rates at full action [rad/s], [m/s]
+        ("fastest_pose", _F, ARM),  # pose rates at full action [m/s], [rad/s]
+        ("accelerations", _F, ARM),  # acceleration limits of the pose [m/s^2], [rad/s^2]
         ("limit", _F, AXES),  # commands at full action [1], or in the drive's unit
-        ("arm", _F, 9),  # of kinematics.task.arm_parameters
-        ("ranges", _F, (AXES, 2)),  # of the axes [rad], [m]
-        ("servo", _F, (AXES, 14)),  # of control.servo.servo_parameters
+        ("arm", _F, 9),  # see kinematics.task.arm_parameters
+        ("ranges", _F, (AXES, 2)),  # joint ranges of the axes [rad], [m]
+        ("servo", _F, (AXES, 14)),  # see control.servo.servo_parameters
         ("feedforward", _F),
-        ("grid", _F, (AXES, 2)),  # of control.servo.drive_tables
-        ("accuracy", _F, CHANNELS),
-        ("converters", _F, (3, CHANNELS)),
-        ("parameters", _F, PARAMETERS),  # of the task
-        ("delayed_command", _I),  # control ticks in the ring of commands, 0 without delays
-        ("delayed_sensor", _I),  # physics steps in the ring of sensed values, 0 where none is late
+        ("grid", _F, (AXES, 2)),  # see control.servo.drive_tables
+        ("accuracy", _F, CHANNELS),  # bound of the uniform random error of every sensor
+        ("converters", _F, (3, CHANNELS)),  # see machine.machine.converter
+        ("parameters", _F, PARAMETERS),  # task parameters
+        ("delayed_command", _I),  # control periods in the command ring buffer, 0 without delays
+        ("delayed_sensor", _I),  # physics steps in the sensor ring buffer, 0 without delays
         ("variants", _I),
         ("states", _I),  # length of a state
-        ("fields", _I),  # number of fields of the model that differ between variants
-        ("width", _I),  # of the terrain of an episode, 0 without
+        ("fields", _I),  # number of model fields that differ between variants
+        ("width", _I),  # values of the terrain per episode, 0 without terrain
         # addresses
         ("episodes", _I),
         ("action", _I),  # (n, actions) float32
@@ -125,22 +125,22 @@ TASK_PARAMETERS = np.dtype(
         ("table", _I),  # (k, POINTS, 3) of control.servo.drive_tables
         ("starts", _I),  # (v, states)
         ("start_tips", _I),  # (v, 3)
-        ("users", _I),  # (v, k SLOTS) numbers of the actuators
-        ("scales", _I),  # (v, CHANNELS) of the sensors
-        ("offsets", _I),
-        ("lags", _I),  # (v, CHANNELS, 2) delays of the sensors: whole physics steps, rest of a step
-        ("ratios", _I),  # (v, CHANNELS) a physics step over the time constant of a sensor's lag
-        ("delays", _I),  # (v, AXES, 2) of the commands: whole physics steps, rest of a step
-        ("commands", _I),  # (n, delayed_command, AXES) ring
-        ("sensed", _I),  # (n, delayed_sensor, CHANNELS) ring
+        ("users", _I),  # (v, k SLOTS) actuator parameters
+        ("scales", _I),  # (v, CHANNELS) sensor scale factors
+        ("offsets", _I),  # (v, CHANNELS) sensor offsets
+        ("lags", _I),  # (v, CHANNELS, 2) sensor delays: whole physics steps, fraction of a step
+        ("ratios", _I),  # (v, CHANNELS) physics step divided by the sensor time constant
+        ("delays", _I),  # (v, AXES, 2) command delays: whole physics steps, fraction of a step
+        ("commands", _I),  # (n, delayed_command, AXES) ring buffer
+        ("sensed", _I),  # (n, delayed_sensor, CHANNELS) ring buffer
         ("sensed_before", _I),  # (n, CHANNELS) true values after the last physics step
-        ("places", _I),  # (fields, 3): address for all variants, address for all n, floats in each
+        ("places", _I),  # (fields, 3): address of all variants, address of all n, floats per row
         ("terrain", _I),  # (n, width)
-        ("eq_rows", _I),  # (n, neq eq_width) of every simulation, 0 where no task writes them
-        ("task", _I),  # its native code, see `world`
+        ("eq_rows", _I),  # (n, neq eq_width) equality data, 0 if no task writes them
+        ("task", _I),  # native code of the task, see `world`
         ("mj_step", _I),
         ("mj_set_state", _I),
-        # where mjData and mjModel keep their members [byte]
+        # offsets of members in mjData and mjModel [byte]
         ("at_qpos", _I),
         ("at_qvel", _I),
         ("at_act", _I),
@@ -159,7 +159,7 @@ TASK_PARAMETERS = np.dtype(
     ],
     align=True,
 )
-"""What all episodes share."""
+"""Parameters that all episodes of a task have in common."""
 
 
 _STEP = np.uint64(0x9E3779B97F4A7C15)
@@ -171,7 +171,7 @@ _UNIT = 2.0**-53
 
 @compiled
 def mix64(z):
-    """A 64-bit integer, scalar, of which every bit depends on every bit of `z`, scalar."""
+    """Mix the bits of a 64-bit integer, scalar (the SplitMix64 finaliser)."""
     z = (z ^ (z >> _30)) * _FIRST
     z = (z ^ (z >> _27)) * _SECOND
     return z ^ (z >> _31)
@@ -179,10 +179,10 @@ def mix64(z):
 
 @compiled
 def uniform(e):
-    """A number of an episode, uniform in [0, 1), scalar; its `random` goes on.
+    """Draw a random number, uniform in [0, 1), from the generator of an episode.
 
     Args:
-        e: its record of EPISODE_STATE.
+        e: record of EPISODE_STATE; `random` is advanced.
 
     Returns:
         The number, scalar [1].
@@ -195,10 +195,10 @@ def uniform(e):
 
 @compiled
 def uniform_between(e, low, high):
-    """A number of an episode, uniform from `low` to `high`, scalars.
+    """Draw a random number, uniform from `low` to `high`, from the generator of an episode.
 
     Args:
-        e: its record of EPISODE_STATE.
+        e: record of EPISODE_STATE; `random` is advanced.
         low: scalar.
         high: scalar.
 
@@ -211,16 +211,16 @@ def uniform_between(e, low, high):
 
 
 def seed_streams(seeds: np.ndarray) -> np.ndarray:
-    """Where the streams of seeds begin.
+    """Return the initial generator states of a list of seeds.
 
     Args:
         seeds: (n,) integers >= 0.
 
     Returns:
-        (n,) values of `random`; seeds that follow each other give unrelated streams.
+        (n,) values of `random`; consecutive seeds give unrelated streams.
 
     Raises:
-        ValueError: a seed is no integer from 0 to 2^64 - 1.
+        ValueError: a seed is not an integer from 0 to 2^64 - 1.
     """
     seeds = np.asarray(seeds)
     if seeds.dtype.kind not in "iu" or (seeds < 0).any():

@@ -1,4 +1,4 @@
-"""What a controller is worth: returns, figures and successes of whole episodes."""
+"""Evaluate controllers on complete episodes: return, error statistics and success rate."""
 
 import dataclasses
 import math
@@ -11,16 +11,16 @@ from hydrotele.envs.controllers.controller import Controller
 from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import DISABLED
 
-SUCCESS = "success"  # a figure of this name says whether an episode succeeded
+SUCCESS = "success"  # name of the measure that is 1 if an episode succeeded
 
 
 @dataclasses.dataclass(frozen=True)
 class Scores:
-    """Figures of m episodes.
+    """Results of m episodes.
 
     Attributes:
-        figures: name -> (m,): `return`, `length` [s], `fault`, and of every measure its mean, RMS
-            and value at the end (`tip_error mean` and so on), `success` where the task has it.
+        figures: name -> (m,): `return`, `length` [s], `fault`, `success` if the task defines it,
+            and the mean, RMS and final value of every measure (`tip_error mean` and so on).
         units: name -> unit.
     """
 
@@ -28,16 +28,16 @@ class Scores:
     units: dict[str, str]
 
     def mean(self, name: str) -> float:
-        """Mean of a figure over the episodes."""
+        """Return the mean of a result over the episodes."""
         return float(self.figures[name].mean())
 
     def error(self, name: str) -> float:
-        """Standard error of that mean."""
+        """Return the standard error of the mean of a result."""
         values = self.figures[name]
         return float(values.std(ddof=1) / math.sqrt(len(values))) if len(values) > 1 else math.inf
 
     def table(self) -> str:
-        """All figures as a Markdown table: mean and standard error."""
+        """Return all results as a Markdown table with mean and standard error."""
         rows = ["| figure | mean | standard error | unit |", "| --- | --- | --- | --- |"]
         rows += [
             f"| {name} | {self.mean(name):.5g} | {self.error(name):.2g} | {self.units[name]} |"
@@ -47,21 +47,21 @@ class Scores:
 
 
 def evaluate(core: TaskCore, controller: Controller, episodes: int, seed: int = 0) -> Scores:
-    """Let a controller do whole episodes, many side by side.
+    """Run a controller for complete episodes in batches.
 
-    Every episode counts once, short ones as much as long ones.
+    Every episode has the same weight, whatever its length.
 
     Args:
-        core: a task whose autoreset is DISABLED.
-        controller: of this task.
-        episodes: at least this many, whole batches of the core.
-        seed: of the first episode; the others count up.
+        core: running task; its autoreset must be DISABLED.
+        controller: a controller of this task.
+        episodes: minimum number of episodes, rounded up to whole batches.
+        seed: seed of the first episode; the following episodes use the next integers.
 
     Returns:
         The scores.
 
     Raises:
-        InputError: the core begins new episodes by itself.
+        InputError: the autoreset of the core is not DISABLED.
     """
     if core.facts["autoreset"] != DISABLED:
         raise InputError("autoreset", "must be DISABLED, so that every episode counts once")
@@ -75,7 +75,7 @@ def evaluate(core: TaskCore, controller: Controller, episodes: int, seed: int = 
 
 
 def _batch(core: TaskCore, controller: Controller) -> dict[str, np.ndarray]:
-    """Figures of one batch of episodes that have just begun."""
+    """Run one batch of newly started episodes to their end and return the results."""
     n, names = core.count, [name for name, _ in core.setup.task.measures]
     total, steps = np.zeros(n), np.zeros(n)
     sums, squares = np.zeros((n, len(names))), np.zeros((n, len(names)))
@@ -110,7 +110,7 @@ def _unit(core: TaskCore, name: str) -> str:
 
 
 def compare(scores: Sequence[tuple[str, Scores]], figures: Sequence[str]) -> str:
-    """A Markdown table of some figures of several controllers, with standard errors."""
+    """Return a Markdown table that compares results of several controllers."""
     first = scores[0][1]
     heads = [f"{name} [{first.units[name]}]" for name in figures]
     rows = ["| | " + " | ".join(heads) + " |", "| --- |" + " --- |" * len(heads)]

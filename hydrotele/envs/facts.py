@@ -1,6 +1,7 @@
-"""Numbers that native code reads of a task: clocks, machine, servo, sensors, MuJoCo's layout.
+"""Build the parameter record of native code: clocks, machine, servo, sensors, MuJoCo layout.
 
-`KINDS` are the tasks in native code by their names: each is a file of its own and compiles alone.
+`KINDS` maps the kind of a task to its native code. Each kind is a separate module and compiles
+separately.
 """
 
 from typing import NamedTuple
@@ -27,18 +28,25 @@ KINDS: dict[str, Callback] = {
     "track": track.code, "line": line.code, "force": force.code, "reach": reach.code,
     "grade": grade.code, "place": place.code,
 }  # fmt: skip
-"""Kind of task -> its code, see `world`."""
+"""Kind of task -> its native code, see `world`."""
 
 
-_CONTROL_RATE = 200.0  # Hz, of the servo at least
-_SHARE = 0.8  # of the speed at rated flow, or at what the pump gives, that a full action asks for
-_FORCE_RATE = 0.5  # rad/s or m/s of a force drive at full action
-ACCELERATION = 1.0  # rad/s^2 or m/s^2
-POSE_ACCELERATIONS = (1.0, 0.5, 1.0, 1.0, 0.8)  # m/s^2, rad/s^2
+_CONTROL_RATE = 200.0  # Hz, minimum control rate of the servo
+_SHARE = 0.8  # fraction of the speed at rated or pump flow that a full action commands
+_FORCE_RATE = 0.5  # rad/s or m/s, rate of a force drive at full action
+ACCELERATION = 1.0  # rad/s^2 or m/s^2, limit of the joint references
+POSE_ACCELERATIONS = (1.0, 0.5, 1.0, 1.0, 0.8)  # m/s^2, rad/s^2, limits of the pose reference
 
 
 class Timing(NamedTuple):
-    """Clocks of an environment: control periods per step, physics steps per period, period [s]."""
+    """Clocks of an environment.
+
+    Attributes:
+        ticks: control periods per environment step.
+        substeps: physics steps per control period.
+        period: control period [s].
+        horizon: environment steps per episode.
+    """
 
     ticks: int
     substeps: int
@@ -47,17 +55,17 @@ class Timing(NamedTuple):
 
 
 class TaskSetup(NamedTuple):
-    """A task as it was chosen.
+    """A task with its options.
 
     Attributes:
         task: the task.
-        options: the user's choices, complete.
-        clock: its clocks.
-        machine: as a controller knows it, without planted or drawn effects.
+        options: the user's options with all defaults filled in.
+        clock: clocks of the environment.
+        machine: nominal machine, without planted or randomised effects, as a controller knows it.
         axes: driven axes in the order of the actions (`valve`, `joint_rate`).
-        arm_axes: how many of them, the first ones, are the arm's.
-        variants: machines and starts that episodes have.
-        fields: of the observation.
+        arm_axes: number of arm axes, which come first in `axes`.
+        variants: machines and starts of the episodes.
+        fields: fields of the observation.
         table: (k, POINTS, 3) of `control.servo.drive_tables`.
     """
 
@@ -73,18 +81,26 @@ class TaskSetup(NamedTuple):
 
 
 def timing(options: Options) -> Timing:
-    """Clocks that the options ask for.
+    """Return the clocks for the given options.
 
     Raises:
-        InputError: the rates do not divide each other.
+        InputError: a rate is out of range, or the control period is not a whole number of physics
+            steps.
     """
     rate, step = options.control_rate, options.timestep
     if not (0.0 < rate <= 1.0e4 and 1.0e-5 <= step <= 5.0e-3):
-        raise InputError("control_rate", f"{rate:g} Hz with a physics step of {step:g} s")
+        message = (
+            f"{rate:g} Hz with a physics step of {step:g} s is out of range: at most 10000 Hz, and"
+            " a physics step from 1e-05 to 0.005 s"
+        )
+        raise InputError("control_rate", message)
     ticks = max(1, round(_CONTROL_RATE / rate))
     substeps = 1.0 / (rate * ticks * step)
     if substeps < 0.999 or abs(substeps - round(substeps)) > 1e-6:
-        message = f"{rate:g} Hz needs whole physics steps of {step:g} s; for example 50 or 200"
+        message = (
+            f"{rate:g} Hz needs a control period of whole physics steps of {step:g} s; use for"
+            " example 50 or 200"
+        )
         raise InputError("control_rate", message)
     assert options.duration is not None
     horizon = round(options.duration * rate)
@@ -94,10 +110,10 @@ def timing(options: Options) -> Timing:
 
 
 def make_facts(setup: TaskSetup, count: int, autoreset: int) -> np.ndarray:
-    """The record of TASK_PARAMETERS of a task; addresses of arrays are left to whoever owns them.
+    """Return the TASK_PARAMETERS record of a task, without the addresses of arrays.
 
     Args:
-        setup: the task as it was chosen.
+        setup: the task with its options.
         count: number of environments.
         autoreset: NEXT_STEP, SAME_STEP or DISABLED.
 
@@ -105,8 +121,8 @@ def make_facts(setup: TaskSetup, count: int, autoreset: int) -> np.ndarray:
         () record.
 
     Raises:
-        InputError: the action kind or the sensors are not known.
-        RuntimeError: MuJoCo's structs are not laid out as expected.
+        InputError: the kind of actions or the sensors do not exist.
+        RuntimeError: the memory layout of MuJoCo's structs is not the expected one.
     """
     facts = np.zeros((), TASK_PARAMETERS)
     task, options, plant = setup.task, setup.options, setup.variants.plant
@@ -122,14 +138,14 @@ def make_facts(setup: TaskSetup, count: int, autoreset: int) -> np.ndarray:
     facts["actions"], facts["observations"] = len(setup.axes), len(setup.fields)
     columns = [plant.axes.index(name) for name in setup.axes]
     if columns[: setup.arm_axes] != list(range(setup.arm_axes)):
-        raise InputError(f"machine {task.machine}", "its arm's axes must be its first ones")
+        raise InputError(f"machine {task.machine}", "the axes of its arm must come first")
     facts["driven_axis"][: len(columns)] = columns
     k, model = len(plant.axes), plant.model
     facts["qpos"][:k], facts["dof"][:k] = plant.qpos, plant.dof
     facts["nq"], facts["nv"], facts["na"] = model.nq, model.nv, model.na
     facts["nbody"], facts["tip_site"] = model.nbody, model.site(TIP_SITE).id
     facts["tip_body"] = model.site(TIP_SITE).bodyid[0]
-    theta = 1 if options.action == "resolved_motion" else 0  # place of the swing among actions
+    theta = 1 if options.action == "resolved_motion" else 0  # index of the swing action
     facts["locked"] = theta if task.swing_locked else -1
     facts["neq"], facts["eq_width"] = model.eq_data.shape
     facts["variants"], facts["states"] = setup.variants.states.shape
@@ -144,14 +160,15 @@ def make_facts(setup: TaskSetup, count: int, autoreset: int) -> np.ndarray:
 
 
 def full_rate(machine: Machine, axis: str) -> float:
-    """Rate of an axis at full action [rad/s] or [m/s]: what its drive reaches all over its range.
+    """Return the rate of an axis at full action, which its drive reaches in its whole range.
 
     Args:
         machine: the machine.
-        axis: its name.
+        axis: name of the axis.
 
     Returns:
-        A share of rated flow, or of the pump's where that is less, over the longest moment arm.
+        The rate [rad/s] or [m/s]: 0.8 times the rated flow, or the pump flow if that is smaller,
+        divided by the head-side area and the largest moment arm; 0.5 for an axis without a valve.
     """
     facts = machine.axes[axis]
     low, high = machine.joints[facts.joint].range or (-1.0, 1.0)
@@ -186,7 +203,7 @@ def _write_sensors(facts: np.ndarray, setup: TaskSetup) -> None:
     sensors: SensorSet | None
     if setup.options.sensors == REAL:
         if not machine.sensors:
-            raise InputError("sensors 'real'", f"machine {machine.name} has none")
+            raise InputError("sensors 'real'", f"machine {machine.name} has no set of sensors")
         sensors = next(iter(machine.sensors.values()))
     else:
         sensors = sensor_set(machine, setup.options.sensors)
@@ -198,7 +215,7 @@ def _write_sensors(facts: np.ndarray, setup: TaskSetup) -> None:
 
 
 def _write_layout(facts: np.ndarray) -> None:
-    """Where MuJoCo keeps what, and its functions."""
+    """Write the offsets of MuJoCo's members and the addresses of its functions."""
     verify_layout()
     facts["mj_step"] = function_address("mj_step")
     facts["mj_set_state"] = function_address("mj_setState")

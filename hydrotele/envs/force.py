@@ -1,8 +1,8 @@
-"""A force held against a plate on a spring, from above the plate on, with one change of the force.
+"""The task `HoldForce`: press with a given force on a plate that stands on a spring.
 
-What the plate's spring and damper carry is the force: a load cell under the plate would read it.
-
-What `HoldForce` is.
+An episode starts with the bucket above the plate, and the reference force changes once. The
+controlled force is the one that the spring and damper of the plate carry, as a load cell under the
+plate measures it.
 """
 
 import math
@@ -32,20 +32,21 @@ from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Plate, Servo, SurroundingObject
 
-WEAKEST, STRONGEST = 1.0e4, 3.5e4  # N, forces that are wanted
-OVERLOAD = 1.0e5  # N
-FAILURE = -50.0  # reward of an overload or of leaving the plate: what a second on target pays
-CELL = 500.0  # N, largest error of the load cell: 1 % of 50 kN
-_CHANGE = 5.0e3  # N, smallest change of the force wanted
-_EARLY, _LATE = 0.4, 0.6  # shares of the duration between which it changes
-_TOUCH = 200.0  # N, from which on the plate counts as touched
-_RANGE = 2.0e5  # N, of the load cell
-_FIRST, _SECOND, _TIME, _FORCE, FORCE_READ, _PEAK = range(6)  # places in the goal
-PLATE_QPOS, PLATE_DOF, PLATE_JOINT, MIDDLE_X, MIDDLE_Y, HALF_X, HALF_Y = range(7)  # in `parameters`
+WEAKEST, STRONGEST = 1.0e4, 3.5e4  # N, range of the reference force
+OVERLOAD = 1.0e5  # N, force that ends the episode
+FAILURE = -50.0  # reward of an overload or of leaving the plate: as much as 1 s on target pays
+CELL = 500.0  # N, maximum error of the load cell: 1 % of 50 kN
+_CHANGE = 5.0e3  # N, minimum change of the reference force
+_EARLY, _LATE = 0.4, 0.6  # fractions of the duration between which the reference changes
+_TOUCH = 200.0  # N, minimum force that counts as contact
+_RANGE = 2.0e5  # N, range of the load cell
+_FIRST, _SECOND, _TIME, _FORCE, FORCE_READ, _PEAK = range(6)  # indices in `goal`
+# indices in `parameters`
+PLATE_QPOS, PLATE_DOF, PLATE_JOINT, MIDDLE_X, MIDDLE_Y, HALF_X, HALF_Y = range(7)
 
 
 def force_fields(machine: Machine, axes: tuple[str, ...]) -> list[Field]:
-    """What `observe_force` writes: force read and wanted, time since it was last changed."""
+    """Return the fields that `observe_force` writes: measured and reference force, time."""
     return [
         Field("force", "N", -_RANGE, _RANGE),
         Field("wanted_force", "N", 0.0, STRONGEST),
@@ -55,7 +56,7 @@ def force_fields(machine: Machine, axes: tuple[str, ...]) -> list[Field]:
 
 @compiled
 def plate_force(f, w):
-    """Force that the plate's spring and damper carry, positive when it is pressed down.
+    """Return the force in the spring and damper of the plate, positive when pressed down.
 
     Args:
         f: record of TASK_PARAMETERS.
@@ -64,7 +65,7 @@ def plate_force(f, w):
     Returns:
         The force, scalar [N].
 
-    Source: `simulate.surroundings`; positions are a step ahead, see `simulate.record`.
+    Source: `simulate.surroundings`; positions are one step ahead, see `simulate.record`.
     """
     dof, joint = int(f.parameters[PLATE_DOF]), int(f.parameters[PLATE_JOINT])
     stiffness = field(w.model, f.at_stiffness, joint + 1)[joint]
@@ -76,7 +77,7 @@ def plate_force(f, w):
 
 @compiled
 def begin_force(f, e, w):
-    """Draw the forces wanted and when they change.
+    """Draw the two reference forces and the time of the change.
 
     Args:
         f: record of TASK_PARAMETERS.
@@ -90,7 +91,7 @@ def begin_force(f, e, w):
     """
     g = e.goal
     g[_FIRST] = uniform_between(e, WEAKEST, STRONGEST)
-    # uniform over what is at least one smallest change away from the first
+    # uniform over all forces that differ from the first by at least _CHANGE
     below = max(0.0, g[_FIRST] - _CHANGE - WEAKEST)
     above = max(0.0, STRONGEST - g[_FIRST] - _CHANGE)
     place = uniform_between(e, 0.0, below + above)
@@ -102,7 +103,7 @@ def begin_force(f, e, w):
 
 @compiled
 def _read(f, e, w):
-    """Let the load cell read, if it is due; it is sampled with the other sensors."""
+    """Update the true force, and sample the load cell if a sensor sample is due."""
     e.goal[_FORCE] = plate_force(f, w)
     if e.tick % f.every == 0:
         error = uniform_between(e, -CELL, CELL) if f.noisy else 0.0
@@ -111,7 +112,7 @@ def _read(f, e, w):
 
 @compiled
 def tick_force(f, e, w):
-    """Read the load cell and remember the largest force of this step.
+    """Read the load cell and update the maximum force of this step.
 
     Args:
         f: record of TASK_PARAMETERS.
@@ -129,11 +130,11 @@ def tick_force(f, e, w):
 
 @compiled
 def reference_force(g, time):
-    """Force wanted at a time since the start [s], and the time since it was last changed.
+    """Return the reference force, and the time since its last change.
 
     Args:
         g: (GOAL,) goal of the episode.
-        time: scalar [s].
+        time: since the start, scalar [s].
 
     Returns:
         (force [N], time [s]), scalars.
@@ -147,12 +148,12 @@ def reference_force(g, time):
 
 @compiled
 def observe_force(f, e, out, at):
-    """Write force read, force wanted and the time since that was changed.
+    """Write the measured force, the reference force and the time since its last change.
 
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE.
-        out: (observations,) float32, written from `at` on.
+        out: (observations,) float32, written from index `at` on.
         at: scalar.
 
     Returns:
@@ -166,13 +167,13 @@ def observe_force(f, e, out, at):
 
 @compiled
 def reward_force(f, e, w):
-    """Reward of the true force; the episode ends by an overload or away from the plate.
+    """Compute the reward from the true force; an overload or leaving the plate ends the episode.
 
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE.
-        w: World; `measures` gets the error of the force [N], whether the plate is touched, whether
-            it was overloaded, whether the tip is no longer over it.
+        w: World; `measures` receives the force error [N] and, as 0 or 1, contact with the plate, an
+            overload, and a tip that is no longer over the plate.
 
     Returns:
         (reward, whether the episode ends), scalars.
@@ -194,23 +195,23 @@ def reward_force(f, e, w):
     return max(-1.0, 1.0 - abs(g[_FORCE] - wanted) / wanted), False
 
 
-_MIDDLE = (6.0, 0.0)  # m, of the plate
-_HALF = (1.2, 1.2)  # m
-_MASS = 300.0  # kg
-_SOFT, _STIFF = 5.0e5, 2.0e6  # N/m
-_DAMPING = 0.87  # of critical, as that of the plate of Zhu 1994's experiment in `press_stiffness`
-_ABOVE = (0.05, 0.15)  # m
+_MIDDLE = (6.0, 0.0)  # m, centre of the plate
+_HALF = (1.2, 1.2)  # m, half sizes of the plate
+_MASS = 300.0  # kg, mass of the plate
+_SOFT, _STIFF = 5.0e5, 2.0e6  # N/m, range of the plate's stiffness
+_DAMPING = 0.87  # damping ratio, as of the plate of Zhu 1994's experiment in `press_stiffness`
+_ABOVE = (0.05, 0.15)  # m, initial height of the tip above the plate
 
 
 def _start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
-    """The bucket over the middle of the plate, its teeth down."""
+    """Draw a start with the bucket over the centre of the plate, teeth down."""
     return draw_start(machine, rng, (5.6, -0.05, 0.2, -1.92), (6.4, 0.05, 0.9, -1.57))
 
 
 def _plate(
     machine: Machine, rng: np.random.Generator, start: dict[str, float]
 ) -> tuple[SurroundingObject, ...]:
-    """A plate below the tip."""
+    """Draw the stiffness and height of a plate below the tip."""
     numbers, axes, _ = arm_facts(machine)
     pose = np.zeros(5)
     task_forward(numbers, np.array([start[name] for name in axes]), pose)
@@ -222,7 +223,7 @@ def _plate(
 
 
 def _parameters(machine: Machine, model: mujoco.MjModel) -> tuple[float, ...]:
-    """Where the plate is in the model and before the machine, as `force` reads it."""
+    """Return the indices of the plate in the model, its centre and its half sizes."""
     joint = model.joint("plate_0")
     return (joint.qposadr[0], joint.dofadr[0], joint.id, *_MIDDLE, *_HALF)
 
@@ -231,13 +232,13 @@ HOLD_FORCE = Task(
     name="HoldForce",
     kind="force",
     sentence=(
-        "The bucket of an excavator presses on a plate on a spring, of unknown stiffness, with a"
-        " force of 10 to 35 kN that changes once."
+        "The bucket of an excavator presses on a plate that stands on a spring of unknown"
+        " stiffness. The reference force is between 10 and 35 kN and changes once."
     ),
     reward=(
-        "1 at the force wanted, less the error as a share of it, at least -1; in the air it is 0."
-        " More than 100 kN on the plate, or a tip that is no longer over it, ends the episode"
-        " with -50."
+        "The reward is 1 minus the relative force error, at least -1; without contact it is 0. A"
+        " force above 100 kN, or a tip that is no longer over the plate, ends the episode with a"
+        " reward of -50."
     ),
     machine="cat215",
     tool="bucket",
@@ -248,15 +249,15 @@ HOLD_FORCE = Task(
     measures=(("force_error", "N"), ("contact", "1"), ("overload", "1"), ("beside", "1")),
     surroundings=_plate,
     parameters=_parameters,
-    servo=Servo(position_gain=5.0),  # with more, a boom that swings freely comes down as a hammer
-    pose_rates=(0.3, 0.1, 0.3, 0.3, 0.25),  # as `press_stiffness`
+    servo=Servo(position_gain=5.0),  # a higher gain lets the boom hammer on the plate
+    pose_rates=(0.3, 0.1, 0.3, 0.3, 0.25),  # as in the scenario `press_stiffness`
 )
-"""A force on a plate."""
+"""Press on a plate with a given force."""
 
 
 @callback(TASK_CODE)
 def code(part, m, d, number, argument, out):
-    """The task in native code, see `world`."""
+    """Run one part of the task in native code; see `world`."""
     f = parameters_at(argument)[0]
     e, w = episodes(f)[number], world(f, m, d, number, argument)
     if part == BEGIN:

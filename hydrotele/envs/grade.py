@@ -1,12 +1,9 @@
-"""Grading: a low bank of soil with mounds is cut down to a plane, and the soil carried away.
+"""The task `Grade`: cut a low bank of soil with mounds down to a plane and carry the soil away.
 
-What `Grade` is.
-
-The bed of soil under a bucket: kept in an episode's terrain, its force on the simulation.
-
-`World.terrain` holds everything that one episode's soil remembers, in slices: the profile, the
-bucket's state, what the last step gave, and the numbers of the soil itself, which episodes may
-have different ones of. The profile lies in the vertical plane of the arm and turns with it.
+The module also couples the soil model to the simulation. `World.terrain` stores the soil state of
+one episode in slices: the profile, the state of the bucket, the result of the last step and the
+soil parameters, which may differ between episodes. The profile lies in the vertical plane of the
+arm and rotates with it.
 """
 
 import math
@@ -52,10 +49,10 @@ from hydrotele.soil.facts import (
 from hydrotele.soil.step import EdgeMotion, bucket_wrench, soil_step
 from hydrotele.soil.terrain import surface_height
 
-START, CELL, CELLS = 2.5, 0.05, 140  # m, m: the profile reaches to 9.5 m
-SOILS_MOST = 3
-_SHARED = OUTLINE + 2 * len(CAT215.outline)  # numbers of soil, bucket and profile
-_LOOSE = CELLS  # places in the terrain
+START, CELL, CELLS = 2.5, 0.05, 140  # m, m, 1: the profile extends to 9.5 m
+SOILS_MOST = 3  # maximum number of soils of a task
+_SHARED = OUTLINE + 2 * len(CAT215.outline)  # parameters of soil, bucket and profile
+_LOOSE = CELLS  # offsets in the terrain
 _BUCKET = _LOOSE + CELLS
 _RESULT = _BUCKET + STATE
 _SOIL = _RESULT + OUT
@@ -63,33 +60,36 @@ TERRAIN = _SOIL + _SHARED
 
 
 def bed_parameters(soils: Sequence[Soil], bucket: Bucket = CAT215) -> np.ndarray:
-    """Numbers of a task with a bed of soil.
+    """Return the task parameters of a bed of soil.
 
     Args:
-        soils: that episodes may have.
-        bucket: that digs.
+        soils: the soils from which an episode draws one.
+        bucket: the bucket that digs.
 
     Returns:
-        (at most PARAMETERS,) those of the first soil with bucket and profile, then what differs.
+        (at most PARAMETERS,) parameters of the first soil with bucket and profile, then the soil
+        parameters of the other soils.
 
     Raises:
-        InputError: there are no soils or more than three, or the bucket has other corners.
+        InputError: there are no soils or more than three, or the outline of the bucket has another
+            number of corners than that of the CAT 215.
     """
     rows = [soil_parameters(soil, bucket, START, CELL) for soil in soils]
     if not 1 <= len(rows) <= SOILS_MOST or len(rows[0]) != _SHARED:
-        raise InputError("bed of soil", f"takes 1 to {SOILS_MOST} soils and the CAT 215's bucket")
+        message = f"needs 1 to {SOILS_MOST} soils and a bucket with the corners of the CAT 215's"
+        raise InputError("bed of soil", message)
     return np.concatenate([rows[0], *(row[:WIDTH] for row in rows[1:])])
 
 
 @compiled
 def surface_of(w):
-    """Heights of the profile (CELLS,), live [m].
+    """Return a view of the surface heights of the profile.
 
     Args:
         w: World.
 
     Returns:
-        (CELLS,).
+        (CELLS,) [m].
 
     Source: this module.
     """
@@ -98,13 +98,13 @@ def surface_of(w):
 
 @compiled
 def loose_of(w):
-    """How much of the profile is loose (CELLS,), live [m].
+    """Return a view of the thickness of the loose soil on the profile.
 
     Args:
         w: World.
 
     Returns:
-        (CELLS,).
+        (CELLS,) [m].
 
     Source: this module.
     """
@@ -113,7 +113,7 @@ def loose_of(w):
 
 @compiled
 def bucket_of(w):
-    """State of the bucket (STATE,), live; see `soil.facts`.
+    """Return a view of the bucket state; see `soil.facts`.
 
     Args:
         w: World.
@@ -128,7 +128,7 @@ def bucket_of(w):
 
 @compiled
 def result_of(w):
-    """What the last step gave (OUT,), live; see `soil.facts`.
+    """Return a view of the result of the last soil step; see `soil.facts`.
 
     Args:
         w: World.
@@ -143,7 +143,7 @@ def result_of(w):
 
 @compiled
 def soil_of(w):
-    """Numbers of the episode's soil, live; see `soil.facts`.
+    """Return a view of the soil parameters of the episode; see `soil.facts`.
 
     Args:
         w: World.
@@ -158,12 +158,12 @@ def soil_of(w):
 
 @compiled
 def lay_bed(f, w, soil):
-    """Begin with level undisturbed soil at height 0 and an empty bucket.
+    """Initialise the terrain with level undisturbed soil at height 0 and an empty bucket.
 
     Args:
         f: record of TASK_PARAMETERS; its parameters are those of `bed_parameters`.
         w: World; `terrain` is written.
-        soil: number of the soil, scalar [1].
+        soil: index of the soil, scalar [1].
 
     Returns:
         Nothing.
@@ -182,10 +182,10 @@ def lay_bed(f, w, soil):
 
 @compiled
 def edge_rates(f, e, w, rates):
-    """Speeds of the bucket's edge, outwards and up, by the nominal arm.
+    """Compute the velocity of the bucket's edge, outwards and up, with the nominal kinematics.
 
-    Only the damping of the soil's springs reads them, for which a variant's arm, some centimetres
-    longer, is the same.
+    Only the damping of the soil uses it, which tolerates the slightly different geometry of a
+    variant.
 
     Args:
         f: record of TASK_PARAMETERS.
@@ -210,23 +210,24 @@ def edge_rates(f, e, w, rates):
 
 @compiled
 def tick_bed(f, e, w):
-    """Move soil and bucket on by one control period; the force acts in the next one.
+    """Advance soil and bucket by one control period; the force acts during the next period.
 
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE.
-        w: World after a physics step; `terrain` and the tip's body in `xfrc` are written.
+        w: World after a physics step; `terrain` and the row of the tip's body in `xfrc` are
+            written.
 
     Returns:
         Nothing.
 
-    Source: `soil.step.soil_step`, `bucket_wrench`; places are MuJoCo's own, so that every
-        variant's geometry is exact.
+    Source: `soil.step.soil_step`, `bucket_wrench`. Positions come from MuJoCo, so that the geometry
+        of every variant is exact.
     """
     body = f.tip_body
     theta = math.atan2(w.tip[1], w.tip[0])
     c, s = math.cos(theta), math.sin(theta)
-    ahead = w.xmat[9 * body : 9 * body + 9]  # its first column points from the pin to the edge
+    ahead = w.xmat[9 * body : 9 * body + 9]  # first column points from the pin to the edge
     attitude = math.atan2(ahead[6], c * ahead[0] + s * ahead[3])
     rates = np.empty(2)
     edge_rates(f, e, w, rates)
@@ -242,35 +243,35 @@ assert _SHARED + (SOILS_MOST - 1) * WIDTH <= PARAMETERS
 
 
 NEAR, FAR = 3.8, 5.8  # m, radii between which the ground is graded
-POINTS = 20  # means of the profile that are observed
-MIDDLE = 0.5 * (NEAR + FAR)  # m, where the height of the plane is told
-GRADED = 0.03  # m of error that counts as graded
-HOLD = 1.0  # s for which it must
-DEEPEST = 0.5  # m below the plane, at which the episode has failed
-SCALE = 0.01  # m of error less that pays 1
-TIME_COST = 0.05  # per s
+POINTS = 20  # number of profile sections whose mean is observed
+MIDDLE = 0.5 * (NEAR + FAR)  # m, radius at which the height of the plane is given
+GRADED = 0.03  # m, maximum RMS error of graded ground
+HOLD = 1.0  # s for which the error must stay below it
+DEEPEST = 0.5  # m below the plane at which the episode fails
+SCALE = 0.01  # m of error reduction for a reward of 1
+TIME_COST = 0.05  # reward per s
 SUCCESS, FAILURE = 5.0, -5.0  # rewards at the end
-SCANNER = 0.01  # m, largest error of a mean of the profile as read, assumed
-SCALES = 30.0  # kg, of the mass carried as read, assumed
-_LEVEL = (0.15, 0.45)  # m, heights of the ground over what the machine stands on
-_SLOPE = 0.06  # rad
-_DOWN = (0.02, 0.08)  # m from the ground to the plane
+SCANNER = 0.01  # m, maximum error of a measured section mean, assumed
+SCALES = 30.0  # kg, maximum error of the measured mass carried, assumed
+_LEVEL = (0.15, 0.45)  # m, height of the ground above the machine's tracks
+_SLOPE = 0.06  # rad, maximum slope of the plane
+_DOWN = (0.02, 0.08)  # m, depth of the plane below the ground
 _HIGH, _LOW = (0.12, 0.30), (0.0, 0.10)  # m, heights of two mounds
-_LONG = (0.7, 1.3)  # m, half their lengths
-_MOST = 4000.0  # kg
-PLANE, TILT, ERROR, HELD, SOIL = range(5)  # places in the goal
+_LONG = (0.7, 1.3)  # m, half lengths of the mounds
+_MOST = 4000.0  # kg, upper bound of the observed mass carried
+PLANE, TILT, ERROR, HELD, SOIL = range(5)  # indices in `goal`
 FIRST, LAST = round((NEAR - START) / CELL), round((FAR - START) / CELL)  # cells
-_EACH = (LAST - FIRST) // POINTS  # cells of a point
+_EACH = (LAST - FIRST) // POINTS  # cells per section
 assert 0 <= FIRST < LAST <= CELLS and _EACH * POINTS == LAST - FIRST
 
 
 def grade_radii() -> list[float]:
-    """Radii of the middles of the parts whose means are observed [m]."""
+    """Return the centre radii of the profile sections whose means are observed [m]."""
     return [NEAR + (FAR - NEAR) * (p + 0.5) / POINTS for p in range(POINTS)]
 
 
 def grade_fields(machine: Machine, axes: tuple[str, ...]) -> list[Field]:
-    """What `observe_grade` writes: errors of the profile, the edge over it, load, plane."""
+    """Return the fields that `observe_grade` writes: profile errors, edge height, mass, plane."""
     far = reach(machine)
     fields = [Field(f"profile_error.{p}", "m", -1.0, 2.0) for p in range(POINTS)]
     return [
@@ -284,7 +285,7 @@ def grade_fields(machine: Machine, axes: tuple[str, ...]) -> list[Field]:
 
 @compiled
 def plane_height(g, r):
-    """Height that the ground shall have at a radius.
+    """Return the height of the target plane at a radius.
 
     Args:
         g: (GOAL,) goal of the episode.
@@ -300,13 +301,13 @@ def plane_height(g, r):
 
 @compiled
 def profile_error(g, surface, first, last):
-    """Mean and root mean square of the ground's height over the plane in some cells.
+    """Return the mean and RMS height of the ground above the target plane in a range of cells.
 
     Args:
         g: (GOAL,) goal of the episode.
         surface: (CELLS,) heights [m].
-        first: cell, scalar [1].
-        last: the cell after the last one, scalar [1].
+        first: index of the first cell, scalar [1].
+        last: index after the last cell, scalar [1].
 
     Returns:
         (mean, root mean square), scalars [m].
@@ -323,7 +324,7 @@ def profile_error(g, surface, first, last):
 
 @compiled
 def _heap(surface, middle, half, height):
-    """Add a mound in the form of a raised cosine."""
+    """Add a mound with a raised-cosine shape to the surface."""
     for i in range(len(surface)):
         place = (START + (i + 0.5) * CELL - middle) / half
         if abs(place) < 1.0:
@@ -332,7 +333,7 @@ def _heap(surface, middle, half, height):
 
 @compiled
 def begin_grade(f, e, w):
-    """Draw the soil, the ground and the plane.
+    """Draw the soil, the ground with two mounds, and the target plane.
 
     Args:
         f: record of TASK_PARAMETERS.
@@ -371,19 +372,19 @@ def begin_grade(f, e, w):
 
 @compiled
 def observe_grade(f, e, w, out, at):
-    """Write errors of the profile, the edge over it, the mass carried and the plane.
+    """Write the profile errors, the height of the edge above the ground, the mass and the plane.
 
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE.
         w: World.
-        out: (observations,) float32, written from `at` on.
+        out: (observations,) float32, written from index `at` on.
         at: scalar.
 
     Returns:
         Nothing.
 
-    Source: `grade_fields`; the edge is where the sensors say.
+    Source: `grade_fields`; the position of the edge follows from the measured joint angles.
     """
     g, surface = e.goal, surface_of(w)
     pose = np.empty(ARM)
@@ -403,13 +404,13 @@ def observe_grade(f, e, w, out, at):
 
 @compiled
 def reward_grade(f, e, w):
-    """Pay every centimetre that the ground comes nearer to the plane; time costs.
+    """Compute the reward from the decrease of the profile error, minus a time cost.
 
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE; `goal` is written.
-        w: World; `measures` gets the error [m], mass carried [kg], force of the soil [N], number
-            of the soil, whether the ground is graded, whether it was spoiled.
+        w: World; `measures` receives the RMS error [m], mass carried [kg], soil force [N], index of
+            the soil, and, as 0 or 1, whether the ground is graded and whether it was spoiled.
 
     Returns:
         (reward, whether the episode ends), scalars.
@@ -436,19 +437,19 @@ def reward_grade(f, e, w):
 
 
 GRADE_SOILS = ("soft", "sandy_loam", "firm")
-"""Names of the soils that episodes have, in the order of their numbers."""
+"""Names of the soils, in the order of their indices."""
 
 _LEAST_POSE = (5.6, -0.5, 1.25, math.radians(-110.0))  # r [m], theta [rad], z [m], attitude [rad]
 _LARGEST_POSE = (6.4, 0.5, 1.5, math.radians(-90.0))
 
 
 def _start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
-    """The bucket over the far end of the stretch, ready to dig, above the highest ground."""
+    """Draw a start with the bucket above the far end of the ground, ready to dig."""
     return draw_start(machine, rng, _LEAST_POSE, _LARGEST_POSE)
 
 
 def _parameters(machine: Machine, model: mujoco.MjModel) -> tuple[float, ...]:
-    """Soils, bucket and profile; the last one is the number of soils."""
+    """Return the parameters of the bed of soil; the last one is the number of soils."""
     bed = bed_parameters([SOILS[name] for name in GRADE_SOILS]).tolist()
     return (*bed, *[0.0] * (PARAMETERS - 1 - len(bed)), float(len(GRADE_SOILS)))
 
@@ -457,14 +458,14 @@ GRADE = Task(
     name="Grade",
     kind="grade",
     sentence=(
-        "An excavator's bucket cuts a low bank of soft, loamy or firm soil down to a plane of given"
-        " height and slope, 3.8 to 5.8 m before it, and carries the soil away; the swing is"
-        " locked, its action does nothing."
+        "An excavator cuts a low bank of soft, loamy or firm soil down to a plane of given height"
+        " and slope, 3.8 to 5.8 m in front of it, and carries the soil away. The swing is locked;"
+        " its action has no effect."
     ),
     reward=(
-        "1 for every 0.01 m by which the root mean square error of the profile shrinks, less 0.05"
-        " per second; 5 for an error below 0.03 m for a second, -5 for the edge 0.5 m below the"
-        " plane, and both end the episode."
+        "The reward is 1 for every 0.01 m by which the RMS error of the profile decreases, minus"
+        " 0.05 per second. An error below 0.03 m for 1 s ends the episode with a reward of 5; an"
+        " edge 0.5 m below the plane ends it with -5."
     ),
     machine="cat215",
     tool="bucket",
@@ -481,12 +482,12 @@ GRADE = Task(
     pose_rates=(0.5, 0.3, 0.4, 0.5, 0.25),
     swing_locked=True,
 )  # fmt: skip
-"""Ground graded to a plane."""
+"""Grade the ground to a plane."""
 
 
 @callback(TASK_CODE)
 def code(part, m, d, number, argument, out):
-    """The task in native code, see `world`."""
+    """Run one part of the task in native code; see `world`."""
     f = parameters_at(argument)[0]
     e, w = episodes(f)[number], world(f, m, d, number, argument)
     if part == BEGIN:

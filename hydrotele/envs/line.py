@@ -1,7 +1,8 @@
-"""A straight line of the tip, gone by trapezoidal speed with the attitude of the tool kept.
+"""The task `StraightLine`: move the tip along a straight line at constant tool attitude.
 
-Straight in r and z, and in some episodes turned by the swing in proportion to the way. A line is
-drawn until all of it lies in the workspace and asks less of the drives than they have.
+The speed profile is trapezoidal. The line is straight in r and z; in some episodes the swing
+rotates in proportion to the travel. Lines are drawn at random until one lies in the workspace and
+does not exceed the rates of the drives.
 """
 
 import math
@@ -29,29 +30,29 @@ from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Servo
 
-PREVIEWS = (0.1, 0.2, 0.4)  # s ahead
-ACROSS, ALONG, TURNED = 0.1, 0.2, 0.2  # m, m, rad that cost a reward of 1
-SETTLE = 0.5  # s before the line begins
-_SHORT, _LONG = 1.0, 3.0  # m
-_SLOW, _FAST = 0.2, 0.6  # m/s
-_GENTLE, _HARD = 0.5, 1.0  # m/s^2
-_TURN, _TURNING = 0.08, 0.4  # rad of swing per metre at most, share of the episodes with it
-_INNER, _LOW, _HIGH = 3.0, 0.1, 6.0  # m: beyond the tracks, above the ground
-_EFFORT = 0.9  # of the drives
-_DRAWS, _TRUE_SIZE = 240, 200  # draws of a line, the first ones of them at its true size
-_SMALLER = 0.7  # factor of size from one draw to the next after those
-# numbers of the goal: pose at the start (r, theta, z, attitude), change of the pose per metre
+PREVIEWS = (0.1, 0.2, 0.4)  # s, look-ahead times of the observed reference
+ACROSS, ALONG, TURNED = 0.1, 0.2, 0.2  # m, m, rad of error that cost a reward of 1
+SETTLE = 0.5  # s before the motion starts
+_SHORT, _LONG = 1.0, 3.0  # m, range of the length
+_SLOW, _FAST = 0.2, 0.6  # m/s, range of the speed
+_GENTLE, _HARD = 0.5, 1.0  # m/s^2, range of the acceleration
+_TURN, _TURNING = 0.08, 0.4  # rad of swing per metre at most, fraction of episodes with swing
+_INNER, _LOW, _HIGH = 3.0, 0.1, 6.0  # m: minimum radius beyond the tracks, range of the height
+_EFFORT = 0.9  # maximum sum of relative axis rates, see `path_effort`
+_DRAWS, _TRUE_SIZE = 240, 200  # maximum number of draws; draws before the line is shortened
+_SMALLER = 0.7  # factor of length and speed per draw after those
+# indices in `goal`: pose at the start (r, theta, z, attitude), change of the pose per metre
 _START, _PER_METRE, _LENGTH, _SPEED, _ACCELERATION = 0, 4, 7, 8, 9
 _R, _THETA, _Z, _ATTITUDE, _HEAD = range(ARM)
-# numbers of the observation, after those of the machine: pose, its rate, places ahead, errors
+# indices in the observation of the task: pose, its rate, positions ahead, errors
 _POSE, _RATE, _AHEAD = 0, 4, 7
 _ALONG = _AHEAD + 3 * len(PREVIEWS)
 _ACROSS = _ALONG + 1
-_QUICK = 1.0  # m/s, rad/s: bound of the rates wanted
+_QUICK = 1.0  # m/s, rad/s: bound of the reference rates
 
 
 def line_fields(machine: Machine, axes: tuple[str, ...]) -> list[Field]:
-    """What `observe_line` writes: pose now and ahead, its rate, errors by the readings."""
+    """Return the fields that `observe_line` writes: reference pose, rates, preview, errors."""
     k, far = len(axes), reach(machine)
     fields = pose_fields(machine, k, "wanted")
     fields += [Field(f"wanted_rate.{c}", unit, -_QUICK, _QUICK)
@@ -67,7 +68,7 @@ def line_fields(machine: Machine, axes: tuple[str, ...]) -> list[Field]:
 
 @compiled
 def begin_line(f, e):
-    """Draw a line from where the tip is.
+    """Draw a line that starts at the current tip position.
 
     Args:
         f: record of TASK_PARAMETERS.
@@ -89,7 +90,7 @@ def begin_line(f, e):
     size = 1.0
     for n in range(_DRAWS):
         if n >= _TRUE_SIZE:
-            size *= _SMALLER  # the start lies inside, so that a small and slow line fits surely
+            size *= _SMALLER  # the start is inside the workspace, so a short slow line fits
         way, length = (
             uniform_between(e, -math.pi, math.pi),
             size * uniform_between(e, _SHORT, _LONG),
@@ -108,14 +109,14 @@ def begin_line(f, e):
 
 @compiled
 def line_way(g, time):
-    """Way gone on the line and its speed.
+    """Return the distance travelled along the line, and the speed.
 
     Args:
         g: (GOAL,) goal of the episode.
         time: since the start, scalar [s].
 
     Returns:
-        (way [m], speed [m/s]), scalars.
+        (distance [m], speed [m/s]), scalars.
 
     Source: this module.
     """
@@ -134,7 +135,7 @@ def line_way(g, time):
 
 @compiled
 def line_pose(g, time, pose, rate):
-    """Pose wanted and its rate.
+    """Compute the reference pose and its rate.
 
     Args:
         g: (GOAL,) goal of the episode.
@@ -157,14 +158,14 @@ def line_pose(g, time, pose, rate):
 
 @compiled
 def line_errors(g, wanted, r, theta, z):
-    """How far the tip is ahead of its place along the line, and how far beside the line.
+    """Return the along-track and cross-track errors of the tip.
 
     Args:
         g: (GOAL,) goal of the episode.
-        wanted: (ARM,) pose wanted.
+        wanted: (ARM,) reference pose.
         r: radius of the tip, scalar [m].
-        theta: its angle about the swing axis, scalar [rad]; whole turns do not count.
-        z: its height, scalar [m].
+        theta: angle of the tip about the swing axis, modulo 2 pi, scalar [rad].
+        z: height of the tip, scalar [m].
 
     Returns:
         (along, positive ahead [m], across, not negative [m]), scalars.
@@ -181,12 +182,12 @@ def line_errors(g, wanted, r, theta, z):
 
 @compiled
 def observe_line(f, e, out, at):
-    """Write the pose wanted now and ahead, and the errors that the readings tell.
+    """Write the reference pose now and ahead, and the errors from the measured joint positions.
 
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE.
-        out: (observations,) float32, written from `at` on.
+        out: (observations,) float32, written from index `at` on.
         at: scalar.
 
     Returns:
@@ -211,19 +212,20 @@ def observe_line(f, e, out, at):
 
 @compiled
 def line_reward(across, along, attitude):
-    """Reward of errors [m], [m], [rad], scalar: 1 without, at least -1."""
+    """Return the reward, scalar from -1 to 1, for errors [m], [m] and [rad]."""
     costs = across / ACROSS + abs(along) / ALONG + abs(attitude) / TURNED
     return max(-1.0, 1.0 - costs)
 
 
 @compiled
 def reward_line(f, e, w):
-    """Reward of the tip's true place.
+    """Compute the reward from the true tip position.
 
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE.
-        w: World; `measures` gets the errors across and along [m] and of the attitude [rad].
+        w: World; `measures` receives the cross-track and along-track errors [m] and the attitude
+            error [rad].
 
     Returns:
         (reward, False), scalars.
@@ -240,7 +242,7 @@ def reward_line(f, e, w):
 
 
 def _start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
-    """The bucket in the air before the machine, about as in Zhu 1994, Figs 6.45-6.48."""
+    """Draw a start with the bucket in the air, about as in Zhu 1994, Figs 6.45-6.48."""
     return draw_start(machine, rng, (4.8, -0.5, 0.4, -1.9), (6.5, 0.5, 2.4, -1.2))
 
 
@@ -248,29 +250,30 @@ STRAIGHT_LINE = Task(
     name="StraightLine",
     kind="line",
     sentence=(
-        "The tip of an excavator's bucket goes along a straight line of 1 to 3 m at 0.2 to 0.6 m/s,"
-        " its attitude kept."
+        "The tip of an excavator's bucket moves along a straight line of 1 to 3 m at 0.2 to 0.6 m/s"
+        " with constant attitude."
     ),
     reward=(
-        "1 on the line and in time, less 1 for every 0.1 m beside the line, every 0.2 m behind or"
-        " ahead and every 0.2 rad of attitude, at least -1."
+        "The reward is 1 minus 1 for every 0.1 m of cross-track error, every 0.2 m of along-track"
+        " error and every 0.2 rad of attitude error, at least -1."
     ),
     machine="cat215",
     tool="bucket",
     action="resolved_motion",
-    duration=16.5,  # of the longest and slowest line, and a little more
+    duration=16.5,  # s: enough for the longest and slowest line
     start=_start,
     fields=line_fields,
     measures=(("cross_track_error", "m"), ("along_track_error", "m"), ("attitude_error", "rad")),
-    servo=Servo(axis_gains={"boom": 2.0}),  # with more, a boom near its end swings on its oil
-    pose_rates=(0.9, 0.3, 0.9, 0.4, 0.25),  # half as much again as the fastest line
+    # a higher gain excites the oil resonance of the boom near the end of its range
+    servo=Servo(axis_gains={"boom": 2.0}),
+    pose_rates=(0.9, 0.3, 0.9, 0.4, 0.25),  # 1.5 times the fastest line
 )
-"""A straight line of the tip."""
+"""Move the tip along a straight line."""
 
 
 @callback(TASK_CODE)
 def code(part, m, d, number, argument, out):
-    """The task in native code, see `world`."""
+    """Run one part of the task in native code; see `world`."""
     f = parameters_at(argument)[0]
     e, w = episodes(f)[number], world(f, m, d, number, argument)
     if part == BEGIN:

@@ -1,8 +1,9 @@
-"""An environment step in native code: actions, control tick, sensors, reward, a new episode.
+"""Environment step in native code: actions, control, sensors, reward and reset.
 
-MuJoCo calls `advance` for every simulation from its own threads; nothing of Python runs in it.
-Actions are bounded in their change, since a machine of 20 t follows no jump: joint rates move joint
-references, pose rates those of the arm by resolved motion, and the joint servo follows them.
+MuJoCo calls `advance` for every simulation from its own threads, without the Python interpreter.
+Joint-rate actions move the joint references; pose-rate actions move them by resolved motion. The
+joint servo tracks the references. The acceleration of the references is limited, since a machine of
+20 t cannot follow a step.
 """
 # pyright: reportCallIssue=false, reportPrivateImportUsage=false
 # numba's intrinsics are called without their typing context, and carray is its documented API.
@@ -55,12 +56,12 @@ from hydrotele.simulate.stepping import (
     true_values,
 )
 
-_AHEAD = 0.2  # rad or m by which a reference may lead its joint: a stalled arm winds nothing up
+_AHEAD = 0.2  # rad or m, maximum lead of a reference over its joint: anti-windup for a stalled arm
 
 
 @compiled
 def _asked(f, action, a):
-    """An action as it counts."""
+    """Return an action clipped to +-1; 0 for the locked action."""
     return 0.0 if a == f.locked else min(1.0, max(-1.0, action[a]))
 
 
@@ -71,7 +72,7 @@ def _towards(now, goal, change):
 
 @compiled
 def _joint_rates(f, e, action, first):
-    """Move the references of axes by their own rates; actions from `first` on."""
+    """Move the references of axes by joint rates, from action `first` on."""
     for a in range(first, f.actions):
         i = f.driven_axis[a]
         goal = _asked(f, action, a) * f.fastest[i]
@@ -86,7 +87,7 @@ def _joint_rates(f, e, action, first):
 
 @compiled
 def _pose_rates(f, e, action):
-    """Move the references of the arm by rates of its pose."""
+    """Move the references of the arm by pose rates (resolved motion)."""
     k, wanted = f.arm_axes, np.empty(ARM)
     for c in range(ARM):
         goal = 0.0
@@ -105,7 +106,7 @@ def _pose_rates(f, e, action):
     if held:
         e.pose_rate[:] = 0.0
         e.reference_rate[:k] = 0.0
-    if far:  # the arm is stopped by something: go on from where it stands
+    if far:  # the arm is blocked by an obstacle: continue from its measured position
         for i in range(k):
             e.reference[i] = _towards(e.joint[i], e.reference[i], _AHEAD)
         task_forward(f.arm, e.reference[:k], e.pose)
@@ -113,13 +114,13 @@ def _pose_rates(f, e, action):
 
 @compiled
 def act(f, e, action):
-    """Commands of this control period.
+    """Convert the action into valve commands, or into references of the servo.
 
     Args:
         f: record of TASK_PARAMETERS.
-        e: record of EPISODE_STATE; `command` and, unless actions are valves, references are
-            written.
-        action: (actions,) of the agent, full at +-1; beyond they count as full.
+        e: record of EPISODE_STATE; `command` is written for valve actions, the references and
+            `drive` for all others.
+        action: (actions,) of the agent; values outside +-1 are clipped.
 
     Returns:
         Nothing.
@@ -146,11 +147,11 @@ def act(f, e, action):
 
 @compiled
 def sense(f, e, sim):
-    """Read the sensors, if a reading is due; otherwise they are held.
+    """Sample the sensors if a sample is due, and hold the last sample otherwise.
 
     Args:
         f: record of TASK_PARAMETERS.
-        e: record of EPISODE_STATE; true positions are written, readings where they are due.
+        e: record of EPISODE_STATE; true positions are always written, measured values if due.
         sim: Simulation of this episode.
 
     Returns:
@@ -191,7 +192,7 @@ _SIGNATURE = types.void(types.int64, types.int64, types.intc, types.int64)
 
 @compiled
 def _simulation(f, e, w):
-    """An episode's plant for `simulate.stepping`."""
+    """Return the simulation record of an episode for `simulate.stepping`."""
     ring = floats(
         f.commands + 8 * w.number * f.delayed_command * AXES, f.delayed_command * AXES
     ).reshape((f.delayed_command, AXES))
@@ -215,7 +216,7 @@ def _simulation(f, e, w):
 
 @compiled
 def _tick(f, e, sim):
-    """Commands of this control period, and the physics under them."""
+    """Run the servo and the physics for one control period."""
     k, none = f.axes, np.zeros(f.axes)
     controller = Controller(f.servo[:k], f.closed[:k], e.load[:k], e.command[:k])
     drive = DriveReference(e.drive[0, :k], e.drive[1, :k], e.drive[2, :k], e.drive[3, :k])
@@ -228,7 +229,7 @@ def _tick(f, e, sim):
 
 @compiled
 def _unstable(f, e, d):
-    """Count MuJoCo's warnings; whether it met infinite states or such as are not a number."""
+    """Count and clear MuJoCo's warnings; return whether a state was infinite or NaN."""
     warnings = carray(pointer(d + f.at_warning), (_WARNINGS, 2), np.int32)  # (information, number)
     bad = False
     for kind in range(_WARNINGS):
@@ -241,7 +242,7 @@ def _unstable(f, e, d):
 
 @compiled
 def _begin_episode(f, e, w):
-    """Put the simulation at the start of a variant, and draw a new goal."""
+    """Draw a variant, set the simulation to its start, and draw a new goal."""
     e.last_variant, e.last_fault = e.variant, e.fault
     e.variant = int(uniform(e) * f.variants)
     start = f.starts + 8 * e.variant * f.states
@@ -276,7 +277,7 @@ def _begin_episode(f, e, w):
 
 @compiled
 def _observe(f, e, w, address):
-    """Write the observation; readings saturate at the ends of their ranges."""
+    """Write the observation, clipped to its bounds."""
     n = f.observations
     out = carray(pointer(address + 4 * w.number * n), (n,), np.float32)
     low = carray(pointer(f.low), (n,), np.float32)
@@ -291,7 +292,7 @@ def _observe(f, e, w, address):
 
 @compiled
 def _step(f, e, w, action):
-    """One environment step; reward, whether the task is over, whether the time is."""
+    """Run one environment step; return the reward, `terminated` and `truncated`."""
     sim = _simulation(f, e, w)
     for _ in range(f.ticks):
         act(f, e, action)
@@ -300,7 +301,7 @@ def _step(f, e, w, action):
         sense(f, e, sim)
         call_task(
             f, w, TICK, 0
-        )  # after the physics: before, MuJoCo's places are another simulation's
+        )  # after the physics: before it, body positions belong to another simulation
     copy_to(e.tip, w.tip)
     e.step += 1
     if _unstable(f, e, w.data):
@@ -340,5 +341,5 @@ def _advance(m, d, sim, argument):
 
 @callback(_SIGNATURE)
 def advance(m, d, sim, argument):
-    """A step or a reset of one simulation: mjModel*, mjData*, number, TASK_PARAMETERS."""
+    """Step or reset one simulation: mjModel*, mjData*, index, TASK_PARAMETERS*."""
     _advance(m, d, sim, argument)

@@ -1,7 +1,7 @@
-"""Environments of gymnasium: from the keywords of `make` and `make_vec` to tasks that run.
+"""Gymnasium environments: the entry points of `make` and `make_vec`.
 
-One environment, which MuJoCo's window can show as fast as its own time runs; and thousands of them
-that one native call steps on a pool of threads.
+`MachineEnv` is a single environment, which MuJoCo's viewer can show in real time.
+`MachineVectorEnv` is a batch of environments, which one native call steps on a pool of threads.
 """
 
 import atexit
@@ -36,7 +36,7 @@ from hydrotele.show.window import check_screen
 
 
 def _about_home(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
-    """Axes somewhere in the middle part of their ranges; the swing anywhere in front."""
+    """Draw axis positions uniformly from the middle 40 % of their ranges."""
     places = {}
     for name, axis in machine.axes.items():
         low, high = machine.joints[axis.joint].range or (-0.5, 0.5)
@@ -50,8 +50,8 @@ TASKS = {
         Task(
             name="TrackTrajectory",
             kind="track",
-            sentence="All axes of an excavator follow Fourier references, without tool.",
-            reward="1 on the trajectory, less 1 for every 0.1 m that the tip is off, at least -1.",
+            sentence="All axes of an excavator without a tool track Fourier references.",
+            reward="The reward is 1 minus 1 for every 0.1 m of tip error, at least -1.",
             machine="cat215",
             tool="none",
             start=_about_home,
@@ -77,20 +77,20 @@ AUTORESET = {"NextStep": NEXT_STEP, "SameStep": SAME_STEP, "Disabled": DISABLED}
 
 
 def make_core(task: str, choices: dict[str, Any], count: int, threads: int, mode: int) -> TaskCore:
-    """A running task.
+    """Make a running task from its name and options.
 
     Args:
-        task: its name.
-        choices: fields of `tasks.task.Options`.
+        task: name of the task.
+        choices: fields of `envs.task.Options`.
         count: number of environments.
-        threads: that step them, 0 for one per core.
-        mode: of autoreset.
+        threads: number of threads that step the environments, 0 for one per core.
+        mode: autoreset mode, NEXT_STEP, SAME_STEP or DISABLED.
 
     Returns:
         The core.
 
     Raises:
-        InputError: no such task, no such option, or a value that does not suit.
+        InputError: the task or an option does not exist, or a value is not valid.
     """
     if task not in TASKS:
         raise InputError(f"task {task!r}", suggest(task, TASKS))
@@ -104,7 +104,7 @@ def make_core(task: str, choices: dict[str, Any], count: int, threads: int, mode
 
 
 def _options(choices: dict[str, Any]) -> Options:
-    """The choices, each of its own type: `variants="3"` is a mistake, and so is a NaN."""
+    """Validate the type of every option; `variants="3"` and NaN are errors."""
     kept: dict[str, Any] = {}
     for name, value in choices.items():
         plain = value.item() if isinstance(value, np.generic) else value
@@ -112,30 +112,30 @@ def _options(choices: dict[str, Any]) -> Options:
         try:
             kept[name] = _TYPES[name].validate_python(plain)
         except ValidationError as error:
-            message = f"{error.errors()[0]['msg']}; it is {value!r}"
+            message = f"{error.errors()[0]['msg']}; got {value!r}"
             raise InputError(f"environment option {name!r}", message) from None
     return Options(**kept)
 
 
 def observation_space(core: TaskCore) -> Box:
-    """(o,) float32 in SI, with the ends at which readings saturate."""
+    """Return the observation space, (o,) float32 in SI units, at whose bounds values saturate."""
     return Box(core.low, core.high, dtype=np.float32)
 
 
 def action_space(core: TaskCore) -> Box:
-    """(a,) float32 from -1 to 1: full action to either side."""
+    """Return the action space, (a,) float32 from -1 to 1."""
     return Box(-1.0, 1.0, (len(core.setup.axes),), np.float32)
 
 
 def info_of(core: TaskCore, final: bool = False) -> dict[str, np.ndarray]:
-    """Name -> (n,) of the last step: the task's figures, variant, whether it became unstable.
+    """Return the `info` of the last step: task measures, variant and fault.
 
     Args:
-        core: the task.
-        final: of the episodes that ended in this step, where new ones have begun since.
+        core: the running task.
+        final: whether to return the values before an autoreset in the same step.
 
     Returns:
-        The figures.
+        Name -> (n,) values.
     """
     told, which = core.setup.task.measures, "last_" if final else ""
     figures = core.final_measures if final else core.measures
@@ -146,45 +146,45 @@ def info_of(core: TaskCore, final: bool = False) -> dict[str, np.ndarray]:
 
 
 def check_mode(mode: str | None, known: list[str]) -> None:
-    """Refuse a render mode that there is not.
+    """Check that a render mode exists.
 
     Raises:
-        InputError: it is not known.
+        InputError: the mode is not in the list.
     """
     if mode is not None and mode not in known:
         raise InputError(f"render_mode {mode!r}", f"choose one of {', '.join(known)}, or none")
 
 
 def with_rate(metadata: dict[str, Any], core: TaskCore) -> dict[str, Any]:
-    """Metadata of an environment with the pictures per second [Hz] that its steps make."""
+    """Return the metadata with `render_fps` set to the environment steps per second [Hz]."""
     rate = core.setup.options.control_rate
     return {**metadata, "render_fps": int(rate) if rate == int(rate) else rate}
 
 
 ADVICE = (
-    "use render_mode='rgb_array', which needs none, or make a screen up: xvfb-run -a python ..."
+    "use render_mode='rgb_array', which needs no screen, or a virtual one: xvfb-run -a python ..."
 )
-_PATIENCE = 5.0  # s that MuJoCo's viewer may take to close its window
-_OPEN: list["TaskWindow"] = []  # at most one: GLFW, which draws it, is for one thread only
+_PATIENCE = 5.0  # s, maximum time to wait for MuJoCo's viewer to close
+_OPEN: list["TaskWindow"] = []  # at most one: GLFW supports one thread only
 
 
 class TaskWindow:
     """A passive viewer of the first simulation of a task; the user may close it.
 
-    A process has one of them: opening another closes the last. Where there is no screen MuJoCo's
-    viewer hangs: `show.window.check_screen` comes before.
+    A process has at most one viewer; opening another closes the first. Call
+    `show.window.check_screen` before, since MuJoCo's viewer hangs without a screen.
     """
 
     def __init__(self, stage: Stage, camera: Camera, rate: float) -> None:
-        """Open it.
+        """Open the viewer.
 
         Args:
-            stage: what is seen.
-            camera: as of `Stage.camera`; the user may choose another one.
-            rate: pictures per second of the task's time [Hz].
+            stage: the scene to show.
+            camera: see `Stage.camera`; the user may select another one in the viewer.
+            rate: frames per second of simulated time [Hz].
 
         Raises:
-            InputError: there is no such camera.
+            InputError: the camera does not exist.
         """
         view = stage.camera(camera)
         from mujoco import viewer
@@ -206,7 +206,7 @@ class TaskWindow:
             self._handle.cam.lookat[:] = view.lookat
 
     def show(self) -> None:
-        """Show the task as it stands now, not before its time; nothing once it was closed."""
+        """Show the current state and wait for real time; do nothing if the viewer is closed."""
         if not self._handle.is_running():
             return
         with self._handle.lock():
@@ -221,7 +221,7 @@ class TaskWindow:
         time.sleep(self._next - now)
 
     def close(self) -> None:
-        """Close it, and wait until it is: Python must not take GLFW down before."""
+        """Close the viewer and wait for its threads, before Python unloads GLFW."""
         if self in _OPEN:
             _OPEN.remove(self)
             atexit.unregister(self.close)
@@ -231,12 +231,12 @@ class TaskWindow:
 
 
 class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-    """A control task on a simulated machine.
+    """Gymnasium environment of a control task on a simulated machine.
 
     Attributes:
-        core: the running task: machine, axes, fields of the observation with units, variants.
-        observation_space: (o,) float32 in SI; what each number is: `core.setup.fields`.
-        action_space: (a,) float32 from -1 to 1; what each number moves: `core.coordinates`.
+        core: the running task with machine, axes, observation fields and variants.
+        observation_space: (o,) float32 in SI units; `core.setup.fields` names the values.
+        action_space: (a,) float32 from -1 to 1; `core.coordinates` names the actions.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 50}
@@ -249,15 +249,16 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
         Args:
             task: name of the task, as in `hydrotele/<Name>-v0`.
-            render_mode: None, `rgb_array` for pictures, or `human` for a window.
-            width: of pictures [pixel].
-            height: of pictures [pixel].
-            camera: a camera of the machine, such as `overview`, `side` or `cab`; without, one that
-                shows all that its arm reaches.
+            render_mode: None, `rgb_array` for images, or `human` for a window.
+            width: width of images [pixel].
+            height: height of images [pixel].
+            camera: a camera of the machine, such as `overview`, `side` or `cab`; None for a free
+                camera that shows the whole workspace of the arm.
             **options: fields of `hydrotele.envs.task.Options`.
 
         Raises:
-            InputError: an option is not known or does not suit, or there is no screen for a window.
+            InputError: an option does not exist or is not valid, or there is no screen for a
+                window.
         """
         check_mode(render_mode, self.metadata["render_modes"])
         if render_mode == "human":
@@ -274,11 +275,11 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin an episode: a variant, and a goal, drawn from the seed or what came of it.
+        """Start an episode with a random variant and goal.
 
         Args:
-            seed: integer >= 0; without one, random numbers go on.
-            options: none.
+            seed: integer >= 0; None continues the random stream.
+            options: not used.
 
         Returns:
             (observation (o,), info).
@@ -292,16 +293,16 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self.core.observation[0].copy(), self._info()
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Go on by one step.
+        """Advance by one step.
 
         Args:
-            action: (a,); beyond +-1 it counts as full.
+            action: (a,); values outside +-1 are clipped.
 
         Returns:
             (observation (o,), reward, terminated, truncated, info).
 
         Raises:
-            ValueError: the action has another shape, or is not a finite number.
+            ValueError: the action has the wrong shape, or is not finite.
         """
         core = self.core
         core.step_one(action)
@@ -315,18 +316,18 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return {name: values[0] for name, values in info_of(self.core).items()}
 
     def render(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Draw the machine and its goal.
+        """Render the machine and its goal.
 
         Returns:
-            (height, width, 3) uint8, or None where no pictures were asked for: a window shows
-            every step by itself.
+            (height, width, 3) uint8 with `render_mode="rgb_array"`, otherwise None: a window shows
+            every step automatically.
 
         Raises:
-            InputError: there is no such camera, or no OpenGL works (says what to do).
+            InputError: the camera does not exist, or OpenGL does not work.
         """
         if self.render_mode != "rgb_array":
             if self.render_mode is None:
-                gymnasium.logger.warn("render() shows nothing without render_mode='rgb_array'")
+                gymnasium.logger.warn("render() returns None without render_mode='rgb_array'")
             return None
         width, height, camera = self._view
         return self._staged().picture(0, width, height, camera)
@@ -337,7 +338,7 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._stage
 
     def _show(self) -> None:
-        """Show this step where there is a window."""
+        """Show the current step with `render_mode="human"`."""
         if self.render_mode != "human":
             return
         if self._window is None:
@@ -345,7 +346,7 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._window.show()
 
     def close(self) -> None:
-        """Close what shows the simulation, and give its memory back."""
+        """Close the window and the renderer, and free the memory of the simulation."""
         if self._window:
             self._window.close()
         if self._stage:
@@ -355,7 +356,9 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
 
 class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
-    """n environments of a task; each is, bit for bit, the single one of its seed.
+    """Gymnasium vector environment with n environments of a task.
+
+    Each environment gives exactly the same values as a single environment with the same seed.
 
     Attributes:
         core: the running task.
@@ -374,16 +377,18 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             task: name of the task.
             num_envs: number of environments n.
             render_mode: None or `rgb_array`.
-            threads: that step them; 0 for one per core. Results do not depend on it.
-            autoreset_mode: of gymnasium.
-            width: of pictures [pixel].
-            height: of pictures [pixel].
-            camera: a camera of the machine; without, one that shows all that its arm reaches.
-            shown: number of environments, the first ones, that pictures are made of; without, all.
+            threads: number of threads that step the environments; 0 for one per core. Results do
+                not depend on it.
+            autoreset_mode: autoreset mode of gymnasium.
+            width: width of images [pixel].
+            height: height of images [pixel].
+            camera: a camera of the machine; None for a free camera that shows the whole workspace
+                of the arm.
+            shown: number of environments to render, from the first one; None for all.
             **options: fields of `hydrotele.envs.task.Options`.
 
         Raises:
-            InputError: an option is not known or does not suit.
+            InputError: an option does not exist or is not valid.
         """
         check_mode(render_mode, self.metadata["render_modes"])
         mode = AutoresetMode(autoreset_mode)
@@ -402,18 +407,19 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin episodes.
+        """Start episodes.
 
         Args:
-            seed: of the first environment, the others count up; or one each.
-            options: `reset_mask` (n,) bool says which ones; all without.
+            seed: seed of the first environment, to which the others add their index; or one seed
+                per environment.
+            options: `reset_mask` (n,) bool selects the environments; all without it.
 
         Returns:
             (observations (n, o), infos).
 
         Raises:
-            ValueError: seeds or mask have a wrong length, or a seed is not usable.
-            RuntimeError: the first reset leaves some out.
+            ValueError: seeds or mask have the wrong length, or a seed is not valid.
+            RuntimeError: the first reset does not include all environments.
         """
         super().reset(seed=seed if isinstance(seed, int) else None)
         chosen = self._chosen(options)
@@ -429,7 +435,7 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         mask = options["reset_mask"]
         if not (isinstance(mask, np.ndarray) and mask.dtype == np.bool_ and mask.any()
                 and mask.shape == (self.num_envs,)):  # fmt: skip
-            raise ValueError(f"reset_mask must be ({self.num_envs},) bool with a True in it")
+            raise ValueError(f"reset_mask must be ({self.num_envs},) bool with at least one True")
         return np.flatnonzero(mask)
 
     def _seeds(self, seed: int | list[int | None] | None) -> np.ndarray | None:
@@ -448,20 +454,20 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Go on by one step; environments whose episode ended begin a new one.
+        """Advance all environments by one step, with the autoreset mode for finished episodes.
 
         Args:
-            actions: (n, a); beyond +-1 they count as full.
+            actions: (n, a); values outside +-1 are clipped.
 
         Returns:
             (observations (n, o), rewards (n,), terminations (n,), truncations (n,), infos).
 
         Raises:
-            ValueError: the actions have another shape, or are not finite numbers.
+            ValueError: the actions have the wrong shape, or are not finite.
         """
         core = self.core
         if np.shape(actions) != core.action.shape:
-            raise ValueError(f"actions are {core.action.shape}, not {np.shape(actions)}")
+            raise ValueError(f"actions must be {core.action.shape}, not {np.shape(actions)}")
         core.step(actions)
         infos = self._infos(None)
         over = (core.terminated | core.truncated).astype(bool)
@@ -478,7 +484,7 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return _masked(info_of(self.core), there)
 
     def _with_final(self, infos: dict[str, Any], over: np.ndarray) -> dict[str, Any]:
-        """What the last steps of episodes ended with, beside the first of the new ones."""
+        """Add the final observations and infos of the episodes that were reset in this step."""
         observations = np.full(self.num_envs, None, dtype=object)
         for number in np.flatnonzero(over):
             observations[number] = self.core.final[number].copy()
@@ -487,23 +493,23 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return infos | _masked(final, over)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """Draw machines and their goals, one after the other.
+        """Render the machines and their goals.
 
         Returns:
-            `shown` pictures (height, width, 3) uint8, or None without `render_mode`.
+            `shown` images (height, width, 3) uint8, or None without `render_mode`.
 
         Raises:
-            InputError: there is no such camera, or no OpenGL works (says what to do).
+            InputError: the camera does not exist, or OpenGL does not work.
         """
         if self.render_mode is None:
-            gymnasium.logger.warn("render() shows nothing without render_mode='rgb_array'")
+            gymnasium.logger.warn("render() returns None without render_mode='rgb_array'")
             return None
         if self._stage is None:
             self._stage = Stage(self.core)
         return tuple(self._stage.picture(n, *self._view) for n in range(self._shown))
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Give the simulations' memory back."""
+        """Close the renderer and free the memory of the simulations."""
         if self._stage:
             self._stage.close()
             self._stage = None
@@ -511,5 +517,5 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
 
 def _masked(infos: dict[str, Any], there: np.ndarray) -> dict[str, Any]:
-    """The same with gymnasium's masks beside: whose figures they are."""
+    """Add gymnasium's masks, which mark the environments for which an entry is valid."""
     return infos | {f"_{name}": there.copy() for name in infos}

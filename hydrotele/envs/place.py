@@ -1,13 +1,9 @@
-"""A log that a grapple picks up from the ground and lays down at another place, turned as asked.
+"""The task `PlaceLog`: pick up a log from the ground with a grapple and lay it down at a goal pose.
 
-Where the log lies, and where it shall lie, is drawn for every episode; the log is moved there by
-its own six coordinates, so that one compiled model serves all of them.
-
-What `PlaceLog` is.
-
-A grapple that hangs freely: when its jaw takes a log, and what is read of its two free joints.
-
-Angle sensors of the machine's kind sit on both free joints: same rate, error and resolution.
+The start pose and the goal pose of the log are drawn for every episode. The log is a free body
+whose coordinates are set at the start, so one compiled model serves all episodes. The grapple hangs
+from two free joints. Both have angle sensors with the sampling rate, error and resolution of the
+first axis.
 """
 
 import math
@@ -38,15 +34,15 @@ from hydrotele.scenario.scenario import LogOnGround, Servo
 from hydrotele.simulate.feedback import convert
 from hydrotele.simulate.surroundings import CENTRE, GRIP, ROW, TAKEN, grip_step, log_grip
 
-HAND, LOG, WELD, JAW, PLACE, RADIUS, HALF_LENGTH = range(GRIP, GRIP + 7)  # in `parameters`
-_FREE = GRIP + 7  # place in qpos and qvel of pitch, then of roll
+HAND, LOG, WELD, JAW, PLACE, RADIUS, HALF_LENGTH = range(GRIP, GRIP + 7)  # indices in `parameters`
+_FREE = GRIP + 7  # index in `parameters`: (qpos, qvel) indices of pitch, then of roll
 FREE_JOINTS = ("grapple_pitch", "grapple_roll")
-READ = 0  # first of the readings in the goal: pitch, roll, their rates
-READINGS = 4
+READ = 0  # index in `goal` of the measured values: pitch, roll, their rates
+READINGS = 4  # number of measured values of the free joints
 
 
 def grapple_parameters(machine: Machine, model: mujoco.MjModel, log: LogOnGround) -> np.ndarray:
-    """Numbers of a task with a grapple and one log.
+    """Return the task parameters for a grapple and one log.
 
     Args:
         machine: the machine.
@@ -54,9 +50,9 @@ def grapple_parameters(machine: Machine, model: mujoco.MjModel, log: LogOnGround
         log: the log.
 
     Returns:
-        (GRIP + 11,): those of `simulate.surroundings.grip_step`, then numbers of the grapple's
-        body, the log's body and weld, places in `qpos` of jaw and log, the log's radius and half
-        its length [m], places of the free joints.
+        (GRIP + 11,): parameters of `simulate.surroundings.grip_step`, then the ids of the grapple's
+        body, the log's body and the weld, the indices in `qpos` of jaw and log, the radius and half
+        length of the log [m], and the indices of the free joints in `qpos` and `qvel`.
     """
     hand = machine.links[machine.link_of(machine.axes[log.grab].joint)].parent
     places = [
@@ -71,7 +67,7 @@ def grapple_parameters(machine: Machine, model: mujoco.MjModel, log: LogOnGround
 
 @compiled
 def is_held(f, w):
-    """Whether the grapple holds the log.
+    """Return whether the grapple holds the log.
 
     Args:
         f: record of TASK_PARAMETERS.
@@ -87,7 +83,7 @@ def is_held(f, w):
 
 @compiled
 def _number(values, count, at):
-    """`count` numbers of body number `at`."""
+    """Return the `count` values of the body with index `at`."""
     return values[count * at : count * at + count]
 
 
@@ -103,23 +99,23 @@ def _take_or_let_go(f, w):
     if change == 0:
         return
     w.eq_active[weld] = 1 if change == TAKEN else 0
-    for c in range(first, first + ROW):  # now, and from the next call on
+    for c in range(first, first + ROW):  # eq_data acts now, eq_rows from the next call on
         w.eq_data[c] = w.eq_rows[c]
 
 
 @compiled
 def read_free_joints(f, e, w):
-    """Read the angles of the free joints and difference quotients, if a reading is due.
+    """Measure the angles and rates of the free joints, if a sensor sample is due.
 
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE; `goal` is written from READ on.
-        w: World, staggered as `simulate.record` says.
+        w: World, with staggered positions and velocities, see `simulate.record`.
 
     Returns:
         Nothing.
 
-    Source: as `envs.loop.sense`, with the error and resolution of the first axis' sensor.
+    Source: like `envs.loop.sense`, with the error and resolution of the sensor of the first axis.
     """
     if e.tick % f.every != 0:
         return
@@ -136,7 +132,7 @@ def read_free_joints(f, e, w):
 
 @compiled
 def tick_grapple(f, e, w):
-    """Take the log or let it go, and read the free joints.
+    """Grip or release the log, and measure the free joints.
 
     Args:
         f: record of TASK_PARAMETERS; its parameters are those of `grapple_parameters`.
@@ -154,15 +150,15 @@ def tick_grapple(f, e, w):
 
 @compiled
 def grip_distance(f, w):
-    """How far the pocket between the jaws is from the log.
+    """Return the distance and the angle between the grapple's pocket and the log.
 
     Args:
         f: record of TASK_PARAMETERS.
         w: World after a physics step.
 
     Returns:
-        (distance of the pocket's middle from the part of the log's axis that can be held [m],
-        angle between the pocket's line and that axis [rad]), scalars.
+        (distance from the centre of the pocket to the part of the log's axis that can be gripped
+        [m], angle between the axes of pocket and log [rad]), scalars.
 
     Source: this module.
     """
@@ -184,37 +180,37 @@ def grip_distance(f, w):
 
 @compiled
 def tilt_angle(f, w):
-    """Angle between the grapple and plumb, scalar [rad].
+    """Return the angle between the grapple and the vertical.
 
     Args:
         f: record of TASK_PARAMETERS.
         w: World after a physics step.
 
     Returns:
-        The angle.
+        The angle, scalar [rad].
 
-    Source: its x points down.
+    Source: the x axis of the grapple points down.
     """
     down = -w.xmat[9 * int(f.parameters[HAND]) + 6]
     return np.arccos(min(1.0, max(-1.0, down)))
 
 
-NEAR, STRAIGHT, KEEP = 0.3, math.radians(15.0), 0.5  # m, rad, s: what counts as placed
-PROGRESS, TIME, LEANING = 1.0, 0.005, 0.02  # per metre nearer, per step, per step and rad
-TAKING, SUCCESS, LOST = 5.0, 20.0, -20.0
-LEVER, ASKEW = 1.0, 0.5  # m: of what a rad counts, of the log and of the grapple
-_LYING = 0.05  # m by which a log that lies may be higher than it should
-_REACH = (2.3, 8.7)  # m from the axis of the house: where some part of the log can be held
-_RADII = (4.5, 6.5)  # m
-_ASIDE = (0.15, 0.5)  # rad from the grapple to the log
-_SLEW = (math.radians(30.0), math.radians(90.0))  # from the log to its goal
-_X, _Y, _YAW, _LEFT, _KEPT, _TAKEN = range(READ + READINGS, READ + READINGS + 6)  # in the goal
-GOAL_PLACE = slice(_X, _YAW + 1)  # x [m], y [m], yaw [rad] of the goal of the episode
-_FASTEST = 10.0  # rad/s of a difference quotient of noisy readings
+NEAR, STRAIGHT, KEEP = 0.3, math.radians(15.0), 0.5  # m, rad, s: tolerances of a placed log
+PROGRESS, TIME, LEANING = 1.0, 0.005, 0.02  # reward per m, cost per step, per step and rad of tilt
+TAKING, SUCCESS, LOST = 5.0, 20.0, -20.0  # rewards of the first grip, of success, of a lost log
+LEVER, ASKEW = 1.0, 0.5  # m per rad: weights of the log's yaw error and the grapple's misalignment
+_LYING = 0.05  # m and rad, maximum height error and slope of a log that lies on the ground
+_REACH = (2.3, 8.7)  # m from the swing axis, range in which the log can be gripped
+_RADII = (4.5, 6.5)  # m, range of the radius of log and goal
+_ASIDE = (0.15, 0.5)  # rad, range of the angle from the grapple to the log
+_SLEW = (math.radians(30.0), math.radians(90.0))  # rad, range of the angle from log to goal
+_X, _Y, _YAW, _LEFT, _KEPT, _TAKEN = range(READ + READINGS, READ + READINGS + 6)  # in `goal`
+GOAL_PLACE = slice(_X, _YAW + 1)  # slice of `goal`: x [m], y [m], yaw [rad] of the goal pose
+_FASTEST = 10.0  # rad/s, bound of the difference quotient of noisy samples
 
 
 def place_fields(machine: Machine, axes: tuple[str, ...]) -> list[Field]:
-    """What `observe_place` writes: log, goal, whether it is held, the grapple's free joints."""
+    """Return the fields that `observe_place` writes: log, goal, held, free joints."""
     far = 2.0 * reach(machine)
     fields = []
     for what, high in (("log", ("z",)), ("goal", ())):
@@ -233,7 +229,7 @@ def place_fields(machine: Machine, axes: tuple[str, ...]) -> list[Field]:
 
 @compiled
 def begin_place(f, e, w):
-    """Lay the log down before the machine and draw where it shall go.
+    """Draw the start pose and the goal pose of the log.
 
     Args:
         f: record of TASK_PARAMETERS; its parameters are those of `grapple_parameters`.
@@ -268,15 +264,15 @@ def _either_side(e, size):
 
 @compiled
 def log_pose(f, w):
-    """Where the log is.
+    """Return the position and direction of the log.
 
     Args:
         f: record of TASK_PARAMETERS.
         w: World.
 
     Returns:
-        (x [m], y [m], z [m], and of its axis sine and cosine of twice the yaw, sine of the angle
-        to the horizontal plane), scalars; its ends are alike.
+        (x [m], y [m], z [m], sine and cosine of twice the yaw of the axis, sine of the angle
+        between axis and horizontal plane), scalars. Twice the yaw, since both ends are equivalent.
 
     Source: this module.
     """
@@ -292,15 +288,15 @@ def log_pose(f, w):
 
 @compiled
 def yaw_between(sine, cosine, yaw):
-    """Angle between an axis without ends and another, scalar from 0 to pi/2 [rad].
+    """Return the angle between two undirected horizontal axes.
 
     Args:
-        sine: of twice the yaw of the first, scalar.
-        cosine: of the same, scalar.
-        yaw: of the second, scalar [rad].
+        sine: sine of twice the yaw of the first axis, scalar.
+        cosine: cosine of twice the yaw of the first axis, scalar.
+        yaw: yaw of the second axis, scalar [rad].
 
     Returns:
-        The angle.
+        The angle, scalar from 0 to pi/2 [rad].
 
     Source: this module.
     """
@@ -310,13 +306,13 @@ def yaw_between(sine, cosine, yaw):
 
 @compiled
 def observe_place(f, e, w, out, at):
-    """Write log, goal, whether it is held, and what is read of the free joints.
+    """Write the poses of log and goal, whether the log is held, and the measured free joints.
 
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE.
         w: World.
-        out: (observations,) float32, written from `at` on.
+        out: (observations,) float32, written from index `at` on.
         at: scalar.
 
     Returns:
@@ -337,13 +333,13 @@ def observe_place(f, e, w, out, at):
 
 @compiled
 def reward_place(f, e, w):
-    """Reward of bringing the grapple to the log and the log to its goal.
+    """Compute the reward for moving the grapple to the log and the log to its goal.
 
     Args:
         f: record of TASK_PARAMETERS.
-        e: record of EPISODE_STATE.
-        w: World; `measures` gets the log's distance from its goal [m], error of its yaw [rad],
-            whether it is held, success, the grapple's angle to plumb [rad].
+        e: record of EPISODE_STATE; `goal` is written.
+        w: World; `measures` receives the distance [m] and yaw error [rad] of the log, whether it is
+            held, success, and the angle of the grapple to the vertical [rad].
 
     Returns:
         (reward, whether the log is placed or out of reach), scalars.
@@ -361,7 +357,7 @@ def reward_place(f, e, w):
     if not (held or there):
         apart, askew = grip_distance(f, w)
         left += apart + ASKEW * askew
-    if g[_LEFT] < 0.0:  # the first step: before it no place of the grapple was known
+    if g[_LEFT] < 0.0:  # first step: the position of the grapple is not known before
         g[_LEFT] = left
     reward = PROGRESS * (g[_LEFT] - left) - TIME - LEANING * swing
     g[_LEFT] = left
@@ -382,13 +378,13 @@ def reward_place(f, e, w):
 
 
 LOG_TO_PLACE = LogOnGround(position=(5.5, 0.0), direction=math.pi / 2.0)
-"""The log; every episode lays it down elsewhere."""
+"""The log; `begin_place` overwrites its pose."""
 
-_LOW, _HIGH = (4.5, -0.5, 2.2), (6.5, 0.5, 2.8)  # m, rad, m: the stick's pin at the start
+_LOW, _HIGH = (4.5, -0.5, 2.2), (6.5, 0.5, 2.8)  # m, rad, m: start of the pin at the stick's tip
 
 
 def _start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
-    """The open grapple hangs plumb, higher than a log on the ground."""
+    """Draw a start with the open grapple hanging vertically above the height of a log."""
     joints = draw_start(machine, rng, _LOW, _HIGH)
     plumb = -0.5 * math.pi - joints["boom"] - joints["stick"]
     turned = float(rng.uniform(-0.5, 0.5) * math.pi)
@@ -403,16 +399,17 @@ PLACE_LOG = Task(
     name="PlaceLog",
     kind="place",
     sentence=(
-        "An excavator takes a log from the ground with a grapple that swings freely and lays it"
-        " down elsewhere, turned as asked. Where log and goal lie is known exactly, also with real"
-        " sensors."
+        "An excavator picks up a log from the ground with a freely swinging grapple and lays it"
+        " down at a goal position and yaw. The poses of log and goal are known exactly, also with"
+        " real sensors."
     ),
     reward=(
-        "1 for every metre nearer: of the grapple to the log until it is held (a radian askew"
-        " counts as 0.5 m), of the log to its goal (a radian of yaw counts as 1 m); 5 for the first"
-        " taking; less 0.005 for every step and 0.02 for every radian that the grapple is off"
-        " plumb in it. 20 once the log has lain within 0.3 m and 15 deg of its goal, let go, for"
-        " 0.5 s, or -20 when it lies out of reach; both end the episode."
+        "The reward is 1 for every metre that the log approaches its goal (1 rad of yaw error"
+        " counts as 1 m), and for every metre that the grapple approaches a log not yet held"
+        " (1 rad of misalignment counts as 0.5 m). The first grip pays 5. Every step costs 0.005,"
+        " and 0.02 per radian between the grapple and the vertical. A released log that has lain"
+        " within 0.3 m and 15 deg of its goal for 0.5 s ends the episode with a reward of 20; a"
+        " log out of reach ends it with -20."
     ),
     machine="cat215",
     tool="grapple_claw",
@@ -429,15 +426,15 @@ PLACE_LOG = Task(
     ground=True,
     parameters=_parameters,
     writes=("eq_data",),
-    # with the usual 4 /s a late, sticky valve lets the boom swing, and the grapple with it
+    # with the default of 4 /s, valve delay and stiction make boom and grapple oscillate
     servo=Servo(position_gain=2.5, axis_gains={"boom": 2.0}),
 )  # fmt: skip
-"""A log picked up and laid down with the CAT 215's claw."""
+"""Pick up a log and lay it down with the claw of the CAT 215."""
 
 
 @callback(TASK_CODE)
 def code(part, m, d, number, argument, out):
-    """The task in native code, see `world`."""
+    """Run one part of the task in native code; see `world`."""
     f = parameters_at(argument)[0]
     e, w = episodes(f)[number], world(f, m, d, number, argument)
     if part == BEGIN:

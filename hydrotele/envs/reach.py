@@ -1,8 +1,7 @@
-"""A pose that the head of a feller-buncher is brought to and kept at, by all five axes of its arm.
+"""The task `ReachFeller`: bring the head of a feller-buncher to a pose and hold it there.
 
-The pose is drawn until the straight way to it lies in the workspace.
-
-What `ReachFeller` is.
+The arm has five axes. Poses are drawn at random until the straight path to one lies in the
+workspace.
 """
 
 import math
@@ -30,18 +29,18 @@ from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Servo
 
-NEAR, LEVEL, KEEP = 0.05, 0.03, 0.5  # m, rad, s: what counts as reached
-PROGRESS, TIME, SUCCESS = 1.0, 0.01, 10.0  # reward per metre nearer, cost of a step, of success
-LEVER = 1.0  # m: of what a rad of attitude counts
-_RADII, _SWING, _HEIGHTS = (4.5, 9.0), 1.0, (0.8, 4.0)  # m, rad to either side, m
-_ATTITUDE, _HEAD = 0.6, 0.4  # rad to either side of level and straight
-_DRAWS, _TRUE_SIZE = 140, 100  # draws of a pose, the first ones of them wherever it lies
-_SMALLER = 0.7  # factor of the way from one draw to the next after those
-_TARGET, _HELD, _LEFT = 0, 5, 6  # places in the goal
+NEAR, LEVEL, KEEP = 0.05, 0.03, 0.5  # m, rad, s: tolerances of a reached pose
+PROGRESS, TIME, SUCCESS = 1.0, 0.01, 10.0  # reward per m, cost per step, reward of success
+LEVER = 1.0  # m per rad, weight of the attitude error
+_RADII, _SWING, _HEIGHTS = (4.5, 9.0), 1.0, (0.8, 4.0)  # m, rad, m: range of the goal
+_ATTITUDE, _HEAD = 0.6, 0.4  # rad, maximum angles of the goal from level and straight
+_DRAWS, _TRUE_SIZE = 140, 100  # maximum number of draws; draws before the path is shortened
+_SMALLER = 0.7  # factor of the path per draw after those
+_TARGET, _HELD, _LEFT = 0, 5, 6  # indices in `goal`
 
 
 def reach_fields(machine: Machine, axes: tuple[str, ...]) -> list[Field]:
-    """What `observe_reach` writes: the pose wanted, distance by the readings, time held."""
+    """Return the fields that `observe_reach` writes: goal pose, measured distance, time held."""
     return [
         *pose_fields(machine, len(axes), "wanted"),
         Field("distance", "m", 0.0, 2.0 * reach(machine)),
@@ -51,7 +50,7 @@ def reach_fields(machine: Machine, axes: tuple[str, ...]) -> list[Field]:
 
 @compiled
 def begin_reach(f, e):
-    """Draw a pose that the arm can go to straight from where it stands.
+    """Draw a goal pose that the arm can reach on a straight path from its start.
 
     Args:
         f: record of TASK_PARAMETERS.
@@ -67,7 +66,7 @@ def begin_reach(f, e):
     size = 1.0
     for n in range(_DRAWS):
         if n >= _TRUE_SIZE:
-            size *= _SMALLER  # the start lies inside, so that a pose near it does too
+            size *= _SMALLER  # the start is inside the workspace, so a close pose is reachable
         change[0] = size * (uniform_between(e, _RADII[0], _RADII[1]) - start[0])
         change[1] = size * uniform_between(e, -_SWING, _SWING)
         change[2] = size * (uniform_between(e, _HEIGHTS[0], _HEIGHTS[1]) - start[2])
@@ -83,18 +82,19 @@ def begin_reach(f, e):
 
 @compiled
 def reach_errors(target, x, y, z, attitude, head):
-    """How far a pose of the tip is from the one wanted.
+    """Return the position and angle errors of the tip with respect to the goal pose.
 
     Args:
-        target: (ARM,) pose wanted: r [m], theta [rad], z [m], attitude, head [rad].
-        x: place of the tip, scalar [m].
+        target: (ARM,) goal pose: r [m], theta [rad], z [m], attitude, head [rad].
+        x: position of the tip, scalar [m].
         y: scalar [m].
         z: scalar [m].
         attitude: of the tilt link, scalar [rad].
         head: angle of the head, scalar [rad].
 
     Returns:
-        (distance [m], angle [rad]), scalars; the angle is the larger one of both errors.
+        (distance [m], angle [rad]), scalars; the angle is the larger of the attitude and head
+        errors.
 
     Source: this module.
     """
@@ -105,7 +105,7 @@ def reach_errors(target, x, y, z, attitude, head):
 
 @compiled
 def reach_left(distance, angle):
-    """What is left of the way, scalar [m]: distance, and the angle over a lever of `LEVER`."""
+    """Return the remaining distance, scalar [m]: position error plus `LEVER` times angle error."""
     return distance + LEVER * angle
 
 
@@ -118,12 +118,12 @@ def _true_errors(f, e):
 
 @compiled
 def observe_reach(f, e, out, at):
-    """Write the pose wanted, the distance that the readings tell, and how long it was held.
+    """Write the goal pose, the distance from the measured joint positions, and the time held.
 
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE.
-        out: (observations,) float32, written from `at` on.
+        out: (observations,) float32, written from index `at` on.
         at: scalar.
 
     Returns:
@@ -143,12 +143,13 @@ def observe_reach(f, e, out, at):
 
 @compiled
 def reward_reach(f, e, w):
-    """Reward of coming nearer; the episode ends once the pose was kept long enough.
+    """Compute the reward from the decrease of the remaining distance; holding the pose ends it.
 
     Args:
         f: record of TASK_PARAMETERS.
-        e: record of EPISODE_STATE.
-        w: World; `measures` gets distance [m], error of attitude and head [rad], success.
+        e: record of EPISODE_STATE; `goal` is written.
+        w: World; `measures` receives the distance [m], the larger error of attitude and head [rad],
+            and success.
 
     Returns:
         (reward, whether the pose was reached), scalars.
@@ -169,7 +170,7 @@ def reward_reach(f, e, w):
 
 
 def _start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
-    """The head in the air before the machine, about level."""
+    """Draw a start with the head in the air in front of the machine, about level."""
     return draw_start(
         machine, rng, (5.0, -0.5, 0.8, -0.4, -0.3), (8.0, 0.5, 3.0, 0.4, 0.3)
     )  # fmt: skip
@@ -178,10 +179,11 @@ def _start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
 REACH_FELLER = Task(
     name="ReachFeller",
     kind="reach",
-    sentence="A feller-buncher brings its head to a pose with all five axes and keeps it there.",
+    sentence="A feller-buncher moves its head to a pose with all five axes and holds it there.",
     reward=(
-        "1 for every metre nearer (a radian of attitude or head counts as one), less 0.01 for every"
-        " step, and 10 once it was within 0.05 m and 0.03 rad for 0.5 s, which ends the episode."
+        "The reward is 1 for every metre that the head approaches the pose (1 rad of attitude or"
+        " head angle counts as 1 m), minus 0.01 per step. Holding the pose within 0.05 m and"
+        " 0.03 rad for 0.5 s ends the episode with a reward of 10."
     ),
     machine="cat325",
     tool=None,
@@ -189,15 +191,15 @@ REACH_FELLER = Task(
     start=_start,
     fields=reach_fields,
     measures=(("distance", "m"), ("attitude_error", "rad"), ("success", "1")),
-    servo=Servo(axis_gains={"swing": 1.0, "boom": 2.0}),  # heavy on soft oil
+    servo=Servo(axis_gains={"swing": 1.0, "boom": 2.0}),  # large inertia on compressible oil
     pose_rates=(0.5, 0.2, 0.5, 0.2, 0.2),
 )
-"""A pose of a feller-buncher's head."""
+"""Reach and hold a pose of the feller-buncher's head."""
 
 
 @callback(TASK_CODE)
 def code(part, m, d, number, argument, out):
-    """The task in native code, see `world`."""
+    """Run one part of the task in native code; see `world`."""
     f = parameters_at(argument)[0]
     e, w = episodes(f)[number], world(f, m, d, number, argument)
     if part == BEGIN:

@@ -1,8 +1,9 @@
-"""The batched environments for stable-baselines3 (the extra `learn`): no Python per environment.
+"""Batched environments for stable-baselines3 (the extra `learn`).
 
-A learning agent sees errors beside readings: a network hardly sees millimetres in the difference of
-two positions that vary by metres. What a machine is like shows only over time, so it sees the last
-steps, too. What it does may correct the action of a reference controller.
+`StableVecEnv` steps all environments in one native call. `AgentView` transforms observations and
+actions for learning. It appends the reference errors, since a network hardly resolves millimetres
+in the difference of two positions that vary by metres. It stacks the last steps, since the dynamics
+of a machine show only over time. The agent may correct the action of a reference controller.
 """
 
 from typing import Any
@@ -16,17 +17,17 @@ from hydrotele.envs.episode import SAME_STEP
 from hydrotele.envs.facts import TaskSetup
 from hydrotele.envs.making import action_space, make_core, observation_space
 
-_ASKED = ("reference", "wanted")  # first words of fields that say what is asked for
+_ASKED = ("reference", "wanted")  # prefixes of the fields that hold references
 
 
 def difference_columns(setup: TaskSetup) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of columns: what is asked for, and what is measured of the same.
+    """Return the observation columns of all references and of the matching measured values.
 
     Args:
-        setup: the task as it was chosen.
+        setup: the task with its options.
 
     Returns:
-        (columns of the fields `reference...` and `wanted...`, columns of what is measured of them).
+        (columns of the fields `reference...` and `wanted...`, columns of the measured values).
     """
     places = {field.name: number for number, field in enumerate(setup.fields)}
     asked, measured = [], []
@@ -45,22 +46,22 @@ def difference_columns(setup: TaskSetup) -> tuple[np.ndarray, np.ndarray]:
 
 
 class AgentView:
-    """Between an environment and an agent, for n episodes side by side.
+    """Transform observations and actions between n environments and an agent.
 
     Attributes:
-        size: numbers that the agent sees.
+        size: number of values in the observation of the agent.
     """
 
     def __init__(
         self, setup: TaskSetup, history: int = 3, law: Controller | None = None, share: float = 1.0
     ) -> None:
-        """Choose what the agent sees and does.
+        """Define the observation and the action of the agent.
 
         Args:
-            setup: the task as it was chosen.
-            history: steps that it sees, this one too.
-            law: a controller whose actions it corrects, none for an agent on its own.
-            share: of a full action that its own is at most.
+            setup: the task with its options.
+            history: number of stacked steps, including the current one.
+            law: a controller whose actions the agent corrects, None for an agent alone.
+            share: maximum action of the agent as a fraction of a full action.
         """
         self._law, self._share, self._history = law, share, history
         self._asked, self._measured = difference_columns(setup)
@@ -69,7 +70,7 @@ class AgentView:
         self.size = history * self._width + (self._actions if law else 0)
 
     def begin(self, count: int) -> None:
-        """Start `count` episodes."""
+        """Allocate the state of `count` episodes."""
         self._past = np.zeros((count, self._history, self._width), np.float32)
         self._base = np.zeros((count, self._actions), np.float32)
         self._fresh = np.ones(count, bool)
@@ -77,7 +78,7 @@ class AgentView:
             self._law.begin(count)
 
     def reset(self, mask: np.ndarray) -> None:
-        """Forget the episodes of mask (n,)."""
+        """Reset the history of the episodes selected by the mask (n,)."""
         self._fresh |= mask
         if self._law:
             self._law.reset(mask)
@@ -91,7 +92,7 @@ class AgentView:
         return np.concatenate([flat, base], axis=1) if self._law else flat.copy()
 
     def see(self, observation: np.ndarray) -> np.ndarray:
-        """What the agent sees, (n, size), at observations (n, o) of the step that comes."""
+        """Return the agent's observation (n, size) for environment observations (n, o)."""
         now = self._now(observation)
         self._past[:, 1:] = self._past[:, :-1]
         self._past[:, 0] = now
@@ -102,16 +103,17 @@ class AgentView:
         return self._shown(self._past, self._base)
 
     def last(self, observation: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-        """What it would see, (m, size), at the last observations (n, o) of `chosen` (m,) episodes.
+        """Return the agent's final observation (m, size) of the `chosen` (m,) episodes.
 
-        The law is not asked again: its state goes on with the next episode.
+        `observation` (n, o) holds the final observations. The controller is not evaluated, since
+        its state belongs to the next episode already.
         """
         now = self._now(observation[chosen])[:, None]
         past = np.concatenate([now, self._past[chosen, :-1]], axis=1)
         return self._shown(past, self._base[chosen])
 
     def act(self, action: np.ndarray) -> np.ndarray:
-        """Actions (n, a) of the environment for the agent's (n, a)."""
+        """Return the environment actions (n, a) for the actions of the agent (n, a)."""
         own = self._share * np.clip(action, -1.0, 1.0)
         return np.clip(self._base + own, -1.0, 1.0) if self._law else own
 
@@ -125,11 +127,11 @@ _Base: Any = VecEnv or object
 
 
 class StableVecEnv(_Base):
-    """n environments of a task as a VecEnv.
+    """A stable-baselines3 VecEnv with n environments of a task.
 
     Attributes:
         core: the running task.
-        view: what the agent sees and does, None for the plain observation and actions.
+        view: transform between environment and agent, None for plain observations and actions.
     """
 
     def __init__(
@@ -141,12 +143,13 @@ class StableVecEnv(_Base):
         Args:
             task: name of the task.
             num_envs: number of environments n.
-            threads: that step them; 0 for one per core.
-            view: between environment and agent, made from the same task and options.
+            threads: number of threads that step the environments; 0 for one per core.
+            view: transform between environment and agent, made from the same task and options.
             **options: fields of `hydrotele.envs.task.Options`.
 
         Raises:
-            InputError: stable-baselines3 is not installed; an option is not known or does not suit.
+            InputError: stable-baselines3 is not installed, or an option does not exist or is not
+                valid.
         """
         if VecEnv is None:
             message = "needs stable-baselines3: pip install 'hydrotele[learn]'"
@@ -162,10 +165,10 @@ class StableVecEnv(_Base):
         self._return, self._length = np.zeros(num_envs), np.zeros(num_envs, int)
 
     def reset(self) -> np.ndarray:
-        """Begin episodes; seeds are those given to `seed`.
+        """Start episodes with the seeds given to `seed`, or random ones.
 
         Returns:
-            (n, o).
+            (n, o) observations.
         """
         drawn = np.random.default_rng().integers(2**62, size=self.num_envs)
         given = zip(self._seeds, drawn, strict=True)
@@ -178,22 +181,22 @@ class StableVecEnv(_Base):
         return self.core.observation.copy()
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Keep the actions (n, a) for `step_wait`.
+        """Store the actions (n, a) for `step_wait`.
 
         Raises:
-            ValueError: there are not as many actions as environments.
+            ValueError: the number of actions differs from the number of environments.
         """
         if np.ndim(actions) != 2 or len(actions) != self.num_envs:
-            raise ValueError(f"{self.num_envs} actions are wanted, not {np.shape(actions)}")
+            raise ValueError(f"needs {self.num_envs} rows of actions, got {np.shape(actions)}")
         self._given = actions
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Go on by one step; environments whose episode ended begin a new one.
+        """Advance by one step; environments whose episode ended start a new one.
 
         Returns:
-            (observations (n, o), rewards (n,), ends of episodes (n,), infos): the dicts of
-            environments that go on are empty, the others hold `terminal_observation`,
-            `TimeLimit.truncated`, `episode` and the task's figures.
+            (observations (n, o), rewards (n,), dones (n,), infos). The info of an environment whose
+            episode ended holds `terminal_observation`, `TimeLimit.truncated`, `episode` and the
+            task measures; the others are empty.
         """
         core, view = self.core, self.view
         core.step(view.act(self._given) if view else self._given)
@@ -212,7 +215,7 @@ class StableVecEnv(_Base):
         return seen, core.reward.astype(np.float32), over, self._infos
 
     def _end(self, ended: np.ndarray, last: np.ndarray) -> None:
-        """Say how episodes ended."""
+        """Write the infos of the episodes that ended."""
         names = [name for name, _ in self.core.setup.task.measures]
         for row, i in enumerate(ended):
             figures = dict(zip(names, self.core.final_measures[i].tolist(), strict=False))
@@ -225,24 +228,24 @@ class StableVecEnv(_Base):
         self._return[ended], self._length[ended] = 0.0, 0
 
     def close(self) -> None:
-        """Give the simulations' memory back."""
+        """Free the memory of the simulations."""
         self.core.close()
 
     def _many(self, indices: Any) -> int:
         return self.num_envs if indices is None else len(np.atleast_1d(indices))
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """The same attribute of this object for every environment."""
+        """Return the attribute of this object once per environment."""
         return [getattr(self, attr_name)] * self._many(indices)
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Refused: the environments are one object."""
-        raise InputError(attr_name, "the environments of a batch share it and it cannot be set")
+        """Raise InputError: the environments are one object."""
+        raise InputError(attr_name, "cannot be set: all environments of a batch share it")
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any):
-        """Refused: the environments are one object."""
-        raise InputError(method_name, "the environments of a batch have no methods of their own")
+        """Raise InputError: the environments are one object."""
+        raise InputError(method_name, "cannot be called: the environments are one object")
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
-        """No environment is wrapped."""
+        """Return False for every environment: wrappers are not supported."""
         return [False] * self._many(indices)

@@ -1,10 +1,8 @@
-"""What a camera sees of a running task: the machine of an episode with its looks, and its goal.
+"""Render running tasks: the machine with its visual geometry, and markers that show the goal.
 
-What an agent is asked to do, as markers in pictures: one function per kind of task.
-
-A function gets the running task and the number of the episode and reads its goal.
-
-A bed of soil as boxes along the arm's plane, the bank darker than what lies loose on it.
+`Stage` copies the state of a simulation to a model with visual geometry and draws it. One function
+per kind of task makes the markers from the goal of an episode. A bed of soil is drawn as boxes in
+the plane of the arm; the undisturbed bank is darker than the loose soil on top.
 """
 
 import copy
@@ -31,30 +29,30 @@ from hydrotele.simulate.fleet import STATE
 from hydrotele.soil.facts import CAT215
 
 _BANK, _LOOSE = (0.36, 0.25, 0.15, 1.0), (0.62, 0.47, 0.30, 1.0)
-_THIN_SOIL = 1e-3  # m of loose soil that is not drawn
+_THIN_SOIL = 1e-3  # m, maximum thickness of loose soil that is not drawn
 
 
 def _turn(core: TaskCore, number: int) -> np.ndarray:
-    """(3, 3) rotation of the house, and with it of the arm's plane."""
+    """Return the rotation (3, 3) of the house, which is that of the plane of the arm."""
     swing = float(core.episodes["position"][number][0])
     c, s = math.cos(swing), math.sin(swing)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def bed_markers(core: TaskCore, number: int) -> list[Marker]:
-    """Cells of the profile of an episode's soil.
+    """Return boxes for the cells of the soil profile of an episode.
 
     Args:
         core: the running task, with a bed of soil.
-        number: of the episode.
+        number: index of the episode.
 
     Returns:
-        The boxes, in the world.
+        The boxes, in the world frame.
     """
     terrain, turn = core.terrain[number], _turn(core, number)
     surface, loose = terrain[:CELLS], terrain[CELLS : 2 * CELLS]
     side, half = float(core.facts["arm"][SIDE]), 0.5 * CAT215.width
-    bottom = min(0.0, float(np.min(surface)) - _THIN_SOIL)  # what the machine stands on
+    bottom = min(0.0, float(np.min(surface)) - _THIN_SOIL)  # 0 is the level of the tracks
 
     def cell(i: int, low: float, high: float, colour) -> Marker:
         middle = turn @ [START + (i + 0.5) * CELL, side, 0.5 * (low + high)]
@@ -67,15 +65,15 @@ def bed_markers(core: TaskCore, number: int) -> list[Marker]:
 
 
 def plane_markers(core: TaskCore, number: int, colour) -> list[Marker]:
-    """Edges of the plane that the soil shall have in the stretch to grade, beside the soil.
+    """Return the outline of the target plane over the ground to grade.
 
     Args:
         core: the running task.
-        number: of the episode.
-        colour: (4,) of the lines.
+        number: index of the episode.
+        colour: (4,) colour of the lines.
 
     Returns:
-        The lines, in the world.
+        The lines, in the world frame.
     """
     goal, turn = core.episodes["goal"][number], _turn(core, number)
     side, out = float(core.facts["arm"][SIDE]), 0.5 * CAT215.width + 0.03
@@ -86,37 +84,37 @@ def plane_markers(core: TaskCore, number: int, colour) -> list[Marker]:
     return polyline(np.array(corners), 0.02, colour)
 
 
-_GOAL = (0.10, 0.75, 0.25, 1.0)  # what is asked for
-_AHEAD = (0.15, 0.45, 0.95, 1.0)  # where that goes
-_OFF = (0.90, 0.15, 0.10, 1.0)  # what is wrong
-_WAY, _PIECES = 3.0, 30  # s of a reference that are shown ahead, lines that show it
-_BALL, _THICK, _THIN = 0.15, 0.045, 0.035  # m
-_METRES = 7.0e-5  # m of an arrow per N
+_GOAL = (0.10, 0.75, 0.25, 1.0)  # colour of the reference
+_AHEAD = (0.15, 0.45, 0.95, 1.0)  # colour of the future reference
+_OFF = (0.90, 0.15, 0.10, 1.0)  # colour of the error
+_WAY, _PIECES = 3.0, 30  # s of the reference that are drawn ahead, number of line segments
+_BALL, _THICK, _THIN = 0.15, 0.045, 0.035  # m, ball radius and line widths
+_METRES = 7.0e-5  # m per N, length of a force arrow
 _BESIDE = 0.3  # m between the arrows of two forces
-_POINTER = 0.8  # m, of an attitude
+_POINTER = 0.8  # m, length of the line that shows an attitude
 
 
 def goal_markers(core: TaskCore, number: int) -> list[Marker]:
-    """Shapes that show the goal of an episode; none for a kind of task that is not here.
+    """Return the markers of the goal of an episode; none for an unknown kind of task.
 
     Args:
         core: the running task.
-        number: of the episode.
+        number: index of the episode.
 
     Returns:
-        The shapes, in the world.
+        The markers, in the world frame.
     """
     draw = _GOALS.get(core.setup.task.kind)
     return draw(core, number) if draw else []
 
 
 def place_of_pose(pose: np.ndarray) -> np.ndarray:
-    """Place (3,) [m] of the tip with a pose r, theta, z, ..."""
+    """Return the position (3,) [m] of a pose (r, theta, z, ...)."""
     return np.array([pose[0] * math.cos(pose[1]), pose[0] * math.sin(pose[1]), pose[2]])
 
 
 def _track(core: TaskCore, number: int) -> list[Marker]:
-    """The tip on its reference, its way ahead, and how far off it is."""
+    """Return markers of the reference tip position, its future path and the tip error."""
     episode, k = core.episodes[number], core.setup.arm_axes
     now = float(episode["tick"]) * core.setup.clock.period
 
@@ -133,7 +131,7 @@ def _track(core: TaskCore, number: int) -> list[Marker]:
 
 
 def _line(core: TaskCore, number: int) -> list[Marker]:
-    """The line, the place of the tip on it, and how far off the tip is."""
+    """Return markers of the line, the reference position on it and the tip error."""
     episode = core.episodes[number]
     now, pose, rate = float(episode["tick"]) * core.setup.clock.period, np.zeros(ARM), np.zeros(ARM)
 
@@ -149,7 +147,7 @@ def _line(core: TaskCore, number: int) -> list[Marker]:
 
 
 def _force(core: TaskCore, number: int) -> list[Marker]:
-    """Arrows on the plate before the tip: the force wanted, and that which the load cell read."""
+    """Return arrows on the plate for the reference force and the measured force."""
     episode, side = core.episodes[number], np.array([0.0, 0.5 * _BESIDE, 0.0])
     goal, foot = episode["goal"], episode["tip"] - np.array([0.6, 0.0, 0.0])
     now = float(episode["tick"]) * core.setup.clock.period
@@ -163,7 +161,7 @@ def _force(core: TaskCore, number: int) -> list[Marker]:
 
 
 def _reach(core: TaskCore, number: int) -> list[Marker]:
-    """The place wanted, how far off the tip is, and the attitude wanted."""
+    """Return markers of the goal position, the tip error and the goal attitude."""
     episode = core.episodes[number]
     pose = episode["goal"][:ARM]
     wanted, level = place_of_pose(pose), math.cos(pose[3])
@@ -173,12 +171,12 @@ def _reach(core: TaskCore, number: int) -> list[Marker]:
 
 
 def _grade(core: TaskCore, number: int) -> list[Marker]:
-    """The soil, and the plane that it shall have."""
+    """Return markers of the soil and of the target plane."""
     return [*bed_markers(core, number), *plane_markers(core, number, _GOAL)]
 
 
 def _place(core: TaskCore, number: int) -> list[Marker]:
-    """The log's middle line where it shall lie, and its rim on the ground."""
+    """Return markers of the axis and the outline of the log at its goal on the ground."""
     x, y, yaw = core.episodes[number]["goal"][GOAL_PLACE]
     radius, half = core.facts["parameters"][RADIUS], core.facts["parameters"][HALF_LENGTH]
     way = np.array([math.cos(yaw), math.sin(yaw), 0.0])
@@ -199,23 +197,23 @@ _GOALS: dict[str, Callable[[TaskCore, int], list[Marker]]] = {
 }
 
 
-_AZIMUTH, _ELEVATION = 232.0, -20.0  # degree: from ahead, aside and above
-_KEPT = 16  # compiled machines
-FREE = -1
+_AZIMUTH, _ELEVATION = 232.0, -20.0  # degree: view from the front, the side and above
+_KEPT = 16  # maximum number of cached models
+FREE = -1  # number of the free camera
 
 Camera = str | int | None
 
 
 class Stage:
-    """One model with looks that follows the simulations of a task, whichever is asked for.
+    """A model with visual geometry that shows any simulation of a task.
 
     Attributes:
-        model: with looks; its numbers become those of the machine of the episode that is shown.
-        data: its state, complete.
+        model: model with visual geometry; `show` sets its parameters to those of the variant shown.
+        data: data of the simulation shown.
     """
 
     def __init__(self, core: TaskCore) -> None:
-        """Compile the machine of the first variant.
+        """Compile the machine of the first variant with visual geometry.
 
         Args:
             core: the running task.
@@ -228,7 +226,7 @@ class Stage:
         self._canvas: Canvas | None = None
 
     def _looks(self, variant: int) -> mujoco.MjModel:
-        """Model of a variant, compiled when it is first asked for."""
+        """Return the model of a variant with visual geometry; compile it on first use."""
         variants, task = self._core.setup.variants, self._core.setup.task
         machine, things = variants.machines[variant], variants.surroundings[variant]
         key = id(machine), repr(things)
@@ -242,7 +240,7 @@ class Stage:
         return self._compiled[key]
 
     def _look_from_afar(self, model: mujoco.MjModel) -> None:
-        """Let MuJoCo's free camera show all that the arm reaches."""
+        """Set MuJoCo's free camera to show the whole workspace of the arm."""
         machine = self._core.setup.machine
         if machine.arm:
             numbers = arm_facts(machine)[0]
@@ -252,10 +250,10 @@ class Stage:
         model.vis.global_.azimuth, model.vis.global_.elevation = _AZIMUTH, _ELEVATION
 
     def show(self, number: int = 0) -> None:
-        """Bring model and data to where a simulation is.
+        """Copy the parameters and the state of a simulation to `model` and `data`.
 
         Args:
-            number: of the simulation.
+            number: index of the simulation.
         """
         variant = int(self._core.episodes["variant"][number])
         if (wanted := self._looks(variant)) is not self._shown:
@@ -265,21 +263,21 @@ class Stage:
         mujoco.mj_forward(self.model, self.data)
 
     def markers(self, number: int = 0) -> list[Marker]:
-        """Goal of the episode of a simulation."""
+        """Return the markers of the goal of a simulation."""
         return goal_markers(self._core, number)
 
     def camera(self, which: Camera = None) -> mujoco.MjvCamera:
-        """Look a camera up.
+        """Return a camera by name or number.
 
         Args:
-            which: name or number of a camera of the machine; None, -1 or `free` for one that shows
-                all that the arm reaches.
+            which: name or number of a camera of the machine; None, -1 or `free` for a free camera
+                that shows the whole workspace of the arm.
 
         Returns:
             The camera.
 
         Raises:
-            InputError: there is no such camera.
+            InputError: the camera does not exist.
         """
         camera = mujoco.MjvCamera()
         names = [self.model.camera(i).name for i in range(self.model.ncam)]
@@ -296,19 +294,20 @@ class Stage:
     def picture(
         self, number: int = 0, width: int = 640, height: int = 480, camera: Camera = None
     ) -> np.ndarray:
-        """Draw a simulation; OpenGL stays open for the next one of the same size.
+        """Render a simulation; the OpenGL context is reused for images of the same size.
 
         Args:
-            number: of the simulation.
+            number: index of the simulation.
             width: [pixel].
             height: [pixel].
-            camera: as of `camera`.
+            camera: see the method `camera`.
 
         Returns:
             (height, width, 3) uint8.
 
         Raises:
-            InputError: there is no such camera, the size is not possible, or no OpenGL works.
+            InputError: the camera does not exist, the size is not possible, or OpenGL does not
+                work.
         """
         view = self.camera(camera)
         if self._canvas is None or self._canvas.size != (width, height):
@@ -318,18 +317,18 @@ class Stage:
         return self._canvas.draw(self.model, self.data, view, self.markers(number))
 
     def close(self) -> None:
-        """Give OpenGL back."""
+        """Free the OpenGL context."""
         if self._canvas:
             self._canvas.close()
             self._canvas = None
 
 
 def copy_parameters(source: mujoco.MjModel, target: mujoco.MjModel) -> None:
-    """Give a model the numbers of another one of the same structure.
+    """Copy the parameters of a model to another model of the same structure.
 
     Args:
-        source: whose.
-        target: written.
+        source: the model to copy from.
+        target: the model to write to.
     """
     for name in MODEL_FIELDS:
         if not name.startswith("opt."):

@@ -1,7 +1,7 @@
-"""What a task is, as facts in Python, and what a user may choose of it.
+"""Definition of a task, the options of a user, and helpers that several tasks use.
 
-An arm starts at poses drawn from ranges until one lies well inside the workspace, from which it can
-go straight to its goal without asking too much of its drives.
+`draw_start` draws a start pose that lies well inside the workspace. `path_effort` checks that a
+straight path of the tip stays in the workspace and within the rates of the drives.
 """
 
 import dataclasses
@@ -30,24 +30,25 @@ class Task:
 
     Attributes:
         name: as in `hydrotele/<Name>-v0`.
-        kind: its name in native code, of `kinds.KINDS`.
-        sentence: what is asked, one sentence.
-        reward: what it pays and when an episode ends, in words.
+        kind: name of its native code in `envs.facts.KINDS`.
+        sentence: description of the task.
+        reward: description of the reward and the termination.
         machine: name of the machine.
-        tool: its tool, None for the machine's first one.
-        more_axes: axes that are driven beside those of the arm.
-        action: kind of actions where the user names none.
-        duration: of an episode [s].
+        tool: name of the tool, None for the first tool of the machine.
+        more_axes: driven axes in addition to those of the arm.
+        action: default kind of actions.
+        duration: duration of an episode [s].
         start: (machine, random generator) -> axis or joint name -> position at the start.
-        fields: (machine, driven axes) -> what `observe_<kind>` writes.
-        measures: name and unit of every figure in `info`.
-        surroundings: (machine, random generator, start) -> what stands around.
+        fields: (machine, driven axes) -> fields that `observe_<kind>` writes.
+        measures: name and unit of every task measure in `info`.
+        surroundings: (machine, random generator, start) -> objects around the machine.
         ground: whether there is a hard ground.
-        parameters: (machine, MuJoCo model) -> up to PARAMETERS that the task's native code reads.
-        terrain: floats that an episode keeps of its ground, 0 without.
-        swing_locked: whether the swing's action does nothing.
-        writes: fields of the model that its native code writes; a new episode has them anew.
-        pose_rates: of the tip at full action: r [m/s], theta [rad/s], z [m/s], attitude, head.
+        parameters: (machine, MuJoCo model) -> up to PARAMETERS values for the native code.
+        terrain: number of terrain values per episode, 0 without terrain.
+        swing_locked: whether the action of the swing has no effect.
+        writes: model fields that the native code writes; they are restored for every episode.
+        pose_rates: tip rates at full action: r [m/s], theta [rad/s], z [m/s], attitude, head
+            [rad/s].
         servo: gains of the joint servo (`joint_rate`, `resolved_motion`).
     """
 
@@ -77,19 +78,19 @@ class Task:
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What a user chooses; None is the task's own.
+    """Options of an environment; None selects the default of the task.
 
     Attributes:
-        action: `valve` (commands of valves), `joint_rate` (rates of the axes, followed by the joint
-            servo) or `resolved_motion` (rates of the tip, by resolved motion).
-        sensors: `ideal`, `real` (the machine's first set of sensors) or the name of a set.
+        action: `valve` (valve commands), `joint_rate` (axis rates, tracked by the joint servo) or
+            `resolved_motion` (tip rates, converted to axis rates).
+        sensors: `ideal`, `real` (the first set of sensors of the machine) or the name of a set.
         control_rate: environment steps per second [Hz]; the servo runs at 200 Hz or faster.
-        duration: of an episode [s].
-        effects: planted in every episode: mappings with `name`, `location`, `parameters`.
-        randomise: the same with a range [low, high] for every parameter: drawn for every variant.
-        variants: machines and starts that are drawn; every episode has one of them.
-        variant_seed: from which they are drawn.
-        timestep: of the physics [s].
+        duration: duration of an episode [s].
+        effects: effects added to every episode: mappings with `name`, `location`, `parameters`.
+        randomise: effects with a range [low, high] per parameter, drawn for every variant.
+        variants: number of random machines and starts; every episode uses one of them.
+        variant_seed: seed for drawing the variants.
+        timestep: physics step [s].
     """
 
     action: ActionKind | None = None
@@ -106,26 +107,27 @@ class Options:
 assert set(ACTIONS) == set(ActionKind.__args__)
 
 
-_DRAWS = 1000
-_ROOM = 0.08  # rad to the ends of the joints' ranges
+_DRAWS = 1000  # maximum number of draws of a start pose
+_ROOM = 0.08  # rad, minimum distance to the limits of the joint ranges
 
 
 def draw_start(
     machine: Machine, rng: np.random.Generator, low: tuple[float, ...], high: tuple[float, ...]
 ) -> dict[str, float]:
-    """Positions of an arm's axes for a pose between two.
+    """Draw a pose of the tip within bounds and return the positions of the arm axes.
 
     Args:
         machine: the machine.
         rng: random generator.
-        low: (5,) or, without a head, (4,) least r [m], theta [rad], z [m], attitude, head [rad].
-        high: the same, at most.
+        low: (5,) or, without a head, (4,) lower bounds of r [m], theta [rad], z [m], attitude, head
+            [rad].
+        high: upper bounds, likewise.
 
     Returns:
         Axis -> position [rad].
 
     Raises:
-        InputError: next to none of these poses can be reached.
+        InputError: none of 1000 random poses is reachable.
     """
     numbers, axes, ranges = arm_facts(machine)
     pose, joints = np.zeros(5), np.zeros(len(axes))
@@ -139,23 +141,25 @@ def draw_start(
     raise InputError(f"start of {machine.name}", f"no pose from {low} to {high} can be reached")
 
 
-_PLACES = 16  # at which a path is looked at
-_ROOM_WORKSPACE = 0.03  # rad that stay free to the ends of the joints' ranges
+_PLACES = 16  # number of path segments whose ends are checked
+_ROOM_WORKSPACE = 0.03  # rad, minimum distance of a path to the limits of the joint ranges
 
 
 @compiled
 def path_effort(f, start, change):
-    """Most that a straight path of the pose asks of the drives, for one that takes a second.
+    """Return the maximum drive effort along a straight path of the tip that takes 1 s.
+
+    The effort is the sum of the axis rates, each relative to its rate at full action. The sum
+    matters because all drives use the same pump.
 
     Args:
         f: record of TASK_PARAMETERS.
-        start: (ARM,) pose where it begins: r [m], theta [rad], z [m], attitude, head [rad].
-        change: (ARM,) from there to its end, the same units.
+        start: (ARM,) start pose: r [m], theta [rad], z [m], attitude, head [rad].
+        change: (ARM,) difference between end pose and start pose, same units.
 
     Returns:
-        Sum of the axes' rates, each as a share of its rate at full action, at the worst place of
-        the path, scalar [s]; infinite where it leaves the workspace. Drives share a pump, so that
-        it is the sum that counts.
+        The maximum effort, scalar [s]; infinite if the path leaves the workspace. Divide it by the
+        duration of the path.
 
     Source: `kinematics.task`.
     """
@@ -181,7 +185,7 @@ def path_effort(f, start, change):
 
 @compiled
 def pose_read(f, e, pose):
-    """Pose of the tip by the readings of the joints.
+    """Compute the pose of the tip from the measured joint positions.
 
     Args:
         f: record of TASK_PARAMETERS.
@@ -198,5 +202,5 @@ def pose_read(f, e, pose):
 
 @compiled
 def turned(angle):
-    """The angle from -pi to pi that points the same way, scalar [rad]."""
+    """Return the equivalent angle from -pi to pi, scalar [rad]."""
     return angle - 2.0 * np.pi * np.rint(angle / (2.0 * np.pi))

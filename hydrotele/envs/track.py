@@ -1,7 +1,8 @@
-"""Trajectory tracking: all axes follow Fourier references, as machines are excited and proven.
+"""The task `TrackTrajectory`: all axes track Fourier references.
 
-Three harmonics per axis of a common period, faded in from rest, drawn anew for every episode: their
-rates stay within a share of what the drives can do, and their positions within the joints' ranges.
+Every episode draws three harmonics per axis with a common period, faded in from rest. The
+amplitudes are scaled so that the rates stay within a fraction of the drive rates, and the positions
+within the joint ranges.
 """
 
 import math
@@ -27,14 +28,14 @@ from hydrotele.envs.world import (
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
 
-PREVIEWS = (0.1, 0.2, 0.4)  # s ahead
+PREVIEWS = (0.1, 0.2, 0.4)  # s, look-ahead times of the observed reference
 SCALE = 0.1  # m of error that costs a reward of 1
-_HARMONICS = 3
-_FADE = 2.0  # s
-_SHORT, _LONG = 8.0, 16.0  # s, periods
-_SLOW, _FAST = 0.3, 0.7  # shares of the drives' rates
-_ROOM = 0.9  # share of the way to the nearest end of a joint's range
-_FREE = 1.5  # rad or m of room of an axis without a range
+_HARMONICS = 3  # number of harmonics per axis
+_FADE = 2.0  # s, fade-in time
+_SHORT, _LONG = 8.0, 16.0  # s, range of the period
+_SLOW, _FAST = 0.3, 0.7  # range of the maximum rate, as a fraction of the drive rate
+_ROOM = 0.9  # maximum amplitude as a fraction of the distance to the joint limit
+_FREE = 1.5  # rad or m, the same distance for an axis without limits
 _FREQUENCY = 0
 _BASE = 1
 _SINE = _BASE + AXES
@@ -42,7 +43,7 @@ _COSINE = _SINE + _HARMONICS * AXES
 
 
 def track_fields(machine: Machine, axes: tuple[str, ...]) -> list[Field]:
-    """What `observe_track` writes: references now and ahead, and their rates."""
+    """Return the fields that `observe_track` writes: references, their rates and previews."""
     fields = [position_field(machine, name, "reference") for name in axes]
     fields += [rate_field(machine, name, "reference_rate") for name in axes]
     for ahead in PREVIEWS:
@@ -79,7 +80,7 @@ def begin_track(f, e):
             rate += size * (h + 1) * g[_FREQUENCY]
         low, high = f.ranges[i, 0] - g[_BASE + i], f.ranges[i, 1] - g[_BASE + i]
         room = max(0.0, _ROOM * min(-low, high, _FREE))
-        # from its start a sine goes up to twice its amplitude to one side
+        # relative to its start, a sine reaches up to twice its amplitude on one side
         scale = min(fastest / rate, 0.5 * room / total)
         for h in range(_HARMONICS):
             g[_SINE + _HARMONICS * i + h] *= scale
@@ -88,11 +89,11 @@ def begin_track(f, e):
 
 @compiled
 def track_reference(g, i, time):
-    """Reference of an axis and its rate.
+    """Return the reference position of an axis and its rate.
 
     Args:
         g: (GOAL,) goal of the episode.
-        i: axis, scalar.
+        i: index of the axis, scalar.
         time: since the start, scalar [s].
 
     Returns:
@@ -121,12 +122,12 @@ def track_reference(g, i, time):
 
 @compiled
 def observe_track(f, e, out, at):
-    """Write references now and ahead.
+    """Write the references, their rates and the references ahead.
 
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE.
-        out: (observations,) float32, written from `at` on.
+        out: (observations,) float32, written from index `at` on.
         at: scalar.
 
     Returns:
@@ -144,12 +145,12 @@ def observe_track(f, e, out, at):
 
 @compiled
 def reward_track(f, e, w):
-    """Reward 1 on the trajectory, less 1 for every 0.1 m that the tip is off, at least -1.
+    """Compute the reward: 1 minus 1 for every 0.1 m of tip error, at least -1.
 
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE.
-        w: World; `measures` gets the tip's distance from its place [m].
+        w: World; `measures` receives the distance of the tip from its reference [m].
 
     Returns:
         (reward, False), scalars.
@@ -170,7 +171,7 @@ def reward_track(f, e, w):
 
 @callback(TASK_CODE)
 def code(part, m, d, number, argument, out):
-    """The task in native code, see `world`."""
+    """Run one part of the task in native code; see `world`."""
     f = parameters_at(argument)[0]
     e, w = episodes(f)[number], world(f, m, d, number, argument)
     if part == BEGIN:

@@ -1,9 +1,8 @@
-"""Machines and starts that episodes are drawn from: exact ones, compiled before the first episode.
+"""Machine variants and start states of the episodes, compiled before the first episode.
 
-Every variant is a complete Machine with the effects that it has, standing still at its start with
-its valves closed. An episode takes one of them by copying numbers, which native code can do.
-
-How machines of one type differ: the ranges from which robustness is usually tried.
+Every variant is a complete machine with its effects, at rest at its start with closed valves. An
+episode selects a variant by copying model parameters and a state in native code.
+`typical_variation` gives parameter ranges for robustness tests.
 """
 
 import dataclasses
@@ -26,26 +25,26 @@ from hydrotele.simulate.plant import Plant, build_plant, rest_state
 from hydrotele.simulate.record import begin_leapfrog, sensed_channels
 from hydrotele.simulate.stepping import command_delays, sensor_delays
 
-_KEPT = 8  # sets of variants: many single environments of one process share theirs
+_KEPT = 8  # maximum number of cached sets of variants, which the environments of a process share
 _KNOWN: dict[str, "Variants"] = {}
 
 
 @dataclasses.dataclass(frozen=True)
 class Variants:
-    """v machines with their starts.
+    """v machines with their start states.
 
     Attributes:
-        plant: of the first one.
+        plant: plant of the first variant.
         machines: the machines.
-        surroundings: what stands around each of them.
-        states: (v, s) complete states at the starts, as `begin_leapfrog` leaves them.
-        tips: (v, 3) places of the tip there [m].
-        fields: field of the model -> (v, size), where they differ or the task writes them.
-        scales: (v, CHANNELS) of the sensors.
-        offsets: (v, CHANNELS).
-        lags: (v, CHANNELS, 2) delays of the sensors: whole physics steps, rest of a step [1].
-        ratios: (v, CHANNELS) a physics step over the time constant of a sensor [1]; 0 without.
-        delays: (v, AXES, 2) of the commands: whole physics steps, rest of a step [1].
+        surroundings: objects around each machine.
+        states: (v, s) complete start states after `begin_leapfrog`.
+        tips: (v, 3) tip positions at the start [m].
+        fields: model field -> (v, size) values, for fields that differ or that the task writes.
+        scales: (v, CHANNELS) sensor scale factors [1].
+        offsets: (v, CHANNELS) sensor offsets.
+        lags: (v, CHANNELS, 2) sensor delays: whole physics steps, fraction of a step [1].
+        ratios: (v, CHANNELS) physics step divided by the sensor time constant [1]; 0 without lag.
+        delays: (v, AXES, 2) command delays: whole physics steps, fraction of a step [1].
     """
 
     plant: Plant
@@ -62,19 +61,19 @@ class Variants:
 
 
 def make_variants(task: Task, options: Options, nominal: Machine) -> Variants:
-    """Draw, compile and place all variants; those of the same choices are made once.
+    """Draw and compile all variants; sets with equal options are cached.
 
     Args:
         task: the task.
-        options: the user's; its effects are planted.
-        nominal: machine without them.
+        options: the user's options, whose effects are applied.
+        nominal: machine without these effects.
 
     Returns:
         The variants.
 
     Raises:
-        InputError: an effect does not suit the machine, or what is randomised changes more than
-            numbers.
+        InputError: an effect is not valid for the machine, or a randomised effect changes the
+            structure of the model.
     """
     key = repr((task.name, options.effects, options.randomise, options.variants,
                 options.variant_seed, options.timestep))  # fmt: skip
@@ -113,12 +112,12 @@ def _make(task: Task, options: Options, nominal: Machine) -> Variants:
 
 
 def _by_joint(machine: Machine, places: Mapping[str, float]) -> dict[str, float]:
-    """Positions of axes or joints by the joints' names."""
+    """Return the positions with axis names replaced by the names of their joints."""
     return {machine.axes[n].joint if n in machine.axes else n: v for n, v in places.items()}
 
 
 def _changed(nominal: Machine, options: Options, rng: np.random.Generator) -> Machine:
-    """The machine with what is planted and what is drawn."""
+    """Return the machine with the given effects and the randomised ones."""
     machine = nominal
     for effect in options.effects:
         machine = apply_effect(machine, *_said(effect), dict(effect.get("parameters", {})))
@@ -132,7 +131,7 @@ def _changed(nominal: Machine, options: Options, rng: np.random.Generator) -> Ma
 
 
 def _said(effect: Mapping[str, Any]) -> tuple[str, str]:
-    """Name and location of an effect that a user gave."""
+    """Check the keys of an effect and return its name and location."""
     keys = ("name", "location", "parameters")
     if not isinstance(effect, Mapping) or "name" not in effect or set(effect) - set(keys):
         raise InputError("effects", f"each needs {', '.join(keys)}, not {effect!r}")
@@ -140,19 +139,19 @@ def _said(effect: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def _range(effect: Mapping[str, Any], key: str, value: Any) -> tuple[float, float]:
-    """Range of a parameter that is drawn; a wrong one is named."""
+    """Return the range of a randomised parameter, or raise InputError if it is not valid."""
     where = f"randomise {effect.get('name')}: {key}"
     try:
         low, high = (float(end) for end in value)
     except (TypeError, ValueError):
         raise InputError(where, f"needs a range [low, high], not {value!r}") from None
     if not (np.isfinite([low, high]).all() and low <= high):
-        raise InputError(where, f"needs a range that rises, not {value!r}")
+        raise InputError(where, f"needs a finite range with low <= high, not {value!r}")
     return low, high
 
 
 def _differing(plants: list[Plant], also: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Fields of the models that are not the same in all of them, and some that may be."""
+    """Return the model fields that differ between plants, and the fields `also`."""
     first, fields = plants[0].model, {}
     distinct = list({id(plant): plant for plant in plants}.values())
     for name in sorted(MODEL_FIELDS):
@@ -173,8 +172,8 @@ def _differing(plants: list[Plant], also: tuple[str, ...]) -> dict[str, np.ndarr
 def _structure(name: str) -> InputError:
     known = ", ".join(sorted(EFFECTS))
     message = (
-        f"the variants differ in more than numbers ({name} of the model): plant such an effect in"
-        f" all of them with `effects`; the library has {known}"
+        f"the variants differ in the structure of the model ({name}), not only in parameters: add"
+        f" the effect to all of them with `effects`; available effects: {known}"
     )
     return InputError("randomise", message)
 
@@ -184,12 +183,12 @@ def _of(model: mujoco.MjModel, name: str):
 
 
 def channels(plant: Plant) -> tuple[str, ...]:
-    """Channels in the order of the native sensors: positions, head and rod pressures, supply."""
+    """Return the sensor channels in the order of native code: positions, pressures, supply."""
     return tuple(c for c in sensed_channels(plant) if not c.startswith("length."))
 
 
 def _sensor_tables(plant: Plant, machines: list[Machine]):
-    """Scales, offsets, delays and lags of all sensors of all variants."""
+    """Return scales, offsets, delays and lag ratios of all sensors of all variants."""
     shape, names = (len(machines), CHANNELS), channels(plant)
     scales, offsets, ratios = np.ones(shape), np.zeros(shape), np.zeros(shape)
     lags, c = np.zeros((*shape, 2)), len(names)
@@ -197,9 +196,7 @@ def _sensor_tables(plant: Plant, machines: list[Machine]):
         defects = [machine.sensor_errors.get(name, SensorError()) for name in names]
         for name, defect in zip(names, defects, strict=True):
             if defect.drift:
-                said = (
-                    "drifts in the machine; environments have no drift, give it an offset instead"
-                )
+                said = "has a drift, which environments do not simulate; give it an offset instead"
                 raise InputError(f"sensor {name}", said)
         scales[v, :c] = [defect.scale for defect in defects]
         offsets[v, :c] = [defect.offset for defect in defects]
@@ -214,25 +211,26 @@ def _delays(plant: Plant, machines: list[Machine]) -> np.ndarray:
     return delays
 
 
-_DEADBAND = (0.5, 2.0)  # times the nominal overlap
-_FLOW = (0.8, 1.2)  # makers' ratings are good to 5 or 10 %, wear and temperature do the rest
-_BANDWIDTH = (0.6, 1.4)
-_FRICTION = (0.5, 2.0)
-_BULK = (0.6, 1.2)  # air in the oil
+_DEADBAND = (0.5, 2.0)  # factors of the nominal overlap
+_FLOW = (0.8, 1.2)  # factors: rating tolerance of 5 to 10 %, plus wear and temperature
+_BANDWIDTH = (0.6, 1.4)  # factors of the nominal bandwidth
+_FRICTION = (0.5, 2.0)  # factors of the nominal Coulomb friction
+_BULK = (0.6, 1.2)  # factors of the nominal bulk modulus: air in the oil
 _DELAY = (0.0, 0.05)  # s, of a fieldbus and its valve amplifiers
-_PAYLOAD = (0.0, 0.02)  # times the mass of all links, at the tip
+_PAYLOAD = (0.0, 0.02)  # factors of the mass of all links, at the tip
 
 
 def typical_variation(machine: Machine) -> tuple[dict[str, Any], ...]:
-    """Effects with ranges, for `Options.randomise`, of every valve, drive and the whole machine.
+    """Return effects with typical parameter ranges for `Options.randomise`.
 
     Args:
         machine: the nominal machine.
 
     Returns:
-        For every valve its overlap (0.5 to 2 times), flow (0.8 to 1.2) and bandwidth (0.6 to 1.4);
-        for every drive its Coulomb friction (0.5 to 2); for the machine the oil's stiffness (0.6 to
-        1.2), the commands' delay (0 to 50 ms) and a payload (0 to 2 % of its mass).
+        For every valve, the overlap (0.5 to 2 times nominal), flow (0.8 to 1.2) and bandwidth (0.6
+        to 1.4); for every drive with a valve, the Coulomb friction (0.5 to 2); for the machine, the
+        bulk modulus (0.6 to 1.2), the command delay (0 to 50 ms) and a payload (0 to 2 % of its
+        mass).
     """
     found = []
     for name, axis in machine.axes.items():

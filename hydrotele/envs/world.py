@@ -1,11 +1,9 @@
-"""What native code of an environment sees of its simulation, and how it calls that of its task.
+"""Access of native code to a simulation, calls of the native code of a task, machine observations.
 
-Every task has code of its own, called by address: so a task compiles without the others, and the
-loop that calls them without any.
-
-What an agent sees of the machine: its sensors, the tip by nominal kinematics, the commands.
-
-`machine_fields` says in Python what `observe_machine` writes in native code, in the same order.
+`World` holds the arrays of one simulation. The native code of a task is called by address, so every
+task, and the loop that calls it, compiles separately. `observe_machine` writes the observation of
+the machine: sensors, tip pose from nominal kinematics, and commands. `machine_fields` returns the
+names, units and bounds of these values in the same order.
 """
 
 # pyright: reportCallIssue=false, reportPrivateImportUsage=false
@@ -26,37 +24,37 @@ from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
 
 BEGIN, TICK, OBSERVE, REWARD = range(4)
-"""What a task is called for: a new episode, after a control period, for what it observes of itself,
-for the reward of the step that is over."""
+"""Parts of a task's native code: start an episode, act after a control period, write the
+observation of the task, compute the reward of a step."""
 
 TASK_CODE = types.float64(*(types.int64,) * 6)
-"""(what it is called for, mjModel*, mjData*, number, TASK_PARAMETERS*, where to observe, float32*)
--> the reward."""
+"""Signature (part, mjModel*, mjData*, index of the simulation, TASK_PARAMETERS*, float32* output of
+the observation) -> reward."""
 
 
 class World(NamedTuple):
-    """Live arrays of one simulation.
+    """Views of the arrays of one simulation.
 
     Attributes:
         qpos: (nq,) positions; staggered, see `simulate.record`.
         qvel: (nv,) velocities.
         act: (na,) activations.
-        ctrl: (k,) commands that act.
-        tip: (3,) place of the arm's tip at the time of the activations [m].
-        xfrc: (6 nbody,) forces and torques from outside on bodies, world frame [N], [N m].
-        xpos: (3 nbody,) places of bodies [m], of the last physics step.
-        xipos: (3 nbody,) places of their centres of mass [m].
+        ctrl: (k,) applied commands.
+        tip: (3,) position of the arm's tip at the time of the activations [m].
+        xfrc: (6 nbody,) external forces and torques on bodies, world frame [N], [N m].
+        xpos: (3 nbody,) positions of the bodies in the last physics step [m].
+        xipos: (3 nbody,) positions of their centres of mass [m].
         xquat: (4 nbody,) quaternions of the bodies.
-        xmat: (9 nbody,) their rotation matrices.
-        eq_active: (neq,) uint8, which equalities act; part of the state.
-        eq_data: (neq eq_width,) numbers of the equalities for the rest of this call.
-        eq_rows: the same from the next call on; empty unless the task writes them.
-        terrain: (width,) what the episode keeps of its ground, empty without.
-        measures: (MEASURES,) figures of this step, for `info`.
+        xmat: (9 nbody,) rotation matrices of the bodies.
+        eq_active: (neq,) uint8, whether an equality constraint is active; part of the state.
+        eq_data: (neq eq_width,) data of the equality constraints during this call.
+        eq_rows: the same from the next call on; empty unless the task writes it.
+        terrain: (width,) terrain state of the episode; empty for tasks without terrain.
+        measures: (MEASURES,) task measures of this step, for `info`.
         model: address of mjModel.
         data: address of mjData.
-        number: of the simulation.
-        argument: address of the record of TASK_PARAMETERS.
+        number: index of the simulation.
+        argument: address of the TASK_PARAMETERS record.
     """
 
     qpos: np.ndarray
@@ -82,25 +80,25 @@ class World(NamedTuple):
 
 @compiled
 def parameters_at(argument):
-    """(1,) record of TASK_PARAMETERS at an address, scalar."""
+    """Return a view (1,) of the TASK_PARAMETERS record at an address, scalar."""
     return carray(pointer(argument), (1,), TASK_PARAMETERS)
 
 
 @compiled
 def episodes(f):
-    """(count,) records of EPISODE_STATE of a record of TASK_PARAMETERS."""
+    """Return a view (count,) of the EPISODE_STATE records of a TASK_PARAMETERS record."""
     return carray(pointer(f.episodes), (f.count,), EPISODE_STATE)
 
 
 @compiled
 def world(f, m, d, number, argument):
-    """The live arrays of a simulation.
+    """Return views of the arrays of a simulation.
 
     Args:
         f: record of TASK_PARAMETERS.
-        m: address of its mjModel, scalar.
-        d: address of its mjData, scalar.
-        number: its number, scalar.
+        m: address of mjModel, scalar.
+        d: address of mjData, scalar.
+        number: index of the simulation, scalar.
         argument: address of `f`, scalar.
 
     Returns:
@@ -137,7 +135,7 @@ def world(f, m, d, number, argument):
 
 @intrinsic
 def _call(typingctx, function, part, model, data, number, argument, out):
-    """Call a function of the signature TASK_CODE by its address."""
+    """Call a function with the signature TASK_CODE by its address."""
 
     def codegen(context, builder, signature, args):
         kind = ir.FunctionType(ir.DoubleType(), [ir.IntType(64)] * 6)
@@ -148,16 +146,16 @@ def _call(typingctx, function, part, model, data, number, argument, out):
 
 @compiled
 def call_task(f, w, part, out):
-    """Let the task do its part.
+    """Call one part of the task's native code.
 
     Args:
         f: record of TASK_PARAMETERS.
         w: World.
         part: BEGIN, TICK, OBSERVE or REWARD, scalar.
-        out: address of the float32 that OBSERVE writes, scalar; 0 for the others.
+        out: address of the float32 output of OBSERVE, scalar; 0 for the other parts.
 
     Returns:
-        The reward, scalar; 0 but for REWARD, which also writes `over` of the episode.
+        The reward, scalar, for REWARD, which also writes `over` of the episode; otherwise 0.
 
     Source: this module.
     """
@@ -166,25 +164,25 @@ def call_task(f, w, part, out):
 
 @compiled
 def observed(f, out):
-    """Room for what a task observes, at least.
+    """Return a view of the memory in which a task writes its observation.
 
     Args:
         f: record of TASK_PARAMETERS.
         out: address, scalar.
 
     Returns:
-        (observations,) float32.
+        (observations,) float32; a task writes only its own fields, from the first element on.
     """
     return carray(pointer(out), (f.observations,), np.float32)
 
 
 @compiled
 def rewarded(e, outcome):
-    """Keep whether an episode ends.
+    """Store whether an episode ends, and return the reward.
 
     Args:
         e: record of EPISODE_STATE; `over` is written.
-        outcome: (reward, whether it ends), scalars.
+        outcome: (reward, whether the episode ends), scalars.
 
     Returns:
         The reward, scalar.
@@ -194,20 +192,20 @@ def rewarded(e, outcome):
     return reward
 
 
-_TURNS = 20.0  # rad: of a slewing house, which has no end
-_BEYOND = 0.15  # rad or m by which a joint and its sensor may read beyond the range
-_FASTEST = 5.0  # rad/s or m/s of a difference quotient of noisy readings
-_PRESSURES = (-1.0e6, 6.0e7)  # Pa: with a sensor's offset and noise; reliefs open at some 32 MPa
+_TURNS = 20.0  # rad, bound for a slewing house, which has no joint limits
+_BEYOND = 0.15  # rad or m by which a measured position may exceed the joint range
+_FASTEST = 5.0  # rad/s or m/s, bound of the difference quotient of noisy samples
+_PRESSURES = (-1.0e6, 6.0e7)  # Pa, with sensor offset and noise; relief valves open at about 32 MPa
 
 
 class Field(NamedTuple):
-    """One number of an observation.
+    """One value of an observation.
 
     Attributes:
-        name: `what.where`.
+        name: `<quantity>.<axis or coordinate>`.
         unit: SI unit.
-        low: lowest value; what lies outside saturates.
-        high: highest value.
+        low: lower bound, at which values saturate.
+        high: upper bound.
     """
 
     name: str
@@ -217,7 +215,7 @@ class Field(NamedTuple):
 
 
 def position_field(machine: Machine, axis: str, what: str = "") -> Field:
-    """Field of an axis' position; `what` is its first part, that of the reading by default."""
+    """Return the field of an axis position; `what` defaults to `angle` or `position`."""
     low, high = machine.joints[machine.axes[axis].joint].range or (-_TURNS, _TURNS)
     kind = machine.position_kind(axis)
     unit = "rad" if kind == "angle" else "m"
@@ -225,13 +223,13 @@ def position_field(machine: Machine, axis: str, what: str = "") -> Field:
 
 
 def rate_field(machine: Machine, axis: str, what: str = "rate") -> Field:
-    """Field of the rate of an axis' position."""
+    """Return the field of an axis rate."""
     unit = "rad/s" if machine.position_kind(axis) == "angle" else "m/s"
     return Field(f"{what}.{axis}", unit, -_FASTEST, _FASTEST)
 
 
 def pose_fields(machine: Machine, arm_axes: int, what: str = "tip") -> list[Field]:
-    """Fields of a pose of the tip: r, theta, z, attitude, and the head of an arm with five axes."""
+    """Return the fields of a tip pose: r, theta, z, attitude, and head for a five-axis arm."""
     far = reach(machine)
     fields = [
         Field(f"{what}.r", "m", 0.0, far),
@@ -244,14 +242,14 @@ def pose_fields(machine: Machine, arm_axes: int, what: str = "tip") -> list[Fiel
 
 
 def reach(machine: Machine) -> float:
-    """A radius that the tip surely stays within [m]: all links in one line."""
+    """Return an upper bound of the tip radius [m]: the sum of all link lengths."""
     lengths = [float(np.linalg.norm(link.position)) for link in machine.links.values()]
     assert machine.arm
     return sum(lengths) + float(np.linalg.norm(machine.arm.tip.position))
 
 
 def machine_fields(machine: Machine, axes: tuple[str, ...], arm_axes: int) -> list[Field]:
-    """What `observe_machine` writes.
+    """Return the fields that `observe_machine` writes.
 
     Args:
         machine: the machine.
@@ -280,12 +278,12 @@ def machine_fields(machine: Machine, axes: tuple[str, ...], arm_axes: int) -> li
 
 @compiled
 def observe_machine(f, e, out):
-    """Write what the machine's sensors say.
+    """Write the measured values of the machine, the tip pose and the commands.
 
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE.
-        out: (observations,) float32; the first ones are written.
+        out: (observations,) float32, written from index 0 on.
 
     Returns:
         Number of values written, scalar.

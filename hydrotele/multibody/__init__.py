@@ -1,1 +1,1 @@
-"""Mechanisms with closed loops: tree, closures, inverse dynamics, regressor."""
+"""Mechanisms with closed loops: joint tree, loop closures, inverse dynamics, regressor."""

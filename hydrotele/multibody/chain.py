@@ -1,7 +1,8 @@
-"""A mechanism read from an MJCF: a joint tree whose loops `connect` and `weld` constraints close.
+"""Read a mechanism from MJCF as a joint tree with loops closed by `connect` and `weld` constraints.
 
-Every joint of the tree is a hinge or a slide. A ball joint becomes three hinges about x, y and z in
-turn (Cardan angles, singular where the second is 90 degrees), a free joint three slides and a ball.
+Every joint of the tree is a hinge or a slide. A ball joint becomes three successive hinges about x,
+y and z (Cardan angles, singular if the second is 90 degrees). A free joint becomes three slides and
+a ball joint.
 """
 
 from dataclasses import dataclass
@@ -21,22 +22,22 @@ _WHERE = "chain"
 
 
 class Tree(NamedTuple):
-    """Numbers of a joint tree, as compiled code takes them; b bodies with the world, v joints.
+    """Joint tree for compiled code; b bodies including the world, v joints, c closures.
 
     Attributes:
-        parent: (b,) parent body.
-        offset: (b, 3) place of a body's frame in its parent's [m].
-        turn: (b, 3, 3) its orientation.
-        first: (b + 1,) first joint of a body; its joints end where the next body's begin.
-        slides: (v,) whether a joint slides instead of turning.
-        axis: (v, 3) in the body's frame.
-        anchor: (v, 3) in the body's frame [m].
-        zero: (v,) position at which the frames stand as in the file [rad] or [m].
+        parent: (b,) index of the parent body.
+        offset: (b, 3) origin of the body frame in the parent frame [m].
+        turn: (b, 3, 3) orientation of the body frame in the parent frame.
+        first: (b + 1,) index of the first joint of a body; `first[i + 1]` is the end.
+        slides: (v,) whether a joint is a slide; otherwise it is a hinge.
+        axis: (v, 3) joint axis in the body frame.
+        anchor: (v, 3) point on the axis in the body frame [m].
+        zero: (v,) joint position in the reference pose of the file [rad] or [m].
         above: (b, v) whether a joint moves a body.
         ends: (c, 2) bodies that a closure connects.
-        points: (c, 2, 3) the points that it holds together, in their bodies' frames [m].
-        turns: (c, 2, 3, 3) orientations, in their bodies' frames, that a weld holds together.
-        row: (c + 1,) first equation of a closure: a connect has 3, a weld 6.
+        points: (c, 2, 3) points that the closure makes coincide, in the body frames [m].
+        turns: (c, 2, 3, 3) orientations that a weld makes coincide, in the body frames.
+        row: (c + 1,) index of the first equation of a closure: a connect has 3, a weld 6.
         gravity: (3,) [m/s^2].
     """
 
@@ -58,26 +59,26 @@ class Tree(NamedTuple):
 
 @dataclass(frozen=True)
 class Chain:
-    """A mechanism with names.
+    """A mechanism with named bodies, joints and closures.
 
     Attributes:
-        name: of the model.
-        tree: its numbers.
+        name: name of the model.
+        tree: arrays of the joint tree.
         bodies: names of the bodies, without the world.
         joints: names of the v joints; those of a ball joint `elbow` are `elbow_rx`, `elbow_ry` and
             `elbow_rz`, those of a free joint also `elbow_x`, `elbow_y` and `elbow_z`.
         closures: names of the c closures.
-        start: (v,) positions from which the loops are closed: those of the file's first keyframe,
-            else of its reference pose.
-        inertia: (b - 1, 10) inertial parameters of the bodies, about their frames' origins.
-        armature: (v,) inertia of a joint's drive [kg] or [kg m^2].
+        start: (v,) initial positions for closing the loops: those of the first keyframe of the
+            file, or of its reference pose.
+        inertia: (b - 1, 10) inertial parameters of the bodies about the origins of their frames.
+        armature: (v,) drive inertia of a joint [kg] or [kg m^2].
         damping: (v,) [N s/m] or [N m s/rad].
         frictionloss: (v,) dry friction [N] or [N m].
-        stiffness: (v,) of a joint's spring [N/m] or [N m/rad].
-        rest: (v,) position at which it is slack [rad] or [m].
-        drives: joints that an actuator moves, in the actuators' order.
-        places: (v,) place of a joint in MuJoCo's `qpos`, -1 for those of ball and free joints.
-        dofs: (v,) place of a joint in MuJoCo's `qvel`, -1 likewise.
+        stiffness: (v,) stiffness of the joint spring [N/m] or [N m/rad].
+        rest: (v,) rest position of the joint spring [rad] or [m].
+        drives: joints that an actuator moves, in the order of the actuators.
+        places: (v,) index of a joint in MuJoCo's `qpos`, -1 for parts of ball and free joints.
+        dofs: (v,) index of a joint in MuJoCo's `qvel`, -1 likewise.
     """
 
     name: str
@@ -97,10 +98,10 @@ class Chain:
     dofs: np.ndarray
 
     def index(self, joint: str) -> int:
-        """Place of a joint.
+        """Return the index of a joint.
 
         Raises:
-            InputError: there is no such joint.
+            InputError: the joint does not exist.
         """
         if joint not in self.joints:
             raise InputError(_WHERE, f"{self.name} has no joint {joint}: {', '.join(self.joints)}")
@@ -127,20 +128,21 @@ class _Joint(NamedTuple):
 
 
 def load_chain(source: str | Path | mujoco.MjModel) -> Chain:
-    """Read a mechanism.
+    """Read a mechanism from an MJCF file or a compiled model.
 
-    What no actuator and no closure holds, such as an object that lies on the ground beside a
-    machine, stands still and has no joints here, unless nothing in the model is held.
+    A kinematic tree without actuator and closure, such as an object on the ground next to a
+    machine, is treated as fixed and has no joints. If no tree has any, all joints are kept.
 
     Args:
-        source: path of an MJCF, or a compiled model.
+        source: path of an MJCF file, or a compiled model.
 
     Returns:
-        The chain. Actuators that move a joint name the drives; without any, all joints are.
+        The chain. The drives are the joints with an actuator, or all joints if there is none.
 
     Raises:
-        InputError: no such file, an actuator on a ball or free joint, such a joint with damping,
-            armature, friction or a spring, or an active constraint other than `connect` and `weld`.
+        InputError: the file does not exist, a ball or free joint has an actuator, damping,
+            armature, friction or a spring, or there is an active constraint other than `connect`
+            and `weld`.
 
     Source: MuJoCo manual, `mj_kinematics` and `mjData`.
     """
@@ -162,7 +164,7 @@ def load_chain(source: str | Path | mujoco.MjModel) -> Chain:
         for j in range(model.body_jntadr[b], model.body_jntadr[b] + model.body_jntnum[b]):
             if model.body_rootid[b] not in held:
                 continue
-            if model.jnt_type[j] == _FREE:  # its position is that of the body itself
+            if model.jnt_type[j] == _FREE:  # its position is the absolute position of the body
                 offset[b], turn[b] = 0.0, np.eye(3)
             joints += _scalar_joints(model, j, pose)
         first[b + 1] = len(joints)
@@ -175,7 +177,7 @@ def load_chain(source: str | Path | mujoco.MjModel) -> Chain:
     for j in moved:
         if int(model.jnt_qposadr[j]) not in whole:
             raise InputError(
-                _WHERE, f"joint {model.joint(j).name or j} has a drive but is no hinge or slide"
+                _WHERE, f"joint {model.joint(j).name or j} has a drive; it must be a hinge or slide"
             )
     tree = Tree(
         parent=model.body_parentid.astype(np.int64), offset=offset, turn=turn, first=first,
@@ -219,7 +221,7 @@ _AXES = tuple(enumerate("xyz"))
 
 
 def _scalar_joints(model: mujoco.MjModel, j: int, pose: np.ndarray) -> list[_Joint]:
-    """The hinges and slides that a joint of MuJoCo becomes, standing as in a pose (nq,)."""
+    """Convert a MuJoCo joint to hinges and slides, with start positions from a pose (nq,)."""
     name, kind = model.joint(j).name or f"joint{j}", model.jnt_type[j]
     body, anchor = int(model.jnt_bodyid[j]), tuple(model.jnt_pos[j])
     place, dof = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
@@ -258,7 +260,7 @@ def _scalar_joints(model: mujoco.MjModel, j: int, pose: np.ndarray) -> list[_Joi
 
 
 def cardan_angles(turn: np.ndarray) -> np.ndarray:
-    """Angles (3,) [rad] of `R = R_x(a) R_y(b) R_z(c)`, with b from -90 to 90 degrees.
+    """Return the angles (3,) [rad] of `R = R_x(a) R_y(b) R_z(c)`, with b from -90 to 90 degrees.
 
     Args:
         turn: (3, 3) rotation R.
@@ -283,7 +285,7 @@ class _Closure(NamedTuple):
 
 
 def _closures(model: mujoco.MjModel) -> list[_Closure]:
-    """The active `connect` and `weld` constraints."""
+    """Return the active `connect` and `weld` constraints."""
     out = []
     for e in range(model.neq):
         if not model.eq_active0[e]:
@@ -292,8 +294,8 @@ def _closures(model: mujoco.MjModel) -> list[_Closure]:
         if kind not in (_CONNECT, _WELD):
             raise InputError(
                 _WHERE,
-                f"constraint {name} is neither `connect` nor `weld`: deactivate it, or build it of"
-                " those",
+                f"constraint {name} is neither `connect` nor `weld`: deactivate it, or replace it"
+                " by these",
             )
         one, two, data = int(model.eq_obj1id[e]), int(model.eq_obj2id[e]), model.eq_data[e]
         turns = (np.eye(3), np.eye(3))
@@ -317,11 +319,11 @@ def _turn(quaternion: np.ndarray) -> np.ndarray:
 
 
 def body_inertia(model: mujoco.MjModel, body: int) -> list[float]:
-    """Mass, mass times centre of mass, and inertia about the frame's origin, of a body.
+    """Return mass, first moments and inertia about the frame origin of a body.
 
     Args:
-        model: compiled.
-        body: its number.
+        model: compiled model.
+        body: index of the body.
 
     Returns:
         The ten inertial parameters in the order of `BODY_PARAMETERS`.

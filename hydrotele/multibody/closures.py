@@ -1,11 +1,11 @@
-"""Closures of a joint tree: how far loops are open, and the joints that they determine.
+"""Loop closures of a joint tree, and the kinematics of closed chains.
 
-A `connect` gives three equations, that two points coincide; a `weld` three more, that two frames
-are parallel. For small angles the latter are the rotation from one frame to the other.
+A `connect` gives three equations: two points coincide. A `weld` gives three more: two frames are
+parallel. For small angles, their residuals are the rotation from one frame to the other.
 
-Kinematics of a closed chain: all joints from some of them, all assemblies, Jacobians. Which way is
-forward is the caller's choice: positions of drives give those of a platform, the six coordinates of
-a platform give those of its drives.
+The kinematic functions compute all joint positions from some of them, all assemblies, and
+Jacobians. They solve the forward and the inverse problem: drive positions determine a platform
+pose, and the six coordinates of a platform determine the drive positions.
 """
 
 from collections.abc import Sequence
@@ -33,21 +33,21 @@ from hydrotele.multibody.tree_motion import (
     vector,
 )
 
-CLOSED = 1e-11  # m or rad, opening of a loop that counts as closed: rounding at a machine's size
-_ROUNDS = 50  # of Newton's method
-_LEAP = 0.5  # rad or m, by which a joint that is sought may move at once near a known pose
-_SMALL = 1e-7  # least ratio of singular values in use
+CLOSED = 1e-11  # m or rad, maximum residual of a closed loop: rounding at the size of a machine
+_ROUNDS = 50  # maximum number of Newton iterations
+_LEAP = 0.5  # rad or m, maximum step of an unknown joint near a known pose
+_SMALL = 1e-7  # minimum relative singular value
 _WHERE = "closures"
 
 
 @allocation_free
 def loop_errors(tree, frames, error, slope):
-    """Openings of the closures and their Jacobian.
+    """Compute the residuals of the loop equations and their Jacobian.
 
     Args:
         tree: Tree.
         frames: Frames after `move_tree`.
-        error: (r, 1) written: r equations, 3 or 6 of every closure [m], [rad].
+        error: (r, 1) written: residuals, 3 or 6 per closure [m], [rad].
         slope: (r, v) written: d error / d joint positions.
 
     Returns:
@@ -82,7 +82,7 @@ def loop_errors(tree, frames, error, slope):
 
 @allocation_free
 def _rotation_error(tree, frames, c):
-    """Sine of the rotation from the second frame of a weld to the first, about its axis."""
+    """Return the sine of the rotation angle between both frames of a weld, times its axis."""
     one, two = rotation(frames.turn, tree.ends[c, 0]), rotation(frames.turn, tree.ends[c, 1])
     own, other = tree.turns[c, 0], tree.turns[c, 1]
     total = (0.0, 0.0, 0.0)
@@ -95,7 +95,7 @@ def _rotation_error(tree, frames, c):
 
 @allocation_free
 def closure_acceleration(tree, frames, out):
-    """Acceleration (r, 1) with which closures part [m/s^2], [rad/s^2].
+    """Compute the acceleration of the loop residuals (r, 1) [m/s^2], [rad/s^2].
 
     Source: second derivative of the loop equations.
     """
@@ -115,15 +115,15 @@ def closure_acceleration(tree, frames, out):
 
 
 class LoopSpace(NamedTuple):
-    """Work space of `close_near`; v joints, m of them sought, r equations.
+    """Workspace of `close_near`; v joints, m unknown joints, r equations.
 
     Attributes:
         still: (v,) zeros.
         none: (3,) zeros.
-        frames: where the bodies are.
-        error: (r, 1) openings [m], [rad].
+        frames: frames of the bodies.
+        error: (r, 1) residuals of the loop equations [m], [rad].
         slope: (r, v) d error / d joint positions.
-        q_factor: (r, m) orthonormal factor of the columns of `slope` that are sought.
+        q_factor: (r, m) orthonormal factor of the columns of `slope` of the unknown joints.
         r_factor: (m, m) triangular factor.
         part: (m, k) solutions, k at least 1.
     """
@@ -140,7 +140,7 @@ class LoopSpace(NamedTuple):
 
 @compiled
 def loop_space(tree, sought, columns):
-    """Room to close the loops of a tree by `sought` joints, for solutions of some columns."""
+    """Allocate the workspace for `sought` unknown joints and solutions with `columns` columns."""
     v, r = len(tree.zero), tree.row[-1]
     return LoopSpace(
         np.zeros(v), np.zeros(3), new_frames(tree), np.zeros((r, 1)), np.zeros((r, v)),
@@ -150,16 +150,17 @@ def loop_space(tree, sought, columns):
 
 @allocation_free
 def close_near(tree, q, others, space):
-    """Close the loops near a position; without memory of its own, row after row.
+    """Close the loops from a nearby position, without allocation.
 
     Args:
         tree: Tree.
         q: (v,) positions, changed in place [rad] or [m].
-        others: (m,) joints that may move.
-        space: LoopSpace of m sought joints; afterwards it has frames, slope and factors there.
+        others: (m,) indices of the joints that may move.
+        space: LoopSpace of m unknown joints; receives frames, Jacobian and factors at the solution.
 
     Returns:
-        False if that fails or leads to another branch; `close_from` starts farther away.
+        False if it fails or the step indicates another branch; `close_from` handles larger
+        distances.
 
     Source: Gauss-Newton.
     """
@@ -187,19 +188,19 @@ def close_near(tree, q, others, space):
 def close_from(
     tree: Tree, q: np.ndarray, others: np.ndarray, closed: float, longest: float
 ) -> float:
-    """Close the loops from some way off by moving some of the joints.
+    """Close the loops from a distant position by moving some of the joints.
 
     Args:
-        tree: of the joints.
+        tree: joint tree.
         q: (v,) positions, changed in place [rad] or [m].
-        others: (m,) joints that may move.
-        closed: opening that counts as closed [m], [rad].
-        longest: most that a joint moves in one round [rad], [m].
+        others: (m,) indices of the joints that may move.
+        closed: maximum residual of a closed loop [m], [rad].
+        longest: maximum joint step per iteration [rad], [m].
 
     Returns:
-        Opening that is left [m], [rad].
+        Maximum remaining residual [m], [rad].
 
-    Source: Gauss-Newton with a bounded step, minimum norm where the closures leave a choice.
+    Source: Gauss-Newton with a bounded step, of minimum norm if the closures are not sufficient.
     """
     open_by = 0.0
     for _ in range(_ROUNDS if tree.row[-1] else 0):
@@ -214,7 +215,7 @@ def close_from(
 
 @compiled
 def _openings(tree, q):
-    """Openings (r, 1) of the closures at positions (v,), and their Jacobian (r, v)."""
+    """Return the loop residuals (r, 1) at positions (v,), and their Jacobian (r, v)."""
     v, r = len(q), tree.row[-1]
     frames, gap, slope, still = new_frames(tree), np.zeros((r, 1)), np.zeros((r, v)), np.zeros(v)
     move_tree(tree, q, still, still, np.zeros(3), frames)
@@ -223,7 +224,7 @@ def _openings(tree, q):
 
 
 def compile_openings() -> None:
-    """Compile what `close_from` and `motion_basis` call, by a pendulum."""
+    """Compile the functions that `close_from` and `motion_basis` call, using a pendulum."""
     body = '<body><joint name="hinge"/><geom size="1"/></body>'
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
     tree = load_chain(model).tree
@@ -231,17 +232,17 @@ def compile_openings() -> None:
 
 
 def motion_basis(chain: Chain, q: np.ndarray, independent: np.ndarray) -> np.ndarray:
-    """Velocities of all joints per unit velocity of each independent one.
+    """Return the rates of all joints per unit rate of each independent joint.
 
     Args:
         chain: the chain.
-        q: (v,) positions in which its loops are closed [rad] or [m].
-        independent: (n,) places of the independent joints.
+        q: (v,) positions with closed loops [rad] or [m].
+        independent: (n,) indices of the independent joints.
 
     Returns:
         (v, n), with `rates = basis @ rates[independent]`.
 
-    Source: `J_d r_d = -J_i r_i` of the closures' Jacobian, dependent and independent part.
+    Source: `J_d r_d = -J_i r_i`, with the dependent and independent columns of the loop Jacobian.
     """
     others = np.setdiff1d(np.arange(len(q)), independent)
     basis = np.zeros((len(q), len(independent)))
@@ -253,15 +254,15 @@ def motion_basis(chain: Chain, q: np.ndarray, independent: np.ndarray) -> np.nda
 
 
 def check_determined(chain: Chain, q: np.ndarray, independent: np.ndarray) -> None:
-    """Refuse joints that are neither independent nor determined by a closure.
+    """Check that the independent joints and the closures determine all other joints.
 
     Args:
         chain: the chain.
-        q: (v,) positions in which its loops are closed [rad] or [m].
-        independent: (n,) places of the independent joints.
+        q: (v,) positions with closed loops [rad] or [m].
+        independent: (n,) indices of the independent joints.
 
     Raises:
-        InputError: names them.
+        InputError: some joints are undetermined; the message names them.
     """
     others = np.setdiff1d(np.arange(len(q)), independent)
     loose = np.linalg.svd(_openings(chain.tree, q)[1][:, others], full_matrices=True)
@@ -271,9 +272,9 @@ def check_determined(chain: Chain, q: np.ndarray, independent: np.ndarray) -> No
         raise InputError(_WHERE, f"neither given nor determined by a closure: {names}")
 
 
-_STRIDE = 0.1  # rad or m, to which the given joints move at once
-_LONGEST = 1.5  # rad or m, that a joint moves in one round of a search from far off
-_SAME = 1e-6  # m and 1, by which places and orientations of one assembly differ at most
+_STRIDE = 0.1  # rad or m, maximum step of the given joints
+_LONGEST = 1.5  # rad or m, maximum joint step per iteration from a distant position
+_SAME = 1e-6  # m and 1, maximum difference of positions and orientations of equal assemblies
 _KINEMATICS = "kinematics"
 
 
@@ -281,23 +282,23 @@ def joint_positions(
     chain: Chain, given: Sequence[str], position: np.ndarray, start: np.ndarray | None = None,
     seed: int = 0,
 ) -> np.ndarray:  # fmt: skip
-    """Positions of all joints along a motion of some.
+    """Compute the positions of all joints along a given motion of some joints.
 
-    Newton's method from the row before; where that fails, that one of all assemblies which is
-    nearest to the row before.
+    Newton's method starts from the previous row. If it fails, the assembly closest to the previous
+    row is used.
 
     Args:
         chain: the chain.
-        given: the k joints whose positions are known; the closures must determine the others.
+        given: the k joints with known positions; the closures must determine the others.
         position: (n, k) [rad] or [m].
-        start: (v,) positions from which to go to the first row; the chain's by default.
-        seed: of the search for all assemblies.
+        start: (v,) initial positions before the first row; those of the chain by default.
+        seed: seed of the search for all assemblies.
 
     Returns:
         (n, v) [rad] or [m].
 
     Raises:
-        InputError: shapes do not fit, a value is missing, the closures do not determine the other
+        InputError: a shape is wrong, a value is missing, the closures do not determine the other
             joints, or a row cannot be reached.
 
     Source: Merlet 2006, Parallel robots, 4.5; Abdellatif 2008, section 4.1.
@@ -308,12 +309,12 @@ def joint_positions(
         raise InputError(_KINEMATICS, f"positions must be (n, {len(columns)}), got {table.shape}")
     if not np.isfinite(table).all():
         row = int(np.argwhere(~np.isfinite(table))[0, 0])
-        raise InputError(_KINEMATICS, f"row {row} has no position of every given joint")
+        raise InputError(_KINEMATICS, f"row {row} has missing positions of the given joints")
     others = np.setdiff1d(np.arange(len(chain.joints)), columns)
     q = np.array(chain.start if start is None else start, float)
     if not close_from(chain.tree, q, np.arange(len(q)), CLOSED, np.inf) < CLOSED:
         raise InputError(
-            _KINEMATICS, f"the loops of {chain.name} cannot be closed from where they start"
+            _KINEMATICS, f"the loops of {chain.name} cannot be closed from the start positions"
         )
     check_determined(chain, q, columns)
     out, first = np.empty((len(table), len(q))), 0
@@ -336,7 +337,7 @@ def joint_positions(
 
 @compiled
 def _follow(tree, given, position, others, q, out):
-    """Fill joint positions row by row; the row that failed, or -1."""
+    """Compute joint positions row by row; return the index of the failed row, or -1."""
     space = loop_space(tree, len(others), 1)
     for row in range(len(position)):
         far = 0.0
@@ -356,21 +357,22 @@ def assemblies(
     chain: Chain, given: Sequence[str], position: np.ndarray, *, body: str | None = None,
     starts: int = 400, seed: int = 0,
 ) -> np.ndarray:  # fmt: skip
-    """All ways to assemble a chain in which some joints have given positions.
+    """Find all assemblies of a chain for given positions of some joints.
 
-    Newton's method from random positions: what is found exists, but nothing proves that there is
-    no more. A Stewart-Gough platform has up to 40.
+    Newton's method starts from random positions. All returned assemblies exist, but there is no
+    proof that the list is complete. A Stewart-Gough platform has up to 40 assemblies.
 
     Args:
         chain: the chain.
-        given: the k joints whose positions are known.
+        given: the k joints with known positions.
         position: (k,) [rad] or [m].
-        body: assemblies that differ in the pose of this body only count; all bodies' by default.
-        starts: random positions from which to search.
-        seed: of these.
+        body: body whose pose distinguishes assemblies; all bodies by default.
+        starts: number of random start positions.
+        seed: seed of the start positions.
 
     Returns:
-        (s, v) joint positions, hinges within -pi .. pi of the chain's start; nearest to it first.
+        (s, v) joint positions, hinges within -pi .. pi of the start of the chain, sorted by
+        distance from it.
 
     Source: Merlet 2006, Parallel robots, 4.1 (number of solutions).
     """
@@ -399,7 +401,7 @@ def assemblies(
 
 
 def _shape(chain: Chain, q: np.ndarray, body: str | None) -> np.ndarray:
-    """Places and orientations of bodies as one vector."""
+    """Return the positions and orientations of bodies as one vector."""
     frames, still = new_frames(chain.tree), np.zeros(len(q))
     move_tree(chain.tree, q, still, still, np.zeros(3), frames)
     some = slice(1, None) if body is None else chain.bodies.index(body) + 1
@@ -409,12 +411,12 @@ def _shape(chain: Chain, q: np.ndarray, body: str | None) -> np.ndarray:
 def jacobian(
     chain: Chain, q: np.ndarray, outputs: Sequence[str], inputs: Sequence[str]
 ) -> np.ndarray:
-    """Rates of some joints per unit rate of others.
+    """Return the rates of some joints per unit rate of the independent joints.
 
     Args:
         chain: the chain.
-        q: (v,) positions in which its loops are closed [rad] or [m].
-        outputs: the m joints whose rates are asked for.
+        q: (v,) positions with closed loops [rad] or [m].
+        outputs: the m joints whose rates are returned.
         inputs: the n independent joints.
 
     Returns:

@@ -1,11 +1,11 @@
-"""Inverse dynamics of a closed chain: motion of all its joints, forces of its drives, regressor.
+"""Inverse dynamics of a closed chain: motion of all joints, drive forces, and regressor.
 
-All rows of a log at once, compiled. Loops are closed by Newton's method from the row before; rates
-and accelerations follow from the closures' Jacobian; forces of passive joints are carried to the
-drives by virtual work.
+Compiled code processes all rows of a log. It closes the loops by Newton's method from the previous
+row. Rates and accelerations follow from the Jacobian of the closures. The forces of passive joints
+are projected on the drives by virtual work.
 
-Drive forces are linear in inertial and friction parameters, for any tree that `multibody.chain`
-reads; friction is that of joints and closures.
+The drive forces are linear in the inertial and friction parameters, for any chain that
+`multibody.chain` reads. Friction acts in joints and closures.
 """
 
 import math
@@ -40,20 +40,20 @@ from hydrotele.multibody.tree_motion import (
     wrenches,
 )
 
-_STRIDE = 0.1  # rad or m, to which the given joints move at once, lest a loop change its branch
+_STRIDE = 0.1  # rad or m, maximum step of the given joints, so that loops stay on their branch
 _WHERE = "closures"
 
 
 class Projection(NamedTuple):
-    """n rows, v joints, b bodies, k drives.
+    """Motion and forces of a chain projected on its drives; n rows, v joints, b bodies, k drives.
 
     Attributes:
         position: (n, v) of all joints [rad] or [m].
         rate: (n, v) [rad/s] or [m/s].
         acceleration: (n, v) [rad/s^2] or [m/s^2].
-        share: (n, k, v) force of drive k per unit of force or torque in joint v.
-        bodies: (n, k, 10 b) force of drive k [N] or [N m] per unit of a body's inertial parameter.
-        twist: (n, c) rate at which the two bodies of a closure turn against each other [rad/s].
+        share: (n, k, v) force of drive k per unit force or torque in joint v.
+        bodies: (n, k, 10 b) force of drive k [N] or [N m] per unit of an inertial parameter.
+        twist: (n, c) relative rotation rate of the two bodies of a closure [rad/s].
         pins: (n, k, c) force of drive k per unit of viscous friction in a closure.
     """
 
@@ -72,25 +72,24 @@ def project(
     start: np.ndarray | None = None,
     moment_free: Mapping[str, tuple[float, float, float]] | None = None,
 ) -> Projection:  # fmt: skip
-    """Project a chain on its drives.
+    """Compute the motion of all joints and project the forces of a chain on its drives.
 
     Args:
         chain: the chain.
-        given: the k joints whose motion is known; the closures must determine the others.
+        given: the k joints with known motion; the closures must determine the others.
         position: (n, k) [rad] or [m].
         rate: (n, k) [rad/s] or [m/s].
         acceleration: (n, k) [rad/s^2] or [m/s^2].
-        drives: k joints whose forces are asked for; the chain's own by default.
-        start: (v,) positions from which to go to the first row; the chain's by default.
+        drives: k joints whose forces are computed; the drives of the chain by default.
+        start: (v,) initial positions before the first row; those of the chain by default.
         moment_free: body -> unit axis through the origin of its frame, in that frame, about which
-            it takes no moment from its neighbours. Its motion is that of the chain all the same.
+            its neighbours transmit no moment. Its motion is not affected.
 
     Returns:
-        The projection. `bodies @ inertia.ravel()`, plus what friction asks for, are the drives'
-        forces.
+        The projection. The drive forces are `bodies @ inertia.ravel()` plus the friction forces.
 
     Raises:
-        InputError: shapes do not fit, a value is missing, a body is not there, the closures do not
+        InputError: a shape is wrong, a value is missing, a body does not exist, the closures do not
             determine the other joints, or a row cannot be reached.
 
     Source: Newton-Euler about the body frames, D'Alembert; Abdellatif 2008, section 2; bodies
@@ -105,8 +104,8 @@ def project(
     if len(moved) != len(columns):
         raise InputError(
             _WHERE,
-            f"{len(columns)} joints are given but {len(moved)} have a drive; forces follow only"
-            " where there are as many",
+            f"{len(columns)} joints are given but {len(moved)} have a drive; inverse dynamics needs"
+            " equal numbers",
         )
     n, v, k = len(tables[0]), len(chain.joints), len(columns)
     axes = np.zeros((len(chain.bodies) + 1, 3))
@@ -116,7 +115,7 @@ def project(
     q = np.array(chain.start if start is None else start, float)
     if not close_from(chain.tree, q, np.arange(v), CLOSED, np.inf) < CLOSED:
         raise InputError(
-            _WHERE, f"the loops of {chain.name} cannot be closed from where they start"
+            _WHERE, f"the loops of {chain.name} cannot be closed from the start positions"
         )
     check_determined(chain, q, columns)
     out = Projection(
@@ -154,7 +153,7 @@ def _table(values: np.ndarray, width: int) -> np.ndarray:
 
 
 class _Given(NamedTuple):
-    """Places (k,) of the given joints, and their motion, (n, k) each."""
+    """Indices (k,) of the given joints, and their motion, (n, k) each."""
 
     joints: np.ndarray
     position: np.ndarray
@@ -164,11 +163,11 @@ class _Given(NamedTuple):
 
 @compiled
 def _project(tree, given, others, drives, moment_free, q, out):
-    """Fill a `Projection` row by row; the row that failed, or -1."""
+    """Compute a `Projection` row by row; return the index of the failed row, or -1."""
     b, v, k = len(tree.parent), len(tree.zero), len(given.joints)
     hidden, space = len(others), loop_space(tree, len(others), k)
     frames, part, ground = space.frames, space.part, -tree.gravity
-    moves = np.zeros((v, k))  # of all joints per unit of the given ones
+    moves = np.zeros((v, k))  # rates of all joints per unit rate of the given joints
     q_drive, r_drive, unit = np.empty((k, k)), np.empty((k, k)), np.eye(k)
     inverse, every = np.empty((k, k)), np.arange(k)
     forces, torques = np.empty((3, 10)), np.empty((3, 10))
@@ -227,7 +226,7 @@ def _project(tree, given, others, drives, moment_free, q, out):
 
 @allocation_free
 def _drop_moment(frames, body, axis, torques):
-    """Take the part about a body's unit axis from torques (3, 10); a zero axis changes nothing."""
+    """Remove the component along a unit axis from torques (3, 10); a zero axis has no effect."""
     way = rotated(rotation(frames.turn, body), axis)
     for m in range(10):
         along = way[0] * torques[0, m] + way[1] * torques[1, m] + way[2] * torques[2, m]
@@ -237,7 +236,7 @@ def _drop_moment(frames, body, axis, torques):
 
 @allocation_free
 def _load(tree, frames, body, forces, torques, share, out):
-    """Carry a body's wrench through the joints that move it to the drives."""
+    """Project the wrench of a body on the drives, through the joints that move it."""
     first, point = 10 * (body - 1), vector(frames.place, body)
     for i in range(len(share)):
         for m in range(10):
@@ -258,7 +257,7 @@ def _load(tree, frames, body, forces, torques, share, out):
 
 @allocation_free
 def _rub(tree, frames, closure, share, out):
-    """Carry viscous friction in a closure to the drives; return the rate of its turning."""
+    """Project viscous friction in a closure on the drives; return its relative rotation rate."""
     one, two = tree.ends[closure, 0], tree.ends[closure, 1]
     spin = subtract(vector(frames.spin, one), vector(frames.spin, two))
     for i in range(len(share)):
@@ -273,7 +272,7 @@ def _rub(tree, frames, closure, share, out):
     return math.sqrt(dot(spin, spin))
 
 
-# Of one body, in its own frame: mass, mass times centre of mass, inertia about the frame's origin.
+# Inertial parameters of a body in its frame: mass, first moments, inertia about the origin.
 BODY_PARAMETERS = {
     "mass": "kg", "moment_x": "kg m", "moment_y": "kg m", "moment_z": "kg m",
     "inertia_xx": "kg m^2", "inertia_xy": "kg m^2", "inertia_xz": "kg m^2",
@@ -281,21 +280,22 @@ BODY_PARAMETERS = {
 }  # fmt: skip
 _SLOPES = ("viscous", "viscous_asymmetry")
 _REGRESSOR = "regressor"
-_NODES, _WEIGHTS = hermegauss(21)  # a sign that is blurred tenfold is then averaged to 1e-3
+# error of the mean of tanh(v / v_0): 1e-5 for a standard deviation of v_0, 0.01 for 3 v_0
+_NODES, _WEIGHTS = hermegauss(21)
 
 
 @dataclass(frozen=True)
 class FrictionTerm:
-    """Friction at one place, linear in its parameters.
+    """Friction of one joint or closure, linear in its parameters.
 
-    `(coulomb + stribeck exp(-(v/v_s)^2)) way + viscous v`, plus a part of each in which `way` or
-    `v` is replaced by `way^2` or `v way` (asymmetry), plus `quadratic v^2 way`, with
-    `way = tanh(v/v_0)`.
+    With `way = tanh(v/v_0)`, the friction is `(coulomb + stribeck exp(-(v/v_s)^2)) way + viscous v
+    + quadratic v^2 way`, plus asymmetry terms in which `way` is replaced by `way^2` and `v` by
+    `v way`.
 
     Attributes:
-        place: a joint, or a closure, whose bodies turn against each other.
-        nominal: parameter -> its value; the columns that there are. See `FRICTION_TERMS`.
-        smoothing: v_0 [rad/s] or [m/s]; 0 is the sign of v.
+        place: name of a joint, or of a closure whose bodies rotate relative to each other.
+        nominal: parameter -> value; each parameter has one column. See `FRICTION_TERMS`.
+        smoothing: v_0 [rad/s] or [m/s]; 0 uses the sign of v.
         stribeck: v_s [rad/s] or [m/s].
     """
 
@@ -313,14 +313,15 @@ FRICTION_TERMS = (
 
 @dataclass(frozen=True)
 class Regressor:
-    """Forces of all drives at every row as matrix times parameters.
+    """Drive forces of every row as a matrix times the parameters.
 
     Attributes:
         matrix: (n, k, m) force [N] or torque [N m] of drive k per unit of parameter m.
-        drives: the k joints whose forces these are.
-        names: the m parameters, such as `mass.boom`, `inertia_yy.boom_rod`, `viscous.swing`.
-        units: (m,) their SI units.
-        nominal: (m,) their values in the chain and in the friction that was asked for.
+        drives: names of the k driven joints.
+        names: names of the m parameters, such as `mass.boom`, `inertia_yy.boom_rod`,
+            `viscous.swing`.
+        units: (m,) SI units of the parameters.
+        nominal: (m,) values of the parameters in the chain and in the friction terms.
     """
 
     matrix: np.ndarray
@@ -336,26 +337,26 @@ def regressor(
     offsets: Mapping[str, float] | bool = True, drive_inertia: Sequence[str] = (),
     rate_std: np.ndarray | None = None,
 ) -> Regressor:  # fmt: skip
-    """Columns of inertial parameters, friction, drive inertia and offsets.
+    """Assemble the regressor of inertial parameters, friction, drive inertia and offsets.
 
     Args:
         chain: the chain.
-        found: its projection on the drives for every row.
-        drives: names of the drives that it was projected on; the chain's own by default.
-        bodies: bodies whose ten inertial parameters get columns; all by default.
-        rubbing: friction, place by place.
-        offsets: whether every drive gets a constant force, such as that of a transducer's offset;
-            or the given ones, drive by drive [N] or [N m].
-        drive_inertia: joints whose drive has an inertia of its own.
-        rate_std: (n, v) standard deviation of the joints' rates [rad/s] or [m/s]. Friction of a
-            joint is then its mean over what the rate may be, lest it be underrated wherever noise
-            hides on which side of zero the rate is. Pins of closures are taken as they are.
+        found: projection of the chain on the drives for every row.
+        drives: names of the drives of the projection; those of the chain by default.
+        bodies: bodies whose ten inertial parameters have columns; all by default.
+        rubbing: friction terms.
+        offsets: whether every drive has a constant force, such as a transducer offset; or nominal
+            offsets by drive [N] or [N m].
+        drive_inertia: joints whose drive has its own inertia.
+        rate_std: (n, v) standard deviation of the joint rates [rad/s] or [m/s]. The friction of a
+            joint is then its expected value over the distribution of the rate. This avoids a bias
+            where noise makes the sign of the rate uncertain. Friction in closures is not averaged.
 
     Returns:
         The regressor.
 
     Raises:
-        InputError: a body, joint or closure is not there, or a parameter is not known.
+        InputError: a body, joint or closure does not exist, or a parameter is not known.
 
     Source: Newton-Euler about the body frames; Khoshzaban 1992, chapter 4; regression calibration:
     Carroll et al. 2006, Measurement error in nonlinear models, chapter 4.
@@ -398,17 +399,17 @@ def sign_uncertainty(
     chain: Chain, found: Projection, drives: Sequence[str], rubbing: Sequence[FrictionTerm],
     rate_std: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """How uncertain it is on which side of zero the rates of the drives are.
+    """Return the standard deviation of the sign of the drive rates due to rate noise.
 
     Args:
         chain: the chain.
         found: its projection.
         drives: names of the k drives.
-        rubbing: friction, place by place; that of the drives counts.
-        rate_std: (n, v) as of `regressor`.
+        rubbing: friction terms; only those of the drives are used.
+        rate_std: (n, v) as in `regressor`.
 
     Returns:
-        (n, k) standard deviation of the sign that dry friction has, 0 .. 1.
+        (n, k) standard deviation of the sign of dry friction, 0 .. 1.
     """
     out, weights = np.zeros((len(found.rate), len(drives))), _WEIGHTS / _WEIGHTS.sum()
     for one in rubbing:
@@ -425,10 +426,11 @@ def sign_uncertainty(
 def _friction_terms(
     chain: Chain, found: Projection, one: FrictionTerm, rate_std: np.ndarray | None
 ):
-    """Parameter -> (column (n, k), unit)."""
+    """Return the columns of a friction term: parameter -> (column (n, k), unit)."""
     strange = [kind for kind in one.nominal if kind not in FRICTION_TERMS]
     if strange:
-        raise InputError(_REGRESSOR, f"friction has no {strange[0]}: {', '.join(FRICTION_TERMS)}")
+        message = f"friction has no {strange[0]}; valid: {', '.join(FRICTION_TERMS)}"
+        raise InputError(_REGRESSOR, message)
     if one.place in chain.closures:
         return _pin(chain.closures.index(one.place), found, one)
     j = chain.index(one.place)
@@ -446,7 +448,7 @@ def _friction_terms(
 
 
 def _shape(one: FrictionTerm, kind: str, velocity: np.ndarray) -> np.ndarray:
-    """Friction per unit of a parameter at velocities of any shape."""
+    """Return the friction per unit of a parameter at velocities of any shape."""
     if kind == "viscous":
         return velocity
     way = np.tanh(velocity / one.smoothing) if one.smoothing else np.sign(velocity)
@@ -461,7 +463,7 @@ def _shape(one: FrictionTerm, kind: str, velocity: np.ndarray) -> np.ndarray:
 
 
 def _pin(closure: int, found: Projection, one: FrictionTerm):
-    """Friction between the bodies of a closure, against the axis about which they turn."""
+    """Return the columns of friction in a closure, opposite to its relative rotation."""
     twist, share = found.twist[:, closure], found.pins[:, :, closure]
     floor = one.smoothing or np.finfo(float).tiny
     slow = np.exp(-((twist / one.stribeck) ** 2))
@@ -469,7 +471,11 @@ def _pin(closure: int, found: Projection, one: FrictionTerm):
     shapes = {"coulomb": way, "stribeck": slow * way, "viscous": np.ones(len(twist))}
     for kind in one.nominal:
         if kind not in shapes:
-            raise InputError(_REGRESSOR, f"{one.place} is a closure, which has no sides for {kind}")
+            message = (
+                f"{one.place} is a closure, which has no sides for {kind}; valid: "
+                f"{', '.join(shapes)}"
+            )
+            raise InputError(_REGRESSOR, message)
     return {
         kind: (share * shapes[kind][:, None], "N m s/rad" if kind in _SLOPES else "N m")
         for kind in one.nominal
@@ -477,13 +483,13 @@ def _pin(closure: int, found: Projection, one: FrictionTerm):
 
 
 def pin_friction(chain: Chain) -> list[FrictionTerm]:
-    """Coulomb friction of all passive hinges and closures.
+    """Return Coulomb friction terms for all passive hinges and closures.
 
     Args:
         chain: the chain.
 
     Returns:
-        One per hinge that no actuator moves, and per closure; none for ball and free joints.
+        One term per hinge without actuator and per closure; none for ball and free joints.
 
     Source: Khoshzaban 1992, 4.3: joint and pin friction of the complete model.
     """

@@ -1,16 +1,11 @@
-"""A Machine's mechanism in reduced coordinates: links, bars, pins of closures, drives, as tables.
+"""Fast dynamics of a machine's mechanism in reduced (independent) coordinates.
 
-A Kalman filter and a tip balance evaluate it at every step, which `inverse_dynamics` is too slow
-for: links alone are in the tree, cylinders are bars between two pins, and nothing allocates. It
-knows a Machine's closures only; the two are tested against each other.
-
-Motion, mass matrix and bias forces are compiled: places and Jacobians of every frame first, then
-rates and accelerations, then Kane's projection.
-
-Closed chains in reduced coordinates: positions, rates and accelerations that closures determine.
-
-Cylinders are bars between two pins, tube and rod turning together. Few unknowns are solved by a
-Cholesky factorisation of its own, quicker than a library call at this size.
+Kalman filters and force estimators evaluate it at every step, for which `inverse_dynamics` is too
+slow. Only links are in the tree; a cylinder is a bar between two pins, whose tube and rod rotate
+together. Compiled functions compute positions and Jacobians of every frame, then rates and
+accelerations, then mass matrix and bias forces by Kane's projection, without allocation. Only the
+closures of a `Machine` are supported. The Cholesky functions here are faster than library calls for
+the few unknowns of a closure.
 """
 
 import math
@@ -29,7 +24,7 @@ def factorise(matrix):
     """Replace a symmetric positive definite matrix by its lower Cholesky factor.
 
     Args:
-        matrix: (>= n, n), overwritten in its lower triangle; further rows are left alone.
+        matrix: (>= n, n), overwritten in its lower triangle; further rows are not changed.
 
     Returns:
         Nothing.
@@ -46,7 +41,7 @@ def factorise(matrix):
 
 @allocation_free
 def solve(factor, right):
-    """Solve with a Cholesky factor, in place.
+    """Solve a linear system with a Cholesky factor, in place.
 
     Args:
         factor: (>= n, n) result of `factorise`.
@@ -70,15 +65,15 @@ def solve(factor, right):
 
 @allocation_free
 def place_bars(tree, shape, first, frame, jacobian, bar):
-    """Places and Jacobians of all bars: x along the bar, y along the pins.
+    """Compute the frames and Jacobians of all bars; x is along the bar, y along the pins.
 
     Args:
-        tree: see `Mechanism`.
-        shape: see `Mechanism`.
+        tree: see `ReducedMechanism`.
+        shape: see `ReducedMechanism`.
         first: index of the first tube.
-        frame: see `Motion`; written.
-        jacobian: see `Motion`; written.
-        bar: see `Motion`; LENGTH and LENGTH_ROW written.
+        frame: see `ReducedMotion`; written.
+        jacobian: see `ReducedMotion`; written.
+        bar: see `ReducedMotion`; LENGTH and LENGTH_ROW written.
 
     Returns:
         Nothing.
@@ -121,13 +116,13 @@ def place_bars(tree, shape, first, frame, jacobian, bar):
 
 @allocation_free
 def move_bars(tree, first, frame, bar):
-    """Rates and accelerations of all placed bars.
+    """Compute the rates and accelerations of all bars, after `place_bars`.
 
     Args:
-        tree: see `Mechanism`.
+        tree: see `ReducedMechanism`.
         first: index of the first tube.
-        frame: see `Motion`; written.
-        bar: see `Motion`; LENGTH_RATE and LENGTH_BIAS written.
+        frame: see `ReducedMotion`; written.
+        bar: see `ReducedMotion`; LENGTH_RATE and LENGTH_BIAS written.
 
     Returns:
         Nothing.
@@ -154,7 +149,7 @@ def move_bars(tree, first, frame, bar):
         square = vx * vx + vy * vy + vz * vz
         bar[b, LENGTH_RATE] = rate
         bar[b, LENGTH_BIAS] = ex * ax + ey * ay + ez * az + (square - rate * rate) / c
-        # velocity and acceleration as the base link sees them, across the bar
+        # velocity and acceleration relative to the base link, perpendicular to the bar
         cx, cy, cz = cross(wx, wy, wz, dx, dy, dz)
         sx, sy, sz = vx - cx, vy - cy, vz - cz
         turn = (ux * sx + uy * sy + uz * sz) / c
@@ -162,7 +157,7 @@ def move_bars(tree, first, frame, bar):
             frame[base, SPIN_RATE], frame[base, SPIN_RATE + 1], frame[base, SPIN_RATE + 2],
             dx, dy, dz,
         )  # fmt: skip
-        # Coriolis and centripetal part in one: w x (2 s + w x d)
+        # Coriolis and centripetal terms together: w x (2 s + w x d)
         gx, gy, gz = cross(wx, wy, wz, 2.0 * sx + cx, 2.0 * sy + cy, 2.0 * sz + cz)
         across = ux * (ax - tx - gx) + uy * (ay - ty - gy) + uz * (az - tz - gz)
         turn_rate = (across - 2.0 * rate * turn) / c
@@ -176,28 +171,28 @@ def move_bars(tree, first, frame, bar):
             frame[i, SPIN_RATE + 2] = frame[base, SPIN_RATE + 2] + nz * turn_rate + mz * turn
 
 
-_NEWTON_STEPS = 20
-_CLOSED = 1.0e-12  # m: rounding of a 10 m machine
-_STEP = 0.2  # largest move of a free coordinate between two searches [rad] or [m]
-_FAR = 20.0  # the same in one call: nobody asks for more
-_TURN = 0.3  # largest move of a bound coordinate in a step of a search [rad] or [m]
+_NEWTON_STEPS = 20  # maximum number of Newton iterations
+_CLOSED = 1.0e-12  # m, maximum residual of a closed loop: rounding of a 10 m machine
+_STEP = 0.2  # rad or m, maximum step of an independent coordinate between two Newton solutions
+_FAR = 20.0  # rad or m, distance per call above which steps get larger than _STEP
+_TURN = 0.3  # rad or m, maximum change of a dependent coordinate per Newton iteration
 
 
 @allocation_free
 def close_chains(mech, m, z):
-    """Go to independent positions with all chains closed, and find the rates that follow.
+    """Move to independent positions with all loops closed, and compute the dependent rates.
 
-    Goes there from the last place in steps small enough to stay on the linkages' branch; from
-    home, if that place is not finite.
+    The function starts from the last position, or from home if the last position is not finite. Its
+    steps are small enough to stay on the same branch of the linkages.
 
     Args:
-        mech: Mechanism.
-        m: Motion; links are placed, bound positions and rates, `basis`, `loop` and `normal`
-            written.
+        mech: ReducedMechanism.
+        m: ReducedMotion; frames of the links, dependent positions and rates, `basis`, `loop` and
+            `normal` are written.
         z: (>= n,) independent positions [rad] or [m].
 
     Returns:
-        Largest opening of a closure [m].
+        Maximum residual of a closure [m].
 
     Source: Newton's method on the loop equations; J_b r_b = -J_f r_f for the rates.
     """
@@ -244,11 +239,12 @@ def close_chains(mech, m, z):
 
 @allocation_free
 def drift_chains(mech, m):
-    """Bound accelerations at zero independent ones, of links that have been moved.
+    """Compute the dependent accelerations at zero independent accelerations.
 
     Args:
-        mech: Mechanism.
-        m: Motion after `close_chains` and `move_links`; DRIFT of the bound coordinates is written.
+        mech: ReducedMechanism.
+        m: ReducedMotion after `close_chains` and `move_links`; DRIFT of the dependent coordinates
+            is written.
 
     Returns:
         Nothing.
@@ -270,7 +266,7 @@ def drift_chains(mech, m):
 
 @allocation_free
 def _open_pins(tree, shape, first, frame, jacobian, loop):
-    """Place the pins of all closures; their openings with Jacobian, and the largest opening."""
+    """Compute the residuals of all closures and their Jacobian; return the maximum residual."""
     n, worst = loop.shape[1] - 2, 0.0
     for row in range(len(loop)):
         i, r = first + 2 * (row // 3), row % 3
@@ -286,7 +282,7 @@ def _open_pins(tree, shape, first, frame, jacobian, loop):
 
 @allocation_free
 def _factorise_loops(bound, loop, normal):
-    """Factor of `A' A` of the bound columns, made positive by a trace of its size."""
+    """Factorise `A' A` of the dependent columns, regularised by 1e-14 times its trace."""
     nb, trace = len(bound), 0.0
     for a in range(nb):
         for b in range(a + 1):
@@ -301,7 +297,7 @@ def _factorise_loops(bound, loop, normal):
 
 @allocation_free
 def _solve_loops(bound, loop, column, normal):
-    """Bound part of the answer to a column of the loops, into the last row of `normal`."""
+    """Solve the loop equations for one column; write the result to the last row of `normal`."""
     nb = len(bound)
     for a in range(nb):
         normal[nb, a] = 0.0
@@ -320,23 +316,27 @@ BAR, JOINT = range(2)  # columns of `drive`
 
 
 class ReducedMechanism(NamedTuple):
-    """Frames 0 = world, 1 .. l = links, tube and rod of every bar, both pins of every closure.
+    """Mechanism of a machine as arrays for compiled code.
+
+    Frame 0 is the world. Frames 1 .. l are the links, followed by tube and rod of every bar, and by
+    both pins of every closure.
 
     Attributes:
-        tree: (f, 4) of every frame: PARENT (a tube's is the link at its base pin, a rod's the one
-            at its rod pin), KIND, tree COORDINATE of its joint (-1 without one), REACH (only tree
-            coordinates below it move the frame).
-        shape: (f, SHAPE) of every frame: POSITION in its parent's [m] (of tube and rod: their
-            pins), AXIS of its joint (of tube and rod: of their pins, in the axes of the tube's
-            parent), COM [m] and INERTIA about it [kg m^2] in its own axes, MASS [kg], CLOSED (of a
-            tube) pin-to-pin length at piston displacement 0 [m].
+        tree: (f, 4) columns PARENT (for a tube the link at its base pin, for a rod the link at its
+            rod pin), KIND, COORDINATE (tree coordinate of the joint, -1 without joint) and REACH
+            (only tree coordinates with a smaller index move the frame).
+        shape: (f, SHAPE) columns POSITION in the parent frame [m] (for tube and rod, of their
+            pins), AXIS of the joint (for tube and rod, of their pins, in the axes of the parent of
+            the tube), COM [m] and INERTIA about it [kg m^2] in the frame's axes, MASS [kg], and
+            CLOSED, for a tube the pin-to-pin length at piston displacement 0 [m].
         links: l, number of links.
         bars: number of bars.
-        joint: (2, N) of every tree coordinate: DAMPING [N m s/rad] or [N s/m], HOME [rad] or [m].
-        free: (n,) tree coordinates that are independent.
-        bound: (N - n,) tree coordinates that the closures determine.
+        joint: (2, N) rows DAMPING [N m s/rad] or [N s/m] and HOME [rad] or [m] of the tree
+            coordinates.
+        free: (n,) indices of the independent tree coordinates.
+        bound: (N - n,) indices of the dependent tree coordinates, which the closures determine.
         gravity: (3,) [m/s^2].
-        drive: (nu, 2) of every drive: BAR, -1 if it acts on its joint itself, and JOINT, the tree
+        drive: (nu, 2) columns BAR, -1 if the drive acts directly on its joint, and JOINT, the tree
             coordinate.
     """
 
@@ -352,31 +352,31 @@ class ReducedMechanism(NamedTuple):
 
     @property
     def bodies(self) -> int:
-        """Number of frames with a mass, and the world, which come first."""
+        """Number of bodies: world, links, tubes and rods, whose frames come first."""
         return 1 + self.links + 2 * self.bars
 
 
 def body_names(machine: Machine) -> list[str]:
-    """Names of the bodies of `mechanism(machine)`: world, links, `<axis>_tube`, `<axis>_rod`."""
+    """Return the body names of `mechanism(machine)`: world, links, `<axis>_tube`, `<axis>_rod`."""
     bars = [n for n in actuator_order(machine) if machine.axes[n].cylinder]
     return ["world", *_tree_order(machine), *(f"{n}_{p}" for n in bars for p in ("tube", "rod"))]
 
 
 def coordinate_names(machine: Machine) -> list[str]:
-    """Names of the joints in the order of the tree coordinates."""
+    """Return the names of the joints in the order of the tree coordinates."""
     links = (machine.links[name] for name in _tree_order(machine))
     return [link.joint.name for link in links if link.joint]
 
 
 def mechanism(machine: Machine) -> ReducedMechanism:
-    """Tables of a machine's mechanism.
+    """Convert the mechanism of a machine to arrays for compiled code.
 
     Args:
-        machine: the machine. The pins of a cylinder are parallel to the joint that it turns, as in
+        machine: the machine. The pins of a cylinder are parallel to the joint that it moves, as in
             the MuJoCo plant.
 
     Returns:
-        The tables.
+        The mechanism.
     """
     order, joints = _tree_order(machine), coordinate_names(machine)
     index = {"world": 0, **{name: 1 + i for i, name in enumerate(order)}}
@@ -433,7 +433,7 @@ def _row(position=(0, 0, 0), axis=(0, 0, 1), com=(0, 0, 0), inertia=(0, 0, 0), m
 
 
 def _with_reach(tree: np.ndarray) -> np.ndarray:
-    """`tree` with the column REACH; bars share that of their ends, parents come first."""
+    """Append the column REACH to `tree`; tube and rod of a bar have the larger one of both."""
     reach = np.zeros(len(tree), int)
     for i, (parent, _, coordinate) in enumerate(tree[1:], start=1):
         reach[i] = max(reach[parent], coordinate + 1)
@@ -443,7 +443,7 @@ def _with_reach(tree: np.ndarray) -> np.ndarray:
 
 
 def _tree_order(machine: Machine) -> list[str]:
-    """Links with every parent before its children."""
+    """Return the names of the links, every parent before its children."""
     order: list[str] = []
     while len(order) < len(machine.links):
         order += [
@@ -462,23 +462,25 @@ Q, RATE, DRIFT, BIAS = range(4)  # rows of `joint`
 
 
 class ReducedMotion(NamedTuple):
-    """Work space and result of `place_frames` and `move_frames`, for f frames, N coordinates.
+    """Workspace and result of the functions of this module, for f frames and N coordinates.
 
     Attributes:
-        frame: (f, FRAME) of every frame: TURN (9, row by row) to the world, ORIGIN [m], SPIN
+        frame: (f, FRAME) columns TURN (9, row by row, rotation to the world), ORIGIN [m], SPIN
             [rad/s], VELOCITY of the origin [m/s]; at zero joint acceleration SPIN_RATE [rad/s^2]
-            and ACCELERATION of the origin minus gravity [m/s^2]; FORCE (6) that this motion needs:
-            force [N] and torque about the origin [N m].
+            and ACCELERATION of the origin minus gravity [m/s^2]; FORCE (6), force [N] and torque
+            about the origin [N m] that this motion requires.
         jacobian: (f, N, 6) d (velocity, spin) / d rates.
         momentum: (f, N, 6) d (momentum, angular momentum about the origin) / d rates.
-        bar: (bars, 3 + N) pin-to-pin LENGTH [m], LENGTH_RATE [m/s], LENGTH_BIAS, its acceleration
-            at zero joint acceleration [m/s^2], and from LENGTH_ROW on d length rate / d rates.
+        bar: (bars, 3 + N) columns LENGTH, pin to pin [m], LENGTH_RATE [m/s], LENGTH_BIAS,
+            acceleration of the length at zero joint acceleration [m/s^2], and from LENGTH_ROW on d
+            length rate / d rates.
         mass: (N, N) mass matrix of the tree with its bars [kg m^2] or [kg].
-        joint: (4, N) positions Q, RATE, DRIFT, the joint acceleration at zero independent
+        joint: (4, N) rows Q, positions, RATE, DRIFT, joint accelerations at zero independent
             acceleration, and BIAS, gravity and velocity forces [N m] or [N].
         basis: (N, n) d rates / d independent rates.
-        loop: (3 closures, N + 2) d opening / d rates, opening [m] and its bias acceleration.
-        normal: (N - n + 1, N - n) normal matrix of the closures, and a right-hand side below it.
+        loop: (3 closures, N + 2) d residual / d rates, residual [m] and its bias acceleration.
+        normal: (N - n + 1, N - n) normal matrix of the closures, with a right-hand side as the last
+            row.
     """
 
     frame: np.ndarray
@@ -493,7 +495,7 @@ class ReducedMotion(NamedTuple):
 
 
 def motion_space(mech: ReducedMechanism) -> ReducedMotion:
-    """Fresh work space, standing at home; the world's row stays as it is written here."""
+    """Allocate a workspace with the mechanism at home; the row of the world is constant."""
     f, n, bound = len(mech.tree), mech.joint.shape[1], len(mech.bound)
     frame = np.zeros((f, FRAME))
     frame[:, TURN : TURN + 9] = np.eye(3).ravel()
@@ -511,7 +513,7 @@ def motion_space(mech: ReducedMechanism) -> ReducedMotion:
 
 @allocation_free
 def cross(ax, ay, az, bx, by, bz):
-    """Cross product of two vectors given by their components.
+    """Return the cross product of two vectors given by their components.
 
     Args:
         ax: scalar.
@@ -531,7 +533,7 @@ def cross(ax, ay, az, bx, by, bz):
 
 @allocation_free
 def rotated(frame, i, x, y, z):
-    """A vector given in a frame, in the world's axes.
+    """Rotate a vector from a frame to the axes of the world.
 
     Args:
         frame: see `ReducedMotion`.
@@ -554,13 +556,13 @@ def rotated(frame, i, x, y, z):
 
 @allocation_free
 def place_origin(tree, shape, frame, jacobian, i):
-    """Origin of a frame as a point of its parent, and its Jacobian.
+    """Compute the origin of a frame and its Jacobian, as a point fixed to the parent.
 
     Args:
         tree: see `ReducedMechanism`.
         shape: see `ReducedMechanism`.
-        frame: see `ReducedMotion`.
-        jacobian: see `ReducedMotion`; the spin's part is that of the parent.
+        frame: see `ReducedMotion`; written.
+        jacobian: see `ReducedMotion`; written, the spin part is that of the parent.
         i: index of the frame.
 
     Returns:
@@ -587,11 +589,11 @@ def place_origin(tree, shape, frame, jacobian, i):
 
 @allocation_free
 def move_origin(tree, frame, i):
-    """Rates and accelerations of a placed frame as if it were fixed to its parent.
+    """Compute the rates and accelerations of a frame as if it were fixed to its parent.
 
     Args:
         tree: see `ReducedMechanism`.
-        frame: see `ReducedMotion`.
+        frame: see `ReducedMotion`; written, after `place_origin`.
         i: index of the frame.
 
     Returns:
@@ -620,7 +622,7 @@ def move_origin(tree, frame, i):
 
 @allocation_free
 def _rotate(frame, i, p, x, y, z, angle):
-    """Turn frame i against p about an axis."""
+    """Rotate frame i relative to frame p about an axis."""
     c, s = np.cos(angle), np.sin(angle)
     k = 1.0 - c
     r00, r01, r02 = c + x * x * k, x * y * k - z * s, x * z * k + y * s
@@ -635,13 +637,13 @@ def _rotate(frame, i, p, x, y, z, angle):
 
 @allocation_free
 def place_links(tree, shape, links, joint, frame, jacobian):
-    """Places and Jacobians of the links.
+    """Compute the frames and Jacobians of the links.
 
     Args:
         tree: see `ReducedMechanism`.
         shape: see `ReducedMechanism`.
         links: number of links.
-        joint: see `ReducedMotion`; its positions.
+        joint: see `ReducedMotion`; the positions are read.
         frame: see `ReducedMotion`; written.
         jacobian: see `ReducedMotion`; written.
 
@@ -678,14 +680,14 @@ def place_links(tree, shape, links, joint, frame, jacobian):
 
 @allocation_free
 def move_links(tree, links, joint, frame, jacobian):
-    """Rates and accelerations of the placed links.
+    """Compute the rates and accelerations of the links, after `place_links`.
 
     Args:
         tree: see `ReducedMechanism`.
         links: number of links.
-        joint: see `ReducedMotion`; its rates.
+        joint: see `ReducedMotion`; the rates are read.
         frame: see `ReducedMotion`; written.
-        jacobian: see `ReducedMotion`; has the joints' axes.
+        jacobian: see `ReducedMotion`; the joint axes are read.
 
     Returns:
         Nothing.
@@ -712,7 +714,7 @@ def move_links(tree, links, joint, frame, jacobian):
 
 @allocation_free
 def gather_forces(mech, m):
-    """Mass matrix and bias forces of the tree with its bars (Kane's projection).
+    """Compute the mass matrix and bias forces of the tree with its bars (Kane's projection).
 
     `M = sum J' P` and `h = sum J' F` with the momenta P and the wrenches F of all bodies.
 
@@ -749,7 +751,7 @@ def gather_forces(mech, m):
 
 @allocation_free
 def _load_body(shape, frame, jacobian, b, reach, momentum):
-    """Momentum per unit rate, and force and torque of inertia and gravity, about the origin."""
+    """Compute momentum per unit rate and the wrench of inertia and gravity about the origin."""
     mass = shape[b, MASS]
     rx, ry, rz = rotated(frame, b, shape[b, COM], shape[b, COM + 1], shape[b, COM + 2])
     i0, i1, i2 = shape[b, INERTIA], shape[b, INERTIA + 1], shape[b, INERTIA + 2]

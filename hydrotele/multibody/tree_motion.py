@@ -1,7 +1,7 @@
-"""Motion of a joint tree: frames of the bodies, joint velocities of points, wrenches of bodies.
+"""Motion of a joint tree: frames of the bodies, Jacobian columns of points, wrenches of bodies.
 
-Vectors of three and rotations are tuples of numbers, which keep compiled code off the heap; least
-squares of a few columns need no memory of their own, so that both serve row after row of a log.
+Three-component vectors and rotations are tuples, so that compiled code does not allocate. The QR
+functions solve least-squares problems of a few columns in given arrays.
 """
 
 import math
@@ -14,55 +14,55 @@ from hydrotele.core.compiled import allocation_free, compiled
 
 @allocation_free
 def vector(rows, k):
-    """Row k of (n, 3) rows as a tuple (x, y, z)."""
+    """Return row k of an (n, 3) array as a tuple (x, y, z)."""
     return rows[k, 0], rows[k, 1], rows[k, 2]
 
 
 @allocation_free
 def store(rows, k, a):
-    """Write a tuple (x, y, z) into row k of (n, 3) rows."""
+    """Write a tuple (x, y, z) into row k of an (n, 3) array."""
     rows[k, 0], rows[k, 1], rows[k, 2] = a
 
 
 @allocation_free
 def add(a, b):
-    """Sum of two vectors."""
+    """Return the sum of two vectors."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 @allocation_free
 def subtract(a, b):
-    """Difference of two vectors."""
+    """Return the difference of two vectors."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 @allocation_free
 def scaled(s, a):
-    """A vector times a number."""
+    """Return a vector times a scalar."""
     return s * a[0], s * a[1], s * a[2]
 
 
 @allocation_free
 def dot(a, b):
-    """Scalar product."""
+    """Return the scalar product of two vectors."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @allocation_free
 def cross(a, b):
-    """Vector product."""
+    """Return the cross product of two vectors."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @allocation_free
 def rotating_acceleration(w, dw, arm):
-    """Acceleration `dw x r + w x (w x r)` of a point at an arm r of a turning body."""
+    """Return the acceleration `dw x r + w x (w x r)` of a point r of a rotating body."""
     return add(cross(dw, arm), cross(w, cross(w, arm)))
 
 
 @allocation_free
 def rotation(rows, k):
-    """Matrix k of (n, 3, 3) as three row vectors."""
+    """Return matrix k of an (n, 3, 3) array as three row vectors."""
     m = rows[k]
     return (
         (m[0, 0], m[0, 1], m[0, 2]), (m[1, 0], m[1, 1], m[1, 2]), (m[2, 0], m[2, 1], m[2, 2])
@@ -71,7 +71,7 @@ def rotation(rows, k):
 
 @allocation_free
 def store_rotation(rows, k, r):
-    """Write three row vectors into matrix k of (n, 3, 3)."""
+    """Write three row vectors into matrix k of an (n, 3, 3) array."""
     m = rows[k]
     m[0, 0], m[0, 1], m[0, 2] = r[0]
     m[1, 0], m[1, 1], m[1, 2] = r[1]
@@ -80,25 +80,25 @@ def store_rotation(rows, k, r):
 
 @allocation_free
 def rotated(r, a):
-    """A vector turned by a rotation."""
+    """Return a vector rotated by r."""
     return dot(r[0], a), dot(r[1], a), dot(r[2], a)
 
 
 @allocation_free
 def rotated_back(r, a):
-    """A vector turned by the inverse of a rotation."""
+    """Return a vector rotated by the inverse of r."""
     return add(add(scaled(a[0], r[0]), scaled(a[1], r[1])), scaled(a[2], r[2]))
 
 
 @allocation_free
 def composed(r, s):
-    """The rotation that first does s, then r."""
+    """Return the rotation r s, which applies s first and then r."""
     return rotated_back(s, r[0]), rotated_back(s, r[1]), rotated_back(s, r[2])
 
 
 @allocation_free
 def axis_rotation(axis, angle):
-    """Rotation about a unit axis by an angle [rad] (Rodrigues)."""
+    """Return the rotation about a unit axis by an angle [rad] (Rodrigues)."""
     c, s = math.cos(angle), math.sin(angle)
     x, y, z = axis
     d = 1.0 - c
@@ -109,12 +109,12 @@ def axis_rotation(axis, angle):
     )
 
 
-_STIFF = 1e-7  # least ratio of a column's own part to the largest column; below, rank is lacking
+_STIFF = 1e-7  # minimum ratio of an orthogonalised column to the largest one for full rank
 
 
 @allocation_free
 def qr_factor(matrix, columns, q, r):
-    """QR of chosen columns by modified Gram-Schmidt, twice; False if they lack rank."""
+    """Factorise selected columns by modified Gram-Schmidt, twice; False if rank deficient."""
     rows, count, size = len(matrix), len(columns), 0.0
     for j in range(count):
         total = 0.0
@@ -146,7 +146,7 @@ def qr_factor(matrix, columns, q, r):
 
 @allocation_free
 def qr_solve(q, r, count, right, column, answer, k):
-    """Least squares after `_factor`, of one column of the right side into one of the answer."""
+    """Solve least squares after `qr_factor`, from a column of `right` to column k of `answer`."""
     for j in range(count - 1, -1, -1):
         total = 0.0
         for m in range(len(right)):
@@ -160,16 +160,16 @@ _PAIRS = np.array([(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)])
 
 
 class Frames(NamedTuple):
-    """Where bodies are and how they move, all in the world; b bodies, v joints.
+    """Positions and motion of bodies and joint axes in the world frame; b bodies, v joints.
 
     Attributes:
-        place: (b, 3) origins.
+        place: (b, 3) origins [m].
         turn: (b, 3, 3) orientations.
-        spin: (b, 3) angular velocities.
-        spin_rate: (b, 3) their rates.
-        acceleration: (b, 3) accelerations of the origins.
+        spin: (b, 3) angular velocities [rad/s].
+        spin_rate: (b, 3) angular accelerations [rad/s^2].
+        acceleration: (b, 3) accelerations of the origins [m/s^2].
         axis: (v, 3) joint axes.
-        anchor: (v, 3) points on them.
+        anchor: (v, 3) points on the joint axes [m].
     """
 
     place: np.ndarray
@@ -183,7 +183,7 @@ class Frames(NamedTuple):
 
 @compiled
 def new_frames(tree):
-    """Room for the frames of a tree."""
+    """Allocate the frames of a tree."""
     b, v = len(tree.parent), len(tree.zero)
     return Frames(
         np.empty((b, 3)), np.empty((b, 3, 3)), np.empty((b, 3)), np.empty((b, 3)),
@@ -193,7 +193,10 @@ def new_frames(tree):
 
 @allocation_free
 def move_tree(tree, q, rate, acceleration, ground, frames):
-    """Place and move all bodies, from (v,) positions, rates, accelerations; ground: (3,)."""
+    """Compute all frames from (v,) positions, rates and accelerations.
+
+    `ground` (3,) is the acceleration of the world, such as minus gravity.
+    """
     store(frames.place, 0, (0.0, 0.0, 0.0))
     store(frames.spin, 0, (0.0, 0.0, 0.0))
     store(frames.spin_rate, 0, (0.0, 0.0, 0.0))
@@ -234,15 +237,16 @@ def move_tree(tree, q, rate, acceleration, ground, frames):
 
 @allocation_free
 def point_column(tree, frames, j, point):
-    """Velocity of a point per unit rate of a joint that moves it."""
+    """Return the velocity of a point per unit rate of a joint that moves it."""
     way = vector(frames.axis, j)
     return way if tree.slides[j] else cross(way, subtract(point, vector(frames.anchor, j)))
 
 
 @allocation_free
 def wrenches(frames, body, forces, torques):
-    """Force and torque (3, 10) at a body's origin per unit of an inertial parameter, in the world.
+    """Compute force and torque (3, 10) at a body's origin per unit of the inertial parameters.
 
+    Forces and torques are in the world frame:
     `f = m a + alpha x s + w x (w x s)` and `n = I alpha + w x I w + s x a` with s = m c.
     """
     t, a = rotation(frames.turn, body), vector(frames.acceleration, body)

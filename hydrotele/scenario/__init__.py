@@ -1,1 +1,1 @@
-"""The facts of a scenario: motion, surroundings, teleoperation."""
+"""Specification of a scenario: motion, surroundings, teleoperation."""

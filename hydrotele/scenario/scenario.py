@@ -1,7 +1,7 @@
-"""A scenario: machine, start, pilot, controller, sensors and clocks of one run; frozen, validated.
+"""Scenario of one run: machine, start, pilot, controller, sensors and clocks.
 
-Scenarios are YAML files; `scenarios/` holds the shipped ones. Keys may carry units as suffixes, as
-in machine files.
+Scenarios are read from YAML files, validated and frozen; `scenarios/` holds the shipped ones. Keys
+may have units as suffixes, as in machine files.
 """
 
 import copy
@@ -31,10 +31,11 @@ from hydrotele.scenario.teleoperation import TeleopPilot
 
 
 class Plate(Facts):
-    """A plate on a spring and a damper: a task of known stiffness.
+    """A plate on a spring and a damper: an environment of known stiffness.
 
-    `position` [m] is the middle of its face, `normal` the way that the face looks (z up, x back
-    towards the machine is -x); half sizes [m], mass [kg], stiffness [N/m], damping [N s/m].
+    `position` [m] is the centre of its face and `normal` the outward normal of the face (z is up,
+    -x points back to the machine). `size` holds the half sizes [m]; further keys are mass [kg],
+    stiffness [N/m] and damping [N s/m].
     """
 
     kind: Literal["plate"] = "plate"
@@ -49,9 +50,9 @@ class Plate(Facts):
 class StandingTree(Facts):
     """A standing tree that a disc saw cuts from its stump and a grab arm then holds.
 
-    `position` [m] on the ground; `kerf` [m] is the height at which it can be cut, `energy` [J/m^3]
-    what cutting takes. `saw` and `grab` are axes of the machine; a grab beyond `closed` [rad] holds
-    a stem that stands in its pocket.
+    `position` [m] is on the ground, `kerf` [m] the height of the cut, and `energy` [J/m^3] the
+    cutting energy per volume. `saw` and `grab` are axes of the machine; a grab at more than
+    `closed` [rad] holds a stem in its pocket.
     """
 
     kind: Literal["tree"] = "tree"
@@ -69,9 +70,10 @@ class StandingTree(Facts):
 class LogOnGround(Facts):
     """A log on the ground that a grapple picks up and puts down.
 
-    `position` [m] of its middle, `direction` [rad] of its axis in the horizontal plane, 0 along x;
-    diameter and length [m], density [kg/m^3]. `grab` is the machine's axis that closes the jaw: the
-    log is held beyond `closed` [rad] where it lies in the pocket, and let go below `open` [rad].
+    `position` [m] is its centre, and `direction` [rad] the angle of its axis in the horizontal
+    plane, 0 along x; diameter and length are in [m], density in [kg/m^3]. `grab` is the axis of the
+    machine that closes the jaw. A log in the pocket is gripped at more than `closed` [rad] and
+    released at less than `open` [rad].
     """
 
     kind: Literal["log"] = "log"
@@ -96,7 +98,7 @@ class LogOnGround(Facts):
 
     @property
     def mass(self) -> float:
-        """[kg]."""
+        """Mass of the log [kg]."""
         return self.density * math.pi * self.diameter**2 / 4.0 * self.length
 
 
@@ -104,7 +106,7 @@ SurroundingObject = Annotated[Plate | StandingTree | LogOnGround, Field(discrimi
 
 
 class Pose(Facts):
-    """The arm's tip: r from the swing axis, z above ground [m], theta, attitude, head [rad]."""
+    """Pose of the tip: r from the swing axis, z above ground [m], theta, attitude, head [rad]."""
 
     r: Positive
     z: float
@@ -114,24 +116,25 @@ class Pose(Facts):
 
 
 class Start(Facts):
-    """Where a run starts: joint positions [rad] or [m], or a pose of the tip; else home."""
+    """Start of a run: joint positions [rad] or [m], or a tip pose; the home position by default."""
 
     joints: dict[Name, float] = {}
     pose: Pose | None = None
 
 
 class ConstantPilot(Facts):
-    """Open loop: the same drive commands all the time."""
+    """Constant drive commands, open loop."""
 
     kind: Literal["constant"]
     commands: dict[Name, float] = {}
 
 
 class TablePilot(Facts):
-    """A table over time, given here by column or in a log file (`file`, CSV or Parquet).
+    """Commands or references from a table over time, given as columns or in a log file.
 
-    `of: command` drives the valves open loop, `of: joint` gives joint references [rad] or [m]. Of a
-    file, `command.<axis>` or `reference.<axis>` (else `angle.<axis>`, `position.<axis>`) is taken.
+    `of: command` drives the valves open loop, `of: joint` gives joint references [rad] or [m].
+    `file` is a CSV or Parquet log, of which the columns `command.<axis>` or `reference.<axis>`
+    (otherwise `angle.<axis>`, `position.<axis>`) are used.
     """
 
     kind: Literal["table"]
@@ -151,7 +154,7 @@ class TablePilot(Facts):
                     f"columns.{name} has {len(values)} values, time has {len(self.time)}"
                 )
         if self.columns and (not self.time or self.time[0] != 0.0 or any(_falls(self.time))):
-            raise ValueError("time must start at 0 and rise")
+            raise ValueError("time must start at 0 and rise strictly")
         return self
 
 
@@ -175,8 +178,8 @@ class Harmonics(Facts):
 class FourierPilot(Facts):
     """Fourier references with a common period [s], faded in from the start over `fade` [s].
 
-    The servo holds axes without a reference at their start, but those of `closed_valves`: their
-    command is 0 throughout.
+    The servo holds axes without a reference at their start, except those in `closed_valves`, whose
+    command is always 0.
     """
 
     kind: Literal["fourier"]
@@ -188,7 +191,9 @@ class FourierPilot(Facts):
     @model_validator(mode="after")
     def _check(self):
         if both := sorted(set(self.closed_valves) & self.axes.keys()):
-            raise ValueError(f"closed_valves: {both[0]} has a reference in axes, too; name it once")
+            raise ValueError(
+                f"closed_valves: {both[0]} also has a reference in axes; name it in one of them"
+            )
         counts = [max(len(axis.sin), len(axis.cos)) for axis in self.axes.values()]
         _refuse_beyond("HARMONICS", max(counts, default=0))
         return self
@@ -207,10 +212,10 @@ class Move(Facts):
 
 
 class LinesPilot(Facts):
-    """Straight lines by resolved motion in cylindrical coordinates.
+    """Straight tip lines by resolved motion in cylindrical coordinates.
 
-    `mode: rate` integrates rate commands as a joystick under rate control gives them, `position`
-    commands the pose itself. Speed [m/s] is that of the tip (or [rad/s] where only angles change),
+    `mode: rate` integrates rate commands like those of a joystick under rate control; `position`
+    commands the pose. The speed is that of the tip [m/s] (or [rad/s] if only angles change),
     reached with `acceleration`.
     """
 
@@ -227,7 +232,7 @@ class LinesPilot(Facts):
 
 
 class Waypoint(Facts):
-    """A joint target or a pose, reached `duration` [s] after the one before, then held `pause`."""
+    """Joint target or pose, reached `duration` [s] after the previous one and held for `pause`."""
 
     duration: Positive
     pause: NonNegative = 0.0
@@ -236,7 +241,7 @@ class Waypoint(Facts):
 
 
 class WaypointsPilot(Facts):
-    """A list of waypoints, joined by quintic polynomials, in joint space or along the pose."""
+    """Waypoints connected by quintic polynomials, in joint space or along the tip pose."""
 
     kind: Literal["waypoints"]
     settle: NonNegative = 0.5
@@ -255,14 +260,15 @@ Pilot = Annotated[
 
 
 class Servo(Facts):
-    """Joint servo.
+    """Gains of the joint servo.
 
-    position_gain [1/s], axis_gains for axes that need another one (a slewing house), velocity_gain
-    (force drives only) [N s/m] or [N m s/rad], feedforward and deadband_compensation as fractions,
-    lead [s] that makes up for the spool's lag, pressure_feedback [1/s] (damping) with load_time [s]
-    of the slow mean force. With `force_model` the force that is expected follows from inverse
-    dynamics along the reference instead of that mean: of the scenario's own machine (`nominal`), or
-    of another (its name or folder).
+    `position_gain` [1/s]; `axis_gains` [1/s] for individual axes (such as a slewing house);
+    `velocity_gain` (force drives only) [N s/m] or [N m s/rad]; `feedforward` and
+    `deadband_compensation` as fractions; `lead` [s], a phase lead that compensates the spool lag;
+    `pressure_feedback` [1/s], which adds damping, with the time constant `load_time` [s] of the
+    low-pass filtered drive force. `force_model` replaces the filtered force by inverse dynamics
+    along the reference, of the machine of the scenario (`nominal`) or of another machine (its name
+    or folder).
     """
 
     position_gain: NonNegative = 4.0
@@ -277,7 +283,10 @@ class Servo(Facts):
 
 
 class PlantedEffect(Facts):
-    """An effect that the simulated machine has and its model lacks (`hydrotele list effects`)."""
+    """An effect of the simulated machine that its nominal model does not have.
+
+    `hydrotele list effects` lists the names.
+    """
 
     name: str
     location: str = ""
@@ -285,7 +294,7 @@ class PlantedEffect(Facts):
 
 
 class Scenario(Facts):
-    """One run, complete: same scenario, same bits."""
+    """Complete specification of one run; the same scenario gives bit-identical results."""
 
     name: Name
     description: str = ""
@@ -330,25 +339,25 @@ class Scenario(Facts):
 
     @property
     def ticks(self) -> int:
-        """Number of control periods."""
+        """Number of control periods of the run."""
         return round(self.duration * self.control_rate)
 
     @property
     def rows(self) -> int:
-        """Number of rows of the logs, all complete."""
+        """Number of log rows of the run."""
         return self.ticks // round(self.control_rate / self.log_rate)
 
 
 def shipped_scenarios() -> list[str]:
-    """Names of the scenarios that come with the package."""
+    """Return the names of the scenarios in the package."""
     return sorted(path.stem for path in scenarios_folder().glob("*.yaml"))
 
 
 def scenario_path(name_or_path: str | Path) -> Path:
-    """File of a shipped scenario (by name) or of a user's.
+    """Return the file of a shipped scenario, given by name, or of the user's scenario file.
 
     Raises:
-        InputError: there is no such scenario; lists those that are shipped.
+        InputError: the scenario does not exist; the message lists the shipped ones.
     """
     path = Path(name_or_path)
     if str(name_or_path) in shipped_scenarios():
@@ -362,12 +371,12 @@ def scenario_path(name_or_path: str | Path) -> Path:
 
 
 class ScenarioFile(NamedTuple):
-    """A scenario's file as read, before overrides and validation.
+    """Content of a scenario file before overrides and validation.
 
     Attributes:
         path: the file.
         data: its keys and values.
-        lines: key path -> line number from 1.
+        lines: key path -> line number, starting at 1.
     """
 
     path: Path
@@ -376,45 +385,45 @@ class ScenarioFile(NamedTuple):
 
 
 def read_scenario_file(name_or_path: str | Path) -> ScenarioFile:
-    """Read the file of a scenario once, to make many scenarios from it with `scenario_from`.
+    """Read a scenario file, from which `scenario_from` can make several scenarios.
 
     Raises:
-        InputError: there is no such scenario, or it is no YAML mapping.
+        InputError: the scenario does not exist, or the file is not a YAML mapping.
     """
     path = scenario_path(name_or_path)
     return ScenarioFile(path, *read_yaml(path))
 
 
 def load_scenario(name_or_path: str | Path, overrides: dict[str, str] | None = None) -> Scenario:
-    """Read a scenario.
+    """Read and validate a scenario.
 
     Args:
-        name_or_path: name of a shipped scenario or a YAML file.
-        overrides: dotted key path -> YAML text, as of `--set servo.position_gain=2`.
+        name_or_path: name of a shipped scenario or path of a YAML file.
+        overrides: dotted key path -> YAML text, as in `--set servo.position_gain=2`.
 
     Returns:
         The validated scenario.
 
     Raises:
-        InputError: names file, line, key path and what is allowed.
+        InputError: the file is not valid; the message names file, line, key path and valid values.
     """
     return scenario_from(read_scenario_file(name_or_path), overrides)
 
 
 def scenario_from(file: ScenarioFile, overrides: dict[str, str] | None = None) -> Scenario:
-    """The scenario of a file that was read, with overrides as of `load_scenario`.
+    """Make a scenario from the content of its file, with overrides as in `load_scenario`.
 
     Raises:
-        InputError: names file, line, key path and what is allowed.
+        InputError: the file is not valid; the message names file, line, key path and valid values.
     """
     path, data, lines = file.path, copy.deepcopy(file.data), file.lines
     for key, text in (overrides or {}).items():
         _override(data, key, text)
     if "folder" in data:
-        raise InputError(_at(path, lines, "folder"), "is the scenario file's own; remove the key")
+        raise InputError(_at(path, lines, "folder"), "is set automatically; remove the key")
     data["folder"] = str(path.parent.resolve())
     kind = data["pilot"].get("kind") if isinstance(data.get("pilot"), dict) else None
-    if isinstance(kind, str):  # pydantic names the pilot's kind in its key paths
+    if isinstance(kind, str):  # the key paths of pydantic contain the kind of the pilot
         lines = lines | {
             ("pilot", kind, *k[1:]): n for k, n in lines.items() if k[:1] == ("pilot",)
         }
@@ -429,7 +438,7 @@ def _at(path: Path, lines: dict[tuple, int], *keys: str) -> str:
 
 
 def _with_table(scenario: Scenario, where: str) -> Scenario:
-    """The scenario with the file of its table pilot read in, so that it is complete by itself."""
+    """Replace the file of a table pilot by its columns, so that the scenario is self-contained."""
     pilot = scenario.pilot
     if not isinstance(pilot, TablePilot) or pilot.file is None:
         return scenario
@@ -451,14 +460,14 @@ def _with_table(scenario: Scenario, where: str) -> Scenario:
 
 
 def own_machine(scenario: Scenario) -> Path | None:
-    """The machine file or folder that lies beside the scenario, None for a shipped machine."""
+    """Return the machine file or folder next to the scenario file, None for a shipped machine."""
     path = Path(scenario.folder, scenario.machine)
     beside = scenario.folder and (path.is_file() or (path / "machine.yaml").is_file())
     return path if beside else None
 
 
 def save_scenario(scenario: Scenario, path: str | Path) -> None:
-    """Write a scenario as YAML, complete with every default, readable by `load_scenario`."""
+    """Write a scenario with all defaults as YAML that `load_scenario` can read."""
     data = scenario.model_dump(mode="json")
     beside = own_machine(scenario)
     data["machine"] = str(beside) if beside else scenario.machine
@@ -487,4 +496,4 @@ def _override(data: dict[str, Any], key: str, text: str) -> None:
     elif isinstance(where, dict):
         where[parts[-1]] = value
     else:
-        raise InputError(f"--set {key}", "there is nothing there to set")
+        raise InputError(f"--set {key}", "there is nothing to set at this key")

@@ -1,7 +1,8 @@
-"""Facts of a teleoperated run: joystick, reflection, operator, channel between them, safety.
+"""Specification of teleoperated runs: joystick, force reflection, operator, channel, safety.
 
-Joystick axes x, y, z [m], rx, ry, rz [rad] move the task coordinates of the arm: r, z [m], theta,
-attitude and head [rad]. All SI, frozen; keys may carry units as suffixes.
+The joystick axes x, y, z [m], rx, ry, rz [rad] move the task coordinates of the arm: r, z [m],
+theta, attitude and head [rad]. All values are in SI units and frozen; keys may have units as
+suffixes.
 """
 
 import math
@@ -25,12 +26,12 @@ _WHERE: dict[str, tuple[str, float]] = {
 
 
 class Coupling(Facts):
-    """How one task coordinate hangs on the joystick.
+    """Mapping from the joystick to one task coordinate.
 
-    Under rate control the handle at its stop asks for `speed` [m/s] or [rad/s]; under position
-    control the coordinate moves `scale` times as far as the handle ([m/m], [rad/rad]; theta by
-    translation [rad/m]), no faster than `speed`. `axis` and `sign` say which way of the joystick
-    moves it.
+    Under rate control, the handle at its stop commands `speed` [m/s] or [rad/s]. Under position
+    control, the coordinate moves `scale` times as far as the handle ([m/m], [rad/rad]; theta by
+    translation [rad/m]), at most at `speed`. `axis` and `sign` select the joystick axis and its
+    direction.
     """
 
     axis: JoystickAxis | None = None
@@ -39,20 +40,20 @@ class Coupling(Facts):
     scale: Positive = 100.0
 
     def placed(self, coordinate: str) -> tuple[str, float]:
-        """Joystick axis and sign, the usual ones of the coordinate where none is given."""
+        """Return the joystick axis and sign, with the defaults of the coordinate if not given."""
         axis, sign = _WHERE[coordinate]
         return self.axis or axis, float(self.sign or sign)
 
 
 class Channel(Facts):
-    """The line between operator and machine: delays [s] either way, share of packets lost.
+    """Communication channel between operator and machine, with delays and packet loss.
 
-    Delays are rounded to whole control periods; one packet is sent a period. Packets are lost from
-    `lost_from` [s] on: each with the probability `lost`. Each is later than the delay by a time of
-    its own with the mean `jitter` [s], exponentially distributed; packets that were overtaken are
-    not used. `trace` is a CSV file of measured delays with the columns `forward` and `back` [s],
-    one row a packet, empty where lost, used again from its beginning where the run is longer; it
-    takes the place of delays and jitter.
+    `delay_forward` and `delay_back` [s] are rounded to whole control periods; one packet is sent
+    per period. From `lost_from` [s] on, every packet is lost with the probability `lost`. Every
+    packet has an additional, exponentially distributed delay with the mean `jitter` [s]; overtaken
+    packets are discarded. `trace` is a CSV file of measured delays with the columns `forward` and
+    `back` [s] and one row per packet, empty for a lost packet. It repeats if the run is longer, and
+    replaces delays and jitter.
     """
 
     delay_forward: Annotated[float, Field(ge=0, le=2)] = 0.0
@@ -65,16 +66,16 @@ class Channel(Facts):
     @model_validator(mode="after")
     def _check(self):
         if self.trace and (self.delay_forward or self.delay_back or self.jitter):
-            raise ValueError("trace has the delays; leave delay_forward, delay_back, jitter out")
+            raise ValueError("trace has the delays; remove delay_forward, delay_back and jitter")
         return self
 
 
 class Safety(Facts):
-    """When the machine stops by itself.
+    """Conditions under which the machine stops automatically.
 
-    Without a new packet for `silence` [s] rates go to zero and the reflected force fades; a joint
-    further than `following_error` [rad] or [m] from its reference, or a sensor that states noise
-    and reads the same for `frozen` [s], closes the valves for good.
+    Without a new packet for `silence` [s], the rates go to zero and the reflected force fades out.
+    The valves close permanently if a joint is further than `following_error` [rad] or [m] from its
+    reference, or if a noisy sensor gives the same value for `frozen` [s].
     """
 
     silence: Positive = 0.15
@@ -83,11 +84,11 @@ class Safety(Facts):
 
 
 class TipOver(Facts):
-    """Tip-over protection: beyond `share` of the tipping moment the stick is pushed back.
+    """Tip-over protection: push the joystick back above a fraction `share` of the tipping moment.
 
-    The machine of `mass` [kg] with its centre of mass `behind` [m] the swing axis tips about the
-    edge of its tracks, `edge` [m] ahead of the axis or behind it. What
-    pushes back is a spring and a damper of `stiffness` [N/m] and `damping` [N s/m].
+    The machine of `mass` [kg] has its centre of mass at `behind` [m] behind the swing axis. It tips
+    about the edge of its tracks, `edge` [m] in front of or behind the axis. The reaction is that of
+    a spring with `stiffness` [N/m] and a damper with `damping` [N s/m].
     """
 
     mass: Positive
@@ -99,14 +100,14 @@ class TipOver(Facts):
 
 
 class Fault(Facts):
-    """A sensor that freezes at a time [s]: `angle.boom`, `pressure_head.boom`, `pressure_rod.x`."""
+    """A sensor that freezes at the time `at` [s], such as `angle.boom` or `pressure_rod.stick`."""
 
     channel: str
     at: NonNegative
 
 
 class Button(Facts):
-    """From `at` [s] on, an axis that the joystick does not move gets a command (saw, grab)."""
+    """Command of an axis that the joystick does not move (saw, grab), from `at` [s] on."""
 
     at: NonNegative
     axis: Name
@@ -116,11 +117,11 @@ class Button(Facts):
 def _check_time(time: list[float]) -> None:
     rises = all(a < b for a, b in zip(time, time[1:], strict=False))
     if not time or time[0] != 0.0 or not rises:
-        raise ValueError("time must start at 0 and rise")
+        raise ValueError("time must start at 0 and rise strictly")
 
 
 class Follow(Facts):
-    """The operator moves the handle along a path, `time` [s] and displacements [m] or [rad]."""
+    """The operator moves the handle along a path of displacements [m] or [rad] over `time` [s]."""
 
     kind: Literal["follow"]
     time: list[NonNegative] = [0.0]
@@ -137,9 +138,9 @@ class Follow(Facts):
 
 
 class ForceTarget(Facts):
-    """A contact force to hold or to track: at `time` [s] the `force` [N] of the coordinate.
+    """Reference contact force along a coordinate: `force` [N] at `time` [s].
 
-    The machine presses with it: positive is the environment's force along the coordinate.
+    The force is positive if the environment pushes the machine along the coordinate.
     """
 
     coordinate: Coordinate = "z"
@@ -155,10 +156,10 @@ class ForceTarget(Facts):
 
 
 class Regulate(Facts):
-    """The operator makes a contact force from what he feels alone.
+    """The operator regulates a contact force by the reflected force alone.
 
-    He knows how joystick and machine translate it (K_nom and K_r, or the direct ratio), and pushes
-    as one does under rate control.
+    The operator knows how joystick and machine map the contact force to the hand (K_nom and K_r, or
+    the direct ratio), and pushes as an operator does under rate control.
     """
 
     kind: Literal["regulate"]
@@ -167,10 +168,10 @@ class Regulate(Facts):
 
 
 class Track(Facts):
-    """The operator tracks a force trajectory that is displayed to him, seeing it late and rough.
+    """The operator tracks a displayed force trajectory, seen with delay and noise.
 
-    `display: both` shows the contact force (as the machine's sensors tell it) beside the target;
-    `target` the target alone, so that he has to feel or to imagine the force.
+    `display: both` shows the target and the contact force from the machine's sensors. `target`
+    shows the target alone, so that the operator has to feel or to estimate the force.
     """
 
     kind: Literal["track"]
@@ -180,9 +181,10 @@ class Track(Facts):
 
 
 class Steer(Facts):
-    """The operator steers the tip to poses that he sees, one after the other.
+    """The operator steers the tip by sight to one pose after the other.
 
-    Each of `points` is a pose (r, theta, z, attitude, head as given) held until `at` [s].
+    `points` gives the values of every coordinate (r, z [m], theta, attitude, head [rad]), each of
+    which applies from its `time` [s] on.
     """
 
     kind: Literal["steer"]
@@ -201,16 +203,16 @@ class Steer(Facts):
 
 
 class Live(Facts):
-    """A person moves the handle by a device (`hydrotele drive`)."""
+    """A person moves the handle with an input device (`hydrotele drive`)."""
 
     kind: Literal["live"]
 
 
 class Recorded(Facts):
-    """The handle moves as a person moved it: `recorded` is a CSV or Parquet file of his hand.
+    """The handle repeats the recorded motion of a person; `recorded` is a CSV or Parquet file.
 
-    It has `time` and `handle.x` ... `handle.rz` (or `x` ... `rz`), as displacements [m] or [rad];
-    a unit may stand in the column's name (`handle.z [mm]`). Axes without a column stay centred.
+    Its columns are `time` and `handle.x` ... `handle.rz` (or `x` ... `rz`), displacements in [m] or
+    [rad]. A column name may contain a unit (`handle.z [mm]`). Axes without a column stay centred.
     """
 
     kind: Literal["recorded"] = "recorded"
@@ -218,21 +220,24 @@ class Recorded(Facts):
 
 
 class Perception(Facts):
-    """Who the simulated operator is, and what his senses and muscles can do.
+    """Parameters of the simulated operator: perception, neuromuscular dynamics and arm impedance.
 
-    `file` has other parameters than `hydrotele/teleop/operator.yaml`, which tells what is known of
-    each; `drawn` takes the operator of that number from the spread given there. `grip` (relaxed,
-    normal, firm) replaces the joystick file's hand, `posture` (near, mid, far) gives it
-    the ellipses of an arm. Every parameter that is set here counts instead of the file's:
+    `file` replaces `hydrotele/teleop/operator.yaml`, which documents every parameter. `drawn`
+    selects a random operator, with that number, from the distributions in the file. `grip`
+    (relaxed, normal, firm) replaces the arm impedance of the joystick file; `posture` (near, mid,
+    far) adds the stiffness ellipses of an arm. Parameters that are set here replace those of the
+    file:
 
-    visual_delay: from seeing to acting [s]; touch: from feeling to acting [s]; crossover: of the
-    loops that he closes by sight, at most [rad/s]; force_weber, position_weber, integration_weber:
-    of felt forces, displacements and stiffnesses, as a share; remnant: of his observation noise;
-    sight: how well a place is seen [m] or [rad]; sight_noise: of a displayed force, as a share of
-    its largest; tremor: of the muscles' force [N]; muscle: of the handle's position [1/s];
-    cocontraction: share of the largest; imagination: spread of what he believes a command does
-    without feeling it, as a share; task_stiffness: what he is used to [N/m]; dwell: between
-    correcting pushes [s]; `Operator` in `hydrotele.teleop.operator_parameters` has all of them.
+    visual_delay: delay from vision to action [s]; touch: delay from haptic perception to action
+    [s]; crossover: maximum crossover frequency of loops that the operator closes by vision [rad/s];
+    force_weber, position_weber, integration_weber: Weber fractions of perceived forces,
+    displacements and stiffnesses; remnant: noise-to-signal ratio of the operator's observations;
+    sight: visual resolution of a position [m] or [rad]; sight_noise: noise of a displayed force, as
+    a fraction of its maximum; tremor: noise of the muscle force [N]; muscle: gain of the position
+    control of the handle [1/s]; cocontraction: fraction of the maximum; imagination: relative
+    standard deviation of the expected effect of a command without force feedback; task_stiffness:
+    stiffness that the operator is used to [N/m]; dwell: time between corrective pushes [s].
+    `Operator` in `hydrotele.teleop.operator_parameters` documents all of them.
     """
 
     file: str | None = None
@@ -268,14 +273,14 @@ class Perception(Facts):
     @model_validator(mode="before")
     @classmethod
     def _rename(cls, data):
-        """Read keys by their former names."""
+        """Replace deprecated keys by their current names, with a warning."""
         if not isinstance(data, dict):
             return data
         for old, new in _FORMER.items():
             if old in data:
                 if new in data:
                     raise ValueError(f"{old} is the former name of {new}; give one of them")
-                message = f"pilot.perception: {old} is now called {new}; it was read as that"
+                message = f"pilot.perception: {old} is deprecated and was read as {new}; rename it"
                 warnings.warn(message, FutureWarning, stacklevel=2)
                 data = {new if key == old else key: value for key, value in data.items()}
         return data
@@ -285,7 +290,7 @@ _FORMER = {"reaction": "visual_delay", "force_noise": "force_weber", "skill": "c
 
 
 def _kind_of(value: object) -> object:
-    """The kind of an operator; one with a record needs no other word."""
+    """Return the kind of an operator; `recorded` if the kind is omitted but the file is given."""
     kind = value.get("kind") if isinstance(value, dict) else getattr(value, "kind", None)
     return "recorded" if kind is None and isinstance(value, dict) and "recorded" in value else kind
 
@@ -306,45 +311,49 @@ Behaviour = Annotated[
 
 
 class TeleopPilot(Facts):
-    """A simulated operator drives the machine through the joystick.
+    """An operator controls the machine through the joystick, with force reflection.
 
-    `mount: cab` shakes the joystick with the link that swings, `mount: table` leaves it alone.
-    `reflection` is the structure, under `mode` rate or position control. `ratio` scales reflected
-    forces: hand per machine force [N/N], up to the `force_limit` [N] of the machine's force.
-    `coupling` [N/m] is the spring between handle and slave of coordinating force and four channels:
-    per metre of the handle under position control (400 if not given), of the machine under rate
-    control (40); `coupling_damping` [N s/m] is a tenth of it. `virtual_mass` [kg] is the slave's of
-    four channels. References speed up by `acceleration` [m/s^2] or [rad/s^2]. `force` chooses where
-    the contact force comes from: the pressures with the static or the dynamic model, through a
-    filter of a `bandwidth` [rad/s] (`bandwidth_hz`), or the simulator's own (`true`).
+    `mount: cab` mounts the joystick on the swinging link, whose motion excites it; `mount: table`
+    mounts it on a fixed table. `reflection` selects the force reflection, under rate or position
+    control (`mode`). `ratio` scales reflected forces: hand force per machine force [N/N], with the
+    machine force limited to `force_limit` [N]. `coupling` [N/m] is the spring between handle and
+    slave of coordinating force and four channels: per metre of the handle under position control
+    (default 400), of the machine under rate control (default 40). `coupling_damping` [N s/m]
+    defaults to a tenth of it. `virtual_mass` [kg] is the slave mass of four channels.
+    `acceleration` [m/s^2] or [rad/s^2] limits the references. `force` selects the source of the
+    contact force: the pressures with the `static` or `dynamic` model, through a filter with
+    `bandwidth` [rad/s] (`bandwidth_hz`), or the exact force of the simulator (`true`).
 
-    What structures can do: stiffness feedback is proven stable with every task and delay where
-    `B^2 > 4 M K_max` and `K_min > 0`, hand included (Zhu 1994, theorem 4-2); the published gains do
-    not meet that, and are stable by the bound on the worst switching (`hydrotele analyse teleop`).
-    Direct force bounces where `ratio` times the task's stiffness (and `scale`) is more than hand
-    and joystick hold. Coordinating force tells of the machine's lag; a stiff servo hides the task
-    from it, and under rate control it needs less coupling with delay. It compares the machine's
-    place with that of the handle (`coordinating: handle`, Zhu 1994, 3.52 and 3.53), or with the
-    machine's own reference (`reference`), which a late line makes later. Four channels under
-    position control give hand = ratio x force and place = scale x handle in the mean; on a
-    valve-controlled machine they bounce unless ratio x scale x task stiffness is below the
-    coupling, some 400 N/m. Four channels under rate control leave a constant contact force unfelt,
-    by design (F_h = s/k_v F_e); they have no dead band. `impedance` adds ratio x gain of the
-    coordinate (its scale, or under rate control its rate per displacement, for one second) x the
-    task's identified stiffness to the joystick's, within its bounds, its damping, at most as much
-    as the joystick's own, and its mass, at most half of the flotor's.
+    Stability and limits of the structures:
 
-    `wave_variables` (impedance `wave` [N s/m]) and `passivity_control` make the line passive with
-    any delay and jitter, under position control: a virtual mass follows the handle through the
-    coupling, which comes back, and the task's force moves it. What the line cannot make passive is
-    a late estimate of that force.
+    - `stiffness`: proven stable with every environment and delay if `B^2 > 4 M K_max` and
+      `K_min > 0`, hand included (Zhu 1994, theorem 4-2). The published gains do not meet this
+      condition; they are stable by the bound for the worst switching (`hydrotele analyse teleop`).
+    - `direct_force`: bounces if `ratio` times the environment stiffness (times `scale`) exceeds the
+      stiffness of hand and joystick.
+    - `coordinating_force`: reflects the lag of the machine; a stiff servo hides the environment
+      from it, and under rate control it needs a smaller coupling with delay. It compares the
+      position of the machine with that of the handle (`coordinating: handle`, Zhu 1994, 3.52 and
+      3.53), or with the reference of the machine (`reference`), which channel delay retards.
+    - `four_channel` under position control: in the mean, hand force = ratio x contact force and
+      position = scale x handle. On a valve-controlled machine it bounces unless ratio x scale x
+      environment stiffness is below the coupling, about 400 N/m. Under rate control it does not
+      reflect a constant contact force, by design (F_h = s/k_v F_e), and has no dead band.
+    - `impedance`: adds ratio x gain of the coordinate (its scale, or under rate control its rate
+      per displacement, for one second) x the identified environment stiffness to the stiffness of
+      the joystick, within its bounds. It likewise adds damping, at most that of the joystick, and
+      mass, at most half of that of the flotor.
+    - `wave_variables` (impedance `wave` [N s/m]) and `passivity_control`: make the channel passive
+      with any delay and jitter, under position control. A virtual mass follows the handle through
+      the coupling, whose force is sent back, and the contact force moves it. The channel cannot
+      compensate a delayed estimate of the contact force.
 
-    `compliance: springs` makes the joystick's axes springs at the handle, `decoupled` gives each
-    its own second-order system whatever the flotor's inertia couples (Zhu 1994, 5.9-5.11).
+    `compliance: springs` makes the joystick axes springs at the handle; `decoupled` gives each axis
+    its own second-order system, without coupling by the inertia of the flotor (Zhu 1994, 5.9-5.11).
 
     `resolved_motion: inverse_kinematics` solves the joint references from the commanded pose;
-    `inverse_jacobian` integrates joint rates `J^-1(q) V` at the measured angles, so that errors of
-    the path accumulate (Zhu 1994, Eq. 2.1). The second is there for comparison.
+    `inverse_jacobian` integrates joint rates `J^-1(q) V` at the measured angles, so that path
+    errors accumulate (Zhu 1994, Eq. 2.1). The second is provided for comparison.
     """
 
     kind: Literal["teleop"]
@@ -380,7 +389,7 @@ class TeleopPilot(Facts):
     def _passive_line(self):
         if self.reflection in ("wave_variables", "passivity_control") and self.mode == "rate":
             raise ValueError(
-                f"reflection {self.reflection} needs mode position: force times the rate that the"
-                " handle asks for is no power that a line could keep"
+                f"reflection {self.reflection} needs mode position: under rate control, force times"
+                " commanded rate is not a power that the channel could preserve"
             )
         return self

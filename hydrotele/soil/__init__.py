@@ -1,10 +1,10 @@
-"""A soil that a bucket cuts, carries and drops, in the vertical plane of the arm.
+"""Soil that a bucket cuts, carries and drops, in the vertical plane of the arm.
 
-`facts` says what the soil is, `shape` what the bucket looks like, `numbers` packs both into one
-flat array; `cutting` has the closed forms of soil mechanics, `terrain` moves soil between cells,
-`bucket` says how much a tilted bucket holds, `step` puts them together for a control loop, and
-`wrench` takes the result to a body of MuJoCo. One profile, one state and one result for each
-environment, one array of numbers for all; nothing is allocated or shared:
+`facts` defines soil and bucket and packs their parameters into one flat array. `terrain` moves soil
+between the cells of the profile. `step` contains the closed-form soil mechanics, the volume that a
+tilted bucket holds, the time step of soil and bucket, and the wrench on a MuJoCo body. Every
+environment has its own profile, bucket state and result; the parameters can be common to all.
+Nothing is allocated during a step:
 
 >>> import numpy as np
 >>> from hydrotele.soil.facts import SOILS
@@ -19,7 +19,7 @@ environment, one array of numbers for all; nothing is allocated or shared:
 >>> bool(20e3 < out[FORCE_R] < 50e3)  # N, against the motion
 True
 
-What is left out: the sides of the trench (the profile is as wide as the bucket), the inertia of
-soil, its compaction below floor and heel, and pressure of water. Loosened soil has weight and
-friction but no cohesion; the bank stays as strong as it was.
+Not modelled: the sides of the trench (the profile is as wide as the bucket), the inertia of the
+soil, its compaction below floor and heel, and pore water pressure. Loosened soil has weight and
+friction but no cohesion; the strength of the bank does not change.
 """

@@ -1,31 +1,33 @@
-r"""Facts of a soil, SI, and three soils to start with.
+r"""Parameters of soil and bucket in SI units, their flat array, and the state of a bucket.
 
-Soil, bucket and profile as one flat array, and the places of a bucket's state.
+The module provides three typical soils and the bucket of the CAT 215. `soil_parameters` packs soil,
+bucket and profile into a flat array for compiled functions; constants name its indices and those of
+the bucket state and of the result of a step.
 
-The bucket seen from its side.
+Side view of the bucket:
 
 ```
-             o pin        Attitude a: of the line pin -> edge against the horizontal, positive
-             |\           raises the edge. The mouth lies along that line and looks along
-             | \          (sin a, -cos a): towards the machine at -90 deg (drawn here: it digs),
-       mouth |  ) shell   straight up at -180 deg (curled in: it holds), straight down at 0
-             | /          (dumped).
+             o pin        Attitude a: angle of the line pin -> edge to the horizontal, positive
+             |\           with the edge raised. The mouth lies along that line and faces
+             | \          (sin a, -cos a): towards the machine at -90 deg (shown here: digging),
+       mouth |  ) shell   straight up at -180 deg (curled in: carrying), straight down at 0
+             | /          (dumping).
              |/ rake
  machine <-- +-------     edge
 ```
 
-Here the machine is on the left, radius grows to the right. The floor runs from the edge back into
-the shell, `floor_angle` from the mouth; seen from the edge it rises outwards at
-`rake = a + 180 deg - floor_angle`. That is the rake of a blade which is drawn towards the machine:
-90 deg is an upright wall, 0 a level floor that only slides, and below 0 the heel lies deeper than
-the edge.
+The machine is on the left, and the radius increases to the right. The floor runs from the edge back
+into the shell, at the angle `floor_angle` to the mouth. Seen from the edge it rises outwards at
+`rake = a + 180 deg - floor_angle`. This is the rake of a blade that is drawn towards the machine:
+90 deg is an upright wall, 0 a level floor that only slides, and below 0 the heel is deeper than the
+edge.
 
 | attitude [deg] | rake | |
 | ---: | ---: | --- |
-| -45 | 93 | upright blade; everything falls out |
+| -45 | 93 | upright blade; all soil falls out |
 | -75 | 63 | enters the ground |
-| -90 | 48 | cuts; holds only what the ground ahead props |
-| -110 | 28 | cuts flat, begins to hold |
+| -90 | 48 | cuts; holds only soil that the ground ahead supports |
+| -110 | 28 | cuts at a flat angle, starts to hold soil |
 | -138 | 0 | floor level: grading; holds nearly a struck load |
 | -170 .. -190 | -32 .. | carries a heaped load |
 """
@@ -42,16 +44,16 @@ from hydrotele.core.errors import InputError
 
 
 class Bucket(NamedTuple):
-    """A bucket's side view, in its own frame: x from pin to edge, z up, [m].
+    """Side view of a bucket in its own frame: x from pin to edge, z up [m].
 
     Attributes:
-        outline: ((x, z), ...) of the room inside, from the edge along floor and shell to the rim
-            beside the pin; the mouth closes it.
-        heel: (x, z) of the lowest point once the bucket is curled in.
-        floor_angle: between mouth and floor, at the edge [rad].
-        floor_length: of the flat floor [m].
-        width: of the cut [m].
-        inner_width: of the room inside [m].
+        outline: ((x, z), ...) corners of the interior, from the edge along floor and shell to the
+            rim next to the pin; the mouth closes it.
+        heel: (x, z) of the lowest point of the curled-in bucket.
+        floor_angle: angle between mouth and floor at the edge [rad].
+        floor_length: length of the flat floor [m].
+        width: width of the cut [m].
+        inner_width: width of the interior [m].
         edge: thickness of the cutting edge [m].
     """
 
@@ -76,12 +78,12 @@ CAT215 = Bucket(
     inner_width=1.168,
     edge=0.03,
 )  # fmt: skip
-"""Of the shapes in models/cat215/cat215.xml: side plates, floor, teeth; edge assumed. 0.59 m^3 to
-the mouth, 0.91 m^3 heaped at 35 deg."""
+"""Bucket of the CAT 215, from the side plates, floor and teeth in models/cat215/cat215.xml; the
+edge thickness is assumed. It holds 0.59 m^3 struck and 0.91 m^3 heaped at 35 deg."""
 
 
 def outline_from_edge(bucket: Bucket) -> np.ndarray:
-    """Outline (m, 2) of the room inside with the edge as origin [m].
+    """Return the outline (m, 2) of the interior relative to the edge [m].
 
     Raises:
         InputError: the outline has too few or too many corners.
@@ -96,20 +98,20 @@ GRAVITY = 9.81  # m/s^2
 
 
 class Soil(Facts):
-    """A soil that follows Mohr and Coulomb, with what happens to it once it is loosened.
+    """A Mohr-Coulomb soil, with parameters of its loosened state.
 
     Attributes:
-        density: in the bank, undisturbed and moist [kg/m^3].
+        density: density in the bank, undisturbed and moist [kg/m^3].
         cohesion: c [Pa].
         friction: angle of internal friction phi [rad].
         tool_friction: angle of friction on steel delta, at most phi [rad].
-        adhesion: to steel c_a, at most the cohesion [Pa].
-        swell: loose volume over bank volume [1].
-        repose: angle at which loosened soil comes to rest [rad].
-        cut_slope: steepest face that stands in the bank for a while [rad].
+        adhesion: adhesion to steel c_a, at most the cohesion [Pa].
+        swell: ratio of loose volume to bank volume [1].
+        repose: angle of repose of loosened soil [rad].
+        cut_slope: maximum slope at which a cut face of the bank stands temporarily [rad].
         stiffness: force per displacement before a surface has mobilised the soil [N/m].
-        damping_time: of that spring [s]; at least half the time between steps keeps a force that
-            is held over a step from feeding energy into a machine.
+        damping_time: ratio of damping to stiffness [s]; at least half the time step, so that a
+            force that is held over a step adds no energy to a machine.
     """
 
     density: Annotated[float, Field(ge=800.0, le=2600.0)] = 1700.0
@@ -131,7 +133,7 @@ class Soil(Facts):
             raise ValueError("adhesion exceeds cohesion: soil would fail before it lets go")
         if self.cut_slope < self.repose:
             raise ValueError(
-                "cut_slope is below repose: soil in the bank stands steeper than loose"
+                "cut_slope is below repose: the bank stands at a steeper slope than loose soil"
             )
         return self
 
@@ -149,16 +151,16 @@ SOILS = {
         cut_slope=math.radians(80.0),
     ),
 }  # fmt: skip
-"""Typical soils to start with. The numbers are as remembered of the books named here, not looked
-up again: replace them by those of your ground. Soft: cohesion and friction of the sandy loam with
-15 % moisture in Wong, Theory of Ground Vehicles, Table 2.3; density and swell of loam (bank 1540,
-loose 1245 kg/m^3) in the Caterpillar Performance Handbook, Weights of Materials. Sandy loam,
-moist: cohesion of the one with 11 % moisture there (4.83 kPa) with a friction between those of the
-two. Firm: density and swell of packed earth in the Handbook (1900, 1510 kg/m^3); cohesion and
-friction of a stiff sandy clay are assumed. Friction on steel is two thirds of that inside, as for
-steel against sand in Terzaghi and Peck; adhesion is a tenth of the cohesion, assumed. Stiffness:
-passive pressure is mobilised after some 2 % of the height of a wall (Clough and Duncan 1991), here
-4 mm in 0.2 m for 12 kN."""
+"""Typical soils. The values have not been checked against the cited books; replace them by those of
+your ground. Soft: cohesion and friction of the sandy loam with 15 % moisture in Wong, Theory of
+Ground Vehicles, Table 2.3; density and swell of loam (bank 1540, loose 1245 kg/m^3) in the
+Caterpillar Performance Handbook, Weights of Materials. Sandy loam, moist: cohesion of the sandy
+loam with 11 % moisture in Wong (4.83 kPa), with a friction angle between those of the two. Firm:
+density and swell of packed earth in the Handbook (1900, 1510 kg/m^3); cohesion and friction of a
+stiff sandy clay are assumed. Friction on steel is two thirds of the internal friction, as for steel
+on sand in Terzaghi and Peck; adhesion is assumed to be a tenth of the cohesion. Stiffness: passive
+pressure is mobilised after about 2 % of the height of a wall (Clough and Duncan 1991), here 4 mm in
+0.2 m for 12 kN."""
 
 
 (
@@ -173,37 +175,37 @@ OUTLINE = 22
     LOW, HIGH, LOST, DEPTH,
 ) = range(16)  # fmt: skip
 STATE = 16
-"""Places of a bucket's state: loose volume carried [m^3]; deflections of the soil against face,
-edge, floor, heel and along the heel [m]; last places of edge and heel [m]; where the cut ends [m];
-whether it was placed; first and last cell that may still slide; loose volume that left the profile
-[m^3]; depth of the edge [m]."""
+"""Indices of the bucket state: loose volume carried [m^3]; deflections of the soil against face,
+edge, floor, heel and along the heel [m]; previous positions of edge and heel [m]; radius to which
+soil has been cut [m]; whether the state is initialised; first and last cell that may still slide;
+loose volume that left the profile [m^3]; depth of the edge [m]."""
 
 (FORCE_R, FORCE_Z, MOMENT, MASS, MASS_R, MASS_Z) = range(6)
 OUT = 6
-"""Places of what a step gives: force of the soil on the bucket at its edge, outwards and up [N];
-moment about the edge, positive raises the outboard end [N m]; mass carried [kg] and where its
-centre lies from the edge, outwards and up [m]."""
+"""Indices of the result of a step: force of the soil on the bucket at its edge, outwards and up
+[N]; moment about the edge, positive if it raises the outboard end [N m]; mass carried [kg] and its
+centre relative to the edge, outwards and up [m]."""
 
 
 def soil_parameters(soil: Soil, bucket: Bucket, start: float, cell: float) -> np.ndarray:
-    """Pack what does not change.
+    """Pack the parameters of soil, bucket and profile into an array for compiled functions.
 
     Args:
         soil: the soil.
         bucket: the bucket.
-        start: radius at which the profile begins [m].
-        cell: length of its cells [m].
+        start: radius at which the profile starts [m].
+        cell: length of a cell [m].
 
     Returns:
-        (k,) numbers for the compiled functions of this room, SI.
+        (k,) parameters in SI units.
 
     Raises:
-        InputError: the cells or the bucket cannot be used.
+        InputError: the cell length, the start or the outline of the bucket is out of range.
     """
     if not 0.01 <= cell <= 0.5:
         raise InputError("soil profile", f"cells of {cell} m; 0.01 to 0.5 m are allowed")
     if not (math.isfinite(start) and start >= 0.0):
-        raise InputError("soil profile", f"begins at a radius of {start} m; it must be at least 0")
+        raise InputError("soil profile", f"starts at a radius of {start} m; it must be at least 0")
     outline = outline_from_edge(bucket)
     edge_x, edge_z = bucket.outline[0]
     return np.array([
@@ -216,22 +218,23 @@ def soil_parameters(soil: Soil, bucket: Bucket, start: float, cell: float) -> np
 
 
 def bucket_state() -> np.ndarray:
-    """State (STATE,) of an empty bucket that has not been placed yet: zeros.
+    """Return the state (STATE,) of an empty bucket: zeros.
 
-    The first step places it. Zeros written into it later begin anew.
+    The first step initialises the positions. Setting the array to zero restarts the bucket.
     """
     return np.zeros(STATE)
 
 
 def level_profile(count: int, height: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """A level profile of undisturbed soil.
+    """Return a level profile of undisturbed soil.
 
     Args:
         count: number of cells.
-        height: of the surface [m].
+        height: height of the surface [m].
 
     Returns:
-        (surface, loose): (count,) height of the surface [m] and how much of it on top is loose [m].
+        (surface, loose): (count,) height of the surface [m], and thickness of the loose layer on
+        top [m].
 
     Raises:
         InputError: there are fewer than 8 cells.
@@ -243,9 +246,9 @@ def level_profile(count: int, height: float = 0.0) -> tuple[np.ndarray, np.ndarr
 
 def soil_mass(numbers: np.ndarray, surface: np.ndarray, loose: np.ndarray,
               state: np.ndarray) -> float:  # fmt: skip
-    """Mass of all soil: of the profile above height 0, in the bucket, and lost off its ends [kg].
+    """Return the total mass of soil above height 0, in the bucket and lost at the ends [kg].
 
-    It does not change in `soil_step`, but for rounding.
+    `soil_step` conserves it up to rounding.
     """
     n = numbers
     thickness = np.sum(surface - loose) + np.sum(loose) / n[SWELL]

@@ -1,24 +1,20 @@
-"""One step of soil and bucket for a control loop: forces, cutting, filling, falling, sliding.
+"""Time step of soil and bucket for a control loop: forces, cutting, filling, spilling, sliding.
 
-Four surfaces of the bucket press on the soil, each a spring that yields at what soil mechanics lets
-it carry, along its own direction: the face (Coulomb's wedge ahead of it, pushed towards the
-machine), the edge (into the soil, along the floor), the floor's underside and the heel (Prandtl's
-zones below). Such an element holds a bucket that rests, gives back no more than the spring holds
-(some joules) and otherwise only takes energy: with a damper in parallel it may be held over a step
-of 5 ms against a machine of 20 t.
+Four surfaces of the bucket press on the soil, each in its own direction: the face (Coulomb's wedge
+ahead of it, pushed towards the machine), the edge (into the soil, along the floor), the underside
+of the floor and the heel (Prandtl's zones below). Each is an elastic-plastic spring that yields at
+the limit force of soil mechanics, with a damper in parallel. It supports a resting bucket and
+returns at most the energy of the spring (some joules). Its force can therefore be held over a step
+of 5 ms on a machine of 20 t.
 
-How much loose soil a tilted bucket holds, and where its centre lies.
-
-Forces of soil on a blade: Coulomb's wedge ahead of it, Prandtl's zones under it.
-
-A blade drawn through soil shears off a wedge along a plane that rises from its edge. Forces on that
-wedge (weight, cohesion and friction on the plane, adhesion and friction on the blade) give the
+A blade drawn through soil shears off a wedge along a plane that rises from its edge. The forces on
+this wedge (weight, cohesion and friction on the plane, adhesion and friction on the blade) give the
 Fundamental Equation of Earthmoving (Reece 1964; McKyes and Ali 1977; McKyes 1985)
-`P = w (g d^2 N_g + c d N_c + c_a d N_ca) + Q N_q`, P inclined by delta against the blade's normal.
-The plane is the one with the least N_g. Luengo, Singh and Cannon (1998) tilt it by the slope of the
-surface and load it with the weight Q of what the bucket has swept up. All angles in radians.
+`P = w (g d^2 N_g + c d N_c + c_a d N_ca) + Q N_q`, P inclined by delta to the normal of the blade.
+The plane is the one with the minimum N_g. Luengo, Singh and Cannon (1998) tilt it by the slope of
+the surface and load it with the weight Q of the soil in the bucket. All angles are in radians.
 
-Soil and load on a bucket as the wrench about its centre of mass that MuJoCo's bodies take.
+`bucket_wrench` converts forces and load to the wrench on a MuJoCo body about its centre of mass.
 """
 
 import math
@@ -77,18 +73,19 @@ from hydrotele.soil.terrain import cell_of, cut_cells_, lay_down_, slide_cells_,
 
 @allocation_free
 def held_soil(n, attitude, level, out):
-    """Volume of soil that rests in the bucket: below a surface at the angle of repose from its rim.
+    """Compute the volume of soil that a tilted bucket holds, and its centre.
 
-    The surface rises from the lower rim into the bucket. With the mouth tilted less than the angle
-    of repose the bucket is full and a heap lies on top, at the angle of repose from both rims. Soil
-    ahead of the mouth props what lies behind it: the surface then begins where it meets the mouth.
+    The soil fills the bucket below a surface at the angle of repose, which rises from the lower rim
+    into the bucket. If the mouth is tilted less than the angle of repose, the bucket is full and a
+    heap lies on top, at the angle of repose from both rims. Soil ahead of the mouth supports the
+    soil behind it: the surface then starts where the soil ahead meets the mouth.
 
     Args:
         n: (k,) of `soil_parameters`.
         attitude: of the bucket, scalar [rad].
-        level: height of the soil ahead of the mouth over the edge, scalar [m].
-        out: (4,) written: volume [m^3]; centre outwards and up from the edge [m]; how far out the
-            lower rim lies from the edge [m].
+        level: height of the soil ahead of the mouth above the edge, scalar [m].
+        out: (4,) written: volume [m^3]; centre outwards and up from the edge [m]; outward distance
+            of the lower rim from the edge [m].
 
     Returns:
         Nothing.
@@ -102,7 +99,7 @@ def held_soil(n, attitude, level, out):
     low_r, low_z = (0.0, 0.0) if rim_z >= 0.0 else (rim_r, rim_z)
     out[3] = low_r
     chord = math.sqrt(rim_r * rim_r + rim_z * rim_z)
-    tilt = math.atan2(abs(rim_z), rim_r)  # of the mouth against level
+    tilt = math.atan2(abs(rim_z), rim_r)  # angle of the mouth to the horizontal
     repose = math.atan(n[REPOSE])
     heaped = tilt < repose
     slope = n[REPOSE] if rim_z >= 0.0 else -n[REPOSE]
@@ -117,7 +114,7 @@ def held_soil(n, attitude, level, out):
         x, y = n[OUTLINE + 2 * i], n[OUTLINE + 2 * i + 1]
         r1, z1 = c * x - s * y, s * x + c * y
         over1 = z1 - low_z - slope * (r1 - low_r)
-        for part in range(2):  # where the side crosses the surface, then its end if below
+        for part in range(2):  # intersection of the side with the surface, then its end if below
             if part == 0:
                 if heaped or (over0 <= 0.0) == (over1 <= 0.0):
                     continue
@@ -155,18 +152,18 @@ def held_soil(n, attitude, level, out):
     out[2] = moment_z / area if area > 1e-9 else 0.0
 
 
-STEEPEST_RAKE = 0.5 * math.pi  # a wedge of soil sticks to a steeper blade and is the blade then
-FLATTEST_RAKE = math.radians(15.0)
-WIDEST_FAN = math.radians(150.0)  # rake + delta + phi beyond which Coulomb's plane fails
-STEEPEST_SLOPE = 0.6  # of the friction angle
-_LEAST_SQUARE = 0.05  # keeps the wedge from jamming where blade and surface are nearly parallel
+STEEPEST_RAKE = 0.5 * math.pi  # rad; soil that sticks to a steeper blade acts as the blade
+FLATTEST_RAKE = math.radians(15.0)  # rad, minimum rake
+WIDEST_FAN = math.radians(150.0)  # rad, rake + delta + phi above which Coulomb's plane fails
+STEEPEST_SLOPE = 0.6  # maximum slope as a fraction of the friction angle
+_LEAST_SQUARE = 0.05  # lower bound that avoids jamming of nearly parallel blade and surface
 
 
 @allocation_free
 def failure_plane(rake, slope, friction, tool_friction):
-    """Angle between surface and the plane on which the wedge shears off: that of least N_g.
+    """Return the angle between surface and failure plane that minimises N_g.
 
-    Setting the derivative of `N_g(cot beta)` to zero leaves a quadratic equation.
+    Setting the derivative of `N_g(cot beta)` to zero gives a quadratic equation.
 
     Args:
         rake: between blade and surface, scalar [rad].
@@ -195,7 +192,7 @@ def failure_plane(rake, slope, friction, tool_friction):
 
 @allocation_free
 def wedge_weight_factor(rake, slope, friction, tool_friction, plane):
-    """N_g: force on the blade by the weight of the wedge, per specific weight, width and depth^2.
+    """Return N_g, the blade force from the wedge weight per specific weight, width and depth^2.
 
     Args:
         rake: between blade and surface, scalar [rad].
@@ -205,7 +202,7 @@ def wedge_weight_factor(rake, slope, friction, tool_friction, plane):
         plane: beta, scalar [rad].
 
     Returns:
-        N_g, scalar [1]; depth counts at right angles to the surface.
+        N_g, scalar [1]; the depth is measured perpendicular to the surface.
 
     Source: McKyes 1985, chapter 3; Luengo et al. 1998.
 
@@ -221,7 +218,7 @@ def wedge_weight_factor(rake, slope, friction, tool_friction, plane):
 
 @allocation_free
 def surcharge_factor(rake, slope, friction, tool_friction, plane):
-    """N_q: force on the blade per weight that rests on the wedge.
+    """Return N_q, the blade force per weight of the surcharge on the wedge.
 
     Args:
         rake: between blade and surface, scalar [rad].
@@ -240,7 +237,7 @@ def surcharge_factor(rake, slope, friction, tool_friction, plane):
 
 @allocation_free
 def cohesion_factor(rake, friction, tool_friction, plane):
-    """N_c: force on the blade by cohesion on the plane, per cohesion, width and depth.
+    """Return N_c, the blade force from cohesion on the plane per cohesion, width and depth.
 
     Args:
         rake: between blade and surface, scalar [rad].
@@ -259,7 +256,7 @@ def cohesion_factor(rake, friction, tool_friction, plane):
 
 @allocation_free
 def adhesion_factor(rake, friction, tool_friction, plane):
-    """N_ca: force on the blade by adhesion to it, per adhesion, width and depth.
+    """Return N_ca, the blade force from adhesion to the blade per adhesion, width and depth.
 
     Args:
         rake: between blade and surface, scalar [rad].
@@ -268,7 +265,7 @@ def adhesion_factor(rake, friction, tool_friction, plane):
         plane: beta, scalar [rad].
 
     Returns:
-        N_ca, scalar [1]; the adhesion itself, along the blade, comes on top.
+        N_ca, scalar [1]; it does not include the adhesion force along the blade itself.
 
     Source: McKyes 1985, chapter 3, simplified.
     """
@@ -278,23 +275,23 @@ def adhesion_factor(rake, friction, tool_friction, plane):
 
 @allocation_free
 def bearing_pressure(overburden, cohesion, friction, tilt):
-    """Pressure at which soil yields under a smooth face that is pushed into it.
+    """Return the pressure at which soil yields under a smooth face that is pushed into it.
 
-    `p + c cot phi = (q + c cot phi) tan^2(45 deg + phi/2) e^(2 theta tan phi)`: a level face turns
-    the principal stresses by theta = 90 deg (Prandtl and Reissner's strip footing, N_q = 18.4 for
-    30 deg), an upright one not at all (Rankine's passive wall).
+    `p + c cot phi = (q + c cot phi) tan^2(45 deg + phi/2) e^(2 theta tan phi)`: a level face
+    rotates the principal stresses by theta = 90 deg (Prandtl and Reissner's strip footing, N_q =
+    18.4 for 30 deg), an upright face does not (Rankine's passive wall).
 
     Args:
-        overburden: q, beside the face, scalar [Pa].
+        overburden: q, vertical pressure next to the face, scalar [Pa].
         cohesion: c, scalar [Pa].
         friction: phi, above 0, scalar [rad].
-        tilt: of the face against the surface, 0 .. pi/2, scalar [rad].
+        tilt: angle between face and surface, 0 .. pi/2, scalar [rad].
 
     Returns:
         p, scalar [Pa].
 
-    Source: Prandtl 1920, Reissner 1924; tilted faces Sokolovskii 1960. The weight below the face
-    (N_gamma) is left out, which is small for narrow edges and on the safe side.
+    Source: Prandtl 1920, Reissner 1924; tilted faces Sokolovskii 1960. The weight of the soil below
+    the face (N_gamma) is neglected, which is conservative and has little effect for narrow edges.
     """
     sine, t = math.sin(friction), math.tan(friction)
     factor = (1.0 + sine) / (1.0 - sine) * math.exp(2.0 * (0.5 * math.pi - tilt) * t)
@@ -303,13 +300,13 @@ def bearing_pressure(overburden, cohesion, friction, tilt):
 
 @allocation_free
 def acting_rake(rake, slope, friction, tool_friction):
-    """Rake against the surface that the wedge feels, kept where the equation holds.
+    """Return the effective rake relative to the surface, limited to the range of the equation.
 
     A wedge of soil sticks to a blade that is steeper than upright, or too steep for its friction
-    (Hettiaratchi and Reece 1975), and acts as the blade; below 15 deg the blade acts as at 15 deg.
+    (Hettiaratchi and Reece 1975), and acts as the blade. A rake below 15 deg is replaced by 15 deg.
 
     Args:
-        rake: of the blade against the horizontal, scalar [rad].
+        rake: of the blade to the horizontal, scalar [rad].
         slope: of the surface, scalar [rad].
         friction: phi, scalar [rad].
         tool_friction: delta, scalar [rad].
@@ -325,47 +322,47 @@ def acting_rake(rake, slope, friction, tool_friction):
 
 @allocation_free
 def acting_slope(slope, friction):
-    """Slope of the surface, kept where a plane can form.
+    """Return the slope of the surface, limited to the range in which a failure plane can form.
 
     Args:
         slope: of the surface, scalar [rad].
         friction: phi, scalar [rad].
 
     Returns:
-        slope within 0.6 phi of level, scalar [rad].
+        slope, limited to +-0.6 phi, scalar [rad].
 
-    Source: Coulomb's forces grow without bound as the slope nears phi.
+    Source: Coulomb's forces grow without bound as the slope approaches phi.
     """
     limit = STEEPEST_SLOPE * friction
     return min(max(slope, -limit), limit)
 
 
-AHEAD = 1.5  # cells from the edge to where the depth of a cut is read: what no cut has touched yet
-PLAY = 0.02  # m, how far the edge goes back before it pushes soil the other way
-SPILL_TIME = 0.3  # s, in which what a tilted bucket does not hold falls out
-SPILL_LEAST = 0.2  # m^3/s, so that it comes to an end
-HEEL_CONTACT = 0.4  # m, of a heel that is pressed in by a quarter of that
-SWEEPS = 2  # of sliding soil per step
-EARTH_AT_REST = 0.5  # horizontal over vertical pressure beside a blade
+AHEAD = 1.5  # cells, distance ahead of the edge at which the depth of a cut is read: not yet cut
+PLAY = 0.02  # m, distance that the edge moves back before it pushes soil outwards
+SPILL_TIME = 0.3  # s, time constant with which excess soil falls out of a tilted bucket
+SPILL_LEAST = 0.2  # m^3/s, minimum spill rate, so that the spilling ends
+HEEL_CONTACT = 0.4  # m, maximum contact length of the heel, reached at a quarter of it in depth
+SWEEPS = 2  # sweeps of sliding soil per step
+EARTH_AT_REST = 0.5  # ratio of horizontal to vertical pressure next to a blade
 
 
 @allocation_free
 def cutting_force(n, depth, loose, rake, slope, load, out):
-    """Force of soil on a blade that is drawn through it towards the machine.
+    """Compute the force of the soil on a blade that is drawn towards the machine.
 
     Args:
         n: (k,) of `soil_parameters`.
         depth: of the edge below the surface ahead, scalar [m].
-        loose: how much of that is loose, which has weight and no cohesion, scalar [m].
-        rake: of the blade against the horizontal, scalar [rad].
-        slope: of the surface, positive where it rises towards the machine, scalar [rad].
-        load: weight of soil in the bucket, which rests on the wedge, scalar [N].
+        loose: thickness of the loose soil in this depth, which has no cohesion, scalar [m].
+        rake: of the blade to the horizontal, scalar [rad].
+        slope: of the surface, positive if it rises towards the machine, scalar [rad].
+        load: weight of the soil in the bucket, which rests on the wedge, scalar [N].
         out: (2,) written: force outwards and up [N].
 
     Returns:
         Nothing.
 
-    Source: see `cutting`; adhesion along the blade as in McKyes 1985, chapter 3.
+    Source: see the module; adhesion along the blade as in McKyes 1985, chapter 3.
     """
     out[0], out[1] = 0.0, 0.0
     if depth <= 0.0:
@@ -381,7 +378,7 @@ def cutting_force(n, depth, loose, rake, slope, load, out):
     force += n[COHESION] * bank * n[WIDTH] * cohesion_factor(rake, phi, delta, plane)
     stuck = n[ADHESION] * bank * n[WIDTH]
     force += stuck * adhesion_factor(rake, phi, delta, plane)
-    resting = min(load, 4.0 * weight)  # a thin wedge carries no full bucket
+    resting = min(load, 4.0 * weight)  # a thin wedge cannot carry a full bucket
     force += resting * surcharge_factor(rake, slope, phi, delta, plane)
     force = max(force, 0.0)
     upright = rake - slope
@@ -391,21 +388,21 @@ def cutting_force(n, depth, loose, rake, slope, load, out):
 
 @allocation_free
 def yielding_force(n, state, place, along, rate, low, high):
-    """Force of one surface along its direction: a spring and a damper that yield.
+    """Return the force of one surface along its direction, from a spring and damper that yield.
 
     Args:
         n: (k,) of `soil_parameters`.
         state: (STATE,) of the bucket; its deflection is changed [m].
-        place: of the deflection in it, scalar [1].
-        along: how far the surface moved against that direction, into the soil, scalar [m].
-        rate: at which it does, scalar [m/s].
-        low: least force, at most 0, scalar [N].
-        high: largest force, at least 0, scalar [N].
+        place: index of the deflection in the state, scalar [1].
+        along: displacement of the surface into the soil, against the force, scalar [m].
+        rate: rate of this displacement, scalar [m/s].
+        low: minimum force, at most 0, scalar [N].
+        high: maximum force, at least 0, scalar [N].
 
     Returns:
         force, scalar [N].
 
-    Source: Prandtl's elastic-plastic element; never gives more work than the spring holds.
+    Source: Prandtl's elastic-plastic element; it returns at most the energy of the spring.
     """
     k = n[STIFFNESS]
     spring = min(max(k * (state[place] + along), low), high)
@@ -423,7 +420,7 @@ def _spread(n, surface, loose, state, first, second, volume):
 
 @allocation_free
 def _touch(state, low, high, count):
-    """Widen the range of cells that may slide."""
+    """Enlarge the range of cells that may slide."""
     low, high = max(low - 1, 0), min(high + 1, count - 1)
     if state[HIGH] <= state[LOW]:
         state[LOW], state[HIGH] = low, high
@@ -432,14 +429,14 @@ def _touch(state, low, high, count):
 
 
 class EdgeMotion(NamedTuple):
-    """Where the edge of the bucket is and how it moves, in the arm's plane; scalars.
+    """Position and velocity of the bucket's edge in the plane of the arm; scalars.
 
     Attributes:
         r: radius [m].
         z: height [m].
-        r_rate: its speed outwards [m/s].
-        z_rate: its speed upwards [m/s].
-        attitude: of the bucket [rad].
+        r_rate: outward speed [m/s].
+        z_rate: upward speed [m/s].
+        attitude: attitude of the bucket [rad].
     """
 
     r: float
@@ -451,12 +448,12 @@ class EdgeMotion(NamedTuple):
 
 @allocation_free
 def _press(n, surface, loose, state, edge, dt, out):
-    """Forces of all surfaces on the bucket; returns depths inside and outside of the edge."""
+    """Compute the forces of all surfaces; return the edge depths on the inner and outer side."""
     r, z, r_rate, z_rate, attitude = edge
     phi, delta = n[FRICTION], n[TOOL_FRICTION]
     reach = AHEAD * n[CELL]
     height = surface_height(n, surface, r - reach)
-    inside = min(height - z, n[SIZE])  # what lies higher falls into the mouth
+    inside = min(height - z, n[SIZE])  # higher soil falls into the mouth
     outside = min(surface_height(n, surface, r + reach) - z, n[SIZE])
     dr, dz = r - state[LAST_R], z - state[LAST_Z]
     # the face
@@ -525,25 +522,26 @@ def _press(n, surface, loose, state, edge, dt, out):
 
 @allocation_free
 def soil_step(n, surface, loose, state, edge, dt, out):
-    """Move the edge of the bucket to a place and say what the soil does to it.
+    """Move the bucket's edge through the soil and compute the force of the soil.
 
-    Allocates nothing and touches nothing but its arguments, so that every environment may run in
-    its own thread. A change of `cutting_force` with depth is smooth: nothing jumps between cells.
+    The function allocates nothing and changes only its arguments, so every environment can run in
+    its own thread. The force changes smoothly with depth, also between cells.
 
     Args:
         n: (k,) of `soil_parameters`, not changed.
         surface: (m,) height of the profile, changed [m].
-        loose: (m,) how much of it is loose, changed [m].
-        state: (STATE,) of the bucket, changed; see `numbers`.
-        edge: EdgeMotion, where the edge is and how it moves [m], [m/s], [rad].
-        dt: time since the step before, scalar [s].
+        loose: (m,) thickness of the loose layer, changed [m].
+        state: (STATE,) of the bucket, changed; see `facts`.
+        edge: EdgeMotion, position and velocity of the edge [m], [m/s], [rad].
+        dt: time since the previous step, scalar [s].
         out: (OUT,) written: force outwards and up [N], moment about the edge [N m], mass carried
-            [kg] and its place from the edge [m]. The weight of what is carried is not in the force.
+            [kg] and its position relative to the edge [m]. The force does not include the weight of
+            the soil carried.
 
     Returns:
         Nothing.
 
-    Source: this module and `cutting`, `bucket`, `terrain`.
+    Source: this module and `terrain`.
     """
     r, z, attitude = edge.r, edge.z, edge.attitude
     for i in range(OUT):
@@ -559,7 +557,7 @@ def soil_step(n, surface, loose, state, edge, dt, out):
     state[DEPTH] = max(inside, 0.0)
     force_r, force_z, moment = out[FORCE_R], out[FORCE_Z], out[MOMENT]
     here = cell_of(n, r)
-    wall = here if inside > 0.0 or outside > 0.0 else -2  # a bucket stands there
+    wall = here if inside > 0.0 or outside > 0.0 else -2  # cell that contains the bucket
     taken, pushed = 0.0, 0.0
     if r < state[FRONT]:
         taken = cut_cells_(n, surface, loose, state[FRONT], z_before, r, z)
@@ -602,19 +600,19 @@ def soil_step(n, surface, loose, state, edge, dt, out):
 
 @allocation_free
 def bucket_wrench(out, edge, theta, centre, wrench):
-    """Force and torque of the soil and of the weight that is carried on the bucket's body.
+    """Compute the wrench of the soil and of the carried load on the bucket's body.
 
     Args:
         out: (OUT,) of `soil_step` [N], [N m], [kg], [m].
-        edge: (3,) place of the edge in the world [m].
-        theta: azimuth of the edge seen from the swing axis, scalar [rad].
+        edge: (3,) position of the edge in the world [m].
+        theta: azimuth of the edge about the swing axis, scalar [rad].
         centre: (3,) centre of mass of the bucket's body, `xipos` [m].
         wrench: (6,) written: force and torque in the world, `xfrc_applied` [N], [N m].
 
     Returns:
         Nothing.
 
-    Source: statics; the inertia of what is carried is left out.
+    Source: statics; the inertia of the load is neglected.
     """
     c, s = math.cos(theta), math.sin(theta)
     weight = GRAVITY * out[MASS]

@@ -1,8 +1,9 @@
-"""Soil that moves between the cells of a profile: cut, laid down, sliding.
+"""Move soil between the cells of a profile: cut it, lay it down, and let it slide.
 
-Cell i reaches from `start + i cell` to the next; `surface` [m] is the height of its top and `loose`
-[m] how much of it lies loose on the undisturbed bank. Volumes are loose ones; what is cut from the
-bank swells. What leaves the profile at its ends is told, so that no mass is lost unnoticed.
+Cell i extends from `start + i cell` to the next cell. `surface` [m] is the height of its top, and
+`loose` [m] the thickness of the loose soil on the undisturbed bank. All volumes are loose volumes;
+soil that is cut from the bank swells. The functions return the volume that leaves the profile at
+its ends, so that mass is conserved.
 """
 
 import math
@@ -10,12 +11,12 @@ import math
 from hydrotele.core.compiled import allocation_free
 from hydrotele.soil.facts import CELL, CUT_SLOPE, REPOSE, START, SWELL, WIDTH
 
-SETTLED = 1e-4  # m, a step between cells beyond the stable one that is left alone
+SETTLED = 1e-4  # m, height difference above the stable one at which soil does not slide
 
 
 @allocation_free
 def surface_height(n, surface, r):
-    """Height of the surface between the middles of cells, that of the end cells beyond them.
+    """Return the height of the surface, linear between cell centres and constant at the ends.
 
     Args:
         n: (k,) of `soil_parameters`.
@@ -39,22 +40,22 @@ def surface_height(n, surface, r):
 
 @allocation_free
 def cut_cells_(n, surface, loose, r0, z0, r1, z1):
-    """Take away what lies above the path of the edge in the cells that it sweeps.
+    """Remove the soil above the path of the edge in the cells that it sweeps.
 
-    A cell of which the edge has passed a part holds the mean of what is cut and what is not: a
-    further part takes its share of what remains.
+    A partly swept cell has the mean height of its cut and uncut parts. A further sweep removes the
+    corresponding fraction of the uncut part.
 
     Args:
         n: (k,) of `soil_parameters`.
         surface: (m,) heights, changed [m].
         loose: (m,) loose part of them, changed [m].
-        r0: radius before, scalar [m].
-        z0: height before, scalar [m].
-        r1: radius after, scalar [m].
-        z1: height after, scalar [m].
+        r0: radius of the edge before the step, scalar [m].
+        z0: height before the step, scalar [m].
+        r1: radius after the step, scalar [m].
+        z1: height after the step, scalar [m].
 
     Returns:
-        Volume taken, loose, scalar [m^3].
+        Loose volume removed, scalar [m^3].
 
     Source: conservation of volume.
     """
@@ -91,11 +92,11 @@ def lay_down_(n, surface, loose, cell, volume):
         n: (k,) of `soil_parameters`.
         surface: (m,) heights, changed [m].
         loose: (m,) loose part of them, changed [m].
-        cell: number of the cell, scalar [1].
+        cell: index of the cell, scalar [1].
         volume: of loose soil, scalar [m^3].
 
     Returns:
-        Volume that fell beside the profile, scalar [m^3].
+        Volume lost because the cell is outside the profile, scalar [m^3].
 
     Source: conservation of volume.
     """
@@ -109,14 +110,14 @@ def lay_down_(n, surface, loose, cell, volume):
 
 @allocation_free
 def cell_of(n, r):
-    """Number of the cell at a radius, below 0 or beyond the last outside of the profile.
+    """Return the index of the cell at a radius; it may be outside the profile.
 
     Args:
         n: (k,) of `soil_parameters`.
         r: radius, scalar [m].
 
     Returns:
-        number, scalar [1].
+        index, scalar [1].
 
     Source: definition of the profile.
     """
@@ -131,14 +132,14 @@ def slide_pair_(n, surface, loose, upper, lower):
         n: (k,) of `soil_parameters`.
         surface: (m,) heights, changed [m].
         loose: (m,) loose part of them, changed [m].
-        upper: number of the higher cell, scalar [1].
-        lower: number of its neighbour, scalar [1].
+        upper: index of the higher cell, scalar [1].
+        lower: index of its neighbour, scalar [1].
 
     Returns:
-        Whether something slid.
+        Whether soil has moved.
 
-    Source: loose soil rests at the angle of repose; the bank stands up to its cut slope, and what
-    breaks from it is loose.
+    Source: loose soil rests at the angle of repose; the bank stands up to its cut slope, and soil
+    that breaks off is loose.
     """
     step = surface[upper] - surface[lower]
     excess = step - n[REPOSE] * n[CELL]
@@ -162,18 +163,19 @@ def slide_pair_(n, surface, loose, upper, lower):
 
 @allocation_free
 def slide_cells_(n, surface, loose, low, high, wall):
-    """Let the soil of a range of cells slide once, from the left and from the right.
+    """Let the soil of a range of cells slide in one forward and one backward sweep.
 
     Args:
         n: (k,) of `soil_parameters`.
         surface: (m,) heights, changed [m].
         loose: (m,) loose part of them, changed [m].
-        low: first cell, scalar [1].
-        high: last cell, scalar [1].
-        wall: cell into which and from which nothing slides, -2 for none, scalar [1].
+        low: index of the first cell, scalar [1].
+        high: index of the last cell, scalar [1].
+        wall: index of the cell that contains the bucket, where no soil slides, -2 for none, scalar
+            [1].
 
     Returns:
-        Whether something slid.
+        Whether soil has moved.
 
     Source: Gauss-Seidel sweeps; every move conserves mass.
     """

@@ -124,7 +124,7 @@ def test_every_number_has_a_source():
 
 
 def test_former_keys_are_read_with_a_warning():
-    with pytest.warns(FutureWarning, match="skill is now called crossover"):
+    with pytest.warns(FutureWarning, match="skill is deprecated and was read as crossover"):
         assert Perception.model_validate({"skill": 0.8}).crossover == 0.8
     with pytest.raises(ValueError, match="give one of them"):
         Perception.model_validate({"skill": 0.8, "crossover": 1.0})

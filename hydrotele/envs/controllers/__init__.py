@@ -1,1 +1,1 @@
-"""Controllers to compare with: they know what sensors read and the nominal machine, no truth."""
+"""Baseline controllers, which use only the observation and the nominal machine."""

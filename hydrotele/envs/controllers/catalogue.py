@@ -1,4 +1,4 @@
-"""Reference controllers by name, and the search for their gains."""
+"""Reference controllers by name, and a search for controller gains."""
 
 from collections.abc import Callable, Mapping
 
@@ -23,23 +23,23 @@ REFERENCES: dict[str, Callable[[TaskSetup], Controller]] = {
     "ReachFeller": reach_controller,
     "PlaceLog": place_controller,
 }
-"""Task -> what a good engineer would write for it, for every kind of actions that suits it."""
+"""Task name -> function that makes its reference controller for the chosen kind of actions."""
 
 CONTROLLERS = ("reference", "zero", "random")
 
 
 def make_controller(name: str, setup: TaskSetup) -> Controller:
-    """A controller of a task.
+    """Make a controller for a task.
 
     Args:
         name: `reference`, `zero` or `random`.
-        setup: the task as it was chosen.
+        setup: the task with its options.
 
     Returns:
-        The controller, to `begin`.
+        The controller; call `begin` before use.
 
     Raises:
-        InputError: there is no such controller.
+        InputError: the controller does not exist, or the task has no reference controller.
     """
     if name == "zero":
         return Zero(setup)
@@ -48,7 +48,7 @@ def make_controller(name: str, setup: TaskSetup) -> Controller:
     if name != "reference":
         raise InputError(f"controller {name!r}", suggest(name, CONTROLLERS))
     if setup.task.name not in REFERENCES:
-        raise InputError(f"task {setup.task.name}", "has no reference controller yet")
+        raise InputError(f"task {setup.task.name}", "has no reference controller")
     return REFERENCES[setup.task.name](setup)
 
 
@@ -56,18 +56,19 @@ def tune(
     value: Callable[[dict[str, float]], float], start: Mapping[str, float], factor: float = 1.5,
     rounds: int = 2, gain: float = 0.0, most: Mapping[str, float] | None = None,
 ) -> tuple[dict[str, float], float]:  # fmt: skip
-    """Better gains by a search along one of them at a time.
+    """Improve controller gains by a coordinate search.
 
     Args:
-        value: of a set of gains, the more the better; always on the same episodes.
-        start: gains to begin with, all positive.
-        factor: by which a gain is changed, again as long as that helps.
-        rounds: through all gains.
-        gain: in value that a change must bring.
-        most: largest sensible values.
+        value: function that returns the score of a set of gains, larger is better; it must always
+            use the same episodes.
+        start: initial gains, all positive.
+        factor: factor by which a gain is changed, repeatedly while the score improves.
+        rounds: number of passes through all gains.
+        gain: minimum improvement of the score that a change must bring.
+        most: upper bounds of the gains.
 
     Returns:
-        (gains, their value).
+        (gains, their score).
     """
     best, score = dict(start), value(dict(start))
     for _ in range(rounds):

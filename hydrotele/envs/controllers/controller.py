@@ -1,10 +1,10 @@
-"""What a controller is, the two that know nothing, and how one finds its columns.
+"""Controller protocol, zero and random controllers, and the joint servo for valve actions.
 
-Laws of one machine are applied to the rows of a batch. Valve commands that make axes follow
-references are those of the joint servo with an integral, at env rate: feedforward of the drive's
-velocity through the flow gain at the measured pressures, compensation of the dead band, position
-feedback, dynamic pressure feedback (`control.servo`); the integral takes out what the nominal
-machine does not know: leakage, other dead bands and flow gains.
+`columns` finds the observation columns of named fields. `ValveLaw` computes valve commands at the
+environment rate with the joint servo of `control.servo`: velocity feedforward through the flow gain
+at the measured pressures, dead-band compensation, position feedback and dynamic pressure feedback.
+Its integral term compensates leakage and deviations of dead band and flow gain from the nominal
+machine.
 """
 
 from collections.abc import Iterable
@@ -29,97 +29,97 @@ from hydrotele.scenario.scenario import Servo
 
 
 class Controller(Protocol):
-    """Actions from observations, for n episodes side by side."""
+    """Compute actions from observations, for n parallel episodes."""
 
     def begin(self, count: int) -> None:
-        """Make room for `count` episodes and start them."""
+        """Allocate and initialise the state of `count` episodes."""
         ...
 
     def reset(self, mask: np.ndarray) -> None:
-        """Forget the episodes that are over.
+        """Reset the state of the episodes that are over.
 
         Args:
-            mask: (n,) bool, which ones.
+            mask: (n,) bool, True for the episodes to reset.
         """
         ...
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Actions of this step.
+        """Return the actions of this step.
 
         Args:
             observation: (n, o).
 
         Returns:
-            (n, a), full at +-1.
+            (n, a), in the range +-1.
         """
         ...
 
 
 class Zero:
-    """Never acts: valves closed, or no rate."""
+    """Controller that returns zero actions: closed valves, or zero rates."""
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Remember the number of actions."""
+        """Store the number of actions."""
         self._actions = len(setup.axes)
 
     def begin(self, count: int) -> None:
-        """Nothing to remember."""
+        """Do nothing: the controller has no state."""
 
     def reset(self, mask: np.ndarray) -> None:
-        """Nothing to forget."""
+        """Do nothing: the controller has no state."""
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Zeros (n, a) for observations (n, o)."""
+        """Return zeros (n, a) for observations (n, o)."""
         return np.zeros((len(observation), self._actions), np.float32)
 
 
 class Random:
-    """Uniform actions, drawn anew in every step, as an agent that has learned nothing."""
+    """Controller that returns independent uniform random actions in every step."""
 
     def __init__(self, setup: TaskSetup, seed: int = 0) -> None:
-        """Remember the number of actions."""
+        """Store the number of actions and the seed."""
         self._actions, self._seed = len(setup.axes), seed
 
     def begin(self, count: int) -> None:
-        """Start the random numbers."""
+        """Seed the random generator."""
         self._chance = np.random.default_rng(self._seed)
 
     def reset(self, mask: np.ndarray) -> None:
-        """Random numbers go on."""
+        """Do nothing: the random stream continues."""
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Numbers (n, a) from -1 to 1 for observations (n, o)."""
+        """Return random actions (n, a) from -1 to 1 for observations (n, o)."""
         return self._chance.uniform(-1.0, 1.0, (len(observation), self._actions))
 
 
 def step_time(setup: TaskSetup) -> float:
-    """Time from one action to the next [s]."""
+    """Return the time between environment steps [s]."""
     return setup.clock.ticks * setup.clock.period
 
 
 def columns(setup: TaskSetup, what: str, where: Iterable[str]) -> np.ndarray:
-    """Columns of the observation with the fields `what.where`.
+    """Return the observation columns of the fields `what.where`.
 
     Args:
-        setup: the task as it was chosen.
-        what: first part of the fields' names.
-        where: second parts, in the order of the columns.
+        setup: the task with its options.
+        what: first part of the field names.
+        where: second parts, in the order of the columns; `""` for a field name without a dot.
 
     Returns:
         (m,) integers, for `observation[:, columns]`.
 
     Raises:
-        InputError: the observation lacks one of them.
+        InputError: the observation has no such field.
     """
     places = {field.name: number for number, field in enumerate(setup.fields)}
     names = [f"{what}.{part}" if part else what for part in where]
     if missing := [name for name in names if name not in places]:
-        raise InputError(f"observation {missing[0]!r}", f"the task has {', '.join(places)}")
+        raise InputError(f"observation {missing[0]!r}", f"the task observes {', '.join(places)}")
     return np.array([places[name] for name in names], int)
 
 
 def position_columns(setup: TaskSetup) -> np.ndarray:
-    """Columns (k,) of the driven axes' measured positions."""
+    """Return the observation columns (k,) of the measured positions of the driven axes."""
     return np.concatenate([
         columns(setup, setup.machine.position_kind(axis), [axis]) for axis in setup.axes
     ])  # fmt: skip
@@ -127,16 +127,16 @@ def position_columns(setup: TaskSetup) -> np.ndarray:
 
 @compiled
 def servo_commands(numbers, grid, table, reference, rate_ahead, measured, load, out):
-    """Commands of n episodes by the joint servo.
+    """Compute the joint servo commands of n episodes.
 
     Args:
         numbers: (k, 14) of `control.servo.servo_parameters`.
         grid: (k, 2) of `control.servo.drive_tables`.
-        table: (k, POINTS, 3) of the same.
+        table: (k, POINTS, 3) of `control.servo.drive_tables`.
         reference: (n, k) [rad] or [m].
-        rate_ahead: (n, k) wanted rates, ahead by the spool's lag [rad/s] or [m/s].
+        rate_ahead: (n, k) reference rates, advanced by the spool lag [rad/s] or [m/s].
         measured: Measured with (n, k) arrays, (n,) supply pressures.
-        load: (n, k) slow means of the drive forces, updated [N] or [N m].
+        load: (n, k) low-pass filtered drive forces, updated [N] or [N m].
         out: (n, k) commands, written [1] or in the drive's unit.
 
     Returns:
@@ -162,7 +162,7 @@ def servo_commands(numbers, grid, table, reference, rate_ahead, measured, load, 
 
 @compiled
 def forward_poses(arm, q, pose):
-    """Poses of the tip of n episodes.
+    """Compute the tip poses of n episodes from their joint angles.
 
     Args:
         arm: (9,) of `kinematics.task.arm_parameters`.
@@ -180,7 +180,7 @@ def forward_poses(arm, q, pose):
 
 @compiled
 def inverse_joints(arm, ranges, pose, q):
-    """Joint angles of n episodes for poses of the tip; those out of reach keep their angles.
+    """Compute the joint angles of n episodes from tip poses; unreachable poses leave `q` unchanged.
 
     Args:
         arm: (9,) of `kinematics.task.arm_parameters`.
@@ -203,19 +203,19 @@ def inverse_joints(arm, ranges, pose, q):
             q[i] = found
 
 
-_MOST = 0.05  # rad/s or m/s that the integral may ask for
+_MOST = 0.05  # rad/s or m/s, limit of the integral term
 
 
 class ValveLaw:
-    """Actions of valves (and of drives without any) from references of the axes."""
+    """Joint servo that returns valve (or force drive) actions for axis references."""
 
     def __init__(self, setup: TaskSetup, servo: Servo, integral_gain: float = 0.0) -> None:
-        """Look up the nominal machine.
+        """Read the parameters of the nominal machine.
 
         Args:
-            setup: the task as it was chosen, with `valve` actions.
-            servo: gains.
-            integral_gain: [1/s^2].
+            setup: the task with its options, with `valve` actions.
+            servo: gains of the joint servo.
+            integral_gain: gain of the integral term [1/s^2].
         """
         machine, self._dt = setup.machine, step_time(setup)
         self._axes, self._integral_gain = setup.axes, integral_gain
@@ -231,27 +231,27 @@ class ValveLaw:
         self._supply = columns(setup, "pressure_supply", [""] if names else [])
 
     def begin(self, count: int) -> None:
-        """Start `count` episodes."""
+        """Allocate the state of `count` episodes."""
         shape = (count, len(self._axes))
         self._load, self._integral, self._out = (np.zeros(shape) for _ in range(3))
         self._fresh = np.ones(count, bool)
 
     def reset(self, mask: np.ndarray) -> None:
-        """Forget the episodes of mask (n,)."""
+        """Reset the state of the episodes selected by the mask (n,)."""
         self._fresh |= mask
 
     def __call__(
         self, observation: np.ndarray, reference: np.ndarray, rate_ahead: np.ndarray
     ) -> np.ndarray:
-        """Actions of this step.
+        """Return the actions of this step.
 
         Args:
             observation: (n, o).
-            reference: (n, k) positions asked for now [rad] or [m].
-            rate_ahead: (n, k) rates asked for, ahead by the spool's lag [rad/s] or [m/s].
+            reference: (n, k) reference positions [rad] or [m].
+            rate_ahead: (n, k) reference rates, advanced by the spool lag [rad/s] or [m/s].
 
         Returns:
-            (n, k).
+            (n, k) actions.
         """
         seen, joint = observation.astype(float), observation[:, self._joint].astype(float)
         head, rod = np.zeros_like(joint), np.zeros_like(joint)
@@ -261,7 +261,7 @@ class ValveLaw:
         self._load[self._fresh], self._integral[self._fresh] = force[self._fresh], 0.0
         self._out[self._fresh], self._fresh[:] = 0.0, False
         limit = self._numbers[:, 6]
-        free = np.abs(self._out) < limit  # a drive at its limit winds nothing up
+        free = np.abs(self._out) < limit  # anti-windup for a saturated drive
         self._integral += self._integral_gain * self._dt * free * (reference - joint)
         np.clip(self._integral, -_MOST, _MOST, out=self._integral)
         servo_commands(

@@ -1,6 +1,7 @@
-"""Grading as an operator does it: cut along the plane, curl, carry out, dump beyond, again.
+"""Reference controller of the task `Grade`: repeated passes that cut, curl, carry and dump.
 
-Actions of any kind that bring the tip along a pose and its rate.
+`Grade` plans the tip pose with a state machine. `PoseFollower` converts the reference pose and its
+rate to actions of the chosen kind.
 """
 
 import numpy as np
@@ -19,16 +20,16 @@ from hydrotele.envs.episode import ARM
 from hydrotele.envs.facts import ACCELERATION, POSE_ACCELERATIONS, TaskSetup, full_rate
 from hydrotele.envs.grade import FAR, MIDDLE, NEAR, POINTS, grade_radii
 
-_INTEGRAL = 2.0  # 1/s^2
-_JOINTS = (6.0, 1.0)  # 1/s: of the model's place to the goal, of the model to what is measured
-_POSE = (4.0, 1.0)
+_INTEGRAL = 2.0  # 1/s^2, integral gain of valve actions
+_JOINTS = (6.0, 1.0)  # 1/s, gains of `RateFeedback` for joints: tracking, model correction
+_POSE = (4.0, 1.0)  # 1/s, the same for the tip pose
 
 
 class PoseFollower:
-    """The tip of an arm without axes beyond it, on a pose that moves."""
+    """Track a moving tip pose with an arm that has no further driven axes."""
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Look up the nominal machine."""
+        """Read the parameters of the nominal machine."""
         k = setup.arm_axes
         self._arm, _, self._ranges = arm_facts(setup.machine)
         self._dt, self._k = step_time(setup), k
@@ -47,25 +48,25 @@ class PoseFollower:
         self._by_pose = setup.options.action == "resolved_motion"
 
     def begin(self, count: int) -> None:
-        """Start `count` episodes."""
+        """Allocate the state of `count` episodes."""
         (self._law or self._asked).begin(count)  # pyright: ignore - one of them is there
         self._q, self._fresh = np.zeros((count, self._k)), np.ones(count, bool)
 
     def reset(self, mask: np.ndarray) -> None:
-        """Forget the episodes of mask (n,)."""
+        """Reset the state of the episodes selected by the mask (n,)."""
         (self._law or self._asked).reset(mask)  # pyright: ignore - one of them is there
         self._fresh |= mask
 
     def __call__(self, observation: np.ndarray, pose: np.ndarray, rate: np.ndarray) -> np.ndarray:
-        """Actions of this step.
+        """Return the actions of this step.
 
         Args:
             observation: (n, o).
-            pose: (n, k) where the tip should be.
-            rate: (n, k) the rate there.
+            pose: (n, k) reference pose of the tip.
+            rate: (n, k) rate of the reference pose.
 
         Returns:
-            (n, k).
+            (n, k) actions.
         """
         if self._by_pose:
             assert self._asked
@@ -85,34 +86,34 @@ class PoseFollower:
 OVER, LOWER, DRAW, CURL, CARRY, DUMP = range(6)
 R, Z, ATTITUDE = range(3)
 _DEGREE = np.pi / 180.0
-_DEEP = 0.15  # m, of one cut
-_UNEVEN = 0.03  # m of a part's error that is worth a pass
-_FLAT = 0.027  # m of error with which it waits
-_LEAD, _TRAIL = 0.20, 0.10  # m by which a pass begins before and ends behind what is uneven
-_FULL = 800.0  # kg
-_CLEAR, _HIGH = 0.5, 1.0  # m over the plane: of the edge before a pass, of a load carried
+_DEEP = 0.15  # m, maximum depth of one cut
+_UNEVEN = 0.03  # m, minimum section error that starts a pass
+_FLAT = 0.027  # m, RMS error below which the controller waits
+_LEAD, _TRAIL = 0.20, 0.10  # m by which a pass starts before and stops behind the uneven part
+_FULL = 800.0  # kg, mass carried that ends a cut
+_CLEAR, _HIGH = 0.5, 1.0  # m above the plane: edge before a pass, carried load
 _CUTS = (NEAR, FAR + _LEAD), (-121.0 * _DEGREE, -106.0 * _DEGREE)  # radius -> attitude of a cut
-_HELD, _EMPTY = -165.0 * _DEGREE, -85.0 * _DEGREE
-_FAST = np.array([0.45, 0.35, 0.45])  # m/s, m/s, rad/s
-_CURLED = np.array([0.45, 0.25, 0.30])  # while boom and stick lift, the bucket's own rate is more
+_HELD, _EMPTY = -165.0 * _DEGREE, -85.0 * _DEGREE  # attitudes of a carrying and an empty bucket
+_FAST = np.array([0.45, 0.35, 0.45])  # m/s, m/s, rad/s, maximum rates of r, z, attitude
+_CURLED = np.array([0.45, 0.25, 0.30])  # the same while curling, where boom and stick also move
 _DRAWN, _LOWERED, _SUNK = 0.30, 0.20, 0.15  # m/s along the plane, in the air, into the soil
-_TOUCH = 0.03  # m of the edge over the ground, from which on it is drawn
-_CHANGE = np.array([0.8, 0.8, 0.8])  # m/s^2, m/s^2, rad/s^2
-_RAISED = 0.4  # m/s, of the edge that follows the ground upwards
-_GAIN = 2.0  # 1/s
-_LEADS = np.array([0.20, 0.08, 0.25])  # m, m, rad by which the reference may lead the tip
-_STALLED = 2.0  # s
+_TOUCH = 0.03  # m, height of the edge above the ground at which a cut starts
+_CHANGE = np.array([0.8, 0.8, 0.8])  # m/s^2, m/s^2, rad/s^2, maximum accelerations
+_RAISED = 0.4  # m/s, maximum upward speed of the edge during a cut
+_GAIN = 2.0  # 1/s, position gain of the reference motion
+_LEADS = np.array([0.20, 0.08, 0.25])  # m, m, rad, maximum lead of the reference over the tip
+_STALLED = 2.0  # s, minimum time of a cut before it counts as stalled
 _ATTITUDES = np.array([-180.0, -170.0, -140.0, -125.0, -115.0, -105.0, -90.0, -60.0]) * _DEGREE
-_FARTHEST = np.array([5.35, 5.55, 6.00, 6.30, 6.50, 6.75, 7.10, 7.75]) - 0.05  # m
-_OPEN = 0.10  # m by which the opening bucket may lag behind the reach
-_NEAREST = np.array([3.0, 3.0, 3.0, 3.45, 3.86, 4.30, 5.10, 6.70]) + 0.05  # m
+_FARTHEST = np.array([5.35, 5.55, 6.00, 6.30, 6.50, 6.75, 7.10, 7.75]) - 0.05  # m, at _ATTITUDES
+_OPEN = 0.10  # m by which the opening of the bucket may lag behind the reach
+_NEAREST = np.array([3.0, 3.0, 3.0, 3.45, 3.86, 4.30, 5.10, 6.70]) + 0.05  # m, at _ATTITUDES
 
 
 class Grade:
-    """Passes of the bucket along the plane, at most 0.15 m deep."""
+    """Grade the ground in passes along the plane, each at most 0.15 m deep."""
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Find the columns."""
+        """Look up the observation columns."""
         self._tip = columns(setup, "tip", COORDINATES[:4])
         self._errors = columns(setup, "profile_error", [str(p) for p in range(POINTS)])
         self._mass, self._edge, self._plane, self._slope = (
@@ -123,7 +124,7 @@ class Grade:
         self._radii = np.array(grade_radii())
 
     def begin(self, count: int) -> None:
-        """Start `count` episodes."""
+        """Allocate the state of `count` episodes."""
         self._follow.begin(count)
         self._phase, self._since = np.zeros(count, int), np.zeros(count)
         self._place, self._rate = np.zeros((count, 3)), np.zeros((count, 3))
@@ -131,12 +132,12 @@ class Grade:
         self._fresh = np.ones(count, bool)
 
     def reset(self, mask: np.ndarray) -> None:
-        """Forget the episodes of mask (n,)."""
+        """Reset the state of the episodes selected by the mask (n,)."""
         self._follow.reset(mask)
         self._fresh |= mask
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Actions (n, 4) for observations (n, o)."""
+        """Return the actions (n, 4) for observations (n, o)."""
         seen = observation.astype(float)
         tip, errors = seen[:, self._tip][:, [0, 2, 3]], seen[:, self._errors]
         fresh = self._fresh
@@ -150,7 +151,7 @@ class Grade:
         return self._follow(seen, pose, np.insert(self._rate, 1, 0.0, axis=1))
 
     def _plan(self, tip: np.ndarray, errors: np.ndarray, mass: np.ndarray, edge: np.ndarray):
-        """Go on to the next phase where one is done."""
+        """Switch finished episodes to their next phase, and choose the range of the next pass."""
         self._since += self._dt
         phase, place = self._phase, self._place
         waiting = np.sqrt(np.mean(errors**2, axis=1)) < _FLAT
@@ -176,14 +177,14 @@ class Grade:
             & moved
         )
         passing = done & (phase == OVER)
-        held = (phase == OVER) & ~passing  # where a pass begins is chosen until it does
+        held = (phase == OVER) & ~passing  # the range is updated until the pass starts
         self._first[held] = np.minimum(first[held] + _LEAD, FAR + _LEAD)
         self._last[held] = np.maximum(last[held] - _TRAIL, NEAR - _TRAIL)
         phase[done] = (phase[done] + 1) % 6
         self._since[done] = 0.0
 
     def _goals(self, seen: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where to go (n, 3), and how fast (n, 3)."""
+        """Return the target (r, z, attitude) (n, 3) and the maximum rates (n, 3)."""
         phase, place = self._phase, self._place
 
         def plane(r: np.ndarray) -> np.ndarray:
@@ -197,7 +198,7 @@ class Grade:
         high = plane(np.full(len(seen), MIDDLE)) + _HIGH
         clear = plane(self._first) + _CLEAR
         here = place[:, R]
-        # it opens only as fast as it gets out, so that all soil falls beyond the stretch
+        # the bucket opens only as it extends, so that all soil falls beyond the graded ground
         opened = np.minimum(np.interp(here + _OPEN, _FARTHEST, _ATTITUDES), _EMPTY)
         goal = np.stack([
             np.choose(phase, [self._first, self._first, self._last, np.minimum(here, 5.0),
@@ -215,10 +216,10 @@ class Grade:
         return goal, fast
 
     def _move(self, goal: np.ndarray, fast: np.ndarray, tip: np.ndarray) -> None:
-        """Move the reference on, within reach and not far ahead of the tip."""
+        """Advance the reference within the reach of the arm and its maximum lead over the tip."""
         wanted = np.clip(_GAIN * (goal - self._place), -fast, fast)
         drawn = (self._phase == DRAW) | (self._phase == LOWER)
-        # along the plane, height follows radius without lag
+        # during a cut, the height tracks the plane without lag
         wanted[drawn, Z] = np.clip(8.0 * (goal - self._place)[drawn, Z], -fast[drawn, Z], _RAISED)
         change = _CHANGE * self._dt
         self._rate += np.clip(wanted - self._rate, -change, change)
@@ -233,5 +234,5 @@ class Grade:
 
 
 def grade_controller(setup: TaskSetup) -> Controller:
-    """Controller of Grade for the chosen kind of actions."""
+    """Make the controller of the task `Grade` for the chosen kind of actions."""
     return Grade(setup)

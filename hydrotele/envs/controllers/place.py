@@ -1,7 +1,7 @@
-"""A log picked up and laid down by a sequence of smooth moves that leave the pendulum at rest.
+"""Reference controller of the task `PlaceLog`: a sequence of moves without residual swing.
 
-Every move is a trapezoid of speed whose ramps last one period of the swinging grapple: it swings
-during them, and no longer after them. What goes wrong is begun anew.
+Every move has a trapezoidal speed profile. Its ramps last one period of the grapple's pendulum
+motion, so the grapple does not swing after them. If the log is lost, the sequence starts again.
 """
 
 import math
@@ -21,28 +21,28 @@ from hydrotele.envs.controllers.track import RateFeedback
 from hydrotele.envs.episode import ARM
 from hydrotele.envs.facts import ACCELERATION, POSE_ACCELERATIONS, TaskSetup, full_rate
 
-ABOVE, TAKE, CARRY, LAY = 2.5, 1.34, 2.6, 1.36  # m: heights of the stick's pin over the ground
-SWAY = 0.03  # m by which the closing jaw pushes the grapple to its own side
-PERIOD = 2.0  # s of the pendulum
-SHUT, OPEN = 1.3, 0.0  # rad
-_SPEEDS = np.array([0.35, 0.2, 0.35, 0.5, 0.8])  # m/s, rad/s, m/s, rad/s, rad/s
-_GAINS = (3.0, 0.3)  # 1/s of `RateFeedback`
-_LEAD = 0.06  # s by which valves are opened ahead: the spool's lag and half a step
+ABOVE, TAKE, CARRY, LAY = 2.5, 1.34, 2.6, 1.36  # m, heights of the pin at the stick's tip
+SWAY = 0.03  # m by which the closing jaw pushes the grapple aside
+PERIOD = 2.0  # s, period of the pendulum motion
+SHUT, OPEN = 1.3, 0.0  # rad, jaw angles
+_SPEEDS = np.array([0.35, 0.2, 0.35, 0.5, 0.8])  # m/s, rad/s, m/s, rad/s, rad/s, maximum rates
+_GAINS = (3.0, 0.3)  # 1/s, gains of `RateFeedback`
+_LEAD = 0.06  # s, phase lead of valve actions: the spool lag and half a step
 _R, _THETA, _Z, _TURN, _JAW = range(5)
 GO, DOWN, CLOSE, UP, SLEW, LOWER, RELEASE, LEAVE = range(8)
-_PAUSES = np.array([1.0, 0.3, 0.5, 0.5, 1.0, 0.3, 0.3, 1.0])  # s
+_PAUSES = np.array([1.0, 0.3, 0.5, 0.5, 1.0, 0.3, 0.3, 1.0])  # s after every phase
 
 
 def course(time: np.ndarray, length: np.ndarray, ramp: np.ndarray) -> np.ndarray:
-    """Share of a move that is done.
+    """Return the completed fraction of a move with trapezoidal speed.
 
     Args:
-        time: (n,) since it began [s].
-        length: (n,) time that it would take at full speed [s].
-        ramp: (n,) time of its first ramp, as of its last one [s]; it takes `length + ramp`.
+        time: (n,) time since the start of the move [s].
+        length: (n,) duration of the move at full speed without ramps [s].
+        ramp: (n,) duration of the first and of the last ramp [s]; the move takes `length + ramp`.
 
     Returns:
-        (n,) from 0 to 1: the integral of a box of speed convolved with a box of `ramp`, whose
+        (n,) from 0 to 1: the integral of a box of speed convolved with a box of width `ramp`, whose
         spectrum is zero at the frequency 1 / `ramp`.
     """
 
@@ -54,20 +54,20 @@ def course(time: np.ndarray, length: np.ndarray, ramp: np.ndarray) -> np.ndarray
 
 
 def _nearest(angle: np.ndarray, turn: float) -> np.ndarray:
-    """An angle less whole turns, from -turn/2 to turn/2."""
+    """Return the angle modulo `turn`, from -turn/2 to turn/2."""
     return angle - turn * np.round(angle / turn)
 
 
 def pin_columns(setup: TaskSetup) -> np.ndarray:
-    """Columns (5,) of r, theta and z of the pin, of the grapple's rotation and of its jaw."""
+    """Return the observation columns (5,) of pin r, theta, z, grapple rotation and jaw."""
     return np.concatenate([columns(setup, "tip", ("r", "theta", "z")), position_columns(setup)[3:]])
 
 
 class Moves:
-    """Where the stick's pin, the grapple's rotation and its jaw should be, phase by phase."""
+    """Plan the motion of the stick's pin, the grapple rotation and the jaw, phase by phase."""
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Look up the nominal machine and the columns."""
+        """Read the parameters of the nominal machine and the observation columns."""
         self._aside = float(arm_facts(setup.machine)[0][2])
         self._tip = pin_columns(setup)
         self._log = columns(setup, "log", ("r", "theta", "sin_2_yaw", "cos_2_yaw"))
@@ -78,18 +78,18 @@ class Moves:
         self._dt = step_time(setup)
 
     def begin(self, count: int) -> None:
-        """Start `count` episodes."""
+        """Allocate the state of `count` episodes."""
         self._phase = np.full(count, GO)
         self._time, self._length, self._ramp = (np.zeros(count) for _ in range(3))
         self._from, self._to = np.zeros((count, 5)), np.zeros((count, 5))
         self._fresh = np.ones(count, bool)
 
     def reset(self, mask: np.ndarray) -> None:
-        """Forget the episodes of mask (n,)."""
+        """Reset the state of the episodes selected by the mask (n,)."""
         self._fresh |= mask
 
     def update(self, seen: np.ndarray) -> None:
-        """Go on by one step with observations (n, o)."""
+        """Advance the plan by one step with observations (n, o)."""
         fresh = self._fresh.copy()
         self._to[fresh], self._phase[fresh], self._fresh[:] = seen[fresh][:, self._tip], GO, False
         self._plan(seen, fresh)
@@ -99,18 +99,21 @@ class Moves:
         self._plan(seen, over)
 
     def at(self, ahead: float) -> np.ndarray:
-        """Places (n, 5) `ahead` [s] from now: r [m], theta [rad], z [m], rotation, jaw [rad]."""
+        """Return the reference (n, 5) `ahead` [s] from now: r, z [m], theta, rotation, jaw [rad].
+
+        The columns are r, theta, z, rotation, jaw.
+        """
         share = course(self._time + ahead, self._length, self._ramp)[:, None]
         return self._from + share * (self._to - self._from)
 
     def _next(self, seen: np.ndarray) -> np.ndarray:
-        """Phases (n,) after those that are over."""
+        """Return the phases (n,) that follow the current ones; a lost log leads to RELEASE."""
         following = (self._phase + 1) % (LEAVE + 1)
         lost = (seen[:, self._held] < 0.5) & np.isin(self._phase, (CLOSE, UP, SLEW))
         return np.where(lost, RELEASE, following)
 
     def _plan(self, seen: np.ndarray, which: np.ndarray) -> None:
-        """Begin the moves of the episodes of mask (n,), from where the last ones went."""
+        """Plan the moves of the episodes selected by the mask (n,), from the last targets."""
         if not which.any():
             return
         phase, goes = self._phase[which], self._to[which].copy()
@@ -131,15 +134,15 @@ class Moves:
         self._time[which] = 0.0
 
     def _swing(self, r: np.ndarray, theta: np.ndarray) -> np.ndarray:
-        """Swing angle of the house when the pin is at r, theta: it lies aside of the boom."""
+        """Return the swing angle for a pin at r, theta; the arm has a lateral offset."""
         return theta - np.arcsin(self._aside / r)
 
     def _over_log(self, seen: np.ndarray, goes: np.ndarray) -> np.ndarray:
-        """The open grapple high over the log, its jaws along it."""
+        """Return the target of the open grapple above the log, aligned with it."""
         r, theta, sine, cosine = seen[:, self._log].T
         to = goes.copy()
         swing = self._swing(r, theta)
-        # its pocket's line stands across the arm, and turns with the house and against its motor
+        # the axis of the pocket is across the arm; it rotates with the house, against its motor
         turn = swing + 0.5 * math.pi - 0.5 * np.arctan2(sine, cosine)
         to[:, _TURN] = goes[:, _TURN] + _nearest(turn - goes[:, _TURN], math.pi)
         side = swing - to[:, _TURN]
@@ -150,7 +153,7 @@ class Moves:
         return to
 
     def _over_goal(self, seen: np.ndarray, goes: np.ndarray) -> np.ndarray:
-        """The log, as it lies in the grapple, over its goal and turned as asked."""
+        """Return the target that brings the held log over its goal with the goal yaw."""
         r, theta, sine, cosine = seen[:, self._log].T
         goal_r, goal_theta, goal_sine, goal_cosine = seen[:, self._goal].T
         now, to = seen[:, self._tip], goes.copy()
@@ -168,10 +171,10 @@ class Moves:
 
 
 class PlaceByTip:
-    """Moves by rates of the pin."""
+    """Track the planned moves by rates of the pin (`resolved_motion`)."""
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Look up the nominal machine."""
+        """Read the parameters of the nominal machine."""
         self.moves, self._tip, self._dt = Moves(setup), pin_columns(setup), step_time(setup)
         rates = [full_rate(setup.machine, name) for name in setup.axes[3:]]
         change = np.array([*POSE_ACCELERATIONS[:3], ACCELERATION, ACCELERATION])
@@ -179,17 +182,17 @@ class PlaceByTip:
         self._asked = RateFeedback(setup, fastest, change, _GAINS)
 
     def begin(self, count: int) -> None:
-        """Start `count` episodes."""
+        """Allocate the state of `count` episodes."""
         self.moves.begin(count)
         self._asked.begin(count)
 
     def reset(self, mask: np.ndarray) -> None:
-        """Forget the episodes of mask (n,)."""
+        """Reset the state of the episodes selected by the mask (n,)."""
         self.moves.reset(mask)
         self._asked.reset(mask)
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Actions (n, 5) for observations (n, o)."""
+        """Return the actions (n, 5) for observations (n, o)."""
         seen = observation.astype(float)
         self.moves.update(seen)
         now = self.moves.at(0.0)
@@ -198,10 +201,10 @@ class PlaceByTip:
 
 
 class PlaceByAxes:
-    """Moves by references of the axes, which are followed by their rates or by their valves."""
+    """Track the planned moves by axis rates (`joint_rate`) or valve commands (`valve`)."""
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Look up the nominal machine."""
+        """Read the parameters of the nominal machine."""
         self.moves, self._joint = Moves(setup), position_columns(setup)
         (self._arm, _, self._ranges), self._dt = arm_facts(setup.machine), step_time(setup)
         fastest = np.array([full_rate(setup.machine, axis) for axis in setup.axes])
@@ -210,19 +213,19 @@ class PlaceByAxes:
         self._asked = RateFeedback(setup, fastest, np.full(len(fastest), ACCELERATION), _GAINS)
 
     def begin(self, count: int) -> None:
-        """Start `count` episodes."""
+        """Allocate the state of `count` episodes."""
         for part in (self.moves, self._asked, self._valves):
             if part:
                 part.begin(count)
 
     def reset(self, mask: np.ndarray) -> None:
-        """Forget the episodes of mask (n,)."""
+        """Reset the state of the episodes selected by the mask (n,)."""
         for part in (self.moves, self._asked, self._valves):
             if part:
                 part.reset(mask)
 
     def _axes_at(self, ahead: float, joint: np.ndarray) -> np.ndarray:
-        """Positions (n, 5) of the axes `ahead` [s] from now, when they stand at `joint` (n, 5)."""
+        """Return the axis references (n, 5) `ahead` [s] from now; `joint` (n, 5) is measured."""
         places, q = self.moves.at(ahead), joint[:, :3].copy()
         pose = np.zeros((len(places), ARM))
         pose[:, :3] = places[:, :3]
@@ -230,7 +233,7 @@ class PlaceByAxes:
         return np.hstack([q, places[:, 3:]])
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Actions (n, 5) for observations (n, o)."""
+        """Return the actions (n, 5) for observations (n, o)."""
         seen = observation.astype(float)
         self.moves.update(seen)
         joint = seen[:, self._joint]
@@ -244,5 +247,5 @@ class PlaceByAxes:
 
 
 def place_controller(setup: TaskSetup) -> Controller:
-    """Controller of PlaceLog for the chosen kind of actions."""
+    """Make the controller of the task `PlaceLog` for the chosen kind of actions."""
     return (PlaceByTip if setup.options.action == "resolved_motion" else PlaceByAxes)(setup)

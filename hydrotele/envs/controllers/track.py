@@ -1,8 +1,9 @@
-"""References followed by valves, joint rates or rates of the tip: feedforward and feedback.
+"""Reference controllers that track references by valve commands, joint rates or tip rates.
 
-A tip follows a line or goes to a pose by its own rates, those of the joints, or valves. Its error
-is fed back gently, since hydraulics and servo below are slow and a house that slews on its oil is
-slower still. To a plate of unknown stiffness it comes down slowly, then the error sets the speed.
+The module holds the controllers of `TrackTrajectory`, `StraightLine`, `ReachFeller` and
+`HoldForce`. They combine feedforward and feedback. Feedback gains of the tip are low, since the
+hydraulics and the servo are slow, and slewing on compressible oil is slower still. The force
+controller approaches the plate slowly and then sets the speed from the force error.
 """
 
 import numpy as np
@@ -30,21 +31,21 @@ from hydrotele.envs.track import PREVIEWS
 from hydrotele.scenario.scenario import Servo
 
 SERVO = Servo()
-_INTEGRAL = 2.0  # 1/s^2
-_LEAD = 0.06  # s: the spool's lag and half a step
-_JOINTS = (8.0, 1.0)  # 1/s: of the model's place to the goal, of the model to what is measured
-_POSE = (3.0, 3.0)  # the same of a tip that must often be faster than it may
-_NEAR = 0.02  # s to either side, of a difference quotient
+_INTEGRAL = 2.0  # 1/s^2, integral gain of valve actions
+_LEAD = 0.06  # s, phase lead of valve actions: the spool lag and half a step
+_JOINTS = (8.0, 1.0)  # 1/s, gains of `RateFeedback` for joints: tracking, model correction
+_POSE = (3.0, 3.0)  # 1/s, the same for a tip whose rates often saturate
+_NEAR = 0.02  # s, half width of the central difference quotient
 
 
 class Preview:
-    """References between those that the observation shows, by the polynomial through all of them.
+    """Interpolate the observed references in time by a polynomial.
 
-    Positions at now and the PREVIEWS and the rate now make it one of fourth order.
+    The polynomial of fourth order matches the positions now and at the PREVIEWS, and the rate now.
     """
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Find the columns."""
+        """Look up the observation columns and invert the interpolation matrix."""
         ahead = [f"reference_in_{time * 1000:.0f}_ms" for time in PREVIEWS]
         self._columns = [
             columns(setup, what, setup.axes) for what in ("reference", "reference_rate", *ahead)
@@ -54,7 +55,7 @@ class Preview:
         self._solved = np.linalg.inv(np.array(rows + [[t**p for p in powers] for t in PREVIEWS]))
 
     def at(self, observation: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """References and their rates, (n, k) each, `time` [s] from now."""
+        """Return the references and their rates, (n, k) each, `time` [s] from now."""
         powers = np.arange(len(self._columns))
         place = time**powers @ self._solved
         rate = (powers[1:] * time ** (powers[1:] - 1)) @ self._solved[1:]
@@ -63,7 +64,7 @@ class Preview:
 
 
 class TrackByValves:
-    """The joint servo with an integral, its velocities ahead by the spools' lag."""
+    """Track references by the joint servo with an integral term and a phase lead of the rates."""
 
     def __init__(
         self,
@@ -72,54 +73,70 @@ class TrackByValves:
         integral: float = _INTEGRAL,
         lead: float = _LEAD,
     ) -> None:
-        """Look up the nominal machine."""
+        """Read the parameters of the nominal machine.
+
+        Args:
+            setup: the task with its options.
+            servo: gains of the joint servo.
+            integral: gain of the integral term [1/s^2].
+            lead: phase lead of the reference rates [s].
+        """
         self._law, self._preview = ValveLaw(setup, servo, integral), Preview(setup)
         self._lead = lead
         self.begin, self.reset = self._law.begin, self._law.reset
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Actions (n, k) for observations (n, o)."""
+        """Return the actions (n, k) for observations (n, o)."""
         now, _ = self._preview.at(observation, 0.0)
         _, rate = self._preview.at(observation, self._lead)
         return self._law(observation, now, rate)
 
 
 class RateFeedback:
-    """Rates for loops below that integrate them, by a model of what they were asked for so far.
+    """Compute rate commands for lower control loops, with a model of their references.
 
-    Feedback of the measured error through the loops below can only be slow; that of the model's
-    place, which rates move at once, is fast. The model creeps to what is measured.
+    Feedback of the measured position must be slow, since the lower loops are slow. The model
+    integrates the commanded rates without lag, so its position can be fed back with a high gain.
+    The model is corrected slowly towards the measured position.
     """
 
     def __init__(
         self, setup: TaskSetup, fastest: np.ndarray, accelerations: np.ndarray, gains
     ) -> None:
-        """Remember clocks and limits, both (k,), and gains [1/s]."""
+        """Store clocks, limits and gains.
+
+        Args:
+            setup: the task with its options.
+            fastest: (k,) rates at full action.
+            accelerations: (k,) acceleration limits.
+            gains: position gain of the model, gain of its correction towards the measured position
+                [1/s].
+        """
         self._stiff, self._slow = gains
         self._fastest, self._dt = fastest, step_time(setup)
         self._period, self._ticks = setup.clock.period, setup.clock.ticks
         self._change = accelerations * self._period
 
     def begin(self, count: int) -> None:
-        """Start `count` episodes."""
+        """Allocate the state of `count` episodes."""
         shape = (count, len(self._fastest))
         self._place, self._rate = np.zeros(shape), np.zeros(shape)
         self._fresh = np.ones(count, bool)
 
     def reset(self, mask: np.ndarray) -> None:
-        """Forget the episodes of mask (n,)."""
+        """Reset the state of the episodes selected by the mask (n,)."""
         self._fresh |= mask
 
     def rates(self, measured: np.ndarray, place: np.ndarray, rate: np.ndarray) -> np.ndarray:
-        """Rates to ask for, (n, k), full at +-1.
+        """Return the rate commands, scaled to +-1.
 
         Args:
-            measured: (n, k) places as measured.
-            place: (n, k) where they should be.
-            rate: (n, k) the rate there.
+            measured: (n, k) measured positions.
+            place: (n, k) reference positions.
+            rate: (n, k) reference rates.
 
         Returns:
-            (n, k).
+            (n, k) commands.
         """
         self._place[self._fresh] = measured[self._fresh]
         self._rate[self._fresh], self._fresh[:] = 0.0, False
@@ -133,33 +150,33 @@ class RateFeedback:
 
 
 class TrackByJointRates:
-    """Joint references by their rates."""
+    """Track joint references by joint rates."""
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Look up the nominal machine."""
+        """Read the parameters of the nominal machine."""
         self._preview, self._joint = Preview(setup), position_columns(setup)
         fastest = np.array([full_rate(setup.machine, axis) for axis in setup.axes])
         self._asked = RateFeedback(setup, fastest, np.full(len(fastest), ACCELERATION), _JOINTS)
         self.begin, self.reset = self._asked.begin, self._asked.reset
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Actions (n, k) for observations (n, o)."""
+        """Return the actions (n, k) for observations (n, o)."""
         measured = observation[:, self._joint].astype(float)
         return self._asked.rates(measured, *self._preview.at(observation, 0.0))
 
 
 class TrackByResolvedMotion:
-    """The pose of the references, through the arm's kinematics, by its rates."""
+    """Track the tip pose of the joint references by tip rates."""
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Look up the nominal machine.
+        """Read the parameters of the nominal machine.
 
         Raises:
-            InputError: axes beyond the arm's are driven.
+            InputError: the task drives axes that do not belong to the arm.
         """
         k = setup.arm_axes
         if k < len(setup.axes):
-            raise InputError(f"task {setup.task.name}", "drives axes beside the arm's")
+            raise InputError(f"task {setup.task.name}", "drives axes that are not part of the arm")
         self._preview, self._arm = Preview(setup), arm_facts(setup.machine)[0]
         self._tip = columns(setup, "tip", COORDINATES[:k])
         fastest = np.array(setup.task.pose_rates[:k])
@@ -167,14 +184,14 @@ class TrackByResolvedMotion:
         self.begin, self.reset = self._asked.begin, self._asked.reset
 
     def _pose(self, observation: np.ndarray, time: float) -> np.ndarray:
-        """Pose (n, k) of the references `time` [s] from now."""
+        """Return the tip pose (n, k) of the references `time` [s] from now."""
         q = self._preview.at(observation, time)[0]
         pose = np.zeros((len(q), ARM))
         forward_poses(self._arm, np.ascontiguousarray(q), pose)
         return pose[:, : q.shape[1]]
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Actions (n, k) for observations (n, o)."""
+        """Return the actions (n, k) for observations (n, o)."""
         after = self._pose(observation, _NEAR)
         before = self._pose(observation, -_NEAR)
         measured = observation[:, self._tip].astype(float)
@@ -183,23 +200,28 @@ class TrackByResolvedMotion:
 
 
 def track_controller(setup: TaskSetup) -> Controller:
-    """Controller of TrackTrajectory for the chosen kind of actions."""
+    """Make the controller of the task `TrackTrajectory` for the chosen kind of actions."""
     kinds = {"valve": TrackByValves, "joint_rate": TrackByJointRates}
     return kinds.get(setup.options.action or "", TrackByResolvedMotion)(setup)
 
 
-_LINE_GAIN = 0.5  # 1/s
-_REACH_GAINS = (1.0, 0.45, 1.0, 1.0, 1.0)  # 1/s of r, theta, z, attitude, head
-_JOINT_GAINS = (0.45, 1.0, 1.0, 1.0, 1.0)  # 1/s of the joints, from swing outwards
-_TIP_INTEGRAL = 1.2  # 1/s^2: of valves that must hold a pose against leakage and dead bands
-_GENTLY = 0.6  # share of a joint's full rate that a reach uses
+_LINE_GAIN = 0.5  # 1/s, position gain on a line
+_REACH_GAINS = (1.0, 0.45, 1.0, 1.0, 1.0)  # 1/s, gains of r, theta, z, attitude, head
+_JOINT_GAINS = (0.45, 1.0, 1.0, 1.0, 1.0)  # 1/s, gains of the joints, from swing outwards
+_TIP_INTEGRAL = 1.2  # 1/s^2, integral gain to hold a pose against leakage and dead bands
+_GENTLY = 0.6  # maximum joint rate of a reach, as a fraction of the full rate
 
 
 class Tip:
-    """Pose and rates of the tip into actions of the chosen kind."""
+    """Base of the controllers that track a tip pose with any kind of actions."""
 
     def __init__(self, setup: TaskSetup, integral: float = 0.0) -> None:
-        """Look up the nominal machine; the gain of the valves' integral is in [1/s^2]."""
+        """Read the parameters of the nominal machine.
+
+        Args:
+            setup: the task with its options.
+            integral: integral gain of valve actions [1/s^2].
+        """
         k = self._k = setup.arm_axes
         self._kind = setup.options.action
         self._arm, _, self._ranges = arm_facts(setup.machine)
@@ -212,17 +234,17 @@ class Tip:
         )
 
     def begin(self, count: int) -> None:
-        """Start `count` episodes."""
+        """Allocate the state of `count` episodes."""
         if self._valves:
             self._valves.begin(count)
 
     def reset(self, mask: np.ndarray) -> None:
-        """Forget the episodes of mask (n,)."""
+        """Reset the state of the episodes selected by the mask (n,)."""
         if self._valves:
             self._valves.reset(mask)
 
     def joints(self, observation: np.ndarray, pose: np.ndarray) -> np.ndarray:
-        """Joint angles (n, k) for poses (n, k)."""
+        """Return the joint angles (n, k) for poses (n, k)."""
         found = np.ascontiguousarray(observation[:, self._joint], float)
         whole = np.zeros((len(pose), ARM))
         whole[:, : self._k] = pose
@@ -231,10 +253,10 @@ class Tip:
 
 
 class LineController(Tip):
-    """Follows the line by the rate shortly ahead and the error of now."""
+    """Track a line by the reference rate shortly ahead and the current error."""
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Find the columns."""
+        """Look up the observation columns."""
         super().__init__(setup)
         self._wanted = columns(setup, "wanted", COORDINATES[: self._k])
         self._ahead = [
@@ -243,7 +265,7 @@ class LineController(Tip):
         ]
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Actions (n, k) for observations (n, o)."""
+        """Return the actions (n, k) for observations (n, o)."""
         seen = observation.astype(float)
         wanted = seen[:, self._wanted]
         later = [np.concatenate([seen[:, c], wanted[:, 3:]], axis=1) for c in self._ahead]
@@ -259,10 +281,10 @@ class LineController(Tip):
 
 
 class ReachController(Tip):
-    """Goes to the pose, the slower the nearer."""
+    """Move to a pose with a rate proportional to the remaining error."""
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Find the columns."""
+        """Look up the observation columns."""
         super().__init__(setup, _TIP_INTEGRAL)
         self._wanted = columns(setup, "wanted", COORDINATES[: self._k])
         servo = setup.task.servo
@@ -270,7 +292,7 @@ class ReachController(Tip):
         self._stiff = np.array(gains)
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Actions (n, k) for observations (n, o)."""
+        """Return the actions (n, k) for observations (n, o)."""
         seen = observation.astype(float)
         wanted = seen[:, self._wanted]
         if self._kind == "resolved_motion":
@@ -286,43 +308,43 @@ class ReachController(Tip):
 
 
 def line_controller(setup: TaskSetup) -> Controller:
-    """Controller of StraightLine for the chosen kind of actions."""
+    """Make the controller of the task `StraightLine` for the chosen kind of actions."""
     return LineController(setup)
 
 
 def reach_controller(setup: TaskSetup) -> Controller:
-    """Controller of ReachFeller for the chosen kind of actions."""
+    """Make the controller of the task `ReachFeller` for the chosen kind of actions."""
     return ReachController(setup)
 
 
-_TOUCH = 1.5e3  # N: what the load cell does not read by error
-_APPROACH, _MOST = 0.08, 0.10  # m/s
-_GAIN = 2.0e-6  # m/s per N: two per second on 1e6 N/m
+_TOUCH = 1.5e3  # N, measured force that counts as contact, above the error of the load cell
+_APPROACH, _MOST = 0.08, 0.10  # m/s, speed without contact, maximum speed with contact
+_GAIN = 2.0e-6  # m/s per N: a loop gain of 2 /s on 1e6 N/m
 
 
 class Press:
-    """The rate of the tip's height from the error of the force; nothing is remembered."""
+    """Set the vertical speed of the tip proportional to the force error."""
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Find the columns.
+        """Look up the observation columns.
 
         Raises:
-            InputError: actions are not rates of the tip.
+            InputError: the actions are not tip rates.
         """
         if setup.options.action != "resolved_motion":
-            raise InputError(f"action {setup.options.action!r}", "presses by resolved_motion only")
+            raise InputError(f"action {setup.options.action!r}", "must be resolved_motion")
         self._force = columns(setup, "force", [""])[0]
         self._wanted = columns(setup, "wanted_force", [""])[0]
         self._fastest, self._actions = setup.task.pose_rates[2], len(setup.axes)
 
     def begin(self, count: int) -> None:
-        """Nothing to remember."""
+        """Do nothing: the controller has no state."""
 
     def reset(self, mask: np.ndarray) -> None:
-        """Nothing to forget."""
+        """Do nothing: the controller has no state."""
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Actions (n, k) for observations (n, o)."""
+        """Return the actions (n, k) for observations (n, o)."""
         force, wanted = observation[:, self._force], observation[:, self._wanted]
         speed = np.clip(_GAIN * (force - wanted), -_MOST, _MOST)
         actions = np.zeros((len(observation), self._actions))
@@ -331,5 +353,5 @@ class Press:
 
 
 def press_controller(setup: TaskSetup) -> Controller:
-    """Controller of HoldForce, whose actions must be rates of the tip."""
+    """Make the controller of the task `HoldForce`; its actions must be `resolved_motion`."""
     return Press(setup)
