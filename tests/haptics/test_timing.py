@@ -114,7 +114,7 @@ def test_report_says_whose_the_missed_deadlines_are(alone, own, said):
         assert words in sentence
     stolen = computer_sentences({"ticks": 1, "missed": 0},
                                 {"stolen_seconds": 0.4, "stolen_share": 0.02})  # fmt: skip
-    assert stolen == ["time stolen by the host meanwhile: 0.4 s, 2 % of all cores"]
+    assert stolen == ["processor time taken by the host: 0.4 s, 2 % of all cores"]
 
 
 def test_garbage_is_collected_again_afterwards():

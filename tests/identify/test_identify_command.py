@@ -80,7 +80,7 @@ def test_the_identified_machine_runs_and_replays(identified, site, tmp_path):
 def test_words_for_people(site, tmp_path):
     done = call("identify", "--data", site, "--out", tmp_path / "found", "--reduced")
     assert done.exit_code == 0, done.output
-    assert "what the data tell" in done.output and "not fitted" in done.output
+    assert "identified parameters" in done.output and "not fitted" in done.output
 
 
 def test_a_foreign_folder_is_not_replaced(site, tmp_path):
