@@ -103,7 +103,7 @@ def test_stolen_time_is_the_kernels(tmp_path):
 
 @pytest.mark.parametrize(
     ("alone", "own", "said"),
-    [(5, 5, []), (50, 80, ["cannot hold 0.1 %"]), (5, 40, ["the rest of the 0.4 %"])],
+    [(5, 5, []), (50, 80, ["limit of 0.1 %"]), (5, 40, ["remainder of the 0.4 %"])],
 )
 def test_report_says_whose_the_missed_deadlines_are(alone, own, said):
     computer = {"seconds": 10.0, "ticks": 10000, "missed": alone,
