@@ -138,7 +138,7 @@ def tiles(half_size: float, count: int) -> tuple[Mesh, np.ndarray]:
 
 
 def moved(mesh: Mesh, position, rotation) -> Mesh:
-    """Return a mesh that is rotated by `rotation` (3, 3), then translated by `position` (3,) [m]."""
+    """Return a mesh rotated by `rotation` (3, 3), then translated by `position` (3,) [m]."""
     rotation = np.asarray(rotation).reshape(3, 3)
     return Mesh(
         mesh.vertices @ rotation.T + np.asarray(position),
@@ -265,7 +265,7 @@ def _geom_mesh(model: mujoco.MjModel, geom: int) -> Mesh | None:
 
 
 def _file_mesh(model: mujoco.MjModel, mesh: int) -> Mesh:
-    """Return a mesh asset with separate vertices per triangle, as normals have their own indices."""
+    """Return a mesh asset with separate vertices per triangle; normals are indexed separately."""
     first = model.mesh_faceadr[mesh]
     faces = slice(first, first + model.mesh_facenum[mesh])
     corners = model.mesh_vert[model.mesh_vertadr[mesh] + model.mesh_face[faces]]
