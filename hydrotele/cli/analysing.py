@@ -57,7 +57,8 @@ _LEGEND = (
     " loop is stable; higher is better, and below 1 the loop is unstable\n"
     "max delay: one-way delay up to which the loop is stable; higher is better; >: largest delay"
     " that was tested\n"
-    "scattering norm: maximum over frequency; the two-port is passive if it does not exceed 1"
+    "norm: maximum norm of the scattering matrix over frequency; the two-port is passive if it does"
+    " not exceed 1"
 )
 _ROBUST_LEGEND = (
     "pairs held: random pairs of operator and task with which the loop is stable; pairs released:"
@@ -196,8 +197,8 @@ def _print(found: Findings) -> None:
     case = found.case
     delays = f"{1e3 * case.delay_forward:g} ms forward, {1e3 * case.delay_back:g} ms back"
     title = f"{found.name}, delay {delays}"
-    rows = table(title, "structure", "held", "released", "gain margin", "max delay",
-                 "scattering norm", "passive")  # fmt: skip
+    rows = table(title, "structure", "held", "released", "gain margin", "max delay", "norm",
+                 "passive")  # fmt: skip
     for one in found.analyses:
         rows.add_row(
             one.structure, _verdict(why_unstable(one)), _verdict(why_unstable(one, True)),

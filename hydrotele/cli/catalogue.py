@@ -22,7 +22,7 @@ def list_things(what: str, as_json: bool) -> None:
     """Print the available machines, joysticks, scenarios, sweeps, effects or environments.
 
     Args:
-        what: kind of the items in the plural, or `all`.
+        what: kind of the items, such as `machines`, or `all`.
         as_json: print JSON instead of tables.
 
     Raises:
