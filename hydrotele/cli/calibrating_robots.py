@@ -478,7 +478,7 @@ MEASUREMENT = "hybrid measurement"
 CRITERIA = ("D", "O1", "O2", "O3", "O4", "O5")
 CANDIDATES = 200  # number of random poses from which the most informative are selected
 NOISE = {"leg": 1e-5, "slide": 1e-5, "turn": 2e-5, "wire": 2e-5}  # m, rad: models/iwr/README.md
-BOX = 8.0  # half width of the search box, in standard deviations of the manufacturing errors
+BOX = 8.0  # half width of the search box, in expected sizes of the manufacturing errors
 
 
 def calibrate_hybrid(

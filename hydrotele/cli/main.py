@@ -113,7 +113,7 @@ Examples:  hydrotele drive   |   hydrotele drive fell_tree --device gamepad
            hydrotele drive --device haptic:127.0.0.1:5610   |   hydrotele drive --latency
 
 \b
-Keyboard: each key press changes the command of an axis by a quarter of its full range. The command
+Keyboard: each key press changes the command of an axis by a quarter of its maximum. The command
 then stays constant; the space bar sets all commands to zero.
   Up, Down: out, in        Left, Right: swing    Page Up, Page Down: raise, lower
   End, Home: curl in, out  Insert, Delete: head  7, 6 and 9, 8: additional axes (grab, saw) up, down

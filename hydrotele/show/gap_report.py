@@ -53,11 +53,11 @@ _CANDIDATES = 12
 _DARKEST = 10.0  # times sensor noise at which the colour of a cell is darkest
 _CHANNELS = 4
 _CHIPS = {
-    "named": "Effect named",
+    "named": "Effect identified",
     "no_gap": "No gap",
     "ambiguous": "Ambiguous",
     "unknown": "Unknown effect",
-    "partly": "Partly named",
+    "partly": "Partly identified",
 }
 
 

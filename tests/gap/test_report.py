@@ -117,7 +117,7 @@ def test_an_unknown_has_its_section(page_of):
 def test_a_partly_named_gap_shows_calibration_laws_and_what_is_left(page_of):
     page, _ = page_of("partly")
     for piece in (
-        "Partly named", "63 %", "Calibrated parameters", "valve gain of the boom: ratio",
+        "Partly identified", "63 %", "Calibrated parameters", "valve gain of the boom: ratio",
         "103.5", "Laws learned from the data", "Force on the boom drive over position",
         "-3e+05 above(position, 0.55)", "31 % of the gap", "Residual forces", "2.1 kN",
         "Noise of the measurements", "not stated", "1.20",
