@@ -1,7 +1,7 @@
 """Implement `hydrotele calibrate mukca`, `scara` and `hybrid`.
 
-`mukca` calibrates a serial robot whose ball tool is held in sockets, `scara` an arm with two links
-from measured positions, and `hybrid` a serial robot that carries a hexapod from measured poses.
+`mukca` calibrates a serial robot whose ball tool is held in sockets. `scara` calibrates an arm with
+two links from measured positions. `hybrid` calibrates a serial robot that carries a hexapod.
 """
 
 import json
