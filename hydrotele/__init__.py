@@ -1,8 +1,8 @@
 """Simulation and teleoperation testbed for heavy hydraulic machines, built on MuJoCo.
 
-The names in `__all__` are the public ones, each imported when it is first used; what is in the
-modules below may move. `docs/api.md` lists them; `hydrotele/__init__.pyi` tells them to
-type checkers.
+The public names are those in `__all__`; each is imported on first use. The submodules are private
+and may change. `docs/api.md` documents the public names, and `hydrotele/__init__.pyi` declares
+them for type checkers.
 """
 
 import contextlib
@@ -15,16 +15,17 @@ _CONFIGURATION = {"numba": ".numba_config.yaml", "matplotlib": "matplotlibrc"}
 
 
 def _ignore_configuration() -> None:
-    """Keep libraries from taking their configuration from the working folder: it holds data.
+    """Prevent numba and matplotlib from reading a configuration file in the working folder.
 
-    numba's may name a cache, which is code, and matplotlib's may name programs. Where such a file
-    lies there, the library is imported from another folder, and does not look again.
+    The working folder holds data, which must not be able to run code. A numba file can name a
+    folder of compiled code, and a matplotlib file can name programs. If such a file exists, the
+    library is imported from another folder.
     """
     for library, file in _CONFIGURATION.items():
         if os.path.lexists(file):
             with contextlib.chdir(os.path.dirname(__file__)):
                 import_module(library)
-            if library == "numba":  # it reads the file again for each function that it compiles
+            if library == "numba":  # reads the file again for each function it compiles
                 vars(import_module("numba.core.config"))["_config_fname"] = os.devnull
 
 

@@ -1,4 +1,4 @@
-"""`python -m hydrotele` is the command `hydrotele`."""
+"""Run the command `hydrotele` by `python -m hydrotele`."""
 
 from hydrotele.cli.start import main
 

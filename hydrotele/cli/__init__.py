@@ -1,1 +1,1 @@
-"""The command line: one module per command."""
+"""Command-line interface: one module for each command or group of commands."""

@@ -1,6 +1,7 @@
-"""`hydrotele analyse teleop`: a teleoperator as a two-port, with hand, task and delays.
+"""Implement `hydrotele analyse teleop`: analyse a linear teleoperator or a scenario.
 
-`hydrotele analyse teleop SCENARIO`: the linear loop of a teleoperated scenario.
+A case describes a teleoperator as a two-port with operator, task and delays. A scenario is
+linearised about its contact pose, and its force-reflection loop is analysed.
 """
 
 import math
@@ -50,22 +51,34 @@ from hydrotele.teleop.switching import Spring
 from hydrotele.teleop.two_port import STRUCTURES
 
 _LEGEND = (
-    "stable: with the task and free, in the operator's hand; let go: without a hand\n"
-    "margin: factor on what comes back (force, or the slave's motion) up to which it stays stable;"
-    " below 1 it has to be made that much smaller\n"
-    "delay: each way, up to which it stays stable; >: the largest that was tried\n"
-    "norm: of the scattering matrix, largest that is drawn; passive only if it is nowhere above 1"
+    "held: stability with the operator's hand on the handle, in contact with the task and in free"
+    " motion; released: the same without a hand\n"
+    "gain margin: factor on the reflected signal (force, or motion of the slave) up to which the"
+    " loop is stable; higher is better, and below 1 the loop is unstable\n"
+    "max delay: one-way delay up to which the loop is stable; higher is better; >: largest delay"
+    " that was tested\n"
+    "norm: maximum norm of the scattering matrix over frequency; the two-port is passive if it does"
+    " not exceed 1"
 )
 _ROBUST_LEGEND = (
-    "operators: drawn hands and tasks with which it is stable; let go: the same tasks, no hand\n"
-    "Llewellyn: least stability parameter; from 1 on every passive hand and task is safe\n"
-    "Z-width: decades between what is felt free and with a clamped slave, 0.1 to 5 Hz\n"
-    "stiffest task: N/m, with the hand and let go; >: the stiffest that was tried"
+    "pairs held: random pairs of operator and task with which the loop is stable; pairs released:"
+    " the same tasks without a hand; higher is better\n"
+    "Llewellyn: minimum of the stability parameter; at 1 or more, the loop is stable with every"
+    " passive operator and task\n"
+    "Z-width: ratio, in decades, of the impedances felt with a clamped and with a free slave, 0.1"
+    " to 5 Hz; higher is better\n"
+    "max task: largest stable task stiffness [N/m], held / released; >: largest that was tested"
 )
 
 
 class Robustly(NamedTuple):
-    """How robustness is asked for: period [s], file of measured delays, drawn hands and tasks."""
+    """Options of the robustness analysis.
+
+    Attributes:
+        period: sampling period [s].
+        delays: CSV file of measured delays, None for the delays of the case.
+        operators: number of random pairs of operator and task.
+    """
 
     period: float = 0.005
     delays: Path | None = None
@@ -76,19 +89,21 @@ def analyse_teleop_to_folder(
     file: Path | None, target: Path | None, structures: Sequence[str], delay: float | None,
     confirm: bool, as_json: bool, robustly: Robustly | None = None,
 ) -> Path | None:  # fmt: skip
-    """Analyse a teleoperator; write report and figures into a folder, whole or not at all.
+    """Analyse a teleoperator case, print the result and write a report with figures.
+
+    The output folder is written completely or not at all.
 
     Args:
-        file: case, None for the shipped one.
-        target: folder, default `runs/analyse_<name>`; with `as_json` none.
-        structures: instead of the case's; none for those.
-        delay: each way, instead of the case's [s].
-        confirm: whether to simulate what is predicted.
-        as_json: print `analysis.json` instead of words.
-        robustly: how to find what it withstands, None not to.
+        file: case file, None for the shipped case.
+        target: output folder, default `runs/analyse_<name>`, or none with `as_json`.
+        structures: control structures to analyse; if empty, those of the case.
+        delay: one-way delay [s], None for that of the case.
+        confirm: whether to verify the predictions by simulation.
+        as_json: print `analysis.json` instead of text.
+        robustly: options of the robustness analysis, None to omit it.
 
     Returns:
-        The folder, None where none was written.
+        The output folder, None if nothing was written.
 
     Raises:
         InputError: case, structures, delay or target are not usable.
@@ -110,18 +125,18 @@ def analyse_case(
     facts: TeleopCase, structures: Sequence[str], delay: float | None, confirm: bool, quiet: bool,
     robustly: Robustly | None = None,
 ) -> Findings:  # fmt: skip
-    """Analyse a case.
+    """Analyse a teleoperator case.
 
     Args:
-        facts: the case.
-        structures: instead of the case's; none for those.
-        delay: each way, instead of the case's [s].
-        confirm: whether to simulate what is predicted.
-        quiet: no bar.
-        robustly: how to find what it withstands, None not to.
+        facts: specification of the case.
+        structures: control structures to analyse; if empty, those of the case.
+        delay: one-way delay [s], None for that of the case.
+        confirm: whether to verify the predictions by simulation.
+        quiet: whether to omit the progress bar.
+        robustly: options of the robustness analysis, None to omit it.
 
     Returns:
-        What was found.
+        Stability, margins and passivity of each structure.
 
     Raises:
         InputError: structures or delay are not usable.
@@ -149,14 +164,14 @@ def analyse_case(
         robust = []
         for one in names or (*facts.structures, *SAMPLED_STRUCTURES[len(STRUCTURES) :]):
             if progress:
-                progress(f"{one}, what it withstands", len(robust) / len(SAMPLED_STRUCTURES))
+                progress(f"robustness of {one}", len(robust) / len(SAMPLED_STRUCTURES))
             spread = spread_of(facts)
             robust.append(robustness(case, one, line, spread, robustly.operators))
         return replace(found, robust=tuple(robust), period=robustly.period)
 
 
 def _line(case: Case, robustly: Robustly) -> PacketAges:
-    """Ages of packets: measured, or of the case's own delays."""
+    """Return the packet ages from measured delays, or from the constant delays of the case."""
     if not 1e-4 <= robustly.period <= 0.1:
         raise InputError("--period", f"must be from 0.0001 to 0.1 s, got {robustly.period:g}")
     if not 1 <= robustly.operators <= 10_000:
@@ -182,7 +197,8 @@ def _print(found: Findings) -> None:
     case = found.case
     delays = f"{1e3 * case.delay_forward:g} ms forward, {1e3 * case.delay_back:g} ms back"
     title = f"{found.name}, delay {delays}"
-    rows = table(title, "structure", "stable", "let go", "margin", "delay", "norm", "passive")
+    rows = table(title, "structure", "held", "released", "gain margin", "max delay", "norm",
+                 "passive")  # fmt: skip
     for one in found.analyses:
         rows.add_row(
             one.structure, _verdict(why_unstable(one)), _verdict(why_unstable(one, True)),
@@ -204,9 +220,10 @@ def _verdict(words: str) -> str:
 
 
 def _print_robust(found: Findings) -> None:
-    title = f"sampled every {1e3 * found.period:g} ms, with the line's jitter"
-    rows = table(title, "structure", "hand, task", "hand, free", "let go, task", "let go, free",
-                 "operators", "let go", "Llewellyn", "Z-width", "stiffest task")  # fmt: skip
+    title = f"robustness with sampling every {1e3 * found.period:g} ms and jitter of the delays"
+    rows = table(title, "structure", "held, task", "held, free", "released, task",
+                 "released, free", "pairs held", "pairs released", "Llewellyn", "Z-width",
+                 "max task")  # fmt: skip
     for one in found.robust:
         told = [_verdict("yes" if p.stable else f"no, {p.reason}") for p in one.sampled]
         worst, width = one.worst, one.width
@@ -233,20 +250,22 @@ def _print_springs(found: Findings) -> None:
 
 
 def _print_confirmed(found: Findings) -> None:
-    rows = table("confirmed in simulation", "structure", "sweep, no delay",
-                 "sweep, with delay", "map agrees")  # fmt: skip
+    rows = table("confirmed in simulation", "structure", "sweep error, no delay",
+                 "sweep error, with delay", "map agreement")  # fmt: skip
     for one in found.agreements:
         errors = [format_error(s.error) for s in found.sweeps if s.structure == one.structure]
         rows.add_row(one.structure, *[*errors, "-"][:2], f"{100.0 * one.share:.1f} %")
     out.print(rows)
-    out.print("sweep: largest error of the felt impedance; map: share of its cells", style="dim")
+    out.print("sweep error: largest error of the impedance felt by the operator (lower is better);"
+              " map agreement: fraction of the cells of the stability map in which simulation and"
+              " prediction agree (higher is better)", style="dim")  # fmt: skip
 
 
 _KIND = "loop analysis"
 
 
 def is_scenario(file: Path | None) -> bool:
-    """Whether a name or file is a scenario: shipped, or a YAML file with a pilot."""
+    """Return whether a name is that of a shipped scenario, or a file contains a pilot."""
     if file is None:
         return False
     if str(file) in shipped_scenarios():
@@ -262,19 +281,19 @@ def analyse_any_to_folder(
     confirm: bool, coordinate: str | None, overrides: dict[str, str], as_json: bool,
     robustly: Robustly | None = None,
 ) -> Path | None:  # fmt: skip
-    """Analyse a case or a scenario; see `analyse_teleop_to_folder`, `analyse_scenario_to_folder`.
+    """Analyse a case by `analyse_teleop_to_folder` or a scenario by `analyse_scenario_to_folder`.
 
     Raises:
-        InputError: an option is of the other kind, or as of these two.
+        InputError: an option does not apply to this kind of file, or the analysis raises it.
     """
     if not is_scenario(file):
         if coordinate or overrides:
-            raise InputError("--coordinate, --set", "are for scenarios")
+            raise InputError("--coordinate, --set", "apply to scenarios only")
         return analyse_teleop_to_folder(
             file, target, structures or [], delay, confirm, as_json, robustly
         )
     if structures or delay is not None or confirm or robustly:
-        message = "are for cases; a scenario has its own structure, and delays by --set"
+        message = "apply to cases only; change a scenario by --set"
         raise InputError("--structure, --delay, --confirm, --robust", message)
     return analyse_scenario_to_folder(str(file), target, coordinate, overrides, as_json)
 
@@ -284,13 +303,13 @@ def analyse_scenario(scenario: Scenario, coordinate: str | None = None) -> Scena
 
     Args:
         scenario: the scenario.
-        coordinate: of the arm; that of the operator's force target by default, else z.
+        coordinate: coordinate of the arm; default that of the operator's force target, else z.
 
     Returns:
-        What was found.
+        Stability, margins and limits of the loop.
 
     Raises:
-        InputError: the scenario has no such loop.
+        InputError: the scenario has no force-reflection loop.
     """
     machine = scenario_model(scenario)
     joystick = load_joystick(joystick_of(scenario))
@@ -302,17 +321,19 @@ def analyse_scenario_to_folder(
     name: str, target: Path | None, coordinate: str | None, overrides: dict[str, str],
     as_json: bool,
 ) -> Path | None:  # fmt: skip
-    """Analyse a scenario; write report and map into a folder, whole or not at all.
+    """Analyse the loop of a scenario, print the result and write a report.
+
+    The output folder is written completely or not at all.
 
     Args:
-        name: of the scenario, or its file.
-        target: folder, default `runs/analyse_<name>`; with `as_json` none.
-        coordinate: of the arm, None for the default.
-        overrides: key path -> YAML text.
-        as_json: print `analysis.json` instead of words.
+        name: name or file of the scenario.
+        target: output folder, default `runs/analyse_<name>`, or none with `as_json`.
+        coordinate: coordinate of the arm, None for the default.
+        overrides: scenario overrides, {key path: YAML text}.
+        as_json: print `analysis.json` instead of text.
 
     Returns:
-        The folder, None where none was written.
+        The output folder, None if nothing was written.
 
     Raises:
         InputError: scenario, coordinate or target are not usable.
@@ -337,7 +358,7 @@ def analyse_scenario_to_folder(
 
 
 def findings_table(found: ScenarioFindings) -> list[tuple[str, str, str]]:
-    """What was found in words: (what, value, remark)."""
+    """Return the findings as rows of text: (quantity, value, remark)."""
     case, loop, tip = found.case, found.loop, found.case.tip
     pole, turns = loop.pole, tip.coordinate not in ("r", "z")
     force, mass, oil = ("N m", "kg m^2", "N m/rad") if turns else ("N", "kg", "N/m")
@@ -345,29 +366,33 @@ def findings_table(found: ScenarioFindings) -> list[tuple[str, str, str]]:
         ("scenario", found.name, f"{case.pilot.reflection} under {case.pilot.mode} control"),
         ("coordinate", tip.coordinate, f"{tip.mass:.0f} {mass}, oil {tip.stiffness:.3g} {oil}"),
         ("task", f"{case.task.stiffness:.3g} {oil}", f"({found.task_source})"),
-        ("loop", loop.structure, "" if loop.own else "in the place of stiffness feedback or none"),
-        ("stable", "yes" if loop.stable else f"no, {loop.unstable_poles} poles", ""),
-        ("gain margin", format_factor(loop.gain_margin), f"on a ratio of {case.ratio:.3g}"),
-        ("largest delay", format_delay(loop.largest_delay), "each way"),
-    ]
+        ("analysed loop", loop.structure,
+         "" if loop.own else "used because the scenario has stiffness feedback or no reflection"),
+        ("stable", "yes" if loop.stable else f"no, {loop.unstable_poles} unstable poles", ""),
+        ("gain margin", format_factor(loop.gain_margin),
+         f"factor on the reflection ratio of {case.ratio:.3g}; higher is better"),
+        ("maximum delay", format_delay(loop.largest_delay), "one way; higher is better"),
+    ]  # fmt: skip
     if math.isfinite(loop.frequency):
-        rows.append(("swing", f"{loop.frequency:.2f} Hz", "where it becomes unstable"))
-        rows.append(("pole", f"{pole.real:.3f} {pole.imag:+.3f}j rad/s", "now"))
+        rows.append(("oscillation frequency", f"{loop.frequency:.2f} Hz", "at the stability limit"))
+        rows.append(("dominant pole", f"{pole.real:.3f} {pole.imag:+.3f}j rad/s", "at this ratio"))
     if math.isfinite(loop.largest_ratio):
         why = f"{loop.hand_force:.2f} for {case.force_limit:.0f} {force}, outside the dead band"
-        rows.append(("largest ratio", f"{loop.largest_ratio:.3g}", why))
+        rows.append(("maximum stable ratio", f"{loop.largest_ratio:.3g}", why))
     if math.isfinite(loop.ratio_with_deadband):
-        why = "for a swing from stop to stop across the dead band"
-        rows.append(("with dead band", f"{loop.ratio_with_deadband:.3g}", why))
-    why = "that stiffness feedback reflects at the dead band's edge"
-    return [*rows, ("local ratio", f"{found.edge_ratio:.3g}", why)]
+        why = "for an oscillation from stop to stop across the dead band"
+        label = "maximum stable ratio with dead band"
+        rows.append((label, f"{loop.ratio_with_deadband:.3g}", why))
+    why = "reflected by stiffness feedback at the edge of the dead band"
+    return [*rows, ("local reflection ratio", f"{found.edge_ratio:.3g}", why)]
 
 
 def _print_spring_table(held: Spring, free: Spring) -> None:
-    rows = table("stiffness feedback: B^2 - 4 M K_max, and the worst switching", "joystick", "B",
-                 "K_min", "K_max", "margin", "B for it", "growth", "B for 1", "stable by",
+    rows = table("stiffness feedback: margin B^2 - 4 M K_max and worst-case switching", "joystick",
+                 "B", "K_min", "K_max", "margin", "B for margin 0", "growth", "B for growth 1",
+                 "stable by",
                  )  # fmt: skip
-    for name, one in (("held", held), ("let go", free)):
+    for name, one in (("held", held), ("released", free)):
         rows.add_row(
             name, f"{one.damping:g}", f"{one.least:g}", f"{one.most:g}", format_number(one.margin),
             f"{one.enough_damping:.4g}", f"{one.growth:.3g}", f"{one.least_damping:.3g}",
@@ -375,8 +400,9 @@ def _print_spring_table(held: Spring, free: Spring) -> None:
         )  # fmt: skip
     out.print(rows)
     out.print(
-        "theorem 4-2 asks for a positive margin and K_min > 0; growth: of half a swing under the"
-        " worst switching between K_min and K_max, which dies out below 1",
+        "theorem 4-2 guarantees stability for a positive margin and K_min > 0; growth: amplitude"
+        " ratio of successive half oscillations under the worst-case switching between K_min and"
+        " K_max, stable below 1; B [N s/m], K [N/m]",
         style="dim",
     )
 

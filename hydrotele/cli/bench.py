@@ -1,4 +1,7 @@
-"""`hydrotele bench`: what a step, a scenario, a batch and a start cost, all from one process."""
+"""Implement `hydrotele bench`: measure the speed of steps, scenarios, batches and start-up.
+
+All times are measured by one process. The results can be saved and compared with earlier ones.
+"""
 
 import json
 import subprocess
@@ -30,12 +33,12 @@ _SHORT_RUN = ("run", "excitation", "--set", "duration=1.0", "--no-review")
 
 
 def run_benchmarks(save: Path | None, compare: Path | None, quick: bool, as_json: bool) -> None:
-    """Measure, print, and save or compare.
+    """Run the benchmarks, print the results, and save them or compare them with earlier ones.
 
     Args:
-        save: file for the figures, or None.
-        compare: file with earlier figures, or None.
-        quick: fewer repetitions.
+        save: file to write the results to, or None.
+        compare: file with earlier results, or None.
+        quick: use fewer repetitions.
         as_json: print JSON only.
 
     Raises:
@@ -55,10 +58,10 @@ def run_benchmarks(save: Path | None, compare: Path | None, quick: bool, as_json
 
 
 def measure(repeats: int) -> dict:
-    """All figures; times are the best of several turns, so that ratios hold.
+    """Return all benchmark results; each time is the shortest of several repetitions.
 
     Args:
-        repeats: number of turns; six times as many for `ratio`.
+        repeats: number of repetitions; `ratio` uses six times as many.
 
     Returns:
         mechanism_us, hydraulics_us, ratio, scenario_realtime_factor, teleoperation_realtime_factor
@@ -94,7 +97,7 @@ def measure(repeats: int) -> dict:
 
 
 def best_of(repeats: int, jobs: list[Callable[[], float]]) -> list[float]:
-    """Shortest time of each job [s], the jobs taken in turns."""
+    """Return the shortest time of each job [s], running the jobs alternately."""
     best = [float("inf")] * len(jobs)
     for _ in range(repeats):
         best = [min(b, job()) for b, job in zip(best, jobs, strict=True)]
@@ -108,7 +111,7 @@ def _full_stepper(plant: Plant) -> Callable[[], float]:
 
 
 def _bare_stepper(plant: Plant) -> Callable[[], float]:
-    """The same mechanism without any actuator, coasting without gravity."""
+    """Return a job that steps the mechanism without actuators and gravity."""
     root = assemble(plant.machine, plant.model.opt.timestep, plant.ground, looks=False)
     for actuator in root.find_all("actuator"):
         actuator.remove()
@@ -150,7 +153,7 @@ def _batch_stepper(plant: Plant, threads: int) -> Callable[[], float]:
 
 
 def _scenario_factor() -> float:
-    """Real-time factor of the excitation scenario with control, sensors and log, all included."""
+    """Return the real-time factor of the excitation scenario with control, sensors and log."""
     scenario = load_scenario("excitation")
     begin = time.perf_counter()
     run_scenario(scenario)
@@ -158,7 +161,7 @@ def _scenario_factor() -> float:
 
 
 def _teleoperation_factor(name: str) -> float:
-    """Real-time factor of the loop: machine, joystick, hand, line, control, sensors."""
+    """Return the real-time factor of a teleoperated scenario, including operator and channel."""
     return run_scenario(load_scenario(name)).summary["realtime_factor"]
 
 
@@ -178,9 +181,9 @@ def _read(path: Path) -> dict:
     try:
         figures = read_json(path)
         if not isinstance(figures, dict) or "ratio" not in figures:
-            raise ValueError("it has no ratio")
+            raise ValueError("it has no key 'ratio'")
     except ValueError as error:
-        raise InputError(path, f"is no saved benchmark: {error}") from None
+        raise InputError(path, f"is not a saved benchmark: {error}") from None
     return figures
 
 
@@ -195,8 +198,9 @@ def _flat(figures: dict) -> dict[str, float]:
 
 
 def _print(figures: dict, earlier: dict | None) -> None:
-    columns = ["figure", "now", *(["earlier", "now / earlier"] if earlier else [])]
-    rows = table("hydrotele bench", *columns)
+    columns = ["quantity", "now", *(["earlier", "now / earlier"] if earlier else [])]
+    title = "hydrotele bench (times, ratio: lower is better; factors, rates: higher is better)"
+    rows = table(title, *columns)
     before = _flat(earlier) if earlier else {}
     for key, value in _flat(figures).items():
         cells = [key, f"{value:,}"]

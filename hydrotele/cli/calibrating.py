@@ -1,4 +1,4 @@
-"""`hydrotele calibrate`: one thin function per form of calibration."""
+"""Command line of `hydrotele calibrate`: one function for each type of calibration."""
 
 from pathlib import Path
 from typing import Annotated
@@ -14,13 +14,13 @@ app = typer.Typer(
 
 Data = Annotated[Path, typer.Option("--data", "-d", help="Folder of measurements.")]
 HeldOut = Annotated[
-    str | None, typer.Option(help="Part of the data to judge on, not fitted; default see below.")
+    str | None, typer.Option(help="Held-out part of the data; the default is described below.")
 ]
 Out = Annotated[
-    Path | None, typer.Option("--out", "-o", help="Folder to write; default nothing is written.")
+    Path | None, typer.Option("--out", "-o", help="Output folder; default: nothing is written.")
 ]
 MachineName = Annotated[
-    str, typer.Option("--machine", "-m", help="Machine with a calibrator, shipped or a folder.")
+    str, typer.Option("--machine", "-m", help="Machine with a calibrator: shipped name or folder.")
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 
@@ -29,23 +29,23 @@ Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON, an
 def arm(
     data: Data, heldout: HeldOut = None, out: Out = None, json: Json = False,
     machine: MachineName = "calibrator",
-    method: Annotated[str, typer.Option(help="joint or hierarchical.")] = "joint",
-    poses: Annotated[int, typer.Option(min=10, help="Poses to take of each log.")] = 300,
+    method: Annotated[str, typer.Option(help="Identification: joint or hierarchical.")] = "joint",
+    poses: Annotated[int, typer.Option(min=10, help="Number of poses used of each log.")] = 300,
     accuracy_deg: Annotated[
         float | None, typer.Option(help="Standard deviation of an angle sensor [deg].")
     ] = None,
-    bad_data: Annotated[bool, typer.Option(help="Look for corrupted readings, leave out.")] = True,
+    bad_data: Annotated[bool, typer.Option(help="Detect and exclude corrupted samples.")] = True,
     drift: Annotated[
-        bool, typer.Option(help="Use the arm's own sensors for how held links drift.")
+        bool, typer.Option(help="Correct the drift of held links by the arm's own sensors.")
     ] = True,
     flexibility: Annotated[
-        bool, typer.Option(help="Estimate how much the calibrator's joints bend under load.")
+        bool, typer.Option(help="Estimate the bending of the calibrator's joints under load.")
     ] = True,
 ) -> None:  # fmt: skip
-    """Links of an arm from logs of the external calibrator (Khoshzaban 1992).
+    """Calibrate the links of an arm from logs of an external calibrator (Khoshzaban 1992).
 
-    One log per link that moved while the others were held. --heldout N: every N-th pose is judged
-    on and not fitted; default 5.
+    Give one log for each link; in each log, only that link moves. With --heldout N, every N-th
+    pose is used for validation and not fitted; default: 5.
     """
     from hydrotele.cli.calibrating_arm import ArmChoices, calibrate_arm
 
@@ -58,17 +58,17 @@ def linkage(
     data: Data, heldout: HeldOut = None, out: Out = None, json: Json = False,
     machine: MachineName = "calibrator",
     angles: Annotated[
-        str, typer.Option(help="measured: the joints' sensors; identified: from the calibrator.")
+        str, typer.Option(help="Joint angles: measured (by sensors) or identified (calibrator).")
     ] = "measured",
 ) -> None:  # fmt: skip
-    """Cylinder linkages of an arm from joint angles and cylinder lengths.
+    """Calibrate the cylinder linkages of an arm from joint angles and cylinder lengths.
 
-    Every fifth sample is judged on and not fitted.
+    Every fifth sample is used for validation and not fitted.
     """
     from hydrotele.cli.calibrating_arm import calibrate_linkage
 
     if heldout is not None:
-        raise InputError("--heldout", "is not used here: every fifth sample is judged on")
+        raise InputError("--heldout", "is not used here: every fifth sample is held out")
     calibrate_linkage(data, machine, angles, out, json)
 
 
@@ -77,21 +77,20 @@ def linkage(
 )
 def machine(
     data: Data,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Output folder.")],
     dynamics: Annotated[
         list[Path] | None,
-        typer.Option(help="Logs for the dynamic step, more than one allowed; default --data."),
+        typer.Option(help="Logs for the dynamic step. Repeatable. Default: --data."),
     ] = None,
-    heldout: Annotated[
-        str | None, typer.Option(help="Run of the dynamic logs to judge on, not fitted.")
-    ] = None,
+    heldout: Annotated[str | None, typer.Option(help="Held-out run of the dynamic logs.")] = None,
     json: Json = False,
     machine: MachineName = "calibrator",
 ) -> None:
-    """Arm, cylinder linkages, masses and friction, one after the other (Khoshzaban 1992, p. 125).
+    """Calibrate arm, cylinder linkages, masses and friction in sequence (Khoshzaban 1992, p. 125).
 
-    --data holds one log per link that moved under the calibrator. The dynamic step uses the
-    calibrated kinematics; its logs need the pressures of the same machine.
+    The folder --data contains one log for each link; in each log, only that link moves, measured
+    by the calibrator. The dynamic step uses the calibrated kinematics. Its logs must contain
+    pressures of the same machine.
     """
     from hydrotele.cli.calibrating_machine import calibrate_machine
 
@@ -101,9 +100,9 @@ def machine(
 @app.command(epilog="Example:  hydrotele calibrate design --out design")
 def design(
     out: Out = None, json: Json = False, machine: MachineName = "calibrator",
-    accuracy_deg: Annotated[float, typer.Option(help="Bound of an angle sensor [deg].")] = 0.1,
+    accuracy_deg: Annotated[float, typer.Option(help="Error bound of angle sensors [deg].")] = 0.1,
 ) -> None:  # fmt: skip
-    """Lengths of a calibrator's arms and the ball joint's place that tell an arm best."""
+    """Design a calibrator: arm lengths and ball-joint position for the smallest tip error."""
     from hydrotele.cli.calibrating_arm import design_calibrator
 
     design_calibrator(machine, accuracy_deg, out, json)
@@ -119,33 +118,40 @@ def hybrid(
         Path | None, typer.Option("--data", "-d", help="Folder with poses.csv or poses.parquet.")
     ] = None,
     robot: Annotated[
-        str | None, typer.Option(help="Nominal robot; default robot.yaml in the folder, or iwr.")
+        str | None, typer.Option(help="Nominal robot; default: robot.yaml in the folder, or iwr.")
     ] = None,
-    model: Annotated[str, typer.Option(help="Error model: dh, poe, or auto: the better.")] = "auto",
+    model: Annotated[
+        str, typer.Option(help="Error model: dh, poe, or auto (the better of the two).")
+    ] = "auto",
     parameters: Annotated[
         str, typer.Option(help="all, document (the 36 of Wang 2012), or names with commas.")
     ] = "all",
     evolution: Annotated[
-        bool, typer.Option("--evolution", help="Search by differential evolution, too.")
+        bool, typer.Option("--evolution", help="Also search by differential evolution.")
     ] = False,
     posterior: Annotated[
-        int, typer.Option(min=0, metavar="STEPS", help="Sample the posterior by MCMC, too.")
+        int, typer.Option(min=0, metavar="STEPS", help="Also sample the posterior by MCMC.")
     ] = 0,
-    seed: Annotated[int, typer.Option(min=0, help="Of all random numbers.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 0,
     simulate: Annotated[
         Path | None, typer.Option(help="Write a simulated measurement to this folder instead.")
     ] = None,
-    poses: Annotated[int, typer.Option(min=1, help="Of the simulated measurement.")] = 25,
-    heldout: Annotated[int, typer.Option(min=0, help="Further ones, to judge on.")] = 25,
+    poses: Annotated[int, typer.Option(min=1, help="Number of simulated poses.")] = 25,
+    heldout: Annotated[int, typer.Option(min=0, help="Number of simulated held-out poses.")] = 25,
     choose: Annotated[
-        str, typer.Option(help="How: random, or the best of 200 by D, O1 to O5.")
+        str,
+        typer.Option(help="Simulated poses: random, or the best of 200 by criterion D, O1 to O5."),
     ] = "random",
-    noise: Annotated[float, typer.Option(min=0.0, help="Factor on the sensors' noise.")] = 1.0,
-    errors: Annotated[float, typer.Option(min=0.0, help="Factor on 1 mm and 1 mrad.")] = 1.0,
+    noise: Annotated[
+        float, typer.Option(min=0.0, help="Factor on the simulated sensor noise.")
+    ] = 1.0,
+    errors: Annotated[
+        float, typer.Option(min=0.0, help="Factor on the simulated errors of 1 mm and 1 mrad.")
+    ] = 1.0,
     out: Out = None,
     json: Json = False,
 ) -> None:
-    """Serial-parallel robot from measured poses (Wang 2012)."""
+    """Calibrate a serial-parallel robot from measured poses (Wang 2012)."""
     from hydrotele.cli.calibrating_robots import calibrate_hybrid, simulate_hybrid
 
     if (data is None) == (simulate is None):
@@ -168,21 +174,24 @@ def scara(
     ] = None,
     heldout: Annotated[
         str | None,
-        typer.Option(help="Poses to judge on, by number from 1, as 3,7; default each in turn."),
+        typer.Option(help="Held-out poses, numbered from 1, as 3,7; default: each in turn."),
     ] = None,
     simulate: Annotated[
-        Path | None, typer.Option(help="Write simulated measurements into this folder.")
+        Path | None, typer.Option(help="Write simulated measurements to this folder.")
     ] = None,
-    poses: Annotated[int, typer.Option(min=4, help="To simulate.")] = 20,
-    noise: Annotated[float, typer.Option(min=0.0, help="Of simulated positions in mm.")] = 0.05,
-    seed: Annotated[int, typer.Option(help="Of the simulation.")] = 1,
+    poses: Annotated[int, typer.Option(min=4, help="Number of simulated poses.")] = 20,
+    noise: Annotated[
+        float,
+        typer.Option(min=0.0, help="Standard deviation of simulated positions [mm]."),
+    ] = 0.05,
+    seed: Annotated[int, typer.Option(help="Random seed of the simulation.")] = 1,
     choose: Annotated[
-        int | None, typer.Option(min=2, help="Also name so many poses that tell most.")
+        int | None, typer.Option(min=2, help="Also list this many most informative poses.")
     ] = None,
     out: Out = None,
     json: Json = False,
 ) -> None:
-    """Link lengths of a SCARA from measured positions (Wang 2012, section 1.1)."""
+    """Calibrate the link lengths of a SCARA from measured positions (Wang 2012, section 1.1)."""
     from hydrotele.cli.calibrating_robots import calibrate_scara_folder, simulate_scara_folder
 
     if simulate is not None:
@@ -190,7 +199,8 @@ def scara(
     if data is not None:
         calibrate_scara_folder(data, heldout, choose, out, json)
     elif simulate is None:
-        raise InputError("calibrate scara", "give --data FOLDER, or --simulate FOLDER to make one")
+        message = "give --data FOLDER, or --simulate FOLDER to create a data set"
+        raise InputError("calibrate scara", message)
 
 
 @app.command(
@@ -204,31 +214,33 @@ def mukca(
     robot: Annotated[
         str | None,
         typer.Option(
-            help="Shipped robot, or a YAML, URDF or MJCF file; default the one in the folder of"
-            " the data, else the shipped one that fits best."
+            help="Shipped robot, or a YAML, URDF or MJCF file; default: the file in the data"
+            " folder, else the shipped robot that fits best."
         ),
     ] = None,
     heldout: Annotated[
         str | None,
-        typer.Option(help="Place to judge on, not fitted; default every place in turn."),
+        typer.Option(help="Held-out place; default: every place in turn."),
     ] = None,
     distance: Annotated[
-        float, typer.Option(min=0.0, help="Of neighbouring sockets in mm; 0 if not known.")
+        float,
+        typer.Option(min=0.0, help="Distance of neighbouring sockets [mm]; 0 if not known."),
     ] = 50.0,
     accuracy: Annotated[
-        float, typer.Option(min=1e-6, help="Standard deviation of that distance in mm.")
+        float, typer.Option(min=1e-6, help="Standard deviation of that distance [mm].")
     ] = 0.05,
-    unit: Annotated[str, typer.Option(help="Of the angles: rad or deg.")] = "rad",
+    unit: Annotated[str, typer.Option(help="Unit of the joint angles: rad or deg.")] = "rad",
     model: Annotated[
         str | None,
         typer.Option(
-            help="Of the joints: rigid, gravity, eccentricity, or both; default what predicts best."
+            help="Joint model: rigid, gravity, eccentricity or both; default: the most accurate"
+            " prediction."
         ),
     ] = None,
     out: Out = None,
     json: Json = False,
 ) -> None:
-    """Serial robot from joint angles alone, its ball held in sockets."""
+    """Calibrate a serial robot from joint angles, with its ball tool held in fixed sockets."""
     from hydrotele.cli.calibrating_robots import SocketChoices, calibrate_mukca
 
     choices = SocketChoices(robot, heldout, 1e-3 * distance, 1e-3 * accuracy, unit, model)

@@ -1,4 +1,8 @@
-"""`hydrotele calibrate arm`, `linkage` and `design`: from logs to results in words, JSON, files."""
+"""Implement `hydrotele calibrate arm`, `linkage` and `design`.
+
+Each command loads logs or a machine, runs the calibration, prints the result as text or JSON and
+writes `calibration.json`, the calibrated machine and a report.
+"""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -39,19 +43,19 @@ from hydrotele.logs.log import load_logs
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import MACHINE_FILE, load_machine, save_machine
 
-_MISFIT = 1.5  # times what the sensors explain, from which on a note says so
+_MISFIT = 1.5  # ratio of residuals to sensor noise above which a note is printed
 
 
 class ArmChoices(NamedTuple):
-    """What a user may choose.
+    """Options of the arm calibration.
 
     Attributes:
         method: `joint` or `hierarchical`.
-        poses: to take of each log.
-        accuracy_deg: standard deviation of an angle sensor [deg], None for what the log says.
-        bad_data: whether corrupted readings are looked for and left out.
-        drift: whether the arm's own sensors show how held links drift.
-        heldout: every how many poses are judged on, as text.
+        poses: number of poses used of each log.
+        accuracy_deg: standard deviation of an angle sensor [deg], None for that of the log.
+        bad_data: whether corrupted samples are detected and excluded.
+        drift: whether the drift of held links is corrected by the arm's own sensors.
+        heldout: N as text: every N-th pose is held out; None for 5.
         flexibility: whether the flexibility of the calibrator's joints is estimated.
     """
 
@@ -65,16 +69,16 @@ class ArmChoices(NamedTuple):
 
 
 class ArmResult(NamedTuple):
-    """What `calibrate arm` found.
+    """Result of an arm calibration.
 
     Attributes:
-        machine: the nominal machine.
-        fit: of the arm.
-        stages: poses that were fitted.
-        regions: corrupted readings that were left out.
-        judged: errors on poses that were not fitted.
-        calibrated: the machine with the fitted parameters.
-        flexibility: of the calibrator's joints; None where it was not estimated.
+        machine: nominal machine.
+        fit: fitted parameters of the arm.
+        stages: fitted poses, one item per log.
+        regions: corrupted samples that were excluded.
+        judged: errors on held-out poses, empty without such poses.
+        calibrated: machine with the fitted parameters.
+        flexibility: flexibility of the calibrator's joints, None if it was not estimated.
     """
 
     machine: Machine
@@ -89,13 +93,20 @@ class ArmResult(NamedTuple):
 def calibrate_arm(
     data: Path, machine: str, choices: ArmChoices, target: Path | None, as_json: bool
 ) -> ArmResult:
-    """Calibrate an arm from a folder of logs; print and write what was found.
+    """Calibrate an arm from a folder of logs; print and write the result.
+
+    Args:
+        data: folder of logs; one link moves in each log.
+        machine: nominal machine with a calibrator, as a shipped name or a folder.
+        choices: options of the calibration.
+        target: output folder, None to write nothing.
+        as_json: print JSON instead of text.
 
     Raises:
-        InputError: the logs or the choices are of no use.
+        InputError: logs, machine, options or target are not usable.
     """
     if choices.method not in ("joint", "hierarchical"):
-        raise InputError("--method", f"{choices.method!r} is none; valid: joint, hierarchical")
+        raise InputError("--method", f"{choices.method!r} is unknown; valid: joint, hierarchical")
     every = _every(choices.heldout)
     if target:
         check_target(target, "arm calibration")
@@ -116,15 +127,16 @@ def _every(text: str | None) -> int:
     if text is None:
         return 5
     if not text.isdigit():
-        raise InputError("--heldout", f"{text!r}: give a whole number N; every N-th pose is judged")
+        message = f"{text!r} is not a whole number N; every N-th pose is held out"
+        raise InputError("--heldout", message)
     return int(text)
 
 
 def arm_result(nominal: Machine, data: Path, choices: ArmChoices, every: int) -> ArmResult:
-    """The calibration itself, without printing.
+    """Calibrate an arm without printing or writing; every N-th pose is held out, N = `every`.
 
     Raises:
-        InputError: as `calibrate_arm`.
+        InputError: the logs or options are not usable.
     """
     loop = loop_of(nominal)
     accuracy = None if choices.accuracy_deg is None else float(np.radians(choices.accuracy_deg))
@@ -153,7 +165,7 @@ def arm_result(nominal: Machine, data: Path, choices: ArmChoices, every: int) ->
 
 
 def _judged(loop: Loop, fit: ArmFit, judged: list[Poses]) -> dict[str, Any]:
-    """Closure of poses that were not fitted, with nominal and identified parameters."""
+    """Return closure errors on held-out poses with nominal and identified parameters."""
     if not judged:
         return {}
     from hydrotele.calibrate.arm import Equations
@@ -173,7 +185,7 @@ def _judged(loop: Loop, fit: ArmFit, judged: list[Poses]) -> dict[str, Any]:
 
 
 def arm_as_data(result: ArmResult) -> dict[str, Any]:
-    """What `--json` prints and `calibration.json` holds; SI units."""
+    """Return an arm calibration in the form of `calibration.json`, in SI units."""
     fit = result.fit
     rows = [
         {
@@ -215,7 +227,7 @@ def arm_as_data(result: ArmResult) -> dict[str, Any]:
 
 
 def _unmoved(fit: ArmFit) -> dict[str, list[str]]:
-    """Links that no log moves, with the parameters that stay unknown."""
+    """Return the links that move in no log, with the parameters that stay nominal."""
     moved = {stage.link for stage in fit.stages}
     return {
         link: [f"{kind}.{link}" for kind in ("alpha", "a", "beta" if parallel else "d")]
@@ -228,19 +240,19 @@ def _unmoved(fit: ArmFit) -> dict[str, list[str]]:
 
 def _notes(fit: ArmFit) -> list[str]:
     said = [
-        f"residuals of {s.link} are {s.chi:.1f} times what its sensors explain: held links move,"
-        " joints bend, or a sensor is worse than stated; intervals are wider by as much"
+        f"residuals of {s.link} are {s.chi:.1f} times the sensor noise: held links move, joints"
+        " bend, or a sensor is worse than stated; the intervals are enlarged by this factor"
         for s in fit.stages
         if s.chi > _MISFIT
     ]
     for link, names in _unmoved(fit).items():
-        said.append(f"no log moves {link}: {', '.join(names)} stay nominal")
+        said.append(f"{link} moves in no log: {', '.join(names)} keep their nominal values")
     return said
 
 
 def _print_arm(said: Mapping[str, Any]) -> None:
     shown = table(f"{said['machine']}: {said['method']} identification", "parameter", "nominal",
-                  "identified", "+-", "unit")  # fmt: skip
+                  "identified", "95 % +-", "unit")  # fmt: skip
     for row in said["parameters"]:
         degrees = row["unit"] == "rad"
         scale = np.degrees(1.0) if degrees else 1.0
@@ -251,7 +263,7 @@ def _print_arm(said: Mapping[str, Any]) -> None:
     out.print(shown)
     for stage in said["stages"]:
         out.print(f"{stage['link']}: {stage['poses']} poses, {stage['iterations']} iterations, RMS"
-                  f" {stage['rms_mm']:.2f} mm, {stage['chi']:.2f} times the sensors'")  # fmt: skip
+                  f" {stage['rms_mm']:.2f} mm, {stage['chi']:.2f} times sensor noise")  # fmt: skip
         for name, reason in stage["not_identified"].items():
             out.print(f"  {name} {reason}", style="dim")
     if said["flexibility"]:
@@ -264,8 +276,9 @@ def _print_arm(said: Mapping[str, Any]) -> None:
                   )  # fmt: skip
     if said["heldout"]:
         held = said["heldout"]
-        out.print(f"{held['poses']} poses not fitted: closure {held['rms_nominal_mm']:.1f} mm RMS"
-                  f" nominal, {held['rms_identified_mm']:.2f} mm identified")  # fmt: skip
+        out.print(f"{held['poses']} held-out poses: RMS closure error"
+                  f" {held['rms_nominal_mm']:.1f} mm with nominal and"
+                  f" {held['rms_identified_mm']:.2f} mm with identified parameters")  # fmt: skip
     for note in said["notes"]:
         out.print(note)
 
@@ -287,7 +300,7 @@ def _write(target: Path, said: Mapping[str, Any], machine: Machine, report) -> N
 
 
 def write_arm_report(folder: Path, result: ArmResult) -> None:
-    """Write `report.html` of an arm's calibration into a folder."""
+    """Write `report.html` of an arm calibration into a folder."""
     from hydrotele.show import calibration_report
 
     path = folder / "report.html"
@@ -297,13 +310,20 @@ def write_arm_report(folder: Path, result: ArmResult) -> None:
 def calibrate_linkage(
     data: Path, machine: str, angles: str, target: Path | None, as_json: bool
 ) -> list[LinkageFit]:
-    """Calibrate the cylinder linkages that move in a folder of logs.
+    """Calibrate the cylinder linkages that move in a folder of logs; print and write the result.
+
+    Args:
+        data: folder of logs.
+        machine: nominal machine, as a shipped name or a folder.
+        angles: source of the joint angles: `measured` or `identified`.
+        target: output folder, None to write nothing.
+        as_json: print JSON instead of text.
 
     Raises:
-        InputError: no linkage moves, or the logs are of no use.
+        InputError: no linkage moves, or the logs are not usable.
     """
     if angles not in ("measured", "identified"):
-        raise InputError("--angles", f"{angles!r} is none; valid: measured, identified")
+        raise InputError("--angles", f"{angles!r} is unknown; valid: measured, identified")
     if target:
         check_target(target, "arm calibration")
     nominal = load_machine(machine)
@@ -326,16 +346,16 @@ def calibrate_linkage(
 
 
 def linkage_fits(nominal: Machine, data: Path, angles: str) -> list[LinkageFit]:
-    """The calibration of the linkages itself, without printing.
+    """Calibrate the cylinder linkages without printing or writing.
 
     Raises:
-        InputError: as `calibrate_linkage`.
+        InputError: no linkage moves, or the logs are not usable.
     """
     axes = [name for name, axis in nominal.axes.items() if axis.cylinder and not axis.four_bar]
     logs = load_logs(data)
     for log in logs:
         if (of := log.metadata.get("machine", nominal.name)) != nominal.name:
-            message = f"is a log of machine {of}, not of {nominal.name}: name it with --machine"
+            message = f"is a log of machine {of}, not of {nominal.name}: give --machine {of}"
             raise InputError(log.source, message)
     strokes = [s for log in logs for s in strokes_of(log, nominal, axes)]
     if angles == "identified":
@@ -355,14 +375,14 @@ def linkage_fits(nominal: Machine, data: Path, angles: str) -> list[LinkageFit]:
             ))  # fmt: skip
     if not strokes:
         names = ", ".join(f"angle.{a} and length.{a}" for a in axes)
-        message = f"no cylinder moves by 5 deg or more: log {names} while one moves"
+        message = f"no cylinder turns its joint by 5 deg or more: log {names} during a motion"
         raise InputError(data, message)
     longest = {s.axis: s for s in sorted(strokes, key=lambda s: np.ptp(s.angle))}
     return [identify_linkage(nominal, s) for s in longest.values()]
 
 
 def linkage_as_data(found: LinkageFit) -> dict[str, Any]:
-    """A linkage as `--json` prints it; SI units."""
+    """Return a linkage calibration in the form that `--json` prints, in SI units."""
     deviations = dict(zip(found.fit.names, found.fit.deviations, strict=True))
     return {
         "parameters": [
@@ -380,7 +400,7 @@ def linkage_as_data(found: LinkageFit) -> dict[str, Any]:
 def _print_linkages(said: Mapping[str, Any]) -> None:
     for axis, found in said["axes"].items():
         shown = table(
-            f"{axis}: {said['angles']} angles", "parameter", "nominal", "identified", "+-"
+            f"{axis}: {said['angles']} angles", "parameter", "nominal", "identified", "95 % +-"
         )
         for row in found["parameters"]:
             scale = np.degrees(1.0) if row["unit"] == "rad" else 1.0
@@ -389,7 +409,7 @@ def _print_linkages(said: Mapping[str, Any]) -> None:
                           f"{scale * row['value']:.4f}", wide)  # fmt: skip
         out.print(shown)
         held = found["heldout"]
-        out.print(f"samples not fitted: RMS {1e3 * held['rms_m']:.2f} mm (nominal"
+        out.print(f"held-out samples: RMS error {1e3 * held['rms_m']:.2f} mm (nominal"
                   f" {1e3 * held['rms_nominal_m']:.2f} mm), VAF {held['vaf_percent']:.3f} %"
                   )  # fmt: skip
 
@@ -397,7 +417,14 @@ def _print_linkages(said: Mapping[str, Any]) -> None:
 def design_calibrator(
     machine: str, accuracy_deg: float, target: Path | None, as_json: bool
 ) -> None:
-    """Look over designs of a calibrator; print the best and write the picture."""
+    """Evaluate calibrator designs; print the present and the best design and draw all of them.
+
+    Args:
+        machine: machine with a calibrator, as a shipped name or a folder.
+        accuracy_deg: error bound of an angle sensor [deg].
+        target: output folder, None to write nothing.
+        as_json: print JSON instead of text.
+    """
     from hydrotele.calibrate.design import best_design, look_over_designs
 
     if target:
@@ -424,6 +451,6 @@ def design_calibrator(
     for name, one in (("present", survey.present), ("best", best)):
         out.print(f"{name}: arm {one.arm:.2f} m, forearm {one.forearm:.2f} m, ball joint"
                   f" {one.ball_x:.2f} m"
-                  f" in front and {one.ball_z:+.2f} m: tip of the arm known to"
+                  f" in front at height {one.ball_z:+.2f} m: tip error"
                   f" {1e3 * one.tip_error:.1f} mm, {100 * one.reached:.0f} % of the poses reached"
                   )  # fmt: skip

@@ -1,4 +1,8 @@
-"""`hydrotele calibrate machine`: arm, cylinder linkages and dynamics of a machine in sequence."""
+"""Implement `hydrotele calibrate machine`: calibrate kinematics, then identify dynamics.
+
+The steps are the links of the arm, the cylinder linkages, and the masses and friction. Each step
+uses the machine that the previous step calibrated.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -29,19 +33,19 @@ from hydrotele.logs.dataset import Dataset, load_dataset
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import MACHINE_FILE, load_machine, save_machine
 
-_POSES = 5  # every fifth pose is held out
+_POSES = 5  # one of so many poses is held out
 
 
 class SequenceResult(NamedTuple):
-    """A machine that was calibrated step by step.
+    """Results of all steps of a machine calibration.
 
     Attributes:
         arm: links, joint axes and sensor offsets.
-        linkages: cylinder pins and closed lengths, one per axis that moves.
-        skipped: why there are no linkages, or empty.
-        kinematic: the machine after both steps.
-        dataset: logs of the dynamic step, read with that machine.
-        dynamics: bodies and friction, with the final machine.
+        linkages: cylinder pins and closed lengths, one item per axis that moves.
+        skipped: reason why the linkages were not calibrated, empty if they were.
+        kinematic: machine after the calibration of arm and linkages.
+        dataset: logs of the dynamic step, loaded with that machine.
+        dynamics: identified bodies and friction, and the final machine.
     """
 
     arm: ArmResult
@@ -59,11 +63,11 @@ def calibrate_machine(
     """Calibrate kinematics, then identify dynamics with the calibrated kinematics.
 
     Args:
-        kinematics: folder of logs in which one link moves at a time under the calibrator.
-        dynamics: logs of the same machine with pressures; the kinematic logs where it is empty.
-        machine: the nominal machine with a calibrator, shipped or a folder.
-        heldout: run of the dynamic logs that is not fitted; None to choose.
-        target: folder to write, all or nothing.
+        kinematics: folder of logs; one link moves in each log, measured by the calibrator.
+        dynamics: logs of the same machine with pressures; if empty, the kinematic logs are used.
+        machine: nominal machine with a calibrator, as a shipped name or a folder.
+        heldout: held-out run of the dynamic logs, None for `test*`, else the last run.
+        target: output folder, written completely or not at all.
         as_json: print the result as JSON instead of tables.
 
     Returns:
@@ -131,7 +135,8 @@ def _write(folder: Path, result: SequenceResult, data: Sequence[Path]) -> None:
 
 
 def _print(result: SequenceResult) -> None:
-    shown = table("held-out errors of each step", "quantity", "before", "after", "unit")
+    title = "errors on held-out data before and after calibration (lower is better)"
+    shown = table(title, "quantity", "before", "after", "unit")
     closure = result.arm.judged
     if closure:
         shown.add_row("closure of the arm (poses)", f"{closure['rms_nominal_mm']:.2f}",
@@ -146,6 +151,6 @@ def _print(result: SequenceResult) -> None:
                       f"{held.unit} RMS")  # fmt: skip
     out.print(shown)
     if result.skipped:
-        out.print(f"[yellow]note[/] cylinder linkages keep their given numbers: {result.skipped}")
+        out.print(f"[yellow]note[/] the cylinder linkages were not calibrated: {result.skipped}")
     if identified:
         out.print(f"dynamics: {identified.status}")

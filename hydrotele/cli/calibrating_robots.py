@@ -1,4 +1,8 @@
-"""`hydrotele calibrate mukca`, `scara`, `hybrid`: serial robots, and those with a hexapod."""
+"""Implement `hydrotele calibrate mukca`, `scara` and `hybrid`.
+
+`mukca` calibrates a serial robot whose ball tool is held in sockets. `scara` calibrates an arm with
+two links from measured positions. `hybrid` calibrates a serial robot that carries a hexapod.
+"""
 
 import json
 from collections.abc import Sequence
@@ -69,21 +73,21 @@ from hydrotele.kinematics.wires import wire_lengths
 
 _ROBOT_FILES = ("robot.yaml", "robot.yml", "*.urdf", "*.xml")
 _EXAMPLE = ScaraFacts(length_a=0.4, length_b=0.3)
-_ERRORS = (0.0, 0.8e-3, 0.0, -0.5e-3)  # of the simulated arm: lengths only, as in Eq. 2
-_SHOWN, _WIDE = 25, 60  # combinations of the printed table, and their letters
+_ERRORS = (0.0, 0.8e-3, 0.0, -0.5e-3)  # errors of the simulated arm: lengths only, as in Eq. 2
+_SHOWN, _WIDE = 25, 60  # rows of the printed table, and characters of a combination
 
 
 @dataclass(frozen=True)
 class SocketChoices:
-    """What a user may choose for `mukca`.
+    """Options of `hydrotele calibrate mukca`.
 
     Attributes:
         robot: shipped robot or file, None to find one.
-        heldout: place or socket to judge on, None for every one in turn.
-        distance: of neighbouring sockets [m], 0 if not known.
-        accuracy: its standard deviation [m].
-        unit: of angles, `rad` or `deg`.
-        model: of the joints, None to choose.
+        heldout: held-out place or socket, None for each in turn.
+        distance: distance of neighbouring sockets [m], 0 if not known.
+        accuracy: standard deviation of that distance [m].
+        unit: unit of the joint angles, `rad` or `deg`.
+        model: joint model, None to select the most accurate one.
     """
 
     robot: str | None = None
@@ -97,16 +101,16 @@ class SocketChoices:
 def calibrate_mukca(
     data: Path, choices: SocketChoices, target: Path | None, as_json: bool
 ) -> dict[str, Any]:
-    """Calibrate a robot on sockets; print the result and write it, whole or not at all.
+    """Calibrate a robot from joint angles with its ball in sockets; print and write the result.
 
     Args:
-        data: folder of places.
-        choices: see there.
-        target: folder to write, None for none.
-        as_json: print JSON instead of words.
+        data: folder with a subfolder for each place.
+        choices: options of the calibration.
+        target: output folder, written completely or not at all; None to write nothing.
+        as_json: print JSON instead of text.
 
     Returns:
-        The document that is printed or written.
+        The result in the form of `calibration.json`.
 
     Raises:
         InputError: data, robot or target are not usable.
@@ -143,7 +147,10 @@ def socket_document(
     data: Path, sockets: Sequence[Socket], found: SocketCalibration, left: Sequence[LeftOut],
     notes: Sequence[str],
 ) -> dict[str, Any]:  # fmt: skip
-    """The result as JSON: lengths of results in mm, parameters in SI units."""
+    """Return a socket calibration in the form of `calibration.json`.
+
+    Errors and distances are in mm, parameters in SI units.
+    """
     fit, angular = found.fit, ("r", "s", "c")
     status = dict(zip(fit.told.names, fit.told.status, strict=True))
     alone = {name for name, told in status.items() if told == FULL}
@@ -217,28 +224,31 @@ def _heldout(left: Sequence[LeftOut], rows: dict[str, int]) -> dict[str, Any]:
 def _robot(
     data: Path, named: str | None, sockets: Sequence[Socket], options: Options
 ) -> tuple[Robot, list[str]]:
-    """The robot, and a note on how it was found."""
+    """Load the given robot, that of the data folder or the best-fitting one, with a note on it."""
     count = sockets[0].joints.shape[1]
     if named is not None:
         return load_robot(named, count), []
     inside = [path for pattern in _ROBOT_FILES for path in sorted(data.glob(pattern))]
     if inside:
-        return load_robot(inside[0], count), [f"robot: {inside[0]}, found beside the data"]
+        return load_robot(inside[0], count), [f"robot: {inside[0]}, found in the data folder"]
     robot, spreads = choose_robot(sockets, options)
     tried = ", ".join(f"{name} {1e3 * spread:.3g}" for name, spread in spreads.items())
-    return robot, [f"robot: {robot.name}, the shipped one that fits best (spread in mm: {tried})"]
+    message = f"robot: {robot.name}, the shipped robot that fits best (scatter [mm]: {tried})"
+    return robot, [message]
 
 
 def _warnings(robot: Robot, sockets: Sequence[Socket], options: Options) -> list[str]:
     notes = [
-        f"{robot.joints[k].name} does not move in any file:"
-        " its offset shows only together with errors of its neighbours"
+        f"{robot.joints[k].name} does not move in any file: its offset is identifiable only in"
+        " combination with errors of the adjacent joints"
         for k in idle_joints(sockets)
     ]
     if options.distance is None:
-        notes.append("no distance of sockets is given: nothing tells the robot's scale")
+        notes.append("no socket distance is given: the scale of the robot is not identifiable")
     elif all(s.hole == sockets[0].hole for s in sockets):
-        notes.append("no place has two neighbouring sockets: nothing tells the robot's scale")
+        notes.append(
+            "no place has two neighbouring sockets: the scale of the robot is not identifiable"
+        )
     return notes
 
 
@@ -268,9 +278,12 @@ def _write(
 
 
 def _print(document: dict[str, Any], found: SocketCalibration, left: Sequence[LeftOut]) -> None:
-    heading = f"{document['robot']}: RMS distance of the ball from its socket's mean"
+    heading = (
+        f"{document['robot']}: RMS distance of the ball from its mean position in the socket"
+        " (lower is better)"
+    )
     rows = table(
-        heading, "predicted, not fitted", "nominal mm", "calibrated mm", "sockets apart mm"
+        heading, "held-out part", "nominal [mm]", "calibrated [mm]", "socket distance [mm]"
     )
     for one in left:
         apart = ", ".join(f"{1e3 * d:.3f}" for d in one.calibrated.distances.values())
@@ -278,25 +291,26 @@ def _print(document: dict[str, Any], found: SocketCalibration, left: Sequence[Le
     if len(left) > 1:
         whole = document["heldout"]
         rows.add_section()
-        rows.add_row("all of them", f"{whole['nominal_rms_mm']:.3f}",
+        rows.add_row("all parts", f"{whole['nominal_rms_mm']:.3f}",
                      f"[bold]{whole['rms_mm']:.3f}[/]", "")  # fmt: skip
     rows.add_section()
     apart = ", ".join(f"{1e3 * d:.3f}" for d in found.after.distances.values())
-    rows.add_row("(fitted)", _mm(found.before), _mm(found.after), apart or "-")
+    rows.add_row("(all data, fitted)", _mm(found.before), _mm(found.after), apart or "-")
     out.print(rows)
     errors = ", ".join(f"{name} {value:.4f}" for name, value in document["model_errors_mm"].items())
-    out.print(f"joints: [bold]{found.model}[/] (error of a coordinate not fitted, mm: {errors})")
+    out.print(f"joint model: [bold]{found.model}[/] (held-out error per coordinate [mm]: {errors})")
     _print_parameters(document)
     for outlier in document["outliers"]:
         out.print(
             f"[yellow]outlier[/] {outlier['socket']}, row {outlier['row']}:"
-            f" {outlier['distance_mm']:.2f} mm from its socket, not fitted"
+            f" {outlier['distance_mm']:.2f} mm from its socket, excluded from the fit"
         )
     for one in left:
         for outlier in one.calibrated.outliers:
             out.print(
                 f"[yellow]outlier[/] {outlier.socket}, row {outlier.line}:"
-                f" {1e3 * outlier.distance:.2f} mm apart in what is predicted, counted there"
+                f" {1e3 * outlier.distance:.2f} mm from its socket in the held-out prediction,"
+                " included in the RMS"
             )
     for note in document["notes"]:
         out.print(f"[yellow]note[/] {note}")
@@ -304,7 +318,8 @@ def _print(document: dict[str, Any], found: SocketCalibration, left: Sequence[Le
 
 def _print_parameters(document: dict[str, Any]) -> None:
     units = {one["name"]: one["unit"] for one in document["parameters"]}
-    rows = table("What the data tell", "parameter or combination", "value", "95 % +-", "unit")
+    title = "Identifiable parameters and combinations"
+    rows = table(title, "parameter or combination", "value", "95 % +-", "unit")
     told = sorted(document["told"], key=lambda one: len(one["text"]))
     for one in told[:_SHOWN]:
         unit = units[one["text"].split()[0]]
@@ -314,8 +329,8 @@ def _print_parameters(document: dict[str, Any]) -> None:
         rows.add_row(text, f"{factor * one['value']:.4g}", reach, shown)
     out.print(rows)
     if len(told) > _SHOWN:
-        out.print(f"... and {len(told) - _SHOWN} longer combinations: --out or --json lists all")
-    out.print("not told: " + (", ".join(document["unknown"]) or "nothing"))
+        out.print(f"... and {len(told) - _SHOWN} longer combinations; --out or --json lists all")
+    out.print("not identifiable: " + (", ".join(document["unknown"]) or "none"))
 
 
 def _unit(name: str, angular: Sequence[str]) -> str:
@@ -340,36 +355,38 @@ def _outliers(outliers: Sequence[Outlier]) -> list[dict[str, Any]]:
 
 
 def simulate_scara_folder(folder: Path, poses: int, noise: float, seed: int) -> None:
-    """Write measurements of an arm of 0.4 and 0.3 m whose links are 0.8 mm longer, 0.5 mm shorter.
+    """Write simulated measurements of an arm with links of 0.4 m and 0.3 m.
+
+    The first link is 0.8 mm longer and the second one 0.5 mm shorter than nominal.
 
     Args:
-        folder: to write into.
-        poses: number of them.
-        noise: of the positions [m].
-        seed: of poses and noise.
+        folder: folder to write.
+        poses: number of poses.
+        noise: standard deviation of the positions [m].
+        seed: random seed of poses and noise.
 
     Raises:
-        InputError: the folder holds something.
+        InputError: the folder is not empty.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(folder, "exists; choose another --simulate")
+        raise InputError(folder, "exists; give another folder to --simulate")
     save_scara(folder, _EXAMPLE, simulated_scara(_EXAMPLE, _ERRORS, poses, noise, seed))
 
 
 def calibrate_scara_folder(
     data: Path, heldout: str | None, choose: int | None, target: Path | None, as_json: bool
 ) -> dict[str, Any]:
-    """Calibrate an arm; print the result and write it, whole or not at all.
+    """Calibrate a SCARA arm from measured positions; print and write the result.
 
     Args:
-        data: folder of `nominal.yaml` and `measured.csv`.
-        heldout: numbers of poses to judge on, None for each in turn.
-        choose: number of poses to name that tell most, None for none.
-        target: folder to write, None for none.
-        as_json: print JSON instead of words.
+        data: folder with `nominal.yaml` and `measured.csv`.
+        heldout: numbers of the held-out poses, None for each in turn.
+        choose: number of most informative poses to list, None for none.
+        target: output folder, written completely or not at all; None to write nothing.
+        as_json: print JSON instead of text.
 
     Returns:
-        The document that is printed or written.
+        The result in the form of `calibration.json`.
 
     Raises:
         InputError: data or target are not usable.
@@ -440,28 +457,28 @@ def _print_scara(document: dict[str, Any]) -> None:
     for one in document["parameters"]:
         unit = {"m": "mm", "rad": "mrad"}[one["unit"]]
         if one["std"] is None:
-            rows.add_row(one["name"], f"{1e3 * one['nominal']:.4f}", "-", "not told", unit)
+            rows.add_row(one["name"], f"{1e3 * one['nominal']:.4f}", "-", "not identifiable", unit)
             continue
         rows.add_row(one["name"], f"{1e3 * one['nominal']:.4f}", f"{1e3 * one['value']:.4f}",
                      f"{0.5e3 * (one['high'] - one['low']):.4f}", unit)  # fmt: skip
     out.print(rows)
     judged = document["heldout"]
-    out.print(f"end predicted, not fitted: [bold]{judged['rms_mm']:.4f} mm[/] RMS"
-              f" (nominal {judged['nominal_rms_mm']:.4f})")  # fmt: skip
+    out.print(f"held-out position error: [bold]{judged['rms_mm']:.4f} mm[/] RMS"
+              f" (nominal {judged['nominal_rms_mm']:.4f} mm)")  # fmt: skip
     if "best_poses" in document:
-        out.print("poses that tell most: " + ", ".join(map(str, document["best_poses"])))
+        out.print("most informative poses: " + ", ".join(map(str, document["best_poses"])))
     for text in document["combinations"]:
-        out.print(f"[yellow]only together[/] {text}")
+        out.print(f"[yellow]identifiable only as a combination[/] {text}")
     if document["unknown"]:
-        out.print("[yellow]not told[/] " + ", ".join(document["unknown"]))
+        out.print("[yellow]not identifiable[/] " + ", ".join(document["unknown"]))
 
 
 KIND = "hybrid calibration"
 MEASUREMENT = "hybrid measurement"
 CRITERIA = ("D", "O1", "O2", "O3", "O4", "O5")
-CANDIDATES = 200  # poses among which the best are chosen
+CANDIDATES = 200  # number of random poses from which the most informative are selected
 NOISE = {"leg": 1e-5, "slide": 1e-5, "turn": 2e-5, "wire": 2e-5}  # m, rad: models/iwr/README.md
-BOX = 8.0  # sizes of the errors of manufacture, that differential evolution searches
+BOX = 8.0  # half width of the search box, in expected sizes of the manufacturing errors
 
 
 def calibrate_hybrid(
@@ -471,21 +488,21 @@ def calibrate_hybrid(
     """Calibrate a hybrid robot from a folder of measurements; print and write the result.
 
     Args:
-        data: the folder.
-        robot: nominal robot; None for the folder's own, or `iwr`.
-        kind: `auto`, `dh` or `poe`.
-        parameters: `all`, `document` or names with commas.
-        evolution: search by differential evolution, too.
-        steps: of MCMC; 0 for none.
-        seed: of both.
-        target: folder to write; None for none.
-        as_json: print JSON.
+        data: folder with `poses.csv` or `poses.parquet`.
+        robot: nominal robot, None for that of the folder, else `iwr`.
+        kind: error model: `auto`, `dh` or `poe`.
+        parameters: `all`, `document` or names separated by commas.
+        evolution: whether to search by differential evolution as well.
+        steps: number of MCMC steps, 0 for no MCMC.
+        seed: random seed of differential evolution and MCMC.
+        target: output folder, None to write nothing.
+        as_json: print JSON instead of text.
 
     Returns:
         The calibration.
 
     Raises:
-        InputError: the folder, the robot or a choice is not usable.
+        InputError: the folder, the robot or an option is not usable.
     """
     if kind not in ("auto", "dh", "poe"):
         raise InputError(f"--model {kind}", "valid: auto, dh, poe")
@@ -622,12 +639,12 @@ def _write_hybrid(folder: Path, result, done: Calibration, heldout, posterior) -
 
     write_json(folder / "calibration.json", result)
     save_hybrid(done.robot, folder / "robot.yaml", "calibrated by hydrotele calibrate hybrid")
-    before, after, what = done.before, done.left_out, "poses, each predicted without itself"
+    before, after, what = done.before, done.left_out, "poses, leave-one-out predictions"
     if len(before.position) != len(after.position):
-        after, what = done.after, "poses of the calibration"
+        after, what = done.after, "fitted poses"
     if heldout is not None:
         before, after = pose_errors(done.model.nominal, heldout), pose_errors(done.robot, heldout)
-        what = "poses not used"
+        what = "held-out poses"
     picture = error_bars(
         {"position [mm]": (1e3 * before.position, 1e3 * after.position),
          "orientation [mrad]": (1e3 * before.orientation, 1e3 * after.orientation)}, what,
@@ -648,32 +665,33 @@ def _write_hybrid(folder: Path, result, done: Calibration, heldout, posterior) -
 def _print_hybrid(result: dict[str, Any]) -> None:
     errors, told = result["errors"], result["redundancy"]
     shown = table(f"{result['robot']}: {result['poses']} poses, model {result['model']}",
-                  "errors of the pose", "RMS mm", "max mm", "RMS mrad")  # fmt: skip
+                  "pose errors (lower is better)", "RMS mm", "max mm", "RMS mrad")  # fmt: skip
     rows = [("nominal", errors["before"]), ("calibrated", errors["after"]),
-            ("each pose predicted without itself", errors["left_out"])]  # fmt: skip
+            ("leave-one-out prediction", errors["left_out"])]  # fmt: skip
     for name, e in rows:
         shown.add_row(name, f"{e['position_rms_mm']:.3f}", f"{e['position_max_mm']:.3f}",
                       f"{e['orientation_rms_mrad']:.3f}")  # fmt: skip
     if "heldout" in result:
         h = result["heldout"]
-        shown.add_row(f"{h['poses']} poses not used, nominal", f"{h['before_rms_mm']:.3f}",
+        shown.add_row(f"{h['poses']} held-out poses, nominal", f"{h['before_rms_mm']:.3f}",
                       f"{h['before_max_mm']:.3f}", "")  # fmt: skip
-        shown.add_row(f"{h['poses']} poses not used, calibrated", f"{h['rms_mm']:.3f}",
+        shown.add_row(f"{h['poses']} held-out poses, calibrated", f"{h['rms_mm']:.3f}",
                       f"{h['max_mm']:.3f}", f"{h['orientation_rms_mrad']:.3f}")  # fmt: skip
     out.print(shown)
     out.print(
-        f"{told['parameters']} parameters, {told['rank']} independent; noise {result['noise']},"
-        f" chi {result['chi']:.2f}"
+        f"{told['parameters']} parameters, {told['rank']} independent; noise {result['noise']};"
+        f" ratio of residuals to noise {result['chi']:.2f}"
     )
     for words in told["words"][:12]:
         out.print(f"  {words}")
     if result["unknown"]:
-        out.print(f"keep their nominal values: {', '.join(result['unknown'])}")
+        out.print(f"kept at their nominal values: {', '.join(result['unknown'])}")
     if told["hidden_by_the_noise"]:
-        out.print(f"hardly told at this noise: {', '.join(told['hidden_by_the_noise'])}")
+        names = ", ".join(told["hidden_by_the_noise"])
+        out.print(f"poorly identifiable at this noise: {names}")
     if result["poses_left_out_as_wrong"]:
         rows_ = ", ".join(map(str, result["poses_left_out_as_wrong"]))
-        out.print(f"left out, as their readings fit no calibration: rows {rows_}")
+        out.print(f"excluded, because their measurements fit no calibration: rows {rows_}")
     for words in result["warnings"]:
         out.print(f"[yellow]warning[/] {words}")
     for key, name in (("evolution", "differential evolution"), ("posterior", "MCMC")):
@@ -681,29 +699,34 @@ def _print_hybrid(result: dict[str, Any]) -> None:
             one = result[key]
             said = one.get("status", "converged" if one["converged"] else "not converged")
             away = one["largest_difference_in_deviations"]
-            out.print(f"{name}: {said}; least squares differs by at most {away:.2f} deviations")
+            out.print(
+                f"{name}: {said}; differs from least squares by at most {away:.2f} standard"
+                " deviations"
+            )
 
 
 def simulate_hybrid(
     target: Path, robot: str | None, poses: int, heldout: int, seed: int, noise: float,
     errors: float, parameters: str, kind: str, choose: str = "random",
 ) -> None:  # fmt: skip
-    """Write a simulated measurement of a robot with errors of manufacture, and its truth apart.
+    """Simulate the measurement of a robot with manufacturing errors and write it to a folder.
+
+    The true errors and the true robot are written to the subfolder `truth`.
 
     Args:
-        target: folder to write.
-        robot: nominal; None for `iwr`.
-        poses: to calibrate from.
-        heldout: poses to judge on.
-        seed: of errors, poses and noise.
+        target: output folder.
+        robot: nominal robot, None for `iwr`.
+        poses: number of poses for the calibration.
+        heldout: number of held-out poses.
+        seed: random seed of errors, poses and noise.
         noise: factor on the noise of all sensors.
-        errors: factor on the errors of manufacture of 1 mm and 1 mrad.
-        parameters: `all`, `document` or names: which have errors.
-        kind: error model of the planted errors, `dh` or `poe`.
+        errors: factor on the manufacturing errors of 1 mm and 1 mrad.
+        parameters: parameters with errors: `all`, `document` or names separated by commas.
+        kind: error model of the simulated errors: `auto`, `dh` or `poe`.
         choose: `random` poses, or a criterion of `informative_poses`.
 
     Raises:
-        InputError: the folder cannot be written, or a choice is not usable.
+        InputError: the folder cannot be written, or an option is not usable.
     """
     from hydrotele.kinematics.hybrid import corrected
     from hydrotele.simulate.hybrid import (
@@ -741,11 +764,11 @@ def simulate_hybrid(
         (folder / "truth" / "errors.json").write_text(text + "\n", encoding="utf-8")
         summary = {"kind": MEASUREMENT, "name": nominal.name, "hydrotele": hydrotele.__version__}
         write_json(folder / "summary.json", summary)
-    out.print(f"written to [bold]{target}[/]: {poses} poses and {heldout} to judge on")
+    out.print(f"written to [bold]{target}[/]: {poses} poses and {heldout} held-out poses")
 
 
 def _chosen(model, wires, count: int, rng: np.random.Generator, criterion: Any):
-    """Commands of the most informative poses among random ones: joints and leg readings."""
+    """Return joint values and leg lengths of the most informative of many random poses."""
     from hydrotele.simulate.hybrid import random_poses
 
     robot = model.nominal

@@ -1,4 +1,8 @@
-"""`hydrotele list`, `validate` and `export`: what there is, and whether a file is right."""
+"""Implement `hydrotele list`, `validate` and `export`.
+
+`list` shows the available machines, scenarios and effects, `validate` checks files, and `export`
+writes the MJCF or an image of a machine.
+"""
 
 from pathlib import Path
 
@@ -15,10 +19,14 @@ _KINDS = ("machines", "joysticks", "scenarios", "sweeps", "effects", "environmen
 
 
 def list_things(what: str, as_json: bool) -> None:
-    """List machines, joysticks, scenarios, sweeps, effects, environments, or all of them.
+    """Print the available machines, joysticks, scenarios, sweeps, effects or environments.
+
+    Args:
+        what: kind of the items, such as `machines`, or `all`.
+        as_json: print JSON instead of tables.
 
     Raises:
-        InputError: there is no such list.
+        InputError: `what` is not a valid kind.
     """
     if what not in (*_KINDS, "all"):
         raise InputError(f"list {what}", suggest(what, [*_KINDS, "all"]))
@@ -91,9 +99,9 @@ def _sweeps() -> list[dict]:
 
 
 def _effects() -> list[dict]:
-    """Effects at the first shipped machine that has a place for them; ranges at the last of these.
+    """Return a row for each effect, with its locations on the first machine that supports it.
 
-    The CAT 215 with bucket comes before all others.
+    The CAT 215 with bucket is tried first. The parameter ranges are those of the last location.
     """
     from hydrotele.effects import EFFECTS
 
@@ -120,7 +128,7 @@ def _effects() -> list[dict]:
 
 
 def _environments() -> list[dict]:
-    """Gymnasium environments."""
+    """Return a row for each gymnasium environment."""
     from hydrotele.envs.making import TASKS
 
     return [
@@ -135,10 +143,14 @@ def _environments() -> list[dict]:
 
 
 def validate_files(paths: list[Path], as_json: bool) -> None:
-    """Check machines with all their tools, joysticks, scenarios, sweeps and logs; say what each is.
+    """Check machines with all their tools, joysticks, scenarios, sweeps and logs.
+
+    Args:
+        paths: files, folders or shipped names to check.
+        as_json: print JSON instead of text.
 
     Raises:
-        InputError: something is wrong; all files have been reported by then.
+        InputError: a file is not valid; it is raised after all files were checked.
     """
     checked: list[dict] = []
     wrong: list[InputError] = []
@@ -181,7 +193,7 @@ def _validate(path: Path) -> tuple[str, str]:
     if path.is_file():
         return "machine", _check_machine(path)
     names = [*shipped_machines(), *shipped_joysticks(), *shipped_scenarios(), *_sweep_names()]
-    message = "is no file, machine, joystick, scenario or sweep"
+    message = "is not a file, machine, joystick, scenario or sweep"
     raise InputError(path, f"{message}; {suggest(name, names)}")
 
 
@@ -201,7 +213,7 @@ def _check_sweep(path: Path) -> str:
 
 
 def _is_joystick(path: Path) -> bool:
-    """Whether a name, folder or file is that of a joystick."""
+    """Return whether a name, folder or file describes a joystick."""
     if str(path) in shipped_joysticks() or (path / JOYSTICK_FILE).is_file():
         return True
     return path.suffix in (".yaml", ".yml") and path.is_file() and "flotor" in read_yaml(path)[0]
@@ -216,9 +228,10 @@ def _check_joystick(path: Path) -> str:
     flight = simulate_levitation(joystick, np.zeros((round(joystick.control_rate), 6)))
     far = np.abs(flight.pose[:, :3]).max()
     if far > 0.1 * joystick.workspace.translation:
-        raise InputError(path, f"its flotor does not hover: it moves by {1e3 * far:.1f} mm in 1 s")
+        message = f"the flotor does not levitate stably: it moves by {1e3 * far:.1f} mm in 1 s"
+        raise InputError(path, message)
     current, most = np.abs(flight.currents[-1]).max(), joystick.coils.max_current
-    return f"hovers with {current:.2f} of {most:g} A; gains {', '.join(joystick.gains)}"
+    return f"levitates with {current:.2f} of {most:g} A; gains {', '.join(joystick.gains)}"
 
 
 def _check_machine(path: Path) -> str:
@@ -236,7 +249,7 @@ def _check_machine(path: Path) -> str:
             axis_linkage(machine, axis)
         check_strokes(machine)
     tools = "" if first.tools == ("none",) else f", tools {', '.join(first.tools)}"
-    return f"axes {', '.join(first.axes)}{tools}; all assemble and stand at rest at home"
+    return f"axes {', '.join(first.axes)}{tools}; assembly and static equilibrium checked"
 
 
 def _check_scenario(scenario) -> str:
@@ -250,10 +263,17 @@ def _check_scenario(scenario) -> str:
 def export_machine(
     name: str, tool: str | None, target: Path | None, picture: Path | None, camera: str
 ) -> None:
-    """Write a machine's or joystick's complete MJCF (default: to stdout), or a picture of it.
+    """Write the complete MJCF of a machine or joystick, or an image of it.
+
+    Args:
+        name: shipped name, file or folder of a machine or joystick.
+        tool: tool of the machine, None for its first tool.
+        target: MJCF file, None for standard output.
+        picture: PNG file to write instead of the MJCF.
+        camera: camera of the image.
 
     Raises:
-        InputError: it is not usable, or pictures cannot be rendered here.
+        InputError: the machine is not usable, or this computer cannot render images.
     """
     if _is_joystick(Path(name)):
         if tool:
@@ -296,7 +316,7 @@ def _write(document: Mjcf, target: Path | None) -> None:
             document.save(part, target)
         notes.print(f"written to {target}")
     elif document.assets:
-        message = f"needs {len(document.assets)} files beside it: give --out FILE.xml"
+        message = f"refers to {len(document.assets)} further files: give --out FILE.xml"
         raise InputError("the MJCF", message)
     else:
         print(document.text)

@@ -1,4 +1,8 @@
-"""`hydrotele compare`: how well machines and black boxes predict runs on the commands alone."""
+"""Implement `hydrotele compare`: open-loop predictions of machine models and black-box models.
+
+Each model predicts held-out runs from the commands alone. The result is the RMS error of each
+channel at each horizon, as a table, as JSON and as a plot.
+"""
 
 import dataclasses
 import math
@@ -32,20 +36,20 @@ from hydrotele.machine.machine_file import MACHINE_FILE
 from hydrotele.machine.signals import usual_unit
 from hydrotele.simulate.native import stop_profiling_clock
 
-_MADE = ("patched", "identified")  # where `gap` and `identify` put the machine in their folders
-_PICTURED, _MOST_PLOTS = 120.0, 12  # s of a run, and channels, that fit into a picture
+_MADE = ("patched", "identified")  # subfolders in which `gap` and `identify` write the machine
+_PICTURED, _MOST_PLOTS = 120.0, 12  # duration [s] and number of channels in the plot
 _ROW_BY_ROW = "one row"
 
 
 @dataclasses.dataclass(frozen=True)
 class Compared:
-    """One model along the judged runs.
+    """Prediction errors of one model on all evaluated runs.
 
     Attributes:
-        name: as the user gave it.
+        name: name or folder that the user gave.
         kind: `machine` or `baseline`.
-        runs: its errors, run by run.
-        pictured: (n, c) its free runs along the first of them.
+        runs: prediction errors, one item per run.
+        pictured: (n, c) open-loop predictions of n rows and c channels of the first run.
     """
 
     name: str
@@ -54,7 +58,7 @@ class Compared:
     pictured: np.ndarray
 
     def mean(self, horizon: str) -> np.ndarray:
-        """(c,) RMS errors of a horizon, or of `_ROW_BY_ROW`, mean over the runs that have it."""
+        """Return the (c,) RMS errors at a horizon or `_ROW_BY_ROW`, averaged over the runs."""
         if horizon == _ROW_BY_ROW:
             found = [errors.one_step for errors in self.runs]
         else:
@@ -63,7 +67,7 @@ class Compared:
         return np.array([column.mean() if len(column) else math.nan for column in columns])
 
     def count(self, horizon: str) -> tuple[int, int]:
-        """Windows of a horizon that left the machine's range, and all of them."""
+        """Return the number of diverged predictions at a horizon and the number of predictions."""
         found = [e.horizons[horizon] for e in self.runs if horizon in e.horizons]
         return sum(h.diverged for h in found), sum(h.windows for h in found)
 
@@ -73,24 +77,24 @@ def compare_models(
     sensors: str | None, horizons: Sequence[float], baselines: Sequence[str], every: bool,
     target: Path | None, as_json: bool, force: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
-    """Compare models on runs that they were not fitted to.
+    """Compare models on runs that were not used to fit them.
 
     Args:
-        machines: names, folders, or folders of `gap` and `identify`; the first one says which
-            channels count.
+        machines: names or folders of machines, or result folders of `gap` and `identify`. The
+            first machine determines the compared channels.
         data: log files, folders of logs, run folders.
-        tool: the machines' tool, None for the logs'.
-        heldout: name of the run to judge on, None to choose.
-        sensors: name of the machines' sensors, None for those that the logs name.
-        horizons: of the free runs [s].
-        baselines: names of black boxes, which are fitted on the other runs.
-        every: judge on the fitted runs, too.
-        target: folder for compare.json and the picture, None to write nothing.
+        tool: tool of the machines, None for that of the logs.
+        heldout: name of the held-out run, None for `test*`, else the last run.
+        sensors: name of the machines' sensor set, None for that named by the logs.
+        horizons: prediction horizons [s].
+        baselines: names of black-box models, which are fitted on the other runs.
+        every: evaluate the models on the fitted runs as well.
+        target: folder for compare.json and the plot, None to write nothing.
         as_json: print JSON instead of tables.
         force: accept logs whose metadata name another machine or tool.
 
     Returns:
-        The document that is printed or written.
+        The result in the form of `compare.json`.
 
     Raises:
         InputError: data, machines, horizons, baselines or target are not usable.
@@ -126,7 +130,7 @@ def compare_models(
 
 
 def machine_place(name: str) -> str:
-    """A machine's name or folder; of a folder of `gap` or `identify`, the machine that it made."""
+    """Return the folder of the machine in a result folder of `gap` or `identify`, else `name`."""
     for inside in _MADE:
         if (Path(name) / inside / MACHINE_FILE).is_file():
             return str(Path(name) / inside)
@@ -136,7 +140,7 @@ def machine_place(name: str) -> str:
 def compare_document(
     compared: Sequence[Compared], shown: Sequence[str], dataset: Dataset, data: Sequence[Path]
 ) -> dict[str, Any]:
-    """The comparison as JSON: RMS errors in SI units; null where a window left the range."""
+    """Return the comparison as JSON data: RMS errors in SI units, None if a model diverged."""
 
     def by_channel(values: np.ndarray) -> dict[str, float]:
         return dict(zip(dataset.channels, values.tolist(), strict=True))
@@ -206,12 +210,12 @@ def _compare(
 
 
 def _check_fits(name: str, machine: Machine, dataset: Dataset) -> None:
-    """Whether a machine predicts what the first one does, from the same commands."""
+    """Raise InputError if a machine has other axes or channels than the first machine."""
     if tuple(actuator_order(machine)) != dataset.axes:
         raise InputError(
             f"machine {name}",
-            f"has the axes {', '.join(actuator_order(machine))}, the first one"
-            f" {', '.join(dataset.axes)}: compare machines with the same axes",
+            f"has the axes {', '.join(actuator_order(machine))}; the first machine has"
+            f" {', '.join(dataset.axes)}. Compare machines with the same axes",
         )
     lacking = [c for c in dataset.channels if c not in predicted_channels(machine)]
     if lacking:
@@ -223,18 +227,18 @@ def _check_horizons(horizons: Sequence[float], judged: Sequence[RunData]) -> Non
         rows = max(run.period for run in judged)
         if not (math.isfinite(seconds) and seconds >= rows):
             raise InputError(
-                f"--horizons {seconds:g}", f"must be seconds, {rows:g} (one row of the log) or more"
+                f"--horizons {seconds:g}", f"must be at least {rows:g} s, the log's sample period"
             )
 
 
 def _shown_horizons(compared: Sequence[Compared]) -> list[str]:
-    """Horizons that any judged run is long enough for, the shortest first."""
+    """Return the horizons that fit into at least one evaluated run, in ascending order."""
     found = {name: h.seconds for m in compared for e in m.runs for name, h in e.horizons.items()}
     return sorted(found, key=lambda name: math.inf if name == TO_THE_END else found[name])
 
 
 def _pictured(horizons: Sequence[float], run: RunData) -> float:
-    """The longest horizon that fits three times into what is pictured of a run, or a third."""
+    """Return the longest horizon that fits three times into the plot, else a third of it [s]."""
     seconds = min(_PICTURED, len(run.reading) * run.period)
     return max([h for h in horizons if 3.0 * h <= seconds], default=seconds / 3.0)
 
@@ -261,7 +265,7 @@ def _write(
     picture = draw_free_runs(
         time, begin.reading[:, some], {m.name: m.pictured[:, some] for m in compared}, channels,
         [usual_unit(channel) for channel in channels],
-        f"{run.name}: free runs of {seconds:.3g} s, one after the other",
+        f"{run.name}: open-loop predictions, restarted every {seconds:.3g} s",
     )  # fmt: skip
     (folder / "free_run.png").write_bytes(picture)
     summary = {
@@ -279,7 +283,8 @@ def _print(
     compared: Sequence[Compared], shown: Sequence[str], dataset: Dataset, judged: Sequence[RunData]
 ) -> None:
     runs = ", ".join(run.name for run in judged)
-    rows = table(f"RMS errors on {runs}", "channel", "ahead", *(m.name for m in compared), "unit")
+    title = f"RMS prediction error on {runs} (lower is better; bold: best model)"
+    rows = table(title, "channel", "horizon", *(m.name for m in compared), "unit")
     for c, channel in enumerate(dataset.channels):
         errors = {h: [m.mean(h)[c] for m in compared] for h in (_ROW_BY_ROW, *shown)}
         finite = [e for row in errors.values() for e in row if math.isfinite(e)]
@@ -302,12 +307,12 @@ def _print(
 
 def _ahead(horizon: str) -> str:
     if horizon in (_ROW_BY_ROW, TO_THE_END):
-        return {_ROW_BY_ROW: _ROW_BY_ROW, TO_THE_END: "to the end"}[horizon]
+        return {_ROW_BY_ROW: _ROW_BY_ROW, TO_THE_END: "whole run"}[horizon]
     return f"{horizon} s"
 
 
 def _cell(model: Compared, horizon: str, error: float) -> str:
-    """An error in customary units, or how many windows left the machine's range."""
+    """Format an error in customary units, or the number of diverged predictions."""
     if math.isnan(error):
         return "-"
     if math.isinf(error):

@@ -1,7 +1,7 @@
-"""`hydrotele compile`: fill the cache of compiled functions with several processes.
+"""Implement `hydrotele compile`: fill the cache of compiled functions, using several processes.
 
-Each job runs the smallest task that calls all compiled functions of one kind of command, with the
-argument types that the command uses.
+Each job runs a short task that calls all compiled functions of one group of commands, with the
+argument types that these commands use.
 """
 
 import hashlib
@@ -23,16 +23,17 @@ from hydrotele.core.compile_progress import SECONDS_BEFORE_BAR, ProgressLine, fo
 from hydrotele.core.compiled import cache_folder
 from hydrotele.core.errors import InputError
 
-_POLL = 0.2  # s between two looks at the jobs
+_POLL = 0.2  # s between two checks of the jobs
 
 
 class Job(NamedTuple):
-    """One process's part of the work.
+    """Work of one process.
 
     Attributes:
-        name: shown in the progress bar.
-        run: does the task.
-        seconds: processor time on an empty cache, for the order and the estimate of time left [s].
+        name: name in the progress bar.
+        run: function that executes the task.
+        seconds: processor time with an empty cache [s]; it determines the order of the jobs and
+            the estimate of the remaining time.
     """
 
     name: str
@@ -90,23 +91,23 @@ JOBS = (
 
 
 def run_job(name: str) -> None:
-    """Run one job in this process."""
+    """Run the job of the given name in this process."""
     next(job for job in JOBS if job.name == name).run()
 
 
 def compile_all(processes: int | None = None) -> None:
-    """Run all jobs, longest first.
+    """Compile all functions by running all jobs, the longest first.
 
     Args:
-        processes: that work side by side; one per core unless given.
+        processes: number of parallel processes, default one per core.
 
     Raises:
-        InputError: there is no folder for the cache, or a job failed.
+        InputError: there is no usable cache folder, or a job failed.
     """
     folder = cache_folder()
     if folder is None:
         raise InputError(
-            "cache", "there is no folder that only you can write to; set XDG_CACHE_HOME to one"
+            "cache", "no folder is writable by you alone; set XDG_CACHE_HOME to such a folder"
         )
     complete = folder / f"complete_{_digest()}"
     if complete.exists():
@@ -128,8 +129,8 @@ def compile_all(processes: int | None = None) -> None:
                     del running[job]
                     finished, spent = finished + job.seconds, spent + time.monotonic() - start
                     if process.returncode:
-                        raise InputError(f"compiling of {job.name}", _last_line(process))
-            scale = spent / finished if finished else 1.0  # of this computer
+                        raise InputError(f"compilation of {job.name}", _last_line(process))
+            scale = spent / finished if finished else 1.0  # time relative to `Job.seconds`
             begun = sum(min((time.monotonic() - start) / scale, job.seconds)
                         for job, (start, _) in running.items())  # fmt: skip
             left = (total - finished - begun) * scale / processes
@@ -148,7 +149,7 @@ def compile_all(processes: int | None = None) -> None:
 
 
 def _digest() -> str:
-    """Return a digest of everything that the compiled code depends on."""
+    """Return a digest of Python, numba, processor and sources, which determine compiled code."""
     package = Path(hydrotele.__file__).parent
     text = hashlib.sha256(f"{sys.version} {numba.__version__} {get_host_cpu_name()}".encode())
     for path in sorted(package.rglob("*.py")):
@@ -167,4 +168,4 @@ def _start(job: Job) -> subprocess.Popen:
 def _last_line(process: subprocess.Popen) -> str:
     assert process.stderr
     lines = process.stderr.read().decode(errors="replace").strip().splitlines()
-    return lines[-1] if lines else f"ended with {process.returncode}"
+    return lines[-1] if lines else f"exit status {process.returncode}"

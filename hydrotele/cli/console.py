@@ -1,4 +1,7 @@
-"""Printing for people and for scripts."""
+"""Print results, notes, tables, JSON and progress on the terminal.
+
+Results go to standard output; notes and progress go to standard error.
+"""
 
 import contextlib
 import json
@@ -17,17 +20,17 @@ from rich.table import Table
 from rich.text import Text
 
 Progress = Callable[[float, float], None]
-_BEAT = 15.0  # s between lines that say how far a command is, where there is no terminal
+_BEAT = 15.0  # s between progress lines if standard error is not a terminal
 
 _STYLES = "bold|dim|red|green|yellow|blue|magenta"
 _NO_TAG = re.compile(rf"(?<!\\)\[(?!/\]|(?:{_STYLES})(?: (?:{_STYLES}))*\])")
 
 
 class _Console(Console):
-    """A console that takes our own styles in brackets only; names and paths may hold any text."""
+    """Console that interprets only a few styles in brackets; other brackets are printed."""
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """The text with its styles; what looks like another tag, or is never opened, is text."""
+        """Return the text with its styles; print unknown or unmatched tags unchanged."""
         try:
             return super().render_str(_NO_TAG.sub(r"\[", text), **options)
         except MarkupError:
@@ -39,12 +42,12 @@ notes = _Console(stderr=True, highlight=False, emoji=False)
 
 
 def print_json(data: Any) -> None:
-    """Print data as JSON; numbers that are not finite become null."""
+    """Print data as JSON; NaN and infinity become null."""
     print(json.dumps(plain(data), indent=2))
 
 
 def write_json(path: Path, data: Any) -> None:
-    """Write data as JSON into a file; numbers that are not finite become null."""
+    """Write data as JSON into a file; NaN and infinity become null."""
     text = json.dumps(plain(data), indent=2, allow_nan=False)
     path.write_text(text + "\n", encoding="utf-8")
 
@@ -52,13 +55,13 @@ def write_json(path: Path, data: Any) -> None:
 def print_result(
     document: Any, as_json: bool, show: Callable[[], None], target: Path | None
 ) -> None:
-    """Print what a command found: as JSON, or in words with the place of its report.
+    """Print the result of a command as JSON, or as text followed by the path of its report.
 
     Args:
-        document: what the JSON holds.
-        as_json: whether to print that.
-        show: prints the words.
-        target: folder that was written, with a report.html; None where none was.
+        document: JSON data of the result.
+        as_json: whether to print JSON.
+        show: function that prints the result as text.
+        target: output folder that contains report.html, None if nothing was written.
     """
     if as_json:
         print_json(document)
@@ -69,7 +72,7 @@ def print_result(
 
 
 def plain(data: Any) -> Any:
-    """Data with Python numbers only, NaN and infinity as None."""
+    """Convert data to Python types for JSON; NaN and infinity become None."""
     if isinstance(data, dict):
         return {str(key): plain(value) for key, value in data.items()}
     if isinstance(data, (list, tuple, np.ndarray)):
@@ -82,7 +85,7 @@ def plain(data: Any) -> Any:
 
 
 def table(title: str, *columns: str) -> Table:
-    """A table whose columns after the first are right-aligned."""
+    """Return an empty table in which all columns but the first are right-aligned."""
     made = Table(title=title, title_justify="left", header_style="bold")
     for place, column in enumerate(columns):
         made.add_column(column, justify="left" if place == 0 else "right")
@@ -91,8 +94,8 @@ def table(title: str, *columns: str) -> Table:
 
 @contextlib.contextmanager
 def _heartbeat(label: str) -> Iterator[Callable[[str], None]]:
-    """A line on stderr every `_BEAT` seconds, with what was told last and the time that it took."""
-    begin, last, over = time.perf_counter(), ["begins"], threading.Event()
+    """Print the latest status text and the elapsed time on stderr every `_BEAT` seconds."""
+    begin, last, over = time.perf_counter(), ["starts"], threading.Event()
 
     def beat() -> None:
         while not over.wait(_BEAT):
@@ -113,9 +116,12 @@ def _heartbeat(label: str) -> Iterator[Callable[[str], None]]:
 
 @contextlib.contextmanager
 def progress_bar(label: str, quiet: bool = False) -> Iterator[Progress | None]:
-    """A bar with simulated time and real-time factor on stderr, or now and then a line.
+    """Show simulated time and real-time factor on stderr while a simulation runs.
 
-    The line is for what is no terminal, such as the log of a job; None where all is to be quiet.
+    On a terminal this is a progress bar, otherwise a line every `_BEAT` seconds.
+
+    Yields:
+        A function of simulated and total time [s] that updates the display, None if `quiet`.
     """
     if quiet:
         yield None
@@ -143,7 +149,11 @@ def progress_bar(label: str, quiet: bool = False) -> Iterator[Progress | None]:
 
 @contextlib.contextmanager
 def stages(label: str, quiet: bool) -> Iterator[Callable[[str, float], None] | None]:
-    """A bar with the stage of the search on stderr, or now and then a line; None if quiet."""
+    """Show the current stage of a computation on stderr, as a progress bar or as lines.
+
+    Yields:
+        A function of stage name and completed fraction that updates the display, None if `quiet`.
+    """
     if quiet:
         yield None
         return
@@ -166,7 +176,11 @@ def stages(label: str, quiet: bool) -> Iterator[Callable[[str, float], None] | N
 
 @contextlib.contextmanager
 def first_interrupt() -> Iterator[Callable[[], bool]]:
-    """The first Ctrl-C only sets what this yields; the second one interrupts as usual."""
+    """Handle the first Ctrl-C as a request to stop; the second one raises KeyboardInterrupt.
+
+    Yields:
+        A function that returns whether Ctrl-C was pressed.
+    """
     seen: list[bool] = []
 
     def note(number, frame) -> None:
@@ -176,7 +190,7 @@ def first_interrupt() -> Iterator[Callable[[], bool]]:
 
     try:
         before = signal.signal(signal.SIGINT, note)
-    except ValueError:  # not in the main thread, where no signals come
+    except ValueError:  # only the main thread can set signal handlers
         yield lambda: False
         return
     try:

@@ -1,4 +1,8 @@
-"""`hydrotele drive`: a person drives a machine, into a folder like a run's."""
+"""Implement `hydrotele drive`: an operator drives a simulated machine in real time.
+
+The operator uses a keyboard, gamepad, SpaceMouse or haptic device, or a script replaces the
+operator. The results are written to a folder with the same files as those of `hydrotele run`.
+"""
 
 import contextlib
 import os
@@ -37,15 +41,15 @@ from hydrotele.scenario.scenario import Scenario, load_scenario
 from hydrotele.simulate.closure import following_joints
 from hydrotele.simulate.native import stop_profiling_clock
 
-LONGEST = 600.0  # s of a drive without --duration
-LATENCY = 60.0  # s of one that only measures latency
-_ALONE = (1.0, 20.0)  # s, least and most, of a loop without work before it: a third of the drive
-_PRIORITY = 20  # of the machine, below the line's and the device's
-_FRAMES, _LINES = 30.0, 5.0  # Hz of window and status line
+LONGEST = 600.0  # s, duration of a drive without --duration
+LATENCY = 60.0  # s, duration of a drive that only measures latency
+_ALONE = (1.0, 20.0)  # s, min and max duration of the idle loop that precedes a latency test
+_PRIORITY = 20  # real-time priority of the machine, below those of channel and device
+_FRAMES, _LINES = 30.0, 5.0  # Hz, update rates of window and status line
 
 
 class DriveOptions(NamedTuple):
-    """What the command line asks for."""
+    """Options of `hydrotele drive`, as `cli.main.drive` describes them."""
 
     scenario: str | None
     overrides: dict[str, str]
@@ -60,22 +64,24 @@ class DriveOptions(NamedTuple):
 
 
 def drive_to_folder(wishes: DriveOptions) -> Path:
-    """Drive a machine live and write everything into a folder, whole or not at all.
+    """Drive a machine in real time, and write the results to a folder.
+
+    The output folder is written completely or not at all.
 
     Returns:
-        The folder.
+        The output folder.
 
     Raises:
         InputError: scenario, device, screen or target are not usable.
-        SimulationFailed: the simulation left the finite numbers.
+        SimulationFailed: the state of the simulation is no longer finite.
     """
     stop_profiling_clock()
     if _is_haptic(wishes) and wishes.speed != 1.0:
-        raise InputError("--speed", "must be 1 with a haptic device: a hand is in real time")
+        raise InputError("--speed", "must be 1 with a haptic device, which runs in real time")
     if not wishes.speed >= 0.0:
-        raise InputError("--speed", "must be 0 (as fast as it goes) or more; 1 is real time")
+        raise InputError("--speed", "must be 0 (as fast as possible) or more; 1 is real time")
     if wishes.device == "keyboard" and not wishes.viewer and not wishes.latency:
-        message = "reads the keys of the viewer's window; leave out --no-viewer, or choose another"
+        message = "needs the viewer window to read keys; omit --no-viewer or use another device"
         raise InputError("--device keyboard", message)
     if wishes.latency:
         return _measured_latency(wishes)
@@ -83,7 +89,15 @@ def drive_to_folder(wishes: DriveOptions) -> Path:
 
 
 def _driven(wishes: DriveOptions, alone: Mapping[str, Any] = MappingProxyType({})) -> Path:
-    """One drive; `alone` is what the computer misses without it, see `computer_alone`."""
+    """Drive the machine once and write the results.
+
+    Args:
+        wishes: options of the command.
+        alone: deadlines missed by an idle loop on this computer, from `computer_alone`.
+
+    Returns:
+        The output folder.
+    """
     scenario = _scenario(wishes)
     target = wishes.target or Path("runs", scenario.name)
     check_target(target, "run")
@@ -116,7 +130,7 @@ def _driven(wishes: DriveOptions, alone: Mapping[str, Any] = MappingProxyType({}
 
 
 def _stolen(before: float | None, seconds: float) -> dict[str, float | None]:
-    """Processor time that the host took meanwhile [s], and its share of all processors'."""
+    """Return the processor time taken by the host since `before` [s] and its fraction [1]."""
     after = stolen_time()
     if before is None or after is None:
         return {"stolen_seconds": None, "stolen_share": None}
@@ -126,24 +140,28 @@ def _stolen(before: float | None, seconds: float) -> dict[str, float | None]:
 
 
 def _measured_latency(wishes: DriveOptions) -> Path:
-    """A drive whose latency is shown; beside a simulated device of its own if none is named."""
+    """Drive with a haptic device and print latencies; start a simulated device if none is given."""
     if _is_haptic(wishes):
         return _driven(wishes, _alone(_scenario(wishes).duration))
     if wishes.device != "keyboard":
-        message = "has no force output to measure: leave --device out, or name haptic:HOST:PORT"
+        message = "has no force output: omit --device, or give --device haptic:HOST:PORT"
         raise InputError(f"--latency with --device {wishes.device}", message)
     duration = LATENCY if wishes.duration is None else wishes.duration
-    _scenario(wishes)  # what is wrong is told at once
-    alone = _alone(duration)  # a device that is just starting has more priority and much to load
+    _scenario(wishes)  # report errors of the scenario before the measurement starts
+    alone = _alone(duration)  # before the device starts, because its start-up loads the computer
     with own_device() as (host, port):
         own = {"device": f"{HAPTIC}:{host}:{port}", "duration": duration}
         return _driven(wishes._replace(viewer=False, review=False, **own), alone)
 
 
 def _alone(duration: float) -> dict[str, Any]:
-    """What a loop without work misses, in a third of a drive's duration [s]."""
+    """Measure the deadlines that an idle loop misses on this computer.
+
+    Args:
+        duration: duration of the drive [s]; the loop runs for a third of it, within `_ALONE`.
+    """
     seconds = min(_ALONE[1], max(_ALONE[0], duration / 3.0))
-    notes.print(f"a loop without work for {seconds:.0f} s, then the drive", style="dim")
+    notes.print(f"running an idle loop for {seconds:.0f} s before the drive", style="dim")
     return computer_alone(seconds, RATE, _PRIORITY)
 
 
@@ -161,20 +179,20 @@ def _write(result: Run, target: Path, wishes: DriveOptions) -> None:
     if "haptic" in result.summary:
         print_latency(result.summary["haptic"])
     if result.summary["pauses"]:
-        said = f"{result.summary['late_seconds']:.2f} s in {result.summary['pauses']} pauses"
-        out.print(f"[yellow]note[/] it could not keep up with real time: {said}")
-    alike = "a run like it" if "haptic" in result.summary else "it in hydrotele run"
-    out.print(f"written to [bold]{target}[/]; its scenario.yaml repeats {alike}")
+        said = f"{result.summary['late_seconds']:.2f} s late in {result.summary['pauses']} pauses"
+        out.print(f"[yellow]note[/] the simulation was slower than real time: {said}")
+    alike = "a similar run" if "haptic" in result.summary else "this run"
+    out.print(f"written to [bold]{target}[/]; hydrotele run with its scenario.yaml repeats {alike}")
 
 
 def _scenario(wishes: DriveOptions) -> Scenario:
-    """The scenario that is named, or the usual one of the machine."""
+    """Load the given scenario, or the default scenario of the machine."""
     overrides, name = dict(wishes.overrides), wishes.scenario
     duration = LONGEST if wishes.duration is None else wishes.duration
     if name is None:
         own = _usual(overrides.get("machine", "cat215").strip('"'))
         name = str(own or _usual("cat215"))
-        if own is None:  # a machine of the user's: what is known of none but cat215 is left out
+        if own is None:  # a custom machine: drop the settings that are specific to cat215
             overrides = {"tool": "null", "sensors": "ideal", "servo": "{}"} | overrides
     overrides["duration"] = repr(duration)
     if _is_haptic(wishes):
@@ -187,7 +205,10 @@ def _scenario(wishes: DriveOptions) -> Scenario:
 
 
 def _loose(scenario: Scenario) -> list[str]:
-    """Joints that hang freely: with such, pressures do not tell the force at the tip."""
+    """Return the passive joints without a drive or a closure.
+
+    With such joints, the force at the tip cannot be computed from the pressures.
+    """
     machine = scenario_machine(scenario)
     known = {axis.joint for axis in machine.axes.values()} | set(following_joints(machine))
     return [joint for joint in machine.joints if joint not in known]
@@ -200,7 +221,7 @@ def _usual(machine: str) -> Path | None:
 
 def _say(sentence: str) -> None:
     if notes.is_terminal:
-        notes.file.write("\r\x1b[K")  # the status line gives way
+        notes.file.write("\r\x1b[K")  # clear the status line
     notes.print(f"[yellow]{sentence}[/]", soft_wrap=True)
 
 
@@ -208,7 +229,11 @@ def _say(sentence: str) -> None:
 def _watching(
     wishes: DriveOptions, device: Device, interrupted: Callable[[], bool]
 ) -> Iterator[Watch]:
-    """Window and status line of a drive; opened with the first tick."""
+    """Show viewer window and status line during a drive.
+
+    Yields:
+        The callback of the drive; it returns False when the drive must stop.
+    """
     from hydrotele.show.window import Window, check_screen
 
     if wishes.viewer:

@@ -1,4 +1,8 @@
-"""`hydrotele experiments`: the experiments of a published document, repeated in simulation."""
+"""Implement `hydrotele experiments`: repeat the experiments of a publication in simulation.
+
+Each published result is compared with the simulated one. The comparison is written as a Markdown
+table, as JSON and as an HTML report with figures.
+"""
 
 import importlib
 from collections.abc import Sequence
@@ -11,16 +15,16 @@ from hydrotele.core.output import check_target, whole_folder
 from hydrotele.experiments.comparison import Comparison, Series, run_series, summarize
 
 DOCUMENTS = ("abdellatif2008", "khoshzaban1992", "wang2012", "zhu1994")
-"""Modules of `hydrotele.experiments`, each with its `SERIES`."""
+"""Names of the publications: modules of `hydrotele.experiments` that define `SERIES`."""
 
 _COLOURS = {"agrees": "green", "differs": "red", "undecided": "yellow"}
 
 
 def load_series(name: str) -> Series:
-    """The experiments of a document.
+    """Return the experiments of a publication.
 
     Raises:
-        InputError: no such document.
+        InputError: there is no publication of this name.
     """
     if name not in DOCUMENTS:
         raise InputError(f"experiments {name!r}", f"valid: {', '.join(DOCUMENTS)}")
@@ -30,20 +34,22 @@ def load_series(name: str) -> Series:
 def experiments_to_folder(
     name: str, target: Path | None, seeds: int | None, jobs: int | None, as_json: bool
 ) -> list[Comparison]:
-    """Run the experiments of a document; write table, report and figures, all or nothing.
+    """Run the experiments of a publication; write a table, a report and figures.
+
+    The output folder is written completely or not at all.
 
     Args:
-        name: of the document.
-        target: folder, default `runs/<name>`; with `as_json` none.
-        seeds: operators or trials of repeated experiments; as many as usual by default.
-        jobs: processes; as many as there are cores by default.
-        as_json: print the rows as JSON instead of text.
+        name: name of the publication, one of `DOCUMENTS`.
+        target: output folder, default `runs/<name>`, or none with `as_json`.
+        seeds: number of repetitions (operators or trials), default that of the publication.
+        jobs: number of processes, default one per core.
+        as_json: print the comparisons as JSON instead of text.
 
     Returns:
-        The rows.
+        The comparisons, one per published result.
 
     Raises:
-        InputError: no such document, or the target is not usable.
+        InputError: there is no publication of this name, or the target is not usable.
     """
     series = load_series(name)
     seeds = seeds or series.repetitions
@@ -60,7 +66,7 @@ def experiments_to_folder(
 
 
 def write_results(folder: Path, series: Series, seeds: int, rows: list[Comparison]) -> None:
-    """Write table, report, figures and `experiments.json` of a document into a folder."""
+    """Write table, report, figures and `experiments.json` of a publication into a folder."""
     from hydrotele.show.experiment_report import write_experiment_report
 
     notes.print("writing report.html and figures ...", style="dim")
@@ -74,11 +80,11 @@ def write_results(folder: Path, series: Series, seeds: int, rows: list[Compariso
 
 
 def markdown_table(rows: Sequence[Comparison], series: Series) -> str:
-    """The rows as Markdown: results, then inputs of the model, then items without a result."""
+    """Format the comparisons as Markdown: results, model inputs, and items without a result."""
     lines = _table([row for row in rows if row.kind != "input"])
     inputs = [row for row in rows if row.kind == "input"]
     if inputs:
-        lines += ["", "## Numbers that the model was built from", "", *_table(inputs)]
+        lines += ["", "## Published values used as inputs of the model", "", *_table(inputs)]
     if series.drawings:
         lines += ["", "## Tables and figures without a result", ""]
         lines += [f"- {item}: {content}" for item, content in series.drawings.items()]

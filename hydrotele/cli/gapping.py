@@ -1,4 +1,8 @@
-"""`hydrotele gap`: where model and measured logs disagree, and the machine that agrees better."""
+"""Implement `hydrotele gap`: find differences between a model and logs, and correct the model.
+
+The result is a report, `gap.json`, a recording and the patched machine. The module handles
+hydraulic machines as well as mechanisms without hydraulics that are given as MJCF.
+"""
 
 import dataclasses
 import tempfile
@@ -32,7 +36,7 @@ _COLOURS = {
     "named": "blue", "partly": "magenta", "no_gap": "green", "ambiguous": "yellow",
     "unknown": "red",
 }  # fmt: skip
-_COLUMNS = ("effect", "parameter", "model had", "found", "95 % interval", "unit")
+_COLUMNS = ("effect", "parameter", "given model", "estimate", "95 % interval", "unit")
 
 
 def gap_to_folder(
@@ -41,24 +45,26 @@ def gap_to_folder(
     effects: Sequence[str] = (), jobs: int | None = None, force: bool = False,
     mask: Path | None = None,
 ) -> Path:  # fmt: skip
-    """Find the gap between a model and logs; write everything into a folder, whole or not at all.
+    """Find the gap between a machine model and logs, and write the results to a folder.
+
+    The output folder is written completely or not at all.
 
     Args:
         data: log files, folders of logs, run folders.
-        machine: the model, None for the one that the logs name.
-        tool: its tool, None for the logs'.
-        heldout: name of the run to judge on, None to choose.
-        sensors: name of the machine's sensors, None for those that the logs name.
-        target: folder, default `gap_<data>`.
-        as_json: print `gap.json` instead of words.
+        machine: machine model, None for that named by the logs.
+        tool: tool of the machine, None for that of the logs.
+        heldout: name of the held-out run, None for `test*`, else the last run.
+        sensors: name of the machine's sensor set, None for that named by the logs.
+        target: output folder, default `gap_<data>`.
+        as_json: print `gap.json` instead of text.
         recording: whether to write the rerun recording.
-        effects: names of the effects to try; none means all.
-        jobs: processes to use, None to let the search choose.
+        effects: names of the effects to test; if empty, all effects.
+        jobs: number of processes, None for 2.
         force: accept logs whose metadata name another machine or tool.
-        mask: file of stretches that may not be used.
+        mask: CSV file of masked intervals, which are not used.
 
     Returns:
-        The folder.
+        The output folder.
 
     Raises:
         InputError: data, machine, effects or target are not usable.
@@ -81,7 +87,15 @@ def gap_to_folder(
 def write_gap(
     gap: Gap, dataset: Dataset, folder: Path, recording: bool = True, data: Sequence[Path] = ()
 ) -> None:
-    """Write gap.json, the report, the patched machine, the next experiment and the recording."""
+    """Write `gap.json`, report, patched machine, next experiment and recording of a gap.
+
+    Args:
+        gap: result of the search.
+        dataset: logs that were used.
+        folder: existing output folder.
+        recording: whether to write the rerun recording.
+        data: paths of the logs, stored in `summary.json`.
+    """
     write_json(folder / "gap.json", gap_document(gap))
     if has_patch(gap) or gap.patched.sensors != gap.machine.sensors:
         from hydrotele.simulate.plant import build_plant
@@ -118,19 +132,19 @@ def gap_mjcf_to_folder(
     data: Sequence[Path], mjcf: Path, columns: Path | None, heldout: str | None,
     target: Path | None, as_json: bool, effects: Sequence[str] = (),
 ) -> Path:  # fmt: skip
-    """Find the gap between the model of a mechanism without hydraulics and its logs.
+    """Find the gap between a mechanism without hydraulics and its logs, and write the results.
 
     Args:
         data: log files, folders of logs.
-        mjcf: the mechanism, with `connect` and `weld` closures.
-        columns: YAML file that says which column is which; None for columns with usual names.
-        heldout: name of the run to judge on, None to choose.
-        target: folder, default `gap_<data>`.
-        as_json: print `gap.json` instead of words.
-        effects: names of the effects to try; none means all.
+        mjcf: MJCF file of the mechanism, whose loops are closed by `connect` and `weld`.
+        columns: YAML file that assigns log columns, None if the columns have standard names.
+        heldout: name of the held-out run, None for `test*`, else the last run.
+        target: output folder, default `gap_<data>`.
+        as_json: print `gap.json` instead of text.
+        effects: names of the effects to test; if empty, all effects.
 
     Returns:
-        The folder.
+        The output folder.
 
     Raises:
         InputError: data, mechanism, mapping, effects or target are not usable.
@@ -146,13 +160,14 @@ def gap_mjcf_to_folder(
     with stages(f"gap {mechanism.setup.chain.name}", as_json) as progress:
         gap = find_mechanism_gap(mjcf, columns, fit, judge, progress, effects, said)
         if progress:
-            progress("drive the models by the measured forces", 0.95)
+            progress("simulate the models with the measured forces", 0.95)
         try:
             gap = dataclasses.replace(
                 gap, open_loop=mechanism_open_loop(gap, data, mechanism, heldout)
             )
         except InputError as error:
-            gap = dataclasses.replace(gap, notes=(*gap.notes, f"No open loop: {error}."))
+            note = f"No open-loop prediction: {error}."
+            gap = dataclasses.replace(gap, notes=(*gap.notes, note))
     with whole_folder(target, "gap") as folder:
         write_json(folder / "gap.json", gap_document(gap))
         if gap.patched is not gap.machine:
@@ -175,53 +190,53 @@ def gap_mjcf_to_folder(
 def mechanism_named(
     machine: str | None, mjcf: Path | None, columns: Path | None
 ) -> tuple[Path | None, Path | None]:
-    """The mechanism that a user names: by its file, or a shipped model that is no machine.
+    """Return the files of the mechanism that the options select, if they select a mechanism.
 
     Args:
-        machine: name of a machine or of such a model.
-        mjcf: file.
-        columns: of the mapping.
+        machine: name of a machine, or of a shipped model without `machine.yaml`.
+        mjcf: MJCF file of a mechanism.
+        columns: YAML file that assigns log columns.
 
     Returns:
-        Its MJCF and its mapping; None, None for a machine.
+        (MJCF file, column file); (None, None) if the options select a machine.
 
     Raises:
-        InputError: a mapping without a mechanism, or a mechanism and a machine.
+        InputError: `columns` without a mechanism, or both a mechanism and a machine.
     """
     if mjcf is not None:
         if machine:
-            raise InputError("--machine", "is another model than --mjcf: name one of them")
+            raise InputError("--machine", "cannot be combined with --mjcf: give one of them")
         return mjcf, columns
     path = models_folder() / machine / f"{machine}.xml" if machine else None
     if path is None or not path.is_file() or (path.parent / MACHINE_FILE).is_file():
         if columns is not None:
             raise InputError(
-                "--columns", "says which column is which of --mjcf: name that, too"
+                "--columns", "is used only together with --mjcf: give both"
             )  # fmt: skip
         return None, None
     beside = path.parent / "columns.yaml"
     return path, columns or (beside if beside.is_file() else None)
 
 
-_HORIZON = 0.25  # s: an unstable mechanism that nothing controls soon leaves any motion
+_HORIZON = 0.25  # s; short, because an unstable mechanism diverges without control
 
 
 def mechanism_open_loop(
     gap: Gap, data: Sequence[Path], mechanism: Mechanism, heldout: str | None
 ) -> dict[str, Any]:  # fmt: skip
-    """How far the given and the patched model run away when the measured forces drive them.
+    """Compute the open-loop errors of the given and the patched model under measured forces.
 
     Args:
-        gap: of a mechanism.
+        gap: result for a mechanism.
         data: log files, folders of logs.
         mechanism: the given model.
-        heldout: name of the run to judge on, None to choose.
+        heldout: name of the held-out run, None for `test*`, else the last run.
 
     Returns:
-        As `Gap.open_loop`.
+        Errors in the form of `Gap.open_loop`.
 
     Raises:
-        InputError: a force is not known for a while, or a simulation fails.
+        InputError: forces are missing in the held-out run, or a simulation fails.
     """
     from hydrotele.gap.patched import COLUMNS_FILE, MJCF_FILE, write_mechanism
 
@@ -239,7 +254,7 @@ def mechanism_open_loop(
         whole = np.stack([motion.value, motion.rate, motion.acceleration])
         known = np.isfinite(judge.force).all(axis=1)
         if not known.all():
-            raise InputError(judge.name, "lacks forces for a while")
+            raise InputError(judge.name, "has rows without forces")
         out[which] = open_loop_errors(
             mujoco.MjModel.from_xml_string(model.mjcf), one.setup.chain, one.setup.given, whole,
             judge.force, judge.period, _HORIZON,
@@ -259,7 +274,7 @@ def _print(gap: Gap) -> None:
     for words in verdict_words(gap):
         out.print(words, markup=False)
     if gap.effects:
-        rows = table("what was found", *_COLUMNS)
+        rows = table("identified effects", *_COLUMNS)
         for effect in gap.effects:
             for name, estimate in effect.parameters.items():
                 s = in_customary_units(estimate, name)

@@ -1,4 +1,4 @@
-"""`hydrotele haptic-device` serves a device; what `hydrotele drive --latency` prints."""
+"""Implement `hydrotele haptic-device` and print the latencies of `hydrotele drive --latency`."""
 
 import contextlib
 import json
@@ -13,17 +13,17 @@ from hydrotele.cli.console import first_interrupt, notes, out, print_json, table
 from hydrotele.core.errors import InputError
 from hydrotele.haptics.server import announce, open_haptic, serve
 
-HELD = 1e-3  # share of deadlines that may be missed
-_PATIENCE = 60.0  # s until a device server of our own must listen
+HELD = 1e-3  # maximum fraction of missed deadlines [1]
+_PATIENCE = 60.0  # s, timeout for the start of the simulated device
 _ROWS = {
-    "answer": "pose received to wrench sent",
-    "loop": "wrench sent to pose that knows of it",
-    "interval": "pose to pose",
+    "answer": "from pose received to wrench sent",
+    "loop": "from wrench sent to the pose that acknowledges it",
+    "interval": "between two poses",
 }
 
 
 class HapticOptions(NamedTuple):
-    """What the command line asks for."""
+    """Options of `hydrotele haptic-device`, as `cli.serving` describes them."""
 
     kind: str
     host: str
@@ -35,7 +35,7 @@ class HapticOptions(NamedTuple):
 
 
 def serve_device(wishes: HapticOptions) -> None:
-    """Serve a device until Ctrl-C, the end of its duration or of the input.
+    """Serve a haptic device until Ctrl-C, the end of the duration or the end of standard input.
 
     Raises:
         InputError: there is no such device, or the address cannot be used.
@@ -51,7 +51,7 @@ def serve_device(wishes: HapticOptions) -> None:
         if wishes.until_eof:
             announce(where)
         else:
-            notes.print(f"{wishes.kind} device at {where[0]}:{where[1]}; Ctrl-C ends", style="dim")
+            notes.print(f"{wishes.kind} device at {where[0]}:{where[1]}; Ctrl-C stops", style="dim")
 
     try:
         with first_interrupt() as interrupted:
@@ -66,8 +66,9 @@ def serve_device(wishes: HapticOptions) -> None:
         return
     refused = ", ".join(f"{count} {why}" for why, count in seen.refused.items() if count)
     out.print(
-        f"{seen.periods} periods, {seen.missed} missed, {seen.unanswered} without an answer in"
-        f" time, {seen.limp} times limp; refused: {refused or 'none'}"
+        f"{seen.periods} periods: {seen.missed} deadlines missed, {seen.unanswered} without an"
+        f" answer in time, force switched off {seen.limp} times; rejected packets:"
+        f" {refused or 'none'}"
     )
 
 
@@ -78,18 +79,18 @@ def _wait_for_the_end(ended: threading.Event) -> None:
 
 @contextlib.contextmanager
 def own_device() -> Iterator[tuple[str, int]]:
-    """A simulated device in a process of its own, for as long as it is needed.
+    """Run a simulated haptic device in a separate process.
 
     Yields:
-        Host and port.
+        Host and port of the device.
 
     Raises:
-        InputError: it does not begin to listen.
+        InputError: the device does not start.
     """
     command = [sys.executable, "-m", "hydrotele", "haptic-device", "--port", "0", "--until-eof"]
     process = subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
-    )  # a Ctrl-C at the terminal is for the drive
+    )  # new session, so that Ctrl-C at the terminal stops only the drive
     assert process.stdin and process.stdout
     timer = threading.Timer(_PATIENCE, process.kill)
     timer.start()
@@ -109,75 +110,82 @@ def own_device() -> Iterator[tuple[str, int]]:
 
 
 def print_latency(figures: dict) -> None:
-    """Tables of missed deadlines, percentiles and histograms.
+    """Print tables of missed deadlines, percentiles and histograms.
 
     Args:
-        figures: `haptic` of a drive's summary.
+        figures: item `haptic` of the summary of a drive.
     """
     machine, line, computer = figures["machine"], figures["line"], figures.get("computer", {})
-    missed = table("Missed deadlines", "", "of", "missed", "share")
+    title = "Missed deadlines (lower is better)"
+    missed = table(title, "deadline", "total", "missed", "fraction")
     rows: list[tuple[str, int, int]] = []
     if "missed" in computer:
-        alone = f"computer alone, no work for {computer['seconds']:g} s"
+        alone = f"computer alone, idle loop of {computer['seconds']:g} s"
         rows.append((alone, computer["missed"], computer["ticks"]))
     for name, count, of in (
         *rows,
         (f"machine, {machine['control_rate']:g} Hz", machine["missed"], machine["ticks"]),
-        ("device, its own periods", line["device_missed"], line["poses"] + line["lost"]),
-        ("device, wrench in time", line["device_unanswered"], line["poses"] + line["lost"]),
-        ("poses lost on the line", line["lost"], line["poses"] + line["lost"]),
+        ("device, sampling period", line["device_missed"], line["poses"] + line["lost"]),
+        (
+            "device, wrench in time",
+            line["device_unanswered"],
+            line["poses"] + line["lost"],
+        ),
+        ("channel, poses lost", line["lost"], line["poses"] + line["lost"]),
     ):
         missed.add_row(name, str(of), str(count), f"{100.0 * count / max(of, 1):.3f} %")
     out.print(missed)
-    spans = {**{said: line[key] for key, said in _ROWS.items()}, "machine late": machine["late"]}
+    spans = {said: line[key] for key, said in _ROWS.items()}
+    spans["lateness of the machine"] = machine["late"]
     if "late" in computer:
-        spans["computer alone late"] = computer["late"]
+        spans["lateness of the idle loop"] = computer["late"]
     names = ("p50", "p90", "p99", "p99.9", "largest")
-    times = table("Times [us]", "", *names)
+    times = table("Percentiles of times [us] (lower is better)", "time", *names)
     for said, found in spans.items():
         times.add_row(said, *(f"{found['percentiles_us'].get(n, 0.0):g}" for n in names))
     out.print(times)
     edges = line["answer"]["histogram"]["edges_us"]
-    histogram = table("Number of times up to [us]", "", *(f"{e}" for e in edges), "more")
+    title = "Histogram: number of samples up to [us]"
+    histogram = table(title, "time", *(f"{e}" for e in edges), "more")
     for said, found in spans.items():
         histogram.add_row(said, *map(str, found["histogram"]["count"]))
     out.print(histogram)
     load = machine["load"]
     out.print(
-        f"priority: machine {machine['priority']}, line {line['priority']}; load of the computer:"
-        f" {load[0] if load else 'unknown'}"
+        f"real-time priority: machine {machine['priority']}, channel {line['priority']}; load"
+        f" average of the computer: {load[0] if load else 'unknown'}"
     )
     for sentence in computer_sentences(machine, computer):
         out.print(sentence)
 
 
 def computer_sentences(machine: dict, computer: dict) -> list[str]:
-    """What the computer alone could hold, and what its host took, in words.
+    """Describe stolen processor time and the deadlines that the idle computer missed.
 
     Args:
-        machine: `haptic.machine` of a drive's summary.
-        computer: `haptic.computer` of it.
+        machine: item `haptic.machine` of the summary of a drive.
+        computer: item `haptic.computer` of the same summary.
 
     Returns:
-        Sentences.
+        Sentences to print.
     """
     said = []
     if (stolen := computer.get("stolen_seconds")) is not None:
         share = 100.0 * computer["stolen_share"]
-        said.append(f"time stolen by the host meanwhile: {stolen:g} s, {share:.2g} % of all cores")
+        said.append(f"processor time taken by the host: {stolen:g} s, {share:.2g} % of all cores")
     if "missed" not in computer:
         return said
     alone, own = (x["missed"] / max(x["ticks"], 1) for x in (computer, machine))
     largest = computer["late"]["percentiles_us"].get("largest", 0.0)
     if alone > HELD:
         said.append(
-            f"[yellow]note[/] the computer alone missed {100.0 * alone:.2g} % of its deadlines, by"
-            f" up to {1e-3 * largest:.2g} ms, without any work: it cannot hold"
-            f" {100.0 * HELD:g} %, whatever runs on it"
+            f"[yellow]note[/] the computer alone missed {100.0 * alone:.2g} % of its deadlines in"
+            f" an idle loop, by up to {1e-3 * largest:.2g} ms: no program on it can stay below the"
+            f" limit of {100.0 * HELD:g} %"
         )
     elif own > HELD:
         said.append(
-            f"[yellow]note[/] the computer alone missed {100.0 * alone:.2g} %: the rest of the"
-            f" {100.0 * own:.2g} % is the machine's, or of what ran beside it"
+            f"[yellow]note[/] the computer alone missed {100.0 * alone:.2g} % of its deadlines: the"
+            f" remainder of the {100.0 * own:.2g} % is caused by the simulation or other programs"
         )
     return said

@@ -1,6 +1,7 @@
-"""`hydrotele identify`: parameters of a machine from logs, and the machine that has them.
+"""Implement `hydrotele identify` and `hydrotele excite`.
 
-`hydrotele excite`: a scenario whose motion tells a machine's parameters best.
+`identify` estimates the parameters of a machine or mechanism from logs and writes the identified
+machine. `excite` designs the most informative trajectory and writes it as a scenario.
 """
 
 import dataclasses
@@ -52,13 +53,13 @@ from hydrotele.simulate.plant import build_plant
 
 @dataclass(frozen=True)
 class MechanismResult:
-    """What was found of bodies, friction and offsets.
+    """Identified bodies, friction and offsets of a machine.
 
     Attributes:
-        found: the identification, None where no force is known.
-        best: the nearest machine that can exist, None with it.
+        found: the identification, None if the logs contain no forces.
+        best: nearest physically consistent parameters, None if `found` is None.
         machine: the identified machine.
-        lacking: why there is none, or nothing.
+        lacking: reason why `found` is None, else empty.
     """
 
     found: Identification | None
@@ -69,15 +70,15 @@ class MechanismResult:
 
 @dataclass(frozen=True)
 class Choices:
-    """What a user may choose, besides data and machine.
+    """Options of the identification.
 
     Attributes:
-        model: complete or reduced to the links.
-        pins: friction in joints and closures without drive.
-        asymmetry: viscous friction that depends on the direction.
-        processing: of the signals.
-        estimator: of the parameters.
-        hydraulics: whether valves, oil and supply are identified, too.
+        model: `complete`, or `reduced` to the links.
+        pins: whether passive joints and pins have friction.
+        asymmetry: whether viscous friction depends on the direction of motion.
+        processing: filter and differentiation of the signals.
+        estimator: estimator of the parameters.
+        hydraulics: whether valves, oil and supply are also identified.
     """
 
     model: Model = "complete"
@@ -93,21 +94,23 @@ def identify_to_folder(
     sensors: str | None, target: Path | None, as_json: bool, choices: Choices,
     force: bool = False,
 ) -> Path:  # fmt: skip
-    """Identify a machine from logs; write everything into a folder, whole or not at all.
+    """Identify a machine from logs and write the results to a folder.
+
+    The output folder is written completely or not at all.
 
     Args:
         data: log files, folders of logs, run folders.
-        machine: the model, None for the one that the logs name.
-        tool: its tool, None for the logs'.
-        heldout: name of the run to judge on, None to choose.
-        sensors: name of the machine's sensors, None for those that the logs name.
-        target: folder, default `identify_<data>`.
-        as_json: print `identify.json` instead of words.
-        choices: what to identify, and how.
+        machine: machine model, None for that named by the logs.
+        tool: tool of the machine, None for that of the logs.
+        heldout: name of the held-out run, None for `test*`, else the last run.
+        sensors: name of the machine's sensor set, None for that named by the logs.
+        target: output folder, default `identify_<data>`.
+        as_json: print `identify.json` instead of text.
+        choices: options of the identification.
         force: accept logs whose metadata name another machine or tool.
 
     Returns:
-        The folder.
+        The output folder.
 
     Raises:
         InputError: data, machine or target are not usable.
@@ -141,20 +144,20 @@ def identify_mjcf_to_folder(
     data: Sequence[Path], mjcf: Path, columns: Path | None, heldout: str | None,
     target: Path | None, as_json: bool, processing: Processing, estimator: Estimator,
 ) -> Path:  # fmt: skip
-    """Identify any mechanism that an MJCF describes, without a Machine.
+    """Identify a mechanism given as an MJCF file and write the results to a folder.
 
     Args:
         data: log files, folders of logs.
-        mjcf: the mechanism, with `connect` and `weld` closures.
-        columns: YAML file that says which column is which; None for columns with usual names.
-        heldout: name of the run to judge on, None to choose.
-        target: folder, default `identify_<data>`.
-        as_json: print `identify.json` instead of words.
-        processing: of the signals.
-        estimator: of the parameters.
+        mjcf: MJCF file of the mechanism, whose loops are closed by `connect` and `weld`.
+        columns: YAML file that assigns log columns, None if the columns have standard names.
+        heldout: name of the held-out run, None for `test*`, else the last run.
+        target: output folder, default `identify_<data>`.
+        as_json: print `identify.json` instead of text.
+        processing: filter and differentiation of the signals.
+        estimator: estimator of the parameters.
 
     Returns:
-        The folder.
+        The output folder.
 
     Raises:
         InputError: data, mechanism, mapping or target are not usable.
@@ -190,17 +193,17 @@ def identify_mjcf_to_folder(
 
 
 def identify_mechanism(dataset: Dataset, choices: Choices) -> MechanismResult:
-    """Identify bodies, friction and offsets.
+    """Identify bodies, friction and offsets of a machine.
 
     Args:
-        dataset: logs of a machine.
-        choices: what to identify, and how.
+        dataset: logs of the machine.
+        choices: options of the identification.
 
     Returns:
-        What was found.
+        The identified parameters and the machine that has them.
 
     Raises:
-        InputError: the logs do not tell it, and hydraulics were not asked for.
+        InputError: the logs do not contain forces, and `choices.hydraulics` is False.
     """
     try:
         fit, heldout, said = records(dataset)
@@ -258,15 +261,16 @@ def _print(mechanism: MechanismResult, hydraulics: Hydraulics | None, dataset: D
     else:
         out.print(f"[yellow]note[/] {mechanism.lacking}")
     if hydraulics:
-        rows = table("hydraulics", "number", "given", "identified", "std", "unit")
+        title = "hydraulic parameters"
+        rows = table(title, "parameter", "given", "identified", "std. dev.", "unit")
         for n in hydraulics.numbers:
-            shown = (f"{n.value:.6g}", f"{n.std:.2g}") if n.told else ("not told", "")
+            shown = (f"{n.value:.6g}", f"{n.std:.2g}") if n.told else ("not identifiable", "")
             rows.add_row(n.name, f"{n.nominal:.6g}", *shown, n.unit)
         out.print(rows)
         out.print(
             f"one-step prediction errors on {dataset.heldout.name}: {hydraulics.before:.3g} times"
-            f" noise with the given hydraulics, {hydraulics.after:.3g} identified;"
-            f" {hydraulics.status}"
+            f" noise with the given and {hydraulics.after:.3g} times noise with the identified"
+            f" hydraulics; {hydraulics.status}"
         )
 
 
@@ -274,7 +278,8 @@ def _print_mechanism(found: Identification, heldout: str) -> None:
     rows = parameter_rows(found)
     many = counts(rows)
     out.print(f"[bold]{found.status}[/]", soft_wrap=True)
-    shown = table("what the data tell", "parameter", "given", "identified", "std", "unit")
+    title = "identified parameters and combinations"
+    shown = table(title, "parameter", "given", "identified", "std. dev.", "unit")
     for row in rows:
         if row.value is None or row.std is None:
             continue
@@ -284,8 +289,8 @@ def _print_mechanism(found: Identification, heldout: str) -> None:
     for status, number in many.items():
         out.print(f"{number:4d} {status}: {MEANING[status]}")
     judged = table(
-        f"force on {heldout}, not fitted, below {found.band:.3g} Hz", "drive",
-        "as given", "identified", "noise alone", "unit", "relative",
+        f"RMS force error on {heldout}, not fitted, below {found.band:.3g} Hz (lower is better)",
+        "drive", "given model", "identified", "noise alone", "unit", "relative",
     )  # fmt: skip
     for drive, h in found.heldout.items():
         judged.add_row(drive, f"{h.nominal_rms:.4g}", f"{h.rms:.4g}", f"{h.noise_rms:.4g}", h.unit,
@@ -293,10 +298,12 @@ def _print_mechanism(found: Identification, heldout: str) -> None:
     out.print(judged)
     distance, limit = found.distance(found.nominal)
     out.print(
-        f"the given parameters lie {'in' if distance <= limit else 'out'}side the 95 % ellipsoid of"
-        f" all together: {distance:.3g}, limit {limit:.3g}"
+        f"the given parameters lie {'in' if distance <= limit else 'out'}side the joint 95 %"
+        f" confidence ellipsoid: squared distance {distance:.3g}, limit {limit:.3g}"
     )
-    out.print(f"condition {found.estimate.condition:.3g}, {found.seconds:.1f} s")
+    out.print(
+        f"condition number {found.estimate.condition:.3g}, computing time {found.seconds:.1f} s"
+    )
     for note in found.notes:
         out.print(f"[yellow]note[/] {note}")
 
@@ -305,33 +312,33 @@ def excite_to_file(
     machine: str, tool: str | None, sensors: str | None, target: Path, period: float,
     harmonics: int, starts: int, seed: int, cycles: float, as_json: bool,
 ) -> Path:  # fmt: skip
-    """Design a motion and write it as a scenario.
+    """Design the most informative trajectory of a machine and write it as a scenario.
 
     Args:
-        machine: name or folder.
-        tool: its tool, None for its own.
-        sensors: name of its sensors, None for its first.
+        machine: name or folder of the machine.
+        tool: tool of the machine, None for its first tool.
+        sensors: name of the machine's sensor set, None for its first.
         target: YAML file to write.
-        period: of the motion [s].
-        harmonics: of it.
-        starts: searches from random motions.
-        seed: of these.
-        cycles: periods that the scenario runs.
-        as_json: print the figures as JSON.
+        period: period of the trajectory [s].
+        harmonics: number of harmonics of the trajectory.
+        starts: number of searches from random trajectories.
+        seed: seed of the random trajectories.
+        cycles: number of periods that the scenario runs.
+        as_json: print the result as JSON.
 
     Returns:
-        The file.
+        The scenario file.
 
     Raises:
-        InputError: no such machine or sensors, or no motion within the limits was found.
+        InputError: there is no such machine or sensor set, or no trajectory within the limits.
     """
     model = load_machine(machine, tool)
     named = sensors or next(iter(model.sensors), None)
     if named is None:
-        raise InputError(machine, "has no sensors: their noise decides what a motion tells")
+        raise InputError(machine, "has no sensors; the design needs their noise: add 'sensors'")
     name = re.sub(r"[^a-z0-9_]", "_", target.stem.lower()).lstrip("_0123456789") or "excitation"
     if target.suffix.lower() != ".yaml" or not target.parent.is_dir():
-        raise InputError(target, "must be a .yaml file in a folder that is there")
+        raise InputError(target, "must be a .yaml file in an existing folder")
     place = machine if machine in shipped_machines() else str(Path(machine).resolve())
     setup = machine_setup(model, closed_chain(model))
     noise = np.maximum(force_noise(model, named), 1e-9)
@@ -353,8 +360,8 @@ def excite_to_file(
         })  # fmt: skip
     else:
         out.print(
-            f"a motion of {period:g} s for {found.parameters} parameters; its tightest limit is"
-            f" used to {100 * found.worst:.0f} %"
+            f"trajectory with a period of {period:g} s for {found.parameters} parameters; it uses"
+            f" its most restrictive limit to {100 * found.worst:.0f} %"
         )
         notes.print(f"hydrotele run {target}", style="dim")
         out.print(f"written to [bold]{target}[/]")

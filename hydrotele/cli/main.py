@@ -1,14 +1,7 @@
-"""Command line: one thin function per command. Heavy imports stay inside the functions.
+"""Command line: one function for each command, with its arguments, options and help text.
 
-Options that several commands share.
-
-What `hydrotele compare` takes on the command line.
-
-What `hydrotele drive` takes on the command line.
-
-What `hydrotele sweep` takes on the command line.
-
-Words of the command line into overrides of a scenario.
+Each function parses its options and calls the module that does the work. Slow imports are inside
+the functions, so that `--help` and completion stay fast.
 """
 
 import os
@@ -30,7 +23,7 @@ from hydrotele.core.errors import InputError
 
 
 def _load(files: list[Path] | None) -> list[Path] | None:
-    """Load the files before anything looks for an effect or a law."""
+    """Load files of custom effects and laws, and return the list of files unchanged."""
     if files:
         from hydrotele.effects import load_effects
 
@@ -45,7 +38,7 @@ EffectFiles = Annotated[
         "--effects",
         metavar="FILE.py",
         callback=_load,
-        help="Python file with effects or laws of your own, which is run; may be repeated.",
+        help="Python file that defines custom effects or laws. It is executed. Repeatable.",
     ),
 ]
 
@@ -56,15 +49,16 @@ Examples:  hydrotele compare cat215 gap_site_a --data measured/site_a
            hydrotele compare cat215 --data logs --heldout run_7 --horizons 2,20 --json
 
 \b
-Every model is started at many rows of a run that it was not fitted to, from its estimate of the
-state there, runs freely on the commands, and is compared with the readings on its way. Beside that
-stands its error from one row to the next. Horizons longer than a run are left out.
+Each model predicts a held-out run, which was not used to fit it. The prediction starts at many rows
+of the log, from the state estimated there. It then uses only the commands (open-loop prediction)
+and is compared with the measurements. The one-step error, from one row to the next, is listed as
+well. Horizons longer than the run are omitted.
 
 \b
-Black boxes, fitted on the other runs (--baseline, may be repeated):
-  table   delay and static table from command to speed, per axis
-  arx     linear model of readings and past commands
-  mlp     neural network of the same; needs pip install 'hydrotele[baselines]'
+Black-box models, fitted on the other runs (--baseline, repeatable):
+  table   delay and static table from command to speed, for each axis
+  arx     linear model with past measurements and commands as inputs
+  mlp     neural network with the same inputs; needs pip install 'hydrotele[baselines]'
 """
 
 
@@ -72,35 +66,37 @@ def compare(
     machine: Annotated[
         list[str],
         typer.Argument(
-            help="Shipped machines, folders with machine.yaml, folders of gap or identify."
+            help="Shipped machines, folders with machine.yaml, result folders of gap or identify."
         ),
     ],
     data: Annotated[
-        list[Path], typer.Option("--data", "-d", help="Folder of logs, log file or run folder.")
+        list[Path], typer.Option("--data", "-d", help="Log file, folder of logs or run folder.")
     ],
     tool: Annotated[str | None, typer.Option("--tool", help="Tool of the machines.")] = None,
     heldout: Annotated[
-        str | None, typer.Option(help="Run to judge on, not fitted; default test*, or the last.")
+        str | None, typer.Option(help="Held-out run; default: test*, else the last run.")
     ] = None,
-    sensors: Annotated[str | None, typer.Option(help="Sensors of the machines.")] = None,
+    sensors: Annotated[str | None, typer.Option(help="Sensor set of the machines.")] = None,
     horizons: Annotated[
-        str, typer.Option(help="Seconds of the free runs; the run's end always counts.")
+        str, typer.Option(help="Prediction horizons [s]; the end of the run is always included.")
     ] = "1,5,10,30",
     baseline: Annotated[
-        list[str] | None, typer.Option("--baseline", help="Black box: table, arx or mlp.")
+        list[str] | None, typer.Option("--baseline", help="Black-box model: table, arx or mlp.")
     ] = None,
-    every: Annotated[bool, typer.Option("--all", help="Judge on the fitted runs, too.")] = False,
+    every: Annotated[
+        bool, typer.Option("--all", help="Evaluate the models on the fitted runs as well.")
+    ] = False,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for compare.json and a picture.")
+        Path | None, typer.Option("--out", "-o", help="Folder for compare.json and a plot.")
     ] = None,
     force: Annotated[
-        bool, typer.Option("--force", help="Accept logs that name another machine or tool.")
+        bool, typer.Option("--force", help="Accept logs recorded with another machine or tool.")
     ] = False,
     json: Annotated[
         bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")
     ] = False,
 ) -> None:
-    """Compare models by free runs on measured commands: RMS error per channel."""
+    """Compare open-loop predictions of several models with logs: RMS error per channel."""
     from hydrotele.cli.comparing import compare_models
 
     pass
@@ -117,60 +113,62 @@ Examples:  hydrotele drive   |   hydrotele drive fell_tree --device gamepad
            hydrotele drive --device haptic:127.0.0.1:5610   |   hydrotele drive --latency
 
 \b
-Keyboard: every press moves an axis on by a quarter of its way, where it stays; space centres all.
-  Up, Down: out, in        Left, Right: swing      Page Up, Page Down: raise, lower
-  End, Home: curl in, out  Insert, Delete: head    7, 6 and 9, 8: further axes (grab, saw) up, down
-  F10, closing the window or Ctrl-C: end and write the logs
+Keyboard: each key press changes the command of an axis by a quarter of its maximum. The command
+then stays constant; the space bar sets all commands to zero.
+  Up, Down: out, in        Left, Right: swing    Page Up, Page Down: raise, lower
+  End, Home: curl in, out  Insert, Delete: head  7, 6 and 9, 8: additional axes (grab, saw) up, down
+  F10, Ctrl-C or closing the window: stop and write the logs
 
 \b
-Gamepad: left stick out/in and swing, right stick raise/lower and tool, shoulders head, cross pad
-further axes, B all off, Start ends. SpaceMouse: push the way the tip shall go; its buttons switch
-the first two further axes, both together all off.
+Gamepad: left stick out/in and swing, right stick raise/lower and tool, shoulder buttons head,
+direction pad additional axes, B switches all off, Start stops. SpaceMouse: push the cap in the
+direction in which the tip must move; its two buttons switch the first two additional axes, both
+together switch all off.
 
 \b
-haptic:HOST:PORT: a device with force output whose server (hydrotele haptic-device) runs there. The
-reflection answers it at its own rate, 1 kHz, beside the machine. --latency shows delays and missed
-deadlines; without --device it starts a simulated device in a process of its own, for 60 s.
+haptic:HOST:PORT: a device with force output, served there by hydrotele haptic-device. The force
+reflection runs at 1 kHz, separately from the simulation of the machine. --latency prints delays
+and missed deadlines; without --device it starts a simulated device in its own process for 60 s.
 """
 
 
 def drive(
     scenario: Annotated[
-        str | None, typer.Argument(help="Teleoperated scenario; default the machine's own.")
+        str | None, typer.Argument(help="Teleoperated scenario; default: that of the machine.")
     ] = None,
     machine: Annotated[
-        str | None, typer.Option("--machine", "-m", help="Machine; default cat215.")
+        str | None, typer.Option("--machine", "-m", help="Machine; default: cat215.")
     ] = None,
     tool: Annotated[str | None, typer.Option("--tool", help="Tool of the machine.")] = None,
     device: Annotated[
         str,
         typer.Option(
-            "--device", "-d", help="keyboard, gamepad, spacemouse, haptic, scripted:FILE."
+            "--device", "-d", help="keyboard, gamepad, spacemouse, haptic or scripted:FILE."
         ),
     ] = "keyboard",
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder to write; default runs/SCENARIO.")
+        Path | None, typer.Option("--out", "-o", help="Output folder; default: runs/SCENARIO.")
     ] = None,
     set_: Annotated[
-        list[str] | None, typer.Option("--set", help="Override key=value; may be repeated.")
+        list[str] | None, typer.Option("--set", help="Scenario override KEY=VALUE. Repeatable.")
     ] = None,
-    viewer: Annotated[bool, typer.Option(help="Open MuJoCo's viewer.")] = True,
+    viewer: Annotated[bool, typer.Option(help="Open the MuJoCo viewer.")] = True,
     duration: Annotated[
-        float | None, typer.Option(help="Longest drive in seconds; default 600.")
+        float | None, typer.Option(help="Maximum simulated time [s]; default: 600.")
     ] = None,
     speed: Annotated[
-        float, typer.Option(help="Simulated per real time; 0: as fast as it goes.")
+        float, typer.Option(help="Simulated time per real time; 0: as fast as possible.")
     ] = 1.0,
     review: Annotated[bool, typer.Option(help="Write the rerun recording review.rrd.")] = True,
     effects: EffectFiles = None,
     latency: Annotated[
-        bool, typer.Option("--latency", help="Show latency, jitter and missed deadlines.")
+        bool, typer.Option("--latency", help="Print latency, jitter and missed deadlines.")
     ] = False,
     json: Annotated[
         bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")
     ] = False,
 ) -> None:
-    """Drive a machine in real time; write a folder as `run` does."""
+    """Drive a machine in real time; write the same files as `run`."""
     from hydrotele.cli.driving import DriveOptions, drive_to_folder
 
     pass
@@ -197,59 +195,61 @@ Examples:  hydrotele sweep servo_gains   |   hydrotele sweep my_sweep.yaml --job
 
 \b
 A sweep file:
-  scenario: zhu_up                                  # shipped, or a file beside this one
+  scenario: zhu_up                                  # shipped, or a file in the same folder
   set: {effects: [{name: payload, location: tool, parameters: {mass: 0}}]}
-  grid: {servo.position_gain: [3, 4, 5]}            # keys of run --set; every combination
-  sample:                                           # each of them with every sample
+  grid: {servo.position_gain: [3, 4, 5]}            # keys as in run --set; all combinations
+  sample:                                           # combined with each point of the grid
     count: 20
     seed: 1
     keys: {effects.0.parameters.mass: {uniform: [0, 1500]}}   # log_uniform, normal, choice
-  repeat: 2                                         # with the scenario's seed counted up
-  figures: [tracking.tip_z.rms, largest_pin_opening_mm]       # to draw; default: some
-  logs: false                                       # keep every run's folder
+  repeat: 2                                         # with successive seeds of the scenario
+  figures: [tracking.tip_z.rms, largest_pin_opening_mm]       # plotted; default: a selection
+  logs: false                                       # true: keep the folder of each run
 
 \b
-Stopped by Ctrl-C or killed: the same command goes on with the missing runs. Exit status 0 also
-where some runs failed (they are listed, and stand in the table with their reason); 3 where all did.
+After an interruption (Ctrl-C, kill), the same command continues with the missing runs. Failed runs
+are listed and appear in the table with the reason. The exit status is 0 if some runs failed and 3
+if all failed.
 """
 
 
 def sweep(
     file: Annotated[str, typer.Argument(help="Sweep file (.yaml), or a shipped sweep.")],
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder to write; default runs/NAME.")
+        Path | None, typer.Option("--out", "-o", help="Output folder; default: runs/NAME.")
     ] = None,
     jobs: Annotated[
-        int | None, typer.Option("--jobs", "-j", min=1, help="Processes; default one per core.")
+        int | None,
+        typer.Option("--jobs", "-j", min=1, help="Number of processes; default: one per core."),
     ] = None,
     dask: Annotated[
         str | None, typer.Option(help="Scheduler of a dask cluster (address or scheduler file).")
     ] = None,
     fresh: Annotated[
-        bool, typer.Option("--fresh", help="Throw away what an earlier sweep left in the folder.")
+        bool, typer.Option("--fresh", help="Discard earlier results in the output folder.")
     ] = False,
     retry_failed: Annotated[
-        bool, typer.Option("--retry-failed", help="Do failed runs again.")
+        bool, typer.Option("--retry-failed", help="Repeat failed runs.")
     ] = False,
     strict: Annotated[
-        bool, typer.Option("--strict", help="Exit with status 3 where any run failed.")
+        bool, typer.Option("--strict", help="Exit with status 3 if any run failed.")
     ] = False,
     effects: EffectFiles = None,
     json: Annotated[
         bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")
     ] = False,
 ) -> None:
-    """Run variations of a scenario (grid or random samples) and collect one table."""
+    """Run variations of a scenario (grid or random samples); collect the results in a table."""
     from hydrotele.cli.running import SweepOptions, sweep_to_folder
 
     sweep_to_folder(file, out, SweepOptions(jobs, dask, fresh, retry_failed, strict, json))
 
 
 class OverviewGroup(TyperGroup):
-    """The program's commands, with the page of `cli.overview` as their help."""
+    """Command group whose help is the text of `cli.overview`."""
 
     def format_help(self, ctx, formatter) -> None:
-        """Print the page."""
+        """Print the overview of all commands."""
         typer.echo(format_overview())
 
 
@@ -276,15 +276,15 @@ MachineName = Annotated[
 ]
 ToolName = Annotated[str | None, typer.Option("--tool", help="Tool of the machine.")]
 Logs = Annotated[
-    list[Path], typer.Option("--data", "-d", help="Folder of logs, log file or run folder.")
+    list[Path], typer.Option("--data", "-d", help="Log file, folder of logs or run folder.")
 ]
-MoreLogs = Annotated[list[Path] | None, typer.Argument(help="More of them.")]
+MoreLogs = Annotated[list[Path] | None, typer.Argument(help="More log files or folders.")]
 HeldOut = Annotated[
-    str | None, typer.Option(help="Run to judge on, not fitted; default test*, or the last.")
+    str | None, typer.Option(help="Held-out run; default: test*, else the last run.")
 ]
-Sensors = Annotated[str | None, typer.Option(help="Sensors of the machine.")]
+Sensors = Annotated[str | None, typer.Option(help="Sensor set of the machine.")]
 Force = Annotated[
-    bool, typer.Option("--force", help="Accept logs that name another machine or tool.")
+    bool, typer.Option("--force", help="Accept logs recorded with another machine or tool.")
 ]
 
 
@@ -294,15 +294,15 @@ Force = Annotated[
 def run(
     scenario: Annotated[str, typer.Argument(help="Shipped scenario, or a YAML file.")],
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder to write; default runs/SCENARIO.")
+        Path | None, typer.Option("--out", "-o", help="Output folder; default: runs/SCENARIO.")
     ] = None,
     set_: Annotated[
-        list[str] | None, typer.Option("--set", help="Override key=value; may be repeated.")
+        list[str] | None, typer.Option("--set", help="Scenario override KEY=VALUE. Repeatable.")
     ] = None,
     machine: Annotated[
         str | None,
         typer.Option(
-            "--machine", "-m", help="Machine instead of the scenario's, such as patched/."
+            "--machine", "-m", help="Machine that replaces that of the scenario, e.g. patched/."
         ),
     ] = None,
     tool: ToolName = None,
@@ -330,19 +330,19 @@ def replay(
     logs: Annotated[list[Path], typer.Argument(help="Log files (.parquet, .csv) or run folders.")],
     machine: MachineName = None,
     tool: ToolName = None,
-    timestep: Annotated[float, typer.Option(help="Physics step in seconds.")] = 1.0e-3,
+    timestep: Annotated[float, typer.Option(help="Simulation time step [s].")] = 1.0e-3,
     out: Annotated[
         Path | None,
         typer.Option(
             "--out",
             "-o",
-            help="Folder for plots and recordings; default runs/replay_LOG, with --json none.",
+            help="Folder for plots and recordings; default: runs/replay_LOG, none with --json.",
         ),
     ] = None,
     effects: EffectFiles = None,
     json: Json = False,
 ) -> None:
-    """Drive the model with the commands of a log; print the prediction errors."""
+    """Simulate the model with the commands of a log; print the prediction errors."""
     from hydrotele.cli.reviewing import replay_logs
 
     replay_logs(logs, machine, tool, timestep, out, json)
@@ -360,32 +360,34 @@ def gap(
     machine: MachineName = None,
     tool: ToolName = None,
     mjcf: Annotated[
-        Path | None, typer.Option("--mjcf", help="Any mechanism (.xml) instead of a machine.")
+        Path | None, typer.Option("--mjcf", help="MJCF mechanism (.xml) instead of a machine.")
     ] = None,
     columns: Annotated[
         Path | None,
-        typer.Option("--columns", help="With --mjcf: which column is which (.yaml)."),
+        typer.Option("--columns", help="With --mjcf: assignment of log columns (.yaml)."),
     ] = None,
     heldout: HeldOut = None,
     sensors: Sensors = None,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder to write; default gap_DATA.")
+        Path | None, typer.Option("--out", "-o", help="Output folder; default: gap_DATA.")
     ] = None,
     effect: Annotated[
         list[str] | None,
-        typer.Option("--effect", help="Try only the effect of this name; may be repeated."),
+        typer.Option("--effect", help="Test only the effect of this name. Repeatable."),
     ] = None,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Processes to use.")] = None,
-    mask: Annotated[Path | None, typer.Option(help="CSV run,begin,end [s] not to use.")] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes.")] = None,
+    mask: Annotated[
+        Path | None, typer.Option(help="CSV of masked intervals: run,begin,end [s].")
+    ] = None,
     force: Force = False,
     recording: Annotated[bool, typer.Option(help="Write the rerun recording.")] = True,
     effects: EffectFiles = None,
     json: Json = False,
 ) -> None:
-    """Find where the model and measured logs disagree, name the effect, patch the model.
+    """Find differences between model and logs, identify their cause, correct the model.
 
-    With --mjcf, or the name of a model without machine.yaml such as palida: any mechanism without
-    hydraulics, from measured positions and drive forces.
+    For a mechanism without hydraulics, give --mjcf or the name of a shipped model without
+    machine.yaml, such as palida. The logs must contain positions and drive forces.
     """
     from hydrotele.cli.gapping import gap_mjcf_to_folder, gap_to_folder, mechanism_named
 
@@ -394,7 +396,7 @@ def gap(
         of_machines = {"--tool": tool, "--sensors": sensors, "--jobs": jobs, "--mask": mask,
                        "--force": force}  # fmt: skip
         if strange := [option for option, value in of_machines.items() if value]:
-            raise InputError(strange[0], "belongs to a machine: leave it out for a mechanism")
+            raise InputError(strange[0], "applies to machines only: omit it for a mechanism")
         every = [*data, *(more or [])]
         gap_mjcf_to_folder(every, model, columns, heldout, out, json, effect or [])
         return
@@ -414,57 +416,60 @@ def identify(
     machine: MachineName = None,
     tool: ToolName = None,
     mjcf: Annotated[
-        Path | None, typer.Option("--mjcf", help="Any mechanism (.xml) instead of a machine.")
+        Path | None, typer.Option("--mjcf", help="MJCF mechanism (.xml) instead of a machine.")
     ] = None,
     columns: Annotated[
         Path | None,
-        typer.Option("--columns", help="With --mjcf: which column is which (.yaml)."),
+        typer.Option("--columns", help="With --mjcf: assignment of log columns (.yaml)."),
     ] = None,
     heldout: HeldOut = None,
     sensors: Sensors = None,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder to write; default identify_DATA.")
+        Path | None, typer.Option("--out", "-o", help="Output folder; default: identify_DATA.")
     ] = None,
     reduced: Annotated[
-        bool, typer.Option("--reduced", help="Links only, without tubes and rods.")
+        bool, typer.Option("--reduced", help="Model the links only, without cylinder bodies.")
     ] = False,
     pins: Annotated[
-        bool, typer.Option("--pins", help="Friction in joints and pins without drive, too.")
+        bool, typer.Option("--pins", help="Include friction in passive joints and pins.")
     ] = False,
     asymmetry: Annotated[
-        bool, typer.Option("--asymmetry", help="Viscous friction that depends on the direction.")
+        bool, typer.Option("--asymmetry", help="Use direction-dependent viscous friction.")
     ] = False,
     hydraulics: Annotated[
-        bool, typer.Option("--hydraulics", help="Identify valves, oil, leakage and supply, too.")
+        bool, typer.Option("--hydraulics", help="Also identify valves, oil, leakage and supply.")
     ] = False,
     processing: Annotated[
-        str, typer.Option(help="zero_phase, optimal, periodic (needs the period) or raw.")
+        str, typer.Option(help="Filter: zero_phase, optimal, periodic (needs --period) or raw.")
     ] = "zero_phase",
     band: Annotated[
         float | None, typer.Option(help="Compare forces below this frequency [Hz].")
     ] = None,
-    period: Annotated[
-        float | None, typer.Option(help="Period of a repeated motion, in seconds.")
-    ] = None,
-    harmonics: Annotated[int, typer.Option(help="Harmonics of it to keep; 0: enough.")] = 0,
+    period: Annotated[float | None, typer.Option(help="Period of a repeated motion [s].")] = None,
+    harmonics: Annotated[
+        int, typer.Option(help="Number of harmonics of --period to keep; 0: automatic.")
+    ] = 0,
     estimator: Annotated[
         str,
-        typer.Option(
-            help="weighted, gauss_markov, least_squares or instruments (needs the period)."
-        ),
+        typer.Option(help="weighted, gauss_markov, least_squares or instruments (needs --period)."),
     ] = "weighted",
     keep_bias: Annotated[
-        bool, typer.Option("--keep-bias", help="Leave in what the positions' noise does to it.")
+        bool, typer.Option("--keep-bias", help="Do not correct the bias due to position noise.")
     ] = False,
-    ridge: Annotated[float, typer.Option(help="Ridge, share of the largest singular value.")] = 0.0,
-    truncate: Annotated[float, typer.Option(help="Leave out smaller singular values.")] = 0.0,
+    ridge: Annotated[
+        float, typer.Option(help="Ridge term as a fraction of the largest singular value.")
+    ] = 0.0,
+    truncate: Annotated[
+        float, typer.Option(help="Discard singular values below this fraction of the largest.")
+    ] = 0.0,
     force: Force = False,
     effects: EffectFiles = None,
     json: Json = False,
 ) -> None:
-    """Identify masses, friction and hydraulics from measured logs; write the machine.
+    """Identify masses, friction and hydraulics from logs; write the identified machine.
 
-    With --mjcf: any mechanism of hinges, slides and balls, its loops closed by connect and weld.
+    With --mjcf, any mechanism with hinge, slide and ball joints can be identified. Its kinematic
+    loops must be closed by connect or weld constraints.
     """
     from hydrotele.cli.identifying import Choices, identify_mjcf_to_folder, identify_to_folder
     from hydrotele.identify.estimation import Estimator
@@ -484,14 +489,14 @@ def identify(
             "--pins": pins, "--asymmetry": asymmetry, "--hydraulics": hydraulics,
         }  # fmt: skip
         if strange := [option for option, value in given.items() if value]:
-            raise InputError(strange[0], "belongs to a machine: leave it out with --mjcf")
+            raise InputError(strange[0], "applies to machines only: omit it with --mjcf")
         identify_mjcf_to_folder(
             [*data, *(more or [])], mjcf, columns, heldout, out, json, choices.processing,
             choices.estimator,
         )  # fmt: skip
         return
     if columns is not None:
-        raise InputError("--columns", "says which column is which of --mjcf: name that, too")
+        raise InputError("--columns", "is used only together with --mjcf: give both")
     identify_to_folder(
         [*data, *(more or [])], machine, tool, heldout, sensors, out, json, choices, force
     )
@@ -500,14 +505,20 @@ def identify(
 @app.command(epilog="Example:  hydrotele excite cat215 --out my_excitation.yaml")
 def excite(
     machine: Annotated[str, typer.Argument(help="Shipped machine, or a folder.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Scenario to write (.yaml).")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Scenario file to write (.yaml).")],
     tool: ToolName = None,
     sensors: Sensors = None,
-    period: Annotated[float, typer.Option(min=1.0, help="Of the motion, in seconds.")] = 20.0,
-    harmonics: Annotated[int, typer.Option(min=1, max=30, help="Of the motion.")] = 8,
-    starts: Annotated[int, typer.Option(min=1, help="Searches from random motions.")] = 2,
-    seed: Annotated[int, typer.Option(help="Of these.")] = 0,
-    cycles: Annotated[float, typer.Option(min=1.0, help="Periods to run.")] = 3.0,
+    period: Annotated[float, typer.Option(min=1.0, help="Period of the trajectory [s].")] = 20.0,
+    harmonics: Annotated[
+        int, typer.Option(min=1, max=30, help="Number of harmonics of the trajectory.")
+    ] = 8,
+    starts: Annotated[
+        int, typer.Option(min=1, help="Number of searches from random trajectories.")
+    ] = 2,
+    seed: Annotated[int, typer.Option(help="Random seed of the searches.")] = 0,
+    cycles: Annotated[
+        float, typer.Option(min=1.0, help="Number of periods that the scenario runs.")
+    ] = 3.0,
     effects: EffectFiles = None,
     json: Json = False,
 ) -> None:
@@ -525,12 +536,12 @@ def excite(
 )
 def analyse_teleop(
     file: Annotated[
-        Path | None, typer.Argument(help="Case (.yaml), scenario; default one of the CAT 215.")
+        Path | None, typer.Argument(help="Case (.yaml) or scenario; default: a CAT 215 case.")
     ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out", "-o", help="Folder to write; default runs/analyse_NAME, with --json none."
+            "--out", "-o", help="Output folder; default: runs/analyse_NAME, none with --json."
         ),
     ] = None,
     structure: Annotated[
@@ -538,31 +549,39 @@ def analyse_teleop(
         typer.Option(
             "--structure",
             help="position_position, position_force, four_channel_position, rate_position, "
-            "rate_force, four_channel_rate, with --robust also wave_variables and "
-            "passivity_control; may be repeated; default the case's.",
+            "rate_force or four_channel_rate; with --robust also wave_variables and "
+            "passivity_control. Repeatable. Default: those of the case.",
         ),
     ] = None,
     delay: Annotated[
-        float | None, typer.Option(help="Delay each way in seconds, instead of the case's.")
+        float | None, typer.Option(help="One-way delay [s]; default: that of the case.")
     ] = None,
     confirm: Annotated[
         bool,
-        typer.Option("--confirm", help="Simulate sine sweeps and every cell of the map, too."),
+        typer.Option("--confirm", help="Verify by simulation: sine sweeps and the stability map."),
     ] = False,
     robust: Annotated[
-        bool, typer.Option("--robust", help="Sampling, jitter, drawn operators, Z-width, too.")
+        bool,
+        typer.Option("--robust", help="Include sampling, jitter, random operators and Z-width."),
     ] = False,
-    period: Annotated[float, typer.Option(help="With --robust: sampling period, s.")] = 0.005,
+    period: Annotated[float, typer.Option(help="With --robust: sampling period [s].")] = 0.005,
     delays: Annotated[
         Path | None,
-        typer.Option(help="With --robust: CSV of measured delays, columns forward and back, s."),
+        typer.Option(help="With --robust: CSV of measured delays [s], columns forward and back."),
     ] = None,
-    operators: Annotated[int, typer.Option(help="With --robust: hands and tasks drawn.")] = 20,
-    coordinate: Annotated[str | None, typer.Option(help="Of a scenario: r, theta, z ...")] = None,
-    set_: Annotated[list[str] | None, typer.Option("--set", help="Of a scenario.")] = None,
+    operators: Annotated[
+        int, typer.Option(help="With --robust: number of sampled pairs of operator and task.")
+    ] = 20,
+    coordinate: Annotated[
+        str | None, typer.Option(help="For a scenario: coordinate of the arm: r, theta, z ...")
+    ] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="For a scenario: override KEY=VALUE. Repeatable."),
+    ] = None,
     json: Json = False,
 ) -> None:
-    """Two-port of a teleoperator: what is felt, passivity, stability with delay, margins."""
+    """Analyse a teleoperator as a two-port: transparency, passivity, stability, delay margins."""
     from hydrotele.cli.analysing import Robustly, analyse_any_to_folder
 
     pairs = overrides_of(set_ or [])
@@ -575,21 +594,26 @@ def analyse_teleop(
 )
 def review(
     log: Annotated[Path, typer.Argument(help="Run folder or log file.")],
-    log2: Annotated[Path | None, typer.Argument(help="Second one, on the same clock.")] = None,
+    log2: Annotated[
+        Path | None, typer.Argument(help="Second log with the same time base, for comparison.")
+    ] = None,
     machine: MachineName = None,
     tool: ToolName = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Recording to write.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Recording file to write (.rrd).")
+    ] = None,
     serve: Annotated[bool, typer.Option("--serve", help="Serve the web viewer.")] = False,
     port: Annotated[int, typer.Option(help="Port of the web viewer.")] = 9090,
     screenshot: Annotated[
-        Path | None, typer.Option("--screenshot", help="Write a PNG of the viewer, headless.")
+        Path | None,
+        typer.Option("--screenshot", help="Write a PNG of the viewer without opening a window."),
     ] = None,
     plot: Annotated[
         Path | None, typer.Option("--plot", help="Write a PNG of all channels instead.")
     ] = None,
     effects: EffectFiles = None,
 ) -> None:
-    """Show a run in rerun: the machine in 3D, joints, pressures, flows and forces."""
+    """Show a run in the rerun viewer: 3D machine, joints, pressures, flows and forces."""
     from hydrotele.cli.reviewing import review_logs
 
     review_logs(log, log2, machine, tool, out, serve, port, screenshot, plot)
@@ -599,12 +623,14 @@ def review(
 def list_(
     what: Annotated[
         str,
-        typer.Argument(help="machines, joysticks, scenarios, sweeps, effects, environments; all."),
+        typer.Argument(
+            help="machines, joysticks, scenarios, sweeps, effects, environments or all."
+        ),
     ] = "all",
     effects: EffectFiles = None,
     json: Json = False,
 ) -> None:
-    """List what is shipped: machines, scenarios, sweeps, effects, environments."""
+    """List the available machines, scenarios, sweeps, effects and environments."""
     from hydrotele.cli.catalogue import list_things
 
     list_things(what, json)
@@ -612,11 +638,13 @@ def list_(
 
 @app.command(epilog="Example:  hydrotele validate my_machine/machine.yaml")
 def validate(
-    files: Annotated[list[Path], typer.Argument(help="Machines, scenarios, sweeps, logs ...")],
+    files: Annotated[
+        list[Path], typer.Argument(help="Machines, joysticks, scenarios, sweeps or logs.")
+    ],
     effects: EffectFiles = None,
     json: Json = False,
 ) -> None:
-    """Check a machine, joystick, scenario, sweep or log; report errors and their place."""
+    """Check a machine, joystick, scenario, sweep or log; report errors with file and line."""
     from hydrotele.cli.catalogue import validate_files
 
     validate_files(files, json)
@@ -627,15 +655,15 @@ def export(
     machine: Annotated[str, typer.Argument(help="Shipped machine or joystick, or a folder.")],
     tool: ToolName = None,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="MJCF file; default stdout.")
+        Path | None, typer.Option("--out", "-o", help="MJCF file; default: standard output.")
     ] = None,
     picture: Annotated[
-        Path | None, typer.Option("--picture", help="Write a PNG of it instead.")
+        Path | None, typer.Option("--picture", help="Write a PNG image instead.")
     ] = None,
-    camera: Annotated[str, typer.Option(help="Camera of the picture.")] = "overview",
+    camera: Annotated[str, typer.Option(help="Camera of the image.")] = "overview",
     effects: EffectFiles = None,
 ) -> None:
-    """Write the complete MJCF of a machine or joystick, or a picture of it."""
+    """Write the complete MJCF of a machine or joystick, or an image of it."""
     from hydrotele.cli.catalogue import export_machine
 
     export_machine(machine, tool, out, picture, camera)
@@ -645,20 +673,23 @@ def export(
 def experiments(
     name: Annotated[
         str,
-        typer.Argument(help="abdellatif2008, khoshzaban1992, wang2012 or zhu1994."),
+        typer.Argument(help="Document: abdellatif2008, khoshzaban1992, wang2012 or zhu1994."),
     ],
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Folder to write; default runs/NAME, with --json none."),
+        typer.Option("--out", "-o", help="Output folder; default: runs/NAME, none with --json."),
     ] = None,
     seeds: Annotated[
         int | None,
-        typer.Option(min=1, help="Repetitions: operators, noise seeds, trials; 20, or 100 trials."),
+        typer.Option(
+            min=1,
+            help="Repetitions (operators, noise seeds or trials); default: 20, or 100 trials.",
+        ),
     ] = None,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Processes to use.")] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes.")] = None,
     json: Json = False,
 ) -> None:
-    """Repeat a published document's experiments; compare every table and figure.
+    """Repeat the experiments of a publication; compare its tables and figures with simulation.
 
     Each row states the published value, the simulated one with its 95 % interval, and a verdict:
     agrees, differs (with the measured reason), undecided, or cannot be computed.
@@ -675,12 +706,16 @@ def experiments(
     epilog="Examples:  hydrotele bench --save a.json   |   hydrotele bench --compare a.json"
 )
 def bench(
-    save: Annotated[Path | None, typer.Option("--save", help="Write the figures.")] = None,
-    compare: Annotated[Path | None, typer.Option("--compare", help="Compare with these.")] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Fewer repetitions.")] = False,
+    save: Annotated[
+        Path | None, typer.Option("--save", help="Write the results to this file (.json).")
+    ] = None,
+    compare: Annotated[
+        Path | None, typer.Option("--compare", help="Compare with the results in this file.")
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Use fewer repetitions.")] = False,
     json: Json = False,
 ) -> None:
-    """Measure speed: mechanism, hydraulics, a whole scenario, batches, start-up."""
+    """Measure the speed of the simulation: mechanism, hydraulics, scenarios, batches, start-up."""
     from hydrotele.cli.bench import run_benchmarks
 
     run_benchmarks(save, compare, quick, json)
@@ -689,10 +724,10 @@ def bench(
 @app.command("compile", epilog="Example:  hydrotele compile --jobs 4")
 def compile_functions(
     jobs: Annotated[
-        int | None, typer.Option(min=1, help="Processes to use; default one per core.")
+        int | None, typer.Option(min=1, help="Number of processes; default: one per core.")
     ] = None,
 ) -> None:
-    """Compile all numerical functions now, so that no later command waits for it."""
+    """Compile all numerical functions now, so that later commands start without delay."""
     from hydrotele.cli.compiling import compile_all
 
     compile_all(jobs)
@@ -700,9 +735,9 @@ def compile_functions(
 
 @app.command(epilog="Example:  hydrotele demo --out demo")
 def demo(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write.")] = Path("demo"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="Output folder.")] = Path("demo"),
 ) -> None:
-    """Run an excavator, replay its log, draw the pictures."""
+    """Simulate an excavator, replay its log and draw the results."""
     from hydrotele.cli.running import run_demo
 
     run_demo(out)
@@ -710,7 +745,7 @@ def demo(
 
 @app.callback(invoke_without_command=True)
 def _options(
-    version: Annotated[bool, typer.Option("--version", help="Print the version and stop.")] = False,
+    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
 ) -> None:
     if version:
         import hydrotele
@@ -720,20 +755,23 @@ def _options(
 
 
 def main() -> None:
-    """Entry point; exits with 2 for users' errors, 3 for failed runs, 130 or 143 for signals."""
-    os.environ["PYTHONSAFEPATH"] = "1"  # children import nothing from the working folder
+    """Run the command line.
+
+    The exit status is 2 for errors in the input, 3 for failed simulations, 130 or 143 for signals.
+    """
+    os.environ["PYTHONSAFEPATH"] = "1"  # child processes import nothing from the working folder
     ended: list[int] = []
 
     def end(number: int, _: object) -> None:
         ended.append(128 + number)
-        sys.exit(ended[0])  # so that everything is cleaned up
+        sys.exit(ended[0])  # SystemExit runs the cleanup code
 
     signal.signal(signal.SIGTERM, end)
     warnings.showwarning = lambda message, *_, **__: typer.echo(f"warning {message}", err=True)
     try:
         _run()
     finally:
-        if ended:  # a library on the way may have made another error of it
+        if ended:  # a library may have replaced SystemExit by another exception
             sys.exit(ended[0])
 
 
@@ -741,7 +779,7 @@ def _run() -> None:
     try:
         app()
     except (InputError, OSError) as error:
-        if isinstance(error, OSError):  # a name that is too long, a disk that fails
+        if isinstance(error, OSError):  # for example a file name that is too long
             error = InputError(error.filename or "the system", error.strerror or str(error))
         typer.secho("error ", fg="red", bold=True, err=True, nl=False)
         typer.echo(str(error), err=True)

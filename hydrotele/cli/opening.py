@@ -1,4 +1,8 @@
-"""Logs and their machines, as a user names them: run folders, log files, shipped machines."""
+"""Open the logs and machines named on the command line.
+
+Logs are given as run folders, folders of logs or log files. If no machine is given, it is found
+next to the log or by the metadata of the log.
+"""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,10 +17,10 @@ _LOGS = (".parquet", ".csv")
 
 
 def log_path(path: Path, which: str = "measured") -> Path:
-    """The log file that a path means: itself, or the one of that kind in a run folder.
+    """Return the log file of a path: the file itself, or `<which>.parquet` in a run folder.
 
     Raises:
-        InputError: neither is there.
+        InputError: the log file does not exist.
     """
     if path.is_dir():
         inside = path / f"{which}.parquet"
@@ -31,22 +35,22 @@ def log_path(path: Path, which: str = "measured") -> Path:
 def open_log(
     path: Path, machine: str | None = None, tool: str | None = None, which: str = "measured"
 ) -> tuple[Machine, Log]:
-    """A log with its machine.
+    """Load a log and its machine.
 
-    The machine is the one named, else the `machine.yaml` beside the log, else the shipped one that
-    the log's metadata names.
+    If no machine is given, `machine.yaml` in the folder of the log is used, else the shipped
+    machine that the metadata of the log names.
 
     Args:
         path: log file or run folder.
         machine: name or folder of a machine, None to find it.
-        tool: its tool, None for the log's if the machine has it.
+        tool: tool of the machine, None for the tool of the log if the machine has it.
         which: `measured` or `truth`, for run folders.
 
     Returns:
         (machine, log).
 
     Raises:
-        InputError: the log is not usable, or no machine is known.
+        InputError: the log is not usable, or its machine is not known.
     """
     file = log_path(path, which)
     beside = file.parent / MACHINE_FILE
@@ -58,26 +62,30 @@ def open_log(
         log = load_log(file)
         chosen = log.metadata.get("machine")
         if not chosen:
-            raise InputError(file, "its metadata names no machine: give --machine")
+            raise InputError(file, "its metadata does not name a machine: give --machine")
     found = load_machine(chosen, tool)
     logged = log.metadata.get("tool")
     if tool is None and logged in found.tools:
         found = load_machine(chosen, logged)
     positions = [f"{found.position_kind(axis)}.{axis}" for axis in found.axes]
     if not any(name in log for name in positions):
-        message = f"is no log of {found.name}: it has none of {', '.join(positions)}"
+        message = f"is not a log of {found.name}: it has none of {', '.join(positions)}"
         raise InputError(file, message)
     return found, log
 
 
 def data_name(data: Sequence[Path]) -> str:
-    """Name of the data: of the folder, or of the folder that holds the files."""
+    """Return the name of the data folder, or of the folder that contains the first file."""
     first = data[0].resolve()
     return first.name if first.is_dir() else first.parent.name or first.stem
 
 
 def machine_of(data: Sequence[Path], name: str | None, tool: str | None) -> Machine:
-    """The machine named, else the one beside the first log, else the one that the log names."""
+    """Load the machine called `name`, else that next to the first log, else that of its metadata.
+
+    Raises:
+        InputError: no machine is known, or the machine is not usable.
+    """
     log = _first_log(data[0])
     metadata: Mapping[str, str] = {}
     if name is None and log and (log.parent / MACHINE_FILE).is_file():
@@ -90,7 +98,7 @@ def machine_of(data: Sequence[Path], name: str | None, tool: str | None) -> Mach
         ).metadata  # fmt: skip
     name = name or metadata.get("machine")
     if not name:
-        raise InputError(data[0], "its metadata names no machine: give --machine")
+        raise InputError(data[0], "its metadata does not name a machine: give --machine")
     found = load_machine(name, tool)
     logged = metadata.get("tool")
     return load_machine(name, logged) if tool is None and logged in found.tools else found

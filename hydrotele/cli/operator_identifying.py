@@ -1,4 +1,4 @@
-"""`hydrotele identify-operator`: parameters of the operator model from a record of tracking."""
+"""Implement `hydrotele identify-operator`: fit the operator model to a log of a tracking task."""
 
 from pathlib import Path
 from typing import Annotated
@@ -10,22 +10,23 @@ Examples:  hydrotele identify-operator tracking.csv --out operator_7
            hydrotele identify-operator trial.csv --hand "stick [deg]" --target "command [deg]"
 
 \b
-The record is a CSV or Parquet file with columns time, target, response and hand (or force, for a
-stick that does not move): compensatory tracking, in which the error of target and response is
-displayed. At least 20 s with 10 samples per second; two minutes or more for close intervals.
-The written operator.yaml is for scenarios: pilot: {perception: {file: operator_7/operator.yaml}}.
+The log is a CSV or Parquet file of a compensatory tracking task, in which the operator sees the
+difference of target and response. Its columns are time, target, response and hand (or force, for a
+stick that does not move). It must contain at least 20 s at 10 Hz or more; narrow confidence
+intervals need two minutes or more. A scenario uses the written file by
+pilot: {perception: {file: operator_7/operator.yaml}}.
 """
 _KIND = "operator identification"
 
 
 def identify_operator(
-    file: Annotated[Path, typer.Argument(help="Record of tracking, .csv or .parquet.")],
-    time: Annotated[str | None, typer.Option(help="Column of the time; default time.")] = None,
-    target: Annotated[str | None, typer.Option(help="Column of the target.")] = None,
-    response: Annotated[str | None, typer.Option(help="Column of the response.")] = None,
-    hand: Annotated[str | None, typer.Option(help="Column of the hand's position.")] = None,
+    file: Annotated[Path, typer.Argument(help="Log of a tracking task, .csv or .parquet.")],
+    time: Annotated[str | None, typer.Option(help="Time column; default: time.")] = None,
+    target: Annotated[str | None, typer.Option(help="Target column.")] = None,
+    response: Annotated[str | None, typer.Option(help="Response column.")] = None,
+    hand: Annotated[str | None, typer.Option(help="Column of the hand position.")] = None,
     equalisation: Annotated[
-        str | None, typer.Option(help="gain, lead, lag or integral; default what fits best.")
+        str | None, typer.Option(help="gain, lead, lag or integral; default: the best fit.")
     ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for operator.yaml and fit.json.")
@@ -79,7 +80,7 @@ def _print(fit, file: Path) -> None:
     element = f", controlled element {fit.element}" if fit.element else ""
     title = (
         f"{file.name}: {fit.duration:.0f} s at {fit.rate:.3g} Hz, equalisation {fit.equalisation}"
-        f"{element}; {100 * fit.explained:.0f} % of the hand's motion come from the target"
+        f"{element}; the target explains {100 * fit.explained:.0f} % of the hand motion"
     )
     rows = table(title, "parameter", "estimate", "95 % interval", "unit", "")
     for name, one in fit.estimates.items():

@@ -1,4 +1,4 @@
-"""Values of command-line options: overrides of a scenario, lists of numbers."""
+"""Parse values of command-line options: scenario overrides and lists of numbers."""
 
 from json import dumps as json_text
 from pathlib import Path
@@ -7,10 +7,10 @@ from hydrotele.core.errors import InputError
 
 
 def overrides_of(items: list[str]) -> dict[str, str]:
-    """Key path -> YAML text of every `key=value`.
+    """Return {key path: YAML text} from a list of `key=value` strings.
 
     Raises:
-        InputError: it is none.
+        InputError: an item does not have the form `key=value`.
     """
     pairs = {}
     for item in items:
@@ -22,7 +22,10 @@ def overrides_of(items: list[str]) -> dict[str, str]:
 
 
 def chosen(machine: str | None, tool: str | None) -> dict[str, str]:
-    """Overrides of a scenario's machine; a path counts from here, not from the scenario's file."""
+    """Return the scenario overrides that select a machine and its tool.
+
+    A relative path is resolved from the working folder, not from the folder of the scenario file.
+    """
     from hydrotele.machine.machine_file import shipped_machines
 
     pairs = {}
@@ -35,10 +38,10 @@ def chosen(machine: str | None, tool: str | None) -> dict[str, str]:
 
 
 def numbers_of(option: str, text: str) -> list[float]:
-    """Positive numbers of an option, separated by commas.
+    """Return the positive numbers of an option value, which are separated by commas.
 
     Raises:
-        InputError: there is none, or one is no positive number.
+        InputError: the text is empty or contains something other than positive numbers.
 
     >>> numbers_of("--horizons", "1, 5,30")
     [1.0, 5.0, 30.0]

@@ -1,6 +1,6 @@
-"""The page of `hydrotele --help`, written without importing the command-line library.
+"""Format the output of `hydrotele --help` without importing typer.
 
-Importing typer takes longer than the rest of `hydrotele --help`.
+Importing typer takes longer than all other work of `hydrotele --help`.
 """
 
 import shutil
@@ -12,35 +12,43 @@ OPTIONS = {
     "--version": "Print the version and exit.",
     "--install-completion": "Install completion for the current shell.",
     "--show-completion": "Print the completion script of the current shell.",
-    "-h, --help": "Show this page and exit.",
+    "-h, --help": "Show this message and exit.",
 }
 COMMANDS = {
     "run": "Simulate a scenario; write logs, a rerun recording, a summary and the MJCF.",
-    "drive": "Drive a machine in real time; write a folder as `run` does.",
-    "haptic-device": "Connect a haptic device to a machine: poses out, wrenches in, watchdog.",
-    "sweep": "Run variations of a scenario (grid or random samples) and collect one table.",
-    "compare": "Compare models by free runs on measured commands: RMS error per channel.",
+    "drive": "Drive a machine in real time; write the same files as `run`.",
+    "haptic-device": "Serve a haptic device over UDP: send poses, apply wrenches, watchdog.",
+    "sweep": "Run variations of a scenario (grid or random samples); collect the results in a"
+    " table.",
+    "compare": "Compare open-loop predictions of several models with logs: RMS error per channel.",
     "identify-operator": "Fit the operator model to a tracking log: delay, margins, lag, remnant.",
-    "replay": "Drive the model with the commands of a log; print the prediction errors.",
-    "gap": "Find where the model and measured logs disagree, name the effect, patch the model.",
-    "identify": "Identify masses, friction and hydraulics from measured logs; write the machine.",
+    "replay": "Simulate the model with the commands of a log; print the prediction errors.",
+    "gap": "Find differences between model and logs, identify their cause, correct the model.",
+    "identify": "Identify masses, friction and hydraulics from logs; write the identified machine.",
     "excite": "Design the most informative trajectory within a machine's limits.",
-    "review": "Show a run in rerun: the machine in 3D, joints, pressures, flows and forces.",
-    "list": "List what is shipped: machines, scenarios, sweeps, effects, environments.",
-    "validate": "Check a machine, joystick, scenario, sweep or log; report errors and their place.",
-    "export": "Write the complete MJCF of a machine or joystick, or a picture of it.",
-    "experiments": "Repeat a published document's experiments; compare every table and figure.",
-    "compile": "Compile all numerical functions now, so that no later command waits for it.",
-    "bench": "Measure speed: mechanism, hydraulics, a whole scenario, batches, start-up.",
-    "demo": "Run an excavator, replay its log, draw the pictures.",
+    "review": "Show a run in the rerun viewer: 3D machine, joints, pressures, flows and forces.",
+    "list": "List the available machines, scenarios, sweeps, effects and environments.",
+    "validate": "Check a machine, joystick, scenario, sweep or log; report errors with file and"
+    " line.",
+    "export": "Write the complete MJCF of a machine or joystick, or an image of it.",
+    "experiments": "Repeat the experiments of a publication; compare its tables and figures with"
+    " simulation.",
+    "compile": "Compile all numerical functions now, so that later commands start without delay.",
+    "bench": "Measure the speed of the simulation: mechanism, hydraulics, scenarios, batches,"
+    " start-up.",
+    "demo": "Simulate an excavator, replay its log and draw the results.",
     "analyse": "Analyse a teleoperator by linear two-port theory.",
     "calibrate": "Calibrate the kinematics of a mechanism from measured poses.",
 }
-"""One line for each command."""
+"""Summary of each command: the first line of its help text."""
 
 
 def format_overview(width: int | None = None) -> str:
-    """Return the help page of the program, wrapped to a width in characters (the terminal's)."""
+    """Return the help text of the program.
+
+    Args:
+        width: line length [characters], default that of the terminal; at most 120.
+    """
     width = min(width or shutil.get_terminal_size().columns, 120)
     parts = [fill(text, width) for text in (USAGE, DESCRIPTION)]
     for title, rows in ("Options", OPTIONS), ("Commands", COMMANDS):

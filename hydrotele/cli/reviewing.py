@@ -1,4 +1,8 @@
-"""`hydrotele replay` and `review`: a log against the model, and recordings of one or two logs."""
+"""Implement `hydrotele replay` and `hydrotele review`.
+
+`replay` simulates a machine with the commands of a log and compares the result with the log.
+`review` shows one or two logs in the rerun viewer or draws their channels.
+"""
 
 import contextlib
 import dataclasses
@@ -20,25 +24,24 @@ def review_logs(
     first: Path, second: Path | None, machine: str | None, tool: str | None, target: Path | None,
     serve: bool, port: int, screenshot: Path | None, plot: Path | None,
 ) -> None:  # fmt: skip
-    """Make a recording and show it.
+    """Record one or two logs for the rerun viewer and show them.
 
     Args:
         first: run folder or log file.
-        second: another one on the same clock, or None.
-        machine: machine of both logs, None to find them.
-        tool: its tool.
-        target: recording to write; default is review.rrd in the run folder or a temporary file.
+        second: second log with the same time base, or None.
+        machine: machine of both logs, None to find it by the logs.
+        tool: tool of the machine.
+        target: recording to write, default review.rrd in the run folder or a temporary file.
         serve: serve the web viewer until interrupted.
-        port: of the web viewer.
-        screenshot: PNG of the viewer to write, headless.
-        plot: PNG of the channels to write instead: of both logs with their difference, or of all
-            channels of one.
+        port: port of the web viewer.
+        screenshot: PNG of the viewer to write, without opening a window.
+        plot: PNG to write instead: all channels of one log, or both logs and their difference.
 
     Raises:
         InputError: a log, machine or viewer is not usable.
     """
     if screenshot and screenshot.suffix.lower() != ".png":
-        raise InputError(screenshot, "give it a name that ends in .png")
+        raise InputError(screenshot, "the name must end in .png")
     if plot:
         _plot(first, second, machine, tool, plot)
         out.print(f"written to [bold]{plot}[/]")
@@ -63,7 +66,7 @@ def _show(recording: Path, serve: bool, port: int, screenshot: Path | None, quie
     elif serve:
         from hydrotele.show.viewer import serve_recording
 
-        tell = "open {} in a browser on this machine; Ctrl-C stops serving"
+        tell = "open {} in a browser on this computer; Ctrl-C stops the server"
         serve_recording(recording, port, lambda url: out.print(tell.format(url), soft_wrap=True))
     elif quiet:
         out.print(f"written to [bold]{recording}[/]")
@@ -71,7 +74,7 @@ def _show(recording: Path, serve: bool, port: int, screenshot: Path | None, quie
         from hydrotele.show.viewer import open_viewer
 
         if open_viewer(recording):
-            message = "no viewer could be opened here; try --serve or --screenshot PNG"
+            message = "no viewer can be opened on this computer; try --serve or --screenshot PNG"
             raise InputError("review", message)
 
 
@@ -98,11 +101,16 @@ def _record(first, second, machine, tool, path: Path) -> None:
 
 
 def _pair(first, second, machine, tool, which: str) -> dict[str, tuple[Machine, Log]]:
-    """Two logs of one kind of machine under names that tell them apart."""
+    """Load two logs of the same machine and return them under different names.
+
+    Raises:
+        InputError: the logs belong to different machines.
+    """
     logs = [open_log(path, machine, tool, which) for path in (first, second)]
     kinds = [found.name for found, _ in logs]
     if kinds[0] != kinds[1]:
-        raise InputError(second, f"is of a {kinds[1]}, {first} of a {kinds[0]}: nothing to compare")
+        message = f"is a log of machine {kinds[1]}, but {first} is a log of machine {kinds[0]}"
+        raise InputError(second, message)
     names = [re.sub(r"[^a-z0-9_]+", "_", path.stem.lower()) for path in (first, second)]
     usable = names[0] != names[1] and all(re.match(r"[a-z]", n) for n in names)
     if not usable or {"about", "difference", "ground"} & set(names):
@@ -117,14 +125,14 @@ def replay_logs(
     paths: list[Path], machine: str | None, tool: str | None, timestep: float, target: Path | None,
     as_json: bool,
 ) -> None:  # fmt: skip
-    """Replay logs and print how far the model is off.
+    """Simulate the commands of logs and print the prediction errors of the model.
 
     Args:
         paths: log files or run folders.
-        machine: machine to drive, None for the logs' own.
-        tool: its tool, None for the log's.
-        timestep: physics step [s].
-        target: folder for overlay plots and recordings; default is runs/replay_<log>, or none with
+        machine: machine to simulate, None for the machine of each log.
+        tool: tool of the machine, None for that of the log.
+        timestep: simulation time step [s].
+        target: folder for plots and recordings, default `runs/replay_<log>`, or none with
             `as_json`.
         as_json: print JSON: one object for one log, a list for several.
 
@@ -146,7 +154,7 @@ def replay_logs(
         results.append((the_machine, result))
         if log.metadata.get("command", "held") != "held":
             notes.print(
-                f"[yellow]note[/] {path}: commands changed faster than the log has rows, so their"
+                f"[yellow]note[/] {path}: the commands changed faster than the log rate, so their"
                 " means are replayed; log with log_rate = control_rate for an exact replay"
             )
         if not as_json:
@@ -166,7 +174,7 @@ def replay_logs(
 
 
 def as_data(result: Replay) -> dict:
-    """A replay as the JSON that `--json` prints."""
+    """Return a replay in the form that `--json` prints."""
     return {
         "log": result.measured.source,
         "machine": result.simulated.metadata["machine"],
@@ -176,8 +184,10 @@ def as_data(result: Replay) -> dict:
 
 
 def _print(source: str, result: Replay) -> None:
-    title = f"{source}: {result.realtime_factor:.0f} x real time"
-    rows = table(title, "channel", "rms", "max", "unit", "of range", "of noise")
+    title = (
+        f"{source}: prediction errors (lower is better), {result.realtime_factor:.0f} x real time"
+    )
+    rows = table(title, "channel", "RMS", "max", "unit", "RMS / range", "RMS / noise")
     for name, c in result.channels.items():
         unit, factor = _SHOWN.get(c.unit, (c.unit, 1.0))
         share = f"{100 * c.rms / c.range:.3f} %" if c.range else "-"

@@ -1,4 +1,8 @@
-"""`hydrotele run`, `sweep` and `demo`: one scenario, many of them, and three to begin with."""
+"""Implement `hydrotele run`, `sweep` and `demo`.
+
+`run` simulates one scenario, `sweep` many variations of a scenario, and `demo` three scenarios
+followed by a replay.
+"""
 
 import contextlib
 from collections.abc import Iterator
@@ -33,21 +37,23 @@ from hydrotele.simulate.native import stop_profiling_clock
 def run_to_folder(
     name: str, target: Path | None, overrides: dict[str, str], review: bool, as_json: bool
 ) -> Path:
-    """Run a scenario and write everything into a folder, whole or not at all.
+    """Run a scenario and write the results to a folder.
+
+    The output folder is written completely or not at all.
 
     Args:
         name: scenario name or file.
-        target: folder, default `runs/<scenario>`.
-        overrides: key path -> YAML text.
+        target: output folder, default `runs/<scenario>`.
+        overrides: scenario overrides, {key path: YAML text}.
         review: whether to write the rerun recording.
         as_json: print the summary as JSON instead of a table.
 
     Returns:
-        The folder.
+        The output folder.
 
     Raises:
         InputError: scenario, machine or target are not usable.
-        SimulationFailed: the simulation left the finite numbers.
+        SimulationFailed: the state of the simulation is no longer finite.
     """
     stop_profiling_clock()
     scenario = load_scenario(name, overrides)
@@ -68,8 +74,8 @@ def run_to_folder(
 def write_run(result: Run, folder: Path, review: bool = True) -> None:
     """Write logs, summary, scenario, machine, MJCF and recording of a run into a folder.
 
-    `machine.yaml` is the model, without the effects that the scenario planted: what they are is
-    truth, which a replay must not know. `machine.xml` is what was simulated.
+    `machine.yaml` describes the machine without the effects that the scenario adds, because a
+    replay must not know them. `machine.xml` describes the simulated machine with the effects.
     """
     save_log(result.measured, folder / "measured.parquet")
     save_log(result.truth, folder / "truth.parquet")
@@ -85,13 +91,13 @@ def write_run(result: Run, folder: Path, review: bool = True) -> None:
 
 
 def print_summary(summary: dict[str, Any]) -> None:
-    """Print the figures of a run as a table, and its notes."""
+    """Print the summary of a run as a table, followed by its notes."""
     rows = table(f"{summary['scenario']} ({summary['machine']}, tool {summary['tool']})", "", "")
     rows.show_header = False
     rows.add_row("simulated", f"{summary['simulated_seconds']:g} s")
     rows.add_row("real-time factor", f"{summary['realtime_factor']:.0f}")
     if summary["effects"]:
-        rows.add_row("planted effects", ", ".join(e["name"] for e in summary["effects"]))
+        rows.add_row("added effects", ", ".join(e["name"] for e in summary["effects"]))
     rows.add_row("largest pin opening", f"{summary['largest_pin_opening_mm']:.4f} mm")
     rows.add_row("largest contact force", f"{summary['largest_contact_force_N'] / 1e3:.1f} kN")
     for key, label in (("flow_balance", "flow balance"), ("energy_balance", "energy balance")):
@@ -99,21 +105,21 @@ def print_summary(summary: dict[str, Any]) -> None:
         rows.add_row(label, "-" if value is None else f"{value:.1e}")
     if station := summary.get("teleoperation"):
         gone, least = station["handle_energy_J"], station["handle_least_energy_J"]
-        rows.add_row("energy into the handle", f"{gone:.2f} J, least {least:.2f} J")
+        rows.add_row("energy into the handle", f"{gone:.2f} J, minimum {least:.2f} J")
     for name, error in summary["tracking"].items():
         unit, factor = ("mm", 1e3) if error["unit"] == "m" else ("deg", 57.29577951308232)
         rms, largest = error["rms"] * factor, error["max"] * factor
-        rows.add_row(f"tracking {name}", f"rms {rms:.2f}, max {largest:.2f} {unit}")
+        rows.add_row(f"tracking error {name}", f"RMS {rms:.2f}, max {largest:.2f} {unit}")
     out.print(rows)
     for note in summary["notes"]:
         out.print(f"[yellow]note[/] {note}")
 
 
 def run_demo(target: Path) -> None:
-    """Run three scenarios, replay one, draw the machine; everything lands in one folder.
+    """Run three scenarios, replay one of them and draw the machine.
 
     Args:
-        target: folder to write into.
+        target: output folder.
 
     Raises:
         InputError: the folder cannot be written.
@@ -121,14 +127,14 @@ def run_demo(target: Path) -> None:
     try:
         target.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(target, f"cannot be made: {error.strerror}") from None
-    _say_step(1, "the bucket goes straight up at 0.5 m/s (Zhu 1994, Fig. 6.45)")
+        raise InputError(target, f"cannot be created: {error.strerror}") from None
+    _say_step(1, "the bucket moves straight up at 0.5 m/s (Zhu 1994, Fig. 6.45)")
     run_to_folder("zhu_up", target / "zhu_up", {}, True, False)
     _say_step(2, "the bucket digs")
     run_to_folder("dig", target / "dig", {}, True, False)
-    _say_step(3, "all axes move together, logged as the sensors of Khoshzaban 1992 see them")
+    _say_step(3, "all axes move together, measured with the sensors of Khoshzaban 1992")
     run_to_folder("excitation", target / "excitation", {}, True, False)
-    _say_step(4, "the model is driven with that log's commands: how far is it off?")
+    _say_step(4, "the model is simulated with the commands of that log: prediction errors")
     log = target / "excitation" / "measured.parquet"
     replay_logs([log], None, None, 1.0e-3, target / "replay", False)
     _say_step(5, "a picture of the machine")
@@ -136,11 +142,11 @@ def run_demo(target: Path) -> None:
         export_machine("cat215", "bucket", None, target / "cat215.png", "overview")
     except InputError as error:
         notes.print(f"[yellow]no picture[/] {error}")
-    out.print(f"\n[bold green]done[/] Everything is in [bold]{target}[/]. Look at it with")
+    out.print(f"\n[bold green]done[/] All results are in [bold]{target}[/]. Show them by")
     out.print("  source .venv/bin/activate             (in a checkout, once per shell)")
     out.print(f"  hydrotele review {target}/dig             (rerun viewer)")
     out.print(f"  hydrotele review {target}/dig --serve     (web viewer)")
-    out.print(f"and see measured against replayed in {target}/replay/measured.png")
+    out.print(f"The plot {target}/replay/measured.png compares log and replay.")
 
 
 def _say_step(step: int, text: str) -> None:
@@ -152,7 +158,7 @@ _LISTED = 10
 
 
 class SweepOptions(NamedTuple):
-    """What the command line asks for, beside the file and the folder."""
+    """Options of `hydrotele sweep` except the sweep file and the output folder."""
 
     jobs: int | None
     dask: str | None
@@ -163,16 +169,16 @@ class SweepOptions(NamedTuple):
 
 
 def sweep_to_folder(name: str, target: Path | None, wishes: SweepOptions) -> None:
-    """Do a sweep and say what came out.
+    """Run a sweep, write its report and print the results.
 
     Args:
         name: sweep file, or name of a shipped sweep.
-        target: folder, default `runs/<name>`.
-        wishes: the rest of the command line.
+        target: output folder, default `runs/<name>`.
+        wishes: options of the command.
 
     Raises:
-        InputError: the file, a point of it, the folder or the cluster cannot be used.
-        typer.Exit: interrupted (130), or runs failed (3) where that counts.
+        InputError: the file, one of its points, the folder or the cluster is not usable.
+        typer.Exit: status 130 after an interruption; 3 if all runs failed, or any with `strict`.
     """
     file = load_sweep(name)
     target = target or Path("runs", file.name)
@@ -182,8 +188,9 @@ def sweep_to_folder(name: str, target: Path | None, wishes: SweepOptions) -> Non
             swept = run_sweep(file, target, how, progress)
     except (KeyboardInterrupt, SystemExit) as stop:
         done = finished(target / JOURNAL)
-        said = f"{done} of {file.sweep.runs} runs are done and kept in {target}"
-        notes.print(f"stopped: {said}; the same command goes on", markup=False, soft_wrap=True)
+        said = f"{done} of {file.sweep.runs} runs are finished and saved in {target}"
+        message = f"stopped: {said}; repeat the command to continue"
+        notes.print(message, markup=False, soft_wrap=True)
         code = stop.code if isinstance(stop, SystemExit) else 130
         raise typer.Exit(code if isinstance(code, int) else 1) from None
     figures = list(file.sweep.figures) or default_figures(swept.table)
@@ -198,7 +205,7 @@ def sweep_to_folder(name: str, target: Path | None, wishes: SweepOptions) -> Non
 
 
 def _study(file: SweepFile, swept: SweepResult, figures: list[str]) -> Study:
-    """What the report shows."""
+    """Return the data of the sweep report."""
     sampled = tuple(file.sweep.sample.keys) if file.sweep.sample else ()
     logarithmic = [k for k in sampled if file.sweep.sample.keys[k].log_uniform]  # pyright: ignore - it has one
     return Study(
@@ -222,7 +229,7 @@ def _say(
         })  # fmt: skip
         return
     title = f"{file.name}: {file.sweep.runs} runs"
-    shown = table(title, "", "unit", "smallest (run)", "median", "largest (run)")
+    shown = table(title, "quantity", "unit", "minimum (run)", "median", "maximum (run)")
     shown.columns[0].overflow = "fold"
     for name, f in found.items():
         ends = (f"{f[end]:.4g} ({f[f'{end}_run']})" for end in ("min", "max"))
@@ -230,7 +237,7 @@ def _say(
     if found:
         out.print(shown)
     elif len(swept.failed) < file.sweep.runs:
-        out.print("the runs do not differ in any number")
+        out.print("all results of the runs are equal")
     if swept.failed:
         out.print(f"[red]{len(swept.failed)} of {file.sweep.runs} runs failed[/]")
     for entry in swept.failed[:_LISTED]:
@@ -238,9 +245,9 @@ def _say(
         said = f"  run {entry.run} ({varied}): {entry.reason}"
         out.print(said, markup=False, soft_wrap=True)
     if len(swept.failed) > _LISTED:
-        out.print(f"  and {len(swept.failed) - _LISTED} more, in the table's column reason")
+        out.print(f"  and {len(swept.failed) - _LISTED} more, in column 'reason' of the table")
     if not swept.done:
-        out.print("nothing was left to run; --fresh does it anew")
+        out.print("all runs were finished already; --fresh repeats them")
     out.print(f"written to [bold]{target}[/]; open {target}/report.html", soft_wrap=True)
 
 
@@ -255,7 +262,11 @@ def _short(value: Any) -> str:
 
 @contextlib.contextmanager
 def _bar(name: str, quiet: bool) -> Iterator[Progress | None]:
-    """A bar with the time that is left on stderr; None where nobody watches."""
+    """Show a progress bar with the remaining time on stderr.
+
+    Yields:
+        A function that updates the bar, None if `quiet` or if stderr is not a terminal.
+    """
     if quiet or not notes.is_terminal:
         yield None
         return
@@ -276,7 +287,7 @@ def _bar(name: str, quiet: bool) -> Iterator[Progress | None]:
         last = ["check"]
 
         def update(stage: str, done: int, total: int, failed: int) -> None:
-            if stage != last[0]:  # what was done before tells nothing about the time that is left
+            if stage != last[0]:  # earlier stages do not predict the remaining time
                 last[0] = stage
                 bar.reset(task, total=total, completed=done)
             said = f"[red]{failed} failed[/]" if failed else ""

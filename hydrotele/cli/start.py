@@ -7,11 +7,11 @@ from hydrotele.cli.overview import format_overview
 
 
 def main() -> None:
-    """Print the overview, or hand the words to the commands, which import typer."""
+    """Print the overview for `--help`; otherwise import typer and run the command."""
     if sys.argv[1:] in (["--help"], ["-h"]):
         try:
             print(format_overview(), flush=True)
-        except BrokenPipeError:  # the reader, such as `head`, has seen enough
+        except BrokenPipeError:  # the reading program, such as `head`, has closed the pipe
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return
     from hydrotele.cli.main import main as run_command

@@ -1,1 +1,1 @@
-"""Pictures, recordings and plots of what has been run. Computes nothing new."""
+"""Reports, plots, images and recordings of results; nothing is simulated or estimated here."""

@@ -1,4 +1,4 @@
-"""Reports and pictures of calibrations: of arms, linkages, calibrators and serial robots."""
+"""Write reports and figures of calibrations of arms, linkages, calibrators and serial robots."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,18 +16,18 @@ from hydrotele.calibrate.loop import unit_of
 from hydrotele.calibrate.mukca import LeftOut, SocketCalibration
 from hydrotele.show.report_html import Section, drawing, png, write_sections
 
-_MOST_TIP = 0.06  # m: the colour scale of the designs ends there
+_MOST_TIP = 0.06  # m, upper limit of the colour scale of the designs
 
 
 def write_arm_report(
     fit: ArmFit, stages: Sequence[Poses], regions: Sequence[Region], path: Path
 ) -> None:
-    """Write the report of an arm.
+    """Write the report of an arm calibration.
 
     Args:
-        fit: of the arm.
-        stages: the fitted poses.
-        regions: corrupted readings that were found.
+        fit: fitted parameters of the arm.
+        stages: fitted poses, one item per log.
+        regions: detected corrupted samples.
         path: HTML file to write.
     """
     rows = []
@@ -38,46 +38,48 @@ def write_arm_report(
                      f"{1.96 * scale * deviation:.2f} {unit}"))  # fmt: skip
     kept = [(s.link, name, why) for s in fit.stages for name, why in s.fixed.items()]
     sections = [
-        Section("Parameters", head=("parameter", "nominal", "identified", "+-"), rows=rows),
-        Section("Kept parameters", "What the poses do not tell keeps its value.",
-                ("moving link", "parameter", "why"), kept),
+        Section("Parameters", head=("parameter", "nominal", "identified", "95 % +-"), rows=rows),
+        Section("Fixed parameters", "Parameters that are not identifiable from the poses keep"
+                " their nominal values.", ("moving link", "parameter", "reason"), kept),
     ]  # fmt: skip
     if regions:
         found = [(r.link, f"{r.first} to {r.last}", r.joint or "the arm's own sensor",
                   f"{np.degrees(r.size):.2f} deg") for r in regions]  # fmt: skip
         sections.append(Section(
-            "Corrupted readings", "Left out where the calibrator is to blame.",
-            ("moving link", "poses", "joint", "RMS error"), found,
+            "Corrupted samples", "Poses with errors of an angle sensor. They were excluded if the"
+            " sensor belongs to the calibrator.", ("moving link", "poses", "joint", "RMS error"),
+            found,
         ))  # fmt: skip
-    sections.append(Section("Residuals", "In units of the sensors' errors.",
+    sections.append(Section("Residuals", "Residuals of the distance and height equations of each"
+                            " pose, divided by the standard deviation due to sensor noise.",
                             picture=draw_residuals(fit, stages)))  # fmt: skip
     write_sections(
         path, f"hydrotele {hydrotele.__version__} - calibrate arm",
         f"{fit.nominal.machine}: {len(fit.names)} parameters, {fit.method}",
         "Angle-free closed-chain identification with an external calibrator (Khoshzaban 1992,"
-        " chapter 3); intervals cover 95 %.", sections,
+        " chapter 3). The columns +- are half widths of 95 % intervals.", sections,
     )  # fmt: skip
 
 
 def draw_residuals(fit: ArmFit, stages: Sequence[Poses]) -> bytes:
-    """Residuals of both equations over the poses, a PNG; a row per moving link."""
+    """Draw the residuals of both equations over the poses as PNG, one panel per moving link."""
     with drawing(0.4 + 1.5 * len(stages)) as figure:
         places = figure.subplots(len(stages), 1, squeeze=False)[:, 0]
         for place, poses in zip(places, stages, strict=True):
             rows = stage_residuals(fit.nominal, poses, fit.numbers)
             place.plot(rows[:, 0], ".", ms=3, color="#1769aa", label="distance")
             place.plot(rows[:, 1], ".", ms=3, color="#e07b00", label="height")
-            place.set_title(f"{poses.link} moves")
+            place.set_title(f"residual / sensor noise [1], moving link {poses.link}")
             place.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
         places[-1].set_xlabel("pose")
         return png(figure)
 
 
 def write_linkage_report(fits: Sequence[LinkageFit], path: Path) -> None:
-    """Write the report of cylinder linkages.
+    """Write the report of the calibration of cylinder linkages.
 
     Args:
-        fits: one per axis.
+        fits: fitted linkages, one per axis.
         path: HTML file to write.
     """
     sections = []
@@ -90,19 +92,20 @@ def write_linkage_report(fits: Sequence[LinkageFit], path: Path) -> None:
             rows.append(
                 (name, f"{scale * nominal:.2f} {unit}", f"{scale * value:.2f} {unit}", wide)
             )
-        said = (f"RMS {1e3 * found.rms:.2f} mm, VAF {found.vaf:.3f} % on samples that were not"
-                f" fitted; {found.angles} angles.")  # fmt: skip
-        sections.append(Section(found.axis, said, ("parameter", "nominal", "identified", "+-"),
+        said = (f"RMS displacement error {1e3 * found.rms:.2f} mm (lower is better) and variance"
+                f" accounted for (VAF) {found.vaf:.3f} % (higher is better) on held-out samples;"
+                f" {found.angles} joint angles.")  # fmt: skip
+        sections.append(Section(found.axis, said, ("parameter", "nominal", "identified", "95 % +-"),
                                 rows, picture=draw_linkage(found)))  # fmt: skip
     write_sections(
         path, f"hydrotele {hydrotele.__version__} - calibrate linkage", "Cylinder linkages",
-        "The triangle of pins under each cylinder (Khoshzaban 1992, Eq. 3.26), judged on samples"
-        " that were not fitted.", sections,
+        "Calibration of the pin triangle of each cylinder (Khoshzaban 1992, Eq. 3.26), validated on"
+        " samples that were not fitted.", sections,
     )  # fmt: skip
 
 
 def draw_linkage(found: LinkageFit) -> bytes:
-    """Error of the displacement over the joint's angle, a PNG."""
+    """Draw the error of the piston displacement over the joint angle as PNG."""
     with drawing(2.4) as figure:
         place = figure.subplots()
         place.plot(np.degrees(found.angle), 1e3 * found.residual, ".", ms=2, color="#1769aa")
@@ -112,17 +115,17 @@ def draw_linkage(found: LinkageFit) -> bytes:
 
 
 def draw_designs(survey: Survey, best: Design) -> bytes:
-    """Error of the arm's tip, information and reach over the lengths of both arms, a PNG."""
+    """Draw tip error, information and reached poses over both arm lengths of designs as PNG."""
     shape = len(FOREARMS), len(ARMS)
     tip = np.array([d.tip_error for d in survey.designs]).reshape(shape)
     told = np.array([d.information for d in survey.designs]).reshape(shape)
     reached = np.array([d.reached for d in survey.designs]).reshape(shape)
     told = np.where(np.isfinite(told), told, np.nan) / np.log(10.0)
     panels = (
-        ("tip of the calibrated arm,\nstandard deviation [mm]", 1e3 * np.minimum(tip, _MOST_TIP),
-         "viridis_r", "%.0f"),
-        ("information about the arm,\nlog10 of the determinant", told, "viridis", "%.0f"),
-        ("poses that the calibrator\nreaches [%]", 100.0 * reached, "viridis", "%.0f"),
+        ("tip error of the calibrated arm,\nstandard deviation [mm]",
+         1e3 * np.minimum(tip, _MOST_TIP), "viridis_r", "%.0f"),
+        ("information on the parameters,\nlog10 of the determinant [1]", told, "viridis", "%.0f"),
+        ("poses reached by the\ncalibrator [%]", 100.0 * reached, "viridis", "%.0f"),
     )  # fmt: skip
     with drawing(4.0) as figure:
         for place, (title, values, colours, form) in zip(
@@ -142,16 +145,16 @@ def draw_designs(survey: Survey, best: Design) -> bytes:
 
 
 _BEFORE, _AFTER, _MARK = "#b9bfc7", "#1769aa", "#e07b00"
-_MOST = 3000  # points of a scatter plot
-_LEVELS = (0.39, 0.86)  # share inside one and two standard deviations of a normal in two dimensions
+_MOST = 3000  # maximum number of points of a scatter plot
+_LEVELS = (0.39, 0.86)  # probability within 1 and 2 standard deviations of a 2D normal distribution
 
 
 def error_bars(errors: Mapping[str, tuple[np.ndarray, np.ndarray]], what: str) -> bytes:
-    """Errors of every pose before and after calibration, on a logarithmic scale.
+    """Draw the errors of each pose before and after calibration on a logarithmic scale.
 
     Args:
-        errors: title with unit -> (before (n,), after (n,)).
-        what: which poses these are.
+        errors: {title with unit: (errors before (n,), errors after (n,))}.
+        what: description of the poses.
 
     Returns:
         A PNG.
@@ -174,14 +177,14 @@ def corner(
     sample: np.ndarray, names: Sequence[str], mark: np.ndarray | None = None,
     mark_label: str = "", unit: str = "mm or mrad",
 ) -> bytes:  # fmt: skip
-    """Marginal posteriors: histograms on the diagonal, pairs of parameters below it.
+    """Draw marginal posteriors: histograms on the diagonal, pairs of parameters below it.
 
     Args:
-        sample: (n, p) draws [unit].
-        names: the p parameters.
-        mark: (p,) a point to show, such as the truth [unit].
-        mark_label: what it is.
-        unit: of all.
+        sample: (n, p) samples of the posterior [unit].
+        names: names of the p parameters.
+        mark: (p,) reference values to mark, such as the truth [unit], or None.
+        mark_label: description of the reference values.
+        unit: unit of all parameters.
 
     Returns:
         A PNG.
@@ -221,7 +224,7 @@ def corner(
 
 
 def _contours(place, x: np.ndarray, y: np.ndarray) -> None:
-    """Contours that hold 39 and 86 % of the draws."""
+    """Draw contours that contain 39 % and 86 % of the samples."""
     counts, xs, ys = np.histogram2d(x, y, 30)
     order = np.sort(counts.ravel())[::-1]
     share = np.cumsum(order) / order.sum()
@@ -234,11 +237,11 @@ NOMINAL, CALIBRATED = "#e07b00", "#1769aa"
 
 
 def draw_sockets(found: SocketCalibration, left: Sequence[LeftOut]) -> bytes:
-    """Distance of every row's ball from its socket's mean, and the distances of the sockets.
+    """Draw the distance of the ball from its mean position in the socket, and socket distances.
 
     Args:
         found: the calibration.
-        left: places predicted without having been fitted; where there are none, the fit is shown.
+        left: predictions of held-out places; if empty, the fitted places are shown.
 
     Returns:
         A PNG.
@@ -257,8 +260,12 @@ def draw_sockets(found: SocketCalibration, left: Sequence[LeftOut]) -> bytes:
         for k, name in enumerate(names):
             x = place + np.arange(len(after[name]))
             for rows, colour, label in (
-                (before[name], NOMINAL, "nominal robot, ball fitted"),
-                (after[name], CALIBRATED, "calibrated on the others" if left else "calibrated"),
+                (before[name], NOMINAL, "nominal robot, only the ball position fitted"),
+                (
+                    after[name],
+                    CALIBRATED,
+                    "calibrated on the other places" if left else "calibrated",
+                ),
             ):
                 upper.plot(x, 1e3 * rows, ".", color=colour, ms=4, label="" if k else label)
                 rms = 1e3 * float(np.sqrt(np.mean(rows**2)))
@@ -275,8 +282,8 @@ def draw_sockets(found: SocketCalibration, left: Sequence[LeftOut]) -> bytes:
         upper.set_xlim(-0.5, place - 0.5)
         upper.set_yscale("log")
         upper.yaxis.set_major_formatter("{x:g}")
-        upper.set_ylabel("ball from its socket's\nmean [mm]; lines: RMS")
-        upper.set_title(f"{found.nominal.name}: consistency of the predicted ball")
+        upper.set_ylabel("distance from mean\nball position [mm]")
+        upper.set_title(f"{found.nominal.name}: scatter of the predicted ball; lines: RMS")
         upper.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False,
                      fontsize=8.5, borderaxespad=0.1, markerscale=2.0)  # fmt: skip
         _draw_distances(lower, apart, found.options.distance)
@@ -300,47 +307,52 @@ def _draw_distances(plot: Any, apart: dict[str, float], given: float | None) -> 
     plot.set_xticklabels(list(apart))
     plot.set_xlim(-0.6, len(values) - 0.4)
     plot.grid(axis="x", visible=False)
-    plot.set_ylabel("sockets apart [mm]")
-    plot.set_title("Distance of the sockets; grey: the tool's, +- 0.1 mm")
+    plot.set_ylabel("socket distance [mm]")
+    plot.set_title("Distance of the sockets; grey: given distance +- 0.1 mm")
 
 
 def write_robot_report(path: Path, document: dict[str, Any], picture: bytes) -> None:
-    """Write one page that needs nothing else.
+    """Write the report of a robot calibration as one self-contained HTML file.
 
     Args:
         path: HTML file to write.
-        document: `calibration.json`.
-        picture: of `draw_sockets`.
+        document: content of `calibration.json`.
+        picture: PNG of `draw_sockets`.
     """
     judged, fitted = document["heldout"], document["fitted"]
     figures = [
-        ("before", fitted["nominal_rms_mm"], "nominal robot, RMS mm"),
-        ("after", fitted["rms_mm"], "calibrated, on the fitted rows, RMS mm"),
+        ("before", fitted["nominal_rms_mm"], "RMS distance [mm], nominal robot"),
+        ("after", fitted["rms_mm"], "RMS distance [mm], calibrated, fitted rows"),
     ]
-    sections = [Section("Distances of the ball from its sockets", picture=picture)]
+    sections = [Section(
+        "Scatter of the ball in its sockets", "Distance of the predicted ball centre from its mean"
+        " position in the socket (lower is better), and distances of neighbouring sockets.",
+        picture=picture,
+    )]  # fmt: skip
     if judged:
-        figures.append(("after", judged["rms_mm"], "calibrated, not fitted, RMS mm"))
+        figures.append(("after", judged["rms_mm"], "RMS distance [mm], calibrated, held-out rows"))
         rows = [
             (name, f"{one['nominal_rms_mm']:.3f}", f"{one['rms_mm']:.3f}",
              f"{one['rms_without_outliers_mm']:.3f}", one["model"])
             for name, one in judged["parts"].items()
         ]  # fmt: skip
         sections.append(Section(
-            "Places that were not fitted", "Root mean square distance of the ball from its"
-            " socket's mean, predicted by a calibration on all others.",
-            ("place", "nominal mm", "calibrated mm", "without outliers mm", "joints"), rows, "-nnn",
+            "Held-out places", "RMS distance of the ball from its mean position in the socket"
+            " (lower is better), predicted by a calibration on all other places.",
+            ("place", "nominal [mm]", "calibrated [mm]", "calibrated, without outliers [mm]",
+             "joint model"), rows, "-nnn",
         ))  # fmt: skip
-    notes = [*(f"{o['socket']}, row {o['row']}: {o['distance_mm']:.2f} mm from its socket, not"
-               " fitted" for o in document["outliers"]), *document["notes"],
+    notes = [*(f"{o['socket']}, row {o['row']}: {o['distance_mm']:.2f} mm from its socket, excluded"
+               " from the fit" for o in document["outliers"]), *document["notes"],
              f"data: {document['data']}"]  # fmt: skip
     sections += [_parameters(document), _told(document),
-                 Section("Notes", "What was left out, and what to know.", notes=notes)]  # fmt: skip
+                 Section("Notes", "Excluded samples and remarks.", notes=notes)]  # fmt: skip
     write_sections(
         path, f"hydrotele {hydrotele.__version__} - closed-chain calibration from joint angles",
         f"{document['robot']}: {len(document['places'])} places,"
         f" {sum(document['rows'].values())} postures",
-        f"Joints: {document['model']}. Noise of a coordinate {document['noise_mm']:.3f} mm."
-        f" Search: {document['status']}.",
+        f"Joint model: {document['model']}. Noise standard deviation of a coordinate:"
+        f" {document['noise_mm']:.3f} mm. Status of the fit: {document['status']}.",
         sections, [(kind, f"{value:.3f}", what) for kind, value, what in figures],
     )  # fmt: skip
 
@@ -350,13 +362,14 @@ def _parameters(document: dict[str, Any]) -> Section:
     for one in document["parameters"]:
         unit, factor = _customary(one["unit"])
         reach = "" if one["std"] is None else f"{0.5 * factor * (one['high'] - one['low']):.2g}"
-        told = {"full": "by itself", "combination": "with others"}.get(one["told"], "no")
+        told = {"full": "yes", "combination": "in a combination"}.get(one["told"], "no")
         rows.append((one["name"], f"{factor * one['value']:.4g}", reach, unit, told))
     return Section(
-        "Parameters", "t and r: displacement along and rotation about the axes of a joint's frame,"
-        " z being the joint's axis; rz is the offset of its angle. sag: yielding of a joint under"
-        " a weight at a place beyond. sine and cosine: error of an encoder once per turn.",
-        ("parameter", "value", "95 % +-", "unit", "told"), rows, "-nn",
+        "Parameters", "t and r: displacement along and rotation about the axes of a joint frame;"
+        " z is the joint axis, and rz is the offset of the joint angle. sag: compliance of a joint"
+        " under a weight at a distal location. sine and cosine: encoder error with a period of one"
+        " revolution.",
+        ("parameter", "value", "95 % +-", "unit", "identifiable"), rows, "-nn",
     )  # fmt: skip
 
 
@@ -368,11 +381,12 @@ def _told(document: dict[str, Any]) -> Section:
         reach = f"{0.5 * factor * (one['high'] - one['low']):.2g}"
         rows.append((one["text"], f"{factor * one['value']:.4g}", reach, unit))
     return Section(
-        "What the data tell", "A parameter or combination is told if its uncertainty is below half"
-        " of its expected size in the noise that there is. How a combination is split between its"
-        " parameters follows from their expected sizes, not from the data.",
+        "Identifiable parameters and combinations", "A parameter or combination is identifiable if"
+        " its standard deviation at the estimated noise is below half of its expected size. The"
+        " values of the single members of a combination follow from their expected sizes, not from"
+        " the data.",
         ("parameter or combination", "value", "95 % +-", "unit"), rows, "-nn",
-        notes=(f"not told at all: {', '.join(document['unknown']) or 'none'}",),
+        notes=(f"not identifiable: {', '.join(document['unknown']) or 'none'}",),
     )  # fmt: skip
 
 

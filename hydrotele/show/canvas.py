@@ -1,8 +1,8 @@
-"""Pictures drawn in this process, one after the other, without a screen.
+"""Render a sequence of images in this process, without a screen.
 
-`mujoco.Renderer` draws with the OpenGL that was chosen when `mujoco` was imported, which on a
-machine without a screen is one that cannot. A Canvas looks for one that works when it is opened.
-Markers are balls, lines and arrows that are drawn into a scene and are no part of a model.
+`mujoco.Renderer` uses the OpenGL driver that was selected when `mujoco` was imported; on a computer
+without a screen, this driver does not work. A `Canvas` selects a working driver when it is opened.
+Markers are spheres, lines, arrows and boxes that are added to a scene and are not part of a model.
 """
 
 import importlib
@@ -22,16 +22,16 @@ _Geom = mujoco.mjtGeom
 
 
 class Marker(NamedTuple):
-    """One shape.
+    """Shape that is added to a scene.
 
     Attributes:
-        shape: of MuJoCo.
-        start: (3,) its middle, or where it begins [m].
-        end: (3,) where it ends [m]; None for a shape that has a middle.
-        size: (3,) of MuJoCo's shape, or (1,) radius of a line [m].
+        shape: MuJoCo geom type.
+        start: (3,) centre of the shape, or start point of a line or arrow [m].
+        end: (3,) end point of a line or arrow [m]; None for other shapes.
+        size: (3,) size of the MuJoCo geom, or (1,) radius of a line or arrow [m].
         colour: (4,) red, green, blue, opacity, 0 .. 1.
-        rotation: (9,) of a shape that has a middle.
-        glow: its own light, 0 .. 1, so that it is seen in shadows.
+        rotation: (9,) rotation matrix of a shape with a centre.
+        glow: emission, 0 .. 1, so that the marker is visible in shadows.
     """
 
     shape: int
@@ -44,22 +44,22 @@ class Marker(NamedTuple):
 
 
 def ball(middle, radius: float, colour) -> Marker:
-    """Give a ball around a point [m]."""
+    """Return a sphere marker with a centre and a radius [m]."""
     return Marker(_Geom.mjGEOM_SPHERE, np.array(middle), None, np.full(3, radius), colour)
 
 
 def line(start, end, radius: float, colour) -> Marker:
-    """Give a round line from point to point [m]."""
+    """Return a marker for a line between two points, with a radius [m]."""
     return Marker(_Geom.mjGEOM_CAPSULE, np.array(start), np.array(end), np.array([radius]), colour)
 
 
 def arrow(start, end, radius: float, colour) -> Marker:
-    """Give an arrow from point to point [m]."""
+    """Return an arrow marker between two points, with a radius [m]."""
     return Marker(_Geom.mjGEOM_ARROW, np.array(start), np.array(end), np.array([radius]), colour)
 
 
 def box(middle, half_sizes, colour, rotation: np.ndarray | None = None) -> Marker:
-    """Give a box around a point [m], turned by (3, 3)."""
+    """Return a box marker with a centre and half sizes [m], and a rotation matrix (3, 3)."""
     turn = np.eye(3) if rotation is None else rotation
     return Marker(
         _Geom.mjGEOM_BOX, np.array(middle), None, np.array(half_sizes), colour, turn.ravel()
@@ -67,16 +67,16 @@ def box(middle, half_sizes, colour, rotation: np.ndarray | None = None) -> Marke
 
 
 def polyline(points, radius: float, colour) -> list[Marker]:
-    """Lines through points (n, 3) [m]."""
+    """Return line markers that connect consecutive points (n, 3) [m]."""
     return [line(a, b, radius, colour) for a, b in zip(points[:-1], points[1:], strict=True)]
 
 
 def write_markers(scene: mujoco.MjvScene, markers: Sequence[Marker]) -> None:
-    """Add shapes to a scene; those that find no room are left out.
+    """Add markers to a scene; markers beyond the capacity of the scene are omitted.
 
     Args:
-        scene: of MuJoCo, brought up to date.
-        markers: the shapes.
+        scene: updated MuJoCo scene.
+        markers: shapes to add.
     """
     for marker in markers[: scene.maxgeom - scene.ngeom]:
         geom = scene.geoms[scene.ngeom]
@@ -92,28 +92,28 @@ def write_markers(scene: mujoco.MjvScene, markers: Sequence[Marker]) -> None:
 
 PACKAGES = "libegl1 and libgl1-mesa-dri, or libosmesa6"
 _OFFSCREEN = ("egl", "osmesa")
-_LARGEST = 8192  # pixel
-_SHADOW = 4096  # pixel of the map of shadows at most
-_MARKERS = 1000
+_LARGEST = 8192  # pixel, maximum width and height of an image
+_SHADOW = 4096  # pixel, maximum size of the shadow map
+_MARKERS = 1000  # maximum number of markers
 
 
 class Canvas:
-    """A place to draw models of one structure (their meshes are loaded once).
+    """Off-screen renderer for models of equal structure, whose meshes are loaded once.
 
     Attributes:
         size: width and height [pixel].
     """
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
-        """Open OpenGL.
+        """Open an OpenGL context.
 
         Args:
-            model: with its looks; the size of its offscreen buffer is written.
-            width: of pictures [pixel].
-            height: of pictures [pixel].
+            model: model with visual geometry; the size of its offscreen buffer is changed.
+            width: image width [pixel].
+            height: image height [pixel].
 
         Raises:
-            InputError: the size is not possible, or no OpenGL works (says what to do).
+            InputError: the size is out of range, or no OpenGL driver works.
         """
         self._gl = self._context = None
         for name, length in (("width", width), ("height", height)):
@@ -121,7 +121,7 @@ class Canvas:
                 raise InputError(name, f"must be 1 to {_LARGEST} pixels, not {length}")
         self.size = width, height
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
-        # A shadow needs no more pixels than it is seen with.
+        # A shadow map needs no more pixels than the image.
         model.vis.quality.shadowsize = min(_SHADOW, 1 << (max(width, height) - 1).bit_length())
         self._gl, self._context = _open(model, width, height)
         self._scene = mujoco.MjvScene(model, model.ngeom + _MARKERS)
@@ -132,16 +132,16 @@ class Canvas:
         self, model: mujoco.MjModel, data: mujoco.MjData, camera: mujoco.MjvCamera,
         markers: Sequence[Marker] = (),
     ) -> np.ndarray:  # fmt: skip
-        """Draw a model as it stands.
+        """Render the current state of a model.
 
         Args:
-            model: with the structure of the one that the canvas was made for.
-            data: its state, with up-to-date places of bodies.
-            camera: where from.
-            markers: drawn beside.
+            model: model with the same structure as that of the canvas.
+            data: state of the model, with updated body positions.
+            camera: camera of the image.
+            markers: additional shapes.
 
         Returns:
-            (height, width, 3) uint8, a new array.
+            Pixels (height, width, 3), uint8, in a new array.
         """
         if self._gl is None or self._context is None:
             raise RuntimeError("the canvas is closed")
@@ -154,7 +154,7 @@ class Canvas:
         return self._upright[::-1].copy()
 
     def close(self) -> None:
-        """Give OpenGL back."""
+        """Release the OpenGL context."""
         context, gl, self._context, self._gl = self._context, self._gl, None, None
         if gl is not None:
             gl.make_current()
@@ -163,39 +163,39 @@ class Canvas:
             gl.free()
 
     def __del__(self) -> None:
-        """Close at the latest when nobody holds it."""
-        if sys.meta_path is not None:  # at the end of Python the drivers are gone already
+        """Release the OpenGL context when the object is deleted."""
+        if sys.meta_path is not None:  # at interpreter exit the drivers are already unloaded
             self.close()
 
 
 def has_screen() -> bool:
-    """Whether there may be a screen to open windows on."""
+    """Return whether a screen for windows is likely to exist."""
     seen = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
     return seen or not sys.platform.startswith("linux")
 
 
 def _open(model: mujoco.MjModel, width: int, height: int):
-    """OpenGL and MuJoCo's part in it, of the first driver that works."""
+    """Return OpenGL context and MuJoCo render context of the first driver that works."""
     reasons = []
     for name in _candidates():
         gl = None
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of GLFW without a screen; the next one is tried
+                warnings.simplefilter("ignore")  # GLFW warns without a screen
                 gl = importlib.import_module(f"mujoco.{name}").GLContext(width, height)
                 gl.make_current()
             context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
             mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, context)
             return gl, context
-        except Exception as error:  # drivers fail in every way there is
+        except Exception as error:  # drivers raise many types of exceptions
             reasons.append(f"{name}: {error}")
             if gl is not None:
                 gl.free()
     raise InputError(
         "picture",
-        "OpenGL cannot draw without a screen; install its software drivers"
-        f" (Debian: {PACKAGES}), or choose another with MUJOCO_GL=egl or MUJOCO_GL=osmesa in the"
-        f" environment. {'; '.join(reasons)}",
+        "OpenGL cannot render without a screen; install its software drivers"
+        f" (Debian: {PACKAGES}), or select another driver by the environment variable"
+        f" MUJOCO_GL=egl or MUJOCO_GL=osmesa. {'; '.join(reasons)}",
     )
 
 
@@ -205,4 +205,4 @@ def _candidates() -> tuple[str, ...]:
         return (wanted,)
     if sys.platform == "darwin":
         return ("cgl", "glfw")
-    return ("egl", "glfw") if has_screen() else ("egl",)  # GLFW is for one thread only
+    return ("egl", "glfw") if has_screen() else ("egl",)  # GLFW last: it works in one thread only

@@ -1,4 +1,4 @@
-"""How a channel is shown: its unit, its title, its colour, and the plot that it belongs to."""
+"""Define unit, title, colour and plot group of each log channel."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
@@ -10,8 +10,7 @@ from hydrotele.core.units import axis_unit
 from hydrotele.logs.log import Log
 from hydrotele.machine.signals import Channel, parse_channel
 
-# SI unit -> the unit on a plot.
-# Kind -> title of its plot, in the order in which signals travel.
+# {kind of channel: title of its plot}, in the order of the signal path.
 TITLES: Mapping[str, str] = {
     "reference": "reference",
     "command": "command",
@@ -20,15 +19,15 @@ TITLES: Mapping[str, str] = {
     "flow_head": "flow into head side",
     "flow_rod": "flow into rod side",
     "flow_supply": "pump flow",
-    "delivery": "flow that the pump is set to",
-    "added_delivery": "flow that terms add to the pump's",
-    "memory": "what terms remember, in shares of their play or switch",
+    "delivery": "reference of the pump flow",
+    "added_delivery": "pump flow added by terms",
+    "memory": "internal state of terms, relative to the width of backlash or relay",
     "pressure_supply": "supply pressure",
     "pressure_head": "head side pressure",
     "pressure_rod": "rod side pressure",
     "force": "force",
     "torque": "torque",
-    "bristle": "force of friction's bristles, of the breakaway force",
+    "bristle": "bristle friction force / breakaway force",
     "contact_force": "contact force",
     "object_contact": "contact force of an object",
     "length": "piston displacement",
@@ -38,24 +37,24 @@ TITLES: Mapping[str, str] = {
     "velocity": "joint velocity",
     "acceleration": "joint acceleration",
     "speed": "pump speed",
-    "speed_reference": "pump speed that was asked for",
+    "speed_reference": "pump speed reference",
     "current": "motor current",
     "pressure_load": "load pressure",
-    "valid": "rows that may be used",
+    "valid": "valid rows",
     "tip": "tip position",
-    "handle": "joystick's handle",
+    "handle": "pose of the joystick handle",
     "hand_force": "force of the hand",
     "handle_force": "force of the coils on the handle",
-    "handle_stiffness": "joystick's stiffness",
+    "handle_stiffness": "joystick stiffness",
     "coil_current": "coil current",
-    "tip_reference": "pose that was asked for",
+    "tip_reference": "reference pose of the tip",
     "tip_pose": "measured pose of the tip",
-    "tip_force": "force felt at the tip",
+    "tip_force": "measured force at the tip",
 }
-# Kinds whose lengths and forces are shown in m and N: a tip is far away, a hand is weak.
+# Kinds shown in m and N: tip positions are large, hand forces are small.
 _PLAIN = ("tip", "tip_pose", "tip_reference", "hand_force", "handle_force")
 
-# One hue per axis: distinct on dark and on white, and for the colour blind (after Okabe and Ito).
+# Colours of the axes, distinguishable on dark and white and by the colour-blind (Okabe and Ito).
 _HUES = (
     (86, 160, 233),
     (240, 150, 0),
@@ -68,17 +67,17 @@ _HUES = (
 )
 _SUPPLY_HUE = (200, 205, 210)
 
-# Bounds of a plot's span below which a difference is rounding or sensor noise [shown unit].
+# Minimum range of a plot [displayed unit]; smaller differences are rounding or sensor noise.
 _SMALLEST_SPANS: Mapping[str, float] = {"deg": 0.5, "mm": 5.0, "MPa": 0.5}
 
 
 class Trace(NamedTuple):
-    """A channel as it is shown.
+    """Channel in the unit of its plot.
 
     Attributes:
-        channel: its parsed name.
-        unit: the unit on the plot.
-        values: (n,) in that unit.
+        channel: parsed name of the channel.
+        unit: unit of the plot.
+        values: (n,) values in that unit.
     """
 
     channel: Channel
@@ -87,7 +86,7 @@ class Trace(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What a legend calls it: the axis, or the supply."""
+        """Name in a legend: the axis, or `supply`."""
         return self.channel.axis or "supply"
 
 
@@ -105,10 +104,9 @@ def shown(log: Log, name: str) -> Trace:
 
 
 def grouped(names: Iterable[str]) -> dict[str, list[str]]:
-    """Sort channel names by kind, in the order in which signals travel.
+    """Group channel names by kind, in the order of the signal path.
 
-    A truth channel stands in the group of its kind; it is left out where the same channel is there
-    as measured.
+    A truth channel is in the group of its kind. It is omitted if the same channel was measured.
 
     >>> grouped(["angle.boom", "truth.angle.boom", "command.boom", "truth.flow_head.boom"])
     {'command': ['command.boom'], 'flow_head': ['truth.flow_head.boom'], 'angle': ['angle.boom']}
@@ -122,9 +120,10 @@ def grouped(names: Iterable[str]) -> dict[str, list[str]]:
 
 
 def colours(logs: Sequence[Log]) -> dict[str, tuple[int, int, int]]:
-    """Return one colour per axis of the logs, sRGB 0 .. 255; "" is that of a channel without axis.
+    """Return the colour of each axis of the logs, sRGB 0 .. 255.
 
-    The measured axes come first, so that they keep their colours whatever else is recorded.
+    The key "" is for channels without an axis. The measured axes come first, so that their colours
+    do not depend on other channels.
     """
     axes = [axis for log in logs for axis in log.axes]
     axes += [parse_channel(name).axis for log in logs for name in log.columns]
@@ -134,20 +133,20 @@ def colours(logs: Sequence[Log]) -> dict[str, tuple[int, int, int]]:
 
 
 def common_channels(first: Log, other: Log) -> list[str]:
-    """Return the channels that both logs have in the same unit, in the order of the first."""
+    """Return the channels that exist in both logs with the same unit, in the order of the first."""
     return [name for name, unit in first.units.items() if other.units.get(name) == unit]
 
 
 def difference(first: Log, other: Log, name: str) -> tuple[np.ndarray, Trace]:
-    """Return `first - other` of a channel on the first log's clock, where both are recorded.
+    """Return `first - other` of a channel at the times of the first log.
 
-    The other log is interpolated linearly.
+    The other log is interpolated linearly. Only the time interval common to both logs is used.
 
     Returns:
         (time (k,) [s], trace (k,)).
 
     Raises:
-        InputError: the logs lack the channel or do not overlap in time.
+        InputError: a log does not have the channel, or the logs do not overlap in time.
     """
     inside = (first.time >= other.time[0]) & (first.time <= other.time[-1])
     if not inside.any():
@@ -163,11 +162,11 @@ def difference(first: Log, other: Log, name: str) -> tuple[np.ndarray, Trace]:
 
 
 def padded_range(values: Iterable[np.ndarray], unit: str) -> tuple[float, float]:
-    """Return the limits of a plot that shows all values with some room, never a blown-up noise.
+    """Return axis limits with a margin around all values, and with a minimum range.
 
     Args:
         values: arrays [unit].
-        unit: the unit on the plot.
+        unit: unit of the plot.
 
     Returns:
         (low, high) [unit].

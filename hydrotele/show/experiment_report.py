@@ -1,4 +1,7 @@
-"""The report of a published document: its results beside ours, with figures of print quality."""
+"""Write the report of an experiment series: published and simulated results, with figures.
+
+The figures are written as PNG and as SVG for print.
+"""
 
 import re
 import textwrap
@@ -19,22 +22,22 @@ _STYLES = (
     ("#1769aa", "-", "o"), ("#e07b00", "--", "s"), ("#23794a", "-.", "^"), ("#8a5fb0", ":", "D"),
     ("#a33b3b", (0, (5, 1)), "v"), ("#5b6670", (0, (3, 1, 1, 1)), "x"),
 )  # fmt: skip
-"""Colour, line and marker of the curves, which a print without colour keeps apart."""
-_MAX_POINTS = 4000  # of a curve: more are not visible
-_INCHES = 1.9  # height of one pair of axes
-_LABEL = 24  # characters of a line beside an axis of that height
-_MANY = 60  # points, from which on markers are smaller
+"""Colour, line style and marker of each curve; distinguishable in black-and-white print."""
+_MAX_POINTS = 4000  # maximum number of points per curve; more are not visible
+_INCHES = 1.9  # inch, height of one panel
+_LABEL = 24  # characters per line of an axis label
+_MANY = 60  # number of points from which markers are smaller
 
 
 class ReportFigure(NamedTuple):
-    """A figure of the report and its files.
+    """Figure of a report and its files.
 
     Attributes:
-        row: to which it belongs.
-        stem: of its files' names.
-        caption: one paragraph.
-        png: for the screen and for documents.
-        svg: for print; None for the dense points of a posterior.
+        row: comparison that the figure belongs to.
+        stem: stem of the file names.
+        caption: caption, one paragraph.
+        png: PNG image for the screen and for documents.
+        svg: SVG image for print, None for the dense points of a posterior.
     """
 
     row: Comparison
@@ -50,10 +53,10 @@ def write_experiment_report(
     """Write `report.html`, and `figures/` with an SVG and a PNG per figure and `captions.md`.
 
     Args:
-        title: of the document.
-        rows: of its table.
-        drawings: item -> why it has nothing to compare.
-        folder: that exists.
+        title: title of the publication.
+        rows: comparisons of published and simulated results.
+        drawings: {table or figure: reason why it contains no result to compare}.
+        folder: existing output folder.
     """
     figures = draw_figures(rows)
     if figures:
@@ -75,7 +78,7 @@ def write_experiment_report(
 
 
 def draw_figures(rows: Sequence[Comparison]) -> list[ReportFigure]:
-    """Draw the panels and posteriors of all rows, numbered in their order."""
+    """Draw the panels and posteriors of all comparisons, numbered consecutively."""
     figures = []
     for row in rows:
         slug = re.sub(r"[^a-z0-9]+", "-", row.name.lower()).strip("-")
@@ -99,14 +102,14 @@ def _caption(row: Comparison, what: str) -> str:
 def _describe(panels: Sequence[Panel]) -> str:
     labels = dict.fromkeys(panel.label.split(" [")[0] for panel in panels)
     across = dict.fromkeys(panel.x_label.split(" [")[0] for panel in panels)
-    return f"First repetition, over {', '.join(across)}: {'; '.join(labels)}."
+    return f"First repetition, plotted over {', '.join(across)}: {'; '.join(labels)}."
 
 
 def draw_panels(panels: Sequence[Panel]) -> tuple[bytes, bytes]:
-    """Draw curves below each other; those over the same quantity share its axis.
+    """Draw panels below each other; panels with the same x quantity share its axis.
 
     Args:
-        panels: what to draw.
+        panels: panels with curves and their errors.
 
     Returns:
         The figure as PNG and as SVG.

@@ -1,12 +1,9 @@
-"""A gap as a rerun recording: measured, nominal, patched and residual on one clock.
+"""Write a gap as a rerun recording: measurements, predictions and prediction errors.
 
-Entities: `/measured`, `/nominal` and `/patched` hold the readings and the one-step predictions,
-`/residual/nominal` and `/residual/patched` the whitened errors, `/gap` their size over time and the
-windows in which the given model is off. The machine moves as it was measured.
-
-What a gap's recording shows at first sight: the rerun blueprint.
-
-Where in time a model is off: windowed sizes of whitened prediction errors, and gap windows.
+Entities: `/measured` contains the measurements, `/nominal` and `/patched` the one-step predictions
+of the given and the patched model. `/residual/nominal` and `/residual/patched` contain the whitened
+errors, `/gap` their RMS over time and the intervals with significant errors (gap windows). The 3D
+machine moves as measured.
 """
 
 import os
@@ -32,17 +29,17 @@ from hydrotele.show.recording import (
     time_column,
 )
 
-WINDOW = 0.5  # s
-_FALSE_ALARMS = 1e-3  # chance that a perfect model shows any gap window in a run
+WINDOW = 0.5  # s, duration of a window
+_FALSE_ALARMS = 1e-3  # probability that a perfect model has any gap window in a run
 
 
 class Windows(NamedTuple):
-    """Sizes of whitened prediction errors in windows of equal length.
+    """RMS of whitened prediction errors in windows of equal length.
 
     Attributes:
-        edges: (w + 1,) borders of the windows [s].
-        rms: (w, c) RMS per window and channel [1], NaN where nothing was measured.
-        count: (w, c) number of readings.
+        edges: (w + 1,) edges of the windows [s].
+        rms: (w, c) RMS per window and channel [1], NaN without measurements.
+        count: (w, c) number of measurements.
     """
 
     edges: np.ndarray
@@ -51,13 +48,13 @@ class Windows(NamedTuple):
 
 
 class GapWindow(NamedTuple):
-    """A stretch of time in which a model is off more than noise explains.
+    """Time interval in which the errors of a model exceed the noise significantly.
 
     Attributes:
-        start: [s].
-        end: [s].
-        channel: the channel that is off most.
-        rms: RMS of its whitened errors in its worst window [1].
+        start: start time [s].
+        end: end time [s].
+        channel: channel with the largest error.
+        rms: RMS of its whitened errors in the worst window [1].
     """
 
     start: float
@@ -67,7 +64,7 @@ class GapWindow(NamedTuple):
 
 
 def windowed(prediction: Prediction, window: float = WINDOW) -> Windows:
-    """Size of the whitened errors in windows of about `window` seconds."""
+    """Return the RMS of the whitened errors in windows of about `window` seconds."""
     time = prediction.time
     period = float(np.median(np.diff(time)))
     rows = max(1, round(window / period))
@@ -85,7 +82,7 @@ def windowed(prediction: Prediction, window: float = WINDOW) -> Windows:
 
 
 def channel_rms(prediction: Prediction) -> np.ndarray:
-    """RMS of the whitened errors per channel (c,) [1], NaN where nothing was measured."""
+    """Return the RMS of the whitened errors per channel (c,) [1], NaN without measurements."""
     present = np.isfinite(prediction.whitened)
     total = (np.where(present, prediction.whitened, 0.0) ** 2).sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -93,17 +90,17 @@ def channel_rms(prediction: Prediction) -> np.ndarray:
 
 
 def gap_windows(prediction: Prediction, noise_floor: float) -> list[GapWindow]:
-    """Stretches in which some channel is off more than a perfect model ever would be.
+    """Return the intervals in which at least one channel has a significant error.
 
-    The limit is that of chi-square: a perfect model, whose errors have the size `noise_floor`,
-    shows a window in one of a thousand runs.
+    The limit is a quantile of the chi-square distribution: a perfect model, whose errors have the
+    RMS `noise_floor`, has any such interval in one of 1000 runs.
 
     Args:
-        prediction: of the model.
-        noise_floor: size of a perfect model's whitened errors [1].
+        prediction: prediction of the model.
+        noise_floor: RMS of the whitened errors of a perfect model [1].
 
     Returns:
-        The stretches in order of time; neighbouring windows are one stretch.
+        Intervals in order of time; adjacent windows are merged.
     """
     from scipy.stats import chi2
 
@@ -129,10 +126,9 @@ def gap_windows(prediction: Prediction, noise_floor: float) -> list[GapWindow]:
 
 
 def most_changed(before: Prediction, after: Prediction, count: int) -> list[str]:
-    """The channels that the patch, or else the given model, says most about, worst first.
+    """Return the `count` channels with the largest decrease of the mean square error.
 
-    They are ordered by the fall of their mean square error; where nothing was patched, by that
-    error itself.
+    If both predictions are equal, the channels with the largest mean square error are returned.
     """
     old, new = channel_rms(before) ** 2, channel_rms(after) ** 2
     weight = old - new if not np.array_equal(old, new, equal_nan=True) else old
@@ -143,23 +139,23 @@ def most_changed(before: Prediction, after: Prediction, count: int) -> list[str]
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
 
-_LEAST_ERROR = 4.0  # times noise that a plot of whitened errors shows at least
+_LEAST_ERROR = 4.0  # times noise, minimum range of a plot of whitened errors
 
 
 def gap_blueprint(
     scene: Scene, before: Prediction, models: Mapping[str, tuple[Prediction, Any]],
     worst: Sequence[str],
 ) -> "rrb.Blueprint":  # fmt: skip
-    """Lay out a gap's recording: machine and gap windows on the left, tabs of plots on the right.
+    """Create the layout of a gap recording: machine and gap windows left, tabs of plots right.
 
     Args:
-        scene: the 3D view.
-        before: predictions of the given model.
-        models: `nominal` and perhaps `patched` -> predictions and anything else.
-        worst: the channels of the first tab.
+        scene: 3D view.
+        before: prediction of the given model.
+        models: {`nominal` or `patched`: (prediction, any value)}.
+        worst: channels of the first tab.
 
     Returns:
-        The blueprint; the time panel starts paused on the timeline `time`.
+        The blueprint; the time panel is paused on the timeline `time`.
     """
     import rerun.blueprint as rrb
 
@@ -194,7 +190,7 @@ def gap_blueprint(
 
 def _sizes(models) -> "rrb.TimeSeriesView":
     paths = [f"/gap/{name}" for name in models]
-    title = "size of the prediction errors [x noise], red: gap windows"
+    title = "RMS prediction error [x noise]; red: gap windows"
     return _view(title, [*paths, "/gap/perfect", "/gap/window"], None, legend=True)
 
 
@@ -244,16 +240,17 @@ _WIDTHS = {"measured": 3.0, "nominal": 1.4, "patched": 1.4}
 def write_gap_recording(
     path: str | os.PathLike, gap: Gap, run: RunData, axes: Sequence[str]
 ) -> None:
-    """Write the held-out run of a Gap as one `.rrd`, all or nothing.
+    """Write the held-out run of a gap to one `.rrd` file, completely or not at all.
 
     Args:
-        path: the file to write, ending in `.rrd`.
-        gap: what the search yields.
-        run: the held-out run, whose commands are shown.
-        axes: names of the run's commands.
+        path: file to write, with the suffix `.rrd`.
+        gap: result of the search.
+        run: held-out run, whose commands are shown.
+        axes: names of the axes of the commands.
 
     Raises:
-        InputError: a linkage does not close on the measured angles, or the file cannot be written.
+        InputError: a linkage cannot be closed at the measured angles, or the file cannot be
+            written.
     """
     before, after = gap.before[0], gap.after[0]
     models = {"nominal": (before, _NOMINAL)}
@@ -274,7 +271,7 @@ def write_gap_recording(
 
 
 def _filled(prediction: Prediction, run: RunData) -> Log:
-    """The readings as a log, with missing ones interpolated so that the machine can move."""
+    """Return the measurements as a log; missing samples are interpolated for the 3D view."""
     columns = {}
     for k, channel in enumerate(prediction.channels):
         values = prediction.measured[:, k]
@@ -297,7 +294,7 @@ def _log_commands(out, run: RunData, axes: Sequence[str]) -> None:
 
 
 def _log_channels(out, models) -> None:
-    """Readings, predictions and whitened errors, without the rows that were not measured."""
+    """Log measurements, predictions and whitened errors, without missing samples."""
     before, _ = models["nominal"]
     for k, channel in enumerate(before.channels):
         unit, factor = axis_unit(usual_unit(channel))
@@ -313,7 +310,7 @@ def _log_channels(out, models) -> None:
 
 
 def _log_sizes(out, models, floor: float | None) -> None:
-    """RMS over all channels in windows, of every model and of a perfect one."""
+    """Log the windowed RMS error over all channels, for each model and for a perfect model."""
     for name, (prediction, colour) in models.items():
         found = windowed(prediction)
         total = np.nansum(found.rms**2 * found.count, axis=1)
@@ -327,12 +324,12 @@ def _log_sizes(out, models, floor: float | None) -> None:
 
 
 def _log_windows(out, gap: Gap, windows: Sequence[GapWindow], before: Prediction) -> None:
-    """A thick red line at zero where the given model is off, and a text where that begins."""
+    """Log the gap windows of the given model as a thick red line at zero and as texts."""
     import rerun as rr
 
     time = np.array([t for w in windows for t in (w.start, w.end, w.end + 1e-6)])
     level = np.array([v for _ in windows for v in (0.0, 0.0, np.nan)])
-    name = "model as given is off"
+    name = "significant error of the given model"
     out.log("/gap/window", _style(_LOUD, name, 7.0), static=True)
     if len(time):
         columns = rr.Scalars.columns(scalars=level)
@@ -342,9 +339,9 @@ def _log_windows(out, gap: Gap, windows: Sequence[GapWindow], before: Prediction
         for w in windows
     ]
     if gap.unknown:
-        said += [(start, f"{start:.1f} to {end:.1f} s: the unknown effect shows most")
+        said += [(start, f"{start:.1f} to {end:.1f} s: largest errors due to the unknown effect")
                  for start, end in gap.unknown.windows]  # fmt: skip
-    said = sorted(said) or [(float(before.time[0]), "no window in which the model is off")]
+    said = sorted(said) or [(float(before.time[0]), "the model has no significant errors")]
     times, texts = zip(*said, strict=True)
     levels = ["WARN" if windows or gap.unknown else "INFO"] * len(texts)
     columns = rr.TextLog.columns(text=texts, level=levels)

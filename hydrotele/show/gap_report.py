@@ -1,8 +1,8 @@
-"""`report.html` of a Gap: one page that needs nothing else, for the screen and for paper.
+"""Write the HTML report of a gap between a model and logs.
 
-Its tables (channels, laws, ranking, residual tests) as texts and numbers, which
-`templates/gap.html.j2` shows, and its pictures: heat map of prediction errors, and predictions
-over readings.
+The module formats the tables (effects, channels, laws, ranking, residual tests) for the template
+`gap.html.j2`. It draws the heat map of the prediction errors, the predictions of single channels
+and the learned laws.
 """
 
 import math
@@ -50,22 +50,22 @@ from hydrotele.show.gap_recording import channel_rms, most_changed, windowed
 from hydrotele.show.report_html import drawing, dumbbell, interval, png
 
 _CANDIDATES = 12
-_DARKEST = 10.0  # times noise, where the colour of a cell is darkest
+_DARKEST = 10.0  # times sensor noise at which the colour of a cell is darkest
 _CHANNELS = 4
 _CHIPS = {
-    "named": "Effect named",
+    "named": "Effect identified",
     "no_gap": "No gap",
     "ambiguous": "Ambiguous",
     "unknown": "Unknown effect",
-    "partly": "Partly named",
+    "partly": "Partly identified",
 }
 
 
 def write_report(gap: Gap, path: str | Path) -> None:
-    """Write a Gap as one self-contained HTML file.
+    """Write the report of a gap as one self-contained HTML file.
 
     Args:
-        gap: what the search yields.
+        gap: result of the search.
         path: file to write.
     """
     mechanism = not isinstance(gap.machine, Machine)
@@ -73,7 +73,7 @@ def write_report(gap: Gap, path: str | Path) -> None:
     over = f"GAP REPORT  ·  machine {gap.machine.name}"
     over += f", tool {gap.machine.tool}" if gap.machine.tool else ""
     if gap.before:
-        over += f"  ·  judged on {gap.before[0].run}" + (f", fitted on {runs}" if runs else "")
+        over += f"  ·  held-out run {gap.before[0].run}" + (f", fitted on {runs}" if runs else "")
     report_html.write_report(
         "gap", path, title=f"{gap.machine.name}: {headline(gap)}", over=over, heading=headline(gap),
         chip=(gap.verdict, _CHIPS[gap.verdict]), figures=_figures(gap), verdict=verdict_words(gap),
@@ -91,10 +91,12 @@ def write_report(gap: Gap, path: str | Path) -> None:
 
 
 _PROOF = {
-    False: "One-step prediction errors on {}: from its readings so far, the model says what the"
-    " sensors will read next. A perfect model is off by the sensors' noise alone, 1.0.",
-    True: "Forces of the drives on {} by inverse dynamics of its measured motion, against those"
-    " measured. A perfect model is off by noise alone, 1.0.",
+    False: "RMS one-step prediction errors on run {}, which was not fitted, divided by the sensor"
+    " noise (lower is better). From the measurements up to a row, the model predicts those of the"
+    " next row. A perfect model has the value 1.0, which is sensor noise alone.",
+    True: "RMS errors of the drive forces on run {}, which was not fitted, divided by the noise"
+    " (lower is better). The model computes the forces from the measured motion by inverse"
+    " dynamics. A perfect model has the value 1.0, which is noise alone.",
 }  # fmt: skip
 _COMMANDS = {
     False: "hydrotele replay LOG --machine patched/\nhydrotele run SCENARIO --machine patched/",
@@ -104,7 +106,7 @@ _COMMANDS = {
 
 
 def _open_loop(gap: Gap) -> dict[str, Any] | None:
-    """How far the models of a mechanism run away when the measured forces drive them."""
+    """Return text and table rows of the open-loop simulation errors of a mechanism."""
     if not gap.open_loop:
         return None
     horizon, models = gap.open_loop["horizon"], [gap.open_loop["before"]]
@@ -114,19 +116,20 @@ def _open_loop(gap: Gap) -> dict[str, Any] | None:
         unit = "m" if gap.law_units["force"] == "N" else "rad"
         rows.append((drive, *(amount(model[drive], unit) for model in models)))
     words = (
-        "The MJCF in MuJoCo without any controller, from measured states: RMS difference of a"
-        f" drive's position after {horizon:g} s."
+        "MuJoCo simulates the MJCF with the measured forces and without a controller, starting from"
+        f" measured states. The table shows the RMS position error of each drive after {horizon:g}"
+        " s (lower is better)."
     )
     return {"words": words, "rows": rows}
 
 
 def _figures(gap: Gap) -> list[tuple[str, str, str]]:
     size, closed, patched = gap.size, gap_closed(gap.size), has_patch(gap)
-    cards = [("before", f"{size.before:.2f} × noise", "prediction error, model as given")]
+    cards = [("before", f"{size.before:.2f} × noise", "prediction error, given model")]
     if patched:
-        cards.append(("after", f"{size.after:.2f} × noise", "prediction error, patched"))
+        cards.append(("after", f"{size.after:.2f} × noise", "prediction error, patched model"))
     if patched and math.isfinite(closed):
-        cards.append(("", f"{100 * closed:.0f} %", "of the gap closed, on data not fitted"))
+        cards.append(("", f"{100 * closed:.0f} %", "of the gap closed on held-out data"))
     if size.noise_floor is not None:
         cards.append(("", f"{size.noise_floor:.2f} × noise", "prediction error of a perfect model"))
     return cards
@@ -152,7 +155,7 @@ def _found(gap: Gap) -> list[dict[str, Any]]:
 
 
 def _calibrated(gap: Gap) -> list[dict[str, Any]]:
-    """Calibrated numbers with their intervals, those that moved most first."""
+    """Return the calibrated parameters with their intervals, the largest changes first."""
     rows = []
     for key in most_moved(gap) if gap.calibration else ():
         s = in_customary_units(gap.calibration[key], key)
@@ -176,16 +179,16 @@ def _unknown(gap: Gap) -> dict[str, Any] | None:
         return None
     windows = ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in unknown.windows)
     facts = [
-        ("law that fails", f"{unknown.law}: {law_words(unknown.law)}"),
-        ("seen most in", channel_words(unknown.channel)),
-        ("changes with", ", ".join(map(channel_words, unknown.depends_on)) or "-"),
-        ("shows most at", windows or "-"),
+        ("violated law", f"{unknown.law}: {law_words(unknown.law)}"),
+        ("channel with the largest error", channel_words(unknown.channel)),
+        ("correlated with", ", ".join(map(channel_words, unknown.depends_on)) or "-"),
+        ("time of the largest errors", windows or "-"),
     ]
     return {"description": unknown.description, "facts": facts}
 
 
 def _lacks(gap: Gap) -> list[tuple[str, str, float]]:
-    """Unknown forces, flows and commands that remain, the largest first."""
+    """Return the residual forces, flows and commands of the patched model, the largest first."""
     return [
         (lack_words(lack), f"{100 * lack.part:.2g} %", lack.part / gap.lacks[0].part)
         for lack in gap.lacks if lack.part > 0
@@ -204,7 +207,7 @@ def _proof(gap: Gap) -> dict[str, Any]:
 
 
 def _channels(before: Prediction, after: Prediction | None) -> list[dict[str, Any]]:
-    """Size of the prediction errors per channel, before and after."""
+    """Return the RMS prediction errors of each channel before and after the patch."""
     old = channel_rms(before)
     new = channel_rms(after) if after else np.full(len(old), np.nan)
     finite_ones = [v for v in (*old, *new) if math.isfinite(v)]
@@ -220,9 +223,9 @@ def _channels(before: Prediction, after: Prediction | None) -> list[dict[str, An
 
 
 def _laws(gap: Gap, changed: bool) -> dict[str, Any]:
-    """Balance residuals by law and place, in multiples of what noise alone would give."""
+    """Return the residuals of each law at each component, in multiples of the sensor noise."""
     places = list(dict.fromkeys(place for by_place in gap.laws.values() for place in by_place))
-    keys = {"before": "as given", "after": "patched"} if changed else {"before": "as given"}
+    keys = {"before": "given", "after": "patched"} if changed else {"before": "given"}
     rows = []
     for law, by_place in gap.laws.items():
         unit = gap.law_units.get(law, "1")
@@ -242,7 +245,7 @@ def _law_cell(residual: Mapping[str, float] | None, key: str, unit: str) -> dict
 
 
 def _heat(ratio: float) -> str:
-    """From white at noise through amber to red."""
+    """Return the cell colour of a residual: white at the noise level, then amber, then red."""
     part = min(max(math.log(max(ratio, 1e-9) / 1.2) / math.log(_DARKEST / 1.2), 0.0), 1.0)
     stops = ((255, 255, 255), (253, 226, 170), (240, 160, 110))
     low, high = (stops[0], stops[1]) if part < 0.5 else (stops[1], stops[2])
@@ -251,7 +254,7 @@ def _heat(ratio: float) -> str:
 
 
 def _ranking(gap: Gap) -> list[dict[str, Any]]:
-    """Single effects by what naming them would gain."""
+    """Return the single effects, ordered by their net gain in log likelihood."""
     shown = gap.ranking[:_CANDIDATES]
     best = max((c.gain - c.charge for c in shown), default=1.0)
     named = {(effect.name, effect.location) for effect in gap.effects}
@@ -278,7 +281,7 @@ def _value(gap: Gap, candidate: Candidate, name: str) -> str:
 
 
 def _tests(gap: Gap) -> list[tuple[str, str, str, bool]]:
-    """Residual tests of the final model."""
+    """Return name, value, limit and result of the residual tests of the final model."""
     return [
         (name, _plain(test.get("value")), _plain(test.get("limit")), bool(test.get("passed")))
         for name, test in gap.tests.items()
@@ -290,7 +293,7 @@ def _plain(value: Any) -> str:
 
 
 def _noise(gap: Gap) -> list[tuple[str, str, str, str]]:
-    """Standard deviation of a reading per channel: found, and stated by the machine."""
+    """Return the noise standard deviations per channel: estimated and stated by the machine."""
     rows = []
     for channel, (found, stated) in gap.noise.items():
         unit, known = usual_unit(channel), math.isfinite(stated)
@@ -324,9 +327,9 @@ MEASURED, NOMINAL, PATCHED = "#262b33", "#e07b00", "#1769aa"
 _ADDED = {"force": "force", "command": "command"} | dict.fromkeys(
     ("flow_head", "flow_rod", "flow_through", "flow_supply"), "flow"
 )
-_ZOOM = 2.0  # s
-_LITTLE = 0.5  # of an axis' usual unit, below which SI is shown, such as N instead of kN
-_LOUDEST = 6.0  # times noise, where the colours of the heat map end at the latest
+_ZOOM = 2.0  # s, duration of the enlarged interval
+_LITTLE = 0.5  # value in the customary unit below which the SI unit is used, such as N for kN
+_LOUDEST = 6.0  # times sensor noise, maximum upper limit of the colour scale
 
 
 def draw_heat_map(before: Prediction, after: Prediction, changed: bool) -> bytes:
@@ -335,12 +338,12 @@ def draw_heat_map(before: Prediction, after: Prediction, changed: bool) -> bytes
     Args:
         before: predictions of the given model.
         after: predictions of the patched model.
-        changed: whether they are two models; otherwise only the first is drawn.
+        changed: whether the models differ; otherwise only the first is drawn.
 
     Returns:
         A PNG.
     """
-    pairs = [("model as given", before), *([("patched model", after)] if changed else [])]
+    pairs = [("given model", before), *([("patched model", after)] if changed else [])]
     labels = [channel_words(channel) for channel in before.channels]
     loudest = np.nanpercentile(windowed(before).rms, 99.5)
     top = float(np.clip(np.ceil(loudest), 2.0, _LOUDEST))
@@ -363,19 +366,19 @@ def draw_heat_map(before: Prediction, after: Prediction, changed: bool) -> bytes
             axes.grid(False)
             axes.tick_params(left=False)
         bar = figure.colorbar(meshes[0], ax=rows.tolist(), pad=0.015, aspect=26, extend="max")
-        bar.set_label("error / sensor noise")
+        bar.set_label("RMS error / sensor noise [1]")
         bar.outline.set_visible(False)  # pyright: ignore - stubs lack the outline's type
         return png(figure)
 
 
 def draw_overlay(before: Prediction, after: Prediction, channel: str, changed: bool) -> bytes:
-    """One channel: readings and predictions, their differences, and a zoom on the worst window.
+    """Draw measurements, predictions and errors of a channel, and an enlarged worst window.
 
     Args:
         before: predictions of the given model.
         after: predictions of the patched model.
-        channel: the channel.
-        changed: whether they are two models; otherwise only the first is drawn.
+        channel: name of the channel.
+        changed: whether the models differ; otherwise only the first is drawn.
 
     Returns:
         A PNG.
@@ -385,7 +388,7 @@ def draw_overlay(before: Prediction, after: Prediction, channel: str, changed: b
     if np.nanmax(np.abs(before.measured[:, column]), initial=0.0) * factor < _LITTLE:
         unit, factor = usual_unit(channel), 1.0
     measured = factor * before.measured[:, column]
-    lines = [("model as given", NOMINAL, factor * before.predicted[:, column])]
+    lines = [("given model", NOMINAL, factor * before.predicted[:, column])]
     if changed:
         lines.append(("patched model", PATCHED, factor * after.predicted[:, column]))
     low, high = _worst(before, column)
@@ -405,13 +408,13 @@ def draw_overlay(before: Prediction, after: Prediction, channel: str, changed: b
         places[0, 0].set_title(channel_words(channel))
         places[0, 0].set_ylabel(unit)
         places[0, 1].set_title(f"worst window, {low:.1f} to {high:.1f} s")
-        places[1, 0].set_ylabel(f"reading -\nprediction\n[{unit}]")
+        places[1, 0].set_ylabel(f"measured -\npredicted\n[{unit}]")
         figure.align_ylabels()
         return png(figure)
 
 
 def draw_law(law: LearnedLaw) -> bytes:
-    """A learned law over its variable, with a band of two standard deviations.
+    """Draw a learned law over its variable, with a band of two standard deviations.
 
     Args:
         law: the law.
@@ -461,7 +464,7 @@ def _limit(axes: "Axes", values: list[np.ndarray]) -> None:
 
 
 def _worst(prediction: Prediction, column: int) -> tuple[float, float]:
-    """Two seconds around the worst window of a channel [s]."""
+    """Return start and stop of the enlarged interval around the worst window of a channel [s]."""
     found = windowed(prediction)
     worst = int(np.argmax(np.nan_to_num(found.rms[:, column])))
     middle = 0.5 * (found.edges[worst] + found.edges[worst + 1])
@@ -471,7 +474,7 @@ def _worst(prediction: Prediction, column: int) -> tuple[float, float]:
 
 
 def _colours(top: float):
-    """White for noise alone, then through amber to dark red at `top` times noise."""
+    """Return a colour map: white for noise alone, amber, then dark red at `top` times noise."""
     from matplotlib.colors import LinearSegmentedColormap
 
     stops = ((0.0, "#f9fafb"), (1.0, "#f3f5f7"), (1.35, "#f3ecdc"), (1.5, "#fbd68b"))

@@ -1,6 +1,7 @@
-"""`report.html` of an identification: one page that needs nothing else.
+"""Write the HTML report of an identification.
 
-The pictures of an identification report: forces on the held-out run, and the parameters.
+The module formats the tables (forces, parameters, tests, identifiability) for the template
+`identify.html.j2` and draws measured and predicted forces of the held-out run.
 """
 
 import math
@@ -28,12 +29,12 @@ MEASURED, NOMINAL, IDENTIFIED = "#262b33", "#e07b00", "#1769aa"
 
 
 def draw_forces(forces: Forces, drive: str, judged: HeldOut) -> bytes:
-    """Measured and predicted force of a drive, and their difference with the noise's band.
+    """Draw measured and predicted force of a drive, and the errors with the noise band.
 
     Args:
-        forces: of the held-out run.
-        drive: which one.
-        judged: how well it is predicted.
+        forces: forces of the held-out run.
+        drive: name of the drive.
+        judged: prediction errors of the drive.
 
     Returns:
         A PNG.
@@ -43,8 +44,8 @@ def draw_forces(forces: Forces, drive: str, judged: HeldOut) -> bytes:
         np.abs(forces.measured[:, k])) >= 2e3 else (judged.unit, 1.0)  # fmt: skip
     measured = factor * forces.measured[:, k]
     lines = [
-        ("machine as given", NOMINAL, factor * forces.nominal[:, k]),
-        ("identified machine", IDENTIFIED, factor * forces.predicted[:, k]),
+        ("given model", NOMINAL, factor * forces.nominal[:, k]),
+        ("identified model", IDENTIFIED, factor * forces.predicted[:, k]),
     ]
     with drawing(3.2) as figure:
         upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(1.6, 1.0))
@@ -68,18 +69,18 @@ def draw_forces(forces: Forces, drive: str, judged: HeldOut) -> bytes:
         return png(figure)
 
 
-_MEMBERS = 6  # of a combination that are written out
+_MEMBERS = 6  # maximum number of listed members of a combination
 
 
 class LearnedFrom(NamedTuple):
-    """What an identification learned from.
+    """Machine and logs of an identification.
 
     Attributes:
-        name: of the machine or mechanism.
-        tool: of the machine; None for a mechanism without a machine.
+        name: name of the machine or mechanism.
+        tool: tool of the machine, None for a mechanism without a machine.
         fit: names of the fitted runs.
-        heldout: name of the run to judge on.
-        notes: on the data.
+        heldout: name of the held-out run.
+        notes: remarks on the logs.
     """
 
     name: str
@@ -93,13 +94,13 @@ def write_identify_report(
     learned: LearnedFrom, found: Identification | None, hydraulics: Hydraulics | None,
     best: Consistent | None, path: str | Path,
 ) -> None:  # fmt: skip
-    """Write an identification as one self-contained HTML file.
+    """Write the report of an identification as one self-contained HTML file.
 
     Args:
-        learned: what it learned from.
-        found: the mechanism, None where no force is known.
-        hydraulics: the hydraulics, None where not asked for.
-        best: the nearest machine that can exist, None without a mechanism.
+        learned: machine and logs.
+        found: identified mechanism, None if the logs contain no forces.
+        hydraulics: identified hydraulics, None if they were not identified.
+        best: nearest physically consistent parameters, None without a mechanism.
         path: file to write.
     """
     of = f"mechanism {learned.name}"
@@ -109,10 +110,10 @@ def write_identify_report(
     good = status == "ok" and (hydraulics is None or hydraulics.status == "ok")
     report_html.write_report(
         "identify", path, title=f"{learned.name}: identification",
-        over=f"IDENTIFICATION REPORT  ·  {of}  ·  judged on {learned.heldout}, fitted on"
+        over=f"IDENTIFICATION REPORT  ·  {of}  ·  held-out run {learned.heldout}, fitted on"
         f" {', '.join(learned.fit)}",
-        heading="The machine's numbers, from its logs" if good else status,
-        chip=("no_gap", "Identified") if good else ("ambiguous", "See below"),
+        heading="Parameters identified from logs" if good else status,
+        chip=("no_gap", "Identified") if good else ("ambiguous", "Incomplete"),
         figures=_figures(found, hydraulics), found=_mechanism(found, best) if found else None,
         hydraulics=_hydraulics(hydraulics) if hydraulics else None,
         notes=found.notes if found else learned.notes, version=hydrotele.__version__,
@@ -127,10 +128,10 @@ def _figures(
     cards = []
     for drive, h in list(found.heldout.items())[:3] if found else ():
         against = f"{h.rms / h.noise_rms:.2f} × noise, " if h.noise_rms > 0.0 else ""
-        what = f"{against}error of the {_name(drive)}'s force"
+        what = f"{against}relative force error of {_name(drive)}"
         cards.append(("after", f"{100 * h.relative:.2f} %", what))
     if hydraulics:
-        what = f"one-step prediction errors ({hydraulics.before:.2f} before)"
+        what = f"one-step prediction error ({hydraulics.before:.2f} with the given hydraulics)"
         cards.append(("after", f"{hydraulics.after:.2f} × noise", what))
     return cards
 
@@ -177,11 +178,13 @@ def _parameters(found: Identification) -> list[dict[str, Any]]:
 
 def _tests(found: Identification, best: Consistent | None) -> list[tuple[str, ...]]:
     distance, limit = found.distance(found.nominal)
-    verdict = "could be the true ones" if distance <= limit else "are refuted"
-    rows = [("the given parameters, all together", f"{distance:.3g}", f"{limit:.3g}", verdict)]
+    verdict = "consistent with the logs" if distance <= limit else "rejected by the logs"
+    rows = [("given parameters", f"{distance:.3g}", f"{limit:.3g}", verdict)]
     if best:
-        verdict = "agrees with the estimate" if best.loss <= limit else "cannot have all of it"
-        rows.append(("a machine that can exist", f"{best.loss:.3g}", f"{limit:.3g}", verdict))
+        agree = best.loss <= limit
+        verdict = "consistent with the estimate" if agree else "differs from the estimate"
+        name = "nearest physically consistent parameters"
+        rows.append((name, f"{best.loss:.3g}", f"{limit:.3g}", verdict))
     return rows
 
 
@@ -195,7 +198,7 @@ def _statuses(found: Identification) -> list[tuple[str, ...]]:
 
 
 def _short(combination: str) -> str:
-    """A combination, cut where it is long."""
+    """Return a combination of parameters, shortened to `_MEMBERS` members."""
     parts = combination.replace(" - ", " + -").split(" + ")
     if len(parts) <= _MEMBERS:
         return combination
@@ -207,7 +210,7 @@ def _hydraulics(found: Hydraulics) -> dict[str, Any]:
     for n in found.numbers:
         estimate = Estimate(n.value, n.unit, *n.ci95, n.nominal)
         s = in_customary_units(estimate, n.parameter)
-        values = (s.value, f"{s.low} to {s.high}") if n.told else ("not told", "")
+        values = (s.value, f"{s.low} to {s.high}") if n.told else ("not identifiable", "")
         rows.append({
             "name": n.name, "texts": (_name(n.parameter), s.nominal, *values, s.unit),
             "drawn": _to_scale(estimate) if n.told else None,

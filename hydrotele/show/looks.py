@@ -1,8 +1,7 @@
-"""The shapes of a machine's bodies as a few coloured meshes, from the MuJoCo model.
+"""Convert the visual geometry of a MuJoCo model to a few coloured triangle meshes.
 
-Triangle meshes of primitive shapes, as pure functions.
-
-Each is centred at the origin, its axis along z, and wound so that normals point outwards.
+Functions create meshes of primitive shapes. Each primitive is centred at the origin with its axis
+along z, and its triangles are wound so that normals point outwards.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -15,12 +14,12 @@ from hydrotele.show import looks as shapes
 
 
 class Mesh(NamedTuple):
-    """A triangle mesh.
+    """Triangle mesh.
 
     Attributes:
         vertices: (v, 3) [m].
         normals: (v, 3) unit vectors.
-        triangles: (t, 3) places in `vertices`.
+        triangles: (t, 3) indices into `vertices`.
     """
 
     vertices: np.ndarray
@@ -29,7 +28,7 @@ class Mesh(NamedTuple):
 
 
 def box(half_sizes) -> Mesh:
-    """A box: half_sizes (3,) [m]; flat faces.
+    """Return the mesh of a box with half sizes (3,) [m] and flat faces.
 
     >>> box((1, 2, 3)).vertices.max(axis=0).tolist()
     [1.0, 2.0, 3.0]
@@ -49,16 +48,17 @@ def box(half_sizes) -> Mesh:
 
 
 def lathe(radii, heights, slopes, segments: int = 24) -> Mesh:
-    """A surface of revolution about z.
+    """Return the mesh of a surface of revolution about z.
 
     Args:
-        radii: (k,) [m], from the lower end to the upper one.
-        heights: (k,) [m].
-        slopes: (k, 2) radial and axial part of the normal there; a sharp edge is two equal points.
-        segments: number of pieces around.
+        radii: (k,) radii of the profile points [m], from the lower to the upper end.
+        heights: (k,) heights of the profile points [m].
+        slopes: (k, 2) radial and axial component of the normal at each profile point. A sharp
+            edge consists of two equal points with different normals.
+        segments: number of segments around the axis.
 
     Returns:
-        The mesh, k (segments + 1) vertices.
+        Mesh with k (segments + 1) vertices.
     """
     around = np.linspace(0.0, 2.0 * np.pi, segments + 1)
     ring = np.stack([np.cos(around), np.sin(around)], axis=1)
@@ -77,7 +77,7 @@ def lathe(radii, heights, slopes, segments: int = 24) -> Mesh:
 
 
 def cylinder(radius: float, half_length: float, segments: int = 24) -> Mesh:
-    """A closed cylinder along z [m]."""
+    """Return the mesh of a closed cylinder along z, with radius and half length [m]."""
     r, h = radius, half_length
     return lathe(
         (0, r, r, r, r, 0),
@@ -88,7 +88,7 @@ def cylinder(radius: float, half_length: float, segments: int = 24) -> Mesh:
 
 
 def capsule(radius: float, half_length: float, segments: int = 16) -> Mesh:
-    """A cylinder along z with a half ball on each end, half_length without them [m]."""
+    """Return the mesh of a capsule along z [m]; `half_length` excludes the hemispheres."""
     rise = np.linspace(-np.pi / 2, np.pi / 2, segments // 2 + 2)
     rise = np.sort(np.append(rise, (0.0, 0.0)))
     slopes = np.stack([np.cos(rise), np.sin(rise)], axis=1)
@@ -98,7 +98,7 @@ def capsule(radius: float, half_length: float, segments: int = 16) -> Mesh:
 
 
 def ellipsoid(radii, segments: int = 24) -> Mesh:
-    """An ellipsoid: radii (3,) [m]; a ball has three equal ones."""
+    """Return the mesh of an ellipsoid with radii (3,) [m]."""
     ball = capsule(1.0, 0.0, segments)
     normals = ball.normals / np.asarray(radii)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -106,7 +106,10 @@ def ellipsoid(radii, segments: int = 24) -> Mesh:
 
 
 def flat(corners: np.ndarray) -> Mesh:
-    """Flat triangles: corners (t, 3, 3) [m], counter-clockwise from outside."""
+    """Return a mesh of flat triangles from corners (t, 3, 3) [m].
+
+    The corners are counter-clockwise as seen from outside.
+    """
     corners = np.asarray(corners, float)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
@@ -115,14 +118,14 @@ def flat(corners: np.ndarray) -> Mesh:
 
 
 def tiles(half_size: float, count: int) -> tuple[Mesh, np.ndarray]:
-    """A flat square of count x count tiles in the plane z = 0.
+    """Return the mesh of a square of count x count tiles in the plane z = 0.
 
     Args:
-        half_size: half the side [m].
-        count: tiles along a side.
+        half_size: half of the side length [m].
+        count: number of tiles along a side.
 
     Returns:
-        (mesh, (v,) 0 or 1: the colour of the chequerboard at each vertex).
+        (mesh, (v,) chequerboard colour of each vertex, 0 or 1).
     """
     edges = np.linspace(-half_size, half_size, count + 1)
     i, j = np.meshgrid(np.arange(count), np.arange(count), indexing="ij")
@@ -135,7 +138,7 @@ def tiles(half_size: float, count: int) -> tuple[Mesh, np.ndarray]:
 
 
 def moved(mesh: Mesh, position, rotation) -> Mesh:
-    """A mesh turned by rotation (3, 3) and then moved by position (3,) [m]."""
+    """Return a mesh rotated by `rotation` (3, 3), then translated by `position` (3,) [m]."""
     rotation = np.asarray(rotation).reshape(3, 3)
     return Mesh(
         mesh.vertices @ rotation.T + np.asarray(position),
@@ -145,7 +148,7 @@ def moved(mesh: Mesh, position, rotation) -> Mesh:
 
 
 def joined(meshes: Sequence[Mesh]) -> Mesh:
-    """Several meshes as one."""
+    """Combine several meshes into one mesh."""
     starts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
     return Mesh(
         np.concatenate([mesh.vertices for mesh in meshes]),
@@ -159,8 +162,8 @@ def _areas(mesh: Mesh) -> np.ndarray:
     return np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
 
-_HIDDEN_GROUP = 3  # MuJoCo viewers hide geoms from this group on: shapes that only collide
-_DEFAULT_COLOUR = (0.5, 0.5, 0.5, 1.0)  # mjModel's, which gives way to a material
+_HIDDEN_GROUP = 3  # MuJoCo viewers hide geoms of this group and above: collision shapes
+_DEFAULT_COLOUR = (0.5, 0.5, 0.5, 1.0)  # default of MuJoCo; the colour of a material overrides it
 
 _Geom = mujoco.mjtGeom
 _PRIMITIVES: Mapping[int, Callable[[np.ndarray], Mesh]] = {
@@ -173,13 +176,13 @@ _PRIMITIVES: Mapping[int, Callable[[np.ndarray], Mesh]] = {
 
 
 class Look(NamedTuple):
-    """What is seen of a body, in one mesh.
+    """Visual geometry of a body with one opacity, as one mesh.
 
     Attributes:
-        body: number of the body.
-        opacity: 0 .. 1, the same for all of the mesh.
-        mesh: in the body's frame [m].
-        colours: (v, 3) uint8 sRGB, one per vertex.
+        body: index of the body.
+        opacity: opacity of the mesh, 0 .. 1.
+        mesh: mesh in the body frame [m].
+        colours: (v, 3) sRGB colour of each vertex, uint8.
     """
 
     body: int
@@ -189,13 +192,13 @@ class Look(NamedTuple):
 
 
 def body_looks(model: mujoco.MjModel) -> list[Look]:
-    """One mesh per body and opacity, all geoms that a viewer shows; without endless planes.
+    """Return one mesh per body and opacity, from all visible geoms except infinite planes.
 
     Args:
-        model: a model compiled with its looks.
+        model: model that was compiled with visual geometry.
 
     Returns:
-        The meshes, in body order.
+        Meshes in the order of the bodies.
     """
     parts: dict[tuple[int, float], list[tuple[Mesh, np.ndarray]]] = {}
     for geom in range(model.ngeom):
@@ -216,7 +219,7 @@ def body_looks(model: mujoco.MjModel) -> list[Look]:
 
 
 def geom_colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
-    """Colour (4,) of a geom, 0 .. 1: its own where it has one, else that of its material."""
+    """Return the colour (4,) of a geom, 0 .. 1: its own colour, else that of its material."""
     own, material = model.geom_rgba[geom], model.geom_matid[geom]
     if material < 0 or not np.allclose(own, _DEFAULT_COLOUR):
         return own
@@ -224,11 +227,11 @@ def geom_colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
 
 
 def bounds(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
-    """Return lowest and highest corner (3,) [m] of a box around all that is seen, without planes.
+    """Return the lowest and highest corner (3,) [m] of a box around all visible geoms but planes.
 
     Args:
         model: the model.
-        data: a configuration with up-to-date kinematics.
+        data: state with updated kinematics.
     """
     seen = (model.geom_type != _Geom.mjGEOM_PLANE) & (model.geom_group < _HIDDEN_GROUP)
     if not seen.any():
@@ -242,13 +245,13 @@ def bounds(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, np.n
 
 
 def ground_height(model: mujoco.MjModel) -> float | None:
-    """Height [m] of the first plane fixed to the world, or None."""
+    """Return the height [m] of the first plane fixed to the world, or None."""
     planes = (model.geom_type == _Geom.mjGEOM_PLANE) & (model.geom_bodyid == 0)
     return float(model.geom_pos[planes][0, 2]) if planes.any() else None
 
 
 def _around(radius: float) -> int:
-    """Number of flat pieces around: pipes of a few centimetres need fewer than drums."""
+    """Return the number of segments around the axis of a cylinder; thin ones need fewer."""
     return 10 if radius < 0.06 else 24
 
 
@@ -262,7 +265,7 @@ def _geom_mesh(model: mujoco.MjModel, geom: int) -> Mesh | None:
 
 
 def _file_mesh(model: mujoco.MjModel, mesh: int) -> Mesh:
-    """A mesh asset; each triangle keeps its own corners, because normals are indexed apart."""
+    """Return a mesh asset with separate vertices per triangle; normals are indexed separately."""
     first = model.mesh_faceadr[mesh]
     faces = slice(first, first + model.mesh_facenum[mesh])
     corners = model.mesh_vert[model.mesh_vertadr[mesh] + model.mesh_face[faces]]

@@ -1,6 +1,7 @@
-"""Child process of `picture`: draws one frame with the OpenGL that MUJOCO_GL names.
+"""Render one image in a child process of `picture`, using the OpenGL driver set by MUJOCO_GL.
 
-Usage: `python offscreen.py FOLDER`, with `model.mjb` and `task.npz` there; writes `pixels.npy`.
+Usage: `python offscreen.py FOLDER`. The program reads `model.mjb` and `task.npz` in the folder and
+writes `pixels.npy`.
 """
 
 import sys
@@ -11,7 +12,7 @@ import numpy as np
 
 
 def main(folder: Path) -> None:
-    """Draw the task of a folder."""
+    """Render the model of `folder` as described by `task.npz` and save the pixels."""
     model = mujoco.MjModel.from_binary_path(str(folder / "model.mjb"))
     task = np.load(folder / "task.npz")
     width, height = (int(n) for n in task["size"])

@@ -1,6 +1,7 @@
-"""Plots on paper: a log at a glance, and measured against simulated with the difference below.
+"""Draw logs as PNG: all channels of a log, two logs with their difference, and predictions.
 
-And of a comparison: what was measured, and free runs of every model beside it.
+The predictions are those of `hydrotele compare`: measurements and open-loop predictions of several
+models.
 """
 
 import contextlib
@@ -58,20 +59,20 @@ def plot_overlay(
     size: tuple[int, int] | None = None,
     title: str = "",
 ) -> None:
-    """Draw two logs over each other, one cell per channel, with `first - other` below.
+    """Draw two logs in the same plots, one per channel, with the difference `first - other` below.
 
     Args:
-        first: the log whose clock counts.
-        other: the one to compare with; interpolated linearly.
-        path: the PNG to write, all or nothing.
-        names: what the legend calls them.
-        kinds: kinds of channels to draw, where both logs have them.
-        size: width and height [pixel]; default grows with the number of channels.
-        title: heading; default is made of the logs' names.
+        first: log that defines the times of the difference.
+        other: log to compare with; it is interpolated linearly.
+        path: PNG file, written completely or not at all.
+        names: names of the logs in the legend.
+        kinds: kinds of channels to draw, if both logs have them.
+        size: width and height [pixel], default according to the number of channels.
+        title: heading, default the names of the logs.
 
     Raises:
-        InputError: they have no such channel in common or share no time, or the file cannot be
-            written.
+        InputError: the logs have no such channel in common or do not overlap in time, or the file
+            cannot be written.
     """
     groups = grouped(common_channels(first, other))
     rows = [groups[kind] for kind in kinds if kind in groups]
@@ -95,13 +96,13 @@ def plot_overlay(
 def plot_log(
     log: Log, path: str | os.PathLike, size: tuple[int, int] | None = None, title: str = ""
 ) -> None:
-    """Draw all channels of a log, one panel per kind, one colour per axis.
+    """Draw all channels of a log, with one panel per kind of channel and one colour per axis.
 
     Args:
         log: the log.
-        path: the PNG to write, all or nothing.
-        size: width and height [pixel]; default grows with the number of panels.
-        title: heading; default is the log's name.
+        path: PNG file, written completely or not at all.
+        size: width and height [pixel], default according to the number of panels.
+        title: heading, default the name of the log.
 
     Raises:
         InputError: the log has no channel, or the file cannot be written.
@@ -126,7 +127,7 @@ def plot_log(
 
 
 def _draw_pair(figure: "Figure", place, first: Log, other: Log, name: str) -> None:
-    """Both logs above, their difference below."""
+    """Draw a channel of both logs and, below, their difference."""
     cell = place.subgridspec(2, 1, height_ratios=(3, 1.1), hspace=0.12)
     upper = figure.add_subplot(cell[0])
     lower = figure.add_subplot(cell[1], sharex=upper)
@@ -141,12 +142,12 @@ def _draw_pair(figure: "Figure", place, first: Log, other: Log, name: str) -> No
     lower.plot(time, gap.values, color=_GAP, lw=0.8)
     _finish(lower, first.time, [gap], "")
     rms = float(np.sqrt(np.mean(gap.values**2)))
-    upper.set_title(f"rms difference {rms:.3g} {gap.unit}", loc="right", fontsize=8.5, color=_GAP)
+    upper.set_title(f"RMS difference {rms:.3g} {gap.unit}", loc="right", fontsize=8.5, color=_GAP)
     lower.set_xlabel("time [s]")
 
 
 def _finish(axes: "Axes", time: np.ndarray, traces: Sequence[Trace], title: str) -> None:
-    """Title, limits and units of one plot."""
+    """Set title, axis limits and units of a plot."""
     units = dict.fromkeys("" if trace.unit == "1" else trace.unit for trace in traces)
     axes.set_title(title)
     axes.set_ylabel(", ".join(units))
@@ -159,12 +160,12 @@ def _finish(axes: "Axes", time: np.ndarray, traces: Sequence[Trace], title: str)
 
 @contextlib.contextmanager
 def _drawing(path: str | os.PathLike, size: tuple[int, int]) -> Iterator["Figure"]:
-    """Give a figure of a size [pixel]; it becomes the PNG at the end."""
+    """Create a figure of a size [pixel] and write it as PNG at the end of the context."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    # No pyplot: neither a window nor a global state is wanted.
+    # pyplot would open windows and keep global state.
     with replacing(path, ".png") as part, matplotlib.rc_context(_STYLE):  # pyright: ignore - its keys are checked by matplotlib
         figure = Figure(figsize=(size[0] / _DPI, size[1] / _DPI), dpi=_DPI, facecolor="white")
         FigureCanvasAgg(figure)
@@ -181,7 +182,7 @@ def _grid(figure: "Figure", rows: int, columns: int):
 
 
 def _heading(figure: "Figure", title: str, keys: Sequence[tuple[str, Any]]) -> None:
-    """Title and one legend for all plots."""
+    """Draw the title and the common legend of all plots."""
     from matplotlib.lines import Line2D
 
     width, height = figure.get_size_inches() * _DPI
@@ -197,23 +198,23 @@ def _heading(figure: "Figure", title: str, keys: Sequence[tuple[str, Any]]) -> N
 
 MEASURED = "#262b33"
 _COLOURS = ("#e07b00", "#1769aa", "#2e8b57", "#b5281c", "#7b4fa3", "#8c6d31")
-_HEIGHT = 1.6  # inch per channel
-_ROOM = 0.15  # of the readings' range, shown above and below it
+_HEIGHT = 1.6  # inch, height of a panel
+_ROOM = 0.15  # margin above and below, relative to the range of the measurements
 
 
 def draw_free_runs(
     time: np.ndarray, measured: np.ndarray, predicted: Mapping[str, np.ndarray],
     channels: Sequence[str], units: Sequence[str], title: str,
 ) -> bytes:  # fmt: skip
-    """Measured and predicted readings over time, one plot per channel.
+    """Draw measurements and open-loop predictions over time, one panel per channel.
 
     Args:
-        time: (n,) [s].
-        measured: (n, c) readings, NaN where missing [channel's unit].
-        predicted: name of a model -> (n, c) its free runs, NaN where there is none.
-        channels: names of the channels.
-        units: SI unit of each.
-        title: of the picture.
+        time: (n,) times [s].
+        measured: (n, c) measurements in SI units, NaN if missing.
+        predicted: {model name: (n, c) open-loop predictions in SI units, NaN if missing}.
+        channels: names of the c channels.
+        units: SI units of the channels.
+        title: title of the figure.
 
     Returns:
         A PNG.

@@ -1,7 +1,7 @@
-"""A picture of a machine, drawn by MuJoCo without a screen.
+"""Render an image of a machine with MuJoCo, without a screen.
 
-A child process draws it, because the OpenGL of a process can be chosen only once, and a faulty
-driver may take the process with it.
+A child process renders the image, because a process can select its OpenGL driver only once, and a
+faulty driver can crash the process.
 """
 
 import os
@@ -24,8 +24,8 @@ from hydrotele.simulate.closure import close_loops
 _BACKENDS = ("egl", "osmesa")
 _PACKAGES = "libegl1 and libgl1-mesa-dri, or libosmesa6"
 _OVERVIEW, _FREE = "overview", "free"
-_FIELD_OF_VIEW = 45.0  # degree, that of MuJoCo's free camera
-_TIMEOUT = 120.0  # s
+_FIELD_OF_VIEW = 45.0  # deg, field of view of MuJoCo's free camera
+_TIMEOUT = 120.0  # s, for one image
 
 
 def render_picture(
@@ -35,19 +35,20 @@ def render_picture(
     camera: str = _OVERVIEW,
     size: tuple[int, int] = (1600, 1000),
 ) -> None:
-    """Draw a machine into a PNG file.
+    """Render an image of a machine and write it as PNG.
 
     Args:
         machine: the machine.
-        path: the picture to write, all or nothing.
-        joints: joint name -> angle [rad] or position [m]; others at home.
-        camera: a camera of the machine, or `free` for one that shows all of it; `overview` is
-            that too where the machine has no camera of this name.
+        path: PNG file, written completely or not at all.
+        joints: {joint name: angle [rad] or position [m]}; other joints are in the home pose.
+        camera: name of a camera of the machine, or `free` for a view of the whole machine.
+            `overview` is replaced by `free` if the machine has no such camera.
         size: width and height [pixel].
 
     Raises:
-        InputError: the linkages do not close there, there is no such camera, OpenGL cannot draw
-            without a screen (says what to install), or the file cannot be written.
+        InputError: the linkages cannot be closed, there is no such camera, OpenGL cannot render
+            without a screen (the message names the packages to install), or the file cannot be
+            written.
     """
     model = model_with_looks(machine)
     data = mujoco.MjData(model)
@@ -59,11 +60,18 @@ def render_model(
     model: mujoco.MjModel, data: mujoco.MjData, path: str | os.PathLike, camera: str = _OVERVIEW,
     size: tuple[int, int] = (1600, 1000),
 ) -> None:  # fmt: skip
-    """Draw a compiled model as it stands into a PNG file; arguments as of `render_picture`.
+    """Render the current state of a model and write it as PNG.
+
+    Args:
+        model: compiled model.
+        data: state of the model.
+        path: PNG file, written completely or not at all.
+        camera: name of a camera, as for `render_picture`.
+        size: width and height [pixel].
 
     Raises:
-        InputError: there is no such camera, OpenGL cannot draw without a screen (says what to
-            install), or the file cannot be written.
+        InputError: there is no such camera, OpenGL cannot render without a screen (the message
+            names the packages to install), or the file cannot be written.
     """
     mujoco.mj_fwdPosition(model, data)
     cameras = [model.camera(i).name for i in range(model.ncam)]
@@ -80,14 +88,14 @@ def render_model(
 
 
 def save_png(path: Path, pixels: np.ndarray) -> None:
-    """Write pixels (height, width, 3) uint8 as PNG."""
+    """Write pixels (height, width, 3), uint8, as PNG."""
     from PIL import Image
 
     Image.fromarray(pixels).save(path, format="PNG")
 
 
 def _free_view(model: mujoco.MjModel, data: mujoco.MjData, size: tuple[int, int]) -> dict:
-    """A camera from ahead, aside and above that shows all of the machine."""
+    """Return a camera in front, to the side and above that shows the whole machine."""
     low, high = bounds(model, data)
     radius = 0.5 * float(np.linalg.norm(high - low))
     narrow = np.radians(0.5 * _FIELD_OF_VIEW) * min(1.0, size[0] / size[1])
@@ -98,7 +106,7 @@ def _free_view(model: mujoco.MjModel, data: mujoco.MjData, size: tuple[int, int]
 
 
 def _draw(model: mujoco.MjModel, qpos: np.ndarray, view: dict, size: tuple[int, int]) -> np.ndarray:
-    """Pixels (height, width, 3) uint8, with the first OpenGL that works."""
+    """Render pixels (height, width, 3), uint8, with the first OpenGL driver that works."""
     wanted = os.environ.get("MUJOCO_GL", "").lower()
     backends = dict.fromkeys((*((wanted,) if wanted in _BACKENDS else ()), *_BACKENDS))
     reasons = []
@@ -114,14 +122,14 @@ def _draw(model: mujoco.MjModel, qpos: np.ndarray, view: dict, size: tuple[int, 
                     worker, env=environment, capture_output=True, text=True, timeout=_TIMEOUT
                 )
             except subprocess.TimeoutExpired:
-                reasons.append(f"{backend}: no picture within {_TIMEOUT:.0f} s")
+                reasons.append(f"{backend}: no image within {_TIMEOUT:.0f} s")
                 continue
             if done.returncode == 0 and result.is_file():
                 return np.load(result)
-            said = done.stderr.strip().splitlines() or [f"ended with {done.returncode}"]
+            said = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
             reasons.append(f"{backend}: {said[-1]}")
     raise InputError(
         "picture",
-        "OpenGL cannot draw without a screen; install its software drivers"
+        "OpenGL cannot render without a screen; install its software drivers"
         f" (Debian: {_PACKAGES}). {'; '.join(reasons)}",
     )

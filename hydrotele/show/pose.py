@@ -1,4 +1,4 @@
-"""From a log to the place of every body: what the 3D view shows."""
+"""Compute the poses of all bodies from a log, for 3D views."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -18,10 +18,10 @@ _THINGS = TypeAdapter(list[SurroundingObject])
 
 
 class Poses(NamedTuple):
-    """World poses of the bodies over time.
+    """World poses of all bodies at n times.
 
     Attributes:
-        bodies: names of the nbody bodies, the world first.
+        bodies: names of the nbody bodies; the world is the first.
         position: (n, nbody, 3) [m].
         quaternion: (n, nbody, 4), w x y z.
     """
@@ -34,12 +34,12 @@ class Poses(NamedTuple):
 def model_with_looks(
     machine: Machine, ground: bool = True, surroundings: tuple[SurroundingObject, ...] = ()
 ) -> mujoco.MjModel:
-    """Compile a machine with all that a picture needs; a plant leaves that out for speed.
+    """Compile a machine with its visual geometry, which simulated plants omit for speed.
 
     Args:
         machine: the machine.
         ground: whether there is a ground.
-        surroundings: what stands around it.
+        surroundings: objects around the machine.
 
     Raises:
         InputError: the MJCF cannot be assembled.
@@ -49,16 +49,17 @@ def model_with_looks(
 
 
 def logged_joints(machine: Machine, log: Log) -> dict[str, np.ndarray]:
-    """Motion of the independent joints that a log knows of.
+    """Return the logged motion of the independent joints.
 
-    Sensors come first; truth fills in what they do not measure, such as a hanging grapple.
+    Measured channels are preferred. True channels are used for joints without a sensor, such as a
+    hanging grapple.
 
     Args:
         machine: the machine.
-        log: its log.
+        log: log of the machine.
 
     Returns:
-        Joint name -> (n,) angle [rad] or position [m].
+        {joint name: (n,) angle [rad] or position [m]}.
     """
     following = following_joints(machine)
     axis_of = {axis.joint: name for name, axis in machine.axes.items()}
@@ -79,12 +80,12 @@ def logged_joints(machine: Machine, log: Log) -> dict[str, np.ndarray]:
 
 
 def logged_surroundings(log: Log) -> tuple[SurroundingObject, ...]:
-    """Plates, trees and logs that a log of truth knows of."""
+    """Return the plates, trees and tree logs that are stored in a log of true states."""
     return tuple(_THINGS.validate_json(log.metadata.get("surroundings", "[]")))
 
 
 def _place_things(model: mujoco.MjModel, log: Log, rows: np.ndarray) -> None:
-    """Put plates, trees and logs where a log of truth has them; `rows` (n, nq) is written."""
+    """Write the positions of surrounding objects from a log of true states to `rows` (n, nq)."""
     for joint, place in object_joints(model):
         name, kind = model.joint(joint).name, model.jnt_type[joint]
         if kind == mujoco.mjtJoint.mjJNT_FREE:
@@ -108,16 +109,16 @@ def logged_positions(
     machine: Machine, model: mujoco.MjModel, joints: Mapping[str, np.ndarray],
     log: Log | None = None,
 ) -> np.ndarray:  # fmt: skip
-    """Positions (n, nq) of all joints, those that follow from the pins too.
+    """Return the positions (n, nq) of all joints, including those determined by closed loops.
 
     Args:
         machine: the machine.
-        model: its model, as `model_with_looks` gives it.
-        joints: joint name -> (n,) angles [rad] or positions [m]; others stay at home.
-        log: of truth, with what stands around the machine; needed if the model has that.
+        model: model of the machine from `model_with_looks`.
+        joints: {joint name: (n,) angles [rad] or positions [m]}; others are in the home pose.
+        log: log of true states; required if the model contains surrounding objects.
 
     Raises:
-        InputError: a linkage cannot be closed in some row.
+        InputError: a linkage cannot be closed in at least one row.
     """
     rows = follow_loops(machine, model, mujoco.MjData(model), joints)
     if log is not None:
@@ -129,19 +130,19 @@ def body_poses(
     machine: Machine, model: mujoco.MjModel, joints: Mapping[str, np.ndarray],
     log: Log | None = None,
 ) -> Poses:  # fmt: skip
-    """Place every body, with tubes, rods, rockers and couplers where the pins put them.
+    """Compute the poses of all bodies, including cylinders, rockers and couplers of closed loops.
 
     Args:
         machine: the machine.
-        model: its model, as `model_with_looks` gives it.
-        joints: joint name -> (n,) angles [rad] or positions [m]; others stay at home.
-        log: of truth, with what stands around the machine; needed if the model has that.
+        model: model of the machine from `model_with_looks`.
+        joints: {joint name: (n,) angles [rad] or positions [m]}; others are in the home pose.
+        log: log of true states; required if the model contains surrounding objects.
 
     Returns:
-        The poses, n rows; one row where no joint is given.
+        Poses with n rows; one row if no joint is given.
 
     Raises:
-        InputError: a linkage cannot be closed in some row.
+        InputError: a linkage cannot be closed in at least one row.
     """
     data = mujoco.MjData(model)
     rows = logged_positions(machine, model, joints, log)
@@ -155,22 +156,22 @@ def body_poses(
 
 
 def body_names(model: mujoco.MjModel) -> tuple[str, ...]:
-    """Names of the bodies, the world first."""
+    """Return the names of the bodies of a model; the world is the first."""
     return tuple(model.body(i).name or f"body_{i}" for i in range(model.nbody))
 
 
 def points_on_body(
     poses: Poses, body: str, point: tuple[float, float, float] | np.ndarray
 ) -> np.ndarray:
-    """Path of a point fixed to a body.
+    """Return the trajectory of a point that is fixed to a body.
 
     Args:
         poses: n poses.
         body: name of the body.
-        point: (3,) in the body's frame [m].
+        point: (3,) position in the body frame [m].
 
     Returns:
-        (n, 3) in the world [m].
+        (n, 3) positions in the world frame [m].
     """
     index = poses.bodies.index(body)
     w, axis = poses.quaternion[:, index, :1], poses.quaternion[:, index, 1:]

@@ -1,13 +1,8 @@
-"""One or more logs as a rerun recording: machines in 3D, plots of all channels, differences.
+"""Write one or more logs as a rerun recording: 3D machines, plots of all channels, differences.
 
-The `.rrd` is written by column after the run. Each log stands under its own root entity; all share
-the timeline `time` [s].
-
-A rerun recording that becomes a file whole or not at all, also where the disk is full.
-
-What a recording shows at first sight: the rerun blueprint.
-
-A machine, the ground and the way of the tool tip as rerun entities.
+Each log is logged below its own root entity; all logs share the timeline `time` [s]. The module
+also defines the initial layout of the viewer (blueprint), and the entities of machine, ground and
+tool-tip path. A recording file is written completely or not at all.
 """
 
 import contextlib
@@ -46,24 +41,24 @@ from hydrotele.show.pose import (
 if TYPE_CHECKING:
     import rerun as rr
 
-_LONGEST_ID = 180  # characters that rerun takes as an application id
+_LONGEST_ID = 180  # maximum number of characters of an application id in rerun
 
 
 @contextlib.contextmanager
 def recording_file(path: str | os.PathLike, application: str) -> Iterator["rr.RecordingStream"]:
-    """Record into memory and write the file at the end.
+    """Record to memory and write the file at the end.
 
-    Rerun's own writer is a thread that nobody hears of when the disk is full.
+    The writer of rerun is not used, because its thread does not report a full disk.
 
     Args:
-        path: the file to write, ending in `.rrd`.
-        application: its id; rerun keeps a user's layout per id.
+        path: file to write, with the suffix `.rrd`.
+        application: application id; rerun stores the layout of a user per id.
 
     Yields:
-        The recording to log to.
+        The recording stream.
 
     Raises:
-        InputError: the name ends otherwise, or the file cannot be written. Nothing is left then.
+        InputError: the suffix is wrong, or the file cannot be written; no file is left.
     """
     import rerun as rr
 
@@ -77,7 +72,7 @@ def recording_file(path: str | os.PathLike, application: str) -> Iterator["rr.Re
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
 
-# Tab -> kinds of plots in it, from top to bottom.
+# {tab: kinds of its plots, from top to bottom}
 _TABS: Mapping[str, tuple[str, ...]] = {
     "Overview": ("command", "angle", "position", "pressure_head", "pressure_rod"),
     "Hydraulics": ("pressure_supply", "flow_supply", "flow_head", "flow_rod", "spool"),
@@ -89,20 +84,20 @@ _COMPARED = ("angle", "position", "pressure_head", "pressure_rod", "length")
 _FIXED_RANGES = {"command": (-1.05, 1.05)}
 _SKY = (206, 217, 228)
 _GRID = (120, 125, 130, 90)
-_TRAIL = 5.0  # s
-_FIRST_SHARE = 1.5  # height of the plot with the legend, in heights of others
+_TRAIL = 5.0  # s, duration of the displayed part of a tip path
+_FIRST_SHARE = 1.5  # height of a plot with legend, relative to other plots
 
 
 class Plot(NamedTuple):
-    """One time-series view.
+    """Time-series view.
 
     Attributes:
-        kind: kind of its channels.
-        entities: entity paths of its lines.
-        labels: their names in the legend, without units.
-        units: units of its lines, without repetition.
-        values: arrays of its lines [unit].
-        is_difference: whether it shows the difference of two logs.
+        kind: kind of the channels.
+        entities: entity paths of the lines.
+        labels: names of the lines in the legend, without units.
+        units: distinct units of the lines.
+        values: values of the lines [unit].
+        is_difference: whether the view shows the difference of two logs.
     """
 
     kind: str
@@ -114,14 +109,14 @@ class Plot(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """The 3D view.
+    """3D view.
 
     Attributes:
-        title: what is seen.
+        title: title of the view.
         contents: entity paths.
-        trails: entities of which only the last seconds are shown.
-        eye: (3,) where it is seen from [m].
-        target: (3,) what it looks at [m].
+        trails: entities of which only the last seconds are displayed.
+        eye: (3,) position of the camera [m].
+        target: (3,) point at which the camera looks [m].
         ground: whether there is a ground; otherwise the viewer draws a grid.
     """
 
@@ -139,16 +134,16 @@ def blueprint(
     scene: Scene,
     minus: str = "",
 ) -> "rrb.Blueprint":
-    """Lay out a recording: the machine on the left, tabs of plots on the right, time below.
+    """Create the layout of a recording: 3D view on the left, tabs of plots on the right.
 
     Args:
-        plots: one per kind of channel.
-        differences: the same for the difference of two logs; may be empty.
-        scene: the 3D view.
-        minus: what the differences are, such as `measured - simulated`.
+        plots: one plot per kind of channel.
+        differences: plots of the difference of two logs; may be empty.
+        scene: 3D view.
+        minus: description of the differences, such as `measured - simulated`.
 
     Returns:
-        The blueprint; the time panel starts paused on the timeline `time`.
+        The blueprint; the time panel is paused on the timeline `time`.
     """
     import rerun.blueprint as rrb
 
@@ -204,7 +199,7 @@ def _tabs(plots: Sequence[Plot], differences: Sequence[Plot], minus: str):
 def _column(
     title: str, plots: Sequence[Plot], minus: str, shares: Sequence[float] | None = None
 ) -> "rrb.Vertical":
-    """Plots below each other; a legend only where it names lines that none above has named."""
+    """Arrange plots in a column; show a legend only for lines that no plot above has named."""
     import rerun.blueprint as rrb
 
     named: set[str] = set()
@@ -238,9 +233,9 @@ if TYPE_CHECKING:
     import rerun as rr
 
 _GHOST_COLOUR = np.array([40.0, 130.0, 255.0])
-_GHOST_TINT = 0.7  # part of the ghost's own colour in what is seen
+_GHOST_TINT = 0.7  # fraction of the ghost colour in the displayed colour
 _GHOST_OPACITY = 0.35
-_GHOST_INSET = 0.01  # m that it is smaller: where both machines agree, the solid one hides it
+_GHOST_INSET = 0.01  # m, reduction in size, so that the solid machine hides an equal ghost
 _GROUND_COLOURS = np.array([[134, 122, 104], [144, 131, 112]], dtype=np.uint8)
 _GROUND_HALF_SIZE = 20.0  # m
 _TIP_COLOUR, _GHOST_TIP_COLOUR = (215, 40, 30), (40, 110, 230)
@@ -254,15 +249,15 @@ def log_machine(
     clock: "rr.TimeColumn",
     ghost: bool = False,
 ) -> None:
-    """Log the shapes once, and where the bodies are by column.
+    """Log the meshes of a machine once, and the poses of its bodies for all times.
 
     Args:
-        stream: where to.
-        root: entity above the bodies.
-        model: the model with its looks.
-        poses: n poses; one alone is static.
+        stream: recording stream.
+        root: parent entity of the bodies.
+        model: model with visual geometry.
+        poses: n poses; a single pose is static.
         clock: n times.
-        ghost: draw only what moves, as tinted glass.
+        ghost: draw only moving bodies, tinted and transparent.
     """
     moving = [i for i in range(model.nbody) if model.body_weldid[i] != 0]
     for look in body_looks(model):
@@ -277,7 +272,7 @@ def log_machine(
 
 
 def mesh_entity(look: Look, ghost: bool = False) -> "rr.Mesh3D":
-    """A look as a rerun mesh; a ghost is tinted and transparent."""
+    """Convert a body mesh to a rerun mesh; a ghost is tinted and transparent."""
     import rerun as rr
 
     colours, opacity, vertices = look.colours, look.opacity, look.mesh.vertices
@@ -295,7 +290,7 @@ def mesh_entity(look: Look, ghost: bool = False) -> "rr.Mesh3D":
 
 
 def log_ground(stream: "rr.RecordingStream", model: mujoco.MjModel) -> bool:
-    """Log a chequered ground with tiles of 2 m; tell whether the model has a ground plane."""
+    """Log a chequered ground with tiles of 2 m; return whether the model has a ground plane."""
     height = ground_height(model)
     if height is None:
         return False
@@ -312,9 +307,9 @@ def log_tip(
     clock: "rr.TimeColumn",
     ghost: bool = False,
 ) -> None:
-    """Log where the tip is (n, 3) [m]: the whole way as a thin line, its latest part, the point.
+    """Log the tip path (n, 3) [m]: the whole path, its latest part and the current point.
 
-    `trail` holds one piece per row; the layout decides how many seconds of it are shown.
+    The entity `trail` has one line segment per row; the layout selects the displayed seconds.
     """
     import rerun as rr
 
@@ -352,8 +347,8 @@ if TYPE_CHECKING:
 TIMELINE = "time"
 _ENTRY = re.compile(r"[a-z][a-z0-9_]*")
 _RESERVED = ("about", "difference", "ground")
-_PALENESS = 0.65  # part of white in the lines of logs after the first
-_EYE_DISTANCE = 1.4  # in radii of what is to be seen
+_PALENESS = 0.65  # fraction of white in the line colours of all logs but the first
+_EYE_DISTANCE = 1.4  # camera distance, relative to the radius of the scene
 
 
 def write_recording(
@@ -361,20 +356,20 @@ def write_recording(
     entries: Mapping[str, tuple[Machine, Log]],
     title: str = "",
 ) -> None:
-    """Write logs with their machines as one `.rrd`, all or nothing.
+    """Write logs with their machines to one `.rrd` file, completely or not at all.
 
-    The first entry is shown as it looks and is what others are compared with: for each channel in
-    common there is `/difference/<entry>/<channel>`, the first minus the other on the first's clock.
-    The other machines are drawn as tinted glass in the same place.
+    The first entry is the reference: its machine is solid, the other machines are transparent. For
+    each channel in common, `/difference/<entry>/<channel>` is the first log minus the other one at
+    the times of the first.
 
     Args:
-        path: the file to write, ending in `.rrd`.
-        entries: root entity, such as `measured` -> machine and log; in the order of importance.
-        title: name of the recording; default is made of machine and runs.
+        path: file to write, with the suffix `.rrd`.
+        entries: {root entity, such as `measured`: (machine, log)}, the reference first.
+        title: name of the recording, default machine and runs.
 
     Raises:
-        InputError: a name cannot be a root entity, two logs share no time, a linkage does not close
-            on the logged angles, or the file cannot be written. Nothing is written then.
+        InputError: a name is not a valid root entity, two logs do not overlap in time, a linkage
+            cannot be closed at the logged angles, or the file cannot be written.
     """
     _check_names(entries)
     machine, _ = next(iter(entries.values()))
@@ -393,7 +388,7 @@ def write_recording(
 
 
 def time_column(time: np.ndarray) -> "rr.TimeColumn":
-    """Times (n,) [s] on the timeline `time`, rounded to the nanosecond."""
+    """Return times (n,) [s] as a column of the timeline `time`, rounded to nanoseconds."""
     import rerun as rr
 
     nanoseconds = np.round(np.asarray(time) * 1e9).astype("timedelta64[ns]")
@@ -401,7 +396,7 @@ def time_column(time: np.ndarray) -> "rr.TimeColumn":
 
 
 def entity(root: str, channel: str) -> str:
-    """Entity path of a channel.
+    """Return the entity path of a channel.
 
     >>> entity("measured", "truth.flow_head.boom")
     '/measured/truth/flow_head/boom'
@@ -445,7 +440,7 @@ def _log_machines(stream, entries) -> Scene:
 
 def _scene_title(names: list[str]) -> str:
     solid, *glass = names
-    return f"{solid} (solid), {', '.join(glass)} (blue glass)" if glass else "machine"
+    return f"{solid} (solid), {', '.join(glass)} (transparent blue)" if glass else "machine"
 
 
 def _tip(machine: Machine, log: Log, poses: Poses) -> np.ndarray | None:
@@ -458,9 +453,9 @@ def _tip(machine: Machine, log: Log, poses: Poses) -> np.ndarray | None:
 
 
 def _eye(model: mujoco.MjModel, tip: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """Where the machine and all that its tip does are well seen from, and what to look at [m].
+    """Return camera position and target (3,) [m] that show the machine and its whole tip path.
 
-    The direction is that of the camera `overview` where there is one.
+    The direction is that of the camera `overview` if the model has one.
     """
     data = mujoco.MjData(model)
     mujoco.mj_fwdPosition(model, data)
@@ -526,11 +521,11 @@ def _plots(drawn: Mapping[str, list], is_difference: bool = False) -> list[Plot]
 
 
 def _line_style(colour: tuple[int, int, int], name: str, rank: int, width: float = 1.2):
-    """The first log is drawn wide and strong, others thin and pale upon it."""
+    """Return the line style of a log: wide and dark for the first, thin and pale for others."""
     import rerun as rr
 
     paler = [round(c + (_PALENESS if rank else 0.0) * (255 - c)) for c in colour]
-    peaks = rr.components.AggregationPolicy.MinMax  # an average would hide them when zoomed out
+    peaks = rr.components.AggregationPolicy.MinMax  # averages would hide peaks when zoomed out
     return rr.SeriesLines(colors=paler, names=name, widths=width, aggregation_policy=peaks)
 
 
@@ -546,11 +541,12 @@ def _about(entries: Mapping[str, tuple[Machine, Log]]) -> "rr.TextDocument":
             f"- machine **{machine.name}**, tool **{machine.tool}**: {machine.description}",
             f"- log `{log.source}`: {len(log)} rows, {log.time[0]:g} to {log.time[-1]:g} s"
             f" at {log.rate:.4g} Hz, {len(log.columns)} channels",
-            *([f"- not logged, shown at home: {', '.join(lost)}"] if lost else []),
+            *([f"- not logged, shown in the home pose: {', '.join(lost)}"] if lost else []),
             *(f"- {key}: {value}" for key, value in log.metadata.items() if len(value) < 200),
             "",
         ]
     if len(entries) > 1:
         first, *others = entries
-        lines.append(f"Differences are {first} minus {' or '.join(others)}, linearly interpolated.")
+        lines.append(f"Differences are {first} minus {' or '.join(others)}, by linear"
+                     " interpolation in time.")  # fmt: skip
     return rr.TextDocument("\n".join(lines), media_type=rr.MediaType.MARKDOWN)

@@ -1,7 +1,7 @@
-"""Reports as one HTML file: Jinja templates of the folder `templates`, and pictures.
+"""Write self-contained HTML reports from the Jinja templates in the folder `templates`.
 
-Every value that a template shows is escaped. Templates and their style are for a screen of 1200 px
-and for A4 paper. Pictures have the width, style and font of the text, and become PNG.
+All values inserted by a template are escaped. The layout fits a screen of 1200 px and A4 paper.
+Figures use the width, style and font of the page and are embedded as PNG.
 """
 
 import base64
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _DPI = 200
-_WIDTH = 11.0  # inch, the width of the report's text
+_WIDTH = 11.0  # inch, width of the text in a report
 _FONTS = ("Helvetica Neue", "Helvetica", "Arial", "Liberation Sans")
 _STYLE = {
     "font.size": 9.0,
@@ -37,7 +37,7 @@ _STYLE = {
 
 
 def _font() -> str:
-    """The page's font where matplotlib has it, else matplotlib's own."""
+    """Return the font of the page if matplotlib has it, else the default font of matplotlib."""
     from matplotlib.font_manager import fontManager
 
     present = {font.name for font in fontManager.ttflist}
@@ -45,14 +45,14 @@ def _font() -> str:
 
 
 def png(figure: "Figure") -> bytes:
-    """A figure as PNG."""
+    """Return a figure as PNG bytes."""
     stream = io.BytesIO()
     figure.savefig(stream, dpi=_DPI, format="png")
     return stream.getvalue()
 
 
 def svg(figure: "Figure") -> bytes:
-    """A figure as SVG, the same bytes for the same figure."""
+    """Return a figure as SVG bytes, which are reproducible."""
     import matplotlib
 
     stream = io.BytesIO()
@@ -63,7 +63,7 @@ def svg(figure: "Figure") -> bytes:
 
 @contextlib.contextmanager
 def drawing(height: float) -> Iterator["Figure"]:
-    """A figure of the report's width and a height [inch], in the report's style."""
+    """Create a figure in the style and width of a report, with a height in inches."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -91,28 +91,28 @@ def _data_uri(png: bytes) -> str:
 
 
 def write_report(template: str, path: str | Path, **content: object) -> None:
-    """Write a report that needs nothing else.
+    """Render a template and write it as one self-contained HTML file.
 
     Args:
-        template: its name in `templates`, without `.html.j2`.
+        template: name of the template in `templates`, without `.html.j2`.
         path: HTML file to write.
-        content: what the template shows, by name.
+        content: variables of the template.
     """
     text = _environment().get_template(f"{template}.html.j2").render(content)
     Path(path).write_text(text, encoding="utf-8")
 
 
 class Section(NamedTuple):
-    """A section of the template `sections`: what of it is empty is left out.
+    """Section of the template `sections`; empty parts are omitted.
 
     Attributes:
-        heading: of the section.
-        why: a sentence on what it is for.
-        head: headings of the table's columns.
-        rows: its cells.
-        numbers: a letter per column, n for those with numbers, which stand right.
-        picture: a PNG.
-        notes: a list of sentences.
+        heading: heading of the section.
+        why: explanation of the section.
+        head: column headings of the table.
+        rows: rows of the table.
+        numbers: one letter per column; columns with letter n are right-aligned.
+        picture: PNG image.
+        notes: list of sentences.
     """
 
     heading: str
@@ -132,11 +132,11 @@ def write_sections(
 
     Args:
         path: HTML file to write.
-        over: a line over the heading, and the browser's title.
-        heading: what was found, in a few words.
-        lead: one or two sentences below it.
-        sections: what follows.
-        figures: (class, number, what it is), shown large.
+        over: line above the heading, and title of the browser window.
+        heading: summary of the result in a few words.
+        lead: one or two sentences below the heading.
+        sections: sections of the report.
+        figures: key figures as (class, number, label), shown large.
     """
     write_report(
         "sections", path, title=over, over=over, heading=heading, lead=lead, sections=sections,
@@ -145,7 +145,7 @@ def write_sections(
 
 
 class Interval(NamedTuple):
-    """Places in a drawing [px]: a value, the start and length of its interval, another value."""
+    """Positions in a drawing [px]: value, start and length of its interval, and model value."""
 
     width: int
     value: float | None
@@ -155,7 +155,7 @@ class Interval(NamedTuple):
 
 
 def interval(value: float, low: float, high: float, model: float) -> Interval | None:
-    """Where a value, its interval and a model's value stand on one scale; None if none is finite.
+    """Return positions of a value, its interval and the model value; None if none is finite.
 
     >>> interval(1.5, 1.0, 2.0, 0.0)
     Interval(width=220, value=159.0, start=110.0, length=98.0, model=12.0)
@@ -174,7 +174,7 @@ def interval(value: float, low: float, high: float, model: float) -> Interval | 
 
 
 class Dumbbell(NamedTuple):
-    """Places in a drawing [px]: of 1, of the size before, of the size after."""
+    """Positions in a drawing [px]: of the value 1, of the value before and of the value after."""
 
     width: int
     one: float
@@ -183,7 +183,7 @@ class Dumbbell(NamedTuple):
 
 
 def dumbbell(before: float, after: float | None, low: float, high: float) -> Dumbbell:
-    """Where sizes before and after stand on a scale from `low` to `high`, and where 1 is."""
+    """Return the positions of 1 and of the values before and after on a scale `low` to `high`."""
     width = 440
 
     def place(size: float) -> float:

@@ -1,6 +1,6 @@
-"""The report of a sweep: what was varied, how far every number spreads, and what does it.
+"""Write the report of a sweep: varied keys, ranges of the results and influence of each key.
 
-The pictures of a sweep: what each varied key does to each number, and maps of two of them.
+The figures show each result over each varied key, and maps of each result over two grid keys.
 """
 
 import json
@@ -19,24 +19,24 @@ from hydrotele.show.report_html import drawing, png
 DOT, MEAN, FAILED = "#9db4c8", "#1769aa", "#b5281c"
 _ACROSS, _MAPS = 4, 3
 _MOST_BINS, _PER_BIN = 8, 5
-_WIDE = 30.0  # times: numbers that far apart are drawn on a logarithmic scale
-_ANNOTATED = 60  # cells of a map; in more of them numbers cannot be read
+_WIDE = 30.0  # ratio of largest and smallest value from which an axis is logarithmic
+_ANNOTATED = 60  # maximum number of cells of a map with printed values
 
 
 class Study(NamedTuple):
-    """What a report of a sweep shows.
+    """Data of a sweep report.
 
     Attributes:
-        name: of the sweep.
-        description: what it is for.
-        scenario: the base scenario.
-        columns: of its table, by name.
-        units: column -> unit.
+        name: name of the sweep.
+        description: purpose of the sweep.
+        scenario: name of the base scenario.
+        columns: columns of the result table, {name: values}.
+        units: units of the columns, {name: unit}.
         grid: keys with given values.
         sampled: keys with random values.
-        logarithmic: those of them that are spread by their logarithm.
-        figures: numbers to show.
-        failed: (run, reason).
+        logarithmic: sampled keys that are distributed on a logarithmic scale.
+        figures: names of the results to show.
+        failed: failed runs as (run, reason).
     """
 
     name: str
@@ -52,31 +52,31 @@ class Study(NamedTuple):
 
     @property
     def varied(self) -> tuple[str, ...]:
-        """The keys along which numbers are drawn; the seed where nothing else is varied."""
+        """Keys with more than one value, or the seed if there is no such key."""
         keys = [key for key in (*self.grid, *self.sampled) if len(levels(self.columns[key])) > 1]
         return tuple(keys) or ("seed",)
 
 
 class Shown(NamedTuple):
-    """A number as it is shown: label with its unit, values (n,) with NaN where there is none."""
+    """Result in display units: label with unit, and values (n,) with NaN for failed runs."""
 
     label: str
     values: np.ndarray
 
 
 def levels(values: Sequence[Any]) -> list[Any]:
-    """The different values, numbers by size, everything else in order of appearance."""
+    """Return the distinct values; numbers are sorted, other values keep their order."""
     found = list({json.dumps(value): value for value in values}.values())
     return sorted(found) if numeric(found) else found
 
 
 def numeric(values: Sequence[Any]) -> bool:
-    """Whether all values are numbers."""
+    """Return whether all values are numbers."""
     return all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in values)
 
 
 def shown(study: Study, name: str) -> Shown:
-    """A number in the unit that people use: mm, deg, kN where they are large."""
+    """Return a result in display units: mm below 2 m, deg, kN from 2 kN."""
     given = study.columns[name]
     values = np.array([math.nan if v is None else float(v) for v in given])
     unit = study.units.get(name, "1")
@@ -93,15 +93,15 @@ def shown(study: Study, name: str) -> Shown:
 
 
 def key_label(study: Study, key: str) -> str:
-    """A key with its unit."""
+    """Return a key with its unit."""
     return f"{key} [{study.units[key]}]" if key in study.units else key
 
 
 def draw_main_effects(study: Study) -> bytes:
-    """Every number over every varied key: all runs as dots, means as a line.
+    """Draw each result over each varied key: runs as dots, means as a line.
 
     Args:
-        study: what to draw.
+        study: data of the sweep.
 
     Returns:
         A PNG.
@@ -147,7 +147,7 @@ def _draw_effect(place, study: Study, key: str, one: Shown) -> None:
 
 
 def _spots(values: Sequence[Any], steps: list[Any]) -> np.ndarray:
-    """Where values stand along an axis: numbers by size, others side by side."""
+    """Return axis positions: the value itself for numbers, else the index of the level."""
     if numeric(steps):
         return np.array([float(value) for value in values])
     texts = [json.dumps(step) for step in steps]
@@ -155,9 +155,9 @@ def _spots(values: Sequence[Any], steps: list[Any]) -> np.ndarray:
 
 
 def _means(binned: bool, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Means of y at every x, or over bins of neighbouring x where few runs share one.
+    """Return the means of y at each x, or over bins of x if few runs have the same x.
 
-    Runs of the same x stay in one bin, so that every bin has its share of all other keys.
+    Runs with the same x are in one bin, so that all values of the other keys contribute to it.
     """
     there = np.unique(x)
     if not binned or len(x) >= _PER_BIN * len(there):
@@ -174,17 +174,17 @@ def _is_wide(values: np.ndarray) -> bool:
 
 
 def map_keys(study: Study) -> tuple[str, str] | None:
-    """The two keys of a grid of two."""
+    """Return the two varied keys of the grid, or None if there are more or fewer."""
     keys = [key for key in study.grid if len(levels(study.columns[key])) > 1]
     return (keys[0], keys[1]) if len(keys) == 2 else None
 
 
 def draw_heat_maps(study: Study, keys: tuple[str, str]) -> bytes:
-    """Every number over two keys, the mean of all runs of a cell.
+    """Draw a map of each result over two keys; a cell shows the mean of its runs.
 
     Args:
-        study: what to draw.
-        keys: along y and x.
+        study: data of the sweep.
+        keys: keys along y and x.
 
     Returns:
         A PNG.
@@ -214,7 +214,7 @@ def draw_heat_maps(study: Study, keys: tuple[str, str]) -> bytes:
 
 
 def _cells(study: Study, keys: tuple[str, str], values: np.ndarray) -> np.ndarray:
-    """Means (levels of the first key, levels of the second), NaN where no run succeeded."""
+    """Return mean values (levels of key 1, levels of key 2), NaN where no run succeeded."""
     texts = [[json.dumps(v) for v in levels(study.columns[key])] for key in keys]
     cells = np.full((len(texts[0]), len(texts[1])), np.nan)
     places = [np.array([t.index(json.dumps(v)) for v in study.columns[key]])
@@ -242,7 +242,7 @@ def _short(value: Any) -> str:
 
 
 def _folded(label: str) -> str:
-    """A long label on two lines."""
+    """Break a long label into two lines."""
     if len(label) <= 26:
         return label
     gaps = [i for i, letter in enumerate(label) if letter == " "]
@@ -256,11 +256,11 @@ _LISTED = 200
 
 
 def write_sweep_report(study: Study, folder: Path) -> None:
-    """Write `report.html` and its pictures as PNG.
+    """Write `report.html` of a sweep and its figures as PNG.
 
     Args:
-        study: what to show.
-        folder: where.
+        study: data of the sweep.
+        folder: existing output folder.
 
     Raises:
         InputError: the folder cannot be written.
@@ -333,7 +333,7 @@ def _spreads(study: Study) -> list[dict[str, Any]]:
 
 
 def _run(study: Study, value: float, row: int) -> tuple[str, str]:
-    """A number of a run, and which run it is."""
+    """Return a result as text, and the run it belongs to with its keys."""
     keys = ", ".join(f"{key} {_text(study.columns[key][row])}" for key in study.varied[:3])
     return f"{value:.4g}", f"run {study.columns['run'][row]}: {keys}"
 

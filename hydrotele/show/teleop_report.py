@@ -1,8 +1,8 @@
-"""`report.html` of a teleoperator's analysis: one page that needs nothing else.
+"""Write the HTML reports of teleoperator analyses and draw their figures.
 
-The pictures of a teleoperator's analysis: two-port, what is felt, passivity, stability.
-
-Page and map of a teleoperated scenario's linear loop.
+The figures of a case show hybrid matrix, transmitted impedance, scattering norm, Nyquist curves,
+stability maps and stiffness feedback. The report of a scenario shows the properties and the
+stability map of its linear loop.
 """
 
 from collections.abc import Sequence
@@ -35,14 +35,14 @@ _LOOKS = {
     "four_channel_position": ("#23794a", "-"), "four_channel_rate": ("#23794a", (0, (4, 1.6))),
 }  # fmt: skip
 _HYBRID = (
-    ("h11: felt with a free slave [N s/m]", "h12: force back over force of the task [1]"),
-    ("h21: slave's velocity over the hand's [1]", "h22: slave's yielding [m/(N s)]"),
+    ("h11: impedance felt with a free slave [N s/m]", "h12: reflected force / task force [1]"),
+    ("h21: slave velocity / hand velocity [1]", "h22: admittance of the slave [m/(N s)]"),
 )
 _NYQUIST = (-3.0, 1.5, -2.25, 2.25)
 
 
 def plain_name(structure: str) -> str:
-    """A structure as people say it.
+    """Return the name of a structure for display.
 
     >>> plain_name("four_channel_rate")
     'four-channel rate'
@@ -51,10 +51,10 @@ def plain_name(structure: str) -> str:
 
 
 def draw_hybrid(found: Findings) -> bytes:
-    """Magnitudes of the hybrid matrix.
+    """Draw the magnitudes of the elements of the hybrid matrix over frequency.
 
     Args:
-        found: the findings.
+        found: results of the analysis.
 
     Returns:
         A PNG.
@@ -77,21 +77,19 @@ def draw_hybrid(found: Findings) -> bytes:
 
 
 def draw_felt(found: Findings) -> bytes:
-    """Transmitted impedance against the task's: magnitude and phase."""
+    """Draw magnitude and phase of the transmitted impedance and of the task impedance as PNG."""
     with drawing(4.2) as figure:
         left, right = figure.subplots(1, 2, sharex=True)
         first = found.analyses[0]
         hertz = first.frequencies / (2.0 * np.pi)
-        left.plot(
-            hertz, np.abs(first.task), color=_INK, lw=4.0, alpha=0.25, label="the task itself"
-        )
+        left.plot(hertz, np.abs(first.task), color=_INK, lw=4.0, alpha=0.25, label="task")
         right.plot(hertz, np.degrees(np.angle(first.task)), color=_INK, lw=4.0, alpha=0.25)
         for one in found.analyses:
             _line(left, one, np.abs(one.transmitted))
             _line(right, one, np.degrees(np.unwrap(np.angle(one.transmitted))))
         _logarithmic(left, 1e-1, 1e7)
-        left.set_title("felt impedance [N s/m]")
-        right.set_title("its phase [deg]")
+        left.set_title("magnitude of the felt impedance [N s/m]")
+        right.set_title("phase of the felt impedance [deg]")
         right.set_ylim(-360.0, 180.0)
         right.set_yticks(range(-360, 181, 90))
         for panel in (left, right):
@@ -101,7 +99,7 @@ def draw_felt(found: Findings) -> bytes:
 
 
 def draw_scattering(found: Findings) -> bytes:
-    """Norm of the scattering matrix; above 1 the two-port can give energy."""
+    """Draw the norm of the scattering matrix as PNG; above 1 the two-port can emit energy."""
     with drawing(3.4) as figure:
         panel = figure.subplots()
         top = max(float(one.scattering.max()) for one in found.analyses)
@@ -113,19 +111,19 @@ def draw_scattering(found: Findings) -> bytes:
         panel.set_yscale("log")
         panel.set_ylim(0.8, 1.3 * top)
         panel.set_xlabel("frequency [Hz]")
-        panel.set_title("norm of the scattering matrix [1]: above 1 it is not passive")
+        panel.set_title("norm of the scattering matrix [1]; above 1 (red) it is not passive")
         _legend(figure, panel)
         return png(figure)
 
 
 def draw_nyquist(found: Findings) -> bytes:
-    """Loop gain with the task and without, around -1."""
+    """Draw Nyquist curves of the loop gain with the task and in free motion as PNG."""
     with drawing(3.1 * _rows(found)) as figure:
         for panel, one in zip(_panels(figure, found), found.analyses, strict=False):
             colour = _LOOKS[one.structure][0]
             for curve, look, name in (
                 (one.loop, {"color": colour, "lw": 1.4}, "with the task"),
-                (one.loop_free, {"color": _SOFT, "lw": 1.1}, "free"),
+                (one.loop_free, {"color": _SOFT, "lw": 1.1}, "free motion"),
             ):
                 panel.plot(np.real(curve), np.imag(curve), label=name, **look)
                 panel.plot(np.real(curve), -np.imag(curve), **(look | {"alpha": 0.35}))
@@ -140,7 +138,7 @@ def draw_nyquist(found: Findings) -> bytes:
 
 
 def draw_maps(found: Findings) -> bytes:
-    """Where every structure is stable, over delay and factor on what comes back."""
+    """Draw the stability of each structure over delay and gain factor as PNG."""
     with drawing(2.9 * _rows(found)) as figure:
         seen = {one.structure: one.seen for one in found.agreements}
         for panel, (name, cells) in zip(_panels(figure, found), found.maps.items(), strict=False):
@@ -154,19 +152,19 @@ def draw_maps(found: Findings) -> bytes:
                     1e3 * found.delays[column], found.factors[row], "x", color="#b5281c", ms=5
                 )
             panel.set_title(plain_name(name))
-            panel.set_xlabel("delay each way [ms]")
-            panel.set_ylabel("reflected, times nominal")
+            panel.set_xlabel("one-way delay [ms]")
+            panel.set_ylabel("factor on reflection [1]")
             panel.grid(False)
         _key(figure)
         return png(figure)
 
 
 def draw_stiffness(spring: Spring, held: Spring) -> bytes:
-    """Margin of the theorem, and what the worst switching of the stiffness leaves stable.
+    """Draw the stability margin of stiffness feedback and its worst-case stability.
 
     Args:
-        spring: the joystick let go.
-        held: the same in the hand, whose mass and least stiffness the maps are drawn for.
+        spring: joystick without a hand.
+        held: joystick with the operator's hand; its mass and minimum stiffness are used.
 
     Returns:
         A PNG.
@@ -180,7 +178,7 @@ def draw_stiffness(spring: Spring, held: Spring) -> bytes:
         _margin(figure, left, damping, stiffest, margin)
         kinds = np.where(margin > 0.0, 2, np.where(growth < 1.0, 1, 0))
         _cells(right, damping, stiffest, kinds, (_BAD, _GOOD, _SURE))
-        right.set_title("stable by the theorem (dark), at the worst switching (light), not (red)")
+        right.set_title("stable by margin (dark), stable in worst case (light), unstable (red)")
         edge = 2.0 * np.sqrt(held.mass * stiffest)
         for panel in (left, right):
             panel.plot(edge, stiffest, color=_INK, lw=1.6)
@@ -190,12 +188,12 @@ def draw_stiffness(spring: Spring, held: Spring) -> bytes:
             panel.set(yscale="log", xlim=(0.0, damping[-1]), xlabel="damping B [N s/m]")
             panel.set_ylim(stiffest[0], stiffest[-1])
             panel.grid(False)
-        left.set_ylabel("largest stiffness [N/m]")
+        left.set_ylabel("maximum stiffness K_max [N/m]")
         return png(figure)
 
 
 def _margin(figure: Any, panel: Any, damping: np.ndarray, stiffest: np.ndarray, margin: np.ndarray):
-    """Margin in thousands, the same colours on both sides of 0."""
+    """Draw the margin in thousands, with a colour scale that is symmetric about 0."""
     reach = float(np.percentile(np.abs(margin), 80.0)) / 1e3
     shown = panel.pcolormesh(
         damping, stiffest, margin / 1e3, cmap="RdBu", vmin=-reach, vmax=reach, shading="nearest"
@@ -205,7 +203,7 @@ def _margin(figure: Any, panel: Any, damping: np.ndarray, stiffest: np.ndarray, 
 
 
 def _cells(panel: Any, x: np.ndarray, y: np.ndarray, kinds: np.ndarray, colours: tuple) -> None:
-    """Cells of a few kinds, each with its colour."""
+    """Draw a map of cells; each kind has its own colour."""
     from matplotlib.colors import ListedColormap
 
     panel.pcolormesh(
@@ -215,7 +213,7 @@ def _cells(panel: Any, x: np.ndarray, y: np.ndarray, kinds: np.ndarray, colours:
 
 
 def _root_scale(panel: Any, delays: np.ndarray) -> None:
-    """An axis that has more room for short delays."""
+    """Set a square-root scale of the delay axis, which enlarges short delays."""
     panel.set_xscale("function", functions=(lambda x: np.sqrt(np.maximum(x, 0.0)), np.square))
     panel.set_xlim(0.0, delays[-1])
     ticks = [tick for tick in (0, 5, 20, 50, 100, 200, 500, 1000, 2000) if tick <= delays[-1]]
@@ -229,7 +227,7 @@ def _line(panel: Any, one: Any, values: np.ndarray) -> None:
 
 
 def _logarithmic(panel: Any, least: float, most: float) -> None:
-    """Logarithmic axes that leave out rounding and resonances without bound."""
+    """Set logarithmic axes with limits that exclude rounding errors and unbounded resonances."""
     panel.set_xscale("log")
     panel.set_yscale("log")
     low, high = panel.get_ylim()
@@ -242,7 +240,7 @@ def _legend(figure: Any, panel: Any) -> None:
 
 
 def _key(figure: Any) -> None:
-    """What the maps' colours and the point mean."""
+    """Draw the legend of the stability maps."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -258,7 +256,7 @@ def _rows(found: Findings) -> int:
 
 
 def _panels(figure: Any, found: Findings) -> list:
-    """Three panels a row; those that are not used stay empty."""
+    """Return the panels of a figure with three panels per row; hide unused panels."""
     panels = list(figure.subplots(_rows(found), 3, squeeze=False).flat)
     for panel in panels[len(found.analyses) :]:
         panel.set_axis_off()
@@ -266,21 +264,21 @@ def _panels(figure: Any, found: Findings) -> list:
 
 
 _CHANNELS = {
-    "position_position": "the slave's position comes back (coordinating force)",
-    "position_force": "the task's force comes back (direct force)",
-    "four_channel_position": "all four channels; transparent without delay",
-    "rate_position": "rate control, the slave's position comes back (coordinating force)",
-    "rate_force": "rate control, the task's force comes back (direct force)",
+    "position_position": "position control, reflects the slave position (coordinating force)",
+    "position_force": "position control, reflects the task force (direct force)",
+    "four_channel_position": "position control, all four channels; transparent without delay",
+    "rate_position": "rate control, reflects the slave position (coordinating force)",
+    "rate_force": "rate control, reflects the task force (direct force)",
     "four_channel_rate": "rate control, all four channels, without jerk",
 }
 
 
 def write_teleop_report(found: Findings, maps: bytes, path: str | Path) -> None:
-    """Write an analysis as one self-contained HTML file.
+    """Write the report of a teleoperator case as one self-contained HTML file.
 
     Args:
-        found: what was found.
-        maps: the picture of its maps of stability, a PNG.
+        found: results of the analysis.
+        maps: PNG of the stability maps, from `draw_maps`.
         path: file to write.
     """
     spring, case = found.spring, found.case
@@ -309,15 +307,17 @@ def _figures(found: Findings) -> list[tuple[str, str, str]]:
     many, good = len(found.analyses), sum(one.stable for one in found.analyses)
     passive = sum(one.passive for one in found.analyses)
     cards = [
-        ("after", f"{good} of {many}", "structures stable, with the task and free"),
-        ("", f"{passive} of {many}", "passive two-ports, safe with any passive hand and task"),
+        ("after", f"{good} of {many}", "structures stable in contact and in free motion"),
+        ("", f"{passive} of {many}", "passive two-ports: stable with any passive hand and task"),
     ]
     if found.agreements:
         worst = min(one.share for one in found.agreements)
-        cards.append(("after", f"{100 * worst:.1f} %", "of the maps' cells confirmed, at least"))
+        what = "of the map cells confirmed by simulation (lowest of all structures)"
+        cards.append(("after", f"{100 * worst:.1f} %", what))
         errors = [s.error for s in found.sweeps if s.error is not None]
         if errors:
-            cards.append(("after", f"{100 * max(errors):.2f} %", "largest error of a sine sweep"))
+            what = "largest impedance error of a sine sweep"
+            cards.append(("after", f"{100 * max(errors):.2f} %", what))
     return cards
 
 
@@ -346,16 +346,16 @@ def _stiffness(spring: Spring, held: Spring) -> dict[str, Any]:
     rows = [
         (name, f"{one.mass:.3g}", f"{one.damping:.4g}", f"{one.least:g} to {one.most:g}",
          format_number(one.margin), f"{one.enough_damping:.4g}", f"{one.growth:.3g}")
-        for name, one in (("held", held), ("let go", spring))
+        for name, one in (("held", held), ("released", spring))
     ]  # fmt: skip
     safe = held.growth < 1.0
     conclusion = (
-        "The theorem holds for this case: no change of the stiffness makes it unstable."
+        "The margin of the held joystick is positive: no change of the stiffness makes it unstable."
         if held.margin > 0.0
-        else "The theorem does not cover this case, which is no proof of instability: at the worst"
-        f" switching of the stiffness half a swing {'shrinks' if safe else 'grows'} to"
-        f" {held.growth:.3g} times the one before, so that it {'stays' if safe else 'is not'}"
-        " stable."
+        else "The margin of the held joystick is not positive, so that the theorem does not decide"
+        " its stability. Under the worst-case switching of the stiffness, each half oscillation"
+        f" {'shrinks' if safe else 'grows'} to {held.growth:.3g} times the previous one: the"
+        f" joystick is {'stable' if safe else 'unstable'}."
     )
     return {"rows": rows, "conclusion": conclusion, "picture": draw_stiffness(spring, held)}
 
@@ -363,22 +363,23 @@ def _stiffness(spring: Spring, held: Spring) -> dict[str, Any]:
 def _impedances(found: Findings) -> list[tuple[str, ...]]:
     case = found.case
     parts: list[tuple[str, Impedance]] = [
-        ("master", case.master), ("its controller", case.master_control), ("hand", case.hand),
-        ("slave", case.slave), ("its controller", case.slave_control), ("task", case.task),
+        ("master", case.master), ("controller of the master", case.master_control),
+        ("hand", case.hand), ("slave", case.slave),
+        ("controller of the slave", case.slave_control), ("task", case.task),
     ]  # fmt: skip
     return [(name, f"{z.mass:.4g}", f"{z.damping:.4g}", f"{z.stiffness:.6g}") for name, z in parts]
 
 
 _DELAYS, _FACTORS = 13, 25
-_LONGEST = 0.3  # s each way
-_SPAN = (0.05, 20.0)  # of the largest stable ratio
+_LONGEST = 0.3  # s, maximum one-way delay of the map
+_SPAN = (0.05, 20.0)  # range of the map, relative to the maximum stable ratio
 
 
 def draw_loop_map(found: ScenarioFindings) -> bytes:
-    """Where the loop is stable, over delay and reflected force at the machine's force limit.
+    """Draw the stability of a loop over delay and reflected force at the machine's force limit.
 
     Args:
-        found: the findings.
+        found: results of the analysis.
 
     Returns:
         A PNG.
@@ -397,27 +398,27 @@ def draw_loop_map(found: ScenarioFindings) -> bytes:
         now = 500.0 * (case.delay_forward + case.delay_back)
         axes.plot(now, case.ratio * case.force_limit, "o", color="#e07b00", ms=8, clip_on=False)
         axes.set_yscale("log")
-        axes.set_xlabel("delay each way [ms]")
+        axes.set_xlabel("one-way delay [ms]")
         axes.set_ylabel(f"hand force at {case.force_limit / 1e3:g} kN [N]")
-        axes.set_title(f"{loop.structure}: blue is stable, the point is the scenario")
+        axes.set_title(f"{loop.structure}; blue: stable, point: scenario")
         return png(figure)
 
 
 def write_loop_report(
     found: ScenarioFindings, said: Sequence[tuple[str, str, str]], map_: bytes, path: Path
 ) -> None:
-    """Write a scenario's analysis as one self-contained HTML file.
+    """Write the report of a scenario analysis as one self-contained HTML file.
 
     Args:
-        found: the findings.
-        said: (what, value, remark) of every finding.
-        map_: a PNG.
+        found: results of the analysis.
+        said: results as text: (quantity, value, remark).
+        map_: PNG of the stability map, from `draw_loop_map`.
         path: file to write.
     """
     springs = [
         (name, f"{one.damping:g}", f"{one.most:g}", format_number(one.margin),
          f"{one.enough_damping:.4g}", f"{one.growth:.3g}")
-        for name, one in (("held", found.held), ("let go", found.free))
+        for name, one in (("held", found.held), ("released", found.free))
     ]  # fmt: skip
     report_html.write_report(
         "loop", path, title=f"{found.name}: loop", over=f"TELEOPERATED SCENARIO  ·  {found.name}",

@@ -1,11 +1,8 @@
-"""The rerun program as a child process: started with its own settings, ended without orphans.
+"""Run the rerun viewer as a child process: native window, web viewer or screenshot.
 
-Open a recording: in the native viewer, or in a browser through a local port.
-
-A picture of a recording as the rerun viewer shows it, without a screen.
-
-The viewer of the wheel draws off-screen (`rerun --headless`) through Vulkan; without a graphics
-card Mesa's lavapipe draws on the processor. It is driven over its local port.
+The child process and its children end with the program. Screenshots use `rerun --headless`, which
+renders by Vulkan; without a graphics card, Mesa's lavapipe renders on the processor. The headless
+viewer is controlled through a local port.
 """
 
 import contextlib
@@ -28,31 +25,31 @@ from hydrotele.core.errors import InputError
 from hydrotele.core.output import replacing
 from hydrotele.show.recording import TIMELINE
 
-_PATIENCE = 5.0  # s that the program has to end by itself
-_PR_SET_PDEATHSIG = 1  # of Linux's prctl: a signal when the parent dies
+_PATIENCE = 5.0  # s, timeout for the program to end after SIGTERM
+_PR_SET_PDEATHSIG = 1  # option of Linux prctl: signal to the child when the parent dies
 
 
 class Viewer(NamedTuple):
     """A running rerun program.
 
     Attributes:
-        process: the process; it leads its own process group.
-        output: file that holds what it prints.
+        process: process, the leader of its own process group.
+        output: file with the output of the program.
     """
 
     process: subprocess.Popen
     output: Path
 
     def said(self) -> str:
-        """Return what it has printed."""
+        """Return the output of the program so far."""
         return self.output.read_text(errors="replace")
 
 
 def rerun_program() -> Path:
-    """Path of the rerun program of the wheel, or that of RERUN_CLI_PATH.
+    """Return the path of the rerun program: RERUN_CLI_PATH, or that of the rerun-sdk wheel.
 
     Raises:
-        InputError: rerun-sdk is not installed, or without its viewer.
+        InputError: rerun-sdk is not installed or does not include the viewer.
     """
     if override := os.environ.get("RERUN_CLI_PATH"):
         return Path(override)
@@ -67,10 +64,10 @@ def rerun_program() -> Path:
 
 
 def recording_file(path: str | os.PathLike) -> Path:
-    """Absolute path of a recording that is there.
+    """Return the absolute path of an existing recording.
 
     Raises:
-        InputError: it is not.
+        InputError: the file does not exist.
     """
     path = Path(path)
     if not path.is_file():
@@ -79,7 +76,7 @@ def recording_file(path: str | os.PathLike) -> Path:
 
 
 def free_port() -> int:
-    """Return a TCP port of this machine that nobody listens to."""
+    """Return a free TCP port of this computer."""
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         return listener.getsockname()[1]
@@ -87,21 +84,21 @@ def free_port() -> int:
 
 @contextlib.contextmanager
 def running(arguments: Sequence[str], clean: bool = False) -> Iterator[Viewer]:
-    """Run the rerun program while the context lasts, then end it with all its children.
+    """Run the rerun program during the context, then end it with all its child processes.
 
     Args:
-        arguments: its command line.
-        clean: whether it has a home of its own, so that no user's settings are read or written.
+        arguments: command-line arguments.
+        clean: use a temporary home folder, so that settings of the user are not read or written.
 
     Raises:
-        InputError: there is no such program.
+        InputError: the rerun program is not installed.
     """
     program = rerun_program()
     with tempfile.TemporaryDirectory(prefix="hydrotele_", ignore_cleanup_errors=True) as folder:
         output = Path(folder, "output.txt")
         environment = {**os.environ, "RERUN_APP_ONLY": "true", "NO_COLOR": "1"}
         if clean:
-            environment["RUST_LOG"] = "warn"  # news would cover a part of the picture
+            environment["RUST_LOG"] = "warn"  # notifications would cover part of the image
             homes = ("HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME", "XDG_CACHE_HOME")
             environment |= dict.fromkeys((*homes, "XDG_RUNTIME_DIR"), folder)
         with open(output, "wb") as file:
@@ -121,7 +118,7 @@ def running(arguments: Sequence[str], clean: bool = False) -> Iterator[Viewer]:
 
 
 def _die_with_parent() -> Callable[[], object] | None:
-    """What a child on Linux does first, so that it ends even when this program is killed."""
+    """Return a function that makes a child on Linux end when this program is killed."""
     if sys.platform != "linux":
         return None
     prctl = ctypes.CDLL(None, use_errno=True).prctl
@@ -139,7 +136,7 @@ def _end(process: subprocess.Popen) -> None:
 
 
 def _signal(process: subprocess.Popen, number: int) -> None:
-    """Signal the whole process group, which outlives its leader while it has members."""
+    """Send a signal to the whole process group, which can outlive its leader."""
     if sys.platform == "win32":
         process.terminate()
         return
@@ -154,18 +151,18 @@ _POLL = 0.1  # s
 def web_viewer(
     rrd: str | os.PathLike, port: int | None = None, timeout: float = 30.0
 ) -> Iterator[str]:
-    """Serve a recording and the viewer for a browser on this machine while the context lasts.
+    """Serve a recording and the web viewer on this computer during the context.
 
     Args:
-        rrd: the recording.
-        port: HTTP port on 127.0.0.1; default is a free one.
-        timeout: the longest that the server may take to answer [s].
+        rrd: recording file.
+        port: HTTP port on 127.0.0.1, default a free port.
+        timeout: maximum time until the server answers [s].
 
     Yields:
-        The URL to open in a browser.
+        URL to open in a browser.
 
     Raises:
-        InputError: the recording is missing, the port is taken, or the server does not come up.
+        InputError: the recording is missing, the port is in use, or the server does not start.
     """
     rrd = recording_file(rrd)
     data_port, port = free_port(), port or free_port()
@@ -188,12 +185,12 @@ def serve_recording(
     """Serve a recording until the program is interrupted.
 
     Args:
-        rrd: the recording.
-        port: HTTP port on 127.0.0.1; default is a free one.
-        tell: is called once with the URL to open in a browser.
+        rrd: recording file.
+        port: HTTP port on 127.0.0.1, default a free port.
+        tell: function that is called once with the URL to open in a browser.
 
     Raises:
-        InputError: as `web_viewer`.
+        InputError: the recording is missing, the port is in use, or the server does not start.
     """
     with web_viewer(rrd, port) as url, contextlib.suppress(KeyboardInterrupt):
         tell(url)
@@ -202,10 +199,10 @@ def serve_recording(
 
 
 def open_viewer(rrd: str | os.PathLike) -> int:
-    """Show a recording in the native viewer until it is closed.
+    """Show a recording in the native viewer until the user closes it.
 
     Returns:
-        The viewer's exit status.
+        Exit status of the viewer.
 
     Raises:
         InputError: the recording is missing or there is no viewer.
@@ -225,11 +222,11 @@ def _answers(page: str) -> bool:
 if TYPE_CHECKING:
     from rerun.experimental import ViewerClient, ViewerState
 
-_LAST_WORDS = 3.0  # s that a dying viewer takes to say why
-_SETTLING = 3  # pictures that are drawn at least: layout and data take a few frames
-_NO_DRIVER = ("render context", "graphics adapter")  # what the viewer says then
+_LAST_WORDS = 3.0  # s, timeout for the error message of a failing viewer
+_SETTLING = 3  # minimum number of frames, because layout and data need a few frames
+_NO_DRIVER = ("render context", "graphics adapter")  # in the output if Vulkan is missing
 _DRIVER = (
-    "needs Vulkan to draw: install a graphics driver or, without a graphics card, Mesa's"
+    "needs Vulkan to render: install a graphics driver or, without a graphics card, that of Mesa"
     " (Debian: apt-get install mesa-vulkan-drivers)"
 )
 
@@ -241,21 +238,21 @@ def take_screenshot(
     at: float | None = None,
     timeout: float = 90.0,
 ) -> tuple[str, ...]:
-    """Save what the viewer shows of a recording.
+    """Save a screenshot of the viewer with a recording, without opening a window.
 
     Args:
-        rrd: the recording.
-        png: the picture to write, all or nothing.
+        rrd: recording file.
+        png: PNG file, written completely or not at all.
         size: width and height [pixel].
-        at: time on the timeline `time` [s]; default is the middle of the recording.
-        timeout: the longest that all of it may take [s].
+        at: time on the timeline `time` [s], default the middle of the recording.
+        timeout: maximum total duration [s].
 
     Returns:
-        Warnings and errors that the viewer has for the recording.
+        Warnings and errors that the viewer reports for the recording.
 
     Raises:
-        InputError: the recording cannot be read, there is no Vulkan driver (says what to install),
-            or time is up. Nothing is written and no process is left then.
+        InputError: the recording cannot be read, there is no Vulkan driver (the message names the
+            package to install), or the timeout expires. No process is left running.
     """
     deadline = time.monotonic() + timeout
     with replacing(png, ".png") as part, _viewing(rrd, size, deadline) as (client, state):
@@ -266,7 +263,7 @@ def take_screenshot(
 
 
 def _complaints(client: "ViewerClient") -> tuple[str, ...]:
-    """Warnings and errors that the viewer has for what it shows."""
+    """Return the warnings and errors that the viewer reports for the recording."""
     views = client.get_state().views
     shown = [f"{v.name}: {r.severity}: {r.summary}" for v in views for r in v.reports]
     entries = [e for e in client.get_logs() if e.level in ("WARN", "ERROR")]
@@ -277,7 +274,11 @@ def _complaints(client: "ViewerClient") -> tuple[str, ...]:
 def _viewing(
     rrd: str | os.PathLike, size: tuple[int, int], deadline: float
 ) -> Iterator[tuple["ViewerClient", "ViewerState"]]:
-    """A viewer that has loaded the recording."""
+    """Run a headless viewer that has loaded the recording.
+
+    Yields:
+        Client and state of the viewer.
+    """
     rrd, port = recording_file(rrd), free_port()
     arguments = ["--headless", "--bind", "127.0.0.1", "--port", str(port)]
     arguments += ["--hide-welcome-screen", "--window-size", f"{size[0]}x{size[1]}", str(rrd)]
@@ -317,19 +318,20 @@ def _loaded(viewer: Viewer, client: "ViewerClient", rrd: Path, deadline: float) 
 
 
 def _check(viewer: Viewer, rrd: Path, deadline: float) -> None:
-    """Explain a viewer that has ended, or one that takes too long."""
+    """Raise InputError if the viewer has ended or the deadline has passed."""
     if viewer.process.poll() is not None:
         said = viewer.said()
         if any(sign in said for sign in _NO_DRIVER):
             raise InputError("rerun viewer", _DRIVER)
         last = " ".join(said.split()[-40:])
-        raise InputError(rrd, f"the viewer ended with {viewer.process.returncode}: {last}")
+        message = f"the viewer ended with exit status {viewer.process.returncode}: {last}"
+        raise InputError(rrd, message)
     if time.monotonic() > deadline:
-        raise InputError(rrd, "the viewer does not show it in time: raise the timeout")
+        raise InputError(rrd, "the viewer does not show it in time: increase the timeout")
 
 
 def _settled_picture(client: "ViewerClient", deadline: float) -> bytes:
-    """The first picture that is like the one before: all data have arrived then."""
+    """Return the first image that equals the previous one, when all data have been loaded."""
     previous, count = b"", 0
     while True:
         picture, count = client.take_screenshot(), count + 1
@@ -345,12 +347,12 @@ def _moment(state: "ViewerState", at: float | None, rrd: str | os.PathLike) -> f
         raise InputError(rrd, f"has no timeline {TIMELINE!r}; it has {', '.join(lines)}")
     start, end = (1e-9 * (t or 0) for t in (lines[TIMELINE].start, lines[TIMELINE].end))
     if at is not None and not start <= at <= end:
-        raise InputError(rrd, f"holds {start:g} to {end:g} s, not {at:g} s")
+        raise InputError(rrd, f"contains {start:g} to {end:g} s, not {at:g} s")
     return 0.5 * (start + end) if at is None else at
 
 
 def _hide_top_panel(client: "ViewerClient") -> None:
-    """Leave out the menu and its warnings of slow drawing: in a picture they are of no use."""
+    """Hide the menu bar, which also warns of slow rendering."""
     layout = client.get_blueprint(of="recording").blueprint
     layout["/top_panel"] = {"PanelBlueprint": {"state": "Hidden"}}
     client.set_blueprint(layout, of="recording")

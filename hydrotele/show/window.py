@@ -1,4 +1,4 @@
-"""MuJoCo's window with the machine in it while it is driven."""
+"""Show a simulated machine in MuJoCo's viewer window while it is driven."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -11,20 +11,20 @@ from hydrotele.show.canvas import has_screen
 from hydrotele.show.pose import model_with_looks
 from hydrotele.simulate.plant import Plant
 
-_ADVICE = "add --no-viewer and choose --device gamepad, spacemouse or scripted:FILE"
-_PATIENCE = 5.0  # s that the last picture may take
-_DISTANCE, _AZIMUTH, _ELEVATION = 14.0, 120.0, -18.0  # m, deg, deg of the camera at first
+_ADVICE = "add --no-viewer and use --device gamepad, spacemouse or scripted:FILE"
+_PATIENCE = 5.0  # s, timeout for the last frame when the window is closed
+_DISTANCE, _AZIMUTH, _ELEVATION = 14.0, 120.0, -18.0  # m, deg, deg, initial camera position
 
 
 class Window:
-    """A passive viewer of a plant, with its looks; open until closed by either side."""
+    """Passive viewer of a plant; open until the user or the program closes it."""
 
     def __init__(self, plant: Plant, pressed: Callable[[int], None] | None = None) -> None:
-        """Open it.
+        """Open the window.
 
         Args:
-            plant: what is simulated.
-            pressed: told the GLFW code of every key that goes down, by another thread.
+            plant: simulated plant.
+            pressed: callback for the GLFW code of each pressed key; runs in another thread.
 
         Raises:
             InputError: there is no screen, or OpenGL does not work on it.
@@ -49,7 +49,11 @@ class Window:
         self._painter.start()
 
     def show(self, qpos: np.ndarray, rows: Sequence[tuple[str, str]]) -> bool:
-        """Show positions (nq,) and a table as soon as may be; False if the user has closed it."""
+        """Show joint positions (nq,) and a table of texts in the next frame.
+
+        Returns:
+            False if the user has closed the window.
+        """
         if not self._handle.is_running():
             return False
         self._newest = qpos.copy(), rows
@@ -57,7 +61,7 @@ class Window:
         return True
 
     def _paint(self) -> None:
-        """Hand the newest state over, by a thread of its own: a slow screen holds up nobody."""
+        """Draw the latest state in a separate thread, so that a slow screen does not block."""
         while self._fresh.wait() and not self._over:
             self._fresh.clear()
             assert self._newest
@@ -72,7 +76,7 @@ class Window:
             self._handle.sync()
 
     def close(self) -> None:
-        """Close it."""
+        """Close the window."""
         self._over = True
         self._fresh.set()
         self._painter.join(_PATIENCE)
@@ -80,13 +84,13 @@ class Window:
 
 
 def check_screen(advice: str = _ADVICE) -> None:
-    """Find out whether a window can be opened, since MuJoCo's viewer hangs where none can.
+    """Check that a window can be opened, because MuJoCo's viewer hangs without a screen.
 
     Args:
-        advice: what to do where it cannot.
+        advice: advice for the error message.
 
     Raises:
-        InputError: it cannot.
+        InputError: no window can be opened.
     """
     if not has_screen():
         raise InputError("viewer", f"there is no screen (DISPLAY is not set); {advice}")

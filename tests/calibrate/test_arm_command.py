@@ -110,7 +110,7 @@ def test_unusable_input_is_one_sentence(folder, tmp_path):
         (["arm", "--data", str(folder), "--machine", "cat215"], "has no sensed_joints"),
         (["arm", "--data", str(folder), "--method", "both"], "valid: joint, hierarchical"),
         (["arm", "--data", str(folder), "--heldout", "all"], "whole number"),
-        (["linkage", "--data", str(lost)], "no cylinder moves"),
+        (["linkage", "--data", str(lost)], "no cylinder turns its joint"),
     ):
         made = RUN.invoke(app, ["calibrate", *arguments])
         assert made.exit_code != 0

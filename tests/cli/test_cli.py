@@ -406,7 +406,7 @@ def test_a_run_of_ones_own_machine_can_be_handed_on(tmp_path):
 
 def test_review_refuses_a_log_of_another_machine(finished):
     code, _, err = invoke("review", finished, "--machine", "rig", "--plot", "x.png")
-    assert code == 2 and "is no log of rig: it has none of position.slide" in err
+    assert code == 2 and "is not a log of rig: it has none of position.slide" in err
 
 
 def test_validate_reports_every_file(tmp_path):
@@ -443,10 +443,10 @@ def test_a_joystick_is_validated_and_exported(tmp_path):
         shutil.copy(models_folder() / "joystick" / name, tmp_path / name)
     own = tmp_path / "joystick.yaml"
     code, out, _ = invoke("validate", "joystick", tmp_path, own)
-    assert code == 0 and out.count("valid joystick") == 3 and "hovers with 0.35 of 4 A" in out
+    assert code == 0 and out.count("valid joystick") == 3 and "levitates with 0.35 of 4 A" in out
     own.write_text(own.read_text().replace("mass: 0.85", "mass: 85.0"))
     code, _, err = invoke("validate", own)
-    assert code == 2 and "does not hover" in err
+    assert code == 2 and "does not levitate stably" in err
     code, out, _ = invoke("export", "joystick")
     assert code == 0 and mujoco.MjModel.from_xml_string(out).nu == 6
     assert invoke("export", "joystick", "--tool", "bucket")[0] == 2

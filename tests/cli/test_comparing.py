@@ -69,7 +69,7 @@ def test_the_patched_machine_is_better_in_json_table_and_folder(site):
     assert (target / "free_run.png").read_bytes().startswith(b"\x89PNG")
     assert json.loads((target / "summary.json").read_text(encoding="utf-8"))["kind"] == "compare"
     code, stdout, _ = invoke(*words)
-    assert code == 0 and "position.slide" in stdout and "to the end" in stdout and "mm" in stdout
+    assert code == 0 and "position.slide" in stdout and "whole run" in stdout and "mm" in stdout
 
 
 def test_all_runs_and_their_mean(site):

@@ -100,13 +100,13 @@ def test_numbers_appear(named, gap_of):
 def test_no_gap_has_no_patch_and_shows_one_model(page_of):
     page, _ = page_of("no_gap", rastered=False)
     assert "Model and machine agree" in page.text and "patched/" not in page.text
-    assert "What was found" not in page.text
+    assert "Identified effects" not in page.text
 
 
 def test_an_unknown_has_its_section(page_of):
     page, _ = page_of("unknown", rastered=False)
     for piece in (
-        "What is not explained",
+        "Unexplained difference",
         "3.0 to 4.6 s",
         "boom piston position",
         "balance of forces",
@@ -117,10 +117,10 @@ def test_an_unknown_has_its_section(page_of):
 def test_a_partly_named_gap_shows_calibration_laws_and_what_is_left(page_of):
     page, _ = page_of("partly")
     for piece in (
-        "Partly named", "63 %", "Numbers that were calibrated", "valve gain of the boom: ratio",
+        "Partly identified", "63 %", "Calibrated parameters", "valve gain of the boom: ratio",
         "103.5", "Laws learned from the data", "Force on the boom drive over position",
-        "-3e+05 above(position, 0.55)", "31 % of the gap", "still lacks", "2.1 kN",
-        "Noise of the readings", "not stated", "1.20",
+        "-3e+05 above(position, 0.55)", "31 % of the gap", "Residual forces", "2.1 kN",
+        "Noise of the measurements", "not stated", "1.20",
     ):  # fmt: skip
         assert piece in page.text, piece
     assert len(page.pictures) == 6  # the law's besides those of every report

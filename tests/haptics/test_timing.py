@@ -103,7 +103,7 @@ def test_stolen_time_is_the_kernels(tmp_path):
 
 @pytest.mark.parametrize(
     ("alone", "own", "said"),
-    [(5, 5, []), (50, 80, ["cannot hold 0.1 %"]), (5, 40, ["the rest of the 0.4 %"])],
+    [(5, 5, []), (50, 80, ["limit of 0.1 %"]), (5, 40, ["remainder of the 0.4 %"])],
 )
 def test_report_says_whose_the_missed_deadlines_are(alone, own, said):
     computer = {"seconds": 10.0, "ticks": 10000, "missed": alone,
@@ -114,7 +114,7 @@ def test_report_says_whose_the_missed_deadlines_are(alone, own, said):
         assert words in sentence
     stolen = computer_sentences({"ticks": 1, "missed": 0},
                                 {"stolen_seconds": 0.4, "stolen_share": 0.02})  # fmt: skip
-    assert stolen == ["time stolen by the host meanwhile: 0.4 s, 2 % of all cores"]
+    assert stolen == ["processor time taken by the host: 0.4 s, 2 % of all cores"]
 
 
 def test_garbage_is_collected_again_afterwards():

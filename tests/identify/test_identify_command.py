@@ -60,7 +60,7 @@ def test_the_machine_and_the_report_stand_in_the_folder(identified):
     (viscous,) = (value for name, value in told.items() if name.startswith("viscous."))
     assert axis.cylinder.friction.viscous == pytest.approx(viscous, rel=0.05)
     page = (target / "report.html").read_text()
-    assert "Forces on data that were not fitted" in page and "data:image/png" in page
+    assert "Force prediction errors on held-out data" in page and "data:image/png" in page
     assert "http" not in page.replace("http://www.w3.org", "")
     summary = json.loads((target / "summary.json").read_text())
     assert summary["kind"] == "identify" and summary["heldout"] == "run_2"
@@ -80,7 +80,7 @@ def test_the_identified_machine_runs_and_replays(identified, site, tmp_path):
 def test_words_for_people(site, tmp_path):
     done = call("identify", "--data", site, "--out", tmp_path / "found", "--reduced")
     assert done.exit_code == 0, done.output
-    assert "what the data tell" in done.output and "not fitted" in done.output
+    assert "identified parameters" in done.output and "not fitted" in done.output
 
 
 def test_a_foreign_folder_is_not_replaced(site, tmp_path):

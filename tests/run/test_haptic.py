@@ -29,8 +29,8 @@ def test_addresses():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"device": "haptic", "speed": 0.0}, "a hand is in real time"),
-        ({"device": "gamepad", "latency": True}, "has no force output to measure"),
+        ({"device": "haptic", "speed": 0.0}, "which runs in real time"),
+        ({"device": "gamepad", "latency": True}, "has no force output: omit --device"),
     ],
 )
 def test_what_does_not_go_together(tmp_path, changes, message):

@@ -214,7 +214,7 @@ def test_drive_that_ends_at_once_writes_nothing(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({}, "reads the keys of the viewer's window"),
+        ({}, "needs the viewer window to read keys"),
         ({"device": "mouse"}, "is not a known device; did you mean 'spacemouse'"),
         ({"device": "scripted:none.csv"}, "no such file"),
         ({"scenario": "zhu_up", "device": "scripted:S"}, "pilot kind lines has no joystick"),

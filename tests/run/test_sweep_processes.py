@@ -73,7 +73,7 @@ def test_interrupted_sweep_ends_as_an_uninterrupted_one(signals, done, tmp_path)
         _, said = process.communicate(timeout=60)
         if number == signal.SIGINT:
             assert process.returncode == 130 and "Traceback" not in said
-            assert f"{lines(journal)} of 8 runs are done" in said and "goes on" in said
+            assert f"{lines(journal)} of 8 runs are finished" in said and "to continue" in said
     # As if the power had failed while the journal and the table were written.
     kept = journal.read_bytes().splitlines(keepends=True)
     journal.write_bytes(b"".join(kept[:-1]) + kept[-1][:100])

@@ -80,8 +80,8 @@ def test_json_of_another_coordinate():
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["press_direct", "--delay", "0.1"], "are for cases"),
-        (["--coordinate", "z"], "are for scenarios"),
+        (["press_direct", "--delay", "0.1"], "apply to cases only"),
+        (["--coordinate", "z"], "apply to scenarios only"),
         (["zhu_up"], "no teleoperated pilot"),
     ],
 )
