@@ -125,11 +125,11 @@ CHAMBERS = (
     ),
     Effect(
         "bulk_modulus", "bulk modulus of the oil that differs from the model", "flow", _everywhere,
-        _bulk_modulus, _set_bulk_modulus, "softness of the oil",
+        _bulk_modulus, _set_bulk_modulus, "oil compliance",
     ),
     Effect(
         "entrained_air", "air in the oil, which makes it compliant at low pressure", "flow",
-        _everywhere, _entrained_air, _set_entrained_air, "softness of the oil",
+        _everywhere, _entrained_air, _set_entrained_air, "oil compliance",
     ),
 )  # fmt: skip
 

@@ -246,11 +246,11 @@ EFFECTS = (
     ),
     Effect(
         "angle_delay", "a delay of a position sensor", "sensor", axes, _angle_delay,
-        _set_angle("delay", "delay"), "late position sensor",
+        _set_angle("delay", "delay"), "position sensor delay",
     ),
     Effect(
         "angle_lag", "a first-order lag of a position sensor", "sensor", axes, _angle_lag,
-        _set_angle("time_constant", "time_constant"), "late position sensor",
+        _set_angle("time_constant", "time_constant"), "position sensor delay",
     ),
     Effect(
         "length_offset", "an offset of a cylinder's length sensor", "sensor", linkages,
@@ -262,7 +262,7 @@ EFFECTS = (
     ),
     Effect(
         "pressure_delay", "a delay of an axis' pressure transducers", "sensor", hydraulics,
-        _pressure_delay, _set_pressure_delay, "late pressure transducers",
+        _pressure_delay, _set_pressure_delay, "pressure transducer delay",
     ),
     Effect(
         "pressure_scale", "a scale error of a pressure transducer", "sensor", _ports,
@@ -270,7 +270,7 @@ EFFECTS = (
     ),
     Effect(
         "pressure_lag", "a first-order lag of an axis' pressure transducers", "sensor",
-        hydraulics, _pressure_lag, _set_pressure_lag, "late pressure transducers",
+        hydraulics, _pressure_lag, _set_pressure_lag, "pressure transducer delay",
     ),
     Effect(
         "clock_offset", "a time offset of all positions or all pressures", "sensor",
