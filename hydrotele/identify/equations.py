@@ -402,7 +402,7 @@ class Gathered:
             if (step := round(period / self.spacing[k])) < 1:
                 raise InputError(
                     record.name, f"a period of {period:g} s is shorter than the time between"
-                    f" equations, {self.spacing[k]:.3g} s: no motion of this band can repeat so fast",
+                    f" equations, {self.spacing[k]:.3g} s: a motion of this band repeats slower",
                 )  # fmt: skip
             own = slice(self.starts[k], self.starts[k + 1])
             whole[own] = cycle_on(whole[own], step)

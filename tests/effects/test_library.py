@@ -161,7 +161,12 @@ def check_limits(machine, tool, name, place):
         ("valve_gain", "", {"ratio": 1}, "has no location ''; valid: boom, bucket, stick, swing"),
         ("payload", "boom", {"mass": 1}, "has no location 'boom'; valid: tool"),
         ("payload", "", {}, "has the parameters mass; 'mass' is missing"),
-        ("payload", "", {"mass": 1, "colour": 2}, "has the parameters mass; 'colour' is not one of them"),
+        (
+            "payload",
+            "",
+            {"mass": 1, "colour": 2},
+            "has the parameters mass; 'colour' is not one of them",
+        ),
         ("base_tilt", "", {"roll": 0.1}, "has the parameters roll, pitch; 'pitch' is missing"),
         ("pressure_offset", "boom", {"offset": 1.0}, "valid: .*boom.head, boom.rod"),
     ],

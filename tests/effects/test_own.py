@@ -147,7 +147,9 @@ def test_installed_packages_offer_effects_as_entry_points(monkeypatch, alone, tm
     assert list(library) == ["gas_spring"]
     assert LAWS["gas_spring_force"].source == "plug-in springs of the package ?"
     entries[0] = importlib.metadata.EntryPoint("springs", "rig_plugin_2", own.GROUP)
-    with pytest.raises(InputError, match="plug-in springs .*cannot be loaded: No module.*uninstall"):
+    with pytest.raises(
+        InputError, match="plug-in springs .*cannot be loaded: No module.*uninstall"
+    ):
         own.add_plugins({})
 
 
