@@ -439,7 +439,8 @@ REFUSED = {
         "the reference of boom is 2 at .* its joint range is",
     ),
     "reference_table": (
-        {"pilot": TABLE | {"of": "joint", "columns": {"boom": [0.45, 2.0]}}}, "the reference of boom is 2",
+        {"pilot": TABLE | {"of": "joint", "columns": {"boom": [0.45, 2.0]}}},
+        "the reference of boom is 2",
     ),
 }  # fmt: skip
 
