@@ -19,8 +19,8 @@ _REAL, _SQUARE, _CUBE = 2.0, 2.0, 1.0  # coefficients of the third-order Butterw
 def filter_table(bandwidth: float, period: float) -> np.ndarray:
     """Return the matrix of one filter step.
 
-    `y''' = w^3 (u - y) - 2 w^2 y' - 2 w y''` (Butterworth), solved exactly for an input u that is
-    linear between the last and the new reading.
+    The filter is `y''' = w^3 (u - y) - 2 w^2 y' - 2 w y''` (Butterworth). It is solved exactly for
+    an input u that is linear between the last and the new reading.
 
     Args:
         bandwidth: w / (2 pi), scalar [Hz], > 0.

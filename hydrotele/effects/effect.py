@@ -1,9 +1,9 @@
 """Types and helpers for defining effects.
 
 `Effect` and `Parameter` describe an effect, its locations and its parameters. Helper functions list
-the axes of a machine at which an effect may occur and compute reference values (largest force,
-typical speed, link size) from which the modules of this package scale the parameters. `with_terms`
-and `term_number` write and read the terms that an effect adds to a machine.
+the axes of a machine at which an effect may occur. Others compute reference values, such as the
+largest force, for the scales of parameters. `with_terms` and `term_number` write and read the terms
+that an effect adds to a machine.
 """
 
 import dataclasses

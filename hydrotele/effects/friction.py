@@ -1,8 +1,8 @@
 """Effects of drive friction.
 
 The module covers Coulomb, viscous and Stribeck friction, their asymmetry between the two
-directions, dry friction that depends on load or position, and presliding: dry friction that acts as
-a spring below breakaway, as the bristles of seals and guides do.
+directions, and dry friction that depends on load or position. Presliding is dry friction that acts
+as a spring below breakaway, as the bristles of seals and guides do.
 """
 
 import math
@@ -29,9 +29,9 @@ from hydrotele.terms.law import Term
 def _numbers(field: str, scale: float, high: float):
     """Return a function that gives a friction parameter, scaled by the drive's largest force.
 
-    The smallest relevant deviation is a thousandth of that force (20 to 30 kPa over the piston, the
-    error of a good transducer) or a tenth of the given friction (the change by warm oil within a
-    shift).
+    The smallest relevant deviation is a thousandth of that force, or a tenth of the given friction.
+    The first is 20 to 30 kPa over the piston, the error of a good transducer. The second is the
+    change by warm oil within a shift.
     """
 
     def parameters(machine: Machine, location: str) -> dict[str, Parameter]:

@@ -46,9 +46,9 @@ def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:
 def _apply(machine: Machine, location: str, values: Values) -> Machine:
     """Move everything at the outboard joint by `length` along the line from the link's own joint.
 
-    The moved parts are the next link (for the last link the arm's tip and a payload welded there),
-    the base pin of the next link's cylinder if it is on this link, and a four-bar rocker on this
-    link. All other pins keep their distance from the link's own joint. The link's centre of mass
+    The moved parts are the next link, the base pin of the next link's cylinder if it is on this
+    link, and a four-bar rocker on this link. For the last link they are the arm's tip and a payload
+    welded there. All other pins keep their distance from the link's own joint. The link's centre of mass
     moves along the same line in proportion; mass and moments of inertia do not change.
     """
     length = values["length"]

@@ -91,8 +91,8 @@ def estimate(
     equations would give most weight to fast changes, where models and derivatives are least
     accurate. With instruments Z the estimate solves `Z' W (F - Y p) = 0`, which is not biased by
     noise in Y as long as Z is independent of that noise. With few rows relative to the correlation
-    time the intervals are too narrow: they cover the truth in 93 % of cases for 400 rows with a
-    correlation of 80 % between successive errors. Ridge and truncation move poorly determined
+    time the intervals are too narrow. For 400 rows with a correlation of 80 % between successive
+    errors, 93 % of them cover the truth. Ridge and truncation move poorly determined
     parameters towards the prior; the covariance does not include that bias.
 
     Args:
@@ -536,11 +536,11 @@ def reduce_parameters(
 ) -> Reduction:  # fmt: skip
     """Drop and merge candidate parameters one after the other.
 
-    The least significant candidate is dropped first, until all remaining ones are significant: the
-    threshold is a normal deviate that any candidate without effect exceeds with a probability of
-    5 %. Within a group, the two candidates with the most correlated estimates get a common
-    parameter, unless the residuals show by the same threshold that they differ. Candidates that are
-    not significant after merging are dropped as well.
+    The least significant candidate is dropped first, until all remaining ones are significant. The
+    threshold is a normal deviate. One or more of all candidates exceed it without effect with a
+    probability of 5 %. Within a group, the two candidates with the most correlated estimates get a
+    common parameter, unless the residuals show by the same threshold that they differ. Candidates
+    that are not significant after merging are dropped as well.
 
     Args:
         matrix: (n, k, p) regressor of independent parameters.

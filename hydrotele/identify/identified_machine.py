@@ -1,9 +1,9 @@
 """Machine with identified parameters, and the document `identify.json`.
 
 The identified base parameters do not determine all parameters. `consistent` selects physically
-consistent ones: every body is an affine deformation of the given body, so that its mass is positive
-and its inertia belongs to a mass distribution, and friction dissipates energy. The selected machine
-has the best fit with the least deformation. `identified_machine` writes the parameters to a
+consistent ones. Every body is an affine deformation of the given body, so that its mass is positive
+and its inertia belongs to a mass distribution. Friction dissipates energy. The selected machine has
+the best fit with the smallest deformation. `identified_machine` writes the parameters to a
 `Machine`; `identify_document` writes an identification as JSON data.
 """
 
