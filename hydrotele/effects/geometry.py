@@ -48,8 +48,8 @@ def _apply(machine: Machine, location: str, values: Values) -> Machine:
 
     The moved parts are the next link, the base pin of the next link's cylinder if it is on this
     link, and a four-bar rocker on this link. For the last link they are the arm's tip and a payload
-    welded there. All other pins keep their distance from the link's own joint. The link's centre of mass
-    moves along the same line in proportion; mass and moments of inertia do not change.
+    welded there. All other pins keep their distance from the link's own joint. The link's centre of
+    mass moves along the same line in proportion; mass and moments of inertia do not change.
     """
     length = values["length"]
     name = machine.link_of(machine.axes[location].joint)

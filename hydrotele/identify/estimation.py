@@ -537,7 +537,7 @@ def reduce_parameters(
     """Drop and merge candidate parameters one after the other.
 
     The least significant candidate is dropped first, until all remaining ones are significant. The
-    threshold is a normal deviate. One or more of all candidates exceed it without effect with a
+    threshold is a normal deviate. If no candidate has an effect, at least one exceeds it with a
     probability of 5 %. Within a group, the two candidates with the most correlated estimates get a
     common parameter, unless the residuals show by the same threshold that they differ. Candidates
     that are not significant after merging are dropped as well.
