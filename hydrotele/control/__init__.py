@@ -1,1 +1,1 @@
-"""Control of the arm: servo, trajectories, resolved motion, force at the tool tip."""
+"""Control of the arm: joint servo, reference plans, resolved motion and tip force estimation."""

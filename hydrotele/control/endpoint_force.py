@@ -1,17 +1,15 @@
-"""Force at the tip of an arm, felt through the pressures of its drives.
+"""Estimation of the force at the tip of an arm from the pressures of its drives.
 
-The static estimate takes the torque of gravity, linear in a few identified parameters, off that of
-the drives (Zhu 1994, 6.1). The dynamic one takes off all that the complete model needs: inertia,
-Coriolis forces, friction, and the closed chains with their cylinders.
+The static estimate subtracts the gravity torque, which is linear in a few identified parameters,
+from the drive torque (Zhu 1994, 6.1). The dynamic estimate uses the complete model with inertia,
+Coriolis forces, friction and the closed chains of the cylinders.
 
-Everything passes two filters. A fast one gives positions, rates, accelerations and pressures that
-are equally late, so that their balance holds, and friction is that of the rate of its time. The
-force that is left passes a slow one, since what noise of the angles makes of accelerations grows
-with the fifth power of the frequency.
+A fast filter gives positions, rates, accelerations and pressures with equal delay, so that their
+balance holds and friction corresponds to the rate of the same time. The resulting force passes a
+slow filter, because the force error from angle noise grows with the fifth power of the frequency.
 
-One step of the force at the tip: readings, two filters, a balance between them.
-
-Static model of an arm: the torque of its weight, linear in a few parameters.
+`EndpointForce` estimates online, `endpoint_force_of_log` from a log. `identify_gravity` identifies
+the static model from a log of slow motion.
 """
 
 import math
@@ -54,28 +52,28 @@ from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine, SensorSet, noise_rms
 
 _NAMES = ("C2", "S2", "C23", "S23", "C234", "S234", "C5")
-_GRID = 9  # poses per joint to which the masses' torques are fitted
-_SPREAD = 3.0e5  # N m: nothing is known of the parameters before
-_RUBBING = 3.0e4  # N: nor of friction
+_GRID = 9  # poses per joint at which the static model is fitted to the masses
+_SPREAD = 3.0e5  # N m, initial standard deviation of the gravity parameters: no prior knowledge
+_RUBBING = 3.0e4  # N, initial standard deviation of dry friction
 PERIOD = 0.2
 """Time between the equations of an identification [s]."""
-_SMOOTH = 1.0  # Hz
-_CREEP = 5.0e-3  # m/s or rad/s: slower drives may stand, and are asked nothing about friction
-_START = 50  # equations whose parameters are no estimate yet (Zhu 1994, 6.1.3)
+_SMOOTH = 1.0  # Hz, bandwidth of the filter of slow motion
+_CREEP = 5.0e-3  # m/s or rad/s: slower drives may be at rest and give no friction equation
+_START = 50  # equations before the parameters are a valid estimate (Zhu 1994, 6.1.3)
 _NORMAL = 1.96
 
 
 @dataclass(frozen=True)
 class Gravity:
-    """Parameters of the static model.
+    """Parameters of the static gravity model.
 
     Attributes:
-        names: (p,) what every parameter multiplies: C2, S2, C23, S23, C234, S234, C5.
+        names: (p,) trigonometric factors of the parameters: C2, S2, C23, S23, C234, S234, C5.
         value: (p,) parameters [N m].
-        interval: (p,) half the width of their 95 % interval [N m]; 0 where they were computed.
-        history: (r, p) parameters after every equation [N m]; empty where they were computed.
-        residual: (m - 1,) RMS of the torques that are left, from the boom outwards [N m].
-        removed: (q,) indices of the equations that were left out as outliers, sorted.
+        interval: (p,) half width of the 95 % intervals [N m]; 0 if computed from masses.
+        history: (r, p) parameters after every equation [N m]; empty if computed from masses.
+        residual: (m - 1,) RMS of the residual torques, from the boom outwards [N m].
+        removed: (q,) indices of equations removed as outliers, sorted.
     """
 
     names: tuple[str, ...]
@@ -87,13 +85,13 @@ class Gravity:
 
 
 def gravity_rows(q: np.ndarray) -> np.ndarray:
-    """Rows Y of the static model `tau = Y(q) P`.
+    """Return the regressor Y of the static model `tau = Y(q) P`.
 
     Args:
         q: (m,) joint angles of the arm, swing first [rad].
 
     Returns:
-        (m, p) [1].
+        (m, p) regressor [1].
 
     Source: Zhu 1994, 6.8 and 6.9.
     """
@@ -105,13 +103,13 @@ def gravity_rows(q: np.ndarray) -> np.ndarray:
 
 
 def gravity_from_masses(machine: Machine) -> Gravity:
-    """The static model that comes nearest to the torques of all a machine's masses.
+    """Fit the static model to the gravity torques of a machine's masses.
 
-    Fitted to the complete model at rest over the joints' ranges. The links' own weight is of the
-    form of the model; that of cylinders and linkages is not, which leaves `residual`.
+    The complete model at rest is fitted over the ranges of the joints. The weight of the links has
+    the form of the static model; that of cylinders and linkages has not and causes `residual`.
 
     Args:
-        machine: with an arm whose joints are driven by valves.
+        machine: machine with an arm whose joints are driven by valves.
 
     Returns:
         The parameters.
@@ -137,7 +135,7 @@ def gravity_from_masses(machine: Machine) -> Gravity:
 
 @compiled
 def _weights(arm, poses, torque):
-    """Torques (r, m) of gravity on the arm's joints in poses (r, m)."""
+    """Compute the gravity torques (r, m) on the arm's joints in poses (r, m)."""
     outside = np.zeros(len(arm.work))
     for row in range(len(poses)):
         for i in range(len(arm.joint)):
@@ -148,12 +146,12 @@ def _weights(arm, poses, torque):
 
 
 class SlowMoves(NamedTuple):
-    """What slow moves tell of an arm with m joints, r rows; all passed the same filter.
+    """Filtered signals of slow motion of an arm with m joints, r rows.
 
     Attributes:
-        angle: (r, m) [rad].
-        torque: (r, m) of the drives [N m].
-        rubbing: (r, m) torque of a newton of dry friction of the drive; 0 where it may stand [m].
+        angle: (r, m) joint angles [rad].
+        torque: (r, m) torques of the drives [N m].
+        rubbing: (r, m) torque per newton of dry friction of the drive [m]; 0 if it may be at rest.
     """
 
     angle: np.ndarray
@@ -162,15 +160,17 @@ class SlowMoves(NamedTuple):
 
 
 def slow_moves(machine: Machine, log: Log, period: float = PERIOD) -> SlowMoves:
-    """Angles and torques of an arm's drives in a log, by virtual work through their linkages.
+    """Compute joint angles and drive torques of an arm from a log of slow motion.
+
+    Cylinder forces are converted to torques by virtual work through the linkages.
 
     Args:
         machine: the machine.
         log: measured angles and pressures.
-        period: between rows [s], rounded to a multiple of the log's.
+        period: time between rows [s], rounded to a multiple of the log's period.
 
     Returns:
-        One row for every period between equations.
+        One row per period.
 
     Raises:
         InputError: a channel is missing, or a joint is not driven by a valve.
@@ -196,27 +196,28 @@ def identify_gravity(
     machine: Machine, log: Log, friction: bool = True, *, remove_outliers: bool = False,
     period: float = PERIOD,
 ) -> Gravity:  # fmt: skip
-    """Static model of a machine from a log of slow moves, by recursive least squares.
+    """Identify the static gravity model from a log of slow motion by recursive least squares.
 
-    With `remove_outliers` equations with a large residual, such as those of a sensor that failed
-    for a moment, are left out and the estimation is repeated until none is left. Large is, by
-    Chauvenet's criterion, a residual of which less than half a one is expected among all equations;
-    its normal distribution has the scale of the median absolute residual of the joint.
+    With `remove_outliers`, equations with large residuals, as during a temporary sensor failure,
+    are removed and the estimation is repeated until none is left. By Chauvenet's criterion, a
+    residual is large if less than half an equation is expected to exceed it. The expected normal
+    distribution has the scale of the median absolute residual of the joint.
 
     Args:
         machine: the machine; its masses are not used.
-        log: measured angles and pressures of joints that move slowly to and fro over their ranges.
-        friction: whether a dry friction of every drive is estimated along with it, or left in the
-            torques as by Zhu, to average out.
-        remove_outliers: whether equations with large residuals are left out.
-        period: between equations [s].
+        log: measured angles and pressures of joints that move slowly back and forth over their
+            ranges.
+        friction: whether dry friction of every drive is estimated as well. If not, it averages out
+            in the torques, as in Zhu.
+        remove_outliers: whether equations with large residuals are removed.
+        period: time between equations [s].
 
     Returns:
         The parameters with their history.
 
     Raises:
-        InputError: a channel is missing, or the log is too short or has too few equations that are
-            no outliers.
+        InputError: a channel is missing, the log is too short, or too few equations are left after
+            removing outliers.
 
     Source: Zhu 1994, 6.1.3; Chauvenet 1863, A manual of spherical and practical astronomy, vol. 2.
     """
@@ -229,7 +230,9 @@ def identify_gravity(
     torque, kept = moves.torque[:, 1:], np.ones(len(rows), bool)
     while True:
         if np.count_nonzero(kept) < _START:
-            raise InputError(log.source, f"{_START * period:g} s of slow moves are needed at least")
+            raise InputError(
+                log.source, f"at least {_START * period:g} s of slow motion are needed"
+            )
         found, history = _solve_recursively(rows[kept], torque[kept], size)
         left = torque - rows @ found.value
         outside = kept & _are_outliers(left, kept)
@@ -251,7 +254,7 @@ def identify_gravity(
 def _solve_recursively(
     rows: np.ndarray, torque: np.ndarray, size: int
 ) -> tuple[RecursiveLeastSquares, list[np.ndarray]]:
-    """Take in equations (r, m - 1, p); the estimate, and the first parameters after every one."""
+    """Process equations (r, m - 1, p); return the estimate and the parameter history."""
     spread = np.append(np.full(size, _SPREAD), np.full(rows.shape[2] - size, _RUBBING))
     found, history = RecursiveLeastSquares(np.zeros(rows.shape[2]), spread), []
     for table, torques in zip(rows, torque, strict=True):
@@ -262,8 +265,8 @@ def _solve_recursively(
 
 
 def _are_outliers(left: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """Whether residuals (r, m - 1) of an equation are too large for their number, (r,)."""
-    from scipy.special import ndtri  # a run does without it
+    """Return for each equation (r,) whether its residuals (r, m - 1) fail Chauvenet's criterion."""
+    from scipy.special import ndtri  # imported here, because runs do not need it
 
     scale = np.median(np.abs(left[kept]), axis=0) / ndtri(0.75)
     most = -ndtri(0.25 / np.count_nonzero(kept))
@@ -275,18 +278,18 @@ _JOINT, _HEAD, _ROD = range(3)  # rows of `DriveReadings.last`
 
 
 class DriveReadings(NamedTuple):
-    """What is kept of the readings; n independent coordinates, h valves, k axes.
+    """State of the reading filters: n independent coordinates, h valves, k axes.
 
     Attributes:
-        period: between two readings of the sensors [s].
-        settle: number of readings that are averaged at first.
-        tables: (2, 3, 5) of the readings' filter and of the force's.
-        position: (n,) column of every coordinate's axis.
-        valve: (h,) column of every valve's axis.
-        state: (n + 2 h + m, 4) of the filters: positions, pressures, force at the tip.
-        outside: (n,) forces on the coordinates from outside [N m] or [N].
-        last: (3, k) last good readings of joint, head and rod; NaN before the first.
-        still: (3, k) readings since one changed.
+        period: time between two readings of the sensors [s].
+        settle: number of initial readings that are averaged.
+        tables: (2, 3, 5) tables of the reading filter and the force filter.
+        position: (n,) column of the axis of each coordinate.
+        valve: (h,) column of the axis of each valve.
+        state: (n + 2 h + m, 4) filter states: positions, pressures, force at the tip.
+        outside: (n,) external forces on the coordinates [N m] or [N].
+        last: (3, k) last valid readings of joint, head and rod; NaN before the first.
+        still: (3, k) number of readings since the last change.
     """
 
     period: float
@@ -302,22 +305,22 @@ class DriveReadings(NamedTuple):
 
 @allocation_free
 def endpoint_force_step(arm, readings, dynamic, count, joint, head, rod, out):
-    """Take in new readings; force at the tip.
+    """Process new readings and update the force at the tip.
 
     Args:
-        arm: Arm.
+        arm: ArmBalance.
         readings: DriveReadings.
-        dynamic: whether the complete model is used, or gravity alone; scalar.
-        count: number of readings before; scalar. The first ones are averaged, as of a machine at
-            rest.
+        dynamic: whether the complete model is used, or gravity only; scalar.
+        count: number of previous readings; scalar. The first ones are averaged, assuming a machine
+            at rest.
         joint: (k,) measured joint positions [rad] or [m].
         head: (k,) head-side pressures [Pa].
         rod: (k,) rod-side pressures [Pa].
         out: (m,) written: r [N], theta [N m], z [N], then attitude and head [N m].
 
     Returns:
-        WAITING before every channel has read once, GOOD, BAD where a reading was not finite and the
-        last one was taken, SINGULAR where the arm is singular and `out` is left alone.
+        WAITING until every channel has a reading, GOOD, BAD if a reading was not finite and was
+        replaced by the last one, SINGULAR if the arm is singular and `out` is unchanged.
 
     Source: Zhu 1994, 6.1.
     """
@@ -356,13 +359,16 @@ def endpoint_force_step(arm, readings, dynamic, count, joint, head, rod, out):
 
 @allocation_free
 def _stand(state, value):
-    """Let a filter stand at a value."""
+    """Set a filter to a constant value."""
     state[LOW], state[RATE], state[CHANGE], state[LAST] = value, 0.0, 0.0, value
 
 
 @allocation_free
 def _reading(r, c):
-    """Place in the arm's state and last good value of a signal: positions, then pressures."""
+    """Return the index in the arm's state and the last valid value of signal c.
+
+    Positions come first, then pressures.
+    """
     n = len(r.position)
     if c < n:
         return c, r.last[_JOINT, r.position[c]]
@@ -372,7 +378,7 @@ def _reading(r, c):
 
 @allocation_free
 def _take(last, still, used, values):
-    """Keep readings that are finite; False if one that is used is not."""
+    """Store finite readings; return False if a used reading is not finite."""
     good = True
     for c in range(len(used)):
         i = used[c]
@@ -389,7 +395,7 @@ def _take(last, still, used, values):
 
 @allocation_free
 def _known(readings):
-    """Whether all channels that are used have read once."""
+    """Return whether all used channels have a reading."""
     for i in readings.position:
         if math.isnan(readings.last[_JOINT, i]):
             return False
@@ -409,7 +415,7 @@ _READINGS = np.dtype(
 
 
 def _readings_record(r: DriveReadings) -> np.ndarray:
-    """(1,) record of DriveReadings whose arrays must outlive it."""
+    """Return a record (1,) of DriveReadings; their arrays must outlive it."""
     arrays = {name: part for name, part in r._asdict().items() if isinstance(part, np.ndarray)}
     record = address_record(_READINGS, arrays)
     (record["signals"], _), (_, record["axes"]) = r.state.shape, r.last.shape
@@ -420,7 +426,11 @@ def _readings_record(r: DriveReadings) -> np.ndarray:
 
 @compiled
 def _update(arm, kept, dynamic, count, joint, head, rod, out):
-    """`endpoint_force_step` of records; its status, and most readings since a channel changed."""
+    """Call `endpoint_force_step` with records.
+
+    Returns:
+        Its status, and the largest number of readings since a channel changed.
+    """
     r = kept[0]
     still = integers(r.still, 3 * r.axes).reshape((3, r.axes))
     readings = DriveReadings(
@@ -433,21 +443,21 @@ def _update(arm, kept, dynamic, count, joint, head, rod, out):
 
 
 Kind = Literal["static", "dynamic"]
-BANDWIDTH = 0.7  # Hz
-FAST = 2.5  # Hz
-_SETTLE = 0.5  # periods of the fast filter
+BANDWIDTH = 0.7  # Hz, of the force estimate
+FAST = 2.5  # Hz, of the filter of positions and pressures
+_SETTLE = 0.5  # periods of the fast filter over which the first readings are averaged
 _TASK = ("r", "theta", "z", "attitude", "head")
 
 
 class EndpointForce:
-    """Online estimate of the force of the environment on the tip of an arm.
+    """Online estimator of the force of the environment on the tip of an arm.
 
     Attributes:
         axes: axes of the readings.
-        task: what the force acts along: r [N], theta [N m], z [N], attitude, head [N m].
-        bandwidth: of the estimate [Hz].
-        delay: by which it is late, for slow changes [s].
-        force: (m,) last estimate; 0 until every channel has read once.
+        task: task coordinates of the force: r [N], theta [N m], z [N], attitude, head [N m].
+        bandwidth: bandwidth of the estimate [Hz].
+        delay: delay of the estimate for slow changes [s].
+        force: (m,) last estimate; 0 until every channel has a reading.
         healthy: whether the last readings were finite and the arm was not singular.
     """
 
@@ -456,23 +466,23 @@ class EndpointForce:
         period: float = 0.005, *, every: int = 1, sensors: SensorSet | None = None,
         gravity: Gravity | None = None, bandwidth: float = BANDWIDTH, fast: float = FAST,
     ):  # fmt: skip
-        """Lay out what every update needs.
+        """Prepare the model and the filters.
 
         Args:
-            machine: with an arm whose joints are driven by valves.
-            axes: order of the readings, as `Feedback.joint`.
-            kind: `static` knows gravity only, `dynamic` the complete model.
+            machine: machine with an arm whose joints are driven by valves.
+            axes: order of the readings, as in `Feedback.joint`.
+            kind: `static` models gravity only, `dynamic` uses the complete model.
             period: time between two updates [s].
-            every: updates per sample of the sensors, as `Feedback.every`: the first brings a new
-                sample, the following ones hold it and change nothing.
-            sensors: of the machine, whose noise the dynamic estimate weighs; None for ideal ones.
-            gravity: parameters of the static model; those of the machine's masses if None.
-            bandwidth: of the estimate [Hz].
-            fast: bandwidth of the motion that friction and inertia are computed of [Hz].
+            every: updates per sample of the sensors, as in `Feedback.every`. The first update uses
+                a new sample, the following ones have no effect.
+            sensors: sensor set of the machine; its noise affects friction in the dynamic estimate.
+                None for ideal sensors.
+            gravity: parameters of the static model; None to compute them from the machine's masses.
+            bandwidth: bandwidth of the estimate [Hz].
+            fast: bandwidth of the motion from which friction and inertia are computed [Hz].
 
         Raises:
-            InputError: a joint is not driven, not by a valve, or not measured; a number makes no
-                sense.
+            InputError: a joint is not driven by a valve or not measured, or a value is invalid.
         """
         where = f"end-point force of {machine.name}"
         if kind not in ("static", "dynamic"):
@@ -480,7 +490,9 @@ class EndpointForce:
         if not (period > 0.0 and every >= 1 and 0.0 < bandwidth < 0.25 / (period * every)):
             rate = 1.0 / (period * every) if period > 0.0 and every >= 1 else float("nan")
             raise InputError(
-                where, f"{bandwidth:g} Hz must be less than a quarter of the sensors' {rate:g} Hz"
+                where,
+                f"the bandwidth, {bandwidth:g} Hz, must be below a quarter of the sensor"
+                f" rate, {rate:g} Hz",
             )
         self.axes, self.bandwidth, self.healthy = tuple(axes), bandwidth, False
         self._dynamic, self._count, self._every, self._tick = kind == "dynamic", 0, every, 0
@@ -501,18 +513,18 @@ class EndpointForce:
         self._records = arm_record(self._arm), _readings_record(self._readings)
 
     def update(self, joint: np.ndarray, head: np.ndarray, rod: np.ndarray) -> np.ndarray:
-        """Take in the readings of one moment.
+        """Process the readings of one instant.
 
-        A reading that is not finite is replaced by the last good one of its channel, and `healthy`
+        A reading that is not finite is replaced by the last valid one of its channel, and `healthy`
         is then False.
 
         Args:
             joint: (k,) measured joint positions [rad] or [m], in the order of `axes`.
-            head: (k,) head-side pressures [Pa]; ignored where there is no valve.
-            rod: (k,) rod-side pressures [Pa].
+            head: (k,) head-side pressures [Pa]; ignored for axes without valve.
+            rod: (k,) rod-side pressures [Pa]; ignored for axes without valve.
 
         Returns:
-            (m,) force of the environment on the machine along `task`; the same array every time.
+            (m,) force of the environment on the machine along `task`; always the same array.
         """
         held, self._tick = self._tick % self._every, self._tick + 1
         if held:
@@ -525,17 +537,17 @@ class EndpointForce:
         return self.force
 
     def frozen(self, duration: float = 0.5) -> tuple[str, ...]:
-        """Channels whose readings have not changed for a while, as a stuck sensor's.
+        """Return the channels whose readings have not changed, as with a stuck sensor.
 
         Args:
-            duration: for how long [s]. Real sensors never read the same twice for long; ideal ones
-                of a machine at rest do.
+            duration: time without change [s]. Readings of real sensors do not stay constant for
+                long; those of ideal sensors of a machine at rest do.
 
         Returns:
             Names such as `joint.boom`, `pressure_head.boom`.
         """
         r, calls = self._readings, duration / self._readings.period
-        if self._stillest < calls:  # as nearly always: what is not read never counts
+        if self._stillest < calls:  # the usual case; unused channels are never counted
             return ()
         kinds = (("joint", r.position), ("pressure_head", r.valve), ("pressure_rod", r.valve))
         return tuple(
@@ -554,7 +566,7 @@ def _readings(
     fast: float,
     where: str,
 ) -> DriveReadings:
-    """Where the readings are and what they go through."""
+    """Create the reading filters and the columns of the used readings."""
     free, valves = free_axes(machine, where), actuator_order(machine)[: len(machine.hydraulic_axes)]
     if missing := [name for name in free if name not in axes]:
         raise InputError(where, f"readings of {', '.join(missing)} are missing")
@@ -576,7 +588,7 @@ def endpoint_force_of_log(
     machine: Machine, log: Log, kind: Kind = "dynamic", gravity: Gravity | None = None,
     bandwidth: float = BANDWIDTH, fast: float = FAST, sensors: SensorSet | None = None,
 ) -> dict[str, np.ndarray]:  # fmt: skip
-    """The online estimate over a log, one update per row.
+    """Run the online estimator over a log, one update per row.
 
     Args:
         machine: the machine.
@@ -591,7 +603,7 @@ def endpoint_force_of_log(
         `r` [N], `theta` [N m], `z` [N], `attitude` [N m] ... and `healthy` [1], (n,) each.
 
     Raises:
-        InputError: a channel is missing, or the arm cannot be felt.
+        InputError: a channel is missing, or the tip force of the arm cannot be estimated.
     """
     axes = tuple(machine.axes)
     joint = np.column_stack([log[f"{machine.position_kind(a)}.{a}"] for a in axes])

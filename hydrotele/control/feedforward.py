@@ -1,4 +1,4 @@
-"""Computed forces: what inverse dynamics asks of the drives along a plan."""
+"""Computed-force feedforward: drive forces along a plan by inverse dynamics."""
 
 import numpy as np
 
@@ -17,22 +17,22 @@ from hydrotele.simulate.closure import closed_chain
 NOMINAL = "nominal"
 
 
-_SMOOTH = 8.0  # Hz: a table's steps and corners above it are no forces to ask for
+_SMOOTH = 8.0  # Hz, cutoff that removes steps and corners of tables from the forces
 
 
 def force_references(machine: Machine, plan: Plan, servo: Servo) -> ForceReferences:
-    """Forces along a plan, by the machine that the servo names.
+    """Compute the drive forces along a plan with the machine that the servo names.
 
     Args:
-        machine: the scenario's own, without planted effects.
+        machine: machine of the scenario, without added effects.
         plan: joint references; all axes must be under feedback.
-        servo: `force_model` names the machine, `lead` [s] makes up for the spool's lag.
+        servo: `force_model` names the machine; `lead` [s] compensates for the spool's lag.
 
     Returns:
-        The references.
+        The force references, all zero if the servo names no machine.
 
     Raises:
-        InputError: no such machine, other axes, or an axis without reference.
+        InputError: the machine does not exist or has other axes, or an axis has no reference.
 
     Source: Abdellatif 2008, section 5 (computed-force feedforward).
     """
@@ -44,7 +44,7 @@ def force_references(machine: Machine, plan: Plan, servo: Servo) -> ForceReferen
         machine = load_machine(servo.force_model, machine.tool)
     if not np.all(plan.closed):
         open_ones = ", ".join(a for a, c in zip(plan.axes, plan.closed, strict=True) if not c)
-        raise InputError(where, f"needs a reference of every axis; {open_ones} has none")
+        raise InputError(where, f"needs a reference for every axis; {open_ones} has none")
     axes = actuator_order(machine)
     if tuple(axes) != tuple(plan.axes):
         raise InputError(where, f"{machine.name} has the axes {', '.join(axes)}")
@@ -66,7 +66,7 @@ def force_references(machine: Machine, plan: Plan, servo: Servo) -> ForceReferen
 
 
 def _smooth(reference: np.ndarray, step: float) -> Smoothed:
-    """Motion (n, k) of a reference; one that is too short for the filter as it is."""
+    """Filter and differentiate a reference (n, k); if it is too short, do not filter."""
     if len(reference) > 5.0 / (_SMOOTH * step):
         return zero_phase(reference, step, _SMOOTH)
     rate = np.gradient(reference, step, axis=0)

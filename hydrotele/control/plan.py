@@ -1,8 +1,7 @@
-"""Pilots: what the machine is asked to do, over the whole run, as arrays.
+"""Conversion of a scenario's pilot to a plan: commands and joint references at every control tick.
 
-A plan holds either open-loop commands or joint references for every axis at every control tick.
-
-What a plan may ask of a machine: ranges of joints, commands of drives, the time of the run.
+`make_plan` computes a `Plan` with either an open-loop command or a joint reference for each axis.
+The check functions compare it with joint ranges, command limits and the length of the run.
 """
 
 import dataclasses
@@ -27,21 +26,21 @@ from hydrotele.scenario.scenario import (
 )
 from hydrotele.scenario.teleoperation import TeleopPilot
 
-_FARTHEST = 1.0e6  # rad or m, of a joint without a range
-_ROUNDING = 1.0e-3  # of a command, as `signals` allows real loggers
+_FARTHEST = 1.0e6  # rad or m, limit of a joint without a range
+_ROUNDING = 1.0e-3  # tolerance of a command, for the rounding of real loggers
 
 
 def check_reference(machine: Machine, name: str, time: np.ndarray, reference: np.ndarray) -> None:
-    """Refuse a joint reference that is not finite or leaves the joint's range.
+    """Raise InputError if a joint reference is not finite or leaves the joint's range.
 
     Args:
         machine: the machine.
         name: axis name.
-        time: (n,) [s].
-        reference: (n,) [rad] or [m].
+        time: (n,) times [s].
+        reference: (n,) joint reference [rad] or [m].
 
     Raises:
-        InputError: names axis, value, time and range.
+        InputError: the message states axis, value, time and range.
     """
     low, high = machine.joints[machine.axes[name].joint].range or (-_FARTHEST, _FARTHEST)
     outside = np.flatnonzero(~((low - 1e-9 <= reference) & (reference <= high + 1e-9)))
@@ -49,13 +48,13 @@ def check_reference(machine: Machine, name: str, time: np.ndarray, reference: np
         row = outside[0]
         raise InputError(
             "pilot",
-            f"asks {name} for {reference[row]:.4g} at {time[row]:.4g} s, its joint allows"
-            f" {low:.4g} .. {high:.4g}",
+            f"the reference of {name} is {reference[row]:.4g} at {time[row]:.4g} s; its joint range"
+            f" is {low:.4g} .. {high:.4g}",
         )
 
 
 def check_command(machine: Machine, name: str, command: np.ndarray) -> None:
-    """Refuse a command beyond what the drive takes.
+    """Raise InputError if a command exceeds the limit of the drive.
 
     Args:
         machine: the machine.
@@ -63,27 +62,27 @@ def check_command(machine: Machine, name: str, command: np.ndarray) -> None:
         command: (n,) valve command [1], or in the force drive's unit.
 
     Raises:
-        InputError: names axis, value and limit.
+        InputError: the message states axis, value and limit.
     """
     force = machine.axes[name].force
     limit, unit = (force.command_limit, force.command_unit) if force else (1.0, "1")
     if len(outside := np.flatnonzero(~(np.abs(command) <= limit + _ROUNDING))):
         raise InputError(
             "pilot",
-            f"commands {name} with {command[outside[0]]:g}, its drive takes -{limit:g} .. {limit:g}"
-            f" [{unit}]",
+            f"the command of {name} is {command[outside[0]]:g}; its drive accepts -{limit:g} .."
+            f" {limit:g} [{unit}]",
         )
 
 
 def cut_short(time: np.ndarray, needed: float) -> tuple[str, ...]:
-    """A note where a pilot is not through when the run ends.
+    """Return a note if the run ends before its pilot.
 
     Args:
-        time: (n,) control ticks [s].
+        time: (n,) times of the control ticks [s].
         needed: time that the pilot needs [s].
 
     Returns:
-        One sentence, or nothing.
+        One sentence, or an empty tuple.
     """
     missing = needed - (2 * time[-1] - time[-2])
     return (f"the run ends {missing:.3g} s before its pilot",) if missing > 1e-6 else ()
@@ -91,17 +90,17 @@ def cut_short(time: np.ndarray, needed: float) -> tuple[str, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """What is asked of every axis at every control tick.
+    """Commands or references of every axis at every control tick.
 
     Attributes:
-        time: (n,) [s].
-        axes: axis names, in the order of the columns.
-        command: (n, k) open-loop commands [1] (or in the drive's unit).
+        time: (n,) times of the control ticks [s].
+        axes: axis names in the order of the columns.
+        command: (n, k) open-loop commands [1], or in the drive's unit.
         reference: (n, k) joint references [rad] or [m].
-        rate: (n, k) their rates [rad/s] or [m/s].
+        rate: (n, k) rates of the references [rad/s] or [m/s].
         closed: (k,) whether the axis follows its reference.
         pose: (n, 4 or 5) desired r, theta, z, attitude and head angle of the tip, or None.
-        notes: what was clamped or could not be followed.
+        notes: sentences about motions that cannot be followed.
     """
 
     time: np.ndarray
@@ -117,21 +116,21 @@ class Plan:
 def make_plan(
     machine: Machine, axes: tuple[str, ...], pilot: Pilot, start: dict[str, float], time: np.ndarray
 ) -> Plan:
-    """Turn a pilot into arrays.
+    """Convert a pilot to a plan.
 
     Args:
         machine: the machine.
         axes: axis names in column order.
         pilot: the scenario's pilot.
         start: joint name -> position at t = 0 [rad] or [m].
-        time: (n,) control ticks [s].
+        time: (n,) times of the control ticks [s].
 
     Returns:
         The plan.
 
     Raises:
-        InputError: the pilot names an unknown axis, starts out of reach, or asks for more than a
-            joint's range or a drive's largest command.
+        InputError: the pilot names an unknown axis, starts out of reach, or exceeds a joint range
+            or a command limit.
     """
     plan = _plan(machine, axes, pilot, start, time)
     for column, name in enumerate(axes):
@@ -168,12 +167,14 @@ def _plan(
 
 
 def _teleoperated(plan: Plan, machine: Machine, pilot: TeleopPilot) -> Plan:
-    """References that are written while it runs; buttons command the axes that they name."""
+    """Return a plan whose references are written during the run; buttons command their axes."""
     closed = np.array([machine.axes[a].force is None for a in plan.axes])
     for button in sorted(pilot.buttons, key=lambda button: button.at):
         column = _column(plan.axes, button.axis, "pilot.buttons")
         if button.axis in arm_axes(machine):
-            raise InputError("pilot.buttons", f"{button.axis} is moved by the joystick")
+            raise InputError(
+                "pilot.buttons", f"{button.axis} is controlled by the joystick; name another axis"
+            )
         plan.command[plan.time >= button.at, column] = button.command
         closed[column] = False
     pose = np.zeros((len(plan.time), max(4, len(arm_axes(machine)))))
@@ -182,7 +183,7 @@ def _teleoperated(plan: Plan, machine: Machine, pilot: TeleopPilot) -> Plan:
 
 def _column(axes: tuple[str, ...], name: str, where: str) -> int:
     if name not in axes:
-        raise InputError(where, f"{name!r} is no axis of the machine; {suggest(name, axes)}")
+        raise InputError(where, f"{name!r} is not an axis of the machine; {suggest(name, axes)}")
     return axes.index(name)
 
 
@@ -206,7 +207,7 @@ def _table(plan: Plan, pilot: TablePilot) -> Plan:
 
 
 def _fourier(plan: Plan, pilot: FourierPilot) -> Plan:
-    """References fade from the start: `start + s(t) (wave - start)` with a quintic s."""
+    """Return references with a fade-in: `start + s(t) (wave - start)` with a quintic s."""
     s, ds = quintic(plan.time, pilot.fade)
     omega = 2.0 * math.pi / pilot.period
     for name, harmonics in pilot.axes.items():
@@ -228,11 +229,11 @@ def _fourier(plan: Plan, pilot: FourierPilot) -> Plan:
 
 
 def quintic(time: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray]:
-    """Smooth step from 0 to 1 with zero speed and acceleration at both ends, and its rate.
+    """Return a smooth step from 0 to 1 with zero speed and acceleration at both ends, and its rate.
 
     Args:
-        time: (n,) [s].
-        duration: [s]; less than a microsecond gives a step that is done at once.
+        time: (n,) times [s].
+        duration: duration of the step [s]; below one microsecond the value is 1 everywhere.
 
     Returns:
         (s (n,) [1], ds/dt (n,) [1/s]).
@@ -247,7 +248,7 @@ def quintic(time: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _trapezoid(time: np.ndarray, distance: float, speed: float, acceleration: float):
-    """Speed (n,) of a move of this distance with a trapezoidal profile, and its duration."""
+    """Return the speed (n,) of a move with a trapezoidal profile, and its duration."""
     ramp = min(speed / acceleration, math.sqrt(distance / acceleration))
     cruise = distance / (ramp * acceleration) - ramp
     rise = np.clip(time / ramp, 0, 1) - np.clip((time - ramp - cruise) / ramp, 0, 1)
@@ -276,7 +277,7 @@ def _lines(plan: Plan, machine: Machine, pilot: LinesPilot) -> Plan:
     notes = cut_short(plan.time, lines_duration(pilot))
     if blocked:
         seconds = blocked * (plan.time[1] - plan.time[0])
-        notes += (f"resolved motion stood at the edge of the workspace for {seconds:.3g} s",)
+        notes += (f"resolved motion was held at the edge of the workspace for {seconds:.3g} s",)
     closed = np.ones(len(plan.axes), bool)
     return dataclasses.replace(plan, closed=closed, pose=pose, notes=notes)
 
@@ -297,7 +298,7 @@ def _rate_commands(time: np.ndarray, pilot: LinesPilot) -> np.ndarray:
 
 
 def lines_duration(pilot: LinesPilot) -> float:
-    """Time that a lines pilot needs for all its moves and pauses [s]."""
+    """Return the time that a lines pilot needs for all moves and pauses [s]."""
     total = pilot.settle
     for move in pilot.moves:
         total += move.pause + _move_duration(move, pilot.acceleration)
@@ -360,8 +361,8 @@ def _pose_path(machine, axes, here, target, s, ds, where: str) -> tuple[np.ndarr
         )
         if motion.blocked:
             raise InputError(
-                f"{where}.pose", f"its straight way leaves the workspace after {100 * part:.0f} %;"
-                " go there by another waypoint, or give joints",
+                f"{where}.pose", f"the straight path leaves the workspace after {100 * part:.0f} %;"
+                " add a waypoint, or give joints",
             )  # fmt: skip
         for name, value in joints.items():
             path[row, axes.index(name)] = value

@@ -1,11 +1,11 @@
 """Resolved motion in cylindrical coordinates (r, theta, z, attitude, head), by rate or position.
 
-Inverse kinematics gives the joint references and the inverse Jacobian their rates, so that no error
-is integrated. A step that would leave the reach or a joint's range is not made: the reference stays
-and `blocked` says so, until the command comes back to where it stands.
+`follow_pose` computes joint references by inverse kinematics and their rates by the inverse
+Jacobian, so that no error is integrated. If a step would leave the workspace or a joint range, the
+reference is held and `blocked` is set until the command returns to the held pose.
 
 `follow_rate` is the alternative of Zhu 1994, Eq. 2.1: joint rates by the inverse Jacobian at the
-measured joint angles, which are integrated to references. Errors of the direction accumulate.
+measured joint angles, integrated to references. Errors of the direction accumulate.
 """
 
 import dataclasses
@@ -33,19 +33,20 @@ from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Pose
 
 COORDINATES = ("r", "theta", "z", "attitude", "head")
-_NEAR = 0.02  # m or rad, about one control period of motion: a blocked reference must not jump
+_NEAR = 0.02  # m or rad, release distance of a blocked reference: about one control period
 
 
 @compiled
 def follow_pose(g, ranges, wanted, rate, blocked, pose, q, speed):
-    """Move joint references to a pose, or hold them where it cannot be reached.
+    """Move joint references to a pose, or hold them if it cannot be reached.
 
     Args:
         g: (9,) of `kinematics.task.arm_parameters`.
         ranges: (k, 2) joint ranges [rad].
-        wanted: (5,) pose asked for: r [m], theta [rad], z [m], attitude [rad], head [rad].
+        wanted: (5,) target pose: r [m], theta [rad], z [m], attitude [rad], head [rad].
         rate: (5,) its rate [m/s], [rad/s].
-        blocked: whether the last step was held, scalar; then only a pose near the held one frees.
+        blocked: whether the last step was held, scalar; then only a pose near the held one releases
+            the references.
         pose: (5,) pose of the references, updated.
         q: (k,) joint references, updated [rad].
         speed: (k,) their rates, written; 0 while held [rad/s].
@@ -82,14 +83,14 @@ def follow_pose(g, ranges, wanted, rate, blocked, pose, q, speed):
 
 @compiled
 def follow_rate(g, ranges, measured, rate, period, pose, q, speed):
-    """Integrate joint rates that the inverse Jacobian gives, or hold them at the edge.
+    """Integrate joint rates of the inverse Jacobian, or hold the references at a limit.
 
     Args:
         g: (9,) of `kinematics.task.arm_parameters`.
         ranges: (k, 2) joint ranges [rad].
-        measured: (k,) joint angles at which the Jacobian is taken [rad].
+        measured: (k,) joint angles at which the Jacobian is evaluated [rad].
         rate: (5,) rate of the pose [m/s], [rad/s].
-        period: over which it is integrated, scalar [s].
+        period: integration period, scalar [s].
         pose: (5,) pose of the references, updated [m], [rad].
         q: (k,) joint references, updated [rad].
         speed: (k,) their rates, written; 0 while held [rad/s].
@@ -126,12 +127,12 @@ class ResolvedMotion:
     """State of the resolved-motion controller.
 
     Attributes:
-        numbers: (9,) the arm, of `kinematics.task.arm_parameters`.
+        numbers: (9,) parameters of the arm, of `kinematics.task.arm_parameters`.
         axes: k axis names from swing outwards, 3 to 5.
         ranges: (k, 2) joint ranges [rad], same order.
         joints: (k,) joint references [rad], same order.
         pose: desired r [m], theta [rad], z [m], attitude [rad] and, with a head, its angle [rad].
-        blocked: whether the last step was stopped at the edge of the workspace.
+        blocked: whether the last step was held at a limit of the workspace.
     """
 
     numbers: np.ndarray
@@ -143,7 +144,7 @@ class ResolvedMotion:
 
     @staticmethod
     def begin(machine: Machine, joints: dict[str, float]) -> "ResolvedMotion":
-        """Start at the given axis positions [rad].
+        """Create a controller at the given axis positions [rad].
 
         Raises:
             InputError: the machine has no arm.
@@ -155,12 +156,12 @@ class ResolvedMotion:
         return ResolvedMotion(numbers, axes, ranges, q, tuple(pose[: max(4, len(axes))].tolist()))
 
     def rate_step(self, rate, dt: float) -> tuple["ResolvedMotion", dict, dict]:
-        """Move by a rate command held for dt.
+        """Move by a rate command that is constant for dt.
 
         Args:
             rate: (4,) or (5,) dr/dt [m/s], dtheta/dt [rad/s], dz/dt [m/s], dattitude/dt [rad/s],
                 dhead/dt [rad/s].
-            dt: [s].
+            dt: duration [s].
 
         Returns:
             (next state, axis -> position [rad], axis -> velocity [rad/s]).
@@ -169,11 +170,11 @@ class ResolvedMotion:
         return self.position_step(wanted, rate)
 
     def position_step(self, wanted, rate) -> tuple["ResolvedMotion", dict, dict]:
-        """Move to a pose, with its rate for feedforward.
+        """Move to a pose and convert its rate to joint rates.
 
         Args:
-            wanted: (4,) or (5,) r [m], theta [rad], z [m], attitude [rad], head [rad].
-            rate: its time derivative.
+            wanted: (4,) or (5,) target r [m], theta [rad], z [m], attitude [rad], head [rad].
+            rate: time derivative of the pose.
 
         Returns:
             (next state, axis -> position [rad], axis -> velocity [rad/s]).
@@ -200,7 +201,7 @@ def _five(values) -> np.ndarray:
 
 
 def arm_axes(machine: Machine) -> tuple[str, ...]:
-    """Axis names of the arm's joints, from swing outwards.
+    """Return the axis names of the arm's joints, from swing outwards.
 
     Raises:
         InputError: the machine has no arm, or a joint of its arm is not driven.
@@ -216,7 +217,9 @@ def arm_axes(machine: Machine) -> tuple[str, ...]:
 
 
 def arm_facts(machine: Machine) -> tuple[np.ndarray, tuple[str, ...], np.ndarray]:
-    """Numbers (9,) of the arm, its k axis names from swing outwards, joint ranges (k, 2) [rad].
+    """Return parameters (9,) of the arm, its k axis names, and its joint ranges (k, 2) [rad].
+
+    The axes are ordered from swing outwards.
 
     Raises:
         InputError: the machine has no arm, or a joint of its arm is not driven.
@@ -232,22 +235,22 @@ def arm_facts(machine: Machine) -> tuple[np.ndarray, tuple[str, ...], np.ndarray
 def pose_to_joints(
     machine: Machine, pose: Pose, here: dict[str, float], where: str = "pose"
 ) -> dict[str, float]:
-    """Axis positions that bring the tip to a pose.
+    """Solve the inverse kinematics of a pose of the tip.
 
-    The joint axes of a calibrated arm may be twisted out of its plane: an arm of three joints then
-    goes on from the plane's solution by Newton's method.
+    The joint axes of a calibrated arm may be twisted out of its plane. For an arm of three joints,
+    Newton's method then refines the solution of the planar arm.
 
     Args:
         machine: the machine.
-        pose: the pose; without `attitude` the tool keeps that of `here`.
-        here: axis -> present position [rad].
+        pose: target pose; without `attitude` the tool keeps that of `here`.
+        here: axis -> current position [rad].
         where: key path of the pose, for messages.
 
     Returns:
         Axis -> position [rad].
 
     Raises:
-        InputError: the pose is out of reach or beyond a joint's range.
+        InputError: the pose is out of reach or violates a joint range.
     """
     numbers, axes, ranges = arm_facts(machine)
     attitude, head = pose.attitude, pose.head
@@ -265,7 +268,7 @@ def pose_to_joints(
         if not low <= q <= high:
             raise InputError(
                 where,
-                f"needs {name} at {math.degrees(q):.1f} deg, which its joint allows only from"
+                f"needs {name} at {math.degrees(q):.1f} deg, but its joint range is"
                 f" {math.degrees(low):.1f} to {math.degrees(high):.1f} deg",
             )
     return dict(zip(axes, joints.tolist(), strict=True))
@@ -273,7 +276,7 @@ def pose_to_joints(
 
 def _why_not(machine: Machine, pose: np.ndarray) -> str:
     if len(pose) == 5:
-        return f"no joint angles bring the tool to r {pose[0]:.6g} m, z {pose[2]:.6g} m"
+        return f"the tool cannot reach r {pose[0]:.6g} m, z {pose[2]:.6g} m"
     try:
         inverse(arm_geometry(machine), pose.tolist())
     except Unreachable as error:

@@ -1,14 +1,15 @@
-"""Joint servo on valve commands: velocity feedforward, position feedback, dead-band compensation.
+"""Joint servo on valve commands: velocity feedforward, position feedback, deadband compensation.
 
-The wanted piston velocity becomes the valve opening that, at the pressures measured now, keeps the
-drive's force constant while the piston moves at that velocity. That holds through the compression
-of the oil when the direction changes, where a steady flow gain would be wrong by centimetres. Since
-it also takes away the damping that orifices give, the deviation of the force from what is expected
-is fed back as a velocity. Expected is its slow mean, or, with computed forces, what inverse
-dynamics asks for along the reference; then the oil that the change of that force compresses is fed
-forward, too, and a plain drive gets the force itself.
+The target piston velocity is converted to the valve opening that keeps the drive force constant at
+the measured pressures. This remains accurate during oil compression at reversals, where a
+steady-state flow gain causes errors of centimetres. It also removes the damping by the orifices, so
+the deviation of the force from its expected value is fed back as a velocity.
 
-References of the drives for one control period: moment arm and chamber volumes, from tables.
+The expected force is the slow mean of the force, or, with computed forces, the force by inverse
+dynamics along the reference. In the latter case the compression flow of that force's rate is fed
+forward as well, and a force drive receives the force itself.
+
+`drive_references` and `drive_row` compute moment arms and chamber volumes along the reference.
 """
 
 import math
@@ -25,14 +26,14 @@ from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Servo
 
 _FORCE, _MOTOR_OR_CYLINDER = 0.0, 1.0
-_CENTRE = 0.005  # opening over which the dead-band jump is spread, or noise would chatter across it
-_LEAST_PRESSURE = 0.02  # of the supply: a valve never counts as having less to drive its flow
+_CENTRE = 0.005  # opening over which the deadband jump is smoothed, to avoid chatter from noise
+_LEAST_PRESSURE = 0.02  # of the supply: smallest assumed pressure drop of a valve
 
 
 def servo_parameters(
     machine: Machine, axes: tuple[str, ...], servo: Servo, dt: float
 ) -> np.ndarray:
-    """Constants of the servo, one row per axis.
+    """Return the constants of the servo, one row per axis.
 
     Args:
         machine: the machine.
@@ -41,16 +42,16 @@ def servo_parameters(
         dt: control period [s].
 
     Returns:
-        (k, 14): hydraulic, area_head, area_rod, flow gain [m^3/(s sqrt(Pa))], dead band, tank [Pa],
-        command limit, drive gain, position gain [1/s], velocity gain, dead-band compensation,
+        (k, 14): hydraulic, area_head, area_rod, flow gain [m^3/(s sqrt(Pa))], deadband, tank [Pa],
+        command limit, drive gain, position gain [1/s], velocity gain, deadband compensation,
         load filter coefficient, bulk modulus [Pa], pressure feedback [1/s].
 
     Raises:
-        InputError: a gain is given for an axis that there is not.
+        InputError: a gain is given for an unknown axis.
     """
     rows = []
     if strange := set(servo.axis_gains) - set(axes):
-        message = f"{sorted(strange)[0]!r} is no axis of the machine; {suggest('', axes)}"
+        message = f"{sorted(strange)[0]!r} is not an axis of the machine; {suggest('', axes)}"
         raise InputError("servo.axis_gains", message)
     for name in axes:
         axis = machine.axes[name]
@@ -63,7 +64,7 @@ def servo_parameters(
             flow_gain = axis.valve.rated_flow / math.sqrt(axis.valve.rated_pressure_drop)
             facts = [_MOTOR_OR_CYLINDER, head, rod, flow_gain, axis.valve.deadband]
             rows.append([*facts, machine.supply.tank_pressure, 1.0, 0.0, *gains])
-        elif axis.pump:  # takes commands only, see `drive_references`
+        elif axis.pump:  # accepts commands only, see `drive_references`
             rows.append([_FORCE, 0, 0, 0, 0, 0, 1.0, 1.0, *gains])
         else:
             assert axis.force
@@ -72,11 +73,11 @@ def servo_parameters(
 
 
 class DriveReferences(NamedTuple):
-    """References of the drives, all (n, k).
+    """References of the drives along a plan, all (n, k).
 
     Attributes:
-        velocity: wanted velocity, ahead of time by the servo's lead [m/s] or [rad/s].
-        arm: d(drive)/d(joint) at the reference.
+        velocity: reference velocity, ahead of time by the servo's lead [m/s] or [rad/s].
+        arm: moment arm d(drive)/d(joint) at the reference.
         volume_head: head chamber volume at the reference [m^3].
         volume_rod: rod chamber volume at the reference [m^3].
     """
@@ -88,18 +89,18 @@ class DriveReferences(NamedTuple):
 
 
 def drive_references(machine: Machine, plan: Plan, servo: Servo) -> DriveReferences:
-    """Wanted drive velocities, moment arms and chamber volumes along a plan.
+    """Compute drive velocities, moment arms and chamber volumes along a plan.
 
     Args:
         machine: the machine.
         plan: joint references.
-        servo: `lead` [s] makes up for the spool's lag, `feedforward` scales.
+        servo: `lead` [s] compensates for the spool's lag, `feedforward` scales the velocities.
 
     Returns:
         The references.
 
     Raises:
-        InputError: the plan moves an axis with a pump of its own.
+        InputError: the plan has a reference for an axis with its own pump.
     """
     velocity, arm = np.zeros_like(plan.reference), np.ones_like(plan.reference)
     head, rod = np.ones_like(plan.reference), np.ones_like(plan.reference)
@@ -108,7 +109,7 @@ def drive_references(machine: Machine, plan: Plan, servo: Servo) -> DriveReferen
         if not plan.closed[column]:
             continue
         if machine.axes[name].pump:
-            message = f"{name} has a pump of its own, which the servo does not move"
+            message = f"{name} has its own pump, which the servo does not control"
             raise InputError("pilot", f"{message}: give its commands (kind: table, of: command)")
         linkage = axis_linkage(machine, name)
         arm[:, column] = linkage.rate(plan.reference[:, column])
@@ -127,9 +128,9 @@ def drive_references(machine: Machine, plan: Plan, servo: Servo) -> DriveReferen
 def feedforward_opening(
     velocity, head, rod, supply, tank, area_head, area_rod, volume_head, volume_rod, flow_gain
 ):
-    """Valve opening at which a piston keeps a velocity without its force changing.
+    """Compute the valve opening at which a piston moves at a velocity with constant force.
 
-    `A_h p_A' = A_r p_B'` with the orifice flows at the present pressures gives
+    `A_h p_A' = A_r p_B'` with the orifice flows at the given pressures gives
     `o = v (A_h^2/V_A + A_r^2/V_B) / (k (A_h/V_A sqrt(dp_in) + A_r/V_B sqrt(dp_out)))`.
 
     Args:
@@ -165,10 +166,10 @@ class DriveReference(NamedTuple):
     """References of k drives for one control period, as `drive_row` writes them.
 
     Attributes:
-        velocity: (k,) reference velocity ahead [m/s] or [rad/s].
-        arm: (k,) d(drive)/d(joint) at the reference.
-        volume_head: (k,) [m^3].
-        volume_rod: (k,) [m^3].
+        velocity: (k,) reference velocity, ahead of time [m/s] or [rad/s].
+        arm: (k,) moment arm d(drive)/d(joint) at the reference.
+        volume_head: (k,) head chamber volume [m^3].
+        volume_rod: (k,) rod chamber volume [m^3].
     """
 
     velocity: np.ndarray
@@ -185,7 +186,7 @@ class Measured(NamedTuple):
         rate: (k,) joint velocities [rad/s] or [m/s].
         head: (k,) head-side pressures [Pa].
         rod: (k,) rod-side pressures [Pa].
-        supply: supply pressure [Pa], one number per row where there are many.
+        supply: supply pressure [Pa], one value per row if there are several rows.
     """
 
     joint: np.ndarray
@@ -196,12 +197,12 @@ class Measured(NamedTuple):
 
 
 class ComputedForce(NamedTuple):
-    """Drive forces that inverse dynamics asks for.
+    """Drive forces by inverse dynamics at one control tick.
 
     Attributes:
-        known: whether they were computed; the arrays count only then.
-        force: (k,) of now [N] or [N m].
-        rate: (k,) rate of change, ahead as the velocity [N/s] or [N m/s].
+        known: whether they were computed; otherwise the arrays are not used.
+        force: (k,) current forces [N] or [N m].
+        rate: (k,) rate of change, ahead of time as the velocity [N/s] or [N m/s].
     """
 
     known: bool
@@ -210,12 +211,12 @@ class ComputedForce(NamedTuple):
 
 
 class ForceReferences(NamedTuple):
-    """Forces of the drives along a plan, (n, k) each.
+    """Drive forces by inverse dynamics along a plan, (n, k) each.
 
     Attributes:
         known: whether they were computed.
-        force: [N] or [N m]; 0 where not computed.
-        rate: its rate of change, ahead of time by the servo's lead [N/s] or [N m/s].
+        force: forces [N] or [N m]; 0 if not computed.
+        rate: rates of change, ahead of time by the servo's lead [N/s] or [N m/s].
     """
 
     known: bool
@@ -225,13 +226,13 @@ class ForceReferences(NamedTuple):
 
 @compiled
 def servo_step(parameters, closed, drive, reference, measured, load, computed, out):
-    """Commands of all axes for one control period.
+    """Compute the commands of all axes for one control period.
 
     Args:
         parameters: (k, 14) of `servo_parameters`.
         closed: (k,) whether the axis is under feedback; the others keep `out`.
         drive: DriveReference.
-        reference: (k,) joint reference when the joint was measured [rad] or [m].
+        reference: (k,) joint reference at the time of the joint measurement [rad] or [m].
         measured: Measured.
         load: (k,) slow mean of the drive force, updated [N] or [N m].
         computed: ComputedForce.
@@ -277,13 +278,13 @@ def servo_step(parameters, closed, drive, reference, measured, load, computed, o
         out[i] = min(1.0, max(-1.0, command))
 
 
-POINTS = 4001  # over a joint's range: interpolation is good to some 1e-7 of a moment arm
+POINTS = 4001  # over a joint's range: interpolation is accurate to about 1e-7 of a moment arm
 _LOW, _STEP = range(2)
-_WIDE = 1.0  # rad or m, of a joint without a range, whose drive is direct
+_WIDE = 1.0  # rad or m, half range for a joint without a range; its drive is direct
 
 
 def drive_tables(machine: Machine, axes: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Moment arms and chamber volumes over the joints' ranges.
+    """Tabulate moment arms and chamber volumes over the joints' ranges.
 
     Args:
         machine: the machine.
@@ -311,18 +312,18 @@ def drive_tables(machine: Machine, axes: tuple[str, ...]) -> tuple[np.ndarray, n
 
 @compiled
 def drive_row(grid, table, reference, rate, scale, velocity, arm, volume_head, volume_rod):
-    """Drive references of one period.
+    """Compute the drive references of one control period from tables.
 
     Args:
         grid: (k, 2) of `drive_tables`.
         table: (k, POINTS, 3) of `drive_tables`.
         reference: (k,) joint references [rad] or [m].
-        rate: (k,) their rates [rad/s] or [m/s].
-        scale: of the velocities, the servo's feedforward; scalar.
-        velocity: (k,) written: wanted drive velocity [m/s] or [rad/s].
-        arm: (k,) written: d(drive)/d(joint).
-        volume_head: (k,) written [m^3].
-        volume_rod: (k,) written [m^3].
+        rate: (k,) rates of the references [rad/s] or [m/s].
+        scale: factor of the velocities, the servo's feedforward; scalar.
+        velocity: (k,) written: reference drive velocity [m/s] or [rad/s].
+        arm: (k,) written: moment arm d(drive)/d(joint).
+        volume_head: (k,) written: head chamber volume [m^3].
+        volume_rod: (k,) written: rod chamber volume [m^3].
 
     Returns:
         Nothing.

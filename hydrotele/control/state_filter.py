@@ -1,8 +1,8 @@
-"""State-variable filter: a signal's low-pass with its first two derivatives, causal.
+"""Causal state-variable filter: low-pass of a signal with its first two derivatives.
 
-All signals that a balance needs go through the same filter, so that they are equally late: a sum of
-signals and derivatives that is zero stays zero. Between two readings a signal is taken as a
-straight line, which is exact for what ramps, and finite for one that is held.
+All signals of a force balance pass the same filter and have equal delay, so that a zero sum of
+signals and derivatives stays zero. Between two readings a signal is interpolated linearly, which is
+exact for ramps and keeps the derivatives of held signals finite.
 """
 
 import math
@@ -13,21 +13,21 @@ from hydrotele.core.compiled import allocation_free, compiled
 
 LOW, RATE, CHANGE, LAST = range(4)  # columns of a filter's state
 _NEGLIGIBLE = 1.0e-12
-_REAL, _SQUARE, _CUBE = 2.0, 2.0, 1.0  # Butterworth's polynomial of third order
+_REAL, _SQUARE, _CUBE = 2.0, 2.0, 1.0  # coefficients of the third-order Butterworth polynomial
 
 
 def filter_table(bandwidth: float, period: float) -> np.ndarray:
-    """One step of the filter as a table.
+    """Return the matrix of one filter step.
 
-    `y''' = w^3 (u - y) - 2 w^2 y' - 2 w y''` (Butterworth), solved exactly for u that runs straight
-    from the last reading to the new one.
+    The filter is `y''' = w^3 (u - y) - 2 w^2 y' - 2 w y''` (Butterworth). It is solved exactly for
+    an input u that is linear between the last and the new reading.
 
     Args:
         bandwidth: w / (2 pi), scalar [Hz], > 0.
         period: time between two calls, scalar [s], > 0.
 
     Returns:
-        (3, 5): new y, y', y'' from the old three, the last and the new reading.
+        (3, 5) matrix from old y, y', y'', last and new reading to new y, y', y''.
 
     Source: Butterworth's filter; Franklin, Powell and Workman 1998, Digital control, section 6.3
     (triangle hold).
@@ -35,13 +35,13 @@ def filter_table(bandwidth: float, period: float) -> np.ndarray:
     >>> filter_table(1.0, 0.01)[:, 3:].sum(axis=1).round(4) + 0.0  # a step of both readings
     array([0.    , 0.0119, 2.3279])
     """
-    from scipy.linalg import expm  # a third of a second that most runs do not need
+    from scipy.linalg import expm  # this import takes a third of a second
 
     w = 2.0 * math.pi * bandwidth
     block = np.zeros((5, 5))
     block[0, 1] = block[1, 2] = block[3, 4] = 1.0
     block[2] = -_CUBE * w**3, -_SQUARE * w**2, -_REAL * w, _CUBE * w**3, 0.0
-    scale = np.diag([1.0, w, w**2, 1.0, 1.0])  # or the exponential would lose digits
+    scale = np.diag([1.0, w, w**2, 1.0, 1.0])  # keeps the matrix exponential accurate
     block[3, 4] = 1.0 / period
     step = scale @ expm(np.linalg.inv(scale) @ block @ scale * period) @ np.linalg.inv(scale)
     table = step[:3].copy()
@@ -50,12 +50,12 @@ def filter_table(bandwidth: float, period: float) -> np.ndarray:
 
 
 def filter_delay(bandwidth: float) -> float:
-    """Delay [s] that the filter gives slow changes, for its bandwidth [Hz]: 2 / w."""
+    """Return the delay 2 / w [s] of the filter for slow changes, from its bandwidth [Hz]."""
     return _SQUARE / (2.0 * math.pi * bandwidth)
 
 
 def butterworth(bandwidth: float, s: np.ndarray) -> np.ndarray:
-    """Transfer function of the filter for readings that run straight from one to the next.
+    """Return the transfer function of the filter for linearly interpolated readings.
 
     Args:
         bandwidth: w / (2 pi), scalar [Hz], > 0.
@@ -74,15 +74,15 @@ def butterworth(bandwidth: float, s: np.ndarray) -> np.ndarray:
 
 
 def noise_gains(table: np.ndarray) -> np.ndarray:
-    """Standard deviations of y, y', y'' for white readings of standard deviation 1.
+    """Return the standard deviations of y, y', y'' for white readings of standard deviation 1.
 
     Args:
         table: (3, 5) of `filter_table`.
 
     Returns:
-        (3,) [1], [1/s], [1/s^2].
+        (3,) standard deviations [1], [1/s], [1/s^2].
 
-    Source: response to a single reading.
+    Source: root of the summed squares of the response to a single reading.
     """
     state, last, total = np.zeros(3), 1.0, table[:, 4] ** 2
     state += table[:, 4]
@@ -94,7 +94,7 @@ def noise_gains(table: np.ndarray) -> np.ndarray:
 
 @allocation_free
 def filter_step(table, state, reading):
-    """Take in the next reading of one signal.
+    """Update the filter state of one signal with the next reading.
 
     Args:
         table: (3, 5) of `filter_table`.
@@ -120,7 +120,7 @@ def filter_step(table, state, reading):
 
 @compiled
 def filtered(table, readings):
-    """A whole signal through the filter, which stands at the first reading.
+    """Filter a whole signal, with the filter initially at rest at the first reading.
 
     Args:
         table: (3, 5) of `filter_table`.

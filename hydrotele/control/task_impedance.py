@@ -1,6 +1,7 @@
-"""Stiffness, damping and mass of the task, identified while the machine touches it.
+"""Online identification of stiffness, damping and mass of the task during contact.
 
-Recursive least squares with forgetting and resetting.
+`RecursiveLeastSquares` estimates parameters with forgetting and covariance resetting.
+`TaskImpedance` applies it to the force and position of the tip.
 """
 
 import numpy as np
@@ -12,32 +13,34 @@ _WHERE = "recursive least squares"
 
 
 class RecursiveLeastSquares:
-    """Parameters of `y = phi . theta`, updated with every equation.
+    """Recursive least squares for `y = phi . theta` with forgetting and covariance resetting.
 
-    A forgetting factor below 1 lets the past fade, so that parameters may drift. Where nothing
-    moves, forgetting would let the covariance grow without end: its trace is bounded. A sudden
-    change, an error many times as large as usual, opens the covariance again.
+    A forgetting factor below 1 reduces the weight of old equations, so that parameters may drift.
+    Without excitation, forgetting would increase the covariance without limit, so its trace is
+    bounded. A sudden change, an error many times larger than usual, resets the covariance.
     """
 
     def __init__(
         self, start: np.ndarray, spread: np.ndarray, *, forgetting: float = 1.0,
         reset: float = np.inf,
     ):  # fmt: skip
-        """Begin.
+        """Set the initial parameters and their covariance.
 
         Args:
-            start: (p,) parameters.
+            start: (p,) initial parameters.
             spread: (p,) their standard deviations, in units of the equations' error.
-            forgetting: share of the past that is kept from one equation to the next, above 0, at
-                most 1.
-            reset: times the usual error beyond which the covariance is opened again.
+            forgetting: forgetting factor per equation, above 0, at most 1.
+            reset: multiple of the usual error above which the covariance is reset.
 
         Raises:
-            InputError: sizes do not fit or a number makes no sense.
+            InputError: sizes do not match or a value is invalid.
         """
         self.value, spread = np.array(start, float), np.array(spread, float)
         if self.value.ndim != 1 or spread.shape != self.value.shape or not np.all(spread > 0.0):
-            raise InputError(_WHERE, f"{len(self.value)} parameters need as many spreads above 0")
+            raise InputError(
+                _WHERE,
+                f"{len(self.value)} parameters need as many standard deviations, all above 0",
+            )
         if not 0.0 < forgetting <= 1.0:
             raise InputError(_WHERE, f"forgetting must be above 0 and at most 1: {forgetting}")
         if not reset > 1.0:
@@ -49,14 +52,14 @@ class RecursiveLeastSquares:
         self._usual, self._count = 0.0, 0
 
     def update(self, row: np.ndarray, measured: float) -> float:
-        """Take in one equation; one that is not finite is left out.
+        """Update the parameters with one equation; skip it if it is not finite.
 
         Args:
             row: (p,) phi.
             measured: y.
 
         Returns:
-            The error before the update; NaN of an equation that was left out.
+            The prediction error before the update; NaN if the equation was skipped.
 
         Source: Ljung 1999, System identification, 11.2 (forgetting); Zhu 1994, 3.74 and 6.1.
         """
@@ -78,45 +81,45 @@ class RecursiveLeastSquares:
         return error
 
     def _sudden(self, error: float) -> bool:
-        """Whether an error is far beyond the usual ones, which it then does not join."""
+        """Return whether an error is far above the usual size; otherwise update that size."""
         known = self._count >= 5 * len(self.value)
         if known and error**2 > self._reset**2 * self._usual:
             return True
         self._count += 1
         share = max(1.0 / self._count, 0.02)
-        if self._count > 2 * len(self.value):  # the first ones tell of the start only
+        if self._count > 2 * len(self.value):  # the first errors depend on the initial parameters
             self._usual += share * (error**2 - self._usual)
         return False
 
 
-_TOUCHING = 500.0  # N: less is no task, but what is left of the estimate in free motion
-# of stiffness [kN/m], damping [kN s/m], mass [t] and offset [kN] before any data
+_TOUCHING = 500.0  # N, smallest contact force: above the error of the estimate in free motion
+# initial standard deviations of stiffness [kN/m], damping [kN s/m], mass [t] and offset [kN]
 _SPREAD = (3e3, 3e3, 30.0, 30.0)
-_FORGET = 0.99  # per sample: some two seconds at 50 Hz
-_RESET = 8.0  # times the usual error
+_FORGET = 0.99  # forgetting factor per sample: about two seconds at 50 Hz
+_RESET = 8.0  # multiple of the usual error that resets the covariance
 
 
 class TaskImpedance:
-    """Recursive least squares of `F = -(K x + B v + M a + c)` along every task coordinate.
+    """Estimator of `F = -(K x + B v + M a + c)` along every task coordinate.
 
-    Force, place, rate and acceleration go through the same filters, so that they are equally late.
+    Force, position, rate and acceleration pass the same filters, so that they have equal delay.
 
     Attributes:
-        stiffness: (k,) K [N/m], [N m/rad]; 0 while nothing is touched.
-        damping: (k,) B [N s/m], [N m s/rad].
-        mass: (k,) M [kg], [kg m^2].
+        stiffness: (k,) K [N/m], [N m/rad]; 0 without contact.
+        damping: (k,) B [N s/m], [N m s/rad]; 0 without contact.
+        mass: (k,) M [kg], [kg m^2]; 0 without contact.
     """
 
     def __init__(
         self, coordinates: int, period: float, bandwidths: tuple[float, ...], *, late: bool
     ) -> None:
-        """Begin with a free task.
+        """Start without contact.
 
         Args:
-            coordinates: their number, k.
-            period: between two samples [s].
-            bandwidths: of the filters, one after the other [Hz].
-            late: whether the force comes through these filters already.
+            coordinates: number k of task coordinates.
+            period: time between two samples [s].
+            bandwidths: bandwidths of the filters in series [Hz].
+            late: whether the force has already passed these filters.
         """
         self.stiffness, self.damping = np.zeros(coordinates), np.zeros(coordinates)
         self.mass = np.zeros(coordinates)
@@ -127,11 +130,11 @@ class TaskImpedance:
         self._force = None if late else self._place.copy()
 
     def update(self, force: np.ndarray, pose: np.ndarray) -> None:
-        """Take in one sample.
+        """Update the estimate with one sample; skip it if it is not finite.
 
         Args:
-            force: (k,) of the environment on the tip [N], [N m].
-            pose: (k,) of the tip [m], [rad]; a sample that is not finite is left out.
+            force: (k,) force of the environment on the tip [N], [N m].
+            pose: (k,) pose of the tip [m], [rad].
 
         Source: Zhu 1994, 3.73-3.76 (mass, damping, stiffness; forgetting and resetting).
         """
@@ -145,7 +148,7 @@ class TaskImpedance:
             self._fit(c, felt, *motion)
 
     def _filtered(self, states: np.ndarray, c: int, reading: float) -> tuple[float, float, float]:
-        """The reading's low-pass with two derivatives; filters stand at the first one."""
+        """Return the filtered reading with two derivatives; filters start at the first reading."""
         for table, state in zip(self._tables, states[:, c], strict=True):
             if np.isnan(state[LOW]):
                 state[:] = 0.0
@@ -155,7 +158,7 @@ class TaskImpedance:
         return reading, rate, change
 
     def _fit(self, c: int, force: float, place: float, rate: float, change: float) -> None:
-        """One equation of one coordinate."""
+        """Update one coordinate with one equation; reset it without contact."""
         if not abs(force) > _TOUCHING:
             self._fits[c] = None
             self.stiffness[c] = self.damping[c] = self.mass[c] = 0.0

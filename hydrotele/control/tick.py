@@ -1,7 +1,6 @@
-"""One control tick: the servo, the physics that its commands drive, and the next readings.
+"""One control tick: servo, physics steps with its commands, and the next sensor readings.
 
-Scenario runs and environments share it; what they follow, a plan or the actions of an agent, is
-written into the references before.
+Scenario runs and environments share it. The references come from a plan or from an agent's actions.
 """
 
 from typing import NamedTuple
@@ -23,7 +22,7 @@ from hydrotele.simulate.stepping import simulation, step_physics
 
 
 class Controller(NamedTuple):
-    """Servo of k axes.
+    """State and parameters of the servo of k axes.
 
     Attributes:
         parameters: (k, 14) of `control.servo.servo_parameters`.
@@ -39,13 +38,13 @@ class Controller(NamedTuple):
 
 
 class TickReference(NamedTuple):
-    """What k axes are to do in one tick.
+    """References of k axes in one tick.
 
     Attributes:
-        joint: (k,) references when the joints were measured [rad] or [m].
-        drive: of the drives.
-        computed: forces that inverse dynamics asks for.
-        stopped: whether all commands are 0 whatever the servo says.
+        joint: (k,) joint references at the time of the measurement [rad] or [m].
+        drive: references of the drives.
+        computed: drive forces by inverse dynamics.
+        stopped: whether all commands are set to 0.
     """
 
     joint: np.ndarray
@@ -56,7 +55,7 @@ class TickReference(NamedTuple):
 
 @compiled
 def control_tick(sim, tick, steps, controller, reference, measured):
-    """Commands of all axes by the servo, and the physics of the tick under them.
+    """Compute the servo commands of all axes and step the physics through one tick.
 
     Args:
         sim: Simulation.
@@ -82,15 +81,15 @@ def control_tick(sim, tick, steps, controller, reference, measured):
 
 
 class Planned(NamedTuple):
-    """A run along a plan of n ticks and k axes.
+    """Data of a run along a plan of n ticks and k axes.
 
     Attributes:
-        controller: its servo.
-        feedback: its sensors.
-        drives: (n, k) each, references of the drives.
-        forces: (n, k) each, computed forces.
+        controller: the servo.
+        feedback: the sensors.
+        drives: references of the drives, (n, k) each.
+        forces: computed forces, (n, k) each.
         reference: (n, k) joint references [rad] or [m].
-        command: (n, k) commands of the axes that are not closed [1], or in the drives' units.
+        command: (n, k) commands of the axes without feedback [1], or in the drives' units.
         given: (n, k) written: commands of every tick.
     """
 
@@ -114,11 +113,11 @@ PLANNED = np.dtype(
     + [(name, _I) for name in ("force", "force_rate", "reference", "planned_command", "given")],
     align=True,
 )
-"""Record of a Planned."""
+"""Record type of a `Planned`: sizes, scalars and array addresses."""
 
 
 def planned_record(run: Planned) -> np.ndarray:
-    """(1,) record of a Planned whose arrays must outlive it."""
+    """Return a record (1,) of a `Planned`; its arrays must outlive it."""
     table, controller = run.feedback, run.controller
     arrays = {
         "parameters": controller.parameters, "closed": controller.closed, "load": controller.load,
@@ -136,7 +135,7 @@ def planned_record(run: Planned) -> np.ndarray:
 
 @compiled
 def _planned(r):
-    """The Planned of a record."""
+    """Return the `Planned` of a record."""
     n, k, c = r.ticks, r.axes, r.channels
     controller = Controller(
         rows_of(r.parameters, k, _SERVO), integers(r.closed, k), floats(r.load, k),
@@ -165,7 +164,7 @@ def _planned(r):
 
 @compiled
 def planned_tick(simulated, planned, tick, steps, stopped):
-    """Go on by one tick and take the readings that are due after it.
+    """Simulate one tick and sample the sensors that are due after it.
 
     Args:
         simulated: record of `simulate.stepping.simulation_record`.

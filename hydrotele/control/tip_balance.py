@@ -1,6 +1,8 @@
-"""Forces on an arm from outside: what its motion needs, less what its drives give.
+"""External forces on an arm: the forces that its motion needs minus the forces of its drives.
 
-Tables of an arm in its machine, and which arms can be felt through their drives.
+`dynamic_balance` uses the complete model, `static_balance` only gravity. `tip_force` converts the
+result to a force at the tip. `arm_tables` prepares an arm, and `free_axes` checks that its tip
+force can be estimated from its drives.
 """
 
 import math
@@ -30,14 +32,14 @@ from hydrotele.multibody.reduced_mechanism import (
 )
 
 _AH, _AR = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)
-_ODDS = 8.0
-_SINGULAR = 1.0e-6  # pivot against the largest entry
+_ODDS = 8.0  # velocity range of a moving drive over sqrt(2 pi) times the noise
+_SINGULAR = 1.0e-6  # pivot over largest entry, below which a Jacobian is singular
 
 
 class BalanceModel(NamedTuple):
-    """What is needed of `estimate.reduced_model.Model`, whose attributes these are.
+    """Required attributes of `estimate.reduced_model.Model`.
 
-    Every array that Python hands over costs a tenth of a microsecond.
+    Passing an array from Python takes a tenth of a microsecond.
     """
 
     mech: ReducedMechanism
@@ -48,7 +50,7 @@ class BalanceModel(NamedTuple):
 
 
 class BalanceSpace(NamedTuple):
-    """What is needed of `estimate.reduced_model.Space`, whose attributes these are."""
+    """Required attributes of `estimate.reduced_model.Space`."""
 
     motion: ReducedMotion
     drive: np.ndarray
@@ -56,21 +58,21 @@ class BalanceSpace(NamedTuple):
 
 
 class ArmBalance(NamedTuple):
-    """An arm in its machine, without transmissions: m joints, n independent coordinates.
+    """Model and state of an arm without transmissions: m joints, n independent coordinates.
 
     Attributes:
-        model: the machine.
-        space: its work space.
-        z: (2 n + 4 h,) state of the model: positions, rates, and four numbers per valve, of which
+        model: model of the machine.
+        space: work arrays of the model.
+        z: (2 n + 4 h,) state of the model: positions, rates, and four values per valve, of which
             the last two are its pressures [Pa].
         joint: (m,) independent coordinate of every joint, swing first.
         task: (9,) of `kinematics.task.arm_parameters`.
         gravity: (p,) parameters of the static model [N m].
-        acceleration: (n,) of the independent coordinates.
-        rate_noise: (n,) standard deviation of the independent coordinates' rates.
-        angle: (m,) work space.
-        table: (m, m) work space.
-        work: (n,) work space.
+        acceleration: (n,) accelerations of the independent coordinates [rad/s^2] or [m/s^2].
+        rate_noise: (n,) standard deviations of their rates [rad/s] or [m/s].
+        angle: (m,) work array.
+        table: (m, m) work array.
+        work: (n,) work array.
     """
 
     model: BalanceModel
@@ -94,7 +96,7 @@ _ARRAYS = {
     "arm": ("z", "joint", "task", "gravity", "acceleration", "rate_noise", "angle", "table",
             "work"),
 }  # fmt: skip
-# Arrays of ArmBalance and of its parts, whose addresses a record has.
+# fields of a record that hold the addresses of the arrays of ArmBalance and its parts
 _ADDRESSES = [f"{part}_{name}" for part, names in _ARRAYS.items() for name in names]
 _ARM = np.dtype(
     [(name, np.int64) for name in ("links", "bars", "hydraulic", "frames", "coordinates", "free")]
@@ -106,7 +108,7 @@ _ARM = np.dtype(
 
 
 def arm_record(arm: ArmBalance) -> np.ndarray:
-    """(1,) record of an ArmBalance whose arrays must outlive it; `arm_of` reads it."""
+    """Return a record (1,) of an ArmBalance for `arm_of`; the arrays must outlive it."""
     mech, motion = arm.model.mech, arm.space.motion
     parts = {"mech": mech, "model": arm.model, "motion": motion, "space": arm.space, "arm": arm}
     arrays = {f"{p}_{n}": getattr(parts[p], n) for p, names in _ARRAYS.items() for n in names}
@@ -126,7 +128,7 @@ def arm_record(arm: ArmBalance) -> np.ndarray:
 
 @compiled
 def arm_of(r):
-    """The ArmBalance of a record of `arm_record`."""
+    """Return the ArmBalance of a record of `arm_record`."""
     f, c, n, m = r.frames, r.coordinates, r.free, r.joints
     mech = ReducedMechanism(
         integers(r.mech_tree, 4 * f).reshape((f, 4)), rows_of(r.mech_shape, f, r.shape_width),
@@ -159,13 +161,13 @@ def arm_of(r):
 
 @allocation_free
 def dynamic_balance(arm, outside):
-    """Forces from outside by the complete model: inertia, gravity, friction, closed chains.
+    """Compute external forces by the complete model: inertia, gravity, friction, closed chains.
 
     `tau = B' (M (B q'' + d) + h + D q') - sum r_i (F_i - f_i(v_i))`
 
     Args:
         arm: ArmBalance; z and acceleration are read.
-        outside: (n,) written: forces on the independent coordinates [N m] or [N].
+        outside: (n,) written: external forces on the independent coordinates [N m] or [N].
 
     Returns:
         Nothing.
@@ -192,14 +194,14 @@ def dynamic_balance(arm, outside):
 
 @allocation_free
 def static_balance(arm, outside):
-    """Forces from outside by the static model of gravity alone.
+    """Compute external forces by the static model, which includes only gravity.
 
     `tau = Y(q) P - sum r_i F_i`
 
     Args:
         arm: ArmBalance; z and gravity are read.
-        outside: (n,) written: forces on the independent coordinates [N m]; those of joints that
-            are not the arm's without gravity.
+        outside: (n,) written: external forces on the independent coordinates [N m]; without gravity
+            for joints that do not belong to the arm.
 
     Returns:
         Nothing.
@@ -216,14 +218,14 @@ def static_balance(arm, outside):
 
 @allocation_free
 def moving(velocity, variance):
-    """Probability that a drive moves, given what is read of its velocity.
+    """Return the probability that a drive moves, given its measured velocity.
 
-    Standing and moving are equally likely beforehand, and a moving drive has any velocity of a
-    range that is ODDS sqrt(2 pi) times as wide as the noise.
+    Rest and motion have equal prior probability. The velocity of a moving drive is uniform over a
+    range of _ODDS sqrt(2 pi) times the noise.
 
     Args:
-        velocity: scalar [m/s] or [rad/s].
-        variance: of its noise, scalar [m^2/s^2] or [rad^2/s^2]; 0 where it is known.
+        velocity: measured velocity, scalar [m/s] or [rad/s].
+        variance: variance of its noise, scalar [m^2/s^2] or [rad^2/s^2]; 0 if exact.
 
     Returns:
         Probability, scalar [1].
@@ -240,7 +242,7 @@ def moving(velocity, variance):
 
 @allocation_free
 def _subtract_drives(arm, rubbing, outside):
-    """Take what the drives give off the forces outside."""
+    """Subtract the drive forces from the external forces."""
     model, sp, n = arm.model, arm.space, len(outside)
     for i in range(model.hydraulic):
         u, a = i * SLOTS, 2 * n + 4 * i
@@ -257,10 +259,11 @@ def _subtract_drives(arm, rubbing, outside):
 
 @allocation_free
 def static_torque(q, joint, gravity, i):
-    """Torque that gravity asks of a joint of the arm.
+    """Return the gravity torque of a joint of the arm.
 
-    Every bending link has two parameters, of the cosine and of the sine of its attitude, which act
-    on all joints before it; the seventh turns with the head of a feller-buncher.
+    Each link from the boom outwards has two parameters, for the cosine and the sine of its
+    attitude, which act on all joints before it. The seventh parameter belongs to the head of a
+    feller-buncher.
 
     Args:
         q: (>= n,) positions of the independent coordinates [rad].
@@ -291,16 +294,16 @@ def static_torque(q, joint, gravity, i):
 
 @allocation_free
 def tip_force(arm, outside, out):
-    """Force at the tip that gives the forces outside.
+    """Compute the force at the tip from external forces on the coordinates.
 
     Args:
-        arm: ArmBalance; z is read, table and work are destroyed.
-        outside: (n,) forces on the independent coordinates from outside [N m] or [N].
-        out: (m,) written: r [N], theta [N m], z [N], then attitude and head [N m]; left alone
-            where the Jacobian is singular.
+        arm: ArmBalance; z is read, table and work are overwritten.
+        outside: (n,) external forces on the independent coordinates [N m] or [N].
+        out: (m,) written: r [N], theta [N m], z [N], then attitude and head [N m]; unchanged if the
+            Jacobian is singular.
 
     Returns:
-        Whether it was written.
+        Whether `out` was written.
 
     Source: Zhu 1994, 6.6: `F = J^-T tau`.
     """
@@ -323,7 +326,7 @@ def tip_force(arm, outside, out):
 
 @allocation_free
 def _eliminated(table, right, m, least):
-    """Solve by elimination, in place; False where a pivot is less than the least."""
+    """Solve linear equations in place by elimination; return False if a pivot is below `least`."""
     for i in range(m):
         best = i
         for r in range(i + 1, m):
@@ -347,57 +350,57 @@ def _eliminated(table, right, m, least):
 
 
 def arm_joints(machine: Machine) -> tuple[str, ...]:
-    """Joints of the arm from swing outwards.
+    """Return the joints of the arm from swing outwards.
 
     Raises:
         InputError: the machine has no arm.
     """
     arm = machine.arm
     if arm is None:
-        raise InputError(f"machine {machine.name}", "has no arm, so there is no tip to feel with")
+        raise InputError(f"machine {machine.name}", "has no arm, so there is no tip force")
     return tuple(j for j in (arm.swing, arm.boom, arm.stick, arm.tool, arm.head) if j)
 
 
 def gravity_size(joints: int) -> int:
-    """Number of parameters of the static model of an arm with that many joints."""
+    """Return the number of parameters of the static model of an arm with that many joints."""
     return 7 if joints == 5 else 2 * (joints - 1)
 
 
 def free_axes(machine: Machine, where: str) -> tuple[str, ...]:
-    """Axes of the independent coordinates, all of which must be driven, those of the arm by valves.
+    """Return the axes of the independent coordinates.
 
     Args:
         machine: the machine.
-        where: who asks, for messages.
+        where: name of the caller, for messages.
 
     Returns:
         Axis names in the order of the coordinates.
 
     Raises:
-        InputError: names the joints that cannot be felt.
+        InputError: a coordinate is not driven, or a joint of the arm is not driven by a valve.
     """
     names, driver = coordinate_names(machine), {a.joint: n for n, a in machine.axes.items()}
     free = [names[i] for i in reduced_model(machine, ()).mech.free]
     if loose := [joint for joint in free if joint not in driver]:
-        raise InputError(where, f"no drive holds {', '.join(loose)}: their motion is not measured")
+        raise InputError(where, f"{', '.join(loose)} has no drive: its motion is not measured")
     joints = arm_joints(machine)
     if plain := [joint for joint in joints if driver[joint] not in machine.hydraulic_axes]:
-        raise InputError(where, f"no valve drives {', '.join(plain)}: their torque is not measured")
+        raise InputError(where, f"{', '.join(plain)} has no valve: its torque is not measured")
     return tuple(driver[joint] for joint in free)
 
 
 def arm_tables(machine: Machine, where: str) -> ArmBalance:
-    """Tables of an arm, whose transmissions are taken as rigid and without inertia.
+    """Create the model of an arm, with transmissions assumed rigid and massless.
 
     Args:
         machine: the machine.
-        where: who asks, for messages.
+        where: name of the caller, for messages.
 
     Returns:
-        The tables, standing at home without pressures.
+        The model at its home position with zero pressures.
 
     Raises:
-        InputError: a joint is not driven, or a joint of the arm not by a valve.
+        InputError: a coordinate is not driven, or a joint of the arm is not driven by a valve.
     """
     free = free_axes(machine, where)
     rigid = {n: a.model_copy(update={"transmission": None}) for n, a in machine.axes.items()}

@@ -1,25 +1,25 @@
-"""Physical effects that a machine can have and its model can lack, a file per group.
+"""Library of physical effects that a machine may have and its model may omit.
 
-One type for three uses: planted in a scenario, tried as a hypothesis, written into a patched
-machine.
+One `Effect` has three uses: a scenario adds it to a machine, a gap search tests it as a hypothesis,
+and a patched machine contains it.
 
-To add an effect, write one file here that defines `EFFECT = Effect(...)` (or `EFFECTS`, a tuple of
-related ones); it is found by itself. Such a file says
+To add an effect, write one module here that defines `EFFECT = Effect(...)`, or `EFFECTS` as a tuple
+of related effects. The library imports the module automatically. The module defines
 
-1. the fixed name, one sentence, and the law of the model that the effect changes;
-2. `locations(machine)`: where it can sit, nothing where the machine has no such part;
-3. `parameters(machine, location)`: for every number its unit, its value in the machine as it is,
-   and its sizes relative to the machine, with the reason for the smallest one worth naming;
-4. `apply(machine, location, values)`: the changed machine, made with `changed`. With the nominal
-   values it must behave as the given machine does.
+1. the fixed name, a one-sentence description, and the law of the model that the effect changes;
+2. `locations(machine)`: the possible locations, empty if the machine has no such part;
+3. `parameters(machine, location)`: for each parameter its unit, its value in the given machine, its
+   bounds and scale relative to the machine, and the reason for its smallest relevant deviation;
+4. `apply(machine, location, values)`: the changed machine, made with `changed`. With nominal values
+   it must behave like the given machine.
 
-Whatever the facts of `Machine` can already say is simulated, estimated, saved and loaded without
-further code; what they cannot is a law of its own and a term that uses it (`hydrotele.terms`). A
-file whose name begins with an underscore holds helpers. Tests of all effects
-(`tests/effects/test_library.py`) take a new one along; a test of its own shows its physics.
+An effect that only changes fields of `Machine` is simulated, estimated, saved and loaded without
+further code. Any other effect needs a law and a term that uses it (`hydrotele.terms`). A module
+whose name starts with an underscore holds helpers. `tests/effects/test_library.py` covers every
+effect of the library; the physics of a new effect needs its own test.
 
-Effects of one's own need no change of this package: `load_effects` reads a file that defines them,
-and installed packages offer theirs as entry points of the group `hydrotele.effects`.
+Custom effects need no change to this package. `load_effects` reads a file that defines them, and
+installed packages provide them as entry points of the group `hydrotele.effects`.
 """
 
 import hashlib
@@ -44,30 +44,32 @@ from hydrotele.terms.law import LAWS, DriveState, Numbers, Term, Variable, defin
 
 GROUP = "hydrotele.effects"
 ENVIRONMENT = "HYDROTELE_EFFECTS"
-"""Files of effects that child processes load, joined as in PATH."""
+"""Environment variable with the effect files that child processes load, joined as in PATH."""
 
 _read: dict[str, tuple[str, ...]] = {}  # digest of a file's text -> names of its effects
 
 
 def read_effects(path: Path, library: dict[str, Effect]) -> tuple[str, ...]:
-    """Run a file and add its effects; a file that was read before, or its copy, is not run again.
+    """Run an effect file and add its effects to a library.
+
+    A file with the same content as one that was read before is not run again.
 
     Args:
         path: the file.
-        library: effects by name, changed.
+        library: effects by name; updated in place.
 
     Returns:
-        Names of its effects.
+        Names of the effects that the file defines.
 
     Raises:
-        InputError: it cannot be read or run, defines nothing, or what has a name that is taken.
+        InputError: the file cannot be read or run, defines nothing, or uses an existing name.
     """
     try:
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:
         raise InputError(path, f"cannot be read: {error.strerror}") from None
     if path.suffix != ".py":
-        raise InputError(path, "is no Python file: effects of your own stand in a .py file")
+        raise InputError(path, "is not a Python file: define custom effects in a .py file")
     if digest not in _read:
         source = str(path.resolve())
         try:
@@ -95,7 +97,7 @@ def _run(path: Path, digest: str) -> ModuleType:
         spec.loader.exec_module(module)
     except InputError:
         raise
-    except Exception as error:  # whatever the user's code raises
+    except Exception as error:  # any error of the user's code
         del sys.modules[name]
         lines = [f.lineno for f in traceback.extract_tb(error.__traceback__)
                  if f.filename == str(path)]  # fmt: skip
@@ -106,7 +108,7 @@ def _run(path: Path, digest: str) -> ModuleType:
 
 
 def _family(content: Any) -> tuple[Any, ...]:
-    """Effects of a module, or of an entry point that names them itself."""
+    """Return the effects of a module or of an entry point that is an effect or a collection."""
     if isinstance(content, ModuleType):
         content = getattr(content, "EFFECT", None) or getattr(content, "EFFECTS", ())
     return tuple(content) if isinstance(content, Iterable) else (content,)
@@ -118,7 +120,7 @@ def _add(library: dict[str, Effect], family: tuple[Any, ...], where: object) -> 
         raise InputError(where, message)
     for effect in family:
         if not isinstance(effect, Effect):
-            message = f"{effect!r} is no hydrotele.effects.Effect"
+            message = f"{effect!r} is not a hydrotele.effects.Effect"
             raise InputError(where, message)
         if effect.name in library:
             message = f"effect {effect.name!r} exists already; choose another name"
@@ -127,7 +129,7 @@ def _add(library: dict[str, Effect], family: tuple[Any, ...], where: object) -> 
 
 
 def _tell_children(path: Path) -> None:
-    """Processes that this one starts load the file, too."""
+    """Add a file to the environment variable from which child processes load effects."""
     known = os.environ.get(ENVIRONMENT, "").split(os.pathsep)
     if str(path.resolve()) not in known:
         paths = [*filter(None, known), str(path.resolve())]
@@ -138,7 +140,7 @@ def add_plugins(library: dict[str, Effect]) -> None:
     """Add the effects of installed packages.
 
     Raises:
-        InputError: one of them does not load; names the package.
+        InputError: an entry point cannot be loaded; the message names the package.
     """
     for entry in importlib.metadata.entry_points(group=GROUP):
         package = entry.dist.name if entry.dist else "?"
@@ -147,13 +149,13 @@ def add_plugins(library: dict[str, Effect]) -> None:
             try:
                 content = entry.load()
             except (ImportError, AttributeError) as error:
-                message = f"does not load: {error}; update or uninstall the package"
+                message = f"cannot be loaded: {error}; update or uninstall the package"
                 raise InputError(where, message) from error
         _add(library, _family(content), where)
 
 
 def add_from_environment(library: dict[str, Effect]) -> None:
-    """Add the effects of the files that the parent process has loaded."""
+    """Add the effects of the files that the parent process loaded."""
     for path in filter(None, os.environ.get(ENVIRONMENT, "").split(os.pathsep)):
         read_effects(Path(path), library)
 
@@ -186,19 +188,19 @@ EFFECTS: dict[str, Effect] = _discover()
 
 
 def load_effects(path: str | Path) -> tuple[str, ...]:
-    """Run a Python file that defines effects, and laws for them, and add them to the library.
+    """Run a Python file that defines effects and laws, and add them to the library.
 
-    Child processes load it, too. The file runs with all rights of the user: only load files that
-    you trust. Nothing else in hydrotele runs a file that it finds.
+    Child processes load the file as well. The file runs with all rights of the user, so load only
+    files that you trust. hydrotele runs no Python file that the user did not name.
 
     Args:
         path: the file; it defines `EFFECT` or `EFFECTS`, and laws, or laws only.
 
     Returns:
-        Names of its effects.
+        Names of the effects that the file defines.
 
     Raises:
-        InputError: it cannot be read or run, defines nothing, or what has a name that is taken.
+        InputError: the file cannot be read or run, defines nothing, or uses an existing name.
     """
     return read_effects(Path(path), EFFECTS)
 
@@ -206,36 +208,36 @@ def load_effects(path: str | Path) -> tuple[str, ...]:
 def apply_effect(
     machine: Machine, name: str, location: str, parameters: Mapping[str, float]
 ) -> Machine:
-    """A machine that has an effect.
+    """Return a copy of a machine with an effect added.
 
     Args:
-        machine: the machine without it.
+        machine: the machine without the effect.
         name: name of the effect.
-        location: where; may be left empty where there is only one place.
-        parameters: parameter name -> value in the effect's unit; optional ones may be left out.
+        location: location of the effect; may be empty if there is only one.
+        parameters: parameter name -> value in the effect's unit; optional ones may be omitted.
 
     Returns:
         The changed machine.
 
     Raises:
-        InputError: unknown effect, location or parameter, or a value out of range; lists what is
-            valid.
+        InputError: unknown effect, location or parameter, or a value out of range; the message
+            lists valid values.
     """
     if name not in EFFECTS:
-        own = "one of your own needs the file that defines it: --effects FILE.py"
+        own = "for a custom effect, name the file that defines it: --effects FILE.py"
         raise InputError(f"effect {name!r}", f"is not known; {suggest(name, EFFECTS)}; {own}")
     effect = EFFECTS[name]
     places = effect.locations(machine)
     if not location and len(places) == 1:
         location = places[0]
     if location not in places:
-        message = f"cannot sit at {location!r}; {suggest(location, places)}"
+        message = f"has no location {location!r}; {suggest(location, places)}"
         raise InputError(f"effect {name}", message)
     known = effect.parameters(machine, location)
     needed = {key for key, p in known.items() if not p.optional}
     for key in sorted((needed - parameters.keys()) | (parameters.keys() - known.keys())):
-        names = ", ".join(f"{k} (may be left out)" if p.optional else k for k, p in known.items())
-        what = "is missing" if key in known else "is none of them"
+        names = ", ".join(f"{k} (optional)" if p.optional else k for k, p in known.items())
+        what = "is missing" if key in known else "is not one of them"
         raise InputError(f"effect {name}", f"has the parameters {names}; {key!r} {what}")
     for key, value in parameters.items():
         limits = known[key]

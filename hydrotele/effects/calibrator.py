@@ -1,4 +1,4 @@
-"""What is wrong with a calibrator: links that bend, sensors with tilted or loose couplings.
+"""Effects of a calibrator arm: link bending, misaligned sensor couplings and coupling backlash.
 
 Khoshzaban 1992, sections 3.4.2 and 3.7.3: joint flexibility and misaligned sensors spoil a
 calibration most; backlash and looseness less.
@@ -27,7 +27,10 @@ def _with(machine: Machine, joint: str, **numbers: float) -> Machine:
 
 
 def _bending(machine: Machine, joint: str) -> dict[str, Parameter]:
-    """A degree under 200 N m, the weight of a stretched calibrator, is 9e-5 rad/(N m)."""
+    """Specify the compliance across a joint.
+
+    One degree under 200 N m, the weight of an extended calibrator, is 9e-5 rad/(N m).
+    """
     present = machine.joints[joint].bending
     high = max(5.0e-4, present)
     return {"compliance": Parameter("rad/(N m)", present, 0.0, high, 5.0e-5, 2.0e-6, (5.0e-5,))}
@@ -38,7 +41,11 @@ def _bend(machine: Machine, joint: str, values: Values) -> Machine:
 
 
 def _misalignment(machine: Machine, joint: str) -> dict[str, Parameter]:
-    """A coupling is aligned to some degrees; 3 degrees err by 0.04 degrees twice a turn."""
+    """Specify the tilt of a sensor coupling.
+
+    Couplings are aligned to a few degrees. A tilt of 3 degrees causes an error of 0.04 degrees
+    twice per revolution.
+    """
     one = math.radians(1.0)
     present = _error(machine, joint).tilt
     high = max(20.0 * one, present)
@@ -50,7 +57,10 @@ def _misalign(machine: Machine, joint: str, values: Values) -> Machine:
 
 
 def _backlash(machine: Machine, joint: str) -> dict[str, Parameter]:
-    """A loose coupling plays by some tenths of a degree; the resolver shows a tenth."""
+    """Specify the backlash of a sensor coupling.
+
+    A loose coupling has some tenths of a degree; the resolver resolves one tenth.
+    """
     one = math.radians(1.0)
     present = _error(machine, joint).backlash
     high = max(5.0 * one, present)
@@ -62,10 +72,10 @@ def _loosen(machine: Machine, joint: str, values: Values) -> Machine:
 
 
 EFFECTS = (
-    Effect("joint_bending", "a link bends across its sensed joint", "geometry", _joints, _bending,
-           _bend),
-    Effect("sensor_misalignment", "the coupling of a joint's sensor is tilted", "sensor", _joints,
+    Effect("joint_bending", "bending of a link across its sensed joint", "geometry", _joints,
+           _bending, _bend),
+    Effect("sensor_misalignment", "a tilted coupling of a joint's sensor", "sensor", _joints,
            _misalignment, _misalign),
-    Effect("sensor_backlash", "the coupling of a joint's sensor has play", "sensor", _joints,
+    Effect("sensor_backlash", "backlash in the coupling of a joint's sensor", "sensor", _joints,
            _backlash, _loosen),
 )  # fmt: skip

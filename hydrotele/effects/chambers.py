@@ -1,6 +1,6 @@
-"""Chambers that leak or give more than in the model.
+"""Effects of the pressure chambers: laminar and turbulent leakage, hose and oil compliance.
 
-Leakage through a gap so short that its flow is turbulent: a torn seal, a cracked piston.
+Turbulent leakage is the flow through a short gap, as of a torn seal or a cracked piston.
 """
 
 import math
@@ -19,11 +19,14 @@ from hydrotele.effects.effect import (
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.law import Term
 
-_SOFTEST = 1.0e7  # Pa, oil full of air: the lowest bulk modulus that a machine may state
+_SOFTEST = 1.0e7  # Pa, oil full of air: the smallest bulk modulus that a machine file may state
 
 
 def _leakage(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Fractions of what makes the rated flow leak at full pressure; a good seal lets 1 % pass."""
+    """Specify the leakage coefficient, scaled by rated flow over highest pressure.
+
+    A good seal leaks 1 % of the rated flow at full pressure.
+    """
     whole = machine.axes[location].rated_flow / machine.highest_pressure(location)
     present = machine.axes[location].hydraulic_drive.leakage
     high = present + 0.5 * whole
@@ -31,10 +34,10 @@ def _leakage(machine: Machine, location: str) -> dict[str, Parameter]:
 
 
 def _tank_leakage(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Fractions of what makes the rated flow leak at full pressure.
+    """Specify the leakage coefficient of a spool, scaled by rated flow over highest pressure.
 
-    By `laws.chamber_flows` 0.01 % is a spool of 25 mm with 7 um of radial clearance, 0.05 % one
-    with 12 um, 0.5 % one with 26 um.
+    By `laws.chamber_flows`, 0.01 % corresponds to a 25 mm spool with 7 um of radial clearance,
+    0.05 % to 12 um, and 0.5 % to 26 um.
     """
     valve = machine.axes[location].valve
     assert valve
@@ -49,7 +52,10 @@ def _set_tank_leakage(machine: Machine, location: str, values: Values) -> Machin
 
 
 def _hose(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Relative to the oil in the middle of the stroke; 5 % is the scatter of a hose's rating."""
+    """Specify the hose compliance, scaled by the compliance of the oil at mid-stroke.
+
+    5 % is the scatter of a hose's rating.
+    """
     drive, cylinder = machine.axes[location].hydraulic_drive, machine.axes[location].cylinder
     assert machine.supply
     middle = 0.5 * cylinder.stroke if cylinder else 0.0
@@ -73,7 +79,10 @@ def _everywhere(machine: Machine) -> tuple[str, ...]:
 
 
 def _bulk_modulus(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Entrained air takes tens of per cent; 5 % is what 1 MPa of pressure changes."""
+    """Specify the bulk modulus of the oil.
+
+    Entrained air reduces it by tens of per cent; a pressure change of 1 MPa changes it by 5 %.
+    """
     assert machine.supply
     present = machine.supply.bulk_modulus
     low = max(_SOFTEST, 0.1 * present)
@@ -86,7 +95,10 @@ def _set_bulk_modulus(machine: Machine, location: str, values: Values) -> Machin
 
 
 def _entrained_air(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Oil in a machine at work carries 0.5 to 5 %; 0.2 % is what hardly shows above 2 MPa."""
+    """Specify the volume fraction of air in the oil.
+
+    Oil of a working machine carries 0.5 to 5 %; 0.2 % is hardly measurable above 2 MPa.
+    """
     assert machine.supply
     present = machine.supply.entrained_air
     high = max(0.15, present)
@@ -99,24 +111,25 @@ def _set_entrained_air(machine: Machine, location: str, values: Values) -> Machi
 
 CHAMBERS = (
     Effect(
-        "internal_leakage", "another leakage between the chambers of a drive", "flow", hydraulics,
-        _leakage, _set("leakage", "leakage"), "leakage",
+        "internal_leakage", "leakage between a drive's chambers that differs from the model",
+        "flow", hydraulics, _leakage, _set("leakage", "leakage"), "leakage",
     ),
     Effect(
-        "tank_leakage", "another leakage of a spool from both work ports to tank", "flow", valves,
-        _tank_leakage, _set_tank_leakage, "leakage",
+        "tank_leakage",
+        "spool leakage from both work ports to tank that differs from the model",
+        "flow", valves, _tank_leakage, _set_tank_leakage, "leakage",
     ),
     Effect(
-        "hose_compliance", "hoses that swell with pressure", "flow", valves, _hose,
+        "hose_compliance", "expansion of the hoses with pressure", "flow", valves, _hose,
         _set("hose_compliance", "compliance"),
     ),
     Effect(
-        "bulk_modulus", "another stiffness of the oil", "flow", _everywhere, _bulk_modulus,
-        _set_bulk_modulus, "softness of the oil",
+        "bulk_modulus", "bulk modulus of the oil that differs from the model", "flow", _everywhere,
+        _bulk_modulus, _set_bulk_modulus, "oil compliance",
     ),
     Effect(
-        "entrained_air", "air in the oil, which makes it soft where the pressure is low", "flow",
-        _everywhere, _entrained_air, _set_entrained_air, "softness of the oil",
+        "entrained_air", "air in the oil, which makes it compliant at low pressure", "flow",
+        _everywhere, _entrained_air, _set_entrained_air, "oil compliance",
     ),
 )  # fmt: skip
 
@@ -125,13 +138,16 @@ NAME = "orifice_leakage"
 
 
 def _root(machine: Machine) -> float:
-    """Square root of the relief pressure [sqrt(Pa)], at which the flow is stated."""
+    """Return the square root of the relief pressure [sqrt(Pa)], at which the flow is stated."""
     assert machine.supply
     return math.sqrt(machine.supply.relief_pressure)
 
 
 def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Flow at the relief pressure, as fractions of the rated flow; sizes as of laminar leakage."""
+    """Specify the leakage flow at the relief pressure, scaled by the rated flow.
+
+    The fractions are those of laminar leakage.
+    """
     valve = machine.axes[location].valve
     assert valve
     gain = term_number(machine, NAME, location, "flow_rod", "flow_gain", 0.0)
@@ -141,7 +157,7 @@ def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:
 
 
 def _apply(machine: Machine, location: str, values: Values) -> Machine:
-    """The same flow out of the head side into the rod side."""
+    """Add the leakage flow to the rod side and subtract it from the head side."""
     valve, gain = machine.axes[location].valve, values["flow"] / _root(machine)
     assert valve
     numbers = {"smoothing": valve.smoothing}

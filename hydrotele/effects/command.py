@@ -1,7 +1,4 @@
-"""Commands that arrive late.
-
-A command that arrives with an offset: a valve's or an amplifier's zero is off.
-"""
+"""Effects of the command path: delay, and offset from a shifted null of a valve or amplifier."""
 
 from hydrotele.effects.effect import Effect, Parameter, Values, changed, term_number, with_terms
 from hydrotele.machine.machine import Machine
@@ -20,14 +17,17 @@ def _nominal(machine: Machine, location: str) -> float:
 
 
 def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """A bus takes milliseconds, pilot hydraulics a tenth of a second; 3 ms is one bus cycle."""
+    """Specify the command delay.
+
+    A bus delays by milliseconds, pilot hydraulics by a tenth of a second; 3 ms is one bus cycle.
+    """
     present = _nominal(machine, location)
     high = max(0.5, present)
     return {"delay": Parameter("s", present, 0.0, high, 0.05, 0.003, starts=(0.03, 0.1, 0.2))}
 
 
 def _apply(machine: Machine, location: str, values: Values) -> Machine:
-    """Set the delay of one axis; at `all`, set the shortest and shift the others by as much."""
+    """Set the delay of one axis, or at `all` the shortest one and shift the others equally."""
     more = values["delay"] - _nominal(machine, location)
     for name in machine.axes if location == ALL else (location,):
         delay = max(0.0, machine.axes[name].command_delay + more)
@@ -36,7 +36,7 @@ def _apply(machine: Machine, location: str, values: Values) -> Machine:
 
 
 COMMAND_DELAY = Effect(
-    "command_delay", "commands reach the valves or drives late", "timing", _locations, _parameters,
+    "command_delay", "delayed commands to the valves or drives", "timing", _locations, _parameters,
     _apply,
 )  # fmt: skip
 
@@ -45,7 +45,10 @@ NAME = "command_offset"
 
 
 def _parameters_command_offset(machine: Machine, location: str) -> dict[str, Parameter]:
-    """A valve's null shifts by a few per cent; 0.2 % of the full command is its hysteresis."""
+    """Specify the command offset.
+
+    A valve's null shifts by a few per cent; its hysteresis is 0.2 % of the full command.
+    """
     drive = machine.axes[location].force
     full, unit = (drive.command_limit, drive.command_unit) if drive else (1.0, "1")
     present = term_number(machine, NAME, location, "command", "value", 0.0)
@@ -61,13 +64,16 @@ def _apply_command_offset(machine: Machine, location: str, values: Values) -> Ma
 
 
 def _graded(machine: Machine) -> tuple[str, ...]:
-    """Axes whose zero can be off: at a pump drive's command 0 a switched valve is shut."""
+    """Return the axes whose null can shift.
+
+    Axes with their own pump are excluded: at command 0 their switching valve is closed.
+    """
     return tuple(name for name, axis in machine.axes.items() if not axis.pump)
 
 
 COMMAND_OFFSET = Effect(
     NAME,
-    "commands that arrive with an offset",
+    "an offset of the received command",
     "valve",
     _graded,
     _parameters_command_offset,

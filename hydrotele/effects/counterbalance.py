@@ -1,6 +1,7 @@
-"""Pressure compensators: inlets whose flow does not follow the load.
+"""Effects of additional valves: pressure compensators and counterbalance valves.
 
-Counterbalance valves that hold a load and throttle its lowering.
+A pressure compensator makes the inlet flow independent of the load. A counterbalance valve holds a
+load and throttles its lowering.
 """
 
 import math
@@ -9,11 +10,11 @@ from hydrotele.effects.effect import Effect, Parameter, Values, changed, valves
 from hydrotele.machine.drives import Counterbalance
 from hydrotele.machine.machine import Machine
 
-_USUAL_DROP = 0.5  # of the relief pressure: there a valve flows with a compensator as without one
+_USUAL_DROP = 0.5  # of the relief pressure: drop at which a compensator does not change the flow
 
 
 def _drop(machine: Machine, location: str) -> float:
-    """Pressure drop that the inlet edge can have [Pa]."""
+    """Return the largest pressure drop across the inlet edge [Pa]."""
     valve = machine.axes[location].valve
     assert valve and machine.supply
     most = machine.supply.relief_pressure
@@ -21,9 +22,10 @@ def _drop(machine: Machine, location: str) -> float:
 
 
 def _regulation(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Part of the relief pressure that a compensator takes up: 90 to 98 % (estimate).
+    """Specify the fraction of the relief pressure that a compensator absorbs.
 
-    Least is the tenth that only an empty arm at full supply pressure would feel.
+    Compensators absorb 90 to 98 % (estimate). A fraction of 0.1 affects only an unloaded arm at
+    full supply pressure.
     """
     assert machine.supply
     present = 1.0 - _drop(machine, location) / machine.supply.relief_pressure
@@ -32,7 +34,7 @@ def _regulation(machine: Machine, location: str) -> dict[str, Parameter]:
 
 
 def _compensate(machine: Machine, location: str, values: Values) -> Machine:
-    """Limit the drop, and open the inlets so far that the usual flow stays what it was."""
+    """Limit the pressure drop and enlarge the inlets so that the typical flow does not change."""
     valve, supply = machine.axes[location].valve, machine.supply
     assert valve and supply
     before = _drop(machine, location)
@@ -51,7 +53,7 @@ def _compensate(machine: Machine, location: str, values: Values) -> Machine:
 
 
 LOAD_COMPENSATION = Effect(
-    "load_compensation", "a pressure compensator that keeps the load out of a valve's flow",
+    "load_compensation", "a pressure compensator that makes a valve's flow independent of the load",
     "valve", valves, _regulation, _compensate,
 )  # fmt: skip
 
@@ -66,9 +68,10 @@ def _present(machine: Machine, location: str) -> Counterbalance | None:
 
 
 def _setting(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Set to 1.3 times the load's pressure, up to the port relief; 0 without a valve.
+    """Specify the pressure setting of a counterbalance valve; 0 without a valve.
 
-    Least is what a tank line at 0.5 MPa with the usual pilot ratio opens by itself.
+    Valves are set to 1.3 times the load pressure, at most to the port relief pressure. With the
+    usual pilot ratio, a tank line at 0.5 MPa opens a valve at the smallest relevant setting.
     """
     assert machine.supply
     relief = machine.supply.relief_pressure

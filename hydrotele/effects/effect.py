@@ -1,8 +1,9 @@
-"""What an effect is: a name, a sentence, places, parameters, and the change of the Machine.
+"""Types and helpers for defining effects.
 
-Sizes of a machine that make the sizes of an effect relative to it.
-
-Terms that an effect puts into a machine, found again by the effect's name.
+`Effect` and `Parameter` describe an effect, its locations and its parameters. Helper functions list
+the axes of a machine at which an effect may occur. Others compute reference values, such as the
+largest force, for the scales of parameters. `with_terms` and `term_number` write and read the terms
+that an effect adds to a machine.
 """
 
 import dataclasses
@@ -20,19 +21,19 @@ Values = Mapping[str, float]
 
 @dataclasses.dataclass(frozen=True)
 class Parameter:
-    """A number of an effect at one place of one machine.
+    """A parameter of an effect at one location of one machine.
 
     Attributes:
         unit: SI unit.
-        nominal: its value in the machine as it is, without the effect.
+        nominal: value in the given machine, without the effect.
         low: smallest physically plausible value.
         high: largest physically plausible value.
-        scale: typical size of a deviation from nominal, the width of its prior.
-        least: deviation below which the effect is not worth naming.
-        starts: values from which a search starts where the effect vanishes at nominal, or where
-            its slope there tells little; empty where nominal is a good start.
-        optional: whether it may be left out where the effect is planted, and is so where it is
-            looked for among others: it then keeps its nominal value.
+        scale: typical deviation from nominal, used as the standard deviation of the prior.
+        least: smallest deviation from nominal that is reported as an effect.
+        starts: start values of a search, for effects that vanish at the nominal value or whose
+            gradient there is not informative; empty if nominal is a good start value.
+        optional: whether the parameter may be omitted when the effect is added to a machine.
+            Screening of many effects omits it, too. An omitted parameter is nominal.
     """
 
     unit: str
@@ -47,18 +48,18 @@ class Parameter:
 
 @dataclasses.dataclass(frozen=True)
 class Effect:
-    """A physical effect that a machine can have and its model can lack.
+    """A physical effect that a machine may have and its model may omit.
 
     Attributes:
-        name: fixed name, as in reports and files.
-        sentence: what it is, one sentence.
+        name: fixed name, used in reports and files.
+        sentence: short description of the effect.
         law: the law of the model that it changes.
-        locations: machine -> names of the places where it can sit.
-        parameters: (machine, location) -> parameter name -> Parameter.
-        apply: (machine, location, parameter name -> value) -> machine that has it. With all values
-            nominal it returns a machine that behaves as the given one.
-        mechanism: what other effects have in common with it that are the same thing in another
-            form, such as a delay and a lag of one sensor; empty for what stands alone.
+        locations: function machine -> names of the possible locations.
+        parameters: function (machine, location) -> parameter name -> Parameter.
+        apply: function (machine, location, parameter name -> value) -> machine with the effect.
+            With nominal values the returned machine behaves like the given one.
+        mechanism: common name of effects that are different forms of one mechanism, such as the
+            delay and the lag of one sensor; empty if there is no other form.
     """
 
     name: str
@@ -71,7 +72,13 @@ class Effect:
 
 
 def changed(machine: Machine, path: str, value: Any) -> Machine:
-    """Copy of a machine with one number replaced, at a dotted path such as `supply.pump_flow`."""
+    """Return a copy of a machine with the value at a dotted path replaced.
+
+    Args:
+        machine: the machine.
+        path: such as `supply.pump_flow` or `axes.boom.valve.deadband`.
+        value: the new value.
+    """
     return _replace(machine, path.split("."), value)
 
 
@@ -83,40 +90,44 @@ def _replace(node: Any, path: list[str], value: Any) -> Any:
     return node.model_copy(update={path[0]: _replace(getattr(node, path[0]), path[1:], value)})
 
 
-_IN_LINE = 1.0e-3  # of its length, by which a cylinder may lie off the slide that it pushes
-_FULL_TRAVEL = 2.0  # s that a force-driven slide takes through its range: no flow rating says it
+_IN_LINE = 1.0e-3  # offset over length up to which a cylinder counts as parallel to its slide
+_FULL_TRAVEL = 2.0  # s for the full range of a force drive, which has no flow rating; an estimate
 
 
 def axes(machine: Machine) -> tuple[str, ...]:
-    """Names of all axes."""
+    """Return the names of all axes."""
     return tuple(machine.axes)
 
 
 def valves(machine: Machine) -> tuple[str, ...]:
-    """Names of the axes with a valve."""
+    """Return the names of the axes with a valve."""
     return tuple(machine.valve_axes)
 
 
 def hydraulics(machine: Machine) -> tuple[str, ...]:
-    """Names of the axes with chambers: behind a valve, or behind a pump of their own."""
+    """Return the names of the axes with pressure chambers, driven by a valve or an own pump."""
     return tuple(machine.hydraulic_axes)
 
 
 def cylinders(machine: Machine) -> tuple[str, ...]:
-    """Names of the axes with a cylinder."""
+    """Return the names of the axes with a cylinder."""
     return tuple(name for name, axis in machine.axes.items() if axis.cylinder)
 
 
 def linkages(machine: Machine) -> tuple[str, ...]:
-    """Names of the axes whose cylinder does not lie along the slide that it pushes.
+    """Return the names of the axes whose cylinder is not parallel to a slide that it drives.
 
-    Along a slide a length is a position, and where the pins sit across it changes nothing.
+    For a cylinder parallel to its slide, length equals position and lateral pin offsets have no
+    effect.
     """
     return tuple(name for name in cylinders(machine) if not _along_slide(machine, name))
 
 
 def across(machine: Machine, axis: str) -> str:
-    """The two directions across an axis' joint, in which pins may sit elsewhere: such as `xz`."""
+    """Return the two coordinates perpendicular to the joint of an axis, such as `xz`.
+
+    Pin offsets in these directions change the linkage.
+    """
     joint = machine.joints[machine.axes[axis].joint]
     way = joint.axis if joint.type == "hinge" else (0.0, 1.0, 0.0)
     return "xyz".replace("xyz"[int(np.argmax(np.abs(way)))], "")
@@ -138,33 +149,33 @@ def _along_slide(machine: Machine, axis: str) -> bool:
 
 
 def hinges(machine: Machine) -> tuple[str, ...]:
-    """Names of the axes whose joint turns."""
+    """Return the names of the axes with a revolute joint."""
     return tuple(name for name in machine.axes if machine.position_kind(name) == "angle")
 
 
 def drive_kind(machine: Machine, axis: str) -> str:
-    """Which field of the axis holds its drive: `cylinder`, `motor` or `force`."""
+    """Return the field that holds the drive of an axis: `cylinder`, `motor` or `force`."""
     facts = machine.axes[axis]
     return "cylinder" if facts.cylinder else "motor" if facts.motor else "force"
 
 
 def drive_turns(machine: Machine, axis: str) -> bool:
-    """Whether the drive itself turns, so that its forces are torques."""
+    """Return whether the drive is rotary, so that its forces are torques."""
     return machine.axes[axis].cylinder is None and machine.position_kind(axis) == "angle"
 
 
 def force_unit(machine: Machine, axis: str) -> str:
-    """Unit of the drive's force."""
+    """Return the unit of the drive's force."""
     return "N m" if drive_turns(machine, axis) else "N"
 
 
 def speed_unit(machine: Machine, axis: str) -> str:
-    """Unit of the drive's velocity."""
+    """Return the unit of the drive's velocity."""
     return "rad/s" if drive_turns(machine, axis) else "m/s"
 
 
 def largest_force(machine: Machine, axis: str) -> float:
-    """Force of a drive at the highest pressure, or at full command [N] or [N m]."""
+    """Return the force of a drive at the highest pressure, or at full command [N] or [N m]."""
     facts = machine.axes[axis]
     if facts.force:
         return abs(facts.force.gain) * facts.force.command_limit
@@ -172,9 +183,9 @@ def largest_force(machine: Machine, axis: str) -> float:
 
 
 def usual_speed(machine: Machine, axis: str) -> float:
-    """Speed of a drive at the rated flow of its valve or pump [m/s] or [rad/s].
+    """Return the speed of a drive at the rated flow of its valve or pump [m/s] or [rad/s].
 
-    A force drive has no such rating: it is taken to pass its range in two seconds.
+    A force drive has no flow rating and is assumed to travel its range in two seconds.
     """
     facts = machine.axes[axis]
     if facts.hydraulic:
@@ -184,15 +195,15 @@ def usual_speed(machine: Machine, axis: str) -> float:
 
 
 def outboard_links(machine: Machine, link: str) -> list[str]:
-    """A link and everything that it carries."""
+    """Return a link and all links that it carries."""
     found = [link]
-    for name in found:  # grows on the way
+    for name in found:  # the list grows during the loop
         found += [n for n, other in machine.links.items() if other.parent == name]
     return found
 
 
 def outboard_child(machine: Machine, link: str) -> str | None:
-    """The link that continues the arm: the one towards its tip, else the farthest child."""
+    """Return the child link towards the arm's tip, or the farthest child; None at the tip."""
     if machine.arm and machine.arm.tip.link != "world":
         step = machine.arm.tip.link
         while step != "world":
@@ -209,7 +220,10 @@ def outboard_child(machine: Machine, link: str) -> str | None:
 
 
 def outboard_point(machine: Machine, link: str) -> np.ndarray | None:
-    """Where the arm goes on, in the link's frame, (3,) [m]; the arm's tip for its last link."""
+    """Return the origin of the next link in a link's frame (3,) [m], for the last link the tip.
+
+    Returns None if no link follows.
+    """
     if machine.arm and machine.arm.tip.link == link:
         return np.array(machine.arm.tip.position)
     child = outboard_child(machine, link)
@@ -217,7 +231,10 @@ def outboard_point(machine: Machine, link: str) -> np.ndarray | None:
 
 
 def link_size(machine: Machine, link: str) -> float:
-    """Distance from a link's joint to where the arm goes on, or to its mass [m]."""
+    """Return the distance from a link's joint to the next joint or to its centre of mass [m].
+
+    The larger distance counts, at least 1 mm.
+    """
     point = outboard_point(machine, link)
     far = 0.0 if point is None else float(np.linalg.norm(point))
     return max(far, float(np.linalg.norm(machine.links[link].com)), 1.0e-3)
@@ -226,18 +243,18 @@ def link_size(machine: Machine, link: str) -> float:
 def term_number(
     machine: Machine, name: str, axis: str, balance: Balance, parameter: str, absent: float
 ) -> float:
-    """A parameter of the term that an effect put onto a drive.
+    """Return a parameter of the term that an effect added to a drive.
 
     Args:
         machine: the machine.
-        name: of the effect.
-        axis: of the drive.
-        balance: of the term.
-        parameter: of its law.
-        absent: what to return where there is no such term.
+        name: name of the effect.
+        axis: axis of the drive.
+        balance: balance of the term.
+        parameter: name of the law's parameter.
+        absent: value to return if there is no such term.
 
     Returns:
-        Its value.
+        The value of the parameter.
     """
     for term in machine.terms:
         if (term.name, term.axis, term.balance) == (name, axis, balance):
@@ -250,13 +267,13 @@ def term_number(
 def with_terms(
     machine: Machine, name: str, terms: Iterable[Term], axes: Iterable[str] | None = None
 ) -> Machine:
-    """A machine whose terms of a name are these, in place of those of that name.
+    """Return a copy of a machine in which the terms of an effect are replaced.
 
     Args:
         machine: the machine.
-        name: of the effect.
-        terms: the new ones, none to take the effect out.
-        axes: of which terms are replaced; None for all.
+        name: name of the effect.
+        terms: the new terms; empty to remove the effect.
+        axes: axes whose terms are replaced; None for all axes.
 
     Returns:
         The changed machine.

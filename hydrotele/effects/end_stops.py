@@ -1,4 +1,4 @@
-"""End stops that are harder or softer than in the model."""
+"""Effect of end stops whose stiffness differs from the model."""
 
 from hydrotele.effects.effect import Effect, Parameter, Values, changed, drive_turns
 from hydrotele.machine.drives import EndStop
@@ -6,12 +6,16 @@ from hydrotele.machine.machine import Machine
 
 
 def _ending(machine: Machine) -> tuple[str, ...]:
-    """Axes whose drives have ends."""
+    """Return the axes whose drives have end stops."""
     return tuple(name for name in machine.axes if machine.end_stop(name))
 
 
 def _stiffness(machine: Machine, location: str) -> dict[str, Parameter]:
-    """A cushion is fifty times softer than steel; 10 % is what the lever of a pin changes."""
+    """Specify the end stop stiffness.
+
+    A cushion is fifty times more compliant than steel; the lever arm of a pin changes the stiffness
+    by 10 %.
+    """
     stop = machine.end_stop(location)
     assert stop
     k = stop.stiffness
@@ -20,7 +24,7 @@ def _stiffness(machine: Machine, location: str) -> dict[str, Parameter]:
 
 
 def _set(machine: Machine, location: str, values: Values) -> Machine:
-    """The damper changes with the spring, so that their time constant stays."""
+    """Set the stiffness and scale the damping with it, so that their time constant stays."""
     stop = machine.end_stop(location)
     assert stop
     if values["stiffness"] == stop.stiffness:
@@ -31,6 +35,6 @@ def _set(machine: Machine, location: str, values: Values) -> Machine:
 
 
 EFFECT = Effect(
-    "end_stop_stiffness", "another stiffness of a drive's end stops", "force", _ending, _stiffness,
-    _set,
+    "end_stop_stiffness", "end stop stiffness of a drive that differs from the model", "force",
+    _ending, _stiffness, _set,
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Forces on a drive that the model lacks: constant, for a while, or growing with the speed."""
+"""Effects of unmodelled forces on a drive: constant, transient, or quadratic in the speed."""
 
 from hydrotele.effects.effect import (
     Effect,
@@ -16,12 +16,15 @@ from hydrotele.machine.machine import Machine
 from hydrotele.terms.law import Term
 
 CONSTANT, PULSE, DRAG = "external_force", "force_pulse", "speed_dependent_force"
-_BEGIN, _LENGTH = 5.0, 5.0  # s, of a pulse of no size, from which a search starts
+_BEGIN, _LENGTH = 5.0, 5.0  # s, start values of a search: a pulse without amplitude has no time
 _DRAG_UNITS = {"N": "N s^2/m^2", "N m": "N m s^2/rad^2"}
 
 
 def _force(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Fractions of the drive's largest force; least is a thousandth, as of friction."""
+    """Specify the constant force, scaled by the drive's largest force.
+
+    The smallest relevant force is a thousandth of the largest one, as for friction.
+    """
     present = term_number(machine, CONSTANT, location, "force", "value", 0.0)
     whole = largest_force(machine, location)
     sizes = present - whole, present + whole, 0.02 * whole, 0.001 * whole
@@ -36,9 +39,10 @@ def _set_force(machine: Machine, location: str, values: Values) -> Machine:
 
 
 def _pulse(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Size as of a constant force, three times as large to be seen in a second.
+    """Specify amplitude, start and duration of a force pulse.
 
-    A pulse of no size has no time: see `_BEGIN`.
+    The smallest relevant amplitude is three times that of a constant force, so that a pulse of one
+    second is detectable. A pulse without amplitude has no time: see `_BEGIN`.
     """
 
     def present(parameter: str, absent: float) -> float:
@@ -62,7 +66,10 @@ def _set_pulse(machine: Machine, location: str, values: Values) -> Machine:
 
 
 def _drag(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Fractions of the drive's largest force at its usual speed, as of viscous friction."""
+    """Specify the drag coefficient, scaled by the drive's largest force at its typical speed.
+
+    The fractions are those of viscous friction.
+    """
     present = term_number(machine, DRAG, location, "force", "coefficient", 0.0)
     whole = largest_force(machine, location) / usual_speed(machine, location) ** 2
     unit = _DRAG_UNITS["N m" if speed_unit(machine, location) == "rad/s" else "N"]
@@ -79,9 +86,19 @@ def _set_drag(machine: Machine, location: str, values: Values) -> Machine:
 EFFECTS = (
     Effect(CONSTANT, "a constant force or torque on a drive", "force", axes, _force, _set_force),
     Effect(
-        PULSE, "a force or torque on a drive for a limited time", "force", axes, _pulse, _set_pulse
+        PULSE,
+        "a force or torque on a drive for a limited time",
+        "force",
+        axes,
+        _pulse,
+        _set_pulse,
     ),
     Effect(
-        DRAG, "resistance that grows with the square of the speed", "force", axes, _drag, _set_drag
+        DRAG,
+        "a resisting force that grows with the square of the speed",
+        "force",
+        axes,
+        _drag,
+        _set_drag,
     ),
 )

@@ -1,8 +1,8 @@
-"""Friction of a drive: dry, viscous, extra at rest, and unequal in the two directions.
+"""Effects of drive friction.
 
-Dry friction that depends on the load or on the place in the travel.
-
-Dry friction that is a spring below breakaway: the bristles of a drive's seals and guides.
+The module covers Coulomb, viscous and Stribeck friction, their asymmetry between the two
+directions, and dry friction that depends on load or position. Presliding is dry friction that acts
+as a spring below breakaway, as the bristles of seals and guides do.
 """
 
 import math
@@ -27,10 +27,11 @@ from hydrotele.terms.law import Term
 
 
 def _numbers(field: str, scale: float, high: float):
-    """Sizes as fractions of the drive's largest force.
+    """Return a function that gives a friction parameter, scaled by the drive's largest force.
 
-    Least is a thousandth of it (20 to 30 kPa over the piston, what a good transducer is off by) or
-    a tenth of the present friction (what warm oil does within a shift).
+    The smallest relevant deviation is a thousandth of that force, or a tenth of the given friction.
+    The first is 20 to 30 kPa over the piston, the error of a good transducer. The second is the
+    change by warm oil within a shift.
     """
 
     def parameters(machine: Machine, location: str) -> dict[str, Parameter]:
@@ -58,13 +59,16 @@ def _set(machine: Machine, location: str, values: Values) -> Machine:
 
 
 def _friction_places(machine: Machine) -> tuple[str, ...]:
-    """Axes that have friction to be unequal."""
+    """Return the axes with friction, which can be asymmetric."""
     present = {name: machine.axes[name].drive.friction for name in machine.axes}
     return tuple(n for n, f in present.items() if f.coulomb + f.stribeck_extra + f.viscous > 0)
 
 
 def _asymmetry(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Fractions: seals with a lip differ by tens of per cent; least is 2 %."""
+    """Specify the asymmetries of dry and viscous friction.
+
+    Lip seals differ by tens of per cent between the directions.
+    """
     friction = machine.axes[location].drive.friction
     sizes = {}
     if friction.coulomb + friction.stribeck_extra > 0:
@@ -76,19 +80,19 @@ def _asymmetry(machine: Machine, location: str) -> dict[str, Parameter]:
 
 FRICTION = (
     Effect(
-        "coulomb_friction", "another Coulomb friction of a drive", "force", axes,
-        _numbers("coulomb", 0.02, 0.08), _set,
+        "coulomb_friction", "Coulomb friction of a drive that differs from the model", "force",
+        axes, _numbers("coulomb", 0.02, 0.08), _set,
     ),
     Effect(
-        "viscous_friction", "another viscous friction of a drive", "force", axes,
-        _numbers("viscous", 0.015, 0.1), _set,
+        "viscous_friction", "viscous friction of a drive that differs from the model", "force",
+        axes, _numbers("viscous", 0.015, 0.1), _set,
     ),
     Effect(
-        "stribeck_friction", "another extra friction at rest", "force", axes,
-        _numbers("stribeck_extra", 0.01, 0.05), _set,
+        "stribeck_friction", "Stribeck friction of a drive that differs from the model", "force",
+        axes, _numbers("stribeck_extra", 0.01, 0.05), _set,
     ),
     Effect(
-        "friction_asymmetry", "friction that is larger in one direction of a drive", "force",
+        "friction_asymmetry", "larger friction in one direction of a drive", "force",
         _friction_places, _asymmetry, _set,
     ),
 )  # fmt: skip
@@ -98,7 +102,10 @@ LOAD, PLACE = "load_dependent_friction", "position_dependent_friction"
 
 
 def _coefficient(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Seals and guides rub with some per cent of the load; least is half a per cent."""
+    """Specify the coefficient of load-dependent friction.
+
+    Friction of seals and guides is some per cent of the load.
+    """
     present = term_number(machine, LOAD, location, "force", "coefficient", 0.0)
     return {"coefficient": Parameter("1", present, 0.0, max(0.4, present), 0.03, 0.005)}
 
@@ -114,7 +121,7 @@ def _set_coefficient(machine: Machine, location: str, values: Values) -> Machine
 
 
 def _travel(machine: Machine, location: str) -> tuple[float, float]:
-    """Range of a drive's position [m] or [rad]; of one that turns without end, once around."""
+    """Return the range of a drive's position [m] or [rad]; one revolution if it is unlimited."""
     axis = machine.axes[location]
     if axis.cylinder:
         return 0.0, axis.cylinder.stroke
@@ -124,7 +131,11 @@ def _travel(machine: Machine, location: str) -> tuple[float, float]:
 
 
 def _bump(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Force as of Coulomb friction; a bent rod or a worn tooth spans a tenth of the travel."""
+    """Specify height, centre and width of additional friction at one position.
+
+    The height is scaled as Coulomb friction. A bent rod or a worn tooth spans a tenth of the
+    travel.
+    """
 
     def present(parameter: str, absent: float) -> float:
         return term_number(machine, PLACE, location, "force", parameter, absent)
@@ -158,26 +169,27 @@ UNEVEN_FRICTION = (
         _set_coefficient,
     ),
     Effect(
-        PLACE, "more dry friction at one place of the travel", "force", axes, _bump, _set_bump
+        PLACE, "additional dry friction at one position of the travel", "force", axes, _bump,
+        _set_bump,
     ),
 )  # fmt: skip
 
 
-_WAY, _TURN = 5.0e-5, 2.0e-4  # m, rad: what seals and gears give before they slide, an estimate
-_RIGID = 0.02  # of the least compliance worth naming: friction as without bristles
+_WAY, _TURN = 5.0e-5, 2.0e-4  # m, rad: deflection of seals and gears before sliding, an estimate
+_RIGID = 0.02  # of the smallest relevant compliance: below it, friction without bristles
 
 
 def _presliding_places(machine: Machine) -> tuple[str, ...]:
-    """Axes with dry friction to break away from; that of a drive with its own pump is rigid."""
+    """Return the axes with dry friction; drives with an own pump have no presliding model."""
     found = {name: axis.drive.friction for name, axis in machine.axes.items() if not axis.pump}
     return tuple(name for name, f in found.items() if f.coulomb + f.stribeck_extra > 0.0)
 
 
 def _compliance(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Deflection of the bristles over their force; 0 is friction without bristles.
+    """Specify the compliance of the bristles; 0 is friction without bristles.
 
-    Surfaces of metal give some micrometres before they slide, seals of rubber up to a tenth of a
-    millimetre; least is 10 um, or 40 urad, at the breakaway force.
+    Metal surfaces deflect by some micrometres before they slide, rubber seals by up to a tenth of a
+    millimetre. The smallest relevant deflection at the breakaway force is 10 um or 40 urad.
     """
     friction, turns = machine.axes[location].drive.friction, drive_turns(machine, location)
     usual = (_TURN if turns else _WAY) / (friction.coulomb + friction.stribeck_extra)
@@ -192,7 +204,7 @@ def _compliance(machine: Machine, location: str) -> dict[str, Parameter]:
 
 
 def _set_presliding(machine: Machine, location: str, values: Values) -> Machine:
-    """Bristles as stiff as that; friction as without them where nobody could tell them apart."""
+    """Set the bristle stiffness; remove the bristles if they are too stiff to be distinguished."""
     compliance = values["compliance"]
     number = _compliance(machine, location)["compliance"]
     if compliance == number.nominal:
@@ -205,7 +217,7 @@ def _set_presliding(machine: Machine, location: str, values: Values) -> Machine:
 
 
 PRESLIDING = Effect(
-    "presliding", "dry friction that gives like a spring before it slides", "force",
+    "presliding", "dry friction that acts as a spring before sliding", "force",
     _presliding_places,
     _compliance, _set_presliding,
 )  # fmt: skip

@@ -1,9 +1,4 @@
-"""A link that is longer or shorter than in the model.
-
-A cylinder whose base pin sits elsewhere than in the model.
-
-A machine that does not stand level.
-"""
+"""Effects of geometry: link length, position of a cylinder's base pin, and tilt of the base."""
 
 import math
 
@@ -24,7 +19,7 @@ from hydrotele.machine.machine import Machine
 
 
 def _locations(machine: Machine) -> tuple[str, ...]:
-    """Turning links that go on across their axis: a boom and a stick, not a slewing house."""
+    """Return the revolute axes whose link extends across the axis: boom, stick, not swing."""
     places = []
     for axis in hinges(machine):
         joint = machine.axes[axis].joint
@@ -38,7 +33,10 @@ def _locations(machine: Machine) -> tuple[str, ...]:
 
 
 def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """A thousandth, 5 mm of a boom, is what welded structures are built to."""
+    """Specify the change of a link's length.
+
+    Welded structures are built to a thousandth of their length, 5 mm for a boom.
+    """
     point = outboard_point(machine, machine.link_of(machine.axes[location].joint))
     assert point is not None
     size = float(np.linalg.norm(point))
@@ -46,12 +44,12 @@ def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:
 
 
 def _apply(machine: Machine, location: str, values: Values) -> Machine:
-    """Move what sits at the outboard joint by `length` along the line from the link's own joint.
+    """Move everything at the outboard joint by `length` along the line from the link's own joint.
 
-    That is the next link (on the last link the arm's tip and what is welded there), the base pin of
-    the cylinder that moves the next link where it sits on this one, and a four-bar's rocker on this
-    link. Every other pin keeps its distance from the link's own joint. The link's centre of mass
-    stretches along the same line in proportion; mass and moments of inertia stay.
+    The moved parts are the next link, the base pin of the next link's cylinder if it is on this
+    link, and a four-bar rocker on this link. For the last link they are the arm's tip and a payload
+    welded there. All other pins keep their distance from the link's own joint. The link's centre of
+    mass moves along the same line in proportion; mass and moments of inertia do not change.
     """
     length = values["length"]
     name = machine.link_of(machine.axes[location].joint)
@@ -84,7 +82,7 @@ def _apply(machine: Machine, location: str, values: Values) -> Machine:
 
 
 def _with_tip(machine: Machine, name: str, shift: np.ndarray) -> Machine:
-    """Move the arm's tip on the last link, and a payload that is welded there."""
+    """Move the arm's tip on the last link and a payload that is welded there."""
     assert machine.arm
     tip = machine.arm.tip.position
     for other, link in machine.links.items():
@@ -102,12 +100,20 @@ def _vector(values: np.ndarray) -> tuple[float, ...]:
 
 
 LINK_LENGTH = Effect(
-    "link_length", "a link is longer or shorter", "geometry", _locations, _parameters, _apply
+    "link_length",
+    "link length that differs from the model",
+    "geometry",
+    _locations,
+    _parameters,
+    _apply,
 )
 
 
 def _parameters_pin_offset(machine: Machine, location: str) -> dict[str, Parameter]:
-    """A thousandth of the closed length, 1.5 mm, is the play of a worn pin."""
+    """Specify the offsets of a base pin.
+
+    The play of a worn pin is a thousandth of the closed length, 1.5 mm.
+    """
     cylinder = machine.axes[location].cylinder
     assert cylinder
     size = cylinder.closed_length
@@ -116,7 +122,7 @@ def _parameters_pin_offset(machine: Machine, location: str) -> dict[str, Paramet
 
 
 def _apply_pin_offset(machine: Machine, location: str, values: Values) -> Machine:
-    """The base pin moves in its link's frame; the closed length, hence x at a length, stays."""
+    """Move the base pin in its link's frame; the closed length does not change."""
     cylinder = machine.axes[location].cylinder
     assert cylinder
     way = zip("xyz", cylinder.base_pin.position, strict=True)
@@ -125,7 +131,8 @@ def _apply_pin_offset(machine: Machine, location: str, values: Values) -> Machin
 
 
 PIN_OFFSET = Effect(
-    "pin_offset", "the base pin of a cylinder sits elsewhere", "geometry", linkages,
+    "pin_offset", "position of a cylinder's base pin that differs from the model", "geometry",
+    linkages,
     _parameters_pin_offset,
     _apply_pin_offset,
 )  # fmt: skip
@@ -136,13 +143,16 @@ def _place(machine: Machine) -> tuple[str, ...]:
 
 
 def _parameters_base_tilt(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Ground is level to a few degrees; 3 mrad is what a builder's level shows."""
+    """Specify the tilt angles of the base.
+
+    Ground is level to a few degrees; a builder's level resolves 3 mrad.
+    """
     tilt = Parameter("rad", 0.0, -0.2, 0.2, 0.03, 0.003)
     return {"roll": tilt, "pitch": tilt}
 
 
 def _apply_base_tilt(machine: Machine, location: str, values: Values) -> Machine:
-    """Gravity in the frame of a base turned by pitch about y and then by roll about its own x.
+    """Rotate gravity into the frame of a base tilted by pitch about y, then by roll about its x.
 
     Positive pitch lowers the front (x), positive roll lowers the right-hand side (-y).
     """
@@ -159,7 +169,7 @@ def _apply_base_tilt(machine: Machine, location: str, values: Values) -> Machine
 
 BASE_TILT = Effect(
     "base_tilt",
-    "the base does not stand level",
+    "tilt of the base",
     "force",
     _place,
     _parameters_base_tilt,

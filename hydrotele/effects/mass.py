@@ -1,7 +1,4 @@
-"""Masses of a link that lie elsewhere than the model says.
-
-A load at the arm's tip.
-"""
+"""Effects of mass: centre of mass and moments of inertia of a link, and a payload at the tip."""
 
 import numpy as np
 
@@ -20,7 +17,7 @@ _LETTERS = "xyz"
 
 
 def _upright(machine: Machine, axis: str) -> bool:
-    """Whether the axis is parallel to gravity at the base, so that weight does not turn it."""
+    """Return whether an axis at the base is parallel to gravity: weight then causes no torque."""
     link = machine.links[machine.link_of(machine.axes[axis].joint)]
     assert link.joint
     gravity = np.array(machine.gravity)
@@ -29,15 +26,16 @@ def _upright(machine: Machine, axis: str) -> bool:
 
 
 def _directions(machine: Machine, axis: str) -> list[str]:
-    """The two coordinates across the joint's axis; the third one changes nothing."""
+    """Return the two coordinates perpendicular to the joint axis; the third one has no effect."""
     axis_direction = np.abs(machine.joints[machine.axes[axis].joint].axis)
     return [_LETTERS[k] for k in range(3) if k != int(np.argmax(axis_direction))]
 
 
 def _com(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Fractions of the link's size: 0.5 % of a boom, some 25 mm, shifts its pressure by 40 kPa.
+    """Specify the offsets of a link's centre of mass, scaled by the size of the link.
 
-    Of an upright axis only the moment of inertia changes, so that it takes six times as much.
+    An offset of 0.5 % of a boom, about 25 mm, changes its pressure by 40 kPa. For a vertical axis
+    only the moment of inertia changes, so that the smallest relevant offset is six times larger.
     """
     size = link_size(machine, machine.link_of(machine.axes[location].joint))
     least = (0.03 if _upright(machine, location) else 0.005) * size
@@ -53,9 +51,10 @@ def _move_com(machine: Machine, location: str, values: Values) -> Machine:
 
 
 def _ratio(machine: Machine, location: str) -> dict[str, Parameter]:
-    """A model from drawings knows a moment of inertia to some 20 %; 5 % is its usual rounding.
+    """Specify the ratio of true to given moments of inertia.
 
-    The range holds what attachments, ballast, or a wrong unit of the drawings do.
+    A model from drawings is accurate to about 20 %, with typical rounding of 5 %. The bounds
+    include attachments, ballast, and a wrong unit in the drawings.
     """
     return {"ratio": Parameter("1", 1.0, 0.05, 20.0, 0.2, 0.05, starts=(1.0, 6.0))}
 
@@ -68,10 +67,12 @@ def _scale_inertia(machine: Machine, location: str, values: Values) -> Machine:
 
 MASS = (
     Effect(
-        "com_offset", "a link's centre of mass lies elsewhere", "force", hinges, _com, _move_com
+        "com_offset", "centre of mass of a link that differs from the model", "force", hinges, _com,
+        _move_com,
     ),
     Effect(
-        "inertia_error", "a link's moments of inertia about its centre of mass are others",
+        "inertia_error",
+        "moments of inertia of a link about its centre of mass that differ from the model",
         "force", hinges, _ratio, _scale_inertia,
     ),
 )  # fmt: skip
@@ -80,8 +81,8 @@ MASS = (
 PAYLOAD = "payload"
 """Name of the link that carries the load."""
 
-_LEAST = 1.0e-3  # kg, below which a load is none: MuJoCo takes no body without mass
-_POINT = 1.0e-3  # m, radius of gyration of a point mass: a body needs some inertia
+_LEAST = 1.0e-3  # kg: a smaller payload is omitted, since MuJoCo accepts no body without mass
+_POINT = 1.0e-3  # m, radius of gyration of a point mass, since MuJoCo needs some inertia
 
 
 def _place(machine: Machine) -> tuple[str, ...]:
@@ -89,7 +90,10 @@ def _place(machine: Machine) -> tuple[str, ...]:
 
 
 def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Relative to what the boom moves: 15 kg of 2.5 t is what seals let one feel."""
+    """Specify the payload mass, scaled by the mass that the boom moves.
+
+    Seal friction hides a payload below 15 kg at a moved mass of 2.5 t.
+    """
     assert machine.arm
     arm = outboard_links(machine, machine.link_of(machine.arm.boom))
     moved = sum(machine.links[name].mass for name in arm if name != PAYLOAD)
@@ -97,7 +101,7 @@ def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:
 
 
 def _apply(machine: Machine, location: str, values: Values) -> Machine:
-    """Point mass at the arm's tip: one more link, welded there; loads add up."""
+    """Add a point mass at the arm's tip as a welded link; repeated payloads add up."""
     assert machine.arm
     tip, mass = machine.arm.tip, values["mass"]
     if mass < _LEAST:

@@ -1,7 +1,7 @@
-"""A pump of an axis' own, its motor, its lines and its load with other numbers than in the model.
+"""Effects of drives with an own pump: pump, motor, lines, accumulator and load cylinder.
 
-Each is one number, so that whoever states it wrongly is told which one. Numbers of a catalogue are
-sized relative to themselves; losses that a catalogue leaves out, relative to what the motor can do.
+Most effects change one parameter, so that a gap search can name the wrong parameter. Catalogue
+values are scaled by themselves; losses that catalogues omit are scaled by the motor's capability.
 """
 
 from hydrotele.effects.effect import Effect, Parameter, Values, changed
@@ -11,17 +11,17 @@ _SIDES = ("head", "rod")
 
 
 def _pumped(machine: Machine) -> tuple[str, ...]:
-    """Axes with a pump of their own."""
+    """Return the axes with an own pump."""
     return tuple(name for name, axis in machine.axes.items() if axis.pump)
 
 
 def _motored(machine: Machine) -> tuple[str, ...]:
-    """Axes whose pump has a motor."""
+    """Return the axes whose pump has a motor."""
     return tuple(n for n in _pumped(machine) if (p := machine.axes[n].pump) and p.motor)
 
 
 def _loaded(machine: Machine) -> tuple[str, ...]:
-    """Axes against which a load cylinder with a relief valve pushes."""
+    """Return the axes that push against a load cylinder with a relief valve."""
     return tuple(n for n in machine.loads if machine.loads[n].relief_pressure > 0.0)
 
 
@@ -38,19 +38,25 @@ def _motor(machine: Machine, axis: str):
 
 
 def _ratio_of(unit: str, present: float, scale: float, least: float, widest: float) -> Parameter:
-    """A positive number of a catalogue: from 1/widest to widest times what it says."""
+    """Specify a positive catalogue parameter with bounds of 1/widest and widest times its value."""
     sizes = present / widest, present * widest, scale * present, least * present
     return Parameter(unit, present, *sizes)
 
 
 def _displacement(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Gear pumps of one size scatter by some per cent; 1 % is what a flow meter sees."""
+    """Specify the pump displacement.
+
+    Gear pumps of one size scatter by some per cent; a flow meter resolves 1 %.
+    """
     present = _pump(machine, location).displacement
     return {"displacement": _ratio_of("m^3/rad", present, 0.1, 0.01, 3.0)}
 
 
 def _leakage(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Of what makes the rated flow leak at the highest pressure: 10 % are usual, 1 % is seen."""
+    """Specify the pump leakage, scaled by rated flow over highest pressure.
+
+    10 % is typical, 1 % is detectable.
+    """
     pump = _pump(machine, location)
     whole = pump.rated_flow / machine.highest_pressure(location)
     high = pump.leakage + 0.5 * whole
@@ -59,19 +65,28 @@ def _leakage(machine: Machine, location: str) -> dict[str, Parameter]:
 
 
 def _torque_loss(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Small gear pumps lose 10 to 60 % of their torque; 3 % is what warm oil changes."""
+    """Specify the torque loss of the pump.
+
+    Small gear pumps lose 10 to 60 % of their torque; warm oil changes the loss by 3 %.
+    """
     present = _pump(machine, location).torque_loss
     return {"torque_loss": Parameter("1", present, 0.0, max(2.0, present), 0.2, 0.03)}
 
 
 def _emf(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Magnets and windings scatter by 10 %; 2 % is what heat takes."""
+    """Specify the motor constant.
+
+    Magnets and windings scatter by 10 %; heating reduces the constant by 2 %.
+    """
     present = _motor(machine, location).emf
     return {"emf": _ratio_of("V s/rad", present, 0.1, 0.02, 5.0)}
 
 
 def _inertia(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Known to tens of per cent, and to powers of ten where a unit was mistaken."""
+    """Specify the inertia of motor and pump.
+
+    It is known to tens of per cent; a wrong unit causes errors of powers of ten.
+    """
     present = _motor(machine, location).inertia
     return {"inertia": _ratio_of("kg m^2", present, 0.3, 0.05, 30.0)}
 
@@ -82,7 +97,10 @@ def _stall_torque(machine: Machine, location: str) -> float:
 
 
 def _drag(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Fractions of the torque at stall: brushes and seals take 5 %; 1 % is worth naming."""
+    """Specify dry drag and breakaway torque, scaled by the stall torque.
+
+    Brushes and seals cause 5 %.
+    """
     motor, whole = _motor(machine, location), _stall_torque(machine, location)
     return {
         name: Parameter("N m", present, 0.0, present + 0.5 * whole, 0.05 * whole, 0.01 * whole)
@@ -91,7 +109,10 @@ def _drag(machine: Machine, location: str) -> dict[str, Parameter]:
 
 
 def _viscous_drag(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Fractions of the torque at stall, at the rated speed; as of dry drag."""
+    """Specify the viscous drag, scaled by stall torque over rated speed.
+
+    The fractions are those of dry drag.
+    """
     present = _motor(machine, location).viscous
     whole = _stall_torque(machine, location) / _pump(machine, location).rated_speed
     sizes = 0.0, present + 0.5 * whole, 0.05 * whole, 0.01 * whole
@@ -103,9 +124,10 @@ def _lines(machine: Machine) -> tuple[str, ...]:
 
 
 def _softness(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Relative to the oil in the middle of the stroke: hoses give some times as much as their oil.
+    """Specify line compliance and air volume, relative to the oil at mid-stroke.
 
-    Air counts at the atmosphere's pressure; a few per cent of the volume are usual.
+    Hoses are several times more compliant than their oil. The air volume is stated at atmospheric
+    pressure; a few per cent of the oil volume are typical.
     """
     axis, _, side = location.partition(".")
     drive, pump = machine.axes[axis].cylinder, _pump(machine, axis)
@@ -127,20 +149,29 @@ def _set_lines(machine: Machine, location: str, values: Values) -> Machine:
 
 
 def _accumulator(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Filled by hand to tens of per cent; 2 % is a gauge's finest mark."""
+    """Specify the charge pressure of the accumulator.
+
+    It is set manually to tens of per cent; the finest mark of a gauge is 2 %.
+    """
     present = _pump(machine, location).accumulator.pressure
     return {"pressure": _ratio_of("Pa", present, 0.2, 0.02, 5.0)}
 
 
 def _load_relief(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Set by hand to tens of per cent of a low setting; 2 % is a gauge's finest mark."""
+    """Specify the relief pressure of the load cylinder.
+
+    Low settings are made manually to tens of per cent; the finest mark of a gauge is 2 %.
+    """
     present = machine.loads[location].relief_pressure
     return {"relief_pressure": Parameter("Pa", present, 0.0, 3.0 * present, 0.2 * present,
                                          0.02 * present)}  # fmt: skip
 
 
 def _load_friction(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Of the load's force: packings take up to some tens of per cent; 2 % is worth naming."""
+    """Specify the packing friction of the load cylinder as a fraction of the load's force.
+
+    Packings cause up to some tens of per cent.
+    """
     present = machine.loads[location].friction
     return {"friction": Parameter("1", present, 0.0, max(1.0, present), 0.1, 0.02)}
 
@@ -157,26 +188,26 @@ def _set(part: str):
 _PUMP, _MOTOR = _set("axes.{}.pump"), _set("axes.{}.pump.motor")
 _GAS, _LOAD = _set("axes.{}.pump.accumulator"), _set("loads.{}")
 EFFECTS = (
-    Effect("pump_displacement", "another displacement of an axis' own pump", "flow", _pumped,
-           _displacement, _PUMP),
-    Effect("pump_leakage", "another leakage of an axis' own pump", "flow", _pumped, _leakage,
-           _PUMP),
-    Effect("pump_torque_loss", "another loss of torque in an axis' own pump", "flow", _motored,
-           _torque_loss, _PUMP),
-    Effect("motor_constant", "another torque per current of a pump's motor", "flow", _motored,
-           _emf, _MOTOR),
-    Effect("motor_inertia", "another inertia of a pump and its motor", "flow", _motored, _inertia,
-           _MOTOR),
-    Effect("motor_drag", "another dry drag of a pump and its motor", "flow", _motored, _drag,
-           _MOTOR),
-    Effect("motor_viscous_drag", "another drag of a pump and its motor that grows with the speed",
+    Effect("pump_displacement", "displacement of an axis pump that differs from the model", "flow",
+           _pumped, _displacement, _PUMP),
+    Effect("pump_leakage", "leakage of an axis pump that differs from the model", "flow", _pumped,
+           _leakage, _PUMP),
+    Effect("pump_torque_loss", "torque loss of an axis pump that differs from the model", "flow",
+           _motored, _torque_loss, _PUMP),
+    Effect("motor_constant", "torque constant of a pump motor that differs from the model", "flow",
+           _motored, _emf, _MOTOR),
+    Effect("motor_inertia", "inertia of pump and motor that differs from the model", "flow",
+           _motored, _inertia, _MOTOR),
+    Effect("motor_drag", "dry drag of pump and motor that differs from the model", "flow", _motored,
+           _drag, _MOTOR),
+    Effect("motor_viscous_drag", "viscous drag of pump and motor that differs from the model",
            "flow", _motored, _viscous_drag, _MOTOR),
-    Effect("line_compliance", "lines between a pump and its cylinder that give more, or hold air",
+    Effect("line_compliance", "compliance of, or air in, the lines between pump and cylinder",
            "flow", _lines, _softness, _set_lines),
-    Effect("accumulator_pressure", "another filling of a pump drive's accumulator", "flow",
-           _pumped, _accumulator, _GAS),
-    Effect("load_relief", "another relief pressure of a load cylinder", "force", _loaded,
-           _load_relief, _LOAD),
-    Effect("load_friction", "another friction of a load cylinder's packings", "force", _loaded,
-           _load_friction, _LOAD),
+    Effect("accumulator_pressure", "accumulator charge pressure that differs from the model",
+           "flow", _pumped, _accumulator, _GAS),
+    Effect("load_relief", "relief pressure of a load cylinder that differs from the model", "force",
+           _loaded, _load_relief, _LOAD),
+    Effect("load_friction", "packing friction of a load cylinder that differs from the model",
+           "force", _loaded, _load_friction, _LOAD),
 )  # fmt: skip

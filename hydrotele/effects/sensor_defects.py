@@ -1,7 +1,4 @@
-"""Sensors that read with an offset, another scale, late, or by a clock of their own.
-
-Position sensors whose offset drifts while they warm up.
-"""
+"""Effects of sensors: offset, drift during warm-up, scale, delay, lag, and clock offset."""
 
 import math
 
@@ -29,7 +26,11 @@ def _with(machine: Machine, channel: str, **numbers: float) -> Machine:
 
 
 def _angle_offset(machine: Machine, location: str) -> dict[str, Parameter]:
-    """A resolver is mounted to half a degree or worse and read to a twentieth; a slide alike."""
+    """Specify the offset of a position sensor.
+
+    Resolvers are mounted to half a degree or worse and resolve a twentieth of a degree. Slides use
+    corresponding fractions of their range.
+    """
     present = _error(machine, _position(machine, location)).offset
     if machine.position_kind(location) == "angle":
         unit, one = "rad", math.radians(1.0)
@@ -49,7 +50,10 @@ def _set_angle(field: str, parameter: str):
 
 
 def _angle_drift(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Sizes in a warm sensor as of an offset; 600 s in which it warms up are an estimate."""
+    """Specify drift and warm-up time constant of a position sensor.
+
+    The drift of the warm sensor has the scale and bounds of an offset.
+    """
     error = _error(machine, _position(machine, location))
     sizes = _angle_offset(machine, location)["offset"]
     reach = sizes.high - sizes.nominal
@@ -63,7 +67,7 @@ def _angle_drift(machine: Machine, location: str) -> dict[str, Parameter]:
 
 
 def _set_angle_drift(machine: Machine, location: str, values: Values) -> Machine:
-    """Without drift its time constant means nothing and is left out."""
+    """Set drift and time constant; without drift the time constant has no effect and is omitted."""
     numbers = {"drift": values["drift"]}
     if values["drift"] and "time_constant" in values:
         numbers["drift_time_constant"] = values["time_constant"]
@@ -71,14 +75,21 @@ def _set_angle_drift(machine: Machine, location: str, values: Values) -> Machine
 
 
 def _angle_scale(machine: Machine, location: str) -> dict[str, Parameter]:
-    """A wrong gear or reference voltage; 0.3 % over a radian is a resolver's linearity."""
+    """Specify the scale of a position sensor.
+
+    It is wrong with a wrong gear or reference voltage. The linearity of a resolver is 0.3 % over
+    one radian.
+    """
     present = _error(machine, _position(machine, location)).scale
     low, high = min(0.8, present), max(1.2, present)
     return {"ratio": Parameter("1", present, low, high, 0.02, 0.003)}
 
 
 def _late(present: float) -> dict[str, Parameter]:
-    """Filters and buses take some 10 ms; 3 ms is one bus cycle."""
+    """Specify a sensor delay.
+
+    Filters and buses delay by about 10 ms; 3 ms is one bus cycle.
+    """
     high = max(0.3, present)
     return {"delay": Parameter("s", present, 0.0, high, 0.02, 0.003, starts=(0.02, 0.06))}
 
@@ -88,7 +99,10 @@ def _angle_delay(machine: Machine, location: str) -> dict[str, Parameter]:
 
 
 def _slow(present: float) -> dict[str, Parameter]:
-    """Transducers and their filters have time constants of 1 to 50 ms; 3 ms is worth naming."""
+    """Specify the time constant of a first-order lag.
+
+    Transducers and their filters have 1 to 50 ms.
+    """
     high = max(0.3, present)
     return {"time_constant": Parameter("s", present, 0.0, high, 0.02, 0.003, starts=(0.01, 0.04))}
 
@@ -98,7 +112,10 @@ def _angle_lag(machine: Machine, location: str) -> dict[str, Parameter]:
 
 
 def _length_offset(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Fractions of the stroke: mounted to a centimetre, worth naming from a millimetre on."""
+    """Specify the offset of a length sensor, scaled by the stroke.
+
+    Length sensors are mounted to a centimetre; the smallest relevant offset is a millimetre.
+    """
     cylinder = machine.axes[location].cylinder
     assert cylinder
     present, stroke = _error(machine, f"length.{location}").offset, cylinder.stroke
@@ -120,7 +137,10 @@ def _transducer(location: str) -> str:
 
 
 def _pressure_offset(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Zero drift: a transducer's class is 0.5 % of its span, its repeatability under 0.1 %."""
+    """Specify the zero offset of a pressure transducer.
+
+    The accuracy class is 0.5 % of the span, the repeatability better than 0.1 %.
+    """
     present = _error(machine, _transducer(location)).offset
     span = machine.highest_pressure(location.rpartition(".")[0])
     low, high = present - 0.05 * span, present + 0.05 * span
@@ -132,7 +152,11 @@ def _set_pressure(machine: Machine, location: str, values: Values) -> Machine:
 
 
 def _pressure_scale(machine: Machine, location: str) -> dict[str, Parameter]:
-    """A wrong span setting or supply voltage; a calibrated transducer is right to 0.25 %."""
+    """Specify the scale of a pressure transducer.
+
+    It is wrong with a wrong span setting or supply voltage. A calibrated transducer is accurate to
+    0.25 %.
+    """
     present = _error(machine, _transducer(location)).scale
     low, high = min(0.8, present), max(1.2, present)
     return {"ratio": Parameter("1", present, low, high, 0.02, 0.003)}
@@ -147,12 +171,12 @@ def _both(axis: str) -> tuple[str, ...]:
 
 
 def _common(machine: Machine, channels: tuple[str, ...], field: str) -> float:
-    """What all channels have in common of a delay or time constant [s]: the least of them."""
+    """Return the delay or time constant common to all channels [s], the smallest of them."""
     return min(getattr(_error(machine, channel), field) for channel in channels)
 
 
 def _with_common(machine: Machine, channels: tuple[str, ...], field: str, value: float) -> Machine:
-    """The least of the channels gets the value, the others shift as much."""
+    """Set the smallest of the channels' values and shift the others equally."""
     more = value - _common(machine, channels, field)
     for channel in channels:
         shifted = getattr(_error(machine, channel), field) + more
@@ -177,7 +201,10 @@ def _set_pressure_lag(machine: Machine, location: str, values: Values) -> Machin
 
 
 def _clocks(machine: Machine) -> dict[str, tuple[str, ...]]:
-    """Groups of channels that one logger may have stamped; one axis alone has its own delays."""
+    """Return the groups of channels that one logger may have time-stamped.
+
+    A group needs more than one axis; a single axis is covered by its sensor delays.
+    """
     pressures = tuple(c for c in machine.sensed_channels if c.startswith("pressure"))
     positions = tuple(c for c in machine.sensed_channels if not c.startswith("pressure"))
     groups = {}
@@ -189,10 +216,11 @@ def _clocks(machine: Machine) -> dict[str, tuple[str, ...]]:
 
 
 def _clock_offset(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Seconds by which a group of sensors is stamped late, against commands and other sensors.
+    """Specify the time by which a group of sensors is late relative to commands and other sensors.
 
-    A group is never early, which would be a response before its command; against the other group
-    either sign is possible, as an offset of one or of the other. Loggers are off by some 10 ms.
+    A group is never early, because that would be a response before its command. Between the two
+    groups either sign is possible, as an offset of one or the other. Loggers are off by about 10
+    ms.
     """
     present = _common(machine, _clocks(machine)[location], "delay")
     high = max(0.5, present)
@@ -205,47 +233,47 @@ def _set_clock_offset(machine: Machine, location: str, values: Values) -> Machin
 
 EFFECTS = (
     Effect(
-        "angle_offset", "a position sensor that is mounted askew", "sensor", axes, _angle_offset,
+        "angle_offset", "an offset of a position sensor", "sensor", axes, _angle_offset,
         _set_angle("offset", "offset"),
     ),
     Effect(
-        "angle_drift", "a position sensor whose offset drifts while it warms up", "sensor", axes,
+        "angle_drift", "an offset of a position sensor that drifts during warm-up", "sensor", axes,
         _angle_drift, _set_angle_drift,
     ),
     Effect(
-        "angle_scale", "a position sensor with another scale", "sensor", axes, _angle_scale,
+        "angle_scale", "a scale error of a position sensor", "sensor", axes, _angle_scale,
         _set_angle("scale", "ratio"),
     ),
     Effect(
-        "angle_delay", "a position sensor that reads late", "sensor", axes, _angle_delay,
-        _set_angle("delay", "delay"), "late position sensor",
+        "angle_delay", "a delay of a position sensor", "sensor", axes, _angle_delay,
+        _set_angle("delay", "delay"), "position sensor delay",
     ),
     Effect(
-        "angle_lag", "a position sensor behind a first-order lag", "sensor", axes, _angle_lag,
-        _set_angle("time_constant", "time_constant"), "late position sensor",
+        "angle_lag", "a first-order lag of a position sensor", "sensor", axes, _angle_lag,
+        _set_angle("time_constant", "time_constant"), "position sensor delay",
     ),
     Effect(
-        "length_offset", "a cylinder's length sensor with an offset", "sensor", linkages,
+        "length_offset", "an offset of a cylinder's length sensor", "sensor", linkages,
         _length_offset, _set_length,
     ),
     Effect(
-        "pressure_offset", "a pressure transducer with an offset", "sensor", _ports,
+        "pressure_offset", "an offset of a pressure transducer", "sensor", _ports,
         _pressure_offset, _set_pressure,
     ),
     Effect(
-        "pressure_delay", "pressure transducers of an axis that read late", "sensor", hydraulics,
-        _pressure_delay, _set_pressure_delay, "late pressure transducers",
+        "pressure_delay", "a delay of an axis' pressure transducers", "sensor", hydraulics,
+        _pressure_delay, _set_pressure_delay, "pressure transducer delay",
     ),
     Effect(
-        "pressure_scale", "a pressure transducer with another scale", "sensor", _ports,
+        "pressure_scale", "a scale error of a pressure transducer", "sensor", _ports,
         _pressure_scale, _set_pressure_scale,
     ),
     Effect(
-        "pressure_lag", "pressure transducers of an axis behind a first-order lag", "sensor",
-        hydraulics, _pressure_lag, _set_pressure_lag, "late pressure transducers",
+        "pressure_lag", "a first-order lag of an axis' pressure transducers", "sensor",
+        hydraulics, _pressure_lag, _set_pressure_lag, "pressure transducer delay",
     ),
     Effect(
-        "clock_offset", "a clock of the positions or of the pressures that is late", "sensor",
+        "clock_offset", "a time offset of all positions or all pressures", "sensor",
         lambda machine: tuple(_clocks(machine)), _clock_offset, _set_clock_offset,
     ),
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""A pump or a main relief valve with other limits, droop or response than in the model."""
+"""Effects of the supply: pump flow, droop and lag, and setting of the main relief valve."""
 
 from hydrotele.effects.effect import Effect, Parameter, Values, changed
 from hydrotele.machine.machine import Machine
@@ -9,20 +9,26 @@ def _place(machine: Machine) -> tuple[str, ...]:
 
 
 def _pumping(machine: Machine) -> tuple[str, ...]:
-    """Where a pump limits the flow: not on a constant-pressure supply."""
+    """Return the supply if its pump limits the flow; a constant-pressure supply does not."""
     supply = machine.supply
     return _place(machine) if supply and supply.kind != "constant_pressure" else ()
 
 
 def _pump(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Engine speed and wear take tens of per cent; 2 % is the droop of an engine's governor."""
+    """Specify the flow of the pump.
+
+    Engine speed and wear change it by tens of per cent; an engine governor has a droop of 2 %.
+    """
     assert machine.supply
     q = machine.supply.pump_flow
     return {"pump_flow": Parameter("m^3/s", q, 0.1 * q, 2.5 * q, 0.15 * q, 0.02 * q)}
 
 
 def _droop(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Leakage and an engine's governor take 5 % at full pressure; 1 % is what a new pump loses."""
+    """Specify the decrease of pump flow with pressure.
+
+    Leakage and engine governor reduce the flow by 5 % at full pressure; a new pump loses 1 %.
+    """
     assert machine.supply
     whole = machine.supply.pump_flow / machine.supply.relief_pressure
     present = machine.supply.pump_droop
@@ -35,7 +41,10 @@ def _set_droop(machine: Machine, location: str, values: Values) -> Machine:
 
 
 def _lag(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Swash plates take 50 to 300 ms; least is what a fast one takes, 20 ms."""
+    """Specify the time constant of the pump.
+
+    Swash plates respond in 50 to 300 ms, fast ones in 20 ms.
+    """
     assert machine.supply
     present = machine.supply.time_constant
     high = max(1.0, present)
@@ -43,9 +52,10 @@ def _lag(machine: Machine, location: str) -> dict[str, Parameter]:
 
 
 def _relief(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Set by hand to a few per cent; 0.3 % is a gauge's finest mark.
+    """Specify relief pressure and pressure override of the main relief valve.
 
-    From opening to all of the pump's flow the pressure rises by some 10 %; 1 % is a piloted valve.
+    The pressure is set manually to a few per cent; the finest mark of a gauge is 0.3 %. From
+    opening to full pump flow the pressure rises by about 10 %, for a pilot-operated valve by 1 %.
     """
     supply = machine.supply
     assert supply
@@ -67,17 +77,18 @@ def _set(machine: Machine, location: str, values: Values) -> Machine:
 
 
 EFFECTS = (
-    Effect("pump_flow_limit", "another flow of the pump", "supply", _pumping, _pump, _set),
     Effect(
-        "pump_droop", "a pump whose flow falls with its pressure", "supply", _pumping, _droop,
+        "pump_flow_limit", "pump flow that differs from the model", "supply", _pumping, _pump, _set
+    ),
+    Effect(
+        "pump_droop", "pump flow that decreases with pressure", "supply", _pumping, _droop,
         _set_droop,
     ),
     Effect(
-        "pump_lag", "a pump whose flow follows what is drawn after a time", "supply", _pumping,
-        _lag, _set,
+        "pump_lag", "pump flow that follows the demand with a lag", "supply", _pumping, _lag, _set
     ),
     Effect(
-        "relief_pressure", "another setting of the main relief valve", "supply", _place, _relief,
-        _set,
+        "relief_pressure", "setting of the main relief valve that differs from the model", "supply",
+        _place, _relief, _set,
     ),
 )  # fmt: skip

@@ -1,8 +1,7 @@
-"""The drive side of a transmission that an effect adds: how heavy it is, how stiff it may be.
+"""Effects of the transmission between drive and load: backlash and joint flexibility.
 
-Teeth with a gap between a motor and what it turns.
-
-A spring between a drive and what it moves.
+Both effects add a `Transmission` with a drive-side inertia, a spring and a damper to an axis.
+Helper functions choose an inertia and a stiffness that a simulation with 1 ms steps can resolve.
 """
 
 import math
@@ -22,17 +21,17 @@ from hydrotele.effects.effect import (
 from hydrotele.machine.drives import Transmission
 from hydrotele.machine.machine import Machine
 
-_SHARE = 0.03  # of the load's inertia: rotor and gears of a slewing drive, seen at the ring
-_CONTACT = 2.0 * math.pi * 40.0  # rad/s of the drive on closed teeth: six steps of 1 ms a radian
-_FASTEST = 2.0 * math.pi * 150.0  # rad/s of the drive on spring and oil: 1 ms is half its limit
-_DAMPING = 0.3  # damping ratio of the drive on its spring: oil and rubbing teeth
+_SHARE = 0.03  # of the load's inertia: rotor and gears of a slewing drive, referred to the ring
+_CONTACT = 2.0 * math.pi * 40.0  # rad/s, drive on closed teeth: a radian takes four steps of 1 ms
+_FASTEST = 2.0 * math.pi * 150.0  # rad/s, drive on spring and oil: 1 ms is half the step limit
+_DAMPING = 0.3  # damping ratio of the drive on its spring: oil and friction of the teeth
 
 
 def rigid_drive(machine: Machine, axis: str) -> Transmission:
-    """Transmission of a rigid drive that is about to get a gap or a spring.
+    """Return the transmission of a rigid drive, before a backlash or a compliance is added.
 
-    Its inertia is the rod's mass, or 3 % of what a motor turns at home; its spring is so stiff that
-    a step of 1 ms just resolves it well (40 Hz).
+    Its inertia is the rod's mass, or 3 % of a motor's load inertia at home. Its spring is as stiff
+    as steps of 1 ms resolve well (40 Hz).
     """
     cylinder = machine.axes[axis].cylinder
     inertia = cylinder.rod.mass if cylinder else _SHARE * load_inertia(machine, axis)
@@ -43,20 +42,20 @@ def rigid_drive(machine: Machine, axis: str) -> Transmission:
 
 
 def damper(inertia: float, stiffness: float) -> float:
-    """Damping of the spring [N s/m] or [N m s/rad]."""
+    """Return the damping of the spring [N s/m] or [N m s/rad] for a damping ratio of 0.3."""
     return 2.0 * _DAMPING * math.sqrt(stiffness * inertia)
 
 
 def resolved_inertia(machine: Machine, axis: str, inertia: float, stiffness: float) -> float:
-    """Inertia with which spring and oil can be stepped with 1 ms: more of it where they are hard.
+    """Return the drive inertia, increased if needed to simulate spring and oil with 1 ms steps.
 
-    The oil is stiffest with the piston at its end: `beta (A^2 / V)` of both chambers.
+    The oil is stiffest at the end of the stroke: the sum of `beta A^2 / V` of both chambers.
     """
     return max(inertia, (stiffness + _oil_stiffness(machine, axis)) / _FASTEST**2)
 
 
 def ringing(machine: Machine, axis: str) -> float:
-    """Angular frequency of an axis' drive on the spring of its transmission and its oil [rad/s]."""
+    """Return the natural frequency of a drive on its transmission spring and oil [rad/s]."""
     facts = machine.axes[axis]
     assert facts.transmission
     oil = _oil_stiffness(machine, axis) if facts.hydraulic else 0.0
@@ -64,7 +63,7 @@ def ringing(machine: Machine, axis: str) -> float:
 
 
 def _oil_stiffness(machine: Machine, axis: str) -> float:
-    """Of both chambers, with the piston at its end [N/m] or [N m/rad]."""
+    """Return the stiffness of both chambers at the end of the stroke [N/m] or [N m/rad]."""
     drive, cylinder = machine.axes[axis].hydraulic_drive, machine.axes[axis].cylinder
     assert machine.supply
     head, rod = drive.areas
@@ -73,10 +72,10 @@ def _oil_stiffness(machine: Machine, axis: str) -> float:
 
 
 def with_transmission(machine: Machine, axis: str, transmission: Transmission) -> Machine:
-    """Machine with a transmission in an axis; what a motor's drive side weighs leaves the link.
+    """Return a copy of a machine with a transmission in an axis.
 
-    So the whole moment of inertia about a motor's axis stays what it was, as long as the link has
-    that much to give.
+    For a motor, the drive-side inertia is subtracted from the link, so that the total inertia about
+    the motor axis does not change. It is not subtracted if the link's inertia would become invalid.
     """
     facts = machine.axes[axis]
     before = facts.transmission.inertia if facts.transmission else 0.0
@@ -94,7 +93,10 @@ def with_transmission(machine: Machine, axis: str, transmission: Transmission) -
 
 
 def load_inertia(machine: Machine, axis: str) -> float:
-    """What the joint of an axis turns [kg m^2] or pushes [kg] at home, without cylinders."""
+    """Return the inertia [kg m^2] or mass [kg] moved by the joint of an axis at home.
+
+    Cylinders are not included.
+    """
     joint = machine.axes[axis].joint
     first = machine.link_of(joint)
     carried = outboard_links(machine, first)
@@ -113,7 +115,7 @@ def load_inertia(machine: Machine, axis: str) -> float:
 
 
 def _frame(machine: Machine, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Origin (3,) [m] and rotation (3, 3) of a link at home in the world."""
+    """Return the world position (3,) [m] and rotation (3, 3) of a link at home."""
     if name == "world":
         return np.zeros(3), np.eye(3)
     link = machine.links[name]
@@ -128,13 +130,13 @@ def _frame(machine: Machine, name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
-    """Rotation matrix (3, 3) about a unit axis, by Rodrigues' formula."""
+    """Return the rotation matrix (3, 3) about a unit axis by Rodrigues' formula."""
     x, y, z = axis
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
 
 
-_CLOSED = 1.0e-6  # rad, a gap that is none: a slewing ring's tooth moves 1 um in it
+_CLOSED = 1.0e-6  # rad: smaller backlash is omitted; it moves a slewing ring's tooth by 1 um
 
 
 def _locations(machine: Machine) -> tuple[str, ...]:
@@ -142,11 +144,12 @@ def _locations(machine: Machine) -> tuple[str, ...]:
 
 
 def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Half a degree is a worn slewing ring; 1 mrad is a new one, or one reading of a resolver.
+    """Specify backlash, drive-side inertia, damping ratio and contact frequency.
 
-    How heavy rotor and gears are, seen at the ring, and how the teeth ring when they meet, is known
-    to a factor; it matters only to who follows the rattling from reading to reading. Teeth of steel
-    ring with 30 to 100 Hz; beyond that oil and teeth could not be stepped with 1 ms.
+    A worn slewing ring has half a degree of backlash, a new one 1 mrad, which is also the
+    resolution of a resolver. Drive inertia and contact frequency are known only to a factor; they
+    matter only for chatter resolved sample by sample. Steel teeth vibrate at 30 to 100 Hz. Faster
+    contact of oil and teeth cannot be simulated with 1 ms steps.
     """
     drive = _drive(machine, location)
     present, rings = drive.backlash, _frequency(drive)
@@ -163,9 +166,10 @@ def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:
 
 
 def _inertia(unit: str, own: float, least: float = 0.0, usual: float = 0.0) -> Parameter:
-    """Of the drive side: known to a factor, and no number that one would name a defect by.
+    """Specify the drive-side inertia as an optional parameter.
 
-    Not below the least that can be stepped; a typical deviation passes what is usual.
+    It is known only to a factor and does not identify a defect. The lower bound is not below the
+    inertia `least` that the simulation can resolve; the scale is at least `usual`.
     """
     scale, low = max(own, usual), min(own, max(0.1 * own, least))
     return Parameter(unit, own, low, own + 4.0 * scale, scale, scale, optional=True)
@@ -177,7 +181,7 @@ def _damping_ratio(drive: Transmission) -> Parameter:
 
 
 def _frequency(drive: Transmission) -> float:
-    """With which the drive side rings on its spring [Hz]."""
+    """Return the natural frequency of the drive side on its spring [Hz]."""
     return math.sqrt(drive.stiffness / drive.inertia) / (2.0 * math.pi)
 
 
@@ -190,7 +194,7 @@ def _ratio(drive: Transmission) -> float:
 
 
 def _apply(machine: Machine, location: str, values: Values) -> Machine:
-    """Give the motor an inertia of its own, from the link's, and a stiff spring with a gap."""
+    """Add a motor-side inertia, taken from the link, and a stiff spring with backlash."""
     gap, before = values["gap"], machine.axes[location].transmission
     if gap < _CLOSED and before is None:
         return machine
@@ -207,26 +211,29 @@ def _apply(machine: Machine, location: str, values: Values) -> Machine:
 
 
 BACKLASH = Effect(
-    "backlash", "teeth with a gap between a motor and what it turns", "force", _locations,
-    _parameters, _apply,
+    "backlash", "backlash between a motor and its load", "force", _locations, _parameters, _apply
 )  # fmt: skip
 
 
-_RIGID = 0.02  # of the least compliance worth naming: stiffer than the parts taken as rigid
+_RIGID = 0.02  # of the smallest relevant compliance: stiffer than parts modelled as rigid
 _TURN = 0.015  # rad, deflection of a slewing drive's gears and shafts at full torque
 
 
 def _travel(machine: Machine, location: str) -> float:
-    """Deflection at full force that is usual for a flexible joint [m] or [rad]: 1 % of a stroke."""
+    """Return the typical deflection of a flexible joint at full force [m] or [rad].
+
+    For cylinders it is 1 % of the stroke.
+    """
     cylinder = machine.axes[location].cylinder
     return 0.01 * cylinder.stroke if cylinder else _TURN
 
 
 def _parameters_joint_flexibility(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Deflection over force; least is 2 mm of a 1 m stroke, or 2 mrad, at full pressure.
+    """Specify compliance, drive-side inertia and damping ratio.
 
-    How heavy the drive side is, and how its spring is damped, is known to a factor. It is never
-    lighter than what the oil alone can be stepped with; a stiff spring may need more than stated.
+    The smallest relevant deflection at full pressure is 2 mm for a stroke of 1 m, or 2 mrad.
+    Inertia and damping are known only to a factor. The inertia is never below the value that the
+    oil alone needs for 1 ms steps; a stiff spring may need more than the stated inertia.
     """
     usual = _travel(machine, location) / largest_force(machine, location)
     transmission = machine.axes[location].transmission
@@ -247,11 +254,11 @@ def _parameters_joint_flexibility(machine: Machine, location: str) -> dict[str, 
 
 
 def _apply_joint_flexibility(machine: Machine, location: str, values: Values) -> Machine:
-    """Put a spring of 1 / compliance in the transmission; a gap that is there stays.
+    """Set the spring stiffness to 1 / compliance; an existing backlash is kept.
 
-    A cylinder's spring lies in line with it, between piston and rod pin: the length sensor and the
-    oil see the piston. The drive side is as heavy as stated, else as the rod, or 3 % of a motor's
-    load, and heavier where a stiff spring could not be stepped otherwise.
+    A cylinder's spring is in line with it, between piston and rod pin, so that length sensor and
+    oil follow the piston. The drive-side inertia is the stated value, otherwise the rod's mass or 3
+    % of a motor's load. It is increased if a stiff spring needs it for 1 ms steps.
     """
     compliance, before = values["compliance"], machine.axes[location].transmission
     table = _parameters_joint_flexibility(machine, location)
@@ -270,7 +277,7 @@ def _apply_joint_flexibility(machine: Machine, location: str, values: Values) ->
 
 
 JOINT_FLEXIBILITY = Effect(
-    "joint_flexibility", "a spring between a drive and what it moves", "force", valves,
+    "joint_flexibility", "compliance between a drive and its load", "force", valves,
     _parameters_joint_flexibility, _apply_joint_flexibility,
 )  # fmt: skip
 

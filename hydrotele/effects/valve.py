@@ -1,12 +1,8 @@
-"""Valves that open later, wider or slower than in the model.
+"""Effects of valves: deadband, flow gain, bandwidth, flow curve, metering edges and slew limit.
 
-Valves whose two directions differ: notches, springs and centring are not made alike.
-
-Valves that open progressively: little over the first travel, much over the last.
-
-Valves whose four edges have areas of their own.
-
-Spools that a small pilot stage moves no faster than at a limited rate.
+Deadband and flow gain may differ between the two directions, because notches, springs and centring
+differ. A progressive flow curve opens little over the first travel and much over the last. The slew
+limit is the largest speed at which the pilot stage moves the spool.
 """
 
 import numpy as np
@@ -23,7 +19,7 @@ def _valve(machine: Machine, location: str) -> Valve:
 
 
 def _common_deadband(machine: Machine) -> tuple[str, ...]:
-    """Valves that have a dead band for both directions, or for one of them."""
+    """Return the valves whose common deadband applies to at least one direction."""
     return tuple(
         name for name in valves(machine)
         if any(way.deadband is None
@@ -32,7 +28,10 @@ def _common_deadband(machine: Machine) -> tuple[str, ...]:
 
 
 def _deadband(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Overlaps are a few per cent of the stroke; 0.4 % is a spool's usual hysteresis."""
+    """Specify the common deadband.
+
+    Overlaps are a few per cent of the stroke; the typical hysteresis of a spool is 0.4 %.
+    """
     present = _valve(machine, location).deadband
     return {"deadband": Parameter("1", present, 0.0, max(0.3, present), 0.03, 0.004)}
 
@@ -42,9 +41,10 @@ def _set_deadband(machine: Machine, location: str, values: Values) -> Machine:
 
 
 def _gain(machine: Machine, location: str) -> dict[str, Parameter]:
-    """A makers' flow rating is good to 5 or 10 %; 2 % is the linearity of a spool.
+    """Specify the ratio of true to given flow gain.
 
-    The range is that of another spool in the same body.
+    A manufacturer's flow rating is accurate to 5 or 10 %, the linearity of a spool is 2 %. The
+    bounds include a different spool in the same body.
     """
     return {"ratio": Parameter("1", 1.0, 0.05, 5.0, 0.15, 0.02)}
 
@@ -55,7 +55,11 @@ def _scale_gain(machine: Machine, location: str, values: Values) -> Machine:
 
 
 def _bandwidth(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Least is 8 %, which at 8 Hz is a lag of 3 ms, as the least delay worth naming."""
+    """Specify the bandwidth of the spool.
+
+    The smallest relevant deviation is 8 %. At 8 Hz it changes the lag by 3 ms, the smallest
+    relevant delay.
+    """
     w = _valve(machine, location).bandwidth
     return {"bandwidth": Parameter("rad/s", w, 0.1 * w, 4.0 * w, 0.4 * w, 0.08 * w)}
 
@@ -67,7 +71,7 @@ def _set_bandwidth(machine: Machine, location: str, values: Values) -> Machine:
 VALVE = (
     Effect(
         "valve_deadband",
-        "another overlap of a valve",
+        "valve overlap that differs from the model",
         "valve",
         _common_deadband,
         _deadband,
@@ -76,7 +80,7 @@ VALVE = (
     ),
     Effect(
         "valve_gain",
-        "another flow gain of a valve",
+        "valve flow gain that differs from the model",
         "valve",
         valves,
         _gain,
@@ -84,7 +88,12 @@ VALVE = (
         "flow gain",
     ),
     Effect(
-        "spool_lag", "another bandwidth of a spool", "valve", valves, _bandwidth, _set_bandwidth
+        "spool_lag",
+        "spool bandwidth that differs from the model",
+        "valve",
+        valves,
+        _bandwidth,
+        _set_bandwidth,
     ),
 )
 
@@ -93,7 +102,7 @@ DIRECTIONS = ("positive", "negative")
 
 
 def _gains(machine: Machine, location: str) -> dict[str, Parameter]:
-    """As the flow gain of a whole valve: rated to 5 or 10 %, linear to 2 %."""
+    """Specify the flow gain ratio of each direction, scaled as the common one."""
     return dict.fromkeys(DIRECTIONS, Parameter("1", 1.0, 0.05, 5.0, 0.15, 0.02))
 
 
@@ -107,7 +116,7 @@ def _scale_gains(machine: Machine, location: str, values: Values) -> Machine:
 
 
 def _deadbands(machine: Machine, location: str) -> dict[str, Parameter]:
-    """As the overlap of a whole valve, with room for a spool off its centre."""
+    """Specify the deadband of each direction, with larger bounds for a spool off its centre."""
     present = _valve(machine, location).deadbands
     return {
         direction: Parameter("1", band, 0.0, max(0.6, band), 0.03, 0.004)
@@ -126,12 +135,12 @@ def _set_deadbands(machine: Machine, location: str, values: Values) -> Machine:
 
 BY_DIRECTION = (
     Effect(
-        "valve_gain_direction", "flow gains of a valve that differ between its directions", "valve",
+        "valve_gain_direction", "valve flow gains that differ between the directions", "valve",
         valves, _gains, _scale_gains, "flow gain",
     ),
     Effect(
-        "valve_deadband_direction", "overlaps of a valve that differ between its directions",
-        "valve", valves, _deadbands, _set_deadbands, "overlap",
+        "valve_deadband_direction", "valve overlaps that differ between the directions", "valve",
+        valves, _deadbands, _set_deadbands, "overlap",
     ),
 )  # fmt: skip
 
@@ -141,7 +150,11 @@ _DIRECTIONS = ("positive", "negative")
 
 
 def _progression(machine: Machine, location: str) -> dict[str, Parameter]:
-    """0.3 opens to 42 % at half travel; estimates: fine control comes to 0.6, notches to 4 %."""
+    """Specify the progression of each direction.
+
+    A progression of 0.3 gives an opening of 42 % at half travel. Estimates: spools for fine control
+    reach 0.6, notches cause 0.04.
+    """
     return dict.fromkeys(_DIRECTIONS, Parameter("1", 0.0, -0.9, 0.9, 0.3, 0.04))
 
 
@@ -156,14 +169,16 @@ def _bend(machine: Machine, location: str, values: Values) -> Machine:
 
 
 def bent(present: Metering, progression: float) -> FlowCurve:
-    """A direction's curve times `1 - c + c t`, which leaves the full opening what it is.
+    """Return the flow curve of a direction multiplied by `1 - c + c t`, t being the travel.
+
+    The full opening does not change.
 
     Args:
-        present: the direction; straight without a curve.
+        present: the direction; linear without a curve.
         progression: c, from -1 (steep at first) to 1 (flat at first) [1].
 
     Returns:
-        The curve, at the knots of the present one, or at eight.
+        The curve at the knots of the given one, otherwise at eight knots.
     """
     old = present.curve or FlowCurve(travel=_KNOTS, opening=_KNOTS)
     pairs = zip(old.travel, old.opening, strict=True)
@@ -172,8 +187,7 @@ def bent(present: Metering, progression: float) -> FlowCurve:
 
 
 FLOW_CURVE = Effect(
-    "flow_curve", "a valve that opens progressively over its travel, or early", "valve", valves,
-    _progression, _bend,
+    "flow_curve", "a nonlinear valve opening over the travel", "valve", valves, _progression, _bend
 )  # fmt: skip
 
 
@@ -181,11 +195,14 @@ EDGES = {
     "p_a": "positive.inlet", "b_t": "positive.outlet", "p_b": "negative.inlet",
     "a_t": "negative.outlet",
 }  # fmt: skip
-"""Edge -> its gain in the valve's facts."""
+"""Metering edge -> field of the valve that holds its gain."""
 
 
 def _edges(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Estimates: spools for unequal cylinders differ by tens of per cent; 3 % is a notch's cut."""
+    """Specify the gain of each metering edge.
+
+    Estimates: spools for single-rod cylinders differ by tens of per cent; a notch changes 3 %.
+    """
     valve = machine.axes[location].valve
     assert valve
     present = {
@@ -205,16 +222,16 @@ def _set_edges(machine: Machine, location: str, values: Values) -> Machine:
 
 
 METERING_EDGES = Effect(
-    "metering_edges", "metering edges of a valve (P-A, B-T, P-B, A-T) with other areas", "valve",
-    valves, _edges, _set_edges,
+    "metering_edges", "areas of a valve's metering edges (P-A, B-T, P-B, A-T) that differ from the"
+    " model", "valve", valves, _edges, _set_edges,
 )  # fmt: skip
 
 
 def _travel_time(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Time from centre to full opening, in units of the spool's own 1 / w; 0 without a limit.
+    """Specify the time from centre to full opening, scaled by the spool's 1 / w; 0 without a limit.
 
-    A step to full opening moves a free spool of damping 0.9 at most at 0.38 w, so that a limit is
-    felt from a travel time of 2.6 / w on; the sizes are estimates, 3 times that and more.
+    A step to full opening moves an unlimited spool with damping ratio 0.9 at 0.38 w at most. A
+    limit therefore has an effect for travel times above 2.6 / w. The scales are estimates.
     """
     valve = machine.axes[location].valve
     assert valve
@@ -233,12 +250,12 @@ def _set(machine: Machine, location: str, values: Values) -> Machine:
     valve = machine.axes[location].valve
     assert valve
     if valve.slew_limit and limit and abs(limit / valve.slew_limit - 1.0) < 1.0e-15:
-        return machine  # the reciprocal of a reciprocal may be off by a rounding
+        return machine  # the reciprocal of a reciprocal may differ by rounding
     return changed(machine, f"axes.{location}.valve.slew_limit", limit)
 
 
 SPOOL_SLEW = Effect(
-    "spool_slew", "a spool that moves no faster than its pilot stage lets it", "valve", valves,
+    "spool_slew", "a spool speed that is limited by the pilot stage", "valve", valves,
     _travel_time, _set,
 )  # fmt: skip
 

@@ -1,21 +1,21 @@
-"""Oil and grease that warm up during a run: less viscous friction, more leakage."""
+"""Effect of oil and grease that warm up during a run: less viscous friction, more leakage."""
 
 from hydrotele.effects.effect import Effect, Parameter, Values, with_terms
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.law import Term
 
 NAME, ALL = "warming", "all"
-_SLOW = 300.0  # s, in which a tank of some hundred litres warms up
+_SLOW = 300.0  # s, time constant of warming of a tank of some hundred litres
 
 
 def _viscous(machine: Machine) -> dict[str, float]:
-    """Axes with viscous friction."""
+    """Return the viscous friction of the axes that have any."""
     found = {name: axis.drive.friction.viscous for name, axis in machine.axes.items()}
     return {name: viscous for name, viscous in found.items() if viscous}
 
 
 def _leaking(machine: Machine) -> dict[str, float]:
-    """Axes with leakage."""
+    """Return the leakage of the axes that have any."""
     found = {n: axis.hydraulic_drive.leakage for n, axis in machine.hydraulic_axes.items()}
     return {name: leakage for name, leakage in found.items() if leakage}
 
@@ -25,7 +25,10 @@ def _place(machine: Machine) -> tuple[str, ...]:
 
 
 def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Viscosity at the end over that at the beginning: 20 K halve it; 5 % are two kelvins."""
+    """Specify the ratio of final to initial viscosity and the time constant of warming.
+
+    Warming by 20 K halves the viscosity; a change of 5 % corresponds to 2 K.
+    """
     term = next((term for term in machine.terms if term.name == NAME), None)
     present = dict(term.parameters) if term else {"ratio": 1.0, "time_constant": _SLOW}
     ratio, slow = present["ratio"], present["time_constant"]
@@ -37,7 +40,7 @@ def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:
 
 
 def _apply(machine: Machine, location: str, values: Values) -> Machine:
-    """Terms that change what friction and leakage the machine has now, their even part."""
+    """Add terms that change the symmetric part of the machine's viscous friction and leakage."""
     if values["ratio"] == 1.0:
         return with_terms(machine, NAME, [])
     numbers = dict(values)
@@ -58,6 +61,6 @@ def _apply(machine: Machine, location: str, values: Values) -> Machine:
 
 
 EFFECT = Effect(
-    NAME, "oil that warms up: less viscous friction, more leakage", "force", _place, _parameters,
+    NAME, "warming oil, with less viscous friction and more leakage", "force", _place, _parameters,
     _apply,
 )  # fmt: skip

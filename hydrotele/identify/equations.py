@@ -1,6 +1,8 @@
-"""Equations of a run: regressor and forces, low-passed alike and thinned out.
+"""Linear equations `regressor @ parameters = force` of one run, and of all fitted runs.
 
-The equations of all runs to fit, one below the other.
+The regressor is computed from the filtered motion of the joints. Regressor and forces pass the same
+low-pass filter and are then downsampled. `build_equations` does this for one run; `gather` stacks
+the equations of several runs.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,33 +25,33 @@ from hydrotele.identify.setup import RegressorSetup
 from hydrotele.identify.smoothing import Smoothed, error_draws, smooth
 from hydrotele.multibody.inverse_dynamics import Regressor, sign_uncertainty
 
-_TAPS = 1.5  # half of the low-pass' length, in periods of its cutoff
-_KAISER = 5.0  # its ripple is 50 dB down
+_TAPS = 1.5  # half length of the low-pass filter, in periods of its cutoff
+_KAISER = 5.0  # window parameter: ripple of -50 dB
 _SPARE = 1.25  # equations per second over twice the band
-_FINE = 4  # times more rows where forces are judged and shown
-_CHUNK = 8000  # rows at a time, so that long logs need little memory
-_MISSING = 0.1  # part of a low-pass' weight that may lie on missing forces
-_NOISY = 6000  # rows at most on which they are tried
-_DRAWS = 4  # of the motion's errors: an RMS over thousands of rows needs no more
-_NYQUIST = 0.4  # of the sample rate that a band may reach
+_FINE = 4  # factor of the row rate where forces are evaluated and plotted
+_CHUNK = 8000  # rows per block, to limit memory for long logs
+_MISSING = 0.1  # largest fraction of the filter weight that may fall on missing forces
+_NOISY = 6000  # rows, largest number with which the effect of motion errors is sampled
+_DRAWS = 4  # samples of the motion errors: enough for an RMS over thousands of rows
+_NYQUIST = 0.4  # of the sample rate: largest band
 
 
 @dataclass(frozen=True)
 class Equations:
-    """Low-passed equations of one run; n of them, k drives, m parameters.
+    """Low-pass filtered equations of one run: n rows, k drives, m parameters.
 
     Attributes:
-        name: the run's.
-        band: of the low-pass [Hz].
-        matrix: (n, k, m).
-        force: (n, k) less what the joints' stated damping and springs take [N] or [N m]; NaN where
-            unknown.
-        time: (n,) [s] from the run's start.
-        spacing: between equations [s]; a whole part of a repeated motion's period.
-        doubt: (n, k) how uncertain the sign of the drives' dry friction is, 0 .. 1.
-        force_noise: (k,) standard deviation that the force sensors' noise leaves; NaN if unknown.
-        motion_noise: (k, m, m) second moments of what the motion's errors leave per parameter;
-            see `noise_of`. Empty where not asked for.
+        name: name of the run.
+        band: cutoff of the low-pass filter [Hz].
+        matrix: (n, k, m) regressor.
+        force: (n, k) drive forces minus the forces of stated joint damping and springs [N] or
+            [N m]; NaN where unknown.
+        time: (n,) time from the start of the run [s].
+        spacing: time between equations [s]; an integer fraction of a repeated motion's period.
+        doubt: (n, k) uncertainty of the sign of the drives' dry friction, 0 .. 1.
+        force_noise: (k,) standard deviation of the filtered force noise; NaN if unknown.
+        motion_noise: (k, m, m) second moments of the force errors per parameter that errors of the
+            motion cause; see `noise_of`. Empty if not requested.
     """
 
     name: str
@@ -63,7 +65,7 @@ class Equations:
     motion_noise: np.ndarray
 
     def noise_of(self, value: np.ndarray) -> np.ndarray:
-        """RMS (k,) [N] or [N m] that a perfect model with parameters (m,) would show."""
+        """Return the RMS error (k,) [N] or [N m] of a perfect model with parameters (m,)."""
         if not self.motion_noise.size:
             return np.full(len(self.force_noise), np.nan)
         moved = np.einsum("m,kml,l->k", value, self.motion_noise, value)
@@ -71,7 +73,7 @@ class Equations:
 
 
 class RateErrors(NamedTuple):
-    """Errors of the rates of the joints that were measured, one independent of the other.
+    """Independent errors of the rates of the measured joints.
 
     Attributes:
         axes: names of the k joints.
@@ -82,7 +84,7 @@ class RateErrors(NamedTuple):
     std: np.ndarray
 
     def part(self, rows: slice) -> "RateErrors":
-        """Those of some rows."""
+        """Return the errors of some rows."""
         return self._replace(std=self.std[rows])
 
 
@@ -90,22 +92,22 @@ def build_equations(
     record: IdentificationRecord, setup: RegressorSetup, processing: Processing, found: Resolution,
     with_noise: bool = False, rate_errors: RateErrors | None = None,
 ) -> tuple[Equations, Regressor]:  # fmt: skip
-    """Equations of a run.
+    """Build the low-pass filtered equations of a run.
 
     Args:
         record: the run.
-        setup: what the regressor is built of.
-        processing: how positions are differentiated.
-        found: what the positions of all runs resolve.
-        with_noise: whether to find what the motion's errors leave, and to thin out less.
-        rate_errors: of the joints that were measured, where these are not the record's; by default
-            the record's own, which count as independent.
+        setup: definition of the regressor.
+        processing: method to differentiate the positions.
+        found: resolution of the positions.
+        with_noise: whether to compute `motion_noise`, and to downsample less.
+        rate_errors: rate errors of the measured joints, if these are not the joints of the record;
+            by default the joints of the record, with independent errors.
 
     Returns:
         The equations, and a regressor without rows that has names, units and nominal values.
 
     Raises:
-        InputError: the run is too short for the band, or cannot be followed by the chain.
+        InputError: the run is too short for the band, or the mechanism cannot follow it.
     """
     band = processing.band or found.band
     motion = _motion(record, found, processing)
@@ -150,7 +152,11 @@ def build_equations(
 
 
 def _motion(record: IdentificationRecord, found: Resolution, processing: Processing) -> Smoothed:
-    """Motion of the joints, refused with a remedy where a filter cannot bridge a gap."""
+    """Return the motion of the joints.
+
+    Raises:
+        InputError: a gap in the positions is too long for the filter; the message says what to do.
+    """
     known = np.isfinite(record.position)
     if processing.method in ("raw", "zero_phase"):
         bridge = round(GAP / record.period) if processing.method == "zero_phase" else 0
@@ -160,9 +166,9 @@ def _motion(record: IdentificationRecord, found: Resolution, processing: Process
             if len(rows) and missing.max() > bridge:
                 at = int(np.insert(rows, 0, 0)[missing.argmax()])
                 raise InputError(
-                    record.name, f"lacks the position of {axis} for"
+                    record.name, f"the position of {axis} is missing for"
                     f" {missing.max() * record.period:.3g} s from {at * record.period:.3g} s on:"
-                    " take --processing optimal, which needs no filter, or cut the run there",
+                    " use --processing optimal, which accepts gaps, or cut the run there",
                 )  # fmt: skip
     return joint_motion(record.position, record.period, found, processing)
 
@@ -171,10 +177,9 @@ def _motion_noise(
     record: IdentificationRecord, setup: RegressorSetup, found: Resolution, motions: np.ndarray,
     errors: RateErrors, low: np.ndarray, thin: int,
 ) -> np.ndarray:  # fmt: skip
-    """What the motion's errors leave in the drives' forces (k, m, m); see `Equations`.
+    """Return second moments (k, m, m) of the force errors caused by motion errors.
 
-    True motions that the positions allow are drawn about the optimal smoother's; their rates are
-    certain.
+    Possible true motions are sampled about that of the optimal smoother. See `Equations`.
     """
     rows = slice(0, max(_NOISY, 4 * len(low)))
     smoothed = smooth(record.position[rows], record.period, found.noise)
@@ -193,16 +198,16 @@ def row_forces(
     value: np.ndarray,
     rate_std: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Drive forces along a motion.
+    """Compute the drive forces along a motion.
 
     Args:
-        setup: what the regressor is built of.
+        setup: definition of the regressor.
         motions: (3, n, k) positions, rates and accelerations of the given joints.
         value: (m,) parameters.
-        rate_std: (n, k) of the rates [rad/s] or [m/s]; None if they are certain.
+        rate_std: (n, k) standard deviations of the rates [rad/s] or [m/s]; None if exact.
 
     Returns:
-        (n, k) [N] or [N m], with the joints' stated damping and springs.
+        (n, k) forces [N] or [N m], including stated damping and springs of the joints.
     """
     out, start = [], None
     for first in range(0, motions.shape[1], _CHUNK):
@@ -219,7 +224,12 @@ def _rows(
     errors: RateErrors | None,
     start: np.ndarray | None,
 ):
-    """Some rows (3, n, k): regressor, doubt of the signs, damping and springs, the last pose."""
+    """Evaluate the regressor for some rows (3, n, k) of a motion.
+
+    Returns:
+        The regressor, the uncertainty of the friction signs, the drive forces of damping and
+        springs, and the last pose.
+    """
     chain = setup.chain
     found = setup.project(*motions, start=start)
     spread = None
@@ -235,16 +245,16 @@ def _rows(
 
 
 def low_pass(band: float, period: float, cycle: float | None = None) -> tuple[np.ndarray, int]:
-    """Low-pass without lag.
+    """Design a low-pass filter without lag and its downsampling factor.
 
     Args:
-        band: of the equations [Hz].
-        period: between rows [s].
+        band: cutoff [Hz].
+        period: time between rows [s].
         cycle: period of a repeated motion [s].
 
     Returns:
-        Weights, their number odd, and how many rows make one equation: a part of a cycle's rows
-        where they have a suitable one.
+        An odd number of weights, and the number of rows per equation. That number divides the rows
+        of a cycle if it has a suitable divisor.
     """
     half = round(_TAPS / (band * period))
     if half < 1:
@@ -258,19 +268,19 @@ def low_pass(band: float, period: float, cycle: float | None = None) -> tuple[np
 
 
 def low_passed(values: np.ndarray, low: np.ndarray, thin: int) -> np.ndarray:
-    """Rows after a low-pass, as far as all of its weights lie on rows.
+    """Apply a low-pass filter and downsample, without rows where the filter exceeds the ends.
 
     Args:
-        values: (n, ...).
-        low: weights, their number odd.
-        thin: every which row is kept.
+        values: (n, ...) rows.
+        low: odd number of weights.
+        thin: downsampling factor.
 
     Returns:
-        (rows, ...).
+        (rows, ...) filtered rows.
     """
     count = (len(values) - len(low)) // thin + 1
     flat = values.reshape(len(values), -1)
-    # upfirdn puts out a row for every input; the first whole one ends at row len(low) - 1
+    # upfirdn also returns partial rows; the first complete one ends at input row len(low) - 1
     shift = (len(low) - 1) % thin
     padded = np.concatenate([np.zeros(((thin - shift) % thin, flat.shape[1])), flat])
     out = upfirdn(low, padded, down=thin, axis=0)
@@ -279,16 +289,16 @@ def low_passed(values: np.ndarray, low: np.ndarray, thin: int) -> np.ndarray:
 
 
 def low_passed_forces(force: np.ndarray, period: float, low: np.ndarray, thin: int) -> np.ndarray:
-    """Forces after a low-pass; short gaps are bridged, long ones leave NaN.
+    """Apply a low-pass filter to forces; interpolate short gaps and set long ones to NaN.
 
     Args:
-        force: (n, k), NaN where unknown.
-        period: between rows [s].
-        low: weights, their number odd.
-        thin: every which row is kept.
+        force: (n, k) forces, NaN where unknown.
+        period: time between rows [s].
+        low: odd number of weights.
+        thin: downsampling factor.
 
     Returns:
-        (rows, k).
+        (rows, k) filtered forces.
     """
     known = np.isfinite(force)
     far = np.zeros_like(known)
@@ -310,29 +320,29 @@ def low_passed_forces(force: np.ndarray, period: float, low: np.ndarray, thin: i
 
 
 def stacked(parts: Sequence[Equations], of: Callable[[Equations], np.ndarray]) -> np.ndarray:
-    """A field of several runs, one below the other."""
+    """Concatenate a field of the equations of several runs."""
     return np.concatenate([of(part) for part in parts])
 
 
-_LEAST = 4.0  # periods of the band that a run must have: its low-pass takes three
+_LEAST = 4.0  # periods of the band, shortest run: the low-pass filter spans three
 _WHERE = "identification"
 
 
 @dataclass(frozen=True)
 class Gathered:
-    """Equations of some runs; n of them, k drives whose forces are known, m parameters.
+    """Stacked equations of several runs: n rows, k drives with known forces, m parameters.
 
     Attributes:
-        runs: the runs that are long enough, and what their positions resolve.
-        table: a regressor without rows: names, units and nominal values; all drives.
-        columns: places of the k drives among the table's.
-        rows: which of the runs' stacked equations are the n.
-        starts: at which of the stacked equations every run starts, and their number.
-        spacing: between the equations of every run [s].
-        matrix: (n, k, m).
-        force: (n, k) [N] or [N m].
-        doubt: (n, k) of the signs of dry friction.
-        notes: on what was left out.
+        runs: the runs that are long enough, with the resolution of their positions.
+        table: regressor without rows: names, units and nominal values; all drives.
+        columns: indices of the k drives in the table.
+        rows: mask of the n used rows among the stacked equations of all runs.
+        starts: first stacked equation of each run, and their total number.
+        spacing: time between the equations of each run [s].
+        matrix: (n, k, m) regressor.
+        force: (n, k) forces [N] or [N m].
+        doubt: (n, k) uncertainty of the signs of dry friction.
+        notes: sentences about runs that were left out.
     """
 
     runs: tuple[tuple[IdentificationRecord, Resolution], ...]
@@ -348,18 +358,18 @@ class Gathered:
 
     @property
     def drives(self) -> tuple[str, ...]:
-        """The k drives whose forces are known."""
+        """Names of the k drives with known forces."""
         return tuple(self.table.drives[k] for k in self.columns)
 
     def spread(self, values: np.ndarray, run: int) -> np.ndarray:
-        """Values (p, n, k) of the equations of one run, with 0 for rows and drives not used.
+        """Expand values of the used equations to all rows and drives of one run.
 
         Args:
-            values: (p, n, k) of all.
-            run: its place.
+            values: (p, n, k) values of the used equations of all runs.
+            run: index of the run.
 
         Returns:
-            (p, equations of the run, all drives).
+            (p, equations of the run, all drives), 0 for rows and drives that are not used.
         """
         out = np.zeros((len(values), len(self.rows), len(self.table.drives)))
         places = np.flatnonzero(self.rows)
@@ -368,29 +378,31 @@ class Gathered:
         return out[:, self.starts[run] : self.starts[run + 1]]
 
     def cycle_on(self, values: np.ndarray, period: float) -> np.ndarray:
-        """Values one period later, or earlier where the run ends before.
+        """Return the values one period later, or one period earlier near the end of a run.
 
         Args:
-            values: (n, ...) at every row.
-            period: of the repeated motion [s].
+            values: (n, ...) values of every row.
+            period: period of the repeated motion [s].
 
         Returns:
-            (n, ...), NaN where there is neither.
+            (n, ...) shifted values, NaN where neither exists.
 
         Raises:
-            InputError: a run is shorter than two periods, or a period than two equations.
+            InputError: a run is shorter than two periods, or the period is shorter than the time
+                between equations.
         """
         whole = np.full((len(self.rows), *values.shape[1:]), np.nan)
         whole[self.rows] = values
         for k, (record, _) in enumerate(self.runs):
             if len(record.force) * record.period < 2.0 * period:
                 raise InputError(
-                    record.name, f"does not repeat its motion: two periods of {period:g} s at least"
+                    record.name,
+                    f"does not repeat its motion: it is shorter than two periods of {period:g} s",
                 )
             if (step := round(period / self.spacing[k])) < 1:
                 raise InputError(
                     record.name, f"a period of {period:g} s is shorter than the time between"
-                    f" equations, {self.spacing[k]:.3g} s: no motion of this band repeats so fast",
+                    f" equations, {self.spacing[k]:.3g} s: a motion of this band repeats slower",
                 )  # fmt: skip
             own = slice(self.starts[k], self.starts[k + 1])
             whole[own] = cycle_on(whole[own], step)
@@ -398,7 +410,7 @@ class Gathered:
 
 
 def cycle_on(values: np.ndarray, step: int) -> np.ndarray:
-    """Values (n, ...) `step` rows later, or earlier where there are none; NaN without both."""
+    """Return values (n, ...) of `step` rows later, near the end of `step` rows earlier, or NaN."""
     later, earlier = np.full((2, *values.shape), np.nan)
     later[:-step], earlier[step:] = values[step:], values[:-step]
     return np.where(np.isnan(later), earlier, later)
@@ -409,18 +421,18 @@ def gather(
     setup: RegressorSetup,
     processing: Processing,
 ) -> Gathered:
-    """Equations of all runs.
+    """Build and stack the equations of all runs.
 
     Args:
-        runs: records, and what their positions resolve.
-        setup: what the regressor is built of.
-        processing: how positions are differentiated; it has a band.
+        runs: records and the resolution of their positions.
+        setup: definition of the regressor.
+        processing: method to differentiate the positions; its band must be set.
 
     Returns:
-        The equations.
+        The stacked equations.
 
     Raises:
-        InputError: no drive has a force, or all runs are too short.
+        InputError: no drive has a known force, or all runs are too short.
     """
     band = processing.band
     assert band
@@ -432,20 +444,24 @@ def gather(
         made.append(build_equations(record, setup, processing, found))
         kept.append((record, found))
     if not made:
-        raise InputError(_WHERE, f"all runs are too short for a band of {band:.3g} Hz: log longer")
+        raise InputError(
+            _WHERE, f"all runs are too short for a band of {band:.3g} Hz: log longer runs"
+        )
     table, equations = made[0][1], [e for e, _ in made]
     force = stacked(equations, lambda e: e.force)
     columns = [k for k in range(force.shape[1]) if np.isfinite(force[:, k]).any()]
     if not columns:
-        raise InputError(_WHERE, "no drive has a known force in any run: log both its pressures")
+        raise InputError(_WHERE, "no drive has a known force in any run: log both pressures")
     rows = np.asarray(np.isfinite(force[:, columns]).all(axis=1))
     notes += [
-        f"{e.name} lacks the force of {', '.join(lost)} throughout; left out."
+        f"{e.name} has no force of {', '.join(lost)}; left out."
         for e in equations
         if (lost := [table.drives[k] for k in columns if np.isnan(e.force[:, k]).all()])
     ]
     if not rows.any():
-        raise InputError(_WHERE, "no run has the forces of all drives that any run has")
+        raise InputError(
+            _WHERE, "no run has the forces of all drives whose forces are known in some run"
+        )
     spacing = tuple(e.spacing for e in equations)
     starts = np.cumsum([0, *(len(e.time) for e in equations)])
     return Gathered(

@@ -1,14 +1,9 @@
-"""From gathered equations to base parameters: weights, and what noisy data tell.
+"""Estimators of parameters that are linear in the drive forces, with their uncertainty.
 
-Estimators of parameters that drive forces are linear in, with their uncertainty.
-
-All work on the base parameters of `identifiability`; what they do not tell stays at its nominal
-value. Equations come as (n, k, m) regressors and (n, k) forces of k drives over n rows.
-
-Fewer friction parameters: those below the noise are dropped, correlated ones are merged.
-
-Every passive joint of a closed chain may have friction of its own. Measurements tell it badly, and
-what they do not tell makes all other estimates worse.
+`estimate` solves (n, k, m) regressors and (n, k) forces of k drives over n rows by least squares.
+`weighted` and `identifiable_from` weight the equations and select the base parameters that noisy
+data determine; all other combinations keep their nominal values. `reduce_parameters` drops and
+merges friction parameters, because poorly determined passive-joint friction degrades all estimates.
 """
 
 from collections.abc import Sequence
@@ -32,24 +27,24 @@ from hydrotele.multibody.inverse_dynamics import FRICTION_TERMS, Regressor
 
 _ESTIMATE = "estimate"
 _NORMAL95 = 1.959964
-_LONGEST = 30  # rows of memory that are looked for
+_LONGEST = 30  # rows, highest order of the autoregression of the errors
 _SILENT = 1e-12  # of a force: rounding
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Parameters with their uncertainty; p of them, k drives, n rows.
+    """Estimated parameters with their uncertainty: p parameters, k drives, n rows.
 
     Attributes:
-        value: (p,) in the parameters' SI units.
-        covariance: (p, p).
-        residual: (n, k) measured less predicted force [N] or [N m].
-        gain: (p, n, k) of the forces: how the value follows from each; 0 for rows left out.
-        condition: ratio of the singular values of the weighted, scaled equations.
-        white: (k, k) by which the equations were weighted.
-        normal: (p, p) inverse of the weighted normal equations: for weighted Y (or Z) and F the
-            value is the prior and `normal Y' (F - Y prior)`.
-        rank: number of directions that truncation left.
+        value: (p,) estimates in SI units.
+        covariance: (p, p) covariance.
+        residual: (n, k) measured minus predicted force [N] or [N m].
+        gain: (p, n, k) derivative of the estimates with respect to each force; 0 for omitted rows.
+        condition: condition number of the weighted, scaled equations.
+        white: (k, k) matrix that weighted the equations.
+        normal: (p, p) inverse of the weighted normal equations: with weighted Y (or Z) and F,
+            `value = prior + normal Y' (F - Y prior)`.
+        rank: number of directions left by truncation.
     """
 
     value: np.ndarray
@@ -63,19 +58,19 @@ class Estimate:
 
     @property
     def std(self) -> np.ndarray:
-        """(p,) standard deviations."""
+        """Standard deviations (p,)."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
     def ci95(self) -> np.ndarray:
-        """(p, 2) 95 % intervals."""
+        """95 % intervals (p, 2)."""
         reach = _NORMAL95 * self.std
         return np.column_stack([self.value - reach, self.value + reach])
 
     def ellipsoid(self, truth: np.ndarray) -> float:
-        """Squared distance of other parameters (p,) in standard deviations: chi^2 of rank degrees.
+        """Return the squared Mahalanobis distance of other parameters (p,) from the estimate.
 
-        Directions that truncation has fixed do not count.
+        Its distribution is chi^2 with `rank` degrees of freedom. Truncated directions are excluded.
         """
         away = (np.asarray(truth) - self.value) / self.std
         values, ways = np.linalg.eigh(self.covariance / np.outer(self.std, self.std))
@@ -88,32 +83,33 @@ def estimate(
     instruments: np.ndarray | None = None, ridge: float = 0.0, cut: float = 0.0,
     prior: np.ndarray | None = None, order: int | None = None,
 ) -> Estimate:  # fmt: skip
-    """Least squares, weighted or not, for errors that are correlated in time and between drives.
+    """Estimate parameters by least squares with errors correlated in time and between drives.
 
-    With the covariance of the drives' errors it is the Gauss-Markov estimate; without, every drive
-    counts by its own residuals. That errors follow each other is told by an autoregression of the
-    residuals; it widens the covariance and leaves the estimate alone, because equations freed of
-    their errors' memory weigh most what models and derivatives know least, the fast changes. With
-    instruments Z it solves `Z' W (F - Y p) = 0`, which noise in Y does not bias as long as Z has
-    none of it. With few rows beyond the errors' memory intervals are too narrow: 93 % of them cover
-    the truth for 400 rows whose errors keep 80 % of those before. Ridge and truncation pull what
-    the data hardly tell towards the prior, and say nothing of their bias.
+    With the covariance of the drives' errors this is the Gauss-Markov estimate. Without it, each
+    drive is weighted by its residuals. An autoregression of the residuals models their correlation
+    in time. It increases the covariance but does not change the estimate, because prewhitened
+    equations would give most weight to fast changes, where models and derivatives are least
+    accurate. With instruments Z the estimate solves `Z' W (F - Y p) = 0`, which is not biased by
+    noise in Y as long as Z is independent of that noise. With few rows relative to the correlation
+    time the intervals are too narrow. For 400 rows with a correlation of 80 % between successive
+    errors, 93 % of them cover the truth. Ridge and truncation move poorly determined
+    parameters towards the prior; the covariance does not include that bias.
 
     Args:
-        matrix: (n, k, p) regressor Y; rows with NaN are left out.
-        forces: (n, k) F [N] or [N m].
-        covariance: (k, k) of the errors of the k drives at one instant, up to a factor.
+        matrix: (n, k, p) regressor Y; rows with NaN are omitted.
+        forces: (n, k) forces F [N] or [N m].
+        covariance: (k, k) covariance of the errors of the k drives at one instant, up to a factor.
         instruments: (n, k, p) Z, correlated with the noise-free regressor but not with its noise.
-        ridge: added to the squares of the singular values, as a share of the largest.
-        cut: share of the largest singular value below which directions keep the prior.
-        prior: (p,) towards which ridge and truncation pull; 0 by default.
-        order: of the autoregression; None to choose it, 0 for errors without memory.
+        ridge: added to the squared singular values, as a fraction of the largest one squared.
+        cut: fraction of the largest singular value below which directions keep the prior.
+        prior: (p,) values towards which ridge and truncation move the estimate; 0 by default.
+        order: order of the autoregression; None to choose it, 0 for uncorrelated errors.
 
     Returns:
         The estimate.
 
     Raises:
-        InputError: shapes do not fit, fewer equations than parameters, or a column without effect.
+        InputError: shapes do not match, fewer equations than parameters, or a column is zero.
 
     Source: Abdellatif 2008, section 4 (Gauss-Markov); Khoshzaban 1992, 4.59-4.60 (truncation and
     ridge); Janot, Vandanjon and Gautier 2014 (instruments); Schwarz 1978 (order).
@@ -125,9 +121,9 @@ def estimate(
     x, y = white @ matrix[there], forces[there] @ white.T
     z = None if instruments is None else white @ np.asarray(instruments, float)[there]
     if y.size <= x.shape[2]:
-        raise InputError(_ESTIMATE, f"{y.size} equations do not tell {x.shape[2]} parameters")
+        raise InputError(_ESTIMATE, f"{y.size} equations do not determine {x.shape[2]} parameters")
     if not (size := np.sqrt(np.einsum("nkp,nkp->p", x, x))).all():
-        raise InputError(_ESTIMATE, f"column {int(np.argmin(size))} has no effect: leave it out")
+        raise InputError(_ESTIMATE, f"column {int(np.argmin(size))} has no effect: remove it")
     start = np.zeros(x.shape[2]) if prior is None else np.asarray(prior, float)
     shape = _Shape(start, ridge, cut, covariance is None)
     value, inverse, solved, scale = _solve(x, y, z, shape)
@@ -143,7 +139,14 @@ def estimate(
 
 
 class _Shape(NamedTuple):
-    """How to solve: (p,) prior, ridge, cut, and whether drives are weighted by their residuals."""
+    """Options of the solver.
+
+    Attributes:
+        prior: (p,) values towards which ridge and truncation move the estimate.
+        ridge: see `estimate`.
+        cut: see `estimate`.
+        weigh: whether drives are weighted by their residuals.
+    """
 
     prior: np.ndarray
     ridge: float
@@ -152,7 +155,7 @@ class _Shape(NamedTuple):
 
 
 class _Solved(NamedTuple):
-    """Of scaled equations: their condition, inverse of their normal equations, and rank."""
+    """Condition number, inverse of the normal equations and rank of scaled equations."""
 
     condition: float
     normal: np.ndarray
@@ -160,7 +163,12 @@ class _Solved(NamedTuple):
 
 
 def _solve(x, y, z, shape: _Shape) -> tuple[np.ndarray, np.ndarray, _Solved, np.ndarray]:
-    """Value (p,), how it follows from the forces (p, n, k), the rest, and the drives' scales."""
+    """Solve the equations, weighting the drives by their residuals if requested.
+
+    Returns:
+        Estimates (p,), their derivative with respect to the forces (p, n, k), the solution
+        properties, and the scales (k,) of the drives.
+    """
     value, inverse, solved = _solve_once(x, y, z, shape)
     ones = np.ones(y.shape[1])
     if shape.weigh and y.shape[1] > 1:
@@ -188,13 +196,13 @@ def _solve_once(x, y, z, shape: _Shape):
 
 
 def _carried(inverse: np.ndarray, error: np.ndarray, follow: np.ndarray) -> np.ndarray:
-    """Covariance (p, p) of `inverse @ errors`, for errors with the memory `follow`."""
+    """Return the covariance (p, p) of `inverse @ errors` for autoregressive errors `follow`."""
     p, _, k = inverse.shape
     fresh, late = np.empty_like(error), np.empty_like(inverse)
     for c in range(k):
         weights = np.concatenate([[1.0], -follow[:, c]])
         fresh[:, c] = lfilter(weights, 1.0, error[:, c])
-        # what an error does to all that follow it: the recursion backwards in time
+        # the effect of an error on all later errors: the recursion backwards in time
         late[:, ::-1, c] = lfilter([1.0], weights, inverse[:, ::-1, c], axis=1)
     fresh = fresh[len(follow) :]
     between = fresh.T @ fresh / len(fresh)
@@ -202,14 +210,14 @@ def _carried(inverse: np.ndarray, error: np.ndarray, follow: np.ndarray) -> np.n
 
 
 def autoregression(error: np.ndarray, order: int | None = None) -> np.ndarray:
-    """What errors take over from those before them.
+    """Fit an autoregression to errors.
 
     Args:
-        error: (n, k).
-        order: number q of rows before; None for the one that Schwarz's criterion asks for.
+        error: (n, k) errors.
+        order: order q; None to choose it by Schwarz's criterion.
 
     Returns:
-        (q, k) weights of the rows before, the latest first.
+        (q, k) coefficients of the previous rows, the latest first.
 
     Source: Yule and Walker; Levinson's recursion.
     """
@@ -236,7 +244,7 @@ def autoregression(error: np.ndarray, order: int | None = None) -> np.ndarray:
 
 
 def _pseudo_inverse(x: np.ndarray, ridge: float, cut: float) -> tuple[np.ndarray, _Solved]:
-    """(p, N) with columns of length 1, and the rest."""
+    """Return the regularised pseudo-inverse (p, N) of normalised columns, and its properties."""
     u, s, v = np.linalg.svd(x, full_matrices=False)
     kept = s > max(cut, 1e-14) * s[0]
     squares = np.where(kept, 1.0 / (s**2 + ridge * s[0] ** 2), 0.0)
@@ -256,7 +264,7 @@ def _whitener(covariance: np.ndarray) -> np.ndarray:
 def _check(matrix, forces, covariance, instruments) -> None:
     if matrix.ndim != 3 or forces.shape != matrix.shape[:2]:
         raise InputError(
-            _ESTIMATE, f"a regressor (n, k, m) and forces (n, k) must fit: {matrix.shape},"
+            _ESTIMATE, f"regressor (n, k, m) and forces (n, k) do not match: {matrix.shape},"
             f" {forces.shape}")  # fmt: skip
     if covariance is not None and np.shape(covariance) != (matrix.shape[1],) * 2:
         raise InputError(_ESTIMATE, f"the covariance must be (k, k): {np.shape(covariance)}")
@@ -266,25 +274,27 @@ def _check(matrix, forces, covariance, instruments) -> None:
 
 Method = Literal["weighted", "gauss_markov", "least_squares", "instruments"]
 METHODS = ("weighted", "gauss_markov", "least_squares", "instruments")
-REPEATED = ("gauss_markov", "instruments")  # that compare the periods of a repeated motion
+REPEATED = ("gauss_markov", "instruments")  # methods that compare periods of a repeated motion
 _WHERE = "identification"
 
 
 @dataclass(frozen=True)
 class Estimator:
-    """How base parameters are estimated.
+    """Options for estimating the base parameters.
 
     Attributes:
-        method: `weighted`: least squares in which every drive counts by its own residuals, and
-            those in which dry friction may have either sign count less. `gauss_markov`: the same
-            with the covariance between the drives, of repeated periods where there are any.
-            `least_squares`: all equations count alike. `instruments`: weighted, with the regressor
-            of another period of the motion as instruments.
-        ridge: added to the squares of singular values, as a share of the largest; towards the
-            given parameters.
-        cut: share of the largest singular value below which directions keep the given parameters.
-        pairs: of added noise by which the bias of the positions' noise is found and taken off; 0 to
-            leave it. Instruments are free of it only where the regressor is linear in the noise.
+        method: `weighted`: least squares in which each drive is weighted by its residuals, and
+            equations with an uncertain sign of dry friction have less weight. `gauss_markov`: the
+            same with the covariance between the drives, from repeated periods if there are any.
+            `least_squares`: equal weights. `instruments`: weighted, with the regressor of another
+            period of the motion as instruments.
+        ridge: added to the squared singular values, as a fraction of the largest one squared; moves
+            the estimate towards the given parameters.
+        cut: fraction of the largest singular value below which directions keep the given
+            parameters.
+        pairs: number of antithetic noise pairs with which the bias caused by position noise is
+            estimated and subtracted; 0 for no correction. Instruments avoid that bias only where
+            the regressor is linear in the noise.
     """
 
     method: Method = "weighted"
@@ -293,32 +303,34 @@ class Estimator:
     pairs: int = 4
 
     def __post_init__(self) -> None:
-        """Refuse what is not known or makes no sense."""
+        """Raise InputError for unknown methods and invalid values."""
         if self.method not in METHODS:
             raise InputError("estimator", f"{self.method!r} is not known: {', '.join(METHODS)}")
         if not (0.0 <= self.ridge < np.inf and 0.0 <= self.cut < 1.0):
             raise InputError(
                 "estimator",
-                f"ridge must not be negative and cut below 1: {self.ridge}, {self.cut}",
+                f"ridge must be 0 or more and cut in [0, 1), got {self.ridge} and {self.cut}",
             )
         if self.method == "instruments" and (self.ridge or self.cut):
-            raise InputError("estimator", "instruments know no ridge and no truncation")
+            raise InputError("estimator", "instruments cannot be combined with ridge or truncation")
         if self.pairs < 0:
-            raise InputError("estimator", f"pairs of noise must be 0 or more, got {self.pairs}")
+            raise InputError("estimator", f"pairs must be 0 or more, got {self.pairs}")
 
 
 @dataclass(frozen=True)
 class Weighted:
-    """Weighted equations; n of them, k drives, m parameters.
+    """Weighted equations: n rows, k drives, m parameters.
 
     Attributes:
         table: names, units and nominal values of the parameters.
-        weight: (n, k) of the equations.
-        doubtful: (k, 2) variance of a drive's errors, and what doubt of a sign adds to it.
-        matrix: (n, k, m), weighted.
-        force: (n, k), weighted [N] or [N m].
-        covariance: (k, k) of the weighted forces' errors; None to count drives by residuals.
-        instruments: (n, k, m), weighted, or None.
+        weight: (n, k) weights of the equations.
+        doubtful: (k, 2) error variance of each drive, and the variance added by an uncertain
+            friction sign.
+        matrix: (n, k, m) weighted regressor.
+        force: (n, k) weighted forces [N] or [N m].
+        covariance: (k, k) covariance of the weighted force errors; None to weight the drives by
+            their residuals.
+        instruments: (n, k, m) weighted instruments, or None.
     """
 
     table: Regressor
@@ -333,16 +345,16 @@ class Weighted:
         self, told: Identifiability, ridge: float = 0.0, cut: float = 0.0,
         order: int | None = None,
     ) -> Estimate:  # fmt: skip
-        """Base parameters; what the data do not tell of the others stays as given.
+        """Estimate the base parameters; undetermined combinations keep their given values.
 
         Args:
-            told: the base.
+            told: the base parameters.
             ridge: see `Estimator`.
             cut: see `Estimator`.
-            order: of the errors' autoregression; None to choose it.
+            order: order of the errors' autoregression; None to choose it.
 
         Returns:
-            The estimate of the combinations.
+            The estimate of the base parameters.
         """
         base = self.matrix[:, :, told.base]
         given = told.combination @ self.table.nominal
@@ -357,19 +369,19 @@ class Weighted:
 def weighted(
     data: Gathered, structure: Identifiability, method: Method, period: float | None
 ) -> Weighted:
-    """Equations weighted for an estimator.
+    """Weight the equations for an estimator.
 
     Args:
         data: equations.
-        structure: base parameters of their motion.
-        method: of the estimator.
-        period: of a repeated motion [s]; instruments need it.
+        structure: base parameters of their motion without noise.
+        method: method of the estimator.
+        period: period of a repeated motion [s]; required for instruments.
 
     Returns:
         The weighted equations.
 
     Raises:
-        InputError: a method that compares periods gets runs of one.
+        InputError: the method compares periods, but a run is shorter than two periods.
     """
     ones, drives = np.ones_like(data.force), data.force.shape[1]
     alike = np.tile([1.0, 0.0], (drives, 1))
@@ -382,7 +394,7 @@ def weighted(
     found = Weighted(data.table, weight, doubtful, matrix, force)
     if method == "gauss_markov":
         error = found.fitted(structure, order=0).residual
-        if period:  # what repeats is the model's error, the rest is noise, twice of it
+        if period:  # a difference of periods has no repeated model error and twice the variance
             error = (error - data.cycle_on(error, period)) / np.sqrt(2.0)
             error = error[np.isfinite(error).all(axis=1)]
         return replace(found, covariance=error.T @ error / len(error))
@@ -397,26 +409,26 @@ def identifiable_from(
     data: Weighted, structure: Identifiability, setup: RegressorSetup, resting: Sequence[str],
     drives: Sequence[str],
 ) -> Identifiability:  # fmt: skip
-    """What data tell in spite of their noise.
+    """Select the base parameters that noisy data determine.
 
-    Friction of drives that rest is not asked for: whatever holds them is no sliding.
+    Friction of drives at rest is excluded, because they do not slide.
 
     Args:
         data: weighted equations.
-        structure: base parameters of their motion.
-        setup: of the regressor.
-        resting: drives that rest.
+        structure: base parameters of their motion without noise.
+        setup: definition of the regressor.
+        resting: drives at rest.
         drives: names of the k drives.
 
     Returns:
         The base parameters.
 
     Raises:
-        InputError: nothing is told.
+        InputError: no parameter is identifiable.
     """
     if not len(structure.base):
         raise InputError(_WHERE, "no parameter has an effect on the forces of this motion")
-    plain = replace(data, instruments=None)  # which tell badly what the data hardly tell
+    plain = replace(data, instruments=None)  # inaccurate for poorly determined parameters
     noise = _long_run(plain.fitted(structure, order=0).residual)
     table = data.table
     sizes = reference_sizes(table, setup, np.sqrt(np.mean(data.force**2, axis=0)), drives)
@@ -425,32 +437,34 @@ def identifiable_from(
     rows = (data.matrix / noise[:, None]).reshape(-1, data.matrix.shape[2])
     told = identifiable_in_noise(rows, table.names, sizes, asked)
     if not len(told.base):
-        raise InputError(_WHERE, "these data tell no parameter: log a motion with larger forces")
+        raise InputError(
+            _WHERE, "no parameter is identifiable from these logs: log a motion with larger forces"
+        )
     return told
 
 
 def weights(doubtful: np.ndarray, doubt: np.ndarray) -> np.ndarray:
-    """Weights of equations in which dry friction may have either sign.
+    """Return weights that decrease with the uncertainty of the friction sign.
 
     Args:
-        doubtful: (k, 2) as of `Weighted`.
-        doubt: (n, k) of the signs.
+        doubtful: (k, 2) as in `Weighted`.
+        doubt: (n, k) uncertainty of the signs.
 
     Returns:
-        (n, k), 1 at most.
+        (n, k) weights, at most 1.
     """
     return np.sqrt(doubtful[:, 0] / (doubtful[:, 0] + doubtful[:, 1] * doubt**2))
 
 
 def find_doubtful(residual: np.ndarray, doubt: np.ndarray) -> np.ndarray:
-    """How much larger doubtful errors are, read off the residuals of a first estimate.
+    """Estimate the additional error variance of equations with an uncertain friction sign.
 
     Args:
-        residual: (n, k).
-        doubt: (n, k) of the signs of dry friction.
+        residual: (n, k) residuals of a first estimate.
+        doubt: (n, k) uncertainty of the signs of dry friction.
 
     Returns:
-        (k, 2) as of `Weighted`.
+        (k, 2) as in `Weighted`.
     """
     out = np.tile([1.0, 0.0], (doubt.shape[1], 1))
     for k in range(doubt.shape[1]):
@@ -463,7 +477,7 @@ def find_doubtful(residual: np.ndarray, doubt: np.ndarray) -> np.ndarray:
 
 
 def _long_run(residual: np.ndarray) -> np.ndarray:
-    """Standard deviations (k,) of independent errors that would tell slow changes as badly."""
+    """Return standard deviations (k,) of independent errors with the same low-frequency power."""
     follow = autoregression(residual)
     fresh = residual.copy()
     for q, kept in enumerate(follow, start=1):
@@ -472,7 +486,7 @@ def _long_run(residual: np.ndarray) -> np.ndarray:
     return np.maximum(spread, np.std(residual, axis=0))
 
 
-_FALSE = 0.05  # chance that any one of all candidates without effect is kept
+_FALSE = 0.05  # probability that any candidate without effect is kept
 _REDUCTION = "reduction"
 
 
@@ -482,12 +496,12 @@ class Step:
 
     Attributes:
         action: `start`, `drop` or `merge`.
-        names: what is dropped or merged.
-        figure: of `drop`: estimate over its standard deviation; of `merge`: the correlation of two
-            estimates; of `start`: 0.
-        parameters: that are left.
+        names: parameters that are dropped or merged.
+        figure: for `drop` the estimate over its standard deviation; for `merge` the correlation of
+            the two estimates; for `start` 0.
+        parameters: number of remaining parameters.
         largest_std: largest ratio of a standard deviation to that of the first step, among
-            parameters that are no candidates.
+            parameters that are not candidates.
         misfit: weighted squared residuals over the degrees of freedom.
     """
 
@@ -504,9 +518,9 @@ class Reduction:
     """Result of a reduction.
 
     Attributes:
-        steps: the first is the whole model.
-        groups: names that share a parameter, for every parameter that is left.
-        value: (p,) estimates of these.
+        steps: the steps; the first is the full model.
+        groups: names that share a parameter, for every remaining parameter.
+        value: (p,) estimates of the remaining parameters.
         std: (p,) standard deviations.
     """
 
@@ -520,31 +534,32 @@ def reduce_parameters(
     matrix: np.ndarray, forces: np.ndarray, covariance: np.ndarray, names: Sequence[str],
     candidates: Sequence[Sequence[str]],
 ) -> Reduction:  # fmt: skip
-    """Drop and merge candidates, one after the other.
+    """Drop and merge candidate parameters one after the other.
 
-    The least significant candidate goes first, until all that are left stand above the noise: a
-    normal deviate that all candidates together exceed by chance with 5 % only. Among
-    candidates of one kind, the two whose estimates correlate most get a common parameter, unless
-    the residuals say by the same deviate that they differ. What is then below the noise goes, too.
+    The least significant candidate is dropped first, until all remaining ones are significant. The
+    threshold is a normal deviate. If no candidate has an effect, at least one exceeds it with a
+    probability of 5 %. Within a group, the two candidates with the most correlated estimates get a
+    common parameter, unless the residuals show by the same threshold that they differ. Candidates
+    that are not significant after merging are dropped as well.
 
     Args:
         matrix: (n, k, p) regressor of independent parameters.
-        forces: (n, k) [N] or [N m].
-        covariance: (k, k) of their errors.
-        names: the p parameters.
-        candidates: groups of names of one kind, within which parameters may be merged.
+        forces: (n, k) forces [N] or [N m].
+        covariance: (k, k) covariance of the force errors.
+        names: names of the p parameters.
+        candidates: groups of names within which parameters may be merged.
 
     Returns:
-        The reduction, with all its steps.
+        The reduction with all steps.
 
     Raises:
-        InputError: a candidate is no parameter.
+        InputError: a candidate is not a parameter.
 
     Source: Abdellatif 2008, section 2.2.
     """
     kind = {name: k for k, group in enumerate(candidates) for name in group}
     if strange := [name for name in kind if name not in names]:
-        raise InputError(_REDUCTION, f"{strange[0]} is no parameter: {', '.join(names)}")
+        raise InputError(_REDUCTION, f"{strange[0]} is not a parameter; valid: {', '.join(names)}")
     significant = float(norm.isf(0.5 * _FALSE / max(len(kind), 1)))
     groups: list[tuple[str, ...]] = [(name,) for name in names]
     columns = {name: matrix[:, :, k] for k, name in enumerate(names)}
@@ -555,7 +570,7 @@ def reduce_parameters(
 
     def fit():
         stacked = np.stack([sum(columns[n] for n in group) for group in groups], axis=2)
-        # the covariance is known, so that no residual scales it
+        # the covariance is known, so residuals do not scale it
         found = estimate(stacked, forces, covariance, order=0)
         normal = np.einsum("nkp,kl,nlq->pq", stacked, whitened.T @ whitened, stacked, optimize=True)
         spread = np.linalg.inv(normal)
@@ -598,7 +613,7 @@ def reduce_parameters(
             merged = groups[b]
             groups.pop(a)
             now = fit()
-            if now[2] - old[2] > significant**2:  # they differ by more than the noise
+            if now[2] - old[2] > significant**2:  # the two parameters differ significantly
                 separate.add((before[a], before[b]))
                 groups[:], now = before, old
                 continue

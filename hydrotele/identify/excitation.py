@@ -1,4 +1,9 @@
-"""Excitation: the periodic motion that tells a machine's parameters best within its limits."""
+"""Design of periodic excitation motions that are most informative within a machine's limits.
+
+`design_motion` maximises the determinant of the information about the base parameters over Fourier
+series of the joint positions. `MachineLimits` and `DriveLimits` evaluate the limits of stroke,
+flow, force, speed and acceleration.
+"""
 
 import math
 from collections.abc import Callable, Sequence
@@ -15,13 +20,13 @@ from hydrotele.identify.setup import RegressorSetup
 from hydrotele.machine.machine import Machine
 from hydrotele.multibody.inverse_dynamics import Projection
 
-_ROWS = 12  # per period of the highest harmonic
-_MARGIN = 0.05  # of a range, stroke or limit that is left free
-_FLOW, _FORCE, _VALVE = 0.95, 0.8, 0.8  # of the pump, of the relief pressure, of a valve's rating
-_PRESS = (1e1, 1e3, 1e5)  # weights of violated limits, growing, so that the end lies inside them
-_READ = 0.02  # s between force readings of an ordinary log
-_BETWEEN = 8  # times more rows on which the limits are checked at last
-_DRAWN = 12  # random motions of which the best is where a search starts
+_ROWS = 12  # rows per period of the highest harmonic
+_MARGIN = 0.05  # unused margin of a range or stroke
+_FLOW, _FORCE, _VALVE = 0.95, 0.8, 0.8  # usable fractions: pump flow, relief force, valve rating
+_PRESS = (1e1, 1e3, 1e5)  # increasing penalty weights, so that the result is within the limits
+_READ = 0.02  # s between force readings of a typical log
+_BETWEEN = 8  # factor of the row rate for the final check of the limits
+_DRAWN = 12  # random motions, the best of which is the start of a search
 _WHERE = "excitation"
 
 
@@ -30,14 +35,14 @@ class Excitation:
     """A periodic motion of k axes with H harmonics.
 
     Attributes:
-        axes: the k axes.
-        period: [s].
-        mean: (k,) middle of the motion [rad] or [m].
-        sin: (k, H) amplitudes of the positions [rad] or [m].
-        cos: (k, H) amplitudes of the positions [rad] or [m].
-        criterion: ln det of the information per parameter.
-        worst: largest use of a limit, 1 at the limit.
-        parameters: number of base parameters that the criterion counts.
+        axes: names of the k axes.
+        period: period [s].
+        mean: (k,) mean positions [rad] or [m].
+        sin: (k, H) sine amplitudes of the positions [rad] or [m].
+        cos: (k, H) cosine amplitudes of the positions [rad] or [m].
+        criterion: ln det of the information, divided by the number of parameters.
+        worst: largest utilisation of a limit, 1 at the limit.
+        parameters: number of base parameters in the criterion.
     """
 
     axes: tuple[str, ...]
@@ -50,7 +55,7 @@ class Excitation:
     parameters: int
 
     def motion(self, time: np.ndarray) -> np.ndarray:
-        """Positions, rates and accelerations (3, n, k) at times (n,) [s]."""
+        """Return positions, rates and accelerations (3, n, k) at times (n,) [s]."""
         h = np.arange(1, self.sin.shape[1] + 1)
         turn = 2.0 * math.pi * h / self.period
         s, c = np.sin(np.outer(time, turn)), np.cos(np.outer(time, turn))
@@ -63,14 +68,14 @@ class Excitation:
     def scenario(
         self, name: str, machine: Machine, cycles: float, found_at: str | None = None, **more: Any
     ) -> dict[str, Any]:
-        """Scenario that runs it, as `hydrotele run` reads it.
+        """Return a scenario for `hydrotele run` that executes the motion.
 
         Args:
-            name: of the scenario.
+            name: name of the scenario.
             machine: the machine.
-            cycles: periods to run after the fade-in.
-            found_at: its name or folder for the scenario; its name by default.
-            more: further keys, such as `sensors`.
+            cycles: number of periods after the fade-in.
+            found_at: name or folder of the machine in the scenario; its name by default.
+            more: further keys of the scenario, such as `sensors`.
         """
         fade = 0.25 * self.period
         axes = {
@@ -91,15 +96,15 @@ def information(
     setup: RegressorSetup, motions: np.ndarray, noise: np.ndarray, base: Sequence[int] | np.ndarray,
     sizes: np.ndarray | None = None,
 ) -> np.ndarray:  # fmt: skip
-    """Information (p, p) per row that a motion holds of base parameters.
+    """Compute the Fisher information (p, p) per row of a motion about the base parameters.
 
     Args:
-        setup: of the regressor.
+        setup: definition of the regressor.
         motions: (3, n, k) positions, rates and accelerations.
-        noise: of the drives' force errors: (k,) standard deviations [N] or [N m], or their (k, k)
+        noise: force errors of the drives: (k,) standard deviations [N] or [N m], or (k, k)
             covariance.
-        base: places of the p base parameters.
-        sizes: (p,) to count the parameters in; 1 by default.
+        base: indices of the p base parameters.
+        sizes: (p,) units in which the parameters are expressed; 1 by default.
     """
     found = setup.project(*motions)
     table = setup.table(found)
@@ -117,17 +122,17 @@ def information(
 def informative_base(
     machine: Machine, setup: RegressorSetup, noise: np.ndarray, period: float = 20.0, seed: int = 0
 ) -> np.ndarray:
-    """Places of base parameters that an ordinary motion tells in spite of the noise.
+    """Select the base parameters that a random, not optimised motion determines despite noise.
 
     Args:
         machine: the machine.
-        setup: of the regressor.
+        setup: definition of the regressor.
         noise: (k,) standard deviation of a force reading [N] or [N m].
-        period: of that motion [s].
-        seed: of its random harmonics.
+        period: period of that motion [s].
+        seed: seed of its random harmonics.
 
     Returns:
-        (p,) places in the regressor's parameters: worth designing a motion for.
+        (p,) indices of the regressor's parameters for which a motion should be designed.
     """
     limits, rng = MachineLimits(machine, setup), np.random.default_rng(seed)
     time = np.arange(0.0, period, _READ)
@@ -148,14 +153,14 @@ def informative_base(
 
 
 class MotionLimits(Protocol):
-    """What k given joints, and the drives with them, may do.
+    """Motion limits of k given joints and of the drives.
 
     Attributes:
         axes: names of the k joints or of their axes.
         low: (k,) lowest positions [rad] or [m].
         high: (k,) highest positions [rad] or [m].
-        middle: (k,) between them.
-        half: (k,) of the distance.
+        middle: (k,) centres of the ranges.
+        half: (k,) half widths of the ranges.
     """
 
     axes: tuple[str, ...]
@@ -165,14 +170,14 @@ class MotionLimits(Protocol):
     half: np.ndarray
 
     def use(self, motions: np.ndarray, held: np.ndarray) -> np.ndarray:
-        """Use of every limit at every row.
+        """Compute the utilisation of every limit at every row.
 
         Args:
             motions: (3, n, k) positions, rates and accelerations.
-            held: the same with positions inside of `low` and `high`.
+            held: the same with positions clipped to `low` and `high`.
 
         Returns:
-            (n, l), 1 at the limit.
+            (n, l) utilisation, 1 at the limit.
         """
         ...
 
@@ -183,27 +188,27 @@ def design_motion(
     period: float = 20.0, harmonics: int = 8, starts: int = 2, iterations: int = 150,
     seed: int = 0, progress: Callable[[str, float], None] | None = None,
 ) -> Excitation:  # fmt: skip
-    """D-optimal Fourier motion of the setup's given joints within any limits.
+    """Design a D-optimal Fourier motion of the given joints within limits.
 
-    Maximises ln det of the information of the base parameters.
+    Maximises ln det of the information about the base parameters.
 
     Args:
-        limits: of the motion; `MachineLimits` has those of a machine.
-        setup: of the regressor.
-        noise: of the drives' force errors, as of `information`.
-        base: places of the base parameters that count.
-        period: [s].
-        harmonics: number H of them.
-        starts: random motions from which to search.
-        iterations: of each search, per weight of the limits.
-        seed: of these.
-        progress: told what is being done and how far, 0 .. 1.
+        limits: limits of the motion; `MachineLimits` evaluates those of a machine.
+        setup: definition of the regressor.
+        noise: force errors of the drives, as in `information`.
+        base: indices of the base parameters in the criterion.
+        period: period of the motion [s].
+        harmonics: number H of harmonics.
+        starts: number of searches, each from random motions.
+        iterations: iterations of each search per penalty weight.
+        seed: seed of the random motions.
+        progress: called with a description of the step and the finished fraction, 0 .. 1.
 
     Returns:
         The best motion found.
 
     Raises:
-        InputError: no start moves within the limits.
+        InputError: no search ends within the limits.
 
     Source: Abdellatif 2008, section 4 and (22)-(26); Swevers et al. 1997.
     """
@@ -251,7 +256,7 @@ def design_motion(
         if use.max() <= 1.0 and (best is None or value > best[0]):
             best = (value, x, float(use.max()))
     if best is None:
-        raise InputError(_WHERE, "no motion within the limits was found: give more starts")
+        raise InputError(_WHERE, "no motion within the limits was found: increase starts")
     between = np.arange(_BETWEEN * rows) * period / (_BETWEEN * rows)
     x = _inside(best[1], lambda x: measure(x, between), 0.998)
     value, use = measure(x, between)
@@ -260,7 +265,7 @@ def design_motion(
 
 
 def _inside(x: np.ndarray, measure: Callable, step: float = 0.97) -> np.ndarray:
-    """A motion shrunk until it keeps all limits."""
+    """Scale the parameters of a motion down until it satisfies all limits."""
     for _ in range(60):
         if measure(x)[1].max() <= 1.0:
             return x
@@ -271,7 +276,10 @@ def _inside(x: np.ndarray, measure: Callable, step: float = 0.97) -> np.ndarray:
 def _sizes(
     setup: RegressorSetup, base: Sequence[int] | np.ndarray, middle: np.ndarray
 ) -> np.ndarray:
-    """Sizes of base parameters, so that a determinant is no matter of units: those given."""
+    """Return scales of the base parameters that make the determinant independent of units.
+
+    They are the magnitudes of the given values, at least 1.
+    """
     still = np.zeros((1, len(middle)))
     found = setup.project(middle[None], still, still)
     table = setup.table(found)
@@ -279,21 +287,21 @@ def _sizes(
 
 
 class DriveLimits:
-    """Limits of the drives alone, for given joints that may be any coordinates, such as a pose."""
+    """Motion limits of the drives, for given joints that may be any coordinates, such as a pose."""
 
     def __init__(
         self, setup: RegressorSetup, low: np.ndarray, high: np.ndarray, stroke: np.ndarray,
         speed: float, acceleration: float,
     ):  # fmt: skip
-        """Limits of a motion in coordinates of a pose.
+        """Set the limits.
 
         Args:
-            setup: of the regressor.
+            setup: definition of the regressor.
             low: (k,) lowest positions of the given joints [rad] or [m].
-            high: (k,) highest positions.
+            high: (k,) highest positions of the given joints [rad] or [m].
             stroke: (d, 2) lowest and highest positions of the d drives [rad] or [m].
-            speed: that no drive may exceed [rad/s] or [m/s].
-            acceleration: that no drive may exceed [rad/s^2] or [m/s^2].
+            speed: largest speed of a drive [rad/s] or [m/s].
+            acceleration: largest acceleration of a drive [rad/s^2] or [m/s^2].
 
         Source: Abdellatif 2008, (25).
         """
@@ -306,7 +314,7 @@ class DriveLimits:
         self.drives = [setup.chain.index(d) for d in setup.chain.drives]
 
     def use(self, motions: np.ndarray, held: np.ndarray) -> np.ndarray:
-        """Use of every limit at every row (n, l), 1 at the limit."""
+        """Return the utilisation of every limit at every row (n, l), 1 at the limit."""
         found = self.setup.project(*held)
         return np.concatenate(
             [
@@ -321,23 +329,23 @@ class DriveLimits:
 
 
 class MachineLimits:
-    """What a machine allows: joint ranges, strokes, flows, and forces at the relief pressure.
+    """Motion limits of a machine: joint ranges, strokes, flows, and forces at relief pressure.
 
-    The pump's flow is shared by all axes. The setup's given numbers tell the forces.
+    All axes share the pump flow. Forces follow from the nominal parameters of the setup.
 
     Args:
         machine: the machine.
-        setup: of the regressor.
+        setup: definition of the regressor.
 
     Raises:
-        InputError: the machine has plain drives, whose feedback nobody has tuned.
+        InputError: the machine has force drives, for which there are no default servo gains.
     """
 
     def __init__(self, machine: Machine, setup: RegressorSetup):
         if plain := [name for name, axis in machine.axes.items() if axis.force]:
             raise InputError(
-                _WHERE, f"{', '.join(plain)} has a plain drive, whose feedback depends on its use:"
-                " write a scenario with a `fourier` pilot and a `servo` of your own",
+                _WHERE, f"{', '.join(plain)} has a force drive without default servo gains:"
+                " write a scenario with a `fourier` pilot and your own `servo` gains",
             )  # fmt: skip
         self.machine, self.setup = machine, setup
         self.axes = tuple(actuator_order(machine))
@@ -351,7 +359,7 @@ class MachineLimits:
         self.drives = [setup.chain.index(d) for d in setup.chain.drives]
 
     def use(self, motions: np.ndarray, held: np.ndarray) -> np.ndarray:
-        """Use of every limit at every row (n, l), 1 at the limit."""
+        """Return the utilisation of every limit at every row (n, l), 1 at the limit."""
         parts = [
             1.0 + (motions[0] - self.high) / self.half,
             1.0 + (self.low - motions[0]) / self.half,
@@ -370,7 +378,7 @@ class MachineLimits:
     def _drive_use(
         self, axis: str, i: int, found: Projection, force: np.ndarray, flow: np.ndarray
     ) -> np.ndarray:
-        """Use (n,) of a drive's own limits; adds its flow (n,) [m^3/s]."""
+        """Return the utilisation (n,) of a drive's limits; add its flow to `flow` (n,) [m^3/s]."""
         facts, supply = self.machine.axes[axis], self.machine.supply
         j = self.drives[i]
         if facts.force:

@@ -1,9 +1,9 @@
-"""Hydraulic identification: valves, oil, leakage and supply from commands, pressures and motion.
+"""Identification of valves, oil, leakage and supply from commands, pressures and motion.
 
-The numbers are those of the library's effects, all fitted together to the one-step prediction
-errors of a Kalman filter on the whole model. Nothing is differentiated, the sensors' noise has its
-place, and what the data do not tell keeps its prior: the given value with a spread that the effect
-states.
+The parameters are those of the effect library. All are fitted together to the one-step prediction
+errors of a Kalman filter on the complete model, so that no signal is differentiated and sensor
+noise is modelled. Parameters that the data do not determine keep their prior: the given value with
+the standard deviation of the effect.
 """
 
 import dataclasses
@@ -25,29 +25,29 @@ HYDRAULIC = (
     "valve_gain", "valve_deadband", "spool_lag", "internal_leakage", "bulk_modulus",
     "pump_flow_limit", "relief_pressure",
 )  # fmt: skip
-_ROUNDS = 6  # of new gains and slopes
-_SETTLED = 0.2  # standard deviations by which a round may still move a number
-_STEPS = 2  # Gauss-Newton steps between new gains
-_TOLD = 0.7  # of the prior's spread; a number known no better was not told by the data
+_ROUNDS = 6  # largest number of rounds, each with new filter gains and sensitivities
+_SETTLED = 0.2  # standard deviations, largest change of a parameter in the last round
+_STEPS = 2  # Gauss-Newton steps between new filter gains
+_TOLD = 0.7  # of the prior's standard deviation: the data determine parameters known better
 _NORMAL95 = 1.959964
-_MOST = 240.0  # s of data: slopes of all numbers cost as many runs of the filter
+_MOST = 240.0  # s of data used: every parameter costs one filter run per Jacobian
 _WHERE = "hydraulic identification"
 
 
 @dataclass(frozen=True)
 class HydraulicNumber:
-    """One identified number of the hydraulics.
+    """One identified parameter of the hydraulics.
 
     Attributes:
-        effect: name of the library's effect that changes it.
+        effect: name of the effect that changes the parameter.
         location: axis, `supply` or `all`.
-        parameter: its name in the effect.
-        unit: SI.
-        nominal: as given.
-        value: identified.
+        parameter: name of the parameter in the effect.
+        unit: SI unit.
+        nominal: given value.
+        value: identified value.
         std: standard deviation.
         ci95: 95 % interval.
-        told: whether the data tell it; otherwise value and std are mostly the prior's.
+        told: whether the data determine it; otherwise value and std are mostly those of the prior.
     """
 
     effect: str
@@ -62,23 +62,23 @@ class HydraulicNumber:
 
     @property
     def name(self) -> str:
-        """Such as `valve_gain.boom`."""
+        """Name with location, such as `valve_gain.boom`."""
         return f"{self.effect}.{self.location}"
 
 
 @dataclass(frozen=True)
 class Hydraulics:
-    """Result.
+    """Result of a hydraulic identification.
 
     Attributes:
-        numbers: the identified numbers.
-        machine: the machine that has those which the data tell.
-        before: RMS of the held-out run's whitened one-step prediction errors with the machine that
-            the search started from [1], by the noise of the readings that the sensors state or,
-            where they state none, that was found with the identified machine.
+        numbers: the identified parameters.
+        machine: machine with the parameters that the data determine.
+        before: RMS of the whitened one-step prediction errors of the held-out run with the given
+            machine [1]. The noise is that stated by the sensors, otherwise that found with the
+            identified machine.
         after: the same with the identified machine.
-        status: `ok`, or what is wrong and what to do about it.
-        seconds: that it took.
+        status: `ok`, or a sentence that names the problem and the remedy.
+        seconds: computing time [s].
     """
 
     numbers: tuple[HydraulicNumber, ...]
@@ -92,15 +92,15 @@ class Hydraulics:
 def identify_hydraulics(
     dataset: Dataset, jobs: int = 2, progress: Callable[[str, float], None] | None = None
 ) -> Hydraulics:
-    """Identify the numbers of valves, oil, leakage, pump and relief valve.
+    """Identify the parameters of valves, oil, leakage, pump and relief valve.
 
     Args:
-        dataset: logs of the machine; its machine is where the search starts.
-        jobs: workers.
-        progress: told what is being done and how far, 0 .. 1.
+        dataset: logs of the machine; the search starts from its machine.
+        jobs: number of worker processes.
+        progress: called with a description of the step and the finished fraction, 0 .. 1.
 
     Returns:
-        The numbers and the machine that has them.
+        The parameters and the identified machine.
 
     Raises:
         InputError: the machine has no hydraulics.
@@ -127,19 +127,19 @@ def identify_hydraulics(
     machine = _machine(dataset.machine, numbers)
     sizes = [_size(m, data, levels) for m in (dataset.machine, machine)]
     status = "ok" if settled else (
-        "not settled: the given numbers are far off, or the model lacks something; start again"
-        " from the identified machine, or look with `hydrotele gap`"
+        "not converged: the given parameters are inaccurate or the model is incomplete; start again"
+        " from the identified machine, or search for missing effects with `hydrotele gap`"
     )  # fmt: skip
     if settled and known_levels(dataset) and sizes[1] > 1.5:
         status = (
-            f"on the held-out run prediction errors are {sizes[1]:.2g} times what the sensors"
-            " explain: the model lacks something; look for it with `hydrotele gap`"
+            f"prediction errors on the held-out run are {sizes[1]:.2g} times the sensor noise: the"
+            " model is incomplete; search for missing effects with `hydrotele gap`"
         )
     return Hydraulics(numbers, machine, sizes[0], sizes[1], status, time.perf_counter() - started)
 
 
 def _fitted(evidence: Evidence, guess: Guess, say: Callable[[str, float], None]):
-    """Gauss-Newton with gains anew in every round; the fit and whether it settled."""
+    """Fit by Gauss-Newton with new filter gains in every round; return fit and convergence."""
     fit = None
     for k in range(_ROUNDS):
         say(f"round {k + 1}", 0.9 * k / _ROUNDS)
@@ -172,7 +172,7 @@ def _numbers(guess: Guess, std: np.ndarray) -> tuple[HydraulicNumber, ...]:
 
 
 def _machine(machine: Machine, numbers: tuple[HydraulicNumber, ...]) -> Machine:
-    """The machine with the numbers that are told; all effects here have one parameter."""
+    """Return the machine with the determined parameters; all effects here have one parameter."""
     for n in numbers:
         if n.told:
             machine = EFFECTS[n.effect].apply(machine, n.location, {n.parameter: n.value})
@@ -180,7 +180,7 @@ def _machine(machine: Machine, numbers: tuple[HydraulicNumber, ...]) -> Machine:
 
 
 def _size(machine: Machine, data: Dataset, levels: Levels) -> float:
-    """RMS of whitened prediction errors along the held-out run."""
+    """Return the RMS of the whitened prediction errors of the held-out run."""
     data = dataclasses.replace(data, machine=machine)
     whitened = track_run(machine, data, data.heldout, levels=levels).whitened
     return float(np.sqrt(np.nanmean(whitened**2)))

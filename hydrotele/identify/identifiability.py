@@ -1,6 +1,8 @@
-"""Which parameters a regressor tells: each by itself, in combination with others, or not at all.
+"""Classification of parameters as identifiable, identifiable in combination, or not identifiable.
 
-How large parameters are, to tell whether data say anything about them.
+`identifiability` uses the null space of a noise-free regressor, `identifiable_in_noise` the
+accuracy that noisy equations allow. `reference_sizes` gives the magnitude of each parameter, with
+which its standard deviation is compared.
 """
 
 from collections.abc import Sequence
@@ -12,28 +14,27 @@ from hydrotele.identify.setup import RegressorSetup
 from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, Regressor
 
 UNIDENTIFIABLE, COMBINATION, FULL = "unidentifiable", "combination", "full"
-WEAK = "weak"  # an effect below the noise
-_NOTHING = 1e-11  # of the largest column of its kind: rounding
-_RANK = 1e-8  # of the largest singular value of columns of length 1: the square root of rounding
-_SHARE = 1e-5  # part of a parameter in the null space that puts it into a combination
-_HALF = 0.5  # of its size, within which a parameter must be known to be worth saying
-_SHIFT = 0.1  # standard deviations by which a parameter of its size must shift a combination
-_COEFFICIENT = 1e-7  # below it a coefficient is rounding
+WEAK = "weak"  # influence below the noise
+_NOTHING = 1e-11  # of the largest column with the same unit: rounding
+_RANK = 1e-8  # of the largest singular value of normalised columns: square root of rounding
+_SHARE = 1e-5  # null space component from which a parameter belongs to a combination
+_HALF = 0.5  # of its reference size: largest standard deviation of an identifiable parameter
+_SHIFT = 0.1  # standard deviations: smallest shift for which a parameter is named in a combination
+_COEFFICIENT = 1e-7  # smaller coefficients are rounding
 
 
 @dataclass(frozen=True)
 class Identifiability:
-    """What a regressor tells; m parameters, rank r.
+    """Identifiability of m parameters of a regressor of rank r.
 
     Attributes:
-        names: the m parameters.
-        status: (m,) `unidentifiable`, `combination` or `full`; in noisy data also `weak`.
-        base: (r,) places of the parameters that stand for the base parameters.
-        combination: (r, m) base parameters as combinations of all parameters.
-        condition: ratio of the largest to the smallest singular value of the base columns, each
-            of length 1.
-        gap: singular values on either side of the rank, over the largest; 0 without null space,
-            and in noisy data.
+        names: names of the m parameters.
+        status: (m,) `unidentifiable`, `combination` or `full`; for noisy data also `weak`.
+        base: (r,) indices of the parameters that represent the base parameters.
+        combination: (r, m) base parameters as linear combinations of all parameters.
+        condition: condition number of the normalised base columns.
+        gap: last singular value within the rank and the next one, over the largest; 0 without null
+            space and for noisy data.
     """
 
     names: tuple[str, ...]
@@ -45,12 +46,12 @@ class Identifiability:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Status -> number of parameters; `weak` only where there are any."""
+        """Number of parameters per status; `weak` only if there are any."""
         known = (UNIDENTIFIABLE, COMBINATION, FULL, *([WEAK] if WEAK in self.status else []))
         return {s: self.status.count(s) for s in known}
 
     def text(self, base: int) -> str:
-        """A base parameter written out, such as `inertia_zz.swing + 2.5 mass.boom`."""
+        """Return a base parameter as text, such as `inertia_zz.swing + 2.5 mass.boom`."""
         row = self.combination[base]
         parts = []
         for k in [self.base[base], *np.flatnonzero(row)]:
@@ -68,10 +69,10 @@ def identifiability(
     """Classify parameters by the null space of a noise-free regressor.
 
     Args:
-        matrix: (N, m) equations of a motion that excites whatever can be excited.
-        names: the m parameters.
-        units: (m,) theirs; columns are compared with others of the same unit only.
-        first: parameters that shall stand for a base parameter if they can, in this order.
+        matrix: (N, m) equations of a motion that excites all parameters that can be excited.
+        names: names of the m parameters.
+        units: (m,) their units; columns are compared only with columns of the same unit.
+        first: parameters that preferably represent a base parameter, in this order.
 
     Returns:
         The classification.
@@ -109,21 +110,23 @@ def identifiability(
 def identifiable_in_noise(
     matrix: np.ndarray, names: Sequence[str], sizes: np.ndarray, asked: np.ndarray
 ) -> Identifiability:
-    """What noisy data tell: parameters that they tell to better than half of their own sizes.
+    """Classify parameters by the accuracy with which noisy equations determine them.
 
-    Column by column, one is taken if its part that no earlier one explains stands above the noise;
-    then the least known are given up, for each makes others known better. All other columns are
-    combinations of those within the noise, and are named in them if they would shift them by a
-    tenth of a standard deviation.
+    A base parameter has a standard deviation of at most half its reference size. A column is
+    selected if its component orthogonal to the selected ones exceeds the noise. Then the least
+    accurate ones are removed one by one, which improves the others. Each remaining column is,
+    within the noise, a combination of the selected ones. It is named in a base parameter that it
+    would shift by at least a tenth of a standard deviation.
 
     Args:
-        matrix: (N, m) equations over the standard deviation of their errors.
-        names: the m parameters.
-        sizes: (m,) their sizes.
-        asked: (m,) whether a parameter may stand for a combination.
+        matrix: (N, m) equations divided by the standard deviation of their errors.
+        names: names of the m parameters.
+        sizes: (m,) reference sizes.
+        asked: (m,) whether a parameter may represent a base parameter.
 
     Returns:
-        The classification; `weak` is what shows by less than the noise, and stays as given.
+        The classification; `weak` parameters have an influence below the noise and keep their given
+        values.
     """
     whole = np.linalg.qr(matrix, mode="r") if len(matrix) > matrix.shape[1] else matrix
     scaled = np.asarray(whole) * (_HALF * sizes)
@@ -149,7 +152,7 @@ def identifiable_in_noise(
 
 
 def _above_noise(scaled: np.ndarray, length: np.ndarray, asked: np.ndarray) -> np.ndarray:
-    """Places of the columns that data tell, each to better than 1."""
+    """Return the indices of columns whose parameters have standard deviations of at most 1."""
     chosen: list[int] = []
     span = np.zeros((len(scaled), 0))
     for k in np.flatnonzero(asked & (length > 1.0)):
@@ -168,11 +171,11 @@ def _above_noise(scaled: np.ndarray, length: np.ndarray, asked: np.ndarray) -> n
 
 
 def _base(triangle, size, there, rank, first):
-    """Places of independent columns, and all parameters' combinations in them."""
+    """Return the indices of independent columns and the combinations of all parameters in them."""
     order = [k for k in first if there[k]] + [k for k in np.flatnonzero(there) if k not in first]
     chosen: list[int] = []
     span = np.zeros((len(triangle), 0))
-    for k in order:  # in the given order, so that the first of a combination stands for it
+    for k in order:  # the first parameter of a combination represents it
         if len(chosen) == rank:
             break
         column = triangle[:, k] / size[k]
@@ -194,27 +197,27 @@ def _base(triangle, size, there, rank, first):
     return base, combination
 
 
-_PART = 0.05  # of a drive's force that friction or an offset may be where none is given
-_SPEED = 0.1  # m/s or rad/s, at which viscous friction may be as large
-_LEVER = 0.1  # m: friction of a pin acts on its radius, that of a drive on a lever ten times longer
+_PART = 0.05  # of a drive's force: size of friction and offsets that are not given
+_SPEED = 0.1  # m/s or rad/s, speed at which viscous friction has that size
+_LEVER = 0.1  # m: friction of a pin acts at its radius, a tenth of the lever arm of a drive
 
 
 def reference_sizes(
     table: Regressor, setup: RegressorSetup, forces: np.ndarray, drives: Sequence[str] | None = None
 ) -> np.ndarray:
-    """Sizes of all parameters.
+    """Return the reference sizes of all parameters.
 
-    A body's are its given mass and radius of gyration; friction's are as given, and at least a
-    share of its drive's force.
+    Sizes of a body follow from its given mass and radius of gyration. Sizes of friction are the
+    given values, at least a fraction of the drive force.
 
     Args:
         table: the parameters.
-        setup: of the regressor.
-        forces: (k,) RMS of drives' forces [N] or [N m].
-        drives: names of these drives; the table's by default.
+        setup: definition of the regressor.
+        forces: (k,) RMS drive forces [N] or [N m].
+        drives: names of these drives; those of the table by default.
 
     Returns:
-        (m,) positive, in the parameters' units.
+        (m,) positive sizes in the units of the parameters.
     """
     chain = setup.chain
     names = table.drives if drives is None else drives

@@ -1,16 +1,12 @@
-"""Identification: from records of runs to parameters, what they tell of them, and how well.
+"""Identification of inertial and friction parameters from records of runs.
 
-Covariance of an estimate from the sensors' stated noise: every reading's way into it.
+`identify_dynamics` fits the base parameters, subtracts the bias caused by position noise, and
+predicts a held-out run. `identify_with_shapes` also selects between sharp and smooth dry friction.
 
-An estimate that is linear in the forces gives every equation a gain. Backwards through the
-low-pass that gain falls on single force readings, and through the forces' slopes with respect to
-the motion and the filter that made it, on single position readings. Their noise is independent.
-
-Bias that noise of the positions leaves in identified parameters, by repeating it.
-
-How well identified parameters predict a run that was not fitted, and what to say about it.
-
-Whether dry friction changes sign at once or smoothly: the data choose.
+The covariance follows from the stated sensor noise. The estimate is linear in the forces, with a
+gain for every equation. The adjoint of the low-pass filter maps that gain to single force readings.
+The sensitivities of the forces to the motion, and the adjoint of the differentiation, map it to
+single position readings, whose noise is independent.
 """
 
 import math
@@ -48,26 +44,26 @@ from hydrotele.identify.setup import RegressorSetup
 from hydrotele.identify.smoothing import Smoothed, smooth
 from hydrotele.multibody.inverse_dynamics import Regressor
 
-_SLOPES = 8000  # rows of a run that are asked for the forces' slopes
-_BLOCK = 4  # parameters at a time, so that long logs need little memory
+_SLOPES = 8000  # rows, largest number at which force sensitivities are computed
+_BLOCK = 4  # parameters per block, to limit memory for long logs
 
 
 def propagated(
     record: IdentificationRecord, found: Resolution, gain: np.ndarray, setup: RegressorSetup,
     processing: Processing, value: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Covariance that the noise of one run's readings leaves in an estimate.
+    """Propagate the sensor noise of one run to the covariance of an estimate.
 
     Args:
         record: the run.
-        found: what its positions resolve.
-        gain: (p, n, k) of the estimate, for the run's equations and all drives; 0 where not used.
-        setup: what the regressor is built of.
-        processing: how positions are differentiated.
+        found: resolution of its positions.
+        gain: (p, n, k) gain of the estimate for the run's equations and all drives; 0 if not used.
+        setup: definition of the regressor.
+        processing: method to differentiate the positions.
         value: (m,) parameters.
 
     Returns:
-        (p, p).
+        (p, p) covariance.
 
     Source: first-order propagation of errors; Abdellatif 2008, section 4.2 (noise of positions).
     """
@@ -83,14 +79,14 @@ def propagated(
     out = np.einsum("pnk,k,qnk->pq", on_force, noise**2, on_force, optimize=True)
     motion = joint_motion(record.position, record.period, found, processing)
     cycles = 1
-    if processing.method == "periodic":  # every cycle has the same slopes and is read alike
+    if processing.method == "periodic":  # all cycles have the same sensitivities
         assert processing.period
         cycles = round(rows * record.period / processing.period)
     slopes = _slopes(motion, rows // cycles, setup, value)
     parts = []
     for first in range(0, p, _BLOCK):
         folded = on_force[first : first + _BLOCK].reshape(-1, cycles, rows // cycles, k)
-        # an equation's error is measured less modelled force: the sign does not matter in a square
+        # the sign of the error, measured minus modelled force, does not matter in a square
         on_motion = np.einsum("pcnk,xnkj->xpnj", folded, slopes, optimize=True)
         parts.append(adjoint(on_motion, record.period, found, processing))
     on_position, stated = np.concatenate(parts), found.noise**2 / cycles
@@ -98,9 +94,9 @@ def propagated(
 
 
 def _slopes(motion: Smoothed, count: int, setup: RegressorSetup, value: np.ndarray) -> np.ndarray:
-    """Slopes (3, n, k, j) of drive forces over positions, rates and accelerations of the joints.
+    """Return sensitivities (3, n, k, j) of drive forces to positions, rates and accelerations.
 
-    They change as slowly as the motion: in long runs those of every few rows tell the others.
+    In long runs they are computed at every few rows and interpolated, since they change slowly.
     """
     rows = np.arange(0, count, max(1, count // _SLOPES))
     motions = np.stack([motion.value, motion.rate, motion.acceleration])[:, rows]
@@ -121,35 +117,35 @@ def _slopes(motion: Smoothed, count: int, setup: RegressorSetup, value: np.ndarr
     return (1.0 - part) * out[:, before] + part * out[:, before + 1]
 
 
-_ENOUGH = 240.0  # s of data in all, spread evenly over the runs
-_PIECE = 20.0  # s of one piece of a long run
-_PERIODS = 12.0  # of the band that a piece has at least: its low-pass takes three
+_ENOUGH = 240.0  # s of data in total, distributed evenly over the runs
+_PIECE = 20.0  # s, length of one segment of a long run
+_PERIODS = 12.0  # periods of the band, shortest segment: the low-pass filter spans three
 
 
 def motion_bias(
     data: Gathered, equations: Weighted, base: np.ndarray, found: Estimate, value: np.ndarray,
     setup: RegressorSetup, processing: Processing, pairs: int, seed: int = 0,
 ) -> np.ndarray:  # fmt: skip
-    """Mean error of an estimate whose regressor comes from noisy positions.
+    """Estimate the bias that noise of the positions causes in the base parameters.
 
-    The optimal smoother's motion, or the mean cycle, is taken for the true one and the parameters
-    found for the true ones. Forces that follow from both meet a regressor to which the positions'
-    noise is added anew: what then stands on the right of the normal equations would be 0 without
-    noise. Every noise is used with both signs, so that only what does not average out remains.
+    The smoothed motion (or the mean cycle) and the estimated parameters are taken as the truth, and
+    forces are computed from them. Noise is then added to the positions, and a regressor is built
+    from them. The right-hand side of the normal equations, 0 without noise, gives the bias. Every
+    noise sample is used with both signs, so that contributions of first order cancel.
 
     Args:
         data: equations of all runs.
         equations: the same, weighted.
-        base: (r,) places of the base parameters.
+        base: (r,) indices of the base parameters.
         found: their estimate.
         value: (m,) all parameters that follow from it.
-        setup: what the regressor is built of.
-        processing: how positions are differentiated.
-        pairs: of noise and its negative [1].
-        seed: of the noise [1].
+        setup: definition of the regressor.
+        processing: method to differentiate the positions.
+        pairs: number of pairs of a noise sample and its negative [1].
+        seed: seed of the noise [1].
 
     Returns:
-        (r,) to be taken off the base parameters.
+        (r,) bias, to be subtracted from the base parameters.
 
     Source: Efron and Tibshirani 1993, An introduction to the bootstrap, chapter 10; Cook and
     Stefanski 1994 (noise added to correct for noise).
@@ -184,7 +180,10 @@ def _world(
     processing: Processing,
     value: np.ndarray,
 ) -> IdentificationRecord:
-    """A record whose forces are those of its motion, and as unknown as they were."""
+    """Return a record with smoothed positions and the forces of that motion.
+
+    Forces that were unknown stay unknown.
+    """
     if processing.method == "periodic":
         motion = joint_motion(record.position, record.period, found, processing)
     else:
@@ -197,9 +196,10 @@ def _world(
 def _pieces(
     data: Gathered, processing: Processing
 ) -> Iterator[tuple[IdentificationRecord, Resolution, np.ndarray]]:
-    """Pieces of the runs, what their positions resolve, and the noise (k,) of a position.
+    """Yield segments of the runs, the resolution of their positions, and the position noise (k,).
 
-    The noise of a mean cycle is that of all cycles.
+    With the periodic method the noise is reduced so that the mean cycle has the noise of the mean
+    of all cycles.
     """
     lengths = [len(record.force) * record.period for record, _ in data.runs]
     part = min(1.0, _ENOUGH / sum(lengths))
@@ -228,8 +228,8 @@ def _pieces(
                 yield cut, found, noise
 
 
-_WORSE = 1.5  # times the noise; beyond it the model lacks something
-_FOREIGN = 3.0  # times the fitted runs' residuals; beyond it they tell too little
+_WORSE = 1.5  # prediction error over noise above which the model is incomplete
+_FOREIGN = 3.0  # prediction error over fitted residuals above which the runs are not informative
 
 
 def heldout_errors(
@@ -239,7 +239,10 @@ def heldout_errors(
     columns: list[int],
     setup: RegressorSetup,
 ) -> dict[str, HeldOut]:
-    """Drive -> prediction of the held-out run, of the drives at `columns` with known forces."""
+    """Return the prediction errors of the held-out run for each drive at `columns`.
+
+    Drives without known forces are omitted.
+    """
     noise = judged.noise_of(value)
     out = {}
     for k in columns:
@@ -260,7 +263,7 @@ def heldout_errors(
 
 
 def heldout_forces(judged: Equations, table: Regressor, value: np.ndarray) -> Forces:
-    """Measured and predicted forces of the held-out run."""
+    """Return measured and predicted forces of the held-out run."""
     return Forces(
         judged.name, table.drives, judged.time, judged.force, judged.matrix @ value,
         judged.matrix @ table.nominal,
@@ -268,7 +271,7 @@ def heldout_forces(judged: Equations, table: Regressor, value: np.ndarray) -> Fo
 
 
 def whiteness(residual: np.ndarray) -> np.ndarray:
-    """Correlation (k,) of residuals (n, k) with those before them."""
+    """Return the correlation (k,) of successive residuals (n, k)."""
     error = residual - residual.mean(axis=0)
     return np.sum(error[1:] * error[:-1], axis=0) / np.sum(error**2, axis=0)
 
@@ -276,57 +279,57 @@ def whiteness(residual: np.ndarray) -> np.ndarray:
 def status_of(
     heldout: dict[str, HeldOut], fitted: dict[str, float], still: np.ndarray, setup: RegressorSetup
 ) -> str:
-    """`ok`, or what is wrong and what to do about it.
+    """Evaluate the result of an identification.
 
     Args:
-        heldout: prediction of the held-out run.
-        fitted: drive -> RMS of the residuals of the runs to fit [N] or [N m].
-        still: (k,) whether a given joint stood still in all runs to fit.
-        setup: of the regressor.
+        heldout: prediction errors of the held-out run.
+        fitted: drive -> RMS of the residuals of the fitted runs [N] or [N m].
+        still: (k,) whether a given joint was at rest in all fitted runs.
+        setup: definition of the regressor.
 
     Returns:
-        A sentence.
+        `ok`, or a sentence that names the problem and the remedy.
     """
     if still.any():
         names = ", ".join(j for j, stands in zip(setup.given, still, strict=True) if stands)
         return (
-            f"{names} stood still: what shows only in motion of it is not told, and kept as given;"
-            " log a motion of all axes, fast and in many poses"
+            f"{names} did not move: parameters that need its motion keep their given values;"
+            " log a fast motion of all axes in many poses"
         )
     if not heldout:
-        return "the held-out run has no known force: nothing was judged; hold out another one"
+        return "the held-out run has no known force, so nothing was validated: hold out another run"
     worse = [d for d, h in heldout.items() if h.rms > _WORSE * h.noise_rms]
     if worse:
         return (
-            f"on the held-out run the force of {', '.join(worse)} differs by more than the sensors"
-            " explain: the model lacks something there; look for it with `hydrotele gap`"
+            f"on the held-out run the force error of {', '.join(worse)} exceeds the sensor noise:"
+            " the model is incomplete; search for missing effects with `hydrotele gap`"
         )
     worse = [d for d, h in heldout.items() if h.rms > _FOREIGN * fitted[d]]
     if worse:
         return (
-            f"on the held-out run the force of {', '.join(worse)} differs by more than"
-            f" {_FOREIGN:g} times as much as on the fitted ones: they do not tell what happens"
-            " there; fit runs like it, too"
+            f"on the held-out run the force error of {', '.join(worse)} is more than"
+            f" {_FOREIGN:g} times that on the fitted runs: their motion is not informative enough;"
+            " fit runs like the held-out run as well"
         )
     return "ok"
 
 
-_UNSURE = 0.2  # of a bias: the motion that it is found with is smoother than the true one
-_MANY = 2e7  # ways of readings into parameters; beyond it residuals alone tell the covariance
+_UNSURE = 0.2  # relative uncertainty of a bias: it is computed with a smoothed motion
+_MANY = 2e7  # readings times parameters, above which only residuals give the covariance
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """A fit to some runs, before its bias is taken off.
+    """A fit to several runs without bias correction.
 
     Attributes:
         data: equations of the runs.
-        processing: with the band.
-        equations: weighted.
-        structure: base parameters that the motion would tell without noise.
-        told: those that the data tell.
-        estimate: of them.
-        still: (k,) whether a given joint stood still in all runs.
+        processing: method to differentiate the positions, with the band.
+        equations: weighted equations.
+        structure: base parameters that the motion determines without noise.
+        told: base parameters that the data determine.
+        estimate: estimate of the base parameters `told`.
+        still: (k,) whether a given joint was at rest in all runs.
     """
 
     data: Gathered
@@ -338,7 +341,7 @@ class Fitted:
     still: np.ndarray
 
     def whole(self) -> np.ndarray:
-        """All parameters (m,): what the data do not tell stays as given."""
+        """Return all parameters (m,); undetermined combinations keep their given values."""
         return _whole(self.told, self.data.table.nominal, self.estimate)
 
 
@@ -347,24 +350,25 @@ def identify_dynamics(
     processing: Processing | None = None, estimator: Estimator | None = None, *,
     notes: Sequence[str] = (),
 ) -> Identification:  # fmt: skip
-    """Identify the parameters of a chain.
+    """Identify the parameters of a mechanism.
 
     Args:
-        fit: records to learn from.
-        heldout: record to judge on.
-        setup: what the regressor is built of.
-        processing: how positions are differentiated, and the band; each run as its own positions
-            allow by default. Where it is `periodic`, runs to fit are cut to their last whole
-            cycles, and the held-out run, which need not be periodic, is filtered.
-        estimator: how base parameters are estimated. Where the sensors state their noise, its
-            bias is taken off, and the covariance is that of every reading's noise.
-        notes: to hand on.
+        fit: records to fit.
+        heldout: record for validation.
+        setup: definition of the regressor.
+        processing: method to differentiate the positions, and the band; by default the band follows
+            from the resolution of the positions. With `periodic`, the fitted runs are cut to their
+            last whole cycles, and the held-out run, which need not be periodic, is filtered.
+        estimator: options of the estimator. If the sensors state their noise, the bias is
+            subtracted and the covariance is propagated from the noise of the readings.
+        notes: notes to include in the result.
 
     Returns:
         The identification.
 
     Raises:
-        InputError: no drive has a force, there are too few rows, or the estimator needs a period.
+        InputError: no drive has a known force, there are too few rows, or the estimator needs a
+            period.
 
     Source: Khoshzaban 1992, chapter 4; Abdellatif 2008, section 4.
     """
@@ -410,27 +414,27 @@ def fit_runs(
     processing: Processing,
     estimator: Estimator,
 ) -> Fitted:
-    """Fit base parameters to runs, without care for bias or a run to judge on.
+    """Fit the base parameters to runs, without bias correction and validation.
 
     Args:
         fit: records.
-        setup: what the regressor is built of.
-        processing: as of `identify`.
-        estimator: as of `identify`.
+        setup: definition of the regressor.
+        processing: as in `identify_dynamics`.
+        estimator: as in `identify_dynamics`.
 
     Returns:
         The fit.
 
     Raises:
-        InputError: as `identify`.
+        InputError: as in `identify_dynamics`.
     """
     if estimator.method == "instruments":
         if not processing.period:
             raise InputError("estimator", "instruments need the period of the motion [s]")
         if processing.method == "periodic":
             raise InputError(
-                "estimator", "instruments need cycles of their own, `periodic` takes their mean:"
-                " take zero_phase",
+                "estimator", "instruments need separate cycles, but `periodic` averages them:"
+                " use zero_phase",
             )  # fmt: skip
     if processing.method == "periodic":
         assert processing.period
@@ -455,7 +459,7 @@ def fit_runs(
 
 
 def _cycles(record: IdentificationRecord, processing: Processing) -> int:
-    """How many cycles of a motion are taken the mean of."""
+    """Return the number of cycles that are averaged."""
     if processing.method != "periodic" or not processing.period:
         return 1
     return round(len(record.force) * record.period / processing.period)
@@ -468,7 +472,7 @@ def _whole(told: Identifiability, nominal: np.ndarray, found: Estimate) -> np.nd
 
 
 def _residual_sizes(fitted: Fitted) -> dict[str, float]:
-    """Drive -> RMS of its residuals, as if all equations counted alike [N] or [N m]."""
+    """Return the RMS of the unweighted residuals of each drive [N] or [N m]."""
     residual = fitted.estimate.residual / fitted.equations.weight
     return dict(
         zip(fitted.data.drives, np.sqrt(np.mean(residual**2, axis=0)).tolist(), strict=True)
@@ -476,7 +480,7 @@ def _residual_sizes(fitted: Fitted) -> dict[str, float]:
 
 
 def _noise_stated(data: Gathered) -> bool:
-    """Whether sensors state the noise of all positions and of the forces that are used."""
+    """Return whether the sensors state the noise of all positions and used forces."""
     return all(
         np.all(record.position_noise > 0.0) and np.isfinite(record.force_noise[data.columns]).all()
         for record, _ in data.runs
@@ -484,9 +488,10 @@ def _noise_stated(data: Gathered) -> bool:
 
 
 def _covariance(fitted: Fitted, setup: RegressorSetup) -> np.ndarray:
-    """Covariance (r, r) by the sensors' noise, larger where residuals are.
+    """Return the covariance (r, r) from sensor noise, increased if the residuals are larger.
 
-    Residuals alone tell it in long logs, and where a smoother adapts to the data.
+    For long logs, and for the smoother, which adapts to the data, it follows from the residuals
+    only.
     """
     data, found = fitted.data, fitted.estimate
     readings = sum(record.force.size + record.position.size for record, _ in data.runs)
@@ -503,7 +508,7 @@ def _covariance(fitted: Fitted, setup: RegressorSetup) -> np.ndarray:
     return total * max(1.0, ratio)
 
 
-_TRIED = 600.0  # s of data that tell the shape
+_TRIED = 600.0  # s of data with which the friction shape is selected
 
 
 def identify_with_shapes(
@@ -511,23 +516,23 @@ def identify_with_shapes(
     processing: Processing | None = None, estimator: Estimator | None = None, *,
     notes: Sequence[str] = (),
 ) -> Identification:  # fmt: skip
-    """Identify with friction as smooth as the machine states, or with a sharp sign.
+    """Identify with dry friction as smooth as the machine states, or with a sharp sign change.
 
-    A machine's smoothing velocity often only helps a simulator; sharp friction is Coulomb's own.
+    The smoothing velocity of a machine often serves only the simulation; Coulomb friction is sharp.
 
     Args:
-        fit: as of `identify`.
-        heldout: as of `identify`.
-        setup: as of `identify`.
-        processing: as of `identify`.
-        estimator: as of `identify`.
-        notes: as of `identify`.
+        fit: as in `identify_dynamics`.
+        heldout: as in `identify_dynamics`.
+        setup: as in `identify_dynamics`.
+        processing: as in `identify_dynamics`.
+        estimator: as in `identify_dynamics`.
+        notes: as in `identify_dynamics`.
 
     Returns:
-        The identification with the smaller residuals; a note says if it is the sharp one.
+        The identification with the larger likelihood; a note says if sharp friction was selected.
 
     Raises:
-        InputError: as `identify`.
+        InputError: as in `identify_dynamics`.
     """
     started = time.perf_counter()
     processing, estimator = processing or Processing(), estimator or Estimator()
@@ -537,14 +542,14 @@ def identify_with_shapes(
         misfits = [_misfit(some, s, processing, estimator) for s in (setup, sharp)]
         if misfits[1] < misfits[0]:
             setup = sharp
-            said = "Dry friction changes sign at once in these data, more sharply than given."
+            said = "Sharp Coulomb friction fits these data better than the given smoothing."
             notes = (*notes, said)
     found = identify_dynamics(fit, heldout, setup, processing, estimator, notes=notes)
     return replace(found, seconds=time.perf_counter() - started)
 
 
 def _some(fit: Sequence[IdentificationRecord], period: float | None) -> list[IdentificationRecord]:
-    """The first runs, as many as last long enough; one that alone is longer is cut."""
+    """Return the first runs with a total length of 600 s; a longer run is cut."""
     some, seconds = [], 0.0
     for record in fit:
         some.append(beginning(record, _TRIED, period))
@@ -560,8 +565,8 @@ def _misfit(
     processing: Processing,
     estimator: Estimator,
 ) -> float:
-    """What the residuals' likelihood asks to be small."""
+    """Return minus twice the log likelihood of the residuals, per row and without constants."""
     found = fit_runs(fit, setup, processing, estimator)
-    # weights count as the inverse of standard deviations, or the shape that doubts most would win
+    # weights are inverse standard deviations; without them the most uncertain shape would win
     doubted = np.sum(np.mean(np.log(found.equations.weight**2), axis=0))
     return float(np.sum(np.log(np.mean(found.estimate.residual**2, axis=0))) - doubted)

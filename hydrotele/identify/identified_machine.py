@@ -1,13 +1,10 @@
-"""The machine with its identified numbers: a Machine like any other, which runs and replays.
+"""Machine with identified parameters, and the document `identify.json`.
 
-`identify.json`: an identification as scripts read it.
-
-Physically consistent parameters: bodies that can exist, friction that takes energy.
-
-The base parameters that data tell leave the others open. Here every body is the given one, deformed
-by an affine map of space: whatever the map, its mass is positive and its inertia that of a mass
-distribution. Of all such machines it takes the one that explains the data best and deforms the
-given one least.
+The identified base parameters do not determine all parameters. `consistent` selects physically
+consistent ones. Every body is an affine deformation of the given body, so that its mass is positive
+and its inertia belongs to a mass distribution. Friction dissipates energy. The selected machine has
+the best fit with the smallest deformation. `identified_machine` writes the parameters to a
+`Machine`; `identify_document` writes an identification as JSON data.
 """
 
 from collections.abc import Mapping
@@ -23,20 +20,20 @@ from hydrotele.identify.result import WEAK, Identification, counts, parameter_ro
 from hydrotele.machine.machine import Machine, SensorError
 from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, FRICTION_TERMS
 
-_USUAL = 0.3  # deformation that counts as one standard deviation: masses to 60 %, sizes to 30 %
-_THIN = 1e-4  # of the largest second moment, that a body has at least in every direction
-_CERTAIN = 1e-10  # of the largest variance, below which truncation has left none
+_USUAL = 0.3  # standard deviation of a deformation: masses to 60 %, dimensions to 30 %
+_THIN = 1e-4  # of the trace of the second moments: smallest second moment of a body
+_CERTAIN = 1e-10  # of the largest variance: smaller variances come from truncation
 _SIGNED = ("asymmetry",)  # friction that may have either sign
 
 
 @dataclass(frozen=True)
 class Consistent:
-    """Result.
+    """Physically consistent parameters.
 
     Attributes:
-        value: (m,) parameters of machines that can exist, in the identification's order.
-        loss: squared distance of its base parameters from the estimate, in standard deviations;
-            about their number where the estimate is consistent within its noise.
+        value: (m,) parameters in the order of the identification.
+        loss: squared Mahalanobis distance of their base parameters from the estimate. It is about
+            the number of base parameters if the estimate is consistent within its noise.
     """
 
     value: np.ndarray
@@ -45,11 +42,11 @@ class Consistent:
 
 @dataclass(frozen=True)
 class Freedom:
-    """How a body may differ from the given one.
+    """Allowed deformation of a body.
 
     Attributes:
-        shear: whether its principal axes may turn.
-        axis: (3,) line along which its centre of mass may move; None for any way.
+        shear: whether the principal axes may rotate.
+        axis: (3,) direction along which the centre of mass may move; None for all directions.
     """
 
     shear: bool = True
@@ -57,11 +54,11 @@ class Freedom:
 
 
 def consistent(found: Identification, freedom: Mapping[str, Freedom] | None = None) -> Consistent:
-    """The nearest machine that can exist.
+    """Find the physically consistent parameters nearest to an estimate.
 
     Args:
         found: the identification; its given bodies must have mass.
-        freedom: body -> how it may differ; everything by default.
+        freedom: body -> allowed deformation; unrestricted by default.
 
     Returns:
         The parameters.
@@ -112,7 +109,7 @@ def consistent(found: Identification, freedom: Mapping[str, Freedom] | None = No
 
 
 class _Body:
-    """A body and the maps that deform it: stretches, mass, shift, shear."""
+    """A body with its affine deformations: scaling, mass, shift of the centre of mass, shear."""
 
     def __init__(self, found: Identification, body: str, freedom: Freedom):
         self.places = np.array([found.names.index(f"{kind}.{body}") for kind in BODY_PARAMETERS])
@@ -126,7 +123,7 @@ class _Body:
         self.size = 4 + len(self.shifts) + (3 if freedom.shear else 0)
 
     def parameters(self, x: np.ndarray) -> np.ndarray:
-        """(10,) inertial parameters."""
+        """Return the inertial parameters (10,) of the deformed body."""
         shift = self.scale * x[4 : 4 + len(self.shifts)] @ self.shifts
         deform = np.diag(np.exp(x[:4]))
         deform[:3, 3] = shift
@@ -136,7 +133,10 @@ class _Body:
 
 
 def _pseudo_inertia(p: np.ndarray) -> np.ndarray:
-    """(4, 4) second moments, first moments and mass of a body (10,)."""
+    """Return the pseudo-inertia (4, 4) of a body with inertial parameters (10,).
+
+    It holds the second moments, first moments and mass.
+    """
     inertia = np.array([[p[4], p[5], p[6]], [p[5], p[7], p[8]], [p[6], p[8], p[9]]])
     out = np.empty((4, 4))
     out[:3, :3] = 0.5 * np.trace(inertia) * np.eye(3) - inertia
@@ -146,14 +146,14 @@ def _pseudo_inertia(p: np.ndarray) -> np.ndarray:
 
 
 def _parameters(pseudo: np.ndarray) -> np.ndarray:
-    """(10,) inertial parameters of a pseudo-inertia (4, 4)."""
+    """Return the inertial parameters (10,) of a pseudo-inertia (4, 4)."""
     second = pseudo[:3, :3]
     inertia = np.trace(second) * np.eye(3) - second
     return np.concatenate([[pseudo[3, 3]], pseudo[:3, 3], inertia[np.triu_indices(3)]])
 
 
 def _thick(pseudo: np.ndarray) -> np.ndarray:
-    """A body with some extent in every direction: a rod without any cannot be stretched."""
+    """Return a pseudo-inertia with some extent in every direction, so that it can be scaled."""
     central = pseudo[:3, :3] - np.outer(pseudo[:3, 3], pseudo[:3, 3]) / pseudo[3, 3]
     least = _THIN * max(float(np.trace(central)), 1e-12)
     values, axes = np.linalg.eigh(central)
@@ -163,24 +163,24 @@ def _thick(pseudo: np.ndarray) -> np.ndarray:
 
 
 def _sizes(found: Identification, others: np.ndarray) -> np.ndarray:
-    """Sizes (o,) by which parameters that belong to no body are counted."""
+    """Return scales (o,) of the parameters that do not belong to a body."""
     spread = {k: s for k, s in zip(found.told.base, found.estimate.std, strict=True)}
     return np.array(
         [max(abs(found.nominal[k]), abs(found.value[k]), spread.get(k, 0.0), 1e-9) for k in others]
     )
 
 
-_SURE = 2.0  # standard deviations by which an offset must differ to be written
+_SURE = 2.0  # standard deviations: smallest change of an offset that is written
 _FRICTION = {"coulomb": "coulomb", "stribeck": "stribeck_extra", "viscous": "viscous"}
 
 
 def identified_machine(
     machine: Machine, found: Identification, bars: dict[str, tuple[str, str]]
 ) -> tuple[Machine, Consistent]:
-    """Machine with the identified bodies, friction and offsets.
+    """Return a machine with the identified bodies, friction and offsets.
 
-    A Machine's links have their principal axes along their frames, and bars their mass on their
-    axis; of all such machines it is the one that explains the data best.
+    Links of a `Machine` have principal axes parallel to their frames, and tubes and rods have their
+    centre of mass on their axis. The result is the machine of this form with the best fit.
 
     Args:
         machine: the given machine.
@@ -188,7 +188,7 @@ def identified_machine(
         bars: body of a tube or rod -> (axis, `tube` or `rod`).
 
     Returns:
-        The machine, and how well it agrees with the estimate.
+        The machine, and its consistent parameters with their distance from the estimate.
     """
     freedom = {}
     for name in found.names:
@@ -214,7 +214,7 @@ def identified_machine(
 
 
 def _bar_axis(found: Identification, body: str) -> np.ndarray:
-    """Line on which a bar's centre of mass lies, in its frame."""
+    """Return the direction of a bar's centre of mass in its frame, a unit vector (3,)."""
     places = [found.names.index(f"moment_{c}.{body}") for c in "xyz"]
     moment = found.nominal[places]
     size = np.linalg.norm(moment)
@@ -222,7 +222,7 @@ def _bar_axis(found: Identification, body: str) -> np.ndarray:
 
 
 def _drive_joint(found: Identification, joint: str, axis: str) -> str | None:
-    """Place of an axis' friction in the names: its joint, or its cylinder's rod."""
+    """Return the joint in the names of an axis' friction: its cylinder's rod or its joint."""
     for place in (f"{axis}_rod", joint):
         if f"coulomb.{place}" in found.names:
             return place
@@ -290,16 +290,16 @@ def identify_document(
     found: Identification | None, hydraulics: Hydraulics | None = None,
     best: Consistent | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """The document; what is unknown is None or NaN.
+    """Return the content of `identify.json`; unknown values are None or NaN.
 
     Args:
-        found: identification of the mechanism, None where no force is known.
-        hydraulics: identification of the hydraulics, None where not asked for.
-        best: the nearest machine that can exist.
+        found: identification of the mechanism, None if no force is known.
+        hydraulics: identification of the hydraulics, None if not requested.
+        best: the nearest physically consistent parameters.
 
     Returns:
         Keys `parameters`, `condition`, `heldout`, `counts`, `status`, `seconds`, `band_hz`,
-        `whiteness`, `given`, `consistent`, `notes`; `hydraulics` where asked for.
+        `whiteness`, `given`, `consistent`, `notes`; `hydraulics` if requested.
     """
     distance, limit = found.distance(found.nominal) if found else (None, None)
     rows = parameter_rows(found) if found else []

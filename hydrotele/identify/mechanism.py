@@ -1,7 +1,8 @@
-"""Identification of any mechanism: an MJCF, logs, and which column is which.
+"""Reading of any mechanism for identification: an MJCF file, logs, and a column mapping.
 
-Nothing of a Machine is needed: the MJCF gives bodies, joints, closures (`connect`, `weld`) and
-drives, a short mapping names the columns of positions and forces.
+No machine file is needed. The MJCF file defines bodies, joints, closures (`connect`, `weld`) and
+drives. A `ColumnMapping` names the columns of positions and forces. `load_mechanism` reads both,
+`mechanism_records` reads the logs.
 """
 
 import fnmatch
@@ -25,38 +26,38 @@ from hydrotele.multibody.chain import load_chain
 from hydrotele.multibody.closures import joint_positions
 from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, FRICTION_TERMS
 
-_FITTED = 2.0 / 3.0  # of a single run; the rest judges
+_FITTED = 2.0 / 3.0  # fitted fraction of a single run; the remainder is for validation
 _POSITIONS = ("position.{joint}", "angle.{joint}", "{joint}")
 _FORCES = ("force.{joint}", "torque.{joint}", "effort.{joint}")
-_SPARSE = 1.5  # ticks of a clock per row
+_SPARSE = 1.5  # clock ticks per row, above which rows are interpolated to their median period
 
 
 class ColumnMapping(Facts):
-    """Which column is which, and what is known of the mechanism.
+    """Assignment of log columns to joints, and known properties of the mechanism.
 
-    Names of joints, bodies and closures are those of the MJCF; `*` and `?` stand for any letters.
+    Names of joints, bodies and closures are those of the MJCF; `*` and `?` are wildcards.
 
     Attributes:
         time: column of the time [s].
-        position: joint -> column of its position [rad] or [m], with a minus before it where the
-            sign is the other way round; or one name for all, such as `angle.{joint}`.
-        force: drive -> column of its force or torque [N] or [N m], likewise.
-        position_noise: standard deviation of a position reading [rad] or [m], joint by joint or one
-            for all; where both noises are stated, they tell the covariance, and the bias that the
-            positions' noise leaves is taken off.
-        force_noise: standard deviation of a force reading [N] or [N m], likewise.
+        position: joint -> column of its position [rad] or [m], with a leading minus to reverse the
+            sign; or one pattern for all joints, such as `angle.{joint}`.
+        force: drive -> column of its force or torque [N] or [N m], in the same form.
+        position_noise: standard deviation of a position reading [rad] or [m], per joint or one for
+            all. If both noises are stated, the covariance follows from them, and the bias caused by
+            position noise is subtracted.
+        force_noise: standard deviation of a force reading [N] or [N m], per drive or one for all.
         coordinates: joints in which the motion is described and filtered, such as those of a
-            platform, where they are not those that are measured.
+            platform, if they differ from the measured joints.
         passive_friction: joints without drive, and closures, that have friction.
         alike: groups of bodies or joints that have the same parameters.
-        absent: parameters that are known to be 0, such as `moment_x.stator_*`.
+        absent: parameters known to be 0, such as `moment_x.stator_*`.
         offsets: whether drives may have constant forces.
         friction: joint -> friction that an MJCF cannot state, such as `stribeck`, `quadratic`,
             `viscous_asymmetry`; see `FrictionTerm`. `stribeck_velocity` is that of `stribeck`.
         sensor_errors: `position.JOINT` or `force.DRIVE` -> known defect of its sensor, which is
-            taken off the readings (after signs that the mapping turns).
-        uncertainty: share by which masses, inertias and friction of the MJCF may be off; a gap
-            search calibrates them within it before it names anything.
+            removed from the readings (after a sign reversal by the mapping).
+        uncertainty: relative uncertainty of masses, inertias and friction of the MJCF. A gap search
+            first calibrates them within this range.
     """
 
     time: str = "time"
@@ -76,13 +77,13 @@ class ColumnMapping(Facts):
 
 @dataclass(frozen=True)
 class Mechanism:
-    """A mechanism that is identified.
+    """A mechanism to be identified.
 
     Attributes:
-        setup: what the regressor is built of.
+        setup: definition of the regressor.
         measured: joints whose positions are measured.
-        mapping: which column is which.
-        source: of the mapping or the MJCF, for messages.
+        mapping: the column mapping.
+        source: file of the mapping or the MJCF, for messages.
     """
 
     setup: RegressorSetup
@@ -94,18 +95,18 @@ class Mechanism:
 def load_mechanism(
     mjcf: str | Path, mapping: str | Path | ColumnMapping | None = None
 ) -> Mechanism:
-    """Read a mechanism and its mapping.
+    """Read a mechanism and its column mapping.
 
     Args:
-        mjcf: the file.
-        mapping: YAML file with the keys of `ColumnMapping`, or one; None where columns have the
-            joints' names, alone or after `position.`, `angle.`, `force.`, `torque.` or `effort.`.
+        mjcf: the MJCF file.
+        mapping: a `ColumnMapping`, or a YAML file with its keys. None if columns have the names of
+            the joints, alone or after `position.`, `angle.`, `force.`, `torque.` or `effort.`.
 
     Returns:
         The mechanism.
 
     Raises:
-        InputError: a file is unusable, or a name in the mapping is not in the MJCF.
+        InputError: a file cannot be read, or a name in the mapping is not in the MJCF.
     """
     chain, source = load_chain(mjcf), str(mapping if isinstance(mapping, str | Path) else mjcf)
     if mapping is None:
@@ -156,7 +157,7 @@ def load_mechanism(
 
 
 def _named(known: Sequence[str], patterns, source: str, what: str) -> list[str]:
-    """Names that patterns stand for, in the order of the patterns."""
+    """Return the names that match patterns, in the order of the patterns."""
     out: list[str] = []
     for pattern in patterns:
         found = fnmatch.filter(known, pattern)
@@ -174,23 +175,23 @@ def mechanism_records(
 
     Args:
         paths: log files (.csv, .parquet) and folders of them.
-        mechanism: what they are of.
-        heldout: name of the run to judge on; by default one that begins with `test`, else the last;
-            a single run is split in time.
-        period: of a repeated motion [s]; a single run is then split at a whole period.
-        as_measured: whether to leave positions in the measured joints.
+        mechanism: the mechanism.
+        heldout: name of the held-out run. By default it is the first one that begins with `test`,
+            otherwise the last. A single run is split in time.
+        period: period of a repeated motion [s]; a single run is then split at a whole period.
+        as_measured: whether to keep positions of the measured joints.
 
     Returns:
-        Records of the runs to fit, of the run to judge on, and notes.
+        Records of the fitted runs, of the held-out run, and notes.
 
     Raises:
-        InputError: a file is unusable, lacks a column, or there is no such run.
+        InputError: a file cannot be read, a column is missing, or there is no such run.
     """
     runs, notes = {}, []
     for path in _logs(paths):
         log, columns = _load(path, mechanism)
         if log.name in runs:
-            raise InputError(log.source, f"run {log.name!r} is there twice: rename one")
+            raise InputError(log.source, f"the run name {log.name!r} is used twice: rename one")
         run, said = _record(log, columns, mechanism)
         runs[log.name] = run if as_measured else in_coordinates(run, mechanism.setup)
         notes += said
@@ -204,8 +205,8 @@ def mechanism_records(
             first = max(1, round(first / step)) * step
         fit, judge = (_rows(whole, slice(0, first)), _rows(whole, slice(first, None)))
         notes.append(
-            f"{whole.name} is the only run: fitted up to {first * whole.period:.3g} s, judged on"
-            " the rest."
+            f"{whole.name} is the only run: fitted up to {first * whole.period:.3g} s, validated"
+            " on the remainder."
         )
         return (fit,), replace(judge, name=f"{whole.name}, last part"), tuple(notes)
     named = sorted(runs)
@@ -221,28 +222,28 @@ def _logs(paths: Sequence[str | Path]) -> list[Path]:
             continue
         some = sorted(p for p in path.iterdir() if p.suffix.lower() in (".csv", ".parquet"))
         if not some:
-            raise InputError(path, "the folder holds no log: put .parquet or .csv files there")
+            raise InputError(path, "the folder contains no log: add .parquet or .csv files")
         out += some
     if not out:
-        raise InputError("the data", "no file was given: name a folder with logs, or logs")
+        raise InputError("the data", "no file was given: name log files, or a folder with logs")
     return out
 
 
 class _Column(NamedTuple):
-    """Channel under which a column is read, and its sign."""
+    """Channel name and sign of a column."""
 
     channel: str
     sign: float
 
 
 def _load(path: Path, mechanism: Mechanism) -> tuple[Log, dict[tuple[str, str], _Column]]:
-    """Read a log; (`position` or `force`, joint) -> the column that has it."""
+    """Read a log, and return it with the columns by (`position` or `force`, joint)."""
     mapping, chain, source = mechanism.mapping, mechanism.setup.chain, mechanism.source
     raw, columns = read_table(path, missing=True), {}
-    names, ours = raw.names, "hydrotele" in raw.metadata  # those keep their names
+    names, ours = raw.names, "hydrotele" in raw.metadata  # logs of hydrotele keep their names
     aliases = dict.fromkeys(names, LEFT_OUT)
     if mapping.time not in names:
-        raise InputError(path, f"has no column {mapping.time!r} of the time: name it in the"
+        raise InputError(path, f"has no time column {mapping.time!r}: name it in the"
                          f" mapping, as `time: COLUMN`; columns: {', '.join(names)}")  # fmt: skip
     aliases[mapping.time] = "time"
     for what, joints, stated, usual in (
@@ -262,7 +263,7 @@ def _load(path: Path, mechanism: Mechanism) -> tuple[Log, dict[tuple[str, str], 
             sign, name = (-1.0, name[1:]) if name.startswith("-") else (1.0, name)
             if name not in names:
                 raise InputError(
-                    path, f"has no column {name!r}, which {source} names for the {what} of"
+                    path, f"has no column {name!r}, which {source} requires for the {what} of"
                     f" {joint}; {suggest(name, names)}",
                 )  # fmt: skip
             straight = chain.tree.slides[chain.index(joint)]
@@ -279,7 +280,7 @@ def _record(
     chain = mechanism.setup.chain
     clock, notes = fit_clock(log.time, log.source)
     time, period = log.time[clock.row], clock.period
-    if clock.tick[-1] > _SPARSE * len(time):  # no common clock: rows at their usual distance
+    if clock.tick[-1] > _SPARSE * len(time):  # no common clock: use the median period
         period = float(np.median(np.diff(time)))
         notes = (f"{log.name}: {notes[0].rpartition('; ')[0].partition(': ')[2]}; interpolated to"
                  f" {1.0 / period:.4g} Hz.",)  # fmt: skip
@@ -314,8 +315,8 @@ def _record(
     force = [spread(values_of("force", drive)) for drive in chain.drives]
     if not np.isfinite(force).any():
         raise InputError(
-            log.source, "has no force of any drive: name the columns in the mapping, as `force:"
-            f" {{{chain.drives[0]}: COLUMN}}`",
+            log.source, "has no column of a drive force: name the columns in the mapping, as"
+            f" `force: {{{chain.drives[0]}: COLUMN}}`",
         )  # fmt: skip
     mapping = mechanism.mapping
     record = IdentificationRecord(
@@ -327,24 +328,25 @@ def _record(
 
 
 def _noise(stated: float | dict[str, float] | None, joints: Sequence[str]) -> np.ndarray:
-    """Noise (k,) of readings, NaN where it is not stated."""
+    """Return the noise (k,) of readings, NaN where it is not stated."""
     if isinstance(stated, dict):
         return np.array([stated.get(joint, np.nan) for joint in joints])
     return np.full(len(joints), np.nan if stated is None else stated)
 
 
 def in_coordinates(record: IdentificationRecord, setup: RegressorSetup) -> IdentificationRecord:
-    """A record whose positions are those of the setup's given joints.
+    """Convert the positions of a record to the given joints of a setup.
 
     Args:
-        record: of the measured joints, which determine all others.
-        setup: whose given joints are wanted.
+        record: record of the measured joints, which determine all other joints.
+        setup: definition of the regressor with the given joints.
 
     Returns:
-        The record, by forward kinematics row by row where the joints are others.
+        The record, unchanged if the joints are the same, otherwise computed by forward kinematics
+        row by row.
 
     Raises:
-        InputError: a row lacks a position, or cannot be reached.
+        InputError: a position is missing in a row, or cannot be reached.
 
     Source: Abdellatif 2008, section 4.1.
     """

@@ -1,6 +1,8 @@
-"""Motion of the joints from noisy positions: smoothed, differentiated, with its uncertainty.
+"""Filtering and differentiation of noisy joint positions, with standard deviations.
 
-Filter and differentiation of periodic signals in the frequency domain.
+`resolution` estimates noise and bandwidth of the positions. `joint_motion` computes position, rate
+and acceleration with the optimal smoother, a zero-phase filter, finite differences, or `periodic`,
+which filters and differentiates periodic signals in the frequency domain.
 """
 
 import math
@@ -30,26 +32,27 @@ def periodic(
     harmonics: int,
     noise: float | np.ndarray | None = None,
 ) -> Smoothed:
-    """Keep the mean and the first harmonics of whole cycles, and differentiate them exactly.
+    """Reduce a signal to the mean and first harmonics of its cycles, and differentiate it exactly.
 
-    With `N` samples, white noise of standard deviation s leaves `s sqrt((1 + 2 H) / N)` in the
-    value, `s sqrt(2 sum_h w_h^2 / N)` in the rate and `s sqrt(2 sum_h w_h^4 / N)` in the
-    acceleration.
+    With `N` samples, white noise of standard deviation s causes standard deviations of
+    `s sqrt((1 + 2 H) / N)` in the value, `s sqrt(2 sum_h w_h^2 / N)` in the rate and
+    `s sqrt(2 sum_h w_h^4 / N)` in the acceleration.
 
     Args:
-        values: (n,) or (n, k) samples on a uniform clock, n a multiple of `samples_per_cycle`, and
-            the machine in its steady cycle [u].
+        values: (n,) or (n, k) samples of a steady cyclic motion on a uniform clock, n a multiple of
+            `samples_per_cycle` [u].
         period: time between samples [s].
-        samples_per_cycle: of the excitation [1].
+        samples_per_cycle: samples per cycle of the excitation [1].
         harmonics: number H of harmonics to keep [1], below half of `samples_per_cycle`.
-        noise: standard deviation of one sample, scalar or (k,) [u]; None to find it from what is
-            not kept.
+        noise: standard deviation of one sample, scalar or (k,) [u]; None to estimate it from the
+            removed part of the signal.
 
     Returns:
-        The filtered signals, in the shape of `values`; all cycles are the same, their mean.
+        The filtered signals in the shape of `values`; every cycle is the mean cycle.
 
     Raises:
-        InputError: samples are missing, n is no multiple, or too many harmonics.
+        InputError: samples are missing, n is not a multiple of `samples_per_cycle`, or too many
+            harmonics.
 
     Source: Abdellatif 2008, section on frequency-domain filtering; Swevers et al. 1997, IEEE Trans.
     Robotics and Automation 13(5).
@@ -65,7 +68,8 @@ def periodic(
     if not np.isfinite(samples).all():
         row = int(np.argwhere(np.isnan(samples))[0, 0])
         raise InputError(
-            _PERIODIC, f"row {row} is missing, whole cycles are needed: use the optimal smoother"
+            _PERIODIC,
+            f"row {row} is missing, but complete cycles are needed: use the optimal smoother",
         )
     if cycle < 3 or rows % cycle:
         raise InputError(
@@ -75,7 +79,7 @@ def periodic(
         )
     if not 0 <= harmonics < 0.5 * cycle:
         raise InputError(
-            _PERIODIC, f"{cycle} samples per cycle tell less than {cycle / 2:g} harmonics"
+            _PERIODIC, f"harmonics must be below {cycle / 2:g} for {cycle} samples per cycle"
         )
     mean = samples.reshape(-1, cycle, samples.shape[1]).mean(axis=0)
     spectrum = np.fft.rfft(mean, axis=0)
@@ -101,28 +105,28 @@ def periodic(
 
 Method = Literal["optimal", "zero_phase", "periodic", "raw"]
 METHODS = ("optimal", "zero_phase", "periodic", "raw")
-_KEPT = 2.5  # times the resolved bandwidth: there the signal is a thousandth of the noise
-_BAND = 0.5  # of the bandwidth is compared: there accelerations still stand above their noise
-_CONTENT = 0.98  # of an acceleration's power, beyond which forces tell of other things than motion
-_LINES = 10.0  # of the record's own lines lie in the band at least
-_MOVES = 10.0  # standard deviations of the noise, from which a joint counts as moved
-GAP = 0.1  # s without samples that a filter may bridge
+_KEPT = 2.5  # filter cutoff over resolved bandwidth: there the signal is a thousandth of the noise
+_BAND = 0.5  # band of the equations over bandwidth: there accelerations exceed their noise
+_CONTENT = 0.98  # of the accelerations' power: above it, forces depend on more than the motion
+_LINES = 10.0  # smallest number of the record's spectral lines in the band
+_MOVES = 10.0  # standard deviations of the noise: smallest amplitude of a moving joint
+GAP = 0.1  # s, longest gap that a filter may interpolate
 _WHERE = "signal processing"
 
 
 @dataclass(frozen=True)
 class Processing:
-    """How positions become rates and accelerations, and which band of the forces is compared.
+    """Options for differentiating positions, and the frequency band of the equations.
 
     Attributes:
         method: `zero_phase` filter, `optimal` smoother, `periodic` (frequency domain) or `raw`
-            differences. A smoother holds back the sharp corners of a motion, so that inertia and
-            friction near reversals are underrated; a filter twice as wide as it does not.
-        band: low-pass that regressor and forces pass alike [Hz]; None to take half of what the
-            positions resolve.
-        period: of the motion [s], where it is repeated.
-        harmonics: of it that are kept in the frequency domain; 0 for those that a zero-phase
-            filter would keep.
+            differences. A smoother attenuates sharp corners of a motion, which reduces estimated
+            inertia and friction near reversals; a filter with twice the bandwidth does not.
+        band: cutoff of the low-pass filter of regressor and forces [Hz]; None to derive it from the
+            resolution of the positions.
+        period: period of a repeated motion [s], otherwise None.
+        harmonics: number of harmonics kept by `periodic`; 0 for those within the bandwidth of the
+            zero-phase filter.
     """
 
     method: Method = "zero_phase"
@@ -131,7 +135,7 @@ class Processing:
     harmonics: int = 0
 
     def __post_init__(self) -> None:
-        """Refuse what is not known or lacks a number."""
+        """Raise InputError for unknown methods and missing or invalid values."""
         if self.method not in METHODS:
             raise InputError(_WHERE, f"{self.method!r} is not known: {', '.join(METHODS)}")
         if self.band is not None and not (math.isfinite(self.band) and self.band > 0):
@@ -146,14 +150,14 @@ class Processing:
 
 @dataclass(frozen=True)
 class Resolution:
-    """What positions tell of the motion.
+    """Resolution of measured positions.
 
     Attributes:
-        bandwidth: frequency [Hz] at which the optimal smoother keeps half of the signal, of the
-            moving joint that is told least; at most 0.2 of the sample rate.
-        moves: (k,) whether a joint moves at all, by more than ten times the noise.
-        content: frequency [Hz] below which 98 % of the accelerations' power lie.
-        noise: (k,) standard deviation of one position [rad] or [m], stated or found.
+        bandwidth: frequency [Hz] at which the optimal smoother has a gain of 1/2, smallest of the
+            moving joints; at most 0.2 of the sample rate.
+        moves: (k,) whether a joint moves by more than ten times the noise.
+        content: frequency [Hz] that contains 98 % of the accelerations' power.
+        noise: (k,) standard deviation of one position [rad] or [m], stated or estimated.
     """
 
     bandwidth: float
@@ -163,26 +167,26 @@ class Resolution:
 
     @property
     def band(self) -> float:
-        """Of the equations [Hz]."""
+        """Band of the equations [Hz]."""
         return min(_BAND * self.bandwidth, self.content)
 
 
 def resolution(
     positions: np.ndarray, period: float, noise: np.ndarray, cycles: int = 1
 ) -> Resolution:
-    """Bandwidth and noise of positions.
+    """Estimate bandwidth and noise of positions.
 
-    The optimal smoother's gain is `1 / (1 + (f/f_h)^(2 order))`; the mean of many cycles has less
-    noise and resolves more.
+    The gain of the optimal smoother is `1 / (1 + (f/f_h)^(2 order))`. The mean of many cycles has
+    less noise and thus a larger bandwidth.
 
     Args:
-        positions: (n, k) [rad] or [m], NaN where missing.
+        positions: (n, k) positions [rad] or [m], NaN where missing.
         period: time between rows [s].
-        noise: (k,) standard deviation of a position, NaN where to be found.
-        cycles: of a repeated motion, of which the mean will be taken [1].
+        noise: (k,) standard deviation of a position, NaN to estimate it.
+        cycles: number of cycles of a repeated motion that are averaged later [1].
 
     Returns:
-        The resolution; joints at rest are left out of the bandwidth.
+        The resolution; joints at rest do not affect the bandwidth.
 
     Source: Wiener filter of an integrator chain in white noise.
     """
@@ -204,19 +208,19 @@ def resolution(
 def joint_motion(
     positions: np.ndarray, period: float, found: Resolution, processing: Processing
 ) -> Smoothed:
-    """Motion of all joints.
+    """Filter and differentiate the positions of all joints.
 
     Args:
-        positions: (n, k) [rad] or [m], NaN where missing.
+        positions: (n, k) positions [rad] or [m], NaN where missing.
         period: time between rows [s].
-        found: their resolution.
-        processing: how.
+        found: resolution of the positions.
+        processing: method to differentiate the positions.
 
     Returns:
         Position, rate, acceleration and their standard deviations, (n, k) each.
 
     Raises:
-        InputError: the positions do not suit the method.
+        InputError: the method cannot be used with these positions.
     """
     if processing.method == "optimal":
         return smooth(positions, period, found.noise)
@@ -229,18 +233,19 @@ def joint_motion(
 def adjoint(
     gain: np.ndarray, period: float, found: Resolution, processing: Processing
 ) -> np.ndarray:
-    """What single positions add to a sum over a motion; all but the optimal smoother.
+    """Apply the adjoint of filtering and differentiation to gains on a motion.
 
-    The filters are symmetric in time, the first derivative antisymmetric.
+    It holds for all methods except the optimal smoother: the filters are symmetric in time, the
+    first derivative is antisymmetric.
 
     Args:
-        gain: (3, p, n, k) of p sums for positions, rates and accelerations.
+        gain: (3, p, n, k) gains of p sums on positions, rates and accelerations.
         period: time between rows [s].
         found: resolution of the positions.
-        processing: how they become a motion.
+        processing: method to differentiate the positions.
 
     Returns:
-        (p, n, k) gains for positions; 0 for joints that rest.
+        (p, n, k) gains on measured positions; 0 for joints at rest.
     """
     _, p, rows, k = gain.shape
     flat = np.where(found.moves, gain, 0.0).transpose(0, 2, 1, 3).reshape(3, rows, p * k)
@@ -253,7 +258,7 @@ def _filtered(
     positions: np.ndarray, period: float, found: Resolution, processing: Processing,
     noise: np.ndarray | None,
 ) -> Smoothed:  # fmt: skip
-    """Linear filter and derivatives of any number of columns."""
+    """Apply the linear filter of the method to any number of columns, and differentiate."""
     if processing.method == "zero_phase":
         cutoff = min(_KEPT * found.bandwidth, 0.4 / period)
         return zero_phase(positions, period, cutoff, noise, bridge=round(GAP / period))
@@ -273,15 +278,15 @@ def _filtered(
 
 
 def rate_deviations(found: Projection, given: list[int], rate_std: np.ndarray) -> np.ndarray:
-    """Standard deviations of all joints' rates.
+    """Propagate standard deviations of the given joints' rates to all joints.
 
     Args:
         found: projection on k drives.
-        given: places of the k joints whose motion is known.
-        rate_std: (n, k) of theirs [rad/s] or [m/s].
+        given: indices of the k joints whose motion is known.
+        rate_std: (n, k) standard deviations of their rates [rad/s] or [m/s].
 
     Returns:
-        (n, v) [rad/s] or [m/s].
+        (n, v) standard deviations [rad/s] or [m/s].
     """
     # share[n, d, v] = d q_v / d q_d for the drives d; with it d q_v / d q_g for the given joints g
     moves = np.linalg.solve(found.share[:, :, given], found.share)
@@ -289,7 +294,7 @@ def rate_deviations(found: Projection, given: list[int], rate_std: np.ndarray) -
 
 
 def _rested(moving: Smoothed, smoothed: Smoothed, moves: np.ndarray) -> Smoothed:
-    """Joints that do not move as the smoother has them: a filter makes motion of their noise."""
+    """Use the smoother's motion for joints at rest: a filter would turn their noise into motion."""
     return Smoothed(*(
         np.where(moves, getattr(moving, part.name), getattr(smoothed, part.name))
         for part in fields(Smoothed)
@@ -297,5 +302,5 @@ def _rested(moving: Smoothed, smoothed: Smoothed, moves: np.ndarray) -> Smoothed
 
 
 def _known(noise: np.ndarray) -> np.ndarray | None:
-    """Stated noise; None where it is to be found. An exact sensor counts as one to be found."""
+    """Return the stated noise, or None to estimate it, also for a stated noise of 0."""
     return noise if (np.isfinite(noise) & (noise > 0.0)).all() else None

@@ -1,4 +1,8 @@
-"""What logs tell of the drives: position of every joint and force of every drive, row by row."""
+"""Records for identification: joint positions and drive forces of a run on a uniform clock.
+
+`records` computes them from the logs of a machine, with known sensor defects removed. The other
+functions cut records and check that a motion is periodic.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,9 +17,9 @@ from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.machine import Machine, SensorError, noise_rms, sensor_set
 
 _WHERE = "identification"
-_DRIFT = 0.5  # rows by which a cycle may move away from the rows over a whole record
-_MEDIAN = 0.6745  # of a standard deviation is the median of a normal error's size
-_UNLIKE = 8.0  # times noise: servos answer to noise, and no cycle is quite like the one before
+_DRIFT = 0.5  # rows, largest shift of a cycle against the rows over a whole record
+_MEDIAN = 0.6745  # median absolute value of a normal error over its standard deviation
+_UNLIKE = 8.0  # noise multiples: servos react to noise, so that cycles differ slightly
 
 
 @dataclass(frozen=True)
@@ -23,14 +27,14 @@ class IdentificationRecord:
     """One run of k axes over n rows of a uniform clock.
 
     Attributes:
-        name: the run's.
+        name: name of the run.
         period: time between rows [s].
         axes: names of the axes.
-        position: (n, k) of their joints [rad] or [m], NaN where not known.
-        position_noise: (k,) standard deviation of one position; NaN where the sensors state none.
-        force: (n, k) of their drives [N] or [N m], NaN where not known: of the oil, or of a plain
-            drive's command, friction included.
-        force_noise: (k,) standard deviation of one force; 0 where a command tells it, NaN where
+        position: (n, k) joint positions [rad] or [m], NaN where unknown.
+        position_noise: (k,) standard deviation of one position; NaN if the sensors state none.
+        force: (n, k) drive forces before friction [N] or [N m], NaN where unknown: the force of the
+            oil, or of a force drive's command.
+        force_noise: (k,) standard deviation of one force; 0 if it follows from a command, NaN if
             the sensors state none.
     """
 
@@ -46,61 +50,61 @@ class IdentificationRecord:
 def records(
     dataset: Dataset,
 ) -> tuple[tuple[IdentificationRecord, ...], IdentificationRecord, tuple[str, ...]]:
-    """Positions and forces of all runs.
+    """Compute positions and forces of all runs.
 
-    A joint with its own sensor and a sensor of its cylinder's length is told by both, each weighted
-    by its noise.
+    For a joint with an own sensor and a cylinder length sensor, both readings are averaged with
+    weights according to their noise.
 
     Args:
         dataset: logs of a machine.
 
     Returns:
-        Records of the runs to fit, of the held-out run, and notes on what could not be used.
+        Records of the fitted runs, of the held-out run, and notes on missing readings.
 
     Raises:
-        InputError: no axis has both a position and a force.
+        InputError: an axis has a transmission or no position, or no drive has a known force.
     """
     for axis, facts in dataset.machine.axes.items():
         if facts.transmission:
             raise InputError(
                 _WHERE, f"{axis} has a transmission (backlash or flexibility) between drive and"
-                " load: what is measured of one does not tell the other",
+                " load: measurements of one side do not determine the other",
             )  # fmt: skip
     axes = tuple(axis for axis in dataset.axes if _positions(dataset, axis))
     forced = [axis for axis in axes if _force_channels(dataset, axis) is not None]
-    notes = [f"{a} has no position sensor: nothing is known of it." for a in dataset.axes
+    notes = [f"{a} has no position sensor: it is not used." for a in dataset.axes
              if a not in axes]  # fmt: skip
-    notes += [f"{a} lacks a pressure of one side: its motion is used, its force is not known."
+    notes += [f"{a} has no pressure sensor at one side: its motion is used, its force is unknown."
               for a in axes if a not in forced]  # fmt: skip
     if len(axes) < len(dataset.axes):
         missing = ", ".join(a for a in dataset.axes if a not in axes)
         raise InputError(
             _WHERE,
-            f"the position of {missing} is not in the logs; forces of all axes depend on it:"
-            " log its angle or its length",
+            f"the position of {missing} is not in the logs, but the forces of all axes depend on"
+            " it: log its angle or its length",
         )
     if not forced:
         raise InputError(
             _WHERE,
-            "no axis has the pressures of both its sides (or a drive command): no force is known",
+            "no force is known: log both pressures of at least one axis (or a drive command)",
         )
     made = [_record(dataset, run, axes) for run in (*dataset.fit, dataset.heldout)]
     return tuple(made[:-1]), made[-1], tuple(notes)
 
 
 def force_noise(machine: Machine, sensors: str) -> np.ndarray:
-    """Noise of all drives' forces with the machine's sensors.
+    """Compute the force noise of all drives for a sensor set of the machine.
 
     Args:
         machine: the machine.
-        sensors: name of its sensors.
+        sensors: name of the sensor set.
 
     Returns:
-        (k,) standard deviation of a force reading, in actuator order [N] or [N m]; 0 of plain
+        (k,) standard deviation of a force reading in actuator order [N] or [N m]; 0 for force
         drives.
 
     Raises:
-        InputError: the machine has no such sensors.
+        InputError: the machine has no such sensor set.
     """
     known, out = sensor_set(machine, sensors), []
     for axis in actuator_order(machine):
@@ -116,24 +120,24 @@ def force_noise(machine: Machine, sensors: str) -> np.ndarray:
 
 
 def whole_cycles(record: IdentificationRecord, period: float) -> IdentificationRecord:
-    """The last whole cycles of a record: those before may still hold its fade-in.
+    """Cut a record to its last whole cycles; earlier rows may contain the fade-in.
 
     Args:
-        record: of a periodic motion.
-        period: of the motion [s].
+        record: record of a periodic motion.
+        period: period of the motion [s].
 
     Returns:
         The cut record.
 
     Raises:
-        InputError: it has no whole cycle, or a cycle is no whole number of rows.
+        InputError: the record has no whole cycle, or a cycle is not a whole number of rows.
     """
     rows = period / record.period
     cycle = round(rows)
     drift = abs(rows - cycle) * len(record.force) / max(cycle, 1)
     if drift > _DRIFT or cycle < 3:
         raise InputError(
-            record.name, f"a period of {period:g} s is no whole number of rows of"
+            record.name, f"a period of {period:g} s is not a whole number of rows of"
             f" {record.period:g} s",
         )  # fmt: skip
     count = len(record.force) // cycle * cycle
@@ -143,15 +147,15 @@ def whole_cycles(record: IdentificationRecord, period: float) -> IdentificationR
 
 
 def check_repeats(record: IdentificationRecord, period: float, noise: np.ndarray) -> None:
-    """Refuse a record whose motion does not repeat.
+    """Raise InputError if the motion of a record does not repeat.
 
     Args:
         record: the record.
-        period: that its motion is said to have [s].
-        noise: (k,) of its positions [rad] or [m].
+        period: stated period of the motion [s].
+        noise: (k,) noise of the positions [rad] or [m].
 
     Raises:
-        InputError: positions differ from those a period before by far more than noise.
+        InputError: positions differ from those one period before by much more than the noise.
     """
     step = round(period / record.period)
     if step < 1 or len(record.force) <= step:
@@ -169,18 +173,18 @@ def check_repeats(record: IdentificationRecord, period: float, noise: np.ndarray
 def beginning(
     record: IdentificationRecord, seconds: float, period: float | None = None
 ) -> IdentificationRecord:
-    """The first part of a record.
+    """Cut a record to its first part.
 
     Args:
         record: the record.
-        seconds: of it, at most [s].
-        period: of its motion [s], of which to keep whole ones; None for any length.
+        seconds: largest length of the part [s].
+        period: period of the motion, of which a whole number is kept [s]; None for any length.
 
     Returns:
         The cut record.
 
     Raises:
-        InputError: a position is never read in it.
+        InputError: a position has no valid sample in this part.
     """
     if period:
         seconds = max(1.0, seconds // period) * period
@@ -205,21 +209,21 @@ def _record(dataset: Dataset, run: RunData, axes: Sequence[str]) -> Identificati
 
 
 def trimmed(record: IdentificationRecord) -> IdentificationRecord:
-    """The rows from the first to the last at which every position was read.
+    """Remove rows at the ends of a record at which a position is missing.
 
     Args:
         record: the record.
 
     Returns:
-        It without rows at its ends that filters could not bridge.
+        The rows from the first to the last with all positions.
 
     Raises:
-        InputError: a position is never read.
+        InputError: a position has no valid sample.
     """
     known = np.isfinite(record.position)
     for axis, column in zip(record.axes, known.T, strict=True):
         if not column.any():
-            raise InputError(record.name, f"has no good position of {axis}: leave this run out")
+            raise InputError(record.name, f"has no valid position of {axis}: remove this run")
     first = int(known.argmax(axis=0).max())
     last = len(known) - int(known[::-1].argmax(axis=0).max())
     return replace(record, position=record.position[first:last], force=record.force[first:last])
@@ -231,7 +235,7 @@ def _positions(dataset: Dataset, axis: str) -> list[str]:
 
 
 def _position(dataset: Dataset, run: RunData, axis: str) -> tuple[np.ndarray, float]:
-    """Position (n,) of an axis' joint and its noise."""
+    """Return the joint position (n,) of an axis and its noise."""
     machine = dataset.machine
     values, noises = [], []
     for channel in _positions(dataset, axis):
@@ -258,19 +262,21 @@ def _position(dataset: Dataset, run: RunData, axis: str) -> tuple[np.ndarray, fl
 
 
 def _joint(machine: Machine, axis: str, linkage: DriveLinkage, length: np.ndarray) -> np.ndarray:
-    """Joint positions (n,) at piston displacements (n,) [m]."""
+    """Return the joint positions (n,) at piston displacements (n,) [m]."""
     cylinder = machine.axes[axis].cylinder
     assert cylinder is not None
     out, known = np.full(len(length), np.nan), np.isfinite(length)
     try:
         out[known] = linkage.angle(length[known] + cylinder.closed_length)
     except LoopOpen as error:
-        raise InputError(f"length.{axis}", f"does not fit the machine's linkage: {error}") from None
+        raise InputError(
+            f"length.{axis}", f"does not match the machine's linkage: {error}"
+        ) from None
     return out
 
 
 def _force_channels(dataset: Dataset, axis: str) -> tuple[str, ...] | None:
-    """Channels that tell the force of a drive, () for a plain one, None where some lack."""
+    """Return the channels of a drive's force, () for a force drive, None if one is missing."""
     if not dataset.machine.axes[axis].hydraulic:
         return ()
     names = (f"pressure_head.{axis}", f"pressure_rod.{axis}")
@@ -278,7 +284,7 @@ def _force_channels(dataset: Dataset, axis: str) -> tuple[str, ...] | None:
 
 
 def _force(dataset: Dataset, run: RunData, axis: str) -> tuple[np.ndarray, float]:
-    """Force (n,) of an axis' drive and its noise."""
+    """Return the drive force (n,) of an axis and its noise."""
     machine = dataset.machine
     channels = _force_channels(dataset, axis)
     facts = machine.axes[axis]
@@ -297,7 +303,7 @@ def _force(dataset: Dataset, run: RunData, axis: str) -> tuple[np.ndarray, float
 
 
 def _reading(dataset: Dataset, run: RunData, channel: str) -> tuple[np.ndarray, float]:
-    """Readings (n,) freed of the sensor defects that the machine states, and their noise."""
+    """Return the readings (n,) corrected for the machine's sensor defects, and their noise."""
     column = dataset.channels.index(channel)
     error = dataset.machine.sensor_errors.get(channel, SensorError())
     values = without_error(run.reading[:, column], error, run.period, run.start)
@@ -307,17 +313,17 @@ def _reading(dataset: Dataset, run: RunData, channel: str) -> tuple[np.ndarray, 
 def without_error(
     values: np.ndarray, error: SensorError, period: float, start: float = 0.0
 ) -> np.ndarray:
-    """What a sensor would read without its defect.
+    """Correct readings for a known sensor defect.
 
     Args:
         values: (n,) readings, NaN where missing.
-        error: offset, drift, scale, delay and lag; the lag counts as a delay, which it is of
-            motions that are slower.
-        period: between rows [s].
-        start: time of the first row since the run's beginning [s].
+        error: offset, drift, scale, delay and lag. The lag is treated as a delay, which is accurate
+            for motions slower than the lag.
+        period: time between rows [s].
+        start: time of the first row since the start of the run [s].
 
     Returns:
-        (n,), NaN where nothing is known: at the end, where the sensor is late.
+        (n,) corrected readings, NaN where unknown, as at the end for a delayed sensor.
     """
     values = (values - error.offset_at(start + period * np.arange(len(values)))) / error.scale
     if error.late:

@@ -1,7 +1,4 @@
-"""What an identification found.
-
-An identification, parameter by parameter, as reports and files have it.
-"""
+"""Result types of an identification, and its parameters as table rows for reports and files."""
 
 from dataclasses import dataclass
 
@@ -20,14 +17,14 @@ from hydrotele.identify.identifiability import (
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Force of one drive on the run that was not fitted, in the band of the equations.
+    """Prediction error of one drive's force on the held-out run, in the band of the equations.
 
     Attributes:
-        rms: of measured less predicted force [N] or [N m].
-        unit: its unit.
-        noise_rms: what a perfect model would show with these sensors; NaN if not known.
-        relative: the error's norm over the force's [1].
-        nominal_rms: the same as rms, with the given parameters.
+        rms: RMS of measured minus predicted force [N] or [N m].
+        unit: unit of the force.
+        noise_rms: RMS error of a perfect model with these sensors; NaN if unknown.
+        relative: RMS error over RMS force [1].
+        nominal_rms: RMS error with the given parameters.
     """
 
     rms: float
@@ -39,15 +36,15 @@ class HeldOut:
 
 @dataclass(frozen=True)
 class Forces:
-    """Forces of the held-out run in the band of the equations; n rows, k drives [N] or [N m].
+    """Forces of the held-out run in the band of the equations: n rows, k drives [N] or [N m].
 
     Attributes:
-        run: its name.
-        drives: the k drives.
-        time: (n,) [s] from its start.
-        measured: (n, k), NaN where unknown.
-        predicted: (n, k) with the identified parameters.
-        nominal: (n, k) with the given parameters.
+        run: name of the run.
+        drives: names of the k drives.
+        time: (n,) time from the start of the run [s].
+        measured: (n, k) measured forces, NaN where unknown.
+        predicted: (n, k) forces predicted with the identified parameters.
+        nominal: (n, k) forces predicted with the given parameters.
     """
 
     run: str
@@ -60,24 +57,24 @@ class Forces:
 
 @dataclass(frozen=True)
 class Identification:
-    """Result; m parameters, r of them in the base.
+    """Result of an identification: m parameters, r base parameters.
 
     Attributes:
-        names: the m parameters.
+        names: names of the m parameters.
         units: (m,) SI units.
-        nominal: (m,) as given.
-        value: (m,) identified; what the data do not tell stays as given.
-        told: what these data tell in spite of their noise.
-        structure: what this motion would tell without noise, and the base parameters.
-        estimate: of the base parameters, with covariance and residuals.
-        bias: (r,) that the positions' noise would have left in them, taken off.
-        heldout: drive -> prediction of the held-out run.
-        forces: of the held-out run.
-        band: of the equations [Hz].
-        whiteness: drive -> correlation of a residual with the one before it.
-        status: `ok`, or what is wrong and what to do about it.
-        notes: one sentence each.
-        seconds: that it took.
+        nominal: (m,) given values.
+        value: (m,) identified values; undetermined combinations keep their given values.
+        told: parameters that these data determine despite noise.
+        structure: parameters that this motion determines without noise.
+        estimate: estimate of the base parameters `told`, with covariance and residuals.
+        bias: (r,) bias caused by position noise, already subtracted.
+        heldout: drive -> prediction error of the held-out run.
+        forces: forces of the held-out run.
+        band: band of the equations [Hz].
+        whiteness: drive -> correlation of successive residuals.
+        status: `ok`, or a sentence that names the problem and the remedy.
+        notes: notes, one sentence each.
+        seconds: computing time [s].
     """
 
     names: tuple[str, ...]
@@ -97,13 +94,14 @@ class Identification:
     seconds: float
 
     def distance(self, value: np.ndarray) -> tuple[float, float]:
-        """How far other parameters are from the estimate: the test by its confidence ellipsoid.
+        """Test whether other parameters lie in the confidence ellipsoid of the estimate.
 
         Args:
             value: (m,) parameters.
 
         Returns:
-            Squared distance in standard deviations, and what 95 % of right ones stay below.
+            The squared Mahalanobis distance from the estimate, and the limit below which 95 % of
+            true parameters lie.
         """
         limit = float(chi2.ppf(0.95, self.estimate.rank))
         return self.estimate.ellipsoid(self.told.combination @ value), limit
@@ -112,28 +110,28 @@ class Identification:
 STATUSES = (UNIDENTIFIABLE, COMBINATION, FULL, WEAK)
 MEANING = {
     UNIDENTIFIABLE: "has no effect on the measured forces in this motion",
-    COMBINATION: "only a combination with others shows in the forces",
-    FULL: "is told by itself",
-    WEAK: "would show in the forces, but less than noise does in these data: kept as given",
+    COMBINATION: "identifiable only in combination with other parameters",
+    FULL: "identifiable individually",
+    WEAK: "affects the forces by less than the noise in these data: given value kept",
 }
 
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """One parameter.
+    """Table row of one parameter.
 
     Attributes:
-        name: such as `mass.boom`.
-        unit: SI.
-        nominal: as given; of a combination its value with the given parameters.
-        value: identified; of a combination that stands behind this name, the combination's; None
-            where these data do not tell it.
-        std: its standard deviation, or None.
-        ci95: its 95 % interval, or None.
+        name: name, such as `mass.boom`.
+        unit: SI unit.
+        nominal: given value; for a combination its value with the given parameters.
+        value: identified value, of the combination if the name represents one; None if these data
+            do not determine it.
+        std: standard deviation, or None.
+        ci95: 95 % interval, or None.
         status: see `MEANING`.
-        combination: the combination that stands behind this name, or those that the parameter is
-            part of; empty where there is none.
-        bias: that noise of the positions would have left in the value, taken off; or None.
+        combination: the combination that the name represents, or those that contain the parameter;
+            empty if there is none.
+        bias: bias caused by position noise, already subtracted from the value; or None.
     """
 
     name: str
@@ -148,13 +146,13 @@ class ParameterRow:
 
 
 def parameter_rows(found: Identification) -> list[ParameterRow]:
-    """Rows of all parameters, in their order.
+    """Return the table rows of all parameters in their order.
 
     Args:
         found: the identification.
 
     Returns:
-        The rows; numbers only where these data tell them.
+        The rows; values only for parameters that these data determine.
     """
     told = {int(b): k for k, b in enumerate(found.told.base)}
     given = found.told.combination @ found.nominal
@@ -179,5 +177,5 @@ def parameter_rows(found: Identification) -> list[ParameterRow]:
 
 
 def counts(rows: list[ParameterRow]) -> dict[str, int]:
-    """Status -> number of parameters."""
+    """Count the parameters of each status."""
     return {status: sum(row.status == status for row in rows) for status in STATUSES}

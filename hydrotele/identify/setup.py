@@ -1,4 +1,8 @@
-"""Which parameters the regressor of a machine has: its bodies, and the friction of its drives."""
+"""Definition of the regressor: bodies, friction, offsets and drive inertias with parameters.
+
+`machine_setup` defines it for a machine, `mechanism_setup` for any mechanism. `RegressorSetup`
+projects the mechanism along a motion and computes its regressor.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -22,20 +26,20 @@ from hydrotele.multibody.inverse_dynamics import (
 
 
 def drive_friction(machine: Machine, chain: Chain) -> list[FrictionTerm]:
-    """Friction of all drives, with the machine's numbers.
+    """Return the friction terms of all drives with the machine's parameters.
 
-    Coulomb and viscous parts are always there; the Stribeck part and the asymmetries
+    Coulomb and viscous friction are always included. Stribeck friction and the asymmetries
     `coulomb_asymmetry` (F_c a_c), `stribeck_asymmetry` (F_s a_c) and `viscous_asymmetry` (b a_v)
-    where they are not 0.
+    are included if they are not 0.
 
     Args:
         machine: the machine.
-        chain: its chain, whose drives are in actuator order.
+        chain: its kinematic chain with drives in actuator order.
 
     Returns:
-        One per drive.
+        One friction term per drive.
 
-    Source: nominal model, "Piston force", without the speeds that make it nonlinear.
+    Source: nominal model, "Piston force"; its nonlinear velocities are not parameters.
     """
     return [
         FrictionTerm(joint, _numbers(f), f.smoothing_velocity, f.stribeck_velocity)
@@ -62,20 +66,20 @@ _BAR_AXIS = (1.0, 0.0, 0.0)  # of a tube and of a rod, in their frames: from pin
 
 @dataclass(frozen=True)
 class RegressorSetup:
-    """What a regressor is built of.
+    """Definition of a regressor.
 
     Attributes:
-        chain: the mechanism.
+        chain: kinematic chain of the mechanism.
         given: the k joints whose motion is measured.
-        bodies: those with columns.
-        rubbing: friction, place by place.
-        offsets: constant forces of the drives as given [N] or [N m]; None for no such columns.
-        drive_inertia: joints whose drive has an inertia of its own.
-        alike: bodies, joints or closures that have the same parameters; one column, named after
-            the first, stands for all of a group.
-        absent: parameters that are known to be 0, such as `moment_x.stator`.
-        moment_free: body -> unit axis in its frame about which it takes no moment from its
-            neighbours; see `project`.
+        bodies: bodies with inertial parameters.
+        rubbing: friction terms of joints, closures and drives.
+        offsets: drive -> given constant force [N] or [N m]; None for a regressor without offsets.
+        drive_inertia: joints whose drive has an inertia.
+        alike: groups of bodies, joints or closures with the same parameters; one column, named
+            after the first member, represents a group.
+        absent: parameters known to be 0, such as `moment_x.stator`.
+        moment_free: body -> unit axis in its frame about which neighbours transmit no moment to it;
+            see `project`.
     """
 
     chain: Chain
@@ -95,16 +99,16 @@ class RegressorSetup:
         """Project the chain on its drives along a motion of the given joints.
 
         Args:
-            position: (n, k) of the given joints [rad] or [m].
-            rate: (n, k) [rad/s] or [m/s].
-            acceleration: (n, k) [rad/s^2] or [m/s^2].
-            start: (v,) positions from which to go to the first row; the chain's by default.
+            position: (n, k) positions of the given joints [rad] or [m].
+            rate: (n, k) rates [rad/s] or [m/s].
+            acceleration: (n, k) accelerations [rad/s^2] or [m/s^2].
+            start: (v,) initial guess of all joint positions; by default that of the chain.
 
         Returns:
             The projection.
 
         Raises:
-            InputError: as of `hydrotele.multibody.inverse_dynamics.project`.
+            InputError: as in `hydrotele.multibody.inverse_dynamics.project`.
         """
         return project(
             self.chain, self.given, position, rate, acceleration, start=start,
@@ -112,17 +116,17 @@ class RegressorSetup:
         )  # fmt: skip
 
     def table(self, found: Projection, rate_std: np.ndarray | None = None) -> Regressor:
-        """Regressor along a motion.
+        """Compute the regressor along a motion.
 
         Args:
-            found: projection of the chain along it.
-            rate_std: (n, v) of the rates [rad/s] or [m/s]; None if they are certain.
+            found: projection of the chain along the motion.
+            rate_std: (n, v) standard deviations of the rates [rad/s] or [m/s]; None if exact.
 
         Returns:
-            The regressor, with one column for what is alike and none for what is absent.
+            The regressor, with one column per group of equal parameters and none for absent ones.
 
         Raises:
-            InputError: a body, joint or parameter is not known.
+            InputError: a body, joint or parameter is unknown.
         """
         whole = regressor(
             self.chain, found, bodies=self.bodies, rubbing=self.rubbing,
@@ -133,7 +137,7 @@ class RegressorSetup:
 
 
 def _merged(whole: Regressor, alike: Sequence[Sequence[str]], absent: Sequence[str]) -> Regressor:
-    """A regressor with summed columns for places that are alike, without those absent."""
+    """Return a regressor with summed columns for equal parameters and without absent ones."""
     first = {place: group[0] for group in alike for place in group}
     names, members = [], {}
     for k, name in enumerate(whole.names):
@@ -144,9 +148,9 @@ def _merged(whole: Regressor, alike: Sequence[Sequence[str]], absent: Sequence[s
         members.setdefault(stands, []).append(k)
     places = {name.partition(".")[2] for name in whole.names}
     if strange := [place for place in first if place not in places]:
-        raise InputError("setup", f"no parameters belong to {strange[0]}, which is stated alike")
+        raise InputError("setup", f"alike: {strange[0]} has no parameters; remove it")
     if strange := [name for name in absent if name not in members]:
-        raise InputError("setup", f"{strange[0]} is stated absent but is no parameter")
+        raise InputError("setup", f"absent: {strange[0]} is not a parameter; remove it")
     kept = [name for name in names if name not in absent]
     groups = [members[name] for name in kept]
     sums = np.zeros((len(whole.names), len(kept)))
@@ -163,21 +167,22 @@ def machine_setup(
     machine: Machine, chain: Chain, model: Model = "complete", *, pins: bool = False,
     asymmetry: bool = False, ball_joints: bool = False,
 ) -> RegressorSetup:  # fmt: skip
-    """Setup for a machine.
+    """Define the regressor of a machine.
 
     Args:
         machine: the machine.
-        chain: its chain, with drives in actuator order.
+        chain: its kinematic chain with drives in actuator order.
         model: `complete`, or `reduced` to the links, without tubes and rods.
         pins: whether joints and closures without drive have Coulomb friction.
-        asymmetry: whether viscous friction of the drives may depend on the direction. Dry friction
-            that does cannot be told from a force offset.
-        ball_joints: whether cylinders end in ball joints instead of pins: they then carry no
-            moment about their own axes. Tube and rod still turn about it as pins would turn them,
-            which is exact where their inertia about it is negligible.
+        asymmetry: whether viscous friction of the drives may depend on the direction. Asymmetric
+            dry friction cannot be distinguished from a force offset.
+        ball_joints: whether cylinders have ball joints instead of pins at their ends and transmit
+        no
+            moment about their own axes. Tube and rod still rotate as with pins, which is exact if
+            their inertia about that axis is negligible.
 
     Returns:
-        The setup. Bodies that no joint moves have no columns.
+        The setup. Bodies that no joint moves have no parameters.
 
     Source: Khoshzaban 1992, 4.3 (complete and reduced model) and p. 92, Eq. 4.23 (ball joints).
     """
@@ -200,7 +205,7 @@ def machine_setup(
 
 
 def cylinder_bars(machine: Machine) -> dict[str, tuple[str, str]]:
-    """Body of a cylinder's tube or rod -> (axis, `tube` or `rod`)."""
+    """Return a dict from the body of a cylinder's tube or rod to (axis, `tube` or `rod`)."""
     return {
         f"{name}_{part}": (name, part)
         for name, axis in machine.axes.items()
@@ -214,23 +219,24 @@ def mechanism_setup(
     offsets: bool = True, alike: Sequence[Sequence[str]] = (), absent: Sequence[str] = (),
     friction: Mapping[str, Mapping[str, float]] | None = None,
 ) -> RegressorSetup:  # fmt: skip
-    """Setup for any mechanism, without a machine.
+    """Define the regressor of any mechanism, without a machine.
 
-    Drives, and the passive joints that are named, have dry and viscous friction; the file's
-    `damping` and `frictionloss` are the given numbers.
+    Drives and the named passive joints have dry and viscous friction, with `damping` and
+    `frictionloss` of the MJCF file as given values.
 
     Args:
-        chain: the mechanism.
+        chain: kinematic chain of the mechanism.
         given: joints whose motion is measured; the drives by default.
         passive: joints and closures without drive that have friction.
         offsets: whether the drives may have constant forces.
-        alike: as of `Setup`.
-        absent: as of `Setup`.
-        friction: joint -> further parameters of its friction, which an MJCF cannot state; see
+        alike: as in `RegressorSetup`.
+        absent: as in `RegressorSetup`.
+        friction: joint -> further friction parameters, which an MJCF cannot state; see
             `FRICTION_TERMS`, and `stribeck_velocity`.
 
     Returns:
-        The setup. Bodies that no joint moves have no columns; joints with an `armature` have one.
+        The setup. Bodies that no joint moves have no parameters; joints with an `armature` have a
+        drive inertia.
     """
     moved = tuple(b for k, b in enumerate(chain.bodies) if chain.tree.above[k + 1].any())
     rubbing, damping = [], chain.damping.copy()
@@ -239,7 +245,7 @@ def mechanism_setup(
         if place not in chain.closures:
             j = chain.index(place)
             numbers = {"coulomb": float(chain.frictionloss[j]), "viscous": float(damping[j])}
-            damping[j] = 0.0  # it has a column
+            damping[j] = 0.0  # it is a parameter of the regressor
         more = dict((friction or {}).get(place, {}))
         slow = more.pop("stribeck_velocity", FrictionTerm.stribeck)
         rubbing.append(FrictionTerm(place, numbers | more, stribeck=slow))

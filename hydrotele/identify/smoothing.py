@@ -1,29 +1,23 @@
-"""Optimal smoothing and differentiation of noisy samples, after Trujillo and Busby.
+"""Smoothing and differentiation of noisy samples by an optimal smoother or a zero-phase filter.
 
-The signal is taken as an integrator chain with an unknown input (`integrator_chain`): the value,
-its rate, its acceleration and so on, the highest of them driven by white noise. The one free
-number, how rough the input is, follows from the data by maximum likelihood or generalised
-cross-validation.
+`smooth` models the signal as a chain of m integrators driven by white noise, after Trujillo and
+Busby. Its only free parameter, the variance of the input, follows from the data by maximum
+likelihood or generalised cross-validation. `zero_phase` runs a Butterworth filter forwards and
+backwards and differentiates by central differences.
 
-Smoothing by an integrator chain with unknown input, as compiled dynamic programming.
+The signal is the first state of `c_(j+1) = T c_j + b g_j`, with an input g that is constant between
+samples. The smoothed states minimise
 
-The signal is the first state of `c_(j+1) = T c_j + b g_j`: m integrators in a row, whose input g is
-held from sample to sample. Sought are the states that minimise
+    sum_j w_j (d_j - c_j[0])^2 + (1 / r) sum_j g_j^2.                                         (1)
 
-    sum_j w_j (d_j - c_j[0])^2 + (1 / r) sum_j g_j^2,                                         (1)
-
-which is also their conditional mean where the noise has the variance 1/w and the input, white and
-Gaussian, r in the same unit (the fixed-interval smoother of Rauch, Tung and Striebel). Everything
-is dimensionless here: time counts in samples, and the k-th state is `dt^k` times the derivative.
-Information matrices run backwards and forwards, so that the start needs no guess.
+They are also the conditional mean for noise of variance 1/w and white Gaussian input of variance r
+in the same unit (fixed-interval smoother of Rauch, Tung and Striebel). All quantities are
+dimensionless: time is in samples, and the k-th state is `dt^k` times the k-th derivative. Forward
+and backward recursions of information matrices need no initial guess.
 
 Source: Trujillo and Busby 1983, J. Math. Anal. Appl. 94, "Investigation of a technique for the
 differentiation of empirical data" (dynamic programming); likelihood: the integral of exp(-(1)/2)
 over all inputs and, with a flat prior, over the initial state.
-
-What every smoother of this room yields, and the checks that they share.
-
-Zero-phase low-pass by a Butterworth filter run forwards and backwards, and differentiation.
 """
 
 import math
@@ -40,16 +34,16 @@ from hydrotele.core.errors import InputError
 class Smoothed:
     """Signals with their first two time derivatives and standard deviations.
 
-    All arrays have the shape of the input, (n,) or (n, k); [u] is the input's unit. A standard
-    deviation is NaN where it cannot be told.
+    All arrays have the shape of the input, (n,) or (n, k); [u] is the unit of the input. Unknown
+    standard deviations are NaN.
 
     Attributes:
-        value: [u].
-        rate: [u/s].
-        acceleration: [u/s^2].
-        value_std: of the value's error [u].
-        rate_std: of the rate's error [u/s].
-        acceleration_std: of the acceleration's error [u/s^2].
+        value: filtered signal [u].
+        rate: first derivative [u/s].
+        acceleration: second derivative [u/s^2].
+        value_std: standard deviation of the value [u].
+        rate_std: standard deviation of the rate [u/s].
+        acceleration_std: standard deviation of the acceleration [u/s^2].
     """
 
     value: np.ndarray
@@ -61,18 +55,18 @@ class Smoothed:
 
 
 def columns_of(values: np.ndarray, least: int, where: str) -> np.ndarray:
-    """Samples as columns, refused where they are too few.
+    """Convert samples to columns and check their number.
 
     Args:
-        values: (n,) or (n, k) [any unit], NaN where missing.
-        least: finite samples that each column needs [1].
+        values: (n,) or (n, k) samples [any unit], NaN where missing.
+        least: smallest number of finite samples per column [1].
         where: name of the caller for the message.
 
     Returns:
         (n, k) float64, a copy.
 
     Raises:
-        InputError: another shape, an infinite value, or too few finite samples in a column.
+        InputError: invalid shape, an infinite value, or too few finite samples in a column.
     """
     array = np.array(values, dtype=np.float64)
     if array.ndim not in (1, 2):
@@ -93,19 +87,19 @@ def columns_of(values: np.ndarray, least: int, where: str) -> np.ndarray:
 
 
 def per_column(number: float | np.ndarray, count: int, what: str, where: str) -> np.ndarray:
-    """One number per column, refused unless positive.
+    """Expand a positive value to one value per column.
 
     Args:
         number: scalar or (k,) [any unit].
         count: number of columns k [1].
-        what: name of the number for the message.
+        what: name of the value for the message.
         where: name of the caller for the message.
 
     Returns:
         (k,) float64.
 
     Raises:
-        InputError: a number is not positive and finite, or there are not k of them.
+        InputError: a value is not positive and finite, or there are not k values.
     """
     numbers = np.asarray(number, dtype=np.float64)
     if numbers.ndim > 1 or (numbers.ndim == 1 and len(numbers) != count):
@@ -117,14 +111,14 @@ def per_column(number: float | np.ndarray, count: int, what: str, where: str) ->
 
 
 def checked_period(period: float, where: str) -> float:
-    """The time between samples [s], refused unless positive.
+    """Check that a sample period is positive and return it.
 
     Args:
-        period: [s].
+        period: time between samples [s].
         where: name of the caller for the message.
 
     Returns:
-        The period [s].
+        The period as a float [s].
 
     Raises:
         InputError: the period is not positive and finite.
@@ -139,7 +133,7 @@ _SETTLED = 1.0e-12  # relative change of the information matrix per sample
 
 @compiled
 def transition(order):
-    """Matrices of the chain: the exact step of m integrators with the input held.
+    """Return the matrices of an exact step of m integrators with constant input.
 
     Args:
         order: number m of integrators [1].
@@ -210,14 +204,17 @@ def _settled(old, new, order):
 
 @compiled
 def backward_pass(known, ratio, order, infos, gains, totals):
-    """Backward recursion of the information: it depends on which samples are known, not on them.
+    """Run the backward recursion of the information matrices.
+
+    It depends on which samples are known, but not on their values.
 
     Args:
         known: (n,) 1 where a sample is known, 0 where it is missing [1].
         ratio: r, variance of the input over that of the noise, scalar [1], > 0.
         order: number m of integrators [1].
-        infos: (n, m, m) written: R_j, information of samples j .. n-1 on the state j.
-        gains: (n, m) written: R_(j+1) b / totals_j; the best input falls by `gains_j . T c_j`.
+        infos: (n, m, m) written: R_j, information of samples j .. n-1 about state j.
+        gains: (n, m) written: R_(j+1) b / totals_j; the optimal input has the term
+            `-gains_j . T c_j`.
         totals: (n,) written: 1/r + b' R_(j+1) b.
 
     Returns:
@@ -247,10 +244,10 @@ def backward_pass(known, ratio, order, infos, gains, totals):
 
 @compiled
 def smooth_states(samples, known, ratio, order, infos, gains, totals, states):
-    """States that minimise (1), the minimum, and the log determinant of the likelihood.
+    """Compute the states that minimise (1), the minimum, and the log determinant of the likelihood.
 
     Args:
-        samples: (n,) samples over the noise's standard deviation [1]; anything where missing.
+        samples: (n,) samples over the noise standard deviation [1]; any value where missing.
         known: (n,) 1 where a sample is known, 0 where it is missing [1].
         ratio: r, scalar [1].
         order: number m of integrators [1].
@@ -268,7 +265,7 @@ def smooth_states(samples, known, ratio, order, infos, gains, totals, states):
     backward_pass(known, ratio, order, infos, gains, totals)
     forward, _, drive = transition(order)
     count = len(samples)
-    pulls = np.zeros((count, order))  # R_j c is pulled towards this vector
+    pulls = np.zeros((count, order))  # information vectors of samples j .. n-1
     pulls[count - 1, 0] = known[count - 1] * samples[count - 1]
     rest = np.zeros(order)
     for j in range(count - 2, -1, -1):
@@ -306,15 +303,15 @@ def smooth_states(samples, known, ratio, order, infos, gains, totals, states):
 
 @compiled
 def state_variances(known, ratio, order, infos, variances):
-    """Variances of the smoothed states, over that of the noise.
+    """Compute the variances of the smoothed states, relative to that of the noise.
 
-    The information of the samples before j runs forwards and adds to that of j .. n-1.
+    A forward recursion adds the information of the samples before j to that of j .. n-1.
 
     Args:
         known: (n,) 1 where a sample is known, 0 where it is missing [1].
         ratio: r, scalar [1].
         order: number m of integrators [1].
-        infos: (n, m, m) as `backward_pass` writes them.
+        infos: (n, m, m) as written by `backward_pass`.
         variances: (n, m) written [1].
 
     Returns:
@@ -343,23 +340,23 @@ def state_variances(known, ratio, order, infos, variances):
         info[:] = out
 
 
-ORDER = 3  # value, rate and acceleration; the jerk is the unknown input
-_LOWEST, _HIGHEST = -16, 6  # log10 of input variance over noise variance, per sample
-_SECTIONS = 11  # leave 2 % of the ratio open, which the curves do not show
+ORDER = 3  # value, rate and acceleration; the jerk is the white input
+_LOWEST, _HIGHEST = -16, 6  # search range of log10 of input variance over noise variance
+_SECTIONS = 11  # golden sections: the ratio is accurate to 2 %, which is not visible in results
 _GOLDEN = 1.0 - 0.5 * (math.sqrt(5.0) - 1.0)
 _WHERE = "optimal smoother"
 
 
 @dataclass(frozen=True)
 class OptimallySmoothed(Smoothed):
-    """Signals smoothed by `smooth`, with what the smoother found and used.
+    """Signals smoothed by `smooth`, with the parameters of the smoother.
 
     Attributes:
-        noise: (k,) standard deviation of one sample, given or found [u].
-        input_std: (k,) root mean square of the input, given or found [u/s^order].
+        noise: (k,) standard deviation of one sample, given or estimated [u].
+        input_std: (k,) root mean square of the input, given or estimated [u/s^order].
         order: number of integrators [1].
         period: time between samples [s].
-        known: (n, k) whether a sample was there.
+        known: (n, k) whether a sample exists.
     """
 
     noise: np.ndarray
@@ -378,31 +375,32 @@ def smooth(
     order: int = ORDER,
     method: Literal["likelihood", "validation"] = "likelihood",
 ) -> OptimallySmoothed:
-    """Fixed-interval smoothing: the best value, rate and acceleration at every sample.
+    """Estimate value, rate and acceleration at every sample by fixed-interval smoothing.
 
     Minimises `sum (d - x)^2 / noise^2 + sum g^2 / input_std^2` over the states of an integrator
-    chain with the input g. The standard deviations hold for a signal as rough as `input_std` says.
+    chain with input g. The standard deviations hold for a signal whose input has the root mean
+    square `input_std`.
 
     Args:
         values: (n,) or (n, k) samples on a uniform clock, NaN where missing [u].
         period: time between samples [s].
-        noise: standard deviation of one sample, scalar or (k,) [u]; None to find it, for which the
-            signal must be well oversampled.
-        input_std: root mean square of the input, the derivative of number `order`, scalar or (k,)
-            [u/s^order]; None to find it.
+        noise: standard deviation of one sample, scalar or (k,) [u]; None to estimate it, for which
+            the signal must be well oversampled.
+        input_std: root mean square of the input, the derivative of order `order`, scalar or (k,)
+            [u/s^order]; None to estimate it.
         order: number of integrators [1], 3 or 4.
-        method: how to find what is not given: maximum "likelihood", or "validation", generalised
-            cross-validation, which uses the noise for the standard deviations only.
+        method: estimation of values not given: maximum "likelihood", or "validation" (generalised
+            cross-validation), which uses the noise only for the standard deviations.
 
     Returns:
-        The smoothed signals, in the shape of `values`.
+        The smoothed signals in the shape of `values`.
 
     Raises:
-        InputError: order or method is not known, a number is not positive, `input_std` comes
+        InputError: order or method is unknown, a value is not positive, `input_std` is given
             without `noise`, or a column has fewer than order + 2 samples.
 
-    Source: Trujillo and Busby 1983 as used in Khoshzaban 1992, section 4.4; likelihood: see
-    `integrator_chain`; generalised cross-validation: Craven and Wahba 1979.
+    Source: Trujillo and Busby 1983 as used in Khoshzaban 1992, section 4.4; likelihood: see the
+    module docstring; generalised cross-validation: Craven and Wahba 1979.
 
     >>> import numpy as np
     >>> time = 0.02 * np.arange(200)
@@ -445,19 +443,20 @@ def smooth(
 
 
 def error_draws(smoothed: OptimallySmoothed, count: int, seed: int = 0) -> np.ndarray:
-    """Random errors of smoothed signals: what noise adds and what smoothing takes away.
+    """Sample random errors of smoothed signals.
 
-    A signal of the chain itself, as rough as `input_std`, is drawn, noise is added, and it is
-    smoothed with the same numbers and the same missing samples; the error does not depend on the
-    signal that was measured.
+    A signal of the integrator chain with input `input_std` is simulated, noise is added, and the
+    signal is smoothed with the same parameters and the same missing samples. The error does not
+    depend on the measured signal.
 
     Args:
         smoothed: result of `smooth`.
-        count: number of draws [1].
-        seed: of the random numbers [1].
+        count: number of samples [1].
+        seed: seed of the random generator [1].
 
     Returns:
-        (count, 3, n, k) smoothed minus true value [u], rate [u/s] and acceleration [u/s^2].
+        (count, 3, n, k) errors of value [u], rate [u/s] and acceleration [u/s^2], smoothed minus
+        true.
 
     Source: Durbin and Koopman 2002, Biometrika 89(3), "A simple and efficient simulation smoother".
     """
@@ -480,14 +479,20 @@ def error_draws(smoothed: OptimallySmoothed, count: int, seed: int = 0) -> np.nd
 def _scaled(
     samples: np.ndarray, known: np.ndarray, noises: np.ndarray | None, k: int
 ) -> tuple[np.ndarray, float, float]:
-    """Samples about their mean over the noise, or over their steps' size; the mean; the unit."""
+    """Subtract the mean and divide by the noise, or by the scatter of the steps if it is unknown.
+
+    Returns:
+        The scaled samples, the mean, and the divisor.
+    """
     base = float(samples[known].mean())
     if noises is not None:
         unit = float(noises[k])
     else:
         unit = float(np.diff(samples[known]).std())
         if unit == 0.0:
-            raise InputError(_WHERE, f"column {k} is constant, so its noise is unknown: give it")
+            raise InputError(
+                _WHERE, f"column {k} is constant, so its noise cannot be estimated: give noise"
+            )
     return np.where(known, (samples - base) / unit, 0.0), base, unit
 
 
@@ -502,7 +507,7 @@ def _states(samples, known, ratio, order):
 
 @compiled
 def _chain(inputs, order):
-    """Run the chain from zero: (draws, n) inputs -> (draws, n, m) states."""
+    """Simulate the integrator chain from zero: (draws, n) inputs -> (draws, n, m) states."""
     forward, _, drive = transition(order)
     draws, rows = inputs.shape
     states = np.zeros((draws, rows, order))
@@ -517,7 +522,7 @@ def _chain(inputs, order):
 
 @compiled
 def _cost(samples, known, exponent, order, likely, noise_known, work):
-    """What the best ratio, 10^exponent, makes smallest."""
+    """Return the objective of the variance ratio 10^exponent, to be minimised."""
     infos, gains, totals, states, variances = work
     ratio = 10.0**exponent
     residuals, inputs, logs = smooth_states(
@@ -535,7 +540,7 @@ def _cost(samples, known, exponent, order, likely, noise_known, work):
 
 @compiled
 def _best_exponent(samples, known, order, likely, noise_known, work):
-    """Best log10 of the ratio: the best of every second decade, then golden sections about it."""
+    """Find the best log10 of the ratio on a grid of two decades, refined by golden sections."""
     best, middle = math.inf, 0.0
     for decade in range(_LOWEST, _HIGHEST + 1, 2):
         cost = _cost(samples, known, float(decade), order, likely, noise_known, work)
@@ -559,10 +564,10 @@ def _best_exponent(samples, known, order, likely, noise_known, work):
 
 @compiled
 def _smooth_column(samples, known, ratio, order, likely, noise_known):
-    """Smooth one dimensionless column; a ratio of NaN is found.
+    """Smooth one dimensionless column; a ratio of NaN is estimated.
 
     Returns:
-        (states (n, m), variances (n, m), ratio, noise's standard deviation over the given unit).
+        (states (n, m), variances (n, m), ratio, noise standard deviation over the given unit).
     """
     rows = len(samples)
     infos, gains, totals = np.zeros((rows, order, order)), np.zeros((rows, order)), np.zeros(rows)
@@ -590,23 +595,24 @@ def zero_phase(
     order: int = 4,
     bridge: int = 0,
 ) -> Smoothed:
-    """Low-pass without phase lag, and its derivatives by central differences.
+    """Filter by a zero-phase low-pass, and differentiate by central differences.
 
     The two passes together have the gain `1 / (1 + (tan(pi f dt) / tan(pi f_c dt))^(2 order))`,
-    which is 1/2 at the cutoff f_c. The five-point differences keep the rate of a frequency f to
-    `(2 pi f dt)^4 / 30` of itself, the acceleration to a third of that.
+    which is 1/2 at the cutoff f_c. The relative error of the five-point differences at a frequency
+    f is `(2 pi f dt)^4 / 30` for the rate and a third of that for the acceleration.
 
     Args:
         values: (n,) or (n, k) samples on a uniform clock, NaN where missing [u].
         period: time between samples [s].
         cutoff: f_c [Hz], below half the sample rate.
         noise: standard deviation of one sample, scalar or (k,), for the standard deviations [u].
-        order: of the Butterworth filter that is run twice [1].
-        bridge: longest gap to bridge by a straight line [samples]; 0 refuses missing samples.
+        order: order of the Butterworth filter, which is applied twice [1].
+        bridge: longest gap that is interpolated linearly [samples]; with 0, missing samples are an
+            error.
 
     Returns:
-        The filtered signals, in the shape of `values`. Their standard deviations are what noise
-        leaves; what the filter takes from the signal is not in them, nor are the ends.
+        The filtered signals in the shape of `values`. Their standard deviations include the noise,
+        but not the attenuation of the signal by the filter or effects at the ends.
 
     Raises:
         InputError: the cutoff is not below half the sample rate, too few samples, or a gap is
@@ -629,10 +635,10 @@ def zero_phase(
             f" got {cutoff:g} Hz",
         )
     samples = _bridged(columns_of(values, 2, _WHERE_ZERO_PHASE), bridge)
-    from scipy.signal import butter, sosfiltfilt  # half a second that most runs do not need
+    from scipy.signal import butter, sosfiltfilt  # this import takes half a second
 
     filtering = butter(order, cutoff, fs=1.0 / dt, output="sos")
-    pad = round(3.0 / (cutoff * dt))  # the filter has forgotten its start after three periods
+    pad = round(3.0 / (cutoff * dt))  # the filter's transient lasts three periods
     if len(samples) <= pad:
         raise InputError(
             _WHERE_ZERO_PHASE,
@@ -670,15 +676,15 @@ def _bridged(samples: np.ndarray, bridge: int) -> np.ndarray:
         if missing > bridge:
             raise InputError(
                 _WHERE_ZERO_PHASE,
-                f"column {k} lacks {missing} samples in a row, {bridge} may be bridged: set bridge,"
-                " or use the optimal smoother, which needs none",
+                f"column {k} has {missing} successive missing samples, at most {bridge} are"
+                " interpolated: set bridge, or use the optimal smoother, which accepts gaps",
             )
         samples[:, k] = np.interp(rows, known, samples[known, k])
     return samples
 
 
 def _derivatives(x: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(n, k) and its first two derivatives: five points, towards the ends three."""
+    """Return x (n, k) and two derivatives by five-point differences, three-point at the ends."""
     rate = np.gradient(x, dt, axis=0, edge_order=2)
     acceleration = np.empty_like(x)
     acceleration[1:-1] = (x[2:] - 2.0 * x[1:-1] + x[:-2]) / dt**2

@@ -99,7 +99,7 @@ def test_a_short_log_is_refused(slow_log):
         {name: values[:100] for name, values in slow_log.columns.items()},
         slow_log.units,
     )
-    with pytest.raises(InputError, match="10 s of slow moves"):
+    with pytest.raises(InputError, match="10 s of slow motion"):
         identify_gravity(CAT, short)
 
 

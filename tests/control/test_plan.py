@@ -238,7 +238,9 @@ def test_pose_way_through_the_edge_is_refused():
     """Straight up past the machine the stick would have to fold further than it can."""
     near, far = {"r": 3.6, "z": -0.5, "theta": 0.0}, {"r": 3.6, "z": 3.9, "theta": 0.0}
     pilot = {"kind": "waypoints", "points": [{"duration": 2.0, "pose": far}]}
-    with pytest.raises(InputError, match=r"points\.0\.pose: its straight way leaves the workspace"):
+    with pytest.raises(
+        InputError, match=r"points\.0\.pose: the straight path leaves the workspace"
+    ):
         plan_of(pilot, start=start_at("none", **near), tool="none")
 
 
@@ -257,7 +259,7 @@ def test_run_that_ends_early_says_so():
 def test_force_drive_commands_keep_their_unit():
     plan = plan_of({"kind": "constant", "commands": {"slide": 9.5}}, tool=None, machine="emps")
     assert np.all(plan.command == 9.5)
-    with pytest.raises(InputError, match=r"slide with 10.5, its drive takes -10 .. 10 \[V\]"):
+    with pytest.raises(InputError, match=r"slide is 10.5; its drive accepts -10 .. 10 \[V\]"):
         plan_of({"kind": "constant", "commands": {"slide": 10.5}}, tool=None, machine="emps")
 
 

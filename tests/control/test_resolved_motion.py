@@ -96,7 +96,7 @@ def test_pose_to_joints():
     assert sum(kept[a] for a in ("boom", "stick", "bucket")) == pytest.approx(0.45 - 1.6 - 1.2)
     with pytest.raises(InputError, match=r"a\.b: .*reachable is"):
         pose_to_joints(BUCKET, Pose(r=50.0, z=1.0), HOME, "a.b")
-    with pytest.raises(InputError, match="needs bucket at .* deg, which its joint allows only"):
+    with pytest.raises(InputError, match="needs bucket at .* deg, but its joint range is"):
         pose_to_joints(BUCKET, Pose(r=5.5, z=1.0, attitude=2.5), HOME)
 
 

@@ -158,10 +158,15 @@ def check_limits(machine, tool, name, place):
     [
         ("payloat", "", {"mass": 1}, "did you mean 'payload'.*bulk_modulus"),
         ("valve_gain", "bom", {"ratio": 1}, "'bom'; did you mean 'boom'"),
-        ("valve_gain", "", {"ratio": 1}, "cannot sit at ''; valid: boom, bucket, stick, swing"),
-        ("payload", "boom", {"mass": 1}, "cannot sit at 'boom'; valid: tool"),
+        ("valve_gain", "", {"ratio": 1}, "has no location ''; valid: boom, bucket, stick, swing"),
+        ("payload", "boom", {"mass": 1}, "has no location 'boom'; valid: tool"),
         ("payload", "", {}, "has the parameters mass; 'mass' is missing"),
-        ("payload", "", {"mass": 1, "colour": 2}, "has the parameters mass; 'colour' is none"),
+        (
+            "payload",
+            "",
+            {"mass": 1, "colour": 2},
+            "has the parameters mass; 'colour' is not one of them",
+        ),
         ("base_tilt", "", {"roll": 0.1}, "has the parameters roll, pitch; 'pitch' is missing"),
         ("pressure_offset", "boom", {"offset": 1.0}, "valid: .*boom.head, boom.rod"),
     ],

@@ -89,7 +89,7 @@ def test_the_force_of_the_example_is_that_of_a_gas_spring(gas_spring):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("x = 1\nEFFECT = 3", "3 is no hydrotele.effects.Effect"),
+        ("x = 1\nEFFECT = 3", "3 is not a hydrotele.effects.Effect"),
         ("x = 1", "defines neither EFFECT = Effect.* nor EFFECTS = .* nor a law"),
         ("import math\nx = 1 / 0", r"bad.py:2: cannot be run: ZeroDivisionError"),
         ("x = (", r"bad.py:1: cannot be run: SyntaxError"),
@@ -111,7 +111,7 @@ def test_a_missing_file_or_another_kind_is_refused(tmp_path, alone):
     with pytest.raises(InputError, match=r"none\.py: cannot be read: No such file"):
         load_effects(tmp_path / "none.py")
     (tmp_path / "effects.yaml").write_text("a: 1")
-    with pytest.raises(InputError, match=r"stand in a \.py file"):
+    with pytest.raises(InputError, match=r"define custom effects in a \.py file"):
         load_effects(tmp_path / "effects.yaml")
 
 
@@ -147,7 +147,9 @@ def test_installed_packages_offer_effects_as_entry_points(monkeypatch, alone, tm
     assert list(library) == ["gas_spring"]
     assert LAWS["gas_spring_force"].source == "plug-in springs of the package ?"
     entries[0] = importlib.metadata.EntryPoint("springs", "rig_plugin_2", own.GROUP)
-    with pytest.raises(InputError, match="plug-in springs .*does not load: No module.*uninstall"):
+    with pytest.raises(
+        InputError, match="plug-in springs .*cannot be loaded: No module.*uninstall"
+    ):
         own.add_plugins({})
 
 

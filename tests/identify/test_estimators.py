@@ -122,9 +122,9 @@ def test_a_gap_in_the_rows_is_no_neighbour():
 
 def test_refusals():
     y = equations(np.random.default_rng(7))
-    with pytest.raises(InputError, match="must fit"):
+    with pytest.raises(InputError, match="do not match"):
         estimate(y, np.zeros((400, 3)))
-    with pytest.raises(InputError, match="6 equations do not tell 8"):
+    with pytest.raises(InputError, match="6 equations do not determine 8"):
         estimate(np.ones((3, 2, 8)), np.ones((3, 2)))
     y[:, :, 1] = 0.0
     with pytest.raises(InputError, match="column 1 has no effect"):

@@ -88,7 +88,7 @@ def test_sensor_errors_that_the_machine_states_are_taken_out():
 def test_a_missing_side_leaves_the_force_unknown_and_says_so():
     fit, heldout, notes = records(made_up(drop=["pressure_rod.boom"]))
     assert np.isnan(fit[0].force[:, 1]).all() and np.isfinite(fit[0].force[:, 0]).all()
-    assert any("boom lacks a pressure" in note for note in notes)
+    assert any("boom has no pressure sensor at one side" in note for note in notes)
     assert heldout.name == "b"
 
 

@@ -32,5 +32,5 @@ def test_those_that_differ_stay_apart():
 
 
 def test_a_candidate_that_is_not_there_is_refused():
-    with pytest.raises(InputError, match="c1 is no parameter"):
+    with pytest.raises(InputError, match="c1 is not a parameter"):
         reduce_parameters(*made([1] * 7), COVARIANCE, NAMES, (("c1",),))

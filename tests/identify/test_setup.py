@@ -33,8 +33,8 @@ def test_what_is_not_there_is_refused():
     chain = load_chain(FOLDER / "palida.xml")
     still = np.zeros((1, 6))
     for setup, message in (
-        (mechanism_setup(chain, alike=[("ring_1", "wing")]), "belong to wing"),
-        (mechanism_setup(chain, absent=["mass.wing"]), "mass.wing is stated absent"),
+        (mechanism_setup(chain, alike=[("ring_1", "wing")]), "alike: wing has no parameters"),
+        (mechanism_setup(chain, absent=["mass.wing"]), "absent: mass.wing is not a parameter"),
     ):
         legs = chain.start[[chain.index(d) for d in chain.drives]][None]
         found = project(chain, chain.drives, legs, still, still)

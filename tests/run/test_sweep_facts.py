@@ -28,7 +28,11 @@ EFFECT = "set: {effects: [{name: payload, location: tool, parameters: {mass: 100
         ("grid: {machine: [nix]}", ":2: grid.machine", "valid: calibrator, cat215"),
         ("grid: {effects.0.parameters.mass: [1]}", ":2: grid.effects", "there is no entry 0"),
         (f"{EFFECT}grid: {{effects.0.parameters.mass: [-4]}}", ":3: grid.effects", "outside 0"),
-        (f"{EFFECT}grid: {{effects.0.parameters.mas: [4]}}", ":3: grid.effects", "none of them"),
+        (
+            f"{EFFECT}grid: {{effects.0.parameters.mas: [4]}}",
+            ":3: grid.effects",
+            "is not one of them",
+        ),
         ("grid: {timestep: [0.001], control_rate: [200, 300]}", ":2", "whole number"),
         (
             "grid: {control_rate: [200, 100], log_rate: [50, 200]}",

@@ -429,17 +429,18 @@ REFUSED = {
     ),
     "reference_fourier": (
         {"pilot": {"kind": "fourier", "period": 1, "fade": 0, "axes": {"boom": {"mean": 2}}}},
-        "asks boom for .* its joint allows -0.733 .. 1.012",
+        "the reference of boom is .* its joint range is -0.733 .. 1.012",
     ),
     "reference_overflow": (
         {"pilot": {"kind": "fourier", "period": 1, "axes": {"swing": {"mean": 1e300}}}}, "swing",
     ),
     "reference_waypoint": (
         {"pilot": {"kind": "waypoints", "points": [{"duration": 9, "joints": {"boom": 2}}]}},
-        "asks boom for 2 at .* its joint allows",
+        "the reference of boom is 2 at .* its joint range is",
     ),
     "reference_table": (
-        {"pilot": TABLE | {"of": "joint", "columns": {"boom": [0.45, 2.0]}}}, "asks boom for 2",
+        {"pilot": TABLE | {"of": "joint", "columns": {"boom": [0.45, 2.0]}}},
+        "the reference of boom is 2",
     ),
 }  # fmt: skip
 
