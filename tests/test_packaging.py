@@ -126,9 +126,7 @@ def test_lock_holds_every_declared_dependency(lock):
     # tools/setup refuses a lock that is behind pyproject.toml, and then nothing can be set up.
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     texts = list(project["project"]["dependencies"])
-    texts += [
-        text for extra in project["project"]["optional-dependencies"].values() for text in extra
-    ]
+    texts += [text for extra in project["project"]["optional-dependencies"].values() for text in extra]
     declared = {canonicalize_name(Requirement(text).name) for text in texts}
     texts += [text for group in project["dependency-groups"].values() for text in group]
     stale = []

@@ -16,40 +16,47 @@ import scipy.optimize
 import scipy.sparse
 
 from hydrotele.calibrate.arm_poses import Poses
-from hydrotele.calibrate.estimation import identifiable, least_squares
-from hydrotele.calibrate.loop import KINDS, Loop, ball_from, ball_place, link_chain, unit_of
+from hydrotele.calibrate.estimation import classify_scaled_parameters, least_squares
+from hydrotele.calibrate.loop import (
+    PARAMETER_KINDS,
+    CalibrationLoop,
+    ball_position,
+    ball_position_and_rates,
+    link_chain,
+    unit_of,
+)
 from hydrotele.core.errors import InputError
-from hydrotele.effects.effect import changed
+from hydrotele.effects.effect import with_value
 from hydrotele.identify.identifiability import Identifiability
-from hydrotele.kinematics.serial_chain import forward, joint_axes
+from hydrotele.kinematics.serial_chain import chain_poses, joint_axes
 from hydrotele.machine.machine import Closure, Machine, SensorError
 
-SIZES = {"m": 0.1, "rad": np.radians(5.0)}
+NOMINAL_ERRORS = {"m": 0.1, "rad": np.radians(5.0)}
 """Expected error of a nominal parameter, by unit: the accuracy of a tape and a protractor."""
 
-LABORATORY = {"m": 1.0e-3, "rad": np.radians(0.05)}
+LABORATORY_ERRORS = {"m": 1.0e-3, "rad": np.radians(0.05)}
 """Expected error of the calibrator's link parameters, measured in a laboratory (K 3.6.4)."""
 
-TRUNCATION = (0.05, 0.01, 1.0e-3, 1.0e-5)
+TRUNCATION_LEVELS = (0.05, 0.01, 1.0e-3, 1.0e-5)
 """Truncation levels relative to the largest singular value: K's 5 %, lowered on convergence."""
 
-_CRITICAL = 1.959964
-_ROUNDS = 3  # reweighting iterations; the second one already changes parameters by less than 1e-3
-_FEWEST = 2  # equations per parameter
-_STILL = np.radians(2.0)  # minimum range of a calibrator joint while a link moves
+_QUANTILE_95 = 1.959964
+_MAX_REWEIGHTINGS = 3  # reweighting iterations; the second one already changes parameters by less than 1e-3
+_MIN_EQUATIONS_PER_PARAMETER = 2  # equations per parameter
+_MIN_JOINT_RANGE = np.radians(2.0)  # minimum range of a calibrator joint while a link moves
 
-Numbers = dict[str, float]
+ParameterValues = dict[str, float]
 
 
 @dataclass(frozen=True)
-class Stage:
+class StageFit:
     """Result of the identification of one moving link.
 
     Attributes:
         link: the moving link.
         names: the p identified parameters.
-        told: identifiability of the candidate parameters of this stage.
-        fixed: reason why a candidate keeps its nominal value, by parameter name.
+        identifiability: identifiability of the candidate parameters of this stage.
+        hold_reasons: reason why a candidate keeps its nominal value, by parameter name.
         iterations: number of Levenberg-Marquardt iterations.
         poses: number of poses.
         rms: root mean square of both equations' residuals [m].
@@ -59,8 +66,8 @@ class Stage:
 
     link: str
     names: tuple[str, ...]
-    told: Identifiability
-    fixed: Mapping[str, str]
+    identifiability: Identifiability
+    hold_reasons: Mapping[str, str]
     iterations: int
     poses: int
     rms: float
@@ -78,45 +85,45 @@ class ArmFit:
         names: the p identified parameters, in the order of their stages.
         values: (p,) identified values [rad] or [m].
         covariance: (p, p) covariance of the values due to sensor noise of this and earlier stages.
-        numbers: all parameters after calibration, including held angles and ball positions.
-        start: all parameters before calibration.
+        parameters: all parameters after calibration, including held angles and ball positions.
+        start_parameters: all parameters before calibration.
         stages: results of the moving links, the outermost first.
         method: `hierarchical` or `joint`.
     """
 
-    nominal: Loop
-    loop: Loop
+    nominal: CalibrationLoop
+    loop: CalibrationLoop
     names: tuple[str, ...]
     values: np.ndarray
     covariance: np.ndarray
-    numbers: Mapping[str, float]
-    start: Mapping[str, float]
-    stages: tuple[Stage, ...]
+    parameters: Mapping[str, float]
+    start_parameters: Mapping[str, float]
+    stages: tuple[StageFit, ...]
     method: str
 
     @property
-    def deviations(self) -> np.ndarray:
+    def standard_deviations(self) -> np.ndarray:
         """(p,) standard deviations [rad] or [m]."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
     @property
     def intervals(self) -> np.ndarray:
         """(p, 2) 95 % intervals [rad] or [m]."""
-        reach = _CRITICAL * self.deviations
+        reach = _QUANTILE_95 * self.standard_deviations
         return np.column_stack([self.values - reach, self.values + reach])
 
     def value(self, name: str) -> float:
         """Return a parameter by name, identified or nominal [rad] or [m]."""
-        return float(self.numbers[name])
+        return float(self.parameters[name])
 
 
-def stage_order(loop: Loop, stages: Sequence[Poses]) -> list[Poses]:
+def sort_stages(loop: CalibrationLoop, stages: Sequence[Poses]) -> list[Poses]:
     """Sort stages from the outermost moving link inwards.
 
     Raises:
         InputError: a link cannot be calibrated, or two stages move the same link.
     """
-    links = loop.links[: loop.moved]
+    links = loop.links[: loop.powered_count]
     for poses in stages:
         if poses.link not in links:
             message = f"moves {poses.link!r}; links that can be calibrated: {', '.join(links)}"
@@ -129,7 +136,7 @@ def stage_order(loop: Loop, stages: Sequence[Poses]) -> list[Poses]:
     return sorted(stages, key=lambda poses: -links.index(poses.link))
 
 
-def candidates(loop: Loop, link: str) -> list[str]:
+def candidate_parameters(loop: CalibrationLoop, link: str) -> list[str]:
     """Return the parameters that the poses of a moving link may identify, in order of preference.
 
     Args:
@@ -141,11 +148,11 @@ def candidates(loop: Loop, link: str) -> list[str]:
     """
     place = loop.links.index(link)
     first = [f"p_xy.{link}", f"p_z.{link}"]
-    if place == loop.moved - 1:
-        mount = loop.links[loop.moved]
+    if place == loop.powered_count - 1:
+        mount = loop.links[loop.powered_count]
         own = [f"{k}.{link}" for k in ("alpha", "a")]
         own += [f"{k}.{mount}" for k in ("offset", "alpha", "a", "d")]
-        rest = loop.links[loop.moved + 1 :]
+        rest = loop.links[loop.powered_count + 1 :]
         own += [f"offset.{name}" for name in rest[:-1]]
         own += [f"offset.{rest[-1]}"]
         own += [f"{k}.{name}" for name in rest for k in ("d", "a", "alpha", "beta")]
@@ -157,73 +164,71 @@ def candidates(loop: Loop, link: str) -> list[str]:
     return first + own
 
 
-def size_of(loop: Loop, name: str) -> float:
+def expected_error(loop: CalibrationLoop, name: str) -> float:
     """Return the expected error of a parameter's start value [rad] or [m]."""
     kind, _, link = name.partition(".")
-    known = loop.links[loop.moved + 1 :]
+    known = loop.links[loop.powered_count + 1 :]
     if link in known and not (kind == "offset" and link != known[-1]):
-        return LABORATORY[unit_of(name)]
-    return SIZES[unit_of(name)]
+        return LABORATORY_ERRORS[unit_of(name)]
+    return NOMINAL_ERRORS[unit_of(name)]
 
 
-class Equations:
+class StageEquations:
     """The two residual equations per pose of one stage."""
 
-    FLOOR = 1.0e-4
+    MIN_DEVIATION = 1.0e-4
     """Minimum standard deviation [m] of an equation; bounds the weight of insensitive poses."""
 
-    def __init__(self, loop: Loop, poses: Poses) -> None:
+    def __init__(self, loop: CalibrationLoop, poses: Poses) -> None:
         self.loop, self.poses = loop, poses
         self.place = loop.links.index(poses.link)
         self.outer = loop.links[self.place :]
 
-    def seen(self, numbers: Mapping[str, float]) -> tuple[Loop, np.ndarray]:
+    def chain_and_angles(self, parameters: Mapping[str, float]) -> tuple[CalibrationLoop, np.ndarray]:
         """Return the chain with given parameters, and the joint angles beyond the moving link.
 
         The angles have shape (M, number of links beyond the moving one) [rad]. The moving link's
         own d keeps its nominal value, because only the difference p_z - d is identifiable.
         """
         loop, poses = self.loop, self.poses
-        values = np.array([[numbers[f"{kind}.{link}"] for kind in KINDS] for link in loop.links])
-        values[self.place, KINDS.index("d")] = loop.values[self.place, KINDS.index("d")]
+        values = np.array([[parameters[f"{kind}.{link}"] for kind in PARAMETER_KINDS] for link in loop.links])
+        values[self.place, PARAMETER_KINDS.index("d")] = loop.values[self.place, PARAMETER_KINDS.index("d")]
         theta = np.empty((len(poses), len(loop) - self.place - 1))
         for column, link in enumerate(self.outer[1:]):
             k = self.place + 1 + column
-            if k < loop.moved:
-                theta[:, column] = numbers[f"held.{link}"]
+            if k < loop.powered_count:
+                theta[:, column] = parameters[f"held.{link}"]
                 if poses.drift and link in poses.drift.held:
                     theta[:, column] += poses.drift.held[link]
             else:
-                theta[:, column] = poses.theta[:, k - loop.moved] + numbers[f"offset.{link}"]
+                theta[:, column] = poses.theta[:, k - loop.powered_count] + parameters[f"offset.{link}"]
         return dataclasses.replace(loop, values=values), theta
 
-    def _error(self, s: np.ndarray, numbers: Mapping[str, float]) -> np.ndarray:
+    def _error(self, s: np.ndarray, parameters: Mapping[str, float]) -> np.ndarray:
         reach, link = np.hypot(s[:, 0], s[:, 1]), self.poses.link
-        error = np.stack(
-            [reach - numbers[f"p_xy.{link}"], s[:, 2] - numbers[f"p_z.{link}"]], axis=1
-        )
+        error = np.stack([reach - parameters[f"p_xy.{link}"], s[:, 2] - parameters[f"p_z.{link}"]], axis=1)
         return error - self.poses.drift.ball[:, :2] if self.poses.drift else error
 
-    def residual(self, numbers: Mapping[str, float]) -> np.ndarray:
+    def residual(self, parameters: Mapping[str, float]) -> np.ndarray:
         """Return the residuals of both equations (M, 2) [m]."""
-        loop, theta = self.seen(numbers)
-        return self._error(ball_place(loop, self.place, theta), numbers)
+        loop, theta = self.chain_and_angles(parameters)
+        return self._error(ball_position(loop, self.place, theta), parameters)
 
-    def at(self, numbers: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def residual_and_jacobian(self, parameters: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return residuals and their derivatives.
 
         Returns:
             (residuals (M, 2) [m], derivatives by link parameters (M, 2, links, 5),
             derivatives by the S calibrator readings (M, 2, S) [m/rad]).
         """
-        loop, theta = self.seen(numbers)
-        s, by = ball_from(loop, self.place, theta)
+        loop, theta = self.chain_and_angles(parameters)
+        s, by = ball_position_and_rates(loop, self.place, theta)
         way = s[:, :2] / np.hypot(s[:, :1], s[:, 1:2])
         plane = way[:, 0, None, None] * by[:, 0] + way[:, 1, None, None] * by[:, 1]
         rows = np.stack([plane, by[:, 2]], axis=1)
-        return self._error(s, numbers), rows, rows[:, :, loop.moved - self.place :, 0]
+        return self._error(s, parameters), rows, rows[:, :, loop.powered_count - self.place :, 0]
 
-    def columns(self, by: np.ndarray, names: Sequence[str], own_d: bool = False) -> np.ndarray:
+    def select_columns(self, by: np.ndarray, names: Sequence[str], own_d: bool = False) -> np.ndarray:
         """Return the derivatives (M, 2, p) by named parameters; zero for parameters without effect.
 
         The column of the moving link's d is zero unless `own_d` is set.
@@ -236,23 +241,23 @@ class Equations:
                     out[:, 0 if kind == "p_xy" else 1, column] = -1.0
             elif link in self.outer:
                 k = self.outer.index(link)
-                held = 0 < k and self.place + k < self.loop.moved
+                held = 0 < k and self.place + k < self.loop.powered_count
                 if k == 0 and kind == "d" and not own_d:
                     continue
                 if kind == "held" and held:
                     out[:, :, column] = by[:, :, k, 0]
-                elif kind != "held" and not (kind == "offset" and self.place + k < self.loop.moved):
-                    out[:, :, column] = by[:, :, k, KINDS.index(kind)]
+                elif kind != "held" and not (kind == "offset" and self.place + k < self.loop.powered_count):
+                    out[:, :, column] = by[:, :, k, PARAMETER_KINDS.index(kind)]
         return out
 
-    def whitening(self, sensed: np.ndarray) -> np.ndarray:
+    def whitening_factors(self, by_readings: np.ndarray) -> np.ndarray:
         """Return upper factors (M, 2, 2) that give both equations of a pose unit covariance."""
-        spread = sensed * self.poses.sigma[..., None, :]
-        covariance = spread @ spread.transpose(0, 2, 1) + self.FLOOR**2 * np.eye(2)
+        spread = by_readings * self.poses.sigma[..., None, :]
+        covariance = spread @ spread.transpose(0, 2, 1) + self.MIN_DEVIATION**2 * np.eye(2)
         return np.linalg.cholesky(np.linalg.inv(covariance)).transpose(0, 2, 1)
 
 
-def start_numbers(loop: Loop, stages: Sequence[Poses]) -> Numbers:
+def initial_parameters(loop: CalibrationLoop, stages: Sequence[Poses]) -> ParameterValues:
     """Return start values of all parameters.
 
     Held angles are the median readings of the manipulator's sensors if it has any, otherwise the
@@ -265,25 +270,23 @@ def start_numbers(loop: Loop, stages: Sequence[Poses]) -> Numbers:
     Returns:
         Parameter values by name [rad] or [m].
     """
-    numbers = {name: loop.value(name) for name in loop.names}
-    for k, link in enumerate(loop.links[: loop.moved]):
+    numbers = {name: loop.value(name) for name in loop.parameter_names}
+    for k, link in enumerate(loop.links[: loop.powered_count]):
         numbers[f"held.{link}"] = float(loop.home[k])
         inward = [p for p in stages if loop.links.index(p.link) < k and link in p.manipulator]
         if inward:
             outermost = max(inward, key=lambda p: loop.links.index(p.link))
-            numbers[f"held.{link}"] = float(
-                np.median(outermost.manipulator[link]) + loop.values[k, 0]
-            )
+            numbers[f"held.{link}"] = float(np.median(outermost.manipulator[link]) + loop.values[k, 0])
     for poses in stages:
         blank = numbers | {f"p_xy.{poses.link}": 0.0, f"p_z.{poses.link}": 0.0}
-        mean = Equations(loop, poses).residual(blank).mean(axis=0)
+        mean = StageEquations(loop, poses).residual(blank).mean(axis=0)
         numbers[f"p_xy.{poses.link}"], numbers[f"p_z.{poses.link}"] = map(float, mean)
     return numbers
 
 
 def identify_arm(
-    loop: Loop, stages: Sequence[Poses], *, weighted: bool = True,
-    chosen: Mapping[str, Sequence[str]] | None = None,
+    loop: CalibrationLoop, stages: Sequence[Poses], *, weighted: bool = True,
+    parameters_by_link: Mapping[str, Sequence[str]] | None = None,
 ) -> ArmFit:  # fmt: skip
     """Identify the arm link by link, from the outermost stage inwards.
 
@@ -292,7 +295,7 @@ def identify_arm(
         stages: poses of one or more links; links without poses keep their nominal parameters.
         weighted: weight each equation by its sensor noise; False for Khoshzaban's unweighted least
             squares, whose intervals are too narrow.
-        chosen: parameters to identify by link, instead of those found to be identifiable.
+        parameters_by_link: parameters to identify by link, instead of those found to be identifiable.
 
     Returns:
         The fit, with the covariance due to sensor noise in this and all earlier stages.
@@ -302,53 +305,53 @@ def identify_arm(
 
     Source: Khoshzaban 1992, sections 3.6.3 and 3.6.4.
     """
-    order = stage_order(loop, stages)
+    order = sort_stages(loop, stages)
     for poses in order:
         check_poses(loop, poses)
-    numbers = start_numbers(loop, order)
+    numbers = initial_parameters(loop, order)
     start = dict(numbers)
     names: tuple[str, ...] = ()
     covariance = np.zeros((0, 0))
     found = []
     for poses in order:
-        equations = Equations(loop, poses)
-        wanted = candidates(loop, poses.link)
-        told = what_is_told(equations, start | {n: numbers[n] for n in names}, wanted)
-        own = list((chosen or {}).get(poses.link, [told.names[k] for k in sorted(told.base)]))
-        stage, numbers, covariance = identify_stage(
-            equations, numbers, own, names, covariance, told, wanted, weighted
-        )
+        equations = StageEquations(loop, poses)
+        wanted = candidate_parameters(loop, poses.link)
+        told = classify_candidates(equations, start | {n: numbers[n] for n in names}, wanted)
+        own = list((parameters_by_link or {}).get(poses.link, [told.names[k] for k in sorted(told.base)]))
+        stage, numbers, covariance = identify_stage(equations, numbers, own, names, covariance, told, wanted, weighted)
         names = (*names, *own)
         found.append(stage)
-    return arm_fit(loop, numbers, start, names, covariance, found, "hierarchical")
+    return assemble_fit(loop, numbers, start, names, covariance, found, "hierarchical")
 
 
-def what_is_told(equations: Equations, numbers: Numbers, names: Sequence[str]) -> Identifiability:
+def classify_candidates(
+    equations: StageEquations, parameters: ParameterValues, names: Sequence[str]
+) -> Identifiability:
     """Classify the candidate parameters of a stage by identifiability, at given parameters."""
     loop = equations.loop
-    _, by, sensed = equations.at(numbers)
-    matrix = equations.whitening(sensed) @ equations.columns(by, names, own_d=True)
-    sizes = [size_of(loop, name) for name in names]
-    return identifiable(matrix.reshape(-1, len(names)), names, sizes, sigma=1.0)
+    _, by, sensed = equations.residual_and_jacobian(parameters)
+    matrix = equations.whitening_factors(sensed) @ equations.select_columns(by, names, own_d=True)
+    sizes = [expected_error(loop, name) for name in names]
+    return classify_scaled_parameters(matrix.reshape(-1, len(names)), names, sizes, sigma=1.0)
 
 
 def identify_stage(
-    equations: Equations, numbers: Numbers, own: list[str], earlier: tuple[str, ...],
-    covariance: np.ndarray, told: Identifiability, wanted: Sequence[str], weighted: bool = True,
-    near: bool = False,
-) -> tuple[Stage, Numbers, np.ndarray]:  # fmt: skip
+    equations: StageEquations, parameters: ParameterValues, own: list[str], earlier: tuple[str, ...],
+    covariance: np.ndarray, identifiability: Identifiability, candidates: Sequence[str], weighted: bool = True,
+    start_is_close: bool = False,
+) -> tuple[StageFit, ParameterValues, np.ndarray]:  # fmt: skip
     """Identify the parameters of one stage.
 
     Args:
         equations: equations of the stage.
-        numbers: all parameters, the start of the search.
+        parameters: all parameters, the start of the search.
         own: p parameters to identify.
         earlier: q parameters identified by earlier stages.
         covariance: (q, q) covariance of the earlier parameters.
-        told: identifiability of the candidate parameters.
-        wanted: the candidate parameters.
+        identifiability: identifiability of the candidate parameters.
+        candidates: the candidate parameters.
         weighted: as in `identify_arm`.
-        near: whether the start is close to the solution, so that no truncation is needed.
+        start_is_close: whether the start is close to the solution, so that no truncation is needed.
 
     Returns:
         (the stage, all parameters, covariance (q + p, q + p) of earlier and own parameters).
@@ -357,82 +360,82 @@ def identify_stage(
         InputError: there are too few poses.
     """
     poses, loop = equations.poses, equations.loop
-    if 2 * len(poses) < _FEWEST * len(own):
+    if 2 * len(poses) < _MIN_EQUATIONS_PER_PARAMETER * len(own):
         raise InputError(
             poses.source,
             f"{len(poses)} poses of {poses.link} are too few for {len(own)} parameters:"
-            f" record {len(own) * _FEWEST} or more, preferably 200",
+            f" record {len(own) * _MIN_EQUATIONS_PER_PARAMETER} or more, preferably 200",
         )
-    sizes = [size_of(loop, name) for name in own]
-    start = np.array([numbers[name] for name in own])
+    sizes = [expected_error(loop, name) for name in own]
+    start = np.array([parameters[name] for name in own])
     iterations, fit = 0, None
-    for _ in range(_ROUNDS if weighted else 1):
-        now = numbers if fit is None else numbers | dict(zip(own, fit.values.tolist(), strict=True))
-        whitening = equations.whitening(equations.at(now)[2])
+    for _ in range(_MAX_REWEIGHTINGS if weighted else 1):
+        now = parameters if fit is None else parameters | dict(zip(own, fit.values.tolist(), strict=True))
+        whitening = equations.whitening_factors(equations.residual_and_jacobian(now)[2])
         if not weighted:
             level = np.sqrt(np.mean(np.linalg.inv(whitening) ** 2) * 2.0)
             whitening = np.broadcast_to(np.eye(2) / level, whitening.shape)
 
         def residual(x, whitening=whitening):
-            error = equations.residual(numbers | dict(zip(own, x.tolist(), strict=True)))
+            error = equations.residual(parameters | dict(zip(own, x.tolist(), strict=True)))
             return (whitening @ error[..., None]).ravel()
 
         def jacobian(x, whitening=whitening):
-            _, by, _ = equations.at(numbers | dict(zip(own, x.tolist(), strict=True)))
-            return (whitening @ equations.columns(by, own)).reshape(-1, len(own))
+            _, by, _ = equations.residual_and_jacobian(parameters | dict(zip(own, x.tolist(), strict=True)))
+            return (whitening @ equations.select_columns(by, own)).reshape(-1, len(own))
 
         fit = least_squares(
             residual, start if fit is None else fit.values, own, sizes, sigma=1.0, jac=jacobian,
-            truncation=TRUNCATION if iterations == 0 and not near else None, select="none",
+            truncation=TRUNCATION_LEVELS if iterations == 0 and not start_is_close else None, select="none",
         )  # fmt: skip
         iterations = iterations or fit.iterations
     assert fit is not None
-    numbers = numbers | dict(zip(own, fit.values.tolist(), strict=True))
-    error, by, _ = equations.at(numbers)
-    inverse = np.linalg.pinv((whitening @ equations.columns(by, own)).reshape(-1, len(own)))
+    parameters = parameters | dict(zip(own, fit.values.tolist(), strict=True))
+    error, by, _ = equations.residual_and_jacobian(parameters)
+    inverse = np.linalg.pinv((whitening @ equations.select_columns(by, own)).reshape(-1, len(own)))
     chi = float(np.sqrt(np.mean(np.einsum("mij,mj->mi", whitening, error) ** 2)
                         * 2 * len(poses) / (2 * len(poses) - len(own))))  # fmt: skip
-    before = (whitening @ equations.columns(by, earlier)).reshape(2 * len(poses), len(earlier))
+    before = (whitening @ equations.select_columns(by, earlier)).reshape(2 * len(poses), len(earlier))
     through = -inverse @ before
     noise = max(chi, 1.0) ** 2 * inverse @ inverse.T
     corner = through @ covariance
     covariance = np.block([[covariance, corner.T], [corner, noise + corner @ through.T]])
-    columns = equations.columns(by, own).reshape(-1, len(own)) * sizes
+    columns = equations.select_columns(by, own).reshape(-1, len(own)) * sizes
     columns = columns / np.linalg.norm(columns, axis=0)
-    fixed = {name: _reason(told, name, loop) for name in wanted if name not in own}
-    stage = Stage(
-        poses.link, tuple(own), told, fixed, iterations, len(poses),
+    fixed = {name: _hold_reason(identifiability, name, loop) for name in candidates if name not in own}
+    stage = StageFit(
+        poses.link, tuple(own), identifiability, fixed, iterations, len(poses),
         float(np.sqrt(np.mean(error**2))), chi, float(np.linalg.cond(columns)),
     )  # fmt: skip
-    return stage, numbers, covariance
+    return stage, parameters, covariance
 
 
-def _reason(told: Identifiability, name: str, loop: Loop) -> str:
+def _hold_reason(identifiability: Identifiability, name: str, loop: CalibrationLoop) -> str:
     """Return a short reason why a candidate keeps its value."""
     kind, _, link = name.partition(".")
-    if link in loop.links[loop.moved + 1 :] and size_of(loop, name) == LABORATORY[unit_of(name)]:
-        if told.status[told.names.index(name)] != "unidentifiable":
+    if link in loop.links[loop.powered_count + 1 :] and expected_error(loop, name) == LABORATORY_ERRORS[unit_of(name)]:
+        if identifiability.status[identifiability.names.index(name)] != "unidentifiable":
             return "known more accurately from the laboratory"
-    column = told.combination[:, told.names.index(name)]
-    partners = [told.names[told.base[k]] for k in np.flatnonzero(column)]
-    if told.status[told.names.index(name)] == "unidentifiable" or not partners:
+    column = identifiability.combination[:, identifiability.names.index(name)]
+    partners = [identifiability.names[identifiability.base[k]] for k in np.flatnonzero(column)]
+    if identifiability.status[identifiability.names.index(name)] == "unidentifiable" or not partners:
         return "has no effect in any pose"
     return f"identifiable only together with {', '.join(partners)}"
 
 
-def arm_fit(loop, numbers, start, names, covariance, stages, method) -> ArmFit:
+def assemble_fit(loop, parameters, start, names, covariance, stages, method) -> ArmFit:
     """Assemble the fit; update the ball position if the innermost stage identified it."""
-    values = {name: numbers[name] for name in loop.names}
+    values = {name: parameters[name] for name in loop.names}
     calibrated = loop.with_values(values)
     first = loop.links[0]
     if f"p_xy.{first}" in names:
         flat = np.hypot(*loop.ball[:2])
         way = loop.ball[:2] / flat if flat > 0.0 else np.array([1.0, 0.0])
-        ball = np.array([*(way * numbers[f"p_xy.{first}"]),
-                         numbers[f"p_z.{first}"] ])  # fmt: skip
+        ball = np.array([*(way * parameters[f"p_xy.{first}"]),
+                         parameters[f"p_z.{first}"] ])  # fmt: skip
         calibrated = dataclasses.replace(calibrated, ball=ball)
     return ArmFit(
-        loop, calibrated, names, np.array([numbers[n] for n in names]), covariance, numbers, start,
+        loop, calibrated, names, np.array([parameters[n] for n in names]), covariance, parameters, start,
         tuple(stages), method,
     )  # fmt: skip
 
@@ -454,14 +457,14 @@ def identify_jointly(fit: ArmFit, stages: Sequence[Poses]) -> ArmFit:
         InputError: the search does not converge.
     """
     loop, names = fit.nominal, fit.names
-    order = stage_order(loop, stages)
-    equations = [Equations(loop, poses) for poses in order]
-    sizes = np.array([size_of(loop, name) for name in names])
-    base = dict(fit.numbers)
+    order = sort_stages(loop, stages)
+    equations = [StageEquations(loop, poses) for poses in order]
+    sizes = np.array([expected_error(loop, name) for name in names])
+    base = dict(fit.parameters)
     x = fit.values.copy()
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_REWEIGHTINGS):
         now = base | dict(zip(names, x.tolist(), strict=True))
-        whitenings = [e.whitening(e.at(now)[2]) for e in equations]
+        whitenings = [e.whitening_factors(e.residual_and_jacobian(now)[2]) for e in equations]
 
         def residual(u, whitenings=whitenings):
             at = base | dict(zip(names, (u * sizes).tolist(), strict=True))
@@ -474,7 +477,7 @@ def identify_jointly(fit: ArmFit, stages: Sequence[Poses]) -> ArmFit:
             at = base | dict(zip(names, (u * sizes).tolist(), strict=True))
             return scipy.sparse.vstack([
                 scipy.sparse.csr_matrix(
-                    (w @ e.columns(e.at(at)[1], names)).reshape(-1, len(names)) * sizes
+                    (w @ e.select_columns(e.residual_and_jacobian(at)[1], names)).reshape(-1, len(names)) * sizes
                 ) for e, w in zip(equations, whitenings, strict=True)
             ]).tocsr()  # fmt: skip
 
@@ -485,9 +488,7 @@ def identify_jointly(fit: ArmFit, stages: Sequence[Poses]) -> ArmFit:
             max_nfev=100,
         )  # fmt: skip
         if found.status <= 0:
-            raise InputError(
-                "joint identification", "does not converge; check the poses' residuals"
-            )
+            raise InputError("joint identification", "does not converge; check the poses' residuals")
         x = found.x * sizes
     matrix = jacobian(x / sizes).toarray() / sizes
     numbers = base | dict(zip(names, x.tolist(), strict=True))
@@ -506,18 +507,18 @@ def identify_jointly(fit: ArmFit, stages: Sequence[Poses]) -> ArmFit:
             stage, rms=float(np.sqrt(np.mean(error**2))),
             chi=float(np.sqrt(np.mean(parts[order.index(poses)] ** 2))), iterations=int(found.njev),
         ))  # fmt: skip
-    return arm_fit(loop, numbers, fit.start, names, scaled @ scaled.T, updated, "joint")
+    return assemble_fit(loop, numbers, fit.start_parameters, names, scaled @ scaled.T, updated, "joint")
 
 
-def check_poses(loop: Loop, poses: Poses) -> None:
+def check_poses(loop: CalibrationLoop, poses: Poses) -> None:
     """Raise an error for readings that are not finite, or for poses that are all the same."""
     bad = np.argwhere(~np.isfinite(poses.theta))
     if len(bad):
         row, column = bad[0]
-        name = f"angle.{loop.links[loop.moved + column]}"
+        name = f"angle.{loop.links[loop.powered_count + column]}"
         raise InputError(f"{poses.source}, column {name}, row {row + 1}", "is not a number")
     spread = np.ptp(poses.theta, axis=0)
-    if np.all(spread < _STILL):
+    if np.all(spread < _MIN_JOINT_RANGE):
         raise InputError(
             poses.source,
             f"contains only one pose of {poses.link}: no calibrator joint moves by more"
@@ -525,23 +526,23 @@ def check_poses(loop: Loop, poses: Poses) -> None:
         )
 
 
-def stage_residuals(loop: Loop, poses: Poses, numbers: Mapping[str, float]) -> np.ndarray:
+def stage_residuals(loop: CalibrationLoop, poses: Poses, parameters: Mapping[str, float]) -> np.ndarray:
     """Return the residuals of a stage in units of their standard deviations from sensor noise.
 
     Args:
         loop: the nominal chain.
         poses: poses of the stage.
-        numbers: parameters of a fit.
+        parameters: parameters of a fit.
 
     Returns:
         (M, 2) whitened residuals, of unit variance if sensor noise is the only error.
     """
-    equations = Equations(loop, poses)
-    error, _, sensed = equations.at(numbers)
-    return np.einsum("mij,mj->mi", equations.whitening(sensed), error)
+    equations = StageEquations(loop, poses)
+    error, _, sensed = equations.residual_and_jacobian(parameters)
+    return np.einsum("mij,mj->mi", equations.whitening_factors(sensed), error)
 
 
-def machine_with_loop(machine: Machine, nominal: Loop, loop: Loop) -> Machine:
+def machine_with_loop(machine: Machine, nominal: CalibrationLoop, loop: CalibrationLoop) -> Machine:
     """Return a machine with the link positions and joint axes of a chain.
 
     The joint zeros of the machine are kept; a changed offset in the chain is a sensor error.
@@ -558,12 +559,12 @@ def machine_with_loop(machine: Machine, nominal: Loop, loop: Loop) -> Machine:
     rest = nominal.values[:, 0]
     points, ways = joint_axes(link_chain(loop.values), rest[None])
     old, old_ways = joint_axes(link_chain(nominal.values), rest[None])
-    tip = forward(link_chain(loop.values), rest[None]).position[0]
+    tip = chain_poses(link_chain(loop.values), rest[None]).position[0]
     origin: dict[str, np.ndarray] = {"world": np.zeros(3)}
     before: dict[str, np.ndarray] = {"world": np.zeros(3)}
     places = {machine.link_of(joint): k for k, joint in enumerate(loop.joints)}
     changes: dict[str, object] = {}
-    for name in _in_tree_order(machine):
+    for name in _sort_links_by_depth(machine):
         link = machine.links[name]
         before[name] = before[link.parent] + np.array(link.position)
         origin[name] = origin[link.parent] + np.array(link.position)
@@ -579,7 +580,7 @@ def machine_with_loop(machine: Machine, nominal: Loop, loop: Loop) -> Machine:
         changes[f"links.{name}.joint.axis"] = axis
     last = machine.link_of(loop.joints[-1])
     for path, value in changes.items():
-        machine = changed(machine, path, value)
+        machine = with_value(machine, path, value)
     closures = {}
     for name, closure in machine.closures.items():
         ends = [closure.a, closure.b]
@@ -592,10 +593,10 @@ def machine_with_loop(machine: Machine, nominal: Loop, loop: Loop) -> Machine:
                 ends[1 - k] = other.model_copy(update={"position": ball})
         closures[name] = Closure(a=ends[0], b=ends[1])
     machine = machine.model_copy(update={"closures": closures})
-    return _with_tip(machine, before, origin)
+    return _move_tip(machine, before, origin)
 
 
-def _in_tree_order(machine: Machine) -> list[str]:
+def _sort_links_by_depth(machine: Machine) -> list[str]:
     ordered, waiting = [], list(machine.links)
     while waiting:
         for name in list(waiting):
@@ -605,7 +606,7 @@ def _in_tree_order(machine: Machine) -> list[str]:
     return ordered
 
 
-def _with_tip(machine: Machine, before: Mapping, origin: Mapping) -> Machine:
+def _move_tip(machine: Machine, before: Mapping, origin: Mapping) -> Machine:
     """Move the arm's tip together with the link that is attached to it."""
     if machine.arm is None:
         return machine
@@ -614,7 +615,7 @@ def _with_tip(machine: Machine, before: Mapping, origin: Mapping) -> Machine:
         old = before[name] - before[link.parent]
         if link.parent == tip.link and np.allclose(old, tip.position, atol=1e-9):
             new = tuple(map(float, origin[name] - origin[link.parent]))
-            return changed(machine, "arm.tip.position", new)
+            return with_value(machine, "arm.tip.position", new)
     return machine
 
 
@@ -635,17 +636,17 @@ def calibrated_machine(machine: Machine, fit: ArmFit, stages: Sequence[Poses]) -
     made = machine_with_loop(machine, nominal, loop)
     errors = dict(made.sensor_errors)
 
-    def put(channel: str, offset: float) -> None:
+    def add_offset(channel: str, offset: float) -> None:
         known = errors.get(channel, SensorError())
         errors[channel] = known.model_copy(update={"offset": known.offset + offset})
 
     for k, (link, channel) in enumerate(zip(loop.links, loop.channels, strict=True)):
-        if k >= loop.moved and f"offset.{link}" in fit.names:
-            put(channel, float(loop.signs[k] * (nominal.values[k, 0] - loop.values[k, 0])))
+        if k >= loop.powered_count and f"offset.{link}" in fit.names:
+            add_offset(channel, float(loop.signs[k] * (nominal.values[k, 0] - loop.values[k, 0])))
         held = f"held.{link}"
-        if k < loop.moved and held in fit.names:
+        if k < loop.powered_count and held in fit.names:
             seen = [p for p in stages if p.link == loop.links[k - 1] and link in p.manipulator]
             if seen:
                 shown = float(np.mean(seen[0].manipulator[link])) + nominal.values[k, 0]
-                put(channel, float(loop.signs[k] * (shown - fit.value(held))))
+                add_offset(channel, float(loop.signs[k] * (shown - fit.value(held))))
     return made.model_copy(update={"sensor_errors": errors})

@@ -7,22 +7,26 @@ from pathlib import Path
 import numpy as np
 
 from hydrotele.calibrate.arm_poses import Poses
-from hydrotele.calibrate.linkage import Strokes
-from hydrotele.calibrate.loop import Loop
+from hydrotele.calibrate.linkage import AxisStrokes
+from hydrotele.calibrate.loop import CalibrationLoop
 from hydrotele.core.errors import InputError
 from hydrotele.logs.log import Log, load_logs
-from hydrotele.machine.machine import IDEAL, Machine, noise_rms, sensor_set
+from hydrotele.machine.machine import IDEAL_SENSORS, Machine, get_sensors, noise_rms
 
-POSES = 300
+MAX_POSES = 300
 """Maximum number of poses taken from a log, evenly spaced; Khoshzaban's figures show 300 to 400."""
 
-_SETTLED = np.radians(1.0)  # maximum drift of a held link while another link moves
-_LINEAR = 2.0e-3 / math.sqrt(3.0)  # m, of a linear transducer, K 2.5
-_RESOLVER = np.radians(0.1) / math.sqrt(3.0)  # default of a sensor without stated accuracy, K 2.5
+_MAX_HELD_DRIFT = np.radians(1.0)  # maximum drift of a held link while another link moves
+_TRANSDUCER_DEVIATION = 2.0e-3 / math.sqrt(3.0)  # m, of a linear transducer, K 2.5
+_RESOLVER_DEVIATION = np.radians(0.1) / math.sqrt(3.0)  # default of a sensor without stated accuracy, K 2.5
 
 
 def read_stages(
-    path: Path, machine: Machine, loop: Loop, poses: int = POSES, accuracy: float | None = None
+    path: Path,
+    machine: Machine,
+    loop: CalibrationLoop,
+    poses: int = MAX_POSES,
+    accuracy: float | None = None,
 ) -> list[Poses]:
     """Read the logs of a folder, one per moving link.
 
@@ -40,12 +44,16 @@ def read_stages(
     Raises:
         InputError: a channel is missing, the machine differs, or the moving link is unknown.
     """
-    logs = load_logs(path, required=loop.channels[loop.moved :])
-    return [stage_of(log, machine, loop, poses, accuracy) for log in logs]
+    logs = load_logs(path, required=loop.channels[loop.powered_count :])
+    return [log_to_poses(log, machine, loop, poses, accuracy) for log in logs]
 
 
-def stage_of(
-    log: Log, machine: Machine, loop: Loop, poses: int = POSES, accuracy: float | None = None
+def log_to_poses(
+    log: Log,
+    machine: Machine,
+    loop: CalibrationLoop,
+    poses: int = MAX_POSES,
+    accuracy: float | None = None,
 ) -> Poses:
     """Convert one log to the poses of a stage.
 
@@ -64,9 +72,7 @@ def stage_of(
     """
     of = log.metadata.get("machine", machine.name)
     if of != machine.name:
-        message = (
-            f"is a log of machine {of}, not of {machine.name}: name the machine with --machine"
-        )
+        message = f"is a log of machine {of}, not of {machine.name}: name the machine with --machine"
         raise InputError(log.source, message)
     rows = np.arange(len(log))
     if "valid" in log:
@@ -74,31 +80,31 @@ def stage_of(
     if len(rows) < 2:
         raise InputError(f"{log.source}, column valid", "leaves no rows: mark valid rows with 1")
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(poses, len(rows))).round().astype(int))]
-    link = moving_link(log, loop)
-    sensed = loop.channels[loop.moved :]
-    theta = np.stack([log[name][rows] for name in sensed], axis=1) * loop.signs[loop.moved :]
+    link = find_moving_link(log, loop)
+    sensed = loop.channels[loop.powered_count :]
+    theta = np.stack([log[name][rows] for name in sensed], axis=1) * loop.signs[loop.powered_count :]
     own = {
         name: log[channel][rows] * sign
         for name, channel, sign in zip(loop.links, loop.channels, loop.signs, strict=True)
-        if name in loop.links[: loop.moved] and channel in log
+        if name in loop.links[: loop.powered_count] and channel in log
     }
-    sigma = np.array([_deviation(log, machine, name, accuracy) for name in sensed])
-    others = [_deviation(log, machine, f"angle.{name}", accuracy) for name in own]
+    sigma = np.array([_angle_deviation(log, machine, name, accuracy) for name in sensed])
+    others = [_angle_deviation(log, machine, f"angle.{name}", accuracy) for name in own]
     return Poses(link, theta, sigma, own, max(others, default=0.0), log.source, rows)
 
 
-def _deviation(log: Log, machine: Machine, channel: str, accuracy: float | None) -> float:
+def _angle_deviation(log: Log, machine: Machine, channel: str, accuracy: float | None) -> float:
     """Return the standard deviation of a channel's readings [rad]."""
     if accuracy is not None:
         return accuracy
     name = log.metadata.get("sensors", "")
-    if name in machine.sensors and name != IDEAL:
-        known = noise_rms(machine, sensor_set(machine, name), channel)
-        return known or _RESOLVER
-    return _RESOLVER
+    if name in machine.sensors and name != IDEAL_SENSORS:
+        known = noise_rms(machine, get_sensors(machine, name), channel)
+        return known or _RESOLVER_DEVIATION
+    return _RESOLVER_DEVIATION
 
 
-def moving_link(log: Log, loop: Loop) -> str:
+def find_moving_link(log: Log, loop: CalibrationLoop) -> str:
     """Return the name of the powered link that moves in a log while the others are held.
 
     It is found from joint angles, else from cylinder lengths or commands, else from the file name.
@@ -116,11 +122,11 @@ def moving_link(log: Log, loop: Loop) -> str:
     >>> from hydrotele.machine.machine_file import load_machine
     >>> from hydrotele.calibrate.loop import loop_of
     >>> log = Log(np.arange(3.0), {"angle.boom": np.array([0.1, 0.3, 0.6])}, {"angle.boom": "rad"})
-    >>> moving_link(log, loop_of(load_machine("calibrator")))
+    >>> find_moving_link(log, loop_of(load_machine("calibrator")))
     'boom'
     """
-    links = loop.links[: loop.moved]
-    for kind, still in (("angle", _SETTLED), ("length", 0.02), ("command", 0.1)):
+    links = loop.links[: loop.powered_count]
+    for kind, still in (("angle", _MAX_HELD_DRIFT), ("length", 0.02), ("command", 0.1)):
         span = {n: float(np.ptp(log[f"{kind}.{n}"])) for n in links if f"{kind}.{n}" in log}
         moving = [name for name, size in span.items() if size > still]
         if len(moving) > 1 and kind == "angle":
@@ -140,7 +146,7 @@ def moving_link(log: Log, loop: Loop) -> str:
     raise InputError(log.source, message)
 
 
-def held_out(stages: Sequence[Poses], every: int = 5) -> tuple[list[Poses], list[Poses]]:
+def split_poses(stages: Sequence[Poses], every: int = 5) -> tuple[list[Poses], list[Poses]]:
     """Split the poses of each stage into a fitting set and a validation set.
 
     Args:
@@ -153,11 +159,11 @@ def held_out(stages: Sequence[Poses], every: int = 5) -> tuple[list[Poses], list
     if every <= 1:
         return list(stages), []
     judged = [np.arange(len(p)) % every == every // 2 for p in stages]
-    return ([p.only(~j) for p, j in zip(stages, judged, strict=True)],
-            [p.only(j) for p, j in zip(stages, judged, strict=True)])  # fmt: skip
+    return ([p.select(~j) for p, j in zip(stages, judged, strict=True)],
+            [p.select(j) for p, j in zip(stages, judged, strict=True)])  # fmt: skip
 
 
-def strokes_of(log: Log, machine: Machine, axes: Sequence[str], poses: int = 0) -> list[Strokes]:
+def extract_strokes(log: Log, machine: Machine, axes: Sequence[str], poses: int = 0) -> list[AxisStrokes]:
     """Return joint angles and cylinder displacements of the axes that move in a log.
 
     Args:
@@ -178,8 +184,8 @@ def strokes_of(log: Log, machine: Machine, axes: Sequence[str], poses: int = 0) 
         if not all(c in log for c in channels) or np.ptp(log[channels[0]][rows]) < np.radians(5.0):
             continue
         angle, length = (log[c][rows] for c in channels)
-        sigma = _deviation(log, machine, channels[0], None)
-        found.append(Strokes(
+        sigma = _angle_deviation(log, machine, channels[0], None)
+        found.append(AxisStrokes(
             axis, angle, length, sigma, _length_deviation(log, machine, channels[1]), "measured",
             log.source,
         ))  # fmt: skip
@@ -189,6 +195,6 @@ def strokes_of(log: Log, machine: Machine, axes: Sequence[str], poses: int = 0) 
 def _length_deviation(log: Log, machine: Machine, channel: str) -> float:
     """Return the standard deviation of a displacement reading [m]."""
     name = log.metadata.get("sensors", "")
-    if name in machine.sensors and name != IDEAL:
-        return noise_rms(machine, sensor_set(machine, name), channel) or _LINEAR
-    return _LINEAR
+    if name in machine.sensors and name != IDEAL_SENSORS:
+        return noise_rms(machine, get_sensors(machine, name), channel) or _TRANSDUCER_DEVIATION
+    return _TRANSDUCER_DEVIATION

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.calibrate.loop import Loop, frame_of
+from hydrotele.calibrate.loop import CalibrationLoop, frame_after_links
 
 
 class Drift(NamedTuple):
@@ -52,23 +52,24 @@ class Poses:
         """Return the number of poses M."""
         return len(self.theta)
 
-    def only(self, kept: np.ndarray) -> "Poses":
+    def select(self, index: np.ndarray) -> "Poses":
         """Return the poses selected by an index array or mask."""
         rows = np.arange(len(self)) if self.rows is None else self.rows
         drift = self.drift and Drift(
-            {name: values[kept] for name, values in self.drift.held.items()}, self.drift.ball[kept]
+            {name: values[index] for name, values in self.drift.held.items()},
+            self.drift.ball[index],
         )
-        sigma = self.sigma[kept] if self.sigma.ndim == 2 else self.sigma
+        sigma = self.sigma[index] if self.sigma.ndim == 2 else self.sigma
         return replace(
-            self, theta=self.theta[kept], sigma=sigma, rows=rows[kept], drift=drift,
-            manipulator={name: values[kept] for name, values in self.manipulator.items()},
+            self, theta=self.theta[index], sigma=sigma, rows=rows[index], drift=drift,
+            manipulator={name: values[index] for name, values in self.manipulator.items()},
         )  # fmt: skip
 
 
-_TREND = 2  # polynomial degree over the poses: leakage decreases while pressures settle
+_TREND_DEGREE = 2  # polynomial degree over the poses: leakage decreases while pressures settle
 
 
-def with_drift(loop: Loop, poses: Poses) -> Poses:
+def add_drift(loop: CalibrationLoop, poses: Poses) -> Poses:
     """Add the drift of held links, a smooth trend of the manipulator's own sensors, to poses.
 
     Only changes of the readings are used, so sensor offsets have no effect. The ball displacement
@@ -84,7 +85,7 @@ def with_drift(loop: Loop, poses: Poses) -> Poses:
     place = loop.links.index(poses.link)
     u = np.linspace(-1.0, 1.0, len(poses))
     trends = {
-        name: np.polynomial.Polynomial.fit(u, values, _TREND)(u) - float(np.mean(values))
+        name: np.polynomial.Polynomial.fit(u, values, _TREND_DEGREE)(u) - float(np.mean(values))
         for name, values in poses.manipulator.items() if name != poses.link and len(poses) > 10
     }  # fmt: skip
     if not trends:
@@ -94,7 +95,7 @@ def with_drift(loop: Loop, poses: Poses) -> Poses:
         if name in trends:
             middle = float(np.mean(poses.manipulator[name])) + loop.values[k, 0]
             theta[:, k] = middle + trends[name]
-    origin, turn = frame_of(loop, place, theta)
+    origin, turn = frame_after_links(loop, place, theta)
     seen = np.einsum("mji,mj->mi", turn, loop.ball - origin)
     middle = seen.mean(axis=0)
     away = middle[:2] / np.hypot(*middle[:2])

@@ -15,32 +15,32 @@ import scipy.stats
 
 from hydrotele.calibrate.arm import (
     ArmFit,
-    Equations,
-    arm_fit,
-    candidates,
+    StageEquations,
+    assemble_fit,
+    candidate_parameters,
     check_poses,
+    classify_candidates,
     identify_stage,
-    stage_order,
-    start_numbers,
-    what_is_told,
+    initial_parameters,
+    sort_stages,
 )
 from hydrotele.calibrate.arm_poses import Poses
-from hydrotele.calibrate.loop import Loop, ball_from
+from hydrotele.calibrate.loop import CalibrationLoop, ball_position_and_rates
 
-FALSE_ALARM = 0.005
+FALSE_ALARM_PROBABILITY = 0.005
 """Probability of finding a region in a complete measurement without corruption."""
 
-_ROUNDS = 8
-_CORE = 0.6  # fraction of the poses used by the first, robust fit of a stage
-_EXCESS = 2.0  # squared residual over its expected value, above which a pose adds to a region
-_FLOOR = 1.0e-4  # m, as in `arm`
-_FREE = 1.0e3  # prior standard deviation over noise of the third equation's unknown zero
-_FAR = 16.0  # squared residual over its typical value, above which a pose is an outlier
-_RULED_OUT = 20.0  # chi-square difference that excludes a joint: probability of 1 in 20 000
-_MOST = 0.7  # maximum fraction of a stage's poses that may be left out
+_MAX_ROUNDS = 8
+_CONSISTENT_FRACTION = 0.6  # fraction of the poses used by the first, robust fit of a stage
+_MIN_EXCESS_RATIO = 2.0  # squared residual over its expected value, above which a pose adds to a region
+_MIN_DEVIATION = 1.0e-4  # m, as in `arm`
+_ANGLE_ZERO_STD = 1.0e3  # prior standard deviation over noise of the third equation's unknown zero
+_OUTLIER_RATIO = 16.0  # squared residual over its typical value, above which a pose is an outlier
+_MAX_CHI2_DIFFERENCE = 20.0  # chi-square difference that excludes a joint: probability of 1 in 20 000
+_MAX_REMOVED_FRACTION = 0.7  # maximum fraction of a stage's poses that may be left out
 
 
-class Region(NamedTuple):
+class CorruptedRegion(NamedTuple):
     """Sequence of poses of a stage with corrupted readings.
 
     Attributes:
@@ -63,7 +63,7 @@ class Region(NamedTuple):
     possible: tuple[str, ...]
 
 
-class Cleaned(NamedTuple):
+class CleanedFit(NamedTuple):
     """Result of an identification without corrupted poses.
 
     Attributes:
@@ -74,33 +74,36 @@ class Cleaned(NamedTuple):
 
     fit: ArmFit
     stages: list[Poses]
-    regions: list[Region]
+    regions: list[CorruptedRegion]
 
 
-class Misfit(NamedTuple):
+class WhitenedResiduals(NamedTuple):
     """Whitened equations of all poses of a stage, of unit variance if only sensor noise acts.
 
     Attributes:
         rows: (M, E) residuals; E is 3 with the moving joint's sensor, otherwise 2.
-        sensed: (M, E, S) derivatives by the calibrator's readings [1/rad].
-        own: (M, E) derivatives by the moving joint's reading [1/rad], zero for E = 2.
+        by_readings: (M, E, S) derivatives by the calibrator's readings [1/rad].
+        by_own_reading: (M, E) derivatives by the moving joint's reading [1/rad], zero for E = 2.
     """
 
     rows: np.ndarray
-    sensed: np.ndarray
-    own: np.ndarray
+    by_readings: np.ndarray
+    by_own_reading: np.ndarray
 
 
-class Known(NamedTuple):
+class ParameterUncertainty(NamedTuple):
     """Names of p parameters and their covariance (p, p)."""
 
     names: tuple[str, ...]
     covariance: np.ndarray
 
 
-def misfit(
-    loop: Loop, poses: Poses, numbers: Mapping[str, float], known: Known | None = None
-) -> Misfit:
+def whitened_residuals(
+    loop: CalibrationLoop,
+    poses: Poses,
+    parameters: Mapping[str, float],
+    known: ParameterUncertainty | None = None,
+) -> WhitenedResiduals:
     """Return the whitened residuals of a stage, with the angle equation if it is measured.
 
     The angle equation is not part of the identification. Residuals due to parameter uncertainty
@@ -109,23 +112,23 @@ def misfit(
     Args:
         loop: the nominal chain.
         poses: poses of the stage.
-        numbers: parameters of a fit.
+        parameters: parameters of a fit.
         known: uncertainty of its parameters; None to take them as exact.
 
     Returns:
         Residuals and derivatives, whitened.
     """
-    equations = Equations(loop, poses)
-    error, slopes, sensed = equations.at(numbers)
+    equations = StageEquations(loop, poses)
+    error, slopes, sensed = equations.residual_and_jacobian(parameters)
     own = np.zeros((len(poses), 2))
     spread = sensed * poses.sigma[..., None, :]
-    covariance = spread @ spread.transpose(0, 2, 1) + _FLOOR**2 * np.eye(2)
+    covariance = spread @ spread.transpose(0, 2, 1) + _MIN_DEVIATION**2 * np.eye(2)
     if poses.link in poses.manipulator:
-        seen, theta = equations.seen(numbers)
-        s, by = ball_from(seen, equations.place, theta)
+        seen, theta = equations.chain_and_angles(parameters)
+        s, by = ball_position_and_rates(seen, equations.place, theta)
         reach = np.hypot(s[:, 0], s[:, 1])
         around = np.stack([-s[:, 1], s[:, 0]], 1) / reach[:, None]
-        by_sensed = by[:, :, loop.moved - equations.place :, 0]
+        by_sensed = by[:, :, loop.powered_count - equations.place :, 0]
         angle = np.unwrap(np.arctan2(s[:, 1], s[:, 0]) + poses.manipulator[poses.link])
         third = reach * angle - (poses.drift.ball[:, 2] if poses.drift else 0.0)
         third = reach.mean() * (third / reach)
@@ -137,28 +140,30 @@ def misfit(
         sensed = np.concatenate([sensed, turn[:, None]], axis=1)
         own = np.stack([0.0 * reach, 0.0 * reach, reach], axis=1)
         spread = sensed * poses.sigma[..., None, :]
-        covariance = spread @ spread.transpose(0, 2, 1) + _FLOOR**2 * np.eye(3)
+        covariance = spread @ spread.transpose(0, 2, 1) + _MIN_DEVIATION**2 * np.eye(3)
         covariance[:, 2, 2] += (reach * poses.manipulator_sigma) ** 2
     whitening = np.linalg.cholesky(np.linalg.inv(covariance)).transpose(0, 2, 1)
     rows = (whitening @ error[..., None])[..., 0]
     if known and len(known.names):
-        rows = _absorbed(rows, whitening @ equations.columns(slopes, known.names), known.covariance)
-    return Misfit(rows, whitening @ sensed, (whitening @ own[..., None])[..., 0])
+        rows = _remove_parameter_errors(
+            rows, whitening @ equations.select_columns(slopes, known.names), known.covariance
+        )
+    return WhitenedResiduals(rows, whitening @ sensed, (whitening @ own[..., None])[..., 0])
 
 
-def _absorbed(rows: np.ndarray, slopes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+def _remove_parameter_errors(rows: np.ndarray, slopes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Return residuals (M, E) after parameters moved within their covariance, without outliers."""
     root = np.linalg.cholesky(covariance + 1.0e-18 * np.eye(len(covariance)))
     scaled = slopes @ root
     if rows.shape[1] == 3:  # the zero of the third equation is unknown
         third = np.zeros((*rows.shape, 1))
-        third[:, 2, 0] = _FREE
+        third[:, 2, 0] = _ANGLE_ZERO_STD
         scaled = np.concatenate([scaled, third], axis=2)
     count = scaled.shape[2]
     left, usual = rows, scipy.stats.chi2.median(rows.shape[1])
     for _ in range(4):
         square = np.sum(left**2, axis=1)
-        near = square < _FAR * max(1.0, float(np.median(square)) / usual)
+        near = square < _OUTLIER_RATIO * max(1.0, float(np.median(square)) / usual)
         matrix = scaled[near].reshape(-1, count)
         move = np.linalg.solve(np.eye(count) + matrix.T @ matrix, -matrix.T @ rows[near].ravel())
         left = rows + scaled @ move
@@ -166,10 +171,10 @@ def _absorbed(rows: np.ndarray, slopes: np.ndarray, covariance: np.ndarray) -> n
 
 
 def find_regions(
-    loop: Loop, poses: Poses, numbers: Mapping[str, float], total: int,
-    false_alarm: float = FALSE_ALARM,
-    known: Known | None = None,
-) -> list[Region]:  # fmt: skip
+    loop: CalibrationLoop, poses: Poses, parameters: Mapping[str, float], total: int,
+    false_alarm: float = FALSE_ALARM_PROBABILITY,
+    known: ParameterUncertainty | None = None,
+) -> list[CorruptedRegion]:  # fmt: skip
     """Find sequences of poses whose residuals are too large to be sensor noise.
 
     The cumulative sum of squared residuals less twice their expected value is followed along the
@@ -179,7 +184,7 @@ def find_regions(
     Args:
         loop: the nominal chain.
         poses: all poses of a stage.
-        numbers: parameters of a fit.
+        parameters: parameters of a fit.
         total: number of poses of the whole measurement.
         false_alarm: probability of a region in a measurement without corruption.
         known: uncertainty of the fit's parameters.
@@ -189,34 +194,36 @@ def find_regions(
 
     Source: Karlin and Altschul 1990 (high-scoring segments).
     """
-    found = misfit(loop, poses, numbers, known)
+    found = whitened_residuals(loop, poses, parameters, known)
     square, freedom = np.sum(found.rows**2, axis=1), found.rows.shape[1]
     usual = max(1.0, float(np.median(square)) / scipy.stats.chi2.median(freedom))
-    score = square / usual - _EXCESS * freedom
+    score = square / usual - _MIN_EXCESS_RATIO * freedom
     rate = scipy.optimize.brentq(
-        lambda r: -0.5 * freedom * np.log1p(-2.0 * r) - _EXCESS * freedom * r, 0.05, 0.4999
+        lambda r: -0.5 * freedom * np.log1p(-2.0 * r) - _MIN_EXCESS_RATIO * freedom * r,
+        0.05,
+        0.4999,
     )
     threshold = np.log(total / false_alarm) / rate
     regions = []
-    for first, last in _rises(score, threshold):
-        regions.append(_blamed(loop, poses, found, first, last))
+    for first, last in _find_high_segments(score, threshold):
+        regions.append(_assign_joint(loop, poses, found, first, last))
     return regions
 
 
-def _rises(score: np.ndarray, threshold: float) -> list[tuple[int, int]]:
+def _find_high_segments(score: np.ndarray, threshold: float) -> list[tuple[int, int]]:
     """Return disjoint index ranges with the largest sums, each above a threshold."""
     found: list[tuple[int, int]] = []
     waiting = [(0, len(score))]
     while waiting:
         low, high = waiting.pop()
-        best, first, last = _largest(score[low:high])
+        best, first, last = _max_sum_segment(score[low:high])
         if best > threshold:
             found.append((low + first, low + last))
             waiting += [(low, low + first), (low + last + 1, high)]
     return sorted(found)
 
 
-def _largest(score: np.ndarray) -> tuple[float, int, int]:
+def _max_sum_segment(score: np.ndarray) -> tuple[float, int, int]:
     """Return sum, first and last index of the contiguous range with the largest sum."""
     best, first, last = -np.inf, 0, -1
     run, begin = 0.0, 0
@@ -229,16 +236,18 @@ def _largest(score: np.ndarray) -> tuple[float, int, int]:
     return best, first, last
 
 
-def _blamed(loop: Loop, poses: Poses, found: Misfit, first: int, last: int) -> Region:
+def _assign_joint(
+    loop: CalibrationLoop, poses: Poses, found: WhitenedResiduals, first: int, last: int
+) -> CorruptedRegion:
     """Return a region with the joint whose sensor error explains most of its residuals."""
     inside = slice(first, last + 1)
     rows = found.rows[inside]
     whole = float(np.sum(rows**2))
     explained, errors = {}, {}
-    names = list(loop.links[loop.moved :])
-    slopes = {name: found.sensed[inside, :, k] for k, name in enumerate(names)}
+    names = list(loop.links[loop.powered_count :])
+    slopes = {name: found.by_readings[inside, :, k] for k, name in enumerate(names)}
     if rows.shape[1] == 3:
-        slopes[""] = found.own[inside]
+        slopes[""] = found.by_own_reading[inside]
     for name, slope in slopes.items():
         length = np.maximum(np.sum(slope**2, axis=1), 1.0e-12)
         error = np.sum(slope * rows, axis=1) / length
@@ -246,18 +255,18 @@ def _blamed(loop: Loop, poses: Poses, found: Misfit, first: int, last: int) -> R
         errors[name] = error
     left = {name: whole * (1.0 - part) for name, part in explained.items()}
     best = min((n for n in left if n), key=lambda name: left[name])
-    if left.get("", np.inf) < left[best] - _RULED_OUT:
+    if left.get("", np.inf) < left[best] - _MAX_CHI2_DIFFERENCE:
         best = ""  # only if clear, because the calibrator is under test
     usual = max(1.0, left[best] / max(1, rows.size - len(rows)))
     order = sorted(left, key=lambda name: left[name])
-    possible = tuple(n for n in order if n and left[n] - left[best] < _RULED_OUT * usual)
+    possible = tuple(n for n in order if n and left[n] - left[best] < _MAX_CHI2_DIFFERENCE * usual)
     size = float(np.sqrt(np.mean(errors[best] ** 2)))
-    return Region(poses.link, first, last, best, size, explained[best], possible if best else ("",))
+    return CorruptedRegion(poses.link, first, last, best, size, explained[best], possible if best else ("",))
 
 
 def identify_without_bad_data(
-    loop: Loop, stages: Sequence[Poses], false_alarm: float = FALSE_ALARM
-) -> Cleaned:
+    loop: CalibrationLoop, stages: Sequence[Poses], false_alarm: float = FALSE_ALARM_PROBABILITY
+) -> CleanedFit:
     """Identify link by link, leaving out the corrupted regions of each link before the next one.
 
     A stage with regions is refitted to its most consistent poses first, so that a fit to corrupted
@@ -275,66 +284,66 @@ def identify_without_bad_data(
     Raises:
         InputError: as in `identify_arm`.
     """
-    order = stage_order(loop, stages)
+    order = sort_stages(loop, stages)
     for poses in order:
         check_poses(loop, poses)
-    numbers = start_numbers(loop, order)
+    numbers = initial_parameters(loop, order)
     start = dict(numbers)
     total = sum(map(len, order))
     names: tuple[str, ...] = ()
     covariance = np.zeros((0, 0))
     parts, kept_stages, regions = [], [], []
     for poses in order:
-        wanted = candidates(loop, poses.link)
+        wanted = candidate_parameters(loop, poses.link)
         at = start | {n: numbers[n] for n in names}
-        told = what_is_told(Equations(loop, poses), at, wanted)
+        told = classify_candidates(StageEquations(loop, poses), at, wanted)
         own = [told.names[k] for k in sorted(told.base)]
 
         def solve(kept, near, numbers=numbers, poses=poses, own=own, told=told,
                   wanted=wanted, names=names, covariance=covariance):  # fmt: skip
             return identify_stage(
-                Equations(loop, poses.only(kept)), numbers, own, names, covariance, told, wanted,
-                near=near,
+                StageEquations(loop, poses.select(kept)), numbers, own, names, covariance, told, wanted,
+                start_is_close=near,
             )  # fmt: skip
 
         kept = np.ones(len(poses), bool)
         found = solve(kept, False)
         every = (*names, *own)
-        inside = find_regions(loop, poses, found[1], total, false_alarm, Known(every, found[2]))
+        inside = find_regions(loop, poses, found[1], total, false_alarm, ParameterUncertainty(every, found[2]))
         if inside:
-            found, inside = _settled(loop, poses, solve, found, total, false_alarm, every, own)
-        kept = _outside(inside, len(poses))
+            found, inside = _iterate_regions(loop, poses, solve, found, total, false_alarm, every, own)
+        kept = _mask_regions(inside, len(poses))
         found = solve(kept, True) if inside else found
         stage, numbers, covariance = found
         names = (*names, *own)
         parts.append(stage)
-        kept_stages.append(poses.only(kept))
+        kept_stages.append(poses.select(kept))
         regions += inside
-    fit = arm_fit(loop, numbers, start, names, covariance, parts, "hierarchical")
-    return Cleaned(fit, kept_stages, regions)
+    fit = assemble_fit(loop, numbers, start, names, covariance, parts, "hierarchical")
+    return CleanedFit(fit, kept_stages, regions)
 
 
-def _settled(loop, poses, solve, found, total, false_alarm, names, own):
+def _iterate_regions(loop, poses, solve, found, total, false_alarm, names, own):
     """Repeat fit and search, starting from the most consistent poses, until regions are stable."""
     for _ in range(3):
-        known = Known(names, found[2])
-        square = np.sum(misfit(loop, poses, found[1], known).rows ** 2, axis=1)
+        known = ParameterUncertainty(names, found[2])
+        square = np.sum(whitened_residuals(loop, poses, found[1], known).rows ** 2, axis=1)
         width = max(5, len(poses) // 40)
         smooth = np.convolve(np.pad(square, width, mode="edge"), np.ones(2 * width + 1), "valid")
-        core = smooth <= np.quantile(smooth, max(_CORE, min(1.0, 3.0 * len(own) / len(poses))))
+        core = smooth <= np.quantile(smooth, max(_CONSISTENT_FRACTION, min(1.0, 3.0 * len(own) / len(poses))))
         found = solve(core, True)
-    inside: list[Region] = []
-    for _ in range(_ROUNDS):
-        fresh = find_regions(loop, poses, found[1], total, false_alarm, Known(names, found[2]))
-        kept = _outside(fresh, len(poses))
-        if [r[:3] for r in fresh] == [r[:3] for r in inside] or kept.mean() < 1.0 - _MOST:
+    inside: list[CorruptedRegion] = []
+    for _ in range(_MAX_ROUNDS):
+        fresh = find_regions(loop, poses, found[1], total, false_alarm, ParameterUncertainty(names, found[2]))
+        kept = _mask_regions(fresh, len(poses))
+        if [r[:3] for r in fresh] == [r[:3] for r in inside] or kept.mean() < 1.0 - _MAX_REMOVED_FRACTION:
             break
         inside = fresh
         found = solve(kept, True)
     return found, inside
 
 
-def _outside(regions: Sequence[Region], count: int) -> np.ndarray:
+def _mask_regions(regions: Sequence[CorruptedRegion], count: int) -> np.ndarray:
     """Return a mask (count,) of the poses outside all regions of calibrator joints."""
     kept = np.ones(count, bool)
     for region in regions:
@@ -343,18 +352,18 @@ def _outside(regions: Sequence[Region], count: int) -> np.ndarray:
     return kept
 
 
-def predicted_readings(loop: Loop, poses: Poses, numbers: Mapping[str, float]) -> np.ndarray:
+def predict_readings(loop: CalibrationLoop, poses: Poses, parameters: Mapping[str, float]) -> np.ndarray:
     """Return the expected reading of each calibrator sensor, given the other sensors' readings.
 
     Args:
         loop: the nominal chain.
         poses: poses of a stage.
-        numbers: parameters of a fit.
+        parameters: parameters of a fit.
 
     Returns:
         (M, S) readings [rad]: for each sensor the value that best satisfies the pose's equations
         while the other sensors keep their readings.
     """
-    found = misfit(loop, poses, numbers)
-    length = np.maximum(np.sum(found.sensed**2, axis=1), 1.0e-12)
-    return poses.theta - np.einsum("mes,me->ms", found.sensed, found.rows) / length
+    found = whitened_residuals(loop, poses, parameters)
+    length = np.maximum(np.sum(found.by_readings**2, axis=1), 1.0e-12)
+    return poses.theta - np.einsum("mes,me->ms", found.by_readings, found.rows) / length

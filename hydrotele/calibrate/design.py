@@ -15,11 +15,22 @@ from typing import Literal, NamedTuple, TypeVar
 import numpy as np
 import scipy.optimize
 
-from hydrotele.calibrate.arm import Equations, candidates, size_of, start_numbers, what_is_told
+from hydrotele.calibrate.arm import (
+    StageEquations,
+    candidate_parameters,
+    classify_candidates,
+    expected_error,
+    initial_parameters,
+)
 from hydrotele.calibrate.arm_poses import Poses
-from hydrotele.calibrate.loop import Loop, calibrator_angles, frame_of, link_chain
+from hydrotele.calibrate.loop import (
+    CalibrationLoop,
+    frame_after_links,
+    link_chain,
+    solve_calibrator_angles,
+)
 from hydrotele.core.errors import InputError
-from hydrotele.kinematics.serial_chain import forward_and_rates
+from hydrotele.kinematics.serial_chain import chain_poses_and_rates
 
 
 class Sweep(NamedTuple):
@@ -44,7 +55,7 @@ class Sweep(NamedTuple):
     phase: float = 0.0
 
 
-SWEEPS: Mapping[str, Sweep] = {
+PUBLISHED_SWEEPS: Mapping[str, Sweep] = {
     "pitch": Sweep((20.0, 80.0), {"swing": 0.0, "boom": -27.5, "stick": 80.0},
                    {"boom": -0.2, "stick": 0.3}, 40.0),
     "stick": Sweep((45.0, 145.0), {"swing": 0.0, "boom": -27.5, "pitch": 42.9}, {"boom": -0.4}),
@@ -54,27 +65,27 @@ SWEEPS: Mapping[str, Sweep] = {
 }  # fmt: skip
 """Ranges, drifts and numbers of poses of Khoshzaban 1992 Figs 16 to 18; link 4 is an assumption."""
 
-_HELD = {"swing": 0.0, "boom": -27.8, "stick": 80.6, "pitch": 42.9}  # K Table 2
+_HELD_ANGLES = {"swing": 0.0, "boom": -27.8, "stick": 80.6, "pitch": 42.9}  # K Table 2
 
-STILL = {name: sweep._replace(drift={}, held=_HELD) for name, sweep in SWEEPS.items()}
+DRIFT_FREE_SWEEPS = {name: sweep._replace(drift={}, held=_HELD_ANGLES) for name, sweep in PUBLISHED_SWEEPS.items()}
 """The same sweeps without drift, with each held link at one angle in all stages."""
 
 
-class Clean(NamedTuple):
+class SweepPoses(NamedTuple):
     """Error-free poses of a stage.
 
     Attributes:
         link: moving link.
         theta: (M, N) true angles with offsets [rad].
-        reached: fraction of the requested poses that the calibrator reaches [1].
+        reached_fraction: fraction of the requested poses that the calibrator reaches [1].
     """
 
     link: str
     theta: np.ndarray
-    reached: float
+    reached_fraction: float
 
 
-def sweep_poses(loop: Loop, link: str, sweep: Sweep, seed: int = 0) -> Clean:
+def generate_sweep_poses(loop: CalibrationLoop, link: str, sweep: Sweep, seed: int = 0) -> SweepPoses:
     """Generate true poses while a link sweeps its range and held links drift.
 
     Args:
@@ -95,35 +106,39 @@ def sweep_poses(loop: Loop, link: str, sweep: Sweep, seed: int = 0) -> Clean:
     moving = loop.links.index(link)
     turn = 2.0 * np.pi * sweep.cycles * u + sweep.phase
     theta[:, moving] = 0.5 * (low + high) - 0.5 * (high - low) * np.cos(turn)
-    pointing = _pointing(loop, theta)
+    pointing = _grapple_angle_to_ball(loop, theta)
     phases = rng.uniform(0.0, 2.0 * np.pi, 3)
-    wave = sum(
-        np.sin(2.0 * np.pi * f * u + p) for f, p in zip((3.7, 7.3, 11.9), phases, strict=True)
-    )
-    theta[:, loop.moved] = pointing + np.radians(sweep.wander) * wave / 3.0 * 1.6
-    theta, reached = calibrator_angles(loop, theta)
+    wave = sum(np.sin(2.0 * np.pi * f * u + p) for f, p in zip((3.7, 7.3, 11.9), phases, strict=True))
+    theta[:, loop.powered_count] = pointing + np.radians(sweep.wander) * wave / 3.0 * 1.6
+    theta, reached = solve_calibrator_angles(loop, theta)
     good = theta[reached]
     rows = np.linspace(0, len(good) - 1, min(sweep.poses, len(good))).astype(int)
-    return Clean(link, good[rows], float(reached.mean()))
+    return SweepPoses(link, good[rows], float(reached.mean()))
 
 
-def _pointing(loop: Loop, theta: np.ndarray) -> np.ndarray:
+def _grapple_angle_to_ball(loop: CalibrationLoop, theta: np.ndarray) -> np.ndarray:
     """Return the grapple angle at which its yoke axis is perpendicular to the line to the ball."""
-    place, turn = frame_of(loop, loop.moved, theta)
+    place, turn = frame_after_links(loop, loop.powered_count, theta)
     x, y, _ = np.einsum("mji,mj->im", turn, loop.ball - place)
     return np.arctan2(y, x)
 
 
-ARMS = np.linspace(2.0, 4.8, 8)
+ARM_LENGTHS = np.linspace(2.0, 4.8, 8)
 """Grid of calibrator arm lengths [m]."""
 
-FOREARMS = np.linspace(2.4, 4.8, 7)
+FOREARM_LENGTHS = np.linspace(2.4, 4.8, 7)
 """Grid of calibrator forearm lengths [m]."""
 
-_POSES = 60  # per link
-_REACH = 0.98  # minimum fraction of poses that a design must reach
-_TIP = ((-0.8, 0.9), (-0.5, 1.4), (-0.1, 1.9), (-0.1, 0.7), (-0.8, 2.2))  # boom, stick [rad, K]
-_OUT = 1.0e3  # m: tip error assigned to a design that does not reach its poses
+_POSES_PER_LINK = 60  # per link
+_MIN_REACHED_FRACTION = 0.98  # minimum fraction of poses that a design must reach
+_TIP_POSES = (
+    (-0.8, 0.9),
+    (-0.5, 1.4),
+    (-0.1, 1.9),
+    (-0.1, 0.7),
+    (-0.8, 2.2),
+)  # boom, stick [rad, K]
+_UNREACHED_TIP_ERROR = 1.0e3  # m: tip error assigned to a design that does not reach its poses
 
 
 class Design(NamedTuple):
@@ -149,15 +164,15 @@ class Design(NamedTuple):
     reached: float
 
 
-class Survey(NamedTuple):
+class DesignSurvey(NamedTuple):
     """Designs over a grid of arm and forearm lengths, and the present design."""
 
     designs: tuple[Design, ...]
     present: Design
 
 
-def design_of(
-    loop: Loop, arm: float, forearm: float, ball_x: float, ball_z: float, accuracy: float
+def evaluate_design(
+    loop: CalibrationLoop, arm: float, forearm: float, ball_x: float, ball_z: float, accuracy: float
 ) -> Design:
     """Evaluate a calibrator of given dimensions.
 
@@ -175,52 +190,52 @@ def design_of(
     values = loop.values.copy()
     values[-2, 3], values[-1, 2] = arm, forearm
     loop = replace(loop, values=values, ball=np.array([ball_x, loop.ball[1], ball_z]))
-    sigma = np.full(len(loop) - loop.moved, accuracy / np.sqrt(3.0))
+    sigma = np.full(len(loop) - loop.powered_count, accuracy / np.sqrt(3.0))
     stages, reached = [], []
-    for link, sweep in STILL.items():
-        clean = sweep_poses(loop, link, sweep._replace(poses=_POSES))
-        reached.append(clean.reached)
-        if len(clean.theta) < _POSES // 2:
-            return Design(arm, forearm, ball_x, ball_z, _OUT, -np.inf, float(np.mean(reached)))
+    for link, sweep in DRIFT_FREE_SWEEPS.items():
+        clean = generate_sweep_poses(loop, link, sweep._replace(poses=_POSES_PER_LINK))
+        reached.append(clean.reached_fraction)
+        if len(clean.theta) < _POSES_PER_LINK // 2:
+            return Design(arm, forearm, ball_x, ball_z, _UNREACHED_TIP_ERROR, -np.inf, float(np.mean(reached)))
         shown = clean.theta - loop.values[:, 0]
-        own = {n: shown[:, k] for k, n in enumerate(loop.links[: loop.moved])}
-        stages.append(Poses(link, shown[:, loop.moved :], sigma, own))
-    names, matrix = _whole_jacobian(loop, stages)
-    sizes = np.array([size_of(loop, name) for name in names])
+        own = {n: shown[:, k] for k, n in enumerate(loop.links[: loop.powered_count])}
+        stages.append(Poses(link, shown[:, loop.powered_count :], sigma, own))
+    names, matrix = _stacked_jacobian(loop, stages)
+    sizes = np.array([expected_error(loop, name) for name in names])
     scaled = matrix * sizes
     covariance = np.linalg.pinv(scaled.T @ scaled, rcond=1e-14) * np.outer(sizes, sizes)
     own = [k for k, n in enumerate(names) if not n.startswith("p_")
-           and n.partition(".")[2] in loop.links[: loop.moved]]  # fmt: skip
+           and n.partition(".")[2] in loop.links[: loop.powered_count]]  # fmt: skip
     part = covariance[np.ix_(own, own)] / np.outer(sizes[own], sizes[own])
     information = -float(np.linalg.slogdet(part)[1])
     tip = _tip_error(loop, names, covariance)
     return Design(arm, forearm, ball_x, ball_z, tip, information, float(np.mean(reached)))
 
 
-def _whole_jacobian(loop: Loop, stages: list[Poses]) -> tuple[list[str], np.ndarray]:
+def _stacked_jacobian(loop: CalibrationLoop, stages: list[Poses]) -> tuple[list[str], np.ndarray]:
     """Return the identifiable parameters and the weighted Jacobian of all stages."""
-    numbers = start_numbers(loop, stages)
+    numbers = initial_parameters(loop, stages)
     names: list[str] = []
     parts = []
     for poses in stages:
-        equations = Equations(loop, poses)
-        told = what_is_told(equations, numbers, candidates(loop, poses.link))
+        equations = StageEquations(loop, poses)
+        told = classify_candidates(equations, numbers, candidate_parameters(loop, poses.link))
         names += [told.names[k] for k in sorted(told.base)]
     for poses in stages:
-        equations = Equations(loop, poses)
-        _, by, sensed = equations.at(numbers)
-        rows = equations.whitening(sensed) @ equations.columns(by, names)
+        equations = StageEquations(loop, poses)
+        _, by, sensed = equations.residual_and_jacobian(numbers)
+        rows = equations.whitening_factors(sensed) @ equations.select_columns(by, names)
         parts.append(rows.reshape(-1, len(names)))
     return names, np.vstack(parts)
 
 
-def _tip_error(loop: Loop, names: list[str], covariance: np.ndarray) -> float:
+def _tip_error(loop: CalibrationLoop, names: list[str], covariance: np.ndarray) -> float:
     """Return the RMS standard deviation of the arm's tip over a set of arm poses [m]."""
-    count = loop.moved - 1
+    count = loop.powered_count - 1
     chain = link_chain(loop.values[:count])
     total = 0.0
-    for boom, stick in _TIP:
-        rates = forward_and_rates(chain, np.array([[0.0, boom, stick][:count]]))
+    for boom, stick in _TIP_POSES:
+        rates = chain_poses_and_rates(chain, np.array([[0.0, boom, stick][:count]]))
         by = rates.position_by_parameter[0].reshape(3, count, 5)
         slope = np.zeros((3, len(names)))
         for column, name in enumerate(names):
@@ -229,10 +244,10 @@ def _tip_error(loop: Loop, names: list[str], covariance: np.ndarray) -> float:
                 at = ("held", "d", "a", "alpha", "beta").index(kind)
                 slope[:, column] = by[:, loop.links.index(link), at]
         total += float(np.trace(slope @ covariance @ slope.T))
-    return float(np.sqrt(total / len(_TIP)))
+    return float(np.sqrt(total / len(_TIP_POSES)))
 
 
-def look_over_designs(loop: Loop, accuracy: float) -> Survey:
+def survey_designs(loop: CalibrationLoop, accuracy: float) -> DesignSurvey:
     """Evaluate designs over a grid of both lengths, with the ball joint at its present position.
 
     Args:
@@ -243,13 +258,13 @@ def look_over_designs(loop: Loop, accuracy: float) -> Survey:
         The designs, ordered by forearm length, and the present design.
     """
     x, z = float(loop.ball[0]), float(loop.ball[2])
-    grid = [design_of(loop, float(a), float(f), x, z, accuracy) for f in FOREARMS for a in ARMS]
+    grid = [evaluate_design(loop, float(a), float(f), x, z, accuracy) for f in FOREARM_LENGTHS for a in ARM_LENGTHS]
     arm, forearm = float(loop.values[-2, 3]), float(loop.values[-1, 2])
-    present = design_of(loop, arm, forearm, x, z, accuracy)
-    return Survey(tuple(grid), present)
+    present = evaluate_design(loop, arm, forearm, x, z, accuracy)
+    return DesignSurvey(tuple(grid), present)
 
 
-def best_design(loop: Loop, survey: Survey, accuracy: float) -> Design:
+def optimize_design(loop: CalibrationLoop, survey: DesignSurvey, accuracy: float) -> Design:
     """Find the reachable design with minimum tip error; lengths and ball joint are free.
 
     Args:
@@ -261,12 +276,12 @@ def best_design(loop: Loop, survey: Survey, accuracy: float) -> Design:
         The design; the ball joint stays on the chassis, 1.0 to 2.6 m in front of the swing axis
         and 1.3 to 0.6 m below the boom pin.
     """
-    reaching = [d for d in (*survey.designs, survey.present) if d.reached >= _REACH]
+    reaching = [d for d in (*survey.designs, survey.present) if d.reached >= _MIN_REACHED_FRACTION]
     start = min(reaching or [survey.present], key=lambda d: d.tip_error)
 
     def cost(x):
-        found = design_of(loop, x[0], x[1], x[2], x[3], accuracy)
-        return np.log(found.tip_error) + 50.0 * max(0.0, _REACH - found.reached)
+        found = evaluate_design(loop, x[0], x[1], x[2], x[3], accuracy)
+        return np.log(found.tip_error) + 50.0 * max(0.0, _MIN_REACHED_FRACTION - found.reached)
 
     bounds = [(1.5, 4.8), (1.5, 5.2), (1.0, 2.6), (-1.3, -0.6)]
     first = np.clip(start[:4], *np.array(bounds).T)
@@ -275,18 +290,18 @@ def best_design(loop: Loop, survey: Survey, accuracy: float) -> Design:
         options={"maxfev": 120, "xatol": 0.02, "fatol": 1e-3},
     )  # fmt: skip
     arm, forearm, ball_x, ball_z = found.x.tolist()
-    return design_of(loop, arm, forearm, ball_x, ball_z, accuracy)
+    return evaluate_design(loop, arm, forearm, ball_x, ball_z, accuracy)
 
 
 Criterion = Literal["D", "O1", "O2", "O3", "O4", "O5"]
-_RIDGE = 1e-9  # times the mean information, so that the first poses have a nonzero determinant
+_RELATIVE_RIDGE = 1e-9  # times the mean information, so that the first poses have a nonzero determinant
 
 Key = TypeVar("Key", bound=Hashable)
 Fitted = TypeVar("Fitted")
 
 
 @dataclass(frozen=True)
-class Selection:
+class PoseSelection:
     """Selected poses.
 
     Attributes:
@@ -300,7 +315,7 @@ class Selection:
     exchanges: int
 
 
-def observability(information: np.ndarray, criterion: Criterion, equations: int) -> float:
+def observability_index(information: np.ndarray, criterion: Criterion, equations: int) -> float:
     """Return an observability index of scaled parameters; larger is better.
 
     With singular values s1 >= ... >= sp of the scaled identification Jacobian of m equations:
@@ -318,7 +333,7 @@ def observability(information: np.ndarray, criterion: Criterion, equations: int)
     Source: Borm and Menq 1991 (O1); Driels and Pathre 1990 (O2); Nahvi, Hollerbach and Hayward 1994
     (O3); Nahvi and Hollerbach 1996 (O4); Sun and Hollerbach 2008 (O5, comparison).
 
-    >>> observability(np.diag([4.0, 1.0]), "O2", 10)
+    >>> observability_index(np.diag([4.0, 1.0]), "O2", 10)
     0.5
     """
     s = np.sqrt(np.maximum(np.linalg.eigvalsh(information), 0.0))[::-1]
@@ -338,7 +353,7 @@ def observability(information: np.ndarray, criterion: Criterion, equations: int)
 def select_poses(
     jacobians: np.ndarray, count: int, criterion: Criterion = "D",
     prior: np.ndarray | None = None,
-) -> Selection:  # fmt: skip
+) -> PoseSelection:  # fmt: skip
     """Select the poses whose measurements are most informative about the parameters.
 
     Args:
@@ -361,49 +376,45 @@ def select_poses(
     if not 0 < count <= n:
         raise InputError("poses", f"cannot select {count} poses from {n} candidates")
     if prior is None and count * k < p:
-        raise InputError(
-            "poses", f"{count} poses give {count * k} equations for {p} parameters: choose more"
-        )
+        raise InputError("poses", f"{count} poses give {count * k} equations for {p} parameters: choose more")
     each = np.einsum("nki,nkj->nij", rows, rows)
-    small = _RIDGE * max(float(np.trace(each.mean(axis=0))) / p, 1e-300) * np.eye(p)
+    small = _RELATIVE_RIDGE * max(float(np.trace(each.mean(axis=0))) / p, 1e-300) * np.eye(p)
     base = small if prior is None else np.asarray(prior, float) + small
 
-    def best(total: np.ndarray, open_: np.ndarray, size: int) -> tuple[int, float]:
+    def find_best_candidate(total: np.ndarray, open_: np.ndarray, size: int) -> tuple[int, float]:
         if criterion in ("D", "O1"):
-            gains = _gains(total, rows[open_])
+            gains = _log_det_gains(total, rows[open_])
             place = int(np.argmax(gains))
         else:
-            values = [observability(total + each[c], criterion, size * k) for c in open_]
+            values = [observability_index(total + each[c], criterion, size * k) for c in open_]
             place = int(np.argmax(values))
         chosen = int(open_[place])
-        return chosen, observability(total + each[chosen], criterion, size * k)
+        return chosen, observability_index(total + each[chosen], criterion, size * k)
 
     chosen: list[int] = []
     total = base.copy()
     for size in range(1, count + 1):
         open_ = np.setdiff1d(np.arange(n), chosen)
-        new, _ = best(total, open_, size)
+        new, _ = find_best_candidate(total, open_, size)
         chosen.append(new)
         total = total + each[new]
-    value, exchanges, improved = observability(total, criterion, count * k), 0, True
+    value, exchanges, improved = observability_index(total, criterion, count * k), 0, True
     while improved and count < n:
         improved = False
         for place in range(count):
             without = total - each[chosen[place]]
             open_ = np.setdiff1d(np.arange(n), chosen)
-            new, better = best(without, open_, count)
+            new, better = find_best_candidate(without, open_, count)
             if better > value * (1.0 + 1e-9):
                 chosen[place], total, value = new, without + each[new], better
                 exchanges, improved = exchanges + 1, True
-    return Selection(tuple(chosen), value, exchanges)
+    return PoseSelection(tuple(chosen), value, exchanges)
 
 
-def _gains(total: np.ndarray, rows: np.ndarray) -> np.ndarray:
+def _log_det_gains(total: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Return the increase of log det from each candidate's (n, k, p) rows: log det(I + J P J')."""
     factor = np.linalg.cholesky(total)
-    half = np.linalg.solve(
-        factor, np.swapaxes(rows, 1, 2).transpose(1, 0, 2).reshape(len(total), -1)
-    )
+    half = np.linalg.solve(factor, np.swapaxes(rows, 1, 2).transpose(1, 0, 2).reshape(len(total), -1))
     half = half.reshape(len(total), len(rows), -1)
     grown = np.einsum("pnk,pnl->nkl", half, half) + np.eye(rows.shape[1])
     return np.linalg.slogdet(grown)[1]
@@ -411,14 +422,14 @@ def _gains(total: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 def leave_one_out(
     groups: Iterable[Key], fit: Callable[[Sequence[Key]], Fitted],
-    judge: Callable[[Fitted, Key], float],
+    evaluate: Callable[[Fitted, Key], float],
 ) -> dict[Key, float]:  # fmt: skip
     """Return the prediction error of each group by a fit to all other groups.
 
     Args:
         groups: names of poses, or of groups of poses that are left out together.
         fit: function from groups to a fit.
-        judge: function that returns the error of a fit on a group.
+        evaluate: function that returns the error of a fit on a group.
 
     Returns:
         Error by group.
@@ -429,4 +440,4 @@ def leave_one_out(
     {'a': 3.0, 'b': 1.5, 'c': 4.5}
     """
     named = list(groups)
-    return {name: judge(fit([other for other in named if other != name]), name) for name in named}
+    return {name: evaluate(fit([other for other in named if other != name]), name) for name in named}

@@ -17,29 +17,32 @@ import scipy.stats
 
 from hydrotele.core.errors import InputError
 from hydrotele.identify.identifiability import (
-    COMBINATION,
-    FULL,
+    STATUS_COMBINATION,
+    STATUS_FULL,
     Identifiability,
-    identifiability,
-    identifiable_in_noise,
+    classify_noisy_parameters,
+    classify_parameters,
 )
 
 Residual = Callable[[np.ndarray], np.ndarray]
 Jacobian = Callable[[np.ndarray], np.ndarray | scipy.sparse.spmatrix]
 Selection = Literal["structure", "noise", "none"]
 
-TRUNCATION = (0.05, 0.01, 0.002, 4e-4, 8e-5, 1.6e-5, 3.2e-6)
+TRUNCATION_LEVELS = (0.05, 0.01, 0.002, 4e-4, 8e-5, 1.6e-5, 3.2e-6)
 """Truncation levels relative to the largest singular value: 5 % first, lowered on convergence."""
 
-_WHERE = "calibration"
+_ERROR_SOURCE = "calibration"
 _COMPLEX_STEP = 1e-30  # times a scale; complex steps have no cancellation error
-_CENTRAL = np.finfo(float).eps ** (1.0 / 3.0)  # balances rounding and the third derivative
-_CONVERGED = 1e-10  # of a step in units of the scales
-_HALVINGS = 12
-_NOISE_ROUNDS, _NOISE_KNOWN = 30, 1e-4  # maximum rounds, relative tolerance of the noise estimate
-_EXACT = 1e-100  # a residual that counts as zero
-_NORMAL95 = 1.959964
-_UNSETTLED = "noise and prior estimates do not converge: give sigma"
+_CENTRAL_STEP = np.finfo(float).eps ** (1.0 / 3.0)  # balances rounding and the third derivative
+_STEP_TOLERANCE = 1e-10  # of a step in units of the scales
+_MAX_HALVINGS = 12
+_MAX_NOISE_ROUNDS, _NOISE_TOLERANCE = (
+    30,
+    1e-4,
+)  # maximum rounds, relative tolerance of the noise estimate
+_MIN_RESIDUAL = 1e-100  # a residual that counts as zero
+_NORMAL_QUANTILE_95 = 1.959964
+_NOISE_NOT_CONVERGED = "noise and prior estimates do not converge: give sigma"
 
 
 @dataclass(frozen=True)
@@ -68,15 +71,15 @@ class ParameterFit:
         residual: (m,) unweighted residuals at the solution.
         noise: standard deviation of one equation's error, estimated from the residuals.
         chi: estimated over given standard deviation; near 1 if `sigma` is correct, 1 without it.
-        freedom: degrees of freedom, equations minus (effective) parameters.
+        degrees_of_freedom: degrees of freedom, equations minus (effective) parameters.
         rank: number of fitted directions.
         iterations: number of Jacobian evaluations.
         evaluations: number of residual evaluations, without those for finite differences.
         converged: whether the search met its tolerances.
         status: how the search ended and, if it failed, the remedy.
-        told: identifiability of the parameters from the data without the prior.
+        identifiability: identifiability of the parameters from the data without the prior.
         jacobian: (m, p) unweighted Jacobian at the solution.
-        critical: quantile that converts standard deviations to 95 % intervals.
+        interval_quantile: quantile that converts standard deviations to 95 % intervals.
     """
 
     names: tuple[str, ...]
@@ -87,25 +90,25 @@ class ParameterFit:
     residual: np.ndarray
     noise: float
     chi: float
-    freedom: float
+    degrees_of_freedom: float
     rank: int
     iterations: int
     evaluations: int
     converged: bool
     status: str
-    told: Identifiability
+    identifiability: Identifiability
     jacobian: np.ndarray
-    critical: float
+    interval_quantile: float
 
     @property
-    def deviations(self) -> np.ndarray:
+    def standard_deviations(self) -> np.ndarray:
         """(p,) standard deviations; infinite for held parameters."""
         return np.where(self.held, np.inf, np.sqrt(np.maximum(np.diag(self.covariance), 0.0)))
 
     @property
     def intervals(self) -> np.ndarray:
         """(p, 2) 95 % intervals; for a combination's representative, with the others held."""
-        reach = self.critical * self.deviations
+        reach = self.interval_quantile * self.standard_deviations
         return np.column_stack([self.values - reach, self.values + reach])
 
     @property
@@ -124,7 +127,7 @@ def least_squares(
     prior: Prior | None = None, jac: Jacobian | Literal["cs"] | None = None,
     sparsity: np.ndarray | scipy.sparse.spmatrix | None = None,
     truncation: Sequence[float] | None = None, select: Selection = "structure",
-    first: Sequence[str] = (), max_iterations: int = 100,
+    preferred: Sequence[str] = (), max_iterations: int = 100,
 ) -> ParameterFit:  # fmt: skip
     """Fit parameters to equations `residual(x) = noise`.
 
@@ -142,11 +145,11 @@ def least_squares(
             differences.
         sparsity: (m, p), nonzero where a residual depends on a parameter, for differences.
         truncation: decreasing thresholds, relative to the largest singular value, below which
-            directions of a step are omitted; each is used until convergence (`TRUNCATION`). None
+            directions of a step are omitted; each is used until convergence (`TRUNCATION_LEVELS`). None
             for SciPy's Levenberg-Marquardt search.
         select: which parameters are held: those without any effect (`structure`), also those whose
             effect is below the noise (`noise`), or `none`.
-        first: parameters preferred as representatives of combinations.
+        preferred: parameters preferred as representatives of combinations.
         max_iterations: maximum number of iterations.
 
     Returns:
@@ -160,7 +163,7 @@ def least_squares(
     >>> y = 2.0 + 3.0 * x
     >>> fit = least_squares(lambda p: p[0] + p[1] * x + p[2] - y, [0.0, 0.0, 0.0],
     ...                     ["a", "b", "c"], [1.0, 1.0, 1.0], jac="cs")
-    >>> fit.values.round(9).tolist(), fit.told.text(0)
+    >>> fit.values.round(9).tolist(), fit.identifiability.text(0)
     ([2.0, 3.0, 0.0], 'a + c')
 
     Source: Khoshzaban 1992, 3.37-3.43 (truncation, 5 % lowered on convergence); Khalil and Gautier
@@ -168,48 +171,48 @@ def least_squares(
     """
     problem = _Problem(residual, start, names, scales, jac, sparsity)
     begin = problem.start
-    rows, matrix = problem.at(begin)
+    rows, matrix = problem.residual_and_jacobian(begin)
     known = sigma is not None
-    weight = _weights(sigma, len(rows))
-    told = _structure(matrix * weight[:, None], problem, first)
-    free = np.ones(len(begin), bool) if select == "none" else _places(told)
+    weight = _equation_weights(sigma, len(rows))
+    told = _classify_structure(matrix * weight[:, None], problem, preferred)
+    free = np.ones(len(begin), bool) if select == "none" else _representative_mask(told)
     if prior is not None:
         free |= np.isfinite(prior.std)
     _check_count(len(rows), int(free.sum()), prior is not None, known)
-    noise, searched = 1.0, _Searched(begin)
+    noise, searched = 1.0, _SearchState(begin)
     while True:
-        search = _Search(problem, weight / noise, prior, free)
-        searched = search.run(searched, truncation, max_iterations)
-        left, end = problem.at(searched.x)
-        freedom = len(left) - search.effective(end)
+        search = _ScaledProblem(problem, weight / noise, prior, free)
+        searched = search.solve(searched, truncation, max_iterations)
+        left, end = problem.residual_and_jacobian(searched.x)
+        freedom = len(left) - search.effective_parameters(end)
         chi = float(np.sqrt(np.sum((left * weight) ** 2) / max(freedom, 1e-12)))
-        before, noise = noise, noise if known else max(chi, _EXACT)
+        before, noise = noise, noise if known else max(chi, _MIN_RESIDUAL)
         weak = np.zeros(len(begin), bool)
-        if select == "noise" and chi > _EXACT:
-            told = _in_noise(end * (weight / noise)[:, None], problem, told)
-            weak = free & ~_places(told)
+        if select == "noise" and chi > _MIN_RESIDUAL:
+            told = _classify_in_noise(end * (weight / noise)[:, None], problem, told)
+            weak = free & ~_representative_mask(told)
         if weak.any():
             free = free & ~weak
             searched = replace(searched, x=np.where(weak, begin, searched.x))
-        elif known or prior is None or abs(noise - before) < _NOISE_KNOWN * noise:
+        elif known or prior is None or abs(noise - before) < _NOISE_TOLERANCE * noise:
             break
-        if searched.rounds >= _NOISE_ROUNDS:
-            searched = replace(searched, status=_UNSETTLED, converged=False)
+        if searched.rounds >= _MAX_NOISE_ROUNDS:
+            searched = replace(searched, status=_NOISE_NOT_CONVERGED, converged=False)
             break
-    covariance, rank = _Search(problem, weight / noise, prior, free).covariance(end, truncation)
+    covariance, rank = _ScaledProblem(problem, weight / noise, prior, free).covariance(end, truncation)
     return ParameterFit(
         names=tuple(names), values=searched.x, scales=problem.scales, covariance=covariance,
         held=~free, residual=left, noise=chi * float(np.mean(1.0 / weight)),
-        chi=chi if known else 1.0, freedom=float(freedom), rank=rank,
+        chi=chi if known else 1.0, degrees_of_freedom=float(freedom), rank=rank,
         iterations=searched.iterations, evaluations=searched.evaluations,
-        converged=searched.converged, status=searched.status, told=told, jacobian=end,
-        critical=_NORMAL95 if known else float(scipy.stats.t.ppf(0.975, max(freedom, 1.0))),
+        converged=searched.converged, status=searched.status, identifiability=told, jacobian=end,
+        interval_quantile=_NORMAL_QUANTILE_95 if known else float(scipy.stats.t.ppf(0.975, max(freedom, 1.0))),
     )  # fmt: skip
 
 
-def identifiable(
+def classify_scaled_parameters(
     jacobian: np.ndarray, names: Sequence[str], scales: Sequence[float] | np.ndarray, *,
-    sigma: float | np.ndarray | None = None, first: Sequence[str] = (),
+    sigma: float | np.ndarray | None = None, preferred: Sequence[str] = (),
 ) -> Identifiability:  # fmt: skip
     """Classify parameters: identifiable alone, only in a combination, or not at all.
 
@@ -223,48 +226,48 @@ def identifiable(
         names: the p parameters.
         scales: (p,) expected sizes of the parameters.
         sigma: standard deviation of the equations' errors, one value or (m,); None for no noise.
-        first: parameters preferred as representatives of combinations.
+        preferred: parameters preferred as representatives of combinations.
 
     Returns:
-        The classification; `told_in_words` converts it to text.
+        The classification; `list_identifiability` converts it to text.
     """
     matrix = np.asarray(jacobian, float)
     sizes = np.asarray(scales, float)
-    exact = identifiability(matrix * sizes, names, ["1"] * len(sizes), first)
-    exact = _unscaled(exact, sizes)
+    exact = classify_parameters(matrix * sizes, names, ["1"] * len(sizes), preferred)
+    exact = _remove_scales(exact, sizes)
     if sigma is None:
         return exact
     weighted = matrix / np.broadcast_to(np.asarray(sigma, float), matrix.shape[:1])[:, None]
-    return identifiable_in_noise(weighted, names, sizes, _places(exact))
+    return classify_noisy_parameters(weighted, names, sizes, _representative_mask(exact))
 
 
-def told_in_words(told: Identifiability) -> dict[str, list[str]]:
+def list_identifiability(identifiability: Identifiability) -> dict[str, list[str]]:
     """Return lists of identifiable parameters, combinations and unidentifiable parameters.
 
     Args:
-        told: identifiability of the parameters.
+        identifiability: identifiability of the parameters.
 
     Returns:
         `identifiable`: parameters identifiable alone. `combinations`: identifiable combinations as
         text. `unknown`: unidentifiable parameters.
 
     >>> matrix = np.array([[1.0, 2.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1.0, 2.0, 1.0, 0.0]])
-    >>> told_in_words(identifiable(matrix, ["a", "b", "c", "d"], [1.0] * 4))
+    >>> list_identifiability(classify_scaled_parameters(matrix, ["a", "b", "c", "d"], [1.0] * 4))
     {'identifiable': ['c'], 'combinations': ['a + 2 b'], 'unknown': ['d']}
     """
-    status = dict(zip(told.names, told.status, strict=True))
+    status = dict(zip(identifiability.names, identifiability.status, strict=True))
     return {
-        "identifiable": [n for n in told.names if status[n] == FULL],
+        "identifiable": [n for n in identifiability.names if status[n] == STATUS_FULL],
         "combinations": [
-            told.text(row) for row, base in enumerate(told.base)
-            if status[told.names[base]] == COMBINATION
+            identifiability.format_combination(row) for row, base in enumerate(identifiability.base)
+            if status[identifiability.names[base]] == STATUS_COMBINATION
         ],
-        "unknown": [n for n in told.names if status[n] not in (FULL, COMBINATION)],
+        "unknown": [n for n in identifiability.names if status[n] not in (STATUS_FULL, STATUS_COMBINATION)],
     }  # fmt: skip
 
 
 @dataclass(frozen=True)
-class Combination:
+class CombinationEstimate:
     """Estimate of one identifiable parameter or combination of parameters.
 
     Attributes:
@@ -282,7 +285,7 @@ class Combination:
     high: float
 
 
-def told_combinations(fit: ParameterFit) -> tuple[Combination, ...]:
+def estimate_combinations(fit: ParameterFit) -> tuple[CombinationEstimate, ...]:
     """Return all identifiable combinations with their intervals.
 
     A parameter that is identifiable only in a combination has no separate interval: its part of the
@@ -294,18 +297,20 @@ def told_combinations(fit: ParameterFit) -> tuple[Combination, ...]:
     Returns:
         One combination per identifiable direction.
     """
-    order = [fit.names.index(name) for name in fit.told.names]
+    order = [fit.names.index(name) for name in fit.identifiability.names]
     values, covariance = fit.values[order], fit.covariance[np.ix_(order, order)]
     made = []
-    for row, weights in enumerate(fit.told.combination):
+    for row, weights in enumerate(fit.identifiability.combination):
         value, std = float(weights @ values), float(np.sqrt(weights @ covariance @ weights))
-        reach = fit.critical * std
-        made.append(Combination(fit.told.text(row), value, std, value - reach, value + reach))
+        reach = fit.interval_quantile * std
+        made.append(
+            CombinationEstimate(fit.identifiability.format_combination(row), value, std, value - reach, value + reach)
+        )
     return tuple(made)
 
 
 @dataclass(frozen=True)
-class _Searched:
+class _SearchState:
     """State of a search at its end."""
 
     x: np.ndarray
@@ -322,66 +327,66 @@ class _Problem:
     def __init__(self, residual, start, names, scales, jac, sparsity) -> None:
         self.start, self.scales = np.array(start, float), np.array(scales, float)
         self.names, self.residual, self.jac = tuple(names), residual, jac
-        self.hits = None if sparsity is None else _dense(sparsity) != 0.0
+        self.hits = None if sparsity is None else _to_dense(sparsity) != 0.0
         p = len(self.names)
         if self.start.shape != (p,) or self.scales.shape != (p,):
             raise InputError(
-                _WHERE,
+                _ERROR_SOURCE,
                 f"{p} names, start {self.start.shape} and scales {self.scales.shape} must match",
             )
         bad = [n for n, s in zip(names, self.scales, strict=True) if not 0.0 < s < np.inf]
         if bad:
-            raise InputError(_WHERE, f"the scales of {', '.join(bad)} must be positive and finite")
-        self.groups = np.arange(p) if self.hits is None else _groups(self.hits)
+            raise InputError(_ERROR_SOURCE, f"the scales of {', '.join(bad)} must be positive and finite")
+        self.groups = np.arange(p) if self.hits is None else _group_columns(self.hits)
 
-    def rows(self, x: np.ndarray) -> np.ndarray:
+    def residual_vector(self, x: np.ndarray) -> np.ndarray:
         """Return the residual (m,)."""
         rows = np.asarray(self.residual(x))
         if np.iscomplexobj(x):
             return rows
         rows = np.asarray(rows, float)
         if rows.ndim != 1:
-            raise InputError(_WHERE, f"the residual must be (m,), got {rows.shape}")
+            raise InputError(_ERROR_SOURCE, f"the residual must be (m,), got {rows.shape}")
         if not np.isfinite(rows).all():
             where = int(np.flatnonzero(~np.isfinite(rows))[0])
-            raise InputError(_WHERE, f"equation {where + 1} of {len(rows)} is not finite")
+            raise InputError(_ERROR_SOURCE, f"equation {where + 1} of {len(rows)} is not finite")
         return rows
 
-    def at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def residual_and_jacobian(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the residual (m,) and the Jacobian (m, p)."""
-        return self.rows(x), self.matrix(x)
+        return self.residual_vector(x), self.jacobian(x)
 
-    def matrix(self, x: np.ndarray) -> np.ndarray:
+    def jacobian(self, x: np.ndarray) -> np.ndarray:
         """Return the dense Jacobian (m, p)."""
         if callable(self.jac):
-            return _dense(self.jac(x))
+            return _to_dense(self.jac(x))
         if self.jac == "cs":
             columns = []
             for k, size in enumerate(self.scales):
                 step = x.astype(complex)
                 step[k] += 1j * _COMPLEX_STEP * size
-                columns.append(np.imag(self.rows(step)) / (_COMPLEX_STEP * size))
+                columns.append(np.imag(self.residual_vector(step)) / (_COMPLEX_STEP * size))
             return np.column_stack(columns)
-        return self._differences(x)
+        return self._central_differences(x)
 
-    def _differences(self, x: np.ndarray) -> np.ndarray:
+    def _central_differences(self, x: np.ndarray) -> np.ndarray:
         """Return central differences; parameters without a common equation are moved together."""
-        steps = _CENTRAL * np.maximum(np.abs(x), self.scales)
+        steps = _CENTRAL_STEP * np.maximum(np.abs(x), self.scales)
         columns: list[np.ndarray] = [np.empty(0)] * len(x)
         for group in range(self.groups.max() + 1):
             moved = np.where(self.groups == group, steps, 0.0)
-            change = self.rows(x + moved) - self.rows(x - moved)
+            change = self.residual_vector(x + moved) - self.residual_vector(x - moved)
             for k in np.flatnonzero(self.groups == group):
                 own = change if self.hits is None else np.where(self.hits[:, k], change, 0.0)
                 columns[k] = own / (2.0 * steps[k])
         return np.column_stack(columns)
 
 
-def _dense(matrix) -> np.ndarray:
+def _to_dense(matrix) -> np.ndarray:
     return np.asarray(matrix.toarray() if scipy.sparse.issparse(matrix) else matrix, float)
 
 
-def _groups(hits: np.ndarray) -> np.ndarray:
+def _group_columns(hits: np.ndarray) -> np.ndarray:
     """Return the group number (p,) of each column; columns of a group have no row in common."""
     groups: list[int] = []
     taken: list[np.ndarray] = []
@@ -394,54 +399,54 @@ def _groups(hits: np.ndarray) -> np.ndarray:
     return np.array(groups)
 
 
-class _Search:
+class _ScaledProblem:
     """A weighted problem in its free, scaled parameters, with one extra row per prior."""
 
     def __init__(self, problem: _Problem, weight, prior: Prior | None, free) -> None:
         self.problem, self.weight, self.free = problem, weight, np.flatnonzero(free)
         self.scales = problem.scales[self.free]
-        self.pull, self.mean = np.zeros(len(self.free)), np.zeros(len(self.free))
+        self.prior_weight, self.mean = np.zeros(len(self.free)), np.zeros(len(self.free))
         if prior is not None:
             std, mean = np.asarray(prior.std, float), np.asarray(prior.mean, float)
             if not (std > 0.0).all():
-                raise InputError(_WHERE, "standard deviations of the prior must be positive")
-            self.pull, self.mean = self.scales / std[self.free], mean[self.free]
-        self.drawn = self.pull > 0.0
+                raise InputError(_ERROR_SOURCE, "standard deviations of the prior must be positive")
+            self.prior_weight, self.mean = self.scales / std[self.free], mean[self.free]
+        self.has_prior = self.prior_weight > 0.0
 
-    def full(self, base: np.ndarray, u: np.ndarray) -> np.ndarray:
+    def all_parameters(self, base: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Return all parameters (p,) from base values and scaled steps of the free parameters."""
         x = base.copy()
         x[self.free] += u * self.scales
         return x
 
-    def rows(self, x: np.ndarray) -> np.ndarray:
+    def weighted_residual(self, x: np.ndarray) -> np.ndarray:
         """Return the weighted residuals followed by the prior's residuals."""
-        away = self.pull * (x[self.free] - self.mean) / self.scales
-        return np.concatenate([self.problem.rows(x) * self.weight, away[self.drawn]])
+        away = self.prior_weight * (x[self.free] - self.mean) / self.scales
+        return np.concatenate([self.problem.residual_vector(x) * self.weight, away[self.has_prior]])
 
-    def matrix(self, matrix: np.ndarray) -> np.ndarray:
+    def weighted_jacobian(self, matrix: np.ndarray) -> np.ndarray:
         """Return the Jacobian of `rows` by the scaled free parameters."""
         weighted = matrix[:, self.free] * self.weight[:, None] * self.scales
-        return np.vstack([weighted, np.diag(self.pull)[self.drawn]])
+        return np.vstack([weighted, np.diag(self.prior_weight)[self.has_prior]])
 
-    def effective(self, matrix: np.ndarray) -> float:
+    def effective_parameters(self, matrix: np.ndarray) -> float:
         """Return the effective number of parameters determined by the equations, not the prior."""
-        whole = self.matrix(matrix)
+        whole = self.weighted_jacobian(matrix)
         q = np.linalg.qr(whole)[0][: len(matrix)]
         return float(np.sum(q**2))
 
-    def run(self, begin: _Searched, truncation: Sequence[float] | None, most: int) -> _Searched:
+    def solve(self, begin: _SearchState, truncation: Sequence[float] | None, max_steps: int) -> _SearchState:
         """Continue the search from the end of a previous one."""
         found = (
-            _truncated(self, begin, truncation, most)
+            _minimize_truncated(self, begin, truncation, max_steps)
             if truncation
-            else _trust_region(self, begin, most)
+            else _minimize_with_scipy(self, begin, max_steps)
         )
         return replace(found, rounds=begin.rounds + 1)
 
     def covariance(self, matrix: np.ndarray, truncation) -> tuple[np.ndarray, int]:
         """Return the covariance (p, p), zero for held parameters, and the rank."""
-        whole = self.matrix(matrix)
+        whole = self.weighted_jacobian(matrix)
         _, s, v = np.linalg.svd(whole, full_matrices=False)
         cut = truncation[-1] if truncation else len(self.free) * np.finfo(float).eps
         kept = s > cut * s[0]
@@ -451,41 +456,43 @@ class _Search:
         return covariance, int(kept.sum())
 
 
-def _trust_region(search: _Search, begin: _Searched, most: int) -> _Searched:
-    """Run SciPy's Levenberg-Marquardt search, limited to 10 `most` residual evaluations."""
+def _minimize_with_scipy(search: _ScaledProblem, begin: _SearchState, max_steps: int) -> _SearchState:
+    """Run SciPy's Levenberg-Marquardt search, limited to 10 `max_steps` residual evaluations."""
     base, problem = begin.x, search.problem
     found = scipy.optimize.least_squares(
-        lambda u: search.rows(search.full(base, u)), np.zeros(len(search.free)),
+        lambda u: search.weighted_residual(search.all_parameters(base, u)), np.zeros(len(search.free)),
         jac=lambda u: search.matrix(problem.matrix(search.full(base, u))),  # type: ignore
-        method="lm", ftol=1e-14, xtol=1e-12, gtol=1e-14, max_nfev=10 * most,
+        method="lm", ftol=1e-14, xtol=1e-12, gtol=1e-14, max_nfev=10 * max_steps,
     )  # fmt: skip
     good = found.status > 0
-    said = "converged" if good else f"not converged after {most} steps: increase max_iterations"
-    return _Searched(
-        search.full(base, found.x), begin.iterations + int(found.njev),
+    said = "converged" if good else f"not converged after {max_steps} steps: increase max_iterations"
+    return _SearchState(
+        search.all_parameters(base, found.x), begin.iterations + int(found.njev),
         begin.evaluations + int(found.nfev), good, said,
     )  # fmt: skip
 
 
-def _truncated(search: _Search, begin: _Searched, shares: Sequence[float], most: int) -> _Searched:
+def _minimize_truncated(
+    search: _ScaledProblem, begin: _SearchState, thresholds: Sequence[float], max_steps: int
+) -> _SearchState:
     """Run Gauss-Newton steps with truncated singular values; the threshold is lowered in steps.
 
     A step that does not reduce the residual is halved. If halving fails, or a step is small, the
     next threshold follows.
     """
     x, problem = begin.x, search.problem
-    rows = search.rows(x)
+    rows = search.weighted_residual(x)
     iterations, evaluations, good = begin.iterations, begin.evaluations + 1, True
-    for share in shares:
-        for _ in range(most):
-            matrix = search.matrix(problem.matrix(x))
+    for share in thresholds:
+        for _ in range(max_steps):
+            matrix = search.weighted_jacobian(problem.jacobian(x))
             iterations += 1
             u, s, v = np.linalg.svd(matrix, full_matrices=False)
             kept = s > share * s[0]
             step = -v[kept].T @ ((u.T @ rows)[kept] / s[kept])
-            for _ in range(_HALVINGS):
-                new = search.full(x, step)
-                tried = search.rows(new)
+            for _ in range(_MAX_HALVINGS):
+                new = search.all_parameters(x, step)
+                tried = search.weighted_residual(new)
                 evaluations += 1
                 if tried @ tried < rows @ rows:
                     break
@@ -493,50 +500,53 @@ def _truncated(search: _Search, begin: _Searched, shares: Sequence[float], most:
             else:
                 break
             x, rows = new, tried
-            if np.max(np.abs(step)) < _CONVERGED:
+            if np.max(np.abs(step)) < _STEP_TOLERANCE:
                 break
         else:
             good = False
-    said = "converged" if good else f"not converged after {most} steps: increase max_iterations"
-    return _Searched(x, iterations, evaluations, good, said)
+    said = "converged" if good else f"not converged after {max_steps} steps: increase max_iterations"
+    return _SearchState(x, iterations, evaluations, good, said)
 
 
-def _weights(sigma: float | np.ndarray | None, m: int) -> np.ndarray:
+def _equation_weights(sigma: float | np.ndarray | None, m: int) -> np.ndarray:
     sizes = np.broadcast_to(np.asarray(1.0 if sigma is None else sigma, float), (m,))
     if not (np.isfinite(sizes).all() and (sizes > 0.0).all()):
-        raise InputError(_WHERE, "sigma must be positive")
+        raise InputError(_ERROR_SOURCE, "sigma must be positive")
     return 1.0 / sizes
 
 
-def _places(told: Identifiability) -> np.ndarray:
+def _representative_mask(identifiability: Identifiability) -> np.ndarray:
     """Return (p,) whether each parameter represents an identifiable combination."""
-    return np.isin(np.arange(len(told.names)), told.base)
+    return np.isin(np.arange(len(identifiability.names)), identifiability.base)
 
 
-def _structure(matrix: np.ndarray, problem: _Problem, first: Sequence[str]) -> Identifiability:
-    told = identifiable(matrix, problem.names, problem.scales, first=first)
+def _classify_structure(matrix: np.ndarray, problem: _Problem, first: Sequence[str]) -> Identifiability:
+    told = classify_scaled_parameters(matrix, problem.names, problem.scales, preferred=first)
     if not len(told.base):
-        raise InputError(
-            _WHERE, f"none of {', '.join(problem.names)} is identifiable: vary the poses"
-        )
+        raise InputError(_ERROR_SOURCE, f"none of {', '.join(problem.names)} is identifiable: vary the poses")
     return told
 
 
-def _in_noise(matrix: np.ndarray, problem: _Problem, told: Identifiability) -> Identifiability:
-    found = identifiable_in_noise(matrix, problem.names, problem.scales, _places(told))
+def _classify_in_noise(matrix: np.ndarray, problem: _Problem, identifiability: Identifiability) -> Identifiability:
+    found = classify_noisy_parameters(matrix, problem.names, problem.scales, _representative_mask(identifiability))
     if not len(found.base):
         raise InputError(
-            _WHERE, f"the effects of {', '.join(problem.names)} are all below the noise: record"
+            _ERROR_SOURCE, f"the effects of {', '.join(problem.names)} are all below the noise: record"
             " more poses that differ more"
         )  # fmt: skip
     return found
 
 
-def _unscaled(told: Identifiability, sizes: np.ndarray) -> Identifiability:
+def _remove_scales(identifiability: Identifiability, sizes: np.ndarray) -> Identifiability:
     """Convert a classification of scaled parameters to one of unscaled parameters."""
-    combination = told.combination * sizes[told.base][:, None] / sizes
+    combination = identifiability.combination * sizes[identifiability.base][:, None] / sizes
     return Identifiability(
-        told.names, told.status, told.base, combination, told.condition, told.gap
+        identifiability.names,
+        identifiability.status,
+        identifiability.base,
+        combination,
+        identifiability.condition,
+        identifiability.singular_value_gap,
     )
 
 
@@ -544,6 +554,6 @@ def _check_count(equations: int, unknowns: int, prior: bool, known: bool) -> Non
     needed = 1 if prior else unknowns + (0 if known else 1)
     if equations < needed:
         raise InputError(
-            _WHERE,
+            _ERROR_SOURCE,
             f"{equations} equations are too few for {unknowns} parameters: record more poses",
         )

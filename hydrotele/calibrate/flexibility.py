@@ -15,13 +15,13 @@ from typing import NamedTuple
 import numpy as np
 import scipy.optimize
 
-from hydrotele.calibrate.arm import ArmFit, Equations
+from hydrotele.calibrate.arm import ArmFit, StageEquations
 from hydrotele.calibrate.arm_poses import Poses
-from hydrotele.calibrate.loop import Loop, ball_place, frame_of
+from hydrotele.calibrate.loop import CalibrationLoop, ball_position, frame_after_links
 
-_ROUNDS = 3  # alternations of noise model and parameters; the third changes the f_k by below 1 %
+_MAX_ALTERNATIONS = 3  # alternations of noise model and parameters; the third changes the f_k by below 1 %
 _MAX_FLEXIBILITY = np.radians(10.0)  # rad at full load: far above that of any calibrator
-_START = np.radians(0.2)  # rad at full load, start of the search
+_START_FLEXIBILITY = np.radians(0.2)  # rad at full load, start of the search
 
 Refit = Callable[[Sequence[Poses]], ArmFit]
 
@@ -32,44 +32,44 @@ class Flexibility(NamedTuple):
     Attributes:
         joints: names of the S joints.
         at_full_load: (S,) standard deviation of the angle error at full load [rad].
-        gain: increase in log likelihood over a model without flexibility [1].
+        log_likelihood_gain: increase in log likelihood over a model without flexibility [1].
     """
 
     joints: tuple[str, ...]
     at_full_load: np.ndarray
-    gain: float
+    log_likelihood_gain: float
 
 
-def joint_loads(loop: Loop, poses: Poses, fit: ArmFit) -> np.ndarray:
+def joint_loads(loop: CalibrationLoop, poses: Poses, fit: ArmFit) -> np.ndarray:
     """Return the loads (M, S) of the calibrator's joints, 0 .. 1, in the poses of a stage."""
-    equations = Equations(loop, poses)
-    chain, theta = equations.seen(fit.numbers)
+    equations = StageEquations(loop, poses)
+    chain, theta = equations.chain_and_angles(fit.parameters)
     place = equations.place
     angles = np.tile(loop.home, (len(poses), 1))
     angles[:, place + 1 :] = theta
     for k, link in enumerate(loop.links[:place]):
         if link in poses.manipulator:
             angles[:, k] = poses.manipulator[link] + loop.values[k, 0]
-    origin, rotation = frame_of(fit.loop, place, angles)
+    origin, rotation = frame_after_links(fit.loop, place, angles)
     ball = np.einsum("mji,mj->mi", rotation, fit.loop.ball - origin)
-    along = ball_place(chain, place, theta)
+    along = ball_position(chain, place, theta)
     angles[:, place] = np.arctan2(ball[:, 1], ball[:, 0]) - np.arctan2(along[:, 1], along[:, 0])
-    loads = np.empty((len(poses), len(loop) - loop.moved))
-    lengths = np.hypot(chain.values[loop.moved :, 2], chain.values[loop.moved :, 3])
+    loads = np.empty((len(poses), len(loop) - loop.powered_count))
+    lengths = np.hypot(chain.values[loop.powered_count :, 2], chain.values[loop.powered_count :, 3])
     for column in range(loads.shape[1]):
-        at, _ = frame_of(chain, loop.moved + column, angles)
+        at, _ = frame_after_links(chain, loop.powered_count + column, angles)
         reach = lengths[column:].sum()
         loads[:, column] = np.hypot(*(fit.loop.ball - at)[:, :2].T) / reach
     return np.minimum(loads, 1.0)
 
 
-def with_flexibility(loop: Loop, poses: Poses, fit: ArmFit, flexibility: np.ndarray) -> Poses:
+def add_flexibility(loop: CalibrationLoop, poses: Poses, fit: ArmFit, flexibility: np.ndarray) -> Poses:
     """Return the poses with sensor standard deviations (M, S) that include joint flexibility."""
     loads = joint_loads(loop, poses, fit)
     return replace(poses, sigma=np.hypot(poses.sigma, flexibility * loads))
 
 
-def estimate_flexibility(loop: Loop, stages: Sequence[Poses], fit: ArmFit) -> Flexibility:
+def estimate_flexibility(loop: CalibrationLoop, stages: Sequence[Poses], fit: ArmFit) -> Flexibility:
     """Estimate the joints' flexibility by maximum likelihood, with fixed arm parameters.
 
     Args:
@@ -82,8 +82,8 @@ def estimate_flexibility(loop: Loop, stages: Sequence[Poses], fit: ArmFit) -> Fl
     """
     errors, sensed, loads, sigma = [], [], [], []
     for poses in stages:
-        equations = Equations(loop, poses)
-        error, _, by = equations.at(fit.numbers)
+        equations = StageEquations(loop, poses)
+        error, _, by = equations.residual_and_jacobian(fit.parameters)
         errors.append(error)
         sensed.append(by)
         loads.append(joint_loads(loop, poses, fit))
@@ -93,7 +93,7 @@ def estimate_flexibility(loop: Loop, stages: Sequence[Poses], fit: ArmFit) -> Fl
 
     def cost(x: np.ndarray) -> float:
         variance = known**2 + (x * load) ** 2
-        c = np.einsum("mis,ms,mjs->mij", by, variance, by) + Equations.FLOOR**2 * np.eye(2)
+        c = np.einsum("mis,ms,mjs->mij", by, variance, by) + StageEquations.MIN_DEVIATION**2 * np.eye(2)
         whole = c[:, 0, 0] * c[:, 1, 1] - c[:, 0, 1] ** 2
         e0, e1 = error[:, 0], error[:, 1]
         square = (c[:, 1, 1] * e0**2 - 2 * c[:, 0, 1] * e0 * e1 + c[:, 0, 0] * e1**2) / whole
@@ -101,16 +101,16 @@ def estimate_flexibility(loop: Loop, stages: Sequence[Poses], fit: ArmFit) -> Fl
 
     count = load.shape[1]
     found = scipy.optimize.minimize(
-        lambda u: cost(u * _START), np.ones(count), method="L-BFGS-B",
-        bounds=[(0.0, _MAX_FLEXIBILITY / _START)] * count,
+        lambda u: cost(u * _START_FLEXIBILITY), np.ones(count), method="L-BFGS-B",
+        bounds=[(0.0, _MAX_FLEXIBILITY / _START_FLEXIBILITY)] * count,
     )  # fmt: skip
-    at_full_load = found.x * _START
+    at_full_load = found.x * _START_FLEXIBILITY
     gain = cost(np.zeros(count)) - cost(at_full_load)
-    return Flexibility(loop.links[loop.moved :], at_full_load, gain)
+    return Flexibility(loop.links[loop.powered_count :], at_full_load, gain)
 
 
 def refit_with_flexibility(
-    loop: Loop, stages: Sequence[Poses], fit: ArmFit, refit: Refit
+    loop: CalibrationLoop, stages: Sequence[Poses], fit: ArmFit, refit: Refit
 ) -> tuple[ArmFit, Flexibility]:
     """Estimate flexibility and arm parameters alternately.
 
@@ -124,7 +124,7 @@ def refit_with_flexibility(
         The fit weighted by the noise model, and the flexibility.
     """
     found = estimate_flexibility(loop, stages, fit)
-    for _ in range(_ROUNDS):
-        fit = refit([with_flexibility(loop, p, fit, found.at_full_load) for p in stages])
+    for _ in range(_MAX_ALTERNATIONS):
+        fit = refit([add_flexibility(loop, p, fit, found.at_full_load) for p in stages])
         found = estimate_flexibility(loop, stages, fit)
     return fit, found

@@ -17,37 +17,42 @@ import numpy as np
 import scipy.stats
 
 from hydrotele.calibrate.design import Criterion, select_poses
-from hydrotele.calibrate.estimation import ParameterFit, Prior, identifiable, least_squares
+from hydrotele.calibrate.estimation import (
+    ParameterFit,
+    Prior,
+    classify_scaled_parameters,
+    least_squares,
+)
 from hydrotele.calibrate.hybrid_data import Measurement
 from hydrotele.core.errors import InputError
-from hydrotele.identify.identifiability import COMBINATION, FULL, Identifiability
+from hydrotele.identify.identifiability import STATUS_COMBINATION, STATUS_FULL, Identifiability
 from hydrotele.kinematics.hybrid import (
-    LEGS,
+    LEG_COUNT,
     ErrorModel,
-    Hybrid,
-    Kind,
-    Unreachable,
-    corrected,
-    document_parameters,
-    error_model,
-    forward,
+    ErrorModelKind,
+    HybridRobot,
+    UnreachableError,
+    apply_errors,
+    build_error_model,
+    forward_kinematics,
     pose_difference,
-    predicted_readings,
+    predict_leg_readings,
+    refined_model_parameters,
 )
 
-_STEP = 1e-2  # of a parameter's scale, for central differences of second-order accuracy
-_LEFT_OUT = 200  # maximum number of poses left out one by one
-_MOST_OUT = 0.2  # maximum fraction of poses left out as inconsistent
-_WRONG = 1e-6  # probability below which a pose's residual is not noise
-_LARGE = 20.0  # scales above which an error cannot be due to manufacturing
-_UNLIKELY = 1e-4  # probability below which the stated noise does not explain the residuals
-_BETTER = 0.95  # ratio to the other model's error below which a model is preferred
-_STILL = 1e-3  # m or rad: minimum range of a joint that moves
-_LOADING = 1e-4  # minimum component of a null direction for a parameter to be part of it
+_DIFFERENCE_STEP = 1e-2  # of a parameter's scale, for central differences of second-order accuracy
+_MAX_LEFT_OUT_POSES = 200  # maximum number of poses left out one by one
+_MAX_REMOVED_FRACTION = 0.2  # maximum fraction of poses left out as inconsistent
+_MIN_POSE_PROBABILITY = 1e-6  # probability below which a pose's residual is not noise
+_MAX_ERROR_SCALES = 20.0  # scales above which an error cannot be due to manufacturing
+_MIN_NOISE_PROBABILITY = 1e-4  # probability below which the stated noise does not explain the residuals
+_PREFERENCE_RATIO = 0.95  # ratio to the other model's error below which a model is preferred
+_MIN_JOINT_RANGE = 1e-3  # m or rad: minimum range of a joint that moves
+_MIN_NULL_COMPONENT = 1e-4  # minimum component of a null direction for a parameter to be part of it
 
 
 @dataclass(frozen=True)
-class Equations:
+class PoseEquations:
     """Whitened equations of a measurement: N poses, six each, for q of p parameters.
 
     Attributes:
@@ -65,13 +70,13 @@ class Equations:
     @property
     def scales(self) -> np.ndarray:
         """(q,) scales of the free parameters."""
-        return self.model.scales[self.model.index(self.names)]
+        return self.model.scales[self.model.parameter_indices(self.names)]
 
-    def full(self, values: np.ndarray) -> np.ndarray:
+    def expand_errors(self, values: np.ndarray) -> np.ndarray:
         """Expand (..., q) free errors to errors of all parameters (..., p)."""
         values = np.asarray(values, float)
         whole = np.zeros((*values.shape[:-1], len(self.model.names)))
-        whole[..., self.model.index(self.names)] = values
+        whole[..., self.model.parameter_indices(self.names)] = values
         return whole
 
     def residuals(self, values: np.ndarray) -> np.ndarray:
@@ -84,27 +89,23 @@ class Equations:
             (W, 6 N), of unit standard deviation if the noise is known.
         """
         m = self.measurement
-        away = predicted_readings(
-            self.model, self.full(values), m.joints, m.pose.rotation, m.pose.position
-        )
+        away = predict_leg_readings(self.model, self.expand_errors(values), m.joints, m.pose.rotation, m.pose.position)
         away -= m.legs
         return np.matmul(self.whitening, away[..., None])[..., 0].reshape(len(away), -1)
 
-    def misfit(self, values: np.ndarray) -> np.ndarray:
+    def negative_log_likelihood(self, values: np.ndarray) -> np.ndarray:
         """Return half the sum of squared whitened residuals (W,), minus the log likelihood."""
         return 0.5 * np.einsum("wr,wr->w", *(2 * [self.residuals(values)]))
 
     def jacobian(self, values: np.ndarray) -> np.ndarray:
         """Return the derivatives (6 N, q) of the whitened residuals by central differences."""
-        steps = np.diag(_STEP * self.scales)
+        steps = np.diag(_DIFFERENCE_STEP * self.scales)
         both = self.residuals(np.vstack([values + steps, values - steps]))
         q = len(self.names)
-        return ((both[:q] - both[q:]) / (2.0 * _STEP * self.scales)[:, None]).T
+        return ((both[:q] - both[q:]) / (2.0 * _DIFFERENCE_STEP * self.scales)[:, None]).T
 
 
-def equations(
-    model: ErrorModel, measurement: Measurement, names: Sequence[str] | None = None
-) -> Equations:
+def build_equations(model: ErrorModel, measurement: Measurement, names: Sequence[str] | None = None) -> PoseEquations:
     """Build the equations of a measurement.
 
     Args:
@@ -116,9 +117,9 @@ def equations(
         InputError: a parameter name is unknown.
     """
     names = tuple(names or model.names)
-    model.index(names)
+    model.parameter_indices(names)
     factor = np.linalg.cholesky(measurement.covariance)
-    return Equations(model, measurement, names, np.linalg.inv(factor))
+    return PoseEquations(model, measurement, names, np.linalg.inv(factor))
 
 
 class Redundancy(NamedTuple):
@@ -126,24 +127,24 @@ class Redundancy(NamedTuple):
 
     Attributes:
         rank: number of independent parameters, from the singular values of the Jacobian.
-        held: names of the parameters left out to reach this rank, by pivoted QR.
-        directions: (null, p) combinations of scaled parameters without effect on any reading.
-        takes_part: names of the parameters with a component in these directions.
-        words: explanations of the redundancy.
-        singular: (p,) singular values of the Jacobian with unit columns, relative to the largest.
-        told: names of the parameters whose standard deviation is below half of their scale.
+        held_names: names of the parameters left out to reach this rank, by pivoted QR.
+        null_directions: (null, p) combinations of scaled parameters without effect on any reading.
+        redundant_names: names of the parameters with a component in these directions.
+        explanations: explanations of the redundancy.
+        singular_values: (p,) singular values of the Jacobian with unit columns, relative to the largest.
+        determined_names: names of the parameters whose standard deviation is below half of their scale.
     """
 
     rank: int
-    held: tuple[str, ...]
-    directions: np.ndarray
-    takes_part: tuple[str, ...]
-    words: tuple[str, ...]
-    singular: np.ndarray
-    told: tuple[str, ...]
+    held_names: tuple[str, ...]
+    null_directions: np.ndarray
+    redundant_names: tuple[str, ...]
+    explanations: tuple[str, ...]
+    singular_values: np.ndarray
+    determined_names: tuple[str, ...]
 
 
-def redundancy(eq: Equations, values: np.ndarray | None = None) -> Redundancy:
+def find_redundancy(eq: PoseEquations, values: np.ndarray | None = None) -> Redundancy:
     """Find redundant parameters of equations from singular values and QR of the Jacobian.
 
     Args:
@@ -158,8 +159,8 @@ def redundancy(eq: Equations, values: np.ndarray | None = None) -> Redundancy:
     at = np.zeros(len(eq.names)) if values is None else values
     matrix = eq.jacobian(at) * eq.scales
     ones = np.ones(len(eq.names))
-    first = [n for n in document_parameters(eq.model) if n in eq.names]
-    exact = identifiable(matrix, eq.names, ones, first=first)
+    first = [n for n in refined_model_parameters(eq.model) if n in eq.names]
+    exact = classify_scaled_parameters(matrix, eq.names, ones, preferred=first)
     length = np.linalg.norm(matrix, axis=0)
     there = length > 1e-11 * length.max()
     s = np.zeros(len(eq.names))
@@ -168,27 +169,27 @@ def redundancy(eq: Equations, values: np.ndarray | None = None) -> Redundancy:
     held = tuple(n for k, n in enumerate(eq.names) if k not in set(exact.base))
     directions = null_directions(exact)
     shares = np.abs(directions).max(axis=0, initial=0.0)
-    partners = tuple(n for n, share in zip(eq.names, shares, strict=True) if share > _LOADING)
-    noisy = identifiable(matrix, eq.names, ones, sigma=1.0, first=first)
+    partners = tuple(n for n, share in zip(eq.names, shares, strict=True) if share > _MIN_NULL_COMPONENT)
+    noisy = classify_scaled_parameters(matrix, eq.names, ones, sigma=1.0, preferred=first)
     told = tuple(eq.names[k] for k in sorted(noisy.base)
-                 if noisy.status[k] in (FULL, COMBINATION))  # fmt: skip
-    return Redundancy(rank, held, directions, partners, _in_words(eq, exact, held, partners),
+                 if noisy.status[k] in (STATUS_FULL, STATUS_COMBINATION))  # fmt: skip
+    return Redundancy(rank, held, directions, partners, _explain_redundancy(eq, exact, held, partners),
                       s / s[0], told)  # fmt: skip
 
 
-def null_directions(told: Identifiability) -> np.ndarray:
+def null_directions(identifiability: Identifiability) -> np.ndarray:
     """Return orthonormal parameter changes (null, p) that leave all base parameters unchanged."""
-    _, s, v = np.linalg.svd(told.combination, full_matrices=True)
-    return v[int(np.sum(s > 1e-9 * s[0])) :] if len(told.base) else np.eye(len(told.names))
+    _, s, v = np.linalg.svd(identifiability.combination, full_matrices=True)
+    return v[int(np.sum(s > 1e-9 * s[0])) :] if len(identifiability.base) else np.eye(len(identifiability.names))
 
 
-def _in_words(eq: Equations, told: Identifiability, held, partners) -> tuple[str, ...]:
+def _explain_redundancy(eq: PoseEquations, identifiability: Identifiability, held, partners) -> tuple[str, ...]:
     words = []
     model, last = eq.model, len(eq.model.nominal.joints)
-    for row, base in enumerate(told.base):
-        others = [k for k in np.flatnonzero(told.combination[row]) if k != base]
+    for row, base in enumerate(identifiability.base):
+        others = [k for k in np.flatnonzero(identifiability.combination[row]) if k != base]
         if others:
-            words.append(f"identifiable only together: {told.text(row)}")
+            words.append(f"identifiable only together: {identifiability.format_combination(row)}")
     carriage = [n for n in partners if n in model.names[: model.carriage_count]]
     own = {f"{part}{last}" for part in ("theta", "d", "a", "alpha")}
     if carriage and model.kind == "dh" and set(carriage) <= own and held:
@@ -200,12 +201,12 @@ def _in_words(eq: Equations, told: Identifiability, held, partners) -> tuple[str
             )  # fmt: skip
     still = np.ptp(eq.measurement.joints, axis=0)
     for joint, moved in zip(model.nominal.joints, still, strict=True):
-        if moved < _STILL:
+        if moved < _MIN_JOINT_RANGE:
             words.append(f"joint {joint} never moves: its axis is not identifiable; move it")
     return tuple(words)
 
 
-class Errors(NamedTuple):
+class PoseErrors(NamedTuple):
     """Errors of predicted poses.
 
     Attributes:
@@ -216,7 +217,7 @@ class Errors(NamedTuple):
     position: np.ndarray
     orientation: np.ndarray
 
-    def summary(self) -> dict[str, float]:
+    def summarize(self) -> dict[str, float]:
         """Return RMS and maximum errors in mm and mrad."""
         return {
             "position_rms_mm": 1e3 * float(np.sqrt(np.mean(self.position**2))),
@@ -226,7 +227,7 @@ class Errors(NamedTuple):
         }
 
 
-def pose_errors(robot: Hybrid, measurement: Measurement) -> Errors:
+def pose_errors(robot: HybridRobot, measurement: Measurement) -> PoseErrors:
     """Compare the forward kinematics of the readings with the measured poses.
 
     Args:
@@ -237,11 +238,11 @@ def pose_errors(robot: Hybrid, measurement: Measurement) -> Errors:
         InputError: the forward kinematics of a pose have no solution.
     """
     try:
-        found = forward(robot, measurement.joints, measurement.legs, measurement.pose)
-    except Unreachable as error:
+        found = forward_kinematics(robot, measurement.joints, measurement.legs, measurement.pose)
+    except UnreachableError as error:
         raise InputError(measurement.source, f"{error}: correct its leg readings") from None
     away = pose_difference(found, measurement.pose)
-    return Errors(np.linalg.norm(away[:, :3], axis=1), np.linalg.norm(away[:, 3:], axis=1))
+    return PoseErrors(np.linalg.norm(away[:, :3], axis=1), np.linalg.norm(away[:, 3:], axis=1))
 
 
 @dataclass(frozen=True)
@@ -254,35 +255,35 @@ class Calibration:
         fit: least-squares fit of the free parameters.
         redundancy: redundancy of the free parameters.
         robot: calibrated robot.
-        before: errors of the nominal robot at the poses.
-        after: errors of the calibrated robot at the poses.
-        wrong: rows of the poses left out as inconsistent.
+        nominal_errors: errors of the nominal robot at the poses.
+        calibrated_errors: errors of the calibrated robot at the poses.
+        inconsistent_rows: rows of the poses left out as inconsistent.
         warnings: possible problems of the result, with remedies.
     """
 
     model: ErrorModel
-    equations: Equations
+    equations: PoseEquations
     fit: ParameterFit
     redundancy: Redundancy
-    robot: Hybrid
-    before: Errors
-    after: Errors
-    wrong: tuple[int, ...]
+    robot: HybridRobot
+    nominal_errors: PoseErrors
+    calibrated_errors: PoseErrors
+    inconsistent_rows: tuple[int, ...]
     warnings: tuple[str, ...]
 
     @cached_property
-    def left_out(self) -> Errors:
+    def leave_one_out_errors(self) -> PoseErrors:
         """Errors of each pose predicted by a calibration without this pose."""
-        return _left_out(self.equations, self.fit)
+        return _leave_one_out_errors(self.equations, self.fit)
 
     @property
-    def errors(self) -> np.ndarray:
+    def parameter_errors(self) -> np.ndarray:
         """(p,) identified errors of all parameters, zero for held parameters."""
-        return self.equations.full(self.fit.values)
+        return self.equations.expand_errors(self.fit.values)
 
 
-def calibrate(
-    robot: Hybrid, measurement: Measurement, kind: Kind, names: Sequence[str] | None = None,
+def calibrate_hybrid_robot(
+    robot: HybridRobot, measurement: Measurement, kind: ErrorModelKind, names: Sequence[str] | None = None,
     prior: Prior | None = None,
 ) -> Calibration:  # fmt: skip
     """Identify the errors of a hybrid robot by least squares.
@@ -303,27 +304,27 @@ def calibrate(
     Raises:
         InputError: there are too few different poses.
     """
-    model = error_model(robot, kind)
-    eq = equations(model, measurement, names)
+    model = build_error_model(robot, kind)
+    eq = build_equations(model, measurement, names)
     _check_poses(eq)
     wrong: list[int] = []
     while True:
-        fit = _fit(eq, prior)
-        suspect = _suspect(eq, fit)
-        if suspect is None or len(wrong) + 1 > _MOST_OUT * len(measurement):
+        fit = _fit_equations(eq, prior)
+        suspect = _find_inconsistent_pose(eq, fit)
+        if suspect is None or len(wrong) + 1 > _MAX_REMOVED_FRACTION * len(measurement):
             break
         wrong.append(int(eq.measurement.rows[suspect]))
         kept = np.arange(len(eq.measurement)) != suspect
-        eq = equations(model, eq.measurement.subset(kept), names)
-    calibrated = corrected(model, eq.full(fit.values))
+        eq = build_equations(model, eq.measurement.subset(kept), names)
+    calibrated = apply_errors(model, eq.expand_errors(fit.values))
     return Calibration(
-        model, eq, fit, redundancy(eq, fit.values), calibrated,
+        model, eq, fit, find_redundancy(eq, fit.values), calibrated,
         pose_errors(model.nominal, eq.measurement), pose_errors(calibrated, eq.measurement),
-        tuple(sorted(wrong)), _warnings(eq, fit),
+        tuple(sorted(wrong)), _collect_warnings(eq, fit),
     )  # fmt: skip
 
 
-def best(robot: Hybrid, measurement: Measurement, names: Sequence[str] | None = None
+def calibrate_best_model(robot: HybridRobot, measurement: Measurement, names: Sequence[str] | None = None
          ) -> Calibration:  # fmt: skip
     """Calibrate with both error models; return the one that predicts left-out poses better.
 
@@ -336,34 +337,33 @@ def best(robot: Hybrid, measurement: Measurement, names: Sequence[str] | None = 
         names: free parameters of the `dh` model; by default all.
 
     Raises:
-        InputError: as in `calibrate`.
+        InputError: as in `calibrate_hybrid_robot`.
     """
-    if not robot.facts.carriage:
-        return calibrate(robot, measurement, "poe", names)
-    dh = calibrate(robot, measurement, "dh", names)
+    if not robot.specification.carriage:
+        return calibrate_hybrid_robot(robot, measurement, "poe", names)
+    dh = calibrate_hybrid_robot(robot, measurement, "dh", names)
     if names is not None:
         return dh
-    poe = calibrate(robot, measurement, "poe")
-    size = [np.sqrt(np.mean(c.left_out.position**2)) for c in (dh, poe)]
-    return poe if size[1] < _BETTER * size[0] else dh
+    poe = calibrate_hybrid_robot(robot, measurement, "poe")
+    size = [np.sqrt(np.mean(c.leave_one_out_errors.position**2)) for c in (dh, poe)]
+    return poe if size[1] < _PREFERENCE_RATIO * size[0] else dh
 
 
-def _warnings(eq: Equations, fit: ParameterFit) -> tuple[str, ...]:
+def _collect_warnings(eq: PoseEquations, fit: ParameterFit) -> tuple[str, ...]:
     said = []
-    units = [eq.model.units[k] for k in eq.model.index(eq.names)]
-    large = np.flatnonzero(np.abs(fit.values) > _LARGE * eq.scales)
+    units = [eq.model.units[k] for k in eq.model.parameter_indices(eq.names)]
+    large = np.flatnonzero(np.abs(fit.values) > _MAX_ERROR_SCALES * eq.scales)
     if len(large):
         which = ", ".join(
-            f"{fit.names[k]} {1e3 * fit.values[k]:.3g} {'mm' if units[k] == 'm' else 'mrad'}"
-            for k in large[:6]
+            f"{fit.names[k]} {1e3 * fit.values[k]:.3g} {'mm' if units[k] == 'm' else 'mrad'}" for k in large[:6]
         )
         said.append(
             f"{which}: too large for manufacturing errors; the data are of another robot, a sensor"
             " has another zero, or a frame differs from that of the nominal robot"
         )
-    if eq.measurement.stated:
-        freedom = max(fit.freedom, 1.0)
-        if scipy.stats.chi2.sf(freedom * fit.chi**2, freedom) < _UNLIKELY:
+    if eq.measurement.noise_is_known:
+        freedom = max(fit.degrees_of_freedom, 1.0)
+        if scipy.stats.chi2.sf(freedom * fit.chi**2, freedom) < _MIN_NOISE_PROBABILITY:
             said.append(
                 f"residuals are {fit.chi:.2f} times as large as the stated noise predicts: the"
                 " noise is larger than stated, or the error model (or its selected parameters)"
@@ -374,46 +374,46 @@ def _warnings(eq: Equations, fit: ParameterFit) -> tuple[str, ...]:
     return tuple(said)
 
 
-def _fit(eq: Equations, prior: Prior | None) -> ParameterFit:
-    first = [n for n in document_parameters(eq.model) if n in eq.names]
-    known = 1.0 if eq.measurement.stated else None
+def _fit_equations(eq: PoseEquations, prior: Prior | None) -> ParameterFit:
+    first = [n for n in refined_model_parameters(eq.model) if n in eq.names]
+    known = 1.0 if eq.measurement.noise_is_known else None
     return least_squares(
         lambda x: eq.residuals(x[None])[0], np.zeros(len(eq.names)), eq.names, eq.scales,
-        sigma=known, prior=prior, jac=eq.jacobian, first=first,
+        sigma=known, prior=prior, jac=eq.jacobian, preferred=first,
     )  # fmt: skip
 
 
-def _check_poses(eq: Equations) -> None:
+def _check_poses(eq: PoseEquations) -> None:
     """Raise an error if there are not more equations than independent parameters."""
     m, q = eq.measurement, len(eq.names)
     matrix = eq.jacobian(np.zeros(q)) * eq.scales
-    rank = len(identifiable(matrix, eq.names, np.ones(q)).base)
-    if LEGS * m.distinct <= rank:
-        same = "" if m.distinct == len(m) else f" ({len(m)} rows, many of them the same pose)"
+    rank = len(classify_scaled_parameters(matrix, eq.names, np.ones(q)).base)
+    if LEG_COUNT * m.distinct_count <= rank:
+        same = "" if m.distinct_count == len(m) else f" ({len(m)} rows, many of them the same pose)"
         raise InputError(
             m.source,
-            f"{m.distinct} different poses{same} give {LEGS * m.distinct} equations for"
-            f" {q} parameters: measure at least {q // LEGS + 1} different poses, preferably twice"
+            f"{m.distinct_count} different poses{same} give {LEG_COUNT * m.distinct_count} equations for"
+            f" {q} parameters: measure at least {q // LEG_COUNT + 1} different poses, preferably twice"
             " as many, or identify fewer parameters (--parameters document)",
         )
 
 
-def _suspect(eq: Equations, fit: ParameterFit) -> int | None:
+def _find_inconsistent_pose(eq: PoseEquations, fit: ParameterFit) -> int | None:
     """Return the index of the pose whose residual is not noise, or None.
 
     The influence of each pose on the fit is removed from its six residuals. Relative to the noise
     of the other poses, their mean square follows an F(6, rest) distribution.
     """
     n = len(eq.measurement)
-    residual = fit.residual.reshape(n, LEGS)
+    residual = fit.residual.reshape(n, LEG_COUNT)
     free = np.flatnonzero(~fit.held)
     q, _ = np.linalg.qr(fit.jacobian[:, free] * fit.scales[free])
-    q = q.reshape(n, LEGS, -1)
+    q = q.reshape(n, LEG_COUNT, -1)
     leverage = np.einsum("nij,nkj->nik", q, q)
-    rest = LEGS * (n - 1) - len(free)
-    if rest < LEGS:
+    rest = LEG_COUNT * (n - 1) - len(free)
+    if rest < LEG_COUNT:
         return None
-    inside = np.eye(LEGS) - leverage
+    inside = np.eye(LEG_COUNT) - leverage
     solid = np.linalg.eigvalsh(inside)[:, 0] > 1e-6
     squares = np.full(n, 0.0)
     squares[solid] = np.einsum(
@@ -424,12 +424,12 @@ def _suspect(eq: Equations, fit: ParameterFit) -> int | None:
     left = np.maximum(total - squares, 1e-300)
     if total < 1e-12:  # residuals are rounding errors
         return None
-    ratio = (squares / LEGS) / (left / rest)
+    ratio = (squares / LEG_COUNT) / (left / rest)
     worst = int(np.argmax(ratio))
-    return worst if scipy.stats.f.sf(ratio[worst], LEGS, rest) * n < _WRONG else None
+    return worst if scipy.stats.f.sf(ratio[worst], LEG_COUNT, rest) * n < _MIN_POSE_PROBABILITY else None
 
 
-def _left_out(eq: Equations, fit: ParameterFit) -> Errors:
+def _leave_one_out_errors(eq: PoseEquations, fit: ParameterFit) -> PoseErrors:
     """Return each pose's prediction error by a calibration without it, for at most 200 poses.
 
     The equations are linear over changes smaller than the parameters' standard deviations. With
@@ -439,32 +439,32 @@ def _left_out(eq: Equations, fit: ParameterFit) -> Errors:
     free = np.flatnonzero(~fit.held)
     n = len(eq.measurement)
     q, r = np.linalg.qr(fit.jacobian[:, free] * fit.scales[free])
-    q, residual = q.reshape(n, LEGS, -1), fit.residual.reshape(n, LEGS)
+    q, residual = q.reshape(n, LEG_COUNT, -1), fit.residual.reshape(n, LEG_COUNT)
     result = np.full((2, n), np.nan)
-    for k in np.unique(np.linspace(0, n - 1, min(n, _LEFT_OUT)).astype(int)):
-        inside = np.eye(LEGS) - q[k] @ q[k].T
+    for k in np.unique(np.linspace(0, n - 1, min(n, _MAX_LEFT_OUT_POSES)).astype(int)):
+        inside = np.eye(LEG_COUNT) - q[k] @ q[k].T
         if np.linalg.eigvalsh(inside)[0] < 1e-9:
             continue
         step = np.linalg.solve(r, q[k].T @ np.linalg.solve(inside, residual[k]))
         values = fit.values.copy()
         values[free] += step * fit.scales[free]
-        robot = corrected(eq.model, eq.full(values))
+        robot = apply_errors(eq.model, eq.expand_errors(values))
         try:
             found = pose_errors(robot, eq.measurement.subset(np.array([k])))
         except InputError:  # without this pose, the calibration is not valid there
             continue
         result[:, k] = found.position[0], found.orientation[0]
     known = ~np.isnan(result[0])
-    return Errors(*(result[:, known] if known.any() else result))
+    return PoseErrors(*(result[:, known] if known.any() else result))
 
 
-def subset(calibration: Calibration) -> Equations:
+def fitted_equations(calibration: Calibration) -> PoseEquations:
     """Return the equations of a calibration restricted to its fitted parameters."""
     eq, held = calibration.equations, calibration.fit.held
     return replace(eq, names=tuple(n for n, h in zip(eq.names, held, strict=True) if not h))
 
 
-def informative_poses(
+def select_informative_poses(
     model: ErrorModel, candidates: Measurement, count: int, criterion: Criterion = "D"
 ) -> np.ndarray:
     """Select the most informative poses from candidates.
@@ -481,8 +481,8 @@ def informative_poses(
     Raises:
         InputError: there are too few candidates or poses.
     """
-    eq = equations(model, candidates)
+    eq = build_equations(model, candidates)
     matrix = eq.jacobian(np.zeros(len(eq.names))) * eq.scales
-    base = identifiable(matrix, eq.names, np.ones(len(eq.names))).base
-    rows = matrix[:, base].reshape(len(candidates), LEGS, -1)
+    base = classify_scaled_parameters(matrix, eq.names, np.ones(len(eq.names))).base
+    rows = matrix[:, base].reshape(len(candidates), LEG_COUNT, -1)
     return np.sort(select_poses(rows, count, criterion).chosen)

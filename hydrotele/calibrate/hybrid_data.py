@@ -21,36 +21,47 @@ from pathlib import Path
 
 import numpy as np
 
-from hydrotele.core.datafile import Facts, Positive, parse, read_yaml, suggest
+from hydrotele.core.datafile import (
+    PositiveFloat,
+    StrictModel,
+    read_yaml,
+    suggest_valid_name,
+    validate_data,
+)
 from hydrotele.core.errors import InputError
-from hydrotele.core.output import replacing
+from hydrotele.core.output import atomic_file
 from hydrotele.core.units import to_si
 from hydrotele.kinematics.hybrid import (
-    LEGS,
+    LEG_COUNT,
     REVOLUTE,
-    Hybrid,
-    Pose,
-    Unreachable,
-    euler_of_rotation,
-    forward,
+    HybridRobot,
+    PlatformPose,
+    UnreachableError,
+    euler_to_rotation,
+    forward_kinematics,
     leg_jacobian,
     leg_readings,
-    rotation_of_euler,
+    rotation_to_euler,
 )
-from hydrotele.kinematics.wires import NoIntersection, Wires, pose_covariance, pose_of_wires
+from hydrotele.kinematics.wires import (
+    NoIntersectionError,
+    WireGeometry,
+    pose_covariance,
+    pose_from_wires,
+)
 from hydrotele.logs.log import Table, read_table
 
-COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
-COVARIANCE = tuple(f"covariance.{a}.{b}" for a, b in combinations_with_replacement(COORDINATES, 2))
-POSES, HELDOUT, FACTS = "poses", "heldout", "measurement.yaml"
-_KINDS = (".csv", ".parquet")
-_MARGIN = 0.2  # fraction of a joint's range by which a reading may exceed it
-_FAR = 0.05  # m: median leg difference from the nominal robot above which it is another robot
-_WIRE = 1e-4  # m: default of a wire's deviation; only its ratio to the other errors matters
-_SAME = 1e-5  # m or rad: resolution at which poses count as repeated
+POSE_COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
+COVARIANCE_COLUMNS = tuple(f"covariance.{a}.{b}" for a, b in combinations_with_replacement(POSE_COORDINATES, 2))
+POSES_STEM, HELDOUT_STEM, MEASUREMENT_FILE = "poses", "heldout", "measurement.yaml"
+_FILE_SUFFIXES = (".csv", ".parquet")
+_RANGE_MARGIN = 0.2  # fraction of a joint's range by which a reading may exceed it
+_MAX_LEG_DIFFERENCE = 0.05  # m: median leg difference from the nominal robot above which it is another robot
+_DEFAULT_WIRE_DEVIATION = 1e-4  # m: default of a wire's deviation; only its ratio to the other errors matters
+_POSE_RESOLUTION = 1e-5  # m or rad: resolution at which poses count as repeated
 
 
-class Noise(Facts):
+class SensorNoise(StrictModel):
     """Standard deviations of the sensors; None if unknown.
 
     Attributes:
@@ -62,20 +73,20 @@ class Noise(Facts):
         orientation: of a measured pose's rotation vector [rad].
     """
 
-    leg: Positive | None = None
-    slide: Positive | None = None
-    turn: Positive | None = None
-    wire: Positive | None = None
-    position: Positive | None = None
-    orientation: Positive | None = None
+    leg: PositiveFloat | None = None
+    slide: PositiveFloat | None = None
+    turn: PositiveFloat | None = None
+    wire: PositiveFloat | None = None
+    position: PositiveFloat | None = None
+    orientation: PositiveFloat | None = None
 
 
-class MeasurementFacts(Facts):
+class MeasurementSpec(StrictModel):
     """Contents of `measurement.yaml`."""
 
     robot: str = ""
-    wires: Wires | None = None
-    noise: Noise = Noise()
+    wires: WireGeometry | None = None
+    noise: SensorNoise = SensorNoise()
 
 
 @dataclass(frozen=True)
@@ -89,39 +100,39 @@ class Measurement:
         legs: (N, 6) leg readings [m].
         pose: measured pose of the moving platform in frame 0.
         covariance: (N, 6, 6) covariance of the leg readings minus those predicted from measured
-            pose and carriage [m^2]; known up to a factor if `stated` is false.
-        stated: whether the noise is known.
+            pose and carriage [m^2]; known up to a factor if `noise_is_known` is false.
+        noise_is_known: whether the noise is known.
     """
 
     source: str
     rows: np.ndarray
     joints: np.ndarray
     legs: np.ndarray
-    pose: Pose
+    pose: PlatformPose
     covariance: np.ndarray
-    stated: bool
+    noise_is_known: bool
 
     def __len__(self) -> int:
         """Return the number of poses."""
         return len(self.legs)
 
-    def subset(self, places: np.ndarray) -> "Measurement":
+    def subset(self, index: np.ndarray) -> "Measurement":
         """Return the poses selected by an index array or mask."""
         return replace(
-            self, rows=self.rows[places], joints=self.joints[places], legs=self.legs[places],
-            pose=Pose(self.pose.rotation[places], self.pose.position[places]),
-            covariance=self.covariance[places],
+            self, rows=self.rows[index], joints=self.joints[index], legs=self.legs[index],
+            pose=PlatformPose(self.pose.rotation[index], self.pose.position[index]),
+            covariance=self.covariance[index],
         )  # fmt: skip
 
     @property
-    def distinct(self) -> int:
+    def distinct_count(self) -> int:
         """Number of different poses."""
         whole = np.hstack([self.joints, self.legs])
-        return len(np.unique(np.round(whole / _SAME), axis=0))
+        return len(np.unique(np.round(whole / _POSE_RESOLUTION), axis=0))
 
 
-def measurement_of_wires(
-    robot: Hybrid, joints: np.ndarray, legs: np.ndarray, lengths: np.ndarray, wires: Wires,
+def measurement_from_wires(
+    robot: HybridRobot, joints: np.ndarray, legs: np.ndarray, lengths: np.ndarray, wires: WireGeometry,
     noise: Mapping[str, float], source: str,
 ) -> Measurement:  # fmt: skip
     """Build a measurement from readings of carriage, legs and wires.
@@ -132,28 +143,28 @@ def measurement_of_wires(
         legs: (N, 6) leg readings [m].
         lengths: (N, 6) wire lengths [m].
         wires: geometry of the wires.
-        noise: standard deviations by the names of `Noise`, in SI.
+        noise: standard deviations by the names of `SensorNoise`, in SI.
         source: name of the measurement, for messages.
 
     Raises:
         NoIntersection: the wires do not meet.
         Unreachable: the legs do not fit this robot.
     """
-    pose = pose_of_wires(wires, lengths, forward(robot, joints, legs))
-    stated = Noise(**noise)
-    of_pose = pose_covariance(wires, pose, stated.wire or _WIRE)
-    whole = _covariance(robot, joints, pose, of_pose, stated)
+    pose = pose_from_wires(wires, lengths, forward_kinematics(robot, joints, legs))
+    stated = SensorNoise(**noise)
+    of_pose = pose_covariance(wires, pose, stated.wire or _DEFAULT_WIRE_DEVIATION)
+    whole = _leg_residual_covariance(robot, joints, pose, of_pose, stated)
     known = stated.wire is not None and stated.leg is not None
     return Measurement(source, np.arange(len(legs)), joints, legs, pose, whole, known)
 
 
-def robot_file(folder: Path) -> Path | None:
+def find_robot_file(folder: Path) -> Path | None:
     """Return the path of the nominal robot in a measurement folder, or None."""
     path = folder / "robot.yaml"
     return path if path.is_file() else None
 
 
-def read_measurement(folder: Path, robot: Hybrid) -> tuple[Measurement, Measurement | None]:
+def read_measurement(folder: Path, robot: HybridRobot) -> tuple[Measurement, Measurement | None]:
     """Read a folder of measurements.
 
     Args:
@@ -168,97 +179,93 @@ def read_measurement(folder: Path, robot: Hybrid) -> tuple[Measurement, Measurem
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise InputError(folder, f"is not a folder: give one with {POSES}.csv or {POSES}.parquet")
-    file = _table(folder, POSES)
+        raise InputError(folder, f"is not a folder: give one with {POSES_STEM}.csv or {POSES_STEM}.parquet")
+    file = _find_table(folder, POSES_STEM)
     if file is None:
-        raise InputError(folder, f"contains neither {POSES}.csv nor {POSES}.parquet")
-    facts = MeasurementFacts()
-    if (folder / FACTS).is_file():
-        data, lines = read_yaml(folder / FACTS)
-        facts = parse(MeasurementFacts, data, str(folder / FACTS), lines)
+        raise InputError(folder, f"contains neither {POSES_STEM}.csv nor {POSES_STEM}.parquet")
+    facts = MeasurementSpec()
+    if (folder / MEASUREMENT_FILE).is_file():
+        data, lines = read_yaml(folder / MEASUREMENT_FILE)
+        facts = validate_data(MeasurementSpec, data, str(folder / MEASUREMENT_FILE), lines)
     if facts.robot and facts.robot != robot.name:
         raise InputError(
-            folder / FACTS, f"is a measurement of the robot {facts.robot!r}, but the model is"
+            folder / MEASUREMENT_FILE, f"is a measurement of the robot {facts.robot!r}, but the model is"
             f" {robot.name!r}: select that robot with --robot",
         )  # fmt: skip
-    heldout = _table(folder, HELDOUT)
-    return _measurement(file, facts, robot), _measurement(
-        heldout, facts, robot
-    ) if heldout else None
+    heldout = _find_table(folder, HELDOUT_STEM)
+    return _read_poses(file, facts, robot), _read_poses(heldout, facts, robot) if heldout else None
 
 
-def _table(folder: Path, stem: str) -> Path | None:
-    return next((folder / f"{stem}{k}" for k in _KINDS if (folder / f"{stem}{k}").is_file()), None)
+def _find_table(folder: Path, stem: str) -> Path | None:
+    return next((folder / f"{stem}{k}" for k in _FILE_SUFFIXES if (folder / f"{stem}{k}").is_file()), None)
 
 
-def _measurement(file: Path, facts: MeasurementFacts, robot: Hybrid) -> Measurement:
+def _read_poses(file: Path, facts: MeasurementSpec, robot: HybridRobot) -> Measurement:
     table = read_table(file)
-    columns = _columns(table, robot, facts)
+    columns = _read_columns(table, robot, facts)
     if not len(table.values) or not len(table.values[0]):
         raise InputError(file, "contains no pose: write one line per pose")
     joints = np.column_stack([columns[f"joint.{name}"] for name in robot.joints])
-    legs = np.column_stack([columns[f"leg.{k}"] for k in range(1, LEGS + 1)])
+    legs = np.column_stack([columns[f"leg.{k}"] for k in range(1, LEG_COUNT + 1)])
     _check_ranges(table, robot, joints, legs)
     noise = facts.noise
     if "wire.1" in columns:
         pose = _pose_from_wires(table, columns, facts, robot, joints, legs)
         assert facts.wires is not None
-        of_pose = pose_covariance(facts.wires, pose, noise.wire or _WIRE)
+        of_pose = pose_covariance(facts.wires, pose, noise.wire or _DEFAULT_WIRE_DEVIATION)
         known = noise.wire is not None
     else:
-        place = np.column_stack([columns[f"pose.{c}"] for c in COORDINATES])
-        pose = Pose(rotation_of_euler(place[:, 3:]), place[:, :3])
+        place = np.column_stack([columns[f"pose.{c}"] for c in POSE_COORDINATES])
+        pose = PlatformPose(euler_to_rotation(place[:, 3:]), place[:, :3])
         of_pose, known = _pose_covariance(table, columns, noise, len(legs))
     _check_robot(table, robot, joints, legs, pose)
-    whole = _covariance(robot, joints, pose, of_pose, noise)
+    whole = _leg_residual_covariance(robot, joints, pose, of_pose, noise)
     return Measurement(
         str(file), np.arange(len(legs)), joints, legs, pose, whole,
         known and noise.leg is not None,
     )  # fmt: skip
 
 
-def _columns(table: Table, robot: Hybrid, facts: MeasurementFacts) -> dict[str, np.ndarray]:
+def _read_columns(table: Table, robot: HybridRobot, facts: MeasurementSpec) -> dict[str, np.ndarray]:
     """Return the columns by name in SI units, after checks of names, units and values."""
     joints = dict(zip((f"joint.{n}" for n in robot.joints), robot.kinds, strict=True))
-    legs, wires = ([f"{what}.{k}" for k in range(1, LEGS + 1)] for what in ("leg", "wire"))
-    poses = [f"pose.{c}" for c in COORDINATES]
+    legs, wires = ([f"{what}.{k}" for k in range(1, LEG_COUNT + 1)] for what in ("leg", "wire"))
+    poses = [f"pose.{c}" for c in POSE_COORDINATES]
     angles = {*poses[3:], *(name for name, kind in joints.items() if kind == REVOLUTE)}
-    known = [*joints, *legs, *poses, *wires, *COVARIANCE]
+    known = [*joints, *legs, *poses, *wires, *COVARIANCE_COLUMNS]
     columns: dict[str, np.ndarray] = {}
     for name, values, unit in zip(table.names, table.values, table.units, strict=True):
         if name not in known:
-            raise InputError(table.where(name), f"is not a column of {robot.name}: "
-                             f"{suggest(name, known[:-21])}, covariance.x.x ...")  # fmt: skip
+            raise InputError(table.location(name), f"is not a column of {robot.name}: "
+                             f"{suggest_valid_name(name, known[:-21])}, covariance.x.x ...")  # fmt: skip
         if name in columns:
-            raise InputError(table.where(name), "occurs twice")
+            raise InputError(table.location(name), "occurs twice")
         wrong = np.flatnonzero(~np.isfinite(values))
         if len(wrong):
             said = f"is {values[wrong[0]]}: remove the row or measure the pose again"
-            raise InputError(table.where(name, int(wrong[0])), said)
+            raise InputError(table.location(name, int(wrong[0])), said)
         needed = "rad" if name in angles else "m"
         si, factor = to_si(unit) if unit else (needed, 1.0)
-        if si != needed and name not in COVARIANCE:
+        if si != needed and name not in COVARIANCE_COLUMNS:
             like = "rad, deg or mrad" if needed == "rad" else "m or mm"
-            raise InputError(table.where(name), f"has the unit {unit!r}, but needs {like}")
-        columns[name] = np.asarray(values, float) * (1.0 if name in COVARIANCE else factor)
+            raise InputError(table.location(name), f"has the unit {unit!r}, but needs {like}")
+        columns[name] = np.asarray(values, float) * (1.0 if name in COVARIANCE_COLUMNS else factor)
     for group in ((*joints, *legs), wires if "wire.1" in columns else poses):
         missing = [name for name in group if name not in columns]
         if missing:
             either = " (or wire.1 to wire.6)" if group is poses else ""
             raise InputError(table.source, f"has no column {', '.join(missing)}{either}")
     if "wire.1" in columns and facts.wires is None:
-        raise InputError(
-            Path(table.source).with_name(FACTS), "must state `wires`: anchors and points"
-        )
+        raise InputError(Path(table.source).with_name(MEASUREMENT_FILE), "must state `wires`: anchors and points")
     return columns
 
 
-def _check_ranges(table: Table, robot: Hybrid, joints: np.ndarray, legs: np.ndarray) -> None:
+def _check_ranges(table: Table, robot: HybridRobot, joints: np.ndarray, legs: np.ndarray) -> None:
     named = [(f"joint.{n}", v, r) for n, v, r in
              zip(robot.joints, joints.T, robot.joint_range, strict=True)]  # fmt: skip
     named += [(f"leg.{k}", v, robot.leg_range) for k, v in enumerate(legs.T, 1)]
     for name, values, (low, high) in named:
-        room = _MARGIN * (high - low)
+        room = _RANGE_MARGIN * (high - low)
         wrong = np.flatnonzero((values < low - room) | (values > high + room))
         if len(wrong):
             row = int(wrong[0])
@@ -266,31 +273,32 @@ def _check_ranges(table: Table, robot: Hybrid, joints: np.ndarray, legs: np.ndar
                              if k == REVOLUTE}  # fmt: skip
             unit, other = ("rad", "deg") if angle else ("m", "mm")
             raise InputError(
-                table.where(name, row), f"is {values[row]:.6g} {unit}, but robot {robot.name}"
+                table.location(name, row), f"is {values[row]:.6g} {unit}, but robot {robot.name}"
                 f" has the range {low:.6g} to {high:.6g}: correct the value, state the unit in the"
                 f" header ('{name} [{other}]') or select the correct robot",
             )  # fmt: skip
 
 
-def _pose_from_wires(table, columns, facts, robot, joints, legs) -> Pose:
-    lengths = np.column_stack([columns[f"wire.{k}"] for k in range(1, LEGS + 1)])
+def _pose_from_wires(table, columns, facts, robot, joints, legs) -> PlatformPose:
+    lengths = np.column_stack([columns[f"wire.{k}"] for k in range(1, LEG_COUNT + 1)])
     try:
-        near = forward(robot, joints, legs)
-        return pose_of_wires(facts.wires, lengths, near)
-    except (Unreachable, NoIntersection) as error:
+        near = forward_kinematics(robot, joints, legs)
+        return pose_from_wires(facts.wires, lengths, near)
+    except (UnreachableError, NoIntersectionError) as error:
         raise InputError(
-            table.source, f"{error}: check the order and units of the wires in it and in {FACTS}"
+            table.source,
+            f"{error}: check the order and units of the wires in it and in {MEASUREMENT_FILE}",
         ) from None
 
 
 def _pose_covariance(table, columns, noise, count) -> tuple[np.ndarray, bool]:
-    present = [name for name in COVARIANCE if name in columns]
+    present = [name for name in COVARIANCE_COLUMNS if name in columns]
     if present:
-        if len(present) < len(COVARIANCE):
-            missing = [name for name in COVARIANCE if name not in columns]
+        if len(present) < len(COVARIANCE_COLUMNS):
+            missing = [name for name in COVARIANCE_COLUMNS if name not in columns]
             raise InputError(table.source, f"has no {', '.join(missing[:6])}: give all 21 or none")
         result, at = np.empty((count, 6, 6)), np.triu_indices(6)
-        result[:, at[0], at[1]] = np.column_stack([columns[name] for name in COVARIANCE])
+        result[:, at[0], at[1]] = np.column_stack([columns[name] for name in COVARIANCE_COLUMNS])
         result[:, at[1], at[0]] = result[:, at[0], at[1]]
         for row, matrix in enumerate(result):
             if np.linalg.eigvalsh(matrix)[0] < 0.0:
@@ -302,10 +310,10 @@ def _pose_covariance(table, columns, noise, count) -> tuple[np.ndarray, bool]:
     return np.broadcast_to(np.diag([position**2] * 3 + [orientation**2] * 3), (count, 6, 6)), known
 
 
-def _covariance(robot: Hybrid, joints, pose: Pose, of_pose: np.ndarray, noise: Noise):
+def _leg_residual_covariance(robot: HybridRobot, joints, pose: PlatformPose, of_pose: np.ndarray, noise: SensorNoise):
     """Return the covariance (N, 6, 6) of leg readings minus predictions, from all sensors."""
     by_pose = leg_jacobian(robot, joints, pose)
-    by_joint = np.empty((len(joints), LEGS, len(robot.joints)))
+    by_joint = np.empty((len(joints), LEG_COUNT, len(robot.joints)))
     for k in range(len(robot.joints)):
         step = np.zeros(len(robot.joints))
         step[k] = 1e-6
@@ -314,16 +322,16 @@ def _covariance(robot: Hybrid, joints, pose: Pose, of_pose: np.ndarray, noise: N
     sizes = np.where(robot.kinds == REVOLUTE, noise.turn or 0.0, noise.slide or 0.0)
     by_joint = by_joint * sizes
     return (
-        (noise.leg or 1e-5) ** 2 * np.eye(LEGS)
+        (noise.leg or 1e-5) ** 2 * np.eye(LEG_COUNT)
         + by_pose @ of_pose @ np.swapaxes(by_pose, 1, 2)
         + by_joint @ np.swapaxes(by_joint, 1, 2)
     )
 
 
-def _check_robot(table: Table, robot: Hybrid, joints, legs, pose: Pose) -> None:
+def _check_robot(table: Table, robot: HybridRobot, joints, legs, pose: PlatformPose) -> None:
     """Raise an error if the leg readings do not fit the nominal robot at the measured poses."""
     away = np.abs(leg_readings(robot, joints, pose) - legs)
-    if np.median(away) > _FAR:
+    if np.median(away) > _MAX_LEG_DIFFERENCE:
         row = int(np.argmax(away.max(axis=1)))
         raise InputError(
             table.source, f"legs differ from those of the robot {robot.name} at the measured poses"
@@ -333,14 +341,14 @@ def _check_robot(table: Table, robot: Hybrid, joints, legs, pose: Pose) -> None:
 
 
 def save_measurement(
-    folder: Path, stem: str, robot: Hybrid, joints: np.ndarray, legs: np.ndarray,
-    pose: Pose | None = None, wires: np.ndarray | None = None,
+    folder: Path, stem: str, robot: HybridRobot, joints: np.ndarray, legs: np.ndarray,
+    pose: PlatformPose | None = None, wires: np.ndarray | None = None,
 ) -> None:  # fmt: skip
     """Write a table of poses in mm and degrees, in the format of `read_measurement`.
 
     Args:
         folder: existing folder.
-        stem: `POSES` or `HELDOUT`.
+        stem: `POSES_STEM` or `HELDOUT_STEM`.
         robot: robot that has these joints.
         joints: (N, n) carriage readings [m] or [rad].
         legs: (N, 6) leg readings [m].
@@ -355,23 +363,23 @@ def save_measurement(
     if wires is not None:
         columns |= {f"wire.{k} [mm]": 1e3 * v for k, v in enumerate(wires.T, 1)}
     if pose is not None:
-        angles = np.degrees(euler_of_rotation(pose.rotation))
+        angles = np.degrees(rotation_to_euler(pose.rotation))
         columns |= {f"pose.{c} [mm]": 1e3 * v
-                    for c, v in zip(COORDINATES, pose.position.T, strict=False)}  # fmt: skip
-        columns |= {f"pose.{c} [deg]": v for c, v in zip(COORDINATES[3:], angles.T, strict=True)}
+                    for c, v in zip(POSE_COORDINATES, pose.position.T, strict=False)}  # fmt: skip
+        columns |= {f"pose.{c} [deg]": v for c, v in zip(POSE_COORDINATES[3:], angles.T, strict=True)}
     lines = [",".join(columns)]
     lines += [",".join(f"{v:.9f}" for v in row) for row in np.column_stack([*columns.values()])]
-    with replacing(folder / f"{stem}.csv", ".csv") as part:
+    with atomic_file(folder / f"{stem}.csv", ".csv") as part:
         part.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def measurement_text(robot: str, wires: Wires | None, noise: Mapping[str, float]) -> str:
+def measurement_text(robot: str, wires: WireGeometry | None, noise: Mapping[str, float]) -> str:
     """Return the text of `measurement.yaml`, with lengths in mm and angles in degrees.
 
     Args:
         robot: name of the robot.
         wires: geometry of the wires.
-        noise: standard deviations by the names of `Noise`, in SI.
+        noise: standard deviations by the names of `SensorNoise`, in SI.
     """
     import yaml
 

@@ -13,29 +13,29 @@ from typing import Literal
 
 import numpy as np
 
-from hydrotele.calibrate.arm import ArmFit, Equations
+from hydrotele.calibrate.arm import ArmFit, StageEquations
 from hydrotele.calibrate.arm_poses import Poses
 from hydrotele.calibrate.estimation import ParameterFit, least_squares
-from hydrotele.calibrate.loop import ball_place, frame_of
+from hydrotele.calibrate.loop import ball_position, frame_after_links
 from hydrotele.core.errors import InputError
-from hydrotele.effects.effect import changed
+from hydrotele.effects.effect import with_value
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.kinematics.linkages import TwoBar
 from hydrotele.machine.machine import Machine
 
-Angles = Literal["measured", "identified"]
+AngleSource = Literal["measured", "identified"]
 
-NAMES = ("theta_off", "l_l", "l_c", "l_u")
+PARAMETER_NAMES = ("theta_off", "l_l", "l_c", "l_u")
 """Offset of the included angle [rad], lower pin distance, closed length, upper pin distance [m]."""
 
-_SIZES = np.array([np.radians(10.0), 0.2, 0.2, 0.2])
-_SPAN = np.radians(5.0)  # minimum range of the joint angle
-_EVERY = 5  # every fifth sample is used for validation
-_ROUNDS = 3
+_PARAMETER_SCALES = np.array([np.radians(10.0), 0.2, 0.2, 0.2])
+_MIN_ANGLE_RANGE = np.radians(5.0)  # minimum range of the joint angle
+_VALIDATION_STRIDE = 5  # every fifth sample is used for validation
+_MAX_REWEIGHTINGS = 3
 
 
 @dataclass(frozen=True)
-class Strokes:
+class AxisStrokes:
     """Joint angles and piston displacements of one axis.
 
     Attributes:
@@ -44,7 +44,7 @@ class Strokes:
         length: (n,) piston displacements [m].
         angle_sigma: standard deviation of an angle [rad].
         length_sigma: standard deviation of a displacement [m].
-        angles: origin of the angles.
+        angle_source: origin of the angles.
         source: the file.
     """
 
@@ -53,7 +53,7 @@ class Strokes:
     length: np.ndarray
     angle_sigma: float
     length_sigma: float
-    angles: Angles = "measured"
+    angle_source: AngleSource = "measured"
     source: str = "memory"
 
 
@@ -63,8 +63,8 @@ class LinkageFit:
 
     Attributes:
         axis: name of the axis.
-        angles: origin of the angles.
-        nominal: (4,) nominal parameters, in the order of `NAMES`.
+        angle_source: origin of the angles.
+        nominal: (4,) nominal parameters, in the order of `PARAMETER_NAMES`.
         fit: fit of the free parameters.
         fixed: names of the fixed parameters.
         direction: +1 if the cylinder extends as the angle increases, otherwise -1.
@@ -77,7 +77,7 @@ class LinkageFit:
     """
 
     axis: str
-    angles: Angles
+    angle_source: AngleSource
     nominal: np.ndarray
     fit: ParameterFit
     fixed: tuple[str, ...]
@@ -90,15 +90,13 @@ class LinkageFit:
     angle: np.ndarray
 
 
-def displacement(values: np.ndarray, direction: int, angle: np.ndarray) -> np.ndarray:
-    """Return the piston displacement (n,) [m] for parameters as `NAMES`, at angles (n,) [rad]."""
+def piston_displacement(values: np.ndarray, direction: int, angle: np.ndarray) -> np.ndarray:
+    """Return the piston displacement (n,) [m] for parameters as `PARAMETER_NAMES`, at angles (n,) [rad]."""
     offset, lower, closed, upper = values
     return TwoBar(lower, upper, offset, direction).length(angle) - closed
 
 
-def identify_linkage(
-    machine: Machine, strokes: Strokes, fixed: Sequence[str] | None = None
-) -> LinkageFit:
+def identify_linkage(machine: Machine, strokes: AxisStrokes, fixed: Sequence[str] | None = None) -> LinkageFit:
     """Identify the triangle of a cylinder linkage.
 
     Args:
@@ -118,7 +116,7 @@ def identify_linkage(
     cylinder = machine.axes[strokes.axis].cylinder
     if not isinstance(linkage, TwoBar) or cylinder is None:
         raise InputError(f"axis {strokes.axis}", "has no cylinder across its joint (two-bar)")
-    if np.ptp(strokes.angle) < _SPAN:
+    if np.ptp(strokes.angle) < _MIN_ANGLE_RANGE:
         moved = np.degrees(np.ptp(strokes.angle))
         raise InputError(
             strokes.source,
@@ -128,12 +126,12 @@ def identify_linkage(
     nominal = np.array([linkage.angle_offset, linkage.lower, cylinder.closed_length, linkage.upper])
     if fixed is None:
         longer = "l_u" if linkage.upper > linkage.lower else "l_l"
-        fixed = (longer,) if strokes.angles == "identified" else ()
-    free = [k for k, name in enumerate(NAMES) if name not in fixed]
-    judged = np.arange(len(strokes.angle)) % _EVERY == _EVERY // 2
+        fixed = (longer,) if strokes.angle_source == "identified" else ()
+    free = [k for k, name in enumerate(PARAMETER_NAMES) if name not in fixed]
+    judged = np.arange(len(strokes.angle)) % _VALIDATION_STRIDE == _VALIDATION_STRIDE // 2
     angle, length = strokes.angle[~judged], strokes.length[~judged]
     values, fit = nominal.copy(), None
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_REWEIGHTINGS):
         offset, lower, _, upper = values
         arm = TwoBar(lower, upper, offset, linkage.direction).rate(angle)
         sigma = np.hypot(strokes.length_sigma, np.asarray(arm) * strokes.angle_sigma)
@@ -142,29 +140,33 @@ def identify_linkage(
             full = nominal.copy()
             full[free] = x
             full[[1, 3]] = np.maximum(full[[1, 3]], 1.0e-3)
-            return displacement(full, linkage.direction, angle) - length
+            return piston_displacement(full, linkage.direction, angle) - length
 
         fit = least_squares(
-            residual, values[free], [NAMES[k] for k in free], _SIZES[free], sigma=sigma
+            residual,
+            values[free],
+            [PARAMETER_NAMES[k] for k in free],
+            _PARAMETER_SCALES[free],
+            sigma=sigma,
         )
         values[free] = fit.values
     assert fit is not None
-    error = displacement(values, linkage.direction, strokes.angle) - strokes.length
-    before = displacement(nominal, linkage.direction, strokes.angle) - strokes.length
+    error = piston_displacement(values, linkage.direction, strokes.angle) - strokes.length
+    before = piston_displacement(nominal, linkage.direction, strokes.angle) - strokes.length
     kept = strokes.length[judged]
     return LinkageFit(
-        strokes.axis, strokes.angles, nominal, fit, tuple(fixed), linkage.direction,
+        strokes.axis, strokes.angle_source, nominal, fit, tuple(fixed), linkage.direction,
         float(np.sqrt(np.mean(error[judged] ** 2))),
         100.0 * float(1.0 - np.sum(error[judged] ** 2) / np.sum((kept - kept.mean()) ** 2)),
         float(np.sqrt(np.mean(before[judged] ** 2))), len(strokes.angle), error, strokes.angle,
     )  # fmt: skip
 
 
-def values_of(found: LinkageFit) -> np.ndarray:
-    """Return all parameters (4,) in the order of `NAMES`; fixed ones are nominal."""
+def linkage_parameters(found: LinkageFit) -> np.ndarray:
+    """Return all parameters (4,) in the order of `PARAMETER_NAMES`; fixed ones are nominal."""
     values = found.nominal.copy()
     for name, value in zip(found.fit.names, found.fit.values, strict=True):
-        values[NAMES.index(name)] = value
+        values[PARAMETER_NAMES.index(name)] = value
     return values
 
 
@@ -186,7 +188,7 @@ def machine_with_linkage(machine: Machine, found: LinkageFit) -> Machine:
     outboard = machine.link_of(axis.joint)
     link = machine.links[outboard]
     assert link.joint
-    offset, lower, closed, upper = values_of(found)
+    offset, lower, closed, upper = linkage_parameters(found)
     turn = found.direction * (offset - found.nominal[0])
     way, ends = np.array(link.joint.axis), {}
     for part in ("base_pin", "rod_pin"):
@@ -204,10 +206,10 @@ def machine_with_linkage(machine: Machine, found: LinkageFit) -> Machine:
         position = tuple(map(float, origin + along + across))
         ends[part] = pin.model_copy(update={"position": position})
     cylinder = axis.cylinder.model_copy(update={**ends, "closed_length": float(closed)})
-    return changed(machine, f"axes.{found.axis}.cylinder", cylinder)
+    return with_value(machine, f"axes.{found.axis}.cylinder", cylinder)
 
 
-def identified_angles(fit: ArmFit, poses: Poses) -> np.ndarray:
+def identify_joint_angles(fit: ArmFit, poses: Poses) -> np.ndarray:
     """Compute the angle of the moving joint from the calibrator's readings alone.
 
     The ball's direction relative to the joint's axis rotates opposite to the joint. Its zero is
@@ -221,14 +223,12 @@ def identified_angles(fit: ArmFit, poses: Poses) -> np.ndarray:
         (M,) angles, machine's sign [rad], on the branch nearest to the nominal home angle.
     """
     loop = fit.nominal
-    equations = Equations(loop, poses)
-    seen, theta = equations.seen(fit.numbers)
-    s = ball_place(seen, equations.place, theta)
+    equations = StageEquations(loop, poses)
+    seen, theta = equations.chain_and_angles(fit.parameters)
+    s = ball_position(seen, equations.place, theta)
     angle = -np.unwrap(np.arctan2(s[:, 1], s[:, 0]))
-    origin, turn = frame_of(fit.loop, equations.place, loop.home[None])
+    origin, turn = frame_after_links(fit.loop, equations.place, loop.home[None])
     ball = turn[0].T @ (fit.loop.ball - origin[0])
     angle = angle + np.arctan2(ball[1], ball[0])
-    angle = angle - 2.0 * np.pi * np.round(
-        (angle.mean() - loop.home[equations.place]) / (2 * np.pi)
-    )
+    angle = angle - 2.0 * np.pi * np.round((angle.mean() - loop.home[equations.place]) / (2 * np.pi))
     return (angle - loop.values[equations.place, 0]) * loop.signs[equations.place]

@@ -14,18 +14,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hydrotele.core.errors import InputError
-from hydrotele.kinematics.serial_chain import Element, SerialChain, forward, forward_and_rates
+from hydrotele.kinematics.serial_chain import (
+    Element,
+    SerialChain,
+    chain_poses,
+    chain_poses_and_rates,
+)
 from hydrotele.machine.machine import Machine
 
-KINDS = ("offset", "alpha", "a", "d", "beta")
+PARAMETER_KINDS = ("offset", "alpha", "a", "d", "beta")
 """Kinds of link parameters; `offset` is theta at the zero of the joint's sensor."""
 
-_PARALLEL = 0.05  # rad, maximum angle between nominally parallel neighbouring axes
-_DOF = {kind: k for k, kind in enumerate(KINDS)}
+_MAX_PARALLEL_ANGLE = 0.05  # rad, maximum angle between nominally parallel neighbouring axes
+_KIND_COLUMNS = {kind: k for k, kind in enumerate(PARAMETER_KINDS)}
 
 
 @dataclass(frozen=True)
-class Loop:
+class CalibrationLoop:
     """A closed chain of N links with its ball joint.
 
     Attributes:
@@ -33,7 +38,7 @@ class Loop:
         channels: (N,) log channel of each joint's sensor.
         links: (N,) name of each link: the axis name of a driven joint, otherwise the joint name.
         signs: (N,) factors from the machine's joint angles to K's.
-        moved: number n of powered manipulator joints; the others belong to the calibrator.
+        powered_count: number n of powered manipulator joints; the others belong to the calibrator.
         values: (N, 5) offset [rad], alpha [rad], a [m], d [m], beta [rad] of each link.
         ball: (3,) position of the ball in frame 0, whose x axis points to it at zero swing [m].
         base: (3,) origin of frame 0 in the machine's frame [m].
@@ -46,7 +51,7 @@ class Loop:
     channels: tuple[str, ...]
     links: tuple[str, ...]
     signs: np.ndarray
-    moved: int
+    powered_count: int
     values: np.ndarray
     ball: np.ndarray
     base: np.ndarray
@@ -58,7 +63,7 @@ class Loop:
         """Return the number of links N."""
         return len(self.joints)
 
-    def place(self, name: str) -> tuple[int, int]:
+    def parameter_index(self, name: str) -> tuple[int, int]:
         """Return row and column in `values` of a parameter such as `a.boom`.
 
         Raises:
@@ -66,23 +71,23 @@ class Loop:
             ValueError: the link is unknown.
         """
         kind, _, link = name.partition(".")
-        return self.links.index(link), _DOF[kind]
+        return self.links.index(link), _KIND_COLUMNS[kind]
 
     def value(self, name: str) -> float:
         """Return a parameter by name [rad] or [m]."""
-        return float(self.values[self.place(name)])
+        return float(self.values[self.parameter_index(name)])
 
-    def with_values(self, numbers: dict[str, float]) -> "Loop":
+    def with_values(self, parameters: dict[str, float]) -> "CalibrationLoop":
         """Return the chain with some parameters replaced."""
         values = self.values.copy()
-        for name, number in numbers.items():
-            values[self.place(name)] = number
+        for name, number in parameters.items():
+            values[self.parameter_index(name)] = number
         return replace(self, values=values)
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def parameter_names(self) -> tuple[str, ...]:
         """Names of all parameters, link by link."""
-        return tuple(f"{kind}.{link}" for link in self.links for kind in KINDS)
+        return tuple(f"{kind}.{link}" for link in self.links for kind in PARAMETER_KINDS)
 
 
 def unit_of(name: str) -> str:
@@ -94,18 +99,18 @@ def link_chain(values: np.ndarray) -> SerialChain:
     """Return the serial chain of consecutive links; its joint coordinates include the offsets.
 
     Args:
-        values: (k, 5) rows of `Loop.values`; the offsets are not used.
+        values: (k, 5) rows of `CalibrationLoop.values`; the offsets are not used.
 
     Returns:
         A chain of k joints with 5 parameters per link: offset, d, a, alpha, beta.
     """
-    return _chain_of(len(values), values.tobytes())
+    return _build_chain(len(values), values.tobytes())
 
 
 @functools.lru_cache(maxsize=64)
-def _chain_of(count: int, numbers: bytes) -> SerialChain:
+def _build_chain(count: int, value_bytes: bytes) -> SerialChain:
     elements = []
-    for k, (_, alpha, a, d, beta) in enumerate(np.frombuffer(numbers).reshape(count, 5)):
+    for k, (_, alpha, a, d, beta) in enumerate(np.frombuffer(value_bytes).reshape(count, 5)):
         elements += [
             Element("rz", f"offset.{k}", 0.0, k), Element("tz", f"d.{k}", float(d)),
             Element("tx", f"a.{k}", float(a)), Element("rx", f"alpha.{k}", float(alpha)),
@@ -114,10 +119,16 @@ def _chain_of(count: int, numbers: bytes) -> SerialChain:
     return SerialChain(tuple(map(str, range(count))), tuple(elements))
 
 
-_ORDER = [0, 3, 2, 1, 4]  # from chain order (offset, d, a, alpha, beta) to the order of KINDS
+_CHAIN_TO_KINDS = [
+    0,
+    3,
+    2,
+    1,
+    4,
+]  # from chain order (offset, d, a, alpha, beta) to the order of KINDS
 
 
-def frame_of(loop: Loop, count: int, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def frame_after_links(loop: CalibrationLoop, count: int, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the frame at the end of the first links.
 
     Args:
@@ -128,16 +139,16 @@ def frame_of(loop: Loop, count: int, theta: np.ndarray) -> tuple[np.ndarray, np.
     Returns:
         (origins (M, 3) [m], rotations (M, 3, 3)) in frame 0.
     """
-    return forward(link_chain(loop.values[:count]), theta[:, :count])
+    return chain_poses(link_chain(loop.values[:count]), theta[:, :count])
 
 
-def ball_place(loop: Loop, first: int, theta: np.ndarray) -> np.ndarray:
-    """Return the ball position (M, 3) [m] as `ball_from` does, without derivatives."""
+def ball_position(loop: CalibrationLoop, first: int, theta: np.ndarray) -> np.ndarray:
+    """Return the ball position (M, 3) [m] as `ball_position_and_rates` does, without derivatives."""
     angles = np.concatenate([np.zeros((len(theta), 1)), theta], axis=1)
-    return forward(link_chain(loop.values[first:]), angles).position
+    return chain_poses(link_chain(loop.values[first:]), angles).position
 
 
-def ball_from(loop: Loop, first: int, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def ball_position_and_rates(loop: CalibrationLoop, first: int, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the ball position relative to a joint axis, without that joint's angle, and its rates.
 
     `s = Tx(a_i) Rx(alpha_i) Ry(beta_i) A_(i+1) ... A_N [0 0 0 1]'` of K Eqs 3.23 and 3.24, with
@@ -153,12 +164,12 @@ def ball_from(loop: Loop, first: int, theta: np.ndarray) -> tuple[np.ndarray, np
         i .. N; the derivative by the offset of link i is that by a rotation of joint i.)
     """
     angles = np.concatenate([np.zeros((len(theta), 1)), theta], axis=1)
-    found = forward_and_rates(link_chain(loop.values[first:]), angles)
+    found = chain_poses_and_rates(link_chain(loop.values[first:]), angles)
     by = found.position_by_parameter.reshape(len(theta), 3, len(loop) - first, 5)
-    return found.position, by[..., _ORDER]
+    return found.position, by[..., _CHAIN_TO_KINDS]
 
 
-def closure(loop: Loop, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def closure_error(loop: CalibrationLoop, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the closure error of the chain and its derivatives by the joint angles.
 
     Args:
@@ -168,7 +179,7 @@ def closure(loop: Loop, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Returns:
         (end of chain minus ball (M, 3) in frame 0 [m], derivatives (M, 3, N) [m/rad]).
     """
-    place, by = ball_from(loop, 0, theta[:, 1:])
+    place, by = ball_position_and_rates(loop, 0, theta[:, 1:])
     ct, st = np.cos(theta[:, 0]), np.sin(theta[:, 0])
     turn = np.zeros((len(theta), 3, 3))
     turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1], turn[:, 2, 2] = ct, -st, st, ct, 1.0
@@ -176,8 +187,8 @@ def closure(loop: Loop, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.einsum("mij,mj->mi", turn, place) - loop.ball, by
 
 
-def close(
-    loop: Loop, theta: np.ndarray, free: Sequence[int], start: np.ndarray
+def close_chain(
+    loop: CalibrationLoop, theta: np.ndarray, free: Sequence[int], start: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find the angles of three joints that close the chain, by Newton's method.
 
@@ -193,23 +204,23 @@ def close(
     theta, free = theta.copy(), list(free)
     if np.ndim(start) == 2:
         theta[:, free] = start
-        reached = _newton(loop, theta, free)
+        reached = _close_by_newton(loop, theta, free)
         return theta, reached
     reached = np.zeros(len(theta), dtype=bool)
     last = np.asarray(start, float)
     for row in range(len(theta)):
         one = theta[row : row + 1]
         one[:, free] = last
-        reached[row] = _newton(loop, one, free)[0]
+        reached[row] = _close_by_newton(loop, one, free)[0]
         if reached[row]:
             last = one[0, free]
     return theta, reached
 
 
-def _newton(loop: Loop, theta: np.ndarray, free: list[int]) -> np.ndarray:
+def _close_by_newton(loop: CalibrationLoop, theta: np.ndarray, free: list[int]) -> np.ndarray:
     """Close all rows in place; return whether each row closes."""
     for _ in range(40):
-        gap, by = closure(loop, theta)
+        gap, by = closure_error(loop, theta)
         if np.abs(gap).max() < 1.0e-12:
             break
         slope = by[:, :, free]
@@ -217,11 +228,11 @@ def _newton(loop: Loop, theta: np.ndarray, free: list[int]) -> np.ndarray:
         step = -np.linalg.solve(damped, slope.transpose(0, 2, 1) @ gap[..., None])[..., 0]
         largest = np.abs(step).max(axis=1, keepdims=True)
         theta[:, free] += step * np.minimum(1.0, 0.3 / np.maximum(largest, 1.0e-300))
-    gap, _ = closure(loop, theta)
+    gap, _ = closure_error(loop, theta)
     return np.abs(gap).max(axis=1) < 1.0e-9
 
 
-def loop_of(machine: Machine) -> Loop:
+def build_loop(machine: Machine) -> CalibrationLoop:
     """Build the closed chain of a machine with a calibrator from its links and joints.
 
     Args:
@@ -265,11 +276,11 @@ def loop_of(machine: Machine) -> Loop:
     points = np.array([origin[name] for name in chain])
     tip = origin[last] + np.array(end.position)
     angle = ways @ np.roll(ways, -1, axis=0).T
-    parallel = np.array([np.arccos(min(1.0, abs(angle[k, k]))) < _PARALLEL
+    parallel = np.array([np.arccos(min(1.0, abs(angle[k, k]))) < _MAX_PARALLEL_ANGLE
                          for k in range(len(ways) - 1)] + [False])  # fmt: skip
     values, base = _denavit_hartenberg(ways, points, tip, parallel)
     home = np.array([machine.home.get(joint, 0.0) for joint in joints]) * signs + values[:, 0]
-    return Loop(
+    return CalibrationLoop(
         joints, tuple(f"angle.{link}" for link in links), links, signs, moved, values,
         np.array(ball.position) - base, base, parallel, home, machine.name,
     )  # fmt: skip
@@ -284,25 +295,25 @@ def _ancestors(machine: Machine, link: str) -> list[str]:
 
 
 def _denavit_hartenberg(
-    ways: np.ndarray, points: np.ndarray, tip: np.ndarray, parallel: np.ndarray
+    directions: np.ndarray, points: np.ndarray, tip: np.ndarray, parallel: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return parameters (N, 5) of axes through points, and the origin of frame 0 (3,)."""
-    count = len(ways)
+    count = len(directions)
     values = np.zeros((count, 5))
-    foot, _ = _feet(points[0], ways[0], points[1], ways[1])
+    foot, _ = _common_normal_feet(points[0], directions[0], points[1], directions[1])
     base = foot
-    frame = np.column_stack([*_across(ways[0]), ways[0]])
+    frame = np.column_stack([*_perpendicular_axes(directions[0]), directions[0]])
     for k in range(count):
-        z = ways[k]
+        z = directions[k]
         if k == count - 1:
             centre, along = tip, None
         elif parallel[k]:
             height = z @ (points[k + 1] - foot)  # as K: d keeps its nominal value
-            nearby, along = points[k + 1], ways[k + 1]
+            nearby, along = points[k + 1], directions[k + 1]
             centre = nearby + along * ((foot + z * height - nearby) @ z) / (along @ z)
         else:
-            on_this, centre = _feet(points[k], z, points[k + 1], ways[k + 1])
-            along = ways[k + 1]
+            on_this, centre = _common_normal_feet(points[k], z, points[k + 1], directions[k + 1])
+            along = directions[k + 1]
         d = z @ (centre - foot)
         if along is not None and not parallel[k]:
             d = z @ (on_this - foot)
@@ -322,12 +333,12 @@ def _denavit_hartenberg(
             beta = float(np.arcsin(np.clip(u[0], -1.0, 1.0))) if parallel[k] else 0.0
             alpha = float(np.arctan2(-u[1], u[2]))
         values[k] = theta, alpha, a, d, beta
-        rotation = forward(link_chain(np.array([[0.0, alpha, 0.0, 0.0, beta]])), np.zeros((1, 1)))
+        rotation = chain_poses(link_chain(np.array([[0.0, alpha, 0.0, 0.0, beta]])), np.zeros((1, 1)))
         frame, foot = middle @ rotation.rotation[0], centre
     return values, base
 
 
-def _across(way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _perpendicular_axes(way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return two unit vectors perpendicular to a direction: one near the machine's x, and y."""
     x = np.array([1.0, 0.0, 0.0]) if abs(way[0]) < 0.9 else np.array([0.0, 0.0, 1.0])
     x = x - way * (way @ x)
@@ -335,7 +346,7 @@ def _across(way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return x, np.cross(way, x)
 
 
-def _feet(p, u, q, v) -> tuple[np.ndarray, np.ndarray]:
+def _common_normal_feet(p, u, q, v) -> tuple[np.ndarray, np.ndarray]:
     """Return the feet of the common normal of the lines p + s u and q + t v."""
     between, cosine = q - p, u @ v
     square = 1.0 - cosine**2
@@ -344,7 +355,7 @@ def _feet(p, u, q, v) -> tuple[np.ndarray, np.ndarray]:
     return p + s * u, q + t * v
 
 
-def calibrator_angles(loop: Loop, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def solve_calibrator_angles(loop: CalibrationLoop, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Find the last three joint angles that close the chain, with a hanging elbow.
 
     The closed-form solution for a yoke, twist and elbow with axes that intersect at right angles is
@@ -359,7 +370,7 @@ def calibrator_angles(loop: Loop, theta: np.ndarray) -> tuple[np.ndarray, np.nda
     """
     theta = theta.copy()
     first = len(loop) - 3
-    place, turn = frame_of(loop, first, theta)
+    place, turn = frame_after_links(loop, first, theta)
     x, y, z = np.einsum("mji,mj->im", turn, loop.ball - place)
     upper, lower, aside = loop.values[-2, 3], loop.values[-1, 2], loop.values[-1, 3]
     sine = (x**2 + y**2 + z**2 - upper**2 - lower**2 - aside**2) / (2.0 * upper * lower)
@@ -374,6 +385,6 @@ def calibrator_angles(loop: Loop, theta: np.ndarray) -> tuple[np.ndarray, np.nda
     closed = theta[possible]
     reached = possible.copy()
     if len(closed):
-        reached[possible] = _newton(loop, closed, [first, first + 1, first + 2])
+        reached[possible] = _close_by_newton(loop, closed, [first, first + 1, first + 2])
         theta[possible] = closed
     return theta, reached

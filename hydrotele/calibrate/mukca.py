@@ -20,48 +20,53 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import scipy.stats
 
-from hydrotele.calibrate.estimation import ParameterFit, Prior, identifiable, least_squares
-from hydrotele.calibrate.sockets import Socket, places_of
-from hydrotele.core.datafile import suggest
+from hydrotele.calibrate.estimation import (
+    ParameterFit,
+    Prior,
+    classify_scaled_parameters,
+    least_squares,
+)
+from hydrotele.calibrate.sockets import Socket, place_names
+from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
-from hydrotele.kinematics.serial_chain import forward, forward_and_rates
+from hydrotele.kinematics.serial_chain import chain_poses, chain_poses_and_rates
 from hydrotele.kinematics.serial_robot import (
-    Robot,
-    corrected_robot,
-    deflection_names,
-    deflections,
+    SerialRobot,
+    correct_robot,
+    correction_derivatives,
+    correction_names,
     load_robot,
     robot_chain,
     shipped_robots,
 )
 
-_SMALLEST = 1e-7  # minimum size relative to its start: the kind has no errors
-_LARGEST = 1e3
-_ROUNDS, _SETTLED = 200, 1e-4
+_MIN_SIZE_RATIO = 1e-7  # minimum size relative to its start: the kind has no errors
+_MAX_SIZE_RATIO = 1e3
+_MAX_ROUNDS, _SIZE_TOLERANCE = 200, 1e-4
 
 
 @dataclass(frozen=True)
-class Sizes:
+class ErrorSizes:
     """Standard deviations of the parameters by kind, and of the noise.
 
     Attributes:
         std: (p,) prior standard deviation of each parameter.
         noise: standard deviation of an equation's error.
-        effective: effective number of parameters determined by the equations.
+        effective_parameters: effective number of parameters determined by the equations.
         rounds: number of iterations.
     """
 
     std: np.ndarray
     noise: float
-    effective: float
+    effective_parameters: float
     rounds: int
 
 
 def estimate_sizes(
-    matrix: np.ndarray, rest: np.ndarray, kinds: Sequence[str], start: np.ndarray,
-    freedom: float, noise: float, known: np.ndarray | None = None,
-    known_rest: np.ndarray | None = None, finest: float = 0.0,
-) -> Sizes:  # fmt: skip
+    matrix: np.ndarray, right_hand_side: np.ndarray, kinds: Sequence[str], start: np.ndarray,
+    degrees_of_freedom: float, noise: float, known: np.ndarray | None = None,
+    known_right_hand_side: np.ndarray | None = None, min_noise: float = 0.0,
+) -> ErrorSizes:  # fmt: skip
     """Estimate the standard deviation of each kind of parameters by maximum evidence.
 
     For `rest = matrix x + error` with x ~ N(0, s_kind^2), iterates the fixed point
@@ -70,14 +75,14 @@ def estimate_sizes(
 
     Args:
         matrix: (m, p) equations with the unknown noise.
-        rest: (m,) right-hand side of these equations.
+        right_hand_side: (m,) right-hand side of these equations.
         kinds: (p,) kind of each parameter; "" for a parameter with a fixed size.
         start: (p,) initial standard deviations.
-        freedom: degrees of freedom of the m equations before parameters are fitted.
+        degrees_of_freedom: degrees of freedom of the m equations before parameters are fitted.
         noise: initial standard deviation of the noise.
         known: (r, p) equations whose error has the standard deviation 1, or None.
-        known_rest: (r,) right-hand side of the known equations.
-        finest: lower bound of the noise.
+        known_right_hand_side: (r,) right-hand side of the known equations.
+        min_noise: lower bound of the noise.
 
     Returns:
         The standard deviations.
@@ -85,43 +90,46 @@ def estimate_sizes(
     Source: MacKay 1992, Bayesian interpolation; Tipping 2001 (sizes that vanish).
     """
     basis, triangle = np.linalg.qr(matrix)
-    inside = basis.T @ rest
-    outside = float(np.sum((rest - basis @ inside) ** 2))
-    if known is None or known_rest is None:
-        known, known_rest = np.empty((0, matrix.shape[1])), np.empty(0)
+    inside = basis.T @ right_hand_side
+    outside = float(np.sum((right_hand_side - basis @ inside) ** 2))
+    if known is None or known_right_hand_side is None:
+        known, known_right_hand_side = np.empty((0, matrix.shape[1])), np.empty(0)
     std = np.array(start, float)
     groups = {kind: np.flatnonzero([k == kind for k in kinds]) for kind in set(kinds) - {""}}
     decided = np.zeros(len(std))
-    for rounds in range(1, _ROUNDS + 1):  # noqa: B007 - reported
+    for rounds in range(1, _MAX_ROUNDS + 1):  # noqa: B007 - reported
         # scaled by size and noise, solved by SVD, so that small noise causes no rounding errors
         scaled = np.vstack([triangle / noise, known]) * std
-        wanted = np.concatenate([inside / noise, known_rest])
+        wanted = np.concatenate([inside / noise, known_right_hand_side])
         u, s, v = np.linalg.svd(scaled, full_matrices=False)
         value = std * (v.T @ (s / (1.0 + s**2) * (u.T @ wanted)))
         decided = (s**2 / (1.0 + s**2)) @ v**2
         error = float(np.sum((inside - triangle @ value) ** 2)) + outside
         before = np.append(std, noise)
-        noise = max(float(np.sqrt(max(error, 1e-300) / max(freedom - decided.sum(), 1.0))), finest)
+        noise = max(
+            float(np.sqrt(max(error, 1e-300) / max(degrees_of_freedom - decided.sum(), 1.0))),
+            min_noise,
+        )
         for places in groups.values():
             share = decided[places].sum()
             size = np.sqrt(np.sum(value[places] ** 2) / share) if share > 0.0 else 0.0
             first = start[places]
-            std[places] = np.clip(size, _SMALLEST * first, _LARGEST * first)
+            std[places] = np.clip(size, _MIN_SIZE_RATIO * first, _MAX_SIZE_RATIO * first)
         change = np.abs(np.log(np.append(std, noise) / before))
-        there = np.append(std > 10.0 * _SMALLEST * start, True)
-        if change[there].max() < _SETTLED:
+        there = np.append(std > 10.0 * _MIN_SIZE_RATIO * start, True)
+        if change[there].max() < _SIZE_TOLERANCE:
             break
-    return Sizes(std, noise, float(decided.sum()), rounds)
+    return ErrorSizes(std, noise, float(decided.sum()), rounds)
 
 
-def prediction_error(
-    matrix: np.ndarray, rest: np.ndarray, folds: np.ndarray, sizes: Sizes
+def cross_validation_error(
+    matrix: np.ndarray, right_hand_side: np.ndarray, folds: np.ndarray, sizes: ErrorSizes
 ) -> float:
     """Return the RMS error of equations predicted by cross-validation.
 
     Args:
         matrix: (m, p) equations, linear in the parameters.
-        rest: (m,) right-hand side of the equations.
+        right_hand_side: (m,) right-hand side of the equations.
         folds: (m,) fold of each equation.
         sizes: standard deviations of parameters and noise, the same for all folds.
 
@@ -130,24 +138,24 @@ def prediction_error(
 
     >>> x = np.linspace(-1.0, 1.0, 40)
     >>> line = np.column_stack([np.ones(40), x])
-    >>> sizes = Sizes(np.ones(2), 0.01, 2.0, 1)
-    >>> prediction_error(line, 1.0 + 2.0 * x, np.arange(40) % 4, sizes) < 1e-4
+    >>> sizes = ErrorSizes(np.ones(2), 0.01, 2.0, 1)
+    >>> cross_validation_error(line, 1.0 + 2.0 * x, np.arange(40) % 4, sizes) < 1e-4
     True
     """
     std = sizes.std / sizes.noise
     scaled = matrix * std
-    normal, right = scaled.T @ scaled, scaled.T @ rest
+    normal, right = scaled.T @ scaled, scaled.T @ right_hand_side
     total = 0.0
     for fold in np.unique(folds):
         inside = folds == fold
-        own, wanted = scaled[inside], rest[inside]
+        own, wanted = scaled[inside], right_hand_side[inside]
         left = normal - own.T @ own + np.eye(len(std))
         value = np.linalg.solve(left, right - own.T @ wanted)
         total += float(np.sum((wanted - own @ value) ** 2))
-    return float(np.sqrt(total / len(rest)))
+    return float(np.sqrt(total / len(right_hand_side)))
 
 
-MODELS = {
+JOINT_MODELS = {
     "rigid": (False, False),
     "gravity": (True, False),
     "eccentricity": (False, True),
@@ -155,25 +163,25 @@ MODELS = {
 }
 """Joint models: (deflection under gravity, encoder errors once per turn) by name."""
 
-_SIZE = 1e-3  # m and rad, initial size: a typical tolerance
-_SAG_SIZE = 1e-4  # rad s^2/m^2, initial size: 1 mrad per kilogram at 1 m
-_BALL = 0.3  # m, prior standard deviation of the ball position in the last link
-_FINEST = 1e-8  # m, minimum noise: below it rounding determines the result
-_PASSES, _SAME_NOISE = 6, 1e-3
+_START_SIZE = 1e-3  # m and rad, initial size: a typical tolerance
+_START_SAG_SIZE = 1e-4  # rad s^2/m^2, initial size: 1 mrad per kilogram at 1 m
+_BALL_PRIOR_STD = 0.3  # m, prior standard deviation of the ball position in the last link
+_MIN_NOISE = 1e-8  # m, minimum noise: below it rounding determines the result
+_MAX_PASSES, _NOISE_TOLERANCE = 6, 1e-3
 _MEDIAN_CHI3 = 1.5382  # median length of three standard normal errors
-_FALSE_ALARM = 1e-3  # probability that normal noise causes an outlier in any row of a data set
-_WRONG_ROBOT = 30e-3  # m, scatter of the ball above which the nominal robot is another robot
-_KINDS = {"t": "length", "r": "tilt"}
+_FALSE_ALARM_PROBABILITY = 1e-3  # probability that normal noise causes an outlier in any row of a data set
+_MAX_BALL_SCATTER = 30e-3  # m, scatter of the ball above which the nominal robot is another robot
+_KIND_BY_LETTER = {"t": "length", "r": "tilt"}
 
 
 @dataclass(frozen=True)
-class Options:
+class SocketOptions:
     """Options of a socket calibration.
 
     Attributes:
         distance: distance of neighbouring sockets of one tool [m]; None if unknown.
         accuracy: standard deviation of that distance [m].
-        model: joint model, a key of `MODELS`; None to select it by cross-validation.
+        model: joint model, a key of `JOINT_MODELS`; None to select it by cross-validation.
     """
 
     distance: float | None = 0.050
@@ -197,24 +205,24 @@ class Outlier:
 
 
 @dataclass(frozen=True)
-class Judged:
+class SocketErrors:
     """Prediction errors of a robot at sockets.
 
     Attributes:
         rms: root mean square distance of the predicted balls from their sockets' means [m].
         rms_without_outliers: the same without the rows in `outliers`.
-        sockets: root mean square distance [m] by socket.
-        distances: distance of the means of the first two sockets [m] by place.
+        rms_by_socket: root mean square distance [m] by socket.
+        socket_distances: distance of the means of the first two sockets [m] by place.
         outliers: rows that disagree with the other rows of their socket.
-        rows: distance of each row's ball from the socket's mean [m] by socket.
+        distances_by_socket: distance of each row's ball from the socket's mean [m] by socket.
     """
 
     rms: float
     rms_without_outliers: float
-    sockets: dict[str, float]
-    distances: dict[str, float]
+    rms_by_socket: dict[str, float]
+    socket_distances: dict[str, float]
     outliers: tuple[Outlier, ...]
-    rows: dict[str, np.ndarray]
+    distances_by_socket: dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -224,101 +232,101 @@ class SocketCalibration:
     Attributes:
         nominal: the given robot.
         robot: the calibrated robot.
-        model: joint model, a key of `MODELS`.
-        rivals: cross-validated RMS error of a coordinate [m] by joint model.
+        model: joint model, a key of `JOINT_MODELS`.
+        model_errors: cross-validated RMS error of a coordinate [m] by joint model.
         fit: fit of all parameters.
         sizes: standard deviation [m], [rad] or [rad s^2/m^2] by kind of parameter.
         noise: standard deviation of one coordinate of the ball [m].
-        before: errors of the nominal robot with its ball fitted, at all sockets.
-        after: errors of the calibrated robot at all sockets.
+        nominal_errors: errors of the nominal robot with its ball fitted, at all sockets.
+        calibrated_errors: errors of the calibrated robot at all sockets.
         outliers: rows that were not fitted.
         options: options of the calibration.
     """
 
-    nominal: Robot
-    robot: Robot
+    nominal: SerialRobot
+    robot: SerialRobot
     model: str
-    rivals: dict[str, float]
+    model_errors: dict[str, float]
     fit: ParameterFit
     sizes: dict[str, float]
     noise: float
-    before: Judged
-    after: Judged
+    nominal_errors: SocketErrors
+    calibrated_errors: SocketErrors
     outliers: tuple[Outlier, ...]
-    options: Options = field(default_factory=Options)
+    options: SocketOptions = field(default_factory=SocketOptions)
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class HeldOutPrediction:
     """Prediction of one place, or socket, by calibrations on all others.
 
     Attributes:
         name: name of the place or socket.
-        given: errors of the nominal robot with the ball position of its file.
-        nominal: errors of the nominal robot with the ball fitted to all others.
-        calibrated: errors of the robot calibrated on all others.
+        given_errors: errors of the nominal robot with the ball position of its file.
+        nominal_errors: errors of the nominal robot with the ball fitted to all others.
+        calibrated_errors: errors of the robot calibrated on all others.
         model: joint model, selected without this place.
     """
 
     name: str
-    given: Judged
-    nominal: Judged
-    calibrated: Judged
+    given_errors: SocketErrors
+    nominal_errors: SocketErrors
+    calibrated_errors: SocketErrors
     model: str
 
 
-class _Problem:
+class _SocketProblem:
     """Equations of sockets for a robot with joint corrections."""
 
-    def __init__(self, robot: Robot, sockets: Sequence[Socket], extra: Sequence[str], options):
+    def __init__(self, robot: SerialRobot, sockets: Sequence[Socket], extra: Sequence[str], options):
         self.robot, self.sockets, self.extra = robot, tuple(sockets), tuple(extra)
         self.chain = robot_chain(robot)
         self.names = (*self.chain.parameters, *self.extra)
         self.joints = np.vstack([s.joints for s in sockets])
         self.index = np.repeat(np.arange(len(sockets)), [len(s.joints) for s in sockets])
         self.count = np.bincount(self.index)
-        self.basis = deflections(robot, self.joints, self.extra)
-        self.start = np.concatenate([self.chain.nominal, np.zeros(len(self.extra))])
+        self.basis = correction_derivatives(robot, self.joints, self.extra)
+        self.start = np.concatenate([self.chain.nominal_values, np.zeros(len(self.extra))])
         self.options = options
-        self.pairs = _pairs(sockets) if options.distance is not None else []
+        self.pairs = _neighbour_pairs(sockets) if options.distance is not None else []
 
     @property
-    def freedom(self) -> int:
+    def degrees_of_freedom(self) -> int:
         """Number of ball coordinates minus that of the unknown socket positions."""
         return 3 * (len(self.joints) - len(self.sockets))
 
-    def means(self, values: np.ndarray) -> np.ndarray:
+    def socket_means(self, values: np.ndarray) -> np.ndarray:
         """Return the mean of rows (n, ...) over every socket."""
         total = np.zeros((len(self.count), *values.shape[1:]))
         np.add.at(total, self.index, values)
         return total / self.count.reshape(-1, *[1] * (values.ndim - 1))
 
-    def balls(self, x: np.ndarray) -> np.ndarray:
+    def predict_balls(self, x: np.ndarray) -> np.ndarray:
         """Return the predicted ball positions (n, 3)."""
-        p = len(self.chain.nominal)
+        p = len(self.chain.nominal_values)
         joints = self.joints + self.basis @ x[p:] if self.extra else self.joints
-        return forward(self.chain, joints, x[:p]).position
+        return chain_poses(self.chain, joints, x[:p]).position
 
-    def apart(self, balls: np.ndarray) -> np.ndarray:
+    def subtract_means(self, balls: np.ndarray) -> np.ndarray:
         """Return the balls (n, 3) relative to their socket's mean."""
-        return balls - self.means(balls)[self.index]
+        return balls - self.socket_means(balls)[self.index]
 
     def residual(self, x: np.ndarray) -> np.ndarray:
         """Return the balls relative to their means, then the socket distance errors [m]."""
-        balls = self.balls(x)
-        means = self.means(balls)
+        balls = self.predict_balls(x)
+        means = self.socket_means(balls)
         gaps = [np.linalg.norm(means[a] - means[b]) - self.options.distance for a, b in self.pairs]
         return np.concatenate([(balls - means[self.index]).ravel(), gaps])
 
     def jacobian(self, x: np.ndarray) -> np.ndarray:
         """Return the derivatives of `residual`."""
-        p = len(self.chain.nominal)
+        p = len(self.chain.nominal_values)
         joints = self.joints + self.basis @ x[p:] if self.extra else self.joints
-        rates = forward_and_rates(self.chain, joints, x[:p])
+        rates = chain_poses_and_rates(self.chain, joints, x[:p])
         whole = rates.position_by_parameter
         if self.extra:
             whole = np.concatenate([whole, rates.position_by_joint @ self.basis], axis=2)
-        means, middle = self.means(rates.position), self.means(whole)
+        means, middle = self.socket_means(rates.position), self.socket_means(whole)
         rows = [(whole - middle[self.index]).reshape(-1, whole.shape[2])]
         for a, b in self.pairs:
             way = means[a] - means[b]
@@ -326,14 +334,14 @@ class _Problem:
             rows.append((way @ (middle[a] - middle[b]))[None])
         return np.vstack(rows)
 
-    def sigma(self, noise: float) -> np.ndarray:
+    def equation_deviations(self, noise: float) -> np.ndarray:
         """Return the standard deviation of every equation."""
         means = [1.0 / self.count[a] + 1.0 / self.count[b] for a, b in self.pairs]
         gaps = np.sqrt(self.options.accuracy**2 + noise**2 * np.array(means))
         return np.concatenate([np.full(3 * len(self.joints), noise), gaps])
 
 
-def choose_robot(sockets: Sequence[Socket], options: Options) -> tuple[Robot, dict[str, float]]:
+def choose_robot(sockets: Sequence[Socket], options: SocketOptions) -> tuple[SerialRobot, dict[str, float]]:
     """Select the shipped robot whose nominal chain has the smallest scatter of the ball.
 
     Args:
@@ -353,14 +361,14 @@ def choose_robot(sockets: Sequence[Socket], options: Options) -> tuple[Robot, di
         robot = load_robot(name)
         if len(robot.joints) == count:
             robots[name] = robot
-            spreads[name] = _nominal_spread(robot, sockets)
+            spreads[name] = _nominal_scatter(robot, sockets)
     if not spreads:
         raise InputError(
             folder, f"has {count} columns, but no shipped robot has {count} joints:"
             f" give --robot FILE (YAML, URDF or MJCF)"
         )  # fmt: skip
     best = min(spreads, key=lambda name: spreads[name])
-    if spreads[best] > _WRONG_ROBOT:
+    if spreads[best] > _MAX_BALL_SCATTER:
         said = ", ".join(f"{name} {1e3 * spread:.0f} mm" for name, spread in spreads.items())
         raise InputError(
             folder, f"no shipped robot fits the measurements (median scatter of the ball: {said}):"
@@ -369,7 +377,7 @@ def choose_robot(sockets: Sequence[Socket], options: Options) -> tuple[Robot, di
     return robots[best], spreads
 
 
-def check_robot(robot: Robot, sockets: Sequence[Socket]) -> None:
+def check_robot(robot: SerialRobot, sockets: Sequence[Socket]) -> None:
     """Raise an error if the measurements do not fit a robot.
 
     Args:
@@ -379,20 +387,20 @@ def check_robot(robot: Robot, sockets: Sequence[Socket]) -> None:
     Raises:
         InputError: the ball positions of all files, or of one file, scatter by centimetres.
     """
-    problem = _Problem(robot, sockets, (), Options(distance=None))
-    apart = problem.apart(problem.balls(_with_ball(problem)))
+    problem = _SocketProblem(robot, sockets, (), SocketOptions(distance=None))
+    apart = problem.subtract_means(problem.predict_balls(_fit_nominal_ball(problem)))
     typical = np.array([
         np.median(np.linalg.norm(apart[problem.index == k], axis=1)) for k in range(len(sockets))
     ])  # fmt: skip
     usual = float(np.median(typical))
-    if usual > _WRONG_ROBOT:
+    if usual > _MAX_BALL_SCATTER:
         raise InputError(
             sockets[0].path.parent, f"the ball of robot {robot.name} scatters by"
             f" {1e3 * usual:.0f} mm: another robot, another order or sign of joints"
             f"{_degrees_hint({robot.name: robot}, sockets)}"
         )  # fmt: skip
     for socket, spread in zip(sockets, typical, strict=True):
-        if spread > max(_WRONG_ROBOT, 5.0 * usual):
+        if spread > max(_MAX_BALL_SCATTER, 5.0 * usual):
             raise InputError(
                 socket.path, f"the ball of robot {robot.name} scatters by {1e3 * spread:.0f} mm, in"
                 f" the other files by {1e3 * usual:.1f} mm: a file of another robot or unit, or"
@@ -401,7 +409,7 @@ def check_robot(robot: Robot, sockets: Sequence[Socket]) -> None:
 
 
 def calibrate_sockets(
-    robot: Robot, sockets: Sequence[Socket], options: Options | None = None
+    robot: SerialRobot, sockets: Sequence[Socket], options: SocketOptions | None = None
 ) -> SocketCalibration:
     """Calibrate a robot from postures with its ball in sockets.
 
@@ -416,42 +424,40 @@ def calibrate_sockets(
     Raises:
         InputError: there are fewer equations than parameters.
     """
-    options = options or Options()
-    problem = _Problem(robot, sockets, (), options)
+    options = options or SocketOptions()
+    problem = _SocketProblem(robot, sockets, (), options)
     _check_count(problem)
-    robust, gone = _without_gross(problem)
+    robust, gone = _remove_gross_outliers(problem)
     outliers: list[Outlier] = []
     state = None
-    for _ in range(_PASSES):
-        problem = _Problem(robot, robust, (), options)
-        state = _settled(problem, state)
-        model, rivals = _chosen(problem, state)
-        extra = deflection_names(robot, *MODELS[model])
-        full = _Problem(robot, robust, extra, options)
-        found = _settled(full, state if not extra else _extended(full, state))
-        fresh = _outlying(robot, sockets, extra, found.x, found.sizes.noise)
+    for _ in range(_MAX_PASSES):
+        problem = _SocketProblem(robot, robust, (), options)
+        state = _iterate_sizes(problem, state)
+        model, rivals = _select_model(problem, state)
+        extra = correction_names(robot, *JOINT_MODELS[model])
+        full = _SocketProblem(robot, robust, extra, options)
+        found = _iterate_sizes(full, state if not extra else _extend_state(full, state))
+        fresh = _find_outliers(robot, sockets, extra, found.x, found.sizes.noise)
         outliers, names = fresh, {(one.socket, one.line) for one in fresh}
         if names == gone:
             break
         gone = names
-        robust = _without(sockets, gone)
-    fit = _fit(full, found)
-    p = len(full.chain.nominal)
+        robust = _remove_rows(sockets, gone)
+    fit = _final_fit(full, found)
+    p = len(full.chain.nominal_values)
     values = dict(zip(full.names, fit.values.tolist(), strict=True))
-    made = corrected_robot(robot, values, dict(zip(extra, fit.values[p:].tolist(), strict=True)))
-    kinds = _kinds(full)
-    sizes = {
-        kind: float(found.sizes.std[kinds.index(kind)]) for kind in dict.fromkeys(kinds) if kind
-    }
-    plain = _Problem(robot, sockets, (), options)
-    before = _judged(plain, plain.balls(_with_ball(plain)))
+    made = correct_robot(robot, values, dict(zip(extra, fit.values[p:].tolist(), strict=True)))
+    kinds = _parameter_kinds(full)
+    sizes = {kind: float(found.sizes.std[kinds.index(kind)]) for kind in dict.fromkeys(kinds) if kind}
+    plain = _SocketProblem(robot, sockets, (), options)
+    before = _evaluate_balls(plain, plain.predict_balls(_fit_nominal_ball(plain)))
     return SocketCalibration(
         robot, made, model, rivals, fit, sizes, found.sizes.noise, before,
-        judge(made, sockets), tuple(outliers), options,
+        evaluate_robot(made, sockets), tuple(outliers), options,
     )  # fmt: skip
 
 
-def judge(robot: Robot, sockets: Sequence[Socket]) -> Judged:
+def evaluate_robot(robot: SerialRobot, sockets: Sequence[Socket]) -> SocketErrors:
     """Evaluate the predictions of a robot at sockets, without any fit.
 
     Args:
@@ -461,14 +467,17 @@ def judge(robot: Robot, sockets: Sequence[Socket]) -> Judged:
     Returns:
         RMS distances from the means, distances of the sockets, and outliers.
     """
-    problem = _Problem(robot, sockets, tuple(robot.corrections), Options(distance=None))
-    x = np.concatenate([problem.chain.nominal, list(robot.corrections.values())])
-    return _judged(problem, problem.balls(x))
+    problem = _SocketProblem(robot, sockets, tuple(robot.corrections), SocketOptions(distance=None))
+    x = np.concatenate([problem.chain.nominal_values, list(robot.corrections.values())])
+    return _evaluate_balls(problem, problem.predict_balls(x))
 
 
-def leave_out(
-    robot: Robot, sockets: Sequence[Socket], names: Sequence[str], options: Options | None = None
-) -> tuple[LeftOut, ...]:
+def predict_held_out_places(
+    robot: SerialRobot,
+    sockets: Sequence[Socket],
+    names: Sequence[str],
+    options: SocketOptions | None = None,
+) -> tuple[HeldOutPrediction, ...]:
     """Predict each named place, or socket, by a calibration on all others.
 
     Args:
@@ -483,12 +492,12 @@ def leave_out(
     Raises:
         InputError: there is no such place, or no other place to calibrate on.
     """
-    return tuple(hold_out(robot, sockets, name, options)[0] for name in names)
+    return tuple(predict_held_out_place(robot, sockets, name, options)[0] for name in names)
 
 
-def hold_out(
-    robot: Robot, sockets: Sequence[Socket], name: str, options: Options | None = None
-) -> tuple[LeftOut, SocketCalibration]:
+def predict_held_out_place(
+    robot: SerialRobot, sockets: Sequence[Socket], name: str, options: SocketOptions | None = None
+) -> tuple[HeldOutPrediction, SocketCalibration]:
     """Predict one place, or socket, by a calibration on all others.
 
     Args:
@@ -506,48 +515,52 @@ def hold_out(
     own = tuple(s for s in sockets if name in (s.place, s.name))
     rest = tuple(s for s in sockets if name not in (s.place, s.name))
     if not own:
-        known = (*places_of(sockets), *(s.name for s in sockets))
-        raise InputError(f"--heldout {name}", f"is not a place of the data; {suggest(name, known)}")
+        known = (*place_names(sockets), *(s.name for s in sockets))
+        raise InputError(f"--heldout {name}", f"is not a place of the data; {suggest_valid_name(name, known)}")
     if not rest:
         raise InputError(f"--heldout {name}", "is the only place; record another one")
     found = calibrate_sockets(robot, rest, options)
-    problem = _Problem(robot, rest, (), Options(distance=None))
-    values = dict(zip(problem.names, _with_ball(problem).tolist(), strict=True))
-    nominal = corrected_robot(robot, values, {})
-    return LeftOut(
-        name, judge(robot, own), judge(nominal, own), judge(found.robot, own), found.model
+    problem = _SocketProblem(robot, rest, (), SocketOptions(distance=None))
+    values = dict(zip(problem.names, _fit_nominal_ball(problem).tolist(), strict=True))
+    nominal = correct_robot(robot, values, {})
+    return HeldOutPrediction(
+        name,
+        evaluate_robot(robot, own),
+        evaluate_robot(nominal, own),
+        evaluate_robot(found.robot, own),
+        found.model,
     ), found
 
 
-def parts_to_leave_out(sockets: Sequence[Socket]) -> tuple[str, ...]:
+def held_out_names(sockets: Sequence[Socket]) -> tuple[str, ...]:
     """Return the places if there are several, else the sockets if several, else nothing."""
-    places = places_of(sockets)
+    places = place_names(sockets)
     if len(places) > 1:
         return places
     return tuple(s.name for s in sockets) if len(sockets) > 1 else ()
 
 
 @dataclass(frozen=True)
-class _State:
+class _FitState:
     """Parameter values with sizes and noise."""
 
     x: np.ndarray
-    sizes: Sizes
+    sizes: ErrorSizes
 
 
-def _settled(problem: _Problem, begin: _State | None) -> _State:
+def _iterate_sizes(problem: _SocketProblem, begin: _FitState | None) -> _FitState:
     """Iterate parameters, sizes and noise until they are consistent."""
-    kinds = _kinds(problem)
+    kinds = _parameter_kinds(problem)
     if begin is None:
-        start = np.array([_SAG_SIZE if k.startswith("sag") else _SIZE for k in kinds])
-        start[np.array(kinds) == ""] = _BALL
-        begin = _State(_with_ball(problem), Sizes(start, _SIZE, 0.0, 0))
+        start = np.array([_START_SAG_SIZE if k.startswith("sag") else _START_SIZE for k in kinds])
+        start[np.array(kinds) == ""] = _BALL_PRIOR_STD
+        begin = _FitState(_fit_nominal_ball(problem), ErrorSizes(start, _START_SIZE, 0.0, 0))
     x, sizes = begin.x, begin.sizes
-    first = np.array([_SAG_SIZE if k.startswith("sag") else _SIZE for k in kinds])
-    first[np.array(kinds) == ""] = _BALL
+    first = np.array([_START_SAG_SIZE if k.startswith("sag") else _START_SIZE for k in kinds])
+    first[np.array(kinds) == ""] = _BALL_PRIOR_STD
     many = 3 * len(problem.joints)
-    for _ in range(_PASSES):
-        sigma = problem.sigma(sizes.noise)
+    for _ in range(_MAX_PASSES):
+        sigma = problem.equation_deviations(sizes.noise)
         fit = least_squares(
             problem.residual, x, problem.names, np.maximum(sizes.std, 1e-12), sigma=sigma,
             prior=Prior(problem.start, sizes.std), jac=problem.jacobian, select="none",
@@ -556,32 +569,32 @@ def _settled(problem: _Problem, begin: _State | None) -> _State:
         rest = matrix @ (x - problem.start) - fit.residual
         weight = 1.0 / sigma[many:, None]
         new = estimate_sizes(
-            matrix[:many], rest[:many], kinds, first, problem.freedom, sizes.noise,
-            matrix[many:] * weight, rest[many:] * weight[:, 0], _FINEST,
+            matrix[:many], rest[:many], kinds, first, problem.degrees_of_freedom, sizes.noise,
+            matrix[many:] * weight, rest[many:] * weight[:, 0], _MIN_NOISE,
         )  # fmt: skip
-        close = abs(new.noise - sizes.noise) < _SAME_NOISE * sizes.noise
+        close = abs(new.noise - sizes.noise) < _NOISE_TOLERANCE * sizes.noise
         sizes = new
         if close:
             break
-    return _State(x, sizes)
+    return _FitState(x, sizes)
 
 
-def _fit(problem: _Problem, state: _State) -> ParameterFit:
+def _final_fit(problem: _SocketProblem, state: _FitState) -> ParameterFit:
     """Return the final fit with intervals and identifiability at the estimated noise."""
-    sigma = problem.sigma(state.sizes.noise)
+    sigma = problem.equation_deviations(state.sizes.noise)
     fit = least_squares(
         problem.residual, state.x, problem.names, np.maximum(state.sizes.std, 1e-12), sigma=sigma,
         prior=Prior(problem.start, state.sizes.std), jac=problem.jacobian, select="none",
     )  # fmt: skip
-    scales = _expected(problem, state)
-    order = sorted(range(len(scales)), key=lambda k: _standing(problem.names[k]))
-    told = identifiable(
+    scales = _identifiability_scales(problem, state)
+    order = sorted(range(len(scales)), key=lambda k: _representative_rank(problem.names[k]))
+    told = classify_scaled_parameters(
         fit.jacobian[:, order], [problem.names[k] for k in order], scales[order], sigma=sigma
     )
     return replace(fit, told=told, scales=scales)
 
 
-def _standing(name: str) -> int:
+def _representative_rank(name: str) -> int:
     """Return a parameter's rank as representative: ball, joint offsets, lengths, then tilts."""
     kind, _, place = name.partition(".")
     if place == "tool":
@@ -590,41 +603,41 @@ def _standing(name: str) -> int:
     return 1 + order.index(kind)
 
 
-def _expected(problem: _Problem, state: _State) -> np.ndarray:
+def _identifiability_scales(problem: _SocketProblem, state: _FitState) -> np.ndarray:
     """Return the scales that decide identifiability: estimated sizes with a lower bound."""
     sag = np.array([name.startswith("sag") for name in problem.names])
-    return np.maximum(state.sizes.std, np.where(sag, 0.1 * _SAG_SIZE, 0.1 * _SIZE))
+    return np.maximum(state.sizes.std, np.where(sag, 0.1 * _START_SAG_SIZE, 0.1 * _START_SIZE))
 
 
-def _kinds(problem: _Problem) -> list[str]:
+def _parameter_kinds(problem: _SocketProblem) -> list[str]:
     """Return the kind of every parameter, empty for the ball; each kind has one size."""
     kinds = []
     for name in problem.names:
         first, _, joint = name.partition(".")
         if joint == "tool":
             kinds.append("")
-        elif first in ("rz", "tz") and _axial(problem.robot, joint) == first[0]:
+        elif first in ("rz", "tz") and _axis_letter(problem.robot, joint) == first[0]:
             kinds.append("offset" if first == "rz" else "length")
         elif first in ("sag", "sine", "cosine"):
             kinds.append("sag" if first == "sag" else "eccentricity")
         else:
-            kinds.append(_KINDS[first[0]])
+            kinds.append(_KIND_BY_LETTER[first[0]])
     return kinds
 
 
-def _axial(robot: Robot, joint: str) -> str:
+def _axis_letter(robot: SerialRobot, joint: str) -> str:
     kind = next(j.kind for j in robot.joints if j.name == joint)
     return "r" if kind == "revolute" else "t"
 
 
-def _with_ball(problem: _Problem) -> np.ndarray:
+def _fit_nominal_ball(problem: _SocketProblem) -> np.ndarray:
     """Return start values, with the ball position that minimises its scatter."""
     x = problem.start.copy()
     places = [problem.names.index(f"{c}.tool") for c in "xyz"]
-    rates = forward_and_rates(problem.chain, problem.joints, problem.chain.nominal)
+    rates = chain_poses_and_rates(problem.chain, problem.joints, problem.chain.nominal_values)
     ball = rates.position_by_parameter[:, :, places]
-    apart = problem.apart(rates.position).ravel()
-    matrix = (ball - problem.means(ball)[problem.index]).reshape(-1, 3)
+    apart = problem.subtract_means(rates.position).ravel()
+    matrix = (ball - problem.socket_means(ball)[problem.index]).reshape(-1, 3)
     weight = np.ones(len(matrix) // 3)
     step = np.zeros(3)
     for _ in range(30):  # least absolute distances, robust against outliers
@@ -636,18 +649,18 @@ def _with_ball(problem: _Problem) -> np.ndarray:
     return x
 
 
-def _nominal_spread(robot: Robot, sockets: Sequence[Socket]) -> float:
+def _nominal_scatter(robot: SerialRobot, sockets: Sequence[Socket]) -> float:
     """Return the median over sockets of the median distance from the mean [m], ball fitted."""
-    problem = _Problem(robot, sockets, (), Options(distance=None))
-    apart = np.linalg.norm(problem.apart(problem.balls(_with_ball(problem))), axis=1)
+    problem = _SocketProblem(robot, sockets, (), SocketOptions(distance=None))
+    apart = np.linalg.norm(problem.subtract_means(problem.predict_balls(_fit_nominal_ball(problem))), axis=1)
     return float(np.median([np.median(apart[problem.index == k]) for k in range(len(sockets))]))
 
 
-def _degrees_hint(robots: dict[str, Robot], sockets: Sequence[Socket]) -> str:
+def _degrees_hint(robots: dict[str, SerialRobot], sockets: Sequence[Socket]) -> str:
     radians = [Socket(s.place, s.hole, s.path, np.radians(s.joints), s.lines) for s in sockets]
     for name, robot in robots.items():
-        spread = _nominal_spread(robot, radians)
-        if spread < _WRONG_ROBOT:
+        spread = _nominal_scatter(robot, radians)
+        if spread < _MAX_BALL_SCATTER:
             return (
                 f"; read as degrees, the ball of {name} scatters by {1e3 * spread:.1f} mm:"
                 " convert the angles to radians or give --unit deg"
@@ -655,12 +668,12 @@ def _degrees_hint(robots: dict[str, Robot], sockets: Sequence[Socket]) -> str:
     return ""
 
 
-def _chosen(problem: _Problem, state: _State) -> tuple[str, dict[str, float]]:
+def _select_model(problem: _SocketProblem, state: _FitState) -> tuple[str, dict[str, float]]:
     """Select the joint model with the smallest cross-validated error; also return all errors."""
     wanted = problem.options.model
-    if wanted is not None and wanted not in MODELS:
-        raise InputError(f"--model {wanted}", f"is not known: {', '.join(MODELS)}")
-    places = places_of(problem.sockets)
+    if wanted is not None and wanted not in JOINT_MODELS:
+        raise InputError(f"--model {wanted}", f"is not known: {', '.join(JOINT_MODELS)}")
+    places = place_names(problem.sockets)
     part = [places.index(s.place) if len(places) > 2 else k
             for k, s in enumerate(problem.sockets)]  # fmt: skip
     folds = np.repeat(np.array(part)[problem.index], 3)
@@ -668,44 +681,44 @@ def _chosen(problem: _Problem, state: _State) -> tuple[str, dict[str, float]]:
         return wanted or "rigid", {}
     errors = {}
     many = 3 * len(problem.joints)
-    for model, kinds in MODELS.items():
-        extra = deflection_names(problem.robot, *kinds)
-        full = _Problem(problem.robot, problem.sockets, extra, problem.options)
-        begun = state if not extra else _extended(full, state)
+    for model, kinds in JOINT_MODELS.items():
+        extra = correction_names(problem.robot, *kinds)
+        full = _SocketProblem(problem.robot, problem.sockets, extra, problem.options)
+        begun = state if not extra else _extend_state(full, state)
         matrix, left = full.jacobian(begun.x), full.residual(begun.x)
         rest = matrix @ (begun.x - full.start) - left
-        weight = 1.0 / full.sigma(state.sizes.noise)[many:]
+        weight = 1.0 / full.equation_deviations(state.sizes.noise)[many:]
         sizes = estimate_sizes(
-            matrix[:many], rest[:many], _kinds(full), begun.sizes.std, full.freedom,
-            state.sizes.noise, matrix[many:] * weight[:, None], rest[many:] * weight, _FINEST,
+            matrix[:many], rest[:many], _parameter_kinds(full), begun.sizes.std, full.degrees_of_freedom,
+            state.sizes.noise, matrix[many:] * weight[:, None], rest[many:] * weight, _MIN_NOISE,
         )  # fmt: skip
-        errors[model] = prediction_error(matrix[:many], rest[:many], folds, sizes)
+        errors[model] = cross_validation_error(matrix[:many], rest[:many], folds, sizes)
     return wanted or min(errors, key=lambda model: errors[model]), errors
 
 
-def _extended(problem: _Problem, state: _State) -> _State:
+def _extend_state(problem: _SocketProblem, state: _FitState) -> _FitState:
     """Extend a state of the rigid model to a problem with joint corrections."""
-    more = [_SAG_SIZE if name.startswith("sag") else _SIZE for name in problem.extra]
-    sizes = Sizes(np.append(state.sizes.std, more), state.sizes.noise, state.sizes.effective, 0)
-    return _State(np.append(state.x, np.zeros(len(more))), sizes)
+    more = [_START_SAG_SIZE if name.startswith("sag") else _START_SIZE for name in problem.extra]
+    sizes = ErrorSizes(np.append(state.sizes.std, more), state.sizes.noise, state.sizes.effective_parameters, 0)
+    return _FitState(np.append(state.x, np.zeros(len(more))), sizes)
 
 
-def _limit(noise: float, rows: int) -> float:
+def _outlier_distance(noise: float, rows: int) -> float:
     """Return the distance [m] that any row exceeds in one of a thousand data sets."""
-    return noise * float(np.sqrt(scipy.stats.chi2.isf(_FALSE_ALARM / rows, 3)))
+    return noise * float(np.sqrt(scipy.stats.chi2.isf(_FALSE_ALARM_PROBABILITY / rows, 3)))
 
 
-def _outlying(
-    robot: Robot, sockets: Sequence[Socket], extra: Sequence[str], x: np.ndarray, noise: float
+def _find_outliers(
+    robot: SerialRobot, sockets: Sequence[Socket], extra: Sequence[str], x: np.ndarray, noise: float
 ) -> list[Outlier]:
-    problem = _Problem(robot, sockets, extra, Options(distance=None))
-    return _apart_rows(problem, problem.balls(x), noise)
+    problem = _SocketProblem(robot, sockets, extra, SocketOptions(distance=None))
+    return _outlier_rows(problem, problem.predict_balls(x), noise)
 
 
-def _apart_rows(problem: _Problem, balls: np.ndarray, noise: float) -> list[Outlier]:
+def _outlier_rows(problem: _SocketProblem, balls: np.ndarray, noise: float) -> list[Outlier]:
     """Return rows that are beyond the limit from the mean of the other rows of their socket."""
     found = []
-    limit = _limit(noise, len(balls))
+    limit = _outlier_distance(noise, len(balls))
     for k, socket in enumerate(problem.sockets):
         own = balls[problem.index == k]
         middle = np.median(own, axis=0)
@@ -719,19 +732,21 @@ def _apart_rows(problem: _Problem, balls: np.ndarray, noise: float) -> list[Outl
     return found
 
 
-def _without_gross(problem: _Problem) -> tuple[tuple[Socket, ...], set[tuple[str, int]]]:
+def _remove_gross_outliers(
+    problem: _SocketProblem,
+) -> tuple[tuple[Socket, ...], set[tuple[str, int]]]:
     """Remove rows that are outliers already with the nominal robot."""
-    balls = problem.balls(_with_ball(problem))
+    balls = problem.predict_balls(_fit_nominal_ball(problem))
     away = np.empty(len(balls))
     for k in range(len(problem.sockets)):
         own = balls[problem.index == k]
         away[problem.index == k] = np.linalg.norm(own - np.median(own, axis=0), axis=1)
     noise = float(np.median(away)) / _MEDIAN_CHI3
-    gone = {(one.socket, one.line) for one in _apart_rows(problem, balls, 2.0 * noise)}
-    return _without(problem.sockets, gone), gone
+    gone = {(one.socket, one.line) for one in _outlier_rows(problem, balls, 2.0 * noise)}
+    return _remove_rows(problem.sockets, gone), gone
 
 
-def _without(sockets: Sequence[Socket], gone: set[tuple[str, int]]) -> tuple[Socket, ...]:
+def _remove_rows(sockets: Sequence[Socket], gone: set[tuple[str, int]]) -> tuple[Socket, ...]:
     made = []
     for socket in sockets:
         kept = np.array([(socket.name, int(line)) not in gone for line in socket.lines])
@@ -741,10 +756,10 @@ def _without(sockets: Sequence[Socket], gone: set[tuple[str, int]]) -> tuple[Soc
     return tuple(made)
 
 
-def _judged(problem: _Problem, balls: np.ndarray) -> Judged:
-    apart = np.linalg.norm(problem.apart(balls), axis=1)
+def _evaluate_balls(problem: _SocketProblem, balls: np.ndarray) -> SocketErrors:
+    apart = np.linalg.norm(problem.subtract_means(balls), axis=1)
     noise = float(np.median(apart)) / _MEDIAN_CHI3
-    outliers = _apart_rows(problem, balls, noise)
+    outliers = _outlier_rows(problem, balls, noise)
     gone = {(one.socket, one.line) for one in outliers}
     kept = np.concatenate([
         [(s.name, int(line)) not in gone for line in s.lines] for s in problem.sockets
@@ -757,12 +772,12 @@ def _judged(problem: _Problem, balls: np.ndarray) -> Judged:
             squares.append(np.sum((own - clean[-1]) ** 2, axis=1))
         else:
             clean.append(balls[problem.index == k].mean(axis=0))
-    means = problem.means(balls)
+    means = problem.socket_means(balls)
     distances = {
         problem.sockets[a].place: float(np.linalg.norm(means[a] - means[b]))
-        for a, b in reversed(_pairs(problem.sockets))
+        for a, b in reversed(_neighbour_pairs(problem.sockets))
     }
-    return Judged(
+    return SocketErrors(
         float(np.sqrt(np.mean(apart**2))),
         float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else float("nan"),
         {s.name: float(np.sqrt(np.mean(apart[problem.index == k] ** 2)))
@@ -772,7 +787,7 @@ def _judged(problem: _Problem, balls: np.ndarray) -> Judged:
     )  # fmt: skip
 
 
-def _pairs(sockets: Sequence[Socket]) -> list[tuple[int, int]]:
+def _neighbour_pairs(sockets: Sequence[Socket]) -> list[tuple[int, int]]:
     """Return index pairs of neighbouring sockets of one tool."""
     return [
         (k, k + 1) for k in range(len(sockets) - 1)
@@ -780,12 +795,12 @@ def _pairs(sockets: Sequence[Socket]) -> list[tuple[int, int]]:
     ]  # fmt: skip
 
 
-def _check_count(problem: _Problem) -> None:
+def _check_count(problem: _SocketProblem) -> None:
     needed = 4 * len(problem.robot.joints)
-    if problem.freedom < needed:
+    if problem.degrees_of_freedom < needed:
         raise InputError(
             problem.sockets[0].path.parent,
             f"{len(problem.joints)} rows in {len(problem.sockets)} sockets give"
-            f" {problem.freedom} equations, but the robot's geometry has at least {needed}"
+            f" {problem.degrees_of_freedom} equations, but the robot's geometry has at least {needed}"
             " parameters: record 20 postures or more per socket",
         )

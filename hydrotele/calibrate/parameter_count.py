@@ -107,13 +107,13 @@ class Mechanism:
     Attributes:
         name: name of the mechanism, such as `6-UPS`.
         chains: at least one chain.
-        straight: names of links that place the next joint on the z axis of the joint before, with
+        straight_links: names of links that place the next joint on the z axis of the joint before, with
             parallel axes; all others have arbitrary dimensions.
     """
 
     name: str
     chains: tuple[Chain, ...]
-    straight: frozenset[str] = frozenset()
+    straight_links: frozenset[str] = frozenset()
 
     @property
     def joints(self) -> dict[str, Joint]:
@@ -139,9 +139,7 @@ def serial_mechanism(name: str, kinds: tuple[JointKind, ...]) -> Mechanism:
     return Mechanism(name, (Chain(tuple(f"link{k}" for k in range(len(kinds) + 1)), joints),))
 
 
-def hexapod_mechanism(
-    name: str, kinds: tuple[JointKind, ...], straight: tuple[int, ...] = ()
-) -> Mechanism:
+def hexapod_mechanism(name: str, kinds: tuple[JointKind, ...], straight: tuple[int, ...] = ()) -> Mechanism:
     """Build a hexapod of six equal legs whose prismatic joints are measured.
 
     Args:
@@ -158,9 +156,7 @@ def hexapod_mechanism(
                     for k, kind in enumerate(kinds)))
         for leg in range(6)
     )  # fmt: skip
-    return Mechanism(
-        name, chains, frozenset(f"link{leg}.{k}" for leg in range(6) for k in straight)
-    )
+    return Mechanism(name, chains, frozenset(f"link{leg}.{k}" for leg in range(6) for k in straight))
 
 
 def delta_mechanism() -> Mechanism:
@@ -176,7 +172,7 @@ def delta_mechanism() -> Mechanism:
 
 def identifiable_rank(
     mechanism: Mechanism, rng: np.random.Generator, poses: int = 60, motion: float = 0.4,
-    unmoved: frozenset[str] = frozenset(),
+    fixed_joints: frozenset[str] = frozenset(),
 ) -> int:  # fmt: skip
     """Return the number of parameters identifiable from measured poses and encoders.
 
@@ -189,7 +185,7 @@ def identifiable_rank(
         rng: random generator of dimensions and poses.
         poses: number of poses.
         motion: maximum random motion of a joint [m] or [rad], before the loops are closed.
-        unmoved: names of joints that do not move, to test a poor choice of poses.
+        fixed_joints: names of joints that do not move, to test a poor choice of poses.
 
     Returns:
         The rank.
@@ -198,8 +194,8 @@ def identifiable_rank(
     passive = [name for name, joint in mechanism.joints.items() if not joint.measured]
     blocks = []
     for _ in range(poses):
-        moved = _move_joints(mechanism, state, rng, motion, unmoved)
-        moved = _close_loops(mechanism, links, moved, unmoved)
+        moved = _move_joints(mechanism, state, rng, motion, fixed_joints)
+        moved = _close_loops(mechanism, links, moved, fixed_joints)
         by_link, by_joint = _end_jacobians(mechanism, links, moved, list(links), passive)
         if passive:
             by_link = null_space(by_joint.T, rcond=MIN_SINGULAR_VALUE).T @ by_link
@@ -214,11 +210,11 @@ def _arbitrary_geometry(
     """Return links (4, 4) and joint positions (4, 4) by name for which all loops are closed."""
     links, state = {}, {}
     for name, joint in mechanism.joints.items():
-        state[name] = _exponential(_SUBSPACES[joint.kind] @ _random(rng, joint.kind, 1.0))
+        state[name] = _exponential(_SUBSPACES[joint.kind] @ _random_coordinates(rng, joint.kind, 1.0))
     for chain in mechanism.chains:
         for link in chain.links:
             twist = np.r_[rng.uniform(-1.0, 1.0, 3), rng.uniform(-0.5, 0.5, 3)]
-            if link in mechanism.straight:
+            if link in mechanism.straight_links:
                 twist = np.array([0, 0, 0, 0, 0, 0.7])
             links.setdefault(link, _exponential(twist))
     goal = _chain_pose(mechanism.chains[0], links, state)
@@ -228,14 +224,14 @@ def _arbitrary_geometry(
     return links, state
 
 
-def _random(rng: np.random.Generator, kind: JointKind, size: float) -> np.ndarray:
+def _random_coordinates(rng: np.random.Generator, kind: JointKind, size: float) -> np.ndarray:
     return rng.uniform(-size, size, _SUBSPACES[kind].shape[1])
 
 
 def _move_joints(mechanism, state, rng, motion, unmoved) -> dict[str, np.ndarray]:
     return {
         name: state[name] if name in unmoved
-        else state[name] @ _exponential(_SUBSPACES[joint.kind] @ _random(rng, joint.kind, motion))
+        else state[name] @ _exponential(_SUBSPACES[joint.kind] @ _random_coordinates(rng, joint.kind, motion))
         for name, joint in mechanism.joints.items()
     }  # fmt: skip
 

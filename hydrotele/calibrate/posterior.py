@@ -17,13 +17,13 @@ from scipy.optimize import differential_evolution
 from hydrotele.core.errors import InputError
 
 Cost = Callable[[np.ndarray], np.ndarray]  # (S, p) -> (S,)
-_RHAT = 1.05  # maximum split R-hat of mixed chains
-_LENGTHS = 50.0  # minimum chain length in autocorrelation times, as recommended by emcee
-_JUMP = 0.1  # fraction of DE moves with the full difference, which jump between modes
+_MAX_RHAT = 1.05  # maximum split R-hat of mixed chains
+_MIN_AUTOCORRELATION_TIMES = 50.0  # minimum chain length in autocorrelation times, as recommended by emcee
+_JUMP_FRACTION = 0.1  # fraction of DE moves with the full difference, which jump between modes
 
 
 @dataclass(frozen=True)
-class Evolution:
+class EvolutionResult:
     """Result of a search by differential evolution.
 
     Attributes:
@@ -43,16 +43,16 @@ class Evolution:
     history: np.ndarray
 
 
-def evolve(
+def minimize_by_evolution(
     cost: Cost, low: np.ndarray, high: np.ndarray, *, seed: int = 0, population: int = 6,
-    generations: int = 20000, agreement: float = 1e-5,
-) -> Evolution:  # fmt: skip
+    generations: int = 20000, cost_tolerance: float = 1e-5,
+) -> EvolutionResult:  # fmt: skip
     """Minimise a function by differential evolution, without gradient or start values.
 
     The strategy is `randtobest1bin` with crossover 0.95 and a varying mutation. Calibration errors
     are strongly correlated, so most coordinates must change together, and a population that only
     follows its best member converges prematurely. The search ends when the costs of the population
-    differ by less than `agreement`.
+    differ by less than `cost_tolerance`.
 
     Args:
         cost: function of (S, p) parameter sets, such as half the weighted sum of squares.
@@ -61,13 +61,13 @@ def evolve(
         seed: seed of the random generator.
         population: population size per parameter.
         generations: maximum number of generations.
-        agreement: range of the population's costs at which the search ends. If the cost is minus a
+        cost_tolerance: range of the population's costs at which the search ends. If the cost is minus a
             log likelihood, the best cost is then within about 1e-2 of the minimum.
 
     Returns:
         The best parameters, without a final gradient search.
 
-    >>> found = evolve(lambda x: np.sum((x - 1.0) ** 2, axis=1), np.zeros(3) - 5, np.zeros(3) + 5)
+    >>> found = minimize_by_evolution(lambda x: np.sum((x - 1.0) ** 2, axis=1), np.zeros(3) - 5, np.zeros(3) + 5)
     >>> bool(np.abs(found.values - 1.0).max() < 0.02), found.converged
     (True, True)
     """
@@ -83,7 +83,7 @@ def evolve(
 
     def watch(intermediate_result) -> bool:
         history.append(float(intermediate_result.fun))
-        return bool(np.ptp(intermediate_result.population_energies) < agreement)
+        return bool(np.ptp(intermediate_result.population_energies) < cost_tolerance)
 
     found = differential_evolution(
         batch, list(zip(low, high, strict=True)), strategy="randtobest1bin",
@@ -91,7 +91,7 @@ def evolve(
         polish=False, init="latinhypercube", rng=np.random.default_rng(seed), vectorized=True,
         updating="deferred", callback=watch,
     )  # fmt: skip
-    return Evolution(found.x, float(found.fun), int(found.nit), evaluations,
+    return EvolutionResult(found.x, float(found.fun), int(found.nit), evaluations,
                      len(history) > 0 and found.nit < generations, np.array(history))  # fmt: skip
 
 
@@ -103,10 +103,10 @@ class Posterior:
         names: the p parameters.
         sample: (draws, walkers, p) every `thin`-th step after the burn-in.
         log_probability: (draws, walkers) log probability of the sample.
-        acceptance: mean fraction of accepted moves.
+        acceptance_fraction: mean fraction of accepted moves.
         autocorrelation: (p,) integrated autocorrelation times [steps of the chain].
         rhat: (p,) split R-hat over walkers.
-        effective: (p,) effective sample sizes.
+        effective_size: (p,) effective sample sizes.
         steps: number of steps after the burn-in.
         evaluations: number of evaluations of the log probability.
         converged: whether all R-hat are below 1.05 and the chain has 50 autocorrelation times.
@@ -116,44 +116,44 @@ class Posterior:
     names: tuple[str, ...]
     sample: np.ndarray
     log_probability: np.ndarray
-    acceptance: float
+    acceptance_fraction: float
     autocorrelation: np.ndarray
     rhat: np.ndarray
-    effective: np.ndarray
+    effective_size: np.ndarray
     steps: int
     evaluations: int
     converged: bool
     status: str
 
     @property
-    def flat(self) -> np.ndarray:
+    def flat_sample(self) -> np.ndarray:
         """(draws times walkers, p) sample without the chain structure."""
         return self.sample.reshape(-1, self.sample.shape[-1])
 
     @property
     def mean(self) -> np.ndarray:
         """(p,) posterior means."""
-        return self.flat.mean(axis=0)
+        return self.flat_sample.mean(axis=0)
 
     @property
-    def deviations(self) -> np.ndarray:
+    def standard_deviations(self) -> np.ndarray:
         """(p,) posterior standard deviations."""
-        return self.flat.std(axis=0, ddof=1)
+        return self.flat_sample.std(axis=0, ddof=1)
 
     @property
     def correlation(self) -> np.ndarray:
         """(p, p) posterior correlations."""
-        return np.corrcoef(self.flat, rowvar=False)
+        return np.corrcoef(self.flat_sample, rowvar=False)
 
     @property
     def intervals(self) -> np.ndarray:
         """(p, 2) central 95 % intervals."""
-        return np.quantile(self.flat, [0.025, 0.975], axis=0).T
+        return np.quantile(self.flat_sample, [0.025, 0.975], axis=0).T
 
 
 def sample_posterior(
-    log_probability: Cost, start: np.ndarray, spread: np.ndarray, names: Sequence[str], *,
-    steps: int = 6000, burn: int | None = None, walkers: int | None = None, seed: int = 0,
+    log_probability: Cost, start: np.ndarray, start_scatter: np.ndarray, names: Sequence[str], *,
+    steps: int = 6000, burn_in: int | None = None, walkers: int | None = None, seed: int = 0,
     thin: int = 10,
 ) -> Posterior:  # fmt: skip
     """Sample a posterior with emcee's DEMove (80 %) and DESnookerMove (20 %).
@@ -161,10 +161,10 @@ def sample_posterior(
     Args:
         log_probability: function of (S, p) parameter sets; -inf outside the prior.
         start: (p,) mean of the walkers' start, or (walkers, p) start of each walker.
-        spread: (p,) standard deviations or (p, p) covariance of the walkers' start.
+        start_scatter: (p,) standard deviations or (p, p) covariance of the walkers' start.
         names: the p parameters.
         steps: steps of every walker after the burn-in.
-        burn: number of burn-in steps; by default half of `steps`.
+        burn_in: number of burn-in steps; by default half of `steps`.
         walkers: number of chains; by default 4 p, because each half moves along differences of
             the other half, which must span all directions.
         seed: seed of the random generator.
@@ -179,35 +179,39 @@ def sample_posterior(
     import emcee
 
     p = len(names)
-    burn = steps // 2 if burn is None else burn
+    burn_in = steps // 2 if burn_in is None else burn_in
     rng = np.random.default_rng(seed)
     count = walkers or 4 * p
     if np.ndim(start) == 2:
         begin = np.asarray(start, float)
-    elif np.ndim(spread) == 2:
-        begin = rng.multivariate_normal(start, spread, size=count, method="svd")
+    elif np.ndim(start_scatter) == 2:
+        begin = rng.multivariate_normal(start, start_scatter, size=count, method="svd")
     else:
-        begin = start + np.asarray(spread) * rng.normal(size=(count, p))
+        begin = start + np.asarray(start_scatter) * rng.normal(size=(count, p))
     if not np.isfinite(log_probability(begin)).all():
         raise InputError("posterior", "the start is outside the prior: start closer to it")
     full = emcee.moves.DEMove(gamma0=1.0)
     usual = emcee.moves.DEMove(gamma0=2.38 / np.sqrt(2.0 * p))
-    moves = [(usual, 0.8 - _JUMP), (full, _JUMP), (emcee.moves.DESnookerMove(), 0.2)]
+    moves = [
+        (usual, 0.8 - _JUMP_FRACTION),
+        (full, _JUMP_FRACTION),
+        (emcee.moves.DESnookerMove(), 0.2),
+    ]
     sampler = emcee.EnsembleSampler(len(begin), p, log_probability, moves=moves, vectorize=True)
     sampler.random_state = np.random.RandomState(seed).get_state()
     state = begin
-    if burn:
-        state = sampler.run_mcmc(begin, burn, store=False, skip_initial_state_check=True)
+    if burn_in:
+        state = sampler.run_mcmc(begin, burn_in, store=False, skip_initial_state_check=True)
     sampler.reset()
     sampler.run_mcmc(state, -(-steps // thin), thin_by=thin, skip_initial_state_check=True)
     chain = sampler.get_chain()
     probability = sampler.get_log_prob()
     assert chain is not None and probability is not None
-    return judged(names, chain, probability, float(np.mean(sampler.acceptance_fraction)),
-                  (burn + steps) * len(begin), thin)  # fmt: skip
+    return diagnose_chain(names, chain, probability, float(np.mean(sampler.acceptance_fraction)),
+                  (burn_in + steps) * len(begin), thin)  # fmt: skip
 
 
-def judged(
+def diagnose_chain(
     names: Sequence[str], chain: np.ndarray, log_probability: np.ndarray, acceptance: float,
     evaluations: int, thin: int = 1,
 ) -> Posterior:  # fmt: skip
@@ -227,7 +231,7 @@ def judged(
     tau, rhat = autocorrelation_time(chain), split_rhat(chain)
     effective = chain.shape[0] * chain.shape[1] / tau
     long = len(chain) / tau.max()
-    good = bool(rhat.max() < _RHAT and long > _LENGTHS)
+    good = bool(rhat.max() < _MAX_RHAT and long > _MIN_AUTOCORRELATION_TIMES)
     said = (
         f"{'converged' if good else 'not converged'}: split R-hat at most {rhat.max():.3f},"
         f" {long:.0f} autocorrelation times, effective size at least {effective.min():.0f}"

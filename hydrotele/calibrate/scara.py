@@ -13,28 +13,33 @@ from pathlib import Path
 
 import numpy as np
 
-from hydrotele.calibrate.design import Selection, leave_one_out, select_poses
+from hydrotele.calibrate.design import PoseSelection, leave_one_out, select_poses
 from hydrotele.calibrate.estimation import ParameterFit, least_squares
-from hydrotele.core.datafile import Facts, Positive, parse, read_yaml
+from hydrotele.core.datafile import PositiveFloat, StrictModel, read_yaml, validate_data
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import read_text
-from hydrotele.kinematics.serial_chain import Element, SerialChain, forward, forward_and_rates
+from hydrotele.kinematics.serial_chain import (
+    Element,
+    SerialChain,
+    chain_poses,
+    chain_poses_and_rates,
+)
 
-MEASURED, NOMINAL = "measured.csv", "nominal.yaml"
+MEASURED_FILE, NOMINAL_FILE = "measured.csv", "nominal.yaml"
 COLUMNS = ("theta", "phi", "u", "v")
 _SCALES = {"length": 1e-3, "offset": 1e-3}  # m and rad: typical tolerances
-_TURN = 2.0 * np.pi + 0.2  # rad
+_MAX_ANGLE = 2.0 * np.pi + 0.2  # rad
 
 
-class ScaraFacts(Facts):
+class ScaraSpec(StrictModel):
     """Nominal lengths of the links [m]."""
 
-    length_a: Positive
-    length_b: Positive
+    length_a: PositiveFloat
+    length_b: PositiveFloat
 
 
 @dataclass(frozen=True)
-class Positions:
+class MeasuredPositions:
     """Measured poses.
 
     Attributes:
@@ -51,21 +56,21 @@ class ScaraCalibration:
     """Result of the calibration of an arm.
 
     Attributes:
-        fit: fit of the lengths and, if `offsets`, the joint offsets.
-        offsets: whether joint offsets were fitted.
-        rivals: RMS distance [m] of poses predicted by fits without them, by model.
+        fit: fit of the lengths and, if `has_offsets`, the joint offsets.
+        has_offsets: whether joint offsets were fitted.
+        model_errors: RMS distance [m] of poses predicted by fits without them, by model.
         nominal_rms: RMS distance of the nominal arm [m].
         heldout_rms: RMS distance of the validation poses, or of each pose left out in turn [m].
     """
 
     fit: ParameterFit
-    offsets: bool
-    rivals: dict[str, float]
+    has_offsets: bool
+    model_errors: dict[str, float]
     nominal_rms: float
     heldout_rms: float
 
 
-def scara_chain(nominal: ScaraFacts) -> SerialChain:
+def scara_chain(nominal: ScaraSpec) -> SerialChain:
     """Return the arm of Eq. 2 with offsets of both joints."""
     return SerialChain(
         ("theta", "phi"),
@@ -78,7 +83,7 @@ def scara_chain(nominal: ScaraFacts) -> SerialChain:
     )
 
 
-def load_scara(folder: Path) -> tuple[ScaraFacts, Positions]:
+def load_scara(folder: Path) -> tuple[ScaraSpec, MeasuredPositions]:
     """Read nominal lengths and measured poses.
 
     Args:
@@ -91,9 +96,9 @@ def load_scara(folder: Path) -> tuple[ScaraFacts, Positions]:
     Raises:
         InputError: a file is invalid; the message names file, row and column.
     """
-    data, lines = read_yaml(folder / NOMINAL)
-    nominal = parse(ScaraFacts, data, str(folder / NOMINAL), lines)
-    path = folder / MEASURED
+    data, lines = read_yaml(folder / NOMINAL_FILE)
+    nominal = validate_data(ScaraSpec, data, str(folder / NOMINAL_FILE), lines)
+    path = folder / MEASURED_FILE
     rows = [line.split(",") for line in read_text(path).splitlines() if line.strip()]
     if not rows or tuple(word.strip() for word in rows[0]) != COLUMNS:
         raise InputError(path, f"the first row must be {','.join(COLUMNS)}")
@@ -107,24 +112,20 @@ def load_scara(folder: Path) -> tuple[ScaraFacts, Positions]:
             except ValueError:
                 good = False
             if not good:
-                raise InputError(
-                    f"{path}: row {number}, column {name}", f"{word!r} is not a finite number"
-                )
+                raise InputError(f"{path}: row {number}, column {name}", f"{word!r} is not a finite number")
         values.append([float(word) for word in words])
     if len(values) < 4:
         raise InputError(path, f"has {len(values)} poses; measure at least 4 different ones")
     table = np.array(values)
-    if np.abs(table[:, :2]).max() > _TURN:
+    if np.abs(table[:, :2]).max() > _MAX_ANGLE:
         raise InputError(path, "angles exceed one turn: they must be in rad, positions in m")
     reach = 1.5 * (nominal.length_a + nominal.length_b)
     if np.abs(table[:, 2:]).max() > reach:
         raise InputError(path, f"positions beyond the arm's reach of {reach / 1.5:g} m: in mm?")
-    return nominal, Positions(table[:, :2], table[:, 2:])
+    return nominal, MeasuredPositions(table[:, :2], table[:, 2:])
 
 
-def calibrate_scara(
-    nominal: ScaraFacts, measured: Positions, heldout: Sequence[int] = ()
-) -> ScaraCalibration:
+def calibrate_scara(nominal: ScaraSpec, measured: MeasuredPositions, heldout: Sequence[int] = ()) -> ScaraCalibration:
     """Fit the arm by least squares on the distances of Eq. 3.
 
     Args:
@@ -143,11 +144,11 @@ def calibrate_scara(
     everything = range(len(measured.joints))
     fitted = [k for k in everything if k not in set(heldout)]
 
-    def judge(fit: ParameterFit, poses: Sequence[int]) -> float:
-        values = chain.nominal.copy()
+    def rms_of_fit(fit: ParameterFit, poses: Sequence[int]) -> float:
+        values = chain.nominal_values.copy()
         for name, value in zip(fit.names, fit.values, strict=True):
             values[chain.parameters.index(name)] = value
-        return _rms(chain, measured, poses, values)
+        return _rms_distance(chain, measured, poses, values)
 
     rivals, whole = {}, {}
     for model in ("lengths", "lengths and offsets"):
@@ -155,18 +156,16 @@ def calibrate_scara(
         errors = leave_one_out(
             fitted,
             lambda rest, model=model: fit_scara(chain, measured, rest, model != "lengths"),
-            lambda fit, one: judge(fit, [one]),
+            lambda fit, one: rms_of_fit(fit, [one]),
         )
         rivals[model] = float(np.sqrt(np.mean(np.square(list(errors.values())))))
     best = min(rivals, key=lambda model: rivals[model])
-    left = judge(whole[best], list(heldout)) if len(heldout) else rivals[best]
-    before = _rms(chain, measured, list(heldout) or list(everything), chain.nominal)
+    left = rms_of_fit(whole[best], list(heldout)) if len(heldout) else rivals[best]
+    before = _rms_distance(chain, measured, list(heldout) or list(everything), chain.nominal_values)
     return ScaraCalibration(whole[best], best != "lengths", rivals, before, left)
 
 
-def fit_scara(
-    chain: SerialChain, measured: Positions, poses: Sequence[int], offsets: bool
-) -> ParameterFit:
+def fit_scara(chain: SerialChain, measured: MeasuredPositions, poses: Sequence[int], offsets: bool) -> ParameterFit:
     """Fit lengths, or lengths and offsets, to some poses.
 
     Args:
@@ -185,20 +184,20 @@ def fit_scara(
     places = [chain.parameters.index(name) for name in names]
     joints, ends = measured.joints[list(poses)], measured.ends[list(poses)]
 
-    def whole(x: np.ndarray) -> np.ndarray:
-        values = chain.nominal.copy()
+    def insert_parameters(x: np.ndarray) -> np.ndarray:
+        values = chain.nominal_values.copy()
         values[places] = x
         return values
 
     return least_squares(
-        lambda x: (forward(chain, joints, whole(x)).position[:, :2] - ends).ravel(),
-        chain.nominal[places], names, _scales(names),
-        jac=lambda x: forward_and_rates(chain, joints, whole(x))
+        lambda x: (chain_poses(chain, joints, insert_parameters(x)).position[:, :2] - ends).ravel(),
+        chain.nominal_values[places], names, _scales(names),
+        jac=lambda x: chain_poses_and_rates(chain, joints, insert_parameters(x))
         .position_by_parameter[:, :2][:, :, places].reshape(-1, len(places)),
     )  # fmt: skip
 
 
-def best_poses(nominal: ScaraFacts, measured: Positions, count: int) -> Selection:
+def select_scara_poses(nominal: ScaraSpec, measured: MeasuredPositions, count: int) -> PoseSelection:
     """Select the poses that are most informative about lengths and offsets (D-optimal).
 
     Args:
@@ -210,13 +209,13 @@ def best_poses(nominal: ScaraFacts, measured: Positions, count: int) -> Selectio
         The selection.
     """
     chain = scara_chain(nominal)
-    rates = forward_and_rates(chain, measured.joints).position_by_parameter[:, :2]
+    rates = chain_poses_and_rates(chain, measured.joints).position_by_parameter[:, :2]
     return select_poses(rates * _scales(chain.parameters), count)
 
 
-def simulated_scara(
-    nominal: ScaraFacts, errors: Sequence[float], poses: int, noise: float, seed: int
-) -> Positions:
+def simulate_scara(
+    nominal: ScaraSpec, errors: Sequence[float], poses: int, noise: float, seed: int
+) -> MeasuredPositions:
     """Simulate measured poses of an arm with errors.
 
     Args:
@@ -232,17 +231,17 @@ def simulated_scara(
     rng = np.random.default_rng(seed)
     chain = scara_chain(nominal)
     joints = np.column_stack([rng.uniform(-1.5, 1.5, poses), rng.uniform(0.3, 2.4, poses)])
-    ends = forward(chain, joints, chain.nominal + np.asarray(errors)).position[:, :2]
-    return Positions(joints, ends + noise * rng.standard_normal(ends.shape))
+    ends = chain_poses(chain, joints, chain.nominal_values + np.asarray(errors)).position[:, :2]
+    return MeasuredPositions(joints, ends + noise * rng.standard_normal(ends.shape))
 
 
-def save_scara(folder: Path, nominal: ScaraFacts, measured: Positions) -> None:
+def save_scara(folder: Path, nominal: ScaraSpec, measured: MeasuredPositions) -> None:
     """Write `nominal.yaml` and `measured.csv`."""
     folder.mkdir(parents=True, exist_ok=True)
     text = f"length_a: {nominal.length_a!r}\nlength_b: {nominal.length_b!r}\n"
-    (folder / NOMINAL).write_text(text, encoding="utf-8")
+    (folder / NOMINAL_FILE).write_text(text, encoding="utf-8")
     table = np.column_stack([measured.joints, measured.ends])
-    np.savetxt(folder / MEASURED, table, delimiter=",", header=",".join(COLUMNS), comments="",
+    np.savetxt(folder / MEASURED_FILE, table, delimiter=",", header=",".join(COLUMNS), comments="",
                fmt="%.9f")  # fmt: skip
 
 
@@ -250,6 +249,6 @@ def _scales(names: Sequence[str]) -> np.ndarray:
     return np.array([_SCALES[name.partition(".")[0]] for name in names])
 
 
-def _rms(chain, measured: Positions, poses: Sequence[int], values: np.ndarray) -> float:
-    ends = forward(chain, measured.joints[list(poses)], values).position[:, :2]
+def _rms_distance(chain, measured: MeasuredPositions, poses: Sequence[int], values: np.ndarray) -> float:
+    ends = chain_poses(chain, measured.joints[list(poses)], values).position[:, :2]
     return float(np.sqrt(np.mean(np.sum((ends - measured.ends[list(poses)]) ** 2, axis=1))))

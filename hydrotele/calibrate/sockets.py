@@ -17,17 +17,17 @@ import numpy as np
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import read_text
 from hydrotele.kinematics.serial_robot import (
-    Robot,
-    corrected_robot,
-    joints_for_places,
+    SerialRobot,
+    correct_robot,
     robot_chain,
     robot_poses,
+    solve_ball_positions,
 )
 
-_FILE = re.compile(r"hole_?(\d+)\.(csv|txt)", re.IGNORECASE)
-_SEPARATOR = re.compile(r"[,;\t ]\s*|\s+")
-_SAME = 1e-6  # rad or m: postures that differ by less count as repeated
-_FEWEST = 3  # postures, minimum for a mean and a scatter
+_FILE_PATTERN = re.compile(r"hole_?(\d+)\.(csv|txt)", re.IGNORECASE)
+_SEPARATOR_PATTERN = re.compile(r"[,;\t ]\s*|\s+")
+_POSTURE_TOLERANCE = 1e-6  # rad or m: postures that differ by less count as repeated
+_MIN_POSTURES = 3  # postures, minimum for a mean and a scatter
 
 
 @dataclass(frozen=True)
@@ -70,58 +70,52 @@ def load_sockets(folder: str | Path, degrees: bool = False) -> tuple[tuple[Socke
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(folder, "is not a folder")
-    paths = sorted(p for p in (*folder.glob("*"), *folder.glob("*/*")) if _FILE.fullmatch(p.name))
+    paths = sorted(p for p in (*folder.glob("*"), *folder.glob("*/*")) if _FILE_PATTERN.fullmatch(p.name))
     if not paths:
         inside = ", ".join(sorted(p.name for p in folder.iterdir())[:6]) or "nothing"
-        raise InputError(
-            folder, f"contains no PLACE/hole_0.csv, PLACE/hole_1.csv, ... (it contains {inside})"
-        )
+        raise InputError(folder, f"contains no PLACE/hole_0.csv, PLACE/hole_1.csv, ... (it contains {inside})")
     sockets, notes = [], []
     for path in paths:
-        found = _FILE.fullmatch(path.name)
+        found = _FILE_PATTERN.fullmatch(path.name)
         assert found is not None
         place = path.parent.resolve().name
-        joints, lines = _read(path)
+        joints, lines = _read_joints(path)
         if degrees:
             joints = np.radians(joints)
-        sockets.append(_distinct(Socket(place, int(found[1]), path, joints, lines), notes))
+        sockets.append(_remove_repeated(Socket(place, int(found[1]), path, joints, lines), notes))
     columns = {s.path: s.joints.shape[1] for s in sockets}
     usual = max(set(columns.values()), key=list(columns.values()).count)
     for path, count in columns.items():
         if count != usual:
-            raise InputError(
-                path, f"has {count} columns, but the other files have {usual}: one per joint"
-            )
+            raise InputError(path, f"has {count} columns, but the other files have {usual}: one per joint")
     return tuple(sockets), notes
 
 
-def places_of(sockets: Sequence[Socket]) -> tuple[str, ...]:
+def place_names(sockets: Sequence[Socket]) -> tuple[str, ...]:
     """Return the names of the places, in order."""
     return tuple(dict.fromkeys(socket.place for socket in sockets))
 
 
-def idle_joints(sockets: Sequence[Socket]) -> list[int]:
+def find_idle_joints(sockets: Sequence[Socket]) -> list[int]:
     """Return the columns with one value in all files: joints that never move."""
     joints = np.vstack([socket.joints for socket in sockets])
-    return [int(k) for k in np.flatnonzero(np.ptp(joints, axis=0) < _SAME)]
+    return [int(k) for k in np.flatnonzero(np.ptp(joints, axis=0) < _POSTURE_TOLERANCE)]
 
 
-def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
+def _read_joints(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Return the numbers (n, k) of a file and their line numbers (n,)."""
     rows, lines = [], []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         line = line.strip().lstrip("\ufeff")
         if not line or line.startswith("#"):
             continue
-        words = _SEPARATOR.split(line)
-        values = [_number(word) for word in words]
+        words = _SEPARATOR_PATTERN.split(line)
+        values = [_parse_number(word) for word in words]
         if not rows and all(value is None for value in values):
             continue  # header line
         for column, (word, value) in enumerate(zip(words, values, strict=True), start=1):
             if value is None or not math.isfinite(value):
-                raise InputError(
-                    f"{path}: row {number}, column {column}", f"{word!r} is not a finite number"
-                )
+                raise InputError(f"{path}: row {number}, column {column}", f"{word!r} is not a finite number")
         if rows and len(values) != len(rows[0]):
             raise InputError(
                 f"{path}: row {number}",
@@ -129,33 +123,33 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
             )
         rows.append(values)
         lines.append(number)
-    if len(rows) < _FEWEST:
+    if len(rows) < _MIN_POSTURES:
         raise InputError(
             path,
-            f"has {len(rows)} rows; record at least {_FEWEST} different postures, preferably 20",
+            f"has {len(rows)} rows; record at least {_MIN_POSTURES} different postures, preferably 20",
         )
     return np.array(rows, float), np.array(lines)
 
 
-def _number(word: str) -> float | None:
+def _parse_number(word: str) -> float | None:
     try:
         return float(word)
     except ValueError:
         return None
 
 
-def _distinct(socket: Socket, notes: list[str]) -> Socket:
+def _remove_repeated(socket: Socket, notes: list[str]) -> Socket:
     """Return a socket without repeated postures."""
     kept: list[int] = []
     for row in range(len(socket.joints)):
         away = np.abs(socket.joints[kept] - socket.joints[row]).max(axis=1)
-        if not (away < _SAME).any():
+        if not (away < _POSTURE_TOLERANCE).any():
             kept.append(row)
-    if len(kept) < _FEWEST:
+    if len(kept) < _MIN_POSTURES:
         raise InputError(
             socket.path,
             f"repeats one posture: {len(socket.joints)} rows contain {len(kept)} different ones;"
-            f" record at least {_FEWEST}, preferably 20",
+            f" record at least {_MIN_POSTURES}, preferably 20",
         )
     if len(kept) < len(socket.joints):
         gone = sorted(set(range(len(socket.joints))) - set(kept))
@@ -165,13 +159,13 @@ def _distinct(socket: Socket, notes: list[str]) -> Socket:
     return replace(socket, joints=socket.joints[kept], lines=socket.lines[kept])
 
 
-_TRIES = 200
-_REACHED = 1e-9  # m
-_IDLE = 0.3  # rad
+_MAX_TRIES = 200
+_MAX_BALL_ERROR = 1e-9  # m
+_IDLE_ANGLE = 0.3  # rad
 
 
 @dataclass(frozen=True)
-class Errors:
+class RobotErrors:
     """Standard deviations of a robot's geometric errors and of its measurement.
 
     Attributes:
@@ -191,10 +185,10 @@ class Errors:
     play: float = 1.0e-4
 
 
-def robot_with_errors(
-    robot: Robot, errors: Errors, rng: np.random.Generator,
+def add_random_errors(
+    robot: SerialRobot, errors: RobotErrors, rng: np.random.Generator,
     corrections: Mapping[str, float] | None = None,
-) -> tuple[Robot, dict[str, float]]:  # fmt: skip
+) -> tuple[SerialRobot, dict[str, float]]:  # fmt: skip
     """Return a robot with random geometric errors.
 
     Args:
@@ -208,17 +202,17 @@ def robot_with_errors(
     """
     chain = robot_chain(robot)
     values = {}
-    for name, nominal in zip(chain.parameters, chain.nominal, strict=True):
+    for name, nominal in zip(chain.parameters, chain.nominal_values, strict=True):
         kind, _, joint = name.partition(".")
         size = errors.length if kind[0] == "t" else errors.offset if kind == "rz" else errors.tilt
         if joint == "tool":
             size = errors.ball
         values[name] = float(nominal + size * rng.standard_normal())
-    return corrected_robot(robot, values, corrections or {}), values
+    return correct_robot(robot, values, corrections or {}), values
 
 
-def simulated_sockets(
-    robot: Robot, places: Mapping[str, Sequence[float]], rows: int, errors: Errors,
+def simulate_sockets(
+    robot: SerialRobot, places: Mapping[str, Sequence[float]], rows: int, errors: RobotErrors,
     rng: np.random.Generator, distance: float = 0.050, limit: float = 2.8,
     idle: int | None = None,
 ) -> tuple[Socket, ...]:  # fmt: skip
@@ -245,10 +239,10 @@ def simulated_sockets(
     for place, first in places.items():
         for hole in (0, 1):
             middle = np.asarray(first, float) + [0.0, hole * distance, 0.0]
-            joints = _postures(robot, middle, rows, errors, rng, limit, place, idle)
+            joints = _solve_postures(robot, middle, rows, errors, rng, limit, place, idle)
             joints = joints + errors.encoder * rng.standard_normal(joints.shape)
             if idle is not None:
-                joints[:, idle] = _IDLE
+                joints[:, idle] = _IDLE_ANGLE
             path = Path(place) / f"hole_{hole}.csv"
             made.append(Socket(place, hole, path, joints, np.arange(1, rows + 1)))
     return tuple(made)
@@ -262,21 +256,21 @@ def save_sockets(sockets: Sequence[Socket], folder: Path) -> None:
         np.savetxt(path, socket.joints, delimiter=",", fmt="%.9f")
 
 
-def _postures(
-    robot: Robot, middle: np.ndarray, rows: int, errors: Errors, rng: np.random.Generator,
+def _solve_postures(
+    robot: SerialRobot, middle: np.ndarray, rows: int, errors: RobotErrors, rng: np.random.Generator,
     limit: float, place: str, idle: int | None,
 ) -> np.ndarray:  # fmt: skip
     """Return encoder readings (rows, k) of postures that put the ball into a socket."""
     found: list[np.ndarray] = []
-    for _ in range(_TRIES):
+    for _ in range(_MAX_TRIES):
         start = rng.uniform(-limit, limit, (4 * rows, len(robot.joints)))
         if idle is not None:
-            start[:, idle] = _IDLE
+            start[:, idle] = _IDLE_ANGLE
         near = np.linalg.norm(robot_poses(robot, start).position - middle, axis=1)
         start = start[np.argsort(near)[: 2 * rows]]
         targets = middle + errors.play * rng.standard_normal((len(start), 3))
-        reached = joints_for_places(robot, targets, start, idle=idle)
-        good = (reached.missed < _REACHED) & (np.abs(reached.joints).max(axis=1) < limit)
+        reached = solve_ball_positions(robot, targets, start, idle=idle)
+        good = (reached.remaining_distance < _MAX_BALL_ERROR) & (np.abs(reached.joints).max(axis=1) < limit)
         found += list(reached.joints[good])
         if len(found) >= rows:
             return np.array(found[:rows])

@@ -14,43 +14,54 @@ import numpy as np
 
 import hydrotele
 from hydrotele.cli.console import (
-    notes,
-    out,
-    plain,
+    make_table,
     print_json,
     print_result,
-    stages,
-    table,
+    show_stages,
+    stderr_console,
+    stdout_console,
+    to_json_types,
     write_json,
 )
 from hydrotele.core.datafile import read_yaml
 from hydrotele.core.errors import InputError
-from hydrotele.core.output import check_target, whole_folder
+from hydrotele.core.output import atomic_folder, check_output_folder
 from hydrotele.machine.joystick import load_joystick
-from hydrotele.run.run import scenario_model
+from hydrotele.run.run import load_nominal_machine
 from hydrotele.scenario.scenario import Scenario, load_scenario, shipped_scenarios
-from hydrotele.teleop.analysis import LONGEST, Case, TeleopCase, known_structures, load_teleop_case
+from hydrotele.teleop.analysis import (
+    MAX_DELAY,
+    TeleopCaseFile,
+    TeleoperatorAxis,
+    check_structures,
+    load_teleop_case,
+)
 from hydrotele.teleop.findings import (
-    Findings,
     ScenarioFindings,
-    find,
-    find_loop,
-    findings_document,
+    TeleopFindings,
+    analyse_scenario_case,
+    analyse_structures,
+    describe_stability,
+    findings_to_dict,
     format_delay,
     format_error,
     format_factor,
     format_number,
-    loop_document,
-    why_unstable,
+    scenario_findings_to_dict,
 )
-from hydrotele.teleop.linear_case import joystick_of, scenario_case
-from hydrotele.teleop.robust import robustness, spread_of
+from hydrotele.teleop.linear_case import build_scenario_case, scenario_joystick
+from hydrotele.teleop.robust import case_impedance_ranges, evaluate_robustness
 from hydrotele.teleop.round_trip import load_delays
-from hydrotele.teleop.sampled import SAMPLED_STRUCTURES, PacketAges, jittering_line, steady_line
-from hydrotele.teleop.switching import Spring
+from hydrotele.teleop.sampled import (
+    SAMPLED_STRUCTURES,
+    PacketAges,
+    constant_delay_ages,
+    measured_delay_ages,
+)
+from hydrotele.teleop.switching import StiffnessAxis
 from hydrotele.teleop.two_port import STRUCTURES
 
-_LEGEND = (
+_STABILITY_LEGEND = (
     "held: stability with the operator's hand on the handle, in contact with the task and in free"
     " motion; released: the same without a hand\n"
     "gain margin: factor on the reflected signal (force, or motion of the slave) up to which the"
@@ -71,7 +82,7 @@ _ROBUST_LEGEND = (
 )
 
 
-class Robustly(NamedTuple):
+class RobustnessOptions(NamedTuple):
     """Options of the robustness analysis.
 
     Attributes:
@@ -85,9 +96,9 @@ class Robustly(NamedTuple):
     operators: int = 20
 
 
-def analyse_teleop_to_folder(
+def analyse_case_to_folder(
     file: Path | None, target: Path | None, structures: Sequence[str], delay: float | None,
-    confirm: bool, as_json: bool, robustly: Robustly | None = None,
+    confirm: bool, as_json: bool, robustness_options: RobustnessOptions | None = None,
 ) -> Path | None:  # fmt: skip
     """Analyse a teleoperator case, print the result and write a report with figures.
 
@@ -100,7 +111,7 @@ def analyse_teleop_to_folder(
         delay: one-way delay [s], None for that of the case.
         confirm: whether to verify the predictions by simulation.
         as_json: print `analysis.json` instead of text.
-        robustly: options of the robustness analysis, None to omit it.
+        robustness_options: options of the robustness analysis, None to omit it.
 
     Returns:
         The output folder, None if nothing was written.
@@ -111,29 +122,29 @@ def analyse_teleop_to_folder(
     facts = load_teleop_case(file)
     target = target or (None if as_json else Path("runs") / f"analyse_{facts.name}")
     if target:
-        check_target(target, "two-port analysis")
-    found = analyse_case(facts, structures, delay, confirm, as_json, robustly)
-    document = plain(findings_document(found))
+        check_output_folder(target, "two-port analysis")
+    found = analyse_case(facts, structures, delay, confirm, as_json, robustness_options)
+    document = to_json_types(findings_to_dict(found))
     if target:
-        with whole_folder(target, "two-port analysis") as folder:
+        with atomic_folder(target, "two-port analysis") as folder:
             _write(folder, found, document)
     print_result(document, as_json, lambda: _print(found), target)
     return target
 
 
 def analyse_case(
-    facts: TeleopCase, structures: Sequence[str], delay: float | None, confirm: bool, quiet: bool,
-    robustly: Robustly | None = None,
-) -> Findings:  # fmt: skip
+    specification: TeleopCaseFile, structures: Sequence[str], delay: float | None, confirm: bool, quiet: bool,
+    robustness_options: RobustnessOptions | None = None,
+) -> TeleopFindings:  # fmt: skip
     """Analyse a teleoperator case.
 
     Args:
-        facts: specification of the case.
+        specification: specification of the case.
         structures: control structures to analyse; if empty, those of the case.
         delay: one-way delay [s], None for that of the case.
         confirm: whether to verify the predictions by simulation.
         quiet: whether to omit the progress bar.
-        robustly: options of the robustness analysis, None to omit it.
+        robustness_options: options of the robustness analysis, None to omit it.
 
     Returns:
         Stability, margins and passivity of each structure.
@@ -142,121 +153,124 @@ def analyse_case(
         InputError: structures or delay are not usable.
     """
     try:
-        known = SAMPLED_STRUCTURES if robustly else STRUCTURES
-        names = known_structures(tuple(structures), known)
+        known = SAMPLED_STRUCTURES if robustness_options else STRUCTURES
+        names = check_structures(tuple(structures), known)
     except ValueError as error:
         raise InputError("--structure", str(error)) from None
-    case = facts.case()
+    case = specification.to_axis()
     if delay is not None:
-        if not 0.0 <= delay <= LONGEST:
-            raise InputError("--delay", f"must be from 0 to {LONGEST:g} s, got {delay:g}")
+        if not 0.0 <= delay <= MAX_DELAY:
+            raise InputError("--delay", f"must be from 0 to {MAX_DELAY:g} s, got {delay:g}")
         case = case.with_delay(delay)
-    reach = facts.map
+    reach = specification.map
     delays = max(reach.longest_delay, case.delay) * np.linspace(0.0, 1.0, reach.points) ** 2
     factors = np.geomspace(reach.least_factor, reach.most_factor, reach.points)
-    spring = facts.stiffness.spring() if facts.stiffness else None
-    linear = tuple(name for name in names if name in STRUCTURES) if names else facts.structures
-    with stages(f"analyse {facts.name}", quiet) as progress:
-        found = find(facts.name, case, linear, delays, factors, spring, confirm, progress)
-        if not robustly:
+    spring = specification.stiffness.to_spring() if specification.stiffness else None
+    linear = tuple(name for name in names if name in STRUCTURES) if names else specification.structures
+    with show_stages(f"analyse {specification.name}", quiet) as progress:
+        found = analyse_structures(specification.name, case, linear, delays, factors, spring, confirm, progress)
+        if not robustness_options:
             return found
-        line = _line(case, robustly)
+        line = _packet_ages(case, robustness_options)
         robust = []
-        for one in names or (*facts.structures, *SAMPLED_STRUCTURES[len(STRUCTURES) :]):
+        for one in names or (*specification.structures, *SAMPLED_STRUCTURES[len(STRUCTURES) :]):
             if progress:
                 progress(f"robustness of {one}", len(robust) / len(SAMPLED_STRUCTURES))
-            spread = spread_of(facts)
-            robust.append(robustness(case, one, line, spread, robustly.operators))
-        return replace(found, robust=tuple(robust), period=robustly.period)
+            spread = case_impedance_ranges(specification)
+            robust.append(evaluate_robustness(case, one, line, spread, robustness_options.operators))
+        return replace(found, robustness_results=tuple(robust), period=robustness_options.period)
 
 
-def _line(case: Case, robustly: Robustly) -> PacketAges:
+def _packet_ages(case: TeleoperatorAxis, robustness_options: RobustnessOptions) -> PacketAges:
     """Return the packet ages from measured delays, or from the constant delays of the case."""
-    if not 1e-4 <= robustly.period <= 0.1:
-        raise InputError("--period", f"must be from 0.0001 to 0.1 s, got {robustly.period:g}")
-    if not 1 <= robustly.operators <= 10_000:
-        raise InputError("--operators", f"must be from 1 to 10000, got {robustly.operators}")
-    if robustly.delays is None:
-        return steady_line(robustly.period, case.delay_forward, case.delay_back)
-    return jittering_line(robustly.period, *load_delays(robustly.delays))
+    if not 1e-4 <= robustness_options.period <= 0.1:
+        raise InputError("--period", f"must be from 0.0001 to 0.1 s, got {robustness_options.period:g}")
+    if not 1 <= robustness_options.operators <= 10_000:
+        raise InputError("--operators", f"must be from 1 to 10000, got {robustness_options.operators}")
+    if robustness_options.delays is None:
+        return constant_delay_ages(robustness_options.period, case.delay_forward, case.delay_back)
+    return measured_delay_ages(robustness_options.period, *load_delays(robustness_options.delays))
 
 
-def _write(folder: Path, found: Findings, document: dict) -> None:
+def _write(folder: Path, findings: TeleopFindings, document: dict) -> None:
     write_json(folder / "analysis.json", document)
-    from hydrotele.show.teleop_report import draw_maps, write_teleop_report
+    from hydrotele.show.teleop_report import draw_stability_maps, write_teleop_report
 
-    notes.print("writing report.html ...", style="dim")
-    maps = draw_maps(found)
-    write_teleop_report(found, maps, folder / "report.html")
+    stderr_console.print("writing report.html ...", style="dim")
+    maps = draw_stability_maps(findings)
+    write_teleop_report(findings, maps, folder / "report.html")
     (folder / "stability.png").write_bytes(maps)
-    summary = {"kind": "two-port analysis", "name": found.name, "hydrotele": hydrotele.__version__}
+    summary = {
+        "kind": "two-port analysis",
+        "name": findings.name,
+        "hydrotele": hydrotele.__version__,
+    }
     write_json(folder / "summary.json", summary)
 
 
-def _print(found: Findings) -> None:
-    case = found.case
+def _print(findings: TeleopFindings) -> None:
+    case = findings.case
     delays = f"{1e3 * case.delay_forward:g} ms forward, {1e3 * case.delay_back:g} ms back"
-    title = f"{found.name}, delay {delays}"
-    rows = table(title, "structure", "held", "released", "gain margin", "max delay", "norm",
+    title = f"{findings.name}, delay {delays}"
+    rows = make_table(title, "structure", "held", "released", "gain margin", "max delay", "norm",
                  "passive")  # fmt: skip
-    for one in found.analyses:
+    for one in findings.analyses:
         rows.add_row(
-            one.structure, _verdict(why_unstable(one)), _verdict(why_unstable(one, True)),
-            format_factor(one.gain_margin), format_delay(one.largest_delay),
-            f"{one.scattering.max():.3g}", "yes" if one.passive else "no",
+            one.structure, _color_verdict(describe_stability(one)), _color_verdict(describe_stability(one, True)),
+            format_factor(one.gain_margin), format_delay(one.max_delay),
+            f"{one.scattering_norms.max():.3g}", "yes" if one.has_passive_port else "no",
         )  # fmt: skip
-    out.print(rows)
-    out.print(_LEGEND, style="dim")
-    if found.spring:
-        _print_springs(found)
-    if found.agreements:
-        _print_confirmed(found)
-    if found.robust:
-        _print_robust(found)
+    stdout_console.print(rows)
+    stdout_console.print(_STABILITY_LEGEND, style="dim")
+    if findings.spring:
+        _print_case_springs(findings)
+    if findings.agreements:
+        _print_confirmation(findings)
+    if findings.robustness_results:
+        _print_robustness(findings)
 
 
-def _verdict(words: str) -> str:
-    return words if words == "yes" else f"[red]{words}[/]"
+def _color_verdict(verdict: str) -> str:
+    return verdict if verdict == "yes" else f"[red]{verdict}[/]"
 
 
-def _print_robust(found: Findings) -> None:
+def _print_robustness(found: TeleopFindings) -> None:
     title = f"robustness with sampling every {1e3 * found.period:g} ms and jitter of the delays"
-    rows = table(title, "structure", "held, task", "held, free", "released, task",
+    rows = make_table(title, "structure", "held, task", "held, free", "released, task",
                  "released, free", "pairs held", "pairs released", "Llewellyn", "Z-width",
                  "max task")  # fmt: skip
-    for one in found.robust:
-        told = [_verdict("yes" if p.stable else f"no, {p.reason}") for p in one.sampled]
-        worst, width = one.worst, one.width
+    for one in found.robustness_results:
+        told = [_color_verdict("yes" if p.is_stable else f"no, {p.reason}") for p in one.sampled]
+        worst, width = one.sampled_pairs, one.z_width_result
         stiffest = "-"
         if width:
-            most = f"> {width.most_tried:.2g}"
+            most = f"> {width.max_tested_stiffness:.2g}"
             stiffest = " / ".join(
-                most if math.isinf(k) else f"{k:.2g}"
-                for k in (width.stiffest_held, width.stiffest_let_go)
+                most if math.isinf(k) else f"{k:.2g}" for k in (width.max_stiffness_held, width.max_stiffness_released)
             )
         rows.add_row(
-            one.structure, *told, f"{worst.pairs - worst.unstable} of {worst.pairs}",
-            f"{worst.pairs - worst.unstable_let_go} of {worst.pairs}",
+            one.structure, *told, f"{worst.pair_count - worst.unstable_count} of {worst.pair_count}",
+            f"{worst.pair_count - worst.unstable_released_count} of {worst.pair_count}",
             "-" if math.isnan(one.llewellyn) else f"{one.llewellyn:.3g}",
             f"{width.decades:.2f}" if width else "-", stiffest,
         )  # fmt: skip
-    out.print(rows)
-    out.print(_ROBUST_LEGEND, style="dim")
+    stdout_console.print(rows)
+    stdout_console.print(_ROBUST_LEGEND, style="dim")
 
 
-def _print_springs(found: Findings) -> None:
+def _print_case_springs(found: TeleopFindings) -> None:
     assert found.spring
-    _print_spring_table(found.spring.held(found.case.hand), found.spring)
+    _print_spring_table(found.spring.with_hand(found.case.hand), found.spring)
 
 
-def _print_confirmed(found: Findings) -> None:
-    rows = table("confirmed in simulation", "structure", "sweep error, no delay",
+def _print_confirmation(found: TeleopFindings) -> None:
+    rows = make_table("confirmed in simulation", "structure", "sweep error, no delay",
                  "sweep error, with delay", "map agreement")  # fmt: skip
     for one in found.agreements:
-        errors = [format_error(s.error) for s in found.sweeps if s.structure == one.structure]
-        rows.add_row(one.structure, *[*errors, "-"][:2], f"{100.0 * one.share:.1f} %")
-    out.print(rows)
-    out.print("sweep error: largest error of the impedance felt by the operator (lower is better);"
+        errors = [format_error(s.max_relative_error) for s in found.sweeps if s.structure == one.structure]
+        rows.add_row(one.structure, *[*errors, "-"][:2], f"{100.0 * one.agreement_fraction:.1f} %")
+    stdout_console.print(rows)
+    stdout_console.print("sweep error: largest error of the impedance felt by the operator (lower is better);"
               " map agreement: fraction of the cells of the stability map in which simulation and"
               " prediction agree (higher is better)", style="dim")  # fmt: skip
 
@@ -279,9 +293,9 @@ def is_scenario(file: Path | None) -> bool:
 def analyse_any_to_folder(
     file: Path | None, target: Path | None, structures: list[str] | None, delay: float | None,
     confirm: bool, coordinate: str | None, overrides: dict[str, str], as_json: bool,
-    robustly: Robustly | None = None,
+    robustness_options: RobustnessOptions | None = None,
 ) -> Path | None:  # fmt: skip
-    """Analyse a case by `analyse_teleop_to_folder` or a scenario by `analyse_scenario_to_folder`.
+    """Analyse a case by `analyse_case_to_folder` or a scenario by `analyse_scenario_to_folder`.
 
     Raises:
         InputError: an option does not apply to this kind of file, or the analysis raises it.
@@ -289,10 +303,8 @@ def analyse_any_to_folder(
     if not is_scenario(file):
         if coordinate or overrides:
             raise InputError("--coordinate, --set", "apply to scenarios only")
-        return analyse_teleop_to_folder(
-            file, target, structures or [], delay, confirm, as_json, robustly
-        )
-    if structures or delay is not None or confirm or robustly:
+        return analyse_case_to_folder(file, target, structures or [], delay, confirm, as_json, robustness_options)
+    if structures or delay is not None or confirm or robustness_options:
         message = "apply to cases only; change a scenario by --set"
         raise InputError("--structure, --delay, --confirm, --robust", message)
     return analyse_scenario_to_folder(str(file), target, coordinate, overrides, as_json)
@@ -311,10 +323,10 @@ def analyse_scenario(scenario: Scenario, coordinate: str | None = None) -> Scena
     Raises:
         InputError: the scenario has no force-reflection loop.
     """
-    machine = scenario_model(scenario)
-    joystick = load_joystick(joystick_of(scenario))
-    case, contact = scenario_case(scenario, machine, joystick, coordinate)
-    return find_loop(scenario.name, case, contact.source)
+    machine = load_nominal_machine(scenario)
+    joystick = load_joystick(scenario_joystick(scenario))
+    case, contact = build_scenario_case(scenario, machine, joystick, coordinate)
+    return analyse_scenario_case(scenario.name, case, contact.source)
 
 
 def analyse_scenario_to_folder(
@@ -341,65 +353,67 @@ def analyse_scenario_to_folder(
     scenario = load_scenario(name, overrides)
     target = target or (None if as_json else Path("runs") / f"analyse_{scenario.name}")
     if target:
-        check_target(target, _KIND)
+        check_output_folder(target, _KIND)
     found = analyse_scenario(scenario, coordinate)
-    document = plain(loop_document(found))
+    document = to_json_types(scenario_findings_to_dict(found))
     if target:
-        with whole_folder(target, _KIND) as folder:
-            _write_loop(folder, found, document)
+        with atomic_folder(target, _KIND) as folder:
+            _write_loop_files(folder, found, document)
     if as_json:
         print_json(document)
     else:
-        for label, value, why in findings_table(found):
-            out.print(f"{label}: [bold]{value}[/] {why}".rstrip())
-        _print_spring_table(found.held, found.free)
-        out.print(f"written to [bold]{target}[/]; open {target}/report.html")
+        for label, value, why in format_findings(found):
+            stdout_console.print(f"{label}: [bold]{value}[/] {why}".rstrip())
+        _print_spring_table(found.held_spring, found.released_spring)
+        stdout_console.print(f"written to [bold]{target}[/]; open {target}/report.html")
     return target
 
 
-def findings_table(found: ScenarioFindings) -> list[tuple[str, str, str]]:
+def format_findings(findings: ScenarioFindings) -> list[tuple[str, str, str]]:
     """Return the findings as rows of text: (quantity, value, remark)."""
-    case, loop, tip = found.case, found.loop, found.case.tip
+    case, loop, tip = findings.case, findings.loop, findings.case.tip
     pole, turns = loop.pole, tip.coordinate not in ("r", "z")
     force, mass, oil = ("N m", "kg m^2", "N m/rad") if turns else ("N", "kg", "N/m")
     rows = [
-        ("scenario", found.name, f"{case.pilot.reflection} under {case.pilot.mode} control"),
+        ("scenario", findings.name, f"{case.pilot.reflection} under {case.pilot.mode} control"),
         ("coordinate", tip.coordinate, f"{tip.mass:.0f} {mass}, oil {tip.stiffness:.3g} {oil}"),
-        ("task", f"{case.task.stiffness:.3g} {oil}", f"({found.task_source})"),
+        ("task", f"{case.task.stiffness:.3g} {oil}", f"({findings.task_source})"),
         ("analysed loop", loop.structure,
-         "" if loop.own else "used because the scenario has stiffness feedback or no reflection"),
-        ("stable", "yes" if loop.stable else f"no, {loop.unstable_poles} unstable poles", ""),
+         "" if loop.is_scenario_structure else "used because the scenario has stiffness feedback or no reflection"),
+        ("stable", "yes" if loop.is_stable else f"no, {loop.unstable_poles} unstable poles", ""),
         ("gain margin", format_factor(loop.gain_margin),
          f"factor on the reflection ratio of {case.ratio:.3g}; higher is better"),
-        ("maximum delay", format_delay(loop.largest_delay), "one way; higher is better"),
+        ("maximum delay", format_delay(loop.max_delay), "one way; higher is better"),
     ]  # fmt: skip
     if math.isfinite(loop.frequency):
         rows.append(("oscillation frequency", f"{loop.frequency:.2f} Hz", "at the stability limit"))
         rows.append(("dominant pole", f"{pole.real:.3f} {pole.imag:+.3f}j rad/s", "at this ratio"))
-    if math.isfinite(loop.largest_ratio):
+    if math.isfinite(loop.max_ratio):
         why = f"{loop.hand_force:.2f} for {case.force_limit:.0f} {force}, outside the dead band"
-        rows.append(("maximum stable ratio", f"{loop.largest_ratio:.3g}", why))
-    if math.isfinite(loop.ratio_with_deadband):
+        rows.append(("maximum stable ratio", f"{loop.max_ratio:.3g}", why))
+    if math.isfinite(loop.max_ratio_with_deadband):
         why = "for an oscillation from stop to stop across the dead band"
         label = "maximum stable ratio with dead band"
-        rows.append((label, f"{loop.ratio_with_deadband:.3g}", why))
+        rows.append((label, f"{loop.max_ratio_with_deadband:.3g}", why))
     why = "reflected by stiffness feedback at the edge of the dead band"
-    return [*rows, ("local reflection ratio", f"{found.edge_ratio:.3g}", why)]
+    return [*rows, ("local reflection ratio", f"{findings.deadband_edge_ratio:.3g}", why)]
 
 
-def _print_spring_table(held: Spring, free: Spring) -> None:
-    rows = table("stiffness feedback: margin B^2 - 4 M K_max and worst-case switching", "joystick",
+def _print_spring_table(held: StiffnessAxis, free: StiffnessAxis) -> None:
+    rows = make_table("stiffness feedback: margin B^2 - 4 M K_max and worst-case switching", "joystick",
                  "B", "K_min", "K_max", "margin", "B for margin 0", "growth", "B for growth 1",
                  "stable by",
                  )  # fmt: skip
     for name, one in (("held", held), ("released", free)):
         rows.add_row(
-            name, f"{one.damping:g}", f"{one.least:g}", f"{one.most:g}", format_number(one.margin),
-            f"{one.enough_damping:.4g}", f"{one.growth:.3g}", f"{one.least_damping:.3g}",
-            _verdict(one.stable_by) if one.stable_by == "nothing" else one.stable_by,
+            name, f"{one.damping:g}", f"{one.min_stiffness:g}", f"{one.max_stiffness:g}",
+            format_number(one.theorem_margin),
+            f"{one.theorem_damping:.4g}", f"{one.half_swing_growth:.3g}", f"{one.min_stable_damping:.3g}",
+            _color_verdict(one.stability_criterion)
+            if one.stability_criterion == "nothing" else one.stability_criterion,
         )  # fmt: skip
-    out.print(rows)
-    out.print(
+    stdout_console.print(rows)
+    stdout_console.print(
         "theorem 4-2 guarantees stability for a positive margin and K_min > 0; growth: amplitude"
         " ratio of successive half oscillations under the worst-case switching between K_min and"
         " K_max, stable below 1; B [N s/m], K [N/m]",
@@ -407,12 +421,12 @@ def _print_spring_table(held: Spring, free: Spring) -> None:
     )
 
 
-def _write_loop(folder: Path, found: ScenarioFindings, document: dict) -> None:
+def _write_loop_files(folder: Path, found: ScenarioFindings, document: dict) -> None:
     from hydrotele.show.teleop_report import draw_loop_map, write_loop_report
 
     write_json(folder / "analysis.json", document)
     picture = draw_loop_map(found)
     (folder / "stability.png").write_bytes(picture)
-    write_loop_report(found, findings_table(found), picture, folder / "report.html")
+    write_loop_report(found, format_findings(found), picture, folder / "report.html")
     summary = {"kind": _KIND, "name": found.name, "hydrotele": hydrotele.__version__}
     write_json(folder / "summary.json", summary)

@@ -14,22 +14,22 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from hydrotele.cli.console import notes, out, print_json, table
+from hydrotele.cli.console import make_table, print_json, stderr_console, stdout_console
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import read_json
-from hydrotele.core.output import replacing
+from hydrotele.core.output import atomic_file
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
-from hydrotele.simulate.mechanism import assemble, mjcf_document
+from hydrotele.simulate.mechanism import assemble_mjcf, mjcf_document
 from hydrotele.simulate.native import stop_profiling_clock
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
 
 STEPS = 1000
 SIMULATIONS = 256
-TELEOPERATED = ("joystick_up", "press_stiffness", "feller_steps")
-COMMAND = (0.2, 0.1, -0.1)
-_SHORT_RUN = ("run", "excitation", "--set", "duration=1.0", "--no-review")
+TELEOPERATED_SCENARIOS = ("joystick_up", "press_stiffness", "feller_steps")
+VALVE_COMMANDS = (0.2, 0.1, -0.1)
+_SHORT_RUN_ARGUMENTS = ("run", "excitation", "--set", "duration=1.0", "--no-review")
 
 
 def run_benchmarks(save: Path | None, compare: Path | None, quick: bool, as_json: bool) -> None:
@@ -47,9 +47,9 @@ def run_benchmarks(save: Path | None, compare: Path | None, quick: bool, as_json
     earlier = _read(compare) if compare else None
     if save and not save.parent.is_dir():
         raise InputError(save, f"cannot be written: {save.parent} is not a folder")
-    figures = measure(5 if quick else 25)
+    figures = measure_speed(5 if quick else 25)
     if save:
-        with replacing(save, ".json") as part:
+        with atomic_file(save, ".json") as part:
             part.write_text(json.dumps(figures, indent=2) + "\n")
     if as_json:
         print_json(figures)
@@ -57,7 +57,7 @@ def run_benchmarks(save: Path | None, compare: Path | None, quick: bool, as_json
     _print(figures, earlier)
 
 
-def measure(repeats: int) -> dict:
+def measure_speed(repeats: int) -> dict:
     """Return all benchmark results; each time is the shortest of several repetitions.
 
     Args:
@@ -68,20 +68,19 @@ def measure(repeats: int) -> dict:
         by scenario, batch_steps_per_s by thread count, batch_scaling, help_s, run_s.
     """
     stop_profiling_clock()
-    notes.print("mechanism with and without hydraulics ...", style="dim")
+    stderr_console.print("mechanism with and without hydraulics ...", style="dim")
     plant = build_plant(load_machine("cat215", "none"))
-    bare, full = best_of(6 * repeats, [_bare_stepper(plant), _full_stepper(plant)])
-    notes.print("whole scenario ...", style="dim")
-    factor = max(_scenario_factor() for _ in range(max(2, repeats // 2)))
-    notes.print("teleoperation ...", style="dim")
+    bare, full = shortest_times(6 * repeats, [_make_mechanism_job(plant), _make_hydraulic_job(plant)])
+    stderr_console.print("whole scenario ...", style="dim")
+    factor = max(_measure_scenario_factor() for _ in range(max(2, repeats // 2)))
+    stderr_console.print("teleoperation ...", style="dim")
     turns = max(2, repeats // 2)
     teleoperated = {
-        name: round(max(_teleoperation_factor(name) for _ in range(turns)), 1)
-        for name in TELEOPERATED
+        name: round(max(_measure_teleop_factor(name) for _ in range(turns)), 1) for name in TELEOPERATED_SCENARIOS
     }
-    notes.print("batches ...", style="dim")
-    one, two = best_of(max(3, repeats), [_batch_stepper(plant, n) for n in (1, 2)])
-    notes.print("start-up ...", style="dim")
+    stderr_console.print("batches ...", style="dim")
+    one, two = shortest_times(max(3, repeats), [_make_batch_job(plant, n) for n in (1, 2)])
+    stderr_console.print("start-up ...", style="dim")
     steps = SIMULATIONS * STEPS / 5
     return {
         "mechanism_us": round(bare / STEPS * 1e6, 3),
@@ -91,12 +90,12 @@ def measure(repeats: int) -> dict:
         "teleoperation_realtime_factor": teleoperated,
         "batch_steps_per_s": {"1": round(steps / one), "2": round(steps / two)},
         "batch_scaling": round(one / two, 3),
-        "help_s": round(min(_start("--help") for _ in range(3)), 3),
-        "run_s": round(min(_start(*_SHORT_RUN) for _ in range(2)), 3),
+        "help_s": round(min(_measure_start_time("--help") for _ in range(3)), 3),
+        "run_s": round(min(_measure_start_time(*_SHORT_RUN_ARGUMENTS) for _ in range(2)), 3),
     }
 
 
-def best_of(repeats: int, jobs: list[Callable[[], float]]) -> list[float]:
+def shortest_times(repeats: int, jobs: list[Callable[[], float]]) -> list[float]:
     """Return the shortest time of each job [s], running the jobs alternately."""
     best = [float("inf")] * len(jobs)
     for _ in range(repeats):
@@ -104,25 +103,25 @@ def best_of(repeats: int, jobs: list[Callable[[], float]]) -> list[float]:
     return best
 
 
-def _full_stepper(plant: Plant) -> Callable[[], float]:
+def _make_hydraulic_job(plant: Plant) -> Callable[[], float]:
     start = rest_state(plant)
-    start.ctrl[:] = COMMAND
-    return _stepper(plant.model, start)
+    start.ctrl[:] = VALVE_COMMANDS
+    return _make_step_job(plant.model, start)
 
 
-def _bare_stepper(plant: Plant) -> Callable[[], float]:
+def _make_mechanism_job(plant: Plant) -> Callable[[], float]:
     """Return a job that steps the mechanism without actuators and gravity."""
-    root = assemble(plant.machine, plant.model.opt.timestep, plant.ground, looks=False)
+    root = assemble_mjcf(plant.machine, plant.model.opt.timestep, plant.ground, visuals=False)
     for actuator in root.find_all("actuator"):
         actuator.remove()
     model = mjcf_document(root).compile()
     model.opt.gravity[:] = 0.0
     start = rest_state(plant)
     start.qvel[plant.dof[0]] = 0.1
-    return _stepper(model, start)
+    return _make_step_job(model, start)
 
 
-def _stepper(model: mujoco.MjModel, start: mujoco.MjData) -> Callable[[], float]:
+def _make_step_job(model: mujoco.MjModel, start: mujoco.MjData) -> Callable[[], float]:
     data = mujoco.MjData(model)
 
     def job() -> float:
@@ -137,7 +136,7 @@ def _stepper(model: mujoco.MjModel, start: mujoco.MjData) -> Callable[[], float]
     return job
 
 
-def _batch_stepper(plant: Plant, threads: int) -> Callable[[], float]:
+def _make_batch_job(plant: Plant, threads: int) -> Callable[[], float]:
     start = rest_state(plant)
     batch = Batch(plant.model, SIMULATIONS, nthread=threads)
     commands = np.random.default_rng(0).uniform(-0.3, 0.3, (SIMULATIONS, plant.model.nu))
@@ -152,7 +151,7 @@ def _batch_stepper(plant: Plant, threads: int) -> Callable[[], float]:
     return job
 
 
-def _scenario_factor() -> float:
+def _measure_scenario_factor() -> float:
     """Return the real-time factor of the excitation scenario with control, sensors and log."""
     scenario = load_scenario("excitation")
     begin = time.perf_counter()
@@ -160,12 +159,12 @@ def _scenario_factor() -> float:
     return scenario.duration / (time.perf_counter() - begin)
 
 
-def _teleoperation_factor(name: str) -> float:
+def _measure_teleop_factor(name: str) -> float:
     """Return the real-time factor of a teleoperated scenario, including operator and channel."""
     return run_scenario(load_scenario(name)).summary["realtime_factor"]
 
 
-def _start(*arguments: str) -> float:
+def _measure_start_time(*arguments: str) -> float:
     import tempfile
 
     with tempfile.TemporaryDirectory() as folder:
@@ -187,7 +186,7 @@ def _read(path: Path) -> dict:
     return figures
 
 
-def _flat(figures: dict) -> dict[str, float]:
+def _flatten_results(figures: dict) -> dict[str, float]:
     flat = {}
     for key, value in figures.items():
         if isinstance(value, dict):
@@ -200,12 +199,12 @@ def _flat(figures: dict) -> dict[str, float]:
 def _print(figures: dict, earlier: dict | None) -> None:
     columns = ["quantity", "now", *(["earlier", "now / earlier"] if earlier else [])]
     title = "hydrotele bench (times, ratio: lower is better; factors, rates: higher is better)"
-    rows = table(title, *columns)
-    before = _flat(earlier) if earlier else {}
-    for key, value in _flat(figures).items():
+    rows = make_table(title, *columns)
+    before = _flatten_results(earlier) if earlier else {}
+    for key, value in _flatten_results(figures).items():
         cells = [key, f"{value:,}"]
         if earlier:
             old = before.get(key)
             cells += [f"{old:,}", f"{value / old:.3f}"] if old else ["-", "-"]
         rows.add_row(*cells)
-    out.print(rows)
+    stdout_console.print(rows)

@@ -12,23 +12,19 @@ app = typer.Typer(
     no_args_is_help=True,
 )  # fmt: skip
 
-Data = Annotated[Path, typer.Option("--data", "-d", help="Folder of measurements.")]
-HeldOut = Annotated[
-    str | None, typer.Option(help="Held-out part of the data; the default is described below.")
-]
-Out = Annotated[
-    Path | None, typer.Option("--out", "-o", help="Output folder; default: nothing is written.")
-]
-MachineName = Annotated[
+DataOption = Annotated[Path, typer.Option("--data", "-d", help="Folder of measurements.")]
+HeldOutOption = Annotated[str | None, typer.Option(help="Held-out part of the data; the default is described below.")]
+OutOption = Annotated[Path | None, typer.Option("--out", "-o", help="Output folder; default: nothing is written.")]
+MachineOption = Annotated[
     str, typer.Option("--machine", "-m", help="Machine with a calibrator: shipped name or folder.")
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 
 
 @app.command(epilog="Example:  hydrotele calibrate arm --data logs --json --out calibrated")
 def arm(
-    data: Data, heldout: HeldOut = None, out: Out = None, json: Json = False,
-    machine: MachineName = "calibrator",
+    data: DataOption, heldout: HeldOutOption = None, out: OutOption = None, json: JsonOption = False,
+    machine: MachineOption = "calibrator",
     method: Annotated[str, typer.Option(help="Identification: joint or hierarchical.")] = "joint",
     poses: Annotated[int, typer.Option(min=10, help="Number of poses used of each log.")] = 300,
     accuracy_deg: Annotated[
@@ -55,8 +51,8 @@ def arm(
 
 @app.command(epilog="Example:  hydrotele calibrate linkage --data logs --json")
 def linkage(
-    data: Data, heldout: HeldOut = None, out: Out = None, json: Json = False,
-    machine: MachineName = "calibrator",
+    data: DataOption, heldout: HeldOutOption = None, out: OutOption = None, json: JsonOption = False,
+    machine: MachineOption = "calibrator",
     angles: Annotated[
         str, typer.Option(help="Joint angles: measured (by sensors) or identified (calibrator).")
     ] = "measured",
@@ -72,19 +68,17 @@ def linkage(
     calibrate_linkage(data, machine, angles, out, json)
 
 
-@app.command(
-    epilog="Example:  hydrotele calibrate machine --data poses --dynamics motions --out calibrated"
-)
+@app.command(epilog="Example:  hydrotele calibrate machine --data poses --dynamics motions --out calibrated")
 def machine(
-    data: Data,
+    data: DataOption,
     out: Annotated[Path, typer.Option("--out", "-o", help="Output folder.")],
     dynamics: Annotated[
         list[Path] | None,
         typer.Option(help="Logs for the dynamic step. Repeatable. Default: --data."),
     ] = None,
     heldout: Annotated[str | None, typer.Option(help="Held-out run of the dynamic logs.")] = None,
-    json: Json = False,
-    machine: MachineName = "calibrator",
+    json: JsonOption = False,
+    machine: MachineOption = "calibrator",
 ) -> None:
     """Calibrate arm, cylinder linkages, masses and friction in sequence (Khoshzaban 1992, p. 125).
 
@@ -99,7 +93,7 @@ def machine(
 
 @app.command(epilog="Example:  hydrotele calibrate design --out design")
 def design(
-    out: Out = None, json: Json = False, machine: MachineName = "calibrator",
+    out: OutOption = None, json: JsonOption = False, machine: MachineOption = "calibrator",
     accuracy_deg: Annotated[float, typer.Option(help="Error bound of angle sensors [deg].")] = 0.1,
 ) -> None:  # fmt: skip
     """Design a calibrator: arm lengths and ball-joint position for the smallest tip error."""
@@ -114,42 +108,24 @@ def design(
     "hydrotele calibrate hybrid --data measured --evolution --posterior 8000 --json"
 )
 def hybrid(
-    data: Annotated[
-        Path | None, typer.Option("--data", "-d", help="Folder with poses.csv or poses.parquet.")
-    ] = None,
-    robot: Annotated[
-        str | None, typer.Option(help="Nominal robot; default: robot.yaml in the folder, or iwr.")
-    ] = None,
-    model: Annotated[
-        str, typer.Option(help="Error model: dh, poe, or auto (the better of the two).")
-    ] = "auto",
-    parameters: Annotated[
-        str, typer.Option(help="all, document (the 36 of Wang 2012), or names with commas.")
-    ] = "all",
-    evolution: Annotated[
-        bool, typer.Option("--evolution", help="Also search by differential evolution.")
-    ] = False,
-    posterior: Annotated[
-        int, typer.Option(min=0, metavar="STEPS", help="Also sample the posterior by MCMC.")
-    ] = 0,
+    data: Annotated[Path | None, typer.Option("--data", "-d", help="Folder with poses.csv or poses.parquet.")] = None,
+    robot: Annotated[str | None, typer.Option(help="Nominal robot; default: robot.yaml in the folder, or iwr.")] = None,
+    model: Annotated[str, typer.Option(help="Error model: dh, poe, or auto (the better of the two).")] = "auto",
+    parameters: Annotated[str, typer.Option(help="all, document (the 36 of Wang 2012), or names with commas.")] = "all",
+    evolution: Annotated[bool, typer.Option("--evolution", help="Also search by differential evolution.")] = False,
+    posterior: Annotated[int, typer.Option(min=0, metavar="STEPS", help="Also sample the posterior by MCMC.")] = 0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 0,
-    simulate: Annotated[
-        Path | None, typer.Option(help="Write a simulated measurement to this folder instead.")
-    ] = None,
+    simulate: Annotated[Path | None, typer.Option(help="Write a simulated measurement to this folder instead.")] = None,
     poses: Annotated[int, typer.Option(min=1, help="Number of simulated poses.")] = 25,
     heldout: Annotated[int, typer.Option(min=0, help="Number of simulated held-out poses.")] = 25,
     choose: Annotated[
         str,
         typer.Option(help="Simulated poses: random, or the best of 200 by criterion D, O1 to O5."),
     ] = "random",
-    noise: Annotated[
-        float, typer.Option(min=0.0, help="Factor on the simulated sensor noise.")
-    ] = 1.0,
-    errors: Annotated[
-        float, typer.Option(min=0.0, help="Factor on the simulated errors of 1 mm and 1 mrad.")
-    ] = 1.0,
-    out: Out = None,
-    json: Json = False,
+    noise: Annotated[float, typer.Option(min=0.0, help="Factor on the simulated sensor noise.")] = 1.0,
+    errors: Annotated[float, typer.Option(min=0.0, help="Factor on the simulated errors of 1 mm and 1 mrad.")] = 1.0,
+    out: OutOption = None,
+    json: JsonOption = False,
 ) -> None:
     """Calibrate a serial-parallel robot from measured poses (Wang 2012)."""
     from hydrotele.cli.calibrating_robots import calibrate_hybrid, simulate_hybrid
@@ -157,9 +133,7 @@ def hybrid(
     if (data is None) == (simulate is None):
         raise InputError("calibrate hybrid", "give either --data FOLDER or --simulate FOLDER")
     if simulate is not None:
-        simulate_hybrid(
-            simulate, robot, poses, heldout, seed, noise, errors, parameters, model, choose
-        )
+        simulate_hybrid(simulate, robot, poses, heldout, seed, noise, errors, parameters, model, choose)
     elif data is not None:
         calibrate_hybrid(data, robot, model, parameters, evolution, posterior, seed, out, json)
 
@@ -169,35 +143,29 @@ def hybrid(
     "hydrotele calibrate scara --data measured --out calibrated"
 )
 def scara(
-    data: Annotated[
-        Path | None, typer.Option("--data", "-d", help="Folder of nominal.yaml and measured.csv.")
-    ] = None,
+    data: Annotated[Path | None, typer.Option("--data", "-d", help="Folder of nominal.yaml and measured.csv.")] = None,
     heldout: Annotated[
         str | None,
         typer.Option(help="Held-out poses, numbered from 1, as 3,7; default: each in turn."),
     ] = None,
-    simulate: Annotated[
-        Path | None, typer.Option(help="Write simulated measurements to this folder.")
-    ] = None,
+    simulate: Annotated[Path | None, typer.Option(help="Write simulated measurements to this folder.")] = None,
     poses: Annotated[int, typer.Option(min=4, help="Number of simulated poses.")] = 20,
     noise: Annotated[
         float,
         typer.Option(min=0.0, help="Standard deviation of simulated positions [mm]."),
     ] = 0.05,
     seed: Annotated[int, typer.Option(help="Random seed of the simulation.")] = 1,
-    choose: Annotated[
-        int | None, typer.Option(min=2, help="Also list this many most informative poses.")
-    ] = None,
-    out: Out = None,
-    json: Json = False,
+    choose: Annotated[int | None, typer.Option(min=2, help="Also list this many most informative poses.")] = None,
+    out: OutOption = None,
+    json: JsonOption = False,
 ) -> None:
     """Calibrate the link lengths of a SCARA from measured positions (Wang 2012, section 1.1)."""
-    from hydrotele.cli.calibrating_robots import calibrate_scara_folder, simulate_scara_folder
+    from hydrotele.cli.calibrating_robots import calibrate_scara_to_folder, simulate_scara_to_folder
 
     if simulate is not None:
-        simulate_scara_folder(simulate, poses, 1e-3 * noise, seed)
+        simulate_scara_to_folder(simulate, poses, 1e-3 * noise, seed)
     if data is not None:
-        calibrate_scara_folder(data, heldout, choose, out, json)
+        calibrate_scara_to_folder(data, heldout, choose, out, json)
     elif simulate is None:
         message = "give --data FOLDER, or --simulate FOLDER to create a data set"
         raise InputError("calibrate scara", message)
@@ -208,9 +176,7 @@ def scara(
     "hydrotele calibrate mukca --data sets --robot arm.urdf --heldout left --json"
 )
 def mukca(
-    data: Annotated[
-        Path, typer.Option("--data", "-d", help="Folder of PLACE/hole_0.csv, PLACE/hole_1.csv.")
-    ],
+    data: Annotated[Path, typer.Option("--data", "-d", help="Folder of PLACE/hole_0.csv, PLACE/hole_1.csv.")],
     robot: Annotated[
         str | None,
         typer.Option(
@@ -226,19 +192,14 @@ def mukca(
         float,
         typer.Option(min=0.0, help="Distance of neighbouring sockets [mm]; 0 if not known."),
     ] = 50.0,
-    accuracy: Annotated[
-        float, typer.Option(min=1e-6, help="Standard deviation of that distance [mm].")
-    ] = 0.05,
+    accuracy: Annotated[float, typer.Option(min=1e-6, help="Standard deviation of that distance [mm].")] = 0.05,
     unit: Annotated[str, typer.Option(help="Unit of the joint angles: rad or deg.")] = "rad",
     model: Annotated[
         str | None,
-        typer.Option(
-            help="Joint model: rigid, gravity, eccentricity or both; default: the most accurate"
-            " prediction."
-        ),
+        typer.Option(help="Joint model: rigid, gravity, eccentricity or both; default: the most accurate prediction."),
     ] = None,
-    out: Out = None,
-    json: Json = False,
+    out: OutOption = None,
+    json: JsonOption = False,
 ) -> None:
     """Calibrate a serial robot from joint angles, with its ball tool held in fixed sockets."""
     from hydrotele.cli.calibrating_robots import SocketChoices, calibrate_mukca

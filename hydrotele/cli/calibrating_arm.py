@@ -18,32 +18,32 @@ from hydrotele.calibrate.arm import (
     identify_jointly,
     stage_residuals,
 )
-from hydrotele.calibrate.arm_data import held_out, read_stages, strokes_of
-from hydrotele.calibrate.arm_poses import Poses, with_drift
-from hydrotele.calibrate.bad_data import Region, identify_without_bad_data
+from hydrotele.calibrate.arm_data import extract_strokes, read_stages, split_poses
+from hydrotele.calibrate.arm_poses import Poses, add_drift
+from hydrotele.calibrate.bad_data import CorruptedRegion, identify_without_bad_data
 from hydrotele.calibrate.flexibility import (
     Flexibility,
+    add_flexibility,
     refit_with_flexibility,
-    with_flexibility,
 )
 from hydrotele.calibrate.linkage import (
-    NAMES,
+    PARAMETER_NAMES,
+    AxisStrokes,
     LinkageFit,
-    Strokes,
-    identified_angles,
+    identify_joint_angles,
     identify_linkage,
+    linkage_parameters,
     machine_with_linkage,
-    values_of,
 )
-from hydrotele.calibrate.loop import Loop, loop_of, unit_of
-from hydrotele.cli.console import out, plain, print_json, table, write_json
+from hydrotele.calibrate.loop import CalibrationLoop, build_loop, unit_of
+from hydrotele.cli.console import make_table, print_json, stdout_console, to_json_types, write_json
 from hydrotele.core.errors import InputError
-from hydrotele.core.output import check_target, whole_folder
+from hydrotele.core.output import atomic_folder, check_output_folder
 from hydrotele.logs.log import load_logs
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import MACHINE_FILE, load_machine, save_machine
 
-_MISFIT = 1.5  # ratio of residuals to sensor noise above which a note is printed
+_MAX_RESIDUAL_RATIO = 1.5  # ratio of residuals to sensor noise above which a note is printed
 
 
 class ArmChoices(NamedTuple):
@@ -76,7 +76,7 @@ class ArmResult(NamedTuple):
         fit: fitted parameters of the arm.
         stages: fitted poses, one item per log.
         regions: corrupted samples that were excluded.
-        judged: errors on held-out poses, empty without such poses.
+        heldout_errors: errors on held-out poses, empty without such poses.
         calibrated: machine with the fitted parameters.
         flexibility: flexibility of the calibrator's joints, None if it was not estimated.
     """
@@ -84,15 +84,13 @@ class ArmResult(NamedTuple):
     machine: Machine
     fit: ArmFit
     stages: list[Poses]
-    regions: list[Region]
-    judged: Mapping[str, Any]
+    regions: list[CorruptedRegion]
+    heldout_errors: Mapping[str, Any]
     calibrated: Machine
     flexibility: Flexibility | None
 
 
-def calibrate_arm(
-    data: Path, machine: str, choices: ArmChoices, target: Path | None, as_json: bool
-) -> ArmResult:
+def calibrate_arm(data: Path, machine: str, choices: ArmChoices, target: Path | None, as_json: bool) -> ArmResult:
     """Calibrate an arm from a folder of logs; print and write the result.
 
     Args:
@@ -107,23 +105,23 @@ def calibrate_arm(
     """
     if choices.method not in ("joint", "hierarchical"):
         raise InputError("--method", f"{choices.method!r} is unknown; valid: joint, hierarchical")
-    every = _every(choices.heldout)
+    every = _parse_heldout_interval(choices.heldout)
     if target:
-        check_target(target, "arm calibration")
+        check_output_folder(target, "arm calibration")
     nominal = load_machine(machine)
-    result = arm_result(nominal, data, choices, every)
+    result = fit_arm(nominal, data, choices, every)
     said = arm_as_data(result)
     if target:
         _write(target, said, result.calibrated, lambda folder: write_arm_report(folder, result))
     if as_json:
         print_json(said)
     else:
-        _print_arm(said)
-        _print_target(target)
+        _print_arm_document(said)
+        _print_output_folder(target)
     return result
 
 
-def _every(text: str | None) -> int:
+def _parse_heldout_interval(text: str | None) -> int:
     if text is None:
         return 5
     if not text.isdigit():
@@ -132,23 +130,23 @@ def _every(text: str | None) -> int:
     return int(text)
 
 
-def arm_result(nominal: Machine, data: Path, choices: ArmChoices, every: int) -> ArmResult:
-    """Calibrate an arm without printing or writing; every N-th pose is held out, N = `every`.
+def fit_arm(nominal: Machine, data: Path, choices: ArmChoices, heldout_interval: int) -> ArmResult:
+    """Calibrate an arm without printing or writing; every N-th pose is held out, N = `heldout_interval`.
 
     Raises:
         InputError: the logs or options are not usable.
     """
-    loop = loop_of(nominal)
+    loop = build_loop(nominal)
     accuracy = None if choices.accuracy_deg is None else float(np.radians(choices.accuracy_deg))
     stages = read_stages(data, nominal, loop, choices.poses, accuracy)
     if choices.drift:
-        stages = [with_drift(loop, poses) for poses in stages]
-    regions: list[Region] = []
+        stages = [add_drift(loop, poses) for poses in stages]
+    regions: list[CorruptedRegion] = []
     kept = stages
     if choices.bad_data:
         cleaned = identify_without_bad_data(loop, stages)
         regions, kept = cleaned.regions, cleaned.stages
-    fitted, judged = held_out(kept, every)
+    fitted, judged = split_poses(kept, heldout_interval)
 
     def identify(stages: Sequence[Poses]) -> ArmFit:
         fit = identify_arm(loop, stages)
@@ -158,29 +156,29 @@ def arm_result(nominal: Machine, data: Path, choices: ArmChoices, every: int) ->
     if choices.flexibility:
         fit, flexibility = refit_with_flexibility(loop, fitted, fit, identify)
         bend = flexibility.at_full_load
-        judged = [with_flexibility(loop, poses, fit, bend) for poses in judged]
+        judged = [add_flexibility(loop, poses, fit, bend) for poses in judged]
     made = calibrated_machine(nominal, fit, fitted)
-    errors = _judged(loop, fit, judged)
+    errors = _heldout_errors(loop, fit, judged)
     return ArmResult(nominal, fit, fitted, regions, errors, made, flexibility)
 
 
-def _judged(loop: Loop, fit: ArmFit, judged: list[Poses]) -> dict[str, Any]:
+def _heldout_errors(loop: CalibrationLoop, fit: ArmFit, heldout_poses: list[Poses]) -> dict[str, Any]:
     """Return closure errors on held-out poses with nominal and identified parameters."""
-    if not judged:
+    if not heldout_poses:
         return {}
-    from hydrotele.calibrate.arm import Equations
+    from hydrotele.calibrate.arm import StageEquations
 
     rows: dict[str, list] = {"nominal": [], "identified": []}
     chi = []
-    for poses in judged:
-        equations = Equations(loop, poses)
-        for name, numbers in (("nominal", fit.start), ("identified", fit.numbers)):
+    for poses in heldout_poses:
+        equations = StageEquations(loop, poses)
+        for name, numbers in (("nominal", fit.start_parameters), ("identified", fit.parameters)):
             error = equations.residual(numbers)
             rows[name].append(error - error.mean(axis=0) if name == "nominal" else error)
-        chi.append(stage_residuals(loop, poses, fit.numbers))
+        chi.append(stage_residuals(loop, poses, fit.parameters))
     rms = {f"rms_{k}_mm": 1e3 * float(np.sqrt(np.mean(np.concatenate(v) ** 2)))
            for k, v in rows.items()}  # fmt: skip
-    return {"poses": sum(map(len, judged)), **rms,
+    return {"poses": sum(map(len, heldout_poses)), **rms,
             "chi": float(np.sqrt(np.mean(np.concatenate(chi) ** 2)))}  # fmt: skip
 
 
@@ -189,19 +187,19 @@ def arm_as_data(result: ArmResult) -> dict[str, Any]:
     fit = result.fit
     rows = [
         {
-            "name": name, "unit": unit_of(name), "nominal": fit.start[name],
+            "name": name, "unit": unit_of(name), "nominal": fit.start_parameters[name],
             "value": float(value), "standard_deviation": float(deviation),
             "interval": [float(low), float(high)],
         }
         for name, value, deviation, (low, high) in zip(
-            fit.names, fit.values, fit.deviations, fit.intervals, strict=True
+            fit.names, fit.values, fit.standard_deviations, fit.intervals, strict=True
         )
     ]  # fmt: skip
     stages = [
         {
             "link": s.link, "poses": s.poses, "iterations": s.iterations, "rms_mm": 1e3 * s.rms,
             "chi": s.chi, "condition": s.condition, "identified": list(s.names),
-            "not_identified": dict(s.fixed),
+            "not_identified": dict(s.hold_reasons),
         }
         for s in fit.stages
     ]  # fmt: skip
@@ -216,85 +214,83 @@ def arm_as_data(result: ArmResult) -> dict[str, Any]:
     bend = result.flexibility
     flexibility = bend and {
         "at_full_load_rad": dict(zip(bend.joints, bend.at_full_load.tolist(), strict=True)),
-        "log_likelihood_gain": bend.gain,
+        "log_likelihood_gain": bend.log_likelihood_gain,
     }  # fmt: skip
-    return plain({
+    return to_json_types({
         "machine": fit.nominal.machine, "method": fit.method, "parameters": rows,
         "flexibility": flexibility,
-        "stages": stages, "bad_data": regions, "heldout": dict(result.judged),
-        "links_without_log": _unmoved(fit), "notes": _notes(fit),
+        "stages": stages, "bad_data": regions, "heldout": dict(result.heldout_errors),
+        "links_without_log": _links_without_log(fit), "notes": _fit_notes(fit),
     })  # fmt: skip
 
 
-def _unmoved(fit: ArmFit) -> dict[str, list[str]]:
+def _links_without_log(fit: ArmFit) -> dict[str, list[str]]:
     """Return the links that move in no log, with the parameters that stay nominal."""
     moved = {stage.link for stage in fit.stages}
     return {
         link: [f"{kind}.{link}" for kind in ("alpha", "a", "beta" if parallel else "d")]
         for link, parallel in zip(
-            fit.nominal.links[: fit.nominal.moved], fit.nominal.parallel, strict=False
+            fit.nominal.links[: fit.nominal.powered_count], fit.nominal.parallel, strict=False
         )
         if link not in moved
     }  # fmt: skip
 
 
-def _notes(fit: ArmFit) -> list[str]:
+def _fit_notes(fit: ArmFit) -> list[str]:
     said = [
         f"residuals of {s.link} are {s.chi:.1f} times the sensor noise: held links move, joints"
         " bend, or a sensor is worse than stated; the intervals are enlarged by this factor"
         for s in fit.stages
-        if s.chi > _MISFIT
+        if s.chi > _MAX_RESIDUAL_RATIO
     ]
-    for link, names in _unmoved(fit).items():
+    for link, names in _links_without_log(fit).items():
         said.append(f"{link} moves in no log: {', '.join(names)} keep their nominal values")
     return said
 
 
-def _print_arm(said: Mapping[str, Any]) -> None:
-    shown = table(f"{said['machine']}: {said['method']} identification", "parameter", "nominal",
+def _print_arm_document(document: Mapping[str, Any]) -> None:
+    shown = make_table(f"{document['machine']}: {document['method']} identification", "parameter", "nominal",
                   "identified", "95 % +-", "unit")  # fmt: skip
-    for row in said["parameters"]:
+    for row in document["parameters"]:
         degrees = row["unit"] == "rad"
         scale = np.degrees(1.0) if degrees else 1.0
         shown.add_row(
             row["name"], f"{scale * row['nominal']:.4f}", f"{scale * row['value']:.4f}",
             f"{1.96 * scale * row['standard_deviation']:.4f}", "deg" if degrees else "m",
         )  # fmt: skip
-    out.print(shown)
-    for stage in said["stages"]:
-        out.print(f"{stage['link']}: {stage['poses']} poses, {stage['iterations']} iterations, RMS"
+    stdout_console.print(shown)
+    for stage in document["stages"]:
+        stdout_console.print(f"{stage['link']}: {stage['poses']} poses, {stage['iterations']} iterations, RMS"
                   f" {stage['rms_mm']:.2f} mm, {stage['chi']:.2f} times sensor noise")  # fmt: skip
         for name, reason in stage["not_identified"].items():
-            out.print(f"  {name} {reason}", style="dim")
-    if said["flexibility"]:
-        bends = said["flexibility"]["at_full_load_rad"].items()
+            stdout_console.print(f"  {name} {reason}", style="dim")
+    if document["flexibility"]:
+        bends = document["flexibility"]["at_full_load_rad"].items()
         text = ", ".join(f"{name} {np.degrees(value):.3f}" for name, value in bends)
-        out.print(f"angle errors of flexible joints at full load, standard deviation [deg]: {text}")
-    for region in said["bad_data"]:
-        out.print(f"[yellow]bad data[/] {region['link']}, poses {region['first_pose']} to"
+        stdout_console.print(f"angle errors of flexible joints at full load, standard deviation [deg]: {text}")
+    for region in document["bad_data"]:
+        stdout_console.print(f"[yellow]bad data[/] {region['link']}, poses {region['first_pose']} to"
                   f" {region['last_pose']}: {region['joint']}, {region['size_deg']:.2f} deg"
                   )  # fmt: skip
-    if said["heldout"]:
-        held = said["heldout"]
-        out.print(f"{held['poses']} held-out poses: RMS closure error"
+    if document["heldout"]:
+        held = document["heldout"]
+        stdout_console.print(f"{held['poses']} held-out poses: RMS closure error"
                   f" {held['rms_nominal_mm']:.1f} mm with nominal and"
                   f" {held['rms_identified_mm']:.2f} mm with identified parameters")  # fmt: skip
-    for note in said["notes"]:
-        out.print(note)
+    for note in document["notes"]:
+        stdout_console.print(note)
 
 
-def _print_target(target: Path | None) -> None:
+def _print_output_folder(target: Path | None) -> None:
     if target:
-        out.print(
-            f"written to [bold]{target}[/]; the calibrated machine is {target}/{MACHINE_FILE}"
-        )
+        stdout_console.print(f"written to [bold]{target}[/]; the calibrated machine is {target}/{MACHINE_FILE}")
 
 
-def _write(target: Path, said: Mapping[str, Any], machine: Machine, report) -> None:
-    with whole_folder(target, "arm calibration") as folder:
-        write_json(folder / "calibration.json", said)
+def _write(target: Path, document: Mapping[str, Any], machine: Machine, write_report) -> None:
+    with atomic_folder(target, "arm calibration") as folder:
+        write_json(folder / "calibration.json", document)
         save_machine(machine, folder / MACHINE_FILE)
-        report(folder)
+        write_report(folder)
         summary = {"kind": "arm calibration", "hydrotele": hydrotele.__version__}
         write_json(folder / "summary.json", summary)
 
@@ -307,9 +303,7 @@ def write_arm_report(folder: Path, result: ArmResult) -> None:
     calibration_report.write_arm_report(result.fit, result.stages, result.regions, path)
 
 
-def calibrate_linkage(
-    data: Path, machine: str, angles: str, target: Path | None, as_json: bool
-) -> list[LinkageFit]:
+def calibrate_linkage(data: Path, machine: str, angles: str, target: Path | None, as_json: bool) -> list[LinkageFit]:
     """Calibrate the cylinder linkages that move in a folder of logs; print and write the result.
 
     Args:
@@ -325,10 +319,10 @@ def calibrate_linkage(
     if angles not in ("measured", "identified"):
         raise InputError("--angles", f"{angles!r} is unknown; valid: measured, identified")
     if target:
-        check_target(target, "arm calibration")
+        check_output_folder(target, "arm calibration")
     nominal = load_machine(machine)
-    fits = linkage_fits(nominal, data, angles)
-    said = plain({"machine": nominal.name, "angles": angles, "axes": {
+    fits = fit_linkages(nominal, data, angles)
+    said = to_json_types({"machine": nominal.name, "angles": angles, "axes": {
         found.axis: linkage_as_data(found) for found in fits}})  # fmt: skip
     made = nominal
     for found in fits:
@@ -341,11 +335,11 @@ def calibrate_linkage(
         print_json(said)
     else:
         _print_linkages(said)
-        _print_target(target)
+        _print_output_folder(target)
     return fits
 
 
-def linkage_fits(nominal: Machine, data: Path, angles: str) -> list[LinkageFit]:
+def fit_linkages(nominal: Machine, data: Path, angles: str) -> list[LinkageFit]:
     """Calibrate the cylinder linkages without printing or writing.
 
     Raises:
@@ -357,20 +351,20 @@ def linkage_fits(nominal: Machine, data: Path, angles: str) -> list[LinkageFit]:
         if (of := log.metadata.get("machine", nominal.name)) != nominal.name:
             message = f"is a log of machine {of}, not of {nominal.name}: give --machine {of}"
             raise InputError(log.source, message)
-    strokes = [s for log in logs for s in strokes_of(log, nominal, axes)]
+    strokes = [s for log in logs for s in extract_strokes(log, nominal, axes)]
     if angles == "identified":
-        loop = loop_of(nominal)
+        loop = build_loop(nominal)
         stages = read_stages(data, nominal, loop)
         fit = identify_jointly(identify_arm(loop, stages), stages)
         by_source = {log.source: log for log in logs}
         strokes = []
         for poses in stages:
             log = by_source[poses.source]
-            known = strokes_of(log, nominal, [poses.link])
+            known = extract_strokes(log, nominal, [poses.link])
             if not known or poses.rows is None:
                 continue
-            strokes.append(Strokes(
-                poses.link, identified_angles(fit, poses), log[f"length.{poses.link}"][poses.rows],
+            strokes.append(AxisStrokes(
+                poses.link, identify_joint_angles(fit, poses), log[f"length.{poses.link}"][poses.rows],
                 float(poses.sigma.max()) * 2.0, known[0].length_sigma, "identified", log.source,
             ))  # fmt: skip
     if not strokes:
@@ -381,42 +375,38 @@ def linkage_fits(nominal: Machine, data: Path, angles: str) -> list[LinkageFit]:
     return [identify_linkage(nominal, s) for s in longest.values()]
 
 
-def linkage_as_data(found: LinkageFit) -> dict[str, Any]:
+def linkage_as_data(fit: LinkageFit) -> dict[str, Any]:
     """Return a linkage calibration in the form that `--json` prints, in SI units."""
-    deviations = dict(zip(found.fit.names, found.fit.deviations, strict=True))
+    deviations = dict(zip(fit.fit.names, fit.fit.standard_deviations, strict=True))
     return {
         "parameters": [
             {"name": name, "unit": "rad" if name == "theta_off" else "m", "nominal": nominal,
              "value": value, "standard_deviation": deviations.get(name),
-             "held": name in found.fixed}
-            for name, nominal, value in zip(NAMES, found.nominal, values_of(found), strict=True)
+             "held": name in fit.fixed}
+            for name, nominal, value in zip(PARAMETER_NAMES, fit.nominal, linkage_parameters(fit), strict=True)
         ],
-        "heldout": {"rms_m": found.rms, "vaf_percent": found.vaf,
-                    "rms_nominal_m": found.rms_before},
-        "samples": found.samples,
+        "heldout": {"rms_m": fit.rms, "vaf_percent": fit.vaf,
+                    "rms_nominal_m": fit.rms_before},
+        "samples": fit.samples,
     }  # fmt: skip
 
 
-def _print_linkages(said: Mapping[str, Any]) -> None:
-    for axis, found in said["axes"].items():
-        shown = table(
-            f"{axis}: {said['angles']} angles", "parameter", "nominal", "identified", "95 % +-"
-        )
+def _print_linkages(document: Mapping[str, Any]) -> None:
+    for axis, found in document["axes"].items():
+        shown = make_table(f"{axis}: {document['angles']} angles", "parameter", "nominal", "identified", "95 % +-")
         for row in found["parameters"]:
             scale = np.degrees(1.0) if row["unit"] == "rad" else 1.0
             wide = "held" if row["held"] else f"{1.96 * scale * row['standard_deviation']:.4f}"
             shown.add_row(row["name"], f"{scale * row['nominal']:.4f}",
                           f"{scale * row['value']:.4f}", wide)  # fmt: skip
-        out.print(shown)
+        stdout_console.print(shown)
         held = found["heldout"]
-        out.print(f"held-out samples: RMS error {1e3 * held['rms_m']:.2f} mm (nominal"
+        stdout_console.print(f"held-out samples: RMS error {1e3 * held['rms_m']:.2f} mm (nominal"
                   f" {1e3 * held['rms_nominal_m']:.2f} mm), VAF {held['vaf_percent']:.3f} %"
                   )  # fmt: skip
 
 
-def design_calibrator(
-    machine: str, accuracy_deg: float, target: Path | None, as_json: bool
-) -> None:
+def design_calibrator(machine: str, accuracy_deg: float, target: Path | None, as_json: bool) -> None:
     """Evaluate calibrator designs; print the present and the best design and draw all of them.
 
     Args:
@@ -425,22 +415,22 @@ def design_calibrator(
         target: output folder, None to write nothing.
         as_json: print JSON instead of text.
     """
-    from hydrotele.calibrate.design import best_design, look_over_designs
+    from hydrotele.calibrate.design import optimize_design, survey_designs
 
     if target:
-        check_target(target, "arm calibration")
+        check_output_folder(target, "arm calibration")
     nominal = load_machine(machine)
-    loop = loop_of(nominal)
-    survey = look_over_designs(loop, float(np.radians(accuracy_deg)))
-    best = best_design(loop, survey, float(np.radians(accuracy_deg)))
-    said = plain({
+    loop = build_loop(nominal)
+    survey = survey_designs(loop, float(np.radians(accuracy_deg)))
+    best = optimize_design(loop, survey, float(np.radians(accuracy_deg)))
+    said = to_json_types({
         "machine": machine, "present": survey.present._asdict(), "best": best._asdict(),
         "designs": [d._asdict() for d in survey.designs],
     })  # fmt: skip
     if target:
         from hydrotele.show.calibration_report import draw_designs
 
-        with whole_folder(target, "arm calibration") as folder:
+        with atomic_folder(target, "arm calibration") as folder:
             (folder / "design.png").write_bytes(draw_designs(survey, best))
             write_json(folder / "calibration.json", said)
             summary = {"kind": "arm calibration", "hydrotele": hydrotele.__version__}
@@ -449,7 +439,7 @@ def design_calibrator(
         print_json(said)
         return
     for name, one in (("present", survey.present), ("best", best)):
-        out.print(f"{name}: arm {one.arm:.2f} m, forearm {one.forearm:.2f} m, ball joint"
+        stdout_console.print(f"{name}: arm {one.arm:.2f} m, forearm {one.forearm:.2f} m, ball joint"
                   f" {one.ball_x:.2f} m"
                   f" in front at height {one.ball_z:+.2f} m: tip error"
                   f" {1e3 * one.tip_error:.1f} mm, {100 * one.reached:.0f} % of the poses reached"

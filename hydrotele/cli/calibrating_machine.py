@@ -14,52 +14,59 @@ from hydrotele.cli.calibrating_arm import (
     ArmChoices,
     ArmResult,
     arm_as_data,
-    arm_result,
+    fit_arm,
+    fit_linkages,
     linkage_as_data,
-    linkage_fits,
     write_arm_report,
 )
-from hydrotele.cli.console import out, plain, print_json, stages, table, write_json
+from hydrotele.cli.console import (
+    make_table,
+    print_json,
+    show_stages,
+    stdout_console,
+    to_json_types,
+    write_json,
+)
 from hydrotele.cli.identifying import (
-    Choices,
-    MechanismResult,
+    IdentificationOptions,
+    MechanismIdentification,
     identify_mechanism,
     write_identification,
 )
 from hydrotele.core.errors import InputError
-from hydrotele.core.output import check_target, whole_folder
-from hydrotele.identify.identified_machine import identify_document
+from hydrotele.core.output import atomic_folder, check_output_folder
+from hydrotele.identify.identified_machine import build_identify_document
 from hydrotele.logs.dataset import Dataset, load_dataset
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import MACHINE_FILE, load_machine, save_machine
 
-_POSES = 5  # one of so many poses is held out
+_HELDOUT_INTERVAL = 5  # one of so many poses is held out
 
 
-class SequenceResult(NamedTuple):
+class MachineCalibration(NamedTuple):
     """Results of all steps of a machine calibration.
 
     Attributes:
         arm: links, joint axes and sensor offsets.
         linkages: cylinder pins and closed lengths, one item per axis that moves.
-        skipped: reason why the linkages were not calibrated, empty if they were.
-        kinematic: machine after the calibration of arm and linkages.
+        linkages_skip_reason: reason why the linkages were not calibrated, empty if they were.
+        kinematic_machine: machine after the calibration of arm and linkages.
         dataset: logs of the dynamic step, loaded with that machine.
         dynamics: identified bodies and friction, and the final machine.
     """
 
     arm: ArmResult
     linkages: list[LinkageFit]
-    skipped: str
-    kinematic: Machine
+    linkages_skip_reason: str
+    kinematic_machine: Machine
     dataset: Dataset
-    dynamics: MechanismResult
+    dynamics: MechanismIdentification
 
 
 def calibrate_machine(
     kinematics: Path, dynamics: Sequence[Path], machine: str, heldout: str | None, target: Path,
     as_json: bool,
-) -> SequenceResult:  # fmt: skip
+) -> MachineCalibration:  # fmt: skip
     """Calibrate kinematics, then identify dynamics with the calibrated kinematics.
 
     Args:
@@ -78,55 +85,55 @@ def calibrate_machine(
 
     Source: Khoshzaban 1992, section 5.3 (p. 125), kinematic and dynamic calibration in sequence.
     """
-    check_target(target, "machine calibration")
+    check_output_folder(target, "machine calibration")
     nominal = load_machine(machine)
-    with stages(f"calibrate {nominal.name}", as_json) as progress:
+    with show_stages(f"calibrate {nominal.name}", as_json) as progress:
         report = progress or (lambda stage, fraction: None)
         report("links of the arm", 0.0)
-        arm = arm_result(nominal, kinematics, ArmChoices(), _POSES)
+        arm = fit_arm(nominal, kinematics, ArmChoices(), _HELDOUT_INTERVAL)
         report("cylinder linkages", 0.2)
         made, linkages, skipped = arm.calibrated, [], ""
         try:
-            linkages = linkage_fits(made, kinematics, "measured")
+            linkages = fit_linkages(made, kinematics, "measured")
         except InputError as error:
             skipped = str(error)
         for found in linkages:
             made = machine_with_linkage(made, found)
         report("bodies and friction", 0.3)
         dataset = load_dataset(list(dynamics) or [kinematics], made, None, heldout)
-        identified = identify_mechanism(dataset, Choices())
-    result = SequenceResult(arm, linkages, skipped, made, dataset, identified)
-    with whole_folder(target, "machine calibration") as folder:
+        identified = identify_mechanism(dataset, IdentificationOptions())
+    result = MachineCalibration(arm, linkages, skipped, made, dataset, identified)
+    with atomic_folder(target, "machine calibration") as folder:
         _write(folder, result, list(dynamics) or [kinematics])
     if as_json:
-        print_json(_as_data(result))
+        print_json(_calibration_document(result))
     else:
         _print(result)
-        out.print(f"written to [bold]{target}[/]; the machine is {target}/identified")
+        stdout_console.print(f"written to [bold]{target}[/]; the machine is {target}/identified")
     return result
 
 
-def _as_data(result: SequenceResult) -> dict[str, Any]:
-    return plain({
+def _calibration_document(result: MachineCalibration) -> dict[str, Any]:
+    return to_json_types({
         "machine": result.arm.machine.name,
         "arm": arm_as_data(result.arm),
         "linkages": {found.axis: linkage_as_data(found) for found in result.linkages},
-        "linkages_skipped": result.skipped,
-        "dynamics": identify_document(result.dynamics.found, None, result.dynamics.best),
+        "linkages_skipped": result.linkages_skip_reason,
+        "dynamics": build_identify_document(result.dynamics.identification, None, result.dynamics.consistent),
     })  # fmt: skip
 
 
-def _write(folder: Path, result: SequenceResult, data: Sequence[Path]) -> None:
-    write_json(folder / "calibration.json", _as_data(result))
+def _write(folder: Path, result: MachineCalibration, data: Sequence[Path]) -> None:
+    write_json(folder / "calibration.json", _calibration_document(result))
     kinematics = folder / "kinematics"
     kinematics.mkdir()
-    save_machine(result.kinematic, kinematics / MACHINE_FILE)
+    save_machine(result.kinematic_machine, kinematics / MACHINE_FILE)
     write_arm_report(kinematics, result.arm)
     if result.linkages:
         from hydrotele.show.calibration_report import write_linkage_report
 
         write_linkage_report(result.linkages, kinematics / "linkages.html")
-    write_identification(folder, result.dataset, result.dynamics, None, data, Choices())
+    write_identification(folder, result.dataset, result.dynamics, None, data, IdentificationOptions())
     summary = {
         "kind": "machine calibration", "machine": result.arm.machine.name,
         "heldout": result.dataset.heldout.name, "hydrotele": hydrotele.__version__,
@@ -134,10 +141,10 @@ def _write(folder: Path, result: SequenceResult, data: Sequence[Path]) -> None:
     write_json(folder / "summary.json", summary)
 
 
-def _print(result: SequenceResult) -> None:
+def _print(result: MachineCalibration) -> None:
     title = "errors on held-out data before and after calibration (lower is better)"
-    shown = table(title, "quantity", "before", "after", "unit")
-    closure = result.arm.judged
+    shown = make_table(title, "quantity", "before", "after", "unit")
+    closure = result.arm.heldout_errors
     if closure:
         shown.add_row("closure of the arm (poses)", f"{closure['rms_nominal_mm']:.2f}",
                       f"{closure['rms_identified_mm']:.2f}", "mm RMS")  # fmt: skip
@@ -145,12 +152,14 @@ def _print(result: SequenceResult) -> None:
         shown.add_row(f"displacement of the {found.axis} cylinder",
                       f"{1e3 * found.rms_before:.2f}", f"{1e3 * found.rms:.2f}",
                       "mm RMS")  # fmt: skip
-    identified = result.dynamics.found
+    identified = result.dynamics.identification
     for drive, held in (identified.heldout if identified else {}).items():
         shown.add_row(f"force of {drive}", f"{held.nominal_rms:.4g}", f"{held.rms:.4g}",
                       f"{held.unit} RMS")  # fmt: skip
-    out.print(shown)
-    if result.skipped:
-        out.print(f"[yellow]note[/] the cylinder linkages were not calibrated: {result.skipped}")
+    stdout_console.print(shown)
+    if result.linkages_skip_reason:
+        stdout_console.print(
+            f"[yellow]note[/] the cylinder linkages were not calibrated: {result.linkages_skip_reason}"
+        )
     if identified:
-        out.print(f"dynamics: {identified.status}")
+        stdout_console.print(f"dynamics: {identified.status}")

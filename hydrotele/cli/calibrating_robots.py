@@ -13,68 +13,88 @@ from typing import Any
 import numpy as np
 
 import hydrotele
-from hydrotele.calibrate.estimation import told_combinations, told_in_words
+from hydrotele.calibrate.estimation import estimate_combinations, list_identifiability
 from hydrotele.calibrate.hybrid import (
     Calibration,
-    Errors,
-    best,
-    calibrate,
-    informative_poses,
+    PoseErrors,
+    calibrate_best_model,
+    calibrate_hybrid_robot,
+    fitted_equations,
     pose_errors,
-    subset,
+    select_informative_poses,
 )
 from hydrotele.calibrate.hybrid_data import (
-    HELDOUT,
-    POSES,
-    measurement_of_wires,
+    HELDOUT_STEM,
+    POSES_STEM,
+    find_robot_file,
+    measurement_from_wires,
     measurement_text,
     read_measurement,
-    robot_file,
     save_measurement,
 )
 from hydrotele.calibrate.mukca import (
-    Judged,
-    LeftOut,
-    Options,
+    HeldOutPrediction,
     Outlier,
     SocketCalibration,
+    SocketErrors,
+    SocketOptions,
     calibrate_sockets,
     check_robot,
     choose_robot,
-    hold_out,
-    leave_out,
-    parts_to_leave_out,
+    held_out_names,
+    predict_held_out_place,
+    predict_held_out_places,
 )
-from hydrotele.calibrate.posterior import Evolution, Posterior, evolve, sample_posterior
+from hydrotele.calibrate.posterior import (
+    EvolutionResult,
+    Posterior,
+    minimize_by_evolution,
+    sample_posterior,
+)
 from hydrotele.calibrate.scara import (
-    ScaraFacts,
-    best_poses,
+    ScaraSpec,
     calibrate_scara,
     load_scara,
     save_scara,
-    simulated_scara,
+    select_scara_poses,
+    simulate_scara,
 )
-from hydrotele.calibrate.sockets import Socket, idle_joints, load_sockets, places_of
-from hydrotele.cli.console import notes, out, plain, print_json, table, write_json
+from hydrotele.calibrate.sockets import Socket, find_idle_joints, load_sockets, place_names
+from hydrotele.cli.console import (
+    make_table,
+    print_json,
+    stderr_console,
+    stdout_console,
+    to_json_types,
+    write_json,
+)
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import read_text
-from hydrotele.core.output import check_target, whole_folder
-from hydrotele.identify.identifiability import FULL
+from hydrotele.core.output import atomic_folder, check_output_folder
+from hydrotele.identify.identifiability import STATUS_FULL
 from hydrotele.kinematics.hybrid import (
-    Hybrid,
-    document_parameters,
-    error_model,
-    forward,
+    HybridRobot,
+    build_error_model,
+    forward_kinematics,
     load_hybrid,
+    refined_model_parameters,
     save_hybrid,
 )
-from hydrotele.kinematics.serial_robot import Robot, corrected_urdf, load_robot, robot_yaml
+from hydrotele.kinematics.serial_robot import SerialRobot, correct_urdf, load_robot, robot_to_yaml
 from hydrotele.kinematics.wires import wire_lengths
 
 _ROBOT_FILES = ("robot.yaml", "robot.yml", "*.urdf", "*.xml")
-_EXAMPLE = ScaraFacts(length_a=0.4, length_b=0.3)
-_ERRORS = (0.0, 0.8e-3, 0.0, -0.5e-3)  # errors of the simulated arm: lengths only, as in Eq. 2
-_SHOWN, _WIDE = 25, 60  # rows of the printed table, and characters of a combination
+_EXAMPLE = ScaraSpec(length_a=0.4, length_b=0.3)
+_EXAMPLE_ERRORS = (
+    0.0,
+    0.8e-3,
+    0.0,
+    -0.5e-3,
+)  # errors of the simulated arm: lengths only, as in Eq. 2
+_MAX_PRINTED_ROWS, _MAX_TEXT_LENGTH = (
+    25,
+    60,
+)  # rows of the printed table, and characters of a combination
 
 
 @dataclass(frozen=True)
@@ -98,9 +118,7 @@ class SocketChoices:
     model: str | None = None
 
 
-def calibrate_mukca(
-    data: Path, choices: SocketChoices, target: Path | None, as_json: bool
-) -> dict[str, Any]:
+def calibrate_mukca(data: Path, choices: SocketChoices, target: Path | None, as_json: bool) -> dict[str, Any]:
     """Calibrate a robot from joint angles with its ball in sockets; print and write the result.
 
     Args:
@@ -118,42 +136,42 @@ def calibrate_mukca(
     if choices.unit not in ("rad", "deg"):
         raise InputError(f"--unit {choices.unit}", "must be rad or deg")
     if target is not None:
-        check_target(target, "robot calibration")
+        check_output_folder(target, "robot calibration")
     sockets, notes = load_sockets(data, choices.unit == "deg")
-    options = Options(choices.distance or None, choices.accuracy, choices.model)
-    robot, said = _robot(data, choices.robot, sockets, options)
+    options = SocketOptions(choices.distance or None, choices.accuracy, choices.model)
+    robot, said = _find_robot(data, choices.robot, sockets, options)
     check_robot(robot, sockets)
-    notes = [*said, *notes, *_warnings(robot, sockets, options)]
+    notes = [*said, *notes, *_identifiability_notes(robot, sockets, options)]
     if choices.heldout is not None:
-        one, found = hold_out(robot, sockets, choices.heldout, options)
-        left: tuple[LeftOut, ...] = (one,)
+        one, found = predict_held_out_place(robot, sockets, choices.heldout, options)
+        left: tuple[HeldOutPrediction, ...] = (one,)
     else:
         found = calibrate_sockets(robot, sockets, options)
-        left = leave_out(robot, sockets, parts_to_leave_out(sockets), options)
+        left = predict_held_out_places(robot, sockets, held_out_names(sockets), options)
     document = socket_document(data, sockets, found, left, notes)
     if target is not None:
-        with whole_folder(target, "robot calibration") as folder:
+        with atomic_folder(target, "robot calibration") as folder:
             _write(folder, document, found, left)
     if as_json:
         print_json(document)
     else:
         _print(document, found, left)
         if target is not None:
-            out.print(f"written to [bold]{target}[/]")
+            stdout_console.print(f"written to [bold]{target}[/]")
     return document
 
 
 def socket_document(
-    data: Path, sockets: Sequence[Socket], found: SocketCalibration, left: Sequence[LeftOut],
+    data: Path, sockets: Sequence[Socket], calibration: SocketCalibration, heldout_parts: Sequence[HeldOutPrediction],
     notes: Sequence[str],
 ) -> dict[str, Any]:  # fmt: skip
     """Return a socket calibration in the form of `calibration.json`.
 
     Errors and distances are in mm, parameters in SI units.
     """
-    fit, angular = found.fit, ("r", "s", "c")
-    status = dict(zip(fit.told.names, fit.told.status, strict=True))
-    alone = {name for name, told in status.items() if told == FULL}
+    fit, angular = calibration.fit, ("r", "s", "c")
+    status = dict(zip(fit.identifiability.names, fit.identifiability.status, strict=True))
+    alone = {name for name, told in status.items() if told == STATUS_FULL}
     parameters = [
         {
             "name": name, "value": value, "unit": _unit(name, angular), "told": status[name],
@@ -161,73 +179,73 @@ def socket_document(
             "high": high if name in alone else None,
         }
         for name, value, std, (low, high) in zip(
-            fit.names, fit.values, fit.deviations, fit.intervals, strict=True
+            fit.names, fit.values, fit.standard_deviations, fit.intervals, strict=True
         )
     ]  # fmt: skip
-    rows = {one.name: sum(len(r) for r in one.calibrated.rows.values()) for one in left}
-    return plain(
+    rows = {one.name: sum(len(r) for r in one.calibrated_errors.distances_by_socket.values()) for one in heldout_parts}
+    return to_json_types(
         {
-            "robot": found.nominal.name,
-            "robot_file": found.nominal.source,
+            "robot": calibration.nominal.name,
+            "robot_file": calibration.nominal.source,
             "data": str(data),
-            "places": list(places_of(sockets)),
+            "places": list(place_names(sockets)),
             "rows": {s.name: len(s.joints) for s in sockets},
-            "heldout": _heldout(left, rows) if left else None,
+            "heldout": _heldout_document(heldout_parts, rows) if heldout_parts else None,
             "fitted": {
-                "nominal_rms_mm": 1e3 * found.before.rms,
-                "rms_mm": 1e3 * found.after.rms,
-                "rms_without_outliers_mm": 1e3 * found.after.rms_without_outliers,
-                "socket_distance_mm": _millimetres(found.after.distances),
+                "nominal_rms_mm": 1e3 * calibration.nominal_errors.rms,
+                "rms_mm": 1e3 * calibration.calibrated_errors.rms,
+                "rms_without_outliers_mm": 1e3 * calibration.calibrated_errors.rms_without_outliers,
+                "socket_distance_mm": _millimetres(calibration.calibrated_errors.socket_distances),
             },
-            "distance_mm": None if found.options.distance is None else 1e3 * found.options.distance,
-            "noise_mm": 1e3 * found.noise,
-            "model": found.model,
-            "model_errors_mm": _millimetres(found.rivals),
-            "sizes": found.sizes,
+            "distance_mm": None if calibration.options.distance is None else 1e3 * calibration.options.distance,
+            "noise_mm": 1e3 * calibration.noise,
+            "model": calibration.model,
+            "model_errors_mm": _millimetres(calibration.model_errors),
+            "sizes": calibration.sizes,
             "parameters": parameters,
-            "effective_parameters": len(found.fit.residual) - found.fit.freedom,
-            **told_in_words(fit.told),
-            "told": [asdict(one) for one in told_combinations(fit)],
-            "outliers": _outliers(found.outliers),
+            "effective_parameters": len(calibration.fit.residual) - calibration.fit.degrees_of_freedom,
+            **list_identifiability(fit.identifiability),
+            "told": [asdict(one) for one in estimate_combinations(fit)],
+            "outliers": _outlier_rows(calibration.outliers),
             "status": fit.status,
             "notes": list(notes),
         }
     )
 
 
-def _heldout(left: Sequence[LeftOut], rows: dict[str, int]) -> dict[str, Any]:
-    def over(kind: str, what: str) -> float:
-        squares = [getattr(getattr(one, kind), what) ** 2 * rows[one.name] for one in left]
+def _heldout_document(heldout_parts: Sequence[HeldOutPrediction], rows: dict[str, int]) -> dict[str, Any]:
+    def rms_over_parts(kind: str, what: str) -> float:
+        squares = [getattr(getattr(one, kind), what) ** 2 * rows[one.name] for one in heldout_parts]
         return 1e3 * float(np.sqrt(np.sum(squares) / sum(rows.values())))
 
-    distances = {k: v for one in left for k, v in one.calibrated.distances.items()}
+    distances = {k: v for one in heldout_parts for k, v in one.calibrated_errors.socket_distances.items()}
     return {
-        "rms_mm": over("calibrated", "rms"),
-        "rms_without_outliers_mm": over("calibrated", "rms_without_outliers"),
-        "nominal_rms_mm": over("nominal", "rms"),
-        "given_rms_mm": over("given", "rms"),
+        "rms_mm": rms_over_parts("calibrated", "rms"),
+        "rms_without_outliers_mm": rms_over_parts("calibrated", "rms_without_outliers"),
+        "nominal_rms_mm": rms_over_parts("nominal", "rms"),
+        "given_rms_mm": rms_over_parts("given", "rms"),
         "socket_distance_mm": _millimetres(distances),
         "parts": {
             one.name: {
-                "rms_mm": 1e3 * one.calibrated.rms,
-                "rms_without_outliers_mm": 1e3 * one.calibrated.rms_without_outliers,
-                "nominal_rms_mm": 1e3 * one.nominal.rms,
-                "sockets_mm": _millimetres(one.calibrated.sockets),
+                "rms_mm": 1e3 * one.calibrated_errors.rms,
+                "rms_without_outliers_mm": 1e3 * one.calibrated_errors.rms_without_outliers,
+                "nominal_rms_mm": 1e3 * one.nominal_errors.rms,
+                "sockets_mm": _millimetres(one.calibrated_errors.rms_by_socket),
                 "model": one.model,
-                "outliers": _outliers(one.calibrated.outliers),
+                "outliers": _outlier_rows(one.calibrated_errors.outliers),
             }
-            for one in left
+            for one in heldout_parts
         },
     }
 
 
-def _robot(
-    data: Path, named: str | None, sockets: Sequence[Socket], options: Options
-) -> tuple[Robot, list[str]]:
+def _find_robot(
+    data: Path, robot_option: str | None, sockets: Sequence[Socket], options: SocketOptions
+) -> tuple[SerialRobot, list[str]]:
     """Load the given robot, that of the data folder or the best-fitting one, with a note on it."""
     count = sockets[0].joints.shape[1]
-    if named is not None:
-        return load_robot(named, count), []
+    if robot_option is not None:
+        return load_robot(robot_option, count), []
     inside = [path for pattern in _ROBOT_FILES for path in sorted(data.glob(pattern))]
     if inside:
         return load_robot(inside[0], count), [f"robot: {inside[0]}, found in the data folder"]
@@ -237,34 +255,35 @@ def _robot(
     return robot, [message]
 
 
-def _warnings(robot: Robot, sockets: Sequence[Socket], options: Options) -> list[str]:
+def _identifiability_notes(robot: SerialRobot, sockets: Sequence[Socket], options: SocketOptions) -> list[str]:
     notes = [
         f"{robot.joints[k].name} does not move in any file: its offset is identifiable only in"
         " combination with errors of the adjacent joints"
-        for k in idle_joints(sockets)
+        for k in find_idle_joints(sockets)
     ]
     if options.distance is None:
         notes.append("no socket distance is given: the scale of the robot is not identifiable")
     elif all(s.hole == sockets[0].hole for s in sockets):
-        notes.append(
-            "no place has two neighbouring sockets: the scale of the robot is not identifiable"
-        )
+        notes.append("no place has two neighbouring sockets: the scale of the robot is not identifiable")
     return notes
 
 
 def _write(
-    folder: Path, document: dict[str, Any], found: SocketCalibration, left: Sequence[LeftOut]
+    folder: Path,
+    document: dict[str, Any],
+    calibration: SocketCalibration,
+    heldout_parts: Sequence[HeldOutPrediction],
 ) -> None:
     from hydrotele.show.calibration_report import draw_sockets, write_robot_report
 
     write_json(folder / "calibration.json", document)
     source = f"calibrated by hydrotele {hydrotele.__version__} from {document['data']}"
-    (folder / "calibrated.yaml").write_text(robot_yaml(found.robot, source), encoding="utf-8")
-    origin = Path(found.nominal.source)
+    (folder / "calibrated.yaml").write_text(robot_to_yaml(calibration.robot, source), encoding="utf-8")
+    origin = Path(calibration.nominal.source)
     if origin.suffix == ".urdf":
-        made = corrected_urdf(found.robot, read_text(origin))
+        made = correct_urdf(calibration.robot, read_text(origin))
         (folder / "calibrated.urdf").write_text(made, encoding="utf-8")
-    picture = draw_sockets(found, left)
+    picture = draw_sockets(calibration, heldout_parts)
     (folder / "sockets.png").write_bytes(picture)
     write_robot_report(folder / "report.html", document, picture)
     summary = {
@@ -277,60 +296,69 @@ def _write(
     write_json(folder / "summary.json", summary)
 
 
-def _print(document: dict[str, Any], found: SocketCalibration, left: Sequence[LeftOut]) -> None:
-    heading = (
-        f"{document['robot']}: RMS distance of the ball from its mean position in the socket"
-        " (lower is better)"
-    )
-    rows = table(
-        heading, "held-out part", "nominal [mm]", "calibrated [mm]", "socket distance [mm]"
-    )
-    for one in left:
-        apart = ", ".join(f"{1e3 * d:.3f}" for d in one.calibrated.distances.values())
-        rows.add_row(one.name, _mm(one.nominal), f"[bold]{_mm(one.calibrated)}[/]", apart or "-")
-    if len(left) > 1:
+def _print(
+    document: dict[str, Any],
+    calibration: SocketCalibration,
+    heldout_parts: Sequence[HeldOutPrediction],
+) -> None:
+    heading = f"{document['robot']}: RMS distance of the ball from its mean position in the socket (lower is better)"
+    rows = make_table(heading, "held-out part", "nominal [mm]", "calibrated [mm]", "socket distance [mm]")
+    for one in heldout_parts:
+        apart = ", ".join(f"{1e3 * d:.3f}" for d in one.calibrated_errors.socket_distances.values())
+        rows.add_row(
+            one.name,
+            _mm(one.nominal_errors),
+            f"[bold]{_mm(one.calibrated_errors)}[/]",
+            apart or "-",
+        )
+    if len(heldout_parts) > 1:
         whole = document["heldout"]
         rows.add_section()
         rows.add_row("all parts", f"{whole['nominal_rms_mm']:.3f}",
                      f"[bold]{whole['rms_mm']:.3f}[/]", "")  # fmt: skip
     rows.add_section()
-    apart = ", ".join(f"{1e3 * d:.3f}" for d in found.after.distances.values())
-    rows.add_row("(all data, fitted)", _mm(found.before), _mm(found.after), apart or "-")
-    out.print(rows)
+    apart = ", ".join(f"{1e3 * d:.3f}" for d in calibration.calibrated_errors.socket_distances.values())
+    rows.add_row(
+        "(all data, fitted)",
+        _mm(calibration.nominal_errors),
+        _mm(calibration.calibrated_errors),
+        apart or "-",
+    )
+    stdout_console.print(rows)
     errors = ", ".join(f"{name} {value:.4f}" for name, value in document["model_errors_mm"].items())
-    out.print(f"joint model: [bold]{found.model}[/] (held-out error per coordinate [mm]: {errors})")
-    _print_parameters(document)
+    stdout_console.print(f"joint model: [bold]{calibration.model}[/] (held-out error per coordinate [mm]: {errors})")
+    _print_combinations(document)
     for outlier in document["outliers"]:
-        out.print(
+        stdout_console.print(
             f"[yellow]outlier[/] {outlier['socket']}, row {outlier['row']}:"
             f" {outlier['distance_mm']:.2f} mm from its socket, excluded from the fit"
         )
-    for one in left:
-        for outlier in one.calibrated.outliers:
-            out.print(
+    for one in heldout_parts:
+        for outlier in one.calibrated_errors.outliers:
+            stdout_console.print(
                 f"[yellow]outlier[/] {outlier.socket}, row {outlier.line}:"
                 f" {1e3 * outlier.distance:.2f} mm from its socket in the held-out prediction,"
                 " included in the RMS"
             )
     for note in document["notes"]:
-        out.print(f"[yellow]note[/] {note}")
+        stdout_console.print(f"[yellow]note[/] {note}")
 
 
-def _print_parameters(document: dict[str, Any]) -> None:
+def _print_combinations(document: dict[str, Any]) -> None:
     units = {one["name"]: one["unit"] for one in document["parameters"]}
     title = "Identifiable parameters and combinations"
-    rows = table(title, "parameter or combination", "value", "95 % +-", "unit")
+    rows = make_table(title, "parameter or combination", "value", "95 % +-", "unit")
     told = sorted(document["told"], key=lambda one: len(one["text"]))
-    for one in told[:_SHOWN]:
+    for one in told[:_MAX_PRINTED_ROWS]:
         unit = units[one["text"].split()[0]]
         shown, factor = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}.get(unit, (unit, 1.0))
-        text = one["text"] if len(one["text"]) < _WIDE else f"{one['text'][:_WIDE]} ..."
+        text = one["text"] if len(one["text"]) < _MAX_TEXT_LENGTH else f"{one['text'][:_MAX_TEXT_LENGTH]} ..."
         reach = f"{0.5 * factor * (one['high'] - one['low']):.2g}"
         rows.add_row(text, f"{factor * one['value']:.4g}", reach, shown)
-    out.print(rows)
-    if len(told) > _SHOWN:
-        out.print(f"... and {len(told) - _SHOWN} longer combinations; --out or --json lists all")
-    out.print("not identifiable: " + (", ".join(document["unknown"]) or "none"))
+    stdout_console.print(rows)
+    if len(told) > _MAX_PRINTED_ROWS:
+        stdout_console.print(f"... and {len(told) - _MAX_PRINTED_ROWS} longer combinations; --out or --json lists all")
+    stdout_console.print("not identifiable: " + (", ".join(document["unknown"]) or "none"))
 
 
 def _unit(name: str, angular: Sequence[str]) -> str:
@@ -339,7 +367,7 @@ def _unit(name: str, angular: Sequence[str]) -> str:
     return "rad" if name[0] in angular else "m"
 
 
-def _mm(judged: Judged) -> str:
+def _mm(judged: SocketErrors) -> str:
     return f"{1e3 * judged.rms:.3f}"
 
 
@@ -347,14 +375,11 @@ def _millimetres(values: dict[str, float]) -> dict[str, float]:
     return {name: 1e3 * value for name, value in values.items()}
 
 
-def _outliers(outliers: Sequence[Outlier]) -> list[dict[str, Any]]:
-    return [
-        {"socket": one.socket, "row": one.line, "distance_mm": 1e3 * one.distance}
-        for one in outliers
-    ]
+def _outlier_rows(outliers: Sequence[Outlier]) -> list[dict[str, Any]]:
+    return [{"socket": one.socket, "row": one.line, "distance_mm": 1e3 * one.distance} for one in outliers]
 
 
-def simulate_scara_folder(folder: Path, poses: int, noise: float, seed: int) -> None:
+def simulate_scara_to_folder(folder: Path, poses: int, noise: float, seed: int) -> None:
     """Write simulated measurements of an arm with links of 0.4 m and 0.3 m.
 
     The first link is 0.8 mm longer and the second one 0.5 mm shorter than nominal.
@@ -370,10 +395,10 @@ def simulate_scara_folder(folder: Path, poses: int, noise: float, seed: int) -> 
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(folder, "exists; give another folder to --simulate")
-    save_scara(folder, _EXAMPLE, simulated_scara(_EXAMPLE, _ERRORS, poses, noise, seed))
+    save_scara(folder, _EXAMPLE, simulate_scara(_EXAMPLE, _EXAMPLE_ERRORS, poses, noise, seed))
 
 
-def calibrate_scara_folder(
+def calibrate_scara_to_folder(
     data: Path, heldout: str | None, choose: int | None, target: Path | None, as_json: bool
 ) -> dict[str, Any]:
     """Calibrate a SCARA arm from measured positions; print and write the result.
@@ -392,13 +417,13 @@ def calibrate_scara_folder(
         InputError: data or target are not usable.
     """
     if target is not None:
-        check_target(target, "robot calibration")
+        check_output_folder(target, "robot calibration")
     nominal, measured = load_scara(data)
-    judged = _pose_numbers(heldout, len(measured.joints))
+    judged = _parse_pose_numbers(heldout, len(measured.joints))
     found = calibrate_scara(nominal, measured, judged)
     fit = found.fit
     start = {"length.a": nominal.length_a, "length.b": nominal.length_b}
-    document = plain(
+    document = to_json_types(
         {
             "data": str(data),
             "poses": len(measured.joints),
@@ -407,24 +432,24 @@ def calibrate_scara_folder(
                 "nominal_rms_mm": 1e3 * found.nominal_rms,
                 "poses": [k + 1 for k in judged] or "each in turn",
             },
-            "model": "lengths and offsets" if found.offsets else "lengths",
-            "model_errors_mm": {name: 1e3 * error for name, error in found.rivals.items()},
+            "model": "lengths and offsets" if found.has_offsets else "lengths",
+            "model_errors_mm": {name: 1e3 * error for name, error in found.model_errors.items()},
             "noise_mm": 1e3 * fit.noise,
             "parameters": [
                 {"name": name, "nominal": start.get(name, 0.0), "value": value, "std": std,
                  "low": low, "high": high, "unit": "m" if name.startswith("length") else "rad"}
                 for name, value, std, (low, high) in zip(
-                    fit.names, fit.values, fit.deviations, fit.intervals, strict=True)
+                    fit.names, fit.values, fit.standard_deviations, fit.intervals, strict=True)
             ],
-            **told_in_words(fit.told),
+            **list_identifiability(fit.identifiability),
             "status": fit.status,
         }
     )  # fmt: skip
     if choose is not None:
-        chosen = best_poses(nominal, measured, choose)
+        chosen = select_scara_poses(nominal, measured, choose)
         document["best_poses"] = sorted(k + 1 for k in chosen.chosen)
     if target is not None:
-        with whole_folder(target, "robot calibration") as folder:
+        with atomic_folder(target, "robot calibration") as folder:
             write_json(folder / "calibration.json", document)
             summary = {
                 "kind": "robot calibration",
@@ -438,11 +463,11 @@ def calibrate_scara_folder(
     else:
         _print_scara(document)
         if target is not None:
-            out.print(f"written to [bold]{target}[/]")
+            stdout_console.print(f"written to [bold]{target}[/]")
     return document
 
 
-def _pose_numbers(heldout: str | None, count: int) -> list[int]:
+def _parse_pose_numbers(heldout: str | None, count: int) -> list[int]:
     if heldout is None:
         return []
     words = heldout.split(",")
@@ -452,7 +477,7 @@ def _pose_numbers(heldout: str | None, count: int) -> list[int]:
 
 
 def _print_scara(document: dict[str, Any]) -> None:
-    rows = table(f"{document['poses']} poses, model: {document['model']}", "parameter", "nominal",
+    rows = make_table(f"{document['poses']} poses, model: {document['model']}", "parameter", "nominal",
                  "calibrated", "95 % +-", "unit")  # fmt: skip
     for one in document["parameters"]:
         unit = {"m": "mm", "rad": "mrad"}[one["unit"]]
@@ -461,24 +486,29 @@ def _print_scara(document: dict[str, Any]) -> None:
             continue
         rows.add_row(one["name"], f"{1e3 * one['nominal']:.4f}", f"{1e3 * one['value']:.4f}",
                      f"{0.5e3 * (one['high'] - one['low']):.4f}", unit)  # fmt: skip
-    out.print(rows)
+    stdout_console.print(rows)
     judged = document["heldout"]
-    out.print(f"held-out position error: [bold]{judged['rms_mm']:.4f} mm[/] RMS"
+    stdout_console.print(f"held-out position error: [bold]{judged['rms_mm']:.4f} mm[/] RMS"
               f" (nominal {judged['nominal_rms_mm']:.4f} mm)")  # fmt: skip
     if "best_poses" in document:
-        out.print("most informative poses: " + ", ".join(map(str, document["best_poses"])))
+        stdout_console.print("most informative poses: " + ", ".join(map(str, document["best_poses"])))
     for text in document["combinations"]:
-        out.print(f"[yellow]identifiable only as a combination[/] {text}")
+        stdout_console.print(f"[yellow]identifiable only as a combination[/] {text}")
     if document["unknown"]:
-        out.print("[yellow]not identifiable[/] " + ", ".join(document["unknown"]))
+        stdout_console.print("[yellow]not identifiable[/] " + ", ".join(document["unknown"]))
 
 
 KIND = "hybrid calibration"
 MEASUREMENT = "hybrid measurement"
 CRITERIA = ("D", "O1", "O2", "O3", "O4", "O5")
 CANDIDATES = 200  # number of random poses from which the most informative are selected
-NOISE = {"leg": 1e-5, "slide": 1e-5, "turn": 2e-5, "wire": 2e-5}  # m, rad: models/iwr/README.md
-BOX = 8.0  # half width of the search box, in expected sizes of the manufacturing errors
+SENSOR_NOISE = {
+    "leg": 1e-5,
+    "slide": 1e-5,
+    "turn": 2e-5,
+    "wire": 2e-5,
+}  # m, rad: models/iwr/README.md
+SEARCH_BOX_SIGMAS = 8.0  # half width of the search box, in expected sizes of the manufacturing errors
 
 
 def calibrate_hybrid(
@@ -507,108 +537,116 @@ def calibrate_hybrid(
     if kind not in ("auto", "dh", "poe"):
         raise InputError(f"--model {kind}", "valid: auto, dh, poe")
     if target:
-        check_target(target, KIND)
-    nominal = load_hybrid(robot or robot_file(Path(data)) or "iwr")
+        check_output_folder(target, KIND)
+    nominal = load_hybrid(robot or find_robot_file(Path(data)) or "iwr")
     measurement, heldout = read_measurement(data, nominal)
-    names = _names(nominal, kind, parameters)
+    names = _parameter_names(nominal, kind, parameters)
     if kind == "auto":
-        done = best(nominal, measurement, names)
+        done = calibrate_best_model(nominal, measurement, names)
     else:
-        done = calibrate(nominal, measurement, "dh" if kind == "dh" else "poe", names)
-    evolved = _evolved(done, seed) if evolution else None
-    posterior = _posterior(done, steps, seed) if steps else None
-    result = _result(data, done, heldout, evolved, posterior)
+        done = calibrate_hybrid_robot(nominal, measurement, "dh" if kind == "dh" else "poe", names)
+    evolved = _run_evolution(done, seed) if evolution else None
+    posterior = _run_mcmc(done, steps, seed) if steps else None
+    result = _hybrid_document(data, done, heldout, evolved, posterior)
     if target:
-        with whole_folder(target, KIND) as folder:
-            _write_hybrid(folder, result, done, heldout, posterior)
+        with atomic_folder(target, KIND) as folder:
+            _write_hybrid_files(folder, result, done, heldout, posterior)
     if as_json:
         print_json(result)
     else:
         _print_hybrid(result)
         if target:
-            out.print(f"written to [bold]{target}[/]; robot.yaml there is the calibrated robot")
+            stdout_console.print(f"written to [bold]{target}[/]; robot.yaml there is the calibrated robot")
     return done
 
 
-def _names(nominal: Hybrid, kind: str, parameters: str) -> tuple[str, ...] | None:
+def _parameter_names(nominal: HybridRobot, kind: str, parameters: str) -> tuple[str, ...] | None:
     if parameters == "all":
         return None
-    model = error_model(nominal, "poe" if kind == "poe" or not nominal.facts.carriage else "dh")
+    model = build_error_model(nominal, "poe" if kind == "poe" or not nominal.specification.carriage else "dh")
     if parameters == "document":
-        return document_parameters(model)
+        return refined_model_parameters(model)
     names = tuple(name.strip() for name in parameters.split(","))
-    model.index(names)
+    model.parameter_indices(names)
     return names
 
 
-def _evolved(done: Calibration, seed: int) -> Evolution:
-    eq = subset(done)
-    notes.print("differential evolution ...", style="dim")
-    return evolve(eq.misfit, -BOX * eq.scales, BOX * eq.scales, seed=seed)
+def _run_evolution(calibration: Calibration, seed: int) -> EvolutionResult:
+    eq = fitted_equations(calibration)
+    stderr_console.print("differential evolution ...", style="dim")
+    return minimize_by_evolution(
+        eq.negative_log_likelihood,
+        -SEARCH_BOX_SIGMAS * eq.scales,
+        SEARCH_BOX_SIGMAS * eq.scales,
+        seed=seed,
+    )
 
 
-def _posterior(done: Calibration, steps: int, seed: int) -> Posterior:
-    eq, fit = subset(done), done.fit
-    notes.print("MCMC ...", style="dim")
+def _run_mcmc(calibration: Calibration, steps: int, seed: int) -> Posterior:
+    eq, fit = fitted_equations(calibration), calibration.fit
+    stderr_console.print("MCMC ...", style="dim")
     free = ~fit.held
-    noise = 1.0 if done.equations.measurement.stated else fit.noise
+    noise = 1.0 if calibration.equations.measurement.noise_is_known else fit.noise
     return sample_posterior(
-        lambda x: -eq.misfit(x) / noise**2, fit.values[free],
-        fit.covariance[np.ix_(free, free)], eq.names, steps=steps, burn=steps // 4, seed=seed,
+        lambda x: -eq.negative_log_likelihood(x) / noise**2, fit.values[free],
+        fit.covariance[np.ix_(free, free)], eq.names, steps=steps, burn_in=steps // 4, seed=seed,
     )  # fmt: skip
 
 
-def _result(data, done: Calibration, heldout, evolved, posterior) -> dict[str, Any]:
-    fit, model = done.fit, done.model
+def _hybrid_document(data, calibration: Calibration, heldout, evolved, posterior) -> dict[str, Any]:
+    fit, model = calibration.fit, calibration.model
     held = dict(zip(fit.names, fit.held, strict=True))
     values = dict(zip(fit.names, fit.values, strict=True))
-    deviations = dict(zip(fit.names, fit.deviations, strict=True))
+    deviations = dict(zip(fit.names, fit.standard_deviations, strict=True))
     intervals = dict(zip(fit.names, fit.intervals, strict=True))
-    weak = [n for n in fit.names if not held[n] and n not in done.redundancy.told]
+    weak = [n for n in fit.names if not held[n] and n not in calibration.redundancy.determined_names]
     result: dict[str, Any] = {
         "robot": model.nominal.name, "data": str(data), "hydrotele": hydrotele.__version__,
-        "model": model.kind, "poses": len(done.equations.measurement),
-        "poses_left_out_as_wrong": list(done.wrong),
-        "noise": "stated" if done.equations.measurement.stated else "estimated",
-        "chi": fit.chi, "degrees_of_freedom": fit.freedom, "iterations": fit.iterations,
-        "converged": fit.converged, "status": fit.status, "warnings": list(done.warnings),
+        "model": model.kind, "poses": len(calibration.equations.measurement),
+        "poses_left_out_as_wrong": list(calibration.inconsistent_rows),
+        "noise": "stated" if calibration.equations.measurement.noise_is_known else "estimated",
+        "chi": fit.chi, "degrees_of_freedom": fit.degrees_of_freedom, "iterations": fit.iterations,
+        "converged": fit.converged, "status": fit.status, "warnings": list(calibration.warnings),
         "redundancy": {
-            "parameters": len(fit.names), "rank": done.redundancy.rank,
-            "redundant": list(done.redundancy.held), "take_part": list(done.redundancy.takes_part),
-            "words": list(done.redundancy.words), "told_at_this_noise": len(done.redundancy.told),
+            "parameters": len(fit.names), "rank": calibration.redundancy.rank,
+            "redundant": list(calibration.redundancy.held_names),
+            "take_part": list(calibration.redundancy.redundant_names),
+            "words": list(calibration.redundancy.explanations),
+            "told_at_this_noise": len(calibration.redundancy.determined_names),
             "hidden_by_the_noise": weak,
-            "singular_values": done.redundancy.singular,
+            "singular_values": calibration.redundancy.singular_values,
         },
         "unknown": [n for n in fit.names if held[n]],
-        "errors": {"before": done.before.summary(), "after": done.after.summary(),
-                   "left_out": done.left_out.summary()},
+        "errors": {"before": calibration.nominal_errors.summarize(), "after": calibration.calibrated_errors.summarize(),
+                   "left_out": calibration.leave_one_out_errors.summarize()},
         "parameters": [
             {"name": name, "words": words, "unit": unit, "identified": not held[name],
              "value": values[name], "standard_deviation": deviations[name],
              "interval_95": intervals[name]}
-            for name, words, unit in zip(model.names, model.words, model.units, strict=True)
+            for name, words, unit in zip(model.names, model.descriptions, model.units, strict=True)
             if name in held
         ],
     }  # fmt: skip
     if heldout is not None:
-        after, before = pose_errors(done.robot, heldout), pose_errors(model.nominal, heldout)
-        result["heldout"] = _hybrid_heldout(len(heldout), before, after)
+        after, before = pose_errors(calibration.robot, heldout), pose_errors(model.nominal, heldout)
+        result["heldout"] = _hybrid_heldout_document(len(heldout), before, after)
     free = ~fit.held
     if evolved is not None:
-        away = np.abs(evolved.values - fit.values[free]) / fit.deviations[free]
+        away = np.abs(evolved.values - fit.values[free]) / fit.standard_deviations[free]
         result["evolution"] = {
             "generations": evolved.generations, "evaluations": evolved.evaluations,
             "converged": evolved.converged, "misfit": evolved.cost,
-            "misfit_least_squares": float(subset(done).misfit(fit.values[free][None])[0]),
+            "misfit_least_squares": float(
+                fitted_equations(calibration).negative_log_likelihood(fit.values[free][None])[0]),
             "largest_difference_in_deviations": float(away.max()),
-            "values": dict(zip(subset(done).names, evolved.values.tolist(), strict=True)),
+            "values": dict(zip(fitted_equations(calibration).names, evolved.values.tolist(), strict=True)),
         }  # fmt: skip
     if posterior is not None:
-        away = np.abs(posterior.mean - fit.values[free]) / fit.deviations[free]
+        away = np.abs(posterior.mean - fit.values[free]) / fit.standard_deviations[free]
         result["posterior"] = {
             "converged": posterior.converged, "status": posterior.status,
             "steps": posterior.steps, "evaluations": posterior.evaluations,
-            "acceptance": posterior.acceptance,
+            "acceptance": posterior.acceptance_fraction,
             "largest_autocorrelation_time": posterior.autocorrelation.max(),
             "largest_split_rhat": posterior.rhat.max(),
             "least_effective_size": posterior.effective.min(),
@@ -616,7 +654,7 @@ def _result(data, done: Calibration, heldout, evolved, posterior) -> dict[str, A
             "parameters": [
                 {"name": n, "mean": m, "standard_deviation": s, "interval_95": i,
                  "split_rhat": r, "effective_size": e}
-                for n, m, s, i, r, e in zip(posterior.names, posterior.mean, posterior.deviations,
+                for n, m, s, i, r, e in zip(posterior.names, posterior.mean, posterior.standard_deviations,
                                             posterior.intervals, posterior.rhat,
                                             posterior.effective, strict=True)
             ],
@@ -624,8 +662,8 @@ def _result(data, done: Calibration, heldout, evolved, posterior) -> dict[str, A
     return result
 
 
-def _hybrid_heldout(count: int, before: Errors, after: Errors) -> dict[str, Any]:
-    had, has = before.summary(), after.summary()
+def _hybrid_heldout_document(count: int, before: PoseErrors, after: PoseErrors) -> dict[str, Any]:
+    had, has = before.summarize(), after.summarize()
     return {
         "poses": count, "rms_mm": has["position_rms_mm"], "max_mm": has["position_max_mm"],
         "orientation_rms_mrad": has["orientation_rms_mrad"],
@@ -634,18 +672,25 @@ def _hybrid_heldout(count: int, before: Errors, after: Errors) -> dict[str, Any]
     }  # fmt: skip
 
 
-def _write_hybrid(folder: Path, result, done: Calibration, heldout, posterior) -> None:
-    from hydrotele.show.calibration_report import corner, error_bars
+def _write_hybrid_files(folder: Path, result, calibration: Calibration, heldout, posterior) -> None:
+    from hydrotele.show.calibration_report import draw_pose_errors, draw_posterior
 
     write_json(folder / "calibration.json", result)
-    save_hybrid(done.robot, folder / "robot.yaml", "calibrated by hydrotele calibrate hybrid")
-    before, after, what = done.before, done.left_out, "poses, leave-one-out predictions"
+    save_hybrid(calibration.robot, folder / "robot.yaml", "calibrated by hydrotele calibrate hybrid")
+    before, after, what = (
+        calibration.nominal_errors,
+        calibration.leave_one_out_errors,
+        "poses, leave-one-out predictions",
+    )
     if len(before.position) != len(after.position):
-        after, what = done.after, "fitted poses"
+        after, what = calibration.calibrated_errors, "fitted poses"
     if heldout is not None:
-        before, after = pose_errors(done.model.nominal, heldout), pose_errors(done.robot, heldout)
+        before, after = (
+            pose_errors(calibration.model.nominal, heldout),
+            pose_errors(calibration.robot, heldout),
+        )
         what = "held-out poses"
-    picture = error_bars(
+    picture = draw_pose_errors(
         {"position [mm]": (1e3 * before.position, 1e3 * after.position),
          "orientation [mrad]": (1e3 * before.orientation, 1e3 * after.orientation)}, what,
     )  # fmt: skip
@@ -654,8 +699,8 @@ def _write_hybrid(folder: Path, result, done: Calibration, heldout, posterior) -
         place = np.argsort(-np.abs(posterior.correlation - np.eye(len(posterior.names))).max(0))[:6]
         chosen = np.sort(place)
         sizes = [1e-3] * len(chosen)
-        truth = done.fit.values[[done.fit.names.index(posterior.names[k]) for k in chosen]]
-        image = corner(posterior.flat[:, chosen] / sizes, [posterior.names[k] for k in chosen],
+        truth = calibration.fit.values[[calibration.fit.names.index(posterior.names[k]) for k in chosen]]
+        image = draw_posterior(posterior.flat[:, chosen] / sizes, [posterior.names[k] for k in chosen],
                        truth / sizes, "least squares")  # fmt: skip
         (folder / "posterior.png").write_bytes(image)
     summary = {"kind": KIND, "name": result["robot"], "hydrotele": hydrotele.__version__}
@@ -664,7 +709,7 @@ def _write_hybrid(folder: Path, result, done: Calibration, heldout, posterior) -
 
 def _print_hybrid(result: dict[str, Any]) -> None:
     errors, told = result["errors"], result["redundancy"]
-    shown = table(f"{result['robot']}: {result['poses']} poses, model {result['model']}",
+    shown = make_table(f"{result['robot']}: {result['poses']} poses, model {result['model']}",
                   "pose errors (lower is better)", "RMS mm", "max mm", "RMS mrad")  # fmt: skip
     rows = [("nominal", errors["before"]), ("calibrated", errors["after"]),
             ("leave-one-out prediction", errors["left_out"])]  # fmt: skip
@@ -677,31 +722,30 @@ def _print_hybrid(result: dict[str, Any]) -> None:
                       f"{h['before_max_mm']:.3f}", "")  # fmt: skip
         shown.add_row(f"{h['poses']} held-out poses, calibrated", f"{h['rms_mm']:.3f}",
                       f"{h['max_mm']:.3f}", f"{h['orientation_rms_mrad']:.3f}")  # fmt: skip
-    out.print(shown)
-    out.print(
+    stdout_console.print(shown)
+    stdout_console.print(
         f"{told['parameters']} parameters, {told['rank']} independent; noise {result['noise']};"
         f" ratio of residuals to noise {result['chi']:.2f}"
     )
     for words in told["words"][:12]:
-        out.print(f"  {words}")
+        stdout_console.print(f"  {words}")
     if result["unknown"]:
-        out.print(f"kept at their nominal values: {', '.join(result['unknown'])}")
+        stdout_console.print(f"kept at their nominal values: {', '.join(result['unknown'])}")
     if told["hidden_by_the_noise"]:
         names = ", ".join(told["hidden_by_the_noise"])
-        out.print(f"poorly identifiable at this noise: {names}")
+        stdout_console.print(f"poorly identifiable at this noise: {names}")
     if result["poses_left_out_as_wrong"]:
         rows_ = ", ".join(map(str, result["poses_left_out_as_wrong"]))
-        out.print(f"excluded, because their measurements fit no calibration: rows {rows_}")
+        stdout_console.print(f"excluded, because their measurements fit no calibration: rows {rows_}")
     for words in result["warnings"]:
-        out.print(f"[yellow]warning[/] {words}")
+        stdout_console.print(f"[yellow]warning[/] {words}")
     for key, name in (("evolution", "differential evolution"), ("posterior", "MCMC")):
         if key in result:
             one = result[key]
             said = one.get("status", "converged" if one["converged"] else "not converged")
             away = one["largest_difference_in_deviations"]
-            out.print(
-                f"{name}: {said}; differs from least squares by at most {away:.2f} standard"
-                " deviations"
+            stdout_console.print(
+                f"{name}: {said}; differs from least squares by at most {away:.2f} standard deviations"
             )
 
 
@@ -723,38 +767,38 @@ def simulate_hybrid(
         errors: factor on the manufacturing errors of 1 mm and 1 mrad.
         parameters: parameters with errors: `all`, `document` or names separated by commas.
         kind: error model of the simulated errors: `auto`, `dh` or `poe`.
-        choose: `random` poses, or a criterion of `informative_poses`.
+        choose: `random` poses, or a criterion of `select_informative_poses`.
 
     Raises:
         InputError: the folder cannot be written, or an option is not usable.
     """
-    from hydrotele.kinematics.hybrid import corrected
+    from hydrotele.kinematics.hybrid import apply_errors
     from hydrotele.simulate.hybrid import (
-        manufactured_errors,
-        measured_poses,
-        random_poses,
-        shipped_wires,
+        default_wires,
+        sample_manufacturing_errors,
+        sample_poses,
+        simulate_measured_poses,
     )
 
     if choose not in ("random", *CRITERIA):
         raise InputError(f"--choose {choose}", f"valid: random, {', '.join(CRITERIA)}")
-    check_target(target, MEASUREMENT)
+    check_output_folder(target, MEASUREMENT)
     nominal = load_hybrid(robot or "iwr")
-    kind = "dh" if kind == "auto" and nominal.facts.carriage else "poe" if kind == "auto" else kind
-    names = _names(nominal, kind, parameters)
-    model = error_model(nominal, "dh" if kind == "dh" else "poe")
-    rng, wires = np.random.default_rng(seed), shipped_wires()
-    planted = manufactured_errors(model, rng, names, errors)
-    true = corrected(model, planted)
-    sizes = {key: noise * size for key, size in NOISE.items()}
+    kind = "dh" if kind == "auto" and nominal.specification.carriage else "poe" if kind == "auto" else kind
+    names = _parameter_names(nominal, kind, parameters)
+    model = build_error_model(nominal, "dh" if kind == "dh" else "poe")
+    rng, wires = np.random.default_rng(seed), default_wires()
+    planted = sample_manufacturing_errors(model, rng, names, errors)
+    true = apply_errors(model, planted)
+    sizes = {key: noise * size for key, size in SENSOR_NOISE.items()}
     stated = sizes if noise > 0.0 else {}
-    with whole_folder(target, MEASUREMENT) as folder:
-        for stem, count in ((POSES, poses), (HELDOUT, heldout)):
+    with atomic_folder(target, MEASUREMENT) as folder:
+        for stem, count in ((POSES_STEM, poses), (HELDOUT_STEM, heldout)):
             if count:
-                joints, legs = random_poses(nominal, count, rng, wires)
-                if stem == POSES and choose != "random":
-                    joints, legs = _chosen(model, wires, count, rng, choose)
-                read = measured_poses(true, joints, legs, wires, sizes, rng)
+                joints, legs = sample_poses(nominal, count, rng, wires)
+                if stem == POSES_STEM and choose != "random":
+                    joints, legs = _select_poses(model, wires, count, rng, choose)
+                read = simulate_measured_poses(true, joints, legs, wires, sizes, rng)
                 save_measurement(folder, stem, nominal, read.joints, read.legs, wires=read.wires)
         (folder / "measurement.yaml").write_text(measurement_text(nominal.name, wires, stated))
         save_hybrid(nominal, folder / "robot.yaml", "nominal robot")
@@ -764,16 +808,16 @@ def simulate_hybrid(
         (folder / "truth" / "errors.json").write_text(text + "\n", encoding="utf-8")
         summary = {"kind": MEASUREMENT, "name": nominal.name, "hydrotele": hydrotele.__version__}
         write_json(folder / "summary.json", summary)
-    out.print(f"written to [bold]{target}[/]: {poses} poses and {heldout} held-out poses")
+    stdout_console.print(f"written to [bold]{target}[/]: {poses} poses and {heldout} held-out poses")
 
 
-def _chosen(model, wires, count: int, rng: np.random.Generator, criterion: Any):
+def _select_poses(model, wires, count: int, rng: np.random.Generator, criterion: Any):
     """Return joint values and leg lengths of the most informative of many random poses."""
-    from hydrotele.simulate.hybrid import random_poses
+    from hydrotele.simulate.hybrid import sample_poses
 
     robot = model.nominal
-    joints, legs = random_poses(robot, max(CANDIDATES, count), rng, wires)
-    lengths = wire_lengths(wires, forward(robot, joints, legs))
-    candidates = measurement_of_wires(robot, joints, legs, lengths, wires, NOISE, "candidates")
-    places = informative_poses(model, candidates, count, criterion)
+    joints, legs = sample_poses(robot, max(CANDIDATES, count), rng, wires)
+    lengths = wire_lengths(wires, forward_kinematics(robot, joints, legs))
+    candidates = measurement_from_wires(robot, joints, legs, lengths, wires, SENSOR_NOISE, "candidates")
+    places = select_informative_poses(model, candidates, count, criterion)
     return joints[places], legs[places]

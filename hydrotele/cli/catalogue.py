@@ -8,8 +8,8 @@ from pathlib import Path
 
 from rich.markup import escape
 
-from hydrotele.cli.console import notes, out, print_json, table
-from hydrotele.core.datafile import read_yaml, suggest
+from hydrotele.cli.console import make_table, print_json, stderr_console, stdout_console
+from hydrotele.core.datafile import read_yaml, suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.machine.joystick import JOYSTICK_FILE, load_joystick, shipped_joysticks
 from hydrotele.machine.machine_file import load_machine, machine_path, shipped_machines
@@ -18,87 +18,81 @@ from hydrotele.simulate.mechanism import Mjcf
 _KINDS = ("machines", "joysticks", "scenarios", "sweeps", "effects", "environments")
 
 
-def list_things(what: str, as_json: bool) -> None:
+def list_items(item_kind: str, as_json: bool) -> None:
     """Print the available machines, joysticks, scenarios, sweeps, effects or environments.
 
     Args:
-        what: kind of the items, such as `machines`, or `all`.
+        item_kind: kind of the items, such as `machines`, or `all`.
         as_json: print JSON instead of tables.
 
     Raises:
-        InputError: `what` is not a valid kind.
+        InputError: `item_kind` is not a valid kind.
     """
-    if what not in (*_KINDS, "all"):
-        raise InputError(f"list {what}", suggest(what, [*_KINDS, "all"]))
-    wanted = _KINDS if what == "all" else (what,)
+    if item_kind not in (*_KINDS, "all"):
+        raise InputError(f"list {item_kind}", suggest_valid_name(item_kind, [*_KINDS, "all"]))
+    wanted = _KINDS if item_kind == "all" else (item_kind,)
     tables = {
-        "machines": _machines, "joysticks": _joysticks, "scenarios": _scenarios,
-        "sweeps": _sweeps, "effects": _effects, "environments": _environments,
+        "machines": _machine_rows, "joysticks": _joystick_rows, "scenarios": _scenario_rows,
+        "sweeps": _sweep_rows, "effects": _effect_rows, "environments": _environment_rows,
     }  # fmt: skip
     data = {kind: tables[kind]() for kind in wanted}
     if as_json:
-        print_json(data if what == "all" else data[what])
+        print_json(data if item_kind == "all" else data[item_kind])
         return
     for kind, rows in data.items():
         columns = list(rows[0]) if rows else ["name"]
-        shown = table(kind, *columns)
+        shown = make_table(kind, *columns)
         for column in shown.columns:
             column.justify = "left"
         for row in rows:
-            shown.add_row(*(_cell(row[c]) for c in columns))
-        out.print(shown)
+            shown.add_row(*(_format_cell(row[c]) for c in columns))
+        stdout_console.print(shown)
 
 
-def _cell(value) -> str:
+def _format_cell(value) -> str:
     if isinstance(value, dict):
-        return escape(
-            ", ".join(
-                f"{n} [{p['unit']}] {p['low']:.4g} .. {p['high']:.4g}" for n, p in value.items()
-            )
-        )
+        return escape(", ".join(f"{n} [{p['unit']}] {p['low']:.4g} .. {p['high']:.4g}" for n, p in value.items()))
     return ", ".join(value) if isinstance(value, list) else str(value)
 
 
-def _machines() -> list[dict]:
+def _machine_rows() -> list[dict]:
     rows = []
     for name in shipped_machines():
         data, _ = read_yaml(machine_path(name))
         tools = list(data.get("tools") or ["none"])
         axes = list(data.get("axes") or {})
-        rows.append(
-            {"name": name, "axes": axes, "tools": tools, "description": data.get("description", "")}
-        )
+        rows.append({"name": name, "axes": axes, "tools": tools, "description": data.get("description", "")})
     return rows
 
 
-def _joysticks() -> list[dict]:
+def _joystick_rows() -> list[dict]:
     found = map(load_joystick, shipped_joysticks())
     return [{"name": j.name, "gains": list(j.gains), "description": j.description} for j in found]
 
 
-def _scenarios() -> list[dict]:
-    from hydrotele.scenario.scenario import scenario_path, shipped_scenarios
+def _scenario_rows() -> list[dict]:
+    from hydrotele.scenario.scenario import find_scenario, shipped_scenarios
 
     rows = []
     for name in shipped_scenarios():
-        data, _ = read_yaml(scenario_path(name))
+        data, _ = read_yaml(find_scenario(name))
         keys = ("machine", "tool", "duration", "description")
         rows.append({"name": name, **{k: data.get(k, "") for k in keys}})
     return rows
 
 
-def _sweeps() -> list[dict]:
+def _sweep_rows() -> list[dict]:
     from hydrotele.run.sweep_facts import load_sweep, shipped_sweeps
 
     rows = []
     for name in shipped_sweeps():
         sweep = load_sweep(name).sweep
-        facts = {"runs": sweep.runs, "scenario": sweep.scenario, "keys": list(sweep.varied)}
+        facts = {"runs": sweep.runs, "scenario": sweep.scenario, "keys": list(sweep.varied_keys)}
         rows.append({"name": name, **facts, "description": sweep.description})
     return rows
 
 
-def _effects() -> list[dict]:
+def _effect_rows() -> list[dict]:
     """Return a row for each effect, with its locations on the first machine that supports it.
 
     The CAT 215 with bucket is tried first. The parameter ranges are those of the last location.
@@ -115,11 +109,16 @@ def _effects() -> list[dict]:
         rows.append(
             {
                 "name": effect.name,
-                "what": effect.sentence,
+                "what": effect.description,
                 "machine": machine.name if places else "",
                 "locations": list(places),
                 "parameters": {
-                    n: {"unit": p.unit, "low": p.low, "high": p.high, "optional": p.optional}
+                    n: {
+                        "unit": p.unit,
+                        "low": p.lower_bound,
+                        "high": p.upper_bound,
+                        "optional": p.optional,
+                    }
                     for n, p in numbers.items()
                 },
             }
@@ -127,7 +126,7 @@ def _effects() -> list[dict]:
     return rows
 
 
-def _environments() -> list[dict]:
+def _environment_rows() -> list[dict]:
     """Return a row for each gymnasium environment."""
     from hydrotele.envs.making import TASKS
 
@@ -135,7 +134,7 @@ def _environments() -> list[dict]:
         {
             "name": f"hydrotele/{task.name}-v0",
             "machine": f"{task.machine}, {task.tool or 'its first tool'}",
-            "what": task.sentence,
+            "what": task.description,
             "reward": task.reward,
         }
         for task in TASKS.values()
@@ -156,29 +155,29 @@ def validate_files(paths: list[Path], as_json: bool) -> None:
     wrong: list[InputError] = []
     for path in paths:
         try:
-            kind, said = _validate(path)
+            kind, said = _validate_file(path)
             checked.append({"file": str(path), "kind": kind, "valid": True, "contents": said})
             if not as_json:
-                out.print(f"[green]valid[/] {kind} {path}: {said}", soft_wrap=True)
+                stdout_console.print(f"[green]valid[/] {kind} {path}: {said}", soft_wrap=True)
         except InputError as error:
             checked.append({"file": str(path), "valid": False, "error": str(error)})
             wrong.append(error)
     if as_json:
         print_json(checked)
     for error in wrong[:-1]:
-        notes.print(f"error {error}", markup=False, soft_wrap=True)
+        stderr_console.print(f"error {error}", markup=False, soft_wrap=True)
     if wrong:
         raise wrong[-1]
 
 
-def _validate(path: Path) -> tuple[str, str]:
+def _validate_file(path: Path) -> tuple[str, str]:
     if path.suffix.lower() in (".parquet", ".csv"):
         from hydrotele.logs.log import load_log
 
         log = load_log(path)
         return "log", f"{len(log)} rows at {log.rate:g} Hz, {len(log.columns)} columns"
     if path.is_dir() and (path / "summary.json").is_file():
-        return _validate(path / "measured.parquet")
+        return _validate_file(path / "measured.parquet")
     from hydrotele.scenario.scenario import load_scenario, shipped_scenarios
 
     name = str(path)
@@ -194,7 +193,7 @@ def _validate(path: Path) -> tuple[str, str]:
         return "machine", _check_machine(path)
     names = [*shipped_machines(), *shipped_joysticks(), *shipped_scenarios(), *_sweep_names()]
     message = "is not a file, machine, joystick, scenario or sweep"
-    raise InputError(path, f"{message}; {suggest(name, names)}")
+    raise InputError(path, f"{message}; {suggest_valid_name(name, names)}")
 
 
 def _sweep_names() -> list[str]:
@@ -208,7 +207,7 @@ def _check_sweep(path: Path) -> str:
 
     file = load_sweep(path)
     check_points(open_base(file))
-    varied = ", ".join(file.sweep.varied) or "seed"
+    varied = ", ".join(file.sweep.varied_keys) or "seed"
     return f"{file.sweep.runs} runs of {file.sweep.scenario}, varied: {varied}"
 
 
@@ -260,9 +259,7 @@ def _check_scenario(scenario) -> str:
     return f"{scenario.duration:g} s of {scenario.machine}, {scenario.pilot.kind} pilot{notes_}"
 
 
-def export_machine(
-    name: str, tool: str | None, target: Path | None, picture: Path | None, camera: str
-) -> None:
+def export_machine(name: str, tool: str | None, target: Path | None, picture: Path | None, camera: str) -> None:
     """Write the complete MJCF of a machine or joystick, or an image of it.
 
     Args:
@@ -285,7 +282,7 @@ def export_machine(
         from hydrotele.show.picture import render_picture
 
         render_picture(machine, picture, camera=camera)
-        notes.print(f"written to {picture}")
+        stderr_console.print(f"written to {picture}")
         return
     from hydrotele.simulate.plant import build_plant
 
@@ -305,16 +302,16 @@ def _export_joystick(name: str, target: Path | None, picture: Path | None, camer
     from hydrotele.show.picture import render_model
 
     render_model(model, mujoco.MjData(model), picture, camera)
-    notes.print(f"written to {picture}")
+    stderr_console.print(f"written to {picture}")
 
 
 def _write(document: Mjcf, target: Path | None) -> None:
-    from hydrotele.core.output import replacing
+    from hydrotele.core.output import atomic_file
 
     if target:
-        with replacing(target, ".xml") as part:
+        with atomic_file(target, ".xml") as part:
             document.save(part, target)
-        notes.print(f"written to {target}")
+        stderr_console.print(f"written to {target}")
     elif document.assets:
         message = f"refers to {len(document.assets)} further files: give --out FILE.xml"
         raise InputError("the MJCF", message)

@@ -13,12 +13,20 @@ from typing import Any
 import numpy as np
 
 import hydrotele
-from hydrotele.cli.console import notes, out, plain, print_json, stages, table, write_json
-from hydrotele.cli.opening import machine_of
-from hydrotele.core.datafile import suggest
+from hydrotele.cli.console import (
+    make_table,
+    print_json,
+    show_stages,
+    stderr_console,
+    stdout_console,
+    to_json_types,
+    write_json,
+)
+from hydrotele.cli.opening import find_machine
+from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
-from hydrotele.core.output import check_target, whole_folder
-from hydrotele.core.units import customary
+from hydrotele.core.output import atomic_folder, check_output_folder
+from hydrotele.core.units import display_unit
 from hydrotele.estimate.baselines import BASELINES, fit_baseline
 from hydrotele.estimate.free_run import (
     TO_THE_END,
@@ -33,40 +41,43 @@ from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.logs.dataset import Dataset, RunData, load_dataset
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import MACHINE_FILE
-from hydrotele.machine.signals import usual_unit
+from hydrotele.machine.signals import default_unit
 from hydrotele.simulate.native import stop_profiling_clock
 
-_MADE = ("patched", "identified")  # subfolders in which `gap` and `identify` write the machine
-_PICTURED, _MOST_PLOTS = 120.0, 12  # duration [s] and number of channels in the plot
-_ROW_BY_ROW = "one row"
+_MACHINE_SUBFOLDERS = (
+    "patched",
+    "identified",
+)  # subfolders in which `gap` and `identify` write the machine
+_MAX_PLOT_SECONDS, _MAX_PLOTS = 120.0, 12  # duration [s] and number of channels in the plot
+_ONE_STEP = "one row"
 
 
 @dataclasses.dataclass(frozen=True)
-class Compared:
+class ModelComparison:
     """Prediction errors of one model on all evaluated runs.
 
     Attributes:
         name: name or folder that the user gave.
         kind: `machine` or `baseline`.
         runs: prediction errors, one item per run.
-        pictured: (n, c) open-loop predictions of n rows and c channels of the first run.
+        plotted_prediction: (n, c) open-loop predictions of n rows and c channels of the first run.
     """
 
     name: str
     kind: str
     runs: tuple[RunErrors, ...]
-    pictured: np.ndarray
+    plotted_prediction: np.ndarray
 
-    def mean(self, horizon: str) -> np.ndarray:
-        """Return the (c,) RMS errors at a horizon or `_ROW_BY_ROW`, averaged over the runs."""
-        if horizon == _ROW_BY_ROW:
+    def mean_errors(self, horizon: str) -> np.ndarray:
+        """Return the (c,) RMS errors at a horizon or `_ONE_STEP`, averaged over the runs."""
+        if horizon == _ONE_STEP:
             found = [errors.one_step for errors in self.runs]
         else:
             found = [e.horizons[horizon].rms for e in self.runs if horizon in e.horizons]
         columns = [column[~np.isnan(column)] for column in np.array(found).T]
         return np.array([column.mean() if len(column) else math.nan for column in columns])
 
-    def count(self, horizon: str) -> tuple[int, int]:
+    def count_diverged(self, horizon: str) -> tuple[int, int]:
         """Return the number of diverged predictions at a horizon and the number of predictions."""
         found = [e.horizons[horizon] for e in self.runs if horizon in e.horizons]
         return sum(h.diverged for h in found), sum(h.windows for h in found)
@@ -74,7 +85,7 @@ class Compared:
 
 def compare_models(
     machines: Sequence[str], data: Sequence[Path], tool: str | None, heldout: str | None,
-    sensors: str | None, horizons: Sequence[float], baselines: Sequence[str], every: bool,
+    sensors: str | None, horizons: Sequence[float], baselines: Sequence[str], include_fitted: bool,
     target: Path | None, as_json: bool, force: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
     """Compare models on runs that were not used to fit them.
@@ -88,7 +99,7 @@ def compare_models(
         sensors: name of the machines' sensor set, None for that named by the logs.
         horizons: prediction horizons [s].
         baselines: names of black-box models, which are fitted on the other runs.
-        every: evaluate the models on the fitted runs as well.
+        include_fitted: evaluate the models on the fitted runs as well.
         target: folder for compare.json and the plot, None to write nothing.
         as_json: print JSON instead of tables.
         force: accept logs whose metadata name another machine or tool.
@@ -101,44 +112,47 @@ def compare_models(
     """
     for name in baselines:
         if name not in BASELINES:
-            raise InputError(f"--baseline {name}", f"is not known; {suggest(name, BASELINES)}")
+            raise InputError(f"--baseline {name}", f"is not known; {suggest_valid_name(name, BASELINES)}")
     if target is not None:
-        check_target(target, "compare")
+        check_output_folder(target, "compare")
     stop_profiling_clock()
-    named = {name: machine_of(data, machine_place(name), tool) for name in machines}
+    named = {name: find_machine(data, machine_folder(name), tool) for name in machines}
     dataset = load_dataset(
         list(data), next(iter(named.values())), sensors, heldout, force=force
     )  # fmt: skip
     for name, machine in named.items():
-        _check_fits(name, machine, dataset)
-    judged = [*dataset.fit, dataset.heldout] if every else [dataset.heldout]
+        _check_same_channels(name, machine, dataset)
+    judged = [*dataset.fit, dataset.heldout] if include_fitted else [dataset.heldout]
     _check_horizons(horizons, judged)
-    with stages("compare", as_json) as progress:
-        compared = _compare(named, baselines, dataset, judged, horizons, progress)
-    shown = _shown_horizons(compared)
+    with show_stages("compare", as_json) as progress:
+        compared = _evaluate_models(named, baselines, dataset, judged, horizons, progress)
+    shown = _available_horizons(compared)
     document = compare_document(compared, shown, dataset, data)
     if target is not None:
-        with whole_folder(target, "compare") as folder:
-            _write(folder, document, compared, dataset, judged[0], _pictured(horizons, judged[0]))
+        with atomic_folder(target, "compare") as folder:
+            _write(folder, document, compared, dataset, judged[0], _plot_horizon(horizons, judged[0]))
     if as_json:
         print_json(document)
     else:
         _print(compared, shown, dataset, judged)
         if target is not None:
-            out.print(f"written to [bold]{target}[/]")
+            stdout_console.print(f"written to [bold]{target}[/]")
     return document
 
 
-def machine_place(name: str) -> str:
+def machine_folder(name: str) -> str:
     """Return the folder of the machine in a result folder of `gap` or `identify`, else `name`."""
-    for inside in _MADE:
+    for inside in _MACHINE_SUBFOLDERS:
         if (Path(name) / inside / MACHINE_FILE).is_file():
             return str(Path(name) / inside)
     return name
 
 
 def compare_document(
-    compared: Sequence[Compared], shown: Sequence[str], dataset: Dataset, data: Sequence[Path]
+    comparisons: Sequence[ModelComparison],
+    printed_horizons: Sequence[str],
+    dataset: Dataset,
+    data: Sequence[Path],
 ) -> dict[str, Any]:
     """Return the comparison as JSON data: RMS errors in SI units, None if a model diverged."""
 
@@ -146,7 +160,7 @@ def compare_document(
         return dict(zip(dataset.channels, values.tolist(), strict=True))
 
     models = []
-    for model in compared:
+    for model in comparisons:
         runs = [
             {
                 "run": errors.run,
@@ -162,54 +176,54 @@ def compare_document(
             }
             for errors in model.runs
         ]  # fmt: skip
-        mean = {name: by_channel(model.mean(name)) for name in shown}
-        one_step = by_channel(model.mean(_ROW_BY_ROW))
+        mean = {name: by_channel(model.mean_errors(name)) for name in printed_horizons}
+        one_step = by_channel(model.mean_errors(_ONE_STEP))
         models.append(
             {"name": model.name, "kind": model.kind, "runs": runs,
              "mean": {"one_step": one_step, "horizons": mean}}
         )  # fmt: skip
-    return plain(
+    return to_json_types(
         {
             "machine": dataset.machine.name,
             "data": [str(path) for path in data],
             "fitted": [run.name for run in dataset.fit],
-            "judged": [errors.run for errors in compared[0].runs],
-            "units": {channel: usual_unit(channel) for channel in dataset.channels},
+            "judged": [errors.run for errors in comparisons[0].runs],
+            "units": {channel: default_unit(channel) for channel in dataset.channels},
             "models": models,
             "notes": list(dataset.notes),
         }
     )
 
 
-def _compare(
-    named: dict[str, Machine], baselines: Sequence[str], dataset: Dataset,
-    judged: Sequence[RunData], horizons: Sequence[float], progress: Callable | None,
-) -> list[Compared]:  # fmt: skip
+def _evaluate_models(
+    machines: dict[str, Machine], baselines: Sequence[str], dataset: Dataset,
+    evaluated_runs: Sequence[RunData], horizons: Sequence[float], progress: Callable | None,
+) -> list[ModelComparison]:  # fmt: skip
     say = progress or (lambda said, share: None)
-    total = (len(named) + len(baselines)) * (len(judged) + 1)
+    total = (len(machines) + len(baselines)) * (len(evaluated_runs) + 1)
     models: list[tuple[str, str, Callable[[], Prepare]]] = [
         (name, "machine", lambda machine=machine: machine_runner(machine, dataset))
-        for name, machine in named.items()
+        for name, machine in machines.items()
     ]
     models += [(n, "baseline", lambda n=n: fit_baseline(n, dataset)) for n in baselines]
     compared, done = [], 0
     for name, kind, make in models:
         say(name, done / total)
         prepare, errors, pictured = make(), [], np.empty(0)
-        for run in judged:
+        for run in evaluated_runs:
             done += 1
             say(f"{name} on {run.name}", done / total)
             runner = prepare(run)
             errors.append(free_run_errors(runner, run, horizons))
-            if run is judged[0]:
-                begin = _beginning(run)
-                pictured = chained(runner, begin, _pictured(horizons, run))
+            if run is evaluated_runs[0]:
+                begin = _first_rows(run)
+                pictured = chained(runner, begin, _plot_horizon(horizons, run))
         done += 1
-        compared.append(Compared(name, kind, tuple(errors), pictured))
+        compared.append(ModelComparison(name, kind, tuple(errors), pictured))
     return compared
 
 
-def _check_fits(name: str, machine: Machine, dataset: Dataset) -> None:
+def _check_same_channels(name: str, machine: Machine, dataset: Dataset) -> None:
     """Raise InputError if a machine has other axes or channels than the first machine."""
     if tuple(actuator_order(machine)) != dataset.axes:
         raise InputError(
@@ -222,29 +236,27 @@ def _check_fits(name: str, machine: Machine, dataset: Dataset) -> None:
         raise InputError(f"machine {name}", f"does not predict {', '.join(lacking)}")
 
 
-def _check_horizons(horizons: Sequence[float], judged: Sequence[RunData]) -> None:
+def _check_horizons(horizons: Sequence[float], evaluated_runs: Sequence[RunData]) -> None:
     for seconds in horizons:
-        rows = max(run.period for run in judged)
+        rows = max(run.period for run in evaluated_runs)
         if not (math.isfinite(seconds) and seconds >= rows):
-            raise InputError(
-                f"--horizons {seconds:g}", f"must be at least {rows:g} s, the log's sample period"
-            )
+            raise InputError(f"--horizons {seconds:g}", f"must be at least {rows:g} s, the log's sample period")
 
 
-def _shown_horizons(compared: Sequence[Compared]) -> list[str]:
+def _available_horizons(comparisons: Sequence[ModelComparison]) -> list[str]:
     """Return the horizons that fit into at least one evaluated run, in ascending order."""
-    found = {name: h.seconds for m in compared for e in m.runs for name, h in e.horizons.items()}
+    found = {name: h.seconds for m in comparisons for e in m.runs for name, h in e.horizons.items()}
     return sorted(found, key=lambda name: math.inf if name == TO_THE_END else found[name])
 
 
-def _pictured(horizons: Sequence[float], run: RunData) -> float:
+def _plot_horizon(horizons: Sequence[float], run: RunData) -> float:
     """Return the longest horizon that fits three times into the plot, else a third of it [s]."""
-    seconds = min(_PICTURED, len(run.reading) * run.period)
+    seconds = min(_MAX_PLOT_SECONDS, len(run.reading) * run.period)
     return max([h for h in horizons if 3.0 * h <= seconds], default=seconds / 3.0)
 
 
-def _beginning(run: RunData) -> RunData:
-    rows = slice(0, round(_PICTURED / run.period))
+def _first_rows(run: RunData) -> RunData:
+    rows = slice(0, round(_MAX_PLOT_SECONDS / run.period))
     return dataclasses.replace(
         run, command=run.command[rows], command_known=run.command_known[rows],
         reading=run.reading[rows],
@@ -252,19 +264,19 @@ def _beginning(run: RunData) -> RunData:
 
 
 def _write(
-    folder: Path, document: dict[str, Any], compared: Sequence[Compared], dataset: Dataset,
+    folder: Path, document: dict[str, Any], comparisons: Sequence[ModelComparison], dataset: Dataset,
     run: RunData, seconds: float,
 ) -> None:  # fmt: skip
-    from hydrotele.show.overlay import draw_free_runs
+    from hydrotele.show.overlay import draw_open_loop_predictions
 
     write_json(folder / "compare.json", document)
-    notes.print("drawing free_run.png ...", style="dim")
-    begin, some = _beginning(run), slice(0, _MOST_PLOTS)
+    stderr_console.print("drawing free_run.png ...", style="dim")
+    begin, some = _first_rows(run), slice(0, _MAX_PLOTS)
     time = run.start + run.period * np.arange(len(begin.reading))
     channels = dataset.channels[some]
-    picture = draw_free_runs(
-        time, begin.reading[:, some], {m.name: m.pictured[:, some] for m in compared}, channels,
-        [usual_unit(channel) for channel in channels],
+    picture = draw_open_loop_predictions(
+        time, begin.reading[:, some], {m.name: m.plotted_prediction[:, some] for m in comparisons}, channels,
+        [default_unit(channel) for channel in channels],
         f"{run.name}: open-loop predictions, restarted every {seconds:.3g} s",
     )  # fmt: skip
     (folder / "free_run.png").write_bytes(picture)
@@ -272,7 +284,7 @@ def _write(
         "kind": "compare",
         "machine": document["machine"],
         "data": document["data"],
-        "models": [model.name for model in compared],
+        "models": [model.name for model in comparisons],
         "judged": document["judged"],
         "hydrotele": hydrotele.__version__,
     }
@@ -280,42 +292,51 @@ def _write(
 
 
 def _print(
-    compared: Sequence[Compared], shown: Sequence[str], dataset: Dataset, judged: Sequence[RunData]
+    comparisons: Sequence[ModelComparison],
+    printed_horizons: Sequence[str],
+    dataset: Dataset,
+    evaluated_runs: Sequence[RunData],
 ) -> None:
-    runs = ", ".join(run.name for run in judged)
+    runs = ", ".join(run.name for run in evaluated_runs)
     title = f"RMS prediction error on {runs} (lower is better; bold: best model)"
-    rows = table(title, "channel", "horizon", *(m.name for m in compared), "unit")
+    rows = make_table(title, "channel", "horizon", *(m.name for m in comparisons), "unit")
     for c, channel in enumerate(dataset.channels):
-        errors = {h: [m.mean(h)[c] for m in compared] for h in (_ROW_BY_ROW, *shown)}
+        errors = {h: [m.mean_errors(h)[c] for m in comparisons] for h in (_ONE_STEP, *printed_horizons)}
         finite = [e for row in errors.values() for e in row if math.isfinite(e)]
-        unit, factor = customary(usual_unit(channel), max(finite, default=math.nan))
+        unit, factor = display_unit(default_unit(channel), max(finite, default=math.nan))
         for horizon, row in errors.items():
-            cells = [_cell(m, horizon, e * factor) for m, e in zip(compared, row, strict=True)]
+            cells = [_format_error(m, horizon, e * factor) for m, e in zip(comparisons, row, strict=True)]
             best = min((e for e in row if math.isfinite(e)), default=math.nan)
             cells = [f"[bold]{cell}[/]" if e == best and len(row) > 1 else cell
                      for cell, e in zip(cells, row, strict=True)]  # fmt: skip
-            first = channel if horizon == _ROW_BY_ROW else ""
-            rows.add_row(first, _ahead(horizon), *cells, unit, end_section=horizon == shown[-1])
-    out.print(rows)
-    fitted = [m.name for m in compared if m.kind == "baseline"]
+            first = channel if horizon == _ONE_STEP else ""
+            rows.add_row(
+                first,
+                _format_horizon(horizon),
+                *cells,
+                unit,
+                end_section=horizon == printed_horizons[-1],
+            )
+    stdout_console.print(rows)
+    fitted = [m.name for m in comparisons if m.kind == "baseline"]
     if fitted:
         trained = ", ".join(run.name for run in dataset.fit)
-        out.print(f"{', '.join(fitted)}: fitted on {trained}")
+        stdout_console.print(f"{', '.join(fitted)}: fitted on {trained}")
     for note in dataset.notes:
-        out.print(f"[yellow]note[/] {note}")
+        stdout_console.print(f"[yellow]note[/] {note}")
 
 
-def _ahead(horizon: str) -> str:
-    if horizon in (_ROW_BY_ROW, TO_THE_END):
-        return {_ROW_BY_ROW: _ROW_BY_ROW, TO_THE_END: "whole run"}[horizon]
+def _format_horizon(horizon: str) -> str:
+    if horizon in (_ONE_STEP, TO_THE_END):
+        return {_ONE_STEP: _ONE_STEP, TO_THE_END: "whole run"}[horizon]
     return f"{horizon} s"
 
 
-def _cell(model: Compared, horizon: str, error: float) -> str:
+def _format_error(model: ModelComparison, horizon: str, error: float) -> str:
     """Format an error in customary units, or the number of diverged predictions."""
     if math.isnan(error):
         return "-"
     if math.isinf(error):
-        gone, windows = model.count(horizon)
+        gone, windows = model.count_diverged(horizon)
         return f"diverged in {gone} of {windows}" if windows else "diverged"
     return f"{error:.3g}"

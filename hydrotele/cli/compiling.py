@@ -106,9 +106,7 @@ def compile_all(processes: int | None = None) -> None:
     """
     folder = cache_folder()
     if folder is None:
-        raise InputError(
-            "cache", "no folder is writable by you alone; set XDG_CACHE_HOME to such a folder"
-        )
+        raise InputError("cache", "no folder is writable by you alone; set XDG_CACHE_HOME to such a folder")
     complete = folder / f"complete_{_digest()}"
     if complete.exists():
         typer.echo("all functions are compiled already")

@@ -20,10 +20,10 @@ from rich.table import Table
 from rich.text import Text
 
 Progress = Callable[[float, float], None]
-_BEAT = 15.0  # s between progress lines if standard error is not a terminal
+_STATUS_PERIOD = 15.0  # s between progress lines if standard error is not a terminal
 
 _STYLES = "bold|dim|red|green|yellow|blue|magenta"
-_NO_TAG = re.compile(rf"(?<!\\)\[(?!/\]|(?:{_STYLES})(?: (?:{_STYLES}))*\])")
+_UNKNOWN_TAG = re.compile(rf"(?<!\\)\[(?!/\]|(?:{_STYLES})(?: (?:{_STYLES}))*\])")
 
 
 class _Console(Console):
@@ -32,29 +32,27 @@ class _Console(Console):
     def render_str(self, text: str, **options: Any) -> Text:
         """Return the text with its styles; print unknown or unmatched tags unchanged."""
         try:
-            return super().render_str(_NO_TAG.sub(r"\[", text), **options)
+            return super().render_str(_UNKNOWN_TAG.sub(r"\[", text), **options)
         except MarkupError:
             return super().render_str(text, **{**options, "markup": False})
 
 
-out = _Console(highlight=False, emoji=False)
-notes = _Console(stderr=True, highlight=False, emoji=False)
+stdout_console = _Console(highlight=False, emoji=False)
+stderr_console = _Console(stderr=True, highlight=False, emoji=False)
 
 
 def print_json(data: Any) -> None:
     """Print data as JSON; NaN and infinity become null."""
-    print(json.dumps(plain(data), indent=2))
+    print(json.dumps(to_json_types(data), indent=2))
 
 
 def write_json(path: Path, data: Any) -> None:
     """Write data as JSON into a file; NaN and infinity become null."""
-    text = json.dumps(plain(data), indent=2, allow_nan=False)
+    text = json.dumps(to_json_types(data), indent=2, allow_nan=False)
     path.write_text(text + "\n", encoding="utf-8")
 
 
-def print_result(
-    document: Any, as_json: bool, show: Callable[[], None], target: Path | None
-) -> None:
+def print_result(document: Any, as_json: bool, show: Callable[[], None], target: Path | None) -> None:
     """Print the result of a command as JSON, or as text followed by the path of its report.
 
     Args:
@@ -68,15 +66,15 @@ def print_result(
         return
     show()
     if target:
-        out.print(f"written to [bold]{target}[/]; open {target}/report.html")
+        stdout_console.print(f"written to [bold]{target}[/]; open {target}/report.html")
 
 
-def plain(data: Any) -> Any:
+def to_json_types(data: Any) -> Any:
     """Convert data to Python types for JSON; NaN and infinity become None."""
     if isinstance(data, dict):
-        return {str(key): plain(value) for key, value in data.items()}
+        return {str(key): to_json_types(value) for key, value in data.items()}
     if isinstance(data, (list, tuple, np.ndarray)):
-        return [plain(value) for value in data]
+        return [to_json_types(value) for value in data]
     if isinstance(data, (float, np.floating)):
         return float(data) if np.isfinite(data) else None
     if isinstance(data, np.integer):
@@ -84,7 +82,7 @@ def plain(data: Any) -> Any:
     return data
 
 
-def table(title: str, *columns: str) -> Table:
+def make_table(title: str, *columns: str) -> Table:
     """Return an empty table in which all columns but the first are right-aligned."""
     made = Table(title=title, title_justify="left", header_style="bold")
     for place, column in enumerate(columns):
@@ -93,14 +91,14 @@ def table(title: str, *columns: str) -> Table:
 
 
 @contextlib.contextmanager
-def _heartbeat(label: str) -> Iterator[Callable[[str], None]]:
-    """Print the latest status text and the elapsed time on stderr every `_BEAT` seconds."""
+def _print_status_regularly(label: str) -> Iterator[Callable[[str], None]]:
+    """Print the latest status text and the elapsed time on stderr every `_STATUS_PERIOD` seconds."""
     begin, last, over = time.perf_counter(), ["starts"], threading.Event()
 
     def beat() -> None:
-        while not over.wait(_BEAT):
+        while not over.wait(_STATUS_PERIOD):
             line = f"{label}: {last[0]}, {time.perf_counter() - begin:.0f} s"
-            notes.print(line, markup=False, soft_wrap=True)
+            stderr_console.print(line, markup=False, soft_wrap=True)
 
     def tell(text: str) -> None:
         last[0] = text
@@ -115,10 +113,10 @@ def _heartbeat(label: str) -> Iterator[Callable[[str], None]]:
 
 
 @contextlib.contextmanager
-def progress_bar(label: str, quiet: bool = False) -> Iterator[Progress | None]:
+def show_simulation_progress(label: str, quiet: bool = False) -> Iterator[Progress | None]:
     """Show simulated time and real-time factor on stderr while a simulation runs.
 
-    On a terminal this is a progress bar, otherwise a line every `_BEAT` seconds.
+    On a terminal this is a progress bar, otherwise a line every `_STATUS_PERIOD` seconds.
 
     Yields:
         A function of simulated and total time [s] that updates the display, None if `quiet`.
@@ -126,15 +124,20 @@ def progress_bar(label: str, quiet: bool = False) -> Iterator[Progress | None]:
     if quiet:
         yield None
         return
-    if not notes.is_terminal:
-        with _heartbeat(label) as tell:
+    if not stderr_console.is_terminal:
+        with _print_status_regularly(label) as tell:
             yield lambda done, total: tell(f"{done:.1f} of {total:.1f} s simulated")
         return
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     text = TextColumn("{task.completed:6.1f} / {task.total:.1f} s  {task.fields[factor]}")
     bar = Progress(
-        TextColumn(label), BarColumn(), text, TimeRemainingColumn(), console=notes, transient=True
+        TextColumn(label),
+        BarColumn(),
+        text,
+        TimeRemainingColumn(),
+        console=stderr_console,
+        transient=True,
     )
     with bar:
         task = bar.add_task(label, total=1.0, factor="")
@@ -148,7 +151,7 @@ def progress_bar(label: str, quiet: bool = False) -> Iterator[Progress | None]:
 
 
 @contextlib.contextmanager
-def stages(label: str, quiet: bool) -> Iterator[Callable[[str, float], None] | None]:
+def show_stages(label: str, quiet: bool) -> Iterator[Callable[[str, float], None] | None]:
     """Show the current stage of a computation on stderr, as a progress bar or as lines.
 
     Yields:
@@ -157,15 +160,15 @@ def stages(label: str, quiet: bool) -> Iterator[Callable[[str, float], None] | N
     if quiet:
         yield None
         return
-    if not notes.is_terminal:
-        with _heartbeat(label) as tell:
+    if not stderr_console.is_terminal:
+        with _print_status_regularly(label) as tell:
             yield lambda said, fraction: tell(f"{100.0 * fraction:.0f} %, {said}")
         return
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
     columns = TextColumn(label), BarColumn(), TaskProgressColumn(), TimeElapsedColumn()
     stage = TextColumn("{task.description}")
-    with Progress(*columns, stage, console=notes, transient=True) as bar:
+    with Progress(*columns, stage, console=stderr_console, transient=True) as bar:
         task = bar.add_task("", total=1.0)
 
         def update(said: str, fraction: float) -> None:
@@ -175,7 +178,7 @@ def stages(label: str, quiet: bool) -> Iterator[Callable[[str, float], None] | N
 
 
 @contextlib.contextmanager
-def first_interrupt() -> Iterator[Callable[[], bool]]:
+def catch_first_interrupt() -> Iterator[Callable[[], bool]]:
     """Handle the first Ctrl-C as a request to stop; the second one raises KeyboardInterrupt.
 
     Yields:

@@ -12,40 +12,43 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from hydrotele.cli.console import first_interrupt, notes, out, print_json
-from hydrotele.cli.haptic import own_device, print_latency
+from hydrotele.cli.console import catch_first_interrupt, print_json, stderr_console, stdout_console
+from hydrotele.cli.haptic import print_latency, run_simulated_device
 from hydrotele.cli.running import print_summary, write_run
 from hydrotele.core.errors import InputError
-from hydrotele.core.output import check_target, whole_folder
+from hydrotele.core.output import atomic_folder, check_output_folder
 from hydrotele.haptics.timing import (
-    Deadlines,
-    computer_alone,
+    RealTimePacer,
     load_of_machine,
-    stolen_time,
-    summary_of,
+    measure_idle_deadlines,
+    read_steal_time,
+    summarise_durations,
 )
 from hydrotele.run.devices import Device, Keyboard, open_device
 from hydrotele.run.live import (
     HAPTIC,
-    RATE,
+    HAPTIC_CONTROL_RATE,
     HapticHandle,
     Pacer,
     Status,
-    Watch,
-    drive,
-    further_axes,
+    TickCallback,
+    additional_axes,
+    drive_scenario,
     haptic_address,
 )
-from hydrotele.run.run import Run, Session, scenario_machine
+from hydrotele.run.run import Run, Session, load_simulated_machine
 from hydrotele.scenario.scenario import Scenario, load_scenario
-from hydrotele.simulate.closure import following_joints
+from hydrotele.simulate.closure import dependent_joints
 from hydrotele.simulate.native import stop_profiling_clock
 
-LONGEST = 600.0  # s, duration of a drive without --duration
-LATENCY = 60.0  # s, duration of a drive that only measures latency
-_ALONE = (1.0, 20.0)  # s, min and max duration of the idle loop that precedes a latency test
-_PRIORITY = 20  # real-time priority of the machine, below those of channel and device
-_FRAMES, _LINES = 30.0, 5.0  # Hz, update rates of window and status line
+DEFAULT_DURATION = 600.0  # s, duration of a drive without --duration
+LATENCY_TEST_DURATION = 60.0  # s, duration of a drive that only measures latency
+_IDLE_TEST_LIMITS = (
+    1.0,
+    20.0,
+)  # s, min and max duration of the idle loop that precedes a latency test
+_MACHINE_PRIORITY = 20  # real-time priority of the machine, below those of channel and device
+_WINDOW_RATE, _STATUS_LINE_RATE = 30.0, 5.0  # Hz, update rates of window and status line
 
 
 class DriveOptions(NamedTuple):
@@ -63,7 +66,7 @@ class DriveOptions(NamedTuple):
     latency: bool = False
 
 
-def drive_to_folder(wishes: DriveOptions) -> Path:
+def drive_to_folder(options: DriveOptions) -> Path:
     """Drive a machine in real time, and write the results to a folder.
 
     The output folder is written completely or not at all.
@@ -76,62 +79,65 @@ def drive_to_folder(wishes: DriveOptions) -> Path:
         SimulationFailed: the state of the simulation is no longer finite.
     """
     stop_profiling_clock()
-    if _is_haptic(wishes) and wishes.speed != 1.0:
+    if _is_haptic_device(options) and options.speed != 1.0:
         raise InputError("--speed", "must be 1 with a haptic device, which runs in real time")
-    if not wishes.speed >= 0.0:
+    if not options.speed >= 0.0:
         raise InputError("--speed", "must be 0 (as fast as possible) or more; 1 is real time")
-    if wishes.device == "keyboard" and not wishes.viewer and not wishes.latency:
+    if options.device == "keyboard" and not options.viewer and not options.latency:
         message = "needs the viewer window to read keys; omit --no-viewer or use another device"
         raise InputError("--device keyboard", message)
-    if wishes.latency:
-        return _measured_latency(wishes)
-    return _driven(wishes)
+    if options.latency:
+        return _drive_with_latency_test(options)
+    return _drive_once(options)
 
 
-def _driven(wishes: DriveOptions, alone: Mapping[str, Any] = MappingProxyType({})) -> Path:
+def _drive_once(options: DriveOptions, idle_test: Mapping[str, Any] = MappingProxyType({})) -> Path:
     """Drive the machine once and write the results.
 
     Args:
-        wishes: options of the command.
-        alone: deadlines missed by an idle loop on this computer, from `computer_alone`.
+        options: options of the command.
+        idle_test: deadlines missed by an idle loop on this computer, from `measure_idle_deadlines`.
 
     Returns:
         The output folder.
     """
-    scenario = _scenario(wishes)
-    target = wishes.target or Path("runs", scenario.name)
-    check_target(target, "run")
-    machine = scenario_machine(scenario)
-    further = tuple(further_axes(machine))
-    if _is_haptic(wishes):
-        device = HapticHandle(*haptic_address(wishes.device), len(further))
-        pacer = Deadlines(scenario.ticks, _PRIORITY)
+    scenario = _load_drive_scenario(options)
+    target = options.target or Path("runs", scenario.name)
+    check_output_folder(target, "run")
+    machine = load_simulated_machine(scenario)
+    further = tuple(additional_axes(machine))
+    if _is_haptic_device(options):
+        device = HapticHandle(*haptic_address(options.device), len(further))
+        pacer = RealTimePacer(scenario.tick_count, _MACHINE_PRIORITY)
     else:
-        device, pacer = open_device(wishes.device, further), Pacer(wishes.speed)
-    stolen, begun = stolen_time(), clock.monotonic()
+        device, pacer = open_device(options.device, further), Pacer(options.speed)
+    stolen, begun = read_steal_time(), clock.monotonic()
     try:
-        with first_interrupt() as interrupted, _watching(wishes, device, interrupted) as watch:
-            result = drive(scenario, machine, device, pacer, watch, _say)
+        with (
+            catch_first_interrupt() as interrupted,
+            _show_progress(options, device, interrupted) as watch,
+        ):
+            result = drive_scenario(scenario, machine, device, pacer, watch, _print_message)
     finally:
         pacer.close()
         device.close()
-    if isinstance(pacer, Deadlines):
+    if isinstance(pacer, RealTimePacer):
         machine_side = {
             "control_rate": scenario.control_rate, "ticks": pacer.ticks, "missed": pacer.missed,
-            "late": summary_of(pacer.lateness()), "priority": pacer.priority,
+            "late": summarise_durations(pacer.delays()), "priority": pacer.priority,
             "load": load_of_machine(),
         }  # fmt: skip
         result.summary["haptic"] = {
             "machine": machine_side, "line": result.summary["haptic"],
-            "computer": {**alone, **_stolen(stolen, clock.monotonic() - begun)},
+            "computer": {**idle_test, **_measure_stolen_time(stolen, clock.monotonic() - begun)},
         }  # fmt: skip
-    _write(result, target, wishes)
+    _write(result, target, options)
     return target
 
 
-def _stolen(before: float | None, seconds: float) -> dict[str, float | None]:
+def _measure_stolen_time(before: float | None, seconds: float) -> dict[str, float | None]:
     """Return the processor time taken by the host since `before` [s] and its fraction [1]."""
-    after = stolen_time()
+    after = read_steal_time()
     if before is None or after is None:
         return {"stolen_seconds": None, "stolen_share": None}
     taken = after - before
@@ -139,40 +145,40 @@ def _stolen(before: float | None, seconds: float) -> dict[str, float | None]:
     return {"stolen_seconds": round(taken, 3), "stolen_share": round(share, 6)}
 
 
-def _measured_latency(wishes: DriveOptions) -> Path:
+def _drive_with_latency_test(options: DriveOptions) -> Path:
     """Drive with a haptic device and print latencies; start a simulated device if none is given."""
-    if _is_haptic(wishes):
-        return _driven(wishes, _alone(_scenario(wishes).duration))
-    if wishes.device != "keyboard":
+    if _is_haptic_device(options):
+        return _drive_once(options, _run_idle_test(_load_drive_scenario(options).duration))
+    if options.device != "keyboard":
         message = "has no force output: omit --device, or give --device haptic:HOST:PORT"
-        raise InputError(f"--latency with --device {wishes.device}", message)
-    duration = LATENCY if wishes.duration is None else wishes.duration
-    _scenario(wishes)  # report errors of the scenario before the measurement starts
-    alone = _alone(duration)  # before the device starts, because its start-up loads the computer
-    with own_device() as (host, port):
+        raise InputError(f"--latency with --device {options.device}", message)
+    duration = LATENCY_TEST_DURATION if options.duration is None else options.duration
+    _load_drive_scenario(options)  # report errors of the scenario before the measurement starts
+    alone = _run_idle_test(duration)  # before the device starts, because its start-up loads the computer
+    with run_simulated_device() as (host, port):
         own = {"device": f"{HAPTIC}:{host}:{port}", "duration": duration}
-        return _driven(wishes._replace(viewer=False, review=False, **own), alone)
+        return _drive_once(options._replace(viewer=False, review=False, **own), alone)
 
 
-def _alone(duration: float) -> dict[str, Any]:
+def _run_idle_test(duration: float) -> dict[str, Any]:
     """Measure the deadlines that an idle loop misses on this computer.
 
     Args:
-        duration: duration of the drive [s]; the loop runs for a third of it, within `_ALONE`.
+        duration: duration of the drive [s]; the loop runs for a third of it, within `_IDLE_TEST_LIMITS`.
     """
-    seconds = min(_ALONE[1], max(_ALONE[0], duration / 3.0))
-    notes.print(f"running an idle loop for {seconds:.0f} s before the drive", style="dim")
-    return computer_alone(seconds, RATE, _PRIORITY)
+    seconds = min(_IDLE_TEST_LIMITS[1], max(_IDLE_TEST_LIMITS[0], duration / 3.0))
+    stderr_console.print(f"running an idle loop for {seconds:.0f} s before the drive", style="dim")
+    return measure_idle_deadlines(seconds, HAPTIC_CONTROL_RATE, _MACHINE_PRIORITY)
 
 
-def _is_haptic(wishes: DriveOptions) -> bool:
-    return wishes.device.split(":")[0] == HAPTIC
+def _is_haptic_device(options: DriveOptions) -> bool:
+    return options.device.split(":")[0] == HAPTIC
 
 
-def _write(result: Run, target: Path, wishes: DriveOptions) -> None:
-    with whole_folder(target, "run") as folder:
-        write_run(result, folder, wishes.review)
-    if wishes.json:
+def _write(result: Run, target: Path, options: DriveOptions) -> None:
+    with atomic_folder(target, "run") as folder:
+        write_run(result, folder, options.review)
+    if options.json:
         print_json({**result.summary, "folder": str(target)})
         return
     print_summary(result.summary)
@@ -180,55 +186,53 @@ def _write(result: Run, target: Path, wishes: DriveOptions) -> None:
         print_latency(result.summary["haptic"])
     if result.summary["pauses"]:
         said = f"{result.summary['late_seconds']:.2f} s late in {result.summary['pauses']} pauses"
-        out.print(f"[yellow]note[/] the simulation was slower than real time: {said}")
+        stdout_console.print(f"[yellow]note[/] the simulation was slower than real time: {said}")
     alike = "a similar run" if "haptic" in result.summary else "this run"
-    out.print(f"written to [bold]{target}[/]; hydrotele run with its scenario.yaml repeats {alike}")
+    stdout_console.print(f"written to [bold]{target}[/]; hydrotele run with its scenario.yaml repeats {alike}")
 
 
-def _scenario(wishes: DriveOptions) -> Scenario:
+def _load_drive_scenario(options: DriveOptions) -> Scenario:
     """Load the given scenario, or the default scenario of the machine."""
-    overrides, name = dict(wishes.overrides), wishes.scenario
-    duration = LONGEST if wishes.duration is None else wishes.duration
+    overrides, name = dict(options.overrides), options.scenario
+    duration = DEFAULT_DURATION if options.duration is None else options.duration
     if name is None:
-        own = _usual(overrides.get("machine", "cat215").strip('"'))
-        name = str(own or _usual("cat215"))
+        own = _default_scenario_path(overrides.get("machine", "cat215").strip('"'))
+        name = str(own or _default_scenario_path("cat215"))
         if own is None:  # a custom machine: drop the settings that are specific to cat215
             overrides = {"tool": "null", "sensors": "ideal", "servo": "{}"} | overrides
     overrides["duration"] = repr(duration)
-    if _is_haptic(wishes):
-        overrides = {"control_rate": repr(RATE)} | overrides
+    if _is_haptic_device(options):
+        overrides = {"control_rate": repr(HAPTIC_CONTROL_RATE)} | overrides
     scenario = load_scenario(name, overrides)
-    if wishes.scenario is None and "pilot.force" not in overrides and _loose(scenario):
+    if options.scenario is None and "pilot.force" not in overrides and _passive_joints(scenario):
         overrides |= {"pilot.force": '"true"', "sensors": "ideal"}
         scenario = load_scenario(name, overrides)
     return scenario
 
 
-def _loose(scenario: Scenario) -> list[str]:
+def _passive_joints(scenario: Scenario) -> list[str]:
     """Return the passive joints without a drive or a closure.
 
     With such joints, the force at the tip cannot be computed from the pressures.
     """
-    machine = scenario_machine(scenario)
-    known = {axis.joint for axis in machine.axes.values()} | set(following_joints(machine))
+    machine = load_simulated_machine(scenario)
+    known = {axis.joint for axis in machine.axes.values()} | set(dependent_joints(machine))
     return [joint for joint in machine.joints if joint not in known]
 
 
-def _usual(machine: str) -> Path | None:
+def _default_scenario_path(machine: str) -> Path | None:
     path = Path(__file__).with_name(f"drive_{machine}.yaml")
     return path if "/" not in machine and path.is_file() else None
 
 
-def _say(sentence: str) -> None:
-    if notes.is_terminal:
-        notes.file.write("\r\x1b[K")  # clear the status line
-    notes.print(f"[yellow]{sentence}[/]", soft_wrap=True)
+def _print_message(sentence: str) -> None:
+    if stderr_console.is_terminal:
+        stderr_console.file.write("\r\x1b[K")  # clear the status line
+    stderr_console.print(f"[yellow]{sentence}[/]", soft_wrap=True)
 
 
 @contextlib.contextmanager
-def _watching(
-    wishes: DriveOptions, device: Device, interrupted: Callable[[], bool]
-) -> Iterator[Watch]:
+def _show_progress(options: DriveOptions, device: Device, interrupted: Callable[[], bool]) -> Iterator[TickCallback]:
     """Show viewer window and status line during a drive.
 
     Yields:
@@ -236,25 +240,25 @@ def _watching(
     """
     from hydrotele.show.window import Window, check_screen
 
-    if wishes.viewer:
+    if options.viewer:
         check_screen()
-    lines = notes.is_terminal and not wishes.json
+    lines = stderr_console.is_terminal and not options.json
     window: list[Window] = []
     due = [0.0, 0.0]
 
     def watch(session: Session, status: Callable[[], Status], now: float) -> bool:
         if interrupted():
             return False
-        if wishes.viewer and now >= due[0]:
-            due[0] = now + 1.0 / _FRAMES
+        if options.viewer and now >= due[0]:
+            due[0] = now + 1.0 / _WINDOW_RATE
             if not window:
                 pressed = device.press if isinstance(device, Keyboard) else None
                 window.append(Window(session.plant, pressed))
             if not window[0].show(session.data.qpos, status().rows()):
                 return False
         if lines and now >= due[1]:
-            due[1] = now + 1.0 / _LINES
-            notes.print(_line(status()), end="\r", overflow="crop", no_wrap=True, style="dim")
+            due[1] = now + 1.0 / _STATUS_LINE_RATE
+            stderr_console.print(_line(status()), end="\r", overflow="crop", no_wrap=True, style="dim")
         return True
 
     try:

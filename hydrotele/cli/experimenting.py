@@ -9,12 +9,18 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import hydrotele
-from hydrotele.cli.console import notes, out, print_result, stages, write_json
+from hydrotele.cli.console import (
+    print_result,
+    show_stages,
+    stderr_console,
+    stdout_console,
+    write_json,
+)
 from hydrotele.core.errors import InputError
-from hydrotele.core.output import check_target, whole_folder
-from hydrotele.experiments.comparison import Comparison, Series, run_series, summarize
+from hydrotele.core.output import atomic_folder, check_output_folder
+from hydrotele.experiments.comparison import Comparison, Series, run_series, summarize_verdicts
 
-DOCUMENTS = ("abdellatif2008", "khoshzaban1992", "wang2012", "zhu1994")
+PUBLICATIONS = ("abdellatif2008", "khoshzaban1992", "wang2012", "zhu1994")
 """Names of the publications: modules of `hydrotele.experiments` that define `SERIES`."""
 
 _COLOURS = {"agrees": "green", "differs": "red", "undecided": "yellow"}
@@ -26,8 +32,8 @@ def load_series(name: str) -> Series:
     Raises:
         InputError: there is no publication of this name.
     """
-    if name not in DOCUMENTS:
-        raise InputError(f"experiments {name!r}", f"valid: {', '.join(DOCUMENTS)}")
+    if name not in PUBLICATIONS:
+        raise InputError(f"experiments {name!r}", f"valid: {', '.join(PUBLICATIONS)}")
     return importlib.import_module(f"hydrotele.experiments.{name}").SERIES
 
 
@@ -39,7 +45,7 @@ def experiments_to_folder(
     The output folder is written completely or not at all.
 
     Args:
-        name: name of the publication, one of `DOCUMENTS`.
+        name: name of the publication, one of `PUBLICATIONS`.
         target: output folder, default `runs/<name>`, or none with `as_json`.
         seeds: number of repetitions (operators or trials), default that of the publication.
         jobs: number of processes, default one per core.
@@ -55,39 +61,39 @@ def experiments_to_folder(
     seeds = seeds or series.repetitions
     target = target or (None if as_json else Path("runs") / name)
     if target:
-        check_target(target, "experiments")
-    with stages(f"experiments {name}", as_json) as progress:
+        check_output_folder(target, "experiments")
+    with show_stages(f"experiments {name}", as_json) as progress:
         rows = run_series(series, seeds, jobs, progress)
     if target:
-        with whole_folder(target, "experiments") as folder:
-            write_results(folder, series, seeds, rows)
+        with atomic_folder(target, "experiments") as folder:
+            write_comparison_files(folder, series, seeds, rows)
     print_result([row.row() for row in rows], as_json, lambda: _print(rows), target)
     return rows
 
 
-def write_results(folder: Path, series: Series, seeds: int, rows: list[Comparison]) -> None:
+def write_comparison_files(folder: Path, series: Series, seeds: int, rows: list[Comparison]) -> None:
     """Write table, report, figures and `experiments.json` of a publication into a folder."""
     from hydrotele.show.experiment_report import write_experiment_report
 
-    notes.print("writing report.html and figures ...", style="dim")
+    stderr_console.print("writing report.html and figures ...", style="dim")
     write_json(folder / "experiments.json", [row.row() for row in rows])
-    write_experiment_report(series.title, rows, series.drawings, folder)
-    text = f"`hydrotele experiments {series.name} --seeds {seeds}`: {summarize(rows)}.\n\n"
-    text += markdown_table(rows, series)
+    write_experiment_report(series.title, rows, series.items_without_result, folder)
+    text = f"`hydrotele experiments {series.name} --seeds {seeds}`: {summarize_verdicts(rows)}.\n\n"
+    text += format_markdown(rows, series)
     (folder / "table.md").write_text(f"# Experiments of {series.title}\n\n{text}", "utf-8")
     summary = {"kind": "experiments", "name": series.name, "hydrotele": hydrotele.__version__}
     write_json(folder / "summary.json", summary)
 
 
-def markdown_table(rows: Sequence[Comparison], series: Series) -> str:
+def format_markdown(rows: Sequence[Comparison], series: Series) -> str:
     """Format the comparisons as Markdown: results, model inputs, and items without a result."""
     lines = _table([row for row in rows if row.kind != "input"])
     inputs = [row for row in rows if row.kind == "input"]
     if inputs:
         lines += ["", "## Published values used as inputs of the model", "", *_table(inputs)]
-    if series.drawings:
+    if series.items_without_result:
         lines += ["", "## Tables and figures without a result", ""]
-        lines += [f"- {item}: {content}" for item, content in series.drawings.items()]
+        lines += [f"- {item}: {content}" for item, content in series.items_without_result.items()]
     return "\n".join(lines) + "\n"
 
 
@@ -108,12 +114,12 @@ def _table(rows: Sequence[Comparison]) -> list[str]:
 def _print(rows: Sequence[Comparison]) -> None:
     for row in rows:
         colour = _COLOURS.get(row.verdict, "dim")
-        out.print(f"[{colour}]{row.verdict}[/] [bold]{row.name}[/] ({row.item})")
+        stdout_console.print(f"[{colour}]{row.verdict}[/] [bold]{row.name}[/] ({row.item})")
         for label, text in (
             ("stated here" if row.kind == "additional" else "published", row.published),
             ("simulated", row.simulated), ("agrees if", row.criterion),
             ("reason", row.explanation),
         ):  # fmt: skip
             if text:
-                out.print(f"  {label}: {text}", markup=False)
-    out.print(summarize(rows)[:1].upper() + summarize(rows)[1:])
+                stdout_console.print(f"  {label}: {text}", markup=False)
+    stdout_console.print(summarize_verdicts(rows)[:1].upper() + summarize_verdicts(rows)[1:])

@@ -15,18 +15,25 @@ import numpy as np
 import yaml
 
 import hydrotele
-from hydrotele.cli.console import notes, out, print_result, stages, table, write_json
-from hydrotele.cli.opening import data_name, machine_of
-from hydrotele.core.datafile import suggest
+from hydrotele.cli.console import (
+    make_table,
+    print_result,
+    show_stages,
+    stderr_console,
+    stdout_console,
+    write_json,
+)
+from hydrotele.cli.opening import find_machine, name_of_data
+from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import models_folder
-from hydrotele.core.output import check_target, whole_folder
+from hydrotele.core.output import atomic_folder, check_output_folder
 from hydrotele.effects import EFFECTS
 from hydrotele.gap.description import effect_title, headline, verdict_words
 from hydrotele.gap.patched import add_head, has_patch, write_effects, write_patch
 from hydrotele.gap.result import Gap, finite, gap_document, in_customary_units
-from hydrotele.identify.mechanism import Mechanism, load_mechanism, mechanism_records
-from hydrotele.identify.motion import Processing, joint_motion, resolution
+from hydrotele.identify.mechanism import Mechanism, load_mechanism, load_mechanism_records
+from hydrotele.identify.motion import Processing, compute_joint_motion, estimate_resolution
 from hydrotele.logs.dataset import Dataset, load_dataset
 from hydrotele.machine.machine_file import MACHINE_FILE
 from hydrotele.simulate.driven_chain import open_loop_errors
@@ -71,20 +78,20 @@ def gap_to_folder(
     """
     for name in effects:
         if name not in EFFECTS:
-            raise InputError(f"--effect {name}", f"is not known; {suggest(name, EFFECTS)}")
-    target = target or Path(f"gap_{data_name(data)}")
-    check_target(target, "gap")
+            raise InputError(f"--effect {name}", f"is not known; {suggest_valid_name(name, EFFECTS)}")
+    target = target or Path(f"gap_{name_of_data(data)}")
+    check_output_folder(target, "gap")
     stop_profiling_clock()
-    model = machine_of(data, machine, tool)
+    model = find_machine(data, machine, tool)
     dataset = load_dataset(list(data), model, sensors, heldout, force=force, mask=mask)
-    gap = _search(dataset, effects, jobs, quiet=as_json)
-    with whole_folder(target, "gap") as folder:
-        write_gap(gap, dataset, folder, recording, data)
+    gap = _run_search(dataset, effects, jobs, quiet=as_json)
+    with atomic_folder(target, "gap") as folder:
+        write_gap_files(gap, dataset, folder, recording, data)
     print_result(gap_document(gap), as_json, lambda: _print(gap), target)
     return target
 
 
-def write_gap(
+def write_gap_files(
     gap: Gap, dataset: Dataset, folder: Path, recording: bool = True, data: Sequence[Path] = ()
 ) -> None:
     """Write `gap.json`, report, patched machine, next experiment and recording of a gap.
@@ -109,12 +116,12 @@ def write_gap(
         (folder / "next_experiment.yaml").write_text(text, encoding="utf-8")
     from hydrotele.show.gap_report import write_report
 
-    notes.print("writing report.html ...", style="dim")
+    stderr_console.print("writing report.html ...", style="dim")
     write_report(gap, folder / "report.html")
     if recording:
         from hydrotele.show.gap_recording import write_gap_recording
 
-        notes.print("writing recording.rrd ...", style="dim")
+        stderr_console.print("writing recording.rrd ...", style="dim")
         write_gap_recording(folder / "recording.rrd", gap, dataset.heldout, dataset.axes)
     summary = {
         "kind": "gap",
@@ -153,22 +160,20 @@ def gap_mjcf_to_folder(
     from hydrotele.gap.patched import COLUMNS_FILE, write_mechanism
     from hydrotele.show.gap_report import write_report
 
-    target = target or Path(f"gap_{data_name(data)}")
-    check_target(target, "gap")
+    target = target or Path(f"gap_{name_of_data(data)}")
+    check_output_folder(target, "gap")
     mechanism = load_mechanism(mjcf, columns)
-    fit, judge, said = mechanism_records(data, mechanism, heldout, as_measured=True)
-    with stages(f"gap {mechanism.setup.chain.name}", as_json) as progress:
+    fit, judge, said = load_mechanism_records(data, mechanism, heldout, keep_measured_joints=True)
+    with show_stages(f"gap {mechanism.setup.chain.name}", as_json) as progress:
         gap = find_mechanism_gap(mjcf, columns, fit, judge, progress, effects, said)
         if progress:
             progress("simulate the models with the measured forces", 0.95)
         try:
-            gap = dataclasses.replace(
-                gap, open_loop=mechanism_open_loop(gap, data, mechanism, heldout)
-            )
+            gap = dataclasses.replace(gap, open_loop=simulate_open_loop(gap, data, mechanism, heldout))
         except InputError as error:
             note = f"No open-loop prediction: {error}."
             gap = dataclasses.replace(gap, notes=(*gap.notes, note))
-    with whole_folder(target, "gap") as folder:
+    with atomic_folder(target, "gap") as folder:
         write_json(folder / "gap.json", gap_document(gap))
         if gap.patched is not gap.machine:
             patched = folder / "patched"
@@ -187,7 +192,7 @@ def gap_mjcf_to_folder(
     return target
 
 
-def mechanism_named(
+def find_mechanism_files(
     machine: str | None, mjcf: Path | None, columns: Path | None
 ) -> tuple[Path | None, Path | None]:
     """Return the files of the mechanism that the options select, if they select a mechanism.
@@ -218,10 +223,10 @@ def mechanism_named(
     return path, columns or (beside if beside.is_file() else None)
 
 
-_HORIZON = 0.25  # s; short, because an unstable mechanism diverges without control
+_OPEN_LOOP_HORIZON = 0.25  # s; short, because an unstable mechanism diverges without control
 
 
-def mechanism_open_loop(
+def simulate_open_loop(
     gap: Gap, data: Sequence[Path], mechanism: Mechanism, heldout: str | None
 ) -> dict[str, Any]:  # fmt: skip
     """Compute the open-loop errors of the given and the patched model under measured forces.
@@ -245,42 +250,42 @@ def mechanism_open_loop(
         with tempfile.TemporaryDirectory() as folder:
             write_mechanism(Path(folder), gap.patched.mjcf, gap.patched.mapping)
             models["after"] = load_mechanism(Path(folder, MJCF_FILE), Path(folder, COLUMNS_FILE))
-    out: dict[str, Any] = {"horizon": _HORIZON}
+    out: dict[str, Any] = {"horizon": _OPEN_LOOP_HORIZON}
     for which, one in models.items():
-        _, judge, _ = mechanism_records(data, one, heldout)
-        found = resolution(judge.position, judge.period, judge.position_noise)
-        motion = joint_motion(judge.position, judge.period, found, Processing())
+        _, judge, _ = load_mechanism_records(data, one, heldout)
+        found = estimate_resolution(judge.position, judge.period, judge.position_noise)
+        motion = compute_joint_motion(judge.position, judge.period, found, Processing())
         model = gap.machine if which == "before" else gap.patched
         whole = np.stack([motion.value, motion.rate, motion.acceleration])
         known = np.isfinite(judge.force).all(axis=1)
         if not known.all():
             raise InputError(judge.name, "has rows without forces")
         out[which] = open_loop_errors(
-            mujoco.MjModel.from_xml_string(model.mjcf), one.setup.chain, one.setup.given, whole,
-            judge.force, judge.period, _HORIZON,
+            mujoco.MjModel.from_xml_string(model.mjcf), one.setup.chain, one.setup.given_joints, whole,
+            judge.force, judge.period, _OPEN_LOOP_HORIZON,
         )  # fmt: skip
     return out
 
 
-def _search(dataset: Dataset, effects: Sequence[str], jobs: int | None, quiet: bool) -> Gap:
+def _run_search(dataset: Dataset, effects: Sequence[str], jobs: int | None, quiet: bool) -> Gap:
     from hydrotele.gap.find import find_gap
 
-    with stages(f"gap {dataset.machine.name}", quiet) as progress:
+    with show_stages(f"gap {dataset.machine.name}", quiet) as progress:
         return find_gap(dataset, progress, effects=tuple(effects), jobs=jobs or 2)
 
 
 def _print(gap: Gap) -> None:
-    out.print(f"[bold {_COLOURS[gap.verdict]}]{headline(gap)}[/]", soft_wrap=True)
+    stdout_console.print(f"[bold {_COLOURS[gap.verdict]}]{headline(gap)}[/]", soft_wrap=True)
     for words in verdict_words(gap):
-        out.print(words, markup=False)
+        stdout_console.print(words, markup=False)
     if gap.effects:
-        rows = table("identified effects", *_COLUMNS)
+        rows = make_table("identified effects", *_COLUMNS)
         for effect in gap.effects:
             for name, estimate in effect.parameters.items():
                 s = in_customary_units(estimate, name)
                 between = f"{s.low} .. {s.high}"
                 rows.add_row(effect_title(effect), name, s.nominal, s.value, between, s.unit)
         rows.columns[4].no_wrap = True
-        out.print(rows)
+        stdout_console.print(rows)
     for note in gap.notes:
-        out.print(f"[yellow]note[/] {note}")
+        stdout_console.print(f"[yellow]note[/] {note}")

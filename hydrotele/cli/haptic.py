@@ -9,13 +9,19 @@ import time as clock
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from hydrotele.cli.console import first_interrupt, notes, out, print_json, table
+from hydrotele.cli.console import (
+    catch_first_interrupt,
+    make_table,
+    print_json,
+    stderr_console,
+    stdout_console,
+)
 from hydrotele.core.errors import InputError
-from hydrotele.haptics.server import announce, open_haptic, serve
+from hydrotele.haptics.server import open_haptic_device, print_address, run_server
 
-HELD = 1e-3  # maximum fraction of missed deadlines [1]
-_PATIENCE = 60.0  # s, timeout for the start of the simulated device
-_ROWS = {
+MAX_MISSED_FRACTION = 1e-3  # maximum fraction of missed deadlines [1]
+_START_TIMEOUT = 60.0  # s, timeout for the start of the simulated device
+_TIME_LABELS = {
     "answer": "from pose received to wrench sent",
     "loop": "from wrench sent to the pose that acknowledges it",
     "interval": "between two poses",
@@ -34,51 +40,51 @@ class HapticOptions(NamedTuple):
     json: bool
 
 
-def serve_device(wishes: HapticOptions) -> None:
+def serve_device(options: HapticOptions) -> None:
     """Serve a haptic device until Ctrl-C, the end of the duration or the end of standard input.
 
     Raises:
         InputError: there is no such device, or the address cannot be used.
     """
-    period = 1.0 / wishes.rate
-    device = open_haptic(wishes.kind, period)
+    period = 1.0 / options.rate
+    device = open_haptic_device(options.kind, period)
     ended = threading.Event()
-    if wishes.until_eof:
-        threading.Thread(target=_wait_for_the_end, args=(ended,), daemon=True).start()
-    end = clock.monotonic() + (wishes.duration or float("inf"))
+    if options.until_eof:
+        threading.Thread(target=_wait_for_stdin_close, args=(ended,), daemon=True).start()
+    end = clock.monotonic() + (options.duration or float("inf"))
 
-    def opened(where: tuple[str, int]) -> None:
-        if wishes.until_eof:
-            announce(where)
+    def announce_address(where: tuple[str, int]) -> None:
+        if options.until_eof:
+            print_address(where)
         else:
-            notes.print(f"{wishes.kind} device at {where[0]}:{where[1]}; Ctrl-C stops", style="dim")
+            stderr_console.print(f"{options.kind} device at {where[0]}:{where[1]}; Ctrl-C stops", style="dim")
 
     try:
-        with first_interrupt() as interrupted:
-            seen = serve(
-                device, (wishes.host, wishes.port), period,
-                lambda: interrupted() or ended.is_set() or clock.monotonic() > end, opened,
+        with catch_first_interrupt() as interrupted:
+            seen = run_server(
+                device, (options.host, options.port), period,
+                lambda: interrupted() or ended.is_set() or clock.monotonic() > end, announce_address,
             )  # fmt: skip
     finally:
         device.close()
-    if wishes.json or wishes.until_eof:
+    if options.json or options.until_eof:
         print_json(seen._asdict())
         return
     refused = ", ".join(f"{count} {why}" for why, count in seen.refused.items() if count)
-    out.print(
+    stdout_console.print(
         f"{seen.periods} periods: {seen.missed} deadlines missed, {seen.unanswered} without an"
         f" answer in time, force switched off {seen.limp} times; rejected packets:"
         f" {refused or 'none'}"
     )
 
 
-def _wait_for_the_end(ended: threading.Event) -> None:
+def _wait_for_stdin_close(ended: threading.Event) -> None:
     sys.stdin.read()
     ended.set()
 
 
 @contextlib.contextmanager
-def own_device() -> Iterator[tuple[str, int]]:
+def run_simulated_device() -> Iterator[tuple[str, int]]:
     """Run a simulated haptic device in a separate process.
 
     Yields:
@@ -92,7 +98,7 @@ def own_device() -> Iterator[tuple[str, int]]:
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
     )  # new session, so that Ctrl-C at the terminal stops only the drive
     assert process.stdin and process.stdout
-    timer = threading.Timer(_PATIENCE, process.kill)
+    timer = threading.Timer(_START_TIMEOUT, process.kill)
     timer.start()
     try:
         line = process.stdout.readline()
@@ -117,7 +123,7 @@ def print_latency(figures: dict) -> None:
     """
     machine, line, computer = figures["machine"], figures["line"], figures.get("computer", {})
     title = "Missed deadlines (lower is better)"
-    missed = table(title, "deadline", "total", "missed", "fraction")
+    missed = make_table(title, "deadline", "total", "missed", "fraction")
     rows: list[tuple[str, int, int]] = []
     if "missed" in computer:
         alone = f"computer alone, idle loop of {computer['seconds']:g} s"
@@ -134,32 +140,32 @@ def print_latency(figures: dict) -> None:
         ("channel, poses lost", line["lost"], line["poses"] + line["lost"]),
     ):
         missed.add_row(name, str(of), str(count), f"{100.0 * count / max(of, 1):.3f} %")
-    out.print(missed)
-    spans = {said: line[key] for key, said in _ROWS.items()}
+    stdout_console.print(missed)
+    spans = {said: line[key] for key, said in _TIME_LABELS.items()}
     spans["lateness of the machine"] = machine["late"]
     if "late" in computer:
         spans["lateness of the idle loop"] = computer["late"]
     names = ("p50", "p90", "p99", "p99.9", "largest")
-    times = table("Percentiles of times [us] (lower is better)", "time", *names)
+    times = make_table("Percentiles of times [us] (lower is better)", "time", *names)
     for said, found in spans.items():
         times.add_row(said, *(f"{found['percentiles_us'].get(n, 0.0):g}" for n in names))
-    out.print(times)
+    stdout_console.print(times)
     edges = line["answer"]["histogram"]["edges_us"]
     title = "Histogram: number of samples up to [us]"
-    histogram = table(title, "time", *(f"{e}" for e in edges), "more")
+    histogram = make_table(title, "time", *(f"{e}" for e in edges), "more")
     for said, found in spans.items():
         histogram.add_row(said, *map(str, found["histogram"]["count"]))
-    out.print(histogram)
+    stdout_console.print(histogram)
     load = machine["load"]
-    out.print(
+    stdout_console.print(
         f"real-time priority: machine {machine['priority']}, channel {line['priority']}; load"
         f" average of the computer: {load[0] if load else 'unknown'}"
     )
-    for sentence in computer_sentences(machine, computer):
-        out.print(sentence)
+    for sentence in describe_computer(machine, computer):
+        stdout_console.print(sentence)
 
 
-def computer_sentences(machine: dict, computer: dict) -> list[str]:
+def describe_computer(machine: dict, computer: dict) -> list[str]:
     """Describe stolen processor time and the deadlines that the idle computer missed.
 
     Args:
@@ -177,13 +183,13 @@ def computer_sentences(machine: dict, computer: dict) -> list[str]:
         return said
     alone, own = (x["missed"] / max(x["ticks"], 1) for x in (computer, machine))
     largest = computer["late"]["percentiles_us"].get("largest", 0.0)
-    if alone > HELD:
+    if alone > MAX_MISSED_FRACTION:
         said.append(
             f"[yellow]note[/] the computer alone missed {100.0 * alone:.2g} % of its deadlines in"
             f" an idle loop, by up to {1e-3 * largest:.2g} ms: no program on it can stay below the"
-            f" limit of {100.0 * HELD:g} %"
+            f" limit of {100.0 * MAX_MISSED_FRACTION:g} %"
         )
-    elif own > HELD:
+    elif own > MAX_MISSED_FRACTION:
         said.append(
             f"[yellow]note[/] the computer alone missed {100.0 * alone:.2g} % of its deadlines: the"
             f" remainder of the {100.0 * own:.2g} % is caused by the simulation or other programs"

@@ -15,28 +15,37 @@ import yaml
 
 import hydrotele
 from hydrotele.cli.console import (
-    notes,
-    out,
-    plain,
+    make_table,
     print_json,
     print_result,
-    stages,
-    table,
+    show_stages,
+    stderr_console,
+    stdout_console,
+    to_json_types,
     write_json,
 )
-from hydrotele.cli.opening import data_name, machine_of
+from hydrotele.cli.opening import find_machine, name_of_data
 from hydrotele.core.errors import InputError
-from hydrotele.core.output import check_target, replacing, whole_folder
+from hydrotele.core.output import atomic_file, atomic_folder, check_output_folder
 from hydrotele.identify.estimation import Estimator
-from hydrotele.identify.excitation import MachineLimits, design_motion, informative_base
-from hydrotele.identify.hydraulic import Hydraulics, identify_hydraulics
-from hydrotele.identify.identification import identify_with_shapes
-from hydrotele.identify.identified_machine import Consistent, identified_machine, identify_document
-from hydrotele.identify.mechanism import load_mechanism, mechanism_records
+from hydrotele.identify.excitation import MachineLimits, design_motion, select_informative_base
+from hydrotele.identify.hydraulic import HydraulicIdentification, identify_hydraulics
+from hydrotele.identify.identification import identify_with_friction_shapes
+from hydrotele.identify.identified_machine import (
+    ConsistentParameters,
+    build_identified_machine,
+    build_identify_document,
+)
+from hydrotele.identify.mechanism import load_mechanism, load_mechanism_records
 from hydrotele.identify.motion import Processing
-from hydrotele.identify.record import force_noise, records
-from hydrotele.identify.result import MEANING, Identification, counts, parameter_rows
-from hydrotele.identify.setup import Model, cylinder_bars, machine_setup
+from hydrotele.identify.record import build_records, compute_force_noise
+from hydrotele.identify.result import (
+    STATUS_DESCRIPTIONS,
+    Identification,
+    count_statuses,
+    parameter_rows,
+)
+from hydrotele.identify.setup import DynamicModel, cylinder_bars, machine_setup
 from hydrotele.logs.dataset import Dataset, load_dataset
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import (
@@ -46,30 +55,30 @@ from hydrotele.machine.machine_file import (
     shipped_machines,
 )
 from hydrotele.scenario.scenario import load_scenario
-from hydrotele.simulate.closure import closed_chain
+from hydrotele.simulate.closure import load_closed_chain
 from hydrotele.simulate.native import stop_profiling_clock
 from hydrotele.simulate.plant import build_plant
 
 
 @dataclass(frozen=True)
-class MechanismResult:
+class MechanismIdentification:
     """Identified bodies, friction and offsets of a machine.
 
     Attributes:
-        found: the identification, None if the logs contain no forces.
-        best: nearest physically consistent parameters, None if `found` is None.
+        identification: the identification, None if the logs contain no forces.
+        consistent: nearest physically consistent parameters, None if `identification` is None.
         machine: the identified machine.
-        lacking: reason why `found` is None, else empty.
+        missing_reason: reason why `identification` is None, else empty.
     """
 
-    found: Identification | None
-    best: Consistent | None
+    identification: Identification | None
+    consistent: ConsistentParameters | None
     machine: Machine
-    lacking: str = ""
+    missing_reason: str = ""
 
 
 @dataclass(frozen=True)
-class Choices:
+class IdentificationOptions:
     """Options of the identification.
 
     Attributes:
@@ -81,7 +90,7 @@ class Choices:
         hydraulics: whether valves, oil and supply are also identified.
     """
 
-    model: Model = "complete"
+    model: DynamicModel = "complete"
     pins: bool = False
     asymmetry: bool = False
     processing: Processing = dataclasses.field(default_factory=Processing)
@@ -91,7 +100,7 @@ class Choices:
 
 def identify_to_folder(
     data: Sequence[Path], machine: str | None, tool: str | None, heldout: str | None,
-    sensors: str | None, target: Path | None, as_json: bool, choices: Choices,
+    sensors: str | None, target: Path | None, as_json: bool, choices: IdentificationOptions,
     force: bool = False,
 ) -> Path:  # fmt: skip
     """Identify a machine from logs and write the results to a folder.
@@ -115,24 +124,24 @@ def identify_to_folder(
     Raises:
         InputError: data, machine or target are not usable.
     """
-    target = target or Path(f"identify_{data_name(data)}")
-    check_target(target, "identify")
+    target = target or Path(f"identify_{name_of_data(data)}")
+    check_output_folder(target, "identify")
     stop_profiling_clock()
-    model = machine_of(data, machine, tool)
+    model = find_machine(data, machine, tool)
     dataset = load_dataset(list(data), model, sensors, heldout, force=force)
-    with stages(f"identify {model.name}", as_json) as progress:
+    with show_stages(f"identify {model.name}", as_json) as progress:
         say = progress or (lambda said, share: None)
         say("mechanism", 0.0)
         mechanism, hydraulics = identify_mechanism(dataset, choices), None
         if choices.hydraulics:
             better = dataclasses.replace(dataset, machine=mechanism.machine)
             hydraulics = identify_hydraulics(better, progress=progress)
-    if mechanism.found is None and hydraulics is None:
-        raise InputError(target, mechanism.lacking)
-    with whole_folder(target, "identify") as folder:
+    if mechanism.identification is None and hydraulics is None:
+        raise InputError(target, mechanism.missing_reason)
+    with atomic_folder(target, "identify") as folder:
         write_identification(folder, dataset, mechanism, hydraulics, data, choices)
     print_result(
-        identify_document(mechanism.found, hydraulics, mechanism.best),
+        build_identify_document(mechanism.identification, hydraulics, mechanism.consistent),
         as_json,
         lambda: _print(mechanism, hydraulics, dataset),
         target,
@@ -162,23 +171,23 @@ def identify_mjcf_to_folder(
     Raises:
         InputError: data, mechanism, mapping or target are not usable.
     """
-    from hydrotele.show.identify_report import LearnedFrom, write_identify_report
+    from hydrotele.show.identify_report import ReportSource, write_identify_report
 
-    target = target or Path(f"identify_{data_name(data)}")
-    check_target(target, "identify")
+    target = target or Path(f"identify_{name_of_data(data)}")
+    check_output_folder(target, "identify")
     mechanism = load_mechanism(mjcf, columns)
     name = mechanism.setup.chain.name
-    fit, judge, said = mechanism_records(data, mechanism, heldout, processing.period)
-    with stages(f"identify {name}", as_json) as progress:
+    fit, judge, said = load_mechanism_records(data, mechanism, heldout, processing.period)
+    with show_stages(f"identify {name}", as_json) as progress:
         if progress:
             progress("mechanism", 0.0)
-        found = identify_with_shapes(
+        found = identify_with_friction_shapes(
             fit, judge, mechanism.setup, processing, estimator, notes=said
         )  # fmt: skip
-    with whole_folder(target, "identify") as folder:
-        document = plain(identify_document(found))
+    with atomic_folder(target, "identify") as folder:
+        document = to_json_types(build_identify_document(found))
         write_json(folder / "identify.json", document)
-        learned = LearnedFrom(name, None, tuple(run.name for run in fit), judge.name)
+        learned = ReportSource(name, None, tuple(run.name for run in fit), judge.name)
         write_identify_report(learned, found, None, None, folder / "report.html")
         summary = {
             "kind": "identify", "mjcf": str(mjcf), "columns": str(columns) if columns else None,
@@ -186,13 +195,11 @@ def identify_mjcf_to_folder(
             "status": document["status"], "hydrotele": hydrotele.__version__,
         }  # fmt: skip
         write_json(folder / "summary.json", summary)
-    print_result(
-        identify_document(found), as_json, lambda: _print_mechanism(found, judge.name), target
-    )
+    print_result(build_identify_document(found), as_json, lambda: _print_mechanism(found, judge.name), target)
     return target
 
 
-def identify_mechanism(dataset: Dataset, choices: Choices) -> MechanismResult:
+def identify_mechanism(dataset: Dataset, choices: IdentificationOptions) -> MechanismIdentification:
     """Identify bodies, friction and offsets of a machine.
 
     Args:
@@ -206,42 +213,45 @@ def identify_mechanism(dataset: Dataset, choices: Choices) -> MechanismResult:
         InputError: the logs do not contain forces, and `choices.hydraulics` is False.
     """
     try:
-        fit, heldout, said = records(dataset)
+        fit, heldout, said = build_records(dataset)
     except InputError as error:
         if not choices.hydraulics:
             raise
-        return MechanismResult(None, None, dataset.machine, str(error))
+        return MechanismIdentification(None, None, dataset.machine, str(error))
     setup = machine_setup(
-        dataset.machine, closed_chain(dataset.machine), choices.model, pins=choices.pins,
+        dataset.machine, load_closed_chain(dataset.machine), choices.model, pins=choices.pins,
         asymmetry=choices.asymmetry,
     )  # fmt: skip
-    found = identify_with_shapes(
+    found = identify_with_friction_shapes(
         fit, heldout, setup, choices.processing, choices.estimator, notes=(*dataset.notes, *said)
     )  # fmt: skip
-    patched, best = identified_machine(dataset.machine, found, cylinder_bars(dataset.machine))
-    return MechanismResult(found, best, patched)
+    patched, best = build_identified_machine(dataset.machine, found, cylinder_bars(dataset.machine))
+    return MechanismIdentification(found, best, patched)
 
 
 def write_identification(
-    folder: Path, dataset: Dataset, mechanism: MechanismResult, hydraulics: Hydraulics | None,
-    data: Sequence[Path], choices: Choices,
+    folder: Path, dataset: Dataset, mechanism: MechanismIdentification, hydraulics: HydraulicIdentification | None,
+    data: Sequence[Path], choices: IdentificationOptions,
 ) -> None:  # fmt: skip
     """Write `identify.json`, `report.html`, the identified machine and `summary.json`."""
-    found, patched = mechanism.found, hydraulics.machine if hydraulics else mechanism.machine
-    document = plain(identify_document(found, hydraulics, mechanism.best))
+    found, patched = (
+        mechanism.identification,
+        hydraulics.machine if hydraulics else mechanism.machine,
+    )
+    document = to_json_types(build_identify_document(found, hydraulics, mechanism.consistent))
     write_json(folder / "identify.json", document)
     made = folder / "identified"
     made.mkdir()
     save_machine(patched, made / MACHINE_FILE)
     build_plant(patched).document.save(made / "machine.xml")
-    from hydrotele.show.identify_report import LearnedFrom, write_identify_report
+    from hydrotele.show.identify_report import ReportSource, write_identify_report
 
-    notes.print("writing report.html ...", style="dim")
-    learned = LearnedFrom(
+    stderr_console.print("writing report.html ...", style="dim")
+    learned = ReportSource(
         dataset.machine.name, dataset.machine.tool, tuple(run.name for run in dataset.fit),
         dataset.heldout.name, tuple(dataset.notes),
     )  # fmt: skip
-    write_identify_report(learned, found, hydraulics, mechanism.best, folder / "report.html")
+    write_identify_report(learned, found, hydraulics, mechanism.consistent, folder / "report.html")
     summary = {
         "kind": "identify",
         "machine": dataset.machine.name,
@@ -255,60 +265,60 @@ def write_identification(
     write_json(folder / "summary.json", summary)
 
 
-def _print(mechanism: MechanismResult, hydraulics: Hydraulics | None, dataset: Dataset) -> None:
-    if mechanism.found:
-        _print_mechanism(mechanism.found, dataset.heldout.name)
+def _print(mechanism: MechanismIdentification, hydraulics: HydraulicIdentification | None, dataset: Dataset) -> None:
+    if mechanism.identification:
+        _print_mechanism(mechanism.identification, dataset.heldout.name)
     else:
-        out.print(f"[yellow]note[/] {mechanism.lacking}")
+        stdout_console.print(f"[yellow]note[/] {mechanism.missing_reason}")
     if hydraulics:
         title = "hydraulic parameters"
-        rows = table(title, "parameter", "given", "identified", "std. dev.", "unit")
-        for n in hydraulics.numbers:
-            shown = (f"{n.value:.6g}", f"{n.std:.2g}") if n.told else ("not identifiable", "")
-            rows.add_row(n.name, f"{n.nominal:.6g}", *shown, n.unit)
-        out.print(rows)
-        out.print(
-            f"one-step prediction errors on {dataset.heldout.name}: {hydraulics.before:.3g} times"
-            f" noise with the given and {hydraulics.after:.3g} times noise with the identified"
+        rows = make_table(title, "parameter", "given", "identified", "std. dev.", "unit")
+        for n in hydraulics.parameters:
+            shown = (f"{n.value:.6g}", f"{n.std:.2g}") if n.is_determined else ("not identifiable", "")
+            rows.add_row(n.qualified_name, f"{n.nominal:.6g}", *shown, n.unit)
+        stdout_console.print(rows)
+        stdout_console.print(
+            f"one-step prediction errors on {dataset.heldout.name}: {hydraulics.nominal_rms_error:.3g} times"
+            f" noise with the given and {hydraulics.identified_rms_error:.3g} times noise with the identified"
             f" hydraulics; {hydraulics.status}"
         )
 
 
-def _print_mechanism(found: Identification, heldout: str) -> None:
-    rows = parameter_rows(found)
-    many = counts(rows)
-    out.print(f"[bold]{found.status}[/]", soft_wrap=True)
+def _print_mechanism(identification: Identification, heldout: str) -> None:
+    rows = parameter_rows(identification)
+    many = count_statuses(rows)
+    stdout_console.print(f"[bold]{identification.status}[/]", soft_wrap=True)
     title = "identified parameters and combinations"
-    shown = table(title, "parameter", "given", "identified", "std. dev.", "unit")
+    shown = make_table(title, "parameter", "given", "identified", "std. dev.", "unit")
     for row in rows:
         if row.value is None or row.std is None:
             continue
         name = row.name + (" + ..." if row.combination else "")
         shown.add_row(name, f"{row.nominal:.6g}", f"{row.value:.6g}", f"{row.std:.2g}", row.unit)
-    out.print(shown)
+    stdout_console.print(shown)
     for status, number in many.items():
-        out.print(f"{number:4d} {status}: {MEANING[status]}")
-    judged = table(
-        f"RMS force error on {heldout}, not fitted, below {found.band:.3g} Hz (lower is better)",
+        stdout_console.print(f"{number:4d} {status}: {STATUS_DESCRIPTIONS[status]}")
+    judged = make_table(
+        f"RMS force error on {heldout}, not fitted, below {identification.band:.3g} Hz (lower is better)",
         "drive", "given model", "identified", "noise alone", "unit", "relative",
     )  # fmt: skip
-    for drive, h in found.heldout.items():
+    for drive, h in identification.heldout.items():
         judged.add_row(drive, f"{h.nominal_rms:.4g}", f"{h.rms:.4g}", f"{h.noise_rms:.4g}", h.unit,
-                       f"{100 * h.relative:.2f} %")  # fmt: skip
-    out.print(judged)
-    distance, limit = found.distance(found.nominal)
-    out.print(
+                       f"{100 * h.relative_error:.2f} %")  # fmt: skip
+    stdout_console.print(judged)
+    distance, limit = identification.squared_distance(identification.nominal)
+    stdout_console.print(
         f"the given parameters lie {'in' if distance <= limit else 'out'}side the joint 95 %"
         f" confidence ellipsoid: squared distance {distance:.3g}, limit {limit:.3g}"
     )
-    out.print(
-        f"condition number {found.estimate.condition:.3g}, computing time {found.seconds:.1f} s"
+    stdout_console.print(
+        f"condition number {identification.estimate.condition:.3g}, computing time {identification.seconds:.1f} s"
     )
-    for note in found.notes:
-        out.print(f"[yellow]note[/] {note}")
+    for note in identification.notes:
+        stdout_console.print(f"[yellow]note[/] {note}")
 
 
-def excite_to_file(
+def design_excitation_file(
     machine: str, tool: str | None, sensors: str | None, target: Path, period: float,
     harmonics: int, starts: int, seed: int, cycles: float, as_json: bool,
 ) -> Path:  # fmt: skip
@@ -340,29 +350,29 @@ def excite_to_file(
     if target.suffix.lower() != ".yaml" or not target.parent.is_dir():
         raise InputError(target, "must be a .yaml file in an existing folder")
     place = machine if machine in shipped_machines() else str(Path(machine).resolve())
-    setup = machine_setup(model, closed_chain(model))
-    noise = np.maximum(force_noise(model, named), 1e-9)
-    base = informative_base(model, setup, noise, period, seed)
-    with stages(f"excite {model.name}", as_json) as progress:
+    setup = machine_setup(model, load_closed_chain(model))
+    noise = np.maximum(compute_force_noise(model, named), 1e-9)
+    base = select_informative_base(model, setup, noise, period, seed)
+    with show_stages(f"excite {model.name}", as_json) as progress:
         found = design_motion(
             MachineLimits(model, setup), setup, noise, base, period=period, harmonics=harmonics,
             starts=starts, seed=seed, progress=progress,
         )  # fmt: skip
-    scenario = found.scenario(name, model, cycles, place, sensors=named)
-    with replacing(target, ".yaml") as part:
+    scenario = found.to_scenario(name, model, cycles, place, sensors=named)
+    with atomic_file(target, ".yaml") as part:
         text = yaml.safe_dump(scenario, sort_keys=False, default_flow_style=None)
         part.write_text(text, encoding="utf-8")
     load_scenario(target)
     if as_json:
         print_json({
             "file": str(target), "criterion": found.criterion, "parameters": found.parameters,
-            "largest_use_of_a_limit": found.worst,
+            "largest_use_of_a_limit": found.max_utilisation,
         })  # fmt: skip
     else:
-        out.print(
+        stdout_console.print(
             f"trajectory with a period of {period:g} s for {found.parameters} parameters; it uses"
-            f" its most restrictive limit to {100 * found.worst:.0f} %"
+            f" its most restrictive limit to {100 * found.max_utilisation:.0f} %"
         )
-        notes.print(f"hydrotele run {target}", style="dim")
-        out.print(f"written to [bold]{target}[/]")
+        stderr_console.print(f"hydrotele run {target}", style="dim")
+        stdout_console.print(f"written to [bold]{target}[/]")
     return target

@@ -16,13 +16,13 @@ from typer.core import TyperGroup
 
 from hydrotele.cli.calibrating import app as calibrate_app
 from hydrotele.cli.operator_identifying import IDENTIFY_OPERATOR_EPILOG, identify_operator
-from hydrotele.cli.option_values import chosen, numbers_of, overrides_of
+from hydrotele.cli.option_values import machine_overrides, parse_numbers, parse_overrides
 from hydrotele.cli.overview import DESCRIPTION, format_overview
 from hydrotele.cli.serving import HAPTIC_EPILOG, haptic_device
 from hydrotele.core.errors import InputError
 
 
-def _load(files: list[Path] | None) -> list[Path] | None:
+def _load_effect_files(files: list[Path] | None) -> list[Path] | None:
     """Load files of custom effects and laws, and return the list of files unchanged."""
     if files:
         from hydrotele.effects import load_effects
@@ -32,12 +32,12 @@ def _load(files: list[Path] | None) -> list[Path] | None:
     return files
 
 
-EffectFiles = Annotated[
+EffectFilesOption = Annotated[
     list[Path] | None,
     typer.Option(
         "--effects",
         metavar="FILE.py",
-        callback=_load,
+        callback=_load_effect_files,
         help="Python file that defines custom effects or laws. It is executed. Repeatable.",
     ),
 ]
@@ -65,17 +65,11 @@ Black-box models, fitted on the other runs (--baseline, repeatable):
 def compare(
     machine: Annotated[
         list[str],
-        typer.Argument(
-            help="Shipped machines, folders with machine.yaml, result folders of gap or identify."
-        ),
+        typer.Argument(help="Shipped machines, folders with machine.yaml, result folders of gap or identify."),
     ],
-    data: Annotated[
-        list[Path], typer.Option("--data", "-d", help="Log file, folder of logs or run folder.")
-    ],
+    data: Annotated[list[Path], typer.Option("--data", "-d", help="Log file, folder of logs or run folder.")],
     tool: Annotated[str | None, typer.Option("--tool", help="Tool of the machines.")] = None,
-    heldout: Annotated[
-        str | None, typer.Option(help="Held-out run; default: test*, else the last run.")
-    ] = None,
+    heldout: Annotated[str | None, typer.Option(help="Held-out run; default: test*, else the last run.")] = None,
     sensors: Annotated[str | None, typer.Option(help="Sensor set of the machines.")] = None,
     horizons: Annotated[
         str, typer.Option(help="Prediction horizons [s]; the end of the run is always included.")
@@ -83,18 +77,10 @@ def compare(
     baseline: Annotated[
         list[str] | None, typer.Option("--baseline", help="Black-box model: table, arx or mlp.")
     ] = None,
-    every: Annotated[
-        bool, typer.Option("--all", help="Evaluate the models on the fitted runs as well.")
-    ] = False,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for compare.json and a plot.")
-    ] = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="Accept logs recorded with another machine or tool.")
-    ] = False,
-    json: Annotated[
-        bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")
-    ] = False,
+    every: Annotated[bool, typer.Option("--all", help="Evaluate the models on the fitted runs as well.")] = False,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for compare.json and a plot.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Accept logs recorded with another machine or tool.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")] = False,
 ) -> None:
     """Compare open-loop predictions of several models with logs: RMS error per channel."""
     from hydrotele.cli.comparing import compare_models
@@ -102,7 +88,7 @@ def compare(
     pass
 
     compare_models(
-        machine, data, tool, heldout, sensors, numbers_of("--horizons", horizons), baseline or [],
+        machine, data, tool, heldout, sensors, parse_numbers("--horizons", horizons), baseline or [],
         every, out, json, force,
     )  # fmt: skip
 
@@ -133,40 +119,22 @@ and missed deadlines; without --device it starts a simulated device in its own p
 
 
 def drive(
-    scenario: Annotated[
-        str | None, typer.Argument(help="Teleoperated scenario; default: that of the machine.")
-    ] = None,
-    machine: Annotated[
-        str | None, typer.Option("--machine", "-m", help="Machine; default: cat215.")
-    ] = None,
+    scenario: Annotated[str | None, typer.Argument(help="Teleoperated scenario; default: that of the machine.")] = None,
+    machine: Annotated[str | None, typer.Option("--machine", "-m", help="Machine; default: cat215.")] = None,
     tool: Annotated[str | None, typer.Option("--tool", help="Tool of the machine.")] = None,
     device: Annotated[
         str,
-        typer.Option(
-            "--device", "-d", help="keyboard, gamepad, spacemouse, haptic or scripted:FILE."
-        ),
+        typer.Option("--device", "-d", help="keyboard, gamepad, spacemouse, haptic or scripted:FILE."),
     ] = "keyboard",
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Output folder; default: runs/SCENARIO.")
-    ] = None,
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", help="Scenario override KEY=VALUE. Repeatable.")
-    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Output folder; default: runs/SCENARIO.")] = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", help="Scenario override KEY=VALUE. Repeatable.")] = None,
     viewer: Annotated[bool, typer.Option(help="Open the MuJoCo viewer.")] = True,
-    duration: Annotated[
-        float | None, typer.Option(help="Maximum simulated time [s]; default: 600.")
-    ] = None,
-    speed: Annotated[
-        float, typer.Option(help="Simulated time per real time; 0: as fast as possible.")
-    ] = 1.0,
+    duration: Annotated[float | None, typer.Option(help="Maximum simulated time [s]; default: 600.")] = None,
+    speed: Annotated[float, typer.Option(help="Simulated time per real time; 0: as fast as possible.")] = 1.0,
     review: Annotated[bool, typer.Option(help="Write the rerun recording review.rrd.")] = True,
-    effects: EffectFiles = None,
-    latency: Annotated[
-        bool, typer.Option("--latency", help="Print latency, jitter and missed deadlines.")
-    ] = False,
-    json: Annotated[
-        bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")
-    ] = False,
+    effects: EffectFilesOption = None,
+    latency: Annotated[bool, typer.Option("--latency", help="Print latency, jitter and missed deadlines.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")] = False,
 ) -> None:
     """Drive a machine in real time; write the same files as `run`."""
     from hydrotele.cli.driving import DriveOptions, drive_to_folder
@@ -176,7 +144,7 @@ def drive(
     drive_to_folder(
         DriveOptions(
             scenario,
-            overrides_of(set_ or []) | chosen(machine, tool),
+            parse_overrides(set_ or []) | machine_overrides(machine, tool),
             device,
             out,
             viewer,
@@ -215,29 +183,17 @@ if all failed.
 
 def sweep(
     file: Annotated[str, typer.Argument(help="Sweep file (.yaml), or a shipped sweep.")],
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Output folder; default: runs/NAME.")
-    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Output folder; default: runs/NAME.")] = None,
     jobs: Annotated[
         int | None,
         typer.Option("--jobs", "-j", min=1, help="Number of processes; default: one per core."),
     ] = None,
-    dask: Annotated[
-        str | None, typer.Option(help="Scheduler of a dask cluster (address or scheduler file).")
-    ] = None,
-    fresh: Annotated[
-        bool, typer.Option("--fresh", help="Discard earlier results in the output folder.")
-    ] = False,
-    retry_failed: Annotated[
-        bool, typer.Option("--retry-failed", help="Repeat failed runs.")
-    ] = False,
-    strict: Annotated[
-        bool, typer.Option("--strict", help="Exit with status 3 if any run failed.")
-    ] = False,
-    effects: EffectFiles = None,
-    json: Annotated[
-        bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")
-    ] = False,
+    dask: Annotated[str | None, typer.Option(help="Scheduler of a dask cluster (address or scheduler file).")] = None,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Discard earlier results in the output folder.")] = False,
+    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="Repeat failed runs.")] = False,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit with status 3 if any run failed.")] = False,
+    effects: EffectFilesOption = None,
+    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")] = False,
 ) -> None:
     """Run variations of a scenario (grid or random samples); collect the results in a table."""
     from hydrotele.cli.running import SweepOptions, sweep_to_folder
@@ -263,57 +219,41 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-analyse_app = typer.Typer(
-    help="Analyse a teleoperator by linear two-port theory.", no_args_is_help=True
-)
+analyse_app = typer.Typer(help="Analyse a teleoperator by linear two-port theory.", no_args_is_help=True)
 app.add_typer(analyse_app, name="analyse")
 app.add_typer(calibrate_app, name="calibrate")
 
-Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
-MachineName = Annotated[
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
+MachineOption = Annotated[
     str | None,
     typer.Option("--machine", "-m", help="Shipped machine, or a folder with machine.yaml."),
 ]
-ToolName = Annotated[str | None, typer.Option("--tool", help="Tool of the machine.")]
-Logs = Annotated[
-    list[Path], typer.Option("--data", "-d", help="Log file, folder of logs or run folder.")
-]
-MoreLogs = Annotated[list[Path] | None, typer.Argument(help="More log files or folders.")]
-HeldOut = Annotated[
-    str | None, typer.Option(help="Held-out run; default: test*, else the last run.")
-]
-Sensors = Annotated[str | None, typer.Option(help="Sensor set of the machine.")]
-Force = Annotated[
-    bool, typer.Option("--force", help="Accept logs recorded with another machine or tool.")
-]
+ToolOption = Annotated[str | None, typer.Option("--tool", help="Tool of the machine.")]
+LogsOption = Annotated[list[Path], typer.Option("--data", "-d", help="Log file, folder of logs or run folder.")]
+MoreLogsArgument = Annotated[list[Path] | None, typer.Argument(help="More log files or folders.")]
+HeldOutOption = Annotated[str | None, typer.Option(help="Held-out run; default: test*, else the last run.")]
+SensorsOption = Annotated[str | None, typer.Option(help="Sensor set of the machine.")]
+ForceOption = Annotated[bool, typer.Option("--force", help="Accept logs recorded with another machine or tool.")]
 
 
-@app.command(
-    epilog="Examples:  hydrotele run zhu_up   |   hydrotele run my.yaml --out runs/a --set seed=7"
-)
+@app.command(epilog="Examples:  hydrotele run zhu_up   |   hydrotele run my.yaml --out runs/a --set seed=7")
 def run(
     scenario: Annotated[str, typer.Argument(help="Shipped scenario, or a YAML file.")],
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Output folder; default: runs/SCENARIO.")
-    ] = None,
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", help="Scenario override KEY=VALUE. Repeatable.")
-    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Output folder; default: runs/SCENARIO.")] = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", help="Scenario override KEY=VALUE. Repeatable.")] = None,
     machine: Annotated[
         str | None,
-        typer.Option(
-            "--machine", "-m", help="Machine that replaces that of the scenario, e.g. patched/."
-        ),
+        typer.Option("--machine", "-m", help="Machine that replaces that of the scenario, e.g. patched/."),
     ] = None,
-    tool: ToolName = None,
+    tool: ToolOption = None,
     review: Annotated[bool, typer.Option(help="Write the rerun recording review.rrd.")] = True,
-    effects: EffectFiles = None,
-    json: Json = False,
+    effects: EffectFilesOption = None,
+    json: JsonOption = False,
 ) -> None:
     """Simulate a scenario; write logs, a rerun recording, a summary and the MJCF."""
     from hydrotele.cli.running import run_to_folder
 
-    run_to_folder(scenario, out, overrides_of(set_ or []) | chosen(machine, tool), review, json)
+    run_to_folder(scenario, out, parse_overrides(set_ or []) | machine_overrides(machine, tool), review, json)
 
 
 app.command(epilog=DRIVE_EPILOG)(drive)
@@ -323,13 +263,11 @@ app.command(epilog=COMPARE_EPILOG)(compare)
 app.command("identify-operator", epilog=IDENTIFY_OPERATOR_EPILOG)(identify_operator)
 
 
-@app.command(
-    epilog="Example:  hydrotele replay measured/fit_1.parquet --machine cat215 --out overlay"
-)
+@app.command(epilog="Example:  hydrotele replay measured/fit_1.parquet --machine cat215 --out overlay")
 def replay(
     logs: Annotated[list[Path], typer.Argument(help="Log files (.parquet, .csv) or run folders.")],
-    machine: MachineName = None,
-    tool: ToolName = None,
+    machine: MachineOption = None,
+    tool: ToolOption = None,
     timestep: Annotated[float, typer.Option(help="Simulation time step [s].")] = 1.0e-3,
     out: Annotated[
         Path | None,
@@ -339,8 +277,8 @@ def replay(
             help="Folder for plots and recordings; default: runs/replay_LOG, none with --json.",
         ),
     ] = None,
-    effects: EffectFiles = None,
-    json: Json = False,
+    effects: EffectFilesOption = None,
+    json: JsonOption = False,
 ) -> None:
     """Simulate the model with the commands of a log; print the prediction errors."""
     from hydrotele.cli.reviewing import replay_logs
@@ -355,43 +293,37 @@ def replay(
     "hydrotele gap --mjcf robot.xml --columns columns.yaml --data logs"
 )
 def gap(
-    data: Logs,
-    more: MoreLogs = None,
-    machine: MachineName = None,
-    tool: ToolName = None,
-    mjcf: Annotated[
-        Path | None, typer.Option("--mjcf", help="MJCF mechanism (.xml) instead of a machine.")
-    ] = None,
+    data: LogsOption,
+    more: MoreLogsArgument = None,
+    machine: MachineOption = None,
+    tool: ToolOption = None,
+    mjcf: Annotated[Path | None, typer.Option("--mjcf", help="MJCF mechanism (.xml) instead of a machine.")] = None,
     columns: Annotated[
         Path | None,
         typer.Option("--columns", help="With --mjcf: assignment of log columns (.yaml)."),
     ] = None,
-    heldout: HeldOut = None,
-    sensors: Sensors = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Output folder; default: gap_DATA.")
-    ] = None,
+    heldout: HeldOutOption = None,
+    sensors: SensorsOption = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Output folder; default: gap_DATA.")] = None,
     effect: Annotated[
         list[str] | None,
         typer.Option("--effect", help="Test only the effect of this name. Repeatable."),
     ] = None,
     jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes.")] = None,
-    mask: Annotated[
-        Path | None, typer.Option(help="CSV of masked intervals: run,begin,end [s].")
-    ] = None,
-    force: Force = False,
+    mask: Annotated[Path | None, typer.Option(help="CSV of masked intervals: run,begin,end [s].")] = None,
+    force: ForceOption = False,
     recording: Annotated[bool, typer.Option(help="Write the rerun recording.")] = True,
-    effects: EffectFiles = None,
-    json: Json = False,
+    effects: EffectFilesOption = None,
+    json: JsonOption = False,
 ) -> None:
     """Find differences between model and logs, identify their cause, correct the model.
 
     For a mechanism without hydraulics, give --mjcf or the name of a shipped model without
     machine.yaml, such as palida. The logs must contain positions and drive forces.
     """
-    from hydrotele.cli.gapping import gap_mjcf_to_folder, gap_to_folder, mechanism_named
+    from hydrotele.cli.gapping import find_mechanism_files, gap_mjcf_to_folder, gap_to_folder
 
-    model, columns = mechanism_named(machine, mjcf, columns)
+    model, columns = find_mechanism_files(machine, mjcf, columns)
     if model is not None:
         of_machines = {"--tool": tool, "--sensors": sensors, "--jobs": jobs, "--mask": mask,
                        "--force": force}  # fmt: skip
@@ -411,44 +343,30 @@ def gap(
     "hydrotele identify --machine emps --data main.parquet --asymmetry"
 )
 def identify(
-    data: Logs,
-    more: MoreLogs = None,
-    machine: MachineName = None,
-    tool: ToolName = None,
-    mjcf: Annotated[
-        Path | None, typer.Option("--mjcf", help="MJCF mechanism (.xml) instead of a machine.")
-    ] = None,
+    data: LogsOption,
+    more: MoreLogsArgument = None,
+    machine: MachineOption = None,
+    tool: ToolOption = None,
+    mjcf: Annotated[Path | None, typer.Option("--mjcf", help="MJCF mechanism (.xml) instead of a machine.")] = None,
     columns: Annotated[
         Path | None,
         typer.Option("--columns", help="With --mjcf: assignment of log columns (.yaml)."),
     ] = None,
-    heldout: HeldOut = None,
-    sensors: Sensors = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Output folder; default: identify_DATA.")
-    ] = None,
-    reduced: Annotated[
-        bool, typer.Option("--reduced", help="Model the links only, without cylinder bodies.")
-    ] = False,
-    pins: Annotated[
-        bool, typer.Option("--pins", help="Include friction in passive joints and pins.")
-    ] = False,
-    asymmetry: Annotated[
-        bool, typer.Option("--asymmetry", help="Use direction-dependent viscous friction.")
-    ] = False,
+    heldout: HeldOutOption = None,
+    sensors: SensorsOption = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Output folder; default: identify_DATA.")] = None,
+    reduced: Annotated[bool, typer.Option("--reduced", help="Model the links only, without cylinder bodies.")] = False,
+    pins: Annotated[bool, typer.Option("--pins", help="Include friction in passive joints and pins.")] = False,
+    asymmetry: Annotated[bool, typer.Option("--asymmetry", help="Use direction-dependent viscous friction.")] = False,
     hydraulics: Annotated[
         bool, typer.Option("--hydraulics", help="Also identify valves, oil, leakage and supply.")
     ] = False,
     processing: Annotated[
         str, typer.Option(help="Filter: zero_phase, optimal, periodic (needs --period) or raw.")
     ] = "zero_phase",
-    band: Annotated[
-        float | None, typer.Option(help="Compare forces below this frequency [Hz].")
-    ] = None,
+    band: Annotated[float | None, typer.Option(help="Compare forces below this frequency [Hz].")] = None,
     period: Annotated[float | None, typer.Option(help="Period of a repeated motion [s].")] = None,
-    harmonics: Annotated[
-        int, typer.Option(help="Number of harmonics of --period to keep; 0: automatic.")
-    ] = 0,
+    harmonics: Annotated[int, typer.Option(help="Number of harmonics of --period to keep; 0: automatic.")] = 0,
     estimator: Annotated[
         str,
         typer.Option(help="weighted, gauss_markov, least_squares or instruments (needs --period)."),
@@ -456,26 +374,26 @@ def identify(
     keep_bias: Annotated[
         bool, typer.Option("--keep-bias", help="Do not correct the bias due to position noise.")
     ] = False,
-    ridge: Annotated[
-        float, typer.Option(help="Ridge term as a fraction of the largest singular value.")
-    ] = 0.0,
-    truncate: Annotated[
-        float, typer.Option(help="Discard singular values below this fraction of the largest.")
-    ] = 0.0,
-    force: Force = False,
-    effects: EffectFiles = None,
-    json: Json = False,
+    ridge: Annotated[float, typer.Option(help="Ridge term as a fraction of the largest singular value.")] = 0.0,
+    truncate: Annotated[float, typer.Option(help="Discard singular values below this fraction of the largest.")] = 0.0,
+    force: ForceOption = False,
+    effects: EffectFilesOption = None,
+    json: JsonOption = False,
 ) -> None:
     """Identify masses, friction and hydraulics from logs; write the identified machine.
 
     With --mjcf, any mechanism with hinge, slide and ball joints can be identified. Its kinematic
     loops must be closed by connect or weld constraints.
     """
-    from hydrotele.cli.identifying import Choices, identify_mjcf_to_folder, identify_to_folder
+    from hydrotele.cli.identifying import (
+        IdentificationOptions,
+        identify_mjcf_to_folder,
+        identify_to_folder,
+    )
     from hydrotele.identify.estimation import Estimator
     from hydrotele.identify.motion import Processing
 
-    choices = Choices(
+    choices = IdentificationOptions(
         model="reduced" if reduced else "complete", pins=pins, asymmetry=asymmetry,
         processing=Processing(processing, band, period, harmonics),  # pyright: ignore - checks itself
         estimator=Estimator(
@@ -497,35 +415,27 @@ def identify(
         return
     if columns is not None:
         raise InputError("--columns", "is used only together with --mjcf: give both")
-    identify_to_folder(
-        [*data, *(more or [])], machine, tool, heldout, sensors, out, json, choices, force
-    )
+    identify_to_folder([*data, *(more or [])], machine, tool, heldout, sensors, out, json, choices, force)
 
 
 @app.command(epilog="Example:  hydrotele excite cat215 --out my_excitation.yaml")
 def excite(
     machine: Annotated[str, typer.Argument(help="Shipped machine, or a folder.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Scenario file to write (.yaml).")],
-    tool: ToolName = None,
-    sensors: Sensors = None,
+    tool: ToolOption = None,
+    sensors: SensorsOption = None,
     period: Annotated[float, typer.Option(min=1.0, help="Period of the trajectory [s].")] = 20.0,
-    harmonics: Annotated[
-        int, typer.Option(min=1, max=30, help="Number of harmonics of the trajectory.")
-    ] = 8,
-    starts: Annotated[
-        int, typer.Option(min=1, help="Number of searches from random trajectories.")
-    ] = 2,
+    harmonics: Annotated[int, typer.Option(min=1, max=30, help="Number of harmonics of the trajectory.")] = 8,
+    starts: Annotated[int, typer.Option(min=1, help="Number of searches from random trajectories.")] = 2,
     seed: Annotated[int, typer.Option(help="Random seed of the searches.")] = 0,
-    cycles: Annotated[
-        float, typer.Option(min=1.0, help="Number of periods that the scenario runs.")
-    ] = 3.0,
-    effects: EffectFiles = None,
-    json: Json = False,
+    cycles: Annotated[float, typer.Option(min=1.0, help="Number of periods that the scenario runs.")] = 3.0,
+    effects: EffectFilesOption = None,
+    json: JsonOption = False,
 ) -> None:
     """Design the most informative trajectory within a machine's limits."""
-    from hydrotele.cli.identifying import excite_to_file
+    from hydrotele.cli.identifying import design_excitation_file
 
-    excite_to_file(machine, tool, sensors, out, period, harmonics, starts, seed, cycles, json)
+    design_excitation_file(machine, tool, sensors, out, period, harmonics, starts, seed, cycles, json)
 
 
 @analyse_app.command(
@@ -535,14 +445,10 @@ def excite(
     "hydrotele analyse teleop press_direct --set pilot.ratio=2.0e-5",
 )
 def analyse_teleop(
-    file: Annotated[
-        Path | None, typer.Argument(help="Case (.yaml) or scenario; default: a CAT 215 case.")
-    ] = None,
+    file: Annotated[Path | None, typer.Argument(help="Case (.yaml) or scenario; default: a CAT 215 case.")] = None,
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out", "-o", help="Output folder; default: runs/analyse_NAME, none with --json."
-        ),
+        typer.Option("--out", "-o", help="Output folder; default: runs/analyse_NAME, none with --json."),
     ] = None,
     structure: Annotated[
         list[str] | None,
@@ -553,9 +459,7 @@ def analyse_teleop(
             "passivity_control. Repeatable. Default: those of the case.",
         ),
     ] = None,
-    delay: Annotated[
-        float | None, typer.Option(help="One-way delay [s]; default: that of the case.")
-    ] = None,
+    delay: Annotated[float | None, typer.Option(help="One-way delay [s]; default: that of the case.")] = None,
     confirm: Annotated[
         bool,
         typer.Option("--confirm", help="Verify by simulation: sine sweeps and the stability map."),
@@ -569,9 +473,7 @@ def analyse_teleop(
         Path | None,
         typer.Option(help="With --robust: CSV of measured delays [s], columns forward and back."),
     ] = None,
-    operators: Annotated[
-        int, typer.Option(help="With --robust: number of sampled pairs of operator and task.")
-    ] = 20,
+    operators: Annotated[int, typer.Option(help="With --robust: number of sampled pairs of operator and task.")] = 20,
     coordinate: Annotated[
         str | None, typer.Option(help="For a scenario: coordinate of the arm: r, theta, z ...")
     ] = None,
@@ -579,39 +481,31 @@ def analyse_teleop(
         list[str] | None,
         typer.Option("--set", help="For a scenario: override KEY=VALUE. Repeatable."),
     ] = None,
-    json: Json = False,
+    json: JsonOption = False,
 ) -> None:
     """Analyse a teleoperator as a two-port: transparency, passivity, stability, delay margins."""
-    from hydrotele.cli.analysing import Robustly, analyse_any_to_folder
+    from hydrotele.cli.analysing import RobustnessOptions, analyse_any_to_folder
 
-    pairs = overrides_of(set_ or [])
-    how = Robustly(period, delays, operators) if robust or delays else None
+    pairs = parse_overrides(set_ or [])
+    how = RobustnessOptions(period, delays, operators) if robust or delays else None
     analyse_any_to_folder(file, out, structure, delay, confirm, coordinate, pairs, json, how)
 
 
-@app.command(
-    epilog="Examples:  hydrotele review runs/zhu_up   |   hydrotele review a.parquet b.parquet"
-)
+@app.command(epilog="Examples:  hydrotele review runs/zhu_up   |   hydrotele review a.parquet b.parquet")
 def review(
     log: Annotated[Path, typer.Argument(help="Run folder or log file.")],
-    log2: Annotated[
-        Path | None, typer.Argument(help="Second log with the same time base, for comparison.")
-    ] = None,
-    machine: MachineName = None,
-    tool: ToolName = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Recording file to write (.rrd).")
-    ] = None,
+    log2: Annotated[Path | None, typer.Argument(help="Second log with the same time base, for comparison.")] = None,
+    machine: MachineOption = None,
+    tool: ToolOption = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Recording file to write (.rrd).")] = None,
     serve: Annotated[bool, typer.Option("--serve", help="Serve the web viewer.")] = False,
     port: Annotated[int, typer.Option(help="Port of the web viewer.")] = 9090,
     screenshot: Annotated[
         Path | None,
         typer.Option("--screenshot", help="Write a PNG of the viewer without opening a window."),
     ] = None,
-    plot: Annotated[
-        Path | None, typer.Option("--plot", help="Write a PNG of all channels instead.")
-    ] = None,
-    effects: EffectFiles = None,
+    plot: Annotated[Path | None, typer.Option("--plot", help="Write a PNG of all channels instead.")] = None,
+    effects: EffectFilesOption = None,
 ) -> None:
     """Show a run in the rerun viewer: 3D machine, joints, pressures, flows and forces."""
     from hydrotele.cli.reviewing import review_logs
@@ -623,26 +517,22 @@ def review(
 def list_(
     what: Annotated[
         str,
-        typer.Argument(
-            help="machines, joysticks, scenarios, sweeps, effects, environments or all."
-        ),
+        typer.Argument(help="machines, joysticks, scenarios, sweeps, effects, environments or all."),
     ] = "all",
-    effects: EffectFiles = None,
-    json: Json = False,
+    effects: EffectFilesOption = None,
+    json: JsonOption = False,
 ) -> None:
     """List the available machines, scenarios, sweeps, effects and environments."""
-    from hydrotele.cli.catalogue import list_things
+    from hydrotele.cli.catalogue import list_items
 
-    list_things(what, json)
+    list_items(what, json)
 
 
 @app.command(epilog="Example:  hydrotele validate my_machine/machine.yaml")
 def validate(
-    files: Annotated[
-        list[Path], typer.Argument(help="Machines, joysticks, scenarios, sweeps or logs.")
-    ],
-    effects: EffectFiles = None,
-    json: Json = False,
+    files: Annotated[list[Path], typer.Argument(help="Machines, joysticks, scenarios, sweeps or logs.")],
+    effects: EffectFilesOption = None,
+    json: JsonOption = False,
 ) -> None:
     """Check a machine, joystick, scenario, sweep or log; report errors with file and line."""
     from hydrotele.cli.catalogue import validate_files
@@ -653,15 +543,11 @@ def validate(
 @app.command(epilog="Example:  hydrotele export cat215 --tool bucket --out scene.xml")
 def export(
     machine: Annotated[str, typer.Argument(help="Shipped machine or joystick, or a folder.")],
-    tool: ToolName = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="MJCF file; default: standard output.")
-    ] = None,
-    picture: Annotated[
-        Path | None, typer.Option("--picture", help="Write a PNG image instead.")
-    ] = None,
+    tool: ToolOption = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="MJCF file; default: standard output.")] = None,
+    picture: Annotated[Path | None, typer.Option("--picture", help="Write a PNG image instead.")] = None,
     camera: Annotated[str, typer.Option(help="Camera of the image.")] = "overview",
-    effects: EffectFiles = None,
+    effects: EffectFilesOption = None,
 ) -> None:
     """Write the complete MJCF of a machine or joystick, or an image of it."""
     from hydrotele.cli.catalogue import export_machine
@@ -687,7 +573,7 @@ def experiments(
         ),
     ] = None,
     jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes.")] = None,
-    json: Json = False,
+    json: JsonOption = False,
 ) -> None:
     """Repeat the experiments of a publication; compare its tables and figures with simulation.
 
@@ -702,18 +588,12 @@ def experiments(
         raise typer.Exit(1)
 
 
-@app.command(
-    epilog="Examples:  hydrotele bench --save a.json   |   hydrotele bench --compare a.json"
-)
+@app.command(epilog="Examples:  hydrotele bench --save a.json   |   hydrotele bench --compare a.json")
 def bench(
-    save: Annotated[
-        Path | None, typer.Option("--save", help="Write the results to this file (.json).")
-    ] = None,
-    compare: Annotated[
-        Path | None, typer.Option("--compare", help="Compare with the results in this file.")
-    ] = None,
+    save: Annotated[Path | None, typer.Option("--save", help="Write the results to this file (.json).")] = None,
+    compare: Annotated[Path | None, typer.Option("--compare", help="Compare with the results in this file.")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Use fewer repetitions.")] = False,
-    json: Json = False,
+    json: JsonOption = False,
 ) -> None:
     """Measure the speed of the simulation: mechanism, hydraulics, scenarios, batches, start-up."""
     from hydrotele.cli.bench import run_benchmarks
@@ -723,9 +603,7 @@ def bench(
 
 @app.command("compile", epilog="Example:  hydrotele compile --jobs 4")
 def compile_functions(
-    jobs: Annotated[
-        int | None, typer.Option(min=1, help="Number of processes; default: one per core.")
-    ] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes; default: one per core.")] = None,
 ) -> None:
     """Compile all numerical functions now, so that later commands start without delay."""
     from hydrotele.cli.compiling import compile_all

@@ -16,7 +16,7 @@ from hydrotele.machine.machine_file import MACHINE_FILE, load_machine
 _LOGS = (".parquet", ".csv")
 
 
-def log_path(path: Path, which: str = "measured") -> Path:
+def find_log_file(path: Path, which: str = "measured") -> Path:
     """Return the log file of a path: the file itself, or `<which>.parquet` in a run folder.
 
     Raises:
@@ -52,7 +52,7 @@ def open_log(
     Raises:
         InputError: the log is not usable, or its machine is not known.
     """
-    file = log_path(path, which)
+    file = find_log_file(path, which)
     beside = file.parent / MACHINE_FILE
     chosen = machine or (str(beside) if beside.is_file() else None)
     if chosen:
@@ -74,19 +74,19 @@ def open_log(
     return found, log
 
 
-def data_name(data: Sequence[Path]) -> str:
+def name_of_data(data: Sequence[Path]) -> str:
     """Return the name of the data folder, or of the folder that contains the first file."""
     first = data[0].resolve()
     return first.name if first.is_dir() else first.parent.name or first.stem
 
 
-def machine_of(data: Sequence[Path], name: str | None, tool: str | None) -> Machine:
+def find_machine(data: Sequence[Path], name: str | None, tool: str | None) -> Machine:
     """Load the machine called `name`, else that next to the first log, else that of its metadata.
 
     Raises:
         InputError: no machine is known, or the machine is not usable.
     """
-    log = _first_log(data[0])
+    log = _find_first_log(data[0])
     metadata: Mapping[str, str] = {}
     if name is None and log and (log.parent / MACHINE_FILE).is_file():
         name = str(log.parent / MACHINE_FILE)
@@ -104,7 +104,7 @@ def machine_of(data: Sequence[Path], name: str | None, tool: str | None) -> Mach
     return load_machine(name, logged) if tool is None and logged in found.tools else found
 
 
-def _first_log(path: Path) -> Path | None:
+def _find_first_log(path: Path) -> Path | None:
     if not path.is_dir():
         return path if path.is_file() else None
     files = [p for p in sorted(path.rglob("*")) if p.suffix.lower() in _LOGS]

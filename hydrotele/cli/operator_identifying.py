@@ -29,37 +29,36 @@ def identify_operator(
         str | None, typer.Option(help="gain, lead, lag or integral; default: the best fit.")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for operator.yaml and fit.json.")
+        Path | None,
+        typer.Option("--stdout_console", "-o", help="Folder for operator.yaml and fit.json."),
     ] = None,
-    json: Annotated[
-        bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")
-    ] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")] = False,
 ) -> None:
     """Fit the operator model to a tracking log: delay, margins, lag, remnant."""
     import hydrotele
-    from hydrotele.cli.console import notes, plain, print_json, write_json
-    from hydrotele.core.output import check_target, whole_folder
+    from hydrotele.cli.console import print_json, stderr_console, to_json_types, write_json
+    from hydrotele.core.output import atomic_folder, check_output_folder
     from hydrotele.teleop.operator_identification import (
+        format_operator_file,
         identify_operator,
-        operator_file_of,
         read_tracking,
     )
 
     if out:
-        check_target(out, _KIND)
+        check_output_folder(out, _KIND)
     given = {"time": time, "target": target, "response": response, "hand": hand}
     record, said = read_tracking(file, {key: name for key, name in given.items() if name})
     fit = identify_operator(record, equalisation, source=str(file))
     fit = fit._replace(notes=(*said, *fit.notes))
-    document = plain({
+    document = to_json_types({
         "file": file.name, "equalisation": fit.equalisation, "controlled_element": fit.element,
-        "explained": fit.explained, "rate_hz": fit.rate, "duration": fit.duration,
+        "explained": fit.explained_fraction, "rate_hz": fit.rate, "duration": fit.duration,
         "estimates": {name: one._asdict() for name, one in fit.estimates.items()},
         "notes": list(fit.notes),
     })  # fmt: skip
     if out:
-        text = operator_file_of(fit, "identified", file.name)
-        with whole_folder(out, _KIND) as folder:
+        text = format_operator_file(fit, "identified", file.name)
+        with atomic_folder(out, _KIND) as folder:
             (folder / "operator.yaml").write_text(text, encoding="utf-8")
             write_json(folder / "fit.json", document)
             summary = {"kind": _KIND, "name": file.name, "hydrotele": hydrotele.__version__}
@@ -69,23 +68,23 @@ def identify_operator(
         return
     _print(fit, file)
     for note in fit.notes:
-        notes.print(f"[yellow]note[/] {note}")
+        stderr_console.print(f"[yellow]note[/] {note}")
     if out:
-        notes.print(f"written to [bold]{out}[/]: operator.yaml, fit.json")
+        stderr_console.print(f"written to [bold]{out}[/]: operator.yaml, fit.json")
 
 
 def _print(fit, file: Path) -> None:
-    from hydrotele.cli.console import out, table
+    from hydrotele.cli.console import make_table, stdout_console
 
     element = f", controlled element {fit.element}" if fit.element else ""
     title = (
         f"{file.name}: {fit.duration:.0f} s at {fit.rate:.3g} Hz, equalisation {fit.equalisation}"
         f"{element}; the target explains {100 * fit.explained:.0f} % of the hand motion"
     )
-    rows = table(title, "parameter", "estimate", "95 % interval", "unit", "")
+    rows = make_table(title, "parameter", "estimate", "95 % interval", "unit", "")
     for name, one in fit.estimates.items():
         rows.add_row(
             name.replace("_", " "), f"{one.value:.4g}", f"{one.low:.4g} to {one.high:.4g}",
             one.unit, "" if one.identified else "[yellow]not identified[/]",
         )  # fmt: skip
-    out.print(rows)
+    stdout_console.print(rows)

@@ -6,7 +6,7 @@ from pathlib import Path
 from hydrotele.core.errors import InputError
 
 
-def overrides_of(items: list[str]) -> dict[str, str]:
+def parse_overrides(items: list[str]) -> dict[str, str]:
     """Return {key path: YAML text} from a list of `key=value` strings.
 
     Raises:
@@ -21,7 +21,7 @@ def overrides_of(items: list[str]) -> dict[str, str]:
     return pairs
 
 
-def chosen(machine: str | None, tool: str | None) -> dict[str, str]:
+def machine_overrides(machine: str | None, tool: str | None) -> dict[str, str]:
     """Return the scenario overrides that select a machine and its tool.
 
     A relative path is resolved from the working folder, not from the folder of the scenario file.
@@ -37,13 +37,13 @@ def chosen(machine: str | None, tool: str | None) -> dict[str, str]:
     return pairs
 
 
-def numbers_of(option: str, text: str) -> list[float]:
+def parse_numbers(option: str, text: str) -> list[float]:
     """Return the positive numbers of an option value, which are separated by commas.
 
     Raises:
         InputError: the text is empty or contains something other than positive numbers.
 
-    >>> numbers_of("--horizons", "1, 5,30")
+    >>> parse_numbers("--horizons", "1, 5,30")
     [1.0, 5.0, 30.0]
     """
     try:

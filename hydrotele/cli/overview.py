@@ -18,8 +18,7 @@ COMMANDS = {
     "run": "Simulate a scenario; write logs, a rerun recording, a summary and the MJCF.",
     "drive": "Drive a machine in real time; write the same files as `run`.",
     "haptic-device": "Serve a haptic device over UDP: send poses, apply wrenches, watchdog.",
-    "sweep": "Run variations of a scenario (grid or random samples); collect the results in a"
-    " table.",
+    "sweep": "Run variations of a scenario (grid or random samples); collect the results in a table.",
     "compare": "Compare open-loop predictions of several models with logs: RMS error per channel.",
     "identify-operator": "Fit the operator model to a tracking log: delay, margins, lag, remnant.",
     "replay": "Simulate the model with the commands of a log; print the prediction errors.",
@@ -28,14 +27,11 @@ COMMANDS = {
     "excite": "Design the most informative trajectory within a machine's limits.",
     "review": "Show a run in the rerun viewer: 3D machine, joints, pressures, flows and forces.",
     "list": "List the available machines, scenarios, sweeps, effects and environments.",
-    "validate": "Check a machine, joystick, scenario, sweep or log; report errors with file and"
-    " line.",
+    "validate": "Check a machine, joystick, scenario, sweep or log; report errors with file and line.",
     "export": "Write the complete MJCF of a machine or joystick, or an image of it.",
-    "experiments": "Repeat the experiments of a publication; compare its tables and figures with"
-    " simulation.",
+    "experiments": "Repeat the experiments of a publication; compare its tables and figures with simulation.",
     "compile": "Compile all numerical functions now, so that later commands start without delay.",
-    "bench": "Measure the speed of the simulation: mechanism, hydraulics, scenarios, batches,"
-    " start-up.",
+    "bench": "Measure the speed of the simulation: mechanism, hydraulics, scenarios, batches, start-up.",
     "demo": "Simulate an excavator, replay its log and draw the results.",
     "analyse": "Analyse a teleoperator by linear two-port theory.",
     "calibrate": "Calibrate the kinematics of a mechanism from measured poses.",

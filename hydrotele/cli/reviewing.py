@@ -10,10 +10,17 @@ import re
 import tempfile
 from pathlib import Path
 
-from hydrotele.cli.console import notes, out, print_json, progress_bar, table, write_json
-from hydrotele.cli.opening import log_path, open_log
+from hydrotele.cli.console import (
+    make_table,
+    print_json,
+    show_simulation_progress,
+    stderr_console,
+    stdout_console,
+    write_json,
+)
+from hydrotele.cli.opening import find_log_file, open_log
 from hydrotele.core.errors import InputError
-from hydrotele.core.output import check_target, whole_folder
+from hydrotele.core.output import atomic_folder, check_output_folder
 from hydrotele.logs.log import Log, save_log
 from hydrotele.machine.machine import Machine
 from hydrotele.run.replay import Replay, replay_log
@@ -44,7 +51,7 @@ def review_logs(
         raise InputError(screenshot, "the name must end in .png")
     if plot:
         _plot(first, second, machine, tool, plot)
-        out.print(f"written to [bold]{plot}[/]")
+        stdout_console.print(f"written to [bold]{plot}[/]")
         return
     with contextlib.ExitStack() as stack:
         made = first / "review.rrd"
@@ -59,17 +66,17 @@ def _show(recording: Path, serve: bool, port: int, screenshot: Path | None, quie
     if screenshot:
         from hydrotele.show.viewer import take_screenshot
 
-        notes.print("taking a screenshot ...", style="dim")
+        stderr_console.print("taking a screenshot ...", style="dim")
         for complaint in take_screenshot(recording, screenshot):
-            notes.print(f"[yellow]viewer[/] {complaint}", soft_wrap=True)
-        out.print(f"written to [bold]{screenshot}[/]")
+            stderr_console.print(f"[yellow]viewer[/] {complaint}", soft_wrap=True)
+        stdout_console.print(f"written to [bold]{screenshot}[/]")
     elif serve:
         from hydrotele.show.viewer import serve_recording
 
         tell = "open {} in a browser on this computer; Ctrl-C stops the server"
-        serve_recording(recording, port, lambda url: out.print(tell.format(url), soft_wrap=True))
+        serve_recording(recording, port, lambda url: stdout_console.print(tell.format(url), soft_wrap=True))
     elif quiet:
-        out.print(f"written to [bold]{recording}[/]")
+        stdout_console.print(f"written to [bold]{recording}[/]")
     else:
         from hydrotele.show.viewer import open_viewer
 
@@ -85,7 +92,7 @@ def _plot(first, second, machine, tool, path: Path) -> None:
         _, log = open_log(first, machine, tool)
         plot_log(log, path, title=log.metadata.get("run", log.name))
     else:
-        (a, (_, one)), (b, (_, two)) = _pair(first, second, machine, tool, "measured").items()
+        (a, (_, one)), (b, (_, two)) = _open_log_pair(first, second, machine, tool, "measured").items()
         plot_overlay(one, two, path, names=(a, b), title=f"{a} and {b}")
 
 
@@ -96,11 +103,11 @@ def _record(first, second, machine, tool, path: Path) -> None:
         which = "truth" if (first / "truth.parquet").is_file() else "measured"
         entries = {which: open_log(first, machine, tool, which)}
     else:
-        entries = _pair(first, second, machine, tool, "measured")
+        entries = _open_log_pair(first, second, machine, tool, "measured")
     write_recording(path, entries)
 
 
-def _pair(first, second, machine, tool, which: str) -> dict[str, tuple[Machine, Log]]:
+def _open_log_pair(first, second, machine, tool, which: str) -> dict[str, tuple[Machine, Log]]:
     """Load two logs of the same machine and return them under different names.
 
     Raises:
@@ -118,7 +125,7 @@ def _pair(first, second, machine, tool, which: str) -> dict[str, tuple[Machine, 
     return dict(zip(names, logs, strict=True))
 
 
-_SHOWN = {"rad": ("deg", 57.29577951308232), "m": ("mm", 1e3), "Pa": ("kPa", 1e-3)}
+_DISPLAY_UNITS = {"rad": ("deg", 57.29577951308232), "m": ("mm", 1e3), "Pa": ("kPa", 1e-3)}
 
 
 def replay_logs(
@@ -140,40 +147,40 @@ def replay_logs(
         InputError: a log or machine is not usable.
     """
     if target is None and not as_json:
-        one = log_path(paths[0])
+        one = find_log_file(paths[0])
         name = one.parent.name if paths[0].is_dir() else one.stem
         target = Path("runs", f"replay_{name}" if len(paths) == 1 else "replay_logs")
     if target:
-        check_target(target, "replay")
+        check_output_folder(target, "replay")
     stop_profiling_clock()
     results = []
     for path in paths:
         the_machine, log = open_log(path, machine, tool)
-        with progress_bar(f"replay {log.name}", quiet=as_json) as progress:
+        with show_simulation_progress(f"replay {log.name}", quiet=as_json) as progress:
             result = replay_log(log, the_machine, timestep, progress)
         results.append((the_machine, result))
         if log.metadata.get("command", "held") != "held":
-            notes.print(
+            stderr_console.print(
                 f"[yellow]note[/] {path}: the commands changed faster than the log rate, so their"
                 " means are replayed; log with log_rate = control_rate for an exact replay"
             )
         if not as_json:
-            _print(str(log_path(path)), result)
+            _print(str(find_log_file(path)), result)
     if target:
-        with whole_folder(target, "replay") as folder:
+        with atomic_folder(target, "replay") as folder:
             for number, (the_machine, result) in enumerate(results):
                 prefix = f"{number}_" if len(paths) > 1 else ""
                 name = prefix + result.measured.name
                 _write(folder, name, the_machine, result)
-            data = {"kind": "replay", "replays": [as_data(result) for _, result in results]}
+            data = {"kind": "replay", "replays": [replay_document(result) for _, result in results]}
             write_json(folder / "summary.json", data)
-        notes.print(f"written to {target}")
+        stderr_console.print(f"written to {target}")
     if as_json:
-        data = [as_data(result) for _, result in results]
+        data = [replay_document(result) for _, result in results]
         print_json(data[0] if len(data) == 1 else data)
 
 
-def as_data(result: Replay) -> dict:
+def replay_document(result: Replay) -> dict:
     """Return a replay in the form that `--json` prints."""
     return {
         "log": result.measured.source,
@@ -184,16 +191,14 @@ def as_data(result: Replay) -> dict:
 
 
 def _print(source: str, result: Replay) -> None:
-    title = (
-        f"{source}: prediction errors (lower is better), {result.realtime_factor:.0f} x real time"
-    )
-    rows = table(title, "channel", "RMS", "max", "unit", "RMS / range", "RMS / noise")
+    title = f"{source}: prediction errors (lower is better), {result.realtime_factor:.0f} x real time"
+    rows = make_table(title, "channel", "RMS", "max", "unit", "RMS / range", "RMS / noise")
     for name, c in result.channels.items():
-        unit, factor = _SHOWN.get(c.unit, (c.unit, 1.0))
+        unit, factor = _DISPLAY_UNITS.get(c.unit, (c.unit, 1.0))
         share = f"{100 * c.rms / c.range:.3f} %" if c.range else "-"
         noise = f"{c.rms / c.noise_rms:.2f}" if c.noise_rms else "-"
         rows.add_row(name, f"{c.rms * factor:.4g}", f"{c.max * factor:.4g}", unit, share, noise)
-    out.print(rows)
+    stdout_console.print(rows)
 
 
 def _write(folder: Path, name: str, machine, result: Replay) -> None:

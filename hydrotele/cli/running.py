@@ -12,31 +12,36 @@ from typing import Any, NamedTuple
 import typer
 
 from hydrotele.cli.catalogue import export_machine
-from hydrotele.cli.console import notes, out, print_json, progress_bar, table, write_json
+from hydrotele.cli.console import (
+    make_table,
+    print_json,
+    show_simulation_progress,
+    stderr_console,
+    stdout_console,
+    write_json,
+)
 from hydrotele.cli.reviewing import replay_logs
 from hydrotele.core.errors import InputError
-from hydrotele.core.output import check_target, whole_folder
+from hydrotele.core.output import atomic_folder, check_output_folder
 from hydrotele.logs.log import save_log
 from hydrotele.machine.machine_file import save_machine
-from hydrotele.run.run import Run, run_scenario, scenario_model
+from hydrotele.run.run import Run, load_nominal_machine, run_scenario
 from hydrotele.run.sweep import (
     Progress,
     SweepResult,
     SweepSettings,
-    default_figures,
+    choose_figures,
+    compute_statistics,
     run_sweep,
-    spread_statistics,
 )
 from hydrotele.run.sweep_facts import SweepFile, load_sweep
-from hydrotele.run.sweep_runs import JOURNAL, Entry, finished
+from hydrotele.run.sweep_runs import JOURNAL, JournalEntry, count_finished_runs
 from hydrotele.scenario.scenario import load_scenario, save_scenario
 from hydrotele.show.sweep_report import Study, write_sweep_report
 from hydrotele.simulate.native import stop_profiling_clock
 
 
-def run_to_folder(
-    name: str, target: Path | None, overrides: dict[str, str], review: bool, as_json: bool
-) -> Path:
+def run_to_folder(name: str, target: Path | None, overrides: dict[str, str], review: bool, as_json: bool) -> Path:
     """Run a scenario and write the results to a folder.
 
     The output folder is written completely or not at all.
@@ -58,16 +63,16 @@ def run_to_folder(
     stop_profiling_clock()
     scenario = load_scenario(name, overrides)
     target = target or Path("runs", scenario.name)
-    check_target(target, "run")
-    with progress_bar(f"run {scenario.name}", quiet=as_json) as progress:
+    check_output_folder(target, "run")
+    with show_simulation_progress(f"run {scenario.name}", quiet=as_json) as progress:
         result = run_scenario(scenario, progress)
-    with whole_folder(target, "run") as folder:
+    with atomic_folder(target, "run") as folder:
         write_run(result, folder, review)
     if as_json:
         print_json({**result.summary, "folder": str(target)})
     else:
         print_summary(result.summary)
-        out.print(f"written to [bold]{target}[/]")
+        stdout_console.print(f"written to [bold]{target}[/]")
     return target
 
 
@@ -81,18 +86,18 @@ def write_run(result: Run, folder: Path, review: bool = True) -> None:
     save_log(result.truth, folder / "truth.parquet")
     save_scenario(result.scenario, folder / "scenario.yaml")
     result.plant.document.save(folder / "machine.xml")
-    save_machine(scenario_model(result.scenario), folder / "machine.yaml")
+    save_machine(load_nominal_machine(result.scenario), folder / "machine.yaml")
     if review:
         from hydrotele.show.recording import write_recording
 
-        notes.print("writing review.rrd ...", style="dim")
+        stderr_console.print("writing review.rrd ...", style="dim")
         write_recording(folder / "review.rrd", {"truth": (result.plant.machine, result.truth)})
     write_json(folder / "summary.json", result.summary)
 
 
 def print_summary(summary: dict[str, Any]) -> None:
     """Print the summary of a run as a table, followed by its notes."""
-    rows = table(f"{summary['scenario']} ({summary['machine']}, tool {summary['tool']})", "", "")
+    rows = make_table(f"{summary['scenario']} ({summary['machine']}, tool {summary['tool']})", "", "")
     rows.show_header = False
     rows.add_row("simulated", f"{summary['simulated_seconds']:g} s")
     rows.add_row("real-time factor", f"{summary['realtime_factor']:.0f}")
@@ -110,9 +115,9 @@ def print_summary(summary: dict[str, Any]) -> None:
         unit, factor = ("mm", 1e3) if error["unit"] == "m" else ("deg", 57.29577951308232)
         rms, largest = error["rms"] * factor, error["max"] * factor
         rows.add_row(f"tracking error {name}", f"RMS {rms:.2f}, max {largest:.2f} {unit}")
-    out.print(rows)
+    stdout_console.print(rows)
     for note in summary["notes"]:
-        out.print(f"[yellow]note[/] {note}")
+        stdout_console.print(f"[yellow]note[/] {note}")
 
 
 def run_demo(target: Path) -> None:
@@ -128,33 +133,33 @@ def run_demo(target: Path) -> None:
         target.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(target, f"cannot be created: {error.strerror}") from None
-    _say_step(1, "the bucket moves straight up at 0.5 m/s (Zhu 1994, Fig. 6.45)")
+    _print_demo_step(1, "the bucket moves straight up at 0.5 m/s (Zhu 1994, Fig. 6.45)")
     run_to_folder("zhu_up", target / "zhu_up", {}, True, False)
-    _say_step(2, "the bucket digs")
+    _print_demo_step(2, "the bucket digs")
     run_to_folder("dig", target / "dig", {}, True, False)
-    _say_step(3, "all axes move together, measured with the sensors of Khoshzaban 1992")
+    _print_demo_step(3, "all axes move together, measured with the sensors of Khoshzaban 1992")
     run_to_folder("excitation", target / "excitation", {}, True, False)
-    _say_step(4, "the model is simulated with the commands of that log: prediction errors")
+    _print_demo_step(4, "the model is simulated with the commands of that log: prediction errors")
     log = target / "excitation" / "measured.parquet"
     replay_logs([log], None, None, 1.0e-3, target / "replay", False)
-    _say_step(5, "a picture of the machine")
+    _print_demo_step(5, "a picture of the machine")
     try:
         export_machine("cat215", "bucket", None, target / "cat215.png", "overview")
     except InputError as error:
-        notes.print(f"[yellow]no picture[/] {error}")
-    out.print(f"\n[bold green]done[/] All results are in [bold]{target}[/]. Show them by")
-    out.print("  source .venv/bin/activate             (in a checkout, once per shell)")
-    out.print(f"  hydrotele review {target}/dig             (rerun viewer)")
-    out.print(f"  hydrotele review {target}/dig --serve     (web viewer)")
-    out.print(f"The plot {target}/replay/measured.png compares log and replay.")
+        stderr_console.print(f"[yellow]no picture[/] {error}")
+    stdout_console.print(f"\n[bold green]done[/] All results are in [bold]{target}[/]. Show them by")
+    stdout_console.print("  source .venv/bin/activate             (in a checkout, once per shell)")
+    stdout_console.print(f"  hydrotele review {target}/dig             (rerun viewer)")
+    stdout_console.print(f"  hydrotele review {target}/dig --serve     (web viewer)")
+    stdout_console.print(f"The plot {target}/replay/measured.png compares log and replay.")
 
 
-def _say_step(step: int, text: str) -> None:
-    out.print(f"\n[bold]{step}/5[/] {text}")
+def _print_demo_step(step: int, text: str) -> None:
+    stdout_console.print(f"\n[bold]{step}/5[/] {text}")
 
 
-_ALL_FAILED = 3
-_LISTED = 10
+_FAILURE_STATUS = 3
+_MAX_LISTED_FAILURES = 10
 
 
 class SweepOptions(NamedTuple):
@@ -168,13 +173,13 @@ class SweepOptions(NamedTuple):
     json: bool
 
 
-def sweep_to_folder(name: str, target: Path | None, wishes: SweepOptions) -> None:
+def sweep_to_folder(name: str, target: Path | None, options: SweepOptions) -> None:
     """Run a sweep, write its report and print the results.
 
     Args:
         name: sweep file, or name of a shipped sweep.
         target: output folder, default `runs/<name>`.
-        wishes: options of the command.
+        options: options of the command.
 
     Raises:
         InputError: the file, one of its points, the folder or the cluster is not usable.
@@ -182,29 +187,29 @@ def sweep_to_folder(name: str, target: Path | None, wishes: SweepOptions) -> Non
     """
     file = load_sweep(name)
     target = target or Path("runs", file.name)
-    how = SweepSettings(wishes.jobs, wishes.dask, wishes.fresh, wishes.retry_failed, write_run)
+    how = SweepSettings(options.jobs, options.dask, options.fresh, options.retry_failed, write_run)
     try:
-        with _bar(file.name, wishes.json) as progress:
+        with _show_sweep_progress(file.name, options.json) as progress:
             swept = run_sweep(file, target, how, progress)
     except (KeyboardInterrupt, SystemExit) as stop:
-        done = finished(target / JOURNAL)
+        done = count_finished_runs(target / JOURNAL)
         said = f"{done} of {file.sweep.runs} runs are finished and saved in {target}"
         message = f"stopped: {said}; repeat the command to continue"
-        notes.print(message, markup=False, soft_wrap=True)
+        stderr_console.print(message, markup=False, soft_wrap=True)
         code = stop.code if isinstance(stop, SystemExit) else 130
         raise typer.Exit(code if isinstance(code, int) else 1) from None
-    figures = list(file.sweep.figures) or default_figures(swept.table)
-    study = _study(file, swept, figures)
-    if not wishes.json:
-        notes.print("writing report.html ...", style="dim")
+    figures = list(file.sweep.figures) or choose_figures(swept.table)
+    study = _sweep_study(file, swept, figures)
+    if not options.json:
+        stderr_console.print("writing report.html ...", style="dim")
     write_sweep_report(study, target)
-    _say(file, target, swept, figures, wishes.json)
+    _print_sweep(file, target, swept, figures, options.json)
     failed = len(swept.failed)
-    if failed and (wishes.strict or failed == file.sweep.runs):
-        raise typer.Exit(_ALL_FAILED)
+    if failed and (options.strict or failed == file.sweep.runs):
+        raise typer.Exit(_FAILURE_STATUS)
 
 
-def _study(file: SweepFile, swept: SweepResult, figures: list[str]) -> Study:
+def _sweep_study(file: SweepFile, swept: SweepResult, figures: list[str]) -> Study:
     """Return the data of the sweep report."""
     sampled = tuple(file.sweep.sample.keys) if file.sweep.sample else ()
     logarithmic = [k for k in sampled if file.sweep.sample.keys[k].log_uniform]  # pyright: ignore - it has one
@@ -215,59 +220,57 @@ def _study(file: SweepFile, swept: SweepResult, figures: list[str]) -> Study:
     )  # fmt: skip
 
 
-def _say(
-    file: SweepFile, target: Path, swept: SweepResult, figures: list[str], as_json: bool
-) -> None:
-    found = spread_statistics(swept.table, figures)
+def _print_sweep(file: SweepFile, target: Path, swept: SweepResult, figures: list[str], as_json: bool) -> None:
+    found = compute_statistics(swept.table, figures)
     if as_json:
         print_json({
             "kind": "sweep", "name": file.name, "folder": str(target), "runs": file.sweep.runs,
-            "done_now": swept.done, "failed": len(swept.failed),
+            "done_now": swept.n_executed, "failed": len(swept.failed),
             "failures": [{"run": e.run, "reason": e.reason, **_values(swept, e)}
                          for e in swept.failed],
             "figures": found,
         })  # fmt: skip
         return
     title = f"{file.name}: {file.sweep.runs} runs"
-    shown = table(title, "quantity", "unit", "minimum (run)", "median", "maximum (run)")
+    shown = make_table(title, "quantity", "unit", "minimum (run)", "median", "maximum (run)")
     shown.columns[0].overflow = "fold"
     for name, f in found.items():
         ends = (f"{f[end]:.4g} ({f[f'{end}_run']})" for end in ("min", "max"))
         shown.add_row(name, f["unit"], next(ends), f"{f['median']:.4g}", next(ends))
     if found:
-        out.print(shown)
+        stdout_console.print(shown)
     elif len(swept.failed) < file.sweep.runs:
-        out.print("all results of the runs are equal")
+        stdout_console.print("all results of the runs are equal")
     if swept.failed:
-        out.print(f"[red]{len(swept.failed)} of {file.sweep.runs} runs failed[/]")
-    for entry in swept.failed[:_LISTED]:
-        varied = ", ".join(f"{key} {_short(value)}" for key, value in _values(swept, entry).items())
+        stdout_console.print(f"[red]{len(swept.failed)} of {file.sweep.runs} runs failed[/]")
+    for entry in swept.failed[:_MAX_LISTED_FAILURES]:
+        varied = ", ".join(f"{key} {_format_value(value)}" for key, value in _values(swept, entry).items())
         said = f"  run {entry.run} ({varied}): {entry.reason}"
-        out.print(said, markup=False, soft_wrap=True)
-    if len(swept.failed) > _LISTED:
-        out.print(f"  and {len(swept.failed) - _LISTED} more, in column 'reason' of the table")
-    if not swept.done:
-        out.print("all runs were finished already; --fresh repeats them")
-    out.print(f"written to [bold]{target}[/]; open {target}/report.html", soft_wrap=True)
+        stdout_console.print(said, markup=False, soft_wrap=True)
+    if len(swept.failed) > _MAX_LISTED_FAILURES:
+        stdout_console.print(f"  and {len(swept.failed) - _MAX_LISTED_FAILURES} more, in column 'reason' of the table")
+    if not swept.n_executed:
+        stdout_console.print("all runs were finished already; --fresh repeats them")
+    stdout_console.print(f"written to [bold]{target}[/]; open {target}/report.html", soft_wrap=True)
 
 
-def _values(swept: SweepResult, entry: Entry) -> dict[str, Any]:
+def _values(swept: SweepResult, entry: JournalEntry) -> dict[str, Any]:
     columns = swept.table.columns
-    return {key: columns[key][entry.run - 1] for key in (*swept.table.varied, "seed")}
+    return {key: columns[key][entry.run - 1] for key in (*swept.table.varied_keys, "seed")}
 
 
-def _short(value: Any) -> str:
+def _format_value(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 @contextlib.contextmanager
-def _bar(name: str, quiet: bool) -> Iterator[Progress | None]:
+def _show_sweep_progress(name: str, quiet: bool) -> Iterator[Progress | None]:
     """Show a progress bar with the remaining time on stderr.
 
     Yields:
         A function that updates the bar, None if `quiet` or if stderr is not a terminal.
     """
-    if quiet or not notes.is_terminal:
+    if quiet or not stderr_console.is_terminal:
         yield None
         return
     from rich.progress import (
@@ -281,7 +284,7 @@ def _bar(name: str, quiet: bool) -> Iterator[Progress | None]:
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
                TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())  # fmt: skip
-    with Progress(*columns, TextColumn("{task.fields[failed]}"), console=notes,
+    with Progress(*columns, TextColumn("{task.fields[failed]}"), console=stderr_console,
                   transient=True, speed_estimate_period=600.0) as bar:  # fmt: skip
         task = bar.add_task(f"check {name}", total=None, failed="")
         last = ["check"]

@@ -22,21 +22,13 @@ def haptic_device(
         str, typer.Option("--kind", help="simulated, force-dimension, haption, haption:HOST#PORT.")
     ] = "simulated",
     host: Annotated[str, typer.Option("--host", help="Address to listen on.")] = "127.0.0.1",
-    port: Annotated[
-        int, typer.Option("--port", min=0, max=65535, help="UDP port; 0: any free port.")
-    ] = 5610,
-    rate: Annotated[
-        float, typer.Option("--rate", min=50, max=4000, help="Sampling rate [Hz].")
-    ] = 1000,
-    duration: Annotated[
-        float | None, typer.Option("--duration", help="Duration [s]; default: until Ctrl-C.")
-    ] = None,
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="UDP port; 0: any free port.")] = 5610,
+    rate: Annotated[float, typer.Option("--rate", min=50, max=4000, help="Sampling rate [Hz].")] = 1000,
+    duration: Annotated[float | None, typer.Option("--duration", help="Duration [s]; default: until Ctrl-C.")] = None,
     until_eof: Annotated[
         bool, typer.Option("--until-eof", help="Stop when standard input is closed.", hidden=True)
     ] = False,
-    json: Annotated[
-        bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")
-    ] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")] = False,
 ) -> None:
     """Serve a haptic device over UDP: send poses, apply wrenches, watchdog."""
     from hydrotele.cli.haptic import HapticOptions, serve_device

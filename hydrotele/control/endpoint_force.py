@@ -20,71 +20,71 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from hydrotele.control.state_filter import (
-    CHANGE,
-    LAST,
-    LOW,
+    LAST_READING,
     RATE,
+    SECOND_DERIVATIVE,
+    VALUE,
     filter_delay,
+    filter_signal,
     filter_step,
     filter_table,
-    filtered,
     noise_gains,
 )
 from hydrotele.control.task_impedance import RecursiveLeastSquares
 from hydrotele.control.tip_balance import (
     arm_joints,
-    arm_of,
     arm_record,
-    arm_tables,
+    create_arm_balance,
     dynamic_balance,
-    free_axes,
-    gravity_size,
+    gravity_parameter_count,
+    independent_axes,
+    read_arm_record,
+    solve_tip_force,
     static_balance,
     static_torque,
-    tip_force,
 )
 from hydrotele.core.compiled import allocation_free, compiled
 from hydrotele.core.errors import InputError
-from hydrotele.core.memory import address_record, floats, integers, rows_of
+from hydrotele.core.memory import address_record, float64_view, int64_view, matrix_view
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine, SensorSet, noise_rms
 
-_NAMES = ("C2", "S2", "C23", "S23", "C234", "S234", "C5")
-_GRID = 9  # poses per joint at which the static model is fitted to the masses
-_SPREAD = 3.0e5  # N m, initial standard deviation of the gravity parameters: no prior knowledge
-_RUBBING = 3.0e4  # N, initial standard deviation of dry friction
-PERIOD = 0.2
+_GRAVITY_NAMES = ("C2", "S2", "C23", "S23", "C234", "S234", "C5")
+_POSES_PER_JOINT = 9  # poses per joint at which the static model is fitted to the masses
+_INITIAL_GRAVITY_STD = 3.0e5  # N m, initial standard deviation of the gravity parameters: no prior knowledge
+_INITIAL_FRICTION_STD = 3.0e4  # N, initial standard deviation of dry friction
+EQUATION_PERIOD_S = 0.2
 """Time between the equations of an identification [s]."""
-_SMOOTH = 1.0  # Hz, bandwidth of the filter of slow motion
-_CREEP = 5.0e-3  # m/s or rad/s: slower drives may be at rest and give no friction equation
-_START = 50  # equations before the parameters are a valid estimate (Zhu 1994, 6.1.3)
-_NORMAL = 1.96
+_SLOW_MOTION_BANDWIDTH_HZ = 1.0  # Hz, bandwidth of the filter of slow motion
+_MIN_SLIDING_SPEED = 5.0e-3  # m/s or rad/s: slower drives may be at rest and give no friction equation
+_MIN_EQUATIONS = 50  # equations before the parameters are a valid estimate (Zhu 1994, 6.1.3)
+_NORMAL95 = 1.96
 
 
 @dataclass(frozen=True)
-class Gravity:
+class GravityModel:
     """Parameters of the static gravity model.
 
     Attributes:
         names: (p,) trigonometric factors of the parameters: C2, S2, C23, S23, C234, S234, C5.
         value: (p,) parameters [N m].
-        interval: (p,) half width of the 95 % intervals [N m]; 0 if computed from masses.
+        ci95_half_width: (p,) half width of the 95 % intervals [N m]; 0 if computed from masses.
         history: (r, p) parameters after every equation [N m]; empty if computed from masses.
         residual: (m - 1,) RMS of the residual torques, from the boom outwards [N m].
-        removed: (q,) indices of equations removed as outliers, sorted.
+        outlier_indices: (q,) indices of equations removed as outliers, sorted.
     """
 
     names: tuple[str, ...]
     value: np.ndarray
-    interval: np.ndarray
+    ci95_half_width: np.ndarray
     history: np.ndarray
     residual: np.ndarray
-    removed: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    outlier_indices: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
 
 
-def gravity_rows(q: np.ndarray) -> np.ndarray:
+def gravity_regressor(q: np.ndarray) -> np.ndarray:
     """Return the regressor Y of the static model `tau = Y(q) P`.
 
     Args:
@@ -95,14 +95,12 @@ def gravity_rows(q: np.ndarray) -> np.ndarray:
 
     Source: Zhu 1994, 6.8 and 6.9.
     """
-    joint, size = np.arange(len(q)), gravity_size(len(q))
+    joint, size = np.arange(len(q)), gravity_parameter_count(len(q))
     units = np.eye(size)
-    return np.array(
-        [[static_torque(q, joint, units[p], i) for p in range(size)] for i in range(len(q))]
-    )
+    return np.array([[static_torque(q, joint, units[p], i) for p in range(size)] for i in range(len(q))])
 
 
-def gravity_from_masses(machine: Machine) -> Gravity:
+def fit_gravity_to_masses(machine: Machine) -> GravityModel:
     """Fit the static model to the gravity torques of a machine's masses.
 
     The complete model at rest is fitted over the ranges of the joints. The weight of the links has
@@ -117,24 +115,28 @@ def gravity_from_masses(machine: Machine) -> Gravity:
     Raises:
         InputError: the arm's joints are not all driven.
     """
-    arm = arm_tables(machine, f"gravity of {machine.name}")
+    arm = create_arm_balance(machine, f"gravity of {machine.name}")
     joints = arm_joints(machine)
     ranges = [machine.joints[j].range or (-math.pi, math.pi) for j in joints[1:]]
-    grid = np.meshgrid(*(np.linspace(low, high, _GRID) for low, high in ranges), indexing="ij")
+    grid = np.meshgrid(*(np.linspace(low, high, _POSES_PER_JOINT) for low, high in ranges), indexing="ij")
     poses = np.column_stack([np.zeros(grid[0].size), *(axis.ravel() for axis in grid)])
     torque = np.zeros((len(poses), len(joints)))
-    _weights(arm, poses, torque)
-    rows = np.array([gravity_rows(q)[1:] for q in poses])
+    _gravity_torques(arm, poses, torque)
+    rows = np.array([gravity_regressor(q)[1:] for q in poses])
     value = np.linalg.lstsq(rows.reshape(-1, rows.shape[2]), torque[:, 1:].ravel(), rcond=None)[0]
     left = torque[:, 1:] - rows @ value
     size = len(value)
-    return Gravity(
-        _NAMES[:size], value, np.zeros(size), np.zeros((0, size)), np.sqrt(np.mean(left**2, axis=0))
+    return GravityModel(
+        _GRAVITY_NAMES[:size],
+        value,
+        np.zeros(size),
+        np.zeros((0, size)),
+        np.sqrt(np.mean(left**2, axis=0)),
     )
 
 
 @compiled
-def _weights(arm, poses, torque):
+def _gravity_torques(arm, poses, torque):
     """Compute the gravity torques (r, m) on the arm's joints in poses (r, m)."""
     outside = np.zeros(len(arm.work))
     for row in range(len(poses)):
@@ -145,21 +147,21 @@ def _weights(arm, poses, torque):
             torque[row, i] = outside[arm.joint[i]]
 
 
-class SlowMoves(NamedTuple):
+class SlowMotion(NamedTuple):
     """Filtered signals of slow motion of an arm with m joints, r rows.
 
     Attributes:
         angle: (r, m) joint angles [rad].
         torque: (r, m) torques of the drives [N m].
-        rubbing: (r, m) torque per newton of dry friction of the drive [m]; 0 if it may be at rest.
+        friction_torque: (r, m) torque per newton of dry friction of the drive [m]; 0 if it may be at rest.
     """
 
     angle: np.ndarray
     torque: np.ndarray
-    rubbing: np.ndarray
+    friction_torque: np.ndarray
 
 
-def slow_moves(machine: Machine, log: Log, period: float = PERIOD) -> SlowMoves:
+def extract_slow_motion(machine: Machine, log: Log, period: float = EQUATION_PERIOD_S) -> SlowMotion:
     """Compute joint angles and drive torques of an arm from a log of slow motion.
 
     Cylinder forces are converted to torques by virtual work through the linkages.
@@ -177,25 +179,28 @@ def slow_moves(machine: Machine, log: Log, period: float = PERIOD) -> SlowMoves:
 
     Source: Zhu 1994, 6.12 and 6.13.
     """
-    free_axes(machine, f"torques of {machine.name}")
+    independent_axes(machine, f"torques of {machine.name}")
     driver = {axis.joint: name for name, axis in machine.axes.items()}
-    table, every = filter_table(_SMOOTH, 1.0 / log.rate), max(1, round(period * log.rate))
+    table, every = (
+        filter_table(_SLOW_MOTION_BANDWIDTH_HZ, 1.0 / log.rate),
+        max(1, round(period * log.rate)),
+    )
     columns = []
     for name in (driver[joint] for joint in arm_joints(machine)):
         head, rod = machine.axes[name].hydraulic_drive.areas
         force = head * log[f"pressure_head.{name}"] - rod * log[f"pressure_rod.{name}"]
-        moved, pushed = (filtered(table, x)[::every] for x in (log[f"angle.{name}"], force))
-        lever = axis_linkage(machine, name).rate(moved[:, LOW])
+        moved, pushed = (filter_signal(table, x)[::every] for x in (log[f"angle.{name}"], force))
+        lever = axis_linkage(machine, name).rate(moved[:, VALUE])
         speed = np.abs(lever * moved[:, RATE])
-        way = np.where(speed > _CREEP, np.sign(moved[:, RATE]), 0.0)
-        columns.append((moved[:, LOW], lever * pushed[:, LOW], np.abs(lever) * way))
-    return SlowMoves(*(np.column_stack(part) for part in zip(*columns, strict=True)))
+        way = np.where(speed > _MIN_SLIDING_SPEED, np.sign(moved[:, RATE]), 0.0)
+        columns.append((moved[:, VALUE], lever * pushed[:, VALUE], np.abs(lever) * way))
+    return SlowMotion(*(np.column_stack(part) for part in zip(*columns, strict=True)))
 
 
 def identify_gravity(
     machine: Machine, log: Log, friction: bool = True, *, remove_outliers: bool = False,
-    period: float = PERIOD,
-) -> Gravity:  # fmt: skip
+    period: float = EQUATION_PERIOD_S,
+) -> GravityModel:  # fmt: skip
     """Identify the static gravity model from a log of slow motion by recursive least squares.
 
     With `remove_outliers`, equations with large residuals, as during a temporary sensor failure,
@@ -221,18 +226,16 @@ def identify_gravity(
 
     Source: Zhu 1994, 6.1.3; Chauvenet 1863, A manual of spherical and practical astronomy, vol. 2.
     """
-    moves = slow_moves(machine, log, period)
-    size, joints = gravity_size(moves.angle.shape[1]), moves.angle.shape[1]
-    rows = np.array([gravity_rows(q)[1:] for q in moves.angle])
+    moves = extract_slow_motion(machine, log, period)
+    size, joints = gravity_parameter_count(moves.angle.shape[1]), moves.angle.shape[1]
+    rows = np.array([gravity_regressor(q)[1:] for q in moves.angle])
     if friction:
-        rubbing = moves.rubbing[:, 1:, None] * np.eye(joints - 1)
+        rubbing = moves.friction_torque[:, 1:, None] * np.eye(joints - 1)
         rows = np.concatenate([rows, rubbing], axis=2)
     torque, kept = moves.torque[:, 1:], np.ones(len(rows), bool)
     while True:
-        if np.count_nonzero(kept) < _START:
-            raise InputError(
-                log.source, f"at least {_START * period:g} s of slow motion are needed"
-            )
+        if np.count_nonzero(kept) < _MIN_EQUATIONS:
+            raise InputError(log.source, f"at least {_MIN_EQUATIONS * period:g} s of slow motion are needed")
         found, history = _solve_recursively(rows[kept], torque[kept], size)
         left = torque - rows @ found.value
         outside = kept & _are_outliers(left, kept)
@@ -241,10 +244,10 @@ def identify_gravity(
         kept &= ~outside
     left = left[kept]
     usual = math.sqrt(float(np.sum(left**2)) / (left.size - rows.shape[2]))
-    return Gravity(
-        _NAMES[:size],
+    return GravityModel(
+        _GRAVITY_NAMES[:size],
         found.value[:size],
-        _NORMAL * usual * np.sqrt(np.diag(found.covariance)[:size]),
+        _NORMAL95 * usual * np.sqrt(np.diag(found.covariance)[:size]),
         np.array(history),
         np.sqrt(np.mean(left**2, axis=0)),
         np.flatnonzero(~kept),
@@ -255,7 +258,7 @@ def _solve_recursively(
     rows: np.ndarray, torque: np.ndarray, size: int
 ) -> tuple[RecursiveLeastSquares, list[np.ndarray]]:
     """Process equations (r, m - 1, p); return the estimate and the parameter history."""
-    spread = np.append(np.full(size, _SPREAD), np.full(rows.shape[2] - size, _RUBBING))
+    spread = np.append(np.full(size, _INITIAL_GRAVITY_STD), np.full(rows.shape[2] - size, _INITIAL_FRICTION_STD))
     found, history = RecursiveLeastSquares(np.zeros(rows.shape[2]), spread), []
     for table, torques in zip(rows, torque, strict=True):
         for row, one in zip(table, torques, strict=True):
@@ -273,8 +276,8 @@ def _are_outliers(left: np.ndarray, kept: np.ndarray) -> np.ndarray:
     return np.asarray((np.abs(left) > most * scale).any(axis=1))
 
 
-WAITING, GOOD, BAD, SINGULAR = range(4)
-_JOINT, _HEAD, _ROD = range(3)  # rows of `DriveReadings.last`
+STATUS_WAITING, STATUS_GOOD, STATUS_BAD, STATUS_SINGULAR = range(4)
+_JOINT_ROW, _HEAD_ROW, _ROD_ROW = range(3)  # rows of `DriveReadings.last`
 
 
 class DriveReadings(NamedTuple):
@@ -325,59 +328,64 @@ def endpoint_force_step(arm, readings, dynamic, count, joint, head, rod, out):
     Source: Zhu 1994, 6.1.
     """
     r, n = readings, len(readings.position)
-    good = _take(r.last[_JOINT], r.still[_JOINT], r.position, joint)
-    good = _take(r.last[_HEAD], r.still[_HEAD], r.valve, head) and good
-    good = _take(r.last[_ROD], r.still[_ROD], r.valve, rod) and good
-    if not _known(r):
-        return WAITING
+    good = _store_readings(r.last[_JOINT_ROW], r.still[_JOINT_ROW], r.position, joint)
+    good = _store_readings(r.last[_HEAD_ROW], r.still[_HEAD_ROW], r.valve, head) and good
+    good = _store_readings(r.last[_ROD_ROW], r.still[_ROD_ROW], r.valve, rod) and good
+    if not _has_all_readings(r):
+        return STATUS_WAITING
     places = n + 2 * len(r.valve)
     for c in range(places):
-        place, value = _reading(r, c)
+        place, value = _get_reading(r, c)
         if count < r.settle:
-            before = r.state[c, LOW] if count > 0 else value
-            _stand(r.state[c], before + (value - before) / (count + 1))
+            before = r.state[c, VALUE] if count > 0 else value
+            _reset_filter(r.state[c], before + (value - before) / (count + 1))
         else:
             filter_step(r.tables[0], r.state[c], value)
-        arm.z[place] = r.state[c, LOW]
+        arm.z[place] = r.state[c, VALUE]
         if c < n:
             arm.z[n + c] = r.state[c, RATE]
-            arm.acceleration[c] = r.state[c, CHANGE]
+            arm.acceleration[c] = r.state[c, SECOND_DERIVATIVE]
     if dynamic:
         dynamic_balance(arm, r.outside)
     else:
         static_balance(arm, r.outside)
-    if not tip_force(arm, r.outside, out):
-        return SINGULAR
+    if not solve_tip_force(arm, r.outside, out):
+        return STATUS_SINGULAR
     for i in range(len(out)):
         if count < r.settle:
-            _stand(r.state[places + i], out[i])
+            _reset_filter(r.state[places + i], out[i])
         else:
             filter_step(r.tables[1], r.state[places + i], out[i])
-        out[i] = r.state[places + i, LOW]
-    return GOOD if good else BAD
+        out[i] = r.state[places + i, VALUE]
+    return STATUS_GOOD if good else STATUS_BAD
 
 
 @allocation_free
-def _stand(state, value):
+def _reset_filter(state, value):
     """Set a filter to a constant value."""
-    state[LOW], state[RATE], state[CHANGE], state[LAST] = value, 0.0, 0.0, value
+    state[VALUE], state[RATE], state[SECOND_DERIVATIVE], state[LAST_READING] = (
+        value,
+        0.0,
+        0.0,
+        value,
+    )
 
 
 @allocation_free
-def _reading(r, c):
+def _get_reading(r, c):
     """Return the index in the arm's state and the last valid value of signal c.
 
     Positions come first, then pressures.
     """
     n = len(r.position)
     if c < n:
-        return c, r.last[_JOINT, r.position[c]]
+        return c, r.last[_JOINT_ROW, r.position[c]]
     i, side = (c - n) // 2, (c - n) % 2
-    return 2 * n + 4 * i + 2 + side, r.last[_HEAD + side, r.valve[i]]
+    return 2 * n + 4 * i + 2 + side, r.last[_HEAD_ROW + side, r.valve[i]]
 
 
 @allocation_free
-def _take(last, still, used, values):
+def _store_readings(last, still, used, values):
     """Store finite readings; return False if a used reading is not finite."""
     good = True
     for c in range(len(used)):
@@ -394,18 +402,18 @@ def _take(last, still, used, values):
 
 
 @allocation_free
-def _known(readings):
+def _has_all_readings(readings):
     """Return whether all used channels have a reading."""
     for i in readings.position:
-        if math.isnan(readings.last[_JOINT, i]):
+        if math.isnan(readings.last[_JOINT_ROW, i]):
             return False
     for i in readings.valve:
-        if math.isnan(readings.last[_HEAD, i]) or math.isnan(readings.last[_ROD, i]):
+        if math.isnan(readings.last[_HEAD_ROW, i]) or math.isnan(readings.last[_ROD_ROW, i]):
             return False
     return True
 
 
-_READINGS = np.dtype(
+_READINGS_DTYPE = np.dtype(
     [("period", np.float64)]
     + [(name, np.int64) for name in ("settle", "free", "valves", "signals", "axes")]
     + [(name, np.int64) for name in ("tables", "position", "valve")]  # addresses from here on
@@ -417,7 +425,7 @@ _READINGS = np.dtype(
 def _readings_record(r: DriveReadings) -> np.ndarray:
     """Return a record (1,) of DriveReadings; their arrays must outlive it."""
     arrays = {name: part for name, part in r._asdict().items() if isinstance(part, np.ndarray)}
-    record = address_record(_READINGS, arrays)
+    record = address_record(_READINGS_DTYPE, arrays)
     (record["signals"], _), (_, record["axes"]) = r.state.shape, r.last.shape
     record["free"], record["valves"] = len(r.position), len(r.valve)
     record["period"], record["settle"] = r.period, r.settle
@@ -425,28 +433,28 @@ def _readings_record(r: DriveReadings) -> np.ndarray:
 
 
 @compiled
-def _update(arm, kept, dynamic, count, joint, head, rod, out):
+def _step_records(arm, kept, dynamic, count, joint, head, rod, out):
     """Call `endpoint_force_step` with records.
 
     Returns:
         Its status, and the largest number of readings since a channel changed.
     """
     r = kept[0]
-    still = integers(r.still, 3 * r.axes).reshape((3, r.axes))
+    still = int64_view(r.still, 3 * r.axes).reshape((3, r.axes))
     readings = DriveReadings(
-        r.period, r.settle, floats(r.tables, 30).reshape((2, 3, 5)), integers(r.position, r.free),
-        integers(r.valve, r.valves), rows_of(r.state, r.signals, 4), floats(r.outside, r.free),
-        rows_of(r.last, 3, r.axes), still,
+        r.period, r.settle, float64_view(r.tables, 30).reshape((2, 3, 5)), int64_view(r.position, r.free),
+        int64_view(r.valve, r.valves), matrix_view(r.state, r.signals, 4), float64_view(r.outside, r.free),
+        matrix_view(r.last, 3, r.axes), still,
     )  # fmt: skip
-    status = endpoint_force_step(arm_of(arm[0]), readings, dynamic, count, joint, head, rod, out)
+    status = endpoint_force_step(read_arm_record(arm[0]), readings, dynamic, count, joint, head, rod, out)
     return status, still.max()
 
 
-Kind = Literal["static", "dynamic"]
-BANDWIDTH = 0.7  # Hz, of the force estimate
-FAST = 2.5  # Hz, of the filter of positions and pressures
-_SETTLE = 0.5  # periods of the fast filter over which the first readings are averaged
-_TASK = ("r", "theta", "z", "attitude", "head")
+EstimatorKind = Literal["static", "dynamic"]
+FORCE_BANDWIDTH_HZ = 0.7  # Hz, of the force estimate
+MOTION_BANDWIDTH_HZ = 2.5  # Hz, of the filter of positions and pressures
+_SETTLING_PERIODS = 0.5  # periods of the fast filter over which the first readings are averaged
+_TASK_COORDINATES = ("r", "theta", "z", "attitude", "head")
 
 
 class EndpointForce:
@@ -458,13 +466,14 @@ class EndpointForce:
         bandwidth: bandwidth of the estimate [Hz].
         delay: delay of the estimate for slow changes [s].
         force: (m,) last estimate; 0 until every channel has a reading.
-        healthy: whether the last readings were finite and the arm was not singular.
+        is_healthy: whether the last readings were finite and the arm was not singular.
     """
 
     def __init__(
-        self, machine: Machine, axes: Sequence[str], kind: Kind = "dynamic",
+        self, machine: Machine, axes: Sequence[str], kind: EstimatorKind = "dynamic",
         period: float = 0.005, *, every: int = 1, sensors: SensorSet | None = None,
-        gravity: Gravity | None = None, bandwidth: float = BANDWIDTH, fast: float = FAST,
+        gravity: GravityModel | None = None, bandwidth: float = FORCE_BANDWIDTH_HZ,
+        motion_bandwidth: float = MOTION_BANDWIDTH_HZ,
     ):  # fmt: skip
         """Prepare the model and the filters.
 
@@ -479,7 +488,7 @@ class EndpointForce:
                 None for ideal sensors.
             gravity: parameters of the static model; None to compute them from the machine's masses.
             bandwidth: bandwidth of the estimate [Hz].
-            fast: bandwidth of the motion from which friction and inertia are computed [Hz].
+            motion_bandwidth: bandwidth of the motion from which friction and inertia are computed [Hz].
 
         Raises:
             InputError: a joint is not driven by a valve or not measured, or a value is invalid.
@@ -491,31 +500,30 @@ class EndpointForce:
             rate = 1.0 / (period * every) if period > 0.0 and every >= 1 else float("nan")
             raise InputError(
                 where,
-                f"the bandwidth, {bandwidth:g} Hz, must be below a quarter of the sensor"
-                f" rate, {rate:g} Hz",
+                f"the bandwidth, {bandwidth:g} Hz, must be below a quarter of the sensor rate, {rate:g} Hz",
             )
-        self.axes, self.bandwidth, self.healthy = tuple(axes), bandwidth, False
+        self.axes, self.bandwidth, self.is_healthy = tuple(axes), bandwidth, False
         self._dynamic, self._count, self._every, self._tick = kind == "dynamic", 0, every, 0
-        self._arm = arm_tables(machine, where)
+        self._arm = create_arm_balance(machine, where)
         if not self._dynamic:
-            found = gravity or gravity_from_masses(machine)
+            found = gravity or fit_gravity_to_masses(machine)
             if len(found.value) != len(self._arm.gravity):
                 raise InputError(where, f"gravity needs {len(self._arm.gravity)} parameters")
             self._arm.gravity[:] = found.value
-        self._readings = _readings(machine, self.axes, period * every, bandwidth, fast, where)
+        self._readings = _create_readings(machine, self.axes, period * every, bandwidth, motion_bandwidth, where)
         noise = noise_gains(self._readings.tables[0])[1]
-        for i, name in enumerate(free_axes(machine, where)):
+        for i, name in enumerate(independent_axes(machine, where)):
             channel = f"{machine.position_kind(name)}.{name}"
             self._arm.rate_noise[i] = noise * noise_rms(machine, sensors, channel)
-        self.delay = filter_delay(fast) + filter_delay(bandwidth)
-        self.task = _TASK[: len(self._arm.joint)]
-        self.force, self._stillest = np.zeros(len(self.task)), 0
+        self.delay = filter_delay(motion_bandwidth) + filter_delay(bandwidth)
+        self.task = _TASK_COORDINATES[: len(self._arm.joint)]
+        self.force, self._max_constant_readings = np.zeros(len(self.task)), 0
         self._records = arm_record(self._arm), _readings_record(self._readings)
 
     def update(self, joint: np.ndarray, head: np.ndarray, rod: np.ndarray) -> np.ndarray:
         """Process the readings of one instant.
 
-        A reading that is not finite is replaced by the last valid one of its channel, and `healthy`
+        A reading that is not finite is replaced by the last valid one of its channel, and `is_healthy`
         is then False.
 
         Args:
@@ -529,14 +537,14 @@ class EndpointForce:
         held, self._tick = self._tick % self._every, self._tick + 1
         if held:
             return self.force
-        status, self._stillest = _update(
+        status, self._max_constant_readings = _step_records(
             *self._records, self._dynamic, self._count, joint, head, rod, self.force
         )
-        self._count += status != WAITING
-        self.healthy = status == GOOD
+        self._count += status != STATUS_WAITING
+        self.is_healthy = status == STATUS_GOOD
         return self.force
 
-    def frozen(self, duration: float = 0.5) -> tuple[str, ...]:
+    def find_constant_channels(self, duration: float = 0.5) -> tuple[str, ...]:
         """Return the channels whose readings have not changed, as with a stuck sensor.
 
         Args:
@@ -547,7 +555,7 @@ class EndpointForce:
             Names such as `joint.boom`, `pressure_head.boom`.
         """
         r, calls = self._readings, duration / self._readings.period
-        if self._stillest < calls:  # the usual case; unused channels are never counted
+        if self._max_constant_readings < calls:  # the usual case; unused channels are never counted
             return ()
         kinds = (("joint", r.position), ("pressure_head", r.valve), ("pressure_rod", r.valve))
         return tuple(
@@ -558,23 +566,26 @@ class EndpointForce:
         )
 
 
-def _readings(
+def _create_readings(
     machine: Machine,
     axes: tuple[str, ...],
     period: float,
     bandwidth: float,
-    fast: float,
-    where: str,
+    motion_bandwidth: float,
+    context: str,
 ) -> DriveReadings:
     """Create the reading filters and the columns of the used readings."""
-    free, valves = free_axes(machine, where), actuator_order(machine)[: len(machine.hydraulic_axes)]
+    free, valves = (
+        independent_axes(machine, context),
+        actuator_order(machine)[: len(machine.hydraulic_axes)],
+    )
     if missing := [name for name in free if name not in axes]:
-        raise InputError(where, f"readings of {', '.join(missing)} are missing")
+        raise InputError(context, f"readings of {', '.join(missing)} are missing")
     n, h, k = len(free), len(valves), len(axes)
     return DriveReadings(
         period=period,
-        settle=max(1, round(_SETTLE / (fast * period))),
-        tables=np.array([filter_table(fast, period), filter_table(bandwidth, period)]),
+        settle=max(1, round(_SETTLING_PERIODS / (motion_bandwidth * period))),
+        tables=np.array([filter_table(motion_bandwidth, period), filter_table(bandwidth, period)]),
         position=np.array([axes.index(name) for name in free]),
         valve=np.array([axes.index(name) for name in valves]),
         state=np.zeros((n + 2 * h + len(arm_joints(machine)), 4)),
@@ -585,8 +596,9 @@ def _readings(
 
 
 def endpoint_force_of_log(
-    machine: Machine, log: Log, kind: Kind = "dynamic", gravity: Gravity | None = None,
-    bandwidth: float = BANDWIDTH, fast: float = FAST, sensors: SensorSet | None = None,
+    machine: Machine, log: Log, kind: EstimatorKind = "dynamic", gravity: GravityModel | None = None,
+    bandwidth: float = FORCE_BANDWIDTH_HZ, motion_bandwidth: float = MOTION_BANDWIDTH_HZ,
+    sensors: SensorSet | None = None,
 ) -> dict[str, np.ndarray]:  # fmt: skip
     """Run the online estimator over a log, one update per row.
 
@@ -596,11 +608,11 @@ def endpoint_force_of_log(
         kind: see `EndpointForce`.
         gravity: see `EndpointForce`.
         bandwidth: see `EndpointForce`.
-        fast: see `EndpointForce`.
+        motion_bandwidth: see `EndpointForce`.
         sensors: see `EndpointForce`.
 
     Returns:
-        `r` [N], `theta` [N m], `z` [N], `attitude` [N m] ... and `healthy` [1], (n,) each.
+        `r` [N], `theta` [N m], `z` [N], `attitude` [N m] ... and `is_healthy` [1], (n,) each.
 
     Raises:
         InputError: a channel is missing, or the tip force of the arm cannot be estimated.
@@ -619,10 +631,10 @@ def endpoint_force_of_log(
         sensors=sensors,
         gravity=gravity,
         bandwidth=bandwidth,
-        fast=fast,
+        motion_bandwidth=motion_bandwidth,
     )
     out, healthy = np.empty((len(log), len(felt.task))), np.empty(len(log))
     for row in range(len(log)):
         out[row] = felt.update(joint[row], head[row], rod[row])
-        healthy[row] = felt.healthy
+        healthy[row] = felt.is_healthy
     return {**dict(zip(felt.task, out.T, strict=True)), "healthy": healthy}

@@ -7,20 +7,20 @@ from hydrotele.control.servo import ForceReferences
 from hydrotele.core.errors import InputError
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.identify.setup import machine_setup
-from hydrotele.identify.smoothing import Smoothed, zero_phase
+from hydrotele.identify.smoothing import SmoothedSignal, filter_zero_phase
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.multibody.inverse_dynamics import regressor
+from hydrotele.multibody.inverse_dynamics import make_regressor
 from hydrotele.scenario.scenario import Servo
-from hydrotele.simulate.closure import closed_chain
+from hydrotele.simulate.closure import load_closed_chain
 
 NOMINAL = "nominal"
 
 
-_SMOOTH = 8.0  # Hz, cutoff that removes steps and corners of tables from the forces
+_REFERENCE_CUTOFF_HZ = 8.0  # Hz, cutoff that removes steps and corners of tables from the forces
 
 
-def force_references(machine: Machine, plan: Plan, servo: Servo) -> ForceReferences:
+def compute_force_references(machine: Machine, plan: Plan, servo: Servo) -> ForceReferences:
     """Compute the drive forces along a plan with the machine that the servo names.
 
     Args:
@@ -42,34 +42,38 @@ def force_references(machine: Machine, plan: Plan, servo: Servo) -> ForceReferen
     where = "servo.force_model"
     if servo.force_model != NOMINAL:
         machine = load_machine(servo.force_model, machine.tool)
-    if not np.all(plan.closed):
-        open_ones = ", ".join(a for a, c in zip(plan.axes, plan.closed, strict=True) if not c)
+    if not np.all(plan.closed_loop):
+        open_ones = ", ".join(a for a, c in zip(plan.axes, plan.closed_loop, strict=True) if not c)
         raise InputError(where, f"needs a reference for every axis; {open_ones} has none")
     axes = actuator_order(machine)
     if tuple(axes) != tuple(plan.axes):
         raise InputError(where, f"{machine.name} has the axes {', '.join(axes)}")
     joints = [machine.axes[a].joint for a in plan.axes]
-    chain = closed_chain(machine, dict(zip(joints, plan.reference[0], strict=True)))
+    chain = load_closed_chain(machine, dict(zip(joints, plan.reference[0], strict=True)))
     setup = machine_setup(machine, chain)
     step = float(plan.time[1] - plan.time[0])
-    motion = _smooth(plan.reference, step)
+    motion = _differentiate_reference(plan.reference, step)
     found = setup.project(plan.reference, motion.rate, motion.acceleration)
-    table = regressor(
-        chain, found, bodies=setup.bodies, rubbing=setup.rubbing, offsets=setup.offsets or {}
+    table = make_regressor(
+        chain,
+        found,
+        bodies=setup.bodies,
+        friction=setup.friction_terms,
+        offsets=setup.offsets or {},
     )
     force = table.matrix @ table.nominal
-    force += np.einsum("nkv,nv->nk", found.share, chain.damping * found.rate)
+    force += np.einsum("nkv,nv->nk", found.joint_projection, chain.damping * found.rate)
     ahead = np.minimum(plan.time + servo.lead, plan.time[-1])
     change = np.gradient(force, step, axis=0)
     rate = np.stack([np.interp(ahead, plan.time, column) for column in change.T], axis=1)
     return ForceReferences(True, np.ascontiguousarray(force), np.ascontiguousarray(rate))
 
 
-def _smooth(reference: np.ndarray, step: float) -> Smoothed:
+def _differentiate_reference(reference: np.ndarray, step: float) -> SmoothedSignal:
     """Filter and differentiate a reference (n, k); if it is too short, do not filter."""
-    if len(reference) > 5.0 / (_SMOOTH * step):
-        return zero_phase(reference, step, _SMOOTH)
+    if len(reference) > 5.0 / (_REFERENCE_CUTOFF_HZ * step):
+        return filter_zero_phase(reference, step, _REFERENCE_CUTOFF_HZ)
     rate = np.gradient(reference, step, axis=0)
     unknown = np.full_like(reference, np.nan)
     acceleration = np.gradient(rate, step, axis=0)
-    return Smoothed(reference, rate, acceleration, unknown, unknown, unknown)
+    return SmoothedSignal(reference, rate, acceleration, unknown, unknown, unknown)

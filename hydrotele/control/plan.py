@@ -11,23 +11,23 @@ from itertools import zip_longest
 import numpy as np
 
 from hydrotele.control.resolved_motion import ResolvedMotion, arm_axes, pose_to_joints
-from hydrotele.core.datafile import suggest
+from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import (
     ConstantPilot,
     FourierPilot,
     LinesPilot,
-    Move,
     Pilot,
     TablePilot,
+    TipMove,
     Waypoint,
     WaypointsPilot,
 )
 from hydrotele.scenario.teleoperation import TeleopPilot
 
-_FARTHEST = 1.0e6  # rad or m, limit of a joint without a range
-_ROUNDING = 1.0e-3  # tolerance of a command, for the rounding of real loggers
+_UNLIMITED_POSITION = 1.0e6  # rad or m, limit of a joint without a range
+_COMMAND_TOLERANCE = 1.0e-3  # tolerance of a command, for the rounding of real loggers
 
 
 def check_reference(machine: Machine, name: str, time: np.ndarray, reference: np.ndarray) -> None:
@@ -42,7 +42,10 @@ def check_reference(machine: Machine, name: str, time: np.ndarray, reference: np
     Raises:
         InputError: the message states axis, value, time and range.
     """
-    low, high = machine.joints[machine.axes[name].joint].range or (-_FARTHEST, _FARTHEST)
+    low, high = machine.joints[machine.axes[name].joint].range or (
+        -_UNLIMITED_POSITION,
+        _UNLIMITED_POSITION,
+    )
     outside = np.flatnonzero(~((low - 1e-9 <= reference) & (reference <= high + 1e-9)))
     if len(outside):
         row = outside[0]
@@ -66,25 +69,24 @@ def check_command(machine: Machine, name: str, command: np.ndarray) -> None:
     """
     force = machine.axes[name].force
     limit, unit = (force.command_limit, force.command_unit) if force else (1.0, "1")
-    if len(outside := np.flatnonzero(~(np.abs(command) <= limit + _ROUNDING))):
+    if len(outside := np.flatnonzero(~(np.abs(command) <= limit + _COMMAND_TOLERANCE))):
         raise InputError(
             "pilot",
-            f"the command of {name} is {command[outside[0]]:g}; its drive accepts -{limit:g} .."
-            f" {limit:g} [{unit}]",
+            f"the command of {name} is {command[outside[0]]:g}; its drive accepts -{limit:g} .. {limit:g} [{unit}]",
         )
 
 
-def cut_short(time: np.ndarray, needed: float) -> tuple[str, ...]:
+def note_early_end(time: np.ndarray, pilot_duration: float) -> tuple[str, ...]:
     """Return a note if the run ends before its pilot.
 
     Args:
         time: (n,) times of the control ticks [s].
-        needed: time that the pilot needs [s].
+        pilot_duration: time that the pilot needs [s].
 
     Returns:
         One sentence, or an empty tuple.
     """
-    missing = needed - (2 * time[-1] - time[-2])
+    missing = pilot_duration - (2 * time[-1] - time[-2])
     return (f"the run ends {missing:.3g} s before its pilot",) if missing > 1e-6 else ()
 
 
@@ -98,7 +100,7 @@ class Plan:
         command: (n, k) open-loop commands [1], or in the drive's unit.
         reference: (n, k) joint references [rad] or [m].
         rate: (n, k) rates of the references [rad/s] or [m/s].
-        closed: (k,) whether the axis follows its reference.
+        closed_loop: (k,) whether the axis follows its reference.
         pose: (n, 4 or 5) desired r, theta, z, attitude and head angle of the tip, or None.
         notes: sentences about motions that cannot be followed.
     """
@@ -108,14 +110,12 @@ class Plan:
     command: np.ndarray
     reference: np.ndarray
     rate: np.ndarray
-    closed: np.ndarray
+    closed_loop: np.ndarray
     pose: np.ndarray | None = None
     notes: tuple[str, ...] = ()
 
 
-def make_plan(
-    machine: Machine, axes: tuple[str, ...], pilot: Pilot, start: dict[str, float], time: np.ndarray
-) -> Plan:
+def make_plan(machine: Machine, axes: tuple[str, ...], pilot: Pilot, start: dict[str, float], time: np.ndarray) -> Plan:
     """Convert a pilot to a plan.
 
     Args:
@@ -132,66 +132,62 @@ def make_plan(
         InputError: the pilot names an unknown axis, starts out of reach, or exceeds a joint range
             or a command limit.
     """
-    plan = _plan(machine, axes, pilot, start, time)
+    plan = _build_plan(machine, axes, pilot, start, time)
     for column, name in enumerate(axes):
-        if plan.closed[column]:
+        if plan.closed_loop[column]:
             check_reference(machine, name, plan.time, plan.reference[:, column])
         else:
             check_command(machine, name, plan.command[:, column])
     return plan
 
 
-def _plan(
+def _build_plan(
     machine: Machine, axes: tuple[str, ...], pilot: Pilot, start: dict[str, float], time: np.ndarray
 ) -> Plan:
     n, k = len(time), len(axes)
     home = np.array([start.get(machine.axes[a].joint, 0.0) for a in axes])
-    plan = Plan(
-        time, axes, np.zeros((n, k)), np.tile(home, (n, 1)), np.zeros((n, k)), np.zeros(k, bool)
-    )
+    plan = Plan(time, axes, np.zeros((n, k)), np.tile(home, (n, 1)), np.zeros((n, k)), np.zeros(k, bool))
     match pilot:
         case ConstantPilot():
             for name, value in pilot.commands.items():
-                plan.command[:, _column(axes, name, "pilot.commands")] = value
+                plan.command[:, _find_column(axes, name, "pilot.commands")] = value
             return plan
         case TablePilot():
-            return _table(plan, pilot)
+            return _plan_table(plan, pilot)
         case FourierPilot():
-            return _fourier(plan, pilot)
+            return _plan_fourier(plan, pilot)
         case LinesPilot():
-            return _lines(plan, machine, pilot)
+            return _plan_lines(plan, machine, pilot)
         case WaypointsPilot():
-            return _waypoints(plan, machine, pilot)
+            return _plan_waypoints(plan, machine, pilot)
         case TeleopPilot():
-            return _teleoperated(plan, machine, pilot)
+            return _plan_teleoperation(plan, machine, pilot)
 
 
-def _teleoperated(plan: Plan, machine: Machine, pilot: TeleopPilot) -> Plan:
+def _plan_teleoperation(plan: Plan, machine: Machine, pilot: TeleopPilot) -> Plan:
     """Return a plan whose references are written during the run; buttons command their axes."""
     closed = np.array([machine.axes[a].force is None for a in plan.axes])
     for button in sorted(pilot.buttons, key=lambda button: button.at):
-        column = _column(plan.axes, button.axis, "pilot.buttons")
+        column = _find_column(plan.axes, button.axis, "pilot.buttons")
         if button.axis in arm_axes(machine):
-            raise InputError(
-                "pilot.buttons", f"{button.axis} is controlled by the joystick; name another axis"
-            )
+            raise InputError("pilot.buttons", f"{button.axis} is controlled by the joystick; name another axis")
         plan.command[plan.time >= button.at, column] = button.command
         closed[column] = False
     pose = np.zeros((len(plan.time), max(4, len(arm_axes(machine)))))
     return dataclasses.replace(plan, closed=closed, pose=pose)
 
 
-def _column(axes: tuple[str, ...], name: str, where: str) -> int:
+def _find_column(axes: tuple[str, ...], name: str, where: str) -> int:
     if name not in axes:
-        raise InputError(where, f"{name!r} is not an axis of the machine; {suggest(name, axes)}")
+        raise InputError(where, f"{name!r} is not an axis of the machine; {suggest_valid_name(name, axes)}")
     return axes.index(name)
 
 
-def _table(plan: Plan, pilot: TablePilot) -> Plan:
+def _plan_table(plan: Plan, pilot: TablePilot) -> Plan:
     times = np.array(pilot.time)
-    closed = plan.closed.copy()
+    closed = plan.closed_loop.copy()
     for name, values in pilot.columns.items():
-        column = _column(plan.axes, name, "pilot.columns")
+        column = _find_column(plan.axes, name, "pilot.columns")
         if pilot.interpolate == "linear":
             wanted = np.interp(plan.time, times, values)
         else:
@@ -206,12 +202,12 @@ def _table(plan: Plan, pilot: TablePilot) -> Plan:
     return dataclasses.replace(plan, closed=closed | (pilot.of == "joint"))
 
 
-def _fourier(plan: Plan, pilot: FourierPilot) -> Plan:
+def _plan_fourier(plan: Plan, pilot: FourierPilot) -> Plan:
     """Return references with a fade-in: `start + s(t) (wave - start)` with a quintic s."""
-    s, ds = quintic(plan.time, pilot.fade)
+    s, ds = quintic_step(plan.time, pilot.fade)
     omega = 2.0 * math.pi / pilot.period
     for name, harmonics in pilot.axes.items():
-        column = _column(plan.axes, name, "pilot.axes")
+        column = _find_column(plan.axes, name, "pilot.axes")
         wave = np.full_like(plan.time, harmonics.mean)
         slope = np.zeros_like(plan.time)
         pairs = zip_longest(harmonics.sin, harmonics.cos, fillvalue=0.0)
@@ -224,11 +220,11 @@ def _fourier(plan: Plan, pilot: FourierPilot) -> Plan:
         plan.rate[:, column] = s * slope + ds * (wave - begin)
     closed = np.ones(len(plan.axes), bool)
     for name in pilot.closed_valves:
-        closed[_column(plan.axes, name, "pilot.closed_valves")] = False
+        closed[_find_column(plan.axes, name, "pilot.closed_valves")] = False
     return dataclasses.replace(plan, closed=closed)
 
 
-def quintic(time: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray]:
+def quintic_step(time: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray]:
     """Return a smooth step from 0 to 1 with zero speed and acceleration at both ends, and its rate.
 
     Args:
@@ -238,7 +234,7 @@ def quintic(time: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray]:
     Returns:
         (s (n,) [1], ds/dt (n,) [1/s]).
 
-    >>> quintic(np.array([0.0, 1.0, 2.0, 3.0]), 2.0)[0]
+    >>> quintic_step(np.array([0.0, 1.0, 2.0, 3.0]), 2.0)[0]
     array([0. , 0.5, 1. , 1. ])
     """
     if duration < 1.0e-6:
@@ -247,7 +243,7 @@ def quintic(time: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray]:
     return x**3 * (10 - 15 * x + 6 * x**2), 30 * x**2 * (1 - x) ** 2 / duration
 
 
-def _trapezoid(time: np.ndarray, distance: float, speed: float, acceleration: float):
+def _trapezoidal_speed(time: np.ndarray, distance: float, speed: float, acceleration: float):
     """Return the speed (n,) of a move with a trapezoidal profile, and its duration."""
     ramp = min(speed / acceleration, math.sqrt(distance / acceleration))
     cruise = distance / (ramp * acceleration) - ramp
@@ -255,8 +251,8 @@ def _trapezoid(time: np.ndarray, distance: float, speed: float, acceleration: fl
     return acceleration * ramp * rise, 2 * ramp + cruise
 
 
-def _lines(plan: Plan, machine: Machine, pilot: LinesPilot) -> Plan:
-    motion = ResolvedMotion.begin(machine, dict(zip(plan.axes, plan.reference[0], strict=True)))
+def _plan_lines(plan: Plan, machine: Machine, pilot: LinesPilot) -> Plan:
+    motion = ResolvedMotion.from_joints(machine, dict(zip(plan.axes, plan.reference[0], strict=True)))
     rates = _rate_commands(plan.time, pilot)
     dt = np.diff(plan.time, prepend=plan.time[0])
     pose = np.empty((len(plan.time), len(motion.pose)))
@@ -265,16 +261,16 @@ def _lines(plan: Plan, machine: Machine, pilot: LinesPilot) -> Plan:
     blocked = 0
     for row in range(len(plan.time)):
         if pilot.mode == "rate":
-            motion, joints, speeds = motion.rate_step(rates[row], dt[row])
+            motion, joints, speeds = motion.step_by_rate(rates[row], dt[row])
         else:
-            motion, joints, speeds = motion.position_step(wanted[row], rates[row])
-        blocked += motion.blocked
+            motion, joints, speeds = motion.step_to_pose(wanted[row], rates[row])
+        blocked += motion.is_blocked
         pose[row] = motion.pose
         for name, value in joints.items():
             column = plan.axes.index(name)
             plan.reference[row, column] = value
             plan.rate[row, column] = speeds[name]
-    notes = cut_short(plan.time, lines_duration(pilot))
+    notes = note_early_end(plan.time, lines_duration(pilot))
     if blocked:
         seconds = blocked * (plan.time[1] - plan.time[0])
         notes += (f"resolved motion was held at the edge of the workspace for {seconds:.3g} s",)
@@ -291,7 +287,7 @@ def _rate_commands(time: np.ndarray, pilot: LinesPilot) -> np.ndarray:
         if size == 0.0:
             begin += move.pause
             continue
-        speed, duration = _trapezoid(time - begin, size, move.speed, pilot.acceleration)
+        speed, duration = _trapezoidal_speed(time - begin, size, move.speed, pilot.acceleration)
         rates += speed[:, None] * way / size
         begin += duration + move.pause
     return rates
@@ -305,17 +301,17 @@ def lines_duration(pilot: LinesPilot) -> float:
     return total
 
 
-def _move_duration(move: Move, acceleration: float) -> float:
+def _move_duration(move: TipMove, acceleration: float) -> float:
     size = math.hypot(move.r, move.z) or max(abs(move.theta), abs(move.attitude), abs(move.head))
-    return _trapezoid(np.zeros(1), size, move.speed, acceleration)[1] if size else 0.0
+    return _trapezoidal_speed(np.zeros(1), size, move.speed, acceleration)[1] if size else 0.0
 
 
-def _waypoints(plan: Plan, machine: Machine, pilot: WaypointsPilot) -> Plan:
+def _plan_waypoints(plan: Plan, machine: Machine, pilot: WaypointsPilot) -> Plan:
     begin = pilot.settle
     here = dict(zip(plan.axes, plan.reference[0], strict=True))
     for number, point in enumerate(pilot.points):
         inside = (plan.time >= begin) & (plan.time <= begin + point.duration)
-        s, ds = quintic(plan.time[inside] - begin, point.duration)
+        s, ds = quintic_step(plan.time[inside] - begin, point.duration)
         where = f"pilot.points.{number}"
         target = _waypoint_joints(machine, plan.axes, here, point, where)
         for name, value in target.items():
@@ -331,35 +327,33 @@ def _waypoints(plan: Plan, machine: Machine, pilot: WaypointsPilot) -> Plan:
         plan.reference[plan.time > begin] = [target[a] for a in plan.axes]
         begin += point.pause
         here = target
-    notes = cut_short(plan.time, begin)
+    notes = note_early_end(plan.time, begin)
     return dataclasses.replace(plan, closed=np.ones(len(plan.axes), bool), notes=notes)
 
 
-def _waypoint_joints(machine, axes, here: dict, point: Waypoint, where: str) -> dict[str, float]:
-    target = dict(here)
+def _waypoint_joints(machine, axes, current: dict, point: Waypoint, where: str) -> dict[str, float]:
+    target = dict(current)
     if point.pose:
-        target |= pose_to_joints(machine, point.pose, here, f"{where}.pose")
+        target |= pose_to_joints(machine, point.pose, current, f"{where}.pose")
     for name, value in point.joints.items():
-        target[axes[_column(axes, name, f"{where}.joints")]] = value
+        target[axes[_find_column(axes, name, f"{where}.joints")]] = value
     return target
 
 
-def _pose_path(machine, axes, here, target, s, ds, where: str) -> tuple[np.ndarray, np.ndarray]:
+def _pose_path(machine, axes, current, target, s, ds, where: str) -> tuple[np.ndarray, np.ndarray]:
     order = arm_axes(machine)
-    first = np.array(ResolvedMotion.begin(machine, here).pose)
-    last = np.array(ResolvedMotion.begin(machine, target).pose)
-    path = np.tile([here[a] for a in axes], (len(s), 1))
+    first = np.array(ResolvedMotion.from_joints(machine, current).pose)
+    last = np.array(ResolvedMotion.from_joints(machine, target).pose)
+    path = np.tile([current[a] for a in axes], (len(s), 1))
     speeds = np.zeros_like(path)
     for a in axes:
         if a not in order:
-            path[:, axes.index(a)] += s * (target[a] - here[a])
-            speeds[:, axes.index(a)] = ds * (target[a] - here[a])
-    motion = ResolvedMotion.begin(machine, here)
+            path[:, axes.index(a)] += s * (target[a] - current[a])
+            speeds[:, axes.index(a)] = ds * (target[a] - current[a])
+    motion = ResolvedMotion.from_joints(machine, current)
     for row, (part, rate) in enumerate(zip(s, ds, strict=True)):
-        motion, joints, velocity = motion.position_step(
-            first + part * (last - first), rate * (last - first)
-        )
-        if motion.blocked:
+        motion, joints, velocity = motion.step_to_pose(first + part * (last - first), rate * (last - first))
+        if motion.is_blocked:
             raise InputError(
                 f"{where}.pose", f"the straight path leaves the workspace after {100 * part:.0f} %;"
                 " add a waypoint, or give joints",

@@ -2,7 +2,7 @@
 
 `follow_pose` computes joint references by inverse kinematics and their rates by the inverse
 Jacobian, so that no error is integrated. If a step would leave the workspace or a joint range, the
-reference is held and `blocked` is set until the command returns to the held pose.
+reference is held and `is_blocked` is set until the command returns to the held pose.
 
 `follow_rate` is the alternative of Zhu 1994, Eq. 2.1: joint rates by the inverse Jacobian at the
 measured joint angles, integrated to references. Errors of the direction accumulate.
@@ -15,12 +15,12 @@ import numpy as np
 
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
-from hydrotele.kinematics.arm import Unreachable, inverse
+from hydrotele.kinematics.arm import UnreachableError, inverse_kinematics
 from hydrotele.kinematics.from_machine import (
     arm_geometry,
-    arm_is_plane,
     feller_geometry,
-    joints_for_tip,
+    is_planar_arm,
+    solve_tip_position,
 )
 from hydrotele.kinematics.task import (
     REACHED,
@@ -33,17 +33,17 @@ from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Pose
 
 COORDINATES = ("r", "theta", "z", "attitude", "head")
-_NEAR = 0.02  # m or rad, release distance of a blocked reference: about one control period
+_RELEASE_DISTANCE = 0.02  # m or rad, release distance of a blocked reference: about one control period
 
 
 @compiled
-def follow_pose(g, ranges, wanted, rate, blocked, pose, q, speed):
+def follow_pose(g, ranges, target, rate, blocked, pose, q, speed):
     """Move joint references to a pose, or hold them if it cannot be reached.
 
     Args:
         g: (9,) of `kinematics.task.arm_parameters`.
         ranges: (k, 2) joint ranges [rad].
-        wanted: (5,) target pose: r [m], theta [rad], z [m], attitude [rad], head [rad].
+        target: (5,) target pose: r [m], theta [rad], z [m], attitude [rad], head [rad].
         rate: (5,) its rate [m/s], [rad/s].
         blocked: whether the last step was held, scalar; then only a pose near the held one releases
             the references.
@@ -61,21 +61,21 @@ def follow_pose(g, ranges, wanted, rate, blocked, pose, q, speed):
     held = False
     if blocked:
         for i in range(max(k, 3)):
-            if i < k and not abs(wanted[i] - pose[i]) <= _NEAR:
+            if i < k and not abs(target[i] - pose[i]) <= _RELEASE_DISTANCE:
                 held = True
-    held = held or task_inverse(g, wanted, q[0], found) != 0
+    held = held or task_inverse(g, target, q[0], found) != 0
     if not held:
         for i in range(k):
             if not ranges[i, 0] <= found[i] <= ranges[i, 1]:
                 held = True
-    held = held or task_rates(g, found, wanted, rate, speed) != 0
+    held = held or task_rates(g, found, target, rate, speed) != 0
     if held:
         speed[:] = 0.0
         return True
     for i in range(k):
         q[i] = found[i]
     for i in range(len(pose)):
-        pose[i] = wanted[i]
+        pose[i] = target[i]
     if k < 4:
         pose[3] = found[1] + found[2]
     return False
@@ -127,35 +127,35 @@ class ResolvedMotion:
     """State of the resolved-motion controller.
 
     Attributes:
-        numbers: (9,) parameters of the arm, of `kinematics.task.arm_parameters`.
+        arm_geometry_parameters: (9,) parameters of the arm, of `kinematics.task.arm_parameters`.
         axes: k axis names from swing outwards, 3 to 5.
         ranges: (k, 2) joint ranges [rad], same order.
         joints: (k,) joint references [rad], same order.
         pose: desired r [m], theta [rad], z [m], attitude [rad] and, with a head, its angle [rad].
-        blocked: whether the last step was held at a limit of the workspace.
+        is_blocked: whether the last step was held at a limit of the workspace.
     """
 
-    numbers: np.ndarray
+    arm_geometry_parameters: np.ndarray
     axes: tuple[str, ...]
     ranges: np.ndarray
     joints: tuple[float, ...]
     pose: tuple[float, ...]
-    blocked: bool = False
+    is_blocked: bool = False
 
     @staticmethod
-    def begin(machine: Machine, joints: dict[str, float]) -> "ResolvedMotion":
+    def from_joints(machine: Machine, joints: dict[str, float]) -> "ResolvedMotion":
         """Create a controller at the given axis positions [rad].
 
         Raises:
             InputError: the machine has no arm.
         """
-        numbers, axes, ranges = arm_facts(machine)
+        numbers, axes, ranges = arm_specification(machine)
         q = tuple(float(joints[a]) for a in axes)
         pose = np.zeros(5)
         task_forward(numbers, np.array(q), pose)
         return ResolvedMotion(numbers, axes, ranges, q, tuple(pose[: max(4, len(axes))].tolist()))
 
-    def rate_step(self, rate, dt: float) -> tuple["ResolvedMotion", dict, dict]:
+    def step_by_rate(self, rate, dt: float) -> tuple["ResolvedMotion", dict, dict]:
         """Move by a rate command that is constant for dt.
 
         Args:
@@ -167,25 +167,32 @@ class ResolvedMotion:
             (next state, axis -> position [rad], axis -> velocity [rad/s]).
         """
         wanted = tuple(p + v * dt for p, v in zip(self.pose, rate, strict=False))
-        return self.position_step(wanted, rate)
+        return self.step_to_pose(wanted, rate)
 
-    def position_step(self, wanted, rate) -> tuple["ResolvedMotion", dict, dict]:
+    def step_to_pose(self, target, rate) -> tuple["ResolvedMotion", dict, dict]:
         """Move to a pose and convert its rate to joint rates.
 
         Args:
-            wanted: (4,) or (5,) target r [m], theta [rad], z [m], attitude [rad], head [rad].
+            target: (4,) or (5,) target r [m], theta [rad], z [m], attitude [rad], head [rad].
             rate: time derivative of the pose.
 
         Returns:
             (next state, axis -> position [rad], axis -> velocity [rad/s]).
         """
-        pose, q, speed = _five(self.pose), np.array(self.joints), np.zeros(len(self.axes))
+        pose, q, speed = _pad_to_five(self.pose), np.array(self.joints), np.zeros(len(self.axes))
         blocked = follow_pose(
-            self.numbers, self.ranges, _five(wanted), _five(rate), self.blocked, pose, q, speed
+            self.arm_geometry_parameters,
+            self.ranges,
+            _pad_to_five(target),
+            _pad_to_five(rate),
+            self.is_blocked,
+            pose,
+            q,
+            speed,
         )
         state = dataclasses.replace(
             self, joints=tuple(q.tolist()), pose=tuple(pose[: len(self.pose)].tolist()),
-            blocked=bool(blocked),
+            is_blocked=bool(blocked),
         )  # fmt: skip
         return (
             state,
@@ -194,7 +201,7 @@ class ResolvedMotion:
         )
 
 
-def _five(values) -> np.ndarray:
+def _pad_to_five(values) -> np.ndarray:
     out = np.zeros(5)
     out[: min(5, len(values))] = values[:5]
     return out
@@ -216,7 +223,7 @@ def arm_axes(machine: Machine) -> tuple[str, ...]:
     return tuple(by_joint[j] for j in joints)
 
 
-def arm_facts(machine: Machine) -> tuple[np.ndarray, tuple[str, ...], np.ndarray]:
+def arm_specification(machine: Machine) -> tuple[np.ndarray, tuple[str, ...], np.ndarray]:
     """Return parameters (9,) of the arm, its k axis names, and its joint ranges (k, 2) [rad].
 
     The axes are ordered from swing outwards.
@@ -232,9 +239,7 @@ def arm_facts(machine: Machine) -> tuple[np.ndarray, tuple[str, ...], np.ndarray
     return arm_parameters(geometry), axes, ranges
 
 
-def pose_to_joints(
-    machine: Machine, pose: Pose, here: dict[str, float], where: str = "pose"
-) -> dict[str, float]:
+def pose_to_joints(machine: Machine, pose: Pose, current: dict[str, float], where: str = "pose") -> dict[str, float]:
     """Solve the inverse kinematics of a pose of the tip.
 
     The joint axes of a calibrated arm may be twisted out of its plane. For an arm of three joints,
@@ -242,8 +247,8 @@ def pose_to_joints(
 
     Args:
         machine: the machine.
-        pose: target pose; without `attitude` the tool keeps that of `here`.
-        here: axis -> current position [rad].
+        pose: target pose; without `attitude` the tool keeps that of `current`.
+        current: axis -> current position [rad].
         where: key path of the pose, for messages.
 
     Returns:
@@ -252,18 +257,18 @@ def pose_to_joints(
     Raises:
         InputError: the pose is out of reach or violates a joint range.
     """
-    numbers, axes, ranges = arm_facts(machine)
+    numbers, axes, ranges = arm_specification(machine)
     attitude, head = pose.attitude, pose.head
     if attitude is None:
-        attitude = sum(here[a] for a in axes[1:4])
+        attitude = sum(current[a] for a in axes[1:4])
     if head is None:
-        head = here[axes[4]] if len(axes) == 5 else 0.0
+        head = current[axes[4]] if len(axes) == 5 else 0.0
     joints, wanted = np.zeros(len(axes)), np.array([pose.r, pose.theta, pose.z, attitude, head])
     if task_inverse(numbers, wanted, pose.theta, joints) != REACHED:
-        raise InputError(where, _why_not(machine, wanted[: len(axes)]))
-    if len(axes) == 3 and not arm_is_plane(machine):
+        raise InputError(where, _describe_unreachable(machine, wanted[: len(axes)]))
+    if len(axes) == 3 and not is_planar_arm(machine):
         place = (pose.r * math.cos(pose.theta), pose.r * math.sin(pose.theta), pose.z)
-        joints = joints_for_tip(machine, np.array(place), joints)
+        joints = solve_tip_position(machine, np.array(place), joints)
     for name, q, (low, high) in zip(axes, joints.tolist(), ranges, strict=True):
         if not low <= q <= high:
             raise InputError(
@@ -274,11 +279,11 @@ def pose_to_joints(
     return dict(zip(axes, joints.tolist(), strict=True))
 
 
-def _why_not(machine: Machine, pose: np.ndarray) -> str:
+def _describe_unreachable(machine: Machine, pose: np.ndarray) -> str:
     if len(pose) == 5:
         return f"the tool cannot reach r {pose[0]:.6g} m, z {pose[2]:.6g} m"
     try:
-        inverse(arm_geometry(machine), pose.tolist())
-    except Unreachable as error:
+        inverse_kinematics(arm_geometry(machine), pose.tolist())
+    except UnreachableError as error:
         return str(error)
     return "is out of reach"

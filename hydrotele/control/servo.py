@@ -9,7 +9,8 @@ The expected force is the slow mean of the force, or, with computed forces, the 
 dynamics along the reference. In the latter case the compression flow of that force's rate is fed
 forward as well, and a force drive receives the force itself.
 
-`drive_references` and `drive_row` compute moment arms and chamber volumes along the reference.
+`compute_drive_references` and `interpolate_drive_reference` compute moment arms and chamber volumes
+along the reference.
 """
 
 import math
@@ -19,20 +20,18 @@ import numpy as np
 
 from hydrotele.control.plan import Plan
 from hydrotele.core.compiled import compiled
-from hydrotele.core.datafile import suggest
+from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Servo
 
-_FORCE, _MOTOR_OR_CYLINDER = 0.0, 1.0
-_CENTRE = 0.005  # opening over which the deadband jump is smoothed, to avoid chatter from noise
-_LEAST_PRESSURE = 0.02  # of the supply: smallest assumed pressure drop of a valve
+_FORCE_DRIVE, _HYDRAULIC_DRIVE = 0.0, 1.0
+_DEADBAND_SMOOTHING = 0.005  # opening over which the deadband jump is smoothed, to avoid chatter from noise
+_MIN_PRESSURE_DROP_RATIO = 0.02  # of the supply: smallest assumed pressure drop of a valve
 
 
-def servo_parameters(
-    machine: Machine, axes: tuple[str, ...], servo: Servo, dt: float
-) -> np.ndarray:
+def servo_parameters(machine: Machine, axes: tuple[str, ...], servo: Servo, dt: float) -> np.ndarray:
     """Return the constants of the servo, one row per axis.
 
     Args:
@@ -51,7 +50,7 @@ def servo_parameters(
     """
     rows = []
     if strange := set(servo.axis_gains) - set(axes):
-        message = f"{sorted(strange)[0]!r} is not an axis of the machine; {suggest('', axes)}"
+        message = f"{sorted(strange)[0]!r} is not an axis of the machine; {suggest_valid_name('', axes)}"
         raise InputError("servo.axis_gains", message)
     for name in axes:
         axis = machine.axes[name]
@@ -62,13 +61,13 @@ def servo_parameters(
         if axis.valve and machine.supply:
             head, rod = axis.hydraulic_drive.areas
             flow_gain = axis.valve.rated_flow / math.sqrt(axis.valve.rated_pressure_drop)
-            facts = [_MOTOR_OR_CYLINDER, head, rod, flow_gain, axis.valve.deadband]
+            facts = [_HYDRAULIC_DRIVE, head, rod, flow_gain, axis.valve.deadband]
             rows.append([*facts, machine.supply.tank_pressure, 1.0, 0.0, *gains])
-        elif axis.pump:  # accepts commands only, see `drive_references`
-            rows.append([_FORCE, 0, 0, 0, 0, 0, 1.0, 1.0, *gains])
+        elif axis.pump:  # accepts commands only, see `compute_drive_references`
+            rows.append([_FORCE_DRIVE, 0, 0, 0, 0, 0, 1.0, 1.0, *gains])
         else:
             assert axis.force
-            rows.append([_FORCE, 0, 0, 0, 0, 0, axis.force.command_limit, axis.force.gain, *gains])
+            rows.append([_FORCE_DRIVE, 0, 0, 0, 0, 0, axis.force.command_limit, axis.force.gain, *gains])
     return np.array(rows, dtype=float)
 
 
@@ -88,7 +87,7 @@ class DriveReferences(NamedTuple):
     volume_rod: np.ndarray
 
 
-def drive_references(machine: Machine, plan: Plan, servo: Servo) -> DriveReferences:
+def compute_drive_references(machine: Machine, plan: Plan, servo: Servo) -> DriveReferences:
     """Compute drive velocities, moment arms and chamber volumes along a plan.
 
     Args:
@@ -106,7 +105,7 @@ def drive_references(machine: Machine, plan: Plan, servo: Servo) -> DriveReferen
     head, rod = np.ones_like(plan.reference), np.ones_like(plan.reference)
     ahead = np.minimum(plan.time + servo.lead, plan.time[-1])
     for column, name in enumerate(plan.axes):
-        if not plan.closed[column]:
+        if not plan.closed_loop[column]:
             continue
         if machine.axes[name].pump:
             message = f"{name} has its own pump, which the servo does not control"
@@ -116,7 +115,7 @@ def drive_references(machine: Machine, plan: Plan, servo: Servo) -> DriveReferen
         speed = arm[:, column] * plan.rate[:, column]
         velocity[:, column] = servo.feedforward * np.interp(ahead, plan.time, speed)
         axis = machine.axes[name]
-        if axis.hydraulic:
+        if axis.is_hydraulic:
             x = np.asarray(linkage.length(plan.reference[:, column]))
             if axis.cylinder:
                 x = np.clip(x - axis.cylinder.closed_length, 0.0, axis.cylinder.stroke)
@@ -125,9 +124,7 @@ def drive_references(machine: Machine, plan: Plan, servo: Servo) -> DriveReferen
 
 
 @compiled
-def feedforward_opening(
-    velocity, head, rod, supply, tank, area_head, area_rod, volume_head, volume_rod, flow_gain
-):
+def compute_valve_opening(velocity, head, rod, supply, tank, area_head, area_rod, volume_head, volume_rod, flow_gain):
     """Compute the valve opening at which a piston moves at a velocity with constant force.
 
     `A_h p_A' = A_r p_B'` with the orifice flows at the given pressures gives
@@ -154,7 +151,7 @@ def feedforward_opening(
         drop_head, drop_rod = supply - head, rod - tank
     else:
         drop_head, drop_rod = head - tank, supply - rod
-    floor = _LEAST_PRESSURE * supply
+    floor = _MIN_PRESSURE_DROP_RATIO * supply
     stiff_head, stiff_rod = area_head / volume_head, area_rod / volume_rod
     flow = stiff_head * math.sqrt(max(drop_head, 0.0)) + stiff_rod * math.sqrt(max(drop_rod, 0.0))
     least = (stiff_head + stiff_rod) * math.sqrt(floor)
@@ -163,7 +160,7 @@ def feedforward_opening(
 
 
 class DriveReference(NamedTuple):
-    """References of k drives for one control period, as `drive_row` writes them.
+    """References of k drives for one control period, as `interpolate_drive_reference` writes them.
 
     Attributes:
         velocity: (k,) reference velocity, ahead of time [m/s] or [rad/s].
@@ -178,7 +175,7 @@ class DriveReference(NamedTuple):
     volume_rod: np.ndarray
 
 
-class Measured(NamedTuple):
+class MeasuredState(NamedTuple):
     """Sensor readings of k axes.
 
     Attributes:
@@ -200,12 +197,12 @@ class ComputedForce(NamedTuple):
     """Drive forces by inverse dynamics at one control tick.
 
     Attributes:
-        known: whether they were computed; otherwise the arrays are not used.
+        is_computed: whether they were computed; otherwise the arrays are not used.
         force: (k,) current forces [N] or [N m].
         rate: (k,) rate of change, ahead of time as the velocity [N/s] or [N m/s].
     """
 
-    known: bool
+    is_computed: bool
     force: np.ndarray
     rate: np.ndarray
 
@@ -214,12 +211,12 @@ class ForceReferences(NamedTuple):
     """Drive forces by inverse dynamics along a plan, (n, k) each.
 
     Attributes:
-        known: whether they were computed.
+        is_computed: whether they were computed.
         force: forces [N] or [N m]; 0 if not computed.
         rate: rates of change, ahead of time by the servo's lead [N/s] or [N m/s].
     """
 
-    known: bool
+    is_computed: bool
     force: np.ndarray
     rate: np.ndarray
 
@@ -248,7 +245,7 @@ def servo_step(parameters, closed, drive, reference, measured, load, computed, o
     for i in range(parameters.shape[0]):
         error = reference[i] - joint[i]
         gain, rate_gain = parameters[i, 8], parameters[i, 9]
-        if parameters[i, 0] == _FORCE:
+        if parameters[i, 0] == _FORCE_DRIVE:
             if closed[i]:
                 force = rate_gain * (gain * error + velocity[i] - rate[i])
                 if computed.known:
@@ -262,28 +259,26 @@ def servo_step(parameters, closed, drive, reference, measured, load, computed, o
         load[i] += parameters[i, 11] * (force - model - load[i])
         if not closed[i]:
             continue
-        stiffness = parameters[i, 12] * (
-            area_head**2 / volume_head[i] + area_rod**2 / volume_rod[i]
-        )
+        stiffness = parameters[i, 12] * (area_head**2 / volume_head[i] + area_rod**2 / volume_rod[i])
         wanted = velocity[i] + gain * arm[i] * error
         wanted -= parameters[i, 13] * (force - model - load[i]) / stiffness
         if computed.known:
             wanted += computed.rate[i] / stiffness
-        opening = feedforward_opening(
+        opening = compute_valve_opening(
             wanted, head[i], rod[i], supply, parameters[i, 5], area_head, area_rod, volume_head[i],
             volume_rod[i], parameters[i, 3],
         )  # fmt: skip
         deadband = parameters[i, 4] * parameters[i, 10]
-        command = opening * (1.0 - deadband) + deadband * math.tanh(opening / _CENTRE)
+        command = opening * (1.0 - deadband) + deadband * math.tanh(opening / _DEADBAND_SMOOTHING)
         out[i] = min(1.0, max(-1.0, command))
 
 
-POINTS = 4001  # over a joint's range: interpolation is accurate to about 1e-7 of a moment arm
+TABLE_POINTS = 4001  # over a joint's range: interpolation is accurate to about 1e-7 of a moment arm
 _LOW, _STEP = range(2)
-_WIDE = 1.0  # rad or m, half range for a joint without a range; its drive is direct
+_DEFAULT_HALF_RANGE = 1.0  # rad or m, half range for a joint without a range; its drive is direct
 
 
-def drive_tables(machine: Machine, axes: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
+def tabulate_drives(machine: Machine, axes: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Tabulate moment arms and chamber volumes over the joints' ranges.
 
     Args:
@@ -294,15 +289,15 @@ def drive_tables(machine: Machine, axes: tuple[str, ...]) -> tuple[np.ndarray, n
         (grid (k, 2): lowest joint position and step, table (k, POINTS, 3): d(drive)/d(joint), head
         and rod chamber volume [m^3]).
     """
-    grid, table = np.zeros((len(axes), 2)), np.ones((len(axes), POINTS, 3))
+    grid, table = np.zeros((len(axes), 2)), np.ones((len(axes), TABLE_POINTS, 3))
     for i, name in enumerate(axes):
         axis = machine.axes[name]
-        low, high = machine.joints[axis.joint].range or (-_WIDE, _WIDE)
-        places = np.linspace(low, high, POINTS)
+        low, high = machine.joints[axis.joint].range or (-_DEFAULT_HALF_RANGE, _DEFAULT_HALF_RANGE)
+        places = np.linspace(low, high, TABLE_POINTS)
         grid[i] = low, places[1] - places[0]
         linkage = axis_linkage(machine, name)
         table[i, :, 0] = linkage.rate(places)
-        if axis.hydraulic:
+        if axis.is_hydraulic:
             x = np.asarray(linkage.length(places))
             if axis.cylinder:
                 x = np.clip(x - axis.cylinder.closed_length, 0.0, axis.cylinder.stroke)
@@ -311,12 +306,12 @@ def drive_tables(machine: Machine, axes: tuple[str, ...]) -> tuple[np.ndarray, n
 
 
 @compiled
-def drive_row(grid, table, reference, rate, scale, velocity, arm, volume_head, volume_rod):
+def interpolate_drive_reference(grid, table, reference, rate, scale, velocity, arm, volume_head, volume_rod):
     """Compute the drive references of one control period from tables.
 
     Args:
-        grid: (k, 2) of `drive_tables`.
-        table: (k, POINTS, 3) of `drive_tables`.
+        grid: (k, 2) of `tabulate_drives`.
+        table: (k, POINTS, 3) of `tabulate_drives`.
         reference: (k,) joint references [rad] or [m].
         rate: (k,) rates of the references [rad/s] or [m/s].
         scale: factor of the velocities, the servo's feedforward; scalar.

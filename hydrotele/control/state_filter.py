@@ -11,8 +11,8 @@ import numpy as np
 
 from hydrotele.core.compiled import allocation_free, compiled
 
-LOW, RATE, CHANGE, LAST = range(4)  # columns of a filter's state
-_NEGLIGIBLE = 1.0e-12
+VALUE, RATE, SECOND_DERIVATIVE, LAST_READING = range(4)  # columns of a filter's state
+_MIN_RELATIVE_POWER = 1.0e-12
 _REAL, _SQUARE, _CUBE = 2.0, 2.0, 1.0  # coefficients of the third-order Butterworth polynomial
 
 
@@ -54,7 +54,7 @@ def filter_delay(bandwidth: float) -> float:
     return _SQUARE / (2.0 * math.pi * bandwidth)
 
 
-def butterworth(bandwidth: float, s: np.ndarray) -> np.ndarray:
+def butterworth_response(bandwidth: float, s: np.ndarray) -> np.ndarray:
     """Return the transfer function of the filter for linearly interpolated readings.
 
     Args:
@@ -66,7 +66,7 @@ def butterworth(bandwidth: float, s: np.ndarray) -> np.ndarray:
 
     Source: Butterworth's filter of third order.
 
-    >>> abs(butterworth(1.0, np.array([2j * np.pi]))).round(4)
+    >>> abs(butterworth_response(1.0, np.array([2j * np.pi]))).round(4)
     array([0.7071])
     """
     w = 2.0 * math.pi * bandwidth
@@ -86,7 +86,7 @@ def noise_gains(table: np.ndarray) -> np.ndarray:
     """
     state, last, total = np.zeros(3), 1.0, table[:, 4] ** 2
     state += table[:, 4]
-    while np.any(state**2 > _NEGLIGIBLE * total):
+    while np.any(state**2 > _MIN_RELATIVE_POWER * total):
         state = table @ (*state, last, 0.0)
         total, last = total + state**2, 0.0
     return np.sqrt(total)
@@ -106,20 +106,21 @@ def filter_step(table, state, reading):
 
     Source: `filter_table`.
     """
-    low, rate, change, last = state[LOW], state[RATE], state[CHANGE], state[LAST]
+    low, rate, change, last = (
+        state[VALUE],
+        state[RATE],
+        state[SECOND_DERIVATIVE],
+        state[LAST_READING],
+    )
     for i in range(3):
         state[i] = (
-            table[i, 0] * low
-            + table[i, 1] * rate
-            + table[i, 2] * change
-            + table[i, 3] * last
-            + table[i, 4] * reading
+            table[i, 0] * low + table[i, 1] * rate + table[i, 2] * change + table[i, 3] * last + table[i, 4] * reading
         )
-    state[LAST] = reading
+    state[LAST_READING] = reading
 
 
 @compiled
-def filtered(table, readings):
+def filter_signal(table, readings):
     """Filter a whole signal, with the filter initially at rest at the first reading.
 
     Args:
@@ -132,7 +133,7 @@ def filtered(table, readings):
     Source: `filter_table`.
     """
     state, out = np.zeros(4), np.zeros((len(readings), 3))
-    state[LOW] = state[LAST] = readings[0]
+    state[VALUE] = state[LAST_READING] = readings[0]
     for row in range(len(readings)):
         filter_step(table, state, readings[row])
         out[row] = state[:3]

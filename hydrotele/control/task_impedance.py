@@ -6,10 +6,17 @@
 
 import numpy as np
 
-from hydrotele.control.state_filter import CHANGE, LAST, LOW, RATE, filter_step, filter_table
+from hydrotele.control.state_filter import (
+    LAST_READING,
+    RATE,
+    SECOND_DERIVATIVE,
+    VALUE,
+    filter_step,
+    filter_table,
+)
 from hydrotele.core.errors import InputError
 
-_WHERE = "recursive least squares"
+_ERROR_CONTEXT = "recursive least squares"
 
 
 class RecursiveLeastSquares:
@@ -21,35 +28,38 @@ class RecursiveLeastSquares:
     """
 
     def __init__(
-        self, start: np.ndarray, spread: np.ndarray, *, forgetting: float = 1.0,
-        reset: float = np.inf,
+        self, start: np.ndarray, initial_std: np.ndarray, *, forgetting: float = 1.0,
+        reset_ratio: float = np.inf,
     ):  # fmt: skip
         """Set the initial parameters and their covariance.
 
         Args:
             start: (p,) initial parameters.
-            spread: (p,) their standard deviations, in units of the equations' error.
+            initial_std: (p,) their standard deviations, in units of the equations' error.
             forgetting: forgetting factor per equation, above 0, at most 1.
-            reset: multiple of the usual error above which the covariance is reset.
+            reset_ratio: multiple of the usual error above which the covariance is reset.
 
         Raises:
             InputError: sizes do not match or a value is invalid.
         """
-        self.value, spread = np.array(start, float), np.array(spread, float)
-        if self.value.ndim != 1 or spread.shape != self.value.shape or not np.all(spread > 0.0):
+        self.value, initial_std = np.array(start, float), np.array(initial_std, float)
+        if self.value.ndim != 1 or initial_std.shape != self.value.shape or not np.all(initial_std > 0.0):
             raise InputError(
-                _WHERE,
+                _ERROR_CONTEXT,
                 f"{len(self.value)} parameters need as many standard deviations, all above 0",
             )
         if not 0.0 < forgetting <= 1.0:
-            raise InputError(_WHERE, f"forgetting must be above 0 and at most 1: {forgetting}")
-        if not reset > 1.0:
-            raise InputError(_WHERE, f"reset must be above 1, got {reset}")
-        self.covariance = np.diag(spread**2)
+            raise InputError(_ERROR_CONTEXT, f"forgetting must be above 0 and at most 1: {forgetting}")
+        if not reset_ratio > 1.0:
+            raise InputError(_ERROR_CONTEXT, f"reset must be above 1, got {reset_ratio}")
+        self.covariance = np.diag(initial_std**2)
         self.resets = 0
-        self._open, self._most = self.covariance.copy(), float(np.trace(self.covariance))
-        self._forgetting, self._reset = forgetting, reset
-        self._usual, self._count = 0.0, 0
+        self._initial_covariance, self._max_trace = (
+            self.covariance.copy(),
+            float(np.trace(self.covariance)),
+        )
+        self._forgetting, self._reset_ratio = forgetting, reset_ratio
+        self._mean_square_error, self._count = 0.0, 0
 
     def update(self, row: np.ndarray, measured: float) -> float:
         """Update the parameters with one equation; skip it if it is not finite.
@@ -67,36 +77,36 @@ class RecursiveLeastSquares:
         if not (np.isfinite(row).all() and np.isfinite(measured)):
             return float("nan")
         error = float(measured - row @ self.value)
-        if self._sudden(error):
-            self.covariance = self._open.copy()
-            self.resets, self._usual, self._count = self.resets + 1, 0.0, 0
+        if self._detect_sudden_change(error):
+            self.covariance = self._initial_covariance.copy()
+            self.resets, self._mean_square_error, self._count = self.resets + 1, 0.0, 0
         way = self.covariance @ row
         gain = way / (self._forgetting + row @ way)
         self.value = self.value + gain * error
         wider = (self.covariance - np.outer(gain, way)) / self._forgetting
-        if np.trace(wider) <= self._most:
+        if np.trace(wider) <= self._max_trace:
             self.covariance = 0.5 * (wider + wider.T)
         else:
             self.covariance = self.covariance - np.outer(gain, way)
         return error
 
-    def _sudden(self, error: float) -> bool:
+    def _detect_sudden_change(self, error: float) -> bool:
         """Return whether an error is far above the usual size; otherwise update that size."""
         known = self._count >= 5 * len(self.value)
-        if known and error**2 > self._reset**2 * self._usual:
+        if known and error**2 > self._reset_ratio**2 * self._mean_square_error:
             return True
         self._count += 1
         share = max(1.0 / self._count, 0.02)
         if self._count > 2 * len(self.value):  # the first errors depend on the initial parameters
-            self._usual += share * (error**2 - self._usual)
+            self._mean_square_error += share * (error**2 - self._mean_square_error)
         return False
 
 
-_TOUCHING = 500.0  # N, smallest contact force: above the error of the estimate in free motion
+_MIN_CONTACT_FORCE_N = 500.0  # N, smallest contact force: above the error of the estimate in free motion
 # initial standard deviations of stiffness [kN/m], damping [kN s/m], mass [t] and offset [kN]
-_SPREAD = (3e3, 3e3, 30.0, 30.0)
-_FORGET = 0.99  # forgetting factor per sample: about two seconds at 50 Hz
-_RESET = 8.0  # multiple of the usual error that resets the covariance
+_INITIAL_STD = (3e3, 3e3, 30.0, 30.0)
+_FORGETTING_FACTOR = 0.99  # forgetting factor per sample: about two seconds at 50 Hz
+_RESET_ERROR_RATIO = 8.0  # multiple of the usual error that resets the covariance
 
 
 class TaskImpedance:
@@ -111,7 +121,12 @@ class TaskImpedance:
     """
 
     def __init__(
-        self, coordinates: int, period: float, bandwidths: tuple[float, ...], *, late: bool
+        self,
+        coordinates: int,
+        period: float,
+        bandwidths: tuple[float, ...],
+        *,
+        force_is_filtered: bool,
     ) -> None:
         """Start without contact.
 
@@ -119,15 +134,15 @@ class TaskImpedance:
             coordinates: number k of task coordinates.
             period: time between two samples [s].
             bandwidths: bandwidths of the filters in series [Hz].
-            late: whether the force has already passed these filters.
+            force_is_filtered: whether the force has already passed these filters.
         """
         self.stiffness, self.damping = np.zeros(coordinates), np.zeros(coordinates)
         self.mass = np.zeros(coordinates)
         self._fits: list[RecursiveLeastSquares | None] = [None] * coordinates
         self._origin = np.zeros(coordinates)
         self._tables = [filter_table(bandwidth, period) for bandwidth in bandwidths]
-        self._place = np.full((len(bandwidths), coordinates, 4), np.nan)
-        self._force = None if late else self._place.copy()
+        self._position_states = np.full((len(bandwidths), coordinates, 4), np.nan)
+        self._force_states = None if force_is_filtered else self._position_states.copy()
 
     def update(self, force: np.ndarray, pose: np.ndarray) -> None:
         """Update the estimate with one sample; skip it if it is not finite.
@@ -141,25 +156,25 @@ class TaskImpedance:
         if not (np.isfinite(force).all() and np.isfinite(pose).all()):
             return
         for c in range(len(force)):
-            motion = self._filtered(self._place, c, pose[c])
+            motion = self._filter_reading(self._position_states, c, pose[c])
             felt = force[c]
-            if self._force is not None:
-                felt = self._filtered(self._force, c, force[c])[0]
+            if self._force_states is not None:
+                felt = self._filter_reading(self._force_states, c, force[c])[0]
             self._fit(c, felt, *motion)
 
-    def _filtered(self, states: np.ndarray, c: int, reading: float) -> tuple[float, float, float]:
+    def _filter_reading(self, states: np.ndarray, c: int, reading: float) -> tuple[float, float, float]:
         """Return the filtered reading with two derivatives; filters start at the first reading."""
         for table, state in zip(self._tables, states[:, c], strict=True):
-            if np.isnan(state[LOW]):
+            if np.isnan(state[VALUE]):
                 state[:] = 0.0
-                state[LOW] = state[LAST] = reading
+                state[VALUE] = state[LAST_READING] = reading
             filter_step(table, state, float(reading))
-            reading, rate, change = state[LOW], state[RATE], state[CHANGE]
+            reading, rate, change = state[VALUE], state[RATE], state[SECOND_DERIVATIVE]
         return reading, rate, change
 
     def _fit(self, c: int, force: float, place: float, rate: float, change: float) -> None:
         """Update one coordinate with one equation; reset it without contact."""
-        if not abs(force) > _TOUCHING:
+        if not abs(force) > _MIN_CONTACT_FORCE_N:
             self._fits[c] = None
             self.stiffness[c] = self.damping[c] = self.mass[c] = 0.0
             return
@@ -167,7 +182,10 @@ class TaskImpedance:
         if fit is None:
             self._origin[c] = place
             fit = self._fits[c] = RecursiveLeastSquares(
-                np.zeros(4), np.array(_SPREAD), forgetting=_FORGET, reset=_RESET
+                np.zeros(4),
+                np.array(_INITIAL_STD),
+                forgetting=_FORGETTING_FACTOR,
+                reset_ratio=_RESET_ERROR_RATIO,
             )
         fit.update(np.array([place - self._origin[c], rate, change, 1.0]), -force / 1e3)
         self.stiffness[c] = max(0.0, 1e3 * fit.value[0])

@@ -12,13 +12,13 @@ from hydrotele.control.servo import (
     DriveReference,
     DriveReferences,
     ForceReferences,
-    Measured,
+    MeasuredState,
     servo_step,
 )
 from hydrotele.core.compiled import compiled
-from hydrotele.core.memory import address_record, floats, integers, rows_of
-from hydrotele.simulate.feedback import FeedbackTable, Readings, Sensors, sample
-from hydrotele.simulate.stepping import simulation, step_physics
+from hydrotele.core.memory import address_record, float64_view, int64_view, matrix_view
+from hydrotele.simulate.feedback import FeedbackTable, Readings, SensorParameters, sample_sensors
+from hydrotele.simulate.stepping import read_simulation, step_physics
 
 
 class Controller(NamedTuple):
@@ -80,7 +80,7 @@ def control_tick(sim, tick, steps, controller, reference, measured):
     step_physics(sim, tick, steps, controller.command)
 
 
-class Planned(NamedTuple):
+class PlannedRun(NamedTuple):
     """Data of a run along a plan of n ticks and k axes.
 
     Attributes:
@@ -102,22 +102,22 @@ class Planned(NamedTuple):
     given: np.ndarray
 
 
-_I, _SERVO = np.int64, 14
-PLANNED = np.dtype(
-    [(name, _I) for name in ("axes", "ticks", "channels", "samples", "every", "known")]
+_INT, _SERVO_COLUMNS = np.int64, 14
+PLANNED_RUN_DTYPE = np.dtype(
+    [(name, _INT) for name in ("axes", "ticks", "channels", "samples", "every", "known")]
     + [("period", np.float64)]
-    + [(name, _I) for name in ("parameters", "closed", "load", "command")]  # addresses from here on
-    + [(name, _I) for name in ("scale", "offset", "step", "low", "high", "errors")]
-    + [(name, _I) for name in ("joint", "rate", "head", "rod", "supply")]
-    + [(name, _I) for name in ("velocity", "arm", "volume_head", "volume_rod")]
-    + [(name, _I) for name in ("force", "force_rate", "reference", "planned_command", "given")],
+    + [(name, _INT) for name in ("parameters", "closed", "load", "command")]  # addresses from here on
+    + [(name, _INT) for name in ("scale", "offset", "step", "low", "high", "errors")]
+    + [(name, _INT) for name in ("joint", "rate", "head", "rod", "supply")]
+    + [(name, _INT) for name in ("velocity", "arm", "volume_head", "volume_rod")]
+    + [(name, _INT) for name in ("force", "force_rate", "reference", "planned_command", "given")],
     align=True,
 )
-"""Record type of a `Planned`: sizes, scalars and array addresses."""
+"""Record type of a `PlannedRun`: sizes, scalars and array addresses."""
 
 
-def planned_record(run: Planned) -> np.ndarray:
-    """Return a record (1,) of a `Planned`; its arrays must outlive it."""
+def planned_run_record(run: PlannedRun) -> np.ndarray:
+    """Return a record (1,) of a `PlannedRun`; its arrays must outlive it."""
     table, controller = run.feedback, run.controller
     arrays = {
         "parameters": controller.parameters, "closed": controller.closed, "load": controller.load,
@@ -126,49 +126,49 @@ def planned_record(run: Planned) -> np.ndarray:
         "force_rate": run.forces.rate, "reference": run.reference, "planned_command": run.command,
         "given": run.given,
     }  # fmt: skip
-    record = address_record(PLANNED, arrays)
-    (record["ticks"], record["axes"]), record["every"] = run.reference.shape, table.every
+    record = address_record(PLANNED_RUN_DTYPE, arrays)
+    (record["ticks"], record["axes"]), record["every"] = run.reference.shape, table.ticks_per_sample
     (record["samples"], record["channels"]), record["period"] = table.errors.shape, table.period
-    record["known"] = run.forces.known
+    record["known"] = run.forces.is_computed
     return record
 
 
 @compiled
-def _planned(r):
-    """Return the `Planned` of a record."""
+def _read_planned_run(r):
+    """Return the `PlannedRun` of a record."""
     n, k, c = r.ticks, r.axes, r.channels
     controller = Controller(
-        rows_of(r.parameters, k, _SERVO), integers(r.closed, k), floats(r.load, k),
-        floats(r.command, k),
+        matrix_view(r.parameters, k, _SERVO_COLUMNS), int64_view(r.closed, k), float64_view(r.load, k),
+        float64_view(r.command, k),
     )  # fmt: skip
-    sensors = Sensors(
-        floats(r.scale, c), floats(r.offset, c), floats(r.step, c), floats(r.low, c),
-        floats(r.high, c),
+    sensors = SensorParameters(
+        float64_view(r.scale, c), float64_view(r.offset, c), float64_view(r.step, c), float64_view(r.low, c),
+        float64_view(r.high, c),
     )  # fmt: skip
     readings = Readings(
-        floats(r.joint, k), floats(r.rate, k), floats(r.head, k), floats(r.rod, k),
-        floats(r.supply, 1),
+        float64_view(r.joint, k), float64_view(r.rate, k), float64_view(r.head, k), float64_view(r.rod, k),
+        float64_view(r.supply, 1),
     )  # fmt: skip
     drives = DriveReferences(
-        rows_of(r.velocity, n, k), rows_of(r.arm, n, k), rows_of(r.volume_head, n, k),
-        rows_of(r.volume_rod, n, k),
+        matrix_view(r.velocity, n, k), matrix_view(r.arm, n, k), matrix_view(r.volume_head, n, k),
+        matrix_view(r.volume_rod, n, k),
     )  # fmt: skip
-    return Planned(
+    return PlannedRun(
         controller,
-        FeedbackTable(r.every, r.period, sensors, rows_of(r.errors, r.samples, c), readings),
+        FeedbackTable(r.every, r.period, sensors, matrix_view(r.errors, r.samples, c), readings),
         drives,
-        ForceReferences(r.known != 0, rows_of(r.force, n, k), rows_of(r.force_rate, n, k)),
-        rows_of(r.reference, n, k), rows_of(r.planned_command, n, k), rows_of(r.given, n, k),
+        ForceReferences(r.known != 0, matrix_view(r.force, n, k), matrix_view(r.force_rate, n, k)),
+        matrix_view(r.reference, n, k), matrix_view(r.planned_command, n, k), matrix_view(r.given, n, k),
     )  # fmt: skip
 
 
 @compiled
-def planned_tick(simulated, planned, tick, steps, stopped):
+def step_planned_run(simulated, planned, tick, steps, stopped):
     """Simulate one tick and sample the sensors that are due after it.
 
     Args:
         simulated: record of `simulate.stepping.simulation_record`.
-        planned: record of `planned_record`, with the readings of this tick.
+        planned: record of `planned_run_record`, with the readings of this tick.
         tick: control tick, scalar.
         steps: physics steps per tick, scalar.
         stopped: whether all commands are 0, scalar.
@@ -178,22 +178,18 @@ def planned_tick(simulated, planned, tick, steps, stopped):
 
     Source: `control_tick`.
     """
-    sim, run = simulation(simulated[0]), _planned(planned[0])
+    sim, run = read_simulation(simulated[0]), _read_planned_run(planned[0])
     controller, readings = run.controller, run.feedback.readings
     for i in range(len(controller.command)):
         controller.command[i] = run.command[tick, i]
     drives, forces = run.drives, run.forces
-    drive = DriveReference(
-        drives.velocity[tick], drives.arm[tick], drives.volume_head[tick], drives.volume_rod[tick]
-    )
+    drive = DriveReference(drives.velocity[tick], drives.arm[tick], drives.volume_head[tick], drives.volume_rod[tick])
     reference = TickReference(
         run.reference[tick - tick % run.feedback.every], drive,
         ComputedForce(forces.known, forces.force[tick], forces.rate[tick]), stopped,
     )  # fmt: skip
-    measured = Measured(
-        readings.joint, readings.rate, readings.head, readings.rod, readings.supply[0]
-    )
+    measured = MeasuredState(readings.joint, readings.rate, readings.head, readings.rod, readings.supply[0])
     control_tick(sim, tick, steps, controller, reference, measured)
     for i in range(len(controller.command)):
         run.given[tick, i] = controller.command[i]
-    sample(run.feedback, sim, tick + 1, steps)
+    sample_sensors(run.feedback, sim, tick + 1, steps)

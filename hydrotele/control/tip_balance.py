@@ -1,7 +1,7 @@
 """External forces on an arm: the forces that its motion needs minus the forces of its drives.
 
-`dynamic_balance` uses the complete model, `static_balance` only gravity. `tip_force` converts the
-result to a force at the tip. `arm_tables` prepares an arm, and `free_axes` checks that its tip
+`dynamic_balance` uses the complete model, `static_balance` only gravity. `solve_tip_force` converts the
+result to a force at the tip. `create_arm_balance` prepares an arm, and `independent_axes` checks that its tip
 force can be estimated from its drives.
 """
 
@@ -10,13 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.control.resolved_motion import arm_facts
+from hydrotele.control.resolved_motion import arm_specification
 from hydrotele.core.compiled import allocation_free, compiled
 from hydrotele.core.errors import InputError
-from hydrotele.core.memory import address_record, floats, integers, rows_of
+from hydrotele.core.memory import address_record, float64_view, int64_view, matrix_view
 from hydrotele.estimate.reduced_model import model_space, place_mechanism, reduced_model, state_size
 from hydrotele.hydraulics.circuit import actuator_friction
-from hydrotele.hydraulics.parameters import SLOTS, Slot
+from hydrotele.hydraulics.parameters import SLOT_COUNT, Slot
 from hydrotele.kinematics.task import task_jacobian
 from hydrotele.machine.machine import Machine
 from hydrotele.multibody.reduced_mechanism import (
@@ -27,13 +27,13 @@ from hydrotele.multibody.reduced_mechanism import (
     RATE,
     ReducedMechanism,
     ReducedMotion,
+    compute_mass_and_bias,
     coordinate_names,
-    gather_forces,
 )
 
 _AH, _AR = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)
-_ODDS = 8.0  # velocity range of a moving drive over sqrt(2 pi) times the noise
-_SINGULAR = 1.0e-6  # pivot over largest entry, below which a Jacobian is singular
+_VELOCITY_RANGE_RATIO = 8.0  # velocity range of a moving drive over sqrt(2 pi) times the noise
+_MIN_PIVOT_RATIO = 1.0e-6  # pivot over largest entry, below which a Jacobian is singular
 
 
 class BalanceModel(NamedTuple):
@@ -88,7 +88,7 @@ class ArmBalance(NamedTuple):
     work: np.ndarray
 
 
-_ARRAYS = {
+_ARRAY_FIELDS = {
     "mech": ("tree", "shape", "joint", "free", "bound", "gravity", "drive"),
     "model": ("user", "gear", "transmission"),
     "motion": ("frame", "jacobian", "momentum", "bar", "mass", "joint", "basis", "loop", "normal"),
@@ -97,25 +97,25 @@ _ARRAYS = {
             "work"),
 }  # fmt: skip
 # fields of a record that hold the addresses of the arrays of ArmBalance and its parts
-_ADDRESSES = [f"{part}_{name}" for part, names in _ARRAYS.items() for name in names]
-_ARM = np.dtype(
+_ADDRESS_FIELDS = [f"{part}_{name}" for part, names in _ARRAY_FIELDS.items() for name in names]
+_ARM_DTYPE = np.dtype(
     [(name, np.int64) for name in ("links", "bars", "hydraulic", "frames", "coordinates", "free")]
     + [(name, np.int64) for name in ("drives", "geared", "loops", "joints", "states", "users")]
     + [(name, np.int64) for name in ("shape_width", "frame_width", "bar_width", "terms")]
-    + [(name, np.int64) for name in _ADDRESSES],
+    + [(name, np.int64) for name in _ADDRESS_FIELDS],
     align=True,
 )
 
 
 def arm_record(arm: ArmBalance) -> np.ndarray:
-    """Return a record (1,) of an ArmBalance for `arm_of`; the arrays must outlive it."""
+    """Return a record (1,) of an ArmBalance for `read_arm_record`; the arrays must outlive it."""
     mech, motion = arm.model.mech, arm.space.motion
     parts = {"mech": mech, "model": arm.model, "motion": motion, "space": arm.space, "arm": arm}
-    arrays = {f"{p}_{n}": getattr(parts[p], n) for p, names in _ARRAYS.items() for n in names}
-    record = address_record(_ARM, arrays)
+    arrays = {f"{p}_{n}": getattr(parts[p], n) for p, names in _ARRAY_FIELDS.items() for n in names}
+    record = address_record(_ARM_DTYPE, arrays)
     for name, value in {
-        "links": mech.links, "bars": mech.bars, "hydraulic": arm.model.hydraulic,
-        "frames": len(mech.tree), "coordinates": mech.joint.shape[1], "free": len(mech.free),
+        "links": mech.link_count, "bars": mech.bar_count, "hydraulic": arm.model.hydraulic,
+        "frames": len(mech.tree), "coordinates": mech.joint.shape[1], "free": len(mech.independent),
         "drives": len(mech.drive), "geared": len(arm.model.transmission),
         "loops": len(motion.loop), "joints": len(arm.joint), "states": len(arm.z),
         "users": len(arm.model.user), "shape_width": mech.shape.shape[1],
@@ -127,47 +127,47 @@ def arm_record(arm: ArmBalance) -> np.ndarray:
 
 
 @compiled
-def arm_of(r):
+def read_arm_record(r):
     """Return the ArmBalance of a record of `arm_record`."""
     f, c, n, m = r.frames, r.coordinates, r.free, r.joints
     mech = ReducedMechanism(
-        integers(r.mech_tree, 4 * f).reshape((f, 4)), rows_of(r.mech_shape, f, r.shape_width),
-        r.links, r.bars, rows_of(r.mech_joint, 2, c), integers(r.mech_free, n),
-        integers(r.mech_bound, c - n), floats(r.mech_gravity, 3),
-        integers(r.mech_drive, 2 * r.drives).reshape((r.drives, 2)),
+        int64_view(r.mech_tree, 4 * f).reshape((f, 4)), matrix_view(r.mech_shape, f, r.shape_width),
+        r.links, r.bar_count, matrix_view(r.mech_joint, 2, c), int64_view(r.mech_free, n),
+        int64_view(r.mech_bound, c - n), float64_view(r.mech_gravity, 3),
+        int64_view(r.mech_drive, 2 * r.drives).reshape((r.drives, 2)),
     )  # fmt: skip
     motion = ReducedMotion(
-        rows_of(r.motion_frame, f, r.frame_width),
-        floats(r.motion_jacobian, 6 * f * c).reshape((f, c, 6)),
-        floats(r.motion_momentum, 6 * f * c).reshape((f, c, 6)),
-        rows_of(r.motion_bar, r.bars, r.bar_width), rows_of(r.motion_mass, c, c),
-        rows_of(r.motion_joint, 4, c), rows_of(r.motion_basis, c, n),
-        rows_of(r.motion_loop, r.loops, c + 2), rows_of(r.motion_normal, c - n + 1, c - n),
+        matrix_view(r.motion_frame, f, r.frame_width),
+        float64_view(r.motion_jacobian, 6 * f * c).reshape((f, c, 6)),
+        float64_view(r.motion_momentum, 6 * f * c).reshape((f, c, 6)),
+        matrix_view(r.motion_bar, r.bar_count, r.bar_width), matrix_view(r.motion_mass, c, c),
+        matrix_view(r.motion_joint, 4, c), matrix_view(r.motion_basis, c, n),
+        matrix_view(r.motion_loop, r.loops, c + 2), matrix_view(r.motion_normal, c - n + 1, c - n),
     )  # fmt: skip
     return ArmBalance(
         BalanceModel(
-            mech, floats(r.model_user, r.users), r.hydraulic, integers(r.model_gear, r.drives),
-            rows_of(r.model_transmission, r.geared, 4),
+            mech, float64_view(r.model_user, r.users), r.hydraulic, int64_view(r.model_gear, r.drives),
+            matrix_view(r.model_transmission, r.geared, 4),
         ),
         BalanceSpace(
-            motion, rows_of(r.space_drive, 5, r.drives), rows_of(r.space_row, r.drives, n)
+            motion, matrix_view(r.space_drive, 5, r.drives), matrix_view(r.space_row, r.drives, n)
         ),
-        floats(r.arm_z, r.states), integers(r.arm_joint, m), floats(r.arm_task, 9),
-        floats(r.arm_gravity, r.terms), floats(r.arm_acceleration, n),
-        floats(r.arm_rate_noise, n), floats(r.arm_angle, m), rows_of(r.arm_table, m, m),
-        floats(r.arm_work, n),
+        float64_view(r.arm_z, r.states), int64_view(r.arm_joint, m), float64_view(r.arm_task, 9),
+        float64_view(r.arm_gravity, r.terms), float64_view(r.arm_acceleration, n),
+        float64_view(r.arm_rate_noise, n), float64_view(r.arm_angle, m), matrix_view(r.arm_table, m, m),
+        float64_view(r.arm_work, n),
     )  # fmt: skip
 
 
 @allocation_free
-def dynamic_balance(arm, outside):
+def dynamic_balance(arm, external_force):
     """Compute external forces by the complete model: inertia, gravity, friction, closed chains.
 
     `tau = B' (M (B q'' + d) + h + D q') - sum r_i (F_i - f_i(v_i))`
 
     Args:
         arm: ArmBalance; z and acceleration are read.
-        outside: (n,) written: external forces on the independent coordinates [N m] or [N].
+        external_force: (n,) written: external forces on the independent coordinates [N m] or [N].
 
     Returns:
         Nothing.
@@ -175,11 +175,11 @@ def dynamic_balance(arm, outside):
     Source: Zhu 1994, 6.2, with the projection of `estimate.reduced_model`.
     """
     model, m = arm.model, arm.space.motion
-    n, nt = len(outside), m.joint.shape[1]
+    n, nt = len(external_force), m.joint.shape[1]
     place_mechanism(model, arm.space, arm.z)
-    gather_forces(model.mech, m)
+    compute_mass_and_bias(model.mech, m)
     for f in range(n):
-        outside[f] = 0.0
+        external_force[f] = 0.0
     for j in range(nt):
         need = m.joint[BIAS, j] + model.mech.joint[DAMPING, j] * m.joint[RATE, j]
         for k in range(nt):
@@ -188,19 +188,19 @@ def dynamic_balance(arm, outside):
                 way += m.basis[k, f] * arm.acceleration[f]
             need += m.mass[j, k] * way
         for f in range(n):
-            outside[f] += m.basis[j, f] * need
-    _subtract_drives(arm, True, outside)
+            external_force[f] += m.basis[j, f] * need
+    _subtract_drives(arm, True, external_force)
 
 
 @allocation_free
-def static_balance(arm, outside):
+def static_balance(arm, external_force):
     """Compute external forces by the static model, which includes only gravity.
 
     `tau = Y(q) P - sum r_i F_i`
 
     Args:
         arm: ArmBalance; z and gravity are read.
-        outside: (n,) written: external forces on the independent coordinates [N m]; without gravity
+        external_force: (n,) written: external forces on the independent coordinates [N m]; without gravity
             for joints that do not belong to the arm.
 
     Returns:
@@ -209,15 +209,15 @@ def static_balance(arm, outside):
     Source: Zhu 1994, 6.6.
     """
     place_mechanism(arm.model, arm.space, arm.z)
-    for f in range(len(outside)):
-        outside[f] = 0.0
+    for f in range(len(external_force)):
+        external_force[f] = 0.0
     for i in range(len(arm.joint)):
-        outside[arm.joint[i]] = static_torque(arm.z, arm.joint, arm.gravity, i)
-    _subtract_drives(arm, False, outside)
+        external_force[arm.joint[i]] = static_torque(arm.z, arm.joint, arm.gravity, i)
+    _subtract_drives(arm, False, external_force)
 
 
 @allocation_free
-def moving(velocity, variance):
+def motion_probability(velocity, variance):
     """Return the probability that a drive moves, given its measured velocity.
 
     Rest and motion have equal prior probability. The velocity of a moving drive is uniform over a
@@ -232,29 +232,29 @@ def moving(velocity, variance):
 
     Source: Bayes' rule.
 
-    >>> [round(moving(v, 1.0), 3) for v in (0.0, 2.0, 4.0)]
+    >>> [round(motion_probability(v, 1.0), 3) for v in (0.0, 2.0, 4.0)]
     [0.111, 0.48, 0.997]
     """
     if not variance > 0.0:
         return 1.0
-    return 1.0 / (1.0 + _ODDS * math.exp(-0.5 * velocity * velocity / variance))
+    return 1.0 / (1.0 + _VELOCITY_RANGE_RATIO * math.exp(-0.5 * velocity * velocity / variance))
 
 
 @allocation_free
-def _subtract_drives(arm, rubbing, outside):
+def _subtract_drives(arm, with_friction, external_force):
     """Subtract the drive forces from the external forces."""
-    model, sp, n = arm.model, arm.space, len(outside)
+    model, sp, n = arm.model, arm.space, len(external_force)
     for i in range(model.hydraulic):
-        u, a = i * SLOTS, 2 * n + 4 * i
+        u, a = i * SLOT_COUNT, 2 * n + 4 * i
         give = model.user[u + _AH] * arm.z[a + 2] - model.user[u + _AR] * arm.z[a + 3]
-        if rubbing:
+        if with_friction:
             v, noise = 0.0, 0.0
             for f in range(n):
                 v += sp.row[i, f] * arm.z[n + f]
                 noise += (sp.row[i, f] * arm.rate_noise[f]) ** 2
-            give -= moving(v, noise) * actuator_friction(model.user, u, v)
+            give -= motion_probability(v, noise) * actuator_friction(model.user, u, v)
         for f in range(n):
-            outside[f] -= sp.row[i, f] * give
+            external_force[f] -= sp.row[i, f] * give
 
 
 @allocation_free
@@ -293,12 +293,12 @@ def static_torque(q, joint, gravity, i):
 
 
 @allocation_free
-def tip_force(arm, outside, out):
+def solve_tip_force(arm, external_force, out):
     """Compute the force at the tip from external forces on the coordinates.
 
     Args:
         arm: ArmBalance; z is read, table and work are overwritten.
-        outside: (n,) external forces on the independent coordinates [N m] or [N].
+        external_force: (n,) external forces on the independent coordinates [N m] or [N].
         out: (m,) written: r [N], theta [N m], z [N], then attitude and head [N m]; unchanged if the
             Jacobian is singular.
 
@@ -312,12 +312,12 @@ def tip_force(arm, outside, out):
         arm.angle[i] = arm.z[arm.joint[i]]
     task_jacobian(arm.task, arm.angle, arm.table)
     for i in range(m):
-        arm.work[i] = outside[arm.joint[i]]
+        arm.work[i] = external_force[arm.joint[i]]
         for j in range(i):
             arm.table[i, j], arm.table[j, i] = arm.table[j, i], arm.table[i, j]
         for j in range(m):
             most = max(most, abs(arm.table[i, j]))
-    if not _eliminated(arm.table, arm.work, m, _SINGULAR * most):
+    if not _solve_by_elimination(arm.table, arm.work, m, _MIN_PIVOT_RATIO * most):
         return False
     for i in range(m):
         out[i] = arm.work[i]
@@ -325,14 +325,14 @@ def tip_force(arm, outside, out):
 
 
 @allocation_free
-def _eliminated(table, right, m, least):
-    """Solve linear equations in place by elimination; return False if a pivot is below `least`."""
+def _solve_by_elimination(table, right, m, min_pivot):
+    """Solve linear equations in place by elimination; return False if a pivot is below `min_pivot`."""
     for i in range(m):
         best = i
         for r in range(i + 1, m):
             if abs(table[r, i]) > abs(table[best, i]):
                 best = r
-        if not abs(table[best, i]) > least:
+        if not abs(table[best, i]) > min_pivot:
             return False
         for j in range(m):
             table[i, j], table[best, j] = table[best, j], table[i, j]
@@ -361,17 +361,17 @@ def arm_joints(machine: Machine) -> tuple[str, ...]:
     return tuple(j for j in (arm.swing, arm.boom, arm.stick, arm.tool, arm.head) if j)
 
 
-def gravity_size(joints: int) -> int:
+def gravity_parameter_count(joints: int) -> int:
     """Return the number of parameters of the static model of an arm with that many joints."""
     return 7 if joints == 5 else 2 * (joints - 1)
 
 
-def free_axes(machine: Machine, where: str) -> tuple[str, ...]:
+def independent_axes(machine: Machine, context: str) -> tuple[str, ...]:
     """Return the axes of the independent coordinates.
 
     Args:
         machine: the machine.
-        where: name of the caller, for messages.
+        context: name of the caller, for messages.
 
     Returns:
         Axis names in the order of the coordinates.
@@ -380,21 +380,21 @@ def free_axes(machine: Machine, where: str) -> tuple[str, ...]:
         InputError: a coordinate is not driven, or a joint of the arm is not driven by a valve.
     """
     names, driver = coordinate_names(machine), {a.joint: n for n, a in machine.axes.items()}
-    free = [names[i] for i in reduced_model(machine, ()).mech.free]
+    free = [names[i] for i in reduced_model(machine, ()).mech.independent]
     if loose := [joint for joint in free if joint not in driver]:
-        raise InputError(where, f"{', '.join(loose)} has no drive: its motion is not measured")
+        raise InputError(context, f"{', '.join(loose)} has no drive: its motion is not measured")
     joints = arm_joints(machine)
     if plain := [joint for joint in joints if driver[joint] not in machine.hydraulic_axes]:
-        raise InputError(where, f"{', '.join(plain)} has no valve: its torque is not measured")
+        raise InputError(context, f"{', '.join(plain)} has no valve: its torque is not measured")
     return tuple(driver[joint] for joint in free)
 
 
-def arm_tables(machine: Machine, where: str) -> ArmBalance:
+def create_arm_balance(machine: Machine, context: str) -> ArmBalance:
     """Create the model of an arm, with transmissions assumed rigid and massless.
 
     Args:
         machine: the machine.
-        where: name of the caller, for messages.
+        context: name of the caller, for messages.
 
     Returns:
         The model at its home position with zero pressures.
@@ -402,19 +402,23 @@ def arm_tables(machine: Machine, where: str) -> ArmBalance:
     Raises:
         InputError: a coordinate is not driven, or a joint of the arm is not driven by a valve.
     """
-    free = free_axes(machine, where)
+    free = independent_axes(machine, context)
     rigid = {n: a.model_copy(update={"transmission": None}) for n, a in machine.axes.items()}
     model = reduced_model(machine.model_copy(update={"axes": rigid}), ())
-    space, z, (task, axes, _) = model_space(model), np.zeros(state_size(model)), arm_facts(machine)
+    space, z, (task, axes, _) = (
+        model_space(model),
+        np.zeros(state_size(model)),
+        arm_specification(machine),
+    )
     n, m = len(free), len(axes)
-    z[:n] = model.mech.joint[HOME][model.mech.free]
+    z[:n] = model.mech.joint[HOME][model.mech.independent]
     return ArmBalance(
         model=BalanceModel(model.mech, model.user, model.hydraulic, model.gear, model.transmission),
         space=BalanceSpace(space.motion, space.drive, space.row),
         z=z,
         joint=np.array([free.index(name) for name in axes]),
         task=task,
-        gravity=np.zeros(gravity_size(m)),
+        gravity=np.zeros(gravity_parameter_count(m)),
         acceleration=np.zeros(n),
         rate_noise=np.zeros(n),
         angle=np.zeros(m),

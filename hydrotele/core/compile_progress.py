@@ -21,33 +21,33 @@ SECONDS_BEFORE_BAR = 1.0
 """Time spent compiling, in seconds, before the bar appears."""
 SECONDS_BETWEEN_LINES = 2.0
 """Time between two lines if stderr is not a terminal, in seconds."""
-_REDRAW = 0.2  # s between two updates in a terminal
-_CONSTANT = 100  # bytes of bytecode that cost as much to compile as an empty function
-_WIDTH = 30  # characters of the bar
+_REDRAW_INTERVAL = 0.2  # s between two updates in a terminal
+_FUNCTION_OVERHEAD_BYTES = 100  # bytes of bytecode that cost as much to compile as an empty function
+_BAR_WIDTH = 30  # characters of the bar
 _LOG = logging.getLogger("hydrotele")
 
 
-def format_bar(name: str, fraction: float, left: float | None) -> str:
+def format_bar(name: str, fraction: float, seconds_left: float | None) -> str:
     """Return the text of the progress bar.
 
     Args:
         name: name of the function that is compiled.
         fraction: completed fraction of the work, 0 to 1.
-        left: estimated time left [s]; None if unknown.
+        seconds_left: estimated time left [s]; None if unknown.
 
     Returns:
         The line, without a line break.
     """
-    filled = round(_WIDTH * min(max(fraction, 0.0), 1.0))
-    rest = "" if left is None else f", about {left:.0f} s left"
-    return f"compiling {name} [{'#' * filled}{'-' * (_WIDTH - filled)}]{rest} (once, then cached)"
+    filled = round(_BAR_WIDTH * min(max(fraction, 0.0), 1.0))
+    rest = "" if seconds_left is None else f", about {seconds_left:.0f} s left"
+    return f"compiling {name} [{'#' * filled}{'-' * (_BAR_WIDTH - filled)}]{rest} (once, then cached)"
 
 
 class ProgressLine:
     """A status line on stderr: redrawn in place in a terminal, printed repeatedly elsewhere."""
 
     def __init__(self) -> None:
-        self._printed, self._width = 0.0, 0
+        self._print_time, self._width = 0.0, 0
 
     def show(self, text: str) -> None:
         """Redraw the line in a terminal; elsewhere print it if the last one is two seconds old."""
@@ -56,9 +56,9 @@ class ProgressLine:
         if sys.stderr.isatty():
             sys.stderr.write("\r" + text.ljust(self._width))
             self._width = len(text)
-        elif time.monotonic() - self._printed >= SECONDS_BETWEEN_LINES:
+        elif time.monotonic() - self._print_time >= SECONDS_BETWEEN_LINES:
             sys.stderr.write(text + "\n")
-            self._printed = time.monotonic()
+            self._print_time = time.monotonic()
         sys.stderr.flush()
 
     def clear(self) -> None:
@@ -80,10 +80,10 @@ class CompileProgress(event.Listener):
         self._is_cached = is_cached
         self._line, self._lock = ProgressLine(), threading.Lock()
         self._names: list[str] = []
-        self._began = self._spent = 0.0
+        self._start_time = self._elapsed_time = 0.0
         self._pending: dict[FunctionType, int] = {}
         self._total = self._done = self._done_before = 0
-        self._collecting = False
+        self._gc_was_enabled = False
         self._thread: threading.Thread | None = None
 
     def on_start(self, event: event.Event) -> None:
@@ -91,11 +91,11 @@ class CompileProgress(event.Listener):
         dispatcher = (event.data or {})["dispatcher"]
         if not self._names:
             # The compiler creates millions of objects that all live until it ends.
-            self._collecting = gc.isenabled()
+            self._gc_was_enabled = gc.isenabled()
             gc.disable()
             self._pending = self._find_pending(dispatcher)
             self._total, self._done = sum(self._pending.values()), 0
-            self._began = time.monotonic()
+            self._start_time = time.monotonic()
             if self._thread is None:
                 self._thread = threading.Thread(target=self._draw, daemon=True)
                 self._thread.start()
@@ -108,8 +108,8 @@ class CompileProgress(event.Listener):
         weight = self._pending.pop(function, 0)
         self._done, self._done_before = self._done + weight, self._done_before + weight
         if not self._names:
-            self._spent += time.monotonic() - self._began
-            if self._collecting:
+            self._elapsed_time += time.monotonic() - self._start_time
+            if self._gc_was_enabled:
                 gc.enable()
             with self._lock:
                 self._line.clear()
@@ -121,16 +121,16 @@ class CompileProgress(event.Listener):
             function = left.pop().py_func
             if function in found:
                 continue
-            found[function] = _CONSTANT + len(function.__code__.co_code)
+            found[function] = _FUNCTION_OVERHEAD_BYTES + len(function.__code__.co_code)
             left += [d for d in called_dispatchers(function) if not self._is_cached(d.py_func)]
         return found
 
     def _draw(self) -> None:
         """Update the progress bar periodically; runs in the background thread."""
         while True:
-            time.sleep(_REDRAW)
+            time.sleep(_REDRAW_INTERVAL)
             names = self._names[:1] + self._names[-1:]
-            spent = self._spent + time.monotonic() - self._began
+            spent = self._elapsed_time + time.monotonic() - self._start_time
             if not names or spent < SECONDS_BEFORE_BAR:
                 continue
             left = None
@@ -147,9 +147,7 @@ def called_dispatchers(function: FunctionType) -> list[Any]:
     names = function.__code__.co_names
     scope = function.__globals__ | {
         name: cell.cell_contents
-        for name, cell in zip(
-            function.__code__.co_freevars, function.__closure__ or (), strict=True
-        )
+        for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
     }
     found = [scope.get(name) for name in (*names, *function.__code__.co_freevars)]
     for module in [m for m in found if isinstance(m, ModuleType)]:

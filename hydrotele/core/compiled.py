@@ -39,7 +39,7 @@ from hydrotele.core.linking import Callee, LinkedCache
 from hydrotele.core.references import argument_type
 
 _CONFIG: Any = _numba_config  # its attributes are created at run time
-_UNUSED = 30 * 24 * 3600.0  # s, after which an unused cache of an older source version is removed
+_MAX_UNUSED_AGE = 30 * 24 * 3600.0  # s, after which an unused cache of an older source version is removed
 
 
 def compiled(function):
@@ -75,7 +75,7 @@ def _compile(function, **options: Any):
     The second one has no wrapper that converts Python objects. The wrapper takes a fifth of the
     compile time, and most functions are never called from Python.
     """
-    with _caching(function.__module__) as cache:
+    with _module_cache(function.__module__) as cache:
         options |= {
             "cache": cache, "error_model": "numpy", "nogil": True,
             "no_cfunc_wrapper": True,  # the unused wrapper takes a fifth of the compile time
@@ -84,9 +84,9 @@ def _compile(function, **options: Any):
         made = compile_with(**options)(function)
         called = compile_with(**options, no_cpython_wrapper=True)(function)
         if cache:
-            made._cache, called._cache = _SharedCache(function), _CalledCache(function)
+            made._cache, called._cache = _SharedCache(function), _CalleeCache(function)
     callee = Callee(called, inline=options.get("forceinline", False))
-    made.get_call_template, made.get_overload = callee.call_template, callee.overload
+    made.get_call_template, made.get_overload = callee.call_template, callee.overload_key
     type_of = made.typeof_pyval
     made.typeof_pyval = lambda value: argument_type(type_of(value))
     return made
@@ -103,18 +103,18 @@ class Callback:
     def __init__(self, function, signature) -> None:
         self._function, self._signature = function, signature
 
-    def compile_elsewhere(self, then: str = "") -> None:
-        """Start to compile in a background process, see the function `compile_elsewhere`.
+    def compile_in_background(self, follow_up_code: str = "") -> None:
+        """Start to compile in a background process, see the function `compile_in_background`.
 
         Args:
-            then: Python code that the process runs afterwards.
+            follow_up_code: Python code that the process runs afterwards.
         """
         module, name = self._function.__module__, self._function.__name__
-        compile_elsewhere(self._function, f"from {module} import {name}; {name}.address; {then}")
+        compile_in_background(self._function, f"from {module} import {name}; {name}.address; {follow_up_code}")
 
     @functools.cached_property
     def _compiled(self) -> Any:
-        with _caching(self._function.__module__) as cache:
+        with _module_cache(self._function.__module__) as cache:
             signature = normalize_signature(self._signature)
             made: Any = CFunc(self._function, signature, {}, {"error_model": "numpy"})
             if cache:
@@ -133,7 +133,7 @@ class Callback:
         return self._compiled.ctypes
 
 
-def compile_elsewhere(function, code: str) -> None:
+def compile_in_background(function, code: str) -> None:
     """Start to compile a function in a background process, unless it is cached already.
 
     Args:
@@ -141,29 +141,29 @@ def compile_elsewhere(function, code: str) -> None:
         code: Python code that compiles it.
     """
     function = getattr(function, "py_func", function)
-    with _caching(function.__module__) as cache:
+    with _module_cache(function.__module__) as cache:
         folder = Path(_CONFIG.CACHE_DIR)
-    if not cache or code in _ELSEWHERE or any(folder.glob(_index(function))):
+    if not cache or code in _background_processes or any(folder.glob(_cache_index_pattern(function))):
         return
-    path = os.pathsep.join([str(_PACKAGE.parent), *filter(None, sys.path)])
-    _ELSEWHERE[code] = process = subprocess.Popen(
+    path = os.pathsep.join([str(_PACKAGE_FOLDER.parent), *filter(None, sys.path)])
+    _background_processes[code] = process = subprocess.Popen(
         [sys.executable, "-P", "-c", code], env={**os.environ, "PYTHONPATH": path},
         stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
-    atexit.register(_end, process)
+    atexit.register(_stop_process, process)
 
 
-_ELSEWHERE: dict[str, subprocess.Popen] = {}
+_background_processes: dict[str, subprocess.Popen] = {}
 
 
-def _end(process: subprocess.Popen) -> None:
+def _stop_process(process: subprocess.Popen) -> None:
     process.kill()
     process.wait()
 
 
-def _index(function) -> str:
+def _cache_index_pattern(function) -> str:
     """Return the file pattern of numba's cache index of a function."""
-    return f"*{function.__name__}-{_line(function)}.*.nbi"
+    return f"*{function.__name__}-{_first_line(function)}.*.nbi"
 
 
 def cache_folder() -> Path | None:
@@ -179,32 +179,32 @@ def cache_folder() -> Path | None:
     try:
         folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         folder.mkdir(mode=0o700, exist_ok=True)
-        if not all(map(_private, (folder, folder.parent))) or not os.access(folder, os.W_OK):
+        if not all(map(_is_private_folder, (folder, folder.parent))) or not os.access(folder, os.W_OK):
             return None
     except OSError:
         return None
     return folder
 
 
-def _private(folder: Path) -> bool:
+def _is_private_folder(folder: Path) -> bool:
     """Return whether a path is a folder that only this user owns and can write to."""
     found = folder.lstat()
     shared = found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
     return stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not shared
 
 
-_FOLDER = cache_folder()
-_PACKAGE = Path(__file__).parent.parent
-_IMPORT = re.compile(rb"^\s*(?:from|import) +(hydrotele[\w.]*)(?: +import +([^#\n]*))?", re.M)
+_CACHE_FOLDER = cache_folder()
+_PACKAGE_FOLDER = Path(__file__).parent.parent
+_IMPORT_PATTERN = re.compile(rb"^\s*(?:from|import) +(hydrotele[\w.]*)(?: +import +([^#\n]*))?", re.M)
 
 
 @functools.cache
-def _source(module: str) -> bytes | None:
+def _read_source(module: str) -> bytes | None:
     """Return the source of a module of this package; None if there is no such module."""
     package, *parts = module.split(".")
-    if package != _PACKAGE.name:
+    if package != _PACKAGE_FOLDER.name:
         return None
-    place = _PACKAGE.joinpath(*parts)
+    place = _PACKAGE_FOLDER.joinpath(*parts)
     for path in (place.with_suffix(".py"), place / "__init__.py"):
         with contextlib.suppress(OSError):
             return path.read_bytes()
@@ -212,20 +212,20 @@ def _source(module: str) -> bytes | None:
 
 
 @functools.cache
-def _imports(module: str) -> frozenset[str]:
+def _find_imports(module: str) -> frozenset[str]:
     """Return the modules of this package that a module imports directly."""
     found = set()
-    for place, names in _IMPORT.findall(_source(module) or b""):
+    for place, names in _IMPORT_PATTERN.findall(_read_source(module) or b""):
         package = place.decode()
         found.add(package)
         for name in re.findall(r"\w+", names.decode()):
-            if _source(f"{package}.{name}") is not None:
+            if _read_source(f"{package}.{name}") is not None:
                 found.add(f"{package}.{name}")
     return frozenset(found)
 
 
 @functools.cache
-def digest(module: str) -> str:
+def source_digest(module: str) -> str:
     """Return a digest of the sources of a module, of its imports and of this module.
 
     A change of any of these sources selects another cache folder. This module is always included,
@@ -234,17 +234,17 @@ def digest(module: str) -> str:
     open_ones = [module, __name__]
     reached = set(open_ones)
     while open_ones:
-        more = _imports(open_ones.pop()) - reached
+        more = _find_imports(open_ones.pop()) - reached
         reached |= more
         open_ones += more
     text = hashlib.sha256()
     for name in sorted(reached):
-        text.update(name.encode() + b"\0" + (_source(name) or b"") + b"\0")
+        text.update(name.encode() + b"\0" + (_read_source(name) or b"") + b"\0")
     return text.hexdigest()[:16]
 
 
-class Locator(UserProvidedCacheLocator):
-    """numba cache locator that selects the cache folder set by `_caching`."""
+class CacheLocator(UserProvidedCacheLocator):
+    """numba cache locator that selects the cache folder set by `_module_cache`."""
 
     def __init__(self, py_func, py_file):
         super().__init__(py_func, py_file)
@@ -265,7 +265,7 @@ class _SharedCache(FunctionCache):
         """Return compiled code of a signature, or None if this process has to compile it."""
         found = super().load_overload(sig, target_context)
         if found is None and self._held is None:
-            self._held = _lock(self.cache_path, self._py_func)
+            self._held = _acquire_lock(self.cache_path, self._py_func)
             found = super().load_overload(sig, target_context)
             if found is not None:
                 self._let_go()
@@ -279,30 +279,30 @@ class _SharedCache(FunctionCache):
             self._let_go()
 
     def _let_go(self) -> None:
-        _release(self._held)
+        _close_lock(self._held)
         self._held = None
 
 
-class _CalledCache(_SharedCache):
+class _CalleeCache(_SharedCache):
     """Cache of code without a Python wrapper."""
 
     def _index_key(self, sig, codegen):
         return *super()._index_key(sig, codegen), "called"
 
 
-def _line(function) -> int:
+def _first_line(function) -> int:
     return function.__code__.co_firstlineno
 
 
-def _lock(folder: str, function) -> int | None:
+def _acquire_lock(folder: str, function) -> int | None:
     """Lock a function against other processes and return the file handle; None after a timeout."""
     try:
-        path = Path(folder, f"{function.__name__}-{_line(function)}.lock")
+        path = Path(folder, f"{function.__name__}-{_first_line(function)}.lock")
         handle = os.open(path, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
     except OSError:
         return None
     began, line = time.monotonic(), ProgressLine()
-    while (waited := time.monotonic() - began) < _PATIENT:
+    while (waited := time.monotonic() - began) < _MAX_LOCK_WAIT:
         with contextlib.suppress(BlockingIOError):
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             line.clear()
@@ -315,22 +315,22 @@ def _lock(folder: str, function) -> int | None:
     return None
 
 
-def _release(handle: int | None) -> None:
+def _close_lock(handle: int | None) -> None:
     if handle is not None:
         os.close(handle)
 
 
-_PATIENT = 300.0  # s, longest wait for another process, which may have failed without exiting
+_MAX_LOCK_WAIT = 300.0  # s, longest wait for another process, which may have failed without exiting
 
 
 @contextlib.contextmanager
-def _caching(module: str) -> Iterator[bool]:
+def _module_cache(module: str) -> Iterator[bool]:
     """Point numba to the cache folder of a module in this context; yield whether there is one."""
     names = ("CACHE_DIR", "CACHE_LOCATOR_CLASSES")
     given = {name: getattr(_CONFIG, name, "") for name in names}
-    own = _folder_of(module) if _FOLDER and _source(module) is not None else None
+    own = _module_cache_folder(module) if _CACHE_FOLDER and _read_source(module) is not None else None
     _CONFIG.CACHE_DIR = str(own or "")
-    _CONFIG.CACHE_LOCATOR_CLASSES = f"{__name__}.{Locator.__name__}" if own else ""
+    _CONFIG.CACHE_LOCATOR_CLASSES = f"{__name__}.{CacheLocator.__name__}" if own else ""
     try:
         yield own is not None
     finally:
@@ -339,18 +339,18 @@ def _caching(module: str) -> Iterator[bool]:
 
 
 @functools.cache
-def _folder_of(module: str) -> Path | None:
+def _module_cache_folder(module: str) -> Path | None:
     """Return a module's cache folder, mark it as used and delete unused folders of the module.
 
     Returns None if the folder cannot be created.
     """
-    assert _FOLDER
-    folder = _FOLDER / f"{module}_{digest(module)}"
+    assert _CACHE_FOLDER
+    folder = _CACHE_FOLDER / f"{module}_{source_digest(module)}"
     try:
         if not folder.exists():
             folder.mkdir(mode=0o700)
-            for old in _FOLDER.glob(f"{module}_{'?' * 16}"):
-                if time.time() - old.stat().st_mtime > _UNUSED:
+            for old in _CACHE_FOLDER.glob(f"{module}_{'?' * 16}"):
+                if time.time() - old.stat().st_mtime > _MAX_UNUSED_AGE:
                     shutil.rmtree(old, ignore_errors=True)
         os.utime(folder)
     except OSError:
@@ -360,10 +360,10 @@ def _folder_of(module: str) -> Path | None:
 
 def _is_cached(function) -> bool:
     """Return whether the cache contains any code of a function of this package."""
-    if not _FOLDER or _source(function.__module__) is None:
+    if not _CACHE_FOLDER or _read_source(function.__module__) is None:
         return False
-    folder = _folder_of(function.__module__)
-    return folder is not None and any(folder.glob(_index(function)))
+    folder = _module_cache_folder(function.__module__)
+    return folder is not None and any(folder.glob(_cache_index_pattern(function)))
 
 
 event.register("numba:compile", CompileProgress(_is_cached))

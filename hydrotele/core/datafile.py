@@ -15,17 +15,17 @@ import pydantic
 import yaml
 
 from hydrotele.core.errors import InputError
-from hydrotele.core.files import beyond, limit, read_text
+from hydrotele.core.files import describe_excess, get_limit, read_text
 from hydrotele.core.units import KEY_SUFFIXES, to_si
 
-LARGEST = 1.0e20  # largest magnitude of a number in SI; keeps products of a few numbers finite
-Number = Annotated[float, pydantic.Field(ge=-LARGEST, le=LARGEST)]
+MAX_MAGNITUDE = 1.0e20  # largest magnitude of a number in SI; keeps products of a few numbers finite
+Number = Annotated[float, pydantic.Field(ge=-MAX_MAGNITUDE, le=MAX_MAGNITUDE)]
 Vector = tuple[Number, Number, Number]
-Positive = Annotated[float, pydantic.Field(gt=0, le=LARGEST)]
-NonNegative = Annotated[float, pydantic.Field(ge=0, le=LARGEST)]
+PositiveFloat = Annotated[float, pydantic.Field(gt=0, le=MAX_MAGNITUDE)]
+NonNegativeFloat = Annotated[float, pydantic.Field(ge=0, le=MAX_MAGNITUDE)]
 Name = Annotated[str, pydantic.Field(pattern=r"^[a-z][a-z0-9_]*$")]
 
-ANGULAR_FREQUENCIES = ("bandwidth",)  # in rad/s: the suffix `_hz` multiplies them by 2 pi
+ANGULAR_FREQUENCY_KEYS = ("bandwidth",)  # in rad/s: the suffix `_hz` multiplies them by 2 pi
 
 
 def scale_numbers(value: Any, factor: float) -> Any:
@@ -55,12 +55,12 @@ def split_unit(key: str) -> tuple[str, float | None]:
     for suffix, unit in KEY_SUFFIXES.items():
         if key.endswith(suffix):
             stem = key.removesuffix(suffix)
-            turns = suffix == "_hz" and stem in ANGULAR_FREQUENCIES
+            turns = suffix == "_hz" and stem in ANGULAR_FREQUENCY_KEYS
             return stem, 2.0 * math.pi if turns else to_si(unit)[1]
     return key, None
 
 
-def suggest(name: object, valid) -> str:
+def suggest_valid_name(name: object, valid) -> str:
     """Return a hint for an error message: the closest valid name, if any, and all valid names."""
     names = sorted(map(str, valid))
     close = difflib.get_close_matches(str(name), names, n=1)
@@ -68,7 +68,7 @@ def suggest(name: object, valid) -> str:
     return f"{hint}valid: {', '.join(names) or '(none)'}"
 
 
-class Facts(pydantic.BaseModel):
+class StrictModel(pydantic.BaseModel):
     """Base class of all data read from YAML: immutable, finite, in SI units, no unknown keys."""
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -88,17 +88,17 @@ class Facts(pydantic.BaseModel):
             elif factor is not None and name in fields:
                 value = scale_numbers(value, factor)
             else:
-                raise ValueError(f"unknown key {key!r}; {suggest(key, fields)}")
+                raise ValueError(f"unknown key {key!r}; {suggest_valid_name(key, fields)}")
             if name in result:
                 raise ValueError(f"{name!r} is given twice, as {key!r} and with another unit")
             result[name] = value
         return result
 
 
-_BASE: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml: ten times as fast
+_BASE_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml: ten times as fast
 
 
-class _Loader(_BASE):
+class _Loader(_BASE_LOADER):
     """SafeLoader that reads 28.0e6 as a number, as YAML 1.2 does, and rejects repeated keys."""
 
     def __init__(self, stream):
@@ -129,7 +129,7 @@ _Loader.add_implicit_resolver(
 )
 
 
-def _load(text: str) -> tuple[Any, Any]:
+def _load_yaml(text: str) -> tuple[Any, Any]:
     """Return the node and the value of a YAML text, after `_check_size`."""
     _check_size(text)
     loader = _Loader(text)
@@ -148,8 +148,8 @@ def _check_size(text: str) -> None:
     """
     opened: list[tuple[str | None, int]] = []  # anchors of open nodes, number of values before them
     sizes: dict[str, int] = {}
-    values, most_values, most_depth = 0, limit("FILE_VALUES"), limit("FILE_DEPTH")
-    for event in yaml.parse(text, Loader=_BASE):
+    values, most_values, most_depth = 0, get_limit("FILE_VALUES"), get_limit("FILE_DEPTH")
+    for event in yaml.parse(text, Loader=_BASE_LOADER):
         anchor = getattr(event, "anchor", None)
         if isinstance(event, yaml.AliasEvent):
             values += sizes.get(str(anchor), 1)
@@ -165,7 +165,7 @@ def _check_size(text: str) -> None:
             if anchor:
                 sizes[anchor] = values - before
         if values > most_values or len(opened) > most_depth:
-            said = beyond("FILE_DEPTH", len(opened)) or beyond("FILE_VALUES", values)
+            said = describe_excess("FILE_DEPTH", len(opened)) or describe_excess("FILE_VALUES", values)
             raise yaml.MarkedYAMLError(problem=f"it has {said}", problem_mark=event.start_mark)
 
 
@@ -190,7 +190,7 @@ def _key_lines(root) -> dict[tuple, int]:
 
 
 # PyYAML's constructors raise these for a value that does not match its explicit tag.
-_BAD_SCALARS = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError)
+_SCALAR_ERRORS = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError)
 
 
 def read_yaml(path: str | Path) -> tuple[dict, dict[tuple, int]]:
@@ -208,8 +208,8 @@ def read_yaml(path: str | Path) -> tuple[dict, dict[tuple, int]]:
     path = Path(path)
     text = read_text(path)
     try:
-        node, data = _load(text)
-    except (yaml.YAMLError, RecursionError, *_BAD_SCALARS) as error:
+        node, data = _load_yaml(text)
+    except (yaml.YAMLError, RecursionError, *_SCALAR_ERRORS) as error:
         mark = getattr(error, "problem_mark", None)
         line = f":{mark.line + 1}" if mark else ""
         nested = isinstance(error, RecursionError)
@@ -221,20 +221,20 @@ def read_yaml(path: str | Path) -> tuple[dict, dict[tuple, int]]:
     return data, _key_lines(node)
 
 
-def read_value(text: str) -> Any:
+def parse_yaml_value(text: str) -> Any:
     """Parse a single YAML value with the same rules as for files.
 
     Raises:
         yaml.YAMLError: the text is not valid YAML.
     """
-    return _load(text)[1]
+    return _load_yaml(text)[1]
 
 
-Model = TypeVar("Model", bound=Facts)
+Model = TypeVar("Model", bound=StrictModel)
 
 
-def parse(model: type[Model], data: dict, source: str, lines: dict[tuple, int]) -> Model:
-    """Validate data against a subclass of `Facts`.
+def validate_data(model: type[Model], data: dict, source: str, lines: dict[tuple, int]) -> Model:
+    """Validate data against a subclass of `StrictModel`.
 
     Args:
         model: the class.

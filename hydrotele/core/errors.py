@@ -1,6 +1,6 @@
 """The error raised for invalid user input."""
 
-_MOST = 400, 1400  # bytes of location and message; keys and values of a file can be very long
+_MAX_BYTES = 400, 1400  # bytes of location and message; keys and values of a file can be very long
 
 
 class InputError(ValueError):
@@ -13,7 +13,7 @@ class InputError(ValueError):
 
     def __init__(self, where: object, message: str) -> None:
         """Store location and message, each shortened if too long; `where` may be a path."""
-        self.where, self.message = map(_shortened, (str(where), message), _MOST)
+        self.where, self.message = map(_shorten_text, (str(where), message), _MAX_BYTES)
         super().__init__(self.where, self.message)  # pickling passes `args` to the constructor
 
     def __str__(self) -> str:
@@ -21,17 +21,17 @@ class InputError(ValueError):
         return f"{self.where}: {self.message}"
 
 
-def _shortened(text: str, most: int) -> str:
-    """Shorten a text to `most` bytes by cutting its middle, and escape control characters."""
-    if len(text) > 2 * most:
-        text = f"{text[:most]} ... {text[-most:]}"
-    text = "".join(c if c.isprintable() or c == "\n" else _escaped(c) for c in text)
+def _shorten_text(text: str, max_bytes: int) -> str:
+    """Shorten a text to `max_bytes` bytes by cutting its middle, and escape control characters."""
+    if len(text) > 2 * max_bytes:
+        text = f"{text[:max_bytes]} ... {text[-max_bytes:]}"
+    text = "".join(c if c.isprintable() or c == "\n" else _escape_character(c) for c in text)
     content = text.encode()
-    if len(content) <= most:
+    if len(content) <= max_bytes:
         return text
-    head, tail = content[: 2 * most // 3 - 5], content[-(most // 3) :]
+    head, tail = content[: 2 * max_bytes // 3 - 5], content[-(max_bytes // 3) :]
     return f"{head.decode(errors='ignore')} ... {tail.decode(errors='ignore')}"
 
 
-def _escaped(character: str) -> str:
+def _escape_character(character: str) -> str:
     return character.encode("unicode_escape").decode()

@@ -34,7 +34,7 @@ LIMITS: Mapping[str, tuple[float, str]] = MappingProxyType({
 """Name -> (largest allowed amount, description of the counted quantity)."""
 
 
-def limit(name: str) -> float:
+def get_limit(name: str) -> float:
     """Return a limit of `LIMITS`, or the value of its environment variable if that is set.
 
     Raises:
@@ -53,20 +53,20 @@ def limit(name: str) -> float:
     return value
 
 
-def beyond(name: str, amount: float) -> str | None:
+def describe_excess(name: str, amount: float) -> str | None:
     """Return an error text for an amount above its limit, or None if the limit is respected.
 
-    >>> beyond("MOVES", 3)
-    >>> beyond("MOVES", 20000)
+    >>> describe_excess("MOVES", 3)
+    >>> describe_excess("MOVES", 20000)
     '20000 moves or waypoints of a pilot, at most 10000; HYDROTELE_MAX_MOVES=20000 allows them'
     """
-    most = limit(name)
+    most = get_limit(name)
     if amount <= most:
         return None
     asked = f"{amount:.0f}" if amount < 1e7 else f"{amount:.4g}"
-    return (
-        f"{asked} {LIMITS[name][1]}, at most {most:g}; HYDROTELE_MAX_{name}={asked} allows them"
-    ).replace("e+0", "e")
+    return (f"{asked} {LIMITS[name][1]}, at most {most:g}; HYDROTELE_MAX_{name}={asked} allows them").replace(
+        "e+0", "e"
+    )
 
 
 def check_limit(where: object, name: str, amount: float) -> None:
@@ -75,7 +75,7 @@ def check_limit(where: object, name: str, amount: float) -> None:
     Raises:
         InputError: the limit is exceeded; the message names the variable that raises it.
     """
-    if said := beyond(name, amount):
+    if said := describe_excess(name, amount):
         raise InputError(where, f"has {said}")
 
 
@@ -152,7 +152,7 @@ def read_xml(path: str | Path) -> ElementTree.Element:
     return root
 
 
-def json_value(text: str | bytes) -> Any:
+def parse_json(text: str | bytes) -> Any:
     """Parse JSON text.
 
     Raises:
@@ -171,14 +171,14 @@ def read_json(path: str | Path) -> Any:
         InputError: as `read_text`, or the content is not JSON.
     """
     try:
-        return json_value(read_text(path))
+        return parse_json(read_text(path))
     except ValueError as error:
         if isinstance(error, InputError):
             raise
         raise InputError(path, f"is not valid JSON: {error}") from None
 
 
-def _folder(name: str) -> Path:
+def _find_data_folder(name: str) -> Path:
     """Return a data folder inside the installed package, or next to the package in a checkout."""
     package = Path(__file__).resolve().parent.parent
     for base in (package, package.parent):
@@ -189,16 +189,19 @@ def _folder(name: str) -> Path:
 
 def models_folder() -> Path:
     """Return the folder that has one subfolder per shipped machine."""
-    return _folder("models")
+    return _find_data_folder("models")
 
 
 def scenarios_folder() -> Path:
     """Return the folder of the shipped scenarios."""
-    return _folder("scenarios")
+    return _find_data_folder("scenarios")
 
 
-_FOLDERS = {"texture": "texturedir"}  # element -> compiler attribute; all others use `meshdir`
-_FILES = ("file", *(f"file{side}" for side in ("right", "left", "up", "down", "front", "back")))
+_FOLDER_ATTRIBUTES = {"texture": "texturedir"}  # element -> compiler attribute; all others use `meshdir`
+_FILE_ATTRIBUTES = (
+    "file",
+    *(f"file{side}" for side in ("right", "left", "up", "down", "front", "back")),
+)
 
 
 def asset_files(tree: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, str, str]]:
@@ -208,9 +211,9 @@ def asset_files(tree: ElementTree.Element) -> Iterator[tuple[ElementTree.Element
         folders |= compiler.attrib
     for assets in tree.findall("asset"):
         for element in assets:
-            kind = _FOLDERS.get(element.tag, "meshdir")
+            kind = _FOLDER_ATTRIBUTES.get(element.tag, "meshdir")
             folder = folders.get(kind, folders.get("assetdir", ""))
-            for attribute in _FILES:
+            for attribute in _FILE_ATTRIBUTES:
                 if file := element.get(attribute):
                     yield element, attribute, os.path.join(folder, file)
 

@@ -12,9 +12,9 @@ from typing import Any
 from numba.core.caching import CompileResultCacheImpl
 from numba.core.typing.templates import make_concrete_template
 
-from hydrotele.core.references import argument_type, check_result
+from hydrotele.core.references import argument_type, check_result_type
 
-LINKED_BYTECODE = 300
+MAX_INLINED_BYTECODE = 300
 """Largest bytecode length of a function whose code is copied into the caller [bytes]. LLVM seldom
 inlines longer functions."""
 
@@ -30,13 +30,13 @@ class Callee:
     def __init__(self, dispatcher: Any, inline: bool) -> None:
         self.dispatcher = dispatcher
         function = dispatcher.py_func
-        self.place = function.__module__, function.__qualname__, function.__code__.co_firstlineno
+        self.location = function.__module__, function.__qualname__, function.__code__.co_firstlineno
         self.is_separate = (
             not inline
             and "<locals>" not in function.__qualname__
-            and len(function.__code__.co_code) > LINKED_BYTECODE
+            and len(function.__code__.co_code) > MAX_INLINED_BYTECODE
         )
-        _callees[self.place] = self
+        _callees[self.location] = self
 
     def compile(self, args: tuple) -> Any:
         """Compile for the given argument types, or load from the cache; return numba's result."""
@@ -51,11 +51,11 @@ class Callee:
         """
         pysig, args = self.dispatcher.fold_argument_types(args, keywords)
         args = tuple(map(argument_type, args))
-        signature, name = self.compile(args).signature, self.place[1]
-        check_result(signature.return_type, name)
+        signature, name = self.compile(args).signature, self.location[1]
+        check_result_type(signature.return_type, name)
         return make_concrete_template(f"CallTemplate({name})", name, [signature]), pysig, args, {}
 
-    def overload(self, args: tuple) -> Any:
+    def overload_key(self, args: tuple) -> Any:
         """Return the key of the callee's entry point; replaces `Dispatcher.get_overload`."""
         result = self.dispatcher.overloads[tuple(args)]
         if not self.is_separate:
@@ -67,7 +67,7 @@ class Callee:
         symbol = result.fndesc.mangled_name
         if symbol not in _symbols:
             self.dispatcher.targetctx.insert_user_function(("symbol", symbol), result.fndesc)
-            _symbols[symbol] = self.place, tuple(result.signature.args)
+            _symbols[symbol] = self.location, tuple(result.signature.args)
         return "symbol", symbol
 
 

@@ -14,7 +14,7 @@ from hydrotele.core.compiled import compiled
 
 
 @intrinsic
-def pointer(typingctx, address):
+def address_to_pointer(typingctx, address):
     """Convert an int64 address to a void pointer."""
 
     def codegen(context, builder, signature, args):
@@ -24,44 +24,44 @@ def pointer(typingctx, address):
 
 
 @compiled
-def floats(address, count):
+def float64_view(address, count):
     """Return a (count,) view of the 64-bit floats at an address."""
-    return carray(pointer(address), (count,), np.float64)
+    return carray(address_to_pointer(address), (count,), np.float64)
 
 
 @compiled
-def rows_of(address, rows, columns):
+def matrix_view(address, rows, columns):
     """Return a (rows, columns) view of the 64-bit floats at an address."""
-    return floats(address, rows * columns).reshape((rows, columns))
+    return float64_view(address, rows * columns).reshape((rows, columns))
 
 
 @compiled
-def integers(address, count):
+def int64_view(address, count):
     """Return a (count,) view of the 64-bit integers at an address."""
-    return carray(pointer(address), (count,), np.int64)
+    return carray(address_to_pointer(address), (count,), np.int64)
 
 
 @compiled
-def copy_to(there, values):
+def copy_values(target, values):
     """Copy values into the first elements of an array.
 
     numba's slice assignment also compiles the formatting of its error message, which takes seconds.
 
     Args:
-        there: (>= n,) destination array; its first n elements are written.
+        target: (>= n,) destination array; its first n elements are written.
         values: (n,) values to copy.
 
     Returns:
         Nothing.
     """
     for i in range(len(values)):
-        there[i] = values[i]
+        target[i] = values[i]
 
 
 @compiled
-def short_integers(address, count):
+def int32_view(address, count):
     """Return a (count,) view of the 32-bit integers at an address."""
-    return carray(pointer(address), (count,), np.int32)
+    return carray(address_to_pointer(address), (count,), np.int32)
 
 
 def address_record(kind: np.dtype, arrays: dict[str, np.ndarray]) -> np.ndarray:
@@ -89,6 +89,6 @@ def address_record(kind: np.dtype, arrays: dict[str, np.ndarray]) -> np.ndarray:
 
 
 @compiled
-def field(base, offset, count):
+def struct_field_view(base, offset, count):
     """Return a (count,) view of the floats that the pointer at `base + offset` points to."""
-    return floats(carray(pointer(base + offset), (1,), np.int64)[0], count)
+    return float64_view(carray(address_to_pointer(base + offset), (1,), np.int64)[0], count)

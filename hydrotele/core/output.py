@@ -17,7 +17,7 @@ from pathlib import Path
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import read_json
 
-OURS = {
+OUTPUT_FILES = {
     "run": ("measured.parquet", "truth.parquet", "review.rrd", "scenario.yaml", "machine.*",
             "machine_assets/*"),
     "replay": ("*.png", "*.rrd", "*_simulated.parquet"),
@@ -47,26 +47,26 @@ OURS = {
 
 
 @contextlib.contextmanager
-def whole_folder(target: str | Path, kind: str) -> Iterator[Path]:
+def atomic_folder(target: str | Path, kind: str) -> Iterator[Path]:
     """Create an output folder atomically: write to a hidden folder and rename it at the end.
 
     Args:
         target: folder to create; an existing folder of the same kind is replaced.
-        kind: a key of `OURS`.
+        kind: a key of `OUTPUT_FILES`.
 
     Yields:
         The temporary folder to write to. A killed run leaves only `.NAME.*.part`, which the next
         run with the same target removes.
 
     Raises:
-        InputError: as `check_target`, or the folder cannot be created or written.
+        InputError: as `check_output_folder`, or the folder cannot be created or written.
     """
     asked, target = target, Path(target).resolve()
-    check_target(asked, kind)
+    check_output_folder(asked, kind)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         for stale in target.parent.glob(f".{glob.escape(target.name)}.*.part"):
-            if _ours(stale) and not _alive(stale):
+            if _is_temporary_folder(stale) and not _is_process_running(stale):
                 shutil.rmtree(stale, ignore_errors=True)
         prefix = f".{target.name}.{os.getpid()}."
         part = Path(tempfile.mkdtemp(prefix=prefix, suffix=".part", dir=target.parent))
@@ -92,12 +92,12 @@ def whole_folder(target: str | Path, kind: str) -> Iterator[Path]:
         raise
 
 
-def check_target(target: str | Path, kind: str) -> None:
+def check_output_folder(target: str | Path, kind: str) -> None:
     """Check that a folder can be created or replaced without deleting files of the user.
 
     Args:
         target: the folder to be written.
-        kind: a key of `OURS`.
+        kind: a key of `OUTPUT_FILES`.
 
     Raises:
         InputError: the target is a file, a folder of another kind, a folder with unknown files, or
@@ -112,23 +112,23 @@ def check_target(target: str | Path, kind: str) -> None:
     if not place.is_dir():
         raise InputError(target, f"exists and was not written by a {kind}; choose another --out")
     inside = sorted(path.relative_to(place).as_posix() for path in place.rglob("*"))
-    if inside and _kind(place) != kind:
+    if inside and _read_kind(place) != kind:
         raise InputError(target, f"exists and was not written by a {kind}; choose another --out")
-    patterns = ("summary.json", *OURS[kind])
-    strange = [name for name in inside if not any(_matches(name, p) for p in patterns)]
+    patterns = ("summary.json", *OUTPUT_FILES[kind])
+    strange = [name for name in inside if not any(_is_match(name, p) for p in patterns)]
     if strange:
         listed = ", ".join(strange[:3])
         message = f"contains {listed}, not written by a {kind}; choose another --out"
         raise InputError(target, message)
 
 
-def _matches(name: str, pattern: str) -> bool:
+def _is_match(name: str, pattern: str) -> bool:
     """Return whether a path matches a pattern or is a parent folder of such a path."""
     parts, wanted = name.split("/"), pattern.split("/")
     return len(parts) <= len(wanted) and all(map(fnmatch.fnmatch, parts, wanted))
 
 
-def _kind(folder: Path) -> str | None:
+def _read_kind(folder: Path) -> str | None:
     """Return the kind stated in a folder's `summary.json`; None if it cannot be read."""
     try:
         return read_json(folder / "summary.json").get("kind")
@@ -136,18 +136,18 @@ def _kind(folder: Path) -> str | None:
         return None
 
 
-_PART = re.compile(r"\.(\d+)\.[a-z0-9_]{8}(?:\.old)?\.part$")  # process id, mkdtemp
+_TEMPORARY_NAME = re.compile(r"\.(\d+)\.[a-z0-9_]{8}(?:\.old)?\.part$")  # process id, mkdtemp
 
 
-def _ours(part: Path) -> bool:
+def _is_temporary_folder(part: Path) -> bool:
     """Return whether a path is a temporary folder of this module; only these are removed."""
-    return bool(_PART.search(part.name)) and part.is_dir() and not part.is_symlink()
+    return bool(_TEMPORARY_NAME.search(part.name)) and part.is_dir() and not part.is_symlink()
 
 
-def _alive(part: Path) -> bool:
+def _is_process_running(part: Path) -> bool:
     """Return whether the process that created a temporary folder is another running process."""
     try:
-        pid = int(_PART.findall(part.name)[0])
+        pid = int(_TEMPORARY_NAME.findall(part.name)[0])
         os.kill(pid, 0)
     except (ProcessLookupError, OverflowError):
         return False
@@ -157,7 +157,7 @@ def _alive(part: Path) -> bool:
 
 
 @contextlib.contextmanager
-def replacing(path: str | os.PathLike, suffix: str) -> Iterator[Path]:
+def atomic_file(path: str | os.PathLike, suffix: str) -> Iterator[Path]:
     """Write a file atomically: yield a temporary path in the same folder and rename it at the end.
 
     Args:

@@ -25,7 +25,7 @@ MAX_ARGUMENTS_BY_VALUE = 40
 """Largest number of native arguments of a named tuple that is still passed by value. Small named
 tuples stay in registers."""
 
-_RECORDS = (types.NamedTuple, types.NamedUniTuple)
+_NAMED_TUPLES = (types.NamedTuple, types.NamedUniTuple)
 
 
 class Reference(types.BaseNamedTuple):
@@ -43,7 +43,7 @@ class Reference(types.BaseNamedTuple):
         self.instance_class, self.fields, self.count = (
             record.instance_class, record.fields, len(record)
         )  # fmt: skip
-        self.types = tuple(Reference(t) if isinstance(t, _RECORDS) else t for t in record)
+        self.types = tuple(Reference(t) if isinstance(t, _NAMED_TUPLES) else t for t in record)
         owner = record.instance_class
         text = f"{owner.__module__}.{owner.__qualname__} {record}"
         digest = hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -74,7 +74,7 @@ def argument_type(kind: Any) -> Any:
         A `Reference` for a large named tuple; the non-literal type for a constant, so that a
         function is not compiled for each constant; otherwise `kind` itself.
     """
-    if isinstance(kind, _RECORDS) and count_arguments(kind) > MAX_ARGUMENTS_BY_VALUE:
+    if isinstance(kind, _NAMED_TUPLES) and count_arguments(kind) > MAX_ARGUMENTS_BY_VALUE:
         return Reference(kind)
     return types.unliteral(kind)
 
@@ -82,11 +82,11 @@ def argument_type(kind: Any) -> Any:
 def count_arguments(kind: Any) -> int:
     """Count the native arguments of a type when it is passed by value."""
     if isinstance(kind, types.BaseTuple) and not isinstance(kind, Reference):
-        return sum(count_arguments(part) for part in _parts(kind))
+        return sum(count_arguments(part) for part in _item_types(kind))
     return 5 + 2 * kind.ndim if isinstance(kind, types.Array) else 1
 
 
-def check_result(kind: Any, name: str) -> None:
+def check_result_type(kind: Any, name: str) -> None:
     """Reject a function that returns a reference, which could outlive the memory it points to.
 
     Args:
@@ -99,11 +99,11 @@ def check_result(kind: Any, name: str) -> None:
     if isinstance(kind, Reference):
         raise errors.TypingError(f"{name} returns a large named tuple that it got as an argument")
     if isinstance(kind, types.BaseTuple):
-        for part in _parts(kind):
-            check_result(part, name)
+        for part in _item_types(kind):
+            check_result_type(part, name)
 
 
-def _parts(kind: Any) -> tuple:
+def _item_types(kind: Any) -> tuple:
     """Return the types of the items of a tuple."""
     return tuple(kind)
 
@@ -130,7 +130,7 @@ def _read_field(context, builder, kind, address, index):
     memory = context.data_model_manager[kind.record].get_data_type()
     place = cgutils.gep_inbounds(builder, builder.bitcast(address, memory.as_pointer()), 0, index)
     field = kind.types[index]
-    if isinstance(tuple(kind.record)[index], _RECORDS):
+    if isinstance(tuple(kind.record)[index], _NAMED_TUPLES):
         return builder.bitcast(place, cgutils.voidptr_t)
     block, begin = builder.block, len(builder.block.instructions)
     found = context.data_model_manager[field].load_from_data_pointer(builder, place)
@@ -143,12 +143,12 @@ def _read_field(context, builder, kind, address, index):
 
 @lower_cast(types.NamedTuple, Reference)
 @lower_cast(types.NamedUniTuple, Reference)
-def _store(context, builder, fromty, toty, value):
+def _store_named_tuple(context, builder, fromty, toty, value):
     """Store a named tuple on the stack of the calling function."""
     memory = context.data_model_manager[fromty].get_data_type()
     space = cgutils.alloca_once(builder, memory)
     _store_fields(context, builder, fromty, value, space)
-    return _hide(builder, space)
+    return _hide_origin(builder, space)
 
 
 def _store_fields(context, builder, record, value, space) -> None:
@@ -156,13 +156,13 @@ def _store_fields(context, builder, record, value, space) -> None:
     for index, field in enumerate(record):
         part = builder.extract_value(value, index)
         place = cgutils.gep_inbounds(builder, space, 0, index)
-        if isinstance(field, _RECORDS):
+        if isinstance(field, _NAMED_TUPLES):
             _store_fields(context, builder, field, part, place)
         else:
             context.pack_value(builder, field, part, place)
 
 
-def _hide(builder, space):
+def _hide_origin(builder, space):
     """Hide the origin of an address from LLVM.
 
     Otherwise LLVM could move the reads marked as invariant before the writes after inlining.
@@ -173,10 +173,10 @@ def _hide(builder, space):
 
 
 @unbox(Reference)
-def _unbox(kind, value, c):
+def _unbox_reference(kind, value, c):
     """Store a Python named tuple in memory and return its address."""
     native = c.unbox(kind.record, value)
     memory = c.context.data_model_manager[kind.record].get_data_type()
     space = cgutils.alloca_once(c.builder, memory)
     _store_fields(c.context, c.builder, kind.record, native.value, space)
-    return NativeValue(_hide(c.builder, space), native.is_error, native.cleanup)
+    return NativeValue(_hide_origin(c.builder, space), native.is_error, native.cleanup)

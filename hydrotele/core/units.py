@@ -66,13 +66,13 @@ KEY_SUFFIXES: Mapping[str, str] = {
 }  # fmt: skip
 """Suffix of a key in a YAML file -> unit. For an angular frequency, Hz stands for 2 pi rad/s."""
 
-_ON_AXES: Mapping[str, str] = {
+_AXIS_UNITS: Mapping[str, str] = {
     "rad": "deg", "rad/s": "deg/s", "rad/s^2": "deg/s^2", "m": "mm", "m/s": "mm/s",
     "m/s^2": "mm/s^2", "Pa": "MPa", "m^3/s": "L/min", "N": "kN", "N m": "kN m",
 }  # fmt: skip
 
 # SI unit -> (smallest magnitude in SI, unit in reports), in descending order of magnitude.
-_IN_REPORTS: Mapping[str, tuple[tuple[float, str], ...]] = {
+_REPORT_UNITS: Mapping[str, tuple[tuple[float, str], ...]] = {
     "1": ((0.0, "%"),),
     "m": ((1.0, "m"), (0.0, "mm")),
     "m/s": ((0.0, "mm/s"),),
@@ -122,27 +122,27 @@ def axis_unit(unit: str) -> tuple[str, float]:
     >>> axis_unit("1")
     ('1', 1.0)
     """
-    shown = _ON_AXES.get(unit, unit)
+    shown = _AXIS_UNITS.get(unit, unit)
     return shown, 1.0 / to_si(shown)[1]
 
 
-def customary(unit: str, size: float, parameter: str = "") -> tuple[str, float]:
+def display_unit(unit: str, magnitude: float, parameter: str = "") -> tuple[str, float]:
     """Return the display unit for values of a given magnitude, and the factor to it.
 
     Args:
         unit: SI unit.
-        size: the largest magnitude to be displayed [unit].
+        magnitude: the largest magnitude to be displayed [unit].
         parameter: name of the parameter; a bandwidth in rad/s is displayed in Hz.
 
     Returns:
         (display unit, factor).
 
-    >>> customary("Pa", 24.5e6), customary("Pa", 6e4)
+    >>> display_unit("Pa", 24.5e6), display_unit("Pa", 6e4)
     (('MPa', 1e-06), ('bar', 1e-05))
     """
     if unit == "rad/s" and parameter.endswith("bandwidth"):
         return "Hz", 0.5 / math.pi
-    for least, shown in _IN_REPORTS.get(unit, ()):
-        if abs(size) >= least or not math.isfinite(size):
+    for least, shown in _REPORT_UNITS.get(unit, ()):
+        if abs(magnitude) >= least or not math.isfinite(magnitude):
             return shown, 1.0 / to_si(shown)[1]
     return unit, 1.0

@@ -10,7 +10,7 @@ of related effects. The library imports the module automatically. The module def
 2. `locations(machine)`: the possible locations, empty if the machine has no such part;
 3. `parameters(machine, location)`: for each parameter its unit, its value in the given machine, its
    bounds and scale relative to the machine, and the reason for its smallest relevant deviation;
-4. `apply(machine, location, values)`: the changed machine, made with `changed`. With nominal values
+4. `apply(machine, location, values)`: the changed machine, made with `with_value`. With nominal values
    it must behave like the given machine.
 
 An effect that only changes fields of `Machine` is simulated, estimated, saved and loaded without
@@ -36,20 +36,20 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from hydrotele.core.datafile import suggest
+from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
-from hydrotele.effects.effect import Effect, Parameter, changed, term_number, with_terms
+from hydrotele.effects.effect import Effect, Parameter, term_parameter, with_terms, with_value
 from hydrotele.machine.machine import Machine
-from hydrotele.terms.law import LAWS, DriveState, Numbers, Term, Variable, defined_by, law
+from hydrotele.terms.law import LAWS, DriveState, LawSource, Numbers, Term, Variable, law
 
-GROUP = "hydrotele.effects"
-ENVIRONMENT = "HYDROTELE_EFFECTS"
+ENTRY_POINT_GROUP = "hydrotele.effects"
+ENVIRONMENT_VARIABLE = "HYDROTELE_EFFECTS"
 """Environment variable with the effect files that child processes load, joined as in PATH."""
 
-_read: dict[str, tuple[str, ...]] = {}  # digest of a file's text -> names of its effects
+_loaded_effects: dict[str, tuple[str, ...]] = {}  # digest of a file's text -> names of its effects
 
 
-def read_effects(path: Path, library: dict[str, Effect]) -> tuple[str, ...]:
+def add_effects_from_file(path: Path, library: dict[str, Effect]) -> tuple[str, ...]:
     """Run an effect file and add its effects to a library.
 
     A file with the same content as one that was read before is not run again.
@@ -70,24 +70,24 @@ def read_effects(path: Path, library: dict[str, Effect]) -> tuple[str, ...]:
         raise InputError(path, f"cannot be read: {error.strerror}") from None
     if path.suffix != ".py":
         raise InputError(path, "is not a Python file: define custom effects in a .py file")
-    if digest not in _read:
+    if digest not in _loaded_effects:
         source = str(path.resolve())
         try:
-            with defined_by(source):
-                module = _run(path, digest)
-            family = _family(module)
+            with LawSource(source):
+                module = _execute_file(path, digest)
+            family = _collect_effects(module)
             if family or not any(law.source == source for law in LAWS.values()):
-                _add(library, family, path)
+                _add_to_library(library, family, path)
         except InputError:
             for name in [name for name, law in LAWS.items() if law.source == source]:
                 del LAWS[name]
             raise
-        _read[digest] = tuple(effect.name for effect in family)
-        _tell_children(path)
-    return _read[digest]
+        _loaded_effects[digest] = tuple(effect.name for effect in family)
+        _export_to_children(path)
+    return _loaded_effects[digest]
 
 
-def _run(path: Path, digest: str) -> ModuleType:
+def _execute_file(path: Path, digest: str) -> ModuleType:
     name = f"hydrotele_effects_{path.stem}_{digest[:8]}"
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec and spec.loader
@@ -107,14 +107,14 @@ def _run(path: Path, digest: str) -> ModuleType:
     return module
 
 
-def _family(content: Any) -> tuple[Any, ...]:
+def _collect_effects(content: Any) -> tuple[Any, ...]:
     """Return the effects of a module or of an entry point that is an effect or a collection."""
     if isinstance(content, ModuleType):
         content = getattr(content, "EFFECT", None) or getattr(content, "EFFECTS", ())
     return tuple(content) if isinstance(content, Iterable) else (content,)
 
 
-def _add(library: dict[str, Effect], family: tuple[Any, ...], where: object) -> None:
+def _add_to_library(library: dict[str, Effect], family: tuple[Any, ...], where: object) -> None:
     if not family:
         message = "defines neither EFFECT = Effect(...) nor EFFECTS = (...), nor a law"
         raise InputError(where, message)
@@ -128,45 +128,45 @@ def _add(library: dict[str, Effect], family: tuple[Any, ...], where: object) -> 
     library.update((effect.name, effect) for effect in family)
 
 
-def _tell_children(path: Path) -> None:
+def _export_to_children(path: Path) -> None:
     """Add a file to the environment variable from which child processes load effects."""
-    known = os.environ.get(ENVIRONMENT, "").split(os.pathsep)
+    known = os.environ.get(ENVIRONMENT_VARIABLE, "").split(os.pathsep)
     if str(path.resolve()) not in known:
         paths = [*filter(None, known), str(path.resolve())]
-        os.environ[ENVIRONMENT] = os.pathsep.join(paths)
+        os.environ[ENVIRONMENT_VARIABLE] = os.pathsep.join(paths)
 
 
-def add_plugins(library: dict[str, Effect]) -> None:
+def add_plugin_effects(library: dict[str, Effect]) -> None:
     """Add the effects of installed packages.
 
     Raises:
         InputError: an entry point cannot be loaded; the message names the package.
     """
-    for entry in importlib.metadata.entry_points(group=GROUP):
+    for entry in importlib.metadata.entry_points(group=ENTRY_POINT_GROUP):
         package = entry.dist.name if entry.dist else "?"
         where = f"plug-in {entry.name} of the package {package}"
-        with defined_by(where):
+        with LawSource(where):
             try:
                 content = entry.load()
             except (ImportError, AttributeError) as error:
                 message = f"cannot be loaded: {error}; update or uninstall the package"
                 raise InputError(where, message) from error
-        _add(library, _family(content), where)
+        _add_to_library(library, _collect_effects(content), where)
 
 
-def add_from_environment(library: dict[str, Effect]) -> None:
+def add_environment_effects(library: dict[str, Effect]) -> None:
     """Add the effects of the files that the parent process loaded."""
-    for path in filter(None, os.environ.get(ENVIRONMENT, "").split(os.pathsep)):
-        read_effects(Path(path), library)
+    for path in filter(None, os.environ.get(ENVIRONMENT_VARIABLE, "").split(os.pathsep)):
+        add_effects_from_file(Path(path), library)
 
 
 __all__ = [
     "EFFECTS", "DriveState", "Effect", "Numbers", "Parameter", "Term", "Variable", "apply_effect",
-    "changed", "law", "load_effects", "term_number", "with_terms",
+    "with_value", "law", "load_effects", "term_parameter", "with_terms",
 ]  # fmt: skip
 
 
-def _discover() -> dict[str, Effect]:
+def _discover_effects() -> dict[str, Effect]:
     found: dict[str, Effect] = {}
     for module in pkgutil.iter_modules(__path__):
         if module.name.startswith("_") or module.name == "effect":
@@ -183,7 +183,7 @@ def _discover() -> dict[str, Effect]:
     return found
 
 
-EFFECTS: dict[str, Effect] = _discover()
+EFFECTS: dict[str, Effect] = _discover_effects()
 """Effects by name."""
 
 
@@ -202,19 +202,17 @@ def load_effects(path: str | Path) -> tuple[str, ...]:
     Raises:
         InputError: the file cannot be read or run, defines nothing, or uses an existing name.
     """
-    return read_effects(Path(path), EFFECTS)
+    return add_effects_from_file(Path(path), EFFECTS)
 
 
-def apply_effect(
-    machine: Machine, name: str, location: str, parameters: Mapping[str, float]
-) -> Machine:
+def apply_effect(machine: Machine, name: str, location: str, values: Mapping[str, float]) -> Machine:
     """Return a copy of a machine with an effect added.
 
     Args:
         machine: the machine without the effect.
         name: name of the effect.
         location: location of the effect; may be empty if there is only one.
-        parameters: parameter name -> value in the effect's unit; optional ones may be omitted.
+        values: parameter name -> value in the effect's unit; optional ones may be omitted.
 
     Returns:
         The changed machine.
@@ -225,29 +223,29 @@ def apply_effect(
     """
     if name not in EFFECTS:
         own = "for a custom effect, name the file that defines it: --effects FILE.py"
-        raise InputError(f"effect {name!r}", f"is not known; {suggest(name, EFFECTS)}; {own}")
+        raise InputError(f"effect {name!r}", f"is not known; {suggest_valid_name(name, EFFECTS)}; {own}")
     effect = EFFECTS[name]
     places = effect.locations(machine)
     if not location and len(places) == 1:
         location = places[0]
     if location not in places:
-        message = f"has no location {location!r}; {suggest(location, places)}"
+        message = f"has no location {location!r}; {suggest_valid_name(location, places)}"
         raise InputError(f"effect {name}", message)
     known = effect.parameters(machine, location)
     needed = {key for key, p in known.items() if not p.optional}
-    for key in sorted((needed - parameters.keys()) | (parameters.keys() - known.keys())):
+    for key in sorted((needed - values.keys()) | (values.keys() - known.keys())):
         names = ", ".join(f"{k} (optional)" if p.optional else k for k, p in known.items())
         what = "is missing" if key in known else "is not one of them"
         raise InputError(f"effect {name}", f"has the parameters {names}; {key!r} {what}")
-    for key, value in parameters.items():
+    for key, value in values.items():
         limits = known[key]
-        if math.isnan(value) or not limits.low <= value <= limits.high:
+        if math.isnan(value) or not limits.lower_bound <= value <= limits.upper_bound:
             raise InputError(
                 f"effect {name}: {key}",
-                f"{value:g} is outside {limits.low:g} .. {limits.high:g} {limits.unit}",
+                f"{value:g} is outside {limits.lower_bound:g} .. {limits.upper_bound:g} {limits.unit}",
             )
-    return effect.apply(machine, location, parameters)
+    return effect.apply(machine, location, values)
 
 
-add_plugins(EFFECTS)
-add_from_environment(EFFECTS)
+add_plugin_effects(EFFECTS)
+add_environment_effects(EFFECTS)

@@ -9,31 +9,31 @@ from hydrotele.effects.effect import (
     Effect,
     Parameter,
     Values,
-    changed,
     drive_kind,
-    hydraulics,
-    term_number,
-    valves,
+    hydraulic_axes,
+    term_parameter,
+    valve_axes,
     with_terms,
+    with_value,
 )
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.law import Term
 
-_SOFTEST = 1.0e7  # Pa, oil full of air: the smallest bulk modulus that a machine file may state
+_MIN_BULK_MODULUS_PA = 1.0e7  # Pa, oil full of air: the smallest bulk modulus that a machine file may state
 
 
-def _leakage(machine: Machine, location: str) -> dict[str, Parameter]:
+def _leakage_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the leakage coefficient, scaled by rated flow over highest pressure.
 
     A good seal leaks 1 % of the rated flow at full pressure.
     """
-    whole = machine.axes[location].rated_flow / machine.highest_pressure(location)
+    whole = machine.axes[location].rated_flow / machine.max_feed_pressure(location)
     present = machine.axes[location].hydraulic_drive.leakage
     high = present + 0.5 * whole
     return {"leakage": Parameter("m^3/(s Pa)", present, 0.0, high, 0.05 * whole, 0.005 * whole)}
 
 
-def _tank_leakage(machine: Machine, location: str) -> dict[str, Parameter]:
+def _tank_leakage_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the leakage coefficient of a spool, scaled by rated flow over highest pressure.
 
     By `laws.chamber_flows`, 0.01 % corresponds to a 25 mm spool with 7 um of radial clearance,
@@ -41,17 +41,17 @@ def _tank_leakage(machine: Machine, location: str) -> dict[str, Parameter]:
     """
     valve = machine.axes[location].valve
     assert valve
-    whole = valve.rated_flow / machine.highest_pressure(location)
+    whole = valve.rated_flow / machine.max_feed_pressure(location)
     present = valve.tank_leakage
     high = present + 0.1 * whole
     return {"leakage": Parameter("m^3/(s Pa)", present, 0.0, high, 5e-3 * whole, 5e-4 * whole)}
 
 
 def _set_tank_leakage(machine: Machine, location: str, values: Values) -> Machine:
-    return changed(machine, f"axes.{location}.valve.tank_leakage", values["leakage"])
+    return with_value(machine, f"axes.{location}.valve.tank_leakage", values["leakage"])
 
 
-def _hose(machine: Machine, location: str) -> dict[str, Parameter]:
+def _hose_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the hose compliance, scaled by the compliance of the oil at mid-stroke.
 
     5 % is the scatter of a hose's rating.
@@ -66,35 +66,35 @@ def _hose(machine: Machine, location: str) -> dict[str, Parameter]:
                                     0.05 * oil)}  # fmt: skip
 
 
-def _set(field: str, parameter: str):
+def _make_setter(field: str, parameter: str):
     def apply(machine: Machine, location: str, values: Values) -> Machine:
         path = f"axes.{location}.{drive_kind(machine, location)}.{field}"
-        return changed(machine, path, values[parameter])
+        return with_value(machine, path, values[parameter])
 
     return apply
 
 
-def _everywhere(machine: Machine) -> tuple[str, ...]:
+def _oil_location(machine: Machine) -> tuple[str, ...]:
     return ("all",) if machine.supply and machine.valve_axes else ()
 
 
-def _bulk_modulus(machine: Machine, location: str) -> dict[str, Parameter]:
+def _bulk_modulus_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the bulk modulus of the oil.
 
     Entrained air reduces it by tens of per cent; a pressure change of 1 MPa changes it by 5 %.
     """
     assert machine.supply
     present = machine.supply.bulk_modulus
-    low = max(_SOFTEST, 0.1 * present)
+    low = max(_MIN_BULK_MODULUS_PA, 0.1 * present)
     return {"bulk_modulus": Parameter("Pa", present, low, 2.5 * present, 0.25 * present,
                                       0.05 * present)}  # fmt: skip
 
 
 def _set_bulk_modulus(machine: Machine, location: str, values: Values) -> Machine:
-    return changed(machine, "supply.bulk_modulus", values["bulk_modulus"])
+    return with_value(machine, "supply.bulk_modulus", values["bulk_modulus"])
 
 
-def _entrained_air(machine: Machine, location: str) -> dict[str, Parameter]:
+def _entrained_air_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the volume fraction of air in the oil.
 
     Oil of a working machine carries 0.5 to 5 %; 0.2 % is hardly measurable above 2 MPa.
@@ -106,30 +106,30 @@ def _entrained_air(machine: Machine, location: str) -> dict[str, Parameter]:
 
 
 def _set_entrained_air(machine: Machine, location: str, values: Values) -> Machine:
-    return changed(machine, "supply.entrained_air", values["fraction"])
+    return with_value(machine, "supply.entrained_air", values["fraction"])
 
 
-CHAMBERS = (
+CHAMBER_EFFECTS = (
     Effect(
         "internal_leakage", "leakage between a drive's chambers that differs from the model",
-        "flow", hydraulics, _leakage, _set("leakage", "leakage"), "leakage",
+        "flow", hydraulic_axes, _leakage_parameters, _make_setter("leakage", "leakage"), "leakage",
     ),
     Effect(
         "tank_leakage",
         "spool leakage from both work ports to tank that differs from the model",
-        "flow", valves, _tank_leakage, _set_tank_leakage, "leakage",
+        "flow", valve_axes, _tank_leakage_parameters, _set_tank_leakage, "leakage",
     ),
     Effect(
-        "hose_compliance", "expansion of the hoses with pressure", "flow", valves, _hose,
-        _set("hose_compliance", "compliance"),
+        "hose_compliance", "expansion of the hoses with pressure", "flow", valve_axes, _hose_parameters,
+        _make_setter("hose_compliance", "compliance"),
     ),
     Effect(
-        "bulk_modulus", "bulk modulus of the oil that differs from the model", "flow", _everywhere,
-        _bulk_modulus, _set_bulk_modulus, "oil compliance",
+        "bulk_modulus", "bulk modulus of the oil that differs from the model", "flow", _oil_location,
+        _bulk_modulus_parameters, _set_bulk_modulus, "oil compliance",
     ),
     Effect(
         "entrained_air", "air in the oil, which makes it compliant at low pressure", "flow",
-        _everywhere, _entrained_air, _set_entrained_air, "oil compliance",
+        _oil_location, _entrained_air_parameters, _set_entrained_air, "oil compliance",
     ),
 )  # fmt: skip
 
@@ -137,28 +137,28 @@ CHAMBERS = (
 NAME = "orifice_leakage"
 
 
-def _root(machine: Machine) -> float:
+def _root_relief_pressure(machine: Machine) -> float:
     """Return the square root of the relief pressure [sqrt(Pa)], at which the flow is stated."""
     assert machine.supply
     return math.sqrt(machine.supply.relief_pressure)
 
 
-def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:
+def _orifice_leakage_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the leakage flow at the relief pressure, scaled by the rated flow.
 
     The fractions are those of laminar leakage.
     """
     valve = machine.axes[location].valve
     assert valve
-    gain = term_number(machine, NAME, location, "flow_rod", "flow_gain", 0.0)
-    present, rated = gain * _root(machine), valve.rated_flow
+    gain = term_parameter(machine, NAME, location, "flow_rod", "flow_gain", 0.0)
+    present, rated = gain * _root_relief_pressure(machine), valve.rated_flow
     high = present + 0.5 * rated
     return {"flow": Parameter("m^3/s", present, 0.0, high, 0.05 * rated, 0.005 * rated)}
 
 
-def _apply(machine: Machine, location: str, values: Values) -> Machine:
+def _set_orifice_leakage(machine: Machine, location: str, values: Values) -> Machine:
     """Add the leakage flow to the rod side and subtract it from the head side."""
-    valve, gain = machine.axes[location].valve, values["flow"] / _root(machine)
+    valve, gain = machine.axes[location].valve, values["flow"] / _root_relief_pressure(machine)
     assert valve
     numbers = {"smoothing": valve.smoothing}
     terms = [
@@ -171,8 +171,9 @@ def _apply(machine: Machine, location: str, values: Values) -> Machine:
 
 
 ORIFICE_LEAKAGE = Effect(
-    NAME, "turbulent leakage between the chambers of a drive", "flow", valves, _parameters, _apply,
+    NAME, "turbulent leakage between the chambers of a drive", "flow", valve_axes, _orifice_leakage_parameters,
+    _set_orifice_leakage,
     "leakage",
 )  # fmt: skip
 
-EFFECTS = (*CHAMBERS, ORIFICE_LEAKAGE)
+EFFECTS = (*CHAMBER_EFFECTS, ORIFICE_LEAKAGE)

@@ -6,68 +6,68 @@ load and throttles its lowering.
 
 import math
 
-from hydrotele.effects.effect import Effect, Parameter, Values, changed, valves
+from hydrotele.effects.effect import Effect, Parameter, Values, valve_axes, with_value
 from hydrotele.machine.drives import Counterbalance
 from hydrotele.machine.machine import Machine
 
-_USUAL_DROP = 0.5  # of the relief pressure: drop at which a compensator does not change the flow
+_TYPICAL_DROP_RATIO = 0.5  # of the relief pressure: drop at which a compensator does not change the flow
 
 
-def _drop(machine: Machine, location: str) -> float:
+def _max_inlet_drop(machine: Machine, location: str) -> float:
     """Return the largest pressure drop across the inlet edge [Pa]."""
     valve = machine.axes[location].valve
     assert valve and machine.supply
     most = machine.supply.relief_pressure
-    return min(valve.held_drop, most) if valve.held_drop else most
+    return min(valve.compensator_drop, most) if valve.compensator_drop else most
 
 
-def _regulation(machine: Machine, location: str) -> dict[str, Parameter]:
+def _regulation_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the fraction of the relief pressure that a compensator absorbs.
 
     Compensators absorb 90 to 98 % (estimate). A fraction of 0.1 affects only an unloaded arm at
     full supply pressure.
     """
     assert machine.supply
-    present = 1.0 - _drop(machine, location) / machine.supply.relief_pressure
+    present = 1.0 - _max_inlet_drop(machine, location) / machine.supply.relief_pressure
     return {"regulation": Parameter("1", present, 0.0, max(0.98, present), 0.4, 0.1,
-                                    starts=(0.6, 0.95))}  # fmt: skip
+                                    start_values=(0.6, 0.95))}  # fmt: skip
 
 
-def _compensate(machine: Machine, location: str, values: Values) -> Machine:
+def _set_compensation(machine: Machine, location: str, values: Values) -> Machine:
     """Limit the pressure drop and enlarge the inlets so that the typical flow does not change."""
     valve, supply = machine.axes[location].valve, machine.supply
     assert valve and supply
-    before = _drop(machine, location)
+    before = _max_inlet_drop(machine, location)
     if values["regulation"] == 1.0 - before / supply.relief_pressure:
         return machine
     drop = (1.0 - values["regulation"]) * supply.relief_pressure
-    usual = _USUAL_DROP * supply.relief_pressure
+    usual = _TYPICAL_DROP_RATIO * supply.relief_pressure
     wider = math.sqrt(min(before, usual) / min(drop, usual))
     where = f"axes.{location}.valve"
-    machine = changed(machine, f"{where}.compensation", "pressure")
-    machine = changed(machine, f"{where}.compensated_drop", drop)
+    machine = with_value(machine, f"{where}.compensation", "pressure")
+    machine = with_value(machine, f"{where}.compensated_drop", drop)
     for direction in ("positive", "negative"):
         inlet = getattr(valve, direction).inlet * wider
-        machine = changed(machine, f"{where}.{direction}.inlet", inlet)
+        machine = with_value(machine, f"{where}.{direction}.inlet", inlet)
     return machine
 
 
 LOAD_COMPENSATION = Effect(
     "load_compensation", "a pressure compensator that makes a valve's flow independent of the load",
-    "valve", valves, _regulation, _compensate,
+    "valve", valve_axes, _regulation_parameters, _set_compensation,
 )  # fmt: skip
 
 
-def _sides(machine: Machine) -> tuple[str, ...]:
+def _chamber_locations(machine: Machine) -> tuple[str, ...]:
     return tuple(f"{axis}.{side}" for axis in machine.valve_axes for side in ("head", "rod"))
 
 
-def _present(machine: Machine, location: str) -> Counterbalance | None:
+def _installed_valve(machine: Machine, location: str) -> Counterbalance | None:
     axis, _, side = location.partition(".")
     return getattr(machine.axes[axis].load_holding, side)
 
 
-def _setting(machine: Machine, location: str) -> dict[str, Parameter]:
+def _setting_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the pressure setting of a counterbalance valve; 0 without a valve.
 
     Valves are set to 1.3 times the load pressure, at most to the port relief pressure. With the
@@ -75,22 +75,27 @@ def _setting(machine: Machine, location: str) -> dict[str, Parameter]:
     """
     assert machine.supply
     relief = machine.supply.relief_pressure
-    valve = _present(machine, location)
+    valve = _installed_valve(machine, location)
     setting = valve.setting if valve else 0.0
     return {"setting": Parameter("Pa", setting, 0.0, max(1.5 * relief, setting), 0.4 * relief,
-                                 0.07 * relief, starts=(0.4 * relief, relief))}  # fmt: skip
+                                 0.07 * relief, start_values=(0.4 * relief, relief))}  # fmt: skip
 
 
-def _set(machine: Machine, location: str, values: Values) -> Machine:
+def _set_counterbalance(machine: Machine, location: str, values: Values) -> Machine:
     axis, _, side = location.partition(".")
     setting = values["setting"]
-    valve = _present(machine, location) or Counterbalance(setting=max(setting, 1.0))
+    valve = _installed_valve(machine, location) or Counterbalance(setting=max(setting, 1.0))
     held = valve.model_copy(update={"setting": setting}) if setting > 0.0 else None
-    return changed(machine, f"axes.{axis}.load_holding.{side}", held)
+    return with_value(machine, f"axes.{axis}.load_holding.{side}", held)
 
 
 LOAD_HOLDING = Effect(
-    "load_holding", "a counterbalance valve at a chamber", "valve", _sides, _setting, _set
+    "load_holding",
+    "a counterbalance valve at a chamber",
+    "valve",
+    _chamber_locations,
+    _setting_parameters,
+    _set_counterbalance,
 )
 
 EFFECTS = (LOAD_COMPENSATION, LOAD_HOLDING)

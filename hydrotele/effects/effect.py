@@ -2,7 +2,7 @@
 
 `Effect` and `Parameter` describe an effect, its locations and its parameters. Helper functions list
 the axes of a machine at which an effect may occur. Others compute reference values, such as the
-largest force, for the scales of parameters. `with_terms` and `term_number` write and read the terms
+largest force, for the scales of parameters. `with_terms` and `term_parameter` write and read the terms
 that an effect adds to a machine.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.law import Balance, Term
 
-Law = Literal["force", "flow", "valve", "supply", "geometry", "timing", "sensor"]
+ModelPart = Literal["force", "flow", "valve", "supply", "geometry", "timing", "sensor"]
 Values = Mapping[str, float]
 
 
@@ -26,11 +26,11 @@ class Parameter:
     Attributes:
         unit: SI unit.
         nominal: value in the given machine, without the effect.
-        low: smallest physically plausible value.
-        high: largest physically plausible value.
-        scale: typical deviation from nominal, used as the standard deviation of the prior.
-        least: smallest deviation from nominal that is reported as an effect.
-        starts: start values of a search, for effects that vanish at the nominal value or whose
+        lower_bound: smallest physically plausible value.
+        upper_bound: largest physically plausible value.
+        prior_std: typical deviation from nominal, used as the standard deviation of the prior.
+        min_relevant_change: smallest deviation from nominal that is reported as an effect.
+        start_values: start values of a search, for effects that vanish at the nominal value or whose
             gradient there is not informative; empty if nominal is a good start value.
         optional: whether the parameter may be omitted when the effect is added to a machine.
             Screening of many effects omits it, too. An omitted parameter is nominal.
@@ -38,11 +38,11 @@ class Parameter:
 
     unit: str
     nominal: float
-    low: float
-    high: float
-    scale: float
-    least: float
-    starts: tuple[float, ...] = ()
+    lower_bound: float
+    upper_bound: float
+    prior_std: float
+    min_relevant_change: float
+    start_values: tuple[float, ...] = ()
     optional: bool = False
 
 
@@ -52,8 +52,8 @@ class Effect:
 
     Attributes:
         name: fixed name, used in reports and files.
-        sentence: short description of the effect.
-        law: the law of the model that it changes.
+        description: short description of the effect.
+        model_part: the law of the model that it changes.
         locations: function machine -> names of the possible locations.
         parameters: function (machine, location) -> parameter name -> Parameter.
         apply: function (machine, location, parameter name -> value) -> machine with the effect.
@@ -63,67 +63,67 @@ class Effect:
     """
 
     name: str
-    sentence: str
-    law: Law
+    description: str
+    model_part: ModelPart
     locations: Callable[[Machine], tuple[str, ...]]
     parameters: Callable[[Machine, str], dict[str, Parameter]]
     apply: Callable[[Machine, str, Values], Machine]
     mechanism: str = ""
 
 
-def changed(machine: Machine, path: str, value: Any) -> Machine:
+def with_value(machine: Machine, path: str, value: Any) -> Machine:
     """Return a copy of a machine with the value at a dotted path replaced.
 
     Args:
         machine: the machine.
-        path: such as `supply.pump_flow` or `axes.boom.valve.deadband`.
+        path: such as `supply.pump_flow` or `all_axes.boom.valve.deadband`.
         value: the new value.
     """
-    return _replace(machine, path.split("."), value)
+    return _replace_at_path(machine, path.split("."), value)
 
 
-def _replace(node: Any, path: list[str], value: Any) -> Any:
+def _replace_at_path(node: Any, path: list[str], value: Any) -> Any:
     if not path:
         return value
     if isinstance(node, dict):
-        return {**node, path[0]: _replace(node[path[0]], path[1:], value)}
-    return node.model_copy(update={path[0]: _replace(getattr(node, path[0]), path[1:], value)})
+        return {**node, path[0]: _replace_at_path(node[path[0]], path[1:], value)}
+    return node.model_copy(update={path[0]: _replace_at_path(getattr(node, path[0]), path[1:], value)})
 
 
-_IN_LINE = 1.0e-3  # offset over length up to which a cylinder counts as parallel to its slide
-_FULL_TRAVEL = 2.0  # s for the full range of a force drive, which has no flow rating; an estimate
+_MAX_LATERAL_OFFSET_RATIO = 1.0e-3  # offset over length up to which a cylinder counts as parallel to its slide
+_FULL_TRAVEL_TIME_S = 2.0  # s for the full range of a force drive, which has no flow rating; an estimate
 
 
-def axes(machine: Machine) -> tuple[str, ...]:
+def all_axes(machine: Machine) -> tuple[str, ...]:
     """Return the names of all axes."""
     return tuple(machine.axes)
 
 
-def valves(machine: Machine) -> tuple[str, ...]:
+def valve_axes(machine: Machine) -> tuple[str, ...]:
     """Return the names of the axes with a valve."""
     return tuple(machine.valve_axes)
 
 
-def hydraulics(machine: Machine) -> tuple[str, ...]:
+def hydraulic_axes(machine: Machine) -> tuple[str, ...]:
     """Return the names of the axes with pressure chambers, driven by a valve or an own pump."""
     return tuple(machine.hydraulic_axes)
 
 
-def cylinders(machine: Machine) -> tuple[str, ...]:
+def cylinder_axes(machine: Machine) -> tuple[str, ...]:
     """Return the names of the axes with a cylinder."""
     return tuple(name for name, axis in machine.axes.items() if axis.cylinder)
 
 
-def linkages(machine: Machine) -> tuple[str, ...]:
+def linkage_axes(machine: Machine) -> tuple[str, ...]:
     """Return the names of the axes whose cylinder is not parallel to a slide that it drives.
 
     For a cylinder parallel to its slide, length equals position and lateral pin offsets have no
     effect.
     """
-    return tuple(name for name in cylinders(machine) if not _along_slide(machine, name))
+    return tuple(name for name in cylinder_axes(machine) if not _is_parallel_to_slide(machine, name))
 
 
-def across(machine: Machine, axis: str) -> str:
+def lateral_directions(machine: Machine, axis: str) -> str:
     """Return the two coordinates perpendicular to the joint of an axis, such as `xz`.
 
     Pin offsets in these directions change the linkage.
@@ -133,7 +133,7 @@ def across(machine: Machine, axis: str) -> str:
     return "xyz".replace("xyz"[int(np.argmax(np.abs(way)))], "")
 
 
-def _along_slide(machine: Machine, axis: str) -> bool:
+def _is_parallel_to_slide(machine: Machine, axis: str) -> bool:
     facts = machine.axes[axis]
     joint, cylinder = machine.joints[facts.joint], facts.cylinder
     name = machine.link_of(facts.joint)
@@ -145,10 +145,10 @@ def _along_slide(machine: Machine, axis: str) -> bool:
     rod_pin = np.array(link.position) + cylinder.rod_pin.position
     line = rod_pin - np.array(cylinder.base_pin.position)
     across = np.linalg.norm(np.cross(line, joint.axis)) / np.linalg.norm(joint.axis)
-    return bool(across < _IN_LINE * np.linalg.norm(line))
+    return bool(across < _MAX_LATERAL_OFFSET_RATIO * np.linalg.norm(line))
 
 
-def hinges(machine: Machine) -> tuple[str, ...]:
+def hinge_axes(machine: Machine) -> tuple[str, ...]:
     """Return the names of the axes with a revolute joint."""
     return tuple(name for name in machine.axes if machine.position_kind(name) == "angle")
 
@@ -159,39 +159,39 @@ def drive_kind(machine: Machine, axis: str) -> str:
     return "cylinder" if facts.cylinder else "motor" if facts.motor else "force"
 
 
-def drive_turns(machine: Machine, axis: str) -> bool:
+def is_rotary_drive(machine: Machine, axis: str) -> bool:
     """Return whether the drive is rotary, so that its forces are torques."""
     return machine.axes[axis].cylinder is None and machine.position_kind(axis) == "angle"
 
 
 def force_unit(machine: Machine, axis: str) -> str:
     """Return the unit of the drive's force."""
-    return "N m" if drive_turns(machine, axis) else "N"
+    return "N m" if is_rotary_drive(machine, axis) else "N"
 
 
 def speed_unit(machine: Machine, axis: str) -> str:
     """Return the unit of the drive's velocity."""
-    return "rad/s" if drive_turns(machine, axis) else "m/s"
+    return "rad/s" if is_rotary_drive(machine, axis) else "m/s"
 
 
-def largest_force(machine: Machine, axis: str) -> float:
+def max_drive_force(machine: Machine, axis: str) -> float:
     """Return the force of a drive at the highest pressure, or at full command [N] or [N m]."""
     facts = machine.axes[axis]
     if facts.force:
         return abs(facts.force.gain) * facts.force.command_limit
-    return machine.highest_pressure(axis) * facts.hydraulic_drive.areas[0]
+    return machine.max_feed_pressure(axis) * facts.hydraulic_drive.areas[0]
 
 
-def usual_speed(machine: Machine, axis: str) -> float:
+def typical_speed(machine: Machine, axis: str) -> float:
     """Return the speed of a drive at the rated flow of its valve or pump [m/s] or [rad/s].
 
     A force drive has no flow rating and is assumed to travel its range in two seconds.
     """
     facts = machine.axes[axis]
-    if facts.hydraulic:
+    if facts.is_hydraulic:
         return facts.rated_flow / facts.hydraulic_drive.areas[0]
     low, high = machine.joints[facts.joint].range or (-0.5, 0.5)
-    return (high - low) / _FULL_TRAVEL
+    return (high - low) / _FULL_TRAVEL_TIME_S
 
 
 def outboard_links(machine: Machine, link: str) -> list[str]:
@@ -214,9 +214,7 @@ def outboard_child(machine: Machine, link: str) -> str | None:
         if machine.arm.tip.link == link:
             return None
     children = [n for n, other in machine.links.items() if other.parent == link]
-    return max(
-        children, key=lambda n: float(np.linalg.norm(machine.links[n].position)), default=None
-    )
+    return max(children, key=lambda n: float(np.linalg.norm(machine.links[n].position)), default=None)
 
 
 def outboard_point(machine: Machine, link: str) -> np.ndarray | None:
@@ -240,9 +238,7 @@ def link_size(machine: Machine, link: str) -> float:
     return max(far, float(np.linalg.norm(machine.links[link].com)), 1.0e-3)
 
 
-def term_number(
-    machine: Machine, name: str, axis: str, balance: Balance, parameter: str, absent: float
-) -> float:
+def term_parameter(machine: Machine, name: str, axis: str, balance: Balance, parameter: str, default: float) -> float:
     """Return a parameter of the term that an effect added to a drive.
 
     Args:
@@ -251,7 +247,7 @@ def term_number(
         axis: axis of the drive.
         balance: balance of the term.
         parameter: name of the law's parameter.
-        absent: value to return if there is no such term.
+        default: value to return if there is no such term.
 
     Returns:
         The value of the parameter.
@@ -261,12 +257,10 @@ def term_number(
             value = term.parameters[parameter]
             assert isinstance(value, float)
             return value
-    return absent
+    return default
 
 
-def with_terms(
-    machine: Machine, name: str, terms: Iterable[Term], axes: Iterable[str] | None = None
-) -> Machine:
+def with_terms(machine: Machine, name: str, terms: Iterable[Term], axes: Iterable[str] | None = None) -> Machine:
     """Return a copy of a machine in which the terms of an effect are replaced.
 
     Args:

@@ -1,16 +1,16 @@
 """Effect of end stops whose stiffness differs from the model."""
 
-from hydrotele.effects.effect import Effect, Parameter, Values, changed, drive_turns
+from hydrotele.effects.effect import Effect, Parameter, Values, is_rotary_drive, with_value
 from hydrotele.machine.drives import EndStop
 from hydrotele.machine.machine import Machine
 
 
-def _ending(machine: Machine) -> tuple[str, ...]:
+def _end_stop_axes(machine: Machine) -> tuple[str, ...]:
     """Return the axes whose drives have end stops."""
     return tuple(name for name in machine.axes if machine.end_stop(name))
 
 
-def _stiffness(machine: Machine, location: str) -> dict[str, Parameter]:
+def _stiffness_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the end stop stiffness.
 
     A cushion is fifty times more compliant than steel; the lever arm of a pin changes the stiffness
@@ -19,11 +19,11 @@ def _stiffness(machine: Machine, location: str) -> dict[str, Parameter]:
     stop = machine.end_stop(location)
     assert stop
     k = stop.stiffness
-    unit = "N m/rad" if drive_turns(machine, location) else "N/m"
+    unit = "N m/rad" if is_rotary_drive(machine, location) else "N/m"
     return {"stiffness": Parameter(unit, k, 0.01 * k, 20.0 * k, 0.5 * k, 0.1 * k)}
 
 
-def _set(machine: Machine, location: str, values: Values) -> Machine:
+def _set_stiffness(machine: Machine, location: str, values: Values) -> Machine:
     """Set the stiffness and scale the damping with it, so that their time constant stays."""
     stop = machine.end_stop(location)
     assert stop
@@ -31,10 +31,10 @@ def _set(machine: Machine, location: str, values: Values) -> Machine:
         return machine
     damping = stop.damping * values["stiffness"] / stop.stiffness
     other = EndStop(stiffness=values["stiffness"], damping=damping)
-    return changed(machine, f"axes.{location}.end_stop", other)
+    return with_value(machine, f"axes.{location}.end_stop", other)
 
 
 EFFECT = Effect(
     "end_stop_stiffness", "end stop stiffness of a drive that differs from the model", "force",
-    _ending, _stiffness, _set,
+    _end_stop_axes, _stiffness_parameters, _set_stiffness,
 )  # fmt: skip

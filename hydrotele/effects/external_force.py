@@ -4,52 +4,59 @@ from hydrotele.effects.effect import (
     Effect,
     Parameter,
     Values,
-    axes,
+    all_axes,
     force_unit,
-    largest_force,
+    max_drive_force,
     speed_unit,
-    term_number,
-    usual_speed,
+    term_parameter,
+    typical_speed,
     with_terms,
 )
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.law import Term
 
-CONSTANT, PULSE, DRAG = "external_force", "force_pulse", "speed_dependent_force"
-_BEGIN, _LENGTH = 5.0, 5.0  # s, start values of a search: a pulse without amplitude has no time
+CONSTANT_FORCE, FORCE_PULSE, SPEED_DEPENDENT_FORCE = (
+    "external_force",
+    "force_pulse",
+    "speed_dependent_force",
+)
+_PULSE_START_S, _PULSE_DURATION_S = (
+    5.0,
+    5.0,
+)  # s, start values of a search: a pulse without amplitude has no time
 _DRAG_UNITS = {"N": "N s^2/m^2", "N m": "N m s^2/rad^2"}
 
 
-def _force(machine: Machine, location: str) -> dict[str, Parameter]:
+def _force_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the constant force, scaled by the drive's largest force.
 
     The smallest relevant force is a thousandth of the largest one, as for friction.
     """
-    present = term_number(machine, CONSTANT, location, "force", "value", 0.0)
-    whole = largest_force(machine, location)
+    present = term_parameter(machine, CONSTANT_FORCE, location, "force", "value", 0.0)
+    whole = max_drive_force(machine, location)
     sizes = present - whole, present + whole, 0.02 * whole, 0.001 * whole
     return {"force": Parameter(force_unit(machine, location), present, *sizes)}
 
 
 def _set_force(machine: Machine, location: str, values: Values) -> Machine:
     force = values["force"]
-    term = Term(name=CONSTANT, axis=location, balance="force", law="constant",
+    term = Term(name=CONSTANT_FORCE, axis=location, balance="force", law="constant",
                 parameters={"value": force})  # fmt: skip
-    return with_terms(machine, CONSTANT, [term] if force else [], [location])
+    return with_terms(machine, CONSTANT_FORCE, [term] if force else [], [location])
 
 
-def _pulse(machine: Machine, location: str) -> dict[str, Parameter]:
+def _pulse_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify amplitude, start and duration of a force pulse.
 
     The smallest relevant amplitude is three times that of a constant force, so that a pulse of one
-    second is detectable. A pulse without amplitude has no time: see `_BEGIN`.
+    second is detectable. A pulse without amplitude has no time: see `_PULSE_START_S`.
     """
 
     def present(parameter: str, absent: float) -> float:
-        return term_number(machine, PULSE, location, "force", parameter, absent)
+        return term_parameter(machine, FORCE_PULSE, location, "force", parameter, absent)
 
-    size, whole = present("size", 0.0), largest_force(machine, location)
-    start, duration = present("start", _BEGIN), present("duration", _LENGTH)
+    size, whole = present("size", 0.0), max_drive_force(machine, location)
+    start, duration = present("start", _PULSE_START_S), present("duration", _PULSE_DURATION_S)
     return {
         "size": Parameter(
             force_unit(machine, location), size, size - 2.0 * whole, size + 2.0 * whole,
@@ -61,44 +68,51 @@ def _pulse(machine: Machine, location: str) -> dict[str, Parameter]:
 
 
 def _set_pulse(machine: Machine, location: str, values: Values) -> Machine:
-    term = Term(name=PULSE, axis=location, balance="force", law="pulse", parameters=dict(values))
-    return with_terms(machine, PULSE, [term] if values["size"] else [], [location])
+    term = Term(name=FORCE_PULSE, axis=location, balance="force", law="pulse", parameters=dict(values))
+    return with_terms(machine, FORCE_PULSE, [term] if values["size"] else [], [location])
 
 
-def _drag(machine: Machine, location: str) -> dict[str, Parameter]:
+def _drag_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the drag coefficient, scaled by the drive's largest force at its typical speed.
 
     The fractions are those of viscous friction.
     """
-    present = term_number(machine, DRAG, location, "force", "coefficient", 0.0)
-    whole = largest_force(machine, location) / usual_speed(machine, location) ** 2
+    present = term_parameter(machine, SPEED_DEPENDENT_FORCE, location, "force", "coefficient", 0.0)
+    whole = max_drive_force(machine, location) / typical_speed(machine, location) ** 2
     unit = _DRAG_UNITS["N m" if speed_unit(machine, location) == "rad/s" else "N"]
     sizes = present + 0.2 * whole, 0.015 * whole, 0.001 * whole
     return {"coefficient": Parameter(unit, present, 0.0, *sizes)}
 
 
 def _set_drag(machine: Machine, location: str, values: Values) -> Machine:
-    term = Term(name=DRAG, axis=location, balance="force", law="quadratic_drag",
+    term = Term(name=SPEED_DEPENDENT_FORCE, axis=location, balance="force", law="quadratic_drag",
                 parameters=dict(values))  # fmt: skip
-    return with_terms(machine, DRAG, [term] if values["coefficient"] else [], [location])
+    return with_terms(machine, SPEED_DEPENDENT_FORCE, [term] if values["coefficient"] else [], [location])
 
 
 EFFECTS = (
-    Effect(CONSTANT, "a constant force or torque on a drive", "force", axes, _force, _set_force),
     Effect(
-        PULSE,
+        CONSTANT_FORCE,
+        "a constant force or torque on a drive",
+        "force",
+        all_axes,
+        _force_parameters,
+        _set_force,
+    ),
+    Effect(
+        FORCE_PULSE,
         "a force or torque on a drive for a limited time",
         "force",
-        axes,
-        _pulse,
+        all_axes,
+        _pulse_parameters,
         _set_pulse,
     ),
     Effect(
-        DRAG,
+        SPEED_DEPENDENT_FORCE,
         "a resisting force that grows with the square of the speed",
         "force",
-        axes,
-        _drag,
+        all_axes,
+        _drag_parameters,
         _set_drag,
     ),
 )

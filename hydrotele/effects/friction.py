@@ -11,22 +11,22 @@ from hydrotele.effects.effect import (
     Effect,
     Parameter,
     Values,
-    axes,
-    changed,
+    all_axes,
     drive_kind,
-    drive_turns,
     force_unit,
-    largest_force,
+    is_rotary_drive,
+    max_drive_force,
     speed_unit,
-    term_number,
-    usual_speed,
+    term_parameter,
+    typical_speed,
     with_terms,
+    with_value,
 )
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.law import Term
 
 
-def _numbers(field: str, scale: float, high: float):
+def _make_friction_parameters(field: str, scale: float, high: float):
     """Return a function that gives a friction parameter, scaled by the drive's largest force.
 
     The smallest relevant deviation is a thousandth of that force, or a tenth of the given friction.
@@ -36,9 +36,9 @@ def _numbers(field: str, scale: float, high: float):
 
     def parameters(machine: Machine, location: str) -> dict[str, Parameter]:
         present = getattr(machine.axes[location].drive.friction, field)
-        whole, unit = largest_force(machine, location), force_unit(machine, location)
+        whole, unit = max_drive_force(machine, location), force_unit(machine, location)
         if field == "viscous":
-            whole /= usual_speed(machine, location)
+            whole /= typical_speed(machine, location)
             unit = f"{unit}/({speed_unit(machine, location)})"
         least = max(0.001 * whole, 0.1 * present)
         size = max(scale * whole, 0.3 * present)
@@ -51,20 +51,20 @@ def _numbers(field: str, scale: float, high: float):
 _UNITS = {"N/(m/s)": "N s/m", "N m/(rad/s)": "N m s/rad"}
 
 
-def _set(machine: Machine, location: str, values: Values) -> Machine:
+def _set_friction(machine: Machine, location: str, values: Values) -> Machine:
     for field, value in values.items():
         path = f"axes.{location}.{drive_kind(machine, location)}.friction.{field}"
-        machine = changed(machine, path, value)
+        machine = with_value(machine, path, value)
     return machine
 
 
-def _friction_places(machine: Machine) -> tuple[str, ...]:
+def _friction_axes(machine: Machine) -> tuple[str, ...]:
     """Return the axes with friction, which can be asymmetric."""
     present = {name: machine.axes[name].drive.friction for name in machine.axes}
     return tuple(n for n, f in present.items() if f.coulomb + f.stribeck_extra + f.viscous > 0)
 
 
-def _asymmetry(machine: Machine, location: str) -> dict[str, Parameter]:
+def _asymmetry_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the asymmetries of dry and viscous friction.
 
     Lip seals differ by tens of per cent between the directions.
@@ -78,49 +78,49 @@ def _asymmetry(machine: Machine, location: str) -> dict[str, Parameter]:
     return {name: Parameter("1", present, -0.9, 0.9, 0.2, 0.02) for name, present in sizes.items()}
 
 
-FRICTION = (
+BASIC_FRICTION_EFFECTS = (
     Effect(
         "coulomb_friction", "Coulomb friction of a drive that differs from the model", "force",
-        axes, _numbers("coulomb", 0.02, 0.08), _set,
+        all_axes, _make_friction_parameters("coulomb", 0.02, 0.08), _set_friction,
     ),
     Effect(
         "viscous_friction", "viscous friction of a drive that differs from the model", "force",
-        axes, _numbers("viscous", 0.015, 0.1), _set,
+        all_axes, _make_friction_parameters("viscous", 0.015, 0.1), _set_friction,
     ),
     Effect(
         "stribeck_friction", "Stribeck friction of a drive that differs from the model", "force",
-        axes, _numbers("stribeck_extra", 0.01, 0.05), _set,
+        all_axes, _make_friction_parameters("stribeck_extra", 0.01, 0.05), _set_friction,
     ),
     Effect(
         "friction_asymmetry", "larger friction in one direction of a drive", "force",
-        _friction_places, _asymmetry, _set,
+        _friction_axes, _asymmetry_parameters, _set_friction,
     ),
 )  # fmt: skip
 
 
-LOAD, PLACE = "load_dependent_friction", "position_dependent_friction"
+LOAD_FRICTION, POSITION_FRICTION = "load_dependent_friction", "position_dependent_friction"
 
 
-def _coefficient(machine: Machine, location: str) -> dict[str, Parameter]:
+def _load_friction_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the coefficient of load-dependent friction.
 
     Friction of seals and guides is some per cent of the load.
     """
-    present = term_number(machine, LOAD, location, "force", "coefficient", 0.0)
+    present = term_parameter(machine, LOAD_FRICTION, location, "force", "coefficient", 0.0)
     return {"coefficient": Parameter("1", present, 0.0, max(0.4, present), 0.03, 0.005)}
 
 
-def _smoothing(machine: Machine, location: str) -> float:
+def _smoothing_velocity(machine: Machine, location: str) -> float:
     return machine.axes[location].drive.friction.smoothing_velocity
 
 
-def _set_coefficient(machine: Machine, location: str, values: Values) -> Machine:
-    numbers = {**values, "smoothing_velocity": _smoothing(machine, location)}
-    term = Term(name=LOAD, axis=location, balance="force", law="load_friction", parameters=numbers)
-    return with_terms(machine, LOAD, [term] if values["coefficient"] else [], [location])
+def _set_load_friction(machine: Machine, location: str, values: Values) -> Machine:
+    numbers = {**values, "smoothing_velocity": _smoothing_velocity(machine, location)}
+    term = Term(name=LOAD_FRICTION, axis=location, balance="force", law="load_friction", parameters=numbers)
+    return with_terms(machine, LOAD_FRICTION, [term] if values["coefficient"] else [], [location])
 
 
-def _travel(machine: Machine, location: str) -> tuple[float, float]:
+def _position_range(machine: Machine, location: str) -> tuple[float, float]:
     """Return the range of a drive's position [m] or [rad]; one revolution if it is unlimited."""
     axis = machine.axes[location]
     if axis.cylinder:
@@ -130,7 +130,7 @@ def _travel(machine: Machine, location: str) -> tuple[float, float]:
     return machine.joints[axis.joint].range or widest
 
 
-def _bump(machine: Machine, location: str) -> dict[str, Parameter]:
+def _bump_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify height, centre and width of additional friction at one position.
 
     The height is scaled as Coulomb friction. A bent rod or a worn tooth spans a tenth of the
@@ -138,10 +138,10 @@ def _bump(machine: Machine, location: str) -> dict[str, Parameter]:
     """
 
     def present(parameter: str, absent: float) -> float:
-        return term_number(machine, PLACE, location, "force", parameter, absent)
+        return term_parameter(machine, POSITION_FRICTION, location, "force", parameter, absent)
 
-    low, high = _travel(machine, location)
-    span, whole = high - low, largest_force(machine, location)
+    low, high = _position_range(machine, location)
+    span, whole = high - low, max_drive_force(machine, location)
     coulomb, centre = present("coulomb", 0.0), present("centre", low + 0.5 * span)
     width = present("width", 0.1 * span)
     unit = "m" if force_unit(machine, location) == "N" else "rad"
@@ -158,47 +158,56 @@ def _bump(machine: Machine, location: str) -> dict[str, Parameter]:
 
 
 def _set_bump(machine: Machine, location: str, values: Values) -> Machine:
-    numbers = {**values, "smoothing_velocity": _smoothing(machine, location)}
-    term = Term(name=PLACE, axis=location, balance="force", law="friction_bump", parameters=numbers)
-    return with_terms(machine, PLACE, [term] if values["coulomb"] else [], [location])
+    numbers = {**values, "smoothing_velocity": _smoothing_velocity(machine, location)}
+    term = Term(
+        name=POSITION_FRICTION,
+        axis=location,
+        balance="force",
+        law="friction_bump",
+        parameters=numbers,
+    )
+    return with_terms(machine, POSITION_FRICTION, [term] if values["coulomb"] else [], [location])
 
 
-UNEVEN_FRICTION = (
+NONUNIFORM_FRICTION_EFFECTS = (
     Effect(
-        LOAD, "dry friction that grows with the drive's load", "force", axes, _coefficient,
-        _set_coefficient,
+        LOAD_FRICTION, "dry friction that grows with the drive's load", "force", all_axes, _load_friction_parameters,
+        _set_load_friction,
     ),
     Effect(
-        PLACE, "additional dry friction at one position of the travel", "force", axes, _bump,
+        POSITION_FRICTION, "additional dry friction at one position of the travel", "force", all_axes, _bump_parameters,
         _set_bump,
     ),
 )  # fmt: skip
 
 
-_WAY, _TURN = 5.0e-5, 2.0e-4  # m, rad: deflection of seals and gears before sliding, an estimate
-_RIGID = 0.02  # of the smallest relevant compliance: below it, friction without bristles
+_LINEAR_DEFLECTION_M, _ANGULAR_DEFLECTION_RAD = (
+    5.0e-5,
+    2.0e-4,
+)  # m, rad: deflection of seals and gears before sliding, an estimate
+_MIN_COMPLIANCE_RATIO = 0.02  # of the smallest relevant compliance: below it, friction without bristles
 
 
-def _presliding_places(machine: Machine) -> tuple[str, ...]:
+def _presliding_axes(machine: Machine) -> tuple[str, ...]:
     """Return the axes with dry friction; drives with an own pump have no presliding model."""
     found = {name: axis.drive.friction for name, axis in machine.axes.items() if not axis.pump}
     return tuple(name for name, f in found.items() if f.coulomb + f.stribeck_extra > 0.0)
 
 
-def _compliance(machine: Machine, location: str) -> dict[str, Parameter]:
+def _compliance_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the compliance of the bristles; 0 is friction without bristles.
 
     Metal surfaces deflect by some micrometres before they slide, rubber seals by up to a tenth of a
     millimetre. The smallest relevant deflection at the breakaway force is 10 um or 40 urad.
     """
-    friction, turns = machine.axes[location].drive.friction, drive_turns(machine, location)
-    usual = (_TURN if turns else _WAY) / (friction.coulomb + friction.stribeck_extra)
+    friction, turns = machine.axes[location].drive.friction, is_rotary_drive(machine, location)
+    usual = (_ANGULAR_DEFLECTION_RAD if turns else _LINEAR_DEFLECTION_M) / (friction.coulomb + friction.stribeck_extra)
     stiffness = friction.presliding_stiffness
     present = 1.0 / stiffness if stiffness else 0.0
     return {
         "compliance": Parameter(
             "rad/(N m)" if turns else "m/N", present, 0.0, max(20.0 * usual, present), usual,
-            0.2 * usual, starts=(0.4 * usual, usual, 4.0 * usual),
+            0.2 * usual, start_values=(0.4 * usual, usual, 4.0 * usual),
         )
     }  # fmt: skip
 
@@ -206,20 +215,20 @@ def _compliance(machine: Machine, location: str) -> dict[str, Parameter]:
 def _set_presliding(machine: Machine, location: str, values: Values) -> Machine:
     """Set the bristle stiffness; remove the bristles if they are too stiff to be distinguished."""
     compliance = values["compliance"]
-    number = _compliance(machine, location)["compliance"]
+    number = _compliance_parameters(machine, location)["compliance"]
     if compliance == number.nominal:
         return machine
-    stiffness = 1.0 / compliance if compliance >= _RIGID * number.least else 0.0
+    stiffness = 1.0 / compliance if compliance >= _MIN_COMPLIANCE_RATIO * number.min_relevant_change else 0.0
     path = f"axes.{location}.{drive_kind(machine, location)}.friction"
     if not stiffness:
-        machine = changed(machine, f"{path}.presliding_damping", 0.0)
-    return changed(machine, f"{path}.presliding_stiffness", stiffness)
+        machine = with_value(machine, f"{path}.presliding_damping", 0.0)
+    return with_value(machine, f"{path}.presliding_stiffness", stiffness)
 
 
 PRESLIDING = Effect(
     "presliding", "dry friction that acts as a spring before sliding", "force",
-    _presliding_places,
-    _compliance, _set_presliding,
+    _presliding_axes,
+    _compliance_parameters, _set_presliding,
 )  # fmt: skip
 
-EFFECTS = (*FRICTION, *UNEVEN_FRICTION, PRESLIDING)
+EFFECTS = (*BASIC_FRICTION_EFFECTS, *NONUNIFORM_FRICTION_EFFECTS, PRESLIDING)

@@ -8,20 +8,20 @@ from hydrotele.effects.effect import (
     Effect,
     Parameter,
     Values,
-    across,
-    changed,
-    hinges,
-    linkages,
+    hinge_axes,
+    lateral_directions,
+    linkage_axes,
     outboard_child,
     outboard_point,
+    with_value,
 )
 from hydrotele.machine.machine import Machine
 
 
-def _locations(machine: Machine) -> tuple[str, ...]:
+def _link_length_axes(machine: Machine) -> tuple[str, ...]:
     """Return the revolute axes whose link extends across the axis: boom, stick, not swing."""
     places = []
-    for axis in hinges(machine):
+    for axis in hinge_axes(machine):
         joint = machine.axes[axis].joint
         point = outboard_point(machine, machine.link_of(joint))
         if point is None or not point.any():
@@ -32,7 +32,7 @@ def _locations(machine: Machine) -> tuple[str, ...]:
     return tuple(places)
 
 
-def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:
+def _link_length_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the change of a link's length.
 
     Welded structures are built to a thousandth of their length, 5 mm for a boom.
@@ -43,7 +43,7 @@ def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     return {"length": Parameter("m", 0.0, -0.1 * size, 0.1 * size, 0.01 * size, 0.001 * size)}
 
 
-def _apply(machine: Machine, location: str, values: Values) -> Machine:
+def _set_link_length(machine: Machine, location: str, values: Values) -> Machine:
     """Move everything at the outboard joint by `length` along the line from the link's own joint.
 
     The moved parts are the next link, the base pin of the next link's cylinder if it is on this
@@ -60,9 +60,9 @@ def _apply(machine: Machine, location: str, values: Values) -> Machine:
     way = point / size
     com = np.array(machine.links[name].com)
     stretched = com + way * np.dot(com, way) * length / size
-    machine = changed(machine, f"links.{name}.com", _vector(stretched))
+    machine = with_value(machine, f"links.{name}.com", _to_float_tuple(stretched))
     if machine.arm and machine.arm.tip.link == name:
-        return _with_tip(machine, name, way * length)
+        return _move_tip(machine, name, way * length)
     child = outboard_child(machine, name)
     assert child
     moved = {f"links.{child}.position": machine.links[child].position}
@@ -77,25 +77,25 @@ def _apply(machine: Machine, location: str, values: Values) -> Machine:
             rocker = axis.four_bar.rocker
             moved[f"links.{rocker}.position"] = machine.links[rocker].position
     for path, position in moved.items():
-        machine = _moved(machine, path, position, way * length)
+        machine = _move_position(machine, path, position, way * length)
     return machine
 
 
-def _with_tip(machine: Machine, name: str, shift: np.ndarray) -> Machine:
+def _move_tip(machine: Machine, name: str, shift: np.ndarray) -> Machine:
     """Move the arm's tip on the last link and a payload that is welded there."""
     assert machine.arm
     tip = machine.arm.tip.position
     for other, link in machine.links.items():
         if link.parent == name and link.joint is None and link.position == tip:
-            machine = _moved(machine, f"links.{other}.position", tip, shift)
-    return _moved(machine, "arm.tip.position", tip, shift)
+            machine = _move_position(machine, f"links.{other}.position", tip, shift)
+    return _move_position(machine, "arm.tip.position", tip, shift)
 
 
-def _moved(machine: Machine, path: str, position, shift: np.ndarray) -> Machine:
-    return changed(machine, path, _vector(np.array(position) + shift))
+def _move_position(machine: Machine, path: str, position, shift: np.ndarray) -> Machine:
+    return with_value(machine, path, _to_float_tuple(np.array(position) + shift))
 
 
-def _vector(values: np.ndarray) -> tuple[float, ...]:
+def _to_float_tuple(values: np.ndarray) -> tuple[float, ...]:
     return tuple(float(value) for value in values)
 
 
@@ -103,13 +103,13 @@ LINK_LENGTH = Effect(
     "link_length",
     "link length that differs from the model",
     "geometry",
-    _locations,
-    _parameters,
-    _apply,
+    _link_length_axes,
+    _link_length_parameters,
+    _set_link_length,
 )
 
 
-def _parameters_pin_offset(machine: Machine, location: str) -> dict[str, Parameter]:
+def _pin_offset_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the offsets of a base pin.
 
     The play of a worn pin is a thousandth of the closed length, 1.5 mm.
@@ -118,31 +118,31 @@ def _parameters_pin_offset(machine: Machine, location: str) -> dict[str, Paramet
     assert cylinder
     size = cylinder.closed_length
     offset = Parameter("m", 0.0, -0.05 * size, 0.05 * size, 0.005 * size, 0.001 * size)
-    return dict.fromkeys(across(machine, location), offset)
+    return dict.fromkeys(lateral_directions(machine, location), offset)
 
 
-def _apply_pin_offset(machine: Machine, location: str, values: Values) -> Machine:
+def _set_pin_offset(machine: Machine, location: str, values: Values) -> Machine:
     """Move the base pin in its link's frame; the closed length does not change."""
     cylinder = machine.axes[location].cylinder
     assert cylinder
     way = zip("xyz", cylinder.base_pin.position, strict=True)
     position = tuple(place + values.get(name, 0.0) for name, place in way)
-    return changed(machine, f"axes.{location}.cylinder.base_pin.position", position)
+    return with_value(machine, f"axes.{location}.cylinder.base_pin.position", position)
 
 
 PIN_OFFSET = Effect(
     "pin_offset", "position of a cylinder's base pin that differs from the model", "geometry",
-    linkages,
-    _parameters_pin_offset,
-    _apply_pin_offset,
+    linkage_axes,
+    _pin_offset_parameters,
+    _set_pin_offset,
 )  # fmt: skip
 
 
-def _place(machine: Machine) -> tuple[str, ...]:
+def _base_location(machine: Machine) -> tuple[str, ...]:
     return ("base",) if any(machine.gravity) else ()
 
 
-def _parameters_base_tilt(machine: Machine, location: str) -> dict[str, Parameter]:
+def _base_tilt_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the tilt angles of the base.
 
     Ground is level to a few degrees; a builder's level resolves 3 mrad.
@@ -151,7 +151,7 @@ def _parameters_base_tilt(machine: Machine, location: str) -> dict[str, Paramete
     return {"roll": tilt, "pitch": tilt}
 
 
-def _apply_base_tilt(machine: Machine, location: str, values: Values) -> Machine:
+def _set_base_tilt(machine: Machine, location: str, values: Values) -> Machine:
     """Rotate gravity into the frame of a base tilted by pitch about y, then by roll about its x.
 
     Positive pitch lowers the front (x), positive roll lowers the right-hand side (-y).
@@ -164,16 +164,16 @@ def _apply_base_tilt(machine: Machine, location: str, values: Values) -> Machine
     if roll == 0.0 and pitch == 0.0:
         return machine
     gravity = (about_y @ about_x).T @ np.array(machine.gravity)
-    return changed(machine, "gravity", tuple(float(g) for g in gravity))
+    return with_value(machine, "gravity", tuple(float(g) for g in gravity))
 
 
 BASE_TILT = Effect(
     "base_tilt",
     "tilt of the base",
     "force",
-    _place,
-    _parameters_base_tilt,
-    _apply_base_tilt,
+    _base_location,
+    _base_tilt_parameters,
+    _set_base_tilt,
 )
 
 EFFECTS = (LINK_LENGTH, PIN_OFFSET, BASE_TILT)

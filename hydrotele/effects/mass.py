@@ -6,17 +6,17 @@ from hydrotele.effects.effect import (
     Effect,
     Parameter,
     Values,
-    changed,
-    hinges,
+    hinge_axes,
     link_size,
     outboard_links,
+    with_value,
 )
 from hydrotele.machine.machine import Link, Machine
 
-_LETTERS = "xyz"
+_COORDINATES = "xyz"
 
 
-def _upright(machine: Machine, axis: str) -> bool:
+def _is_vertical(machine: Machine, axis: str) -> bool:
     """Return whether an axis at the base is parallel to gravity: weight then causes no torque."""
     link = machine.links[machine.link_of(machine.axes[axis].joint)]
     assert link.joint
@@ -25,55 +25,55 @@ def _upright(machine: Machine, axis: str) -> bool:
     return link.parent == "world" and along > 0.95 * float(np.linalg.norm(gravity))
 
 
-def _directions(machine: Machine, axis: str) -> list[str]:
+def _lateral_directions(machine: Machine, axis: str) -> list[str]:
     """Return the two coordinates perpendicular to the joint axis; the third one has no effect."""
     axis_direction = np.abs(machine.joints[machine.axes[axis].joint].axis)
-    return [_LETTERS[k] for k in range(3) if k != int(np.argmax(axis_direction))]
+    return [_COORDINATES[k] for k in range(3) if k != int(np.argmax(axis_direction))]
 
 
-def _com(machine: Machine, location: str) -> dict[str, Parameter]:
+def _com_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the offsets of a link's centre of mass, scaled by the size of the link.
 
     An offset of 0.5 % of a boom, about 25 mm, changes its pressure by 40 kPa. For a vertical axis
     only the moment of inertia changes, so that the smallest relevant offset is six times larger.
     """
     size = link_size(machine, machine.link_of(machine.axes[location].joint))
-    least = (0.03 if _upright(machine, location) else 0.005) * size
+    least = (0.03 if _is_vertical(machine, location) else 0.005) * size
     number = Parameter("m", 0.0, -0.3 * size, 0.3 * size, max(0.05 * size, 2 * least), least)
-    return dict.fromkeys(_directions(machine, location), number)
+    return dict.fromkeys(_lateral_directions(machine, location), number)
 
 
 def _move_com(machine: Machine, location: str, values: Values) -> Machine:
     link = machine.link_of(machine.axes[location].joint)
-    offsets = [values.get(letter, 0.0) for letter in _LETTERS]
+    offsets = [values.get(letter, 0.0) for letter in _COORDINATES]
     com = tuple(c + d for c, d in zip(machine.links[link].com, offsets, strict=True))
-    return changed(machine, f"links.{link}.com", com)
+    return with_value(machine, f"links.{link}.com", com)
 
 
-def _ratio(machine: Machine, location: str) -> dict[str, Parameter]:
+def _inertia_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the ratio of true to given moments of inertia.
 
     A model from drawings is accurate to about 20 %, with typical rounding of 5 %. The bounds
     include attachments, ballast, and a wrong unit in the drawings.
     """
-    return {"ratio": Parameter("1", 1.0, 0.05, 20.0, 0.2, 0.05, starts=(1.0, 6.0))}
+    return {"ratio": Parameter("1", 1.0, 0.05, 20.0, 0.2, 0.05, start_values=(1.0, 6.0))}
 
 
 def _scale_inertia(machine: Machine, location: str, values: Values) -> Machine:
     link = machine.link_of(machine.axes[location].joint)
     inertia = tuple(moment * values["ratio"] for moment in machine.links[link].inertia)
-    return changed(machine, f"links.{link}.inertia", inertia)
+    return with_value(machine, f"links.{link}.inertia", inertia)
 
 
-MASS = (
+LINK_MASS_EFFECTS = (
     Effect(
-        "com_offset", "centre of mass of a link that differs from the model", "force", hinges, _com,
+        "com_offset", "centre of mass of a link that differs from the model", "force", hinge_axes, _com_parameters,
         _move_com,
     ),
     Effect(
         "inertia_error",
         "moments of inertia of a link about its centre of mass that differ from the model",
-        "force", hinges, _ratio, _scale_inertia,
+        "force", hinge_axes, _inertia_parameters, _scale_inertia,
     ),
 )  # fmt: skip
 
@@ -81,15 +81,15 @@ MASS = (
 PAYLOAD = "payload"
 """Name of the link that carries the load."""
 
-_LEAST = 1.0e-3  # kg: a smaller payload is omitted, since MuJoCo accepts no body without mass
-_POINT = 1.0e-3  # m, radius of gyration of a point mass, since MuJoCo needs some inertia
+_MIN_PAYLOAD_KG = 1.0e-3  # kg: a smaller payload is omitted, since MuJoCo accepts no body without mass
+_GYRATION_RADIUS_M = 1.0e-3  # m, radius of gyration of a point mass, since MuJoCo needs some inertia
 
 
-def _place(machine: Machine) -> tuple[str, ...]:
+def _tool_location(machine: Machine) -> tuple[str, ...]:
     return ("tool",) if machine.arm else ()
 
 
-def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:
+def _payload_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the payload mass, scaled by the mass that the boom moves.
 
     Seal friction hides a payload below 15 kg at a moved mass of 2.5 t.
@@ -100,21 +100,26 @@ def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     return {"mass": Parameter("kg", 0.0, 0.0, 1.2 * moved, 0.1 * moved, 0.006 * moved)}
 
 
-def _apply(machine: Machine, location: str, values: Values) -> Machine:
+def _set_payload(machine: Machine, location: str, values: Values) -> Machine:
     """Add a point mass at the arm's tip as a welded link; repeated payloads add up."""
     assert machine.arm
     tip, mass = machine.arm.tip, values["mass"]
-    if mass < _LEAST:
+    if mass < _MIN_PAYLOAD_KG:
         return machine
     if PAYLOAD in machine.links:
         mass += machine.links[PAYLOAD].mass
-    size = mass * _POINT**2
+    size = mass * _GYRATION_RADIUS_M**2
     load = Link(parent=tip.link, position=tip.position, mass=mass, inertia=(size, size, size))
     return machine.model_copy(update={"links": {**machine.links, PAYLOAD: load}})
 
 
 TIP_PAYLOAD = Effect(
-    "payload", "a point mass at the arm's tip", "force", _place, _parameters, _apply
+    "payload",
+    "a point mass at the arm's tip",
+    "force",
+    _tool_location,
+    _payload_parameters,
+    _set_payload,
 )
 
-EFFECTS = (*MASS, TIP_PAYLOAD)
+EFFECTS = (*LINK_MASS_EFFECTS, TIP_PAYLOAD)

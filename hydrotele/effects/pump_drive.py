@@ -4,23 +4,23 @@ Most effects change one parameter, so that a gap search can name the wrong param
 values are scaled by themselves; losses that catalogues omit are scaled by the motor's capability.
 """
 
-from hydrotele.effects.effect import Effect, Parameter, Values, changed
+from hydrotele.effects.effect import Effect, Parameter, Values, with_value
 from hydrotele.machine.machine import Machine
 
 _SIDES = ("head", "rod")
 
 
-def _pumped(machine: Machine) -> tuple[str, ...]:
+def _pump_axes(machine: Machine) -> tuple[str, ...]:
     """Return the axes with an own pump."""
     return tuple(name for name, axis in machine.axes.items() if axis.pump)
 
 
-def _motored(machine: Machine) -> tuple[str, ...]:
+def _pump_motor_axes(machine: Machine) -> tuple[str, ...]:
     """Return the axes whose pump has a motor."""
-    return tuple(n for n in _pumped(machine) if (p := machine.axes[n].pump) and p.motor)
+    return tuple(n for n in _pump_axes(machine) if (p := machine.axes[n].pump) and p.motor)
 
 
-def _loaded(machine: Machine) -> tuple[str, ...]:
+def _relief_load_axes(machine: Machine) -> tuple[str, ...]:
     """Return the axes that push against a load cylinder with a relief valve."""
     return tuple(n for n in machine.loads if machine.loads[n].relief_pressure > 0.0)
 
@@ -37,34 +37,34 @@ def _motor(machine: Machine, axis: str):
     return motor
 
 
-def _ratio_of(unit: str, present: float, scale: float, least: float, widest: float) -> Parameter:
+def _ratio_parameter(unit: str, present: float, scale: float, least: float, widest: float) -> Parameter:
     """Specify a positive catalogue parameter with bounds of 1/widest and widest times its value."""
     sizes = present / widest, present * widest, scale * present, least * present
     return Parameter(unit, present, *sizes)
 
 
-def _displacement(machine: Machine, location: str) -> dict[str, Parameter]:
+def _displacement_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the pump displacement.
 
     Gear pumps of one size scatter by some per cent; a flow meter resolves 1 %.
     """
     present = _pump(machine, location).displacement
-    return {"displacement": _ratio_of("m^3/rad", present, 0.1, 0.01, 3.0)}
+    return {"displacement": _ratio_parameter("m^3/rad", present, 0.1, 0.01, 3.0)}
 
 
-def _leakage(machine: Machine, location: str) -> dict[str, Parameter]:
+def _leakage_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the pump leakage, scaled by rated flow over highest pressure.
 
     10 % is typical, 1 % is detectable.
     """
     pump = _pump(machine, location)
-    whole = pump.rated_flow / machine.highest_pressure(location)
+    whole = pump.rated_flow / machine.max_feed_pressure(location)
     high = pump.leakage + 0.5 * whole
     numbers = "m^3/(s Pa)", pump.leakage, 0.0, high, 0.1 * whole, 0.01 * whole
     return {"leakage": Parameter(*numbers)}
 
 
-def _torque_loss(machine: Machine, location: str) -> dict[str, Parameter]:
+def _torque_loss_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the torque loss of the pump.
 
     Small gear pumps lose 10 to 60 % of their torque; warm oil changes the loss by 3 %.
@@ -73,22 +73,22 @@ def _torque_loss(machine: Machine, location: str) -> dict[str, Parameter]:
     return {"torque_loss": Parameter("1", present, 0.0, max(2.0, present), 0.2, 0.03)}
 
 
-def _emf(machine: Machine, location: str) -> dict[str, Parameter]:
+def _motor_constant_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the motor constant.
 
     Magnets and windings scatter by 10 %; heating reduces the constant by 2 %.
     """
     present = _motor(machine, location).emf
-    return {"emf": _ratio_of("V s/rad", present, 0.1, 0.02, 5.0)}
+    return {"emf": _ratio_parameter("V s/rad", present, 0.1, 0.02, 5.0)}
 
 
-def _inertia(machine: Machine, location: str) -> dict[str, Parameter]:
+def _inertia_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the inertia of motor and pump.
 
     It is known to tens of per cent; a wrong unit causes errors of powers of ten.
     """
     present = _motor(machine, location).inertia
-    return {"inertia": _ratio_of("kg m^2", present, 0.3, 0.05, 30.0)}
+    return {"inertia": _ratio_parameter("kg m^2", present, 0.3, 0.05, 30.0)}
 
 
 def _stall_torque(machine: Machine, location: str) -> float:
@@ -96,7 +96,7 @@ def _stall_torque(machine: Machine, location: str) -> float:
     return motor.emf * motor.voltage / motor.resistance
 
 
-def _drag(machine: Machine, location: str) -> dict[str, Parameter]:
+def _drag_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify dry drag and breakaway torque, scaled by the stall torque.
 
     Brushes and seals cause 5 %.
@@ -108,7 +108,7 @@ def _drag(machine: Machine, location: str) -> dict[str, Parameter]:
     }
 
 
-def _viscous_drag(machine: Machine, location: str) -> dict[str, Parameter]:
+def _viscous_drag_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the viscous drag, scaled by stall torque over rated speed.
 
     The fractions are those of dry drag.
@@ -119,11 +119,11 @@ def _viscous_drag(machine: Machine, location: str) -> dict[str, Parameter]:
     return {"viscous": Parameter("N m s/rad", present, *sizes)}
 
 
-def _lines(machine: Machine) -> tuple[str, ...]:
-    return tuple(f"{axis}.{side}" for axis in _pumped(machine) for side in _SIDES)
+def _line_locations(machine: Machine) -> tuple[str, ...]:
+    return tuple(f"{axis}.{side}" for axis in _pump_axes(machine) for side in _SIDES)
 
 
-def _softness(machine: Machine, location: str) -> dict[str, Parameter]:
+def _line_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify line compliance and air volume, relative to the oil at mid-stroke.
 
     Hoses are several times more compliant than their oil. The air volume is stated at atmospheric
@@ -144,20 +144,20 @@ def _softness(machine: Machine, location: str) -> dict[str, Parameter]:
 def _set_lines(machine: Machine, location: str, values: Values) -> Machine:
     axis, _, side = location.partition(".")
     for name, value in values.items():
-        machine = changed(machine, f"axes.{axis}.pump.{name}_{side}", value)
+        machine = with_value(machine, f"axes.{axis}.pump.{name}_{side}", value)
     return machine
 
 
-def _accumulator(machine: Machine, location: str) -> dict[str, Parameter]:
+def _accumulator_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the charge pressure of the accumulator.
 
     It is set manually to tens of per cent; the finest mark of a gauge is 2 %.
     """
     present = _pump(machine, location).accumulator.pressure
-    return {"pressure": _ratio_of("Pa", present, 0.2, 0.02, 5.0)}
+    return {"pressure": _ratio_parameter("Pa", present, 0.2, 0.02, 5.0)}
 
 
-def _load_relief(machine: Machine, location: str) -> dict[str, Parameter]:
+def _load_relief_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the relief pressure of the load cylinder.
 
     Low settings are made manually to tens of per cent; the finest mark of a gauge is 2 %.
@@ -167,7 +167,7 @@ def _load_relief(machine: Machine, location: str) -> dict[str, Parameter]:
                                          0.02 * present)}  # fmt: skip
 
 
-def _load_friction(machine: Machine, location: str) -> dict[str, Parameter]:
+def _load_friction_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the packing friction of the load cylinder as a fraction of the load's force.
 
     Packings cause up to some tens of per cent.
@@ -176,38 +176,38 @@ def _load_friction(machine: Machine, location: str) -> dict[str, Parameter]:
     return {"friction": Parameter("1", present, 0.0, max(1.0, present), 0.1, 0.02)}
 
 
-def _set(part: str):
+def _make_setter(part: str):
     def apply(machine: Machine, location: str, values: Values) -> Machine:
         for name, value in values.items():
-            machine = changed(machine, part.format(location) + "." + name, value)
+            machine = with_value(machine, part.format(location) + "." + name, value)
         return machine
 
     return apply
 
 
-_PUMP, _MOTOR = _set("axes.{}.pump"), _set("axes.{}.pump.motor")
-_GAS, _LOAD = _set("axes.{}.pump.accumulator"), _set("loads.{}")
+_set_pump, _set_motor = _make_setter("axes.{}.pump"), _make_setter("axes.{}.pump.motor")
+_set_accumulator, _set_load = _make_setter("axes.{}.pump.accumulator"), _make_setter("loads.{}")
 EFFECTS = (
     Effect("pump_displacement", "displacement of an axis pump that differs from the model", "flow",
-           _pumped, _displacement, _PUMP),
-    Effect("pump_leakage", "leakage of an axis pump that differs from the model", "flow", _pumped,
-           _leakage, _PUMP),
+           _pump_axes, _displacement_parameters, _set_pump),
+    Effect("pump_leakage", "leakage of an axis pump that differs from the model", "flow", _pump_axes,
+           _leakage_parameters, _set_pump),
     Effect("pump_torque_loss", "torque loss of an axis pump that differs from the model", "flow",
-           _motored, _torque_loss, _PUMP),
+           _pump_motor_axes, _torque_loss_parameters, _set_pump),
     Effect("motor_constant", "torque constant of a pump motor that differs from the model", "flow",
-           _motored, _emf, _MOTOR),
+           _pump_motor_axes, _motor_constant_parameters, _set_motor),
     Effect("motor_inertia", "inertia of pump and motor that differs from the model", "flow",
-           _motored, _inertia, _MOTOR),
-    Effect("motor_drag", "dry drag of pump and motor that differs from the model", "flow", _motored,
-           _drag, _MOTOR),
+           _pump_motor_axes, _inertia_parameters, _set_motor),
+    Effect("motor_drag", "dry drag of pump and motor that differs from the model", "flow", _pump_motor_axes,
+           _drag_parameters, _set_motor),
     Effect("motor_viscous_drag", "viscous drag of pump and motor that differs from the model",
-           "flow", _motored, _viscous_drag, _MOTOR),
+           "flow", _pump_motor_axes, _viscous_drag_parameters, _set_motor),
     Effect("line_compliance", "compliance of, or air in, the lines between pump and cylinder",
-           "flow", _lines, _softness, _set_lines),
+           "flow", _line_locations, _line_parameters, _set_lines),
     Effect("accumulator_pressure", "accumulator charge pressure that differs from the model",
-           "flow", _pumped, _accumulator, _GAS),
+           "flow", _pump_axes, _accumulator_parameters, _set_accumulator),
     Effect("load_relief", "relief pressure of a load cylinder that differs from the model", "force",
-           _loaded, _load_relief, _LOAD),
+           _relief_load_axes, _load_relief_parameters, _set_load),
     Effect("load_friction", "packing friction of a load cylinder that differs from the model",
-           "force", _loaded, _load_friction, _LOAD),
+           "force", _relief_load_axes, _load_friction_parameters, _set_load),
 )  # fmt: skip

@@ -2,36 +2,43 @@
 
 import math
 
-from hydrotele.effects.effect import Effect, Parameter, Values, axes, hydraulics, linkages
+from hydrotele.effects.effect import (
+    Effect,
+    Parameter,
+    Values,
+    all_axes,
+    hydraulic_axes,
+    linkage_axes,
+)
 from hydrotele.machine.machine import Machine, SensorError
 
-_PERFECT = SensorError()
+_NO_ERROR = SensorError()
 _SIDES = ("head", "rod")
 
 
-def _position(machine: Machine, axis: str) -> str:
+def _position_channel(machine: Machine, axis: str) -> str:
     return f"{machine.position_kind(axis)}.{axis}"
 
 
-def _error(machine: Machine, channel: str) -> SensorError:
-    return machine.sensor_errors.get(channel, _PERFECT)
+def _sensor_error(machine: Machine, channel: str) -> SensorError:
+    return machine.sensor_errors.get(channel, _NO_ERROR)
 
 
-def _with(machine: Machine, channel: str, **numbers: float) -> Machine:
-    error = _error(machine, channel).model_copy(update=numbers)
+def _with_sensor_error(machine: Machine, channel: str, **numbers: float) -> Machine:
+    error = _sensor_error(machine, channel).model_copy(update=numbers)
     errors = {name: e for name, e in machine.sensor_errors.items() if name != channel}
-    if error != _PERFECT:
+    if error != _NO_ERROR:
         errors[channel] = error
     return machine.model_copy(update={"sensor_errors": errors})
 
 
-def _angle_offset(machine: Machine, location: str) -> dict[str, Parameter]:
+def _angle_offset_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the offset of a position sensor.
 
     Resolvers are mounted to half a degree or worse and resolve a twentieth of a degree. Slides use
     corresponding fractions of their range.
     """
-    present = _error(machine, _position(machine, location)).offset
+    present = _sensor_error(machine, _position_channel(machine, location)).offset
     if machine.position_kind(location) == "angle":
         unit, one = "rad", math.radians(1.0)
         sizes = present - 5 * one, present + 5 * one, 0.5 * one, 0.05 * one
@@ -42,27 +49,25 @@ def _angle_offset(machine: Machine, location: str) -> dict[str, Parameter]:
     return {"offset": Parameter(unit, present, *sizes)}
 
 
-def _set_angle(field: str, parameter: str):
+def _make_position_setter(field: str, parameter: str):
     def apply(machine: Machine, location: str, values: Values) -> Machine:
-        return _with(machine, _position(machine, location), **{field: values[parameter]})
+        return _with_sensor_error(machine, _position_channel(machine, location), **{field: values[parameter]})
 
     return apply
 
 
-def _angle_drift(machine: Machine, location: str) -> dict[str, Parameter]:
+def _angle_drift_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify drift and warm-up time constant of a position sensor.
 
     The drift of the warm sensor has the scale and bounds of an offset.
     """
-    error = _error(machine, _position(machine, location))
-    sizes = _angle_offset(machine, location)["offset"]
-    reach = sizes.high - sizes.nominal
+    error = _sensor_error(machine, _position_channel(machine, location))
+    sizes = _angle_offset_parameters(machine, location)["offset"]
+    reach = sizes.upper_bound - sizes.nominal
     low, high = error.drift - reach, error.drift + reach
     return {
-        "drift": Parameter(sizes.unit, error.drift, low, high, sizes.scale, sizes.least),
-        "time_constant": Parameter(
-            "s", error.drift_time_constant, 1.0, 36000.0, 300.0, 30.0, optional=True
-        ),
+        "drift": Parameter(sizes.unit, error.drift, low, high, sizes.prior_std, sizes.min_relevant_change),
+        "time_constant": Parameter("s", error.drift_time_constant, 1.0, 36000.0, 300.0, 30.0, optional=True),
     }
 
 
@@ -71,136 +76,136 @@ def _set_angle_drift(machine: Machine, location: str, values: Values) -> Machine
     numbers = {"drift": values["drift"]}
     if values["drift"] and "time_constant" in values:
         numbers["drift_time_constant"] = values["time_constant"]
-    return _with(machine, _position(machine, location), **numbers)
+    return _with_sensor_error(machine, _position_channel(machine, location), **numbers)
 
 
-def _angle_scale(machine: Machine, location: str) -> dict[str, Parameter]:
+def _angle_scale_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the scale of a position sensor.
 
     It is wrong with a wrong gear or reference voltage. The linearity of a resolver is 0.3 % over
     one radian.
     """
-    present = _error(machine, _position(machine, location)).scale
+    present = _sensor_error(machine, _position_channel(machine, location)).scale
     low, high = min(0.8, present), max(1.2, present)
     return {"ratio": Parameter("1", present, low, high, 0.02, 0.003)}
 
 
-def _late(present: float) -> dict[str, Parameter]:
+def _delay_parameters(present: float) -> dict[str, Parameter]:
     """Specify a sensor delay.
 
     Filters and buses delay by about 10 ms; 3 ms is one bus cycle.
     """
     high = max(0.3, present)
-    return {"delay": Parameter("s", present, 0.0, high, 0.02, 0.003, starts=(0.02, 0.06))}
+    return {"delay": Parameter("s", present, 0.0, high, 0.02, 0.003, start_values=(0.02, 0.06))}
 
 
-def _angle_delay(machine: Machine, location: str) -> dict[str, Parameter]:
-    return _late(_error(machine, _position(machine, location)).delay)
+def _angle_delay_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
+    return _delay_parameters(_sensor_error(machine, _position_channel(machine, location)).delay)
 
 
-def _slow(present: float) -> dict[str, Parameter]:
+def _lag_parameters(present: float) -> dict[str, Parameter]:
     """Specify the time constant of a first-order lag.
 
     Transducers and their filters have 1 to 50 ms.
     """
     high = max(0.3, present)
-    return {"time_constant": Parameter("s", present, 0.0, high, 0.02, 0.003, starts=(0.01, 0.04))}
+    return {"time_constant": Parameter("s", present, 0.0, high, 0.02, 0.003, start_values=(0.01, 0.04))}
 
 
-def _angle_lag(machine: Machine, location: str) -> dict[str, Parameter]:
-    return _slow(_error(machine, _position(machine, location)).time_constant)
+def _angle_lag_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
+    return _lag_parameters(_sensor_error(machine, _position_channel(machine, location)).time_constant)
 
 
-def _length_offset(machine: Machine, location: str) -> dict[str, Parameter]:
+def _length_offset_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the offset of a length sensor, scaled by the stroke.
 
     Length sensors are mounted to a centimetre; the smallest relevant offset is a millimetre.
     """
     cylinder = machine.axes[location].cylinder
     assert cylinder
-    present, stroke = _error(machine, f"length.{location}").offset, cylinder.stroke
+    present, stroke = _sensor_error(machine, f"length.{location}").offset, cylinder.stroke
     low, high = present - 0.1 * stroke, present + 0.1 * stroke
     return {"offset": Parameter("m", present, low, high, 0.01 * stroke, 0.001 * stroke)}
 
 
-def _set_length(machine: Machine, location: str, values: Values) -> Machine:
-    return _with(machine, f"length.{location}", offset=values["offset"])
+def _set_length_offset(machine: Machine, location: str, values: Values) -> Machine:
+    return _with_sensor_error(machine, f"length.{location}", offset=values["offset"])
 
 
-def _ports(machine: Machine) -> tuple[str, ...]:
+def _transducer_locations(machine: Machine) -> tuple[str, ...]:
     return tuple(f"{axis}.{side}" for axis in machine.hydraulic_axes for side in _SIDES)
 
 
-def _transducer(location: str) -> str:
+def _transducer_channel(location: str) -> str:
     axis, _, side = location.rpartition(".")
     return f"pressure_{side}.{axis}"
 
 
-def _pressure_offset(machine: Machine, location: str) -> dict[str, Parameter]:
+def _pressure_offset_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the zero offset of a pressure transducer.
 
     The accuracy class is 0.5 % of the span, the repeatability better than 0.1 %.
     """
-    present = _error(machine, _transducer(location)).offset
-    span = machine.highest_pressure(location.rpartition(".")[0])
+    present = _sensor_error(machine, _transducer_channel(location)).offset
+    span = machine.max_feed_pressure(location.rpartition(".")[0])
     low, high = present - 0.05 * span, present + 0.05 * span
     return {"offset": Parameter("Pa", present, low, high, 0.005 * span, 20.0e3 / 28.0e6 * span)}
 
 
-def _set_pressure(machine: Machine, location: str, values: Values) -> Machine:
-    return _with(machine, _transducer(location), offset=values["offset"])
+def _set_pressure_offset(machine: Machine, location: str, values: Values) -> Machine:
+    return _with_sensor_error(machine, _transducer_channel(location), offset=values["offset"])
 
 
-def _pressure_scale(machine: Machine, location: str) -> dict[str, Parameter]:
+def _pressure_scale_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the scale of a pressure transducer.
 
     It is wrong with a wrong span setting or supply voltage. A calibrated transducer is accurate to
     0.25 %.
     """
-    present = _error(machine, _transducer(location)).scale
+    present = _sensor_error(machine, _transducer_channel(location)).scale
     low, high = min(0.8, present), max(1.2, present)
     return {"ratio": Parameter("1", present, low, high, 0.02, 0.003)}
 
 
 def _set_pressure_scale(machine: Machine, location: str, values: Values) -> Machine:
-    return _with(machine, _transducer(location), scale=values["ratio"])
+    return _with_sensor_error(machine, _transducer_channel(location), scale=values["ratio"])
 
 
-def _both(axis: str) -> tuple[str, ...]:
+def _transducer_channels(axis: str) -> tuple[str, ...]:
     return tuple(f"pressure_{side}.{axis}" for side in _SIDES)
 
 
-def _common(machine: Machine, channels: tuple[str, ...], field: str) -> float:
+def _common_value(machine: Machine, channels: tuple[str, ...], field: str) -> float:
     """Return the delay or time constant common to all channels [s], the smallest of them."""
-    return min(getattr(_error(machine, channel), field) for channel in channels)
+    return min(getattr(_sensor_error(machine, channel), field) for channel in channels)
 
 
-def _with_common(machine: Machine, channels: tuple[str, ...], field: str, value: float) -> Machine:
+def _with_common_value(machine: Machine, channels: tuple[str, ...], field: str, value: float) -> Machine:
     """Set the smallest of the channels' values and shift the others equally."""
-    more = value - _common(machine, channels, field)
+    more = value - _common_value(machine, channels, field)
     for channel in channels:
-        shifted = getattr(_error(machine, channel), field) + more
-        machine = _with(machine, channel, **{field: max(0.0, shifted)})
+        shifted = getattr(_sensor_error(machine, channel), field) + more
+        machine = _with_sensor_error(machine, channel, **{field: max(0.0, shifted)})
     return machine
 
 
-def _pressure_delay(machine: Machine, location: str) -> dict[str, Parameter]:
-    return _late(_common(machine, _both(location), "delay"))
+def _pressure_delay_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
+    return _delay_parameters(_common_value(machine, _transducer_channels(location), "delay"))
 
 
 def _set_pressure_delay(machine: Machine, location: str, values: Values) -> Machine:
-    return _with_common(machine, _both(location), "delay", values["delay"])
+    return _with_common_value(machine, _transducer_channels(location), "delay", values["delay"])
 
 
-def _pressure_lag(machine: Machine, location: str) -> dict[str, Parameter]:
-    return _slow(_common(machine, _both(location), "time_constant"))
+def _pressure_lag_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
+    return _lag_parameters(_common_value(machine, _transducer_channels(location), "time_constant"))
 
 
 def _set_pressure_lag(machine: Machine, location: str, values: Values) -> Machine:
-    return _with_common(machine, _both(location), "time_constant", values["time_constant"])
+    return _with_common_value(machine, _transducer_channels(location), "time_constant", values["time_constant"])
 
 
-def _clocks(machine: Machine) -> dict[str, tuple[str, ...]]:
+def _clock_groups(machine: Machine) -> dict[str, tuple[str, ...]]:
     """Return the groups of channels that one logger may have time-stamped.
 
     A group needs more than one axis; a single axis is covered by its sensor delays.
@@ -215,65 +220,65 @@ def _clocks(machine: Machine) -> dict[str, tuple[str, ...]]:
     return groups
 
 
-def _clock_offset(machine: Machine, location: str) -> dict[str, Parameter]:
+def _clock_offset_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the time by which a group of sensors is late relative to commands and other sensors.
 
     A group is never early, because that would be a response before its command. Between the two
     groups either sign is possible, as an offset of one or the other. Loggers are off by about 10
     ms.
     """
-    present = _common(machine, _clocks(machine)[location], "delay")
+    present = _common_value(machine, _clock_groups(machine)[location], "delay")
     high = max(0.5, present)
-    return {"offset": Parameter("s", present, 0.0, high, 0.02, 0.003, starts=(0.02, 0.1))}
+    return {"offset": Parameter("s", present, 0.0, high, 0.02, 0.003, start_values=(0.02, 0.1))}
 
 
 def _set_clock_offset(machine: Machine, location: str, values: Values) -> Machine:
-    return _with_common(machine, _clocks(machine)[location], "delay", values["offset"])
+    return _with_common_value(machine, _clock_groups(machine)[location], "delay", values["offset"])
 
 
 EFFECTS = (
     Effect(
-        "angle_offset", "an offset of a position sensor", "sensor", axes, _angle_offset,
-        _set_angle("offset", "offset"),
+        "angle_offset", "an offset of a position sensor", "sensor", all_axes, _angle_offset_parameters,
+        _make_position_setter("offset", "offset"),
     ),
     Effect(
-        "angle_drift", "an offset of a position sensor that drifts during warm-up", "sensor", axes,
-        _angle_drift, _set_angle_drift,
+        "angle_drift", "an offset of a position sensor that drifts during warm-up", "sensor", all_axes,
+        _angle_drift_parameters, _set_angle_drift,
     ),
     Effect(
-        "angle_scale", "a scale error of a position sensor", "sensor", axes, _angle_scale,
-        _set_angle("scale", "ratio"),
+        "angle_scale", "a scale error of a position sensor", "sensor", all_axes, _angle_scale_parameters,
+        _make_position_setter("scale", "ratio"),
     ),
     Effect(
-        "angle_delay", "a delay of a position sensor", "sensor", axes, _angle_delay,
-        _set_angle("delay", "delay"), "position sensor delay",
+        "angle_delay", "a delay of a position sensor", "sensor", all_axes, _angle_delay_parameters,
+        _make_position_setter("delay", "delay"), "position sensor delay",
     ),
     Effect(
-        "angle_lag", "a first-order lag of a position sensor", "sensor", axes, _angle_lag,
-        _set_angle("time_constant", "time_constant"), "position sensor delay",
+        "angle_lag", "a first-order lag of a position sensor", "sensor", all_axes, _angle_lag_parameters,
+        _make_position_setter("time_constant", "time_constant"), "position sensor delay",
     ),
     Effect(
-        "length_offset", "an offset of a cylinder's length sensor", "sensor", linkages,
-        _length_offset, _set_length,
+        "length_offset", "an offset of a cylinder's length sensor", "sensor", linkage_axes,
+        _length_offset_parameters, _set_length_offset,
     ),
     Effect(
-        "pressure_offset", "an offset of a pressure transducer", "sensor", _ports,
-        _pressure_offset, _set_pressure,
+        "pressure_offset", "an offset of a pressure transducer", "sensor", _transducer_locations,
+        _pressure_offset_parameters, _set_pressure_offset,
     ),
     Effect(
-        "pressure_delay", "a delay of an axis' pressure transducers", "sensor", hydraulics,
-        _pressure_delay, _set_pressure_delay, "pressure transducer delay",
+        "pressure_delay", "a delay of an axis' pressure transducers", "sensor", hydraulic_axes,
+        _pressure_delay_parameters, _set_pressure_delay, "pressure transducer delay",
     ),
     Effect(
-        "pressure_scale", "a scale error of a pressure transducer", "sensor", _ports,
-        _pressure_scale, _set_pressure_scale,
+        "pressure_scale", "a scale error of a pressure transducer", "sensor", _transducer_locations,
+        _pressure_scale_parameters, _set_pressure_scale,
     ),
     Effect(
         "pressure_lag", "a first-order lag of an axis' pressure transducers", "sensor",
-        hydraulics, _pressure_lag, _set_pressure_lag, "pressure transducer delay",
+        hydraulic_axes, _pressure_lag_parameters, _set_pressure_lag, "pressure transducer delay",
     ),
     Effect(
         "clock_offset", "a time offset of all positions or all pressures", "sensor",
-        lambda machine: tuple(_clocks(machine)), _clock_offset, _set_clock_offset,
+        lambda machine: tuple(_clock_groups(machine)), _clock_offset_parameters, _set_clock_offset,
     ),
 )  # fmt: skip

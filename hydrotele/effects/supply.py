@@ -1,20 +1,20 @@
 """Effects of the supply: pump flow, droop and lag, and setting of the main relief valve."""
 
-from hydrotele.effects.effect import Effect, Parameter, Values, changed
+from hydrotele.effects.effect import Effect, Parameter, Values, with_value
 from hydrotele.machine.machine import Machine
 
 
-def _place(machine: Machine) -> tuple[str, ...]:
+def _supply_location(machine: Machine) -> tuple[str, ...]:
     return ("supply",) if machine.supply and machine.valve_axes else ()
 
 
-def _pumping(machine: Machine) -> tuple[str, ...]:
+def _limited_flow_location(machine: Machine) -> tuple[str, ...]:
     """Return the supply if its pump limits the flow; a constant-pressure supply does not."""
     supply = machine.supply
-    return _place(machine) if supply and supply.kind != "constant_pressure" else ()
+    return _supply_location(machine) if supply and supply.kind != "constant_pressure" else ()
 
 
-def _pump(machine: Machine, location: str) -> dict[str, Parameter]:
+def _pump_flow_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the flow of the pump.
 
     Engine speed and wear change it by tens of per cent; an engine governor has a droop of 2 %.
@@ -24,7 +24,7 @@ def _pump(machine: Machine, location: str) -> dict[str, Parameter]:
     return {"pump_flow": Parameter("m^3/s", q, 0.1 * q, 2.5 * q, 0.15 * q, 0.02 * q)}
 
 
-def _droop(machine: Machine, location: str) -> dict[str, Parameter]:
+def _droop_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the decrease of pump flow with pressure.
 
     Leakage and engine governor reduce the flow by 5 % at full pressure; a new pump loses 1 %.
@@ -37,10 +37,10 @@ def _droop(machine: Machine, location: str) -> dict[str, Parameter]:
 
 
 def _set_droop(machine: Machine, location: str, values: Values) -> Machine:
-    return changed(machine, "supply.pump_droop", values["droop"])
+    return with_value(machine, "supply.pump_droop", values["droop"])
 
 
-def _lag(machine: Machine, location: str) -> dict[str, Parameter]:
+def _lag_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the time constant of the pump.
 
     Swash plates respond in 50 to 300 ms, fast ones in 20 ms.
@@ -48,10 +48,10 @@ def _lag(machine: Machine, location: str) -> dict[str, Parameter]:
     assert machine.supply
     present = machine.supply.time_constant
     high = max(1.0, present)
-    return {"time_constant": Parameter("s", present, 0.0, high, 0.1, 0.02, starts=(0.05, 0.2))}
+    return {"time_constant": Parameter("s", present, 0.0, high, 0.1, 0.02, start_values=(0.05, 0.2))}
 
 
-def _relief(machine: Machine, location: str) -> dict[str, Parameter]:
+def _relief_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify relief pressure and pressure override of the main relief valve.
 
     The pressure is set manually to a few per cent; the finest mark of a gauge is 0.3 %. From
@@ -70,25 +70,27 @@ def _relief(machine: Machine, location: str) -> dict[str, Parameter]:
     return found
 
 
-def _set(machine: Machine, location: str, values: Values) -> Machine:
+def _set_supply(machine: Machine, location: str, values: Values) -> Machine:
     for field, value in values.items():
-        machine = changed(machine, f"supply.{field}", value)
+        machine = with_value(machine, f"supply.{field}", value)
     return machine
 
 
 EFFECTS = (
     Effect(
-        "pump_flow_limit", "pump flow that differs from the model", "supply", _pumping, _pump, _set
+        "pump_flow_limit", "pump flow that differs from the model", "supply", _limited_flow_location,
+        _pump_flow_parameters, _set_supply
     ),
     Effect(
-        "pump_droop", "pump flow that decreases with pressure", "supply", _pumping, _droop,
+        "pump_droop", "pump flow that decreases with pressure", "supply", _limited_flow_location, _droop_parameters,
         _set_droop,
     ),
     Effect(
-        "pump_lag", "pump flow that follows the demand with a lag", "supply", _pumping, _lag, _set
+        "pump_lag", "pump flow that follows the demand with a lag", "supply", _limited_flow_location, _lag_parameters,
+        _set_supply
     ),
     Effect(
         "relief_pressure", "setting of the main relief valve that differs from the model", "supply",
-        _place, _relief, _set,
+        _supply_location, _relief_parameters, _set_supply,
     ),
 )  # fmt: skip

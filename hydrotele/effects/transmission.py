@@ -12,53 +12,56 @@ from hydrotele.effects.effect import (
     Effect,
     Parameter,
     Values,
-    changed,
-    drive_turns,
-    largest_force,
+    is_rotary_drive,
+    max_drive_force,
     outboard_links,
-    valves,
+    valve_axes,
+    with_value,
 )
 from hydrotele.machine.drives import Transmission
 from hydrotele.machine.machine import Machine
 
-_SHARE = 0.03  # of the load's inertia: rotor and gears of a slewing drive, referred to the ring
-_CONTACT = 2.0 * math.pi * 40.0  # rad/s, drive on closed teeth: a radian takes four steps of 1 ms
-_FASTEST = 2.0 * math.pi * 150.0  # rad/s, drive on spring and oil: 1 ms is half the step limit
-_DAMPING = 0.3  # damping ratio of the drive on its spring: oil and friction of the teeth
+_DRIVE_INERTIA_FRACTION = 0.03  # of the load's inertia: rotor and gears of a slewing drive, referred to the ring
+_CONTACT_FREQUENCY_RAD_S = 2.0 * math.pi * 40.0  # rad/s, drive on closed teeth: a radian takes four steps of 1 ms
+_MAX_FREQUENCY_RAD_S = 2.0 * math.pi * 150.0  # rad/s, drive on spring and oil: 1 ms is half the step limit
+_DEFAULT_DAMPING_RATIO = 0.3  # damping ratio of the drive on its spring: oil and friction of the teeth
 
 
-def rigid_drive(machine: Machine, axis: str) -> Transmission:
+def rigid_transmission(machine: Machine, axis: str) -> Transmission:
     """Return the transmission of a rigid drive, before a backlash or a compliance is added.
 
     Its inertia is the rod's mass, or 3 % of a motor's load inertia at home. Its spring is as stiff
     as steps of 1 ms resolve well (40 Hz).
     """
     cylinder = machine.axes[axis].cylinder
-    inertia = cylinder.rod.mass if cylinder else _SHARE * load_inertia(machine, axis)
-    stiffness = inertia * _CONTACT**2
+    inertia = cylinder.rod.mass if cylinder else _DRIVE_INERTIA_FRACTION * load_inertia(machine, axis)
+    stiffness = inertia * _CONTACT_FREQUENCY_RAD_S**2
     return Transmission(
-        inertia=inertia, stiffness=stiffness, damping=damper(inertia, stiffness), backlash=0.0
+        inertia=inertia,
+        stiffness=stiffness,
+        damping=spring_damping(inertia, stiffness),
+        backlash=0.0,
     )
 
 
-def damper(inertia: float, stiffness: float) -> float:
+def spring_damping(inertia: float, stiffness: float) -> float:
     """Return the damping of the spring [N s/m] or [N m s/rad] for a damping ratio of 0.3."""
-    return 2.0 * _DAMPING * math.sqrt(stiffness * inertia)
+    return 2.0 * _DEFAULT_DAMPING_RATIO * math.sqrt(stiffness * inertia)
 
 
-def resolved_inertia(machine: Machine, axis: str, inertia: float, stiffness: float) -> float:
+def min_resolvable_inertia(machine: Machine, axis: str, inertia: float, stiffness: float) -> float:
     """Return the drive inertia, increased if needed to simulate spring and oil with 1 ms steps.
 
     The oil is stiffest at the end of the stroke: the sum of `beta A^2 / V` of both chambers.
     """
-    return max(inertia, (stiffness + _oil_stiffness(machine, axis)) / _FASTEST**2)
+    return max(inertia, (stiffness + _oil_stiffness(machine, axis)) / _MAX_FREQUENCY_RAD_S**2)
 
 
-def ringing(machine: Machine, axis: str) -> float:
+def natural_frequency(machine: Machine, axis: str) -> float:
     """Return the natural frequency of a drive on its transmission spring and oil [rad/s]."""
     facts = machine.axes[axis]
     assert facts.transmission
-    oil = _oil_stiffness(machine, axis) if facts.hydraulic else 0.0
+    oil = _oil_stiffness(machine, axis) if facts.is_hydraulic else 0.0
     return math.sqrt((facts.transmission.stiffness + oil) / facts.transmission.inertia)
 
 
@@ -79,7 +82,7 @@ def with_transmission(machine: Machine, axis: str, transmission: Transmission) -
     """
     facts = machine.axes[axis]
     before = facts.transmission.inertia if facts.transmission else 0.0
-    machine = changed(machine, f"axes.{axis}.transmission", transmission)
+    machine = with_value(machine, f"axes.{axis}.transmission", transmission)
     if facts.cylinder:
         return machine
     name = machine.link_of(facts.joint)
@@ -89,7 +92,7 @@ def with_transmission(machine: Machine, axis: str, transmission: Transmission) -
     a, b, c = sorted(inertia)
     if a <= 0.0 or a + b < c:
         return machine
-    return changed(machine, f"links.{name}.inertia", tuple(inertia))
+    return with_value(machine, f"links.{name}.inertia", tuple(inertia))
 
 
 def load_inertia(machine: Machine, axis: str) -> float:
@@ -102,7 +105,7 @@ def load_inertia(machine: Machine, axis: str) -> float:
     carried = outboard_links(machine, first)
     if machine.joints[joint].type == "slide":
         return sum(machine.links[name].mass for name in carried)
-    frames = {name: _frame(machine, name) for name in carried}
+    frames = {name: _link_pose(machine, name) for name in carried}
     origin, turn = frames[first]
     way = turn @ np.array(machine.joints[joint].axis)
     total = 0.0
@@ -114,36 +117,36 @@ def load_inertia(machine: Machine, axis: str) -> float:
     return total
 
 
-def _frame(machine: Machine, name: str) -> tuple[np.ndarray, np.ndarray]:
+def _link_pose(machine: Machine, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Return the world position (3,) [m] and rotation (3, 3) of a link at home."""
     if name == "world":
         return np.zeros(3), np.eye(3)
     link = machine.links[name]
-    position, rotation = _frame(machine, link.parent)
+    position, rotation = _link_pose(machine, link.parent)
     position = position + rotation @ np.array(link.position)
     if link.joint:
         value, axis = machine.home.get(link.joint.name, 0.0), np.array(link.joint.axis)
         if link.joint.type == "slide":
             return position + rotation @ axis * value, rotation
-        rotation = rotation @ _turn(axis, value)
+        rotation = rotation @ _rotation_matrix(axis, value)
     return position, rotation
 
 
-def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
+def _rotation_matrix(axis: np.ndarray, angle: float) -> np.ndarray:
     """Return the rotation matrix (3, 3) about a unit axis by Rodrigues' formula."""
     x, y, z = axis
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
 
 
-_CLOSED = 1.0e-6  # rad: smaller backlash is omitted; it moves a slewing ring's tooth by 1 um
+_MIN_BACKLASH_RAD = 1.0e-6  # rad: smaller backlash is omitted; it moves a slewing ring's tooth by 1 um
 
 
-def _locations(machine: Machine) -> tuple[str, ...]:
-    return tuple(n for n, a in machine.axes.items() if a.motor and drive_turns(machine, n))
+def _backlash_axes(machine: Machine) -> tuple[str, ...]:
+    return tuple(n for n, a in machine.axes.items() if a.motor and is_rotary_drive(machine, n))
 
 
-def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:
+def _backlash_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify backlash, drive-side inertia, damping ratio and contact frequency.
 
     A worn slewing ring has half a degree of backlash, a new one 1 mrad, which is also the
@@ -151,21 +154,17 @@ def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     matter only for chatter resolved sample by sample. Steel teeth vibrate at 30 to 100 Hz. Faster
     contact of oil and teeth cannot be simulated with 1 ms steps.
     """
-    drive = _drive(machine, location)
-    present, rings = drive.backlash, _frequency(drive)
+    drive = _current_transmission(machine, location)
+    present, rings = drive.backlash, _spring_frequency(drive)
     return {
-        "gap": Parameter(
-            "rad", present, 0.0, max(0.05, present), 0.01, 1e-3, starts=(0.003, 0.01, 0.03)
-        ),
-        "drive_inertia": _inertia("kg m^2", drive.inertia),
-        "damping_ratio": _damping_ratio(drive),
-        "contact_frequency": Parameter(
-            "Hz", rings, min(10.0, rings), max(110.0, rings), 20.0, 20.0, optional=True
-        ),
+        "gap": Parameter("rad", present, 0.0, max(0.05, present), 0.01, 1e-3, start_values=(0.003, 0.01, 0.03)),
+        "drive_inertia": _inertia_parameter("kg m^2", drive.inertia),
+        "damping_ratio": _damping_ratio_parameter(drive),
+        "contact_frequency": Parameter("Hz", rings, min(10.0, rings), max(110.0, rings), 20.0, 20.0, optional=True),
     }
 
 
-def _inertia(unit: str, own: float, least: float = 0.0, usual: float = 0.0) -> Parameter:
+def _inertia_parameter(unit: str, own: float, least: float = 0.0, usual: float = 0.0) -> Parameter:
     """Specify the drive-side inertia as an optional parameter.
 
     It is known only to a factor and does not identify a defect. The lower bound is not below the
@@ -175,85 +174,88 @@ def _inertia(unit: str, own: float, least: float = 0.0, usual: float = 0.0) -> P
     return Parameter(unit, own, low, own + 4.0 * scale, scale, scale, optional=True)
 
 
-def _damping_ratio(drive: Transmission) -> Parameter:
-    ratio = _ratio(drive)
+def _damping_ratio_parameter(drive: Transmission) -> Parameter:
+    ratio = _transmission_damping_ratio(drive)
     return Parameter("1", ratio, min(1e-3, ratio), max(2.0, ratio), 0.3, 0.3, optional=True)
 
 
-def _frequency(drive: Transmission) -> float:
+def _spring_frequency(drive: Transmission) -> float:
     """Return the natural frequency of the drive side on its spring [Hz]."""
     return math.sqrt(drive.stiffness / drive.inertia) / (2.0 * math.pi)
 
 
-def _drive(machine: Machine, location: str) -> Transmission:
-    return machine.axes[location].transmission or rigid_drive(machine, location)
+def _current_transmission(machine: Machine, location: str) -> Transmission:
+    return machine.axes[location].transmission or rigid_transmission(machine, location)
 
 
-def _ratio(drive: Transmission) -> float:
+def _transmission_damping_ratio(drive: Transmission) -> float:
     return drive.damping / (2.0 * math.sqrt(drive.stiffness * drive.inertia))
 
 
-def _apply(machine: Machine, location: str, values: Values) -> Machine:
+def _set_backlash(machine: Machine, location: str, values: Values) -> Machine:
     """Add a motor-side inertia, taken from the link, and a stiff spring with backlash."""
     gap, before = values["gap"], machine.axes[location].transmission
-    if gap < _CLOSED and before is None:
+    if gap < _MIN_BACKLASH_RAD and before is None:
         return machine
-    drive = _drive(machine, location)
+    drive = _current_transmission(machine, location)
     inertia = values.get("drive_inertia", drive.inertia)
-    ratio, rings = values.get("damping_ratio", _ratio(drive)), _frequency(drive)
+    ratio, rings = (
+        values.get("damping_ratio", _transmission_damping_ratio(drive)),
+        _spring_frequency(drive),
+    )
     frequency = values.get("contact_frequency", rings)
     stiffness = drive.stiffness * (inertia / drive.inertia) * (frequency / rings) ** 2
     damping = drive.damping
-    if (inertia, ratio, frequency) != (drive.inertia, _ratio(drive), rings):
+    if (inertia, ratio, frequency) != (drive.inertia, _transmission_damping_ratio(drive), rings):
         damping = 2.0 * ratio * math.sqrt(stiffness * inertia)
     transmission = Transmission(inertia=inertia, stiffness=stiffness, damping=damping, backlash=gap)
     return with_transmission(machine, location, transmission)
 
 
 BACKLASH = Effect(
-    "backlash", "backlash between a motor and its load", "force", _locations, _parameters, _apply
+    "backlash", "backlash between a motor and its load", "force", _backlash_axes, _backlash_parameters, _set_backlash
 )  # fmt: skip
 
 
-_RIGID = 0.02  # of the smallest relevant compliance: stiffer than parts modelled as rigid
-_TURN = 0.015  # rad, deflection of a slewing drive's gears and shafts at full torque
+_MIN_COMPLIANCE_RATIO = 0.02  # of the smallest relevant compliance: stiffer than parts modelled as rigid
+_MOTOR_DEFLECTION_RAD = 0.015  # rad, deflection of a slewing drive's gears and shafts at full torque
 
 
-def _travel(machine: Machine, location: str) -> float:
+def _typical_deflection(machine: Machine, location: str) -> float:
     """Return the typical deflection of a flexible joint at full force [m] or [rad].
 
     For cylinders it is 1 % of the stroke.
     """
     cylinder = machine.axes[location].cylinder
-    return 0.01 * cylinder.stroke if cylinder else _TURN
+    return 0.01 * cylinder.stroke if cylinder else _MOTOR_DEFLECTION_RAD
 
 
-def _parameters_joint_flexibility(machine: Machine, location: str) -> dict[str, Parameter]:
+def _flexibility_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify compliance, drive-side inertia and damping ratio.
 
     The smallest relevant deflection at full pressure is 2 mm for a stroke of 1 m, or 2 mrad.
     Inertia and damping are known only to a factor. The inertia is never below the value that the
     oil alone needs for 1 ms steps; a stiff spring may need more than the stated inertia.
     """
-    usual = _travel(machine, location) / largest_force(machine, location)
+    usual = _typical_deflection(machine, location) / max_drive_force(machine, location)
     transmission = machine.axes[location].transmission
     present = 1.0 / transmission.stiffness if transmission else 0.0
-    drive = transmission or rigid_drive(machine, location)
-    resolved = [resolved_inertia(machine, location, 0.0, k) for k in (0.0, 1.0 / usual)]
+    drive = transmission or rigid_transmission(machine, location)
+    resolved = [min_resolvable_inertia(machine, location, 0.0, k) for k in (0.0, 1.0 / usual)]
     inertia = drive.inertia if transmission else max(drive.inertia, resolved[0])
     high = max(4.0 * usual, present)
     starts = (0.3 * usual, 1.0 * usual, 3.0 * usual)
     least = 0.15 * usual
-    turns = drive_turns(machine, location)
+    turns = is_rotary_drive(machine, location)
     unit, of_inertia = ("rad/(N m)", "kg m^2") if turns else ("m/N", "kg")
     return {
         "compliance": Parameter(unit, present, 0.0, high, usual, least, starts),
-        "drive_inertia": _inertia(of_inertia, inertia, *resolved),
-        "damping_ratio": _damping_ratio(drive),
+        "drive_inertia": _inertia_parameter(of_inertia, inertia, *resolved),
+        "damping_ratio": _damping_ratio_parameter(drive),
     }
 
 
-def _apply_joint_flexibility(machine: Machine, location: str, values: Values) -> Machine:
+def _set_flexibility(machine: Machine, location: str, values: Values) -> Machine:
     """Set the spring stiffness to 1 / compliance; an existing backlash is kept.
 
     A cylinder's spring is in line with it, between piston and rod pin, so that length sensor and
@@ -261,24 +263,24 @@ def _apply_joint_flexibility(machine: Machine, location: str, values: Values) ->
     % of a motor's load. It is increased if a stiff spring needs it for 1 ms steps.
     """
     compliance, before = values["compliance"], machine.axes[location].transmission
-    table = _parameters_joint_flexibility(machine, location)
-    least = _RIGID * table["compliance"].least
+    table = _flexibility_parameters(machine, location)
+    least = _MIN_COMPLIANCE_RATIO * table["compliance"].min_relevant_change
     unlike = [key for key in table if key in values and values[key] != table[key].nominal]
     if not unlike or (before is None and compliance < least):
         return machine
-    transmission = before or rigid_drive(machine, location)
+    transmission = before or rigid_transmission(machine, location)
     stiffness = 1.0 / max(compliance, least) if "compliance" in unlike else transmission.stiffness
     inertia = values.get("drive_inertia", transmission.inertia)
-    inertia = resolved_inertia(machine, location, inertia, stiffness)
-    ratio = values.get("damping_ratio", _ratio(transmission))
+    inertia = min_resolvable_inertia(machine, location, inertia, stiffness)
+    ratio = values.get("damping_ratio", _transmission_damping_ratio(transmission))
     damping = 2.0 * ratio * math.sqrt(stiffness * inertia)
     soft = {"stiffness": stiffness, "inertia": inertia, "damping": damping}
     return with_transmission(machine, location, transmission.model_copy(update=soft))
 
 
 JOINT_FLEXIBILITY = Effect(
-    "joint_flexibility", "compliance between a drive and its load", "force", valves,
-    _parameters_joint_flexibility, _apply_joint_flexibility,
+    "joint_flexibility", "compliance between a drive and its load", "force", valve_axes,
+    _flexibility_parameters, _set_flexibility,
 )  # fmt: skip
 
 EFFECTS = (BACKLASH, JOINT_FLEXIBILITY)

@@ -7,7 +7,7 @@ limit is the largest speed at which the pilot stage moves the spool.
 
 import numpy as np
 
-from hydrotele.effects.effect import Effect, Parameter, Values, changed, valves
+from hydrotele.effects.effect import Effect, Parameter, Values, valve_axes, with_value
 from hydrotele.machine.drives import FlowCurve, Metering, Valve
 from hydrotele.machine.machine import Machine
 
@@ -18,16 +18,16 @@ def _valve(machine: Machine, location: str) -> Valve:
     return valve
 
 
-def _common_deadband(machine: Machine) -> tuple[str, ...]:
+def _common_deadband_axes(machine: Machine) -> tuple[str, ...]:
     """Return the valves whose common deadband applies to at least one direction."""
     return tuple(
-        name for name in valves(machine)
+        name for name in valve_axes(machine)
         if any(way.deadband is None
                for way in (_valve(machine, name).positive, _valve(machine, name).negative))
     )  # fmt: skip
 
 
-def _deadband(machine: Machine, location: str) -> dict[str, Parameter]:
+def _deadband_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the common deadband.
 
     Overlaps are a few per cent of the stroke; the typical hysteresis of a spool is 0.4 %.
@@ -37,10 +37,10 @@ def _deadband(machine: Machine, location: str) -> dict[str, Parameter]:
 
 
 def _set_deadband(machine: Machine, location: str, values: Values) -> Machine:
-    return changed(machine, f"axes.{location}.valve.deadband", values["deadband"])
+    return with_value(machine, f"axes.{location}.valve.deadband", values["deadband"])
 
 
-def _gain(machine: Machine, location: str) -> dict[str, Parameter]:
+def _gain_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the ratio of true to given flow gain.
 
     A manufacturer's flow rating is accurate to 5 or 10 %, the linearity of a spool is 2 %. The
@@ -51,10 +51,10 @@ def _gain(machine: Machine, location: str) -> dict[str, Parameter]:
 
 def _scale_gain(machine: Machine, location: str, values: Values) -> Machine:
     flow = _valve(machine, location).rated_flow * values["ratio"]
-    return changed(machine, f"axes.{location}.valve.rated_flow", flow)
+    return with_value(machine, f"axes.{location}.valve.rated_flow", flow)
 
 
-def _bandwidth(machine: Machine, location: str) -> dict[str, Parameter]:
+def _bandwidth_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the bandwidth of the spool.
 
     The smallest relevant deviation is 8 %. At 8 Hz it changes the lag by 3 ms, the smallest
@@ -65,16 +65,16 @@ def _bandwidth(machine: Machine, location: str) -> dict[str, Parameter]:
 
 
 def _set_bandwidth(machine: Machine, location: str, values: Values) -> Machine:
-    return changed(machine, f"axes.{location}.valve.bandwidth", values["bandwidth"])
+    return with_value(machine, f"axes.{location}.valve.bandwidth", values["bandwidth"])
 
 
-VALVE = (
+COMMON_VALVE_EFFECTS = (
     Effect(
         "valve_deadband",
         "valve overlap that differs from the model",
         "valve",
-        _common_deadband,
-        _deadband,
+        _common_deadband_axes,
+        _deadband_parameters,
         _set_deadband,
         "overlap",
     ),
@@ -82,8 +82,8 @@ VALVE = (
         "valve_gain",
         "valve flow gain that differs from the model",
         "valve",
-        valves,
-        _gain,
+        valve_axes,
+        _gain_parameters,
         _scale_gain,
         "flow gain",
     ),
@@ -91,8 +91,8 @@ VALVE = (
         "spool_lag",
         "spool bandwidth that differs from the model",
         "valve",
-        valves,
-        _bandwidth,
+        valve_axes,
+        _bandwidth_parameters,
         _set_bandwidth,
     ),
 )
@@ -101,21 +101,21 @@ VALVE = (
 DIRECTIONS = ("positive", "negative")
 
 
-def _gains(machine: Machine, location: str) -> dict[str, Parameter]:
+def _direction_gain_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the flow gain ratio of each direction, scaled as the common one."""
     return dict.fromkeys(DIRECTIONS, Parameter("1", 1.0, 0.05, 5.0, 0.15, 0.02))
 
 
-def _scale_gains(machine: Machine, location: str, values: Values) -> Machine:
+def _scale_direction_gains(machine: Machine, location: str, values: Values) -> Machine:
     for direction in DIRECTIONS:
         present = getattr(_valve(machine, location), direction)
         for edge in ("inlet", "outlet"):
             path = f"axes.{location}.valve.{direction}.{edge}"
-            machine = changed(machine, path, getattr(present, edge) * values[direction])
+            machine = with_value(machine, path, getattr(present, edge) * values[direction])
     return machine
 
 
-def _deadbands(machine: Machine, location: str) -> dict[str, Parameter]:
+def _direction_deadband_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the deadband of each direction, with larger bounds for a spool off its centre."""
     present = _valve(machine, location).deadbands
     return {
@@ -124,32 +124,32 @@ def _deadbands(machine: Machine, location: str) -> dict[str, Parameter]:
     }
 
 
-def _set_deadbands(machine: Machine, location: str, values: Values) -> Machine:
+def _set_direction_deadbands(machine: Machine, location: str, values: Values) -> Machine:
     present = _valve(machine, location).deadbands
     for direction, band in zip(DIRECTIONS, present, strict=True):
         if values[direction] != band:
             path = f"axes.{location}.valve.{direction}.deadband"
-            machine = changed(machine, path, values[direction])
+            machine = with_value(machine, path, values[direction])
     return machine
 
 
-BY_DIRECTION = (
+DIRECTION_EFFECTS = (
     Effect(
         "valve_gain_direction", "valve flow gains that differ between the directions", "valve",
-        valves, _gains, _scale_gains, "flow gain",
+        valve_axes, _direction_gain_parameters, _scale_direction_gains, "flow gain",
     ),
     Effect(
         "valve_deadband_direction", "valve overlaps that differ between the directions", "valve",
-        valves, _deadbands, _set_deadbands, "overlap",
+        valve_axes, _direction_deadband_parameters, _set_direction_deadbands, "overlap",
     ),
 )  # fmt: skip
 
 
-_KNOTS = tuple(float(t) for t in np.linspace(0.0, 1.0, 8))
+_CURVE_KNOTS = tuple(float(t) for t in np.linspace(0.0, 1.0, 8))
 _DIRECTIONS = ("positive", "negative")
 
 
-def _progression(machine: Machine, location: str) -> dict[str, Parameter]:
+def _progression_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the progression of each direction.
 
     A progression of 0.3 gives an opening of 42 % at half travel. Estimates: spools for fine control
@@ -158,17 +158,17 @@ def _progression(machine: Machine, location: str) -> dict[str, Parameter]:
     return dict.fromkeys(_DIRECTIONS, Parameter("1", 0.0, -0.9, 0.9, 0.3, 0.04))
 
 
-def _bend(machine: Machine, location: str, values: Values) -> Machine:
+def _set_progression(machine: Machine, location: str, values: Values) -> Machine:
     valve = machine.axes[location].valve
     assert valve
     for direction in _DIRECTIONS:
         if values[direction] != 0.0:
-            curve = bent(getattr(valve, direction), values[direction])
-            machine = changed(machine, f"axes.{location}.valve.{direction}.curve", curve)
+            curve = bend_flow_curve(getattr(valve, direction), values[direction])
+            machine = with_value(machine, f"axes.{location}.valve.{direction}.curve", curve)
     return machine
 
 
-def bent(present: Metering, progression: float) -> FlowCurve:
+def bend_flow_curve(present: Metering, progression: float) -> FlowCurve:
     """Return the flow curve of a direction multiplied by `1 - c + c t`, t being the travel.
 
     The full opening does not change.
@@ -180,25 +180,26 @@ def bent(present: Metering, progression: float) -> FlowCurve:
     Returns:
         The curve at the knots of the given one, otherwise at eight knots.
     """
-    old = present.curve or FlowCurve(travel=_KNOTS, opening=_KNOTS)
+    old = present.curve or FlowCurve(travel=_CURVE_KNOTS, opening=_CURVE_KNOTS)
     pairs = zip(old.travel, old.opening, strict=True)
     opening = tuple(o * (1.0 - progression + progression * t) for t, o in pairs)
     return FlowCurve(travel=old.travel, opening=opening)
 
 
 FLOW_CURVE = Effect(
-    "flow_curve", "a nonlinear valve opening over the travel", "valve", valves, _progression, _bend
+    "flow_curve", "a nonlinear valve opening over the travel", "valve", valve_axes, _progression_parameters,
+    _set_progression
 )  # fmt: skip
 
 
-EDGES = {
+EDGE_FIELDS = {
     "p_a": "positive.inlet", "b_t": "positive.outlet", "p_b": "negative.inlet",
     "a_t": "negative.outlet",
 }  # fmt: skip
 """Metering edge -> field of the valve that holds its gain."""
 
 
-def _edges(machine: Machine, location: str) -> dict[str, Parameter]:
+def _edge_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the gain of each metering edge.
 
     Estimates: spools for single-rod cylinders differ by tens of per cent; a notch changes 3 %.
@@ -210,24 +211,23 @@ def _edges(machine: Machine, location: str) -> dict[str, Parameter]:
         "a_t": valve.negative.outlet,
     }  # fmt: skip
     return {
-        edge: Parameter("1", ratio, min(0.05, ratio), max(5.0, ratio), 0.3, 0.03)
-        for edge, ratio in present.items()
+        edge: Parameter("1", ratio, min(0.05, ratio), max(5.0, ratio), 0.3, 0.03) for edge, ratio in present.items()
     }
 
 
 def _set_edges(machine: Machine, location: str, values: Values) -> Machine:
-    for edge, field in EDGES.items():
-        machine = changed(machine, f"axes.{location}.valve.{field}", values[edge])
+    for edge, field in EDGE_FIELDS.items():
+        machine = with_value(machine, f"axes.{location}.valve.{field}", values[edge])
     return machine
 
 
 METERING_EDGES = Effect(
     "metering_edges", "areas of a valve's metering edges (P-A, B-T, P-B, A-T) that differ from the"
-    " model", "valve", valves, _edges, _set_edges,
+    " model", "valve", valve_axes, _edge_parameters, _set_edges,
 )  # fmt: skip
 
 
-def _travel_time(machine: Machine, location: str) -> dict[str, Parameter]:
+def _travel_time_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the time from centre to full opening, scaled by the spool's 1 / w; 0 without a limit.
 
     A step to full opening moves an unlimited spool with damping ratio 0.9 at 0.38 w at most. A
@@ -240,23 +240,23 @@ def _travel_time(machine: Machine, location: str) -> dict[str, Parameter]:
     return {
         "travel_time": Parameter(
             "s", present, 0.0, max(200.0 * own, present), 8.0 * own, 4.0 * own,
-            starts=(8.0 * own, 40.0 * own),
+            start_values=(8.0 * own, 40.0 * own),
         )
     }  # fmt: skip
 
 
-def _set(machine: Machine, location: str, values: Values) -> Machine:
+def _set_slew_limit(machine: Machine, location: str, values: Values) -> Machine:
     limit = 1.0 / values["travel_time"] if values["travel_time"] > 0.0 else None
     valve = machine.axes[location].valve
     assert valve
     if valve.slew_limit and limit and abs(limit / valve.slew_limit - 1.0) < 1.0e-15:
         return machine  # the reciprocal of a reciprocal may differ by rounding
-    return changed(machine, f"axes.{location}.valve.slew_limit", limit)
+    return with_value(machine, f"axes.{location}.valve.slew_limit", limit)
 
 
 SPOOL_SLEW = Effect(
-    "spool_slew", "a spool speed that is limited by the pilot stage", "valve", valves,
-    _travel_time, _set,
+    "spool_slew", "a spool speed that is limited by the pilot stage", "valve", valve_axes,
+    _travel_time_parameters, _set_slew_limit,
 )  # fmt: skip
 
-EFFECTS = (*VALVE, *BY_DIRECTION, FLOW_CURVE, METERING_EDGES, SPOOL_SLEW)
+EFFECTS = (*COMMON_VALVE_EFFECTS, *DIRECTION_EFFECTS, FLOW_CURVE, METERING_EDGES, SPOOL_SLEW)

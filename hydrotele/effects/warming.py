@@ -4,33 +4,33 @@ from hydrotele.effects.effect import Effect, Parameter, Values, with_terms
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.law import Term
 
-NAME, ALL = "warming", "all"
-_SLOW = 300.0  # s, time constant of warming of a tank of some hundred litres
+NAME, ALL_AXES = "warming", "all"
+_WARMING_TIME_S = 300.0  # s, time constant of warming of a tank of some hundred litres
 
 
-def _viscous(machine: Machine) -> dict[str, float]:
+def _viscous_friction(machine: Machine) -> dict[str, float]:
     """Return the viscous friction of the axes that have any."""
     found = {name: axis.drive.friction.viscous for name, axis in machine.axes.items()}
     return {name: viscous for name, viscous in found.items() if viscous}
 
 
-def _leaking(machine: Machine) -> dict[str, float]:
+def _leakage_coefficients(machine: Machine) -> dict[str, float]:
     """Return the leakage of the axes that have any."""
     found = {n: axis.hydraulic_drive.leakage for n, axis in machine.hydraulic_axes.items()}
     return {name: leakage for name, leakage in found.items() if leakage}
 
 
-def _place(machine: Machine) -> tuple[str, ...]:
-    return (ALL,) if _viscous(machine) or _leaking(machine) else ()
+def _oil_location(machine: Machine) -> tuple[str, ...]:
+    return (ALL_AXES,) if _viscous_friction(machine) or _leakage_coefficients(machine) else ()
 
 
-def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:
+def _warming_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Specify the ratio of final to initial viscosity and the time constant of warming.
 
     Warming by 20 K halves the viscosity; a change of 5 % corresponds to 2 K.
     """
     term = next((term for term in machine.terms if term.name == NAME), None)
-    present = dict(term.parameters) if term else {"ratio": 1.0, "time_constant": _SLOW}
+    present = dict(term.parameters) if term else {"ratio": 1.0, "time_constant": _WARMING_TIME_S}
     ratio, slow = present["ratio"], present["time_constant"]
     assert isinstance(ratio, float) and isinstance(slow, float)
     return {
@@ -39,7 +39,7 @@ def _parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     }
 
 
-def _apply(machine: Machine, location: str, values: Values) -> Machine:
+def _set_warming(machine: Machine, location: str, values: Values) -> Machine:
     """Add terms that change the symmetric part of the machine's viscous friction and leakage."""
     if values["ratio"] == 1.0:
         return with_terms(machine, NAME, [])
@@ -47,9 +47,9 @@ def _apply(machine: Machine, location: str, values: Values) -> Machine:
     terms = [
         Term(name=NAME, axis=axis, balance="force", law="viscous_drift",
              parameters={"viscous": viscous, **numbers})
-        for axis, viscous in _viscous(machine).items()
+        for axis, viscous in _viscous_friction(machine).items()
     ]  # fmt: skip
-    for axis, leakage in _leaking(machine).items():
+    for axis, leakage in _leakage_coefficients(machine).items():
         into_rod, into_head = {"leakage": leakage, **numbers}, {"leakage": -leakage, **numbers}
         terms += [
             Term(name=NAME, axis=axis, balance="flow_rod", law="leakage_drift",
@@ -61,6 +61,6 @@ def _apply(machine: Machine, location: str, values: Values) -> Machine:
 
 
 EFFECT = Effect(
-    NAME, "warming oil, with less viscous friction and more leakage", "force", _place, _parameters,
-    _apply,
+    NAME, "warming oil, with less viscous friction and more leakage", "force", _oil_location, _warming_parameters,
+    _set_warming,
 )  # fmt: skip

@@ -10,30 +10,30 @@ import mujoco
 import numpy as np
 
 from hydrotele.control.resolved_motion import arm_axes
-from hydrotele.control.servo import drive_tables
+from hydrotele.control.servo import tabulate_drives
 from hydrotele.core.errors import InputError
 from hydrotele.envs.episode import (
-    AXES,
-    CHANNELS,
     EPISODE_STATE,
-    MEASURES,
+    MAX_AXES,
+    MAX_CHANNELS,
+    MAX_MEASURES,
     NEXT_STEP,
     RESET,
     STEP,
-    seed_streams,
+    make_seed_states,
 )
-from hydrotele.envs.facts import TaskSetup, make_facts, timing
+from hydrotele.envs.facts import TaskSetup, make_task_parameters, make_timing
 from hydrotele.envs.loop import advance
 from hydrotele.envs.task import Options, Task
 from hydrotele.envs.variants import make_variants
 from hydrotele.envs.world import machine_fields
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.simulate.fleet import Fleet
+from hydrotele.simulate.fleet import SimulationBatch
 from hydrotele.simulate.native import stop_profiling_clock
-from hydrotele.simulate.stepping import line_length, past_length
+from hydrotele.simulate.stepping import delay_line_length, sensor_history_length
 
 
-def set_up(task: Task, options: Options) -> TaskSetup:
+def make_setup(task: Task, options: Options) -> TaskSetup:
     """Combine a task with the user's options: load its machines, observation and clocks.
 
     Args:
@@ -52,12 +52,12 @@ def set_up(task: Task, options: Options) -> TaskSetup:
     )  # fmt: skip
     if options.variants < 1:
         raise InputError("variants", f"must be at least 1, not {options.variants}")
-    machine, clock = load_machine(task.machine, task.tool), timing(options)
+    machine, clock = load_machine(task.machine, task.tool), make_timing(options)
     arm = arm_axes(machine)
-    axes = (*arm, *task.more_axes)
+    axes = (*arm, *task.extra_axes)
     variants = make_variants(task, options, machine)
     fields = [*machine_fields(machine, axes, len(arm)), *task.fields(machine, axes)]
-    table = drive_tables(machine, variants.plant.axes)[1]
+    table = tabulate_drives(machine, variants.plant.axes)[1]
     return TaskSetup(task, options, clock, machine, axes, len(arm), variants, fields, table)
 
 
@@ -72,7 +72,7 @@ class TaskCore:
         simulations: the batch of simulation states.
         episodes: (n,) records of EPISODE_STATE.
         observation: (n, o) float32.
-        final: (n, o) float32 observations before an autoreset in the same step.
+        final_observation: (n, o) float32 observations before an autoreset in the same step.
         reward: (n,).
         terminated: (n,) uint8.
         truncated: (n,) uint8.
@@ -97,62 +97,62 @@ class TaskCore:
             InputError: an option is not valid for the task.
         """
         stop_profiling_clock()
-        self.count, self.setup = count, set_up(task, options)
+        self.count, self.setup = count, make_setup(task, options)
         if count < 1:
             raise InputError("num_envs", f"must be at least 1, not {count}")
-        self.simulations = Fleet(self.setup.variants.plant.model, count, threads)
+        self.simulations = SimulationBatch(self.setup.variants.plant.model, count, threads)
         self._make_arrays()
-        self.facts = make_facts(self.setup, count, autoreset)
-        self._link()
-        self._begun = np.zeros(count, bool)
+        self.parameters = make_task_parameters(self.setup, count, autoreset)
+        self._store_addresses()
+        self._is_started = np.zeros(count, bool)
 
     def _make_arrays(self) -> None:
         n, o, v = self.count, len(self.setup.fields), self.setup.variants
         self.episodes = np.zeros(n, EPISODE_STATE)
         self.action = np.zeros((n, len(self.setup.axes)), np.float32)
-        self.observation, self.final = (np.zeros((n, o), np.float32) for _ in range(2))
-        self.low = np.array([field.low for field in self.setup.fields], np.float32)
-        self.high = np.array([field.high for field in self.setup.fields], np.float32)
+        self.observation, self.final_observation = (np.zeros((n, o), np.float32) for _ in range(2))
+        self.observation_low = np.array([field.low for field in self.setup.fields], np.float32)
+        self.observation_high = np.array([field.high for field in self.setup.fields], np.float32)
         self.reward = np.zeros(n)
-        self.measures, self.final_measures = (np.zeros((n, MEASURES)) for _ in range(2))
+        self.measures, self.final_measures = (np.zeros((n, MAX_MEASURES)) for _ in range(2))
         self.terminated, self.truncated = (np.zeros(n, np.uint8) for _ in range(2))
-        self.terrain = np.zeros((n, self.setup.task.terrain))
-        self._commands = np.zeros((n, line_length(v.delays, self.setup.clock.substeps), AXES))
-        self._sensed = np.zeros((n, past_length(v.lags, v.ratios), CHANNELS))
-        self._before = np.zeros((n, CHANNELS))
-        self._expanded = {name: self.simulations.expand(name) for name in v.fields}
-        for name, live in self._expanded.items():
+        self.terrain = np.zeros((n, self.setup.task.terrain_size))
+        self._commands = np.zeros((n, delay_line_length(v.command_delays, self.setup.clock.substeps), MAX_AXES))
+        self._sensed = np.zeros((n, sensor_history_length(v.sensor_delays, v.lag_ratios), MAX_CHANNELS))
+        self._sensed_before = np.zeros((n, MAX_CHANNELS))
+        self._expanded_fields = {name: self.simulations.expand_field(name) for name in v.fields}
+        for name, live in self._expanded_fields.items():
             if live.shape[1] != v.fields[name].shape[1]:  # native code copies one into the other
                 message = f"variants cannot differ in {name}: the model has colliding meshes"
                 raise InputError("randomise", message)
         same = np.tile(v.plant.model.actuator_user.ravel(), (len(v.states), 1))
-        self._users = np.ascontiguousarray(v.fields.get("actuator_user", same))
+        self._actuator_parameters = np.ascontiguousarray(v.fields.get("actuator_user", same))
 
-    def _link(self) -> None:
+    def _store_addresses(self) -> None:
         """Store the addresses of all arrays in the record that native code reads."""
-        v, f = self.setup.variants, self.facts
+        v, f = self.setup.variants, self.parameters
         f["delayed_command"], f["delayed_sensor"] = self._commands.shape[1], self._sensed.shape[1]
         rows = [(v.fields[n].ctypes.data, live.ctypes.data, v.fields[n].shape[1])
-                for n, live in self._expanded.items()]  # fmt: skip
-        self._places = np.array(rows, np.int64).reshape(-1, 3)
+                for n, live in self._expanded_fields.items()]  # fmt: skip
+        self._field_addresses = np.array(rows, np.int64).reshape(-1, 3)
         f["fields"] = len(rows)
         for name, array in (
             ("episodes", self.episodes), ("action", self.action), ("observation", self.observation),
-            ("final", self.final), ("low", self.low), ("high", self.high),
+            ("final", self.final_observation), ("low", self.observation_low), ("high", self.observation_high),
             ("reward", self.reward), ("terminated", self.terminated),
             ("truncated", self.truncated), ("measures", self.measures),
             ("final_measures", self.final_measures), ("starts", v.states),
-            ("start_tips", v.tips), ("users", self._users), ("scales", v.scales),
-            ("offsets", v.offsets), ("lags", v.lags), ("ratios", v.ratios),
-            ("delays", v.delays), ("commands", self._commands), ("sensed", self._sensed),
-            ("sensed_before", self._before), ("places", self._places), ("terrain", self.terrain),
+            ("start_tips", v.start_tips), ("users", self._actuator_parameters), ("scales", v.sensor_scales),
+            ("offsets", v.sensor_offsets), ("lags", v.sensor_delays), ("ratios", v.lag_ratios),
+            ("delays", v.command_delays), ("commands", self._commands), ("sensed", self._sensed),
+            ("sensed_before", self._sensed_before), ("places", self._field_addresses), ("terrain", self.terrain),
         ):  # fmt: skip
             f[name] = array.ctypes.data
-        if "eq_data" in self._expanded:
-            f["eq_rows"] = self._expanded["eq_data"].ctypes.data
+        if "eq_data" in self._expanded_fields:
+            f["eq_rows"] = self._expanded_fields["eq_data"].ctypes.data
 
     @property
-    def coordinates(self) -> tuple[str, ...]:
+    def action_names(self) -> tuple[str, ...]:
         """Names of the actions: axes, or tip coordinates and the axes beyond the arm."""
         setup = self.setup
         if setup.options.action != "resolved_motion":
@@ -164,9 +164,9 @@ class TaskCore:
     def bytes_per_environment(self) -> int:
         """Memory per environment: simulation state, episode record and results [byte]."""
         arrays = (
-            self.episodes, self.action, self.observation, self.final, self.reward, self.terminated,
+            self.episodes, self.action, self.observation, self.final_observation, self.reward, self.terminated,
             self.truncated, self.measures, self.final_measures, self.terrain, self._commands,
-            self._sensed, self._before, self.simulations.state, *self._expanded.values(),
+            self._sensed, self._sensed_before, self.simulations.state, *self._expanded_fields.values(),
         )  # fmt: skip
         return sum(array.nbytes for array in arrays) // self.count
 
@@ -183,18 +183,18 @@ class TaskCore:
             ValueError: a seed is negative or exceeds 64 bits.
         """
         place = slice(None) if chosen is None else chosen
-        begun = self._begun.copy()
+        begun = self._is_started.copy()
         begun[place] = True
         if not begun.all():
             raise RuntimeError("the first reset must begin all episodes: give it no mask")
         if seeds is not None:
-            self.episodes["random"][place] = seed_streams(seeds)
-        elif not self._begun.all():
+            self.episodes["random"][place] = make_seed_states(seeds)
+        elif not self._is_started.all():
             raise RuntimeError("the first reset needs seeds")
-        self._begun = begun
-        self.facts["call"] = RESET
+        self._is_started = begun
+        self.parameters["call"] = RESET
         ids = None if chosen is None else np.ascontiguousarray(chosen, np.int32)
-        self.simulations.apply(advance.address, self.facts.ctypes.data, ids)
+        self.simulations.apply(advance.address, self.parameters.ctypes.data, ids)
 
     def step(self, action: np.ndarray) -> None:
         """Advance all episodes by one environment step.
@@ -206,7 +206,7 @@ class TaskCore:
             ValueError: the shape is wrong, or an action is not finite.
             RuntimeError: the episodes have not been reset, or the simulations were closed.
         """
-        if not self._begun.all():
+        if not self._is_started.all():
             raise RuntimeError("reset before the first step")
         wanted = self.action.shape
         if np.shape(action) not in (wanted, wanted[1:]):
@@ -214,17 +214,17 @@ class TaskCore:
         self.action[...] = action
         if not np.isfinite(self.action).all():
             raise ValueError("all actions must be finite numbers")
-        self.facts["call"] = STEP
-        self.simulations.apply(advance.address, self.facts.ctypes.data)
+        self.parameters["call"] = STEP
+        self.simulations.apply(advance.address, self.parameters.ctypes.data)
 
-    def step_one(self, action: np.ndarray) -> None:
+    def step_single(self, action: np.ndarray) -> None:
         """Advance a single episode; like `step`, but the action must have shape (a,)."""
         wanted = self.action.shape[1:]
         if np.shape(action) != wanted:
             raise ValueError(f"the action must have shape {wanted}, not {np.shape(action)}")
         self.step(action)
 
-    def model_and_data(self, number: int = 0) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    def copy_model_and_data(self, number: int = 0) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """Return copies of the model and data of one simulation, after `mj_forward`."""
         model = copy.copy(self.setup.variants.plant.model)
         data = mujoco.MjData(model)
@@ -235,7 +235,7 @@ class TaskCore:
 
     def close(self) -> None:
         """Free the memory of the simulations."""
-        self._expanded = {}
+        self._expanded_fields = {}
         self.simulations.close()
 
     def __reduce__(self):

@@ -14,11 +14,11 @@ from dm_control.mujoco import engine, wrapper
 from dm_env import specs
 
 from hydrotele.envs.episode import DISABLED
-from hydrotele.envs.making import info_of, make_core
-from hydrotele.envs.stage import FREE, Camera, Stage
-from hydrotele.envs.world import Field
+from hydrotele.envs.making import make_core, make_info
+from hydrotele.envs.stage import FREE_CAMERA, Camera, TaskRenderer
+from hydrotele.envs.world import ObservationField
 
-FLAT = "observations"  # dm_control's key for a flat observation
+FLAT_KEY = "observations"  # dm_control's key for a flat observation
 
 
 def load(
@@ -69,22 +69,23 @@ class MachineEnvironment(dm_env.Environment):
         elif isinstance(random, np.random.RandomState):
             random = int(random.randint(2**31 - 1))
         self._seed = random
-        self._begun, self._over = False, True
-        self._places = group([FLAT] * len(self.core.setup.fields) if flat else self._kinds())
-        self.fields: dict[str, tuple[Field, ...]] = {
-            key: tuple(self.core.setup.fields[i] for i in places)
-            for key, places in self._places.items()
+        self._is_started, self._is_over = False, True
+        self._key_indices = group_indices(
+            [FLAT_KEY] * len(self.core.setup.fields) if flat else self._observation_keys()
+        )
+        self.fields: dict[str, tuple[ObservationField, ...]] = {
+            key: tuple(self.core.setup.fields[i] for i in places) for key, places in self._key_indices.items()
         }
-        self._stage: Stage | None = None
+        self._stage: TaskRenderer | None = None
         self._physics: Physics | None = None
 
-    def _kinds(self) -> list[str]:
+    def _observation_keys(self) -> list[str]:
         return [field.name.partition(".")[0] for field in self.core.setup.fields]
 
     def reset(self) -> dm_env.TimeStep:
         """Start an episode; the first one uses the seed."""
-        self.core.reset(None if self._begun else np.array([self._seed]))
-        self._begun, self._over = True, False
+        self.core.reset(None if self._is_started else np.array([self._seed]))
+        self._is_started, self._is_over = True, False
         return dm_env.restart(self._observation())
 
     def step(self, action: np.ndarray) -> dm_env.TimeStep:
@@ -99,41 +100,42 @@ class MachineEnvironment(dm_env.Environment):
         Raises:
             ValueError: the action has the wrong shape, or is not finite.
         """
-        if self._over:
+        if self._is_over:
             return self.reset()
         core = self.core
-        core.step_one(action)
+        core.step_single(action)
         reward, seen = float(core.reward[0]), self._observation()
-        self._over = bool(core.terminated[0] or core.truncated[0])
+        self._is_over = bool(core.terminated[0] or core.truncated[0])
         if core.terminated[0]:
             return dm_env.termination(reward, seen)
-        return dm_env.truncation(reward, seen) if self._over else dm_env.transition(reward, seen)
+        return dm_env.truncation(reward, seen) if self._is_over else dm_env.transition(reward, seen)
 
     def _observation(self) -> collections.OrderedDict[str, np.ndarray]:
-        return split(self.core.observation[0], self._places)
+        return split_by_key(self.core.observation[0], self._key_indices)
 
     def observation_spec(self) -> collections.OrderedDict[str, specs.BoundedArray]:
         """Return the bounds in SI units at which observations saturate; see `fields` for names."""
-        low, high = (split(ends, self._places) for ends in (self.core.low, self.core.high))
+        low, high = (
+            split_by_key(ends, self._key_indices) for ends in (self.core.observation_low, self.core.observation_high)
+        )
         return collections.OrderedDict(
-            (key, specs.BoundedArray(low[key].shape, np.float32, low[key], high[key], key))
-            for key in self._places
+            (key, specs.BoundedArray(low[key].shape, np.float32, low[key], high[key], key)) for key in self._key_indices
         )
 
     def action_spec(self) -> specs.BoundedArray:
         """Return the action bounds, (a,) from -1 to 1; the name lists the axes, tab-separated."""
-        name, count = "\t".join(self.core.coordinates), len(self.core.coordinates)
+        name, count = "\t".join(self.core.action_names), len(self.core.action_names)
         return specs.BoundedArray((count,), np.float32, -1.0, 1.0, name)
 
     def control_timestep(self) -> float:
         """Return the time between steps [s]."""
         return 1.0 / self.core.setup.options.control_rate
 
-    def figures(self) -> dict[str, Any]:
+    def last_info(self) -> dict[str, Any]:
         """Return the `info` of the last step: task measures, variant and fault."""
-        return {name: values[0] for name, values in info_of(self.core).items()}
+        return {name: values[0] for name, values in make_info(self.core).items()}
 
-    def render(self, height: int = 240, width: int = 320, camera_id: Camera = FREE) -> np.ndarray:
+    def render(self, height: int = 240, width: int = 320, camera_id: Camera = FREE_CAMERA) -> np.ndarray:
         """Render the machine and its goal.
 
         Args:
@@ -148,11 +150,11 @@ class MachineEnvironment(dm_env.Environment):
         Raises:
             InputError: the camera does not exist, or OpenGL does not work.
         """
-        return self._staged().picture(0, width, height, camera_id)
+        return self._get_stage().render(0, width, height, camera_id)
 
-    def _staged(self) -> Stage:
+    def _get_stage(self) -> TaskRenderer:
         if self._stage is None:
-            self._stage = Stage(self.core)
+            self._stage = TaskRenderer(self.core)
         return self._stage
 
     @property
@@ -161,11 +163,11 @@ class MachineEnvironment(dm_env.Environment):
 
         Changes to it do not affect the simulation.
         """
-        stage = self._staged()
+        stage = self._get_stage()
         if self._physics is None:
             self._physics = Physics.from_model(wrapper.MjModel(stage.model))
             self._physics.stage = stage
-        stage.show()
+        stage.update()
         mujoco.mj_copyData(self._physics.data.ptr, stage.model, stage.data)
         return self._physics
 
@@ -182,11 +184,9 @@ class MachineEnvironment(dm_env.Environment):
 class Physics(engine.Physics):
     """dm_control physics of an environment, whose `render` also draws the goal."""
 
-    stage: Stage
+    stage: TaskRenderer
 
-    def render(
-        self, height: int = 240, width: int = 320, camera_id: Any = FREE, **asked: Any
-    ) -> np.ndarray:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def render(self, height: int = 240, width: int = 320, camera_id: Any = FREE_CAMERA, **asked: Any) -> np.ndarray:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Render like the environment, or with dm_control if further options are given.
 
         Args:
@@ -204,10 +204,10 @@ class Physics(engine.Physics):
         """
         if any(value not in (None, False, ()) for value in asked.values()):
             return super().render(height, width, camera_id, **asked)
-        return self.stage.picture(0, width, height, camera_id)
+        return self.stage.render(0, width, height, camera_id)
 
 
-def group(keys: list[str]) -> collections.OrderedDict[str, np.ndarray]:
+def group_indices(keys: list[str]) -> collections.OrderedDict[str, np.ndarray]:
     """Return the indices of every distinct key in a list, in order of first occurrence."""
     places: collections.OrderedDict[str, list[int]] = collections.OrderedDict()
     for place, key in enumerate(keys):
@@ -215,8 +215,6 @@ def group(keys: list[str]) -> collections.OrderedDict[str, np.ndarray]:
     return collections.OrderedDict((key, np.array(some)) for key, some in places.items())
 
 
-def split(
-    values: np.ndarray, places: Mapping[str, np.ndarray]
-) -> collections.OrderedDict[str, np.ndarray]:
+def split_by_key(values: np.ndarray, places: Mapping[str, np.ndarray]) -> collections.OrderedDict[str, np.ndarray]:
     """Return a copy of the values of every key."""
     return collections.OrderedDict((key, values[some]) for key, some in places.items())

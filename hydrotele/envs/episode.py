@@ -8,12 +8,12 @@ import numpy as np
 
 from hydrotele.core.compiled import compiled
 
-AXES = 8  # maximum number of axes of a machine
-ARM = 5  # maximum number of arm axes among them
-CHANNELS = 3 * AXES + 1  # sensors: positions, head and rod pressures of valves, supply pressure
-GOAL = 96  # values that a task stores per episode for its goal and progress
-PARAMETERS = 64  # maximum number of task parameters
-MEASURES = 8  # maximum number of task measures per step, reported in `info`
+MAX_AXES = 8  # maximum number of axes of a machine
+MAX_ARM_AXES = 5  # maximum number of arm axes among them
+MAX_CHANNELS = 3 * MAX_AXES + 1  # sensors: positions, head and rod pressures of valves, supply pressure
+GOAL_SIZE = 96  # values that a task stores per episode for its goal and progress
+MAX_PARAMETERS = 64  # maximum number of task parameters
+MAX_MEASURES = 8  # maximum number of task measures per step, reported in `info`
 
 VALVE, JOINT_RATE, RESOLVED_MOTION = range(3)  # values of `mode`: kind of actions
 ACTIONS = ("valve", "joint_rate", "resolved_motion")
@@ -36,24 +36,28 @@ EPISODE_STATE = np.dtype(
         ("last_fault", _I),  # fault of the previous episode
         ("warnings", _I),  # total number of MuJoCo warnings
         ("saturated", _I),  # total number of observations outside their bounds
-        ("position", _F, AXES),  # true axis positions [rad], [m]
+        ("position", _F, MAX_AXES),  # true axis positions [rad], [m]
         ("tip", _F, 3),  # true tip position in the world frame [m]
-        ("joint", _F, AXES),  # measured axis positions [rad], [m]
-        ("rate", _F, AXES),  # difference quotients of the measured positions [rad/s], [m/s]
-        ("head", _F, AXES),  # measured head-side pressures [Pa]
-        ("rod", _F, AXES),  # measured rod-side pressures [Pa]
+        ("joint", _F, MAX_AXES),  # measured axis positions [rad], [m]
+        ("rate", _F, MAX_AXES),  # difference quotients of the measured positions [rad/s], [m/s]
+        ("head", _F, MAX_AXES),  # measured head-side pressures [Pa]
+        ("rod", _F, MAX_AXES),  # measured rod-side pressures [Pa]
         ("supply", _F),  # measured supply pressure [Pa]
-        ("error", _F, CHANNELS),  # random errors of the current sample
-        ("reference", _F, AXES),  # reference axis positions [rad], [m]
-        ("reference_rate", _F, AXES),  # reference axis rates [rad/s], [m/s]
-        ("sampled_reference", _F, AXES),  # references at the time of the last sensor sample
-        ("pose", _F, ARM),  # pose of the references: r [m], theta, z [m], attitude, head [rad]
-        ("pose_rate", _F, ARM),  # [m/s], [rad/s]
+        ("error", _F, MAX_CHANNELS),  # random errors of the current sample
+        ("reference", _F, MAX_AXES),  # reference axis positions [rad], [m]
+        ("reference_rate", _F, MAX_AXES),  # reference axis rates [rad/s], [m/s]
+        ("sampled_reference", _F, MAX_AXES),  # references at the time of the last sensor sample
+        (
+            "pose",
+            _F,
+            MAX_ARM_AXES,
+        ),  # pose of the references: r [m], theta, z [m], attitude, head [rad]
+        ("pose_rate", _F, MAX_ARM_AXES),  # [m/s], [rad/s]
         ("blocked", _I),  # whether the arm is at the edge of its workspace
-        ("load", _F, AXES),  # low-pass filtered drive forces [N], [N m]
-        ("command", _F, AXES),  # valve and drive commands [1], or in the drive's unit
-        ("drive", _F, (4, AXES)),  # reference drive velocity, moment arm, two chamber volumes
-        ("goal", _F, GOAL),  # values of the task
+        ("load", _F, MAX_AXES),  # low-pass filtered drive forces [N], [N m]
+        ("command", _F, MAX_AXES),  # valve and drive commands [1], or in the drive's unit
+        ("drive", _F, (4, MAX_AXES)),  # reference drive velocity, moment arm, two chamber volumes
+        ("goal", _F, GOAL_SIZE),  # values of the task
     ],
     align=True,
 )
@@ -79,10 +83,10 @@ TASK_PARAMETERS = np.dtype(
         ("period", _F),  # control period [s]
         ("acceleration", _F),  # acceleration limit of joint references [rad/s^2], [m/s^2]
         ("axes_driven", _I),  # number of driven axes
-        ("driven_axis", _I, AXES),  # indices of the driven axes; arm axes come first
+        ("driven_axis", _I, MAX_AXES),  # indices of the driven axes; arm axes come first
         ("locked", _I),  # index of the action without effect, -1 for none
-        ("qpos", _I, AXES),  # index of every axis in mjData.qpos
-        ("dof", _I, AXES),  # index of every axis in mjData.qvel
+        ("qpos", _I, MAX_AXES),  # index of every axis in mjData.qpos
+        ("dof", _I, MAX_AXES),  # index of every axis in mjData.qvel
         ("nq", _I),
         ("nv", _I),
         ("na", _I),
@@ -91,19 +95,19 @@ TASK_PARAMETERS = np.dtype(
         ("eq_width", _I),  # number of data values per equality constraint
         ("tip_site", _I),
         ("tip_body", _I),
-        ("closed", _I, AXES),  # whether the servo controls the axis
-        ("fastest", _F, AXES),  # axis rates at full action [rad/s], [m/s]
-        ("fastest_pose", _F, ARM),  # pose rates at full action [m/s], [rad/s]
-        ("accelerations", _F, ARM),  # acceleration limits of the pose [m/s^2], [rad/s^2]
-        ("limit", _F, AXES),  # commands at full action [1], or in the drive's unit
+        ("closed", _I, MAX_AXES),  # whether the servo controls the axis
+        ("fastest", _F, MAX_AXES),  # axis rates at full action [rad/s], [m/s]
+        ("fastest_pose", _F, MAX_ARM_AXES),  # pose rates at full action [m/s], [rad/s]
+        ("accelerations", _F, MAX_ARM_AXES),  # acceleration limits of the pose [m/s^2], [rad/s^2]
+        ("limit", _F, MAX_AXES),  # commands at full action [1], or in the drive's unit
         ("arm", _F, 9),  # see kinematics.task.arm_parameters
-        ("ranges", _F, (AXES, 2)),  # joint ranges of the axes [rad], [m]
-        ("servo", _F, (AXES, 14)),  # see control.servo.servo_parameters
+        ("ranges", _F, (MAX_AXES, 2)),  # joint ranges of the axes [rad], [m]
+        ("servo", _F, (MAX_AXES, 14)),  # see control.servo.servo_parameters
         ("feedforward", _F),
-        ("grid", _F, (AXES, 2)),  # see control.servo.drive_tables
-        ("accuracy", _F, CHANNELS),  # bound of the uniform random error of every sensor
-        ("converters", _F, (3, CHANNELS)),  # see machine.machine.converter
-        ("parameters", _F, PARAMETERS),  # task parameters
+        ("grid", _F, (MAX_AXES, 2)),  # see control.servo.drive_tables
+        ("accuracy", _F, MAX_CHANNELS),  # bound of the uniform random error of every sensor
+        ("converters", _F, (3, MAX_CHANNELS)),  # see machine.machine.converter
+        ("parameters", _F, MAX_PARAMETERS),  # task parameters
         ("delayed_command", _I),  # control periods in the command ring buffer, 0 without delays
         ("delayed_sensor", _I),  # physics steps in the sensor ring buffer, 0 without delays
         ("variants", _I),
@@ -162,23 +166,28 @@ TASK_PARAMETERS = np.dtype(
 """Parameters that all episodes of a task have in common."""
 
 
-_STEP = np.uint64(0x9E3779B97F4A7C15)
-_FIRST = np.uint64(0xBF58476D1CE4E5B9)
-_SECOND = np.uint64(0x94D049BB133111EB)
-_30, _27, _31, _11 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(11)
-_UNIT = 2.0**-53
+_INCREMENT = np.uint64(0x9E3779B97F4A7C15)
+_MULTIPLIER_1 = np.uint64(0xBF58476D1CE4E5B9)
+_MULTIPLIER_2 = np.uint64(0x94D049BB133111EB)
+_SHIFT_30, _SHIFT_27, _SHIFT_31, _SHIFT_11 = (
+    np.uint64(30),
+    np.uint64(27),
+    np.uint64(31),
+    np.uint64(11),
+)
+_UNIT_SCALE = 2.0**-53
 
 
 @compiled
 def mix64(z):
     """Mix the bits of a 64-bit integer, scalar (the SplitMix64 finaliser)."""
-    z = (z ^ (z >> _30)) * _FIRST
-    z = (z ^ (z >> _27)) * _SECOND
-    return z ^ (z >> _31)
+    z = (z ^ (z >> _SHIFT_30)) * _MULTIPLIER_1
+    z = (z ^ (z >> _SHIFT_27)) * _MULTIPLIER_2
+    return z ^ (z >> _SHIFT_31)
 
 
 @compiled
-def uniform(e):
+def draw_uniform(e):
     """Draw a random number, uniform in [0, 1), from the generator of an episode.
 
     Args:
@@ -189,12 +198,12 @@ def uniform(e):
 
     Source: see the module.
     """
-    e.random += _STEP
-    return (mix64(e.random) >> _11) * _UNIT
+    e.random += _INCREMENT
+    return (mix64(e.random) >> _SHIFT_11) * _UNIT_SCALE
 
 
 @compiled
-def uniform_between(e, low, high):
+def draw_uniform_between(e, low, high):
     """Draw a random number, uniform from `low` to `high`, from the generator of an episode.
 
     Args:
@@ -207,10 +216,10 @@ def uniform_between(e, low, high):
 
     Source: see the module.
     """
-    return low + (high - low) * uniform(e)
+    return low + (high - low) * draw_uniform(e)
 
 
-def seed_streams(seeds: np.ndarray) -> np.ndarray:
+def make_seed_states(seeds: np.ndarray) -> np.ndarray:
     """Return the initial generator states of a list of seeds.
 
     Args:
@@ -226,4 +235,4 @@ def seed_streams(seeds: np.ndarray) -> np.ndarray:
     if seeds.dtype.kind not in "iu" or (seeds < 0).any():
         raise ValueError("a seed must be an integer from 0 to 2^64 - 1")
     with np.errstate(over="ignore"):
-        return mix64.py_func(np.asarray(seeds, np.uint64) * _STEP + _SECOND)
+        return mix64.py_func(np.asarray(seeds, np.uint64) * _INCREMENT + _MULTIPLIER_2)

@@ -19,29 +19,29 @@ class Scores:
     """Results of m episodes.
 
     Attributes:
-        figures: name -> (m,): `return`, `length` [s], `fault`, `success` if the task defines it,
+        results: name -> (m,): `return`, `length` [s], `fault`, `success` if the task defines it,
             and the mean, RMS and final value of every measure (`tip_error mean` and so on).
         units: name -> unit.
     """
 
-    figures: dict[str, np.ndarray]
+    results: dict[str, np.ndarray]
     units: dict[str, str]
 
     def mean(self, name: str) -> float:
         """Return the mean of a result over the episodes."""
-        return float(self.figures[name].mean())
+        return float(self.results[name].mean())
 
-    def error(self, name: str) -> float:
+    def standard_error(self, name: str) -> float:
         """Return the standard error of the mean of a result."""
-        values = self.figures[name]
+        values = self.results[name]
         return float(values.std(ddof=1) / math.sqrt(len(values))) if len(values) > 1 else math.inf
 
-    def table(self) -> str:
+    def to_markdown(self) -> str:
         """Return all results as a Markdown table with mean and standard error."""
         rows = ["| figure | mean | standard error | unit |", "| --- | --- | --- | --- |"]
         rows += [
-            f"| {name} | {self.mean(name):.5g} | {self.error(name):.2g} | {self.units[name]} |"
-            for name in self.figures
+            f"| {name} | {self.mean(name):.5g} | {self.standard_error(name):.2g} | {self.units[name]} |"
+            for name in self.results
         ]
         return "\n".join(rows)
 
@@ -63,18 +63,18 @@ def evaluate(core: TaskCore, controller: Controller, episodes: int, seed: int = 
     Raises:
         InputError: the autoreset of the core is not DISABLED.
     """
-    if core.facts["autoreset"] != DISABLED:
+    if core.parameters["autoreset"] != DISABLED:
         raise InputError("autoreset", "must be DISABLED, so that every episode counts once")
     parts = []
     for first in range(0, max(1, episodes), core.count):
         core.reset(seed + first + np.arange(core.count))
         controller.begin(core.count)
-        parts.append(_batch(core, controller))
+        parts.append(_run_batch(core, controller))
     figures = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    return Scores(figures, {name: _unit(core, name) for name in figures})
+    return Scores(figures, {name: _find_unit(core, name) for name in figures})
 
 
-def _batch(core: TaskCore, controller: Controller) -> dict[str, np.ndarray]:
+def _run_batch(core: TaskCore, controller: Controller) -> dict[str, np.ndarray]:
     """Run one batch of newly started episodes to their end and return the results."""
     n, names = core.count, [name for name, _ in core.setup.task.measures]
     total, steps = np.zeros(n), np.zeros(n)
@@ -103,18 +103,18 @@ def _batch(core: TaskCore, controller: Controller) -> dict[str, np.ndarray]:
     return figures
 
 
-def _unit(core: TaskCore, name: str) -> str:
+def _find_unit(core: TaskCore, name: str) -> str:
     if name == "length":
         return "s"
     return dict(core.setup.task.measures).get(name.rpartition(" ")[0], "1")
 
 
-def compare(scores: Sequence[tuple[str, Scores]], figures: Sequence[str]) -> str:
+def compare_scores(scores: Sequence[tuple[str, Scores]], names: Sequence[str]) -> str:
     """Return a Markdown table that compares results of several controllers."""
     first = scores[0][1]
-    heads = [f"{name} [{first.units[name]}]" for name in figures]
+    heads = [f"{name} [{first.units[name]}]" for name in names]
     rows = ["| | " + " | ".join(heads) + " |", "| --- |" + " --- |" * len(heads)]
     for label, score in scores:
-        cells = [f"{score.mean(name):.4g} ± {score.error(name):.2g}" for name in figures]
+        cells = [f"{score.mean(name):.4g} ± {score.standard_error(name):.2g}" for name in names]
         rows.append(f"| {label} | " + " | ".join(cells) + " |")
     return "\n".join(rows)

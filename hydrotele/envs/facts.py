@@ -1,6 +1,6 @@
 """Build the parameter record of native code: clocks, machine, servo, sensors, MuJoCo layout.
 
-`KINDS` maps the kind of a task to its native code. Each kind is a separate module and compiles
+`TASK_CODES` maps the kind of a task to its native code. Each kind is a separate module and compiles
 separately.
 """
 
@@ -8,34 +8,40 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.control.resolved_motion import arm_facts
-from hydrotele.control.servo import drive_tables, servo_parameters
+from hydrotele.control.resolved_motion import arm_specification
+from hydrotele.control.servo import servo_parameters, tabulate_drives
 from hydrotele.core.compiled import Callback
-from hydrotele.core.datafile import suggest
+from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.envs import force, grade, line, place, reach, track
 from hydrotele.envs.episode import ACTIONS, TASK_PARAMETERS, VALVE
-from hydrotele.envs.task import REAL, Options, Task
-from hydrotele.envs.variants import Variants, channels
-from hydrotele.envs.world import Field
+from hydrotele.envs.task import REAL_SENSORS, Options, Task
+from hydrotele.envs.variants import Variants, sensor_channels
+from hydrotele.envs.world import ObservationField
 from hydrotele.kinematics.from_machine import axis_linkage
-from hydrotele.machine.machine import Machine, SensorSet, channel_sensor, converter, sensor_set
-from hydrotele.simulate.feedback import samples_every
+from hydrotele.machine.machine import (
+    Machine,
+    SensorSet,
+    channel_converter,
+    channel_sensor,
+    get_sensors,
+)
+from hydrotele.simulate.feedback import periods_per_sample
 from hydrotele.simulate.layout import field_offsets, function_address, verify_layout
 from hydrotele.simulate.mechanism import TIP_SITE
 
-KINDS: dict[str, Callback] = {
-    "track": track.code, "line": line.code, "force": force.code, "reach": reach.code,
-    "grade": grade.code, "place": place.code,
+TASK_CODES: dict[str, Callback] = {
+    "track": track.task_code, "line": line.task_code, "force": force.task_code, "reach": reach.task_code,
+    "grade": grade.task_code, "place": place.task_code,
 }  # fmt: skip
 """Kind of task -> its native code, see `world`."""
 
 
-_CONTROL_RATE = 200.0  # Hz, minimum control rate of the servo
-_SHARE = 0.8  # fraction of the speed at rated or pump flow that a full action commands
-_FORCE_RATE = 0.5  # rad/s or m/s, rate of a force drive at full action
-ACCELERATION = 1.0  # rad/s^2 or m/s^2, limit of the joint references
-POSE_ACCELERATIONS = (1.0, 0.5, 1.0, 1.0, 0.8)  # m/s^2, rad/s^2, limits of the pose reference
+_MIN_CONTROL_RATE = 200.0  # Hz, minimum control rate of the servo
+_FULL_RATE_FRACTION = 0.8  # fraction of the speed at rated or pump flow that a full action commands
+_FORCE_DRIVE_RATE = 0.5  # rad/s or m/s, rate of a force drive at full action
+MAX_ACCELERATION = 1.0  # rad/s^2 or m/s^2, limit of the joint references
+MAX_POSE_ACCELERATIONS = (1.0, 0.5, 1.0, 1.0, 0.8)  # m/s^2, rad/s^2, limits of the pose reference
 
 
 class Timing(NamedTuple):
@@ -66,7 +72,7 @@ class TaskSetup(NamedTuple):
         arm_axes: number of arm axes, which come first in `axes`.
         variants: machines and starts of the episodes.
         fields: fields of the observation.
-        table: (k, POINTS, 3) of `control.servo.drive_tables`.
+        drive_table: (k, POINTS, 3) of `control.servo.drive_tables`.
     """
 
     task: Task
@@ -76,11 +82,11 @@ class TaskSetup(NamedTuple):
     axes: tuple[str, ...]
     arm_axes: int
     variants: Variants
-    fields: list[Field]
-    table: np.ndarray
+    fields: list[ObservationField]
+    drive_table: np.ndarray
 
 
-def timing(options: Options) -> Timing:
+def make_timing(options: Options) -> Timing:
     """Return the clocks for the given options.
 
     Raises:
@@ -94,13 +100,10 @@ def timing(options: Options) -> Timing:
             " a physics step from 1e-05 to 0.005 s"
         )
         raise InputError("control_rate", message)
-    ticks = max(1, round(_CONTROL_RATE / rate))
+    ticks = max(1, round(_MIN_CONTROL_RATE / rate))
     substeps = 1.0 / (rate * ticks * step)
     if substeps < 0.999 or abs(substeps - round(substeps)) > 1e-6:
-        message = (
-            f"{rate:g} Hz needs a control period of whole physics steps of {step:g} s; use for"
-            " example 50 or 200"
-        )
+        message = f"{rate:g} Hz needs a control period of whole physics steps of {step:g} s; use for example 50 or 200"
         raise InputError("control_rate", message)
     assert options.duration is not None
     horizon = round(options.duration * rate)
@@ -109,7 +112,7 @@ def timing(options: Options) -> Timing:
     return Timing(ticks, round(substeps), round(substeps) * step, horizon)
 
 
-def make_facts(setup: TaskSetup, count: int, autoreset: int) -> np.ndarray:
+def make_task_parameters(setup: TaskSetup, count: int, autoreset: int) -> np.ndarray:
     """Return the TASK_PARAMETERS record of a task, without the addresses of arrays.
 
     Args:
@@ -127,12 +130,12 @@ def make_facts(setup: TaskSetup, count: int, autoreset: int) -> np.ndarray:
     facts = np.zeros((), TASK_PARAMETERS)
     task, options, plant = setup.task, setup.options, setup.variants.plant
     if options.action not in ACTIONS:
-        raise InputError(f"action {options.action!r}", suggest(options.action, ACTIONS))
-    facts["task"], facts["mode"] = KINDS[task.kind].address, ACTIONS.index(options.action)
+        raise InputError(f"action {options.action!r}", suggest_valid_name(options.action, ACTIONS))
+    facts["task"], facts["mode"] = TASK_CODES[task.kind].address, ACTIONS.index(options.action)
     facts["autoreset"], facts["count"] = autoreset, count
     clock = setup.clock
     facts["ticks"], facts["substeps"], facts["period"], facts["horizon"] = clock[:2] + clock[2:]
-    facts["timestep"], facts["acceleration"] = options.timestep, ACCELERATION
+    facts["timestep"], facts["acceleration"] = options.timestep, MAX_ACCELERATION
     facts["axes"], facts["hydraulic"] = len(plant.axes), plant.hydraulic
     facts["arm_axes"], facts["axes_driven"] = setup.arm_axes, len(setup.axes)
     facts["actions"], facts["observations"] = len(setup.axes), len(setup.fields)
@@ -149,7 +152,7 @@ def make_facts(setup: TaskSetup, count: int, autoreset: int) -> np.ndarray:
     facts["locked"] = theta if task.swing_locked else -1
     facts["neq"], facts["eq_width"] = model.eq_data.shape
     facts["variants"], facts["states"] = setup.variants.states.shape
-    facts["width"] = task.terrain
+    facts["width"] = task.terrain_size
     if task.parameters:
         numbers = task.parameters(setup.machine, model)
         facts["parameters"][: len(numbers)] = numbers
@@ -159,7 +162,7 @@ def make_facts(setup: TaskSetup, count: int, autoreset: int) -> np.ndarray:
     return facts
 
 
-def full_rate(machine: Machine, axis: str) -> float:
+def full_action_rate(machine: Machine, axis: str) -> float:
     """Return the rate of an axis at full action, which its drive reaches in its whole range.
 
     Args:
@@ -173,45 +176,46 @@ def full_rate(machine: Machine, axis: str) -> float:
     facts = machine.axes[axis]
     low, high = machine.joints[facts.joint].range or (-1.0, 1.0)
     if not (facts.valve and machine.supply):
-        return _FORCE_RATE
+        return _FORCE_DRIVE_RATE
     arm = np.abs(axis_linkage(machine, axis).rate(np.linspace(low, high, 101))).max()
     flow = min(facts.valve.rated_flow, machine.supply.pump_flow)
-    return _SHARE * flow / facts.hydraulic_drive.areas[0] / float(arm)
+    return _FULL_RATE_FRACTION * flow / facts.hydraulic_drive.areas[0] / float(arm)
 
 
 def _write_machine(facts: np.ndarray, setup: TaskSetup, columns: list[int]) -> None:
     plant, machine = setup.variants.plant, setup.machine
     k, servo = len(plant.axes), setup.task.servo
-    facts["limit"][:k] = [
-        drive.command_limit if (drive := machine.axes[name].force) else 1.0 for name in plant.axes
-    ]
-    facts["fastest"][:k] = [full_rate(machine, name) for name in plant.axes]
+    facts["limit"][:k] = [drive.command_limit if (drive := machine.axes[name].force) else 1.0 for name in plant.axes]
+    facts["fastest"][:k] = [full_action_rate(machine, name) for name in plant.axes]
     facts["fastest_pose"] = setup.task.pose_rates
-    facts["accelerations"] = POSE_ACCELERATIONS
+    facts["accelerations"] = MAX_POSE_ACCELERATIONS
     facts["closed"][columns] = int(facts["mode"]) != VALVE
     ranges = [machine.joints[machine.axes[name].joint].range for name in plant.axes]
     facts["ranges"][:k] = [limits or (-np.inf, np.inf) for limits in ranges]
-    facts["arm"] = arm_facts(machine)[0]
+    facts["arm"] = arm_specification(machine)[0]
     facts["servo"][:k] = servo_parameters(machine, plant.axes, servo, setup.clock.period)
     facts["feedforward"] = servo.feedforward
-    facts["grid"][:k] = drive_tables(machine, plant.axes)[0]
-    facts["table"] = setup.table.ctypes.data
+    facts["grid"][:k] = tabulate_drives(machine, plant.axes)[0]
+    facts["table"] = setup.drive_table.ctypes.data
 
 
 def _write_sensors(facts: np.ndarray, setup: TaskSetup) -> None:
     plant, machine, clock = setup.variants.plant, setup.machine, setup.clock
     sensors: SensorSet | None
-    if setup.options.sensors == REAL:
+    if setup.options.sensors == REAL_SENSORS:
         if not machine.sensors:
             raise InputError("sensors 'real'", f"machine {machine.name} has no set of sensors")
         sensors = next(iter(machine.sensors.values()))
     else:
-        sensors = sensor_set(machine, setup.options.sensors)
-    facts["every"], facts["noisy"] = samples_every(1.0 / clock.period, sensors), sensors is not None
-    for c, name in enumerate(channels(plant)):
+        sensors = get_sensors(machine, setup.options.sensors)
+    facts["every"], facts["noisy"] = (
+        periods_per_sample(1.0 / clock.period, sensors),
+        sensors is not None,
+    )
+    for c, name in enumerate(sensor_channels(plant)):
         kind = channel_sensor(machine, sensors, name)
         facts["accuracy"][c] = kind.accuracy or 3**0.5 * kind.standard_deviation  # of equal RMS
-        facts["converters"][:, c] = converter(kind, name)
+        facts["converters"][:, c] = channel_converter(kind, name)
 
 
 def _write_layout(facts: np.ndarray) -> None:

@@ -10,47 +10,50 @@ import math
 import mujoco
 import numpy as np
 
-from hydrotele.control.resolved_motion import arm_facts
+from hydrotele.control.resolved_motion import arm_specification
 from hydrotele.core.compiled import callback, compiled
-from hydrotele.core.memory import field
-from hydrotele.envs.episode import uniform_between
+from hydrotele.core.memory import struct_field_view
+from hydrotele.envs.episode import draw_uniform_between
 from hydrotele.envs.task import Task, draw_start
 from hydrotele.envs.world import (
     BEGIN,
     OBSERVE,
     REWARD,
-    TASK_CODE,
+    TASK_SIGNATURE,
     TICK,
-    Field,
-    episodes,
-    observed,
-    parameters_at,
-    rewarded,
-    world,
+    ObservationField,
+    episode_records,
+    observation_view,
+    parameters_view,
+    simulation_view,
+    store_outcome,
 )
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Plate, Servo, SurroundingObject
 
-WEAKEST, STRONGEST = 1.0e4, 3.5e4  # N, range of the reference force
-OVERLOAD = 1.0e5  # N, force that ends the episode
-FAILURE = -50.0  # reward of an overload or of leaving the plate: as much as 1 s on target pays
-CELL = 500.0  # N, maximum error of the load cell: 1 % of 50 kN
-_CHANGE = 5.0e3  # N, minimum change of the reference force
-_EARLY, _LATE = 0.4, 0.6  # fractions of the duration between which the reference changes
-_TOUCH = 200.0  # N, minimum force that counts as contact
-_RANGE = 2.0e5  # N, range of the load cell
-_FIRST, _SECOND, _TIME, _FORCE, FORCE_READ, _PEAK = range(6)  # indices in `goal`
+MIN_FORCE, MAX_FORCE = 1.0e4, 3.5e4  # N, range of the reference force
+OVERLOAD_FORCE = 1.0e5  # N, force that ends the episode
+FAILURE_REWARD = -50.0  # reward of an overload or of leaving the plate: as much as 1 s on target pays
+MAX_CELL_ERROR = 500.0  # N, maximum error of the load cell: 1 % of 50 kN
+_MIN_FORCE_CHANGE = 5.0e3  # N, minimum change of the reference force
+_MIN_CHANGE_TIME, _MAX_CHANGE_TIME = (
+    0.4,
+    0.6,
+)  # fractions of the duration between which the reference changes
+_CONTACT_FORCE = 200.0  # N, minimum force that counts as contact
+_CELL_RANGE = 2.0e5  # N, range of the load cell
+_FIRST_FORCE, _SECOND_FORCE, _CHANGE_TIME, _TRUE_FORCE, MEASURED_FORCE, _PEAK_FORCE = range(6)  # indices in `goal`
 # indices in `parameters`
-PLATE_QPOS, PLATE_DOF, PLATE_JOINT, MIDDLE_X, MIDDLE_Y, HALF_X, HALF_Y = range(7)
+PLATE_QPOS, PLATE_DOF, PLATE_JOINT, CENTRE_X, CENTRE_Y, HALF_X, HALF_Y = range(7)
 
 
-def force_fields(machine: Machine, axes: tuple[str, ...]) -> list[Field]:
+def force_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
     """Return the fields that `observe_force` writes: measured and reference force, time."""
     return [
-        Field("force", "N", -_RANGE, _RANGE),
-        Field("wanted_force", "N", 0.0, STRONGEST),
-        Field("time_since_change", "s", 0.0, 3600.0),
+        ObservationField("force", "N", -_CELL_RANGE, _CELL_RANGE),
+        ObservationField("wanted_force", "N", 0.0, MAX_FORCE),
+        ObservationField("time_since_change", "s", 0.0, 3600.0),
     ]
 
 
@@ -68,8 +71,8 @@ def plate_force(f, w):
     Source: `simulate.surroundings`; positions are one step ahead, see `simulate.record`.
     """
     dof, joint = int(f.parameters[PLATE_DOF]), int(f.parameters[PLATE_JOINT])
-    stiffness = field(w.model, f.at_stiffness, joint + 1)[joint]
-    damping = field(w.model, f.at_damping, dof + 1)[dof]
+    stiffness = struct_field_view(w.model, f.at_stiffness, joint + 1)[joint]
+    damping = struct_field_view(w.model, f.at_damping, dof + 1)[dof]
     speed = w.qvel[dof]
     place = w.qpos[int(f.parameters[PLATE_QPOS])] - f.timestep * speed
     return -(stiffness * place + damping * speed)
@@ -89,29 +92,29 @@ def begin_force(f, e, w):
 
     Source: this module.
     """
-    g = e.goal
-    g[_FIRST] = uniform_between(e, WEAKEST, STRONGEST)
+    g = e.reference
+    g[_FIRST_FORCE] = draw_uniform_between(e, MIN_FORCE, MAX_FORCE)
     # uniform over all forces that differ from the first by at least _CHANGE
-    below = max(0.0, g[_FIRST] - _CHANGE - WEAKEST)
-    above = max(0.0, STRONGEST - g[_FIRST] - _CHANGE)
-    place = uniform_between(e, 0.0, below + above)
-    g[_SECOND] = WEAKEST + place if place < below else g[_FIRST] + _CHANGE + (place - below)
-    g[_TIME] = uniform_between(e, _EARLY, _LATE) * f.horizon * f.ticks * f.period
-    g[_PEAK] = 0.0
-    _read(f, e, w)
+    below = max(0.0, g[_FIRST_FORCE] - _MIN_FORCE_CHANGE - MIN_FORCE)
+    above = max(0.0, MAX_FORCE - g[_FIRST_FORCE] - _MIN_FORCE_CHANGE)
+    place = draw_uniform_between(e, 0.0, below + above)
+    g[_SECOND_FORCE] = MIN_FORCE + place if place < below else g[_FIRST_FORCE] + _MIN_FORCE_CHANGE + (place - below)
+    g[_CHANGE_TIME] = draw_uniform_between(e, _MIN_CHANGE_TIME, _MAX_CHANGE_TIME) * f.horizon * f.ticks * f.period
+    g[_PEAK_FORCE] = 0.0
+    _sample_force(f, e, w)
 
 
 @compiled
-def _read(f, e, w):
+def _sample_force(f, e, w):
     """Update the true force, and sample the load cell if a sensor sample is due."""
-    e.goal[_FORCE] = plate_force(f, w)
+    e.reference[_TRUE_FORCE] = plate_force(f, w)
     if e.tick % f.every == 0:
-        error = uniform_between(e, -CELL, CELL) if f.noisy else 0.0
-        e.goal[FORCE_READ] = e.goal[_FORCE] + error
+        error = draw_uniform_between(e, -MAX_CELL_ERROR, MAX_CELL_ERROR) if f.noisy else 0.0
+        e.reference[MEASURED_FORCE] = e.reference[_TRUE_FORCE] + error
 
 
 @compiled
-def tick_force(f, e, w):
+def update_force(f, e, w):
     """Read the load cell and update the maximum force of this step.
 
     Args:
@@ -124,8 +127,8 @@ def tick_force(f, e, w):
 
     Source: this module.
     """
-    _read(f, e, w)
-    e.goal[_PEAK] = max(e.goal[_PEAK], e.goal[_FORCE])
+    _sample_force(f, e, w)
+    e.reference[_PEAK_FORCE] = max(e.reference[_PEAK_FORCE], e.reference[_TRUE_FORCE])
 
 
 @compiled
@@ -141,9 +144,9 @@ def reference_force(g, time):
 
     Source: this module.
     """
-    if time < g[_TIME]:
-        return g[_FIRST], time
-    return g[_SECOND], time - g[_TIME]
+    if time < g[_CHANGE_TIME]:
+        return g[_FIRST_FORCE], time
+    return g[_SECOND_FORCE], time - g[_CHANGE_TIME]
 
 
 @compiled
@@ -161,8 +164,8 @@ def observe_force(f, e, out, at):
 
     Source: `force_fields`.
     """
-    out[at] = e.goal[FORCE_READ]
-    out[at + 1], out[at + 2] = reference_force(e.goal, e.tick * f.period)
+    out[at] = e.reference[MEASURED_FORCE]
+    out[at + 1], out[at + 2] = reference_force(e.reference, e.tick * f.period)
 
 
 @compiled
@@ -180,58 +183,56 @@ def reward_force(f, e, w):
 
     Source: this module.
     """
-    g, n = e.goal, f.parameters
+    g, n = e.reference, f.parameters
     wanted = reference_force(g, e.tick * f.period)[0]
-    overload = g[_PEAK] > OVERLOAD
-    aside = math.fabs(e.tip[0] - n[MIDDLE_X]) > n[HALF_X]
-    aside = aside or math.fabs(e.tip[1] - n[MIDDLE_Y]) > n[HALF_Y]
-    g[_PEAK] = 0.0
-    w.measures[0] = g[_FORCE] - wanted
-    w.measures[1] = 1.0 if g[_FORCE] > _TOUCH else 0.0
+    overload = g[_PEAK_FORCE] > OVERLOAD_FORCE
+    aside = math.fabs(e.tip[0] - n[CENTRE_X]) > n[HALF_X]
+    aside = aside or math.fabs(e.tip[1] - n[CENTRE_Y]) > n[HALF_Y]
+    g[_PEAK_FORCE] = 0.0
+    w.measures[0] = g[_TRUE_FORCE] - wanted
+    w.measures[1] = 1.0 if g[_TRUE_FORCE] > _CONTACT_FORCE else 0.0
     w.measures[2] = 1.0 if overload else 0.0
     w.measures[3] = 1.0 if aside else 0.0
     if overload or aside:
-        return FAILURE, True
-    return max(-1.0, 1.0 - abs(g[_FORCE] - wanted) / wanted), False
+        return FAILURE_REWARD, True
+    return max(-1.0, 1.0 - abs(g[_TRUE_FORCE] - wanted) / wanted), False
 
 
-_MIDDLE = (6.0, 0.0)  # m, centre of the plate
-_HALF = (1.2, 1.2)  # m, half sizes of the plate
+_CENTRE = (6.0, 0.0)  # m, centre of the plate
+_HALF_SIZE = (1.2, 1.2)  # m, half sizes of the plate
 _MASS = 300.0  # kg, mass of the plate
-_SOFT, _STIFF = 5.0e5, 2.0e6  # N/m, range of the plate's stiffness
-_DAMPING = 0.87  # damping ratio, as of the plate of Zhu 1994's experiment in `press_stiffness`
-_ABOVE = (0.05, 0.15)  # m, initial height of the tip above the plate
+_MIN_STIFFNESS, _MAX_STIFFNESS = 5.0e5, 2.0e6  # N/m, range of the plate's stiffness
+_DAMPING_RATIO = 0.87  # damping ratio, as of the plate of Zhu 1994's experiment in `press_stiffness`
+_START_HEIGHTS = (0.05, 0.15)  # m, initial height of the tip above the plate
 
 
-def _start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
+def _draw_start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
     """Draw a start with the bucket over the centre of the plate, teeth down."""
     return draw_start(machine, rng, (5.6, -0.05, 0.2, -1.92), (6.4, 0.05, 0.9, -1.57))
 
 
-def _plate(
-    machine: Machine, rng: np.random.Generator, start: dict[str, float]
-) -> tuple[SurroundingObject, ...]:
+def _make_plate(machine: Machine, rng: np.random.Generator, start: dict[str, float]) -> tuple[SurroundingObject, ...]:
     """Draw the stiffness and height of a plate below the tip."""
-    numbers, axes, _ = arm_facts(machine)
+    numbers, axes, _ = arm_specification(machine)
     pose = np.zeros(5)
     task_forward(numbers, np.array([start[name] for name in axes]), pose)
-    stiffness = math.exp(rng.uniform(math.log(_SOFT), math.log(_STIFF)))
-    height = float(pose[2] - rng.uniform(*_ABOVE))
-    damping = 2.0 * _DAMPING * math.sqrt(stiffness * _MASS)
-    return (Plate(position=(*_MIDDLE, height), size=_HALF, mass=_MASS, stiffness=stiffness,
+    stiffness = math.exp(rng.uniform(math.log(_MIN_STIFFNESS), math.log(_MAX_STIFFNESS)))
+    height = float(pose[2] - rng.uniform(*_START_HEIGHTS))
+    damping = 2.0 * _DAMPING_RATIO * math.sqrt(stiffness * _MASS)
+    return (Plate(position=(*_CENTRE, height), size=_HALF_SIZE, mass=_MASS, stiffness=stiffness,
                   damping=damping),)  # fmt: skip
 
 
-def _parameters(machine: Machine, model: mujoco.MjModel) -> tuple[float, ...]:
+def _make_parameters(machine: Machine, model: mujoco.MjModel) -> tuple[float, ...]:
     """Return the indices of the plate in the model, its centre and its half sizes."""
     joint = model.joint("plate_0")
-    return (joint.qposadr[0], joint.dofadr[0], joint.id, *_MIDDLE, *_HALF)
+    return (joint.qposadr[0], joint.dofadr[0], joint.id, *_CENTRE, *_HALF_SIZE)
 
 
 HOLD_FORCE = Task(
     name="HoldForce",
     kind="force",
-    sentence=(
+    description=(
         "The bucket of an excavator presses on a plate that stands on a spring of unknown"
         " stiffness. The reference force is between 10 and 35 kN and changes once."
     ),
@@ -244,28 +245,28 @@ HOLD_FORCE = Task(
     tool="bucket",
     action="resolved_motion",
     duration=20.0,
-    start=_start,
+    start=_draw_start,
     fields=force_fields,
     measures=(("force_error", "N"), ("contact", "1"), ("overload", "1"), ("beside", "1")),
-    surroundings=_plate,
-    parameters=_parameters,
+    surroundings=_make_plate,
+    parameters=_make_parameters,
     servo=Servo(position_gain=5.0),  # a higher gain lets the boom hammer on the plate
     pose_rates=(0.3, 0.1, 0.3, 0.3, 0.25),  # as in the scenario `press_stiffness`
 )
 """Press on a plate with a given force."""
 
 
-@callback(TASK_CODE)
-def code(part, m, d, number, argument, out):
-    """Run one part of the task in native code; see `world`."""
-    f = parameters_at(argument)[0]
-    e, w = episodes(f)[number], world(f, m, d, number, argument)
+@callback(TASK_SIGNATURE)
+def task_code(part, m, d, number, argument, out):
+    """Run one part of the task in native code; see `simulation_view`."""
+    f = parameters_view(argument)[0]
+    e, w = episode_records(f)[number], simulation_view(f, m, d, number, argument)
     if part == BEGIN:
         begin_force(f, e, w)
     elif part == TICK:
-        tick_force(f, e, w)
+        update_force(f, e, w)
     elif part == OBSERVE:
-        observe_force(f, e, observed(f, out), 0)
+        observe_force(f, e, observation_view(f, out), 0)
     elif part == REWARD:
-        return rewarded(e, reward_force(f, e, w))
+        return store_outcome(e, reward_force(f, e, w))
     return 0.0

@@ -14,21 +14,21 @@ import numpy as np
 
 from hydrotele.core.compiled import callback, compiled
 from hydrotele.core.errors import InputError
-from hydrotele.envs.episode import ARM, PARAMETERS, uniform, uniform_between
+from hydrotele.envs.episode import MAX_ARM_AXES, MAX_PARAMETERS, draw_uniform, draw_uniform_between
 from hydrotele.envs.task import Task, draw_start
 from hydrotele.envs.world import (
     BEGIN,
     OBSERVE,
     REWARD,
-    TASK_CODE,
+    TASK_SIGNATURE,
     TICK,
-    Field,
-    episodes,
-    observed,
-    parameters_at,
-    reach,
-    rewarded,
-    world,
+    ObservationField,
+    episode_records,
+    max_reach,
+    observation_view,
+    parameters_view,
+    simulation_view,
+    store_outcome,
 )
 from hydrotele.kinematics.task import task_forward, task_jacobian
 from hydrotele.machine.machine import Machine
@@ -37,26 +37,26 @@ from hydrotele.soil.facts import (
     FORCE_R,
     FORCE_Z,
     MASS,
-    OUT,
-    OUTLINE,
+    OUTLINE_START,
+    RESULT_SIZE,
     SOILS,
-    STATE,
+    STATE_SIZE,
     WIDTH,
     Bucket,
     Soil,
-    soil_parameters,
+    pack_soil_parameters,
 )
-from hydrotele.soil.step import EdgeMotion, bucket_wrench, soil_step
+from hydrotele.soil.step import EdgeMotion, compute_bucket_wrench, step_soil
 from hydrotele.soil.terrain import surface_height
 
-START, CELL, CELLS = 2.5, 0.05, 140  # m, m, 1: the profile extends to 9.5 m
-SOILS_MOST = 3  # maximum number of soils of a task
-_SHARED = OUTLINE + 2 * len(CAT215.outline)  # parameters of soil, bucket and profile
-_LOOSE = CELLS  # offsets in the terrain
-_BUCKET = _LOOSE + CELLS
-_RESULT = _BUCKET + STATE
-_SOIL = _RESULT + OUT
-TERRAIN = _SOIL + _SHARED
+PROFILE_START, CELL_LENGTH, CELL_COUNT = 2.5, 0.05, 140  # m, m, 1: the profile extends to 9.5 m
+MAX_SOILS = 3  # maximum number of soils of a task
+_PARAMETER_COUNT = OUTLINE_START + 2 * len(CAT215.outline)  # parameters of soil, bucket and profile
+_LOOSE_OFFSET = CELL_COUNT  # offsets in the terrain
+_BUCKET_OFFSET = _LOOSE_OFFSET + CELL_COUNT
+_RESULT_OFFSET = _BUCKET_OFFSET + STATE_SIZE
+_SOIL_OFFSET = _RESULT_OFFSET + RESULT_SIZE
+TERRAIN_SIZE = _SOIL_OFFSET + _PARAMETER_COUNT
 
 
 def bed_parameters(soils: Sequence[Soil], bucket: Bucket = CAT215) -> np.ndarray:
@@ -74,15 +74,15 @@ def bed_parameters(soils: Sequence[Soil], bucket: Bucket = CAT215) -> np.ndarray
         InputError: there are no soils or more than three, or the outline of the bucket has another
             number of corners than that of the CAT 215.
     """
-    rows = [soil_parameters(soil, bucket, START, CELL) for soil in soils]
-    if not 1 <= len(rows) <= SOILS_MOST or len(rows[0]) != _SHARED:
-        message = f"needs 1 to {SOILS_MOST} soils and a bucket with the corners of the CAT 215's"
+    rows = [pack_soil_parameters(soil, bucket, PROFILE_START, CELL_LENGTH) for soil in soils]
+    if not 1 <= len(rows) <= MAX_SOILS or len(rows[0]) != _PARAMETER_COUNT:
+        message = f"needs 1 to {MAX_SOILS} soils and a bucket with the corners of the CAT 215's"
         raise InputError("bed of soil", message)
     return np.concatenate([rows[0], *(row[:WIDTH] for row in rows[1:])])
 
 
 @compiled
-def surface_of(w):
+def surface_view(w):
     """Return a view of the surface heights of the profile.
 
     Args:
@@ -93,11 +93,11 @@ def surface_of(w):
 
     Source: this module.
     """
-    return w.terrain[:CELLS]
+    return w.terrain[:CELL_COUNT]
 
 
 @compiled
-def loose_of(w):
+def loose_view(w):
     """Return a view of the thickness of the loose soil on the profile.
 
     Args:
@@ -108,11 +108,11 @@ def loose_of(w):
 
     Source: this module.
     """
-    return w.terrain[_LOOSE:_BUCKET]
+    return w.terrain[_LOOSE_OFFSET:_BUCKET_OFFSET]
 
 
 @compiled
-def bucket_of(w):
+def bucket_view(w):
     """Return a view of the bucket state; see `soil.facts`.
 
     Args:
@@ -123,11 +123,11 @@ def bucket_of(w):
 
     Source: this module.
     """
-    return w.terrain[_BUCKET:_RESULT]
+    return w.terrain[_BUCKET_OFFSET:_RESULT_OFFSET]
 
 
 @compiled
-def result_of(w):
+def result_view(w):
     """Return a view of the result of the last soil step; see `soil.facts`.
 
     Args:
@@ -138,11 +138,11 @@ def result_of(w):
 
     Source: this module.
     """
-    return w.terrain[_RESULT:_SOIL]
+    return w.terrain[_RESULT_OFFSET:_SOIL_OFFSET]
 
 
 @compiled
-def soil_of(w):
+def soil_view(w):
     """Return a view of the soil parameters of the episode; see `soil.facts`.
 
     Args:
@@ -153,11 +153,11 @@ def soil_of(w):
 
     Source: this module.
     """
-    return w.terrain[_SOIL:TERRAIN]
+    return w.terrain[_SOIL_OFFSET:TERRAIN_SIZE]
 
 
 @compiled
-def lay_bed(f, w, soil):
+def init_bed(f, w, soil):
     """Initialise the terrain with level undisturbed soil at height 0 and an empty bucket.
 
     Args:
@@ -171,17 +171,17 @@ def lay_bed(f, w, soil):
     Source: this module.
     """
     w.terrain[:] = 0.0
-    numbers = soil_of(w)
-    for i in range(_SHARED):
+    numbers = soil_view(w)
+    for i in range(_PARAMETER_COUNT):
         numbers[i] = f.parameters[i]
     if soil > 0:
-        first = _SHARED + (soil - 1) * WIDTH
+        first = _PARAMETER_COUNT + (soil - 1) * WIDTH
         for i in range(WIDTH):
             numbers[i] = f.parameters[first + i]
 
 
 @compiled
-def edge_rates(f, e, w, rates):
+def compute_edge_rates(f, e, w, rates):
     """Compute the velocity of the bucket's edge, outwards and up, with the nominal kinematics.
 
     Only the damping of the soil uses it, which tolerates the slightly different geometry of a
@@ -209,7 +209,7 @@ def edge_rates(f, e, w, rates):
 
 
 @compiled
-def tick_bed(f, e, w):
+def step_bed(f, e, w):
     """Advance soil and bucket by one control period; the force acts during the next period.
 
     Args:
@@ -221,7 +221,7 @@ def tick_bed(f, e, w):
     Returns:
         Nothing.
 
-    Source: `soil.step.soil_step`, `bucket_wrench`. Positions come from MuJoCo, so that the geometry
+    Source: `soil.step.soil_step`, `compute_bucket_wrench`. Positions come from MuJoCo, so that the geometry
         of every variant is exact.
     """
     body = f.tip_body
@@ -230,56 +230,57 @@ def tick_bed(f, e, w):
     ahead = w.xmat[9 * body : 9 * body + 9]  # first column points from the pin to the edge
     attitude = math.atan2(ahead[6], c * ahead[0] + s * ahead[3])
     rates = np.empty(2)
-    edge_rates(f, e, w, rates)
-    out = result_of(w)
+    compute_edge_rates(f, e, w, rates)
+    out = result_view(w)
     edge = EdgeMotion(math.hypot(w.tip[0], w.tip[1]), w.tip[2], rates[0], rates[1], attitude)
-    soil_step(soil_of(w), surface_of(w), loose_of(w), bucket_of(w), edge, f.period, out)
-    bucket_wrench(
-        out, w.tip, theta, w.xipos[3 * body : 3 * body + 3], w.xfrc[6 * body : 6 * body + 6]
-    )
+    step_soil(soil_view(w), surface_view(w), loose_view(w), bucket_view(w), edge, f.period, out)
+    compute_bucket_wrench(out, w.tip, theta, w.xipos[3 * body : 3 * body + 3], w.xfrc[6 * body : 6 * body + 6])
 
 
-assert _SHARED + (SOILS_MOST - 1) * WIDTH <= PARAMETERS
+assert _PARAMETER_COUNT + (MAX_SOILS - 1) * WIDTH <= MAX_PARAMETERS
 
 
-NEAR, FAR = 3.8, 5.8  # m, radii between which the ground is graded
-POINTS = 20  # number of profile sections whose mean is observed
-MIDDLE = 0.5 * (NEAR + FAR)  # m, radius at which the height of the plane is given
-GRADED = 0.03  # m, maximum RMS error of graded ground
-HOLD = 1.0  # s for which the error must stay below it
-DEEPEST = 0.5  # m below the plane at which the episode fails
-SCALE = 0.01  # m of error reduction for a reward of 1
+MIN_RADIUS, MAX_RADIUS = 3.8, 5.8  # m, radii between which the ground is graded
+SECTION_COUNT = 20  # number of profile sections whose mean is observed
+MEAN_RADIUS = 0.5 * (MIN_RADIUS + MAX_RADIUS)  # m, radius at which the height of the plane is given
+MAX_GRADED_ERROR = 0.03  # m, maximum RMS error of graded ground
+HOLD_TIME = 1.0  # s for which the error must stay below it
+FAILURE_DEPTH = 0.5  # m below the plane at which the episode fails
+ERROR_PER_REWARD = 0.01  # m of error reduction for a reward of 1
 TIME_COST = 0.05  # reward per s
-SUCCESS, FAILURE = 5.0, -5.0  # rewards at the end
-SCANNER = 0.01  # m, maximum error of a measured section mean, assumed
-SCALES = 30.0  # kg, maximum error of the measured mass carried, assumed
-_LEVEL = (0.15, 0.45)  # m, height of the ground above the machine's tracks
-_SLOPE = 0.06  # rad, maximum slope of the plane
-_DOWN = (0.02, 0.08)  # m, depth of the plane below the ground
-_HIGH, _LOW = (0.12, 0.30), (0.0, 0.10)  # m, heights of two mounds
-_LONG = (0.7, 1.3)  # m, half lengths of the mounds
-_MOST = 4000.0  # kg, upper bound of the observed mass carried
-PLANE, TILT, ERROR, HELD, SOIL = range(5)  # indices in `goal`
-FIRST, LAST = round((NEAR - START) / CELL), round((FAR - START) / CELL)  # cells
-_EACH = (LAST - FIRST) // POINTS  # cells per section
-assert 0 <= FIRST < LAST <= CELLS and _EACH * POINTS == LAST - FIRST
+SUCCESS_REWARD, FAILURE_REWARD = 5.0, -5.0  # rewards at the end
+MAX_SCANNER_ERROR = 0.01  # m, maximum error of a measured section mean, assumed
+MAX_MASS_ERROR = 30.0  # kg, maximum error of the measured mass carried, assumed
+_GROUND_HEIGHTS = (0.15, 0.45)  # m, height of the ground above the machine's tracks
+_MAX_SLOPE = 0.06  # rad, maximum slope of the plane
+_PLANE_DEPTHS = (0.02, 0.08)  # m, depth of the plane below the ground
+_HIGH_MOUND_HEIGHTS, _LOW_MOUND_HEIGHTS = (0.12, 0.30), (0.0, 0.10)  # m, heights of two mounds
+_MOUND_HALF_LENGTHS = (0.7, 1.3)  # m, half lengths of the mounds
+_MAX_MASS = 4000.0  # kg, upper bound of the observed mass carried
+PLANE_HEIGHT, PLANE_SLOPE, LAST_ERROR, TIME_HELD, SOIL_INDEX = range(5)  # indices in `goal`
+FIRST_CELL, END_CELL = (
+    round((MIN_RADIUS - PROFILE_START) / CELL_LENGTH),
+    round((MAX_RADIUS - PROFILE_START) / CELL_LENGTH),
+)  # cells
+_CELLS_PER_SECTION = (END_CELL - FIRST_CELL) // SECTION_COUNT  # cells per section
+assert 0 <= FIRST_CELL < END_CELL <= CELL_COUNT and _CELLS_PER_SECTION * SECTION_COUNT == END_CELL - FIRST_CELL
 
 
-def grade_radii() -> list[float]:
+def section_radii() -> list[float]:
     """Return the centre radii of the profile sections whose means are observed [m]."""
-    return [NEAR + (FAR - NEAR) * (p + 0.5) / POINTS for p in range(POINTS)]
+    return [MIN_RADIUS + (MAX_RADIUS - MIN_RADIUS) * (p + 0.5) / SECTION_COUNT for p in range(SECTION_COUNT)]
 
 
-def grade_fields(machine: Machine, axes: tuple[str, ...]) -> list[Field]:
+def grade_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
     """Return the fields that `observe_grade` writes: profile errors, edge height, mass, plane."""
-    far = reach(machine)
-    fields = [Field(f"profile_error.{p}", "m", -1.0, 2.0) for p in range(POINTS)]
+    far = max_reach(machine)
+    fields = [ObservationField(f"profile_error.{p}", "m", -1.0, 2.0) for p in range(SECTION_COUNT)]
     return [
         *fields,
-        Field("edge_height", "m", -2.0, far),
-        Field("carried_mass", "kg", -SCALES, _MOST),
-        Field("plane_height", "m", -1.0, 1.0),
-        Field("plane_slope", "rad", -0.1, 0.1),
+        ObservationField("edge_height", "m", -2.0, far),
+        ObservationField("carried_mass", "kg", -MAX_MASS_ERROR, _MAX_MASS),
+        ObservationField("plane_height", "m", -1.0, 1.0),
+        ObservationField("plane_slope", "rad", -0.1, 0.1),
     ]
 
 
@@ -296,7 +297,7 @@ def plane_height(g, r):
 
     Source: this module.
     """
-    return g[PLANE] + math.tan(g[TILT]) * (r - MIDDLE)
+    return g[PLANE_HEIGHT] + math.tan(g[PLANE_SLOPE]) * (r - MEAN_RADIUS)
 
 
 @compiled
@@ -316,17 +317,17 @@ def profile_error(g, surface, first, last):
     """
     total, square = 0.0, 0.0
     for i in range(first, last):
-        over = surface[i] - plane_height(g, START + (i + 0.5) * CELL)
+        over = surface[i] - plane_height(g, PROFILE_START + (i + 0.5) * CELL_LENGTH)
         total += over
         square += over * over
     return total / (last - first), math.sqrt(square / (last - first))
 
 
 @compiled
-def _heap(surface, middle, half, height):
+def _add_mound(surface, middle, half, height):
     """Add a mound with a raised-cosine shape to the surface."""
     for i in range(len(surface)):
-        place = (START + (i + 0.5) * CELL - middle) / half
+        place = (PROFILE_START + (i + 0.5) * CELL_LENGTH - middle) / half
         if abs(place) < 1.0:
             surface[i] += 0.5 * height * (1.0 + math.cos(math.pi * place))
 
@@ -345,29 +346,34 @@ def begin_grade(f, e, w):
 
     Source: this module.
     """
-    g = e.goal
+    g = e.reference
     soils = int(f.parameters[len(f.parameters) - 1])
-    soil = int(uniform(e) * soils)
-    g[SOIL] = soil
-    lay_bed(f, w, soil)
-    ground = uniform_between(e, _LEVEL[0], _LEVEL[1])
-    g[TILT] = uniform_between(e, -_SLOPE, _SLOPE)
-    g[PLANE] = ground
-    surface = surface_of(w)
-    for i in range(CELLS):
-        surface[i] = plane_height(g, START + (i + 0.5) * CELL)
-    g[PLANE] = ground - uniform_between(e, _DOWN[0], _DOWN[1])
-    half = uniform_between(e, _LONG[0], _LONG[1])
-    _heap(
+    soil = int(draw_uniform(e) * soils)
+    g[SOIL_INDEX] = soil
+    init_bed(f, w, soil)
+    ground = draw_uniform_between(e, _GROUND_HEIGHTS[0], _GROUND_HEIGHTS[1])
+    g[PLANE_SLOPE] = draw_uniform_between(e, -_MAX_SLOPE, _MAX_SLOPE)
+    g[PLANE_HEIGHT] = ground
+    surface = surface_view(w)
+    for i in range(CELL_COUNT):
+        surface[i] = plane_height(g, PROFILE_START + (i + 0.5) * CELL_LENGTH)
+    g[PLANE_HEIGHT] = ground - draw_uniform_between(e, _PLANE_DEPTHS[0], _PLANE_DEPTHS[1])
+    half = draw_uniform_between(e, _MOUND_HALF_LENGTHS[0], _MOUND_HALF_LENGTHS[1])
+    _add_mound(
         surface,
-        uniform_between(e, NEAR + 0.3, FAR - 0.3),
+        draw_uniform_between(e, MIN_RADIUS + 0.3, MAX_RADIUS - 0.3),
         half,
-        uniform_between(e, _HIGH[0], _HIGH[1]),
+        draw_uniform_between(e, _HIGH_MOUND_HEIGHTS[0], _HIGH_MOUND_HEIGHTS[1]),
     )
-    half = uniform_between(e, _LONG[0], _LONG[1])
-    _heap(surface, uniform_between(e, NEAR, FAR), half, uniform_between(e, _LOW[0], _LOW[1]))
-    g[ERROR], g[HELD] = profile_error(g, surface, FIRST, LAST)[1], 0.0
-    w.measures[0], w.measures[3] = g[ERROR], g[SOIL]
+    half = draw_uniform_between(e, _MOUND_HALF_LENGTHS[0], _MOUND_HALF_LENGTHS[1])
+    _add_mound(
+        surface,
+        draw_uniform_between(e, MIN_RADIUS, MAX_RADIUS),
+        half,
+        draw_uniform_between(e, _LOW_MOUND_HEIGHTS[0], _LOW_MOUND_HEIGHTS[1]),
+    )
+    g[LAST_ERROR], g[TIME_HELD] = profile_error(g, surface, FIRST_CELL, END_CELL)[1], 0.0
+    w.measures[0], w.measures[3] = g[LAST_ERROR], g[SOIL_INDEX]
 
 
 @compiled
@@ -386,20 +392,20 @@ def observe_grade(f, e, w, out, at):
 
     Source: `grade_fields`; the position of the edge follows from the measured joint angles.
     """
-    g, surface = e.goal, surface_of(w)
-    pose = np.empty(ARM)
+    g, surface = e.reference, surface_view(w)
+    pose = np.empty(MAX_ARM_AXES)
     task_forward(f.arm, e.joint[: f.arm_axes], pose)
-    scan, scales = (SCANNER, SCALES) if f.noisy else (0.0, 0.0)
-    for p in range(POINTS):
-        first = FIRST + p * _EACH
-        mean = profile_error(g, surface, first, first + _EACH)[0]
-        out[at + p] = mean + (uniform_between(e, -scan, scan) if f.noisy else 0.0)
-    height = surface_height(soil_of(w), surface, pose[0])
-    out[at + POINTS] = pose[2] - height - (uniform_between(e, -scan, scan) if f.noisy else 0.0)
-    load = result_of(w)[MASS]
-    out[at + POINTS + 1] = load + (uniform_between(e, -scales, scales) if f.noisy else 0.0)
-    out[at + POINTS + 2] = g[PLANE]
-    out[at + POINTS + 3] = g[TILT]
+    scan, scales = (MAX_SCANNER_ERROR, MAX_MASS_ERROR) if f.noisy else (0.0, 0.0)
+    for p in range(SECTION_COUNT):
+        first = FIRST_CELL + p * _CELLS_PER_SECTION
+        mean = profile_error(g, surface, first, first + _CELLS_PER_SECTION)[0]
+        out[at + p] = mean + (draw_uniform_between(e, -scan, scan) if f.noisy else 0.0)
+    height = surface_height(soil_view(w), surface, pose[0])
+    out[at + SECTION_COUNT] = pose[2] - height - (draw_uniform_between(e, -scan, scan) if f.noisy else 0.0)
+    load = result_view(w)[MASS]
+    out[at + SECTION_COUNT + 1] = load + (draw_uniform_between(e, -scales, scales) if f.noisy else 0.0)
+    out[at + SECTION_COUNT + 2] = g[PLANE_HEIGHT]
+    out[at + SECTION_COUNT + 3] = g[PLANE_SLOPE]
 
 
 @compiled
@@ -417,47 +423,52 @@ def reward_grade(f, e, w):
 
     Source: this module.
     """
-    g, out = e.goal, result_of(w)
+    g, out = e.reference, result_view(w)
     dt = f.ticks * f.period
-    error = profile_error(g, surface_of(w), FIRST, LAST)[1]
-    reward = (g[ERROR] - error) / SCALE - TIME_COST * dt
-    g[ERROR] = error
-    g[HELD] = g[HELD] + dt if error < GRADED else 0.0
-    graded = g[HELD] >= HOLD - 0.5 * dt
-    spoiled = w.tip[2] < plane_height(g, math.hypot(w.tip[0], w.tip[1])) - DEEPEST
+    error = profile_error(g, surface_view(w), FIRST_CELL, END_CELL)[1]
+    reward = (g[LAST_ERROR] - error) / ERROR_PER_REWARD - TIME_COST * dt
+    g[LAST_ERROR] = error
+    g[TIME_HELD] = g[TIME_HELD] + dt if error < MAX_GRADED_ERROR else 0.0
+    graded = g[TIME_HELD] >= HOLD_TIME - 0.5 * dt
+    spoiled = w.tip[2] < plane_height(g, math.hypot(w.tip[0], w.tip[1])) - FAILURE_DEPTH
     w.measures[0] = error
     w.measures[1] = out[MASS]
     w.measures[2] = math.hypot(out[FORCE_R], out[FORCE_Z])
-    w.measures[3] = g[SOIL]
+    w.measures[3] = g[SOIL_INDEX]
     w.measures[4] = 1.0 if graded else 0.0
     w.measures[5] = 1.0 if spoiled else 0.0
     if spoiled:
-        return reward + FAILURE, True
-    return (reward + SUCCESS, True) if graded else (reward, False)
+        return reward + FAILURE_REWARD, True
+    return (reward + SUCCESS_REWARD, True) if graded else (reward, False)
 
 
 GRADE_SOILS = ("soft", "sandy_loam", "firm")
 """Names of the soils, in the order of their indices."""
 
-_LEAST_POSE = (5.6, -0.5, 1.25, math.radians(-110.0))  # r [m], theta [rad], z [m], attitude [rad]
-_LARGEST_POSE = (6.4, 0.5, 1.5, math.radians(-90.0))
+_MIN_START_POSE = (
+    5.6,
+    -0.5,
+    1.25,
+    math.radians(-110.0),
+)  # r [m], theta [rad], z [m], attitude [rad]
+_MAX_START_POSE = (6.4, 0.5, 1.5, math.radians(-90.0))
 
 
-def _start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
+def _draw_start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
     """Draw a start with the bucket above the far end of the ground, ready to dig."""
-    return draw_start(machine, rng, _LEAST_POSE, _LARGEST_POSE)
+    return draw_start(machine, rng, _MIN_START_POSE, _MAX_START_POSE)
 
 
-def _parameters(machine: Machine, model: mujoco.MjModel) -> tuple[float, ...]:
+def _make_parameters(machine: Machine, model: mujoco.MjModel) -> tuple[float, ...]:
     """Return the parameters of the bed of soil; the last one is the number of soils."""
     bed = bed_parameters([SOILS[name] for name in GRADE_SOILS]).tolist()
-    return (*bed, *[0.0] * (PARAMETERS - 1 - len(bed)), float(len(GRADE_SOILS)))
+    return (*bed, *[0.0] * (MAX_PARAMETERS - 1 - len(bed)), float(len(GRADE_SOILS)))
 
 
 GRADE = Task(
     name="Grade",
     kind="grade",
-    sentence=(
+    description=(
         "An excavator cuts a low bank of soft, loamy or firm soil down to a plane of given height"
         " and slope, 3.8 to 5.8 m in front of it, and carries the soil away. The swing is locked;"
         " its action has no effect."
@@ -471,31 +482,31 @@ GRADE = Task(
     tool="bucket",
     action="resolved_motion",
     duration=60.0,
-    start=_start,
+    start=_draw_start,
     fields=grade_fields,
     measures=(
         ("profile_rms", "m"), ("carried_mass", "kg"), ("soil_force", "N"), ("soil", "1"),
         ("success", "1"), ("spoiled", "1"),
     ),
-    parameters=_parameters,
-    terrain=TERRAIN,
+    parameters=_make_parameters,
+    terrain_size=TERRAIN_SIZE,
     pose_rates=(0.5, 0.3, 0.4, 0.5, 0.25),
     swing_locked=True,
 )  # fmt: skip
 """Grade the ground to a plane."""
 
 
-@callback(TASK_CODE)
-def code(part, m, d, number, argument, out):
-    """Run one part of the task in native code; see `world`."""
-    f = parameters_at(argument)[0]
-    e, w = episodes(f)[number], world(f, m, d, number, argument)
+@callback(TASK_SIGNATURE)
+def task_code(part, m, d, number, argument, out):
+    """Run one part of the task in native code; see `simulation_view`."""
+    f = parameters_view(argument)[0]
+    e, w = episode_records(f)[number], simulation_view(f, m, d, number, argument)
     if part == BEGIN:
         begin_grade(f, e, w)
     elif part == TICK:
-        tick_bed(f, e, w)
+        step_bed(f, e, w)
     elif part == OBSERVE:
-        observe_grade(f, e, w, observed(f, out), 0)
+        observe_grade(f, e, w, observation_view(f, out), 0)
     elif part == REWARD:
-        return rewarded(e, reward_grade(f, e, w))
+        return store_outcome(e, reward_grade(f, e, w))
     return 0.0

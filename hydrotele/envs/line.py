@@ -10,59 +10,73 @@ import math
 import numpy as np
 
 from hydrotele.core.compiled import callback, compiled
-from hydrotele.envs.episode import ARM, uniform, uniform_between
-from hydrotele.envs.task import Task, draw_start, path_effort, pose_read, turned
+from hydrotele.envs.episode import MAX_ARM_AXES, draw_uniform, draw_uniform_between
+from hydrotele.envs.task import Task, draw_start, measure_pose, path_effort, wrap_angle
 from hydrotele.envs.world import (
     BEGIN,
     OBSERVE,
     REWARD,
-    TASK_CODE,
-    Field,
-    episodes,
-    observed,
-    parameters_at,
+    TASK_SIGNATURE,
+    ObservationField,
+    episode_records,
+    max_reach,
+    observation_view,
+    parameters_view,
     pose_fields,
-    reach,
-    rewarded,
-    world,
+    simulation_view,
+    store_outcome,
 )
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Servo
 
-PREVIEWS = (0.1, 0.2, 0.4)  # s, look-ahead times of the observed reference
-ACROSS, ALONG, TURNED = 0.1, 0.2, 0.2  # m, m, rad of error that cost a reward of 1
-SETTLE = 0.5  # s before the motion starts
-_SHORT, _LONG = 1.0, 3.0  # m, range of the length
-_SLOW, _FAST = 0.2, 0.6  # m/s, range of the speed
-_GENTLE, _HARD = 0.5, 1.0  # m/s^2, range of the acceleration
-_TURN, _TURNING = 0.08, 0.4  # rad of swing per metre at most, fraction of episodes with swing
-_INNER, _LOW, _HIGH = 3.0, 0.1, 6.0  # m: minimum radius beyond the tracks, range of the height
-_EFFORT = 0.9  # maximum sum of relative axis rates, see `path_effort`
-_DRAWS, _TRUE_SIZE = 240, 200  # maximum number of draws; draws before the line is shortened
-_SMALLER = 0.7  # factor of length and speed per draw after those
+PREVIEW_TIMES = (0.1, 0.2, 0.4)  # s, look-ahead times of the observed reference
+CROSS_ERROR_SCALE, ALONG_ERROR_SCALE, ATTITUDE_ERROR_SCALE = (
+    0.1,
+    0.2,
+    0.2,
+)  # m, m, rad of error that cost a reward of 1
+SETTLE_TIME = 0.5  # s before the motion starts
+_MIN_LENGTH, _MAX_LENGTH = 1.0, 3.0  # m, range of the length
+_MIN_SPEED, _MAX_SPEED = 0.2, 0.6  # m/s, range of the speed
+_MIN_ACCELERATION, _MAX_ACCELERATION = 0.5, 1.0  # m/s^2, range of the acceleration
+_MAX_SWING_PER_METRE, _SWING_FRACTION = (
+    0.08,
+    0.4,
+)  # rad of swing per metre at most, fraction of episodes with swing
+_MIN_RADIUS, _MIN_HEIGHT, _MAX_HEIGHT = (
+    3.0,
+    0.1,
+    6.0,
+)  # m: minimum radius beyond the tracks, range of the height
+_MAX_EFFORT = 0.9  # maximum sum of relative axis rates, see `path_effort`
+_MAX_DRAWS, _FULL_SIZE_DRAWS = (
+    240,
+    200,
+)  # maximum number of draws; draws before the line is shortened
+_SHRINK_FACTOR = 0.7  # factor of length and speed per draw after those
 # indices in `goal`: pose at the start (r, theta, z, attitude), change of the pose per metre
 _START, _PER_METRE, _LENGTH, _SPEED, _ACCELERATION = 0, 4, 7, 8, 9
-_R, _THETA, _Z, _ATTITUDE, _HEAD = range(ARM)
+_R, _THETA, _Z, _ATTITUDE, _HEAD = range(MAX_ARM_AXES)
 # indices in the observation of the task: pose, its rate, positions ahead, errors
-_POSE, _RATE, _AHEAD = 0, 4, 7
-_ALONG = _AHEAD + 3 * len(PREVIEWS)
-_ACROSS = _ALONG + 1
-_QUICK = 1.0  # m/s, rad/s: bound of the reference rates
+_POSE_COLUMN, _RATE_COLUMN, _PREVIEW_COLUMN = 0, 4, 7
+_ALONG_COLUMN = _PREVIEW_COLUMN + 3 * len(PREVIEW_TIMES)
+_CROSS_COLUMN = _ALONG_COLUMN + 1
+_RATE_BOUND = 1.0  # m/s, rad/s: bound of the reference rates
 
 
-def line_fields(machine: Machine, axes: tuple[str, ...]) -> list[Field]:
+def line_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
     """Return the fields that `observe_line` writes: reference pose, rates, preview, errors."""
-    k, far = len(axes), reach(machine)
+    k, far = len(axes), max_reach(machine)
     fields = pose_fields(machine, k, "wanted")
-    fields += [Field(f"wanted_rate.{c}", unit, -_QUICK, _QUICK)
+    fields += [ObservationField(f"wanted_rate.{c}", unit, -_RATE_BOUND, _RATE_BOUND)
                for c, unit in (("r", "m/s"), ("theta", "rad/s"), ("z", "m/s"))]  # fmt: skip
-    for ahead in PREVIEWS:
+    for ahead in PREVIEW_TIMES:
         fields += pose_fields(machine, k, f"wanted_in_{ahead * 1000:.0f}_ms")[:3]
     return [
         *fields,
-        Field("along_track_error", "m", -2.0 * far, 2.0 * far),
-        Field("cross_track_error", "m", 0.0, 2.0 * far),
+        ObservationField("along_track_error", "m", -2.0 * far, 2.0 * far),
+        ObservationField("cross_track_error", "m", 0.0, 2.0 * far),
     ]
 
 
@@ -79,21 +93,24 @@ def begin_line(f, e):
 
     Source: this module.
     """
-    g, start, change = e.goal, np.zeros(ARM), np.zeros(ARM)
+    g, start, change = e.reference, np.zeros(MAX_ARM_AXES), np.zeros(MAX_ARM_AXES)
     task_forward(f.arm, e.position[: f.arm_axes], start)
     for c in range(4):
         g[_START + c] = start[c]
-    speed, g[_ACCELERATION] = uniform_between(e, _SLOW, _FAST), uniform_between(e, _GENTLE, _HARD)
-    turn = uniform_between(e, -_TURN, _TURN)
-    if uniform(e) >= _TURNING:
+    speed, g[_ACCELERATION] = (
+        draw_uniform_between(e, _MIN_SPEED, _MAX_SPEED),
+        draw_uniform_between(e, _MIN_ACCELERATION, _MAX_ACCELERATION),
+    )
+    turn = draw_uniform_between(e, -_MAX_SWING_PER_METRE, _MAX_SWING_PER_METRE)
+    if draw_uniform(e) >= _SWING_FRACTION:
         turn = 0.0
     size = 1.0
-    for n in range(_DRAWS):
-        if n >= _TRUE_SIZE:
-            size *= _SMALLER  # the start is inside the workspace, so a short slow line fits
+    for n in range(_MAX_DRAWS):
+        if n >= _FULL_SIZE_DRAWS:
+            size *= _SHRINK_FACTOR  # the start is inside the workspace, so a short slow line fits
         way, length = (
-            uniform_between(e, -math.pi, math.pi),
-            size * uniform_between(e, _SHORT, _LONG),
+            draw_uniform_between(e, -math.pi, math.pi),
+            size * draw_uniform_between(e, _MIN_LENGTH, _MAX_LENGTH),
         )
         g[_PER_METRE + _R], g[_PER_METRE + _THETA] = math.cos(way), turn
         g[_PER_METRE + _Z] = math.sin(way)
@@ -101,14 +118,14 @@ def begin_line(f, e):
         for c in range(3):
             change[c] = length * g[_PER_METRE + c]
         end = start + change
-        if end[_R] < _INNER or not _LOW <= end[_Z] <= _HIGH:
+        if end[_R] < _MIN_RADIUS or not _MIN_HEIGHT <= end[_Z] <= _MAX_HEIGHT:
             continue
-        if path_effort(f, start, change) * g[_SPEED] / length <= _EFFORT:
+        if path_effort(f, start, change) * g[_SPEED] / length <= _MAX_EFFORT:
             break
 
 
 @compiled
-def line_way(g, time):
+def line_travel(g, time):
     """Return the distance travelled along the line, and the speed.
 
     Args:
@@ -124,7 +141,7 @@ def line_way(g, time):
     speed = min(g[_SPEED], math.sqrt(most * length))
     ramp = speed / most
     total = length / speed + ramp
-    t = min(max(time - SETTLE, 0.0), total)
+    t = min(max(time - SETTLE_TIME, 0.0), total)
     if t < ramp:
         return 0.5 * most * t * t, most * t
     left = total - t
@@ -134,7 +151,7 @@ def line_way(g, time):
 
 
 @compiled
-def line_pose(g, time, pose, rate):
+def compute_line_pose(g, time, pose, rate):
     """Compute the reference pose and its rate.
 
     Args:
@@ -148,7 +165,7 @@ def line_pose(g, time, pose, rate):
 
     Source: this module.
     """
-    way, speed = line_way(g, time)
+    way, speed = line_travel(g, time)
     for c in range(3):
         pose[c] = g[_START + c] + way * g[_PER_METRE + c]
         rate[c] = speed * g[_PER_METRE + c]
@@ -157,12 +174,12 @@ def line_pose(g, time, pose, rate):
 
 
 @compiled
-def line_errors(g, wanted, r, theta, z):
+def line_errors(g, reference, r, theta, z):
     """Return the along-track and cross-track errors of the tip.
 
     Args:
         g: (GOAL,) goal of the episode.
-        wanted: (ARM,) reference pose.
+        reference: (ARM,) reference pose.
         r: radius of the tip, scalar [m].
         theta: angle of the tip about the swing axis, modulo 2 pi, scalar [rad].
         z: height of the tip, scalar [m].
@@ -172,10 +189,10 @@ def line_errors(g, wanted, r, theta, z):
 
     Source: this module.
     """
-    x, up = r - wanted[_R], z - wanted[_Z]
-    y = wanted[_R] * turned(theta - wanted[_THETA])
+    x, up = r - reference[_R], z - reference[_Z]
+    y = reference[_R] * wrap_angle(theta - reference[_THETA])
     ahead, rise = g[_PER_METRE + _R], g[_PER_METRE + _Z]
-    aside = wanted[_R] * g[_PER_METRE + _THETA]
+    aside = reference[_R] * g[_PER_METRE + _THETA]
     along = (x * ahead + y * aside + up * rise) / math.sqrt(ahead**2 + aside**2 + rise**2)
     return along, math.sqrt(max(0.0, x * x + y * y + up * up - along * along))
 
@@ -195,25 +212,30 @@ def observe_line(f, e, out, at):
 
     Source: `line_fields`.
     """
-    now, pose, rate, tip = e.tick * f.period, np.empty(ARM), np.empty(ARM), np.empty(ARM)
-    line_pose(e.goal, now, pose, rate)
-    pose_read(f, e, tip)
+    now, pose, rate, tip = (
+        e.tick * f.period,
+        np.empty(MAX_ARM_AXES),
+        np.empty(MAX_ARM_AXES),
+        np.empty(MAX_ARM_AXES),
+    )
+    compute_line_pose(e.reference, now, pose, rate)
+    measure_pose(f, e, tip)
     for c in range(4):
-        out[at + _POSE + c] = pose[c]
+        out[at + _POSE_COLUMN + c] = pose[c]
     for c in range(3):
-        out[at + _RATE + c] = rate[c]
-    along, across = line_errors(e.goal, pose, tip[_R], tip[_THETA], tip[_Z])
-    out[at + _ALONG], out[at + _ACROSS] = along, across
-    for p in range(len(PREVIEWS)):
-        line_pose(e.goal, now + PREVIEWS[p], pose, rate)
+        out[at + _RATE_COLUMN + c] = rate[c]
+    along, across = line_errors(e.reference, pose, tip[_R], tip[_THETA], tip[_Z])
+    out[at + _ALONG_COLUMN], out[at + _CROSS_COLUMN] = along, across
+    for p in range(len(PREVIEW_TIMES)):
+        compute_line_pose(e.reference, now + PREVIEW_TIMES[p], pose, rate)
         for c in range(3):
-            out[at + _AHEAD + 3 * p + c] = pose[c]
+            out[at + _PREVIEW_COLUMN + 3 * p + c] = pose[c]
 
 
 @compiled
-def line_reward(across, along, attitude):
+def reward_from_errors(across, along, attitude):
     """Return the reward, scalar from -1 to 1, for errors [m], [m] and [rad]."""
-    costs = across / ACROSS + abs(along) / ALONG + abs(attitude) / TURNED
+    costs = across / CROSS_ERROR_SCALE + abs(along) / ALONG_ERROR_SCALE + abs(attitude) / ATTITUDE_ERROR_SCALE
     return max(-1.0, 1.0 - costs)
 
 
@@ -230,18 +252,18 @@ def reward_line(f, e, w):
     Returns:
         (reward, False), scalars.
 
-    Source: `line_reward`.
+    Source: `reward_from_errors`.
     """
-    pose, rate = np.empty(ARM), np.empty(ARM)
-    line_pose(e.goal, e.tick * f.period, pose, rate)
+    pose, rate = np.empty(MAX_ARM_AXES), np.empty(MAX_ARM_AXES)
+    compute_line_pose(e.reference, e.tick * f.period, pose, rate)
     r, theta = math.hypot(e.tip[0], e.tip[1]), math.atan2(e.tip[1], e.tip[0])
-    along, across = line_errors(e.goal, pose, r, theta, e.tip[2])
+    along, across = line_errors(e.reference, pose, r, theta, e.tip[2])
     attitude = e.position[1] + e.position[2] + e.position[3] - pose[_ATTITUDE]
     w.measures[0], w.measures[1], w.measures[2] = across, along, attitude
-    return line_reward(across, along, attitude), False
+    return reward_from_errors(across, along, attitude), False
 
 
-def _start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
+def _draw_start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
     """Draw a start with the bucket in the air, about as in Zhu 1994, Figs 6.45-6.48."""
     return draw_start(machine, rng, (4.8, -0.5, 0.4, -1.9), (6.5, 0.5, 2.4, -1.2))
 
@@ -249,7 +271,7 @@ def _start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
 STRAIGHT_LINE = Task(
     name="StraightLine",
     kind="line",
-    sentence=(
+    description=(
         "The tip of an excavator's bucket moves along a straight line of 1 to 3 m at 0.2 to 0.6 m/s"
         " with constant attitude."
     ),
@@ -261,7 +283,7 @@ STRAIGHT_LINE = Task(
     tool="bucket",
     action="resolved_motion",
     duration=16.5,  # s: enough for the longest and slowest line
-    start=_start,
+    start=_draw_start,
     fields=line_fields,
     measures=(("cross_track_error", "m"), ("along_track_error", "m"), ("attitude_error", "rad")),
     # a higher gain excites the oil resonance of the boom near the end of its range
@@ -271,15 +293,15 @@ STRAIGHT_LINE = Task(
 """Move the tip along a straight line."""
 
 
-@callback(TASK_CODE)
-def code(part, m, d, number, argument, out):
-    """Run one part of the task in native code; see `world`."""
-    f = parameters_at(argument)[0]
-    e, w = episodes(f)[number], world(f, m, d, number, argument)
+@callback(TASK_SIGNATURE)
+def task_code(part, m, d, number, argument, out):
+    """Run one part of the task in native code; see `simulation_view`."""
+    f = parameters_view(argument)[0]
+    e, w = episode_records(f)[number], simulation_view(f, m, d, number, argument)
     if part == BEGIN:
         begin_line(f, e)
     elif part == OBSERVE:
-        observe_line(f, e, observed(f, out), 0)
+        observe_line(f, e, observation_view(f, out), 0)
     elif part == REWARD:
-        return rewarded(e, reward_line(f, e, w))
+        return store_outcome(e, reward_line(f, e, w))
     return 0.0

@@ -13,23 +13,29 @@ import numpy as np
 from numba import carray, types
 
 from hydrotele.control.resolved_motion import follow_pose
-from hydrotele.control.servo import POINTS, ComputedForce, DriveReference, Measured, drive_row
+from hydrotele.control.servo import (
+    TABLE_POINTS,
+    ComputedForce,
+    DriveReference,
+    MeasuredState,
+    interpolate_drive_reference,
+)
 from hydrotele.control.tick import Controller, TickReference, control_tick
 from hydrotele.core.compiled import callback, compiled
-from hydrotele.core.memory import copy_to, floats, pointer
+from hydrotele.core.memory import address_to_pointer, copy_values, float64_view
 from hydrotele.envs.episode import (
-    ARM,
-    AXES,
-    CHANNELS,
     DISABLED,
     JOINT_RATE,
-    MEASURES,
+    MAX_ARM_AXES,
+    MAX_AXES,
+    MAX_CHANNELS,
+    MAX_MEASURES,
     NEXT_STEP,
     RESET,
     RESOLVED_MOTION,
     SAME_STEP,
     VALVE,
-    uniform,
+    draw_uniform,
 )
 from hydrotele.envs.world import (
     BEGIN,
@@ -37,83 +43,83 @@ from hydrotele.envs.world import (
     REWARD,
     TICK,
     call_task,
-    episodes,
+    episode_records,
     observe_machine,
-    parameters_at,
-    world,
+    parameters_view,
+    simulation_view,
 )
-from hydrotele.hydraulics.parameters import SLOTS
+from hydrotele.hydraulics.parameters import SLOT_COUNT
 from hydrotele.kinematics.task import task_forward
-from hydrotele.simulate.feedback import Readings, Sensors, hold_readings, read_sensors
-from hydrotele.simulate.fleet import STATE
+from hydrotele.simulate.feedback import Readings, SensorParameters, read_sensors, store_readings
+from hydrotele.simulate.fleet import STATE_KIND
 from hydrotele.simulate.layout import call_set_state
 from hydrotele.simulate.stepping import (
-    CommandLine,
-    SensorPast,
+    CommandDelayLine,
+    SensorHistory,
     Simulation,
-    begin_past,
-    delayed_values,
-    true_values,
+    apply_sensor_delays,
+    initialise_history,
+    true_sensor_values,
 )
 
-_AHEAD = 0.2  # rad or m, maximum lead of a reference over its joint: anti-windup for a stalled arm
+_MAX_REFERENCE_LEAD = 0.2  # rad or m, maximum lead of a reference over its joint: anti-windup for a stalled arm
 
 
 @compiled
-def _asked(f, action, a):
+def _clip_action(f, action, a):
     """Return an action clipped to +-1; 0 for the locked action."""
     return 0.0 if a == f.locked else min(1.0, max(-1.0, action[a]))
 
 
 @compiled
-def _towards(now, goal, change):
+def _limit_change(now, goal, change):
     return min(now + change, max(now - change, goal))
 
 
 @compiled
-def _joint_rates(f, e, action, first):
+def _integrate_joint_rates(f, e, action, first):
     """Move the references of axes by joint rates, from action `first` on."""
     for a in range(first, f.actions):
         i = f.driven_axis[a]
-        goal = _asked(f, action, a) * f.fastest[i]
-        rate = _towards(e.reference_rate[i], goal, f.acceleration * f.period)
+        goal = _clip_action(f, action, a) * f.fastest[i]
+        rate = _limit_change(e.reference_rate[i], goal, f.acceleration * f.period)
         place = e.reference[i] + f.period * rate
-        low = max(f.ranges[i, 0], e.joint[i] - _AHEAD)
-        high = min(f.ranges[i, 1], e.joint[i] + _AHEAD)
+        low = max(f.ranges[i, 0], e.joint[i] - _MAX_REFERENCE_LEAD)
+        high = min(f.ranges[i, 1], e.joint[i] + _MAX_REFERENCE_LEAD)
         if place < low or place > high:
             place, rate = min(high, max(low, e.reference[i])), 0.0
         e.reference[i], e.reference_rate[i] = place, rate
 
 
 @compiled
-def _pose_rates(f, e, action):
+def _integrate_pose_rates(f, e, action):
     """Move the references of the arm by pose rates (resolved motion)."""
-    k, wanted = f.arm_axes, np.empty(ARM)
-    for c in range(ARM):
+    k, wanted = f.arm_axes, np.empty(MAX_ARM_AXES)
+    for c in range(MAX_ARM_AXES):
         goal = 0.0
         if c < k:
-            goal = _asked(f, action, c) * f.fastest_pose[c]
-        e.pose_rate[c] = _towards(e.pose_rate[c], goal, f.accelerations[c] * f.period)
+            goal = _clip_action(f, action, c) * f.fastest_pose[c]
+        e.pose_rate[c] = _limit_change(e.pose_rate[c], goal, f.accelerations[c] * f.period)
         wanted[c] = e.pose[c] + f.period * e.pose_rate[c]
     far = False
     for i in range(k):
-        far = far or abs(e.reference[i] - e.joint[i]) > _AHEAD
+        far = far or abs(e.reference[i] - e.joint[i]) > _MAX_REFERENCE_LEAD
     held = far or follow_pose(
         f.arm, f.ranges[:k], wanted, e.pose_rate, False, e.pose, e.reference[:k],
         e.reference_rate[:k],
     )  # fmt: skip
-    e.blocked = 1 if held else 0
+    e.is_blocked = 1 if held else 0
     if held:
         e.pose_rate[:] = 0.0
         e.reference_rate[:k] = 0.0
     if far:  # the arm is blocked by an obstacle: continue from its measured position
         for i in range(k):
-            e.reference[i] = _towards(e.joint[i], e.reference[i], _AHEAD)
+            e.reference[i] = _limit_change(e.joint[i], e.reference[i], _MAX_REFERENCE_LEAD)
         task_forward(f.arm, e.reference[:k], e.pose)
 
 
 @compiled
-def act(f, e, action):
+def apply_action(f, e, action):
     """Convert the action into valve commands, or into references of the servo.
 
     Args:
@@ -130,23 +136,23 @@ def act(f, e, action):
     if f.mode == VALVE:
         for a in range(f.actions):
             i = f.driven_axis[a]
-            e.command[i] = _asked(f, action, a) * f.limit[i]
+            e.command[i] = _clip_action(f, action, a) * f.limit[i]
         return
     if f.mode == RESOLVED_MOTION:
-        _pose_rates(f, e, action)
-        _joint_rates(f, e, action, f.arm_axes)
+        _integrate_pose_rates(f, e, action)
+        _integrate_joint_rates(f, e, action, f.arm_axes)
     elif f.mode == JOINT_RATE:
-        _joint_rates(f, e, action, 0)
+        _integrate_joint_rates(f, e, action, 0)
     k = f.axes
-    table = floats(f.table, k * POINTS * 3).reshape((k, POINTS, 3))
-    drive_row(
+    table = float64_view(f.table, k * TABLE_POINTS * 3).reshape((k, TABLE_POINTS, 3))
+    interpolate_drive_reference(
         f.grid[:k], table, e.reference[:k], e.reference_rate[:k], f.feedforward, e.drive[0, :k],
         e.drive[1, :k], e.drive[2, :k], e.drive[3, :k],
     )  # fmt: skip
 
 
 @compiled
-def sense(f, e, sim):
+def update_sensors(f, e, sim):
     """Sample the sensors if a sample is due, and hold the last sample otherwise.
 
     Args:
@@ -164,58 +170,62 @@ def sense(f, e, sim):
         for i in range(k):
             e.position[i] = sim.qpos[f.qpos[i]] - f.timestep * sim.qvel[f.dof[i]]
         return
-    values, scales = np.empty(c), f.scales + 8 * e.variant * CHANNELS
-    true_values(sim, values)
+    values, scales = np.empty(c), f.scales + 8 * e.variant * MAX_CHANNELS
+    true_sensor_values(sim, values)
     for i in range(k):
         e.position[i] = values[i]
         e.sampled_reference[i] = e.reference[i]
-    delayed_values(sim.past, e.tick * f.substeps, values)
+    apply_sensor_delays(sim.past, e.tick * f.substeps, values)
     for i in range(c):
-        e.error[i] = f.accuracy[i] * (2.0 * uniform(e) - 1.0) if f.noisy else 0.0
-    sensors = Sensors(
-        floats(scales, c), floats(f.offsets + 8 * e.variant * CHANNELS, c), f.converters[0],
+        e.error[i] = f.accuracy[i] * (2.0 * draw_uniform(e) - 1.0) if f.noisy else 0.0
+    sensors = SensorParameters(
+        float64_view(scales, c), float64_view(f.offsets + 8 * e.variant * MAX_CHANNELS, c), f.converters[0],
         f.converters[1], f.converters[2],
     )  # fmt: skip
     read_sensors(sensors, values, e.error[:c])
     span = f.every * f.period if e.tick > 0 else 0.0
     readings = Readings(e.joint[:k], e.rate[:k], e.head[:k], e.rod[:k], np.empty(1))
-    e.supply = hold_readings(values, f.hydraulic, span, readings)
+    e.supply = store_readings(values, f.hydraulic, span, readings)
 
 
-assert CHANNELS >= 3 * AXES + 1
+assert MAX_CHANNELS >= 3 * MAX_AXES + 1
 
 
-_WARNINGS = int(mujoco.mjtWarning.mjNWARNING)
-_FIRST_BAD, _LAST_BAD = int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC)
+_WARNING_COUNT = int(mujoco.mjtWarning.mjNWARNING)
+_FIRST_BAD_STATE, _LAST_BAD_STATE = (
+    int(mujoco.mjtWarning.mjWARN_BADQPOS),
+    int(mujoco.mjtWarning.mjWARN_BADQACC),
+)
 _SIGNATURE = types.void(types.int64, types.int64, types.intc, types.int64)
 
 
 @compiled
-def _simulation(f, e, w):
+def _make_simulation(f, e, w):
     """Return the simulation record of an episode for `simulate.stepping`."""
-    ring = floats(
-        f.commands + 8 * w.number * f.delayed_command * AXES, f.delayed_command * AXES
-    ).reshape((f.delayed_command, AXES))
-    delays = floats(f.delays + 8 * e.variant * AXES * 2, AXES * 2).reshape((AXES, 2))
+    ring = float64_view(f.commands + 8 * w.number * f.delayed_command * MAX_AXES, f.delayed_command * MAX_AXES).reshape(
+        (f.delayed_command, MAX_AXES)
+    )
+    delays = float64_view(f.delays + 8 * e.variant * MAX_AXES * 2, MAX_AXES * 2).reshape((MAX_AXES, 2))
     c = f.axes + 2 * f.hydraulic + (1 if f.hydraulic > 0 else 0)
-    sensed = floats(
-        f.sensed + 8 * w.number * f.delayed_sensor * CHANNELS, f.delayed_sensor * CHANNELS
-    ).reshape((f.delayed_sensor, CHANNELS))
-    lags = floats(f.lags + 8 * e.variant * CHANNELS * 2, CHANNELS * 2).reshape((CHANNELS, 2))
-    past = SensorPast(
-        sensed, floats(f.sensed_before + 8 * w.number * CHANNELS, c), lags,
-        floats(f.ratios + 8 * e.variant * CHANNELS, CHANNELS),
+    sensed = float64_view(
+        f.by_readings + 8 * w.number * f.delayed_sensor * MAX_CHANNELS,
+        f.delayed_sensor * MAX_CHANNELS,
+    ).reshape((f.delayed_sensor, MAX_CHANNELS))
+    lags = float64_view(f.lags + 8 * e.variant * MAX_CHANNELS * 2, MAX_CHANNELS * 2).reshape((MAX_CHANNELS, 2))
+    past = SensorHistory(
+        sensed, float64_view(f.sensed_before + 8 * w.number * MAX_CHANNELS, c), lags,
+        float64_view(f.lag_ratios + 8 * e.variant * MAX_CHANNELS, MAX_CHANNELS),
     )  # fmt: skip
     none = f.qpos[:0]
-    user = floats(f.users + 8 * e.variant * f.axes * SLOTS, f.axes * SLOTS)
+    user = float64_view(f.users + 8 * e.variant * f.axes * SLOT_COUNT, f.axes * SLOT_COUNT)
     return Simulation(
         f.mj_step, w.model, w.data, w.qpos, w.qvel, w.act, w.ctrl, f.timestep, f.axes, f.hydraulic,
-        f.qpos[: f.axes], f.dof[: f.axes], none, none, user, CommandLine(ring, delays), past,
+        f.qpos[: f.axes], f.dof[: f.axes], none, none, user, CommandDelayLine(ring, delays), past,
     )  # fmt: skip
 
 
 @compiled
-def _tick(f, e, sim):
+def _run_control_period(f, e, sim):
     """Run the servo and the physics for one control period."""
     k, none = f.axes, np.zeros(f.axes)
     controller = Controller(f.servo[:k], f.closed[:k], e.load[:k], e.command[:k])
@@ -223,19 +233,19 @@ def _tick(f, e, sim):
     reference = TickReference(
         e.sampled_reference[:k], drive, ComputedForce(False, none, none), False
     )  # fmt: skip
-    measured = Measured(e.joint[:k], e.rate[:k], e.head[:k], e.rod[:k], e.supply)
+    measured = MeasuredState(e.joint[:k], e.rate[:k], e.head[:k], e.rod[:k], e.supply)
     control_tick(sim, e.tick, f.substeps, controller, reference, measured)
 
 
 @compiled
-def _unstable(f, e, d):
+def _check_stability(f, e, d):
     """Count and clear MuJoCo's warnings; return whether a state was infinite or NaN."""
-    warnings = carray(pointer(d + f.at_warning), (_WARNINGS, 2), np.int32)  # (information, number)
+    warnings = carray(address_to_pointer(d + f.at_warning), (_WARNING_COUNT, 2), np.int32)  # (information, number)
     bad = False
-    for kind in range(_WARNINGS):
+    for kind in range(_WARNING_COUNT):
         if warnings[kind, 1] > 0:
             e.warnings += warnings[kind, 1]
-            bad = bad or _FIRST_BAD <= kind <= _LAST_BAD
+            bad = bad or _FIRST_BAD_STATE <= kind <= _LAST_BAD_STATE
             warnings[kind, 1] = 0
     return bad
 
@@ -244,27 +254,27 @@ def _unstable(f, e, d):
 def _begin_episode(f, e, w):
     """Draw a variant, set the simulation to its start, and draw a new goal."""
     e.last_variant, e.last_fault = e.variant, e.fault
-    e.variant = int(uniform(e) * f.variants)
+    e.variant = int(draw_uniform(e) * f.variants)
     start = f.starts + 8 * e.variant * f.states
-    call_set_state(f.mj_set_state, w.model, w.data, start, STATE)
-    places = carray(pointer(f.places), (3 * f.fields,), np.int64)
+    call_set_state(f.mj_set_state, w.model, w.data, start, STATE_KIND)
+    places = carray(address_to_pointer(f.places), (3 * f.fields,), np.int64)
     for n in range(f.fields):
         size = places[3 * n + 2]
-        given = floats(places[3 * n] + 8 * e.variant * size, size)
-        taken = floats(places[3 * n + 1] + 8 * w.number * size, size)
+        given = float64_view(places[3 * n] + 8 * e.variant * size, size)
+        taken = float64_view(places[3 * n + 1] + 8 * w.number * size, size)
         for c in range(size):
             taken[c] = given[c]
     e.episode += 1
-    e.step, e.tick, e.over, e.fault, e.blocked = 0, 0, 0, 0, 0
+    e.step, e.tick, e.over, e.fault, e.is_blocked = 0, 0, 0, 0, 0
     e.command[:] = 0.0
     for i in range(f.axes):
         e.command[i] = w.ctrl[i]
-    sim = _simulation(f, e, w)
-    begin_past(sim, w.ctrl)
-    tips = floats(f.start_tips + 24 * e.variant, 3)
-    copy_to(e.tip, tips)
+    sim = _make_simulation(f, e, w)
+    initialise_history(sim, w.ctrl)
+    tips = float64_view(f.start_tips + 24 * e.variant, 3)
+    copy_values(e.tip, tips)
     e.reference_rate[:], e.pose_rate[:] = 0.0, 0.0
-    sense(f, e, sim)
+    update_sensors(f, e, sim)
     for i in range(len(e.joint)):
         e.reference[i] = e.sampled_reference[i] = e.joint[i]
     if f.arm_axes > 0:
@@ -276,12 +286,12 @@ def _begin_episode(f, e, w):
 
 
 @compiled
-def _observe(f, e, w, address):
+def _write_observation(f, e, w, address):
     """Write the observation, clipped to its bounds."""
     n = f.observations
-    out = carray(pointer(address + 4 * w.number * n), (n,), np.float32)
-    low = carray(pointer(f.low), (n,), np.float32)
-    high = carray(pointer(f.high), (n,), np.float32)
+    out = carray(address_to_pointer(address + 4 * w.number * n), (n,), np.float32)
+    low = carray(address_to_pointer(f.low), (n,), np.float32)
+    high = carray(address_to_pointer(f.high), (n,), np.float32)
     at = observe_machine(f, e, out)
     call_task(f, w, OBSERVE, address + 4 * (w.number * n + at))
     for c in range(n):
@@ -291,20 +301,18 @@ def _observe(f, e, w, address):
 
 
 @compiled
-def _step(f, e, w, action):
+def _run_step(f, e, w, action):
     """Run one environment step; return the reward, `terminated` and `truncated`."""
-    sim = _simulation(f, e, w)
+    sim = _make_simulation(f, e, w)
     for _ in range(f.ticks):
-        act(f, e, action)
-        _tick(f, e, sim)
+        apply_action(f, e, action)
+        _run_control_period(f, e, sim)
         e.tick += 1
-        sense(f, e, sim)
-        call_task(
-            f, w, TICK, 0
-        )  # after the physics: before it, body positions belong to another simulation
-    copy_to(e.tip, w.tip)
+        update_sensors(f, e, sim)
+        call_task(f, w, TICK, 0)  # after the physics: before it, body positions belong to another simulation
+    copy_values(e.tip, w.tip)
     e.step += 1
-    if _unstable(f, e, w.data):
+    if _check_stability(f, e, w.data):
         e.fault = 1
         e.faults += 1
         return 0.0, True, False
@@ -314,32 +322,32 @@ def _step(f, e, w, action):
 
 
 @compiled
-def _advance(m, d, sim, argument):
-    f = parameters_at(argument)[0]
-    e, w = episodes(f)[sim], world(f, m, d, sim, argument)
-    reward = carray(pointer(f.reward), (f.count,), np.float64)
-    terminated = carray(pointer(f.terminated), (f.count,), np.uint8)
-    truncated = carray(pointer(f.truncated), (f.count,), np.uint8)
+def _advance_simulation(m, d, sim, argument):
+    f = parameters_view(argument)[0]
+    e, w = episode_records(f)[sim], simulation_view(f, m, d, sim, argument)
+    reward = carray(address_to_pointer(f.reward), (f.count,), np.float64)
+    terminated = carray(address_to_pointer(f.terminated), (f.count,), np.uint8)
+    truncated = carray(address_to_pointer(f.truncated), (f.count,), np.uint8)
     reward[sim], terminated[sim], truncated[sim] = 0.0, 0, 0
     fresh = f.call == RESET or (f.autoreset == NEXT_STEP and e.over != 0)
     if fresh:
         _begin_episode(f, e, w)
-        _observe(f, e, w, f.observation)
+        _write_observation(f, e, w, f.observation)
         return
     if f.autoreset == DISABLED and e.over != 0:
         return
-    action = carray(pointer(f.action + 4 * sim * f.actions), (f.actions,), np.float32)
-    value, done, late = _step(f, e, w, action)
+    action = carray(address_to_pointer(f.action + 4 * sim * f.actions), (f.actions,), np.float32)
+    value, done, late = _run_step(f, e, w, action)
     reward[sim], terminated[sim], truncated[sim] = value, done, late
     e.over = 1 if done or late else 0
     if f.autoreset == SAME_STEP and e.over != 0:
-        copy_to(floats(f.final_measures + 8 * sim * MEASURES, MEASURES), w.measures)
-        _observe(f, e, w, f.final)
+        copy_values(float64_view(f.final_measures + 8 * sim * MAX_MEASURES, MAX_MEASURES), w.measures)
+        _write_observation(f, e, w, f.final)
         _begin_episode(f, e, w)
-    _observe(f, e, w, f.observation)
+    _write_observation(f, e, w, f.observation)
 
 
 @callback(_SIGNATURE)
 def advance(m, d, sim, argument):
     """Step or reset one simulation: mjModel*, mjData*, index, TASK_PARAMETERS*."""
-    _advance(m, d, sim, argument)
+    _advance_simulation(m, d, sim, argument)

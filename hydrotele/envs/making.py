@@ -17,7 +17,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from hydrotele.core.datafile import suggest
+from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import DISABLED, NEXT_STEP, SAME_STEP
@@ -27,7 +27,7 @@ from hydrotele.envs.line import STRAIGHT_LINE
 from hydrotele.envs.loop import advance
 from hydrotele.envs.place import PLACE_LOG
 from hydrotele.envs.reach import REACH_FELLER
-from hydrotele.envs.stage import Camera, Stage
+from hydrotele.envs.stage import Camera, TaskRenderer
 from hydrotele.envs.task import Options, Task
 from hydrotele.envs.track import track_fields
 from hydrotele.machine.machine import Machine
@@ -35,7 +35,7 @@ from hydrotele.show.canvas import write_markers
 from hydrotele.show.window import check_screen
 
 
-def _about_home(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
+def _draw_start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
     """Draw axis positions uniformly from the middle 40 % of their ranges."""
     places = {}
     for name, axis in machine.axes.items():
@@ -50,11 +50,11 @@ TASKS = {
         Task(
             name="TrackTrajectory",
             kind="track",
-            sentence="All axes of an excavator without a tool track Fourier references.",
+            description="All axes of an excavator without a tool track Fourier references.",
             reward="The reward is 1 minus 1 for every 0.1 m of tip error, at least -1.",
             machine="cat215",
             tool="none",
-            start=_about_home,
+            start=_draw_start,
             fields=track_fields,
             measures=(("tip_error", "m"),),
         ),
@@ -68,15 +68,15 @@ TASKS = {
 """Tasks by name."""
 
 
-_STRICT = ConfigDict(strict=True, allow_inf_nan=False)
-_TYPES: dict[str, TypeAdapter] = {
-    name: TypeAdapter(hint, config=_STRICT) for name, hint in get_type_hints(Options).items()
+_STRICT_CONFIG = ConfigDict(strict=True, allow_inf_nan=False)
+_OPTION_TYPES: dict[str, TypeAdapter] = {
+    name: TypeAdapter(hint, config=_STRICT_CONFIG) for name, hint in get_type_hints(Options).items()
 }
-_LOOPS = "from hydrotele.multibody.closures import compile_openings; compile_openings()"
-AUTORESET = {"NextStep": NEXT_STEP, "SameStep": SAME_STEP, "Disabled": DISABLED}
+_COMPILE_LOOPS_COMMAND = "from hydrotele.multibody.closures import compile_openings; compile_openings()"
+AUTORESET_MODES = {"NextStep": NEXT_STEP, "SameStep": SAME_STEP, "Disabled": DISABLED}
 
 
-def make_core(task: str, choices: dict[str, Any], count: int, threads: int, mode: int) -> TaskCore:
+def make_core(task: str, choices: dict[str, Any], count: int, threads: int, autoreset: int) -> TaskCore:
     """Make a running task from its name and options.
 
     Args:
@@ -84,7 +84,7 @@ def make_core(task: str, choices: dict[str, Any], count: int, threads: int, mode
         choices: fields of `envs.task.Options`.
         count: number of environments.
         threads: number of threads that step the environments, 0 for one per core.
-        mode: autoreset mode, NEXT_STEP, SAME_STEP or DISABLED.
+        autoreset: autoreset mode, NEXT_STEP, SAME_STEP or DISABLED.
 
     Returns:
         The core.
@@ -93,41 +93,41 @@ def make_core(task: str, choices: dict[str, Any], count: int, threads: int, mode
         InputError: the task or an option does not exist, or a value is not valid.
     """
     if task not in TASKS:
-        raise InputError(f"task {task!r}", suggest(task, TASKS))
+        raise InputError(f"task {task!r}", suggest_valid_name(task, TASKS))
     known = {field.name for field in dataclasses.fields(Options)}
     if strange := set(choices) - known:
         name = sorted(strange)[0]
-        raise InputError(f"environment option {name!r}", suggest(name, known))
-    options = _options(choices)
-    advance.compile_elsewhere(_LOOPS)  # while the plant's own code is compiled here
-    return TaskCore(TASKS[task], options, count, threads, mode)
+        raise InputError(f"environment option {name!r}", suggest_valid_name(name, known))
+    options = _validate_options(choices)
+    advance.compile_in_background(_COMPILE_LOOPS_COMMAND)  # while the plant's own code is compiled here
+    return TaskCore(TASKS[task], options, count, threads, autoreset)
 
 
-def _options(choices: dict[str, Any]) -> Options:
+def _validate_options(choices: dict[str, Any]) -> Options:
     """Validate the type of every option; `variants="3"` and NaN are errors."""
     kept: dict[str, Any] = {}
     for name, value in choices.items():
         plain = value.item() if isinstance(value, np.generic) else value
         plain = tuple(plain) if isinstance(plain, list) else plain
         try:
-            kept[name] = _TYPES[name].validate_python(plain)
+            kept[name] = _OPTION_TYPES[name].validate_python(plain)
         except ValidationError as error:
             message = f"{error.errors()[0]['msg']}; got {value!r}"
             raise InputError(f"environment option {name!r}", message) from None
     return Options(**kept)
 
 
-def observation_space(core: TaskCore) -> Box:
+def make_observation_space(core: TaskCore) -> Box:
     """Return the observation space, (o,) float32 in SI units, at whose bounds values saturate."""
-    return Box(core.low, core.high, dtype=np.float32)
+    return Box(core.observation_low, core.observation_high, dtype=np.float32)
 
 
-def action_space(core: TaskCore) -> Box:
+def make_action_space(core: TaskCore) -> Box:
     """Return the action space, (a,) float32 from -1 to 1."""
     return Box(-1.0, 1.0, (len(core.setup.axes),), np.float32)
 
 
-def info_of(core: TaskCore, final: bool = False) -> dict[str, np.ndarray]:
+def make_info(core: TaskCore, final: bool = False) -> dict[str, np.ndarray]:
     """Return the `info` of the last step: task measures, variant and fault.
 
     Args:
@@ -145,7 +145,7 @@ def info_of(core: TaskCore, final: bool = False) -> dict[str, np.ndarray]:
     return info
 
 
-def check_mode(mode: str | None, known: list[str]) -> None:
+def check_render_mode(mode: str | None, known: list[str]) -> None:
     """Check that a render mode exists.
 
     Raises:
@@ -155,17 +155,15 @@ def check_mode(mode: str | None, known: list[str]) -> None:
         raise InputError(f"render_mode {mode!r}", f"choose one of {', '.join(known)}, or none")
 
 
-def with_rate(metadata: dict[str, Any], core: TaskCore) -> dict[str, Any]:
+def add_render_fps(metadata: dict[str, Any], core: TaskCore) -> dict[str, Any]:
     """Return the metadata with `render_fps` set to the environment steps per second [Hz]."""
     rate = core.setup.options.control_rate
     return {**metadata, "render_fps": int(rate) if rate == int(rate) else rate}
 
 
-ADVICE = (
-    "use render_mode='rgb_array', which needs no screen, or a virtual one: xvfb-run -a python ..."
-)
-_PATIENCE = 5.0  # s, maximum time to wait for MuJoCo's viewer to close
-_OPEN: list["TaskWindow"] = []  # at most one: GLFW supports one thread only
+NO_SCREEN_ADVICE = "use render_mode='rgb_array', which needs no screen, or a virtual one: xvfb-run -a python ..."
+_CLOSE_TIMEOUT = 5.0  # s, maximum time to wait for MuJoCo's viewer to close
+_OPEN_WINDOWS: list["TaskWindow"] = []  # at most one: GLFW supports one thread only
 
 
 class TaskWindow:
@@ -175,59 +173,57 @@ class TaskWindow:
     `show.window.check_screen` before, since MuJoCo's viewer hangs without a screen.
     """
 
-    def __init__(self, stage: Stage, camera: Camera, rate: float) -> None:
+    def __init__(self, stage: TaskRenderer, camera: Camera, rate: float) -> None:
         """Open the viewer.
 
         Args:
             stage: the scene to show.
-            camera: see `Stage.camera`; the user may select another one in the viewer.
+            camera: see `TaskRenderer.find_camera`; the user may select another one in the viewer.
             rate: frames per second of simulated time [Hz].
 
         Raises:
             InputError: the camera does not exist.
         """
-        view = stage.camera(camera)
+        view = stage.find_camera(camera)
         from mujoco import viewer
 
-        for other in tuple(_OPEN):
+        for other in tuple(_OPEN_WINDOWS):
             other.close()
-        self._stage, self._period, self._next = stage, 1.0 / rate, 0.0
-        stage.show()
+        self._stage, self._period, self._next_time = stage, 1.0 / rate, 0.0
+        stage.update()
         before = set(threading.enumerate())
-        self._handle = viewer.launch_passive(
-            stage.model, stage.data, show_left_ui=False, show_right_ui=False
-        )
+        self._viewer = viewer.launch_passive(stage.model, stage.data, show_left_ui=False, show_right_ui=False)
         self._threads = set(threading.enumerate()) - before
-        _OPEN.append(self)
+        _OPEN_WINDOWS.append(self)
         atexit.register(self.close)
-        with self._handle.lock():
+        with self._viewer.lock():
             for name in ("type", "fixedcamid", "distance", "azimuth", "elevation"):
-                setattr(self._handle.cam, name, getattr(view, name))
-            self._handle.cam.lookat[:] = view.lookat
+                setattr(self._viewer.cam, name, getattr(view, name))
+            self._viewer.cam.lookat[:] = view.lookat
 
     def show(self) -> None:
         """Show the current state and wait for real time; do nothing if the viewer is closed."""
-        if not self._handle.is_running():
+        if not self._viewer.is_running():
             return
-        with self._handle.lock():
-            self._stage.show()
-            scene = self._handle.user_scn
+        with self._viewer.lock():
+            self._stage.update()
+            scene = self._viewer.user_scn
             assert scene is not None
             scene.ngeom = 0
             write_markers(scene, self._stage.markers())
-        self._handle.sync()
+        self._viewer.sync()
         now = time.monotonic()
-        self._next = max(self._next + self._period, now)
-        time.sleep(self._next - now)
+        self._next_time = max(self._next_time + self._period, now)
+        time.sleep(self._next_time - now)
 
     def close(self) -> None:
         """Close the viewer and wait for its threads, before Python unloads GLFW."""
-        if self in _OPEN:
-            _OPEN.remove(self)
+        if self in _OPEN_WINDOWS:
+            _OPEN_WINDOWS.remove(self)
             atexit.unregister(self.close)
-            self._handle.close()
+            self._viewer.close()
             for thread in self._threads:
-                thread.join(_PATIENCE)
+                thread.join(_CLOSE_TIMEOUT)
 
 
 class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -260,17 +256,17 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             InputError: an option does not exist or is not valid, or there is no screen for a
                 window.
         """
-        check_mode(render_mode, self.metadata["render_modes"])
+        check_render_mode(render_mode, self.metadata["render_modes"])
         if render_mode == "human":
-            check_screen(ADVICE)
+            check_screen(NO_SCREEN_ADVICE)
         self.core = make_core(task, options, 1, 1, DISABLED)
-        self.metadata = with_rate(self.metadata, self.core)
-        self.render_mode, self._view = render_mode, (width, height, camera)
-        self._stage: Stage | None = None
+        self.metadata = add_render_fps(self.metadata, self.core)
+        self.render_mode, self._image_settings = render_mode, (width, height, camera)
+        self._stage: TaskRenderer | None = None
         self._window: TaskWindow | None = None
-        self.observation_space = observation_space(self.core)
-        self.action_space = action_space(self.core)
-        self._begun = False
+        self.observation_space = make_observation_space(self.core)
+        self.action_space = make_action_space(self.core)
+        self._is_started = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -285,12 +281,12 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             (observation (o,), info).
         """
         super().reset(seed=seed)
-        if seed is None and not self._begun:
+        if seed is None and not self._is_started:
             seed = int(self.np_random.integers(2**62))
-        self._begun = True
+        self._is_started = True
         self.core.reset(None if seed is None else np.array([seed]))
-        self._show()
-        return self.core.observation[0].copy(), self._info()
+        self._show_step()
+        return self.core.observation[0].copy(), self._make_info()
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Advance by one step.
@@ -305,15 +301,15 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             ValueError: the action has the wrong shape, or is not finite.
         """
         core = self.core
-        core.step_one(action)
-        self._show()
+        core.step_single(action)
+        self._show_step()
         return (
             core.observation[0].copy(), float(core.reward[0]), bool(core.terminated[0]),
-            bool(core.truncated[0]), self._info(),
+            bool(core.truncated[0]), self._make_info(),
         )  # fmt: skip
 
-    def _info(self) -> dict[str, Any]:
-        return {name: values[0] for name, values in info_of(self.core).items()}
+    def _make_info(self) -> dict[str, Any]:
+        return {name: values[0] for name, values in make_info(self.core).items()}
 
     def render(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Render the machine and its goal.
@@ -329,20 +325,20 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             if self.render_mode is None:
                 gymnasium.logger.warn("render() returns None without render_mode='rgb_array'")
             return None
-        width, height, camera = self._view
-        return self._staged().picture(0, width, height, camera)
+        width, height, camera = self._image_settings
+        return self._get_stage().render(0, width, height, camera)
 
-    def _staged(self) -> Stage:
+    def _get_stage(self) -> TaskRenderer:
         if self._stage is None:
-            self._stage = Stage(self.core)
+            self._stage = TaskRenderer(self.core)
         return self._stage
 
-    def _show(self) -> None:
+    def _show_step(self) -> None:
         """Show the current step with `render_mode="human"`."""
         if self.render_mode != "human":
             return
         if self._window is None:
-            self._window = TaskWindow(self._staged(), self._view[2], self.metadata["render_fps"])
+            self._window = TaskWindow(self._get_stage(), self._image_settings[2], self.metadata["render_fps"])
         self._window.show()
 
     def close(self) -> None:
@@ -390,19 +386,19 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         Raises:
             InputError: an option does not exist or is not valid.
         """
-        check_mode(render_mode, self.metadata["render_modes"])
+        check_render_mode(render_mode, self.metadata["render_modes"])
         mode = AutoresetMode(autoreset_mode)
-        self.core = make_core(task, options, num_envs, threads, AUTORESET[mode.value])
-        self.metadata = {**with_rate(self.metadata, self.core), "autoreset_mode": mode}
+        self.core = make_core(task, options, num_envs, threads, AUTORESET_MODES[mode.value])
+        self.metadata = {**add_render_fps(self.metadata, self.core), "autoreset_mode": mode}
         self.num_envs, self.render_mode = num_envs, render_mode
-        self.single_observation_space = observation_space(self.core)
-        self.single_action_space = action_space(self.core)
+        self.single_observation_space = make_observation_space(self.core)
+        self.single_action_space = make_action_space(self.core)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._mode, self._begun = mode, False
-        self._view: tuple[int, int, Camera] = width, height, camera
-        self._stage: Stage | None = None
-        self._shown = num_envs if shown is None else min(shown, num_envs)
+        self._autoreset_mode, self._is_started = mode, False
+        self._image_settings: tuple[int, int, Camera] = width, height, camera
+        self._stage: TaskRenderer | None = None
+        self._render_count = num_envs if shown is None else min(shown, num_envs)
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -422,14 +418,14 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             RuntimeError: the first reset does not include all environments.
         """
         super().reset(seed=seed if isinstance(seed, int) else None)
-        chosen = self._chosen(options)
+        chosen = self._select_environments(options)
         seeds = self._seeds(seed)
         if seeds is not None and chosen is not None:
             seeds = seeds[chosen]
         self.core.reset(seeds, chosen)
-        return self.core.observation.copy(), self._infos(chosen)
+        return self.core.observation.copy(), self._make_infos(chosen)
 
-    def _chosen(self, options: dict[str, Any] | None) -> np.ndarray | None:
+    def _select_environments(self, options: dict[str, Any] | None) -> np.ndarray | None:
         if not options or "reset_mask" not in options:
             return None
         mask = options["reset_mask"]
@@ -439,9 +435,9 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return np.flatnonzero(mask)
 
     def _seeds(self, seed: int | list[int | None] | None) -> np.ndarray | None:
-        if seed is None and self._begun:
+        if seed is None and self._is_started:
             return None
-        self._begun = True
+        self._is_started = True
         if isinstance(seed, (int, np.integer)):
             return np.array([int(seed) + k for k in range(self.num_envs)])
         drawn = self.np_random.integers(2**62, size=self.num_envs)
@@ -451,9 +447,7 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             raise ValueError(f"{len(seed)} seeds for {self.num_envs} environments")
         return np.array([d if s is None else s for s, d in zip(seed, drawn, strict=True)])
 
-    def step(
-        self, actions: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Advance all environments by one step, with the autoreset mode for finished episodes.
 
         Args:
@@ -469,28 +463,28 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if np.shape(actions) != core.action.shape:
             raise ValueError(f"actions must be {core.action.shape}, not {np.shape(actions)}")
         core.step(actions)
-        infos = self._infos(None)
+        infos = self._make_infos(None)
         over = (core.terminated | core.truncated).astype(bool)
-        if self._mode is AutoresetMode.SAME_STEP and over.any():
-            infos = self._with_final(infos, over)
+        if self._autoreset_mode is AutoresetMode.SAME_STEP and over.any():
+            infos = self._add_final_infos(infos, over)
         return (
             core.observation.copy(), core.reward.copy(), core.terminated.astype(bool),
             core.truncated.astype(bool), infos,
         )  # fmt: skip
 
-    def _infos(self, chosen: np.ndarray | None) -> dict[str, Any]:
+    def _make_infos(self, chosen: np.ndarray | None) -> dict[str, Any]:
         there = np.zeros(self.num_envs, bool)
         there[slice(None) if chosen is None else chosen] = True
-        return _masked(info_of(self.core), there)
+        return _add_masks(make_info(self.core), there)
 
-    def _with_final(self, infos: dict[str, Any], over: np.ndarray) -> dict[str, Any]:
+    def _add_final_infos(self, infos: dict[str, Any], over: np.ndarray) -> dict[str, Any]:
         """Add the final observations and infos of the episodes that were reset in this step."""
         observations = np.full(self.num_envs, None, dtype=object)
         for number in np.flatnonzero(over):
-            observations[number] = self.core.final[number].copy()
-        last = _masked(info_of(self.core, final=True), over)
+            observations[number] = self.core.final_observation[number].copy()
+        last = _add_masks(make_info(self.core, final=True), over)
         final = {"final_obs": observations, "final_info": last}
-        return infos | _masked(final, over)
+        return infos | _add_masks(final, over)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Render the machines and their goals.
@@ -505,8 +499,8 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             gymnasium.logger.warn("render() returns None without render_mode='rgb_array'")
             return None
         if self._stage is None:
-            self._stage = Stage(self.core)
-        return tuple(self._stage.picture(n, *self._view) for n in range(self._shown))
+            self._stage = TaskRenderer(self.core)
+        return tuple(self._stage.render(n, *self._image_settings) for n in range(self._render_count))
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the renderer and free the memory of the simulations."""
@@ -516,6 +510,6 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.core.close()
 
 
-def _masked(infos: dict[str, Any], there: np.ndarray) -> dict[str, Any]:
+def _add_masks(infos: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
     """Add gymnasium's masks, which mark the environments for which an entry is valid."""
-    return infos | {f"_{name}": there.copy() for name in infos}
+    return infos | {f"_{name}": mask.copy() for name in infos}

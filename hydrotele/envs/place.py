@@ -12,33 +12,42 @@ import mujoco
 import numpy as np
 
 from hydrotele.core.compiled import callback, compiled
-from hydrotele.envs.episode import ARM, uniform, uniform_between
+from hydrotele.envs.episode import MAX_ARM_AXES, draw_uniform, draw_uniform_between
 from hydrotele.envs.task import Task, draw_start
 from hydrotele.envs.world import (
     BEGIN,
     OBSERVE,
     REWARD,
-    TASK_CODE,
+    TASK_SIGNATURE,
     TICK,
-    Field,
-    episodes,
-    observed,
-    parameters_at,
-    reach,
-    rewarded,
-    world,
+    ObservationField,
+    episode_records,
+    max_reach,
+    observation_view,
+    parameters_view,
+    simulation_view,
+    store_outcome,
 )
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import LogOnGround, Servo
-from hydrotele.simulate.feedback import convert
-from hydrotele.simulate.surroundings import CENTRE, GRIP, ROW, TAKEN, grip_step, log_grip
+from hydrotele.simulate.feedback import quantise_reading
+from hydrotele.simulate.surroundings import (
+    GRIP_SIZE,
+    POCKET_CENTRE,
+    TAKEN,
+    WELD_SIZE,
+    grip_step,
+    log_grip,
+)
 
-HAND, LOG, WELD, JAW, PLACE, RADIUS, HALF_LENGTH = range(GRIP, GRIP + 7)  # indices in `parameters`
-_FREE = GRIP + 7  # index in `parameters`: (qpos, qvel) indices of pitch, then of roll
+GRAPPLE_BODY, LOG_BODY, WELD_ID, JAW_QPOS, LOG_QPOS, LOG_RADIUS, LOG_HALF_LENGTH = range(
+    GRIP_SIZE, GRIP_SIZE + 7
+)  # indices in `parameters`
+_FREE_JOINT_INDICES = GRIP_SIZE + 7  # index in `parameters`: (qpos, qvel) indices of pitch, then of roll
 FREE_JOINTS = ("grapple_pitch", "grapple_roll")
-READ = 0  # index in `goal` of the measured values: pitch, roll, their rates
-READINGS = 4  # number of measured values of the free joints
+MEASURED_START = 0  # index in `goal` of the measured values: pitch, roll, their rates
+MEASURED_COUNT = 4  # number of measured values of the free joints
 
 
 def grapple_parameters(machine: Machine, model: mujoco.MjModel, log: LogOnGround) -> np.ndarray:
@@ -78,33 +87,37 @@ def is_held(f, w):
 
     Source: this module.
     """
-    return w.eq_active[int(f.parameters[WELD])] != 0
+    return w.eq_active[int(f.parameters[WELD_ID])] != 0
 
 
 @compiled
-def _number(values, count, at):
+def _body_values(values, count, at):
     """Return the `count` values of the body with index `at`."""
     return values[count * at : count * at + count]
 
 
 @compiled
-def _take_or_let_go(f, w):
-    hand, log, weld = int(f.parameters[HAND]), int(f.parameters[LOG]), int(f.parameters[WELD])
+def _update_grip(f, w):
+    hand, log, weld = (
+        int(f.parameters[GRAPPLE_BODY]),
+        int(f.parameters[LOG_BODY]),
+        int(f.parameters[WELD_ID]),
+    )
     first = weld * f.eq_width
     change = grip_step(
-        f.parameters[:GRIP], _number(w.xpos, 3, hand), _number(w.xquat, 4, hand),
-        _number(w.xpos, 3, log), _number(w.xquat, 4, log), w.qpos[int(f.parameters[JAW])],
-        w.eq_active[weld] != 0, w.eq_rows[first : first + ROW],
+        f.parameters[:GRIP_SIZE], _body_values(w.xpos, 3, hand), _body_values(w.xquat, 4, hand),
+        _body_values(w.xpos, 3, log), _body_values(w.xquat, 4, log), w.qpos[int(f.parameters[JAW_QPOS])],
+        w.eq_active[weld] != 0, w.eq_rows[first : first + WELD_SIZE],
     )  # fmt: skip
     if change == 0:
         return
     w.eq_active[weld] = 1 if change == TAKEN else 0
-    for c in range(first, first + ROW):  # eq_data acts now, eq_rows from the next call on
+    for c in range(first, first + WELD_SIZE):  # eq_data acts now, eq_rows from the next call on
         w.eq_data[c] = w.eq_rows[c]
 
 
 @compiled
-def read_free_joints(f, e, w):
+def measure_free_joints(f, e, w):
     """Measure the angles and rates of the free joints, if a sensor sample is due.
 
     Args:
@@ -120,18 +133,21 @@ def read_free_joints(f, e, w):
     if e.tick % f.every != 0:
         return
     for j in range(2):
-        place, dof = int(f.parameters[_FREE + 2 * j]), int(f.parameters[_FREE + 2 * j + 1])
+        place, dof = (
+            int(f.parameters[_FREE_JOINT_INDICES + 2 * j]),
+            int(f.parameters[_FREE_JOINT_INDICES + 2 * j + 1]),
+        )
         value = w.qpos[place] - f.timestep * w.qvel[dof]
         if f.noisy:
-            value += f.accuracy[0] * (2.0 * uniform(e) - 1.0)
-            value = convert(value, f.converters[0, 0], f.converters[1, 0], f.converters[2, 0])
-        past = e.goal[READ + j]
-        e.goal[READ + 2 + j] = (value - past) / (f.every * f.period) if e.tick > 0 else 0.0
-        e.goal[READ + j] = value
+            value += f.accuracy[0] * (2.0 * draw_uniform(e) - 1.0)
+            value = quantise_reading(value, f.converters[0, 0], f.converters[1, 0], f.converters[2, 0])
+        past = e.reference[MEASURED_START + j]
+        e.reference[MEASURED_START + 2 + j] = (value - past) / (f.every * f.period) if e.tick > 0 else 0.0
+        e.reference[MEASURED_START + j] = value
 
 
 @compiled
-def tick_grapple(f, e, w):
+def update_grapple(f, e, w):
     """Grip or release the log, and measure the free joints.
 
     Args:
@@ -144,8 +160,8 @@ def tick_grapple(f, e, w):
 
     Source: `simulate.surroundings.grip_step`.
     """
-    _take_or_let_go(f, w)
-    read_free_joints(f, e, w)
+    _update_grip(f, w)
+    measure_free_joints(f, e, w)
 
 
 @compiled
@@ -162,14 +178,18 @@ def grip_distance(f, w):
 
     Source: this module.
     """
-    hand, log, reach = int(f.parameters[HAND]), int(f.parameters[LOG]), f.parameters[GRIP - 1]
-    turn, own = _number(w.xmat, 9, hand), _number(w.xmat, 9, log)
+    hand, log, reach = (
+        int(f.parameters[GRAPPLE_BODY]),
+        int(f.parameters[LOG_BODY]),
+        f.parameters[GRIP_SIZE - 1],
+    )
+    turn, own = _body_values(w.xmat, 9, hand), _body_values(w.xmat, 9, log)
     along, across, square = 0.0, 0.0, 0.0
     way = np.empty(3)
     for c in range(3):
         way[c] = w.xpos[3 * hand + c] - w.xpos[3 * log + c]
         for k in range(3):
-            way[c] += turn[3 * c + k] * f.parameters[CENTRE + k]
+            way[c] += turn[3 * c + k] * f.parameters[POCKET_CENTRE + k]
         along += way[c] * own[3 * c]
         across += turn[3 * c + 1] * own[3 * c]
     along = min(reach, max(-reach, along))
@@ -191,39 +211,56 @@ def tilt_angle(f, w):
 
     Source: the x axis of the grapple points down.
     """
-    down = -w.xmat[9 * int(f.parameters[HAND]) + 6]
+    down = -w.xmat[9 * int(f.parameters[GRAPPLE_BODY]) + 6]
     return np.arccos(min(1.0, max(-1.0, down)))
 
 
-NEAR, STRAIGHT, KEEP = 0.3, math.radians(15.0), 0.5  # m, rad, s: tolerances of a placed log
-PROGRESS, TIME, LEANING = 1.0, 0.005, 0.02  # reward per m, cost per step, per step and rad of tilt
-TAKING, SUCCESS, LOST = 5.0, 20.0, -20.0  # rewards of the first grip, of success, of a lost log
-LEVER, ASKEW = 1.0, 0.5  # m per rad: weights of the log's yaw error and the grapple's misalignment
-_LYING = 0.05  # m and rad, maximum height error and slope of a log that lies on the ground
-_REACH = (2.3, 8.7)  # m from the swing axis, range in which the log can be gripped
-_RADII = (4.5, 6.5)  # m, range of the radius of log and goal
-_ASIDE = (0.15, 0.5)  # rad, range of the angle from the grapple to the log
-_SLEW = (math.radians(30.0), math.radians(90.0))  # rad, range of the angle from log to goal
-_X, _Y, _YAW, _LEFT, _KEPT, _TAKEN = range(READ + READINGS, READ + READINGS + 6)  # in `goal`
-GOAL_PLACE = slice(_X, _YAW + 1)  # slice of `goal`: x [m], y [m], yaw [rad] of the goal pose
-_FASTEST = 10.0  # rad/s, bound of the difference quotient of noisy samples
+MAX_DISTANCE, MAX_YAW_ERROR, HOLD_TIME = (
+    0.3,
+    math.radians(15.0),
+    0.5,
+)  # m, rad, s: tolerances of a placed log
+REWARD_PER_METRE, STEP_COST, TILT_COST = (
+    1.0,
+    0.005,
+    0.02,
+)  # reward per m, cost per step, per step and rad of tilt
+GRIP_REWARD, SUCCESS_REWARD, LOST_REWARD = (
+    5.0,
+    20.0,
+    -20.0,
+)  # rewards of the first grip, of success, of a lost log
+YAW_WEIGHT, MISALIGNMENT_WEIGHT = (
+    1.0,
+    0.5,
+)  # m per rad: weights of the log's yaw error and the grapple's misalignment
+_LYING_TOLERANCE = 0.05  # m and rad, maximum height error and slope of a log that lies on the ground
+_GRIP_RADII = (2.3, 8.7)  # m from the swing axis, range in which the log can be gripped
+_GOAL_RADII = (4.5, 6.5)  # m, range of the radius of log and goal
+_LOG_ANGLES = (0.15, 0.5)  # rad, range of the angle from the grapple to the log
+_GOAL_ANGLES = (math.radians(30.0), math.radians(90.0))  # rad, range of the angle from log to goal
+_X, _Y, _YAW, _REMAINING_DISTANCE, _TIME_HELD, _WAS_GRIPPED = range(
+    MEASURED_START + MEASURED_COUNT, MEASURED_START + MEASURED_COUNT + 6
+)  # in `goal`
+GOAL_POSE = slice(_X, _YAW + 1)  # slice of `goal`: x [m], y [m], yaw [rad] of the goal pose
+_RATE_BOUND = 10.0  # rad/s, bound of the difference quotient of noisy samples
 
 
-def place_fields(machine: Machine, axes: tuple[str, ...]) -> list[Field]:
+def place_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
     """Return the fields that `observe_place` writes: log, goal, held, free joints."""
-    far = 2.0 * reach(machine)
+    far = 2.0 * max_reach(machine)
     fields = []
     for what, high in (("log", ("z",)), ("goal", ())):
         fields += [
-            Field(f"{what}.r", "m", 0.0, far), Field(f"{what}.theta", "rad", -math.pi, math.pi)
+            ObservationField(f"{what}.r", "m", 0.0, far), ObservationField(f"{what}.theta", "rad", -math.pi, math.pi)
         ]  # fmt: skip
-        fields += [Field(f"{what}.{name}", "m", -far, far) for name in high]
-        fields += [Field(f"{what}.{name}_2_yaw", "1", -1.0, 1.0) for name in ("sin", "cos")]
-    fields.append(Field("held", "1", 0.0, 1.0))
+        fields += [ObservationField(f"{what}.{name}", "m", -far, far) for name in high]
+        fields += [ObservationField(f"{what}.{name}_2_yaw", "1", -1.0, 1.0) for name in ("sin", "cos")]
+    fields.append(ObservationField("held", "1", 0.0, 1.0))
     for name in FREE_JOINTS:
         low, top = machine.joints[name].range or (-math.pi, math.pi)
-        fields.append(Field(f"pendulum.{name}", "rad", low - 0.15, top + 0.15))
-    fields += [Field(f"pendulum_rate.{name}", "rad/s", -_FASTEST, _FASTEST) for name in FREE_JOINTS]
+        fields.append(ObservationField(f"pendulum.{name}", "rad", low - 0.15, top + 0.15))
+    fields += [ObservationField(f"pendulum_rate.{name}", "rad/s", -_RATE_BOUND, _RATE_BOUND) for name in FREE_JOINTS]
     return fields
 
 
@@ -241,25 +278,28 @@ def begin_place(f, e, w):
 
     Source: this module.
     """
-    g, pose, at = e.goal, np.empty(ARM), int(f.parameters[PLACE])
+    g, pose, at = e.reference, np.empty(MAX_ARM_AXES), int(f.parameters[LOG_QPOS])
     task_forward(f.arm, e.position[: f.arm_axes], pose)
-    radius, theta = uniform_between(e, _RADII[0], _RADII[1]), pose[1] + _either_side(e, _ASIDE)
-    half = 0.5 * uniform_between(e, 0.0, math.pi)
+    radius, theta = (
+        draw_uniform_between(e, _GOAL_RADII[0], _GOAL_RADII[1]),
+        pose[1] + _draw_with_random_sign(e, _LOG_ANGLES),
+    )
+    half = 0.5 * draw_uniform_between(e, 0.0, math.pi)
     w.qpos[at], w.qpos[at + 1] = radius * math.cos(theta), radius * math.sin(theta)
     w.qpos[at + 3], w.qpos[at + 4], w.qpos[at + 5] = math.cos(half), 0.0, 0.0
     w.qpos[at + 6] = math.sin(half)
-    theta += _either_side(e, _SLEW)
-    radius = uniform_between(e, _RADII[0], _RADII[1])
+    theta += _draw_with_random_sign(e, _GOAL_ANGLES)
+    radius = draw_uniform_between(e, _GOAL_RADII[0], _GOAL_RADII[1])
     g[_X], g[_Y] = radius * math.cos(theta), radius * math.sin(theta)
-    g[_YAW] = uniform_between(e, 0.0, math.pi)
-    g[_LEFT], g[_KEPT], g[_TAKEN] = -1.0, 0.0, 0.0
-    read_free_joints(f, e, w)
+    g[_YAW] = draw_uniform_between(e, 0.0, math.pi)
+    g[_REMAINING_DISTANCE], g[_TIME_HELD], g[_WAS_GRIPPED] = -1.0, 0.0, 0.0
+    measure_free_joints(f, e, w)
 
 
 @compiled
-def _either_side(e, size):
-    value = uniform_between(e, size[0], size[1])
-    return value if uniform(e) < 0.5 else -value
+def _draw_with_random_sign(e, size):
+    value = draw_uniform_between(e, size[0], size[1])
+    return value if draw_uniform(e) < 0.5 else -value
 
 
 @compiled
@@ -276,7 +316,7 @@ def log_pose(f, w):
 
     Source: this module.
     """
-    at = int(f.parameters[PLACE])
+    at = int(f.parameters[LOG_QPOS])
     a, b, c, d = w.qpos[at + 3], w.qpos[at + 4], w.qpos[at + 5], w.qpos[at + 6]
     ax, ay, az = 1.0 - 2.0 * (c * c + d * d), 2.0 * (b * c + a * d), 2.0 * (b * d - a * c)
     level = max(1.0e-12, ax * ax + ay * ay)
@@ -287,7 +327,7 @@ def log_pose(f, w):
 
 
 @compiled
-def yaw_between(sine, cosine, yaw):
+def yaw_difference(sine, cosine, yaw):
     """Return the angle between two undirected horizontal axes.
 
     Args:
@@ -320,15 +360,15 @@ def observe_place(f, e, w, out, at):
 
     Source: `place_fields`.
     """
-    g = e.goal
+    g = e.reference
     x, y, z, sine, cosine, _ = log_pose(f, w)
     out[at], out[at + 1], out[at + 2] = math.hypot(x, y), math.atan2(y, x), z
     out[at + 3], out[at + 4] = sine, cosine
     out[at + 5], out[at + 6] = math.hypot(g[_X], g[_Y]), math.atan2(g[_Y], g[_X])
     out[at + 7], out[at + 8] = math.sin(2.0 * g[_YAW]), math.cos(2.0 * g[_YAW])
     out[at + 9] = 1.0 if is_held(f, w) else 0.0
-    for c in range(READINGS):
-        out[at + 10 + c] = g[READ + c]
+    for c in range(MEASURED_COUNT):
+        out[at + 10 + c] = g[MEASURED_START + c]
 
 
 @compiled
@@ -346,59 +386,62 @@ def reward_place(f, e, w):
 
     Source: this module.
     """
-    g, held = e.goal, is_held(f, w)
+    g, held = e.reference, is_held(f, w)
     x, y, z, sine, cosine, slope = log_pose(f, w)
-    height = z - f.parameters[RADIUS]
+    height = z - f.parameters[LOG_RADIUS]
     distance = math.sqrt((x - g[_X]) ** 2 + (y - g[_Y]) ** 2 + height**2)
-    yaw, swing = yaw_between(sine, cosine, g[_YAW]), tilt_angle(f, w)
-    lies = not held and height < _LYING and abs(slope) < _LYING
-    there = lies and distance <= NEAR and yaw <= STRAIGHT
-    left = distance + LEVER * yaw
+    yaw, swing = yaw_difference(sine, cosine, g[_YAW]), tilt_angle(f, w)
+    lies = not held and height < _LYING_TOLERANCE and abs(slope) < _LYING_TOLERANCE
+    there = lies and distance <= MAX_DISTANCE and yaw <= MAX_YAW_ERROR
+    left = distance + YAW_WEIGHT * yaw
     if not (held or there):
         apart, askew = grip_distance(f, w)
-        left += apart + ASKEW * askew
-    if g[_LEFT] < 0.0:  # first step: the position of the grapple is not known before
-        g[_LEFT] = left
-    reward = PROGRESS * (g[_LEFT] - left) - TIME - LEANING * swing
-    g[_LEFT] = left
-    if held and g[_TAKEN] == 0.0:
-        g[_TAKEN] = 1.0
-        reward += TAKING
+        left += apart + MISALIGNMENT_WEIGHT * askew
+    if g[_REMAINING_DISTANCE] < 0.0:  # first step: the position of the grapple is not known before
+        g[_REMAINING_DISTANCE] = left
+    reward = REWARD_PER_METRE * (g[_REMAINING_DISTANCE] - left) - STEP_COST - TILT_COST * swing
+    g[_REMAINING_DISTANCE] = left
+    if held and g[_WAS_GRIPPED] == 0.0:
+        g[_WAS_GRIPPED] = 1.0
+        reward += GRIP_REWARD
     step = f.ticks * f.period
-    g[_KEPT] = g[_KEPT] + step if there else 0.0
-    placed = g[_KEPT] >= KEEP - 0.5 * step
-    lost = not held and not _REACH[0] <= math.hypot(x, y) <= _REACH[1]
+    g[_TIME_HELD] = g[_TIME_HELD] + step if there else 0.0
+    placed = g[_TIME_HELD] >= HOLD_TIME - 0.5 * step
+    lost = not held and not _GRIP_RADII[0] <= math.hypot(x, y) <= _GRIP_RADII[1]
     w.measures[0], w.measures[1], w.measures[2] = distance, yaw, 1.0 if held else 0.0
     w.measures[3], w.measures[4] = 1.0 if placed else 0.0, swing
     if placed:
-        reward += SUCCESS
+        reward += SUCCESS_REWARD
     elif lost:
-        reward += LOST
+        reward += LOST_REWARD
     return reward, placed or lost
 
 
 LOG_TO_PLACE = LogOnGround(position=(5.5, 0.0), direction=math.pi / 2.0)
 """The log; `begin_place` overwrites its pose."""
 
-_LOW, _HIGH = (4.5, -0.5, 2.2), (6.5, 0.5, 2.8)  # m, rad, m: start of the pin at the stick's tip
+_MIN_START_POSE, _MAX_START_POSE = (
+    (4.5, -0.5, 2.2),
+    (6.5, 0.5, 2.8),
+)  # m, rad, m: start of the pin at the stick's tip
 
 
-def _start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
+def _draw_start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
     """Draw a start with the open grapple hanging vertically above the height of a log."""
-    joints = draw_start(machine, rng, _LOW, _HIGH)
+    joints = draw_start(machine, rng, _MIN_START_POSE, _MAX_START_POSE)
     plumb = -0.5 * math.pi - joints["boom"] - joints["stick"]
     turned = float(rng.uniform(-0.5, 0.5) * math.pi)
     return {**joints, "grapple_pitch": plumb, "grapple": turned, "claw": 0.0}
 
 
-def _parameters(machine: Machine, model: mujoco.MjModel) -> np.ndarray:
+def _make_parameters(machine: Machine, model: mujoco.MjModel) -> np.ndarray:
     return grapple_parameters(machine, model, LOG_TO_PLACE)
 
 
 PLACE_LOG = Task(
     name="PlaceLog",
     kind="place",
-    sentence=(
+    description=(
         "An excavator picks up a log from the ground with a freely swinging grapple and lays it"
         " down at a goal position and yaw. The poses of log and goal are known exactly, also with"
         " real sensors."
@@ -413,10 +456,10 @@ PLACE_LOG = Task(
     ),
     machine="cat215",
     tool="grapple_claw",
-    more_axes=("grapple", "claw"),
+    extra_axes=("grapple", "claw"),
     action="resolved_motion",
     duration=60.0,
-    start=_start,
+    start=_draw_start,
     fields=place_fields,
     measures=(
         ("log_distance", "m"), ("yaw_error", "rad"), ("held", "1"), ("success", "1"),
@@ -424,25 +467,25 @@ PLACE_LOG = Task(
     ),
     surroundings=lambda *_: (LOG_TO_PLACE,),
     ground=True,
-    parameters=_parameters,
-    writes=("eq_data",),
+    parameters=_make_parameters,
+    written_fields=("eq_data",),
     # with the default of 4 /s, valve delay and stiction make boom and grapple oscillate
     servo=Servo(position_gain=2.5, axis_gains={"boom": 2.0}),
 )  # fmt: skip
 """Pick up a log and lay it down with the claw of the CAT 215."""
 
 
-@callback(TASK_CODE)
-def code(part, m, d, number, argument, out):
-    """Run one part of the task in native code; see `world`."""
-    f = parameters_at(argument)[0]
-    e, w = episodes(f)[number], world(f, m, d, number, argument)
+@callback(TASK_SIGNATURE)
+def task_code(part, m, d, number, argument, out):
+    """Run one part of the task in native code; see `simulation_view`."""
+    f = parameters_view(argument)[0]
+    e, w = episode_records(f)[number], simulation_view(f, m, d, number, argument)
     if part == BEGIN:
         begin_place(f, e, w)
     elif part == TICK:
-        tick_grapple(f, e, w)
+        update_grapple(f, e, w)
     elif part == OBSERVE:
-        observe_place(f, e, w, observed(f, out), 0)
+        observe_place(f, e, w, observation_view(f, out), 0)
     elif part == REWARD:
-        return rewarded(e, reward_place(f, e, w))
+        return store_outcome(e, reward_place(f, e, w))
     return 0.0

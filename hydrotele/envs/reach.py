@@ -9,42 +9,56 @@ import math
 import numpy as np
 
 from hydrotele.core.compiled import callback, compiled
-from hydrotele.envs.episode import ARM, uniform_between
-from hydrotele.envs.task import Task, draw_start, path_effort, pose_read, turned
+from hydrotele.envs.episode import MAX_ARM_AXES, draw_uniform_between
+from hydrotele.envs.task import Task, draw_start, measure_pose, path_effort, wrap_angle
 from hydrotele.envs.world import (
     BEGIN,
     OBSERVE,
     REWARD,
-    TASK_CODE,
-    Field,
-    episodes,
-    observed,
-    parameters_at,
+    TASK_SIGNATURE,
+    ObservationField,
+    episode_records,
+    max_reach,
+    observation_view,
+    parameters_view,
     pose_fields,
-    reach,
-    rewarded,
-    world,
+    simulation_view,
+    store_outcome,
 )
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Servo
 
-NEAR, LEVEL, KEEP = 0.05, 0.03, 0.5  # m, rad, s: tolerances of a reached pose
-PROGRESS, TIME, SUCCESS = 1.0, 0.01, 10.0  # reward per m, cost per step, reward of success
-LEVER = 1.0  # m per rad, weight of the attitude error
-_RADII, _SWING, _HEIGHTS = (4.5, 9.0), 1.0, (0.8, 4.0)  # m, rad, m: range of the goal
-_ATTITUDE, _HEAD = 0.6, 0.4  # rad, maximum angles of the goal from level and straight
-_DRAWS, _TRUE_SIZE = 140, 100  # maximum number of draws; draws before the path is shortened
-_SMALLER = 0.7  # factor of the path per draw after those
-_TARGET, _HELD, _LEFT = 0, 5, 6  # indices in `goal`
+MAX_DISTANCE, MAX_ANGLE, HOLD_TIME = 0.05, 0.03, 0.5  # m, rad, s: tolerances of a reached pose
+REWARD_PER_METRE, STEP_COST, SUCCESS_REWARD = (
+    1.0,
+    0.01,
+    10.0,
+)  # reward per m, cost per step, reward of success
+ANGLE_WEIGHT = 1.0  # m per rad, weight of the attitude error
+_GOAL_RADII, _MAX_GOAL_SWING, _GOAL_HEIGHTS = (
+    (4.5, 9.0),
+    1.0,
+    (0.8, 4.0),
+)  # m, rad, m: range of the goal
+_MAX_GOAL_ATTITUDE, _MAX_GOAL_HEAD = (
+    0.6,
+    0.4,
+)  # rad, maximum angles of the goal from level and straight
+_MAX_DRAWS, _FULL_SIZE_DRAWS = (
+    140,
+    100,
+)  # maximum number of draws; draws before the path is shortened
+_SHRINK_FACTOR = 0.7  # factor of the path per draw after those
+_TARGET, _TIME_HELD, _REMAINING_DISTANCE = 0, 5, 6  # indices in `goal`
 
 
-def reach_fields(machine: Machine, axes: tuple[str, ...]) -> list[Field]:
+def reach_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
     """Return the fields that `observe_reach` writes: goal pose, measured distance, time held."""
     return [
         *pose_fields(machine, len(axes), "wanted"),
-        Field("distance", "m", 0.0, 2.0 * reach(machine)),
-        Field("held", "s", 0.0, 2.0 * KEEP),
+        ObservationField("distance", "m", 0.0, 2.0 * max_reach(machine)),
+        ObservationField("held", "s", 0.0, 2.0 * HOLD_TIME),
     ]
 
 
@@ -61,23 +75,23 @@ def begin_reach(f, e):
 
     Source: this module.
     """
-    g, start, change = e.goal, np.empty(ARM), np.empty(ARM)
+    g, start, change = e.reference, np.empty(MAX_ARM_AXES), np.empty(MAX_ARM_AXES)
     task_forward(f.arm, e.position[: f.arm_axes], start)
     size = 1.0
-    for n in range(_DRAWS):
-        if n >= _TRUE_SIZE:
-            size *= _SMALLER  # the start is inside the workspace, so a close pose is reachable
-        change[0] = size * (uniform_between(e, _RADII[0], _RADII[1]) - start[0])
-        change[1] = size * uniform_between(e, -_SWING, _SWING)
-        change[2] = size * (uniform_between(e, _HEIGHTS[0], _HEIGHTS[1]) - start[2])
-        change[3] = size * (uniform_between(e, -_ATTITUDE, _ATTITUDE) - start[3])
-        change[4] = size * (uniform_between(e, -_HEAD, _HEAD) - start[4])
-        for c in range(ARM):
+    for n in range(_MAX_DRAWS):
+        if n >= _FULL_SIZE_DRAWS:
+            size *= _SHRINK_FACTOR  # the start is inside the workspace, so a close pose is reachable
+        change[0] = size * (draw_uniform_between(e, _GOAL_RADII[0], _GOAL_RADII[1]) - start[0])
+        change[1] = size * draw_uniform_between(e, -_MAX_GOAL_SWING, _MAX_GOAL_SWING)
+        change[2] = size * (draw_uniform_between(e, _GOAL_HEIGHTS[0], _GOAL_HEIGHTS[1]) - start[2])
+        change[3] = size * (draw_uniform_between(e, -_MAX_GOAL_ATTITUDE, _MAX_GOAL_ATTITUDE) - start[3])
+        change[4] = size * (draw_uniform_between(e, -_MAX_GOAL_HEAD, _MAX_GOAL_HEAD) - start[4])
+        for c in range(MAX_ARM_AXES):
             g[_TARGET + c] = start[c] + change[c]
         if path_effort(f, start, change) < np.inf:
             break
-    g[_HELD] = 0.0
-    g[_LEFT] = reach_left(*_true_errors(f, e))
+    g[_TIME_HELD] = 0.0
+    g[_REMAINING_DISTANCE] = remaining_distance(*_true_errors(f, e))
 
 
 @compiled
@@ -100,19 +114,19 @@ def reach_errors(target, x, y, z, attitude, head):
     """
     dx, dy = x - target[0] * math.cos(target[1]), y - target[0] * math.sin(target[1])
     distance = math.sqrt(dx * dx + dy * dy + (z - target[2]) ** 2)
-    return distance, max(abs(turned(attitude - target[3])), abs(head - target[4]))
+    return distance, max(abs(wrap_angle(attitude - target[3])), abs(head - target[4]))
 
 
 @compiled
-def reach_left(distance, angle):
-    """Return the remaining distance, scalar [m]: position error plus `LEVER` times angle error."""
-    return distance + LEVER * angle
+def remaining_distance(distance, angle):
+    """Return the remaining distance, scalar [m]: position error plus `ANGLE_WEIGHT` times angle error."""
+    return distance + ANGLE_WEIGHT * angle
 
 
 @compiled
 def _true_errors(f, e):
     attitude = e.position[1] + e.position[2] + e.position[3]
-    target = e.goal[_TARGET : _TARGET + ARM]
+    target = e.reference[_TARGET : _TARGET + MAX_ARM_AXES]
     return reach_errors(target, e.tip[0], e.tip[1], e.tip[2], attitude, e.position[4])
 
 
@@ -131,14 +145,14 @@ def observe_reach(f, e, out, at):
 
     Source: `reach_fields`.
     """
-    tip = np.empty(ARM)
-    pose_read(f, e, tip)
-    for c in range(ARM):
-        out[at + c] = e.goal[_TARGET + c]
+    tip = np.empty(MAX_ARM_AXES)
+    measure_pose(f, e, tip)
+    for c in range(MAX_ARM_AXES):
+        out[at + c] = e.reference[_TARGET + c]
     x, y = tip[0] * math.cos(tip[1]), tip[0] * math.sin(tip[1])
-    target = e.goal[_TARGET : _TARGET + ARM]
-    out[at + ARM] = reach_errors(target, x, y, tip[2], tip[3], tip[4])[0]
-    out[at + ARM + 1] = e.goal[_HELD]
+    target = e.reference[_TARGET : _TARGET + MAX_ARM_AXES]
+    out[at + MAX_ARM_AXES] = reach_errors(target, x, y, tip[2], tip[3], tip[4])[0]
+    out[at + MAX_ARM_AXES + 1] = e.reference[_TIME_HELD]
 
 
 @compiled
@@ -156,20 +170,20 @@ def reward_reach(f, e, w):
 
     Source: this module.
     """
-    g = e.goal
+    g = e.reference
     distance, angle = _true_errors(f, e)
-    left = reach_left(distance, angle)
-    reward = PROGRESS * (g[_LEFT] - left) - TIME
-    g[_LEFT] = left
-    inside = distance <= NEAR and angle <= LEVEL
+    left = remaining_distance(distance, angle)
+    reward = REWARD_PER_METRE * (g[_REMAINING_DISTANCE] - left) - STEP_COST
+    g[_REMAINING_DISTANCE] = left
+    inside = distance <= MAX_DISTANCE and angle <= MAX_ANGLE
     step = f.ticks * f.period
-    g[_HELD] = g[_HELD] + step if inside else 0.0
-    done = g[_HELD] >= KEEP - 0.5 * step
+    g[_TIME_HELD] = g[_TIME_HELD] + step if inside else 0.0
+    done = g[_TIME_HELD] >= HOLD_TIME - 0.5 * step
     w.measures[0], w.measures[1], w.measures[2] = distance, angle, 1.0 if done else 0.0
-    return reward + (SUCCESS if done else 0.0), done
+    return reward + (SUCCESS_REWARD if done else 0.0), done
 
 
-def _start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
+def _draw_start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
     """Draw a start with the head in the air in front of the machine, about level."""
     return draw_start(
         machine, rng, (5.0, -0.5, 0.8, -0.4, -0.3), (8.0, 0.5, 3.0, 0.4, 0.3)
@@ -179,7 +193,7 @@ def _start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
 REACH_FELLER = Task(
     name="ReachFeller",
     kind="reach",
-    sentence="A feller-buncher moves its head to a pose with all five axes and holds it there.",
+    description="A feller-buncher moves its head to a pose with all five axes and holds it there.",
     reward=(
         "The reward is 1 for every metre that the head approaches the pose (1 rad of attitude or"
         " head angle counts as 1 m), minus 0.01 per step. Holding the pose within 0.05 m and"
@@ -188,7 +202,7 @@ REACH_FELLER = Task(
     machine="cat325",
     tool=None,
     duration=20.0,
-    start=_start,
+    start=_draw_start,
     fields=reach_fields,
     measures=(("distance", "m"), ("attitude_error", "rad"), ("success", "1")),
     servo=Servo(axis_gains={"swing": 1.0, "boom": 2.0}),  # large inertia on compressible oil
@@ -197,15 +211,15 @@ REACH_FELLER = Task(
 """Reach and hold a pose of the feller-buncher's head."""
 
 
-@callback(TASK_CODE)
-def code(part, m, d, number, argument, out):
-    """Run one part of the task in native code; see `world`."""
-    f = parameters_at(argument)[0]
-    e, w = episodes(f)[number], world(f, m, d, number, argument)
+@callback(TASK_SIGNATURE)
+def task_code(part, m, d, number, argument, out):
+    """Run one part of the task in native code; see `simulation_view`."""
+    f = parameters_view(argument)[0]
+    e, w = episode_records(f)[number], simulation_view(f, m, d, number, argument)
     if part == BEGIN:
         begin_reach(f, e)
     elif part == OBSERVE:
-        observe_reach(f, e, observed(f, out), 0)
+        observe_reach(f, e, observation_view(f, out), 0)
     elif part == REWARD:
-        return rewarded(e, reward_reach(f, e, w))
+        return store_outcome(e, reward_reach(f, e, w))
     return 0.0

@@ -1,6 +1,6 @@
 """Batched environments for stable-baselines3 (the extra `learn`).
 
-`StableVecEnv` steps all environments in one native call. `AgentView` transforms observations and
+`StableVecEnv` steps all environments in one native call. `AgentInterface` transforms observations and
 actions for learning. It appends the reference errors, since a network hardly resolves millimetres
 in the difference of two positions that vary by metres. It stacks the last steps, since the dynamics
 of a machine show only over time. The agent may correct the action of a reference controller.
@@ -15,12 +15,12 @@ from hydrotele.core.errors import InputError
 from hydrotele.envs.controllers.controller import Controller
 from hydrotele.envs.episode import SAME_STEP
 from hydrotele.envs.facts import TaskSetup
-from hydrotele.envs.making import action_space, make_core, observation_space
+from hydrotele.envs.making import make_action_space, make_core, make_observation_space
 
-_ASKED = ("reference", "wanted")  # prefixes of the fields that hold references
+_REFERENCE_PREFIXES = ("reference", "wanted")  # prefixes of the fields that hold references
 
 
-def difference_columns(setup: TaskSetup) -> tuple[np.ndarray, np.ndarray]:
+def find_reference_pairs(setup: TaskSetup) -> tuple[np.ndarray, np.ndarray]:
     """Return the observation columns of all references and of the matching measured values.
 
     Args:
@@ -34,7 +34,7 @@ def difference_columns(setup: TaskSetup) -> tuple[np.ndarray, np.ndarray]:
     for number, field in enumerate(setup.fields):
         what, _, where = field.name.partition(".")
         start, _, rest = what.partition("_")
-        if start not in _ASKED:
+        if start not in _REFERENCE_PREFIXES:
             continue
         twins = (rest,) if rest in ("rate", "force") else ("angle", "length", "tip")
         for twin in twins:
@@ -45,77 +45,81 @@ def difference_columns(setup: TaskSetup) -> tuple[np.ndarray, np.ndarray]:
     return np.array(asked, int), np.array(measured, int)
 
 
-class AgentView:
+class AgentInterface:
     """Transform observations and actions between n environments and an agent.
 
     Attributes:
-        size: number of values in the observation of the agent.
+        observation_size: number of values in the observation of the agent.
     """
 
     def __init__(
-        self, setup: TaskSetup, history: int = 3, law: Controller | None = None, share: float = 1.0
+        self,
+        setup: TaskSetup,
+        history: int = 3,
+        controller: Controller | None = None,
+        max_fraction: float = 1.0,
     ) -> None:
         """Define the observation and the action of the agent.
 
         Args:
             setup: the task with its options.
             history: number of stacked steps, including the current one.
-            law: a controller whose actions the agent corrects, None for an agent alone.
-            share: maximum action of the agent as a fraction of a full action.
+            controller: a controller whose actions the agent corrects, None for an agent alone.
+            max_fraction: maximum action of the agent as a fraction of a full action.
         """
-        self._law, self._share, self._history = law, share, history
-        self._asked, self._measured = difference_columns(setup)
+        self._controller, self._max_fraction, self._history = controller, max_fraction, history
+        self._reference_columns, self._measured_columns = find_reference_pairs(setup)
         self._actions = len(setup.axes)
-        self._width = len(setup.fields) + len(self._asked)
-        self.size = history * self._width + (self._actions if law else 0)
+        self._step_size = len(setup.fields) + len(self._reference_columns)
+        self.observation_size = history * self._step_size + (self._actions if controller else 0)
 
     def begin(self, count: int) -> None:
         """Allocate the state of `count` episodes."""
-        self._past = np.zeros((count, self._history, self._width), np.float32)
-        self._base = np.zeros((count, self._actions), np.float32)
-        self._fresh = np.ones(count, bool)
-        if self._law:
-            self._law.begin(count)
+        self._stacked_steps = np.zeros((count, self._history, self._step_size), np.float32)
+        self._base_action = np.zeros((count, self._actions), np.float32)
+        self._is_new = np.ones(count, bool)
+        if self._controller:
+            self._controller.begin(count)
 
     def reset(self, mask: np.ndarray) -> None:
         """Reset the history of the episodes selected by the mask (n,)."""
-        self._fresh |= mask
-        if self._law:
-            self._law.reset(mask)
+        self._is_new |= mask
+        if self._controller:
+            self._controller.reset(mask)
 
-    def _now(self, observation: np.ndarray) -> np.ndarray:
-        errors = observation[:, self._asked] - observation[:, self._measured]
+    def _append_errors(self, observation: np.ndarray) -> np.ndarray:
+        errors = observation[:, self._reference_columns] - observation[:, self._measured_columns]
         return np.concatenate([observation, errors], axis=1)
 
-    def _shown(self, past: np.ndarray, base: np.ndarray) -> np.ndarray:
+    def _build_observation(self, past: np.ndarray, base: np.ndarray) -> np.ndarray:
         flat = past.reshape(len(past), -1)
-        return np.concatenate([flat, base], axis=1) if self._law else flat.copy()
+        return np.concatenate([flat, base], axis=1) if self._controller else flat.copy()
 
-    def see(self, observation: np.ndarray) -> np.ndarray:
+    def observe(self, observation: np.ndarray) -> np.ndarray:
         """Return the agent's observation (n, size) for environment observations (n, o)."""
-        now = self._now(observation)
-        self._past[:, 1:] = self._past[:, :-1]
-        self._past[:, 0] = now
-        self._past[self._fresh] = now[self._fresh, None]
-        self._fresh[:] = False
-        if self._law:
-            self._base[:] = np.clip(self._law(observation), -1.0, 1.0)
-        return self._shown(self._past, self._base)
+        now = self._append_errors(observation)
+        self._stacked_steps[:, 1:] = self._stacked_steps[:, :-1]
+        self._stacked_steps[:, 0] = now
+        self._stacked_steps[self._is_new] = now[self._is_new, None]
+        self._is_new[:] = False
+        if self._controller:
+            self._base_action[:] = np.clip(self._controller(observation), -1.0, 1.0)
+        return self._build_observation(self._stacked_steps, self._base_action)
 
-    def last(self, observation: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    def observe_final(self, observation: np.ndarray, chosen: np.ndarray) -> np.ndarray:
         """Return the agent's final observation (m, size) of the `chosen` (m,) episodes.
 
         `observation` (n, o) holds the final observations. The controller is not evaluated, since
         its state belongs to the next episode already.
         """
-        now = self._now(observation[chosen])[:, None]
-        past = np.concatenate([now, self._past[chosen, :-1]], axis=1)
-        return self._shown(past, self._base[chosen])
+        now = self._append_errors(observation[chosen])[:, None]
+        past = np.concatenate([now, self._stacked_steps[chosen, :-1]], axis=1)
+        return self._build_observation(past, self._base_action[chosen])
 
-    def act(self, action: np.ndarray) -> np.ndarray:
+    def convert_action(self, action: np.ndarray) -> np.ndarray:
         """Return the environment actions (n, a) for the actions of the agent (n, a)."""
-        own = self._share * np.clip(action, -1.0, 1.0)
-        return np.clip(self._base + own, -1.0, 1.0) if self._law else own
+        own = self._max_fraction * np.clip(action, -1.0, 1.0)
+        return np.clip(self._base_action + own, -1.0, 1.0) if self._controller else own
 
 
 try:
@@ -123,10 +127,10 @@ try:
 except ImportError:
     VecEnv = None
 
-_Base: Any = VecEnv or object
+_VecEnvBase: Any = VecEnv or object
 
 
-class StableVecEnv(_Base):
+class StableVecEnv(_VecEnvBase):
     """A stable-baselines3 VecEnv with n environments of a task.
 
     Attributes:
@@ -135,7 +139,7 @@ class StableVecEnv(_Base):
     """
 
     def __init__(
-        self, task: str, num_envs: int, threads: int = 0, view: AgentView | None = None,
+        self, task: str, num_envs: int, threads: int = 0, view: AgentInterface | None = None,
         **options: Any,
     ) -> None:  # fmt: skip
         """Compile the machines.
@@ -156,12 +160,12 @@ class StableVecEnv(_Base):
             raise InputError("StableVecEnv", message)
         self.core, self.view = make_core(task, options, num_envs, threads, SAME_STEP), view
         self.render_mode = None
-        space = observation_space(self.core)
+        space = make_observation_space(self.core)
         if view:
-            space = Box(-np.inf, np.inf, (view.size,), np.float32)
-        super().__init__(num_envs, space, action_space(self.core))
+            space = Box(-np.inf, np.inf, (view.observation_size,), np.float32)
+        super().__init__(num_envs, space, make_action_space(self.core))
         self._infos: list[dict[str, Any]] = [{} for _ in range(num_envs)]
-        self._ended = np.zeros(0, int)
+        self._finished = np.zeros(0, int)
         self._return, self._length = np.zeros(num_envs), np.zeros(num_envs, int)
 
     def reset(self) -> np.ndarray:
@@ -177,7 +181,7 @@ class StableVecEnv(_Base):
         self._return[:], self._length[:] = 0.0, 0
         if self.view:
             self.view.begin(self.num_envs)
-            return self.view.see(self.core.observation)
+            return self.view.observe(self.core.observation)
         return self.core.observation.copy()
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -188,7 +192,7 @@ class StableVecEnv(_Base):
         """
         if np.ndim(actions) != 2 or len(actions) != self.num_envs:
             raise ValueError(f"needs {self.num_envs} rows of actions, got {np.shape(actions)}")
-        self._given = actions
+        self._pending_actions = actions
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Advance by one step; environments whose episode ended start a new one.
@@ -199,22 +203,25 @@ class StableVecEnv(_Base):
             task measures; the others are empty.
         """
         core, view = self.core, self.view
-        core.step(view.act(self._given) if view else self._given)
+        core.step(view.convert_action(self._pending_actions) if view else self._pending_actions)
         self._return += core.reward
         self._length += 1
         over = (core.terminated | core.truncated) != 0
         ended = np.flatnonzero(over)
-        for number in self._ended:
+        for number in self._finished:
             self._infos[number] = {}
-        self._ended = ended
+        self._finished = ended
         if len(ended):
-            self._end(ended, view.last(core.final, ended) if view else core.final[ended])
+            self._write_final_infos(
+                ended,
+                view.observe_final(core.final_observation, ended) if view else core.final_observation[ended],
+            )
             if view:
                 view.reset(over)
-        seen = view.see(core.observation) if view else core.observation.copy()
+        seen = view.observe(core.observation) if view else core.observation.copy()
         return seen, core.reward.astype(np.float32), over, self._infos
 
-    def _end(self, ended: np.ndarray, last: np.ndarray) -> None:
+    def _write_final_infos(self, ended: np.ndarray, last: np.ndarray) -> None:
         """Write the infos of the episodes that ended."""
         names = [name for name, _ in self.core.setup.task.measures]
         for row, i in enumerate(ended):
@@ -231,12 +238,12 @@ class StableVecEnv(_Base):
         """Free the memory of the simulations."""
         self.core.close()
 
-    def _many(self, indices: Any) -> int:
+    def _count_indices(self, indices: Any) -> int:
         return self.num_envs if indices is None else len(np.atleast_1d(indices))
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """Return the attribute of this object once per environment."""
-        return [getattr(self, attr_name)] * self._many(indices)
+        return [getattr(self, attr_name)] * self._count_indices(indices)
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Raise InputError: the environments are one object."""
@@ -248,4 +255,4 @@ class StableVecEnv(_Base):
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
         """Return False for every environment: wrappers are not supported."""
-        return [False] * self._many(indices)
+        return [False] * self._count_indices(indices)

@@ -1,6 +1,6 @@
 """Render running tasks: the machine with its visual geometry, and markers that show the goal.
 
-`Stage` copies the state of a simulation to a model with visual geometry and draws it. One function
+`TaskRenderer` copies the state of a simulation to a model with visual geometry and draws it. One function
 per kind of task makes the markers from the goal of an episode. A bed of soil is drawn as boxes in
 the plane of the arm; the undisturbed bank is darker than the loose soil on top.
 """
@@ -13,26 +13,40 @@ import mujoco
 import numpy as np
 from mujoco.batch import MODEL_FIELDS
 
-from hydrotele.control.resolved_motion import arm_facts
+from hydrotele.control.resolved_motion import arm_specification
 from hydrotele.core.errors import InputError
 from hydrotele.envs.core import TaskCore
-from hydrotele.envs.episode import ARM
-from hydrotele.envs.force import FORCE_READ, reference_force
-from hydrotele.envs.grade import CELL, CELLS, FAR, NEAR, START, plane_height
-from hydrotele.envs.line import SETTLE, line_pose
-from hydrotele.envs.place import GOAL_PLACE, HALF_LENGTH, RADIUS
+from hydrotele.envs.episode import MAX_ARM_AXES
+from hydrotele.envs.force import MEASURED_FORCE, reference_force
+from hydrotele.envs.grade import (
+    CELL_COUNT,
+    CELL_LENGTH,
+    MAX_RADIUS,
+    MIN_RADIUS,
+    PROFILE_START,
+    plane_height,
+)
+from hydrotele.envs.line import SETTLE_TIME, compute_line_pose
+from hydrotele.envs.place import GOAL_POSE, LOG_HALF_LENGTH, LOG_RADIUS
 from hydrotele.envs.track import track_reference
-from hydrotele.kinematics.task import ALONG, BASE_RADIUS, BOOM, SIDE, STICK, task_forward
+from hydrotele.kinematics.task import (
+    BASE_RADIUS,
+    BOOM_LENGTH,
+    LATERAL_OFFSET,
+    STICK_LENGTH,
+    TOOL_ALONG,
+    task_forward,
+)
 from hydrotele.show.canvas import Canvas, Marker, arrow, ball, box, line, polyline
-from hydrotele.show.pose import model_with_looks
-from hydrotele.simulate.fleet import STATE
+from hydrotele.show.pose import compile_visual_model
+from hydrotele.simulate.fleet import STATE_KIND
 from hydrotele.soil.facts import CAT215
 
-_BANK, _LOOSE = (0.36, 0.25, 0.15, 1.0), (0.62, 0.47, 0.30, 1.0)
-_THIN_SOIL = 1e-3  # m, maximum thickness of loose soil that is not drawn
+_BANK_COLOUR, _LOOSE_COLOUR = (0.36, 0.25, 0.15, 1.0), (0.62, 0.47, 0.30, 1.0)
+_MIN_LOOSE_THICKNESS = 1e-3  # m, maximum thickness of loose soil that is not drawn
 
 
-def _turn(core: TaskCore, number: int) -> np.ndarray:
+def _house_rotation(core: TaskCore, number: int) -> np.ndarray:
     """Return the rotation (3, 3) of the house, which is that of the plane of the arm."""
     swing = float(core.episodes["position"][number][0])
     c, s = math.cos(swing), math.sin(swing)
@@ -49,19 +63,19 @@ def bed_markers(core: TaskCore, number: int) -> list[Marker]:
     Returns:
         The boxes, in the world frame.
     """
-    terrain, turn = core.terrain[number], _turn(core, number)
-    surface, loose = terrain[:CELLS], terrain[CELLS : 2 * CELLS]
-    side, half = float(core.facts["arm"][SIDE]), 0.5 * CAT215.width
-    bottom = min(0.0, float(np.min(surface)) - _THIN_SOIL)  # 0 is the level of the tracks
+    terrain, turn = core.terrain[number], _house_rotation(core, number)
+    surface, loose = terrain[:CELL_COUNT], terrain[CELL_COUNT : 2 * CELL_COUNT]
+    side, half = float(core.parameters["arm"][LATERAL_OFFSET]), 0.5 * CAT215.width
+    bottom = min(0.0, float(np.min(surface)) - _MIN_LOOSE_THICKNESS)  # 0 is the level of the tracks
 
     def cell(i: int, low: float, high: float, colour) -> Marker:
-        middle = turn @ [START + (i + 0.5) * CELL, side, 0.5 * (low + high)]
-        return box(middle, (0.5 * CELL, half, 0.5 * (high - low)), colour, turn)
+        middle = turn @ [PROFILE_START + (i + 0.5) * CELL_LENGTH, side, 0.5 * (low + high)]
+        return box(middle, (0.5 * CELL_LENGTH, half, 0.5 * (high - low)), colour, turn)
 
     bank = surface - loose
-    boxes = [cell(i, bottom, float(bank[i]), _BANK) for i in range(CELLS)]
-    heaps = [i for i in range(CELLS) if loose[i] > _THIN_SOIL]
-    return boxes + [cell(i, float(bank[i]), float(surface[i]), _LOOSE) for i in heaps]
+    boxes = [cell(i, bottom, float(bank[i]), _BANK_COLOUR) for i in range(CELL_COUNT)]
+    heaps = [i for i in range(CELL_COUNT) if loose[i] > _MIN_LOOSE_THICKNESS]
+    return boxes + [cell(i, float(bank[i]), float(surface[i]), _LOOSE_COLOUR) for i in heaps]
 
 
 def plane_markers(core: TaskCore, number: int, colour) -> list[Marker]:
@@ -75,23 +89,32 @@ def plane_markers(core: TaskCore, number: int, colour) -> list[Marker]:
     Returns:
         The lines, in the world frame.
     """
-    goal, turn = core.episodes["goal"][number], _turn(core, number)
-    side, out = float(core.facts["arm"][SIDE]), 0.5 * CAT215.width + 0.03
+    goal, turn = core.episodes["goal"][number], _house_rotation(core, number)
+    side, out = float(core.parameters["arm"][LATERAL_OFFSET]), 0.5 * CAT215.width + 0.03
     corners = [
         turn @ [r, side + y, plane_height.py_func(goal, r)]
-        for r, y in ((NEAR, -out), (FAR, -out), (FAR, out), (NEAR, out), (NEAR, -out))
+        for r, y in (
+            (MIN_RADIUS, -out),
+            (MAX_RADIUS, -out),
+            (MAX_RADIUS, out),
+            (MIN_RADIUS, out),
+            (MIN_RADIUS, -out),
+        )
     ]
     return polyline(np.array(corners), 0.02, colour)
 
 
-_GOAL = (0.10, 0.75, 0.25, 1.0)  # colour of the reference
-_AHEAD = (0.15, 0.45, 0.95, 1.0)  # colour of the future reference
-_OFF = (0.90, 0.15, 0.10, 1.0)  # colour of the error
-_WAY, _PIECES = 3.0, 30  # s of the reference that are drawn ahead, number of line segments
-_BALL, _THICK, _THIN = 0.15, 0.045, 0.035  # m, ball radius and line widths
-_METRES = 7.0e-5  # m per N, length of a force arrow
-_BESIDE = 0.3  # m between the arrows of two forces
-_POINTER = 0.8  # m, length of the line that shows an attitude
+_GOAL_COLOUR = (0.10, 0.75, 0.25, 1.0)  # colour of the reference
+_PATH_COLOUR = (0.15, 0.45, 0.95, 1.0)  # colour of the future reference
+_ERROR_COLOUR = (0.90, 0.15, 0.10, 1.0)  # colour of the error
+_PREVIEW_TIME, _PATH_SEGMENTS = (
+    3.0,
+    30,
+)  # s of the reference that are drawn ahead, number of line segments
+_BALL_RADIUS, _THICK_WIDTH, _THIN_WIDTH = 0.15, 0.045, 0.035  # m, ball radius and line widths
+_ARROW_LENGTH_PER_NEWTON = 7.0e-5  # m per N, length of a force arrow
+_ARROW_DISTANCE = 0.3  # m between the arrows of two forces
+_POINTER_LENGTH = 0.8  # m, length of the line that shows an attitude
 
 
 def goal_markers(core: TaskCore, number: int) -> list[Marker]:
@@ -104,111 +127,130 @@ def goal_markers(core: TaskCore, number: int) -> list[Marker]:
     Returns:
         The markers, in the world frame.
     """
-    draw = _GOALS.get(core.setup.task.kind)
+    draw = _MARKER_FUNCTIONS.get(core.setup.task.kind)
     return draw(core, number) if draw else []
 
 
-def place_of_pose(pose: np.ndarray) -> np.ndarray:
+def pose_position(pose: np.ndarray) -> np.ndarray:
     """Return the position (3,) [m] of a pose (r, theta, z, ...)."""
     return np.array([pose[0] * math.cos(pose[1]), pose[0] * math.sin(pose[1]), pose[2]])
 
 
-def _track(core: TaskCore, number: int) -> list[Marker]:
+def _track_markers(core: TaskCore, number: int) -> list[Marker]:
     """Return markers of the reference tip position, its future path and the tip error."""
     episode, k = core.episodes[number], core.setup.arm_axes
     now = float(episode["tick"]) * core.setup.clock.period
 
     def place(time: float) -> np.ndarray:
-        joints, pose = np.empty(k), np.empty(ARM)
+        joints, pose = np.empty(k), np.empty(MAX_ARM_AXES)
         for axis in range(k):
             joints[axis] = track_reference(episode["goal"], axis, time)[0]
-        task_forward(core.facts["arm"], joints, pose)
-        return place_of_pose(pose)
+        task_forward(core.parameters["arm"], joints, pose)
+        return pose_position(pose)
 
-    way = np.array([place(now + ahead) for ahead in np.linspace(0.0, _WAY, _PIECES + 1)])
-    off = line(episode["tip"], way[0], _THICK, _OFF)
-    return [ball(way[0], _BALL, _GOAL), off, *polyline(way, _THIN, _AHEAD)]
+    way = np.array([place(now + ahead) for ahead in np.linspace(0.0, _PREVIEW_TIME, _PATH_SEGMENTS + 1)])
+    off = line(episode["tip"], way[0], _THICK_WIDTH, _ERROR_COLOUR)
+    return [
+        ball(way[0], _BALL_RADIUS, _GOAL_COLOUR),
+        off,
+        *polyline(way, _THIN_WIDTH, _PATH_COLOUR),
+    ]
 
 
-def _line(core: TaskCore, number: int) -> list[Marker]:
+def _line_markers(core: TaskCore, number: int) -> list[Marker]:
     """Return markers of the line, the reference position on it and the tip error."""
     episode = core.episodes[number]
-    now, pose, rate = float(episode["tick"]) * core.setup.clock.period, np.zeros(ARM), np.zeros(ARM)
+    now, pose, rate = (
+        float(episode["tick"]) * core.setup.clock.period,
+        np.zeros(MAX_ARM_AXES),
+        np.zeros(MAX_ARM_AXES),
+    )
 
     def place(time: float) -> np.ndarray:
-        line_pose(episode["goal"], time, pose, rate)
-        return place_of_pose(pose)
+        compute_line_pose(episode["goal"], time, pose, rate)
+        return pose_position(pose)
 
     end = core.setup.clock.horizon * core.setup.clock.ticks * core.setup.clock.period
-    way = np.array([place(time) for time in np.linspace(SETTLE, end, _PIECES + 1)])
+    way = np.array([place(time) for time in np.linspace(SETTLE_TIME, end, _PATH_SEGMENTS + 1)])
     wanted = place(now)
-    off = line(episode["tip"], wanted, _THICK, _OFF)
-    return [ball(wanted, _BALL, _GOAL), off, *polyline(way, _THIN, _AHEAD)]
+    off = line(episode["tip"], wanted, _THICK_WIDTH, _ERROR_COLOUR)
+    return [
+        ball(wanted, _BALL_RADIUS, _GOAL_COLOUR),
+        off,
+        *polyline(way, _THIN_WIDTH, _PATH_COLOUR),
+    ]
 
 
-def _force(core: TaskCore, number: int) -> list[Marker]:
+def _force_markers(core: TaskCore, number: int) -> list[Marker]:
     """Return arrows on the plate for the reference force and the measured force."""
-    episode, side = core.episodes[number], np.array([0.0, 0.5 * _BESIDE, 0.0])
+    episode, side = core.episodes[number], np.array([0.0, 0.5 * _ARROW_DISTANCE, 0.0])
     goal, foot = episode["goal"], episode["tip"] - np.array([0.6, 0.0, 0.0])
     now = float(episode["tick"]) * core.setup.clock.period
     wanted, _ = reference_force(goal, now)
-    up = np.array([0.0, 0.0, _METRES])
-    pushes = ((wanted, -side, _GOAL), (float(goal[FORCE_READ]), side, _OFF))
+    up = np.array([0.0, 0.0, _ARROW_LENGTH_PER_NEWTON])
+    pushes = ((wanted, -side, _GOAL_COLOUR), (float(goal[MEASURED_FORCE]), side, _ERROR_COLOUR))
     return [
-        arrow(foot + way + max(0.0, force) * up, foot + way, 1.5 * _THICK, colour)
+        arrow(foot + way + max(0.0, force) * up, foot + way, 1.5 * _THICK_WIDTH, colour)
         for force, way, colour in pushes
     ]
 
 
-def _reach(core: TaskCore, number: int) -> list[Marker]:
+def _reach_markers(core: TaskCore, number: int) -> list[Marker]:
     """Return markers of the goal position, the tip error and the goal attitude."""
     episode = core.episodes[number]
-    pose = episode["goal"][:ARM]
-    wanted, level = place_of_pose(pose), math.cos(pose[3])
+    pose = episode["goal"][:MAX_ARM_AXES]
+    wanted, level = pose_position(pose), math.cos(pose[3])
     ahead = np.array([level * math.cos(pose[1]), level * math.sin(pose[1]), math.sin(pose[3])])
-    pointer = line(wanted - _POINTER * ahead, wanted, _THICK, _AHEAD)
-    return [ball(wanted, _BALL, _GOAL), line(episode["tip"], wanted, _THICK, _OFF), pointer]
+    pointer = line(wanted - _POINTER_LENGTH * ahead, wanted, _THICK_WIDTH, _PATH_COLOUR)
+    return [
+        ball(wanted, _BALL_RADIUS, _GOAL_COLOUR),
+        line(episode["tip"], wanted, _THICK_WIDTH, _ERROR_COLOUR),
+        pointer,
+    ]
 
 
-def _grade(core: TaskCore, number: int) -> list[Marker]:
+def _grade_markers(core: TaskCore, number: int) -> list[Marker]:
     """Return markers of the soil and of the target plane."""
-    return [*bed_markers(core, number), *plane_markers(core, number, _GOAL)]
+    return [*bed_markers(core, number), *plane_markers(core, number, _GOAL_COLOUR)]
 
 
-def _place(core: TaskCore, number: int) -> list[Marker]:
+def _place_markers(core: TaskCore, number: int) -> list[Marker]:
     """Return markers of the axis and the outline of the log at its goal on the ground."""
-    x, y, yaw = core.episodes[number]["goal"][GOAL_PLACE]
-    radius, half = core.facts["parameters"][RADIUS], core.facts["parameters"][HALF_LENGTH]
+    x, y, yaw = core.episodes[number]["goal"][GOAL_POSE]
+    radius, half = (
+        core.parameters["parameters"][LOG_RADIUS],
+        core.parameters["parameters"][LOG_HALF_LENGTH],
+    )
     way = np.array([math.cos(yaw), math.sin(yaw), 0.0])
     aside = radius * np.array([-math.sin(yaw), math.cos(yaw), 0.0])
     middle = np.array([x, y, 0.02])
     ends = [middle + half * a * way + b * aside for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
-    rim = polyline(np.array([*ends, ends[0]]), 0.03, _GOAL)
-    return [*rim, line(middle - half * way, middle + half * way, 0.03, _GOAL)]
+    rim = polyline(np.array([*ends, ends[0]]), 0.03, _GOAL_COLOUR)
+    return [*rim, line(middle - half * way, middle + half * way, 0.03, _GOAL_COLOUR)]
 
 
-_GOALS: dict[str, Callable[[TaskCore, int], list[Marker]]] = {
-    "track": _track,
-    "line": _line,
-    "force": _force,
-    "reach": _reach,
-    "grade": _grade,
-    "place": _place,
+_MARKER_FUNCTIONS: dict[str, Callable[[TaskCore, int], list[Marker]]] = {
+    "track": _track_markers,
+    "line": _line_markers,
+    "force": _force_markers,
+    "reach": _reach_markers,
+    "grade": _grade_markers,
+    "place": _place_markers,
 }
 
 
 _AZIMUTH, _ELEVATION = 232.0, -20.0  # degree: view from the front, the side and above
-_KEPT = 16  # maximum number of cached models
-FREE = -1  # number of the free camera
+_MAX_CACHED_MODELS = 16  # maximum number of cached models
+FREE_CAMERA = -1  # number of the free camera
 
 Camera = str | int | None
 
 
-class Stage:
+class TaskRenderer:
     """A model with visual geometry that shows any simulation of a task.
 
     Attributes:
-        model: model with visual geometry; `show` sets its parameters to those of the variant shown.
+        model: model with visual geometry; `update` sets its parameters to those of the variant shown.
         data: data of the simulation shown.
     """
 
@@ -219,54 +261,54 @@ class Stage:
             core: the running task.
         """
         self._core = core
-        self._compiled: dict[tuple[int, str], mujoco.MjModel] = {}
-        self._shown = self._looks(0)
-        self.model = copy.copy(self._shown)
+        self._cached_models: dict[tuple[int, str], mujoco.MjModel] = {}
+        self._current_model = self._get_visual_model(0)
+        self.model = copy.copy(self._current_model)
         self.data = mujoco.MjData(self.model)
         self._canvas: Canvas | None = None
 
-    def _looks(self, variant: int) -> mujoco.MjModel:
+    def _get_visual_model(self, variant: int) -> mujoco.MjModel:
         """Return the model of a variant with visual geometry; compile it on first use."""
         variants, task = self._core.setup.variants, self._core.setup.task
         machine, things = variants.machines[variant], variants.surroundings[variant]
         key = id(machine), repr(things)
-        if key not in self._compiled:
-            model = model_with_looks(machine, task.ground, things)
-            assert mujoco.mj_stateSize(model, STATE) == self._core.simulations.state.shape[1]
-            self._look_from_afar(model)
-            self._compiled[key] = model
-            while len(self._compiled) > _KEPT:
-                self._compiled.pop(next(iter(self._compiled)))
-        return self._compiled[key]
+        if key not in self._cached_models:
+            model = compile_visual_model(machine, task.ground, things)
+            assert mujoco.mj_stateSize(model, STATE_KIND) == self._core.simulations.state.shape[1]
+            self._set_free_camera(model)
+            self._cached_models[key] = model
+            while len(self._cached_models) > _MAX_CACHED_MODELS:
+                self._cached_models.pop(next(iter(self._cached_models)))
+        return self._cached_models[key]
 
-    def _look_from_afar(self, model: mujoco.MjModel) -> None:
+    def _set_free_camera(self, model: mujoco.MjModel) -> None:
         """Set MuJoCo's free camera to show the whole workspace of the arm."""
         machine = self._core.setup.machine
         if machine.arm:
-            numbers = arm_facts(machine)[0]
-            far = float(numbers[[BASE_RADIUS, BOOM, STICK]].sum() + abs(numbers[ALONG]))
+            numbers = arm_specification(machine)[0]
+            far = float(numbers[[BASE_RADIUS, BOOM_LENGTH, STICK_LENGTH]].sum() + abs(numbers[TOOL_ALONG]))
             model.stat.center[:] = 0.40 * far, 0.0, 0.18 * far
             model.stat.extent = far
         model.vis.global_.azimuth, model.vis.global_.elevation = _AZIMUTH, _ELEVATION
 
-    def show(self, number: int = 0) -> None:
+    def update(self, number: int = 0) -> None:
         """Copy the parameters and the state of a simulation to `model` and `data`.
 
         Args:
             number: index of the simulation.
         """
         variant = int(self._core.episodes["variant"][number])
-        if (wanted := self._looks(variant)) is not self._shown:
+        if (wanted := self._get_visual_model(variant)) is not self._current_model:
             copy_parameters(wanted, self.model)
-            self._shown = wanted
-        mujoco.mj_setState(self.model, self.data, self._core.simulations.state[number], STATE)
+            self._current_model = wanted
+        mujoco.mj_setState(self.model, self.data, self._core.simulations.state[number], STATE_KIND)
         mujoco.mj_forward(self.model, self.data)
 
     def markers(self, number: int = 0) -> list[Marker]:
         """Return the markers of the goal of a simulation."""
         return goal_markers(self._core, number)
 
-    def camera(self, which: Camera = None) -> mujoco.MjvCamera:
+    def find_camera(self, which: Camera = None) -> mujoco.MjvCamera:
         """Return a camera by name or number.
 
         Args:
@@ -280,8 +322,8 @@ class Stage:
             InputError: the camera does not exist.
         """
         camera = mujoco.MjvCamera()
-        names = [self.model.camera(i).name for i in range(self.model.ncam)]
-        if which is None or which == FREE or which == "free":
+        names = [self.model.find_camera(i).name for i in range(self.model.ncam)]
+        if which is None or which == FREE_CAMERA or which == "free":
             mujoco.mjv_defaultFreeCamera(self.model, camera)
             return camera
         if which in names:
@@ -291,16 +333,14 @@ class Stage:
         camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, int(which)
         return camera
 
-    def picture(
-        self, number: int = 0, width: int = 640, height: int = 480, camera: Camera = None
-    ) -> np.ndarray:
+    def render(self, number: int = 0, width: int = 640, height: int = 480, camera: Camera = None) -> np.ndarray:
         """Render a simulation; the OpenGL context is reused for images of the same size.
 
         Args:
             number: index of the simulation.
             width: [pixel].
             height: [pixel].
-            camera: see the method `camera`.
+            camera: see the method `find_camera`.
 
         Returns:
             (height, width, 3) uint8.
@@ -309,11 +349,11 @@ class Stage:
             InputError: the camera does not exist, the size is not possible, or OpenGL does not
                 work.
         """
-        view = self.camera(camera)
+        view = self.find_camera(camera)
         if self._canvas is None or self._canvas.size != (width, height):
             self.close()
             self._canvas = Canvas(self.model, width, height)
-        self.show(number)
+        self.update(number)
         return self._canvas.draw(self.model, self.data, view, self.markers(number))
 
     def close(self) -> None:

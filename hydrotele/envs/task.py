@@ -11,17 +11,17 @@ from typing import Any, Literal
 import mujoco
 import numpy as np
 
-from hydrotele.control.resolved_motion import arm_facts
+from hydrotele.control.resolved_motion import arm_specification
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
-from hydrotele.envs.episode import ACTIONS, ARM
-from hydrotele.envs.world import Field
+from hydrotele.envs.episode import ACTIONS, MAX_ARM_AXES
+from hydrotele.envs.world import ObservationField
 from hydrotele.kinematics.task import REACHED, task_forward, task_inverse, task_rates
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Servo, SurroundingObject
 
 ActionKind = Literal["valve", "joint_rate", "resolved_motion"]
-REAL = "real"
+REAL_SENSORS = "real"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,11 +31,11 @@ class Task:
     Attributes:
         name: as in `hydrotele/<Name>-v0`.
         kind: name of its native code in `envs.facts.KINDS`.
-        sentence: description of the task.
+        description: description of the task.
         reward: description of the reward and the termination.
         machine: name of the machine.
         tool: name of the tool, None for the first tool of the machine.
-        more_axes: driven axes in addition to those of the arm.
+        extra_axes: driven axes in addition to those of the arm.
         action: default kind of actions.
         duration: duration of an episode [s].
         start: (machine, random generator) -> axis or joint name -> position at the start.
@@ -44,9 +44,9 @@ class Task:
         surroundings: (machine, random generator, start) -> objects around the machine.
         ground: whether there is a hard ground.
         parameters: (machine, MuJoCo model) -> up to PARAMETERS values for the native code.
-        terrain: number of terrain values per episode, 0 without terrain.
+        terrain_size: number of terrain values per episode, 0 without terrain.
         swing_locked: whether the action of the swing has no effect.
-        writes: model fields that the native code writes; they are restored for every episode.
+        written_fields: model fields that the native code writes; they are restored for every episode.
         pose_rates: tip rates at full action: r [m/s], theta [rad/s], z [m/s], attitude, head
             [rad/s].
         servo: gains of the joint servo (`joint_rate`, `resolved_motion`).
@@ -54,24 +54,24 @@ class Task:
 
     name: str
     kind: str
-    sentence: str
+    description: str
     reward: str
     machine: str
     tool: str | None
     start: Callable[[Machine, np.random.Generator], dict[str, float]]
-    fields: Callable[[Machine, tuple[str, ...]], list[Field]]
+    fields: Callable[[Machine, tuple[str, ...]], list[ObservationField]]
     measures: tuple[tuple[str, str], ...]
-    more_axes: tuple[str, ...] = ()
+    extra_axes: tuple[str, ...] = ()
     action: ActionKind = "valve"
     duration: float = 20.0
-    surroundings: Callable[
-        [Machine, np.random.Generator, dict[str, float]], tuple[SurroundingObject, ...]
-    ] = lambda *_: ()
+    surroundings: Callable[[Machine, np.random.Generator, dict[str, float]], tuple[SurroundingObject, ...]] = (
+        lambda *_: ()
+    )
     ground: bool = False
     parameters: Callable[[Machine, mujoco.MjModel], Sequence[float] | np.ndarray] | None = None
-    terrain: int = 0
+    terrain_size: int = 0
     swing_locked: bool = False
-    writes: tuple[str, ...] = ()
+    written_fields: tuple[str, ...] = ()
     pose_rates: tuple[float, ...] = (0.5, 0.3, 0.5, 0.4, 0.25)
     servo: Servo = Servo()
 
@@ -107,8 +107,8 @@ class Options:
 assert set(ACTIONS) == set(ActionKind.__args__)
 
 
-_DRAWS = 1000  # maximum number of draws of a start pose
-_ROOM = 0.08  # rad, minimum distance to the limits of the joint ranges
+_MAX_DRAWS = 1000  # maximum number of draws of a start pose
+_START_MARGIN = 0.08  # rad, minimum distance to the limits of the joint ranges
 
 
 def draw_start(
@@ -129,20 +129,20 @@ def draw_start(
     Raises:
         InputError: none of 1000 random poses is reachable.
     """
-    numbers, axes, ranges = arm_facts(machine)
+    numbers, axes, ranges = arm_specification(machine)
     pose, joints = np.zeros(5), np.zeros(len(axes))
-    for _ in range(_DRAWS):
+    for _ in range(_MAX_DRAWS):
         pose[: len(low)] = rng.uniform(low, high)
         if (
             task_inverse(numbers, pose, pose[1], joints) == REACHED
-            and ((ranges[:, 0] + _ROOM <= joints) & (joints <= ranges[:, 1] - _ROOM)).all()
+            and ((ranges[:, 0] + _START_MARGIN <= joints) & (joints <= ranges[:, 1] - _START_MARGIN)).all()
         ):
             return dict(zip(axes, joints.tolist(), strict=True))
     raise InputError(f"start of {machine.name}", f"no pose from {low} to {high} can be reached")
 
 
-_PLACES = 16  # number of path segments whose ends are checked
-_ROOM_WORKSPACE = 0.03  # rad, minimum distance of a path to the limits of the joint ranges
+_PATH_SEGMENTS = 16  # number of path segments whose ends are checked
+_PATH_MARGIN = 0.03  # rad, minimum distance of a path to the limits of the joint ranges
 
 
 @compiled
@@ -164,15 +164,15 @@ def path_effort(f, start, change):
     Source: `kinematics.task`.
     """
     k = f.arm_axes
-    pose, q, rates = np.empty(ARM), np.empty(k), np.empty(k)
+    pose, q, rates = np.empty(MAX_ARM_AXES), np.empty(k), np.empty(k)
     worst = 0.0
-    for n in range(_PLACES + 1):
-        for c in range(ARM):
-            pose[c] = start[c] + change[c] * n / _PLACES
+    for n in range(_PATH_SEGMENTS + 1):
+        for c in range(MAX_ARM_AXES):
+            pose[c] = start[c] + change[c] * n / _PATH_SEGMENTS
         if task_inverse(f.arm, pose, pose[1], q) != 0:
             return np.inf
         for i in range(k):
-            if not f.ranges[i, 0] + _ROOM_WORKSPACE <= q[i] <= f.ranges[i, 1] - _ROOM_WORKSPACE:
+            if not f.ranges[i, 0] + _PATH_MARGIN <= q[i] <= f.ranges[i, 1] - _PATH_MARGIN:
                 return np.inf
         if task_rates(f.arm, q, pose, change, rates) != 0:
             return np.inf
@@ -184,7 +184,7 @@ def path_effort(f, start, change):
 
 
 @compiled
-def pose_read(f, e, pose):
+def measure_pose(f, e, pose):
     """Compute the pose of the tip from the measured joint positions.
 
     Args:
@@ -201,6 +201,6 @@ def pose_read(f, e, pose):
 
 
 @compiled
-def turned(angle):
+def wrap_angle(angle):
     """Return the equivalent angle from -pi to pi, scalar [rad]."""
     return angle - 2.0 * np.pi * np.rint(angle / (2.0 * np.pi))

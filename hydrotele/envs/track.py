@@ -10,43 +10,46 @@ import math
 import numpy as np
 
 from hydrotele.core.compiled import callback, compiled
-from hydrotele.envs.episode import ARM, AXES, uniform, uniform_between
+from hydrotele.envs.episode import MAX_ARM_AXES, MAX_AXES, draw_uniform, draw_uniform_between
 from hydrotele.envs.world import (
     BEGIN,
     OBSERVE,
     REWARD,
-    TASK_CODE,
-    Field,
-    episodes,
-    observed,
-    parameters_at,
+    TASK_SIGNATURE,
+    ObservationField,
+    episode_records,
+    observation_view,
+    parameters_view,
     position_field,
     rate_field,
-    rewarded,
-    world,
+    simulation_view,
+    store_outcome,
 )
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
 
-PREVIEWS = (0.1, 0.2, 0.4)  # s, look-ahead times of the observed reference
-SCALE = 0.1  # m of error that costs a reward of 1
-_HARMONICS = 3  # number of harmonics per axis
-_FADE = 2.0  # s, fade-in time
-_SHORT, _LONG = 8.0, 16.0  # s, range of the period
-_SLOW, _FAST = 0.3, 0.7  # range of the maximum rate, as a fraction of the drive rate
-_ROOM = 0.9  # maximum amplitude as a fraction of the distance to the joint limit
-_FREE = 1.5  # rad or m, the same distance for an axis without limits
+PREVIEW_TIMES = (0.1, 0.2, 0.4)  # s, look-ahead times of the observed reference
+ERROR_PER_REWARD = 0.1  # m of error that costs a reward of 1
+_HARMONIC_COUNT = 3  # number of harmonics per axis
+_FADE_TIME = 2.0  # s, fade-in time
+_MIN_PERIOD, _MAX_PERIOD = 8.0, 16.0  # s, range of the period
+_MIN_RATE_FRACTION, _MAX_RATE_FRACTION = (
+    0.3,
+    0.7,
+)  # range of the maximum rate, as a fraction of the drive rate
+_MAX_RANGE_FRACTION = 0.9  # maximum amplitude as a fraction of the distance to the joint limit
+_DEFAULT_RANGE = 1.5  # rad or m, the same distance for an axis without limits
 _FREQUENCY = 0
 _BASE = 1
-_SINE = _BASE + AXES
-_COSINE = _SINE + _HARMONICS * AXES
+_SINE = _BASE + MAX_AXES
+_COSINE = _SINE + _HARMONIC_COUNT * MAX_AXES
 
 
-def track_fields(machine: Machine, axes: tuple[str, ...]) -> list[Field]:
+def track_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
     """Return the fields that `observe_track` writes: references, their rates and previews."""
     fields = [position_field(machine, name, "reference") for name in axes]
     fields += [rate_field(machine, name, "reference_rate") for name in axes]
-    for ahead in PREVIEWS:
+    for ahead in PREVIEW_TIMES:
         label = f"reference_in_{ahead * 1000:.0f}_ms"
         fields += [position_field(machine, name, label) for name in axes]
     return fields
@@ -65,26 +68,26 @@ def begin_track(f, e):
 
     Source: this module.
     """
-    g = e.goal
-    g[_FREQUENCY] = 2.0 * math.pi / uniform_between(e, _SHORT, _LONG)
+    g = e.reference
+    g[_FREQUENCY] = 2.0 * math.pi / draw_uniform_between(e, _MIN_PERIOD, _MAX_PERIOD)
     for a in range(f.axes_driven):
         i = f.driven_axis[a]
         g[_BASE + i] = e.reference[i]
-        fastest = uniform_between(e, _SLOW, _FAST) * f.fastest[i]
+        fastest = draw_uniform_between(e, _MIN_RATE_FRACTION, _MAX_RATE_FRACTION) * f.fastest[i]
         total, rate = 0.0, 0.0
-        for h in range(_HARMONICS):
-            place = _HARMONICS * i + h
-            size, phase = uniform(e), uniform_between(e, -math.pi, math.pi)
+        for h in range(_HARMONIC_COUNT):
+            place = _HARMONIC_COUNT * i + h
+            size, phase = draw_uniform(e), draw_uniform_between(e, -math.pi, math.pi)
             g[_SINE + place], g[_COSINE + place] = size * math.cos(phase), size * math.sin(phase)
             total += size
             rate += size * (h + 1) * g[_FREQUENCY]
         low, high = f.ranges[i, 0] - g[_BASE + i], f.ranges[i, 1] - g[_BASE + i]
-        room = max(0.0, _ROOM * min(-low, high, _FREE))
+        room = max(0.0, _MAX_RANGE_FRACTION * min(-low, high, _DEFAULT_RANGE))
         # relative to its start, a sine reaches up to twice its amplitude on one side
         scale = min(fastest / rate, 0.5 * room / total)
-        for h in range(_HARMONICS):
-            g[_SINE + _HARMONICS * i + h] *= scale
-            g[_COSINE + _HARMONICS * i + h] *= scale
+        for h in range(_HARMONIC_COUNT):
+            g[_SINE + _HARMONIC_COUNT * i + h] *= scale
+            g[_COSINE + _HARMONIC_COUNT * i + h] *= scale
 
 
 @compiled
@@ -104,19 +107,19 @@ def track_reference(g, i, time):
     wave, rate = 0.0, 0.0
     first_sine, first_cosine = math.sin(g[_FREQUENCY] * time), math.cos(g[_FREQUENCY] * time)
     sine, cosine = first_sine, first_cosine
-    for h in range(_HARMONICS):
-        along, across = g[_SINE + _HARMONICS * i + h], g[_COSINE + _HARMONICS * i + h]
+    for h in range(_HARMONIC_COUNT):
+        along, across = g[_SINE + _HARMONIC_COUNT * i + h], g[_COSINE + _HARMONIC_COUNT * i + h]
         wave += along * sine + across * (cosine - 1.0)
         rate += (h + 1) * g[_FREQUENCY] * (along * cosine - across * sine)
         sine, cosine = (
             sine * first_cosine + cosine * first_sine,
             cosine * first_cosine - sine * first_sine,
         )
-    if time >= _FADE:
+    if time >= _FADE_TIME:
         return g[_BASE + i] + wave, rate
-    part = max(0.0, time / _FADE)
+    part = max(0.0, time / _FADE_TIME)
     share = part * part * (3.0 - 2.0 * part)
-    growth = 6.0 * part * (1.0 - part) / _FADE
+    growth = 6.0 * part * (1.0 - part) / _FADE_TIME
     return g[_BASE + i] + share * wave, share * rate + growth * wave
 
 
@@ -138,9 +141,9 @@ def observe_track(f, e, out, at):
     now, n = e.tick * f.period, f.axes_driven
     for a in range(n):
         i = f.driven_axis[a]
-        out[at + a], out[at + n + a] = track_reference(e.goal, i, now)
-        for p in range(len(PREVIEWS)):
-            out[at + (2 + p) * n + a] = track_reference(e.goal, i, now + PREVIEWS[p])[0]
+        out[at + a], out[at + n + a] = track_reference(e.reference, i, now)
+        for p in range(len(PREVIEW_TIMES)):
+            out[at + (2 + p) * n + a] = track_reference(e.reference, i, now + PREVIEW_TIMES[p])[0]
 
 
 @compiled
@@ -158,26 +161,26 @@ def reward_track(f, e, w):
     Source: this module.
     """
     now = e.tick * f.period
-    q, pose = np.empty(f.arm_axes), np.empty(ARM)
+    q, pose = np.empty(f.arm_axes), np.empty(MAX_ARM_AXES)
     for i in range(f.arm_axes):
-        q[i] = track_reference(e.goal, i, now)[0]
+        q[i] = track_reference(e.reference, i, now)[0]
     task_forward(f.arm, q, pose)
     x, y = pose[0] * math.cos(pose[1]), pose[0] * math.sin(pose[1])
     square = (e.tip[0] - x) ** 2 + (e.tip[1] - y) ** 2 + (e.tip[2] - pose[2]) ** 2
     error = math.sqrt(square)
     w.measures[0] = error
-    return max(-1.0, 1.0 - error / SCALE), False
+    return max(-1.0, 1.0 - error / ERROR_PER_REWARD), False
 
 
-@callback(TASK_CODE)
-def code(part, m, d, number, argument, out):
-    """Run one part of the task in native code; see `world`."""
-    f = parameters_at(argument)[0]
-    e, w = episodes(f)[number], world(f, m, d, number, argument)
+@callback(TASK_SIGNATURE)
+def task_code(part, m, d, number, argument, out):
+    """Run one part of the task in native code; see `simulation_view`."""
+    f = parameters_view(argument)[0]
+    e, w = episode_records(f)[number], simulation_view(f, m, d, number, argument)
     if part == BEGIN:
         begin_track(f, e)
     elif part == OBSERVE:
-        observe_track(f, e, observed(f, out), 0)
+        observe_track(f, e, observation_view(f, out), 0)
     elif part == REWARD:
-        return rewarded(e, reward_track(f, e, w))
+        return store_outcome(e, reward_track(f, e, w))
     return 0.0

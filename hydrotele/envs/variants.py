@@ -15,18 +15,18 @@ from mujoco.batch import MODEL_FIELDS
 
 from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS, apply_effect
-from hydrotele.envs.episode import AXES, CHANNELS
+from hydrotele.envs.episode import MAX_AXES, MAX_CHANNELS
 from hydrotele.envs.task import Options, Task
 from hydrotele.machine.machine import Machine, SensorError
 from hydrotele.scenario.scenario import SurroundingObject
-from hydrotele.simulate.fleet import STATE
+from hydrotele.simulate.fleet import STATE_KIND
 from hydrotele.simulate.mechanism import TIP_SITE
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
-from hydrotele.simulate.record import begin_leapfrog, sensed_channels
+from hydrotele.simulate.record import sensed_channels, start_leapfrog
 from hydrotele.simulate.stepping import command_delays, sensor_delays
 
-_KEPT = 8  # maximum number of cached sets of variants, which the environments of a process share
-_KNOWN: dict[str, "Variants"] = {}
+_MAX_CACHED_SETS = 8  # maximum number of cached sets of variants, which the environments of a process share
+_CACHE: dict[str, "Variants"] = {}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,27 +37,27 @@ class Variants:
         plant: plant of the first variant.
         machines: the machines.
         surroundings: objects around each machine.
-        states: (v, s) complete start states after `begin_leapfrog`.
-        tips: (v, 3) tip positions at the start [m].
+        states: (v, s) complete start states after `start_leapfrog`.
+        start_tips: (v, 3) tip positions at the start [m].
         fields: model field -> (v, size) values, for fields that differ or that the task writes.
-        scales: (v, CHANNELS) sensor scale factors [1].
-        offsets: (v, CHANNELS) sensor offsets.
-        lags: (v, CHANNELS, 2) sensor delays: whole physics steps, fraction of a step [1].
-        ratios: (v, CHANNELS) physics step divided by the sensor time constant [1]; 0 without lag.
-        delays: (v, AXES, 2) command delays: whole physics steps, fraction of a step [1].
+        sensor_scales: (v, CHANNELS) sensor scale factors [1].
+        sensor_offsets: (v, CHANNELS) sensor offsets.
+        sensor_delays: (v, CHANNELS, 2) sensor delays: whole physics steps, fraction of a step [1].
+        lag_ratios: (v, CHANNELS) physics step divided by the sensor time constant [1]; 0 without lag.
+        command_delays: (v, AXES, 2) command delays: whole physics steps, fraction of a step [1].
     """
 
     plant: Plant
     machines: tuple[Machine, ...]
     surroundings: tuple[tuple[SurroundingObject, ...], ...]
     states: np.ndarray
-    tips: np.ndarray
+    start_tips: np.ndarray
     fields: dict[str, np.ndarray]
-    scales: np.ndarray
-    offsets: np.ndarray
-    lags: np.ndarray
-    ratios: np.ndarray
-    delays: np.ndarray
+    sensor_scales: np.ndarray
+    sensor_offsets: np.ndarray
+    sensor_delays: np.ndarray
+    lag_ratios: np.ndarray
+    command_delays: np.ndarray
 
 
 def make_variants(task: Task, options: Options, nominal: Machine) -> Variants:
@@ -77,20 +77,20 @@ def make_variants(task: Task, options: Options, nominal: Machine) -> Variants:
     """
     key = repr((task.name, options.effects, options.randomise, options.variants,
                 options.variant_seed, options.timestep))  # fmt: skip
-    if key not in _KNOWN:
-        _KNOWN[key] = _make(task, options, nominal)
-        while len(_KNOWN) > _KEPT:
-            _KNOWN.pop(next(iter(_KNOWN)))
-    return _KNOWN[key]
+    if key not in _CACHE:
+        _CACHE[key] = _build_variants(task, options, nominal)
+        while len(_CACHE) > _MAX_CACHED_SETS:
+            _CACHE.pop(next(iter(_CACHE)))
+    return _CACHE[key]
 
 
-def _make(task: Task, options: Options, nominal: Machine) -> Variants:
+def _build_variants(task: Task, options: Options, nominal: Machine) -> Variants:
     machines, plants, states, tips = [], [], [], []
     for number in range(options.variants):
         rng = np.random.default_rng([options.variant_seed, number])
         joints = task.start(nominal, rng)
         things = task.surroundings(nominal, rng, joints)
-        machine = _changed(nominal, options, rng)
+        machine = _apply_effects(nominal, options, rng)
         known = (p for m, p in zip(machines, plants, strict=True)
                  if m == machine and p.surroundings == things)  # fmt: skip
         plant = next(known, None)
@@ -98,39 +98,39 @@ def _make(task: Task, options: Options, nominal: Machine) -> Variants:
             plant = build_plant(machine, options.timestep, task.ground, things)
         machines.append(machine)
         plants.append(plant)
-        data = rest_state(plant, _by_joint(machine, joints))
-        begin_leapfrog(plant.model, data)
-        state = np.zeros(mujoco.mj_stateSize(plant.model, STATE))
-        mujoco.mj_getState(plant.model, data, state, STATE)
+        data = rest_state(plant, _to_joint_names(machine, joints))
+        start_leapfrog(plant.model, data)
+        state = np.zeros(mujoco.mj_stateSize(plant.model, STATE_KIND))
+        mujoco.mj_getState(plant.model, data, state, STATE_KIND)
         states.append(state)
         tips.append(data.site(TIP_SITE).xpos.copy())
     return Variants(
         plants[0], tuple(machines), tuple(plant.surroundings for plant in plants),
-        np.array(states), np.array(tips), _differing(plants, task.writes),
-        *_sensor_tables(plants[0], machines), _delays(plants[0], machines),
+        np.array(states), np.array(tips), _find_differing_fields(plants, task.written_fields),
+        *_sensor_tables(plants[0], machines), _command_delay_table(plants[0], machines),
     )  # fmt: skip
 
 
-def _by_joint(machine: Machine, places: Mapping[str, float]) -> dict[str, float]:
+def _to_joint_names(machine: Machine, places: Mapping[str, float]) -> dict[str, float]:
     """Return the positions with axis names replaced by the names of their joints."""
     return {machine.axes[n].joint if n in machine.axes else n: v for n, v in places.items()}
 
 
-def _changed(nominal: Machine, options: Options, rng: np.random.Generator) -> Machine:
+def _apply_effects(nominal: Machine, options: Options, rng: np.random.Generator) -> Machine:
     """Return the machine with the given effects and the randomised ones."""
     machine = nominal
     for effect in options.effects:
-        machine = apply_effect(machine, *_said(effect), dict(effect.get("parameters", {})))
+        machine = apply_effect(machine, *_parse_effect(effect), dict(effect.get("parameters", {})))
     for effect in options.randomise:
         drawn = {
-            key: float(rng.uniform(*_range(effect, key, value)))
+            key: float(rng.uniform(*_parse_range(effect, key, value)))
             for key, value in effect.get("parameters", {}).items()
         }
-        machine = apply_effect(machine, *_said(effect), drawn)
+        machine = apply_effect(machine, *_parse_effect(effect), drawn)
     return machine
 
 
-def _said(effect: Mapping[str, Any]) -> tuple[str, str]:
+def _parse_effect(effect: Mapping[str, Any]) -> tuple[str, str]:
     """Check the keys of an effect and return its name and location."""
     keys = ("name", "location", "parameters")
     if not isinstance(effect, Mapping) or "name" not in effect or set(effect) - set(keys):
@@ -138,7 +138,7 @@ def _said(effect: Mapping[str, Any]) -> tuple[str, str]:
     return str(effect["name"]), str(effect.get("location", ""))
 
 
-def _range(effect: Mapping[str, Any], key: str, value: Any) -> tuple[float, float]:
+def _parse_range(effect: Mapping[str, Any], key: str, value: Any) -> tuple[float, float]:
     """Return the range of a randomised parameter, or raise InputError if it is not valid."""
     where = f"randomise {effect.get('name')}: {key}"
     try:
@@ -150,26 +150,26 @@ def _range(effect: Mapping[str, Any], key: str, value: Any) -> tuple[float, floa
     return low, high
 
 
-def _differing(plants: list[Plant], also: tuple[str, ...]) -> dict[str, np.ndarray]:
+def _find_differing_fields(plants: list[Plant], also: tuple[str, ...]) -> dict[str, np.ndarray]:
     """Return the model fields that differ between plants, and the fields `also`."""
     first, fields = plants[0].model, {}
     distinct = list({id(plant): plant for plant in plants}.values())
     for name in sorted(MODEL_FIELDS):
-        values = [np.asarray(_of(plant.model, name)) for plant in distinct]
+        values = [np.asarray(_get_model_field(plant.model, name)) for plant in distinct]
         if any(value.shape != values[0].shape for value in values):
-            raise _structure(name)
+            raise _make_structure_error(name)
         if name not in also and all(np.array_equal(value, values[0]) for value in values):
             continue
         if values[0].dtype != np.float64:
-            raise _structure(name)
-        fields[name] = np.array([np.asarray(_of(p.model, name)).ravel() for p in plants])
+            raise _make_structure_error(name)
+        fields[name] = np.array([np.asarray(_get_model_field(p.model, name)).ravel() for p in plants])
     for size in ("nv", "na"):
         if any(getattr(plant.model, size) != getattr(first, size) for plant in distinct):
-            raise _structure(size)
+            raise _make_structure_error(size)
     return fields
 
 
-def _structure(name: str) -> InputError:
+def _make_structure_error(name: str) -> InputError:
     known = ", ".join(sorted(EFFECTS))
     message = (
         f"the variants differ in the structure of the model ({name}), not only in parameters: add"
@@ -178,18 +178,18 @@ def _structure(name: str) -> InputError:
     return InputError("randomise", message)
 
 
-def _of(model: mujoco.MjModel, name: str):
+def _get_model_field(model: mujoco.MjModel, name: str):
     return getattr(model.opt, name[4:]) if name.startswith("opt.") else getattr(model, name)
 
 
-def channels(plant: Plant) -> tuple[str, ...]:
+def sensor_channels(plant: Plant) -> tuple[str, ...]:
     """Return the sensor channels in the order of native code: positions, pressures, supply."""
     return tuple(c for c in sensed_channels(plant) if not c.startswith("length."))
 
 
 def _sensor_tables(plant: Plant, machines: list[Machine]):
     """Return scales, offsets, delays and lag ratios of all sensors of all variants."""
-    shape, names = (len(machines), CHANNELS), channels(plant)
+    shape, names = (len(machines), MAX_CHANNELS), sensor_channels(plant)
     scales, offsets, ratios = np.ones(shape), np.zeros(shape), np.zeros(shape)
     lags, c = np.zeros((*shape, 2)), len(names)
     for v, machine in enumerate(machines):
@@ -204,20 +204,20 @@ def _sensor_tables(plant: Plant, machines: list[Machine]):
     return scales, offsets, lags, ratios
 
 
-def _delays(plant: Plant, machines: list[Machine]) -> np.ndarray:
-    delays = np.zeros((len(machines), AXES, 2))
+def _command_delay_table(plant: Plant, machines: list[Machine]) -> np.ndarray:
+    delays = np.zeros((len(machines), MAX_AXES, 2))
     for v, machine in enumerate(machines):
         delays[v, : len(plant.axes)] = command_delays(machine, plant.axes, plant.model.opt.timestep)
     return delays
 
 
-_DEADBAND = (0.5, 2.0)  # factors of the nominal overlap
-_FLOW = (0.8, 1.2)  # factors: rating tolerance of 5 to 10 %, plus wear and temperature
-_BANDWIDTH = (0.6, 1.4)  # factors of the nominal bandwidth
-_FRICTION = (0.5, 2.0)  # factors of the nominal Coulomb friction
-_BULK = (0.6, 1.2)  # factors of the nominal bulk modulus: air in the oil
-_DELAY = (0.0, 0.05)  # s, of a fieldbus and its valve amplifiers
-_PAYLOAD = (0.0, 0.02)  # factors of the mass of all links, at the tip
+_DEADBAND_FACTORS = (0.5, 2.0)  # factors of the nominal overlap
+_FLOW_FACTORS = (0.8, 1.2)  # factors: rating tolerance of 5 to 10 %, plus wear and temperature
+_BANDWIDTH_FACTORS = (0.6, 1.4)  # factors of the nominal bandwidth
+_FRICTION_FACTORS = (0.5, 2.0)  # factors of the nominal Coulomb friction
+_BULK_MODULUS_FACTORS = (0.6, 1.2)  # factors of the nominal bulk modulus: air in the oil
+_DELAY_RANGE = (0.0, 0.05)  # s, of a fieldbus and its valve amplifiers
+_PAYLOAD_FACTORS = (0.0, 0.02)  # factors of the mass of all links, at the tip
 
 
 def typical_variation(machine: Machine) -> tuple[dict[str, Any], ...]:
@@ -237,25 +237,25 @@ def typical_variation(machine: Machine) -> tuple[dict[str, Any], ...]:
         if axis.valve is None:
             continue
         found += [
-            _effect("valve_deadband", name, deadband=_times(axis.valve.deadband, _DEADBAND)),
-            _effect("valve_gain", name, ratio=list(_FLOW)),
-            _effect("spool_lag", name, bandwidth=_times(axis.valve.bandwidth, _BANDWIDTH)),
-            _effect(
+            _make_effect("valve_deadband", name, deadband=_scale_range(axis.valve.deadband, _DEADBAND_FACTORS)),
+            _make_effect("valve_gain", name, ratio=list(_FLOW_FACTORS)),
+            _make_effect("spool_lag", name, bandwidth=_scale_range(axis.valve.bandwidth, _BANDWIDTH_FACTORS)),
+            _make_effect(
                 "coulomb_friction", name,
-                coulomb=_times(axis.hydraulic_drive.friction.coulomb, _FRICTION),
+                coulomb=_scale_range(axis.hydraulic_drive.friction.coulomb, _FRICTION_FACTORS),
             ),
         ]  # fmt: skip
     if machine.supply:
-        bulk = _times(machine.supply.bulk_modulus, _BULK)
-        found.append(_effect("bulk_modulus", "all", bulk_modulus=bulk))
+        bulk = _scale_range(machine.supply.bulk_modulus, _BULK_MODULUS_FACTORS)
+        found.append(_make_effect("bulk_modulus", "all", bulk_modulus=bulk))
     weight = sum(link.mass for link in machine.links.values())
-    found.append(_effect("command_delay", "all", delay=list(_DELAY)))
-    return (*found, _effect("payload", "tool", mass=_times(weight, _PAYLOAD)))
+    found.append(_make_effect("command_delay", "all", delay=list(_DELAY_RANGE)))
+    return (*found, _make_effect("payload", "tool", mass=_scale_range(weight, _PAYLOAD_FACTORS)))
 
 
-def _effect(name: str, location: str, **ranges: list[float]) -> dict[str, Any]:
+def _make_effect(name: str, location: str, **ranges: list[float]) -> dict[str, Any]:
     return {"name": name, "location": location, "parameters": ranges}
 
 
-def _times(nominal: float, factors: tuple[float, float]) -> list[float]:
+def _scale_range(nominal: float, factors: tuple[float, float]) -> list[float]:
     return [factor * nominal for factor in factors]

@@ -1,6 +1,6 @@
 """Access of native code to a simulation, calls of the native code of a task, machine observations.
 
-`World` holds the arrays of one simulation. The native code of a task is called by address, so every
+`SimulationView` holds the arrays of one simulation. The native code of a task is called by address, so every
 task, and the loop that calls it, compiles separately. `observe_machine` writes the observation of
 the machine: sensors, tip pose from nominal kinematics, and commands. `machine_fields` returns the
 names, units and bounds of these values in the same order.
@@ -18,8 +18,8 @@ from numba import carray, types
 from numba.extending import intrinsic
 
 from hydrotele.core.compiled import compiled
-from hydrotele.core.memory import field, floats, pointer
-from hydrotele.envs.episode import ARM, EPISODE_STATE, MEASURES, TASK_PARAMETERS
+from hydrotele.core.memory import address_to_pointer, float64_view, struct_field_view
+from hydrotele.envs.episode import EPISODE_STATE, MAX_ARM_AXES, MAX_MEASURES, TASK_PARAMETERS
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
 
@@ -27,12 +27,12 @@ BEGIN, TICK, OBSERVE, REWARD = range(4)
 """Parts of a task's native code: start an episode, act after a control period, write the
 observation of the task, compute the reward of a step."""
 
-TASK_CODE = types.float64(*(types.int64,) * 6)
+TASK_SIGNATURE = types.float64(*(types.int64,) * 6)
 """Signature (part, mjModel*, mjData*, index of the simulation, TASK_PARAMETERS*, float32* output of
 the observation) -> reward."""
 
 
-class World(NamedTuple):
+class SimulationView(NamedTuple):
     """Views of the arrays of one simulation.
 
     Attributes:
@@ -53,8 +53,8 @@ class World(NamedTuple):
         measures: (MEASURES,) task measures of this step, for `info`.
         model: address of mjModel.
         data: address of mjData.
-        number: index of the simulation.
-        argument: address of the TASK_PARAMETERS record.
+        index: index of the simulation.
+        parameters_address: address of the TASK_PARAMETERS record.
     """
 
     qpos: np.ndarray
@@ -74,24 +74,24 @@ class World(NamedTuple):
     measures: np.ndarray
     model: int
     data: int
-    number: int
-    argument: int
+    index: int
+    parameters_address: int
 
 
 @compiled
-def parameters_at(argument):
+def parameters_view(argument):
     """Return a view (1,) of the TASK_PARAMETERS record at an address, scalar."""
-    return carray(pointer(argument), (1,), TASK_PARAMETERS)
+    return carray(address_to_pointer(argument), (1,), TASK_PARAMETERS)
 
 
 @compiled
-def episodes(f):
+def episode_records(f):
     """Return a view (count,) of the EPISODE_STATE records of a TASK_PARAMETERS record."""
-    return carray(pointer(f.episodes), (f.count,), EPISODE_STATE)
+    return carray(address_to_pointer(f.episodes), (f.count,), EPISODE_STATE)
 
 
 @compiled
-def world(f, m, d, number, argument):
+def simulation_view(f, m, d, number, argument):
     """Return views of the arrays of a simulation.
 
     Args:
@@ -106,26 +106,26 @@ def world(f, m, d, number, argument):
 
     Source: `simulate.layout`.
     """
-    place = carray(pointer(d + f.at_site), (1,), np.int64)[0]
-    active = carray(pointer(d + f.at_eq_active), (1,), np.int64)[0]
+    place = carray(address_to_pointer(d + f.at_site), (1,), np.int64)[0]
+    active = carray(address_to_pointer(d + f.at_eq_active), (1,), np.int64)[0]
     numbers = f.neq * f.eq_width
     site = f.tip_site if f.tip_site >= 0 else 0
-    return World(
-        field(d, f.at_qpos, f.nq),
-        field(d, f.at_qvel, f.nv),
-        field(d, f.at_act, f.na),
-        field(d, f.at_ctrl, f.axes),
-        floats(place + 24 * site, 3),
-        field(d, f.at_xfrc, 6 * f.nbody),
-        field(d, f.at_xpos, 3 * f.nbody),
-        field(d, f.at_xipos, 3 * f.nbody),
-        field(d, f.at_xquat, 4 * f.nbody),
-        field(d, f.at_xmat, 9 * f.nbody),
-        carray(pointer(active), (f.neq,), np.uint8),
-        field(m, f.at_eq_data, numbers),
-        floats(f.eq_rows + 8 * number * numbers, numbers if f.eq_rows else 0),
-        floats(f.terrain + 8 * number * f.width, f.width),
-        floats(f.measures + 8 * number * MEASURES, MEASURES),
+    return SimulationView(
+        struct_field_view(d, f.at_qpos, f.nq),
+        struct_field_view(d, f.at_qvel, f.nv),
+        struct_field_view(d, f.at_act, f.na),
+        struct_field_view(d, f.at_ctrl, f.axes),
+        float64_view(place + 24 * site, 3),
+        struct_field_view(d, f.at_xfrc, 6 * f.nbody),
+        struct_field_view(d, f.at_xpos, 3 * f.nbody),
+        struct_field_view(d, f.at_xipos, 3 * f.nbody),
+        struct_field_view(d, f.at_xquat, 4 * f.nbody),
+        struct_field_view(d, f.at_xmat, 9 * f.nbody),
+        carray(address_to_pointer(active), (f.neq,), np.uint8),
+        struct_field_view(m, f.at_eq_data, numbers),
+        float64_view(f.eq_rows + 8 * number * numbers, numbers if f.eq_rows else 0),
+        float64_view(f.terrain + 8 * number * f.width, f.width),
+        float64_view(f.measures + 8 * number * MAX_MEASURES, MAX_MEASURES),
         m,
         d,
         number,
@@ -134,7 +134,7 @@ def world(f, m, d, number, argument):
 
 
 @intrinsic
-def _call(typingctx, function, part, model, data, number, argument, out):
+def _call_address(typingctx, function, part, model, data, number, argument, out):
     """Call a function with the signature TASK_CODE by its address."""
 
     def codegen(context, builder, signature, args):
@@ -159,11 +159,11 @@ def call_task(f, w, part, out):
 
     Source: this module.
     """
-    return _call(f.task, part, w.model, w.data, w.number, w.argument, out)
+    return _call_address(f.task, part, w.model, w.data, w.number, w.parameters_address, out)
 
 
 @compiled
-def observed(f, out):
+def observation_view(f, out):
     """Return a view of the memory in which a task writes its observation.
 
     Args:
@@ -173,11 +173,11 @@ def observed(f, out):
     Returns:
         (observations,) float32; a task writes only its own fields, from the first element on.
     """
-    return carray(pointer(out), (f.observations,), np.float32)
+    return carray(address_to_pointer(out), (f.observations,), np.float32)
 
 
 @compiled
-def rewarded(e, outcome):
+def store_outcome(e, outcome):
     """Store whether an episode ends, and return the reward.
 
     Args:
@@ -192,13 +192,16 @@ def rewarded(e, outcome):
     return reward
 
 
-_TURNS = 20.0  # rad, bound for a slewing house, which has no joint limits
-_BEYOND = 0.15  # rad or m by which a measured position may exceed the joint range
-_FASTEST = 5.0  # rad/s or m/s, bound of the difference quotient of noisy samples
-_PRESSURES = (-1.0e6, 6.0e7)  # Pa, with sensor offset and noise; relief valves open at about 32 MPa
+_SWING_BOUND = 20.0  # rad, bound for a slewing house, which has no joint limits
+_POSITION_MARGIN = 0.15  # rad or m by which a measured position may exceed the joint range
+_RATE_BOUND = 5.0  # rad/s or m/s, bound of the difference quotient of noisy samples
+_PRESSURE_BOUNDS = (
+    -1.0e6,
+    6.0e7,
+)  # Pa, with sensor offset and noise; relief valves open at about 32 MPa
 
 
-class Field(NamedTuple):
+class ObservationField(NamedTuple):
     """One value of an observation.
 
     Attributes:
@@ -214,41 +217,41 @@ class Field(NamedTuple):
     high: float
 
 
-def position_field(machine: Machine, axis: str, what: str = "") -> Field:
+def position_field(machine: Machine, axis: str, what: str = "") -> ObservationField:
     """Return the field of an axis position; `what` defaults to `angle` or `position`."""
-    low, high = machine.joints[machine.axes[axis].joint].range or (-_TURNS, _TURNS)
+    low, high = machine.joints[machine.axes[axis].joint].range or (-_SWING_BOUND, _SWING_BOUND)
     kind = machine.position_kind(axis)
     unit = "rad" if kind == "angle" else "m"
-    return Field(f"{what or kind}.{axis}", unit, low - _BEYOND, high + _BEYOND)
+    return ObservationField(f"{what or kind}.{axis}", unit, low - _POSITION_MARGIN, high + _POSITION_MARGIN)
 
 
-def rate_field(machine: Machine, axis: str, what: str = "rate") -> Field:
+def rate_field(machine: Machine, axis: str, what: str = "rate") -> ObservationField:
     """Return the field of an axis rate."""
     unit = "rad/s" if machine.position_kind(axis) == "angle" else "m/s"
-    return Field(f"{what}.{axis}", unit, -_FASTEST, _FASTEST)
+    return ObservationField(f"{what}.{axis}", unit, -_RATE_BOUND, _RATE_BOUND)
 
 
-def pose_fields(machine: Machine, arm_axes: int, what: str = "tip") -> list[Field]:
+def pose_fields(machine: Machine, arm_axes: int, what: str = "tip") -> list[ObservationField]:
     """Return the fields of a tip pose: r, theta, z, attitude, and head for a five-axis arm."""
-    far = reach(machine)
+    far = max_reach(machine)
     fields = [
-        Field(f"{what}.r", "m", 0.0, far),
-        Field(f"{what}.theta", "rad", -_TURNS, _TURNS),
-        Field(f"{what}.z", "m", -far, far),
-        Field(f"{what}.attitude", "rad", -2.0 * math.pi, 2.0 * math.pi),
-        Field(f"{what}.head", "rad", -math.pi, math.pi),
+        ObservationField(f"{what}.r", "m", 0.0, far),
+        ObservationField(f"{what}.theta", "rad", -_SWING_BOUND, _SWING_BOUND),
+        ObservationField(f"{what}.z", "m", -far, far),
+        ObservationField(f"{what}.attitude", "rad", -2.0 * math.pi, 2.0 * math.pi),
+        ObservationField(f"{what}.head", "rad", -math.pi, math.pi),
     ]
     return fields[: max(4, arm_axes)]
 
 
-def reach(machine: Machine) -> float:
+def max_reach(machine: Machine) -> float:
     """Return an upper bound of the tip radius [m]: the sum of all link lengths."""
     lengths = [float(np.linalg.norm(link.position)) for link in machine.links.values()]
     assert machine.arm
     return sum(lengths) + float(np.linalg.norm(machine.arm.tip.position))
 
 
-def machine_fields(machine: Machine, axes: tuple[str, ...], arm_axes: int) -> list[Field]:
+def machine_fields(machine: Machine, axes: tuple[str, ...], arm_axes: int) -> list[ObservationField]:
     """Return the fields that `observe_machine` writes.
 
     Args:
@@ -260,19 +263,19 @@ def machine_fields(machine: Machine, axes: tuple[str, ...], arm_axes: int) -> li
         The fields, in order: positions, rates, head and rod pressures of the driven axes, supply
         pressure, pose of the tip, commands.
     """
-    valves = [name for name in axes if machine.axes[name].hydraulic]
+    valves = [name for name in axes if machine.axes[name].is_hydraulic]
     fields = [position_field(machine, name) for name in axes]
     fields += [rate_field(machine, name) for name in axes]
-    fields += [Field(f"pressure_head.{name}", "Pa", *_PRESSURES) for name in valves]
-    fields += [Field(f"pressure_rod.{name}", "Pa", *_PRESSURES) for name in valves]
+    fields += [ObservationField(f"pressure_head.{name}", "Pa", *_PRESSURE_BOUNDS) for name in valves]
+    fields += [ObservationField(f"pressure_rod.{name}", "Pa", *_PRESSURE_BOUNDS) for name in valves]
     if valves:
-        fields.append(Field("pressure_supply", "Pa", *_PRESSURES))
+        fields.append(ObservationField("pressure_supply", "Pa", *_PRESSURE_BOUNDS))
     fields += pose_fields(machine, arm_axes)
     for name in axes:
         force = machine.axes[name].force
         limit = force.command_limit if force else 1.0
         unit = force.command_unit if force else "1"
-        fields.append(Field(f"command.{name}", unit, -limit, limit))
+        fields.append(ObservationField(f"command.{name}", unit, -limit, limit))
     return fields
 
 
@@ -308,7 +311,7 @@ def observe_machine(f, e, out):
     if f.hydraulic > 0:
         out[at] = e.supply
         at += 1
-    pose = np.empty(ARM)
+    pose = np.empty(MAX_ARM_AXES)
     task_forward(f.arm, e.joint[: f.arm_axes], pose)
     for c in range(max(4, f.arm_axes)):
         out[at] = pose[c]

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.core.datafile import suggest
+from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.estimate.free_run import Prepare, Runner
 from hydrotele.logs.dataset import Dataset, RunData
@@ -52,7 +52,7 @@ def fit_baseline(name: str, data: Dataset) -> Prepare:
         InputError: there is no such baseline, too little data, or a package is not installed.
     """
     if name not in BASELINES:
-        raise InputError(f"--baseline {name}", f"is not known; {suggest(name, BASELINES)}")
+        raise InputError(f"--baseline {name}", f"is not known; {suggest_valid_name(name, BASELINES)}")
     return BASELINES[name](data)
 
 
@@ -141,9 +141,7 @@ def fit_table(data: Dataset) -> Prepare:
         axes = [data.axes.index(signal.axis)] if signal.axis in data.axes else range(len(data.axes))
         moves = signal.kind in _TABULATED
         tried = [
-            _tabulate(data.fit, column, axis, delay, moves)
-            for axis in axes
-            for delay in np.arange(0.0, _MEMORY, _PACE)
+            _tabulate(data.fit, column, axis, delay, moves) for axis in axes for delay in np.arange(0.0, _MEMORY, _PACE)
         ]
         tables.append(min(tried, key=lambda table: table.error))
 
@@ -189,9 +187,7 @@ def _tabulate(
 ) -> _Table:  # fmt: skip
     """The table of one channel, command and delay, by least squares."""
     command = np.concatenate([_delayed(run.command[:, axis], delay, run.period) for run in runs])
-    target = np.concatenate(
-        [_rates(run)[:, column] if moves else run.reading[:, column] for run in runs]
-    )
+    target = np.concatenate([_rates(run)[:, column] if moves else run.reading[:, column] for run in runs])
     low, high = float(command.min()), float(command.max())
     nodes = np.linspace(low, high if high > low else low + 1.0, _NODES)
     known = np.isfinite(target)
@@ -216,15 +212,11 @@ def _integrated(scales: _Scales, rate: Callable[[np.ndarray], np.ndarray]) -> Pr
         def free(starts: np.ndarray, count: int) -> np.ndarray:
             steps = -(-count // pace)
             back = np.maximum(starts[:, None] - pace * np.arange(behind, -1, -1), 0)
-            way = np.concatenate(
-                [filled[back], np.empty((len(starts), steps, filled.shape[1]))], axis=1
-            )
+            way = np.concatenate([filled[back], np.empty((len(starts), steps, filled.shape[1]))], axis=1)
             with np.errstate(over="ignore", invalid="ignore"):
                 for k in range(steps):
                     now, before = way[:, behind + k], way[:, k]
-                    seen = np.column_stack(
-                        [now, (now - before) / (behind * step), past[starts + k * pace]]
-                    )
+                    seen = np.column_stack([now, (now - before) / (behind * step), past[starts + k * pace]])
                     way[:, behind + k + 1] = now + step * rate(seen)
                 part = np.arange(1, count + 1) / pace
                 low = np.minimum(part.astype(int), steps - 1)

@@ -101,9 +101,7 @@ def _threads(jobs: int, runs: int) -> int:
 
     Three runs on two workers would take as long as four.
     """
-    processors = (
-        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    )
+    processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return min(max(jobs, runs), 2 * jobs) if 1 < jobs >= (processors or 1) else jobs
 
 
@@ -134,9 +132,7 @@ class Evidence:
     def track(self, machine: Machine, runs: Sequence[RunData] | None = None) -> tuple[Track, ...]:
         """Tracks with gains of their own and the levels that the machine states."""
         runs = self.runs if runs is None else runs
-        return tuple(
-            self._pool.map(lambda run: track_run(machine, self.data, run, None, self.step), runs)
-        )
+        return tuple(self._pool.map(lambda run: track_run(machine, self.data, run, None, self.step), runs))
 
     def judged(self, guess: Guess, same: bool = False, reopened: bool = False) -> Judged:
         """A guess with noise levels of its own, found from those of the base.
@@ -150,9 +146,7 @@ class Evidence:
             tracks = self.track(machine)
         else:
             rounds = 1 + reopened if self.tracks else _ROUNDS
-            tracks = find_levels(
-                self.data, machine, self.tracks, self._pool.map, self.step, rounds, same, reopened
-            )
+            tracks = find_levels(self.data, machine, self.tracks, self._pool.map, self.step, rounds, same, reopened)
         loss = sum(track.loss for track in tracks) + tracks[0].levels.penalty
         return Judged(guess, tracks, loss + guess.prior)
 
@@ -164,14 +158,10 @@ class Evidence:
         """
         machine = guess.machine(self.data.machine)
         tracks = self.map(
-            lambda near: track_run(
-                machine, self.data, near.run, None, self.step, levels, None, True, near.rest
-            ),
+            lambda near: track_run(machine, self.data, near.run, None, self.step, levels, None, True, near.rest),
             self.tracks,
         )
-        tracks = find_levels(
-            self.data, machine, tracks, self.map, self.step, _ROUNDS, reopened=True
-        )
+        tracks = find_levels(self.data, machine, tracks, self.map, self.step, _ROUNDS, reopened=True)
         loss = sum(track.loss for track in tracks) + tracks[0].levels.penalty
         return Judged(guess, tracks, loss + guess.prior)
 
@@ -330,9 +320,7 @@ class Evidence:
         """Keep what slopes (E, P) tell of a guess: a base of its numbers needs no rough ones."""
         self._information = guess.names, slopes.T @ slopes + np.eye(slopes.shape[1])
 
-    def _along(
-        self, information: np.ndarray, errors: np.ndarray, parallel: bool, step: float
-    ) -> np.ndarray:
+    def _along(self, information: np.ndarray, errors: np.ndarray, parallel: bool, step: float) -> np.ndarray:
         """(E, P) slopes of the base from differences along the directions of an information."""
         base, sizes, ways = self._base, *np.linalg.eigh(information)
         here = base.deviation
@@ -414,9 +402,7 @@ def _move(guess: Guess, slopes: np.ndarray, errors: np.ndarray) -> np.ndarray:
     root = np.linalg.cholesky(slopes.T @ slopes + np.diag(weight))
     target = -solve_triangular(root, slopes.T @ errors + weight * d, lower=True)
     move = solve_triangular(root.T, target)
-    low, high = (
-        np.concatenate([getattr(h, side) for h in guess.hypotheses]) - d for side in ("low", "high")
-    )
+    low, high = (np.concatenate([getattr(h, side) for h in guess.hypotheses]) - d for side in ("low", "high"))
     if np.all((move >= low) & (move <= high)):
         return move
     # a trace beyond the ends, so that `at` puts what ends there at its end exactly

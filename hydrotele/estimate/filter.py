@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.core.compiled import allocation_free, compiled
-from hydrotele.effects.effect import changed
+from hydrotele.effects.effect import with_value
 from hydrotele.estimate.reduced_model import (
     Model,
     X,
@@ -41,20 +41,20 @@ from hydrotele.estimate.reduced_model import (
     reduced_model,
     supply_of,
 )
-from hydrotele.hydraulics.laws import air_compliance, softening
+from hydrotele.hydraulics.laws import air_compliance, air_softening_factor
 from hydrotele.hydraulics.parameters import (
-    ADDED_DELIVERY,
-    SLOTS,
-    Kind,
+    ADDED_DELIVERY_STATE,
+    SLOT_COUNT,
+    ActuatorKind,
     Slot,
     actuator_order,
     extra_state_names,
-    longest_step,
+    max_time_step,
 )
-from hydrotele.hydraulics.pump import STALLED
-from hydrotele.hydraulics.supply import ADDED_LAG
+from hydrotele.hydraulics.pump import STALLED_SPEED
+from hydrotele.hydraulics.supply import TERM_FLOW_TIME_CONSTANT
 from hydrotele.machine.machine import Machine
-from hydrotele.multibody.reduced_mechanism import JOINT, solve
+from hydrotele.multibody.reduced_mechanism import JOINT, solve_cholesky
 from hydrotele.terms.law import Term
 
 MEMORY = 0.3  # s, correlation time: longer than a valve's lag, shorter than a motion
@@ -95,7 +95,7 @@ def possible_inputs(machine: Machine, axes: Sequence[str] = ()) -> tuple[Input, 
         facts = machine.axes[axis]
         count = 4 if facts.valve else 3 if facts.pump else 1
         found += [Input(balance, axis) for balance in BALANCES[:count]]
-    if ADDED_DELIVERY in extra_state_names(machine):
+    if ADDED_DELIVERY_STATE in extra_state_names(machine):
         found.append(Input(SUPPLY, next(iter(machine.valve_axes))))
     return tuple(found)
 
@@ -150,7 +150,7 @@ def _drive_responses(model, sp, states, position, response):
             else:
                 for f in range(n):
                     column[f] = sp.row[i, f]
-            solve(sp.mass, column)
+            solve_cholesky(sp.mass, column)
             response[row, i] = column
 
 
@@ -163,9 +163,7 @@ def _rows_later(model, sp, states, command, period, steps, later):
         advance(model, sp, later[row], command, row, period, steps, trail)
 
 
-def _pumped_column(
-    machine: Machine, states: np.ndarray, command: np.ndarray, period: float, i: Input
-) -> np.ndarray:
+def _pumped_column(machine: Machine, states: np.ndarray, command: np.ndarray, period: float, i: Input) -> np.ndarray:
     """(n, nz) change of the states per unit of an input of a pump drive, by difference.
 
     Its oil and friction are faster than a row, so that no rule at the row's ends tells the change.
@@ -175,7 +173,7 @@ def _pumped_column(
     size = _TRIED * float(input_sizes(machine, [i])[0])
     if i.balance == "force":
         for part in ("coulomb", "stribeck_extra"):
-            machine = changed(machine, f"axes.{i.axis}.cylinder.friction.{part}", 0.0)
+            machine = with_value(machine, f"axes.{i.axis}.cylinder.friction.{part}", 0.0)
         if i.axis in machine.loads:
             bare = machine.loads[i.axis].model_copy(update={"friction": 0.0, "return_force": 0.0})
             machine = machine.model_copy(update={"loads": {**machine.loads, i.axis: bare}})
@@ -184,7 +182,7 @@ def _pumped_column(
         "parameters": {"value": size},
     })  # fmt: skip
     more = machine.model_copy(update={"terms": (*machine.terms, term)})
-    steps = max(1, math.ceil(period / min(_ROWS_STEP, longest_step(machine, i.axis))))
+    steps = max(1, math.ceil(period / min(_ROWS_STEP, max_time_step(machine, i.axis))))
     ends = []
     for one in (machine, more):
         model, later = reduced_model(one, ()), np.empty(states.shape)
@@ -214,7 +212,7 @@ def input_columns(
     model = reduced_model(machine, ())
     order = actuator_order(machine)
     rows, size, nu = *states.shape, len(order)
-    first = 2 * (len(model.mech.free) + len(model.transmission))
+    first = 2 * (len(model.mech.independent) + len(model.transmission))
     rates = first // 2
     position, response = np.empty((rows, nu)), np.empty((rows, nu, rates))
     _drive_responses(model, model_space(model), states, position, response)
@@ -228,8 +226,8 @@ def input_columns(
             columns[:, m, rates : 2 * rates] = response[:, i]
         elif balance == SUPPLY:
             assert machine.supply
-            at = first + 4 * model.hydraulic + extra_state_names(machine).index(ADDED_DELIVERY)
-            follows = 2.0 / period * math.tanh(0.5 * period / ADDED_LAG)  # of its exponential
+            at = first + 4 * model.hydraulic + extra_state_names(machine).index(ADDED_DELIVERY_STATE)
+            follows = 2.0 / period * math.tanh(0.5 * period / TERM_FLOW_TIME_CONSTANT)  # of its exponential
             columns[:, m, at] = follows / machine.supply.pump_flow
         elif balance == "command":
             assert facts.valve
@@ -425,7 +423,7 @@ def perturb_delayed(late, place, change, readings):
         readings[place - 1] += late.moves[place] * change
 
 
-_KIND, _PUMPED = int(Slot.KIND), float(Kind.PUMPED)
+_KIND, _PUMPED = int(Slot.KIND), float(ActuatorKind.PUMP_DRIVE)
 _AIR, _ONSET = int(Slot.AIR_RELEASE), int(Slot.AIR_ONSET)
 _BRISTLE_STIFFNESS, _BRISTLE = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE)
 _ASYMMETRY, _DELIVERY = int(Slot.COULOMB_ASYMMETRY), int(Slot.DELIVERY)
@@ -463,8 +461,8 @@ def _slopes(model, sp, z, nudge, slope, moved):
                 for f in range(n):
                     slope[c, f] = model.scale[c] * sp.row[i, f]
         elif model.kind[c] < 4:
-            air, onset = model.user[i * SLOTS + _AIR], model.user[i * SLOTS + _ONSET]
-            soft = softening(sp.act[4 * i + model.kind[c]], air, onset)
+            air, onset = model.user[i * SLOT_COUNT + _AIR], model.user[i * SLOT_COUNT + _ONSET]
+            soft = air_softening_factor(sp.act[4 * i + model.kind[c]], air, onset)
             slope[c, first + 4 * i + model.kind[c]] = model.scale[c] * soft
     for c in range(len(model.kind)):
         if model.kind[c] != 4:
@@ -717,7 +715,7 @@ def _correct(model, sp, z, own, delta):
         for s in range(len(z)):
             z[s] += delta[s]
         for i in range(model.hydraulic):
-            if model.user[i * SLOTS + _KIND] == _PUMPED:
+            if model.user[i * SLOT_COUNT + _KIND] == _PUMPED:
                 _keep_side(z, 2 * (n + t) + 4 * i, delta[2 * (n + t) + 4 * i])
         if model.memory >= 0:
             _bound_memory(model, z)
@@ -743,7 +741,7 @@ def _bound_memory(model, z):
     """Keep bristles within their breakaway force, and a pump between no flow and all of it."""
     act = z[2 * (len(model.mech.free) + len(model.transmission)) :]
     for i in range(len(model.gear)):
-        u = i * SLOTS
+        u = i * SLOT_COUNT
         if model.user[u + _BRISTLE_STIFFNESS] > 0.0:
             at, unequal = int(model.user[u + _BRISTLE]), model.user[u + _ASYMMETRY]
             act[at] = min(1.0 + unequal, max(unequal - 1.0, act[at]))
@@ -762,7 +760,7 @@ def _keep_side(z, at, moved):
     if before == 0.0:
         z[at] = 0.0
     elif z[at] * before <= 0.0:
-        z[at] = math.copysign(STALLED, before)
+        z[at] = math.copysign(STALLED_SPEED, before)
     z[at + 1] = max(0.0, z[at + 1])
 
 

@@ -30,9 +30,7 @@ from hydrotele.machine.signals import parse_channel
 
 HORIZONS = (1.0, 5.0, 10.0, 30.0)  # s
 TO_THE_END = "end"
-SETTLE = (
-    1.0  # s at a run's start, in which the state's estimate becomes good; no window starts there
-)
+SETTLE = 1.0  # s at a run's start, in which the state's estimate becomes good; no window starts there
 _RATE_OVER = 0.1  # s over which rates are taken where no noise is stated
 _FOLLOW = 0.5  # s in which a rate may become another one: as fast as a machine starts and stops
 _SMALLEST = 1e-5  # of a channel's size: less noise than a converter of 16 bits is not believed

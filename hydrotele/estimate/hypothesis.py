@@ -18,7 +18,7 @@ from functools import partial
 import numpy as np
 
 from hydrotele.effects import EFFECTS, Effect, Parameter
-from hydrotele.effects.effect import across, changed, linkages
+from hydrotele.effects.effect import lateral_directions, linkage_axes, with_value
 from hydrotele.machine.machine import Machine
 
 _CURVE = 0.02  # of the typical deviation: small enough for a slope, large against rounding
@@ -61,23 +61,23 @@ class Hypothesis:
     @property
     def low(self) -> np.ndarray:
         """(p,) smallest deviation."""
-        return np.array([(p.low - p.nominal) / p.scale for p in self.parameters.values()])
+        return np.array([(p.lower_bound - p.nominal) / p.prior_std for p in self.parameters.values()])
 
     @property
     def high(self) -> np.ndarray:
         """(p,) largest deviation."""
-        return np.array([(p.high - p.nominal) / p.scale for p in self.parameters.values()])
+        return np.array([(p.upper_bound - p.nominal) / p.prior_std for p in self.parameters.values()])
 
     @property
     def least(self) -> np.ndarray:
         """(p,) deviation worth naming."""
-        return np.array([p.least / p.scale for p in self.parameters.values()])
+        return np.array([p.min_relevant_change / p.prior_std for p in self.parameters.values()])
 
     @property
     def has_wide_prior(self) -> bool:
         """Whether sizes far from common ones are rare, not impossible."""
         known = EFFECTS.get(self.name)
-        return known is not None and not self.change and known.law in _OPEN
+        return known is not None and not self.change and known.model_part in _OPEN
 
     def prior(self, deviation: np.ndarray) -> float:
         """-2 log of the prior at a deviation (p,), 0 at nominal."""
@@ -95,14 +95,14 @@ class Hypothesis:
     @property
     def starts(self) -> list[np.ndarray]:
         """Deviations (p,) from which to search: nominal, and where the effect says so."""
-        tables = [p.starts for p in self.parameters.values()]
+        tables = [p.start_values for p in self.parameters.values()]
         if not any(tables):
             return [np.zeros(self.size)]
         known = EFFECTS.get(self.name)
-        slope = [np.zeros(self.size)] if known and known.law in _SMOOTH else []
+        slope = [np.zeros(self.size)] if known and known.model_part in _SMOOTH else []
         return slope + [
             np.array([
-                (p.starts[k] - p.nominal) / p.scale if k < len(p.starts) else 0.0
+                (p.start_values[k] - p.nominal) / p.prior_std if k < len(p.start_values) else 0.0
                 for p in self.parameters.values()
             ])
             for k in range(max(map(len, tables)))
@@ -116,7 +116,7 @@ class Hypothesis:
     def values(self, deviation: np.ndarray) -> dict[str, float]:
         """Parameter values at a deviation (p,)."""
         return {
-            key: float(np.clip(p.nominal + d * p.scale, p.low, p.high))
+            key: float(np.clip(p.nominal + d * p.prior_std, p.lower_bound, p.upper_bound))
             for (key, p), d in zip(self.parameters.items(), deviation, strict=True)
         }
 
@@ -127,9 +127,7 @@ class Hypothesis:
 
     def held(self, deviation: np.ndarray) -> "Hypothesis":
         """The same with its numbers fixed at a deviation (p,): none is left to fit."""
-        return replace(
-            self, parameters={}, change=lambda nominal, _: self.machine(nominal, deviation)
-        )
+        return replace(self, parameters={}, change=lambda nominal, _: self.machine(nominal, deviation))
 
     def nudges(self, deviation: np.ndarray, size: float = _CURVE) -> np.ndarray:
         """(p,) signed steps for slopes at a deviation, away from the nearer bound."""
@@ -307,7 +305,7 @@ def _states(machine: Machine, kind: str) -> bool:
 
 def _narrow(p: Parameter, scale: float, widest: float = _WIDEST) -> Parameter:
     low, high = p.nominal - widest * scale, p.nominal + widest * scale
-    return replace(p, low=max(p.low, low), high=min(p.high, high), scale=scale, starts=())
+    return replace(p, low=max(p.lower_bound, low), high=min(p.upper_bound, high), scale=scale, starts=())
 
 
 def _of_effects(machine: Machine) -> list[Number]:
@@ -323,9 +321,9 @@ def _of_effects(machine: Machine) -> list[Number]:
                     continue
                 size = abs(p.nominal)
                 if stated and size == 0.0:
-                    size = p.scale
+                    size = p.prior_std
                 if name in _LENGTHS:
-                    size = (p.high - p.low) / (0.6 if name == "com_offset" else 0.1)
+                    size = (p.upper_bound - p.lower_bound) / (0.6 if name == "com_offset" else 0.1)
                     size = size if name != "link_length" else 0.5 * size
                 if size > 0.0 and share > 0.0:
                     found.append(Number(
@@ -358,7 +356,7 @@ def _of_facts(machine: Machine) -> list[Number]:
             path = f"axes.{name}.motor.displacement"
             size = axis.motor.displacement
             places.append(("displacement", name, path, "m^3/rad", size))
-        if axis.hydraulic:
+        if axis.is_hydraulic:
             kind = "cylinder" if axis.cylinder else "motor"
             path = f"axes.{name}.{kind}.dead_volume"
             size = axis.hydraulic_drive.dead_volume
@@ -380,7 +378,7 @@ def _of_facts(machine: Machine) -> list[Number]:
         p = Parameter(unit, value, 0.2 * value, 5.0 * value, share * abs(value), 0.0)
         if value < 0.0:
             p = replace(p, low=5.0 * value, high=0.2 * value)
-        p = _narrow(p, p.scale, _PLAIN)
+        p = _narrow(p, p.prior_std, _PLAIN)
         found.append(Number(f"{kind}.{place}", share, p, None, partial(_set, path)))
     return found
 
@@ -388,7 +386,7 @@ def _of_facts(machine: Machine) -> list[Number]:
 def _of_rods(machine: Machine) -> list[Number]:
     """Where rods end: their pins, and the closed lengths that their extensions count from."""
     found = []
-    for name in linkages(machine):
+    for name in linkage_axes(machine):
         cylinder = machine.axes[name].cylinder
         assert cylinder
         size, pin = cylinder.closed_length, cylinder.rod_pin.position
@@ -396,7 +394,7 @@ def _of_rods(machine: Machine) -> list[Number]:
             f"closed_length.{name}", size, 0.2,
             partial(_set, f"axes.{name}.cylinder.closed_length"),
         )]  # fmt: skip
-        for way in across(machine, name):
+        for way in lateral_directions(machine, name):
             index = "xyz".index(way)
             change = partial(_set_rod_pin, name, index)
             places.append((f"rod_pin.{name}.{way}", pin[index], 0.1, change))
@@ -404,7 +402,7 @@ def _of_rods(machine: Machine) -> list[Number]:
             share = _share(machine, "pin_offset", name, key)
             if share > 0.0:
                 p = Parameter("m", at, at - reach * size, at + reach * size, share * size, 0.0)
-                p = _narrow(p, p.scale, _PLAIN)
+                p = _narrow(p, p.prior_std, _PLAIN)
                 found.append(Number(key, share, p, None, change))
     return found
 
@@ -415,11 +413,11 @@ def _set_rod_pin(axis: str, index: int, machine: Machine, value: float) -> Machi
     assert cylinder
     place = list(cylinder.rod_pin.position)
     place[index] = value
-    return changed(machine, f"axes.{axis}.cylinder.rod_pin.position", tuple(place))
+    return with_value(machine, f"axes.{axis}.cylinder.rod_pin.position", tuple(place))
 
 
 def _set(path: str, machine: Machine, value: float) -> Machine:
-    return changed(machine, path, value)
+    return with_value(machine, path, value)
 
 
 def _moves(machine: Machine, name: str) -> bool:

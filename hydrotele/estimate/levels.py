@@ -39,8 +39,8 @@ from hydrotele.estimate.track import (
     state_drift,
     track_run,
 )
-from hydrotele.logs.dataset import Dataset, RunData, busiest_rows
-from hydrotele.machine.machine import Machine, channel_sensor, converter
+from hydrotele.logs.dataset import Dataset, RunData, find_exciting_segment
+from hydrotele.machine.machine import Machine, channel_converter, channel_sensor
 
 
 class LinearRun(NamedTuple):
@@ -361,7 +361,8 @@ def rough_noise(data: Dataset) -> np.ndarray:
     found = np.zeros(len(data.channels))
     for c, channel in enumerate(data.channels):
         values = np.concatenate([
-            np.diff(run.reading[:, c], n=3) * (1.0 if run.behind is None else run.behind[c] ** 0.5)
+            np.diff(run.reading[:, c],
+            n=3) * (1.0 if run.readings_per_mean is None else run.readings_per_mean[c] ** 0.5)
             for run in data.fit
         ])  # fmt: skip
         values = values[np.isfinite(values)]
@@ -375,7 +376,7 @@ def rough_noise(data: Dataset) -> np.ndarray:
 def _rounding(data: Dataset, channel: str) -> float:
     """Standard deviation of a converter's rounding [channel's unit]."""
     sensors = data.machine.sensors.get(data.sensors) if data.sensors else None
-    step = converter(channel_sensor(data.machine, sensors, channel), channel).step
+    step = channel_converter(channel_sensor(data.machine, sensors, channel), channel).step
     return step / 12.0**0.5
 
 
@@ -608,17 +609,13 @@ def columns_of(machine: Machine, near: Track, inputs: Sequence[Input]) -> np.nda
     """(n, m, nz) what inputs do in a machine, from a linearised track of one like it."""
     names, before = state_names(machine), list(near.names[: near.states.shape[1]])
     if names == before:
-        return input_columns(
-            machine, near.states, near.flow, near.run.period, inputs, near.run.command
-        )
+        return input_columns(machine, near.states, near.flow, near.run.period, inputs, near.run.command)
     there = [before.index(n) for n in names if n in before]
     here = [s for s, n in enumerate(names) if n in before]
     states = np.zeros((len(near.states), len(names)))
     flow = np.tile(np.eye(len(names)), (len(states), 1, 1))
     states[:, here] = near.states[:, there]
-    flow[np.ix_(range(len(states)), here, here)] = near.flow[
-        np.ix_(range(len(states)), there, there)
-    ]
+    flow[np.ix_(range(len(states)), here, here)] = near.flow[np.ix_(range(len(states)), there, there)]
     return input_columns(machine, states, flow, near.run.period, inputs, near.run.command)
 
 
@@ -652,7 +649,7 @@ def _most_likely(
             run: RunData = part[1]
             drift = state_drift(names, now, run.period)
             found = smooth(part[0], row_variances(now, run, part[2]), drift, rates=part[2])
-            noise = now.noise**2 if run.behind is None else now.noise**2 / run.behind
+            noise = now.noise**2 if run.readings_per_mean is None else now.noise**2 / run.readings_per_mean
             per_jitter = now.jitter**2 * found.jitter_slope
             return found.loss, noise * found.noise_slope, drift * found.drift_slope, per_jitter
 
@@ -693,14 +690,12 @@ def _white_states(machine: Machine, names: Sequence[str]) -> list[str]:
     return [n for n in names if n.partition(".")[0] in WHITE or n in held]
 
 
-def _part(
-    track: Track, names: list[str], rows: int, jittered: bool
-) -> tuple[LinearRun, RunData, np.ndarray | None]:
+def _part(track: Track, names: list[str], rows: int, jittered: bool) -> tuple[LinearRun, RunData, np.ndarray | None]:
     """The stretch of a run in which the commands change most: linearised, and its squared rates."""
-    busy = busiest_rows(track.run, rows)
+    busy = find_exciting_segment(track.run, rows)
     rates = np.ascontiguousarray(squared_rates(track.run)[busy]) if jittered else None
     linear = linear_run(track, by_kind(names, STARTLE) ** 2, busy)
-    return linear, track.run.part(busy.start, busy.stop), rates
+    return linear, track.run.select_rows(busy.start, busy.stop), rates
 
 
 def smoothed_inputs(track: Track, answer: tuple[LinearRun, Smoothed] | None = None) -> np.ndarray:

@@ -33,7 +33,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.core.errors import InputError
-from hydrotele.effects import Parameter, changed
+from hydrotele.effects import Parameter, with_value
 from hydrotele.estimate.free_run import _run_from, _shown, following_levels
 from hydrotele.estimate.hypothesis import Guess, Hypothesis
 from hydrotele.estimate.reduced_model import model_space, reduced_model
@@ -132,9 +132,9 @@ def flow_table(machine: Machine, axis: str) -> Hypothesis:
             steps = [values[f"{way}_{k}"] for k in range(1, len(TRAVEL))]
             logs = values[f"gain_{way}"] + np.array(steps)
             if np.any(logs):
-                nominal = changed(nominal, f"{path}.curve", stretched(getattr(valve, way), logs))
+                nominal = with_value(nominal, f"{path}.curve", stretched(getattr(valve, way), logs))
             if values[f"deadband_{way}"] != present:
-                nominal = changed(nominal, f"{path}.deadband", values[f"deadband_{way}"])
+                nominal = with_value(nominal, f"{path}.deadband", values[f"deadband_{way}"])
         return nominal
 
     return Hypothesis("flow_table", axis, parameters, change)
@@ -192,11 +192,11 @@ def timing(machine: Machine, axis: str) -> Hypothesis:
         parameters["damping"] = _log(_share(machine, "valve_damping", axis), math.log(4.0))
 
     def change(nominal: Machine, values: Mapping[str, float]) -> Machine:
-        nominal = changed(nominal, f"axes.{axis}.command_delay", values["delay"])
+        nominal = with_value(nominal, f"axes.{axis}.command_delay", values["delay"])
         valve = nominal.axes[axis].valve
         for field in ("bandwidth", "damping") if valve else ():
             value = getattr(valve, field) * math.exp(values[field])
-            nominal = changed(nominal, f"axes.{axis}.valve.{field}", value)
+            nominal = with_value(nominal, f"axes.{axis}.valve.{field}", value)
         return nominal
 
     return Hypothesis("timing", axis, parameters, change)
@@ -234,14 +234,14 @@ def linkage(machine: Machine, axis: str) -> Hypothesis:
             if end == "rod_pin":
                 arm = _turned(arm, np.array(nominal.joints[joint].axis), values["angle"])
             place = tuple(float(x) for x in centre + arm)
-            moved = changed(moved, f"axes.{axis}.cylinder.{end}.position", place)
+            moved = with_value(moved, f"axes.{axis}.cylinder.{end}.position", place)
         after = range_at_drive(moved, axis)
         if after is None:  # the linkage would turn back within the joint's range
             return nominal
         stroke = cylinder.stroke + (after[1] - after[0]) - (before[1] - before[0])
         closed = max(cylinder.closed_length + after[0] - before[0], stroke + _CLEARANCE)
-        moved = changed(moved, f"axes.{axis}.cylinder.stroke", stroke)
-        return changed(moved, f"axes.{axis}.cylinder.closed_length", closed)
+        moved = with_value(moved, f"axes.{axis}.cylinder.stroke", stroke)
+        return with_value(moved, f"axes.{axis}.cylinder.closed_length", closed)
 
     return Hypothesis("linkage", axis, {"base": ratio, "rod": ratio, "angle": angle}, change)
 
@@ -256,9 +256,7 @@ def supply_limits(machine: Machine) -> Hypothesis:
         The hypothesis, of two parameters, one on a constant-pressure supply.
     """
     assert machine.supply
-    parameters = {
-        "relief_pressure": _log(_share(machine, "relief_pressure", "supply"), math.log(3.0))
-    }
+    parameters = {"relief_pressure": _log(_share(machine, "relief_pressure", "supply"), math.log(3.0))}
     if machine.supply.kind != "constant_pressure":
         share = _share(machine, "pump_flow_limit", "supply")
         parameters["pump_flow"] = _log(share, math.log(3.0))
@@ -267,7 +265,7 @@ def supply_limits(machine: Machine) -> Hypothesis:
         assert nominal.supply
         for field, value in values.items():
             new = getattr(nominal.supply, field) * math.exp(value)
-            nominal = changed(nominal, f"supply.{field}", new)
+            nominal = with_value(nominal, f"supply.{field}", new)
         return nominal
 
     return Hypothesis("supply", "supply", parameters, change)
@@ -422,9 +420,7 @@ def fit_free_runs(
         )  # fmt: skip
 
 
-def free_run_windows(
-    runs: Sequence[RunData], seconds: float = WINDOW, most: int = MOST_WINDOWS
-) -> list[Window]:
+def free_run_windows(runs: Sequence[RunData], seconds: float = WINDOW, most: int = MOST_WINDOWS) -> list[Window]:
     """Windows side by side through all runs, without those in which nothing moves.
 
     Args:
@@ -455,8 +451,7 @@ def free_run_windows(
     if not found:
         raise InputError(
             "the runs to fit",
-            f"contain no interval of {LEAD + seconds:g} s with motion: use longer runs or a shorter"
-            " window",
+            f"contain no interval of {LEAD + seconds:g} s with motion: use longer runs or a shorter window",
         )
     every = np.linspace(0, len(found) - 1, min(most, len(found)))
     return [found[k] for k in np.round(every).astype(int)]
@@ -486,7 +481,7 @@ class _Problem:
         """(lead + 1, nz) states before every window, the last of them its start."""
 
         def lead(window: Window) -> np.ndarray:
-            part = window.run.part(window.first - _rows(window, LEAD), window.first + 1)
+            part = window.run.select_rows(window.first - _rows(window, LEAD), window.first + 1)
             return track_run(machine, self.data, part, step=self.step, levels=self.levels).states
 
         return list(self.pool.map(lead, self.windows))
@@ -532,9 +527,7 @@ class _Point:
     errors: np.ndarray
 
 
-def _fit(
-    problem: _Problem, now: _Point, max_iterations: int, say: Callable[[str], None]
-) -> tuple[_Point, int, bool]:
+def _fit(problem: _Problem, now: _Point, max_iterations: int, say: Callable[[str], None]) -> tuple[_Point, int, bool]:
     """Rounds of steps with kept starts, until a round with new starts is no better.
 
     Returns:
@@ -556,9 +549,7 @@ def _fit(
     return now, taken, converged
 
 
-def _descend(
-    problem: _Problem, now: _Point, weights: np.ndarray, scale: np.ndarray, most: int
-) -> tuple[_Point, int]:
+def _descend(problem: _Problem, now: _Point, weights: np.ndarray, scale: np.ndarray, most: int) -> tuple[_Point, int]:
     """At most so many damped Gauss-Newton steps with the starts of a point; (point, steps)."""
     damping, factor, largest = _DAMPING
     loss = _loss(now, weights, scale)
@@ -607,9 +598,7 @@ def _normal_equations(
     return slope + now.guess.deviation, curvature + np.eye(len(slope))
 
 
-def _half_loss(
-    z: np.ndarray, columns: np.ndarray, weights: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _half_loss(z: np.ndarray, columns: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Slope (P,) and curvature (P, P) of half the loss of scaled errors (r, c), without prior."""
     known = weights > 0.0
     there = columns[known]

@@ -13,33 +13,33 @@ import numpy as np
 from hydrotele.core.compiled import allocation_free, compiled
 from hydrotele.hydraulics.actuator import bristle_friction, bristle_rate
 from hydrotele.hydraulics.circuit import (
-    NO_MEMORY,
-    SCRATCH,
+    NO_EXTRA_STATES,
+    SCRATCH_SIZE,
     actuator_stop,
-    add_to_commands,
-    advance_memories,
-    circuit_supply,
-    delivered_share,
+    add_command_terms,
+    advance_term_states,
+    circuit_supply_pressure,
+    compute_ports,
+    delivered_flow_fraction,
     drive_state,
     force_after_friction,
-    open_ports,
     step_circuit,
 )
 from hydrotele.hydraulics.laws import pressure_with_air, pressure_without_air
 from hydrotele.hydraulics.parameters import (
-    SLOTS,
+    SLOT_COUNT,
     Slot,
     actuator_order,
     actuator_parameters,
     extra_state_names,
-    terms_of,
+    machine_terms_table,
 )
-from hydrotele.machine.machine import Machine, SensorError, first_order, warming_drift
+from hydrotele.machine.machine import Machine, SensorError, step_first_order_lag, warming_drift
 from hydrotele.machine.signals import parse_channel
 from hydrotele.multibody.reduced_mechanism import (
     BAR,
     BIAS,
-    CLOSED,
+    CLOSED_LENGTH,
     DAMPING,
     DRIFT,
     JOINT,
@@ -48,24 +48,24 @@ from hydrotele.multibody.reduced_mechanism import (
     Q,
     ReducedMechanism,
     ReducedMotion,
-    close_chains,
+    close_loops,
+    compute_bar_frames,
+    compute_bar_motion,
+    compute_drift,
+    compute_link_frames,
+    compute_link_motion,
+    compute_mass_and_bias,
     coordinate_names,
-    drift_chains,
-    factorise,
-    gather_forces,
-    mechanism,
-    motion_space,
-    move_bars,
-    move_links,
-    place_bars,
-    place_links,
-    solve,
+    factorise_cholesky,
+    make_reduced_mechanism,
+    make_reduced_motion,
+    solve_cholesky,
 )
 from hydrotele.multibody.reduced_mechanism import LENGTH as BAR_LENGTH
 from hydrotele.terms.law import Drives
 from hydrotele.terms.table import COMMAND as ON_COMMAND
 from hydrotele.terms.table import FORCE as ON_FORCE
-from hydrotele.terms.table import acts_on, added_with_slope
+from hydrotele.terms.table import has_term, sum_terms_with_slope
 
 POSITION, LENGTH, HEAD, ROD, SUPPLY = range(5)
 _KINDS = {
@@ -181,47 +181,49 @@ def reduced_model(machine: Machine, channels: tuple[str, ...]) -> Model:
         index.append(count if axis.transmission else -1)
         count += axis.transmission is not None
     return Model(
-        mech=mechanism(machine),
+        mech=make_reduced_mechanism(machine),
         user=np.concatenate(list(actuator_parameters(machine).values())),
         hydraulic=len(machine.hydraulic_axes),
         gain=np.array([axis.force.gain if axis.force else 0.0 for axis in axes]),
         delay=np.array([axis.command_delay for axis in axes], float),
         gear=np.array(index, int),
-        transmission=np.array(
-            [(g.inertia, g.stiffness, g.damping, g.backlash) for g in gears], float
-        ).reshape(-1, 4),
+        transmission=np.array([(g.inertia, g.stiffness, g.damping, g.backlash) for g in gears], float).reshape(-1, 4),
         kind=np.array([_KINDS[c.kind] for c in parsed], int),
         drive=np.array([order.index(c.axis) if c.axis else 0 for c in parsed], int),
         scale=np.array([e.scale for e in errors], float),
         offset=np.array([e.offset for e in errors], float),
         lag=np.array([e.delay for e in errors], float),
-        terms=terms_of(machine),
+        terms=machine_terms_table(machine),
         time_constant=np.array([e.time_constant for e in errors], float),
         drift=np.array([(e.drift, e.drift_time_constant) for e in errors], float).reshape(-1, 2),
-        memory=len(extra_state_names(machine)) or NO_MEMORY,
+        memory=len(extra_state_names(machine)) or NO_EXTRA_STATES,
     )
 
 
 def model_space(model: Model) -> Space:
     """Fresh work space for a model."""
-    nu, n, acts = len(model.gear), len(model.mech.free), 4 * model.hydraulic + max(model.memory, 0)
+    nu, n, acts = (
+        len(model.gear),
+        len(model.mech.independent),
+        4 * model.hydraulic + max(model.memory, 0),
+    )
     total = n + len(model.transmission)
     return Space(
-        motion_space(model.mech), np.zeros((5, nu)), np.zeros((nu, n)), np.zeros((total, total)),
-        np.zeros(total), np.zeros(acts), np.zeros(acts), np.zeros(SCRATCH), np.zeros(2),
+        make_reduced_motion(model.mech), np.zeros((5, nu)), np.zeros((nu, n)), np.zeros((total, total)),
+        np.zeros(total), np.zeros(acts), np.zeros(acts), np.zeros(SCRATCH_SIZE), np.zeros(2),
     )  # fmt: skip
 
 
 def state_size(model: Model) -> int:
     """Number of states."""
-    moving = 2 * (len(model.mech.free) + len(model.transmission))
+    moving = 2 * (len(model.mech.independent) + len(model.transmission))
     return moving + 4 * model.hydraulic + max(model.memory, 0)
 
 
 def state_names(machine: Machine) -> list[str]:
     """Names of the states of `reduced_model(machine, ...)`, such as `rate.boom`, `spool.boom`."""
-    names, mech = coordinate_names(machine), mechanism(machine)
-    free = [names[i] for i in mech.free]
+    names, mech = coordinate_names(machine), make_reduced_mechanism(machine)
+    free = [names[i] for i in mech.independent]
     gears = [n for n in actuator_order(machine) if machine.axes[n].transmission]
     out = [f"position.{n}" for n in free] + [f"drive.{n}" for n in gears]
     out += [f"rate.{n}" for n in free] + [f"drive_rate.{n}" for n in gears]
@@ -252,7 +254,7 @@ def set_activations(model, sp, z):
     for k in range(len(sp.act)):
         sp.act[k] = z[first + k]
     for i in range(model.hydraulic):
-        release, onset = model.user[i * SLOTS + _AIR], model.user[i * SLOTS + _ONSET]
+        release, onset = model.user[i * SLOT_COUNT + _AIR], model.user[i * SLOT_COUNT + _ONSET]
         for k in range(4 * i + 2, 4 * i + 4):
             sp.act[k] = pressure_with_air(sp.act[k], release, onset)
 
@@ -275,7 +277,7 @@ def store_activations(model, sp, z):
     for k in range(len(sp.act)):
         z[first + k] = sp.act[k]
     for i in range(model.hydraulic):
-        release, onset = model.user[i * SLOTS + _AIR], model.user[i * SLOTS + _ONSET]
+        release, onset = model.user[i * SLOT_COUNT + _AIR], model.user[i * SLOT_COUNT + _ONSET]
         for k in range(4 * i + 2, 4 * i + 4):
             z[first + k] = pressure_without_air(sp.act[k], release, onset)
 
@@ -288,9 +290,9 @@ def supply_of(model, sp, z):
     """
     user, count, act = model.user, model.hydraulic, sp.act
     set_activations(model, sp, z)
-    open_ports(user, act, act, sp.scratch, 0, count, 0.0, act)
-    share = 1.0 if model.memory < 0 else delivered_share(user, 0, act)
-    return circuit_supply(user, 0, count, sp.scratch, share)
+    compute_ports(user, act, act, sp.scratch, 0, count, 0.0, act)
+    share = 1.0 if model.memory < 0 else delivered_flow_fraction(user, 0, act)
+    return circuit_supply_pressure(user, 0, count, sp.scratch, share)
 
 
 @allocation_free
@@ -308,8 +310,8 @@ def term_force(model, sp, z, i, velocity):
         (force [N] or [N m], d force / d velocity); of a force drive with the terms of its command.
     """
     count = model.hydraulic
-    commanded = i >= count and acts_on(model.terms, ON_COMMAND, i)
-    if not (commanded or acts_on(model.terms, ON_FORCE, i)):
+    commanded = i >= count and has_term(model.terms, ON_COMMAND, i)
+    if not (commanded or has_term(model.terms, ON_FORCE, i)):
         return 0.0, 0.0
     supply = supply_of(model, sp, z) if count > 0 else 0.0
     s = drive_state(
@@ -317,9 +319,9 @@ def term_force(model, sp, z, i, velocity):
         sp.drive[COMMAND, i], model.gain[i],
     )  # fmt: skip
     drives = Drives(count, sp.act, sp.drive[X], sp.drive[V], sp.drive[COMMAND])
-    force, slope = added_with_slope(model.terms, ON_FORCE, i, s, drives)
+    force, slope = sum_terms_with_slope(model.terms, ON_FORCE, i, s, drives)
     if commanded:
-        more, steep = added_with_slope(model.terms, ON_COMMAND, i, s, drives)
+        more, steep = sum_terms_with_slope(model.terms, ON_COMMAND, i, s, drives)
         force += model.gain[i] * more
         slope += model.gain[i] * steep
     return force, slope
@@ -340,7 +342,7 @@ def add_commands(model, sp, h):
     """
     drive = sp.drive
     drives = Drives(model.hydraulic, sp.act, drive[X], drive[V], drive[COMMAND])
-    add_to_commands(model.user, model.terms, drives, h, sp.time[0], sp.scratch, drive[GIVEN])
+    add_command_terms(model.user, model.terms, drives, h, sp.time[0], sp.scratch, drive[GIVEN])
 
 
 @allocation_free
@@ -379,7 +381,7 @@ def follow_channel(trail, c, ratio, shown):
     trail[0, c] = shown
     for k in range(1, len(trail)):
         now = trail[k, c]
-        shown = first_order(shown, before, now, ratio)
+        shown = step_first_order_lag(shown, before, now, ratio)
         trail[k, c] = shown
         before = now
     return shown
@@ -447,16 +449,16 @@ def place_mechanism(model, sp, z):
     for f in range(n):
         m.joint[RATE, mech.free[f]] = z[n + t + f]
     if nt > n:
-        close_chains(mech, m, z)
+        close_loops(mech, m, z)
     else:
         for f in range(n):
             m.joint[Q, f] = z[f]
-        place_links(mech.tree, mech.shape, mech.links, m.joint, m.frame, m.jacobian)
-    move_links(mech.tree, mech.links, m.joint, m.frame, m.jacobian)
+        compute_link_frames(mech.tree, mech.shape, mech.links, m.joint, m.frame, m.jacobian)
+    compute_link_motion(mech.tree, mech.links, m.joint, m.frame, m.jacobian)
     if nt > n:
-        drift_chains(mech, m)
-    place_bars(mech.tree, mech.shape, 1 + mech.links, m.frame, m.jacobian, m.bar)
-    move_bars(mech.tree, 1 + mech.links, m.frame, m.bar)
+        compute_drift(mech, m)
+    compute_bar_frames(mech.tree, mech.shape, 1 + mech.links, m.frame, m.jacobian, m.bar)
+    compute_bar_motion(mech.tree, 1 + mech.links, m.frame, m.bar)
     for i in range(len(model.gear)):
         bar, joint = mech.drive[i, BAR], mech.drive[i, JOINT]
         for f in range(n):
@@ -482,7 +484,7 @@ def load_position(model, sp, i):
     mech, bar = model.mech, model.mech.drive[i, BAR]
     if bar < 0:
         return sp.motion.joint[Q, mech.drive[i, JOINT]]
-    return sp.motion.bar[bar, BAR_LENGTH] - mech.shape[1 + mech.links + 2 * bar, CLOSED]
+    return sp.motion.bar[bar, BAR_LENGTH] - mech.shape[1 + mech.links + 2 * bar, CLOSED_LENGTH]
 
 
 @allocation_free
@@ -506,14 +508,14 @@ def accelerate(model, sp, z, dt):
     """
     mech, m, user = model.mech, sp.motion, model.user
     n, t, half = len(mech.free), len(model.transmission), 0.5 * dt
-    gather_forces(mech, m)
+    compute_mass_and_bias(mech, m)
     _project(mech.joint, m.mass, m.joint, m.basis, half, n, sp.mass, sp.force)
     first = n + t  # of the rates
     if len(model.terms) > 0:
         for i in range(len(model.gear)):
             sp.drive[V, i] = _drive_velocity(model, sp, z, i)
     for i in range(len(model.gear)):
-        u, gear = i * SLOTS, model.gear[i]
+        u, gear = i * SLOT_COUNT, model.gear[i]
         if i < model.hydraulic:
             push = user[u + _AH] * sp.act[4 * i + 2] - user[u + _AR] * sp.act[4 * i + 3]
         else:
@@ -558,8 +560,8 @@ def accelerate(model, sp, z, dt):
             sp.force[f] += sp.row[i, f] * push
             for g in range(f + 1):
                 sp.mass[f, g] += slope * sp.row[i, f] * sp.row[i, g]
-    factorise(sp.mass)
-    solve(sp.mass, sp.force)
+    factorise_cholesky(sp.mass)
+    solve_cholesky(sp.mass, sp.force)
 
 
 @allocation_free
@@ -709,7 +711,7 @@ def advance(model, sp, z, command, row, period, steps, trail):
             )  # fmt: skip
             if model.memory >= 0 and len(model.terms) > 0:
                 drives = Drives(count, act, drive[X], drive[V], drive[COMMAND])
-                advance_memories(model.user, model.terms, drives, sp.act_dot, h, sp.time[0], supply)
+                advance_term_states(model.user, model.terms, drives, sp.act_dot, h, sp.time[0], supply)
             for k in range(4 * count):
                 act[k] += h * sp.act_dot[k]
         if model.memory >= 0:
@@ -729,7 +731,7 @@ def advance(model, sp, z, command, row, period, steps, trail):
 def _bend(user, act, drive, h, act_dot):
     """Rates of all bristles over a step in which the drives' velocities are held."""
     for i in range(drive.shape[1]):
-        u = i * SLOTS
+        u = i * SLOT_COUNT
         if user[u + _BRISTLE_STIFFNESS] > 0.0:
             at = int(user[u + _BRISTLE])
             act_dot[at] = bristle_rate(user, u, act[at], drive[V, i], drive[INERTIA, i], h)

@@ -21,7 +21,7 @@ from scipy.optimize import fminbound
 from scipy.signal import savgol_filter
 
 from hydrotele.core.compiled import compiled
-from hydrotele.effects.transmission import ringing
+from hydrotele.effects.transmission import natural_frequency
 from hydrotele.estimate.filter import (
     Crossing,
     Gains,
@@ -45,8 +45,14 @@ from hydrotele.estimate.reduced_model import (
     reduced_model,
     state_names,
 )
-from hydrotele.hydraulics.circuit import circuit_scratch, demanded_share, open_ports
-from hydrotele.hydraulics.parameters import DELIVERY, SLOTS, Slot, actuator_order, longest_step
+from hydrotele.hydraulics.circuit import circuit_scratch, compute_ports, demanded_flow_fraction
+from hydrotele.hydraulics.parameters import (
+    DELIVERY_STATE,
+    SLOT_COUNT,
+    Slot,
+    actuator_order,
+    max_time_step,
+)
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.machine import Machine
 
@@ -109,8 +115,8 @@ def start_state(
             state[s] = shown.get(f"{kind}.{axis}", 3e6)
             if f"{kind}.{axis}" not in shown:
                 wide[s] = _BLIND[kind]
-    if DELIVERY in names:
-        state[names.index(DELIVERY)] = _drawn(model, state)
+    if DELIVERY_STATE in names:
+        state[names.index(DELIVERY_STATE)] = _drawn(model, state)
     spread = np.diag(wide**2)
     _place_drives(model, state, spread, np.zeros(len(model.transmission)) if rest is None else rest)
     return state, spread
@@ -118,10 +124,10 @@ def start_state(
 
 def _drawn(model: Model, state: np.ndarray) -> float:
     """Share of its flow that a pump gives whose valves have stood where they stand."""
-    act = state[2 * (len(model.mech.free) + len(model.transmission)) :]
+    act = state[2 * (len(model.mech.independent) + len(model.transmission)) :]
     ports = circuit_scratch()
-    open_ports(model.user, act, act, ports, 0, model.hydraulic, 0.0, act)
-    return demanded_share(model.user, 0, model.hydraulic, ports)
+    compute_ports(model.user, act, act, ports, 0, model.hydraulic, 0.0, act)
+    return demanded_flow_fraction(model.user, 0, model.hydraulic, ports)
 
 
 def _first_rows(run: RunData, c: int) -> int:
@@ -139,13 +145,13 @@ def _place_drives(model: Model, state: np.ndarray, spread: np.ndarray, rest: np.
     """
     space = model_space(model)
     place(model, space, state)
-    n, t = len(model.mech.free), len(model.transmission)
+    n, t = len(model.mech.independent), len(model.transmission)
     first = 2 * (n + t)
     for i, gear in enumerate(model.gear):
         if gear < 0:
             continue
         _, stiffness, _, backlash = model.transmission[gear]
-        numbers = model.user[i * SLOTS : (i + 1) * SLOTS]
+        numbers = model.user[i * SLOT_COUNT : (i + 1) * SLOT_COUNT]
         twist, held = 0.5 * rest[gear] * backlash, numbers[Slot.COULOMB] + numbers[Slot.STRIBECK]
         if i < model.hydraulic and (abs(rest[gear]) == 1.0 or backlash == 0.0):
             head, rod = first + 4 * i + 2, first + 4 * i + 3
@@ -188,9 +194,7 @@ def find_rest(loss: Callable[[np.ndarray], float], free: np.ndarray) -> np.ndarr
     return rest
 
 
-STEP = (
-    1.0e-3  # s: 2 ms leaves errors of 1000 in the loss where the pump is starved, 1 ms none of 100
-)
+STEP = 1.0e-3  # s: 2 ms leaves errors of 1000 in the loss where the pump is starved, 1 ms none of 100
 COARSE = 4.0e-3  # s, for a first look at a candidate; at 6.7 ms an inertia that rings is not seen
 _TANGENT = 5.0e-3  # s, for the transition Jacobians: a covariance need not be exact
 _STIFF = 1.0e-3  # s, the least that a transmission asks for: its spring may ring at 150 Hz with oil
@@ -302,10 +306,10 @@ def fine_enough(machine: Machine, step: float) -> float:
     transmission.
     """
     springs = [
-        max(_STIFF, _RADIAN / ringing(machine, name))
+        max(_STIFF, _RADIAN / natural_frequency(machine, name))
         for name, axis in machine.axes.items() if axis.transmission
     ]  # fmt: skip
-    rigid = [longest_step(machine, name) for name, axis in machine.axes.items() if axis.pump]
+    rigid = [max_time_step(machine, name) for name, axis in machine.axes.items() if axis.pump]
     return min([step, *springs, *rigid])
 
 
@@ -327,7 +331,7 @@ def steps_per_row(machine: Machine, period: float, step: float) -> int:
 def first_rows(track: Track, rows: int) -> Track:
     """The first rows of a track, for a look at less than its run; without transition Jacobians."""
     part = slice(0, rows)
-    run = track.run.part(0, min(rows, len(track.run.command)))
+    run = track.run.select_rows(0, min(rows, len(track.run.command)))
     gains = Gains(*(np.ascontiguousarray(table[part]) for table in track.gains))
     return dataclasses.replace(
         track, run=run, gains=gains, whitened=track.whitened[part],
@@ -347,7 +351,7 @@ def row_variances(levels: Levels, run: RunData, rates: np.ndarray | None = None)
     An instant that is off by dt makes a reading wrong by its rate times dt. The `squared_rates` of
     the run are found where they are not given.
     """
-    noise = levels.noise if run.behind is None else levels.noise / np.sqrt(run.behind)
+    noise = levels.noise if run.readings_per_mean is None else levels.noise / np.sqrt(run.readings_per_mean)
     found = np.tile(noise**2, (len(run.reading), 1))
     if levels.jitter:
         found += levels.jitter**2 * (squared_rates(run) if rates is None else rates)
@@ -368,7 +372,7 @@ def squared_rates(run: RunData) -> np.ndarray:
         return np.zeros(whole.shape)
     rates = savgol_filter(whole, _ROWS_OF_A_RATE, 1, deriv=1, delta=run.period, axis=0)
     found = np.asarray(rates) ** 2
-    return found if run.behind is None else found / run.behind
+    return found if run.readings_per_mean is None else found / run.readings_per_mean
 
 
 def state_drift(names: list[str], levels: Levels, period: float) -> np.ndarray:
@@ -418,7 +422,7 @@ def track_run(
     known = rest is not None and len(rest) == len(play) and bool(np.isfinite(rest[play]).all())
     if kept is None and not known:
         rows = min(max(2, round(_LOOK / run.period)), len(run.command))
-        first, part = run.part(0, rows), columns[:rows]
+        first, part = run.select_rows(0, rows), columns[:rows]
         rest = find_rest(
             lambda r: _cross(trial, first, None, r, part, noise[:rows]).loss,
             play,
@@ -441,7 +445,7 @@ def following_model(machine: Machine, data: Dataset) -> Model:
     for i, name in enumerate(actuator_order(machine)[: model.hydraulic]):
         read = [noise.get(f"pressure_{side}.{name}", np.nan) for side in ("head", "rod")]
         user = model.user.copy() if user is None else user
-        user[i * SLOTS + Slot.AIR_ONSET] = np.inf if np.isnan(read).any() else _DOUBT * max(read)
+        user[i * SLOT_COUNT + Slot.AIR_ONSET] = np.inf if np.isnan(read).any() else _DOUBT * max(read)
     return model if user is None else model._replace(user=user)
 
 
@@ -480,8 +484,7 @@ def _cross(
     start, spread = start_state(machine, data, run, model, names, np.nan_to_num(rest))
     shown = [data.channels[k] for k in late.channel]
     names += [
-        f"late.{channel}.{i - late.first[k]}"
-        for i, (channel, k) in enumerate(zip(shown, late.channel, strict=True))
+        f"late.{channel}.{i - late.first[k]}" for i, (channel, k) in enumerate(zip(shown, late.channel, strict=True))
     ]
     names += [f"input.{i.name}" for i in levels.inputs]
     full = len(names)
@@ -506,9 +509,7 @@ def _cross(
     if given is not None and given.shape[1] != full:  # another number of readings on their way
         given = None
     flow = np.empty((rows if linearise else 0, full, full)) if given is None else given
-    variances = Variances(
-        noise, state_drift(names, levels, run.period), by_kind(names, STARTLE) ** 2
-    )
+    variances = Variances(noise, state_drift(names, levels, run.period), by_kind(names, STARTLE) ** 2)
     steps = Steps(fine, coarse, by_kind(names, _NUDGE))
     own = np.array([names.index(name) for name in known])
     lines = Linearisation(kept is None, given is not None, own, gains, initial, flow)
@@ -563,9 +564,7 @@ def _respond(slope, gain, spread, whitened, flow, column, values, out):
         moved[:] = next_
 
 
-def error_responses(
-    track: Track, column: np.ndarray, values: np.ndarray, rows: slice = slice(None)
-) -> np.ndarray:
+def error_responses(track: Track, column: np.ndarray, values: np.ndarray, rows: slice = slice(None)) -> np.ndarray:
     """Change of a track's whitened errors per unit of each of p additions.
 
     Args:

@@ -14,8 +14,8 @@ import numpy as np
 from hydrotele.core.files import models_folder
 from hydrotele.experiments.abdellatif_processing import HARMONICS, PROCESSING, average_periods
 from hydrotele.experiments.abdellatif_trials import (
-    PERIODS,
-    REACTION,
+    ENCODER_FEEDBACK,
+    PERIODS_PER_TRIAL,
     TRIAL_SERIES,
     TRIAL_SETTINGS,
     simulate_trials,
@@ -23,8 +23,8 @@ from hydrotele.experiments.abdellatif_trials import (
 from hydrotele.experiments.comparison import (
     Changes,
     Claim,
+    Evaluation,
     Experiment,
-    Judgement,
     Panel,
     Sample,
     Series,
@@ -34,31 +34,31 @@ from hydrotele.experiments.intervals import (
     check_fraction,
     check_mean,
     check_statistic,
-    collect,
+    collect_values,
     format_values,
 )
 from hydrotele.experiments.palida import (
-    DRIVE,
+    PLOTTED_DRIVE,
     POSE_HIGH,
     POSE_LOW,
-    TABLE,
-    drive_limits,
-    force_covariance,
+    PUBLISHED_PARAMETERS,
+    compute_force_covariance,
     load_excitation,
     load_robot,
+    make_drive_limits,
+    merge_settings,
     plan_circle,
     plan_square,
-    read_settings,
     simulate_excitation,
     simulate_measurement,
     track_path,
 )
 from hydrotele.experiments.palida_base import STRUCTURE
 from hydrotele.identify.estimation import reduce_parameters
-from hydrotele.identify.excitation import Excitation, information
+from hydrotele.identify.excitation import Excitation, compute_information
 from hydrotele.identify.mechanism import ColumnMapping, load_mechanism
 from hydrotele.identify.setup import RegressorSetup
-from hydrotele.multibody.inverse_dynamics import Regressor, project
+from hydrotele.multibody.inverse_dynamics import Regressor, project_on_drives
 
 # Friction of the passive joints, section 2.2.
 
@@ -85,7 +85,7 @@ def build_complete_regressor(motion: np.ndarray) -> Regressor:
         motion: (3, n, 6) poses, rates and accelerations.
     """
     setup = load_complete_setup()
-    return setup.table(project(setup.chain, setup.given, *motion))
+    return setup.compute_regressor(project_on_drives(setup.chain, setup.given_joints, *motion))
 
 
 def measure_reduction(seed: int, changes: Changes) -> Sample:
@@ -102,7 +102,7 @@ def measure_reduction(seed: int, changes: Changes) -> Sample:
         Counts of parameters before and after, and whether exactly one dry friction parameter per
         kind of joint remains.
     """
-    settings = read_settings({"hinge_scatter": 0.0}, changes)
+    settings = merge_settings({"hinge_scatter": 0.0}, changes)
     cycle = simulate_excitation()
     if settings["hinge_scatter"]:
         full = build_complete_regressor(cycle.motion)
@@ -112,16 +112,16 @@ def measure_reduction(seed: int, changes: Changes) -> Sample:
             for name, value in zip(full.names, full.nominal, strict=True)
         ])  # fmt: skip
         cycle = cycle._replace(force=cycle.force + full.matrix @ scatter)
-    record = simulate_measurement(cycle, PERIODS, np.random.default_rng([22, seed]))
+    record = simulate_measurement(cycle, PERIODS_PER_TRIAL, np.random.default_rng([22, seed]))
     data = average_periods(record, cycle.period)
     table = build_complete_regressor(data.motion)
-    names = [one.column for one in TABLE[:10]]
+    names = [one.column for one in PUBLISHED_PARAMETERS[:10]]
     names += [name for name in table.names if name.startswith(("coulomb", "viscous"))]
     columns = [table.names.index(name) for name in names]
     kinds = [[name for name in names if name.startswith(f"{kind}.{joint}")]
              for kind in ("coulomb", "viscous") for joint in HINGES]  # fmt: skip
     found = reduce_parameters(
-        table.matrix[:, :, columns], data.force, data.covariance / PERIODS, names, kinds
+        table.matrix[:, :, columns], data.force, data.covariance / PERIODS_PER_TRIAL, names, kinds
     )
     passive = [group for group in found.groups if _is_passive(group[0])]
     reached = sorted((len(g), g[0].partition(".")[0]) for g in passive) == [(6, "coulomb")] * 2
@@ -134,7 +134,7 @@ def measure_reduction(seed: int, changes: Changes) -> Sample:
               "step", discrete=True),
         *(
             Panel(label, number, {"": np.array([
-                step.figure if step.action == action else np.nan for step in found.steps
+                step.statistic if step.action == action else np.nan for step in found.steps
             ])}, "step", discrete=True)
             for action, label in (("drop", "estimate / standard deviation [1]"),
                                   ("merge", "correlation of merged [1]"))
@@ -148,14 +148,14 @@ def _is_passive(name: str) -> bool:
     return name.partition(".")[2].startswith(HINGES)
 
 
-def judge_reduction(samples: Sequence[Sample]) -> Judgement:
+def evaluate_reduction(samples: Sequence[Sample]) -> Evaluation:
     """Check how often the reduction gives the friction model of the document."""
     check = check_fraction(
         "fraction of the data sets that lead to these 14 friction parameters",
-        collect(samples, "reached") > 0.5, reason="more than half; the document had one data set",
+        collect_values(samples, "reached") > 0.5, reason="more than half; the document had one data set",
     )  # fmt: skip
     first = samples[0].values
-    return Judgement((check,), note=(
+    return Evaluation((check,), note=(
         f"from {first['start']:.0f} parameters to {format_values(samples, 'stop')}; in the first"
         f" set {first['dropped']:.0f} are dropped and {first['merged']:.0f} merged"
     ))  # fmt: skip
@@ -171,7 +171,7 @@ REDUCTION = Experiment(
             ' with high correlation are replaced by a common parameter." "Friction in the passive'
             " joints is modelled only as dry friction with a common parameter for all"
             ' αj and another one for all βj -joints."',
-            "Table 1, sections 2.2 and 5.1", "document", judge_reduction,
+            "Table 1, sections 2.2 and 5.1", "document", evaluate_reduction,
             {"hinge_scatter": 0.5}, "dry friction of hinges of one kind differs by 50 %",
         ),
     ),
@@ -193,60 +193,60 @@ def measure_design(seed: int, changes: Changes) -> Sample:
         one (geometric mean over the axes of the confidence ellipsoid). `use`: utilization of the
         most restrictive limit by the designed excitation.
     """
-    settings = read_settings({"amplitude": 1.0}, changes)
-    best, bounds = load_excitation(), drive_limits()
+    settings = merge_settings({"amplitude": 1.0}, changes)
+    best, bounds = load_excitation(), make_drive_limits()
     size = settings["amplitude"]
     best = replace(best, sin=size * best.sin, cos=size * best.cos)
     time = np.arange(240) * best.period / 240
     rng = np.random.default_rng(seed)
-    wide = 0.3 * bounds.half[:, None] / np.arange(1, HARMONICS + 1)
+    wide = 0.3 * bounds.half_range[:, None] / np.arange(1, HARMONICS + 1)
     sin, cos = wide * rng.normal(size=(2, 6, HARMONICS))
-    other = Excitation(bounds.axes, best.period, bounds.middle, sin, cos, 0.0, 0.0, len(TABLE))
+    other = Excitation(bounds.axes, best.period, bounds.centre, sin, cos, 0.0, 0.0, len(PUBLISHED_PARAMETERS))
     for _ in range(200):
-        if find_limit_use(other, time) <= 1.0:
+        if compute_limit_utilization(other, time) <= 1.0:
             break
         other = replace(other, sin=0.95 * other.sin, cos=0.95 * other.cos)
-    designed, random = (_log_information(one, time) for one in (best, other))
-    motion = best.motion(time)[0]
+    designed, random = (_compute_log_information(one, time) for one in (best, other))
+    motion = best.evaluate(time)[0]
     values = {
-        "ratio": float(np.exp(0.5 * (designed - random) / len(TABLE))),
-        "use": find_limit_use(best, time), "designed": designed, "random": random,
+        "ratio": float(np.exp(0.5 * (designed - random) / len(PUBLISHED_PARAMETERS))),
+        "use": compute_limit_utilization(best, time), "designed": designed, "random": random,
     }  # fmt: skip
     return Sample(values, (
         Panel("position [m]", time, dict(zip(("x", "y", "z"), motion.T[:3], strict=True))),
         Panel("orientation [deg]", time,
               dict(zip(("phi", "theta", "psi"), np.degrees(motion.T[3:]), strict=True))),
         Panel("leg length [m]", time,
-              {f"leg {k + 1}": c for k, c in enumerate(load_robot().lengths(motion).T)}),
+              {f"leg {k + 1}": c for k, c in enumerate(load_robot().compute_leg_lengths(motion).T)}),
     ))  # fmt: skip
 
 
-def find_limit_use(motion: Excitation, time: np.ndarray) -> float:
+def compute_limit_utilization(motion: Excitation, time: np.ndarray) -> float:
     """Return the largest utilization of any pose or drive limit; 1 means at the limit."""
-    whole = motion.motion(time)
+    whole = motion.evaluate(time)
     inside = np.clip(whole[0], POSE_LOW, POSE_HIGH)
-    return float(drive_limits().use(whole, np.stack([inside, whole[1], whole[2]])).max())
+    return float(make_drive_limits().compute_utilisation(whole, np.stack([inside, whole[1], whole[2]])).max())
 
 
-def _log_information(motion: Excitation, time: np.ndarray) -> float:
+def _compute_log_information(motion: Excitation, time: np.ndarray) -> float:
     own = load_robot()
-    base = own.structure.base[own.order]
-    held = information(own.setup, motion.motion(time), force_covariance(), base)
+    base = own.base_parameters.base[own.order]
+    held = compute_information(own.setup, motion.evaluate(time), compute_force_covariance(), base)
     return float(np.linalg.slogdet(held)[1])
 
 
-def judge_design(samples: Sequence[Sample]) -> Judgement:
+def evaluate_design(samples: Sequence[Sample]) -> Evaluation:
     """Check the precision and the limit utilization of the designed excitation."""
-    return Judgement(
+    return Evaluation(
         (
             check_statistic(
                 "standard deviations with random motions over those with the designed one",
-                collect(samples, "ratio"), lambda ratios: float(np.exp(np.mean(np.log(ratios)))),
+                collect_values(samples, "ratio"), lambda ratios: float(np.exp(np.mean(np.log(ratios)))),
                 (1.0, np.inf), "the designed motion is more precise"),
             check_exact("use of the tightest limit", samples[0].values["use"], (0.0, 1.0), "(25)"),
         ),
         note=f"ln det of the information {samples[0].values['designed']:.1f}; of the best random"
-        f" motion {collect(samples, 'random').max():.1f}",
+        f" motion {collect_values(samples, 'random').max():.1f}",
     )  # fmt: skip
 
 
@@ -258,7 +258,7 @@ DESIGN = Experiment(
             "D-optimal excitation",
             '"it is recommended to opt for the D-optimal design" "for experimental identification'
             ' just a sufficiently good excitation trajectory is needed"; five harmonics',
-            "Fig. 5, (22) to (26), section 5.2", "document", judge_design,
+            "Fig. 5, (22) to (26), section 5.2", "document", evaluate_design,
             {"amplitude": 0.1}, "the amplitude of the motion is scaled by 0.1",
         ),
     ),
@@ -266,9 +266,9 @@ DESIGN = Experiment(
 
 # Control, section 5.4.
 
-SPEEDS = (0.25, 0.5, 0.75, 1.0)  # tool speeds [m/s]; the text of the document gives none
+TOOL_SPEEDS = (0.25, 0.5, 0.75, 1.0)  # tool speeds [m/s]; the text of the document gives none
 STRATEGIES = ("linear control", "nominal feedforward", "identified feedforward")
-PATHS: dict[str, Callable[..., np.ndarray]] = {"circle": plan_circle, "square": plan_square}
+PATH_PLANNERS: dict[str, Callable[..., np.ndarray]] = {"circle": plan_circle, "square": plan_square}
 
 
 def measure_control(seed: int, changes: Changes) -> Sample:
@@ -282,16 +282,16 @@ def measure_control(seed: int, changes: Changes) -> Sample:
         Ratios of RMS actuator errors between strategies and speeds, and the RMS errors of
         actuator 5 and of the tool at the highest speed [mm].
     """
-    settings = read_settings({"force_scale": 1.0}, changes)
+    settings = merge_settings({"force_scale": 1.0}, changes)
     trial = simulate_trials(seed, TRIAL_SETTINGS | {"trials": 1, "friction_excess": 0.0})
     identified = settings["force_scale"] * trial.value[0]  # the estimate is linear in the forces
-    models = (None, np.array([one.prior for one in TABLE]), identified)
+    models = (None, np.array([one.prior for one in PUBLISHED_PARAMETERS]), identified)
     values: dict[str, float] = {"warnings": 0.0}
     panels = []
-    for path, plan in PATHS.items():
-        rms = {name: np.zeros(len(SPEEDS)) for name in STRATEGIES}
+    for path, plan in PATH_PLANNERS.items():
+        rms = {name: np.zeros(len(TOOL_SPEEDS)) for name in STRATEGIES}
         tracked = {}
-        for k, speed in enumerate(SPEEDS):
+        for k, speed in enumerate(TOOL_SPEEDS):
             motion = plan(speed, laps=1.0)
             for name, model in zip(STRATEGIES, models, strict=True):
                 tracked[name] = track_path(motion, model, seed)
@@ -301,14 +301,14 @@ def measure_control(seed: int, changes: Changes) -> Sample:
         values[f"{path} growth"] = float(none[-1] / none[0])
         values[f"{path} nominal"] = float(np.max(nominal / none))
         values[f"{path} identified"] = float(np.max(best / nominal))
-        panels.append(Panel(f"RMS actuator error on the {path} [mm]", np.array(SPEEDS),
+        panels.append(Panel(f"RMS actuator error on the {path} [mm]", np.array(TOOL_SPEEDS),
                             {name: 1e3 * one for name, one in rms.items()}, "speed [m/s]",
                             discrete=True))  # fmt: skip
         fast = {name: tracked[name] for name in STRATEGIES[1:]}
         time = fast[STRATEGIES[1]].time
         for label, curves in (
             (f"error of actuator 5 on the {path} [mm]",
-             {name: 1e3 * one.error[:, DRIVE] for name, one in fast.items()}),
+             {name: 1e3 * one.error[:, PLOTTED_DRIVE] for name, one in fast.items()}),
             (f"Cartesian error on the {path} [mm]",
              {name: 1e3 * np.linalg.norm(one.pose_error[:, :3], axis=1)
               for name, one in fast.items()}),
@@ -319,64 +319,64 @@ def measure_control(seed: int, changes: Changes) -> Sample:
     return Sample(values, tuple(panels))
 
 
-def judge_errors(samples: Sequence[Sample], path: str) -> Judgement:
+def evaluate_actuator_errors(samples: Sequence[Sample], path: str) -> Evaluation:
     """Compare the RMS actuator errors of the three strategies on one path."""
-    if collect(samples, "warnings").any():
-        return Judgement(unavailable="MuJoCo warned of an unstable simulation")
+    if collect_values(samples, "warnings").any():
+        return Evaluation(unavailable="MuJoCo warned of an unstable simulation")
     curves = samples[0].panels[[p.label for p in samples[0].panels].index(
         f"RMS actuator error on the {path} [mm]")].curves  # fmt: skip
     rows = "; ".join(
         f"{speed:g} m/s: " + ", ".join(f"{curve[k]:.3f}" for curve in curves.values()) + " mm"
-        for k, speed in enumerate(SPEEDS)
+        for k, speed in enumerate(TOOL_SPEEDS)
     )
-    return Judgement(
+    return Evaluation(
         (
             check_mean(
                 "error of linear control at the highest speed over that at the lowest",
-                collect(samples, f"{path} growth"), (1.5, np.inf),
+                collect_values(samples, f"{path} growth"), (1.5, np.inf),
                 '"significant decreasing accuracy": at least 1.5 times the error'),
             check_mean(
                 "largest error with the nominal model over that of linear control",
-                collect(samples, f"{path} nominal"), (0.0, 1.0), '"improves always"'),
+                collect_values(samples, f"{path} nominal"), (0.0, 1.0), '"improves always"'),
             check_mean(
                 "largest error with the identified over that with the nominal model",
-                collect(samples, f"{path} identified"), (0.0, 0.8),
+                collect_values(samples, f"{path} identified"), (0.0, 0.8),
                 '"outperforms clearly": by a fifth of the error, at every speed'),
         ),
         note=f"linear, nominal, identified: {rows}",
     )  # fmt: skip
 
 
-def judge_circle(samples: Sequence[Sample]) -> Judgement:
+def evaluate_circle_errors(samples: Sequence[Sample]) -> Evaluation:
     """Compare the RMS actuator errors on the circle."""
-    return judge_errors(samples, "circle")
+    return evaluate_actuator_errors(samples, "circle")
 
 
-def judge_square(samples: Sequence[Sample]) -> Judgement:
+def evaluate_square_errors(samples: Sequence[Sample]) -> Evaluation:
     """Compare the RMS actuator errors on the square."""
-    return judge_errors(samples, "square")
+    return evaluate_actuator_errors(samples, "square")
 
 
-def judge_fastest(samples: Sequence[Sample], quantity: str) -> Judgement:
+def evaluate_highest_speed(samples: Sequence[Sample], quantity: str) -> Evaluation:
     """Compare an error at the highest speed between the identified and the nominal model."""
     checks, notes = [], []
-    for path in PATHS:
+    for path in PATH_PLANNERS:
         label = f"{quantity} on the {path} [mm]"
-        nominal, best = (collect(samples, f"{label}, {m}") for m in ("nominal", "identified"))
+        nominal, best = (collect_values(samples, f"{label}, {m}") for m in ("nominal", "identified"))
         checks.append(check_mean(f"RMS error on the {path}, identified over nominal",
                                  best / nominal, (0.0, 1.0), "smaller"))  # fmt: skip
         notes.append(f"{path} {nominal.mean():.3f} and {best.mean():.3f} mm")
-    return Judgement(tuple(checks), note=f"nominal and identified: {', '.join(notes)}")
+    return Evaluation(tuple(checks), note=f"nominal and identified: {', '.join(notes)}")
 
 
-def judge_actuator(samples: Sequence[Sample]) -> Judgement:
+def evaluate_drive_error(samples: Sequence[Sample]) -> Evaluation:
     """Compare the errors of actuator 5 between both models."""
-    return judge_fastest(samples, "error of actuator 5")
+    return evaluate_highest_speed(samples, "error of actuator 5")
 
 
-def judge_tool(samples: Sequence[Sample]) -> Judgement:
+def evaluate_tool_error(samples: Sequence[Sample]) -> Evaluation:
     """Compare the Cartesian errors of the tool between both models."""
-    return judge_fastest(samples, "Cartesian error")
+    return evaluate_highest_speed(samples, "Cartesian error")
 
 
 _CONTROL_QUOTE = (
@@ -385,28 +385,28 @@ _CONTROL_QUOTE = (
     ' tracking performance." "the compensation of identified model (variation 3) outperforms'
     ' clearly variation 2"'
 )
-_HALF_FORCE = {"force_scale": 0.5}
-_HALF_FORCE_WORDS = "the identification reads half of the actual forces"
+_FORCE_SCALE_FAULT = {"force_scale": 0.5}
+_FORCE_SCALE_FAULT_TEXT = "the identification reads half of the actual forces"
 
 CONTROL = Experiment(
     "control",
     measure_control,
     (
         Claim("control errors on the circle", _CONTROL_QUOTE, "Fig. 10, section 5.4", "document",
-              judge_circle, _HALF_FORCE, _HALF_FORCE_WORDS,
+              evaluate_circle_errors, _FORCE_SCALE_FAULT, _FORCE_SCALE_FAULT_TEXT,
               ("RMS actuator error on the circle [mm]",)),
         Claim("control errors on the square", _CONTROL_QUOTE, "Fig. 10, section 5.4", "document",
-              judge_square, _HALF_FORCE, _HALF_FORCE_WORDS,
+              evaluate_square_errors, _FORCE_SCALE_FAULT, _FORCE_SCALE_FAULT_TEXT,
               ("RMS actuator error on the square [mm]",)),
         Claim("error of actuator 5",
               '"For the same arbitrarily chosen actuator, the tracking accuracy is higher if the'
               ' identified model is implemented."',
-              "Fig. 11, section 5.4", "document", judge_actuator, _HALF_FORCE, _HALF_FORCE_WORDS,
-              tuple(f"error of actuator 5 on the {path} [mm]" for path in PATHS)),
+              "Fig. 11, section 5.4", "document", evaluate_drive_error, _FORCE_SCALE_FAULT, _FORCE_SCALE_FAULT_TEXT,
+              tuple(f"error of actuator 5 on the {path} [mm]" for path in PATH_PLANNERS)),
         Claim("Cartesian error",
               '"The same results are noticeable for the cartesian tracking accuracy Δx"',
-              "Fig. 12, section 5.4", "document", judge_tool, _HALF_FORCE, _HALF_FORCE_WORDS,
-              tuple(f"Cartesian error on the {path} [mm]" for path in PATHS)),
+              "Fig. 12, section 5.4", "document", evaluate_tool_error, _FORCE_SCALE_FAULT, _FORCE_SCALE_FAULT_TEXT,
+              tuple(f"Cartesian error on the {path} [mm]" for path in PATH_PLANNERS)),
     ),
     max_repetitions=3,
 )  # fmt: skip
@@ -416,8 +416,8 @@ SERIES = Series(
     "H. Abdellatif, B. Heimann, J. Kotlarski: On the Robust Dynamics Identification of Parallel"
     " Manipulators: Methodology and Experiments, 2008",
     100,
-    (STRUCTURE, REDUCTION, DESIGN, PROCESSING, TRIAL_SERIES, REACTION, CONTROL),
-    drawings={
+    (STRUCTURE, REDUCTION, DESIGN, PROCESSING, TRIAL_SERIES, ENCODER_FEEDBACK, CONTROL),
+    items_without_result={
         "Fig. 1": "photograph and drawing of the robot",
         "Fig. 2": "scheme of a parallel manipulator",
         "Fig. 3": "block diagram of the frequency-domain processing, whose result is Fig. 6",

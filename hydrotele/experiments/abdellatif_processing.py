@@ -11,29 +11,29 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.experiments.comparison import Changes, Claim, Experiment, Judgement, Panel, Sample
-from hydrotele.experiments.intervals import check_mean, check_statistic, collect
+from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Panel, Sample
+from hydrotele.experiments.intervals import check_mean, check_statistic, collect_values
 from hydrotele.experiments.palida import (
-    DRIVE,
+    PLOTTED_DRIVE,
     POSE_HIGH,
     POSE_LOW,
     SAMPLE_RATE,
     RepeatedMotion,
-    force_covariance,
+    compute_force_covariance,
     load_robot,
-    read_settings,
+    merge_settings,
     simulate_excitation,
     simulate_measurement,
     simulate_motion,
 )
 from hydrotele.identify.estimation import estimate
-from hydrotele.identify.mechanism import in_coordinates
-from hydrotele.identify.motion import Processing, joint_motion, resolution
+from hydrotele.identify.mechanism import convert_coordinates
+from hydrotele.identify.motion import Processing, compute_joint_motion, estimate_resolution
 from hydrotele.identify.record import IdentificationRecord
 
 HARMONICS = 5
 """Number of harmonics of the excitation and of the frequency window (section 5.2)."""
-WAYS = {"raw": "raw", "zero_phase": "time domain", "periodic": "frequency domain"}
+METHOD_NAMES = {"raw": "raw", "zero_phase": "time domain", "periodic": "frequency domain"}
 MAX_VISIBLE_ERROR = 0.01
 """Largest RMS error over RMS signal that counts as "almost no noise": a printed line's width."""
 Y_AXIS = 1  # index of y in the pose; Fig. 6 shows y
@@ -91,9 +91,7 @@ def average_force(force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return mean, rest.T @ rest / ((len(force) - 1) * len(mean))
 
 
-def process_lengths(
-    record: IdentificationRecord, period: float, method: str, harmonics: int = HARMONICS
-) -> np.ndarray:
+def process_lengths(record: IdentificationRecord, period: float, method: str, harmonics: int = HARMONICS) -> np.ndarray:
     """Compute poses, rates and accelerations from measured leg lengths.
 
     Args:
@@ -105,13 +103,13 @@ def process_lengths(
     Returns:
         (3, n, 6) motion in coordinates of the pose.
     """
-    pose = in_coordinates(record, load_robot().setup)
-    found = resolution(pose.position, pose.period, pose.position_noise)
+    pose = convert_coordinates(record, load_robot().setup)
+    found = estimate_resolution(pose.position, pose.period, pose.position_noise)
     processing = (
         Processing("periodic", period=period, harmonics=harmonics) if method == "periodic"
         else Processing(method)  # pyright: ignore[reportArgumentType]
     )  # fmt: skip
-    smoothed = joint_motion(pose.position, pose.period, found, processing)
+    smoothed = compute_joint_motion(pose.position, pose.period, found, processing)
     return np.stack([smoothed.value, smoothed.rate, smoothed.acceleration])
 
 
@@ -141,7 +139,7 @@ def measure_processing(seed: int, changes: Changes) -> Sample:
         Relative RMS errors of y and its derivatives, and error variances of the force predicted
         on the circle.
     """
-    settings = read_settings({"harmonics": HARMONICS}, changes)
+    settings = merge_settings({"harmonics": HARMONICS}, changes)
     cycle, lap, own, periods = simulate_excitation(), simulate_circle(), load_robot(), 2
     rng = np.random.default_rng([7, seed])
     record = simulate_measurement(cycle, periods, rng)
@@ -149,24 +147,24 @@ def measure_processing(seed: int, changes: Changes) -> Sample:
     rows, middle = len(cycle.force), slice(len(lap.force), 2 * len(lap.force))
     true = cycle.motion[:, :, Y_AXIS]
     values, rebuilt, predicted = {}, {}, {}
-    for way in WAYS:
+    for way in METHOD_NAMES:
         motion = process_lengths(record, cycle.period, way, settings["harmonics"])
         rebuilt[way] = motion[:, :rows, Y_AXIS]
         for order, error in enumerate(rebuilt[way] - true):
             values[f"{way} {order}"] = float(np.std(error) / np.std(true[order]))
-        value = estimate(own.matrix(motion), record.force, force_covariance(), order=0).value
+        value = estimate(own.matrix(motion), record.force, compute_force_covariance(), order=0).value
         circle = process_lengths(check, lap.period, way, settings["harmonics"])[:, middle]
         force = own.matrix(circle) @ value
         values[f"{way} variance"] = float(np.mean((force - check.force[middle]) ** 2))
         values[f"{way} true variance"] = float(np.mean((force - lap.force) ** 2))
-        predicted[way] = force[:, DRIVE]
-    panels = (*_draw_reconstruction(rebuilt, true, record.force[:rows, DRIVE], cycle.period,
+        predicted[way] = force[:, PLOTTED_DRIVE]
+    panels = (*_draw_reconstruction(rebuilt, true, record.force[:rows, PLOTTED_DRIVE], cycle.period,
                                     settings["harmonics"]),
-              *_draw_prediction(predicted, check.force[middle, DRIVE]))  # fmt: skip
+              *_draw_prediction(predicted, check.force[middle, PLOTTED_DRIVE]))  # fmt: skip
     return Sample(values, panels)
 
 
-_ORDERS = ("y [m]", "rate of y [m/s]", "acceleration of y [m/s^2]")
+_DERIVATIVE_LABELS = ("y [m]", "rate of y [m/s]", "acceleration of y [m/s^2]")
 
 
 def _draw_reconstruction(
@@ -178,7 +176,7 @@ def _draw_reconstruction(
     frequency = lines / period
     panels, spectrum = [], 2.0 * np.fft.rfft(rebuilt["raw"][0])[lines] / true.shape[1]
     spectra = [np.abs(spectrum * (2.0 * np.pi * frequency) ** order) for order in range(3)]
-    for label, amplitude in zip(_ORDERS, spectra, strict=True):
+    for label, amplitude in zip(_DERIVATIVE_LABELS, spectra, strict=True):
         window = np.where(lines <= harmonics, amplitude.max(), np.nan)
         panels.append(Panel(f"amplitude of {label}", frequency,
                             {"measured": amplitude, "window": window}, "frequency [Hz]", log=True,
@@ -187,10 +185,10 @@ def _draw_reconstruction(
     panels.append(Panel("amplitude of force of drive 5 [N]", frequency, {"measured": amplitude},
                         "frequency [Hz]", log=True, discrete=True))  # fmt: skip
     time = np.arange(true.shape[1]) / SAMPLE_RATE
-    for order, label in enumerate(_ORDERS):
+    for order, label in enumerate(_DERIVATIVE_LABELS):
         panels.append(Panel(
             label, time, {"frequency domain": rebuilt["periodic"][order], "true": true[order]},
-            errors={WAYS[way]: rebuilt[way][order] - true[order] for way in WAYS if way != "raw"},
+            errors={METHOD_NAMES[way]: rebuilt[way][order] - true[order] for way in METHOD_NAMES if way != "raw"},
             error_label=f"error of {label}",
         ))  # fmt: skip
     return panels
@@ -199,41 +197,45 @@ def _draw_reconstruction(
 def _draw_prediction(predicted: dict[str, np.ndarray], force: np.ndarray) -> list[Panel]:
     time = np.arange(len(force)) / SAMPLE_RATE
     return [
-        Panel(f"force of drive 5, {WAYS[way]} [N]", time, {"measured": force, "predicted": one})
+        Panel(
+            f"force of drive 5, {METHOD_NAMES[way]} [N]",
+            time,
+            {"measured": force, "predicted": one},
+        )
         for way, one in predicted.items()
     ]
 
 
-def judge_reconstruction(samples: Sequence[Sample]) -> Judgement:
+def evaluate_reconstruction(samples: Sequence[Sample]) -> Evaluation:
     """Check the errors of y and its derivatives after frequency-domain filtering."""
     checks = tuple(
         check_mean(f"relative RMS error of {label.partition(' [')[0]}",
-                   collect(samples, f"periodic {order}"), (0.0, MAX_VISIBLE_ERROR),
+                   collect_values(samples, f"periodic {order}"), (0.0, MAX_VISIBLE_ERROR),
                    '"almost no noise": below the width of a printed line, 1 % of the signal')
-        for order, label in enumerate(_ORDERS)
+        for order, label in enumerate(_DERIVATIVE_LABELS)
     )  # fmt: skip
     others = ", ".join(
-        f"{np.mean(collect(samples, f'{way} 2')):.2g} {WAYS[way]}" for way in ("raw", "zero_phase")
+        f"{np.mean(collect_values(samples, f'{way} 2')):.2g} {METHOD_NAMES[way]}" for way in ("raw", "zero_phase")
     )
-    return Judgement(checks, note=f"acceleration by the other methods: {others}")
+    return Evaluation(checks, note=f"acceleration by the other methods: {others}")
 
 
-def judge_prediction(samples: Sequence[Sample]) -> Judgement:
+def evaluate_prediction(samples: Sequence[Sample]) -> Evaluation:
     """Check that the error variances have the order of the document."""
     checks = tuple(
         check_statistic(
-            f"error variance, {WAYS[one]} over {WAYS[other]}",
-            collect(samples, f"{one} variance") / collect(samples, f"{other} variance"),
+            f"error variance, {METHOD_NAMES[one]} over {METHOD_NAMES[other]}",
+            collect_values(samples, f"{one} variance") / collect_values(samples, f"{other} variance"),
             lambda ratios: float(np.exp(np.mean(np.log(ratios)))), (0.0, 1.0),
             "smaller")
         for one, other in (("periodic", "zero_phase"), ("zero_phase", "raw"))
     )  # fmt: skip
     measured, true = (
-        ", ".join(f"{np.mean(collect(samples, f'{way} {kind}')):.3g} N^2 {words}"
-                  for way, words in WAYS.items())
+        ", ".join(f"{np.mean(collect_values(samples, f'{way} {kind}')):.3g} N^2 {words}"
+                  for way, words in METHOD_NAMES.items())
         for kind in ("variance", "true variance")
     )  # fmt: skip
-    return Judgement(checks, note=f"variance of measured minus predicted force: {measured}; of true"
+    return Evaluation(checks, note=f"variance of measured minus predicted force: {measured}; of true"
                      f" minus predicted force: {true}")  # fmt: skip
 
 
@@ -245,18 +247,19 @@ PROCESSING = Experiment(
             "reconstruction of the motion",
             '"The effectiveness of the proposed filter is obvious, since the calculated signals'
             ' exhibit almost no noise or disturbance corruption."',
-            "Fig. 6, section 5.2", "document", judge_reconstruction,
+            "Fig. 6, section 5.2", "document", evaluate_reconstruction,
             {"harmonics": 200}, "the window holds 200 instead of 5 harmonics",
-            (*(f"amplitude of {label}" for label in (*_ORDERS, "force of drive 5 [N]")), *_ORDERS),
+            (*(f"amplitude of {label}" for label in (*_DERIVATIVE_LABELS, "force of drive 5 [N]")),
+            *_DERIVATIVE_LABELS),
         ),
         Claim(
             "prediction on a circle",
             '"The frequency-domain processing yields the best prediction quality corresponding to'
             ' the smallest error variance σ2 . Time-domain filtering is not accurate enough to'
             ' extract all information at the relevant frequencies."',
-            "Fig. 7, section 5.2", "document", judge_prediction,
+            "Fig. 7, section 5.2", "document", evaluate_prediction,
             {"harmonics": 200}, "the window holds 200 instead of 5 harmonics",
-            tuple(f"force of drive 5, {words} [N]" for words in WAYS.values()),
+            tuple(f"force of drive 5, {words} [N]" for words in METHOD_NAMES.values()),
         ),
     ),
     max_repetitions=10,

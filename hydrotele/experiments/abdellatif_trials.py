@@ -22,8 +22,8 @@ from hydrotele.experiments.comparison import (
     Changes,
     Check,
     Claim,
+    Evaluation,
     Experiment,
-    Judgement,
     Panel,
     Sample,
 )
@@ -33,26 +33,26 @@ from hydrotele.experiments.intervals import (
     check_fraction,
     check_mean,
     check_statistic,
-    collect,
+    collect_values,
 )
 from hydrotele.experiments.palida import (
     CHI2_LIMIT,
     LENGTH_NOISE,
+    PUBLISHED_PARAMETERS,
     SYMBOLS,
-    TABLE,
-    control_gains,
+    compute_control_gains,
+    compute_force_covariance,
     draw_force_noise,
-    force_covariance,
     load_robot,
-    read_settings,
+    merge_settings,
     simulate_excitation,
     simulate_measurement,
 )
 from hydrotele.identify.estimation import estimate
 
-PERIODS = 4
+PERIODS_PER_TRIAL = 4
 """Repetitions of the motion in one trial; the document gives no number."""
-TRIALS = 100
+TRIALS_PER_SERIES = 100
 """Trials in one series (section 5.3)."""
 FRICTION_EXCESS = 0.03
 """Relative excess of all friction parameters in the first trial over their stationary values.
@@ -65,7 +65,7 @@ EXCESS_DECAY = 0.1
 An excess of 0.3 % puts one in seven second trials outside the ellipsoid; 5 % are expected without
 excess.
 """
-RIPPLE, RIPPLE_PITCH = 5.0, 0.03
+RIPPLE_FORCE, RIPPLE_PITCH = 5.0, 0.03
 """Amplitude [N] and period in leg length [m] of a repeatable force, such as motor cogging.
 
 Assumed; used only to explain a difference.
@@ -75,9 +75,9 @@ MAX_EXCEPTIONS = 0.1
 
 Twice the 5 % that are expected outside a 95 % interval.
 """
-_PRINTED = np.array([one.value for one in TABLE])
-_STD = np.array([one.std for one in TABLE])
-_IS_FRICTION = np.array([one.column.startswith(("coulomb", "viscous")) for one in TABLE])
+_PRINTED_VALUES = np.array([one.value for one in PUBLISHED_PARAMETERS])
+_PRINTED_DEVIATIONS = np.array([one.std for one in PUBLISHED_PARAMETERS])
+_IS_FRICTION = np.array([one.column.startswith(("coulomb", "viscous")) for one in PUBLISHED_PARAMETERS])
 
 
 class NormalEquations:
@@ -127,30 +127,30 @@ class NormalEquations:
         return (self._columns @ force).reshape(6, 24, 6).transpose(0, 2, 1)
 
 
-class Trials(NamedTuple):
+class TrialEstimates(NamedTuple):
     """Estimates of a series of t trials.
 
     Attributes:
         value: (t, 24) Gauss-Markov estimates.
         information: (t, 24, 24) inverse of their covariance P by (28).
-        warm_first: (24,) estimate of the first trial with the same noise but stationary friction.
+        first_without_excess: (24,) estimate of the first trial with the same noise but stationary friction.
         least_squares: (t, 24) estimates with equal weights for all drives.
-        rippled: (t, 24) estimates with an additional repeatable force, weighted by the residual
+        ripple_estimates: (t, 24) estimates with an additional repeatable force, weighted by the residual
             covariance.
-        rippled_information: (24, 24) inverse of the covariance of `rippled` by (28).
+        ripple_information: (24, 24) inverse of the covariance of `ripple_estimates` by (28).
     """
 
     value: np.ndarray
     information: np.ndarray
-    warm_first: np.ndarray
+    first_without_excess: np.ndarray
     least_squares: np.ndarray
-    rippled: np.ndarray
-    rippled_information: np.ndarray
+    ripple_estimates: np.ndarray
+    ripple_information: np.ndarray
 
 
 TRIAL_SETTINGS = {
     "friction_excess": FRICTION_EXCESS, "claimed_noise": 1.0, "processing": "periodic",
-    "trials": TRIALS,
+    "trials": TRIALS_PER_SERIES,
 }  # fmt: skip
 """Settings of `simulate_trials`.
 
@@ -161,11 +161,11 @@ TRIAL_SETTINGS = {
 """
 
 
-def simulate_trials(seed: int, settings: Changes) -> Trials:
+def simulate_trials(seed: int, settings: Changes) -> TrialEstimates:
     """Identify the robot in a series of trials with new force noise in every trial.
 
     All trials of a series use the same leg length noise, whose effect on the estimates is small;
-    see `judge_ellipsoid`.
+    see `evaluate_ellipsoid`.
 
     Args:
         seed: seed of the series.
@@ -178,8 +178,8 @@ def simulate_trials(seed: int, settings: Changes) -> Trials:
     """
     own, cycle = load_robot(), simulate_excitation()
     rng = np.random.default_rng([2008, seed])
-    record = simulate_measurement(cycle, PERIODS, rng)
-    lengths = record.position.reshape(PERIODS, -1, 6).mean(axis=0)
+    record = simulate_measurement(cycle, PERIODS_PER_TRIAL, rng)
+    lengths = record.position.reshape(PERIODS_PER_TRIAL, -1, 6).mean(axis=0)
     averaged = replace(record, position=lengths, force=cycle.force)
     motion = process_lengths(averaged, cycle.period, settings["processing"])
     equations = NormalEquations(own.matrix(motion))
@@ -187,22 +187,22 @@ def simulate_trials(seed: int, settings: Changes) -> Trials:
     friction = settings["friction_excess"] * friction
     found, weights = [], []
     for number in range(settings["trials"]):
-        noise = draw_force_noise((PERIODS, len(lengths)), rng)
+        noise = draw_force_noise((PERIODS_PER_TRIAL, len(lengths)), rng)
         mean, covariance = average_force(noise)
-        covariance = settings["claimed_noise"] ** 2 * covariance / PERIODS
+        covariance = settings["claimed_noise"] ** 2 * covariance / PERIODS_PER_TRIAL
         weights.append(np.linalg.inv(covariance))
         found.append(equations.correlate(cycle.force + EXCESS_DECAY**number * friction + mean))
     weight, correlations = np.array(weights), np.array(found)
     value, information = equations.solve(weight, correlations)
     warm, _ = equations.solve(weight[:1], correlations[:1] - equations.correlate(friction))
     plain, _ = equations.solve(np.eye(6)[None], correlations)
-    ripple = RIPPLE * np.sin(2.0 * np.pi / RIPPLE_PITCH * cycle.length)
+    ripple = RIPPLE_FORCE * np.sin(2.0 * np.pi / RIPPLE_PITCH * cycle.length)
     residual = cycle.force + ripple - equations.matrix @ (value[-1] + equations.solve(
         weight[-1:], equations.correlate(ripple)[None])[0][0])  # fmt: skip
     total = np.linalg.inv(weight[-1]) + residual.T @ residual / len(residual)
     rippled, claimed = equations.solve(
         np.linalg.inv(total)[None], correlations + equations.correlate(ripple))  # fmt: skip
-    return Trials(value, information, warm[0], plain, rippled, claimed[0])
+    return TrialEstimates(value, information, warm[0], plain, rippled, claimed[0])
 
 
 def measure_trials(seed: int, changes: Changes) -> Sample:
@@ -217,22 +217,22 @@ def measure_trials(seed: int, changes: Changes) -> Sample:
         distance from the mean of all trials after the first. The values describe the first trial
         and the fractions of estimates inside intervals.
     """
-    trials = simulate_trials(seed, read_settings(TRIAL_SETTINGS, changes))
+    trials = simulate_trials(seed, merge_settings(TRIAL_SETTINGS, changes))
     later = trials.value[1:]
     mean = later.mean(axis=0)
     std = np.sqrt(np.diag(np.linalg.inv(trials.information[-1])))
-    distance = square_distance(trials.value - mean, trials.information)
-    rippled = trials.rippled[1:] - trials.rippled[1:].mean(axis=0)
+    distance = compute_square_distance(trials.value - mean, trials.information)
+    rippled = trials.ripple_estimates[1:] - trials.ripple_estimates[1:].mean(axis=0)
     outside = np.abs(trials.value - mean) > 2.0 * std
     values = {
-        "printed": float(np.mean(np.abs(later - _PRINTED) <= 2.0 * _STD)),
+        "printed": float(np.mean(np.abs(later - _PRINTED_VALUES) <= 2.0 * _PRINTED_DEVIATIONS)),
         "inside": float(1.0 - outside[1:].mean()), "first": float(outside[0].mean()),
         "p1": float(outside[1:, 0].mean()), "first distance": float(distance[0]),
         "warm first distance": float(
-            square_distance(trials.warm_first - mean, trials.information[0])),
+            compute_square_distance(trials.first_without_excess - mean, trials.information[0])),
         "rippled": float(np.mean(
-            square_distance(rippled, trials.rippled_information) < CHI2_LIMIT)),
-        "common shift": float(np.sqrt(square_distance(
+            compute_square_distance(rippled, trials.ripple_information) < CHI2_LIMIT)),
+        "common shift": float(np.sqrt(compute_square_distance(
             mean - load_robot().truth, trials.information[-1]))),
     }  # fmt: skip
     arrays = {"value": trials.value, "least_squares": trials.least_squares, "std": std,
@@ -241,7 +241,7 @@ def measure_trials(seed: int, changes: Changes) -> Sample:
                   arrays)  # fmt: skip
 
 
-def square_distance(error: np.ndarray, information: np.ndarray) -> np.ndarray:
+def compute_square_distance(error: np.ndarray, information: np.ndarray) -> np.ndarray:
     """Return the squared Mahalanobis distance (...) of errors (..., 24), by (29)."""
     return np.einsum("...p,...pq,...q->...", error, information, error)
 
@@ -257,31 +257,31 @@ def _draw_history(value: np.ndarray, mean: np.ndarray, std: np.ndarray) -> tuple
     )  # fmt: skip
 
 
-_DISTANCE = "squared distance from mean [1]"
+_DISTANCE_LABEL = "squared distance from mean [1]"
 
 
 def _draw_distance(distance: np.ndarray) -> Panel:
     limit = np.full(len(distance), CHI2_LIMIT)
-    return Panel(_DISTANCE, np.arange(1.0, len(distance) + 1),
+    return Panel(_DISTANCE_LABEL, np.arange(1.0, len(distance) + 1),
                  {"trial": distance, "95 % ellipsoid": limit}, "trial", log=True)  # fmt: skip
 
 
-def judge_intervals(samples: Sequence[Sample]) -> Judgement:
+def evaluate_printed_intervals(samples: Sequence[Sample]) -> Evaluation:
     """Check how many estimates lie inside the printed intervals."""
     check = check_mean(
-        "fraction of the estimates within the printed 95 % intervals", collect(samples, "printed"),
+        "fraction of the estimates within the printed 95 % intervals", collect_values(samples, "printed"),
         (1.0 - MAX_EXCEPTIONS, 1.0), "at most twice the 5 % expected outside a 95 % interval",
     )  # fmt: skip
-    return Judgement((check,))
+    return Evaluation((check,))
 
 
-def judge_deviations(samples: Sequence[Sample]) -> Judgement:
+def evaluate_standard_deviations(samples: Sequence[Sample]) -> Evaluation:
     """Compare the standard deviations with those of the printed intervals."""
-    ratio = np.mean([sample.arrays["std"] for sample in samples], axis=0) / _STD
+    ratio = np.mean([sample.arrays["std"] for sample in samples], axis=0) / _PRINTED_DEVIATIONS
     low, high = int(np.argmin(ratio)), int(np.argmax(ratio))
     words = "standard deviation over the printed one, "
     reason = "noise and geometry of the model are chosen to agree within a factor of two"
-    return Judgement(
+    return Evaluation(
         (
             check_exact(f"{words}smallest ({SYMBOLS[low]})", ratio[low], (0.5, 2.0), reason),
             check_exact(f"{words}largest ({SYMBOLS[high]})", ratio[high], (0.5, 2.0), reason),
@@ -290,29 +290,29 @@ def judge_deviations(samples: Sequence[Sample]) -> Judgement:
     )
 
 
-def judge_history(samples: Sequence[Sample]) -> Judgement:
+def evaluate_history(samples: Sequence[Sample]) -> Evaluation:
     """Check how many estimates lie inside their own intervals about the mean of the series."""
-    return Judgement((
+    return Evaluation((
         check_mean(
             "fraction of the estimates after the first trial within their intervals",
-            collect(samples, "inside"), (1.0 - MAX_EXCEPTIONS, 1.0),
+            collect_values(samples, "inside"), (1.0 - MAX_EXCEPTIONS, 1.0),
             '"mostly": at most twice the 5 % expected outside a 95 % interval'),
         check_mean(
             "fraction of the 24 estimates of the first trial outside their intervals",
-            collect(samples, "first"), (MAX_EXCEPTIONS, 1.0),
+            collect_values(samples, "first"), (MAX_EXCEPTIONS, 1.0),
             '"exceptions": more than twice the 5 % expected outside a 95 % interval'),
     ))  # fmt: skip
 
 
-def judge_first_parameter(samples: Sequence[Sample]) -> Judgement:
+def evaluate_first_parameter(samples: Sequence[Sample]) -> Evaluation:
     """Check whether estimates of p1 are outside their intervals more often than others."""
     check = check_mean(
-        "fraction of the estimates of p1 outside their intervals", collect(samples, "p1"),
+        "fraction of the estimates of p1 outside their intervals", collect_values(samples, "p1"),
         (MAX_EXCEPTIONS, 1.0),
         '"exceptions": more than twice the 5 % expected outside a 95 % interval',
     )  # fmt: skip
-    others = 100.0 * (1.0 - float(np.mean(collect(samples, "inside"))))
-    return Judgement(
+    others = 100.0 * (1.0 - float(np.mean(collect_values(samples, "inside"))))
+    return Evaluation(
         (check,),
         f"only the simulated force noise changes from trial to trial, and the covariance includes"
         f" all of it, so that p1 is no exception ({others:.1f} % of all estimates are"
@@ -321,10 +321,10 @@ def judge_first_parameter(samples: Sequence[Sample]) -> Judgement:
     )
 
 
-def judge_first_trial(samples: Sequence[Sample]) -> Judgement:
+def evaluate_first_trial(samples: Sequence[Sample]) -> Evaluation:
     """Check whether the friction excess moves the first trial out of the ellipsoid."""
-    cold, warm = (collect(samples, name) for name in ("first distance", "warm first distance"))
-    return Judgement(
+    cold, warm = (collect_values(samples, name) for name in ("first distance", "warm first distance"))
+    return Evaluation(
         (
             check_fraction("fraction of the first trials outside the ellipsoid", cold > CHI2_LIMIT,
                            reason="more than half of the series; the document had one"),
@@ -337,25 +337,25 @@ def judge_first_trial(samples: Sequence[Sample]) -> Judgement:
     )  # fmt: skip
 
 
-def judge_ellipsoid(samples: Sequence[Sample]) -> Judgement:
+def evaluate_ellipsoid(samples: Sequence[Sample]) -> Evaluation:
     """Compare the fraction of trials within the ellipsoid with 99 of 99 in the document."""
     distance = np.concatenate([sample.arrays["distance"][1:] for sample in samples])
-    published = TRIALS - 1
+    published = TRIALS_PER_SERIES - 1
     low = float(binomtest(published, published).proportion_ci(CONFIDENCE, "exact").low)
     check = check_fraction(
         "fraction of the trials after the first within the ellipsoid", distance < CHI2_LIMIT,
         (low, 1.0), f"95 % interval of the document's {published} of {published}", published=1.0,
     )  # fmt: skip
-    rippled, shift = (np.mean(collect(samples, name)) for name in ("rippled", "common shift"))
-    return Judgement(
+    rippled, shift = (np.mean(collect_values(samples, name)) for name in ("rippled", "common shift"))
+    return Evaluation(
         (check,),
         f"if the covariance is that of the differences between trials, 5 % are outside a 95 %"
         f" ellipsoid; all {published} are then within it with a probability of"
         f" {100 * 0.95**published:.1f} %. A covariance of residuals also includes errors that"
-        f" repeat in every trial: with a repeatable force of {RIPPLE:g} N in every drive,"
+        f" repeat in every trial: with a repeatable force of {RIPPLE_FORCE:g} N in every drive,"
         f" {100 * rippled:.1f} % are within it",
         f"the mean of a series is {shift:.2f} standard deviations from the model's values, where"
-        f" {np.sqrt(len(TABLE) / published):.2f} are expected of {published} independent trials",
+        f" {np.sqrt(len(PUBLISHED_PARAMETERS) / published):.2f} are expected of {published} independent trials",
     )  # fmt: skip
 
 
@@ -391,19 +391,19 @@ def check_bias(quantity: str, mean: np.ndarray, covariance: np.ndarray, count: i
     )  # fmt: skip
 
 
-def judge_least_squares(samples: Sequence[Sample]) -> Judgement:
+def evaluate_least_squares(samples: Sequence[Sample]) -> Evaluation:
     """Check the bias of least squares for cross-correlated forces of the drives."""
     truth = load_robot().truth
     value = np.concatenate([sample.arrays["least_squares"][1:] for sample in samples])
     equations = NormalEquations(simulate_excitation().matrix)
     normal = np.linalg.inv(equations.information(np.eye(6)))
-    noise = force_covariance() / PERIODS
+    noise = compute_force_covariance() / PERIODS_PER_TRIAL
     covariance = normal @ equations.information(noise) @ normal
     best = np.linalg.inv(equations.information(np.linalg.inv(noise)))
     wide = np.exp(0.5 * np.mean(np.log(np.diag(covariance) / np.diag(best))))
     check = check_bias("bias of least squares in standard deviations of one estimate",
                        value.mean(axis=0) - truth, covariance, len(value))  # fmt: skip
-    return Judgement(
+    return Evaluation(
         (check,),
         "if the regressor has no noise, least squares is unbiased for any covariance of the"
         f" forces; it is only less precise: its standard deviations are {wide:.2f} times those"
@@ -418,7 +418,7 @@ METHODS = {
 }
 
 
-def measure_reaction(seed: int, changes: Changes) -> Sample:
+def measure_encoder_feedback(seed: int, changes: Changes) -> Sample:
     """Estimate the parameters if controllers feed encoder noise back into the forces.
 
     Args:
@@ -428,10 +428,10 @@ def measure_reaction(seed: int, changes: Changes) -> Sample:
     Returns:
         Errors (24,) of the estimates by each of `METHODS`, in printed standard deviations.
     """
-    settings = read_settings({"length_noise": 1.0}, changes)
+    settings = merge_settings({"length_noise": 1.0}, changes)
     own, cycle, periods = load_robot(), simulate_excitation(), 2
     record = simulate_measurement(
-        cycle, periods, np.random.default_rng([21, seed]), control_gains(),
+        cycle, periods, np.random.default_rng([21, seed]), compute_control_gains(),
         settings["length_noise"] * LENGTH_NOISE,
     )  # fmt: skip
     sampled = NormalEquations(own.matrix(process_lengths(record, cycle.period, "raw")))
@@ -444,10 +444,10 @@ def measure_reaction(seed: int, changes: Changes) -> Sample:
         "periods, Gauss-Markov": estimate(
             own.matrix(mean.motion), mean.force, mean.covariance, order=0).value,
     }  # fmt: skip
-    return Sample({}, arrays={name: (one - own.truth) / _STD for name, one in value.items()})
+    return Sample({}, arrays={name: (one - own.truth) / _PRINTED_DEVIATIONS for name, one in value.items()})
 
 
-def judge_reaction(samples: Sequence[Sample]) -> Judgement:
+def evaluate_encoder_feedback(samples: Sequence[Sample]) -> Evaluation:
     """Check which methods are biased by noise common to regressor and forces."""
     checks = []
     for name, words in METHODS.items():
@@ -460,11 +460,11 @@ def judge_reaction(samples: Sequence[Sample]) -> Judgement:
             "bias exceeds random error" if biased else "a standard deviation of one experiment",
             unit="printed standard deviations",
         ))  # fmt: skip
-    return Judgement(tuple(checks))
+    return Evaluation(tuple(checks))
 
 
-_CLAIM_TOO_SMALL = {"claimed_noise": 0.5}
-_HALF_NOISE = "the covariance assumes half of the actual noise"
+_COVARIANCE_FAULT = {"claimed_noise": 0.5}
+_COVARIANCE_FAULT_TEXT = "the covariance assumes half of the actual noise"
 
 TRIAL_SERIES = Experiment(
     "trials",
@@ -473,12 +473,12 @@ TRIAL_SERIES = Experiment(
         Claim(
             "estimates within the printed intervals",
             "24 parameters with 95 % confidence intervals",
-            "Table 2", "document", judge_intervals,
+            "Table 2", "document", evaluate_printed_intervals,
             {"processing": "raw"}, "poses are differentiated without a filter", (),
         ),
         Claim(
             "standard deviations", "24 standard deviations (of the printed intervals)", "Table 2",
-            "input", judge_deviations, None, "", (),
+            "input", evaluate_standard_deviations, None, "", (),
         ),
         Claim(
             "history of the estimates",
@@ -486,13 +486,13 @@ TRIAL_SERIES = Experiment(
             ' observed though, such the very small first rigid-body parameter and the first few'
             ' measurement trials." "due to the variation of friction at the beginning of the'
             ' measurement process until a nearly stationary state is reached."',
-            "Fig. 8, section 5.3", "document", judge_history, _CLAIM_TOO_SMALL, _HALF_NOISE,
+            "Fig. 8, section 5.3", "document", evaluate_history, _COVARIANCE_FAULT, _COVARIANCE_FAULT_TEXT,
             tuple(f"{SYMBOLS[k]} over its mean [1]" for k in (0, 1, 4, 9, 12, 18)),
         ),
         Claim(
             "exception of the first parameter",
             '"Some exceptions are observed though, such the very small first rigid-body parameter"',
-            "Fig. 8, section 5.3", "document", judge_first_parameter,
+            "Fig. 8, section 5.3", "document", evaluate_first_parameter,
             {"claimed_noise": 2.0}, "the covariance assumes twice the actual noise",
             (f"{SYMBOLS[0]} over its mean [1]",),
         ),
@@ -500,34 +500,34 @@ TRIAL_SERIES = Experiment(
             "first trial outside the ellipsoid",
             '"Excepting the first trial, the set of all parameters lays clearly within the'
             ' confidence ellipsoid"; radius 36.42',
-            "Fig. 9, section 5.3", "document", judge_first_trial,
-            {"friction_excess": 0.0}, "friction is stationary from the start", (_DISTANCE,),
+            "Fig. 9, section 5.3", "document", evaluate_first_trial,
+            {"friction_excess": 0.0}, "friction is stationary from the start", (_DISTANCE_LABEL,),
         ),
         Claim(
             "all other trials within the ellipsoid",
             '"Excepting the first trial, the set of all parameters lays clearly within the'
             ' confidence ellipsoid"; radius 36.42, 100 trials',
-            "Fig. 9, section 5.3", "document", judge_ellipsoid, _CLAIM_TOO_SMALL, _HALF_NOISE,
-            (_DISTANCE,),
+            "Fig. 9, section 5.3", "document", evaluate_ellipsoid, _COVARIANCE_FAULT, _COVARIANCE_FAULT_TEXT,
+            (_DISTANCE_LABEL,),
         ),
         Claim(
             "bias of least squares",
             '"Neglecting this fact by applying the simple LS-method will lead to biased estimates"',
-            "section 3, after (21)", "document", judge_least_squares,
+            "section 3, after (21)", "document", evaluate_least_squares,
             {"friction_excess": 0.0}, "friction is stationary from the start", (),
         ),
     ),
 )  # fmt: skip
 
-REACTION = Experiment(
+ENCODER_FEEDBACK = Experiment(
     "controllers that react to encoder noise",
-    measure_reaction,
+    measure_encoder_feedback,
     (
         Claim(
             "bias by controllers",
             "controllers feed encoder noise back into the forces; least squares and"
             " Gauss-Markov on samples are then biased, the frequency-domain processing is not",
-            "section 3, after (21)", "additional", judge_reaction,
+            "section 3, after (21)", "additional", evaluate_encoder_feedback,
             {"length_noise": 0.001}, "encoders without noise", (),
         ),
     ),

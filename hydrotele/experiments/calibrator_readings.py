@@ -14,20 +14,20 @@ import numpy as np
 
 from hydrotele.calibrate.arm import calibrated_machine, identify_arm, identify_jointly
 from hydrotele.calibrate.arm_poses import Poses
-from hydrotele.calibrate.design import STILL, SWEEPS, Clean, Sweep
-from hydrotele.calibrate.loop import Loop, ball_place, frame_of, loop_of
+from hydrotele.calibrate.design import DRIFT_FREE_SWEEPS, PUBLISHED_SWEEPS, Sweep, SweepPoses
+from hydrotele.calibrate.loop import CalibrationLoop, ball_position, build_loop, frame_after_links
 from hydrotele.control.resolved_motion import pose_to_joints
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import Pose
-from hydrotele.simulate.mechanism import TIP_SITE, assemble, mjcf_document
+from hydrotele.simulate.mechanism import TIP_SITE, assemble_mjcf, mjcf_document
 
-RESOLVER = np.radians(0.1)
+MAX_RESOLVER_ERROR = np.radians(0.1)
 """Largest error of a resolver, uniformly distributed [rad]; Khoshzaban 1992, section 2.5."""
 
 
 def simulate_readings(
-    loop: Loop, clean: Clean, rng: np.random.Generator | None, accuracy: float = RESOLVER,
-    extra: np.ndarray | None = None,
+    loop: CalibrationLoop, clean: SweepPoses, rng: np.random.Generator | None, accuracy: float = MAX_RESOLVER_ERROR,
+    extra_errors: np.ndarray | None = None,
 ) -> Poses:  # fmt: skip
     """Simulate the sensor readings of one calibration stage.
 
@@ -36,27 +36,25 @@ def simulate_readings(
         clean: true poses.
         rng: random generator of the errors, uniform within +-accuracy; None for no errors.
         accuracy: largest error of every angle sensor [rad].
-        extra: (M, N) additional errors, such as those of bent joints [rad].
+        extra_errors: (M, N) additional errors, such as those of bent joints [rad].
 
     Returns:
         The measured poses.
     """
     shown = clean.theta - loop.values[:, 0]
-    if extra is not None:
-        shown = shown + extra
+    if extra_errors is not None:
+        shown = shown + extra_errors
     if rng is not None:
         shown = shown + rng.uniform(-accuracy, accuracy, shown.shape)
-    sigma = np.full(len(loop) - loop.moved, accuracy / np.sqrt(3.0))
+    sigma = np.full(len(loop) - loop.powered_count, accuracy / np.sqrt(3.0))
     return Poses(
-        clean.link, shown[:, loop.moved :], sigma,
-        {name: shown[:, k] for k, name in enumerate(loop.links[: loop.moved]) if name != "pitch"},
+        clean.link, shown[:, loop.powered_count :], sigma,
+        {name: shown[:, k] for k, name in enumerate(loop.links[: loop.powered_count]) if name != "pitch"},
         accuracy / np.sqrt(3.0), f"simulated {clean.link}",
     )  # fmt: skip
 
 
-def draw_sweeps(
-    rng: np.random.Generator, drift: bool = True, share: float = 1.0
-) -> dict[str, Sweep]:
+def draw_sweeps(rng: np.random.Generator, drift: bool = True, pose_fraction: float = 1.0) -> dict[str, Sweep]:
     """Draw a random sweep of every link within the ranges of Khoshzaban 1992, Figs 16 to 18.
 
     The scan does not show the motion over time. The number of cycles is therefore uniform in 1 to
@@ -65,7 +63,7 @@ def draw_sweeps(
     Args:
         rng: random generator of cycles and phase.
         drift: whether held links drift as in the figures.
-        share: fraction of the document's number of poses.
+        pose_fraction: fraction of the document's number of poses.
 
     Returns:
         Link -> sweep.
@@ -73,44 +71,48 @@ def draw_sweeps(
     return {
         link: sweep._replace(
             cycles=float(rng.uniform(1.0, 3.0)), phase=float(rng.uniform(0.0, 2.0 * np.pi)),
-            poses=round(share * sweep.poses),
+            poses=round(pose_fraction * sweep.poses),
         )
-        for link, sweep in (SWEEPS if drift else STILL).items()
+        for link, sweep in (PUBLISHED_SWEEPS if drift else DRIFT_FREE_SWEEPS).items()
     }  # fmt: skip
 
 
-def bend_level_joints(
-    loop: Loop, clean: Clean, rng: np.random.Generator, degrees: float = 1.0, share: float = 0.35,
-    lasting: bool = False,
+def draw_gravity_bends(
+    loop: CalibrationLoop, clean: SweepPoses, rng: np.random.Generator, deviation_deg: float = 1.0,
+    bent_fraction: float = 0.35,
+    constant: bool = False,
 ) -> np.ndarray:  # fmt: skip
     """Draw errors of joints bent by gravity, as in Khoshzaban 1992, section 3.7.3 (p. 61).
 
-    N(0, `degrees`) is added to the grapple and yoke angles in the poses in which gravity bends them
+    N(0, `deviation_deg`) is added to the grapple and yoke angles in the poses in which gravity bends them
     most. In these poses the calibrator's arm is closest to horizontal.
 
     Args:
         loop: true chain.
         clean: true poses.
         rng: random generator of the errors.
-        degrees: standard deviation of the errors [deg].
-        share: fraction of the poses in which joints bend; the document gives none.
-        lasting: whether a joint has the same error in all bent poses.
+        deviation_deg: standard deviation of the errors [deg].
+        bent_fraction: fraction of the poses in which joints bend; the document gives none.
+        constant: whether a joint has the same error in all bent poses.
 
     Returns:
         (M, N) errors [rad].
     """
-    _, turn = frame_of(loop, len(loop) - 2, clean.theta)
+    _, turn = frame_after_links(loop, len(loop) - 2, clean.theta)
     slope = np.abs(turn[:, 2, 2])  # of the arm's direction along the vertical
-    bent = slope <= np.quantile(slope, share)
+    bent = slope <= np.quantile(slope, bent_fraction)
     extra = np.zeros_like(clean.theta)
-    places = [loop.moved, loop.moved + 1]
-    drawn = rng.standard_normal((1 if lasting else bent.sum(), 2))
-    extra[np.ix_(bent, places)] = np.radians(degrees) * drawn
+    places = [loop.powered_count, loop.powered_count + 1]
+    drawn = rng.standard_normal((1 if constant else bent.sum(), 2))
+    extra[np.ix_(bent, places)] = np.radians(deviation_deg) * drawn
     return extra
 
 
-def bend_pulled_in_joints(
-    loop: Loop, clean: Clean, sizes: Mapping[str, float], share: float = 0.28
+def compute_retraction_bends(
+    loop: CalibrationLoop,
+    clean: SweepPoses,
+    max_errors: Mapping[str, float],
+    bent_fraction: float = 0.28,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute errors of joints that bend when the stick is retracted (Khoshzaban 1992, p. 69).
 
@@ -120,8 +122,8 @@ def bend_pulled_in_joints(
     Args:
         loop: true chain.
         clean: true poses of the stick's stage; the errors of another stage are zero.
-        sizes: calibrator joint -> largest error [rad].
-        share: fraction of the poses in the bent region.
+        max_errors: calibrator joint -> largest error [rad].
+        bent_fraction: fraction of the poses in the bent region.
 
     Returns:
         (errors (M, N) [rad], whether a pose is in the region (M,)).
@@ -129,41 +131,44 @@ def bend_pulled_in_joints(
     extra, inside = np.zeros_like(clean.theta), np.zeros(len(clean.theta), bool)
     if clean.link == "stick":
         angle = clean.theta[:, loop.links.index("stick")]
-        edge = np.quantile(angle, 1.0 - share)
+        edge = np.quantile(angle, 1.0 - bent_fraction)
         inside = angle > edge
         depth = np.clip((angle - edge) / (angle.max() - edge), 0.0, None)
-        for joint, size in sizes.items():
+        for joint, size in max_errors.items():
             extra[:, loop.links.index(joint)] = size * depth
     return extra, inside
 
 
 def perturb_loop(
-    loop: Loop, rng: np.random.Generator, length: float = 0.03, angle: float = 1.0,
-    sensors: float = 0.0,
-) -> Loop:  # fmt: skip
+    loop: CalibrationLoop, rng: np.random.Generator, length_deviation: float = 0.03, angle_deviation: float = 1.0,
+    sensor_offset: float = 0.0,
+) -> CalibrationLoop:  # fmt: skip
     """Draw a true chain with manufacturing and wear errors relative to the nominal chain.
 
     The manipulator's lengths and the ball position get errors N(0, length) [m]. Its twists and the
     offsets of grapple, yoke and twist get errors N(0, angle) [deg]. The manipulator's sensors get
     offsets N(0, sensors) [deg]. The calibrator's links are known and get no errors.
     """
-    values, m = loop.values.copy(), loop.moved
+    values, m = loop.values.copy(), loop.powered_count
     for k in range(m + 1):
-        values[k, 2] += length * rng.standard_normal()
-        values[k, 1] += np.radians(angle) * rng.standard_normal()
+        values[k, 2] += length_deviation * rng.standard_normal()
+        values[k, 1] += np.radians(angle_deviation) * rng.standard_normal()
         if k < m and loop.parallel[k]:
-            values[k, 4] += np.radians(angle) * rng.standard_normal()
-    values[1, 3] += length * rng.standard_normal()
-    values[m, 3] += length * rng.standard_normal()
-    values[m : m + 3, 0] += np.radians(angle) * rng.standard_normal(3)
-    if sensors:
-        values[1:m, 0] += np.radians(sensors) * rng.standard_normal(m - 1)
-    ball = loop.ball + np.array([1.0, 0.0, 1.0]) * length * rng.standard_normal(3)
+            values[k, 4] += np.radians(angle_deviation) * rng.standard_normal()
+    values[1, 3] += length_deviation * rng.standard_normal()
+    values[m, 3] += length_deviation * rng.standard_normal()
+    values[m : m + 3, 0] += np.radians(angle_deviation) * rng.standard_normal(3)
+    if sensor_offset:
+        values[1:m, 0] += np.radians(sensor_offset) * rng.standard_normal(m - 1)
+    ball = loop.ball + np.array([1.0, 0.0, 1.0]) * length_deviation * rng.standard_normal(3)
     return replace(loop, values=values, ball=ball)
 
 
-def true_numbers(
-    loop: Loop, nominal: Loop, names: Sequence[str], clean: Sequence[Clean]
+def find_true_parameters(
+    loop: CalibrationLoop,
+    nominal: CalibrationLoop,
+    names: Sequence[str],
+    clean: Sequence[SweepPoses],
 ) -> np.ndarray:
     """Return the true values of identified parameters.
 
@@ -184,7 +189,7 @@ def true_numbers(
         if kind == "held":
             found.append(float(stages[loop.links[place - 1]].theta[:, place].mean()))
         elif kind in ("p_xy", "p_z"):
-            seen = ball_place(loop, place, stages[link].theta[:1, place + 1 :])[0]
+            seen = ball_position(loop, place, stages[link].theta[:1, place + 1 :])[0]
             height = seen[2] - loop.values[place, 3] + nominal.values[place, 3]
             found.append(float(np.hypot(*seen[:2]) if kind == "p_xy" else height))
         else:
@@ -192,16 +197,14 @@ def true_numbers(
     return np.array(found)
 
 
-TARGETS = tuple(
-    (r, z, theta) for r in (4.2, 5.0, 5.8) for z in (1.8, 2.6, 3.4) for theta in (-0.6, 0.5)
-)
+TIP_TARGETS = tuple((r, z, theta) for r in (4.2, 5.0, 5.8) for z in (1.8, 2.6, 3.4) for theta in (-0.6, 0.5))
 """Tip target positions: r [m], z [m] above ground, theta [rad]."""
 
 
-def tip_errors(
-    nominal: Machine, true: Machine, loop: Loop, stages: Sequence[Poses]
+def compute_tip_errors(
+    nominal: Machine, true: Machine, loop: CalibrationLoop, stages: Sequence[Poses]
 ) -> tuple[float, float]:
-    """Return the RMS distance of the true arm's tip from the `TARGETS`.
+    """Return the RMS distance of the true arm's tip from the `TIP_TARGETS`.
 
     Resolved motion converts each target to joint angles with the nominal or the calibrated machine.
     The true joints are set so that the sensors, corrected by the known offsets, read these angles.
@@ -216,27 +219,29 @@ def tip_errors(
     Returns:
         (with the nominal machine, with the calibrated one) [m].
     """
-    known = loop_of(nominal)
+    known = build_loop(nominal)
     hierarchical = identify_arm(known, stages)
     fit = identify_jointly(hierarchical, stages)
     made = calibrated_machine(nominal, fit, stages)
-    document = mjcf_document(assemble(true, ground=False, looks=False))
+    document = mjcf_document(assemble_mjcf(true, ground=False, visuals=False))
     model = document.compile()
     data = mujoco.MjData(model)
     sums = []
     for machine in (nominal, made):
-        squares = [_miss(machine, known, loop, model, data, target) for target in TARGETS]
+        squares = [_compute_square_error(machine, known, loop, model, data, target) for target in TIP_TARGETS]
         sums.append(float(np.sqrt(np.mean(squares))))
     return sums[0], sums[1]
 
 
-def _miss(machine: Machine, known: Loop, loop: Loop, model, data, target) -> float:
+def _compute_square_error(
+    machine: Machine, known: CalibrationLoop, loop: CalibrationLoop, model, data, target
+) -> float:
     """Return the squared distance of the tip from a target [m^2]."""
     r, z, theta = target
     here = {name: machine.home.get(axis.joint, 0.0) for name, axis in machine.axes.items()}
     joints = pose_to_joints(machine, Pose(r=r, z=z, theta=theta), here, "target")
     data.qpos[:] = 0.0
-    for k, link in enumerate(loop.links[: loop.moved]):
+    for k, link in enumerate(loop.links[: loop.powered_count]):
         if link not in joints:
             continue
         error = machine.sensor_errors.get(loop.channels[k])

@@ -110,10 +110,10 @@ class Check(NamedTuple):
         'ratio 1.52 [1.31, 1.8] (published 11)'
         """
         unit = f" {self.unit}" if self.unit else ""
-        text = f"{self.quantity} {_format(self.value)}"
+        text = f"{self.quantity} {_format_value(self.value)}"
         if self.low < self.high:
-            text += f" [{_format(self.low)}, {_format(self.high)}]"
-        published = "" if self.published is None else f" (published {_format(self.published)})"
+            text += f" [{_format_value(self.low)}, {_format_value(self.high)}]"
+        published = "" if self.published is None else f" (published {_format_value(self.published)})"
         return f"{text}{unit}{published}"
 
     def describe_range(self) -> str:
@@ -124,19 +124,19 @@ class Check(NamedTuple):
         """
         (least, most), unit = self.accepted, f" {self.unit}" if self.unit else ""
         if np.isinf(most):
-            words = f"at least {_format(least)}"
+            words = f"at least {_format_value(least)}"
         elif np.isinf(least):
-            words = f"at most {_format(most)}"
+            words = f"at most {_format_value(most)}"
         else:
-            words = f"{_format(least)} to {_format(most)}"
+            words = f"{_format_value(least)} to {_format_value(most)}"
         return f"{self.quantity} {words}{unit}" + (f": {self.reason}" if self.reason else "")
 
 
-def _format(value: float) -> str:
+def _format_value(value: float) -> str:
     return f"{value:.3g}" if abs(value) < 1e3 or np.isinf(value) else f"{value:.0f}"
 
 
-class Judgement(NamedTuple):
+class Evaluation(NamedTuple):
     """Evaluation of a claim with the samples of its experiment.
 
     Attributes:
@@ -172,7 +172,7 @@ class Comparison(NamedTuple):
         item: table, figure, equation or section of the document, with its page.
         published: sentence or values of the document.
         kind: see `Kind`.
-        judgement: evaluation of the claim.
+        evaluation: evaluation of the claim.
         panels: curves to draw.
         marginals: posterior to draw.
     """
@@ -181,35 +181,35 @@ class Comparison(NamedTuple):
     item: str
     published: str
     kind: Kind
-    judgement: Judgement
+    evaluation: Evaluation
     panels: tuple[Panel, ...] = ()
     marginals: Marginals | None = None
 
     @property
     def verdict(self) -> Verdict:
         """Verdict of the judgement; `no verdict` if only a caption is published."""
-        return self.judgement.verdict
+        return self.evaluation.verdict
 
     @property
     def simulated(self) -> str:
         """Simulated values with their intervals, as text."""
-        parts = [check.describe() for check in self.judgement.checks]
-        return "; ".join([*parts, *([self.judgement.note] if self.judgement.note else [])])
+        parts = [check.describe() for check in self.evaluation.checks]
+        return "; ".join([*parts, *([self.evaluation.note] if self.evaluation.note else [])])
 
     @property
     def criterion(self) -> str:
         """Accepted ranges of all checks with their reasons, as text."""
-        return "; ".join(check.describe_range() for check in self.judgement.checks)
+        return "; ".join(check.describe_range() for check in self.evaluation.checks)
 
     @property
     def explanation(self) -> str:
         """Measured reason for a difference, or the reason why nothing can be computed."""
-        return self.judgement.unavailable or self.judgement.explanation
+        return self.evaluation.unavailable or self.evaluation.explanation
 
     def row(self) -> dict[str, Any]:
         """Return the row as a dictionary, as printed with `--json`."""
         checks = [
-            check._asdict() | {"verdict": check.verdict} for check in self.judgement.checks
+            check._asdict() | {"verdict": check.verdict} for check in self.evaluation.checks
         ]  # fmt: skip
         return {
             "name": self.name, "item": self.item, "kind": self.kind, "published": self.published,
@@ -248,29 +248,29 @@ class Claim:
             the statement of this project.
         item: table, figure, equation or section, with its page.
         kind: see `Kind`.
-        judge: samples of all repetitions -> judgement.
-        broken: fault (changed settings) for which the verdict must be `differs`; None if the claim
+        evaluate: samples of all repetitions -> judgement.
+        fault: fault (changed settings) for which the verdict must be `differs`; None if the claim
             has no verdict.
-        broken_how: description of the fault.
-        panels: labels of the sample's panels to draw; None for all.
+        fault_description: description of the fault.
+        panel_labels: labels of the sample's panels to draw; None for all.
     """
 
     name: str
     quote: str
     item: str
     kind: Kind
-    judge: Callable[[Sequence[Sample]], Judgement]
-    broken: Changes | None = None
-    broken_how: str = ""
-    panels: tuple[str, ...] | None = None
+    evaluate: Callable[[Sequence[Sample]], Evaluation]
+    fault: Changes | None = None
+    fault_description: str = ""
+    panel_labels: tuple[str, ...] | None = None
 
     def compare(self, samples: Sequence[Sample]) -> Comparison:
         """Evaluate the claim with at least one sample; the first sample provides the curves."""
         panels = tuple(panel for panel in samples[0].panels
-                       if self.panels is None or panel.label in self.panels)  # fmt: skip
+                       if self.panel_labels is None or panel.label in self.panel_labels)  # fmt: skip
         return Comparison(
-            self.name, self.item, self.quote, self.kind, self.judge(samples), panels,
-            samples[0].marginals if self.panels is None else None,
+            self.name, self.item, self.quote, self.kind, self.evaluate(samples), panels,
+            samples[0].marginals if self.panel_labels is None else None,
         )  # fmt: skip
 
 
@@ -283,7 +283,7 @@ class Experiment:
         measure: (seed from 1 on, changes of its settings) -> sample.
         claims: claims evaluated with the samples.
         max_repetitions: upper limit of the number of repetitions, which bounds the run time.
-        repetitions_fixed: fixed number of repetitions: 1 if nothing is random, or the number of
+        fixed_repetitions: fixed number of repetitions: 1 if nothing is random, or the number of
             conditions; 0 if the number is not fixed.
     """
 
@@ -291,11 +291,11 @@ class Experiment:
     measure: Callable[[int, Changes], Sample]
     claims: tuple[Claim, ...] = field(default=())
     max_repetitions: int = 1000
-    repetitions_fixed: int = 0
+    fixed_repetitions: int = 0
 
     def repetitions(self, requested: int) -> int:
         """Return the number of repetitions to run for a requested number."""
-        return self.repetitions_fixed or min(requested, self.max_repetitions)
+        return self.fixed_repetitions or min(requested, self.max_repetitions)
 
 
 @dataclass(frozen=True)
@@ -308,7 +308,7 @@ class Series:
         repetitions: default number of repetitions.
         experiments: experiments in the order of the document.
         unavailable: rows that cannot be computed, each with the reason.
-        drawings: table or figure without a result -> its content, such as `photograph`.
+        items_without_result: table or figure without a result -> its content, such as `photograph`.
     """
 
     name: str
@@ -316,7 +316,7 @@ class Series:
     repetitions: int
     experiments: tuple[Experiment, ...]
     unavailable: tuple[Comparison, ...] = ()
-    drawings: Mapping[str, str] = field(default_factory=dict)
+    items_without_result: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def claims(self) -> dict[str, Claim]:
@@ -327,7 +327,7 @@ class Series:
 Progress = Callable[[str, float], None]
 """Called with the name of the finished task and the finished fraction."""
 
-BROKEN_REPETITIONS = 6
+FAULT_REPETITIONS = 6
 """Repetitions with a fault: the smallest n for which 0 of n successes gives a 95 % interval of the
 fraction below one half."""
 
@@ -367,7 +367,7 @@ def compare_by_seeds(
         Number of repetitions -> rows.
     """
     planned = [(one, {}, one.repetitions(max(counts))) for one in series.experiments]
-    measured = measure_experiments(planned, jobs, progress)
+    measured = run_experiments(planned, jobs, progress)
     return {
         count: [
             claim.compare(samples[: one.repetitions(count)])
@@ -378,7 +378,7 @@ def compare_by_seeds(
     }  # fmt: skip
 
 
-def break_series(
+def run_with_faults(
     series: Series, names: Sequence[str] = (), jobs: int | None = None,
     progress: Progress | None = None,
 ) -> list[tuple[Claim, Comparison]]:  # fmt: skip
@@ -394,15 +394,15 @@ def break_series(
         The claims, each with a row whose verdict should be `differs`.
     """
     chosen = [(one, claim) for one in series.experiments for claim in one.claims
-              if claim.broken is not None and (not names or claim.name in names)]  # fmt: skip
-    planned = [(one, claim.broken or {}, one.repetitions(BROKEN_REPETITIONS))
+              if claim.fault is not None and (not names or claim.name in names)]  # fmt: skip
+    planned = [(one, claim.fault or {}, one.repetitions(FAULT_REPETITIONS))
                for one, claim in chosen]  # fmt: skip
-    measured = measure_experiments(planned, jobs, progress)
+    measured = run_experiments(planned, jobs, progress)
     return [(claim, claim.compare(samples))
             for (_, claim), samples in zip(chosen, measured, strict=True)]  # fmt: skip
 
 
-def measure_experiments(
+def run_experiments(
     planned: Sequence[tuple[Experiment, Changes, int]],
     jobs: int | None = None,
     progress: Progress | None = None,
@@ -418,9 +418,7 @@ def measure_experiments(
         For each experiment, one sample per repetition.
     """
     tasks: list[tuple[Callable[..., Any], tuple]] = [
-        (one.measure, (seed, dict(changes)))
-        for one, changes, count in planned
-        for seed in range(1, count + 1)
+        (one.measure, (seed, dict(changes))) for one, changes, count in planned for seed in range(1, count + 1)
     ]
     names = [one.name for one, _, count in planned for _ in range(count)]
     results = []
@@ -435,9 +433,7 @@ def measure_experiments(
     return found
 
 
-def run_tasks(
-    tasks: Sequence[tuple[Callable[..., Any], tuple]], jobs: int | None = None
-) -> Iterator[Any]:
+def run_tasks(tasks: Sequence[tuple[Callable[..., Any], tuple]], jobs: int | None = None) -> Iterator[Any]:
     """Run functions in several processes and yield their results in order.
 
     Args:
@@ -459,11 +455,11 @@ def run_tasks(
             yield future.result()
 
 
-def summarize(rows: Sequence[Comparison]) -> str:
+def summarize_verdicts(rows: Sequence[Comparison]) -> str:
     """Return a sentence that counts the verdicts of the published and the additional claims.
 
-    >>> row = Comparison("a", "p. 1", "", "document", Judgement(unavailable="no text"))
-    >>> summarize([row])
+    >>> row = Comparison("a", "p. 1", "", "document", Evaluation(unavailable="no text"))
+    >>> summarize_verdicts([row])
     'of 1 published results 0 agree, 0 differ, 0 undecided, 1 cannot be computed'
     """
     published = [row.verdict for row in rows if row.kind == "document"]

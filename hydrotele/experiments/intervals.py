@@ -11,31 +11,27 @@ from hydrotele.experiments.comparison import Check, Sample
 CONFIDENCE = 0.95
 """Confidence level of all intervals."""
 
-MAJORITY = (0.5, 1.0)
+MAJORITY_RANGE = (0.5, 1.0)
 """Accepted fraction of the operators.
 
 The publication had one operator; its statement agrees if it holds for more than half of a
 population of simulated operators.
 """
 
-_NORMAL = float(stats.norm.ppf(0.5 + CONFIDENCE / 2.0))
+_NORMAL_QUANTILE = float(stats.norm.ppf(0.5 + CONFIDENCE / 2.0))
 
 
-def collect(samples: Sequence[Sample], name: str) -> np.ndarray:
+def collect_values(samples: Sequence[Sample], name: str) -> np.ndarray:
     """Return the (n,) values of a named result over all samples."""
     return np.array([sample.values[name] for sample in samples])
 
 
-def check_exact(
-    quantity: str, value: float, accepted: tuple[float, float], reason: str, **more: Any
-) -> Check:
+def check_exact(quantity: str, value: float, accepted: tuple[float, float], reason: str, **more: Any) -> Check:
     """Return a check of a quantity that is not random; its interval is its value."""
     return Check(quantity, float(value), float(value), float(value), accepted, reason, **more)
 
 
-def check_mean(
-    quantity: str, values: np.ndarray, accepted: tuple[float, float], reason: str, **more: Any
-) -> Check:
+def check_mean(quantity: str, values: np.ndarray, accepted: tuple[float, float], reason: str, **more: Any) -> Check:
     """Return a check of the mean over repetitions, with Student's confidence interval.
 
     Args:
@@ -58,7 +54,7 @@ def check_mean(
 
 def check_fraction(
     quantity: str, successes: Sequence[bool] | np.ndarray,
-    accepted: tuple[float, float] = MAJORITY,
+    accepted: tuple[float, float] = MAJORITY_RANGE,
     reason: str = "more than half of the operators; the publication had one", **more: Any,
 ) -> Check:  # fmt: skip
     """Return a check of the fraction of repetitions that fulfil a condition.
@@ -107,9 +103,7 @@ def check_statistic(
     return Check(quantity, value, float(low), float(high), accepted, reason, **more)
 
 
-def check_population(
-    quantity: str, values: np.ndarray, published: float, unit: str = "", log: bool = True
-) -> Check:
+def check_population(quantity: str, values: np.ndarray, published: float, unit: str = "", log: bool = True) -> Check:
     """Return a check whether a published value lies in the central 95 % of the repetitions.
 
     The checked quantity is the distance d of the published value from the mean of the repetitions,
@@ -131,13 +125,13 @@ def check_population(
     n = len(values)
     spread = float(np.std(scaled, ddof=1)) if n > 1 else np.nan
     distance = float((goal - np.mean(scaled)) / spread) if n > 1 and spread else np.nan
-    half = _NORMAL * np.sqrt(1.0 / n + distance**2 / (2.0 * n))
+    half = _NORMAL_QUANTILE * np.sqrt(1.0 / n + distance**2 / (2.0 * n))
     typical = float(np.exp(np.mean(scaled)) if log else np.mean(values))
     words = f"{quantity} {published:.3g} {unit}".strip()
     return Check(
         f"distance of the published {words} from the simulated ones (mean {typical:.3g}) in"
         " standard deviations",
-        distance, distance - half, distance + half, (-_NORMAL, _NORMAL),
+        distance, distance - half, distance + half, (-_NORMAL_QUANTILE, _NORMAL_QUANTILE),
         "the central 95 % of the repetitions",
     )  # fmt: skip
 
@@ -154,7 +148,7 @@ def format_values(samples: Sequence[Sample], name: str, scale: float = 1.0, digi
     Returns:
         Text such as `2.1 (1.5 to 4.7)`; only the value if there is one sample.
     """
-    values = scale * collect(samples, name)
+    values = scale * collect_values(samples, name)
     mean = f"{np.mean(values):.{digits}f}"
     if len(values) == 1:
         return mean

@@ -13,8 +13,8 @@ from hydrotele.experiments.comparison import (
     Changes,
     Claim,
     Comparison,
+    Evaluation,
     Experiment,
-    Judgement,
     Panel,
     Sample,
 )
@@ -22,37 +22,41 @@ from hydrotele.experiments.intervals import (
     check_exact,
     check_mean,
     check_statistic,
-    collect,
+    collect_values,
     format_values,
 )
 from hydrotele.experiments.khoshzaban_models import (
     DRIVES,
-    PERIOD,
+    SAMPLE_PERIOD,
     UNITS,
     Motion,
-    document_setup,
     draw_motion,
     draw_states,
+    make_document_setup,
     make_regressor,
-    read_settings,
+    merge_settings,
     scale_cylinders,
     stack_rows,
 )
 from hydrotele.experiments.khoshzaban_prediction import PREDICTION
-from hydrotele.experiments.khoshzaban_sensors import ACCURACY, NOISE, SENSOR_ACCURACY
+from hydrotele.experiments.khoshzaban_sensors import (
+    FORCE_ACCURACY,
+    SENSOR_ACCURACY,
+    SENSOR_NOISE_EXPERIMENT,
+)
 from hydrotele.identify.identifiability import (
-    COMBINATION,
-    FULL,
-    UNIDENTIFIABLE,
+    STATUS_COMBINATION,
+    STATUS_FULL,
+    STATUS_UNIDENTIFIABLE,
     Identifiability,
-    identifiability,
+    classify_parameters,
 )
 
 FORCE_SETTINGS = {
     "cylinder_scale": 1.0,  # of mass, mass moments and inertia of all tubes and rods
     "rods_beyond_pins": False,  # whether rods' centres of mass lie beyond their pins
 }
-_LARGE = 0.5  # fraction of the peak force above which the factor between two forces is meaningful
+_MIN_FORCE_FRACTION = 0.5  # fraction of the peak force above which the factor between two forces is meaningful
 
 
 def measure_forces(seed: int, changes: Changes) -> Sample:
@@ -65,9 +69,9 @@ def measure_forces(seed: int, changes: Changes) -> Sample:
     Returns:
         Factors between the forces of both models, and their RMS differences.
     """
-    settings = read_settings(FORCE_SETTINGS, changes)
+    settings = merge_settings(FORCE_SETTINGS, changes)
     motion = draw_motion(np.random.default_rng(seed))
-    table = make_regressor(document_setup("complete"), motion)
+    table = make_regressor(make_document_setup("complete"), motion)
     parameters = scale_cylinders(table, settings["cylinder_scale"])
     if settings["rods_beyond_pins"]:
         turned = [name.startswith("moment_x") and name.endswith("_rod") for name in table.names]
@@ -82,14 +86,14 @@ def measure_forces(seed: int, changes: Changes) -> Sample:
     values = {}
     for k, drive in enumerate(DRIVES):
         twice = factor[:, k] >= 2.0
-        values[f"factor.{drive}"] = float(factor[share[:, k] >= _LARGE, k].max())
+        values[f"factor.{drive}"] = float(factor[share[:, k] >= _MIN_FORCE_FRACTION, k].max())
         values[f"twice.{drive}"] = float(twice.mean())
         values[f"twice_below.{drive}"] = float(share[twice, k].max(initial=0.0))
         values[f"difference.{drive}"] = float(difference[k])
         values[f"relative.{drive}"] = float(difference[k] / usual[k])
         values[f"peak_rate.{drive}"] = float(np.abs(motion[1][:, k]).max())
         values[f"peak.{drive}"] = float(np.abs(complete[:, k]).max())
-    return Sample(values, _force_panels(motion, complete, reduced))
+    return Sample(values, _draw_forces(motion, complete, reduced))
 
 
 MOTION_LABELS = ("joint angle [deg]", "joint rate [rad/s]", "joint acceleration [rad/s^2]")
@@ -99,8 +103,8 @@ FORCE_LABELS = tuple(
 )
 
 
-def _force_panels(motion: Motion, complete: np.ndarray, reduced: np.ndarray) -> tuple[Panel, ...]:
-    time = PERIOD * np.arange(len(complete))
+def _draw_forces(motion: Motion, complete: np.ndarray, reduced: np.ndarray) -> tuple[Panel, ...]:
+    time = SAMPLE_PERIOD * np.arange(len(complete))
     angles, rates, accelerations = motion
     parts = (np.rad2deg(angles), rates, accelerations)
     panels = [
@@ -115,9 +119,9 @@ def _force_panels(motion: Motion, complete: np.ndarray, reduced: np.ndarray) -> 
     return tuple(panels)
 
 
-def judge_factor(samples: Sequence[Sample]) -> Judgement:
+def evaluate_force_factor(samples: Sequence[Sample]) -> Evaluation:
     """Check whether the factor between the models' forces reaches two at large forces."""
-    largest = np.max([collect(samples, f"factor.{drive}") for drive in DRIVES], axis=0)
+    largest = np.max([collect_values(samples, f"factor.{drive}") for drive in DRIVES], axis=0)
     check = check_mean(
         "largest factor between both models' forces, of three drives, at instants with more than"
         " half of the peak force",
@@ -126,11 +130,11 @@ def judge_factor(samples: Sequence[Sample]) -> Judgement:
     )  # fmt: skip
     twice = "; ".join(
         f"{d}: {format_values(samples, f'twice.{d}', 100.0, 0)} % of the time, where its force is"
-        f" below {100 * collect(samples, f'twice_below.{d}').max():.0f} % of its peak"
+        f" below {100 * collect_values(samples, f'twice_below.{d}').max():.0f} % of its peak"
         for d in DRIVES
     )
     relative = ", ".join(f"{d} {format_values(samples, f'relative.{d}', 100.0)} %" for d in DRIVES)
-    return Judgement(
+    return Evaluation(
         (check,),
         "Table 13's cylinders of 200 kg each are too light compared with links of 1830 and 688 kg:"
         " the boom's force reaches a factor of two with cylinders eight times as heavy (2.05),"
@@ -141,9 +145,9 @@ def judge_factor(samples: Sequence[Sample]) -> Judgement:
     )
 
 
-def judge_proximal(samples: Sequence[Sample]) -> Judgement:
+def evaluate_proximal_error(samples: Sequence[Sample]) -> Evaluation:
     """Check that the boom's force error exceeds its sensor error and the stick's force error."""
-    rows = np.stack([collect(samples, f"difference.{d}") for d in ("boom", "stick")], axis=1)
+    rows = np.stack([collect_values(samples, f"difference.{d}") for d in ("boom", "stick")], axis=1)
     checks = (
         check_mean(
             "RMS difference of both models' forces, boom", rows[:, 0],
@@ -156,46 +160,45 @@ def judge_proximal(samples: Sequence[Sample]) -> Judgement:
         ),
     )  # fmt: skip
     sizes = ", ".join(
-        f"{d} {format_values(samples, f'difference.{d}', digits=0)} {u}"
-        for d, u in zip(DRIVES, UNITS, strict=True)
+        f"{d} {format_values(samples, f'difference.{d}', digits=0)} {u}" for d, u in zip(DRIVES, UNITS, strict=True)
     )
     relative = ", ".join(f"{d} {format_values(samples, f'relative.{d}', 100.0)} %" for d in DRIVES)
-    return Judgement(
+    return Evaluation(
         checks,
         "Relative to the RMS force, the stick's error is larger than the boom's.",
         note=f"RMS differences {sizes}; of the RMS force {relative}",
     )
 
 
-def judge_motion(samples: Sequence[Sample]) -> Judgement:
+def describe_motions(samples: Sequence[Sample]) -> Evaluation:
     """Describe the drawn motions; only the axis ticks of the published ones are legible."""
     rates = ", ".join(f"{d} {format_values(samples, f'peak_rate.{d}', digits=2)}" for d in DRIVES)
-    return Judgement(note=f"a new random motion in every repetition; largest rates {rates} rad/s")
+    return Evaluation(note=f"a new random motion in every repetition; largest rates {rates} rad/s")
 
 
-FORCES = Experiment(
+FORCE_COMPARISON = Experiment(
     "complete and reduced model", measure_forces,
     (
         Claim(
             "simulated motions", "Simulated trajectory of the swing, the boom, the stick (axes in"
             " the document's signs: -40 to 20, -50 to 0, 0 to 150 deg; 0.4, 0.4, 1.5 rad/s; 5 s)",
-            "Figs 30 to 32, pp. 102 to 104", "caption", judge_motion, panels=MOTION_LABELS,
+            "Figs 30 to 32, pp. 102 to 104", "caption", describe_motions, panel_labels=MOTION_LABELS,
         ),
         Claim(
             "neglected minor links: factor of two",
             '"neglecting the dynamics of the minor links (hydraulic actuators) may overestimate or'
             " underestimate the forces/torques applied to the joints/links of the arm by a factor"
             ' of two or more."',
-            "Fig. 33, pp. 105 and 123", "document", judge_factor,
-            broken={"cylinder_scale": 0.0}, broken_how="cylinders without mass",
-            panels=FORCE_LABELS,
+            "Fig. 33, pp. 105 and 123", "document", evaluate_force_factor,
+            fault={"cylinder_scale": 0.0}, fault_description="cylinders without mass",
+            panel_labels=FORCE_LABELS,
         ),
         Claim(
             "neglected minor links: proximal links",
             '"a large error in force/torque prediction results, especially for the proximal links,'
             ' if we simply ignore the dynamics of the minor links"',
-            "Fig. 33, pp. 105 and 106", "document", judge_proximal,
-            broken={"cylinder_scale": 0.0}, broken_how="cylinders without mass", panels=(),
+            "Fig. 33, pp. 105 and 106", "document", evaluate_proximal_error,
+            fault={"cylinder_scale": 0.0}, fault_description="cylinders without mass", panel_labels=(),
         ),
     ),
 )  # fmt: skip
@@ -215,22 +218,22 @@ PIN_COUNTS = {"deleted": 37, "combined": 25, "full": 20}
 """The same counts for cylinders with pins, computed by this project."""
 
 
-def count_parameters(told: Identifiability) -> dict[str, int]:
+def count_parameters(classification: Identifiability) -> dict[str, int]:
     """Count the parameters in the document's three classes.
 
     Columns without effect and columns that depend linearly on others are deleted and count as
     unidentifiable. The number of remaining columns is the rank.
 
     Args:
-        told: classification of all parameters.
+        classification: classification of all parameters.
 
     Returns:
         Counts `deleted`, `combined` (remaining columns that represent a combination) and `full`.
 
     Source: Khoshzaban 1992, p. 100.
     """
-    rank, full = len(told.base), told.counts[FULL]
-    return {"deleted": len(told.names) - rank, "combined": rank - full, "full": full}
+    rank, full = len(classification.base), classification.status_counts[STATUS_FULL]
+    return {"deleted": len(classification.names) - rank, "combined": rank - full, "full": full}
 
 
 def measure_identifiability(seed: int, changes: Changes) -> Sample:
@@ -243,25 +246,28 @@ def measure_identifiability(seed: int, changes: Changes) -> Sample:
     Returns:
         Counts of the classes, and the relative singular values on either side of the rank.
     """
-    settings = read_settings(COUNT_SETTINGS, changes)
+    settings = merge_settings(COUNT_SETTINGS, changes)
     states = draw_states(settings["states"], seed)
     values = {}
     for kind, ball in (("document", settings["ball_joints"]), ("pins", not settings["pins"])):
-        setup = document_setup("complete", ball, settings["tilt_deg"])
+        setup = make_document_setup("complete", ball, settings["tilt_deg"])
         table = make_regressor(setup, states)
-        told = identifiability(stack_rows(table), table.names, table.units)
+        told = classify_parameters(stack_rows(table), table.names, table.units)
         values |= {f"{kind}.{name}": n for name, n in count_parameters(told).items()}
-        values |= {f"{kind}.smallest": told.gap[0], f"{kind}.next": told.gap[1]}
+        values |= {
+            f"{kind}.smallest": told.singular_value_gap[0],
+            f"{kind}.next": told.singular_value_gap[1],
+        }
         status = dict(zip(told.names, told.status, strict=True))
-        lost = [name for name, s in status.items() if s == UNIDENTIFIABLE]
+        lost = [name for name, s in status.items() if s == STATUS_UNIDENTIFIABLE]
         swing = [name for name in told.names if name.endswith(".swing")][:9]
         values[f"{kind}.without_effect"] = len(lost)
         values[f"{kind}.first_nine_lost"] = float(lost == swing)
-        values[f"{kind}.swing_combined"] = float(status["inertia_zz.swing"] == COMBINATION)
+        values[f"{kind}.swing_combined"] = float(status["inertia_zz.swing"] == STATUS_COMBINATION)
     return Sample(values)
 
 
-def judge_table_13(samples: Sequence[Sample]) -> Judgement:
+def evaluate_table_13(samples: Sequence[Sample]) -> Evaluation:
     """Compare the counts with Table 13."""
     values = samples[0].values
     words = {"deleted": "unidentifiable", "combined": "linearly identifiable",
@@ -272,7 +278,7 @@ def judge_table_13(samples: Sequence[Sample]) -> Judgement:
         for name, n in TABLE_13.items()
     )  # fmt: skip
     pins = "/".join(f"{values[f'pins.{name}']:.0f}" for name in TABLE_13)
-    return Judgement(
+    return Evaluation(
         checks,
         "The counts hold for cylinders that transmit no moment about their axes (Eq. 4.23, ball"
         " joints). Cylinders with pins transmit this moment, so that six combinations of the tubes'"
@@ -282,10 +288,10 @@ def judge_table_13(samples: Sequence[Sample]) -> Judgement:
     )
 
 
-def judge_pins(samples: Sequence[Sample]) -> Judgement:
+def evaluate_pin_counts(samples: Sequence[Sample]) -> Evaluation:
     """Check the counts for cylinders with pins."""
     values = samples[0].values
-    return Judgement(
+    return Evaluation(
         tuple(
             check_exact(f"{name} parameters", values[f"pins.{name}"], (n, n), "a count")
             for name, n in PIN_COUNTS.items()
@@ -293,10 +299,10 @@ def judge_pins(samples: Sequence[Sample]) -> Judgement:
     )
 
 
-def judge_swing(samples: Sequence[Sample]) -> Judgement:
+def evaluate_swing_parameters(samples: Sequence[Sample]) -> Evaluation:
     """Check that nine swing parameters have no effect and the tenth appears in a combination."""
     values = samples[0].values
-    return Judgement(
+    return Evaluation(
         (
             check_exact("parameters without effect", values["document.without_effect"], (9, 9),
                         "the first nine of the swing", published=9),
@@ -316,31 +322,37 @@ IDENTIFIABILITY = Experiment(
             '"the 31 unidentifiable parameters in Table 13 are marked with "*", the 24 linearly'
             ' identifiable ones are marked with "f", and the 27 fully identifiable parameters are'
             ' marked with "t"."',
-            "Table 13, pp. 106 and 107", "document", judge_table_13,
-            broken={"ball_joints": False}, broken_how="cylinders that end in pins",
+            "Table 13, pp. 106 and 107", "document", evaluate_table_13,
+            fault={"ball_joints": False}, fault_description="cylinders that end in pins",
         ),
         Claim(
             "identifiability with pins",
             "With cylinders that end in pins, 37 of the 82 parameters are unidentifiable, 25"
             " linearly identifiable and 20 fully identifiable.",
-            "supplement to Table 13", "additional", judge_pins,
-            broken={"pins": False}, broken_how="cylinders that end in ball joints",
+            "supplement to Table 13", "additional", evaluate_pin_counts,
+            fault={"pins": False}, fault_description="cylinders that end in ball joints",
         ),
         Claim(
             "parameters of the swing",
             '"the first nine parameters of the first link (cabin) are not identifiable because this'
             ' link has only one degree of freedom about its z axis"; Izz, alone, is identifiable'
             " only in linear combination in a multi-link manipulator",
-            "Tables 13 and 16, pp. 107 and 113", "document", judge_swing,
-            broken={"tilt_deg": 10.0}, broken_how="a machine on ground with a slope of 10 deg",
+            "Tables 13 and 16, pp. 107 and 113", "document", evaluate_swing_parameters,
+            fault={"tilt_deg": 10.0}, fault_description="a machine on ground with a slope of 10 deg",
         ),
     ),
-    repetitions_fixed=1,
+    fixed_repetitions=1,
 )  # fmt: skip
 """Table 13."""
 
 
-EXPERIMENTS: tuple[Experiment, ...] = (FORCES, IDENTIFIABILITY, ACCURACY, NOISE, PREDICTION)
+EXPERIMENTS: tuple[Experiment, ...] = (
+    FORCE_COMPARISON,
+    IDENTIFIABILITY,
+    FORCE_ACCURACY,
+    SENSOR_NOISE_EXPERIMENT,
+    PREDICTION,
+)
 """Experiments of chapter 4, in the order of the document."""
 
 UNAVAILABLE: tuple[Comparison, ...] = (
@@ -348,7 +360,7 @@ UNAVAILABLE: tuple[Comparison, ...] = (
         "identified parameters of the UBC machine", "Tables 16 and 17, pp. 115 and 116",
         "identified parameters of the UBC hydraulic manipulator, complete and reduced model",
         "document",
-        Judgement(
+        Evaluation(
             unavailable="the excavator's logs are not published, and its parameters are unknown"
         ),
     ),
@@ -364,7 +376,7 @@ DRAWINGS = {
 }
 """Figures of chapter 4 without a result."""
 
-ITEMS = (
+TABLES_AND_FIGURES = (
     *(f"Table {n}" for n in range(13, 18)),
     *(f"Fig. {n}" for n in range(26, 38)),
 )

@@ -8,35 +8,35 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hydrotele.calibrate.design import SWEEPS, sweep_poses
-from hydrotele.calibrate.loop import loop_of
+from hydrotele.calibrate.design import PUBLISHED_SWEEPS, generate_sweep_poses
+from hydrotele.calibrate.loop import build_loop
 from hydrotele.experiments import khoshzaban_linkages
-from hydrotele.experiments.comparison import Changes, Check, Claim, Experiment, Judgement, Sample
+from hydrotele.experiments.comparison import Changes, Check, Claim, Evaluation, Experiment, Sample
 from hydrotele.experiments.intervals import (
     check_exact,
     check_fraction,
     check_population,
     check_statistic,
-    collect,
+    collect_values,
 )
 from hydrotele.experiments.khoshzaban_arm import (
-    LENGTHS,
-    MOVED,
-    NOMINAL,
-    SHORT,
-    TWISTS,
+    LENGTH_PARAMETERS,
+    LENGTH_SYMBOLS,
+    NOMINAL_LENGTHS,
+    SIMULATED_STAGES,
+    TWIST_PARAMETERS,
     check_rms_ratio,
-    choose_settings,
-    root_mean_square,
+    compute_rms,
+    merge_settings,
 )
 from hydrotele.experiments.khoshzaban_calibration import (
-    ENDS,
+    END_POINT_LINKS,
     NO_FAULTS,
     SIDES,
-    Model,
-    end_place,
+    ArmModel,
+    compute_end_position,
+    measure_bend_detection,
     measure_calibration,
-    measure_search,
 )
 from hydrotele.machine.machine_file import load_machine
 
@@ -53,9 +53,9 @@ _PRINTED_TWISTS = {
 _PRINTED_OUTER = {"a.pitch": 0.069, "a.grapple": -0.028, "d.grapple": 0.003}
 _PRINTED_OUTER_TWISTS = {"alpha.pitch": -2.5, "alpha.grapple": 5.0}
 _PRINTED_OFFSETS = (8.6, 4.2, 0.7)
-_OFFSETS = ("offset.grapple", "offset.calibrator_yoke", "offset.calibrator_twist")
+_OFFSET_PARAMETERS = ("offset.grapple", "offset.calibrator_yoke", "offset.calibrator_twist")
 
-POSITIONS = {
+PUBLISHED_POSITION_ERRORS = {
     ("identified", "manipulator"): {"stick": 0.212, "grapple": 0.256},
     ("identified", "calibrator"): {"stick": 0.542, "grapple": 0.0},
     ("reidentified", "manipulator"): {"stick": 0.153, "grapple": 0.205},
@@ -63,7 +63,7 @@ POSITIONS = {
 }
 """RMS position error of the end points relative to the nominal model, pp. 66-67 and 71 [m]."""
 
-DISTANCES = {
+PUBLISHED_DISTANCE_ERRORS = {
     ("nominal", "manipulator"): {"stick": 0.036, "grapple": 0.066},
     ("identified", "manipulator"): {"stick": 0.162, "grapple": 0.217},
     ("reidentified", "manipulator"): {"stick": 0.101, "grapple": 0.125},
@@ -74,49 +74,51 @@ DISTANCES = {
 """RMS error of distances, Tables 8 (p. 66) and 10 (p. 71) [m]."""
 
 
-def printed_length_errors(model: str) -> dict[str, float]:
+def find_printed_length_errors(model: str) -> dict[str, float]:
     """Return the printed lengths minus those of Table 2 [m]."""
-    return {n: v - NOMINAL[n] for n, v in zip(LENGTHS, _PRINTED_LENGTHS[model], strict=True)}
+    return {n: v - NOMINAL_LENGTHS[n] for n, v in zip(LENGTH_PARAMETERS, _PRINTED_LENGTHS[model], strict=True)}
 
 
-def changed_range(ratio: float) -> tuple[float, float]:
+def compute_accepted_change(ratio: float) -> tuple[float, float]:
     """Return the range of ratios whose decrease is half to twice that of a published ratio."""
     return max(0.0, 1.0 - 2.0 * (1.0 - ratio)), 1.0 - 0.5 * (1.0 - ratio)
 
 
-CHANGE = "half to twice the published decrease of one measurement"
+CHANGE_REASON = "half to twice the published decrease of one measurement"
 
 
-def measure_printed(seed: int, changes: Changes) -> Sample:
+def measure_printed_parameters(seed: int, changes: Changes) -> Sample:
     """Compare end points of the printed parameters with nominal ones for exact joint angles."""
-    chosen = choose_settings({"table_9": "reidentified"}, changes)
-    loop = loop_of(load_machine("calibrator"))
-    theta = np.concatenate([sweep_poses(loop, link, SWEEPS[link]).theta for link in MOVED])
-    nominal, values = Model(loop.values, loop.ball, float(loop.home[3])), {}
+    chosen = merge_settings({"table_9": "reidentified"}, changes)
+    loop = build_loop(load_machine("calibrator"))
+    theta = np.concatenate(
+        [generate_sweep_poses(loop, link, PUBLISHED_SWEEPS[link]).theta for link in SIMULATED_STAGES]
+    )
+    nominal, values = ArmModel(loop.values, loop.ball, float(loop.home[3])), {}
     for model, table in (("identified", "identified"), ("reidentified", chosen["table_9"])):
-        numbers = {n: loop.value(n) + v for n, v in printed_length_errors(table).items()
+        numbers = {n: loop.value(n) + v for n, v in find_printed_length_errors(table).items()
                    if not n.startswith("p_")}  # fmt: skip
-        twists = dict(zip(TWISTS, _PRINTED_TWISTS[table], strict=True)) | _PRINTED_OUTER_TWISTS
+        twists = dict(zip(TWIST_PARAMETERS, _PRINTED_TWISTS[table], strict=True)) | _PRINTED_OUTER_TWISTS
         numbers |= {n: loop.value(n) + np.radians(v) for n, v in twists.items()}
         numbers |= {n: loop.value(n) + v for n, v in _PRINTED_OUTER.items()}
         height, reach = _PRINTED_LENGTHS[table][:2]
-        printed = Model(loop.with_values(numbers).values, np.array([reach, 0.0, height]), 0.0)
+        printed = ArmModel(loop.with_values(numbers).values, np.array([reach, 0.0, height]), 0.0)
         shifted = theta.copy()
-        shifted[:, loop.moved : loop.moved + 3] += np.radians(_PRINTED_OFFSETS)
-        for end, links in ENDS.items():
+        shifted[:, loop.powered_count : loop.powered_count + 3] += np.radians(_PRINTED_OFFSETS)
+        for end, links in END_POINT_LINKS.items():
             for side in SIDES:
                 angles = shifted if side == "calibrator" else theta
-                true = end_place(nominal, theta, side, links)
-                error = end_place(printed, angles, side, links) - true
+                true = compute_end_position(nominal, theta, side, links)
+                error = compute_end_position(printed, angles, side, links) - true
                 size = float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
                 values[f"{model}.{side}.{end}"] = size
     return Sample(values)
 
 
-def judge_printed(samples: Sequence[Sample]) -> Judgement:
+def evaluate_printed_parameters(samples: Sequence[Sample]) -> Evaluation:
     """Check whether the printed parameters give the printed position errors."""
     checks = []
-    for (model, side), ends in POSITIONS.items():
+    for (model, side), ends in PUBLISHED_POSITION_ERRORS.items():
         for end, published in ends.items():
             table = 7 if model == "identified" else 9
             checks.append(check_exact(
@@ -126,7 +128,7 @@ def judge_printed(samples: Sequence[Sample]) -> Judgement:
                 "30 %: the thesis' own poses have the same ranges" if published
                 else "printed as 0.000", unit="m", published=published,
             ))  # fmt: skip
-    return Judgement(
+    return Evaluation(
         tuple(checks),
         "Table 9's parameters are not closer to nominal in the sweep of any link: stick's end"
         " 0.278, 0.299 and 0.268 m for stick, boom and swing; the error of the grapple's end is"
@@ -135,18 +137,18 @@ def judge_printed(samples: Sequence[Sample]) -> Judgement:
     )
 
 
-def judge_parameters(samples: Sequence[Sample]) -> Judgement:
+def evaluate_parameters(samples: Sequence[Sample]) -> Evaluation:
     """Compare the sizes of the parameter errors with Table 7."""
     outer = np.array([[s.values[f"identified.error.{n}"] for n in _PRINTED_OUTER] for s in samples])
-    offsets = np.array([[s.values[f"identified.error.{n}"] for n in _OFFSETS] for s in samples])
+    offsets = np.array([[s.values[f"identified.error.{n}"] for n in _OFFSET_PARAMETERS] for s in samples])
     checks = (
         *_check_links(samples, "identified"),
-        check_population("RMS error of a4, a5, d5", 1e3 * _row_rms(outer),
-                         1e3 * root_mean_square(list(_PRINTED_OUTER.values())), "mm"),
-        check_population("RMS error of the offsets of joints 5 to 7", np.degrees(_row_rms(offsets)),
-                         root_mean_square(_PRINTED_OFFSETS), "deg"),
+        check_population("RMS error of a4, a5, d5", 1e3 * _compute_row_rms(outer),
+                         1e3 * compute_rms(list(_PRINTED_OUTER.values())), "mm"),
+        check_population("RMS error of the offsets of joints 5 to 7", np.degrees(_compute_row_rms(offsets)),
+                         compute_rms(_PRINTED_OFFSETS), "deg"),
     )  # fmt: skip
-    return Judgement(
+    return Evaluation(
         checks,
         "only the stick's stage has bent joints here (p. 69), so that the errors of links 4 and 5,"
         " which are identified before, come only from sensor noise and drift; the thesis' offsets"
@@ -156,63 +158,63 @@ def judge_parameters(samples: Sequence[Sample]) -> Judgement:
     )
 
 
-def judge_iterations(samples: Sequence[Sample]) -> Judgement:
+def evaluate_iterations(samples: Sequence[Sample]) -> Evaluation:
     """Compare the iterations of links 2 and 3 with Table 7."""
-    return Judgement((check_rms_ratio(
+    return Evaluation((check_rms_ratio(
         "iterations of link 2 over those of link 3", samples,
         ("identified.iterations.boom", "identified.iterations.stick"),
         (1.0 + 0.5 * 7.0 / 11.0, np.inf), "at least half of the published increase", 18.0 / 11.0,
     ),))  # fmt: skip
 
 
-def _row_rms(rows: np.ndarray) -> np.ndarray:
+def _compute_row_rms(rows: np.ndarray) -> np.ndarray:
     return np.sqrt(np.mean(rows**2, axis=1))
 
 
 def _check_links(samples: Sequence[Sample], model: str) -> list[Check]:
     """Return checks of the RMS errors of lengths and twists of links 0 to 3."""
-    lengths = root_mean_square(list(printed_length_errors(model).values()))
+    lengths = compute_rms(list(find_printed_length_errors(model).values()))
     return [
         check_population("RMS error of the six lengths of links 0 to 3",
-                         1e3 * collect(samples, f"{model}.lengths"), 1e3 * lengths, "mm"),
+                         1e3 * collect_values(samples, f"{model}.lengths"), 1e3 * lengths, "mm"),
         check_population("RMS error of alpha and beta of links 1 to 3",
-                         np.degrees(collect(samples, f"{model}.twists")),
-                         root_mean_square(_PRINTED_TWISTS[model]), "deg"),
+                         np.degrees(collect_values(samples, f"{model}.twists")),
+                         compute_rms(_PRINTED_TWISTS[model]), "deg"),
     ]  # fmt: skip
 
 
 def _describe_links(samples: Sequence[Sample], model: str) -> str:
     """Return mean, standard deviation and published value of each parameter error as text."""
     parts = []
-    for name, published in printed_length_errors(model).items():
-        ours = 1e3 * collect(samples, f"{model}.error.{name}")
-        parts.append(f"{SHORT[name]} {ours.mean():.0f} +- {ours.std():.0f} ({1e3 * published:.0f})")
-    for name, published in zip(TWISTS, _PRINTED_TWISTS[model], strict=True):
-        ours = np.degrees(collect(samples, f"{model}.error.{name}"))
+    for name, published in find_printed_length_errors(model).items():
+        ours = 1e3 * collect_values(samples, f"{model}.error.{name}")
+        parts.append(f"{LENGTH_SYMBOLS[name]} {ours.mean():.0f} +- {ours.std():.0f} ({1e3 * published:.0f})")
+    for name, published in zip(TWIST_PARAMETERS, _PRINTED_TWISTS[model], strict=True):
+        ours = np.degrees(collect_values(samples, f"{model}.error.{name}"))
         parts.append(f"{name} {ours.mean():.1f} +- {ours.std():.1f} ({published:.1f})")
     return f"errors in mm and deg (published; d0, a0 as -d0, -a0): {', '.join(parts)}"
 
 
-def judge_reidentified(samples: Sequence[Sample]) -> Judgement:
+def evaluate_error_change(samples: Sequence[Sample]) -> Evaluation:
     """Compare the change of the parameter errors from Table 7 to Table 9."""
-    before, after = (printed_length_errors(m) for m in ("identified", "reidentified"))
+    before, after = (find_printed_length_errors(m) for m in ("identified", "reidentified"))
     checks = []
     for name in ("a.swing", "d.boom"):
         ratio = abs(after[name] / before[name])
         checks.append(check_rms_ratio(
-            f"error of {SHORT[name]} over that of Table 7", samples,
-            (f"reidentified.error.{name}", f"identified.error.{name}"), changed_range(ratio),
-            CHANGE, ratio,
+            f"error of {LENGTH_SYMBOLS[name]} over that of Table 7", samples,
+            (f"reidentified.error.{name}", f"identified.error.{name}"), compute_accepted_change(ratio),
+            CHANGE_REASON, ratio,
         ))  # fmt: skip
     for kind in ("alpha", "beta"):
-        ratio = _printed_twists("reidentified", kind) / _printed_twists("identified", kind)
-        accepted = changed_range(ratio) if ratio < 1.0 else (1.0, np.inf)
+        ratio = _compute_printed_twist_rms("reidentified", kind) / _compute_printed_twist_rms("identified", kind)
+        accepted = compute_accepted_change(ratio) if ratio < 1.0 else (1.0, np.inf)
         checks.append(check_rms_ratio(
             f"error of {kind} over that of Table 7", samples,
             (f"reidentified.{kind}", f"identified.{kind}"), accepted,
-            CHANGE if ratio < 1.0 else "increased", ratio,
+            CHANGE_REASON if ratio < 1.0 else "increased", ratio,
         ))  # fmt: skip
-    return Judgement(
+    return Evaluation(
         tuple(checks),
         "without the bent poses both alpha and beta are close to the truth; a1 is identified in the"
         " swing's stage, which has no bent poses, and keeps the errors caused by the drift of held"
@@ -220,9 +222,9 @@ def judge_reidentified(samples: Sequence[Sample]) -> Judgement:
     )
 
 
-def judge_left_errors(samples: Sequence[Sample]) -> Judgement:
+def evaluate_remaining_errors(samples: Sequence[Sample]) -> Evaluation:
     """Compare the sizes of the remaining parameter errors with Table 9."""
-    return Judgement(
+    return Evaluation(
         tuple(_check_links(samples, "reidentified")),
         "after the removal only sensor noise affects alpha and beta here; the thesis also names"
         " sensor misalignment as a cause (p. 65), which is not simulated",
@@ -230,73 +232,70 @@ def judge_left_errors(samples: Sequence[Sample]) -> Judgement:
     )
 
 
-def _printed_twists(model: str, kind: str) -> float:
-    pairs = zip(TWISTS, _PRINTED_TWISTS[model], strict=True)
-    return root_mean_square([value for name, value in pairs if name.startswith(kind)])
+def _compute_printed_twist_rms(model: str, kind: str) -> float:
+    pairs = zip(TWIST_PARAMETERS, _PRINTED_TWISTS[model], strict=True)
+    return compute_rms([value for name, value in pairs if name.startswith(kind)])
 
 
-def _check_sizes(
-    samples: Sequence[Sample], model: str, side: str, published: dict, name: str
-) -> list[Check]:
+def _check_rms_errors(samples: Sequence[Sample], model: str, side: str, published: dict, name: str) -> list[Check]:
     """Return checks whether the published RMS errors agree with the repetitions."""
     return [
         check_population(f"{end}'s end, {model}, {side} side",
-                         1e3 * collect(samples, name.format(model=model, side=side, end=end)),
+                         1e3 * collect_values(samples, name.format(model=model, side=side, end=end)),
                          1e3 * size, "mm")
         for end, size in published[model, side].items() if size
     ]  # fmt: skip
 
 
-_POSITION, _DISTANCE = "{model}.position.{side}.{end}", "{model}.{side}.{end}.rms"
+_POSITION_KEY, _DISTANCE_KEY = "{model}.position.{side}.{end}", "{model}.{side}.{end}.rms"
 
 
-def _check_fall(
+def _check_decrease(
     samples: Sequence[Sample], names: tuple[str, str], published: dict, side: str, name: str
 ) -> list[Check]:
     """Return checks whether errors decrease from one model to another as published."""
     checks = []
-    for end in ENDS:
+    for end in END_POINT_LINKS:
         before, after = (published[model, side][end] for model in names)
         keys = tuple(name.format(model=model, side=side, end=end) for model in reversed(names))
         ratio = after / before
         checks.append(check_rms_ratio(
             f"{end}'s end, {names[1]} over {names[0]}", samples, (keys[0], keys[1]),
-            changed_range(ratio), CHANGE, ratio,
+            compute_accepted_change(ratio), CHANGE_REASON, ratio,
         ))  # fmt: skip
     return checks
 
 
-def judge_ends(samples: Sequence[Sample]) -> Judgement:
+def evaluate_end_points(samples: Sequence[Sample]) -> Evaluation:
     """Compare the position errors from the manipulator side with pp. 66 and 71."""
-    return Judgement(
+    return Evaluation(
         tuple(check for model in ("identified", "reidentified")
-              for check in _check_sizes(samples, model, "manipulator", POSITIONS, _POSITION)),
+              for check in _check_rms_errors(samples, model, "manipulator", PUBLISHED_POSITION_ERRORS, _POSITION_KEY)),
         "the size of the bends is an assumption: bends of 6 to 12 deg instead of 2 to 6 deg cause"
         " errors of 0.18 m (stick) and 0.14 m (grapple)",
     )  # fmt: skip
 
 
-def judge_fall(samples: Sequence[Sample]) -> Judgement:
+def evaluate_position_decrease(samples: Sequence[Sample]) -> Evaluation:
     """Compare the decrease of the position errors from Table 7 to Table 9."""
     names = ("identified", "reidentified")
-    return Judgement(
-        tuple(_check_fall(samples, names, POSITIONS, "manipulator", _POSITION)),
-        "the drift of held links remains: without drift the error of the stick's end decreases from"
-        " 0.076 to 0.031 m",
+    return Evaluation(
+        tuple(_check_decrease(samples, names, PUBLISHED_POSITION_ERRORS, "manipulator", _POSITION_KEY)),
+        "the drift of held links remains: without drift the error of the stick's end decreases from 0.076 to 0.031 m",
     )
 
 
-def judge_calibrator_ends(samples: Sequence[Sample]) -> Judgement:
+def evaluate_calibrator_ends(samples: Sequence[Sample]) -> Evaluation:
     """Compare the position errors from the calibrator side with pp. 67 and 71."""
     models = ("identified", "reidentified")
     checks = [
         check
         for model in models
-        for check in _check_sizes(samples, model, "calibrator", POSITIONS, _POSITION)
+        for check in _check_rms_errors(samples, model, "calibrator", PUBLISHED_POSITION_ERRORS, _POSITION_KEY)
     ]
     checks += [
         check_exact(f"largest of the grapple's end, {model}",
-                    float(collect(samples, f"{model}.position.calibrator.grapple").max()),
+                    float(collect_values(samples, f"{model}.position.calibrator.grapple").max()),
                     (0.0, 0.0005), "printed as 0.000", unit="m", published=0.0)
         for model in models
     ]  # fmt: skip
@@ -307,12 +306,12 @@ def judge_calibrator_ends(samples: Sequence[Sample]) -> Judgement:
             "stick's end, reidentified over identified",
             samples,
             (stick[0], stick[1]),
-            changed_range(ratio),
-            CHANGE,
+            compute_accepted_change(ratio),
+            CHANGE_REASON,
             ratio,
         )
     )
-    return Judgement(
+    return Evaluation(
         tuple(checks),
         "relative to the ball the stick's end depends only on links 4 to 8, which are equal in"
         " Tables 7 and 9: with equal poses the error cannot decrease, and with the printed"
@@ -320,14 +319,14 @@ def judge_calibrator_ends(samples: Sequence[Sample]) -> Judgement:
     )
 
 
-def judge_distances(samples: Sequence[Sample]) -> Judgement:
+def evaluate_distances(samples: Sequence[Sample]) -> Evaluation:
     """Compare the distance errors from the manipulator side with Table 8 and Fig. 19."""
     checks = [
         check
         for model in ("nominal", "identified")
-        for check in _check_sizes(samples, model, "manipulator", DISTANCES, _DISTANCE)
+        for check in _check_rms_errors(samples, model, "manipulator", PUBLISHED_DISTANCE_ERRORS, _DISTANCE_KEY)
     ]
-    return Judgement(
+    return Evaluation(
         tuple(checks),
         "the nominal machine is the true one here, so that the nominal model has only errors of"
         " sensors and tape; if lengths differ by N(0, 20 mm) and angles by N(0, 0.7 deg) from"
@@ -337,12 +336,13 @@ def judge_distances(samples: Sequence[Sample]) -> Judgement:
     )
 
 
-def judge_order(samples: Sequence[Sample]) -> Judgement:
+def evaluate_model_order(samples: Sequence[Sample]) -> Evaluation:
     """Compare the distance errors of the nominal and the identified model with Fig. 19."""
     checks = []
-    for end in ENDS:
+    for end in END_POINT_LINKS:
         ratio = (
-            DISTANCES["identified", "manipulator"][end] / DISTANCES["nominal", "manipulator"][end]
+            PUBLISHED_DISTANCE_ERRORS["identified", "manipulator"][end]
+            / PUBLISHED_DISTANCE_ERRORS["nominal", "manipulator"][end]
         )
         checks.append(check_rms_ratio(
             f"{end}'s end, identified over nominal", samples,
@@ -354,7 +354,7 @@ def judge_order(samples: Sequence[Sample]) -> Judgement:
         ("identified.manipulator.stick.far", "identified.manipulator.stick.near"), (0.0, 1.0),
         "the error decreases when the manipulator stretches its arms",
     ))  # fmt: skip
-    return Judgement(
+    return Evaluation(
         tuple(checks),
         "the nominal machine is the true one here; if lengths differ by N(0, 20 mm) and angles by"
         " N(0, 0.7 deg) from nominal, the ratios are 2.2 and 1.1",
@@ -365,30 +365,30 @@ def _describe_vaf(samples: Sequence[Sample], side: str) -> str:
     """Return the mean variance accounted for (VAF) of all models as text."""
     parts = []
     for model in ("nominal", "identified", "reidentified"):
-        means = [collect(samples, f"{model}.{side}.{end}.vaf").mean() for end in ENDS]
+        means = [collect_values(samples, f"{model}.{side}.{end}.vaf").mean() for end in END_POINT_LINKS]
         parts.append(f"{model} {', '.join(f'{mean:.2f}' for mean in means)}")
     return f"VAF in %: {'; '.join(parts)}"
 
 
-def judge_calibrator_distances(samples: Sequence[Sample]) -> Judgement:
+def evaluate_calibrator_distances(samples: Sequence[Sample]) -> Evaluation:
     """Compare the distance errors from the calibrator side with Table 8."""
     checks = [
         check
         for model in ("nominal", "identified")
-        for check in _check_sizes(samples, model, "calibrator", DISTANCES, _DISTANCE)
+        for check in _check_rms_errors(samples, model, "calibrator", PUBLISHED_DISTANCE_ERRORS, _DISTANCE_KEY)
     ]
     stick = 0.021 / 0.026
     checks.append(check_rms_ratio(
         "stick's end, identified over nominal", samples,
-        ("identified.calibrator.stick.rms", "nominal.calibrator.stick.rms"), changed_range(stick),
-        CHANGE, stick,
+        ("identified.calibrator.stick.rms", "nominal.calibrator.stick.rms"), compute_accepted_change(stick),
+        CHANGE_REASON, stick,
     ))  # fmt: skip
     same = [abs(s.values["identified.calibrator.grapple.rms"]
                 - s.values["nominal.calibrator.grapple.rms"]) for s in samples]  # fmt: skip
     checks.append(check_exact("grapple's end, largest difference of both models", max(same),
                               (0.0, 0.0005), "printed with the same three digits", unit="m",
                               published=0.0))  # fmt: skip
-    return Judgement(
+    return Evaluation(
         tuple(checks),
         "the grapple's end depends on the elbow's angle and three laboratory lengths, so that the"
         " published 38 mm come from these and from the tape, for which 5 mm are assumed; links 4"
@@ -397,29 +397,29 @@ def judge_calibrator_distances(samples: Sequence[Sample]) -> Judgement:
     )
 
 
-def judge_new_distances(samples: Sequence[Sample]) -> Judgement:
+def evaluate_new_distances(samples: Sequence[Sample]) -> Evaluation:
     """Compare the sizes of the distance errors with Table 10."""
-    return Judgement(
-        tuple(_check_sizes(samples, "reidentified", "manipulator", DISTANCES, _DISTANCE)),
+    return Evaluation(
+        tuple(_check_rms_errors(samples, "reidentified", "manipulator", PUBLISHED_DISTANCE_ERRORS, _DISTANCE_KEY)),
         "after the bent poses are excluded, the drift of held links is the only large error here",
         _describe_vaf(samples, "manipulator"),
     )
 
 
-def judge_distance_fall(samples: Sequence[Sample]) -> Judgement:
+def evaluate_distance_decrease(samples: Sequence[Sample]) -> Evaluation:
     """Compare the change of the distance errors from Table 8 to Table 10."""
     models = ("identified", "reidentified")
-    checks = _check_fall(samples, models, DISTANCES, "manipulator", _DISTANCE)
-    for end in ENDS:
+    checks = _check_decrease(samples, models, PUBLISHED_DISTANCE_ERRORS, "manipulator", _DISTANCE_KEY)
+    for end in END_POINT_LINKS:
         change = [abs(s.values[f"reidentified.calibrator.{end}.rms"]
                       - s.values[f"identified.calibrator.{end}.rms"]) for s in samples]  # fmt: skip
         checks.append(check_exact(f"{end}'s end, calibrator side, largest change", max(change),
                                   (0.0, 0.0005), "printed with the same three digits", unit="m",
                                   published=0.0))  # fmt: skip
-    return Judgement(tuple(checks))
+    return Evaluation(tuple(checks))
 
 
-def judge_sensor_outputs(samples: Sequence[Sample]) -> Judgement:
+def evaluate_sensor_outputs(samples: Sequence[Sample]) -> Evaluation:
     """Compare the differences between predicted and actual readings with Figs 20 and 21."""
     checks = []
     for joint in (5, 6):
@@ -429,16 +429,16 @@ def judge_sensor_outputs(samples: Sequence[Sample]) -> Judgement:
             "a large discrepancy there: at least twice",
         ))  # fmt: skip
     for joint in (7, 8):
-        rows = np.column_stack([collect(samples, f"inside.{k}") for k in (joint, 5, 6)])
+        rows = np.column_stack([collect_values(samples, f"inside.{k}") for k in (joint, 5, 6)])
         checks.append(check_statistic(
             f"difference at joint {joint} over the smaller one of joints 5 and 6, stick retracted",
-            rows, _worst_ratio, (0.0, 0.5),
+            rows, _compute_worst_ratio, (0.0, 0.5),
             "good agreement against a large discrepancy: at most half",
         ))  # fmt: skip
-    sizes = ", ".join(f"{k}: {root_mean_square(collect(samples, f'inside.{k}')):.2f} and"
-                      f" {root_mean_square(collect(samples, f'outside.{k}')):.2f}"
+    sizes = ", ".join(f"{k}: {compute_rms(collect_values(samples, f'inside.{k}')):.2f} and"
+                      f" {compute_rms(collect_values(samples, f'outside.{k}')):.2f}"
                       for k in (5, 6, 7, 8))  # fmt: skip
-    return Judgement(
+    return Evaluation(
         tuple(checks),
         "the axes of joints 5 and 7 are nearly parallel when the yoke angle is near zero, so that"
         " an error of one is predicted at the other; if only joint 6 bends, joint 7 differs by"
@@ -447,16 +447,16 @@ def judge_sensor_outputs(samples: Sequence[Sample]) -> Judgement:
     )  # fmt: skip
 
 
-def _worst_ratio(rows: np.ndarray) -> float:
+def _compute_worst_ratio(rows: np.ndarray) -> float:
     rms = np.sqrt(np.mean(rows**2, axis=0))
     return float(rms[0] / min(rms[1:]))
 
 
-def judge_search(samples: Sequence[Sample]) -> Judgement:
+def evaluate_bend_detection(samples: Sequence[Sample]) -> Evaluation:
     """Check how often `identify_without_bad_data` finds the bent joints."""
     found = [s.values["overlap"] > 0.5 and s.values["blamed"] > 0.5 for s in samples]
-    visible = collect(samples, "left out").mean()
-    return Judgement(
+    visible = collect_values(samples, "left out").mean()
+    return Evaluation(
         (check_fraction("calibrations in which the region and one of its joints are found", found,
                         (0.9, 1.0), "nine of ten, as with errors of one joint"),),
         "the parameters of the stage, identified from the same poses, absorb bends of two joints"
@@ -466,36 +466,36 @@ def judge_search(samples: Sequence[Sample]) -> Judgement:
 
 
 EXPERIMENTS = (
-    Experiment("printed parameters", measure_printed, (
+    Experiment("printed parameters", measure_printed_parameters, (
         Claim(
             "end points with the printed parameters",
             "RMS position errors relative to the nominal model: Table 7 0.212 m (stick) and 0.256"
             " m (grapple) from the manipulator side, 0.542 and 0.000 m from the calibrator side;"
             " Table 9 0.153, 0.205, 0.373 and 0.000 m",
-            "Tables 7 and 9, pp. 63, 66-67, 70-71", "document", judge_printed,
+            "Tables 7 and 9, pp. 63, 66-67, 70-71", "document", evaluate_printed_parameters,
             {"table_9": "identified"}, "Table 7's parameters replace those of Table 9",
         ),
-    ), repetitions_fixed=1),
+    ), fixed_repetitions=1),
     Experiment("calibration with bent joints", measure_calibration, (
         Claim(
             "identified parameters",
             "a1 0.011, a2 5.485, a3 1.868, d0 0.623, d2 0.001 m; alpha 1 to 3 -84.5, -4.7, -3.6,"
             " beta 2 and 3 -2.0, -1.3 deg; offsets of joints 5 to 7 8.6, 4.2, 0.7 deg",
-            "Table 7, section 3.8.1, pp. 62-63", "document", judge_parameters, NO_FAULTS,
+            "Table 7, section 3.8.1, pp. 62-63", "document", evaluate_parameters, NO_FAULTS,
             "joints do not bend and held links do not drift", (),
         ),
         Claim(
             "iterations with bent joints",
             '"the number of iterations increases rapidly as the identification proceeds from Link'
             ' 3 to link 2": 11 and 18',
-            "Table 7, section 3.8.1, pp. 62-63", "document", judge_iterations,
+            "Table 7, section 3.8.1, pp. 62-63", "document", evaluate_iterations,
             {**NO_FAULTS, "accuracy": 1e-6}, "readings without error", (),
         ),
         Claim(
             "re-identified parameters, errors that are left",
             "a1 0.401, a2 5.312, a3 1.848, d0 0.699, d2 -0.059 m; alpha 1 to 3 -86.2, -2.1, 0.2,"
             " beta 2 and 3 -3.4, -2.8 deg",
-            "Table 9, section 3.8.2, p. 70", "document", judge_left_errors, NO_FAULTS,
+            "Table 9, section 3.8.2, p. 70", "document", evaluate_remaining_errors, NO_FAULTS,
             "joints do not bend and held links do not drift", (),
         ),
         Claim(
@@ -503,36 +503,36 @@ EXPERIMENTS = (
             "the error in alpha has been largely reduced while the error in beta has increased;"
             " the errors in a1 and d2 have considerably been reduced: a1 -329 to 61 mm, d2 111 to"
             " 51 mm",
-            "Table 9, section 3.8.2, p. 70", "document", judge_reidentified, {"removal": False},
+            "Table 9, section 3.8.2, p. 70", "document", evaluate_error_change, {"removal": False},
             "no pose is excluded", (),
         ),
         Claim(
             "end points, manipulator side",
             "RMS position error relative to the nominal model: 0.212 m (stick) and 0.256 m"
             " (grapple), without the bad data 0.153 and 0.205 m",
-            "Tables 7 and 9, pp. 66, 71", "document", judge_ends, NO_FAULTS,
+            "Tables 7 and 9, pp. 66, 71", "document", evaluate_end_points, NO_FAULTS,
             "joints do not bend and held links do not drift", (),
         ),
         Claim(
             "end points, change",
             '"the re-identified model behavior is now very similar to that of the nominal model":'
             " RMS position error 0.212 to 0.153 m (stick), 0.256 to 0.205 m (grapple)",
-            "Figs 22 to 25, pp. 71-75", "document", judge_fall, {"removal": False},
+            "Figs 22 to 25, pp. 71-75", "document", evaluate_position_decrease, {"removal": False},
             "no pose is excluded",
-            tuple(f"{end}'s end, {axis} [m]" for end in ENDS for axis in "xyz"),
+            tuple(f"{end}'s end, {axis} [m]" for end in END_POINT_LINKS for axis in "xyz"),
         ),
         Claim(
             "end points, calibrator side",
             "RMS position error relative to the nominal model: 0.542 m (stick) and 0.000 m"
             " (grapple), without the bad data 0.373 and 0.000 m",
-            "Tables 7 and 9, pp. 67, 71", "document", judge_calibrator_ends, NO_FAULTS,
+            "Tables 7 and 9, pp. 67, 71", "document", evaluate_calibrator_ends, NO_FAULTS,
             "joints do not bend and held links do not drift", (),
         ),
         Claim(
             "distances, nominal and identified, manipulator side",
             "RMS nominal 0.036 m (stick) and 0.066 m (grapple), identified 0.162 and 0.217 m; VAF"
             " 99.86, 99.74, 98.32, 98.69 %",
-            "Table 8, pp. 65-66", "document", judge_distances, NO_FAULTS,
+            "Table 8, pp. 65-66", "document", evaluate_distances, NO_FAULTS,
             "joints do not bend and held links do not drift", (),
         ),
         Claim(
@@ -540,7 +540,7 @@ EXPERIMENTS = (
             '"the distance error for the nominal model is less than that of the identified model'
             ' and decreases for the identified model when the manipulator stretches its arms":'
             " 0.036 against 0.162 m and 0.066 against 0.217 m",
-            "Fig. 19, pp. 65-66", "document", judge_order, NO_FAULTS,
+            "Fig. 19, pp. 65-66", "document", evaluate_model_order, NO_FAULTS,
             "joints do not bend and held links do not drift", ("stick's end to the ball [m]",),
         ),
         Claim(
@@ -548,20 +548,20 @@ EXPERIMENTS = (
             "RMS nominal 0.026 m (stick) and 0.038 m (grapple), identified 0.021 and 0.038 m; VAF"
             ' 99.92, 99.91, 99.95, 99.91 %; they "appear to act in favor of the identified'
             ' parameters"',
-            "Table 8, pp. 65-66", "document", judge_calibrator_distances, {"tape": 0.3},
+            "Table 8, pp. 65-66", "document", evaluate_calibrator_distances, {"tape": 0.3},
             "the tape has errors of 0.3 m", (),
         ),
         Claim(
             "distances, re-identified",
             "manipulator side: RMS 0.101 m (stick) and 0.125 m (grapple), VAF 98.87, 99.07 %",
-            "Table 10, p. 71", "document", judge_new_distances, NO_FAULTS,
+            "Table 10, p. 71", "document", evaluate_new_distances, NO_FAULTS,
             "joints do not bend and held links do not drift", (),
         ),
         Claim(
             "distances, change",
             "manipulator side: RMS 0.162 to 0.101 m (stick) and 0.217 to 0.125 m (grapple);"
             " calibrator side: 0.021 and 0.038 m as before",
-            "Tables 8 and 10, pp. 66, 71", "document", judge_distance_fall, {"removal": False},
+            "Tables 8 and 10, pp. 66, 71", "document", evaluate_distance_decrease, {"removal": False},
             "no pose is excluded", (),
         ),
         Claim(
@@ -569,18 +569,18 @@ EXPERIMENTS = (
             '"There is good agreement between the simulated and the actual sensor readings for'
             ' Joints 7 and 8"; "there is a large discrepancy between the actual and the simulated'
             ' sensor readings for Joints 5 and 6" where the stick is pulled in',
-            "Figs 20 and 21, section 3.8.2, pp. 67-69", "document", judge_sensor_outputs,
+            "Figs 20 and 21, section 3.8.2, pp. 67-69", "document", evaluate_sensor_outputs,
             {"bent": ("calibrator_twist", "calibrator_elbow")}, "joints 7 and 8 bend instead",
             ("stick angle [deg]", "joint 5, grapple [deg]", "joint 6, calibrator_yoke [deg]",
              "joint 7, calibrator_twist [deg]", "joint 8, calibrator_elbow [deg]"),
         ),
         *khoshzaban_linkages.CLAIMS,
     )),
-    Experiment("search for bent joints", measure_search, (
+    Experiment("search for bent joints", measure_bend_detection, (
         Claim(
             "search for bent joints without an observer",
             "the poses with bent joints and one of these joints are found by the equations alone",
-            "section 3.8.2, pp. 67-70", "additional", judge_search, {"bend": (0.0, 0.0)},
+            "section 3.8.2, pp. 67-70", "additional", evaluate_bend_detection, {"bend": (0.0, 0.0)},
             "no joint bends", (),
         ),
     ), max_repetitions=20),

@@ -9,22 +9,26 @@ from collections.abc import Sequence
 import numpy as np
 
 from hydrotele.calibrate.arm import identify_arm
-from hydrotele.calibrate.design import STILL, sweep_poses
-from hydrotele.calibrate.loop import Loop, closure, loop_of
+from hydrotele.calibrate.design import DRIFT_FREE_SWEEPS, generate_sweep_poses
+from hydrotele.calibrate.loop import CalibrationLoop, build_loop, closure_error
 from hydrotele.core.units import PSI
-from hydrotele.effects.effect import changed
+from hydrotele.effects.effect import with_value
 from hydrotele.experiments.calibrator_readings import simulate_readings
 from hydrotele.experiments.comparison import (
     Changes,
     Check,
     Claim,
+    Evaluation,
     Experiment,
-    Judgement,
     Panel,
     Sample,
 )
-from hydrotele.experiments.intervals import check_exact, collect
-from hydrotele.experiments.khoshzaban_arm import LISTS, MOVED, choose_settings
+from hydrotele.experiments.intervals import check_exact, collect_values
+from hydrotele.experiments.khoshzaban_arm import (
+    IDENTIFIABLE_PARAMETERS,
+    SIMULATED_STAGES,
+    merge_settings,
+)
 from hydrotele.experiments.scenario_runs import run_shipped
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.kinematics.linkages import TwoBar
@@ -39,11 +43,11 @@ TABLE_2 = (
 )  # fmt: skip
 """Nominal Denavit-Hartenberg parameters of machine and calibrator (p. 56)."""
 
-_MASSES = {"swing": 8031.0, "boom": 1830.0, "stick": 688.0}
-_CENTRES = {"boom": (2.30, 0.20), "stick": (0.90, 0.10)}
-_TRIANGLES = {"boom": (0.625, 2.000, 1.447, 78.6), "stick": (2.444, 0.720, 1.799, 10.3)}
+_PUBLISHED_MASSES = {"swing": 8031.0, "boom": 1830.0, "stick": 688.0}
+_PUBLISHED_MASS_CENTRES = {"boom": (2.30, 0.20), "stick": (0.90, 0.10)}
+_PUBLISHED_TRIANGLES = {"boom": (0.625, 2.000, 1.447, 78.6), "stick": (2.444, 0.720, 1.799, 10.3)}
 _TRIANGLE_NAMES = ("l_l", "l_u", "l_c", "offset")
-_TORQUES = {"swing": 1400.0, "boom": 5700.0, "stick": 4200.0}
+_PUBLISHED_FORCE_ERRORS = {"swing": 1400.0, "boom": 5700.0, "stick": 4200.0}
 
 
 def measure_machine(seed: int, changes: Changes) -> Sample:
@@ -58,35 +62,35 @@ def measure_machine(seed: int, changes: Changes) -> Sample:
     """
     machine = load_machine("calibrator")
     for path, value in changes.items():
-        machine = changed(machine, path, value)
-    loop = loop_of(machine)
+        machine = with_value(machine, path, value)
+    loop = build_loop(machine)
     table = [(0.0, -float(loop.ball[0]), -float(loop.ball[2]), 0.0)]
     table += [(math.degrees(v[1]), v[2], v[3], math.degrees(v[4])) for v in loop.values]
     values = {
         "table_2": float(np.abs(np.array(table) - np.array(TABLE_2)).max()),
-        "links_machine": float(_links_needed(6, 4, 1, 3, 1)),
-        "links_excavator": float(_links_needed(4, 4, 1, 3, 1)),
-        "mobility": float(len(loop) - loop.moved + 1 + 3 - 6),
-        **_plates(machine),
+        "links_machine": float(_count_extra_links(6, 4, 1, 3, 1)),
+        "links_excavator": float(_count_extra_links(4, 4, 1, 3, 1)),
+        "mobility": float(len(loop) - loop.powered_count + 1 + 3 - 6),
+        **_measure_pin_distances(machine),
     }
-    for name in _MASSES:
+    for name in _PUBLISHED_MASSES:
         values[f"mass.{name}"] = machine.links[name].mass
-    for name in _CENTRES:
+    for name in _PUBLISHED_MASS_CENTRES:
         com = machine.links[name].com
         values |= {f"com_x.{name}": com[0], f"com_z.{name}": com[2]}
-    for name in _TRIANGLES:
+    for name in _PUBLISHED_TRIANGLES:
         linkage, cylinder = axis_linkage(machine, name), machine.axes[name].cylinder
         assert isinstance(linkage, TwoBar) and cylinder
         found = (linkage.lower, linkage.upper, cylinder.closed_length,
                  abs(math.degrees(linkage.angle_offset)))  # fmt: skip
         values |= {f"{n}.{name}": v for n, v in zip(_TRIANGLE_NAMES, found, strict=True)}
-    for name in _TORQUES:
+    for name in _PUBLISHED_FORCE_ERRORS:
         areas = machine.axes[name].hydraulic_drive.areas
         values[f"torque.{name}"] = 25.0 * PSI * (areas[0] + areas[1])
     return Sample(values)
 
 
-def _plates(machine: Machine) -> dict[str, float]:
+def _measure_pin_distances(machine: Machine) -> dict[str, float]:
     """Return the distances [m] and angles [deg] between the pins of Figs 5 and 6."""
     boom_axis, stick_axis = machine.axes["boom"].cylinder, machine.axes["stick"].cylinder
     assert boom_axis and stick_axis
@@ -98,47 +102,47 @@ def _plates(machine: Machine) -> dict[str, float]:
     return {
         "boom.L1": float(np.linalg.norm(stick_pin)), "boom.L2": float(np.linalg.norm(boom_rod)),
         "boom.L3": float(np.linalg.norm(stick_pin - boom_rod)),
-        "boom.L4": float(np.linalg.norm(base)), "boom.gamma": _angle_between(stick_pin, boom_rod),
+        "boom.L4": float(np.linalg.norm(base)), "boom.gamma": _compute_angle(stick_pin, boom_rod),
         "stick.L1": float(np.linalg.norm(tip)), "stick.L2": float(np.linalg.norm(rod)),
-        "stick.L3": float(np.linalg.norm(tip - rod)), "stick.gamma": _angle_between(-tip, rod),
+        "stick.L3": float(np.linalg.norm(tip - rod)), "stick.gamma": _compute_angle(-tip, rod),
     }  # fmt: skip
 
 
-def _angle_between(one: np.ndarray, other: np.ndarray) -> float:
+def _compute_angle(one: np.ndarray, other: np.ndarray) -> float:
     lengths = np.linalg.norm(one) * np.linalg.norm(other)
     return math.degrees(math.acos(float(one @ other / lengths)))
 
 
-def _links_needed(dof: int, powered: int, moving: int, task: int, wanted: int) -> int:
+def _count_extra_links(dof: int, powered: int, moving: int, task: int, mobility: int) -> int:
     """Return the required number of extra links by Eq. 3.5: l = (6 + m) - [(n - p) + d + t]."""
-    return (6 + wanted) - ((dof - powered) + moving + task)
+    return (6 + mobility) - ((dof - powered) + moving + task)
 
 
-def _check_near(
-    quantity: str, value: float, published: float, reach: float, reason: str, unit: str
+def _check_published_value(
+    quantity: str, value: float, published: float, tolerance: float, reason: str, unit: str
 ) -> Check:
-    accepted = (published - reach, published + reach)
+    accepted = (published - tolerance, published + tolerance)
     return check_exact(quantity, value, accepted, reason, unit=unit, published=published)
 
 
-def judge_masses(samples: Sequence[Sample]) -> Judgement:
+def evaluate_masses(samples: Sequence[Sample]) -> Evaluation:
     """Compare masses and centres of mass with Table 1."""
     values = samples[0].values
-    checks = [_check_near(f"mass of the {n}", values[f"mass.{n}"], v, 0.5, "last digit", "kg")
-              for n, v in _MASSES.items()]  # fmt: skip
-    for name, centre in _CENTRES.items():
+    checks = [_check_published_value(f"mass of the {n}", values[f"mass.{n}"], v, 0.5, "last digit", "kg")
+              for n, v in _PUBLISHED_MASSES.items()]  # fmt: skip
+    for name, centre in _PUBLISHED_MASS_CENTRES.items():
         for axis, published in zip("xz", centre, strict=True):
-            checks.append(_check_near(f"centre of mass of the {name}, {axis}",
+            checks.append(_check_published_value(f"centre of mass of the {name}, {axis}",
                                       values[f"com_{axis}.{name}"], published, 0.005, "last digit",
                                       "m"))  # fmt: skip
-    return Judgement(
+    return Evaluation(
         tuple(checks),
         note="the inertias are not the printed ones, because the printed 15400 and 600 kg m2 are"
         " 3.7 and 3.2 times those of slender rods about their centres",
     )
 
 
-def judge_plates(samples: Sequence[Sample]) -> Judgement:
+def evaluate_plates(samples: Sequence[Sample]) -> Evaluation:
     """Compare the pin distances with Figs 5 and 6."""
     values, digit = samples[0].values, "last printed digit"
     # The model uses L1 = 5.180 m of Table 2; Fig. 5 has 5.190 m, which changes L3 by 9.5 mm.
@@ -151,57 +155,57 @@ def judge_plates(samples: Sequence[Sample]) -> Judgement:
         ("stick.L3", 2.425, 0.005, "half a degree of gamma, its last digit, is 5 mm"),
         ("stick.gamma", 35.0, 0.5, digit),
     )  # fmt: skip
-    return Judgement(tuple(
-        _check_near(name, values[name], published, reach, reason,
+    return Evaluation(tuple(
+        _check_published_value(name, values[name], published, reach, reason,
                     "deg" if name.endswith("gamma") else "m")
         for name, published, reach, reason in wanted
     ))  # fmt: skip
 
 
-def judge_triangles(samples: Sequence[Sample]) -> Judgement:
+def evaluate_triangles(samples: Sequence[Sample]) -> Evaluation:
     """Compare the cylinder triangles with Figs 9 and 10 and Tables 3 and 11."""
     checks = [
-        _check_near(f"{quantity} of the {name}", samples[0].values[f"{quantity}.{name}"], published,
+        _check_published_value(f"{quantity} of the {name}", samples[0].values[f"{quantity}.{name}"], published,
                     0.05 if quantity == "offset" else 0.0005, "last printed digit",
                     "deg" if quantity == "offset" else "m")
-        for name, numbers in _TRIANGLES.items()
+        for name, numbers in _PUBLISHED_TRIANGLES.items()
         for quantity, published in zip(_TRIANGLE_NAMES, numbers, strict=True)
     ]  # fmt: skip
-    return Judgement(
+    return Evaluation(
         tuple(checks),
         note="Table 3 prints l_c 1.423 m for the boom where Fig. 9 and Table 11 have 1.447 m",
     )
 
 
-def judge_mobility(samples: Sequence[Sample]) -> Judgement:
+def evaluate_mobility(samples: Sequence[Sample]) -> Evaluation:
     """Compare the numbers of extra links and the mobility with Eq. 3.5."""
     wanted = (("extra links of the machine with grapple", "links_machine", 1.0),
               ("extra links of the excavator", "links_excavator", 3.0),
               ("mobility with one moving and four sensed links", "mobility", 2.0))  # fmt: skip
-    return Judgement(tuple(
-        _check_near(quantity, samples[0].values[name], published, 0.0, "an integer", "")
+    return Evaluation(tuple(
+        _check_published_value(quantity, samples[0].values[name], published, 0.0, "an integer", "")
         for quantity, name, published in wanted
     ))  # fmt: skip
 
 
-def judge_chain(samples: Sequence[Sample]) -> Judgement:
+def evaluate_chain(samples: Sequence[Sample]) -> Evaluation:
     """Compare the Denavit-Hartenberg parameters with Table 2."""
-    return Judgement((check_exact(
+    return Evaluation((check_exact(
         "largest difference of 36 numbers", samples[0].values["table_2"], (0.0, 5e-4),
         "last printed digit of a length", unit="m or deg",
     ),))  # fmt: skip
 
 
-def judge_pressures(samples: Sequence[Sample]) -> Judgement:
+def evaluate_pressures(samples: Sequence[Sample]) -> Evaluation:
     """Compare the errors of torque and forces with Eq. 4.61."""
-    return Judgement(tuple(
-        _check_near(f"error of the {name}", samples[0].values[f"torque.{name}"], published, 60.0,
+    return Evaluation(tuple(
+        _check_published_value(f"error of the {name}", samples[0].values[f"torque.{name}"], published, 60.0,
                     "5747 N is printed as 5700", "N m" if name == "swing" else "N")
-        for name, published in _TORQUES.items()
+        for name, published in _PUBLISHED_FORCE_ERRORS.items()
     ))  # fmt: skip
 
 
-def measure_lists(seed: int, changes: Changes) -> Sample:
+def measure_identifiable_lists(seed: int, changes: Changes) -> Sample:
     """Find the parameters identified in each stage.
 
     Args:
@@ -211,27 +215,32 @@ def measure_lists(seed: int, changes: Changes) -> Sample:
     Returns:
         Per stage, the number of parameters that are in only one of found list and document's list.
     """
-    chosen = choose_settings({"wander": None}, changes)
-    loop = loop_of(load_machine("calibrator"))
+    chosen = merge_settings({"wander": None}, changes)
+    loop = build_loop(load_machine("calibrator"))
     rng = np.random.default_rng(1)
     sweeps = {
         link: sweep if chosen["wander"] is None else sweep._replace(wander=chosen["wander"])
-        for link, sweep in STILL.items()
+        for link, sweep in DRIFT_FREE_SWEEPS.items()
     }
-    stages = [simulate_readings(loop, sweep_poses(loop, link, sweep), rng)
+    stages = [simulate_readings(loop, generate_sweep_poses(loop, link, sweep), rng)
               for link, sweep in sweeps.items()]  # fmt: skip
     fit = identify_arm(loop, stages)
     found = {s.link: {n for n in s.names if not n.startswith("p_")} for s in fit.stages}
-    return Sample({f"different.{link}": float(len(found[link] ^ LISTS[link])) for link in LISTS})
+    return Sample(
+        {
+            f"different.{link}": float(len(found[link] ^ IDENTIFIABLE_PARAMETERS[link]))
+            for link in IDENTIFIABLE_PARAMETERS
+        }
+    )
 
 
-def judge_lists(samples: Sequence[Sample]) -> Judgement:
+def evaluate_identifiable_lists(samples: Sequence[Sample]) -> Evaluation:
     """Compare the lists of identifiable parameters with section 3.6.4."""
-    return Judgement(tuple(
+    return Evaluation(tuple(
         check_exact(f"parameters of the {link} stage that are in one list only",
                     samples[0].values[f"different.{link}"], (0.0, 0.0), "the same lists",
                     published=0.0)
-        for link in LISTS
+        for link in IDENTIFIABLE_PARAMETERS
     ), note="links 6 to 8 are assumed known to 1 mm and 0.05 deg from the laboratory")  # fmt: skip
 
 
@@ -245,14 +254,14 @@ def measure_drift(seed: int, changes: Changes) -> Sample:
     Returns:
         Largest drift of each held link [deg] and largest closure error `gap` [m].
     """
-    loop = loop_of(load_machine("calibrator"))
-    loop = loop.with_values({name: changes[name] for name in loop.names if name in changes})
-    changes = {key: value for key, value in changes.items() if key not in loop.names}
+    loop = build_loop(load_machine("calibrator"))
+    loop = loop.with_values({name: changes[name] for name in loop.parameter_names if name in changes})
+    changes = {key: value for key, value in changes.items() if key not in loop.parameter_names}
     panels, values, gap = [], {}, 0.0
-    for link in MOVED:
+    for link in SIMULATED_STAGES:
         _, run = run_shipped(f"calibrate_{link}", changes)
         truth = run.truth
-        gap = max(gap, _closure_error(loop, truth))
+        gap = max(gap, _compute_closure_error(loop, truth))
         held = [name for name in ("swing", "boom", "stick") if name != link]
         for name in held:
             angle = np.degrees(truth[f"angle.{name}"])
@@ -265,10 +274,10 @@ def measure_drift(seed: int, changes: Changes) -> Sample:
     return Sample({**values, "gap": gap}, tuple(panels))
 
 
-def _closure_error(loop: Loop, truth) -> float:
+def _compute_closure_error(loop: CalibrationLoop, truth) -> float:
     """Return the largest closure error of Table 2's chain for simulated angles [m]."""
     angles = np.stack([truth[c] * s for c, s in zip(loop.channels, loop.signs, strict=True)], 1)
-    return float(np.abs(closure(loop, angles + loop.values[:, 0])[0]).max())
+    return float(np.abs(closure_error(loop, angles + loop.values[:, 0])[0]).max())
 
 
 _PUBLISHED_DRIFT = {
@@ -278,7 +287,7 @@ _PUBLISHED_DRIFT = {
 """Read from the axes of Figs 16(b), 17(c), 18(b) and 18(c) [deg]."""
 
 
-def judge_drift(samples: Sequence[Sample]) -> Judgement:
+def evaluate_drift(samples: Sequence[Sample]) -> Evaluation:
     """Compare the drift of held links with Figs 16 to 18."""
     values = samples[0].values
     checks = [
@@ -293,7 +302,7 @@ def judge_drift(samples: Sequence[Sample]) -> Judgement:
                     " less than one", unit="deg", published=0.0)
         for name, value in values.items() if name.startswith("swing while")
     ]  # fmt: skip
-    return Judgement(
+    return Evaluation(
         tuple(checks),
         "in the scenarios closed spools leak 2.7e-14 m3/(s Pa) to tank (25 mm, 7.5 um radial"
         " clearance), cylinders do not leak, and a run takes 120 s; the thesis gives no values."
@@ -302,10 +311,10 @@ def judge_drift(samples: Sequence[Sample]) -> Judgement:
     )
 
 
-def judge_closure(samples: Sequence[Sample]) -> Judgement:
+def evaluate_closure(samples: Sequence[Sample]) -> Evaluation:
     """Check the closure error of the kinematic chain with angles of the MuJoCo model."""
-    return Judgement((
-        check_exact("largest gap", 1e6 * float(collect(samples, "gap").max()), (0.0, 10.0),
+    return Evaluation((
+        check_exact("largest gap", 1e6 * float(collect_values(samples, "gap").max()), (0.0, 10.0),
                     "0.01 mm, much smaller than all errors in this study", unit="um"),
     ))  # fmt: skip
 
@@ -313,52 +322,52 @@ def judge_closure(samples: Sequence[Sample]) -> Judgement:
 EXPERIMENTS = (
     Experiment("dimensions", measure_machine, (
         Claim("masses of the links", "M 8031, 1830, 688 kg; k_x 2.30 and 0.90, k_y 0.2 and 0.1 m",
-              "Table 1, p. 18", "input", judge_masses, {"links.boom.mass": 1900.0},
+              "Table 1, p. 18", "input", evaluate_masses, {"links.boom.mass": 1900.0},
               "a heavier boom"),
         Claim("plates of boom and stick",
               "boom: L1 = 5.190, L2 = 2.000, L3 = 3.790, L4 = 2.443 m, gamma = 37.0 deg; stick:"
               " L1 = 1.800, L2 = 0.720, L3 = 2.425 m, gamma = 35 deg",
-              "Figs 5 and 6, pp. 14-15", "input", judge_plates,
+              "Figs 5 and 6, pp. 14-15", "input", evaluate_plates,
               {"axes.boom.cylinder.rod_pin.position": (1.88, 0.0, 0.684)},
               "the boom's rod pin 20 deg from its chord"),
         Claim("cylinder triangles",
               "boom: l_l 0.625, l_u 2.000, l_c 1.447 m, offset 78.6 deg; stick: 2.444, 0.720,"
               " 1.799 m, 10.3 deg",
-              "Figs 9 and 10, p. 19-20; Tables 3 and 11, pp. 57, 76", "input", judge_triangles,
+              "Figs 9 and 10, p. 19-20; Tables 3 and 11, pp. 57, 76", "input", evaluate_triangles,
               {"axes.stick.cylinder.closed_length": 1.85}, "a longer stick cylinder"),
         Claim("mobility of the closed chain",
               '"we thus need at least 1 extra link for the UBC experimental machine and 3 links for'
               ' the excavator"; with 4 sensed links 2 degrees of mobility',
-              "Eq. 3.5, pp. 29-30, 46-47", "input", judge_mobility,
+              "Eq. 3.5, pp. 29-30, 46-47", "input", evaluate_mobility,
               {"sensed_joints": ("calibrator_yoke", "calibrator_twist", "calibrator_elbow")},
               "the grapple's joint is not sensed"),
         Claim("Denavit-Hartenberg parameters of machine and calibrator",
               "36 numbers of nine frames, among them a1 = 0.340, d2 = -0.110, a2 = 5.180, d5 ="
               " 1.134, d7 = 2.994, a8 = 3.505 m",
-              "Table 2, p. 56; Figs 4, 7 and 15, pp. 13, 16, 53", "input", judge_chain,
+              "Table 2, p. 56; Figs 4, 7 and 15, pp. 13, 16, 53", "input", evaluate_chain,
               {"links.stick.position": (5.19, 0.0, 0.0)}, "the boom's length of Fig. 5"),
         Claim("error of torque and force from pressures within 25 psi",
               "about 1400 N m (swing), 5700 N (boom), 4200 N (stick)",
-              "section 4.4.3, p. 108", "input", judge_pressures,
+              "section 4.4.3, p. 108", "input", evaluate_pressures,
               {"axes.boom.cylinder.area_head": 0.01}, "a smaller boom cylinder"),
-    ), repetitions_fixed=1),
-    Experiment("identifiable parameters", measure_lists, (
+    ), fixed_repetitions=1),
+    Experiment("identifiable parameters", measure_identifiable_lists, (
         Claim("identifiable parameters of each stage",
               "link 4: offsets of joints 5 to 7, alpha, a, d of link 5, alpha, a of link 4; links 3"
               " and 2: the held angle outside, alpha, a, beta; link 1: theta_fix 2, d2, alpha 1,"
               " a1; in addition, the ball's p_xy and p_z",
-              "section 3.6.4, pp. 54-56", "document", judge_lists, {"wander": 0.0},
+              "section 3.6.4, pp. 54-56", "document", evaluate_identifiable_lists, {"wander": 0.0},
               "the grapple does not rotate"),
-    ), repetitions_fixed=1),
+    ), fixed_repetitions=1),
     Experiment("held links", measure_drift, (
         Claim("held links drift while one moves",
               '"there will be a drift at the endpoint of each link which is actuated by a hydraulic'
               ' jack": 0.4 to 0.8 deg of boom and stick in the figures, none of the swing',
-              "Figs 16 to 18, section 3.7.1, pp. 57-59", "document", judge_drift,
+              "Figs 16 to 18, section 3.7.1, pp. 57-59", "document", evaluate_drift,
               {"pilot.closed_valves": "[]"}, "the servo holds the links instead of closed valves"),
         Claim("closure of the kinematic chain",
               "the chain of Table 2 closes on the angles of the MuJoCo model",
-              "Figs 16 to 18, pp. 57-59", "additional", judge_closure,
+              "Figs 16 to 18, pp. 57-59", "additional", evaluate_closure,
               {"a.boom": 5.19}, "the chain has the boom's length of Fig. 5", ()),
-    ), repetitions_fixed=1),
+    ), fixed_repetitions=1),
 )  # fmt: skip

@@ -14,15 +14,15 @@ import numpy as np
 
 from hydrotele.core.errors import InputError
 from hydrotele.experiments.comparison import Changes
-from hydrotele.identify.identifiability import Identifiability, identifiability, reference_sizes
-from hydrotele.identify.setup import Model, RegressorSetup, machine_setup
+from hydrotele.identify.identifiability import Identifiability, classify_parameters, reference_sizes
+from hydrotele.identify.setup import DynamicModel, RegressorSetup, machine_setup
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.multibody.inverse_dynamics import FrictionTerm, Regressor, pin_friction
-from hydrotele.simulate.closure import closed_chain
+from hydrotele.multibody.inverse_dynamics import FrictionTerm, Regressor, passive_friction_terms
+from hydrotele.simulate.closure import load_closed_chain
 
 DRIVES = ("swing", "boom", "stick")
 UNITS = ("N m", "N", "N")
-PERIOD = 0.02
+SAMPLE_PERIOD = 0.02
 """Sample period [s] (p. 21, 50 Hz)."""
 
 DURATION = 5.0
@@ -31,8 +31,8 @@ DURATION = 5.0
 _DEG = np.pi / 180.0
 # Ranges of start and end [deg] and of the largest rate [rad/s] of swing, boom and stick in this
 # project's signs, from the axis limits of Figs 30 to 32.
-_STARTS = ((-40.0, -20.0), (0.0, 10.0), (-50.0, -25.0))
-_ENDS = ((0.0, 20.0), (40.0, 50.0), (-150.0, -100.0))
+_START_ANGLES = ((-40.0, -20.0), (0.0, 10.0), (-50.0, -25.0))
+_END_ANGLES = ((0.0, 20.0), (40.0, 50.0), (-150.0, -100.0))
 _PEAK_RATES = ((0.3, 0.4), (0.3, 0.4), (1.0, 1.5))
 _QUINTIC_PEAK = 1.875  # largest rate of a fifth-order polynomial of unit travel and duration
 
@@ -40,7 +40,7 @@ Motion = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Positions, rates and accelerations (n, 3) of swing, boom and stick [rad], [rad/s], [rad/s^2]."""
 
 
-def read_settings(settings: Mapping[str, Any], changes: Changes) -> dict[str, Any]:
+def merge_settings(settings: Mapping[str, Any], changes: Changes) -> dict[str, Any]:
     """Return the default settings of an experiment with changes applied.
 
     Args:
@@ -59,8 +59,8 @@ def read_settings(settings: Mapping[str, Any], changes: Changes) -> dict[str, An
 
 
 @cache
-def document_setup(
-    model: Model = "complete", ball_joints: bool = True, tilt_deg: float = 0.0
+def make_document_setup(
+    model: DynamicModel = "complete", ball_joints: bool = True, tilt_deg: float = 0.0
 ) -> RegressorSetup:
     """Return the setup of the document's regressor.
 
@@ -75,20 +75,20 @@ def document_setup(
     Source: Khoshzaban 1992, p. 92, Eq. 4.23; pp. 97 to 98, Eqs 4.51 to 4.56.
     """
     machine = load_machine("cat215")
-    chain = closed_chain(machine)
+    chain = load_closed_chain(machine)
     slope = np.array([np.sin(_DEG * tilt_deg), 0.0, np.cos(_DEG * tilt_deg)])
     gravity = -float(np.linalg.norm(chain.tree.gravity)) * slope
     chain = replace(chain, tree=chain.tree._replace(gravity=gravity))
     setup = machine_setup(machine, chain, model, ball_joints=ball_joints)
     rubbing = [FrictionTerm(joint, {"coulomb": 0.0}) for joint in chain.drives]
     if model == "complete":
-        rubbing += pin_friction(chain)
+        rubbing += passive_friction_terms(chain)
     return replace(setup, rubbing=tuple(rubbing))
 
 
 def make_regressor(setup: RegressorSetup, motion: Motion) -> Regressor:
     """Return the regressor along a motion."""
-    return setup.table(setup.project(*motion))
+    return setup.compute_regressor(setup.project(*motion))
 
 
 def stack_rows(table: Regressor) -> np.ndarray:
@@ -128,11 +128,11 @@ def draw_motion(rng: np.random.Generator) -> Motion:
     """
     start, end, peak = (
         np.array([rng.uniform(*pair) for pair in pairs])
-        for pairs in (_STARTS, _ENDS, _PEAK_RATES)
+        for pairs in (_START_ANGLES, _END_ANGLES, _PEAK_RATES)
     )  # fmt: skip
     start, way = _DEG * start, _DEG * (end - start)
     lasting = np.minimum(_QUINTIC_PEAK * np.abs(way) / peak, DURATION)
-    s = np.clip(np.arange(0.0, DURATION, PERIOD)[:, None] / lasting, 0.0, 1.0)
+    s = np.clip(np.arange(0.0, DURATION, SAMPLE_PERIOD)[:, None] / lasting, 0.0, 1.0)
     return (
         start + way * (10 * s**3 - 15 * s**4 + 6 * s**5),
         way * (30 * s**2 - 60 * s**3 + 30 * s**4) / lasting,
@@ -162,19 +162,19 @@ def scale_cylinders(table: Regressor, scale: float, bodies: Sequence[str] | None
 
 
 @dataclass(frozen=True)
-class Base:
+class BaseParameters:
     """Base parameters of a model.
 
     Attributes:
         setup: setup of the regressor.
-        told: identifiability of all parameters.
+        classification: identifiability of all parameters.
         names: (p,) names of the parameters that represent the base parameters.
         truth: (p,) base parameters of Table 13's machine.
         sizes: (p,) reference sizes for the errors.
     """
 
     setup: RegressorSetup
-    told: Identifiability
+    classification: Identifiability
     names: tuple[str, ...]
     truth: np.ndarray
     sizes: np.ndarray
@@ -192,37 +192,37 @@ class Base:
 
         Source: Khoshzaban 1992, p. 99, Eq. 4.58; p. 100.
         """
-        rows = self.rows(motion)
+        rows = self.build_regressor(motion)
         length = np.linalg.norm(rows, axis=0)
         right = forces.reshape(*forces.shape[:-2], -1).T
         q, r = np.linalg.qr(rows / length)
-        return np.linalg.lstsq(r, q.T @ right, rcond=_ROUNDING)[0].T / length
+        return np.linalg.lstsq(r, q.T @ right, rcond=_RANK_TOLERANCE)[0].T / length
 
-    def rows(self, motion: Motion) -> np.ndarray:
+    def build_regressor(self, motion: Motion) -> np.ndarray:
         """Return the (3 n, p) regressor of the base parameters."""
-        return stack_rows(make_regressor(self.setup, motion))[:, self.told.base]
+        return stack_rows(make_regressor(self.setup, motion))[:, self.classification.base]
 
 
-_ROUNDING = 1e-13  # relative to the largest singular value: some 100 times the rounding of doubles
-_STATES = 300  # random states; each gives three equations for at most 82 parameters
+_RANK_TOLERANCE = 1e-13  # relative to the largest singular value: some 100 times the rounding of doubles
+_RANDOM_STATES = 300  # random states; each gives three equations for at most 82 parameters
 
 
 @cache
-def find_base(model: Model, ball_joints: bool = True) -> Base:
+def find_base(model: DynamicModel, ball_joints: bool = True) -> BaseParameters:
     """Find the base parameters of a model from random states.
 
     Args:
         model: `complete` or `reduced`.
-        ball_joints: see `document_setup`.
+        ball_joints: see `make_document_setup`.
 
     Returns:
         The base parameters.
     """
-    setup = document_setup(model, ball_joints)
-    table = make_regressor(setup, draw_states(_STATES))
-    told = identifiability(stack_rows(table), table.names, table.units)
+    setup = make_document_setup(model, ball_joints)
+    table = make_regressor(setup, draw_states(_RANDOM_STATES))
+    told = classify_parameters(stack_rows(table), table.names, table.units)
     usual = np.sqrt(np.mean((table.matrix @ table.nominal) ** 2, axis=0))
-    return Base(
+    return BaseParameters(
         setup, told, tuple(table.names[b] for b in told.base), told.combination @ table.nominal,
         reference_sizes(table, setup, usual)[told.base],
     )  # fmt: skip

@@ -9,23 +9,23 @@ from collections.abc import Sequence
 import numpy as np
 
 from hydrotele.calibrate.arm import identify_arm
-from hydrotele.calibrate.design import STILL, sweep_poses
+from hydrotele.calibrate.design import DRIFT_FREE_SWEEPS, generate_sweep_poses
 from hydrotele.calibrate.flexibility import refit_with_flexibility
-from hydrotele.calibrate.loop import loop_of
+from hydrotele.calibrate.loop import build_loop
 from hydrotele.experiments.calibrator_readings import (
-    RESOLVER,
-    bend_level_joints,
+    MAX_RESOLVER_ERROR,
+    draw_gravity_bends,
     simulate_readings,
 )
-from hydrotele.experiments.comparison import Changes, Claim, Experiment, Judgement, Sample
-from hydrotele.experiments.intervals import check_exact, check_mean, check_statistic, collect
-from hydrotele.experiments.khoshzaban_arm import LENGTHS, MOVED, choose_settings
+from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Sample
+from hydrotele.experiments.intervals import check_exact, check_mean, check_statistic, collect_values
+from hydrotele.experiments.khoshzaban_arm import LENGTH_PARAMETERS, SIMULATED_STAGES, merge_settings
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.kinematics.linkages import TwoBar
 from hydrotele.machine.machine_file import load_machine
 
-_STEP = 1.0e-6  # step of central differences [m] or [rad]
-_RANK = 1.0e-6  # relative to the largest singular value; rounding of the differences is 1e-9
+_DIFFERENCE_STEP = 1.0e-6  # step of central differences [m] or [rad]
+_RANK_TOLERANCE = 1.0e-6  # relative to the largest singular value; rounding of the differences is 1e-9
 
 LINKAGE_SETTINGS = {"axial_offset": 0.05}
 """Distance of the two pins of the boom's cylinder along the joint's axis [m]."""
@@ -45,7 +45,7 @@ def measure_linkage(seed: int, changes: Changes) -> Sample:
     Returns:
         Number of undetermined parameters per set of sensors, and `needed` angle sensors.
     """
-    chosen = choose_settings(LINKAGE_SETTINGS, changes)
+    chosen = merge_settings(LINKAGE_SETTINGS, changes)
     machine = load_machine("cat215", "none")
     linkage, cylinder = axis_linkage(machine, "boom"), machine.axes["boom"].cylinder
     assert isinstance(linkage, TwoBar) and cylinder
@@ -74,24 +74,24 @@ def measure_linkage(seed: int, changes: Changes) -> Sample:
         columns = []
         for k in range(len(start)):
             step = np.zeros(len(start))
-            step[k] = _STEP
-            columns.append((read(start + step) - read(start - step)) / (2.0 * _STEP))
+            step[k] = _DIFFERENCE_STEP
+            columns.append((read(start + step) - read(start - step)) / (2.0 * _DIFFERENCE_STEP))
         jacobian = np.array(columns).T
         jacobian /= np.linalg.norm(jacobian, axis=0)
         size = np.linalg.svd(jacobian, compute_uv=False)
-        values[name] = float(len(start) - np.sum(size > _RANK * size[0]))
+        values[name] = float(len(start) - np.sum(size > _RANK_TOLERANCE * size[0]))
     needed = next((k for k, name in enumerate(sensors) if values[name] == 0.0), len(sensors))
     return Sample(values | {"needed": float(needed)})
 
 
-def judge_linkage(samples: Sequence[Sample]) -> Judgement:
+def evaluate_linkage(samples: Sequence[Sample]) -> Evaluation:
     """Check the number of additional sensors that the parameters require."""
     v = samples[0].values
     check = check_exact(
         "angle sensors needed in addition to the displacement", v["needed"], (2.0, 2.0),
         "the document's number", published=2.0,
     )  # fmt: skip
-    return Judgement(
+    return Evaluation(
         (check,),
         "the length depends on the distance h of the pins along the axis only through"
         " l_l^2 + l_u^2 + h^2 and l_l l_u; one angle of the cylinder gives the ratio l_u / l_l,"
@@ -109,14 +109,14 @@ and whether the noise model is estimated."""
 
 def measure_flexibility(seed: int, changes: Changes) -> Sample:
     """Identify an arm with bent joints, without and with the noise model of flexible joints."""
-    chosen = choose_settings(FLEXIBILITY_SETTINGS, changes)
-    loop = loop_of(load_machine("calibrator"))
+    chosen = merge_settings(FLEXIBILITY_SETTINGS, changes)
+    loop = build_loop(load_machine("calibrator"))
     rng = np.random.default_rng([124, seed])
     stages = []
-    for link in MOVED:
-        clean = sweep_poses(loop, link, STILL[link], seed)
-        bend = bend_level_joints(loop, clean, rng, chosen["bend"], chosen["bent_share"], False)
-        stages.append(simulate_readings(loop, clean, rng, RESOLVER, bend))
+    for link in SIMULATED_STAGES:
+        clean = generate_sweep_poses(loop, link, DRIFT_FREE_SWEEPS[link], seed)
+        bend = draw_gravity_bends(loop, clean, rng, chosen["bend"], chosen["bent_share"], False)
+        stages.append(simulate_readings(loop, clean, rng, MAX_RESOLVER_ERROR, bend))
     plain = identify_arm(loop, stages)
     better, flexibility = plain, np.zeros(2)
     if chosen["estimated"]:
@@ -124,18 +124,18 @@ def measure_flexibility(seed: int, changes: Changes) -> Sample:
         flexibility = np.degrees(found.at_full_load[:2])
     values = {"grapple": float(flexibility[0]), "yoke": float(flexibility[1])}
     for name, fit in (("plain", plain), ("modelled", better)):
-        truth = {n: loop.value(n) for n in fit.names if n in loop.names}
-        lengths = [fit.value(n) - truth[n] for n in LENGTHS if n in truth]
+        truth = {n: loop.value(n) for n in fit.names if n in loop.parameter_names}
+        lengths = [fit.value(n) - truth[n] for n in LENGTH_PARAMETERS if n in truth]
         values[f"{name}_square"] = float(np.mean(np.square(lengths)))
-        deviations = dict(zip(fit.names, fit.deviations, strict=True))
+        deviations = dict(zip(fit.names, fit.standard_deviations, strict=True))
         inside = [abs(fit.value(n) - t) < 1.96 * deviations[n] for n, t in truth.items()]
         values[f"{name}_covered"] = float(np.mean(inside))
     return Sample(values)
 
 
-def judge_flexibility(samples: Sequence[Sample]) -> Judgement:
+def evaluate_flexibility(samples: Sequence[Sample]) -> Evaluation:
     """Check the ratio of the length errors and the coverage of the 95 % intervals."""
-    squares = np.column_stack([collect(samples, f"{n}_square") for n in ("modelled", "plain")])
+    squares = np.column_stack([collect_values(samples, f"{n}_square") for n in ("modelled", "plain")])
     ratio = check_statistic(
         "RMS error of the lengths, with over without the noise model", squares,
         lambda rows: float(np.sqrt(rows[:, 0].mean() / rows[:, 1].mean())), (0.0, 0.95),
@@ -143,15 +143,15 @@ def judge_flexibility(samples: Sequence[Sample]) -> Judgement:
     )  # fmt: skip
     covered = check_mean(
         "fraction of the 95 % intervals that contain the truth",
-        collect(samples, "modelled_covered"), (0.85, 1.0),
+        collect_values(samples, "modelled_covered"), (0.85, 1.0),
         "95 % minus 10 %, because the simulated joints bend by another law than the modelled ones",
     )  # fmt: skip
-    plain = float(np.mean(collect(samples, "plain_covered")))
-    return Judgement(
+    plain = float(np.mean(collect_values(samples, "plain_covered")))
+    return Evaluation(
         (ratio, covered),
         note=f"without the noise model {100 * plain:.0f} % of the intervals do so; estimated"
-        f" flexibility at full load {np.mean(collect(samples, 'grapple')):.2f} deg (grapple) and"
-        f" {np.mean(collect(samples, 'yoke')):.2f} deg (yoke)",
+        f" flexibility at full load {np.mean(collect_values(samples, 'grapple')):.2f} deg (grapple) and"
+        f" {np.mean(collect_values(samples, 'yoke')):.2f} deg (yoke)",
     )
 
 
@@ -163,11 +163,11 @@ EXPERIMENTS = (
             " and two more joint angle sensors are required to identify the geometric parameters",
             "p. 43, section 3.4.4, Fig. 12",
             "document",
-            judge_linkage,
+            evaluate_linkage,
             {"axial_offset": 0.0},
             "pins in one plane: no angle sensor is needed",
         ),
-    ), repetitions_fixed=1),
+    ), fixed_repetitions=1),
     Experiment("flexible joints", measure_flexibility, (
         Claim(
             "noise model of flexible joints",
@@ -175,7 +175,7 @@ EXPERIMENTS = (
             " estimated with the parameters of the arm and improves them",
             "p. 124, section 5.3",
             "additional",
-            judge_flexibility,
+            evaluate_flexibility,
             {"estimated": False},
             "the noise model is not estimated",
         ),

@@ -14,29 +14,29 @@ import numpy as np
 from hydrotele.experiments.comparison import (
     Changes,
     Claim,
+    Evaluation,
     Experiment,
-    Judgement,
     Panel,
     Sample,
 )
 from hydrotele.experiments.intervals import check_mean, check_statistic, format_values
 from hydrotele.experiments.khoshzaban_models import (
     DRIVES,
-    PERIOD,
+    SAMPLE_PERIOD,
     UNITS,
-    Base,
+    BaseParameters,
     Motion,
     find_base,
     join_motions,
     make_regressor,
-    read_settings,
+    merge_settings,
 )
 from hydrotele.experiments.khoshzaban_sensors import SENSOR_ACCURACY
-from hydrotele.identify.equations import row_forces
+from hydrotele.identify.equations import predict_forces
 from hydrotele.identify.estimation import Estimator
 from hydrotele.identify.identification import fit_runs
 from hydrotele.identify.motion import Processing
-from hydrotele.identify.record import IdentificationRecord, records
+from hydrotele.identify.record import IdentificationRecord, build_records
 from hydrotele.identify.setup import RegressorSetup, machine_setup
 from hydrotele.identify.smoothing import smooth
 from hydrotele.logs.dataset import make_dataset
@@ -44,13 +44,13 @@ from hydrotele.logs.files import RunFiles
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
-from hydrotele.simulate.closure import closed_chain
+from hydrotele.simulate.closure import load_closed_chain
 
-FITTED = ("excitation", "excitation_boom", "excitation_stick", "excitation_swing")
+FIT_SCENARIOS = ("excitation", "excitation_boom", "excitation_stick", "excitation_swing")
 """Scenarios for identification; the document has five sets of trajectories (p. 113)."""
 
-HELD_OUT = "excitation_fast"
-FITTED_ROWS = 1664
+HELD_OUT_SCENARIO = "excitation_fast"
+FIT_ROWS = 1664
 """Number of samples for identification (p. 113)."""
 
 HELD_OUT_ROWS = 450
@@ -72,7 +72,7 @@ SETTINGS = {
     "friction_identified": True,  # whether the identified models have columns for friction
     "linear": False,  # whether the fitted forces are those of the linear model, without errors
 }
-_SKIPPED = 200  # rows at the start, while the excitation fades in
+_SKIPPED_ROWS = 200  # rows at the start, while the excitation fades in
 _PSI = 6894.757  # Pa
 
 
@@ -90,38 +90,41 @@ def measure_prediction(seed: int, changes: Changes) -> Sample:
     Returns:
         RMS prediction errors per model and drive, and fractions of unrealistic parameters.
     """
-    settings = read_settings(SETTINGS, changes)
+    settings = merge_settings(SETTINGS, changes)
     rng = np.random.default_rng(seed)
     fit, heldout = (
         [_add_errors(record, settings, rng) for record in part]
-        for part in _simulate(settings["swing_friction"])
+        for part in _simulate_records(settings["swing_friction"])
     )
-    learned, (judged,) = [_smooth(record) for record in fit], [_smooth(r) for r in heldout]
+    learned, (judged,) = (
+        [_differentiate_record(record) for record in fit],
+        [_differentiate_record(r) for r in heldout],
+    )
     motion = join_motions(learned)
     force, measured = np.concatenate([record.force for record in fit]), heldout[0].force
     predicted, unrealistic = {}, {}
     machine = load_machine("cat215")
-    chain = closed_chain(machine)
+    chain = load_closed_chain(machine)
     for model in ("complete", "reduced"):
         setup = machine_setup(machine, chain, model)
         if not settings["friction_identified"]:
             setup = replace(setup, rubbing=())
         found = fit_runs(fit, setup, Processing(), Estimator())
-        predicted[model] = row_forces(setup, np.stack(judged), found.whole())
+        predicted[model] = predict_forces(setup, np.stack(judged), found.expand_parameters())
         base = find_base(model)
-        truth = _plant_values(base, settings["swing_friction"])
-        fitted = (base.rows(motion) @ truth).reshape(-1, 3) if settings["linear"] else force
+        truth = _find_plant_parameters(base, settings["swing_friction"])
+        fitted = (base.build_regressor(motion) @ truth).reshape(-1, 3) if settings["linear"] else force
         value = base.estimate(motion, fitted)
-        predicted[f"{model} by plain least squares"] = (base.rows(judged) @ value).reshape(-1, 3)
+        predicted[f"{model} by plain least squares"] = (base.build_regressor(judged) @ value).reshape(-1, 3)
         unrealistic[model] = np.abs(value - truth) > base.sizes
     nominal = machine_setup(machine, chain)
     if settings["nominal"] == "gross":
-        nominal = _make_gross(nominal, settings["mass_error"], rng)
+        nominal = _add_model_errors(nominal, settings["mass_error"], rng)
     table = make_regressor(nominal, (judged[0][:1], judged[1][:1], judged[2][:1]))
     value = table.nominal.copy()
     if settings["nominal"] == "exact":
         value[table.names.index("coulomb.swing")] = settings["swing_friction"]
-    predicted["nominal"] = row_forces(nominal, np.stack(judged), value)
+    predicted["nominal"] = predict_forces(nominal, np.stack(judged), value)
     values = {
         f"{model}.{drive}": float(np.sqrt(np.mean((forces[:, k] - measured[:, k]) ** 2)))
         for model, forces in predicted.items()
@@ -129,27 +132,27 @@ def measure_prediction(seed: int, changes: Changes) -> Sample:
     }
     values |= {f"unrealistic.{m}": float(np.mean(part)) for m, part in unrealistic.items()}
     values["unrealistic"] = float(np.mean(np.concatenate(list(unrealistic.values()))))
-    values |= _find_unexplained_share(motion)
-    return Sample(values, _panels(motion, judged, measured, predicted))
+    values |= _find_unexplained_fraction(motion)
+    return Sample(values, _draw_panels(motion, judged, measured, predicted))
 
 
 @cache
-def _simulate(
+def _simulate_records(
     swing_friction: float,
 ) -> tuple[list[IdentificationRecord], list[IdentificationRecord]]:
     """Simulate records without sensor errors: those for identification and the held-out one."""
     numbers = f"{{coulomb: {swing_friction}}}"
     friction = f"{{name: coulomb_friction, location: swing, parameters: {numbers}}}"
     own, files = {"sensors": "ideal", "effects": f"[{friction}]"}, []
-    for name in (*FITTED, HELD_OUT):
+    for name in (*FIT_SCENARIOS, HELD_OUT_SCENARIO):
         files.append(RunFiles(name, (run_scenario(load_scenario(name, own)).measured,)))
-    fit, heldout, _ = records(make_dataset(files, load_machine("cat215"), "ideal", HELD_OUT))
-    rows = FITTED_ROWS // len(FITTED)
-    return [_cut(record, rows) for record in fit], [_cut(heldout, HELD_OUT_ROWS)]
+    fit, heldout, _ = build_records(make_dataset(files, load_machine("cat215"), "ideal", HELD_OUT_SCENARIO))
+    rows = FIT_ROWS // len(FIT_SCENARIOS)
+    return [_select_rows(record, rows) for record in fit], [_select_rows(heldout, HELD_OUT_ROWS)]
 
 
-def _cut(record: IdentificationRecord, rows: int) -> IdentificationRecord:
-    chosen = slice(_SKIPPED, _SKIPPED + rows)
+def _select_rows(record: IdentificationRecord, rows: int) -> IdentificationRecord:
+    chosen = slice(_SKIPPED_ROWS, _SKIPPED_ROWS + rows)
     return replace(record, position=record.position[chosen], force=record.force[chosen])
 
 
@@ -171,24 +174,22 @@ def _add_errors(
     )  # fmt: skip
 
 
-def _smooth(record: IdentificationRecord) -> Motion:
+def _differentiate_record(record: IdentificationRecord) -> Motion:
     """Compute positions, rates and accelerations with the optimal smoother (p. 112)."""
     found = smooth(record.position, record.period, record.position_noise)
     return found.value, found.rate, found.acceleration
 
 
-def _make_gross(
-    setup: RegressorSetup, mass_error: float, rng: np.random.Generator
-) -> RegressorSetup:
+def _add_model_errors(setup: RegressorSetup, mass_error: float, rng: np.random.Generator) -> RegressorSetup:
     """Return the nominal model with errors of masses and centres of mass, without friction."""
     inertia = setup.chain.inertia.copy()
     inertia *= rng.uniform(1.0 - mass_error, 1.0 + mass_error, (len(inertia), 1))
     inertia[:, 1:4] *= rng.uniform(1.0 - mass_error, 1.0 + mass_error, (len(inertia), 1))
-    rubbing = tuple(replace(r, nominal=dict.fromkeys(r.nominal, 0.0)) for r in setup.rubbing)
+    rubbing = tuple(replace(r, nominal=dict.fromkeys(r.nominal, 0.0)) for r in setup.friction_terms)
     return replace(setup, chain=replace(setup.chain, inertia=inertia), rubbing=rubbing)
 
 
-def _plant_values(base: Base, swing_friction: float) -> np.ndarray:
+def _find_plant_parameters(base: BaseParameters, swing_friction: float) -> np.ndarray:
     """Return the base parameters (p,) of the simulated machine.
 
     Unlike Table 13, the simulated machine has Coulomb friction.
@@ -202,21 +203,21 @@ def _plant_values(base: Base, swing_friction: float) -> np.ndarray:
     return base.truth + np.array([dry.get(name, 0.0) for name in base.names])
 
 
-def _find_unexplained_share(motion: Motion) -> dict[str, float]:
+def _find_unexplained_fraction(motion: Motion) -> dict[str, float]:
     """Return the fraction of the cylinders' forces that the reduced model cannot reproduce."""
     complete, reduced = find_base("complete"), find_base("reduced")
     table = make_regressor(complete.setup, motion)
     bars = [name.endswith(("_tube", "_rod")) and "coulomb" not in name for name in table.names]
     force = (table.matrix @ np.where(bars, table.nominal, 0.0)).ravel()
-    rows = reduced.rows(motion)
+    rows = reduced.build_regressor(motion)
     rest = force - rows @ np.linalg.lstsq(rows, force, rcond=None)[0]
     sizes = [np.sqrt(np.mean(part.reshape(-1, 3) ** 2, axis=0)) for part in (rest, force)]
     return {f"unexplained.{d}": float(sizes[0][k] / sizes[1][k]) for k, d in enumerate(DRIVES)}
 
 
-def _panels(motion, judged, force, predicted) -> tuple[Panel, ...]:
+def _draw_panels(motion, heldout, force, predicted) -> tuple[Panel, ...]:
     panels = []
-    for label, part in ((FIT_LABEL, motion[0]), (HELD_OUT_LABEL, judged[0])):
+    for label, part in ((FIT_LABEL, motion[0]), (HELD_OUT_LABEL, heldout[0])):
         curves = {drive: np.rad2deg(part[:, k]) for k, drive in enumerate(DRIVES)}
         panels.append(Panel(label, np.arange(len(part)), curves, "sample (50 Hz)"))
     chosen = ("complete", "reduced", "nominal")
@@ -224,7 +225,7 @@ def _panels(motion, judged, force, predicted) -> tuple[Panel, ...]:
         curves = {"measured": force[:, k]} | {name: predicted[name][:, k] for name in chosen}
         errors = {name: predicted[name][:, k] - force[:, k] for name in chosen}
         panels.append(
-            Panel(label, PERIOD * np.arange(len(force)), curves, errors=errors,
+            Panel(label, SAMPLE_PERIOD * np.arange(len(force)), curves, errors=errors,
                   error_label=f"predicted minus measured [{unit}]")
         )  # fmt: skip
     return tuple(panels)
@@ -237,7 +238,7 @@ FORCE_LABELS = tuple(
 )
 
 
-def _ratio_check(samples: Sequence[Sample], one: str, other: str, k: int, accepted, reason):
+def _check_rms_ratio(samples: Sequence[Sample], one: str, other: str, k: int, accepted, reason):
     """Return a check of the ratio of two models' RMS errors of drive k over all repetitions."""
     drive = DRIVES[k]
     rows = np.array([[s.values[f"{m}.{drive}"] for m in (one, other)] for s in samples])
@@ -248,7 +249,7 @@ def _ratio_check(samples: Sequence[Sample], one: str, other: str, k: int, accept
     )  # fmt: skip
 
 
-def judge_complete_and_reduced(samples: Sequence[Sample]) -> Judgement:
+def evaluate_reduced_model(samples: Sequence[Sample]) -> Evaluation:
     """Check that the complete model is better by at least half of the published gain."""
     checks = []
     for k in range(3):
@@ -256,11 +257,11 @@ def judge_complete_and_reduced(samples: Sequence[Sample]) -> Judgement:
         if ratio < 1.0:  # the boom, which the reduced model predicted better
             continue
         checks.append(
-            _ratio_check(samples, "reduced", "complete", k, (0.5 * (1.0 + ratio), np.inf),
+            _check_rms_ratio(samples, "reduced", "complete", k, (0.5 * (1.0 + ratio), np.inf),
                          "half of the published gain of one unrepeated experiment")
         )  # fmt: skip
     shares = ", ".join(f"{d} {format_values(samples, f'unexplained.{d}', 100.0)} %" for d in DRIVES)
-    return Judgement(
+    return Evaluation(
         tuple(checks),
         "The reduced model explains these data as well as the complete one: tubes and rods move"
         " with the links, so that the links' parameters reproduce the cylinders' forces except for"
@@ -268,11 +269,11 @@ def judge_complete_and_reduced(samples: Sequence[Sample]) -> Judgement:
         " document's gain may come from effects of its machine that the additional parameters fit."
         " Plain least squares of all base parameters, the document's method, predicts worse with"
         " the complete model, because its parameters fit the noise.",
-        note=_describe_levels(samples),
+        note=_describe_rms_errors(samples),
     )
 
 
-def _describe_levels(samples: Sequence[Sample]) -> str:
+def _describe_rms_errors(samples: Sequence[Sample]) -> str:
     """Return the RMS errors of all models as text."""
     parts = []
     for model in samples[0].values:
@@ -283,17 +284,17 @@ def _describe_levels(samples: Sequence[Sample]) -> str:
     return "RMS errors (swing N m, boom N, stick N): " + "; ".join(parts)
 
 
-def judge_identified_and_nominal(samples: Sequence[Sample]) -> Judgement:
+def evaluate_nominal_model(samples: Sequence[Sample]) -> Evaluation:
     """Check that the nominal model is worse by half of the smallest published excess."""
     ratios = np.divide(PUBLISHED_RMS["nominal"], PUBLISHED_RMS["complete"])
     checks = tuple(
-        _ratio_check(
+        _check_rms_ratio(
             samples, "nominal", "complete", k, (0.5 * (1.0 + float(ratios.min())), np.inf),
             "half of the smallest published excess, which the document calls much closer",
         )
         for k in range(3)
     )  # fmt: skip
-    return Judgement(
+    return Evaluation(
         checks,
         "The ratios depend on the errors of the nominal model, which are unknown in the document:"
         " here it has no friction, as in Table 13, and masses and centres of mass have errors of up"
@@ -302,7 +303,7 @@ def judge_identified_and_nominal(samples: Sequence[Sample]) -> Judgement:
     )
 
 
-def judge_sensor_accuracy(samples: Sequence[Sample]) -> Judgement:
+def evaluate_sensor_accuracy(samples: Sequence[Sample]) -> Evaluation:
     """Compare the complete model's errors with the sensors' accuracy."""
     ratios = np.divide(PUBLISHED_RMS["complete"], SENSOR_ACCURACY)
     checks = [
@@ -314,30 +315,28 @@ def judge_sensor_accuracy(samples: Sequence[Sample]) -> Judgement:
         )
         for k, drive in enumerate(DRIVES)
     ]  # fmt: skip
-    return Judgement(tuple(checks))
+    return Evaluation(tuple(checks))
 
 
-def judge_realistic(samples: Sequence[Sample]) -> Judgement:
+def evaluate_parameter_errors(samples: Sequence[Sample]) -> Evaluation:
     """Check that most estimates have errors above the size of the parameter."""
     check = check_mean(
         "fraction of base parameters with estimation errors above the parameter's size",
         np.array([s.values["unrealistic"] for s in samples]), (0.5, 1.0),
         "most: more than half; an error above the size is not realistic",
     )  # fmt: skip
-    complete, reduced = (
-        format_values(samples, f"unrealistic.{m}", 100.0, 0) for m in ("complete", "reduced")
-    )
-    return Judgement((check,), note=f"complete model {complete} %, reduced model {reduced} %")
+    complete, reduced = (format_values(samples, f"unrealistic.{m}", 100.0, 0) for m in ("complete", "reduced"))
+    return Evaluation((check,), note=f"complete model {complete} %, reduced model {reduced} %")
 
 
-def judge_caption(samples: Sequence[Sample]) -> Judgement:
+def describe_motions(samples: Sequence[Sample]) -> Evaluation:
     """Describe the joint angles; only the axes of the published figures are legible."""
     angles = {panel.label: panel.curves for panel in samples[0].panels}
     ranges = "; ".join(
         f"{label}: " + ", ".join(f"{d} {v.min():.0f} to {v.max():.0f}" for d, v in curves.items())
         for label, curves in angles.items() if label in (FIT_LABEL, HELD_OUT_LABEL)
     )  # fmt: skip
-    return Judgement(note=f"{FITTED_ROWS} and {HELD_OUT_ROWS} samples; {ranges}")
+    return Evaluation(note=f"{FIT_ROWS} and {HELD_OUT_ROWS} samples; {ranges}")
 
 
 PREDICTION = Experiment(
@@ -348,42 +347,42 @@ PREDICTION = Experiment(
             " manipulator used to identify dynamic parameters; Figure 36: position trajectories"
             " of an unused motion (axes: swing -100 to 150, boom -50 to 0, stick 50 to 150 deg in"
             " the document's signs)",
-            "Figs 35 and 36, pp. 114 and 118", "caption", judge_caption,
-            panels=(FIT_LABEL, HELD_OUT_LABEL),
+            "Figs 35 and 36, pp. 114 and 118", "caption", describe_motions,
+            panel_labels=(FIT_LABEL, HELD_OUT_LABEL),
         ),
         Claim(
             "identified parameters are not realistic",
             '"Most of the estimated parameters are even far from being realistic."',
-            "Tables 16 and 17, pp. 113, 115 and 116", "document", judge_realistic,
-            broken={"linear": True},
-            broken_how="the fitted forces are those of the linear model, without errors", panels=(),
+            "Tables 16 and 17, pp. 113, 115 and 116", "document", evaluate_parameter_errors,
+            fault={"linear": True},
+            fault_description="the fitted forces are those of the linear model, without errors", panel_labels=(),
         ),
         Claim(
             "complete model predicts better than reduced",
             '"the complete model predicted the actuator forces/torques better than both reduced and'
             ' nominal models"; RMS complete and reduced: 3720 and 4720 N m (swing), 5860 and 5500 N'
             " (boom), 8700 and 11900 N (stick)",
-            "Fig. 37, pp. 116 to 117, 119 and 123", "document", judge_complete_and_reduced,
-            broken={"pressure_error_psi": 250.0}, broken_how="ten times worse pressure sensors",
-            panels=FORCE_LABELS,
+            "Fig. 37, pp. 116 to 117, 119 and 123", "document", evaluate_reduced_model,
+            fault={"pressure_error_psi": 250.0}, fault_description="ten times worse pressure sensors",
+            panel_labels=FORCE_LABELS,
         ),
         Claim(
             "identified models predict better than nominal",
             '"the estimated torques/forces obtained from the complete or reduced model match the'
             ' measured torques/forces much more closely than those obtained from the existing'
             ' (nominal) model"; RMS nominal: 12200 N m, 39200 N, 14600 N',
-            "Fig. 37, pp. 116 to 117", "document", judge_identified_and_nominal,
-            broken={"nominal": "exact"},
-            broken_how="the nominal model has the parameters of the machine", panels=(),
+            "Fig. 37, pp. 116 to 117", "document", evaluate_nominal_model,
+            fault={"nominal": "exact"},
+            fault_description="the nominal model has the parameters of the machine", panel_labels=(),
         ),
         Claim(
             "prediction within the sensors' accuracy",
             '"the errors in the estimated torques/forces of the complete model are almost within'
             ' the accuracy of the sensors"; 3720 N m, 5860 N, 8700 N against +-1400 N m, +-5700 N,'
             " +-4200 N",
-            "pp. 108 and 117", "document", judge_sensor_accuracy,
-            broken={"friction_identified": False},
-            broken_how="the identified model has no friction", panels=(),
+            "pp. 108 and 117", "document", evaluate_sensor_accuracy,
+            fault={"friction_identified": False},
+            fault_description="the identified model has no friction", panel_labels=(),
         ),
     ),
     max_repetitions=20,

@@ -4,17 +4,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hydrotele.experiments.comparison import Changes, Claim, Experiment, Judgement, Sample
+from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Sample
 from hydrotele.experiments.intervals import check_exact, check_mean, check_statistic
 from hydrotele.experiments.khoshzaban_models import (
     DRIVES,
-    PERIOD,
+    SAMPLE_PERIOD,
     UNITS,
     Motion,
     draw_motion,
     find_base,
     make_regressor,
-    read_settings,
+    merge_settings,
 )
 from hydrotele.identify.smoothing import smooth
 from hydrotele.machine.machine_file import load_machine
@@ -46,20 +46,20 @@ def measure_errors(seed: int, changes: Changes) -> Sample:
     Returns:
         Errors of the base parameters relative to their sizes, per model and case.
     """
-    settings = read_settings(NOISE_SETTINGS, changes)
+    settings = merge_settings(NOISE_SETTINGS, changes)
     rng = np.random.default_rng(seed)
     motion = draw_motion(rng)
     rows = len(motion[0])
     angles = ANGLE_ACCURACY * rng.uniform(-1.0, 1.0, (2, rows, 3))
     forces = np.array(SENSOR_ACCURACY) * rng.uniform(-1.0, 1.0, (2, rows, 3))
     scale, rest, gain = (settings[k] for k in ("noise", "residual_noise", "pressure_gain"))
-    derived = smooth(motion[0] + scale * angles[0], PERIOD, ANGLE_ACCURACY / np.sqrt(3.0))
+    derived = smooth(motion[0] + scale * angles[0], SAMPLE_PERIOD, ANGLE_ACCURACY / np.sqrt(3.0))
     five = scale / gain
     # (measured motion, case -> (factor of the force errors, index of their random sample))
     plans = (
-        (_add_angles(motion, scale * angles[0]), {"25 psi": (scale, 0), "5 psi": (five, 0)}),
-        (_add_angles(motion, scale * angles[1]), {"independent": (five, 1)}),
-        (_add_angles(motion, rest * angles[0]), {"none": (rest, 0)}),
+        (_add_angle_errors(motion, scale * angles[0]), {"25 psi": (scale, 0), "5 psi": (five, 0)}),
+        (_add_angle_errors(motion, scale * angles[1]), {"independent": (five, 1)}),
+        (_add_angle_errors(motion, rest * angles[0]), {"none": (rest, 0)}),
         (motion, {"pressures 25 psi": (scale, 0), "pressures 5 psi": (five, 0)}),
         ((derived.value, derived.rate, derived.acceleration),
          {"differentiated 25 psi": (scale, 0), "differentiated 5 psi": (five, 0)}),
@@ -78,38 +78,38 @@ def measure_errors(seed: int, changes: Changes) -> Sample:
     return Sample(values, arrays=arrays)
 
 
-def _add_angles(motion: Motion, errors: np.ndarray) -> Motion:
+def _add_angle_errors(motion: Motion, errors: np.ndarray) -> Motion:
     return motion[0] + errors, motion[1], motion[2]
 
 
-def _errors(samples: Sequence[Sample], name: str) -> np.ndarray:
+def _collect_errors(samples: Sequence[Sample], name: str) -> np.ndarray:
     """Return the (n, p) errors of all repetitions."""
     return np.array([sample.arrays[name] for sample in samples])
 
 
-def _ratio_of_means(rows: np.ndarray) -> float:
+def _compute_mean_ratio(rows: np.ndarray) -> float:
     """Return the ratio of two geometric means over repetitions (n, 2, p), median of parameters."""
     logs = np.mean(np.log(np.maximum(rows, np.finfo(float).tiny)), axis=0)
     return float(np.median(np.exp(logs[0] - logs[1])))
 
 
-def _fraction_improved(samples: Sequence[Sample], model: str, better: str) -> np.ndarray:
+def _find_improved_fraction(samples: Sequence[Sample], model: str, better: str) -> np.ndarray:
     """Return the (n,) fraction of parameters whose error decreases by a factor of 10 to 100."""
-    ratio = _errors(samples, f"{model}.25 psi") / _errors(samples, f"{model}.{better}")
+    ratio = _collect_errors(samples, f"{model}.25 psi") / _collect_errors(samples, f"{model}.{better}")
     return np.mean((ratio >= 10.0) & (ratio <= 100.0), axis=1)
 
 
-def _improvement_judge(model: str, more: str = ""):
+def _make_improvement_evaluation(model: str, note_suffix: str = ""):
     """Return the judge of the error ratio between 25 psi and 5 psi sensors.
 
     Args:
         model: `complete` or `reduced`.
-        more: text appended to the note.
+        note_suffix: text appended to the note.
     """
 
-    def judge(samples: Sequence[Sample]) -> Judgement:
+    def judge(samples: Sequence[Sample]) -> Evaluation:
         pairs = {
-            name: np.stack([_errors(samples, f"{model}.{k}") for k in names], axis=1)
+            name: np.stack([_collect_errors(samples, f"{model}.{k}") for k in names], axis=1)
             for name, names in (
                 ("", ("25 psi", "5 psi")),
                 ("pressures", ("pressures 25 psi", "pressures 5 psi")),
@@ -117,15 +117,15 @@ def _improvement_judge(model: str, more: str = ""):
             )
         }
         reason = '"10 to 100 times"'
-        independent = _fraction_improved(samples, model, "independent")
+        independent = _find_improved_fraction(samples, model, "independent")
         checks = (
             check_statistic("error with 25 psi over error with 5 psi, median of the parameters",
-                            pairs[""], _ratio_of_means, (10.0, 100.0), reason),
+                            pairs[""], _compute_mean_ratio, (10.0, 100.0), reason),
             check_mean("fraction of parameters whose error decreases 10 to 100 times in one run"
                        " with independent errors", independent, (0.5, 1.0), "most parameters"),
         )  # fmt: skip
-        only, smoothed = (_ratio_of_means(pairs[k]) for k in ("pressures", "differentiated"))
-        return Judgement(
+        only, smoothed = (_compute_mean_ratio(pairs[k]) for k in ("pressures", "differentiated"))
+        return Evaluation(
             checks,
             "The estimate is linear in the forces: five times smaller pressure errors give five"
             f" times smaller parameter errors ({only:.3g} with exact angles), and less than five"
@@ -134,40 +134,40 @@ def _improvement_judge(model: str, more: str = ""):
             " parameters decrease 10 to 100 times; for two independent normal errors of ratio 5 it"
             " would be 26 %. The document compares two single runs.",
             note=f"runs in which the errors of most parameters decrease 10 to 100 times:"
-            f" {100 * np.mean(independent > 0.5):.0f} %{more}",
+            f" {100 * np.mean(independent > 0.5):.0f} %{note_suffix}",
         )
 
     return judge
 
 
-def judge_large_errors(samples: Sequence[Sample]) -> Judgement:
+def evaluate_large_errors(samples: Sequence[Sample]) -> Evaluation:
     """Check that almost all parameters of the complete model have large errors."""
-    errors = _errors(samples, "complete.25 psi")
+    errors = _collect_errors(samples, "complete.25 psi")
     check = check_mean(
         "fraction of base parameters of the complete model with errors above half of their"
         " size", np.mean(errors > 0.5, axis=1), (0.8, 1.0),
         "almost all: four of five; an error above half of the size is large",
     )  # fmt: skip
     medians = ", ".join(
-        f"{m} {np.median(_errors(samples, f'{m}.25 psi')):.3g}" for m in ("complete", "reduced")
+        f"{m} {np.median(_collect_errors(samples, f'{m}.25 psi')):.3g}" for m in ("complete", "reduced")
     )
-    return Judgement((check,), note=f"median error over size: {medians}")
+    return Evaluation((check,), note=f"median error over size: {medians}")
 
 
-def judge_without_errors(samples: Sequence[Sample]) -> Judgement:
+def evaluate_exact_sensors(samples: Sequence[Sample]) -> Evaluation:
     """Check that readings without errors give the printed parameters."""
     checks = tuple(
         check_statistic(
             f"largest error over size of the {model} model, median of the runs",
-            _errors(samples, f"{model}.none"), lambda r: float(np.median(r.max(axis=1))),
+            _collect_errors(samples, f"{model}.none"), lambda r: float(np.median(r.max(axis=1))),
             (0.0, 5e-4), "three digits are printed",
         )
         for model in ("complete", "reduced")
     )  # fmt: skip
-    return Judgement(checks)
+    return Evaluation(checks)
 
 
-def judge_reduced_errors(samples: Sequence[Sample]) -> Judgement:
+def evaluate_reduced_errors(samples: Sequence[Sample]) -> Evaluation:
     """Check that parameters of both models have smaller errors in the reduced model."""
     names = [find_base(model).names for model in ("complete", "reduced")]
     if samples[0].arrays["complete.none"].size == len(names[1]):
@@ -175,60 +175,60 @@ def judge_reduced_errors(samples: Sequence[Sample]) -> Judgement:
     shared = [name for name in names[1] if name in names[0]]
     rows = np.stack(
         [
-            _errors(samples, f"{model}.25 psi")[:, [own.index(name) for name in shared]]
+            _collect_errors(samples, f"{model}.25 psi")[:, [own.index(name) for name in shared]]
             for model, own in zip(("complete", "reduced"), names, strict=True)
         ],
         axis=1,
     )
     check = check_statistic(
         f"error in the complete over error in the reduced model, median of {len(shared)} common"
-        " parameters", rows, _ratio_of_means, (2.0, np.inf), "much less: at most half",
+        " parameters", rows, _compute_mean_ratio, (2.0, np.inf), "much less: at most half",
     )  # fmt: skip
-    return Judgement((check,))
+    return Evaluation((check,))
 
 
-_TABLE_15 = (
+_TABLE_15_NOTE = (
     "; of 13 legible entries of Table 15 whose true value is zero, 10 decrease 10 to 100 times"
     " between the two runs of the document"
 )
 
-NOISE = Experiment(
+SENSOR_NOISE_EXPERIMENT = Experiment(
     "sensor accuracy", measure_errors,
     (
         Claim(
             "large errors of the complete model",
             '"almost all the identified parameters contain large errors"',
-            "Table 14, pp. 108 and 109", "document", judge_large_errors,
-            broken={"noise": 1e-6}, broken_how="sensors a million times more accurate",
+            "Table 14, pp. 108 and 109", "document", evaluate_large_errors,
+            fault={"noise": 1e-6}, fault_description="sensors a million times more accurate",
         ),
         Claim(
             "five times better pressure sensors, complete model",
             '"The error in this case, however, is much less (10 to 100 times) than the error for'
             ' the accuracy of +-25 psi."',
-            "Table 14, pp. 108, 109 and 123", "document", _improvement_judge("complete"),
-            broken={"pressure_gain": 1.0}, broken_how="both sensors have the same accuracy",
+            "Table 14, pp. 108, 109 and 123", "document", _make_improvement_evaluation("complete"),
+            fault={"pressure_gain": 1.0}, fault_description="both sensors have the same accuracy",
         ),
         Claim(
             "five times better pressure sensors, reduced model",
             '"The error in this case, however, is much less (10 to 100 times) than the error for'
             ' the accuracy of +-25 psi."',
-            "Table 15, pp. 108 and 110", "document", _improvement_judge("reduced", _TABLE_15),
-            broken={"pressure_gain": 1.0}, broken_how="both sensors have the same accuracy",
+            "Table 15, pp. 108 and 110", "document", _make_improvement_evaluation("reduced", _TABLE_15_NOTE),
+            fault={"pressure_gain": 1.0}, fault_description="both sensors have the same accuracy",
         ),
         Claim(
             "no error without noise",
             '"if no noise is injected to the sensors, the error in sensor readings tends to zero'
             " and again we obtain the same error-free parameters for the major and minor links as"
             ' the ones tabulated in Table 13."',
-            "Tables 13 to 15, pp. 108 and 110", "document", judge_without_errors,
-            broken={"residual_noise": 0.01}, broken_how="a hundredth of the noise remains",
+            "Tables 13 to 15, pp. 108 and 110", "document", evaluate_exact_sensors,
+            fault={"residual_noise": 0.01}, fault_description="a hundredth of the noise remains",
         ),
         Claim(
             "reduced model identified more accurately",
             '"the error in the individual parameters of the reduced model is much less than that of'
             ' the corresponding parameters for the complete model."',
-            "Tables 14 and 15, p. 110", "document", judge_reduced_errors,
-            broken={"cylinders_known": True}, broken_how="cylinders of the complete model known",
+            "Tables 14 and 15, p. 110", "document", evaluate_reduced_errors,
+            fault={"cylinders_known": True}, fault_description="cylinders of the complete model known",
         ),
     ),
     max_repetitions=40,
@@ -241,16 +241,14 @@ ACCURACY_SETTINGS = {"accuracy_psi": 25.0}
 
 def measure_accuracy(seed: int, changes: Changes) -> Sample:
     """Compute the largest force errors of the drives from pressure errors and piston areas."""
-    pressure = 6894.757 * read_settings(ACCURACY_SETTINGS, changes)["accuracy_psi"]
+    pressure = 6894.757 * merge_settings(ACCURACY_SETTINGS, changes)["accuracy_psi"]
     machine = load_machine("cat215")
-    return Sample(
-        {d: pressure * float(np.sum(machine.axes[d].hydraulic_drive.areas)) for d in DRIVES}
-    )
+    return Sample({d: pressure * float(np.sum(machine.axes[d].hydraulic_drive.areas)) for d in DRIVES})
 
 
-def judge_accuracy(samples: Sequence[Sample]) -> Judgement:
+def evaluate_accuracy(samples: Sequence[Sample]) -> Evaluation:
     """Check that the errors round to the printed ones."""
-    return Judgement(
+    return Evaluation(
         tuple(
             check_exact(f"largest error, {drive}", samples[0].values[drive],
                         (limit - 50.0, 1.001 * (limit + 50.0)), unit=unit, published=limit,
@@ -260,15 +258,15 @@ def judge_accuracy(samples: Sequence[Sample]) -> Judgement:
     )  # fmt: skip
 
 
-ACCURACY = Experiment(
+FORCE_ACCURACY = Experiment(
     "accuracy of forces", measure_accuracy,
     (
         Claim(
             "accuracy of forces", "cabin: +-1400 N m, boom: +-5700 N, stick: +-4200 N",
-            "Eqs 4.33 and 4.61, p. 108", "input", judge_accuracy,
-            broken={"accuracy_psi": 5.0}, broken_how="sensors of 5 psi",
+            "Eqs 4.33 and 4.61, p. 108", "input", evaluate_accuracy,
+            fault={"accuracy_psi": 5.0}, fault_description="sensors of 5 psi",
         ),
     ),
-    repetitions_fixed=1,
+    fixed_repetitions=1,
 )  # fmt: skip
 """Force errors assumed in Tables 14 and 15."""

@@ -15,30 +15,30 @@ import numpy as np
 from hydrotele.core.files import models_folder
 from hydrotele.experiments.comparison import Changes
 from hydrotele.identify.excitation import DriveLimits, Excitation
-from hydrotele.identify.identifiability import Identifiability, identifiability
+from hydrotele.identify.identifiability import Identifiability, classify_parameters
 from hydrotele.identify.mechanism import Mechanism, load_mechanism
 from hydrotele.identify.record import IdentificationRecord
 from hydrotele.identify.setup import RegressorSetup
 from hydrotele.multibody.chain import cardan_angles
-from hydrotele.multibody.closures import joint_positions
-from hydrotele.multibody.inverse_dynamics import project
+from hydrotele.multibody.closures import solve_joint_positions
+from hydrotele.multibody.inverse_dynamics import project_on_drives
 
 _MAX_ROWS = 1000  # rows computed together; reused memory is faster than new memory
 LEGS = range(1, 7)
-DRIVE = 4  # index of the drive in figures: actuator 5, as in Fig. 11
+PLOTTED_DRIVE = 4  # index of the drive in figures: actuator 5, as in Fig. 11
 CHI2_LIMIT = 36.42  # 95 % quantile of chi^2 with 24 degrees of freedom, as printed (5.3)
 HOME_POSE = np.array([0.0, 0.0, 0.55, 0.0, 0.0, 0.0])
 # Assumed (see the model's README.md): the document gives neither noise nor limits.
 SAMPLE_RATE = 1000.0  # Hz
-FORCE_NOISE = 53.0  # force noise over the published standard deviation of the dry friction
+FORCE_NOISE_RATIO = 53.0  # force noise over the published standard deviation of the dry friction
 LENGTH_NOISE = 10e-6  # m, standard deviation of a measured leg length
-CORRELATION = 0.6  # correlation of the force noise of any two drives
+FORCE_NOISE_CORRELATION = 0.6  # correlation of the force noise of any two drives
 STROKE, MAX_SPEED, MAX_ACCELERATION = (0.60, 1.06), 1.2, 25.0  # m, m/s, m/s^2 of every drive
 POSE_LOW = np.array([-0.20, -0.20, 0.42, -0.35, -0.35, -0.25])  # limits of the pose [m], [rad]
 POSE_HIGH = np.array([0.20, 0.20, 0.70, 0.35, 0.35, 0.25])
 
 
-class Published(NamedTuple):
+class PublishedParameter(NamedTuple):
     """One row of the document's Table 2.
 
     Attributes:
@@ -66,33 +66,33 @@ class Published(NamedTuple):
         return 0.25 * (self.interval[1] - self.interval[0])
 
 
-TABLE = (
-    Published("p1", "inertia_zz.ring_1", -0.0447, (-0.0526, -0.0369), 0.0074),
-    Published("p2", "inertia_xx.stator_1", 1.0892, (1.0753, 1.1032), 0.9439),
-    Published("p3", "inertia_zz.stator_1", 1.0077, (0.9988, 1.0166), 0.9458),
-    Published("p4", "moment_y.stator_1", 0.5995, (0.5922, 0.6068), 0.6201),
-    Published("p5", "moment_z.slider_1", -1.2885, (-1.2998, -1.2772), -1.2295),
-    Published("p6", "inertia_xx.platform", 0.3078, (0.3049, 0.3106), 0.2878),
-    Published("p7", "inertia_yy.platform", 0.3021, (0.2996, 0.3045), 0.2878),
-    Published("p8", "inertia_zz.platform", 0.1176, (0.1152, 0.1201), 0.1217),
-    Published("p9", "moment_z.platform", 1.8896, (1.8774, 1.9017), 1.9012),
-    Published("p10", "mass.platform", 16.3081, (16.2161, 16.4002), 16.1920),
-    Published("r_alpha", "coulomb.alpha_1", 0.5756, (0.5440, 0.6072)),
-    Published("r_beta", "coulomb.beta_1", 0.9195, (0.8837, 0.9552)),
-    Published("r11", "coulomb.slide_1", 11.9772, (11.4803, 12.4742)),
-    Published("r12", "coulomb.slide_2", 4.8071, (4.4350, 5.1793)),
-    Published("r13", "coulomb.slide_3", 20.1528, (19.5075, 20.7980)),
-    Published("r14", "coulomb.slide_4", 5.1518, (4.7884, 5.5151)),
-    Published("r15", "coulomb.slide_5", 1.5857, (1.0620, 2.1094)),
-    Published("r16", "coulomb.slide_6", 5.0057, (4.3018, 5.7096)),
-    Published("r21", "viscous.slide_1", 16.8771, (15.8235, 17.9307)),
-    Published("r22", "viscous.slide_2", 16.7406, (15.9981, 17.4830)),
-    Published("r23", "viscous.slide_3", 6.3408, (5.1968, 7.4848)),
-    Published("r24", "viscous.slide_4", 23.1662, (22.4065, 23.9259)),
-    Published("r25", "viscous.slide_5", 26.4675, (25.5754, 27.3596)),
-    Published("r26", "viscous.slide_6", 22.8053, (21.6974, 23.9131)),
+PUBLISHED_PARAMETERS = (
+    PublishedParameter("p1", "inertia_zz.ring_1", -0.0447, (-0.0526, -0.0369), 0.0074),
+    PublishedParameter("p2", "inertia_xx.stator_1", 1.0892, (1.0753, 1.1032), 0.9439),
+    PublishedParameter("p3", "inertia_zz.stator_1", 1.0077, (0.9988, 1.0166), 0.9458),
+    PublishedParameter("p4", "moment_y.stator_1", 0.5995, (0.5922, 0.6068), 0.6201),
+    PublishedParameter("p5", "moment_z.slider_1", -1.2885, (-1.2998, -1.2772), -1.2295),
+    PublishedParameter("p6", "inertia_xx.platform", 0.3078, (0.3049, 0.3106), 0.2878),
+    PublishedParameter("p7", "inertia_yy.platform", 0.3021, (0.2996, 0.3045), 0.2878),
+    PublishedParameter("p8", "inertia_zz.platform", 0.1176, (0.1152, 0.1201), 0.1217),
+    PublishedParameter("p9", "moment_z.platform", 1.8896, (1.8774, 1.9017), 1.9012),
+    PublishedParameter("p10", "mass.platform", 16.3081, (16.2161, 16.4002), 16.1920),
+    PublishedParameter("r_alpha", "coulomb.alpha_1", 0.5756, (0.5440, 0.6072)),
+    PublishedParameter("r_beta", "coulomb.beta_1", 0.9195, (0.8837, 0.9552)),
+    PublishedParameter("r11", "coulomb.slide_1", 11.9772, (11.4803, 12.4742)),
+    PublishedParameter("r12", "coulomb.slide_2", 4.8071, (4.4350, 5.1793)),
+    PublishedParameter("r13", "coulomb.slide_3", 20.1528, (19.5075, 20.7980)),
+    PublishedParameter("r14", "coulomb.slide_4", 5.1518, (4.7884, 5.5151)),
+    PublishedParameter("r15", "coulomb.slide_5", 1.5857, (1.0620, 2.1094)),
+    PublishedParameter("r16", "coulomb.slide_6", 5.0057, (4.3018, 5.7096)),
+    PublishedParameter("r21", "viscous.slide_1", 16.8771, (15.8235, 17.9307)),
+    PublishedParameter("r22", "viscous.slide_2", 16.7406, (15.9981, 17.4830)),
+    PublishedParameter("r23", "viscous.slide_3", 6.3408, (5.1968, 7.4848)),
+    PublishedParameter("r24", "viscous.slide_4", 23.1662, (22.4065, 23.9259)),
+    PublishedParameter("r25", "viscous.slide_5", 26.4675, (25.5754, 27.3596)),
+    PublishedParameter("r26", "viscous.slide_6", 22.8053, (21.6974, 23.9131)),
 )
-SYMBOLS = tuple(one.symbol for one in TABLE)
+SYMBOLS = tuple(one.symbol for one in PUBLISHED_PARAMETERS)
 
 
 @dataclass(frozen=True)
@@ -102,13 +102,13 @@ class Robot:
     Attributes:
         mechanism: mechanism as loaded by `hydrotele identify --mjcf`, with equal legs and 19
             inertial parameters that are 0 by symmetry.
-        structure: base parameters, found from the null space of the regressor.
+        base_parameters: base parameters, found from the null space of the regressor.
         order: (24,) index of every row of Table 2 among the base parameters.
         truth: (24,) parameter values of the model.
     """
 
     mechanism: Mechanism
-    structure: Identifiability
+    base_parameters: Identifiability
     order: np.ndarray
     truth: np.ndarray
 
@@ -122,18 +122,18 @@ class Robot:
         out, start = [], None
         for first in range(0, motion.shape[1], _MAX_ROWS):
             some = motion[:, first : first + _MAX_ROWS]
-            found = project(self.setup.chain, self.setup.given, *some, start=start)
+            found = project_on_drives(self.setup.chain, self.setup.given_joints, *some, start=start)
             start = found.position[-1]
-            out.append(self.setup.table(found).matrix[:, :, self.structure.base[self.order]])
+            out.append(self.setup.compute_regressor(found).matrix[:, :, self.base_parameters.base[self.order]])
         return np.concatenate(out)
 
-    def lengths(self, motion: np.ndarray) -> np.ndarray:
+    def compute_leg_lengths(self, motion: np.ndarray) -> np.ndarray:
         """Return the leg lengths (n, 6) [m] at poses (n, 6)."""
-        q = joint_positions(self.setup.chain, self.setup.given, motion)
+        q = solve_joint_positions(self.setup.chain, self.setup.given_joints, motion)
         return q[:, [self.setup.chain.index(name) for name in self.setup.chain.drives]]
 
 
-def read_settings(defaults: Changes, changes: Changes) -> dict[str, Any]:
+def merge_settings(defaults: Changes, changes: Changes) -> dict[str, Any]:
     """Return the default settings of an experiment with changes applied.
 
     Raises:
@@ -158,15 +158,15 @@ def load_robot() -> Robot:
     folder = models_folder() / "palida"
     mechanism = load_mechanism(folder / "palida.xml", folder / "columns.yaml")
     setup = mechanism.setup
-    table = setup.table(project(setup.chain, setup.given, *draw_states()))
+    table = setup.compute_regressor(project_on_drives(setup.chain, setup.given_joints, *draw_states()))
     rows = table.matrix.reshape(-1, len(table.names))
-    structure = identifiability(rows, table.names, table.units, [one.column for one in TABLE])
+    structure = classify_parameters(rows, table.names, table.units, [one.column for one in PUBLISHED_PARAMETERS])
     names = [table.names[b] for b in structure.base]
-    order = np.array([names.index(one.column) for one in TABLE])
+    order = np.array([names.index(one.column) for one in PUBLISHED_PARAMETERS])
     return Robot(mechanism, structure, order, (structure.combination @ table.nominal)[order])
 
 
-def force_covariance() -> np.ndarray:
+def compute_force_covariance() -> np.ndarray:
     """Return the covariance (6, 6) of the drives' force noise [N^2], white at `SAMPLE_RATE`.
 
     The document calls the noise high and cross-correlated but gives no value. The standard
@@ -174,8 +174,8 @@ def force_covariance() -> np.ndarray:
     Their size and the robot's geometry are chosen to give about the published standard deviations
     of the parameters.
     """
-    size = FORCE_NOISE * np.array([one.std for one in TABLE[12:18]])
-    return np.outer(size, size) * (CORRELATION + (1.0 - CORRELATION) * np.eye(6))
+    size = FORCE_NOISE_RATIO * np.array([one.std for one in PUBLISHED_PARAMETERS[12:18]])
+    return np.outer(size, size) * (FORCE_NOISE_CORRELATION + (1.0 - FORCE_NOISE_CORRELATION) * np.eye(6))
 
 
 @cache
@@ -184,12 +184,12 @@ def load_excitation() -> Excitation:
     found = json.loads((models_folder() / "palida" / "excitation.json").read_text(encoding="utf-8"))
     mean, sin, cos = (np.array(found[key]) for key in ("mean", "sin", "cos"))
     return Excitation(
-        load_robot().setup.given, found["period"], mean, sin, cos, found["criterion"],
-        found["worst"], len(TABLE),
+        load_robot().setup.given_joints, found["period"], mean, sin, cos, found["criterion"],
+        found["worst"], len(PUBLISHED_PARAMETERS),
     )  # fmt: skip
 
 
-def drive_limits() -> DriveLimits:
+def make_drive_limits() -> DriveLimits:
     """Return the limits of pose and drives for the design of motions."""
     return DriveLimits(
         load_robot().setup,
@@ -223,7 +223,7 @@ def simulate_motion(motion: np.ndarray, period: float) -> RepeatedMotion:
     """Compute leg lengths and drive forces along one period of a motion (3, n, 6)."""
     own = load_robot()
     matrix = own.matrix(motion)
-    return RepeatedMotion(period, motion, own.lengths(motion[0]), matrix, matrix @ own.truth)
+    return RepeatedMotion(period, motion, own.compute_leg_lengths(motion[0]), matrix, matrix @ own.truth)
 
 
 @cache
@@ -231,17 +231,17 @@ def simulate_excitation() -> RepeatedMotion:
     """Simulate the designed excitation at `SAMPLE_RATE`."""
     motion = load_excitation()
     time = np.arange(round(motion.period * SAMPLE_RATE)) / SAMPLE_RATE
-    return simulate_motion(motion.motion(time), motion.period)
+    return simulate_motion(motion.evaluate(time), motion.period)
 
 
 def draw_force_noise(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-    """Draw force noise (*shape, 6) [N] with covariance `force_covariance`."""
-    return rng.standard_normal((*shape, 6)) @ np.linalg.cholesky(force_covariance()).T
+    """Draw force noise (*shape, 6) [N] with covariance `compute_force_covariance`."""
+    return rng.standard_normal((*shape, 6)) @ np.linalg.cholesky(compute_force_covariance()).T
 
 
 def simulate_measurement(
     cycle: RepeatedMotion, periods: int, rng: np.random.Generator,
-    reaction: tuple[float, float] = (0.0, 0.0), length_noise: float = LENGTH_NOISE,
+    feedback_gains: tuple[float, float] = (0.0, 0.0), length_noise: float = LENGTH_NOISE,
 ) -> IdentificationRecord:  # fmt: skip
     """Simulate a measurement of repeated periods with noise of leg lengths and drive forces.
 
@@ -249,7 +249,7 @@ def simulate_measurement(
         cycle: one period of the true motion.
         periods: number of repetitions.
         rng: random generator of the noise.
-        reaction: controller gains from errors of the measured length [N/m] and of its rate
+        feedback_gains: controller gains from errors of the measured length [N/m] and of its rate
             [N s/m] to the drive force, which feed encoder noise back into the forces.
         length_noise: standard deviation of a measured leg length [m].
 
@@ -259,23 +259,23 @@ def simulate_measurement(
     n = len(cycle.length) * periods
     error = length_noise * rng.standard_normal((n, 6))
     noise = draw_force_noise((n,), rng)
-    noise -= reaction[0] * error
-    noise -= reaction[1] * np.gradient(error, 1.0 / SAMPLE_RATE, axis=0)
+    noise -= feedback_gains[0] * error
+    noise -= feedback_gains[1] * np.gradient(error, 1.0 / SAMPLE_RATE, axis=0)
     drives = load_robot().setup.chain.drives
     return IdentificationRecord(
         "excitation", 1.0 / SAMPLE_RATE, drives, np.tile(cycle.length, (periods, 1)) + error,
         np.full(6, length_noise), np.tile(cycle.force, (periods, 1)) + noise,
-        np.sqrt(np.diag(force_covariance())),
+        np.sqrt(np.diag(compute_force_covariance())),
     )  # fmt: skip
 
 
 # Control: one PID controller per drive, and feedforward of a model's forces along the reference.
 DRIVE_MASS, BANDWIDTH, DAMPING_RATIO = 4.0, 12.0, 0.8  # mean mass per drive [kg], [Hz], [1]
 INTEGRAL_RATE = 3.0  # integral over proportional gain [1/s]
-_START_TIME = 1.0  # time to reach full speed on a circle [s]
+_ACCELERATION_TIME = 1.0  # time to reach full speed on a circle [s]
 
 
-def control_gains() -> tuple[float, float]:
+def compute_control_gains() -> tuple[float, float]:
     """Return the stiffness [N/m] and damping [N s/m] of every drive's controller."""
     turn = 2.0 * np.pi * BANDWIDTH
     return DRIVE_MASS * turn**2, 2.0 * DAMPING_RATIO * DRIVE_MASS * turn
@@ -293,10 +293,10 @@ def plan_circle(speed: float, radius: float = 0.10, laps: float = 2.0) -> np.nda
         (3, n, 6) poses, rates and accelerations at `SAMPLE_RATE`.
     """
     turn = speed / radius
-    time = np.arange(0.0, _START_TIME + laps * 2.0 * np.pi / turn, 1.0 / SAMPLE_RATE)
-    r = np.clip(time / _START_TIME, 0.0, 1.0)  # the speed rises as 10 r^3 - 15 r^4 + 6 r^5
-    faded = _START_TIME * (2.5 * r**4 - 3.0 * r**5 + r**6)
-    angle = turn * (faded + np.maximum(time - _START_TIME, 0.0))
+    time = np.arange(0.0, _ACCELERATION_TIME + laps * 2.0 * np.pi / turn, 1.0 / SAMPLE_RATE)
+    r = np.clip(time / _ACCELERATION_TIME, 0.0, 1.0)  # the speed rises as 10 r^3 - 15 r^4 + 6 r^5
+    faded = _ACCELERATION_TIME * (2.5 * r**4 - 3.0 * r**5 + r**6)
+    angle = turn * (faded + np.maximum(time - _ACCELERATION_TIME, 0.0))
     return _differentiate(radius * np.cos(angle), radius * np.sin(angle))
 
 
@@ -332,7 +332,7 @@ def _differentiate(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.stack([pose, rate, np.gradient(rate, 1.0 / SAMPLE_RATE, axis=0)])
 
 
-class Tracked(NamedTuple):
+class TrackingErrors(NamedTuple):
     """Tracking errors along a path; n rows at `SAMPLE_RATE`.
 
     Attributes:
@@ -348,7 +348,7 @@ class Tracked(NamedTuple):
     warnings: int
 
 
-def track_path(motion: np.ndarray, feedforward: np.ndarray | None, seed: int = 0) -> Tracked:
+def track_path(motion: np.ndarray, feedforward: np.ndarray | None, seed: int = 0) -> TrackingErrors:
     """Track a path in MuJoCo with closed chains, friction and encoder noise.
 
     Args:
@@ -365,32 +365,30 @@ def track_path(motion: np.ndarray, feedforward: np.ndarray | None, seed: int = 0
     chain = own.setup.chain
     model = mujoco.MjModel.from_xml_path(str(models_folder() / "palida" / "palida.xml"))
     data = mujoco.MjData(model)
-    q = joint_positions(chain, own.setup.given, motion[0])
+    q = solve_joint_positions(chain, own.setup.given_joints, motion[0])
     drives = [chain.index(name) for name in chain.drives]
     reference = q[:, drives]
     rate = np.gradient(reference, 1.0 / SAMPLE_RATE, axis=0)
     model_force = np.zeros_like(reference)
     if feedforward is not None:
         model_force = own.matrix(motion) @ feedforward
-    here = chain.places >= 0
-    data.qpos[chain.places[here]] = q[0, here]
+    here = chain.qpos_indices >= 0
+    data.qpos[chain.qpos_indices[here]] = q[0, here]
     place = model.joint("platform").qposadr[0]
     data.qpos[place : place + 3] = motion[0, 0, :3]
-    data.qpos[place + 3 : place + 7] = _quaternion(motion[0, 0, 3:])
-    stiff, damp = control_gains()
-    held = (
-        own.matrix(np.stack([motion[0, :1], 0 * motion[1, :1], 0 * motion[2, :1]]))[0] @ own.truth
-    )
+    data.qpos[place + 3 : place + 7] = _convert_to_quaternion(motion[0, 0, 3:])
+    stiff, damp = compute_control_gains()
+    held = own.matrix(np.stack([motion[0, :1], 0 * motion[1, :1], 0 * motion[2, :1]]))[0] @ own.truth
     if feedforward is not None:
         held = held - model_force[0]  # the integral part holds the robot where it starts
-    slides = chain.places[drives]
+    slides = chain.qpos_indices[drives]
     steps = round(1.0 / SAMPLE_RATE / model.opt.timestep)
     error, pose_error = np.empty_like(reference), np.empty_like(reference)
     last, speed = None, np.zeros(6)
     for row in range(len(reference)):
         true = data.qpos[slides]
         error[row] = reference[row] - true
-        pose_error[row] = motion[0, row] - _pose(data.qpos[place : place + 7])
+        pose_error[row] = motion[0, row] - _convert_to_pose(data.qpos[place : place + 7])
         reading = true + LENGTH_NOISE * rng.standard_normal(6)
         if last is not None:  # first-order low-pass at 100 Hz of the differences
             speed += (1.0 - np.exp(-2.0 * np.pi * 100.0 / SAMPLE_RATE)) * (
@@ -401,10 +399,10 @@ def track_path(motion: np.ndarray, feedforward: np.ndarray | None, seed: int = 0
         data.ctrl[:] = stiff * away + damp * (rate[row] - speed) + held + model_force[row]
         mujoco.mj_step(model, data, steps)
     time = np.arange(len(reference)) / SAMPLE_RATE
-    return Tracked(time, error, pose_error, int(sum(w.number for w in data.warning)))
+    return TrackingErrors(time, error, pose_error, int(sum(w.number for w in data.warning)))
 
 
-def _quaternion(angles: np.ndarray) -> np.ndarray:
+def _convert_to_quaternion(angles: np.ndarray) -> np.ndarray:
     out, one = np.array([1.0, 0.0, 0.0, 0.0]), np.empty(4)
     for axis, angle in zip(np.eye(3), angles, strict=True):
         mujoco.mju_axisAngle2Quat(one, axis, angle)
@@ -412,7 +410,7 @@ def _quaternion(angles: np.ndarray) -> np.ndarray:
     return out
 
 
-def _pose(qpos: np.ndarray) -> np.ndarray:
+def _convert_to_pose(qpos: np.ndarray) -> np.ndarray:
     turn = np.empty(9)
     mujoco.mju_quat2Mat(turn, qpos[3:])
     return np.concatenate([qpos[:3], cardan_angles(turn.reshape(3, 3))])

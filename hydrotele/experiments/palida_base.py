@@ -10,19 +10,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.experiments.comparison import Changes, Claim, Experiment, Judgement, Panel, Sample
-from hydrotele.experiments.intervals import check_exact, collect
+from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Panel, Sample
+from hydrotele.experiments.intervals import check_exact, collect_values
 from hydrotele.experiments.palida import (
     LEGS,
+    PUBLISHED_PARAMETERS,
     SYMBOLS,
-    TABLE,
     draw_states,
     load_robot,
-    read_settings,
+    merge_settings,
 )
-from hydrotele.identify.identifiability import Identifiability, identifiability
+from hydrotele.identify.identifiability import Identifiability, classify_parameters
 from hydrotele.multibody.chain import Chain
-from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, Regressor, project
+from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, Regressor, project_on_drives
 
 _KINDS = tuple(BODY_PARAMETERS)
 _INERTIAS = tuple(kind for kind in _KINDS if kind.startswith("inertia"))
@@ -63,7 +63,7 @@ def transfer_parameters(rotation: np.ndarray, offset: np.ndarray) -> np.ndarray:
     columns = []
     for unit in np.eye(10):
         mass, moment = unit[0], unit[1:4]
-        tensor = _tensor(unit[4:])
+        tensor = _build_inertia_tensor(unit[4:])
         shifted = rotation @ moment + mass * offset
         second = rotation @ (0.5 * np.trace(tensor) * np.eye(3) - tensor) @ rotation.T
         cross = np.outer(rotation @ moment, offset)
@@ -73,7 +73,7 @@ def transfer_parameters(rotation: np.ndarray, offset: np.ndarray) -> np.ndarray:
     return np.array(columns).T
 
 
-def _tensor(entries: np.ndarray) -> np.ndarray:
+def _build_inertia_tensor(entries: np.ndarray) -> np.ndarray:
     tensor = np.zeros((3, 3))
     tensor[np.triu_indices(3)] = entries
     return tensor + np.triu(tensor, 1).T
@@ -101,14 +101,14 @@ def list_relations(chain: Chain, platform_rule: bool = True) -> Iterator[Relatio
     for leg in LEGS:
         ring, stator, slider = (f"{kind}_{leg}" for kind in ("ring", "stator", "slider"))
         body = chain.bodies.index(slider) + 1
-        turned = transfer_parameters(tree.turn[body], np.zeros(3))
+        turned = transfer_parameters(tree.rotation[body], np.zeros(3))
         for kind in _INERTIAS:
             yield Relation(f"{kind}.{slider}", _name_weights(turned, kind, stator))
         if platform_rule:
-            joint = transfer_parameters(np.eye(3), tree.points[leg - 1, 1])
+            joint = transfer_parameters(np.eye(3), tree.closure_points[leg - 1, 1])
             yield Relation(f"mass.{slider}", _name_weights(joint, "mass", "platform"))
         body = chain.bodies.index(stator) + 1
-        moved = transfer_parameters(tree.turn[body], tree.offset[body])
+        moved = transfer_parameters(tree.rotation[body], tree.offset[body])
         for kind in ("mass", "moment_z"):
             yield Relation(f"{kind}.{stator}", _name_weights(moved, kind, ring))
         rod = _name_weights(moved, "inertia_xx", ring, "inertia_yy")
@@ -144,7 +144,7 @@ def regroup_parameters(names: Sequence[str], relations: Iterator[Relation]) -> n
     return regrouped
 
 
-def table_1(joints: np.ndarray) -> dict[str, dict[str, float]]:
+def list_table_1(joints: np.ndarray) -> dict[str, dict[str, float]]:
     """Return the ten combinations of Table 1 with the parameter names of the model's first leg.
 
     Args:
@@ -171,7 +171,7 @@ def table_1(joints: np.ndarray) -> dict[str, dict[str, float]]:
     }  # fmt: skip
 
 
-_STAGES = {
+_BODY_ASSUMPTIONS = {
     "19 bodies": {"alike": (), "absent": ()},
     "equal legs": {"absent": ()},
     "equal legs, symmetrical bodies": {},
@@ -196,33 +196,36 @@ def measure_structure(seed: int, changes: Changes) -> Sample:
         Numbers of base parameters, and largest differences of coefficients.
     """
     defaults = {"declare_symmetry": True, "platform_rule": True, "joint_radius": 1.0}
-    settings = read_settings(defaults, changes)
+    settings = merge_settings(defaults, changes)
     own = load_robot()
-    chain, found = own.setup.chain, project(own.setup.chain, own.setup.given, *draw_states())
+    chain, found = (
+        own.setup.chain,
+        project_on_drives(own.setup.chain, own.setup.given_joints, *draw_states()),
+    )
     bodies = [f"{kind}.{body}" for body in chain.bodies for kind in _KINDS]
     regrouped = regroup_parameters(bodies, list_relations(chain, settings["platform_rule"]))
     values: dict[str, float] = {}
     spectra = []
-    for stage, options in _STAGES.items():
-        table = replace(own.setup, **options).table(found)
+    for stage, options in _BODY_ASSUMPTIONS.items():
+        table = replace(own.setup, **options).compute_regressor(found)
         structure, kept = _reduce_inertial(table)
         names = [table.names[k] for k in kept]
-        sums = _sum_equal(bodies, names, own.setup.alike if stage != "19 bodies" else ())
+        sums = _build_sum_matrix(bodies, names, own.setup.equal_groups if stage != "19 bodies" else ())
         rules = (regrouped @ sums)[[bodies.index(name) for name in names]]  # one of equal legs
         rules = rules[np.any(rules, axis=1)]
         values[f"columns, {stage}"] = len(kept)
         values[f"rank, {stage}"] = len(structure.base)
         values[f"rules, {stage}"] = len(rules)
-        values[f"difference, {stage}"] = _largest_difference(rules, structure)
-        spectra.append(_singular_values(table.matrix[:, :, kept]))
-    printed = table_1(settings["joint_radius"] * chain.tree.points[:, 1])
-    structure = own.structure
+        values[f"difference, {stage}"] = _find_largest_difference(rules, structure)
+        spectra.append(_compute_singular_values(table.matrix[:, :, kept]))
+    printed = list_table_1(settings["joint_radius"] * chain.tree.closure_points[:, 1])
+    structure = own.base_parameters
     if not settings["declare_symmetry"]:
-        table = replace(own.setup, absent=()).table(found)
+        table = replace(own.setup, absent=()).compute_regressor(found)
         rows = table.matrix.reshape(-1, len(table.names))
-        structure = identifiability(rows, table.names, table.units, [one.column for one in TABLE])
-    values |= _compare_with_print(structure, printed)
-    values["values"] = float(np.abs(own.truth - [one.value for one in TABLE]).max())
+        structure = classify_parameters(rows, table.names, table.units, [one.column for one in PUBLISHED_PARAMETERS])
+    values |= _compare_with_table_1(structure, printed)
+    values["values"] = float(np.abs(own.truth - [one.value for one in PUBLISHED_PARAMETERS]).max())
     labels = ("19 bodies", "equal legs", "symmetry")
     panels = tuple(
         Panel(f"singular value, {label} [1]", np.arange(1.0, len(s) + 1), {"": s}, "number",
@@ -232,7 +235,7 @@ def measure_structure(seed: int, changes: Changes) -> Sample:
     return Sample(values, panels)
 
 
-def _singular_values(matrix: np.ndarray) -> np.ndarray:
+def _compute_singular_values(matrix: np.ndarray) -> np.ndarray:
     """Return relative singular values of the nonzero columns (n, k, m), scaled to unit length."""
     rows = matrix.reshape(-1, matrix.shape[2])
     length = np.linalg.norm(rows, axis=0)
@@ -246,15 +249,13 @@ def _reduce_inertial(table: Regressor) -> tuple[Identifiability, list[int]]:
     kept = [k for k, name in enumerate(table.names) if name.partition(".")[0] in _KINDS]
     names, units = [table.names[k] for k in kept], [table.units[k] for k in kept]
     rows = table.matrix[:, :, kept].reshape(-1, len(kept))
-    first = [one.column for one in TABLE[:10]]
-    return identifiability(rows, names, units, [name for name in first if name in names]), kept
+    first = [one.column for one in PUBLISHED_PARAMETERS[:10]]
+    return classify_parameters(rows, names, units, [name for name in first if name in names]), kept
 
 
-def _sum_equal(
-    bodies: Sequence[str], names: Sequence[str], alike: Sequence[Sequence[str]]
-) -> np.ndarray:
+def _build_sum_matrix(bodies: Sequence[str], names: Sequence[str], equal_bodies: Sequence[Sequence[str]]) -> np.ndarray:
     """Return the matrix (190, m) from the m distinct parameters to those of all bodies."""
-    first = {body: group[0] for group in alike for body in group}
+    first = {body: group[0] for group in equal_bodies for body in group}
     sums = np.zeros((len(bodies), len(names)))
     for k, name in enumerate(bodies):
         kind, _, body = name.partition(".")
@@ -264,7 +265,7 @@ def _sum_equal(
     return sums
 
 
-def _largest_difference(rules: np.ndarray, structure: Identifiability) -> float:
+def _find_largest_difference(rules: np.ndarray, structure: Identifiability) -> float:
     """Return the largest difference of coefficients between rules (r, m) and null space.
 
     The null space may represent the same combinations by other members, so that the rules are first
@@ -276,29 +277,25 @@ def _largest_difference(rules: np.ndarray, structure: Identifiability) -> float:
     return float(np.abs(solved - structure.combination).max())
 
 
-def _compare_with_print(
-    structure: Identifiability, printed: dict[str, dict[str, float]]
-) -> dict[str, float]:
+def _compare_with_table_1(structure: Identifiability, printed: dict[str, dict[str, float]]) -> dict[str, float]:
     """Count the parameters, and the combinations whose coefficients agree with Table 1."""
     names, same = [structure.names[k] for k in structure.base], 0
     for symbol, members in printed.items():
-        column = TABLE[SYMBOLS.index(symbol)].column
+        column = PUBLISHED_PARAMETERS[SYMBOLS.index(symbol)].column
         if column not in names:
             continue
         row = structure.combination[names.index(column)]
         found = {structure.names[k]: row[k] for k in np.flatnonzero(row)
                  if not structure.names[k].startswith("drive_inertia")}  # fmt: skip
-        same += set(found) == set(members) and all(
-            abs(found[name] - members[name]) < MAX_ROUNDING for name in members
-        )
+        same += set(found) == set(members) and all(abs(found[name] - members[name]) < MAX_ROUNDING for name in members)
     friction = sum(name.startswith(("coulomb", "viscous")) for name in names)
     return {"rigid": len(names) - friction, "friction": friction, "same": same}
 
 
-def judge_table_1(samples: Sequence[Sample]) -> Judgement:
+def evaluate_table_1(samples: Sequence[Sample]) -> Evaluation:
     """Compare number and members of the base parameters with Table 1."""
     values = samples[0].values
-    return Judgement(
+    return Evaluation(
         (
             check_exact("rigid-body base parameters", values["rigid"], (10, 10), "Table 1",
                         published=10),
@@ -313,10 +310,10 @@ def judge_table_1(samples: Sequence[Sample]) -> Judgement:
     )  # fmt: skip
 
 
-def judge_rules(samples: Sequence[Sample]) -> Judgement:
+def evaluate_regrouping_rules(samples: Sequence[Sample]) -> Evaluation:
     """Compare number and coefficients of the regrouped parameters with the null space."""
     values, checks = samples[0].values, []
-    for stage in _STAGES:
+    for stage in _BODY_ASSUMPTIONS:
         rank = values[f"rank, {stage}"]
         checks += [
             check_exact(f"base parameters by the rules, {stage}", values[f"rules, {stage}"],
@@ -324,15 +321,15 @@ def judge_rules(samples: Sequence[Sample]) -> Judgement:
             check_exact(f"largest difference of coefficients, {stage}",
                         values[f"difference, {stage}"], (0.0, MAX_ROUNDING), "rounding"),
         ]  # fmt: skip
-    return Judgement(tuple(checks))
+    return Evaluation(tuple(checks))
 
 
-def judge_values(samples: Sequence[Sample]) -> Judgement:
+def evaluate_parameter_values(samples: Sequence[Sample]) -> Evaluation:
     """Compare the model's base parameters with the printed estimates."""
-    worst = float(collect(samples, "values").max())
+    worst = float(collect_values(samples, "values").max())
     check = check_exact("largest difference from the estimates of Table 2", worst, (0.0, 1e-9),
                         "rounding of the decimals in the MJCF", unit="SI")  # fmt: skip
-    return Judgement((check,))
+    return Evaluation((check,))
 
 
 STRUCTURE = Experiment(
@@ -343,7 +340,7 @@ STRUCTURE = Experiment(
             "base parameters",
             '"The rigid-body part contains 10 base parameters (see Table 1)." "The friction model'
             ' contains therefore 14 different parameters."',
-            "Table 1, section 5.1", "document", judge_table_1,
+            "Table 1, section 5.1", "document", evaluate_table_1,
             {"declare_symmetry": False}, "no inertial parameter is declared absent", (),
         ),
         Claim(
@@ -353,14 +350,14 @@ STRUCTURE = Experiment(
             ' moments of inertia can be added to the carrying antecedent joint" "The masses of'
             " terminal bodies can be grouped to the inertial parameter of the platform according to"
             " Steiner's laws.\"",
-            "section 2.1, (9) to (11)", "document", judge_rules,
+            "section 2.1, (9) to (11)", "document", evaluate_regrouping_rules,
             {"platform_rule": False}, "the rule for the platform is not applied",
         ),
         Claim(
             "parameters of the model",
             "24 estimates",
-            "Table 2", "input", judge_values, None, "", (),
+            "Table 2", "input", evaluate_parameter_values, None, "", (),
         ),
     ),
-    repetitions_fixed=1,
+    fixed_repetitions=1,
 )  # fmt: skip

@@ -22,23 +22,23 @@ def run_shipped(name: str, overrides: Mapping[str, str] | None = None) -> tuple[
     return scenario, run_scenario(scenario)
 
 
-def true_channel(run: Run, channel: str) -> np.ndarray:
+def read_true_channel(run: Run, channel: str) -> np.ndarray:
     """Return the (n,) samples of a truth channel, or zeros if the run has no such channel."""
     return run.truth.columns.get(channel, np.zeros(len(run.truth.time)))
 
 
-def cylindrical_pose(run: Run) -> dict[str, np.ndarray]:
+def compute_cylindrical_pose(run: Run) -> dict[str, np.ndarray]:
     """Return the true tip pose: r, z [m], theta and attitude [rad], each (n,)."""
-    x, y, z = (true_channel(run, f"truth.tip.{c}") for c in "xyz")
+    x, y, z = (read_true_channel(run, f"truth.tip.{c}") for c in "xyz")
     arm = run.plant.machine.arm
     assert arm is not None
     axes = {axis.joint: name for name, axis in run.plant.machine.axes.items()}
-    bends = [true_channel(run, f"angle.{axes[j]}") for j in (arm.boom, arm.stick, arm.tool) if j]
+    bends = [read_true_channel(run, f"angle.{axes[j]}") for j in (arm.boom, arm.stick, arm.tool) if j]
     return {"r": np.hypot(x, y), "theta": np.unwrap(np.arctan2(y, x)), "z": z,
             "attitude": np.sum(bends, axis=0)}  # fmt: skip
 
 
-def operator_changes(seed: int) -> dict[str, str]:
+def make_operator_changes(seed: int) -> dict[str, str]:
     """Return scenario changes that draw an operator of the published population and set the seed.
 
     Args:

@@ -14,7 +14,7 @@ SERIES = Series(
     " serial-parallel hybrid robot, thesis, Lappeenranta 2012",
     20,
     (*wang_models.EXPERIMENTS, *wang_identification.EXPERIMENTS, *wang_calibration.EXPERIMENTS),
-    drawings={
+    items_without_result={
         "Fig. 1": "picture of the fusion reactor ITER",
         "Fig. 2": "photograph of the robot",
         "Fig. 3": "drawing of a SCARA robot",

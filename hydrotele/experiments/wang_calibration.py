@@ -9,12 +9,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from hydrotele.calibrate.hybrid import calibrate
+from hydrotele.calibrate.hybrid import calibrate_hybrid_robot
 from hydrotele.experiments.comparison import (
     Changes,
     Claim,
+    Evaluation,
     Experiment,
-    Judgement,
     Panel,
     Sample,
 )
@@ -22,7 +22,7 @@ from hydrotele.experiments.intervals import (
     check_fraction,
     check_mean,
     check_statistic,
-    collect,
+    collect_values,
     format_values,
 )
 from hydrotele.experiments.wang_models import MAX_ROUNDING
@@ -30,30 +30,30 @@ from hydrotele.experiments.wang_robots import (
     REQUIRED_ACCURACY,
     SENSOR_NOISE,
     SimulatedRobot,
-    caption_claim,
-    change_settings,
-    pose_errors_at_test_poses,
-    root_mean_square,
+    compute_rms,
+    compute_test_errors,
+    make_caption_claim,
+    merge_settings,
     simulate_robot,
 )
 from hydrotele.kinematics.hybrid import (
-    Hybrid,
-    document_parameters,
-    forward,
-    inverse,
+    HybridRobot,
+    forward_kinematics,
+    inverse_kinematics,
     leg_readings,
     load_hybrid,
     pose_difference,
+    refined_model_parameters,
 )
-from hydrotele.kinematics.wires import pose_covariance, pose_of_wires, wire_lengths
-from hydrotele.simulate.hybrid import random_poses, shipped_wires
+from hydrotele.kinematics.wires import pose_covariance, pose_from_wires, wire_lengths
+from hydrotele.simulate.hybrid import default_wires, sample_poses
 
 ACCURACY_REASON = "high accuracy (±0.1 mm), page 19, RMS"
 
 POSE_LABEL = "pose [1]"
 
 
-def _panel(label: str, before: np.ndarray, after: np.ndarray) -> Panel:
+def _draw_errors(label: str, before: np.ndarray, after: np.ndarray) -> Panel:
     """Draw errors before and after calibration; the latter also have a separate axis."""
     return Panel(
         label, np.arange(1, len(before) + 1), {"before": 1e3 * before, "after": 1e3 * after},
@@ -62,7 +62,7 @@ def _panel(label: str, before: np.ndarray, after: np.ndarray) -> Panel:
 
 
 def _check_accuracy(quantity: str, samples: Sequence[Sample], name: str):
-    return check_mean(quantity, 1e3 * collect(samples, name), (-np.inf, 1e3 * REQUIRED_ACCURACY),
+    return check_mean(quantity, 1e3 * collect_values(samples, name), (-np.inf, 1e3 * REQUIRED_ACCURACY),
                       ACCURACY_REASON, unit="mm")  # fmt: skip
 
 
@@ -73,7 +73,7 @@ def _describe_change(samples: Sequence[Sample], name: str, unit: str = "mm") -> 
     )
 
 
-def measure_refined(seed: int, changes: Changes) -> Sample:
+def measure_refined_model(seed: int, changes: Changes) -> Sample:
     """Calibrate a robot with errors in the 36 parameters by least squares from 25 poses.
 
     Args:
@@ -86,39 +86,35 @@ def measure_refined(seed: int, changes: Changes) -> Sample:
         RMS position errors at test poses, fraction of errors inside their intervals, and largest
         parameter error without noise.
     """
-    settings = change_settings(
-        {"document": True, "noise": 1.0, "stated_noise": 1.0, "exact_noise": 0.0}, changes
-    )
+    settings = merge_settings({"document": True, "noise": 1.0, "stated_noise": 1.0, "exact_noise": 0.0}, changes)
     nominal = load_hybrid("iwr")
-    simulated = simulate_robot(
-        1000 + seed, 25, document=settings["document"], noise=settings["noise"]
-    )
+    simulated = simulate_robot(1000 + seed, 25, refined_only=settings["document"], noise=settings["noise"])
     measurement = simulated.measurement
     covariance = measurement.covariance * settings["stated_noise"] ** 2
     measurement = replace(measurement, covariance=covariance)
-    names = document_parameters(simulated.model)
-    done = calibrate(nominal, measurement, "dh", names)
-    truth = simulated.errors[simulated.model.index(done.fit.names)]
+    names = refined_model_parameters(simulated.model)
+    done = calibrate_hybrid_robot(nominal, measurement, "dh", names)
+    truth = simulated.errors[simulated.model.parameter_indices(done.fit.names)]
     low, high = done.fit.intervals.T
     exact = simulate_robot(1000 + seed, 25, noise=settings["exact_noise"])
-    recovered = calibrate(nominal, exact.measurement, "dh", names).fit
-    before = pose_errors_at_test_poses(simulated, nominal)[0]
-    after = pose_errors_at_test_poses(simulated, done.robot)[0]
-    complete = calibrate(nominal, measurement, "dh").robot
+    recovered = calibrate_hybrid_robot(nominal, exact.measurement, "dh", names).fit
+    before = compute_test_errors(simulated, nominal)[0]
+    after = compute_test_errors(simulated, done.robot)[0]
+    complete = calibrate_hybrid_robot(nominal, measurement, "dh").robot
     return Sample(
-        {"position before": root_mean_square(before), "position after": root_mean_square(after),
+        {"position before": compute_rms(before), "position after": compute_rms(after),
          "largest": float(after.max()),
-         "with 54": root_mean_square(pose_errors_at_test_poses(simulated, complete)[0]),
+         "with 54": compute_rms(compute_test_errors(simulated, complete)[0]),
          "inside": float(np.mean((truth > low) & (truth < high))),
          "exact": float(np.abs(
-             recovered.values - exact.errors[exact.model.index(recovered.names)]).max())},
-        (_panel("position error at test poses [mm]", before, after),),
+             recovered.values - exact.errors[exact.model.parameter_indices(recovered.names)]).max())},
+        (_draw_errors("position error at test poses [mm]", before, after),),
     )  # fmt: skip
 
 
-def _judge_minimality(samples: Sequence[Sample]) -> Judgement:
+def _evaluate_redundancy(samples: Sequence[Sample]) -> Evaluation:
     pairs = np.array([(s.values["with 54"], s.values["position after"]) for s in samples])
-    return Judgement(
+    return Evaluation(
         (check_statistic("RMS error at test poses with the 54 parameters over that with the 36",
                          pairs, lambda rows: float(np.sqrt(
                              np.mean(rows[:, 0] ** 2) / np.mean(rows[:, 1] ** 2))),
@@ -127,9 +123,9 @@ def _judge_minimality(samples: Sequence[Sample]) -> Judgement:
     )  # fmt: skip
 
 
-def _judge_accurate_model(samples: Sequence[Sample]) -> Judgement:
+def _evaluate_accurate_model(samples: Sequence[Sample]) -> Evaluation:
     within = [sample.values["largest"] < REQUIRED_ACCURACY for sample in samples]
-    return Judgement(
+    return Evaluation(
         (_check_accuracy("RMS position error at 25 test poses", samples, "position after"),
          check_fraction("robots with all 25 poses within 0.1 mm", within, (0.5, 1.0),
                         "more than half of the robots; the publication had one")),
@@ -138,20 +134,20 @@ def _judge_accurate_model(samples: Sequence[Sample]) -> Judgement:
     )  # fmt: skip
 
 
-def _judge_intervals(samples: Sequence[Sample]) -> Judgement:
-    return Judgement((check_mean(
-        "assumed errors within their 95 % intervals", 100.0 * collect(samples, "inside"),
+def _evaluate_intervals(samples: Sequence[Sample]) -> Evaluation:
+    return Evaluation((check_mean(
+        "assumed errors within their 95 % intervals", 100.0 * collect_values(samples, "inside"),
         (92.0, 98.0), "95 %; a deviation of 3 % is a standard deviation wrong by one sixth",
         unit="%"),))  # fmt: skip
 
 
-def _judge_exact(samples: Sequence[Sample]) -> Judgement:
-    return Judgement((check_mean(
-        "largest error of an identified parameter", collect(samples, "exact"),
+def _evaluate_exact_readings(samples: Sequence[Sample]) -> Evaluation:
+    return Evaluation((check_mean(
+        "largest error of an identified parameter", collect_values(samples, "exact"),
         (-np.inf, MAX_ROUNDING), "rounding", unit="m or rad"),))  # fmt: skip
 
 
-def measure_poe(seed: int, changes: Changes) -> Sample:
+def measure_poe_model(seed: int, changes: Changes) -> Sample:
     """Calibrate a robot with errors in all 54 parameters of the POE model from 25 poses.
 
     Args:
@@ -161,32 +157,32 @@ def measure_poe(seed: int, changes: Changes) -> Sample:
     Returns:
         Rank, RMS position errors at measured and test poses, and RMS parameter errors.
     """
-    settings = change_settings({"noise": 1.0}, changes)
+    settings = merge_settings({"noise": 1.0}, changes)
     nominal = load_hybrid("iwr")
-    simulated = simulate_robot(900 + seed, 25, "poe", document=False, noise=settings["noise"])
-    done = calibrate(nominal, simulated.measurement, "poe")
-    test = pose_errors_at_test_poses(simulated, done.robot)[0]
-    truth, found = simulated.errors, done.errors
+    simulated = simulate_robot(900 + seed, 25, "poe", refined_only=False, noise=settings["noise"])
+    done = calibrate_hybrid_robot(nominal, simulated.measurement, "poe")
+    test = compute_test_errors(simulated, done.robot)[0]
+    truth, found = simulated.errors, done.parameter_errors
     count = simulated.model.carriage_count
     values = {
         "rank": done.redundancy.rank,
-        "position before": root_mean_square(done.before.position),
-        "position after": root_mean_square(done.after.position),
-        "test": root_mean_square(test),
-        "better": float(np.mean(done.after.position < done.before.position)),
+        "position before": compute_rms(done.nominal_errors.position),
+        "position after": compute_rms(done.calibrated_errors.position),
+        "test": compute_rms(test),
+        "better": float(np.mean(done.calibrated_errors.position < done.nominal_errors.position)),
     }
     for part, at in (("carriage", slice(0, count)), ("hexapod", slice(count, None))):
-        values[f"assumed {part}"] = root_mean_square(truth[at])
-        values[f"missed {part}"] = root_mean_square((found - truth)[at])
-    axes = simulated.model.nominal.facts.axes
+        values[f"assumed {part}"] = compute_rms(truth[at])
+        values[f"missed {part}"] = compute_rms((found - truth)[at])
+    axes = simulated.model.nominal.specification.axes
     arrays = {"axes": np.array([(*row.direction, *row.point) for row in axes])}
-    panel = _panel("position error [mm]", done.before.position, done.after.position)
+    panel = _draw_errors("position error [mm]", done.nominal_errors.position, done.calibrated_errors.position)
     return Sample(values, (panel,), arrays)
 
 
-def _judge_poe(samples: Sequence[Sample]) -> Judgement:
-    return Judgement(
-        (check_mean("independent parameters of the 54", collect(samples, "rank"), (54.0, 54.0),
+def _evaluate_poe_model(samples: Sequence[Sample]) -> Evaluation:
+    return Evaluation(
+        (check_mean("independent parameters of the 54", collect_values(samples, "rank"), (54.0, 54.0),
                     "all: complete and minimal"),
          _check_accuracy("RMS position error at 25 test poses", samples, "test")),
         "The sensor noise is an assumption; errors are proportional to it.",
@@ -220,41 +216,45 @@ def measure_wire_calibration(seed: int, changes: Changes) -> Sample:
     Returns:
         Leg, pose and parameter errors, and errors of positions commanded by inverse kinematics.
     """
-    settings = change_settings({"noise": 1.0}, changes)
+    settings = merge_settings({"noise": 1.0}, changes)
     nominal = load_hybrid("iwr")
-    simulated = simulate_robot(1300 + seed, 20, document=False, noise=settings["noise"])
+    simulated = simulate_robot(1300 + seed, 20, refined_only=False, noise=settings["noise"])
     m = simulated.measurement
-    done = calibrate(nominal, m, "dh")
+    done = calibrate_hybrid_robot(nominal, m, "dh")
     legs = [np.abs(leg_readings(robot, m.joints, m.pose) - m.legs).max(axis=1)
             for robot in (nominal, done.robot)]  # fmt: skip
-    test = pose_errors_at_test_poses(simulated, done.robot)[0]
+    test = compute_test_errors(simulated, done.robot)[0]
     reached = [_reach_desired_poses(simulated, robot) for robot in (nominal, done.robot)]
-    truth, found = simulated.errors, done.errors
+    truth, found = simulated.errors, done.parameter_errors
     values = {
         "leg before": float(legs[0].max()),
         "leg after": float(legs[1].max()),
-        "test": root_mean_square(test),
-        "reached before": root_mean_square(reached[0]),
-        "reached after": root_mean_square(reached[1]),
-        "assumed": root_mean_square(truth),
-        "missed": root_mean_square(found - truth),
+        "test": compute_rms(test),
+        "reached before": compute_rms(reached[0]),
+        "reached after": compute_rms(reached[1]),
+        "assumed": compute_rms(truth),
+        "missed": compute_rms(found - truth),
         "rank": done.redundancy.rank,
         "least legs": float(m.legs.min()),
         "most legs": float(m.legs.max()),
     }
-    for name, errors in (("before", done.before), ("after", done.after)):
-        values[f"position {name}"] = root_mean_square(errors.position)
-        values[f"orientation {name}"] = root_mean_square(errors.orientation)
+    for name, errors in (("before", done.nominal_errors), ("after", done.calibrated_errors)):
+        values[f"position {name}"] = compute_rms(errors.position)
+        values[f"orientation {name}"] = compute_rms(errors.orientation)
     panels = (
-        _panel("largest leg error [mm]", *legs),
-        _panel("orientation error [mrad]", done.before.orientation, done.after.orientation),
-        _panel("position error [mm]", done.before.position, done.after.position),
-        _panel("error of the reached position [mm]", *reached),
+        _draw_errors("largest leg error [mm]", *legs),
+        _draw_errors(
+            "orientation error [mrad]",
+            done.nominal_errors.orientation,
+            done.calibrated_errors.orientation,
+        ),
+        _draw_errors("position error [mm]", done.nominal_errors.position, done.calibrated_errors.position),
+        _draw_errors("error of the reached position [mm]", *reached),
     )
     return Sample(values, panels)
 
 
-def _reach_desired_poses(simulated: SimulatedRobot, robot: Hybrid) -> np.ndarray:
+def _reach_desired_poses(simulated: SimulatedRobot, robot: HybridRobot) -> np.ndarray:
     """Return the position errors when a model's inverse kinematics command the true robot.
 
     Args:
@@ -265,13 +265,13 @@ def _reach_desired_poses(simulated: SimulatedRobot, robot: Hybrid) -> np.ndarray
         (M,) [m].
     """
     joints, legs = simulated.test_commands
-    desired = forward(load_hybrid("iwr"), joints, legs)
-    reached = forward(simulated.robot, joints, inverse(robot, desired, joints))
+    desired = forward_kinematics(load_hybrid("iwr"), joints, legs)
+    reached = forward_kinematics(simulated.robot, joints, inverse_kinematics(robot, desired, joints))
     return np.linalg.norm(pose_difference(reached, desired)[:, :3], axis=1)
 
 
-def _judge_whole_robot(samples: Sequence[Sample]) -> Judgement:
-    return Judgement(
+def _evaluate_whole_robot(samples: Sequence[Sample]) -> Evaluation:
+    return Evaluation(
         (_check_accuracy("RMS position error at 25 test poses", samples, "test"),),
         "The sensor noise is an assumption; errors are proportional to it.",
         f"20 platform poses; {format_values(samples, 'rank', digits=0)} of 54 parameters are"
@@ -279,8 +279,8 @@ def _judge_whole_robot(samples: Sequence[Sample]) -> Judgement:
     )  # fmt: skip
 
 
-def _judge_correction(samples: Sequence[Sample]) -> Judgement:
-    return Judgement(
+def _evaluate_correction(samples: Sequence[Sample]) -> Evaluation:
+    return Evaluation(
         (_check_accuracy("RMS error of the reached position", samples, "reached after"),),
         "The sensor noise is an assumption; errors are proportional to it.",
         f"25 desired poses, commanded by the inverse kinematics; RMS"
@@ -308,16 +308,16 @@ def measure_wire_method(seed: int, changes: Changes) -> Sample:
         Largest pose error with exact lengths; with noisy lengths, the normalized squared pose error
         and median position and orientation errors.
     """
-    settings = change_settings({"noise": 1.0}, changes)
-    robot, wires, rng = load_hybrid("iwr"), shipped_wires(), np.random.default_rng(seed)
-    joints, legs = random_poses(robot, 100, rng, wires)
-    pose = forward(robot, joints, legs)
+    settings = merge_settings({"noise": 1.0}, changes)
+    robot, wires, rng = load_hybrid("iwr"), default_wires(), np.random.default_rng(seed)
+    joints, legs = sample_poses(robot, 100, rng, wires)
+    pose = forward_kinematics(robot, joints, legs)
     lengths = wire_lengths(wires, pose)
-    exact = np.abs(pose_difference(pose_of_wires(wires, lengths, pose), pose)).max()
+    exact = np.abs(pose_difference(pose_from_wires(wires, lengths, pose), pose)).max()
     sigma = SENSOR_NOISE["wire"]
     covariance = pose_covariance(wires, pose, sigma)
     noisy = lengths + settings["noise"] * sigma * rng.normal(size=lengths.shape)
-    away = pose_difference(pose_of_wires(wires, noisy, pose), pose)
+    away = pose_difference(pose_from_wires(wires, noisy, pose), pose)
     squares = np.einsum("ni,nij,nj->n", away, np.linalg.inv(covariance), away)
     position, turn = (float(np.median(np.linalg.norm(away[:, k : k + 3], axis=1))) for k in (0, 3))
     return Sample({
@@ -328,12 +328,12 @@ def measure_wire_method(seed: int, changes: Changes) -> Sample:
     })  # fmt: skip
 
 
-def _judge_wires(samples: Sequence[Sample]) -> Judgement:
-    return Judgement(
-        (check_mean("largest error of a pose from exact lengths", collect(samples, "exact"),
+def _evaluate_wire_poses(samples: Sequence[Sample]) -> Evaluation:
+    return Evaluation(
+        (check_mean("largest error of a pose from exact lengths", collect_values(samples, "exact"),
                     (-np.inf, MAX_ROUNDING), "rounding", unit="m or rad"),
          check_mean("squared pose error over that of the propagated covariance",
-                    collect(samples, "squares"), (0.9, 1.1),
+                    collect_values(samples, "squares"), (0.9, 1.1),
                     "1; 10 % of the square are 5 % of the standard deviation")),
     )  # fmt: skip
 
@@ -349,16 +349,16 @@ def _describe_wire_poses(samples: Sequence[Sample]) -> str:
 
 
 def _describe_wire_points(samples: Sequence[Sample]) -> str:
-    wires = shipped_wires()
+    wires = default_wires()
     anchors = "; ".join(str(tuple(round(1e3 * v) for v in point)) for point in wires.anchors)
     points = "; ".join(str(tuple(round(1e3 * v) for v in point)) for point in wires.points)
     return f"anchors {anchors} mm; platform points {points} mm; all are assumptions"
 
 
-POSES = Experiment(
+WIRE_POSES = Experiment(
     "3-2-1 wires", measure_wire_method,
     (
-        caption_claim(
+        make_caption_claim(
             "poses and carriage displacements", "Table 2 (p. 43)",
             '"Randomly generated end-effector poses and carriage-joint displacements (unit: mm for'
             ' lengths and rad. for angles)"', _describe_range("joints", "carriage joints from"),
@@ -367,16 +367,16 @@ POSES = Experiment(
             "3-2-1 wires: pose by three spheres",
             "Six wire lengths give the pose, with errors that agree with the propagated"
             " covariance.",
-            "section 5.1", "additional", _judge_wires, {"noise": 1.5},
+            "section 5.1", "additional", _evaluate_wire_poses, {"noise": 1.5},
             "the wires' noise is 1.5 times the assumed one",
         ),
-        caption_claim(
+        make_caption_claim(
             "hexagon and end-effector points", "Table 10 (p. 69)",
             '"The hexagon vertex coordinate values with respect to the reference frame and three'
             ' end-effector points coordinate values with respect to the moving platform"',
             _describe_wire_points,
         ),
-        caption_claim(
+        make_caption_claim(
             "wire lengths and calculated poses", "Table 12 (p. 70)",
             '"Measured wire lengths in the Solidworks model and the corresponding calculated'
             ' end-effector poses based on the 3-2-1 pose estimation method"', _describe_wire_poses,
@@ -384,23 +384,23 @@ POSES = Experiment(
     ),
 )  # fmt: skip
 
-REFINED = Experiment(
-    "36 parameters by least squares", measure_refined,
+REFINED_MODEL = Experiment(
+    "36 parameters by least squares", measure_refined_model,
     (
         Claim(
             "redundant parameters deteriorate the identification",
             '"the redundant parameters have to be eliminated since they would deteriorate the'
-            ' identification result"', "section 2.1 (p. 24)", "document", _judge_minimality,
-            {"document": False}, "the robot has errors in all 54 parameters", panels=(),
+            ' identification result"', "section 2.1 (p. 24)", "document", _evaluate_redundancy,
+            {"document": False}, "the robot has errors in all 54 parameters", panel_labels=(),
         ),
         Claim(
             "accurate kinematic model",
             '"the identified parameter errors are substituted into the error model to obtain an'
             ' accurate kinematic model"; "high accuracy (±0.1 mm) for the assembly robot"',
-            "section 1.1 (p. 21, 19)", "document", _judge_accurate_model, {"noise": 10.0},
+            "section 1.1 (p. 21, 19)", "document", _evaluate_accurate_model, {"noise": 10.0},
             "ten times the sensor noise",
         ),
-        caption_claim(
+        make_caption_claim(
             "36 parameters, without measurement noise", "Table 4 (p. 53)",
             '"Nominal values, assumed errors, identified posterior mean values, and standard'
             ' deviations for the refined 36-parameter model (without measurement noise)"',
@@ -410,38 +410,38 @@ REFINED = Experiment(
         Claim(
             "exact measurements return the 36 assumed errors",
             "Without noise the 36 identified errors equal the assumed ones.", "section 4.2.2",
-            "additional", _judge_exact, {"exact_noise": 0.01},
-            "1 % of the sensor noise is added", panels=(),
+            "additional", _evaluate_exact_readings, {"exact_noise": 0.01},
+            "1 % of the sensor noise is added", panel_labels=(),
         ),
         Claim(
             "intervals of the 36 parameters",
             "95 % of the assumed errors are within the 95 % intervals of least squares.",
-            "section 4.2.3", "additional", _judge_intervals, {"stated_noise": 0.5},
-            "the covariance assumes half of the true noise", panels=(),
+            "section 4.2.3", "additional", _evaluate_intervals, {"stated_noise": 0.5},
+            "the covariance assumes half of the true noise", panel_labels=(),
         ),
     ),
 )  # fmt: skip
 
-POE = Experiment(
-    "POE model: 25 poses", measure_poe,
+POE_MODEL = Experiment(
+    "POE model: 25 poses", measure_poe_model,
     (
         Claim(
             "POE model of the hybrid robot",
             '"Extending the product-of-exponentials (POE) modeling and calibration method from a'
             ' serial robot to a redundant serial-parallel hybrid robot"; "high accuracy (±0.1 mm)'
             ' for the assembly robot"', "section 1.3 (p. 22), section 1.1 (p. 19)", "document",
-            _judge_poe, {"noise": 10.0}, "ten times the sensor noise",
+            _evaluate_poe_model, {"noise": 10.0}, "ten times the sensor noise",
         ),
-        caption_claim("kinematic parameters of the POE model", "Table 6 (p. 56)",
+        make_caption_claim("kinematic parameters of the POE model", "Table 6 (p. 56)",
                       '"Kinematic parameters in the reference configuration"', _describe_axes),
-        caption_claim(
+        make_caption_claim(
             "POE model: carriage", "Table 7 (p. 57)",
             '"Nominal and identified parameters of carriage"', _describe_part("carriage"),
         ),
-        caption_claim("POE model: hexapod", "Table 8 (p. 57)",
+        make_caption_claim("POE model: hexapod", "Table 8 (p. 57)",
                       '"Nominal and identified parameters of the Hexa-WH (unit: mm)"',
                       _describe_part("hexapod")),
-        caption_claim(
+        make_caption_claim(
             "POE model: 25 poses before and after", "Table 9, Figs 20 and 21 (p. 60, 61)",
             '"Results of 25 end-effector poses before and after calibration"; "Position errors'
             ' before calibration in the 25 end-effector pose configurations."; "Position errors'
@@ -460,20 +460,20 @@ WIRE_CALIBRATION = Experiment(
             '"the two hybrid parts do not need to be calibrated separately but can be regarded as a'
             ' whole, and then the pose measurement of the end-effector can fulfill the calibration'
             ' purpose effectively"; "high accuracy (±0.1 mm) for the assembly robot"',
-            "section 2.1 (p. 25), section 1.1 (p. 19)", "document", _judge_whole_robot,
-            {"noise": 10.0}, "ten times the sensor noise", panels=(),
+            "section 2.1 (p. 25), section 1.1 (p. 19)", "document", _evaluate_whole_robot,
+            {"noise": 10.0}, "ten times the sensor noise", panel_labels=(),
         ),
         Claim(
             "correction in the controller",
             '"to compensate them in the robot controller so as to make the error model match the'
             ' real robot as closely as possible"; "high accuracy (±0.1 mm) for the assembly robot"',
-            "section 1.1 (p. 20, 19)", "document", _judge_correction, {"noise": 10.0},
-            "ten times the sensor noise", panels=("error of the reached position [mm]",),
+            "section 1.1 (p. 20, 19)", "document", _evaluate_correction, {"noise": 10.0},
+            "ten times the sensor noise", panel_labels=("error of the reached position [mm]",),
         ),
-        caption_claim("actuated-joint displacements", "Table 11 (p. 69)",
+        make_caption_claim("actuated-joint displacements", "Table 11 (p. 69)",
                       '"Measured actuated-joint displacements in the Solidworks environment"',
                       _describe_range("legs", "legs from")),
-        caption_claim(
+        make_caption_claim(
             "identified parameters of the hybrid robot", "Table 13 (p. 72)",
             '"Nominal and identified parameters of the hybrid IWR robot (unit: mm)"',
             lambda samples: f"RMS of the assumed errors {format_values(samples, 'assumed', 1e3, 2)}"
@@ -481,21 +481,21 @@ WIRE_CALIBRATION = Experiment(
             f" {format_values(samples, 'missed', 1e3, 2)}, since A_i and the last link are"
             " identifiable only in combinations",
         ),
-        caption_claim(
+        make_caption_claim(
             "legs before and after calibration", "Table 14, Figs 25 and 26 (p. 73, 74)",
             '"Leg errors before calibration in 20 pose configurations."; "Leg errors after'
             ' calibration in 20 pose configurations."',
             lambda samples: f"largest leg error {_describe_change(samples, 'leg')}",
             lambda samples: (samples[0].panels[:1], None),
         ),
-        caption_claim(
+        make_caption_claim(
             "orientation before and after calibration", "Table 15, Figs 27 and 28 (p. 75, 76)",
             '"Orientation errors before calibration in 20 pose configurations."; "Orientaion errors'
             ' after calibration in 20 pose configurations."',
             lambda samples: f"RMS {_describe_change(samples, 'orientation', 'mrad')}",
             lambda samples: (samples[0].panels[1:2], None),
         ),
-        caption_claim(
+        make_caption_claim(
             "position before and after calibration", "Table 15, Figs 29 and 30 (p. 75, 77)",
             '"Position errors before calibration in 20 pose configurations."; "Position errors'
             ' after calibration in 20 pose configurations"',
@@ -505,5 +505,5 @@ WIRE_CALIBRATION = Experiment(
     ),
 )  # fmt: skip
 
-EXPERIMENTS = (REFINED, POE, POSES, WIRE_CALIBRATION)
+EXPERIMENTS = (REFINED_MODEL, POE_MODEL, WIRE_POSES, WIRE_CALIBRATION)
 """Experiments in the order of the document."""

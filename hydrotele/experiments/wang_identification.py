@@ -5,47 +5,62 @@ from collections.abc import Sequence
 import numpy as np
 
 from hydrotele.calibrate.estimation import Prior
-from hydrotele.calibrate.hybrid import calibrate, equations, redundancy, subset
-from hydrotele.calibrate.posterior import Posterior, evolve, sample_posterior
+from hydrotele.calibrate.hybrid import (
+    build_equations,
+    calibrate_hybrid_robot,
+    find_redundancy,
+    fitted_equations,
+)
+from hydrotele.calibrate.posterior import Posterior, minimize_by_evolution, sample_posterior
 from hydrotele.experiments.comparison import (
     Changes,
     Check,
     Claim,
+    Evaluation,
     Experiment,
-    Judgement,
     Marginals,
     Panel,
     Sample,
 )
-from hydrotele.experiments.intervals import check_mean, check_statistic, collect, format_values
+from hydrotele.experiments.intervals import (
+    check_mean,
+    check_statistic,
+    collect_values,
+    format_values,
+)
 from hydrotele.experiments.wang_robots import (
     Drawing,
-    caption_claim,
-    change_settings,
+    compute_rms,
+    compute_test_errors,
+    make_caption_claim,
     measure_nominal_robot,
-    pose_errors_at_test_poses,
-    root_mean_square,
+    merge_settings,
     simulate_robot,
 )
-from hydrotele.kinematics.hybrid import Kind, document_parameters, error_model, load_hybrid
-from hydrotele.simulate.hybrid import TILT
+from hydrotele.kinematics.hybrid import (
+    ErrorModelKind,
+    build_error_model,
+    load_hybrid,
+    refined_model_parameters,
+)
+from hydrotele.simulate.hybrid import PLATFORM_TILT
 
 MAX_RHAT = 1.1
 """Largest split R-hat of converged chains: Gelman et al., Bayesian Data Analysis, 11.4."""
 
-MAX_EXCESS = 0.5
+MAX_LIKELIHOOD_EXCESS = 0.5
 """Largest accepted excess of DE's negative log likelihood over the optimum.
 
 A change of one parameter by one standard deviation causes an excess of 0.5.
 """
 
-SEARCH_BOX = 5.0
+SEARCH_HALF_WIDTH = 5.0
 """Half the width of DE's search region, in standard deviations of the manufacturing errors."""
 
-KEPT_DRAWS = 4000
+MAX_PLOTTED_SAMPLES = 4000
 """Number of posterior samples kept for figures."""
 
-CAPTIONS = {
+FIGURE_CAPTIONS = {
     12: (49, ("a4", "theta4", "a1x", "a2x"), "δa4, δθ4, δa1x, δa2x"),
     13: (50, ("a4", "a3x", "a4x", "a5x"), "δa4, δa3x, δa4x, δa5x"),
     14: (50, ("d4", "a1y", "a2y", "a1x"), "δdd, δa1y, δa2y, δa1x"),
@@ -59,9 +74,9 @@ The available text does not define the dd of Fig. 14; d4 is used instead.
 """
 
 
-def _select_draws(posterior: Posterior) -> np.ndarray:
-    flat = posterior.flat
-    return flat[:: max(1, len(flat) // KEPT_DRAWS)]
+def _select_samples(posterior: Posterior) -> np.ndarray:
+    flat = posterior.flat_sample
+    return flat[:: max(1, len(flat) // MAX_PLOTTED_SAMPLES)]
 
 
 def measure_redundancy(seed: int, changes: Changes) -> Sample:
@@ -79,42 +94,40 @@ def measure_redundancy(seed: int, changes: Changes) -> Sample:
     Returns:
         Ratios of standard deviations, correlations, convergence and posterior samples.
     """
-    settings = change_settings({"tilt_of_jacobian": None, "steps": 4000}, changes)
-    simulated = simulate_robot(400 + seed, 25, document=False)
-    eq = equations(simulated.model, simulated.measurement)
+    settings = merge_settings({"tilt_of_jacobian": None, "steps": 4000}, changes)
+    simulated = simulate_robot(400 + seed, 25, refined_only=False)
+    eq = build_equations(simulated.model, simulated.measurement)
     scales, names = eq.scales, eq.names
     prior = Prior(np.zeros(54), scales)
-    fit = calibrate(load_hybrid("iwr"), simulated.measurement, "dh", prior=prior).fit
+    fit = calibrate_hybrid_robot(load_hybrid("iwr"), simulated.measurement, "dh", prior=prior).fit
     posterior = sample_posterior(
-        lambda x: -eq.misfit(x) - 0.5 * np.sum((x / scales) ** 2, axis=1), fit.values,
-        fit.covariance, names, steps=settings["steps"], burn=200, walkers=110, seed=seed,
+        lambda x: -eq.negative_log_likelihood(x) - 0.5 * np.sum((x / scales) ** 2, axis=1), fit.values,
+        fit.covariance, names, steps=settings["steps"], burn_in=200, walkers=110, seed=seed,
     )  # fmt: skip
     analysed = eq
     if settings["tilt_of_jacobian"] is not None:
-        analysed = equations(
-            simulated.model, measure_nominal_robot(25, seed, settings["tilt_of_jacobian"])
-        )
-    found = redundancy(analysed)
+        analysed = build_equations(simulated.model, measure_nominal_robot(25, seed, settings["tilt_of_jacobian"]))
+    found = find_redundancy(analysed)
     _, singular, rows = np.linalg.svd(analysed.jacobian(fit.values) * scales)
-    scaled = (posterior.flat - posterior.mean) / scales
+    scaled = (posterior.flat_sample - posterior.mean) / scales
     ratio = np.std(scaled @ rows.T, axis=0) * np.sqrt(1.0 + singular**2)
     correlation = posterior.correlation
     values = {
-        "redundant": float(len(found.held)),
-        "posterior over prior": float(np.std(scaled @ found.directions.T, axis=0).mean()),
+        "redundant": float(len(found.held_names)),
+        "posterior over prior": float(np.std(scaled @ found.null_directions.T, axis=0).mean()),
         "posterior over theory": float(np.sqrt(np.mean(ratio[: found.rank] ** 2))),
         "rhat": float(posterior.rhat.max()),
         "weak": float(np.sum(singular < 1.0)),
     }
     at = {name: k for k, name in enumerate(names)}
-    for figure, (_, shown, _) in CAPTIONS.items():
+    for figure, (_, shown, _) in FIGURE_CAPTIONS.items():
         for name in shown[1:]:
             values[f"{figure} {name}"] = float(correlation[at[shown[0]], at[name]])
     for name in ("a4", "theta4", "a1x"):
         values[f"mean {name}"] = 1e3 * float(posterior.mean[at[name]])
-        values[f"deviation {name}"] = 1e3 * float(posterior.deviations[at[name]])
+        values[f"deviation {name}"] = 1e3 * float(posterior.standard_deviations[at[name]])
         values[f"assumed {name}"] = 1e3 * float(simulated.errors[at[name]])
-    arrays = {"draws": 1e3 * _select_draws(posterior), "truth": 1e3 * simulated.errors,
+    arrays = {"draws": 1e3 * _select_samples(posterior), "truth": 1e3 * simulated.errors,
               "names": np.array(names)}  # fmt: skip
     return Sample(values, (), arrays)
 
@@ -129,17 +142,17 @@ def _draw_posterior(names: tuple[str, ...]) -> Drawing:
 
 
 def _check_rhat(samples: Sequence[Sample]) -> Check:
-    return check_mean("largest split R-hat of a parameter", collect(samples, "rhat"),
+    return check_mean("largest split R-hat of a parameter", collect_values(samples, "rhat"),
                       (1.0, MAX_RHAT), "converged chains, Gelman et al. 11.4")  # fmt: skip
 
 
-def _judge_redundancy(samples: Sequence[Sample]) -> Judgement:
-    return Judgement(
+def _evaluate_redundancy(samples: Sequence[Sample]) -> Evaluation:
+    return Evaluation(
         (check_mean("posterior over prior standard deviation along the redundant directions of QR",
-                    collect(samples, "posterior over prior"), (0.9, 1.1),
+                    collect_values(samples, "posterior over prior"), (0.9, 1.1),
                     "1: no information; 10 % is the error of a sampled standard deviation"),
          check_mean("posterior standard deviation over that from the singular values, RMS over the"
-                    " other directions", collect(samples, "posterior over theory"), (0.9, 1.1),
+                    " other directions", collect_values(samples, "posterior over theory"), (0.9, 1.1),
                     "1: both methods agree; 10 % as before"),
          _check_rhat(samples)),
         note=f"{format_values(samples, 'redundant', digits=0)} redundant parameters by QR; along"
@@ -183,44 +196,44 @@ def measure_refined_posterior(seed: int, changes: Changes) -> Sample:
     Returns:
         Differences from least squares, coverage, convergence and posterior samples.
     """
-    settings = change_settings({"chain_noise": 1.0, "steps": 3000}, changes)
+    settings = merge_settings({"chain_noise": 1.0, "steps": 3000}, changes)
     simulated = simulate_robot(500 + seed, 25)
-    names = document_parameters(simulated.model)
-    done = calibrate(load_hybrid("iwr"), simulated.measurement, "dh", names)
-    eq, fit = subset(done), done.fit
+    names = refined_model_parameters(simulated.model)
+    done = calibrate_hybrid_robot(load_hybrid("iwr"), simulated.measurement, "dh", names)
+    eq, fit = fitted_equations(done), done.fit
     weight = settings["chain_noise"] ** -2
     posterior = sample_posterior(
-        lambda x: -weight * eq.misfit(x), fit.values, fit.covariance, eq.names,
-        steps=settings["steps"], burn=200, walkers=74, seed=seed,
+        lambda x: -weight * eq.negative_log_likelihood(x), fit.values, fit.covariance, eq.names,
+        steps=settings["steps"], burn_in=200, walkers=74, seed=seed,
     )  # fmt: skip
-    truth = simulated.errors[simulated.model.index(names)]
+    truth = simulated.errors[simulated.model.parameter_indices(names)]
     low, high = posterior.intervals.T
     values = {
-        "shift": float(np.abs((posterior.mean - fit.values) / fit.deviations).max()),
-        "ratio": root_mean_square(posterior.deviations / fit.deviations),
+        "shift": float(np.abs((posterior.mean - fit.values) / fit.standard_deviations).max()),
+        "ratio": compute_rms(posterior.standard_deviations / fit.standard_deviations),
         "inside": float(np.sum((truth > low) & (truth < high))),
         "rhat": float(posterior.rhat.max()),
     }
     for name in REFINED_NAMES:
         at = names.index(name)
         values[f"mean {name}"] = 1e3 * float(posterior.mean[at])
-        values[f"deviation {name}"] = 1e3 * float(posterior.deviations[at])
+        values[f"deviation {name}"] = 1e3 * float(posterior.standard_deviations[at])
         values[f"assumed {name}"] = 1e3 * float(truth[at])
     arrays = {
-        "draws": 1e3 * _select_draws(posterior),
+        "draws": 1e3 * _select_samples(posterior),
         "truth": 1e3 * truth,
         "names": np.array(names),
     }
     return Sample(values, (), arrays)
 
 
-def _judge_refined_posterior(samples: Sequence[Sample]) -> Judgement:
-    return Judgement(
+def _evaluate_refined_posterior(samples: Sequence[Sample]) -> Evaluation:
+    return Evaluation(
         (check_mean("largest distance of a posterior mean from least squares, in standard"
-                    " deviations", collect(samples, "shift"), (-np.inf, 0.2),
+                    " deviations", collect_values(samples, "shift"), (-np.inf, 0.2),
                     "this shift reduces the coverage of a 95 % interval by half a percent"),
          check_mean("posterior over least-squares standard deviation, RMS of 36",
-                    collect(samples, "ratio"), (0.95, 1.05),
+                    collect_values(samples, "ratio"), (0.95, 1.05),
                     "1; a 95 % interval that is 5 % too short has a coverage of 94 %"),
          _check_rhat(samples)),
         note=f"{format_values(samples, 'inside', digits=1)} of 36 assumed errors are within the"
@@ -240,25 +253,25 @@ def measure_rank(seed: int, changes: Changes) -> Sample:
     Returns:
         Ranks, singular values, and RMS position errors at test poses.
     """
-    settings = change_settings({"tilt": TILT}, changes)
-    nominal, simulated = load_hybrid("iwr"), simulate_robot(600 + seed, 25, document=False)
+    settings = merge_settings({"tilt": PLATFORM_TILT}, changes)
+    nominal, simulated = load_hybrid("iwr"), simulate_robot(600 + seed, 25, refined_only=False)
     measured = measure_nominal_robot(60, seed, settings["tilt"])
     untilted = measure_nominal_robot(60, seed, 0.0)
     values: dict[str, float] = {}
     for kind in ("dh", "poe"):
-        model = error_model(nominal, kind)
-        found = redundancy(equations(model, measured))
+        model = build_error_model(nominal, kind)
+        found = find_redundancy(build_equations(model, measured))
         values[f"rank {kind}"] = found.rank
-        values[f"rank {kind} without tilt"] = redundancy(equations(model, untilted)).rank
+        values[f"rank {kind} without tilt"] = find_redundancy(build_equations(model, untilted)).rank
         if kind == "dh":
-            values["told"] = len(found.told)
-            singular = found.singular
-    names = document_parameters(simulated.model)
-    values["rank of 36"] = redundancy(equations(simulated.model, measured, names)).rank
+            values["told"] = len(found.determined_names)
+            singular = found.singular_values
+    names = refined_model_parameters(simulated.model)
+    values["rank of 36"] = find_redundancy(build_equations(simulated.model, measured, names)).rank
     for label, chosen in (("36", names), ("54", None)):
-        robot = calibrate(nominal, simulated.measurement, "dh", chosen).robot
-        values[f"error with {label}"] = root_mean_square(
-            pose_errors_at_test_poses(simulated, robot)[0])  # fmt: skip
+        robot = calibrate_hybrid_robot(nominal, simulated.measurement, "dh", chosen).robot
+        values[f"error with {label}"] = compute_rms(
+            compute_test_errors(simulated, robot)[0])  # fmt: skip
     panel = Panel(
         "singular value over the largest [1]", np.arange(1, 55),
         {"Jacobian of 54 parameters, columns of length 1": np.maximum(singular, 1e-16)},
@@ -267,12 +280,12 @@ def measure_rank(seed: int, changes: Changes) -> Sample:
     return Sample(values, (panel,))
 
 
-def _judge_rank(samples: Sequence[Sample]) -> Judgement:
+def _evaluate_rank(samples: Sequence[Sample]) -> Evaluation:
     def number(name: str) -> str:
         return format_values(samples, name, digits=0)
 
-    return Judgement(
-        (check_mean("independent parameters of the 54", collect(samples, "rank dh"), (36.0, 36.0),
+    return Evaluation(
+        (check_mean("independent parameters of the 54", collect_values(samples, "rank dh"), (36.0, 36.0),
                     "the refined model has as many, and must be minimal (p. 24)",
                     published=36.0),),
         f"Four parameters are redundant: theta4, d4, a4 and alpha4 have the same effect as a"
@@ -287,17 +300,22 @@ def _judge_rank(samples: Sequence[Sample]) -> Judgement:
     )  # fmt: skip
 
 
-def _measure_evolution(seed: int, changes: Changes, kind: Kind, poses: int) -> Sample:
-    settings = change_settings({"generations": 20000}, changes)
+def _measure_evolution(seed: int, changes: Changes, kind: ErrorModelKind, poses: int) -> Sample:
+    settings = merge_settings({"generations": 20000}, changes)
     simulated = simulate_robot(seed, poses, kind)
-    names = document_parameters(simulated.model)
-    done = calibrate(load_hybrid("iwr"), simulated.measurement, simulated.model.kind, names)
-    eq = subset(done)
-    box = SEARCH_BOX * eq.scales
-    found = evolve(
-        eq.misfit, -box, box, seed=seed, agreement=1e-3, generations=settings["generations"]
+    names = refined_model_parameters(simulated.model)
+    done = calibrate_hybrid_robot(load_hybrid("iwr"), simulated.measurement, simulated.model.kind, names)
+    eq = fitted_equations(done)
+    box = SEARCH_HALF_WIDTH * eq.scales
+    found = minimize_by_evolution(
+        eq.negative_log_likelihood,
+        -box,
+        box,
+        seed=seed,
+        cost_tolerance=1e-3,
+        generations=settings["generations"],
     )
-    optimum = float(eq.misfit(done.fit.values[~done.fit.held][None])[0])
+    optimum = float(eq.negative_log_likelihood(done.fit.values[~done.fit.held][None])[0])
     return Sample(
         {"excess": found.cost - optimum, "evaluations": float(found.evaluations),
          "least squares": float(done.fit.evaluations + 2 * len(eq.names) * done.fit.iterations),
@@ -316,16 +334,16 @@ def measure_evolution_poe(seed: int, changes: Changes) -> Sample:
     return _measure_evolution(200 + seed, changes, "poe", 25)
 
 
-def _judge_evolution(samples: Sequence[Sample]) -> Judgement:
+def _evaluate_evolution(samples: Sequence[Sample]) -> Evaluation:
     effort = np.array([(s.values["evaluations"], s.values["least squares"]) for s in samples])
-    return Judgement(
+    return Evaluation(
         (check_mean("excess of DE's negative log likelihood over that of least squares",
-                    collect(samples, "excess"), (-np.inf, MAX_EXCESS),
+                    collect_values(samples, "excess"), (-np.inf, MAX_LIKELIHOOD_EXCESS),
                     "one standard deviation of one parameter"),
          check_statistic("evaluations of the model by DE over those by least squares", effort,
                          lambda rows: float(np.sum(rows[:, 0]) / np.sum(rows[:, 1])),
                          (1.0, np.inf), '"less computation time" of the linearization, p. 25')),
-        note=f"DE starts within {SEARCH_BOX:g} standard deviations of the errors and stops"
+        note=f"DE starts within {SEARCH_HALF_WIDTH:g} standard deviations of the errors and stops"
         f" after {format_values(samples, 'generations', digits=0)} generations",
     )  # fmt: skip
 
@@ -357,21 +375,21 @@ EVOLUTION_DH = Experiment(
             "DE does not depend on initial values",
             '"whether the initial values are close to the optimum solution or not is'
             ' insignificant"; iterative linearization has "less computation time to converge"',
-            "section 2.2 (p. 25, 26)", "document", _judge_evolution, {"generations": 200},
+            "section 2.2 (p. 25, 26)", "document", _evaluate_evolution, {"generations": 200},
             "DE is stopped after 200 generations",
         ),
-        caption_claim(
+        make_caption_claim(
             "DE on four data sets", "Fig. 10 (p. 45)",
             '"Simulation results of four different data sets."',
             lambda samples: _describe_evolution(samples[:4]), _draw_evolution(4),
         ),
-        caption_claim(
+        make_caption_claim(
             "DE on five data sets of 15 poses", "Fig. 11 (p. 46)",
             '"Simulation results of 15 measurement poses in five different data sets."',
             _describe_evolution, _draw_evolution(5),
         ),
     ),
-    repetitions_fixed=5,
+    fixed_repetitions=5,
 )  # fmt: skip
 
 REDUNDANCY = Experiment(
@@ -382,27 +400,27 @@ REDUNDANCY = Experiment(
             '"the MCMC method has also been used to analyze parameter redundancy and parameter'
             ' identifiability of the hybrid error model"; "the identifiable parameters are'
             ' calculated from QR decomposition of the analytical observation matrix"',
-            "section 2.2 (p. 26), section 2.1 (p. 23)", "document", _judge_redundancy,
+            "section 2.2 (p. 26), section 2.1 (p. 23)", "document", _evaluate_redundancy,
             {"tilt_of_jacobian": 0.0}, "QR analyses poses without tilt, MCMC those with tilt",
-            panels=(),
+            panel_labels=(),
         ),
-        caption_claim(
+        make_caption_claim(
             "54 parameters, without measurement noise", "Table 3 (p. 47)",
             '"Nominal values, assumed errors, identified posterior mean values, and standard'
             ' deviations for the 54-parameter model (without measurement noise)"',
             _describe_estimates(("a4", "theta4", "a1x")),
         ),
-        *(caption_claim(
+        *(make_caption_claim(
             f"posterior of Fig. {figure}", f"Fig. {figure} (p. {page})",
             '"2D marginal posterior distributions and 1D marginal density for parameters'
             f' {words}."',
             _describe_correlation(figure, names), _draw_posterior(names),
-        ) for figure, (page, names, words) in CAPTIONS.items()),
+        ) for figure, (page, names, words) in FIGURE_CAPTIONS.items()),
     ),
     max_repetitions=3,
 )  # fmt: skip
 
-RANK = Experiment(
+RANK_EXPERIMENT = Experiment(
     "independent parameters", measure_rank,
     (
         Claim(
@@ -411,7 +429,7 @@ RANK = Experiment(
             ' model must contain only a minimal number of parameters and the redundant parameters'
             ' have to be eliminated"', 
             "titles of Tables 3 to 5 (p. 47, 53, 54), section 2.1 (p. 24)", "document",
-            _judge_rank, {"tilt": 0.0}, "the platform never tilts",
+            _evaluate_rank, {"tilt": 0.0}, "the platform never tilts",
         ),
     ),
     max_repetitions=10,
@@ -424,16 +442,16 @@ REFINED_POSTERIOR = Experiment(
             "MCMC and least squares agree on 36 parameters",
             "Posterior means and standard deviations of the 36 parameters with sensor noise equal"
             " those of least squares.", "Table 5, section 3.4", "additional",
-            _judge_refined_posterior, {"chain_noise": 2.0},
-            "the chain assumes twice the sensor noise", panels=(),
+            _evaluate_refined_posterior, {"chain_noise": 2.0},
+            "the chain assumes twice the sensor noise", panel_labels=(),
         ),
-        caption_claim(
+        make_caption_claim(
             "36 parameters, with measurement noise", "Table 5 (p. 54)",
             '"Nominal values, assumed errors, identified posterior mean values, and standard'
             ' deviations for the refined 36-parameter model (with measurement noise)"',
             _describe_estimates(REFINED_NAMES),
         ),
-        caption_claim(
+        make_caption_claim(
             "posterior of Fig. 18", "Fig. 18 (p. 55)",
             '"2D marginal posterior distributions and 1D marginal density for parameters δa4, δθ4,'
             ' δb1x, δb6z."', _describe_estimates(REFINED_NAMES), _draw_posterior(REFINED_NAMES),
@@ -445,14 +463,14 @@ REFINED_POSTERIOR = Experiment(
 EVOLUTION_POE = Experiment(
     "POE model by DE", measure_evolution_poe,
     (
-        caption_claim(
+        make_caption_claim(
             "fitness of DE, POE model", "Fig. 19 (p. 59)",
             '"Fitness values of four different runs with four different measurement data sets."',
             _describe_evolution, _draw_evolution(4),
         ),
     ),
-    repetitions_fixed=4,
+    fixed_repetitions=4,
 )  # fmt: skip
 
-EXPERIMENTS = (EVOLUTION_DH, REDUNDANCY, RANK, REFINED_POSTERIOR, EVOLUTION_POE)
+EXPERIMENTS = (EVOLUTION_DH, REDUNDANCY, RANK_EXPERIMENT, REFINED_POSTERIOR, EVOLUTION_POE)
 """Experiments in the order of the document."""

@@ -18,8 +18,8 @@ from hydrotele.calibrate.parameter_count import (
 from hydrotele.experiments.comparison import (
     Changes,
     Claim,
+    Evaluation,
     Experiment,
-    Judgement,
     Panel,
     Sample,
 )
@@ -29,25 +29,25 @@ from hydrotele.experiments.intervals import (
     check_statistic,
     format_values,
 )
-from hydrotele.experiments.wang_robots import REQUIRED_ACCURACY, change_settings
+from hydrotele.experiments.wang_robots import REQUIRED_ACCURACY, merge_settings
 from hydrotele.kinematics.hybrid import (
-    Pose,
+    PlatformPose,
+    apply_errors,
+    build_error_model,
+    build_hybrid,
     carriage_pose,
-    corrected,
-    error_model,
-    first_order,
-    forward,
-    forward_evolution,
-    hybrid_of,
+    first_order_carriage_pose,
+    forward_by_evolution,
+    forward_kinematics,
     leg_readings,
     load_hybrid,
     pose_difference,
 )
 from hydrotele.simulate.hybrid import (
-    hybrid_mechanism,
-    manufactured_errors,
-    mechanism_pose,
-    random_poses,
+    build_hybrid_mechanism,
+    sample_manufacturing_errors,
+    sample_poses,
+    solve_mechanism_pose,
 )
 
 MAX_ROUNDING = 1e-9  # [m] or [rad]: below the resolution of any sensor, above rounding errors
@@ -64,20 +64,20 @@ def measure_kinematics(seed: int, changes: Changes) -> Sample:
     Returns:
         Largest difference [m], and counts of parameter errors.
     """
-    settings = change_settings({"third_twist": 0.5 * np.pi, "second_joint": "prismatic"}, changes)
+    settings = merge_settings({"third_twist": 0.5 * np.pi, "second_joint": "prismatic"}, changes)
     robot, rng = load_hybrid("iwr"), np.random.default_rng(seed)
-    joints, _ = random_poses(robot, 200, rng)
-    rows = list(robot.facts.carriage)
+    joints, _ = sample_poses(robot, 200, rng)
+    rows = list(robot.specification.carriage)
     rows[1] = rows[1].model_copy(update={"kind": settings["second_joint"]})
     rows[2] = rows[2].model_copy(update={"alpha": settings["third_twist"]})
-    robot = hybrid_of(robot.facts.model_copy(update={"carriage": tuple(rows)}))
+    robot = build_hybrid(robot.specification.model_copy(update={"carriage": tuple(rows)}))
     d1, d2, q3, q4 = joints.T
     a3, d3, a4 = rows[2].a, rows[2].d, rows[3].a
     c3, s3, c4, s4 = np.cos(q3), np.sin(q3), np.cos(q4), np.sin(q4)
     printed = np.column_stack([
         d3 + a4 * s4, -(d2 + a3 * s3 + a4 * s3 * c4), d1 + a3 * c3 + a4 * c3 * c4,
     ])  # fmt: skip
-    model = error_model(robot, "dh")
+    model = build_error_model(robot, "dh")
     difference = np.abs(carriage_pose(robot, joints)[:, :3, 3] - printed).max()
     return Sample({
         "difference": float(difference), "carriage": model.carriage_count,
@@ -85,59 +85,56 @@ def measure_kinematics(seed: int, changes: Changes) -> Sample:
     })  # fmt: skip
 
 
-def _judge_carriage(samples: Sequence[Sample]) -> Judgement:
-    return Judgement(
+def _evaluate_carriage(samples: Sequence[Sample]) -> Evaluation:
+    return Evaluation(
         (check_exact("largest difference of a coordinate", samples[0].values["difference"],
                      (0.0, MAX_ROUNDING), "rounding", unit="m"),),
         note="200 random poses; minus signs, missing in the available text, follow from Table 1",
     )  # fmt: skip
 
 
-def _judge_model_size(samples: Sequence[Sample]) -> Judgement:
+def _evaluate_model_size(samples: Sequence[Sample]) -> Evaluation:
     values = samples[0].values
-    return Judgement(tuple(
+    return Evaluation(tuple(
         check_exact(f"parameter errors of the {part}", values[part], (float(count), float(count)),
                     "as printed", published=count)
         for part, count in (("carriage", 12), ("hexapod", 42))
     ))  # fmt: skip
 
 
-_TWO: tuple[JointKind, JointKind] = ("revolute", "revolute")
+_TWO_HINGES: tuple[JointKind, JointKind] = ("revolute", "revolute")
 _SLIDE: JointKind = "prismatic"
 _BALL: JointKind = "spherical"
 
 
-def carriage_with_hexapod(straight: bool) -> Mechanism:
+def build_hybrid_robot(straight: bool) -> Mechanism:
     """Build the IWR: a measured PPRR carriage in series with a hexapod of six S-P-S legs.
 
     Args:
         straight: whether the slide axes pass through both spherical joints, as in Wang Eq. 27.
     """
-    carriage = serial_mechanism("", (_SLIDE, _SLIDE, *_TWO)).chains[0]
+    carriage = serial_mechanism("", (_SLIDE, _SLIDE, *_TWO_HINGES)).chains[0]
     legs = hexapod_mechanism("", (_BALL, _SLIDE, _BALL), (1, 2) if straight else ())
-    chains = tuple(
-        Chain((*carriage.links[:-1], *leg.links), (*carriage.joints, *leg.joints))
-        for leg in legs.chains
-    )
-    return Mechanism("IWR", chains, legs.straight)
+    chains = tuple(Chain((*carriage.links[:-1], *leg.links), (*carriage.joints, *leg.joints)) for leg in legs.chains)
+    return Mechanism("IWR", chains, legs.straight_links)
 
 
 MECHANISMS = {
     "6-SPS hexapod": hexapod_mechanism("6-SPS", (_BALL, _SLIDE, _BALL)),
     "6-UPS hexapod, universal joints of two hinges": hexapod_mechanism(
-        "6-UPS", (*_TWO, _SLIDE, _BALL)),
-    "6-RRPRRR hexapod": hexapod_mechanism("6-RRPRRR", (*_TWO, _SLIDE, *_TWO, "revolute")),
+        "6-UPS", (*_TWO_HINGES, _SLIDE, _BALL)),
+    "6-RRPRRR hexapod": hexapod_mechanism("6-RRPRRR", (*_TWO_HINGES, _SLIDE, *_TWO_HINGES, "revolute")),
     "Delta robot": delta_mechanism(),
-    "IWR with 6-SPS hexapod": carriage_with_hexapod(straight=False),
+    "IWR with 6-SPS hexapod": build_hybrid_robot(straight=False),
 }  # fmt: skip
 """Mechanisms with loops and arbitrary dimensions, for which Eq. 5 is evaluated."""
 
 STRAIGHT_HEXAPOD = hexapod_mechanism("6-SPS", (_BALL, _SLIDE, _BALL), (1, 2))
 """Hexapod of page 34, whose slide axes pass through the centres of both spherical joints."""
 
-_SERIAL: dict[str, tuple[JointKind, ...]] = {
-    "carriage PPRR": (_SLIDE, _SLIDE, *_TWO), "SCARA RRPR": (*_TWO, _SLIDE, "revolute"),
-    "six hinges": (*_TWO, *_TWO, *_TWO),
+_SERIAL_ROBOTS: dict[str, tuple[JointKind, ...]] = {
+    "carriage PPRR": (_SLIDE, _SLIDE, *_TWO_HINGES), "SCARA RRPR": (*_TWO_HINGES, _SLIDE, "revolute"),
+    "six hinges": (*_TWO_HINGES, *_TWO_HINGES, *_TWO_HINGES),
 }  # fmt: skip
 
 
@@ -152,32 +149,28 @@ def measure_parameter_counts(seed: int, changes: Changes) -> Sample:
     Returns:
         Count and rank of every mechanism.
     """
-    settings = change_settings({"locked_joints": 0, "poses": 30}, changes)
+    settings = merge_settings({"locked_joints": 0, "poses": 30}, changes)
 
     def rank(mechanism: Mechanism) -> int:
         measured = [name for name, joint in mechanism.joints.items() if joint.measured]
         locked = frozenset(measured[: settings["locked_joints"]])
-        return identifiable_rank(
-            mechanism, np.random.default_rng(seed), settings["poses"], unmoved=locked
-        )
+        return identifiable_rank(mechanism, np.random.default_rng(seed), settings["poses"], fixed_joints=locked)
 
     values: dict[str, float] = {"hexapod": rank(STRAIGHT_HEXAPOD)}
-    values["robot"] = rank(carriage_with_hexapod(straight=True))
-    for name, kinds in _SERIAL.items():
+    values["robot"] = rank(build_hybrid_robot(straight=True))
+    for name, kinds in _SERIAL_ROBOTS.items():
         values[f"rank {name}"] = rank(serial_mechanism(name, kinds))
-        values[f"count {name}"] = count_serial_parameters(
-            kinds.count("revolute"), kinds.count("prismatic")
-        )
+        values[f"count {name}"] = count_serial_parameters(kinds.count("revolute"), kinds.count("prismatic"))
     for name, mechanism in MECHANISMS.items():
         values[f"rank {name}"] = rank(mechanism)
         values[f"count {name}"] = mechanism.count_parameters()
     return Sample(values)
 
 
-def _judge_counts(names: Sequence[str], note: str):
-    def judge(samples: Sequence[Sample]) -> Judgement:
+def _make_count_evaluation(names: Sequence[str], note: str):
+    def judge(samples: Sequence[Sample]) -> Evaluation:
         values = samples[0].values
-        return Judgement(tuple(
+        return Evaluation(tuple(
             check_exact(f"independent parameters of the {name}", values[f"rank {name}"],
                         (values[f"count {name}"], values[f"count {name}"]), "the formula",
                         published=values[f"count {name}"])
@@ -187,9 +180,9 @@ def _judge_counts(names: Sequence[str], note: str):
     return judge
 
 
-def _judge_hexapod(samples: Sequence[Sample]) -> Judgement:
+def _evaluate_hexapod(samples: Sequence[Sample]) -> Evaluation:
     values = samples[0].values
-    return Judgement(
+    return Evaluation(
         (check_exact("independent parameters", values["hexapod"], (42, 42),
                      "as many as the error model has: complete and minimal, page 23",
                      published=42),),
@@ -210,32 +203,32 @@ def measure_first_order(seed: int, changes: Changes) -> Sample:
     Returns:
         Largest position errors of the first-order model and of the nominal model [m].
     """
-    settings = change_settings({"error_size": 1.0, "growth": 2.0}, changes)
+    settings = merge_settings({"error_size": 1.0, "growth": 2.0}, changes)
     nominal, rng = load_hybrid("iwr"), np.random.default_rng(seed)
-    joints, _ = random_poses(nominal, 100, rng)
-    errors = manufactured_errors(error_model(nominal, "dh"), rng) * settings["error_size"]
+    joints, _ = sample_poses(nominal, 100, rng)
+    errors = sample_manufacturing_errors(build_error_model(nominal, "dh"), rng) * settings["error_size"]
     growth = settings["growth"]
     rows = tuple(row.model_copy(update={"a": growth * row.a, "d": growth * row.d})
-                 for row in nominal.facts.carriage)  # fmt: skip
-    larger = hybrid_of(nominal.facts.model_copy(update={"carriage": rows}))
+                 for row in nominal.specification.carriage)  # fmt: skip
+    larger = build_hybrid(nominal.specification.model_copy(update={"carriage": rows}))
     stretched = joints * np.where(nominal.kinds == 0, growth, 1.0)
     values = {}
     for name, robot, planted, at in (
         ("usual", nominal, errors, joints), ("errors", nominal, growth * errors, joints),
         ("structure", larger, errors, stretched),
     ):  # fmt: skip
-        model = error_model(robot, "dh")
-        true = carriage_pose(corrected(model, planted), at)[:, :3, 3]
-        linear = first_order(robot, planted[: model.carriage_count], at)[:, :3, 3]
+        model = build_error_model(robot, "dh")
+        true = carriage_pose(apply_errors(model, planted), at)[:, :3, 3]
+        linear = first_order_carriage_pose(robot, planted[: model.carriage_count], at)[:, :3, 3]
         unchanged = carriage_pose(robot, at)[:, :3, 3]
         values[f"omitted {name}"] = float(np.linalg.norm(linear - true, axis=1).max())
         values[f"moved {name}"] = float(np.linalg.norm(unchanged - true, axis=1).max())
     return Sample(values)
 
 
-def _judge_first_order(samples: Sequence[Sample]) -> Judgement:
+def _evaluate_first_order(samples: Sequence[Sample]) -> Evaluation:
     omitted = [1e3 * sample.values["omitted usual"] for sample in samples]
-    return Judgement(
+    return Evaluation(
         (check_mean("largest position error of the first-order model, mean over robots",
                     np.array(omitted), (-np.inf, 1e3 * REQUIRED_ACCURACY),
                     "the required accuracy, page 19", unit="mm"),),
@@ -244,18 +237,16 @@ def _judge_first_order(samples: Sequence[Sample]) -> Judgement:
     )  # fmt: skip
 
 
-def _judge_growth(samples: Sequence[Sample]) -> Judgement:
+def _evaluate_error_growth(samples: Sequence[Sample]) -> Evaluation:
     checks = []
     for name, words in (("errors", "errors"), ("structure", "lengths and travels")):
-        pairs = np.array(
-            [(s.values[f"omitted {name}"], s.values["omitted usual"]) for s in samples]
-        )
+        pairs = np.array([(s.values[f"omitted {name}"], s.values["omitted usual"]) for s in samples])
         checks.append(check_statistic(
             f"second-order error with doubled {words} over the usual one", pairs,
             lambda rows: float(np.sqrt(np.mean(rows[:, 0] ** 2) / np.mean(rows[:, 1] ** 2))),
             (1.0, np.inf), "increases",
         ))  # fmt: skip
-    return Judgement(tuple(checks))
+    return Evaluation(tuple(checks))
 
 
 def measure_proportionality(seed: int, changes: Changes) -> Sample:
@@ -268,7 +259,7 @@ def measure_proportionality(seed: int, changes: Changes) -> Sample:
     Returns:
         Exponents of the change over tilts of 0.1 to 10 mrad.
     """
-    settings = change_settings({"parallel": True}, changes)
+    settings = merge_settings({"parallel": True}, changes)
     rng = np.random.default_rng(seed)
     distance, direction = rng.uniform(0.2, 0.5), rng.uniform(0.0, 2.0 * np.pi)
     point = np.array([distance, 0.0, 0.0])
@@ -295,9 +286,9 @@ def measure_proportionality(seed: int, changes: Changes) -> Sample:
     return Sample({**slopes, "dh at 1 mrad": float(curves["dh"][4])}, (panel,))
 
 
-def _judge_proportionality(samples: Sequence[Sample]) -> Judgement:
+def _evaluate_proportionality(samples: Sequence[Sample]) -> Evaluation:
     exponents = {name: np.array([s.values[name] for s in samples]) for name in ("dh", "poe")}
-    return Judgement(
+    return Evaluation(
         (check_mean("exponent of the change of d (D-H) with the tilt", exponents["dh"],
                     (-np.inf, 0.0), "not proportional: it does not decrease with the tilt"),
          check_mean("exponent of the change of the axis (POE) with the tilt", exponents["poe"],
@@ -317,14 +308,14 @@ def measure_forward_kinematics(seed: int, changes: Changes) -> Sample:
     Returns:
         Differences of DE, MuJoCo and inverse kinematics from Newton's method.
     """
-    settings = change_settings({"reach": 0.35}, changes)
+    settings = merge_settings({"reach": 0.35}, changes)
     robot, rng = load_hybrid("iwr"), np.random.default_rng(seed)
-    joints, legs = random_poses(robot, 1, rng)
-    pose = forward(robot, joints, legs)
-    newton = Pose(pose.rotation[0], pose.position[0])
-    evolved = forward_evolution(robot, joints[0], legs[0], seed=seed, reach=settings["reach"])
-    model = hybrid_mechanism(robot).compile()
-    closed = mechanism_pose(model, mujoco.MjData(model), robot, joints[0], legs[0])
+    joints, legs = sample_poses(robot, 1, rng)
+    pose = forward_kinematics(robot, joints, legs)
+    newton = PlatformPose(pose.rotation[0], pose.position[0])
+    evolved = forward_by_evolution(robot, joints[0], legs[0], seed=seed, reach=settings["reach"])
+    model = build_hybrid_mechanism(robot).compile()
+    closed = solve_mechanism_pose(model, mujoco.MjData(model), robot, joints[0], legs[0])
     return Sample({
         "evolution": float(np.abs(pose_difference(evolved, newton)).max()),
         "mechanism": float(np.abs(pose_difference(closed, newton)).max()),
@@ -332,10 +323,10 @@ def measure_forward_kinematics(seed: int, changes: Changes) -> Sample:
     })  # fmt: skip
 
 
-def _judge_forward_kinematics(samples: Sequence[Sample]) -> Judgement:
+def _evaluate_forward_kinematics(samples: Sequence[Sample]) -> Evaluation:
     values = np.array([1e3 * sample.values["evolution"] for sample in samples])
     largest = {name: max(s.values[name] for s in samples) for name in ("mechanism", "inverse")}
-    return Judgement(
+    return Evaluation(
         (check_mean("largest error of a coordinate by DE", values,
                     (-np.inf, 1e1 * REQUIRED_ACCURACY),
                     "a hundredth of the required accuracy, page 19", unit="mm or mrad"),),
@@ -352,17 +343,17 @@ KINEMATICS = Experiment(
             "carriage: forward kinematics",
             "The product of the four D-H matrices of Table 1 is Eq. 7; its last column is (d3 + a4"
             " s4, d2 + a3 s3 + a4 s3 c4, d1 + a3 c3 + a4 c3 c4).",
-            "Table 1, Eq. 7 (p. 29)", "input", _judge_carriage, {"third_twist": -0.5 * np.pi},
+            "Table 1, Eq. 7 (p. 29)", "input", _evaluate_carriage, {"third_twist": -0.5 * np.pi},
             "the third link is twisted by -90 instead of 90 deg",
         ),
         Claim(
             "size of the error model",
             '"the number of parameter errors for the serial part is 12"; "the number of parameter'
-            ' errors for the Hexa-WH is 42"', "section 3.1.2 (p. 34)", "input", _judge_model_size,
+            ' errors for the Hexa-WH is 42"', "section 3.1.2 (p. 34)", "input", _evaluate_model_size,
             {"second_joint": "revolute"}, "the second joint is a hinge",
         ),
     ),
-    repetitions_fixed=1,
+    fixed_repetitions=1,
 )  # fmt: skip
 
 PARAMETER_COUNTS = Experiment(
@@ -372,7 +363,7 @@ PARAMETER_COUNTS = Experiment(
             "number of parameters of serial robots",
             '"for the serial robot, the minimum number of geometrical parameters is given by'
             ' Mooring et al." C = 4R + 2P + T', "Eq. 4 (p. 23)", "document",
-            _judge_counts(tuple(_SERIAL), "every link has errors in all six directions; T = 6"),
+            _make_count_evaluation(tuple(_SERIAL_ROBOTS), "every link has errors in all six directions; T = 6"),
             {"locked_joints": 1}, "the first joint never moves",
         ),
         Claim(
@@ -380,7 +371,7 @@ PARAMETER_COUNTS = Experiment(
             '"For multi-loop parallel robots, the number of independent parameters can be'
             ' calculated by using the formula proposed by Vischer" C = 3R + P + SS + E + 6L +'
             " 6(F-1)", "Eq. 5 (p. 24)", "document",
-            _judge_counts(
+            _make_count_evaluation(
                 tuple(MECHANISMS), "every link has errors in all six directions and arbitrary"
                 " dimensions; F = 2; SS counts rigid links between spherical joints. For the Delta"
                 " robot Vischer and Clavel 1998 also give 54; six legs with the 22 parameters of"
@@ -391,11 +382,11 @@ PARAMETER_COUNTS = Experiment(
             "hexapod: 42 parameters are complete and minimal",
             '"the universal joint and the spherical joint can be simplified as a coordinate'
             ' point"; "the number of parameter errors for the Hexa-WH is 42"',
-            "Eq. 27, section 3.1.2 (p. 34)", "document", _judge_hexapod,
+            "Eq. 27, section 3.1.2 (p. 34)", "document", _evaluate_hexapod,
             {"poses": 6}, "six poses are measured, which give 36 equations",
         ),
     ),
-    repetitions_fixed=1,
+    fixed_repetitions=1,
 )  # fmt: skip
 
 FIRST_ORDER = Experiment(
@@ -404,14 +395,14 @@ FIRST_ORDER = Experiment(
         Claim(
             "first-order error model",
             '"the first-order model is sufficiently accurate for most applications"',
-            "Eqs 12 to 26 (p. 31 to 33)", "document", _judge_first_order, {"error_size": 10.0},
+            "Eqs 12 to 26 (p. 31 to 33)", "document", _evaluate_first_order, {"error_size": 10.0},
             "manufacturing errors of 10 mm and 10 mrad",
         ),
         Claim(
             "second-order errors grow with size and errors",
             '"As the size of the manipulator structure or the size of the input kinematic errors'
             ' increases, the effect of the second-order error terms increases."',
-            "section 3.1.2 (p. 33)", "document", _judge_growth, {"growth": 0.5},
+            "section 3.1.2 (p. 33)", "document", _evaluate_error_growth, {"growth": 0.5},
             "errors and structure are halved instead of doubled",
         ),
     ),
@@ -424,7 +415,7 @@ PROPORTIONALITY = Experiment(
             "proportionality of D-H and POE models",
             'the D-H model "fails to be proportional when the two consecutive joint axes are'
             ' parallel or nearly parallel"; "the POE model can perfectly meet the proportionality'
-            ' properties"', "section 2.1 (p. 24)", "document", _judge_proportionality,
+            ' properties"', "section 2.1 (p. 24)", "document", _evaluate_proportionality,
             {"parallel": False}, "the axes are perpendicular",
         ),
     ),
@@ -437,7 +428,7 @@ FORWARD_KINEMATICS = Experiment(
             "hexapod: forward kinematics by DE",
             '"the DE algorithm was employed in Publications 1, 5 and 7 to identify parameter errors'
             ' and to find numerical solutions for the robot forward kinematics"',
-            "section 2.2 (p. 26), Eqs 8 and 11", "document", _judge_forward_kinematics,
+            "section 2.2 (p. 26), Eqs 8 and 11", "document", _evaluate_forward_kinematics,
             {"reach": 0.005}, "DE searches only within 5 mm of the home pose",
         ),
     ),

@@ -10,36 +10,36 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hydrotele.calibrate.hybrid import calibrate
-from hydrotele.calibrate.hybrid_data import Measurement, measurement_of_wires
+from hydrotele.calibrate.hybrid import calibrate_hybrid_robot
+from hydrotele.calibrate.hybrid_data import Measurement, measurement_from_wires
 from hydrotele.core.errors import InputError
 from hydrotele.experiments.comparison import (
     Changes,
     Claim,
     Comparison,
-    Judgement,
+    Evaluation,
     Marginals,
     Panel,
     Sample,
 )
 from hydrotele.kinematics.hybrid import (
     ErrorModel,
-    Hybrid,
-    Kind,
-    corrected,
-    document_parameters,
-    error_model,
-    forward,
+    ErrorModelKind,
+    HybridRobot,
+    apply_errors,
+    build_error_model,
+    forward_kinematics,
     load_hybrid,
     pose_difference,
+    refined_model_parameters,
 )
 from hydrotele.kinematics.wires import wire_lengths
 from hydrotele.simulate.hybrid import (
-    TILT,
-    manufactured_errors,
-    measured_poses,
-    random_poses,
-    shipped_wires,
+    PLATFORM_TILT,
+    default_wires,
+    sample_manufacturing_errors,
+    sample_poses,
+    simulate_measured_poses,
 )
 
 SENSOR_NOISE = {"leg": 1e-5, "slide": 1e-5, "turn": 2e-5, "wire": 2e-5}
@@ -64,13 +64,13 @@ class SimulatedRobot(NamedTuple):
 
     model: ErrorModel
     errors: np.ndarray
-    robot: Hybrid
+    robot: HybridRobot
     measurement: Measurement
     test_commands: tuple[np.ndarray, np.ndarray]
 
 
 def simulate_robot(
-    seed: int, poses: int, kind: Kind = "dh", document: bool = True, noise: float = 1.0,
+    seed: int, poses: int, kind: ErrorModelKind = "dh", refined_only: bool = True, noise: float = 1.0,
 ) -> SimulatedRobot:  # fmt: skip
     """Simulate a robot with errors of 1 mm and 1 mrad (standard deviations) and measure it.
 
@@ -78,27 +78,27 @@ def simulate_robot(
         seed: seed of errors, poses and noise.
         poses: number of poses for the calibration.
         kind: kind of the error model.
-        document: whether only the 36 parameters of the document's refined model have errors.
+        refined_only: whether only the 36 parameters of the document's refined model have errors.
         noise: factor of `SENSOR_NOISE`; 0 for exact measurements.
 
     Returns:
         The robot, its measurement and 25 held-out poses.
     """
-    rng, wires, nominal = np.random.default_rng([_SEED, seed]), shipped_wires(), load_hybrid("iwr")
-    model = error_model(nominal, kind)
-    errors = manufactured_errors(model, rng, document_parameters(model) if document else None)
-    robot = corrected(model, errors)
+    rng, wires, nominal = np.random.default_rng([_SEED, seed]), default_wires(), load_hybrid("iwr")
+    model = build_error_model(nominal, kind)
+    errors = sample_manufacturing_errors(model, rng, refined_model_parameters(model) if refined_only else None)
+    robot = apply_errors(model, errors)
     sizes = {name: noise * size for name, size in SENSOR_NOISE.items()}
-    commands = random_poses(nominal, poses, rng, wires)
-    read = measured_poses(robot, *commands, wires, sizes, rng)
+    commands = sample_poses(nominal, poses, rng, wires)
+    read = simulate_measured_poses(robot, *commands, wires, sizes, rng)
     stated = sizes if noise > 0.0 else SENSOR_NOISE
-    measurement = measurement_of_wires(
+    measurement = measurement_from_wires(
         nominal, read.joints, read.legs, read.wires, wires, stated, f"simulated robot {seed}"
     )
-    return SimulatedRobot(model, errors, robot, measurement, random_poses(nominal, 25, rng, wires))
+    return SimulatedRobot(model, errors, robot, measurement, sample_poses(nominal, 25, rng, wires))
 
 
-def measure_nominal_robot(poses: int, seed: int, tilt: float = TILT) -> Measurement:
+def measure_nominal_robot(poses: int, seed: int, tilt: float = PLATFORM_TILT) -> Measurement:
     """Measure the nominal robot without sensor noise.
 
     Args:
@@ -109,22 +109,21 @@ def measure_nominal_robot(poses: int, seed: int, tilt: float = TILT) -> Measurem
     Returns:
         The measurement.
     """
-    robot, wires = load_hybrid("iwr"), shipped_wires()
-    joints, legs = random_poses(robot, poses, np.random.default_rng([_SEED, seed]), tilt=tilt)
-    lengths = wire_lengths(wires, forward(robot, joints, legs))
-    return measurement_of_wires(robot, joints, legs, lengths, wires, SENSOR_NOISE, "exact")
+    robot, wires = load_hybrid("iwr"), default_wires()
+    joints, legs = sample_poses(robot, poses, np.random.default_rng([_SEED, seed]), tilt=tilt)
+    lengths = wire_lengths(wires, forward_kinematics(robot, joints, legs))
+    return measurement_from_wires(robot, joints, legs, lengths, wires, SENSOR_NOISE, "exact")
 
 
-def pose_errors_at_test_poses(
-    simulated: SimulatedRobot, robot: Hybrid
-) -> tuple[np.ndarray, np.ndarray]:
+def compute_test_errors(simulated: SimulatedRobot, robot: HybridRobot) -> tuple[np.ndarray, np.ndarray]:
     """Return the errors of a model's forward kinematics at the test poses.
 
     Returns:
         ((M,) position errors [m], (M,) orientation errors [rad]).
     """
     difference = pose_difference(
-        forward(robot, *simulated.test_commands), forward(simulated.robot, *simulated.test_commands)
+        forward_kinematics(robot, *simulated.test_commands),
+        forward_kinematics(simulated.robot, *simulated.test_commands),
     )
     return np.linalg.norm(difference[:, :3], axis=1), np.linalg.norm(difference[:, 3:], axis=1)
 
@@ -136,18 +135,18 @@ def count_covered_errors(seed: int) -> tuple[int, int]:
         (number inside, number of parameters).
     """
     simulated = simulate_robot(1000 + seed, 25)
-    names = document_parameters(simulated.model)
-    fit = calibrate(load_hybrid("iwr"), simulated.measurement, "dh", names).fit
-    truth = simulated.errors[simulated.model.index(fit.names)]
+    names = refined_model_parameters(simulated.model)
+    fit = calibrate_hybrid_robot(load_hybrid("iwr"), simulated.measurement, "dh", names).fit
+    truth = simulated.errors[simulated.model.parameter_indices(fit.names)]
     return int(np.sum((truth > fit.intervals[:, 0]) & (truth < fit.intervals[:, 1]))), len(names)
 
 
-def root_mean_square(values: np.ndarray) -> float:
+def compute_rms(values: np.ndarray) -> float:
     """Return the root mean square of an array."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def change_settings(defaults: Mapping[str, Any], changes: Changes) -> dict[str, Any]:
+def merge_settings(defaults: Mapping[str, Any], changes: Changes) -> dict[str, Any]:
     """Return the default settings of an experiment with changes applied.
 
     Raises:
@@ -175,7 +174,7 @@ class DrawnClaim(Claim):
         return row._replace(panels=panels, marginals=marginals)
 
 
-def caption_claim(
+def make_caption_claim(
     name: str, item: str, quote: str, note: Callable[[Sequence[Sample]], str],
     draw: Drawing | None = None,
 ) -> Claim:  # fmt: skip
@@ -190,5 +189,5 @@ def caption_claim(
     """
     return DrawnClaim(
         name, item=item, quote=quote, kind="caption", draw=draw,
-        judge=lambda samples: Judgement(note=note(samples)),
+        evaluate=lambda samples: Evaluation(note=note(samples)),
     )  # fmt: skip

@@ -18,18 +18,18 @@ from hydrotele.experiments.comparison import Experiment, Series
 
 EXPERIMENTS: tuple[Experiment, ...] = (
     *zhu_control.EXPERIMENTS,
-    zhu_tables.TABLES,
+    zhu_tables.TABLE_COMPARISON,
     *zhu_identification.EXPERIMENTS,
     zhu_motion.STEERING,
     *zhu_motion.LINES,
-    *zhu_forces.BY_FEEL,
+    *zhu_forces.STIFFNESS_FEEDBACK,
     *zhu_felling.TIP_OVER,
-    *zhu_motion.HANDLE,
-    *zhu_forces.TRACKING,
+    *zhu_motion.HANDLE_RAMPS,
+    *zhu_forces.FORCE_TRACKING,
     *zhu_felling.FELLING,
     *zhu_motion.STEPS,
     *zhu_false_force.FALSE_FORCE,
-    *zhu_forces.LARGE_DIRECT,
+    *zhu_forces.UNSTABLE_FEEDBACK,
 )
 """Experiments in the order of the document."""
 
@@ -38,5 +38,5 @@ SERIES = Series(
     "Zhu 1994, Master-slave force-reflecting resolved motion control of hydraulic mobile machines",
     20,
     EXPERIMENTS,
-    drawings=zhu_control.DRAWINGS | zhu_identification.DRAWINGS,
+    items_without_result=zhu_control.DRAWINGS | zhu_identification.DRAWINGS,
 )

@@ -12,64 +12,64 @@ from pathlib import Path
 
 import numpy as np
 
-from hydrotele.control.endpoint_force import Gravity, endpoint_force_of_log, identify_gravity
-from hydrotele.effects.effect import changed
-from hydrotele.experiments.comparison import Changes, Claim, Experiment, Judgement, Panel, Sample
-from hydrotele.experiments.intervals import check_mean, collect, format_values
-from hydrotele.experiments.scenario_runs import operator_changes, run_shipped
+from hydrotele.control.endpoint_force import GravityModel, endpoint_force_of_log, identify_gravity
+from hydrotele.effects.effect import with_value
+from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Panel, Sample
+from hydrotele.experiments.intervals import check_mean, collect_values, format_values
+from hydrotele.experiments.scenario_runs import make_operator_changes, run_shipped
 from hydrotele.identify.estimation import Estimator
-from hydrotele.identify.identification import identify_with_shapes
-from hydrotele.identify.identified_machine import identified_machine
+from hydrotele.identify.identification import identify_with_friction_shapes
+from hydrotele.identify.identified_machine import build_identified_machine
 from hydrotele.identify.motion import Processing
-from hydrotele.identify.record import records
+from hydrotele.identify.record import build_records
 from hydrotele.identify.setup import cylinder_bars, machine_setup
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.log import save_log
 from hydrotele.machine.machine import Machine
-from hydrotele.simulate.closure import closed_chain
+from hydrotele.simulate.closure import load_closed_chain
 
-_INITIAL_ERROR = 1.3  # factor of masses and dry friction at the start of the identification
-_MIN_RATIO = 3.0  # false force in motion over that at rest
-_MAX_SHARE = 0.2  # false force of the dynamic over that of the static model
-_SENSORS = "zhu1994"
-_SEEDS = (11, 12)  # seeds of the logs for the fit and for the validation
+_INITIAL_ERROR_FACTOR = 1.3  # factor of masses and dry friction at the start of the identification
+_MIN_MOTION_RATIO = 3.0  # false force in motion over that at rest
+_MAX_ERROR_RATIO = 0.2  # false force of the dynamic over that of the static model
+_SENSOR_SET = "zhu1994"
+_LOG_SEEDS = (11, 12)  # seeds of the logs for the fit and for the validation
 
 
-def _falsify_machine(machine: Machine) -> Machine:
-    """Return the machine with masses and dry friction multiplied by `_INITIAL_ERROR`."""
+def _perturb_machine(machine: Machine) -> Machine:
+    """Return the machine with masses and dry friction multiplied by `_INITIAL_ERROR_FACTOR`."""
     for name, link in machine.links.items():
-        machine = changed(machine, f"links.{name}.mass", _INITIAL_ERROR * link.mass)
+        machine = with_value(machine, f"links.{name}.mass", _INITIAL_ERROR_FACTOR * link.mass)
     for name, axis in machine.axes.items():
         if axis.cylinder:
             path = f"axes.{name}.cylinder.friction.coulomb"
-            machine = changed(machine, path, _INITIAL_ERROR * axis.cylinder.friction.coulomb)
+            machine = with_value(machine, path, _INITIAL_ERROR_FACTOR * axis.cylinder.friction.coulomb)
     return machine
 
 
 @cache
-def identify_models(offset: int) -> tuple[Machine, Gravity]:
+def identify_models(seed_offset: int) -> tuple[Machine, GravityModel]:
     """Identify the feller-buncher and its static model from logs of simulated sensors.
 
     Args:
-        offset: number added to the seeds of the logs.
+        seed_offset: number added to the seeds of the logs.
 
     Returns:
         (machine of the dynamic estimate, parameters of the static estimate).
     """
-    _, slow = run_shipped("feller_slow_moves", {"seed": str(10 + offset)})
-    start = _falsify_machine(slow.plant.machine)
+    _, slow = run_shipped("feller_slow_moves", {"seed": str(10 + seed_offset)})
+    start = _perturb_machine(slow.plant.machine)
     gravity = identify_gravity(start, slow.measured)
     with tempfile.TemporaryDirectory() as folder:
-        for number, seed in enumerate(_SEEDS):
+        for number, seed in enumerate(_LOG_SEEDS):
             period = "30.0" if number == 0 else "26.0"
-            keys = {"seed": str(seed + offset), "pilot.period": period}
+            keys = {"seed": str(seed + seed_offset), "pilot.period": period}
             _, run = run_shipped("feller_excitation", keys)
             save_log(run.measured, Path(folder, f"log_{number}.parquet"))
-        data = load_dataset(Path(folder), start, _SENSORS, "log_1", force=True)
-    fit, validation, notes = records(data)
-    setup = machine_setup(start, closed_chain(start), "complete")
-    found = identify_with_shapes(fit, validation, setup, Processing(), Estimator(), notes=notes)
-    machine, _ = identified_machine(start, found, cylinder_bars(start))
+        data = load_dataset(Path(folder), start, _SENSOR_SET, "log_1", force=True)
+    fit, validation, notes = build_records(data)
+    setup = machine_setup(start, load_closed_chain(start), "complete")
+    found = identify_with_friction_shapes(fit, validation, setup, Processing(), Estimator(), notes=notes)
+    machine, _ = build_identified_machine(start, found, cylinder_bars(start))
     return machine, gravity
 
 
@@ -93,11 +93,11 @@ def measure_false_force(seed: int, changes: Changes) -> Sample:
         if name == "feller_joint_steps":
             keys = {"seed": str(seed)} | dict(changes)
         else:  # this scenario has another pilot, to which changes of the first do not apply
-            keys = operator_changes(seed)
+            keys = make_operator_changes(seed)
             keys |= {k: v for k, v in changes.items() if not k.startswith("pilot")}
         _, run = run_shipped(name, keys)
         time = run.measured.time
-        sensors = machine.sensors.get(_SENSORS)
+        sensors = machine.sensors.get(_SENSOR_SET)
         curves = {}
         for kind in ("static", "dynamic"):
             force = endpoint_force_of_log(
@@ -120,23 +120,23 @@ def measure_false_force(seed: int, changes: Changes) -> Sample:
     return Sample(values, tuple(panels))
 
 
-def _judge_static(samples: Sequence[Sample]) -> Judgement:
+def _evaluate_static_model(samples: Sequence[Sample]) -> Evaluation:
     check = check_mean(
         "false force of the static model in joint steps over that at rest",
-        collect(samples, "ratio"), (_MIN_RATIO, np.inf),
+        collect_values(samples, "ratio"), (_MIN_MOTION_RATIO, np.inf),
         "big: three times the error at rest",
     )  # fmt: skip
     note = (
         f"{format_values(samples, 'static_feller_joint_steps', 1e-3, 2)} kN RMS during the steps,"
         f" {format_values(samples, 'at_rest', 1e-3, 2)} kN at rest before them"
     )
-    return Judgement((check,), note=note)
+    return Evaluation((check,), note=note)
 
 
-def _judge_dynamic(samples: Sequence[Sample]) -> Judgement:
+def _evaluate_dynamic_model(samples: Sequence[Sample]) -> Evaluation:
     check = check_mean(
-        "false force of the dynamic model over that of the static one", collect(samples, "share"),
-        (0.0, _MAX_SHARE), "a limit of this project",
+        "false force of the dynamic model over that of the static one", collect_values(samples, "share"),
+        (0.0, _MAX_ERROR_RATIO), "a limit of this project",
     )  # fmt: skip
     note = (
         f"{format_values(samples, 'static', 1e-3, 2)} kN RMS with the static model,"
@@ -145,10 +145,9 @@ def _judge_dynamic(samples: Sequence[Sample]) -> Judgement:
         f" {format_values(samples, 'dynamic_feller_steps', 1e-3, 2)} kN in steps of the joystick"
     )
     explanation = (
-        "both models are identified from logs, starting with"
-        f" {_INITIAL_ERROR:g} times the masses and friction"
+        f"both models are identified from logs, starting with {_INITIAL_ERROR_FACTOR:g} times the masses and friction"
     )
-    return Judgement((check,), explanation, note)
+    return Evaluation((check,), explanation, note)
 
 
 FALSE_FORCE = (
@@ -159,7 +158,7 @@ FALSE_FORCE = (
             ' introduce big computed-force error"',
             "p. 107",
             "document",
-            _judge_static,
+            _evaluate_static_model,
             {
                 "pilot.interpolate": "linear", "pilot.time": "[0, 30, 31]",
                 "pilot.columns": "{boom: [0.45, 0.45, 0.45], stick: [-1.35, -1.35, -1.35],"
@@ -173,7 +172,7 @@ FALSE_FORCE = (
             " of the static model",
             "additional to p. 107",
             "additional",
-            _judge_dynamic,
+            _evaluate_dynamic_model,
             {"effects": "[{name: payload, parameters: {mass: 300.0}}]"},
             "the machine carries an additional load of 300 kg",
         ),

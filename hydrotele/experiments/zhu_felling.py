@@ -4,32 +4,32 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hydrotele.experiments.comparison import Changes, Claim, Experiment, Judgement, Panel, Sample
+from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Panel, Sample
 from hydrotele.experiments.intervals import (
     check_fraction,
     check_mean,
-    collect,
+    collect_values,
     format_values,
 )
 from hydrotele.experiments.scenario_runs import (
-    cylindrical_pose,
-    operator_changes,
+    compute_cylindrical_pose,
+    make_operator_changes,
+    read_true_channel,
     run_shipped,
-    true_channel,
 )
 from hydrotele.run.run import Run
 from hydrotele.scenario.teleoperation import TeleopPilot, TipOver
-from hydrotele.teleop.master import tipping_share
+from hydrotele.teleop.master import tipping_ratio
 
-JUST_NOTICEABLE = 0.23
+JUST_NOTICEABLE_DIFFERENCE = 0.23
 """Just noticeable relative difference of a compliance without other cues (Tan 1995)."""
-_CONTACT = 500.0  # force of the head on the stem that counts as contact [N]
-_STANDS_OUT = 3.0  # detectable force over the force estimated without contact
-_MAX_RISE = 1.0  # s; a ninth of the time axis of Fig. 6.55
-_NEVER = np.inf  # time of an event that does not occur [s]
-_MAX_LAID = -50.0  # attitude of the head at which the stem lies rather than stands [deg]
-_MIN_SWING = 30.0  # swing angle to the side [deg]
-_EVENTS = {"cut": "is cut", "held": "holds", "let_go": "lets"}
+_MIN_CONTACT_FORCE = 500.0  # force of the head on the stem that counts as contact [N]
+_MIN_FORCE_RATIO = 3.0  # detectable force over the force estimated without contact
+_MAX_RISE_TIME = 1.0  # s; a ninth of the time axis of Fig. 6.55
+_NO_EVENT_TIME = np.inf  # time of an event that does not occur [s]
+_MAX_LYING_ATTITUDE = -50.0  # attitude of the head at which the stem lies rather than stands [deg]
+_MIN_SWING_ANGLE = 30.0  # swing angle to the side [deg]
+_EVENT_WORDS = {"cut": "is cut", "held": "holds", "let_go": "lets"}
 
 
 def measure_felling(seed: int, changes: Changes) -> Sample:
@@ -45,35 +45,35 @@ def measure_felling(seed: int, changes: Changes) -> Sample:
     Returns:
         Event times, contact forces, joystick stiffness and final pose of the stem.
     """
-    scenario, run = run_shipped("fell_tree", operator_changes(seed) | dict(changes))
-    pose, time, m = cylindrical_pose(run), run.truth.time, run.measured
-    contact = {thing: _contact_size(run, thing) for thing in ("tree_0", "tree_0_stump")}
+    scenario, run = run_shipped("fell_tree", make_operator_changes(seed) | dict(changes))
+    pose, time, m = compute_cylindrical_pose(run), run.truth.time, run.measured
+    contact = {thing: _compute_contact_force(run, thing) for thing in ("tree_0", "tree_0_stump")}
     values = {
-        key: next((float(n.rsplit(" ", 2)[-2]) for n in run.summary["notes"] if word in n), _NEVER)
-        for key, word in _EVENTS.items()
+        key: next((float(n.rsplit(" ", 2)[-2]) for n in run.summary["notes"] if word in n), _NO_EVENT_TIME)
+        for key, word in _EVENT_WORDS.items()
     }
     assert isinstance(scenario.pilot, TeleopPilot)
     saw = min((b.at for b in scenario.pilot.buttons if b.axis == "saw" and b.command), default=0.0)
-    on_stem = contact["tree_0"] > _CONTACT
-    touched = float(time[np.argmax(on_stem)]) if on_stem.any() else _NEVER
+    on_stem = contact["tree_0"] > _MIN_CONTACT_FORCE
+    touched = float(time[np.argmax(on_stem)]) if on_stem.any() else _NO_EVENT_TIME
     free = (m.time > 0.5) & (m.time < min(touched, saw) - 0.2)
     pressing = (m.time >= touched) & (m.time < saw)
     force, stiffness = np.abs(m["tip_force.r"]), m["handle_stiffness.x"]
-    free_force = _percentile(force[free])
-    rise = m.time[pressing & (force > _STANDS_OUT * free_force)]
+    free_force = _compute_robust_maximum(force[free])
+    rise = m.time[pressing & (force > _MIN_FORCE_RATIO * free_force)]
     in_air = float(np.median(stiffness[free])) if free.any() else np.nan
     change = np.abs(stiffness[pressing] / in_air - 1.0)
     before_release = time < min(values["let_go"], time[-1])
     values |= {
         "touched": touched, "saw": saw, "free_force": free_force,
-        "contact_force": _percentile(force[pressing]),
-        "rise": float(rise[0]) - touched if rise.size else _NEVER,
+        "contact_force": _compute_robust_maximum(force[pressing]),
+        "rise": float(rise[0]) - touched if rise.size else _NO_EVENT_TIME,
         "stem": float(contact["tree_0"][(time >= touched) & (time < saw)].max(initial=0.0)),
         "stump": float(contact["tree_0_stump"].max()),
         "stiffness_free": in_air,
         "stiffness_contact": float(stiffness[pressing][change.argmax()]) if change.size else np.nan,
         "stiffness_change": float(change.max(initial=0.0)),
-        "centring": _percentile(np.abs(m["handle_force.x"][pressing])),
+        "centring": _compute_robust_maximum(np.abs(m["handle_force.x"][pressing])),
         "laid": float(np.degrees(pose["attitude"][before_release][-1])),
         "aside": float(np.degrees(pose["theta"][before_release][-1])),
         "tripped": float(run.summary["teleoperation"]["tripped"]),
@@ -90,24 +90,24 @@ def measure_felling(seed: int, changes: Changes) -> Sample:
     ))  # fmt: skip
 
 
-def _contact_size(run: Run, thing: str) -> np.ndarray:
+def _compute_contact_force(run: Run, object_name: str) -> np.ndarray:
     """Return the contact force magnitude (n,) between the machine and an object [N]."""
-    parts = [true_channel(run, f"truth.object_contact.{thing}_{c}") for c in "xyz"]
+    parts = [read_true_channel(run, f"truth.object_contact.{object_name}_{c}") for c in "xyz"]
     return np.linalg.norm(parts, axis=0)
 
 
-def _percentile(values: np.ndarray) -> float:
+def _compute_robust_maximum(values: np.ndarray) -> float:
     """Return the 98th percentile, a maximum that is robust against single noisy samples."""
     return float(np.percentile(values, 98)) if values.size else np.nan
 
 
-def _judge_contact(samples: Sequence[Sample]) -> Judgement:
+def _evaluate_contact(samples: Sequence[Sample]) -> Evaluation:
     checks = (
         check_fraction("operators whose head presses on the stem with 0.5 kN or more before the saw"
-                       " starts", collect(samples, "touched") < collect(samples, "saw")),
-        check_fraction(f"operators whose estimated force reaches {_STANDS_OUT:g} times that without"
-                       f" contact within {_MAX_RISE:g} s after contact",
-                       collect(samples, "rise") <= _MAX_RISE),
+                       " starts", collect_values(samples, "touched") < collect_values(samples, "saw")),
+        check_fraction(f"operators whose estimated force reaches {_MIN_FORCE_RATIO:g} times that without"
+                       f" contact within {_MAX_RISE_TIME:g} s after contact",
+                       collect_values(samples, "rise") <= _MAX_RISE_TIME),
     )  # fmt: skip
     note = (
         f"contact at {format_values(samples, 'touched')} s, up to"
@@ -120,13 +120,13 @@ def _judge_contact(samples: Sequence[Sample]) -> Judgement:
         "the resting disc touches the stem, then the operator retracts it and starts the saw,"
         " because a disc that presses on the stem does not start"
     )
-    return Judgement(checks, explanation, note)
+    return Evaluation(checks, explanation, note)
 
 
-def _judge_felt(samples: Sequence[Sample]) -> Judgement:
+def _evaluate_felt_stiffness(samples: Sequence[Sample]) -> Evaluation:
     check = check_fraction(
-        f"operators whose stiffness changes by more than {100 * JUST_NOTICEABLE:.0f} % before the"
-        " saw starts", collect(samples, "stiffness_change") > JUST_NOTICEABLE,
+        f"operators whose stiffness changes by more than {100 * JUST_NOTICEABLE_DIFFERENCE:.0f} % before the"
+        " saw starts", collect_values(samples, "stiffness_change") > JUST_NOTICEABLE_DIFFERENCE,
     )  # fmt: skip
     note = (
         f"stiffness along x from {format_values(samples, 'stiffness_free', 1e-3)} N/mm without"
@@ -135,19 +135,18 @@ def _judge_felt(samples: Sequence[Sample]) -> Judgement:
         f" up to {format_values(samples, 'centring')} N"
     )
     explanation = (
-        f"felt: a change of more than {100 * JUST_NOTICEABLE:.0f} %, the just noticeable difference"
+        f"felt: a change of more than {100 * JUST_NOTICEABLE_DIFFERENCE:.0f} %, the just noticeable difference"
         " of a compliance (Tan 1995)"
     )
-    return Judgement((check,), explanation, note)
+    return Evaluation((check,), explanation, note)
 
 
-def _judge_process(samples: Sequence[Sample]) -> Judgement:
+def _evaluate_process(samples: Sequence[Sample]) -> Evaluation:
     touched, saw, cut, held, let_go, laid, aside, tripped = (
-        collect(samples, key)
-        for key in ("touched", "saw", "cut", "held", "let_go", "laid", "aside", "tripped")
+        collect_values(samples, key) for key in ("touched", "saw", "cut", "held", "let_go", "laid", "aside", "tripped")
     )
-    in_order = (touched < saw) & (saw < cut) & (cut < _NEVER) & (saw < held) & (held < let_go)
-    lies = (let_go < _NEVER) & (laid < _MAX_LAID) & (aside > _MIN_SWING)
+    in_order = (touched < saw) & (saw < cut) & (cut < _NO_EVENT_TIME) & (saw < held) & (held < let_go)
+    lies = (let_go < _NO_EVENT_TIME) & (laid < _MAX_LYING_ATTITUDE) & (aside > _MIN_SWING_ANGLE)
     checks = (
         check_fraction("operators who touch, saw, grab and let go in this order",
                        in_order & (tripped == 0.0)),
@@ -164,23 +163,23 @@ def _judge_process(samples: Sequence[Sample]) -> Judgement:
         f" {format_values(samples, 'stump', 1e-3)} kN"
     )
     explanation = (
-        f"lies: the attitude of the head is below {_MAX_LAID:.0f} deg; to the"
-        f" side: more than {_MIN_SWING:.0f} deg of swing"
+        f"lies: the attitude of the head is below {_MAX_LYING_ATTITUDE:.0f} deg; to the"
+        f" side: more than {_MIN_SWING_ANGLE:.0f} deg of swing"
     )
-    return Judgement(checks, explanation, note)
+    return Evaluation(checks, explanation, note)
 
 
-_FELLER = TipOver(mass=25.0e3, edge=1.6)
+_FELLER_TIP_OVER = TipOver(mass=25.0e3, edge=1.6)
 """The mass of 25 t is from the feller-buncher's data sheet; half the track gauge is assumed."""
-_DEADBAND = 1.5e-3  # m, Table 6.9
-_SOIL = "[{kind: plate, position: [6.8, 0.0, 0.3], size: [1.0, 1.0], stiffness: 3.0e+5, damping: 3.0e+4}]"  # noqa: E501
+_DEADBAND_WIDTH = 1.5e-3  # m, Table 6.9
+_SOFT_SOIL = "[{kind: plate, position: [6.8, 0.0, 0.3], size: [1.0, 1.0], stiffness: 3.0e+5, damping: 3.0e+4}]"  # noqa: E501
 
 
-def _tipping_share(run: Run, facts: TipOver) -> np.ndarray:
+def _compute_tipping_fraction(run: Run, facts: TipOver) -> np.ndarray:
     """Return the moment of the contact force as a fraction of the tipping moment, (n,)."""
-    pose, force = cylindrical_pose(run), true_channel(run, "truth.contact_force.z")
+    pose, force = compute_cylindrical_pose(run), read_true_channel(run, "truth.contact_force.z")
     pairs = zip(pose["r"], force, strict=True)
-    return np.array([tipping_share(facts, r, f) for r, f in pairs])
+    return np.array([tipping_ratio(facts, r, f) for r, f in pairs])
 
 
 def measure_pushing(seed: int, changes: Changes) -> Sample:
@@ -199,14 +198,14 @@ def measure_pushing(seed: int, changes: Changes) -> Sample:
     cases = {
         "with": {"pilot.reflection": "stiffness"},
         "without": {"pilot.reflection": "none"},
-        "soil": {"surroundings": _SOIL},
+        "soil": {"surroundings": _SOFT_SOIL},
         "stiff_hand": {"pilot.perception.muscle": "6.0"},
     }
     values, panels = {}, []
     for name, keys in cases.items():
-        keys = operator_changes(seed) | keys | dict(changes)
+        keys = make_operator_changes(seed) | keys | dict(changes)
         _, run = run_shipped("press_over", keys)
-        share, m = _tipping_share(run, _FELLER), run.measured
+        share, m = _compute_tipping_fraction(run, _FELLER_TIP_OVER), run.measured
         touching = run.truth.time[np.argmax(share > 0.02)] if (share > 0.02).any() else 0.0
         late = m.time > run.scenario.duration - 5.0
         before = (m.time > touching - 0.5) & (m.time < touching)
@@ -221,9 +220,9 @@ def measure_pushing(seed: int, changes: Changes) -> Sample:
     return Sample(values, tuple(panels))
 
 
-def _judge_pushed_back(samples: Sequence[Sample]) -> Judgement:
-    pushed_back = (collect(samples, "with_handle") < _DEADBAND) & (
-        collect(samples, "without_handle") > _DEADBAND
+def _evaluate_push_back(samples: Sequence[Sample]) -> Evaluation:
+    pushed_back = (collect_values(samples, "with_handle") < _DEADBAND_WIDTH) & (
+        collect_values(samples, "without_handle") > _DEADBAND_WIDTH
     )
     check = check_fraction("operators whose handle is in the dead band with reflection and outside"
                            " without", pushed_back)  # fmt: skip
@@ -233,14 +232,14 @@ def _judge_pushed_back(samples: Sequence[Sample]) -> Judgement:
         f" {format_values(samples, 'without_handle', 1e3)} mm; a stiff hand is not"
         f" pushed back ({format_values(samples, 'stiff_hand_handle', 1e3)} mm)"
     )
-    return Judgement((check,), "dead band of 1.5 mm, Table 6.9", note)
+    return Evaluation((check,), "dead band of 1.5 mm, Table 6.9", note)
 
 
-def _judge_avoided(samples: Sequence[Sample]) -> Judgement:
+def _evaluate_tip_over(samples: Sequence[Sample]) -> Evaluation:
     reason = "the machine tips at 1; mass and gauge are not in the thesis"
     checks = tuple(
         check_mean(f"largest fraction of the tipping moment {words}",
-                   collect(samples, f"{key}_share"), accepted, reason)
+                   collect_values(samples, f"{key}_share"), accepted, reason)
         for key, words, accepted in (
             ("with", "with reflection on rock of 2 MN/m", (0.0, 1.0)),
             ("soil", "with reflection on soil of 0.3 MN/m", (0.0, 1.0)),
@@ -251,7 +250,7 @@ def _judge_avoided(samples: Sequence[Sample]) -> Judgement:
         "the handle returns to its dead band, but the force estimate has a delay of 0.3 s and the"
         " stiffness saturates at the 30 kN of Table 6.10: on hard rock the head continues to move"
     )
-    return Judgement(checks, explanation)
+    return Evaluation(checks, explanation)
 
 
 def measure_protection(seed: int, changes: Changes) -> Sample:
@@ -267,12 +266,10 @@ def measure_protection(seed: int, changes: Changes) -> Sample:
     values, panels = {}, []
     too_large = {"pilot.operator.target.force": "[6.0e+4]"}
     for name, keys in (("spring", {}), ("bare", {"pilot.tip_over": "null"})):
-        scenario, run = run_shipped(
-            "tip_over", operator_changes(seed) | too_large | keys | dict(changes)
-        )
+        scenario, run = run_shipped("tip_over", make_operator_changes(seed) | too_large | keys | dict(changes))
         assert isinstance(scenario.pilot, TeleopPilot)
         facts = scenario.pilot.tip_over or TipOver(mass=20.0e3, edge=1.6)
-        share, handle = _tipping_share(run, facts), run.measured["handle.z"]
+        share, handle = _compute_tipping_fraction(run, facts), run.measured["handle.z"]
         values[f"{name}_share"] = float(share.max())
         late = run.measured.time > 10.0
         values[f"{name}_handle"] = float(np.abs(handle[late]).max())
@@ -283,8 +280,8 @@ def measure_protection(seed: int, changes: Changes) -> Sample:
     return Sample(values, tuple(panels))
 
 
-def _judge_protection(samples: Sequence[Sample]) -> Judgement:
-    kept, bare = collect(samples, "spring_share"), collect(samples, "bare_share")
+def _evaluate_protection(samples: Sequence[Sample]) -> Evaluation:
+    kept, bare = collect_values(samples, "spring_share"), collect_values(samples, "bare_share")
     check = check_fraction(
         "operators who tip the machine without the spring but not with it",
         (kept < 1.0) & (bare > 1.0), reason="a statement on most operators",
@@ -295,7 +292,7 @@ def _judge_protection(samples: Sequence[Sample]) -> Judgement:
         f" {format_values(samples, 'spring_handle', 1e3)} mm after 10 s"
     )
     explanation = "8 kN/m and 100 N s/m beyond half of the tipping moment; not in the thesis"
-    return Judgement((check,), explanation, note)
+    return Evaluation((check,), explanation, note)
 
 
 TIP_OVER = (
@@ -306,7 +303,7 @@ TIP_OVER = (
             ' joystick back into its position deadband"',
             "p. 99",
             "document",
-            _judge_pushed_back,
+            _evaluate_push_back,
             {"pilot.reflection": "none"},
             "no reflection in both",
         ),
@@ -316,7 +313,7 @@ TIP_OVER = (
             ' computer control"',
             "p. 6",
             "document",
-            _judge_avoided,
+            _evaluate_tip_over,
             {"pilot.reflection": "none"},
             "no reflection in both",
         ),
@@ -328,7 +325,7 @@ TIP_OVER = (
             " whose target force is too large from tipping the machine",
             "additional to p. 99",
             "additional",
-            _judge_protection,
+            _evaluate_protection,
             {"pilot.tip_over": "null"},
             "without the spring in both",
         ),
@@ -342,7 +339,7 @@ FELLING = (
             '"The endpoint force increased rapidly after contact with the tree was made"',
             "p. 105, Fig. 6.55",
             "document",
-            _judge_contact,
+            _evaluate_contact,
             {"pilot.buttons": "[{at: 0.0, axis: saw, command: 1.0}]"},
             "the saw runs from the start and cuts the stem before contact",
         ),
@@ -352,7 +349,7 @@ FELLING = (
             ' kinesthetically"',
             "p. 105, Fig. 6.55",
             "document",
-            _judge_felt,
+            _evaluate_felt_stiffness,
             {"pilot.reflection": "none"},
             "no reflection",
         ),
@@ -362,7 +359,7 @@ FELLING = (
             ' closed and grabbed it. The cut tree was then laid to the side in bunches"',
             "p. 105",
             "document",
-            _judge_process,
+            _evaluate_process,
             {"pilot.buttons": "[{at: 16.0, axis: saw, command: 1.0}]"},
             "the grab arm never closes",
         ),

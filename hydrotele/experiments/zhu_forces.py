@@ -13,48 +13,52 @@ import numpy as np
 import yaml
 
 from hydrotele.core.files import models_folder
-from hydrotele.experiments.comparison import Changes, Claim, Experiment, Judgement, Panel, Sample
+from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Panel, Sample
 from hydrotele.experiments.intervals import (
     check_exact,
     check_fraction,
     check_mean,
     check_statistic,
-    collect,
+    collect_values,
     format_values,
 )
-from hydrotele.experiments.scenario_runs import operator_changes, run_shipped, true_channel
-from hydrotele.experiments.zhu_felling import JUST_NOTICEABLE
+from hydrotele.experiments.scenario_runs import (
+    make_operator_changes,
+    read_true_channel,
+    run_shipped,
+)
+from hydrotele.experiments.zhu_felling import JUST_NOTICEABLE_DIFFERENCE
 from hydrotele.run.run import Run
 from hydrotele.scenario.scenario import Scenario
-from hydrotele.scenario.teleoperation import Regulate, TeleopPilot, Track
+from hydrotele.scenario.teleoperation import RegulateForce, TeleopPilot, TrackForce
 
-_UNFILTERED = {"pilot.force": "static", "pilot.bandwidth_hz": "5.0"}
+_FORCE_ESTIMATE_CHANGES = {"pilot.force": "static", "pilot.bandwidth_hz": "5.0"}
 """The thesis computes the force from pressures by (6.6) and mentions no filter.
 
 5 Hz is the highest filter bandwidth available here.
 """
-_HELD = 6.0  # last seconds of a target, in which the force is averaged [s]
+_AVERAGING_TIME = 6.0  # last seconds of a target, in which the force is averaged [s]
 _MAX_RIPPLE = 0.15  # standard deviation over mean of a stable force
 _MIN_UNSTABLE_RIPPLE = 0.5  # standard deviation over mean of an unstable force
 _MAX_DEVIATION = 0.15  # relative to the hand force
 _DEADBAND = 1.5e-3  # m, Table 6.7
-_TASK = 25.0e3  # target force of direct feedback [N]; read from the axis of Fig. 6.50
-_PUBLISHED = 4.5  # hand force [N], p. 96
-_RATIO = _PUBLISHED / _TASK
+_TARGET_FORCE = 25.0e3  # target force of direct feedback [N]; read from the axis of Fig. 6.50
+_PUBLISHED_HAND_FORCE = 4.5  # hand force [N], p. 96
+_PUBLISHED_FORCE_RATIO = _PUBLISHED_HAND_FORCE / _TARGET_FORCE
 
 
-def find_task(scenario: Scenario) -> Regulate | Track:
+def find_task(scenario: Scenario) -> RegulateForce | TrackForce:
     """Return the task of the scenario's operator, which contains the target force."""
     assert isinstance(scenario.pilot, TeleopPilot)
     behaviour = scenario.pilot.operator
-    assert isinstance(behaviour, Regulate | Track)
+    assert isinstance(behaviour, RegulateForce | TrackForce)
     return behaviour
 
 
 def _draw_panels(scenario: Scenario, run: Run, title: str = "") -> tuple[Panel, ...]:
     time, facts, m = run.truth.time, find_task(scenario).target, run.measured
     target = np.interp(time, facts.time, facts.force) / 1e3
-    force = true_channel(run, "truth.contact_force.z") / 1e3
+    force = read_true_channel(run, "truth.contact_force.z") / 1e3
     estimated = np.interp(time, m.time, m["tip_force.z"]) / 1e3
     return (
         Panel(f"{title}contact force [kN]", time,
@@ -64,12 +68,12 @@ def _draw_panels(scenario: Scenario, run: Run, title: str = "") -> tuple[Panel, 
     )  # fmt: skip
 
 
-def _line_error(x: np.ndarray, force: np.ndarray, slope: np.ndarray | float) -> float:
+def _compute_line_error(x: np.ndarray, force: np.ndarray, slope: np.ndarray | float) -> float:
     """Return the RMS deviation of a force from slope times displacement, relative to its RMS."""
     return float(np.sqrt(np.mean((force - slope * x) ** 2) / np.mean(force**2)))
 
 
-def measure_by_feel(seed: int, changes: Changes) -> Sample:
+def measure_stiffness_feedback(seed: int, changes: Changes) -> Sample:
     """Hold 20 kN and then 35 kN with the joystick's stiffness as the only force feedback.
 
     Args:
@@ -79,31 +83,31 @@ def measure_by_feel(seed: int, changes: Changes) -> Sample:
     Returns:
         Held forces [N], relative errors, and deviations of the hand force from proportionality.
     """
-    keys = operator_changes(seed) | _UNFILTERED | dict(changes)
+    keys = make_operator_changes(seed) | _FORCE_ESTIMATE_CHANGES | dict(changes)
     scenario, run = run_shipped("press_stiffness", keys)
     m, values = run.measured, {}
     facts = find_task(scenario).target
     edges = [*facts.time[2::2], scenario.duration]
     error, true_error, line, fixed_line = 0.0, 0.0, 0.0, 0.0
-    force = true_channel(run, "truth.contact_force.z")
+    force = read_true_channel(run, "truth.contact_force.z")
     start = float(m.time[np.argmax(m["tip_force.z"] > 0.25 * facts.force[0])])
     for goal, edge in zip(facts.force[::2], edges, strict=False):
-        late = (m.time > edge - _HELD) & (m.time <= edge - 0.05)
+        late = (m.time > edge - _AVERAGING_TIME) & (m.time <= edge - 0.05)
         held = float(m["tip_force.z"][late].mean())
-        true = float(force[(run.truth.time > edge - _HELD) & (run.truth.time <= edge)].mean())
+        true = float(force[(run.truth.time > edge - _AVERAGING_TIME) & (run.truth.time <= edge)].mean())
         values[f"held_{goal / 1e3:.0f}"] = held
         error = max(error, abs(held / goal - 1.0))
         true_error = max(true_error, abs(true / goal - 1.0))
         pressing = (m.time > start + 1.0) & (m.time <= edge)
         x, hand = m["handle.z"][pressing], m["hand_force.z"][pressing]
-        line = max(line, _line_error(x, hand, m["handle_stiffness.z"][pressing]))
-        fixed_line = max(fixed_line, _line_error(x, hand, float((x @ hand) / (x @ x))))
+        line = max(line, _compute_line_error(x, hand, m["handle_stiffness.z"][pressing]))
+        fixed_line = max(fixed_line, _compute_line_error(x, hand, float((x @ hand) / (x @ x))))
         start = edge
     values |= {"error": error, "true_error": true_error, "line": line, "fixed_line": fixed_line}
     return Sample(values, _draw_panels(scenario, run))
 
 
-def measure_direct(ratio: float, seed: int, changes: Changes) -> Sample:
+def measure_direct_feedback(ratio: float, seed: int, changes: Changes) -> Sample:
     """Hold 25 kN with direct force feedback.
 
     Args:
@@ -115,14 +119,14 @@ def measure_direct(ratio: float, seed: int, changes: Changes) -> Sample:
         Mean forces [N], ripple, and handle displacements [m] in the last 40 % of the run.
     """
     keys = {
-        "pilot.ratio": str(ratio), "pilot.operator.target.force": f"[{_TASK}]"
-    } | operator_changes(seed) | _UNFILTERED | dict(changes)  # fmt: skip
+        "pilot.ratio": str(ratio), "pilot.operator.target.force": f"[{_TARGET_FORCE}]"
+    } | make_operator_changes(seed) | _FORCE_ESTIMATE_CHANGES | dict(changes)  # fmt: skip
     scenario, run = run_shipped("press_direct", keys)
     assert isinstance(scenario.pilot, TeleopPilot)
     m, start = run.measured, 0.6 * scenario.duration
     late = m.time > start
     handle = m["handle.z"][late]
-    true = true_channel(run, "truth.contact_force.z")[run.truth.time > start]
+    true = read_true_channel(run, "truth.contact_force.z")[run.truth.time > start]
     values = {
         "ratio": scenario.pilot.ratio,
         "held": float(m["tip_force.z"][late].mean()),
@@ -134,7 +138,7 @@ def measure_direct(ratio: float, seed: int, changes: Changes) -> Sample:
     return Sample(values, _draw_panels(scenario, run))
 
 
-def _describe_held(samples: Sequence[Sample]) -> str:
+def _describe_held_forces(samples: Sequence[Sample]) -> str:
     return (
         f"{format_values(samples, 'held_20', 1e-3)} kN for a target of 20 kN,"
         f" {format_values(samples, 'held_35', 1e-3)} kN for 35 kN; error"
@@ -143,77 +147,77 @@ def _describe_held(samples: Sequence[Sample]) -> str:
     )
 
 
-def _judge_by_feel(samples: Sequence[Sample]) -> Judgement:
+def _evaluate_stiffness_feedback(samples: Sequence[Sample]) -> Evaluation:
     check = check_fraction(
-        f"operators whose force is within {100 * JUST_NOTICEABLE:.0f} % of both targets",
-        collect(samples, "error") < JUST_NOTICEABLE,
+        f"operators whose force is within {100 * JUST_NOTICEABLE_DIFFERENCE:.0f} % of both targets",
+        collect_values(samples, "error") < JUST_NOTICEABLE_DIFFERENCE,
     )
     explanation = (
-        f"reasonably good: {100 * JUST_NOTICEABLE:.0f} %, the just noticeable difference of a"
+        f"reasonably good: {100 * JUST_NOTICEABLE_DIFFERENCE:.0f} %, the just noticeable difference of a"
         " compliance (Tan 1995). Perception errors of that fraction in the stiffness and K_nom"
         " cause force errors of 33 % at 20 kN and 29 % at 35 kN (4.1, Tables 6.7 and 6.8); the"
         " operator of the thesis practised with the force on a screen, the simulated one only knows"
         " K_nom and K_r"
     )
-    return Judgement((check,), explanation, _describe_held(samples))
+    return Evaluation((check,), explanation, _describe_held_forces(samples))
 
 
-def _judge_targets(samples: Sequence[Sample]) -> Judgement:
+def _evaluate_target_forces(samples: Sequence[Sample]) -> Evaluation:
     check = check_fraction(
-        "operators within 10 % of both targets", collect(samples, "error") < 0.1,
+        "operators within 10 % of both targets", collect_values(samples, "error") < 0.1,
         reason="a statement on most operators",
     )  # fmt: skip
-    return Judgement((check,), "see the row on the force applied by feel", _describe_held(samples))
+    return Evaluation((check,), "see the row on the force applied by feel", _describe_held_forces(samples))
 
 
-def _judge_proportional(samples: Sequence[Sample]) -> Judgement:
+def _evaluate_proportionality(samples: Sequence[Sample]) -> Evaluation:
     check = check_mean(
         "RMS deviation of the hand's force from the current stiffness times the displacement",
-        collect(samples, "line"), (0.0, _MAX_DEVIATION),
+        collect_values(samples, "line"), (0.0, _MAX_DEVIATION),
         "proportional, except for damping and inertia of the moving handle",
     )  # fmt: skip
     note = f"from a line of fixed slope {format_values(samples, 'fixed_line', 100.0, 0)} %"
-    return Judgement((check,), "the slope follows the contact force (4.1)", note)
+    return Evaluation((check,), "the slope follows the contact force (4.1)", note)
 
 
-def _judge_direct(samples: Sequence[Sample]) -> Judgement:
+def _evaluate_direct_feedback(samples: Sequence[Sample]) -> Evaluation:
     checks = (
-        check_mean("force of the hand", collect(samples, "hand"), (-1.1 * _PUBLISHED,
-                   -0.9 * _PUBLISHED), "10 %: the ratio is known only from the axis of Fig. 6.50",
-                   unit="N", published=-_PUBLISHED),
+        check_mean("force of the hand", collect_values(samples, "hand"), (-1.1 * _PUBLISHED_HAND_FORCE,
+                   -0.9 * _PUBLISHED_HAND_FORCE), "10 %: the ratio is known only from the axis of Fig. 6.50",
+                   unit="N", published=-_PUBLISHED_HAND_FORCE),
         check_mean("displacement of the handle from its centre",
-                   1e3 * collect(samples, "displacement"), (0.0, 1e3 * _DEADBAND),
+                   1e3 * collect_values(samples, "displacement"), (0.0, 1e3 * _DEADBAND),
                    "almost none: inside the dead band of Table 6.7", unit="mm"),
         check_fraction(f"operators who hold the force with less than {100 * _MAX_RIPPLE:.0f} %"
-                       " ripple", collect(samples, "ripple") < _MAX_RIPPLE),
+                       " ripple", collect_values(samples, "ripple") < _MAX_RIPPLE),
     )  # fmt: skip
     note = (
         f"{format_values(samples, 'held', 1e-3)} kN with {samples[0].values['ratio']:.1e} N/N,"
         f" ripple {format_values(samples, 'ripple', 100.0, 0)} %"
     )
     explanation = (
-        f"with this ratio 50 kN (Table 6.8) give {50e3 * _RATIO:.0f} N, which is close to the"
+        f"with this ratio 50 kN (Table 6.8) give {50e3 * _PUBLISHED_FORCE_RATIO:.0f} N, which is close to the"
         " stability limit; the force filter has the highest bandwidth (5 Hz), because the thesis"
         " mentions no filter"
     )
-    return Judgement(checks, explanation, note)
+    return Evaluation(checks, explanation, note)
 
 
-_SOFT = "[{kind: plate, position: [6.0, -0.11, 0.3], size: [0.8, 0.9], stiffness: 3.0e+5, damping: 3.0e+4}]"  # noqa: E501
-_HARD = "[{kind: plate, position: [6.0, -0.11, 0.3], size: [0.8, 0.9], stiffness: 3.0e+6, damping: 9.0e+4}]"  # noqa: E501
-CONDITIONS: tuple[tuple[str, Changes, dict[str, float]], ...] = (
+_SOFT_GROUND = "[{kind: plate, position: [6.0, -0.11, 0.3], size: [0.8, 0.9], stiffness: 3.0e+5, damping: 3.0e+4}]"  # noqa: E501
+_HARD_GROUND = "[{kind: plate, position: [6.0, -0.11, 0.3], size: [0.8, 0.9], stiffness: 3.0e+6, damping: 9.0e+4}]"  # noqa: E501
+FEEDBACK_CONDITIONS: tuple[tuple[str, Changes, dict[str, float]], ...] = (
     ("reference (force delay 0.10 s, 1 MN/m, 0.3 m/s at the stop, 200 Hz)", {}, {}),
     ("true force without delay, available only in simulation", {"pilot.force": "'true'"}, {}),
     ("force delay 0.32 s (1.5 Hz)", {"pilot.bandwidth_hz": "1.5"}, {}),
     ("force delay 0.68 s (0.7 Hz)", {"pilot.bandwidth_hz": "0.7"}, {}),
-    ("ground of 0.3 MN/m", {"surroundings": _SOFT}, {}),
-    ("ground of 3 MN/m", {"surroundings": _HARD}, {}),
+    ("ground of 0.3 MN/m", {"surroundings": _SOFT_GROUND}, {}),
+    ("ground of 3 MN/m", {"surroundings": _HARD_GROUND}, {}),
     ("0.1 m/s at the stop", {"pilot.coordinates.z.speed": "0.1"}, {}),
     ("hand twice as stiff and damped", {}, {"stiffness": 2.0, "damping": 2.0}),
     ("joystick sampled at 100 Hz", {"control_rate": "100"}, {}),
 )  # fmt: skip
 """Conditions that may limit direct feedback: (description, changes, factors of the hand)."""
-_SEARCH = (4.0e-5, 8.0e-4)  # range of searched ratios [N/N]
+_SEARCH_RANGE = (4.0e-5, 8.0e-4)  # range of searched ratios [N/N]
 _HALVINGS = 4
 _SEARCH_ERROR = 1.2  # uncertainty factor of the limit after the halvings
 
@@ -222,18 +226,18 @@ def search_limit(number: int, changes: Changes) -> Sample:
     """Search for the largest stable ratio of direct feedback under a condition, to 20 %.
 
     Args:
-        number: number of the condition in `CONDITIONS`, from 1 on.
+        number: number of the condition in `FEEDBACK_CONDITIONS`, from 1 on.
         changes: scenario keys.
 
     Returns:
         `limit`: largest stable ratio [N/N]; 0 if none is stable, infinite if all are.
     """
-    _, keys, hand = CONDITIONS[number - 1]
+    _, keys, hand = FEEDBACK_CONDITIONS[number - 1]
     with tempfile.TemporaryDirectory() as folder:
         keys = {"duration": "25.0", **keys, **changes}
         if hand:
             keys["pilot.joystick"] = _write_joystick(Path(folder), hand)
-        low, high = _SEARCH
+        low, high = _SEARCH_RANGE
         if not _is_stable(low, keys):
             return Sample({"limit": 0.0})
         if _is_stable(high, keys):
@@ -246,7 +250,7 @@ def search_limit(number: int, changes: Changes) -> Sample:
 
 def _is_stable(ratio: float, keys: Changes) -> bool:
     """Return whether the handle stays within twice its dead band in the last 40 % of the run."""
-    values = measure_direct(ratio, 1, keys).values
+    values = measure_direct_feedback(ratio, 1, keys).values
     return values["max_displacement"] < 2.0 * _DEADBAND
 
 
@@ -263,14 +267,14 @@ def _write_joystick(folder: Path, factors: dict[str, float]) -> str:
     return str(target)
 
 
-def _judge_limits(samples: Sequence[Sample]) -> Judgement:
-    limits = collect(samples, "limit")
+def _evaluate_feedback_limits(samples: Sequence[Sample]) -> Evaluation:
+    limits = collect_values(samples, "limit")
     exists = (limits > 0.0) & np.isfinite(limits)
-    words = [one[0] for one in CONDITIONS]
-    published = 50e3 * _RATIO
+    words = [one[0] for one in FEEDBACK_CONDITIONS]
+    published = 50e3 * _PUBLISHED_FORCE_RATIO
     checks = (
         check_exact("conditions under which direct feedback has a limit", int(exists.sum()),
-                    (len(CONDITIONS), len(CONDITIONS)), "severely restricted: under all"),
+                    (len(FEEDBACK_CONDITIONS), len(FEEDBACK_CONDITIONS)), "severely restricted: under all"),
         check_exact("limit of the reflected force for 50 kN in the reference condition",
                     5e4 * limits[0], (published / _SEARCH_ERROR, np.inf),
                     "the published 4.5 N were held, the search is accurate to a factor of"
@@ -283,23 +287,20 @@ def _judge_limits(samples: Sequence[Sample]) -> Judgement:
     if exists.all():
         factor = np.maximum(limits / limits[0], limits[0] / limits)
         order = np.argsort(-factor)[:3]
-        explanation = "the limit depends most on " + ", ".join(
-            f"{words[k]} ({factor[k]:.1f} times)" for k in order
-        )
-    return Judgement(checks, explanation, note)
+        explanation = "the limit depends most on " + ", ".join(f"{words[k]} ({factor[k]:.1f} times)" for k in order)
+    return Evaluation(checks, explanation, note)
 
 
 def _describe_limit(limit: float) -> str:
     if limit == 0.0:
-        return f"below {5e4 * _SEARCH[0]:.0f} N"
-    return f"above {5e4 * _SEARCH[1]:.0f} N" if np.isinf(limit) else f"{5e4 * limit:.1f} N"
+        return f"below {5e4 * _SEARCH_RANGE[0]:.0f} N"
+    return f"above {5e4 * _SEARCH_RANGE[1]:.0f} N" if np.isinf(limit) else f"{5e4 * limit:.1f} N"
 
 
-def _judge_unstable(samples: Sequence[Sample]) -> Judgement:
+def _evaluate_instability(samples: Sequence[Sample]) -> Evaluation:
     check = check_fraction(
-        "operators whose contact force has a ripple of more than"
-        f" {100 * _MIN_UNSTABLE_RIPPLE:.0f} % of its mean",
-        collect(samples, "ripple") > _MIN_UNSTABLE_RIPPLE,
+        f"operators whose contact force has a ripple of more than {100 * _MIN_UNSTABLE_RIPPLE:.0f} % of its mean",
+        collect_values(samples, "ripple") > _MIN_UNSTABLE_RIPPLE,
     )
     ratio = samples[0].values["ratio"]
     note = (
@@ -307,10 +308,10 @@ def _judge_unstable(samples: Sequence[Sample]) -> Judgement:
         f" {format_values(samples, 'ripple', 100.0, 0)} %, handle up to"
         f" {format_values(samples, 'max_displacement', 1e3)} mm"
     )
-    return Judgement((check,), note=note)
+    return Evaluation((check,), note=note)
 
 
-_CONTACT_MADE = 12.0  # time at which the head has reached the rock [s]
+_CONTACT_TIME = 12.0  # time at which the head has reached the rock [s]
 _MIN_IMPROVEMENT = 2.0  # error ratio
 
 
@@ -332,10 +333,10 @@ def measure_tracking(seed: int, changes: Changes) -> Sample:
         for reflection in ("stiffness", "none"):
             keys = {
                 "pilot.reflection": reflection, "pilot.detent": detent
-            } | operator_changes(seed) | dict(changes)  # fmt: skip
+            } | make_operator_changes(seed) | dict(changes)  # fmt: skip
             scenario, run = run_shipped("track_rock", keys)
             m, facts = run.measured, find_task(scenario).target
-            late = m.time > _CONTACT_MADE
+            late = m.time > _CONTACT_TIME
             error = m["tip_force.z"] - np.interp(m.time, facts.time, facts.force)
             name = f"{reflection}_{'detent' if detent == 'true' else 'plain'}"
             values[name] = float(np.sqrt(np.mean(error[late] ** 2)))
@@ -344,10 +345,10 @@ def measure_tracking(seed: int, changes: Changes) -> Sample:
     return Sample(values, tuple(panels))
 
 
-def _judge_tracking(samples: Sequence[Sample]) -> Judgement:
+def _evaluate_tracking(samples: Sequence[Sample]) -> Evaluation:
     checks = []
     for key, words in (("detent", "with detents"), ("plain", "without detents")):
-        pairs = np.stack([collect(samples, f"{kind}_{key}") for kind in ("none", "stiffness")], 1)
+        pairs = np.stack([collect_values(samples, f"{kind}_{key}") for kind in ("none", "stiffness")], 1)
         checks.append(check_statistic(
             f"mean RMS error without reflection over that with reflection, {words}", pairs,
             lambda rows: float(np.mean(rows[:, 0]) / np.mean(rows[:, 1])),
@@ -363,18 +364,18 @@ def _judge_tracking(samples: Sequence[Sample]) -> Judgement:
         "an operator who sees the contact force on the screen corrects it even without force"
         f" reflection: the error ratio is {checks[1].value:.1f} without detents"
     )
-    return Judgement(tuple(checks), explanation, note)
+    return Evaluation(tuple(checks), explanation, note)
 
 
-BY_FEEL = (
-    Experiment("force by feel", measure_by_feel, (
+STIFFNESS_FEEDBACK = (
+    Experiment("force by feel", measure_stiffness_feedback, (
         Claim(
             "stiffness feedback: a force applied by feel",
             '"Both methods achieved reasonably good results in terms of controlling the endpoint'
             ' force"',
             "p. 96, Fig. 6.49",
             "document",
-            _judge_by_feel,
+            _evaluate_stiffness_feedback,
             {"pilot.reflection": "none"},
             "no reflection",
         ),
@@ -384,7 +385,7 @@ BY_FEEL = (
             ' corresponding z axis"',
             "p. 96, Fig. 6.49",
             "document",
-            _judge_proportional,
+            _evaluate_proportionality,
             {"pilot.reflection": "direct_force", "pilot.ratio": "1.0e-4"},
             "direct feedback",
         ),
@@ -393,19 +394,19 @@ BY_FEEL = (
             "20 kN and then 35 kN are held within 10 % of the target",
             "additional to p. 96",
             "additional",
-            _judge_targets,
+            _evaluate_target_forces,
             {"pilot.reflection": "none"},
             "no reflection",
         ),
     )),
-    Experiment("direct feedback", partial(measure_direct, _RATIO), (
+    Experiment("direct feedback", partial(measure_direct_feedback, _PUBLISHED_FORCE_RATIO), (
         Claim(
             "direct feedback: held with 4.5 N",
             '"while the operator applied - 4 . 5 Newton force to the wrist to counterbalance the'
             ' feedback force there is almost no wrist displacement in z axis"',
             "p. 96, Fig. 6.50",
             "document",
-            _judge_direct,
+            _evaluate_direct_feedback,
             {"pilot.ratio": "4.0e-4"},
             "twice the reflected force",
         ),
@@ -417,14 +418,14 @@ BY_FEEL = (
             ' severely restricted. Otherwise, stability problems can arise"',
             "p. 96",
             "document",
-            _judge_limits,
+            _evaluate_feedback_limits,
             {"pilot.reflection": "stiffness"},
             "stiffness feedback, which has no such limit",
         ),
-    ), repetitions_fixed=len(CONDITIONS)),
+    ), fixed_repetitions=len(FEEDBACK_CONDITIONS)),
 )  # fmt: skip
 
-TRACKING = (
+FORCE_TRACKING = (
     Experiment("force tracking", measure_tracking, (
         Claim(
             "force tracking with and without reflection",
@@ -434,21 +435,21 @@ TRACKING = (
             ' endpoint force"',
             "p. 102, Fig. 6.53, Fig. 6.54",
             "document",
-            _judge_tracking,
+            _evaluate_tracking,
             {"pilot.reflection": "none"},
             "no reflection in both",
         ),
     ), 10),
 )  # fmt: skip
 
-LARGE_DIRECT = (
-    Experiment("direct feedback, large", partial(measure_direct, 4.0e-4), (
+UNSTABLE_FEEDBACK = (
+    Experiment("direct feedback, large", partial(measure_direct_feedback, 4.0e-4), (
         Claim(
             "direct feedback: unstable when large",
             '"direct force feedback under rate control can easily introduce instability"',
             "p. 111",
             "document",
-            _judge_unstable,
+            _evaluate_instability,
             {"pilot.ratio": "4.0e-5"},
             "a tenth of the reflected force",
         ),

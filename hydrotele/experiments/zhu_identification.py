@@ -10,32 +10,37 @@ from functools import partial
 
 import numpy as np
 
-from hydrotele.control.endpoint_force import Gravity, gravity_from_masses, identify_gravity
+from hydrotele.control.endpoint_force import GravityModel, fit_gravity_to_masses, identify_gravity
 from hydrotele.core.errors import InputError
 from hydrotele.experiments.comparison import (
     Changes,
     Claim,
+    Evaluation,
     Experiment,
-    Judgement,
     Panel,
     Sample,
 )
-from hydrotele.experiments.intervals import check_mean, check_statistic, collect, format_values
+from hydrotele.experiments.intervals import (
+    check_mean,
+    check_statistic,
+    collect_values,
+    format_values,
+)
 from hydrotele.experiments.scenario_runs import run_shipped
 from hydrotele.logs.log import Log
 
-_FIRST = 50  # samples from which the document computed the initial parameters
-_CONVERGED = 0.01  # relative to the largest parameter
-_DRAWS = 8  # random samples of failures per run
-_RUNS = 6  # repetitions; a run of the machine takes several seconds
+_INITIAL_SAMPLES = 50  # samples from which the document computed the initial parameters
+_MAX_RELATIVE_CHANGE = 0.01  # relative to the largest parameter
+_FAILURE_SAMPLES = 8  # random samples of failures per run
+_MAX_REPETITIONS = 6  # repetitions; a run of the machine takes several seconds
 
-_MACHINES = {
+_MACHINE_SCENARIOS = {
     "excavator": ("slow_moves", 250, "6.37-6.40"),
     "feller-buncher": ("feller_slow_moves", 400, "6.41-6.44"),
 }
 
 
-def _scaled_error(found: np.ndarray, true: np.ndarray) -> float:
+def _compute_scaled_error(found: np.ndarray, true: np.ndarray) -> float:
     """Return the largest parameter error relative to the largest parameter."""
     return float(np.abs(found - true).max() / np.abs(true).max())
 
@@ -52,47 +57,46 @@ def measure_convergence(name: str, seed: int, changes: Changes) -> Sample:
         `late`: largest change in the second half, and `error`: largest final error, both relative
         to the largest parameter; parameters `P1` and interval half-widths `interval P1` [N m].
     """
-    scenario, samples, _ = _MACHINES[name]
+    scenario, samples, _ = _MACHINE_SCENARIOS[name]
     shipped, run = run_shipped(scenario, {"seed": str(seed)} | dict(changes))
     machine = run.plant.machine
-    true = gravity_from_masses(machine).value
+    true = fit_gravity_to_masses(machine).value
     period = shipped.duration / samples
     found = identify_gravity(machine, run.measured, period=period)
     half = len(found.history) // 2
-    values = {"late": max(_scaled_error(row, found.value) for row in found.history[half:]),
-              "error": _scaled_error(found.value, true)}  # fmt: skip
+    values = {"late": max(_compute_scaled_error(row, found.value) for row in found.history[half:]),
+              "error": _compute_scaled_error(found.value, true)}  # fmt: skip
     for i, value in enumerate(found.value):
-        values |= {f"P{i + 1}": value, f"interval P{i + 1}": found.interval[i],
+        values |= {f"P{i + 1}": value, f"interval P{i + 1}": found.ci95_half_width[i],
                    f"true P{i + 1}": true[i]}  # fmt: skip
-    number = np.arange(len(found.history))[_FIRST:]
+    number = np.arange(len(found.history))[_INITIAL_SAMPLES:]
     return Sample(values, tuple(
         Panel(f"P{i + 1}, factor of {part} [kN m]", number, {
-            "estimated": found.history[_FIRST:, i] / 1e3,
+            "estimated": found.history[_INITIAL_SAMPLES:, i] / 1e3,
             "of the masses": np.full(len(number), true[i] / 1e3),
         }, "sample")
         for i, part in enumerate(found.names)
     ))  # fmt: skip
 
 
-def judge_parameters(samples: Sequence[Sample]) -> Judgement:
+def describe_parameters(samples: Sequence[Sample]) -> Evaluation:
     """Describe the parameters; the available text does not contain the published curves."""
     count = sum(name.startswith("true P") for name in samples[0].values)
     words = [
-        f"P{i} {format_values(samples, f'P{i}', 1e-3)}"
-        f" (masses {samples[0].values[f'true P{i}'] / 1e3:.1f})"
+        f"P{i} {format_values(samples, f'P{i}', 1e-3)} (masses {samples[0].values[f'true P{i}'] / 1e3:.1f})"
         for i in range(1, count + 1)
     ]
-    return Judgement(note=f"in kN m: {', '.join(words)}")
+    return Evaluation(note=f"in kN m: {', '.join(words)}")
 
 
-def judge_convergence(samples: Sequence[Sample]) -> Judgement:
+def evaluate_convergence(samples: Sequence[Sample]) -> Evaluation:
     """Check the change in the second half of the samples, and the final error."""
     reason = "converged to 1 % of the largest parameter"
-    return Judgement((
+    return Evaluation((
         check_mean("largest change of a parameter in the second half of the samples, over the"
-                   " largest parameter", collect(samples, "late"), (-np.inf, _CONVERGED), reason),
+                   " largest parameter", collect_values(samples, "late"), (-np.inf, _MAX_RELATIVE_CHANGE), reason),
         check_mean("largest final error of a parameter, over the largest parameter",
-                   collect(samples, "error"), (-np.inf, 2.0 * _CONVERGED),
+                   collect_values(samples, "error"), (-np.inf, 2.0 * _MAX_RELATIVE_CHANGE),
                    "2 %: the static model neglects inertia and the shape of friction"),
     ))  # fmt: skip
 
@@ -135,54 +139,54 @@ def measure_outliers(seed: int, changes: Changes) -> Sample:
     if unknown := sorted(set(changes) - set(given)):
         raise InputError("changes", f"{', '.join(unknown)} unknown; valid: failures, remove")
     given |= changes
-    scenario, samples, _ = _MACHINES["excavator"]
+    scenario, samples, _ = _MACHINE_SCENARIOS["excavator"]
     shipped, run = run_shipped(scenario, {"seed": str(seed)})
     machine, period = run.plant.machine, shipped.duration / samples
-    true = gravity_from_masses(machine).value
+    true = fit_gravity_to_masses(machine).value
     rng = np.random.default_rng([seed, 81])
 
-    def identify(log: Log, remove: bool) -> Gravity:
+    def identify(log: Log, remove: bool) -> GravityModel:
         return identify_gravity(machine, log, remove_outliers=remove, period=period)
 
     clean, spoilt, kept = identify(run.measured, False), [], []
-    for _ in range(_DRAWS):
+    for _ in range(_FAILURE_SAMPLES):
         bad = fail_sensors(run.measured, ("boom", "stick", "bucket"), int(given["failures"]), rng)
         spoilt.append(identify(bad, False))
         kept.append(identify(bad, bool(given["remove"])))
-    number = np.arange(_FIRST, len(clean.history))
+    number = np.arange(_INITIAL_SAMPLES, len(clean.history))
     return Sample({
-        "clean": _scaled_error(clean.value, true),
-        "spoilt": float(np.mean([_scaled_error(one.value, true) for one in spoilt])),
-        "kept": float(np.mean([_scaled_error(one.value, true) for one in kept])),
-        "removed": float(np.mean([len(one.removed) for one in kept])),
+        "clean": _compute_scaled_error(clean.value, true),
+        "spoilt": float(np.mean([_compute_scaled_error(one.value, true) for one in spoilt])),
+        "kept": float(np.mean([_compute_scaled_error(one.value, true) for one in kept])),
+        "removed": float(np.mean([len(one.outlier_indices) for one in kept])),
     }, (
         Panel("P1, factor of C2 [kN m]", number, {
-            "no failure": clean.history[_FIRST:, 0] / 1e3,
-            "sensor failures": spoilt[0].history[_FIRST:, 0] / 1e3,
+            "no failure": clean.history[_INITIAL_SAMPLES:, 0] / 1e3,
+            "sensor failures": spoilt[0].history[_INITIAL_SAMPLES:, 0] / 1e3,
         }, "sample"),
     ))  # fmt: skip
 
 
-def _ratio_of_means(rows: np.ndarray) -> float:
+def _compute_mean_ratio(rows: np.ndarray) -> float:
     return float(rows[:, 0].mean() / rows[:, 1].mean())
 
 
-def _errors(samples: Sequence[Sample], name: str) -> np.ndarray:
-    return np.column_stack([collect(samples, name), collect(samples, "clean")])
+def _collect_errors(samples: Sequence[Sample], name: str) -> np.ndarray:
+    return np.column_stack([collect_values(samples, name), collect_values(samples, "clean")])
 
 
-def judge_effect(samples: Sequence[Sample]) -> Judgement:
+def evaluate_outlier_effect(samples: Sequence[Sample]) -> Evaluation:
     """Check how much sensor failures increase the error."""
-    return Judgement(
+    return Evaluation(
         (check_statistic("error with over error without sensor failures",
-                         _errors(samples, "spoilt"), _ratio_of_means, (2.0, np.inf),
+                         _collect_errors(samples, "spoilt"), _compute_mean_ratio, (2.0, np.inf),
                          "strong: at least twice; no size is published"),),
         note=f"{format_values(samples, 'spoilt', 100.0)} % of the largest parameter against"
         f" {format_values(samples, 'clean', 100.0)} %",
     )  # fmt: skip
 
 
-def _removed_fraction(rows: np.ndarray) -> float:
+def _compute_removed_fraction(rows: np.ndarray) -> float:
     """Return the fraction of the error due to failures that the removal eliminates.
 
     Args:
@@ -192,21 +196,21 @@ def _removed_fraction(rows: np.ndarray) -> float:
     return float((spoilt - kept) / (spoilt - clean))
 
 
-def judge_removal(samples: Sequence[Sample]) -> Judgement:
+def evaluate_outlier_removal(samples: Sequence[Sample]) -> Evaluation:
     """Check which fraction of the error due to failures the removal of outliers eliminates."""
-    rows = np.column_stack([collect(samples, name) for name in ("spoilt", "kept", "clean")])
-    return Judgement(
+    rows = np.column_stack([collect_values(samples, name) for name in ("spoilt", "kept", "clean")])
+    return Evaluation(
         (check_statistic("fraction of the error due to failures that the removal eliminates",
-                         rows, _removed_fraction, (0.75, np.inf),
+                         rows, _compute_removed_fraction, (0.75, np.inf),
                          "eliminated: at least three quarters; no size is published"),),
         note=f"{format_values(samples, 'kept', 100.0)} % of the largest parameter;"
         f" {format_values(samples, 'removed', 1.0, 0)} of 250 samples removed",
     )  # fmt: skip
 
 
-def _convergence(name: str) -> Experiment:
-    _, samples, figures = _MACHINES[name]
-    judge: Callable[[Sequence[Sample]], Judgement] = judge_parameters
+def _make_convergence_experiment(name: str) -> Experiment:
+    _, samples, figures = _MACHINE_SCENARIOS[name]
+    judge: Callable[[Sequence[Sample]], Evaluation] = describe_parameters
     claims = (
         Claim(f"{name}: parameters by recursive least squares",
               f'"{name.capitalize()} link parameter identification"; curves over {samples} samples',
@@ -214,27 +218,25 @@ def _convergence(name: str) -> Experiment:
         Claim(f"{name}: convergence of the parameters",
               "the estimates converge: in the second half of the samples no parameter changes by"
               " more than 1 % of the largest parameter, and final errors are below 2 % of it",
-              f"additional to p. 81, Figs {figures}", "additional", judge_convergence,
+              f"additional to p. 81, Figs {figures}", "additional", evaluate_convergence,
               {"duration": "20.0"}, "the machine moves for 20 s, only to the first configuration"),
     )  # fmt: skip
-    return Experiment(
-        f"parameters of the {name}", partial(measure_convergence, name), claims, _RUNS
-    )
+    return Experiment(f"parameters of the {name}", partial(measure_convergence, name), claims, _MAX_REPETITIONS)
 
 
 EXPERIMENTS: tuple[Experiment, ...] = (
     Experiment("outliers", measure_outliers, (
         Claim("outliers: effect on the parameters",
               '"Since the number of observations is always limited, these outliers can have a'
-              ' strong effect on the estimated parameters."', "p. 81", "document", judge_effect,
+              ' strong effect on the estimated parameters."', "p. 81", "document", evaluate_outlier_effect,
               {"failures": 0}, "no sensor fails"),
         Claim("outliers: removed before the estimation",
               'outliers of the residuals "can be eliminated, and the estimation procedure'
-              ' repeated"', "p. 81", "document", judge_removal, {"remove": False},
+              ' repeated"', "p. 81", "document", evaluate_outlier_removal, {"remove": False},
               "outliers are kept"),
-    ), _RUNS),
-    _convergence("excavator"),
-    _convergence("feller-buncher"),
+    ), _MAX_REPETITIONS),
+    _make_convergence_experiment("excavator"),
+    _make_convergence_experiment("feller-buncher"),
 )  # fmt: skip
 
 DRAWINGS: dict[str, str] = {

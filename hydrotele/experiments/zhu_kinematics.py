@@ -5,54 +5,58 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hydrotele.control.resolved_motion import arm_facts
-from hydrotele.experiments.comparison import Changes, Claim, Experiment, Judgement, Panel, Sample
+from hydrotele.control.resolved_motion import arm_specification
+from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Panel, Sample
 from hydrotele.experiments.intervals import (
     check_exact,
     check_fraction,
     check_mean,
     check_statistic,
-    collect,
+    collect_values,
     format_values,
 )
-from hydrotele.experiments.scenario_runs import cylindrical_pose, operator_changes, run_shipped
+from hydrotele.experiments.scenario_runs import (
+    compute_cylindrical_pose,
+    make_operator_changes,
+    run_shipped,
+)
 from hydrotele.experiments.zhu_two_port import (
-    ROUNDING,
-    exact_experiment,
+    ROUNDING_RANGE,
     make_claim,
-    read_settings,
+    make_exact_experiment,
+    merge_settings,
 )
 from hydrotele.kinematics.from_machine import feller_geometry
 from hydrotele.kinematics.task import (
-    ALONG,
     BASE_HEIGHT,
     BASE_RADIUS,
-    BOOM,
-    HEAD,
+    BOOM_LENGTH,
+    HEAD_RADIUS,
+    LATERAL_OFFSET,
     REACHED,
-    SIDE,
-    STICK,
-    UP,
+    STICK_LENGTH,
+    TOOL_ALONG,
+    TOOL_UP,
     task_forward,
     task_inverse,
 )
 from hydrotele.machine.machine_file import load_machine
 
-_MACHINES = {"excavator": ("cat215", "bucket"), "feller-buncher": ("cat325", None)}
-_POSES = 400
-_RUNS = 6  # repetitions of a scenario
+_MACHINE_TOOLS = {"excavator": ("cat215", "bucket"), "feller-buncher": ("cat325", None)}
+_POSE_COUNT = 400
+_MAX_REPETITIONS = 6  # repetitions of a scenario
 
 
-def _arm(name: str) -> tuple[np.ndarray, np.ndarray]:
+def _load_arm(name: str) -> tuple[np.ndarray, np.ndarray]:
     """Return the geometric parameters (9,) of an arm and its joint ranges (k, 2) [rad]."""
-    machine, tool = _MACHINES[name]
-    numbers, _, ranges = arm_facts(load_machine(machine, tool) if tool else load_machine(machine))
+    machine, tool = _MACHINE_TOOLS[name]
+    numbers, _, ranges = arm_specification(load_machine(machine, tool) if tool else load_machine(machine))
     ranges = ranges.copy()
     ranges[0] = -math.pi, math.pi
     return numbers, ranges
 
 
-def _link(turn: float, along: float, length: float, twist: float) -> np.ndarray:
+def _build_link_transform(turn: float, along: float, length: float, twist: float) -> np.ndarray:
     """Return the homogeneous transformation of a link with given Denavit-Hartenberg parameters."""
     ct, st, ca, sa = math.cos(turn), math.sin(turn), math.cos(twist), math.sin(twist)
     return np.array([
@@ -63,7 +67,7 @@ def _link(turn: float, along: float, length: float, twist: float) -> np.ndarray:
     ])  # fmt: skip
 
 
-def tool_place(g: np.ndarray, q: np.ndarray) -> np.ndarray:
+def compute_tool_position(g: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Return the position of the tool by the chains of Tables 2.1 and 2.2.
 
     Args:
@@ -73,16 +77,20 @@ def tool_place(g: np.ndarray, q: np.ndarray) -> np.ndarray:
     Returns:
         (3,) position relative to the foot of the swing axis [m].
     """
-    whole = _link(q[0], g[BASE_HEIGHT], g[BASE_RADIUS], math.pi / 2.0)
-    whole = whole @ _link(q[1], -g[SIDE], g[BOOM], 0.0) @ _link(q[2], 0.0, g[STICK], 0.0)
+    whole = _build_link_transform(q[0], g[BASE_HEIGHT], g[BASE_RADIUS], math.pi / 2.0)
+    whole = (
+        whole
+        @ _build_link_transform(q[1], -g[LATERAL_OFFSET], g[BOOM_LENGTH], 0.0)
+        @ _build_link_transform(q[2], 0.0, g[STICK_LENGTH], 0.0)
+    )
     if len(q) == 4:
-        whole = whole @ _link(q[3], 0.0, 0.0, 0.0)
-        return (whole @ [g[ALONG], g[UP], 0.0, 1.0])[:3]
-    whole = whole @ _link(q[3], 0.0, g[ALONG], math.pi / 2.0)
-    return (whole @ _link(q[4], -g[UP], g[HEAD], 0.0))[:3, 3]
+        whole = whole @ _build_link_transform(q[3], 0.0, 0.0, 0.0)
+        return (whole @ [g[TOOL_ALONG], g[TOOL_UP], 0.0, 1.0])[:3]
+    whole = whole @ _build_link_transform(q[3], 0.0, g[TOOL_ALONG], math.pi / 2.0)
+    return (whole @ _build_link_transform(q[4], -g[TOOL_UP], g[HEAD_RADIUS], 0.0))[:3, 3]
 
 
-def measure_inverse(changes: Changes) -> Sample:
+def measure_inverse_kinematics(changes: Changes) -> Sample:
     """Compare closed-form kinematics with the chains of the tables, in and out of reach.
 
     Args:
@@ -91,65 +99,69 @@ def measure_inverse(changes: Changes) -> Sample:
     Returns:
         Largest position errors [m], and the fraction of poses with the correct reachability.
     """
-    given = read_settings(changes, stick=1.0)
+    given = merge_settings(changes, stick=1.0)
     rng, values = np.random.default_rng(23), {}
-    for name in _MACHINES:
-        g, ranges = _arm(name)
+    for name in _MACHINE_TOOLS:
+        g, ranges = _load_arm(name)
         wrong = g.copy()
-        wrong[STICK] *= given["stick"]
+        wrong[STICK_LENGTH] *= given["stick"]
         chain, back, agree = 0.0, 0.0, 0
-        for _ in range(_POSES):
+        for _ in range(_POSE_COUNT):
             q, pose, found = rng.uniform(*ranges.T), np.zeros(5), np.zeros(len(ranges))
             task_forward(g, q, pose)
-            place = tool_place(g, q)
+            place = compute_tool_position(g, q)
             there = np.array([pose[0] * math.cos(pose[1]), pose[0] * math.sin(pose[1]), pose[2]])
             chain = max(chain, float(np.abs(place - there).max()))
             status = task_inverse(wrong, pose, q[0], found)
-            error = np.abs(tool_place(g, found) - place).max() if status == REACHED else np.inf
+            error = np.abs(compute_tool_position(g, found) - place).max() if status == REACHED else np.inf
             back = max(back, float(error))
-            pose[0] = rng.uniform(1.5, 1.5 * (g[BOOM] + g[STICK]))
-            pose[2] = rng.uniform(-1.0, 1.5) * g[BOOM]
+            pose[0] = rng.uniform(1.5, 1.5 * (g[BOOM_LENGTH] + g[STICK_LENGTH]))
+            pose[2] = rng.uniform(-1.0, 1.5) * g[BOOM_LENGTH]
             agree += (task_inverse(wrong, pose, q[0], found) == REACHED) == _is_reachable(g, pose)
-        values |= {f"chain {name}": chain, f"back {name}": back, f"agree {name}": agree / _POSES}
+        values |= {
+            f"chain {name}": chain,
+            f"back {name}": back,
+            f"agree {name}": agree / _POSE_COUNT,
+        }
     return Sample(values)
 
 
 def _is_reachable(g: np.ndarray, pose: np.ndarray) -> bool:
     """Return whether a pose is in reach, by a search over the elbow angle."""
     head, attitude = pose[4], pose[3]
-    ahead = math.sqrt(pose[0] ** 2 - (g[SIDE] - g[HEAD] * math.sin(head)) ** 2) - g[BASE_RADIUS]
-    bar, rise = g[ALONG] + g[HEAD] * math.cos(head), g[UP]
+    ahead = math.sqrt(pose[0] ** 2 - (g[LATERAL_OFFSET] - g[HEAD_RADIUS] * math.sin(head)) ** 2) - g[BASE_RADIUS]
+    bar, rise = g[TOOL_ALONG] + g[HEAD_RADIUS] * math.cos(head), g[TOOL_UP]
     ahead -= bar * math.cos(attitude) - rise * math.sin(attitude)
     up = pose[2] - g[BASE_HEIGHT] - bar * math.sin(attitude) - rise * math.cos(attitude)
     elbow = np.linspace(0.0, math.pi, 2001)
-    reach = np.abs(g[BOOM] + g[STICK] * np.exp(1j * elbow))
+    reach = np.abs(g[BOOM_LENGTH] + g[STICK_LENGTH] * np.exp(1j * elbow))
     return bool(reach.min() <= math.hypot(ahead, up) <= reach.max())
 
 
-def judge_chain(samples: Sequence[Sample]) -> Judgement:
+def evaluate_forward_kinematics(samples: Sequence[Sample]) -> Evaluation:
     """Compare the forward kinematics with the chains of the tables."""
-    return Judgement(tuple(
+    return Evaluation(tuple(
         check_exact(f"largest difference of position, {name}", samples[0].values[f"chain {name}"],
-                    ROUNDING, "rounding", unit="m") for name in _MACHINES
+                    ROUNDING_RANGE, "rounding", unit="m") for name in _MACHINE_TOOLS
     ))  # fmt: skip
 
 
-def judge_inverse(samples: Sequence[Sample]) -> Judgement:
+def evaluate_inverse_kinematics(samples: Sequence[Sample]) -> Evaluation:
     """Check the closed-form solution for poses in reach."""
-    return Judgement(tuple(
-        check_exact(f"largest position error over {_POSES} poses in reach, {name}",
+    return Evaluation(tuple(
+        check_exact(f"largest position error over {_POSE_COUNT} poses in reach, {name}",
                     samples[0].values[f"back {name}"], (0.0, 1e-6), "closed form: rounding, which"
-                    " increases at a straight elbow", unit="m") for name in _MACHINES
+                    " increases at a straight elbow", unit="m") for name in _MACHINE_TOOLS
     ))  # fmt: skip
 
 
-def judge_reach(samples: Sequence[Sample]) -> Judgement:
+def evaluate_reachability(samples: Sequence[Sample]) -> Evaluation:
     """Check that a solution exists if and only if the pose is in reach."""
-    return Judgement(tuple(
-        check_exact(f"fraction of {_POSES} poses, many of them out of reach, for which the closed"
+    return Evaluation(tuple(
+        check_exact(f"fraction of {_POSE_COUNT} poses, many of them out of reach, for which the closed"
                     f" form and a search over the elbow agree, {name}",
                     samples[0].values[f"agree {name}"], (1.0, 1.0), "agreement for all poses")
-        for name in _MACHINES
+        for name in _MACHINE_TOOLS
     ))  # fmt: skip
 
 
@@ -165,11 +177,11 @@ def measure_solutions(changes: Changes) -> Sample:
     Returns:
         Largest numbers of solutions, and mean numbers of extraneous candidates.
     """
-    given = read_settings(changes, check=1.0)
-    g, (numbers, ranges) = feller_geometry(load_machine("cat325")), _arm("feller-buncher")
+    given = merge_settings(changes, check=1.0)
+    g, (numbers, ranges) = feller_geometry(load_machine("cat325")), _load_arm("feller-buncher")
     rng = np.random.default_rng(24)
     counts = {"first": [], "second": [], "extra_first": [], "extra_second": []}
-    for _ in range(_POSES):
+    for _ in range(_POSE_COUNT):
         q, pose = rng.uniform(*ranges.T), np.zeros(5)
         task_forward(numbers, q, pose)
         x, y = pose[0] * math.cos(pose[1]), pose[0] * math.sin(pose[1])
@@ -178,9 +190,7 @@ def measure_solutions(changes: Changes) -> Sample:
         aside = radius * math.sin(pose[4])
         base = math.atan2(x, -y)
         turn = math.atan2(math.sqrt(max(x * x + y * y - aside * aside, 0.0)), aside)
-        radii = [
-            x * math.cos(phi) + y * math.sin(phi) - ahead for phi in (base + turn, base - turn)
-        ]
+        radii = [x * math.cos(phi) + y * math.sin(phi) - ahead for phi in (base + turn, base - turn)]
         kept = sum(r > 0.0 for r in radii) if given["check"] else len(radii)
         counts["first"].append(kept)
         counts["extra_first"].append(len(radii) - kept)
@@ -206,10 +216,10 @@ def measure_solutions(changes: Changes) -> Sample:
     })  # fmt: skip
 
 
-def judge_solutions(samples: Sequence[Sample]) -> Judgement:
+def evaluate_solutions(samples: Sequence[Sample]) -> Evaluation:
     """Compare the numbers of solutions and extraneous candidates with the document."""
     v = samples[0].values
-    return Judgement((
+    return Evaluation((
         check_exact("largest number of solutions, approach 1", v["first"], (1.0, 2.0),
                     "at most two"),
         check_exact("largest number of solutions, approach 2", v["second"], (1.0, 4.0),
@@ -220,7 +230,7 @@ def judge_solutions(samples: Sequence[Sample]) -> Judgement:
        f" {v['extra_second']:.2f} of 4")  # fmt: skip
 
 
-_CYCLES = {
+_CYCLE_CHANGES = {
     "duration": "22.0",
     "pilot.operator.time":
         "[0, 1, 1.5, 4.5, 5, 6, 6.5, 9.5, 10, 11, 11.5, 14.5, 15, 16, 16.5, 19.5, 20, 22]",
@@ -228,7 +238,7 @@ _CYCLES = {
                            " 0, -0.004, -0.004, 0, 0]}",
 }  # fmt: skip
 """Scenario changes for two cycles up and down, with a travel of 1.4 m."""
-_METHODS = {
+_METHOD_CHANGES = {
     "kinematics": {},
     "jacobian": {"pilot.resolved_motion": "inverse_jacobian"},
     "rates": {"pilot.resolved_motion": "inverse_jacobian", "servo.position_gain": "0.0"},
@@ -236,7 +246,7 @@ _METHODS = {
 }
 
 
-def measure_methods(seed: int, changes: Changes) -> Sample:
+def measure_motion_methods(seed: int, changes: Changes) -> Sample:
     """Move the bucket twice up and down with both methods of resolved motion.
 
     Each method is simulated with closed and with open joint loops.
@@ -250,9 +260,9 @@ def measure_methods(seed: int, changes: Changes) -> Sample:
         radius after one and after two cycles [m].
     """
     values, radius, time = {}, {}, np.zeros(0)
-    for name, keys in _METHODS.items():
-        _, run = run_shipped("joystick_up", operator_changes(seed) | _CYCLES | keys | dict(changes))
-        pose, time = cylindrical_pose(run), run.truth.time
+    for name, keys in _METHOD_CHANGES.items():
+        _, run = run_shipped("joystick_up", make_operator_changes(seed) | _CYCLE_CHANGES | keys | dict(changes))
+        pose, time = compute_cylindrical_pose(run), run.truth.time
         radius[name] = 1e3 * (pose["r"] - pose["r"][0])
         reference = run.measured["tip_reference.r"]
         once, twice = np.searchsorted(run.measured.time, (10.9, 21.9))
@@ -272,24 +282,24 @@ def measure_methods(seed: int, changes: Changes) -> Sample:
     ))  # fmt: skip
 
 
-def _ratio_of_means(rows: np.ndarray) -> float:
+def _compute_mean_ratio(rows: np.ndarray) -> float:
     return float(rows[:, 0].mean() / max(rows[:, 1].mean(), 1e-12))
 
 
-def _pairs(samples: Sequence[Sample], first: str, second: str) -> np.ndarray:
-    return np.column_stack([collect(samples, first), collect(samples, second)])
+def _collect_pairs(samples: Sequence[Sample], first: str, second: str) -> np.ndarray:
+    return np.column_stack([collect_values(samples, first), collect_values(samples, second)])
 
 
-def judge_accumulation(samples: Sequence[Sample]) -> Judgement:
+def evaluate_accumulation(samples: Sequence[Sample]) -> Evaluation:
     """Check the growth of the reference error and the accuracy of the bucket."""
-    return Judgement(
+    return Evaluation(
         (
             check_statistic("error of the references' radius after two cycles over that after one",
-                            _pairs(samples, "twice jacobian", "once jacobian"), _ratio_of_means,
+                            _collect_pairs(samples, "twice jacobian", "once jacobian"), _compute_mean_ratio,
                             (1.0, np.inf), "it accumulates"),
             check_statistic("largest deviation of the radius over that by inverse kinematics",
-                            _pairs(samples, "stray jacobian", "stray kinematics"),
-                            _ratio_of_means, (2.0, np.inf),
+                            _collect_pairs(samples, "stray jacobian", "stray kinematics"),
+                            _compute_mean_ratio, (2.0, np.inf),
                             "low: at least twice as much; no size is published"),
         ),
         explanation="the rates are integrated to references of closed joint loops, whose path"
@@ -303,12 +313,12 @@ def judge_accumulation(samples: Sequence[Sample]) -> Judgement:
     )  # fmt: skip
 
 
-def judge_accuracy(samples: Sequence[Sample]) -> Judgement:
+def evaluate_accuracy(samples: Sequence[Sample]) -> Evaluation:
     """Compare inverse kinematics with closed joint loops to joint rates alone."""
-    return Judgement(
+    return Evaluation(
         (check_statistic("largest deviation of the radius by joint rates of the inverse Jacobian"
                          " alone, over that by inverse kinematics with closed joint loops",
-                         _pairs(samples, "stray rates", "stray kinematics"), _ratio_of_means,
+                         _collect_pairs(samples, "stray rates", "stray kinematics"), _compute_mean_ratio,
                          (2.0, np.inf), "high: at least twice as accurate; no size is published"),),
         explanation="the closed joint loops determine the accuracy: the deviation of inverse"
         " kinematics with open loops is"
@@ -319,12 +329,16 @@ def judge_accuracy(samples: Sequence[Sample]) -> Judgement:
     )  # fmt: skip
 
 
-_EDGE = {
+_EDGE_CHANGES = {
     "duration": "18.0",
     "pilot.operator": "{kind: follow, time: [0, 1, 1.5, 13, 13.5, 17, 17.5],"
                       " path: {x: [0, 0, 0.004, 0.004, -0.004, -0.004, 0]}}",
 }  # fmt: skip
-_PAST, _OUTWARDS, _BACK = 10.5, 13.0, 13.5  # s: edge reached, end of outward command, reversed
+_EDGE_TIME, _REVERSAL_START, _REVERSAL_END = (
+    10.5,
+    13.0,
+    13.5,
+)  # s: edge reached, end of outward command, reversed
 
 
 def measure_edge(seed: int, changes: Changes) -> Sample:
@@ -340,21 +354,21 @@ def measure_edge(seed: int, changes: Changes) -> Sample:
         time from the reversal until the references leave the edge [s]; `speed`: largest joint
         rate [rad/s]; `stick`: angle of the stick from straight at the edge [deg].
     """
-    _, run = run_shipped("feller_steps", operator_changes(seed) | _EDGE | dict(changes))
-    pose, time, m = cylindrical_pose(run), run.truth.time, run.measured
+    _, run = run_shipped("feller_steps", make_operator_changes(seed) | _EDGE_CHANGES | dict(changes))
+    pose, time, m = compute_cylindrical_pose(run), run.truth.time, run.measured
     reference = m["tip_reference.r"]
-    edge = float(reference[np.searchsorted(m.time, _OUTWARDS)])
-    left = m.time[(m.time > _OUTWARDS) & (reference < edge - 1e-3)]
-    before = time < _OUTWARDS
+    edge = float(reference[np.searchsorted(m.time, _REVERSAL_START)])
+    left = m.time[(m.time > _REVERSAL_START) & (reference < edge - 1e-3)]
+    before = time < _REVERSAL_START
     rates = [np.abs(np.gradient(run.truth.columns[f"angle.{axis}"], time)).max()
              for axis in ("boom", "stick", "tilt")]  # fmt: skip
-    stick = run.truth.columns["angle.stick"][np.searchsorted(time, _OUTWARDS)]
-    held = (m.time > _PAST) & (m.time < _OUTWARDS)
+    stick = run.truth.columns["angle.stick"][np.searchsorted(time, _REVERSAL_START)]
+    held = (m.time > _EDGE_TIME) & (m.time < _REVERSAL_START)
     return Sample({
         "beyond": float(pose["r"].max() - edge), "edge": edge,
         "moved": float(np.ptp(reference[held])),
         "height": float(np.abs(pose["z"][before] - pose["z"][0]).max()),
-        "back": float(left[0] - _OUTWARDS) if len(left) else np.inf,
+        "back": float(left[0] - _REVERSAL_START) if len(left) else np.inf,
         "speed": float(max(rates)), "stick": float(abs(np.degrees(stick))),
     }, (
         Panel("head [m]", m.time, {
@@ -363,14 +377,14 @@ def measure_edge(seed: int, changes: Changes) -> Sample:
     ))  # fmt: skip
 
 
-def judge_edge(samples: Sequence[Sample]) -> Judgement:
+def evaluate_edge(samples: Sequence[Sample]) -> Evaluation:
     """Check the stop at the edge, the constant height, and the return."""
     way = "2 % of the travel of 2.9 m, as in the rows of straight lines"
-    turned = _BACK - _OUTWARDS
-    return Judgement((
-        check_mean("distance of the head beyond the edge", collect(samples, "beyond"),
+    turned = _REVERSAL_END - _REVERSAL_START
+    return Evaluation((
+        check_mean("distance of the head beyond the edge", collect_values(samples, "beyond"),
                    (-np.inf, 0.058), way, unit="m"),
-        check_mean("deviation of the height", collect(samples, "height"), (-np.inf, 0.058), way,
+        check_mean("deviation of the height", collect_values(samples, "height"), (-np.inf, 0.058), way,
                    unit="m"),
         check_fraction("operators whose references stop at the edge and leave it within"
                        f" {turned:g} s, before the handle is fully reversed",
@@ -381,46 +395,46 @@ def judge_edge(samples: Sequence[Sample]) -> Judgement:
 
 
 EXPERIMENTS: tuple[Experiment, ...] = (
-    exact_experiment("inverse kinematics", measure_inverse, make_claim(
+    make_exact_experiment("inverse kinematics", measure_inverse_kinematics, make_claim(
         "links: Denavit-Hartenberg parameters",
         "the chains of Tables 2.1 and 2.2 are those of the arms", "p. 13, Tables 2.1, 2.2,"
-        " Figs 2.7, 2.9", judge_chain, None, "", "input",
+        " Figs 2.7, 2.9", evaluate_forward_kinematics, None, "", "input",
     ), make_claim(
         "inverse kinematics in closed form",
         '"In this chapter, closed-form inverse kinematics solutions are provided for typical'
         ' hydraulic mobile machines, excavators and feller-bunchers"', "p. 10, Fig. 2.8",
-        judge_inverse, {"stick": 1.01}, "a stick 1 % too long in the closed form",
+        evaluate_inverse_kinematics, {"stick": 1.01}, "a stick 1 % too long in the closed form",
     ), make_claim(
         "no solution out of reach",
         '"assuming the specified endpoint frame is within the manipulator\'s work space; Otherwise,'
-        ' solution does not exist."', "p. 15", judge_reach, {"stick": 1.1},
+        ' solution does not exist."', "p. 15", evaluate_reachability, {"stick": 1.1},
         "a stick 10 % too long in the closed form",
     )),
-    exact_experiment("number of solutions", measure_solutions, make_claim(
+    make_exact_experiment("number of solutions", measure_solutions, make_claim(
         "feller-buncher: number of solutions",
         '"We can see there are at most two" (approach 1); "there are at most four solutions to this'
         ' problem" (approach 2); "approach 1 is easier than approach 2, and introduces fewer'
-        ' extraneous solutions"', "p. 24, Fig. 2.9", judge_solutions, {"check": 0.0},
+        ' extraneous solutions"', "p. 24, Fig. 2.9", evaluate_solutions, {"check": 0.0},
         "extraneous candidates are not rejected",
     )),
-    Experiment("methods of resolved motion", measure_methods, (make_claim(
+    Experiment("methods of resolved motion", measure_motion_methods, (make_claim(
         "inverse Jacobian: error accumulates",
         '"Since position error can accumulate, the inverse Jacobian method suffers from low'
-        ' accuracy."', "p. 10, Eq. 2.1", judge_accumulation,
+        ' accuracy."', "p. 10, Eq. 2.1", evaluate_accumulation,
         {"pilot.resolved_motion": "inverse_kinematics"}, "inverse kinematics instead",
     ), make_claim(
         "inverse kinematics and closed joint loops: accuracy",
         '"It is clear from these plots that the motion accuracy is high due to the fact inverse'
         " kinematics instead of Jacobian transformations were used and the joint angles of the"
-        ' excavator were under closed-loop control."', "p. 91", judge_accuracy,
+        ' excavator were under closed-loop control."', "p. 91", evaluate_accuracy,
         {"servo.position_gain": "0.0"}, "open joint loops everywhere",
-    )), _RUNS),
+    )), _MAX_REPETITIONS),
     Experiment("edge of the workspace", measure_edge, (Claim(
         "feller-buncher: edge of the workspace",
         'if commanded beyond the edge, the references stop there, height and attitude stay'
         ' constant, and the head leaves when the command is reversed; the document says "Resolved'
         ' motion control of the feller-buncher near the edge of workspace needs further study."',
-        "additional to p. 112", "additional", judge_edge, {"servo.axis_gains": "{stick: 0.0}"},
+        "additional to p. 112", "additional", evaluate_edge, {"servo.axis_gains": "{stick: 0.0}"},
         "no position loop of the stick",
-    ),), _RUNS),
+    ),), _MAX_REPETITIONS),
 )  # fmt: skip

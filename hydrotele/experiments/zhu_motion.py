@@ -13,18 +13,22 @@ from hydrotele.experiments.comparison import (
     Changes,
     Check,
     Claim,
+    Evaluation,
     Experiment,
-    Judgement,
     Panel,
     Sample,
 )
 from hydrotele.experiments.intervals import (
     check_fraction,
     check_mean,
-    collect,
+    collect_values,
     format_values,
 )
-from hydrotele.experiments.scenario_runs import cylindrical_pose, operator_changes, run_shipped
+from hydrotele.experiments.scenario_runs import (
+    compute_cylindrical_pose,
+    make_operator_changes,
+    run_shipped,
+)
 from hydrotele.run.run import Run
 
 _LINES = {
@@ -34,14 +38,14 @@ _LINES = {
     "in": (48, "x", -1, ("z",), {"r": "6.2", "z": "1.2"}),
 }
 """Direction -> (figure 6.n, axis of the handle, its sign, constant coordinates, start [m])."""
-_MAX_STRAY = 0.02  # deviation from the line over the travel
+_MAX_DEVIATION_RATIO = 0.02  # deviation from the line over the travel
 _MAX_ROTATION = 2.0  # rotation of the bucket [deg]
 _MIN_TRAVEL = 1.0  # m
-_VERTICAL = (
+_VERTICAL_QUOTE = (
     "the bucket was commanded to go straightly up and down while keeping the bucket angle and"
     " radial displacement constant"
 )
-_HORIZONTAL = (
+_HORIZONTAL_QUOTE = (
     "the bucket was directed to come straightly out from and in towards the cabin while keeping"
     " the bucket angle and height constant"
 )
@@ -53,8 +57,8 @@ def measure_line(direction: str, seed: int, changes: Changes) -> Sample:
     push = 0.004 * sign
     keys = {f"start.pose.{k}": v for k, v in start.items()}
     keys |= {"pilot.operator.path": f"{{{axis}: [0, 0, {push}, {push}, 0, 0]}}"}
-    _, run = run_shipped("joystick_up", keys | operator_changes(seed) | dict(changes))
-    pose, time = cylindrical_pose(run), run.truth.time
+    _, run = run_shipped("joystick_up", keys | make_operator_changes(seed) | dict(changes))
+    pose, time = compute_cylindrical_pose(run), run.truth.time
     moved = pose["z" if axis == "z" else "r"]
     travel = float(sign * (moved[-1] - moved[0]))
     stray = float(max(np.abs(pose[c] - pose[c][0]).max() for c in held))
@@ -72,14 +76,14 @@ def measure_line(direction: str, seed: int, changes: Changes) -> Sample:
     ))  # fmt: skip
 
 
-def _judge_line(samples: Sequence[Sample]) -> Judgement:
+def _evaluate_line(samples: Sequence[Sample]) -> Evaluation:
     checks = (
-        check_mean("travel", collect(samples, "travel"), (_MIN_TRAVEL, np.inf),
+        check_mean("travel", collect_values(samples, "travel"), (_MIN_TRAVEL, np.inf),
                    "long compared with the accepted deviation", unit="m"),
         check_mean("largest deviation from the line over the travel",
-                   collect(samples, "stray_share"), (0.0, _MAX_STRAY),
+                   collect_values(samples, "stray_share"), (0.0, _MAX_DEVIATION_RATIO),
                    "constant: the width of a drawn line in a plot of this travel"),
-        check_mean("largest rotation of the bucket", collect(samples, "rotation"),
+        check_mean("largest rotation of the bucket", collect_values(samples, "rotation"),
                    (0.0, _MAX_ROTATION),
                    "constant: the width of a drawn line on the plot's axis of 60 deg", unit="deg"),
     )  # fmt: skip
@@ -87,31 +91,31 @@ def _judge_line(samples: Sequence[Sample]) -> Judgement:
         f"deviates by {format_values(samples, 'stray', 1e3, 0)} mm, sideways by"
         f" {format_values(samples, 'sideways', 1e3, 0)} mm"
     )
-    return Judgement(checks, "the thesis gives no values", note)
+    return Evaluation(checks, "the thesis gives no values", note)
 
 
-def _claim_line(direction: str) -> Claim:
+def _make_line_claim(direction: str) -> Claim:
     return Claim(
         f"straight line {direction}",
-        f'"{_VERTICAL if direction in ("up", "down") else _HORIZONTAL}"',
+        f'"{_VERTICAL_QUOTE if direction in ("up", "down") else _HORIZONTAL_QUOTE}"',
         f"p. 91, Fig. 6.{_LINES[direction][0]}",
         "document",
-        _judge_line,
+        _evaluate_line,
         {"servo.axis_gains": "{stick: 0.0}", "servo.feedforward": "0.0"},
         "no servo on the stick, no feedforward",
     )
 
 
-_GOALS = {"r": (5.8, 6.2, 6.2, 6.0), "z": (1.4, 1.4, 1.8, 1.6)}
-_HOLDS = ((2.0, 11.0), (11.0, 20.0), (20.0, 30.0))  # time intervals of the goals [s]
-_RESOLVED = 0.03  # smallest counted error [m]; 1.5 times the operator's visual resolution
+_GOAL_POSITIONS = {"r": (5.8, 6.2, 6.2, 6.0), "z": (1.4, 1.4, 1.8, 1.6)}
+_GOAL_INTERVALS = ((2.0, 11.0), (11.0, 20.0), (20.0, 30.0))  # time intervals of the goals [s]
+_MIN_COUNTED_ERROR = 0.03  # smallest counted error [m]; 1.5 times the operator's visual resolution
 _MAX_OVERSHOOT = 0.15  # overshoot over step of a smooth motion
 _MIN_REVERSALS = 2  # reversals about a goal that count as an oscillation
 _CAUSE_OPERATORS = 5  # number of operators with whom the causes of an oscillation are varied
-_FAST = "{r: {speed: 3.0, scale: 120.0}, theta: {speed: 0.75, scale: 20.0}, z: {speed: 3.0, scale: 120.0}, attitude: {speed: 2.0, scale: 5.0}}"  # noqa: E501
+_FAST_COORDINATES = "{r: {speed: 3.0, scale: 120.0}, theta: {speed: 0.75, scale: 20.0}, z: {speed: 3.0, scale: 120.0}, attitude: {speed: 2.0, scale: 5.0}}"  # noqa: E501
 
 
-def count_reversals(run: Run) -> tuple[float, int]:
+def measure_step_response(run: Run) -> tuple[float, int]:
     """Return the largest overshoot of the tip and the number of reversals about its goals.
 
     Args:
@@ -121,15 +125,15 @@ def count_reversals(run: Run) -> tuple[float, int]:
         (largest overshoot over its step [1], number of changes between errors above +3 cm and
         below -3 cm).
     """
-    pose, time = cylindrical_pose(run), run.truth.time
+    pose, time = compute_cylindrical_pose(run), run.truth.time
     overshoot, count = 0.0, 0
-    for c, goals in _GOALS.items():
-        for k, (start, end) in enumerate(_HOLDS):
+    for c, goals in _GOAL_POSITIONS.items():
+        for k, (start, end) in enumerate(_GOAL_INTERVALS):
             inside = (time > start) & (time < end)
             step, error = goals[k + 1] - goals[k], pose[c][inside] - goals[k + 1]
             if step:
                 overshoot = max(overshoot, float((np.sign(step) * error).max() / abs(step)))
-            far = error[np.abs(error) > _RESOLVED]
+            far = error[np.abs(error) > _MIN_COUNTED_ERROR]
             count += int(np.count_nonzero(np.diff(np.sign(far))))
     return overshoot, count
 
@@ -144,7 +148,11 @@ def measure_steering(seed: int, changes: Changes) -> Sample:
         "rate": {"pilot.mode": "rate"},
         "position": {"pilot.mode": "position"},
         "calm": {"pilot.mode": "position", "pilot.perception.tremor": "0"},
-        "fast": {"pilot.mode": "position", "pilot.coordinates": _FAST, "pilot.acceleration": "5.0"},
+        "fast": {
+            "pilot.mode": "position",
+            "pilot.coordinates": _FAST_COORDINATES,
+            "pilot.acceleration": "5.0",
+        },
         "slow_rate": {"pilot.mode": "rate", "pilot.perception.crossover": "1.5"},
         "slow_position": {"pilot.mode": "position", "pilot.perception.crossover": "1.5"},
     }
@@ -152,12 +160,12 @@ def measure_steering(seed: int, changes: Changes) -> Sample:
         cases = {name: cases[name] for name in ("rate", "position")}
     values, panels = {}, []
     for name, keys in cases.items():
-        keys = {"pilot.mount": "table"} | operator_changes(seed) | keys | dict(changes)
+        keys = {"pilot.mount": "table"} | make_operator_changes(seed) | keys | dict(changes)
         _, run = run_shipped("steer", keys)
-        overshoot, count = count_reversals(run)
+        overshoot, count = measure_step_response(run)
         values |= {f"{name}_overshoot": overshoot, f"{name}_reversals": float(count)}
         if name in ("rate", "position"):
-            pose = cylindrical_pose(run)
+            pose = compute_cylindrical_pose(run)
             tip = {c: pose[c] for c in "rz"}
             panels.append(Panel(f"tip under {name} control [m]", run.truth.time, tip))
             handle = {c: 1e3 * run.measured[f"handle.{c}"] for c in "xz"}
@@ -165,11 +173,11 @@ def measure_steering(seed: int, changes: Changes) -> Sample:
     return Sample(values, tuple(panels))
 
 
-def _judge_steering(samples: Sequence[Sample]) -> Judgement:
-    smooth = (collect(samples, "rate_overshoot") < _MAX_OVERSHOOT) & (
-        collect(samples, "rate_reversals") < _MIN_REVERSALS
+def _evaluate_steering(samples: Sequence[Sample]) -> Evaluation:
+    smooth = (collect_values(samples, "rate_overshoot") < _MAX_OVERSHOOT) & (
+        collect_values(samples, "rate_reversals") < _MIN_REVERSALS
     )
-    oscillates = collect(samples, "position_reversals") >= _MIN_REVERSALS
+    oscillates = collect_values(samples, "position_reversals") >= _MIN_REVERSALS
     check = check_fraction(
         "operators whose motion is smooth under rate control and oscillates under position control",
         smooth & oscillates,
@@ -199,7 +207,7 @@ def _judge_steering(samples: Sequence[Sample]) -> Judgement:
         f" Operators with a crossover of 1.5 rad/s: rate {describe_case('slow_rate')}, position"
         f" {describe_case('slow_position')}"
     )
-    return Judgement((check,), explanation, note)
+    return Evaluation((check,), explanation, note)
 
 
 _MAX_NONLINEARITY = 0.03  # RMS deviation over the largest force
@@ -210,7 +218,7 @@ _DEADBAND_EDGE = 1.5  # mm, Table 6.9
 
 def measure_handle_ramp(detent: str, seed: int, changes: Changes) -> Sample:
     """Measure the hand force while the handle moves slowly from its centre to its stop."""
-    keys = {"pilot.detent": detent} | operator_changes(seed) | dict(changes)
+    keys = {"pilot.detent": detent} | make_operator_changes(seed) | dict(changes)
     _, run = run_shipped("handle_ramp", keys)
     m, values, panels = run.measured, {}, []
     for axis, (start, end, *_) in _RAMPS.items():
@@ -218,59 +226,55 @@ def measure_handle_ramp(detent: str, seed: int, changes: Changes) -> Sample:
         x, force = 1e3 * m[f"handle.{axis}"][inside], m[f"hand_force.{axis}"][inside]
         slope = float(x @ force / (x @ x))
         values[f"{axis}_slope"] = slope
-        values[f"{axis}_nonlinearity"] = float(
-            np.sqrt(np.mean((force - slope * x) ** 2)) / np.abs(force).max()
-        )
+        values[f"{axis}_nonlinearity"] = float(np.sqrt(np.mean((force - slope * x) ** 2)) / np.abs(force).max())
         near, far = (x > 0.2) & (x < _DEADBAND_EDGE - 0.1), x > _DEADBAND_EDGE + 0.3
         inner, outer = np.polyfit(x[near], force[near], 1), np.polyfit(x[far], force[far], 1)
         values[f"{axis}_inside"], values[f"{axis}_outside"] = float(inner[0]), float(outer[0])
-        values[f"{axis}_drop"] = float(
-            np.polyval(inner, _DEADBAND_EDGE) - np.polyval(outer, _DEADBAND_EDGE)
-        )
+        values[f"{axis}_drop"] = float(np.polyval(inner, _DEADBAND_EDGE) - np.polyval(outer, _DEADBAND_EDGE))
         order = np.argsort(x)
         panels.append(Panel(f"hand force along {axis} [N]", x[order], {"force": force[order]},
                             "displacement [mm]"))  # fmt: skip
     return Sample(values, tuple(panels))
 
 
-def _judge_centring(samples: Sequence[Sample]) -> Judgement:
+def _evaluate_centring(samples: Sequence[Sample]) -> Evaluation:
     checks: list[Check] = []
     for axis, (_, _, kp, _, _) in _RAMPS.items():
         checks.append(check_mean(
-            f"stiffness along {axis}", collect(samples, f"{axis}_slope"), (kp - 0.05, kp + 0.05),
+            f"stiffness along {axis}", collect_values(samples, f"{axis}_slope"), (kp - 0.05, kp + 0.05),
             "the printed digits of Table 6.9", unit="N/mm", published=kp,
         ))  # fmt: skip
         checks.append(check_mean(
             f"RMS deviation from a straight line along {axis} over the largest force",
-            collect(samples, f"{axis}_nonlinearity"), (0.0, _MAX_NONLINEARITY),
+            collect_values(samples, f"{axis}_nonlinearity"), (0.0, _MAX_NONLINEARITY),
             "linear, except for noise and friction of the measured hand force",
         ))  # fmt: skip
-    return Judgement(tuple(checks), "evaluated with the hand's force, not with the command")
+    return Evaluation(tuple(checks), "evaluated with the hand's force, not with the command")
 
 
-def _judge_detent(samples: Sequence[Sample]) -> Judgement:
+def _evaluate_detent(samples: Sequence[Sample]) -> Evaluation:
     checks: list[Check] = []
     for axis, (_, _, kp, kp1, drop) in _RAMPS.items():
         checks.append(check_mean(
-            f"Kp along {axis}", collect(samples, f"{axis}_inside"), (kp - 0.05, kp + 0.05),
+            f"Kp along {axis}", collect_values(samples, f"{axis}_inside"), (kp - 0.05, kp + 0.05),
             "the printed digits of Table 6.11", unit="N/mm", published=kp,
         ))  # fmt: skip
         checks.append(check_mean(
-            f"Kp1 along {axis}", collect(samples, f"{axis}_outside"), (kp1 - 0.05, kp1 + 0.05),
+            f"Kp1 along {axis}", collect_values(samples, f"{axis}_outside"), (kp1 - 0.05, kp1 + 0.05),
             "the printed digits of Table 6.11", unit="N/mm", published=kp1,
         ))  # fmt: skip
         checks.append(check_mean(
-            f"force drop along {axis}", collect(samples, f"{axis}_drop"), (0.9 * drop, 1.1 * drop),
+            f"force drop along {axis}", collect_values(samples, f"{axis}_drop"), (0.9 * drop, 1.1 * drop),
             "10 %: both lines are extrapolated to the edge from the moving hand's force", unit="N",
             published=drop,
         ))  # fmt: skip
-    return Judgement(tuple(checks), "lines fitted to the hand's force inside and outside")
+    return Evaluation(tuple(checks), "lines fitted to the hand's force inside and outside")
 
 
 _JOINT_STEPS = {"boom": (1.0, 56), "stick": (11.0, 57), "tilt": (21.0, 58)}
 """Joint -> time of its step [s], figure 6.n; it steps back 5 s later."""
-_BACK = 5.0  # time from a step to the step back [s]
-_REST = 0.5  # length of an averaging interval [s]
+_STEP_DURATION = 5.0  # time from a step to the step back [s]
+_AVERAGING_TIME = 0.5  # length of an averaging interval [s]
 _MIN_PRESSURE_SWING = 0.5  # peak-to-peak pressure over the pressure before the step
 _MAX_JOINT_ERROR = 0.05  # remaining error over the step
 _MAX_JOINT_OVERSHOOT = 0.10  # overshoot over the step
@@ -296,9 +300,9 @@ def _measure_joint_steps(seed: int, changes: Changes) -> tuple[dict[str, float],
     m, values, panels = run.measured, {}, []
     table = run.scenario.pilot.columns  # pyright: ignore[reportAttributeAccessIssue]
     for name, (start, _) in _JOINT_STEPS.items():
-        before = (m.time > start - _REST) & (m.time < start)
-        after = (m.time >= start) & (m.time < start + _BACK - 0.1)
-        late = (m.time >= start + _BACK - 0.1 - _REST) & (m.time < start + _BACK - 0.1)
+        before = (m.time > start - _AVERAGING_TIME) & (m.time < start)
+        after = (m.time >= start) & (m.time < start + _STEP_DURATION - 0.1)
+        late = (m.time >= start + _STEP_DURATION - 0.1 - _AVERAGING_TIME) & (m.time < start + _STEP_DURATION - 0.1)
         angle, head = m[f"angle.{name}"], m[f"pressure_head.{name}"]
         goal = max(table[name])
         step = goal - table[name][0]
@@ -308,43 +312,43 @@ def _measure_joint_steps(seed: int, changes: Changes) -> tuple[dict[str, float],
         values[f"{name}_overshoot"] = float((angle[after].max() - goal) / step)
         values[f"{name}_error"] = float(abs(angle[late].mean() - goal) / step)
         values[f"{name}_ringing"] = float(np.ptp(angle[late]) / 2.0 / step)
-        shown = (m.time > start - 1.0) & (m.time < start + 2 * _BACK)
+        shown = (m.time > start - 1.0) & (m.time < start + 2 * _STEP_DURATION)
         panels.append(Panel(f"{name} angle [rad]", m.time[shown], {"measured": angle[shown]}))
         panels.append(Panel(f"head-side pressure of the {name} [MPa]", m.time[shown],
                             {"measured": head[shown] / 1e6}))  # fmt: skip
     return values, tuple(panels)
 
 
-def _judge_pressure(joint: str, samples: Sequence[Sample]) -> Judgement:
+def _evaluate_pressure(joint: str, samples: Sequence[Sample]) -> Evaluation:
     check = check_mean(
         "pressure from peak to peak over the pressure before the step",
-        collect(samples, f"{joint}_pressure"), (_MIN_PRESSURE_SWING, np.inf),
+        collect_values(samples, f"{joint}_pressure"), (_MIN_PRESSURE_SWING, np.inf),
         "huge: half of the pressure that carries the arm; no values of the curves are legible",
     )  # fmt: skip
     note = (
         f"{format_values(samples, f'{joint}_swing', 1e-6, 0)} MPa from peak to peak on"
         f" {format_values(samples, f'{joint}_level', 1e-6, 0)} MPa"
     )
-    return Judgement((check,), note=note)
+    return Evaluation((check,), note=note)
 
 
-def _claim_pressure(joint: str) -> Claim:
+def _make_pressure_claim(joint: str) -> Claim:
     return Claim(
         f"feller-buncher: pressure of a {joint} step",
         '"the joint step responses of the fellerbuncher , from which we can see that huge hydraulic'
         ' pressures oscillations during free motion"',
         f"p. 107, Fig. 6.{_JOINT_STEPS[joint][1]}",
         "document",
-        partial(_judge_pressure, joint),
+        partial(_evaluate_pressure, joint),
         _SLOW_RAMPS,
         "slow ramps instead of steps",
         (f"{joint} angle [rad]", f"head-side pressure of the {joint} [MPa]"),
     )
 
 
-def _judge_following(samples: Sequence[Sample]) -> Judgement:
+def _evaluate_joint_steps(samples: Sequence[Sample]) -> Evaluation:
     checks = [
-        check_mean(f"{words} of the {name} over its step", collect(samples, f"{name}_{key}"),
+        check_mean(f"{words} of the {name} over its step", collect_values(samples, f"{name}_{key}"),
                    (-np.inf, limit), "a limit of this project")
         for name in _JOINT_STEPS
         for key, words, limit in (("overshoot", "overshoot", _MAX_JOINT_OVERSHOOT),
@@ -358,29 +362,27 @@ def _judge_following(samples: Sequence[Sample]) -> Judgement:
         f" +-{100 * v['boom_ringing_slower']:.1f} %: the servo's gain is too high for the oil under"
         " the whole arm's weight"
     )
-    return Judgement(tuple(checks), explanation)
+    return Evaluation(tuple(checks), explanation)
 
 
-_COORDINATES = {"r": 1.0, "theta": 6.0, "z": 11.0, "attitude": 16.0, "head": 21.0}
+_COORDINATE_STEPS = {"r": 1.0, "theta": 6.0, "z": 11.0, "attitude": 16.0, "head": 21.0}
 """Coordinate -> time of its step [s]."""
-_MAX_CROSS = 0.1  # motion of another coordinate over the step of that coordinate
+_MAX_CROSS_MOTION = 0.1  # motion of another coordinate over the step of that coordinate
 
 
 def measure_resolved_steps(seed: int, changes: Changes) -> Sample:
     """Step the joystick in all five task coordinates and measure the pose."""
-    _, run = run_shipped("feller_steps", operator_changes(seed) | dict(changes))
+    _, run = run_shipped("feller_steps", make_operator_changes(seed) | dict(changes))
     m, values, panels = run.measured, {}, []
-    for name, start in _COORDINATES.items():
+    for name, start in _COORDINATE_STEPS.items():
         inside = (m.time >= start) & (m.time < start + 4.9)
         pose, reference = m[f"tip_pose.{name}"][inside], m[f"tip_reference.{name}"][inside]
         step = reference[-1] - reference[0]
         values[f"{name}_step"] = float(abs(step))
-        values[f"{name}_overshoot"] = float(
-            (np.sign(step) * (pose - reference[-1])).max() / abs(step)
-        )
+        values[f"{name}_overshoot"] = float((np.sign(step) * (pose - reference[-1])).max() / abs(step))
         values[f"{name}_error"] = float(abs(pose[-25:].mean() - reference[-1]) / abs(step))
         cross = 0.0
-        for other in _COORDINATES:
+        for other in _COORDINATE_STEPS:
             if other != name:
                 moved, scale = m[f"tip_pose.{other}"][inside], np.ptp(m[f"tip_reference.{other}"])
                 cross = max(cross, float(np.abs(moved - moved[0]).max() / scale))
@@ -393,23 +395,23 @@ def measure_resolved_steps(seed: int, changes: Changes) -> Sample:
     return Sample(values, tuple(panels))
 
 
-def _judge_resolved(samples: Sequence[Sample]) -> Judgement:
+def _evaluate_resolved_steps(samples: Sequence[Sample]) -> Evaluation:
     checks = [
-        check_mean(f"{words} of {name}", collect(samples, f"{name}_{key}"), (-np.inf, limit),
+        check_mean(f"{words} of {name}", collect_values(samples, f"{name}_{key}"), (-np.inf, limit),
                    "a limit of this project")
-        for name in _COORDINATES
+        for name in _COORDINATE_STEPS
         for key, words, limit in (
             ("overshoot", "overshoot", _MAX_JOINT_OVERSHOOT),
             ("error", "remaining error", _MAX_JOINT_ERROR),
-            ("cross", "motion of other coordinates during the step", _MAX_CROSS),
+            ("cross", "motion of other coordinates during the step", _MAX_CROSS_MOTION),
         )
     ]  # fmt: skip
     steps = ", ".join(f"{name} {format_values(samples, f'{name}_step', 1.0, 2)}"
-                      for name in _COORDINATES)  # fmt: skip
-    return Judgement(tuple(checks), note=f"steps of {steps} m or rad; errors relative to the step")
+                      for name in _COORDINATE_STEPS)  # fmt: skip
+    return Evaluation(tuple(checks), note=f"steps of {steps} m or rad; errors relative to the step")
 
 
-_SLACK = {"servo.position_gain": "0.3", "servo.feedforward": "0.6"}
+_SLOW_SERVO = {"servo.position_gain": "0.3", "servo.feedforward": "0.6"}
 _SLOW_RAMPS = {
     "pilot.interpolate": "linear", "pilot.time": "[0, 5, 6, 15, 16, 25, 31]",
     "pilot.columns": "{boom: [0.45, 0.55, 0.55, 0.55, 0.55, 0.55, 0.55],"
@@ -425,17 +427,15 @@ STEERING = Experiment("steering", measure_steering, (
         ' when the machine is under rate control"',
         "p. 90",
         "document",
-        _judge_steering,
+        _evaluate_steering,
         {"pilot.mode": "rate"},
         "rate control in both",
     ),
 ))  # fmt: skip
 
-LINES = tuple(
-    Experiment(f"line {one}", partial(measure_line, one), (_claim_line(one),), 10) for one in _LINES
-)
+LINES = tuple(Experiment(f"line {one}", partial(measure_line, one), (_make_line_claim(one),), 10) for one in _LINES)
 
-HANDLE = (
+HANDLE_RAMPS = (
     Experiment("handle ramp with detents", partial(measure_handle_ramp, "true"), (
         Claim(
             "detents",
@@ -444,7 +444,7 @@ HANDLE = (
             ' edge of the band, there is fixed amount of force drop"',
             "p. 101, Fig. 6.51",
             "document",
-            _judge_detent,
+            _evaluate_detent,
             {"pilot.detent": "false"},
             "detents off",
         ),
@@ -456,7 +456,7 @@ HANDLE = (
             ' position error, the higher the restoring force"',
             "p. 101, Fig. 6.52",
             "document",
-            _judge_centring,
+            _evaluate_centring,
             {"pilot.detent": "true"},
             "detents on",
         ),
@@ -465,14 +465,14 @@ HANDLE = (
 
 STEPS = (
     Experiment("joint steps", measure_joint_steps, (
-        *(_claim_pressure(joint) for joint in _JOINT_STEPS),
+        *(_make_pressure_claim(joint) for joint in _JOINT_STEPS),
         Claim(
             "feller-buncher: joints follow their steps",
             "boom, stick and tilt follow a step of 0.1 rad without overshoot or sustained"
             " oscillation",
             "additional to Fig. 6.56, whose curves have no legible values",
             "additional",
-            _judge_following,
+            _evaluate_joint_steps,
             {"servo.position_gain": "12.0", "servo.pressure_feedback": "0.0"},
             "three times the position gain, no damping by pressure",
         ),
@@ -484,8 +484,8 @@ STEPS = (
             " constant",
             "additional to Fig. 6.56, which shows joints",
             "additional",
-            _judge_resolved,
-            _SLACK,
+            _evaluate_resolved_steps,
+            _SLOW_SERVO,
             "joint servos with a tenth of the gain and 60 % of the feedforward",
         ),
     ), 10),

@@ -12,20 +12,23 @@ from scipy.integrate import solve_ivp
 from hydrotele.core.compiled import compiled
 from hydrotele.experiments.comparison import (
     Changes,
+    Evaluation,
     Experiment,
-    Judgement,
     Panel,
     Sample,
 )
-from hydrotele.experiments.intervals import check_exact, check_mean, collect
-from hydrotele.experiments.zhu_two_port import exact_experiment, make_claim, read_settings
+from hydrotele.experiments.intervals import check_exact, check_mean, collect_values
+from hydrotele.experiments.zhu_two_port import make_claim, make_exact_experiment, merge_settings
 from hydrotele.machine.joystick import load_joystick
-from hydrotele.teleop.coils import three_stations
+from hydrotele.teleop.coils import make_three_station_coils
 from hydrotele.teleop.levitation import pose_resolution
-from hydrotele.teleop.switching import Spring, worst_growth
+from hydrotele.teleop.switching import StiffnessAxis, worst_switching_growth
 
-_STEP = 1e-3  # s
-_LOWEST, _HIGHEST = 1.0, 9.0  # K_min and K_max of a unit mass [1/s^2]; B^2 > 4 K_max if B > 6
+_TIME_STEP = 1e-3  # s
+_MIN_STIFFNESS, _MAX_STIFFNESS = (
+    1.0,
+    9.0,
+)  # K_min and K_max of a unit mass [1/s^2]; B^2 > 4 K_max if B > 6
 _DAMPING = 6.1  # 1/s
 
 
@@ -38,7 +41,7 @@ def measure_counter_example(changes: Changes) -> Sample:
     Returns:
         `end`: x after 12 s with the former; `slow`: |x| after 100 s with the latter.
     """
-    given = read_settings(changes, stiffness=1.0)
+    given = merge_settings(changes, stiffness=1.0)
 
     def solve(damping, last: float) -> tuple[np.ndarray, np.ndarray]:
         def motion(t: float, state: np.ndarray) -> list[float]:
@@ -57,10 +60,10 @@ def measure_counter_example(changes: Changes) -> Sample:
     ))  # fmt: skip
 
 
-def judge_counter_example(samples: Sequence[Sample]) -> Judgement:
+def evaluate_counter_example(samples: Sequence[Sample]) -> Evaluation:
     """Check the final displacement of both motions."""
     v = samples[0].values
-    return Judgement((
+    return Evaluation((
         check_exact("x after 12 s", v["end"], (1.0 - 1e-4, 1.0 + 1e-4),
                     "1 + exp(-12) is 6 10^-6 above 1; the remaining tolerance is for integration",
                     published=1.0),
@@ -78,19 +81,19 @@ def measure_worst_switching(changes: Changes) -> Sample:
     Returns:
         `growth`: speed after half a swing over that before.
     """
-    given = read_settings(changes, ratio=0.02)
+    given = merge_settings(changes, ratio=0.02)
     ratios = np.geomspace(0.01, 1.5, 25)
-    growth = [worst_growth(1.0, 2.0 * ratio * 3.0, _LOWEST, _HIGHEST) for ratio in ratios]
+    growth = [worst_switching_growth(1.0, 2.0 * ratio * 3.0, _MIN_STIFFNESS, _MAX_STIFFNESS) for ratio in ratios]
     return Sample(
-        {"growth": worst_growth(1.0, 2.0 * given["ratio"] * 3.0, _LOWEST, _HIGHEST)},
+        {"growth": worst_switching_growth(1.0, 2.0 * given["ratio"] * 3.0, _MIN_STIFFNESS, _MAX_STIFFNESS)},
         (Panel("speed over that half a swing before [1]", ratios, {"worst switching":
                np.array(growth)}, "damping ratio with K_max [1]"),),
     )  # fmt: skip
 
 
-def judge_worst_switching(samples: Sequence[Sample]) -> Judgement:
+def evaluate_worst_switching(samples: Sequence[Sample]) -> Evaluation:
     """Check that the motion grows."""
-    return Judgement((
+    return Evaluation((
         check_exact("speed after half a swing over that before, damping ratio 0.02, K_max 9 times"
                     " K_min", samples[0].values["growth"], (1.0 + 1e-9, np.inf),
                     "the motion grows, so that the system is unstable"),
@@ -98,13 +101,13 @@ def judge_worst_switching(samples: Sequence[Sample]) -> Judgement:
 
 
 @compiled
-def integrate_motion(damping, stiffness, place, speed, step, path):
+def integrate_motion(damping, stiffness, position, speed, step, path):
     """Integrate `x'' = -B x' - K(t) x` by the Runge-Kutta method, with constant K in each step.
 
     Args:
         damping: B, scalar [1/s].
         stiffness: (n,) K [1/s^2].
-        place: x at the start, scalar.
+        position: x at the start, scalar.
         speed: x' at the start, scalar.
         step: scalar [s].
         path: (n + 1, 2) output: x, x'.
@@ -114,7 +117,7 @@ def integrate_motion(damping, stiffness, place, speed, step, path):
 
     Source: Zhu 1994, Eq. 4.11.
     """
-    x, v = place, speed
+    x, v = position, speed
     path[0, 0], path[0, 1] = x, v
     for i in range(len(stiffness)):
         k = stiffness[i]
@@ -128,19 +131,21 @@ def integrate_motion(damping, stiffness, place, speed, step, path):
         path[i + 1, 0], path[i + 1, 1] = x, v
 
 
-def switched_stiffness(rng: np.random.Generator, count: int) -> np.ndarray:
+def draw_switched_stiffness(rng: np.random.Generator, count: int) -> np.ndarray:
     """Draw (count,) stiffness with jumps at random times to random values in [K_min, K_max]."""
-    jumps = rng.random(count) < _STEP / 10.0 ** rng.uniform(-1.5, 0.5)
+    jumps = rng.random(count) < _TIME_STEP / 10.0 ** rng.uniform(-1.5, 0.5)
     jumps[0] = True
     values = rng.choice(
-        [_LOWEST, _HIGHEST, rng.uniform(_LOWEST, _HIGHEST)], size=count, p=[0.4, 0.4, 0.2]
+        [_MIN_STIFFNESS, _MAX_STIFFNESS, rng.uniform(_MIN_STIFFNESS, _MAX_STIFFNESS)],
+        size=count,
+        p=[0.4, 0.4, 0.2],
     )
     return values[np.maximum.accumulate(np.where(jumps, np.arange(count), 0))]
 
 
-def _path(damping: float, stiffness: np.ndarray, start: tuple[float, float]) -> np.ndarray:
+def _integrate_path(damping: float, stiffness: np.ndarray, start: tuple[float, float]) -> np.ndarray:
     path = np.empty((len(stiffness) + 1, 2))
-    integrate_motion(damping, stiffness, *start, _STEP, path)
+    integrate_motion(damping, stiffness, *start, _TIME_STEP, path)
     return path
 
 
@@ -156,37 +161,37 @@ def measure_theorem(seed: int, changes: Changes) -> Sample:
         largest distance from the origin after 40 s over that at the start; `outside`: largest
         distance of paths from the x axis outside the region between those of K_min and K_max.
     """
-    given = read_settings(changes, damping=_DAMPING)
+    given = merge_settings(changes, damping=_DAMPING)
     damping, rng, count = given["damping"], np.random.default_rng([seed, 42]), 40_000
     crossings, left, outside, panels = 0, 0.0, 0.0, ()
     from_axis = {
-        "K_min": _path(damping, np.full(count, _LOWEST), (1.0, 0.0)),
-        "K_max": _path(damping, np.full(count, _HIGHEST), (1.0, 0.0)),
+        "K_min": _integrate_path(damping, np.full(count, _MIN_STIFFNESS), (1.0, 0.0)),
+        "K_max": _integrate_path(damping, np.full(count, _MAX_STIFFNESS), (1.0, 0.0)),
     }
     for trial in range(20):
         angle = rng.uniform(0.0, 2.0 * np.pi)
-        stiffness = switched_stiffness(rng, count)
-        path = _path(damping, stiffness, (float(np.cos(angle)), float(np.sin(angle))))
+        stiffness = draw_switched_stiffness(rng, count)
+        path = _integrate_path(damping, stiffness, (float(np.cos(angle)), float(np.sin(angle))))
         away = np.hypot(*path.T) > 1e-6
         speed = path[away, 1]
         crossings = max(crossings, int(np.count_nonzero(np.diff(np.sign(speed[speed != 0.0])))))
         left = max(left, float(np.hypot(*path[-1])))
-        bounded = _path(damping, stiffness, (1.0, 0.0))
-        outside = max(outside, _leaves(bounded, from_axis))
+        bounded = _integrate_path(damping, stiffness, (1.0, 0.0))
+        outside = max(outside, _measure_bound_violation(bounded, from_axis))
         if trial == 0:
             grid = np.linspace(0.01, 1.0, 300)
-            curves = {name: _speed_at(path, grid) for name, path in from_axis.items()}
-            curves["K(t)"] = _speed_at(bounded, grid)
+            curves = {name: _interpolate_speed(path, grid) for name, path in from_axis.items()}
+            curves["K(t)"] = _interpolate_speed(bounded, grid)
             panels = (
                 Panel("speed dx/dt, start on the x axis [1/s]", grid, curves, "displacement x [1]"),
-                Panel("displacement, start anywhere [1]", _STEP * np.arange(5000),
+                Panel("displacement, start anywhere [1]", _TIME_STEP * np.arange(5000),
                       {"x": path[:5000, 0]}),
             )  # fmt: skip
     values = {"crossings": float(crossings), "left": left, "outside": outside}
     return Sample(values, panels)
 
 
-def _speed_at(path: np.ndarray, grid: np.ndarray) -> np.ndarray:
+def _interpolate_speed(path: np.ndarray, grid: np.ndarray) -> np.ndarray:
     """Return the speed at given displacements during the first motion towards the origin."""
     turn = np.flatnonzero(np.diff(path[:, 0]) >= 0.0)
     end = int(turn[1]) if len(turn) > 1 and turn[0] == 0 else int(turn[0]) if len(turn) else None
@@ -194,35 +199,38 @@ def _speed_at(path: np.ndarray, grid: np.ndarray) -> np.ndarray:
     return np.interp(grid, way[::-1, 0], way[::-1, 1])
 
 
-def _leaves(path: np.ndarray, bounds: dict[str, np.ndarray]) -> float:
+def _measure_bound_violation(path: np.ndarray, bounds: dict[str, np.ndarray]) -> float:
     """Return how far a path in quadrant IV lies outside the paths of K_min and K_max."""
     grid = np.linspace(0.02, 0.98, 200)
-    speed = _speed_at(path, grid)
-    upper, lower = _speed_at(bounds["K_min"], grid), _speed_at(bounds["K_max"], grid)
+    speed = _interpolate_speed(path, grid)
+    upper, lower = (
+        _interpolate_speed(bounds["K_min"], grid),
+        _interpolate_speed(bounds["K_max"], grid),
+    )
     return float(max(np.max(speed - upper), np.max(lower - speed), 0.0, np.max(-path[:, 0])))
 
 
-def judge_theorem(samples: Sequence[Sample]) -> Judgement:
+def evaluate_stability(samples: Sequence[Sample]) -> Evaluation:
     """Check the final distance of the motions and their crossings of the x axis."""
-    return Judgement((
+    return Evaluation((
         check_mean("largest distance from the origin after 40 s over that at the start",
-                   collect(samples, "left"), (-np.inf, 1e-2), "asymptotically stable: the slowest"
+                   collect_values(samples, "left"), (-np.inf, 1e-2), "asymptotically stable: the slowest"
                    " rate with K_min is 0.17 1/s, which gives 10^-3"),
         check_exact("largest number of crossings of the x axis",
-                    float(collect(samples, "crossings").max()), (0.0, 1.0), "at most once"),
+                    float(collect_values(samples, "crossings").max()), (0.0, 1.0), "at most once"),
     ))  # fmt: skip
 
 
-def judge_bounds(samples: Sequence[Sample]) -> Judgement:
+def evaluate_path_bounds(samples: Sequence[Sample]) -> Evaluation:
     """Check whether paths stay between those of K_min and K_max."""
-    return Judgement((
+    return Evaluation((
         check_exact("largest distance by which a path lies outside",
-                    float(collect(samples, "outside").max()), (0.0, 1e-3),
+                    float(collect_values(samples, "outside").max()), (0.0, 1e-3),
                     "error of the interpolation between steps of 1 ms"),
     ))  # fmt: skip
 
 
-_TABLES = {
+_PUBLISHED_GAINS = {
     "excavator x y z": (0.06e3, 0.6e3, 0.3e3, 4.0e3),
     "feller-buncher x": (0.06e3, 4.0e3, 3.0e3, 8.0e3),
     "feller-buncher y": (0.06e3, 3.0e3, 2.0e3, 4.0e3),
@@ -240,23 +248,23 @@ def measure_published_gains(changes: Changes) -> Sample:
     Returns:
         `margin`: largest B^2 - 4 M K_max; `growth`: largest growth per half swing.
     """
-    given = read_settings(changes, damping=1.0)
+    given = merge_settings(changes, damping=1.0)
     joystick = load_joystick()
-    mass, hand = joystick.flotor.mass, joystick.hand.along(0)
+    mass, hand = joystick.flotor.mass, joystick.hand.axis_impedance(0)
     margins, growths = [], []
-    for damping, nominal, least, most in _TABLES.values():
-        alone = Spring(mass, given["damping"] * damping, nominal, least, most)
-        for spring in (alone, Spring(mass + hand[0], alone.damping + given["damping"] * hand[1],
+    for damping, nominal, least, most in _PUBLISHED_GAINS.values():
+        alone = StiffnessAxis(mass, given["damping"] * damping, nominal, least, most)
+        for spring in (alone, StiffnessAxis(mass + hand[0], alone.damping + given["damping"] * hand[1],
                        nominal + hand[2], least + hand[2], most + hand[2])):  # fmt: skip
-            margins.append(spring.margin)
-            growths.append(spring.growth)
+            margins.append(spring.theorem_margin)
+            growths.append(spring.half_swing_growth)
     return Sample({"margin": max(margins), "growth": max(growths)})
 
 
-def judge_published_gains(samples: Sequence[Sample]) -> Judgement:
+def evaluate_published_gains(samples: Sequence[Sample]) -> Evaluation:
     """Check that no axis satisfies (4.14) and that the worst switching decays."""
     v = samples[0].values
-    return Judgement((
+    return Evaluation((
         check_exact("largest B^2 - 4 M K_max over the axes, with and without hand", v["margin"],
                     (-np.inf, -1e-9), "no axis satisfies (4.14)", unit="(N s/m)^2"),
         check_exact("largest growth per half swing with the worst switching", v["growth"],
@@ -273,10 +281,10 @@ def measure_joystick(changes: Changes) -> Sample:
     Returns:
         Condition number, and standard deviations of position [um] and rotation [deg].
     """
-    given = read_settings(changes, step=1.0, radius=1.0)
+    given = merge_settings(changes, step=1.0, radius=1.0)
     joystick = load_joystick()
     facts = joystick.coils
-    coils = three_stations(facts.radius, facts.force_per_ampere, facts.max_current)
+    coils = make_three_station_coils(facts.radius, facts.force_per_ampere, facts.max_current)
     sizes = np.array([1.0, 1.0, 1.0, *[given["radius"] / facts.radius] * 3])
     pose = pose_resolution(joystick.diodes.distance, given["step"] * joystick.diodes.step)
     return Sample({
@@ -286,19 +294,19 @@ def measure_joystick(changes: Changes) -> Sample:
     })  # fmt: skip
 
 
-def judge_condition(samples: Sequence[Sample]) -> Judgement:
+def evaluate_condition(samples: Sequence[Sample]) -> Evaluation:
     """Check the condition number of the coil matrix."""
-    return Judgement((
+    return Evaluation((
         check_exact("condition number of M, torques divided by the coils' radius",
                     samples[0].values["condition"], (1.0, 10.0),
                     "well-conditioned: within a factor of ten"),
     ))  # fmt: skip
 
 
-def judge_resolution(samples: Sequence[Sample]) -> Judgement:
+def evaluate_resolution(samples: Sequence[Sample]) -> Evaluation:
     """Check the pose resolution for photodiodes with steps of 1 um."""
     v, reason = samples[0].values, "approximately: up to the printed figure"
-    return Judgement((
+    return Evaluation((
         check_exact("standard deviation of the position", v["translation"], (0.0, 1.0), reason,
                     unit="um", published=1.0),
         check_exact("of the rotation", v["rotation"], (0.0, 1e-3), reason, unit="deg",
@@ -307,45 +315,45 @@ def judge_resolution(samples: Sequence[Sample]) -> Judgement:
 
 
 EXPERIMENTS: tuple[Experiment, ...] = (
-    exact_experiment("damping that rises", measure_counter_example, make_claim(
+    make_exact_experiment("damping that rises", measure_counter_example, make_claim(
         "counter-example of rising damping",
         '"the above system has solution x(t)" = 1 + e^-t "which goes to x(oo)" = 1 "instead" of 0',
-        "p. 53, Eq. 4.6", judge_counter_example, {"stiffness": 2.0}, "a spring of K = 2",
+        "p. 53, Eq. 4.6", evaluate_counter_example, {"stiffness": 2.0}, "a spring of K = 2",
     )),
-    exact_experiment("worst switching", measure_worst_switching, make_claim(
+    make_exact_experiment("worst switching", measure_worst_switching, make_claim(
         "stiffness that switches: unstable",
         '"a slightly damped mass-damper-spring system goes unstable if we set the spring constant'
         " to a large value whenever the mass moves towards the equihbrium point and a small value"
-        ' whenever the mass moves away from it"', "p. 54", judge_worst_switching, {"ratio": 1.0},
+        ' whenever the mass moves away from it"', "p. 54", evaluate_worst_switching, {"ratio": 1.0},
         "critical damping",
     )),
     Experiment("theorem 4-2", measure_theorem, (make_claim(
         "theorem 4-2: stable, one crossing at most",
         '"Under these conditions, the system is uniformly asymptotically stable"; the trajectory'
         ' "can cross the x axis at most once"',
-        "p. 55, Figs 4.26, 4.27", judge_theorem, {"damping": 0.3},
+        "p. 55, Figs 4.26, 4.27", evaluate_stability, {"damping": 0.3},
         "damping that is too small for the condition",
     ), make_claim(
         "theorem 4-2: paths between those of K_min and K_max",
         '"the trajectory of this time-variant system must be bounded by curve 1 and curve 2"',
-        "p. 61, Figs 4.28, 4.29", judge_bounds, {"damping": 0.3},
+        "p. 61, Figs 4.28, 4.29", evaluate_path_bounds, {"damping": 0.3},
         "damping that is too small for the condition",
     ))),
-    exact_experiment("published gains", measure_published_gains, make_claim(
+    make_exact_experiment("published gains", measure_published_gains, make_claim(
         "published gains: worst switching dies out",
         "no axis of Tables 6.7 and 6.9 satisfies the condition of theorem 4-2, but the motion with"
         " the worst switching between their bounds decays",
-        "additional to p. 55, Tables 6.7, 6.9", judge_published_gains,
+        "additional to p. 55, Tables 6.7, 6.9", evaluate_published_gains,
         {"damping": 0.1}, "a tenth of the damping", "additional",
     )),
-    exact_experiment("levitated joystick", measure_joystick, make_claim(
+    make_exact_experiment("levitated joystick", measure_joystick, make_claim(
         "joystick: condition of the coils' map",
-        '"M is a well-conditioned 6 x 6 constant matrix"', "p. 66, Eq. 5.1", judge_condition,
+        '"M is a well-conditioned 6 x 6 constant matrix"', "p. 66, Eq. 5.1", evaluate_condition,
         {"radius": 100.0}, "torques scaled with a lever a hundred times as long", "input",
     ), make_claim(
         "joystick: resolution of the pose",
         '"approximately 1" um "for translation and 0.001" deg "for rotation"',
-        "p. 65, Figs 5.31, 5.32", judge_resolution, {"step": 10.0},
+        "p. 65, Figs 5.31, 5.32", evaluate_resolution, {"step": 10.0},
         "photodiodes with steps of 10 um", "input",
     )),
 )  # fmt: skip

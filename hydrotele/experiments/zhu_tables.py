@@ -8,26 +8,26 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 from hydrotele.core.errors import InputError
-from hydrotele.experiments.comparison import Changes, Claim, Experiment, Judgement, Sample
+from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Sample
 from hydrotele.experiments.intervals import check_exact
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
 
-Entries = dict[str, tuple[float, float, float]]
+TableEntries = dict[str, tuple[float, float, float]]
 """Name -> (value of the model, printed value, half of the last printed digit), in one unit."""
 
 _INCH = 0.0254  # m
-_KHOSHZABAN = 1.0  # tolerance [mm]: Khoshzaban 1992 prints the same pins with three decimals
+_KHOSHZABAN_TOLERANCE = 1.0  # tolerance [mm]: Khoshzaban 1992 prints the same pins with three decimals
 
 
-def _distance(a: Sequence[float], b: Sequence[float], *axes: int) -> float:
+def _compute_distance(a: Sequence[float], b: Sequence[float], *axes: int) -> float:
     """Return the distance [mm] of two points [m] in the given axes."""
     return 1e3 * math.dist([a[k] for k in axes], [b[k] for k in axes])
 
 
-def _cylinder_areas(machine: Machine, printed: dict[str, tuple[float, float]]) -> Entries:
-    entries: Entries = {}
+def _compare_cylinder_areas(machine: Machine, printed: dict[str, tuple[float, float]]) -> TableEntries:
+    entries: TableEntries = {}
     for name, (head, rod) in printed.items():
         cylinder = machine.axes[name].cylinder
         assert cylinder is not None
@@ -36,7 +36,7 @@ def _cylinder_areas(machine: Machine, printed: dict[str, tuple[float, float]]) -
     return entries
 
 
-def _cylinder_diameters(machine: Machine, printed: dict[str, tuple[int, float, float]]) -> Entries:
+def _compare_cylinder_diameters(machine: Machine, printed: dict[str, tuple[int, float, float]]) -> TableEntries:
     """Return the entries of piston diameters.
 
     Args:
@@ -44,7 +44,7 @@ def _cylinder_diameters(machine: Machine, printed: dict[str, tuple[int, float, f
         printed: axis -> (number of cylinders that the model's cylinder represents, head diameter
             [mm], rod diameter [mm]).
     """
-    entries: Entries = {}
+    entries: TableEntries = {}
     for name, (count, head, rod) in printed.items():
         cylinder = machine.axes[name].cylinder
         assert cylinder is not None
@@ -55,7 +55,7 @@ def _cylinder_diameters(machine: Machine, printed: dict[str, tuple[int, float, f
     return entries
 
 
-def _two_bar(machine: Machine, name: str, a: float, b: float, half: float = 0.05) -> Entries:
+def _compare_two_bar(machine: Machine, name: str, a: float, b: float, half: float = 0.05) -> TableEntries:
     """Return the entries of a two-bar linkage: distances of both pins from the joint.
 
     Args:
@@ -70,7 +70,7 @@ def _two_bar(machine: Machine, name: str, a: float, b: float, half: float = 0.05
     link = machine.link_of(axis.joint)
     joint = machine.links[link].position
     levers = sorted(
-        _distance(pin.position, (0.0, 0.0, 0.0) if pin.link == link else joint, *plane)
+        _compute_distance(pin.position, (0.0, 0.0, 0.0) if pin.link == link else joint, *plane)
         for pin in (axis.cylinder.base_pin, axis.cylinder.rod_pin)
         for plane in ((0, 1) if name == "head" else (0, 2),)
     )
@@ -81,7 +81,7 @@ def _two_bar(machine: Machine, name: str, a: float, b: float, half: float = 0.05
     }
 
 
-def _four_bar(machine: Machine, name: str, closure: str, printed: Sequence[float]) -> Entries:
+def _compare_four_bar(machine: Machine, name: str, closure: str, printed: Sequence[float]) -> TableEntries:
     """Return the entries of a four-bar linkage.
 
     Args:
@@ -97,10 +97,10 @@ def _four_bar(machine: Machine, name: str, closure: str, printed: Sequence[float
     base, crank = axis.cylinder.base_pin.position, axis.cylinder.rod_pin.position
     ends, origin = machine.closures[closure], (0.0, 0.0, 0.0)
     model = (
-        _distance(joint, pivot, 0, 2), _distance(ends.b.position, origin, 0, 2),
-        _distance(ends.a.position, origin, 0, 2), _distance(crank, origin, 0, 2),
+        _compute_distance(joint, pivot, 0, 2), _compute_distance(ends.b.position, origin, 0, 2),
+        _compute_distance(ends.a.position, origin, 0, 2), _compute_distance(crank, origin, 0, 2),
         abs(math.atan2(pivot[2] - base[2], pivot[0] - base[0])),
-        math.atan2(pivot[2] - joint[2], joint[0] - pivot[0]), _distance(base, pivot, 0, 2),
+        math.atan2(pivot[2] - joint[2], joint[0] - pivot[0]), _compute_distance(base, pivot, 0, 2),
     )  # fmt: skip
     names = ("r1 [mm]", "r2 [mm]", "r3 [mm]", "r4 [mm]", "gamma [rad]", "alpha [rad]", "L [mm]")
     halves = (0.05,) * 4 + (5e-5, 5e-5, 0.05)
@@ -110,38 +110,38 @@ def _four_bar(machine: Machine, name: str, closure: str, printed: Sequence[float
     }
 
 
-def _excavator() -> Machine:
+def _load_excavator() -> Machine:
     return load_machine("cat215", tool="bucket")
 
 
-def _excavator_pistons() -> Entries:
+def _compare_excavator_pistons() -> TableEntries:
     printed = {"boom": (31.80, 19.92), "stick": (23.75, 14.13), "bucket": (15.90, 9.96)}
-    return _cylinder_areas(_excavator(), printed)
+    return _compare_cylinder_areas(_load_excavator(), printed)
 
 
-def _feller_pistons() -> Entries:
+def _compare_feller_pistons() -> TableEntries:
     printed = {"boom": (2, 120.0, 85.0), "stick": (1, 150.0, 105.0), "tilt": (1, 150.0, 105.0),
                "head": (1, 152.4, 63.5)}  # fmt: skip
-    return _cylinder_diameters(load_machine("cat325"), printed)
+    return _compare_cylinder_diameters(load_machine("cat325"), printed)
 
 
-def _excavator_linkage() -> Entries:
-    machine = _excavator()
+def _compare_excavator_linkages() -> TableEntries:
+    machine = _load_excavator()
     four = (324.9, 404.9, 484.9, 548.6, 0.0468407, 0.3469905, 1602.7)
     return {
-        **_two_bar(machine, "boom", 1999.8, 624.0, _KHOSHZABAN),
-        **_two_bar(machine, "stick", 720.2, 2443.6, _KHOSHZABAN),
-        **_four_bar(machine, "bucket", "bucket_coupler_pin", four),
+        **_compare_two_bar(machine, "boom", 1999.8, 624.0, _KHOSHZABAN_TOLERANCE),
+        **_compare_two_bar(machine, "stick", 720.2, 2443.6, _KHOSHZABAN_TOLERANCE),
+        **_compare_four_bar(machine, "bucket", "bucket_coupler_pin", four),
     }
 
 
-def _feller_linkage() -> Entries:
+def _compare_feller_linkages() -> TableEntries:
     machine = load_machine("cat325")
     return {
-        **_two_bar(machine, "boom", 2281.6, 911.2),
-        **_two_bar(machine, "stick", 901.2, 2339.0),
-        **_two_bar(machine, "head", 634.0, 588.0),
-        **_four_bar(machine, "tilt", "tilt_coupler_pin",
+        **_compare_two_bar(machine, "boom", 2281.6, 911.2),
+        **_compare_two_bar(machine, "stick", 901.2, 2339.0),
+        **_compare_two_bar(machine, "head", 634.0, 588.0),
+        **_compare_four_bar(machine, "tilt", "tilt_coupler_pin",
                     (481.3, 563.7, 640.0, 685.0, 0.0728, 0.1831, 2316.3)),
     }  # fmt: skip
 
@@ -159,8 +159,8 @@ _FELLER_GAINS = {
 }  # fmt: skip
 
 
-def _joystick_gains(name: str, printed: dict[str, tuple[float, ...]]) -> Entries:
-    entries: Entries = {}
+def _compare_joystick_gains(name: str, printed: dict[str, tuple[float, ...]]) -> TableEntries:
+    entries: TableEntries = {}
     for axis, values in printed.items():
         gains = load_joystick().gains[name][axis]
         stiff, far = (1e3, 1e3) if len(axis) == 1 else (1e2, 1e4)
@@ -172,7 +172,7 @@ def _joystick_gains(name: str, printed: dict[str, tuple[float, ...]]) -> Entries
     return entries
 
 
-def _force_limits(name: str, force: float) -> Entries:
+def _compare_force_limits(name: str, force: float) -> TableEntries:
     """Return the entries of force limits: `force` [kN] in translation, 40 kN m in rotation."""
     return {
         axis: (gains.force_limit / 1e3, force if len(axis) == 1 else 40.0, 0.5)
@@ -180,12 +180,12 @@ def _force_limits(name: str, force: float) -> Entries:
     }
 
 
-def _detents() -> Entries:
+def _compare_detents() -> TableEntries:
     printed = {
         "x": (2.0, 4.0, 0.3), "y": (2.0, 3.0, 0.3), "z": (2.0, 4.0, 0.4),
         "rx": (0.8, 0.45, 0.03), "ry": (0.8, 0.45, 0.03), "rz": (0.0, 0.25, 0.25),
     }  # fmt: skip
-    entries: Entries = {}
+    entries: TableEntries = {}
     for axis, (drop, inside, outside) in printed.items():
         gains = load_joystick().gains["feller"][axis]
         scale = 1e3 if len(axis) == 1 else 1e2
@@ -196,26 +196,26 @@ def _detents() -> Entries:
     return entries
 
 
-_TABLES: dict[str, tuple[str, str, Callable[[], Entries]]] = {
+_TABLE_ROWS: dict[str, tuple[str, str, Callable[[], TableEntries]]] = {
     "piston areas of the excavator": ("p. 78, Table 6.3", "areas of boom, stick and bucket",
-                                      _excavator_pistons),
+                                      _compare_excavator_pistons),
     "piston diameters of the feller-buncher": (
-        "p. 78, Table 6.4", "diameters of boom, stick, tilt and head", _feller_pistons),
+        "p. 78, Table 6.4", "diameters of boom, stick, tilt and head", _compare_feller_pistons),
     "linkages of the excavator": ("p. 80, Table 6.5", "two-bar and four-bar linkages",
-                                  _excavator_linkage),
+                                  _compare_excavator_linkages),
     "linkages of the feller-buncher": ("p. 80, Table 6.6", "two-bar and four-bar linkages",
-                                       _feller_linkage),
+                                       _compare_feller_linkages),
     "joystick gains for the excavator": (
         "p. 90, Table 6.7", "stiffnesses, damping and dead bands of six axes",
-        partial(_joystick_gains, "excavator", _EXCAVATOR_GAINS)),
+        partial(_compare_joystick_gains, "excavator", _EXCAVATOR_GAINS)),
     "largest reflected force of the excavator": (
-        "p. 91, Table 6.8", "50 kN and 40 kN m", partial(_force_limits, "excavator", 50.0)),
+        "p. 91, Table 6.8", "50 kN and 40 kN m", partial(_compare_force_limits, "excavator", 50.0)),
     "joystick gains for the feller-buncher": (
         "p. 99, Table 6.9", "stiffnesses, damping and dead bands of six axes",
-        partial(_joystick_gains, "feller", _FELLER_GAINS)),
+        partial(_compare_joystick_gains, "feller", _FELLER_GAINS)),
     "largest reflected force of the feller-buncher": (
-        "p. 100, Table 6.10", "30 kN and 40 kN m", partial(_force_limits, "feller", 30.0)),
-    "detent parameters": ("p. 102, Table 6.11", "force drop, Kp and Kp1 of six axes", _detents),
+        "p. 100, Table 6.10", "30 kN and 40 kN m", partial(_compare_force_limits, "feller", 30.0)),
+    "detent parameters": ("p. 102, Table 6.11", "force drop, Kp and Kp1 of six axes", _compare_detents),
 }  # fmt: skip
 """Row -> (item, published quantities, function that returns the entries)."""
 
@@ -238,7 +238,7 @@ def measure_tables(seed: int, changes: Changes) -> Sample:
     if unknown:
         raise InputError("changes", f"unknown key {unknown.pop()!r}; valid: factor")
     factor, values = float(changes.get("factor", 1.0)), {}
-    for row, (_, _, find_entries) in _TABLES.items():
+    for row, (_, _, find_entries) in _TABLE_ROWS.items():
         entries = find_entries()
         differs = {
             name: abs(factor * model - printed) > half + 1e-6 * abs(printed)
@@ -255,16 +255,13 @@ def measure_tables(seed: int, changes: Changes) -> Sample:
     return Sample(values)
 
 
-def _judge_table(row: str, samples: Sequence[Sample]) -> Judgement:
+def _evaluate_table(row: str, samples: Sequence[Sample]) -> Evaluation:
     values = samples[0].values
     check = check_exact(
         "entries that differ from the printed values", values[f"{row}: differ"], (0.0, 0.0),
         "half of the last printed digit",
     )  # fmt: skip
-    note = (
-        f"{values[f'{row}: entries']:.0f} entries, largest difference"
-        f" {100 * values[f'{row}: largest']:.2g} %"
-    )
+    note = f"{values[f'{row}: entries']:.0f} entries, largest difference {100 * values[f'{row}: largest']:.2g} %"
     explanation = ""
     if row == "linkages of the excavator":
         explanation = "tolerance of 1 mm for boom and stick: the model uses Khoshzaban 1992"
@@ -273,15 +270,15 @@ def _judge_table(row: str, samples: Sequence[Sample]) -> Judgement:
             f"{values[f'{row}: damping']:.0f} rotational dampings: the model has 0.25 N m s/rad,"
             " because the printed ones are unstable on this flotor at 200 Hz"
         )
-    return Judgement((check,), explanation, note)
+    return Evaluation((check,), explanation, note)
 
 
-TABLES = Experiment(
+TABLE_COMPARISON = Experiment(
     "tables", measure_tables,
     tuple(
-        Claim(row, words, item, "input", partial(_judge_table, row), {"factor": "1.1"},
+        Claim(row, words, item, "input", partial(_evaluate_table, row), {"factor": "1.1"},
               "the parameters of the models are 10 % larger")
-        for row, (item, words, _) in _TABLES.items()
+        for row, (item, words, _) in _TABLE_ROWS.items()
     ),
-    repetitions_fixed=1,
+    fixed_repetitions=1,
 )  # fmt: skip

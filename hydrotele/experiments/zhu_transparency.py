@@ -11,41 +11,41 @@ import numpy as np
 from hydrotele.control.task_impedance import RecursiveLeastSquares
 from hydrotele.experiments.comparison import (
     Changes,
+    Evaluation,
     Experiment,
-    Judgement,
     Panel,
     Sample,
 )
-from hydrotele.experiments.intervals import check_exact, check_mean, collect, format_values
+from hydrotele.experiments.intervals import check_exact, check_mean, collect_values, format_values
 from hydrotele.experiments.zhu_two_port import (
     HAND_FREQUENCIES,
-    NOTICED_DIFFERENCE,
+    NOTICEABLE_DIFFERENCE,
     PASSIVE_NORM,
-    ROUNDING,
+    ROUNDING_RANGE,
     WIDE_FREQUENCIES,
-    constant_block,
-    exact_experiment,
-    identical_case,
+    compute_relative_error,
+    load_shipped_case,
     make_claim,
-    read_settings,
-    relative_error,
-    shipped_case,
+    make_constant_block,
+    make_exact_experiment,
+    make_identical_case,
+    merge_settings,
 )
-from hydrotele.teleop.analysis import Case, first_change, holds
-from hydrotele.teleop.findings import agreement
+from hydrotele.teleop.analysis import TeleoperatorAxis, find_first_change, is_strictly_stable
+from hydrotele.teleop.findings import compare_stability
 from hydrotele.teleop.two_port import (
     Impedance,
     TwoPort,
-    hybrid,
+    count_unstable_poles,
+    hybrid_matrix,
     scattering_norm,
-    transmitted,
-    unstable_poles,
+    transmitted_impedance,
 )
 
 # --- p. 37 to 43: transparency under position control ---------------------------------------------
 
 
-def random_impedance(rng: np.random.Generator, base: Impedance) -> Impedance:
+def draw_impedance(rng: np.random.Generator, base: Impedance) -> Impedance:
     """Draw a passive impedance whose parameters are 0.1 to 10 times those of another one."""
     factors = 10.0 ** rng.uniform(-1.0, 1.0, 3)
     return Impedance(*(factors * (base.mass, base.damping, base.stiffness)))
@@ -61,13 +61,13 @@ def measure_transparency(changes: Changes) -> Sample:
         Error of the hybrid matrix, scattering norm, slowest pole of the position error, and the
         stable fraction of loops with random hands and tasks.
     """
-    given = read_settings(changes, mass_error=0.0, delay=0.0)
-    case = shipped_case().with_delay(given["delay"])
-    port = case.port("four_channel_position")
+    given = merge_settings(changes, mass_error=0.0, delay=0.0)
+    case = load_shipped_case().with_delay(given["delay"])
+    port = case.make_port("four_channel_position")
     real = dataclasses.replace(case.slave, mass=case.slave.mass * (1.0 + given["mass_error"]))
     port = dataclasses.replace(port, slave=real)
     s, ideal = 1j * HAND_FREQUENCIES, np.array([[0.0, 1.0], [-1.0, 0.0]])
-    matrix = hybrid(port, s) * np.array([[1 / 30.0, 1.0], [1.0, 30.0]])  # of 30 N s/m
+    matrix = hybrid_matrix(port, s) * np.array([[1 / 30.0, 1.0], [1.0, 30.0]])  # of 30 N s/m
     roots = np.roots([
         case.master.mass + case.slave.mass,
         case.master_control.damping + case.slave_control.damping,
@@ -75,8 +75,8 @@ def measure_transparency(changes: Changes) -> Sample:
     ])  # fmt: skip
     rng, stable = np.random.default_rng(334), []
     for _ in range(100):
-        hand, task = random_impedance(rng, case.hand), random_impedance(rng, case.task)
-        stable.append(holds(port, hand, task))
+        hand, task = draw_impedance(rng, case.hand), draw_impedance(rng, case.task)
+        stable.append(is_strictly_stable(port, hand, task))
     return Sample({
         "matrix": float(np.abs(matrix - ideal).max()),
         "norm": float(scattering_norm(port, 1j * WIDE_FREQUENCIES, 30.0).max()),
@@ -85,21 +85,21 @@ def measure_transparency(changes: Changes) -> Sample:
     })  # fmt: skip
 
 
-def judge_transparency(samples: Sequence[Sample]) -> Judgement:
+def evaluate_transparency(samples: Sequence[Sample]) -> Evaluation:
     """Check the hybrid matrix and the error dynamics."""
     v = samples[0].values
-    return Judgement((
+    return Evaluation((
         check_exact("largest difference of the hybrid matrix from [[0, 1], [-1, 0]], relative to"
-                    " 30 N s/m", v["matrix"], ROUNDING, "rounding"),
+                    " 30 N s/m", v["matrix"], ROUNDING_RANGE, "rounding"),
         check_exact("slowest pole of the position error (3.31)", v["slowest"], (-np.inf, -1e-9),
                     "asymptotic: negative real part", unit="1/s"),
     ))  # fmt: skip
 
 
-def judge_lossless(samples: Sequence[Sample]) -> Judgement:
+def evaluate_passivity(samples: Sequence[Sample]) -> Evaluation:
     """Check the scattering norm and the stability with random passive hands and tasks."""
     v = samples[0].values
-    return Judgement((
+    return Evaluation((
         check_exact("largest scattering norm", v["norm"], (1.0 - 1e-9, PASSIVE_NORM), "1 (3.33)",
                     published=1.0),
         check_exact("stable fraction of 100 random passive hands and tasks", v["stable"],
@@ -107,7 +107,7 @@ def judge_lossless(samples: Sequence[Sample]) -> Judgement:
     ))  # fmt: skip
 
 
-def intervening_port(case: Case) -> TwoPort:
+def build_intervening_port(case: TeleoperatorAxis) -> TwoPort:
     """Return the four-channel two-port with an intervening impedance (3.37).
 
     Its channels need no acceleration signals.
@@ -120,7 +120,7 @@ def intervening_port(case: Case) -> TwoPort:
     """
     own, held = case.master_control, case.slave_control
     return TwoPort(
-        case.master, case.slave, own, held, held, constant_block(1.0), constant_block(1.0),
+        case.master, case.slave, own, held, held, make_constant_block(1.0), make_constant_block(1.0),
         lambda s: -own(s),
     )  # fmt: skip
 
@@ -134,39 +134,39 @@ def measure_intervening(changes: Changes) -> Sample:
     Returns:
         Relative error of the felt impedance, and the stable fraction of random loops.
     """
-    given = read_settings(changes, slave_mass=1.0)
-    case = identical_case()
+    given = merge_settings(changes, slave_mass=1.0)
+    case = make_identical_case()
     side = Impedance(case.master.mass, 10.0, 100.0)
     slave = dataclasses.replace(side, mass=given["slave_mass"] * side.mass)
     case = dataclasses.replace(case, master=side, slave=slave)
-    port, s = intervening_port(case), 1j * HAND_FREQUENCIES
-    felt, expected = transmitted(port, s, case.task), side(s) + case.task(s)
+    port, s = build_intervening_port(case), 1j * HAND_FREQUENCIES
+    felt, expected = transmitted_impedance(port, s, case.task), side(s) + case.task(s)
     rng = np.random.default_rng(347)
-    stable = [holds(port, random_impedance(rng, case.hand), random_impedance(rng, case.task))
+    stable = [is_strictly_stable(port, draw_impedance(rng, case.hand), draw_impedance(rng, case.task))
               for _ in range(100)]  # fmt: skip
     return Sample(
-        {"felt": relative_error(felt, expected), "stable": float(np.mean(stable))},
+        {"felt": compute_relative_error(felt, expected), "stable": float(np.mean(stable))},
         (Panel("impedance [N s/m]", HAND_FREQUENCIES / (2.0 * np.pi), {
             "felt": np.abs(felt), "of the task": np.abs(case.task(s)), "intervening":
             np.abs(side(s))}, "frequency [Hz]", True),),
     )  # fmt: skip
 
 
-def judge_intervening(samples: Sequence[Sample]) -> Judgement:
+def evaluate_intervening(samples: Sequence[Sample]) -> Evaluation:
     """Check the felt impedance (3.39) and the stability of (3.45) and (3.47)."""
     v = samples[0].values
-    return Judgement((
+    return Evaluation((
         check_exact("largest relative difference of the felt impedance and Z_m + Z_e (3.39)",
-                    v["felt"], ROUNDING, "rounding"),
+                    v["felt"], ROUNDING_RANGE, "rounding"),
         check_exact("stable fraction of 100 random passive hands and tasks", v["stable"],
                     (1.0, 1.0), "both loops are stable (3.45, 3.47)"),
     ))  # fmt: skip
 
 
-_ERRORS = np.geomspace(1e-3, 100.0, 26)
+_FORCE_ERRORS = np.geomspace(1e-3, 100.0, 26)
 
 
-def smallest_force_error(case: Case) -> float:
+def find_smallest_force_error(case: TeleoperatorAxis) -> float:
     """Return the smallest relative error of the force feed-forward that destabilizes the loop.
 
     Args:
@@ -176,15 +176,15 @@ def smallest_force_error(case: Case) -> float:
         The error [1]; infinite if no error up to 100 destabilizes the loop, 0 if the smallest
         one, 0.1 %, does.
     """
-    port = case.port("four_channel_position")
+    port = case.make_port("four_channel_position")
 
     def is_stable(error: float) -> bool:
-        wrong = dataclasses.replace(port, force_forward=constant_block(1.0 + error))
-        return holds(wrong, case.hand, case.task)
+        wrong = dataclasses.replace(port, force_forward=make_constant_block(1.0 + error))
+        return is_strictly_stable(wrong, case.hand, case.task)
 
-    if not is_stable(_ERRORS[0]):
+    if not is_stable(_FORCE_ERRORS[0]):
         return 0.0
-    found = first_change(is_stable, _ERRORS)
+    found = find_first_change(is_stable, _FORCE_ERRORS)
     return np.inf if found is None else found
 
 
@@ -197,30 +197,30 @@ def measure_force_error(changes: Changes) -> Sample:
     Returns:
         Smallest destabilizing errors; gain factor and hand stiffness factor for which 5 % suffices.
     """
-    given = read_settings(changes, scale=1.0)
-    case = identical_case()
+    given = merge_settings(changes, scale=1.0)
+    case = make_identical_case()
 
-    def softer(scale: float) -> Case:
+    def soften_controllers(scale: float) -> TeleoperatorAxis:
         control = case.master_control
         soft = Impedance(0.0, scale * control.damping, scale * control.stiffness)
         return dataclasses.replace(case, master_control=soft, slave_control=soft)
 
-    def stiffer(scale: float) -> Case:
+    def stiffen_hand(scale: float) -> TeleoperatorAxis:
         hand = case.hand
         stiff = Impedance(hand.mass, np.sqrt(scale) * hand.damping, scale * hand.stiffness)
         return dataclasses.replace(case, hand=stiff)
 
     scales = np.geomspace(1.0, 1e-3, 7)
-    limits = np.array([smallest_force_error(softer(scale)) for scale in scales])
+    limits = np.array([find_smallest_force_error(soften_controllers(scale)) for scale in scales])
     hands = np.geomspace(1.0, 1e3, 7)
-    by_hand = np.array([smallest_force_error(stiffer(scale)) for scale in hands])
+    by_hand = np.array([find_smallest_force_error(stiffen_hand(scale)) for scale in hands])
     enough, firm = scales[limits <= 0.05], hands[by_hand <= 0.05]
-    port = case.port("four_channel_position")
-    wrong = dataclasses.replace(port, force_forward=constant_block(1.05))
+    port = case.make_port("four_channel_position")
+    wrong = dataclasses.replace(port, force_forward=make_constant_block(1.05))
     return Sample({
-        "limit": smallest_force_error(softer(given["scale"])),
-        "machine": smallest_force_error(shipped_case()),
-        "late": smallest_force_error(case.with_delay(0.005)),
+        "limit": find_smallest_force_error(soften_controllers(given["scale"])),
+        "machine": find_smallest_force_error(load_shipped_case()),
+        "late": find_smallest_force_error(case.with_delay(0.005)),
         "scale": float(enough[0]) if len(enough) else 0.0,
         "hand": float(firm[0]) if len(firm) else np.inf,
         "norm": float(scattering_norm(wrong, 1j * WIDE_FREQUENCIES, 30.0).max()),
@@ -228,10 +228,10 @@ def measure_force_error(changes: Changes) -> Sample:
               "controllers' gains over those of Table 6.7 [1]", True, True),))  # fmt: skip
 
 
-def judge_force_error(samples: Sequence[Sample]) -> Judgement:
+def evaluate_force_error(samples: Sequence[Sample]) -> Evaluation:
     """Compare the smallest destabilizing error with the reported 5 %."""
     v = samples[0].values
-    return Judgement(
+    return Evaluation(
         (check_exact("smallest relative error of the force feed-forward that is unstable",
                      v["limit"], (0.0, 0.05), "5 % is reported to be enough", published=0.05),),
         explanation="the loop is (Z_m + C_m + Z_s + C_s)(Z_h + Z_e) - e Z_h (Z_e - Z_m - C_m): to"
@@ -256,32 +256,32 @@ def measure_rate_force_extremes(changes: Changes) -> Sample:
     Returns:
         Relative differences from (3.50) and (3.51).
     """
-    given = read_settings(changes, structure_with_task=0.0)
-    case, s = shipped_case(), 1j * HAND_FREQUENCIES
-    port = case.port("four_channel_rate" if given["structure_with_task"] else "rate_force")
+    given = merge_settings(changes, structure_with_task=0.0)
+    case, s = load_shipped_case(), 1j * HAND_FREQUENCIES
+    port = case.make_port("four_channel_rate" if given["structure_with_task"] else "rate_force")
     master, control = case.master(s), case.master_control(s)
     rate = case.gains.velocity / s * case.slave_control(s) * case.gains.force
 
-    def felt(scale: float) -> np.ndarray:
+    def compute_felt_impedance(scale: float) -> np.ndarray:
         task = Impedance(0.0, scale * case.task.damping, scale * case.task.stiffness)
-        return transmitted(port, s, task)
+        return transmitted_impedance(port, s, task)
 
     return Sample({
-        "stiff": relative_error(felt(1e8), master + control + rate),
-        "soft": relative_error(felt(1e-8), master + control),
+        "stiff": compute_relative_error(compute_felt_impedance(1e8), master + control + rate),
+        "soft": compute_relative_error(compute_felt_impedance(1e-8), master + control),
     })  # fmt: skip
 
 
-def judge_rate_force_extremes(samples: Sequence[Sample]) -> Judgement:
+def evaluate_rate_force_extremes(samples: Sequence[Sample]) -> Evaluation:
     """Compare the felt impedance with (3.50) and (3.51)."""
     v, reason = samples[0].values, "the task is 10^8 times stiffer or softer; 10^-4 remains"
-    return Judgement((
+    return Evaluation((
         check_exact("relative difference from (3.50), stiff task", v["stiff"], (0.0, 1e-4), reason),
         check_exact("from (3.51), soft task", v["soft"], (0.0, 1e-4), reason),
     ))  # fmt: skip
 
 
-def rate_port(case: Case, velocity_gain: float = 1.0) -> TwoPort:
+def build_rate_port(case: TeleoperatorAxis, velocity_gain: float = 1.0) -> TwoPort:
     """Return the practical four-channel structure under rate control (3.59).
 
     Args:
@@ -307,28 +307,28 @@ def measure_rate_transparency(changes: Changes) -> Sample:
     Returns:
         Relative errors of felt impedance and velocity.
     """
-    given = read_settings(changes, slave_mass=1.0)
-    case, s = identical_case(), 1j * HAND_FREQUENCIES
+    given = merge_settings(changes, slave_mass=1.0)
+    case, s = make_identical_case(), 1j * HAND_FREQUENCIES
     slave = dataclasses.replace(case.slave, mass=given["slave_mass"] * case.slave.mass)
     case = dataclasses.replace(case, slave=slave)
-    usable = rate_port(case)
-    felt, expected = transmitted(usable, s, case.task), case.master(s) + case.task(s)
-    velocity = -hybrid(usable, s)[..., 1, 0] * s  # over the master's position
+    usable = build_rate_port(case)
+    felt, expected = transmitted_impedance(usable, s, case.task), case.master(s) + case.task(s)
+    velocity = -hybrid_matrix(usable, s)[..., 1, 0] * s  # over the master's position
     return Sample(
-        {"felt": relative_error(felt, expected), "velocity": float(np.abs(velocity - 1.0).max())},
+        {"felt": compute_relative_error(felt, expected), "velocity": float(np.abs(velocity - 1.0).max())},
         (Panel("impedance [N s/m]", HAND_FREQUENCIES / (2.0 * np.pi), {
             "felt": np.abs(felt), "of the task": np.abs(case.task(s))}, "frequency [Hz]", True),),
     )  # fmt: skip
 
 
-def judge_rate_transparency(samples: Sequence[Sample]) -> Judgement:
+def evaluate_rate_transparency(samples: Sequence[Sample]) -> Evaluation:
     """Compare felt impedance and velocity with (3.61) and (3.64)."""
     v = samples[0].values
-    return Judgement((
+    return Evaluation((
         check_exact("largest relative difference of the felt impedance and Z_m + Z_e (3.61)",
-                    v["felt"], ROUNDING, "rounding"),
+                    v["felt"], ROUNDING_RANGE, "rounding"),
         check_exact("largest relative difference of the slave's velocity and the velocity gain"
-                    " times the master's position (3.64)", v["velocity"], ROUNDING, "rounding"),
+                    " times the master's position (3.64)", v["velocity"], ROUNDING_RANGE, "rounding"),
     ))  # fmt: skip
 
 
@@ -342,27 +342,31 @@ def measure_master_damping(changes: Changes) -> Sample:
         Unstable fraction of random polynomials, number of unstable poles, and whether a simulated
         kick decays.
     """
-    given = read_settings(changes, damping=0.0)
+    given = merge_settings(changes, damping=0.0)
     rng = np.random.default_rng(372)
-    control, mass, unstable = shipped_case().master_control, shipped_case().master.mass, []
+    control, mass, unstable = (
+        load_shipped_case().master_control,
+        load_shipped_case().master.mass,
+        [],
+    )
     for _ in range(200):
         factor = 10.0 ** rng.uniform(-1.0, 1.0, 5)
         m, b, k = factor[0] * mass, factor[1] * control.damping, factor[2] * control.stiffness
         gain, spring = factor[3], 100.0 * factor[4]
         unstable.append(np.roots([m, given["damping"], spring + b * gain, k * gain]).real.max() > 0)
-    case, side = identical_case(), Impedance(mass, given["damping"], 100.0)
+    case, side = make_identical_case(), Impedance(mass, given["damping"], 100.0)
     whole = dataclasses.replace(case, master=side, slave=side)
-    poles = unstable_poles(rate_port(whole), Impedance(), case.task)
+    poles = count_unstable_poles(build_rate_port(whole), Impedance(), case.task)
     bare = dataclasses.replace(case, hand=dataclasses.replace(case.hand, damping=0.0))
-    seen = agreement(bare, "four_channel_rate", np.zeros(1), np.ones(1)).seen[0, 0]
+    seen = compare_stability(bare, "four_channel_rate", np.zeros(1), np.ones(1)).simulated[0, 0]
     return Sample({"unstable": float(np.mean(unstable)), "poles": float(poles),
                    "kick": float(seen)})  # fmt: skip
 
 
-def judge_master_damping(samples: Sequence[Sample]) -> Judgement:
+def evaluate_master_damping(samples: Sequence[Sample]) -> Evaluation:
     """Check the instability of the polynomial without damping and of the loop without a hand."""
     v = samples[0].values
-    return Judgement((
+    return Evaluation((
         check_exact("unstable fraction of 200 random masters without damping", v["unstable"],
                     (1.0, 1.0), "it can not be stable"),
         check_exact("unstable poles of the whole loop without damping and without a hand",
@@ -375,8 +379,11 @@ def judge_master_damping(samples: Sequence[Sample]) -> Judgement:
        f"{'decays' if v['kick'] else 'grows'}")  # fmt: skip
 
 
-_TASKS = ((2.0, 150.0, 8000.0), (1.0, 60.0, 1500.0))  # two successive tasks [kg], [N s/m], [N/m]
-_LATE = 4.0  # last seconds of a task, in which the stiffness error is evaluated [s]
+_TASK_IMPEDANCES = (
+    (2.0, 150.0, 8000.0),
+    (1.0, 60.0, 1500.0),
+)  # two successive tasks [kg], [N s/m], [N/m]
+_EVALUATION_TIME = 4.0  # last seconds of a task, in which the stiffness error is evaluated [s]
 
 
 def measure_task_identification(seed: int, changes: Changes) -> Sample:
@@ -390,7 +397,7 @@ def measure_task_identification(seed: int, changes: Changes) -> Sample:
     Returns:
         Largest relative stiffness errors before and after the task changes.
     """
-    given = read_settings(changes, forgetting=0.99, reset=8.0, noise=0.02)
+    given = merge_settings(changes, forgetting=0.99, reset=8.0, noise=0.02)
     rng = np.random.default_rng([seed, 374])
     step, n = 0.02, 1000
     time = step * np.arange(n)
@@ -401,20 +408,23 @@ def measure_task_identification(seed: int, changes: Changes) -> Sample:
     a = -0.005 * (w[:, None] ** 2 * np.sin(phase)).sum(axis=0)
     rows = np.column_stack([a, v, x])
     first = time < 10.0
-    truth = np.where(first[:, None], _TASKS[0], _TASKS[1])
+    truth = np.where(first[:, None], _TASK_IMPEDANCES[0], _TASK_IMPEDANCES[1])
     force = np.sum(rows * truth, axis=1)
     force += given["noise"] * np.sqrt(np.mean(force**2)) * rng.standard_normal(n)
     found = RecursiveLeastSquares(
         np.zeros(3), np.array([1e2, 1e3, 1e5]), forgetting=given["forgetting"],
-        reset=given["reset"],
+        reset_ratio=given["reset"],
     )  # fmt: skip
     history = np.empty((n, 3))
     for i in range(n):
         found.update(rows[i], force[i])
         history[i] = found.value
     values = {}
-    for name, end, task in (("before", 10.0, _TASKS[0]), ("after", 20.0, _TASKS[1])):
-        late = (time > end - _LATE) & (time < end)
+    for name, end, task in (
+        ("before", 10.0, _TASK_IMPEDANCES[0]),
+        ("after", 20.0, _TASK_IMPEDANCES[1]),
+    ):
+        late = (time > end - _EVALUATION_TIME) & (time < end)
         values[name] = float(np.abs(history[late, 2] / task[2] - 1.0).max())
     return Sample(values, (
         Panel("stiffness of the task [kN/m]", time, {
@@ -422,14 +432,14 @@ def measure_task_identification(seed: int, changes: Changes) -> Sample:
     ))  # fmt: skip
 
 
-def judge_task_identification(samples: Sequence[Sample]) -> Judgement:
+def evaluate_task_identification(samples: Sequence[Sample]) -> Evaluation:
     """Check the stiffness estimates of both tasks."""
     reason = "23 % of a compliance is not noticeable (Tan 1995); no size is published"
-    return Judgement(
+    return Evaluation(
         tuple(
-            check_mean(f"largest relative error of the stiffness in the last {_LATE:g} s"
-                       f" {words} the task changes", collect(samples, name),
-                       (-np.inf, NOTICED_DIFFERENCE), reason)
+            check_mean(f"largest relative error of the stiffness in the last {_EVALUATION_TIME:g} s"
+                       f" {words} the task changes", collect_values(samples, name),
+                       (-np.inf, NOTICEABLE_DIFFERENCE), reason)
             for name, words in (("before", "before"), ("after", "after"))
         ),
         note=f"after the change {format_values(samples, 'after', 100.0)} %, with forgetting factor"
@@ -438,50 +448,50 @@ def judge_task_identification(samples: Sequence[Sample]) -> Judgement:
 
 
 EXPERIMENTS: tuple[Experiment, ...] = (
-    exact_experiment("four channels, position control", measure_transparency, make_claim(
+    make_exact_experiment("four channels, position control", measure_transparency, make_claim(
         "transparency under position control",
         'H = [[0, 1], [-1, 0]] (3.28); "the master position asymptotically"',
-        "p. 39", judge_transparency, {"mass_error": 0.1}, "a slave 10 % heavier than assumed",
+        "p. 39", evaluate_transparency, {"mass_error": 0.1}, "a slave 10 % heavier than assumed",
     ), make_claim(
         "transparent teleoperator: lossless and stable",
         '"Therefore, from the network point of view, this two-port is passive" (norm 1, 3.33);'
         ' "Hence when it is connected to any" strictly "passive load, the system'
-        ' stability is ensured."', "p. 39", judge_lossless, {"delay": 0.05}, "50 ms each way",
+        ' stability is ensured."', "p. 39", evaluate_passivity, {"delay": 0.05}, "50 ms each way",
     )),
-    exact_experiment("intervening impedance", measure_intervening, make_claim(
+    make_exact_experiment("intervening impedance", measure_intervening, make_claim(
         "intervenient impedance",
         '"Thus the operator indeed feels the object\'s impedance and an intervenient impedance as'
-        ' we expected."', "p. 41, Fig. 3.20", judge_intervening, {"slave_mass": 3.0},
+        ' we expected."', "p. 41, Fig. 3.20", evaluate_intervening, {"slave_mass": 3.0},
         "a slave three times as heavy as the master",
     )),
-    exact_experiment("force feed-forward error", measure_force_error, make_claim(
+    make_exact_experiment("force feed-forward error", measure_force_error, make_claim(
         "force feed-forward error of 5 %",
         '"reported an error of only 5% in the force feed forward could drive the system unstable"',
-        "p. 43", judge_force_error, {"scale": 3.0}, "controllers three times as stiff",
+        "p. 43", evaluate_force_error, {"scale": 3.0}, "controllers three times as stiff",
     )),
-    exact_experiment("direct force, extremes", measure_rate_force_extremes, make_claim(
+    make_exact_experiment("direct force, extremes", measure_rate_force_extremes, make_claim(
         "rate-force structure: extremes",
         '"At these extremes, the operator could only feel some dynamics of the master-slave system;'
         ' it has nothing to do with the dynamics of the task."', "p. 43",
-        judge_rate_force_extremes, {"structure_with_task": 1.0}, "the transparent structure",
+        evaluate_rate_force_extremes, {"structure_with_task": 1.0}, "the transparent structure",
     )),
-    exact_experiment("four channels, rate control", measure_rate_transparency, make_claim(
+    make_exact_experiment("four channels, rate control", measure_rate_transparency, make_claim(
         "transparency under rate control",
         '"Thus we have the same impedance as for position control, which can be interpreted as the'
         ' master impedance plus the task impedance."; "therefore the slave is indeed under rate'
-        ' control"', "p. 46, Fig. 3.21", judge_rate_transparency, {"slave_mass": 3.0},
+        ' control"', "p. 46, Fig. 3.21", evaluate_rate_transparency, {"slave_mass": 3.0},
         "a slave three times as heavy as the master",
     )),
-    exact_experiment("damping of the master", measure_master_damping, make_claim(
+    make_exact_experiment("damping of the master", measure_master_damping, make_claim(
         "rate control: damping of the master",
         '"otherwise, the system can not be stable" (B_mc = 0 in 3.72)', "p. 48",
-        judge_master_damping, {"damping": 200.0}, "a damped master",
+        evaluate_master_damping, {"damping": 200.0}, "a damped master",
     )),
     Experiment("task identification", measure_task_identification, (make_claim(
         "transparency via impedance identification",
         '"On-line recursive least-squares estimation can be used to identify the task impedance'
         ' parameters. In addition, the resetting and forgetting factor technique can be employed to'
-        ' deal with a changing environment."', "p. 48, Fig. 3.22", judge_task_identification,
+        ' deal with a changing environment."', "p. 48, Fig. 3.22", evaluate_task_identification,
         {"forgetting": 1.0, "reset": 1e9}, "neither forgetting nor resetting",
     ),)),
 )  # fmt: skip

@@ -15,34 +15,38 @@ from hydrotele.core.errors import InputError
 from hydrotele.experiments.comparison import (
     Changes,
     Claim,
+    Evaluation,
     Experiment,
-    Judgement,
     Kind,
     Panel,
     Sample,
 )
-from hydrotele.experiments.intervals import check_exact, check_mean, collect, format_values
-from hydrotele.experiments.scenario_runs import operator_changes, run_shipped, true_channel
-from hydrotele.teleop.analysis import Case, gain_margin, load_teleop_case
-from hydrotele.teleop.findings import agreement
+from hydrotele.experiments.intervals import check_exact, check_mean, collect_values, format_values
+from hydrotele.experiments.scenario_runs import (
+    make_operator_changes,
+    read_true_channel,
+    run_shipped,
+)
+from hydrotele.teleop.analysis import TeleoperatorAxis, gain_margin, load_teleop_case
+from hydrotele.teleop.findings import compare_stability
 from hydrotele.teleop.two_port import (
     Impedance,
     TwoPort,
-    hybrid,
+    hybrid_matrix,
     hybrid_scattering_norm,
     scattering_norm,
-    transmitted,
+    transmitted_impedance,
 )
 
-ROUNDING = (0.0, 1e-9)
+ROUNDING_RANGE = (0.0, 1e-9)
 """Accepted relative difference between two computations of the same quantity."""
 HAND_FREQUENCIES = 2.0 * np.pi * np.geomspace(0.1, 5.0, 60)  # rad/s, bandwidth of a human hand
 WIDE_FREQUENCIES = 2.0 * np.pi * np.geomspace(1e-3, 1e3, 2000)  # rad/s
-NOTICED_DIFFERENCE = 0.23  # just noticeable relative difference of a compliance; Tan 1995
+NOTICEABLE_DIFFERENCE = 0.23  # just noticeable relative difference of a compliance; Tan 1995
 PASSIVE_NORM = 1.0 + 1e-9  # largest scattering norm of a passive two-port, with rounding
 
 
-def read_settings(changes: Changes, **defaults: float) -> dict[str, float]:
+def merge_settings(changes: Changes, **defaults: float) -> dict[str, float]:
     """Return the default settings of an experiment with changes applied.
 
     Args:
@@ -61,32 +65,32 @@ def read_settings(changes: Changes, **defaults: float) -> dict[str, float]:
     return defaults | dict(changes)
 
 
-def exact_experiment(name: str, measure: Callable[[Changes], Sample], *claims: Claim) -> Experiment:
+def make_exact_experiment(name: str, measure: Callable[[Changes], Sample], *claims: Claim) -> Experiment:
     """Return an experiment without randomness, which is run once."""
-    return Experiment(name, partial(_measure_once, measure), claims, repetitions_fixed=1)
+    return Experiment(name, partial(_measure_once, measure), claims, fixed_repetitions=1)
 
 
 def _measure_once(measure: Callable[[Changes], Sample], seed: int, changes: Changes) -> Sample:
     return measure(changes)
 
 
-def shipped_case() -> Case:
+def load_shipped_case() -> TeleoperatorAxis:
     """Load the teleoperator axis of `cat215_axis.yaml` without delay."""
-    return load_teleop_case().case().with_delay(0.0)
+    return load_teleop_case().to_axis().with_delay(0.0)
 
 
-def identical_case() -> Case:
+def make_identical_case() -> TeleoperatorAxis:
     """Return the shipped case with the master's parameters on both sides."""
-    case = shipped_case()
+    case = load_shipped_case()
     return dataclasses.replace(case, slave=case.master, slave_control=case.master_control)
 
 
-def constant_block(value: float) -> Callable[[np.ndarray], np.ndarray]:
+def make_constant_block(value: float) -> Callable[[np.ndarray], np.ndarray]:
     """Return a constant transfer function."""
     return lambda s: np.full_like(s, value)
 
 
-def relative_error(found: np.ndarray, expected: np.ndarray) -> float:
+def compute_relative_error(found: np.ndarray, expected: np.ndarray) -> float:
     """Return the largest difference relative to the largest expected magnitude."""
     return float(np.abs(found - expected).max() / np.abs(expected).max())
 
@@ -103,7 +107,7 @@ def measure_hybrid_matrix(changes: Changes) -> Sample:
     Returns:
         Relative errors of both formulas.
     """
-    given = read_settings(changes, velocity_back_sign=1.0)
+    given = merge_settings(changes, velocity_back_sign=1.0)
     rng = np.random.default_rng(313)
     errors = {"matrix": 0.0, "felt": 0.0}
     for _ in range(50):
@@ -119,22 +123,22 @@ def measure_hybrid_matrix(changes: Changes) -> Sample:
         matrix = np.array([[1.0, -back], [-c3(s), b]])
         solved = np.linalg.solve(matrix, np.array([[a, c2(s)], [c1(s), -1.0]]))
         solved[1] *= -1.0
-        errors["matrix"] = max(errors["matrix"], relative_error(hybrid(port, s), solved))
+        errors["matrix"] = max(errors["matrix"], compute_relative_error(hybrid_matrix(port, s), solved))
         # with F_e = Z_e V_e and V_h = 1
         whole = np.array([[1.0, -back - c2(s) * task(s)], [-c3(s), b + task(s)]])
         felt = np.linalg.solve(whole, np.array([a, c1(s)]))[0]
-        found = transmitted(port, s, task)
+        found = transmitted_impedance(port, s, task)
         errors["felt"] = max(errors["felt"], float(abs(found / felt - 1.0)))
     return Sample(errors)
 
 
-def judge_hybrid_matrix(samples: Sequence[Sample]) -> Judgement:
+def evaluate_hybrid_matrix(samples: Sequence[Sample]) -> Evaluation:
     """Check both formulas."""
     values, reason = samples[0].values, "rounding: two solutions of the same equations"
-    return Judgement((
+    return Evaluation((
         check_exact("largest relative error of the hybrid matrix (3.11)", values["matrix"],
-                    ROUNDING, reason),
-        check_exact("of the felt impedance (3.12)", values["felt"], ROUNDING, reason),
+                    ROUNDING_RANGE, reason),
+        check_exact("of the felt impedance (3.12)", values["felt"], ROUNDING_RANGE, reason),
     ))  # fmt: skip
 
 
@@ -147,7 +151,7 @@ def measure_delayed_channel(changes: Changes) -> Sample:
     Returns:
         `least`: smallest norm over the delays; `lossless`: largest norm of the lossless line.
     """
-    given = read_settings(changes, wave_impedance=0.0)
+    given = merge_settings(changes, wave_impedance=0.0)
     delays = np.array([1e-3, 1e-2, 5e-2, 0.2, 1.0, 5.0])
     s = 1j * np.geomspace(0.05, 500.0, 4001)
     norms, lossless = [], []
@@ -166,17 +170,17 @@ def measure_delayed_channel(changes: Changes) -> Sample:
     ))  # fmt: skip
 
 
-def judge_delayed_channel(samples: Sequence[Sample]) -> Judgement:
+def evaluate_delayed_channel(samples: Sequence[Sample]) -> Evaluation:
     """Check that the norm exceeds 1 for all delays."""
     values = samples[0].values
-    return Judgement(
+    return Evaluation(
         (check_exact("smallest over six delays from 1 ms to 5 s of the largest scattering norm",
                      values["least"], (PASSIVE_NORM, np.inf), "above 1 is not passive (3.6)"),),
         note=f"a lossless line with the same delays has {values['lossless']:.3g}",
     )  # fmt: skip
 
 
-_DELAYS, _FACTORS = np.array([0.0, 0.02, 0.1]), np.array([0.1, 1.0, 5.0, 30.0])
+_DELAYS, _GAIN_FACTORS = np.array([0.0, 0.02, 0.1]), np.array([0.1, 1.0, 5.0, 30.0])
 
 
 def measure_nyquist(changes: Changes) -> Sample:
@@ -188,25 +192,23 @@ def measure_nyquist(changes: Changes) -> Sample:
     Returns:
         `fraction` of loops that agree, and number of loops `cells`.
     """
-    given = read_settings(changes, simulated_task=1.0)
-    case, right, cells = shipped_case(), 0, 0
-    real = dataclasses.replace(
-        case, task=dataclasses.replace(case.task, stiffness=given["simulated_task"] * 36e3)
-    )
+    given = merge_settings(changes, simulated_task=1.0)
+    case, right, cells = load_shipped_case(), 0, 0
+    real = dataclasses.replace(case, task=dataclasses.replace(case.task, stiffness=given["simulated_task"] * 36e3))
     for structure in ("position_position", "position_force", "rate_position", "rate_force"):
-        predicted = agreement(case, structure, _DELAYS, _FACTORS)
-        seen = predicted.seen
+        predicted = compare_stability(case, structure, _DELAYS, _GAIN_FACTORS)
+        seen = predicted.simulated
         if given["simulated_task"] != 1.0:
-            seen = agreement(real, structure, _DELAYS, _FACTORS).seen
+            seen = compare_stability(real, structure, _DELAYS, _GAIN_FACTORS).simulated
         right += int(np.sum(predicted.predicted == seen))
         cells += seen.size
     return Sample({"fraction": right / cells, "cells": float(cells)})
 
 
-def judge_nyquist(samples: Sequence[Sample]) -> Judgement:
+def evaluate_nyquist(samples: Sequence[Sample]) -> Evaluation:
     """Check that criterion and simulation agree for all loops."""
     values = samples[0].values
-    return Judgement((
+    return Evaluation((
         check_exact(f"fraction of {values['cells']:.0f} loops (four structures, three delays, four"
                     " gains) in which the criterion and a simulated kick agree", values["fraction"],
                     (1.0, 1.0), "the criterion is necessary and sufficient"),
@@ -226,11 +228,11 @@ def measure_coordinating_force(changes: Changes) -> Sample:
     Returns:
         `norm`: largest scattering norm; `difference`: relative difference of hybrid matrices.
     """
-    given = read_settings(changes, slave_gain=1.0, coupling_gain=1.0)
-    case = identical_case()
+    given = merge_settings(changes, slave_gain=1.0, coupling_gain=1.0)
+    case = make_identical_case()
     control, k = case.master_control, given["slave_gain"]
     held = Impedance(0.0, k * control.damping, k * control.stiffness)
-    port = dataclasses.replace(case, slave_control=held).port("position_position")
+    port = dataclasses.replace(case, slave_control=held).make_port("position_position")
     s = 1j * WIDE_FREQUENCIES
     # masses M_m and M_s joined by C: F_h = Z_m V_h + C (V_h - V_e), -F_e = Z_s V_e - C (V_h - V_e)
     a, b = port.master(s), port.slave(s)
@@ -238,32 +240,32 @@ def measure_coordinating_force(changes: Changes) -> Sample:
     whole = b + c
     rows = [[a + c - c * c / whole, c / whole], [-c / whole, 1.0 / whole]]
     network = np.moveaxis(np.array(rows), (0, 1), (-2, -1))
-    found = hybrid(port, s)
+    found = hybrid_matrix(port, s)
     error = np.abs(found - network).max(axis=0) / np.abs(network).max(axis=0)
     return Sample({"norm": float(scattering_norm(port, s, 30.0).max()),
                    "difference": float(error.max())})  # fmt: skip
 
 
-def judge_passive_coupling(samples: Sequence[Sample]) -> Judgement:
+def evaluate_passivity(samples: Sequence[Sample]) -> Evaluation:
     """Check the passivity by the scattering norm."""
-    return Judgement((
+    return Evaluation((
         check_exact("largest scattering norm, 1 mHz to 1 kHz", samples[0].values["norm"],
                     (0.0, PASSIVE_NORM), "passive (3.6), with rounding"),
     ))  # fmt: skip
 
 
-def judge_mechanical_equivalent(samples: Sequence[Sample]) -> Judgement:
+def evaluate_mechanical_equivalent(samples: Sequence[Sample]) -> Evaluation:
     """Check that both hybrid matrices are equal."""
-    return Judgement((
+    return Evaluation((
         check_exact("largest relative difference of the hybrid matrices",
-                    samples[0].values["difference"], ROUNDING, "rounding"),
+                    samples[0].values["difference"], ROUNDING_RANGE, "rounding"),
     ))  # fmt: skip
 
 
-_DURATION = 16.0  # duration of the first target, 20 kN [s]
+_FIRST_TARGET_DURATION = 16.0  # duration of the first target, 20 kN [s]
 
 
-def measure_pressing(seed: int, changes: Changes) -> Sample:
+def measure_contact_error(seed: int, changes: Changes) -> Sample:
     """Compare the position error due to a contact force with the measurement noise.
 
     The excavator presses with 20 kN under stiffness feedback. The joystick's stiffness is also
@@ -276,12 +278,12 @@ def measure_pressing(seed: int, changes: Changes) -> Sample:
     Returns:
         Position error and noise [m], their ratio, contact force [N], and relative stiffness error.
     """
-    keys = {"duration": str(_DURATION)} | operator_changes(seed) | dict(changes)
+    keys = {"duration": str(_FIRST_TARGET_DURATION)} | make_operator_changes(seed) | dict(changes)
     scenario, run = run_shipped("press_stiffness", keys)
     m = run.measured
-    height = np.interp(m.time, run.truth.time, true_channel(run, "truth.tip.z"))
+    height = np.interp(m.time, run.truth.time, read_true_channel(run, "truth.tip.z"))
     error = m["tip_reference.z"] - m["tip_pose.z"]
-    free, late = (m.time > 0.3) & (m.time < 1.0), m.time > _DURATION - 5.0
+    free, late = (m.time > 0.3) & (m.time < 1.0), m.time > _FIRST_TARGET_DURATION - 5.0
     shift = float(abs(error[late].mean() - error[free].mean()))
     noise = float((m["tip_pose.z"] - height)[late].std())
     force = float(np.mean(m["tip_force.z"][late]))
@@ -298,11 +300,11 @@ def measure_pressing(seed: int, changes: Changes) -> Sample:
     ))  # fmt: skip
 
 
-def judge_position_error(samples: Sequence[Sample]) -> Judgement:
+def evaluate_position_error(samples: Sequence[Sample]) -> Evaluation:
     """Check that the position error is smaller than the noise."""
-    return Judgement(
+    return Evaluation(
         (check_mean("position error due to contact over the RMS noise of the measured"
-                    " position", collect(samples, "ratio"), (-np.inf, 1.0),
+                    " position", collect_values(samples, "ratio"), (-np.inf, 1.0),
                     "smaller than the noise"),),
         note=f"{format_values(samples, 'shift', 1e3)} mm with"
         f" {format_values(samples, 'force', 1e-3)} kN; noise {format_values(samples, 'noise', 1e3)}"
@@ -310,11 +312,11 @@ def judge_position_error(samples: Sequence[Sample]) -> Judgement:
     )  # fmt: skip
 
 
-def judge_stiffness_law(samples: Sequence[Sample]) -> Judgement:
+def evaluate_stiffness_law(samples: Sequence[Sample]) -> Evaluation:
     """Compare the joystick's stiffness with (4.1) and the values of Tables 6.7 and 6.8."""
-    return Judgement((
+    return Evaluation((
         check_mean("RMS difference of the stiffness along z from (4.1), relative",
-                   collect(samples, "law"), (-np.inf, 0.05),
+                   collect_values(samples, "law"), (-np.inf, 0.05),
                    "log times of force and stiffness differ by up to 20 ms"),
     ))  # fmt: skip
 
@@ -328,8 +330,8 @@ def measure_direct_force(changes: Changes) -> Sample:
     Returns:
         Gain margins without delay and with 20 ms each way.
     """
-    given = read_settings(changes, task=1.0)
-    case, k = shipped_case(), given["task"]
+    given = merge_settings(changes, task=1.0)
+    case, k = load_shipped_case(), given["task"]
     task = Impedance(0.0, k * case.task.damping, k * case.task.stiffness)
     case = dataclasses.replace(case, task=task)
     late = case.with_delay(0.02)
@@ -341,11 +343,11 @@ def measure_direct_force(changes: Changes) -> Sample:
     })  # fmt: skip
 
 
-def judge_rate_force(samples: Sequence[Sample]) -> Judgement:
+def evaluate_rate_force(samples: Sequence[Sample]) -> Evaluation:
     """Check that rate control has a limit without delay that is below that of position control."""
     v = samples[0].values
     ratio = v["rate"] / v["position"]
-    return Judgement(
+    return Evaluation(
         (
             check_exact("largest stable factor of the reflected force under rate control, without"
                         " delay", v["rate"], (0.0, 100.0), "a limit exists; 100 times the shipped"
@@ -359,10 +361,10 @@ def judge_rate_force(samples: Sequence[Sample]) -> Judgement:
     )  # fmt: skip
 
 
-def judge_position_force(samples: Sequence[Sample]) -> Judgement:
+def evaluate_position_force(samples: Sequence[Sample]) -> Evaluation:
     """Check that position control with direct force is unstable but stable with a smaller gain."""
     v = samples[0].values
-    return Judgement(
+    return Evaluation(
         (check_exact("largest stable factor of the reflected force under position control, 20 ms"
                      " each way", v["late_position"], (1e-9, 1.0 - 1e-9),
                      "unstable with the shipped gain, stable with a smaller gain"),),
@@ -370,7 +372,7 @@ def judge_position_force(samples: Sequence[Sample]) -> Judgement:
     )  # fmt: skip
 
 
-def measure_opacity(changes: Changes) -> Sample:
+def measure_impedance_difference(changes: Changes) -> Sample:
     """Compute the relative difference of felt and task impedance at hand frequencies.
 
     Args:
@@ -379,14 +381,14 @@ def measure_opacity(changes: Changes) -> Sample:
     Returns:
         Largest relative difference of each structure.
     """
-    given = read_settings(changes, transparent=0.0)
-    case, s, values, curves = shipped_case(), 1j * HAND_FREQUENCIES, {}, {}
+    given = merge_settings(changes, transparent=0.0)
+    case, s, values, curves = load_shipped_case(), 1j * HAND_FREQUENCIES, {}, {}
     names = {"position_position": "position_position", "position_force": "position_force",
              "rate_force": "rate_force"}  # fmt: skip
     for name, structure in names.items():
         if given["transparent"]:
             structure = "four_channel_position"
-        felt = transmitted(case.port(structure), s, case.task) / case.task(s)
+        felt = transmitted_impedance(case.make_port(structure), s, case.task) / case.task(s)
         values[name] = float(np.abs(felt - 1.0).max())
         curves[name.replace("_", "-")] = np.abs(felt)
     return Sample(values, (
@@ -395,12 +397,12 @@ def measure_opacity(changes: Changes) -> Sample:
     ))  # fmt: skip
 
 
-def _judge_opacity(*structures: str) -> Callable[[Sequence[Sample]], Judgement]:
-    def judge(samples: Sequence[Sample]) -> Judgement:
-        return Judgement(tuple(
+def _make_impedance_evaluation(*structures: str) -> Callable[[Sequence[Sample]], Evaluation]:
+    def judge(samples: Sequence[Sample]) -> Evaluation:
+        return Evaluation(tuple(
             check_exact(
                 f"largest relative difference of the felt and the task's impedance,"
-                f" {name.replace('_', '-')}", samples[0].values[name], (NOTICED_DIFFERENCE, np.inf),
+                f" {name.replace('_', '-')}", samples[0].values[name], (NOTICEABLE_DIFFERENCE, np.inf),
                 "23 % of a compliance is noticeable (Tan 1995)",
             ) for name in structures
         ))  # fmt: skip
@@ -409,79 +411,79 @@ def _judge_opacity(*structures: str) -> Callable[[Sequence[Sample]], Judgement]:
 
 
 def make_claim(
-    name: str, quote: str, item: str, judge: Callable[[Sequence[Sample]], Judgement],
-    broken: Changes | None, broken_how: str, kind: Kind = "document",
+    name: str, quote: str, item: str, evaluate: Callable[[Sequence[Sample]], Evaluation],
+    fault: Changes | None, fault_description: str, kind: Kind = "document",
 ) -> Claim:  # fmt: skip
     """Return a claim; the arguments have the order name, statement, source, evaluation, fault."""
-    return Claim(name, quote, item, kind, judge, broken, broken_how)
+    return Claim(name, quote, item, kind, evaluate, fault, fault_description)
 
 
 EXPERIMENTS: tuple[Experiment, ...] = (
-    exact_experiment("hybrid matrix", measure_hybrid_matrix, make_claim(
+    make_exact_experiment("hybrid matrix", measure_hybrid_matrix, make_claim(
         "general structure: hybrid matrix",
         '"The hybrid matrix of this two-port teleoperator system can be easily derived" (3.11,'
-        " 3.12)", "p. 30, Fig. 3.13", judge_hybrid_matrix, {"velocity_back_sign": -1.0},
+        " 3.12)", "p. 30, Fig. 3.13", evaluate_hybrid_matrix, {"velocity_back_sign": -1.0},
         "the returned velocity has the wrong sign in the equations",
     )),
-    exact_experiment("delayed channel", measure_delayed_channel, make_claim(
+    make_exact_experiment("delayed channel", measure_delayed_channel, make_claim(
         "delay: not passive",
         '"It can be shown that the standard method of communicating forces and velocity between the'
         ' master and slave in a teleoperator system leads to a nonpassive system for any time'
-        ' delay."', "p. 28, Eq. 3.8", judge_delayed_channel, {"wave_impedance": 1.0},
+        ' delay."', "p. 28, Eq. 3.8", evaluate_delayed_channel, {"wave_impedance": 1.0},
         "a lossless line instead of the delayed channel",
     )),
-    exact_experiment("Nyquist criterion", measure_nyquist, make_claim(
+    make_exact_experiment("Nyquist criterion", measure_nyquist, make_claim(
         "closed-loop stability by the loop transfer functions",
         'the Nyquist plots of LG1 and LG2 "can not encircle the critical point" for a stable'
-        " system", "p. 31, Fig. 3.14", judge_nyquist, {"simulated_task": 0.01},
+        " system", "p. 31, Fig. 3.14", evaluate_nyquist, {"simulated_task": 0.01},
         "the simulated task is a hundred times softer than that of the criterion",
     )),
-    exact_experiment("coordinating force", measure_coordinating_force, make_claim(
+    make_exact_experiment("coordinating force", measure_coordinating_force, make_claim(
         "position-position structure: passive",
         '"coordinating force (position error) method can be shown to be passive under position'
         ' control"; "any circuit network made up of strictly passive" "components is itself'
         ' passive, thus the system can not go unstable"', "p. 32, Figs 3.15, 3.16",
-        judge_passive_coupling, {"slave_gain": 3.0},
+        evaluate_passivity, {"slave_gain": 3.0},
         "the slave's controller three times as stiff as the master's",
     ), make_claim(
         "position-position structure: mechanical equivalence",
         '"The mechanical equivalent of the above two-port teleoperator system is shown" as two'
-        " masses joined by a spring and a damper", "p. 33, Fig. 3.17", judge_mechanical_equivalent,
+        " masses joined by a spring and a damper", "p. 33, Fig. 3.17", evaluate_mechanical_equivalent,
         {"coupling_gain": 2.0}, "a spring and a damper twice as large between the masses",
     )),
-    Experiment("pressing", measure_pressing, (make_claim(
+    Experiment("pressing", measure_contact_error, (make_claim(
         "rate-position structure: position error below noise",
         '"the position gain is so high for hydraulic mobile machines such as excavators and'
         ' feller-bunchers that there is virtually no position error for feedback considering the'
-        ' noise"', "p. 34, Fig. 3.18", judge_position_error, {"servo.position_gain": "1.0"},
+        ' noise"', "p. 34, Fig. 3.18", evaluate_position_error, {"servo.position_gain": "1.0"},
         "joint loops with an eighth of the position gain",
     ), make_claim(
         "stiffness adjustment",
         "the stiffness of the joystick is that of (4.1) with Tables 6.7 and 6.8",
-        "p. 51, Fig. 4.24", judge_stiffness_law, {"pilot.reflection": "none"}, "no reflection",
+        "p. 51, Fig. 4.24", evaluate_stiffness_law, {"pilot.reflection": "none"}, "no reflection",
         "input",
     )), max_repetitions=6),
-    exact_experiment("direct force, linear", measure_direct_force, make_claim(
+    make_exact_experiment("direct force, linear", measure_direct_force, make_claim(
         "position-force structure: reduced gain",
         '"For position control with direct force feedback, stability can be achieved by reducing'
-        ' the loop gain"', "p. 36, Fig. 3.19", judge_position_force, {"task": 1e-6},
+        ' the loop gain"', "p. 36, Fig. 3.19", evaluate_position_force, {"task": 1e-6},
         "a task a million times softer, which reflects no force",
     ), make_claim(
         "rate control with direct force feedback",
         '"Therefore rate control with direct force feedback tends to be unstable even without'
-        ' time-delay in the system."', "p. 37", judge_rate_force, {"task": 1e-6},
+        ' time-delay in the system."', "p. 37", evaluate_rate_force, {"task": 1e-6},
         "a task a million times softer, which reflects no force",
     )),
-    exact_experiment("felt impedance", measure_opacity, make_claim(
+    make_exact_experiment("felt impedance", measure_impedance_difference, make_claim(
         "structures that are not transparent, position control",
         '"the position-position structure does not provide transparency, nor does the'
         ' position-force structure if the dynamics of the system can not be neglected"',
-        "p. 37, Figs 3.15, 3.19", _judge_opacity("position_position", "position_force"),
+        "p. 37, Figs 3.15, 3.19", _make_impedance_evaluation("position_position", "position_force"),
         {"transparent": 1.0}, "the transparent four-channel structure instead",
     ), make_claim(
         "structures that are not transparent, rate control",
         '"The position-force structure does not provide transparency nor does the rate-force'
-        ' structure."', "p. 43", _judge_opacity("rate_force"), {"transparent": 1.0},
+        ' structure."', "p. 43", _make_impedance_evaluation("rate_force"), {"transparent": 1.0},
         "the transparent four-channel structure instead",
     )),
 )  # fmt: skip

@@ -26,30 +26,30 @@ from hydrotele.estimate.reduced_model import (
     reduced_model,
 )
 from hydrotele.hydraulics.circuit import (
-    SLOTS,
+    SLOT_COUNT,
     Slot,
     actuator_friction,
     actuator_stop,
     axis_opening,
     chamber_flows,
-    circuit_supply,
-    delivered_share,
-    demanded_share,
-    open_ports,
+    circuit_supply_pressure,
+    compute_ports,
+    delivered_flow_fraction,
+    demanded_flow_fraction,
     pump_response,
 )
-from hydrotele.hydraulics.laws import air_compliance, port_flow, softening, spool_step
-from hydrotele.hydraulics.parameters import PUMP, actuator_order, actuator_parameters
+from hydrotele.hydraulics.laws import air_compliance, air_softening_factor, port_flow, spool_step
+from hydrotele.hydraulics.parameters import PUMP_OFFSET, actuator_order, actuator_parameters
 from hydrotele.hydraulics.pump import load_force, load_pressure_step
-from hydrotele.hydraulics.supply import drawn_flow, highest_supply
+from hydrotele.hydraulics.supply import drawn_flow, max_supply_pressure
 from hydrotele.identify import smoothing
 from hydrotele.kinematics.from_machine import axis_linkage
-from hydrotele.kinematics.linkages import LoopOpen
+from hydrotele.kinematics.linkages import LoopOpenError
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.logs.log import Log
 from hydrotele.logs.rows import fit_clock
-from hydrotele.machine.machine import Machine, SensorError, noise_rms, sensor_set
-from hydrotele.machine.signals import parse_channel, usual_unit
+from hydrotele.machine.machine import Machine, SensorError, get_sensors, noise_rms
+from hydrotele.machine.signals import default_unit, parse_channel
 from hydrotele.multibody.reduced_mechanism import (
     BAR,
     BIAS,
@@ -59,7 +59,7 @@ from hydrotele.multibody.reduced_mechanism import (
     LENGTH_BIAS,
     LENGTH_ROW,
     RATE,
-    gather_forces,
+    compute_mass_and_bias,
 )
 
 _AH, _AR, _LEAK = int(Slot.AREA_HEAD), int(Slot.AREA_ROD), int(Slot.LEAKAGE)
@@ -69,7 +69,7 @@ _BETA, _HOSE = int(Slot.BULK_MODULUS), int(Slot.HOSE_COMPLIANCE)
 _AIR, _ONSET = int(Slot.AIR_RELEASE), int(Slot.AIR_ONSET)
 _BUBBLES = int(Slot.ENTRAINED_AIR)
 _LAG, _DELIVERY = int(Slot.PUMP_TIME_CONSTANT), int(Slot.DELIVERY)
-_MEMORY, _PUMP = int(Slot.MEMORY), int(Slot.PUMP_FLOW)
+_MEMORY, _PUMP = int(Slot.EXTRA_STATES), int(Slot.PUMP_FLOW)
 
 
 @compiled
@@ -99,7 +99,7 @@ def load_forces(model, space, motion):
         z[:free] = motion[k, 0]
         z[total : total + free] = motion[k, 1]
         place(model, space, z)
-        gather_forces(mech, m)
+        compute_mass_and_bias(mech, m)
         acceleration = m.joint[DRIFT] + m.basis @ motion[k, 2]
         tree = m.mass @ acceleration + m.joint[BIAS] + mech.joint[DAMPING] * m.joint[RATE]
         load[:] = m.basis.T @ tree
@@ -112,9 +112,9 @@ def load_forces(model, space, motion):
             bar = mech.drive[i, BAR]
             if bar >= 0:
                 change += m.bar[bar, LENGTH_BIAS] + np.sum(m.bar[bar, LENGTH_ROW:] * m.joint[DRIFT])
-            forces[k, i] += actuator_friction(model.user, i * SLOTS, velocity)
+            forces[k, i] += actuator_friction(model.user, i * SLOT_COUNT, velocity)
             at = space.drive[X, i] if model.gear[i] < 0 else load_position(model, space, i)
-            forces[k, i] -= actuator_stop(model.user, i * SLOTS, at, velocity)[0]
+            forces[k, i] -= actuator_stop(model.user, i * SLOT_COUNT, at, velocity)[0]
             if model.gear[i] >= 0:
                 forces[k, i] += model.transmission[model.gear[i], 0] * change
     return forces
@@ -153,8 +153,8 @@ def chamber_residuals(user, spool, supply, head, rod, volumes, velocity):
         stored_head = (volumes[0, k] * soft + hose) * head[1, k]
         soft = 1.0 / beta + air_compliance(p_rod, user[_BUBBLES])
         stored_rod = (volumes[1, k] * soft + hose) * rod[1, k]
-        soft_head = softening(p_head, user[_AIR], user[_ONSET])
-        soft_rod = softening(p_rod, user[_AIR], user[_ONSET])
+        soft_head = air_softening_factor(p_head, user[_AIR], user[_ONSET])
+        soft_rod = air_softening_factor(p_rod, user[_AIR], user[_ONSET])
         out[0, k] = stored_head + soft_head * (user[_AH] * velocity[k] + leak - q_head - r_head)
         out[1, k] = stored_rod - soft_rod * (user[_AR] * velocity[k] + leak + q_rod + r_rod)
     return out
@@ -167,9 +167,9 @@ def _settle(user, spools, pressures, period, act, ports):
     for i in range(count):
         act[4 * i] = spools[i]
         act[4 * i + 2], act[4 * i + 3] = pressures[i]
-    open_ports(user, act, act, ports, 0, count, 0.0, act)
+    compute_ports(user, act, act, ports, 0, count, 0.0, act)
     if user[_LAG] > 0.0:
-        wanted = demanded_share(user, 0, count, ports)
+        wanted = demanded_flow_fraction(user, 0, count, ports)
         act[at] = pump_response(user, 0, wanted, act[at], period) if period > 0.0 else wanted
 
 
@@ -194,7 +194,7 @@ def supply_pressures(user, spools, pressures, period):
     act = np.zeros(4 * count + int(user[_MEMORY]))
     for k in range(rows):
         _settle(user, spools[:, k], pressures[:, :, k], period if k else 0.0, act, ports)
-        out[k] = circuit_supply(user, 0, count, ports, delivered_share(user, 0, act))
+        out[k] = circuit_supply_pressure(user, 0, count, ports, delivered_flow_fraction(user, 0, act))
     return out
 
 
@@ -220,9 +220,9 @@ def pump_lacks(user, spools, pressures, supply, period):
     act = np.zeros(4 * count + int(user[_MEMORY]))
     for k in range(rows):
         _settle(user, spools[:, k], pressures[:, :, k], period if k else 0.0, act, ports)
-        given = user[_PUMP] * delivered_share(user, 0, act)
+        given = user[_PUMP] * delivered_flow_fraction(user, 0, act)
         out[0, k] = drawn_flow(user, 0, count, ports, supply[k]) - given
-        out[1, k] = highest_supply(user, 0, count, ports) - supply[k]
+        out[1, k] = max_supply_pressure(user, 0, count, ports) - supply[k]
     return out
 
 
@@ -256,9 +256,7 @@ class Signals:
         return all(channel in self.smoothed for channel in channels)
 
 
-def read_signals(
-    machine: Machine, log: Log, sensors: str | None, noise: Mapping[str, float] | None = None
-) -> Signals:
+def read_signals(machine: Machine, log: Log, sensors: str | None, noise: Mapping[str, float] | None = None) -> Signals:
     """Signals of a log.
 
     Args:
@@ -276,7 +274,7 @@ def read_signals(
     clock, _ = fit_clock(log.time, log.source)
     rows = int(clock.tick[-1]) + 1
     time = clock.start + clock.period * np.arange(rows)
-    stated = None if sensors is None else sensor_set(machine, sensors)
+    stated = None if sensors is None else get_sensors(machine, sensors)
     command, reading, found, smoothed = {}, {}, {}, {}
     told = noise or {}
     for k, (name, values) in enumerate(log.columns.items()):
@@ -298,7 +296,7 @@ def read_signals(
             continue
         motion = smoothing.smooth(on_clock[:, None], clock.period, sigma)
         best = np.stack([motion.value, motion.rate, motion.acceleration])[None, :, :, 0]
-        draws = smoothing.error_draws(motion, DRAWS, k)[..., 0]
+        draws = smoothing.sample_errors(motion, DRAWS, k)[..., 0]
         reading[name], found[name] = on_clock, float(motion.noise[0])
         smoothed[name] = np.concatenate([best, best + draws])
     return Signals(time, clock.period, command, reading, found, smoothed)
@@ -325,7 +323,7 @@ def joint_motion(machine: Machine, signals: Signals, axis: str) -> np.ndarray | 
     length, speed, change = np.moveaxis(signals.smoothed[f"length.{axis}"], 1, 0)
     try:
         angle = linkage.angle(length + cylinder.closed_length)
-    except LoopOpen:
+    except LoopOpenError:
         return None
     lever, step = linkage.rate(angle), 1.0e-5  # rad or m: truncation 1e-10, cancellation 1e-11
     bend = (linkage.rate(angle + step) - linkage.rate(angle - step)) / (2.0 * step)
@@ -369,7 +367,7 @@ def _last_known(values: np.ndarray) -> np.ndarray:
 
 def _corrected(values: np.ndarray, error: SensorError, time: np.ndarray) -> np.ndarray:
     values = (values - error.offset_at(time)) / error.scale
-    if not error.late:
+    if not error.is_delayed:
         return values
     # a first-order lag delays motions slower than itself by its time constant
     rows, lag = np.arange(len(values)), (error.delay + error.time_constant) / (time[1] - time[0])
@@ -381,9 +379,7 @@ _LARGEST = 0.5  # s: lag that is searched
 _LEAST_CORRELATION = 0.5  # correlation below which a window tells nothing
 
 
-def window_lags(
-    expected: np.ndarray, measured: np.ndarray, period: float
-) -> tuple[np.ndarray, np.ndarray] | None:
+def window_lags(expected: np.ndarray, measured: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray] | None:
     """Lag of a measured behind an expected signal in windows, with its noise.
 
     The lag is where the cross-correlation of the two, without their means, has its peak, refined by
@@ -403,12 +399,7 @@ def window_lags(
     edges = np.linspace(0, rows, count + 1).astype(int)
     lag, noise = np.full(rows, np.nan), np.full(rows, np.nan)
     for begin, end in zip(edges[:-1], edges[1:], strict=True):
-        lags = np.array(
-            [
-                peak_lag(e[begin:end], m[begin:end], period)
-                for e, m in zip(expected, measured, strict=True)
-            ]
-        )
+        lags = np.array([peak_lag(e[begin:end], m[begin:end], period) for e, m in zip(expected, measured, strict=True)])
         if np.isfinite(lags[0]) and np.isfinite(lags[1:]).sum() > len(lags) // 2:
             lag[begin:end] = lags[0]
             noise[begin:end] = np.sqrt(np.nanmean((lags[1:] - lags[0]) ** 2))
@@ -478,9 +469,7 @@ class Balance:
     normalised_rms: float
 
 
-def run_balances(
-    machine: Machine, data: Dataset, run: RunData, noise: np.ndarray
-) -> dict[str, dict[str, Balance]]:
+def run_balances(machine: Machine, data: Dataset, run: RunData, noise: np.ndarray) -> dict[str, dict[str, Balance]]:
     """Balances of a run as a dataset has it: mended, and without rows that may not be used.
 
     Args:
@@ -505,9 +494,7 @@ def run_balances(
     return {law: {p: masked(b) for p, b in places.items()} for law, places in found.items()}
 
 
-def pump_lack(
-    machine: Machine, data: Dataset, run: RunData, noise: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def pump_lack(machine: Machine, data: Dataset, run: RunData, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Flow that the pump of the valves gives beyond the model's, where it is short.
 
     Read off the supply's balance, row by row: a filter whose model has the pump at its relief
@@ -546,8 +533,8 @@ def _signals(machine: Machine, data: Dataset, run: RunData, noise: np.ndarray) -
     columns = {f"command.{axis}": v for axis, v in zip(data.axes, run.command.T, strict=True)}
     columns |= dict(zip(data.channels, run.reading.T, strict=True))
     time = run.start + run.period * np.arange(len(run.command))
-    log = Log(time, columns, {c: usual_unit(c, columns) for c in columns}, source=run.name)
-    each = noise if run.behind is None else noise / np.sqrt(run.behind)
+    log = Log(time, columns, {c: default_unit(c, columns) for c in columns}, source=run.name)
+    each = noise if run.readings_per_mean is None else noise / np.sqrt(run.readings_per_mean)
     known = dict(zip(data.channels, each.tolist(), strict=True))
     return read_signals(machine, log, data.sensors, known)
 
@@ -591,10 +578,7 @@ Found = Iterator[tuple[str, str, Balance]]
 
 def _balance(time: np.ndarray, residual: np.ndarray, noise: np.ndarray, unit: str) -> Balance:
     ratio = np.divide(residual, noise, out=np.full(len(noise), np.nan), where=noise > 0)
-    rms, normalised = (
-        float(np.sqrt(np.nanmean(v**2))) if np.isfinite(v).any() else np.nan
-        for v in (residual, ratio)
-    )
+    rms, normalised = (float(np.sqrt(np.nanmean(v**2))) if np.isfinite(v).any() else np.nan for v in (residual, ratio))
     return Balance(time, residual, noise, unit, rms, normalised)
 
 
@@ -620,7 +604,7 @@ def _force(machine: Machine, signals: Signals) -> Found:
     order, model = actuator_order(machine), reduced_model(machine, ())
     motions = {name: joint_motion(machine, signals, name) for name in order}
     driven = {int(j): name for j, name in zip(model.mech.drive[:, JOINT], order, strict=True)}
-    free = [driven.get(int(j), "") for j in model.mech.free]
+    free = [driven.get(int(j), "") for j in model.mech.independent]
     parts = [motions[name] for name in free if name and motions[name] is not None]
     pushes = {name: _push(machine, signals, name) for name in order}
     known = {name: push for name, push in pushes.items() if push is not None}
@@ -669,8 +653,8 @@ def _load(machine: Machine, name: str, motion: np.ndarray, period: float) -> np.
     for d, (_, velocity, _) in enumerate(motion):
         pressure = 0.0
         for row in range(1, len(velocity)):
-            pressure = load_pressure_step(user, PUMP, pressure, velocity[row], period)
-            forces[d, row] = load_force(user, PUMP, pressure)
+            pressure = load_pressure_step(user, PUMP_OFFSET, pressure, velocity[row], period)
+            forces[d, row] = load_force(user, PUMP_OFFSET, pressure)
         way = np.tanh(velocity / smooth)
         forces[d] += load.friction * forces[d] * way + load.return_force * np.minimum(way, 0.0)
     return forces
@@ -722,9 +706,7 @@ def _supply(machine: Machine, signals: Signals) -> Found:
     )
 
 
-def _supply_signals(
-    machine: Machine, signals: Signals
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
+def _supply_signals(machine: Machine, signals: Signals) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
     """What the supply's balance is made of, None if a channel is missing.
 
     Returns:

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hydrotele.effects.effect import changed
+from hydrotele.effects.effect import with_value
 from hydrotele.estimate.evidence import MIDDLE, Evidence, Fit, Judged, occam_penalty
 from hydrotele.estimate.free_run import free_run_errors, machine_runner
 from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis, calibration, numbers
@@ -41,7 +41,7 @@ from hydrotele.estimate.output_error import (
 from hydrotele.estimate.track import COARSE
 from hydrotele.gap.result import Estimate
 from hydrotele.gap.screening import Screened
-from hydrotele.logs.dataset import Dataset, RunData, thinned
+from hydrotele.logs.dataset import Dataset, RunData, downsample
 from hydrotele.machine.machine import Machine
 
 _NORMAL95 = 1.96
@@ -106,13 +106,12 @@ def calibrate_freely(
         seconds, remembered = _PUMP_WINDOW, _PUMP_REMEMBERED
     if guess is None or all(_seconds(run) < LEAD + 2.0 * seconds for run in data.fit):
         return None
-    fit = fit_free_runs(thinned(data), guess, seconds, jobs=jobs, say=tell, remembered=remembered)
+    fit = fit_free_runs(downsample(data), guess, seconds, jobs=jobs, say=tell, remembered=remembered)
     before, after = fit.left_out
     if not np.mean(np.log(after / before)) < 0.0:
         return None
     closer = ", ".join(
-        f"{channel} {100.0 * (1.0 - b / a):.0f} %"
-        for channel, a, b in zip(data.channels, before, after, strict=True)
+        f"{channel} {100.0 * (1.0 - b / a):.0f} %" for channel, a, b in zip(data.channels, before, after, strict=True)
     )
     note = (
         "The open parameters of the machine file were calibrated on open-loop predictions first."
@@ -132,11 +131,7 @@ def _open(data: Dataset) -> Guess | None:
         group = calibration(machine)
         return Guess(((group, np.zeros(group.size)),))
     pressures = any(channel.startswith("pressure") for channel in data.channels)
-    return (
-        None
-        if pressures or not states_uncertain_parameters(machine)
-        else uncertain_parameters(machine)
-    )
+    return None if pressures or not states_uncertain_parameters(machine) else uncertain_parameters(machine)
 
 
 def _told(nominal: Machine, fit: FreeRunFit) -> Machine:
@@ -151,9 +146,9 @@ def _told(nominal: Machine, fit: FreeRunFit) -> Machine:
     for name in place:
         key = name.removeprefix(first)
         if name.startswith(first) and key in found:
-            ratio = known[key].parameter.scale / found[key].parameter.scale
+            ratio = known[key].parameter.prior_std / found[key].parameter.prior_std
             stated[key] = found[key].share * ratio * min(float(sd[name]), 1.0)
-    return changed(fit.machine, "uncertainty", stated)
+    return with_value(fit.machine, "uncertainty", stated)
 
 
 def _numbers(nominal: Machine, fit: FreeRunFit) -> dict[str, Estimate]:
@@ -163,7 +158,7 @@ def _numbers(nominal: Machine, fit: FreeRunFit) -> dict[str, Estimate]:
         own = slice(first, first + hypothesis.size)
         first += hypothesis.size
         values = np.array(list(hypothesis.values(deviation).values()))
-        scale = np.array([p.scale for p in hypothesis.parameters.values()])
+        scale = np.array([p.prior_std for p in hypothesis.parameters.values()])
         spread = covariance[own, own] * np.outer(scale, scale)
         if hypothesis.name == _FLOW_TABLE:
             keys = list(hypothesis.parameters)
@@ -173,7 +168,7 @@ def _numbers(nominal: Machine, fit: FreeRunFit) -> dict[str, Estimate]:
                 continue
             reach = _NORMAL95 * np.sqrt(spread[k, k])
             numbers = np.array([values[k], values[k] - reach, values[k] + reach, p.nominal])
-            numbers = np.clip(numbers, p.low, p.high)
+            numbers = np.clip(numbers, p.lower_bound, p.upper_bound)
             if p.unit == LOG:
                 numbers = np.exp(numbers)
             value, low, high, was = map(float, numbers)
@@ -199,9 +194,7 @@ def _openings(
         openings = np.cumsum(grown)
         slope = np.column_stack([openings, np.tril(np.tile(grown, (count, 1)))])
         reach = _NORMAL95 * np.sqrt(np.diag(slope @ spread[np.ix_(own, own)] @ slope.T))
-        for travel, value, own_reach, was in zip(
-            TRAVEL[1:], openings, reach, np.cumsum(steps), strict=True
-        ):
+        for travel, value, own_reach, was in zip(TRAVEL[1:], openings, reach, np.cumsum(steps), strict=True):
             low, high = max(0.0, float(value - own_reach)), float(value + own_reach)
             key = f"{_FLOW_TABLE}.{axis}.{way}_{round(100 * travel)}"
             found[key] = Estimate(float(value), "1", low, high, float(was))
@@ -289,9 +282,7 @@ def mostly_right(guess: Guess, fit: Fit) -> bool:
     return False
 
 
-def promoted(
-    evidence: Evidence, now: Judged, fit: Fit, candidates: Sequence[Hypothesis]
-) -> tuple[Guess, float] | None:
+def promoted(evidence: Evidence, now: Judged, fit: Fit, candidates: Sequence[Hypothesis]) -> tuple[Guess, float] | None:
     """A guess in which the number that is moved furthest beyond the usual is an effect.
 
     What the others move by is what uncertain means (`_usual`). Where nearly all others are right,
@@ -326,9 +317,9 @@ def promoted(
         if effect is None:
             continue
         known = next((c for c in candidates if c.key == effect[:2]), None)
-        if known is None or abs(d * table[key].parameter.scale) < known.parameters[effect[2]].least:
+        if known is None or abs(d * table[key].parameter.prior_std) < known.parameters[effect[2]].min_relevant_change:
             continue
-        ratio = usual * table[key].parameter.scale / known.parameters[effect[2]].scale
+        ratio = usual * table[key].parameter.prior_std / known.parameters[effect[2]].prior_std
         ratios.setdefault(effect[:2], {})[index] = min(ratio, 1.0)
     moved = {
         effect: _gain_of_freedom(
@@ -340,10 +331,7 @@ def promoted(
     }
     ends = {e[:2] for key in _at_ends(group, deviation) if (e := table[key].effect)}
     told = {key: gain for key, gain in moved.items() if gain > BEYOND or key in ends}
-    options = {
-        key: let_out(evidence, now.guess, place, next(c for c in candidates if c.key == key))
-        for key in told
-    }
+    options = {key: let_out(evidence, now.guess, place, next(c for c in candidates if c.key == key)) for key in told}
     stuck = {key: _further(evidence, options[key]) for key in told if key in ends}
     if stuck and min(fall for _, fall in stuck.values()) < -BEYOND:
         key = min(stuck, key=lambda one: stuck[one][1])
@@ -387,7 +375,7 @@ def let_out(evidence: Evidence, guess: Guess, place: int, known: Hypothesis) -> 
         start.append(0.0)
         if full in keys:
             gone.add(full)
-            start[-1] = deviation[keys.index(full)] * table[full].parameter.scale / p.scale
+            start[-1] = deviation[keys.index(full)] * table[full].parameter.prior_std / p.prior_std
     more = guess.plus(known, np.clip(start, known.low, known.high))
     return uncalibrated(more, evidence.data.machine, gone)
 
@@ -397,8 +385,7 @@ def _further(evidence: Evidence, guess: Guess) -> tuple[Guess, float]:
     known, start = guess.parts[-1]
     step = evidence.step_of(guess, COARSE)
     options = [
-        Guess((*guess.parts[:-1], (known, np.clip(factor * start, known.low, known.high))))
-        for factor in _FURTHER
+        Guess((*guess.parts[:-1], (known, np.clip(factor * start, known.low, known.high)))) for factor in _FURTHER
     ]
     errors = evidence.map(lambda option: evidence.errors(option, step), options)
     losses = [float(e @ e) for e in errors]
@@ -415,7 +402,7 @@ def _at_ends(group: Hypothesis, deviation: np.ndarray) -> list[str]:
     values = group.values(deviation)
     return [
         key for key, p in group.parameters.items()
-        if values[key] >= p.high or (values[key] <= p.low and p.low != 0.0)
+        if values[key] >= p.upper_bound or (values[key] <= p.lower_bound and p.lower_bound != 0.0)
     ]  # fmt: skip
 
 
@@ -451,7 +438,7 @@ def taken_back(guess: Guess, machine: Machine, index: int) -> Guess | None:
         full = f"{known.name}.{known.location}.{key}"
         if group is None or full in group.parameters or full not in table:
             return None
-        moved[full] = d * p.scale / table[full].parameter.scale
+        moved[full] = d * p.prior_std / table[full].parameter.prior_std
         if abs(moved[full]) > _UNUSUAL:
             return None
     parts = []
@@ -505,9 +492,7 @@ def fitted(evidence: Evidence, now: Judged, pool: Sequence[Screened]) -> list[Fi
         before = loss_of(evidence, now.guess, step)
 
         def climb(start: Guess) -> Fit:
-            return evidence.fit(
-                start, before, parallel=False, step=step, kept=kept, steps=FIT_STEPS
-            )
+            return evidence.fit(start, before, parallel=False, step=step, kept=kept, steps=FIT_STEPS)
 
         found = climb(more)
         wider = widened(found.guess)
@@ -547,9 +532,7 @@ def fit_until_settled(
             break
         before, judged = judged, evidence.judged(guess, same=True)
         fall = before.loss - judged.loss
-        if (
-            not fall > -_WORSE_SETTLING
-        ):  # a likelihood full of dents, as that of teeth, misleads its slopes
+        if not fall > -_WORSE_SETTLING:  # a likelihood full of dents, as that of teeth, misleads its slopes
             guess, fit = before.guess, last or fit
             evidence.set_base(before)
             break
@@ -591,10 +574,10 @@ def widened(guess: Guess, calibration: bool = False) -> Guess:
         for key, p in hypothesis.parameters.items():
             if (hypothesis.name == CALIBRATION) != calibration:
                 continue
-            if values[key] >= p.high:
-                table[key] = replace(p, high=p.nominal + _ROOM * (p.high - p.nominal))
-            elif values[key] <= p.low and p.low != 0.0:
-                low = p.low / _ROOM if p.low > 0.0 else p.nominal - _ROOM * (p.nominal - p.low)
+            if values[key] >= p.upper_bound:
+                table[key] = replace(p, high=p.nominal + _ROOM * (p.upper_bound - p.nominal))
+            elif values[key] <= p.lower_bound and p.lower_bound != 0.0:
+                low = p.lower_bound / _ROOM if p.lower_bound > 0.0 else p.nominal - _ROOM * (p.nominal - p.lower_bound)
                 table[key] = replace(p, low=low)
         if table != hypothesis.parameters:
             hypothesis = replace(hypothesis, parameters=table)

@@ -29,7 +29,7 @@ from hydrotele.gap.result import (
     in_customary_units,
 )
 from hydrotele.machine.machine import Machine
-from hydrotele.terms.law import OF_A_DRIVE
+from hydrotele.terms.law import DRIVE_VARIABLES
 from hydrotele.terms.table import SWITCH
 
 _PLAYED, _AHEAD = "played ", "lead of the "  # of a variable and its play
@@ -280,9 +280,7 @@ def verdict_words(gap: Gap) -> tuple[str, ...]:
     if gap.verdict == "ambiguous":
         first = f"{first[:-1]}, but these data do not determine which effect it is."
     if gap.verdict == "partly":
-        first = (
-            f"{first[:-1]} with an identified effect; the remaining difference has no known cause."
-        )
+        first = f"{first[:-1]} with an identified effect; the remaining difference has no known cause."
     rivals = _rivals(gap)
     rest = (*_calibrated(gap), *_shrinking(gap), *rivals, *_leftover(gap), *_experiment(gap))
     return (first, *_effects(gap), *rest)
@@ -312,7 +310,7 @@ def _effects(gap: Gap) -> tuple[str, ...]:
 def _effect(effect: NamedEffect, run: str) -> str:
     facts = ", ".join(parameter_words(n, e) for n, e in effect.parameters.items())
     known = EFFECTS.get(effect.name)
-    what = f"{effect_title(effect)} ({known.sentence})" if known else effect_title(effect)
+    what = f"{effect_title(effect)} ({known.description})" if known else effect_title(effect)
     text = _capital(f"{what}: {facts}. Probability {probability_text(effect.probability)}.")
     if math.isfinite(effect.share):
         text += f" Without it, {share_words(effect.share)} of the gap on {run} reappears."
@@ -383,8 +381,7 @@ def _rivals(gap: Gap) -> tuple[str, ...]:
             text = f"Its form is not identifiable: these data do not distinguish {others}."
         else:
             text = (
-                f"These data do not distinguish {others}, because they have the same effect on the"
-                " available sensors."
+                f"These data do not distinguish {others}, because they have the same effect on the available sensors."
             )
         texts.append(f"{text} The patched model contains the first of them.")
     return tuple(texts)
@@ -396,10 +393,7 @@ def _leftover(gap: Gap) -> tuple[str, ...]:
     if not failed:
         return located
     tests = "test" if len(failed) == 1 else "tests"
-    left = (
-        "The explanation is incomplete: the remaining errors fail the"
-        f" {tests} {_listed(failed, 'and')}."
-    )
+    left = f"The explanation is incomplete: the remaining errors fail the {tests} {_listed(failed, 'and')}."
     return (left, *located)
 
 
@@ -418,8 +412,7 @@ def _located(gap: Gap) -> tuple[str, ...]:
     if unknown is None:
         return ()
     where = (
-        f"The unexplained residual is in {law_words(unknown.law)}, most visible in the"
-        f" {channel_words(unknown.channel)}"
+        f"The unexplained residual is in {law_words(unknown.law)}, most visible in the {channel_words(unknown.channel)}"
     )
     if unknown.depends_on:
         on = _listed([channel_words(name) for name in unknown.depends_on], "and")
@@ -516,7 +509,7 @@ def _learned_law(machine: Machine, law: Learned, share: float) -> LearnedLaw:
 
 def _with_axis(variable: str, axis: str) -> str:
     """A variable with its drive, where it is one of a drive."""
-    return f"{variable}.{axis}" if variable in OF_A_DRIVE else variable
+    return f"{variable}.{axis}" if variable in DRIVE_VARIABLES else variable
 
 
 def _formula(law: Learned) -> str:
@@ -526,9 +519,7 @@ def _formula(law: Learned) -> str:
     """
     table = law.table
     if len(table.variables) == 1:
-        pairs = ", ".join(
-            f"{x:.3g}: {y:.3g}" for x, y in zip(table.points[0], law.entries, strict=True)
-        )
+        pairs = ", ".join(f"{x:.3g}: {y:.3g}" for x, y in zip(table.points[0], law.entries, strict=True))
         text = f"linear_table({table.variables[0]}; {pairs})"
     else:
         ways = (f"{v}: {len(p)} points from {p[0]:.3g} to {p[-1]:.3g}"
@@ -583,9 +574,7 @@ def _resembles(law: Learned, along: np.ndarray) -> str:
     return best
 
 
-def describe(
-    lacks: Sequence[Lack], learned: Sequence[LearnedLaw], after: Sequence[Prediction]
-) -> Unknown:
+def describe(lacks: Sequence[Lack], learned: Sequence[LearnedLaw], after: Sequence[Prediction]) -> Unknown:
     """Describe what no effect of the library explains.
 
     Args:
@@ -604,8 +593,7 @@ def describe(
     if learned:
         law, term = _LAW_OF[learned[0].balance], learned[0].formula
         depends = tuple(
-            part if part == "time" or "." in part else f"{part}.{learned[0].axis}"
-            for part in _variables(learned[0])
+            part if part == "time" or "." in part else f"{part}.{learned[0].axis}" for part in _variables(learned[0])
         )
         words += [one.description for one in learned]
     if not words:

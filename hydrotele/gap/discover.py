@@ -50,7 +50,7 @@ from hydrotele.gap.search import lacking
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.machine.machine import Machine
-from hydrotele.terms.law import OF_A_DRIVE, Term
+from hydrotele.terms.law import DRIVE_VARIABLES, Term
 
 LEARNED = "learned"
 """First part of the name of a hypothesis that holds a learned law."""
@@ -149,16 +149,14 @@ def see(data: Dataset, judged: Judged, track: Track) -> Seen:
     order = actuator_order(machine)
     position, velocity = np.empty((len(states), len(order))), np.empty((len(states), len(order)))
     supply, act = np.zeros(len(states)), np.empty((len(states), 4 * model.hydraulic))
-    _drives_of(
-        model, model_space(model), np.ascontiguousarray(states), position, velocity, act, supply
-    )
+    _drives_of(model, model_space(model), np.ascontiguousarray(states), position, velocity, act, supply)
     clock = track.run.start + track.run.period * np.arange(len(states))
     values: dict[str, dict[str, np.ndarray]] = {}
     for i, axis in enumerate(order):
         own = {"time": clock, "position": position[:, i], "velocity": velocity[:, i],
                "command": track.run.command[:, i]}  # fmt: skip
         facts = machine.axes[axis]
-        if facts.hydraulic:
+        if facts.is_hydraulic:
             head, rod = act[:, 4 * i + 2], act[:, 4 * i + 3]
             areas = facts.hydraulic_drive.areas
             own |= {"pressure_head": head, "pressure_rod": rod,
@@ -174,7 +172,7 @@ def see(data: Dataset, judged: Judged, track: Track) -> Seen:
         own |= {
             f"{name}.{other}": column for other, columns in plain.items() if other != axis
             for name, column in columns.items()
-            if name in OF_A_DRIVE and (name != "force" or machine.axes[other].hydraulic)
+            if name in DRIVE_VARIABLES and (name != "force" or machine.axes[other].is_hydraulic)
         }  # fmt: skip
     known = np.isfinite(states.sum(axis=1))
     known[: min(round(0.5 / track.run.period), len(states) // 4)] = False
@@ -288,9 +286,7 @@ def _sides(i: Input, balance: str) -> list[tuple[Input, float]]:
     return [(i, -1.0), (Input("flow_rod", i.axis), 1.0)] if balance == THROUGH else [(i, 1.0)]
 
 
-def candidate_laws(
-    lacks: Lacks, laws: Sequence[Learned], hopeless: set[tuple[str, str]]
-) -> list[list[Learned]]:
+def candidate_laws(lacks: Lacks, laws: Sequence[Learned], hopeless: set[tuple[str, str]]) -> list[list[Learned]]:
     """Laws worth a trial for the largest lacks: those that predict best, then of other balances."""
     machine, levels = lacks.evidence.data.machine, lacks.judged.tracks[0].levels
     order = np.argsort(-levels.sizes / input_sizes(machine, levels.inputs))
@@ -329,9 +325,7 @@ def possible_laws(
         taken: kinds of laws that are there already.
     """
     (i, balance), looked = at, []
-    told = [
-        (_clock(s), s.known, t) for s, t in zip(lacks.seen, lacks.told(i, i.balance), strict=True)
-    ]
+    told = [(_clock(s), s.known, t) for s, t in zip(lacks.seen, lacks.told(i, i.balance), strict=True)]
     window, whole = busy_window(told, _LOUD), busy_window(told)
     values, speed = lacks.values(i.axis), _smoothing(lacks.evidence.data.machine, i.axis)
 
@@ -604,9 +598,7 @@ def discover(evidence: Evidence, judged: Judged, noise: np.ndarray) -> Discovery
     laws: list[Learned] = []
     named = [h.name != CALIBRATION for h in judged.guess.hypotheses]
     parts = judged.guess.parts
-    held = [
-        (h.held(d), np.zeros(0)) if n else (h, d) for n, (h, d) in zip(named, parts, strict=True)
-    ]
+    held = [(h.held(d), np.zeros(0)) if n else (h, d) for n, (h, d) in zip(named, parts, strict=True)]
     prior = sum(h.prior(d) for n, (h, d) in zip(named, parts, strict=True) if n)
     judged = replace(judged, guess=Guess(tuple(held)), loss=judged.loss - prior)
     stages, begin = [judged], judged.loss
@@ -643,9 +635,7 @@ def discover(evidence: Evidence, judged: Judged, noise: np.ndarray) -> Discovery
     return Discovery(judged, tuple(laws), refused, last, first)
 
 
-def relearned(
-    evidence: Evidence, judged: Judged, noise: np.ndarray, laws: Sequence[Learned]
-) -> Discovery:
+def relearned(evidence: Evidence, judged: Judged, noise: np.ndarray, laws: Sequence[Learned]) -> Discovery:
     """Laws that were learned beside other effects than a guess has, fitted again without these.
 
     Args:
@@ -664,9 +654,7 @@ def relearned(
     return Discovery(stages[good], tuple(found[:good]), len(found) - good, last, first)
 
 
-def _held_out(
-    evidence: Evidence, stages: Sequence[Judged], noise: np.ndarray
-) -> tuple[int, OpenLoop, OpenLoop]:
+def _held_out(evidence: Evidence, stages: Sequence[Judged], noise: np.ndarray) -> tuple[int, OpenLoop, OpenLoop]:
     """How many laws make free runs of the held-out run better, these with them, and without any."""
     runs = (evidence.data.heldout,)
     first = open_loop(evidence, runs, stages[0], noise)
@@ -707,9 +695,7 @@ def _cost(judged: Judged, law: Learned) -> float:
     return judged.loss + law.charge
 
 
-def _settled(
-    evidence: Evidence, judged: Judged, now: Judged, law: Learned
-) -> tuple[Judged, Learned]:
+def _settled(evidence: Evidence, judged: Judged, now: Judged, law: Learned) -> tuple[Judged, Learned]:
     """A law whose entries are fitted inside the machine, again and again, judged."""
     for _ in range(_AGAIN):
         again = _refitted(evidence, now, law)
@@ -722,9 +708,7 @@ def _settled(
     return now, law
 
 
-def _another_form(
-    evidence: Evidence, judged: Judged, now: Judged, law: Learned
-) -> tuple[Judged, Learned] | None:
+def _another_form(evidence: Evidence, judged: Judged, now: Judged, law: Learned) -> tuple[Judged, Learned] | None:
     """The form that predicts clearly more in a law's place, if it is better in the machine, too.
 
     As long as no law is there, an unknown input does much of what it should tell, and hides which
@@ -776,9 +760,7 @@ def better_ahead(now: OpenLoop, before: OpenLoop) -> bool:
     return bool(short and (np.isnan(now.far) or now.far <= before.far))
 
 
-def open_loop(
-    evidence: Evidence, runs: Sequence[RunData], judged: Judged, noise: np.ndarray
-) -> OpenLoop:
+def open_loop(evidence: Evidence, runs: Sequence[RunData], judged: Judged, noise: np.ndarray) -> OpenLoop:
     """Errors of free runs through some runs over all channels, in units of a noise (c,).
 
     A law is to make simulations better, not only predictions from one reading to the next.

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from hydrotele.core.files import models_folder
 from hydrotele.kinematics import five_dof
-from hydrotele.kinematics.arm import forward
+from hydrotele.kinematics.arm import forward_kinematics
 from hydrotele.kinematics.from_machine import arm_geometry, axis_linkage, feller_geometry
 from hydrotele.machine.machine import Machine
 
@@ -100,9 +100,7 @@ def _travel(machine: Machine, name: str) -> tuple[float, float]:
     return bounds[0] + margin, bounds[1] - margin
 
 
-def _free(
-    machine: Machine, pose: Mapping[str, float], name: str, ends: tuple[float, float]
-) -> tuple[float, float]:
+def _free(machine: Machine, pose: Mapping[str, float], name: str, ends: tuple[float, float]) -> tuple[float, float]:
     """The part of an axis' range around its place in a pose in which the tip is above ground."""
     low, high = (_clear(machine, pose, {name: end})[name] for end in ends)
     return low, high
@@ -121,9 +119,7 @@ def _speed(machine: Machine, name: str, at: float, width: float) -> float:
     return _SHARE * min(flow, machine.supply.pump_flow) / (axis.hydraulic_drive.areas[0] * arm)
 
 
-def _clear(
-    machine: Machine, home: Mapping[str, float], target: Mapping[str, float]
-) -> dict[str, float]:
+def _clear(machine: Machine, home: Mapping[str, float], target: Mapping[str, float]) -> dict[str, float]:
     """The straight way from home to the target, as far as the arm stays above the ground."""
     clear = {axis: home[axis] for axis in target}
     for step in range(1, _WAY + 1):
@@ -147,10 +143,10 @@ def _height(machine: Machine, pose: Mapping[str, float]) -> float:
     if arm.head:
         feller = feller_geometry(machine)
         elbow = feller.base_height + feller.boom_length * math.sin(of_joint[arm.boom])
-        return min(elbow, five_dof.forward(feller, q).z)
+        return min(elbow, five_dof.forward_kinematics(feller, q).z)
     geometry = arm_geometry(machine)
     elbow = geometry.boom_pin_height + geometry.boom_length * math.sin(of_joint[arm.boom])
-    return min(elbow, forward(geometry, q)[2])
+    return min(elbow, forward_kinematics(geometry, q)[2])
 
 
 def steps(s: Stage, axes: Sequence[str]) -> Iterator[Leg]:
@@ -428,9 +424,7 @@ _RATE = 50.0  # [Hz] of sensors that state none
 _STILL = ("holds",)  # motions in which the valves have to stay closed at rest
 
 
-def next_experiment(
-    machine: Machine, reason: str, effects: Sequence[tuple[str, str]]
-) -> dict[str, Any]:
+def next_experiment(machine: Machine, reason: str, effects: Sequence[tuple[str, str]]) -> dict[str, Any]:
     """Propose a motion that separates effects, or shows an unknown one better.
 
     Args:

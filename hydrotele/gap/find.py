@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from hydrotele.effects.effect import changed
+from hydrotele.effects.effect import with_value
 from hydrotele.estimate.evidence import Evidence, Judged, standard_deviations
 from hydrotele.estimate.filter import input_sizes, input_units
 from hydrotele.estimate.hypothesis import CALIBRATION, Guess, Hypothesis, hypotheses
@@ -48,7 +48,7 @@ from hydrotele.gap.result import (
 )
 from hydrotele.gap.rivals import TOLD, effect_probabilities, part_taken
 from hydrotele.gap.search import Found, lacking, search
-from hydrotele.logs.dataset import Dataset, busiest, thinned
+from hydrotele.logs.dataset import Dataset, downsample, select_exciting_segments
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.signals import parse_channel
 
@@ -108,7 +108,7 @@ def find_gap(
         data = dataclasses.replace(data, machine=opened.machine)
         notes.append(opened.note)
     candidates = hypotheses(data.machine, effects)
-    data = thinned(busiest(data))
+    data = downsample(select_exciting_segments(data))
     evidence = Evidence(data, data.fit, jobs, STEP, lacking=True)
     try:
         found = search(evidence, candidates, progress)
@@ -168,10 +168,10 @@ def find_gap(
     tell("done", 1.0)
     calibration = _calibration(discovery.judged.guess, spread)
     if opened:  # what free runs left uncertain was the search's prior, not the machine's
-        patched = changed(patched, "uncertainty", given.uncertainty)
+        patched = with_value(patched, "uncertainty", given.uncertainty)
     jitter = _jitter(data, judge.levels)
     if jitter[0] != jitter[1] and data.sensors:
-        patched = changed(patched, f"sensors.{data.sensors}.jitter", jitter[0])
+        patched = with_value(patched, f"sensors.{data.sensors}.jitter", jitter[0])
     return Gap(
         machine=given,
         patched=patched,
@@ -317,9 +317,7 @@ def _worse(
     return "" if rms(after[:1]) <= _WORSE * rms(before[:1]) else "the"
 
 
-def _worse_held_out(
-    evidence: Evidence, judged: Judged, opened: FreeCalibration | None, jobs: int
-) -> str:
+def _worse_held_out(evidence: Evidence, judged: Judged, opened: FreeCalibration | None, jobs: int) -> str:
     """In what a guess is worse on the held-out run than the given machine; empty if it is not."""
     if not judged.guess.parts:
         return ""
@@ -371,9 +369,7 @@ def verdict_of(named: Sequence[NamedEffect], failed: bool, floor: float | None) 
     return "partly" if closed >= PARTLY else "unknown"
 
 
-def _named(
-    found: Found, last: Guess, spread: np.ndarray, shares: Mapping
-) -> tuple[NamedEffect, ...]:
+def _named(found: Found, last: Guess, spread: np.ndarray, shares: Mapping) -> tuple[NamedEffect, ...]:
     """Effects of a search, with their numbers in the last guess, which may have learned laws."""
     effects, first = [], 0
     for index, (hypothesis, deviation) in enumerate(last.parts[: len(found.guess.parts)]):
@@ -463,9 +459,7 @@ def _without_effects(evidence: Evidence, found: Found) -> Found:
         evidence.set_base(found.base)
         return found.emptied()
     judged, fit = fit_until_settled(evidence, evidence.judged(Guess((place,))))
-    return dataclasses.replace(
-        found.emptied(), judged=judged, fit=fit, charges=(0.0,), without=(None,), rivals=((),)
-    )
+    return dataclasses.replace(found.emptied(), judged=judged, fit=fit, charges=(0.0,), without=(None,), rivals=((),))
 
 
 def without_details(
@@ -511,8 +505,7 @@ def without_details(
 def detail_words(effect: NamedEffect) -> str:
     """Why an effect is not named although the patched model has it."""
     told = ", ".join(
-        f"{key} {e.value:.4g} {e.unit} ({e.low:.4g} to {e.high:.4g})"
-        for key, e in effect.parameters.items()
+        f"{key} {e.value:.4g} {e.unit} ({e.low:.4g} to {e.high:.4g})" for key, e in effect.parameters.items()
     )
     return (
         f"{effect.name} at {effect.location}, {told}, closes {100 * max(effect.share, 0.0):.1f} %"
@@ -525,8 +518,8 @@ def _estimates(hypothesis: Hypothesis, deviation: np.ndarray, spread: np.ndarray
     values = hypothesis.values(deviation)
     table = {}
     for (key, p), own in zip(hypothesis.parameters.items(), spread, strict=True):
-        reach = _NORMAL95 * own * p.scale
-        low, high = max(p.low, values[key] - reach), min(p.high, values[key] + reach)
+        reach = _NORMAL95 * own * p.prior_std
+        low, high = max(p.lower_bound, values[key] - reach), min(p.upper_bound, values[key] + reach)
         table[key] = Estimate(values[key], p.unit, low, high, p.nominal)
     return table
 
@@ -548,10 +541,7 @@ def _chances(found: Found, index: int, rest: Judged) -> tuple[float, tuple[Alter
 
 def apart(one: Judged, other: Judged) -> float:
     """Sum of squares of what two guesses predict differently, in standard deviations."""
-    return sum(
-        float(np.nansum((a.whitened - b.whitened) ** 2))
-        for a, b in zip(one.tracks, other.tracks, strict=True)
-    )
+    return sum(float(np.nansum((a.whitened - b.whitened) ** 2)) for a, b in zip(one.tracks, other.tracks, strict=True))
 
 
 def _prediction(track: Track, data: Dataset) -> Prediction:
@@ -593,7 +583,7 @@ def _all_calibrated(
 def _far(guess: Guess) -> list[str]:
     """Calibrated numbers that moved far beyond what is stated as uncertain."""
     return [
-        f"{key} {p.nominal + d * p.scale:.4g} {p.unit} (model: {p.nominal:.4g}; {abs(d):.1f} times)"
+        f"{key} {p.nominal + d * p.prior_std:.4g} {p.unit} (model: {p.nominal:.4g}; {abs(d):.1f} times)"
         for hypothesis, deviation in guess.parts
         if hypothesis.name == CALIBRATION
         for (key, p), d in zip(hypothesis.parameters.items(), deviation, strict=True)
@@ -656,9 +646,7 @@ def _notes(found: Found, data: Dataset, levels: Levels, floor: float | None) -> 
         notes.append(f"The noise differs from the machine file: {', '.join(off)}.")
     jitter, stated = _jitter(data, levels)
     if not jitter and stated:
-        notes.append(
-            f"The data show no sampling jitter; the machine file states {1e3 * stated:.3g} ms."
-        )
+        notes.append(f"The data show no sampling jitter; the machine file states {1e3 * stated:.3g} ms.")
     elif jitter != stated:
         notes.append(
             f"The sampling instants have a jitter of {1e3 * jitter:.3g} ms (standard deviation;"
@@ -683,8 +671,7 @@ def _notes(found: Found, data: Dataset, levels: Levels, floor: float | None) -> 
         hypothesis, deviation = found.weak.guess.parts[-1]
         values = hypothesis.values(deviation)
         told = ", ".join(
-            f"{key} {values[key]:.4g} {p.unit} (model: {p.nominal:.4g})"
-            for key, p in hypothesis.parameters.items()
+            f"{key} {values[key]:.4g} {p.unit} (model: {p.nominal:.4g})" for key, p in hypothesis.parameters.items()
         )
         notes.append(
             f"{hypothesis.name} at {hypothesis.location}, {told}, is too small to be named and was"

@@ -19,8 +19,8 @@ import numpy as np
 
 from hydrotele.core.compiled import compiled
 from hydrotele.estimate.track import Track, error_responses
-from hydrotele.terms.law import OF_A_DRIVE
-from hydrotele.terms.table import PLAY, SWITCH, acting, remembered
+from hydrotele.terms.law import DRIVE_VARIABLES
+from hydrotele.terms.table import PLAY, SWITCH, update_hysteresis, window_factor
 
 THROUGH = "flow_through"
 """Balance of a flow from the head side to the rod side."""
@@ -82,7 +82,7 @@ def _along(way, x):
     held, out = 0.0, np.empty(len(x))
     for k in range(len(x)):
         if np.isfinite(x[k]):
-            held = remembered(way, held, x[k])
+            held = update_hysteresis(way, held, x[k])
         out[k] = held
     return out
 
@@ -156,7 +156,7 @@ class Table(NamedTuple):
         if held is not None and self.memory and self.memory.way == SWITCH:
             weights = weights * held[:, None]
         if self.window:
-            weights = weights * acting(values["time"], *self.window)[:, None]
+            weights = weights * window_factor(values["time"], *self.window)[:, None]
         return entries, weights
 
     def precision(self, smoothness: float) -> np.ndarray:
@@ -323,7 +323,7 @@ def finer_memories(table: Table, step: float) -> list[Table]:
 
 
 def _names(values: Sequence[Mapping[str, np.ndarray]]) -> list[str]:
-    others = [n for n in values[0] if "." in n and n.partition(".")[0] in OF_A_DRIVE]
+    others = [n for n in values[0] if "." in n and n.partition(".")[0] in DRIVE_VARIABLES]
     return [n for n in (*_OWN, *others) if n in values[0]]
 
 
@@ -450,10 +450,7 @@ def _entries(
     ]  # fmt: skip
     curvature = np.array([s.T @ s for s, _ in answers])
     slope = np.array([s.T @ e for s, e in answers])
-    falls = {
-        smooth: float(_left_out(curvature, slope, table.precision(smooth)).sum())
-        for smooth in _SMOOTHNESS
-    }
+    falls = {smooth: float(_left_out(curvature, slope, table.precision(smooth)).sum()) for smooth in _SMOOTHNESS}
     smooth = max(falls, key=falls.__getitem__)
     prior = table.precision(smooth)
     whole = curvature.sum(axis=0) + prior
@@ -549,9 +546,7 @@ def ground(
     return Ground((begin, begin + length), width, np.array(curvature), np.array(slope))
 
 
-def at_a_glance(
-    table: Table, runs: Sequence[tuple[Ground, Mapping[str, np.ndarray]]]
-) -> np.ndarray:
+def at_a_glance(table: Table, runs: Sequence[tuple[Ground, Mapping[str, np.ndarray]]]) -> np.ndarray:
     """Falls of the loss that a table predicts in what is left out, seen block by block.
 
     Args:

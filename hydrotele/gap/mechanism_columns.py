@@ -18,15 +18,19 @@ from hydrotele.core.errors import InputError
 from hydrotele.effects.effect import Parameter
 from hydrotele.identify.equations import (
     RateErrors,
+    apply_low_pass,
     build_equations,
-    low_pass,
-    low_passed,
-    low_passed_forces,
-    row_forces,
+    design_low_pass,
+    low_pass_forces,
+    predict_forces,
 )
-from hydrotele.identify.mechanism import Mechanism, in_coordinates
-from hydrotele.identify.motion import Processing, joint_motion, resolution
-from hydrotele.identify.record import IdentificationRecord, trimmed, without_error
+from hydrotele.identify.mechanism import Mechanism, convert_coordinates
+from hydrotele.identify.motion import Processing, compute_joint_motion, estimate_resolution
+from hydrotele.identify.record import (
+    IdentificationRecord,
+    correct_sensor_error,
+    trim_missing_positions,
+)
 from hydrotele.identify.setup import RegressorSetup
 from hydrotele.machine.machine import SensorError
 from hydrotele.multibody.chain import Chain
@@ -117,13 +121,11 @@ def separate_setup(setup: RegressorSetup) -> RegressorSetup:
     extra = {"viscous_asymmetry": 0.0, "quadratic": 0.0}
     drives = setup.chain.drives
     rubbing = tuple(
-        replace(one, nominal={**(extra if one.place in drives else {}), **one.nominal})
-        for one in setup.rubbing
+        replace(one, nominal={**(extra if one.location in drives else {}), **one.nominal})
+        for one in setup.friction_terms
     )
     inertia = dict.fromkeys((*setup.drive_inertia, *drives))
-    return replace(
-        setup, alike=(), absent=(), offsets={}, rubbing=rubbing, drive_inertia=tuple(inertia)
-    )
+    return replace(setup, alike=(), absent=(), offsets={}, rubbing=rubbing, drive_inertia=tuple(inertia))
 
 
 def corrected(record: IdentificationRecord, drives: Sequence[str], errors: Errors):
@@ -140,11 +142,11 @@ def corrected(record: IdentificationRecord, drives: Sequence[str], errors: Error
     position, force = record.position.copy(), record.force.copy()
     for k, joint in enumerate(record.axes):
         if known := errors.get(f"position.{joint}"):
-            position[:, k] = without_error(position[:, k], known, record.period)
+            position[:, k] = correct_sensor_error(position[:, k], known, record.period)
     for k, drive in enumerate(drives):
         if known := errors.get(f"force.{drive}"):
-            force[:, k] = without_error(force[:, k], known, record.period)
-    return trimmed(replace(record, position=position, force=force))
+            force[:, k] = correct_sensor_error(force[:, k], known, record.period)
+    return trim_missing_positions(replace(record, position=position, force=force))
 
 
 def common_band(records: Sequence[IdentificationRecord], mechanism: Mechanism) -> float:
@@ -165,11 +167,11 @@ def common_band(records: Sequence[IdentificationRecord], mechanism: Mechanism) -
     bands, moves = [], []
     for whole in records:
         many = max(1, int(_RESOLVED / whole.period))
-        record = in_coordinates(_averaged(whole, many), mechanism.setup)
-        found = resolution(record.position, record.period, record.position_noise)
+        record = convert_coordinates(_averaged(whole, many), mechanism.setup)
+        found = estimate_resolution(record.position, record.period, record.position_noise)
         bands.append(min(0.5 * found.bandwidth, _WIDEST, 0.2 / record.period))
         bands[-1] = max(bands[-1], _SLOWEST / (len(record.force) * record.period))
-        moves.append(found.moves)
+        moves.append(found.is_moving)
     if not np.any(moves):
         raise InputError(_WHERE, "no joint moves in any run: record a motion")
     return min(bands)
@@ -211,8 +213,7 @@ def build_columns(
         return np.concatenate([p[place][rows] for p, rows in zip(parts, keep, strict=True)])
 
     states = {
-        key: np.concatenate([p[6][key][rows] for p, rows in zip(parts, keep, strict=True)])
-        for key in parts[0][6]
+        key: np.concatenate([p[6][key][rows] for p, rows in zip(parts, keep, strict=True)]) for key in parts[0][6]
     }
     return Columns(
         names, stacked(1), stacked(2), stacked(3), stacked(4), tuple(map(int, starts)), stacked(5),
@@ -226,8 +227,7 @@ def _averaged(record: IdentificationRecord, many: int) -> IdentificationRecord:
     if many == 1 or count < 10:
         return record
     position, force = (
-        values[: count * many].reshape(count, many, -1).mean(axis=1)
-        for values in (record.position, record.force)
+        values[: count * many].reshape(count, many, -1).mean(axis=1) for values in (record.position, record.force)
     )
     small = many**-0.5
     return replace(
@@ -256,17 +256,17 @@ def _run_columns(
 ):  # fmt: skip
     """Names, matrix, measured, modelled, time, doubt, states, spacing of one run."""
     how = Processing("zero_phase", band=band)
-    record = in_coordinates(raw, setup)
-    found = resolution(record.position, record.period, record.position_noise)
-    plain = resolution(raw.position, raw.period, raw.position_noise)
-    lengths = joint_motion(raw.position, raw.period, plain, how)
+    record = convert_coordinates(raw, setup)
+    found = estimate_resolution(record.position, record.period, record.position_noise)
+    plain = estimate_resolution(raw.position, raw.period, raw.position_noise)
+    lengths = compute_joint_motion(raw.position, raw.period, plain, how)
     errors = RateErrors(raw.axes, lengths.rate_std)
     own, table = build_equations(record, setup, how, found, rate_errors=errors)
-    motion = joint_motion(record.position, record.period, found, how)
+    motion = compute_joint_motion(record.position, record.period, found, how)
     stride = max(1, int(1.0 / (_ROWS * band * record.period)))
     rows = slice(None, None, stride)
     whole = np.stack([motion.value, motion.rate, motion.acceleration])[:, rows]
-    smooth, _ = low_pass(_SMOOTH * band, record.period)  # what few rows can still tell
+    smooth, _ = design_low_pass(_SMOOTH * band, record.period)  # what few rows can still tell
     rate = fftconvolve(lengths.rate, smooth[:, None], mode="same", axes=0)
     measured = np.stack([lengths.value, rate])[:, rows]
     value = table.nominal + [about.get(name, 0.0) for name in table.names]
@@ -285,23 +285,23 @@ def _run_columns(
             extra[:, :, names.index(f"delay.position.{drive}")] += value[dry[k]] * turns[:, :, k]
     names = [*names, *of_drives, *(f"sharpness.{drive}" for drive in rubs)]
     extra = np.concatenate([extra, quick, calm - own.matrix[:, :, dry]], axis=2)
-    low, thin = low_pass(band, record.period)
-    force = low_passed_forces(record.force, record.period, low, thin)
+    low, thin = design_low_pass(band, record.period)
+    force = low_pass_forces(record.force, record.period, low, thin)
     matrix = np.concatenate([own.matrix, extra], axis=2)
     states = {}
     for k, joint in enumerate(raw.axes):
         for what, values in (("position", lengths.value), ("velocity", lengths.rate)):
-            states[f"{what}.{joint}"] = low_passed(values[:, k], low, thin)
+            states[f"{what}.{joint}"] = apply_low_pass(values[:, k], low, thin)
     return (
         (*table.names, *names), matrix, force,
-        own.matrix @ table.nominal + force - own.force, own.time, own.doubt, states, own.spacing,
+        own.matrix @ table.nominal + force - own.force, own.time, own.friction_sign_uncertainty, states, own.spacing,
     )  # fmt: skip
 
 
 def _onto(slow: np.ndarray, band: float, period: float, time: np.ndarray) -> np.ndarray:
     """Rows (n, k, m) after the low-pass, at other times."""
-    low, _ = low_pass(band, period)
-    passed = low_passed(slow, low, 1)
+    low, _ = design_low_pass(band, period)
+    passed = apply_low_pass(slow, low, 1)
     own = (np.arange(len(passed)) + (len(low) - 1) / 2) * period
     return CubicSpline(own, passed, axis=0)(np.clip(time, own[0], own[-1]))
 
@@ -310,8 +310,8 @@ def _drive_columns(setup: RegressorSetup, motion: np.ndarray, sizes, value, peri
     """Force sensors, springs, and friction near rest, of the drives: names, and (n, k, m)."""
     chain = setup.chain
     found = setup.project(*motion)
-    passive = chain.damping * found.rate + chain.stiffness * (found.position - chain.rest)
-    base = setup.table(found).matrix @ value + np.einsum("nkv,nv->nk", found.share, passive)
+    passive = chain.damping * found.rate + chain.stiffness * (found.position - chain.spring_rest)
+    base = setup.compute_regressor(found).matrix @ value + np.einsum("nkv,nv->nk", found.joint_projection, passive)
     change = np.gradient(base, period, axis=0)
     names, out = ["delay.force"], [-change]
     for k, drive in enumerate(chain.drives):
@@ -319,7 +319,7 @@ def _drive_columns(setup: RegressorSetup, motion: np.ndarray, sizes, value, peri
         names += [f"scale.force.{drive}", f"delay.force.{drive}"]
         out += [base * own, -change * own]
         j = chain.index(drive)
-        share, rate = found.share[:, :, j], found.rate[:, j]
+        share, rate = found.joint_projection[:, :, j], found.rate[:, j]
         middle = float(found.position[:, j].mean()) if drive not in sizes else sizes[drive][0]
         names.append(f"spring.{drive}")
         out.append(share * (found.position[:, j, None] - middle))
@@ -338,11 +338,14 @@ def _dry_friction(setup: RegressorSetup, motion: np.ndarray, band: float, period
     the band. That may be nearer to what friction does where it turns than the sign which is
     expected of an uncertain rate.
     """
-    chain, rubs = setup.chain, {one.place for one in setup.rubbing if "coulomb" in one.nominal}
+    chain, rubs = (
+        setup.chain,
+        {one.location for one in setup.friction_terms if "coulomb" in one.nominal},
+    )
     drives = [drive for drive in chain.drives if drive in rubs]
     found, places = setup.project(*motion), [chain.index(name) for name in drives]
-    share, rate = found.share[:, :, places], found.rate[:, places]
-    low, _ = low_pass(band, period)
+    share, rate = found.joint_projection[:, :, places], found.rate[:, places]
+    low, _ = design_low_pass(band, period)
     calm = fftconvolve(rate, low[:, None], mode="same", axes=0)
     turns = np.gradient(share * np.sign(rate)[:, None], period, axis=0)
     return drives, turns, share * np.sign(calm)[:, None]
@@ -368,9 +371,9 @@ class _Differences:
         chain = self.setup.chain
         found = self.setup.project(*self.motion)
         here = [chain.index(name) for name in self.axes]
-        moves = np.linalg.solve(found.share[:, :, here], found.share)  # q_v per measured joint
-        given = [chain.index(name) for name in self.setup.given]
-        base = row_forces(self.setup, self.motion, self.value)
+        moves = np.linalg.solve(found.joint_projection[:, :, here], found.joint_projection)  # q_v per measured joint
+        given = [chain.index(name) for name in self.setup.given_joints]
+        base = predict_forces(self.setup, self.motion, self.value)
         names, out = [], []
 
         def add(name: str, column: np.ndarray) -> None:
@@ -396,7 +399,7 @@ class _Differences:
     def _moved(self, change: np.ndarray, base: np.ndarray) -> np.ndarray:
         """What the model's forces gain where the given joints are elsewhere by (n, k)."""
         away = np.stack([change, self._rate(change), self._rate(change, 2)])
-        return -(base - row_forces(self.setup, self.motion + away, self.value))
+        return -(base - predict_forces(self.setup, self.motion + away, self.value))
 
     def _tilted(self, axis: int, base: np.ndarray) -> np.ndarray:
         """What they gain where the base is turned about x or y of the world by the step."""
@@ -405,7 +408,7 @@ class _Differences:
         turn[axis] = _TILT
         down = tilted(chain.tree.gravity, turn)
         moved = replace(self.setup, chain=replace(chain, tree=chain.tree._replace(gravity=down)))
-        return row_forces(moved, self.motion, self.value) - base
+        return predict_forces(moved, self.motion, self.value) - base
 
 
 def tilted(gravity: np.ndarray, turn: np.ndarray) -> np.ndarray:
@@ -486,17 +489,17 @@ class MechanismEffect:
     @property
     def scale(self) -> np.ndarray:
         """(p,) standard deviations of the prior."""
-        return np.array([one.scale for one in self.parameters.values()])
+        return np.array([one.prior_std for one in self.parameters.values()])
 
     @property
     def low(self) -> np.ndarray:
         """(p,) smallest values."""
-        return np.array([one.low for one in self.parameters.values()])
+        return np.array([one.lower_bound for one in self.parameters.values()])
 
     @property
     def high(self) -> np.ndarray:
         """(p,) largest values."""
-        return np.array([one.high for one in self.parameters.values()])
+        return np.array([one.upper_bound for one in self.parameters.values()])
 
 
 def strengths(columns: Columns) -> np.ndarray:
@@ -581,7 +584,7 @@ class _Builder:
 
     def units(self, joint: str) -> tuple[str, str, str, str]:
         """Of force, position, rate and inertia of a joint or a closure."""
-        straight = joint in self.chain.joints and self.chain.tree.slides[self.chain.index(joint)]
+        straight = joint in self.chain.joints and self.chain.tree.is_slide[self.chain.index(joint)]
         return ("N", "m", "m/s", "kg") if straight else ("N m", "rad", "rad/s", "kg m^2")
 
     def joints(self):
@@ -616,13 +619,13 @@ class _Builder:
         The form of that near rest (sticking, presliding) is never known as well as far from it.
         """
         (facts,) = one.parameters.values()
-        least = max(facts.least, _FORM * self.nominal.get(f"coulomb.{one.location}", 0.0))
+        least = max(facts.min_relevant_change, _FORM * self.nominal.get(f"coulomb.{one.location}", 0.0))
         return replace(one, parameters={"stribeck": replace(facts, least=least)})
 
     def spring(self, drive: str) -> MechanismEffect | None:
         force, length, _, _ = self.units(drive)
         j = self.chain.index(drive)
-        stiff, rest = float(self.chain.stiffness[j]), float(self.chain.rest[j])
+        stiff, rest = float(self.chain.stiffness[j]), float(self.chain.spring_rest[j])
         middle, travel, _ = self.columns.sizes.get(drive, (rest, 1.0, 1.0))
         facts = self.number(f"spring.{drive}", f"{force}/{length}", stiff, 0.0)
         if facts is None:
@@ -688,9 +691,7 @@ class _Builder:
             change = mass * (_point(centre + p) - _point(centre))
             return np.concatenate([mass * p, change])
 
-        return MechanismEffect(
-            "com_offset", body, dict.fromkeys("xyz", way), names, coefficients, np.zeros(3)
-        )
+        return MechanismEffect("com_offset", body, dict.fromkeys("xyz", way), names, coefficients, np.zeros(3))
 
     def turned(self, body, names, own) -> MechanismEffect | None:
         upper = own[np.triu_indices(3)]
@@ -724,7 +725,7 @@ class _Builder:
         facts = self.number(column, "s")
         if facts is None:
             return None
-        facts = Parameter("s", 0.0, low, _SECOND, min(facts.scale, 0.02), facts.least)
+        facts = Parameter("s", 0.0, low, _SECOND, min(facts.prior_std, 0.02), facts.min_relevant_change)
         return MechanismEffect(name, place, {"delay": facts}, (column,), lambda p: p, np.zeros(1))
 
     def scale(self, drive: str) -> MechanismEffect | None:

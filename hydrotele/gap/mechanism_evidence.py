@@ -21,7 +21,7 @@ from scipy.signal import lfilter
 from scipy.stats import chi2
 
 from hydrotele.gap.mechanism_columns import TYPICAL, Columns, MechanismEffect, strengths
-from hydrotele.identify.estimation import autoregression, find_doubtful, weights
+from hydrotele.identify.estimation import autoregression, compute_weights, estimate_error_variances
 from hydrotele.identify.mechanism import Mechanism
 from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS
 
@@ -247,10 +247,7 @@ def loud_windows(
     level = np.nanmean(whitened[: count * length].reshape(count, length) ** 2, axis=1)
     usual = np.median(level)
     picked = sorted(int(k) for k in np.argsort(-level)[:most] if level[k] > 4.0 * usual)
-    return tuple(
-        (round(float(time[k * length]), 2), round(float(time[k * length] + _WINDOW), 2))
-        for k in picked
-    )
+    return tuple((round(float(time[k * length]), 2), round(float(time[k * length] + _WINDOW), 2)) for k in picked)
 
 
 _ROUNDS, _STEPS = 3, 40
@@ -322,9 +319,7 @@ def find_noise(columns: Columns) -> Noise:
     wide = TYPICAL / np.maximum(strengths(columns), 1e-300)
     used = np.isfinite(wide) & (wide < 1e200)
     gap = columns.gap
-    matrix = np.concatenate(
-        [columns.matrix[:, :, used] * wide[used], _run_offsets(columns)], axis=2
-    )
+    matrix = np.concatenate([columns.matrix[:, :, used] * wide[used], _run_offsets(columns)], axis=2)
     std = np.maximum(np.std(gap, axis=0), 1e-12)
     noise = Noise(np.zeros((0, k)), np.diag(1.0 / std), np.ones((n, k)), std, gap, np.zeros((k, 2)))
     for _ in range(_ROUNDS):
@@ -361,7 +356,7 @@ def noise_of(rest: np.ndarray, columns: Columns, free: float = 1.0) -> Noise:
         The noise.
     """
     drives = rest.shape[1]
-    doubtful = find_doubtful(rest, columns.doubt)
+    doubtful = estimate_error_variances(rest, columns.doubt)
     weight = row_weights(doubtful, columns.doubt)
     left = rest * weight
     follow = _follow(left, columns.starts)
@@ -383,7 +378,7 @@ def row_weights(doubtful: np.ndarray, doubt: np.ndarray) -> np.ndarray:
     Returns:
         (n, k), 1 at most.
     """
-    return weights(doubtful, doubt) * (doubt < _STICKS)
+    return compute_weights(doubtful, doubt) * (doubt < _STICKS)
 
 
 def _follow(rest: np.ndarray, starts: Sequence[int]) -> np.ndarray:
@@ -441,9 +436,7 @@ class Evidence:
     evidence: float
     places: dict[str, int] = field(default_factory=dict)
 
-    def fit(
-        self, effects: Sequence[MechanismEffect], start: Sequence[np.ndarray] | None = None
-    ) -> Fitted:
+    def fit(self, effects: Sequence[MechanismEffect], start: Sequence[np.ndarray] | None = None) -> Fitted:
         """Fit effects together.
 
         Args:
@@ -530,15 +523,11 @@ class Evidence:
         if not found.effects:
             return self
         value, slope = self._whole(found)
-        inner = slope.T @ self.square @ slope + np.diag(
-            1.0 / np.concatenate([one.scale for one in found.effects]) ** 2
-        )
+        inner = slope.T @ self.square @ slope + np.diag(1.0 / np.concatenate([one.scale for one in found.effects]) ** 2)
         across = self.square @ slope
         cross = self.cross - self.square @ value
         step = np.linalg.solve(inner, np.column_stack([across.T, slope.T @ cross]))
-        return replace(
-            self, square=self.square - across @ step[:, :-1], cross=cross - across @ step[:, -1]
-        )
+        return replace(self, square=self.square - across @ step[:, :-1], cross=cross - across @ step[:, -1])
 
     def _whole(self, found: Fitted) -> tuple[np.ndarray, np.ndarray]:
         """Coefficients (m,) of effects, and their slopes (m, p) over the parameters."""
@@ -580,9 +569,7 @@ class Evidence:
         return self.posterior - self.towards @ c, self.known
 
 
-def effects_by_part(
-    columns: Columns, noise: Noise, off: dict[str, float], found: Fitted
-) -> list[list[np.ndarray]]:
+def effects_by_part(columns: Columns, noise: Noise, off: dict[str, float], found: Fitted) -> list[list[np.ndarray]]:
     """Parameters of effects in every part of the runs, where they differ from part to part.
 
     Args:
@@ -597,10 +584,7 @@ def effects_by_part(
     """
     runs = list(zip(columns.starts[:-1], columns.starts[1:], strict=True))
     cuts = -(-_PARTS // len(runs))
-    edges = [
-        np.linspace(a, b, max(cuts, round((b - a) * columns.spacing / _LONG)) + 1).astype(int)
-        for a, b in runs
-    ]
+    edges = [np.linspace(a, b, max(cuts, round((b - a) * columns.spacing / _LONG)) + 1).astype(int) for a, b in runs]
     values: list[list[np.ndarray]] = [[] for _ in found.effects]
     precisions: list[list[np.ndarray]] = [[] for _ in found.effects]
     for first, last in [pair for e in edges for pair in zip(e[:-1], e[1:], strict=True)]:
@@ -613,7 +597,7 @@ def effects_by_part(
             block = slice(begin, begin + len(value))
             begin += len(value)
             values[k].append(value)
-            least = [facts.least for facts in found.effects[k].parameters.values()]
+            least = [facts.min_relevant_change for facts in found.effects[k].parameters.values()]
             own = fitted.covariance[block, block] + np.diag(np.square(least))
             precisions[k].append(np.linalg.inv(own))
     out = []
@@ -685,13 +669,13 @@ def possible_errors(mechanism: Mechanism, columns: Columns, share: float = 1.0) 
         for kind in BODY_PARAMETERS:
             own = mass if kind == "mass" else reach if kind.startswith("moment") else spread
             out[f"{kind}.{body}"] = off * own
-    for one in mechanism.setup.rubbing:
+    for one in mechanism.setup.friction_terms:
         for kind, value in one.nominal.items():
-            out[f"{kind}.{one.place}"] = off * abs(value)
-        if one.place in chain.drives:
+            out[f"{kind}.{one.location}"] = off * abs(value)
+        if one.location in chain.drives:
             dry = abs(one.nominal.get("coulomb", 0.0)) + abs(one.nominal.get("stribeck", 0.0))
-            out[f"stribeck0.{one.place}"] = out[f"stribeck2.{one.place}"] = _SLOW * dry
-            out[f"sharpness.{one.place}"] = _SHARP * dry
+            out[f"stribeck0.{one.location}"] = out[f"stribeck2.{one.location}"] = _SLOW * dry
+            out[f"sharpness.{one.location}"] = _SHARP * dry
     for joint in mechanism.setup.drive_inertia:
         out[f"drive_inertia.{joint}"] = off * abs(float(chain.armature[chain.index(joint)]))
     out["delay.force"] = 0.5 * columns.row

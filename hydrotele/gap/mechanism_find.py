@@ -87,13 +87,8 @@ _REJECTED = (
     "The changes found on the fitted runs increase the errors on the held-out run; they were"
     " rejected, and no effect is named."
 )
-_SPOILS = (
-    "{} at {}, found on the fitted runs, increases the errors on the held-out run; it was rejected."
-)
-_DIFFERS = (
-    "{} at {}, found on the fitted runs, differs between parts of these runs ({} {} {}); it was"
-    " rejected."
-)
+_SPOILS = "{} at {}, found on the fitted runs, increases the errors on the held-out run; it was rejected."
+_DIFFERS = "{} at {}, found on the fitted runs, differs between parts of these runs ({} {} {}); it was rejected."
 _TURNS = 0.05  # doubt of a sign from which what is left may be the form of dry friction near rest
 _LISTED = 3  # notes of that kind
 METRIC = "RMS of the drive force errors divided by their noise, all drives, held-out run"
@@ -168,7 +163,7 @@ class _Patching(NamedTuple):
         if chosen or numbers:
             speeds = {joint: size[2] for joint, size in found.columns.sizes.items()}
             patch = patch_of(
-                chosen, mechanism.setup.chain, mechanism.measured, numbers, self.nominal, speeds
+                chosen, mechanism.setup.chain, mechanism.measured_joints, numbers, self.nominal, speeds
             )  # fmt: skip
             patched = replace(
                 self.given, mjcf=patched_mjcf(self.mjcf, patch),
@@ -226,9 +221,7 @@ def find_mechanism_gap(
     nominal = nominal_parameters(mechanism)
     found = _searched(fit, mechanism, band, nominal, effects, tell)
     tell("patch the model and evaluate it on the held-out run", 0.8)
-    given = MechanismModel(
-        mechanism.setup.chain.name, Path(mjcf).read_text(encoding="utf-8"), mechanism.mapping
-    )
+    given = MechanismModel(mechanism.setup.chain.name, Path(mjcf).read_text(encoding="utf-8"), mechanism.mapping)
     then = build_columns([heldout], mechanism, band)
     patching = _Patching(mjcf, mechanism, given, nominal, heldout, band, then)
     found, untrue, varies = _constant(found)
@@ -329,8 +322,8 @@ def nominal_parameters(mechanism: Mechanism) -> dict[str, float]:
         for body, row in zip(chain.bodies, chain.inertia, strict=True)
         for kind, value in zip(BODY_PARAMETERS, row, strict=True)
     }
-    for one in setup.rubbing:
-        out |= {f"{kind}.{one.place}": float(value) for kind, value in one.nominal.items()}
+    for one in setup.friction_terms:
+        out |= {f"{kind}.{one.location}": float(value) for kind, value in one.nominal.items()}
     for joint in setup.drive_inertia:
         out[f"drive_inertia.{joint}"] = float(chain.armature[chain.index(joint)])
     return out
@@ -365,9 +358,7 @@ def _searched(fit, mechanism, band, nominal, names, tell) -> _Found:
         ]
         value = found.evidence.coefficients(found.fitted)
         about = {name: value[k] for k, name in enumerate(columns.names) if name in nominal}
-        steps = [
-            np.abs(value - applied.get(one.key, one.start)) / one.scale for one, value in known
-        ]
+        steps = [np.abs(value - applied.get(one.key, one.start)) / one.scale for one, value in known]
         same = {one.key for one, _ in known} == set(applied)
         if same and max((float(s.max()) for s in steps), default=0.0) < _SAME:
             break
@@ -409,9 +400,7 @@ def _search(
         if len(chosen) <= _FEW:
             chosen, now = _improved(evidence, effects, chosen, now, need, refused)
     chosen, now = _improved(evidence, effects, chosen, now, need, refused)
-    return _Found(
-        columns, noise, evidence, effects, now, tuple(weak), singles, frozenset(refused), off
-    )
+    return _Found(columns, noise, evidence, effects, now, tuple(weak), singles, frozenset(refused), off)
 
 
 def _need(effects: Sequence[MechanismEffect]) -> float:
@@ -421,7 +410,7 @@ def _need(effects: Sequence[MechanismEffect]) -> float:
 
 def _slight(effect: MechanismEffect, value: np.ndarray) -> bool:
     """Whether an effect is smaller than worth naming."""
-    least = np.array([one.least for one in effect.parameters.values()])
+    least = np.array([one.min_relevant_change for one in effect.parameters.values()])
     nominal = np.array([one.nominal for one in effect.parameters.values()])
     counted = least > 0.0
     return float(np.linalg.norm((value - nominal)[counted] / least[counted])) < 1.0
@@ -437,9 +426,7 @@ def _improved(evidence, effects, chosen, now: Fitted, need: float, refused):
                 chosen, now = rest, without
                 break
             keys, left = {one.key for one in rest} | refused, evidence.beside(without)
-            score, place = max(
-                (left.fit([one]).score, n) for n, one in enumerate(effects) if one.key not in keys
-            )
+            score, place = max((left.fit([one]).score, n) for n, one in enumerate(effects) if one.key not in keys)
             one = effects[place]
             if one is chosen[k] or without.score + score < now.score + _BETTER:
                 continue
@@ -483,8 +470,8 @@ def _named(found: _Found, shares: Mapping[Key, float]) -> list[NamedEffect]:
         )  # fmt: skip
         numbers = {
             name: Estimate(
-                float(v), p.unit, float(max(v - _NORMAL95 * s, p.low)),
-                float(min(v + _NORMAL95 * s, p.high)), p.nominal,
+                float(v), p.unit, float(max(v - _NORMAL95 * s, p.lower_bound)),
+                float(min(v + _NORMAL95 * s, p.upper_bound)), p.nominal,
             )
             for (name, p), v, s in zip(effect.parameters.items(), value, own, strict=True)
         }  # fmt: skip
@@ -540,7 +527,7 @@ def parameter_unit(mechanism: Mechanism, name: str) -> str:
 
 def _unit(mechanism: Mechanism, joint: str) -> str:
     chain = mechanism.setup.chain
-    straight = joint in chain.joints and chain.tree.slides[chain.index(joint)]
+    straight = joint in chain.joints and chain.tree.is_slide[chain.index(joint)]
     return "N" if straight else "N m"
 
 
@@ -609,10 +596,7 @@ def _judged(
         gain = squares(error + change) - squares(error)
         if gain < min(0.0, expected + 2.0 * _SPOILT * np.sqrt(expected)):
             spoiling[effect.key] = gain
-    channels = tuple(
-        f"{'force' if _unit(mechanism, d) == 'N' else 'torque'}.{d}"
-        for d in mechanism.setup.chain.drives
-    )
+    channels = tuple(f"{'force' if _unit(mechanism, d) == 'N' else 'torque'}.{d}" for d in mechanism.setup.chain.drives)
 
     def prediction(run: str, time: np.ndarray, measured, error, whitened) -> Prediction:
         return Prediction(run, time, channels, measured - error, measured, whitened)
@@ -679,8 +663,7 @@ def _unknown(left: Left, lacks: Sequence[Lack], after: Prediction) -> Unknown:
     if own:
         told = " and ".join(channel_words(name) for name in depends)
         words.append(
-            f"{100 * float(left.share[worst]):.0f} % of the remaining force on {drives[worst]}"
-            f" depend on {told}."
+            f"{100 * float(left.share[worst]):.0f} % of the remaining force on {drives[worst]} depend on {told}."
         )
     else:
         words.append(
@@ -718,7 +701,6 @@ def _notes(found: _Found, band: float) -> list[str]:
             for (name, p), value in zip(effect.parameters.items(), one.values[-1], strict=True)
         )
         notes.append(
-            f"{effect.name} at {effect.location}, {told}, is too small to be named and was not"
-            " added to the model."
+            f"{effect.name} at {effect.location}, {told}, is too small to be named and was not added to the model."
         )
     return notes

@@ -87,14 +87,11 @@ def _values(tracks: Sequence[Track]) -> list[np.ndarray]:
     weights = np.array([p[0] for p in parts])
     total = np.maximum(weights.sum(axis=0), 1.0)
     return [
-        np.sum(weights * np.array([p[index] for p in parts]), axis=0) / total
-        for index in range(1, 1 + len(LIMITS))
+        np.sum(weights * np.array([p[index] for p in parts]), axis=0) / total for index in range(1, 1 + len(LIMITS))
     ]
 
 
-def _measures(
-    whitened: np.ndarray, period: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _measures(whitened: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Per channel (c,): rows with a reading, mean square, window means, autocorrelation."""
     w, window = settled(whitened, period), max(2, round(_WINDOW / period))
     there = np.isfinite(w)
@@ -103,9 +100,7 @@ def _measures(
     some = np.maximum(count, 1.0)
     square = (w**2).sum(axis=0) / some
     windows = len(w) // window
-    cut, filled = (
-        a[: windows * window].reshape(windows, window, -1).sum(axis=1) for a in (w, there)
-    )
+    cut, filled = (a[: windows * window].reshape(windows, window, -1).sum(axis=1) for a in (w, there))
     full = filled > window // 2
     means = np.where(full, cut**2 / np.maximum(filled, 1), 0.0).sum(axis=0)
     means /= np.maximum(full.sum(axis=0), 1)
@@ -226,18 +221,12 @@ def clean_run(machine: Machine, data: Dataset, run: RunData, start: np.ndarray, 
         model, space, start.copy(), run.command.copy(), run.period,
         max(1, round(run.period / (0.5 * STEP))), shown, states,
     )  # fmt: skip
-    noise = (
-        np.random.default_rng(seed).uniform(-1.0, 1.0, shown.shape)
-        * np.sqrt(3.0)
-        * data.noise_of(run)
-    )
+    noise = np.random.default_rng(seed).uniform(-1.0, 1.0, shown.shape) * np.sqrt(3.0) * data.noise_of(run)
     reading = np.where(np.isnan(run.reading), np.nan, shown + noise)
     return replace(run, reading=reading)
 
 
-def perfect_tracks(
-    machine: Machine, data: Dataset, tracks: Sequence[Track], each: Callable = map
-) -> tuple[Track, ...]:
+def perfect_tracks(machine: Machine, data: Dataset, tracks: Sequence[Track], each: Callable = map) -> tuple[Track, ...]:
     """Tracks of a model on readings that it made itself.
 
     Args:
@@ -275,9 +264,7 @@ def believed_part(part: float) -> float:
     return float(expit((part - _PART) / _PART_STEEP))
 
 
-def left_over(
-    before: Track, after: Track, channels: Sequence[str], floor: float | None
-) -> dict[str, float]:
+def left_over(before: Track, after: Track, channels: Sequence[str], floor: float | None) -> dict[str, float]:
     """Share of the gap on a run that a patch leaves, of each axis' channels and of all.
 
     Args:

@@ -13,7 +13,7 @@ from typing import Any, Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
 
-from hydrotele.core.units import customary
+from hydrotele.core.units import display_unit
 from hydrotele.effects import EFFECTS
 
 SURE = 0.95
@@ -320,10 +320,7 @@ def gap_document(gap: Gap) -> dict[str, Any]:
         "description": gap.unknown.description,
     }
     size = gap.size
-    laws = {
-        law: {"unit": gap.law_units.get(law, "1"), "places": places}
-        for law, places in gap.laws.items()
-    }
+    laws = {law: {"unit": gap.law_units.get(law, "1"), "places": places} for law, places in gap.laws.items()}
     open_loop = {} if gap.open_loop is None else {"open_loop": gap.open_loop}
     return finite(open_loop | {
         "verdict": gap.verdict,
@@ -365,8 +362,7 @@ def effect_document(effect: NamedEffect) -> dict[str, Any]:
         "mechanism_probability": effect.mechanism_probability,
         "share": effect.share,
         "parameters": {
-            name: {"value": e.value, "unit": e.unit, "ci95": [e.low, e.high]}
-            for name, e in effect.parameters.items()
+            name: {"value": e.value, "unit": e.unit, "ci95": [e.low, e.high]} for name, e in effect.parameters.items()
         },
         "alternatives": [
             {
@@ -416,7 +412,7 @@ def amount(value: float, unit: str, parameter: str = "") -> str:
     >>> amount(0.0021, "m"), amount(-60e3, "Pa"), amount(0.0, "kg")
     ('2.1 mm', '-0.6 bar', '0 kg')
     """
-    shown, factor = customary(unit, value, parameter)
+    shown, factor = display_unit(unit, value, parameter)
     return f"{_rounded(value * factor)} {shown}"
 
 
@@ -428,7 +424,7 @@ def in_customary_units(estimate: Estimate, parameter: str = "") -> CustomaryEsti
     """
     numbers = (estimate.value, estimate.low, estimate.high, estimate.nominal)
     size = max((abs(x) for x in numbers[:3] if math.isfinite(x)), default=math.nan)
-    unit, factor = customary(estimate.unit, size, parameter)
+    unit, factor = display_unit(estimate.unit, size, parameter)
     width = 0.5 * abs(estimate.high - estimate.low) * factor
     value, low, high = (_number(x * factor, width) for x in numbers[:3])
     return CustomaryEstimate(value, low, high, _rounded(estimate.nominal * factor), unit)

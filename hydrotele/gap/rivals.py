@@ -73,9 +73,7 @@ def weights(blocks: Sequence[np.ndarray], charges: Sequence[float], seed: int = 
     return (effect_probabilities / effect_probabilities.sum(axis=1, keepdims=True)).mean(axis=0)
 
 
-def effect_probabilities(
-    now: Judged, cost: float, rest: Judged, rivals: Sequence[Rival]
-) -> np.ndarray:
+def effect_probabilities(now: Judged, cost: float, rest: Judged, rivals: Sequence[Rival]) -> np.ndarray:
     """(2 + R,) probabilities of an effect, of none, and of its rivals.
 
     Args:
@@ -106,9 +104,9 @@ def is_case_of(evidence: Evidence, guess: Guess, index: int, other: Hypothesis) 
         return False
     (own,), (value,) = hypothesis.parameters.values(), hypothesis.values(deviation).values()
     numbers = other.parameters.values()
-    if any(p.unit != own.unit or not p.low <= value <= p.high for p in numbers):
+    if any(p.unit != own.unit or not p.lower_bound <= value <= p.upper_bound for p in numbers):
         return False
-    equal = np.array([(value - p.nominal) / p.scale for p in numbers])
+    equal = np.array([(value - p.nominal) / p.prior_std for p in numbers])
     instead = Guess(tuple((other, equal) if i == index else p for i, p in enumerate(guess.parts)))
     first = evidence.tracks[:1]
     change = evidence.errors(instead, MIDDLE, first) - evidence.errors(guess, MIDDLE, first)
@@ -134,7 +132,7 @@ def brings_no_more(evidence: Evidence, now: Judged, index: int, other: Hypothesi
         return False
     hypothesis, deviation = now.guess.parts[index]
     (value,) = hypothesis.values(deviation).values()
-    start = np.array([(value - p.nominal) / p.scale for p in other.parameters.values()])
+    start = np.array([(value - p.nominal) / p.prior_std for p in other.parameters.values()])
     first = sum(h.size for h in now.guess.hypotheses[:index])
     kept = np.delete(evidence.base_slopes(evidence.slope_step), first, axis=1)
     instead = now.guess.without(index).plus(other, start)
@@ -159,9 +157,7 @@ def plain_form(hypothesis: Hypothesis, candidates: Sequence[Hypothesis]) -> Hypo
     return None
 
 
-def better(
-    now: Judged, index: int, cost: float, rest: Judged, rivals: Sequence[Rival]
-) -> Rival | None:
+def better(now: Judged, index: int, cost: float, rest: Judged, rivals: Sequence[Rival]) -> Rival | None:
     """The rival that should take an effect's place: likelier, or nearly as likely and plainer.
 
     By the same measure an effect keeps its place beside one with more numbers.
@@ -283,14 +279,10 @@ def differs_significantly(guess: Guess, fit: Fit, index: int) -> bool:
 def idle(rival: Rival) -> bool:
     """Whether a rival does nothing: what is there without it was settled."""
     guess = rival.judged.guess
-    return rival.fit is not None and not differs_significantly(
-        guess, rival.fit, len(guess.parts) - 1
-    )
+    return rival.fit is not None and not differs_significantly(guess, rival.fit, len(guess.parts) - 1)
 
 
-def without_needless(
-    now: Judged, charges: Sequence[float], rivals: Sequence[Sequence[Rival]]
-) -> Guess | None:
+def without_needless(now: Judged, charges: Sequence[float], rivals: Sequence[Sequence[Rival]]) -> Guess | None:
     """The guess without an effect of which a rival that does nothing can take the place."""
     for cost, others in zip(charges, rivals, strict=True):
         for rival in others:
@@ -312,9 +304,7 @@ def pruned(
         now, fit = fit_until_settled(evidence, worst)
 
 
-def rests_of(
-    evidence: Evidence, base: Judged, now: Judged, fit: Fit | None
-) -> tuple[list[Judged | None], list[float]]:
+def rests_of(evidence: Evidence, base: Judged, now: Judged, fit: Fit | None) -> tuple[list[Judged | None], list[float]]:
     """What a guess is without each of its parts.
 
     Args:
@@ -343,9 +333,7 @@ def rests_of(
         rest = evidence.judged(smaller, reopened=True) if smaller.parts else base
         cost = occam_penalty(moved_last(fit.information, now.guess, index), hypothesis.size)
         score = rest.loss - now.loss - cost
-        if not (
-            worth_naming(now.guess, index, score) and differs_significantly(now.guess, fit, index)
-        ):
+        if not (worth_naming(now.guess, index, score) and differs_significantly(now.guess, fit, index)):
             score = min(score, 0.0)
         rests.append(rest)
         scores.append(score)

@@ -137,9 +137,7 @@ def _rank(
     return sorted(evidence.map(rate, candidates), key=lambda s: -s.score)
 
 
-def _around_nominal(
-    hypothesis: Hypothesis, ground: _Ground, shift_to: Callable[[np.ndarray], np.ndarray]
-) -> Screened:
+def _around_nominal(hypothesis: Hypothesis, ground: _Ground, shift_to: Callable[[np.ndarray], np.ndarray]) -> Screened:
     """By both sides of nominal, parameter by parameter."""
     slopes, tried, bent = np.zeros((len(ground.errors), hypothesis.size)), [], False
     for k in range(hypothesis.size):
@@ -177,9 +175,7 @@ def _without_present(ground: _Ground, errors: np.ndarray) -> float:
     return float(errors @ errors + fall)
 
 
-def _least(
-    matrix: np.ndarray, pull: np.ndarray, low: np.ndarray, high: np.ndarray
-) -> tuple[np.ndarray, float]:
+def _least(matrix: np.ndarray, pull: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, float]:
     """Least `x' A x + 2 b' x` within bounds on x, which hold 0: (x, that)."""
     x = -np.linalg.solve(matrix, pull)
     if np.any((x < low) | (x > high)):
@@ -197,9 +193,7 @@ def _explained(ground: _Ground, along: np.ndarray) -> float:
     return float(pull @ np.linalg.solve(ground.matrix, pull))
 
 
-def _line(
-    hypothesis: Hypothesis, ground: _Ground, slopes: np.ndarray, start: np.ndarray
-) -> Screened:
+def _line(hypothesis: Hypothesis, ground: _Ground, slopes: np.ndarray, start: np.ndarray) -> Screened:
     """Best deviation inside the bounds, with straight signatures, what is there following."""
     weight = hypothesis.prior_weight(start)
     own = slopes.T @ slopes + np.diag(weight)
@@ -342,9 +336,7 @@ _EVALUATIONS = 60  # of a simplex
 _CLOSE = 0.01  # ends the search
 
 
-def rattling(
-    evidence: Evidence, guess: Guess, ahead: Judged, axes: Collection[str]
-) -> Judged | None:
+def rattling(evidence: Evidence, guess: Guess, ahead: Judged, axes: Collection[str]) -> Judged | None:
     """Teeth with a gap for an axis that shakes, with levels of their own.
 
     Args:
@@ -370,9 +362,7 @@ def rattling(
     return min(found, key=lambda judged: judged.loss, default=None)
 
 
-def shaken(
-    evidence: Evidence, candidates: Sequence[Hypothesis], guesses: Sequence[Judged]
-) -> list[str]:
+def shaken(evidence: Evidence, candidates: Sequence[Hypothesis], guesses: Sequence[Judged]) -> list[str]:
     """Axes that may have teeth with a gap, and that shake by all of some guesses without them."""
     return [
         c.location for c in candidates
@@ -393,9 +383,7 @@ def _sensors_only(evidence: Evidence) -> Levels:
     return Levels(noise_prior(evidence.data).noise, jitter=jitter)
 
 
-def _likeliest(
-    evidence: Evidence, toothless: Machine, teeth: Hypothesis, rival: Machine | None
-) -> np.ndarray | None:
+def _likeliest(evidence: Evidence, toothless: Machine, teeth: Hypothesis, rival: Machine | None) -> np.ndarray | None:
     """Deviations of the likeliest teeth of a machine; None where none are likelier than none.
 
     Nor are there any where a spring of the same drive, the rival, explains the busiest stretch
@@ -406,7 +394,7 @@ def _likeliest(
     parts = sorted((_busiest_part(run, column) for run in evidence.runs), key=lambda p: -p[0])
     stretches = [run for _, run in parts[:_STRETCHES]]
     nominal, size = np.array([p.nominal for p in teeth.parameters.values()]), teeth.size
-    scale = np.array([p.scale for p in teeth.parameters.values()])
+    scale = np.array([p.prior_std for p in teeth.parameters.values()])
 
     def deviation(x: np.ndarray) -> np.ndarray:
         return np.clip((np.exp(x[:size]) - nominal) / scale, teeth.low, teeth.high)
@@ -456,4 +444,4 @@ def _busiest_part(run: RunData, column: int) -> tuple[float, RunData]:
     passed = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(run.command[:, column])))])
     changes = passed[rows:] - passed[: len(passed) - rows]
     first = int(np.argmax(changes))
-    return float(changes[first]), run.part(first, first + rows)
+    return float(changes[first]), run.select_rows(first, first + rows)

@@ -88,9 +88,7 @@ class WithoutInputs:
     ranking: tuple[Screened, ...]
 
 
-def without_inputs(
-    evidence: Evidence, base: Judged, candidates: Sequence[Hypothesis]
-) -> WithoutInputs:
+def without_inputs(evidence: Evidence, base: Judged, candidates: Sequence[Hypothesis]) -> WithoutInputs:
     """Effects that take most of what is lacking, one after the other, then with a calibration.
 
     Args:
@@ -122,9 +120,7 @@ def without_inputs(
     return WithoutInputs(tuple(options), first)
 
 
-def _beside_calibration(
-    evidence: Evidence, base: Judged, now: Judged
-) -> list[tuple[Judged, float]]:
+def _beside_calibration(evidence: Evidence, base: Judged, now: Judged) -> list[tuple[Judged, float]]:
     """Effects that are no uncertain numbers with all that are; empty without such effects."""
     table = numbers(evidence.data.machine)
     keys = {number.effect[:2] for number in table.values() if number.effect}
@@ -137,7 +133,7 @@ def _beside_calibration(
         for (key, p), d in zip(hypothesis.parameters.items(), deviation, strict=True):
             name = f"{hypothesis.name}.{hypothesis.location}.{key}"
             if name in held:
-                begin[held.index(name)] = d * p.scale / group.parameters[name].scale
+                begin[held.index(name)] = d * p.prior_std / group.parameters[name].prior_std
     guess = Guess(parts).plus(group, np.clip(begin, group.low, group.high))
     for _ in range(_ROUNDS):
         evidence.set_base(_alone(evidence, guess))
@@ -177,9 +173,7 @@ def _alone(evidence: Evidence, guess: Guess) -> Judged:
     machine, levels = guess.machine(evidence.data.machine), _sensors(evidence)
 
     def track(near: Track):
-        return track_run(
-            machine, evidence.data, near.run, None, evidence.step, levels, rest=near.rest
-        )
+        return track_run(machine, evidence.data, near.run, None, evidence.step, levels, rest=near.rest)
 
     tracks = tuple(evidence.map(track, evidence.tracks))
     return Judged(guess, tracks, sum(t.loss for t in tracks))
@@ -261,9 +255,7 @@ class Found:
         return self.judged.guess
 
 
-def search(
-    evidence: Evidence, candidates: Sequence[Hypothesis], progress: Progress | None = None
-) -> Found:
+def search(evidence: Evidence, candidates: Sequence[Hypothesis], progress: Progress | None = None) -> Found:
     """Add effects, or calibrate all numbers, as long as that brings enough; then compare rivals.
 
     Args:
@@ -298,9 +290,7 @@ def search(
     return _compared(evidence, base, grown, tell)
 
 
-def _begun(
-    evidence: Evidence, base: Judged, candidates: Sequence[Hypothesis], tell: Progress
-) -> "_Grown":
+def _begun(evidence: Evidence, base: Judged, candidates: Sequence[Hypothesis], tell: Progress) -> "_Grown":
     """A search from the given machine: how far it gets."""
     tell("evaluate every effect without residual inputs", 0.03)
     bold = without_inputs(evidence, base, candidates)
@@ -400,11 +390,7 @@ def _grow(
             last = len(grown.guess.parts) - 1
             if moved and best.guess.hypotheses == moved[0].hypotheses:
                 worth = max(worth, moved[1])  # what the number cost is paid already
-            if (
-                worth < ENTER
-                or strained(grown.guess, -1)
-                or not differs_significantly(grown.guess, settled, last)
-            ):
+            if worth < ENTER or strained(grown.guess, -1) or not differs_significantly(grown.guess, settled, last):
                 evidence.set_base(now)
                 candidates = [c for c in candidates if c.key != added.key]
                 ranked = _others(ranked, [added.key])
@@ -441,9 +427,7 @@ def _grow(
         for part in grown.guess.parts[len(now.guess.parts) :]:
             rankings[part[0].key] = first if ranked is None else ranked
         now, fit, ranked, ahead = grown, settled, None, None
-    return replace(
-        begin, now=now, fit=fit, first=first, rankings=rankings, weak=weak, toothed=toothed
-    )
+    return replace(begin, now=now, fit=fit, first=first, rankings=rankings, weak=weak, toothed=toothed)
 
 
 def _wrong_everywhere(evidence: Evidence, base: Judged, begin: _Grown) -> bool:
@@ -524,7 +508,7 @@ def _plain(evidence: Evidence, grown: _Grown, candidates: Sequence[Hypothesis]) 
         if gone @ np.linalg.solve(apart @ covariance @ apart.T, gone) > TOLD * len(gone):
             continue
         (p,) = plain.parameters.values()
-        start = (np.mean(list(hypothesis.values(deviation).values())) - p.nominal) / p.scale
+        start = (np.mean(list(hypothesis.values(deviation).values())) - p.nominal) / p.prior_std
         parts = list(grown.now.guess.parts)
         parts[index] = (plain, np.clip(np.array([start]), plain.low, plain.high))
         keys = {f"{plain.name}.{plain.location}.{key}" for key in plain.parameters}
@@ -636,9 +620,7 @@ def _compared(evidence: Evidence, base: Judged, grown: _Grown, tell: Progress) -
         charges, rivals = [], []
         for index, (hypothesis, _) in enumerate(now.guess.parts):
             assert fit
-            charges.append(
-                occam_penalty(moved_last(fit.information, now.guess, index), hypothesis.size)
-            )
+            charges.append(occam_penalty(moved_last(fit.information, now.guess, index), hypothesis.size))
             ranked, rest = grown.rankings.get(hypothesis.key, first), without[index]
             rivals.append(find_rivals(evidence, now, index, ranked, rest) if rest else ())
         needless = without_needless(now, charges, rivals)
@@ -714,7 +696,7 @@ def _lacked(evidence: Evidence, candidates: Sequence[Hypothesis], now: Judged) -
     return [
         c for c in candidates
         if c.location.partition(".")[0] not in sound
-        or c.name not in EFFECTS or EFFECTS[c.name].law not in ("force", "flow", "valve")
+        or c.name not in EFFECTS or EFFECTS[c.name].model_part not in ("force", "flow", "valve")
     ]  # fmt: skip
 
 
@@ -723,9 +705,7 @@ def lacking(judged: Judged, evidence: Evidence) -> float:
     return sum(evidence.map(input_excess, judged.tracks))
 
 
-def _others(
-    ranked: Sequence[Screened] | None, keys: Sequence[tuple[str, str]]
-) -> Sequence[Screened] | None:
+def _others(ranked: Sequence[Screened] | None, keys: Sequence[tuple[str, str]]) -> Sequence[Screened] | None:
     """A ranking without some candidates."""
     return ranked and [r for r in ranked if r.hypothesis.key not in keys]
 
@@ -739,9 +719,7 @@ def _named_so_far(guess: Guess) -> int:
     return sum(h.name != CALIBRATION for h, _ in guess.parts)
 
 
-def _best_singles(
-    evidence: Evidence, now: Judged, ranked: Sequence[Screened]
-) -> list[tuple[Judged, float]]:
+def _best_singles(evidence: Evidence, now: Judged, ranked: Sequence[Screened]) -> list[tuple[Judged, float]]:
     """The best of the first few candidates that bring enough, judged, and their scores."""
     bar = max(0.5 * ENTER, _WORTH * ranked[0].score) if ranked else 0.0
     short = [s for s in ranked[:_SHORT] if s.score > bar]
@@ -753,9 +731,7 @@ def _best_singles(
     return _judged_best(evidence, now, [f for f in close if f.score > 0.5 * ENTER])
 
 
-def _judged_best(
-    evidence: Evidence, now: Judged, fits: Sequence[Fit]
-) -> list[tuple[Judged, float]]:
+def _judged_best(evidence: Evidence, now: Judged, fits: Sequence[Fit]) -> list[tuple[Judged, float]]:
     """Fits that bring enough with levels of their own and may be believed, and their scores."""
     judged = [evidence.judged(fit.guess) for fit in fits]
     scores = [now.loss - j.loss - fit.occam_penalty for j, fit in zip(judged, fits, strict=True)]
@@ -763,9 +739,7 @@ def _judged_best(
     return sorted(options, key=_score)
 
 
-def _best_pairs(
-    evidence: Evidence, now: Judged, ranked: Sequence[Screened]
-) -> list[tuple[Judged, float]]:
+def _best_pairs(evidence: Evidence, now: Judged, ranked: Sequence[Screened]) -> list[tuple[Judged, float]]:
     """The best pairs where no single effect helps by its signature, judged, and their scores.
 
     A single one that does all that a pair does is tried alone: signatures may have been too small.

@@ -5,9 +5,9 @@ It computes the wrench with the joystick's control law (`teleop.master`) from th
 packet. The machine simulation runs concurrently at its own rate; both exchange data through a
 mailbox. The device's travel is scaled to that of the joystick; forces are not scaled.
 
-Safety: if no pose arrives for `SILENT`, the machine gets no command until the handle has returned
-to its dead bands. If the machine sends nothing, first the reflection is switched off (`FADED`),
-then all force (`OFF`). Forces return over `RAMP`.
+Safety: if no pose arrives for `POSE_TIMEOUT`, the machine gets no command until the handle has returned
+to its dead bands. If the machine sends nothing, first the reflection is switched off (`REFLECTION_TIMEOUT`),
+then all force (`FORCE_TIMEOUT`). Forces return over `FORCE_RAMP_TIME`.
 """
 
 import socket
@@ -20,65 +20,72 @@ from numba import types
 
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
-from hydrotele.core.memory import address_record, floats, integers, rows_of
+from hydrotele.core.memory import address_record, float64_view, int64_view, matrix_view
 from hydrotele.haptics.device import HandlePose
 from hydrotele.haptics.packets import (
-    ABLE,
-    ANSWERED,
+    ANSWERED_POSE,
     BUTTONS,
+    CAN_APPLY_FORCE,
+    FORCES_ON,
+    LAST_ACCEPTED,
     MAGIC,
+    MAX_WRENCH,
     MISSED,
-    MOST,
-    ON,
     PERIOD,
-    PLACE,
     POSE_MAGIC,
     POSE_WORDS,
+    POSITION,
     QUATERNION,
     SENT,
     SEQUENCE,
     SESSION,
-    TAKEN,
     TRAVEL,
     UNANSWERED,
     WRENCH,
     WRENCH_MAGIC,
     WRENCH_WORDS,
-    packet,
+    make_packet,
 )
-from hydrotele.haptics.timing import ask_for_priority, summary_of
-from hydrotele.teleop.axis_table import COORDINATE, DEADBAND, REACH, flat_state, flat_view
+from hydrotele.haptics.timing import request_priority, summarise_durations
+from hydrotele.teleop.axis_table import (
+    COORDINATE,
+    DEADBAND,
+    HANDLE_RANGE,
+    flat_view,
+    make_flat_state,
+)
 from hydrotele.teleop.master import (
-    KINDS,
-    Master,
+    REFLECTION_KINDS,
+    MasterParameters,
     MasterState,
-    master_step,
+    step_master,
     unpack_master,
     unpack_master_state,
 )
 
-SILENT = 0.05  # s without a pose after which the machine gets no command
-FADED = 0.05  # s without machine data after which nothing is reflected
-OFF = 0.15  # s without machine data after which the force is zero
-RAMP = 0.3  # s over which forces return
+POSE_TIMEOUT = 0.05  # s without a pose after which the machine gets no command
+REFLECTION_TIMEOUT = 0.05  # s without machine data after which nothing is reflected
+FORCE_TIMEOUT = 0.15  # s without machine data after which the force is zero
+FORCE_RAMP_TIME = 0.3  # s over which forces return
 # The other structures estimate the operator's force from the mass of the joystick's own flotor, or
 # keep the state of the communication channel in the state of one master.
 REFLECTIONS = ("none", "stiffness", "direct_force", "coordinating_force", "impedance")
-_ASK = 100_000_000  # ns between two connection requests
-_WAIT = 0.005  # s that the thread waits for a pose before it checks the stop flag
-_CENTRED = 0.1  # dead band of an axis that has none, as a fraction of its range
-_SAMPLES = 700_000  # number of times that are kept: 11 minutes at 1 kHz
-_SENT_KEPT = 1024
+_REQUEST_INTERVAL_NS = 100_000_000  # ns between two connection requests
+_RECEIVE_TIMEOUT = 0.005  # s that the thread waits for a pose before it checks the stop flag
+_MIN_DEADBAND_RATIO = 0.1  # dead band of an axis that has none, as a fraction of its range
+_MAX_SAMPLES = 700_000  # number of times that are kept: 11 minutes at 1 kHz
+_MAX_SENT_TIMES = 1024
 _PRIORITY = 30
 
-# indices into `Line.count`
-(STOP, SESSION_OF, LAST, NEXT, TAKEN_LAST, RECEIVED, LOST, LATE, MALFORMED, STARTS, ASKED, SENT_AT,
- ANSWERS, ROUNDS, INTERVALS, CAME_AT) = range(16)  # fmt: skip
-# indices into `Line.ramp`
-GAIN, SCALE, TURN_SCALE = range(3)
+# indices into `LinkBuffers.count`
+(STOP_FLAG, CURRENT_SESSION, LAST_POSE, NEXT_WRENCH, LAST_ACKNOWLEDGED, RECEIVED, LOST, LATE, MALFORMED,
+SERVER_STARTS, REQUEST_TIME, POSE_SENT_TIME,
+ ANSWERS, ROUNDS, INTERVALS, POSE_ARRIVAL_TIME) = range(16)  # fmt: skip
+# indices into `LinkBuffers.ramp`
+FORCE_GAIN, POSITION_SCALE, ROTATION_SCALE = range(3)
 
 
-class Line(NamedTuple):
+class LinkBuffers(NamedTuple):
     """Buffers, counters and recorded times of the thread.
 
     Attributes:
@@ -90,7 +97,7 @@ class Line(NamedTuple):
         ramp: (3,) factor on the forces, scale of positions, scale of rotations.
         sent: (1024,) send time of a wrench, by its sequence number [ns].
         answers: (n,) time from the arrival of a pose to the sending of its answer [ns].
-        rounds: (n,) time from the sending of a wrench to the first pose that acknowledges it [ns].
+        round_trip_times: (n,) time from the sending of a wrench to the first pose that acknowledges it [ns].
         intervals: (n,) time between two poses [ns].
         reach: (2,) range of the joystick [m], [rad].
     """
@@ -103,7 +110,7 @@ class Line(NamedTuple):
     ramp: np.ndarray
     sent: np.ndarray
     answers: np.ndarray
-    rounds: np.ndarray
+    round_trip_times: np.ndarray
     intervals: np.ndarray
     reach: np.ndarray
 
@@ -118,7 +125,7 @@ class Mailbox(NamedTuple):
         packet: (rows, k) packet from the machine, see `teleop.master`.
         share: (1,) factor on the packet.
         extra: (6,) additional force on the handle [N], [N m].
-        numbers: flat Master.
+        parameters: flat Master.
         state: flat MasterState of the thread.
     """
 
@@ -128,38 +135,34 @@ class Mailbox(NamedTuple):
     packet: np.ndarray
     share: np.ndarray
     extra: np.ndarray
-    numbers: np.ndarray
+    parameters: np.ndarray
     state: np.ndarray
 
 
 _HANDLE, _MACHINE = range(2)
 
-_recv = types.ExternalFunction(
-    "recv", types.int64(types.int32, types.uintp, types.uint64, types.int32)
-)
-_send = types.ExternalFunction(
-    "send", types.int64(types.int32, types.uintp, types.uint64, types.int32)
-)
+_recv = types.ExternalFunction("recv", types.int64(types.int32, types.uintp, types.uint64, types.int32))
+_send = types.ExternalFunction("send", types.int64(types.int32, types.uintp, types.uint64, types.int32))
 _gettime = types.ExternalFunction("clock_gettime", types.int32(types.int32, types.uintp))
 _MONOTONIC = clock.CLOCK_MONOTONIC
 
 
 @compiled
-def _now(two):
+def _read_clock(two):
     """Return the time of `time.monotonic_ns` [ns] and prevent caching of the shared memory."""
     _gettime(np.int32(_MONOTONIC), two.ctypes.data)
     return two[0] * 1_000_000_000 + two[1]
 
 
 @compiled
-def scaled_pose(place, quaternion, scale, turn_scale, out):
+def scale_pose(position, quaternion, scale, rotation_scale, out):
     """Scale the pose of a device's handle to the range of the joystick.
 
     Args:
-        place: (3,) position [m].
+        position: (3,) position [m].
         quaternion: (4,) scalar first.
         scale: factor on the position, scalar.
-        turn_scale: factor on the rotation angle, scalar.
+        rotation_scale: factor on the rotation angle, scalar.
         out: (>= 7,) written: position [m] and quaternion.
 
     Returns:
@@ -168,14 +171,14 @@ def scaled_pose(place, quaternion, scale, turn_scale, out):
     Source: rotation vector of a quaternion.
     """
     for i in range(3):
-        out[i] = scale * place[i]
+        out[i] = scale * position[i]
     w, size = quaternion[0], 0.0
     for i in range(1, 4):
         size += quaternion[i] * quaternion[i]
     size = np.sqrt(size)
-    half = turn_scale * np.arctan2(size, abs(w))
+    half = rotation_scale * np.arctan2(size, abs(w))
     out[3] = np.cos(half)
-    share = np.sin(half) / size if size > 1e-12 else turn_scale
+    share = np.sin(half) / size if size > 1e-12 else rotation_scale
     for i in range(3):
         out[4 + i] = share * (quaternion[1 + i] if w >= 0.0 else -quaternion[1 + i])
 
@@ -199,106 +202,117 @@ def answer_pose(line, box, now, two):
     if pose[MAGIC] != POSE_MAGIC or not real[PERIOD] > 0.0:
         count[MALFORMED] += 1
         return False
-    if pose[SESSION] != count[SESSION_OF]:  # the server was restarted
-        count[SESSION_OF], count[LAST], count[NEXT], count[TAKEN_LAST] = pose[SESSION], -1, 0, -1
-        count[STARTS] += 1
-        line.ramp[GAIN] = 0.0
-    if pose[SEQUENCE] <= count[LAST]:
+    if pose[SESSION] != count[CURRENT_SESSION]:  # the server was restarted
+        count[CURRENT_SESSION], count[LAST_POSE], count[NEXT_WRENCH], count[LAST_ACKNOWLEDGED] = (
+            pose[SESSION],
+            -1,
+            0,
+            -1,
+        )
+        count[SERVER_STARTS] += 1
+        line.ramp[FORCE_GAIN] = 0.0
+    if pose[SEQUENCE] <= count[LAST_POSE]:
         count[LATE] += 1
         return False
-    first = count[LAST] < 0
+    first = count[LAST_POSE] < 0
     if not first:
-        count[LOST] += pose[SEQUENCE] - count[LAST] - 1
-        line.intervals[count[INTERVALS] % len(line.intervals)] = now - count[CAME_AT]
+        count[LOST] += pose[SEQUENCE] - count[LAST_POSE] - 1
+        line.intervals[count[INTERVALS] % len(line.intervals)] = now - count[POSE_ARRIVAL_TIME]
         count[INTERVALS] += 1
     nominal = real[PERIOD]
-    period = 1e-9 * (pose[SENT] - count[SENT_AT])
+    period = 1e-9 * (pose[SENT] - count[POSE_SENT_TIME])
     period = nominal if first else min(20.0 * nominal, max(0.25 * nominal, period))
-    count[LAST], count[SENT_AT], count[CAME_AT] = pose[SEQUENCE], pose[SENT], now
+    count[LAST_POSE], count[POSE_SENT_TIME], count[POSE_ARRIVAL_TIME] = (
+        pose[SEQUENCE],
+        pose[SENT],
+        now,
+    )
     count[RECEIVED] += 1
-    if pose[TAKEN] > count[TAKEN_LAST]:
-        line.rounds[count[ROUNDS] % len(line.rounds)] = now - line.sent[pose[TAKEN] % _SENT_KEPT]
+    if pose[LAST_ACCEPTED] > count[LAST_ACKNOWLEDGED]:
+        line.rounds[count[ROUNDS] % len(line.rounds)] = now - line.sent[pose[LAST_ACCEPTED] % _MAX_SENT_TIMES]
         count[ROUNDS] += 1
-        count[TAKEN_LAST] = pose[TAKEN]
-    _reflected(line, box, now, two, first, period)
+        count[LAST_ACKNOWLEDGED] = pose[LAST_ACCEPTED]
+    _compute_reflection(line, box, now, two, first, period)
     reply, out = line.reply, line.reply_real
-    reply[MAGIC], reply[SESSION], reply[SEQUENCE] = WRENCH_MAGIC, pose[SESSION], count[NEXT]
-    reply[ANSWERED] = pose[SEQUENCE]
-    reply[ON] = 1 if line.ramp[GAIN] > 0.0 else 0
+    reply[MAGIC], reply[SESSION], reply[SEQUENCE] = WRENCH_MAGIC, pose[SESSION], count[NEXT_WRENCH]
+    reply[ANSWERED_POSE] = pose[SEQUENCE]
+    reply[FORCES_ON] = 1 if line.ramp[FORCE_GAIN] > 0.0 else 0
     m = unpack_master_state(box.state)
     for part in range(2):
         size = 0.0
         for i in range(3 * part, 3 * part + 3):
-            out[WRENCH + i] = line.ramp[GAIN] * m.push[i]
+            out[WRENCH + i] = line.ramp[FORCE_GAIN] * m.push[i]
             size += out[WRENCH + i] ** 2
-        size, most = np.sqrt(size), real[MOST + part]
+        size, most = np.sqrt(size), real[MAX_WRENCH + part]
         share = most / size if size > most else 1.0
         for i in range(3 * part, 3 * part + 3):
             out[WRENCH + i] = share * out[WRENCH + i] if np.isfinite(size) else 0.0
-    count[NEXT] += 1
+    count[NEXT_WRENCH] += 1
     return True
 
 
 @compiled
-def _reflected(line, box, now, two, first, period):
+def _compute_reflection(line, box, now, two, first, period):
     """Write the pose into the mailbox and compute the handle's force in the thread's state."""
     real = line.pose_real
     scale = line.reach[0] / real[TRAVEL] if real[TRAVEL] > 0.0 else 0.0
     turns = line.reach[1] / real[TRAVEL + 1] if real[TRAVEL + 1] > 0.0 else 0.0
     box.turn[_HANDLE] += 1
-    _now(two)
-    scaled_pose(real[PLACE:QUATERNION], real[QUATERNION:TRAVEL], scale, turns, box.handle)
+    _read_clock(two)
+    scale_pose(real[POSITION:QUATERNION], real[QUATERNION:TRAVEL], scale, turns, box.handle)
     box.handle[7] = line.pose[BUTTONS]
-    if not (real[ABLE] == 1.0 and np.isfinite(real[PLACE:TRAVEL]).all()):
+    if not (real[CAN_APPLY_FORCE] == 1.0 and np.isfinite(real[POSITION:TRAVEL]).all()):
         box.handle[:7] = np.nan
-    _now(two)
+    _read_clock(two)
     box.stamp[_HANDLE] = now
     box.turn[_HANDLE] += 1
     packet, state = np.empty(box.packet.shape), unpack_master_state(box.state)
     share, when = 0.0, np.int64(0)
     for _ in range(8):  # retry: the machine writes for 1 us in every 1 ms
         turn = box.turn[_MACHINE]
-        _now(two)
+        _read_clock(two)
         packet[:] = box.packet
         state.extra[:] = box.extra
         share, when = box.share[0], box.stamp[_MACHINE]
-        _now(two)
+        _read_clock(two)
         if turn % 2 == 0 and turn == box.turn[_MACHINE]:
             break
     age = 1e-9 * (now - when)
-    alive = when > 0 and age < OFF
+    alive = when > 0 and age < FORCE_TIMEOUT
     able = np.isfinite(box.handle[0])
-    line.ramp[GAIN] = min(1.0, line.ramp[GAIN] + period / RAMP) if alive and able else 0.0
-    fresh = share if age < FADED else 0.0
-    master_step(unpack_master(box.numbers), box.handle[:7], packet, fresh, period, first, state)
+    line.ramp[FORCE_GAIN] = min(1.0, line.ramp[FORCE_GAIN] + period / FORCE_RAMP_TIME) if alive and able else 0.0
+    fresh = share if age < REFLECTION_TIMEOUT else 0.0
+    step_master(unpack_master(box.numbers), box.handle[:7], packet, fresh, period, first, state)
 
 
 @compiled
-def _answer_all(handle, line, box):
+def _answer_poses(handle, line, box):
     """Answer poses until `count[STOP]` is set."""
     two, count = np.zeros(2, np.int64), line.count
     size, answer = np.uint64(8 * POSE_WORDS), np.uint64(8 * WRENCH_WORDS)
-    while count[STOP] == 0:
+    while count[STOP_FLAG] == 0:
         got = _recv(np.int32(handle), line.pose.ctypes.data, size, np.int32(0))
-        now = _now(two)
-        if now - max(count[ASKED], count[CAME_AT]) > _ASK:  # no server, or client dropped
+        now = _read_clock(two)
+        if (
+            now - max(count[REQUEST_TIME], count[POSE_ARRIVAL_TIME]) > _REQUEST_INTERVAL_NS
+        ):  # no server, or client dropped
             line.reply[:] = 0
             line.reply[MAGIC], line.reply[SENT] = WRENCH_MAGIC, now
-            count[ASKED] = now
+            count[REQUEST_TIME] = now
             _send(np.int32(handle), line.reply.ctypes.data, answer, np.int32(0))
         if got < 0:
             continue
         if got != 8 * POSE_WORDS:
             count[MALFORMED] += 1
         elif answer_pose(line, box, now, two):
-            line.reply[SENT] = _now(two)
-            line.sent[line.reply[SEQUENCE] % _SENT_KEPT] = line.reply[SENT]
+            line.reply[SENT] = _read_clock(two)
+            line.sent[line.reply[SEQUENCE] % _MAX_SENT_TIMES] = line.reply[SENT]
             _send(np.int32(handle), line.reply.ctypes.data, answer, np.int32(0))
-            line.answers[count[ANSWERS] % len(line.answers)] = _now(two) - now
+            line.answers[count[ANSWERS] % len(line.answers)] = _read_clock(two) - now
             count[ANSWERS] += 1
 
 
-_MACHINE_MAIL = np.dtype(
+_MAILBOX_DTYPE = np.dtype(
     [(name, np.int64) for name in ("rows", "columns")]
     + [(name, np.int64) for name in ("turn", "stamp", "handle")]  # addresses from here on
     + [(name, np.int64) for name in ("packet", "share", "extra", "dead")],
@@ -307,7 +321,7 @@ _MACHINE_MAIL = np.dtype(
 
 
 @compiled
-def take_pose(mail, now, pose):
+def read_pose(mail, now, pose):
     """Read the handle's pose from the mailbox.
 
     Args:
@@ -316,32 +330,32 @@ def take_pose(mail, now, pose):
         pose: (8,) written: position in joystick scale [m], quaternion, buttons.
 
     Returns:
-        Whether the pose is finite and not older than `SILENT`.
+        Whether the pose is finite and not older than `POSE_TIMEOUT`.
 
     Source: this module.
     """
     r, two, when = mail[0], np.empty(2, np.int64), np.int64(0)
-    turn, stamp, handle = integers(r.turn, 2), integers(r.stamp, 2), floats(r.handle, 8)
+    turn, stamp, handle = int64_view(r.turn, 2), int64_view(r.stamp, 2), float64_view(r.handle, 8)
     for _ in range(8):
         before = turn[_HANDLE]
-        _now(two)
+        _read_clock(two)
         pose[:] = handle
         when = stamp[_HANDLE]
-        _now(two)
+        _read_clock(two)
         if before % 2 == 0 and before == turn[_HANDLE]:
-            return now - when <= 1e9 * SILENT and np.isfinite(pose).all()
+            return now - when <= 1e9 * POSE_TIMEOUT and np.isfinite(pose).all()
     return False
 
 
 @compiled
-def meet(mail, qpos, packet, share, extra, engaged, now):
+def exchange_with_mailbox(mail, qpos, packet, packet_gain, extra, engaged, now):
     """Write the machine's data into the mailbox and read the handle's pose.
 
     Args:
-        mail: see `take_pose`.
-        qpos: (7,) written, see `Link.exchange`.
-        packet: (rows, k) see `Link.exchange`.
-        share: factor on the packet, scalar.
+        mail: see `read_pose`.
+        qpos: (7,) written, see `HapticLink.exchange`.
+        packet: (rows, k) see `HapticLink.exchange`.
+        packet_gain: factor on the packet, scalar.
         extra: (6,) additional force on the handle [N], [N m].
         engaged: whether the handle has been in its dead bands, scalar.
         now: current time, scalar [ns].
@@ -352,23 +366,23 @@ def meet(mail, qpos, packet, share, extra, engaged, now):
     Source: this module.
     """
     r, two, pose = mail[0], np.empty(2, np.int64), np.empty(8)
-    turn = integers(r.turn, 2)
+    turn = int64_view(r.turn, 2)
     turn[_MACHINE] += 1
-    _now(two)
-    rows_of(r.packet, r.rows, r.columns)[:] = packet
-    floats(r.extra, 6)[:] = extra
-    floats(r.share, 1)[0], integers(r.stamp, 2)[_MACHINE] = share, now
-    _now(two)
+    _read_clock(two)
+    matrix_view(r.packet, r.rows, r.columns)[:] = packet
+    float64_view(r.extra, 6)[:] = extra
+    float64_view(r.share, 1)[0], int64_view(r.stamp, 2)[_MACHINE] = packet_gain, now
+    _read_clock(two)
     turn[_MACHINE] += 1
-    there = take_pose(mail, now, pose)
-    engaged = there and (engaged or _centred(pose, floats(r.dead, 6)))
+    there = read_pose(mail, now, pose)
+    engaged = there and (engaged or _is_centred(pose, float64_view(r.dead, 6)))
     for i in range(7):
         qpos[i] = pose[i] if engaged else np.nan
     return engaged
 
 
 @compiled
-def _centred(pose, dead):
+def _is_centred(pose, dead):
     """Return whether all axes of the joystick are in their dead bands."""
     for i in range(3):
         if not (abs(pose[i]) <= dead[i] and 2.0 * abs(pose[4 + i]) <= dead[3 + i]):
@@ -376,7 +390,7 @@ def _centred(pose, dead):
     return True
 
 
-class Link:
+class HapticLink:
     """Connect to a device; the thread answers poses from `start` until `close`."""
 
     def __init__(self, host: str, port: int) -> None:
@@ -396,117 +410,118 @@ class Link:
             self._socket.connect(address)
         except OSError as error:
             raise InputError(where, f"cannot be reached ({error.strerror or error})") from None
-        pose, reply = packet(POSE_WORDS), packet(WRENCH_WORDS)
-        self.line = Line(
-            *pose, *reply, np.zeros(16, np.int64), np.zeros(3), np.zeros(_SENT_KEPT, np.int64),
-            np.zeros(_SAMPLES, np.int64), np.zeros(_SAMPLES, np.int64),
-            np.zeros(_SAMPLES, np.int64), np.zeros(2),
+        pose, reply = make_packet(POSE_WORDS), make_packet(WRENCH_WORDS)
+        self.buffers = LinkBuffers(
+            *pose, *reply, np.zeros(16, np.int64), np.zeros(3), np.zeros(_MAX_SENT_TIMES, np.int64),
+            np.zeros(_MAX_SAMPLES, np.int64), np.zeros(_MAX_SAMPLES, np.int64),
+            np.zeros(_MAX_SAMPLES, np.int64), np.zeros(2),
         )  # fmt: skip
-        self.line.count[[LAST, TAKEN_LAST]] = -1
-        self.box: Mailbox | None = None
+        self.buffers.count[[LAST_POSE, LAST_ACKNOWLEDGED]] = -1
+        self.mailbox: Mailbox | None = None
         self._thread: threading.Thread | None = None
         self.priority, self.engaged = False, False
-        self._before = np.zeros(2, np.int64)
+        self._counters_at_restart = np.zeros(2, np.int64)
 
-    def start(self, numbers: Master, like: MasterState, rows: tuple[int, ...]) -> None:
+    def start(self, parameters: MasterParameters, template: MasterState, packet_shape: tuple[int, ...]) -> None:
         """Start the thread that answers poses.
 
         Args:
-            numbers: parameters of the master's control law.
-            like: a master state; the thread's own state gets the same shapes.
-            rows: shape of the machine's packets.
+            parameters: parameters of the master's control law.
+            template: a master state; the thread's own state gets the same shapes.
+            packet_shape: shape of the machine's packets.
 
         Raises:
             InputError: the structure needs more data than a pose and the machine's packet.
         """
-        kind = KINDS[int(numbers.kind[0])]
+        kind = REFLECTION_KINDS[int(parameters.kind[0])]
         if kind not in REFLECTIONS:
             message = f"{kind!r} does not support haptic devices; valid: {', '.join(REFLECTIONS)}"
             raise InputError("pilot.reflection", message)
-        state = flat_state(MasterState, [part.shape for part in like])
+        state = make_flat_state(MasterState, [part.shape for part in template])
         state.limited[:] = 1.0
-        self.box = Mailbox(
-            np.zeros(2, np.int64), np.zeros(2, np.int64), np.full(8, np.nan), np.zeros(rows),
-            np.zeros(1), np.zeros(6), flat_view(numbers), flat_view(state),
+        self.mailbox = Mailbox(
+            np.zeros(2, np.int64), np.zeros(2, np.int64), np.full(8, np.nan), np.zeros(packet_shape),
+            np.zeros(1), np.zeros(6), flat_view(parameters), flat_view(state),
         )  # fmt: skip
-        self._axis = numbers.axis
-        self.line.reach[:] = numbers.axis[:3, REACH].max(), numbers.axis[3:, REACH].max()
-        self._dead = np.where(
-            numbers.axis[:, DEADBAND] > 0.0, numbers.axis[:, DEADBAND],
-            _CENTRED * numbers.axis[:, REACH],
+        self._axis = parameters.axis
+        self.buffers.reach[:] = (
+            parameters.axis[:3, HANDLE_RANGE].max(),
+            parameters.axis[3:, HANDLE_RANGE].max(),
+        )
+        self._deadbands = np.where(
+            parameters.axis[:, DEADBAND] > 0.0, parameters.axis[:, DEADBAND],
+            _MIN_DEADBAND_RATIO * parameters.axis[:, HANDLE_RANGE],
         )  # fmt: skip
-        self._dead[numbers.axis[:, COORDINATE] < 0.0] = np.inf  # axes without a command
+        self._deadbands[parameters.axis[:, COORDINATE] < 0.0] = np.inf  # axes without a command
         shared = ("turn", "stamp", "handle", "packet", "share", "extra")
-        arrays = {name: getattr(self.box, name) for name in shared}
-        self._mail = address_record(_MACHINE_MAIL, {**arrays, "dead": self._dead})
-        self._mail["rows"], self._mail["columns"] = rows
-        self.line.count[STOP] = 1
-        _answer_all(self._socket.fileno(), self.line, self.box)  # triggers compilation
-        self.line.count[STOP] = 0
-        seconds = int(_WAIT), round(1e6 * (_WAIT % 1.0))
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _timeval(*seconds))
+        arrays = {name: getattr(self.mailbox, name) for name in shared}
+        self._mailbox_record = address_record(_MAILBOX_DTYPE, {**arrays, "dead": self._deadbands})
+        self._mailbox_record["rows"], self._mailbox_record["columns"] = packet_shape
+        self.buffers.count[STOP_FLAG] = 1
+        _answer_poses(self._socket.fileno(), self.buffers, self.mailbox)  # triggers compilation
+        self.buffers.count[STOP_FLAG] = 0
+        seconds = int(_RECEIVE_TIMEOUT), round(1e6 * (_RECEIVE_TIMEOUT % 1.0))
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, _pack_timeval(*seconds))
         self._thread = threading.Thread(target=self._run, name="haptic link", daemon=True)
         self._thread.start()
 
     def _run(self) -> None:
-        self.priority = ask_for_priority(_PRIORITY)
-        _answer_all(self._socket.fileno(), self.line, self.box)
+        self.priority = request_priority(_PRIORITY)
+        _answer_poses(self._socket.fileno(), self.buffers, self.mailbox)
 
-    def exchange(
-        self, qpos: np.ndarray, packet: np.ndarray, share: float, extra: np.ndarray
-    ) -> None:
+    def exchange(self, qpos: np.ndarray, packet: np.ndarray, packet_gain: float, extra: np.ndarray) -> None:
         """Exchange data with the device once per tick: read the pose, send the machine's packet.
 
         Args:
             qpos: (7,) written: handle position in joystick scale [m], quaternion; NaN while no
                 device is connected, or until the handle has returned to its dead bands.
             packet: packet from the machine.
-            share: factor on the packet.
+            packet_gain: factor on the packet.
             extra: (6,) additional force on the handle [N], [N m].
         """
         now = clock.monotonic_ns()
-        self.engaged = meet(self._mail, qpos, packet, share, extra, self.engaged, now)
+        self.engaged = exchange_with_mailbox(self._mailbox_record, qpos, packet, packet_gain, extra, self.engaged, now)
 
     def pose(self) -> HandlePose | None:
         """Return the handle's pose in joystick scale, None while no pose arrives."""
         values = np.empty(8)
-        if not take_pose(self._mail, clock.monotonic_ns(), values):
+        if not read_pose(self._mailbox_record, clock.monotonic_ns(), values):
             return None
         return HandlePose(values[:3], values[3:7], int(values[7]))
 
-    def restart_figures(self) -> None:
+    def reset_statistics(self) -> None:
         """Reset the statistics, for example after the device has waited for the machine."""
-        line = self.line
+        line = self.buffers
         line.count[[ANSWERS, ROUNDS, INTERVALS, RECEIVED, LOST, LATE, MALFORMED]] = 0
-        self._before = line.pose[[MISSED, UNANSWERED]]
+        self._counters_at_restart = line.pose[[MISSED, UNANSWERED]]
 
-    def figures(self) -> dict[str, Any]:
+    def statistics(self) -> dict[str, Any]:
         """Return the statistics: counts, and times as from `timing.summary_of`."""
-        line, count = self.line, self.line.count
+        line, count = self.buffers, self.buffers.count
         return {
             "poses": int(count[RECEIVED]),
             "lost": int(count[LOST]),
             "late": int(count[LATE]),
             "malformed": int(count[MALFORMED]),
-            "device_starts": int(count[STARTS]),
-            "device_missed": int(line.pose[MISSED] - self._before[0]),
-            "device_unanswered": int(line.pose[UNANSWERED] - self._before[1]),
+            "device_starts": int(count[SERVER_STARTS]),
+            "device_missed": int(line.pose[MISSED] - self._counters_at_restart[0]),
+            "device_unanswered": int(line.pose[UNANSWERED] - self._counters_at_restart[1]),
             "priority": self.priority,
-            "answer": summary_of(line.answers[: count[ANSWERS]]),
-            "loop": summary_of(line.rounds[: count[ROUNDS]]),
-            "interval": summary_of(line.intervals[: count[INTERVALS]]),
+            "answer": summarise_durations(line.answers[: count[ANSWERS]]),
+            "loop": summarise_durations(line.round_trip_times[: count[ROUNDS]]),
+            "interval": summarise_durations(line.intervals[: count[INTERVALS]]),
         }
 
     def close(self) -> None:
         """Stop the thread; the device then switches its force off."""
-        self.line.count[STOP] = 1
+        self.buffers.count[STOP_FLAG] = 1
         if self._thread:
             self._thread.join()
             self._thread = None
         self._socket.close()
 
 
-def _timeval(seconds: int, microseconds: int) -> bytes:
+def _pack_timeval(seconds: int, microseconds: int) -> bytes:
     """Pack a C `struct timeval`."""
     import struct
 

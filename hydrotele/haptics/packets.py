@@ -36,36 +36,36 @@ POSE_WORDS, WRENCH_WORDS = 21, 12
 # indices of words in both packets
 MAGIC, SESSION, SEQUENCE, SENT = range(4)
 # indices of words in a pose
-BUTTONS, TAKEN, MISSED, UNANSWERED, PLACE = range(4, 9)
-QUATERNION, TRAVEL, MOST, PERIOD, ABLE = 11, 15, 17, 19, 20
+BUTTONS, LAST_ACCEPTED, MISSED, UNANSWERED, POSITION = range(4, 9)
+QUATERNION, TRAVEL, MAX_WRENCH, PERIOD, CAN_APPLY_FORCE = 11, 15, 17, 19, 20
 # indices of words in a wrench
-ANSWERED, ON, WRENCH = range(4, 7)
+ANSWERED_POSE, FORCES_ON, WRENCH = range(4, 7)
 
 
 class Packet(NamedTuple):
     """Memory of one packet with an integer and a real view.
 
     Attributes:
-        whole: (n,) int64 view.
-        real: (n,) float64 view of the same memory.
+        integers: (n,) int64 view.
+        reals: (n,) float64 view of the same memory.
     """
 
-    whole: np.ndarray
-    real: np.ndarray
+    integers: np.ndarray
+    reals: np.ndarray
 
     @property
-    def raw(self) -> memoryview:
+    def byte_view(self) -> memoryview:
         """Byte view of the packet, for sending and receiving."""
-        return self.whole.data.cast("B")
+        return self.integers.data.cast("B")
 
 
-def packet(words: int) -> Packet:
+def make_packet(words: int) -> Packet:
     """Create a packet of zeros.
 
     Args:
         words: length in words of 8 bytes.
 
-    >>> p = packet(2)
+    >>> p = make_packet(2)
     >>> p.real[1] = 1.0
     >>> hex(int(p.whole[1]))
     '0x3ff0000000000000'

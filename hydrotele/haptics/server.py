@@ -3,7 +3,7 @@
 It serves one machine at a time: the last one that asked while no other was connected. The safety
 checks are here, next to the hardware. A wrench is limited to the device's maximum. A wrench that is
 not finite, arrives out of order or answers an old pose is rejected. The force is switched off if no
-wrench is accepted for `WATCHDOG`, or if the machine reports that it is not in control.
+wrench is accepted for `WATCHDOG_TIMEOUT`, or if the machine reports that it is not in control.
 """
 
 import contextlib
@@ -20,46 +20,51 @@ import numpy as np
 
 from hydrotele.core.errors import InputError
 from hydrotele.haptics.device import (
-    ADDRESS,
+    DEFAULT_HAPTION_ADDRESS,
     ForceDimension,
     HapticDevice,
     Haption,
     SimulatedDevice,
-    within_limits,
+    limit_wrench,
 )
 from hydrotele.haptics.packets import (
-    ABLE,
-    ANSWERED,
+    ANSWERED_POSE,
     BUTTONS,
+    CAN_APPLY_FORCE,
+    FORCES_ON,
+    LAST_ACCEPTED,
     MAGIC,
     MISSED,
-    ON,
     PERIOD,
-    PLACE,
     POSE_MAGIC,
     POSE_WORDS,
+    POSITION,
     QUATERNION,
     SENT,
     SEQUENCE,
     SESSION,
-    TAKEN,
     TRAVEL,
     UNANSWERED,
     WRENCH,
     WRENCH_MAGIC,
     WRENCH_WORDS,
-    packet,
+    make_packet,
 )
-from hydrotele.haptics.timing import SPIN, load_of_machine, steady, summary_of
+from hydrotele.haptics.timing import (
+    BUSY_WAIT_TIME,
+    load_of_machine,
+    reduced_jitter,
+    summarise_durations,
+)
 
-PORT = 5610
-WATCHDOG = 0.02  # s without a wrench after which the force is switched off
-STALE = 0.02  # s: a wrench that answers an older pose is rejected
-FORGET = 1.0  # s without packets after which another machine may connect
+DEFAULT_PORT = 5610
+WATCHDOG_TIMEOUT = 0.02  # s without a wrench after which the force is switched off
+MAX_POSE_AGE = 0.02  # s: a wrench that answers an older pose is rejected
+CLIENT_TIMEOUT = 1.0  # s without packets after which another machine may connect
 _PRIORITY = 40
-_SAMPLES = 700_000  # number of times that are kept: 11 minutes at 1 kHz
+_MAX_SAMPLES = 700_000  # number of times that are kept: 11 minutes at 1 kHz
 
-_REFUSALS = ("malformed", "stranger", "session", "late", "stale")
+_REJECTION_REASONS = ("malformed", "stranger", "session", "late", "stale")
 
 Address = tuple[str, int]
 
@@ -73,8 +78,8 @@ class ServerSummary(NamedTuple):
         unanswered: number of periods that started without the answer to the previous pose.
         refused: number of rejected packets, by reason.
         limp: number of times that the watchdog switched the force off.
-        wake: delay of the start of a period, see `summary_of`.
-        round_trip: time from sending a pose to receiving its answer, see `summary_of`.
+        wake: delay of the start of a period, see `summarise_durations`.
+        round_trip: time from sending a pose to receiving its answer, see `summarise_durations`.
         priority: whether real-time priority was granted.
         load: load averages of the computer, see `load_of_machine`.
     """
@@ -90,15 +95,15 @@ class ServerSummary(NamedTuple):
     load: list[float] | None
 
 
-class Exchange:
+class DeviceSession:
     """Protocol state between a device and a machine, independent of sockets and clocks.
 
     Attributes:
         pose: packet to send.
         wrench: (6,) wrench that the device must apply now [N], [N m].
         client: address of the connected machine, None without one.
-        refused: number of rejected packets, by reason.
-        limp: number of times that the watchdog switched the force off.
+        rejected_packets: number of rejected packets, by reason.
+        watchdog_trips: number of times that the watchdog switched the force off.
         unanswered: number of periods that started without the answer to the previous pose.
         missed: number of periods that the device has missed.
         answered: sequence number of the last answered pose.
@@ -112,19 +117,23 @@ class Exchange:
             period: period of the server [s].
             session: number that is unique to this start of the server.
         """
-        self._device, self._a = device, device.abilities
-        self.pose, self._answer = packet(POSE_WORDS), packet(WRENCH_WORDS)
-        self.pose.whole[[MAGIC, SESSION]] = POSE_MAGIC, session
-        self.pose.whole[[SEQUENCE, TAKEN]] = -1
-        self.pose.real[TRAVEL : PERIOD + 1] = *self._a, period
+        self._device, self._limits = device, device.limits
+        self.pose, self._answer = make_packet(POSE_WORDS), make_packet(WRENCH_WORDS)
+        self.pose.integers[[MAGIC, SESSION]] = POSE_MAGIC, session
+        self.pose.integers[[SEQUENCE, LAST_ACCEPTED]] = -1
+        self.pose.reals[TRAVEL : PERIOD + 1] = *self._limits, period
         self.wrench = np.zeros(6)
         self.client: Address | None = None
-        self.refused: dict[str, int] = {why: 0 for why in _REFUSALS}
-        self.limp, self.unanswered, self.missed = 0, 0, 0
-        self._last, self._heard, self._stale = -1, 0, max(1, round(STALE / period))
-        self._on, self.answered = False, -1
+        self.rejected_packets: dict[str, int] = {why: 0 for why in _REJECTION_REASONS}
+        self.watchdog_trips, self.unanswered, self.missed = 0, 0, 0
+        self._last_wrench, self._last_packet_time, self._max_pose_lag = (
+            -1,
+            0,
+            max(1, round(MAX_POSE_AGE / period)),
+        )
+        self._forces_on, self.answered = False, -1
 
-    def next_pose(self, now: int) -> None:
+    def update_pose(self, now: int) -> None:
         """Apply the wrench and read the handle into `pose`, which can then be sent.
 
         Args:
@@ -135,25 +144,25 @@ class Exchange:
         whole, real = self.pose
         if self.client and whole[SEQUENCE] >= 0 and self.answered < whole[SEQUENCE]:
             self.unanswered += 1
-        if self.client and now - self._heard > 1e9 * WATCHDOG and self._on:
-            self._on = False
-            self.limp += 1
+        if self.client and now - self._last_packet_time > 1e9 * WATCHDOG_TIMEOUT and self._forces_on:
+            self._forces_on = False
+            self.watchdog_trips += 1
             self.wrench[:] = 0.0
-        if self.client and now - self._heard > 1e9 * FORGET:
+        if self.client and now - self._last_packet_time > 1e9 * CLIENT_TIMEOUT:
             self.client = None
         try:
-            self._device.write(self.wrench, self._on)
+            self._device.write(self.wrench, self._forces_on)
             place, quaternion, buttons = self._device.read()
-            real[PLACE:QUATERNION], real[QUATERNION:TRAVEL] = place, quaternion
-            whole[BUTTONS], real[ABLE] = buttons, 1.0
+            real[POSITION:QUATERNION], real[QUATERNION:TRAVEL] = place, quaternion
+            whole[BUTTONS], real[CAN_APPLY_FORCE] = buttons, 1.0
         except OSError:
-            real[PLACE:TRAVEL], real[ABLE] = np.nan, 0.0
+            real[POSITION:TRAVEL], real[CAN_APPLY_FORCE] = np.nan, 0.0
             self.wrench[:] = 0.0
         whole[SEQUENCE] += 1
-        whole[TAKEN], whole[SENT] = self._last, now
+        whole[LAST_ACCEPTED], whole[SENT] = self._last_wrench, now
         whole[MISSED], whole[UNANSWERED] = self.missed, self.unanswered
 
-    def take(self, data: bytes | memoryview, sender: Address, now: int) -> bool:
+    def accept_packet(self, data: bytes | memoryview, sender: Address, now: int) -> bool:
         """Check a packet from a machine and accept it if it is valid.
 
         Args:
@@ -164,26 +173,26 @@ class Exchange:
         Returns:
             Whether the packet was accepted.
         """
-        why = self._refusal(data, sender)
+        why = self._rejection_reason(data, sender)
         if why:
-            self.refused[why] += 1
+            self.rejected_packets[why] += 1
             return False
         whole, real = self._answer
         if whole[SESSION] == 0:  # connection request
-            self.client, self._last, self._heard = sender, -1, now
-            self.answered, self._on = int(self.pose.whole[SEQUENCE]), False
+            self.client, self._last_wrench, self._last_packet_time = sender, -1, now
+            self.answered, self._forces_on = int(self.pose.integers[SEQUENCE]), False
             self.wrench[:] = 0.0
             return True
-        self._last, self.answered = int(whole[SEQUENCE]), int(whole[ANSWERED])
-        self._heard, self._on = now, whole[ON] == 1
-        self.wrench[:] = within_limits(real[WRENCH:], self._a) if self._on else 0.0
+        self._last_wrench, self.answered = int(whole[SEQUENCE]), int(whole[ANSWERED_POSE])
+        self._last_packet_time, self._forces_on = now, whole[FORCES_ON] == 1
+        self.wrench[:] = limit_wrench(real[WRENCH:], self._limits) if self._forces_on else 0.0
         return True
 
-    def _refusal(self, data, sender: Address) -> str:
+    def _rejection_reason(self, data, sender: Address) -> str:
         """Return the reason to reject a packet, or an empty string; parse it into `_answer`."""
         if len(data) != 8 * WRENCH_WORDS:
             return "malformed"
-        self._answer.raw[:] = data
+        self._answer.byte_view[:] = data
         whole, real = self._answer
         if whole[MAGIC] != WRENCH_MAGIC or not np.isfinite(real[WRENCH:]).all():
             return "malformed"
@@ -191,26 +200,26 @@ class Exchange:
             return ""
         if sender != self.client:
             return "stranger"
-        if whole[SESSION] != self.pose.whole[SESSION]:
+        if whole[SESSION] != self.pose.integers[SESSION]:
             return "session"
-        if whole[SEQUENCE] <= self._last:
+        if whole[SEQUENCE] <= self._last_wrench:
             return "late"
-        behind = self.pose.whole[SEQUENCE] - whole[ANSWERED]
-        return "" if 0 <= behind <= self._stale else "stale"
+        behind = self.pose.integers[SEQUENCE] - whole[ANSWERED_POSE]
+        return "" if 0 <= behind <= self._max_pose_lag else "stale"
 
 
-def serve(
-    device: HapticDevice, address: Address, period: float, over: Callable[[], bool],
-    opened: Callable[[Address], None] = lambda where: None,
+def run_server(
+    device: HapticDevice, address: Address, period: float, should_stop: Callable[[], bool],
+    on_open: Callable[[Address], None] = lambda where: None,
 ) -> ServerSummary:  # fmt: skip
-    """Run the server of a device until `over` returns true.
+    """Run the server of a device until `should_stop` returns true.
 
     Args:
         device: the device; its force is off afterwards, and it stays open.
         address: address to listen on; port 0 selects a free port.
         period: period of the server [s].
-        over: called once per period; returns whether to stop.
-        opened: called with the address that the server listens on.
+        should_stop: called once per period; returns whether to stop.
+        on_open: called with the address that the server listens on.
 
     Returns:
         Statistics of the run.
@@ -226,25 +235,25 @@ def serve(
         where = f"--host {address[0]} --port {address[1]}"
         raise InputError(where, f"cannot be used as address ({error.strerror or error})") from None
     line.setblocking(False)
-    exchange = Exchange(device, period, secrets.randbits(62) + 1)
-    opened(line.getsockname())
-    with line, steady(_PRIORITY) as priority:
-        wake, trips, periods = _periods(line, exchange, period, over)
+    exchange = DeviceSession(device, period, secrets.randbits(62) + 1)
+    on_open(line.getsockname())
+    with line, reduced_jitter(_PRIORITY) as priority:
+        wake, trips, periods = _run_periods(line, exchange, period, should_stop)
         device.write(np.zeros(6), False)
     return ServerSummary(
-        periods, exchange.missed, exchange.unanswered, exchange.refused, exchange.limp,
-        summary_of(wake), summary_of(trips), priority, load_of_machine(),
+        periods, exchange.missed, exchange.unanswered, exchange.rejected_packets, exchange.watchdog_trips,
+        summarise_durations(wake), summarise_durations(trips), priority, load_of_machine(),
     )  # fmt: skip
 
 
-def _periods(
-    line: socket.socket, exchange: Exchange, period: float, over: Callable[[], bool]
+def _run_periods(
+    line: socket.socket, exchange: DeviceSession, period: float, over: Callable[[], bool]
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """Run one period after the other; return start delays [ns], answer times [ns], period count."""
-    wake, trips = np.zeros(_SAMPLES, np.int64), np.zeros(_SAMPLES, np.int64)
-    step, spin, now = round(1e9 * period), round(1e9 * SPIN), clock.monotonic_ns
+    wake, trips = np.zeros(_MAX_SAMPLES, np.int64), np.zeros(_MAX_SAMPLES, np.int64)
+    step, spin, now = round(1e9 * period), round(1e9 * BUSY_WAIT_TIME), clock.monotonic_ns
     count = answers = 0
-    raw, data = exchange.pose.raw, bytearray(8 * WRENCH_WORDS + 1)
+    raw, data = exchange.pose.byte_view, bytearray(8 * WRENCH_WORDS + 1)
     view = memoryview(data)
     due = now() + step
     while not over():
@@ -254,10 +263,10 @@ def _periods(
                 break
             if left > spin:
                 select.select([line], [], [], 1e-9 * (left - spin))
-            answers += _receive(line, exchange, view, trips[answers : answers + 1], now)
+            answers += _receive_packet(line, exchange, view, trips[answers : answers + 1], now)
         began = now()
-        wake[count % _SAMPLES] = began - due
-        exchange.next_pose(began)
+        wake[count % _MAX_SAMPLES] = began - due
+        exchange.update_pose(began)
         count += 1
         if exchange.client:
             with contextlib.suppress(OSError):  # no listener: the watchdog handles it
@@ -265,34 +274,34 @@ def _periods(
         skipped = max(0, (now() - due) // step)
         exchange.missed += skipped
         due += step * (1 + skipped)
-    return wake[: min(count, _SAMPLES)], trips[:answers], count
+    return wake[: min(count, _MAX_SAMPLES)], trips[:answers], count
 
 
-def _receive(line: socket.socket, exchange: Exchange, view: memoryview, trip, now) -> int:
+def _receive_packet(line: socket.socket, exchange: DeviceSession, view: memoryview, trip, now) -> int:
     """Receive one packet, if any, and return whether it answered the pose of this period."""
     try:
         size, sender = line.recvfrom_into(view)
     except OSError:  # no packet, or the previous one could not be delivered
         return 0
     came = now()
-    if not exchange.take(view[:size], sender, came):
+    if not exchange.accept_packet(view[:size], sender, came):
         return 0
-    if not len(trip) or exchange.answered != exchange.pose.whole[SEQUENCE]:
+    if not len(trip) or exchange.answered != exchange.pose.integers[SEQUENCE]:
         return 0
-    trip[0] = came - exchange.pose.whole[SENT]
+    trip[0] = came - exchange.pose.integers[SENT]
     return 1
 
 
-def announce(where: Address) -> None:
+def print_address(address: Address) -> None:
     """Print the address of a server as one line of JSON, for the process that waits for it."""
-    sys.stdout.write(json.dumps({"host": where[0], "port": where[1]}) + "\n")
+    sys.stdout.write(json.dumps({"host": address[0], "port": address[1]}) + "\n")
     sys.stdout.flush()
 
 
-KINDS = ("simulated", "force-dimension", "haption")
+DEVICE_KINDS = ("simulated", "force-dimension", "haption")
 
 
-def open_haptic(kind: str, period: float) -> HapticDevice:
+def open_haptic_device(kind: str, period: float) -> HapticDevice:
     """Open a device for its server.
 
     Args:
@@ -311,5 +320,5 @@ def open_haptic(kind: str, period: float) -> HapticDevice:
         return ForceDimension()
     name, _, address = kind.partition(":")
     if name == "haption":
-        return Haption(period, address or ADDRESS)
-    raise InputError(f"--kind {kind}", f"is not a haptic device; valid: {', '.join(KINDS)}")
+        return Haption(period, address or DEFAULT_HAPTION_ADDRESS)
+    raise InputError(f"--kind {kind}", f"is not a haptic device; valid: {', '.join(DEVICE_KINDS)}")

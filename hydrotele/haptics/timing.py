@@ -18,15 +18,18 @@ from pathlib import Path
 
 import numpy as np
 
-SPIN = 120e-6  # s before a deadline during which a process busy-waits
+BUSY_WAIT_TIME = 120e-6  # s before a deadline during which a process busy-waits
 PERCENTILES = (50.0, 90.0, 99.0, 99.9, 100.0)
-EDGES = (10, 20, 50, 100, 200, 500, 1000, 2000, 5000)  # us, of histograms
-_SLACK, _NO_HUGE_PAGES = 29, 41  # PR_SET_TIMERSLACK and PR_SET_THP_DISABLE of prctl
-_WAKE = Path("/dev/cpu_dma_latency")  # limits the processors' wake-up latency while it is open
-_STAT, _STEAL = Path("/proc/stat"), 8  # index of a word in its first line: proc(5)
+HISTOGRAM_EDGES_US = (10, 20, 50, 100, 200, 500, 1000, 2000, 5000)  # us, of histograms
+_PR_SET_TIMERSLACK, _PR_SET_THP_DISABLE = (
+    29,
+    41,
+)  # PR_SET_TIMERSLACK and PR_SET_THP_DISABLE of prctl
+_WAKE_LATENCY_FILE = Path("/dev/cpu_dma_latency")  # limits the processors' wake-up latency while it is open
+_STAT_FILE, _STEAL_COLUMN = Path("/proc/stat"), 8  # index of a word in its first line: proc(5)
 
 
-def summary_of(nanoseconds: np.ndarray) -> dict:
+def summarise_durations(nanoseconds: np.ndarray) -> dict:
     """Return percentiles and histogram of durations.
 
     Args:
@@ -36,59 +39,67 @@ def summary_of(nanoseconds: np.ndarray) -> dict:
         count, percentiles [us] by name, and a histogram: upper edges [us], and the counts with an
         additional one for values above the last edge.
 
-    >>> summary_of(np.array([5_000, 15_000, 9_000_000]))["histogram"]["count"]
+    >>> summarise_durations(np.array([5_000, 15_000, 9_000_000]))["histogram"]["count"]
     [1, 1, 0, 0, 0, 0, 0, 0, 0, 1]
     """
     micro = np.asarray(nanoseconds, float) / 1e3
     if not len(micro):
-        return {"count": 0, "percentiles_us": {}, "histogram": {"edges_us": EDGES, "count": []}}
+        return {
+            "count": 0,
+            "percentiles_us": {},
+            "histogram": {"edges_us": HISTOGRAM_EDGES_US, "count": []},
+        }
     values = np.percentile(micro, PERCENTILES)
     names = [f"p{p:g}" if p < 100.0 else "largest" for p in PERCENTILES]
-    counts = np.histogram(micro, [-np.inf, *EDGES, np.inf])[0]
+    counts = np.histogram(micro, [-np.inf, *HISTOGRAM_EDGES_US, np.inf])[0]
     return {
         "count": len(micro),
         "percentiles_us": {n: round(float(v), 1) for n, v in zip(names, values, strict=True)},
-        "histogram": {"edges_us": list(EDGES), "count": counts.tolist()},
+        "histogram": {"edges_us": list(HISTOGRAM_EDGES_US), "count": counts.tolist()},
     }
 
 
-class Deadlines:
+class RealTimePacer:
     """Synchronise simulated time with the wall clock, with a deadline for every tick.
 
     Small delays are caught up. After a delay of more than `patience`, simulated time is set back.
 
     Attributes:
         pauses: number of times that simulated time was set back.
-        late: total time by which it was set back [s].
+        total_delay: total time by which it was set back [s].
         missed: number of ticks that missed their deadline.
         ticks: total number of ticks.
         priority: whether real-time priority was granted.
     """
 
     def __init__(
-        self, most: int, level: int = 0, patience: float = 0.25,
+        self, max_ticks: int, priority_level: int = 0, max_delay: float = 0.25,
         now: Callable[[], int] = clock.monotonic_ns, sleep: Callable[[float], None] = clock.sleep,
     ) -> None:  # fmt: skip
         """Prepare the deadlines; time starts with the first call of `wait`, after compilation.
 
         Args:
-            most: maximum number of ticks whose delay is recorded.
-            level: real-time priority from the first tick on, see `steady`; 0 requests none.
-            patience: delay after which simulated time is set back [s].
+            max_ticks: maximum number of ticks whose delay is recorded.
+            priority_level: real-time priority from the first tick on, see `reduced_jitter`; 0 requests none.
+            max_delay: delay after which simulated time is set back [s].
             now: function that returns the time [ns].
             sleep: function that waits for a time [s].
         """
-        self._now, self._sleep, self._patience = now, sleep, patience
-        self._begin: int | None = None
-        self._level, self._steady, self.priority = level, contextlib.ExitStack(), False
-        self._lateness = np.zeros(most, np.int64)
-        self.pauses, self.late, self.missed, self.ticks = 0, 0.0, 0, 0
+        self._now, self._sleep, self._patience = now, sleep, max_delay
+        self._start: int | None = None
+        self._level, self._priority_stack, self.priority = (
+            priority_level,
+            contextlib.ExitStack(),
+            False,
+        )
+        self._lateness = np.zeros(max_ticks, np.int64)
+        self.pauses, self.total_delay, self.missed, self.ticks = 0, 0.0, 0, 0
 
     def now(self) -> float:
         """Return the time of the clock [s]."""
         return self._now() * 1e-9
 
-    def wait(self, simulated: float) -> float:
+    def wait_for_tick(self, simulated: float) -> float:
         """Wait for the deadline of a tick after its work is done.
 
         Args:
@@ -98,40 +109,40 @@ class Deadlines:
             Time by which simulated time was set back [s]; 0 if it keeps up.
         """
         due, now = round(simulated * 1e9), self._now()
-        if self._begin is None:
+        if self._start is None:
             if self._level:
-                self.priority = self._steady.enter_context(steady(self._level))
+                self.priority = self._priority_stack.enter_context(reduced_jitter(self._level))
                 now = self._now()
-            self._begin = now - due
-        early = self._begin + due - now
+            self._start = now - due
+        early = self._start + due - now
         if self.ticks < len(self._lateness):
             self._lateness[self.ticks] = max(0, -early)
         self.ticks += 1
         if early < 0:
             self.missed += 1
             if early < -1e9 * self._patience:
-                self._begin -= early
+                self._start -= early
                 self.pauses += 1
-                self.late -= 1e-9 * early
+                self.total_delay -= 1e-9 * early
                 return -1e-9 * early
             return 0.0
-        if early > 1e9 * SPIN:
-            self._sleep(1e-9 * early - SPIN)
-        while self._now() < self._begin + due:
+        if early > 1e9 * BUSY_WAIT_TIME:
+            self._sleep(1e-9 * early - BUSY_WAIT_TIME)
+        while self._now() < self._start + due:
             pass
         return 0.0
 
     def close(self) -> None:
         """Return to normal priority."""
-        self._steady.close()
+        self._priority_stack.close()
 
-    def lateness(self) -> np.ndarray:
+    def delays(self) -> np.ndarray:
         """Return the delays (n,) of the ticks that missed their deadline [ns]."""
         late = self._lateness[: self.ticks]
         return late[late > 0]
 
 
-def computer_alone(
+def measure_idle_deadlines(
     seconds: float, rate: float, level: int = 0, now: Callable[[], int] = clock.monotonic_ns,
     sleep: Callable[[float], None] = clock.sleep,
 ) -> dict:  # fmt: skip
@@ -140,25 +151,25 @@ def computer_alone(
     Args:
         seconds: duration [s].
         rate: rate of the deadlines [Hz].
-        level: real-time priority, see `steady`.
+        level: real-time priority, see `reduced_jitter`.
         now: function that returns the time [ns].
         sleep: function that waits for a time [s].
 
     Returns:
-        seconds, ticks, missed, late (see `summary_of`), and priority.
+        seconds, ticks, missed, late (see `summarise_durations`), and priority.
     """
     ticks = max(1, round(seconds * rate))
-    pacer = Deadlines(ticks, level, now=now, sleep=sleep)
+    pacer = RealTimePacer(ticks, level, now=now, sleep=sleep)
     try:
         for tick in range(ticks):
-            pacer.wait(tick / rate)
+            pacer.wait_for_tick(tick / rate)
     finally:
         pacer.close()
     return {"seconds": seconds, "ticks": pacer.ticks, "missed": pacer.missed,
-            "late": summary_of(pacer.lateness()), "priority": pacer.priority}  # fmt: skip
+            "late": summarise_durations(pacer.delays()), "priority": pacer.priority}  # fmt: skip
 
 
-def stolen_time(stat: Path = _STAT) -> float | None:
+def read_steal_time(stat: Path = _STAT_FILE) -> float | None:
     """Return the processor time that the host has taken from a virtual machine since its start.
 
     Args:
@@ -172,7 +183,7 @@ def stolen_time(stat: Path = _STAT) -> float | None:
     try:
         with stat.open(encoding="ascii") as file:
             words = file.readline().split()
-        return int(words[_STEAL]) / os.sysconf("SC_CLK_TCK")
+        return int(words[_STEAL_COLUMN]) / os.sysconf("SC_CLK_TCK")
     except (OSError, IndexError, ValueError, AttributeError):  # not Linux, or an old kernel
         return None
 
@@ -185,7 +196,7 @@ def load_of_machine() -> list[float] | None:
         return None
 
 
-def ask_for_priority(level: int) -> bool:
+def request_priority(level: int) -> bool:
     """Request real-time priority (first-in first-out scheduling) for the calling thread.
 
     Args:
@@ -202,41 +213,41 @@ def ask_for_priority(level: int) -> bool:
 
 
 @contextlib.contextmanager
-def steady(level: int) -> Iterator[bool]:
+def reduced_jitter(level: int) -> Iterator[bool]:
     """Reduce timing jitter: no garbage collection, exact sleeps, small pages, real-time priority.
 
     Priority and a short processor wake-up time are set only where the system permits them.
     Huge pages are off: the first access to one clears 2 MB, which takes milliseconds.
 
     Args:
-        level: see `ask_for_priority`; 0 requests none.
+        level: see `request_priority`; 0 requests none.
 
     Yields:
         Whether priority was granted.
 
     Source: Linux, Documentation/power/pm_qos_interface.
     """
-    _control(_SLACK, 1000)  # exact timers: by default the system wakes a thread up to 50 us late
-    _control(_NO_HUGE_PAGES, 1)
+    _set_process_option(_PR_SET_TIMERSLACK, 1000)  # exact timers: by default the system wakes a thread up to 50 us late
+    _set_process_option(_PR_SET_THP_DISABLE, 1)
     gc.collect()
     gc.freeze()
     gc.disable()
-    given = level > 0 and ask_for_priority(level)
+    given = level > 0 and request_priority(level)
     awake = contextlib.ExitStack()
     with contextlib.suppress(OSError):  # not available, or not permitted
-        awake.enter_context(_WAKE.open("r+b", buffering=0)).write(bytes(4))
+        awake.enter_context(_WAKE_LATENCY_FILE.open("r+b", buffering=0)).write(bytes(4))
     try:
         yield given
     finally:
         awake.close()
         if given:
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-        _control(_NO_HUGE_PAGES, 0)
+        _set_process_option(_PR_SET_THP_DISABLE, 0)
         gc.enable()
         gc.unfreeze()
 
 
-def _control(option: int, value: int) -> None:
+def _set_process_option(option: int, value: int) -> None:
     """Set an option of this process or thread where it exists (Linux, prctl(2))."""
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(option, value, 0, 0, 0)

@@ -18,8 +18,8 @@ friction", IEEE Trans. Automatic Control 40(3), Eqs 1-4; Dahl 1968, Aerospace Co
 import math
 
 from hydrotele.core.compiled import allocation_free, inlined
-from hydrotele.hydraulics.laws import friction, friction_slope, stop_force
-from hydrotele.hydraulics.parameters import PUMP, Kind, Slot
+from hydrotele.hydraulics.laws import friction_force, friction_slope, stop_force
+from hydrotele.hydraulics.parameters import PUMP_OFFSET, ActuatorKind, Slot
 from hydrotele.hydraulics.pump import load_force, pump_piston_friction, pump_pressure_rates
 
 _AH, _AR = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)
@@ -29,9 +29,9 @@ _FC, _FS = int(Slot.COULOMB), int(Slot.STRIBECK)
 _VS, _B = int(Slot.STRIBECK_VELOCITY), int(Slot.VISCOUS)
 _V0, _AC = int(Slot.COULOMB_VELOCITY), int(Slot.COULOMB_ASYMMETRY)
 _AV, _KIND = int(Slot.VISCOUS_ASYMMETRY), int(Slot.KIND)
-_LOW, _HIGH = int(Slot.STOP_LOW), int(Slot.STOP_HIGH)
-_HARD, _SOFT = int(Slot.STOP_STIFFNESS), int(Slot.STOP_DAMPING)
-_PUMPED = float(Kind.PUMPED)
+_STOP_LOW, _STOP_HIGH = int(Slot.STOP_LOW), int(Slot.STOP_HIGH)
+_STOP_STIFFNESS, _STOP_DAMPING = int(Slot.STOP_STIFFNESS), int(Slot.STOP_DAMPING)
+_PUMPED = float(ActuatorKind.PUMP_DRIVE)
 
 
 @inlined
@@ -48,7 +48,7 @@ def actuator_friction(user, u, velocity):
 
     Source: nominal model, "Piston force".
     """
-    return friction(
+    return friction_force(
         velocity,
         user[u + _FC],
         user[u + _FS],
@@ -96,15 +96,20 @@ def actuator_stop(user, u, position, velocity):
 
     Source: `laws.stop_force`.
     """
-    if user[u + _HARD] == 0.0:
+    if user[u + _STOP_STIFFNESS] == 0.0:
         return 0.0, 0.0, 0.0
     return stop_force(
-        position, velocity, user[u + _LOW], user[u + _HIGH], user[u + _HARD], user[u + _SOFT]
+        position,
+        velocity,
+        user[u + _STOP_LOW],
+        user[u + _STOP_HIGH],
+        user[u + _STOP_STIFFNESS],
+        user[u + _STOP_DAMPING],
     )
 
 
 @allocation_free
-def pumped_volumes(user, u, x):
+def pump_drive_volumes(user, u, x):
     """Return the volumes of both chambers and the oil volume taken from the accumulator.
 
     Args:
@@ -127,7 +132,7 @@ def pumped_volumes(user, u, x):
 
 
 @allocation_free
-def pumped_rates(user, u, speed, p_head, p_rod, x, v, added):
+def pump_drive_pressure_rates(user, u, speed, p_head, p_rod, x, v, added):
     """Compute the pressure rates of an axis with its own pump, as `circuit.pressure_rates`.
 
     Args:
@@ -146,15 +151,15 @@ def pumped_rates(user, u, speed, p_head, p_rod, x, v, added):
 
     Source: `pump.pump_pressure_rates`.
     """
-    volumes, area_head, area_rod = pumped_volumes(user, u, x), user[u + _AH], user[u + _AR]
+    volumes, area_head, area_rod = pump_drive_volumes(user, u, x), user[u + _AH], user[u + _AR]
     return pump_pressure_rates(
-        user, u + PUMP, speed, p_head, p_rod, volumes, (area_head * v, area_rod * v),
+        user, u + PUMP_OFFSET, speed, p_head, p_rod, volumes, (area_head * v, area_rod * v),
         user[u + _LEAK], added,
     )  # fmt: skip
 
 
 @allocation_free
-def pumped_force(user, u, p_load, p_head, p_rod, v, other, dt):
+def pump_drive_force(user, u, p_load, p_head, p_rod, v, other_force, dt):
     """Return the net force of an axis with its own pump, after load cylinder and friction.
 
     Args:
@@ -164,7 +169,7 @@ def pumped_force(user, u, p_load, p_head, p_rod, v, other, dt):
         p_head: scalar [Pa].
         p_rod: scalar [Pa].
         v: piston velocity, scalar [m/s].
-        other: all other force on the piston, scalar [N].
+        other_force: all other force on the piston, scalar [N].
         dt: time step of the friction, scalar [s]; see `pump_piston_friction`.
 
     Returns:
@@ -172,22 +177,22 @@ def pumped_force(user, u, p_load, p_head, p_rod, v, other, dt):
 
     Source: nominal model, "Piston force", with the friction of `pump_piston_friction`.
     """
-    force = user[u + _AH] * p_head - user[u + _AR] * p_rod - load_force(user, u + PUMP, p_load)
+    force = user[u + _AH] * p_head - user[u + _AR] * p_rod - load_force(user, u + PUMP_OFFSET, p_load)
     seal = (
         user[u + _FC], user[u + _FS], user[u + _VS], user[u + _B], user[u + _AC], user[u + _AV],
     )  # fmt: skip
-    return force - pump_piston_friction(user, u + PUMP, seal, v, force + other, p_load, dt)
+    return force - pump_piston_friction(user, u + PUMP_OFFSET, seal, v, force + other_force, p_load, dt)
 
 
 @allocation_free
-def force_after_friction(user, u, push, other, act, velocity, dt):
+def force_after_friction(user, u, drive_force, other_force, act, velocity, dt):
     """Return the force of an actuator after friction, and the friction slope for an implicit step.
 
     Args:
         user: (nu * SLOTS,) actuator parameters.
         u: index of the first parameter of this actuator in `user`.
-        push: force before friction, scalar [N] or [N m]; not used for an axis with its own pump.
-        other: all other force on the drive, scalar [N] or [N m]. It is not part of the result; the
+        drive_force: force before friction, scalar [N] or [N m]; not used for an axis with its own pump.
+        other_force: all other force on the drive, scalar [N] or [N m]. It is not part of the result; the
             static friction of an axis with its own pump resists it.
         act: activations from those of this actuator on; used only for an axis with its own pump.
         velocity: velocity of the drive, scalar [m/s] or [rad/s].
@@ -200,18 +205,18 @@ def force_after_friction(user, u, push, other, act, velocity, dt):
     Source: nominal model, "Piston force".
     """
     if user[u + _KIND] == _PUMPED:
-        return pumped_force(user, u, act[1], act[2], act[3], velocity, other, dt), 0.0
+        return pump_drive_force(user, u, act[1], act[2], act[3], velocity, other_force, dt), 0.0
     slope = actuator_friction_slope(user, u, velocity)
-    return push - actuator_friction(user, u, velocity), slope
+    return drive_force - actuator_friction(user, u, velocity), slope
 
 
-_STIFF, _DAMP = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE_DAMPING)
+_BRISTLE_STIFFNESS, _BRISTLE_DAMPING = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE_DAMPING)
 
-_RESOLVED = 0.5  # largest (w dt)^2 of a drive on its bristles; the stability limit is 4
+_MAX_PHASE_SQUARED = 0.5  # largest (w dt)^2 of a drive on its bristles; the stability limit is 4
 
 
 @allocation_free
-def sliding_level(velocity, coulomb, stribeck, stribeck_velocity, asymmetry):
+def sliding_friction(velocity, coulomb, stribeck, stribeck_velocity, asymmetry):
     """Return the dry friction of a sliding drive, without smoothing of the sign.
 
     `g = (F_c + F_s exp(-(v/v_s)^2)) s (1 + a s)` with `s = sgn v`.
@@ -228,7 +233,7 @@ def sliding_level(velocity, coulomb, stribeck, stribeck_velocity, asymmetry):
 
     Source: nominal model, "Piston force".
 
-    >>> sliding_level(-1.0, 3000.0, 1500.0, 0.02, 0.0)
+    >>> sliding_friction(-1.0, 3000.0, 1500.0, 0.02, 0.0)
     -3000.0
     """
     ratio = velocity / stribeck_velocity
@@ -245,7 +250,7 @@ def bristle_step(force, velocity, level, stiffness, dt):
     Args:
         force: F, scalar [N] or [N m].
         velocity: v, scalar [m/s] or [rad/s].
-        level: g of `sliding_level`, scalar [N] or [N m].
+        level: g of `sliding_friction`, scalar [N] or [N m].
         stiffness: sigma_0, scalar [N/m] or [N m/rad].
         dt: duration, scalar [s].
 
@@ -267,28 +272,28 @@ def bristle_step(force, velocity, level, stiffness, dt):
 
 
 @allocation_free
-def _level(user, u, velocity):
-    """Return the `sliding_level` of an actuator."""
-    return sliding_level(velocity, user[u + _FC], user[u + _FS], user[u + _VS], user[u + _AC])
+def _actuator_sliding_friction(user, u, velocity):
+    """Return the `sliding_friction` of an actuator."""
+    return sliding_friction(velocity, user[u + _FC], user[u + _FS], user[u + _VS], user[u + _AC])
 
 
 @allocation_free
-def _followed(user, u, inertia, dt):
+def _resolved_stiffness(user, u, inertia, dt):
     """Return the bristle stiffness of an actuator, limited as described in `bristle_rate`."""
-    stiffness = user[u + _STIFF]
+    stiffness = user[u + _BRISTLE_STIFFNESS]
     if inertia > 0.0 and dt > 0.0:
-        stiffness = min(stiffness, _RESOLVED * inertia / (dt * dt))
+        stiffness = min(stiffness, _MAX_PHASE_SQUARED * inertia / (dt * dt))
     return stiffness
 
 
 @allocation_free
-def bristle_rate(user, u, share, velocity, inertia, dt):
+def bristle_rate(user, u, fraction, velocity, inertia, dt):
     """Return the mean rate over a step of the breakaway force fraction carried by the bristles.
 
     Args:
         user: (nu * SLOTS,) actuator parameters.
         u: index of the first parameter of this actuator in `user`.
-        share: r at the start of the step, scalar [1].
+        fraction: r at the start of the step, scalar [1].
         velocity: velocity of the drive over the step, scalar [m/s] or [rad/s].
         inertia: inertia J moved by the drive, scalar [kg] or [kg m^2]. The bristle stiffness is
             limited to 0.5 J / dt^2; 0 means no limit.
@@ -300,13 +305,16 @@ def bristle_rate(user, u, share, velocity, inertia, dt):
     Source: `bristle_step`.
     """
     breakaway = user[u + _FC] + user[u + _FS]
-    level, stiffness = _level(user, u, velocity), _followed(user, u, inertia, dt)
-    after = bristle_step(share * breakaway, velocity, level, stiffness, dt) / breakaway
-    return (after - share) / dt
+    level, stiffness = (
+        _actuator_sliding_friction(user, u, velocity),
+        _resolved_stiffness(user, u, inertia, dt),
+    )
+    after = bristle_step(fraction * breakaway, velocity, level, stiffness, dt) / breakaway
+    return (after - fraction) / dt
 
 
 @allocation_free
-def bristle_friction(user, u, share, velocity, inertia, dt):
+def bristle_friction(user, u, fraction, velocity, inertia, dt):
     """Return the friction of a drive with bristles, and its derivatives.
 
     `F = r (F_c + F_s) + sigma_1 z' + b v (1 + a_v t)`, with the viscous part of `laws.friction`.
@@ -314,7 +322,7 @@ def bristle_friction(user, u, share, velocity, inertia, dt):
     Args:
         user: (nu * SLOTS,) actuator parameters.
         u: index of the first parameter of this actuator in `user`.
-        share: r, scalar [1].
+        fraction: r, scalar [1].
         velocity: v, scalar [m/s] or [rad/s].
         inertia: inertia moved by the drive, see `bristle_rate`.
         dt: time step, scalar [s]; 0 means no limit of stiffness and damping.
@@ -327,29 +335,29 @@ def bristle_friction(user, u, share, velocity, inertia, dt):
     """
     bent = 1.0  # d (deflection) / d (travel), 0 in steady sliding
     if velocity != 0.0:
-        level = _level(user, u, velocity)
-        bent = 1.0 - share * (user[u + _FC] + user[u + _FS]) / level if level != 0.0 else 0.0
-    damping = user[u + _DAMP]
+        level = _actuator_sliding_friction(user, u, velocity)
+        bent = 1.0 - fraction * (user[u + _FC] + user[u + _FS]) / level if level != 0.0 else 0.0
+    damping = user[u + _BRISTLE_DAMPING]
     if inertia > 0.0 and dt > 0.0:
-        damping = min(damping, _RESOLVED * inertia / dt)
+        damping = min(damping, _MAX_PHASE_SQUARED * inertia / dt)
     viscous, asymmetry = user[u + _B], user[u + _AV]
-    force = share * (user[u + _FC] + user[u + _FS]) + damping * bent * velocity
-    force += friction(velocity, 0.0, 0.0, 1.0, viscous, user[u + _V0], 0.0, asymmetry)
+    force = fraction * (user[u + _FC] + user[u + _FS]) + damping * bent * velocity
+    force += friction_force(velocity, 0.0, 0.0, 1.0, viscous, user[u + _V0], 0.0, asymmetry)
     slope = friction_slope(velocity, 0.0, 0.0, 1.0, viscous, user[u + _V0], 0.0, asymmetry)
     bent = max(0.0, bent)
-    return force, damping * bent + slope, _followed(user, u, inertia, dt) * bent
+    return force, damping * bent + slope, _resolved_stiffness(user, u, inertia, dt) * bent
 
 
 @allocation_free
-def settled_bristle_friction(user, u, share, velocity, push, inertia, dt):
+def implicit_bristle_friction(user, u, fraction, velocity, other_force, inertia, dt):
     """Return `bristle_friction` at the end of an implicit step of a free body.
 
     Args:
         user: (nu * SLOTS,) actuator parameters.
         u: index of the first parameter of this actuator in `user`.
-        share: r, scalar [1].
+        fraction: r, scalar [1].
         velocity: at the start of the step, scalar [m/s] or [rad/s].
-        push: all other force, scalar [N] or [N m].
+        other_force: all other force, scalar [N] or [N m].
         inertia: inertia of the body, scalar [kg] or [kg m^2], > 0.
         dt: time step, scalar [s], > 0.
 
@@ -358,6 +366,6 @@ def settled_bristle_friction(user, u, share, velocity, push, inertia, dt):
 
     Source: linearly implicit Euler rule.
     """
-    force, slope, _ = bristle_friction(user, u, share, velocity, inertia, dt)
+    force, slope, _ = bristle_friction(user, u, fraction, velocity, inertia, dt)
     part = slope * dt / inertia
-    return (force + part * push) / (1.0 + part)
+    return (force + part * other_force) / (1.0 + part)

@@ -4,7 +4,7 @@ Pure functions on flat arrays in MuJoCo's layout, so that the native callbacks, 
 estimator run the same code. The parameters of axis `i` are at `user[i * SLOTS + Slot]`. Its
 activations `spool, spool_rate, p_head, p_rod` are at `act[4 i ...]`, counted from the first
 hydraulic axis. The states of bristles, of a pump with a time constant and of terms follow after all
-axes. An axis with its own pump (`Kind.PUMPED`, see `pump`) has pump speed and load cylinder
+axes. An axis with its own pump (`ActuatorKind.PUMP_DRIVE`, see `pump`) has pump speed and load cylinder
 pressure instead of spool and spool rate.
 
 The module also evaluates the terms of a machine in a step, and the implicit friction of a light
@@ -22,71 +22,72 @@ from hydrotele.hydraulics.actuator import (
     actuator_stop,
     bristle_friction,
     force_after_friction,
-    pumped_force,
-    pumped_rates,
-    pumped_volumes,
+    pump_drive_force,
+    pump_drive_pressure_rates,
+    pump_drive_volumes,
 )
 from hydrotele.hydraulics.laws import (
     air_compliance,
+    air_softening_factor,
     axis_opening,
     chamber_flows,
     port_flow,
     pressure_with_air,
     pressure_without_air,
-    softening,
     spool_step,
 )
-from hydrotele.hydraulics.parameters import PUMP, SLOTS, Kind, Slot
+from hydrotele.hydraulics.parameters import PUMP_OFFSET, SLOT_COUNT, ActuatorKind, Slot
 from hydrotele.hydraulics.pump import (
     load_pressure_step,
     pump_flows,
     pump_speed_step,
-    switched_speed,
+    speed_after_switching,
 )
 from hydrotele.hydraulics.supply import (
-    ADDED_LAG,
-    circuit_supply,
-    delivered_share,
-    demanded_share,
-    open_ports,
-    own_share,
+    TERM_FLOW_TIME_CONSTANT,
+    add_flow_fractions,
+    circuit_supply_pressure,
+    compute_ports,
+    delivered_flow_fraction,
+    demanded_flow_fraction,
+    pump_flow_fraction,
     pump_response,
     supply_coupling,
     supply_pressure,
-    with_added,
 )
 from hydrotele.terms.law import VARIABLES, DriveState
 from hydrotele.terms.table import (
-    ANY,
+    ANY_DRIVE,
     COMMAND,
-    COUNT,
+    COUNT_INDEX,
     FLOW_HEAD,
     FLOW_ROD,
     FLOW_SUPPLY,
-    acts_on,
-    added,
-    added_flows,
-    memory_of,
-    remember,
+    has_term,
+    hysteresis_location,
+    sum_flow_terms,
+    sum_terms,
+    update_term_state,
 )
 
 __all__ = [
-    "ACTIVATIONS", "MAX_AXES", "NO_MEMORY", "SCRATCH", "SLOTS", "Kind", "Slot", "actuator_friction",
-    "actuator_friction_slope", "actuator_stop", "axis_opening", "axis_state", "chamber_flows",
-    "circuit_scratch", "circuit_supply", "delivered_share", "force_after_friction", "open_ports",
-    "pressure_rates", "pumped_force", "step_circuit", "supply_pressure", "demanded_share",
+    "ACTIVATIONS_PER_AXIS", "MAX_AXES", "NO_EXTRA_STATES", "SCRATCH_SIZE", "SLOT_COUNT", "ActuatorKind", "Slot",
+    "actuator_friction",
+    "actuator_friction_slope", "actuator_stop", "axis_opening", "axis_flows_and_force", "chamber_flows",
+    "circuit_scratch", "circuit_supply_pressure", "delivered_flow_fraction", "force_after_friction", "compute_ports",
+    "pressure_rates", "pump_drive_force", "step_circuit", "supply_pressure", "demanded_flow_fraction",
 ]  # fmt: skip
 
-ACTIVATIONS = 4
-NO_MEMORY = -1  # value of `memory` that skips all code of additional states
+ACTIVATIONS_PER_AXIS = 4
+NO_EXTRA_STATES = -1  # value of `memory` that skips all code of additional states
 MAX_AXES = 8
 # Layout of the work space: ports, factors of pressures and supply coupling, then the softening of
 # both chambers, later replaced by their rates of the first stage.
-_FACTORS = 4 * MAX_AXES
-_FIRST = 8 * MAX_AXES
-SCRATCH = 10 * MAX_AXES
+_FACTOR_OFFSET = 4 * MAX_AXES
+_STAGE_OFFSET = 8 * MAX_AXES
+SCRATCH_SIZE = 10 * MAX_AXES
 
-_ROS2 = 1.0 + 1.0 / math.sqrt(2.0)  # L-stable, of second order with any approximate Jacobian
+_ROS2_GAMMA = 1.0 + 1.0 / math.sqrt(2.0)  # L-stable, of second order with any approximate Jacobian
 _NO_FLOWS = (0.0, 0.0, 0.0, 0.0)
 
 _AH, _AR = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)
@@ -101,9 +102,9 @@ _ONSET, _ENTRAINED = int(Slot.AIR_ONSET), int(Slot.ENTRAINED_AIR)
 _LAG, _DELIVERY = int(Slot.PUMP_TIME_CONSTANT), int(Slot.DELIVERY)
 _ADDED, _PUMP = int(Slot.ADDED_DELIVERY), int(Slot.PUMP_FLOW)
 _BRISTLE_STIFFNESS, _BRISTLE = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE)
-_KIND, _PUMPED = int(Slot.KIND), float(Kind.PUMPED)
+_KIND, _PUMPED = int(Slot.KIND), float(ActuatorKind.PUMP_DRIVE)
 _TIME, _POSITION, _VELOCITY = (VARIABLES[name] for name in ("time", "position", "velocity"))
-_COMMAND, _SUPPLY, _PUSH = (VARIABLES[n] for n in ("command", "pressure_supply", "force"))
+_COMMAND, _SUPPLY, _FORCE = (VARIABLES[n] for n in ("command", "pressure_supply", "force"))
 
 
 @inlined
@@ -152,7 +153,7 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead, added
     Source: nominal model, "Chambers".
     """
     if user[u + _KIND] == _PUMPED:
-        return pumped_rates(user, u, opening, p_head, p_rod, x, v, added)
+        return pump_drive_pressure_rates(user, u, opening, p_head, p_rod, x, v, added)
     q_head, q_rod, slope_head, slope_rod = chamber_flows(user, u, opening, p_supply, p_head, p_rod)
     leak = user[u + _LEAK] * (p_head - p_rod)
     port, relief_gain = user[u + _PORT], user[u + _KR]
@@ -175,45 +176,45 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead, added
 
 
 @allocation_free
-def _flows_of_terms(terms, i, user, time, x, oil, supply, drives):
+def _term_flows(terms, i, user, time, x, oil, supply, drives):
     """Return the flows that terms add to the chambers of an axis, see `terms.table.added_flows`.
 
     `oil` contains spool, spool rate and both pressures of the axis.
     """
-    if not (acts_on(terms, FLOW_HEAD, i) or acts_on(terms, FLOW_ROD, i)):
+    if not (has_term(terms, FLOW_HEAD, i) or has_term(terms, FLOW_ROD, i)):
         return _NO_FLOWS
     spool, rate, p_head, p_rod = oil
     v, command = drives.velocity[i], drives.command[i]
-    force = user[i * SLOTS + _AH] * p_head - user[i * SLOTS + _AR] * p_rod
+    force = user[i * SLOT_COUNT + _AH] * p_head - user[i * SLOT_COUNT + _AR] * p_rod
     s = DriveState(time, x, v, spool, rate, p_head, p_rod, supply, command, force, 0.0, 0.0)
-    return added_flows(terms, i, s, drives)
+    return sum_flow_terms(terms, i, s, drives)
 
 
 @allocation_free
-def _delivery_of_terms(user, first, drives, terms, time, supply, dt):
+def _term_delivery(user, first, drives, terms, time, supply, dt):
     """Return the fraction of the maximum pump flow that terms add after a step, scalar [1].
 
     The pump follows the terms' values at the start of the step, by the exact exponential.
     """
-    at = int(user[first * SLOTS + _ADDED])
+    at = int(user[first * SLOT_COUNT + _ADDED])
     if at == 0:
         return 0.0
     total, act = 0.0, drives.act
-    if acts_on(terms, FLOW_SUPPLY, ANY):
+    if has_term(terms, FLOW_SUPPLY, ANY_DRIVE):
         for i in range(drives.count):
-            u, a, v = (first + i) * SLOTS, 4 * i, drives.velocity[first + i]
+            u, a, v = (first + i) * SLOT_COUNT, 4 * i, drives.velocity[first + i]
             force = user[u + _AH] * act[a + 2] - user[u + _AR] * act[a + 3]
             s = DriveState(
                 time, drives.position[first + i] - dt * v, v, act[a], act[a + 1], act[a + 2],
                 act[a + 3], supply, drives.command[first + i], force, 0.0, 0.0,
             )  # fmt: skip
-            total += added(terms, FLOW_SUPPLY, first + i, s, drives)
-    wanted = total / user[first * SLOTS + _PUMP]
-    return wanted + (act[at] - wanted) * math.exp(-dt / ADDED_LAG)
+            total += sum_terms(terms, FLOW_SUPPLY, first + i, s, drives)
+    wanted = total / user[first * SLOT_COUNT + _PUMP]
+    return wanted + (act[at] - wanted) * math.exp(-dt / TERM_FLOW_TIME_CONSTANT)
 
 
 @allocation_free
-def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, memory):
+def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, extra_states):
     """Advance spools and chamber pressures of all axes that share a supply by one step.
 
     Spools follow their exact exponential. Pressures take one step of the L-stable second-order
@@ -238,7 +239,7 @@ def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, memory)
         scratch: (SCRATCH,) work space.
         terms: (n,) table of the machine's terms, `NO_TERMS` for none [SI].
         time: time at the start of the step, scalar [s]; used by terms only.
-        memory: number of additional states after the activations, scalar [1]; `NO_MEMORY` skips
+        extra_states: number of additional states after the activations, scalar [1]; `NO_EXTRA_STATES` skips
             them and saves the time of the check.
 
     Returns:
@@ -246,103 +247,101 @@ def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, memory)
 
     Source: nominal model; ROS2: Verwer et al. 1999, SIAM J. Sci. Comput. 20(4), Eq. 2.6.
     """
-    gamma_h = _ROS2 * dt
+    gamma_h = _ROS2_GAMMA * dt
     count, act, length, velocity, command = drives
     for i in range(count):
-        u, a = (first + i) * SLOTS, 4 * i
+        u, a = (first + i) * SLOT_COUNT, 4 * i
         bounded = min(1.0, max(-1.0, command[first + i]))
         if user[u + _KIND] == _PUMPED:
-            act_dot[a] = pump_speed_step(
-                user, u + PUMP, act[a], bounded, act[a + 2], act[a + 3], dt
-            )
-            act_dot[a + 1] = load_pressure_step(user, u + PUMP, act[a + 1], velocity[first + i], dt)
+            act_dot[a] = pump_speed_step(user, u + PUMP_OFFSET, act[a], bounded, act[a + 2], act[a + 3], dt)
+            act_dot[a + 1] = load_pressure_step(user, u + PUMP_OFFSET, act[a + 1], velocity[first + i], dt)
             continue
         act_dot[a], act_dot[a + 1] = spool_step(
             act[a], act[a + 1], bounded, user[u + _W], user[u + _Z], dt, user[u + _SLEW]
         )
-    open_ports(user, act, act, scratch, first, count, 0.0, act_dot)
+    compute_ports(user, act, act, scratch, first, count, 0.0, act_dot)
     held, share, begun, more_delivered = 1.0, 1.0, 0.0, 0.0
-    if memory >= 0:
-        held = delivered_share(user, first, act)
-    p_start = circuit_supply(user, first, count, scratch, held)
-    if memory >= 0:
-        begun = demanded_share(user, first, count, scratch)
-        more_delivered = _delivery_of_terms(user, first, drives, terms, time, p_start, dt)
-        share = pump_response(user, first, begun, own_share(user, first, act), dt)
-        share = with_added(share, more_delivered)
+    if extra_states >= 0:
+        held = delivered_flow_fraction(user, first, act)
+    p_start = circuit_supply_pressure(user, first, count, scratch, held)
+    if extra_states >= 0:
+        begun = demanded_flow_fraction(user, first, count, scratch)
+        more_delivered = _term_delivery(user, first, drives, terms, time, p_start, dt)
+        share = pump_response(user, first, begun, pump_flow_fraction(user, first, act), dt)
+        share = add_flow_fractions(share, more_delivered)
     for i in range(count):
-        u, a = (first + i) * SLOTS, 4 * i
+        u, a = (first + i) * SLOT_COUNT, 4 * i
         x, v = length[first + i] - dt * velocity[first + i], velocity[first + i]
         if user[u + _KIND] == _PUMPED:
-            scratch[a + 3] = switched_speed(act[a], act_dot[a])
+            scratch[a + 3] = speed_after_switching(act[a], act_dot[a])
         more = _NO_FLOWS
         if len(terms) > 0:
             oil = (act[a], act[a + 1], act[a + 2], act[a + 3])
-            more = _flows_of_terms(terms, first + i, user, time, x, oil, p_start, drives)
+            more = _term_flows(terms, first + i, user, time, x, oil, p_start, drives)
         head, rod, j_head, j_rod = pressure_rates(
             user, u, scratch[a + 3], p_start, act[a + 2], act[a + 3], x, v, dt, more,
         )  # fmt: skip
-        f, k = _FACTORS + a, _FIRST + 2 * i
-        scratch[k] = _softening_ahead(user, u, act[a + 2], head, dt)
-        scratch[k + 1] = _softening_ahead(user, u, act[a + 3], rod, dt)
+        f, k = _FACTOR_OFFSET + a, _STAGE_OFFSET + 2 * i
+        scratch[k] = _predicted_softening(user, u, act[a + 2], head, dt)
+        scratch[k + 1] = _predicted_softening(user, u, act[a + 3], rod, dt)
         scratch[f] = 1.0 / (1.0 - gamma_h * (scratch[k] * j_head))
         scratch[f + 1] = 1.0 / (1.0 - gamma_h * (scratch[k + 1] * j_rod))
         act_dot[a + 2], act_dot[a + 3] = head * scratch[f], rod * scratch[f + 1]
-    coupled = supply_coupling(user, first, count, scratch, p_start, scratch[_FACTORS:])
+    coupled = supply_coupling(user, first, count, scratch, p_start, scratch[_FACTOR_OFFSET:])
     if coupled:
-        _begin_coupling(user, first, count, act, length, velocity, dt, gamma_h, scratch)
-        _couple(count, act_dot, scratch)
+        _prepare_coupling(user, first, count, act, length, velocity, dt, gamma_h, scratch)
+        _apply_coupling(count, act_dot, scratch)
     for i in range(count):
-        u, a, k = (first + i) * SLOTS, 4 * i, _FIRST + 2 * i
+        u, a, k = (first + i) * SLOT_COUNT, 4 * i, _STAGE_OFFSET + 2 * i
         scratch[k], scratch[k + 1] = act_dot[a + 2], act_dot[a + 3]
         act_dot[a + 2] = _rate_with_air(user, u, act[a + 2], act_dot[a + 2], dt)
         act_dot[a + 3] = _rate_with_air(user, u, act[a + 3], act_dot[a + 3], dt)
-    open_ports(user, act, act_dot, scratch, first, count, dt, act_dot)
-    p_end = circuit_supply(user, first, count, scratch, share)
-    if memory >= 0:
-        if user[first * SLOTS + _LAG] > 0.0:
-            at = int(user[first * SLOTS + _DELIVERY])
-            wanted = 0.5 * (begun + demanded_share(user, first, count, scratch))
+    compute_ports(user, act, act_dot, scratch, first, count, dt, act_dot)
+    p_end = circuit_supply_pressure(user, first, count, scratch, share)
+    if extra_states >= 0:
+        if user[first * SLOT_COUNT + _LAG] > 0.0:
+            at = int(user[first * SLOT_COUNT + _DELIVERY])
+            wanted = 0.5 * (begun + demanded_flow_fraction(user, first, count, scratch))
             act_dot[at] = (pump_response(user, first, wanted, act[at], dt) - act[at]) / dt
-        if user[first * SLOTS + _ADDED] > 0.0:
-            at = int(user[first * SLOTS + _ADDED])
+        if user[first * SLOT_COUNT + _ADDED] > 0.0:
+            at = int(user[first * SLOT_COUNT + _ADDED])
             act_dot[at] = (more_delivered - act[at]) / dt
     for i in range(count):
-        u, a = (first + i) * SLOTS, 4 * i
+        u, a = (first + i) * SLOT_COUNT, 4 * i
         x, v = length[first + i], velocity[first + i]
         p_head, p_rod = act[a + 2] + dt * act_dot[a + 2], act[a + 3] + dt * act_dot[a + 3]
         more = _NO_FLOWS
         if len(terms) > 0:
             oil = (act_dot[a], act_dot[a + 1], p_head, p_rod)
-            more = _flows_of_terms(terms, first + i, user, time + dt, x, oil, p_end, drives)
+            more = _term_flows(terms, first + i, user, time + dt, x, oil, p_end, drives)
         head, rod, _, _ = pressure_rates(
             user, u, scratch[a + 3], p_end, p_head, p_rod, x, v, 0.0, more,
         )  # fmt: skip
-        f, k = _FACTORS + a, _FIRST + 2 * i
+        f, k = _FACTOR_OFFSET + a, _STAGE_OFFSET + 2 * i
         act_dot[a + 2] = scratch[f] * (head - 2.0 * scratch[k])
         act_dot[a + 3] = scratch[f + 1] * (rod - 2.0 * scratch[k + 1])
         act_dot[a] = (act_dot[a] - act[a]) / dt
         act_dot[a + 1] = (act_dot[a + 1] - act[a + 1]) / dt
     if coupled:
-        _couple(count, act_dot, scratch)
+        _apply_coupling(count, act_dot, scratch)
     for i in range(count):
-        u, a, k = (first + i) * SLOTS, 4 * i, _FIRST + 2 * i
+        u, a, k = (first + i) * SLOT_COUNT, 4 * i, _STAGE_OFFSET + 2 * i
         head = 1.5 * scratch[k] + 0.5 * act_dot[a + 2]
         rod = 1.5 * scratch[k + 1] + 0.5 * act_dot[a + 3]
         port = user[u + _PORT]
         if act[a + 2] < port < act[a + 2] + dt * head:
             stiffness = _chamber_stiffness(user, u, length[first + i], port, act[a + 3])[0]
-            head = _relieved(port - act[a + 2], head, stiffness * user[u + _KR], dt)
+            head = _relief_limited_rate(port - act[a + 2], head, stiffness * user[u + _KR], dt)
         if act[a + 3] < port < act[a + 3] + dt * rod:
             stiffness = _chamber_stiffness(user, u, length[first + i], act[a + 2], port)[1]
-            rod = _relieved(port - act[a + 3], rod, stiffness * user[u + _KR], dt)
+            rod = _relief_limited_rate(port - act[a + 3], rod, stiffness * user[u + _KR], dt)
         act_dot[a + 2] = _rate_with_air(user, u, act[a + 2], head, dt)
         act_dot[a + 3] = _rate_with_air(user, u, act[a + 3], rod, dt)
     return p_start, p_end
 
 
 @allocation_free
-def advance_memories(user, terms, drives, act_dot, dt, time, supply):
+def advance_term_states(user, terms, drives, act_dot, dt, time, supply):
     """Write the rates of the internal states of terms, after those of all other activations.
 
     Args:
@@ -362,8 +361,8 @@ def advance_memories(user, terms, drives, act_dot, dt, time, supply):
     Source: `terms.table.remembered`.
     """
     act, count = drives.act, drives.count
-    for term in range(int(terms[COUNT])):
-        place, i, k = memory_of(terms, term)
+    for term in range(int(terms[COUNT_INDEX])):
+        place, i, k = hysteresis_location(terms, term)
         if not (4 * count <= place < len(act_dot) and 0 <= i < len(drives.velocity)):
             continue
         a = 4 * i
@@ -379,30 +378,30 @@ def advance_memories(user, terms, drives, act_dot, dt, time, supply):
             value = supply
         elif i >= count:
             value = 0.0
-        elif k == _PUSH:
+        elif k == _FORCE:
             head, rod = act[a + 2] + dt * act_dot[a + 2], act[a + 3] + dt * act_dot[a + 3]
-            value = user[i * SLOTS + _AH] * head - user[i * SLOTS + _AR] * rod
+            value = user[i * SLOT_COUNT + _AH] * head - user[i * SLOT_COUNT + _AR] * rod
         else:
             value = act[a + k - 3] + dt * act_dot[a + k - 3]
-        act_dot[place] = (remember(terms, term, value, act[place]) - act[place]) / dt
+        act_dot[place] = (update_term_state(terms, term, value, act[place]) - act[place]) / dt
 
 
 @allocation_free
-def _relieved(room, rate, quick, dt):
+def _relief_limited_rate(margin, rate, relief_rate, dt):
     """Return the mean pressure rate over a step in which a port relief valve opens [Pa/s].
 
     For a valve that is closed in both stages of the method. The pressure rises with the rate r up
     to the setting; from there the excess e follows `e' = r - e q`.
 
     Args:
-        room: pressure difference up to the setting, scalar [Pa].
+        margin: pressure difference up to the setting, scalar [Pa].
         rate: r, rate without the relief valve, scalar [Pa/s].
-        quick: q, rate at which the relief flow reduces the excess, scalar [1/s].
+        relief_rate: q, rate at which the relief flow reduces the excess, scalar [1/s].
         dt: time step, scalar [s].
     """
-    beyond = dt * rate - room
-    turns = quick * beyond / rate
-    return rate if turns <= 0.0 else (room - beyond * math.expm1(-turns) / turns) / dt
+    beyond = dt * rate - margin
+    turns = relief_rate * beyond / rate
+    return rate if turns <= 0.0 else (margin - beyond * math.expm1(-turns) / turns) / dt
 
 
 @inlined
@@ -416,18 +415,18 @@ def _rate_with_air(user, u, pressure, rate, dt):
 
 
 @inlined
-def _softening_ahead(user, u, pressure, rate, dt):
+def _predicted_softening(user, u, pressure, rate, dt):
     """Return the softening for the slopes of a step; 1 if the step would refill the chamber."""
     release, onset = user[u + _AIR], user[u + _ONSET]
     if pressure >= -onset or release == 0.0:
         return 1.0
     if pressure_without_air(pressure, release, onset) + dt * rate > -onset:
         return 1.0
-    return softening(pressure, release, onset)
+    return air_softening_factor(pressure, release, onset)
 
 
 @allocation_free
-def _begin_coupling(user, first, count, act, length, velocity, dt, gamma_h, scratch):
+def _prepare_coupling(user, first, count, act, length, velocity, dt, gamma_h, scratch):
     """Prepare the Sherman-Morrison solution of the stage equations that the supply couples.
 
     The stage equations are `(I - gamma h (D + b w^T)) k = r` with D diagonal, b the rates per
@@ -437,32 +436,32 @@ def _begin_coupling(user, first, count, act, length, velocity, dt, gamma_h, scra
     """
     divisor = 1.0
     for i in range(count):
-        f = _FACTORS + 4 * i
+        f = _FACTOR_OFFSET + 4 * i
         if scratch[f + 2] == 0.0:
             continue
         head, rod = _chamber_stiffness(
-            user, (first + i) * SLOTS, length[first + i] - dt * velocity[first + i],
+            user, (first + i) * SLOT_COUNT, length[first + i] - dt * velocity[first + i],
             act[4 * i + 2], act[4 * i + 3],
         )  # fmt: skip
         own = gamma_h * scratch[f + 2]
         own *= head * scratch[f] if scratch[4 * i + 3] > 0.0 else rod * scratch[f + 1]
-        k = _FIRST + 2 * i
+        k = _STAGE_OFFSET + 2 * i
         scratch[f + 3] *= scratch[k] if scratch[4 * i + 3] > 0.0 else scratch[k + 1]
         divisor -= scratch[f + 3] * own
         scratch[f + 2] = own if scratch[4 * i + 3] > 0.0 else -own
-    for f in range(_FACTORS, _FACTORS + 4 * count, 4):
+    for f in range(_FACTOR_OFFSET, _FACTOR_OFFSET + 4 * count, 4):
         scratch[f + 2] /= divisor
 
 
 @inlined
-def _couple(count, rate, scratch):
+def _apply_coupling(count, rate, scratch):
     """Add the coupling through the supply to the stage rates of uncoupled chambers."""
     pull = 0.0
     for a in range(0, 4 * count, 4):
-        f = _FACTORS + a
+        f = _FACTOR_OFFSET + a
         pull += scratch[f + 3] * rate[a + 2 if scratch[f + 2] > 0.0 else a + 3]
     for a in range(0, 4 * count, 4):
-        f = _FACTORS + a
+        f = _FACTOR_OFFSET + a
         if scratch[f + 2] > 0.0:
             rate[a + 2] += scratch[f + 2] * pull
         else:
@@ -470,7 +469,7 @@ def _couple(count, rate, scratch):
 
 
 @allocation_free
-def axis_state(user, i, supply, act, x, v, share=0.0):
+def axis_flows_and_force(user, i, supply, act, x, v, bristle_fraction=0.0):
     """Return the flows and the force of one axis in a state, for logs and balances.
 
     Args:
@@ -480,37 +479,37 @@ def axis_state(user, i, supply, act, x, v, share=0.0):
         act: (4,) spool [1], spool rate [1/s], p_head, p_rod [Pa].
         x: piston displacement, scalar [m].
         v: piston velocity, scalar [m/s] or [rad/s].
-        share: fraction of the breakaway force that the bristles carry, scalar [1].
+        bristle_fraction: fraction of the breakaway force that the bristles carry, scalar [1].
 
     Returns:
         (q_head, q_rod [m^3/s], force or torque after friction [N] or [N m]).
 
     Source: nominal model, "Orifice" and "Piston force".
     """
-    u = i * SLOTS
+    u = i * SLOT_COUNT
     if user[u + _KIND] == _PUMPED:
-        taken = pumped_volumes(user, u, x)[2]
-        q_head, q_rod, _, _ = pump_flows(user, u + PUMP, act[0], act[2], act[3], taken)
-        return q_head, q_rod, pumped_force(user, u, act[1], act[2], act[3], v, 0.0, 0.0)
+        taken = pump_drive_volumes(user, u, x)[2]
+        q_head, q_rod, _, _ = pump_flows(user, u + PUMP_OFFSET, act[0], act[2], act[3], taken)
+        return q_head, q_rod, pump_drive_force(user, u, act[1], act[2], act[3], v, 0.0, 0.0)
     opening = axis_opening(user, u, act[0])
     q_head, q_rod, _, _ = chamber_flows(user, u, opening, supply, act[2], act[3])
     force = user[u + _AH] * act[2] - user[u + _AR] * act[3]
     if user[u + _BRISTLE_STIFFNESS] > 0.0:
-        return q_head, q_rod, force - bristle_friction(user, u, share, v, 0.0, 0.0)[0]
+        return q_head, q_rod, force - bristle_friction(user, u, bristle_fraction, v, 0.0, 0.0)[0]
     return q_head, q_rod, force - actuator_friction(user, u, v)
 
 
 def circuit_scratch() -> np.ndarray:
     """Return a work space for `step_circuit`, shape (SCRATCH,)."""
-    return np.zeros(SCRATCH)
+    return np.zeros(SCRATCH_SIZE)
 
 
-_STEPS = 60  # bisection alone converges to rounding errors in 60 steps
-_ROUNDING = 1.0e-13
+_MAX_ITERATIONS = 60  # bisection alone converges to rounding errors in 60 steps
+_RELATIVE_TOLERANCE = 1.0e-13
 
 
 @allocation_free
-def settled_friction(user, u, velocity, push, inertia, dt):
+def implicit_friction(user, u, velocity, other_force, inertia, dt):
     """Return the friction at the end of an implicit step of a free body.
 
     Solves `v' = v + dt / J (F - F_f(v'))` by Newton's method inside a bracket.
@@ -519,7 +518,7 @@ def settled_friction(user, u, velocity, push, inertia, dt):
         user: (nu * SLOTS,) actuator parameters.
         u: index of the first parameter of this actuator in `user`.
         velocity: v at the start of the step, scalar [m/s] or [rad/s].
-        push: F, all other force, scalar [N] or [N m].
+        other_force: F, all other force, scalar [N] or [N m].
         inertia: J of the body, scalar [kg] or [kg m^2], > 0.
         dt: time step, scalar [s], > 0.
 
@@ -529,21 +528,21 @@ def settled_friction(user, u, velocity, push, inertia, dt):
     Source: implicit Euler rule.
     """
     per_force = dt / inertia
-    free = velocity + per_force * push  # velocity without friction
+    free = velocity + per_force * other_force  # velocity without friction
     low, high = min(0.0, free), max(0.0, free)
     v = free
-    for _ in range(_STEPS):
+    for _ in range(_MAX_ITERATIONS):
         resisting = actuator_friction(user, u, v)
         excess = v - free + per_force * resisting
         if excess > 0.0:
             high = v
         else:
             low = v
-        if high - low <= _ROUNDING * abs(free):
+        if high - low <= _RELATIVE_TOLERANCE * abs(free):
             break
         slope = 1.0 + per_force * actuator_friction_slope(user, u, v)
         guess = v - excess / slope if slope > 0.0 else high
-        if slope > 0.0 and abs(guess - v) <= _ROUNDING * abs(free):
+        if slope > 0.0 and abs(guess - v) <= _RELATIVE_TOLERANCE * abs(free):
             break
         v = guess if low < guess < high else 0.5 * (low + high)
     return actuator_friction(user, u, v)
@@ -573,18 +572,16 @@ def drive_state(user, i, count, act, supply, time, x, v, command, gain):
 
     Source: docs/effects.md, "The law".
     """
-    u, a = i * SLOTS, 4 * i
+    u, a = i * SLOT_COUNT, 4 * i
     if i >= count:
         force = gain * command - user[u + _OFFSET]
         return DriveState(time, x, v, 0.0, 0.0, 0.0, 0.0, supply, command, force, 0.0, 0.0)
     force = user[u + _AH] * act[a + 2] - user[u + _AR] * act[a + 3]
-    return DriveState(
-        time, x, v, act[a], act[a + 1], act[a + 2], act[a + 3], supply, command, force, 0.0, 0.0
-    )
+    return DriveState(time, x, v, act[a], act[a + 1], act[a + 2], act[a + 3], supply, command, force, 0.0, 0.0)
 
 
 @allocation_free
-def add_to_commands(user, terms, drives, dt, time, scratch, out):
+def add_command_terms(user, terms, drives, dt, time, scratch, out):
     """Add the command terms to the commands of the valves, evaluated at the middle of a step.
 
     Positions and time are those at the middle of the step. Spools and pressures are those at its
@@ -606,14 +603,14 @@ def add_to_commands(user, terms, drives, dt, time, scratch, out):
     Source: docs/effects.md, "The term": the balance `command`.
     """
     count, act, length, velocity, command = drives
-    if not acts_on(terms, COMMAND, ANY):
+    if not has_term(terms, COMMAND, ANY_DRIVE):
         for i in range(count):
             out[i] = command[i]
         return
-    open_ports(user, act, act, scratch, 0, count, 0.0, act)
-    supply = circuit_supply(user, 0, count, scratch, delivered_share(user, 0, act))
+    compute_ports(user, act, act, scratch, 0, count, 0.0, act)
+    supply = circuit_supply_pressure(user, 0, count, scratch, delivered_flow_fraction(user, 0, act))
     middle = time + 0.5 * dt
     for i in range(count):
         x = length[i] - 0.5 * dt * velocity[i]
         s = drive_state(user, i, count, act, supply, middle, x, velocity[i], command[i], 0.0)
-        out[i] = command[i] + added(terms, COMMAND, i, s, drives)
+        out[i] = command[i] + sum_terms(terms, COMMAND, i, s, drives)

@@ -14,11 +14,11 @@ counterbalance valve can hold the oil of either side.
 import math
 
 from hydrotele.core.compiled import allocation_free, inlined
-from hydrotele.hydraulics.parameters import CURVE, CURVE_KNOTS, Slot
+from hydrotele.hydraulics.parameters import CURVE_KNOTS, CURVE_SIZE, Slot
 
 ATMOSPHERE = 101325.0  # Pa
-_POLYTROPIC = 1.4  # polytropic exponent of bubbles: adiabatic compression
-_VACUUM = 0.01  # Pa absolute, lower bound of a pressure
+_POLYTROPIC_EXPONENT = 1.4  # polytropic exponent of bubbles: adiabatic compression
+_MIN_ABSOLUTE_PRESSURE = 0.01  # Pa absolute, lower bound of a pressure
 
 
 @inlined
@@ -46,7 +46,7 @@ def valve_opening(spool, deadband):
 
 
 @inlined
-def orifice(pressure_drop, flow_gain, smoothing):
+def orifice_flow(pressure_drop, flow_gain, smoothing):
     """Return the turbulent orifice flow, smooth at zero pressure drop, and its slope.
 
     `q = k dp / (dp^2 + d^2)^(1/4)`, which is `k sgn(dp) sqrt(|dp|)` away from zero.
@@ -61,10 +61,10 @@ def orifice(pressure_drop, flow_gain, smoothing):
 
     Source: nominal model, "Orifice".
 
-    >>> flow, slope = orifice(7.0e6, 6.0e-3 / 7.0e6**0.5, 5.0e4)
+    >>> flow, slope = orifice_flow(7.0e6, 6.0e-3 / 7.0e6**0.5, 5.0e4)
     >>> round(flow, 7)
     0.0059999
-    >>> orifice(0.0, 1.0, 4.0)
+    >>> orifice_flow(0.0, 1.0, 4.0)
     (0.0, 0.5)
     """
     square = pressure_drop * pressure_drop
@@ -156,7 +156,7 @@ def air_compliance(pressure, fraction):
     (2.8, 0.05)
     """
     absolute = max(pressure + ATMOSPHERE, 0.1 * ATMOSPHERE)
-    return fraction * (ATMOSPHERE / absolute) ** (1.0 / _POLYTROPIC) / (_POLYTROPIC * absolute)
+    return fraction * (ATMOSPHERE / absolute) ** (1.0 / _POLYTROPIC_EXPONENT) / (_POLYTROPIC_EXPONENT * absolute)
 
 
 @allocation_free
@@ -179,12 +179,12 @@ def pressure_without_air(pressure, release, onset=0.0):
     lack = pressure + onset
     if lack >= 0.0 or release == 0.0:
         return pressure
-    lack = max(lack, _VACUUM - ATMOSPHERE)
+    lack = max(lack, _MIN_ABSOLUTE_PRESSURE - ATMOSPHERE)
     return lack * (1.0 + release / (lack + ATMOSPHERE)) - onset
 
 
 @inlined
-def softening(pressure, release, onset=0.0):
+def air_softening_factor(pressure, release, onset=0.0):
     """Return the derivative of the pressure with released air by the pressure without it.
 
     Args:
@@ -197,19 +197,19 @@ def softening(pressure, release, onset=0.0):
 
     Source: derivative of `pressure_with_air`.
 
-    >>> softening(1.0e5, 1.35e8)
+    >>> air_softening_factor(1.0e5, 1.35e8)
     1.0
-    >>> round(1.0 / softening(-50662.5, 1.35e8))
+    >>> round(1.0 / air_softening_factor(-50662.5, 1.35e8))
     5330
     """
     if pressure + onset >= 0.0 or release == 0.0:
         return 1.0
-    absolute = max(pressure + onset + ATMOSPHERE, _VACUUM)
+    absolute = max(pressure + onset + ATMOSPHERE, _MIN_ABSOLUTE_PRESSURE)
     return 1.0 / (1.0 + release * ATMOSPHERE / (absolute * absolute))
 
 
 @allocation_free
-def holding_share(pressure, pilot, setting, pilot_ratio, override):
+def counterbalance_opening(pressure, pilot, setting, pilot_ratio, override):
     """Return the relative opening of a counterbalance valve, and its slope.
 
     `(p + R p_pilot - p_set) / p_o`, limited to 0 .. 1. Flow into the chamber passes the valve's
@@ -229,7 +229,7 @@ def holding_share(pressure, pilot, setting, pilot_ratio, override):
     Source: static characteristic of a pilot-assisted relief valve, as in manufacturers' data
         sheets.
 
-    >>> holding_share(10.0e6, 5.0e6, 24.0e6, 3.0, 4.0e6)
+    >>> counterbalance_opening(10.0e6, 5.0e6, 24.0e6, 3.0, 4.0e6)
     (0.25, 2.5e-07)
     """
     share = (pressure + pilot_ratio * pilot - setting) / override
@@ -273,7 +273,7 @@ def stop_force(position, velocity, low, high, stiffness, damping):
 
 
 @inlined
-def friction(
+def friction_force(
     velocity, coulomb, stribeck, stribeck_velocity, viscous, coulomb_velocity,
     coulomb_asymmetry=0.0, viscous_asymmetry=0.0,
 ):  # fmt: skip
@@ -297,7 +297,7 @@ def friction(
 
     Source: nominal model, "Piston force" and "Swing motor".
 
-    >>> round(friction(1.0, 3000.0, 1500.0, 0.02, 6000.0, 0.005), 6)
+    >>> round(friction_force(1.0, 3000.0, 1500.0, 0.02, 6000.0, 0.005), 6)
     9000.0
     """
     dry = coulomb
@@ -313,7 +313,7 @@ def friction_slope(
     velocity, coulomb, stribeck, stribeck_velocity, viscous, coulomb_velocity,
     coulomb_asymmetry=0.0, viscous_asymmetry=0.0,
 ):  # fmt: skip
-    """Return the derivative of `friction` with respect to the velocity.
+    """Return the derivative of `friction_force` with respect to the velocity.
 
     Args:
         velocity: v, scalar [m/s] or [rad/s].
@@ -419,7 +419,7 @@ def axis_opening(user, u, spool):
     """
     deadband, c = user[u + _DB], u + _CURVES
     if spool < 0.0:
-        deadband, c = user[u + _DBN], c + CURVE
+        deadband, c = user[u + _DBN], c + CURVE_SIZE
     opening = valve_opening(spool, deadband)
     knots = int(user[c])
     if knots == 0 or opening == 0.0:
@@ -470,15 +470,15 @@ def inlet_flow(drop, gain, smoothing, compensated):
     True
     """
     if compensated > 0.0 and drop > compensated:
-        return orifice(compensated, gain, smoothing)[0], 0.0
-    return orifice(drop, gain, smoothing)
+        return orifice_flow(compensated, gain, smoothing)[0], 0.0
+    return orifice_flow(drop, gain, smoothing)
 
 
 @inlined
 def _outlet_flow(user, u, holding, gain, pressure, pilot):
     """Return the flow out of a chamber through the open edge to tank, and its slope."""
-    flow, slope = orifice(pressure - user[u + _TANK], gain, user[u + _D])
-    return _held_flow(user, u, holding, flow, slope, pressure, pilot)
+    flow, slope = orifice_flow(pressure - user[u + _TANK], gain, user[u + _D])
+    return _counterbalanced_flow(user, u, holding, flow, slope, pressure, pilot)
 
 
 @inlined
@@ -486,15 +486,15 @@ def _tank_leakage(user, u, holding, pressure, pilot):
     """Return the flow out of a chamber through the spool's clearance to tank, and its slope."""
     leak = user[u + _TANK_LEAK]
     flow = leak * (pressure - user[u + _TANK])
-    return _held_flow(user, u, holding, flow, leak, pressure, pilot)
+    return _counterbalanced_flow(user, u, holding, flow, leak, pressure, pilot)
 
 
 @inlined
-def _held_flow(user, u, holding, flow, slope, pressure, pilot):
+def _counterbalanced_flow(user, u, holding, flow, slope, pressure, pilot):
     """Return a flow to tank after the chamber's counterbalance valve, and its slope."""
     if user[u + holding] == 0.0 or flow <= 0.0:
         return flow, slope
-    share, steep = holding_share(
+    share, steep = counterbalance_opening(
         pressure, pilot, user[u + holding], user[u + holding + 1], user[u + holding + 2]
     )
     return share * flow, share * slope + steep * flow

@@ -11,7 +11,7 @@ import numpy as np
 from hydrotele.kinematics.from_machine import drive_travel
 from hydrotele.machine.drives import Axis, Counterbalance, FlowCurve, LoadCylinder, Pump, Valve
 from hydrotele.machine.machine import Machine, Supply
-from hydrotele.terms.table import remembering, terms_table
+from hydrotele.terms.table import terms_table, terms_with_hysteresis
 
 CURVE_KNOTS = 8  # largest number of knots of a valve's flow curve in one direction
 
@@ -93,11 +93,11 @@ class Slot(enum.IntEnum):
     PUMP_TIME_CONSTANT = enum.auto()
     DELIVERY = enum.auto()
     ADDED_DELIVERY = enum.auto()
-    MEMORY = enum.auto()
+    EXTRA_STATES = enum.auto()
     CURVES = enum.auto()
 
 
-CURVE = 1 + 2 * CURVE_KNOTS  # number of parameters of one flow curve
+CURVE_SIZE = 1 + 2 * CURVE_KNOTS  # number of parameters of one flow curve
 
 
 class PumpSlot(enum.IntEnum):
@@ -135,11 +135,11 @@ class PumpSlot(enum.IntEnum):
     LOAD_RETURN = 29
 
 
-PUMP = Slot.CURVES + 2 * CURVE  # index of the pump drive's block
-SLOTS = PUMP + len(PumpSlot)
+PUMP_OFFSET = Slot.CURVES + 2 * CURVE_SIZE  # index of the pump drive's block
+SLOT_COUNT = PUMP_OFFSET + len(PumpSlot)
 
 
-class Kind(enum.IntEnum):
+class ActuatorKind(enum.IntEnum):
     """Kinds of actuators: cylinder, rotary motor, force drive with friction, or pump drive.
 
     PUMPED is a cylinder with its own pump instead of a valve.
@@ -148,17 +148,17 @@ class Kind(enum.IntEnum):
     CYLINDER = 1
     MOTOR = 2
     FORCE = 3
-    PUMPED = 4
+    PUMP_DRIVE = 4
 
 
-DELIVERY = "delivery.supply"
-ADDED_DELIVERY = "added_delivery.supply"
-MARKER = 215325.0  # arbitrary value of actuator_user[0] that marks hydrotele's actuators
+DELIVERY_STATE = "delivery.supply"
+ADDED_DELIVERY_STATE = "added_delivery.supply"
+ACTUATOR_MARKER = 215325.0  # arbitrary value of actuator_user[0] that marks hydrotele's actuators
 
 
 def actuator_order(machine: Machine) -> list[str]:
     """Return the axis names in actuator order: hydraulic axes first, as they share the supply."""
-    return [*machine.hydraulic_axes, *(n for n, a in machine.axes.items() if not a.hydraulic)]
+    return [*machine.hydraulic_axes, *(n for n, a in machine.axes.items() if not a.is_hydraulic)]
 
 
 def extra_state_names(machine: Machine) -> list[str]:
@@ -170,15 +170,15 @@ def extra_state_names(machine: Machine) -> list[str]:
     drives. Most machines have none.
     """
     supply, rubbing = machine.supply, [
-        n for n in actuator_order(machine) if machine.axes[n].drive.friction.presliding
+        n for n in actuator_order(machine) if machine.axes[n].drive.friction.has_presliding
     ]  # fmt: skip
-    names = [f"bristle.{n}" for n in rubbing if machine.axes[n].hydraulic]
+    names = [f"bristle.{n}" for n in rubbing if machine.axes[n].is_hydraulic]
     if supply and supply.time_constant and machine.valve_axes:
-        names.append(DELIVERY)
+        names.append(DELIVERY_STATE)
     if any(term.balance == "flow_supply" for term in machine.terms):
-        names.append(ADDED_DELIVERY)
-    names += [f"memory.term_{k + 1}" for k in range(len(remembering(machine.terms)))]
-    return names + [f"bristle.{n}" for n in rubbing if not machine.axes[n].hydraulic]
+        names.append(ADDED_DELIVERY_STATE)
+    names += [f"memory.term_{k + 1}" for k in range(len(terms_with_hysteresis(machine.terms)))]
+    return names + [f"bristle.{n}" for n in rubbing if not machine.axes[n].is_hydraulic]
 
 
 def actuator_parameters(machine: Machine) -> dict[str, np.ndarray]:
@@ -192,40 +192,40 @@ def actuator_parameters(machine: Machine) -> dict[str, np.ndarray]:
     """
     count = len(machine.hydraulic_axes)
     memory = {name: 4 * count + k for k, name in enumerate(extra_state_names(machine))}
-    rubbing = [f"bristle.{n}" for n, axis in machine.axes.items() if not axis.hydraulic]
+    rubbing = [f"bristle.{n}" for n, axis in machine.axes.items() if not axis.is_hydraulic]
     shared = sum(name not in rubbing for name in memory)
     table = {}
     for name in actuator_order(machine):
-        numbers = np.zeros(SLOTS)
+        numbers = np.zeros(SLOT_COUNT)
         axis = machine.axes[name]
-        numbers[Slot.MARKER] = MARKER
-        numbers[Slot.COUNT] = count if axis.hydraulic else 0
-        numbers[Slot.MEMORY] = shared if axis.hydraulic else 0
+        numbers[Slot.MARKER] = ACTUATOR_MARKER
+        numbers[Slot.COUNT] = count if axis.is_hydraulic else 0
+        numbers[Slot.EXTRA_STATES] = shared if axis.is_hydraulic else 0
         if f"bristle.{name}" in memory:
             numbers[Slot.BRISTLE_STIFFNESS] = axis.drive.friction.presliding_stiffness
             numbers[Slot.BRISTLE_DAMPING] = axis.drive.friction.presliding_damping
             numbers[Slot.BRISTLE] = memory[f"bristle.{name}"]
-        if DELIVERY in memory and axis.valve and machine.supply:
+        if DELIVERY_STATE in memory and axis.valve and machine.supply:
             numbers[Slot.PUMP_TIME_CONSTANT] = machine.supply.time_constant
-            numbers[Slot.DELIVERY] = memory[DELIVERY]
-        if ADDED_DELIVERY in memory and axis.valve:
-            numbers[Slot.ADDED_DELIVERY] = memory[ADDED_DELIVERY]
+            numbers[Slot.DELIVERY] = memory[DELIVERY_STATE]
+        if ADDED_DELIVERY_STATE in memory and axis.valve:
+            numbers[Slot.ADDED_DELIVERY] = memory[ADDED_DELIVERY_STATE]
         _write_friction(numbers, axis)
         _write_end_stop(numbers, machine, name)
         if axis.transmission:
             numbers[Slot.DRIVE_INERTIA] = axis.transmission.inertia
         if axis.pump:
-            _write_pumped(numbers, machine, name)
-        elif axis.hydraulic and machine.supply:
+            _write_pump_drive(numbers, machine, name)
+        elif axis.is_hydraulic and machine.supply:
             _write_hydraulics(numbers, axis, machine.supply)
         else:
-            numbers[Slot.KIND] = Kind.FORCE
+            numbers[Slot.KIND] = ActuatorKind.FORCE
             numbers[Slot.OFFSET] = axis.force.offset if axis.force else 0.0
         table[name] = numbers
     return table
 
 
-def terms_of(machine: Machine) -> np.ndarray:
+def machine_terms_table(machine: Machine) -> np.ndarray:
     """Return the machine's terms as an array for compiled code, see `terms.table.terms_table`."""
     names, first = extra_state_names(machine), 4 * len(machine.hydraulic_axes)
     own = [k for k, name in enumerate(names) if name.startswith("memory.")]
@@ -234,7 +234,7 @@ def terms_of(machine: Machine) -> np.ndarray:
     return terms_table(machine.terms, actuator_order(machine), at, areas)
 
 
-def longest_step(machine: Machine, name: str) -> float:
+def max_time_step(machine: Machine, name: str) -> float:
     """Return the longest time step that resolves the piston motion of an axis with its own pump.
 
     `k h^2 <= m + b h`: at most one radian of the piston's oscillation on its oil per step, or the
@@ -252,11 +252,11 @@ def longest_step(machine: Machine, name: str) -> float:
     Source: stability limit of Verlet's method, h < 2 / omega, halved.
 
     >>> from hydrotele.machine.machine_file import load_machine
-    >>> longest_step(load_machine("eha", "load_30_bar"), "piston")
+    >>> max_time_step(load_machine("eha", "load_30_bar"), "piston")
     0.002
     """
     numbers = actuator_parameters(machine)[name]
-    block, stroke = numbers[PUMP:], numbers[Slot.STROKE]
+    block, stroke = numbers[PUMP_OFFSET:], numbers[Slot.STROKE]
     stiffness = np.zeros(2)  # at both ends of the stroke
     for area, volume, soft, travel in (
         (Slot.AREA_HEAD, Slot.VOLUME_HEAD, PumpSlot.COMPLIANCE_HEAD, np.array([0.0, stroke])),
@@ -294,15 +294,15 @@ def _write_hydraulics(numbers: np.ndarray, axis: Axis, supply: Supply) -> None:
     valve = axis.valve
     assert valve is not None
     drive = axis.hydraulic_drive
-    numbers[Slot.KIND] = Kind.CYLINDER if axis.cylinder else Kind.MOTOR
+    numbers[Slot.KIND] = ActuatorKind.CYLINDER if axis.cylinder else ActuatorKind.MOTOR
     numbers[Slot.STROKE] = axis.cylinder.stroke if axis.cylinder else 0.0
     numbers[Slot.AREA_HEAD], numbers[Slot.AREA_ROD] = drive.areas
     numbers[Slot.VOLUME_HEAD] = numbers[Slot.VOLUME_ROD] = drive.dead_volume
     numbers[Slot.LEAKAGE] = drive.leakage
     numbers[Slot.HOSE_COMPLIANCE] = drive.hose_compliance
     _write_valve(numbers, valve)
-    _write_holding(numbers, Slot.HOLDING_HEAD, axis.load_holding.head)
-    _write_holding(numbers, Slot.HOLDING_ROD, axis.load_holding.rod)
+    _write_counterbalance(numbers, Slot.HOLDING_HEAD, axis.load_holding.head)
+    _write_counterbalance(numbers, Slot.HOLDING_ROD, axis.load_holding.rod)
     numbers[Slot.BULK_MODULUS] = supply.bulk_modulus
     numbers[Slot.AIR_RELEASE] = supply.dissolved_air * supply.bulk_modulus
     numbers[Slot.ENTRAINED_AIR] = supply.entrained_air
@@ -315,21 +315,21 @@ def _write_hydraulics(numbers: np.ndarray, axis: Axis, supply: Supply) -> None:
         numbers[Slot.LOAD_SENSING_MARGIN] = supply.load_sensing_margin
 
 
-def _write_pumped(numbers: np.ndarray, machine: Machine, name: str) -> None:
+def _write_pump_drive(numbers: np.ndarray, machine: Machine, name: str) -> None:
     """Write the parameters of an axis with its own pump."""
     axis = machine.axes[name]
     cylinder, pump = axis.cylinder, axis.pump
     assert cylinder and pump
-    numbers[Slot.KIND] = Kind.PUMPED
+    numbers[Slot.KIND] = ActuatorKind.PUMP_DRIVE
     numbers[Slot.STROKE] = cylinder.stroke
     numbers[Slot.AREA_HEAD], numbers[Slot.AREA_ROD] = cylinder.areas
     numbers[Slot.VOLUME_HEAD] = numbers[Slot.VOLUME_ROD] = cylinder.dead_volume
     numbers[Slot.LEAKAGE] = cylinder.leakage
     numbers[Slot.ORIFICE_SMOOTHING] = Valve.model_fields["smoothing"].default
     moved = machine.links[machine.link_of(axis.joint)].mass + cylinder.rod.mass
-    _write_pump(numbers[PUMP:], pump, moved)
+    _write_pump(numbers[PUMP_OFFSET:], pump, moved)
     if name in machine.loads:
-        _write_load(numbers[PUMP:], machine.loads[name])
+        _write_load_cylinder(numbers[PUMP_OFFSET:], machine.loads[name])
 
 
 def _write_pump(block: np.ndarray, pump: Pump, moved: float) -> None:
@@ -352,7 +352,7 @@ def _write_pump(block: np.ndarray, pump: Pump, moved: float) -> None:
     block[PumpSlot.VISCOUS_DRAG] = motor.viscous
 
 
-def _write_load(block: np.ndarray, load: LoadCylinder) -> None:
+def _write_load_cylinder(block: np.ndarray, load: LoadCylinder) -> None:
     block[PumpSlot.LOAD_AREA], block[PumpSlot.LOAD_RELIEF] = load.area, load.relief_pressure
     block[PumpSlot.LOAD_OVERRIDE], block[PumpSlot.LOAD_STIFFNESS] = load.override, load.stiffness
     block[PumpSlot.LOAD_VOID], block[PumpSlot.LOAD_VOID_PRESSURE] = load.void, load.void_pressure
@@ -370,14 +370,14 @@ def _write_valve(numbers: np.ndarray, valve: Valve) -> None:
     numbers[Slot.METERING_PB], numbers[Slot.METERING_AT] = (
         valve.negative.inlet, valve.negative.outlet
     )  # fmt: skip
-    numbers[Slot.COMPENSATED_DROP] = valve.held_drop
+    numbers[Slot.COMPENSATED_DROP] = valve.compensator_drop
     numbers[Slot.TANK_LEAKAGE] = valve.tank_leakage
     numbers[Slot.ORIFICE_SMOOTHING] = valve.smoothing
     numbers[Slot.PORT_RELIEF] = valve.port_relief
     numbers[Slot.RELIEF_GAIN] = valve.port_relief_gain
     numbers[Slot.MAKEUP_GAIN] = valve.makeup_gain
     _write_curve(numbers, int(Slot.CURVES), valve.positive.curve)
-    _write_curve(numbers, Slot.CURVES + CURVE, valve.negative.curve)
+    _write_curve(numbers, Slot.CURVES + CURVE_SIZE, valve.negative.curve)
 
 
 def _write_curve(numbers: np.ndarray, first: int, curve: FlowCurve | None) -> None:
@@ -389,7 +389,7 @@ def _write_curve(numbers: np.ndarray, first: int, curve: FlowCurve | None) -> No
     numbers[first + 1 + CURVE_KNOTS : first + 1 + CURVE_KNOTS + count] = curve.opening
 
 
-def _write_holding(numbers: np.ndarray, first: int, valve: Counterbalance | None) -> None:
+def _write_counterbalance(numbers: np.ndarray, first: int, valve: Counterbalance | None) -> None:
     """Write setting, pilot ratio and override pressure to consecutive slots."""
     if valve:
         override = valve.override * valve.setting

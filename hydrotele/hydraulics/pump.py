@@ -8,7 +8,7 @@ on the same joint can push against the drive: its oil leaves through a relief va
 return direction the chamber refills without pressure.
 
 The first of the actuator's four activations is the pump speed [rad/s], signed by the selected side;
-it is exactly 0 if the valve is closed (a stalled pump has the speed `STALLED`). The second is the
+it is exactly 0 if the valve is closed (a stalled pump has the speed `STALLED_SPEED`). The second is the
 pressure in the load cylinder [Pa]. `PumpSlot` defines the order of the parameters. All pressures
 are relative to the atmosphere.
 """
@@ -19,8 +19,8 @@ from hydrotele.core.compiled import allocation_free
 from hydrotele.hydraulics.laws import ATMOSPHERE
 from hydrotele.hydraulics.parameters import PumpSlot
 
-STALLED = 1.0e-9  # rad/s, speed of a pump at rest while its valve is open
-_THINNEST = 0.1 * ATMOSPHERE  # Pa absolute, lower bound of the pressure for the air's compliance
+STALLED_SPEED = 1.0e-9  # rad/s, speed of a pump at rest while its valve is open
+_MIN_AIR_PRESSURE = 0.1 * ATMOSPHERE  # Pa absolute, lower bound of the pressure for the air's compliance
 
 _D, _LEAK, _RATED = PumpSlot.DISPLACEMENT.value, PumpSlot.LEAKAGE.value, PumpSlot.RATED_SPEED.value
 _BETA, _GAS = PumpSlot.BULK_MODULUS.value, PumpSlot.GAS_VOLUME.value
@@ -30,13 +30,13 @@ _ACCUMULATOR = PumpSlot.ACCUMULATOR_PRESSURE.value
 _LINE_OUT, _LINE_IN = PumpSlot.LINE_EXTENDING.value, PumpSlot.LINE_RETRACTING.value
 _VOLTAGE, _OHM, _EMF = PumpSlot.VOLTAGE.value, PumpSlot.RESISTANCE.value, PumpSlot.EMF.value
 _INERTIA, _DRAG = PumpSlot.INERTIA.value, PumpSlot.DRAG.value
-_BREAK, _BREAK_SPEED = PumpSlot.BREAKAWAY.value, PumpSlot.BREAKAWAY_SPEED.value
+_BREAKAWAY, _BREAKAWAY_SPEED = PumpSlot.BREAKAWAY.value, PumpSlot.BREAKAWAY_SPEED.value
 _VISCOUS, _LOSS = PumpSlot.VISCOUS_DRAG.value, PumpSlot.TORQUE_LOSS.value
 _MASS, _AREA = PumpSlot.MOVING_MASS.value, PumpSlot.LOAD_AREA.value
-_TOP, _OVERRIDE = PumpSlot.LOAD_RELIEF.value, PumpSlot.LOAD_OVERRIDE.value
-_STIFF, _VOID = PumpSlot.LOAD_STIFFNESS.value, PumpSlot.LOAD_VOID.value
-_VOID_P = PumpSlot.LOAD_VOID_PRESSURE.value
-_RUB, _RETURN = PumpSlot.LOAD_FRICTION.value, PumpSlot.LOAD_RETURN.value
+_LOAD_RELIEF, _OVERRIDE = PumpSlot.LOAD_RELIEF.value, PumpSlot.LOAD_OVERRIDE.value
+_LOAD_STIFFNESS, _VOID = PumpSlot.LOAD_STIFFNESS.value, PumpSlot.LOAD_VOID.value
+_VOID_PRESSURE = PumpSlot.LOAD_VOID_PRESSURE.value
+_LOAD_FRICTION, _LOAD_RETURN = PumpSlot.LOAD_FRICTION.value, PumpSlot.LOAD_RETURN.value
 
 
 @allocation_free
@@ -72,20 +72,20 @@ def pump_speed_step(user, p, speed, command, p_head, p_rod, dt):
         return 0.0
     side = math.copysign(1.0, command)
     if user[p + _INERTIA] == 0.0:
-        return side * max(abs(command) * user[p + _RATED], STALLED)
+        return side * max(abs(command) * user[p + _RATED], STALLED_SPEED)
     w = abs(speed)
     brake = user[p + _EMF] * user[p + _EMF] / user[p + _OHM] + user[p + _VISCOUS]
-    ratio = w / user[p + _BREAK_SPEED]
+    ratio = w / user[p + _BREAKAWAY_SPEED]
     oil = user[p + _D] * side * (p_head - p_rod)
     torque = user[p + _EMF] * abs(command) * user[p + _VOLTAGE] / user[p + _OHM]
     torque -= oil + user[p + _LOSS] * abs(oil)
-    torque -= user[p + _DRAG] + user[p + _BREAK] * math.exp(-ratio * ratio)
+    torque -= user[p + _DRAG] + user[p + _BREAKAWAY] * math.exp(-ratio * ratio)
     gain = dt / user[p + _INERTIA]
-    return side * max((w + gain * torque) / (1.0 + gain * brake), STALLED)
+    return side * max((w + gain * torque) / (1.0 + gain * brake), STALLED_SPEED)
 
 
 @allocation_free
-def switched_speed(speed, after):
+def speed_after_switching(speed, end_speed):
     """Return the pump speed at the start of a step, signed by the valve's side during the step.
 
     The valve switches at the start of the step while the pump keeps turning: only the sign changes.
@@ -93,23 +93,23 @@ def switched_speed(speed, after):
 
     Args:
         speed: speed at the start, signed by the side before switching, scalar [rad/s].
-        after: speed at the end, as returned by `pump_speed_step`, scalar [rad/s].
+        end_speed: speed at the end, as returned by `pump_speed_step`, scalar [rad/s].
 
     Returns:
         Signed speed, scalar [rad/s].
 
     Source: ideal switching valve without spool dynamics.
 
-    >>> switched_speed(40.0, -39.0), switched_speed(40.0, 0.0)
+    >>> speed_after_switching(40.0, -39.0), speed_after_switching(40.0, 0.0)
     (-40.0, 0.0)
     """
-    if after == 0.0:
+    if end_speed == 0.0:
         return 0.0
-    return math.copysign(max(abs(speed), STALLED), after)
+    return math.copysign(max(abs(speed), STALLED_SPEED), end_speed)
 
 
 @allocation_free
-def accumulator_pressure(pressure, gas_volume, taken):
+def accumulator_pressure(pressure, gas_volume, removed_volume):
     """Return the accumulator pressure after oil has left it, with isothermal gas.
 
     `p = (p_0 + p_atm) V_0 / (V_0 + dV) - p_atm`.
@@ -117,7 +117,7 @@ def accumulator_pressure(pressure, gas_volume, taken):
     Args:
         pressure: p_0, pressure before any oil has left, scalar [Pa].
         gas_volume: V_0, gas volume at p_0, scalar [m^3].
-        taken: dV, oil volume that has left, scalar [m^3].
+        removed_volume: dV, oil volume that has left, scalar [m^3].
 
     Returns:
         p, scalar [Pa].
@@ -127,11 +127,11 @@ def accumulator_pressure(pressure, gas_volume, taken):
     >>> round(accumulator_pressure(5.0e5, 1.4e-4, 1.4e-5))
     445334
     """
-    return (pressure + ATMOSPHERE) * gas_volume / (gas_volume + taken) - ATMOSPHERE
+    return (pressure + ATMOSPHERE) * gas_volume / (gas_volume + removed_volume) - ATMOSPHERE
 
 
 @allocation_free
-def pump_flows(user, p, speed, p_head, p_rod, taken):
+def pump_flows(user, p, speed, p_head, p_rod, removed_volume):
     """Return the flows of pump and accumulator line into both chambers, and their slopes.
 
     The pump moves `D w - k dp` from one line to the other, the accumulator adds
@@ -143,7 +143,7 @@ def pump_flows(user, p, speed, p_head, p_rod, taken):
         speed: signed speed, scalar [rad/s]; 0: valve closed.
         p_head: scalar [Pa].
         p_rod: scalar [Pa].
-        taken: oil volume that the piston has taken from the accumulator, scalar [m^3].
+        removed_volume: oil volume that the piston has taken from the accumulator, scalar [m^3].
 
     Returns:
         (q_head, q_rod [m^3/s], d q_head/d p_head, d q_rod/d p_rod [m^3/(s Pa)]).
@@ -152,7 +152,7 @@ def pump_flows(user, p, speed, p_head, p_rod, taken):
     """
     if speed == 0.0:
         return 0.0, 0.0, 0.0, 0.0
-    gas = accumulator_pressure(user[p + _ACCUMULATOR], user[p + _GAS], taken)
+    gas = accumulator_pressure(user[p + _ACCUMULATOR], user[p + _GAS], removed_volume)
     leak = user[p + _LEAK]
     pumped = user[p + _D] * speed - leak * (p_head - p_rod)  # towards the head side
     if speed > 0.0:
@@ -183,7 +183,7 @@ def oil_compliance(volume, bulk_modulus, compliance, air, pressure):
     >>> round(1e12 * oil_compliance(1.0e-3, 1.0e9, 0.0, 1.0e-5, 101325.0), 2)
     25.67
     """
-    absolute = max(pressure + ATMOSPHERE, _THINNEST)
+    absolute = max(pressure + ATMOSPHERE, _MIN_AIR_PRESSURE)
     return volume / bulk_modulus + compliance + air * ATMOSPHERE / (absolute * absolute)
 
 
@@ -247,7 +247,11 @@ def load_pressure_step(user, p, pressure, velocity, dt):
     area = user[p + _AREA]
     if area == 0.0:
         return 0.0
-    per_pressure, void, air = area / user[p + _STIFF], user[p + _VOID], user[p + _VOID_P]
+    per_pressure, void, air = (
+        area / user[p + _LOAD_STIFFNESS],
+        user[p + _VOID],
+        user[p + _VOID_PRESSURE],
+    )
     pressed = void * pressure / (air + pressure) + per_pressure * pressure + dt * velocity
     if pressed <= 0.0:
         return 0.0
@@ -255,7 +259,7 @@ def load_pressure_step(user, p, pressure, velocity, dt):
     root = math.sqrt(half * half + per_pressure * pressed * air)
     # the form of the quadratic's root that avoids cancellation
     risen = (root - half) / per_pressure if half < 0.0 else pressed * air / (root + half)
-    return min(risen, user[p + _TOP] + user[p + _OVERRIDE] * area * max(0.0, velocity))
+    return min(risen, user[p + _LOAD_RELIEF] + user[p + _OVERRIDE] * area * max(0.0, velocity))
 
 
 @allocation_free
@@ -293,9 +297,9 @@ def pump_piston_friction(user, p, seal, velocity, push, load_pressure, dt):
     """
     ratio = velocity / seal[2]
     seals = seal[0] + seal[1] * math.exp(-ratio * ratio)
-    load = user[p + _RUB] * load_force(user, p, load_pressure)
+    load = user[p + _LOAD_FRICTION] * load_force(user, p, load_pressure)
     forward = seals * (1.0 + seal[4]) + load
-    backward = seals * (1.0 - seal[4]) + load + user[p + _RETURN]
+    backward = seals * (1.0 - seal[4]) + load + user[p + _LOAD_RETURN]
     if dt == 0.0:
         if velocity > 0.0:
             return forward + seal[3] * (1.0 + seal[5]) * velocity

@@ -1,19 +1,19 @@
 """Shared hydraulic supply: pressure from the flows of the valves, and pump with a time constant.
 
 Flat arrays have the layout described in `circuit`; `ports` has four values per axis, see
-`open_ports`.
+`compute_ports`.
 """
 
 import math
 
 from hydrotele.core.compiled import allocation_free, inlined
 from hydrotele.hydraulics.laws import axis_opening, inlet_flow, inlet_gain
-from hydrotele.hydraulics.parameters import SLOTS, Kind, Slot
+from hydrotele.hydraulics.parameters import SLOT_COUNT, ActuatorKind, Slot
 
-_NEWTON_STEPS = 60
+_MAX_NEWTON_STEPS = 60
 _FLOW_TOLERANCE = 1.0e-12  # of the pump flow: far below the documented flow balance of 1e-6
-_LEAST_SHARE = 1.0e-6  # smallest fraction of the maximum pump flow; it makes the pressure unique
-ADDED_LAG = 0.02  # s, time constant with which the pump flow follows terms: it cannot jump
+_MIN_FLOW_FRACTION = 1.0e-6  # smallest fraction of the maximum pump flow; it makes the pressure unique
+TERM_FLOW_TIME_CONSTANT = 0.02  # s, time constant with which the pump flow follows terms: it cannot jump
 
 _D, _TANK = int(Slot.ORIFICE_SMOOTHING), int(Slot.TANK_PRESSURE)
 _RELIEF, _PUMP = int(Slot.RELIEF_PRESSURE), int(Slot.PUMP_FLOW)
@@ -21,7 +21,7 @@ _MARGIN, _DROOP = int(Slot.LOAD_SENSING_MARGIN), int(Slot.PUMP_DROOP)
 _DROP = int(Slot.COMPENSATED_DROP)
 _LAG, _DELIVERY = int(Slot.PUMP_TIME_CONSTANT), int(Slot.DELIVERY)
 _ADDED, _OVERRIDE = int(Slot.ADDED_DELIVERY), int(Slot.RELIEF_OVERRIDE)
-_KIND, _PUMPED = int(Slot.KIND), float(Kind.PUMPED)
+_KIND, _PUMPED = int(Slot.KIND), float(ActuatorKind.PUMP_DRIVE)
 
 
 @allocation_free
@@ -60,7 +60,7 @@ def supply_pressure(ports, count, smoothing, relief, pump_flow, droop=0.0, overr
         if ports[4 * i] > 0.0:
             low = min(low, ports[4 * i + 1])
     floor = low
-    for _ in range(_NEWTON_STEPS):
+    for _ in range(_MAX_NEWTON_STEPS):
         demand, slope = 0.0, 0.0
         for i in range(count):
             drop = p - ports[4 * i + 1]
@@ -95,7 +95,7 @@ def supply_pressure(ports, count, smoothing, relief, pump_flow, droop=0.0, overr
 
 
 @inlined
-def open_ports(user, act, spool, ports, first, count, ahead, rate):
+def compute_ports(user, act, spool, ports, first, count, ahead, rate):
     """Compute opening, inlet gain and fed chamber pressure of every axis for `supply_pressure`.
 
     Args:
@@ -115,7 +115,7 @@ def open_ports(user, act, spool, ports, first, count, ahead, rate):
     Source: nominal model, "Orifice".
     """
     for i in range(count):
-        u = (first + i) * SLOTS
+        u = (first + i) * SLOT_COUNT
         if user[u + _KIND] == _PUMPED:  # does not use the shared supply
             ports[4 * i], ports[4 * i + 3] = 0.0, spool[4 * i]
             continue
@@ -129,7 +129,7 @@ def open_ports(user, act, spool, ports, first, count, ahead, rate):
 
 
 @allocation_free
-def delivered_share(user, first, act):
+def delivered_flow_fraction(user, first, act):
     """Return the fraction of its maximum flow that the pump delivers, including terms.
 
     It is 1 for a pump without time constant and without terms.
@@ -143,16 +143,16 @@ def delivered_share(user, first, act):
     Returns:
         Fraction, scalar [1].
 
-    Source: `demanded_share`.
+    Source: `demanded_flow_fraction`.
     """
-    s, added = first * SLOTS, 0.0
+    s, added = first * SLOT_COUNT, 0.0
     if user[s + _ADDED] > 0.0:
         added = act[int(user[s + _ADDED])]
-    return with_added(own_share(user, first, act), added)
+    return add_flow_fractions(pump_flow_fraction(user, first, act), added)
 
 
 @allocation_free
-def own_share(user, first, act):
+def pump_flow_fraction(user, first, act):
     """Return the fraction of its maximum flow that the pump delivers, without terms.
 
     Args:
@@ -163,20 +163,20 @@ def own_share(user, first, act):
     Returns:
         Fraction, scalar [1].
 
-    Source: `demanded_share`.
+    Source: `demanded_flow_fraction`.
     """
-    s = first * SLOTS
+    s = first * SLOT_COUNT
     if user[s + _LAG] == 0.0:
         return 1.0
-    return min(1.0, max(_LEAST_SHARE, act[int(user[s + _DELIVERY])]))
+    return min(1.0, max(_MIN_FLOW_FRACTION, act[int(user[s + _DELIVERY])]))
 
 
 @allocation_free
-def with_added(share, added):
+def add_flow_fractions(fraction, added):
     """Add the contribution of terms to a pump's flow fraction, with a positive lower bound.
 
     Args:
-        share: flow fraction without terms, scalar [1].
+        fraction: flow fraction without terms, scalar [1].
         added: flow fraction of the terms, scalar [1].
 
     Returns:
@@ -184,31 +184,31 @@ def with_added(share, added):
 
     Source: a pump's displacement, bounded from below.
     """
-    return max(_LEAST_SHARE, share + added)
+    return max(_MIN_FLOW_FRACTION, fraction + added)
 
 
 @allocation_free
-def pump_response(user, first, wanted, share, dt):
+def pump_response(user, first, demanded, fraction, dt):
     """Return the pump's flow fraction after a time, by the exact exponential of its lag.
 
     Args:
         user: (nu * SLOTS,) actuator parameters.
         first: index of the first hydraulic actuator.
-        wanted: demanded fraction of `demanded_share`, constant over the time, scalar [1].
-        share: fraction at the start, scalar [1].
+        demanded: demanded fraction of `demanded_flow_fraction`, constant over the time, scalar [1].
+        fraction: fraction at the start, scalar [1].
         dt: duration, scalar [s].
 
     Returns:
         Fraction of the maximum flow, scalar [1]; 1 for a pump without time constant.
 
-    Source: `demanded_share`.
+    Source: `demanded_flow_fraction`.
     """
-    lag = user[first * SLOTS + _LAG]
-    return wanted + (share - wanted) * math.exp(-dt / lag) if lag > 0.0 else 1.0
+    lag = user[first * SLOT_COUNT + _LAG]
+    return demanded + (fraction - demanded) * math.exp(-dt / lag) if lag > 0.0 else 1.0
 
 
 @allocation_free
-def demanded_share(user, first, count, ports):
+def demanded_flow_fraction(user, first, count, ports):
     """Return the fraction of the maximum pump flow that the valves demand.
 
     `q = (sum_i q_i + c_p p_s) / Q_pump` at the pressure p_s of a pump without time constant. A pump
@@ -220,15 +220,15 @@ def demanded_share(user, first, count, ports):
         user: (nu * SLOTS,) actuator parameters.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
-        ports: (>= 4 count,) as `open_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
+        ports: (>= 4 count,) as `compute_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
 
     Returns:
         q, scalar [1], 0 .. 1.
 
     Source: nominal model, "Supply"; first-order swash plate: Merritt 1967, sec. 8-6.
     """
-    supply = circuit_supply(user, first, count, ports, 1.0)
-    return min(1.0, drawn_flow(user, first, count, ports, supply) / user[first * SLOTS + _PUMP])
+    supply = circuit_supply_pressure(user, first, count, ports, 1.0)
+    return min(1.0, drawn_flow(user, first, count, ports, supply) / user[first * SLOT_COUNT + _PUMP])
 
 
 @allocation_free
@@ -239,7 +239,7 @@ def drawn_flow(user, first, count, ports, supply):
         user: (nu * SLOTS,) actuator parameters.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
-        ports: (>= 4 count,) as `open_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
+        ports: (>= 4 count,) as `compute_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
         supply: p_s, scalar [Pa].
 
     Returns:
@@ -247,7 +247,7 @@ def drawn_flow(user, first, count, ports, supply):
 
     Source: nominal model, "Supply".
     """
-    s = first * SLOTS
+    s = first * SLOT_COUNT
     drawn = user[s + _DROOP] * supply
     for i in range(count):
         drop = supply - ports[4 * i + 1]
@@ -257,21 +257,21 @@ def drawn_flow(user, first, count, ports, supply):
 
 
 @inlined
-def highest_supply(user, first, count, ports):
+def max_supply_pressure(user, first, count, ports):
     """Return the upper limit of the supply pressure: relief setting or load-sensing pressure.
 
     Args:
         user: (nu * SLOTS,) actuator parameters.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
-        ports: (>= 4 count,) as `open_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
+        ports: (>= 4 count,) as `compute_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
 
     Returns:
         p_s, scalar [Pa].
 
-    Source: `circuit_supply`.
+    Source: `circuit_supply_pressure`.
     """
-    s = first * SLOTS
+    s = first * SLOT_COUNT
     most = user[s + _RELIEF]
     if user[s + _MARGIN] > 0.0:
         load = user[s + _TANK]
@@ -283,7 +283,7 @@ def highest_supply(user, first, count, ports):
 
 
 @inlined
-def circuit_supply(user, first, count, ports, share):
+def circuit_supply_pressure(user, first, count, ports, fraction):
     """Compute the supply pressure of a circuit from pump, relief valve and load sensing.
 
     A load-sensing pump maintains `max p_i + margin` over the open valves (tank pressure counts as a
@@ -293,16 +293,16 @@ def circuit_supply(user, first, count, ports, share):
         user: (nu * SLOTS,) actuator parameters.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
-        ports: (>= 4 count,) as `open_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
-        share: fraction of its maximum flow that the pump delivers, scalar [1], > 0.
+        ports: (>= 4 count,) as `compute_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
+        fraction: fraction of its maximum flow that the pump delivers, scalar [1], > 0.
 
     Returns:
         p_s, scalar [Pa].
 
     Source: nominal model, "Supply".
     """
-    s, most = first * SLOTS, highest_supply(user, first, count, ports)
-    flow = user[s + _PUMP] * share
+    s, most = first * SLOT_COUNT, max_supply_pressure(user, first, count, ports)
+    flow = user[s + _PUMP] * fraction
     droop, override = user[s + _DROOP], user[s + _OVERRIDE]
     return supply_pressure(ports, count, user[s + _D], most, flow, droop, override)
 
@@ -320,8 +320,8 @@ def supply_coupling(user, first, count, ports, supply, out):
         user: (nu * SLOTS,) actuator parameters.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
-        ports: (>= 4 count,) as `open_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
-        supply: p_s of `circuit_supply`, scalar [Pa].
+        ports: (>= 4 count,) as `compute_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
+        supply: p_s of `circuit_supply_pressure`, scalar [Pa].
         out: (>= 4 count,) written at indices 2 and 3 of every axis: g_i [m^3/(s Pa)] and
             dp_s/dp_i [1].
 
@@ -330,7 +330,7 @@ def supply_coupling(user, first, count, ports, supply, out):
 
     Source: implicit function theorem on "Supply" of the nominal model.
     """
-    s, total, leader = first * SLOTS, user[first * SLOTS + _DROOP], -1
+    s, total, leader = first * SLOT_COUNT, user[first * SLOT_COUNT + _DROOP], -1
     most, load = user[s + _RELIEF], user[s + _TANK]
     if supply > most and user[s + _OVERRIDE] > 0.0:
         total += 1.0 / user[s + _OVERRIDE]

@@ -1,7 +1,7 @@
 """Linear equations `regressor @ parameters = force` of one run, and of all fitted runs.
 
 The regressor is computed from the filtered motion of the joints. Regressor and forces pass the same
-low-pass filter and are then downsampled. `build_equations` does this for one run; `gather` stacks
+low-pass filter and are then downsampled. `build_equations` does this for one run; `stack_equations` stacks
 the equations of several runs.
 """
 
@@ -14,26 +14,26 @@ from scipy.signal import upfirdn
 
 from hydrotele.core.errors import InputError
 from hydrotele.identify.motion import (
-    GAP,
+    MAX_GAP_S,
     Processing,
     Resolution,
-    joint_motion,
-    rate_deviations,
+    compute_joint_motion,
+    propagate_rate_std,
 )
 from hydrotele.identify.record import IdentificationRecord
 from hydrotele.identify.setup import RegressorSetup
-from hydrotele.identify.smoothing import Smoothed, error_draws, smooth
+from hydrotele.identify.smoothing import SmoothedSignal, sample_errors, smooth
 from hydrotele.multibody.inverse_dynamics import Regressor, sign_uncertainty
 
-_TAPS = 1.5  # half length of the low-pass filter, in periods of its cutoff
-_KAISER = 5.0  # window parameter: ripple of -50 dB
-_SPARE = 1.25  # equations per second over twice the band
-_FINE = 4  # factor of the row rate where forces are evaluated and plotted
-_CHUNK = 8000  # rows per block, to limit memory for long logs
-_MISSING = 0.1  # largest fraction of the filter weight that may fall on missing forces
-_NOISY = 6000  # rows, largest number with which the effect of motion errors is sampled
-_DRAWS = 4  # samples of the motion errors: enough for an RMS over thousands of rows
-_NYQUIST = 0.4  # of the sample rate: largest band
+_HALF_LENGTH_PERIODS = 1.5  # half length of the low-pass filter, in periods of its cutoff
+_KAISER_BETA = 5.0  # window parameter: ripple of -50 dB
+_RATE_OVER_TWICE_BAND = 1.25  # equations per second over twice the band
+_FINE_RATE_FACTOR = 4  # factor of the row rate where forces are evaluated and plotted
+_ROWS_PER_CHUNK = 8000  # rows per block, to limit memory for long logs
+_MAX_MISSING_WEIGHT = 0.1  # largest fraction of the filter weight that may fall on missing forces
+_MAX_NOISE_ROWS = 6000  # rows, largest number with which the effect of motion errors is sampled
+_MOTION_ERROR_SAMPLES = 4  # samples of the motion errors: enough for an RMS over thousands of rows
+_MAX_BAND_OVER_SAMPLE_RATE = 0.4  # of the sample rate: largest band
 
 
 @dataclass(frozen=True)
@@ -48,10 +48,10 @@ class Equations:
             [N m]; NaN where unknown.
         time: (n,) time from the start of the run [s].
         spacing: time between equations [s]; an integer fraction of a repeated motion's period.
-        doubt: (n, k) uncertainty of the sign of the drives' dry friction, 0 .. 1.
+        friction_sign_uncertainty: (n, k) uncertainty of the sign of the drives' dry friction, 0 .. 1.
         force_noise: (k,) standard deviation of the filtered force noise; NaN if unknown.
         motion_noise: (k, m, m) second moments of the force errors per parameter that errors of the
-            motion cause; see `noise_of`. Empty if not requested.
+            motion cause; see `noise_rms`. Empty if not requested.
     """
 
     name: str
@@ -60,11 +60,11 @@ class Equations:
     force: np.ndarray
     time: np.ndarray
     spacing: float
-    doubt: np.ndarray
+    friction_sign_uncertainty: np.ndarray
     force_noise: np.ndarray
     motion_noise: np.ndarray
 
-    def noise_of(self, value: np.ndarray) -> np.ndarray:
+    def noise_rms(self, value: np.ndarray) -> np.ndarray:
         """Return the RMS error (k,) [N] or [N m] of a perfect model with parameters (m,)."""
         if not self.motion_noise.size:
             return np.full(len(self.force_noise), np.nan)
@@ -83,13 +83,13 @@ class RateErrors(NamedTuple):
     axes: tuple[str, ...]
     std: np.ndarray
 
-    def part(self, rows: slice) -> "RateErrors":
+    def select_rows(self, rows: slice) -> "RateErrors":
         """Return the errors of some rows."""
         return self._replace(std=self.std[rows])
 
 
 def build_equations(
-    record: IdentificationRecord, setup: RegressorSetup, processing: Processing, found: Resolution,
+    record: IdentificationRecord, setup: RegressorSetup, processing: Processing, position_resolution: Resolution,
     with_noise: bool = False, rate_errors: RateErrors | None = None,
 ) -> tuple[Equations, Regressor]:  # fmt: skip
     """Build the low-pass filtered equations of a run.
@@ -98,7 +98,7 @@ def build_equations(
         record: the run.
         setup: definition of the regressor.
         processing: method to differentiate the positions.
-        found: resolution of the positions.
+        position_resolution: resolution of the positions.
         with_noise: whether to compute `motion_noise`, and to downsample less.
         rate_errors: rate errors of the measured joints, if these are not the joints of the record;
             by default the joints of the record, with independent errors.
@@ -109,49 +109,51 @@ def build_equations(
     Raises:
         InputError: the run is too short for the band, or the mechanism cannot follow it.
     """
-    band = processing.band or found.band
-    motion = _motion(record, found, processing)
+    band = processing.band or position_resolution.band
+    motion = _compute_motion(record, position_resolution, processing)
     motions = np.stack([motion.value, motion.rate, motion.acceleration])
-    low, thin = low_pass(band, record.period, processing.period)
-    thin = max(1, thin // _FINE) if with_noise else thin
+    low, thin = design_low_pass(band, record.period, processing.period)
+    thin = max(1, thin // _FINE_RATE_FACTOR) if with_noise else thin
     count = (len(record.force) - len(low)) // thin + 1
-    if band > _NYQUIST / record.period:
+    if band > _MAX_BAND_OVER_SAMPLE_RATE / record.period:
         raise InputError(
             record.name, f"a band of {band:g} Hz is too wide for rows of {record.period:g} s: at"
-            f" most {_NYQUIST / record.period:g} Hz",
+            f" most {_MAX_BAND_OVER_SAMPLE_RATE / record.period:g} Hz",
         )  # fmt: skip
     if count < 1:
         raise InputError(
             record.name, f"{len(record.force)} rows are too few for a band of {band:g} Hz, which"
             f" needs {len(low)}",
         )  # fmt: skip
-    errors = rate_errors or RateErrors(setup.given, motion.rate_std)
+    errors = rate_errors or RateErrors(setup.given_joints, motion.rate_std)
     start, last, parts, doubts, damped = None, None, [], [], []
     weights = np.abs(low) / np.abs(low).sum()
-    for first in range(0, count, per_chunk := max(1, _CHUNK // thin)):
+    for first in range(0, count, per_chunk := max(1, _ROWS_PER_CHUNK // thin)):
         some = min(per_chunk, count - first)
         rows = slice(first * thin, (first + some - 1) * thin + len(low))
-        last, doubt, damping, pose = _rows(setup, motions[:, rows], errors.part(rows), start)
-        damped.append(low_passed(damping, low, thin))
-        parts.append(low_passed(last.matrix, low, thin))
-        doubts.append(low_passed(doubt, weights, thin))
+        last, doubt, damping, pose = _evaluate_rows(setup, motions[:, rows], errors.select_rows(rows), start)
+        damped.append(apply_low_pass(damping, low, thin))
+        parts.append(apply_low_pass(last.matrix, low, thin))
+        doubts.append(apply_low_pass(doubt, weights, thin))
         start = pose
     assert last is not None
     noise = np.sqrt(np.sum(low**2)) * record.force_noise
     spread = np.zeros(0)
     if with_noise:
-        spread = _motion_noise(record, setup, found, motions, errors, low, thin)
+        spread = _compute_motion_noise(record, setup, position_resolution, motions, errors, low, thin)
     time = (np.arange(count) * thin + (len(low) - 1) / 2) * record.period
     made = Equations(
         record.name, band, np.concatenate(parts), 
-        low_passed_forces(record.force, record.period, low, thin) - np.concatenate(damped), time,
+        low_pass_forces(record.force, record.period, low, thin) - np.concatenate(damped), time,
         thin * record.period, np.concatenate(doubts), noise, spread,
     )  # fmt: skip
     empty = Regressor(last.matrix[:0], last.drives, last.names, last.units, last.nominal)
     return made, empty
 
 
-def _motion(record: IdentificationRecord, found: Resolution, processing: Processing) -> Smoothed:
+def _compute_motion(
+    record: IdentificationRecord, position_resolution: Resolution, processing: Processing
+) -> SmoothedSignal:
     """Return the motion of the joints.
 
     Raises:
@@ -159,7 +161,7 @@ def _motion(record: IdentificationRecord, found: Resolution, processing: Process
     """
     known = np.isfinite(record.position)
     if processing.method in ("raw", "zero_phase"):
-        bridge = round(GAP / record.period) if processing.method == "zero_phase" else 0
+        bridge = round(MAX_GAP_S / record.period) if processing.method == "zero_phase" else 0
         for axis, column in zip(record.axes, known.T, strict=True):
             rows = np.flatnonzero(column)
             missing = np.diff(rows, prepend=-1, append=len(column)) - 1
@@ -170,29 +172,29 @@ def _motion(record: IdentificationRecord, found: Resolution, processing: Process
                     f" {missing.max() * record.period:.3g} s from {at * record.period:.3g} s on:"
                     " use --processing optimal, which accepts gaps, or cut the run there",
                 )  # fmt: skip
-    return joint_motion(record.position, record.period, found, processing)
+    return compute_joint_motion(record.position, record.period, position_resolution, processing)
 
 
-def _motion_noise(
-    record: IdentificationRecord, setup: RegressorSetup, found: Resolution, motions: np.ndarray,
+def _compute_motion_noise(
+    record: IdentificationRecord, setup: RegressorSetup, position_resolution: Resolution, motions: np.ndarray,
     errors: RateErrors, low: np.ndarray, thin: int,
 ) -> np.ndarray:  # fmt: skip
     """Return second moments (k, m, m) of the force errors caused by motion errors.
 
     Possible true motions are sampled about that of the optimal smoother. See `Equations`.
     """
-    rows = slice(0, max(_NOISY, 4 * len(low)))
-    smoothed = smooth(record.position[rows], record.period, found.noise)
+    rows = slice(0, max(_MAX_NOISE_ROWS, 4 * len(low)))
+    smoothed = smooth(record.position[rows], record.period, position_resolution.noise)
     likely = np.stack([smoothed.value, smoothed.rate, smoothed.acceleration])
-    taken = _rows(setup, motions[:, rows], errors.part(rows), None)[0].matrix
+    taken = _evaluate_rows(setup, motions[:, rows], errors.select_rows(rows), None)[0].matrix
     total = np.zeros((taken.shape[1], taken.shape[2], taken.shape[2]))
-    for draw in error_draws(smoothed, _DRAWS):
-        error = low_passed(taken - _rows(setup, likely - draw, None, None)[0].matrix, low, thin)
+    for draw in sample_errors(smoothed, _MOTION_ERROR_SAMPLES):
+        error = apply_low_pass(taken - _evaluate_rows(setup, likely - draw, None, None)[0].matrix, low, thin)
         total += np.einsum("nkm,nkl->kml", error, error)
-    return total / (len(error) * _DRAWS)
+    return total / (len(error) * _MOTION_ERROR_SAMPLES)
 
 
-def row_forces(
+def predict_forces(
     setup: RegressorSetup,
     motions: np.ndarray,
     value: np.ndarray,
@@ -210,15 +212,15 @@ def row_forces(
         (n, k) forces [N] or [N m], including stated damping and springs of the joints.
     """
     out, start = [], None
-    for first in range(0, motions.shape[1], _CHUNK):
-        rows = slice(first, first + _CHUNK)
-        errors = None if rate_std is None else RateErrors(setup.given, rate_std[rows])
-        table, _, damping, start = _rows(setup, motions[:, rows], errors, start)
+    for first in range(0, motions.shape[1], _ROWS_PER_CHUNK):
+        rows = slice(first, first + _ROWS_PER_CHUNK)
+        errors = None if rate_std is None else RateErrors(setup.given_joints, rate_std[rows])
+        table, _, damping, start = _evaluate_rows(setup, motions[:, rows], errors, start)
         out.append(table.matrix @ value + damping)
     return np.concatenate(out)
 
 
-def _rows(
+def _evaluate_rows(
     setup: RegressorSetup,
     motions: np.ndarray,
     errors: RateErrors | None,
@@ -235,16 +237,21 @@ def _rows(
     spread = None
     if errors is not None and np.isfinite(errors.std).all():
         measured = [chain.index(name) for name in errors.axes]
-        spread = rate_deviations(found, measured, errors.std)
-    table = setup.table(found, spread)
+        spread = propagate_rate_std(found, measured, errors.std)
+    table = setup.compute_regressor(found, spread)
     doubt = np.zeros((len(found.rate), len(table.drives)))
     if spread is not None:
-        doubt = sign_uncertainty(chain, found, table.drives, setup.rubbing, spread)
-    passive = chain.damping * found.rate + chain.stiffness * (found.position - chain.rest)
-    return table, doubt, np.einsum("nkv,nv->nk", found.share, passive), found.position[-1]
+        doubt = sign_uncertainty(chain, found, table.drives, setup.friction_terms, spread)
+    passive = chain.damping * found.rate + chain.stiffness * (found.position - chain.spring_rest)
+    return (
+        table,
+        doubt,
+        np.einsum("nkv,nv->nk", found.joint_projection, passive),
+        found.position[-1],
+    )
 
 
-def low_pass(band: float, period: float, cycle: float | None = None) -> tuple[np.ndarray, int]:
+def design_low_pass(band: float, period: float, cycle: float | None = None) -> tuple[np.ndarray, int]:
     """Design a low-pass filter without lag and its downsampling factor.
 
     Args:
@@ -256,46 +263,46 @@ def low_pass(band: float, period: float, cycle: float | None = None) -> tuple[np
         An odd number of weights, and the number of rows per equation. That number divides the rows
         of a cycle if it has a suitable divisor.
     """
-    half = round(_TAPS / (band * period))
+    half = round(_HALF_LENGTH_PERIODS / (band * period))
     if half < 1:
         return np.ones(1), 1
     reach = np.arange(-half, half + 1)
-    weights = np.sinc(2.0 * band * period * reach) * np.kaiser(len(reach), _KAISER)
-    thin = max(1, int(1.0 / (2.0 * _SPARE * band * period)))
+    weights = np.sinc(2.0 * band * period * reach) * np.kaiser(len(reach), _KAISER_BETA)
+    thin = max(1, int(1.0 / (2.0 * _RATE_OVER_TWICE_BAND * band * period)))
     rows = round(cycle / period) if cycle else 0
     parts = [part for part in range(thin, thin // 2, -1) if rows % part == 0]
     return weights / weights.sum(), (parts or [thin])[0]
 
 
-def low_passed(values: np.ndarray, low: np.ndarray, thin: int) -> np.ndarray:
+def apply_low_pass(values: np.ndarray, filter_weights: np.ndarray, downsampling: int) -> np.ndarray:
     """Apply a low-pass filter and downsample, without rows where the filter exceeds the ends.
 
     Args:
         values: (n, ...) rows.
-        low: odd number of weights.
-        thin: downsampling factor.
+        filter_weights: odd number of weights.
+        downsampling: downsampling factor.
 
     Returns:
         (rows, ...) filtered rows.
     """
-    count = (len(values) - len(low)) // thin + 1
+    count = (len(values) - len(filter_weights)) // downsampling + 1
     flat = values.reshape(len(values), -1)
     # upfirdn also returns partial rows; the first complete one ends at input row len(low) - 1
-    shift = (len(low) - 1) % thin
-    padded = np.concatenate([np.zeros(((thin - shift) % thin, flat.shape[1])), flat])
-    out = upfirdn(low, padded, down=thin, axis=0)
-    first = (len(low) - 1 + (thin - shift) % thin) // thin
+    shift = (len(filter_weights) - 1) % downsampling
+    padded = np.concatenate([np.zeros(((downsampling - shift) % downsampling, flat.shape[1])), flat])
+    out = upfirdn(filter_weights, padded, down=downsampling, axis=0)
+    first = (len(filter_weights) - 1 + (downsampling - shift) % downsampling) // downsampling
     return out[first : first + count].reshape(count, *values.shape[1:])
 
 
-def low_passed_forces(force: np.ndarray, period: float, low: np.ndarray, thin: int) -> np.ndarray:
+def low_pass_forces(force: np.ndarray, period: float, filter_weights: np.ndarray, downsampling: int) -> np.ndarray:
     """Apply a low-pass filter to forces; interpolate short gaps and set long ones to NaN.
 
     Args:
         force: (n, k) forces, NaN where unknown.
         period: time between rows [s].
-        low: odd number of weights.
-        thin: downsampling factor.
+        filter_weights: odd number of weights.
+        downsampling: downsampling factor.
 
     Returns:
         (rows, k) filtered forces.
@@ -311,57 +318,57 @@ def low_passed_forces(force: np.ndarray, period: float, low: np.ndarray, thin: i
             after = np.searchsorted(places, rows).clip(0, len(places) - 1)
             before = (after - 1).clip(0)
             near = np.minimum(np.abs(places[after] - rows), np.abs(places[before] - rows))
-            far[:, k] = near * period > 0.5 * GAP
+            far[:, k] = near * period > 0.5 * MAX_GAP_S
             filled[:, k] = np.interp(rows, rows[known[:, k]], force[known[:, k], k])
-    out = low_passed(filled, low, thin)
-    missing = low_passed(far.astype(float), np.abs(low) / np.abs(low).sum(), thin)
-    out[missing > _MISSING] = np.nan
+    out = apply_low_pass(filled, filter_weights, downsampling)
+    missing = apply_low_pass(far.astype(float), np.abs(filter_weights) / np.abs(filter_weights).sum(), downsampling)
+    out[missing > _MAX_MISSING_WEIGHT] = np.nan
     return out
 
 
-def stacked(parts: Sequence[Equations], of: Callable[[Equations], np.ndarray]) -> np.ndarray:
+def concatenate_field(parts: Sequence[Equations], of: Callable[[Equations], np.ndarray]) -> np.ndarray:
     """Concatenate a field of the equations of several runs."""
     return np.concatenate([of(part) for part in parts])
 
 
-_LEAST = 4.0  # periods of the band, shortest run: the low-pass filter spans three
-_WHERE = "identification"
+_MIN_BAND_PERIODS = 4.0  # periods of the band, shortest run: the low-pass filter spans three
+_ERROR_CONTEXT = "identification"
 
 
 @dataclass(frozen=True)
-class Gathered:
+class StackedEquations:
     """Stacked equations of several runs: n rows, k drives with known forces, m parameters.
 
     Attributes:
         runs: the runs that are long enough, with the resolution of their positions.
         table: regressor without rows: names, units and nominal values; all drives.
-        columns: indices of the k drives in the table.
-        rows: mask of the n used rows among the stacked equations of all runs.
-        starts: first stacked equation of each run, and their total number.
+        drive_columns: indices of the k drives in the table.
+        used_rows: mask of the n used rows among the stacked equations of all runs.
+        run_starts: first stacked equation of each run, and their total number.
         spacing: time between the equations of each run [s].
         matrix: (n, k, m) regressor.
         force: (n, k) forces [N] or [N m].
-        doubt: (n, k) uncertainty of the signs of dry friction.
+        friction_sign_uncertainty: (n, k) uncertainty of the signs of dry friction.
         notes: sentences about runs that were left out.
     """
 
     runs: tuple[tuple[IdentificationRecord, Resolution], ...]
     table: Regressor
-    columns: list[int]
-    rows: np.ndarray
-    starts: np.ndarray
+    drive_columns: list[int]
+    used_rows: np.ndarray
+    run_starts: np.ndarray
     spacing: tuple[float, ...]
     matrix: np.ndarray
     force: np.ndarray
-    doubt: np.ndarray
+    friction_sign_uncertainty: np.ndarray
     notes: tuple[str, ...]
 
     @property
     def drives(self) -> tuple[str, ...]:
         """Names of the k drives with known forces."""
-        return tuple(self.table.drives[k] for k in self.columns)
+        return tuple(self.table.drives[k] for k in self.drive_columns)
 
-    def spread(self, values: np.ndarray, run: int) -> np.ndarray:
+    def expand_to_run(self, values: np.ndarray, run: int) -> np.ndarray:
         """Expand values of the used equations to all rows and drives of one run.
 
         Args:
@@ -371,13 +378,13 @@ class Gathered:
         Returns:
             (p, equations of the run, all drives), 0 for rows and drives that are not used.
         """
-        out = np.zeros((len(values), len(self.rows), len(self.table.drives)))
-        places = np.flatnonzero(self.rows)
-        for c, column in enumerate(self.columns):
+        out = np.zeros((len(values), len(self.used_rows), len(self.table.drives)))
+        places = np.flatnonzero(self.used_rows)
+        for c, column in enumerate(self.drive_columns):
             out[:, places, column] = values[:, :, c]
-        return out[:, self.starts[run] : self.starts[run + 1]]
+        return out[:, self.run_starts[run] : self.run_starts[run + 1]]
 
-    def cycle_on(self, values: np.ndarray, period: float) -> np.ndarray:
+    def shift_by_period(self, values: np.ndarray, period: float) -> np.ndarray:
         """Return the values one period later, or one period earlier near the end of a run.
 
         Args:
@@ -391,8 +398,8 @@ class Gathered:
             InputError: a run is shorter than two periods, or the period is shorter than the time
                 between equations.
         """
-        whole = np.full((len(self.rows), *values.shape[1:]), np.nan)
-        whole[self.rows] = values
+        whole = np.full((len(self.used_rows), *values.shape[1:]), np.nan)
+        whole[self.used_rows] = values
         for k, (record, _) in enumerate(self.runs):
             if len(record.force) * record.period < 2.0 * period:
                 raise InputError(
@@ -404,23 +411,23 @@ class Gathered:
                     record.name, f"a period of {period:g} s is shorter than the time between"
                     f" equations, {self.spacing[k]:.3g} s: a motion of this band repeats slower",
                 )  # fmt: skip
-            own = slice(self.starts[k], self.starts[k + 1])
-            whole[own] = cycle_on(whole[own], step)
-        return whole[self.rows]
+            own = slice(self.run_starts[k], self.run_starts[k + 1])
+            whole[own] = shift_by_rows(whole[own], step)
+        return whole[self.used_rows]
 
 
-def cycle_on(values: np.ndarray, step: int) -> np.ndarray:
+def shift_by_rows(values: np.ndarray, step: int) -> np.ndarray:
     """Return values (n, ...) of `step` rows later, near the end of `step` rows earlier, or NaN."""
     later, earlier = np.full((2, *values.shape), np.nan)
     later[:-step], earlier[step:] = values[step:], values[:-step]
     return np.where(np.isnan(later), earlier, later)
 
 
-def gather(
+def stack_equations(
     runs: Sequence[tuple[IdentificationRecord, Resolution]],
     setup: RegressorSetup,
     processing: Processing,
-) -> Gathered:
+) -> StackedEquations:
     """Build and stack the equations of all runs.
 
     Args:
@@ -438,20 +445,18 @@ def gather(
     assert band
     kept, made, notes = [], [], []
     for record, found in runs:
-        if len(record.force) * record.period * band < _LEAST:
+        if len(record.force) * record.period * band < _MIN_BAND_PERIODS:
             notes.append(f"{record.name} is too short for a band of {band:.3g} Hz; left out.")
             continue
         made.append(build_equations(record, setup, processing, found))
         kept.append((record, found))
     if not made:
-        raise InputError(
-            _WHERE, f"all runs are too short for a band of {band:.3g} Hz: log longer runs"
-        )
+        raise InputError(_ERROR_CONTEXT, f"all runs are too short for a band of {band:.3g} Hz: log longer runs")
     table, equations = made[0][1], [e for e, _ in made]
-    force = stacked(equations, lambda e: e.force)
+    force = concatenate_field(equations, lambda e: e.force)
     columns = [k for k in range(force.shape[1]) if np.isfinite(force[:, k]).any()]
     if not columns:
-        raise InputError(_WHERE, "no drive has a known force in any run: log both pressures")
+        raise InputError(_ERROR_CONTEXT, "no drive has a known force in any run: log both pressures")
     rows = np.asarray(np.isfinite(force[:, columns]).all(axis=1))
     notes += [
         f"{e.name} has no force of {', '.join(lost)}; left out."
@@ -459,13 +464,11 @@ def gather(
         if (lost := [table.drives[k] for k in columns if np.isnan(e.force[:, k]).all()])
     ]
     if not rows.any():
-        raise InputError(
-            _WHERE, "no run has the forces of all drives whose forces are known in some run"
-        )
+        raise InputError(_ERROR_CONTEXT, "no run has the forces of all drives whose forces are known in some run")
     spacing = tuple(e.spacing for e in equations)
     starts = np.cumsum([0, *(len(e.time) for e in equations)])
-    return Gathered(
+    return StackedEquations(
         tuple(kept), table, columns, rows, starts, spacing,
-        stacked(equations, lambda e: e.matrix)[rows][:, columns], force[rows][:, columns],
-        stacked(equations, lambda e: e.doubt)[rows][:, columns], tuple(notes),
+        concatenate_field(equations, lambda e: e.matrix)[rows][:, columns], force[rows][:, columns],
+        concatenate_field(equations, lambda e: e.friction_sign_uncertainty)[rows][:, columns], tuple(notes),
     )  # fmt: skip

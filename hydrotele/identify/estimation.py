@@ -1,7 +1,7 @@
 """Estimators of parameters that are linear in the drive forces, with their uncertainty.
 
 `estimate` solves (n, k, m) regressors and (n, k) forces of k drives over n rows by least squares.
-`weighted` and `identifiable_from` weight the equations and select the base parameters that noisy
+`weight_equations` and `find_identifiable_parameters` weight the equations and select the base parameters that noisy
 data determine; all other combinations keep their nominal values. `reduce_parameters` drops and
 merges friction parameters, because poorly determined passive-joint friction degrades all estimates.
 """
@@ -16,19 +16,19 @@ from scipy.signal import lfilter
 from scipy.stats import norm
 
 from hydrotele.core.errors import InputError
-from hydrotele.identify.equations import Gathered
+from hydrotele.identify.equations import StackedEquations
 from hydrotele.identify.identifiability import (
     Identifiability,
-    identifiable_in_noise,
+    classify_noisy_parameters,
     reference_sizes,
 )
 from hydrotele.identify.setup import RegressorSetup
 from hydrotele.multibody.inverse_dynamics import FRICTION_TERMS, Regressor
 
-_ESTIMATE = "estimate"
+_ESTIMATE_CONTEXT = "estimate"
 _NORMAL95 = 1.959964
-_LONGEST = 30  # rows, highest order of the autoregression of the errors
-_SILENT = 1e-12  # of a force: rounding
+_MAX_AUTOREGRESSION_ORDER = 30  # rows, highest order of the autoregression of the errors
+_MIN_RELATIVE_RESIDUAL = 1e-12  # of a force: rounding
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,8 @@ class Estimate:
         residual: (n, k) measured minus predicted force [N] or [N m].
         gain: (p, n, k) derivative of the estimates with respect to each force; 0 for omitted rows.
         condition: condition number of the weighted, scaled equations.
-        white: (k, k) matrix that weighted the equations.
-        normal: (p, p) inverse of the weighted normal equations: with weighted Y (or Z) and F,
+        whitening: (k, k) matrix that weighted the equations.
+        inverse_normal_matrix: (p, p) inverse of the weighted normal equations: with weighted Y (or Z) and F,
             `value = prior + normal Y' (F - Y prior)`.
         rank: number of directions left by truncation.
     """
@@ -52,8 +52,8 @@ class Estimate:
     residual: np.ndarray
     gain: np.ndarray
     condition: float
-    white: np.ndarray
-    normal: np.ndarray
+    whitening: np.ndarray
+    inverse_normal_matrix: np.ndarray
     rank: int
 
     @property
@@ -67,12 +67,12 @@ class Estimate:
         reach = _NORMAL95 * self.std
         return np.column_stack([self.value - reach, self.value + reach])
 
-    def ellipsoid(self, truth: np.ndarray) -> float:
+    def squared_distance(self, parameters: np.ndarray) -> float:
         """Return the squared Mahalanobis distance of other parameters (p,) from the estimate.
 
         Its distribution is chi^2 with `rank` degrees of freedom. Truncated directions are excluded.
         """
-        away = (np.asarray(truth) - self.value) / self.std
+        away = (np.asarray(parameters) - self.value) / self.std
         values, ways = np.linalg.eigh(self.covariance / np.outer(self.std, self.std))
         kept = slice(len(values) - self.rank, None)
         return float(np.sum((away @ ways[:, kept]) ** 2 / values[kept]))
@@ -80,7 +80,7 @@ class Estimate:
 
 def estimate(
     matrix: np.ndarray, forces: np.ndarray, covariance: np.ndarray | None = None, *,
-    instruments: np.ndarray | None = None, ridge: float = 0.0, cut: float = 0.0,
+    instruments: np.ndarray | None = None, ridge: float = 0.0, truncation: float = 0.0,
     prior: np.ndarray | None = None, order: int | None = None,
 ) -> Estimate:  # fmt: skip
     """Estimate parameters by least squares with errors correlated in time and between drives.
@@ -101,7 +101,7 @@ def estimate(
         covariance: (k, k) covariance of the errors of the k drives at one instant, up to a factor.
         instruments: (n, k, p) Z, correlated with the noise-free regressor but not with its noise.
         ridge: added to the squared singular values, as a fraction of the largest one squared.
-        cut: fraction of the largest singular value below which directions keep the prior.
+        truncation: fraction of the largest singular value below which directions keep the prior.
         prior: (p,) values towards which ridge and truncation move the estimate; 0 by default.
         order: order of the autoregression; None to choose it, 0 for uncorrelated errors.
 
@@ -115,54 +115,54 @@ def estimate(
     ridge); Janot, Vandanjon and Gautier 2014 (instruments); Schwarz 1978 (order).
     """
     matrix, forces = np.asarray(matrix, float), np.asarray(forces, float)
-    _check(matrix, forces, covariance, instruments)
+    _check_shapes(matrix, forces, covariance, instruments)
     there = np.isfinite(forces).all(axis=1) & np.isfinite(matrix).all(axis=(1, 2))
-    white = np.eye(forces.shape[1]) if covariance is None else _whitener(covariance)
+    white = np.eye(forces.shape[1]) if covariance is None else _whitening_matrix(covariance)
     x, y = white @ matrix[there], forces[there] @ white.T
     z = None if instruments is None else white @ np.asarray(instruments, float)[there]
     if y.size <= x.shape[2]:
-        raise InputError(_ESTIMATE, f"{y.size} equations do not determine {x.shape[2]} parameters")
+        raise InputError(_ESTIMATE_CONTEXT, f"{y.size} equations do not determine {x.shape[2]} parameters")
     if not (size := np.sqrt(np.einsum("nkp,nkp->p", x, x))).all():
-        raise InputError(_ESTIMATE, f"column {int(np.argmin(size))} has no effect: remove it")
+        raise InputError(_ESTIMATE_CONTEXT, f"column {int(np.argmin(size))} has no effect: remove it")
     start = np.zeros(x.shape[2]) if prior is None else np.asarray(prior, float)
-    shape = _Shape(start, ridge, cut, covariance is None)
+    shape = _SolverOptions(start, ridge, truncation, covariance is None)
     value, inverse, solved, scale = _solve(x, y, z, shape)
     error = y - x @ value
     follow = autoregression(error, order)
-    spread = _carried(inverse, error, follow) * y.size / (y.size - x.shape[2])
+    spread = _propagate_covariance(inverse, error, follow) * y.size / (y.size - x.shape[2])
     gain = np.zeros((len(value), *forces.shape))
     gain[:, there] = inverse @ white
     return Estimate(
         value, spread, forces - matrix @ value, gain, solved.condition, white / scale[:, None],
-        solved.normal, solved.rank,
+        solved.inverse_normal_matrix, solved.rank,
     )  # fmt: skip
 
 
-class _Shape(NamedTuple):
+class _SolverOptions(NamedTuple):
     """Options of the solver.
 
     Attributes:
         prior: (p,) values towards which ridge and truncation move the estimate.
         ridge: see `estimate`.
-        cut: see `estimate`.
-        weigh: whether drives are weighted by their residuals.
+        truncation: see `estimate`.
+        weight_by_residuals: whether drives are weighted by their residuals.
     """
 
     prior: np.ndarray
     ridge: float
-    cut: float
-    weigh: bool
+    truncation: float
+    weight_by_residuals: bool
 
 
-class _Solved(NamedTuple):
+class _SolutionProperties(NamedTuple):
     """Condition number, inverse of the normal equations and rank of scaled equations."""
 
     condition: float
-    normal: np.ndarray
+    inverse_normal_matrix: np.ndarray
     rank: int
 
 
-def _solve(x, y, z, shape: _Shape) -> tuple[np.ndarray, np.ndarray, _Solved, np.ndarray]:
+def _solve(x, y, z, shape: _SolverOptions) -> tuple[np.ndarray, np.ndarray, _SolutionProperties, np.ndarray]:
     """Solve the equations, weighting the drives by their residuals if requested.
 
     Returns:
@@ -171,40 +171,40 @@ def _solve(x, y, z, shape: _Shape) -> tuple[np.ndarray, np.ndarray, _Solved, np.
     """
     value, inverse, solved = _solve_once(x, y, z, shape)
     ones = np.ones(y.shape[1])
-    if shape.weigh and y.shape[1] > 1:
+    if shape.weight_by_residuals and y.shape[1] > 1:
         scale = np.sqrt(np.mean((y - x @ value) ** 2, axis=0))
-        if (scale > _SILENT * np.sqrt(np.mean(y**2, axis=0))).all():
+        if (scale > _MIN_RELATIVE_RESIDUAL * np.sqrt(np.mean(y**2, axis=0))).all():
             x, y, z = x / scale[:, None], y / scale, None if z is None else z / scale[:, None]
             value, inverse, solved = _solve_once(x, y, z, shape)
             return value, inverse / scale, solved, scale
     return value, inverse, solved, ones
 
 
-def _solve_once(x, y, z, shape: _Shape):
+def _solve_once(x, y, z, shape: _SolverOptions):
     n, k, p = x.shape
     size = np.sqrt(np.einsum("nkp,nkp->p", x, x))
     flat, rest = (x / size).reshape(-1, p), (y - x @ shape.prior).ravel()
     if z is None:
-        inverse, solved = _pseudo_inverse(flat, shape.ridge, shape.cut)
-        solved = solved._replace(normal=solved.normal / np.outer(size, size))
+        inverse, solved = _pseudo_inverse(flat, shape.ridge, shape.truncation)
+        solved = solved._replace(normal=solved.inverse_normal_matrix / np.outer(size, size))
     else:
         length = np.sqrt(np.einsum("nkp,nkp->p", z, z))
-        inverse, solved = _by_instruments((z / length).reshape(-1, p), flat)
-        solved = solved._replace(normal=solved.normal / np.outer(size, length))
+        inverse, solved = _solve_by_instruments((z / length).reshape(-1, p), flat)
+        solved = solved._replace(normal=solved.inverse_normal_matrix / np.outer(size, length))
     inverse = inverse / size[:, None]
     return shape.prior + inverse @ rest, inverse.reshape(p, n, k), solved
 
 
-def _carried(inverse: np.ndarray, error: np.ndarray, follow: np.ndarray) -> np.ndarray:
-    """Return the covariance (p, p) of `inverse @ errors` for autoregressive errors `follow`."""
+def _propagate_covariance(inverse: np.ndarray, error: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+    """Return the covariance (p, p) of `inverse @ errors` for autoregressive errors `coefficients`."""
     p, _, k = inverse.shape
     fresh, late = np.empty_like(error), np.empty_like(inverse)
     for c in range(k):
-        weights = np.concatenate([[1.0], -follow[:, c]])
+        weights = np.concatenate([[1.0], -coefficients[:, c]])
         fresh[:, c] = lfilter(weights, 1.0, error[:, c])
         # the effect of an error on all later errors: the recursion backwards in time
         late[:, ::-1, c] = lfilter([1.0], weights, inverse[:, ::-1, c], axis=1)
-    fresh = fresh[len(follow) :]
+    fresh = fresh[len(coefficients) :]
     between = fresh.T @ fresh / len(fresh)
     return np.einsum("pnc,cd,qnd->pq", late, between, late, optimize=True).reshape(p, p)
 
@@ -222,7 +222,7 @@ def autoregression(error: np.ndarray, order: int | None = None) -> np.ndarray:
     Source: Yule and Walker; Levinson's recursion.
     """
     n = len(error)
-    longest = min(_LONGEST, n // 20) if order is None else order
+    longest = min(_MAX_AUTOREGRESSION_ORDER, n // 20) if order is None else order
     tables, best = [], 0
     for column in error.T:
         spectrum = np.abs(np.fft.rfft(column, 2 * n)) ** 2
@@ -243,39 +243,42 @@ def autoregression(error: np.ndarray, order: int | None = None) -> np.ndarray:
     return out
 
 
-def _pseudo_inverse(x: np.ndarray, ridge: float, cut: float) -> tuple[np.ndarray, _Solved]:
+def _pseudo_inverse(x: np.ndarray, ridge: float, truncation: float) -> tuple[np.ndarray, _SolutionProperties]:
     """Return the regularised pseudo-inverse (p, N) of normalised columns, and its properties."""
     u, s, v = np.linalg.svd(x, full_matrices=False)
-    kept = s > max(cut, 1e-14) * s[0]
+    kept = s > max(truncation, 1e-14) * s[0]
     squares = np.where(kept, 1.0 / (s**2 + ridge * s[0] ** 2), 0.0)
-    solved = _Solved(float(s[0] / s[-1]), (v.T * squares) @ v, int(kept.sum()))
+    solved = _SolutionProperties(float(s[0] / s[-1]), (v.T * squares) @ v, int(kept.sum()))
     return (v.T * (s * squares)) @ u.T, solved
 
 
-def _by_instruments(z: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, _Solved]:
+def _solve_by_instruments(z: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, _SolutionProperties]:
     normal = np.linalg.inv(z.T @ x)
-    return normal @ z.T, _Solved(float(np.linalg.cond(x)), normal, x.shape[1])
+    return normal @ z.T, _SolutionProperties(float(np.linalg.cond(x)), normal, x.shape[1])
 
 
-def _whitener(covariance: np.ndarray) -> np.ndarray:
+def _whitening_matrix(covariance: np.ndarray) -> np.ndarray:
     return np.linalg.inv(np.linalg.cholesky(np.asarray(covariance, float)))
 
 
-def _check(matrix, forces, covariance, instruments) -> None:
+def _check_shapes(matrix, forces, covariance, instruments) -> None:
     if matrix.ndim != 3 or forces.shape != matrix.shape[:2]:
         raise InputError(
-            _ESTIMATE, f"regressor (n, k, m) and forces (n, k) do not match: {matrix.shape},"
+            _ESTIMATE_CONTEXT, f"regressor (n, k, m) and forces (n, k) do not match: {matrix.shape},"
             f" {forces.shape}")  # fmt: skip
     if covariance is not None and np.shape(covariance) != (matrix.shape[1],) * 2:
-        raise InputError(_ESTIMATE, f"the covariance must be (k, k): {np.shape(covariance)}")
+        raise InputError(_ESTIMATE_CONTEXT, f"the covariance must be (k, k): {np.shape(covariance)}")
     if instruments is not None and np.shape(instruments) != matrix.shape:
-        raise InputError(_ESTIMATE, "instruments must have the regressor's shape")
+        raise InputError(_ESTIMATE_CONTEXT, "instruments must have the regressor's shape")
 
 
 Method = Literal["weighted", "gauss_markov", "least_squares", "instruments"]
 METHODS = ("weighted", "gauss_markov", "least_squares", "instruments")
-REPEATED = ("gauss_markov", "instruments")  # methods that compare periods of a repeated motion
-_WHERE = "identification"
+METHODS_WITH_PERIOD = (
+    "gauss_markov",
+    "instruments",
+)  # methods that compare periods of a repeated motion
+_ERROR_CONTEXT = "identification"
 
 
 @dataclass(frozen=True)
@@ -283,48 +286,48 @@ class Estimator:
     """Options for estimating the base parameters.
 
     Attributes:
-        method: `weighted`: least squares in which each drive is weighted by its residuals, and
+        method: `weight_equations`: least squares in which each drive is weighted by its residuals, and
             equations with an uncertain sign of dry friction have less weight. `gauss_markov`: the
             same with the covariance between the drives, from repeated periods if there are any.
             `least_squares`: equal weights. `instruments`: weighted, with the regressor of another
             period of the motion as instruments.
         ridge: added to the squared singular values, as a fraction of the largest one squared; moves
             the estimate towards the given parameters.
-        cut: fraction of the largest singular value below which directions keep the given
+        truncation: fraction of the largest singular value below which directions keep the given
             parameters.
-        pairs: number of antithetic noise pairs with which the bias caused by position noise is
+        noise_pairs: number of antithetic noise pairs with which the bias caused by position noise is
             estimated and subtracted; 0 for no correction. Instruments avoid that bias only where
             the regressor is linear in the noise.
     """
 
     method: Method = "weighted"
     ridge: float = 0.0
-    cut: float = 0.0
-    pairs: int = 4
+    truncation: float = 0.0
+    noise_pairs: int = 4
 
     def __post_init__(self) -> None:
         """Raise InputError for unknown methods and invalid values."""
         if self.method not in METHODS:
             raise InputError("estimator", f"{self.method!r} is not known: {', '.join(METHODS)}")
-        if not (0.0 <= self.ridge < np.inf and 0.0 <= self.cut < 1.0):
+        if not (0.0 <= self.ridge < np.inf and 0.0 <= self.truncation < 1.0):
             raise InputError(
                 "estimator",
-                f"ridge must be 0 or more and cut in [0, 1), got {self.ridge} and {self.cut}",
+                f"ridge must be 0 or more and cut in [0, 1), got {self.ridge} and {self.truncation}",
             )
-        if self.method == "instruments" and (self.ridge or self.cut):
+        if self.method == "instruments" and (self.ridge or self.truncation):
             raise InputError("estimator", "instruments cannot be combined with ridge or truncation")
-        if self.pairs < 0:
-            raise InputError("estimator", f"pairs must be 0 or more, got {self.pairs}")
+        if self.noise_pairs < 0:
+            raise InputError("estimator", f"pairs must be 0 or more, got {self.noise_pairs}")
 
 
 @dataclass(frozen=True)
-class Weighted:
+class WeightedEquations:
     """Weighted equations: n rows, k drives, m parameters.
 
     Attributes:
         table: names, units and nominal values of the parameters.
-        weight: (n, k) weights of the equations.
-        doubtful: (k, 2) error variance of each drive, and the variance added by an uncertain
+        weights: (n, k) weights of the equations.
+        error_variances: (k, 2) error variance of each drive, and the variance added by an uncertain
             friction sign.
         matrix: (n, k, m) weighted regressor.
         force: (n, k) weighted forces [N] or [N m].
@@ -334,41 +337,41 @@ class Weighted:
     """
 
     table: Regressor
-    weight: np.ndarray
-    doubtful: np.ndarray
+    weights: np.ndarray
+    error_variances: np.ndarray
     matrix: np.ndarray
     force: np.ndarray
     covariance: np.ndarray | None = None
     instruments: np.ndarray | None = None
 
-    def fitted(
-        self, told: Identifiability, ridge: float = 0.0, cut: float = 0.0,
+    def estimate_base(
+        self, identifiability: Identifiability, ridge: float = 0.0, truncation: float = 0.0,
         order: int | None = None,
     ) -> Estimate:  # fmt: skip
         """Estimate the base parameters; undetermined combinations keep their given values.
 
         Args:
-            told: the base parameters.
+            identifiability: the base parameters.
             ridge: see `Estimator`.
-            cut: see `Estimator`.
+            truncation: see `Estimator`.
             order: order of the errors' autoregression; None to choose it.
 
         Returns:
             The estimate of the base parameters.
         """
-        base = self.matrix[:, :, told.base]
-        given = told.combination @ self.table.nominal
+        base = self.matrix[:, :, identifiability.base]
+        given = identifiability.combination @ self.table.nominal
         rest = self.force - self.matrix @ self.table.nominal + base @ given
-        aside = None if self.instruments is None else self.instruments[:, :, told.base]
+        aside = None if self.instruments is None else self.instruments[:, :, identifiability.base]
         return estimate(
-            base, rest, self.covariance, instruments=aside, ridge=ridge, cut=cut, prior=given,
+            base, rest, self.covariance, instruments=aside, ridge=ridge, truncation=truncation, prior=given,
             order=order,
         )  # fmt: skip
 
 
-def weighted(
-    data: Gathered, structure: Identifiability, method: Method, period: float | None
-) -> Weighted:
+def weight_equations(
+    data: StackedEquations, structure: Identifiability, method: Method, period: float | None
+) -> WeightedEquations:
     """Weight the equations for an estimator.
 
     Args:
@@ -386,27 +389,29 @@ def weighted(
     ones, drives = np.ones_like(data.force), data.force.shape[1]
     alike = np.tile([1.0, 0.0], (drives, 1))
     if method == "least_squares":
-        return Weighted(data.table, ones, alike, data.matrix, data.force, np.eye(drives))
-    plain = Weighted(data.table, ones, alike, data.matrix, data.force)
-    doubtful = find_doubtful(plain.fitted(structure, order=0).residual, data.doubt)
-    weight = weights(doubtful, data.doubt)
+        return WeightedEquations(data.table, ones, alike, data.matrix, data.force, np.eye(drives))
+    plain = WeightedEquations(data.table, ones, alike, data.matrix, data.force)
+    doubtful = estimate_error_variances(
+        plain.estimate_base(structure, order=0).residual, data.friction_sign_uncertainty
+    )
+    weight = compute_weights(doubtful, data.friction_sign_uncertainty)
     matrix, force = weight[:, :, None] * data.matrix, weight * data.force
-    found = Weighted(data.table, weight, doubtful, matrix, force)
+    found = WeightedEquations(data.table, weight, doubtful, matrix, force)
     if method == "gauss_markov":
-        error = found.fitted(structure, order=0).residual
+        error = found.estimate_base(structure, order=0).residual
         if period:  # a difference of periods has no repeated model error and twice the variance
-            error = (error - data.cycle_on(error, period)) / np.sqrt(2.0)
+            error = (error - data.shift_by_period(error, period)) / np.sqrt(2.0)
             error = error[np.isfinite(error).all(axis=1)]
         return replace(found, covariance=error.T @ error / len(error))
     if method == "instruments":
         assert period
-        aside = weight[:, :, None] * np.nan_to_num(data.cycle_on(data.matrix, period))
+        aside = weight[:, :, None] * np.nan_to_num(data.shift_by_period(data.matrix, period))
         return replace(found, instruments=aside)
     return found
 
 
-def identifiable_from(
-    data: Weighted, structure: Identifiability, setup: RegressorSetup, resting: Sequence[str],
+def find_identifiable_parameters(
+    data: WeightedEquations, structure: Identifiability, setup: RegressorSetup, resting: Sequence[str],
     drives: Sequence[str],
 ) -> Identifiability:  # fmt: skip
     """Select the base parameters that noisy data determine.
@@ -427,56 +432,57 @@ def identifiable_from(
         InputError: no parameter is identifiable.
     """
     if not len(structure.base):
-        raise InputError(_WHERE, "no parameter has an effect on the forces of this motion")
+        raise InputError(_ERROR_CONTEXT, "no parameter has an effect on the forces of this motion")
     plain = replace(data, instruments=None)  # inaccurate for poorly determined parameters
-    noise = _long_run(plain.fitted(structure, order=0).residual)
+    noise = _long_run_std(plain.estimate_base(structure, order=0).residual)
     table = data.table
     sizes = reference_sizes(table, setup, np.sqrt(np.mean(data.force**2, axis=0)), drives)
     held = {f"{kind}.{drive}" for kind in FRICTION_TERMS for drive in resting}
     asked = np.array([name not in held for name in table.names])
     rows = (data.matrix / noise[:, None]).reshape(-1, data.matrix.shape[2])
-    told = identifiable_in_noise(rows, table.names, sizes, asked)
+    told = classify_noisy_parameters(rows, table.names, sizes, asked)
     if not len(told.base):
         raise InputError(
-            _WHERE, "no parameter is identifiable from these logs: log a motion with larger forces"
+            _ERROR_CONTEXT,
+            "no parameter is identifiable from these logs: log a motion with larger forces",
         )
     return told
 
 
-def weights(doubtful: np.ndarray, doubt: np.ndarray) -> np.ndarray:
+def compute_weights(error_variances: np.ndarray, sign_uncertainty: np.ndarray) -> np.ndarray:
     """Return weights that decrease with the uncertainty of the friction sign.
 
     Args:
-        doubtful: (k, 2) as in `Weighted`.
-        doubt: (n, k) uncertainty of the signs.
+        error_variances: (k, 2) as in `WeightedEquations`.
+        sign_uncertainty: (n, k) uncertainty of the signs.
 
     Returns:
         (n, k) weights, at most 1.
     """
-    return np.sqrt(doubtful[:, 0] / (doubtful[:, 0] + doubtful[:, 1] * doubt**2))
+    return np.sqrt(error_variances[:, 0] / (error_variances[:, 0] + error_variances[:, 1] * sign_uncertainty**2))
 
 
-def find_doubtful(residual: np.ndarray, doubt: np.ndarray) -> np.ndarray:
+def estimate_error_variances(residual: np.ndarray, sign_uncertainty: np.ndarray) -> np.ndarray:
     """Estimate the additional error variance of equations with an uncertain friction sign.
 
     Args:
         residual: (n, k) residuals of a first estimate.
-        doubt: (n, k) uncertainty of the signs of dry friction.
+        sign_uncertainty: (n, k) uncertainty of the signs of dry friction.
 
     Returns:
-        (k, 2) as in `Weighted`.
+        (k, 2) as in `WeightedEquations`.
     """
-    out = np.tile([1.0, 0.0], (doubt.shape[1], 1))
-    for k in range(doubt.shape[1]):
+    out = np.tile([1.0, 0.0], (sign_uncertainty.shape[1], 1))
+    for k in range(sign_uncertainty.shape[1]):
         square = residual[:, k] ** 2
-        grows = np.column_stack([np.ones(len(square)), doubt[:, k] ** 2])
+        grows = np.column_stack([np.ones(len(square)), sign_uncertainty[:, k] ** 2])
         calm, more = nnls(grows * square.size**-0.5, square * square.size**-0.5)[0]
         if calm > 0.0:
             out[k] = calm, more
     return out
 
 
-def _long_run(residual: np.ndarray) -> np.ndarray:
+def _long_run_std(residual: np.ndarray) -> np.ndarray:
     """Return standard deviations (k,) of independent errors with the same low-frequency power."""
     follow = autoregression(residual)
     fresh = residual.copy()
@@ -486,30 +492,30 @@ def _long_run(residual: np.ndarray) -> np.ndarray:
     return np.maximum(spread, np.std(residual, axis=0))
 
 
-_FALSE = 0.05  # probability that any candidate without effect is kept
-_REDUCTION = "reduction"
+_FALSE_RETENTION_PROBABILITY = 0.05  # probability that any candidate without effect is kept
+_REDUCTION_CONTEXT = "reduction"
 
 
 @dataclass(frozen=True)
-class Step:
+class ReductionStep:
     """One step of a reduction.
 
     Attributes:
         action: `start`, `drop` or `merge`.
         names: parameters that are dropped or merged.
-        figure: for `drop` the estimate over its standard deviation; for `merge` the correlation of
+        statistic: for `drop` the estimate over its standard deviation; for `merge` the correlation of
             the two estimates; for `start` 0.
         parameters: number of remaining parameters.
-        largest_std: largest ratio of a standard deviation to that of the first step, among
+        max_std_ratio: largest ratio of a standard deviation to that of the first step, among
             parameters that are not candidates.
         misfit: weighted squared residuals over the degrees of freedom.
     """
 
     action: str
     names: tuple[str, ...]
-    figure: float
+    statistic: float
     parameters: int
-    largest_std: float
+    max_std_ratio: float
     misfit: float
 
 
@@ -524,7 +530,7 @@ class Reduction:
         std: (p,) standard deviations.
     """
 
-    steps: tuple[Step, ...]
+    steps: tuple[ReductionStep, ...]
     groups: tuple[tuple[str, ...], ...]
     value: np.ndarray
     std: np.ndarray
@@ -559,12 +565,12 @@ def reduce_parameters(
     """
     kind = {name: k for k, group in enumerate(candidates) for name in group}
     if strange := [name for name in kind if name not in names]:
-        raise InputError(_REDUCTION, f"{strange[0]} is not a parameter; valid: {', '.join(names)}")
-    significant = float(norm.isf(0.5 * _FALSE / max(len(kind), 1)))
+        raise InputError(_REDUCTION_CONTEXT, f"{strange[0]} is not a parameter; valid: {', '.join(names)}")
+    significant = float(norm.isf(0.5 * _FALSE_RETENTION_PROBABILITY / max(len(kind), 1)))
     groups: list[tuple[str, ...]] = [(name,) for name in names]
     columns = {name: matrix[:, :, k] for k, name in enumerate(names)}
     whitened = np.linalg.inv(np.linalg.cholesky(covariance))
-    steps: list[Step] = []
+    steps: list[ReductionStep] = []
     first: dict[tuple[str, ...], float] = {}
     separate: set[tuple[tuple[str, ...], tuple[str, ...]]] = set()
 
@@ -582,7 +588,7 @@ def reduce_parameters(
         if not first:
             first.update(std)
         wide = max((s / first[g] for g, s in std.items() if g[0] not in kind), default=1.0)
-        steps.append(Step(action, which, figure, len(groups), float(wide), misfit / free))
+        steps.append(ReductionStep(action, which, figure, len(groups), float(wide), misfit / free))
 
     def drop(now):
         while True:

@@ -18,24 +18,24 @@ from hydrotele.effects import EFFECTS
 from hydrotele.estimate.evidence import Evidence, Fit, standard_deviations
 from hydrotele.estimate.hypothesis import Guess, hypotheses
 from hydrotele.estimate.track import Levels, known_levels, track_run
-from hydrotele.logs.dataset import Dataset, busiest
+from hydrotele.logs.dataset import Dataset, select_exciting_segments
 from hydrotele.machine.machine import Machine
 
-HYDRAULIC = (
+HYDRAULIC_EFFECTS = (
     "valve_gain", "valve_deadband", "spool_lag", "internal_leakage", "bulk_modulus",
     "pump_flow_limit", "relief_pressure",
 )  # fmt: skip
-_ROUNDS = 6  # largest number of rounds, each with new filter gains and sensitivities
-_SETTLED = 0.2  # standard deviations, largest change of a parameter in the last round
-_STEPS = 2  # Gauss-Newton steps between new filter gains
-_TOLD = 0.7  # of the prior's standard deviation: the data determine parameters known better
+_MAX_ROUNDS = 6  # largest number of rounds, each with new filter gains and sensitivities
+_CONVERGENCE_STD = 0.2  # standard deviations, largest change of a parameter in the last round
+_STEPS_PER_ROUND = 2  # Gauss-Newton steps between new filter gains
+_MAX_STD_OVER_PRIOR = 0.7  # of the prior's standard deviation: the data determine parameters known better
 _NORMAL95 = 1.959964
-_MOST = 240.0  # s of data used: every parameter costs one filter run per Jacobian
-_WHERE = "hydraulic identification"
+_MAX_DURATION_S = 240.0  # s of data used: every parameter costs one filter run per Jacobian
+_ERROR_CONTEXT = "hydraulic identification"
 
 
 @dataclass(frozen=True)
-class HydraulicNumber:
+class HydraulicParameter:
     """One identified parameter of the hydraulics.
 
     Attributes:
@@ -47,7 +47,7 @@ class HydraulicNumber:
         value: identified value.
         std: standard deviation.
         ci95: 95 % interval.
-        told: whether the data determine it; otherwise value and std are mostly those of the prior.
+        is_determined: whether the data determine it; otherwise value and std are mostly those of the prior.
     """
 
     effect: str
@@ -58,40 +58,40 @@ class HydraulicNumber:
     value: float
     std: float
     ci95: tuple[float, float]
-    told: bool
+    is_determined: bool
 
     @property
-    def name(self) -> str:
+    def qualified_name(self) -> str:
         """Name with location, such as `valve_gain.boom`."""
         return f"{self.effect}.{self.location}"
 
 
 @dataclass(frozen=True)
-class Hydraulics:
+class HydraulicIdentification:
     """Result of a hydraulic identification.
 
     Attributes:
-        numbers: the identified parameters.
+        parameters: the identified parameters.
         machine: machine with the parameters that the data determine.
-        before: RMS of the whitened one-step prediction errors of the held-out run with the given
+        nominal_rms_error: RMS of the whitened one-step prediction errors of the held-out run with the given
             machine [1]. The noise is that stated by the sensors, otherwise that found with the
             identified machine.
-        after: the same with the identified machine.
+        identified_rms_error: the same with the identified machine.
         status: `ok`, or a sentence that names the problem and the remedy.
         seconds: computing time [s].
     """
 
-    numbers: tuple[HydraulicNumber, ...]
+    parameters: tuple[HydraulicParameter, ...]
     machine: Machine
-    before: float
-    after: float
+    nominal_rms_error: float
+    identified_rms_error: float
     status: str
     seconds: float
 
 
 def identify_hydraulics(
     dataset: Dataset, jobs: int = 2, progress: Callable[[str, float], None] | None = None
-) -> Hydraulics:
+) -> HydraulicIdentification:
     """Identify the parameters of valves, oil, leakage, pump and relief valve.
 
     Args:
@@ -109,23 +109,23 @@ def identify_hydraulics(
     and priors: `hydrotele.effects`.
     """
     started, say = time.perf_counter(), progress or (lambda said, share: None)
-    parts = hypotheses(dataset.machine, HYDRAULIC)
+    parts = hypotheses(dataset.machine, HYDRAULIC_EFFECTS)
     if not parts:
-        raise InputError(_WHERE, f"{dataset.machine.name} has no valves")
-    data = busiest(dataset, _MOST)
+        raise InputError(_ERROR_CONTEXT, f"{dataset.machine.name} has no valves")
+    data = select_exciting_segments(dataset, _MAX_DURATION_S)
     guess = Guess(tuple((h, np.zeros(h.size)) for h in parts))
     evidence = Evidence(data, data.fit, jobs)
     try:
-        fit, settled = _fitted(evidence, guess, say)
+        fit, settled = _fit_in_rounds(evidence, guess, say)
         evidence.set_base(fit.guess)
         say("intervals", 0.9)
         std = standard_deviations(evidence, fit.guess)
         levels = Levels(evidence.tracks[0].levels.noise)
     finally:
         evidence.close()
-    numbers = _numbers(fit.guess, std)
-    machine = _machine(dataset.machine, numbers)
-    sizes = [_size(m, data, levels) for m in (dataset.machine, machine)]
+    numbers = _collect_parameters(fit.guess, std)
+    machine = _apply_parameters(dataset.machine, numbers)
+    sizes = [_prediction_error_rms(m, data, levels) for m in (dataset.machine, machine)]
     status = "ok" if settled else (
         "not converged: the given parameters are inaccurate or the model is incomplete; start again"
         " from the identified machine, or search for missing effects with `hydrotele gap`"
@@ -135,51 +135,51 @@ def identify_hydraulics(
             f"prediction errors on the held-out run are {sizes[1]:.2g} times the sensor noise: the"
             " model is incomplete; search for missing effects with `hydrotele gap`"
         )
-    return Hydraulics(numbers, machine, sizes[0], sizes[1], status, time.perf_counter() - started)
+    return HydraulicIdentification(numbers, machine, sizes[0], sizes[1], status, time.perf_counter() - started)
 
 
-def _fitted(evidence: Evidence, guess: Guess, say: Callable[[str, float], None]):
+def _fit_in_rounds(evidence: Evidence, guess: Guess, report: Callable[[str, float], None]):
     """Fit by Gauss-Newton with new filter gains in every round; return fit and convergence."""
     fit = None
-    for k in range(_ROUNDS):
-        say(f"round {k + 1}", 0.9 * k / _ROUNDS)
+    for k in range(_MAX_ROUNDS):
+        report(f"round {k + 1}", 0.9 * k / _MAX_ROUNDS)
         evidence.set_base(guess)
         before = evidence.base_errors
         loss = float(before @ before + guess.deviation @ guess.deviation)
-        fit = evidence.fit(guess, loss, steps=_STEPS)
+        fit = evidence.fit(guess, loss, steps=_STEPS_PER_ROUND)
         spread = np.sqrt(np.diag(np.linalg.inv(fit.information)))
         moved = np.abs(fit.guess.deviation - guess.deviation) / spread
         guess = fit.guess
-        if moved.max() < _SETTLED:
+        if moved.max() < _CONVERGENCE_STD:
             return fit, True
     assert isinstance(fit, Fit)
     return fit, False
 
 
-def _numbers(guess: Guess, std: np.ndarray) -> tuple[HydraulicNumber, ...]:
+def _collect_parameters(guess: Guess, std: np.ndarray) -> tuple[HydraulicParameter, ...]:
     found, at = [], 0
     for hypothesis, deviation in guess.parts:
         values = hypothesis.values(deviation)
         for name, p in hypothesis.parameters.items():
-            spread, value = float(std[at]) * p.scale, values[name]
+            spread, value = float(std[at]) * p.prior_std, values[name]
             reach = _NORMAL95 * spread
-            found.append(HydraulicNumber(
+            found.append(HydraulicParameter(
                 hypothesis.name, hypothesis.location, name, p.unit, p.nominal, value, spread,
-                (value - reach, value + reach), bool(std[at] < _TOLD),
+                (value - reach, value + reach), bool(std[at] < _MAX_STD_OVER_PRIOR),
             ))  # fmt: skip
             at += 1
     return tuple(found)
 
 
-def _machine(machine: Machine, numbers: tuple[HydraulicNumber, ...]) -> Machine:
+def _apply_parameters(machine: Machine, numbers: tuple[HydraulicParameter, ...]) -> Machine:
     """Return the machine with the determined parameters; all effects here have one parameter."""
     for n in numbers:
-        if n.told:
+        if n.is_determined:
             machine = EFFECTS[n.effect].apply(machine, n.location, {n.parameter: n.value})
     return machine
 
 
-def _size(machine: Machine, data: Dataset, levels: Levels) -> float:
+def _prediction_error_rms(machine: Machine, data: Dataset, levels: Levels) -> float:
     """Return the RMS of the whitened prediction errors of the held-out run."""
     data = dataclasses.replace(data, machine=machine)
     whitened = track_run(machine, data, data.heldout, levels=levels).whitened

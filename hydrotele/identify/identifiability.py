@@ -1,6 +1,6 @@
 """Classification of parameters as identifiable, identifiable in combination, or not identifiable.
 
-`identifiability` uses the null space of a noise-free regressor, `identifiable_in_noise` the
+`classify_parameters` uses the null space of a noise-free regressor, `classify_noisy_parameters` the
 accuracy that noisy equations allow. `reference_sizes` gives the magnitude of each parameter, with
 which its standard deviation is compared.
 """
@@ -13,14 +13,14 @@ import numpy as np
 from hydrotele.identify.setup import RegressorSetup
 from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, Regressor
 
-UNIDENTIFIABLE, COMBINATION, FULL = "unidentifiable", "combination", "full"
-WEAK = "weak"  # influence below the noise
-_NOTHING = 1e-11  # of the largest column with the same unit: rounding
-_RANK = 1e-8  # of the largest singular value of normalised columns: square root of rounding
-_SHARE = 1e-5  # null space component from which a parameter belongs to a combination
-_HALF = 0.5  # of its reference size: largest standard deviation of an identifiable parameter
-_SHIFT = 0.1  # standard deviations: smallest shift for which a parameter is named in a combination
-_COEFFICIENT = 1e-7  # smaller coefficients are rounding
+STATUS_UNIDENTIFIABLE, STATUS_COMBINATION, STATUS_FULL = "unidentifiable", "combination", "full"
+STATUS_WEAK = "weak"  # influence below the noise
+_COLUMN_TOLERANCE = 1e-11  # of the largest column with the same unit: rounding
+_RANK_TOLERANCE = 1e-8  # of the largest singular value of normalised columns: square root of rounding
+_MIN_NULL_SPACE_COMPONENT = 1e-5  # null space component from which a parameter belongs to a combination
+_MAX_STD_OVER_SIZE = 0.5  # of its reference size: largest standard deviation of an identifiable parameter
+_MIN_SHIFT_STD = 0.1  # standard deviations: smallest shift for which a parameter is named in a combination
+_COEFFICIENT_TOLERANCE = 1e-7  # smaller coefficients are rounding
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Identifiability:
         base: (r,) indices of the parameters that represent the base parameters.
         combination: (r, m) base parameters as linear combinations of all parameters.
         condition: condition number of the normalised base columns.
-        gap: last singular value within the rank and the next one, over the largest; 0 without null
+        singular_value_gap: last singular value within the rank and the next one, over the largest; 0 without null
             space and for noisy data.
     """
 
@@ -42,15 +42,20 @@ class Identifiability:
     base: np.ndarray
     combination: np.ndarray
     condition: float
-    gap: tuple[float, float]
+    singular_value_gap: tuple[float, float]
 
     @property
-    def counts(self) -> dict[str, int]:
+    def status_counts(self) -> dict[str, int]:
         """Number of parameters per status; `weak` only if there are any."""
-        known = (UNIDENTIFIABLE, COMBINATION, FULL, *([WEAK] if WEAK in self.status else []))
+        known = (
+            STATUS_UNIDENTIFIABLE,
+            STATUS_COMBINATION,
+            STATUS_FULL,
+            *([STATUS_WEAK] if STATUS_WEAK in self.status else []),
+        )
         return {s: self.status.count(s) for s in known}
 
-    def text(self, base: int) -> str:
+    def format_combination(self, base: int) -> str:
         """Return a base parameter as text, such as `inertia_zz.swing + 2.5 mass.boom`."""
         row = self.combination[base]
         parts = []
@@ -63,8 +68,8 @@ class Identifiability:
         return " ".join(parts).removeprefix("+ ")
 
 
-def identifiability(
-    matrix: np.ndarray, names: Sequence[str], units: Sequence[str], first: Sequence[str] = ()
+def classify_parameters(
+    matrix: np.ndarray, names: Sequence[str], units: Sequence[str], preferred: Sequence[str] = ()
 ) -> Identifiability:
     """Classify parameters by the null space of a noise-free regressor.
 
@@ -72,7 +77,7 @@ def identifiability(
         matrix: (N, m) equations of a motion that excites all parameters that can be excited.
         names: names of the m parameters.
         units: (m,) their units; columns are compared only with columns of the same unit.
-        first: parameters that preferably represent a base parameter, in this order.
+        preferred: parameters that preferably represent a base parameter, in this order.
 
     Returns:
         The classification.
@@ -80,21 +85,17 @@ def identifiability(
     Source: Khoshzaban 1992, 4.4.2 (null space); Gautier 1991, Numerical calculation of the base
     inertial parameters of robots (QR with pivots).
     """
-    triangle = np.asarray(
-        np.linalg.qr(matrix, mode="r") if len(matrix) > matrix.shape[1] else matrix
-    )
+    triangle = np.asarray(np.linalg.qr(matrix, mode="r") if len(matrix) > matrix.shape[1] else matrix)
     size = np.linalg.norm(triangle, axis=0)
     largest = {unit: max(size[k] for k, u in enumerate(units) if u == unit) for unit in units}
-    there = np.array(
-        [s > _NOTHING * max(largest[u], 1e-300) for s, u in zip(size, units, strict=True)]
-    )
+    there = np.array([s > _COLUMN_TOLERANCE * max(largest[u], 1e-300) for s, u in zip(size, units, strict=True)])
     scaled = triangle[:, there] / size[there]
     _, values, directions = np.linalg.svd(scaled, full_matrices=True)
-    rank = int(np.sum(values > _RANK * values[0])) if len(values) else 0
+    rank = int(np.sum(values > _RANK_TOLERANCE * values[0])) if len(values) else 0
     hidden = np.linalg.norm(directions[rank:], axis=0)
-    status = np.full(len(names), UNIDENTIFIABLE, dtype=object)
-    status[there] = np.where(hidden > _SHARE, COMBINATION, FULL)
-    base, combination = _base(triangle, size, there, rank, [list(names).index(n) for n in first])
+    status = np.full(len(names), STATUS_UNIDENTIFIABLE, dtype=object)
+    status[there] = np.where(hidden > _MIN_NULL_SPACE_COMPONENT, STATUS_COMBINATION, STATUS_FULL)
+    base, combination = _select_base(triangle, size, there, rank, [list(names).index(n) for n in preferred])
     kept = np.linalg.svd(triangle[:, base] / size[base], compute_uv=False) if rank else np.ones(1)
     gap = (
         (values[rank - 1] / values[0], values[rank] / values[0])
@@ -107,8 +108,8 @@ def identifiability(
     )  # fmt: skip
 
 
-def identifiable_in_noise(
-    matrix: np.ndarray, names: Sequence[str], sizes: np.ndarray, asked: np.ndarray
+def classify_noisy_parameters(
+    matrix: np.ndarray, names: Sequence[str], sizes: np.ndarray, candidates: np.ndarray
 ) -> Identifiability:
     """Classify parameters by the accuracy with which noisy equations determine them.
 
@@ -122,44 +123,42 @@ def identifiable_in_noise(
         matrix: (N, m) equations divided by the standard deviation of their errors.
         names: names of the m parameters.
         sizes: (m,) reference sizes.
-        asked: (m,) whether a parameter may represent a base parameter.
+        candidates: (m,) whether a parameter may represent a base parameter.
 
     Returns:
         The classification; `weak` parameters have an influence below the noise and keep their given
         values.
     """
     whole = np.linalg.qr(matrix, mode="r") if len(matrix) > matrix.shape[1] else matrix
-    scaled = np.asarray(whole) * (_HALF * sizes)
+    scaled = np.asarray(whole) * (_MAX_STD_OVER_SIZE * sizes)
     length = np.linalg.norm(scaled, axis=0)
-    base = _above_noise(scaled, length, asked)
+    base = _select_columns_above_noise(scaled, length, candidates)
     rows = scaled[:, base]
     inverse = np.linalg.pinv(rows)
     spread = np.linalg.norm(inverse, axis=1)
     weights = inverse @ scaled
     weights[:, base] = np.eye(len(base))
-    weights[np.abs(weights) < _SHIFT * spread[:, None]] = 0.0
+    weights[np.abs(weights) < _MIN_SHIFT_STD * spread[:, None]] = 0.0
     weights[np.arange(len(base)), base] = 1.0
     shared = np.count_nonzero(weights, axis=1) > 1
-    status = np.full(len(names), WEAK, dtype=object)
-    status[length <= _NOTHING * max(length.max(initial=0.0), 1.0)] = UNIDENTIFIABLE
-    status[np.any(weights != 0.0, axis=0)] = COMBINATION
-    status[base[~shared]] = FULL
+    status = np.full(len(names), STATUS_WEAK, dtype=object)
+    status[length <= _COLUMN_TOLERANCE * max(length.max(initial=0.0), 1.0)] = STATUS_UNIDENTIFIABLE
+    status[np.any(weights != 0.0, axis=0)] = STATUS_COMBINATION
+    status[base[~shared]] = STATUS_FULL
     combination = weights * sizes[base][:, None] / sizes
     columns = rows / length[base] if len(base) else np.ones((1, 1))
-    return Identifiability(
-        tuple(names), tuple(status), base, combination, float(np.linalg.cond(columns)), (0.0, 0.0)
-    )
+    return Identifiability(tuple(names), tuple(status), base, combination, float(np.linalg.cond(columns)), (0.0, 0.0))
 
 
-def _above_noise(scaled: np.ndarray, length: np.ndarray, asked: np.ndarray) -> np.ndarray:
+def _select_columns_above_noise(scaled: np.ndarray, length: np.ndarray, candidates: np.ndarray) -> np.ndarray:
     """Return the indices of columns whose parameters have standard deviations of at most 1."""
     chosen: list[int] = []
     span = np.zeros((len(scaled), 0))
-    for k in np.flatnonzero(asked & (length > 1.0)):
+    for k in np.flatnonzero(candidates & (length > 1.0)):
         rest = scaled[:, k] - span @ (span.T @ scaled[:, k])
         rest -= span @ (span.T @ rest)
         size = np.linalg.norm(rest)
-        if size > max(1.0, np.sqrt(_RANK) * 1e-2 * length[k]):
+        if size > max(1.0, np.sqrt(_RANK_TOLERANCE) * 1e-2 * length[k]):
             chosen.append(int(k))
             span = np.column_stack([span, rest / size])
     while chosen:
@@ -170,9 +169,9 @@ def _above_noise(scaled: np.ndarray, length: np.ndarray, asked: np.ndarray) -> n
     return np.array(chosen, int)
 
 
-def _base(triangle, size, there, rank, first):
+def _select_base(triangle, size, nonzero, rank, preferred):
     """Return the indices of independent columns and the combinations of all parameters in them."""
-    order = [k for k in first if there[k]] + [k for k in np.flatnonzero(there) if k not in first]
+    order = [k for k in preferred if nonzero[k]] + [k for k in np.flatnonzero(nonzero) if k not in preferred]
     chosen: list[int] = []
     span = np.zeros((len(triangle), 0))
     for k in order:  # the first parameter of a combination represents it
@@ -181,25 +180,25 @@ def _base(triangle, size, there, rank, first):
         column = triangle[:, k] / size[k]
         rest = column - span @ (span.T @ column)
         rest -= span @ (span.T @ rest)
-        if np.linalg.norm(rest) > np.sqrt(_RANK) * 1e-2:
+        if np.linalg.norm(rest) > np.sqrt(_RANK_TOLERANCE) * 1e-2:
             chosen.append(k)
             span = np.column_stack([span, rest / np.linalg.norm(rest)])
     base = np.array(chosen, int)
     combination = np.zeros((len(base), triangle.shape[1]))
     q, r = np.linalg.qr(triangle[:, base] / size[base])
-    for k in np.flatnonzero(there):
+    for k in np.flatnonzero(nonzero):
         if k in chosen:
             combination[chosen.index(int(k)), k] = 1.0
             continue
         row = np.linalg.solve(r, q.T @ triangle[:, k]) / size[base]
         weights = np.abs(row) * size[base] / size[k]
-        combination[:, k] = np.where(weights > _COEFFICIENT, row, 0.0)
+        combination[:, k] = np.where(weights > _COEFFICIENT_TOLERANCE, row, 0.0)
     return base, combination
 
 
-_PART = 0.05  # of a drive's force: size of friction and offsets that are not given
-_SPEED = 0.1  # m/s or rad/s, speed at which viscous friction has that size
-_LEVER = 0.1  # m: friction of a pin acts at its radius, a tenth of the lever arm of a drive
+_DEFAULT_FORCE_FRACTION = 0.05  # of a drive's force: size of friction and offsets that are not given
+_REFERENCE_SPEED = 0.1  # m/s or rad/s, speed at which viscous friction has that size
+_PIN_LEVER_ARM_M = 0.1  # m: friction of a pin acts at its radius, a tenth of the lever arm of a drive
 
 
 def reference_sizes(
@@ -231,8 +230,8 @@ def reference_sizes(
         elif kind == "drive_inertia":
             sizes.append(max(float(chain.armature[chain.index(place)]), usual))
         else:
-            size = _PART * known.get(place, _LEVER * usual)
-            sizes.append(max(abs(given), size / _SPEED if kind.startswith("viscous") else size))
+            size = _DEFAULT_FORCE_FRACTION * known.get(place, _PIN_LEVER_ARM_M * usual)
+            sizes.append(max(abs(given), size / _REFERENCE_SPEED if kind.startswith("viscous") else size))
     return np.maximum(sizes, 1e-12)
 
 

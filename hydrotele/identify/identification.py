@@ -1,7 +1,7 @@
 """Identification of inertial and friction parameters from records of runs.
 
 `identify_dynamics` fits the base parameters, subtracts the bias caused by position noise, and
-predicts a held-out run. `identify_with_shapes` also selects between sharp and smooth dry friction.
+predicts a held-out run. `identify_with_friction_shapes` also selects between sharp and smooth dry friction.
 
 The covariance follows from the stated sensor noise. The estimate is linear in the forces, with a
 gain for every equation. The adjoint of the low-pass filter maps that gain to single force readings.
@@ -20,43 +20,54 @@ from scipy.signal import fftconvolve
 from hydrotele.core.errors import InputError
 from hydrotele.identify.equations import (
     Equations,
-    Gathered,
+    StackedEquations,
     build_equations,
-    cycle_on,
-    gather,
-    low_pass,
-    row_forces,
+    design_low_pass,
+    predict_forces,
+    shift_by_rows,
+    stack_equations,
 )
 from hydrotele.identify.estimation import (
-    REPEATED,
+    METHODS_WITH_PERIOD,
     Estimate,
     Estimator,
-    Weighted,
-    identifiable_from,
-    weighted,
-    weights,
+    WeightedEquations,
+    compute_weights,
+    find_identifiable_parameters,
+    weight_equations,
 )
-from hydrotele.identify.identifiability import Identifiability, identifiability
-from hydrotele.identify.motion import Processing, Resolution, adjoint, joint_motion, resolution
-from hydrotele.identify.record import IdentificationRecord, beginning, check_repeats, whole_cycles
-from hydrotele.identify.result import Forces, HeldOut, Identification
+from hydrotele.identify.identifiability import Identifiability, classify_parameters
+from hydrotele.identify.motion import (
+    Processing,
+    Resolution,
+    apply_adjoint,
+    compute_joint_motion,
+    estimate_resolution,
+)
+from hydrotele.identify.record import (
+    IdentificationRecord,
+    check_periodicity,
+    cut_beginning,
+    cut_to_whole_cycles,
+)
+from hydrotele.identify.result import HeldOutError, HeldOutForces, Identification
 from hydrotele.identify.setup import RegressorSetup
-from hydrotele.identify.smoothing import Smoothed, smooth
+from hydrotele.identify.smoothing import SmoothedSignal, smooth
 from hydrotele.multibody.inverse_dynamics import Regressor
 
-_SLOPES = 8000  # rows, largest number at which force sensitivities are computed
-_BLOCK = 4  # parameters per block, to limit memory for long logs
+_MAX_SENSITIVITY_ROWS = 8000  # rows, largest number at which force sensitivities are computed
+_PARAMETERS_PER_BLOCK = 4  # parameters per block, to limit memory for long logs
 
 
-def propagated(
-    record: IdentificationRecord, found: Resolution, gain: np.ndarray, setup: RegressorSetup,
+def propagate_noise(
+    record: IdentificationRecord, position_resolution: Resolution, gain: np.ndarray, setup: RegressorSetup,
     processing: Processing, value: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
     """Propagate the sensor noise of one run to the covariance of an estimate.
 
     Args:
         record: the run.
-        found: resolution of its positions.
+        position_resolution: resolution of its positions.
         gain: (p, n, k) gain of the estimate for the run's equations and all drives; 0 if not used.
         setup: definition of the regressor.
         processing: method to differentiate the positions.
@@ -69,7 +80,7 @@ def propagated(
     """
     p, _, k = gain.shape
     assert processing.band
-    low, thin = low_pass(processing.band, record.period, processing.period)
+    low, thin = design_low_pass(processing.band, record.period, processing.period)
     rows = len(record.force)
     spaced = np.zeros((p, rows, k))
     middle = (len(low) - 1) // 2
@@ -77,38 +88,38 @@ def propagated(
     on_force = fftconvolve(spaced, low[None, :, None], mode="same", axes=1)
     noise = np.where(np.isfinite(record.force_noise), record.force_noise, 0.0)
     out = np.einsum("pnk,k,qnk->pq", on_force, noise**2, on_force, optimize=True)
-    motion = joint_motion(record.position, record.period, found, processing)
+    motion = compute_joint_motion(record.position, record.period, position_resolution, processing)
     cycles = 1
     if processing.method == "periodic":  # all cycles have the same sensitivities
         assert processing.period
         cycles = round(rows * record.period / processing.period)
-    slopes = _slopes(motion, rows // cycles, setup, value)
+    slopes = _compute_sensitivities(motion, rows // cycles, setup, value)
     parts = []
-    for first in range(0, p, _BLOCK):
-        folded = on_force[first : first + _BLOCK].reshape(-1, cycles, rows // cycles, k)
+    for first in range(0, p, _PARAMETERS_PER_BLOCK):
+        folded = on_force[first : first + _PARAMETERS_PER_BLOCK].reshape(-1, cycles, rows // cycles, k)
         # the sign of the error, measured minus modelled force, does not matter in a square
         on_motion = np.einsum("pcnk,xnkj->xpnj", folded, slopes, optimize=True)
-        parts.append(adjoint(on_motion, record.period, found, processing))
-    on_position, stated = np.concatenate(parts), found.noise**2 / cycles
+        parts.append(apply_adjoint(on_motion, record.period, position_resolution, processing))
+    on_position, stated = np.concatenate(parts), position_resolution.noise**2 / cycles
     return out + np.einsum("pnj,j,qnj->pq", on_position, stated, on_position, optimize=True)
 
 
-def _slopes(motion: Smoothed, count: int, setup: RegressorSetup, value: np.ndarray) -> np.ndarray:
+def _compute_sensitivities(motion: SmoothedSignal, count: int, setup: RegressorSetup, value: np.ndarray) -> np.ndarray:
     """Return sensitivities (3, n, k, j) of drive forces to positions, rates and accelerations.
 
     In long runs they are computed at every few rows and interpolated, since they change slowly.
     """
-    rows = np.arange(0, count, max(1, count // _SLOPES))
+    rows = np.arange(0, count, max(1, count // _MAX_SENSITIVITY_ROWS))
     motions = np.stack([motion.value, motion.rate, motion.acceleration])[:, rows]
     rate_std = motion.rate_std[rows]
     steps = (motion.value_std[rows], rate_std, motion.acceleration_std[rows])
-    middle = row_forces(setup, motions, value, rate_std)
+    middle = predict_forces(setup, motions, value, rate_std)
     out = np.empty((3, *middle.shape, motions.shape[2]))
     for x, step in enumerate(steps):
         for j in range(motions.shape[2]):
             moved = motions.copy()
             moved[x, :, j] += step[:, j]
-            force = row_forces(setup, moved, value, rate_std)
+            force = predict_forces(setup, moved, value, rate_std)
             out[x, :, :, j] = (force - middle) / np.maximum(step[:, j], 1e-300)[:, None]
     if len(rows) == count:
         return out
@@ -117,14 +128,14 @@ def _slopes(motion: Smoothed, count: int, setup: RegressorSetup, value: np.ndarr
     return (1.0 - part) * out[:, before] + part * out[:, before + 1]
 
 
-_ENOUGH = 240.0  # s of data in total, distributed evenly over the runs
-_PIECE = 20.0  # s, length of one segment of a long run
-_PERIODS = 12.0  # periods of the band, shortest segment: the low-pass filter spans three
+_MAX_BIAS_DURATION_S = 240.0  # s of data in total, distributed evenly over the runs
+_SEGMENT_DURATION_S = 20.0  # s, length of one segment of a long run
+_MIN_SEGMENT_PERIODS = 12.0  # periods of the band, shortest segment: the low-pass filter spans three
 
 
-def motion_bias(
-    data: Gathered, equations: Weighted, base: np.ndarray, found: Estimate, value: np.ndarray,
-    setup: RegressorSetup, processing: Processing, pairs: int, seed: int = 0,
+def estimate_motion_bias(
+    data: StackedEquations, equations: WeightedEquations, base: np.ndarray, found: Estimate, value: np.ndarray,
+    setup: RegressorSetup, processing: Processing, noise_pairs: int, seed: int = 0,
 ) -> np.ndarray:  # fmt: skip
     """Estimate the bias that noise of the positions causes in the base parameters.
 
@@ -141,7 +152,7 @@ def motion_bias(
         value: (m,) all parameters that follow from it.
         setup: definition of the regressor.
         processing: method to differentiate the positions.
-        pairs: number of pairs of a noise sample and its negative [1].
+        noise_pairs: number of pairs of a noise sample and its negative [1].
         seed: seed of the noise [1].
 
     Returns:
@@ -152,30 +163,35 @@ def motion_bias(
     """
     generator = np.random.default_rng(seed)
     total, rows = np.zeros(len(base)), 0
-    for record, resolved, noise in _pieces(data, processing):
-        world = _world(record, resolved, setup, processing, value)
-        for _ in range(pairs):
+    for record, resolved, noise in _iterate_segments(data, processing):
+        world = _simulate_record(record, resolved, setup, processing, value)
+        for _ in range(noise_pairs):
             error = noise * generator.standard_normal(record.position.shape)
             for sign in (1.0, -1.0):
                 moved = replace(world, position=world.position + sign * error)
                 made, _ = build_equations(moved, setup, processing, resolved)
-                matrix, force = made.matrix[:, data.columns], made.force[:, data.columns]
-                weight = weights(equations.doubtful, made.doubt[:, data.columns])
-                left = (weight * (force - matrix @ value)) @ found.white.T
+                matrix, force = (
+                    made.matrix[:, data.drive_columns],
+                    made.force[:, data.drive_columns],
+                )
+                weight = compute_weights(
+                    equations.error_variances, made.friction_sign_uncertainty[:, data.drive_columns]
+                )
+                left = (weight * (force - matrix @ value)) @ found.whitening.T
                 aside = weight[:, :, None] * matrix[:, :, base]
                 if equations.instruments is not None:
                     assert processing.period
                     step = round(processing.period / made.spacing)
-                    aside = np.nan_to_num(cycle_on(aside, step))
+                    aside = np.nan_to_num(shift_by_rows(aside, step))
                 known = np.isfinite(left).all(axis=1)
-                total += np.einsum("nkr,nk->r", (found.white @ aside)[known], left[known])
+                total += np.einsum("nkr,nk->r", (found.whitening @ aside)[known], left[known])
                 rows += int(known.sum())
-    return found.normal @ total * (len(data.force) / max(rows, 1))
+    return found.inverse_normal_matrix @ total * (len(data.force) / max(rows, 1))
 
 
-def _world(
+def _simulate_record(
     record: IdentificationRecord,
-    found: Resolution,
+    position_resolution: Resolution,
     setup: RegressorSetup,
     processing: Processing,
     value: np.ndarray,
@@ -185,16 +201,16 @@ def _world(
     Forces that were unknown stay unknown.
     """
     if processing.method == "periodic":
-        motion = joint_motion(record.position, record.period, found, processing)
+        motion = compute_joint_motion(record.position, record.period, position_resolution, processing)
     else:
-        motion = smooth(record.position, record.period, found.noise)
-    force = row_forces(setup, np.stack([motion.value, motion.rate, motion.acceleration]), value)
+        motion = smooth(record.position, record.period, position_resolution.noise)
+    force = predict_forces(setup, np.stack([motion.value, motion.rate, motion.acceleration]), value)
     force[~np.isfinite(record.force)] = np.nan
     return replace(record, position=motion.value, force=force)
 
 
-def _pieces(
-    data: Gathered, processing: Processing
+def _iterate_segments(
+    data: StackedEquations, processing: Processing
 ) -> Iterator[tuple[IdentificationRecord, Resolution, np.ndarray]]:
     """Yield segments of the runs, the resolution of their positions, and the position noise (k,).
 
@@ -202,7 +218,7 @@ def _pieces(
     of all cycles.
     """
     lengths = [len(record.force) * record.period for record, _ in data.runs]
-    part = min(1.0, _ENOUGH / sum(lengths))
+    part = min(1.0, _MAX_BIAS_DURATION_S / sum(lengths))
     assert processing.band
     for (record, found), length in zip(data.runs, lengths, strict=True):
         noise = found.noise
@@ -215,7 +231,7 @@ def _pieces(
         elif part == 1.0:
             wanted = [(0.0, length)]
         else:
-            piece = min(max(_PIECE, _PERIODS / processing.band), length)
+            piece = min(max(_SEGMENT_DURATION_S, _MIN_SEGMENT_PERIODS / processing.band), length)
             count = max(1, round(part * length / piece))
             starts = (np.arange(count) + 0.5) * length / count - 0.5 * piece
             wanted = [(start, piece) for start in np.clip(starts, 0.0, length - piece)]
@@ -228,121 +244,121 @@ def _pieces(
                 yield cut, found, noise
 
 
-_WORSE = 1.5  # prediction error over noise above which the model is incomplete
-_FOREIGN = 3.0  # prediction error over fitted residuals above which the runs are not informative
+_MAX_ERROR_OVER_NOISE = 1.5  # prediction error over noise above which the model is incomplete
+_MAX_ERROR_OVER_RESIDUAL = 3.0  # prediction error over fitted residuals above which the runs are not informative
 
 
-def heldout_errors(
-    judged: Equations,
+def compute_heldout_errors(
+    equations: Equations,
     table: Regressor,
     value: np.ndarray,
     columns: list[int],
     setup: RegressorSetup,
-) -> dict[str, HeldOut]:
+) -> dict[str, HeldOutError]:
     """Return the prediction errors of the held-out run for each drive at `columns`.
 
     Drives without known forces are omitted.
     """
-    noise = judged.noise_of(value)
+    noise = equations.noise_rms(value)
     out = {}
     for k in columns:
-        force = judged.force[:, k]
+        force = equations.force[:, k]
         known = np.isfinite(force)
         if not known.any():
             continue
         sizes = [
-            float(np.sqrt(np.mean((force - judged.matrix[:, k] @ p)[known] ** 2)))
-            for p in (value, table.nominal)
+            float(np.sqrt(np.mean((force - equations.matrix[:, k] @ p)[known] ** 2))) for p in (value, table.nominal)
         ]
         whole = float(np.sqrt(np.mean(force[known] ** 2)))
-        unit = "N" if setup.chain.tree.slides[setup.chain.index(table.drives[k])] else "N m"
-        out[table.drives[k]] = HeldOut(
-            sizes[0], unit, float(noise[k]), sizes[0] / max(whole, 1e-300), sizes[1]
-        )
+        unit = "N" if setup.chain.tree.is_slide[setup.chain.index(table.drives[k])] else "N m"
+        out[table.drives[k]] = HeldOutError(sizes[0], unit, float(noise[k]), sizes[0] / max(whole, 1e-300), sizes[1])
     return out
 
 
-def heldout_forces(judged: Equations, table: Regressor, value: np.ndarray) -> Forces:
+def compute_heldout_forces(equations: Equations, table: Regressor, value: np.ndarray) -> HeldOutForces:
     """Return measured and predicted forces of the held-out run."""
-    return Forces(
-        judged.name, table.drives, judged.time, judged.force, judged.matrix @ value,
-        judged.matrix @ table.nominal,
+    return HeldOutForces(
+        equations.name, table.drives, equations.time, equations.force, equations.matrix @ value,
+        equations.matrix @ table.nominal,
     )  # fmt: skip
 
 
-def whiteness(residual: np.ndarray) -> np.ndarray:
+def residual_autocorrelation(residual: np.ndarray) -> np.ndarray:
     """Return the correlation (k,) of successive residuals (n, k)."""
     error = residual - residual.mean(axis=0)
     return np.sum(error[1:] * error[:-1], axis=0) / np.sum(error**2, axis=0)
 
 
-def status_of(
-    heldout: dict[str, HeldOut], fitted: dict[str, float], still: np.ndarray, setup: RegressorSetup
+def describe_status(
+    heldout: dict[str, HeldOutError],
+    fitted: dict[str, float],
+    resting: np.ndarray,
+    setup: RegressorSetup,
 ) -> str:
     """Evaluate the result of an identification.
 
     Args:
         heldout: prediction errors of the held-out run.
         fitted: drive -> RMS of the residuals of the fitted runs [N] or [N m].
-        still: (k,) whether a given joint was at rest in all fitted runs.
+        resting: (k,) whether a given joint was at rest in all fitted runs.
         setup: definition of the regressor.
 
     Returns:
         `ok`, or a sentence that names the problem and the remedy.
     """
-    if still.any():
-        names = ", ".join(j for j, stands in zip(setup.given, still, strict=True) if stands)
+    if resting.any():
+        names = ", ".join(j for j, stands in zip(setup.given_joints, resting, strict=True) if stands)
         return (
             f"{names} did not move: parameters that need its motion keep their given values;"
             " log a fast motion of all axes in many poses"
         )
     if not heldout:
         return "the held-out run has no known force, so nothing was validated: hold out another run"
-    worse = [d for d, h in heldout.items() if h.rms > _WORSE * h.noise_rms]
+    worse = [d for d, h in heldout.items() if h.rms > _MAX_ERROR_OVER_NOISE * h.noise_rms]
     if worse:
         return (
             f"on the held-out run the force error of {', '.join(worse)} exceeds the sensor noise:"
             " the model is incomplete; search for missing effects with `hydrotele gap`"
         )
-    worse = [d for d, h in heldout.items() if h.rms > _FOREIGN * fitted[d]]
+    worse = [d for d, h in heldout.items() if h.rms > _MAX_ERROR_OVER_RESIDUAL * fitted[d]]
     if worse:
         return (
             f"on the held-out run the force error of {', '.join(worse)} is more than"
-            f" {_FOREIGN:g} times that on the fitted runs: their motion is not informative enough;"
+            f" {_MAX_ERROR_OVER_RESIDUAL:g} times that on the fitted runs: their motion is not informative enough;"
             " fit runs like the held-out run as well"
         )
     return "ok"
 
 
-_UNSURE = 0.2  # relative uncertainty of a bias: it is computed with a smoothed motion
-_MANY = 2e7  # readings times parameters, above which only residuals give the covariance
+_RELATIVE_BIAS_UNCERTAINTY = 0.2  # relative uncertainty of a bias: it is computed with a smoothed motion
+_MAX_PROPAGATED_GAINS = 2e7  # readings times parameters, above which only residuals give the covariance
 
 
 @dataclass(frozen=True)
-class Fitted:
+class UncorrectedFit:
     """A fit to several runs without bias correction.
 
     Attributes:
         data: equations of the runs.
         processing: method to differentiate the positions, with the band.
         equations: weighted equations.
-        structure: base parameters that the motion determines without noise.
-        told: base parameters that the data determine.
-        estimate: estimate of the base parameters `told`.
-        still: (k,) whether a given joint was at rest in all runs.
+        motion_identifiability: base parameters that the motion determines without noise.
+        data_identifiability: base parameters that the data determine.
+        estimate: estimate of the base parameters `data_identifiability`.
+        joints_at_rest: (k,) whether a given joint was at rest in all runs.
     """
 
-    data: Gathered
+    data: StackedEquations
     processing: Processing
-    equations: Weighted
-    structure: Identifiability
-    told: Identifiability
+    equations: WeightedEquations
+    motion_identifiability: Identifiability
+    data_identifiability: Identifiability
     estimate: Estimate
-    still: np.ndarray
+    joints_at_rest: np.ndarray
 
-    def whole(self) -> np.ndarray:
+    def expand_parameters(self) -> np.ndarray:
         """Return all parameters (m,); undetermined combinations keep their given values."""
-        return _whole(self.told, self.data.table.nominal, self.estimate)
+        return _expand_parameters(self.data_identifiability, self.data.table.nominal, self.estimate)
 
 
 def identify_dynamics(
@@ -374,35 +390,35 @@ def identify_dynamics(
     """
     started, estimator = time.perf_counter(), estimator or Estimator()
     fitted = fit_runs(fit, setup, processing or Processing(), estimator)
-    data, told, found = fitted.data, fitted.told, fitted.estimate
+    data, told, found = fitted.data, fitted.data_identifiability, fitted.estimate
     bias = np.zeros(len(told.base))
-    if _noise_stated(data):
-        found = replace(found, covariance=_covariance(fitted, setup))
-        if estimator.pairs:
-            bias = motion_bias(
-                data, fitted.equations, told.base, found, fitted.whole(), setup, fitted.processing,
-                estimator.pairs,
+    if _has_stated_noise(data):
+        found = replace(found, covariance=_compute_covariance(fitted, setup))
+        if estimator.noise_pairs:
+            bias = estimate_motion_bias(
+                data, fitted.equations, told.base, found, fitted.expand_parameters(), setup, fitted.processing,
+                estimator.noise_pairs,
             )  # fmt: skip
-            unsure = np.outer(_UNSURE * bias, _UNSURE * bias)
+            unsure = np.outer(_RELATIVE_BIAS_UNCERTAINTY * bias, _RELATIVE_BIAS_UNCERTAINTY * bias)
             residual = found.residual + fitted.equations.matrix[:, :, told.base] @ bias
             found = replace(
                 found, value=found.value - bias, covariance=found.covariance + unsure,
                 residual=residual,
             )  # fmt: skip
     table = data.table
-    value = _whole(told, table.nominal, found)
+    value = _expand_parameters(told, table.nominal, found)
     judging = fitted.processing
     if judging.method == "periodic":
         judging = replace(judging, method="zero_phase")
-    resolved = resolution(heldout.position, heldout.period, heldout.position_noise)
+    resolved = estimate_resolution(heldout.position, heldout.period, heldout.position_noise)
     judged, _ = build_equations(heldout, setup, judging, resolved, with_noise=True)
-    predicted = heldout_errors(judged, table, value, data.columns, setup)
+    predicted = compute_heldout_errors(judged, table, value, data.drive_columns, setup)
     return Identification(
-        names=table.names, units=table.units, nominal=table.nominal, value=value, told=told,
-        structure=fitted.structure, estimate=found, bias=bias, heldout=predicted,
-        forces=heldout_forces(judged, table, value), band=judged.band,
-        whiteness=dict(zip(data.drives, whiteness(found.residual).tolist(), strict=True)),
-        status=status_of(predicted, _residual_sizes(fitted), fitted.still, setup),
+        names=table.names, units=table.units, nominal=table.nominal, value=value, data_identifiability=told,
+        motion_identifiability=fitted.motion_identifiability, estimate=found, bias=bias, heldout=predicted,
+        forces=compute_heldout_forces(judged, table, value), band=judged.band,
+        residual_autocorrelation=dict(zip(data.drives, residual_autocorrelation(found.residual).tolist(), strict=True)),
+        status=describe_status(predicted, _residual_rms(fitted), fitted.joints_at_rest, setup),
         notes=(*notes, *data.notes),
         seconds=time.perf_counter() - started,
     )  # fmt: skip
@@ -413,7 +429,7 @@ def fit_runs(
     setup: RegressorSetup,
     processing: Processing,
     estimator: Estimator,
-) -> Fitted:
+) -> UncorrectedFit:
     """Fit the base parameters to runs, without bias correction and validation.
 
     Args:
@@ -438,56 +454,52 @@ def fit_runs(
             )  # fmt: skip
     if processing.method == "periodic":
         assert processing.period
-        fit = [whole_cycles(record, processing.period) for record in fit]
-    resolved = [
-        resolution(r.position, r.period, r.position_noise, _cycles(r, processing)) for r in fit
-    ]
-    if processing.period and (processing.method == "periodic" or estimator.method in REPEATED):
+        fit = [cut_to_whole_cycles(record, processing.period) for record in fit]
+    resolved = [estimate_resolution(r.position, r.period, r.position_noise, _count_cycles(r, processing)) for r in fit]
+    if processing.period and (processing.method == "periodic" or estimator.method in METHODS_WITH_PERIOD):
         for record, found in zip(fit, resolved, strict=True):
-            check_repeats(record, processing.period, found.noise)
+            check_periodicity(record, processing.period, found.noise)
     band = processing.band or min(found.band for found in resolved)
     processing = replace(processing, band=band)
-    data = gather(list(zip(fit, resolved, strict=True)), setup, processing)
+    data = stack_equations(list(zip(fit, resolved, strict=True)), setup, processing)
     rows = data.matrix.reshape(-1, data.matrix.shape[2])
-    structure = identifiability(rows, data.table.names, data.table.units)
-    still = ~np.any([part.moves for part in resolved], axis=0)
+    structure = classify_parameters(rows, data.table.names, data.table.units)
+    still = ~np.any([part.is_moving for part in resolved], axis=0)
     resting = [d for d, stands in zip(data.table.drives, still, strict=True) if stands]
-    equations = weighted(data, structure, estimator.method, processing.period)
-    told = identifiable_from(equations, structure, setup, resting, data.drives)
-    found = equations.fitted(told, estimator.ridge, estimator.cut)
-    return Fitted(data, processing, equations, structure, told, found, still)
+    equations = weight_equations(data, structure, estimator.method, processing.period)
+    told = find_identifiable_parameters(equations, structure, setup, resting, data.drives)
+    found = equations.estimate_base(told, estimator.ridge, estimator.truncation)
+    return UncorrectedFit(data, processing, equations, structure, told, found, still)
 
 
-def _cycles(record: IdentificationRecord, processing: Processing) -> int:
+def _count_cycles(record: IdentificationRecord, processing: Processing) -> int:
     """Return the number of cycles that are averaged."""
     if processing.method != "periodic" or not processing.period:
         return 1
     return round(len(record.force) * record.period / processing.period)
 
 
-def _whole(told: Identifiability, nominal: np.ndarray, found: Estimate) -> np.ndarray:
+def _expand_parameters(told: Identifiability, nominal: np.ndarray, found: Estimate) -> np.ndarray:
     value = nominal.copy()
     value[told.base] += found.value - told.combination @ nominal
     return value
 
 
-def _residual_sizes(fitted: Fitted) -> dict[str, float]:
+def _residual_rms(fitted: UncorrectedFit) -> dict[str, float]:
     """Return the RMS of the unweighted residuals of each drive [N] or [N m]."""
-    residual = fitted.estimate.residual / fitted.equations.weight
-    return dict(
-        zip(fitted.data.drives, np.sqrt(np.mean(residual**2, axis=0)).tolist(), strict=True)
-    )
+    residual = fitted.estimate.residual / fitted.equations.weights
+    return dict(zip(fitted.data.drives, np.sqrt(np.mean(residual**2, axis=0)).tolist(), strict=True))
 
 
-def _noise_stated(data: Gathered) -> bool:
+def _has_stated_noise(data: StackedEquations) -> bool:
     """Return whether the sensors state the noise of all positions and used forces."""
     return all(
-        np.all(record.position_noise > 0.0) and np.isfinite(record.force_noise[data.columns]).all()
+        np.all(record.position_noise > 0.0) and np.isfinite(record.force_noise[data.drive_columns]).all()
         for record, _ in data.runs
     )
 
 
-def _covariance(fitted: Fitted, setup: RegressorSetup) -> np.ndarray:
+def _compute_covariance(fitted: UncorrectedFit, setup: RegressorSetup) -> np.ndarray:
     """Return the covariance (r, r) from sensor noise, increased if the residuals are larger.
 
     For long logs, and for the smoother, which adapts to the data, it follows from the residuals
@@ -495,23 +507,23 @@ def _covariance(fitted: Fitted, setup: RegressorSetup) -> np.ndarray:
     """
     data, found = fitted.data, fitted.estimate
     readings = sum(record.force.size + record.position.size for record, _ in data.runs)
-    many = len(found.value) * readings > _MANY and fitted.processing.method != "periodic"
+    many = len(found.value) * readings > _MAX_PROPAGATED_GAINS and fitted.processing.method != "periodic"
     if many or fitted.processing.method == "optimal":
         return found.covariance
-    value, total = fitted.whole(), np.zeros_like(found.covariance)
+    value, total = fitted.expand_parameters(), np.zeros_like(found.covariance)
     for k, (record, resolved) in enumerate(data.runs):
-        gain = data.spread(fitted.equations.weight * found.gain, k)
-        total += propagated(record, resolved, gain, setup, fitted.processing, value)
+        gain = data.expand_to_run(fitted.equations.weights * found.gain, k)
+        total += propagate_noise(record, resolved, gain, setup, fitted.processing, value)
     size = np.outer(found.std, found.std)
     inverse = np.linalg.pinv(total / size, rcond=1e-10, hermitian=True)
     ratio = np.trace(inverse @ (found.covariance / size)) / found.rank
     return total * max(1.0, ratio)
 
 
-_TRIED = 600.0  # s of data with which the friction shape is selected
+_SHAPE_SELECTION_DURATION_S = 600.0  # s of data with which the friction shape is selected
 
 
-def identify_with_shapes(
+def identify_with_friction_shapes(
     fit: Sequence[IdentificationRecord], heldout: IdentificationRecord, setup: RegressorSetup,
     processing: Processing | None = None, estimator: Estimator | None = None, *,
     notes: Sequence[str] = (),
@@ -536,10 +548,10 @@ def identify_with_shapes(
     """
     started = time.perf_counter()
     processing, estimator = processing or Processing(), estimator or Estimator()
-    if any(one.smoothing for one in setup.rubbing):
-        sharp = replace(setup, rubbing=tuple(replace(one, smoothing=0.0) for one in setup.rubbing))
-        some = _some(fit, processing.period)
-        misfits = [_misfit(some, s, processing, estimator) for s in (setup, sharp)]
+    if any(one.smoothing for one in setup.friction_terms):
+        sharp = replace(setup, rubbing=tuple(replace(one, smoothing=0.0) for one in setup.friction_terms))
+        some = _select_first_runs(fit, processing.period)
+        misfits = [_negative_log_likelihood(some, s, processing, estimator) for s in (setup, sharp)]
         if misfits[1] < misfits[0]:
             setup = sharp
             said = "Sharp Coulomb friction fits these data better than the given smoothing."
@@ -548,18 +560,18 @@ def identify_with_shapes(
     return replace(found, seconds=time.perf_counter() - started)
 
 
-def _some(fit: Sequence[IdentificationRecord], period: float | None) -> list[IdentificationRecord]:
+def _select_first_runs(fit: Sequence[IdentificationRecord], period: float | None) -> list[IdentificationRecord]:
     """Return the first runs with a total length of 600 s; a longer run is cut."""
     some, seconds = [], 0.0
     for record in fit:
-        some.append(beginning(record, _TRIED, period))
+        some.append(cut_beginning(record, _SHAPE_SELECTION_DURATION_S, period))
         seconds += len(record.force) * record.period
-        if seconds >= _TRIED:
+        if seconds >= _SHAPE_SELECTION_DURATION_S:
             break
     return some
 
 
-def _misfit(
+def _negative_log_likelihood(
     fit: Sequence[IdentificationRecord],
     setup: RegressorSetup,
     processing: Processing,
@@ -568,5 +580,5 @@ def _misfit(
     """Return minus twice the log likelihood of the residuals, per row and without constants."""
     found = fit_runs(fit, setup, processing, estimator)
     # weights are inverse standard deviations; without them the most uncertain shape would win
-    doubted = np.sum(np.mean(np.log(found.equations.weight**2), axis=0))
+    doubted = np.sum(np.mean(np.log(found.equations.weights**2), axis=0))
     return float(np.sum(np.log(np.mean(found.estimate.residual**2, axis=0))) - doubted)

@@ -1,10 +1,10 @@
 """Machine with identified parameters, and the document `identify.json`.
 
-The identified base parameters do not determine all parameters. `consistent` selects physically
+The identified base parameters do not determine all parameters. `find_consistent_parameters` selects physically
 consistent ones. Every body is an affine deformation of the given body, so that its mass is positive
 and its inertia belongs to a mass distribution. Friction dissipates energy. The selected machine has
-the best fit with the smallest deformation. `identified_machine` writes the parameters to a
-`Machine`; `identify_document` writes an identification as JSON data.
+the best fit with the smallest deformation. `build_identified_machine` writes the parameters to a
+`Machine`; `build_identify_document` writes an identification as JSON data.
 """
 
 from collections.abc import Mapping
@@ -14,51 +14,53 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
-from hydrotele.effects.effect import changed
-from hydrotele.identify.hydraulic import Hydraulics
-from hydrotele.identify.result import WEAK, Identification, counts, parameter_rows
+from hydrotele.effects.effect import with_value
+from hydrotele.identify.hydraulic import HydraulicIdentification
+from hydrotele.identify.result import STATUS_WEAK, Identification, count_statuses, parameter_rows
 from hydrotele.machine.machine import Machine, SensorError
 from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, FRICTION_TERMS
 
-_USUAL = 0.3  # standard deviation of a deformation: masses to 60 %, dimensions to 30 %
-_THIN = 1e-4  # of the trace of the second moments: smallest second moment of a body
-_CERTAIN = 1e-10  # of the largest variance: smaller variances come from truncation
-_SIGNED = ("asymmetry",)  # friction that may have either sign
+_DEFORMATION_STD = 0.3  # standard deviation of a deformation: masses to 60 %, dimensions to 30 %
+_MIN_SECOND_MOMENT_RATIO = 1e-4  # of the trace of the second moments: smallest second moment of a body
+_MIN_VARIANCE_RATIO = 1e-10  # of the largest variance: smaller variances come from truncation
+_SIGNED_FRICTION_SUFFIXES = ("asymmetry",)  # friction that may have either sign
 
 
 @dataclass(frozen=True)
-class Consistent:
+class ConsistentParameters:
     """Physically consistent parameters.
 
     Attributes:
         value: (m,) parameters in the order of the identification.
-        loss: squared Mahalanobis distance of their base parameters from the estimate. It is about
+        squared_distance: squared Mahalanobis distance of their base parameters from the estimate. It is about
             the number of base parameters if the estimate is consistent within its noise.
     """
 
     value: np.ndarray
-    loss: float
+    squared_distance: float
 
 
 @dataclass(frozen=True)
-class Freedom:
+class AllowedDeformation:
     """Allowed deformation of a body.
 
     Attributes:
-        shear: whether the principal axes may rotate.
-        axis: (3,) direction along which the centre of mass may move; None for all directions.
+        can_rotate_axes: whether the principal axes may rotate.
+        shift_direction: (3,) direction along which the centre of mass may move; None for all directions.
     """
 
-    shear: bool = True
-    axis: np.ndarray | None = None
+    can_rotate_axes: bool = True
+    shift_direction: np.ndarray | None = None
 
 
-def consistent(found: Identification, freedom: Mapping[str, Freedom] | None = None) -> Consistent:
+def find_consistent_parameters(
+    found: Identification, deformations: Mapping[str, AllowedDeformation] | None = None
+) -> ConsistentParameters:
     """Find the physically consistent parameters nearest to an estimate.
 
     Args:
         found: the identification; its given bodies must have mass.
-        freedom: body -> allowed deformation; unrestricted by default.
+        deformations: body -> allowed deformation; unrestricted by default.
 
     Returns:
         The parameters.
@@ -67,72 +69,68 @@ def consistent(found: Identification, freedom: Mapping[str, Freedom] | None = No
     inertial parameter identification (pseudo-inertia); Rucker and Wensing 2022, Smooth
     parameterization of rigid-body inertia.
     """
-    freedom = freedom or {}
+    deformations = deformations or {}
     bodies = [n.partition(".")[2] for n in found.names if n.startswith("mass.")]
-    pieces = [_Body(found, body, freedom.get(body, Freedom())) for body in bodies]
+    pieces = [_DeformableBody(found, body, deformations.get(body, AllowedDeformation())) for body in bodies]
     taken = {k for piece in pieces for k in piece.places}
     others = np.array([k for k in range(len(found.names)) if k not in taken], int)
     std = found.estimate.std
-    variances, ways = np.linalg.eigh(
-        found.estimate.covariance / np.outer(*[found.estimate.std] * 2)
-    )
-    whiten = (ways / np.sqrt(np.maximum(variances, _CERTAIN * variances[-1]))).T
+    variances, ways = np.linalg.eigh(found.estimate.covariance / np.outer(*[found.estimate.std] * 2))
+    whiten = (ways / np.sqrt(np.maximum(variances, _MIN_VARIANCE_RATIO * variances[-1]))).T
     whiten = whiten / std
-    base, wanted = whiten @ found.told.combination, whiten @ found.estimate.value
-    sizes = _sizes(found, others)
-    counts = [piece.size for piece in pieces]
+    base, wanted = whiten @ found.data_identifiability.combination, whiten @ found.estimate.value
+    sizes = _parameter_scales(found, others)
+    counts = [piece.variable_count for piece in pieces]
     ends = np.cumsum([0, *counts])
 
     def value_of(x: np.ndarray) -> np.ndarray:
         value = found.nominal.copy()
         for piece, a, b in zip(pieces, ends, ends[1:], strict=False):
-            value[piece.places] = piece.parameters(x[a:b])
+            value[piece.places] = piece.inertial_parameters(x[a:b])
         value[others] = found.nominal[others] + sizes * x[ends[-1] :]
         return value
 
     def misfit(x: np.ndarray) -> np.ndarray:
         away = base @ value_of(x) - wanted
-        return np.concatenate([away, x[: ends[-1]] / _USUAL, 1e-3 * x[ends[-1] :]])
+        return np.concatenate([away, x[: ends[-1]] / _DEFORMATION_STD, 1e-3 * x[ends[-1] :]])
 
     low = np.full(ends[-1] + len(others), -np.inf)
     for i, k in enumerate(others):
         kind = found.names[k].partition(".")[0]
-        if kind in FRICTION_TERMS and not kind.endswith(_SIGNED):
+        if kind in FRICTION_TERMS and not kind.endswith(_SIGNED_FRICTION_SUFFIXES):
             low[ends[-1] + i] = -found.nominal[k] / sizes[i]
     start = np.zeros(len(low))
-    start[ends[-1] :] = np.maximum(
-        (found.value[others] - found.nominal[others]) / sizes, low[ends[-1] :]
-    )
+    start[ends[-1] :] = np.maximum((found.value[others] - found.nominal[others]) / sizes, low[ends[-1] :])
     solved = least_squares(misfit, start, bounds=(low - 1e-9, np.inf))
     value = value_of(np.maximum(solved.x, low))
-    return Consistent(value, float(np.sum((base @ value - wanted) ** 2)))
+    return ConsistentParameters(value, float(np.sum((base @ value - wanted) ** 2)))
 
 
-class _Body:
+class _DeformableBody:
     """A body with its affine deformations: scaling, mass, shift of the centre of mass, shear."""
 
-    def __init__(self, found: Identification, body: str, freedom: Freedom):
+    def __init__(self, found: Identification, body: str, freedom: AllowedDeformation):
         self.places = np.array([found.names.index(f"{kind}.{body}") for kind in BODY_PARAMETERS])
-        self.given = _thick(_pseudo_inertia(found.nominal[self.places]))
-        if freedom.axis is not None:
-            self.shifts = np.asarray(freedom.axis, float)[None]
+        self.nominal_pseudo_inertia = _add_min_extent(_to_pseudo_inertia(found.nominal[self.places]))
+        if freedom.shift_direction is not None:
+            self.shift_directions = np.asarray(freedom.shift_direction, float)[None]
         else:
-            self.shifts = np.eye(3)
-        self.shear = freedom.shear
-        self.scale = np.sqrt(np.trace(self.given[:3, :3]) / self.given[3, 3])
-        self.size = 4 + len(self.shifts) + (3 if freedom.shear else 0)
+            self.shift_directions = np.eye(3)
+        self.shear = freedom.can_rotate_axes
+        self.scale = np.sqrt(np.trace(self.nominal_pseudo_inertia[:3, :3]) / self.nominal_pseudo_inertia[3, 3])
+        self.variable_count = 4 + len(self.shift_directions) + (3 if freedom.can_rotate_axes else 0)
 
-    def parameters(self, x: np.ndarray) -> np.ndarray:
+    def inertial_parameters(self, x: np.ndarray) -> np.ndarray:
         """Return the inertial parameters (10,) of the deformed body."""
-        shift = self.scale * x[4 : 4 + len(self.shifts)] @ self.shifts
+        shift = self.scale * x[4 : 4 + len(self.shift_directions)] @ self.shift_directions
         deform = np.diag(np.exp(x[:4]))
         deform[:3, 3] = shift
         if self.shear:
             deform[0, 1], deform[0, 2], deform[1, 2] = x[-3:]
-        return _parameters(deform @ self.given @ deform.T)
+        return _from_pseudo_inertia(deform @ self.nominal_pseudo_inertia @ deform.T)
 
 
-def _pseudo_inertia(p: np.ndarray) -> np.ndarray:
+def _to_pseudo_inertia(p: np.ndarray) -> np.ndarray:
     """Return the pseudo-inertia (4, 4) of a body with inertial parameters (10,).
 
     It holds the second moments, first moments and mass.
@@ -145,38 +143,36 @@ def _pseudo_inertia(p: np.ndarray) -> np.ndarray:
     return out
 
 
-def _parameters(pseudo: np.ndarray) -> np.ndarray:
+def _from_pseudo_inertia(pseudo: np.ndarray) -> np.ndarray:
     """Return the inertial parameters (10,) of a pseudo-inertia (4, 4)."""
     second = pseudo[:3, :3]
     inertia = np.trace(second) * np.eye(3) - second
     return np.concatenate([[pseudo[3, 3]], pseudo[:3, 3], inertia[np.triu_indices(3)]])
 
 
-def _thick(pseudo: np.ndarray) -> np.ndarray:
+def _add_min_extent(pseudo: np.ndarray) -> np.ndarray:
     """Return a pseudo-inertia with some extent in every direction, so that it can be scaled."""
     central = pseudo[:3, :3] - np.outer(pseudo[:3, 3], pseudo[:3, 3]) / pseudo[3, 3]
-    least = _THIN * max(float(np.trace(central)), 1e-12)
+    least = _MIN_SECOND_MOMENT_RATIO * max(float(np.trace(central)), 1e-12)
     values, axes = np.linalg.eigh(central)
     out = pseudo.copy()
     out[:3, :3] += axes @ np.diag(np.maximum(values, least) - values) @ axes.T
     return out
 
 
-def _sizes(found: Identification, others: np.ndarray) -> np.ndarray:
+def _parameter_scales(found: Identification, others: np.ndarray) -> np.ndarray:
     """Return scales (o,) of the parameters that do not belong to a body."""
-    spread = {k: s for k, s in zip(found.told.base, found.estimate.std, strict=True)}
-    return np.array(
-        [max(abs(found.nominal[k]), abs(found.value[k]), spread.get(k, 0.0), 1e-9) for k in others]
-    )
+    spread = {k: s for k, s in zip(found.data_identifiability.base, found.estimate.std, strict=True)}
+    return np.array([max(abs(found.nominal[k]), abs(found.value[k]), spread.get(k, 0.0), 1e-9) for k in others])
 
 
-_SURE = 2.0  # standard deviations: smallest change of an offset that is written
-_FRICTION = {"coulomb": "coulomb", "stribeck": "stribeck_extra", "viscous": "viscous"}
+_MIN_OFFSET_CHANGE_STD = 2.0  # standard deviations: smallest change of an offset that is written
+_FRICTION_FIELDS = {"coulomb": "coulomb", "stribeck": "stribeck_extra", "viscous": "viscous"}
 
 
-def identified_machine(
+def build_identified_machine(
     machine: Machine, found: Identification, bars: dict[str, tuple[str, str]]
-) -> tuple[Machine, Consistent]:
+) -> tuple[Machine, ConsistentParameters]:
     """Return a machine with the identified bodies, friction and offsets.
 
     Links of a `Machine` have principal axes parallel to their frames, and tubes and rods have their
@@ -194,20 +190,19 @@ def identified_machine(
     for name in found.names:
         kind, _, body = name.partition(".")
         if kind == "mass":
-            freedom[body] = Freedom(
-                shear=False, axis=_bar_axis(found, body) if body in bars else None
+            freedom[body] = AllowedDeformation(
+                can_rotate_axes=False,
+                shift_direction=_bar_axis(found, body) if body in bars else None,
             )
-    best = consistent(found, freedom)
+    best = find_consistent_parameters(found, freedom)
     numbers = dict(zip(found.names, best.value, strict=True))
     for body in freedom:
         machine = _with_body(machine, body, numbers, bars.get(body))
     for axis, facts in machine.axes.items():
-        place = _drive_joint(found, facts.joint, axis)
+        place = _friction_joint(found, facts.joint, axis)
         if place is None:
             continue
-        drive = (
-            f"axes.{axis}.{'cylinder' if facts.cylinder else 'motor' if facts.motor else 'force'}"
-        )
+        drive = f"axes.{axis}.{'cylinder' if facts.cylinder else 'motor' if facts.motor else 'force'}"
         machine = _with_friction(machine, f"{drive}.friction", place, numbers)
         machine = _with_offset(machine, axis, place, found, numbers)
     return machine, best
@@ -221,7 +216,7 @@ def _bar_axis(found: Identification, body: str) -> np.ndarray:
     return moment / size if size else np.array([1.0, 0.0, 0.0])
 
 
-def _drive_joint(found: Identification, joint: str, axis: str) -> str | None:
+def _friction_joint(found: Identification, joint: str, axis: str) -> str | None:
     """Return the joint in the names of an axis' friction: its cylinder's rod or its joint."""
     for place in (f"{axis}_rod", joint):
         if f"coulomb.{place}" in found.names:
@@ -247,38 +242,34 @@ def _with_body(machine: Machine, body: str, numbers: dict, bar: tuple[str, str] 
     else:
         return machine
     for field, value in numbers_of.items():
-        machine = changed(machine, f"{path}.{field}", value)
+        machine = with_value(machine, f"{path}.{field}", value)
     return machine
 
 
 def _with_friction(machine: Machine, path: str, place: str, numbers: dict) -> Machine:
-    for kind, field in _FRICTION.items():
+    for kind, field in _FRICTION_FIELDS.items():
         if f"{kind}.{place}" in numbers:
-            machine = changed(
-                machine, f"{path}.{field}", float(max(numbers[f"{kind}.{place}"], 0.0))
-            )
+            machine = with_value(machine, f"{path}.{field}", float(max(numbers[f"{kind}.{place}"], 0.0)))
     for kind, whole in (("coulomb", "coulomb"), ("viscous", "viscous")):
         key = f"{kind}_asymmetry.{place}"
         size = numbers.get(f"{whole}.{place}", 0.0)
         if key in numbers and size > 0.0:
             part = float(np.clip(numbers[key] / size, -0.99, 0.99))
-            machine = changed(machine, f"{path}.{kind}_asymmetry", part)
+            machine = with_value(machine, f"{path}.{kind}_asymmetry", part)
     return machine
 
 
-def _with_offset(
-    machine: Machine, axis: str, place: str, found: Identification, numbers: dict
-) -> Machine:
+def _with_offset(machine: Machine, axis: str, place: str, found: Identification, numbers: dict) -> Machine:
     name = f"offset.{place}"
     if name not in numbers:
         return machine
     k = found.names.index(name)
-    spread = {int(b): s for b, s in zip(found.told.base, found.estimate.std, strict=True)}
-    if k not in spread or abs(numbers[name] - found.nominal[k]) < _SURE * spread[k]:
+    spread = {int(b): s for b, s in zip(found.data_identifiability.base, found.estimate.std, strict=True)}
+    if k not in spread or abs(numbers[name] - found.nominal[k]) < _MIN_OFFSET_CHANGE_STD * spread[k]:
         return machine
     facts = machine.axes[axis]
     if facts.force:
-        return changed(machine, f"axes.{axis}.force.offset", float(numbers[name]))
+        return with_value(machine, f"axes.{axis}.force.offset", float(numbers[name]))
     channel = f"pressure_head.{axis}"
     known = machine.sensor_errors.get(channel, SensorError())
     more = numbers[name] / facts.hydraulic_drive.areas[0] * known.scale
@@ -286,9 +277,9 @@ def _with_offset(
     return machine.model_copy(update={"sensor_errors": {**machine.sensor_errors, channel: error}})
 
 
-def identify_document(
-    found: Identification | None, hydraulics: Hydraulics | None = None,
-    best: Consistent | None = None,
+def build_identify_document(
+    found: Identification | None, hydraulics: HydraulicIdentification | None = None,
+    best: ConsistentParameters | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Return the content of `identify.json`; unknown values are None or NaN.
 
@@ -298,10 +289,10 @@ def identify_document(
         best: the nearest physically consistent parameters.
 
     Returns:
-        Keys `parameters`, `condition`, `heldout`, `counts`, `status`, `seconds`, `band_hz`,
-        `whiteness`, `given`, `consistent`, `notes`; `hydraulics` if requested.
+        Keys `parameters`, `condition`, `heldout`, `count_statuses`, `status`, `seconds`, `band_hz`,
+        `whiteness`, `given`, `find_consistent_parameters`, `notes`; `hydraulics` if requested.
     """
-    distance, limit = found.distance(found.nominal) if found else (None, None)
+    distance, limit = found.squared_distance(found.nominal) if found else (None, None)
     rows = parameter_rows(found) if found else []
     document: dict[str, Any] = {
         "parameters": [
@@ -316,19 +307,19 @@ def identify_document(
         "condition": found.estimate.condition if found else None,
         "heldout": {
             drive: {
-                "rms": h.rms, "unit": h.unit, "noise_rms": h.noise_rms, "relative": h.relative,
+                "rms": h.rms, "unit": h.unit, "noise_rms": h.noise_rms, "relative": h.relative_error,
                 "nominal_rms": h.nominal_rms,
             }
             for drive, h in (found.heldout.items() if found else ())
         },
-        "counts": counts(rows),
+        "counts": count_statuses(rows),
         "status": found.status if found else "no force is known",
         "seconds": found.seconds if found else 0.0,
         "band_hz": found.band if found else None,
-        "whiteness": found.whiteness if found else {},
+        "whiteness": found.residual_autocorrelation if found else {},
         "given": {"distance": distance, "limit95": limit},
         "consistent": {
-            "distance": best.loss, "limit95": limit,
+            "distance": best.squared_distance, "limit95": limit,
             "parameters": dict(zip(found.names, best.value.tolist(), strict=True)),
         } if found and best else None,
         "notes": list(found.notes) if found else [],
@@ -336,15 +327,16 @@ def identify_document(
     if hydraulics:
         document["parameters"] += [
             {
-                "name": n.name, "value": n.value if n.told else None,
-                "std": n.std if n.told else None, "ci95": list(n.ci95) if n.told else None,
-                "status": "full" if n.told else WEAK, "unit": n.unit, "nominal": n.nominal,
+                "name": n.qualified_name, "value": n.value if n.is_determined else None,
+                "std": n.std if n.is_determined else None, "ci95": list(n.ci95) if n.is_determined else None,
+                "status": "full" if n.is_determined else STATUS_WEAK, "unit": n.unit, "nominal": n.nominal,
                 "combination": "", "bias": None, "parameter": n.parameter,
             }
-            for n in hydraulics.numbers
+            for n in hydraulics.parameters
         ]  # fmt: skip
         document["hydraulics"] = {
-            "before": hydraulics.before, "after": hydraulics.after, "status": hydraulics.status,
+            "before": hydraulics.nominal_rms_error, "after": hydraulics.identified_rms_error,
+            "status": hydraulics.status,
             "seconds": hydraulics.seconds,
         }  # fmt: skip
         document["seconds"] += hydraulics.seconds

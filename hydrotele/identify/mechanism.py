@@ -2,7 +2,7 @@
 
 No machine file is needed. The MJCF file defines bodies, joints, closures (`connect`, `weld`) and
 drives. A `ColumnMapping` names the columns of positions and forces. `load_mechanism` reads both,
-`mechanism_records` reads the logs.
+`load_mechanism_records` reads the logs.
 """
 
 import fnmatch
@@ -14,25 +14,29 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from hydrotele.core.datafile import Facts, parse, read_yaml, suggest
+from hydrotele.core.datafile import StrictModel, read_yaml, suggest_valid_name, validate_data
 from hydrotele.core.errors import InputError
-from hydrotele.identify.motion import GAP
-from hydrotele.identify.record import IdentificationRecord, trimmed, without_error
+from hydrotele.identify.motion import MAX_GAP_S
+from hydrotele.identify.record import (
+    IdentificationRecord,
+    correct_sensor_error,
+    trim_missing_positions,
+)
 from hydrotele.identify.setup import RegressorSetup, mechanism_setup
-from hydrotele.logs.log import LEFT_OUT, Log, load_log, read_table
+from hydrotele.logs.log import SKIP_COLUMN, Log, load_log, read_table
 from hydrotele.logs.rows import fit_clock
 from hydrotele.machine.machine import SensorError
 from hydrotele.multibody.chain import load_chain
-from hydrotele.multibody.closures import joint_positions
+from hydrotele.multibody.closures import solve_joint_positions
 from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, FRICTION_TERMS
 
-_FITTED = 2.0 / 3.0  # fitted fraction of a single run; the remainder is for validation
-_POSITIONS = ("position.{joint}", "angle.{joint}", "{joint}")
-_FORCES = ("force.{joint}", "torque.{joint}", "effort.{joint}")
-_SPARSE = 1.5  # clock ticks per row, above which rows are interpolated to their median period
+_FIT_FRACTION = 2.0 / 3.0  # fitted fraction of a single run; the remainder is for validation
+_POSITION_PATTERNS = ("position.{joint}", "angle.{joint}", "{joint}")
+_FORCE_PATTERNS = ("force.{joint}", "torque.{joint}", "effort.{joint}")
+_MAX_TICKS_PER_ROW = 1.5  # clock ticks per row, above which rows are interpolated to their median period
 
 
-class ColumnMapping(Facts):
+class ColumnMapping(StrictModel):
     """Assignment of log columns to joints, and known properties of the mechanism.
 
     Names of joints, bodies and closures are those of the MJCF; `*` and `?` are wildcards.
@@ -81,20 +85,18 @@ class Mechanism:
 
     Attributes:
         setup: definition of the regressor.
-        measured: joints whose positions are measured.
+        measured_joints: joints whose positions are measured.
         mapping: the column mapping.
         source: file of the mapping or the MJCF, for messages.
     """
 
     setup: RegressorSetup
-    measured: tuple[str, ...]
+    measured_joints: tuple[str, ...]
     mapping: ColumnMapping
     source: str
 
 
-def load_mechanism(
-    mjcf: str | Path, mapping: str | Path | ColumnMapping | None = None
-) -> Mechanism:
+def load_mechanism(mjcf: str | Path, mapping: str | Path | ColumnMapping | None = None) -> Mechanism:
     """Read a mechanism and its column mapping.
 
     Args:
@@ -115,22 +117,21 @@ def load_mechanism(
         facts = mapping
     else:
         data, lines = read_yaml(mapping)
-        facts = parse(ColumnMapping, data, source, lines)
+        facts = validate_data(ColumnMapping, data, source, lines)
     measured = chain.drives
     if isinstance(facts.position, dict):
-        measured = tuple(_named(chain.joints, facts.position, source, "joint"))
+        measured = tuple(_match_names(chain.joints, facts.position, source, "joint"))
     for stated in (facts.force, facts.force_noise):
         if isinstance(stated, dict):
-            _named(chain.drives, stated, source, "drive")
+            _match_names(chain.drives, stated, source, "drive")
     if isinstance(facts.position_noise, dict):
-        _named(measured, facts.position_noise, source, "measured joint")
+        _match_names(measured, facts.position_noise, source, "measured joint")
     places = (*chain.joints, *chain.closures)
     bodies = [f"{kind}.{body}" for body in chain.bodies for kind in BODY_PARAMETERS]
     alike = tuple(
-        tuple(_named((*chain.bodies, *places), group, source, "body or joint"))
-        for group in facts.alike
+        tuple(_match_names((*chain.bodies, *places), group, source, "body or joint")) for group in facts.alike
     )
-    passive = _named(
+    passive = _match_names(
         [p for p in places if p not in chain.drives], facts.passive_friction, source,
         "joint without drive",
     )  # fmt: skip
@@ -138,38 +139,38 @@ def load_mechanism(
     firsts = {name: group[0] for group in alike for name in group}
     absent = [
         name
-        for name in _named([*bodies, *rubbed], facts.absent, source, "parameter")
+        for name in _match_names([*bodies, *rubbed], facts.absent, source, "parameter")
         if firsts.get(name.partition(".")[2], name.partition(".")[2]) == name.partition(".")[2]
     ]
-    given = _named(chain.joints, facts.coordinates, source, "joint") or measured
-    _named([*passive, *chain.drives], facts.friction, source, "joint with friction")
+    given = _match_names(chain.joints, facts.coordinates, source, "joint") or measured
+    _match_names([*passive, *chain.drives], facts.friction, source, "joint with friction")
     for numbers in facts.friction.values():
-        _named((*FRICTION_TERMS, "stribeck_velocity"), numbers, source, "parameter of friction")
-    _named(
+        _match_names((*FRICTION_TERMS, "stribeck_velocity"), numbers, source, "parameter of friction")
+    _match_names(
         [*(f"position.{j}" for j in measured), *(f"force.{d}" for d in chain.drives)],
         facts.sensor_errors, source, "sensor",
     )  # fmt: skip
     setup = mechanism_setup(
-        chain, given, passive=passive, offsets=facts.offsets, alike=alike, absent=absent,
+        chain, given, passive=passive, offsets=facts.offsets, equal_groups=alike, zero_parameters=absent,
         friction=facts.friction,
     )  # fmt: skip
     return Mechanism(setup, measured, facts, source)
 
 
-def _named(known: Sequence[str], patterns, source: str, what: str) -> list[str]:
+def _match_names(known: Sequence[str], patterns, source: str, label: str) -> list[str]:
     """Return the names that match patterns, in the order of the patterns."""
     out: list[str] = []
     for pattern in patterns:
         found = fnmatch.filter(known, pattern)
         if not found:
-            raise InputError(source, f"has no {what} {pattern!r}: {suggest(pattern, known)}")
+            raise InputError(source, f"has no {label} {pattern!r}: {suggest_valid_name(pattern, known)}")
         out += [name for name in found if name not in out]
     return out
 
 
-def mechanism_records(
+def load_mechanism_records(
     paths: Sequence[str | Path], mechanism: Mechanism, heldout: str | None = None,
-    period: float | None = None, as_measured: bool = False,
+    period: float | None = None, keep_measured_joints: bool = False,
 ) -> tuple[tuple[IdentificationRecord, ...], IdentificationRecord, tuple[str, ...]]:  # fmt: skip
     """Read logs of a mechanism.
 
@@ -179,7 +180,7 @@ def mechanism_records(
         heldout: name of the held-out run. By default it is the first one that begins with `test`,
             otherwise the last. A single run is split in time.
         period: period of a repeated motion [s]; a single run is then split at a whole period.
-        as_measured: whether to keep positions of the measured joints.
+        keep_measured_joints: whether to keep positions of the measured joints.
 
     Returns:
         Records of the fitted runs, of the held-out run, and notes.
@@ -188,25 +189,24 @@ def mechanism_records(
         InputError: a file cannot be read, a column is missing, or there is no such run.
     """
     runs, notes = {}, []
-    for path in _logs(paths):
-        log, columns = _load(path, mechanism)
+    for path in _list_log_files(paths):
+        log, columns = _load_with_columns(path, mechanism)
         if log.name in runs:
             raise InputError(log.source, f"the run name {log.name!r} is used twice: rename one")
-        run, said = _record(log, columns, mechanism)
-        runs[log.name] = run if as_measured else in_coordinates(run, mechanism.setup)
+        run, said = _build_record(log, columns, mechanism)
+        runs[log.name] = run if keep_measured_joints else convert_coordinates(run, mechanism.setup)
         notes += said
     if heldout is not None and heldout not in runs:
-        raise InputError("--heldout", f"there is no run {heldout!r}; {suggest(heldout, runs)}")
+        raise InputError("--heldout", f"there is no run {heldout!r}; {suggest_valid_name(heldout, runs)}")
     if len(runs) == 1:
         (whole,) = runs.values()
-        first = round(_FITTED * len(whole.force))
+        first = round(_FIT_FRACTION * len(whole.force))
         if period:
             step = round(period / whole.period)
             first = max(1, round(first / step)) * step
-        fit, judge = (_rows(whole, slice(0, first)), _rows(whole, slice(first, None)))
+        fit, judge = (_cut_rows(whole, slice(0, first)), _cut_rows(whole, slice(first, None)))
         notes.append(
-            f"{whole.name} is the only run: fitted up to {first * whole.period:.3g} s, validated"
-            " on the remainder."
+            f"{whole.name} is the only run: fitted up to {first * whole.period:.3g} s, validated on the remainder."
         )
         return (fit,), replace(judge, name=f"{whole.name}, last part"), tuple(notes)
     named = sorted(runs)
@@ -214,7 +214,7 @@ def mechanism_records(
     return tuple(runs[n] for n in named if n != chosen), runs[chosen], tuple(notes)
 
 
-def _logs(paths: Sequence[str | Path]) -> list[Path]:
+def _list_log_files(paths: Sequence[str | Path]) -> list[Path]:
     out: list[Path] = []
     for path in map(Path, paths):
         if not path.is_dir():
@@ -236,19 +236,19 @@ class _Column(NamedTuple):
     sign: float
 
 
-def _load(path: Path, mechanism: Mechanism) -> tuple[Log, dict[tuple[str, str], _Column]]:
+def _load_with_columns(path: Path, mechanism: Mechanism) -> tuple[Log, dict[tuple[str, str], _Column]]:
     """Read a log, and return it with the columns by (`position` or `force`, joint)."""
     mapping, chain, source = mechanism.mapping, mechanism.setup.chain, mechanism.source
     raw, columns = read_table(path, missing=True), {}
     names, ours = raw.names, "hydrotele" in raw.metadata  # logs of hydrotele keep their names
-    aliases = dict.fromkeys(names, LEFT_OUT)
+    aliases = dict.fromkeys(names, SKIP_COLUMN)
     if mapping.time not in names:
         raise InputError(path, f"has no time column {mapping.time!r}: name it in the"
                          f" mapping, as `time: COLUMN`; columns: {', '.join(names)}")  # fmt: skip
     aliases[mapping.time] = "time"
     for what, joints, stated, usual in (
-        ("position", mechanism.measured, mapping.position, _POSITIONS),
-        ("force", chain.drives, mapping.force, _FORCES),
+        ("position", mechanism.measured_joints, mapping.position, _POSITION_PATTERNS),
+        ("force", chain.drives, mapping.force, _FORCE_PATTERNS),
     ):
         for number, joint in enumerate(joints):
             if isinstance(stated, dict):
@@ -264,9 +264,9 @@ def _load(path: Path, mechanism: Mechanism) -> tuple[Log, dict[tuple[str, str], 
             if name not in names:
                 raise InputError(
                     path, f"has no column {name!r}, which {source} requires for the {what} of"
-                    f" {joint}; {suggest(name, names)}",
+                    f" {joint}; {suggest_valid_name(name, names)}",
                 )  # fmt: skip
-            straight = chain.tree.slides[chain.index(joint)]
+            straight = chain.tree.is_slide[chain.index(joint)]
             kinds = {"position": ("angle", "position"), "force": ("torque", "force")}[what]
             aliases[name] = f"{kinds[int(straight)]}.{what[0]}{number}"
             columns[what, joint] = _Column(name if ours else aliases[name], sign)
@@ -274,13 +274,13 @@ def _load(path: Path, mechanism: Mechanism) -> tuple[Log, dict[tuple[str, str], 
     return log, columns
 
 
-def _record(
+def _build_record(
     log: Log, columns: dict[tuple[str, str], _Column], mechanism: Mechanism
 ) -> tuple[IdentificationRecord, tuple[str, ...]]:
     chain = mechanism.setup.chain
     clock, notes = fit_clock(log.time, log.source)
     time, period = log.time[clock.row], clock.period
-    if clock.tick[-1] > _SPARSE * len(time):  # no common clock: use the median period
+    if clock.tick[-1] > _MAX_TICKS_PER_ROW * len(time):  # no common clock: use the median period
         period = float(np.median(np.diff(time)))
         notes = (f"{log.name}: {notes[0].rpartition('; ')[0].partition(': ')[2]}; interpolated to"
                  f" {1.0 / period:.4g} Hz.",)  # fmt: skip
@@ -295,17 +295,17 @@ def _record(
         out = np.interp(ticks, time[known], values[clock.row][known])
         after = np.searchsorted(time[known], ticks).clip(1, max(1, known.sum() - 1))
         apart = np.diff(time[known], prepend=time[known][0])[after.clip(0, known.sum() - 1)]
-        return np.where(apart > GAP, np.nan, out)
+        return np.where(apart > MAX_GAP_S, np.nan, out)
 
     def values_of(what: str, joint: str) -> np.ndarray | None:
         column = columns.get((what, joint))
         if column is None:
             return None
         known = mechanism.mapping.sensor_errors.get(f"{what}.{joint}", SensorError())
-        return without_error(column.sign * log[column.channel], known, period)
+        return correct_sensor_error(column.sign * log[column.channel], known, period)
 
     position = []
-    for joint in mechanism.measured:
+    for joint in mechanism.measured_joints:
         if (values := values_of("position", joint)) is None:
             raise InputError(
                 log.source, f"has no column for the position of {joint}: name it in the mapping, as"
@@ -320,21 +320,21 @@ def _record(
         )  # fmt: skip
     mapping = mechanism.mapping
     record = IdentificationRecord(
-        log.name, period, mechanism.measured, np.array(position).T,
-        _noise(mapping.position_noise, mechanism.measured), np.array(force).T,
-        _noise(mapping.force_noise, chain.drives),
+        log.name, period, mechanism.measured_joints, np.array(position).T,
+        _expand_noise(mapping.position_noise, mechanism.measured_joints), np.array(force).T,
+        _expand_noise(mapping.force_noise, chain.drives),
     )  # fmt: skip
-    return trimmed(record), notes
+    return trim_missing_positions(record), notes
 
 
-def _noise(stated: float | dict[str, float] | None, joints: Sequence[str]) -> np.ndarray:
+def _expand_noise(stated: float | dict[str, float] | None, joints: Sequence[str]) -> np.ndarray:
     """Return the noise (k,) of readings, NaN where it is not stated."""
     if isinstance(stated, dict):
         return np.array([stated.get(joint, np.nan) for joint in joints])
     return np.full(len(joints), np.nan if stated is None else stated)
 
 
-def in_coordinates(record: IdentificationRecord, setup: RegressorSetup) -> IdentificationRecord:
+def convert_coordinates(record: IdentificationRecord, setup: RegressorSetup) -> IdentificationRecord:
     """Convert the positions of a record to the given joints of a setup.
 
     Args:
@@ -350,18 +350,18 @@ def in_coordinates(record: IdentificationRecord, setup: RegressorSetup) -> Ident
 
     Source: Abdellatif 2008, section 4.1.
     """
-    if record.axes == setup.given:
+    if record.axes == setup.given_joints:
         return record
-    places = [setup.chain.index(name) for name in setup.given]
+    places = [setup.chain.index(name) for name in setup.given_joints]
     try:
-        q = joint_positions(setup.chain, record.axes, record.position)
+        q = solve_joint_positions(setup.chain, record.axes, record.position)
     except InputError as error:
         raise InputError(record.name, str(error)) from None
     return replace(
-        record, axes=setup.given, position=q[:, places],
+        record, axes=setup.given_joints, position=q[:, places],
         position_noise=np.full(len(places), np.nan),
     )  # fmt: skip
 
 
-def _rows(record: IdentificationRecord, rows: slice) -> IdentificationRecord:
+def _cut_rows(record: IdentificationRecord, rows: slice) -> IdentificationRecord:
     return replace(record, position=record.position[rows], force=record.force[rows])

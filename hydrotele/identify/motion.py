@@ -1,7 +1,7 @@
 """Filtering and differentiation of noisy joint positions, with standard deviations.
 
-`resolution` estimates noise and bandwidth of the positions. `joint_motion` computes position, rate
-and acceleration with the optimal smoother, a zero-phase filter, finite differences, or `periodic`,
+`estimate_resolution` estimates noise and bandwidth of the positions. `compute_joint_motion` computes position, rate
+and acceleration with the optimal smoother, a zero-phase filter, finite differences, or `filter_periodic`,
 which filters and differentiates periodic signals in the frequency domain.
 """
 
@@ -13,25 +13,25 @@ import numpy as np
 
 from hydrotele.core.errors import InputError
 from hydrotele.identify.smoothing import (
-    Smoothed,
-    checked_period,
-    columns_of,
-    per_column,
+    SmoothedSignal,
+    as_columns,
+    check_period,
+    expand_per_column,
+    filter_zero_phase,
     smooth,
-    zero_phase,
 )
 from hydrotele.multibody.inverse_dynamics import Projection
 
-_PERIODIC = "periodic filter"
+_PERIODIC_CONTEXT = "periodic filter"
 
 
-def periodic(
+def filter_periodic(
     values: np.ndarray,
     period: float,
     samples_per_cycle: int,
     harmonics: int,
     noise: float | np.ndarray | None = None,
-) -> Smoothed:
+) -> SmoothedSignal:
     """Reduce a signal to the mean and first harmonics of its cycles, and differentiate it exactly.
 
     With `N` samples, white noise of standard deviation s causes standard deviations of
@@ -59,27 +59,28 @@ def periodic(
 
     >>> import numpy as np
     >>> phase = 2 * np.pi * np.arange(100) / 50
-    >>> found = periodic(np.sin(phase), 0.02, samples_per_cycle=50, harmonics=3)
+    >>> found = filter_periodic(np.sin(phase), 0.02, samples_per_cycle=50, harmonics=3)
     >>> bool(np.allclose(found.rate, 2 * np.pi * np.cos(phase)))
     True
     """
-    dt, samples = checked_period(period, _PERIODIC), columns_of(values, 1, _PERIODIC)
+    dt, samples = check_period(period, _PERIODIC_CONTEXT), as_columns(values, 1, _PERIODIC_CONTEXT)
     rows, cycle = len(samples), int(samples_per_cycle)
     if not np.isfinite(samples).all():
         row = int(np.argwhere(np.isnan(samples))[0, 0])
         raise InputError(
-            _PERIODIC,
+            _PERIODIC_CONTEXT,
             f"row {row} is missing, but complete cycles are needed: use the optimal smoother",
         )
     if cycle < 3 or rows % cycle:
         raise InputError(
-            _PERIODIC,
+            _PERIODIC_CONTEXT,
             f"{rows} samples are not whole cycles of {cycle}: cut the record to"
             f" {rows // max(cycle, 1) * cycle} samples",
         )
     if not 0 <= harmonics < 0.5 * cycle:
         raise InputError(
-            _PERIODIC, f"harmonics must be below {cycle / 2:g} for {cycle} samples per cycle"
+            _PERIODIC_CONTEXT,
+            f"harmonics must be below {cycle / 2:g} for {cycle} samples per cycle",
         )
     mean = samples.reshape(-1, cycle, samples.shape[1]).mean(axis=0)
     spectrum = np.fft.rfft(mean, axis=0)
@@ -89,7 +90,7 @@ def periodic(
     whole = [np.tile(part, (rows // cycle, 1)) for part in parts]
     free = rows - 1 - 2 * harmonics
     if noise is not None:
-        sigma = per_column(noise, samples.shape[1], "noise", _PERIODIC)
+        sigma = expand_per_column(noise, samples.shape[1], "noise", _PERIODIC_CONTEXT)
     elif free > 0:
         sigma = np.sqrt(np.sum((samples - whole[0]) ** 2, axis=0) / free)
     else:
@@ -98,20 +99,18 @@ def periodic(
     gains = [1.0 + 2.0 * harmonics, 2.0 * np.sum(speeds**2), 2.0 * np.sum(speeds**4)]
     shape = np.shape(values)
     spread = (np.broadcast_to(sigma * np.sqrt(g / rows), samples.shape) for g in gains)
-    return Smoothed(
-        *(part.reshape(shape) for part in whole), *(s.reshape(shape).copy() for s in spread)
-    )
+    return SmoothedSignal(*(part.reshape(shape) for part in whole), *(s.reshape(shape).copy() for s in spread))
 
 
 Method = Literal["optimal", "zero_phase", "periodic", "raw"]
 METHODS = ("optimal", "zero_phase", "periodic", "raw")
-_KEPT = 2.5  # filter cutoff over resolved bandwidth: there the signal is a thousandth of the noise
-_BAND = 0.5  # band of the equations over bandwidth: there accelerations exceed their noise
-_CONTENT = 0.98  # of the accelerations' power: above it, forces depend on more than the motion
-_LINES = 10.0  # smallest number of the record's spectral lines in the band
-_MOVES = 10.0  # standard deviations of the noise: smallest amplitude of a moving joint
-GAP = 0.1  # s, longest gap that a filter may interpolate
-_WHERE = "signal processing"
+_CUTOFF_OVER_BANDWIDTH = 2.5  # filter cutoff over resolved bandwidth: there the signal is a thousandth of the noise
+_BAND_OVER_BANDWIDTH = 0.5  # band of the equations over bandwidth: there accelerations exceed their noise
+_ACCELERATION_POWER_FRACTION = 0.98  # of the accelerations' power: above it, forces depend on more than the motion
+_MIN_SPECTRAL_LINES = 10.0  # smallest number of the record's spectral lines in the band
+_MIN_MOTION_OVER_NOISE = 10.0  # standard deviations of the noise: smallest amplitude of a moving joint
+MAX_GAP_S = 0.1  # s, longest gap that a filter may interpolate
+_ERROR_CONTEXT = "signal processing"
 
 
 @dataclass(frozen=True)
@@ -119,13 +118,13 @@ class Processing:
     """Options for differentiating positions, and the frequency band of the equations.
 
     Attributes:
-        method: `zero_phase` filter, `optimal` smoother, `periodic` (frequency domain) or `raw`
+        method: `filter_zero_phase` filter, `optimal` smoother, `filter_periodic` (frequency domain) or `raw`
             differences. A smoother attenuates sharp corners of a motion, which reduces estimated
             inertia and friction near reversals; a filter with twice the bandwidth does not.
         band: cutoff of the low-pass filter of regressor and forces [Hz]; None to derive it from the
             resolution of the positions.
         period: period of a repeated motion [s], otherwise None.
-        harmonics: number of harmonics kept by `periodic`; 0 for those within the bandwidth of the
+        harmonics: number of harmonics kept by `filter_periodic`; 0 for those within the bandwidth of the
             zero-phase filter.
     """
 
@@ -137,15 +136,15 @@ class Processing:
     def __post_init__(self) -> None:
         """Raise InputError for unknown methods and missing or invalid values."""
         if self.method not in METHODS:
-            raise InputError(_WHERE, f"{self.method!r} is not known: {', '.join(METHODS)}")
+            raise InputError(_ERROR_CONTEXT, f"{self.method!r} is not known: {', '.join(METHODS)}")
         if self.band is not None and not (math.isfinite(self.band) and self.band > 0):
-            raise InputError(_WHERE, f"the band must be positive, got {self.band} Hz")
+            raise InputError(_ERROR_CONTEXT, f"the band must be positive, got {self.band} Hz")
         if self.period is not None and not (math.isfinite(self.period) and self.period > 0):
-            raise InputError(_WHERE, f"the period must be positive, got {self.period} s")
+            raise InputError(_ERROR_CONTEXT, f"the period must be positive, got {self.period} s")
         if self.harmonics < 0:
-            raise InputError(_WHERE, f"harmonics must be 0 or more, got {self.harmonics}")
+            raise InputError(_ERROR_CONTEXT, f"harmonics must be 0 or more, got {self.harmonics}")
         if self.method == "periodic" and not self.period:
-            raise InputError(_WHERE, "periodic needs the period of the motion [s]")
+            raise InputError(_ERROR_CONTEXT, "periodic needs the period of the motion [s]")
 
 
 @dataclass(frozen=True)
@@ -155,25 +154,23 @@ class Resolution:
     Attributes:
         bandwidth: frequency [Hz] at which the optimal smoother has a gain of 1/2, smallest of the
             moving joints; at most 0.2 of the sample rate.
-        moves: (k,) whether a joint moves by more than ten times the noise.
-        content: frequency [Hz] that contains 98 % of the accelerations' power.
+        is_moving: (k,) whether a joint moves by more than ten times the noise.
+        acceleration_bandwidth: frequency [Hz] that contains 98 % of the accelerations' power.
         noise: (k,) standard deviation of one position [rad] or [m], stated or estimated.
     """
 
     bandwidth: float
-    moves: np.ndarray
-    content: float
+    is_moving: np.ndarray
+    acceleration_bandwidth: float
     noise: np.ndarray
 
     @property
     def band(self) -> float:
         """Band of the equations [Hz]."""
-        return min(_BAND * self.bandwidth, self.content)
+        return min(_BAND_OVER_BANDWIDTH * self.bandwidth, self.acceleration_bandwidth)
 
 
-def resolution(
-    positions: np.ndarray, period: float, noise: np.ndarray, cycles: int = 1
-) -> Resolution:
+def estimate_resolution(positions: np.ndarray, period: float, noise: np.ndarray, cycles: int = 1) -> Resolution:
     """Estimate bandwidth and noise of positions.
 
     The gain of the optimal smoother is `1 / (1 + (f/f_h)^(2 order))`. The mean of many cycles has
@@ -190,30 +187,30 @@ def resolution(
 
     Source: Wiener filter of an integrator chain in white noise.
     """
-    smoothed = smooth(positions, period, _known(noise))
+    smoothed = smooth(positions, period, _stated_noise(noise))
     ratio = math.sqrt(cycles) * smoothed.input_std / smoothed.noise
     halves = ratio ** (1.0 / smoothed.order) / (2.0 * math.pi)
-    moves = np.nanstd(smoothed.value, axis=0) > _MOVES * smoothed.noise
+    moves = np.nanstd(smoothed.value, axis=0) > _MIN_MOTION_OVER_NOISE * smoothed.noise
     limit = 0.2 / period
     power = np.cumsum(np.abs(np.fft.rfft(smoothed.acceleration[:, moves], axis=0)) ** 2, axis=0)
-    rows = np.argmax(power >= _CONTENT * power[-1], axis=0)
+    rows = np.argmax(power >= _ACCELERATION_POWER_FRACTION * power[-1], axis=0)
     lines = np.fft.rfftfreq(len(positions), period)
-    least = min(_LINES * lines[1], limit)
+    least = min(_MIN_SPECTRAL_LINES * lines[1], limit)
     return Resolution(
-        bandwidth=max(float(min([limit, *halves[moves]])), least / _BAND), moves=moves,
-        content=max([*lines[rows], least]) if moves.any() else limit, noise=smoothed.noise,
+        bandwidth=max(float(min([limit, *halves[moves]])), least / _BAND_OVER_BANDWIDTH), is_moving=moves,
+        acceleration_bandwidth=max([*lines[rows], least]) if moves.any() else limit, noise=smoothed.noise,
     )  # fmt: skip
 
 
-def joint_motion(
-    positions: np.ndarray, period: float, found: Resolution, processing: Processing
-) -> Smoothed:
+def compute_joint_motion(
+    positions: np.ndarray, period: float, position_resolution: Resolution, processing: Processing
+) -> SmoothedSignal:
     """Filter and differentiate the positions of all joints.
 
     Args:
         positions: (n, k) positions [rad] or [m], NaN where missing.
         period: time between rows [s].
-        found: resolution of the positions.
+        position_resolution: resolution of the positions.
         processing: method to differentiate the positions.
 
     Returns:
@@ -223,15 +220,17 @@ def joint_motion(
         InputError: the method cannot be used with these positions.
     """
     if processing.method == "optimal":
-        return smooth(positions, period, found.noise)
-    moving = _filtered(positions, period, found, processing, found.noise)
-    if found.moves.all():
+        return smooth(positions, period, position_resolution.noise)
+    moving = _apply_linear_filter(positions, period, position_resolution, processing, position_resolution.noise)
+    if position_resolution.is_moving.all():
         return moving
-    return _rested(moving, smooth(positions, period, found.noise), found.moves)
+    return _replace_resting_joints(
+        moving, smooth(positions, period, position_resolution.noise), position_resolution.is_moving
+    )
 
 
-def adjoint(
-    gain: np.ndarray, period: float, found: Resolution, processing: Processing
+def apply_adjoint(
+    gain: np.ndarray, period: float, position_resolution: Resolution, processing: Processing
 ) -> np.ndarray:
     """Apply the adjoint of filtering and differentiation to gains on a motion.
 
@@ -241,66 +240,66 @@ def adjoint(
     Args:
         gain: (3, p, n, k) gains of p sums on positions, rates and accelerations.
         period: time between rows [s].
-        found: resolution of the positions.
+        position_resolution: resolution of the positions.
         processing: method to differentiate the positions.
 
     Returns:
         (p, n, k) gains on measured positions; 0 for joints at rest.
     """
     _, p, rows, k = gain.shape
-    flat = np.where(found.moves, gain, 0.0).transpose(0, 2, 1, 3).reshape(3, rows, p * k)
-    parts = [_filtered(one, period, found, processing, None) for one in flat]
+    flat = np.where(position_resolution.is_moving, gain, 0.0).transpose(0, 2, 1, 3).reshape(3, rows, p * k)
+    parts = [_apply_linear_filter(one, period, position_resolution, processing, None) for one in flat]
     out = parts[0].value - parts[1].rate + parts[2].acceleration
     return out.reshape(rows, p, k).transpose(1, 0, 2)
 
 
-def _filtered(
-    positions: np.ndarray, period: float, found: Resolution, processing: Processing,
+def _apply_linear_filter(
+    positions: np.ndarray, period: float, position_resolution: Resolution, processing: Processing,
     noise: np.ndarray | None,
-) -> Smoothed:  # fmt: skip
+) -> SmoothedSignal:  # fmt: skip
     """Apply the linear filter of the method to any number of columns, and differentiate."""
     if processing.method == "zero_phase":
-        cutoff = min(_KEPT * found.bandwidth, 0.4 / period)
-        return zero_phase(positions, period, cutoff, noise, bridge=round(GAP / period))
+        cutoff = min(_CUTOFF_OVER_BANDWIDTH * position_resolution.bandwidth, 0.4 / period)
+        return filter_zero_phase(positions, period, cutoff, noise, max_gap=round(MAX_GAP_S / period))
     if processing.method == "periodic":
         assert processing.period is not None
         cycle = round(processing.period / period)
-        highest = round(_KEPT * found.bandwidth * processing.period)
+        highest = round(_CUTOFF_OVER_BANDWIDTH * position_resolution.bandwidth * processing.period)
         harmonics = min(processing.harmonics or highest, (cycle - 1) // 2)
-        return periodic(positions, period, cycle, harmonics, noise)
+        return filter_periodic(positions, period, cycle, harmonics, noise)
     rate = np.gradient(positions, period, axis=0)
     acceleration = np.gradient(rate, period, axis=0)
     spread = np.broadcast_to(np.nan if noise is None else noise, positions.shape)
-    return Smoothed(
+    return SmoothedSignal(
         positions, rate, acceleration, spread, spread / (math.sqrt(2.0) * period),
         spread * math.sqrt(6.0) / (4.0 * period**2),
     )  # fmt: skip
 
 
-def rate_deviations(found: Projection, given: list[int], rate_std: np.ndarray) -> np.ndarray:
+def propagate_rate_std(projection: Projection, given_joints: list[int], rate_std: np.ndarray) -> np.ndarray:
     """Propagate standard deviations of the given joints' rates to all joints.
 
     Args:
-        found: projection on k drives.
-        given: indices of the k joints whose motion is known.
+        projection: projection on k drives.
+        given_joints: indices of the k joints whose motion is known.
         rate_std: (n, k) standard deviations of their rates [rad/s] or [m/s].
 
     Returns:
         (n, v) standard deviations [rad/s] or [m/s].
     """
     # share[n, d, v] = d q_v / d q_d for the drives d; with it d q_v / d q_g for the given joints g
-    moves = np.linalg.solve(found.share[:, :, given], found.share)
+    moves = np.linalg.solve(projection.joint_projection[:, :, given_joints], projection.joint_projection)
     return np.sqrt(np.einsum("ngv,ng->nv", moves**2, rate_std**2))
 
 
-def _rested(moving: Smoothed, smoothed: Smoothed, moves: np.ndarray) -> Smoothed:
+def _replace_resting_joints(moving: SmoothedSignal, smoothed: SmoothedSignal, is_moving: np.ndarray) -> SmoothedSignal:
     """Use the smoother's motion for joints at rest: a filter would turn their noise into motion."""
-    return Smoothed(*(
-        np.where(moves, getattr(moving, part.name), getattr(smoothed, part.name))
-        for part in fields(Smoothed)
+    return SmoothedSignal(*(
+        np.where(is_moving, getattr(moving, part.name), getattr(smoothed, part.name))
+        for part in fields(SmoothedSignal)
     ))  # fmt: skip
 
 
-def _known(noise: np.ndarray) -> np.ndarray | None:
+def _stated_noise(noise: np.ndarray) -> np.ndarray | None:
     """Return the stated noise, or None to estimate it, also for a stated noise of 0."""
     return noise if (np.isfinite(noise) & (noise > 0.0)).all() else None

@@ -1,6 +1,6 @@
 """Records for identification: joint positions and drive forces of a run on a uniform clock.
 
-`records` computes them from the logs of a machine, with known sensor defects removed. The other
+`build_records` computes them from the logs of a machine, with known sensor defects removed. The other
 functions cut records and check that a motion is periodic.
 """
 
@@ -12,14 +12,14 @@ import numpy as np
 from hydrotele.core.errors import InputError
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.kinematics.from_machine import DriveLinkage, axis_linkage
-from hydrotele.kinematics.linkages import LoopOpen
+from hydrotele.kinematics.linkages import LoopOpenError
 from hydrotele.logs.dataset import Dataset, RunData
-from hydrotele.machine.machine import Machine, SensorError, noise_rms, sensor_set
+from hydrotele.machine.machine import Machine, SensorError, get_sensors, noise_rms
 
-_WHERE = "identification"
-_DRIFT = 0.5  # rows, largest shift of a cycle against the rows over a whole record
-_MEDIAN = 0.6745  # median absolute value of a normal error over its standard deviation
-_UNLIKE = 8.0  # noise multiples: servos react to noise, so that cycles differ slightly
+_ERROR_CONTEXT = "identification"
+_MAX_CYCLE_DRIFT_ROWS = 0.5  # rows, largest shift of a cycle against the rows over a whole record
+_MEDIAN_OVER_STD = 0.6745  # median absolute value of a normal error over its standard deviation
+_MAX_DIFFERENCE_OVER_NOISE = 8.0  # noise multiples: servos react to noise, so that cycles differ slightly
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class IdentificationRecord:
     force_noise: np.ndarray
 
 
-def records(
+def build_records(
     dataset: Dataset,
 ) -> tuple[tuple[IdentificationRecord, ...], IdentificationRecord, tuple[str, ...]]:
     """Compute positions and forces of all runs.
@@ -67,10 +67,10 @@ def records(
     for axis, facts in dataset.machine.axes.items():
         if facts.transmission:
             raise InputError(
-                _WHERE, f"{axis} has a transmission (backlash or flexibility) between drive and"
+                _ERROR_CONTEXT, f"{axis} has a transmission (backlash or flexibility) between drive and"
                 " load: measurements of one side do not determine the other",
             )  # fmt: skip
-    axes = tuple(axis for axis in dataset.axes if _positions(dataset, axis))
+    axes = tuple(axis for axis in dataset.axes if _position_channels(dataset, axis))
     forced = [axis for axis in axes if _force_channels(dataset, axis) is not None]
     notes = [f"{a} has no position sensor: it is not used." for a in dataset.axes
              if a not in axes]  # fmt: skip
@@ -79,20 +79,20 @@ def records(
     if len(axes) < len(dataset.axes):
         missing = ", ".join(a for a in dataset.axes if a not in axes)
         raise InputError(
-            _WHERE,
+            _ERROR_CONTEXT,
             f"the position of {missing} is not in the logs, but the forces of all axes depend on"
             " it: log its angle or its length",
         )
     if not forced:
         raise InputError(
-            _WHERE,
+            _ERROR_CONTEXT,
             "no force is known: log both pressures of at least one axis (or a drive command)",
         )
-    made = [_record(dataset, run, axes) for run in (*dataset.fit, dataset.heldout)]
+    made = [_build_record(dataset, run, axes) for run in (*dataset.fit, dataset.heldout)]
     return tuple(made[:-1]), made[-1], tuple(notes)
 
 
-def force_noise(machine: Machine, sensors: str) -> np.ndarray:
+def compute_force_noise(machine: Machine, sensors: str) -> np.ndarray:
     """Compute the force noise of all drives for a sensor set of the machine.
 
     Args:
@@ -106,7 +106,7 @@ def force_noise(machine: Machine, sensors: str) -> np.ndarray:
     Raises:
         InputError: the machine has no such sensor set.
     """
-    known, out = sensor_set(machine, sensors), []
+    known, out = get_sensors(machine, sensors), []
     for axis in actuator_order(machine):
         facts = machine.axes[axis]
         if facts.force:
@@ -119,7 +119,7 @@ def force_noise(machine: Machine, sensors: str) -> np.ndarray:
     return np.array(out)
 
 
-def whole_cycles(record: IdentificationRecord, period: float) -> IdentificationRecord:
+def cut_to_whole_cycles(record: IdentificationRecord, period: float) -> IdentificationRecord:
     """Cut a record to its last whole cycles; earlier rows may contain the fade-in.
 
     Args:
@@ -135,7 +135,7 @@ def whole_cycles(record: IdentificationRecord, period: float) -> IdentificationR
     rows = period / record.period
     cycle = round(rows)
     drift = abs(rows - cycle) * len(record.force) / max(cycle, 1)
-    if drift > _DRIFT or cycle < 3:
+    if drift > _MAX_CYCLE_DRIFT_ROWS or cycle < 3:
         raise InputError(
             record.name, f"a period of {period:g} s is not a whole number of rows of"
             f" {record.period:g} s",
@@ -146,7 +146,7 @@ def whole_cycles(record: IdentificationRecord, period: float) -> IdentificationR
     return replace(record, position=record.position[-count:], force=record.force[-count:])
 
 
-def check_repeats(record: IdentificationRecord, period: float, noise: np.ndarray) -> None:
+def check_periodicity(record: IdentificationRecord, period: float, noise: np.ndarray) -> None:
     """Raise InputError if the motion of a record does not repeat.
 
     Args:
@@ -161,18 +161,16 @@ def check_repeats(record: IdentificationRecord, period: float, noise: np.ndarray
     if step < 1 or len(record.force) <= step:
         return
     change = record.position[step:] - record.position[:-step]
-    size = np.sqrt(np.nanmedian(change**2, axis=0)) / (_MEDIAN * np.sqrt(2.0) * noise)
+    size = np.sqrt(np.nanmedian(change**2, axis=0)) / (_MEDIAN_OVER_STD * np.sqrt(2.0) * noise)
     for axis, times in zip(record.axes, size, strict=True):
-        if times > _UNLIKE:
+        if times > _MAX_DIFFERENCE_OVER_NOISE:
             raise InputError(
                 record.name, f"the motion of {axis} does not repeat after {period:g} s: it differs"
                 f" by {times:.0f} times its noise",
             )  # fmt: skip
 
 
-def beginning(
-    record: IdentificationRecord, seconds: float, period: float | None = None
-) -> IdentificationRecord:
+def cut_beginning(record: IdentificationRecord, seconds: float, period: float | None = None) -> IdentificationRecord:
     """Cut a record to its first part.
 
     Args:
@@ -191,24 +189,22 @@ def beginning(
     rows = round(seconds / record.period)
     if rows >= len(record.force):
         return record
-    return trimmed(replace(record, position=record.position[:rows], force=record.force[:rows]))
+    return trim_missing_positions(replace(record, position=record.position[:rows], force=record.force[:rows]))
 
 
-def _record(dataset: Dataset, run: RunData, axes: Sequence[str]) -> IdentificationRecord:
+def _build_record(dataset: Dataset, run: RunData, axes: Sequence[str]) -> IdentificationRecord:
     rows = len(run.command)
     position, force = np.full((2, rows, len(axes)), np.nan)
     position_noise, force_noise = np.full((2, len(axes)), np.nan)
     for k, axis in enumerate(axes):
-        position[:, k], position_noise[k] = _position(dataset, run, axis)
-        force[:, k], force_noise[k] = _force(dataset, run, axis)
-    return trimmed(
-        IdentificationRecord(
-            run.name, run.period, tuple(axes), position, position_noise, force, force_noise
-        )
+        position[:, k], position_noise[k] = _compute_position(dataset, run, axis)
+        force[:, k], force_noise[k] = _compute_force(dataset, run, axis)
+    return trim_missing_positions(
+        IdentificationRecord(run.name, run.period, tuple(axes), position, position_noise, force, force_noise)
     )
 
 
-def trimmed(record: IdentificationRecord) -> IdentificationRecord:
+def trim_missing_positions(record: IdentificationRecord) -> IdentificationRecord:
     """Remove rows at the ends of a record at which a position is missing.
 
     Args:
@@ -229,22 +225,22 @@ def trimmed(record: IdentificationRecord) -> IdentificationRecord:
     return replace(record, position=record.position[first:last], force=record.force[first:last])
 
 
-def _positions(dataset: Dataset, axis: str) -> list[str]:
+def _position_channels(dataset: Dataset, axis: str) -> list[str]:
     names = (f"{dataset.machine.position_kind(axis)}.{axis}", f"length.{axis}")
     return [name for name in names if name in dataset.channels]
 
 
-def _position(dataset: Dataset, run: RunData, axis: str) -> tuple[np.ndarray, float]:
+def _compute_position(dataset: Dataset, run: RunData, axis: str) -> tuple[np.ndarray, float]:
     """Return the joint position (n,) of an axis and its noise."""
     machine = dataset.machine
     values, noises = [], []
-    for channel in _positions(dataset, axis):
-        reading, noise = _reading(dataset, run, channel)
+    for channel in _position_channels(dataset, axis):
+        reading, noise = _correct_reading(dataset, run, channel)
         if not np.isfinite(reading).any():
             continue
         if channel.startswith("length."):
             linkage = axis_linkage(machine, axis)
-            reading = _joint(machine, axis, linkage, reading)
+            reading = _compute_joint_position(machine, axis, linkage, reading)
             middle = reading[np.isfinite(reading)]
             noise = noise / float(np.sqrt(np.mean(linkage.rate(middle) ** 2)))
         values.append(reading)
@@ -261,29 +257,27 @@ def _position(dataset: Dataset, run: RunData, axis: str) -> tuple[np.ndarray, fl
     return out, float(weight.sum() ** -0.5)
 
 
-def _joint(machine: Machine, axis: str, linkage: DriveLinkage, length: np.ndarray) -> np.ndarray:
+def _compute_joint_position(machine: Machine, axis: str, linkage: DriveLinkage, length: np.ndarray) -> np.ndarray:
     """Return the joint positions (n,) at piston displacements (n,) [m]."""
     cylinder = machine.axes[axis].cylinder
     assert cylinder is not None
     out, known = np.full(len(length), np.nan), np.isfinite(length)
     try:
         out[known] = linkage.angle(length[known] + cylinder.closed_length)
-    except LoopOpen as error:
-        raise InputError(
-            f"length.{axis}", f"does not match the machine's linkage: {error}"
-        ) from None
+    except LoopOpenError as error:
+        raise InputError(f"length.{axis}", f"does not match the machine's linkage: {error}") from None
     return out
 
 
 def _force_channels(dataset: Dataset, axis: str) -> tuple[str, ...] | None:
     """Return the channels of a drive's force, () for a force drive, None if one is missing."""
-    if not dataset.machine.axes[axis].hydraulic:
+    if not dataset.machine.axes[axis].is_hydraulic:
         return ()
     names = (f"pressure_head.{axis}", f"pressure_rod.{axis}")
     return names if all(name in dataset.channels for name in names) else None
 
 
-def _force(dataset: Dataset, run: RunData, axis: str) -> tuple[np.ndarray, float]:
+def _compute_force(dataset: Dataset, run: RunData, axis: str) -> tuple[np.ndarray, float]:
     """Return the drive force (n,) of an axis and its noise."""
     machine = dataset.machine
     channels = _force_channels(dataset, axis)
@@ -295,24 +289,20 @@ def _force(dataset: Dataset, run: RunData, axis: str) -> tuple[np.ndarray, float
         rows = np.arange(len(command)) - facts.command_delay / run.period
         late = np.maximum(np.floor(rows + 1e-9), 0.0).astype(int)
         return np.where(run.command_known, facts.force.gain * command, np.nan)[late], 0.0
-    (head, noise_head), (rod, noise_rod) = (_reading(dataset, run, c) for c in channels)
+    (head, noise_head), (rod, noise_rod) = (_correct_reading(dataset, run, c) for c in channels)
     area_head, area_rod = facts.hydraulic_drive.areas
-    return area_head * head - area_rod * rod, float(
-        np.hypot(area_head * noise_head, area_rod * noise_rod)
-    )
+    return area_head * head - area_rod * rod, float(np.hypot(area_head * noise_head, area_rod * noise_rod))
 
 
-def _reading(dataset: Dataset, run: RunData, channel: str) -> tuple[np.ndarray, float]:
+def _correct_reading(dataset: Dataset, run: RunData, channel: str) -> tuple[np.ndarray, float]:
     """Return the readings (n,) corrected for the machine's sensor defects, and their noise."""
     column = dataset.channels.index(channel)
     error = dataset.machine.sensor_errors.get(channel, SensorError())
-    values = without_error(run.reading[:, column], error, run.period, run.start)
+    values = correct_sensor_error(run.reading[:, column], error, run.period, run.start)
     return values, float(dataset.noise_of(run)[column]) / error.scale
 
 
-def without_error(
-    values: np.ndarray, error: SensorError, period: float, start: float = 0.0
-) -> np.ndarray:
+def correct_sensor_error(values: np.ndarray, error: SensorError, period: float, start: float = 0.0) -> np.ndarray:
     """Correct readings for a known sensor defect.
 
     Args:
@@ -326,7 +316,7 @@ def without_error(
         (n,) corrected readings, NaN where unknown, as at the end for a delayed sensor.
     """
     values = (values - error.offset_at(start + period * np.arange(len(values)))) / error.scale
-    if error.late:
+    if error.is_delayed:
         rows = np.arange(len(values), dtype=float)
         late = (error.delay + error.time_constant) / period
         values = np.interp(rows + late, rows, values, right=np.nan)

@@ -7,35 +7,35 @@ from scipy.stats import chi2
 
 from hydrotele.identify.estimation import Estimate
 from hydrotele.identify.identifiability import (
-    COMBINATION,
-    FULL,
-    UNIDENTIFIABLE,
-    WEAK,
+    STATUS_COMBINATION,
+    STATUS_FULL,
+    STATUS_UNIDENTIFIABLE,
+    STATUS_WEAK,
     Identifiability,
 )
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class HeldOutError:
     """Prediction error of one drive's force on the held-out run, in the band of the equations.
 
     Attributes:
         rms: RMS of measured minus predicted force [N] or [N m].
         unit: unit of the force.
         noise_rms: RMS error of a perfect model with these sensors; NaN if unknown.
-        relative: RMS error over RMS force [1].
+        relative_error: RMS error over RMS force [1].
         nominal_rms: RMS error with the given parameters.
     """
 
     rms: float
     unit: str
     noise_rms: float
-    relative: float
+    relative_error: float
     nominal_rms: float
 
 
 @dataclass(frozen=True)
-class Forces:
+class HeldOutForces:
     """Forces of the held-out run in the band of the equations: n rows, k drives [N] or [N m].
 
     Attributes:
@@ -64,14 +64,14 @@ class Identification:
         units: (m,) SI units.
         nominal: (m,) given values.
         value: (m,) identified values; undetermined combinations keep their given values.
-        told: parameters that these data determine despite noise.
-        structure: parameters that this motion determines without noise.
-        estimate: estimate of the base parameters `told`, with covariance and residuals.
+        data_identifiability: parameters that these data determine despite noise.
+        motion_identifiability: parameters that this motion determines without noise.
+        estimate: estimate of the base parameters `data_identifiability`, with covariance and residuals.
         bias: (r,) bias caused by position noise, already subtracted.
         heldout: drive -> prediction error of the held-out run.
         forces: forces of the held-out run.
         band: band of the equations [Hz].
-        whiteness: drive -> correlation of successive residuals.
+        residual_autocorrelation: drive -> correlation of successive residuals.
         status: `ok`, or a sentence that names the problem and the remedy.
         notes: notes, one sentence each.
         seconds: computing time [s].
@@ -81,19 +81,19 @@ class Identification:
     units: tuple[str, ...]
     nominal: np.ndarray
     value: np.ndarray
-    told: Identifiability
-    structure: Identifiability
+    data_identifiability: Identifiability
+    motion_identifiability: Identifiability
     estimate: Estimate
     bias: np.ndarray
-    heldout: dict[str, HeldOut]
-    forces: Forces
+    heldout: dict[str, HeldOutError]
+    forces: HeldOutForces
     band: float
-    whiteness: dict[str, float]
+    residual_autocorrelation: dict[str, float]
     status: str
     notes: tuple[str, ...]
     seconds: float
 
-    def distance(self, value: np.ndarray) -> tuple[float, float]:
+    def squared_distance(self, value: np.ndarray) -> tuple[float, float]:
         """Test whether other parameters lie in the confidence ellipsoid of the estimate.
 
         Args:
@@ -104,15 +104,15 @@ class Identification:
             true parameters lie.
         """
         limit = float(chi2.ppf(0.95, self.estimate.rank))
-        return self.estimate.ellipsoid(self.told.combination @ value), limit
+        return self.estimate.squared_distance(self.data_identifiability.combination @ value), limit
 
 
-STATUSES = (UNIDENTIFIABLE, COMBINATION, FULL, WEAK)
-MEANING = {
-    UNIDENTIFIABLE: "has no effect on the measured forces in this motion",
-    COMBINATION: "identifiable only in combination with other parameters",
-    FULL: "identifiable individually",
-    WEAK: "affects the forces by less than the noise in these data: given value kept",
+STATUSES = (STATUS_UNIDENTIFIABLE, STATUS_COMBINATION, STATUS_FULL, STATUS_WEAK)
+STATUS_DESCRIPTIONS = {
+    STATUS_UNIDENTIFIABLE: "has no effect on the measured forces in this motion",
+    STATUS_COMBINATION: "identifiable only in combination with other parameters",
+    STATUS_FULL: "identifiable individually",
+    STATUS_WEAK: "affects the forces by less than the noise in these data: given value kept",
 }
 
 
@@ -128,7 +128,7 @@ class ParameterRow:
             do not determine it.
         std: standard deviation, or None.
         ci95: 95 % interval, or None.
-        status: see `MEANING`.
+        status: see `STATUS_DESCRIPTIONS`.
         combination: the combination that the name represents, or those that contain the parameter;
             empty if there is none.
         bias: bias caused by position noise, already subtracted from the value; or None.
@@ -154,28 +154,33 @@ def parameter_rows(found: Identification) -> list[ParameterRow]:
     Returns:
         The rows; values only for parameters that these data determine.
     """
-    told = {int(b): k for k, b in enumerate(found.told.base)}
-    given = found.told.combination @ found.nominal
+    told = {int(b): k for k, b in enumerate(found.data_identifiability.base)}
+    given = found.data_identifiability.combination @ found.nominal
     rows = []
     for m, name in enumerate(found.names):
-        status, unit, nominal = found.told.status[m], found.units[m], float(found.nominal[m])
+        status, unit, nominal = (
+            found.data_identifiability.status[m],
+            found.units[m],
+            float(found.nominal[m]),
+        )
         if m in told:
             k = told[m]
             low, high = found.estimate.ci95[k]
-            text = found.told.text(k) if status == COMBINATION else ""
+            text = found.data_identifiability.format_combination(k) if status == STATUS_COMBINATION else ""
             rows.append(ParameterRow(
                 name, unit, float(given[k]), float(found.estimate.value[k]),
                 float(found.estimate.std[k]), (float(low), float(high)), status, text,
                 float(found.bias[k]),
             ))  # fmt: skip
             continue
-        part_of = [found.names[b] for b, row in zip(found.told.base, found.told.combination,
+        part_of = [found.names[b] for b, row in zip(found.data_identifiability.base,
+        found.data_identifiability.combination,
                                                     strict=True) if row[m] != 0.0]  # fmt: skip
         text = f"in {', '.join(part_of)}" if part_of else ""
         rows.append(ParameterRow(name, unit, nominal, None, None, None, status, text))
     return rows
 
 
-def counts(rows: list[ParameterRow]) -> dict[str, int]:
+def count_statuses(rows: list[ParameterRow]) -> dict[str, int]:
     """Count the parameters of each status."""
     return {status: sum(row.status == status for row in rows) for status in STATUSES}

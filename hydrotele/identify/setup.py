@@ -19,13 +19,13 @@ from hydrotele.multibody.inverse_dynamics import (
     FrictionTerm,
     Projection,
     Regressor,
-    pin_friction,
-    project,
-    regressor,
+    make_regressor,
+    passive_friction_terms,
+    project_on_drives,
 )
 
 
-def drive_friction(machine: Machine, chain: Chain) -> list[FrictionTerm]:
+def drive_friction_terms(machine: Machine, chain: Chain) -> list[FrictionTerm]:
     """Return the friction terms of all drives with the machine's parameters.
 
     Coulomb and viscous friction are always included. Stribeck friction and the asymmetries
@@ -42,7 +42,7 @@ def drive_friction(machine: Machine, chain: Chain) -> list[FrictionTerm]:
     Source: nominal model, "Piston force"; its nonlinear velocities are not parameters.
     """
     return [
-        FrictionTerm(joint, _numbers(f), f.smoothing_velocity, f.stribeck_velocity)
+        FrictionTerm(joint, _friction_parameters(f), f.smoothing_velocity, f.stribeck_velocity)
         for joint, f in zip(
             chain.drives, (machine.axes[a].drive.friction for a in actuator_order(machine)),
             strict=True,
@@ -50,7 +50,7 @@ def drive_friction(machine: Machine, chain: Chain) -> list[FrictionTerm]:
     ]  # fmt: skip
 
 
-def _numbers(f: Friction) -> dict[str, float]:
+def _friction_parameters(f: Friction) -> dict[str, float]:
     dry, wet = f.coulomb_asymmetry, f.viscous_asymmetry
     parts = {
         "coulomb": f.coulomb, "stribeck": f.stribeck_extra, "coulomb_asymmetry": f.coulomb * dry,
@@ -60,7 +60,7 @@ def _numbers(f: Friction) -> dict[str, float]:
     return {k: v for k, v in parts.items() if v != 0.0 or k in ("coulomb", "viscous")}
 
 
-Model = Literal["complete", "reduced"]
+DynamicModel = Literal["complete", "reduced"]
 _BAR_AXIS = (1.0, 0.0, 0.0)  # of a tube and of a rod, in their frames: from pin to pin
 
 
@@ -70,26 +70,26 @@ class RegressorSetup:
 
     Attributes:
         chain: kinematic chain of the mechanism.
-        given: the k joints whose motion is measured.
+        given_joints: the k joints whose motion is measured.
         bodies: bodies with inertial parameters.
-        rubbing: friction terms of joints, closures and drives.
+        friction_terms: friction terms of joints, closures and drives.
         offsets: drive -> given constant force [N] or [N m]; None for a regressor without offsets.
         drive_inertia: joints whose drive has an inertia.
-        alike: groups of bodies, joints or closures with the same parameters; one column, named
+        equal_groups: groups of bodies, joints or closures with the same parameters; one column, named
             after the first member, represents a group.
-        absent: parameters known to be 0, such as `moment_x.stator`.
+        zero_parameters: parameters known to be 0, such as `moment_x.stator`.
         moment_free: body -> unit axis in its frame about which neighbours transmit no moment to it;
-            see `project`.
+            see `project_on_drives`.
     """
 
     chain: Chain
-    given: tuple[str, ...]
+    given_joints: tuple[str, ...]
     bodies: tuple[str, ...]
-    rubbing: tuple[FrictionTerm, ...]
+    friction_terms: tuple[FrictionTerm, ...]
     offsets: Mapping[str, float] | None = field(default_factory=dict)
     drive_inertia: tuple[str, ...] = ()
-    alike: tuple[tuple[str, ...], ...] = ()
-    absent: tuple[str, ...] = ()
+    equal_groups: tuple[tuple[str, ...], ...] = ()
+    zero_parameters: tuple[str, ...] = ()
     moment_free: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
 
     def project(
@@ -110,16 +110,16 @@ class RegressorSetup:
         Raises:
             InputError: as in `hydrotele.multibody.inverse_dynamics.project`.
         """
-        return project(
-            self.chain, self.given, position, rate, acceleration, start=start,
+        return project_on_drives(
+            self.chain, self.given_joints, position, rate, acceleration, start=start,
             moment_free=self.moment_free,
         )  # fmt: skip
 
-    def table(self, found: Projection, rate_std: np.ndarray | None = None) -> Regressor:
+    def compute_regressor(self, projection: Projection, rate_std: np.ndarray | None = None) -> Regressor:
         """Compute the regressor along a motion.
 
         Args:
-            found: projection of the chain along the motion.
+            projection: projection of the chain along the motion.
             rate_std: (n, v) standard deviations of the rates [rad/s] or [m/s]; None if exact.
 
         Returns:
@@ -128,15 +128,19 @@ class RegressorSetup:
         Raises:
             InputError: a body, joint or parameter is unknown.
         """
-        whole = regressor(
-            self.chain, found, bodies=self.bodies, rubbing=self.rubbing,
+        whole = make_regressor(
+            self.chain, projection, bodies=self.bodies, friction=self.friction_terms,
             offsets=False if self.offsets is None else self.offsets,
             drive_inertia=self.drive_inertia, rate_std=rate_std,
         )  # fmt: skip
-        return _merged(whole, self.alike, self.absent) if self.alike or self.absent else whole
+        return (
+            _merge_columns(whole, self.equal_groups, self.zero_parameters)
+            if self.equal_groups or self.zero_parameters
+            else whole
+        )
 
 
-def _merged(whole: Regressor, alike: Sequence[Sequence[str]], absent: Sequence[str]) -> Regressor:
+def _merge_columns(whole: Regressor, alike: Sequence[Sequence[str]], absent: Sequence[str]) -> Regressor:
     """Return a regressor with summed columns for equal parameters and without absent ones."""
     first = {place: group[0] for group in alike for place in group}
     names, members = [], {}
@@ -164,7 +168,7 @@ def _merged(whole: Regressor, alike: Sequence[Sequence[str]], absent: Sequence[s
 
 
 def machine_setup(
-    machine: Machine, chain: Chain, model: Model = "complete", *, pins: bool = False,
+    machine: Machine, chain: Chain, model: DynamicModel = "complete", *, pins: bool = False,
     asymmetry: bool = False, ball_joints: bool = False,
 ) -> RegressorSetup:  # fmt: skip
     """Define the regressor of a machine.
@@ -186,9 +190,9 @@ def machine_setup(
 
     Source: Khoshzaban 1992, 4.3 (complete and reduced model) and p. 92, Eq. 4.23 (ball joints).
     """
-    moved = [b for k, b in enumerate(chain.bodies) if chain.tree.above[k + 1].any()]
+    moved = [b for k, b in enumerate(chain.bodies) if chain.tree.is_moved[k + 1].any()]
     bodies = tuple(b for b in moved if model == "complete" or b not in cylinder_bars(machine))
-    rubbing = drive_friction(machine, chain)
+    rubbing = drive_friction_terms(machine, chain)
     if asymmetry:
         rubbing = [replace(r, nominal={"viscous_asymmetry": 0.0, **r.nominal}) for r in rubbing]
     order = actuator_order(machine)
@@ -198,8 +202,8 @@ def machine_setup(
         if facts.force
     }
     return RegressorSetup(
-        chain=chain, given=tuple(machine.axes[a].joint for a in order), bodies=bodies,
-        rubbing=(*rubbing, *(pin_friction(chain) if pins else ())), offsets=offsets,
+        chain=chain, given_joints=tuple(machine.axes[a].joint for a in order), bodies=bodies,
+        friction_terms=(*rubbing, *(passive_friction_terms(chain) if pins else ())), offsets=offsets,
         moment_free=dict.fromkeys(cylinder_bars(machine), _BAR_AXIS) if ball_joints else {},
     )  # fmt: skip
 
@@ -215,8 +219,8 @@ def cylinder_bars(machine: Machine) -> dict[str, tuple[str, str]]:
 
 
 def mechanism_setup(
-    chain: Chain, given: Sequence[str] | None = None, *, passive: Sequence[str] = (),
-    offsets: bool = True, alike: Sequence[Sequence[str]] = (), absent: Sequence[str] = (),
+    chain: Chain, given_joints: Sequence[str] | None = None, *, passive: Sequence[str] = (),
+    offsets: bool = True, equal_groups: Sequence[Sequence[str]] = (), zero_parameters: Sequence[str] = (),
     friction: Mapping[str, Mapping[str, float]] | None = None,
 ) -> RegressorSetup:  # fmt: skip
     """Define the regressor of any mechanism, without a machine.
@@ -226,11 +230,11 @@ def mechanism_setup(
 
     Args:
         chain: kinematic chain of the mechanism.
-        given: joints whose motion is measured; the drives by default.
+        given_joints: joints whose motion is measured; the drives by default.
         passive: joints and closures without drive that have friction.
         offsets: whether the drives may have constant forces.
-        alike: as in `RegressorSetup`.
-        absent: as in `RegressorSetup`.
+        equal_groups: as in `RegressorSetup`.
+        zero_parameters: as in `RegressorSetup`.
         friction: joint -> further friction parameters, which an MJCF cannot state; see
             `FRICTION_TERMS`, and `stribeck_velocity`.
 
@@ -238,7 +242,7 @@ def mechanism_setup(
         The setup. Bodies that no joint moves have no parameters; joints with an `armature` have a
         drive inertia.
     """
-    moved = tuple(b for k, b in enumerate(chain.bodies) if chain.tree.above[k + 1].any())
+    moved = tuple(b for k, b in enumerate(chain.bodies) if chain.tree.is_moved[k + 1].any())
     rubbing, damping = [], chain.damping.copy()
     for place in (*passive, *chain.drives):
         numbers = {"coulomb": 0.0, "viscous": 0.0}
@@ -251,8 +255,8 @@ def mechanism_setup(
         rubbing.append(FrictionTerm(place, numbers | more, stribeck=slow))
     return RegressorSetup(
         chain=replace(chain, damping=damping),
-        given=tuple(chain.drives if given is None else given),
-        bodies=moved, rubbing=tuple(rubbing), offsets={} if offsets else None,
+        given_joints=tuple(chain.drives if given_joints is None else given_joints),
+        bodies=moved, friction_terms=tuple(rubbing), offsets={} if offsets else None,
         drive_inertia=tuple(j for j, a in zip(chain.joints, chain.armature, strict=True) if a),
-        alike=tuple(tuple(group) for group in alike), absent=tuple(absent),
+        equal_groups=tuple(tuple(group) for group in equal_groups), zero_parameters=tuple(zero_parameters),
     )  # fmt: skip

@@ -2,7 +2,7 @@
 
 `smooth` models the signal as a chain of m integrators driven by white noise, after Trujillo and
 Busby. Its only free parameter, the variance of the input, follows from the data by maximum
-likelihood or generalised cross-validation. `zero_phase` runs a Butterworth filter forwards and
+likelihood or generalised cross-validation. `filter_zero_phase` runs a Butterworth filter forwards and
 backwards and differentiates by central differences.
 
 The signal is the first state of `c_(j+1) = T c_j + b g_j`, with an input g that is constant between
@@ -31,7 +31,7 @@ from hydrotele.core.errors import InputError
 
 
 @dataclass(frozen=True)
-class Smoothed:
+class SmoothedSignal:
     """Signals with their first two time derivatives and standard deviations.
 
     All arrays have the shape of the input, (n,) or (n, k); [u] is the unit of the input. Unknown
@@ -54,13 +54,13 @@ class Smoothed:
     acceleration_std: np.ndarray
 
 
-def columns_of(values: np.ndarray, least: int, where: str) -> np.ndarray:
+def as_columns(values: np.ndarray, min_samples: int, context: str) -> np.ndarray:
     """Convert samples to columns and check their number.
 
     Args:
         values: (n,) or (n, k) samples [any unit], NaN where missing.
-        least: smallest number of finite samples per column [1].
-        where: name of the caller for the message.
+        min_samples: smallest number of finite samples per column [1].
+        context: name of the caller for the message.
 
     Returns:
         (n, k) float64, a copy.
@@ -70,30 +70,28 @@ def columns_of(values: np.ndarray, least: int, where: str) -> np.ndarray:
     """
     array = np.array(values, dtype=np.float64)
     if array.ndim not in (1, 2):
-        raise InputError(where, f"samples must be (n,) or (n, k), got the shape {array.shape}")
+        raise InputError(context, f"samples must be (n,) or (n, k), got the shape {array.shape}")
     columns = array.reshape(len(array), -1)
     if np.isinf(columns).any():
         row, column = np.argwhere(np.isinf(columns))[0]
-        raise InputError(
-            where, f"column {column}, row {row} is infinite: mark missing samples with NaN"
-        )
+        raise InputError(context, f"column {column}, row {row} is infinite: mark missing samples with NaN")
     known = np.isfinite(columns).sum(axis=0)
-    if len(known) and known.min() < least:
+    if len(known) and known.min() < min_samples:
         raise InputError(
-            where,
-            f"column {int(known.argmin())} has {known.min()} samples, at least {least} are needed",
+            context,
+            f"column {int(known.argmin())} has {known.min()} samples, at least {min_samples} are needed",
         )
     return columns
 
 
-def per_column(number: float | np.ndarray, count: int, what: str, where: str) -> np.ndarray:
+def expand_per_column(number: float | np.ndarray, count: int, label: str, context: str) -> np.ndarray:
     """Expand a positive value to one value per column.
 
     Args:
         number: scalar or (k,) [any unit].
         count: number of columns k [1].
-        what: name of the value for the message.
-        where: name of the caller for the message.
+        label: name of the value for the message.
+        context: name of the caller for the message.
 
     Returns:
         (k,) float64.
@@ -103,19 +101,19 @@ def per_column(number: float | np.ndarray, count: int, what: str, where: str) ->
     """
     numbers = np.asarray(number, dtype=np.float64)
     if numbers.ndim > 1 or (numbers.ndim == 1 and len(numbers) != count):
-        raise InputError(where, f"{what} must be one number or {count}, got {numbers.shape}")
+        raise InputError(context, f"{label} must be one number or {count}, got {numbers.shape}")
     numbers = np.broadcast_to(numbers, (count,)).copy()
     if not (np.isfinite(numbers) & (numbers > 0)).all():
-        raise InputError(where, f"{what} must be positive, got {numbers.tolist()}")
+        raise InputError(context, f"{label} must be positive, got {numbers.tolist()}")
     return numbers
 
 
-def checked_period(period: float, where: str) -> float:
+def check_period(period: float, context: str) -> float:
     """Check that a sample period is positive and return it.
 
     Args:
         period: time between samples [s].
-        where: name of the caller for the message.
+        context: name of the caller for the message.
 
     Returns:
         The period as a float [s].
@@ -124,15 +122,15 @@ def checked_period(period: float, where: str) -> float:
         InputError: the period is not positive and finite.
     """
     if not (math.isfinite(period) and period > 0):
-        raise InputError(where, f"the sample period must be positive, got {period} s")
+        raise InputError(context, f"the sample period must be positive, got {period} s")
     return float(period)
 
 
-_SETTLED = 1.0e-12  # relative change of the information matrix per sample
+_STATIONARITY_TOLERANCE = 1.0e-12  # relative change of the information matrix per sample
 
 
 @compiled
-def transition(order):
+def transition_matrices(order):
     """Return the matrices of an exact step of m integrators with constant input.
 
     Args:
@@ -143,7 +141,7 @@ def transition(order):
 
     Source: Trujillo and Busby 1983, with the time in samples.
 
-    >>> transition(3)[0].tolist()
+    >>> transition_matrices(3)[0].tolist()
     [[1.0, 1.0, 0.5], [0.0, 1.0, 1.0], [0.0, 0.0, 1.0]]
     """
     forward, back, drive = np.zeros((order, order)), np.zeros((order, order)), np.zeros(order)
@@ -158,7 +156,7 @@ def transition(order):
 
 
 @compiled
-def _through_input(info, drive, ratio, order, column):
+def _marginalise_input(info, drive, ratio, order, column):
     """Remove the input from an information matrix: R - R b (1/r + b'R b)^-1 b'R, in place.
 
     Writes the gain (1/r + b'R b)^-1 R b into `column` and returns 1/r + b'R b.
@@ -178,7 +176,7 @@ def _through_input(info, drive, ratio, order, column):
 
 
 @compiled
-def _congruent(info, matrix, order, work, out):
+def _congruence_transform(info, matrix, order, work, out):
     """Write M' R M into `out`."""
     for i in range(order):
         for j in range(order):
@@ -195,9 +193,9 @@ def _congruent(info, matrix, order, work, out):
 
 
 @compiled
-def _settled(old, new, order):
+def _is_stationary(old, new, order):
     for i in range(order):
-        if abs(new[i, i] - old[i, i]) > _SETTLED * abs(new[i, i]):
+        if abs(new[i, i] - old[i, i]) > _STATIONARITY_TOLERANCE * abs(new[i, i]):
             return False
     return True
 
@@ -222,7 +220,7 @@ def backward_pass(known, ratio, order, infos, gains, totals):
 
     Source: Trujillo and Busby 1983.
     """
-    forward, _, drive = transition(order)
+    forward, _, drive = transition_matrices(order)
     info, work, out = np.zeros((order, order)), np.zeros((order, order)), np.zeros((order, order))
     column = np.zeros(order)
     count = len(known)
@@ -233,11 +231,11 @@ def backward_pass(known, ratio, order, infos, gains, totals):
         if settled and known[j] == known[j + 1]:
             infos[j], gains[j], totals[j] = infos[j + 1], gains[j + 1], totals[j + 1]
             continue
-        total = _through_input(info, drive, ratio, order, column)
+        total = _marginalise_input(info, drive, ratio, order, column)
         gains[j], totals[j] = column, total
-        _congruent(info, forward, order, work, out)
+        _congruence_transform(info, forward, order, work, out)
         out[0, 0] += known[j]
-        settled = _settled(infos[j + 1], out, order)
+        settled = _is_stationary(infos[j + 1], out, order)
         info[:] = out
         infos[j] = out
 
@@ -263,7 +261,7 @@ def smooth_states(samples, known, ratio, order, infos, gains, totals, states):
     Source: Trujillo and Busby 1983.
     """
     backward_pass(known, ratio, order, infos, gains, totals)
-    forward, _, drive = transition(order)
+    forward, _, drive = transition_matrices(order)
     count = len(samples)
     pulls = np.zeros((count, order))  # information vectors of samples j .. n-1
     pulls[count - 1, 0] = known[count - 1] * samples[count - 1]
@@ -319,12 +317,12 @@ def state_variances(known, ratio, order, infos, variances):
 
     Source: two-filter form of the fixed-interval smoother.
     """
-    _, back, drive = transition(order)
+    _, back, drive = transition_matrices(order)
     against = back @ drive
     info, work, out = np.zeros((order, order)), np.zeros((order, order)), np.zeros((order, order))
     column, old, settled = np.zeros(order), np.zeros((order, order)), False
     for j in range(len(known)):
-        if not (settled and j > 0 and _settled(infos[j - 1], infos[j], order)):
+        if not (settled and j > 0 and _is_stationary(infos[j - 1], infos[j], order)):
             inverse = np.linalg.inv(info + infos[j])
             for i in range(order):
                 variances[j, i] = inverse[i, i]
@@ -334,21 +332,24 @@ def state_variances(known, ratio, order, infos, variances):
             continue
         old[:] = info
         info[0, 0] += known[j]
-        _through_input(info, against, ratio, order, column)
-        _congruent(info, back, order, work, out)
-        settled = _settled(old, out, order)
+        _marginalise_input(info, against, ratio, order, column)
+        _congruence_transform(info, back, order, work, out)
+        settled = _is_stationary(old, out, order)
         info[:] = out
 
 
-ORDER = 3  # value, rate and acceleration; the jerk is the white input
-_LOWEST, _HIGHEST = -16, 6  # search range of log10 of input variance over noise variance
-_SECTIONS = 11  # golden sections: the ratio is accurate to 2 %, which is not visible in results
-_GOLDEN = 1.0 - 0.5 * (math.sqrt(5.0) - 1.0)
-_WHERE = "optimal smoother"
+DEFAULT_ORDER = 3  # value, rate and acceleration; the jerk is the white input
+_MIN_LOG_RATIO, _MAX_LOG_RATIO = (
+    -16,
+    6,
+)  # search range of log10 of input variance over noise variance
+_GOLDEN_SECTIONS = 11  # golden sections: the ratio is accurate to 2 %, which is not visible in results
+_GOLDEN_FRACTION = 1.0 - 0.5 * (math.sqrt(5.0) - 1.0)
+_SMOOTHER_CONTEXT = "optimal smoother"
 
 
 @dataclass(frozen=True)
-class OptimallySmoothed(Smoothed):
+class OptimallySmoothed(SmoothedSignal):
     """Signals smoothed by `smooth`, with the parameters of the smoother.
 
     Attributes:
@@ -372,7 +373,7 @@ def smooth(
     noise: float | np.ndarray | None = None,
     input_std: float | np.ndarray | None = None,
     *,
-    order: int = ORDER,
+    order: int = DEFAULT_ORDER,
     method: Literal["likelihood", "validation"] = "likelihood",
 ) -> OptimallySmoothed:
     """Estimate value, rate and acceleration at every sample by fixed-interval smoothing.
@@ -410,20 +411,23 @@ def smooth(
     True
     """
     if order not in (3, 4):
-        raise InputError(_WHERE, f"order must be 3 or 4, got {order}")
+        raise InputError(_SMOOTHER_CONTEXT, f"order must be 3 or 4, got {order}")
     if method not in ("likelihood", "validation"):
-        raise InputError(_WHERE, f"method must be likelihood or validation, got {method!r}")
+        raise InputError(_SMOOTHER_CONTEXT, f"method must be likelihood or validation, got {method!r}")
     if noise is None and input_std is not None:
-        raise InputError(_WHERE, "input_std is given without noise: give both or neither")
-    samples, dt = columns_of(values, order + 2, _WHERE), checked_period(period, _WHERE)
+        raise InputError(_SMOOTHER_CONTEXT, "input_std is given without noise: give both or neither")
+    samples, dt = (
+        as_columns(values, order + 2, _SMOOTHER_CONTEXT),
+        check_period(period, _SMOOTHER_CONTEXT),
+    )
     count = samples.shape[1]
-    noises = None if noise is None else per_column(noise, count, "noise", _WHERE)
-    inputs = None if input_std is None else per_column(input_std, count, "input_std", _WHERE)
+    noises = None if noise is None else expand_per_column(noise, count, "noise", _SMOOTHER_CONTEXT)
+    inputs = None if input_std is None else expand_per_column(input_std, count, "input_std", _SMOOTHER_CONTEXT)
     known = np.isfinite(samples)
     states, deviations = np.empty((*samples.shape, 3)), np.empty((*samples.shape, 3))
     scales, roughness = np.empty(count), np.empty(count)
     for k in range(count):
-        column, base, unit = _scaled(samples[:, k], known[:, k], noises, k)
+        column, base, unit = _normalise_samples(samples[:, k], known[:, k], noises, k)
         ratio = math.nan if inputs is None else (inputs[k] * dt**order / unit) ** 2
         found = _smooth_column(
             column, known[:, k].astype(np.float64), ratio, order,
@@ -442,7 +446,7 @@ def smooth(
     )  # fmt: skip
 
 
-def error_draws(smoothed: OptimallySmoothed, count: int, seed: int = 0) -> np.ndarray:
+def sample_errors(smoothed: OptimallySmoothed, count: int, seed: int = 0) -> np.ndarray:
     """Sample random errors of smoothed signals.
 
     A signal of the integrator chain with input `input_std` is simulated, noise is added, and the
@@ -468,15 +472,15 @@ def error_draws(smoothed: OptimallySmoothed, count: int, seed: int = 0) -> np.nd
         known = smoothed.known[:, k].astype(np.float64)
         ratio = (smoothed.input_std[k] * smoothed.period**order / smoothed.noise[k]) ** 2
         inputs = math.sqrt(ratio) * generator.standard_normal((count, rows))
-        truth = _chain(inputs, order)
+        truth = _simulate_chain(inputs, order)
         noisy = truth[:, :, 0] + generator.standard_normal((count, rows))
         for i in range(count):
-            states = _states(noisy[i], known, ratio, order) - truth[i]
+            states = _compute_states(noisy[i], known, ratio, order) - truth[i]
             errors[i, :, :, k] = (smoothed.noise[k] * states[:, :3] / steps).T
     return errors
 
 
-def _scaled(
+def _normalise_samples(
     samples: np.ndarray, known: np.ndarray, noises: np.ndarray | None, k: int
 ) -> tuple[np.ndarray, float, float]:
     """Subtract the mean and divide by the noise, or by the scatter of the steps if it is unknown.
@@ -491,13 +495,14 @@ def _scaled(
         unit = float(np.diff(samples[known]).std())
         if unit == 0.0:
             raise InputError(
-                _WHERE, f"column {k} is constant, so its noise cannot be estimated: give noise"
+                _SMOOTHER_CONTEXT,
+                f"column {k} is constant, so its noise cannot be estimated: give noise",
             )
     return np.where(known, (samples - base) / unit, 0.0), base, unit
 
 
 @compiled
-def _states(samples, known, ratio, order):
+def _compute_states(samples, known, ratio, order):
     rows = len(samples)
     infos, gains = np.zeros((rows, order, order)), np.zeros((rows, order))
     states = np.zeros((rows, order))
@@ -506,9 +511,9 @@ def _states(samples, known, ratio, order):
 
 
 @compiled
-def _chain(inputs, order):
+def _simulate_chain(inputs, order):
     """Simulate the integrator chain from zero: (draws, n) inputs -> (draws, n, m) states."""
-    forward, _, drive = transition(order)
+    forward, _, drive = transition_matrices(order)
     draws, rows = inputs.shape
     states = np.zeros((draws, rows, order))
     for d in range(draws):
@@ -521,17 +526,15 @@ def _chain(inputs, order):
 
 
 @compiled
-def _cost(samples, known, exponent, order, likely, noise_known, work):
+def _evaluate_objective(samples, known, exponent, order, use_likelihood, noise_known, work):
     """Return the objective of the variance ratio 10^exponent, to be minimised."""
     infos, gains, totals, states, variances = work
     ratio = 10.0**exponent
-    residuals, inputs, logs = smooth_states(
-        samples, known, ratio, order, infos, gains, totals, states
-    )
-    if likely and noise_known:
+    residuals, inputs, logs = smooth_states(samples, known, ratio, order, infos, gains, totals, states)
+    if use_likelihood and noise_known:
         return residuals + inputs + logs
     count = known.sum()
-    if likely:
+    if use_likelihood:
         return (count - order) * math.log((residuals + inputs) / (count - order)) + logs
     state_variances(known, ratio, order, infos, variances)
     free = 1.0 - (variances[:, 0] * known).sum() / count
@@ -539,19 +542,19 @@ def _cost(samples, known, exponent, order, likely, noise_known, work):
 
 
 @compiled
-def _best_exponent(samples, known, order, likely, noise_known, work):
+def _find_best_exponent(samples, known, order, use_likelihood, noise_known, work):
     """Find the best log10 of the ratio on a grid of two decades, refined by golden sections."""
     best, middle = math.inf, 0.0
-    for decade in range(_LOWEST, _HIGHEST + 1, 2):
-        cost = _cost(samples, known, float(decade), order, likely, noise_known, work)
+    for decade in range(_MIN_LOG_RATIO, _MAX_LOG_RATIO + 1, 2):
+        cost = _evaluate_objective(samples, known, float(decade), order, use_likelihood, noise_known, work)
         if cost < best:
             best, middle = cost, float(decade)
     low, high = middle - 2.0, middle + 2.0
-    for _ in range(_SECTIONS):
+    for _ in range(_GOLDEN_SECTIONS):
         # the golden section of the longer part, as `best` is known at `middle`
         right = high - middle > middle - low
-        place = middle + _GOLDEN * ((high if right else low) - middle)
-        cost = _cost(samples, known, place, order, likely, noise_known, work)
+        place = middle + _GOLDEN_FRACTION * ((high if right else low) - middle)
+        cost = _evaluate_objective(samples, known, place, order, use_likelihood, noise_known, work)
         if cost < best:
             low, high = (middle, high) if right else (low, middle)
             best, middle = cost, place
@@ -563,7 +566,7 @@ def _best_exponent(samples, known, order, likely, noise_known, work):
 
 
 @compiled
-def _smooth_column(samples, known, ratio, order, likely, noise_known):
+def _smooth_column(samples, known, ratio, order, use_likelihood, noise_known):
     """Smooth one dimensionless column; a ratio of NaN is estimated.
 
     Returns:
@@ -574,7 +577,7 @@ def _smooth_column(samples, known, ratio, order, likely, noise_known):
     states, variances = np.zeros((rows, order)), np.zeros((rows, order))
     work = (infos, gains, totals, states, variances)
     if math.isnan(ratio):
-        ratio = 10.0 ** _best_exponent(samples, known, order, likely, noise_known, work)
+        ratio = 10.0 ** _find_best_exponent(samples, known, order, use_likelihood, noise_known, work)
     residuals, inputs, _ = smooth_states(samples, known, ratio, order, infos, gains, totals, states)
     state_variances(known, ratio, order, infos, variances)
     scale = 1.0
@@ -583,18 +586,18 @@ def _smooth_column(samples, known, ratio, order, likely, noise_known):
     return states, variances, ratio, scale
 
 
-_WHERE_ZERO_PHASE = "zero-phase filter"
+_ZERO_PHASE_CONTEXT = "zero-phase filter"
 
 
-def zero_phase(
+def filter_zero_phase(
     values: np.ndarray,
     period: float,
     cutoff: float,
     noise: float | np.ndarray | None = None,
     *,
     order: int = 4,
-    bridge: int = 0,
-) -> Smoothed:
+    max_gap: int = 0,
+) -> SmoothedSignal:
     """Filter by a zero-phase low-pass, and differentiate by central differences.
 
     The two passes together have the gain `1 / (1 + (tan(pi f dt) / tan(pi f_c dt))^(2 order))`,
@@ -607,7 +610,7 @@ def zero_phase(
         cutoff: f_c [Hz], below half the sample rate.
         noise: standard deviation of one sample, scalar or (k,), for the standard deviations [u].
         order: order of the Butterworth filter, which is applied twice [1].
-        bridge: longest gap that is interpolated linearly [samples]; with 0, missing samples are an
+        max_gap: longest gap that is interpolated linearly [samples]; with 0, missing samples are an
             error.
 
     Returns:
@@ -616,32 +619,31 @@ def zero_phase(
 
     Raises:
         InputError: the cutoff is not below half the sample rate, too few samples, or a gap is
-            longer than `bridge` or at an end.
+            longer than `max_gap` or at an end.
 
     Source: Gustafsson 1996, IEEE Trans. Signal Processing 44(4); five-point differences: Abramowitz
     and Stegun 25.3.6 and 25.3.24.
 
     >>> import numpy as np
     >>> time = 0.01 * np.arange(400)
-    >>> found = zero_phase(np.sin(3 * time), 0.01, cutoff=5.0)
+    >>> found = filter_zero_phase(np.sin(3 * time), 0.01, cutoff=5.0)
     >>> bool(np.abs(found.rate - 3 * np.cos(3 * time))[50:-50].max() < 1e-3)
     True
     """
-    dt = checked_period(period, _WHERE_ZERO_PHASE)
+    dt = check_period(period, _ZERO_PHASE_CONTEXT)
     if not 0.0 < cutoff < 0.5 / dt:
         raise InputError(
-            _WHERE_ZERO_PHASE,
-            f"the cutoff must lie between 0 and half the sample rate, {0.5 / dt:g} Hz,"
-            f" got {cutoff:g} Hz",
+            _ZERO_PHASE_CONTEXT,
+            f"the cutoff must lie between 0 and half the sample rate, {0.5 / dt:g} Hz, got {cutoff:g} Hz",
         )
-    samples = _bridged(columns_of(values, 2, _WHERE_ZERO_PHASE), bridge)
+    samples = _interpolate_gaps(as_columns(values, 2, _ZERO_PHASE_CONTEXT), max_gap)
     from scipy.signal import butter, sosfiltfilt  # this import takes half a second
 
     filtering = butter(order, cutoff, fs=1.0 / dt, output="sos")
     pad = round(3.0 / (cutoff * dt))  # the filter's transient lasts three periods
     if len(samples) <= pad:
         raise InputError(
-            _WHERE_ZERO_PHASE,
+            _ZERO_PHASE_CONTEXT,
             f"{len(samples)} samples are too few for a cutoff of {cutoff:g} Hz, more than {pad} are"
             " needed: raise the cutoff",
         )
@@ -652,15 +654,13 @@ def zero_phase(
         impulse[2 * pad] = 1.0
         answers = _derivatives(sosfiltfilt(filtering, impulse, axis=0, padlen=0), dt)
         gains = np.sqrt([np.sum(answer**2) for answer in answers])
-        deviations = gains[:, None] * per_column(
-            noise, samples.shape[1], "noise", _WHERE_ZERO_PHASE
-        )
+        deviations = gains[:, None] * expand_per_column(noise, samples.shape[1], "noise", _ZERO_PHASE_CONTEXT)
     shape = np.shape(values)
     spread = (np.broadcast_to(d, samples.shape).reshape(shape).copy() for d in deviations)
-    return Smoothed(*(part.reshape(shape) for part in parts), *spread)
+    return SmoothedSignal(*(part.reshape(shape) for part in parts), *spread)
 
 
-def _bridged(samples: np.ndarray, bridge: int) -> np.ndarray:
+def _interpolate_gaps(samples: np.ndarray, max_gap: int) -> np.ndarray:
     rows = np.arange(len(samples))
     for k in range(samples.shape[1]):
         known = np.flatnonzero(np.isfinite(samples[:, k]))
@@ -669,14 +669,13 @@ def _bridged(samples: np.ndarray, bridge: int) -> np.ndarray:
             continue
         if known[0] > 0 or known[-1] < rows[-1]:
             raise InputError(
-                _WHERE_ZERO_PHASE,
-                f"column {k} has no samples at an end: cut the record there, or use the optimal"
-                " smoother",
+                _ZERO_PHASE_CONTEXT,
+                f"column {k} has no samples at an end: cut the record there, or use the optimal smoother",
             )
-        if missing > bridge:
+        if missing > max_gap:
             raise InputError(
-                _WHERE_ZERO_PHASE,
-                f"column {k} has {missing} successive missing samples, at most {bridge} are"
+                _ZERO_PHASE_CONTEXT,
+                f"column {k} has {missing} successive missing samples, at most {max_gap} are"
                 " interpolated: set bridge, or use the optimal smoother, which accepts gaps",
             )
         samples[:, k] = np.interp(rows, known, samples[known, k])

@@ -20,10 +20,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-_ROUNDING = 1e-12  # [m], so that a stretched pose computed by `forward` can be inverted
+_REACH_TOLERANCE = 1e-12  # [m], so that a stretched pose computed by `forward_kinematics` can be inverted
 
 
-class Unreachable(ValueError):
+class UnreachableError(ValueError):
     """No joint angles bring the controlled point to the requested pose."""
 
 
@@ -40,7 +40,7 @@ class ArmGeometry:
             boom pin.
         tool_offset: controlled point in the frame of the last link, from the tool pin, (along, up)
             [m].
-        tool_joint: whether the tool rotates on the stick; if not, its frame is parallel to the
+        has_tool_joint: whether the tool rotates on the stick; if not, its frame is parallel to the
             stick's.
     """
 
@@ -50,17 +50,15 @@ class ArmGeometry:
     stick_length: float
     boom_pin_height: float = 0.0
     tool_offset: tuple[float, float] = (0.0, 0.0)
-    tool_joint: bool = True
+    has_tool_joint: bool = True
 
     def __post_init__(self) -> None:
         """Raise ValueError for links without length."""
         if not (self.boom_length > 0 and self.stick_length > 0):
-            raise ValueError(
-                f"boom_length {self.boom_length} and stick_length {self.stick_length} must be > 0"
-            )
+            raise ValueError(f"boom_length {self.boom_length} and stick_length {self.stick_length} must be > 0")
 
 
-def forward(geometry: ArmGeometry, q: Sequence[float]) -> tuple[float, ...]:
+def forward_kinematics(geometry: ArmGeometry, q: Sequence[float]) -> tuple[float, ...]:
     """Compute the pose of the controlled point in cylindrical coordinates.
 
     x = a1 + a2 cos(q2) + a3 cos(q2 + q3) + tool, z likewise with sines; r = sqrt(x^2 + d2^2),
@@ -76,13 +74,13 @@ def forward(geometry: ArmGeometry, q: Sequence[float]) -> tuple[float, ...]:
     >>> cat215 = ArmGeometry(
     ...     base_radius=0.340, lateral_offset=-0.110, boom_length=5.180, stick_length=1.800
     ... )
-    >>> [round(v, 4) for v in forward(cat215, (0.0, math.radians(27.8), math.radians(-80.6), 0.0))]
+    >>> [round(v, 4) for v in forward_kinematics(cat215, (0.0, math.radians(27.8), math.radians(-80.6), 0.0))]
     [6.0114, -0.0183, 0.9821, -0.9215]
     """
     x, z = _plane_chain(geometry, q)[0]
     r, theta = math.hypot(x, geometry.lateral_offset), q[0] + math.atan2(geometry.lateral_offset, x)
     z += geometry.boom_pin_height
-    return (r, theta, z, q[1] + q[2] + q[3]) if geometry.tool_joint else (r, theta, z)
+    return (r, theta, z, q[1] + q[2] + q[3]) if geometry.has_tool_joint else (r, theta, z)
 
 
 def forward_cartesian(geometry: ArmGeometry, q: Sequence[float]) -> tuple[float, float, float]:
@@ -108,7 +106,7 @@ def forward_cartesian(geometry: ArmGeometry, q: Sequence[float]) -> tuple[float,
     return cosine * x - sine * y, sine * x + cosine * y, z + geometry.boom_pin_height
 
 
-def inverse(geometry: ArmGeometry, pose: Sequence[float], elbow: int = 1) -> tuple[float, ...]:
+def inverse_kinematics(geometry: ArmGeometry, pose: Sequence[float], elbow: int = 1) -> tuple[float, ...]:
     """Compute the joint angles for a pose (Zhu Eqs 2.3-2.6).
 
     x = sqrt(r^2 - d2^2), q1 = theta - atan2(d2, x). The tool offset, rotated by phi, is subtracted.
@@ -139,17 +137,16 @@ def inverse(geometry: ArmGeometry, pose: Sequence[float], elbow: int = 1) -> tup
     >>> cat215 = ArmGeometry(
     ...     base_radius=0.340, lateral_offset=-0.110, boom_length=5.180, stick_length=1.800
     ... )
-    >>> [round(v, 9) for v in inverse(cat215, forward(cat215, (0.5, 0.4, -1.2, -0.3)))]
+    >>> [round(v, 9) for v in inverse_kinematics(cat215, forward_kinematics(cat215, (0.5, 0.4, -1.2, -0.3)))]
     [0.5, 0.4, -1.2, -0.3]
     """
-    x, z, outer, bend = tool_pin(geometry, pose)
+    x, z, outer, bend = outer_bar_end(geometry, pose)
     inner = geometry.boom_length
     distance = math.hypot(x, z)
     folded, stretched = abs(inner - outer), inner + outer
-    if not folded - _ROUNDING <= distance <= stretched + _ROUNDING:
-        raise Unreachable(
-            f"the tool pin would be {distance:.6g} m from the boom pin, "
-            f"reachable is [{folded:.6g}, {stretched:.6g}] m"
+    if not folded - _REACH_TOLERANCE <= distance <= stretched + _REACH_TOLERANCE:
+        raise UnreachableError(
+            f"the tool pin would be {distance:.6g} m from the boom pin, reachable is [{folded:.6g}, {stretched:.6g}] m"
         )
     flexed = max(0.0, stretched - distance) * (stretched + distance)
     extended = max(0.0, distance - folded) * (distance + folded)
@@ -159,11 +156,11 @@ def inverse(geometry: ArmGeometry, pose: Sequence[float], elbow: int = 1) -> tup
     stick = math.atan2(sine, cosine) - bend
     swing = pose[1] - math.atan2(geometry.lateral_offset, _plane_x(geometry, pose[0]))
     arm = swing, boom, stick
-    return (*arm, pose[3] - boom - stick) if geometry.tool_joint else arm
+    return (*arm, pose[3] - boom - stick) if geometry.has_tool_joint else arm
 
 
 def jacobian(geometry: ArmGeometry, q: Sequence[float]) -> np.ndarray:
-    """Compute the Jacobian of `forward`.
+    """Compute the Jacobian of `forward_kinematics`.
 
     dr = (x/r) dx, dtheta = dq1 - (d2/r^2) dx; dz and dphi are the derivatives of z and phi.
 
@@ -188,7 +185,7 @@ def jacobian(geometry: ArmGeometry, q: Sequence[float]) -> np.ndarray:
     square = x * x + geometry.lateral_offset * geometry.lateral_offset
     radial, turning = x / math.sqrt(square), -geometry.lateral_offset / square
     rows = [[0.0, *(radial * v for v in dx)], [1.0, *(turning * v for v in dx)], [0.0, *dz]]
-    return np.array([*rows, [0.0, 1.0, 1.0, 1.0]] if geometry.tool_joint else rows)
+    return np.array([*rows, [0.0, 1.0, 1.0, 1.0]] if geometry.has_tool_joint else rows)
 
 
 def cartesian_jacobian(geometry: ArmGeometry, q: Sequence[float]) -> np.ndarray:
@@ -224,14 +221,14 @@ def _plane_chain(
     geometry: ArmGeometry, q: Sequence[float]
 ) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
     """Return the point (x from swing axis, z from boom pin), and dx/dq and dz/dq for q[1:]."""
-    if len(q) != 3 + geometry.tool_joint:
-        raise ValueError(f"this arm has {3 + geometry.tool_joint} joints, got {len(q)} angles")
+    if len(q) != 3 + geometry.has_tool_joint:
+        raise ValueError(f"this arm has {3 + geometry.has_tool_joint} joints, got {len(q)} angles")
     along, up = geometry.tool_offset
     stick = q[1] + q[2]
     boom_x, boom_z = geometry.boom_length * math.cos(q[1]), geometry.boom_length * math.sin(q[1])
     cosine, sine = math.cos(stick), math.sin(stick)
     stick_x, stick_z = geometry.stick_length * cosine, geometry.stick_length * sine
-    if not geometry.tool_joint:
+    if not geometry.has_tool_joint:
         outer_x = stick_x + along * cosine - up * sine
         outer_z = stick_z + along * sine + up * cosine
         x, z = boom_x + outer_x, boom_z + outer_z
@@ -243,7 +240,7 @@ def _plane_chain(
     return (geometry.base_radius + x, z), (-z, -outer_z, -tool_z), (x, outer_x, tool_x)
 
 
-def tool_pin(geometry: ArmGeometry, pose: Sequence[float]) -> tuple[float, float, float, float]:
+def outer_bar_end(geometry: ArmGeometry, pose: Sequence[float]) -> tuple[float, float, float, float]:
     """Compute the end of the outer bar for a pose, relative to the boom pin in the arm plane.
 
     The outer bar is the stick; without a tool joint it extends to the controlled point.
@@ -259,15 +256,15 @@ def tool_pin(geometry: ArmGeometry, pose: Sequence[float]) -> tuple[float, float
         Unreachable: the radius is less than the lateral offset of the arm plane.
 
     >>> arm = ArmGeometry(base_radius=0.3, lateral_offset=0.0, boom_length=5.2, stick_length=1.8)
-    >>> tool_pin(arm, (5.3, 0.0, 1.0, 0.0))
+    >>> outer_bar_end(arm, (5.3, 0.0, 1.0, 0.0))
     (5.0, 1.0, 1.8, 0.0)
     """
-    if len(pose) != 3 + geometry.tool_joint:
-        raise ValueError(f"this arm's pose has {3 + geometry.tool_joint} numbers, got {len(pose)}")
+    if len(pose) != 3 + geometry.has_tool_joint:
+        raise ValueError(f"this arm's pose has {3 + geometry.has_tool_joint} numbers, got {len(pose)}")
     x = _plane_x(geometry, pose[0]) - geometry.base_radius
     z = pose[2] - geometry.boom_pin_height
     along, up = geometry.tool_offset
-    if not geometry.tool_joint:
+    if not geometry.has_tool_joint:
         straight = geometry.stick_length + along
         return x, z, math.hypot(straight, up), math.atan2(up, straight)
     cosine, sine = math.cos(pose[3]), math.sin(pose[3])
@@ -279,7 +276,7 @@ def _plane_x(geometry: ArmGeometry, r: float) -> float:
     """Return the distance of the controlled point ahead of the swing axis, in the arm plane."""
     side = abs(geometry.lateral_offset)
     if not r >= side:
-        raise Unreachable(
+        raise UnreachableError(
             f"radius {r:.6g} m requested, the arm plane passes the swing axis at {side:.6g} m: "
             f"reachable is [{side:.6g}, inf) m"
         )

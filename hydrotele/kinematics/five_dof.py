@@ -20,8 +20,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-_ROUNDING = 1e-9  # [m] or [1], tolerance for poses computed by `forward`
-_PARALLEL = 1e-9  # sine below which a direction counts as perpendicular to the arm's plane
+_REACH_TOLERANCE = 1e-9  # [m] or [1], tolerance for poses computed by `forward_kinematics`
+_MAX_PERPENDICULAR_SINE = 1e-9  # sine below which a direction counts as perpendicular to the arm's plane
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,9 +51,7 @@ class FellerGeometry:
         if not all(math.isfinite(getattr(self, one.name)) for one in fields(self)):
             raise ValueError(f"lengths must be finite: {self}")
         if not (self.boom_length > 0 and self.stick_length > 0):
-            raise ValueError(
-                f"boom_length {self.boom_length} and stick_length {self.stick_length} must be > 0"
-            )
+            raise ValueError(f"boom_length {self.boom_length} and stick_length {self.stick_length} must be > 0")
 
 
 class FellerPose(NamedTuple):
@@ -66,20 +64,20 @@ class FellerPose(NamedTuple):
     head: float
 
 
-class Reached(NamedTuple):
+class JointSolution(NamedTuple):
     """Joint angles for a pose.
 
     Attributes:
         q: swing, boom, stick, tilt, head [rad].
-        clamped: whether the pose was out of reach and replaced by the nearest reachable one on the
+        is_clamped: whether the pose was out of reach and replaced by the nearest reachable one on the
             line from the boom pin, or from the swing axis.
     """
 
     q: tuple[float, float, float, float, float]
-    clamped: bool
+    is_clamped: bool
 
 
-def forward(geometry: FellerGeometry, q: Sequence[float]) -> FellerPose:
+def forward_kinematics(geometry: FellerGeometry, q: Sequence[float]) -> FellerPose:
     """Compute the pose of the tool.
 
     Args:
@@ -91,7 +89,7 @@ def forward(geometry: FellerGeometry, q: Sequence[float]) -> FellerPose:
 
     >>> arm = FellerGeometry(base_radius=0.3, base_height=2.2, boom_length=5.9, stick_length=2.95,
     ...                      tilt_length=0.55, head_radius=0.35, head_depth=0.6)
-    >>> [round(v, 6) for v in forward(arm, (0.0, math.pi / 2, -math.pi / 2, 0.0, 0.0))]
+    >>> [round(v, 6) for v in forward_kinematics(arm, (0.0, math.pi / 2, -math.pi / 2, 0.0, 0.0))]
     [4.15, 0.0, 7.5, 0.0, 0.0]
     """
     swing, boom, stick, tilt, head = q
@@ -121,7 +119,7 @@ def tool_direction(q: Sequence[float]) -> np.ndarray:
     ])  # fmt: skip
 
 
-def inverse(geometry: FellerGeometry, pose: FellerPose) -> Reached:
+def inverse_kinematics(geometry: FellerGeometry, pose: FellerPose) -> JointSolution:
     """Compute the joint angles for position, attitude and head angle, with the stick hanging down.
 
     The tool is offset from the arm's plane by head radius times sine of the head angle, so that the
@@ -140,17 +138,17 @@ def inverse(geometry: FellerGeometry, pose: FellerPose) -> Reached:
     """
     aside = geometry.head_radius * math.sin(pose.head)
     far = math.hypot(pose.x, pose.y)
-    near = far < abs(aside) - _ROUNDING
+    near = far < abs(aside) - _REACH_TOLERANCE
     swing = math.atan2(pose.y, pose.x) + math.asin(max(-1.0, min(1.0, aside / max(far, 1e-300))))
     r = math.sqrt(max(far**2 - aside**2, 0.0))
-    found = _in_plane(geometry, r, pose.z, pose.attitude, pose.head)
+    found = _inverse_in_plane(geometry, r, pose.z, pose.attitude, pose.head)
     boom, stick, tilt = found.q[1:4]
-    return Reached((_wrapped(swing), boom, stick, tilt, pose.head), near or found.clamped)
+    return JointSolution((_wrap_angle(swing), boom, stick, tilt, pose.head), near or found.is_clamped)
 
 
-def inverse_directed(
+def inverse_for_direction(
     geometry: FellerGeometry, position: Sequence[float], direction: Sequence[float]
-) -> tuple[Reached, ...]:
+) -> tuple[JointSolution, ...]:
     """Compute all joint angles for a tool position and a direction of its X axis.
 
     There are two azimuths, with the arm reaching ahead or back over its own axis, and two head
@@ -184,14 +182,14 @@ def inverse_directed(
         for side in (1.0, -1.0):
             across = side * math.hypot(ahead, m[2])
             head = math.atan2(aside, across)
-            attitude = math.atan2(side * m[2], side * ahead) if abs(across) > _PARALLEL else 0.0
+            attitude = math.atan2(side * m[2], side * ahead) if abs(across) > _MAX_PERPENDICULAR_SINE else 0.0
             bare = geometry.head_radius * math.cos(head)
-            plane = _in_plane(
+            plane = _inverse_in_plane(
                 geometry, r + bare * math.cos(attitude), root[2] + bare * math.sin(attitude),
                 attitude, head,
             )  # fmt: skip
-            if not plane.clamped:
-                found.append(Reached((_wrapped(swing), *plane.q[1:4], head), False))
+            if not plane.is_clamped:
+                found.append(JointSolution((_wrap_angle(swing), *plane.q[1:4], head), False))
     return tuple(found)
 
 
@@ -206,7 +204,7 @@ def jacobian(geometry: FellerGeometry, q: Sequence[float]) -> np.ndarray:
         The derivatives [m/rad] and [1].
     """
     swing, boom, stick, tilt, head = q
-    pose, g = forward(geometry, q), geometry
+    pose, g = forward_kinematics(geometry, q), geometry
     c, s, attitude = math.cos(swing), math.sin(swing), boom + stick + tilt
     out = g.tilt_length + g.head_radius * math.cos(head)
     last = (
@@ -229,9 +227,7 @@ def jacobian(geometry: FellerGeometry, q: Sequence[float]) -> np.ndarray:
     return table
 
 
-def _in_plane(
-    geometry: FellerGeometry, r: float, z: float, attitude: float, head: float
-) -> Reached:
+def _inverse_in_plane(geometry: FellerGeometry, r: float, z: float, attitude: float, head: float) -> JointSolution:
     """Compute boom, stick and tilt for the tool's radius and height in the arm plane; swing 0."""
     g = geometry
     out = g.tilt_length + g.head_radius * math.cos(head)
@@ -242,9 +238,9 @@ def _in_plane(
     inner = (reach**2 - a**2 - b**2) / (2.0 * a * b)
     stick = -math.acos(max(-1.0, min(1.0, inner)))
     boom = math.atan2(up, across) - math.atan2(b * math.sin(stick), a + b * math.cos(stick))
-    clamped = abs(reach - far) > _ROUNDING
-    return Reached((0.0, boom, stick, attitude - boom - stick, head), clamped)
+    clamped = abs(reach - far) > _REACH_TOLERANCE
+    return JointSolution((0.0, boom, stick, attitude - boom - stick, head), clamped)
 
 
-def _wrapped(angle: float) -> float:
+def _wrap_angle(angle: float) -> float:
     return math.remainder(angle, 2.0 * math.pi)

@@ -10,16 +10,16 @@ import numpy as np
 from hydrotele.core.errors import InputError
 from hydrotele.kinematics.arm import ArmGeometry
 from hydrotele.kinematics.five_dof import FellerGeometry
-from hydrotele.kinematics.linkages import FourBar, LoopOpen, TwoBar, two_bar_from_points
+from hydrotele.kinematics.linkages import FourBar, LoopOpenError, TwoBar, two_bar_from_points
 from hydrotele.machine.drives import Axis
 from hydrotele.machine.machine import Machine
 
-_PLAY = 2.0e-3  # m: tolerance of the stroke, because joint ranges are given in whole degrees
-_EXACT = 1.0e-9  # m or 1: rounding of a 10 m machine, far below any relevant length
+_STROKE_TOLERANCE = 2.0e-3  # m: tolerance of the stroke, because joint ranges are given in whole degrees
+_GEOMETRY_TOLERANCE = 1.0e-9  # m or 1: rounding of a 10 m machine, far below any relevant length
 
 
 @dataclass(frozen=True)
-class Direct:
+class DirectDrive:
     """A drive that acts on its joint directly: drive and joint coordinate are equal."""
 
     def length(self, theta: Any) -> Any:
@@ -36,7 +36,7 @@ class Direct:
 
 
 @dataclass(frozen=True)
-class Slider:
+class SliderLinkage:
     """A cylinder on a prismatic joint: length = sqrt((x + along)^2 + across^2).
 
     Attributes:
@@ -60,7 +60,7 @@ class Slider:
         return np.sqrt(length**2 - self.across**2) - self.along
 
 
-DriveLinkage = TwoBar | FourBar | Slider | Direct
+DriveLinkage = TwoBar | FourBar | SliderLinkage | DirectDrive
 
 
 def axis_linkage(machine: Machine, name: str) -> DriveLinkage:
@@ -72,16 +72,16 @@ def axis_linkage(machine: Machine, name: str) -> DriveLinkage:
 
     Returns:
         Two-bar, four-bar or slider with `length`, `rate`, `angle` of the pin-to-pin length;
-        `Direct` for motors and force drives.
+        `DirectDrive` for motors and force drives.
 
     Raises:
         InputError: the pins of the cylinder are not on the two links that the joint connects.
     """
     axis = machine.axes[name]
     if axis.cylinder is None:
-        return Direct()
+        return DirectDrive()
     if axis.four_bar:
-        return _four_bar(machine, axis)
+        return _build_four_bar(machine, axis)
     upper = machine.link_of(axis.joint)
     link = machine.links[upper]
     pins = {axis.cylinder.base_pin.link: axis.cylinder.base_pin.position}
@@ -97,7 +97,7 @@ def axis_linkage(machine: Machine, name: str) -> DriveLinkage:
     if link.joint.type == "slide":
         way = rod - base
         along = float(way @ axis_way)
-        return Slider(along, float(np.linalg.norm(way - along * axis_way)))
+        return SliderLinkage(along, float(np.linalg.norm(way - along * axis_way)))
     first = np.array([1.0, 0.0, 0.0]) if abs(axis_way[0]) < 0.9 else np.array([0.0, 0.0, 1.0])
     first -= axis_way * (first @ axis_way)
     first /= np.linalg.norm(first)
@@ -122,7 +122,7 @@ def has_ball_ends(machine: Machine, name: str) -> bool:
     if axis.cylinder is None or axis.four_bar:
         return False
     linkage = axis_linkage(machine, name)
-    return isinstance(linkage, TwoBar) and abs(linkage.axial_offset) > _EXACT
+    return isinstance(linkage, TwoBar) and abs(linkage.axial_offset) > _GEOMETRY_TOLERANCE
 
 
 def range_at_drive(machine: Machine, name: str) -> tuple[float, float] | None:
@@ -149,7 +149,7 @@ def range_at_drive(machine: Machine, name: str) -> tuple[float, float] | None:
         if linkage.rate(limits[0]) * linkage.rate(limits[1]) <= 0.0:
             return None
         first, second = (float(linkage.length(q)) - axis.cylinder.closed_length for q in limits)
-    except LoopOpen:  # the linkage cannot reach the ends of the range
+    except LoopOpenError:  # the linkage cannot reach the ends of the range
         return None
     return min(first, second), max(first, second)
 
@@ -171,7 +171,7 @@ def drive_travel(machine: Machine, name: str) -> tuple[float, float] | None:
     return max(0.0, low), min(cylinder.stroke, high)
 
 
-def _four_bar(machine: Machine, axis: Axis) -> FourBar:
+def _build_four_bar(machine: Machine, axis: Axis) -> FourBar:
     assert axis.four_bar and axis.cylinder
     output = machine.link_of(axis.joint)
     rocker, coupler = machine.links[axis.four_bar.rocker], machine.links[axis.four_bar.coupler]
@@ -188,17 +188,17 @@ def _four_bar(machine: Machine, axis: Axis) -> FourBar:
         if end.link == axis.four_bar.coupler
     )
     return FourBar(
-        output_pivot=_plane(machine.links[output].position),
-        rocker_pivot=_plane(rocker.position),
-        cylinder_base=_plane(axis.cylinder.base_pin.position),
-        rocker=math.hypot(*_plane(coupler.position)),
-        coupler=math.hypot(*_plane(arm_of_coupler)),
-        output_arm=_plane(arm),
+        output_pivot=_xz_coordinates(machine.links[output].position),
+        rocker_pivot=_xz_coordinates(rocker.position),
+        cylinder_base=_xz_coordinates(axis.cylinder.base_pin.position),
+        rocker=math.hypot(*_xz_coordinates(coupler.position)),
+        coupler=math.hypot(*_xz_coordinates(arm_of_coupler)),
+        output_arm=_xz_coordinates(arm),
         working_angle=machine.home.get(axis.joint, 0.0),
     )
 
 
-def _plane(point) -> tuple[float, float]:
+def _xz_coordinates(point) -> tuple[float, float]:
     return point[0], point[2]
 
 
@@ -233,7 +233,7 @@ def check_strokes(machine: Machine) -> None:
         linkage = axis_linkage(machine, name)
         for end in limits:
             x = float(linkage.length(end)) - axis.cylinder.closed_length
-            if not -_PLAY <= x <= axis.cylinder.stroke + _PLAY:
+            if not -_STROKE_TOLERANCE <= x <= axis.cylinder.stroke + _STROKE_TOLERANCE:
                 raise InputError(
                     f"machine {machine.name}: axes.{name}.cylinder",
                     f"at {axis.joint} = {end:.4g} its piston would be at {x:.4g} m, outside its"
@@ -267,7 +267,7 @@ def arm_geometry(machine: Machine) -> ArmGeometry:
     swing, boom, stick = (machine.links[machine.link_of(j)] for j in joints)
     if arm.tool:
         tool_pin = machine.links[machine.link_of(arm.tool)].position
-        offset = _plane(arm.tip.position)
+        offset = _xz_coordinates(arm.tip.position)
     else:
         tool_pin, offset = arm.tip.position, (0.0, 0.0)
     base = np.add(swing.position, boom.position)
@@ -275,25 +275,25 @@ def arm_geometry(machine: Machine) -> ArmGeometry:
         base_radius=float(base[0]),
         lateral_offset=float(base[1] + stick.position[1] + tool_pin[1]),
         boom_pin_height=float(base[2]),
-        boom_length=math.hypot(*_plane(stick.position)),
-        stick_length=math.hypot(*_plane(tool_pin)),
+        boom_length=math.hypot(*_xz_coordinates(stick.position)),
+        stick_length=math.hypot(*_xz_coordinates(tool_pin)),
         tool_offset=offset,
-        tool_joint=arm.tool is not None,
+        has_tool_joint=arm.tool is not None,
     )
 
 
-def arm_is_plane(machine: Machine) -> bool:
+def is_planar_arm(machine: Machine) -> bool:
     """Return whether swing, boom and stick rotate about z and -y, as the closed forms require."""
     assert machine.arm
     wanted = ((0, 0, 1), (0, -1, 0), (0, -1, 0))
     joints = (machine.arm.swing, machine.arm.boom, machine.arm.stick)
     return all(
-        np.abs(np.subtract(machine.joints[name].axis, axis)).max() < _EXACT
+        np.abs(np.subtract(machine.joints[name].axis, axis)).max() < _GEOMETRY_TOLERANCE
         for name, axis in zip(joints, wanted, strict=True)
     )
 
 
-def tip_place(machine: Machine, joints: np.ndarray) -> np.ndarray:
+def tip_position(machine: Machine, joints: np.ndarray) -> np.ndarray:
     """Compute the position of the arm's tip.
 
     Args:
@@ -318,7 +318,7 @@ def tip_place(machine: Machine, joints: np.ndarray) -> np.ndarray:
     return place
 
 
-def joints_for_tip(machine: Machine, place: np.ndarray, start: np.ndarray) -> np.ndarray:
+def solve_tip_position(machine: Machine, place: np.ndarray, start: np.ndarray) -> np.ndarray:
     """Compute joint angles for a tip position, for any joint axes, by Newton's method.
 
     Args:
@@ -331,11 +331,11 @@ def joints_for_tip(machine: Machine, place: np.ndarray, start: np.ndarray) -> np
     """
     joints, step = np.array(start, float), 1.0e-6
     for _ in range(8):
-        gap = tip_place(machine, joints) - place
-        if np.abs(gap).max() < _EXACT:
+        gap = tip_position(machine, joints) - place
+        if np.abs(gap).max() < _GEOMETRY_TOLERANCE:
             break
         slope = np.column_stack([
-            (tip_place(machine, joints + step * e) - tip_place(machine, joints - step * e))
+            (tip_position(machine, joints + step * e) - tip_position(machine, joints - step * e))
             / (2.0 * step) for e in np.eye(3)
         ])  # fmt: skip
         joints -= np.linalg.lstsq(slope, gap, rcond=None)[0]
@@ -363,7 +363,7 @@ def feller_geometry(machine: Machine) -> FellerGeometry:
     swing, boom, stick, tilt, head = (machine.links[machine.link_of(j)] for j in joints)
     base, tip = np.add(swing.position, boom.position), arm.tip.position
     aside = [base[1], tip[1], *(v for link in (stick, tilt, head) for v in link.position[1:])]
-    _expect_feller(machine, joints, aside)
+    _check_feller(machine, joints, aside)
     return FellerGeometry(
         base_radius=float(base[0]),
         base_height=float(base[2]),
@@ -375,19 +375,17 @@ def feller_geometry(machine: Machine) -> FellerGeometry:
     )
 
 
-def _expect_feller(machine: Machine, joints: Sequence[str], aside: Sequence[float]) -> None:
+def _check_feller(machine: Machine, joints: Sequence[str], aside: Sequence[float]) -> None:
     """Raise an error if an arm's pins or axes do not have the form of `kinematics.five_dof`."""
     where = f"machine {machine.name}: arm"
     axes = ((0, 0, 1), (0, -1, 0), (0, -1, 0), (0, -1, 0), (0, 0, -1))
     for name, axis in zip(joints, axes, strict=True):
-        if np.abs(np.subtract(machine.joints[name].axis, axis)).max() > _EXACT:
+        if np.abs(np.subtract(machine.joints[name].axis, axis)).max() > _GEOMETRY_TOLERANCE:
             raise InputError(where, f"{name} must rotate about {axis} of its link")
     chain = [machine.links[machine.link_of(name)].parent for name in joints[1:]]
     if chain != [machine.link_of(name) for name in joints[:-1]]:
         raise InputError(where, "each joint must carry the next: swing, boom, stick, tool, head")
     if machine.arm and machine.arm.tip.link != machine.link_of(joints[-1]):
         raise InputError(where, f"its tip must be on the head, not on {machine.arm.tip.link}")
-    if np.abs(aside).max() > _EXACT:
-        raise InputError(
-            where, "each pin must be in the plane y = 0, on the x axis of the link before"
-        )
+    if np.abs(aside).max() > _GEOMETRY_TOLERANCE:
+        raise InputError(where, "each pin must be in the plane y = 0, on the x axis of the link before")

@@ -20,7 +20,7 @@ directions perpendicular to it, each prismatic axis rotation errors only; the le
 These are also 54 parameters, but different ones: axes are lines in the frame of the measurement,
 which may differ from the carriage's frame 0.
 
-Errors enter exactly, not linearised; `first_order` is the document's linear form.
+Errors enter exactly, not linearised; `first_order_carriage_pose` is the document's linear form.
 
 Source: Wang 2012, sections 3.1.1 and 3.2.1, Eqs 6 to 11, sections 3.1.2 (Eqs 12 to 29) and 3.2;
 Park and Okamura 1994 (exponentials); Mooring et al. 1991 (4R + 2P + T).
@@ -38,24 +38,32 @@ from scipy.optimize import differential_evolution
 from scipy.spatial.transform import Rotation
 
 from hydrotele.core.compiled import compiled
-from hydrotele.core.datafile import Facts, Number, Positive, Vector, parse, read_yaml, suggest
+from hydrotele.core.datafile import (
+    Number,
+    PositiveFloat,
+    StrictModel,
+    Vector,
+    read_yaml,
+    suggest_valid_name,
+    validate_data,
+)
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import models_folder
-from hydrotele.core.output import replacing
+from hydrotele.core.output import atomic_file
 
-LEGS = 6
+LEG_COUNT = 6
 PRISMATIC, REVOLUTE = 0, 1
-_KINDS = {"prismatic": PRISMATIC, "revolute": REVOLUTE}
-SHIPPED = ("iwr",)
-_CONVERGED = 1e-12  # m and rad, tolerance of a Newton step
-_STEPS = 50
+_KIND_CODES = {"prismatic": PRISMATIC, "revolute": REVOLUTE}
+SHIPPED_ROBOTS = ("iwr",)
+_NEWTON_TOLERANCE = 1e-12  # m and rad, tolerance of a Newton step
+_MAX_NEWTON_STEPS = 50
 
 
-class Unreachable(ValueError):
+class UnreachableError(ValueError):
     """No pose of the platform has these leg lengths, or Newton's method does not find it."""
 
 
-class DhRow(Facts):
+class DhRow(StrictModel):
     """A carriage joint given by its D-H row (Wang, Table 1): lengths [m], angles [rad]."""
 
     joint: str
@@ -67,7 +75,7 @@ class DhRow(Facts):
     range: tuple[Number, Number]
 
 
-class AxisRow(Facts):
+class AxisRow(StrictModel):
     """A carriage joint given by the line of its axis in frame 0 with all joints at zero.
 
     `direction` is a vector along the axis, `point` [m] a point on it (unused for prismatic joints).
@@ -80,23 +88,23 @@ class AxisRow(Facts):
     range: tuple[Number, Number]
 
     @model_validator(mode="after")
-    def _has_direction(self):
+    def _check_direction(self):
         if np.linalg.norm(self.direction) < 1e-9:
             raise ValueError("direction must not be zero")
         return self
 
 
-class PlatformFrame(Facts):
+class PlatformFrame(StrictModel):
     """Connecting platform with joints at zero: origin [m] and rotation vector [rad] in frame 0."""
 
     position: Vector
     rotation: Vector
 
 
-_Six = Annotated[tuple[Vector, ...], Field(min_length=LEGS, max_length=LEGS)]
+_SixVectors = Annotated[tuple[Vector, ...], Field(min_length=LEG_COUNT, max_length=LEG_COUNT)]
 
 
-class HybridFacts(Facts):
+class HybridSpec(StrictModel):
     """Contents of the file of a hybrid robot.
 
     `carriage` holds D-H rows; the last frame is that of the connecting platform. `axes` holds axis
@@ -107,15 +115,15 @@ class HybridFacts(Facts):
     carriage: tuple[DhRow, ...] = ()
     axes: tuple[AxisRow, ...] = ()
     platform_at_zero: PlatformFrame | None = None
-    universal_joints: _Six
-    spherical_joints: _Six
-    leg_offsets: Annotated[tuple[Number, ...], Field(min_length=LEGS, max_length=LEGS)]
-    leg_range: tuple[Positive, Positive]
+    universal_joints: _SixVectors
+    spherical_joints: _SixVectors
+    leg_offsets: Annotated[tuple[Number, ...], Field(min_length=LEG_COUNT, max_length=LEG_COUNT)]
+    leg_range: tuple[PositiveFloat, PositiveFloat]
     home: Vector
     model: str = ""
 
     @model_validator(mode="after")
-    def _one_form(self):
+    def _check_form(self):
         if bool(self.carriage) == bool(self.axes):
             raise ValueError("give either `carriage` (D-H rows) or `axes` (lines of the axes)")
         if bool(self.axes) != (self.platform_at_zero is not None):
@@ -126,7 +134,7 @@ class HybridFacts(Facts):
         return self
 
 
-class Pose(NamedTuple):
+class PlatformPose(NamedTuple):
     """Poses of the moving platform in frame 0.
 
     Attributes:
@@ -139,7 +147,7 @@ class Pose(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Hybrid:
+class HybridRobot:
     """Kinematic model of a hybrid robot with n carriage joints.
 
     Attributes:
@@ -153,7 +161,7 @@ class Hybrid:
         joint_range: (n, 2) joint ranges [m] or [rad].
         leg_range: minimum and maximum reading of a leg [m].
         home: (3,) home position of the moving platform in the connecting platform's frame [m].
-        facts: contents of the file.
+        specification: contents of the file.
     """
 
     name: str
@@ -166,10 +174,10 @@ class Hybrid:
     joint_range: np.ndarray
     leg_range: tuple[float, float]
     home: np.ndarray
-    facts: HybridFacts
+    specification: HybridSpec
 
 
-def load_hybrid(name: str | Path) -> Hybrid:
+def load_hybrid(name: str | Path) -> HybridRobot:
     """Read a hybrid robot.
 
     Args:
@@ -183,19 +191,20 @@ def load_hybrid(name: str | Path) -> Hybrid:
     ('d1', 'd2', 'theta3', 'theta4')
     """
     path = Path(name)
-    if str(name) in SHIPPED:
+    if str(name) in SHIPPED_ROBOTS:
         path = models_folder() / str(name) / f"{name}.yaml"
     elif path.is_dir() and (path / "robot.yaml").is_file():
         path = path / "robot.yaml"
     elif not path.is_file():
         raise InputError(
-            f"hybrid robot {str(name)!r}", f"{suggest(name, SHIPPED)}; or give a file or folder"
+            f"hybrid robot {str(name)!r}",
+            f"{suggest_valid_name(name, SHIPPED_ROBOTS)}; or give a file or folder",
         )
     data, lines = read_yaml(path)
-    return hybrid_of(parse(HybridFacts, data, str(path), lines))
+    return build_hybrid(validate_data(HybridSpec, data, str(path), lines))
 
 
-def save_hybrid(robot: Hybrid, path: str | Path, note: str = "") -> None:
+def save_hybrid(robot: HybridRobot, path: str | Path, note: str = "") -> None:
     """Write a hybrid robot to a file in SI units with all digits; `load_hybrid` reads it.
 
     Args:
@@ -206,22 +215,22 @@ def save_hybrid(robot: Hybrid, path: str | Path, note: str = "") -> None:
     Raises:
         InputError: the file cannot be written.
     """
-    data = robot.facts.model_dump(mode="json", exclude_defaults=True)
+    data = robot.specification.model_dump(mode="json", exclude_defaults=True)
     text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=110)
-    with replacing(path, ".yaml") as part:
+    with atomic_file(path, ".yaml") as part:
         part.write_text((f"# {note}\n" if note else "") + text, encoding="utf-8")
 
 
-def hybrid_of(facts: HybridFacts) -> Hybrid:
+def build_hybrid(facts: HybridSpec) -> HybridRobot:
     """Build the kinematic model of a hybrid robot from the contents of its file."""
     rows = facts.carriage or facts.axes
     if facts.carriage:
         table = np.array([(r.theta, r.d, r.a, r.alpha) for r in facts.carriage])
         constants = np.concatenate([np.eye(4)[None], dh_transform(*table.T)])
     else:
-        constants = constants_of_axes(axis_frames(facts.axes), _at_zero(facts))
-    return Hybrid(
-        facts.name, tuple(r.joint for r in rows), np.array([_KINDS[r.kind] for r in rows]),
+        constants = constants_from_axes(axis_frames(facts.axes), _platform_at_zero(facts))
+    return HybridRobot(
+        facts.name, tuple(r.joint for r in rows), np.array([_KIND_CODES[r.kind] for r in rows]),
         constants, np.array(facts.universal_joints), np.array(facts.spherical_joints),
         np.array(facts.leg_offsets), np.array([r.range for r in rows]), facts.leg_range,
         np.array(facts.home), facts,
@@ -263,7 +272,7 @@ def axis_frames(axes: Sequence[AxisRow]) -> np.ndarray:
     return frames
 
 
-def _at_zero(facts: HybridFacts) -> np.ndarray:
+def _platform_at_zero(facts: HybridSpec) -> np.ndarray:
     """Return the connecting platform's frame (4, 4) in frame 0 with all joints at zero."""
     assert facts.platform_at_zero is not None
     frame = np.eye(4)
@@ -272,7 +281,7 @@ def _at_zero(facts: HybridFacts) -> np.ndarray:
     return frame
 
 
-def constants_of_axes(frames: np.ndarray, at_zero: np.ndarray) -> np.ndarray:
+def constants_from_axes(frames: np.ndarray, at_zero: np.ndarray) -> np.ndarray:
     """Return the constants C_0 to C_n of a product of exponentials from its axis frames.
 
     Args:
@@ -297,7 +306,7 @@ def inverse_transform(transform: np.ndarray) -> np.ndarray:
     return result
 
 
-def zero_frames(robot: Hybrid) -> tuple[np.ndarray, np.ndarray]:
+def zero_frames(robot: HybridRobot) -> tuple[np.ndarray, np.ndarray]:
     """Return frames of the joint axes and the connecting platform in frame 0, joints at zero.
 
     Returns:
@@ -310,12 +319,12 @@ def zero_frames(robot: Hybrid) -> tuple[np.ndarray, np.ndarray]:
     return np.array(frames), frame @ robot.constants[-1]
 
 
-def with_axes(robot: Hybrid) -> Hybrid:
+def convert_to_axes(robot: HybridRobot) -> HybridRobot:
     """Return the same robot, given by axis lines instead of D-H rows.
 
-    >>> same = with_axes(load_hybrid("iwr"))
+    >>> same = convert_to_axes(load_hybrid("iwr"))
     >>> q = np.array([0.3, 0.1, 0.4, -0.2])
-    >>> place = Pose(np.eye(3), np.array([1.2, -0.1, 1.4]))
+    >>> place = PlatformPose(np.eye(3), np.array([1.2, -0.1, 1.4]))
     >>> change = leg_readings(same, q, place) - leg_readings(load_hybrid("iwr"), q, place)
     >>> bool(abs(change).max() < 1e-12)
     True
@@ -330,10 +339,10 @@ def with_axes(robot: Hybrid) -> Hybrid:
     vector = Rotation.from_matrix(last[:3, :3]).as_rotvec()
     seat = PlatformFrame(position=tuple(last[:3, 3]), rotation=tuple(vector))
     changes = {"carriage": (), "axes": tuple(rows), "platform_at_zero": seat}
-    return hybrid_of(robot.facts.model_copy(update=changes))
+    return build_hybrid(robot.specification.model_copy(update=changes))
 
 
-def carriage_pose(robot: Hybrid, joints: np.ndarray) -> np.ndarray:
+def carriage_pose(robot: HybridRobot, joints: np.ndarray) -> np.ndarray:
     """Compute the poses of the connecting platform.
 
     Args:
@@ -358,7 +367,7 @@ def carriage_pose(robot: Hybrid, joints: np.ndarray) -> np.ndarray:
     return result
 
 
-def leg_vectors(robot: Hybrid, joints: np.ndarray, pose: Pose) -> np.ndarray:
+def leg_vectors(robot: HybridRobot, joints: np.ndarray, pose: PlatformPose) -> np.ndarray:
     """Compute the vectors from A_i to B_i in the connecting platform's frame (Wang Eqs 8 and 10).
 
     Args:
@@ -375,7 +384,7 @@ def leg_vectors(robot: Hybrid, joints: np.ndarray, pose: Pose) -> np.ndarray:
     return np.einsum("...ji,...kj->...ki", carriage[..., :3, :3], ends) - robot.universal
 
 
-def leg_readings(robot: Hybrid, joints: np.ndarray, pose: Pose) -> np.ndarray:
+def leg_readings(robot: HybridRobot, joints: np.ndarray, pose: PlatformPose) -> np.ndarray:
     """Compute the readings of the leg sensors at a pose (Wang Eq. 11).
 
     Args:
@@ -389,7 +398,7 @@ def leg_readings(robot: Hybrid, joints: np.ndarray, pose: Pose) -> np.ndarray:
     return np.linalg.norm(leg_vectors(robot, joints, pose), axis=-1) - robot.offsets
 
 
-def inverse(robot: Hybrid, pose: Pose, joints: np.ndarray) -> np.ndarray:
+def inverse_kinematics(robot: HybridRobot, pose: PlatformPose, joints: np.ndarray) -> np.ndarray:
     """Compute leg readings for a pose with given carriage positions, within the legs' range.
 
     The robot is redundant: ten joints for six coordinates. The carriage positions are chosen first
@@ -410,18 +419,18 @@ def inverse(robot: Hybrid, pose: Pose, joints: np.ndarray) -> np.ndarray:
     low, high = robot.leg_range
     if not ((readings >= low) & (readings <= high)).all():
         worst = readings.flat[np.argmax(np.maximum(low - readings, readings - high))]
-        raise Unreachable(f"a leg would read {worst:.4f} m, its range is {low:g} to {high:g} m")
+        raise UnreachableError(f"a leg would read {worst:.4f} m, its range is {low:g} to {high:g} m")
     return readings
 
 
-def home_pose(robot: Hybrid, joints: np.ndarray) -> Pose:
+def home_pose(robot: HybridRobot, joints: np.ndarray) -> PlatformPose:
     """Return the home pose of the moving platform for carriage positions (..., n)."""
     carriage = carriage_pose(robot, joints)
     place = np.einsum("...ij,j->...i", carriage[..., :3, :3], robot.home)
-    return Pose(carriage[..., :3, :3], place + carriage[..., :3, 3])
+    return PlatformPose(carriage[..., :3, :3], place + carriage[..., :3, 3])
 
 
-def leg_jacobian(robot: Hybrid, joints: np.ndarray, pose: Pose) -> np.ndarray:
+def leg_jacobian(robot: HybridRobot, joints: np.ndarray, pose: PlatformPose) -> np.ndarray:
     """Compute the derivatives of the leg readings by position [m] and rotation vector [rad].
 
     The rotation is that of exp(w) R in frame 0.
@@ -442,9 +451,9 @@ def leg_jacobian(robot: Hybrid, joints: np.ndarray, pose: Pose) -> np.ndarray:
     return np.concatenate([unit, np.cross(arms, unit)], axis=-1)
 
 
-def forward(
-    robot: Hybrid, joints: np.ndarray, readings: np.ndarray, start: Pose | None = None
-) -> Pose:
+def forward_kinematics(
+    robot: HybridRobot, joints: np.ndarray, readings: np.ndarray, start: PlatformPose | None = None
+) -> PlatformPose:
     """Compute forward kinematics by Newton's method on the six leg lengths.
 
     Up to 40 poses have the same lengths; the result is the one on the start's branch.
@@ -465,33 +474,33 @@ def forward(
     rotation, position = home_pose(robot, joints) if start is None else start
     rotation, position = np.array(rotation), np.array(position)
     size = np.inf
-    for _ in range(_STEPS):
-        pose = Pose(rotation, position)
+    for _ in range(_MAX_NEWTON_STEPS):
+        pose = PlatformPose(rotation, position)
         error = leg_readings(robot, joints, pose) - readings
         jacobian = leg_jacobian(robot, joints, pose)
         try:
             step = -np.linalg.solve(jacobian, error[..., None])[..., 0]
         except np.linalg.LinAlgError:
-            raise Unreachable("the hexapod is in a singular pose") from None
+            raise UnreachableError("the hexapod is in a singular pose") from None
         turn = np.linalg.norm(step[..., 3:], axis=-1, keepdims=True)
         step = step * np.minimum(1.0, 0.5 / np.maximum(turn, 1e-300))  # rad: same branch
         position = position + step[..., :3]
         turned = Rotation.from_rotvec(step[..., 3:].reshape(-1, 3)).as_matrix()
         rotation = turned.reshape(*step.shape[:-1], 3, 3) @ rotation
         size = np.max(np.abs(step), initial=0.0)
-        if not np.isfinite(size) or size < _CONVERGED:
+        if not np.isfinite(size) or size < _NEWTON_TOLERANCE:
             break
-    pose = Pose(rotation, position)
+    pose = PlatformPose(rotation, position)
     left = np.max(np.abs(leg_readings(robot, joints, pose) - readings), initial=0.0)
     if not left < 1e-9:  # m: far below any sensor, far above rounding
-        raise Unreachable("no pose of the platform has these leg lengths near the start")
+        raise UnreachableError("no pose of the platform has these leg lengths near the start")
     return pose
 
 
-def forward_evolution(
-    robot: Hybrid, joints: np.ndarray, readings: np.ndarray, seed: int = 0,
+def forward_by_evolution(
+    robot: HybridRobot, joints: np.ndarray, readings: np.ndarray, seed: int = 0,
     reach: float = 0.35, turn: float = 0.6, polish: bool = False,
-) -> Pose:  # fmt: skip
+) -> PlatformPose:  # fmt: skip
     """Compute forward kinematics by differential evolution, without start or Jacobian.
 
     The sum of squared errors of the leg lengths is minimised over position and rotation vector in
@@ -513,26 +522,26 @@ def forward_evolution(
     """
     home = home_pose(robot, np.asarray(joints, float))
 
-    def pose_of(x: np.ndarray) -> Pose:  # (6, S) as SciPy passes a population
+    def pose_of(x: np.ndarray) -> PlatformPose:  # (6, S) as SciPy passes a population
         turned = Rotation.from_rotvec(x[3:].T).as_matrix() @ home.rotation
-        return Pose(turned, home.position + x[:3].T)
+        return PlatformPose(turned, home.position + x[:3].T)
 
-    def misfit(x: np.ndarray) -> np.ndarray:
+    def squared_errors(x: np.ndarray) -> np.ndarray:
         x = x if x.ndim == 2 else x[:, None]
         place = np.broadcast_to(joints, (x.shape[1], len(robot.joints)))
         away = leg_readings(robot, place, pose_of(x)) - readings
         return np.sum((1e3 * away) ** 2, axis=-1)
 
     found = differential_evolution(
-        misfit, [(-reach, reach)] * 3 + [(-turn, turn)] * 3, rng=np.random.default_rng(seed),
+        squared_errors, [(-reach, reach)] * 3 + [(-turn, turn)] * 3, rng=np.random.default_rng(seed),
         popsize=10, maxiter=2000, tol=1e-16, polish=polish, vectorized=True,
         updating="deferred",
     )  # fmt: skip
     pose = pose_of(found.x[:, None])
-    return Pose(pose.rotation[0], pose.position[0])
+    return PlatformPose(pose.rotation[0], pose.position[0])
 
 
-def rotation_of_euler(angles: np.ndarray) -> np.ndarray:
+def euler_to_rotation(angles: np.ndarray) -> np.ndarray:
     """Return the rotation Rz(gamma) Ry(beta) Rx(alpha) of Z-Y-X Euler angles (Wang Eq. 9).
 
     Args:
@@ -546,10 +555,10 @@ def rotation_of_euler(angles: np.ndarray) -> np.ndarray:
     return turned.reshape(*angles.shape[:-1], 3, 3)
 
 
-def euler_of_rotation(rotation: np.ndarray) -> np.ndarray:
+def rotation_to_euler(rotation: np.ndarray) -> np.ndarray:
     """Return Z-Y-X Euler angles (..., 3) about x, y, z [rad] of rotations (..., 3, 3).
 
-    >>> euler_of_rotation(rotation_of_euler([0.1, -0.2, 0.3])).round(12).tolist()
+    >>> rotation_to_euler(euler_to_rotation([0.1, -0.2, 0.3])).round(12).tolist()
     [0.1, -0.2, 0.3]
     """
     rotation = np.asarray(rotation, float)
@@ -557,13 +566,11 @@ def euler_of_rotation(rotation: np.ndarray) -> np.ndarray:
     return angles.reshape(*rotation.shape[:-2], 3)
 
 
-def pose_difference(found: Pose, true: Pose) -> np.ndarray:
+def pose_difference(found: PlatformPose, true: PlatformPose) -> np.ndarray:
     """Return position [m] and rotation vector [rad] (..., 6) from `true` to `found`, in frame 0."""
     turned = found.rotation @ np.swapaxes(true.rotation, -1, -2)
     vector = Rotation.from_matrix(turned.reshape(-1, 3, 3)).as_rotvec()
-    return np.concatenate(
-        [found.position - true.position, vector.reshape(found.position.shape)], axis=-1
-    )
+    return np.concatenate([found.position - true.position, vector.reshape(found.position.shape)], axis=-1)
 
 
 @compiled
@@ -625,20 +632,23 @@ def batch_readings(constants, kinds, universal, spherical, offsets, joints, rota
     return result
 
 
-Kind = Literal["dh", "poe"]
-LENGTH_SIZE, ANGLE_SIZE = 1.0e-3, 1.0e-3  # m, rad: typical manufacturing errors, search scales
-_DH = ("theta", "d", "a", "alpha")
-_DH_WORDS = {
+ErrorModelKind = Literal["dh", "poe"]
+LENGTH_ERROR_SCALE, ANGLE_ERROR_SCALE = (
+    1.0e-3,
+    1.0e-3,
+)  # m, rad: typical manufacturing errors, search scales
+_DH_PARTS = ("theta", "d", "a", "alpha")
+_DH_DESCRIPTIONS = {
     "theta": "joint angle offset", "d": "joint distance", "a": "link length", "alpha": "link twist"
 }  # fmt: skip
-_POE = ("rx", "ry", "x", "y")
-_POE_WORDS = {
+_POE_PARTS = ("rx", "ry", "x", "y")
+_POE_DESCRIPTIONS = {
     "rx": "tilt of the axis about its x", "ry": "tilt of the axis about its y",
     "x": "shift of the axis along its x", "y": "shift of the axis along its y",
 }  # fmt: skip
 
 
-class Parts(NamedTuple):
+class GeometryBatch(NamedTuple):
     """W geometries with errors: constants (W, n + 1, 4, 4), A and B (W, 6, 3), offsets (W, 6)."""
 
     constants: np.ndarray
@@ -655,19 +665,19 @@ class ErrorModel:
         kind: `dh` or `poe`.
         nominal: the robot without errors; for `poe` given by its axes.
         names: the p parameters, such as theta4, a4, a1x, b6z, l3 for `dh`.
-        words: description of each parameter.
+        descriptions: description of each parameter.
         units: `m` or `rad` for each parameter.
         scales: (p,) typical manufacturing errors [units].
     """
 
-    kind: Kind
-    nominal: Hybrid
+    kind: ErrorModelKind
+    nominal: HybridRobot
     names: tuple[str, ...]
-    words: tuple[str, ...]
+    descriptions: tuple[str, ...]
     units: tuple[str, ...]
     scales: np.ndarray
 
-    def index(self, names) -> np.ndarray:
+    def parameter_indices(self, names) -> np.ndarray:
         """Return the indices of parameters by their names.
 
         Raises:
@@ -681,10 +691,10 @@ class ErrorModel:
     @property
     def carriage_count(self) -> int:
         """Number of carriage parameters; the 42 parameters of the legs follow."""
-        return len(self.names) - 7 * LEGS
+        return len(self.names) - 7 * LEG_COUNT
 
 
-def error_model(robot: Hybrid, kind: Kind) -> ErrorModel:
+def build_error_model(robot: HybridRobot, kind: ErrorModelKind) -> ErrorModel:
     """Build an error model about a robot.
 
     Args:
@@ -695,39 +705,37 @@ def error_model(robot: Hybrid, kind: Kind) -> ErrorModel:
         InputError: the kind is unknown, or the robot has no D-H rows.
 
     >>> from hydrotele.kinematics.hybrid import load_hybrid
-    >>> [len(error_model(load_hybrid("iwr"), kind).names) for kind in ("dh", "poe")]
+    >>> [len(build_error_model(load_hybrid("iwr"), kind).names) for kind in ("dh", "poe")]
     [54, 54]
     """
     if kind not in ("dh", "poe"):
         raise InputError(f"error model {kind!r}", "valid: dh, poe")
-    if kind == "dh" and not robot.facts.carriage:
+    if kind == "dh" and not robot.specification.carriage:
         raise InputError(f"robot {robot.name}", "is given by `axes`: use the error model poe")
     names, words, units = [], [], []
-    for number, (joint, turning) in enumerate(
-        zip(robot.joints, robot.kinds == REVOLUTE, strict=True), 1
-    ):
+    for number, (joint, turning) in enumerate(zip(robot.joints, robot.kinds == REVOLUTE, strict=True), 1):
         if kind == "dh":
-            own = _DH if turning else ("theta", "alpha")
+            own = _DH_PARTS if turning else ("theta", "alpha")
             names += [f"{part}{number}" for part in own]
-            words += [f"link {number}: {_DH_WORDS[part]}" for part in own]
+            words += [f"link {number}: {_DH_DESCRIPTIONS[part]}" for part in own]
             units += ["m" if part in "da" else "rad" for part in own]
         else:
-            own = _POE if turning else _POE[:2]
+            own = _POE_PARTS if turning else _POE_PARTS[:2]
             names += [f"{joint}.{part}" for part in own]
-            words += [f"joint {joint}: {_POE_WORDS[part]}" for part in own]
+            words += [f"joint {joint}: {_POE_DESCRIPTIONS[part]}" for part in own]
             units += ["m" if part in "xy" else "rad" for part in own]
     for letter, what in (("a", "universal joint"), ("b", "spherical joint")):
-        names += [f"{letter}{leg}{c}" for leg in range(1, LEGS + 1) for c in "xyz"]
-        words += [f"leg {leg}: {c} of its {what}" for leg in range(1, LEGS + 1) for c in "xyz"]
-    names += [f"l{leg}" for leg in range(1, LEGS + 1)]
-    words += [f"leg {leg}: offset of its length" for leg in range(1, LEGS + 1)]
-    units += ["m"] * (7 * LEGS)
-    scales = np.where(np.array(units) == "m", LENGTH_SIZE, ANGLE_SIZE)
-    nominal = robot if kind == "dh" or robot.facts.axes else with_axes(robot)
+        names += [f"{letter}{leg}{c}" for leg in range(1, LEG_COUNT + 1) for c in "xyz"]
+        words += [f"leg {leg}: {c} of its {what}" for leg in range(1, LEG_COUNT + 1) for c in "xyz"]
+    names += [f"l{leg}" for leg in range(1, LEG_COUNT + 1)]
+    words += [f"leg {leg}: offset of its length" for leg in range(1, LEG_COUNT + 1)]
+    units += ["m"] * (7 * LEG_COUNT)
+    scales = np.where(np.array(units) == "m", LENGTH_ERROR_SCALE, ANGLE_ERROR_SCALE)
+    nominal = robot if kind == "dh" or robot.specification.axes else convert_to_axes(robot)
     return ErrorModel(kind, nominal, tuple(names), tuple(words), tuple(units), scales)
 
 
-def document_parameters(model: ErrorModel) -> tuple[str, ...]:
+def refined_model_parameters(model: ErrorModel) -> tuple[str, ...]:
     """Return the 36 parameters of Wang's refined model: carriage, B_i and leg offsets, no A_i.
 
     The chapter that lists them is not in the available text; this choice is inferred. Without the
@@ -739,7 +747,7 @@ def document_parameters(model: ErrorModel) -> tuple[str, ...]:
     return model.names[: model.carriage_count] + tuple(n for n in legs if n[0] != "a")
 
 
-def parts_of(model: ErrorModel, errors: np.ndarray) -> Parts:
+def build_geometries(model: ErrorModel, errors: np.ndarray) -> GeometryBatch:
     """Build geometries with errors.
 
     Args:
@@ -754,14 +762,14 @@ def parts_of(model: ErrorModel, errors: np.ndarray) -> Parts:
     of_carriage = errors[:, :count]
     constants = _dh_constants if model.kind == "dh" else _poe_constants
     legs = errors[:, count:]
-    points = legs[:, : 6 * LEGS].reshape(-1, 2, LEGS, 3)
-    return Parts(
+    points = legs[:, : 6 * LEG_COUNT].reshape(-1, 2, LEG_COUNT, 3)
+    return GeometryBatch(
         np.ascontiguousarray(constants(robot, of_carriage)), robot.universal + points[:, 0],
-        robot.spherical + points[:, 1], robot.offsets + legs[:, 6 * LEGS :],
+        robot.spherical + points[:, 1], robot.offsets + legs[:, 6 * LEG_COUNT :],
     )  # fmt: skip
 
 
-def predicted_readings(
+def predict_leg_readings(
     model: ErrorModel, errors: np.ndarray, joints: np.ndarray, rotation: np.ndarray,
     position: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
@@ -777,7 +785,7 @@ def predicted_readings(
     Returns:
         (W, N, 6) readings [m].
     """
-    parts = parts_of(model, errors)
+    parts = build_geometries(model, errors)
     return batch_readings(
         parts.constants, model.nominal.kinds, parts.universal, parts.spherical, parts.offsets,
         np.ascontiguousarray(joints), np.ascontiguousarray(rotation),
@@ -785,7 +793,7 @@ def predicted_readings(
     )  # fmt: skip
 
 
-def corrected(model: ErrorModel, errors: np.ndarray) -> Hybrid:
+def apply_errors(model: ErrorModel, errors: np.ndarray) -> HybridRobot:
     """Return a robot with given errors: a calibrated robot, or the true robot of a simulation.
 
     Args:
@@ -796,30 +804,30 @@ def corrected(model: ErrorModel, errors: np.ndarray) -> Hybrid:
         A robot of the same form, D-H rows for `dh`, axes for `poe`.
     """
     errors = np.asarray(errors, float)
-    robot, parts = model.nominal, parts_of(model, errors)
+    robot, parts = model.nominal, build_geometries(model, errors)
     changes: dict = {
-        "universal_joints": _points(parts.universal[0]),
-        "spherical_joints": _points(parts.spherical[0]),
+        "universal_joints": _to_point_tuples(parts.universal[0]),
+        "spherical_joints": _to_point_tuples(parts.spherical[0]),
         "leg_offsets": tuple(parts.offsets[0].tolist()),
     }
     if model.kind == "dh":
-        table = _dh_errors(robot, errors[None, : model.carriage_count])[0]
+        table = _dh_error_table(robot, errors[None, : model.carriage_count])[0]
         changes["carriage"] = tuple(
             row.model_copy(update={part: getattr(row, part) + float(e)
-                                   for part, e in zip(_DH, extra, strict=True)})
-            for row, extra in zip(robot.facts.carriage, table, strict=True)
+                                   for part, e in zip(_DH_PARTS, extra, strict=True)})
+            for row, extra in zip(robot.specification.carriage, table, strict=True)
         )  # fmt: skip
     else:
         frames = _poe_frames(robot, errors[None, : model.carriage_count])[0]
         changes["axes"] = tuple(
             row.model_copy(update={"direction": tuple(frame[:3, 2].tolist()),
                                    "point": tuple(frame[:3, 3].tolist())})
-            for row, frame in zip(robot.facts.axes, frames, strict=True)
+            for row, frame in zip(robot.specification.axes, frames, strict=True)
         )  # fmt: skip
-    return hybrid_of(robot.facts.model_copy(update=changes))
+    return build_hybrid(robot.specification.model_copy(update=changes))
 
 
-def first_order(robot: Hybrid, errors: np.ndarray, joints: np.ndarray) -> np.ndarray:
+def first_order_carriage_pose(robot: HybridRobot, errors: np.ndarray, joints: np.ndarray) -> np.ndarray:
     """Compute the carriage pose by the document's linear error model (Wang Eqs 12 to 26).
 
     dT = sum_i (0T_{i-1}) (d Ai) (iT4), with d Ai = A_i delta_i and delta_i = D_theta dtheta + D_d
@@ -833,9 +841,9 @@ def first_order(robot: Hybrid, errors: np.ndarray, joints: np.ndarray) -> np.nda
     Returns:
         (N, 4, 4) nominal pose plus its first-order change.
     """
-    table = _dh_errors(robot, np.asarray(errors, float)[None])[0]
+    table = _dh_error_table(robot, np.asarray(errors, float)[None])[0]
     matrices = []
-    for row, kind, value in zip(robot.facts.carriage, robot.kinds, joints.T, strict=True):
+    for row, kind, value in zip(robot.specification.carriage, robot.kinds, joints.T, strict=True):
         turning = kind == REVOLUTE
         matrices.append(dh_transform(row.theta + turning * value, row.d + (not turning) * value,
                                      row.a, row.alpha))  # fmt: skip
@@ -844,9 +852,7 @@ def first_order(robot: Hybrid, errors: np.ndarray, joints: np.ndarray) -> np.nda
         total = total @ matrix
     change = np.zeros_like(total)
     before = np.broadcast_to(np.eye(4), total.shape)
-    for row, matrix, (dtheta, dd, da, dalpha) in zip(
-        robot.facts.carriage, matrices, table, strict=True
-    ):
+    for row, matrix, (dtheta, dd, da, dalpha) in zip(robot.specification.carriage, matrices, table, strict=True):
         c, s = np.cos(row.alpha), np.sin(row.alpha)
         d_theta = np.array([[0, -c, s, 0], [c, 0, 0, row.a * c], [-s, 0, 0, -row.a * s], [0] * 4])
         d_d = np.array([[0, 0, 0, 0], [0, 0, 0, s], [0, 0, 0, c], [0] * 4])
@@ -859,11 +865,11 @@ def first_order(robot: Hybrid, errors: np.ndarray, joints: np.ndarray) -> np.nda
     return total + change
 
 
-def _points(points: np.ndarray) -> tuple:
+def _to_point_tuples(points: np.ndarray) -> tuple:
     return tuple(map(tuple, points.tolist()))
 
 
-def _dh_errors(robot: Hybrid, errors: np.ndarray) -> np.ndarray:
+def _dh_error_table(robot: HybridRobot, errors: np.ndarray) -> np.ndarray:
     """Return the errors (W, n, 4) of theta, d, a, alpha of every row; zero if not modelled."""
     table, at = np.zeros((len(errors), len(robot.kinds), 4)), 0
     for i, kind in enumerate(robot.kinds):
@@ -873,17 +879,17 @@ def _dh_errors(robot: Hybrid, errors: np.ndarray) -> np.ndarray:
     return table
 
 
-def _dh_constants(robot: Hybrid, errors: np.ndarray) -> np.ndarray:
-    nominal = np.array([(r.theta, r.d, r.a, r.alpha) for r in robot.facts.carriage])
-    rows = nominal + _dh_errors(robot, errors)
+def _dh_constants(robot: HybridRobot, errors: np.ndarray) -> np.ndarray:
+    nominal = np.array([(r.theta, r.d, r.a, r.alpha) for r in robot.specification.carriage])
+    rows = nominal + _dh_error_table(robot, errors)
     links = dh_transform(*np.moveaxis(rows, -1, 0))
     base = np.broadcast_to(np.eye(4), (len(errors), 1, 4, 4))
     return np.concatenate([base, links], axis=1)
 
 
-def _poe_frames(robot: Hybrid, errors: np.ndarray) -> np.ndarray:
+def _poe_frames(robot: HybridRobot, errors: np.ndarray) -> np.ndarray:
     """Return the frames (W, n, 4, 4) of the axes with errors, joints at zero."""
-    nominal = axis_frames(robot.facts.axes)
+    nominal = axis_frames(robot.specification.axes)
     motion, at = np.zeros((len(errors), len(nominal), 4, 4)), 0
     motion[..., 3, 3] = 1.0
     for i, kind in enumerate(robot.kinds):
@@ -897,6 +903,6 @@ def _poe_frames(robot: Hybrid, errors: np.ndarray) -> np.ndarray:
     return nominal @ motion
 
 
-def _poe_constants(robot: Hybrid, errors: np.ndarray) -> np.ndarray:
+def _poe_constants(robot: HybridRobot, errors: np.ndarray) -> np.ndarray:
     at_zero = zero_frames(robot)[1]
-    return constants_of_axes(_poe_frames(robot, errors), at_zero)
+    return constants_from_axes(_poe_frames(robot, errors), at_zero)

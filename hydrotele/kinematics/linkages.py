@@ -24,11 +24,11 @@ Scalar = float | np.ndarray
 Point = tuple[Scalar, Scalar]
 
 
-class LoopOpen(ValueError):
+class LoopOpenError(ValueError):
     """The pins of a linkage cannot be joined at the requested angle or length."""
 
 
-def library(value: Scalar) -> ModuleType:
+def math_module(value: Scalar) -> ModuleType:
     """Return the module for a value: NumPy for an array, the faster math module for a float.
 
     Args:
@@ -38,13 +38,13 @@ def library(value: Scalar) -> ModuleType:
         The module numpy or math; both have sin, cos, sqrt, atan2 and floor under these names (NumPy
         2).
 
-    >>> library(1.0).__name__, library(np.ones(2)).__name__
+    >>> math_module(1.0).__name__, math_module(np.ones(2)).__name__
     ('math', 'numpy')
     """
     return np if isinstance(value, np.ndarray) else math
 
 
-def minus(a: Point, b: Point) -> Point:
+def subtract_points(a: Point, b: Point) -> Point:
     """Return the vector a - b in the plane.
 
     Args:
@@ -54,13 +54,13 @@ def minus(a: Point, b: Point) -> Point:
     Returns:
         (x, z) of the difference [m].
 
-    >>> minus((3.0, 1.0), (1.0, 2.0))
+    >>> subtract_points((3.0, 1.0), (1.0, 2.0))
     (2.0, -1.0)
     """
     return a[0] - b[0], a[1] - b[1]
 
 
-def cross(a: Point, b: Point) -> Scalar:
+def cross_product(a: Point, b: Point) -> Scalar:
     """Return the cross product a_x b_z - a_z b_x, positive if b is to the left of a.
 
     Args:
@@ -70,7 +70,7 @@ def cross(a: Point, b: Point) -> Scalar:
     Returns:
         The product, shape of the coordinates [m^2].
 
-    >>> cross((1.0, 0.0), (0.0, 2.0))
+    >>> cross_product((1.0, 0.0), (0.0, 2.0))
     2.0
     """
     return a[0] * b[1] - a[1] * b[0]
@@ -96,24 +96,24 @@ def apex_angle(left: float, right: float, opposite: Scalar) -> Scalar:
     90.0
     """
     low, high = abs(left - right), left + right
-    opposite = closing(opposite, low, high, "pin-to-pin length")
-    m = library(opposite)
+    opposite = clip_to_bars(opposite, low, high, "pin-to-pin length")
+    m = math_module(opposite)
     sine, cosine = (opposite - low) * (opposite + low), (high - opposite) * (high + opposite)
     return 2 * m.atan2(m.sqrt(sine), m.sqrt(cosine))
 
 
-def third_pin(near: Point, far: Point, near_bar: Scalar, far_bar: Scalar, side: int) -> Point:
-    """Return the pin that joins two bars, an intersection of the circles about `near` and `far`.
+def intersect_bars(first_pin: Point, second_pin: Point, first_bar: Scalar, second_bar: Scalar, side: int) -> Point:
+    """Return the pin that joins two bars, an intersection of the circles about `first_pin` and `second_pin`.
 
-    With D = |far - near|, the pin is at (n^2 - f^2 + D^2) / (2 D) along the line from `near` to
-    `far`, at the distance 2 A / D from it, with the triangle's area A (Heron).
+    With D = |far - near|, the pin is at (n^2 - f^2 + D^2) / (2 D) along the line from `first_pin` to
+    `second_pin`, at the distance 2 A / D from it, with the triangle's area A (Heron).
 
     Args:
-        near: (x, z), coordinates of any one shape [m].
-        far: (x, z), coordinates of any one shape [m], different from `near`.
-        near_bar: length n of the bar from `near`, any one shape [m], > 0.
-        far_bar: length f of the bar from `far`, any one shape [m], > 0.
-        side: +1 for the pin to the left of the line from `near` to `far`, -1 to the right [-].
+        first_pin: (x, z), coordinates of any one shape [m].
+        second_pin: (x, z), coordinates of any one shape [m], different from `first_pin`.
+        first_bar: length n of the bar from `first_pin`, any one shape [m], > 0.
+        second_bar: length f of the bar from `second_pin`, any one shape [m], > 0.
+        side: +1 for the pin to the left of the line from `first_pin` to `second_pin`, -1 to the right [-].
 
     Returns:
         (x, z) of the shared pin [m].
@@ -121,28 +121,28 @@ def third_pin(near: Point, far: Point, near_bar: Scalar, far_bar: Scalar, side: 
     Raises:
         LoopOpen: the bars are too short, or too unequal, to meet.
 
-    >>> [round(v, 9) for v in third_pin((0.0, 0.0), (5.0, 0.0), 3.0, 4.0, 1)]
+    >>> [round(v, 9) for v in intersect_bars((0.0, 0.0), (5.0, 0.0), 3.0, 4.0, 1)]
     [1.8, 2.4]
     """
-    way_x, way_z = minus(far, near)
+    way_x, way_z = subtract_points(second_pin, first_pin)
     square = way_x * way_x + way_z * way_z
-    m = library(square)
-    low, high = abs(near_bar - far_bar), near_bar + far_bar
-    distance = closing(m.sqrt(square), low, high, "distance of the pins that two bars join")
+    m = math_module(square)
+    low, high = abs(first_bar - second_bar), first_bar + second_bar
+    distance = clip_to_bars(m.sqrt(square), low, high, "distance of the pins that two bars join")
     flat = (distance - low) * (distance + low) * (high - distance) * (high + distance)
-    along = 0.5 * (1 + (near_bar - far_bar) * high / square)
-    beside = side * library(flat).sqrt(flat) / (2 * square)
-    return near[0] + along * way_x - beside * way_z, near[1] + along * way_z + beside * way_x
+    along = 0.5 * (1 + (first_bar - second_bar) * high / square)
+    beside = side * math_module(flat).sqrt(flat) / (2 * square)
+    return first_pin[0] + along * way_x - beside * way_z, first_pin[1] + along * way_z + beside * way_x
 
 
-def closing(value: Scalar, low: Scalar, high: Scalar, what: str) -> Scalar:
+def clip_to_bars(value: Scalar, low: Scalar, high: Scalar, quantity: str) -> Scalar:
     """Return a length clipped to the range of the bars; an excess above 1e-12 m raises an error.
 
     Args:
         value: requested length, any shape [m].
         low: minimum length that the bars allow, scalar or shape of value [m].
         high: maximum length that the bars allow, scalar or shape of value [m].
-        what: name of the length for the message [-].
+        quantity: name of the length for the message [-].
 
     Returns:
         The length, within [low, high] [m].
@@ -150,7 +150,7 @@ def closing(value: Scalar, low: Scalar, high: Scalar, what: str) -> Scalar:
     Raises:
         LoopOpen: a length is outside [low, high] or NaN.
 
-    >>> closing(2.0 + 1e-15, 1.0, 2.0, "cylinder length")
+    >>> clip_to_bars(2.0 + 1e-15, 1.0, 2.0, "cylinder length")
     2.0
     """
     inside = (value >= low - 1e-12) & (value <= high + 1e-12)
@@ -161,7 +161,7 @@ def closing(value: Scalar, low: Scalar, high: Scalar, what: str) -> Scalar:
         return np.clip(value, low, high)
     first = ~np.atleast_1d(inside)
     value, low, high = (np.broadcast_to(v, first.shape)[first][0] for v in (value, low, high))
-    raise LoopOpen(f"{what} {value:.6g} m requested, the bars allow [{low:.6g}, {high:.6g}] m")
+    raise LoopOpenError(f"{quantity} {value:.6g} m requested, the bars allow [{low:.6g}, {high:.6g}] m")
 
 
 @dataclass(frozen=True)
@@ -192,9 +192,7 @@ class TwoBar:
     def __post_init__(self) -> None:
         """Raise ValueError for bars without length or an invalid direction."""
         if self.lower <= 0 or self.upper <= 0:
-            raise ValueError(
-                f"two-bar lengths must be positive, got lower={self.lower} upper={self.upper}"
-            )
+            raise ValueError(f"two-bar lengths must be positive, got lower={self.lower} upper={self.upper}")
         if self.direction not in (1, -1):
             raise ValueError(f"two-bar direction must be +1 or -1, got {self.direction}")
 
@@ -213,7 +211,7 @@ class TwoBar:
         >>> round(boom.length(math.radians(27.8)), 6)
         2.257538
         """
-        m = library(theta)
+        m = math_module(theta)
         chord = 2 * m.sin(0.5 * (self.direction * theta + self.angle_offset))
         constant = (self.lower - self.upper) ** 2 + self.axial_offset**2
         return m.sqrt(constant + self.lower * self.upper * chord**2)
@@ -230,7 +228,7 @@ class TwoBar:
         >>> round(TwoBar(0.625, 2.000, math.radians(78.6), 1).rate(math.radians(27.8)), 6)
         0.531173
         """
-        m = library(theta)
+        m = math_module(theta)
         included = self.direction * theta + self.angle_offset
         return self.direction * self.lower * self.upper * m.sin(included) / self.length(theta)
 
@@ -255,7 +253,7 @@ class TwoBar:
         """
         if self.axial_offset:
             square = length * length - self.axial_offset**2
-            length = library(length).sqrt(np.maximum(square, 0.0))
+            length = math_module(length).sqrt(np.maximum(square, 0.0))
         return self.direction * (apex_angle(self.lower, self.upper, length) - self.angle_offset)
 
 
@@ -286,9 +284,7 @@ def two_bar_from_points(
     offset = math.atan2(rod_pin[1], rod_pin[0]) - math.atan2(base_pin[1], base_pin[0])
     included = math.remainder(offset + working_angle, math.tau)
     if abs(math.sin(included)) < 1e-9:
-        raise ValueError(
-            f"joint and cylinder pins are in line at working angle {working_angle}, give another"
-        )
+        raise ValueError(f"joint and cylinder pins are in line at working angle {working_angle}, give another")
     direction = 1 if included > 0 else -1
     return TwoBar(
         math.hypot(*base_pin),
@@ -350,7 +346,7 @@ class FourBar:
         if self.assembly not in (1, -1):
             raise ValueError(f"four-bar assembly must be +1 or -1, got {self.assembly}")
 
-    def pins(self, theta: Scalar) -> tuple[Point, Point]:
+    def pin_positions(self, theta: Scalar) -> tuple[Point, Point]:
         """Return pin Q of the output link and rod pin R, by intersecting circles about P and Q.
 
         Args:
@@ -368,11 +364,11 @@ class FourBar:
         >>> [round(v, 4) for v in (*q, *r)]
         [1.9865, 0.3574, 1.5992, 0.641]
         """
-        m = library(theta)
+        m = math_module(theta)
         cosine, sine = m.cos(theta), m.sin(theta)
         (ox, oz), (ax, az) = self.output_pivot, self.output_arm
         q = (ox + ax * cosine - az * sine, oz + ax * sine + az * cosine)
-        return q, third_pin(self.rocker_pivot, q, self.rocker, self.coupler, self.assembly)
+        return q, intersect_bars(self.rocker_pivot, q, self.rocker, self.coupler, self.assembly)
 
     def pose(self, theta: Scalar) -> FourBarPose:
         """Return rocker angle, coupler angle and cylinder length.
@@ -390,10 +386,10 @@ class FourBar:
         >>> [round(v, 4) for v in bucket.pose(-1.0)]
         [1.3895, 2.5095, 1.7555]
         """
-        m = library(theta)
-        q, r = self.pins(theta)
-        rocker, coupler = minus(r, self.rocker_pivot), minus(r, q)
-        rod = minus(r, self.cylinder_base)
+        m = math_module(theta)
+        q, r = self.pin_positions(theta)
+        rocker, coupler = subtract_points(r, self.rocker_pivot), subtract_points(r, q)
+        rod = subtract_points(r, self.cylinder_base)
         return FourBarPose(
             m.atan2(rocker[1], rocker[0]),
             m.atan2(coupler[1], coupler[0]),
@@ -438,11 +434,11 @@ class FourBar:
         >>> round(bucket.rate(-1.0), 4)
         -0.4015
         """
-        q, r = self.pins(theta)
-        arm, coupler = minus(q, self.output_pivot), minus(r, q)
-        rocker, rod = minus(r, self.rocker_pivot), minus(r, self.cylinder_base)
-        ratio = cross(arm, coupler) / cross(rocker, coupler)
-        return ratio * cross(rocker, rod) / library(theta).sqrt(rod[0] ** 2 + rod[1] ** 2)
+        q, r = self.pin_positions(theta)
+        arm, coupler = subtract_points(q, self.output_pivot), subtract_points(r, q)
+        rocker, rod = subtract_points(r, self.rocker_pivot), subtract_points(r, self.cylinder_base)
+        ratio = cross_product(arm, coupler) / cross_product(rocker, coupler)
+        return ratio * cross_product(rocker, rod) / math_module(theta).sqrt(rod[0] ** 2 + rod[1] ** 2)
 
     def angle(self, length: Scalar) -> Scalar:
         """Return the output angle: triangle B-P-R gives R, then triangle O-R-Q gives Q.
@@ -463,27 +459,32 @@ class FourBar:
         >>> round(bucket.angle(bucket.length(-1.0)), 9)
         -1.0
         """
-        m = library(length)
-        rod_side, arm_side = self._sides
+        m = math_module(length)
+        rod_side, arm_side = self._branch_signs
         ground = math.dist(self.rocker_pivot, self.cylinder_base)
-        closing(length, abs(ground - self.rocker), ground + self.rocker, "cylinder length")
-        r = third_pin(self.rocker_pivot, self.cylinder_base, self.rocker, length, rod_side)
-        q = third_pin(self.output_pivot, r, math.hypot(*self.output_arm), self.coupler, arm_side)
-        turned = cross(minus(q, self.rocker_pivot), minus(r, self.rocker_pivot)) * self.assembly
+        clip_to_bars(length, abs(ground - self.rocker), ground + self.rocker, "cylinder length")
+        r = intersect_bars(self.rocker_pivot, self.cylinder_base, self.rocker, length, rod_side)
+        q = intersect_bars(self.output_pivot, r, math.hypot(*self.output_arm), self.coupler, arm_side)
+        turned = (
+            cross_product(subtract_points(q, self.rocker_pivot), subtract_points(r, self.rocker_pivot)) * self.assembly
+        )
         if np.any(turned < -1e-12):
-            raise LoopOpen(f"cylinder length {length} m: rocker and coupler pass their dead point")
-        arm = minus(q, self.output_pivot)
+            raise LoopOpenError(f"cylinder length {length} m: rocker and coupler pass their dead point")
+        arm = subtract_points(q, self.output_pivot)
         theta = m.atan2(arm[1], arm[0]) - math.atan2(self.output_arm[1], self.output_arm[0])
         return theta - math.tau * m.floor((theta - self.working_angle) / math.tau + 0.5)
 
     @cached_property
-    def _sides(self) -> tuple[int, int]:
-        q, r = self.pins(float(self.working_angle))
-        rod = cross(minus(self.cylinder_base, self.rocker_pivot), minus(r, self.rocker_pivot))
-        arm = cross(minus(r, self.output_pivot), minus(q, self.output_pivot))
+    def _branch_signs(self) -> tuple[int, int]:
+        q, r = self.pin_positions(float(self.working_angle))
+        rod = cross_product(
+            subtract_points(self.cylinder_base, self.rocker_pivot),
+            subtract_points(r, self.rocker_pivot),
+        )
+        arm = cross_product(subtract_points(r, self.output_pivot), subtract_points(q, self.output_pivot))
         return (1 if rod > 0 else -1), (1 if arm > 0 else -1)
 
 
 Linkage = TwoBar | FourBar
 
-__all__ = ["FourBar", "FourBarPose", "Linkage", "LoopOpen", "TwoBar", "two_bar_from_points"]
+__all__ = ["FourBar", "FourBarPose", "Linkage", "LoopOpenError", "TwoBar", "two_bar_from_points"]

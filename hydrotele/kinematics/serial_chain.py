@@ -16,8 +16,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-Kind = Literal["tx", "ty", "tz", "rx", "ry", "rz", "fixed"]
-_AXIS = {"x": 0, "y": 1, "z": 2}
+ElementKind = Literal["tx", "ty", "tz", "rx", "ry", "rz", "fixed"]
+_AXIS_INDEX = {"x": 0, "y": 1, "z": 2}
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Element:
         matrix: (4, 4) homogeneous transform of a `fixed` element.
     """
 
-    kind: Kind
+    kind: ElementKind
     parameter: str = ""
     value: float = 0.0
     joint: int | None = None
@@ -41,7 +41,7 @@ class Element:
     matrix: np.ndarray | None = None
 
 
-class Poses(NamedTuple):
+class ChainPoses(NamedTuple):
     """Frames of n poses: position (n, 3) [m] and rotation (n, 3, 3), columns in the base frame."""
 
     position: np.ndarray
@@ -96,17 +96,17 @@ class SerialChain:
         return tuple(e.parameter for e in self.elements if e.parameter)
 
     @property
-    def nominal(self) -> np.ndarray:
+    def nominal_values(self) -> np.ndarray:
         """(p,) nominal constants."""
         return np.array([e.value for e in self.elements if e.parameter])
 
     @property
-    def angular(self) -> np.ndarray:
+    def is_angle(self) -> np.ndarray:
         """(p,) whether a constant is an angle [rad] rather than a length [m]."""
         return np.array([e.kind[0] == "r" for e in self.elements if e.parameter], bool)
 
 
-def forward(chain: SerialChain, joints: np.ndarray, parameters: np.ndarray | None = None) -> Poses:
+def chain_poses(chain: SerialChain, joints: np.ndarray, parameters: np.ndarray | None = None) -> ChainPoses:
     """Compute poses of the end; accepts complex arguments for complex-step derivatives.
 
     Args:
@@ -119,20 +119,20 @@ def forward(chain: SerialChain, joints: np.ndarray, parameters: np.ndarray | Non
 
     >>> arm = SerialChain(("a", "b"), (Element("rz", joint=0), Element("tx", "length_a", 0.4),
     ...                                Element("rz", joint=1), Element("tx", "length_b", 0.3)))
-    >>> forward(arm, np.array([[0.0, np.pi / 2]])).position.round(6).tolist()
+    >>> chain_poses(arm, np.array([[0.0, np.pi / 2]])).position.round(6).tolist()
     [[0.4, 0.3, 0.0]]
     """
-    constants = chain.nominal if parameters is None else np.asarray(parameters)
-    joints = _checked(chain, joints, constants)
+    constants = chain.nominal_values if parameters is None else np.asarray(parameters)
+    joints = _check_joints(chain, joints, constants)
     kind = np.result_type(joints, constants, float)
     position = np.zeros((len(joints), 3), kind)
     rotation = np.broadcast_to(np.eye(3, dtype=kind), (len(joints), 3, 3)).copy()
-    for element, amount in _amounts(chain, joints, constants):
-        position, rotation = _moved(element, amount, position, rotation)
-    return Poses(position, rotation)
+    for element, amount in _element_coordinates(chain, joints, constants):
+        position, rotation = _apply_element(element, amount, position, rotation)
+    return ChainPoses(position, rotation)
 
 
-def forward_and_rates(
+def chain_poses_and_rates(
     chain: SerialChain, joints: np.ndarray, parameters: np.ndarray | None = None
 ) -> PosesAndRates:
     """Compute poses of the end with exact derivatives by constants and joint coordinates.
@@ -150,19 +150,19 @@ def forward_and_rates(
         n poses and their derivatives.
 
     >>> arm = SerialChain(("a",), (Element("rz", "zero", joint=0), Element("tx", "length", 0.5)))
-    >>> forward_and_rates(arm, np.zeros((1, 1))).position_by_parameter[0].tolist()
+    >>> chain_poses_and_rates(arm, np.zeros((1, 1))).position_by_parameter[0].tolist()
     [[0.0, 1.0], [0.5, 0.0], [0.0, 0.0]]
     """
-    constants = chain.nominal if parameters is None else np.asarray(parameters, float)
-    joints = _checked(chain, joints, constants)
+    constants = chain.nominal_values if parameters is None else np.asarray(parameters, float)
+    joints = _check_joints(chain, joints, constants)
     n = len(joints)
     position, rotation = np.zeros((n, 3)), np.broadcast_to(np.eye(3), (n, 3, 3)).copy()
     axes, origins = [], []
-    for element, amount in _amounts(chain, joints, constants):
+    for element, amount in _element_coordinates(chain, joints, constants):
         if element.kind != "fixed":
-            axes.append(rotation[:, :, _AXIS[element.kind[1]]])
+            axes.append(rotation[:, :, _AXIS_INDEX[element.kind[1]]])
             origins.append(position)
-        position, rotation = _moved(element, amount, position, rotation)
+        position, rotation = _apply_element(element, amount, position, rotation)
     p = len(constants)
     shift, turn = np.zeros((p, n, 3)), np.zeros((p, n, 3))
     joint_shift, joint_turn = (np.zeros((len(chain.joints), n, 3)) for _ in range(2))
@@ -180,9 +180,7 @@ def forward_and_rates(
             joint_shift[element.joint] += element.ratio * moves
             if turns:
                 joint_turn[element.joint] += element.ratio * axis
-    return PosesAndRates(
-        position, rotation, *(np.moveaxis(a, 0, 2) for a in (shift, turn, joint_shift, joint_turn))
-    )
+    return PosesAndRates(position, rotation, *(np.moveaxis(a, 0, 2) for a in (shift, turn, joint_shift, joint_turn)))
 
 
 def joint_axes(
@@ -198,16 +196,16 @@ def joint_axes(
     Returns:
         (n, k, 3) points on the axes [m] and (n, k, 3) their directions, in the base frame.
     """
-    constants = chain.nominal if parameters is None else np.asarray(parameters, float)
-    joints = _checked(chain, joints, constants)
+    constants = chain.nominal_values if parameters is None else np.asarray(parameters, float)
+    joints = _check_joints(chain, joints, constants)
     points, ways = np.zeros((2, len(joints), len(chain.joints), 3))
     position = np.zeros((len(joints), 3))
     rotation = np.broadcast_to(np.eye(3), (len(joints), 3, 3)).copy()
-    for element, amount in _amounts(chain, joints, constants):
+    for element, amount in _element_coordinates(chain, joints, constants):
         if element.joint is not None:
             points[:, element.joint] = position
-            ways[:, element.joint] = rotation[:, :, _AXIS[element.kind[1]]]
-        position, rotation = _moved(element, amount, position, rotation)
+            ways[:, element.joint] = rotation[:, :, _AXIS_INDEX[element.kind[1]]]
+        position, rotation = _apply_element(element, amount, position, rotation)
     return points, ways
 
 
@@ -233,9 +231,7 @@ class DhRow:
     prismatic: bool = False
 
 
-def chain_from_dh(
-    rows: Sequence[DhRow], names: Sequence[str], tool: Sequence[float] | None = None
-) -> SerialChain:
+def chain_from_dh(rows: Sequence[DhRow], names: Sequence[str], tool: Sequence[float] | None = None) -> SerialChain:
     """Build a chain whose parameters are Denavit-Hartenberg constants.
 
     Args:
@@ -265,12 +261,12 @@ def chain_from_dh(
         ]
         if parallel:
             elements.append(Element("ry", f"beta.{name}", row.beta or 0.0))
-    elements += _point(tool)
+    elements += _tool_elements(tool)
     return SerialChain(tuple(names), tuple(elements))
 
 
 def chain_from_frames(
-    frames: Sequence[np.ndarray], axes: Sequence[Kind], names: Sequence[str],
+    frames: Sequence[np.ndarray], axes: Sequence[ElementKind], names: Sequence[str],
     tool: Sequence[float] | None = None,
 ) -> SerialChain:  # fmt: skip
     """Build a chain with six small errors in front of every joint (local product of exponentials).
@@ -295,14 +291,14 @@ def chain_from_frames(
     """
     if len(frames) != len(names) + 1 or len(axes) != len(names):
         raise ValueError(f"{len(names)} joints need as many axes and one more frame")
-    kinds: tuple[Kind, ...] = ("tx", "ty", "tz", "rx", "ry", "rz")
+    kinds: tuple[ElementKind, ...] = ("tx", "ty", "tz", "rx", "ry", "rz")
     elements = []
     for k, (frame, axis, name) in enumerate(zip(frames[:-1], axes, names, strict=True)):
         elements.append(Element("fixed", matrix=np.asarray(frame, float)))
         elements += [Element(kind, f"{kind}.{name}") for kind in kinds]
         elements.append(Element(axis, joint=k))
     elements.append(Element("fixed", matrix=np.asarray(frames[-1], float)))
-    elements += _point(tool)
+    elements += _tool_elements(tool)
     return SerialChain(tuple(names), tuple(elements))
 
 
@@ -360,17 +356,14 @@ def product_of_exponentials(twists: np.ndarray, home: np.ndarray, joints: np.nda
     return pose @ home
 
 
-def _point(tool: Sequence[float] | None) -> list[Element]:
+def _tool_elements(tool: Sequence[float] | None) -> list[Element]:
     if tool is None:
         return []
-    kinds: tuple[Kind, ...] = ("tx", "ty", "tz")
-    return [
-        Element(kind, f"{kind[1]}.tool", float(value))
-        for kind, value in zip(kinds, tool, strict=True)
-    ]
+    kinds: tuple[ElementKind, ...] = ("tx", "ty", "tz")
+    return [Element(kind, f"{kind[1]}.tool", float(value)) for kind, value in zip(kinds, tool, strict=True)]
 
 
-def _checked(chain: SerialChain, joints: np.ndarray, constants: np.ndarray) -> np.ndarray:
+def _check_joints(chain: SerialChain, joints: np.ndarray, constants: np.ndarray) -> np.ndarray:
     joints = np.atleast_2d(np.asarray(joints))
     if joints.ndim != 2 or joints.shape[1] != len(chain.joints):
         raise ValueError(f"joints must be (n, {len(chain.joints)}), got {joints.shape}")
@@ -379,7 +372,7 @@ def _checked(chain: SerialChain, joints: np.ndarray, constants: np.ndarray) -> n
     return joints
 
 
-def _amounts(chain: SerialChain, joints: np.ndarray, constants: np.ndarray):
+def _element_coordinates(chain: SerialChain, joints: np.ndarray, constants: np.ndarray):
     """Yield every element with its coordinate, a number or (n,)."""
     place = 0
     for element in chain.elements:
@@ -392,12 +385,12 @@ def _amounts(chain: SerialChain, joints: np.ndarray, constants: np.ndarray):
         yield element, amount
 
 
-def _moved(element: Element, amount, position: np.ndarray, rotation: np.ndarray):
+def _apply_element(element: Element, amount, position: np.ndarray, rotation: np.ndarray):
     """Return position (n, 3) and rotation (n, 3, 3) after an element."""
     if element.kind == "fixed":
         assert element.matrix is not None
         return position + rotation @ element.matrix[:3, 3], rotation @ element.matrix[:3, :3]
-    axis = _AXIS[element.kind[1]]
+    axis = _AXIS_INDEX[element.kind[1]]
     if element.kind[0] == "t":
         return position + rotation[:, :, axis] * np.reshape(amount, (-1, 1)), rotation
     first, second = (axis + 1) % 3, (axis + 2) % 3

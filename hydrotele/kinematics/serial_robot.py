@@ -18,23 +18,30 @@ from typing import Literal, NamedTuple
 import numpy as np
 import yaml
 
-from hydrotele.core.datafile import Facts, Name, Vector, parse, read_yaml, suggest
+from hydrotele.core.datafile import (
+    Name,
+    StrictModel,
+    Vector,
+    read_yaml,
+    suggest_valid_name,
+    validate_data,
+)
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import models_folder, read_text
 from hydrotele.kinematics.serial_chain import (
-    Poses,
+    ChainPoses,
     SerialChain,
     chain_from_frames,
-    forward,
-    forward_and_rates,
+    chain_poses,
+    chain_poses_and_rates,
     joint_axes,
 )
 
 GRAVITY = (0.0, 0.0, -9.81)
 """Gravity of an upright robot in its base frame [m/s^2]."""
 
-_SAME = 1e-12  # tolerance for an axis that is parallel to a coordinate axis
-_SILENT = 1e-5  # N m per kilogram: rounding
+_AXIS_TOLERANCE = 1e-12  # tolerance for an axis that is parallel to a coordinate axis
+_MIN_TORQUE = 1e-5  # N m per kilogram: rounding
 
 
 @dataclass(frozen=True)
@@ -55,7 +62,7 @@ class RobotJoint:
 
 
 @dataclass(frozen=True)
-class Robot:
+class SerialRobot:
     """A serial robot with a ball at its end.
 
     Attributes:
@@ -64,7 +71,7 @@ class Robot:
         tool: (4, 4) frame of the ball after the last joint [m].
         gravity: (3,) gravity in the base frame [m/s^2].
         corrections: parameters of joint corrections by name, [rad s^2/m^2] or [rad], as defined in
-            `deflection_names`.
+            `correction_names`.
         source: file that it was read from.
     """
 
@@ -76,12 +83,12 @@ class Robot:
     source: str = ""
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def joint_names(self) -> tuple[str, ...]:
         """Names of the joints."""
         return tuple(joint.name for joint in self.joints)
 
 
-def robot_chain(robot: Robot) -> SerialChain:
+def robot_chain(robot: SerialRobot) -> SerialChain:
     """Build the chain of a robot with six errors in front of every joint and the ball position.
 
     Args:
@@ -95,7 +102,7 @@ def robot_chain(robot: Robot) -> SerialChain:
     frames, back = [], np.eye(4)
     for joint in robot.joints:
         turn = np.eye(4)
-        turn[:3, :3] = _from_z(joint.axis)
+        turn[:3, :3] = _rotation_from_z(joint.axis)
         frames.append(back @ joint.origin @ turn)
         back = turn.T
     # The ball position is a parameter, so the last frame has no translation.
@@ -106,9 +113,7 @@ def robot_chain(robot: Robot) -> SerialChain:
     return chain_from_frames(frames, kinds, robot.names, tool[:3, 3])  # type: ignore[arg-type]
 
 
-def corrected_robot(
-    robot: Robot, values: Mapping[str, float], corrections: Mapping[str, float]
-) -> Robot:
+def correct_robot(robot: SerialRobot, values: Mapping[str, float], corrections: Mapping[str, float]) -> SerialRobot:
     """Return a robot whose origins and ball position include calibrated parameters.
 
     Args:
@@ -121,9 +126,9 @@ def corrected_robot(
     """
     joints = []
     for joint in robot.joints:
-        turn = _from_z(joint.axis)
+        turn = _rotation_from_z(joint.axis)
         shift = np.array([values[f"t{c}.{joint.name}"] for c in "xyz"])
-        rotation = np.linalg.multi_dot([_about(c, values[f"r{c}.{joint.name}"]) for c in "xyz"])
+        rotation = np.linalg.multi_dot([_axis_rotation(c, values[f"r{c}.{joint.name}"]) for c in "xyz"])
         error = np.eye(4)
         error[:3, :3] = turn @ rotation @ turn.T
         error[:3, 3] = turn @ shift
@@ -133,7 +138,7 @@ def corrected_robot(
     return replace(robot, joints=tuple(joints), tool=tool, corrections=dict(corrections))
 
 
-def deflection_names(robot: Robot, gravity: bool, eccentricity: bool) -> tuple[str, ...]:
+def correction_names(robot: SerialRobot, gravity: bool, eccentricity: bool) -> tuple[str, ...]:
     """Return the names of a robot's joint correction parameters.
 
     Args:
@@ -151,7 +156,7 @@ def deflection_names(robot: Robot, gravity: bool, eccentricity: bool) -> tuple[s
         posed = np.random.default_rng(0).uniform(-1.0, 1.0, (5, len(robot.joints)))
         chain = robot_chain(robot)
         points, ways = joint_axes(chain, posed)
-        places = np.concatenate([points, forward(chain, posed).position[:, None]], axis=1)
+        places = np.concatenate([points, chain_poses(chain, posed).position[:, None]], axis=1)
         for i, joint in enumerate(robot.joints):
             if joint.kind != "revolute":
                 continue
@@ -159,8 +164,8 @@ def deflection_names(robot: Robot, gravity: bool, eccentricity: bool) -> tuple[s
             for j in range(len(robot.joints), i, -1):
                 weight = np.cross(places[:, j] - points[:, i], robot.gravity)
                 torque = np.sum(ways[:, i] * weight, axis=1)
-                if np.abs(torque).max() < _SILENT or any(
-                    np.abs(torque - other).max() < _SILENT for other in seen
+                if np.abs(torque).max() < _MIN_TORQUE or any(
+                    np.abs(torque - other).max() < _MIN_TORQUE for other in seen
                 ):
                     continue
                 seen.append(torque)
@@ -172,7 +177,7 @@ def deflection_names(robot: Robot, gravity: bool, eccentricity: bool) -> tuple[s
     return tuple(names)
 
 
-def deflections(robot: Robot, joints: np.ndarray, names: Sequence[str]) -> np.ndarray:
+def correction_derivatives(robot: SerialRobot, joints: np.ndarray, names: Sequence[str]) -> np.ndarray:
     """Return the deviations of joints from their encoder readings per unit of each parameter.
 
     A mass m at r rotates a joint at o with axis u by c m u . (r - o) x g.
@@ -180,7 +185,7 @@ def deflections(robot: Robot, joints: np.ndarray, names: Sequence[str]) -> np.nd
     Args:
         robot: the robot; nominal geometry is sufficient.
         joints: (n, k) encoder readings [rad] or [m].
-        names: names of the e parameters, as from `deflection_names`.
+        names: names of the e parameters, as from `correction_names`.
 
     Returns:
         (n, k, e) derivatives of the joints' deviations.
@@ -193,11 +198,11 @@ def deflections(robot: Robot, joints: np.ndarray, names: Sequence[str]) -> np.nd
         return made
     chain = robot_chain(robot)
     points, ways = joint_axes(chain, joints)
-    places = np.concatenate([points, forward(chain, joints).position[:, None]], axis=1)
-    order = {name: k for k, name in enumerate((*robot.names, "tool"))}
+    places = np.concatenate([points, chain_poses(chain, joints).position[:, None]], axis=1)
+    order = {name: k for k, name in enumerate((*robot.joint_names, "tool"))}
     for e, name in enumerate(names):
         kind, _, rest = name.partition(".")
-        joint = next((n for n in robot.names if rest == n or rest.startswith(f"{n}.")), None)
+        joint = next((n for n in robot.joint_names if rest == n or rest.startswith(f"{n}.")), None)
         if joint is None or kind not in ("sag", "sine", "cosine"):
             raise ValueError(f"{name!r} is not a joint correction of {robot.name}")
         i = order[joint]
@@ -212,7 +217,7 @@ def deflections(robot: Robot, joints: np.ndarray, names: Sequence[str]) -> np.nd
     return made
 
 
-def robot_poses(robot: Robot, joints: np.ndarray) -> Poses:
+def robot_poses(robot: SerialRobot, joints: np.ndarray) -> ChainPoses:
     """Compute poses of the ball with all corrections of a robot.
 
     Args:
@@ -222,20 +227,20 @@ def robot_poses(robot: Robot, joints: np.ndarray) -> Poses:
     Returns:
         n poses in the base frame.
     """
-    return forward(robot_chain(robot), _deviated(robot, np.asarray(joints, float)))
+    return chain_poses(robot_chain(robot), _apply_corrections(robot, np.asarray(joints, float)))
 
 
-class Reached(NamedTuple):
-    """Joint coordinates for ball positions; `missed` is the remaining distance [m]."""
+class PositionSolution(NamedTuple):
+    """Joint coordinates for ball positions; `remaining_distance` is the remaining distance [m]."""
 
     joints: np.ndarray
-    missed: np.ndarray
+    remaining_distance: np.ndarray
 
 
-def joints_for_places(
-    robot: Robot, places: np.ndarray, start: np.ndarray, iterations: int = 50,
+def solve_ball_positions(
+    robot: SerialRobot, places: np.ndarray, start: np.ndarray, iterations: int = 50,
     idle: int | None = None,
-) -> Reached:  # fmt: skip
+) -> PositionSolution:  # fmt: skip
     """Compute encoder readings that bring the ball to given positions, by resolved motion.
 
     Every step is a damped minimum-norm step with the robot's Jacobian; the damping vanishes with
@@ -257,7 +262,7 @@ def joints_for_places(
     joints = np.array(start, float)
     gap = np.zeros_like(places)
     for _ in range(iterations + 1):
-        found = forward_and_rates(chain, _deviated(robot, joints))
+        found = chain_poses_and_rates(chain, _apply_corrections(robot, joints))
         gap = places - found.position
         size = np.sum(gap**2, axis=1)
         if size.max(initial=0.0) < 1e-24:
@@ -268,40 +273,40 @@ def joints_for_places(
         square = rates @ np.swapaxes(rates, 1, 2) + (1e-3 * size)[:, None, None] * np.eye(3)
         step = np.swapaxes(rates, 1, 2) @ np.linalg.solve(square, gap[:, :, None])
         joints += step[:, :, 0]
-    return Reached(joints, np.linalg.norm(gap, axis=1))
+    return PositionSolution(joints, np.linalg.norm(gap, axis=1))
 
 
-def _deviated(robot: Robot, joints: np.ndarray) -> np.ndarray:
+def _apply_corrections(robot: SerialRobot, joints: np.ndarray) -> np.ndarray:
     names = tuple(robot.corrections)
     if not names:
         return joints
-    return joints + deflections(robot, joints, names) @ np.array(list(robot.corrections.values()))
+    return joints + correction_derivatives(robot, joints, names) @ np.array(list(robot.corrections.values()))
 
 
-def frame(position: Sequence[float], rpy: Sequence[float] = (0.0, 0.0, 0.0)) -> np.ndarray:
+def frame_from_rpy(position: Sequence[float], rpy: Sequence[float] = (0.0, 0.0, 0.0)) -> np.ndarray:
     """Return the transform (4, 4) of a position [m] and roll, pitch, yaw [rad].
 
     The rotation is Rz(yaw) Ry(pitch) Rx(roll).
     """
     made = np.eye(4)
-    made[:3, :3] = _about("z", rpy[2]) @ _about("y", rpy[1]) @ _about("x", rpy[0])
+    made[:3, :3] = _axis_rotation("z", rpy[2]) @ _axis_rotation("y", rpy[1]) @ _axis_rotation("x", rpy[0])
     made[:3, 3] = position
     return made
 
 
-def rpy_of(rotation: np.ndarray) -> np.ndarray:
+def rotation_to_rpy(rotation: np.ndarray) -> np.ndarray:
     """Return roll, pitch, yaw [rad] of a rotation (3, 3); yaw is 0 if the pitch is +-pi/2."""
     sine = -rotation[2, 0]
     cosine = math.hypot(rotation[2, 1], rotation[2, 2])
     pitch = math.atan2(sine, cosine)
-    if cosine > _SAME:
+    if cosine > _AXIS_TOLERANCE:
         roll = math.atan2(rotation[2, 1], rotation[2, 2])
         return np.array([roll, pitch, math.atan2(rotation[1, 0], rotation[0, 0])])
     return np.array([math.copysign(1.0, sine) * math.atan2(rotation[0, 1], rotation[1, 1]),
                      pitch, 0.0])  # fmt: skip
 
 
-def _about(axis: str, angle: float) -> np.ndarray:
+def _axis_rotation(axis: str, angle: float) -> np.ndarray:
     cosine, sine = math.cos(angle), math.sin(angle)
     made = np.eye(3)
     first, second = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
@@ -310,28 +315,38 @@ def _about(axis: str, angle: float) -> np.ndarray:
     return made
 
 
-def _from_z(axis: np.ndarray) -> np.ndarray:
+def _rotation_from_z(axis: np.ndarray) -> np.ndarray:
     """Return the smallest rotation from z to an axis; half a turn about x for -z."""
     x, y, z = axis
-    if z < -1.0 + _SAME:
+    if z < -1.0 + _AXIS_TOLERANCE:
         return np.diag([1.0, -1.0, -1.0])
     skew = np.array([[0.0, 0.0, x], [0.0, 0.0, y], [-x, -y, 0.0]])
     return np.eye(3) + skew + skew @ skew / (1.0 + z)
 
 
-ROBOTS = "robots"
+ROBOTS_FOLDER = "robots"
 """Folder of the shipped robots, inside the models folder."""
 
-_BALLS = ("calibrated_ball", "ball", "tcp", "tool", "tip", "ee", "end_effector", "flange", "hand")
-_MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
+_BALL_NAMES = (
+    "calibrated_ball",
+    "ball",
+    "tcp",
+    "tool",
+    "tip",
+    "ee",
+    "end_effector",
+    "flange",
+    "hand",
+)
+_MOVING_JOINT_KINDS = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 
 
 def shipped_robots() -> list[str]:
     """Return the names of the robots that are part of the package."""
-    return sorted(path.stem for path in (models_folder() / ROBOTS).glob("*.yaml"))
+    return sorted(path.stem for path in (models_folder() / ROBOTS_FOLDER).glob("*.yaml"))
 
 
-def load_robot(name_or_path: str | Path, joints: int | None = None) -> Robot:
+def load_robot(name_or_path: str | Path, joints: int | None = None) -> SerialRobot:
     """Read a robot.
 
     Args:
@@ -346,30 +361,28 @@ def load_robot(name_or_path: str | Path, joints: int | None = None) -> Robot:
     """
     path = Path(name_or_path)
     if str(name_or_path) in shipped_robots():
-        path = models_folder() / ROBOTS / f"{name_or_path}.yaml"
+        path = models_folder() / ROBOTS_FOLDER / f"{name_or_path}.yaml"
     elif not path.is_file():
         raise InputError(
             f"robot {str(name_or_path)!r}",
-            f"is neither a file nor a shipped robot; {suggest(name_or_path, shipped_robots())}",
+            f"is neither a file nor a shipped robot; {suggest_valid_name(name_or_path, shipped_robots())}",
         )
     if path.suffix in (".yaml", ".yml"):
-        robot = _from_yaml(path)
+        robot = _read_yaml_robot(path)
     else:
-        root = _xml(path)
+        root = _parse_xml(path)
         if root.tag == "mujoco":
-            robot = _from_mjcf(path, joints)
+            robot = _read_mjcf(path, joints)
         elif root.tag == "robot":
-            robot = _from_urdf(path, root, joints)
+            robot = _read_urdf(path, root, joints)
         else:
             raise InputError(path, f"is not a robot file: its first element is <{root.tag}>")
     if joints is not None and len(robot.joints) != joints:
-        raise InputError(
-            path, f"has {len(robot.joints)} moving joints, but the data have {joints} columns"
-        )
+        raise InputError(path, f"has {len(robot.joints)} moving joints, but the data have {joints} columns")
     return robot
 
 
-class _JointFacts(Facts):
+class _JointSpec(StrictModel):
     name: str
     type: Literal["revolute", "prismatic"] = "revolute"
     position: Vector = (0.0, 0.0, 0.0)
@@ -377,36 +390,36 @@ class _JointFacts(Facts):
     axis: Vector = (0.0, 0.0, 1.0)
 
 
-class _BallFacts(Facts):
+class _BallSpec(StrictModel):
     position: Vector = (0.0, 0.0, 0.0)
     rpy: Vector = (0.0, 0.0, 0.0)
 
 
-class _RobotFacts(Facts):
+class _RobotSpec(StrictModel):
     name: Name
     source: str = ""
     gravity: Vector = GRAVITY
-    joints: tuple[_JointFacts, ...]
-    ball: _BallFacts = _BallFacts()
+    joints: tuple[_JointSpec, ...]
+    ball: _BallSpec = _BallSpec()
     corrections: dict[str, float] = {}
 
 
-def _from_yaml(path: Path) -> Robot:
+def _read_yaml_robot(path: Path) -> SerialRobot:
     data, lines = read_yaml(path)
-    facts = parse(_RobotFacts, data, str(path), lines)
+    facts = validate_data(_RobotSpec, data, str(path), lines)
     if not facts.joints:
         raise InputError(path, "has no joints")
     joints = tuple(
-        RobotJoint(j.name, j.type, frame(j.position, j.rpy), _unit(path, j.name, j.axis))
+        RobotJoint(j.name, j.type, frame_from_rpy(j.position, j.rpy), _unit_vector(path, j.name, j.axis))
         for j in facts.joints
     )
-    return Robot(
-        facts.name, joints, frame(facts.ball.position, facts.ball.rpy), np.array(facts.gravity),
+    return SerialRobot(
+        facts.name, joints, frame_from_rpy(facts.ball.position, facts.ball.rpy), np.array(facts.gravity),
         dict(facts.corrections), str(path),
     )  # fmt: skip
 
 
-def robot_yaml(robot: Robot, source: str) -> str:
+def robot_to_yaml(robot: SerialRobot, source: str) -> str:
     """Return a robot as the text of a YAML file that `load_robot` reads.
 
     Args:
@@ -417,20 +430,20 @@ def robot_yaml(robot: Robot, source: str) -> str:
         The text.
     """
     joints = [
-        {"name": j.name, "type": j.kind, "position": _list(j.origin[:3, 3]),
-         "rpy": _list(rpy_of(j.origin[:3, :3])), "axis": _list(j.axis)}
+        {"name": j.name, "type": j.kind, "position": _to_floats(j.origin[:3, 3]),
+         "rpy": _to_floats(rotation_to_rpy(j.origin[:3, :3])), "axis": _to_floats(j.axis)}
         for j in robot.joints
     ]  # fmt: skip
     data = {
-        "name": robot.name, "source": source, "gravity": _list(robot.gravity), "joints": joints,
-        "ball": {"position": _list(robot.tool[:3, 3]), "rpy": _list(rpy_of(robot.tool[:3, :3]))},
+        "name": robot.name, "source": source, "gravity": _to_floats(robot.gravity), "joints": joints,
+        "ball": {"position": _to_floats(robot.tool[:3, 3]), "rpy": _to_floats(rotation_to_rpy(robot.tool[:3, :3]))},
     }  # fmt: skip
     if robot.corrections:
         data["corrections"] = {name: float(v) for name, v in robot.corrections.items()}
     return yaml.safe_dump(data, sort_keys=False, width=100)
 
 
-def corrected_urdf(robot: Robot, text: str) -> str:
+def correct_urdf(robot: SerialRobot, text: str) -> str:
     """Return a URDF with the origins of a calibrated robot.
 
     Fixed joints keep their origins; the errors in front of a moving joint are added to its origin.
@@ -445,16 +458,16 @@ def corrected_urdf(robot: Robot, text: str) -> str:
     """
     root = ElementTree.fromstring(text)
     found = {joint.get("name"): joint for joint in root.findall("joint")}
-    by_child = {_link(joint, "child"): joint for joint in found.values()}
+    by_child = {_link_name(joint, "child"): joint for joint in found.values()}
     last = ""
     for joint in robot.joints:
         element = found[joint.name]
-        before, link = np.eye(4), _link(element, "parent")
-        while link in by_child and by_child[link].get("type") not in _MOVING:
-            before = _origin(by_child[link]) @ before
-            link = _link(by_child[link], "parent")
+        before, link = np.eye(4), _link_name(element, "parent")
+        while link in by_child and by_child[link].get("type") not in _MOVING_JOINT_KINDS:
+            before = _read_origin(by_child[link]) @ before
+            link = _link_name(by_child[link], "parent")
         _set_origin(element, np.linalg.inv(before) @ joint.origin)
-        last = _link(element, "child")
+        last = _link_name(element, "child")
     ElementTree.SubElement(root, "link", {"name": "calibrated_ball"})
     ball = ElementTree.SubElement(root, "joint", {"name": "calibrated_ball", "type": "fixed"})
     ElementTree.SubElement(ball, "parent", {"link": last})
@@ -464,50 +477,50 @@ def corrected_urdf(robot: Robot, text: str) -> str:
     return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
-def _from_urdf(path: Path, root: ElementTree.Element, count: int | None) -> Robot:
+def _read_urdf(path: Path, root: ElementTree.Element, count: int | None) -> SerialRobot:
     joints = root.findall("joint")
-    by_child = {_link(joint, "child"): joint for joint in joints}
-    parents = {_link(joint, "parent") for joint in joints}
+    by_child = {_link_name(joint, "child"): joint for joint in joints}
+    parents = {_link_name(joint, "parent") for joint in joints}
     ways: list[list[ElementTree.Element]] = []
     for link in by_child:
         way, at = [], link
         while at in by_child and len(way) <= len(joints):
             way.insert(0, by_child[at])
-            at = _link(by_child[at], "parent")
+            at = _link_name(by_child[at], "parent")
         if len(way) > len(joints):
             raise InputError(path, f"joints around link {link!r} form a closed loop")
         ways.append(way)
 
-    def moving(way: list[ElementTree.Element]) -> int:
-        return sum(joint.get("type") in _MOVING for joint in way)
+    def count_moving(way: list[ElementTree.Element]) -> int:
+        return sum(joint.get("type") in _MOVING_JOINT_KINDS for joint in way)
 
-    most = max((moving(way) for way in ways), default=0)
+    most = max((count_moving(way) for way in ways), default=0)
     if not most:
         raise InputError(path, "has no moving joint")
-    wanted = count if count in {moving(way) for way in ways} else most
-    ways = [way for way in ways if moving(way) == wanted]
+    wanted = count if count in {count_moving(way) for way in ways} else most
+    ways = [way for way in ways if count_moving(way) == wanted]
 
     def rank(way: list[ElementTree.Element]) -> tuple:
-        end = _link(way[-1], "child").lower()
-        named = next((k for k, word in enumerate(_BALLS) if word in end), len(_BALLS))
+        end = _link_name(way[-1], "child").lower()
+        named = next((k for k, word in enumerate(_BALL_NAMES) if word in end), len(_BALL_NAMES))
         return named, end in parents, -len(way)
 
     way = min(ways, key=rank)
     made, back = [], np.eye(4)
     for joint in way:
-        back = back @ _origin(joint)
-        kind = _MOVING.get(str(joint.get("type")))
+        back = back @ _read_origin(joint)
+        kind = _MOVING_JOINT_KINDS.get(str(joint.get("type")))
         if kind is None:
             continue
         element = joint.find("axis")
-        axis = _numbers(path, joint, element, "xyz", (1.0, 0.0, 0.0))
+        axis = _read_numbers(path, joint, element, "xyz", (1.0, 0.0, 0.0))
         name = str(joint.get("name"))
-        made.append(RobotJoint(name, kind, back, _unit(path, name, axis)))  # type: ignore[arg-type]
+        made.append(RobotJoint(name, kind, back, _unit_vector(path, name, axis)))  # type: ignore[arg-type]
         back = np.eye(4)
-    return Robot(str(root.get("name") or path.stem), tuple(made), back, source=str(path))
+    return SerialRobot(str(root.get("name") or path.stem), tuple(made), back, source=str(path))
 
 
-def _from_mjcf(path: Path, count: int | None) -> Robot:
+def _read_mjcf(path: Path, count: int | None) -> SerialRobot:
     import mujoco
 
     try:
@@ -544,7 +557,7 @@ def _from_mjcf(path: Path, count: int | None) -> Robot:
 
     def rank(one) -> tuple:
         name = (getattr(model, one[0])(one[1]).name or "").lower()
-        return next((k for k, word in enumerate(_BALLS) if word in name), len(_BALLS)), one[1]
+        return next((k for k, word in enumerate(_BALL_NAMES) if word in name), len(_BALL_NAMES)), one[1]
 
     kind, k, joints = min((one for one in found if len(one[2]) == wanted), key=rank)
     made, last = [], np.eye(4)
@@ -561,13 +574,13 @@ def _from_mjcf(path: Path, count: int | None) -> Robot:
     end = np.eye(4)
     place, turn = (data.site_xpos, data.site_xmat) if kind == "site" else (data.xpos, data.xmat)
     end[:3, :3], end[:3, 3] = turn[k].reshape(3, 3), place[k]
-    return Robot(
+    return SerialRobot(
         path.stem, tuple(made), np.linalg.inv(last) @ end, np.array(model.opt.gravity),
         source=str(path),
     )  # fmt: skip
 
 
-def _xml(path: Path) -> ElementTree.Element:
+def _parse_xml(path: Path) -> ElementTree.Element:
     text = read_text(path)
     if "<!ENTITY" in text:
         raise InputError(path, "declares XML entities, which are not supported")
@@ -577,17 +590,17 @@ def _xml(path: Path) -> ElementTree.Element:
         raise InputError(path, f"is not valid XML: {error}") from None
 
 
-def _link(joint: ElementTree.Element, end: str) -> str:
+def _link_name(joint: ElementTree.Element, end: str) -> str:
     element = joint.find(end)
     return "" if element is None else str(element.get("link"))
 
 
-def _origin(joint: ElementTree.Element) -> np.ndarray:
+def _read_origin(joint: ElementTree.Element) -> np.ndarray:
     element = joint.find("origin")
     where = f"joint {joint.get('name')}"
-    return frame(
-        _numbers(where, joint, element, "xyz", (0.0, 0.0, 0.0)),
-        _numbers(where, joint, element, "rpy", (0.0, 0.0, 0.0)),
+    return frame_from_rpy(
+        _read_numbers(where, joint, element, "xyz", (0.0, 0.0, 0.0)),
+        _read_numbers(where, joint, element, "rpy", (0.0, 0.0, 0.0)),
     )
 
 
@@ -595,11 +608,11 @@ def _set_origin(joint: ElementTree.Element, matrix: np.ndarray) -> None:
     element = joint.find("origin")
     if element is None:
         element = ElementTree.SubElement(joint, "origin")
-    element.set("xyz", " ".join(repr(v) for v in _list(matrix[:3, 3])))
-    element.set("rpy", " ".join(repr(v) for v in _list(rpy_of(matrix[:3, :3]))))
+    element.set("xyz", " ".join(repr(v) for v in _to_floats(matrix[:3, 3])))
+    element.set("rpy", " ".join(repr(v) for v in _to_floats(rotation_to_rpy(matrix[:3, :3]))))
 
 
-def _numbers(where, joint, element, key: str, default: Sequence[float]) -> Sequence[float]:
+def _read_numbers(where, joint, element, key: str, default: Sequence[float]) -> Sequence[float]:
     said = None if element is None else element.get(key)
     if said is None:
         return default
@@ -612,12 +625,12 @@ def _numbers(where, joint, element, key: str, default: Sequence[float]) -> Seque
     return numbers
 
 
-def _unit(where, name: str, axis: Sequence[float]) -> np.ndarray:
+def _unit_vector(where, name: str, axis: Sequence[float]) -> np.ndarray:
     size = float(np.linalg.norm(axis))
     if not size > 0.0:
         raise InputError(where, f"joint {name}: its axis must not be zero")
     return np.asarray(axis, float) / size
 
 
-def _list(values: np.ndarray) -> list[float]:
+def _to_floats(values: np.ndarray) -> list[float]:
     return [float(v) for v in np.asarray(values)]

@@ -14,9 +14,19 @@ from hydrotele.core.compiled import compiled
 from hydrotele.kinematics.arm import ArmGeometry
 from hydrotele.kinematics.five_dof import FellerGeometry
 
-BASE_RADIUS, BASE_HEIGHT, SIDE, BOOM, STICK, BEND, ALONG, UP, HEAD = range(9)
-REACHED, BEYOND, SINGULAR = range(3)
-_STRAIGHT = 1e-3  # sine of the elbow, or radius [m], below which rates are not computed
+(
+    BASE_RADIUS,
+    BASE_HEIGHT,
+    LATERAL_OFFSET,
+    BOOM_LENGTH,
+    STICK_LENGTH,
+    BEND_ANGLE,
+    TOOL_ALONG,
+    TOOL_UP,
+    HEAD_RADIUS,
+) = range(9)
+REACHED, OUT_OF_REACH, SINGULAR = range(3)
+_MIN_ELBOW_SINE = 1e-3  # sine of the elbow, or radius [m], below which rates are not computed
 
 
 def arm_parameters(geometry: ArmGeometry | FellerGeometry) -> np.ndarray:
@@ -37,7 +47,7 @@ def arm_parameters(geometry: ArmGeometry | FellerGeometry) -> np.ndarray:
         ])  # fmt: skip
     along, up = g.tool_offset
     stick, bend = g.stick_length, 0.0
-    if not g.tool_joint:
+    if not g.has_tool_joint:
         stick, bend = math.hypot(g.stick_length + along, up), math.atan2(up, g.stick_length + along)
         along, up = 0.0, 0.0
     return np.array([
@@ -78,13 +88,13 @@ def task_forward(g, q, pose):
 
 
 @compiled
-def task_inverse(g, pose, near, q):
+def task_inverse(g, pose, present_swing, q):
     """Compute the joint angles for a pose, with the elbow above and the tip ahead.
 
     Args:
         g: (9,) output of `arm_parameters`.
         pose: (5,) pose as written by `task_forward`.
-        near: present swing angle, scalar [rad]; the result is within half a turn of it.
+        present_swing: present swing angle, scalar [rad]; the result is within half a turn of it.
         q: (k,) joint angles [rad], written unless the pose is out of reach.
 
     Returns:
@@ -109,7 +119,7 @@ def task_inverse(g, pose, near, q):
         return 1
     bent = -math.acos(inner)
     q[0] = pose[1] - math.atan2(side, x)
-    q[0] += 2.0 * math.pi * np.rint((near - q[0]) / (2.0 * math.pi))
+    q[0] += 2.0 * math.pi * np.rint((present_swing - q[0]) / (2.0 * math.pi))
     q[1] = math.atan2(pz, px) - math.atan2(g[4] * math.sin(bent), g[3] + g[4] * inner)
     q[2] = bent - g[5]
     if k > 3:
@@ -141,7 +151,7 @@ def task_rates(g, q, pose, rate, out):
     longer, aside = -g[8] * math.sin(head) * turning, -g[8] * math.cos(head) * turning
     bent = q[2] + g[5]
     x = math.sqrt(max(pose[0] * pose[0] - side * side, 0.0))
-    if abs(math.sin(bent)) < _STRAIGHT or x < _STRAIGHT:
+    if abs(math.sin(bent)) < _MIN_ELBOW_SINE or x < _MIN_ELBOW_SINE:
         return 2
     vx, vz = (pose[0] * rate[0] - side * aside) / x, rate[2]
     out[0] = rate[1] - (aside * x - side * vx) / (pose[0] * pose[0])

@@ -15,13 +15,13 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from hydrotele.core.datafile import Facts, Vector
-from hydrotele.kinematics.hybrid import Pose
+from hydrotele.core.datafile import StrictModel, Vector
+from hydrotele.kinematics.hybrid import PlatformPose
 
-_POINT = (0, 0, 0, 1, 1, 2)  # platform point of each wire
+_POINT_OF_WIRE = (0, 0, 0, 1, 1, 2)  # platform point of each wire
 
 
-class Wires(Facts):
+class WireGeometry(StrictModel):
     """Geometry of six wires.
 
     Attributes:
@@ -34,11 +34,11 @@ class Wires(Facts):
     points: Annotated[tuple[Vector, ...], Field(min_length=3, max_length=3)]
 
 
-class NoIntersection(ValueError):
+class NoIntersectionError(ValueError):
     """The wires are too short to meet, or too long to reach each other."""
 
 
-def wire_lengths(wires: Wires, pose: Pose) -> np.ndarray:
+def wire_lengths(wires: WireGeometry, pose: PlatformPose) -> np.ndarray:
     """Compute the lengths of the six wires at poses.
 
     Args:
@@ -48,7 +48,7 @@ def wire_lengths(wires: Wires, pose: Pose) -> np.ndarray:
     Returns:
         (..., 6) lengths [m].
     """
-    ends = np.einsum("...ij,kj->...ki", pose.rotation, np.array(wires.points)[list(_POINT)])
+    ends = np.einsum("...ij,kj->...ki", pose.rotation, np.array(wires.points)[list(_POINT_OF_WIRE)])
     return np.linalg.norm(ends + pose.position[..., None, :] - np.array(wires.anchors), axis=-1)
 
 
@@ -88,13 +88,13 @@ def trilaterate(centres: np.ndarray, radii: np.ndarray, near: np.ndarray) -> np.
     square = r1**2 - x**2 - y**2
     if not (square > 0.0).all():
         where = np.flatnonzero(~(np.ravel(square) > 0.0))
-        raise NoIntersection(f"the wires do not meet at pose {where[0] + 1}")
+        raise NoIntersectionError(f"the wires do not meet at pose {where[0] + 1}")
     flat = one + x[..., None] * ex + y[..., None] * ey
     side = np.sign(np.sum((near - flat) * ez, axis=-1))
     return flat + (np.where(side < 0.0, -1.0, 1.0) * np.sqrt(square))[..., None] * ez
 
 
-def pose_of_wires(wires: Wires, lengths: np.ndarray, near: Pose) -> Pose:
+def pose_from_wires(wires: WireGeometry, lengths: np.ndarray, near: PlatformPose) -> PlatformPose:
     """Compute the pose of the platform from the lengths of the six wires.
 
     Args:
@@ -125,7 +125,7 @@ def pose_of_wires(wires: Wires, lengths: np.ndarray, near: Pose) -> Pose:
     radii = np.concatenate([lengths[..., 5:], sides], axis=-1)
     third = trilaterate(centres, radii, expected[..., 2, :])
     rotation = _triad(first, second, third) @ np.swapaxes(_triad(*points), -1, -2)
-    return Pose(rotation, first - np.einsum("...ij,j->...i", rotation, points[0]))
+    return PlatformPose(rotation, first - np.einsum("...ij,j->...i", rotation, points[0]))
 
 
 def _triad(first, second, third) -> np.ndarray:
@@ -137,7 +137,7 @@ def _triad(first, second, third) -> np.ndarray:
     return np.stack([x, np.cross(z, x), z], axis=-1)
 
 
-def wire_jacobian(wires: Wires, pose: Pose) -> np.ndarray:
+def wire_jacobian(wires: WireGeometry, pose: PlatformPose) -> np.ndarray:
     """Compute the derivatives of the wire lengths by position [m] and rotation vector [rad].
 
     Args:
@@ -147,13 +147,13 @@ def wire_jacobian(wires: Wires, pose: Pose) -> np.ndarray:
     Returns:
         (..., 6, 6): row k is (u_k, (R p_k) x u_k), u_k the direction of wire k.
     """
-    arms = np.einsum("...ij,kj->...ki", pose.rotation, np.array(wires.points)[list(_POINT)])
+    arms = np.einsum("...ij,kj->...ki", pose.rotation, np.array(wires.points)[list(_POINT_OF_WIRE)])
     away = arms + pose.position[..., None, :] - np.array(wires.anchors)
     unit = away / np.linalg.norm(away, axis=-1, keepdims=True)
     return np.concatenate([unit, np.cross(arms, unit)], axis=-1)
 
 
-def pose_covariance(wires: Wires, pose: Pose, sigma: float) -> np.ndarray:
+def pose_covariance(wires: WireGeometry, pose: PlatformPose, sigma: float) -> np.ndarray:
     """Compute the covariance of poses from wires whose lengths have independent errors.
 
     The covariance is J^-1 sigma^2 J^-T with J of `wire_jacobian`, because the pose reproduces all

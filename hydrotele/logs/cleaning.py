@@ -20,20 +20,20 @@ import numpy as np
 
 from hydrotele.core.errors import InputError
 from hydrotele.logs import cleaning as value_range
-from hydrotele.logs.rows import Rows
-from hydrotele.machine.machine import Machine, Sensor, SensorSet, channel_sensor, converter
+from hydrotele.logs.rows import RunRows
+from hydrotele.machine.machine import Machine, Sensor, SensorSet, channel_converter, channel_sensor
 
-_ANGLE_PLAY = 0.35  # [rad] tolerance beyond a joint's range; sensor zeros are often inaccurate
-_LENGTH_PLAY = 0.2  # tolerance as a fraction of the stroke or range, for the same reason
-_VACUUM = -1.0e6  # [Pa] lower limit for readings of absolute or gauge pressure sensors
-_PRESSURE_PLAY = 2.0  # limit as a multiple of the highest relief pressure; ports overshoot it
-_HARDEST = 500.0  # [rad/s^2] or [m/s^2]: exceeds the acceleration at an end-stop impact
-_SPIKE = 20.0  # standard deviations of one reading
-_NEAR_CLIP = 0.1  # [s] before and after a saturated row in which nearby readings are removed
-_WIDE = 3.46  # standard deviations from the limit within which such readings are removed
+_ANGLE_TOLERANCE = 0.35  # [rad] tolerance beyond a joint's range; sensor zeros are often inaccurate
+_LENGTH_TOLERANCE = 0.2  # tolerance as a fraction of the stroke or range, for the same reason
+_MIN_PRESSURE_READING = -1.0e6  # [Pa] lower limit for readings of absolute or gauge pressure sensors
+_MAX_PRESSURE_RATIO = 2.0  # limit as a multiple of the highest relief pressure; ports overshoot it
+_MAX_ACCELERATION = 500.0  # [rad/s^2] or [m/s^2]: exceeds the acceleration at an end-stop impact
+_SPIKE_NOISE_RATIO = 20.0  # standard deviations of one reading
+_SATURATION_MARGIN_SECONDS = 0.1  # [s] before and after a saturated row in which nearby readings are removed
+_SATURATION_MARGIN_STDS = 3.46  # standard deviations from the limit within which such readings are removed
 
 
-def limits(machine: Machine, channel: str) -> tuple[float, float]:
+def plausible_range(machine: Machine, channel: str) -> tuple[float, float]:
     """Return the plausible range of readings of a channel, with a tolerance.
 
     Args:
@@ -46,15 +46,15 @@ def limits(machine: Machine, channel: str) -> tuple[float, float]:
     kind, _, axis = channel.partition(".")
     if kind.startswith("pressure"):
         if machine.supply is None:  # axes with individual pumps have no stated limit
-            return _VACUUM, math.inf
+            return _MIN_PRESSURE_READING, math.inf
         reliefs = [a.valve.port_relief for a in machine.hydraulic_axes.values() if a.valve]
-        return _VACUUM, _PRESSURE_PLAY * max(machine.supply.relief_pressure, *reliefs)
+        return _MIN_PRESSURE_READING, _MAX_PRESSURE_RATIO * max(machine.supply.relief_pressure, *reliefs)
     if kind == "length":
         cylinder = machine.axes[axis].cylinder
         assert cylinder
-        return -_LENGTH_PLAY * cylinder.stroke, (1 + _LENGTH_PLAY) * cylinder.stroke
+        return -_LENGTH_TOLERANCE * cylinder.stroke, (1 + _LENGTH_TOLERANCE) * cylinder.stroke
     low, high = machine.joints[machine.axes[axis].joint].range or (-math.inf, math.inf)
-    play = _ANGLE_PLAY if kind == "angle" else _LENGTH_PLAY * (high - low)
+    play = _ANGLE_TOLERANCE if kind == "angle" else _LENGTH_TOLERANCE * (high - low)
     return (low - play, high + play) if math.isfinite(high) else (low, high)
 
 
@@ -71,7 +71,7 @@ def check_range(machine: Machine, channel: str, reading: np.ndarray, where: str)
         InputError: the channel is out of range; the message gives both ranges and, if one fits, the
             unit that the file probably has.
     """
-    low, high = limits(machine, channel)
+    low, high = plausible_range(machine, channel)
     values = reading[np.isfinite(reading)]
     if not len(values) or np.mean((values < low) | (values > high)) <= 0.5:
         return
@@ -84,12 +84,11 @@ def check_range(machine: Machine, channel: str, reading: np.ndarray, where: str)
         "check zero, sign and unit, and whether the log is from this machine")  # fmt: skip
     raise InputError(
         f"{where}, column {channel!r}",
-        f"has values {values.min():.4g} .. {values.max():.4g}, the machine allows {low:.4g} .."
-        f" {high:.4g}: {cure}",
+        f"has values {values.min():.4g} .. {values.max():.4g}, the machine allows {low:.4g} .. {high:.4g}: {cure}",
     )
 
 
-def clipped(sensor: Sensor, channel: str, reading: np.ndarray, period: float) -> np.ndarray:
+def find_saturated(sensor: Sensor, channel: str, reading: np.ndarray, period: float) -> np.ndarray:
     """Find saturated readings and readings close to the limit near a saturated one.
 
     Saturation cuts off half of the noise. Removing only the saturated readings would keep those
@@ -105,27 +104,25 @@ def clipped(sensor: Sensor, channel: str, reading: np.ndarray, period: float) ->
     Returns:
         (n,) bool.
     """
-    step, low, high = converter(sensor, channel)
+    step, low, high = channel_converter(sensor, channel)
     at_end = np.zeros(len(reading), dtype=bool)
     if not math.isfinite(high):
         return at_end
     for distance in (reading - low, high - reading):
         cut = np.nan_to_num(distance, nan=math.inf) <= 0.25 * step
         if cut.any():
-            rows = min(max(1, round(_NEAR_CLIP / period)), (len(cut) - 1) // 2)
+            rows = min(max(1, round(_SATURATION_MARGIN_SECONDS / period)), (len(cut) - 1) // 2)
             beside = np.convolve(cut, np.ones(2 * rows + 1), mode="same") > 0.5
-            reach = (2 * sensor.accuracy or _WIDE * sensor.standard_deviation) + step
+            reach = (2 * sensor.accuracy or _SATURATION_MARGIN_STDS * sensor.standard_deviation) + step
             near = np.nan_to_num(distance, nan=math.inf) <= reach
             at_end |= cut | (beside & near)
     return at_end
 
 
-def spikes(
-    machine: Machine, channel: str, reading: np.ndarray, period: float, noise: float
-) -> np.ndarray:
+def find_spikes(machine: Machine, channel: str, reading: np.ndarray, period: float, noise: float) -> np.ndarray:
     """Find single readings that are physically impossible.
 
-    Pressures are checked against `limits` only, because they can change by 10 MPa within a row. A
+    Pressures are checked against `plausible_range` only, because they can change by 10 MPa within a row. A
     position is also a spike if its two neighbours agree and it differs from them by more than any
     acceleration can explain.
 
@@ -139,7 +136,7 @@ def spikes(
     Returns:
         (n,) bool.
     """
-    low, high = limits(machine, channel)
+    low, high = plausible_range(machine, channel)
     with np.errstate(invalid="ignore"):
         bad = (reading < low) | (reading > high) | np.isinf(reading)
     if channel.startswith("pressure") or len(reading) < 3:
@@ -149,20 +146,20 @@ def spikes(
     if not math.isfinite(noise):  # second differences of 0 come from a coarse converter
         bent = np.abs(bend[np.isfinite(bend) & (bend != 0.0)])
         noise = 1.2 * float(np.median(bent)) if len(bent) else 0.0
-    allowed = max(_SPIKE * noise, 0.5 * _HARDEST * period**2)
+    allowed = max(_SPIKE_NOISE_RATIO * noise, 0.5 * _MAX_ACCELERATION * period**2)
     with np.errstate(invalid="ignore"):
         bad[1:-1] |= (np.abs(bend) > allowed) & (apart < 0.25 * np.abs(bend))
     return bad
 
 
-_LEAST = 20  # minimum number of changes
-_REGULAR = 0.9  # minimum fraction of values with the same duration or a multiple of it
-_HURRIED = 0.01  # maximum fraction of values that last for one reading only
-_ONE_STEP = 0.9  # larger fractions of one-step changes mean a slow motion of a coarse sensor
-_EQUAL = 1.05  # changes up to this multiple of the smallest one count as one step
+_MIN_CHANGES = 20  # minimum number of changes
+_MIN_REGULAR_FRACTION = 0.9  # minimum fraction of values with the same duration or a multiple of it
+_MAX_SINGLE_FRACTION = 0.01  # maximum fraction of values that last for one reading only
+_MAX_ONE_STEP_FRACTION = 0.9  # larger fractions of one-step changes mean a slow motion of a coarse sensor
+_ONE_STEP_RATIO = 1.05  # changes up to this multiple of the smallest one count as one step
 
 
-def refreshed_every(reading: np.ndarray) -> float:
+def readings_per_update(reading: np.ndarray) -> float:
     """Return the number of logged readings per update of a channel; 1 if each is an update.
 
     A channel with a slower clock repeats each value for a fixed number of readings, or one more or
@@ -175,65 +172,65 @@ def refreshed_every(reading: np.ndarray) -> float:
     Returns:
         The mean number of readings per update, at least 1.
 
-    >>> refreshed_every(np.repeat(np.random.default_rng(0).normal(size=50), 4))
+    >>> readings_per_update(np.repeat(np.random.default_rng(0).normal(size=50), 4))
     4.0
     """
     values = reading[np.isfinite(reading)]
     change = np.diff(values)
     lasted = np.diff(np.flatnonzero(change))
-    if len(lasted) < _LEAST or np.mean(lasted == 1) > _HURRIED:
+    if len(lasted) < _MIN_CHANGES or np.mean(lasted == 1) > _MAX_SINGLE_FRACTION:
         return 1.0
     size = np.abs(change[change != 0.0])
-    if np.mean(size < _EQUAL * size.min()) > _ONE_STEP:
+    if np.mean(size < _ONE_STEP_RATIO * size.min()) > _MAX_ONE_STEP_FRACTION:
         return 1.0
     usual = np.median(lasted)
     times = np.maximum(np.rint(lasted / usual), 1.0)
     once = times == 1.0
     regular = np.abs(lasted - times * usual) <= 1.0
-    if min(regular.mean(), once.mean()) < _REGULAR:
+    if min(regular.mean(), once.mean()) < _MIN_REGULAR_FRACTION:
         return 1.0
     return float(lasted[once & regular].mean())
 
 
-def stale(reading: np.ndarray, every: float) -> np.ndarray:
+def find_repeated(reading: np.ndarray, per_update: float) -> np.ndarray:
     """Find readings that repeat the previous one because the channel was not updated.
 
     A value that lasts longer than one update period was updated with the same value.
 
     Args:
         reading: (n,) readings, NaN where missing.
-        every: number of readings per update.
+        per_update: number of readings per update.
 
     Returns:
         (n,) bool.
 
-    >>> stale(np.array([1.0, 1.0, 2.0, 2.0, 2.0, 2.0]), 2.0).tolist()
+    >>> find_repeated(np.array([1.0, 1.0, 2.0, 2.0, 2.0, 2.0]), 2.0).tolist()
     [False, True, False, True, False, True]
     """
     rows = np.flatnonzero(np.isfinite(reading))
     place = np.arange(len(rows))
     changed = np.append(True, np.diff(reading[rows]) != 0.0)[: len(rows)]
     since = place - np.maximum.accumulate(np.where(changed, place, 0))
-    again = np.rint(np.rint(since / every) * every) == since
+    again = np.rint(np.rint(since / per_update) * per_update) == since
     lasts = np.append(np.flatnonzero(changed)[1:], len(rows))[np.cumsum(changed) - 1] - place
-    fresh = changed | (again & (lasts >= np.floor(every)))
+    fresh = changed | (again & (lasts >= np.floor(per_update)))
     old = np.zeros(len(reading), dtype=bool)
     old[rows] = ~fresh
     return old
 
 
-_BY_CHANCE = 1.0e-6  # false-alarm probability per data set
-_SHORTEST = 0.1  # [s] minimum duration of a freeze; shorter ones have no effect
-_SHORTEST_QUIET = 1.0  # [s] minimum duration of a freeze of a sensor without known noise
-_QUIET = 0.5  # fraction of the stated noise below which a sensor is quieter than stated
-_WINDOW = 20  # rows per window of the noise estimate
-_PARTNER_STEPS = 20.0  # converter steps that the motion of the other sensor must exceed
-_PARTNER_PRESSURE = 2.0e6  # [Pa] minimum pressure change in the other chamber
-_STRONG = 0.5  # fraction of the command limit that exceeds dead bands
-_STRONG_TIME = 1.0  # [s] minimum time with such a command in each direction
+_FALSE_ALARM_PROBABILITY = 1.0e-6  # false-alarm probability per data set
+_MIN_FREEZE_SECONDS = 0.1  # [s] minimum duration of a freeze; shorter ones have no effect
+_MIN_QUIET_FREEZE_SECONDS = 1.0  # [s] minimum duration of a freeze of a sensor without known noise
+_MIN_NOISE_RATIO = 0.5  # fraction of the stated noise below which a sensor is quieter than stated
+_NOISE_WINDOW_ROWS = 20  # rows per window of the noise estimate
+_MIN_PARTNER_STEPS = 20.0  # converter steps that the motion of the other sensor must exceed
+_MIN_PARTNER_PRESSURE_CHANGE = 2.0e6  # [Pa] minimum pressure change in the other chamber
+_LARGE_COMMAND = 0.5  # fraction of the command limit that exceeds dead bands
+_LARGE_COMMAND_SECONDS = 1.0  # [s] minimum time with such a command in each direction
 
 
-class Stretch(NamedTuple):
+class Interval(NamedTuple):
     """Rows first .. last - 1 of one run in which a channel repeats one value."""
 
     first: int
@@ -251,23 +248,23 @@ def repeat_probability(sensor: Sensor, channel: str) -> float | None:
     if sensor.error_rms == 0.0:
         return None
     width = 2.0 * sensor.accuracy or math.sqrt(2.0 * math.pi) * sensor.standard_deviation
-    share = converter(sensor, channel).step / width
+    share = channel_converter(sensor, channel).step / width
     return max(share, 1.0e-9) if share <= 0.5 else None
 
 
-def longest_repeat(probability: float, count: int) -> int:
+def min_suspicious_repeat(probability: float, count: int) -> int:
     """Return the number of consecutive equal readings that is not random in `count` readings.
 
-    >>> longest_repeat(0.1, 90_000)
+    >>> min_suspicious_repeat(0.1, 90_000)
     12
     """
-    return 1 + math.ceil(math.log(_BY_CHANCE / max(count, 1)) / math.log(probability))
+    return 1 + math.ceil(math.log(_FALSE_ALARM_PROBABILITY / max(count, 1)) / math.log(probability))
 
 
-def repeats(reading: np.ndarray, shortest: int) -> list[Stretch]:
-    """Find intervals of at least `shortest` equal readings; missing readings count as equal.
+def find_repeats(reading: np.ndarray, min_length: int) -> list[Interval]:
+    """Find intervals of at least `min_length` equal readings; missing readings count as equal.
 
-    >>> repeats(np.array([1.0, 2.0, 2.0, np.nan, 2.0, 3.0]), 3)
+    >>> find_repeats(np.array([1.0, 2.0, 2.0, np.nan, 2.0, 3.0]), 3)
     [Stretch(first=1, last=5)]
     """
     rows = np.flatnonzero(np.isfinite(reading))
@@ -276,29 +273,27 @@ def repeats(reading: np.ndarray, shortest: int) -> list[Stretch]:
     starts = np.flatnonzero(np.diff(reading[rows], prepend=np.nan) != 0.0)
     ends = np.append(starts[1:], len(rows))
     return [
-        Stretch(int(rows[a]), int(rows[b - 1]) + 1)
-        for a, b in zip(starts, ends, strict=True)
-        if b - a >= shortest
+        Interval(int(rows[a]), int(rows[b - 1]) + 1) for a, b in zip(starts, ends, strict=True) if b - a >= min_length
     ]
 
 
-def saturated(reading: np.ndarray, parts: Sequence[Stretch]) -> bool:
+def is_saturated(reading: np.ndarray, intervals: Sequence[Interval]) -> bool:
     """Return whether all repetitions of a channel are at one value, its minimum or maximum.
 
     >>> reading = np.array([1.0, 2.0, 2.0, 1.5, 2.0, 2.0, 1.0])
-    >>> saturated(reading, repeats(reading, 2))
+    >>> is_saturated(reading, find_repeats(reading, 2))
     True
 
     Args:
         reading: (n,) readings of one run, NaN where missing.
-        parts: intervals of equal readings.
+        intervals: intervals of equal readings.
     """
-    values = {float(np.nanmedian(reading[slice(*part)])) for part in parts}
+    values = {float(np.nanmedian(reading[slice(*part)])) for part in intervals}
     ends = {float(np.nanmin(reading)), float(np.nanmax(reading))}
-    return len(parts) > 1 and len(values) == 1 and values <= ends
+    return len(intervals) > 1 and len(values) == 1 and values <= ends
 
 
-def noise_floor(reading: np.ndarray) -> float:
+def estimate_noise(reading: np.ndarray) -> float:
     """Estimate the noise standard deviation of a channel at rest [channel's unit].
 
     The estimate is the 10th percentile of the standard deviations from second differences, over
@@ -306,29 +301,27 @@ def noise_floor(reading: np.ndarray) -> float:
     """
     values = reading[np.isfinite(reading)]
     bend = np.diff(values, 2)
-    bend = bend[: len(bend) // _WINDOW * _WINDOW].reshape(-1, _WINDOW)
+    bend = bend[: len(bend) // _NOISE_WINDOW_ROWS * _NOISE_WINDOW_ROWS].reshape(-1, _NOISE_WINDOW_ROWS)
     moving = (bend != 0.0).any(axis=1)
     return float(np.percentile(bend[moving].std(axis=1), 10) / math.sqrt(6.0)) if any(moving) else (
         math.nan)  # fmt: skip
 
 
-def as_noisy_as_stated(sensor: Sensor, channel: str, floors: Sequence[float]) -> bool:
+def has_stated_noise(sensor: Sensor, channel: str, floors: Sequence[float]) -> bool:
     """Return whether the measured noise of a sensor is close to its stated noise.
 
     Args:
         sensor: the sensor.
         channel: channel name.
-        floors: `noise_floor` of this channel and others with an equal sensor, in order of
+        floors: `estimate_noise` of this channel and others with an equal sensor, in order of
             preference; the first finite one is used.
     """
-    stated = math.hypot(sensor.error_rms, converter(sensor, channel).step / 12**0.5)
+    stated = math.hypot(sensor.error_rms, channel_converter(sensor, channel).step / 12**0.5)
     known = [floor for floor in floors if math.isfinite(floor)]
-    return bool(known) and known[0] >= _QUIET * stated
+    return bool(known) and known[0] >= _MIN_NOISE_RATIO * stated
 
 
-def frozen_by_noise(
-    reading: np.ndarray, probability: float, count: int, period: float
-) -> list[Stretch]:
+def find_frozen_by_noise(reading: np.ndarray, probability: float, count: int, period: float) -> list[Interval]:
     """Find intervals of equal readings that are longer than noise allows.
 
     Args:
@@ -337,14 +330,14 @@ def frozen_by_noise(
         count: number of readings in the whole data set.
         period: time between rows [s].
     """
-    shortest = max(longest_repeat(probability, count), math.ceil(_SHORTEST / period))
-    return repeats(reading, shortest)
+    shortest = max(min_suspicious_repeat(probability, count), math.ceil(_MIN_FREEZE_SECONDS / period))
+    return find_repeats(reading, shortest)
 
 
-def frozen_by_motion(
+def find_frozen_position(
     reading: np.ndarray, partner: np.ndarray | None, command: np.ndarray, others: np.ndarray,
     step: float, ranges: tuple[float, float], period: float,
-) -> list[Stretch]:  # fmt: skip
+) -> list[Interval]:  # fmt: skip
     """Find intervals in which a position is constant although the axis must have moved.
 
     Either the second position sensor of the axis (length or angle) changed; or the axis had large
@@ -364,27 +357,25 @@ def frozen_by_motion(
     least = own * 0.02
     low, high = np.nanmin(reading), np.nanmax(reading)
     found = []
-    for part in repeats(reading, math.ceil(_SHORTEST_QUIET / period)):
+    for part in find_repeats(reading, math.ceil(_MIN_QUIET_FREEZE_SECONDS / period)):
         rows = slice(*part)
         if partner is not None and partners > 0.0:
-            moved = _span(partner[rows]) / partners
-            if moved > 0.05 and (own == 0.0 or moved * own > _PARTNER_STEPS * step):
+            moved = _robust_range(partner[rows]) / partners
+            if moved > 0.05 and (own == 0.0 or moved * own > _MIN_PARTNER_STEPS * step):
                 found.append(part)
                 continue
         both = all(
-            period * (sign * command[rows] > _STRONG).sum() >= _STRONG_TIME for sign in (1.0, -1.0)
+            period * (sign * command[rows] > _LARGE_COMMAND).sum() >= _LARGE_COMMAND_SECONDS for sign in (1.0, -1.0)
         )
         value = np.nanmedian(reading[rows])
         at_end = own > 0.0 and (value - low < least or high - value < least)
-        alive = any(_span(other[rows]) > 0.1 * _span(other) > 0.0 for other in others.T)
+        alive = any(_robust_range(other[rows]) > 0.1 * _robust_range(other) > 0.0 for other in others.T)
         if both and not at_end and alive:
             found.append(part)
     return found
 
 
-def frozen_chamber(
-    reading: np.ndarray, partner: np.ndarray, lowest: float, period: float
-) -> list[Stretch]:
+def find_frozen_pressure(reading: np.ndarray, partner: np.ndarray, lowest: float, period: float) -> list[Interval]:
     """Find intervals of constant pressure in one chamber while that of the other chamber changes.
 
     Args:
@@ -395,21 +386,19 @@ def frozen_chamber(
     """
     return [
         part
-        for part in repeats(reading, math.ceil(_SHORTEST_QUIET / period))
-        if _span(partner[slice(*part)]) > _PARTNER_PRESSURE
+        for part in find_repeats(reading, math.ceil(_MIN_QUIET_FREEZE_SECONDS / period))
+        if _robust_range(partner[slice(*part)]) > _MIN_PARTNER_PRESSURE_CHANGE
         and np.nanmedian(reading[slice(*part)]) > lowest
     ]
 
 
-def _span(values: np.ndarray) -> float:
+def _robust_range(values: np.ndarray) -> float:
     """Return the range between the 2nd and the 98th percentile, which ignores outliers."""
     values = values[np.isfinite(values)]
     return float(np.diff(np.percentile(values, [2, 98]))[0]) if len(values) else 0.0
 
 
-def repeated_rows(
-    reading: np.ndarray, probability: Sequence[float | None], count: int
-) -> np.ndarray:
+def find_duplicated_rows(reading: np.ndarray, probability: Sequence[float | None], count: int) -> np.ndarray:
     """Find rows that repeat all readings of the previous row, which noise makes improbable.
 
     Args:
@@ -426,18 +415,18 @@ def repeated_rows(
     logs = np.log([p for p in probability if p is not None])
     pairs = np.isfinite(reading[1:, noisy]) & np.isfinite(reading[:-1, noisy])
     equal = pairs & (reading[1:, noisy] == reading[:-1, noisy])
-    improbable = (equal * logs).sum(axis=1) < math.log(_BY_CHANCE / max(count, 1))
+    improbable = (equal * logs).sum(axis=1) < math.log(_FALSE_ALARM_PROBABILITY / max(count, 1))
     return np.append(False, improbable & (equal == pairs).all(axis=1) & pairs.any(axis=1))
 
 
-_KEPT = 0.1  # minimum fraction of readings that a channel must keep in a run
-_NEAR = 3.0  # noise standard deviations from a sensor limit within which readings are removed
-_CLIPPED = 0.02  # fraction of a run; any machine has some chamber pressures of 0
-_RESOLVED = 1.0e-4  # worst resolution of a sensor without a stated converter, relative to its span
-_STARVED = 0.5e6  # [Pa] above tank pressure, range in which a make-up valve may hold a pressure
+_MIN_KEPT_FRACTION = 0.1  # minimum fraction of readings that a channel must keep in a run
+_LIMIT_NOISE_RATIO = 3.0  # noise standard deviations from a sensor limit within which readings are removed
+_MAX_SATURATED_FRACTION = 0.02  # fraction of a run; any machine has some chamber pressures of 0
+_DEFAULT_RESOLUTION = 1.0e-4  # worst resolution of a sensor without a stated converter, relative to its span
+_STARVED_PRESSURE = 0.5e6  # [Pa] above tank pressure, range in which a make-up valve may hold a pressure
 
 
-class _Data(NamedTuple):
+class _CleaningData(NamedTuple):
     """All runs of one machine, with its sensors and noise."""
 
     machine: Machine
@@ -445,7 +434,7 @@ class _Data(NamedTuple):
     axes: Sequence[str]
     channels: Sequence[str]
     noise: np.ndarray
-    runs: dict[str, Rows]
+    runs: dict[str, RunRows]
 
     def column(self, channel: str, run: str) -> np.ndarray | None:
         """Return the readings (n,) of a channel in a run; None if the channel is unknown."""
@@ -466,8 +455,8 @@ class _Data(NamedTuple):
 
 def remove_faults(
     machine: Machine, sensors: SensorSet | None, axes: Sequence[str], channels: Sequence[str],
-    noise: np.ndarray, runs: Mapping[str, Rows],
-) -> tuple[dict[str, Rows], tuple[str, ...]]:  # fmt: skip
+    noise: np.ndarray, runs: Mapping[str, RunRows],
+) -> tuple[dict[str, RunRows], tuple[str, ...]]:  # fmt: skip
     """Replace saturated, impossible, frozen, repeated and duplicated readings by NaN.
 
     Args:
@@ -482,33 +471,33 @@ def remove_faults(
         (run -> cleaned rows, notes).
     """
     copies = {name: rows._replace(reading=rows.reading.copy()) for name, rows in runs.items()}
-    data = _Data(machine, sensors, axes, channels, noise, copies)
+    data = _CleaningData(machine, sensors, axes, channels, noise, copies)
     notes: list[str] = []
     for column, channel in enumerate(channels):
         for run in data.runs:
-            notes += _out_of_sensor(data, run, channel, noise[column])
-            notes += _stale(data, run, channel)
+            notes += _remove_impossible_readings(data, run, channel, noise[column])
+            notes += _remove_repeated_readings(data, run, channel)
     fresh = {name: rows.reading.copy() for name, rows in data.runs.items()}
-    found = [(run, ch, _frozen(data, run, ch)) for run in data.runs for ch in channels]
+    found = [(run, ch, _find_frozen_intervals(data, run, ch)) for run in data.runs for ch in channels]
     for run, channel, parts in found:  # after all tests, which compare channels with each other
-        notes += _take_out_frozen(data, run, channel, parts)
+        notes += _remove_frozen_readings(data, run, channel, parts)
     for run in data.runs:
-        notes += _take_out_repeated_rows(data, run)
-        notes += _take_out_useless(data, run, fresh[run])
+        notes += _remove_duplicated_rows(data, run)
+        notes += _remove_sparse_channels(data, run, fresh[run])
     return data.runs, tuple(notes)
 
 
-def _out_of_sensor(data: _Data, run: str, channel: str, noise: float) -> list[str]:
+def _remove_impossible_readings(data: _CleaningData, run: str, channel: str, noise: float) -> list[str]:
     reading, period, notes = data.column(channel, run), data.runs[run].period, []
     assert reading is not None
     if bad := int(np.isinf(reading).sum()):
         reading[np.isinf(reading)] = np.nan
         notes.append(f"{run}: {bad} infinite readings of {channel} were removed.")
     for what, noted, rows in (
-        ("at the limit of the sensor", _CLIPPED,
-         value_range.clipped(data.sensor(channel), channel, reading, period)),
+        ("at the limit of the sensor", _MAX_SATURATED_FRACTION,
+         value_range.find_saturated(data.sensor(channel), channel, reading, period)),
         ("that are physically impossible", 0.0,
-         value_range.spikes(data.machine, channel, reading, period, noise)),
+         value_range.find_spikes(data.machine, channel, reading, period, noise)),
     ):  # fmt: skip
         if rows.mean() > noted:
             first = data.runs[run].start + period * int(np.flatnonzero(rows)[0])
@@ -518,47 +507,47 @@ def _out_of_sensor(data: _Data, run: str, channel: str, noise: float) -> list[st
     return notes
 
 
-def _stale(data: _Data, run: str, channel: str) -> list[str]:
+def _remove_repeated_readings(data: _CleaningData, run: str, channel: str) -> list[str]:
     """Remove readings that repeat the last value of a channel with a slower update rate."""
     reading, period = data.column(channel, run), data.runs[run].period
     assert reading is not None
-    every = refreshed_every(reading)
+    every = readings_per_update(reading)
     if every == 1.0:
         return []
     step = period * float(np.median(np.diff(np.flatnonzero(np.isfinite(reading)))))
-    reading[stale(reading, every)] = np.nan
+    reading[find_repeated(reading, every)] = np.nan
     lasts = 1e3 * every * step
     return [f"{run}: {channel} is updated only every {lasts:.3g} ms; the repeated values in"
             " between count as missing."]  # fmt: skip
 
 
-def _count(data: _Data) -> int:
+def _count_readings(data: _CleaningData) -> int:
     return sum(rows.reading.size for rows in data.runs.values())
 
 
-def _frozen(data: _Data, run: str, channel: str) -> list[Stretch]:
+def _find_frozen_intervals(data: _CleaningData, run: str, channel: str) -> list[Interval]:
     """Find the intervals in which a channel is frozen, with the strictest applicable test."""
     reading, sensor, period = data.column(channel, run), data.sensor(channel), data.runs[run].period
     assert reading is not None
     probability = repeat_probability(sensor, channel)
-    if probability and as_noisy_as_stated(sensor, channel, _floors(data, run, channel)):
-        return frozen_by_noise(reading, probability, _count(data), period)
+    if probability and has_stated_noise(sensor, channel, _noise_estimates(data, run, channel)):
+        return find_frozen_by_noise(reading, probability, _count_readings(data), period)
     kind, _, axis = channel.partition(".")
     if kind == "pressure_supply":  # may be constant at the relief pressure for any time
         return []
     if kind.startswith("pressure"):
         other = "pressure_rod" if kind == "pressure_head" else "pressure_head"
         partner = data.column(f"{other}.{axis}", run)
-        lowest = data.machine.return_pressure(axis) + _STARVED
+        lowest = data.machine.return_pressure(axis) + _STARVED_PRESSURE
         if partner is None:
             return []
-        return frozen_chamber(reading, partner, lowest, period)
+        return find_frozen_pressure(reading, partner, lowest, period)
     if not np.isfinite(reading).any():
         return []
-    return _frozen_position(data, run, channel, axis)
+    return _find_frozen_positions(data, run, channel, axis)
 
 
-def _frozen_position(data: _Data, run: str, channel: str, axis: str) -> list[Stretch]:
+def _find_frozen_positions(data: _CleaningData, run: str, channel: str, axis: str) -> list[Interval]:
     position = f"{data.machine.position_kind(axis)}.{axis}"
     partner = position if channel != position else f"length.{axis}"
     force = data.machine.axes[axis].force
@@ -568,15 +557,15 @@ def _frozen_position(data: _Data, run: str, channel: str, axis: str) -> list[Str
     span = data.span(channel)
     reading = data.column(channel, run)
     assert reading is not None
-    return frozen_by_motion(
+    return find_frozen_position(
         reading, data.column(partner, run), command / (force.command_limit if force else 1.0),
         np.column_stack(apart) if apart else np.empty((len(command), 0)),
-        converter(data.sensor(channel), channel).step or _RESOLVED * span,
+        channel_converter(data.sensor(channel), channel).step or _DEFAULT_RESOLUTION * span,
         (span, data.span(partner)), data.runs[run].period,
     )  # fmt: skip
 
 
-def _floors(data: _Data, run: str, channel: str) -> list[float]:
+def _noise_estimates(data: _CleaningData, run: str, channel: str) -> list[float]:
     """Return the first finite noise floor: this run, other runs, channels with an equal sensor."""
     sensor, witnesses = data.sensor(channel), [(channel, run)]
     witnesses += [(channel, other) for other in data.runs if other != run]
@@ -585,12 +574,12 @@ def _floors(data: _Data, run: str, channel: str) -> list[float]:
         (c, r) for c in data.channels for r in data.runs
         if c != channel and c.startswith(kind) and data.sensor(c).error_rms == sensor.error_rms
     ]  # fmt: skip
-    floors = (noise_floor(v) for c, r in witnesses
+    floors = (estimate_noise(v) for c, r in witnesses
               if (v := data.column(c, r)) is not None)  # fmt: skip
     return [next((floor for floor in floors if math.isfinite(floor)), math.nan)]
 
 
-def _take_out_frozen(data: _Data, run: str, channel: str, parts) -> list[str]:
+def _remove_frozen_readings(data: _CleaningData, run: str, channel: str, parts) -> list[str]:
     if not parts:
         return []
     reading, rows = data.column(channel, run), data.runs[run]
@@ -600,24 +589,22 @@ def _take_out_frozen(data: _Data, run: str, channel: str, parts) -> list[str]:
     listed = ", ".join(spans[:3]) + (f" and {len(spans) - 3} more times" if spans[3:] else "")
     value = np.nanmedian(reading[slice(*parts[0])])
     said = f"{run}: {channel} is frozen at {value:.6g} {listed}; these readings were removed."
-    if saturated(reading, parts):
+    if is_saturated(reading, parts):
         noise = float(data.noise[list(data.channels).index(channel)])
-        near = np.abs(reading - value) <= _NEAR * (noise if math.isfinite(noise) else 0.0)
+        near = np.abs(reading - value) <= _LIMIT_NOISE_RATIO * (noise if math.isfinite(noise) else 0.0)
         reading[near] = np.nan
-        said = (
-            f"{run}: {channel} is saturated at {value:.6g} {listed}; these readings were removed."
-        )
+        said = f"{run}: {channel} is saturated at {value:.6g} {listed}; these readings were removed."
     for part in parts:
         reading[slice(*part)] = np.nan
     return [said]
 
 
-def _take_out_repeated_rows(data: _Data, run: str) -> list[str]:
+def _remove_duplicated_rows(data: _CleaningData, run: str) -> list[str]:
     rows = data.runs[run]
     odds = [repeat_probability(data.sensor(c), c) for c in data.channels]
-    odds = [p if p and as_noisy_as_stated(data.sensor(c), c, _floors(data, run, c))
+    odds = [p if p and has_stated_noise(data.sensor(c), c, _noise_estimates(data, run, c))
             else None for c, p in zip(data.channels, odds, strict=True)]  # fmt: skip
-    again = repeated_rows(rows.reading, odds, _count(data))
+    again = find_duplicated_rows(rows.reading, odds, _count_readings(data))
     if not again.any():
         return []
     rows.reading[again] = np.nan
@@ -627,11 +614,11 @@ def _take_out_repeated_rows(data: _Data, run: str) -> list[str]:
             " do not repeat; they count as missing."]  # fmt: skip
 
 
-def _take_out_useless(data: _Data, run: str, before: np.ndarray) -> list[str]:
+def _remove_sparse_channels(data: _CleaningData, run: str, before: np.ndarray) -> list[str]:
     notes, after = [], data.runs[run].reading
     had, has = np.isfinite(before).sum(axis=0), np.isfinite(after).sum(axis=0)
     for column, channel in enumerate(data.channels):
-        if not 0 < has[column] < _KEPT * had[column]:
+        if not 0 < has[column] < _MIN_KEPT_FRACTION * had[column]:
             continue
         after[:, column] = np.nan
         notes.append(f"{run}: {channel} has too few usable readings and was removed from this"

@@ -14,31 +14,43 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.core.datafile import suggest
+from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.logs.cleaning import check_range, remove_faults
 from hydrotele.logs.files import RunFiles, check_commands, read_runs
 from hydrotele.logs.log import Log
-from hydrotele.logs.rows import Masked, Rows, averaged, check_runs, cut, read_mask, run_rows
+from hydrotele.logs.rows import (
+    MaskedInterval,
+    RunRows,
+    average_rows,
+    check_mask_runs,
+    merge_run,
+    read_mask,
+    slice_rows,
+)
 from hydrotele.machine.machine import (
-    IDEAL,
+    IDEAL_SENSORS,
     Machine,
     SensorSet,
     channel_sensor,
+    get_sensors,
     noise_rms,
-    sensor_set,
 )
 from hydrotele.machine.signals import parse_channel
 
-_MOVES = 10.0  # noise standard deviations that a position range must exceed to count as motion
-_UNSTATED = ("none", "", IDEAL)  # `sensors` metadata of logs without a known accuracy
+_MIN_MOTION_RATIO = 10.0  # noise standard deviations that a position range must exceed to count as motion
+_NAMES_WITHOUT_ACCURACY = (
+    "none",
+    "",
+    IDEAL_SENSORS,
+)  # `sensors` metadata of logs without a known accuracy
 
 
-def predicted(machine: Machine) -> tuple[str, ...]:
+def predicted_channels(machine: Machine) -> tuple[str, ...]:
     """Return all channels that the model predicts, in the order of a dataset."""
     order = actuator_order(machine)
-    valves = [name for name in order if machine.axes[name].hydraulic]
+    valves = [name for name in order if machine.axes[name].is_hydraulic]
     return (
         *(f"{machine.position_kind(name)}.{name}" for name in order),
         *(f"length.{name}" for name in order if machine.axes[name].cylinder),
@@ -55,17 +67,17 @@ def common_channels(files: Sequence[RunFiles], machine: Machine) -> tuple[str, .
         InputError: there is no such channel; the message lists the predicted channels.
     """
     logs = [log for run in files for log in run.logs]
-    found = tuple(c for c in predicted(machine) if any(c in log for log in logs))
+    found = tuple(c for c in predicted_channels(machine) if any(c in log for log in logs))
     if not found:
         raise InputError(
             ", ".join(run.name for run in files) or "the data",
             f"contains no channel that the model of {machine.name} predicts; these are"
-            f" {', '.join(predicted(machine))}",
+            f" {', '.join(predicted_channels(machine))}",
         )
     return found
 
 
-def stated_sensors(
+def determine_sensors(
     files: Sequence[RunFiles], machine: Machine, name: str | None
 ) -> tuple[SensorSet | None, list[str]]:
     """Return the sensors of the logs (None if their noise is unknown), and notes.
@@ -79,7 +91,7 @@ def stated_sensors(
         InputError: the machine has no such sensors, or the logs have different ones.
     """
     if name is not None:
-        return sensor_set(machine, name), []
+        return get_sensors(machine, name), []
     stated = {log.metadata["sensors"]: log.source
               for run in files for log in run.logs if "sensors" in log.metadata}  # fmt: skip
     if len(stated) > 1:
@@ -91,13 +103,12 @@ def stated_sensors(
     said = next(iter(stated), None)
     if said in machine.sensors:
         return machine.sensors[said], []
-    if said in _UNSTATED or not machine.sensors:
+    if said in _NAMES_WITHOUT_ACCURACY or not machine.sensors:
         return None, ["the logs state no sensors with a known accuracy; the noise is unknown."]
     first = next(iter(machine.sensors))
     if said is not None:
         return machine.sensors[first], [
-            f"the logs name the sensors {said!r}, which {machine.name} does not have; {first!r} is"
-            " used instead."
+            f"the logs name the sensors {said!r}, which {machine.name} does not have; {first!r} is used instead."
         ]
     return machine.sensors[first], []
 
@@ -109,15 +120,15 @@ def channel_noise(machine: Machine, sensors: SensorSet | None, channel: str) -> 
     return noise_rms(machine, sensors, channel)
 
 
-def unknown_columns(files: Sequence[RunFiles], machine: Machine) -> list[str]:
+def note_unknown_columns(files: Sequence[RunFiles], machine: Machine) -> list[str]:
     """Return notes on channels that the machine does not have, and on averaged commands."""
-    valid = (*predicted(machine), *(f"command.{axis}" for axis in machine.axes))
+    valid = (*predicted_channels(machine), *(f"command.{axis}" for axis in machine.axes))
     kinds = {name.partition(".")[0] for name in valid} | {"angle", "position"}
     notes = []
     for channel in dict.fromkeys(c for run in files for log in run.logs for c in log.columns):
         if channel not in valid and parse_channel(channel).kind in kinds:
             notes.append(f"{channel} is ignored: {machine.name} has no such channel;"
-                         f" {suggest(channel, valid)}.")  # fmt: skip
+                         f" {suggest_valid_name(channel, valid)}.")  # fmt: skip
     averaged = [r.name for r in files if r.logs[0].metadata.get("command", "held") != "held"]
     if averaged:
         notes.append(f"{', '.join(averaged)}: commands are means over each row, not held values;"
@@ -125,24 +136,20 @@ def unknown_columns(files: Sequence[RunFiles], machine: Machine) -> list[str]:
     return notes
 
 
-def still_channels(
-    runs: Mapping[str, Rows], channels: Sequence[str], noise: np.ndarray
-) -> list[str]:
+def note_runs_without_motion(runs: Mapping[str, RunRows], channels: Sequence[str], noise: np.ndarray) -> list[str]:
     """Return notes on runs in which no position changes."""
     notes = []
     places = [c for c, name in enumerate(channels) if not name.startswith("pressure")]
     for name, rows in runs.items():
         good = [c for c in places if np.isfinite(rows.reading[:, c]).any()]
         spans = [np.nanmax(rows.reading[:, c]) - np.nanmin(rows.reading[:, c]) for c in good]
-        if good and all(s <= _MOVES * np.nan_to_num(noise[c])
+        if good and all(s <= _MIN_MOTION_RATIO * np.nan_to_num(noise[c])
                         for s, c in zip(spans, good, strict=True)):  # fmt: skip
-            notes.append(
-                f"{name}: nothing moves; friction, inertia and delays are not identifiable."
-            )
+            notes.append(f"{name}: nothing moves; friction, inertia and delays are not identifiable.")
     return notes
 
 
-def blind_axes(machine: Machine, axes: Sequence[str], channels: Sequence[str]) -> list[str]:
+def note_unmeasured_axes(machine: Machine, axes: Sequence[str], channels: Sequence[str]) -> list[str]:
     """Return notes on axes without a position sensor."""
     return [
         f"neither {machine.position_kind(axis)} nor length of {axis} is measured; parameters that"
@@ -152,18 +159,18 @@ def blind_axes(machine: Machine, axes: Sequence[str], channels: Sequence[str]) -
     ]
 
 
-SHORTEST = 0.5  # [s] minimum run length: a stroke of a fast servo and the unknown initial state
-FEWEST = 50  # minimum number of rows of a run
-_SHORTEST_PIECE = 10.0  # [s] minimum length of a fit piece of a single run
-_PIECES = 3  # maximum number of fit pieces of a single run
-_SHARE = 0.15, 0.6  # fraction of a divided run that the held-out piece should have
-_FIT = 0.75  # fraction of a single run to fit
-_QUIET = 0.1  # minimum fraction of the command changes that the held-out part must contain
-_LEAST_FIT = 0.5  # minimum fraction of a single run to fit
-_HELD_OUT = ("test", "heldout", "validation")
+MIN_RUN_SECONDS = 0.5  # [s] minimum run length: a stroke of a fast servo and the unknown initial state
+MIN_RUN_ROWS = 50  # minimum number of rows of a run
+_MIN_PIECE_SECONDS = 10.0  # [s] minimum length of a fit piece of a single run
+_MAX_PIECES = 3  # maximum number of fit pieces of a single run
+_HELD_OUT_FRACTIONS = 0.15, 0.6  # fraction of a divided run that the held-out piece should have
+_FIT_FRACTION = 0.75  # fraction of a single run to fit
+_MIN_HELD_OUT_CHANGE = 0.1  # minimum fraction of the command changes that the held-out part must contain
+_MIN_FIT_FRACTION = 0.5  # minimum fraction of a single run to fit
+_HELD_OUT_PREFIXES = ("test", "heldout", "validation")
 
 
-class Part(NamedTuple):
+class RunPart(NamedTuple):
     """A run, a piece of a run, or a part of a piece that was split in time.
 
     Attributes:
@@ -174,33 +181,33 @@ class Part(NamedTuple):
 
     name: str
     piece: str
-    rows: Rows
+    rows: RunRows
 
 
 class Split(NamedTuple):
     """Runs to fit and the held-out run."""
 
-    fit: tuple[Part, ...]
-    heldout: Part
+    fit: tuple[RunPart, ...]
+    heldout: RunPart
 
 
-def seconds(rows: Rows) -> float:
+def run_duration(rows: RunRows) -> float:
     """Return the duration of a run [s]."""
     return len(rows.command) * rows.period
 
 
-def too_short(rows: Rows) -> str | None:
+def describe_short_run(rows: RunRows) -> str | None:
     """Return why a run is too short, as text for a message; None if it is long enough."""
-    if seconds(rows) >= SHORTEST - 1e-9 and len(rows.command) >= FEWEST:
+    if run_duration(rows) >= MIN_RUN_SECONDS - 1e-9 and len(rows.command) >= MIN_RUN_ROWS:
         return None
     return (
-        f"{seconds(rows):.3g} s long ({len(rows.command)} rows); {SHORTEST:g} s and {FEWEST} rows"
+        f"{run_duration(rows):.3g} s long ({len(rows.command)} rows); {MIN_RUN_SECONDS:g} s and {MIN_RUN_ROWS} rows"
         " are needed"
     )
 
 
-def split(
-    runs: Mapping[str, Rows], origin: Mapping[str, str], heldout: str | None
+def split_runs(
+    runs: Mapping[str, RunRows], origin: Mapping[str, str], heldout: str | None
 ) -> tuple[Split, tuple[str, ...]]:
     """Split runs into fit runs and one held-out run.
 
@@ -221,7 +228,7 @@ def split(
     """
     names = sorted(set(origin.values()))
     if heldout is not None and heldout not in names:
-        raise InputError(f"held-out run {heldout!r}", f"does not exist; {suggest(heldout, names)}")
+        raise InputError(f"held-out run {heldout!r}", f"does not exist; {suggest_valid_name(heldout, names)}")
     if len(runs) == 1:
         name, rows = next(iter(runs.items()))
         if heldout is not None:
@@ -230,12 +237,12 @@ def split(
                 "is the only run: omit the name to split it in time, or add a run to fit",
             )
         return _split_in_time(name, rows), ()
-    marked = [name for name in names if name.lower().startswith(_HELD_OUT)]
+    marked = [name for name in names if name.lower().startswith(_HELD_OUT_PREFIXES)]
     if marked == names:
         marked = []
     chosen = heldout or (marked or [_last_piece(runs) if len(names) == 1 else names[-1]])[0]
     pieces = [n for n in runs if chosen in (n, origin[n])]
-    judge = max(pieces, key=lambda n: seconds(runs[n]))
+    judge = max(pieces, key=lambda n: run_duration(runs[n]))
     aside = set(marked if heldout is None else ()) | {chosen}
     fit = [n for n in runs if n != judge and not {n, origin[n]} & aside]
     unused = [n for n in runs if n not in fit and n != judge]
@@ -246,22 +253,22 @@ def split(
     )  # fmt: skip
     if not fit:
         raise InputError(f"held-out run {chosen!r}", "leaves no run to fit: add one")
-    parts = tuple(Part(n, n, runs[n]) for n in fit)
-    return Split(parts, Part(judge, judge, runs[judge])), notes
+    parts = tuple(RunPart(n, n, runs[n]) for n in fit)
+    return Split(parts, RunPart(judge, judge, runs[judge])), notes
 
 
-def _last_piece(runs: Mapping[str, Rows]) -> str:
-    """Return the last piece of medium length of a run (fractions `_SHARE`), or the last piece."""
-    total = sum(map(seconds, runs.values()))
-    low, high = _SHARE
-    fair = [name for name, rows in runs.items() if low * total <= seconds(rows) <= high * total]
+def _last_piece(runs: Mapping[str, RunRows]) -> str:
+    """Return the last piece of medium length of a run (fractions `_HELD_OUT_FRACTIONS`), or the last piece."""
+    total = sum(map(run_duration, runs.values()))
+    low, high = _HELD_OUT_FRACTIONS
+    fair = [name for name, rows in runs.items() if low * total <= run_duration(rows) <= high * total]
     return (fair or list(runs))[-1]
 
 
-def _split_in_time(name: str, rows: Rows) -> Split:
-    total = seconds(rows)
+def _split_in_time(name: str, rows: RunRows) -> Split:
+    total = run_duration(rows)
     n = len(rows.command)
-    least = max(SHORTEST, FEWEST * rows.period) / (1.0 - _FIT)
+    least = max(MIN_RUN_SECONDS, MIN_RUN_ROWS * rows.period) / (1.0 - _FIT_FRACTION)
     if total < least - 1e-9:
         raise InputError(
             name,
@@ -269,16 +276,16 @@ def _split_in_time(name: str, rows: Rows) -> Split:
             f" {least:.3g} s: record a longer run or a second run",
         )
     last = _fit_rows(rows)
-    count = int(np.clip(last * rows.period // _SHORTEST_PIECE, 1, _PIECES))
+    count = int(np.clip(last * rows.period // _MIN_PIECE_SECONDS, 1, _MAX_PIECES))
     edges = np.linspace(0, last, count + 1).astype(int)
     fit = tuple(
-        Part(f"{name}_{i + 1}", name, cut(rows, a, b))
+        RunPart(f"{name}_{i + 1}", name, slice_rows(rows, a, b))
         for i, (a, b) in enumerate(zip(edges, edges[1:], strict=False))
     )
-    return Split(fit, Part(f"{name}_heldout", name, cut(rows, edges[-1], n)))
+    return Split(fit, RunPart(f"{name}_heldout", name, slice_rows(rows, edges[-1], n)))
 
 
-def _fit_rows(rows: Rows) -> int:
+def _fit_rows(rows: RunRows) -> int:
     """Return how many rows of a single run to fit: three quarters, or less if the rest is idle.
 
     A machine at rest cannot validate a model. If too few command changes are in the last quarter,
@@ -286,28 +293,28 @@ def _fit_rows(rows: Rows) -> int:
     """
     n = len(rows.command)
     passed = np.cumsum(np.abs(np.diff(rows.command, axis=0, prepend=rows.command[:1])).sum(axis=1))
-    if passed[-1] == 0.0 or passed[-1] - passed[round(_FIT * n) - 1] >= _QUIET * passed[-1]:
-        return round(_FIT * n)
-    return max(int(np.searchsorted(passed, _FIT * passed[-1])), round(_LEAST_FIT * n))
+    if passed[-1] == 0.0 or passed[-1] - passed[round(_FIT_FRACTION * n) - 1] >= _MIN_HELD_OUT_CHANGE * passed[-1]:
+        return round(_FIT_FRACTION * n)
+    return max(int(np.searchsorted(passed, _FIT_FRACTION * passed[-1])), round(_MIN_FIT_FRACTION * n))
 
 
-_SECRET = ("initial_state",)  # metadata that only a simulator can know
+_SIMULATOR_METADATA = ("initial_state",)  # metadata that only a simulator can know
 
 
-def measured_only(run: RunFiles) -> RunFiles:
+def remove_truth(run: RunFiles) -> RunFiles:
     """Return the run without truth columns and without metadata that only a simulator knows."""
     logs = [
         dataclasses.replace(
             log.without_truth(),
-            metadata={k: v for k, v in log.metadata.items() if k not in _SECRET},
+            metadata={k: v for k, v in log.metadata.items() if k not in _SIMULATOR_METADATA},
         )
         for log in run.logs
     ]
     return run._replace(logs=tuple(logs))
 
 
-def piece_log(
-    logs: Sequence[Log], name: str, rows: Rows, axes: Sequence[str], channels: Sequence[str],
+def make_piece_log(
+    logs: Sequence[Log], name: str, rows: RunRows, axes: Sequence[str], channels: Sequence[str],
     as_logged: bool = True,
 ) -> Log:  # fmt: skip
     """Return the log of a run or of a piece of it.
@@ -341,7 +348,7 @@ def piece_log(
     return Log(time, columns, units, first.metadata, name)
 
 
-_MOST_MISSING = 0.3  # maximum fraction of missing rows; beyond it the commands are too uncertain
+_MAX_MISSING_FRACTION = 0.3  # maximum fraction of missing rows; beyond it the commands are too uncertain
 
 
 @dataclass(frozen=True)
@@ -360,7 +367,7 @@ class RunData:
             of this record.
         valid: (n,) whether the model applies to the row, False in contact and in masked rows; None
             means all rows.
-        behind: (c,) number of logged readings averaged into one reading; None means one.
+        readings_per_mean: (c,) number of logged readings averaged into one reading; None means one.
     """
 
     name: str
@@ -371,9 +378,9 @@ class RunData:
     reading: np.ndarray
     log: Log
     valid: np.ndarray | None = None
-    behind: np.ndarray | None = None
+    readings_per_mean: np.ndarray | None = None
 
-    def part(self, first: int, last: int) -> "RunData":
+    def select_rows(self, first: int, last: int) -> "RunData":
         """Return the rows first .. last - 1; the log remains that of the whole run."""
         rows = slice(first, last)
         return replace(
@@ -410,7 +417,7 @@ class Dataset:
 
     def noise_of(self, run: RunData) -> np.ndarray:
         """Return the noise standard deviations (c,) of a run [SI]; averaging reduces them."""
-        return self.noise if run.behind is None else self.noise / np.sqrt(run.behind)
+        return self.noise if run.readings_per_mean is None else self.noise / np.sqrt(run.readings_per_mean)
 
 
 def load_dataset(
@@ -433,7 +440,7 @@ def load_dataset(
         machine: the model.
         sensors: name of the sensors of the machine, or `ideal` if their noise is unknown. The
             default is the metadata of the logs, or else the first sensors of the machine.
-        heldout: name of the run for validation; see `split`.
+        heldout: name of the run for validation; see `split_runs`.
         aliases: column name in the files -> channel, in addition to `log_columns` of the machine.
         force: accept logs whose metadata names another machine or tool.
         mask: file of masked intervals, see `rows.read_mask`. A log may also have a column `valid`
@@ -455,7 +462,7 @@ def make_dataset(
     machine: Machine,
     sensors: str | None = None,
     heldout: str | None = None,
-    masks: Sequence[Masked] = (),
+    masks: Sequence[MaskedInterval] = (),
 ) -> Dataset:
     """Prepare logs in memory for identification; their readings may be NaN where missing.
 
@@ -469,17 +476,17 @@ def make_dataset(
     Raises:
         InputError: see `load_dataset`.
     """
-    files = [measured_only(run) for run in files]
+    files = [remove_truth(run) for run in files]
     axes, channels = tuple(actuator_order(machine)), common_channels(files, machine)
     for run in files:
         check_commands(run, machine)
-    check_runs(masks, [run.name for run in files])
-    known, notes = stated_sensors(files, machine, sensors)
+    check_mask_runs(masks, [run.name for run in files])
+    known, notes = determine_sensors(files, machine, sensors)
     noise = np.array([channel_noise(machine, known, channel) for channel in channels])
-    runs, origin, said = _runs(files, machine, axes, channels, masks)
+    runs, origin, said = _collect_runs(files, machine, axes, channels, masks)
     mended, more = remove_faults(machine, known, axes, channels, noise, runs)
-    notes += unknown_columns(files, machine) + said + list(more)
-    notes += still_channels(mended, channels, noise)
+    notes += note_unknown_columns(files, machine) + said + list(more)
+    notes += note_runs_without_motion(mended, channels, noise)
     kept = np.array([any(np.isfinite(rows.reading[:, column]).any() for rows in mended.values())
                      for column in range(len(channels))])  # fmt: skip
     notes += [f"{c} has no usable reading in any run; it was removed."
@@ -490,23 +497,23 @@ def make_dataset(
             f" and the sensors. {' '.join(notes)}",
         )  # fmt: skip
     channels = tuple(c for c, keep in zip(channels, kept, strict=True) if keep)
-    notes += blind_axes(machine, axes, channels)
+    notes += note_unmeasured_axes(machine, axes, channels)
     whole, behind = {}, {}
     for name, rows in mended.items():
         # C-contiguous: compiled filters would be recompiled for another memory layout
         rows = rows._replace(reading=np.ascontiguousarray(rows.reading[:, kept]))
-        whole[name], behind[name], count = averaged(rows)
+        whole[name], behind[name], count = average_rows(rows)
         if count > 1:
             notes.append(f"{name}: is logged at {1 / rows.period:.6g} Hz; {count} rows each were"
                          f" averaged, giving {1 / whole[name].period:.6g} Hz.")  # fmt: skip
-    parts, left = split(whole, origin, heldout)
+    parts, left = split_runs(whole, origin, heldout)
     logs = {run.name: run.logs for run in files}
     made = {}
     for part in (*parts.fit, parts.heldout):
         rows = part.rows
         means = behind[part.piece] if (behind[part.piece] > 1.0).any() else None
         as_logged = means is None and bool(rows.valid.all())
-        log = piece_log(logs[origin[part.piece]], part.name, rows, axes, channels, as_logged)
+        log = make_piece_log(logs[origin[part.piece]], part.name, rows, axes, channels, as_logged)
         made[part.name] = RunData(
             part.name, rows.start, rows.period, rows.command, rows.known & rows.valid,
             rows.reading, log, rows.valid, means,
@@ -517,26 +524,26 @@ def make_dataset(
                    next((n for n, s in machine.sensors.items() if s is known), None))  # fmt: skip
 
 
-def _runs(
+def _collect_runs(
     files: Sequence[RunFiles], machine: Machine, axes: Sequence[str], channels: Sequence[str],
-    masks: Sequence[Masked],
-) -> tuple[dict[str, Rows], dict[str, str], list[str]]:  # fmt: skip
+    masks: Sequence[MaskedInterval],
+) -> tuple[dict[str, RunRows], dict[str, str], list[str]]:  # fmt: skip
     """Return runs and pieces by name, the logged run of each, and notes."""
     runs, origin, notes = {}, {}, []
     for run in files:
-        pieces, said = run_rows(run, axes, channels, masks)
+        pieces, said = merge_run(run, axes, channels, masks)
         notes += said
         where = ", ".join(log.source for log in run.logs)
         for number, rows in enumerate(pieces, start=1):
             name = run.name if len(pieces) == 1 else f"{run.name}_part{number}"
-            if (short := too_short(rows)) and len(pieces) == 1:
+            if (short := describe_short_run(rows)) and len(pieces) == 1:
                 raise InputError(where, f"is {short}: record a longer run, or remove this one")
             if short:
                 notes.append(f"{name} is only {short}; it was removed.")
-            elif np.mean(~rows.known) > _MOST_MISSING:
+            elif np.mean(~rows.known) > _MAX_MISSING_FRACTION:
                 raise InputError(
                     where, f"{100 * np.mean(~rows.known):.0f} % of the rows are missing, and with"
-                    f" them the commands; at most {100 * _MOST_MISSING:.0f} % are allowed: log"
+                    f" them the commands; at most {100 * _MAX_MISSING_FRACTION:.0f} % are allowed: log"
                     " every row",
                 )  # fmt: skip
             else:
@@ -545,19 +552,19 @@ def _runs(
                 runs[name], origin[name] = rows, run.name
     if not runs:
         message = (
-            f"no run has {SHORTEST:g} s and {FEWEST} rows without a gap or a masked interval:"
+            f"no run has {MIN_RUN_SECONDS:g} s and {MIN_RUN_ROWS} rows without a gap or a masked interval:"
             " record longer runs"
         )
         raise InputError("the data", message)
     return runs, origin, notes
 
 
-_RATE, _PER_CYCLE = 100.0, 6.0  # minimum rate [Hz]; rows per cycle of the fastest valve
-_SHORT = 2.0  # s, shorter runs are not downsampled
-MOST_SECONDS = 150.0  # s, maximum total duration of the fit runs: about four typical runs
+_MIN_RATE, _ROWS_PER_CYCLE = 100.0, 6.0  # minimum rate [Hz]; rows per cycle of the fastest valve
+_MIN_DOWNSAMPLED_SECONDS = 2.0  # s, shorter runs are not downsampled
+MAX_FIT_SECONDS = 150.0  # s, maximum total duration of the fit runs: about four typical runs
 
 
-def busiest(data: Dataset, most: float = MOST_SECONDS) -> Dataset:
+def select_exciting_segments(data: Dataset, max_seconds: float = MAX_FIT_SECONDS) -> Dataset:
     """Limit the total duration of the fit runs to their most exciting segments.
 
     Each run is cut by the same factor to the segment with the largest command changes, and a note
@@ -565,43 +572,41 @@ def busiest(data: Dataset, most: float = MOST_SECONDS) -> Dataset:
 
     Args:
         data: the dataset.
-        most: maximum total duration of the fit runs [s].
+        max_seconds: maximum total duration of the fit runs [s].
 
     Returns:
         The shortened dataset, or the given one if it is short enough.
     """
     total = sum(len(run.command) * run.period for run in data.fit)
-    if total <= most:
+    if total <= max_seconds:
         return data
     runs, notes = [], []
     for run in data.fit:
-        rows = round(len(run.command) * most / total)
-        cut = _stretch(run, _busiest_row(data, run, rows), rows)
+        rows = round(len(run.command) * max_seconds / total)
+        cut = _segment(run, _find_exciting_row(data, run, rows), rows)
         runs.append(cut)
         end = cut.start + rows * run.period
-        notes.append(
-            f"{run.name} is long: only the interval from {cut.start:.0f} to {end:.0f} s is fitted."
-        )
+        notes.append(f"{run.name} is long: only the interval from {cut.start:.0f} to {end:.0f} s is fitted.")
     return dataclasses.replace(data, fit=tuple(runs), notes=(*data.notes, *notes))
 
 
-def thinned(data: Dataset) -> Dataset:
+def downsample(data: Dataset) -> Dataset:
     """Downsample a dataset to a rate that resolves its valves; each row is a mean of several.
 
     Higher rates add little information, because effects of mass, friction and leakage on the
     readings are slower than the valves.
     """
     bandwidths = [a.valve.bandwidth / (2.0 * np.pi) for a in data.machine.axes.values() if a.valve]
-    rate = max(_RATE, _PER_CYCLE * max(bandwidths, default=0.0))
+    rate = max(_MIN_RATE, _ROWS_PER_CYCLE * max(bandwidths, default=0.0))
 
     def thin(run: RunData) -> RunData:
-        if run.period * rate > 0.75 or len(run.command) * run.period < _SHORT:
+        if run.period * rate > 0.75 or len(run.command) * run.period < _MIN_DOWNSAMPLED_SECONDS:
             return run
         valid = np.ones(len(run.command), bool) if run.valid is None else run.valid
-        rows, behind, _ = averaged(
-            Rows(run.start, run.period, run.command, run.command_known, run.reading, valid), rate
+        rows, behind, _ = average_rows(
+            RunRows(run.start, run.period, run.command, run.command_known, run.reading, valid), rate
         )
-        behind = behind * (1.0 if run.behind is None else run.behind)
+        behind = behind * (1.0 if run.readings_per_mean is None else run.readings_per_mean)
         return dataclasses.replace(
             run, period=rows.period, command=rows.command, command_known=rows.known,
             reading=rows.reading, valid=rows.valid, behind=behind,
@@ -611,7 +616,7 @@ def thinned(data: Dataset) -> Dataset:
     return dataclasses.replace(data, fit=fit, heldout=thin(data.heldout))
 
 
-def busiest_rows(run: RunData, rows: int) -> slice:
+def find_exciting_segment(run: RunData, rows: int) -> slice:
     """Return the segment of `rows` rows with the largest command changes, or the whole run."""
     if rows >= len(run.command):
         return slice(0, len(run.command))
@@ -622,12 +627,12 @@ def busiest_rows(run: RunData, rows: int) -> slice:
     return slice(first, first + rows)
 
 
-def _busiest_row(data: Dataset, run: RunData, rows: int) -> int:
+def _find_exciting_row(data: Dataset, run: RunData, rows: int) -> int:
     spread = np.std(np.concatenate([r.command for r in data.fit]), axis=0)
     jumps = np.abs(np.diff(run.command, axis=0)) / np.where(spread > 0.0, spread, 1.0)
     passed = np.concatenate([[0.0], np.cumsum(jumps.sum(axis=1))])
     return int(np.argmax(passed[rows - 1 :] - passed[: len(passed) - rows + 1]))
 
 
-def _stretch(run: RunData, first: int, rows: int) -> RunData:
-    return run.part(first, first + rows)
+def _segment(run: RunData, first: int, rows: int) -> RunData:
+    return run.select_rows(first, first + rows)

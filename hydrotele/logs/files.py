@@ -14,7 +14,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.logs.log import CommandRange, Log, load_log
 from hydrotele.machine.machine import Machine
 
-MEASURED = "measured"  # stem of the measured log in a run folder
+MEASURED_STEM = "measured"  # stem of the measured log in a run folder
 _KINDS = (".parquet", ".csv")
 
 
@@ -43,7 +43,7 @@ def read_runs(
         InputError: a file is invalid or from another machine, or a run exists twice.
     """
     groups: dict[str, list[Log]] = {}
-    named = [pair for path in paths for pair in _files(Path(path))]
+    named = [pair for path in paths for pair in _find_logs(Path(path))]
     if not named:
         raise InputError("the data", "no path was given: give log files or a folder with logs")
     if twice := {str(f) for i, (_, f) in enumerate(named) if f in [g for _, g in named[:i]]}:
@@ -62,11 +62,11 @@ def read_runs(
     runs = []
     for stem, found in groups.items():
         names = [name for name, _ in logs if name.partition(".")[0] == stem]
-        if len(found) == 1 or _apart(found):
+        if len(found) == 1 or _have_distinct_channels(found):
             runs.append((stem if len(found) > 1 else names[0], tuple(found)))
         else:
             runs += [(name, (log,)) for name, log in zip(names, found, strict=True)]
-    runs = _joined_by_metadata(runs)
+    runs = _join_runs_by_metadata(runs)
     for i, (name, found) in enumerate(runs):
         for other, others in runs[:i]:
             if other == name:
@@ -84,50 +84,50 @@ def command_ranges(machine: Machine) -> dict[str, CommandRange]:
     }
 
 
-def _files(path: Path) -> list[tuple[str, Path]]:
+def _find_logs(path: Path) -> list[tuple[str, Path]]:
     """Return (run name, file) of every log at a path."""
     if not path.exists():
         raise InputError(path, "does not exist: give log files or a folder with logs")
     if path.is_file():
-        return [(path.stem if path.stem != MEASURED else path.resolve().parent.name, path)]
+        return [(path.stem if path.stem != MEASURED_STEM else path.resolve().parent.name, path)]
     if not path.is_dir():
         raise InputError(path, "is neither a file nor a folder: give log files or a folder")
     seen = sorted(p for p in path.iterdir() if not p.name.startswith("."))
-    if record := _record(path):
+    if record := _find_measured_log(path):
         return [(path.resolve().name, record)]
     files = [(p.stem, p) for p in seen if p.is_file() and p.suffix.lower() in _KINDS]
     if not files:
-        files = [(p.name, f) for p in seen if p.is_dir() and (f := _record(p))]
+        files = [(p.name, f) for p in seen if p.is_dir() and (f := _find_measured_log(p))]
     if not files:
         raise InputError(path, "the folder contains no log: add .parquet or .csv files")
     return files
 
 
-def _record(folder: Path) -> Path | None:
+def _find_measured_log(folder: Path) -> Path | None:
     """Return the measured log of a run folder, or None for other folders."""
-    kinds = (folder / f"{MEASURED}{kind}" for kind in _KINDS)
+    kinds = (folder / f"{MEASURED_STEM}{kind}" for kind in _KINDS)
     return next((file for file in kinds if file.is_file()), None)
 
 
-def _sensors(log: Log) -> set[str]:
+def _sensor_channels(log: Log) -> set[str]:
     others = ("command.", "reference.", "valid")
     return {name for name in log.columns if not name.startswith(others)}
 
 
-def _apart(logs: Sequence[Log]) -> bool:
+def _have_distinct_channels(logs: Sequence[Log]) -> bool:
     """Return whether no two logs have the same sensor channel."""
-    channels = [channel for log in logs for channel in _sensors(log)]
+    channels = [channel for log in logs for channel in _sensor_channels(log)]
     return len(channels) == len(set(channels))
 
 
-def _joined_by_metadata(runs: list[tuple[str, tuple[Log, ...]]]) -> list:
+def _join_runs_by_metadata(runs: list[tuple[str, tuple[Log, ...]]]) -> list:
     groups: dict[str, list[tuple[str, tuple[Log, ...]]]] = {}
     for name, logs in runs:
         groups.setdefault(logs[0].metadata.get("run", name), []).append((name, logs))
     joined = []
     for run, members in groups.items():
         logs = tuple(log for _, found in members for log in found)
-        joined += [(run, logs)] if len(members) > 1 and _apart(logs) else members
+        joined += [(run, logs)] if len(members) > 1 and _have_distinct_channels(logs) else members
     return joined
 
 

@@ -19,15 +19,15 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.core.errors import InputError
-from hydrotele.core.files import check_limit, limit, open_regular
-from hydrotele.core.output import replacing
+from hydrotele.core.files import check_limit, get_limit, open_regular
+from hydrotele.core.output import atomic_file
 from hydrotele.core.units import canonical_unit, to_si
 from hydrotele.machine import signals
-from hydrotele.machine.signals import allowed_units, magnitude_limits, parse_channel, usual_unit
+from hydrotele.machine.signals import allowed_units, default_unit, magnitude_limits, parse_channel
 
-_PLAY = 0.02  # fraction of half a command range that converter readings may exceed it
-_LONGEST_STEP = 1.0  # [s] longer than any sample period of a hydraulic machine
-_NOTHING = 1e-2  # [Pa] maxima below it mean a dead sensor, not a wrong unit
+_MAX_RANGE_EXCESS = 0.02  # fraction of half a command range that converter readings may exceed it
+_MAX_STEP = 1.0  # [s] longer than any sample period of a hydraulic machine
+_DEAD_SENSOR_PRESSURE = 1e-2  # [Pa] maxima below it mean a dead sensor, not a wrong unit
 
 
 class CommandRange(NamedTuple):
@@ -57,12 +57,12 @@ class Table(NamedTuple):
     metadata: Mapping[str, str]
     lines: np.ndarray | None = None
 
-    def where(self, column: str, row: int | None = None) -> str:
+    def location(self, column: str, row: int | None = None) -> str:
         """Return file, column, row (0 is the first row of data) and line as one string."""
-        return place(self.source, column, row, self.lines)
+        return format_location(self.source, column, row, self.lines)
 
 
-def place(source: str, column: str, row: int | None, lines: Sequence | np.ndarray | None) -> str:
+def format_location(source: str, column: str, row: int | None, lines: Sequence | np.ndarray | None) -> str:
     """Return file, column, row (0 is the first row of data) and line as one string."""
     text = f"{source}, column {column!r}"
     if row is None:
@@ -70,7 +70,7 @@ def place(source: str, column: str, row: int | None, lines: Sequence | np.ndarra
     return f"{text}, row {row}" + ("" if lines is None else f" (line {lines[row]})")
 
 
-def with_valid(table: Table) -> Table:
+def mask_to_valid(table: Table) -> Table:
     """Replace the column `mask` (1 for unusable rows) by the column `valid` (1 for usable rows)."""
     values = [1.0 - column if name == "mask" else column
               for name, column in zip(table.names, table.values, strict=True)]  # fmt: skip
@@ -78,7 +78,7 @@ def with_valid(table: Table) -> Table:
     return table._replace(names=names, values=values)
 
 
-def in_range(table: Table, ranges: Mapping[str, CommandRange]) -> Table:
+def normalise_commands(table: Table, ranges: Mapping[str, CommandRange]) -> Table:
     """Convert commands in volts, mA or counts to fractions in [-1, 1].
 
     Columns in percent or as a fraction are left to the conversion to SI. Readings up to 2 % beyond
@@ -103,17 +103,17 @@ def in_range(table: Table, ranges: Mapping[str, CommandRange]) -> Table:
                 continue
             if si != own_si:
                 raise InputError(
-                    table.where(name),
+                    table.location(name),
                     f"is in {stated!r}, the machine's commands are in {own!r}: correct"
                     f" axes.{axis}.command_unit in the machine file, or convert the column",
                 )
             column = column * (factor / own_factor)
         middle, half = 0.5 * (known.low + known.high), 0.5 * (known.high - known.low)
         share = (column - middle) / half
-        if len(beyond := np.flatnonzero(np.abs(share) > 1.0 + _PLAY)):
+        if len(beyond := np.flatnonzero(np.abs(share) > 1.0 + _MAX_RANGE_EXCESS)):
             row = int(beyond[0])
             raise InputError(
-                table.where(name, row),
+                table.location(name, row),
                 f"is {column[row]:g} {own}, beyond the machine's command_range {known.low:g} .."
                 f" {known.high:g} {own}: correct axes.{axis}.command_range in the machine file, or"
                 " the column",
@@ -122,23 +122,21 @@ def in_range(table: Table, ranges: Mapping[str, CommandRange]) -> Table:
     return table._replace(values=values, units=units)
 
 
-def checked(
-    table: Table, required: Sequence[str], maximum_dropped: float, missing: bool = False
-) -> Table:
+def check_table(table: Table, required: Sequence[str], maximum_dropped: float, allow_nan: bool = False) -> Table:
     """Check a table and return it in SI units; columns without a unit get the usual one.
 
     Args:
         table: content of a file.
         required: channels that must be present.
         maximum_dropped: fraction of the samples that may be missing [1].
-        missing: accept NaN in every column except time.
+        allow_nan: accept NaN in every column except time.
 
     Raises:
         InputError: the table is invalid; the message gives column, row and remedy.
     """
     _check_names(table, required)
-    si = _in_si(table)
-    check_values(si, maximum_dropped, missing)
+    si = _to_si_units(table)
+    check_values(si, maximum_dropped, allow_nan)
     for name, values, unit, stated in zip(si.names, si.values, si.units, table.units, strict=True):
         _check_magnitude(si, name, values, str(unit), stated is not None)
     return si
@@ -165,42 +163,40 @@ def _check_names(table: Table, required: Sequence[str]) -> None:
             parse_channel(name)
         except ValueError as error:
             raise InputError(
-                table.where(name),
+                table.location(name),
                 f"{error}. Rename it, give it an alias or remove it"
                 " (log_columns in the machine file defines aliases; the alias none skips a column)",
             ) from None
     for name, count in Counter(table.names).items():
         if count > 1:
-            raise InputError(table.where(name), f"occurs {count} times: keep one")
+            raise InputError(table.location(name), f"occurs {count} times: keep one")
     missing = [name for name in ("time", *required) if name not in table.names]
     if missing:
-        raise InputError(table.source, lacks(missing, table.names))
+        raise InputError(table.source, missing_channels_message(missing, table.names))
 
 
-def lacks(names: Sequence[str], present: Sequence[str] | Mapping[str, object]) -> str:
+def missing_channels_message(names: Sequence[str], present: Sequence[str] | Mapping[str, object]) -> str:
     """Return the message for missing channels, with the channels that are present."""
     columns = "columns" if len(names) > 1 else "column"
     return f"needs the {columns} {', '.join(names)}; it has {', '.join(present) or 'none'}"
 
 
-def _in_si(table: Table) -> Table:
+def _to_si_units(table: Table) -> Table:
     """Return the table in SI units; CSV columns are scaled, other units in Parquet are refused."""
     columns, units = [], []
     for name, values, stated in zip(table.names, table.values, table.units, strict=True):
         if stated is None:
-            unit, factor = usual_unit(name, table.names), 1.0
+            unit, factor = default_unit(name, table.names), 1.0
         else:
             unit, factor = to_si(stated)
         allowed = allowed_units(name)
         says = f"has the unit {stated!r}; a log needs {' or '.join(allowed)}"
         if unit not in allowed:
             remedy = "correct the unit, or rename the column to a channel with this unit"
-            raise InputError(
-                table.where(name), f"{says}, to which it cannot be converted: {remedy}"
-            )
+            raise InputError(table.location(name), f"{says}, to which it cannot be converted: {remedy}")
         if factor != 1.0 and table.lines is None:
             remedy = f"multiply by {factor:.10g} and set the unit to {unit}"
-            raise InputError(table.where(name), f"{says}: {remedy}")
+            raise InputError(table.location(name), f"{says}: {remedy}")
         columns.append(values if factor == 1.0 else values * factor)
         units.append(unit)
     return table._replace(values=columns, units=units)
@@ -212,7 +208,7 @@ def _check_finite(table: Table, missing: bool) -> None:
         bad = np.flatnonzero(np.isinf(values) if allowed else ~np.isfinite(values))
         if len(bad):
             remedy = "remove the row or enter a value"
-            raise InputError(table.where(name, int(bad[0])), f"is {values[bad[0]]}: {remedy}")
+            raise InputError(table.location(name, int(bad[0])), f"is {values[bad[0]]}: {remedy}")
 
 
 def _check_time(table: Table, maximum_dropped: float) -> None:
@@ -224,14 +220,15 @@ def _check_time(table: Table, maximum_dropped: float) -> None:
         what = "repeats" if time[row] == before else "goes back"
         remedy = "sort the rows by time and keep one row per time"
         raise InputError(
-            table.where("time", row), f"{what} from {before:.10g} to {time[row]:.10g} s: {remedy}"
+            table.location("time", row),
+            f"{what} from {before:.10g} to {time[row]:.10g} s: {remedy}",
         )
-    lost = lost_samples(time)
+    lost = count_missing_samples(time)
     fraction = lost.sum() / (lost.sum() + len(time))
     if fraction > maximum_dropped:
         row = int(np.flatnonzero(lost)[0]) + 1
         raise InputError(
-            table.where("time", row),
+            table.location("time", row),
             f"the step is {step[row - 1]:.4g} s, the median step {np.median(step):.4g} s: "
             f"{100 * fraction:.2g} % of the samples are missing or have irregular times, "
             f"{100 * maximum_dropped:.2g} % are allowed. Resample the run at a fixed rate, split "
@@ -239,22 +236,20 @@ def _check_time(table: Table, maximum_dropped: float) -> None:
         )
 
 
-def lost_samples(time: np.ndarray) -> np.ndarray:
+def count_missing_samples(time: np.ndarray) -> np.ndarray:
     """Return the number of missing samples per step (n-1,); 1 for steps below half the median."""
     with np.errstate(all="ignore"):
         step = np.diff(time)
         deviation = np.abs(step / np.median(step) - 1.0) if len(step) else step
-    return np.where(
-        deviation <= 0.5, 0.0, np.clip(np.nan_to_num(np.rint(deviation), nan=1.0), 1.0, 1e12)
-    )
+    return np.where(deviation <= 0.5, 0.0, np.clip(np.nan_to_num(np.rint(deviation), nan=1.0), 1.0, 1e12))
 
 
 def _check_magnitude(table: Table, name: str, values: np.ndarray, unit: str, stated: bool) -> None:
     """Check that magnitudes are plausible for the unit; limits are wider for a stated unit."""
     if name == "time":
-        if (step := float(np.median(np.diff(values)))) >= _LONGEST_STEP:
+        if (step := float(np.median(np.diff(values)))) >= _MAX_STEP:
             remedy = "looks like milliseconds or less, write seconds"
-            raise InputError(table.where(name, 1), f"increases by {step:g} per row: {remedy}")
+            raise InputError(table.location(name, 1), f"increases by {step:g} per row: {remedy}")
         return
     size = np.abs(values[np.isfinite(values)])
     if not len(size):
@@ -263,7 +258,7 @@ def _check_magnitude(table: Table, name: str, values: np.ndarray, unit: str, sta
         if not np.isnan(values[bad]).all():
             row = int(bad[~np.isnan(values[bad])][0])
             remedy = "write 1 for usable rows and 0 for others"
-            raise InputError(table.where(name, row), f"is {values[row]:g}: {remedy}")
+            raise InputError(table.location(name, row), f"is {values[row]:g}: {remedy}")
     limits = magnitude_limits(name, unit, stated=stated)
     target = unit if stated else f"{unit} and state the unit"
     if unit == "1":
@@ -274,23 +269,23 @@ def _check_magnitude(table: Table, name: str, values: np.ndarray, unit: str, sta
         )
     remedy = f"looks like {limits.looks_like}, write {target}"
     size = np.nan_to_num(np.abs(values))
-    if len(high := np.flatnonzero(size > limits.largest)):
+    if len(high := np.flatnonzero(size > limits.max_magnitude)):
         row = int(high[0])
-        raise InputError(table.where(name, row), f"is {values[row]:g}: {remedy}")
-    if _NOTHING < size.max() < limits.smallest:
+        raise InputError(table.location(name, row), f"is {values[row]:g}: {remedy}")
+    if _DEAD_SENSOR_PRESSURE < size.max() < limits.min_magnitude:
         row = int(np.argmax(size))
-        raise InputError(table.where(name, row), f"never exceeds {size[row]:g}: {remedy}")
+        raise InputError(table.location(name, row), f"never exceeds {size[row]:g}: {remedy}")
 
 
-_LONGEST = 1_000_000  # characters per line
-_HEADER = re.compile(r"(?P<name>.*?)\s*(\[(?P<unit>[^\[\]]*)\])?", re.DOTALL)
+_MAX_LINE_LENGTH = 1_000_000  # characters per line
+_HEADER_CELL = re.compile(r"(?P<name>.*?)\s*(\[(?P<unit>[^\[\]]*)\])?", re.DOTALL)
 
 
 def read_csv(path: Path, missing: bool = False) -> Table:
     """Read a CSV log: a header of `name` or `name [unit]`, then one line of numbers per row.
 
     The separator is the most frequent of comma, semicolon and tab in the header. Decimals have a
-    point. Lines that start with `#` are comments; `# key: value` is read as metadata. `checked`
+    point. Lines that start with `#` are comments; `# key: value` is read as metadata. `check_table`
     converts known units to SI.
 
     Args:
@@ -301,12 +296,12 @@ def read_csv(path: Path, missing: bool = False) -> Table:
         InputError: the file is not UTF-8 text, is empty, has no header, has a row of the wrong
             length, or contains a cell that is not a number.
     """
-    read = _Reading(str(path), missing)
+    read = _CsvReader(str(path), missing)
     with open_regular(path) as file:
         text = io.TextIOWrapper(file, encoding="utf-8-sig")  # read by lines: logs may be large
         try:
-            for number, line in enumerate(iter(lambda: text.readline(_LONGEST), ""), 1):
-                read.take(number, line)
+            for number, line in enumerate(iter(lambda: text.readline(_MAX_LINE_LENGTH), ""), 1):
+                read.parse_line(number, line)
         except UnicodeDecodeError as error:
             reason = f"is not text in UTF-8 ({error.reason}): save it as CSV UTF-8"
             raise InputError(path, reason) from error
@@ -318,21 +313,21 @@ def read_csv(path: Path, missing: bool = False) -> Table:
     return Table(read.source, read.names, columns, read.units, read.metadata, lines)
 
 
-class _Reading:
+class _CsvReader:
     """Names, units, metadata and values read from the lines of a CSV file so far."""
 
     def __init__(self, source: str, missing: bool) -> None:
-        self.source, self.missing, self.most = source, missing, limit("LOG_VALUES")
+        self.source, self.missing, self.most = source, missing, get_limit("LOG_VALUES")
         self.names: list[str] = []
         self.units: list[str | None] = []
         self.metadata: dict[str, str] = {}
         self.separator = ","
         self.values, self.lines = array("d"), array("q")
 
-    def take(self, number: int, line: str) -> None:
+    def parse_line(self, number: int, line: str) -> None:
         """Parse the next line of the file, including its line break."""
-        if len(line) == _LONGEST:
-            message = f"is longer than {_LONGEST} characters"
+        if len(line) == _MAX_LINE_LENGTH:
+            message = f"is longer than {_MAX_LINE_LENGTH} characters"
             raise InputError(f"{self.source}, line {number}", message)
         line = line.rstrip("\n")
         if line.startswith("#"):
@@ -342,7 +337,7 @@ class _Reading:
         elif not line.strip():
             return
         elif not self.names:
-            self._take_header(line)
+            self._parse_header_line(line)
         else:
             row = len(self.lines)
             self.lines.append(number)
@@ -352,7 +347,7 @@ class _Reading:
             if len(self.values) > self.most:
                 check_limit(self.source, "LOG_VALUES", len(self.values))
 
-    def _take_header(self, line: str) -> None:
+    def _parse_header_line(self, line: str) -> None:
         self.separator = max(",;\t", key=line.count)
         self.names, self.units = _parse_header(line, self.separator)
         if any(map(_is_number, self.names)):
@@ -364,7 +359,7 @@ class _Reading:
 def _parse_header(header: str, separator: str) -> tuple[list[str], list[str | None]]:
     names, units = [], []
     for cell in header.split(separator):
-        match = _HEADER.fullmatch(cell.strip().strip('"').strip())
+        match = _HEADER_CELL.fullmatch(cell.strip().strip('"').strip())
         names.append(match["name"] if match else cell)
         units.append((match["unit"] or None) if match else None)
     return names, units
@@ -393,19 +388,14 @@ def _parse_row(
     if len(cells) != len(names):
         column = names[min(len(cells), len(names)) - 1]
         raise InputError(
-            place(source, column, number, lines),
+            format_location(source, column, number, lines),
             f"the row has {len(cells)} cells, the header has {len(names)}: the line is incomplete "
             f"or a separator ({separator!r}) is missing or superfluous",
         )
-    return [
-        _number(source, name, cell, number, lines, missing)
-        for name, cell in zip(names, cells, strict=True)
-    ]
+    return [_parse_number(source, name, cell, number, lines, missing) for name, cell in zip(names, cells, strict=True)]
 
 
-def _number(
-    source: str, name: str, cell: str, row: int, lines: Sequence[int], missing: bool
-) -> float:
+def _parse_number(source: str, name: str, cell: str, row: int, lines: Sequence[int], missing: bool) -> float:
     """Return the number in a cell, which may have quotation marks."""
     text = cell.strip().strip('"').strip()
     if missing and not text:
@@ -415,14 +405,14 @@ def _number(
             return float(text)
     except ValueError:
         pass
-    where = place(source, name, row, lines)
+    where = format_location(source, name, row, lines)
     if not text:
         raise InputError(where, "empty cell: remove the row or enter a value; NaN is not allowed")
     remedy = "write decimals with a point" if "," in text else "write a number or remove the column"
     raise InputError(where, f"{text[:40]!r} is not a number: {remedy}")
 
 
-LEFT_OUT = "none"  # alias of columns to skip
+SKIP_COLUMN = "none"  # alias of columns to skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -450,8 +440,8 @@ class Log:
 
     def __post_init__(self) -> None:
         """Copy the arrays, make them read-only and check the columns."""
-        object.__setattr__(self, "time", _frozen(self.time))
-        object.__setattr__(self, "columns", {k: _frozen(v) for k, v in self.columns.items()})
+        object.__setattr__(self, "time", _read_only_copy(self.time))
+        object.__setattr__(self, "columns", {k: _read_only_copy(v) for k, v in self.columns.items()})
         object.__setattr__(self, "units", dict(self.units))
         object.__setattr__(self, "metadata", dict(self.metadata))
         if self.time.ndim != 1 or self.columns.keys() != self.units.keys():
@@ -460,9 +450,7 @@ class Log:
             allowed = signals.allowed_units(name)
             if name == "time" or values.shape != self.time.shape or self.units[name] not in allowed:
                 expected = f"{self.time.shape} in {' or '.join(allowed)}"
-                raise ValueError(
-                    f"{name}: expected {expected}, got {values.shape} in {self.units[name]!r}"
-                )
+                raise ValueError(f"{name}: expected {expected}, got {values.shape} in {self.units[name]!r}")
         if not all(isinstance(text, str) for item in self.metadata.items() for text in item):
             raise TypeError("metadata must be strings: write structures with json.dumps")
 
@@ -481,7 +469,7 @@ class Log:
             InputError: the log does not have the channel; the message lists its channels.
         """
         if name not in self:
-            raise InputError(self.source, lacks([name], self.columns))
+            raise InputError(self.source, missing_channels_message([name], self.columns))
         return self.time if name == "time" else self.columns[name]
 
     @property
@@ -503,14 +491,12 @@ class Log:
     @property
     def gaps(self) -> np.ndarray:
         """Rows (k,) before which samples are missing, or whose time is off by half a step."""
-        return np.flatnonzero(lost_samples(self.time)) + 1
+        return np.flatnonzero(count_missing_samples(self.time)) + 1
 
     def without_truth(self) -> "Log":
         """Return the log with measured channels only, as identification code may use them."""
         kept = [name for name in self.columns if not signals.parse_channel(name).truth]
-        return replace(
-            self, columns={k: self.columns[k] for k in kept}, units={k: self.units[k] for k in kept}
-        )
+        return replace(self, columns={k: self.columns[k] for k in kept}, units={k: self.units[k] for k in kept})
 
 
 def load_log(
@@ -545,13 +531,13 @@ def load_log(
     path = Path(path)
     table = read_table(path, missing)
     if "hydrotele" not in table.metadata:
-        table = with_valid(_renamed(table, aliases or {}))
-        table = in_range(table, commands or {})
+        table = mask_to_valid(_apply_aliases(table, aliases or {}))
+        table = normalise_commands(table, commands or {})
     names = table.names
     rows, needed = len(table.values[0]) if names else 0, max(minimum_rows, 2)
     if rows < needed:
         raise InputError(path, f"the run is too short: {rows} rows, {needed} are needed")
-    table = checked(table, required, maximum_dropped, missing)
+    table = check_table(table, required, maximum_dropped, missing)
     columns = dict(zip(names, table.values, strict=True))
     units = dict(zip(names, map(str, table.units), strict=True))
     time = columns.pop("time")
@@ -559,7 +545,7 @@ def load_log(
     return Log(time, columns, units, table.metadata, str(path))
 
 
-def _renamed(table: Table, aliases: Mapping[str, str]) -> Table:
+def _apply_aliases(table: Table, aliases: Mapping[str, str]) -> Table:
     for product, channel in aliases.items():
         factors = product.split(" * ")
         if len(factors) == 2 and set(factors) <= set(table.names):
@@ -569,7 +555,7 @@ def _renamed(table: Table, aliases: Mapping[str, str]) -> Table:
                 units=[*table.units, "1"],
             )  # fmt: skip
     names = [aliases.get(name, name) for name in table.names]
-    kept = [place for place, name in enumerate(names) if name != LEFT_OUT]
+    kept = [place for place, name in enumerate(names) if name != SKIP_COLUMN]
     signs = [-1.0 if names[place].startswith("-") else 1.0 for place in kept]
     return table._replace(
         names=[names[place].removeprefix("-") for place in kept],
@@ -600,10 +586,7 @@ def load_logs(
         seen = [p for p in path.iterdir() if not p.name.startswith(".")]
         files = sorted(p for p in seen if p.suffix.lower() in (".parquet", ".csv"))
         files = files or sorted(
-            file
-            for p in seen
-            for file in p.glob("measured.*")
-            if file.suffix in (".parquet", ".csv")
+            file for p in seen for file in p.glob("measured.*") if file.suffix in (".parquet", ".csv")
         )
     if not files:
         raise InputError(path, "the folder contains no log: add .parquet or .csv files")
@@ -635,7 +618,7 @@ def save_log(log: Log, path: str | os.PathLike) -> None:
     table = Table(str(path), names, values, ["s", *log.units.values()], log.metadata)
     check_values(table, maximum_dropped=np.inf)
     content = _parquet_bytes(table)
-    with replacing(path, ".parquet") as part, open(part, "xb") as file:
+    with atomic_file(path, ".parquet") as part, open(part, "xb") as file:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
@@ -700,16 +683,14 @@ def _read_parquet(path: Path, missing: bool) -> Table:
                 read = file.read(columns=[spec.name])  # may include columns with this prefix
                 column = read.column(read.schema.get_all_field_indices(spec.name)[0])
                 names.append(spec.name)
-                values.append(_numbers(f"{path}, column {spec.name!r}", column, missing))
-                units.append(_decoded(spec.metadata).get("unit") or None)
-        metadata = {k: v for k, v in _decoded(schema.metadata).items() if k != "pandas"}
+                values.append(_to_float_array(f"{path}, column {spec.name!r}", column, missing))
+                units.append(_decode_metadata(spec.metadata).get("unit") or None)
+        metadata = {k: v for k, v in _decode_metadata(schema.metadata).items() if k != "pandas"}
     except InputError:
         raise
     except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(
-            path, f"is not a readable Parquet file, copy it again ({reason})"
-        ) from error
+        raise InputError(path, f"is not a readable Parquet file, copy it again ({reason})") from error
     return Table(str(path), names, values, units, metadata)
 
 
@@ -722,7 +703,7 @@ def _check_numbers(path: Path, spec) -> None:
         raise InputError(f"{path}, column {spec.name!r}", message)
 
 
-def _numbers(where: str, column, missing: bool) -> np.ndarray:
+def _to_float_array(where: str, column, missing: bool) -> np.ndarray:
     """Return a Parquet column as (n,) float64, with NaN for null."""
     if column.null_count and not missing:
         row = int(np.flatnonzero(column.is_null().to_numpy())[0])
@@ -731,13 +712,11 @@ def _numbers(where: str, column, missing: bool) -> np.ndarray:
         return column.to_numpy().astype(np.float64)
 
 
-def _decoded(metadata: Mapping[bytes, bytes] | None) -> dict[str, str]:
-    return {
-        k.decode(errors="replace"): v.decode(errors="replace") for k, v in (metadata or {}).items()
-    }
+def _decode_metadata(metadata: Mapping[bytes, bytes] | None) -> dict[str, str]:
+    return {k.decode(errors="replace"): v.decode(errors="replace") for k, v in (metadata or {}).items()}
 
 
-def _frozen(values: np.ndarray) -> np.ndarray:
+def _read_only_copy(values: np.ndarray) -> np.ndarray:
     copy = np.array(values, dtype=np.float64)
     copy.setflags(write=False)
     return copy

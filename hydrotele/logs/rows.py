@@ -1,9 +1,9 @@
 """Put the rows of a run, from one or several log files, on one uniform clock.
 
-`fit_clock` fits a uniform clock to time stamps with jitter, drift or missing rows. `clock_offset`
-estimates the offset between the clocks of two files from commands that both contain. `run_rows`
+`fit_clock` fits a uniform clock to time stamps with jitter, drift or missing rows. `estimate_clock_offset`
+estimates the offset between the clocks of two files from commands that both contain. `merge_run`
 merges the files, splits the run at long gaps and masked intervals, and marks unusable rows (the
-column `valid`, or a mask file), for example those in contact. `averaged` reduces the rate of runs
+column `valid`, or a mask file), for example those in contact. `average_rows` reduces the rate of runs
 that are logged faster than a hydraulic machine moves.
 """
 
@@ -15,21 +15,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.core.datafile import suggest
+from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import read_text
 from hydrotele.logs.files import RunFiles
 from hydrotele.logs.log import Log
 
-_EVEN = 0.01  # of a step: with less jitter each row is one tick, even with drift
-_GAIN = 0.1  # fraction of a stamp's deviation by which the tracking clock is corrected
-_NOTED = 0.02  # of a step: smaller jitter is rounding
-_LOST = 0.005  # of a step over a whole run: tolerance for rounding the period
-_NO_CLOCK = 0.22  # RMS of a step; stamps without any clock have 1 / sqrt(12) = 0.29
-_SHARED = 0.01  # maximum fraction of rows that share their nearest tick with another row
-_FINE = 5  # ticks per step for irregular rows, so that the time error is at most a tenth of a step
-_PACE = 0.5  # of a step: deviation up to which a step counts as regular
-_PACED = 0.9  # minimum fraction of regular steps
+_MAX_REGULAR_JITTER = 0.01  # of a step: with less jitter each row is one tick, even with drift
+_TRACKING_GAIN = 0.1  # fraction of a stamp's deviation by which the tracking clock is corrected
+_MIN_NOTED_JITTER = 0.02  # of a step: smaller jitter is rounding
+_MAX_ROUNDING_ERROR = 0.005  # of a step over a whole run: tolerance for rounding the period
+_MAX_CLOCK_RMS = 0.22  # RMS of a step; stamps without any clock have 1 / sqrt(12) = 0.29
+_MAX_SHARED_FRACTION = 0.01  # maximum fraction of rows that share their nearest tick with another row
+_TICKS_PER_IRREGULAR_STEP = 5  # ticks per step for irregular rows, so that the time error is at most a tenth of a step
+_MAX_STEP_DEVIATION = 0.5  # of a step: deviation up to which a step counts as regular
+_MIN_REGULAR_FRACTION = 0.9  # minimum fraction of regular steps
 
 
 class Clock(NamedTuple):
@@ -73,10 +73,10 @@ def fit_clock(time: np.ndarray, where: str) -> tuple[Clock, tuple[str, ...]]:
     (0.1, [0, 1, 2, 5, 6], ())
     """
     period = float(np.median(np.diff(time)))
-    if np.abs(np.diff(time) / period - 1.0).max() < _EVEN:
+    if np.abs(np.diff(time) / period - 1.0).max() < _MAX_REGULAR_JITTER:
         tick = np.arange(len(time))
     else:
-        tick = _tracked(time, period)
+        tick = _track_ticks(time, period)
     period, start = np.polyfit(tick, time, 1)
     for _ in range(3):  # alternate between assigning ticks and fitting the line
         tick = np.rint((time - start) / period).astype(int)
@@ -84,23 +84,23 @@ def fit_clock(time: np.ndarray, where: str) -> tuple[Clock, tuple[str, ...]]:
     period, start = float(period), float(start)
     off = (time - start) / period - tick
     shared = np.mean(np.diff(tick) == 0)
-    if np.sqrt(np.mean(off**2)) > _NO_CLOCK or shared > _SHARED:
-        return _wandering(time, where)
-    return _clock(time, tick, off, start, period, where)
+    if np.sqrt(np.mean(off**2)) > _MAX_CLOCK_RMS or shared > _MAX_SHARED_FRACTION:
+        return _fit_irregular_clock(time, where)
+    return _make_clock(time, tick, off, start, period, where)
 
 
-def _wandering(time: np.ndarray, where: str) -> tuple[Clock, tuple[str, ...]]:
+def _fit_irregular_clock(time: np.ndarray, where: str) -> tuple[Clock, tuple[str, ...]]:
     step = np.diff(time)
     period = float(np.median(step))
-    paced = np.abs(step / period - 1.0) <= _PACE
-    if paced.mean() < _PACED:
+    paced = np.abs(step / period - 1.0) <= _MAX_STEP_DEVIATION
+    if paced.mean() < _MIN_REGULAR_FRACTION:
         raise InputError(
             where,
             f"the time stamps follow no clock: {100 * np.mean(~paced):.0f} % of the steps differ by"
-            f" more than {100 * _PACE:.0f} % from the median step of {period:.4g} s. Log or"
+            f" more than {100 * _MAX_STEP_DEVIATION:.0f} % from the median step of {period:.4g} s. Log or"
             " resample at a fixed rate",
         )
-    fine = period / _FINE
+    fine = period / _TICKS_PER_IRREGULAR_STEP
     tick, row = np.unique(np.rint((time - time[0]) / fine).astype(int), return_index=True)
     scatter = 100 * float(np.std(step[paced] / period))
     notes = (
@@ -109,15 +109,21 @@ def _wandering(time: np.ndarray, where: str) -> tuple[Clock, tuple[str, ...]]:
     )
     if extra := len(time) - len(row):
         notes += (f"{where}: {extra} rows have the same tick as another row and were removed.",)
-    return Clock(float(time[0]), fine, row, tick, int((1.0 + _PACE) * _FINE) + 1), notes
+    return Clock(
+        float(time[0]),
+        fine,
+        row,
+        tick,
+        int((1.0 + _MAX_STEP_DEVIATION) * _TICKS_PER_IRREGULAR_STEP) + 1,
+    ), notes
 
 
-def _clock(time, tick, off, start, period, where) -> tuple[Clock, tuple[str, ...]]:
+def _make_clock(time, tick, off, start, period, where) -> tuple[Clock, tuple[str, ...]]:
     order = np.lexsort((np.abs(off), tick))
     _, first = np.unique(tick[order], return_index=True)
     row = np.sort(order[first])
     notes: tuple[str, ...] = ()
-    if np.abs(off[row]).max() > _NOTED:
+    if np.abs(off[row]).max() > _MIN_NOTED_JITTER:
         rms = 100 * float(np.sqrt(np.mean(off[row] ** 2)))
         notes += (
             f"{where}: the time stamps have a jitter of {rms:.2g} % of a step; every row was moved"
@@ -125,14 +131,14 @@ def _clock(time, tick, off, start, period, where) -> tuple[Clock, tuple[str, ...
         )
     if extra := len(time) - len(row):
         notes += (f"{where}: {extra} rows have the same tick as another row and were removed.",)
-    if np.abs(off[row]).max() <= _NOTED:
+    if np.abs(off[row]).max() <= _MIN_NOTED_JITTER:
         start = float(time[row[0]])
     else:
         start += period * float(tick[row[0]])
-    return Clock(start, _rounded(period, len(time)), row, tick[row] - tick[row[0]]), notes
+    return Clock(start, _round_period(period, len(time)), row, tick[row] - tick[row[0]]), notes
 
 
-def _tracked(time: np.ndarray, period: float) -> np.ndarray:
+def _track_ticks(time: np.ndarray, period: float) -> np.ndarray:
     """Return the ticks (n,) of time stamps from a clock that is corrected row by row."""
     tick = np.zeros(len(time), dtype=int)
     at = time[0]
@@ -140,27 +146,25 @@ def _tracked(time: np.ndarray, period: float) -> np.ndarray:
         ahead = max(0, round((time[row] - at) / period))
         tick[row] = tick[row - 1] + ahead
         at += ahead * period
-        at += _GAIN * (time[row] - at)
+        at += _TRACKING_GAIN * (time[row] - at)
     return tick
 
 
-def _rounded(period: float, rows: int) -> float:
+def _round_period(period: float, rows: int) -> float:
     """Round to a whole rate [Hz] or period [us] if the time error over all rows is negligible."""
     for even in (1.0 / max(round(1.0 / period), 1), round(1e6 * period) * 1e-6):
-        if abs(even - period) * rows < _LOST * period:
+        if abs(even - period) * rows < _MAX_ROUNDING_ERROR * period:
             return even
     return period
 
 
-_LEAST_OVERLAP = 5.0  # [s] minimum overlap of the two files
-_ALIKE = 0.95  # minimum correlation of two samplings of the same command signal
-_EQUAL = 1.0e-6  # relative: tolerance for commands stored in single precision
-_SAME = 0.99  # minimum fraction of equal rows if two files contain the same rows
+_MIN_OVERLAP_SECONDS = 5.0  # [s] minimum overlap of the two files
+_MIN_CORRELATION = 0.95  # minimum correlation of two samplings of the same command signal
+_COMMAND_TOLERANCE = 1.0e-6  # relative: tolerance for commands stored in single precision
+_MIN_EQUAL_FRACTION = 0.99  # minimum fraction of equal rows if two files contain the same rows
 
 
-def clock_offset(
-    clock: Clock, command: np.ndarray, other: Clock, other_command: np.ndarray
-) -> float | None:
+def estimate_clock_offset(clock: Clock, command: np.ndarray, other: Clock, other_command: np.ndarray) -> float | None:
     """Estimate the offset to add to the times of a second file [s].
 
     The coarse offset maximises the correlation of the two command histories. If both files contain
@@ -177,30 +181,30 @@ def clock_offset(
         The offset [s], None if it is not identifiable: constant commands or different signals.
     """
     step = min(clock.period, other.period)
-    a, b = _held(clock, command, step), _held(other, other_command, step)
-    least = round(_LEAST_OVERLAP / step)
+    a, b = _hold_values(clock, command, step), _hold_values(other, other_command, step)
+    least = round(_MIN_OVERLAP_SECONDS / step)
     if min(len(a), len(b)) < least or not np.ptp(a, axis=0).any():
         return None
-    alike, lags = _correlation(a - a.mean(axis=0), b - a.mean(axis=0), least)
+    alike, lags = _correlate_commands(a - a.mean(axis=0), b - a.mean(axis=0), least)
     best = alike.max()
-    if not best >= _ALIKE:
+    if not best >= _MIN_CORRELATION:
         return None
     near = np.flatnonzero(alike > best - 1.0e-6)
     stated = (other.start - clock.start) / step  # of equally good offsets use the smallest
     lag = int(lags[near[np.argmin(np.abs(lags[near] - stated))]])
     coarse = clock.start + lag * step - other.start
-    exact = _same_rows(clock, command, other, other_command, coarse)
-    return exact if exact is not None else _refined(clock, command, other, other_command, coarse)
+    exact = _offset_from_equal_rows(clock, command, other, other_command, coarse)
+    return exact if exact is not None else _refine_offset(clock, command, other, other_command, coarse)
 
 
-def _held(clock: Clock, values: np.ndarray, step: float) -> np.ndarray:
+def _hold_values(clock: Clock, values: np.ndarray, step: float) -> np.ndarray:
     """Resample values (n, k) to a uniform step, holding each until the next one."""
     time = clock.tick * clock.period
     at = np.arange(round(time[-1] / step) + 1) * step
     return values[np.searchsorted(time, at + 1e-6 * step, side="right") - 1]
 
 
-def _correlation(a: np.ndarray, b: np.ndarray, least: int) -> tuple[np.ndarray, np.ndarray]:
+def _correlate_commands(a: np.ndarray, b: np.ndarray, least: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the correlation of a[i + lag] and b[i] by lag; 0 where the overlap is too short."""
     columns = range(a.shape[1])
     ones_a, ones_b = np.ones(len(a)), np.ones(len(b))
@@ -217,7 +221,7 @@ def _correlation(a: np.ndarray, b: np.ndarray, least: int) -> tuple[np.ndarray, 
     return np.where(enough, product / np.where(enough, power, 1.0), 0.0), lags
 
 
-def _same_rows(clock: Clock, command, other: Clock, other_command, coarse: float) -> float | None:
+def _offset_from_equal_rows(clock: Clock, command, other: Clock, other_command, coarse: float) -> float | None:
     if abs(clock.period / other.period - 1.0) > 1e-3:
         return None
     size = np.abs(command).max()
@@ -226,14 +230,14 @@ def _same_rows(clock: Clock, command, other: Clock, other_command, coarse: float
         _, mine, theirs = np.intersect1d(clock.tick, other.tick + shift, return_indices=True)
         if not len(mine):
             continue
-        equal = np.abs(command[mine] - other_command[theirs]).max(axis=1) <= _EQUAL * size
-        if equal.mean() >= _SAME and np.ptp(command[mine], axis=0).any():
+        equal = np.abs(command[mine] - other_command[theirs]).max(axis=1) <= _COMMAND_TOLERANCE * size
+        if equal.mean() >= _MIN_EQUAL_FRACTION and np.ptp(command[mine], axis=0).any():
             own = clock.start + clock.tick[mine] * clock.period
             return float(np.median(own - (other.start + other.tick[theirs] * other.period)))
     return None
 
 
-def _refined(clock: Clock, command, other: Clock, other_command, coarse: float) -> float:
+def _refine_offset(clock: Clock, command, other: Clock, other_command, coarse: float) -> float:
     own = clock.start + clock.tick * clock.period
     time = other.start + other.tick * other.period
 
@@ -252,10 +256,10 @@ def _refined(clock: Clock, command, other: Clock, other_command, coarse: float) 
     return float(found.x)  # type: ignore[union-attr]
 
 
-_HEADER = ("run", "begin", "end")
+_MASK_HEADER = ("run", "begin", "end")
 
 
-class Masked(NamedTuple):
+class MaskedInterval(NamedTuple):
     """Masked interval from begin to end [s] of a run's time stamps; "" means all runs."""
 
     run: str
@@ -263,7 +267,7 @@ class Masked(NamedTuple):
     end: float
 
 
-def read_mask(path: str | Path) -> tuple[Masked, ...]:
+def read_mask(path: str | Path) -> tuple[MaskedInterval, ...]:
     """Read masked intervals from a CSV file with the columns `run,begin,end`, times in seconds.
 
     Args:
@@ -281,12 +285,12 @@ def read_mask(path: str | Path) -> tuple[Masked, ...]:
             continue
         if not header:
             header = True
-            if tuple(cells) != _HEADER:
+            if tuple(cells) != _MASK_HEADER:
                 raise InputError(f"{path}:{number}", "must be the header run,begin,end")
             continue
         try:
             run, begin, end = cells
-            stretch = Masked(run, float(begin or -math.inf), float(end or math.inf))
+            stretch = MaskedInterval(run, float(begin or -math.inf), float(end or math.inf))
         except ValueError:
             message = f"is {','.join(cells)!r}: write run,begin,end, such as dig_1,12.5,14.0"
             raise InputError(f"{path}:{number}", message) from None
@@ -298,7 +302,7 @@ def read_mask(path: str | Path) -> tuple[Masked, ...]:
     return tuple(found)
 
 
-def check_runs(masks: Sequence[Masked], runs: Sequence[str]) -> None:
+def check_mask_runs(masks: Sequence[MaskedInterval], runs: Sequence[str]) -> None:
     """Check that the runs of all masked intervals exist.
 
     Raises:
@@ -307,14 +311,15 @@ def check_runs(masks: Sequence[Masked], runs: Sequence[str]) -> None:
     for mask in masks:
         if mask.run and mask.run not in runs:
             raise InputError(
-                f"mask of run {mask.run!r}", f"the run does not exist; {suggest(mask.run, runs)}"
+                f"mask of run {mask.run!r}",
+                f"the run does not exist; {suggest_valid_name(mask.run, runs)}",
             )
 
 
-def unmasked(masks: Sequence[Masked], run: str, time: np.ndarray) -> np.ndarray:
+def find_unmasked_rows(masks: Sequence[MaskedInterval], run: str, time: np.ndarray) -> np.ndarray:
     """Return (n,) whether rows of a run at times (n,) [s] are outside all masked intervals.
 
-    >>> unmasked([Masked("", 1.0, 2.0)], "dig_1", np.array([0.5, 1.0, 1.5, 2.0])).tolist()
+    >>> find_unmasked_rows([MaskedInterval("", 1.0, 2.0)], "dig_1", np.array([0.5, 1.0, 1.5, 2.0])).tolist()
     [True, False, False, True]
     """
     valid = np.ones(len(time), dtype=bool)
@@ -324,14 +329,14 @@ def unmasked(masks: Sequence[Masked], run: str, time: np.ndarray) -> np.ndarray:
     return valid
 
 
-LONGEST_GAP = 1.0  # [s] longer gaps split a run, because the command history is unknown
-LONGEST_MASK = 0.2  # [s] longer masked intervals split a run, because the state is unknown
-_FINEST = 5  # maximum number of ticks per row of the file with the commands
-_SLOW = 20.0  # [Hz] below it a row is longer than the response time of a valve
-_OFF = 0.05  # of a row's period: tolerance for the time of a reading
+MAX_GAP_SECONDS = 1.0  # [s] longer gaps split a run, because the command history is unknown
+MAX_MASK_SECONDS = 0.2  # [s] longer masked intervals split a run, because the state is unknown
+_MAX_REFINEMENT = 5  # maximum number of ticks per row of the file with the commands
+_SLOW_RATE = 20.0  # [Hz] below it a row is longer than the response time of a valve
+_MAX_TIME_ERROR = 0.05  # of a row's period: tolerance for the time of a reading
 
 
-class Rows(NamedTuple):
+class RunRows(NamedTuple):
     """A run on a uniform clock.
 
     Attributes:
@@ -351,9 +356,12 @@ class Rows(NamedTuple):
     valid: np.ndarray
 
 
-def run_rows(
-    run: RunFiles, axes: Sequence[str], channels: Sequence[str], masks: Sequence[Masked] = ()
-) -> tuple[tuple[Rows, ...], tuple[str, ...]]:
+def merge_run(
+    run: RunFiles,
+    axes: Sequence[str],
+    channels: Sequence[str],
+    masks: Sequence[MaskedInterval] = (),
+) -> tuple[tuple[RunRows, ...], tuple[str, ...]]:
     """Merge the files of a run on one clock and split it at gaps and masked intervals.
 
     The file with the commands defines the clock. If other files have rows between its rows, the
@@ -375,54 +383,53 @@ def run_rows(
     """
     commands = [f"command.{axis}" for axis in axes]
     logs = sorted(run.logs, key=lambda log: -sum(c in log for c in commands))
-    found = [fit_clock(log.time, _name(run, log)) for log in logs]
+    found = [fit_clock(log.time, _log_label(run, log)) for log in logs]
     notes = [note for _, several in found for note in several]
     clocks = [found[0][0]]
     for log, (clock, _) in zip(logs[1:], found[1:], strict=True):
-        offset, note = _offset(run, logs[0], clocks[0], log, clock, commands)
+        offset, note = _align_clock(run, logs[0], clocks[0], log, clock, commands)
         clocks.append(clock._replace(start=clock.start + offset))
         notes += note
     period, fine, off = _common_period(clocks)
-    if off > _OFF * clocks[0].period:
+    if off > _MAX_TIME_ERROR * clocks[0].period:
         notes.append(f"{run.name}: the files have no common clock; the times of readings are wrong"
                      f" by up to {1e3 * off:.2g} ms.")  # fmt: skip
-    ticks = [_ticks(clock, clocks[0].start, period) for clock in clocks]
+    ticks = [_common_ticks(clock, clocks[0].start, period) for clock in clocks]
     every = np.unique(np.concatenate(ticks))
-    command = _spread(logs, clocks, ticks, every, commands)
+    command = _place_on_ticks(logs, clocks, ticks, every, commands)
     commanded = np.isin(every, ticks[0])
     own = [place for place, name in enumerate(commands) if name in logs[0]]
     commanded &= np.isfinite(command[:, own]).all(axis=1)
-    reading = _spread(logs, clocks, ticks, every, channels)
+    reading = _place_on_ticks(logs, clocks, ticks, every, channels)
     pieces = np.split(np.arange(len(every)), 1 + np.flatnonzero(
-        np.diff(every) * period > LONGEST_GAP))  # fmt: skip
+        np.diff(every) * period > MAX_GAP_SECONDS))  # fmt: skip
     if lost := [every[p[0]] - every[p[0] - 1] for p in pieces[1:]]:
         seconds = ", ".join(f"{n * period:.3g} s" for n in lost)
         notes.append(f"{run.name}: nothing was logged for {seconds}; the run was split there.")
     fine *= clocks[0].hold
     rows = tuple(
-        _dense(clocks[0].start, period, fine, every[p], command[p], commanded[p], reading[p])
-        for p in pieces
+        _fill_ticks(clocks[0].start, period, fine, every[p], command[p], commanded[p], reading[p]) for p in pieces
     )
-    notes += _unread(run, logs, channels)
+    notes += _note_nan_cells(run, logs, channels)
     if missing := sum(int((~r.known).sum()) for r in rows):
         share = 100 * missing / sum(len(r.known) for r in rows)
         notes.append(f"{run.name}: {missing} rows ({share:.2g} %) were not logged; their readings"
                      " are missing and their commands are held.")  # fmt: skip
-    if (rate := 1.0 / clocks[0].period) < _SLOW:
+    if (rate := 1.0 / clocks[0].period) < _SLOW_RATE:
         notes.append(f"{run.name}: is logged at {rate:.3g} Hz; commands are held between rows, and"
                      " delays and lags can be estimated to within one row only.")  # fmt: skip
-    rows = tuple(_masked(run, logs, clocks, piece, masks) for piece in rows)
+    rows = tuple(_apply_masks(run, logs, clocks, piece, masks) for piece in rows)
     if masked := sum(float((~r.valid).sum()) * r.period for r in rows):
-        rows = tuple(part for piece in rows for part in _cut_masked(piece))
+        rows = tuple(part for piece in rows for part in _split_at_masks(piece))
         notes.append(f"{run.name}: {masked:.3g} s are masked; their readings are not used, and the"
-                     f" run was split at masks of more than {LONGEST_MASK:g} s.")  # fmt: skip
+                     f" run was split at masks of more than {MAX_MASK_SECONDS:g} s.")  # fmt: skip
     return rows, tuple(notes)
 
 
-def _masked(run: RunFiles, logs, clocks, rows: Rows, masks: Sequence[Masked]) -> Rows:
+def _apply_masks(run: RunFiles, logs, clocks, rows: RunRows, masks: Sequence[MaskedInterval]) -> RunRows:
     """Set the readings of masked and invalid rows to NaN."""
     time = rows.start + rows.period * np.arange(len(rows.command))
-    valid = unmasked(masks, run.name, time)
+    valid = find_unmasked_rows(masks, run.name, time)
     for log, clock in zip(logs, clocks, strict=True):
         if "valid" in log:
             stamps = clock.start + clock.period * clock.tick
@@ -432,26 +439,26 @@ def _masked(run: RunFiles, logs, clocks, rows: Rows, masks: Sequence[Masked]) ->
     return rows._replace(valid=valid, reading=reading)
 
 
-def _cut_masked(rows: Rows) -> list[Rows]:
+def _split_at_masks(rows: RunRows) -> list[RunRows]:
     """Split a run at its long masked intervals."""
     edges = np.flatnonzero(np.diff(rows.valid, prepend=True, append=True))
     begin, end = edges[::2], edges[1::2]
-    long = (end - begin) * rows.period > LONGEST_MASK
+    long = (end - begin) * rows.period > MAX_MASK_SECONDS
     starts = [0, *end[long].tolist()]
     ends = [*begin[long].tolist(), len(rows.valid)]
-    return [cut(rows, a, b) for a, b in zip(starts, ends, strict=True) if a < b]
+    return [slice_rows(rows, a, b) for a, b in zip(starts, ends, strict=True) if a < b]
 
 
-def cut(rows: Rows, first: int, last: int) -> Rows:
+def slice_rows(rows: RunRows, first: int, last: int) -> RunRows:
     """Return the rows first .. last - 1 of a run."""
     part = slice(int(first), int(last))
-    return Rows(
+    return RunRows(
         rows.start + int(first) * rows.period, rows.period, rows.command[part], rows.known[part],
         rows.reading[part], rows.valid[part],
     )  # fmt: skip
 
 
-def _unread(run: RunFiles, logs: Sequence[Log], channels: Sequence[str]) -> list[str]:
+def _note_nan_cells(run: RunFiles, logs: Sequence[Log], channels: Sequence[str]) -> list[str]:
     """Return a note on cells without a number."""
     counts = {
         name: int(np.isnan(log[name]).sum())
@@ -462,17 +469,17 @@ def _unread(run: RunFiles, logs: Sequence[Log], channels: Sequence[str]) -> list
     return [f"{run.name}: {said} are NaN or empty; they count as missing."] if said else []
 
 
-def _name(run: RunFiles, log: Log) -> str:
+def _log_label(run: RunFiles, log: Log) -> str:
     return run.name if len(run.logs) == 1 else log.name
 
 
-def _offset(run: RunFiles, main: Log, clock: Clock, log: Log, other: Clock, commands):
+def _align_clock(run: RunFiles, main: Log, clock: Clock, log: Log, other: Clock, commands):
     """Return the clock offset of an additional file [s] and notes."""
     both = [name for name in commands if name in main and name in log]
     named = f"{run.name}: {log.source}"
     offset = None
     if both:
-        offset = clock_offset(
+        offset = estimate_clock_offset(
             clock, np.column_stack([main[c] for c in both])[clock.row],
             other, np.column_stack([log[c] for c in both])[other.row],
         )  # fmt: skip
@@ -482,18 +489,17 @@ def _offset(run: RunFiles, main: Log, clock: Clock, log: Log, other: Clock, comm
             f"{named}: {why} its clock offset to {main.source}; 0 is assumed. An offset would"
             " appear as a common delay of all its channels."
         ]
-    if abs(offset) <= _OFF * clock.period:
+    if abs(offset) <= _MAX_TIME_ERROR * clock.period:
         return offset, []
     return offset, [
-        f"{named}: its clock was shifted by {offset:+.6g} s, which aligns its commands with those"
-        f" of {main.source}."
+        f"{named}: its clock was shifted by {offset:+.6g} s, which aligns its commands with those of {main.source}."
     ]
 
 
 def _common_period(clocks: Sequence[Clock]) -> tuple[float, int, float]:
     """Return the longest period with a tick for every row, its refinement, and the error [s]."""
     tried = []
-    for fine in range(1, _FINEST + 1):
+    for fine in range(1, _MAX_REFINEMENT + 1):
         period = clocks[0].period / fine
         off = 0.0
         for clock in clocks[1:]:
@@ -501,17 +507,17 @@ def _common_period(clocks: Sequence[Clock]) -> tuple[float, int, float]:
             twice = (np.diff(np.rint(ahead)) == 0).any()
             off = max(off, np.abs(ahead - np.rint(ahead)).max() * period, twice * clock.period)
         tried.append((float(off), fine, period))
-        if off <= _OFF * clocks[0].period:
+        if off <= _MAX_TIME_ERROR * clocks[0].period:
             break
     off, fine, period = min(tried)
     return period, fine, off
 
 
-def _ticks(clock: Clock, start: float, period: float) -> np.ndarray:
+def _common_ticks(clock: Clock, start: float, period: float) -> np.ndarray:
     return np.rint((clock.start - start + clock.tick * clock.period) / period).astype(int)
 
 
-def _spread(logs, clocks, ticks, every, names) -> np.ndarray:
+def _place_on_ticks(logs, clocks, ticks, every, names) -> np.ndarray:
     """Return columns (n, k) of all files at the common ticks, NaN where missing."""
     values = np.full((len(every), len(names)), np.nan)
     for column, name in enumerate(names):
@@ -522,7 +528,7 @@ def _spread(logs, clocks, ticks, every, names) -> np.ndarray:
     return values
 
 
-def _dense(start, period, fine, tick, command, commanded, reading) -> Rows:
+def _fill_ticks(start, period, fine, tick, command, commanded, reading) -> RunRows:
     """Return rows at every tick; a command is held and known until the next row is due."""
     n = int(tick[-1] - tick[0]) + 1
     place = tick - tick[0]
@@ -540,14 +546,14 @@ def _dense(start, period, fine, tick, command, commanded, reading) -> Rows:
         latest = np.searchsorted(place[own], np.arange(n), side="right") - 1
         age = np.where(latest >= 0, np.arange(n) - place[own][np.maximum(latest, 0)], n)
     first = start + float(tick[0]) * period
-    return Rows(first, period, held, age < fine, full, np.ones(n, dtype=bool))
+    return RunRows(first, period, held, age < fine, full, np.ones(n, dtype=bool))
 
 
-FASTEST = 1000.0  # [Hz] hydraulic dynamics are below about 300 Hz, and filters step at 1 ms
-_SLACK = 0.1  # of a row: rates such as 1.05 kHz are not reduced
+MAX_RATE = 1000.0  # [Hz] hydraulic dynamics are below about 300 Hz, and filters step at 1 ms
+_RATE_TOLERANCE = 0.1  # of a row: rates such as 1.05 kHz are not reduced
 
 
-def averaged(rows: Rows, fastest: float = FASTEST) -> tuple[Rows, np.ndarray, int]:
+def average_rows(rows: RunRows, max_rate: float = MAX_RATE) -> tuple[RunRows, np.ndarray, int]:
     """Reduce the rate of a run by averaging a fixed number of logged rows into one row.
 
     Commands are means over the new row, for which they are held. Readings are means over the same
@@ -557,19 +563,18 @@ def averaged(rows: Rows, fastest: float = FASTEST) -> tuple[Rows, np.ndarray, in
 
     Args:
         rows: the run.
-        fastest: maximum rate [Hz].
+        max_rate: maximum rate [Hz].
 
     Returns:
         (the run, (c,) effective number of logged readings per reading, logged rows per row).
     """
-    count = math.ceil(1.0 / (fastest * rows.period) - _SLACK)
+    count = math.ceil(1.0 / (max_rate * rows.period) - _RATE_TOLERANCE)
     ones = np.ones(rows.reading.shape[1])
     if count < 2:
         return rows, ones, 1
     whole = len(rows.command) // count
     blocks = {
-        name: getattr(rows, name)[: whole * count].reshape(whole, count, -1)
-        for name in ("command", "known", "valid")
+        name: getattr(rows, name)[: whole * count].reshape(whole, count, -1) for name in ("command", "known", "valid")
     }
     weights = np.ones(2 * (count // 2) + 1)
     if count % 2 == 0:
@@ -591,7 +596,7 @@ def averaged(rows: Rows, fastest: float = FASTEST) -> tuple[Rows, np.ndarray, in
         reading, behind = total / weight, np.minimum(weight**2 / square, unlike)
     read = np.isfinite(behind).any(axis=0)
     ones[read] = np.nanmedian(behind[:, read], axis=0)
-    return Rows(
+    return RunRows(
         rows.start, rows.period * count, blocks["command"].mean(axis=1),
         blocks["known"].any(axis=(1, 2)), reading, blocks["valid"].all(axis=(1, 2)),
     ), ones, count  # fmt: skip

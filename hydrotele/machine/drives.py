@@ -9,17 +9,17 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from hydrotele.core.datafile import Facts, Name, NonNegative, Positive, Vector
+from hydrotele.core.datafile import Name, NonNegativeFloat, PositiveFloat, StrictModel, Vector
 
 
-class Pin(Facts):
+class Pin(StrictModel):
     """A point [m] fixed to a link or to the world."""
 
     link: Name
     position: Vector
 
 
-class Friction(Facts):
+class Friction(StrictModel):
     """Friction parameters of `hydraulics.friction`: [N] or [N m], velocities [m/s] or [rad/s].
 
     An asymmetry a multiplies the dry or the viscous friction by 1 + a in the positive direction
@@ -28,15 +28,15 @@ class Friction(Facts):
     [N s/m] or [N m s/rad]; `smoothing_velocity` is then not used.
     """
 
-    coulomb: NonNegative = 0.0
-    stribeck_extra: NonNegative = 0.0
-    stribeck_velocity: Positive = 0.02
-    viscous: NonNegative = 0.0
-    smoothing_velocity: Positive = 0.005
+    coulomb: NonNegativeFloat = 0.0
+    stribeck_extra: NonNegativeFloat = 0.0
+    stribeck_velocity: PositiveFloat = 0.02
+    viscous: NonNegativeFloat = 0.0
+    smoothing_velocity: PositiveFloat = 0.005
     coulomb_asymmetry: Annotated[float, Field(gt=-1, lt=1)] = 0.0
     viscous_asymmetry: Annotated[float, Field(gt=-1, lt=1)] = 0.0
-    presliding_stiffness: NonNegative = 0.0
-    presliding_damping: NonNegative = 0.0
+    presliding_stiffness: NonNegativeFloat = 0.0
+    presliding_damping: NonNegativeFloat = 0.0
 
     @model_validator(mode="after")
     def _check(self):
@@ -45,20 +45,20 @@ class Friction(Facts):
         return self
 
     @property
-    def presliding(self) -> bool:
+    def has_presliding(self) -> bool:
         """Whether presliding applies: a presliding stiffness and a dry friction force."""
         return self.presliding_stiffness > 0.0 and self.coulomb + self.stribeck_extra > 0.0
 
 
-class Bar(Facts):
+class CylinderPart(StrictModel):
     """Tube or rod of a cylinder: mass [kg], com distance from its pin [m], inertia [kg m^2]."""
 
-    mass: Positive
+    mass: PositiveFloat
     com: float
-    inertia: tuple[Positive, Positive, Positive]
+    inertia: tuple[PositiveFloat, PositiveFloat, PositiveFloat]
 
 
-class Cylinder(Facts):
+class Cylinder(StrictModel):
     """A hydraulic cylinder between two pins.
 
     The piston displacement is x = pin-to-pin length - closed_length, 0 .. stroke.
@@ -67,16 +67,16 @@ class Cylinder(Facts):
 
     base_pin: Pin
     rod_pin: Pin
-    closed_length: Positive
-    stroke: Positive
-    area_head: Positive
-    area_rod: Positive
-    dead_volume: Positive
-    leakage: NonNegative
-    hose_compliance: NonNegative = 0.0
+    closed_length: PositiveFloat
+    stroke: PositiveFloat
+    area_head: PositiveFloat
+    area_rod: PositiveFloat
+    dead_volume: PositiveFloat
+    leakage: NonNegativeFloat
+    hose_compliance: NonNegativeFloat = 0.0
     friction: Friction = Friction()
-    tube: Bar
-    rod: Bar
+    tube: CylinderPart
+    rod: CylinderPart
 
     @model_validator(mode="after")
     def _check(self):
@@ -84,8 +84,7 @@ class Cylinder(Facts):
             raise ValueError(f"area_rod {self.area_rod:g} exceeds area_head {self.area_head:g}")
         if self.stroke >= self.closed_length:
             raise ValueError(
-                f"a stroke of {self.stroke:g} m does not fit into a closed_length of"
-                f" {self.closed_length:g} m"
+                f"a stroke of {self.stroke:g} m does not fit into a closed_length of {self.closed_length:g} m"
             )
         return self
 
@@ -104,13 +103,13 @@ class Cylinder(Facts):
         return self.dead_volume + self.area_head * inside, self.dead_volume + self.area_rod * left
 
 
-class Motor(Facts):
+class Motor(StrictModel):
     """A hydraulic motor on a joint: displacement [m^3/rad], constant chamber volumes [m^3]."""
 
-    displacement: Positive
-    dead_volume: Positive
-    leakage: NonNegative
-    hose_compliance: NonNegative = 0.0
+    displacement: PositiveFloat
+    dead_volume: PositiveFloat
+    leakage: NonNegativeFloat
+    hose_compliance: NonNegativeFloat = 0.0
     friction: Friction = Friction()
 
     @property
@@ -124,12 +123,12 @@ class Motor(Facts):
         return constant, constant
 
 
-class ForceDrive(Facts):
+class ForceDrive(StrictModel):
     """A force or torque drive: `gain command = load + friction + offset` [N] or [N m]."""
 
     gain: float
     command_unit: Literal["1", "V", "N"] = "1"
-    command_limit: Positive = 1.0
+    command_limit: PositiveFloat = 1.0
     friction: Friction = Friction()
     offset: float = 0.0
 
@@ -140,7 +139,7 @@ class ForceDrive(Facts):
         return self
 
 
-class FlowCurve(Facts):
+class FlowCurve(StrictModel):
     """Valve opening [1] over spool travel beyond the dead band [1], linear between 2 to 8 knots.
 
     Travel increases from 0 to 1. Opening starts at 0, never decreases, and is 1 at the rated flow.
@@ -154,8 +153,7 @@ class FlowCurve(Facts):
         travel, opening = self.travel, self.opening
         if not 2 <= len(travel) <= 8 or len(opening) != len(travel):
             raise ValueError(
-                f"needs 2 to 8 knots of travel and as many of opening; has {len(travel)} and"
-                f" {len(opening)}"
+                f"needs 2 to 8 knots of travel and as many of opening; has {len(travel)} and {len(opening)}"
             )
         if travel[0] != 0.0 or travel[-1] != 1.0 or np.any(np.diff(travel) <= 0.0):
             raise ValueError(f"travel {travel} must increase from 0 to 1")
@@ -164,7 +162,7 @@ class FlowCurve(Facts):
         return self
 
 
-class Metering(Facts):
+class Metering(StrictModel):
     """One direction of spool travel: dead band, gains of the two metering edges, flow curve.
 
     `inlet` and `outlet` [1] scale the flow gain from the pump into one chamber (P-A or P-B) and
@@ -172,12 +170,12 @@ class Metering(Facts):
     """
 
     deadband: Annotated[float, Field(ge=0, lt=1)] | None = None
-    inlet: Positive = 1.0
-    outlet: Positive = 1.0
+    inlet: PositiveFloat = 1.0
+    outlet: PositiveFloat = 1.0
     curve: FlowCurve | None = None
 
 
-class Valve(Facts):
+class Valve(StrictModel):
     """A spool valve: rated_flow [m^3/s] at rated_pressure_drop [Pa], bandwidth [rad/s].
 
     `slew_limit` [1/s] is the maximum speed of the spool. With `compensation: pressure` the drop
@@ -188,21 +186,21 @@ class Valve(Facts):
     directions of travel; a positive command feeds the head side.
     """
 
-    rated_flow: Positive
-    rated_pressure_drop: Positive = 7.0e6
+    rated_flow: PositiveFloat
+    rated_pressure_drop: PositiveFloat = 7.0e6
     deadband: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    bandwidth: Positive
-    damping: Positive = 0.9
-    slew_limit: Positive | None = None
+    bandwidth: PositiveFloat
+    damping: PositiveFloat = 0.9
+    slew_limit: PositiveFloat | None = None
     compensation: Literal["none", "pressure"] = "none"
-    compensated_drop: Positive | None = None
+    compensated_drop: PositiveFloat | None = None
     positive: Metering = Metering()
     negative: Metering = Metering()
-    port_relief: Positive = 32.0e6
-    smoothing: Positive = 5.0e4
-    port_relief_gain: NonNegative = 1.0e-9
-    makeup_gain: NonNegative = 5.0e-9
-    tank_leakage: NonNegative = 0.0
+    port_relief: PositiveFloat = 32.0e6
+    smoothing: PositiveFloat = 5.0e4
+    port_relief_gain: NonNegativeFloat = 1.0e-9
+    makeup_gain: NonNegativeFloat = 5.0e-9
+    tank_leakage: NonNegativeFloat = 0.0
 
     @property
     def deadbands(self) -> tuple[float, float]:
@@ -212,14 +210,14 @@ class Valve(Facts):
         return forward, backward
 
     @property
-    def held_drop(self) -> float:
+    def compensator_drop(self) -> float:
         """Pressure drop that the compensator maintains at the inlet edge [Pa], 0 without one."""
         if self.compensation == "none":
             return 0.0
         return self.compensated_drop or self.rated_pressure_drop
 
 
-class ElectricMotor(Facts):
+class ElectricMotor(StrictModel):
     """A brushed DC motor on an H-bridge, with the drag torques of motor and pump.
 
     `voltage` [V] of the bridge at full duty, `resistance` [ohm], `emf` constant [V s/rad], equal to
@@ -228,33 +226,33 @@ class ElectricMotor(Facts):
     and `viscous` [N m s/rad].
     """
 
-    voltage: Positive
-    resistance: Positive
-    emf: Positive
-    inertia: Positive
-    drag: NonNegative = 0.0
-    breakaway: NonNegative = 0.0
-    breakaway_speed: Positive = 10.0
-    viscous: NonNegative = 0.0
+    voltage: PositiveFloat
+    resistance: PositiveFloat
+    emf: PositiveFloat
+    inertia: PositiveFloat
+    drag: NonNegativeFloat = 0.0
+    breakaway: NonNegativeFloat = 0.0
+    breakaway_speed: PositiveFloat = 10.0
+    viscous: NonNegativeFloat = 0.0
 
 
-_USUAL_PRESSURE = 2.0e7  # Pa, pressure limit of a pump circuit that no motor limits
+_DEFAULT_STALL_PRESSURE = 2.0e7  # Pa, pressure limit of a pump circuit that no motor limits
 
 
-class Accumulator(Facts):
+class Accumulator(StrictModel):
     """A gas accumulator in place of a tank; values for the fully retracted cylinder.
 
     `pressure` [Pa] relative to the atmosphere, `gas_volume` [m^3] at that pressure, and line
     resistances [Pa s/m^3] for the extending and the retracting cylinder.
     """
 
-    pressure: Positive
-    gas_volume: Positive
-    line_extending: Positive
-    line_retracting: Positive
+    pressure: PositiveFloat
+    gas_volume: PositiveFloat
+    line_extending: PositiveFloat
+    line_retracting: PositiveFloat
 
 
-class Pump(Facts):
+class Pump(StrictModel):
     """An individual pump of one axis with one direction of rotation; a valve selects the side.
 
     The command is the motor duty with the sign of the side, or, without a `motor`, the speed
@@ -264,15 +262,15 @@ class Pump(Facts):
     [m^3/Pa] of hoses and walls, `air_head` and `air_rod` [m^3] at atmospheric pressure.
     """
 
-    displacement: Positive
-    leakage: NonNegative = 0.0
-    torque_loss: NonNegative = 0.0
-    rated_speed: Positive
+    displacement: PositiveFloat
+    leakage: NonNegativeFloat = 0.0
+    torque_loss: NonNegativeFloat = 0.0
+    rated_speed: PositiveFloat
     bulk_modulus: Annotated[float, Field(ge=1.0e7, le=1.0e11)]
-    compliance_head: NonNegative = 0.0
-    compliance_rod: NonNegative = 0.0
-    air_head: NonNegative = 0.0
-    air_rod: NonNegative = 0.0
+    compliance_head: NonNegativeFloat = 0.0
+    compliance_rod: NonNegativeFloat = 0.0
+    air_head: NonNegativeFloat = 0.0
+    air_rod: NonNegativeFloat = 0.0
     accumulator: Accumulator
     motor: ElectricMotor | None = None
 
@@ -289,12 +287,12 @@ class Pump(Facts):
         """
         motor = self.motor
         if motor is None:
-            return _USUAL_PRESSURE
+            return _DEFAULT_STALL_PRESSURE
         torque = motor.emf * motor.voltage / motor.resistance - motor.drag
         return max(torque, 0.0) / (self.displacement * (1.0 + self.torque_loss))
 
 
-class LoadCylinder(Facts):
+class LoadCylinder(StrictModel):
     """A cylinder that resists extension because its oil leaves through a relief valve.
 
     `area` [m^2]; `relief_pressure` [Pa] and its increase with the flow, `override` [Pa s/m^3];
@@ -303,53 +301,53 @@ class LoadCylinder(Facts):
     `return_force` [N] is an additional resistance while the cylinder returns.
     """
 
-    area: Positive
-    relief_pressure: NonNegative
-    override: NonNegative = 0.0
-    stiffness: Positive
-    void: NonNegative = 0.0
-    void_pressure: Positive = 2.0e4
-    friction: NonNegative = 0.0
-    return_force: NonNegative = 0.0
+    area: PositiveFloat
+    relief_pressure: NonNegativeFloat
+    override: NonNegativeFloat = 0.0
+    stiffness: PositiveFloat
+    void: NonNegativeFloat = 0.0
+    void_pressure: PositiveFloat = 2.0e4
+    friction: NonNegativeFloat = 0.0
+    return_force: NonNegativeFloat = 0.0
 
 
-class Counterbalance(Facts):
+class Counterbalance(StrictModel):
     """A load-holding valve of a chamber: oil leaves only if p + pilot_ratio p_pilot > setting.
 
     `setting` [Pa]; p_pilot is the pressure of the other chamber. The valve is fully open at the
     setting times 1 + `override` [1]. Oil enters freely through a check valve.
     """
 
-    setting: Positive
-    pilot_ratio: NonNegative = 3.0
-    override: Positive = 0.2
+    setting: PositiveFloat
+    pilot_ratio: NonNegativeFloat = 3.0
+    override: PositiveFloat = 0.2
 
 
-class LoadHolding(Facts):
+class LoadHolding(StrictModel):
     """Counterbalance valves of the head and the rod side of a drive."""
 
     head: Counterbalance | None = None
     rod: Counterbalance | None = None
 
 
-class EndStop(Facts):
+class EndStop(StrictModel):
     """Spring [N/m] or [N m/rad] and damper [N s/m] or [N m s/rad] at both ends of travel.
 
     The damper acts only while the spring is compressed, and the total force never pulls.
     """
 
-    stiffness: Positive
-    damping: NonNegative
+    stiffness: PositiveFloat
+    damping: NonNegativeFloat
 
 
-class FourBar(Facts):
+class FourBar(StrictModel):
     """Names of the links between cylinder and joint of a four-bar linkage."""
 
     rocker: Name
     coupler: Name
 
 
-class Transmission(Facts):
+class Transmission(StrictModel):
     """Flexible transmission between drive and load: drive inertia, spring, damper and backlash.
 
     The drive acts on its own inertia [kg] or [kg m^2]. Spring [N/m] or [N m/rad] and damper
@@ -358,13 +356,13 @@ class Transmission(Facts):
     cylinder's length sensor measures; the joint sensor measures the load side.
     """
 
-    inertia: Positive
-    stiffness: Positive
-    damping: NonNegative = 0.0
-    backlash: NonNegative = 0.0
+    inertia: PositiveFloat
+    stiffness: PositiveFloat
+    damping: NonNegativeFloat = 0.0
+    backlash: NonNegativeFloat = 0.0
 
 
-class Axis(Facts):
+class Axis(StrictModel):
     """A driven joint with exactly one cylinder, motor or force drive.
 
     A command reaches the valve or the drive after `command_delay` [s]. Valve commands are fractions
@@ -380,7 +378,7 @@ class Axis(Facts):
     valve: Valve | None = None
     pump: Pump | None = None
     four_bar: FourBar | None = None
-    command_delay: NonNegative = 0.0
+    command_delay: NonNegativeFloat = 0.0
     command_unit: str = "1"
     command_range: tuple[float, float] = (-1.0, 1.0)
     transmission: Transmission | None = None
@@ -394,12 +392,9 @@ class Axis(Facts):
             raise ValueError(f"needs exactly one of cylinder, motor, force; has {drives or 'none'}")
         fed = (self.valve is not None) + (self.pump is not None)
         if fed != (self.force is None):
-            raise ValueError(
-                "a cylinder or motor needs either a valve or a pump; a force drive must have"
-                " neither"
-            )
+            raise ValueError("a cylinder or motor needs either a valve or a pump; a force drive must have neither")
         if self.pump:
-            self._check_pumped()
+            self._check_pump_axis()
         if self.force and self.load_holding != LoadHolding():
             raise ValueError("a force drive has no oil and cannot have load_holding valves")
         if self.command_range[0] == self.command_range[1]:
@@ -419,29 +414,22 @@ class Axis(Facts):
             raise ValueError("a four_bar linkage needs a cylinder")
         return self
 
-    def _check_pumped(self) -> None:
+    def _check_pump_axis(self) -> None:
         if self.cylinder is None or self.four_bar or self.transmission:
             raise ValueError("a pump can only drive a cylinder without four_bar and transmission")
         if self.load_holding != LoadHolding():
             raise ValueError("load_holding valves need a valve; an axis with a pump has none")
         if self.cylinder.hose_compliance:
-            raise ValueError(
-                "give pump.compliance_head and pump.compliance_rod instead of"
-                " cylinder.hose_compliance"
-            )
+            raise ValueError("give pump.compliance_head and pump.compliance_rod instead of cylinder.hose_compliance")
         if self.cylinder.friction.presliding_stiffness:
             raise ValueError(
-                "an axis with a pump has friction without presliding: remove"
-                " cylinder.friction.presliding_stiffness"
+                "an axis with a pump has friction without presliding: remove cylinder.friction.presliding_stiffness"
             )
         if self.end_stop is None:
-            raise ValueError(
-                "an axis with a pump needs an end_stop: it cannot be estimated without a relief"
-                " pressure"
-            )
+            raise ValueError("an axis with a pump needs an end_stop: it cannot be estimated without a relief pressure")
 
     @property
-    def hydraulic(self) -> bool:
+    def is_hydraulic(self) -> bool:
         """Whether the axis is hydraulic: it has a valve or an individual pump."""
         return self.valve is not None or self.pump is not None
 

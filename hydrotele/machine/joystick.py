@@ -11,15 +11,15 @@ from typing import Annotated, NamedTuple
 from pydantic import Field, model_validator
 
 from hydrotele.core.datafile import (
-    Facts,
     Name,
-    NonNegative,
+    NonNegativeFloat,
     Number,
-    Positive,
+    PositiveFloat,
+    StrictModel,
     Vector,
-    parse,
     read_yaml,
-    suggest,
+    suggest_valid_name,
+    validate_data,
 )
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import models_folder
@@ -28,34 +28,34 @@ JOYSTICK_FILE = "joystick.yaml"
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
-class Workspace(Facts):
+class Workspace(StrictModel):
     """Travel of the coil centre in the gap, each direction [m], and rotation of the flotor [rad].
 
     A rotation about the handle is smaller, because the handle is off the coils; see
     `Joystick.reach`.
     """
 
-    translation: Positive
-    rotation: Positive
+    translation: PositiveFloat
+    rotation: PositiveFloat
 
 
-class OpticalSensing(Facts):
+class OpticalSensing(StrictModel):
     """Resolution of the measured handle pose: translation [m], rotation [rad]; 0 means ideal."""
 
-    translation: NonNegative
-    rotation: NonNegative
+    translation: NonNegativeFloat
+    rotation: NonNegativeFloat
 
 
-class FlotorFacts(Facts):
+class Flotor(StrictModel):
     """The flotor in the coil frame: mass [kg], com [m], inertia [kg m^2], handle position [m]."""
 
-    mass: Positive
+    mass: PositiveFloat
     com: Vector
-    inertia: tuple[Positive, Positive, Positive]
+    inertia: tuple[PositiveFloat, PositiveFloat, PositiveFloat]
     handle: Vector
 
 
-class CoilFacts(Facts):
+class Coils(StrictModel):
     """Coils: three pairs on a `radius` [m], with `force_per_ampere` [N/A] and `max_current` [A].
 
     `continuous_current` [A] is the permissible continuous current of a coil with the thermal time
@@ -63,32 +63,32 @@ class CoilFacts(Facts):
     end of the gap.
     """
 
-    radius: Positive
-    force_per_ampere: Positive
-    max_current: Positive
-    continuous_current: Positive = 2.0
-    thermal_time: Positive = 60.0
+    radius: PositiveFloat
+    force_per_ampere: PositiveFloat
+    max_current: PositiveFloat
+    continuous_current: PositiveFloat = 2.0
+    thermal_time: PositiveFloat = 60.0
     edge_loss: Annotated[float, Field(ge=0.0, le=0.5)] = 0.0
 
 
-class DiodeFacts(Facts):
+class Diodes(StrictModel):
     """Position-sensing diodes: distance from the coil centre [m], resolution [m]."""
 
-    distance: Positive
-    step: NonNegative
+    distance: PositiveFloat
+    step: NonNegativeFloat
 
 
-class AloneFacts(Facts):
+class UnheldDynamics(StrictModel):
     """Closed-loop dynamics of x, y, z, rx, ry, rz without a hand: frequency [rad/s], ratio [1]."""
 
-    frequency: Annotated[tuple[Positive, ...], Field(min_length=6, max_length=6)]
-    ratio: Annotated[tuple[Positive, ...], Field(min_length=6, max_length=6)]
+    frequency: Annotated[tuple[PositiveFloat, ...], Field(min_length=6, max_length=6)]
+    ratio: Annotated[tuple[PositiveFloat, ...], Field(min_length=6, max_length=6)]
 
 
-Shape = tuple[Positive, Number, Positive]
+SymmetricMatrix = tuple[PositiveFloat, Number, PositiveFloat]
 
 
-class HandFacts(Facts):
+class HandImpedance(StrictModel):
     """Impedance of the operator's hand: mass [kg], damping [N s/m], stiffness [N/m].
 
     Rotations have `rotation_damping` [N m s/rad] and `rotation_stiffness` [N m/rad]. An arm is
@@ -97,13 +97,13 @@ class HandFacts(Facts):
     symmetric matrix [1].
     """
 
-    mass: NonNegative
-    damping: NonNegative
-    stiffness: NonNegative
-    rotation_damping: NonNegative = 0.0
-    rotation_stiffness: NonNegative = 0.0
-    mass_shape: Shape = (1.0, 0.0, 1.0)
-    stiffness_shape: Shape = (1.0, 0.0, 1.0)
+    mass: NonNegativeFloat
+    damping: NonNegativeFloat
+    stiffness: NonNegativeFloat
+    rotation_damping: NonNegativeFloat = 0.0
+    rotation_stiffness: NonNegativeFloat = 0.0
+    mass_shape: SymmetricMatrix = (1.0, 0.0, 1.0)
+    stiffness_shape: SymmetricMatrix = (1.0, 0.0, 1.0)
 
     @model_validator(mode="after")
     def _check(self):
@@ -114,11 +114,11 @@ class HandFacts(Facts):
         return self
 
     @property
-    def carried(self) -> float:
+    def carried_mass(self) -> float:
         """Mass whose weight the handle carries [kg]: the smallest over all directions."""
-        return self.mass * min(1.0, principal(self.mass_shape).least)
+        return self.mass * min(1.0, principal_values(self.mass_shape).min_value)
 
-    def along(self, axis: int) -> tuple[float, float, float]:
+    def axis_impedance(self, axis: int) -> tuple[float, float, float]:
         """Return mass, damping and stiffness of one handle axis with the other axes at rest.
 
         Args:
@@ -133,15 +133,15 @@ class HandFacts(Facts):
         return heavy * self.mass, stiff * self.damping, stiff * self.stiffness
 
 
-class Principal(NamedTuple):
+class PrincipalValues(NamedTuple):
     """Principal values of a symmetric 2 x 2 matrix; angle of its major axis from x [rad]."""
 
-    least: float
-    greatest: float
+    min_value: float
+    max_value: float
     angle: float
 
 
-def principal(shape: Shape) -> Principal:
+def principal_values(shape: SymmetricMatrix) -> PrincipalValues:
     """Return the principal values and the major axis of a symmetric 2 x 2 matrix.
 
     Args:
@@ -150,41 +150,40 @@ def principal(shape: Shape) -> Principal:
     Returns:
         The principal values and the angle of the major axis from x [rad].
 
-    >>> [round(v, 6) for v in principal((2.5, 0.5, 2.5))]
+    >>> [round(v, 6) for v in principal_values((2.5, 0.5, 2.5))]
     [2.0, 3.0, 0.785398]
     """
     xx, xy, yy = shape
     mean, half = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
-    return Principal(mean - half, mean + half, 0.5 * math.atan2(2.0 * xy, xx - yy))
+    return PrincipalValues(mean - half, mean + half, 0.5 * math.atan2(2.0 * xy, xx - yy))
 
 
-class DetentFacts(Facts):
+class Detent(StrictModel):
     """Perceptible edge of the dead band: force drop [N] or [N m], slope outside [N/m]."""
 
-    drop: NonNegative
-    outside: NonNegative
+    drop: NonNegativeFloat
+    outside: NonNegativeFloat
 
 
-class AxisGains(Facts):
+class AxisGains(StrictModel):
     """Stiffness feedback of one joystick axis, [N, m] or [N m, rad].
 
     `force_limit` [N] or [N m] is the machine force at which the stiffness reaches `most`.
     """
 
-    nominal: Positive
-    least: NonNegative
-    most: Positive
-    damping: NonNegative
-    deadband: NonNegative
-    force_limit: Positive
-    detent: DetentFacts | None = None
+    nominal: PositiveFloat
+    least: NonNegativeFloat
+    most: PositiveFloat
+    damping: NonNegativeFloat
+    deadband: NonNegativeFloat
+    force_limit: PositiveFloat
+    detent: Detent | None = None
 
     @model_validator(mode="after")
     def _check(self):
         if not self.least <= self.nominal <= self.most:
             raise ValueError(
-                f"stiffnesses must satisfy least {self.least:g} <= nominal {self.nominal:g}"
-                f" <= most {self.most:g}"
+                f"stiffnesses must satisfy least {self.least:g} <= nominal {self.nominal:g} <= most {self.most:g}"
             )
         if self.detent and self.detent.drop > self.nominal * self.deadband:
             raise ValueError(
@@ -194,7 +193,7 @@ class AxisGains(Facts):
         return self
 
 
-class Joystick(Facts):
+class Joystick(StrictModel):
     """A six-DOF levitated joystick; `mount` [m] is its position in the cab, `control_rate` [Hz]."""
 
     name: Name
@@ -204,17 +203,17 @@ class Joystick(Facts):
     folder: str = ""
     workspace: Workspace
     sensing: OpticalSensing
-    diodes: DiodeFacts
-    control_rate: Annotated[Positive, Field(ge=1.0, le=1.0e5)]
-    flotor: FlotorFacts
-    coils: CoilFacts
-    alone: AloneFacts
-    hand: HandFacts
+    diodes: Diodes
+    control_rate: Annotated[PositiveFloat, Field(ge=1.0, le=1.0e5)]
+    flotor: Flotor
+    coils: Coils
+    alone: UnheldDynamics
+    hand: HandImpedance
     mount: Vector
     gains: dict[Name, dict[Name, AxisGains]] = Field(min_length=1)
 
     @property
-    def reach(self) -> tuple[float, ...]:
+    def handle_travel(self) -> tuple[float, ...]:
         """Travel of the handle along and about each axis separately, (6,) [m], [rad].
 
         A rotation about the centre of the handle also moves the coils, which are at a distance from
@@ -258,7 +257,7 @@ def load_joystick(name_or_path: str | Path = "joystick") -> Joystick:
     elif path.is_dir():
         path = path / JOYSTICK_FILE
     if not path.is_file():
-        known = suggest(str(name_or_path), shipped_joysticks())
+        known = suggest_valid_name(str(name_or_path), shipped_joysticks())
         raise InputError(f"joystick {str(name_or_path)!r}", f"no such file; {known}")
     data, lines = read_yaml(path)
-    return parse(Joystick, data | {"folder": str(path.parent.resolve())}, str(path), lines)
+    return validate_data(Joystick, data | {"folder": str(path.parent.resolve())}, str(path), lines)

@@ -12,13 +12,20 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from hydrotele.core.compiled import compiled
-from hydrotele.core.datafile import Facts, Name, NonNegative, Positive, Vector, suggest
+from hydrotele.core.datafile import (
+    Name,
+    NonNegativeFloat,
+    PositiveFloat,
+    StrictModel,
+    Vector,
+    suggest_valid_name,
+)
 from hydrotele.core.errors import InputError
 from hydrotele.machine.drives import Axis, EndStop, LoadCylinder, Pin
 from hydrotele.terms.law import Term
 
 
-class Sensor(Facts):
+class Sensor(StrictModel):
     """A sensor with a random error and a converter of 2^bits equal steps over the span.
 
     The error is uniform in +-`accuracy`, or normal with `standard_deviation`. Without either, the
@@ -26,17 +33,15 @@ class Sensor(Facts):
     `span` are None for a sensor without converter steps.
     """
 
-    accuracy: NonNegative = 0.0
-    standard_deviation: NonNegative = 0.0
+    accuracy: NonNegativeFloat = 0.0
+    standard_deviation: NonNegativeFloat = 0.0
     bits: Annotated[int, Field(ge=1, le=32)] | None = None
-    span: Positive | None = None
+    span: PositiveFloat | None = None
 
     @model_validator(mode="after")
     def _check(self):
         if self.accuracy and self.standard_deviation:
-            raise ValueError(
-                "give accuracy (the bound of a uniform error) or standard_deviation, not both"
-            )
+            raise ValueError("give accuracy (the bound of a uniform error) or standard_deviation, not both")
         return self
 
     @property
@@ -45,7 +50,7 @@ class Sensor(Facts):
         return self.standard_deviation or self.accuracy / math.sqrt(3.0)
 
 
-class SensorSet(Facts):
+class SensorSet(StrictModel):
     """Sensors of a machine by kind of channel, sampled at `rate` [Hz].
 
     The sampling instants of the rows have a normally distributed error with standard deviation
@@ -53,8 +58,8 @@ class SensorSet(Facts):
     replaces the sensor of its kind; an empty entry means an unknown accuracy.
     """
 
-    rate: Positive = 50.0
-    jitter: NonNegative = 0.0
+    rate: PositiveFloat = 50.0
+    jitter: NonNegativeFloat = 0.0
     angle: Sensor = Sensor()
     position: Sensor = Sensor()
     length: Sensor = Sensor()
@@ -67,13 +72,11 @@ class SensorSet(Facts):
         others = {n: s for n, s in self.channels.items() if not n.startswith("length.")}
         for name, sensor in (kinds | others).items():
             if sensor.bits is not None and sensor.span is None:
-                raise ValueError(
-                    f"{name}: {sensor.bits} bits need a span (only length has a default span)"
-                )
+                raise ValueError(f"{name}: {sensor.bits} bits need a span (only length has a default span)")
         return self
 
 
-class SensorError(Facts):
+class SensorError(StrictModel):
     """Systematic error of one channel: the reading is `scale * y(t - delay) + offset`, delay [s].
 
     y follows the true value with a first-order lag, `time_constant dy/dt = value - y` [s]; without
@@ -84,13 +87,13 @@ class SensorError(Facts):
     """
 
     offset: float = 0.0
-    scale: Positive = 1.0
-    delay: NonNegative = 0.0
-    time_constant: NonNegative = 0.0
+    scale: PositiveFloat = 1.0
+    delay: NonNegativeFloat = 0.0
+    time_constant: NonNegativeFloat = 0.0
     tilt: Annotated[float, Field(ge=0.0, le=0.5)] = 0.0
-    backlash: NonNegative = 0.0
+    backlash: NonNegativeFloat = 0.0
     drift: float = 0.0
-    drift_time_constant: Positive = 600.0
+    drift_time_constant: PositiveFloat = 600.0
 
     def offset_at(self, time: np.ndarray) -> np.ndarray:
         """Return the offset including drift (n,) at times (n,) since the start of the run [s]."""
@@ -99,17 +102,17 @@ class SensorError(Facts):
         return self.offset + warming_drift(time, self.drift, self.drift_time_constant)
 
     @property
-    def coupled(self) -> bool:
+    def has_coupling_error(self) -> bool:
         """Whether the coupling of the sensor has a misalignment or a backlash."""
         return self.tilt > 0.0 or self.backlash > 0.0
 
     @property
-    def late(self) -> bool:
+    def is_delayed(self) -> bool:
         """Whether the sensor has a delay or a lag."""
         return self.delay > 0.0 or self.time_constant > 0.0
 
 
-class Joint(Facts):
+class Joint(StrictModel):
     """One degree of freedom: `range` [rad] or [m], `damping` [N m s/rad] or [N s/m].
 
     `bending` [rad/(N m)] is the compliance of the link of a hinge about both axes perpendicular to
@@ -120,8 +123,8 @@ class Joint(Facts):
     type: Literal["hinge", "slide"] = "hinge"
     axis: Vector = (0.0, 0.0, 1.0)
     range: tuple[float, float] | None = None
-    damping: NonNegative = 0.0
-    bending: NonNegative = 0.0
+    damping: NonNegativeFloat = 0.0
+    bending: NonNegativeFloat = 0.0
 
     @model_validator(mode="after")
     def _check(self):
@@ -134,15 +137,15 @@ class Joint(Facts):
         return self
 
 
-class Link(Facts):
+class Link(StrictModel):
     """A rigid body: position in the parent frame [m], mass [kg], inertia about com [kg m^2]."""
 
     parent: Name = "world"
     position: Vector = (0.0, 0.0, 0.0)
     joint: Joint | None = None
-    mass: Positive
+    mass: PositiveFloat
     com: Vector = (0.0, 0.0, 0.0)
-    inertia: tuple[Positive, Positive, Positive]
+    inertia: tuple[PositiveFloat, PositiveFloat, PositiveFloat]
 
     @model_validator(mode="after")
     def _check(self):
@@ -155,7 +158,7 @@ class Link(Facts):
         return self
 
 
-class Closure(Facts):
+class Closure(StrictModel):
     """A pin joint that closes a kinematic loop: the two points coincide."""
 
     a: Pin
@@ -163,12 +166,12 @@ class Closure(Facts):
 
 
 UNLIMITED_FLOW = 1.0e3  # m^3/s, exceeds any demand: flow of a supply without a limit
-_STOP_GIVES = 1.0e-3  # m: elongation of tube, gland and pins at the largest cylinder force
-_STOP_TURNS = 2.0e-3  # rad: deformation of a rotary drive at its largest torque
-_STOP_RETARDATION = 5.0e-3  # s: damps a 75 rad/s oscillation of a boom within two periods
+_END_STOP_TRAVEL = 1.0e-3  # m: elongation of tube, gland and pins at the largest cylinder force
+_END_STOP_ROTATION = 2.0e-3  # rad: deformation of a rotary drive at its largest torque
+_END_STOP_TIME_CONSTANT = 5.0e-3  # s: damps a 75 rad/s oscillation of a boom within two periods
 
 
-class Supply(Facts):
+class Supply(StrictModel):
     """Pump and tank shared by all valves; pressures [Pa], flow [m^3/s], bulk modulus [Pa].
 
     `constant_flow`: the pump delivers `pump_flow`; the surplus flows through the relief valve.
@@ -185,19 +188,19 @@ class Supply(Facts):
     """
 
     kind: Literal["constant_flow", "load_sensing", "constant_pressure"] = "constant_flow"
-    relief_pressure: Positive
-    tank_pressure: NonNegative
-    pump_flow: Positive = UNLIMITED_FLOW
-    pump_droop: NonNegative = 0.0
-    relief_override: NonNegative = 0.0
-    load_sensing_margin: Positive = 2.0e6
-    time_constant: NonNegative = 0.0
+    relief_pressure: PositiveFloat
+    tank_pressure: NonNegativeFloat
+    pump_flow: PositiveFloat = UNLIMITED_FLOW
+    pump_droop: NonNegativeFloat = 0.0
+    relief_override: NonNegativeFloat = 0.0
+    load_sensing_margin: PositiveFloat = 2.0e6
+    time_constant: NonNegativeFloat = 0.0
     bulk_modulus: Annotated[float, Field(ge=1.0e7, le=1.0e11)]
     dissolved_air: Annotated[float, Field(ge=0.001, le=0.5)] = 0.09
     entrained_air: Annotated[float, Field(ge=0.0, le=0.2)] = 0.0
 
     @property
-    def highest_pressure(self) -> float:
+    def max_pressure(self) -> float:
         """Supply pressure with the whole pump flow through the relief valve [Pa]."""
         return self.relief_pressure + self.relief_override * self.pump_flow
 
@@ -234,7 +237,7 @@ class Supply(Facts):
         return self
 
 
-class Arm(Facts):
+class Arm(StrictModel):
     """Joint names of a swing-boom-stick(-tool(-head)) arm, and its tip.
 
     `tool` rotates in the plane of the arm, like a bucket or the tilt of a feller-buncher. `head`
@@ -255,7 +258,7 @@ class Arm(Facts):
         return self
 
 
-class Machine(Facts):
+class Machine(StrictModel):
     """Complete description of a machine for simulation, control and identification.
 
     `sensed_joints` are the joints with the angle sensors of a calibrator, starting at the machine.
@@ -283,7 +286,7 @@ class Machine(Facts):
     arm: Arm | None = None
     log_columns: dict[str, str] = {}
     removed_bodies: tuple[str, ...] = ()
-    uncertainty: dict[str, NonNegative] = {}
+    uncertainty: dict[str, NonNegativeFloat] = {}
     terms: tuple[Term, ...] = ()
 
     @property
@@ -294,20 +297,20 @@ class Machine(Facts):
     @property
     def hydraulic_axes(self) -> dict[str, Axis]:
         """Axes with a valve or an individual pump."""
-        return {name: axis for name, axis in self.axes.items() if axis.hydraulic}
+        return {name: axis for name, axis in self.axes.items() if axis.is_hydraulic}
 
     @property
     def valve_axes(self) -> dict[str, Axis]:
         """Axes with a valve."""
         return {name: axis for name, axis in self.axes.items() if axis.valve}
 
-    def highest_pressure(self, axis: str) -> float:
+    def max_feed_pressure(self, axis: str) -> float:
         """Return the maximum feed pressure of an axis [Pa]: supply limit or pump stall pressure."""
         pump = self.axes[axis].pump
         if pump:
             return pump.stall_pressure
         assert self.supply
-        return self.supply.highest_pressure
+        return self.supply.max_pressure
 
     def return_pressure(self, axis: str) -> float:
         """Return the return pressure of a hydraulic axis [Pa]: tank or accumulator of its pump."""
@@ -343,8 +346,8 @@ class Machine(Facts):
             assert self.supply
             most = self.supply.relief_pressure * facts.hydraulic_drive.areas[0]
         turns = facts.cylinder is None and joint.type == "hinge"
-        stiffness = most / (_STOP_TURNS if turns else _STOP_GIVES)
-        return EndStop(stiffness=stiffness, damping=_STOP_RETARDATION * stiffness)
+        stiffness = most / (_END_STOP_ROTATION if turns else _END_STOP_TRAVEL)
+        return EndStop(stiffness=stiffness, damping=_END_STOP_TIME_CONSTANT * stiffness)
 
     @property
     def undriven_sensed_joints(self) -> tuple[str, ...]:
@@ -364,57 +367,55 @@ class Machine(Facts):
 
     @model_validator(mode="after")
     def _check(self):
-        _refuse_names(self.links)
+        _check_names(self.links)
         known = {"world", *self.links}
         for name, link in self.links.items():
-            _expect(link.parent, known - {name}, f"links.{name}.parent")
-        _refuse_cycles(self.links)
+            _check_known(link.parent, known - {name}, f"links.{name}.parent")
+        _check_cycles(self.links)
         joints = self.joints
         for name, axis in self.axes.items():
-            _expect(axis.joint, joints, f"axes.{name}.joint")
+            _check_known(axis.joint, joints, f"axes.{name}.joint")
             if axis.cylinder:
-                _expect(axis.cylinder.base_pin.link, known, f"axes.{name}.cylinder.base_pin.link")
-                _expect(axis.cylinder.rod_pin.link, known, f"axes.{name}.cylinder.rod_pin.link")
+                _check_known(axis.cylinder.base_pin.link, known, f"axes.{name}.cylinder.base_pin.link")
+                _check_known(axis.cylinder.rod_pin.link, known, f"axes.{name}.cylinder.rod_pin.link")
             if axis.four_bar:
-                _expect(axis.four_bar.rocker, known, f"axes.{name}.four_bar.rocker")
-                _expect(axis.four_bar.coupler, known, f"axes.{name}.four_bar.coupler")
+                _check_known(axis.four_bar.rocker, known, f"axes.{name}.four_bar.rocker")
+                _check_known(axis.four_bar.coupler, known, f"axes.{name}.four_bar.coupler")
         for name, closure in self.closures.items():
             for end in (closure.a, closure.b):
-                _expect(end.link, known, f"closures.{name}")
+                _check_known(end.link, known, f"closures.{name}")
         for joint in self.sensed_joints:
-            _expect(joint, joints, "sensed_joints")
+            _check_known(joint, joints, "sensed_joints")
             if joints[joint].type != "hinge":
                 raise ValueError(f"sensed_joints: {joint} must be a hinge")
         if strange := [j for j in self.undriven_sensed_joints if j in self.axes]:
             message = f"{strange[0]} is also the name of an axis of another joint; rename one"
             raise ValueError(f"sensed_joints: {message}")
         for joint in self.home:
-            _expect(joint, joints, "home")
+            _check_known(joint, joints, "home")
             low, high = joints[joint].range or (-np.inf, np.inf)
             if not low <= self.home[joint] <= high:
-                raise ValueError(
-                    f"home.{joint}: {self.home[joint]:g} is outside its range {low:g} .. {high:g}"
-                )
+                raise ValueError(f"home.{joint}: {self.home[joint]:g} is outside its range {low:g} .. {high:g}")
         if self.arm:
             for part in ("swing", "boom", "stick", "tool", "head"):
                 joint = getattr(self.arm, part)
                 if joint is not None:
-                    _expect(joint, joints, f"arm.{part}")
-            _expect(self.arm.tip.link, known, "arm.tip.link")
+                    _check_known(joint, joints, f"arm.{part}")
+            _check_known(self.arm.tip.link, known, "arm.tip.link")
         for channel, error in self.sensor_errors.items():
-            _expect(channel, self.sensed_channels, "sensor_errors")
-            if error.coupled:
+            _check_known(channel, self.sensed_channels, "sensor_errors")
+            if error.has_coupling_error:
                 places = [f"angle.{joint}" for joint in self.undriven_sensed_joints]
-                _expect(channel, places, "sensor_errors (tilt, backlash)")
+                _check_known(channel, places, "sensor_errors (tilt, backlash)")
         _check_terms(self.terms, self.axes, self.supply)
         for name, sensors in self.sensors.items():
             for channel in sensors.channels:
-                _expect(channel, self.sensed_channels, f"sensors.{name}.channels")
+                _check_known(channel, self.sensed_channels, f"sensors.{name}.channels")
         for name, axis in self.axes.items():
             if axis.pump and self.joints[axis.joint].type != "slide":
                 raise ValueError(f"axes.{name}.pump: the axis must have a slide joint")
         for name in self.loads:
-            _expect(name, [n for n, a in self.axes.items() if a.pump], "loads")
+            _check_known(name, [n for n, a in self.axes.items() if a.pump], "loads")
         if self.valve_axes and self.supply is None:
             raise ValueError("valves need a supply: give supply.relief_pressure, pump_flow, ...")
         if len(self.hydraulic_axes) > 8:
@@ -422,16 +423,16 @@ class Machine(Facts):
         return self
 
 
-def _expect(name: str, valid, where: str) -> None:
+def _check_known(name: str, valid, where: str) -> None:
     if name not in valid:
-        raise ValueError(f"{where}: {name!r} is not known; {suggest(name, valid)}")
+        raise ValueError(f"{where}: {name!r} is not known; {suggest_valid_name(name, valid)}")
 
 
 def _check_terms(terms: tuple[Term, ...], axes: dict[str, Axis], supply: Supply | None) -> None:
     seen, limited = set(), supply is not None and supply.kind != "constant_pressure"
     for k, term in enumerate(terms):
-        _expect(term.axis, axes, f"terms.{k}.axis")
-        if term.balance.startswith("flow") and not axes[term.axis].hydraulic:
+        _check_known(term.axis, axes, f"terms.{k}.axis")
+        if term.balance.startswith("flow") and not axes[term.axis].is_hydraulic:
             raise ValueError(f"terms.{k}: axis {term.axis} has no chambers for a {term.balance}")
         if term.balance == "flow_supply" and not (axes[term.axis].valve and limited):
             raise ValueError(
@@ -439,36 +440,33 @@ def _check_terms(terms: tuple[Term, ...], axes: dict[str, Axis], supply: Supply 
                 " valve and a supply of kind constant_flow or load_sensing"
             )
         for variable, axis in term.of.items():
-            _expect(axis, axes, f"terms.{k}.of.{variable}")
-            if variable not in ("position", "velocity", "command") and not axes[axis].hydraulic:
+            _check_known(axis, axes, f"terms.{k}.of.{variable}")
+            if variable not in ("position", "velocity", "command") and not axes[axis].is_hydraulic:
                 raise ValueError(f"terms.{k}.of: axis {axis} has no {variable}")
         memory = term.play or term.switch
-        if memory and not any(axis.hydraulic for axis in axes.values()):
+        if memory and not any(axis.is_hydraulic for axis in axes.values()):
             raise ValueError(f"terms.{k}: play or switch needs a machine with hydraulic axes")
         pushed = axes[term.of.get("force", term.axis)]
-        if memory and memory.variable == "force" and not pushed.hydraulic:
+        if memory and memory.variable == "force" and not pushed.is_hydraulic:
             raise ValueError(f"terms.{k}: play or switch of the force needs a hydraulic axis")
         key = (term.name, term.axis, term.balance)
         if key in seen:
             raise ValueError(
-                f"terms.{k}: {term.name} already adds to {term.balance} of {term.axis};"
-                " rename the second term"
+                f"terms.{k}: {term.name} already adds to {term.balance} of {term.axis}; rename the second term"
             )
         seen.add(key)
 
 
-def _refuse_names(links: dict[str, Link]) -> None:
+def _check_names(links: dict[str, Link]) -> None:
     if "world" in links:
         raise ValueError("links.world: world is the fixed frame; choose another name")
     owner: dict[str, str] = {}
     for name, link in links.items():
         if link.joint and (first := owner.setdefault(link.joint.name, name)) != name:
-            raise ValueError(
-                f"links.{name}.joint: {link.joint.name!r} is already the joint of link {first!r}"
-            )
+            raise ValueError(f"links.{name}.joint: {link.joint.name!r} is already the joint of link {first!r}")
 
 
-def _refuse_cycles(links: dict[str, Link]) -> None:
+def _check_cycles(links: dict[str, Link]) -> None:
     for start in links:
         seen, link = {start}, links[start].parent
         while link != "world":
@@ -478,19 +476,19 @@ def _refuse_cycles(links: dict[str, Link]) -> None:
             link = links[link].parent
 
 
-def following_joints(machine: Machine) -> tuple[str, ...]:
+def dependent_joints(machine: Machine) -> tuple[str, ...]:
     """Return the names of the undriven joints that the closures determine."""
     driven = {axis.joint for axis in machine.axes.values()}
     names: list[str] = []
     for closure in machine.closures.values():
-        for link in links_of_loop(machine, closure.a.link, closure.b.link):
+        for link in loop_links(machine, closure.a.link, closure.b.link):
             joint = machine.links[link].joint
             if joint and joint.name not in driven and joint.name not in names:
                 names.append(joint.name)
     return tuple(names)
 
 
-def links_of_loop(machine: Machine, a: str, b: str) -> list[str]:
+def loop_links(machine: Machine, a: str, b: str) -> list[str]:
     """Return the links between two links of the tree, without their common parents."""
     chains = []
     for link in (a, b):
@@ -502,9 +500,9 @@ def links_of_loop(machine: Machine, a: str, b: str) -> list[str]:
     return [x for x in chains[0] + chains[1] if not (x in chains[0] and x in chains[1])]
 
 
-IDEAL = "ideal"
+IDEAL_SENSORS = "ideal"
 
-_KINDS = {
+_SENSOR_KIND_OF_CHANNEL = {
     "angle": "angle",
     "position": "position",
     "length": "length",
@@ -514,19 +512,18 @@ _KINDS = {
 }
 
 
-def sensor_set(machine: Machine, name: str) -> SensorSet | None:
+def get_sensors(machine: Machine, name: str) -> SensorSet | None:
     """Return a sensor set of a machine by name; None for ideal sensors.
 
     Raises:
         InputError: the machine has no such sensor set; the message lists the valid names.
     """
-    if name == IDEAL:
+    if name == IDEAL_SENSORS:
         return None
     if name not in machine.sensors:
         raise InputError(
             f"sensors {name!r}",
-            f"machine {machine.name} does not have them;"
-            f" {suggest(name, [IDEAL, *machine.sensors])}",
+            f"machine {machine.name} does not have them; {suggest_valid_name(name, [IDEAL_SENSORS, *machine.sensors])}",
         )
     return machine.sensors[name]
 
@@ -536,7 +533,7 @@ def channel_sensor(machine: Machine, sensors: SensorSet | None, channel: str) ->
     if sensors is None:
         return Sensor()
     kind, _, axis = channel.partition(".")
-    of_kind: Sensor = getattr(sensors, _KINDS[kind])
+    of_kind: Sensor = getattr(sensors, _SENSOR_KIND_OF_CHANNEL[kind])
     sensor = sensors.channels.get(channel, of_kind)
     if kind == "length" and sensor.bits and sensor.span is None:
         cylinder = machine.axes[axis].cylinder
@@ -556,7 +553,7 @@ class Converter(NamedTuple):
     high: float
 
 
-def converter(sensor: Sensor, channel: str) -> Converter:
+def channel_converter(sensor: Sensor, channel: str) -> Converter:
     """Return the converter of a channel; lengths and pressures are limited to 0 .. span."""
     if sensor.bits is None or sensor.span is None:
         return Converter(0.0, -math.inf, math.inf)
@@ -569,7 +566,7 @@ def converter(sensor: Sensor, channel: str) -> Converter:
 def noise_rms(machine: Machine, sensors: SensorSet | None, channel: str) -> float:
     """Return the standard deviation of one reading [channel's unit]: random error plus rounding."""
     sensor = channel_sensor(machine, sensors, channel)
-    return math.sqrt(sensor.error_rms**2 + converter(sensor, channel).step ** 2 / 12.0)
+    return math.sqrt(sensor.error_rms**2 + channel_converter(sensor, channel).step ** 2 / 12.0)
 
 
 @compiled
@@ -596,24 +593,24 @@ def warming_drift(time, drift, time_constant):
 
 
 @compiled
-def first_order(shown, before, now, ratio):
+def step_first_order_lag(output, input_start, input_end, ratio):
     """Return the output of a first-order lag after a time step with linearly varying input.
 
-    `T dy/dt = x - y` with `x` from `before` to `now`, integrated exactly.
+    `T dy/dt = x - y` with `x` from `input_start` to `input_end`, integrated exactly.
 
     Args:
-        shown: y at the start of the step, scalar or array [channel's unit].
-        before: input at the start of the step, same shape and unit.
-        now: input at the end of the step, same shape and unit.
+        output: y at the start of the step, scalar or array [channel's unit].
+        input_start: input at the start of the step, same shape and unit.
+        input_end: input at the end of the step, same shape and unit.
         ratio: step length divided by the time constant T, scalar, positive [1].
 
     Returns:
-        y at the end of the step, same shape and unit as `shown`.
+        y at the end of the step, same shape and unit as `output`.
 
     Source: step and ramp response of the first-order lag.
 
-    >>> float(round(first_order(0.0, 1.0, 1.0, 1.0), 6))
+    >>> float(round(step_first_order_lag(0.0, 1.0, 1.0, 1.0), 6))
     0.632121
     """
     gone = -np.expm1(-ratio)
-    return shown + gone * (before - shown) + (1.0 - gone / ratio) * (now - before)
+    return output + gone * (input_start - output) + (1.0 - gone / ratio) * (input_end - input_start)

@@ -14,7 +14,13 @@ import mujoco
 import numpy as np
 import yaml
 
-from hydrotele.core.datafile import parse, read_yaml, scale_numbers, split_unit, suggest
+from hydrotele.core.datafile import (
+    read_yaml,
+    scale_numbers,
+    split_unit,
+    suggest_valid_name,
+    validate_data,
+)
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import copy_mjcf, models_folder, read_xml
 from hydrotele.core.units import PSI
@@ -44,7 +50,7 @@ def machine_path(name_or_path: str | Path) -> Path:
     raise InputError(
         f"machine {str(name_or_path)!r}",
         f"is neither a folder with {MACHINE_FILE} nor a shipped machine;"
-        f" {suggest(str(name_or_path), shipped_machines())}",
+        f" {suggest_valid_name(str(name_or_path), shipped_machines())}",
     )
 
 
@@ -70,23 +76,26 @@ def load_machine(name_or_path: str | Path, tool: str | None = None) -> Machine:
     data, lines = read_yaml(path)
     others: list[dict] = []
     if "extends" in data:
-        data, others = _extended(data, path, lines)
+        data, others = _merge_extended_machine(data, path, lines)
     tools = data.pop("tools", None) or {"none": {}}
     _check_tools(tools, path, lines)
     tool = tool or data.get("tool") or "none"
     if not isinstance(tool, str) or tool not in tools:
-        raise InputError(_place(path, lines, "tools"), f"no tool {tool!r}; {suggest(tool, tools)}")
+        raise InputError(
+            _format_location(path, lines, "tools"),
+            f"no tool {tool!r}; {suggest_valid_name(tool, tools)}",
+        )
     lines = _merge_tool(data, tool, tools[tool] or {}, path, lines)
     data |= {"tool": tool, "tools": sorted(tools), "folder": str(path.parent.resolve())}
     others += [fragment for name, fragment in tools.items() if name != tool and fragment]
-    kept = _bodies_of([data])
+    kept = _body_names([data])
     if data.get("resolved") and not (path.parent / str(data.get("mjcf"))).exists():
         data["folder"] = str(models_folder().resolve())
     elif not data.get("resolved"):
-        data["removed_bodies"] = [name for name in _bodies_of(others) if name not in kept]
+        data["removed_bodies"] = [name for name in _body_names(others) if name not in kept]
     _complete_links(data, path, lines)
     _resolve_drives(data, path, lines)
-    return parse(Machine, data, str(path), lines)
+    return validate_data(Machine, data, str(path), lines)
 
 
 def save_machine(machine: Machine, path: str | Path) -> None:
@@ -138,19 +147,15 @@ def _with_law_files(machine: Machine, folder: Path) -> Machine:
     return machine.model_copy(update={"terms": tuple(terms)})
 
 
-def _extended(data: dict, path: Path, lines) -> tuple[dict, list[dict]]:
+def _merge_extended_machine(data: dict, path: Path, lines) -> tuple[dict, list[dict]]:
     """Merge a machine file with the machine that it extends.
 
     Returns:
         The complete data, and the sections of the unused tools of the other machine.
     """
     base = data.pop("extends")
-    where = _place(path, lines, "extends")
-    if (
-        not isinstance(base, dict)
-        or not base.keys() <= {"machine", "tool"}
-        or "machine" not in base
-    ):
+    where = _format_location(path, lines, "extends")
+    if not isinstance(base, dict) or not base.keys() <= {"machine", "tool"} or "machine" not in base:
         raise InputError(where, "must be {machine: NAME or FOLDER, tool: NAME}")
     name = str(base["machine"])
     beside = path.parent / name
@@ -162,24 +167,24 @@ def _extended(data: dict, path: Path, lines) -> tuple[dict, list[dict]]:
     _check_tools(tools, file, base_lines)
     tool = base.get("tool", "none")
     if tool not in tools:
-        raise InputError(where, f"{name} has no tool {tool!r}; {suggest(str(tool), tools)}")
+        raise InputError(where, f"{name} has no tool {tool!r}; {suggest_valid_name(str(tool), tools)}")
     _merge_tool(whole, tool, tools[tool] or {}, file, base_lines)
     if whole.get("mjcf"):
         whole["mjcf"] = os.path.relpath(file.parent / str(whole["mjcf"]), path.parent)
     unused = [fragment for other, fragment in tools.items() if other != tool and fragment]
-    whole = _overlaid(whole, data)
-    home = _entries(whole, "home")
+    whole = _merge_sections(whole, data)
+    home = _section_entries(whole, "home")
     return whole | {"home": {k: v for k, v in home.items() if v is not None}}, unused
 
 
-def _overlaid(base, new):
+def _merge_sections(base, new):
     """Return `base` updated by `new`; mappings are merged recursively."""
     if not (isinstance(base, dict) and isinstance(new, dict)):
         return new
-    return base | {key: _overlaid(base.get(key), value) for key, value in new.items()}
+    return base | {key: _merge_sections(base.get(key), value) for key, value in new.items()}
 
 
-def _place(path: Path, lines, *keys: str) -> str:
+def _format_location(path: Path, lines, *keys: str) -> str:
     """Return file, line and key path as text for messages."""
     line = next((lines[keys[:k]] for k in range(len(keys), 0, -1) if keys[:k] in lines), 0)
     return f"{path}{f':{line}' if line else ''}: {'.'.join(keys)}"
@@ -187,11 +192,11 @@ def _place(path: Path, lines, *keys: str) -> str:
 
 def _check_tools(tools, path: Path, lines) -> None:
     if not isinstance(tools, dict) or not all(isinstance(name, str) for name in tools):
-        raise InputError(_place(path, lines, "tools"), "must map tool names to their sections")
+        raise InputError(_format_location(path, lines, "tools"), "must map tool names to their sections")
     for name, fragment in tools.items():
         if not isinstance(fragment, (dict, type(None))):
             message = "must map sections (links, axes, home, ...) to the entries of the tool"
-            raise InputError(_place(path, lines, "tools", name), message)
+            raise InputError(_format_location(path, lines, "tools", name), message)
 
 
 def _merge_tool(data: dict, tool: str, fragment: dict, path: Path, lines) -> dict:
@@ -203,13 +208,13 @@ def _merge_tool(data: dict, tool: str, fragment: dict, path: Path, lines) -> dic
             if section in ("links", "axes", "closures"):
                 for twice in entries.keys() & data[section]:
                     message = "already exists in the machine; use another name in the tool"
-                    raise InputError(_place(path, lines, *old, str(twice)), message)
+                    raise InputError(_format_location(path, lines, *old, str(twice)), message)
             entries = {**data[section], **entries}
         data[section] = entries
     return lines
 
 
-def _entries(data: dict, section: str) -> dict:
+def _section_entries(data: dict, section: str) -> dict:
     """Return the named entries of a section; empty if the section is not a mapping."""
     entries = data.get(section)
     if not isinstance(entries, dict):
@@ -217,11 +222,11 @@ def _entries(data: dict, section: str) -> dict:
     return {name: facts for name, facts in entries.items() if isinstance(name, str)}
 
 
-def _bodies_of(fragments) -> tuple[str, ...]:
+def _body_names(fragments) -> tuple[str, ...]:
     names = []
     for fragment in fragments:
-        names += _entries(fragment, "links")
-        for axis, facts in _entries(fragment, "axes").items():
+        names += _section_entries(fragment, "links")
+        for axis, facts in _section_entries(fragment, "axes").items():
             if isinstance(facts, dict) and "cylinder" in facts:
                 names += [f"{axis}_tube", f"{axis}_rod"]
     return tuple(dict.fromkeys(names))
@@ -238,22 +243,22 @@ def _complete_links(data: dict, path: Path, lines) -> None:
         read_xml(mjcf)
     except InputError as error:
         message = f"{mjcf} cannot be read: {error.message}"
-        raise InputError(_place(path, lines, "mjcf"), message) from None
+        raise InputError(_format_location(path, lines, "mjcf"), message) from None
     try:
         spec = mujoco.MjSpec.from_file(str(mjcf))
     except (OSError, ValueError) as error:
         message = f"{mjcf} cannot be read: {error}"
-        raise InputError(_place(path, lines, "mjcf"), message) from None
-    for name, link in _entries(data, "links").items():
+        raise InputError(_format_location(path, lines, "mjcf"), message) from None
+    for name, link in _section_entries(data, "links").items():
         body = spec.body(name)
         if body is None or name == "world" or not isinstance(link, dict):
             continue
-        where = _place(path, lines, "links", name)
-        known = _facts_of_body(body, spec.compiler.degree, f"{where}: body {name!r} of {mjcf.name}")
-        data["links"][name] = _join(link, known, where, mjcf.name)
+        where = _format_location(path, lines, "links", name)
+        known = _read_body(body, spec.compiler.degree, f"{where}: body {name!r} of {mjcf.name}")
+        data["links"][name] = _merge_link(link, known, where, mjcf.name)
 
 
-def _join(link: dict, known: dict, where: str, mjcf: str) -> dict:
+def _merge_link(link: dict, known: dict, where: str, mjcf: str) -> dict:
     """Merge the YAML and MJCF data of a link; a value may be in one of them only."""
     joint, known_joint = link.get("joint"), known.get("joint")
     twice = {key for key in link if split_unit(str(key))[0] in known} - {"joint"}
@@ -267,15 +272,13 @@ def _join(link: dict, known: dict, where: str, mjcf: str) -> dict:
     return known | link
 
 
-def _facts_of_body(body, degrees: bool, where: str) -> dict:
+def _read_body(body, degrees: bool, where: str) -> dict:
     """Return parent, position, inertia and joint of an MJCF body, with default classes applied."""
     facts: dict = {"parent": body.parent.name}
     if np.any(body.pos):
         facts["position"] = body.pos.tolist()
     if body.explicitinertial:
-        turned = (
-            np.any(body.iquat[1:]) or body.ialt.type != mujoco.mjtOrientation.mjORIENTATION_QUAT
-        )
+        turned = np.any(body.iquat[1:]) or body.ialt.type != mujoco.mjtOrientation.mjORIENTATION_QUAT
         if turned or np.all(np.isfinite(body.fullinertia)):
             raise InputError(where, "the inertia must be a diaginertia in the axes of the body")
         facts |= {"mass": body.mass, "com": body.ipos.tolist(), "inertia": body.inertia.tolist()}
@@ -296,19 +299,19 @@ def _facts_of_body(body, degrees: bool, where: str) -> dict:
 
 def _resolve_drives(data: dict, path: Path, lines) -> None:
     """Convert pins in polar coordinates to points, and motor torque per psi to displacement."""
-    for name, axis in _entries(data, "axes").items():
+    for name, axis in _section_entries(data, "axes").items():
         if not isinstance(axis, dict):
             continue
         cylinder, motor = axis.get("cylinder"), axis.get("motor")
         for part in ("base_pin", "rod_pin"):
             if isinstance(cylinder, dict) and isinstance(cylinder.get(part), dict):
-                where = _place(path, lines, "axes", name, "cylinder", part)
+                where = _format_location(path, lines, "axes", name, "cylinder", part)
                 cylinder[part] = _resolve_pin(cylinder[part], data, where)
         if isinstance(motor, dict) and "torque_per_psi" in motor:
             motor = dict(motor)
-            where = _place(path, lines, "axes", name, "motor", "torque_per_psi")
-            torque = _number(motor.pop("torque_per_psi"), where)
-            ratio = _number(motor.pop("gear_ratio", 1.0), where)
+            where = _format_location(path, lines, "axes", name, "motor", "torque_per_psi")
+            torque = _check_number(motor.pop("torque_per_psi"), where)
+            ratio = _check_number(motor.pop("gear_ratio", 1.0), where)
             axis["motor"] = motor | {"displacement": torque * ratio / PSI}
 
 
@@ -319,21 +322,21 @@ def _resolve_pin(pin: dict, data: dict, where: str) -> dict:
     pin = dict(pin)
     origin = [0.0, 0.0, 0.0]
     if "from" in pin:
-        child, links = pin.pop("from"), _entries(data, "links")
+        child, links = pin.pop("from"), _section_entries(data, "links")
         if child not in list(links):
-            raise InputError(where, f"from: {child!r} is not a link; {suggest(child, links)}")
+            raise InputError(where, f"from: {child!r} is not a link; {suggest_valid_name(child, links)}")
         link = links[child] if isinstance(links[child], dict) else {}
         origin = link.get("position") or scale_numbers(link.get("position_mm"), 1.0e-3) or origin
         if not isinstance(origin, list) or len(origin) != 3:
             raise InputError(where, f"links.{child}.position must be three numbers")
-    x, y, z = (_number(value, f"{where}: links.position") for value in origin)
-    distance = _number(pin.pop("distance"), f"{where}.distance")
-    angle = math.radians(_number(pin.pop("angle_deg", 0.0), f"{where}.angle_deg"))
+    x, y, z = (_check_number(value, f"{where}: links.position") for value in origin)
+    distance = _check_number(pin.pop("distance"), f"{where}.distance")
+    angle = math.radians(_check_number(pin.pop("angle_deg", 0.0), f"{where}.angle_deg"))
     pin["position"] = [x + distance * math.cos(angle), y, z + distance * math.sin(angle)]
     return pin
 
 
-def _number(value, where: str) -> float:
+def _check_number(value, where: str) -> float:
     try:
         number = float("nan" if isinstance(value, (str, bool)) else value)
     except (TypeError, ValueError, OverflowError):

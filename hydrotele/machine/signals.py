@@ -11,11 +11,11 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
-_AXIS = re.compile(r"[a-z][a-z0-9_]*")
-_TRUTH = "truth."
+_AXIS_PATTERN = re.compile(r"[a-z][a-z0-9_]*")
+_TRUTH_PREFIX = "truth."
 
 
-class Kind(NamedTuple):
+class ChannelKind(NamedTuple):
     """Definition of one kind of channel.
 
     Attributes:
@@ -43,67 +43,67 @@ class Channel(NamedTuple):
         return channel_name(self.kind, self.axis, truth=self.truth)
 
 
-MEASURED: Mapping[str, Kind] = {
-    "time": Kind(("s",), "time of the row", "none"),
-    "command": Kind(("1", "V", "N"), "valve command in [-1, 1], drive voltage or force"),
-    "valid": Kind(("1",), "1 if the row may be used, 0 in contact or in masked rows", "none"),
-    "reference": Kind(("rad", "m"), "position reference of the controller"),
-    "handle": Kind(("m", "rad"), "displacement of the joystick's handle"),
-    "hand_force": Kind(("N", "N m"), "estimated force of the hand on the handle"),
-    "handle_force": Kind(("N", "N m"), "force of the coils on the handle without its weight"),
-    "handle_stiffness": Kind(("N/m", "N m/rad"), "stiffness of the joystick's axis"),
-    "coil_current": Kind(("A",), "current of a coil of the joystick"),
-    "tip_force": Kind(("N", "N m"), "estimated force of the environment on the tip"),
-    "tip_pose": Kind(("m", "rad"), "pose of the tip from the measured joints"),
-    "tip_reference": Kind(("m", "rad"), "reference pose of the tip"),
-    "angle": Kind(("rad",), "joint angle, not wrapped"),
-    "position": Kind(("m",), "displacement of a prismatic joint"),
-    "length": Kind(("m",), "piston displacement of a cylinder"),
-    "velocity": Kind(("rad/s", "m/s"), "joint velocity"),
-    "torque": Kind(("N m",), "joint torque"),
-    "force": Kind(("N",), "force along a prismatic joint"),
-    "pressure_head": Kind(("Pa",), "head side chamber, or port A of a motor"),
-    "pressure_rod": Kind(("Pa",), "rod side chamber, or port B of a motor"),
-    "pressure_supply": Kind(("Pa",), "pump or supply pressure", "none"),
-    "speed": Kind(("rad/s",), "speed of a pump, with the sign of the side that it feeds"),
-    "speed_reference": Kind(("rad/s",), "pump speed reference of the controller"),
-    "current": Kind(("A", "1"), "motor current, or uncalibrated converter counts"),
+MEASURED_KINDS: Mapping[str, ChannelKind] = {
+    "time": ChannelKind(("s",), "time of the row", "none"),
+    "command": ChannelKind(("1", "V", "N"), "valve command in [-1, 1], drive voltage or force"),
+    "valid": ChannelKind(("1",), "1 if the row may be used, 0 in contact or in masked rows", "none"),
+    "reference": ChannelKind(("rad", "m"), "position reference of the controller"),
+    "handle": ChannelKind(("m", "rad"), "displacement of the joystick's handle"),
+    "hand_force": ChannelKind(("N", "N m"), "estimated force of the hand on the handle"),
+    "handle_force": ChannelKind(("N", "N m"), "force of the coils on the handle without its weight"),
+    "handle_stiffness": ChannelKind(("N/m", "N m/rad"), "stiffness of the joystick's axis"),
+    "coil_current": ChannelKind(("A",), "current of a coil of the joystick"),
+    "tip_force": ChannelKind(("N", "N m"), "estimated force of the environment on the tip"),
+    "tip_pose": ChannelKind(("m", "rad"), "pose of the tip from the measured joints"),
+    "tip_reference": ChannelKind(("m", "rad"), "reference pose of the tip"),
+    "angle": ChannelKind(("rad",), "joint angle, not wrapped"),
+    "position": ChannelKind(("m",), "displacement of a prismatic joint"),
+    "length": ChannelKind(("m",), "piston displacement of a cylinder"),
+    "velocity": ChannelKind(("rad/s", "m/s"), "joint velocity"),
+    "torque": ChannelKind(("N m",), "joint torque"),
+    "force": ChannelKind(("N",), "force along a prismatic joint"),
+    "pressure_head": ChannelKind(("Pa",), "head side chamber, or port A of a motor"),
+    "pressure_rod": ChannelKind(("Pa",), "rod side chamber, or port B of a motor"),
+    "pressure_supply": ChannelKind(("Pa",), "pump or supply pressure", "none"),
+    "speed": ChannelKind(("rad/s",), "speed of a pump, with the sign of the side that it feeds"),
+    "speed_reference": ChannelKind(("rad/s",), "pump speed reference of the controller"),
+    "current": ChannelKind(("A", "1"), "motor current, or uncalibrated converter counts"),
 }
 
-TRUTH: Mapping[str, Kind] = {
-    **{k: MEASURED[k] for k in ("angle", "position", "length", "velocity", "torque")},
-    **{k: MEASURED[k] for k in ("pressure_head", "pressure_rod", "pressure_supply")},
-    "acceleration": Kind(("rad/s^2", "m/s^2"), "joint acceleration"),
-    "speed": MEASURED["speed"],
-    "pressure_load": Kind(("Pa",), "pressure in the load cylinder of an axis"),
-    "spool": Kind(("1",), "spool position relative to its stroke"),
-    "spool_rate": Kind(("1/s",), "spool speed relative to the stroke"),
-    "bristle": Kind(("1",), "friction force of the bristles relative to the breakaway force"),
-    "delivery": Kind(("1",), "flow setting of the pump relative to its largest flow", "none"),
-    "added_delivery": Kind(("1",), "flow added by terms relative to the largest flow", "none"),
-    "memory": Kind(("1",), "internal state of a term: backlash over half width, or relay 0 to 1"),
-    "flow_head": Kind(("m^3/s",), "valve flow into the head side chamber"),
-    "flow_rod": Kind(("m^3/s",), "valve flow into the rod side chamber"),
-    "flow_supply": Kind(("m^3/s",), "pump flow", "none"),
-    "force": Kind(("N", "N m"), "piston force or motor torque after friction"),
-    "piston_velocity": Kind(("m/s",), "velocity of the piston in its tube"),
-    "contact_force": Kind(("N",), "contact force on the tool, base frame", "xyz"),
-    "object_contact": Kind(("N",), "contact force of a plate, tree, stump or log on the machine"),
-    "tip": Kind(("m",), "position of the tool tip, base frame", "xyz"),
+TRUTH_KINDS: Mapping[str, ChannelKind] = {
+    **{k: MEASURED_KINDS[k] for k in ("angle", "position", "length", "velocity", "torque")},
+    **{k: MEASURED_KINDS[k] for k in ("pressure_head", "pressure_rod", "pressure_supply")},
+    "acceleration": ChannelKind(("rad/s^2", "m/s^2"), "joint acceleration"),
+    "speed": MEASURED_KINDS["speed"],
+    "pressure_load": ChannelKind(("Pa",), "pressure in the load cylinder of an axis"),
+    "spool": ChannelKind(("1",), "spool position relative to its stroke"),
+    "spool_rate": ChannelKind(("1/s",), "spool speed relative to the stroke"),
+    "bristle": ChannelKind(("1",), "friction force of the bristles relative to the breakaway force"),
+    "delivery": ChannelKind(("1",), "flow setting of the pump relative to its largest flow", "none"),
+    "added_delivery": ChannelKind(("1",), "flow added by terms relative to the largest flow", "none"),
+    "memory": ChannelKind(("1",), "internal state of a term: backlash over half width, or relay 0 to 1"),
+    "flow_head": ChannelKind(("m^3/s",), "valve flow into the head side chamber"),
+    "flow_rod": ChannelKind(("m^3/s",), "valve flow into the rod side chamber"),
+    "flow_supply": ChannelKind(("m^3/s",), "pump flow", "none"),
+    "force": ChannelKind(("N", "N m"), "piston force or motor torque after friction"),
+    "piston_velocity": ChannelKind(("m/s",), "velocity of the piston in its tube"),
+    "contact_force": ChannelKind(("N",), "contact force on the tool, base frame", "xyz"),
+    "object_contact": ChannelKind(("N",), "contact force of a plate, tree, stump or log on the machine"),
+    "tip": ChannelKind(("m",), "position of the tool tip, base frame", "xyz"),
 }
 
 
-class Limits(NamedTuple):
+class MagnitudeLimits(NamedTuple):
     """Plausible range of the maximum magnitude of a channel in a run, and the likely wrong unit."""
 
-    smallest: float
-    largest: float
+    min_magnitude: float
+    max_magnitude: float
     looks_like: str
 
 
 # SI unit -> (limits if the file states the unit, limits if it states none)
-_LIMITS: Mapping[str, tuple[Limits, Limits]] = {
-    unit: (Limits(low, high, looks), Limits(low_unstated, high_unstated, looks))
+_LIMITS_OF_UNIT: Mapping[str, tuple[MagnitudeLimits, MagnitudeLimits]] = {
+    unit: (MagnitudeLimits(low, high, looks), MagnitudeLimits(low_unstated, high_unstated, looks))
     for unit, low, low_unstated, high, high_unstated, looks in (
         ("rad", 0.0, 0.0, 1.0e4, 4 * math.pi, "degrees"),
         ("rad/s", 0.0, 0.0, 100.0, 4 * math.pi, "degrees per second"),
@@ -112,12 +112,12 @@ _LIMITS: Mapping[str, tuple[Limits, Limits]] = {
         ("Pa", 1e4, 1e5, math.inf, math.inf, "bar, MPa, kPa or psi"),
     )
 }
-_NO_LIMITS = Limits(0.0, math.inf, "")
+_NO_LIMITS = MagnitudeLimits(0.0, math.inf, "")
 # Loggers may exceed 1 by float32 rounding or a few counts.
-_COMMAND_LIMITS = Limits(0.0, 1.0 + 1e-3, "percent, counts or volts")
+_COMMAND_LIMITS = MagnitudeLimits(0.0, 1.0 + 1e-3, "percent, counts or volts")
 
 
-def magnitude_limits(name: str, unit: str, *, stated: bool = True) -> Limits:
+def magnitude_limits(name: str, unit: str, *, stated: bool = True) -> MagnitudeLimits:
     """Return the plausible range of the maximum magnitude of a channel [unit].
 
     Values outside it indicate a wrong unit. The range is wider if the file states the unit.
@@ -129,7 +129,7 @@ def magnitude_limits(name: str, unit: str, *, stated: bool = True) -> Limits:
         return _COMMAND_LIMITS
     if name.startswith(("speed.", "speed_reference.", "truth.speed.")):
         return _NO_LIMITS  # a pump turns faster than any joint
-    return _LIMITS.get(unit, (_NO_LIMITS, _NO_LIMITS))[0 if stated else 1]
+    return _LIMITS_OF_UNIT.get(unit, (_NO_LIMITS, _NO_LIMITS))[0 if stated else 1]
 
 
 def channel_name(kind: str, axis: str = "", *, truth: bool = False) -> str:
@@ -138,7 +138,7 @@ def channel_name(kind: str, axis: str = "", *, truth: bool = False) -> str:
     >>> channel_name("flow_head", "boom", truth=True)
     'truth.flow_head.boom'
     """
-    return (_TRUTH if truth else "") + (f"{kind}.{axis}" if axis else kind)
+    return (_TRUTH_PREFIX if truth else "") + (f"{kind}.{axis}" if axis else kind)
 
 
 def channel_names(kind: str, axes: Iterable[str], *, truth: bool = False) -> tuple[str, ...]:
@@ -149,8 +149,8 @@ def channel_names(kind: str, axes: Iterable[str], *, truth: bool = False) -> tup
 def valid_kinds() -> tuple[str, ...]:
     """Return all forms of channel names, such as `angle.<axis>`, measured channels first."""
     endings = {"free": ".<axis>", "xyz": ".x|y|z", "none": ""}
-    measured = [kind + endings[spec.axes] for kind, spec in MEASURED.items()]
-    return tuple(measured + [_TRUTH + kind + endings[spec.axes] for kind, spec in TRUTH.items()])
+    measured = [kind + endings[spec.axes] for kind, spec in MEASURED_KINDS.items()]
+    return tuple(measured + [_TRUTH_PREFIX + kind + endings[spec.axes] for kind, spec in TRUTH_KINDS.items()])
 
 
 def parse_channel(name: str) -> Channel:
@@ -163,14 +163,14 @@ def parse_channel(name: str) -> Channel:
         ValueError: the kind is unknown, or the axis is missing, superfluous or misspelt; the
             message suggests similar valid names.
     """
-    truth = name.startswith(_TRUTH)
-    kind, dot, axis = name.removeprefix(_TRUTH).partition(".")
-    spec = (TRUTH if truth else MEASURED).get(kind)
+    truth = name.startswith(_TRUTH_PREFIX)
+    kind, dot, axis = name.removeprefix(_TRUTH_PREFIX).partition(".")
+    spec = (TRUTH_KINDS if truth else MEASURED_KINDS).get(kind)
     if spec is None:
-        raise ValueError(_unknown(name))
+        raise ValueError(_unknown_channel_message(name))
     if spec.axes == "none" and dot:
         raise ValueError(f"{kind} has no axis: write {channel_name(kind, truth=truth)}")
-    if spec.axes == "free" and not _AXIS.fullmatch(axis):
+    if spec.axes == "free" and not _AXIS_PATTERN.fullmatch(axis):
         example = channel_name(kind, "boom", truth=truth)
         raise ValueError(f"{kind} needs an axis in lower case, such as {example}, got {name!r}")
     if spec.axes == "xyz" and axis not in ("x", "y", "z"):
@@ -188,16 +188,16 @@ def allowed_units(name: str) -> tuple[str, ...]:
         ValueError: as `parse_channel`.
     """
     channel = parse_channel(name)
-    return (TRUTH if channel.truth else MEASURED)[channel.kind].units
+    return (TRUTH_KINDS if channel.truth else MEASURED_KINDS)[channel.kind].units
 
 
-def usual_unit(name: str, present: Iterable[str] = ()) -> str:
+def default_unit(name: str, present: Iterable[str] = ()) -> str:
     """Return the default unit of a channel for files that state none.
 
     If a kind can be rotary or linear, the linear unit is used if the log has a `position` channel
     of the same axis.
 
-    >>> usual_unit("reference.slide", present=["position.slide"])
+    >>> default_unit("reference.slide", present=["position.slide"])
     'm'
 
     Raises:
@@ -205,7 +205,7 @@ def usual_unit(name: str, present: Iterable[str] = ()) -> str:
     """
     units = allowed_units(name)
     position = channel_name("position", parse_channel(name).axis)
-    linear = units[0].startswith("rad") and not {position, _TRUTH + position}.isdisjoint(present)
+    linear = units[0].startswith("rad") and not {position, _TRUTH_PREFIX + position}.isdisjoint(present)
     return units[-1] if linear else units[0]
 
 
@@ -218,9 +218,9 @@ def close_matches(name: str, present: Iterable[str] = ()) -> list[str]:
     'angle.boom'
     """
     plain = re.sub(r"[^a-z0-9_.]+", "_", name.strip().lower())
-    truth = plain.startswith(_TRUTH)
-    kinds = TRUTH if truth else MEASURED
-    words = [word for word in plain.removeprefix(_TRUTH).split(".") if _AXIS.fullmatch(word)]
+    truth = plain.startswith(_TRUTH_PREFIX)
+    kinds = TRUTH_KINDS if truth else MEASURED_KINDS
+    words = [word for word in plain.removeprefix(_TRUTH_PREFIX).split(".") if _AXIS_PATTERN.fullmatch(word)]
     if len(words) == 2 and words[1] in kinds and words[0] not in kinds:  # boom.angle
         return [channel_name(words[1], words[0], truth=truth)]
     for kind in kinds:  # angle_boom
@@ -233,7 +233,7 @@ def close_matches(name: str, present: Iterable[str] = ()) -> list[str]:
     return difflib.get_close_matches(plain, dict.fromkeys(candidates), n=3, cutoff=0.6)
 
 
-def _unknown(name: str) -> str:
+def _unknown_channel_message(name: str) -> str:
     near = close_matches(name)
     hint = f"did you mean {' or '.join(near)}? " if near else ""
     return f"unknown channel {name!r}; {hint}Valid: {', '.join(valid_kinds())}"

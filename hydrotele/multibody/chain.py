@@ -1,4 +1,4 @@
-"""Read a mechanism from MJCF as a joint tree with loops closed by `connect` and `weld` constraints.
+"""Read a mechanism from MJCF as a joint tree with loops closed by `connect` and `is_weld` constraints.
 
 Every joint of the tree is a hinge or a slide. A ball joint becomes three successive hinges about x,
 y and z (Cardan angles, singular if the second is 90 degrees). A free joint becomes three slides and
@@ -18,7 +18,7 @@ _FREE, _BALL, _SLIDE, _HINGE = (
     int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "BALL", "SLIDE", "HINGE")
 )
 _CONNECT, _WELD = int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)
-_WHERE = "chain"
+_ERROR_CONTEXT = "chain"
 
 
 class Tree(NamedTuple):
@@ -27,33 +27,33 @@ class Tree(NamedTuple):
     Attributes:
         parent: (b,) index of the parent body.
         offset: (b, 3) origin of the body frame in the parent frame [m].
-        turn: (b, 3, 3) orientation of the body frame in the parent frame.
-        first: (b + 1,) index of the first joint of a body; `first[i + 1]` is the end.
-        slides: (v,) whether a joint is a slide; otherwise it is a hinge.
+        rotation: (b, 3, 3) orientation of the body frame in the parent frame.
+        first_joint: (b + 1,) index of the first joint of a body; `first[i + 1]` is the end.
+        is_slide: (v,) whether a joint is a slide; otherwise it is a hinge.
         axis: (v, 3) joint axis in the body frame.
         anchor: (v, 3) point on the axis in the body frame [m].
-        zero: (v,) joint position in the reference pose of the file [rad] or [m].
-        above: (b, v) whether a joint moves a body.
-        ends: (c, 2) bodies that a closure connects.
-        points: (c, 2, 3) points that the closure makes coincide, in the body frames [m].
-        turns: (c, 2, 3, 3) orientations that a weld makes coincide, in the body frames.
-        row: (c + 1,) index of the first equation of a closure: a connect has 3, a weld 6.
+        reference_position: (v,) joint position in the reference pose of the file [rad] or [m].
+        is_moved: (b, v) whether a joint moves a body.
+        closure_bodies: (c, 2) bodies that a closure connects.
+        closure_points: (c, 2, 3) points that the closure makes coincide, in the body frames [m].
+        closure_rotations: (c, 2, 3, 3) orientations that a weld makes coincide, in the body frames.
+        first_equation: (c + 1,) index of the first equation of a closure: a connect has 3, a weld 6.
         gravity: (3,) [m/s^2].
     """
 
     parent: np.ndarray
     offset: np.ndarray
-    turn: np.ndarray
-    first: np.ndarray
-    slides: np.ndarray
+    rotation: np.ndarray
+    first_joint: np.ndarray
+    is_slide: np.ndarray
     axis: np.ndarray
     anchor: np.ndarray
-    zero: np.ndarray
-    above: np.ndarray
-    ends: np.ndarray
-    points: np.ndarray
-    turns: np.ndarray
-    row: np.ndarray
+    reference_position: np.ndarray
+    is_moved: np.ndarray
+    closure_bodies: np.ndarray
+    closure_points: np.ndarray
+    closure_rotations: np.ndarray
+    first_equation: np.ndarray
     gravity: np.ndarray
 
 
@@ -75,10 +75,10 @@ class Chain:
         damping: (v,) [N s/m] or [N m s/rad].
         frictionloss: (v,) dry friction [N] or [N m].
         stiffness: (v,) stiffness of the joint spring [N/m] or [N m/rad].
-        rest: (v,) rest position of the joint spring [rad] or [m].
+        spring_rest: (v,) rest position of the joint spring [rad] or [m].
         drives: joints that an actuator moves, in the order of the actuators.
-        places: (v,) index of a joint in MuJoCo's `qpos`, -1 for parts of ball and free joints.
-        dofs: (v,) index of a joint in MuJoCo's `qvel`, -1 likewise.
+        qpos_indices: (v,) index of a joint in MuJoCo's `qpos`, -1 for parts of ball and free joints.
+        dof_indices: (v,) index of a joint in MuJoCo's `qvel`, -1 likewise.
     """
 
     name: str
@@ -92,10 +92,10 @@ class Chain:
     damping: np.ndarray
     frictionloss: np.ndarray
     stiffness: np.ndarray
-    rest: np.ndarray
+    spring_rest: np.ndarray
     drives: tuple[str, ...]
-    places: np.ndarray
-    dofs: np.ndarray
+    qpos_indices: np.ndarray
+    dof_indices: np.ndarray
 
     def index(self, joint: str) -> int:
         """Return the index of a joint.
@@ -104,7 +104,7 @@ class Chain:
             InputError: the joint does not exist.
         """
         if joint not in self.joints:
-            raise InputError(_WHERE, f"{self.name} has no joint {joint}: {', '.join(self.joints)}")
+            raise InputError(_ERROR_CONTEXT, f"{self.name} has no joint {joint}: {', '.join(self.joints)}")
         return self.joints.index(joint)
 
 
@@ -113,18 +113,18 @@ class _Joint(NamedTuple):
 
     name: str
     body: int
-    slides: bool
+    is_slide: bool
     axis: tuple[float, ...]
     anchor: tuple[float, ...]
-    zero: float
+    reference_position: float
     start: float
     armature: float
     damping: float
     frictionloss: float
     stiffness: float
-    rest: float
-    place: int
-    dof: int
+    spring_rest: float
+    qpos_index: int
+    dof_index: int
 
 
 def load_chain(source: str | Path | mujoco.MjModel) -> Chain:
@@ -142,53 +142,54 @@ def load_chain(source: str | Path | mujoco.MjModel) -> Chain:
     Raises:
         InputError: the file does not exist, a ball or free joint has an actuator, damping,
             armature, friction or a spring, or there is an active constraint other than `connect`
-            and `weld`.
+            and `is_weld`.
 
     Source: MuJoCo manual, `mj_kinematics` and `mjData`.
     """
-    model = _read(source) if isinstance(source, str | Path) else source
-    closures = _closures(model)
+    model = _read_model(source) if isinstance(source, str | Path) else source
+    closures = _read_closures(model)
     moved = [
         int(model.actuator_trnid[a, 0])
         for a in range(model.nu)
         if model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT
     ]
     held = {int(model.body_rootid[model.jnt_bodyid[j]]) for j in moved}
-    held |= {int(model.body_rootid[body]) for one in closures for body in one.ends}
+    held |= {int(model.body_rootid[body]) for one in closures for body in one.bodies}
     held = held - {0} or set(range(model.nbody))
     pose = model.key_qpos[0] if model.nkey else model.qpos0
     joints: list[_Joint] = []
     first = np.zeros(model.nbody + 1, np.int64)
-    offset, turn = model.body_pos.copy(), np.array([_turn(q) for q in model.body_quat])
+    offset, turn = model.body_pos.copy(), np.array([_rotation_matrix(q) for q in model.body_quat])
     for b in range(model.nbody):
         for j in range(model.body_jntadr[b], model.body_jntadr[b] + model.body_jntnum[b]):
             if model.body_rootid[b] not in held:
                 continue
             if model.jnt_type[j] == _FREE:  # its position is the absolute position of the body
                 offset[b], turn[b] = 0.0, np.eye(3)
-            joints += _scalar_joints(model, j, pose)
+            joints += _split_joint(model, j, pose)
         first[b + 1] = len(joints)
     above = np.zeros((model.nbody, len(joints)), dtype=np.bool_)
     for b in range(1, model.nbody):
         above[b] = above[model.body_parentid[b]]
         above[b, first[b] : first[b + 1]] = True
     c, names = len(closures), tuple(joint.name for joint in joints)
-    whole = {joint.place: joint.name for joint in joints if joint.place >= 0}
+    whole = {joint.qpos_index: joint.name for joint in joints if joint.qpos_index >= 0}
     for j in moved:
         if int(model.jnt_qposadr[j]) not in whole:
             raise InputError(
-                _WHERE, f"joint {model.joint(j).name or j} has a drive; it must be a hinge or slide"
+                _ERROR_CONTEXT,
+                f"joint {model.joint(j).name or j} has a drive; it must be a hinge or slide",
             )
     tree = Tree(
-        parent=model.body_parentid.astype(np.int64), offset=offset, turn=turn, first=first,
-        slides=np.array([joint.slides for joint in joints], np.bool_),
+        parent=model.body_parentid.astype(np.int64), offset=offset, rotation=turn, first_joint=first,
+        is_slide=np.array([joint.is_slide for joint in joints], np.bool_),
         axis=np.array([joint.axis for joint in joints]).reshape(-1, 3),
         anchor=np.array([joint.anchor for joint in joints]).reshape(-1, 3),
-        zero=np.array([joint.zero for joint in joints]), above=above,
-        ends=np.array([one.ends for one in closures], np.int64).reshape(c, 2),
-        points=np.array([one.points for one in closures]).reshape(c, 2, 3),
-        turns=np.array([one.turns for one in closures]).reshape(c, 2, 3, 3),
-        row=np.cumsum([0, *(6 if one.weld else 3 for one in closures)]).astype(np.int64),
+        reference_position=np.array([joint.reference_position for joint in joints]), is_moved=above,
+        closure_bodies=np.array([one.bodies for one in closures], np.int64).reshape(c, 2),
+        closure_points=np.array([one.points for one in closures]).reshape(c, 2, 3),
+        closure_rotations=np.array([one.rotations for one in closures]).reshape(c, 2, 3, 3),
+        first_equation=np.cumsum([0, *(6 if one.is_weld else 3 for one in closures)]).astype(np.int64),
         gravity=model.opt.gravity.copy(),
     )  # fmt: skip
     return Chain(
@@ -203,14 +204,14 @@ def load_chain(source: str | Path | mujoco.MjModel) -> Chain:
         damping=np.array([joint.damping for joint in joints]),
         frictionloss=np.array([joint.frictionloss for joint in joints]),
         stiffness=np.array([joint.stiffness for joint in joints]),
-        rest=np.array([joint.rest for joint in joints]),
+        spring_rest=np.array([joint.spring_rest for joint in joints]),
         drives=tuple(dict.fromkeys(whole[int(model.jnt_qposadr[j])] for j in moved)) or names,
-        places=np.array([joint.place for joint in joints], np.int64),
-        dofs=np.array([joint.dof for joint in joints], np.int64),
+        qpos_indices=np.array([joint.qpos_index for joint in joints], np.int64),
+        dof_indices=np.array([joint.dof_index for joint in joints], np.int64),
     )
 
 
-def _read(path: str | Path) -> mujoco.MjModel:
+def _read_model(path: str | Path) -> mujoco.MjModel:
     try:
         return mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
@@ -220,7 +221,7 @@ def _read(path: str | Path) -> mujoco.MjModel:
 _AXES = tuple(enumerate("xyz"))
 
 
-def _scalar_joints(model: mujoco.MjModel, j: int, pose: np.ndarray) -> list[_Joint]:
+def _split_joint(model: mujoco.MjModel, j: int, pose: np.ndarray) -> list[_Joint]:
     """Convert a MuJoCo joint to hinges and slides, with start positions from a pose (nq,)."""
     name, kind = model.joint(j).name or f"joint{j}", model.jnt_type[j]
     body, anchor = int(model.jnt_bodyid[j]), tuple(model.jnt_pos[j])
@@ -238,7 +239,7 @@ def _scalar_joints(model: mujoco.MjModel, j: int, pose: np.ndarray) -> list[_Joi
     stated = (model.dof_damping, model.dof_armature, model.dof_frictionloss)
     if any(values[dof:last].any() for values in stated) or model.jnt_stiffness[j]:
         raise InputError(
-            _WHERE,
+            _ERROR_CONTEXT,
             f"joint {name}: only hinges and slides may have damping, armature, friction or springs",
         )
     out, unit = [], np.eye(3)
@@ -250,7 +251,7 @@ def _scalar_joints(model: mujoco.MjModel, j: int, pose: np.ndarray) -> list[_Joi
                        float(ground[k]), 0.0, 0.0, 0.0, 0.0, 0.0, -1, -1)
             )  # fmt: skip
         place += 3
-    angles = cardan_angles(_turn(pose[place : place + 4]))
+    angles = cardan_angles(_rotation_matrix(pose[place : place + 4]))
     for k, letter in _AXES:
         out.append(
             _Joint(f"{name}_r{letter}", body, False, tuple(unit[k]), anchor, 0.0,
@@ -259,33 +260,37 @@ def _scalar_joints(model: mujoco.MjModel, j: int, pose: np.ndarray) -> list[_Joi
     return out
 
 
-def cardan_angles(turn: np.ndarray) -> np.ndarray:
+def cardan_angles(rotation: np.ndarray) -> np.ndarray:
     """Return the angles (3,) [rad] of `R = R_x(a) R_y(b) R_z(c)`, with b from -90 to 90 degrees.
 
     Args:
-        turn: (3, 3) rotation R.
+        rotation: (3, 3) rotation R.
 
     Source: Diebel 2006, Representing attitude, 8.4 (sequence 1-2-3).
 
     >>> cardan_angles(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])).round(4)
     array([-0.    ,  0.    ,  1.5708])
     """
-    middle = np.arcsin(np.clip(turn[0, 2], -1.0, 1.0))
+    middle = np.arcsin(np.clip(rotation[0, 2], -1.0, 1.0))
     return np.array(
-        [np.arctan2(-turn[1, 2], turn[2, 2]), middle, np.arctan2(-turn[0, 1], turn[0, 0])]
+        [
+            np.arctan2(-rotation[1, 2], rotation[2, 2]),
+            middle,
+            np.arctan2(-rotation[0, 1], rotation[0, 0]),
+        ]
     )
 
 
 class _Closure(NamedTuple):
     name: str
-    weld: bool
-    ends: tuple[int, int]
+    is_weld: bool
+    bodies: tuple[int, int]
     points: tuple[np.ndarray, np.ndarray]
-    turns: tuple[np.ndarray, np.ndarray]
+    rotations: tuple[np.ndarray, np.ndarray]
 
 
-def _closures(model: mujoco.MjModel) -> list[_Closure]:
-    """Return the active `connect` and `weld` constraints."""
+def _read_closures(model: mujoco.MjModel) -> list[_Closure]:
+    """Return the active `connect` and `is_weld` constraints."""
     out = []
     for e in range(model.neq):
         if not model.eq_active0[e]:
@@ -293,26 +298,25 @@ def _closures(model: mujoco.MjModel) -> list[_Closure]:
         name, kind = model.equality(e).name or f"closure{e}", model.eq_type[e]
         if kind not in (_CONNECT, _WELD):
             raise InputError(
-                _WHERE,
-                f"constraint {name} is neither `connect` nor `weld`: deactivate it, or replace it"
-                " by these",
+                _ERROR_CONTEXT,
+                f"constraint {name} is neither `connect` nor `weld`: deactivate it, or replace it by these",
             )
         one, two, data = int(model.eq_obj1id[e]), int(model.eq_obj2id[e]), model.eq_data[e]
         turns = (np.eye(3), np.eye(3))
         if model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE:
             ends = (int(model.site_bodyid[one]), int(model.site_bodyid[two]))
             points = (model.site_pos[one].copy(), model.site_pos[two].copy())
-            turns = (_turn(model.site_quat[one]), _turn(model.site_quat[two]))
+            turns = (_rotation_matrix(model.site_quat[one]), _rotation_matrix(model.site_quat[two]))
         elif kind == _CONNECT:
             ends, points = (one, two), (data[:3].copy(), data[3:6].copy())
         else:
             ends, points = (one, two), (data[3:6].copy(), data[:3].copy())
-            turns = (_turn(data[6:10]), np.eye(3))  # of body 2 in body 1
+            turns = (_rotation_matrix(data[6:10]), np.eye(3))  # of body 2 in body 1
         out.append(_Closure(name, kind == _WELD, ends, points, turns))
     return out
 
 
-def _turn(quaternion: np.ndarray) -> np.ndarray:
+def _rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
     matrix = np.empty(9)
     mujoco.mju_quat2Mat(matrix, quaternion)
     return matrix.reshape(3, 3)
@@ -328,7 +332,11 @@ def body_inertia(model: mujoco.MjModel, body: int) -> list[float]:
     Returns:
         The ten inertial parameters in the order of `BODY_PARAMETERS`.
     """
-    mass, com, turn = model.body_mass[body], model.body_ipos[body], _turn(model.body_iquat[body])
+    mass, com, turn = (
+        model.body_mass[body],
+        model.body_ipos[body],
+        _rotation_matrix(model.body_iquat[body]),
+    )
     about = turn @ np.diag(model.body_inertia[body]) @ turn.T
     about += mass * (com @ com * np.eye(3) - np.outer(com, com))
     upper = about[0, 0], about[0, 1], about[0, 2], about[1, 1], about[1, 2], about[2, 2]

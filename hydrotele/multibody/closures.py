@@ -20,60 +20,60 @@ from hydrotele.multibody.chain import Chain, Tree, load_chain
 from hydrotele.multibody.tree_motion import (
     Frames,
     add,
+    compute_frames,
     cross,
-    move_tree,
-    new_frames,
-    point_column,
+    get_rotation,
+    get_vector,
+    make_frames,
+    point_acceleration,
+    point_jacobian,
     qr_factor,
     qr_solve,
-    rotated,
-    rotating_acceleration,
-    rotation,
-    scaled,
-    vector,
+    rotate,
+    scale_vector,
 )
 
-CLOSED = 1e-11  # m or rad, maximum residual of a closed loop: rounding at the size of a machine
-_ROUNDS = 50  # maximum number of Newton iterations
-_LEAP = 0.5  # rad or m, maximum step of an unknown joint near a known pose
-_SMALL = 1e-7  # minimum relative singular value
-_WHERE = "closures"
+CLOSURE_TOLERANCE = 1e-11  # m or rad, maximum residual of a closed loop: rounding at the size of a machine
+_MAX_ITERATIONS = 50  # maximum number of Newton iterations
+_MAX_NEAR_STEP = 0.5  # rad or m, maximum step of an unknown joint near a known pose
+_MIN_SINGULAR_RATIO = 1e-7  # minimum relative singular value
+_ERROR_CONTEXT = "closures"
 
 
 @allocation_free
-def loop_errors(tree, frames, error, slope):
+def compute_loop_residuals(tree, frames, error, error_jacobian):
     """Compute the residuals of the loop equations and their Jacobian.
 
     Args:
         tree: Tree.
-        frames: Frames after `move_tree`.
+        frames: Frames after `compute_frames`.
         error: (r, 1) written: residuals, 3 or 6 per closure [m], [rad].
-        slope: (r, v) written: d error / d joint positions.
+        error_jacobian: (r, v) written: d error / d joint positions.
 
     Returns:
         Nothing.
 
     Source: differential kinematics; MuJoCo manual, "Computation", equality constraints.
     """
-    slope[:, :] = 0.0
+    error_jacobian[:, :] = 0.0
     error[:, 0] = 0.0
     for c in range(len(tree.ends)):
         first = tree.row[c]
         weld = tree.row[c + 1] - first == 6
         for side in range(2):
             body, sign = tree.ends[c, side], 1.0 - 2.0 * side
-            arm = rotated(rotation(frames.turn, body), vector(tree.points[c], side))
-            point = add(vector(frames.place, body), arm)
+            arm = rotate(get_rotation(frames.turn, body), get_vector(tree.points[c], side))
+            point = add(get_vector(frames.place, body), arm)
             for k in range(3):
                 error[first + k, 0] += sign * point[k]
             for j in range(len(frames.axis)):
-                if not tree.above[body, j]:
+                if not tree.is_moved[body, j]:
                     continue
-                column = point_column(tree, frames, j, point)
+                column = point_jacobian(tree, frames, j, point)
                 for k in range(3):
-                    slope[first + k, j] += sign * column[k]
-                    if weld and not tree.slides[j]:
-                        slope[first + 3 + k, j] += sign * frames.axis[j, k]
+                    error_jacobian[first + k, j] += sign * column[k]
+                    if weld and not tree.is_slide[j]:
+                        error_jacobian[first + 3 + k, j] += sign * frames.axis[j, k]
         if weld:
             way = _rotation_error(tree, frames, c)
             for k in range(3):
@@ -83,18 +83,21 @@ def loop_errors(tree, frames, error, slope):
 @allocation_free
 def _rotation_error(tree, frames, c):
     """Return the sine of the rotation angle between both frames of a weld, times its axis."""
-    one, two = rotation(frames.turn, tree.ends[c, 0]), rotation(frames.turn, tree.ends[c, 1])
+    one, two = (
+        get_rotation(frames.turn, tree.ends[c, 0]),
+        get_rotation(frames.turn, tree.ends[c, 1]),
+    )
     own, other = tree.turns[c, 0], tree.turns[c, 1]
     total = (0.0, 0.0, 0.0)
     for k in range(3):
-        a = rotated(one, (own[0, k], own[1, k], own[2, k]))
-        b = rotated(two, (other[0, k], other[1, k], other[2, k]))
+        a = rotate(one, (own[0, k], own[1, k], own[2, k]))
+        b = rotate(two, (other[0, k], other[1, k], other[2, k]))
         total = add(total, cross(b, a))
-    return scaled(0.5, total)
+    return scale_vector(0.5, total)
 
 
 @allocation_free
-def closure_acceleration(tree, frames, out):
+def compute_closure_acceleration(tree, frames, out):
     """Compute the acceleration of the loop residuals (r, 1) [m/s^2], [rad/s^2].
 
     Source: second derivative of the loop equations.
@@ -105,97 +108,98 @@ def closure_acceleration(tree, frames, out):
         weld = tree.row[c + 1] - first == 6
         for side in range(2):
             body, sign = tree.ends[c, side], 1.0 - 2.0 * side
-            arm = rotated(rotation(frames.turn, body), vector(tree.points[c], side))
-            w, dw = vector(frames.spin, body), vector(frames.spin_rate, body)
-            part = add(vector(frames.acceleration, body), rotating_acceleration(w, dw, arm))
+            arm = rotate(get_rotation(frames.turn, body), get_vector(tree.points[c], side))
+            w, dw = (
+                get_vector(frames.angular_velocity, body),
+                get_vector(frames.angular_acceleration, body),
+            )
+            part = add(get_vector(frames.acceleration, body), point_acceleration(w, dw, arm))
             for k in range(3):
                 out[first + k, 0] += sign * part[k]
                 if weld:
                     out[first + 3 + k, 0] += sign * dw[k]
 
 
-class LoopSpace(NamedTuple):
-    """Workspace of `close_near`; v joints, m unknown joints, r equations.
+class LoopWorkspace(NamedTuple):
+    """Workspace of `close_loops_near`; v joints, m unknown joints, r equations.
 
     Attributes:
-        still: (v,) zeros.
-        none: (3,) zeros.
+        zero_rates: (v,) zeros.
+        zero_vector: (3,) zeros.
         frames: frames of the bodies.
         error: (r, 1) residuals of the loop equations [m], [rad].
-        slope: (r, v) d error / d joint positions.
-        q_factor: (r, m) orthonormal factor of the columns of `slope` of the unknown joints.
+        error_jacobian: (r, v) d error / d joint positions.
+        q_factor: (r, m) orthonormal factor of the columns of `error_jacobian` of the unknown joints.
         r_factor: (m, m) triangular factor.
-        part: (m, k) solutions, k at least 1.
+        solution: (m, k) solutions, k at least 1.
     """
 
-    still: np.ndarray
-    none: np.ndarray
+    zero_rates: np.ndarray
+    zero_vector: np.ndarray
     frames: Frames
     error: np.ndarray
-    slope: np.ndarray
+    error_jacobian: np.ndarray
     q_factor: np.ndarray
     r_factor: np.ndarray
-    part: np.ndarray
+    solution: np.ndarray
 
 
 @compiled
-def loop_space(tree, sought, columns):
-    """Allocate the workspace for `sought` unknown joints and solutions with `columns` columns."""
-    v, r = len(tree.zero), tree.row[-1]
-    return LoopSpace(
-        np.zeros(v), np.zeros(3), new_frames(tree), np.zeros((r, 1)), np.zeros((r, v)),
-        np.empty((r, sought)), np.empty((sought, sought)), np.empty((sought, max(columns, 1))),
+def make_loop_workspace(tree, unknowns, columns):
+    """Allocate the workspace for `unknowns` unknown joints and solutions with `columns` columns."""
+    v, r = len(tree.reference_position), tree.row[-1]
+    return LoopWorkspace(
+        np.zeros(v), np.zeros(3), make_frames(tree), np.zeros((r, 1)), np.zeros((r, v)),
+        np.empty((r, unknowns)), np.empty((unknowns, unknowns)), np.empty((unknowns, max(columns, 1))),
     )  # fmt: skip
 
 
 @allocation_free
-def close_near(tree, q, others, space):
+def close_loops_near(tree, q, unknowns, space):
     """Close the loops from a nearby position, without allocation.
 
     Args:
         tree: Tree.
         q: (v,) positions, changed in place [rad] or [m].
-        others: (m,) indices of the joints that may move.
+        unknowns: (m,) indices of the joints that may move.
         space: LoopSpace of m unknown joints; receives frames, Jacobian and factors at the solution.
 
     Returns:
-        False if it fails or the step indicates another branch; `close_from` handles larger
+        False if it fails or the step indicates another branch; `close_loops_from` handles larger
         distances.
 
     Source: Gauss-Newton.
     """
     error, part = space.error, space.part
-    for _ in range(_ROUNDS):
-        move_tree(tree, q, space.still, space.still, space.none, space.frames)
+    for _ in range(_MAX_ITERATIONS):
+        compute_frames(tree, q, space.still, space.still, space.zero_vector, space.frames)
         if len(error) == 0:
             return True
-        loop_errors(tree, space.frames, error, space.slope)
-        if not qr_factor(space.slope, others, space.q_factor, space.r_factor):
+        compute_loop_residuals(tree, space.frames, error, space.slope)
+        if not qr_factor(space.slope, unknowns, space.q_factor, space.r_factor):
             return False
         open_by = 0.0
         for m in range(len(error)):
             open_by = max(open_by, abs(error[m, 0]))
-        if open_by < CLOSED:
+        if open_by < CLOSURE_TOLERANCE:
             return True
-        qr_solve(space.q_factor, space.r_factor, len(others), error, 0, part, 0)
-        for o in range(len(others)):
-            if not abs(part[o, 0]) < _LEAP:
+        qr_solve(space.q_factor, space.r_factor, len(unknowns), error, 0, part, 0)
+        for o in range(len(unknowns)):
+            if not abs(part[o, 0]) < _MAX_NEAR_STEP:
                 return False
-            q[others[o]] -= part[o, 0]
+            q[unknowns[o]] -= part[o, 0]
     return False
 
 
-def close_from(
-    tree: Tree, q: np.ndarray, others: np.ndarray, closed: float, longest: float
-) -> float:
+def close_loops_from(tree: Tree, q: np.ndarray, unknowns: np.ndarray, tolerance: float, max_step: float) -> float:
     """Close the loops from a distant position by moving some of the joints.
 
     Args:
         tree: joint tree.
         q: (v,) positions, changed in place [rad] or [m].
-        others: (m,) indices of the joints that may move.
-        closed: maximum residual of a closed loop [m], [rad].
-        longest: maximum joint step per iteration [rad], [m].
+        unknowns: (m,) indices of the joints that may move.
+        tolerance: maximum residual of a closed loop [m], [rad].
+        max_step: maximum joint step per iteration [rad], [m].
 
     Returns:
         Maximum remaining residual [m], [rad].
@@ -203,32 +207,32 @@ def close_from(
     Source: Gauss-Newton with a bounded step, of minimum norm if the closures are not sufficient.
     """
     open_by = 0.0
-    for _ in range(_ROUNDS if tree.row[-1] else 0):
-        gap, slope = _openings(tree, q)
+    for _ in range(_MAX_ITERATIONS if tree.first_equation[-1] else 0):
+        gap, slope = _loop_residuals(tree, q)
         open_by = float(np.abs(gap).max())
-        if not closed <= open_by < np.inf:
+        if not tolerance <= open_by < np.inf:
             break
-        step = np.linalg.lstsq(slope[:, others], gap[:, 0], _SMALL)[0]
-        q[others] -= step * min(1.0, longest / max(float(np.abs(step).max()), 1e-300))
+        step = np.linalg.lstsq(slope[:, unknowns], gap[:, 0], _MIN_SINGULAR_RATIO)[0]
+        q[unknowns] -= step * min(1.0, max_step / max(float(np.abs(step).max()), 1e-300))
     return open_by
 
 
 @compiled
-def _openings(tree, q):
+def _loop_residuals(tree, q):
     """Return the loop residuals (r, 1) at positions (v,), and their Jacobian (r, v)."""
     v, r = len(q), tree.row[-1]
-    frames, gap, slope, still = new_frames(tree), np.zeros((r, 1)), np.zeros((r, v)), np.zeros(v)
-    move_tree(tree, q, still, still, np.zeros(3), frames)
-    loop_errors(tree, frames, gap, slope)
+    frames, gap, slope, still = make_frames(tree), np.zeros((r, 1)), np.zeros((r, v)), np.zeros(v)
+    compute_frames(tree, q, still, still, np.zeros(3), frames)
+    compute_loop_residuals(tree, frames, gap, slope)
     return gap, slope
 
 
 def compile_openings() -> None:
-    """Compile the functions that `close_from` and `motion_basis` call, using a pendulum."""
+    """Compile the functions that `close_loops_from` and `motion_basis` call, using a pendulum."""
     body = '<body><joint name="hinge"/><geom size="1"/></body>'
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
     tree = load_chain(model).tree
-    _openings(tree, np.zeros_like(tree.zero))
+    _loop_residuals(tree, np.zeros_like(tree.reference_position))
 
 
 def motion_basis(chain: Chain, q: np.ndarray, independent: np.ndarray) -> np.ndarray:
@@ -248,12 +252,12 @@ def motion_basis(chain: Chain, q: np.ndarray, independent: np.ndarray) -> np.nda
     basis = np.zeros((len(q), len(independent)))
     basis[independent, np.arange(len(independent))] = 1.0
     if len(others):
-        slope = _openings(chain.tree, np.ascontiguousarray(q, float))[1]
+        slope = _loop_residuals(chain.tree, np.ascontiguousarray(q, float))[1]
         basis[others] = -np.linalg.lstsq(slope[:, others], slope[:, independent], rcond=1e-10)[0]
     return basis
 
 
-def check_determined(chain: Chain, q: np.ndarray, independent: np.ndarray) -> None:
+def check_joints_determined(chain: Chain, q: np.ndarray, independent: np.ndarray) -> None:
     """Check that the independent joints and the closures determine all other joints.
 
     Args:
@@ -265,20 +269,20 @@ def check_determined(chain: Chain, q: np.ndarray, independent: np.ndarray) -> No
         InputError: some joints are undetermined; the message names them.
     """
     others = np.setdiff1d(np.arange(len(q)), independent)
-    loose = np.linalg.svd(_openings(chain.tree, q)[1][:, others], full_matrices=True)
-    hidden = np.linalg.norm(loose[2][np.sum(loose[1] > _SMALL) :], axis=0)
-    if (hidden > _SMALL).any():
-        names = ", ".join(chain.joints[j] for j in others[hidden > _SMALL])
-        raise InputError(_WHERE, f"neither given nor determined by a closure: {names}")
+    loose = np.linalg.svd(_loop_residuals(chain.tree, q)[1][:, others], full_matrices=True)
+    hidden = np.linalg.norm(loose[2][np.sum(loose[1] > _MIN_SINGULAR_RATIO) :], axis=0)
+    if (hidden > _MIN_SINGULAR_RATIO).any():
+        names = ", ".join(chain.joints[j] for j in others[hidden > _MIN_SINGULAR_RATIO])
+        raise InputError(_ERROR_CONTEXT, f"neither given nor determined by a closure: {names}")
 
 
-_STRIDE = 0.1  # rad or m, maximum step of the given joints
-_LONGEST = 1.5  # rad or m, maximum joint step per iteration from a distant position
-_SAME = 1e-6  # m and 1, maximum difference of positions and orientations of equal assemblies
-_KINEMATICS = "kinematics"
+_MAX_GIVEN_STEP = 0.1  # rad or m, maximum step of the given joints
+_MAX_ITERATION_STEP = 1.5  # rad or m, maximum joint step per iteration from a distant position
+_ASSEMBLY_TOLERANCE = 1e-6  # m and 1, maximum difference of positions and orientations of equal assemblies
+_KINEMATICS_CONTEXT = "kinematics"
 
 
-def joint_positions(
+def solve_joint_positions(
     chain: Chain, given: Sequence[str], position: np.ndarray, start: np.ndarray | None = None,
     seed: int = 0,
 ) -> np.ndarray:  # fmt: skip
@@ -306,28 +310,30 @@ def joint_positions(
     columns = np.array([chain.index(name) for name in given], np.int64)
     table = np.ascontiguousarray(position, np.float64)
     if table.ndim != 2 or table.shape[1] != len(columns):
-        raise InputError(_KINEMATICS, f"positions must be (n, {len(columns)}), got {table.shape}")
+        raise InputError(_KINEMATICS_CONTEXT, f"positions must be (n, {len(columns)}), got {table.shape}")
     if not np.isfinite(table).all():
         row = int(np.argwhere(~np.isfinite(table))[0, 0])
-        raise InputError(_KINEMATICS, f"row {row} has missing positions of the given joints")
+        raise InputError(_KINEMATICS_CONTEXT, f"row {row} has missing positions of the given joints")
     others = np.setdiff1d(np.arange(len(chain.joints)), columns)
     q = np.array(chain.start if start is None else start, float)
-    if not close_from(chain.tree, q, np.arange(len(q)), CLOSED, np.inf) < CLOSED:
+    if not close_loops_from(chain.tree, q, np.arange(len(q)), CLOSURE_TOLERANCE, np.inf) < CLOSURE_TOLERANCE:
         raise InputError(
-            _KINEMATICS, f"the loops of {chain.name} cannot be closed from the start positions"
+            _KINEMATICS_CONTEXT,
+            f"the loops of {chain.name} cannot be closed from the start positions",
         )
-    check_determined(chain, q, columns)
+    check_joints_determined(chain, q, columns)
     out, first = np.empty((len(table), len(q))), 0
     while first < len(table):
-        failed = _follow(chain.tree, columns, table[first:], others, q, out[first:])
+        failed = _follow_motion(chain.tree, columns, table[first:], others, q, out[first:])
         if failed < 0:
             break
         first += failed
         last = out[first - 1] if first else np.array(chain.start, float)
-        found = assemblies(chain, given, table[first], seed=seed)
+        found = find_assemblies(chain, given, table[first], seed=seed)
         if not len(found):
             raise InputError(
-                _KINEMATICS, f"row {first}: the loops of {chain.name} cannot be closed there"
+                _KINEMATICS_CONTEXT,
+                f"row {first}: the loops of {chain.name} cannot be closed there",
             )
         q = found[np.argmin(np.linalg.norm(found - last, axis=1))].copy()
         out[first] = q
@@ -336,24 +342,24 @@ def joint_positions(
 
 
 @compiled
-def _follow(tree, given, position, others, q, out):
+def _follow_motion(tree, given, position, others, q, out):
     """Compute joint positions row by row; return the index of the failed row, or -1."""
-    space = loop_space(tree, len(others), 1)
+    space = make_loop_workspace(tree, len(others), 1)
     for row in range(len(position)):
         far = 0.0
         for i in range(len(given)):
             far = max(far, abs(position[row, i] - q[given[i]]))
-        steps = max(1, int(np.ceil(far / _STRIDE)))
+        steps = max(1, int(np.ceil(far / _MAX_GIVEN_STEP)))
         for step in range(steps, 0, -1):
             for i in range(len(given)):
                 q[given[i]] += (position[row, i] - q[given[i]]) / step
-            if not close_near(tree, q, others, space):
+            if not close_loops_near(tree, q, others, space):
                 return row
         out[row] = q
     return -1
 
 
-def assemblies(
+def find_assemblies(
     chain: Chain, given: Sequence[str], position: np.ndarray, *, body: str | None = None,
     starts: int = 400, seed: int = 0,
 ) -> np.ndarray:  # fmt: skip
@@ -378,7 +384,7 @@ def assemblies(
     """
     columns = np.array([chain.index(name) for name in given], np.int64)
     others = np.setdiff1d(np.arange(len(chain.joints)), columns)
-    slides, rng = chain.tree.slides, np.random.default_rng(seed)
+    slides, rng = chain.tree.is_slide, np.random.default_rng(seed)
     reach = float(np.abs(chain.tree.offset).sum(axis=1).max() + np.abs(chain.start[slides]).max(
         initial=0.0))  # fmt: skip
     found: list[np.ndarray] = []
@@ -389,28 +395,26 @@ def assemblies(
         away = rng.uniform(-1.0, 1.0, len(q)) * np.where(slides, reach, np.pi) * wide
         q[others] += away[others]
         q[columns] = position
-        if not close_from(chain.tree, q, others, CLOSED, _LONGEST) < CLOSED:
+        if not close_loops_from(chain.tree, q, others, CLOSURE_TOLERANCE, _MAX_ITERATION_STEP) < CLOSURE_TOLERANCE:
             continue
         q = np.where(slides, q, (q - chain.start + np.pi) % (2.0 * np.pi) - np.pi + chain.start)
-        shape = _shape(chain, q, body)
-        if all(np.abs(shape - other).max() > _SAME for other in shapes):
+        shape = _flatten_frames(chain, q, body)
+        if all(np.abs(shape - other).max() > _ASSEMBLY_TOLERANCE for other in shapes):
             shapes.append(shape)
             found.append(q)
     found.sort(key=lambda q: float(np.linalg.norm(q - chain.start)))
     return np.array(found).reshape(-1, len(chain.joints))
 
 
-def _shape(chain: Chain, q: np.ndarray, body: str | None) -> np.ndarray:
+def _flatten_frames(chain: Chain, q: np.ndarray, body: str | None) -> np.ndarray:
     """Return the positions and orientations of bodies as one vector."""
-    frames, still = new_frames(chain.tree), np.zeros(len(q))
-    move_tree(chain.tree, q, still, still, np.zeros(3), frames)
+    frames, still = make_frames(chain.tree), np.zeros(len(q))
+    compute_frames(chain.tree, q, still, still, np.zeros(3), frames)
     some = slice(1, None) if body is None else chain.bodies.index(body) + 1
     return np.concatenate([frames.place[some].ravel(), frames.turn[some].ravel()])
 
 
-def jacobian(
-    chain: Chain, q: np.ndarray, outputs: Sequence[str], inputs: Sequence[str]
-) -> np.ndarray:
+def joint_jacobian(chain: Chain, q: np.ndarray, outputs: Sequence[str], inputs: Sequence[str]) -> np.ndarray:
     """Return the rates of some joints per unit rate of the independent joints.
 
     Args:

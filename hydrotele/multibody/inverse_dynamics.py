@@ -20,28 +20,28 @@ from hydrotele.core.compiled import allocation_free, compiled
 from hydrotele.core.errors import InputError
 from hydrotele.multibody.chain import Chain
 from hydrotele.multibody.closures import (
-    CLOSED,
-    check_determined,
-    close_from,
-    close_near,
-    closure_acceleration,
-    loop_space,
+    CLOSURE_TOLERANCE,
+    check_joints_determined,
+    close_loops_from,
+    close_loops_near,
+    compute_closure_acceleration,
+    make_loop_workspace,
 )
 from hydrotele.multibody.tree_motion import (
+    compute_frames,
+    compute_wrenches,
     dot,
-    move_tree,
-    point_column,
+    get_rotation,
+    get_vector,
+    point_jacobian,
     qr_factor,
     qr_solve,
-    rotated,
-    rotation,
+    rotate,
     subtract,
-    vector,
-    wrenches,
 )
 
-_STRIDE = 0.1  # rad or m, maximum step of the given joints, so that loops stay on their branch
-_WHERE = "closures"
+_MAX_GIVEN_STEP = 0.1  # rad or m, maximum step of the given joints, so that loops stay on their branch
+_ERROR_CONTEXT = "closures"
 
 
 class Projection(NamedTuple):
@@ -51,22 +51,22 @@ class Projection(NamedTuple):
         position: (n, v) of all joints [rad] or [m].
         rate: (n, v) [rad/s] or [m/s].
         acceleration: (n, v) [rad/s^2] or [m/s^2].
-        share: (n, k, v) force of drive k per unit force or torque in joint v.
-        bodies: (n, k, 10 b) force of drive k [N] or [N m] per unit of an inertial parameter.
-        twist: (n, c) relative rotation rate of the two bodies of a closure [rad/s].
-        pins: (n, k, c) force of drive k per unit of viscous friction in a closure.
+        joint_projection: (n, k, v) force of drive k per unit force or torque in joint v.
+        body_projection: (n, k, 10 b) force of drive k [N] or [N m] per unit of an inertial parameter.
+        closure_rate: (n, c) relative rotation rate of the two bodies of a closure [rad/s].
+        closure_projection: (n, k, c) force of drive k per unit of viscous friction in a closure.
     """
 
     position: np.ndarray
     rate: np.ndarray
     acceleration: np.ndarray
-    share: np.ndarray
-    bodies: np.ndarray
-    twist: np.ndarray
-    pins: np.ndarray
+    joint_projection: np.ndarray
+    body_projection: np.ndarray
+    closure_rate: np.ndarray
+    closure_projection: np.ndarray
 
 
-def project(
+def project_on_drives(
     chain: Chain, given: tuple[str, ...], position: np.ndarray, rate: np.ndarray,
     acceleration: np.ndarray, drives: tuple[str, ...] | None = None,
     start: np.ndarray | None = None,
@@ -98,61 +98,56 @@ def project(
     drives = chain.drives if drives is None else drives
     columns = np.array([chain.index(name) for name in given], np.int64)
     moved = np.array([chain.index(name) for name in drives], np.int64)
-    tables = [_table(values, len(given)) for values in (position, rate, acceleration)]
+    tables = [_check_table(values, len(given)) for values in (position, rate, acceleration)]
     if len({len(table) for table in tables}) > 1:
-        raise InputError(_WHERE, "positions, rates and accelerations must have the same rows")
+        raise InputError(_ERROR_CONTEXT, "positions, rates and accelerations must have the same rows")
     if len(moved) != len(columns):
         raise InputError(
-            _WHERE,
-            f"{len(columns)} joints are given but {len(moved)} have a drive; inverse dynamics needs"
-            " equal numbers",
+            _ERROR_CONTEXT,
+            f"{len(columns)} joints are given but {len(moved)} have a drive; inverse dynamics needs equal numbers",
         )
     n, v, k = len(tables[0]), len(chain.joints), len(columns)
     axes = np.zeros((len(chain.bodies) + 1, 3))
     for body, axis in (moment_free or {}).items():
-        axes[_body_place(chain, body) + 1] = axis
+        axes[_body_index(chain, body) + 1] = axis
     others = np.setdiff1d(np.arange(v), columns)
     q = np.array(chain.start if start is None else start, float)
-    if not close_from(chain.tree, q, np.arange(v), CLOSED, np.inf) < CLOSED:
-        raise InputError(
-            _WHERE, f"the loops of {chain.name} cannot be closed from the start positions"
-        )
-    check_determined(chain, q, columns)
+    if not close_loops_from(chain.tree, q, np.arange(v), CLOSURE_TOLERANCE, np.inf) < CLOSURE_TOLERANCE:
+        raise InputError(_ERROR_CONTEXT, f"the loops of {chain.name} cannot be closed from the start positions")
+    check_joints_determined(chain, q, columns)
     out = Projection(
         np.empty((n, v)), np.empty((n, v)), np.empty((n, v)), np.empty((n, k, v)),
-        np.empty((n, k, 10 * len(chain.bodies))), np.empty((n, len(chain.tree.ends))),
-        np.empty((n, k, len(chain.tree.ends))),
+        np.empty((n, k, 10 * len(chain.bodies))), np.empty((n, len(chain.tree.closure_bodies))),
+        np.empty((n, k, len(chain.tree.closure_bodies))),
     )  # fmt: skip
-    given_rows = _Given(columns, *tables)
-    failed = _project(chain.tree, given_rows, others, moved, axes, q, out)
+    given_rows = _GivenMotion(columns, *tables)
+    failed = _project_rows(chain.tree, given_rows, others, moved, axes, q, out)
     if failed >= 0:
         raise InputError(
-            _WHERE,
+            _ERROR_CONTEXT,
             f"row {failed}: the loops of {chain.name} cannot be closed there, or the pose is"
             f" singular for the drives {', '.join(drives)}",
         )
     return out
 
 
-def _body_place(chain: Chain, body: str) -> int:
+def _body_index(chain: Chain, body: str) -> int:
     if body not in chain.bodies:
-        raise InputError(_WHERE, f"{chain.name} has no body {body}: {', '.join(chain.bodies)}")
+        raise InputError(_ERROR_CONTEXT, f"{chain.name} has no body {body}: {', '.join(chain.bodies)}")
     return chain.bodies.index(body)
 
 
-def _table(values: np.ndarray, width: int) -> np.ndarray:
+def _check_table(values: np.ndarray, width: int) -> np.ndarray:
     table = np.ascontiguousarray(values, dtype=np.float64)
     if table.ndim != 2 or table.shape[1] != width:
-        raise InputError(
-            _WHERE, f"motion must be (n, {width}), one column per joint: {table.shape}"
-        )
+        raise InputError(_ERROR_CONTEXT, f"motion must be (n, {width}), one column per joint: {table.shape}")
     if not np.isfinite(table).all():
         row = int(np.argwhere(~np.isfinite(table))[0, 0])
-        raise InputError(_WHERE, f"row {row} has no motion: smooth the log over its gaps first")
+        raise InputError(_ERROR_CONTEXT, f"row {row} has no motion: smooth the log over its gaps first")
     return table
 
 
-class _Given(NamedTuple):
+class _GivenMotion(NamedTuple):
     """Indices (k,) of the given joints, and their motion, (n, k) each."""
 
     joints: np.ndarray
@@ -162,10 +157,10 @@ class _Given(NamedTuple):
 
 
 @compiled
-def _project(tree, given, others, drives, moment_free, q, out):
+def _project_rows(tree, given, others, drives, moment_free, q, out):
     """Compute a `Projection` row by row; return the index of the failed row, or -1."""
-    b, v, k = len(tree.parent), len(tree.zero), len(given.joints)
-    hidden, space = len(others), loop_space(tree, len(others), k)
+    b, v, k = len(tree.parent), len(tree.reference_position), len(given.joints)
+    hidden, space = len(others), make_loop_workspace(tree, len(others), k)
     frames, part, ground = space.frames, space.part, -tree.gravity
     moves = np.zeros((v, k))  # rates of all joints per unit rate of the given joints
     q_drive, r_drive, unit = np.empty((k, k)), np.empty((k, k)), np.eye(k)
@@ -177,12 +172,12 @@ def _project(tree, given, others, drives, moment_free, q, out):
         far = 0.0
         for i in range(k):
             far = max(far, abs(given.position[row, i] - q[given.joints[i]]))
-        steps = max(1, int(math.ceil(far / _STRIDE))) if len(space.error) > 0 else 1
+        steps = max(1, int(math.ceil(far / _MAX_GIVEN_STEP))) if len(space.error) > 0 else 1
         for step in range(steps, 0, -1):
             for i in range(k):
                 at = given.joints[i]
                 q[at] += (given.position[row, i] - q[at]) / step
-            if not close_near(tree, q, others, space):
+            if not close_loops_near(tree, q, others, space):
                 return row
         for i in range(k if hidden else 0):
             qr_solve(space.q_factor, space.r_factor, hidden, space.slope, given.joints[i], part, i)
@@ -194,8 +189,8 @@ def _project(tree, given, others, drives, moment_free, q, out):
             for i in range(k):
                 rate[j] += moves[j, i] * given.rate[row, i]
         if hidden:
-            move_tree(tree, q, rate, space.still, space.none, frames)
-            closure_acceleration(tree, frames, space.error)
+            compute_frames(tree, q, rate, space.still, space.zero_vector, frames)
+            compute_closure_acceleration(tree, frames, space.error)
             qr_solve(space.q_factor, space.r_factor, hidden, space.error, 0, part, 0)
             for o in range(hidden):
                 acceleration[others[o]] = -part[o, 0]
@@ -203,7 +198,7 @@ def _project(tree, given, others, drives, moment_free, q, out):
             out.position[row, j] = q[j]
             for i in range(k):
                 acceleration[j] += moves[j, i] * given.acceleration[row, i]
-        move_tree(tree, q, rate, acceleration, ground, frames)
+        compute_frames(tree, q, rate, acceleration, ground, frames)
         if not qr_factor(moves[drives].T.copy(), every, q_drive, r_drive):
             return row
         for i in range(k):
@@ -216,18 +211,18 @@ def _project(tree, given, others, drives, moment_free, q, out):
                     total += inverse[i, m] * moves[j, m]
                 share[i, j] = total
         for body in range(1, b):
-            wrenches(frames, body, forces, torques)
-            _drop_moment(frames, body, vector(moment_free, body), torques)
-            _load(tree, frames, body, forces, torques, share, out.bodies[row])
+            compute_wrenches(frames, body, forces, torques)
+            _remove_moment(frames, body, get_vector(moment_free, body), torques)
+            _project_wrench(tree, frames, body, forces, torques, share, out.bodies[row])
         for m in range(len(tree.ends)):
-            out.twist[row, m] = _rub(tree, frames, m, share, out.pins[row])
+            out.closure_rate[row, m] = _project_closure_friction(tree, frames, m, share, out.pins[row])
     return -1
 
 
 @allocation_free
-def _drop_moment(frames, body, axis, torques):
+def _remove_moment(frames, body, axis, torques):
     """Remove the component along a unit axis from torques (3, 10); a zero axis has no effect."""
-    way = rotated(rotation(frames.turn, body), axis)
+    way = rotate(get_rotation(frames.turn, body), axis)
     for m in range(10):
         along = way[0] * torques[0, m] + way[1] * torques[1, m] + way[2] * torques[2, m]
         for k in range(3):
@@ -235,38 +230,36 @@ def _drop_moment(frames, body, axis, torques):
 
 
 @allocation_free
-def _load(tree, frames, body, forces, torques, share, out):
+def _project_wrench(tree, frames, body, forces, torques, share, out):
     """Project the wrench of a body on the drives, through the joints that move it."""
-    first, point = 10 * (body - 1), vector(frames.place, body)
+    first, point = 10 * (body - 1), get_vector(frames.place, body)
     for i in range(len(share)):
         for m in range(10):
             out[i, first + m] = 0.0
     for j in range(share.shape[1]):
-        if not tree.above[body, j]:
+        if not tree.is_moved[body, j]:
             continue
-        way, turn = point_column(tree, frames, j, point), vector(frames.axis, j)
+        way, turn = point_jacobian(tree, frames, j, point), get_vector(frames.axis, j)
         for m in range(10):
             effort = way[0] * forces[0, m] + way[1] * forces[1, m] + way[2] * forces[2, m]
-            if not tree.slides[j]:
-                effort += (
-                    turn[0] * torques[0, m] + turn[1] * torques[1, m] + turn[2] * torques[2, m]
-                )
+            if not tree.is_slide[j]:
+                effort += turn[0] * torques[0, m] + turn[1] * torques[1, m] + turn[2] * torques[2, m]
             for i in range(len(share)):
                 out[i, first + m] += share[i, j] * effort
 
 
 @allocation_free
-def _rub(tree, frames, closure, share, out):
+def _project_closure_friction(tree, frames, closure, share, out):
     """Project viscous friction in a closure on the drives; return its relative rotation rate."""
     one, two = tree.ends[closure, 0], tree.ends[closure, 1]
-    spin = subtract(vector(frames.spin, one), vector(frames.spin, two))
+    spin = subtract(get_vector(frames.angular_velocity, one), get_vector(frames.angular_velocity, two))
     for i in range(len(share)):
         out[i, closure] = 0.0
     for j in range(share.shape[1]):
-        if tree.slides[j] or tree.above[one, j] == tree.above[two, j]:
+        if tree.is_slide[j] or tree.is_moved[one, j] == tree.is_moved[two, j]:
             continue
-        along = dot(vector(frames.axis, j), spin)
-        along = along if tree.above[one, j] else -along
+        along = dot(get_vector(frames.axis, j), spin)
+        along = along if tree.is_moved[one, j] else -along
         for i in range(len(share)):
             out[i, closure] += share[i, j] * along
     return math.sqrt(dot(spin, spin))
@@ -278,8 +271,8 @@ BODY_PARAMETERS = {
     "inertia_xx": "kg m^2", "inertia_xy": "kg m^2", "inertia_xz": "kg m^2",
     "inertia_yy": "kg m^2", "inertia_yz": "kg m^2", "inertia_zz": "kg m^2",
 }  # fmt: skip
-_SLOPES = ("viscous", "viscous_asymmetry")
-_REGRESSOR = "regressor"
+_VISCOUS_TERMS = ("viscous", "viscous_asymmetry")
+_REGRESSOR_CONTEXT = "regressor"
 # error of the mean of tanh(v / v_0): 1e-5 for a standard deviation of v_0, 0.01 for 3 v_0
 _NODES, _WEIGHTS = hermegauss(21)
 
@@ -293,13 +286,13 @@ class FrictionTerm:
     `v way`.
 
     Attributes:
-        place: name of a joint, or of a closure whose bodies rotate relative to each other.
+        location: name of a joint, or of a closure whose bodies rotate relative to each other.
         nominal: parameter -> value; each parameter has one column. See `FRICTION_TERMS`.
         smoothing: v_0 [rad/s] or [m/s]; 0 uses the sign of v.
         stribeck: v_s [rad/s] or [m/s].
     """
 
-    place: str
+    location: str
     nominal: Mapping[str, float] = field(default_factory=lambda: {"coulomb": 0.0, "viscous": 0.0})
     smoothing: float = 0.0
     stribeck: float = 0.02
@@ -331,9 +324,9 @@ class Regressor:
     nominal: np.ndarray
 
 
-def regressor(
-    chain: Chain, found: Projection, drives: Sequence[str] | None = None,
-    bodies: Sequence[str] | None = None, rubbing: Sequence[FrictionTerm] = (),
+def make_regressor(
+    chain: Chain, projection: Projection, drives: Sequence[str] | None = None,
+    bodies: Sequence[str] | None = None, friction: Sequence[FrictionTerm] = (),
     offsets: Mapping[str, float] | bool = True, drive_inertia: Sequence[str] = (),
     rate_std: np.ndarray | None = None,
 ) -> Regressor:  # fmt: skip
@@ -341,10 +334,10 @@ def regressor(
 
     Args:
         chain: the chain.
-        found: projection of the chain on the drives for every row.
+        projection: projection of the chain on the drives for every row.
         drives: names of the drives of the projection; those of the chain by default.
         bodies: bodies whose ten inertial parameters have columns; all by default.
-        rubbing: friction terms.
+        friction: friction terms.
         offsets: whether every drive has a constant force, such as a transducer offset; or nominal
             offsets by drive [N] or [N m].
         drive_inertia: joints whose drive has its own inertia.
@@ -372,117 +365,111 @@ def regressor(
         nominal.append(value)
 
     for body in chain.bodies if bodies is None else bodies:
-        b = _body_place(chain, body)
-        columns.append(found.bodies[:, :, 10 * b : 10 * (b + 1)])
+        b = _body_index(chain, body)
+        columns.append(projection.body_projection[:, :, 10 * b : 10 * (b + 1)])
         for p, (kind, unit) in enumerate(BODY_PARAMETERS.items()):
             add(None, f"{kind}.{body}", unit, chain.inertia[b, p])
     for joint in drive_inertia:
         j = chain.index(joint)
-        unit = "kg" if chain.tree.slides[j] else "kg m^2"
-        column = found.share[:, :, j] * found.acceleration[:, None, j]
+        unit = "kg" if chain.tree.is_slide[j] else "kg m^2"
+        column = projection.joint_projection[:, :, j] * projection.acceleration[:, None, j]
         add(column, f"drive_inertia.{joint}", unit, chain.armature[j])
-    for one in rubbing:
-        for kind, (column, unit) in _friction_terms(chain, found, one, rate_std).items():
-            add(column, f"{kind}.{one.place}", unit, one.nominal[kind])
+    for one in friction:
+        for kind, (column, unit) in _friction_columns(chain, projection, one, rate_std).items():
+            add(column, f"{kind}.{one.location}", unit, one.nominal[kind])
     given = offsets if isinstance(offsets, Mapping) else {}
     for i, drive in enumerate(drives if offsets is not False else ()):
-        column = np.zeros(found.share.shape[:2])
+        column = np.zeros(projection.joint_projection.shape[:2])
         column[:, i] = 1.0
-        unit = "N" if chain.tree.slides[chain.index(drive)] else "N m"
+        unit = "N" if chain.tree.is_slide[chain.index(drive)] else "N m"
         add(column, f"offset.{drive}", unit, given.get(drive, 0.0))
-    empty = np.zeros((*found.share.shape[:2], 0))
+    empty = np.zeros((*projection.joint_projection.shape[:2], 0))
     matrix = np.concatenate([empty, *columns], axis=2)
     return Regressor(matrix, drives, tuple(names), tuple(units), np.array(nominal))
 
 
 def sign_uncertainty(
-    chain: Chain, found: Projection, drives: Sequence[str], rubbing: Sequence[FrictionTerm],
+    chain: Chain, projection: Projection, drives: Sequence[str], friction: Sequence[FrictionTerm],
     rate_std: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
     """Return the standard deviation of the sign of the drive rates due to rate noise.
 
     Args:
         chain: the chain.
-        found: its projection.
+        projection: its projection.
         drives: names of the k drives.
-        rubbing: friction terms; only those of the drives are used.
-        rate_std: (n, v) as in `regressor`.
+        friction: friction terms; only those of the drives are used.
+        rate_std: (n, v) as in `make_regressor`.
 
     Returns:
         (n, k) standard deviation of the sign of dry friction, 0 .. 1.
     """
-    out, weights = np.zeros((len(found.rate), len(drives))), _WEIGHTS / _WEIGHTS.sum()
-    for one in rubbing:
-        if one.place not in drives:
+    out, weights = np.zeros((len(projection.rate), len(drives))), _WEIGHTS / _WEIGHTS.sum()
+    for one in friction:
+        if one.location not in drives:
             continue
-        j = chain.index(one.place)
-        way = _shape(one, "coulomb", found.rate[:, j, None] + rate_std[:, j, None] * _NODES)
+        j = chain.index(one.location)
+        way = _unit_friction(one, "coulomb", projection.rate[:, j, None] + rate_std[:, j, None] * _NODES)
         mean = way @ weights
         spread = np.sqrt(np.maximum(way**2 @ weights - mean**2, 0.0))
-        out[:, list(drives).index(one.place)] = spread
+        out[:, list(drives).index(one.location)] = spread
     return out
 
 
-def _friction_terms(
-    chain: Chain, found: Projection, one: FrictionTerm, rate_std: np.ndarray | None
-):
+def _friction_columns(chain: Chain, projection: Projection, term: FrictionTerm, rate_std: np.ndarray | None):
     """Return the columns of a friction term: parameter -> (column (n, k), unit)."""
-    strange = [kind for kind in one.nominal if kind not in FRICTION_TERMS]
+    strange = [kind for kind in term.nominal if kind not in FRICTION_TERMS]
     if strange:
         message = f"friction has no {strange[0]}; valid: {', '.join(FRICTION_TERMS)}"
-        raise InputError(_REGRESSOR, message)
-    if one.place in chain.closures:
-        return _pin(chain.closures.index(one.place), found, one)
-    j = chain.index(one.place)
-    velocity, share = found.rate[:, j], found.share[:, :, j]
+        raise InputError(_REGRESSOR_CONTEXT, message)
+    if term.location in chain.closures:
+        return _closure_friction_columns(chain.closures.index(term.location), projection, term)
+    j = chain.index(term.location)
+    velocity, share = projection.rate[:, j], projection.joint_projection[:, :, j]
     if rate_std is None:
-        shapes = {kind: _shape(one, kind, velocity) for kind in one.nominal}
+        shapes = {kind: _unit_friction(term, kind, velocity) for kind in term.nominal}
     else:
         maybe = velocity[:, None] + rate_std[:, j, None] * _NODES
         weights = _WEIGHTS / _WEIGHTS.sum()
-        shapes = {kind: _shape(one, kind, maybe) @ weights for kind in one.nominal}
-    dry, wet = ("N", "N s/m") if chain.tree.slides[j] else ("N m", "N m s/rad")
-    units: dict[str, str] = {kind: wet if kind in _SLOPES else dry for kind in FRICTION_TERMS}
-    units["quadratic"] = "N s^2/m^2" if chain.tree.slides[j] else "N m s^2/rad^2"
-    return {kind: (share * shapes[kind][:, None], units[kind]) for kind in one.nominal}
+        shapes = {kind: _unit_friction(term, kind, maybe) @ weights for kind in term.nominal}
+    dry, wet = ("N", "N s/m") if chain.tree.is_slide[j] else ("N m", "N m s/rad")
+    units: dict[str, str] = {kind: wet if kind in _VISCOUS_TERMS else dry for kind in FRICTION_TERMS}
+    units["quadratic"] = "N s^2/m^2" if chain.tree.is_slide[j] else "N m s^2/rad^2"
+    return {kind: (share * shapes[kind][:, None], units[kind]) for kind in term.nominal}
 
 
-def _shape(one: FrictionTerm, kind: str, velocity: np.ndarray) -> np.ndarray:
+def _unit_friction(term: FrictionTerm, kind: str, velocity: np.ndarray) -> np.ndarray:
     """Return the friction per unit of a parameter at velocities of any shape."""
     if kind == "viscous":
         return velocity
-    way = np.tanh(velocity / one.smoothing) if one.smoothing else np.sign(velocity)
+    way = np.tanh(velocity / term.smoothing) if term.smoothing else np.sign(velocity)
     if kind == "viscous_asymmetry":
         return velocity * way
     if kind == "quadratic":
         return velocity**2 * way
     side = way**2 if kind.endswith("_asymmetry") else way
     if kind.startswith("stribeck"):
-        return np.exp(-((velocity / one.stribeck) ** 2)) * side
+        return np.exp(-((velocity / term.stribeck) ** 2)) * side
     return side
 
 
-def _pin(closure: int, found: Projection, one: FrictionTerm):
+def _closure_friction_columns(closure: int, projection: Projection, term: FrictionTerm):
     """Return the columns of friction in a closure, opposite to its relative rotation."""
-    twist, share = found.twist[:, closure], found.pins[:, :, closure]
-    floor = one.smoothing or np.finfo(float).tiny
-    slow = np.exp(-((twist / one.stribeck) ** 2))
+    twist, share = projection.closure_rate[:, closure], projection.closure_projection[:, :, closure]
+    floor = term.smoothing or np.finfo(float).tiny
+    slow = np.exp(-((twist / term.stribeck) ** 2))
     way = np.tanh(twist / floor) / np.maximum(twist, np.finfo(float).tiny)
     shapes = {"coulomb": way, "stribeck": slow * way, "viscous": np.ones(len(twist))}
-    for kind in one.nominal:
+    for kind in term.nominal:
         if kind not in shapes:
-            message = (
-                f"{one.place} is a closure, which has no sides for {kind}; valid: "
-                f"{', '.join(shapes)}"
-            )
-            raise InputError(_REGRESSOR, message)
+            message = f"{term.location} is a closure, which has no sides for {kind}; valid: {', '.join(shapes)}"
+            raise InputError(_REGRESSOR_CONTEXT, message)
     return {
-        kind: (share * shapes[kind][:, None], "N m s/rad" if kind in _SLOPES else "N m")
-        for kind in one.nominal
+        kind: (share * shapes[kind][:, None], "N m s/rad" if kind in _VISCOUS_TERMS else "N m") for kind in term.nominal
     }
 
 
-def pin_friction(chain: Chain) -> list[FrictionTerm]:
+def passive_friction_terms(chain: Chain) -> list[FrictionTerm]:
     """Return Coulomb friction terms for all passive hinges and closures.
 
     Args:
@@ -493,10 +480,8 @@ def pin_friction(chain: Chain) -> list[FrictionTerm]:
 
     Source: Khoshzaban 1992, 4.3: joint and pin friction of the complete model.
     """
-    slides = chain.tree.slides
+    slides = chain.tree.is_slide
     hinges = [
-        j
-        for k, j in enumerate(chain.joints)
-        if not slides[k] and chain.places[k] >= 0 and j not in chain.drives
+        j for k, j in enumerate(chain.joints) if not slides[k] and chain.qpos_indices[k] >= 0 and j not in chain.drives
     ]
     return [FrictionTerm(place, {"coulomb": 0.0}) for place in (*hinges, *chain.closures)]

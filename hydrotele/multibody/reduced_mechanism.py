@@ -16,11 +16,11 @@ import numpy as np
 from hydrotele.core.compiled import allocation_free
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.kinematics.from_machine import pin_axis
-from hydrotele.machine.machine import Machine, following_joints
+from hydrotele.machine.machine import Machine, dependent_joints
 
 
 @allocation_free
-def factorise(matrix):
+def factorise_cholesky(matrix):
     """Replace a symmetric positive definite matrix by its lower Cholesky factor.
 
     Args:
@@ -40,11 +40,11 @@ def factorise(matrix):
 
 
 @allocation_free
-def solve(factor, right):
+def solve_cholesky(factor, right):
     """Solve a linear system with a Cholesky factor, in place.
 
     Args:
-        factor: (>= n, n) result of `factorise`.
+        factor: (>= n, n) result of `factorise_cholesky`.
         right: (n,) right-hand side, overwritten by the solution.
 
     Returns:
@@ -64,7 +64,7 @@ def solve(factor, right):
 
 
 @allocation_free
-def place_bars(tree, shape, first, frame, jacobian, bar):
+def compute_bar_frames(tree, shape, first, frame, jacobian, bar):
     """Compute the frames and Jacobians of all bars; x is along the bar, y along the pins.
 
     Args:
@@ -83,8 +83,8 @@ def place_bars(tree, shape, first, frame, jacobian, bar):
     for b in range(len(bar)):
         tube, rod = first + 2 * b, first + 2 * b + 1
         base = tree[tube, PARENT]
-        place_origin(tree, shape, frame, jacobian, tube)
-        place_origin(tree, shape, frame, jacobian, rod)
+        compute_origin(tree, shape, frame, jacobian, tube)
+        compute_origin(tree, shape, frame, jacobian, rod)
         dx = frame[rod, ORIGIN] - frame[tube, ORIGIN]
         dy = frame[rod, ORIGIN + 1] - frame[tube, ORIGIN + 1]
         dz = frame[rod, ORIGIN + 2] - frame[tube, ORIGIN + 2]
@@ -100,7 +100,7 @@ def place_bars(tree, shape, first, frame, jacobian, bar):
             frame[i, 0], frame[i, 1], frame[i, 2] = ex, -nx, ux
             frame[i, 3], frame[i, 4], frame[i, 5] = ey, -ny, uy
             frame[i, 6], frame[i, 7], frame[i, 8] = ez, -nz, uz
-        for k in range(tree[tube, REACH]):
+        for k in range(tree[tube, COORDINATE_END]):
             vx = jacobian[rod, k, 0] - jacobian[tube, k, 0]
             vy = jacobian[rod, k, 1] - jacobian[tube, k, 1]
             vz = jacobian[rod, k, 2] - jacobian[tube, k, 2]
@@ -115,8 +115,8 @@ def place_bars(tree, shape, first, frame, jacobian, bar):
 
 
 @allocation_free
-def move_bars(tree, first, frame, bar):
-    """Compute the rates and accelerations of all bars, after `place_bars`.
+def compute_bar_motion(tree, first, frame, bar):
+    """Compute the rates and accelerations of all bars, after `compute_bar_frames`.
 
     Args:
         tree: see `ReducedMechanism`.
@@ -132,8 +132,8 @@ def move_bars(tree, first, frame, bar):
     for b in range(len(bar)):
         tube, rod = first + 2 * b, first + 2 * b + 1
         base, c = tree[tube, PARENT], bar[b, LENGTH]
-        move_origin(tree, frame, tube)
-        move_origin(tree, frame, rod)
+        compute_origin_motion(tree, frame, tube)
+        compute_origin_motion(tree, frame, rod)
         ex, ey, ez = frame[tube, 0], frame[tube, 3], frame[tube, 6]
         nx, ny, nz = -frame[tube, 1], -frame[tube, 4], -frame[tube, 7]
         ux, uy, uz = frame[tube, 2], frame[tube, 5], frame[tube, 8]
@@ -171,15 +171,15 @@ def move_bars(tree, first, frame, bar):
             frame[i, SPIN_RATE + 2] = frame[base, SPIN_RATE + 2] + nz * turn_rate + mz * turn
 
 
-_NEWTON_STEPS = 20  # maximum number of Newton iterations
-_CLOSED = 1.0e-12  # m, maximum residual of a closed loop: rounding of a 10 m machine
-_STEP = 0.2  # rad or m, maximum step of an independent coordinate between two Newton solutions
-_FAR = 20.0  # rad or m, distance per call above which steps get larger than _STEP
-_TURN = 0.3  # rad or m, maximum change of a dependent coordinate per Newton iteration
+_MAX_ITERATIONS = 20  # maximum number of Newton iterations
+_CLOSURE_TOLERANCE = 1.0e-12  # m, maximum residual of a closed loop: rounding of a 10 m machine
+_MAX_INDEPENDENT_STEP = 0.2  # rad or m, maximum step of an independent coordinate between two Newton solutions
+_MAX_DISTANCE = 20.0  # rad or m, distance per call above which steps get larger than _STEP
+_MAX_DEPENDENT_STEP = 0.3  # rad or m, maximum change of a dependent coordinate per Newton iteration
 
 
 @allocation_free
-def close_chains(mech, m, z):
+def close_loops(mech, m, z):
     """Move to independent positions with all loops closed, and compute the dependent rates.
 
     The function starts from the last position, or from home if the last position is not finite. Its
@@ -196,7 +196,7 @@ def close_chains(mech, m, z):
 
     Source: Newton's method on the loop equations; J_b r_b = -J_f r_f for the rates.
     """
-    joint, free, bound = m.joint, mech.free, mech.bound
+    joint, free, bound = m.joint, mech.free, mech.dependent
     n, nb, lost, far, worst = len(free), len(bound), False, 0.0, 0.0
     for k in range(joint.shape[1]):
         lost = lost or not math.isfinite(joint[Q, k])
@@ -210,22 +210,22 @@ def close_chains(mech, m, z):
         move = abs(z[f] - joint[Q, free[f]])
         if move > far:
             far = move
-    for part in range(1 + int(min(far, _FAR) / _STEP), 0, -1):
+    for part in range(1 + int(min(far, _MAX_DISTANCE) / _MAX_INDEPENDENT_STEP), 0, -1):
         for f in range(n):
             move = (z[f] - joint[Q, free[f]]) / part
             joint[Q, free[f]] += move
             for b in range(nb):
                 joint[Q, bound[b]] += m.basis[bound[b], f] * move
-        for _ in range(_NEWTON_STEPS):
-            place_links(mech.tree, mech.shape, mech.links, joint, m.frame, m.jacobian)
+        for _ in range(_MAX_ITERATIONS):
+            compute_link_frames(mech.tree, mech.shape, mech.links, joint, m.frame, m.jacobian)
             first = len(mech.tree) - 2 * len(m.loop) // 3
-            worst = _open_pins(mech.tree, mech.shape, first, m.frame, m.jacobian, m.loop)
+            worst = _compute_residuals(mech.tree, mech.shape, first, m.frame, m.jacobian, m.loop)
             _factorise_loops(bound, m.loop, m.normal)
-            if worst < _CLOSED:
+            if worst < _CLOSURE_TOLERANCE:
                 break
             _solve_loops(bound, m.loop, joint.shape[1], m.normal)
             for b in range(nb):
-                joint[Q, bound[b]] += min(_TURN, max(-_TURN, m.normal[nb, b]))
+                joint[Q, bound[b]] += min(_MAX_DEPENDENT_STEP, max(-_MAX_DEPENDENT_STEP, m.normal[nb, b]))
         for f in range(n):
             _solve_loops(bound, m.loop, free[f], m.normal)
             for b in range(nb):
@@ -238,12 +238,12 @@ def close_chains(mech, m, z):
 
 
 @allocation_free
-def drift_chains(mech, m):
+def compute_drift(mech, m):
     """Compute the dependent accelerations at zero independent accelerations.
 
     Args:
         mech: ReducedMechanism.
-        m: ReducedMotion after `close_chains` and `move_links`; DRIFT of the dependent coordinates
+        m: ReducedMotion after `close_loops` and `compute_link_motion`; DRIFT of the dependent coordinates
             is written.
 
     Returns:
@@ -255,24 +255,24 @@ def drift_chains(mech, m):
     for row in range(len(m.loop)):
         i = first + 2 * (row // 3)
         if row % 3 == 0:
-            move_origin(mech.tree, m.frame, i)
-            move_origin(mech.tree, m.frame, i + 1)
+            compute_origin_motion(mech.tree, m.frame, i)
+            compute_origin_motion(mech.tree, m.frame, i + 1)
         at = ACCELERATION + row % 3
         m.loop[row, n + 1] = m.frame[i, at] - m.frame[i + 1, at]
-    _solve_loops(mech.bound, m.loop, n + 1, m.normal)
-    for b in range(len(mech.bound)):
-        m.joint[DRIFT, mech.bound[b]] = m.normal[len(mech.bound), b]
+    _solve_loops(mech.dependent, m.loop, n + 1, m.normal)
+    for b in range(len(mech.dependent)):
+        m.joint[DRIFT, mech.dependent[b]] = m.normal[len(mech.dependent), b]
 
 
 @allocation_free
-def _open_pins(tree, shape, first, frame, jacobian, loop):
+def _compute_residuals(tree, shape, first, frame, jacobian, loop):
     """Compute the residuals of all closures and their Jacobian; return the maximum residual."""
     n, worst = loop.shape[1] - 2, 0.0
     for row in range(len(loop)):
         i, r = first + 2 * (row // 3), row % 3
         if r == 0:
-            place_origin(tree, shape, frame, jacobian, i)
-            place_origin(tree, shape, frame, jacobian, i + 1)
+            compute_origin(tree, shape, frame, jacobian, i)
+            compute_origin(tree, shape, frame, jacobian, i + 1)
         loop[row, n] = frame[i, ORIGIN + r] - frame[i + 1, ORIGIN + r]
         worst = max(worst, abs(loop[row, n]))
         for k in range(n):
@@ -292,7 +292,7 @@ def _factorise_loops(bound, loop, normal):
         trace += normal[a, a]
     for a in range(nb):
         normal[a, a] += 1.0e-14 * trace
-    factorise(normal)
+    factorise_cholesky(normal)
 
 
 @allocation_free
@@ -303,14 +303,22 @@ def _solve_loops(bound, loop, column, normal):
         normal[nb, a] = 0.0
         for r in range(len(loop)):
             normal[nb, a] -= loop[r, bound[a]] * loop[r, column]
-    solve(normal, normal[nb])
+    solve_cholesky(normal, normal[nb])
 
 
 WELD, HINGE, SLIDE, TUBE, ROD, PIN = range(6)
-_KINDS = {"hinge": HINGE, "slide": SLIDE}
+_JOINT_KINDS = {"hinge": HINGE, "slide": SLIDE}
 
-PARENT, KIND, COORDINATE, REACH = range(4)  # columns of `tree`
-POSITION, AXIS, COM, INERTIA, MASS, CLOSED, SHAPE = 0, 3, 6, 9, 12, 13, 14  # columns of `shape`
+PARENT, KIND, COORDINATE, COORDINATE_END = range(4)  # columns of `tree`
+POSITION, AXIS, COM, INERTIA, MASS, CLOSED_LENGTH, SHAPE_SIZE = (
+    0,
+    3,
+    6,
+    9,
+    12,
+    13,
+    14,
+)  # columns of `shape`
 DAMPING, HOME = range(2)  # rows of `joint`
 BAR, JOINT = range(2)  # columns of `drive`
 
@@ -329,12 +337,12 @@ class ReducedMechanism(NamedTuple):
             pins), AXIS of the joint (for tube and rod, of their pins, in the axes of the parent of
             the tube), COM [m] and INERTIA about it [kg m^2] in the frame's axes, MASS [kg], and
             CLOSED, for a tube the pin-to-pin length at piston displacement 0 [m].
-        links: l, number of links.
-        bars: number of bars.
+        link_count: l, number of links.
+        bar_count: number of bars.
         joint: (2, N) rows DAMPING [N m s/rad] or [N s/m] and HOME [rad] or [m] of the tree
             coordinates.
-        free: (n,) indices of the independent tree coordinates.
-        bound: (N - n,) indices of the dependent tree coordinates, which the closures determine.
+        independent: (n,) indices of the independent tree coordinates.
+        dependent: (N - n,) indices of the dependent tree coordinates, which the closures determine.
         gravity: (3,) [m/s^2].
         drive: (nu, 2) columns BAR, -1 if the drive acts directly on its joint, and JOINT, the tree
             coordinate.
@@ -342,33 +350,33 @@ class ReducedMechanism(NamedTuple):
 
     tree: np.ndarray
     shape: np.ndarray
-    links: int
-    bars: int
+    link_count: int
+    bar_count: int
     joint: np.ndarray
-    free: np.ndarray
-    bound: np.ndarray
+    independent: np.ndarray
+    dependent: np.ndarray
     gravity: np.ndarray
     drive: np.ndarray
 
     @property
-    def bodies(self) -> int:
+    def body_count(self) -> int:
         """Number of bodies: world, links, tubes and rods, whose frames come first."""
-        return 1 + self.links + 2 * self.bars
+        return 1 + self.link_count + 2 * self.bar_count
 
 
 def body_names(machine: Machine) -> list[str]:
-    """Return the body names of `mechanism(machine)`: world, links, `<axis>_tube`, `<axis>_rod`."""
+    """Return the body names of `make_reduced_mechanism(machine)`: world, links, `<axis>_tube`, `<axis>_rod`."""
     bars = [n for n in actuator_order(machine) if machine.axes[n].cylinder]
-    return ["world", *_tree_order(machine), *(f"{n}_{p}" for n in bars for p in ("tube", "rod"))]
+    return ["world", *_sort_links(machine), *(f"{n}_{p}" for n in bars for p in ("tube", "rod"))]
 
 
 def coordinate_names(machine: Machine) -> list[str]:
     """Return the names of the joints in the order of the tree coordinates."""
-    links = (machine.links[name] for name in _tree_order(machine))
+    links = (machine.links[name] for name in _sort_links(machine))
     return [link.joint.name for link in links if link.joint]
 
 
-def mechanism(machine: Machine) -> ReducedMechanism:
+def make_reduced_mechanism(machine: Machine) -> ReducedMechanism:
     """Convert the mechanism of a machine to arrays for compiled code.
 
     Args:
@@ -378,16 +386,16 @@ def mechanism(machine: Machine) -> ReducedMechanism:
     Returns:
         The mechanism.
     """
-    order, joints = _tree_order(machine), coordinate_names(machine)
+    order, joints = _sort_links(machine), coordinate_names(machine)
     index = {"world": 0, **{name: 1 + i for i, name in enumerate(order)}}
-    tree, shape = [(-1, WELD, -1)], [_row()]
+    tree, shape = [(-1, WELD, -1)], [_shape_row()]
     for name in order:
         link = machine.links[name]
-        kind = _KINDS[link.joint.type] if link.joint else WELD
+        kind = _JOINT_KINDS[link.joint.type] if link.joint else WELD
         coordinate = joints.index(link.joint.name) if link.joint else -1
         tree.append((index[link.parent], kind, coordinate))
         axis = link.joint.axis if link.joint else (0.0, 0.0, 1.0)
-        shape.append(_row(link.position, axis, link.com, link.inertia, link.mass))
+        shape.append(_shape_row(link.position, axis, link.com, link.inertia, link.mass))
     drives = actuator_order(machine)
     bars = [name for name in drives if machine.axes[name].cylinder]
     for name in bars:
@@ -396,18 +404,18 @@ def mechanism(machine: Machine) -> ReducedMechanism:
         ends = (TUBE, c.base_pin, c.tube, c.tube.com), (ROD, c.rod_pin, c.rod, -c.rod.com)
         for kind, pin, bar, com in ends:
             tree.append((index[pin.link], kind, -1))
-            row = _row(pin.position, pins, (com, 0, 0), bar.inertia, bar.mass)
+            row = _shape_row(pin.position, pins, (com, 0, 0), bar.inertia, bar.mass)
             shape.append(row)
-        shape[-2][CLOSED] = c.closed_length
+        shape[-2][CLOSED_LENGTH] = c.closed_length
     for pin in (pin for closure in machine.closures.values() for pin in (closure.a, closure.b)):
         tree.append((index[pin.link], PIN, -1))
-        shape.append(_row(pin.position))
-    following = following_joints(machine)
+        shape.append(_shape_row(pin.position))
+    following = dependent_joints(machine)
     return ReducedMechanism(
-        tree=_with_reach(np.array(tree, int)),
+        tree=_append_coordinate_end(np.array(tree, int)),
         shape=np.array(shape),
-        links=len(order),
-        bars=len(bars),
+        link_count=len(order),
+        bar_count=len(bars),
         joint=np.array(
             [
                 [machine.joints[name].damping for name in joints],
@@ -415,24 +423,21 @@ def mechanism(machine: Machine) -> ReducedMechanism:
             ],
             float,
         ),
-        free=np.array([i for i, name in enumerate(joints) if name not in following], int),
-        bound=np.array([i for i, name in enumerate(joints) if name in following], int),
+        independent=np.array([i for i, name in enumerate(joints) if name not in following], int),
+        dependent=np.array([i for i, name in enumerate(joints) if name in following], int),
         gravity=np.array(machine.gravity, float),
         drive=np.array(
-            [
-                (bars.index(name) if name in bars else -1, joints.index(machine.axes[name].joint))
-                for name in drives
-            ],
+            [(bars.index(name) if name in bars else -1, joints.index(machine.axes[name].joint)) for name in drives],
             int,
         ).reshape(-1, 2),
     )
 
 
-def _row(position=(0, 0, 0), axis=(0, 0, 1), com=(0, 0, 0), inertia=(0, 0, 0), mass=0.0):
+def _shape_row(position=(0, 0, 0), axis=(0, 0, 1), com=(0, 0, 0), inertia=(0, 0, 0), mass=0.0):
     return np.array([*position, *axis, *com, *inertia, mass, 0.0], float)
 
 
-def _with_reach(tree: np.ndarray) -> np.ndarray:
+def _append_coordinate_end(tree: np.ndarray) -> np.ndarray:
     """Append the column REACH to `tree`; tube and rod of a bar have the larger one of both."""
     reach = np.zeros(len(tree), int)
     for i, (parent, _, coordinate) in enumerate(tree[1:], start=1):
@@ -442,7 +447,7 @@ def _with_reach(tree: np.ndarray) -> np.ndarray:
     return np.column_stack([tree, reach])
 
 
-def _tree_order(machine: Machine) -> list[str]:
+def _sort_links(machine: Machine) -> list[str]:
     """Return the names of the links, every parent before its children."""
     order: list[str] = []
     while len(order) < len(machine.links):
@@ -455,8 +460,8 @@ def _tree_order(machine: Machine) -> list[str]:
 
 
 # columns of `frame`
-TURN, ORIGIN, SPIN, VELOCITY = 0, 9, 12, 15
-SPIN_RATE, ACCELERATION, FORCE, FRAME = 18, 21, 24, 30
+ROTATION, ORIGIN, SPIN, VELOCITY = 0, 9, 12, 15
+SPIN_RATE, ACCELERATION, FORCE, FRAME_SIZE = 18, 21, 24, 30
 LENGTH, LENGTH_RATE, LENGTH_BIAS, LENGTH_ROW = range(4)  # columns of `bar`
 Q, RATE, DRIFT, BIAS = range(4)  # rows of `joint`
 
@@ -494,19 +499,19 @@ class ReducedMotion(NamedTuple):
     normal: np.ndarray
 
 
-def motion_space(mech: ReducedMechanism) -> ReducedMotion:
+def make_reduced_motion(mech: ReducedMechanism) -> ReducedMotion:
     """Allocate a workspace with the mechanism at home; the row of the world is constant."""
-    f, n, bound = len(mech.tree), mech.joint.shape[1], len(mech.bound)
-    frame = np.zeros((f, FRAME))
-    frame[:, TURN : TURN + 9] = np.eye(3).ravel()
+    f, n, bound = len(mech.tree), mech.joint.shape[1], len(mech.dependent)
+    frame = np.zeros((f, FRAME_SIZE))
+    frame[:, ROTATION : ROTATION + 9] = np.eye(3).ravel()
     frame[0, ACCELERATION : ACCELERATION + 3] = -mech.gravity
-    basis = np.zeros((n, len(mech.free)))
-    basis[mech.free, np.arange(len(mech.free))] = 1.0
+    basis = np.zeros((n, len(mech.independent)))
+    basis[mech.independent, np.arange(len(mech.independent))] = 1.0
     joint = np.zeros((4, n))
     joint[Q] = mech.joint[HOME]
     return ReducedMotion(
-        frame, np.zeros((f, n, 6)), np.zeros((f, n, 6)), np.zeros((mech.bars, LENGTH_ROW + n)),
-        np.zeros((n, n)), joint, basis, np.zeros((3 * (f - mech.bodies) // 2, n + 2)),
+        frame, np.zeros((f, n, 6)), np.zeros((f, n, 6)), np.zeros((mech.bar_count, LENGTH_ROW + n)),
+        np.zeros((n, n)), joint, basis, np.zeros((3 * (f - mech.body_count) // 2, n + 2)),
         np.zeros((bound + 1, bound)),
     )  # fmt: skip
 
@@ -532,7 +537,7 @@ def cross(ax, ay, az, bx, by, bz):
 
 
 @allocation_free
-def rotated(frame, i, x, y, z):
+def rotate_to_world(frame, i, x, y, z):
     """Rotate a vector from a frame to the axes of the world.
 
     Args:
@@ -555,7 +560,7 @@ def rotated(frame, i, x, y, z):
 
 
 @allocation_free
-def place_origin(tree, shape, frame, jacobian, i):
+def compute_origin(tree, shape, frame, jacobian, i):
     """Compute the origin of a frame and its Jacobian, as a point fixed to the parent.
 
     Args:
@@ -571,13 +576,11 @@ def place_origin(tree, shape, frame, jacobian, i):
     Source: rigid-body kinematics.
     """
     p = tree[i, PARENT]
-    rx, ry, rz = rotated(
-        frame, p, shape[i, POSITION], shape[i, POSITION + 1], shape[i, POSITION + 2]
-    )
+    rx, ry, rz = rotate_to_world(frame, p, shape[i, POSITION], shape[i, POSITION + 1], shape[i, POSITION + 2])
     frame[i, ORIGIN] = frame[p, ORIGIN] + rx
     frame[i, ORIGIN + 1] = frame[p, ORIGIN + 1] + ry
     frame[i, ORIGIN + 2] = frame[p, ORIGIN + 2] + rz
-    for k in range(tree[p, REACH]):
+    for k in range(tree[p, COORDINATE_END]):
         wx, wy, wz = jacobian[p, k, 3], jacobian[p, k, 4], jacobian[p, k, 5]
         jacobian[i, k, 0] = jacobian[p, k, 0] + wy * rz - wz * ry
         jacobian[i, k, 1] = jacobian[p, k, 1] + wz * rx - wx * rz
@@ -588,12 +591,12 @@ def place_origin(tree, shape, frame, jacobian, i):
 
 
 @allocation_free
-def move_origin(tree, frame, i):
+def compute_origin_motion(tree, frame, i):
     """Compute the rates and accelerations of a frame as if it were fixed to its parent.
 
     Args:
         tree: see `ReducedMechanism`.
-        frame: see `ReducedMotion`; written, after `place_origin`.
+        frame: see `ReducedMotion`; written, after `compute_origin`.
         i: index of the frame.
 
     Returns:
@@ -636,7 +639,7 @@ def _rotate(frame, i, p, x, y, z, angle):
 
 
 @allocation_free
-def place_links(tree, shape, links, joint, frame, jacobian):
+def compute_link_frames(tree, shape, links, joint, frame, jacobian):
     """Compute the frames and Jacobians of the links.
 
     Args:
@@ -654,9 +657,9 @@ def place_links(tree, shape, links, joint, frame, jacobian):
     """
     for i in range(1, 1 + links):
         p, j = tree[i, PARENT], tree[i, COORDINATE]
-        place_origin(tree, shape, frame, jacobian, i)
+        compute_origin(tree, shape, frame, jacobian, i)
         lx, ly, lz = shape[i, AXIS], shape[i, AXIS + 1], shape[i, AXIS + 2]
-        x, y, z = rotated(frame, p, lx, ly, lz)
+        x, y, z = rotate_to_world(frame, p, lx, ly, lz)
         if tree[i, KIND] == HINGE:
             _rotate(frame, i, p, lx, ly, lz, joint[Q, j])
             jacobian[i, j, 3], jacobian[i, j, 4], jacobian[i, j, 5] = x, y, z
@@ -668,10 +671,8 @@ def place_links(tree, shape, links, joint, frame, jacobian):
             frame[i, ORIGIN] += sx
             frame[i, ORIGIN + 1] += sy
             frame[i, ORIGIN + 2] += sz
-            for k in range(tree[p, REACH]):
-                vx, vy, vz = cross(
-                    jacobian[p, k, 3], jacobian[p, k, 4], jacobian[p, k, 5], sx, sy, sz
-                )
+            for k in range(tree[p, COORDINATE_END]):
+                vx, vy, vz = cross(jacobian[p, k, 3], jacobian[p, k, 4], jacobian[p, k, 5], sx, sy, sz)
                 jacobian[i, k, 0] += vx
                 jacobian[i, k, 1] += vy
                 jacobian[i, k, 2] += vz
@@ -679,8 +680,8 @@ def place_links(tree, shape, links, joint, frame, jacobian):
 
 
 @allocation_free
-def move_links(tree, links, joint, frame, jacobian):
-    """Compute the rates and accelerations of the links, after `place_links`.
+def compute_link_motion(tree, links, joint, frame, jacobian):
+    """Compute the rates and accelerations of the links, after `compute_link_frames`.
 
     Args:
         tree: see `ReducedMechanism`.
@@ -695,7 +696,7 @@ def move_links(tree, links, joint, frame, jacobian):
     Source: differential kinematics of a tree.
     """
     for i in range(1, 1 + links):
-        move_origin(tree, frame, i)
+        compute_origin_motion(tree, frame, i)
         if tree[i, KIND] != HINGE and tree[i, KIND] != SLIDE:
             continue
         p, j = tree[i, PARENT], tree[i, COORDINATE]
@@ -713,14 +714,14 @@ def move_links(tree, links, joint, frame, jacobian):
 
 
 @allocation_free
-def gather_forces(mech, m):
+def compute_mass_and_bias(mech, m):
     """Compute the mass matrix and bias forces of the tree with its bars (Kane's projection).
 
     `M = sum J' P` and `h = sum J' F` with the momenta P and the wrenches F of all bodies.
 
     Args:
         mech: ReducedMechanism.
-        m: ReducedMotion after `close_chains`; `momentum`, `mass`, the columns FORCE of `frame` and
+        m: ReducedMotion after `close_loops`; `momentum`, `mass`, the columns FORCE of `frame` and
             the row BIAS of `joint` are written.
 
     Returns:
@@ -728,21 +729,21 @@ def gather_forces(mech, m):
 
     Source: Kane and Levinson 1985, Dynamics.
     """
-    bodies, n = 1 + mech.links + 2 * mech.bars, m.mass.shape[0]
+    bodies, n = 1 + mech.links + 2 * mech.bar_count, m.mass.shape[0]
     frame, jacobian, momentum = m.frame, m.jacobian, m.momentum
     for b in range(1, bodies):
-        _load_body(mech.shape, frame, jacobian, b, mech.tree[b, REACH], momentum)
+        _compute_body_wrench(mech.shape, frame, jacobian, b, mech.tree[b, COORDINATE_END], momentum)
     for i in range(n):
         bias = 0.0
         for b in range(1, bodies):
-            if mech.tree[b, REACH] > i:
+            if mech.tree[b, COORDINATE_END] > i:
                 for r in range(6):
                     bias += jacobian[b, i, r] * frame[b, FORCE + r]
         m.joint[BIAS, i] = bias
         for j in range(i + 1):
             mass = 0.0
             for b in range(1, bodies):
-                if mech.tree[b, REACH] > i:
+                if mech.tree[b, COORDINATE_END] > i:
                     for r in range(6):
                         mass += jacobian[b, j, r] * momentum[b, i, r]
             m.mass[i, j] = mass
@@ -750,10 +751,10 @@ def gather_forces(mech, m):
 
 
 @allocation_free
-def _load_body(shape, frame, jacobian, b, reach, momentum):
+def _compute_body_wrench(shape, frame, jacobian, b, reach, momentum):
     """Compute momentum per unit rate and the wrench of inertia and gravity about the origin."""
     mass = shape[b, MASS]
-    rx, ry, rz = rotated(frame, b, shape[b, COM], shape[b, COM + 1], shape[b, COM + 2])
+    rx, ry, rz = rotate_to_world(frame, b, shape[b, COM], shape[b, COM + 1], shape[b, COM + 2])
     i0, i1, i2 = shape[b, INERTIA], shape[b, INERTIA + 1], shape[b, INERTIA + 2]
     t0, t1, t2 = frame[b, 0], frame[b, 1], frame[b, 2]
     t3, t4, t5 = frame[b, 3], frame[b, 4], frame[b, 5]

@@ -13,13 +13,13 @@ from hydrotele.core.compiled import allocation_free, compiled
 
 
 @allocation_free
-def vector(rows, k):
+def get_vector(rows, k):
     """Return row k of an (n, 3) array as a tuple (x, y, z)."""
     return rows[k, 0], rows[k, 1], rows[k, 2]
 
 
 @allocation_free
-def store(rows, k, a):
+def set_vector(rows, k, a):
     """Write a tuple (x, y, z) into row k of an (n, 3) array."""
     rows[k, 0], rows[k, 1], rows[k, 2] = a
 
@@ -37,7 +37,7 @@ def subtract(a, b):
 
 
 @allocation_free
-def scaled(s, a):
+def scale_vector(s, a):
     """Return a vector times a scalar."""
     return s * a[0], s * a[1], s * a[2]
 
@@ -55,13 +55,13 @@ def cross(a, b):
 
 
 @allocation_free
-def rotating_acceleration(w, dw, arm):
+def point_acceleration(w, dw, arm):
     """Return the acceleration `dw x r + w x (w x r)` of a point r of a rotating body."""
     return add(cross(dw, arm), cross(w, cross(w, arm)))
 
 
 @allocation_free
-def rotation(rows, k):
+def get_rotation(rows, k):
     """Return matrix k of an (n, 3, 3) array as three row vectors."""
     m = rows[k]
     return (
@@ -70,7 +70,7 @@ def rotation(rows, k):
 
 
 @allocation_free
-def store_rotation(rows, k, r):
+def set_rotation(rows, k, r):
     """Write three row vectors into matrix k of an (n, 3, 3) array."""
     m = rows[k]
     m[0, 0], m[0, 1], m[0, 2] = r[0]
@@ -79,21 +79,21 @@ def store_rotation(rows, k, r):
 
 
 @allocation_free
-def rotated(r, a):
+def rotate(r, a):
     """Return a vector rotated by r."""
     return dot(r[0], a), dot(r[1], a), dot(r[2], a)
 
 
 @allocation_free
-def rotated_back(r, a):
+def rotate_back(r, a):
     """Return a vector rotated by the inverse of r."""
-    return add(add(scaled(a[0], r[0]), scaled(a[1], r[1])), scaled(a[2], r[2]))
+    return add(add(scale_vector(a[0], r[0]), scale_vector(a[1], r[1])), scale_vector(a[2], r[2]))
 
 
 @allocation_free
-def composed(r, s):
+def compose_rotations(r, s):
     """Return the rotation r s, which applies s first and then r."""
-    return rotated_back(s, r[0]), rotated_back(s, r[1]), rotated_back(s, r[2])
+    return rotate_back(s, r[0]), rotate_back(s, r[1]), rotate_back(s, r[2])
 
 
 @allocation_free
@@ -109,7 +109,7 @@ def axis_rotation(axis, angle):
     )
 
 
-_STIFF = 1e-7  # minimum ratio of an orthogonalised column to the largest one for full rank
+_MIN_RANK_RATIO = 1e-7  # minimum ratio of an orthogonalised column to the largest one for full rank
 
 
 @allocation_free
@@ -137,7 +137,7 @@ def qr_factor(matrix, columns, q, r):
         for m in range(rows):
             total += q[m, j] ** 2
         r[j, j] = math.sqrt(total)
-        if not r[j, j] > _STIFF * size:
+        if not r[j, j] > _MIN_RANK_RATIO * size:
             return False
         for m in range(rows):
             q[m, j] /= r[j, j]
@@ -156,35 +156,35 @@ def qr_solve(q, r, count, right, column, answer, k):
         answer[j, k] = total / r[j, j]
 
 
-_PAIRS = np.array([(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)])
+_INERTIA_PAIRS = np.array([(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)])
 
 
 class Frames(NamedTuple):
     """Positions and motion of bodies and joint axes in the world frame; b bodies, v joints.
 
     Attributes:
-        place: (b, 3) origins [m].
-        turn: (b, 3, 3) orientations.
-        spin: (b, 3) angular velocities [rad/s].
-        spin_rate: (b, 3) angular accelerations [rad/s^2].
+        origin: (b, 3) origins [m].
+        rotation: (b, 3, 3) orientations.
+        angular_velocity: (b, 3) angular velocities [rad/s].
+        angular_acceleration: (b, 3) angular accelerations [rad/s^2].
         acceleration: (b, 3) accelerations of the origins [m/s^2].
         axis: (v, 3) joint axes.
         anchor: (v, 3) points on the joint axes [m].
     """
 
-    place: np.ndarray
-    turn: np.ndarray
-    spin: np.ndarray
-    spin_rate: np.ndarray
+    origin: np.ndarray
+    rotation: np.ndarray
+    angular_velocity: np.ndarray
+    angular_acceleration: np.ndarray
     acceleration: np.ndarray
     axis: np.ndarray
     anchor: np.ndarray
 
 
 @compiled
-def new_frames(tree):
+def make_frames(tree):
     """Allocate the frames of a tree."""
-    b, v = len(tree.parent), len(tree.zero)
+    b, v = len(tree.parent), len(tree.reference_position)
     return Frames(
         np.empty((b, 3)), np.empty((b, 3, 3)), np.empty((b, 3)), np.empty((b, 3)),
         np.empty((b, 3)), np.empty((v, 3)), np.empty((v, 3)),
@@ -192,74 +192,78 @@ def new_frames(tree):
 
 
 @allocation_free
-def move_tree(tree, q, rate, acceleration, ground, frames):
+def compute_frames(tree, q, rate, acceleration, ground, frames):
     """Compute all frames from (v,) positions, rates and accelerations.
 
     `ground` (3,) is the acceleration of the world, such as minus gravity.
     """
-    store(frames.place, 0, (0.0, 0.0, 0.0))
-    store(frames.spin, 0, (0.0, 0.0, 0.0))
-    store(frames.spin_rate, 0, (0.0, 0.0, 0.0))
-    store(frames.acceleration, 0, (ground[0], ground[1], ground[2]))
-    store_rotation(frames.turn, 0, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+    set_vector(frames.place, 0, (0.0, 0.0, 0.0))
+    set_vector(frames.angular_velocity, 0, (0.0, 0.0, 0.0))
+    set_vector(frames.angular_acceleration, 0, (0.0, 0.0, 0.0))
+    set_vector(frames.acceleration, 0, (ground[0], ground[1], ground[2]))
+    set_rotation(frames.turn, 0, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
     for b in range(1, len(tree.parent)):
         up = tree.parent[b]
-        t, w, dw = rotation(frames.turn, up), vector(frames.spin, up), vector(frames.spin_rate, up)
-        arm = rotated(t, vector(tree.offset, b))
-        p = add(vector(frames.place, up), arm)
-        a = add(vector(frames.acceleration, up), rotating_acceleration(w, dw, arm))
-        t = composed(t, rotation(tree.turn, b))
+        t, w, dw = (
+            get_rotation(frames.turn, up),
+            get_vector(frames.angular_velocity, up),
+            get_vector(frames.angular_acceleration, up),
+        )
+        arm = rotate(t, get_vector(tree.offset, b))
+        p = add(get_vector(frames.place, up), arm)
+        a = add(get_vector(frames.acceleration, up), point_acceleration(w, dw, arm))
+        t = compose_rotations(t, get_rotation(tree.turn, b))
         for j in range(tree.first[b], tree.first[b + 1]):
-            own, center = vector(tree.axis, j), vector(tree.anchor, j)
-            way, arm = rotated(t, own), rotated(t, center)
-            store(frames.axis, j, way)
-            store(frames.anchor, j, add(p, arm))
-            step, turning = q[j] - tree.zero[j], cross(w, way)
-            if tree.slides[j]:
-                arm = scaled(step, way)
-                a = add(a, rotating_acceleration(w, dw, arm))
-                a = add(a, add(scaled(2.0 * rate[j], turning), scaled(acceleration[j], way)))
+            own, center = get_vector(tree.axis, j), get_vector(tree.anchor, j)
+            way, arm = rotate(t, own), rotate(t, center)
+            set_vector(frames.axis, j, way)
+            set_vector(frames.anchor, j, add(p, arm))
+            step, turning = q[j] - tree.reference_position[j], cross(w, way)
+            if tree.is_slide[j]:
+                arm = scale_vector(step, way)
+                a = add(a, point_acceleration(w, dw, arm))
+                a = add(a, add(scale_vector(2.0 * rate[j], turning), scale_vector(acceleration[j], way)))
                 p = add(p, arm)
                 continue
-            a = add(a, rotating_acceleration(w, dw, arm))
-            dw = add(dw, add(scaled(acceleration[j], way), scaled(rate[j], turning)))
-            w = add(w, scaled(rate[j], way))
-            t = composed(t, axis_rotation(own, step))
-            back = scaled(-1.0, rotated(t, center))
-            a = add(a, rotating_acceleration(w, dw, back))
+            a = add(a, point_acceleration(w, dw, arm))
+            dw = add(dw, add(scale_vector(acceleration[j], way), scale_vector(rate[j], turning)))
+            w = add(w, scale_vector(rate[j], way))
+            t = compose_rotations(t, axis_rotation(own, step))
+            back = scale_vector(-1.0, rotate(t, center))
+            a = add(a, point_acceleration(w, dw, back))
             p = add(add(p, arm), back)
-        store(frames.place, b, p)
-        store_rotation(frames.turn, b, t)
-        store(frames.spin, b, w)
-        store(frames.spin_rate, b, dw)
-        store(frames.acceleration, b, a)
+        set_vector(frames.place, b, p)
+        set_rotation(frames.turn, b, t)
+        set_vector(frames.angular_velocity, b, w)
+        set_vector(frames.angular_acceleration, b, dw)
+        set_vector(frames.acceleration, b, a)
 
 
 @allocation_free
-def point_column(tree, frames, j, point):
+def point_jacobian(tree, frames, j, point):
     """Return the velocity of a point per unit rate of a joint that moves it."""
-    way = vector(frames.axis, j)
-    return way if tree.slides[j] else cross(way, subtract(point, vector(frames.anchor, j)))
+    way = get_vector(frames.axis, j)
+    return way if tree.is_slide[j] else cross(way, subtract(point, get_vector(frames.anchor, j)))
 
 
 @allocation_free
-def wrenches(frames, body, forces, torques):
+def compute_wrenches(frames, body, forces, torques):
     """Compute force and torque (3, 10) at a body's origin per unit of the inertial parameters.
 
     Forces and torques are in the world frame:
     `f = m a + alpha x s + w x (w x s)` and `n = I alpha + w x I w + s x a` with s = m c.
     """
-    t, a = rotation(frames.turn, body), vector(frames.acceleration, body)
-    w, dw = vector(frames.spin, body), vector(frames.spin_rate, body)
+    t, a = get_rotation(frames.turn, body), get_vector(frames.acceleration, body)
+    w, dw = get_vector(frames.angular_velocity, body), get_vector(frames.angular_acceleration, body)
     for k in range(3):
         forces[k, 0], torques[k, 0] = a[k], 0.0
         way = (t[0][k], t[1][k], t[2][k])
-        f, n = rotating_acceleration(w, dw, way), cross(way, a)
+        f, n = point_acceleration(w, dw, way), cross(way, a)
         for m in range(3):
             forces[m, 1 + k], torques[m, 1 + k] = f[m], n[m]
-    v, dv = rotated_back(t, w), rotated_back(t, dw)
+    v, dv = rotate_back(t, w), rotate_back(t, dw)
     for p in range(6):
-        i, j = _PAIRS[p, 0], _PAIRS[p, 1]
+        i, j = _INERTIA_PAIRS[p, 0], _INERTIA_PAIRS[p, 1]
         x, y, z = 0.0, 0.0, 0.0  # I w, with a unit at (i, j) and (j, i)
         dx, dy, dz = 0.0, 0.0, 0.0
         if i == 0:
@@ -273,6 +277,6 @@ def wrenches(frames, body, forces, torques):
                 y, dy = v[i], dv[i]
             else:
                 z, dz = v[i], dv[i]
-        n = rotated(t, add((dx, dy, dz), cross(v, (x, y, z))))
+        n = rotate(t, add((dx, dy, dz), cross(v, (x, y, z))))
         for m in range(3):
             forces[m, 4 + p], torques[m, 4 + p] = 0.0, n[m]

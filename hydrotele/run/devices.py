@@ -22,13 +22,20 @@ from typing import Annotated, Any, Literal, NamedTuple, Protocol
 import numpy as np
 from pydantic import Field, model_validator
 
-from hydrotele.core.datafile import Facts, Name, NonNegative, parse, read_yaml, suggest
+from hydrotele.core.datafile import (
+    Name,
+    NonNegativeFloat,
+    StrictModel,
+    read_yaml,
+    suggest_valid_name,
+    validate_data,
+)
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import read_text
 from hydrotele.machine.joystick import AXES
 from hydrotele.scenario.teleoperation import JoystickAxis
 
-_FINE = 2  # decimals of an axis value: finer than an operator can set, and short in a file
+_AXIS_DECIMALS = 2  # decimals of an axis value: finer than an operator can set, and short in a file
 
 
 class Reading(NamedTuple):
@@ -39,13 +46,13 @@ class Reading(NamedTuple):
         commands: commands of the axes that the joystick does not move, -1 .. 1, in the order of
             the machine.
         quit: whether to stop the drive.
-        said: message for the user, for example that the device was unplugged; empty without one.
+        user_message: message for the user, for example that the device was unplugged; empty without one.
     """
 
     axes: tuple[float, ...] = (0.0,) * 6
     commands: tuple[float, ...] = ()
     quit: bool = False
-    said: str = ""
+    user_message: str = ""
 
 
 class Device(Protocol):
@@ -60,27 +67,27 @@ class Device(Protocol):
         ...
 
 
-def outside(value: float, dead: float) -> float:
+def remove_dead_zone(value: float, dead_zone: float) -> float:
     """Remove the dead zone from an axis value, keeping full scale at the end of its travel.
 
     Args:
         value: raw axis value of the device, -1 .. 1.
-        dead: half width of the dead zone, in the same scale.
+        dead_zone: half width of the dead zone, in the same scale.
 
     Returns:
         0 inside the dead zone, otherwise -1 .. 1, rounded to hundredths.
 
-    >>> outside(0.1, 0.12), outside(-1.2, 0.12), outside(0.56, 0.12)
+    >>> remove_dead_zone(0.1, 0.12), remove_dead_zone(-1.2, 0.12), remove_dead_zone(0.56, 0.12)
     (0.0, -1.0, 0.5)
     """
-    beyond = min(1.0, abs(value)) - dead
+    beyond = min(1.0, abs(value)) - dead_zone
     if not beyond > 0.0:
         return 0.0
-    size = round(beyond / (1.0 - dead), _FINE)
+    size = round(beyond / (1.0 - dead_zone), _AXIS_DECIMALS)
     return size if value > 0.0 else -size
 
 
-class Switches:
+class SwitchedCommands:
     """Commands of additional axes that buttons switch between -1, 0 and 1.
 
     Attributes:
@@ -95,26 +102,26 @@ class Switches:
         """
         self.commands = [0.0] * count
 
-    def up(self, number: int) -> None:
+    def step_up(self, number: int) -> None:
         """Increase the command of an axis by one step: -1 to 0, or 0 to 1."""
         self._set(number, lambda now: min(1.0, now + 1.0))
 
-    def down(self, number: int) -> None:
+    def step_down(self, number: int) -> None:
         """Decrease the command of an axis by one step: 1 to 0, or 0 to -1."""
         self._set(number, lambda now: max(-1.0, now - 1.0))
 
-    def turn(self, number: int) -> None:
+    def cycle_command(self, number: int) -> None:
         """Advance the command of an axis in the cycle 0, 1, 0, -1, for a single button."""
         if number < len(self.commands):
             now = self.commands[number]
-            self._next = -self._next if now else self._next
-            self.commands[number] = 0.0 if now else self._next
+            self._next_direction = -self._next_direction if now else self._next_direction
+            self.commands[number] = 0.0 if now else self._next_direction
 
-    def off(self) -> None:
+    def reset_all(self) -> None:
         """Set all commands to 0."""
         self.commands = [0.0] * len(self.commands)
 
-    _next = 1.0
+    _next_direction = 1.0
 
     def _set(self, number: int, step) -> None:
         if number < len(self.commands):
@@ -151,34 +158,34 @@ class Layout(NamedTuple):
 
     Attributes:
         axes: (handle axis, device axis number, direction 1 or -1).
-        pairs: (handle axis, button for +1, button for -1).
-        dead: dead zone of every axis, 0 .. 1.
-        hat: whether the hat switches the additional axes: up and down the first, right and left
+        button_pairs: (handle axis, button for +1, button for -1).
+        dead_zone: dead zone of every axis, 0 .. 1.
+        uses_hat: whether the hat switches the additional axes: up and down the first, right and left
             the second.
-        turns: button per additional axis that cycles its command through 0, 1, 0, -1.
-        stop: button that sets all additional commands to 0; -1 for none.
-        quit: button that stops the drive; -1 for none.
+        cycle_buttons: button per additional axis that cycles its command through 0, 1, 0, -1.
+        stop_button: button that sets all additional commands to 0; -1 for none.
+        quit_button: button that stops the drive; -1 for none.
     """
 
     axes: tuple[tuple[str, int, float], ...]
-    pairs: tuple[tuple[str, int, int], ...]
-    dead: float
-    hat: bool
-    turns: tuple[int, ...]
-    stop: int
-    quit: int
+    button_pairs: tuple[tuple[str, int, int], ...]
+    dead_zone: float
+    uses_hat: bool
+    cycle_buttons: tuple[int, ...]
+    stop_button: int
+    quit_button: int
 
 
 LAYOUTS = {
     # sticks as Linux numbers them for Xbox and PlayStation pads; 4, 5: shoulders, 1: B, 7: Start
     "gamepad": Layout(
         axes=(("x", 1, -1.0), ("y", 0, -1.0), ("z", 4, -1.0), ("ry", 3, -1.0)),
-        pairs=(("rx", 4, 5),),
-        dead=0.12,
-        hat=True,
-        turns=(),
-        stop=1,
-        quit=7,
+        button_pairs=(("rx", 4, 5),),
+        dead_zone=0.12,
+        uses_hat=True,
+        cycle_buttons=(),
+        stop_button=1,
+        quit_button=7,
     ),
     # right, towards the user, down, pitch, roll, yaw
     "spacemouse": Layout(
@@ -190,12 +197,12 @@ LAYOUTS = {
             ("ry", 3, -1.0),
             ("rz", 5, -1.0),
         ),
-        pairs=(),
-        dead=0.1,
-        hat=False,
-        turns=(0, 1),
-        stop=-1,
-        quit=-1,
+        button_pairs=(),
+        dead_zone=0.1,
+        uses_hat=False,
+        cycle_buttons=(0, 1),
+        stop_button=-1,
+        quit_button=-1,
     ),
 }
 SPACEMOUSE_NAMES = ("space", "3dconnexion")
@@ -204,37 +211,37 @@ SPACEMOUSE_NAMES = ("space", "3dconnexion")
 class Keyboard:
     """Keyboard input; `press` may be called from another thread."""
 
-    def __init__(self, further: int) -> None:
+    def __init__(self, n_additional_axes: int) -> None:
         """Start with all axes centred.
 
         Args:
-            further: number of axes that the joystick does not move.
+            n_additional_axes: number of axes that the joystick does not move.
         """
-        self._pressed: deque[int] = deque()
+        self._pending_keys: deque[int] = deque()
         self._axes: dict[str, float] = dict.fromkeys(AXES, 0.0)
-        self._switches = Switches(further)
+        self._switches = SwitchedCommands(n_additional_axes)
         self._quit = False
 
     def press(self, code: int) -> None:
         """Queue a key press, given by its GLFW code."""
-        self._pressed.append(code)
+        self._pending_keys.append(code)
 
     def read(self, time: float) -> Reading:
         """Process the queued key presses and return the current input."""
-        while self._pressed:
-            self._take(self._pressed.popleft())
+        while self._pending_keys:
+            self._apply_key(self._pending_keys.popleft())
         return Reading(tuple(self._axes.values()), tuple(self._switches.commands), self._quit)
 
-    def _take(self, code: int) -> None:
+    def _apply_key(self, code: int) -> None:
         if code in KEYS:
             _, axis, way = KEYS[code]
             self._axes[axis] = min(1.0, max(-1.0, self._axes[axis] + way * KEY_STEP))
         elif code in SWITCH_KEYS:
             _, number, way = SWITCH_KEYS[code]
-            (self._switches.up if way > 0.0 else self._switches.down)(number)
+            (self._switches.step_up if way > 0.0 else self._switches.step_down)(number)
         elif code == CENTRE_KEY:
             self._axes = dict.fromkeys(AXES, 0.0)
-            self._switches.off()
+            self._switches.reset_all()
         elif code == QUIT_KEY:
             self._quit = True
 
@@ -242,7 +249,7 @@ class Keyboard:
         """Do nothing; a keyboard holds no resources."""
 
 
-class Pad:
+class JoystickDevice:
     """A gamepad or SpaceMouse, which may be unplugged and reconnected during a run."""
 
     def __init__(self, kind: str, sticks: Any, further: int) -> None:
@@ -250,7 +257,7 @@ class Pad:
 
         Args:
             kind: key of `LAYOUTS`.
-            sticks: object with the methods of `Sticks`: `find(kind)`, `changed()` and `close()`.
+            sticks: object with the methods of `SdlJoysticks`: `find(kind)`, `changed()` and `close()`.
             further: number of axes that the joystick does not move.
 
         Raises:
@@ -262,7 +269,7 @@ class Pad:
             sticks.close()
             message = "is not connected: connect it, or choose --device keyboard"
             raise InputError(f"--device {kind}", message)
-        self._switches, self._held = Switches(further), set()
+        self._switches, self._pressed_buttons = SwitchedCommands(further), set()
 
     def read(self, time: float) -> Reading:
         """Return the current input; the handle is centred while the device is unplugged."""
@@ -271,63 +278,63 @@ class Pad:
             before, self._stick = self._stick, self._sticks.find(self._kind)
             if self._stick is None and before is not None:
                 said = f"the {self._kind} is unplugged: the handle returns to its centre"
-                self._switches.off()
-                self._held = set()
+                self._switches.reset_all()
+                self._pressed_buttons = set()
             elif before is None and self._stick is not None:
                 said = f"the {self._kind} is connected again"
         if self._stick is None:
-            return Reading(commands=tuple(self._switches.commands), said=said)
-        axes = _axes(self._stick, self._layout)
-        over = self._press(_held(self._stick, self._layout))
+            return Reading(commands=tuple(self._switches.commands), user_message=said)
+        axes = _read_handle_axes(self._stick, self._layout)
+        over = self._apply_buttons(_read_pressed_buttons(self._stick, self._layout))
         return Reading(axes, tuple(self._switches.commands), over, said)
 
-    def _press(self, held: set[str]) -> bool:
+    def _apply_buttons(self, held: set[str]) -> bool:
         """Apply newly pressed buttons; return whether the quit button is among them."""
-        fresh, self._held = held - self._held, held
+        fresh, self._pressed_buttons = held - self._pressed_buttons, held
         switches, layout = self._switches, self._layout
         for way, act, number in (
-            ("up", switches.up, 0),
-            ("down", switches.down, 0),
-            ("right", switches.up, 1),
-            ("left", switches.down, 1),
+            ("up", switches.step_up, 0),
+            ("down", switches.step_down, 0),
+            ("right", switches.step_up, 1),
+            ("left", switches.step_down, 1),
         ):
             if way in fresh:
                 act(number)
-        for number, button in enumerate(layout.turns):
+        for number, button in enumerate(layout.cycle_buttons):
             if str(button) in fresh:
-                switches.turn(number)
-        together = len(layout.turns) > 1 and {str(b) for b in layout.turns} <= held
-        if str(layout.stop) in fresh or together:
-            switches.off()
-        return str(layout.quit) in fresh
+                switches.cycle_command(number)
+        together = len(layout.cycle_buttons) > 1 and {str(b) for b in layout.cycle_buttons} <= held
+        if str(layout.stop_button) in fresh or together:
+            switches.reset_all()
+        return str(layout.quit_button) in fresh
 
     def close(self) -> None:
         """Shut SDL down."""
         self._sticks.close()
 
 
-def _axes(stick: Any, layout: Layout) -> tuple[float, ...]:
+def _read_handle_axes(stick: Any, layout: Layout) -> tuple[float, ...]:
     values: dict[str, float] = dict.fromkeys(AXES, 0.0)
     for name, number, way in layout.axes:
         if number < stick.get_numaxes():
-            values[name] = way * outside(stick.get_axis(number), layout.dead) + 0.0
-    for name, up, down in layout.pairs:
+            values[name] = way * remove_dead_zone(stick.get_axis(number), layout.dead_zone) + 0.0
+    for name, up, down in layout.button_pairs:
         if max(up, down) < stick.get_numbuttons():
             values[name] = float(bool(stick.get_button(up)) - bool(stick.get_button(down)))
     return tuple(values.values())
 
 
-def _held(stick: Any, layout: Layout) -> set[str]:
+def _read_pressed_buttons(stick: Any, layout: Layout) -> set[str]:
     """Return the numbers of the pressed buttons and the directions of the hat."""
     held = {str(b) for b in range(stick.get_numbuttons()) if stick.get_button(b)}
-    if layout.hat and stick.get_numhats():
+    if layout.uses_hat and stick.get_numhats():
         x, y = stick.get_hat(0)
         held |= {{1: "right", -1: "left"}[x]} if x else set()
         held |= {{1: "up", -1: "down"}[y]} if y else set()
     return held
 
 
-class Sticks:
+class SdlJoysticks:
     """Joystick devices that SDL detects, accessed through pygame."""
 
     def __init__(self, kind: str) -> None:
@@ -351,7 +358,7 @@ class Sticks:
         pygame.display.init()  # SDL delivers events only with an initialised display
         pygame.joystick.init()
 
-    def changed(self) -> bool:
+    def poll_connections(self) -> bool:
         """Update the device states; return whether a device was connected or disconnected."""
         kinds = (self._pygame.JOYDEVICEADDED, self._pygame.JOYDEVICEREMOVED)
         return any(event.type in kinds for event in self._pygame.event.get())
@@ -370,15 +377,15 @@ class Sticks:
         self._pygame.quit()
 
 
-_Part = Annotated[float, Field(ge=-1, le=1)]
+_UnitRangeFloat = Annotated[float, Field(ge=-1, le=1)]
 
 
-class Script(Facts):
+class Script(StrictModel):
     """Input over time: values of the handle `axes` and `commands` of additional axes."""
 
-    time: list[NonNegative]
-    axes: dict[JoystickAxis, list[_Part]] = {}
-    commands: dict[Name, list[_Part]] = {}
+    time: list[NonNegativeFloat]
+    axes: dict[JoystickAxis, list[_UnitRangeFloat]] = {}
+    commands: dict[Name, list[_UnitRangeFloat]] = {}
     interpolate: Literal["hold", "linear"] = "hold"
 
     @model_validator(mode="after")
@@ -392,7 +399,7 @@ class Script(Facts):
         return self
 
 
-class Scripted:
+class ScriptedDevice:
     """A device that plays a script."""
 
     def __init__(self, script: Script, further: tuple[str, ...], where: str) -> None:
@@ -409,7 +416,7 @@ class Scripted:
         for name in script.commands:
             if name not in further:
                 message = f"{name!r} is not one of the axes without a joystick axis"
-                raise InputError(where, f"{message}; {suggest(name, further)}")
+                raise InputError(where, f"{message}; {suggest_valid_name(name, further)}")
         self._script, self._further = script, further
 
     def read(self, time: float) -> Reading:
@@ -417,10 +424,10 @@ class Scripted:
         script = self._script
         row = max(0, bisect.bisect_right(script.time, time + 1e-9) - 1)
         commands = [script.commands[n][row] if n in script.commands else 0.0 for n in self._further]
-        axes = [self._axis(script.axes.get(name), row, time) for name in AXES]
+        axes = [self._axis_value(script.axes.get(name), row, time) for name in AXES]
         return Reading(tuple(axes), tuple(commands), time + 1e-9 >= script.time[-1])
 
-    def _axis(self, values: list[float] | None, row: int, time: float) -> float:
+    def _axis_value(self, values: list[float] | None, row: int, time: float) -> float:
         if values is None:
             return 0.0
         if self._script.interpolate == "linear":
@@ -448,13 +455,13 @@ def load_script(path: str | Path) -> Script:
         raise InputError(path, "no such file; give a .csv or .yaml file after scripted:")
     if path.suffix.lower() in (".yaml", ".yml"):
         data, lines = read_yaml(path)
-        return parse(Script, data, str(path), lines)
+        return validate_data(Script, data, str(path), lines)
     if path.suffix.lower() == ".csv":
-        return _from_csv(path)
+        return _read_csv_script(path)
     raise InputError(path, "must be a .csv or a .yaml file")
 
 
-def _from_csv(path: Path) -> Script:
+def _read_csv_script(path: Path) -> Script:
     try:
         rows = list(csv.reader(read_text(path).splitlines()))
     except csv.Error as error:
@@ -471,17 +478,17 @@ def _from_csv(path: Path) -> Script:
         if len(row) != len(names):
             raise InputError(f"{path}, line {line}", f"has {len(row)} cells, not {len(names)}")
         for name, cell in zip(names, row, strict=True):
-            columns[name].append(_number(cell, f"{path}, line {line}, column {name!r}", name))
-        _check_time(columns["time"], f"{path}, line {line}, column 'time'")
+            columns[name].append(_parse_cell(cell, f"{path}, line {line}, column {name!r}", name))
+        _check_time_increases(columns["time"], f"{path}, line {line}, column 'time'")
     data = {
         "time": columns.pop("time"),
         "axes": {name: v for name, v in columns.items() if name in AXES},
         "commands": {name: v for name, v in columns.items() if name not in AXES},
     }
-    return parse(Script, data, str(path), {})
+    return validate_data(Script, data, str(path), {})
 
 
-def _number(cell: str, where: str, name: str) -> float:
+def _parse_cell(cell: str, where: str, name: str) -> float:
     try:
         value = float(cell)
     except ValueError:
@@ -491,23 +498,23 @@ def _number(cell: str, where: str, name: str) -> float:
     return value
 
 
-def _check_time(time: list[float], where: str) -> None:
+def _check_time_increases(time: list[float], where: str) -> None:
     if len(time) == 1 and time[0] != 0.0:
         raise InputError(where, f"time must start at 0, not at {time[0]:g}")
     if len(time) > 1 and not time[-1] > time[-2]:
         raise InputError(where, f"time must increase: {time[-1]:g} follows {time[-2]:g}")
 
 
-SCRIPTED = "scripted:"
-NAMES = ("keyboard", *LAYOUTS, f"{SCRIPTED}FILE", "haptic:HOST:PORT")
+SCRIPT_PREFIX = "scripted:"
+DEVICE_NAMES = ("keyboard", *LAYOUTS, f"{SCRIPT_PREFIX}FILE", "haptic:HOST:PORT")
 
 
-def open_device(name: str, further: tuple[str, ...]) -> Device:
+def open_device(name: str, additional_axes: tuple[str, ...]) -> Device:
     """Open an input device by name.
 
     Args:
-        name: one of `NAMES`.
-        further: axes that the joystick does not move, in the order of the machine.
+        name: one of `DEVICE_NAMES`.
+        additional_axes: axes that the joystick does not move, in the order of the machine.
 
     Returns:
         The device.
@@ -516,10 +523,10 @@ def open_device(name: str, further: tuple[str, ...]) -> Device:
         InputError: the name is unknown, the device is not connected, or a package is missing.
     """
     if name == "keyboard":
-        return Keyboard(len(further))
+        return Keyboard(len(additional_axes))
     if name in LAYOUTS:
-        return Pad(name, Sticks(name), len(further))
-    if name.startswith(SCRIPTED):
-        path = name.removeprefix(SCRIPTED)
-        return Scripted(load_script(path), further, path)
-    raise InputError(f"--device {name}", f"is not a known device; {suggest(name, NAMES)}")
+        return JoystickDevice(name, SdlJoysticks(name), len(additional_axes))
+    if name.startswith(SCRIPT_PREFIX):
+        path = name.removeprefix(SCRIPT_PREFIX)
+        return ScriptedDevice(load_script(path), additional_axes, path)
+    raise InputError(f"--device {name}", f"is not a known device; {suggest_valid_name(name, DEVICE_NAMES)}")

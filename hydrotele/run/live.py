@@ -14,20 +14,20 @@ import numpy as np
 
 from hydrotele.control.resolved_motion import arm_axes
 from hydrotele.core.errors import InputError
-from hydrotele.haptics.link import Link
-from hydrotele.haptics.server import PORT
+from hydrotele.haptics.link import HapticLink
+from hydrotele.haptics.server import DEFAULT_PORT
 from hydrotele.machine.joystick import AXES
 from hydrotele.machine.machine import Machine
-from hydrotele.run.devices import Device, Reading, Switches
-from hydrotele.run.run import Run, Session, begin, finished
+from hydrotele.run.devices import Device, Reading, SwitchedCommands
+from hydrotele.run.run import Run, Session, finish_run, start_session
 from hydrotele.scenario.scenario import Scenario
-from hydrotele.scenario.teleoperation import Button, Follow, Live, TeleopPilot
-from hydrotele.simulate.record import contact_force, surrounding_bodies
+from hydrotele.scenario.teleoperation import ButtonCommand, FollowPath, LiveOperator, TeleopPilot
+from hydrotele.simulate.record import surrounding_bodies, total_contact_force
 
 HAPTIC = "haptic"
-_ENGAGED = "the haptic device moves the machine"
-LOCAL = "127.0.0.1"
-RATE = 1000.0  # Hz, control rate with a haptic device; one physics step per tick
+_ENGAGED_MESSAGE = "the haptic device moves the machine"
+LOCAL_HOST = "127.0.0.1"
+HAPTIC_CONTROL_RATE = 1000.0  # Hz, control rate with a haptic device; one physics step per tick
 
 
 def haptic_address(device: str) -> tuple[str, int]:
@@ -46,8 +46,8 @@ def haptic_address(device: str) -> tuple[str, int]:
     ('10.0.0.7', 5610)
     """
     parts = device.split(":")
-    host = parts[1] if len(parts) > 1 else LOCAL
-    port = parts[2] if len(parts) > 2 else str(PORT)
+    host = parts[1] if len(parts) > 1 else LOCAL_HOST
+    port = parts[2] if len(parts) > 2 else str(DEFAULT_PORT)
     right = parts[0] == HAPTIC and len(parts) <= 3 and host and port.isdecimal()
     if not right or not 0 < int(port) < 65536:
         raise InputError(f"--device {device}", "must be haptic, haptic:HOST or haptic:HOST:PORT")
@@ -74,37 +74,40 @@ class HapticHandle:
         Raises:
             InputError: the host is unknown.
         """
-        self.link, self._switches = Link(host, port), Switches(further)
-        self._count, self._held, self._state = further, 0, "new"
+        self.link, self._switches = HapticLink(host, port), SwitchedCommands(further)
+        self._count, self._pressed_buttons, self._state = further, 0, "new"
 
     def attach(self, session: Session) -> None:
         """Replace the simulated joystick of a session."""
         assert session.station
         station = session.station
-        self.link.start(station.numbers, station.master_state, station.packet.shape)
-        station.attach(self.link.exchange)
+        self.link.start(station.master_parameters, station.master_state, station.packet.shape)
+        station.attach_device(self.link.exchange)
 
     def read(self, time: float) -> Reading:
         """Return the commands of the buttons, and a message when the connection changes."""
         pose = self.link.pose()
-        said = self._news(pose is not None, self.link.engaged)
+        said = self._connection_message(pose is not None, self.link.engaged)
         if pose:
-            pressed, self._held = pose.buttons & ~self._held, pose.buttons
+            pressed, self._pressed_buttons = pose.buttons & ~self._pressed_buttons, pose.buttons
             for number in range(self._count):
                 if pressed >> number & 1:
-                    self._switches.turn(number)
-        return Reading(commands=tuple(self._switches.commands), said=said)
+                    self._switches.cycle_command(number)
+        return Reading(commands=tuple(self._switches.commands), user_message=said)
 
-    def _news(self, there: bool, engaged: bool) -> str:
+    def _connection_message(self, is_connected: bool, engaged: bool) -> str:
         """Return a message if the state of the connection has changed, otherwise an empty text."""
-        before, self._state = self._state, "gone" if not there else "moves" if engaged else "waits"
+        before, self._state = (
+            self._state,
+            "gone" if not is_connected else "moves" if engaged else "waits",
+        )
         if self._state == before:
             return ""
-        if there:
-            return _ENGAGED if engaged else "a haptic device is connected: centre its handle"
+        if is_connected:
+            return _ENGAGED_MESSAGE if engaged else "a haptic device is connected: centre its handle"
         if before == "new":
             return "no haptic device responds yet: start hydrotele haptic-device"
-        self._switches.off()
+        self._switches.reset_all()
         return "the haptic device does not respond: the machine gets no command"
 
     def close(self) -> None:
@@ -112,10 +115,10 @@ class HapticHandle:
         self.link.close()
 
 
-PATIENCE = 0.25  # s by which the simulation may lag behind real time before it pauses
-_TELL = 2.0  # s, shortest time between two messages about lost real time
-_LED = 5  # decimals of a recorded handle position
-_SLOW_CLOCK = 0.002  # s: shorter waits are skipped, because a sleep is not that accurate
+MAX_LATENESS = 0.25  # s by which the simulation may lag behind real time before it pauses
+_MESSAGE_INTERVAL = 2.0  # s, shortest time between two messages about lost real time
+_HANDLE_DECIMALS = 5  # decimals of a recorded handle position
+_MIN_SLEEP = 0.002  # s: shorter waits are skipped, because a sleep is not that accurate
 
 
 class TimeKeeper(Protocol):
@@ -123,17 +126,17 @@ class TimeKeeper(Protocol):
 
     Attributes:
         pauses: number of times that simulated time was paused.
-        late: total duration of the pauses [s].
+        total_delay: total duration of the pauses [s].
     """
 
     pauses: int
-    late: float
+    total_delay: float
 
     def now(self) -> float:
         """Return the wall-clock time [s]."""
         ...
 
-    def wait(self, simulated: float) -> float:
+    def wait_for_tick(self, simulated: float) -> float:
         """Wait until a simulated time is due; return the pause just inserted [s]."""
         ...
 
@@ -147,7 +150,7 @@ class Pacer:
 
     Attributes:
         pauses: number of pauses.
-        late: total duration of the pauses [s].
+        total_delay: total duration of the pauses [s].
     """
 
     def __init__(
@@ -163,9 +166,9 @@ class Pacer:
         """
         self.speed, self.now, self._sleep = speed, now, sleep
         self._begin: float | None = None
-        self.pauses, self.late = 0, 0.0
+        self.pauses, self.total_delay = 0, 0.0
 
-    def wait(self, simulated: float) -> float:
+    def wait_for_tick(self, simulated: float) -> float:
         """Wait until a simulated time is due.
 
         Args:
@@ -180,24 +183,24 @@ class Pacer:
         if self._begin is None:
             self._begin = now - due
         early = self._begin + due - now
-        if early > _SLOW_CLOCK:
+        if early > _MIN_SLEEP:
             self._sleep(early)
-        if early >= -PATIENCE:
+        if early >= -MAX_LATENESS:
             return 0.0
         self._begin -= early
         self.pauses += 1
-        self.late -= early
+        self.total_delay -= early
         return -early
 
     def close(self) -> None:
         """Do nothing; a `Pacer` holds no resources."""
 
 
-class LiveHand:
+class LiveHandReference:
     """Reference position of the handle from an input device, with the recorded input.
 
     Attributes:
-        span: (2, 6) dead-band edge and end of travel of every axis [m], [rad]; the range of a
+        travel_range: (2, 6) dead-band edge and end of travel of every axis [m], [rad]; the range of a
             device axis is mapped to the interval between them.
     """
 
@@ -207,53 +210,53 @@ class LiveHand:
         Args:
             further: axis that the joystick does not move -> command limit.
         """
-        self.span = np.zeros((2, 6))
-        self._further, self._wanted = further, np.zeros(6)
+        self.travel_range = np.zeros((2, 6))
+        self._further, self._reference = further, np.zeros(6)
         self._before = Reading(commands=(0.0,) * len(further))
         self._time, self._path = [0.0], [(0.0,) * 6]
-        self._buttons = [Button(at=0.0, axis=name, command=0.0) for name in further]
+        self._buttons = [ButtonCommand(at=0.0, axis=name, command=0.0) for name in further]
 
     def __call__(self) -> np.ndarray:
         """Return the current reference position of the handle, (6,) [m], [rad]."""
-        return self._wanted
+        return self._reference
 
-    def take(self, reading: Reading, session: Session) -> None:
+    def apply_reading(self, reading: Reading, session: Session) -> None:
         """Apply a device reading from the next tick of the session on, and record it."""
         if reading.axes != self._before.axes:
-            part, (dead, stop) = np.array(reading.axes), self.span
+            part, (dead, stop) = np.array(reading.axes), self.travel_range
             dead = np.where(dead < stop, dead, 0.0)
-            self._wanted = np.sign(part) * dead + part * (stop - dead)
-            self._note(session.time, self._wanted)
+            self._reference = np.sign(part) * dead + part * (stop - dead)
+            self._record_reference(session.time, self._reference)
         news = zip(self._further.items(), self._before.commands, reading.commands, strict=True)
         for (name, most), old, new in news:
             if new != old:
                 session.set_command(name, most * new)
-                self._buttons.append(Button(at=session.time, axis=name, command=most * new))
+                self._buttons.append(ButtonCommand(at=session.time, axis=name, command=most * new))
         self._before = reading
 
-    def led(self, handle: np.ndarray, time: float) -> None:
+    def record_handle(self, handle: np.ndarray, time: float) -> None:
         """Record the handle position (6,) [m], [rad] of a haptic device at a run time [s].
 
         A repetition uses it as the reference of the simulated hand. The arm dynamics of that hand
         make the repetition similar, but not bit-identical.
         """
-        wanted = [round(value, _LED) for value in handle.tolist()]
-        if wanted != self._wanted.tolist():
-            self._wanted = np.array(wanted)
-            self._note(time, self._wanted)
+        wanted = [round(value, _HANDLE_DECIMALS) for value in handle.tolist()]
+        if wanted != self._reference.tolist():
+            self._reference = np.array(wanted)
+            self._record_reference(time, self._reference)
 
-    def _note(self, time: float, wanted: np.ndarray) -> None:
+    def _record_reference(self, time: float, wanted: np.ndarray) -> None:
         if time == self._time[-1]:
             self._path[-1] = tuple(wanted.tolist())
             return
         self._time.append(time)
         self._path.append(tuple(wanted.tolist()))
 
-    def written_down(self, scenario: Scenario, duration: float) -> Scenario:
+    def recorded_scenario(self, scenario: Scenario, duration: float) -> Scenario:
         """Return the scenario that repeats the recorded input, with a duration [s]."""
         columns = zip(AXES, zip(*self._path, strict=True), strict=True)
         path = {name: list(values) for name, values in columns if any(values)}
-        operator = Follow.model_validate(
+        operator = FollowPath.model_validate(
             {"kind": "follow", "time": self._time, "path": path, "interpolate": "hold"}
         )
         pilot = scenario.pilot.model_copy(update={"operator": operator, "buttons": self._buttons})
@@ -266,40 +269,40 @@ class Status(NamedTuple):
     Attributes:
         time: simulated time [s].
         handle: (6,) displacement of the handle [m], [rad].
-        hand: (6,) force of the hand, as estimated by the joystick [N], [N m].
-        tip: task coordinate -> reflected tip force [N], [N m].
-        contact: (3,) total contact force in the world frame [N].
+        hand_force: (6,) force of the hand, as estimated by the joystick [N], [N m].
+        tip_force: task coordinate -> reflected tip force [N], [N m].
+        total_contact_force: (3,) total contact force in the world frame [N].
         commands: additional axis -> command.
     """
 
     time: float
     handle: np.ndarray
-    hand: np.ndarray
-    tip: dict[str, float]
-    contact: np.ndarray
+    hand_force: np.ndarray
+    tip_force: dict[str, float]
+    total_contact_force: np.ndarray
     commands: dict[str, float]
 
     def rows(self) -> list[tuple[str, str]]:
         """Return (name, formatted value) pairs for display."""
         x, y, z = (1e3 * self.handle[:3]).tolist()
-        push = " ".join(f"{v:+.1f}" for v in self.hand[:3])
-        forces = [f"{n} {f / 1e3:+.1f}" for n, f in self.tip.items() if n in ("r", "z")]
+        push = " ".join(f"{v:+.1f}" for v in self.hand_force[:3])
+        forces = [f"{n} {f / 1e3:+.1f}" for n, f in self.tip_force.items() if n in ("r", "z")]
         named = [(name, f"{value:+g}") for name, value in self.commands.items()]
         return [
             ("time", f"{self.time:.1f} s"),
             ("handle", f"x {x:+.1f} y {y:+.1f} z {z:+.1f} mm ry {self.handle[4]:+.3f} rad"),
             ("hand", f"{push} N"),
             ("tip", f"{' '.join(forces)} kN"),
-            ("contact", f"{np.linalg.norm(self.contact) / 1e3:.1f} kN"),
+            ("contact", f"{np.linalg.norm(self.total_contact_force) / 1e3:.1f} kN"),
             *named,
         ]
 
 
-Watch = Callable[[Session, Callable[[], Status], float], bool]
+TickCallback = Callable[[Session, Callable[[], Status], float], bool]
 """Callback after every tick: session, status function, wall-clock time [s]; False stops the run."""
 
 
-def further_axes(machine: Machine) -> dict[str, float]:
+def additional_axes(machine: Machine) -> dict[str, float]:
     """Return the axes that the joystick does not move, with their command limits."""
     moved = arm_axes(machine)
     return {
@@ -309,7 +312,7 @@ def further_axes(machine: Machine) -> dict[str, float]:
     }
 
 
-def live(scenario: Scenario, further: Iterable[str]) -> Scenario:
+def with_live_operator(scenario: Scenario, further: Iterable[str]) -> Scenario:
     """Replace the operator of a teleoperated scenario by a live one.
 
     Args:
@@ -323,14 +326,14 @@ def live(scenario: Scenario, further: Iterable[str]) -> Scenario:
     if not isinstance(pilot, TeleopPilot):
         message = f"pilot kind {pilot.kind} has no joystick; use a scenario with `kind: teleop`"
         raise InputError(f"scenario {scenario.name}", message)
-    buttons = [Button(at=0.0, axis=name, command=0.0) for name in further]
-    update = {"operator": Live(kind="live"), "buttons": buttons}
+    buttons = [ButtonCommand(at=0.0, axis=name, command=0.0) for name in further]
+    update = {"operator": LiveOperator(kind="live"), "buttons": buttons}
     return scenario.model_copy(update={"pilot": pilot.model_copy(update=update)})
 
 
-def drive(
+def drive_scenario(
     scenario: Scenario, machine: Machine, device: Device, pacer: TimeKeeper,
-    watch: Watch, say: Callable[[str], None],
+    watch: TickCallback, say: Callable[[str], None],
 ) -> Run:  # fmt: skip
     """Run a teleoperated scenario with an input device.
 
@@ -349,49 +352,49 @@ def drive(
         InputError: the scenario does not fit the machine, or the run is too short for a log.
         SimulationFailed: states became infinite or not a number.
     """
-    further = further_axes(machine)
-    hand = LiveHand(further)
-    session = begin(live(scenario, further), hand)
+    further = additional_axes(machine)
+    hand = LiveHandReference(further)
+    session = start_session(with_live_operator(scenario, further), hand)
     station = session.station
     assert station
-    hand.span = station.span
+    hand.travel_range = station.deadbands_and_stops
     haptic = device if isinstance(device, HapticHandle) else None
     if haptic:
         haptic.attach(session)
     handle = station.log.master("handle")
-    status, told = _status_of(session, further), _Told(session, say)
-    every = station.operator.every
+    status, told = _make_status_function(session, further), _MessageReporter(session, say)
+    every = station.operator.ticks_per_decision
     # with a haptic device, read it in ticks without a force estimate and a log row
     phase = every // 2 if haptic else 0
-    while session.tick < session.scenario.ticks:
+    while session.tick < session.scenario.tick_count:
         if session.tick % every == phase or not session.tick:  # tick 0 compiles, timing is free
             reading = device.read(session.time)
-            if reading.said:
-                say(reading.said)
+            if reading.user_message:
+                say(reading.user_message)
             if reading.quit:
                 break
-            hand.take(reading, session)
+            hand.apply_reading(reading, session)
             if haptic:
-                hand.led(handle[max(0, session.tick - 1)], session.time)
+                hand.record_handle(handle[max(0, session.tick - 1)], session.time)
         session.advance()
-        told.news()
+        told.report_new_messages()
         if not watch(session, status, pacer.now()):
             break
         if haptic and session.tick == 1:
-            haptic.link.restart_figures()
-        if pacer.wait(session.time):  # starts after the first tick, which compiles code
-            told.late(pacer)
-    seen = haptic.link.figures() if haptic else {}
-    while session.tick % session.every:  # the logs hold whole rows
+            haptic.link.reset_statistics()
+        if pacer.wait_for_tick(session.time):  # starts after the first tick, which compiles code
+            told.report_pauses(pacer)
+    seen = haptic.link.statistics() if haptic else {}
+    while session.tick % session.ticks_per_row:  # the logs hold whole rows
         session.advance()
-    run = finished(session, hand.written_down(session.scenario, session.time))
-    run.summary.update(late_seconds=round(pacer.late, 3), pauses=pacer.pauses)
+    run = finish_run(session, hand.recorded_scenario(session.scenario, session.time))
+    run.summary.update(late_seconds=round(pacer.total_delay, 3), pauses=pacer.pauses)
     if haptic:
         run.summary["haptic"] = seen
     return run
 
 
-class _Told:
+class _MessageReporter:
     """Passes on each note and event of a session once."""
 
     def __init__(self, session: Session, say: Callable[[str], None]) -> None:
@@ -400,13 +403,13 @@ class _Told:
         self._say, self._count = say, [0, 0]
         self._due = -math.inf
 
-    def late(self, pacer: TimeKeeper) -> None:
-        """Report pauses of simulated time, at most once every `_TELL` seconds."""
+    def report_pauses(self, pacer: TimeKeeper) -> None:
+        """Report pauses of simulated time, at most once every `_MESSAGE_INTERVAL` seconds."""
         if pacer.now() >= self._due:
-            self._due = pacer.now() + _TELL
-            self._say(f"computer too slow for real time: paused, {pacer.late:.2f} s in total")
+            self._due = pacer.now() + _MESSAGE_INTERVAL
+            self._say(f"computer too slow for real time: paused, {pacer.total_delay:.2f} s in total")
 
-    def news(self) -> None:
+    def report_new_messages(self) -> None:
         """Report new notes and events."""
         notes, events = self._notes, self._events
         if self._count == [len(notes), len(events)]:
@@ -418,7 +421,7 @@ class _Told:
         self._count = [len(notes), len(events)]
 
 
-def _status_of(session: Session, further: Iterable[str]) -> Callable[[], Status]:
+def _make_status_function(session: Session, further: Iterable[str]) -> Callable[[], Status]:
     plant, station = session.plant, session.station
     assert station
     around = surrounding_bodies(plant)
@@ -427,11 +430,9 @@ def _status_of(session: Session, further: Iterable[str]) -> Callable[[], Status]
 
     def status() -> Status:
         last = max(0, session.tick - 1)
-        contact = contact_force(plant.model, session.data, around)
-        commands = session.command_of(last)[places].tolist()
-        tip: dict[str, float] = dict(
-            zip(station.coordinates, station.log.force[last].tolist(), strict=True)
-        )
+        contact = total_contact_force(plant.model, session.data, around)
+        commands = session.commands_at(last)[places].tolist()
+        tip: dict[str, float] = dict(zip(station.coordinates, station.log.force[last].tolist(), strict=True))
         return Status(
             session.time, handle[last], hand[last], tip, contact,
             dict(zip(further, commands, strict=True)),

@@ -12,17 +12,23 @@ from typing import Any
 import numpy as np
 
 from hydrotele.core.errors import InputError
-from hydrotele.core.files import json_value
+from hydrotele.core.files import parse_json
 from hydrotele.logs.log import Log
-from hydrotele.machine.machine import Machine, SensorError, noise_rms, sensor_set
-from hydrotele.machine.signals import usual_unit
+from hydrotele.machine.machine import Machine, SensorError, get_sensors, noise_rms
+from hydrotele.machine.signals import default_unit
 from hydrotele.simulate.feedback import apply_sensor_errors
 from hydrotele.simulate.mechanism import flexible_axes
 from hydrotele.simulate.plant import Plant, build_plant, initial_state
-from hydrotele.simulate.record import Record, Recorder, begin_leapfrog, late_channels, true_channels
+from hydrotele.simulate.record import (
+    Record,
+    Recorder,
+    delayed_channels,
+    start_leapfrog,
+    true_channels,
+)
 from hydrotele.simulate.stepping import Stepper
 
-PREDICTED = ("angle", "position", "length", "pressure_head", "pressure_rod", "pressure_supply")
+COMPARED_KINDS = ("angle", "position", "length", "pressure_head", "pressure_rod", "pressure_supply")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,21 +109,20 @@ def replay_log(
     period = float(log.time[-1] - log.time[0]) / (len(log) - 1)
     steps = max(1, math.ceil(period / timestep - 1e-6))
     plant = build_plant(machine, period / steps, ground=log.metadata.get("ground") == "yes")
-    missing = [c for c in _needed(plant) if c not in log]
+    missing = [c for c in _required_channels(plant) if c not in log]
     if missing:
         raise InputError(
             log.source,
-            f"a replay of {machine.name} needs {', '.join(missing)}; the log has"
-            f" {', '.join(sorted(log.columns))}",
+            f"a replay of {machine.name} needs {', '.join(missing)}; the log has {', '.join(sorted(log.columns))}",
         )
-    data = initial_state(plant, _start(plant, log))
+    data = initial_state(plant, _initial_state_from_log(plant, log))
     commands = np.column_stack([log[f"command.{a}"] for a in plant.axes])
     begin = clock.perf_counter()
-    record = _drive(plant, data, log.time, commands, steps, progress)
+    record = _simulate_commands(plant, data, log.time, commands, steps, progress)
     factor = (log.time[-1] - log.time[0]) / max(clock.perf_counter() - begin, 1e-9)
     values, units = true_channels(plant, record)
     if not any(name.startswith("truth.") for name in log.columns):
-        values |= apply_sensor_errors(machine, values | late_channels(plant, record), log.time)
+        values |= apply_sensor_errors(machine, values | delayed_channels(plant, record), log.time)
     simulated = Log(
         time=log.time, columns=values, units=units, source=f"replay of {log.source}",
         metadata={"machine": machine.name, "tool": machine.tool, "run": f"replay {log.name}"},
@@ -125,53 +130,56 @@ def replay_log(
     return Replay(log, simulated, _differences(log, simulated, machine), factor)
 
 
-def _needed(plant: Plant) -> list[str]:
+def _required_channels(plant: Plant) -> list[str]:
     positions = [f"{plant.machine.position_kind(a)}.{a}" for a in plant.axes]
     return [f"command.{a}" for a in plant.axes] + positions
 
 
-def _start(plant: Plant, log: Log) -> dict[str, Any]:
+def _initial_state_from_log(plant: Plant, log: Log) -> dict[str, Any]:
     if "initial_state" in log.metadata:
-        return _stated_start(plant, log)
+        return _initial_state_from_metadata(plant, log)
     axes = list(plant.axes)
     state: dict[str, Any] = {
         "order": axes,
-        "angle": [_first(plant, log, f"{plant.machine.position_kind(a)}.{a}") for a in axes],
+        "angle": [_first_true_value(plant, log, f"{plant.machine.position_kind(a)}.{a}") for a in axes],
     }
     valves = axes[: plant.hydraulic]
     names = [f"pressure_{side}.{a}" for side in ("head", "rod") for a in valves]
     if valves and all(n in log for n in names):
         for side in ("pressure_head", "pressure_rod"):  # readings below 0 are sensor noise
-            state[side] = [max(0.0, _first(plant, log, f"{side}.{a}")) for a in valves]
+            state[side] = [max(0.0, _first_true_value(plant, log, f"{side}.{a}")) for a in valves]
     return state
 
 
-def _first(plant: Plant, log: Log, channel: str) -> float:
+def _first_true_value(plant: Plant, log: Log, channel: str) -> float:
     """Return the first reading of a channel, corrected for the sensor's offset and scale."""
     error = plant.machine.sensor_errors.get(channel, SensorError())
     return (float(log[channel][0]) - error.offset) / error.scale
 
 
-def _stated_start(plant: Plant, log: Log) -> dict[str, Any]:
+def _initial_state_from_metadata(plant: Plant, log: Log) -> dict[str, Any]:
     try:
-        state = json_value(log.metadata["initial_state"])
+        state = parse_json(log.metadata["initial_state"])
         order = list(state["order"])
         if sorted(order) != sorted(plant.axes):
             raise ValueError(f"its order {order} does not list the axes {list(plant.axes)}")
-        start: dict[str, Any] = {"order": order, "angle": _vector(state, "angle", len(order))}
+        start: dict[str, Any] = {
+            "order": order,
+            "angle": _read_finite_vector(state, "angle", len(order)),
+        }
         for key in ("velocity", "spool", "spool_rate", "pressure_head", "pressure_rod"):
             if key in state:
                 size = len(order) if key == "velocity" else plant.hydraulic
-                start[key] = _vector(state, key, size, len(order))
+                start[key] = _read_finite_vector(state, key, size, len(order))
         joints = dict(state.get("joints", {}))
-        start["joints"] = {name: float(_vector(joints, name)) for name in joints}
+        start["joints"] = {name: float(_read_finite_vector(joints, name)) for name in joints}
         for key in ("drive", "drive_velocity"):
             sides = dict(state.get(key, {}))
             known = flexible_axes(plant.machine)
-            start[key] = {name: float(_vector(sides, name)) for name in sides if name in known}
+            start[key] = {name: float(_read_finite_vector(sides, name)) for name in sides if name in known}
         for key in ("bristle", "delivery", "added_delivery"):
             owners = dict(state.get(key, {}))
-            start[key] = {name: float(_vector(owners, name)) for name in owners}
+            start[key] = {name: float(_read_finite_vector(owners, name)) for name in owners}
     except (ValueError, KeyError, TypeError) as error:
         reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
         where = f"{log.source}: metadata initial_state"
@@ -179,7 +187,7 @@ def _stated_start(plant: Plant, log: Log) -> dict[str, Any]:
     return start
 
 
-def _vector(state: dict, key: str, *sizes: int) -> np.ndarray:
+def _read_finite_vector(state: dict, key: str, *sizes: int) -> np.ndarray:
     """Return a state entry as finite numbers of one of these sizes; a scalar without sizes."""
     values = np.asarray(state[key], dtype=float)
     if values.shape not in ([(size,) for size in sizes] or [()]) or not np.isfinite(values).all():
@@ -187,42 +195,42 @@ def _vector(state: dict, key: str, *sizes: int) -> np.ndarray:
     return values
 
 
-def _drive(plant: Plant, data, times, commands, steps, progress) -> Record:
+def _simulate_commands(plant: Plant, data, times, commands, steps, progress) -> Record:
     recorder = Recorder(plant, len(times))
     recorder.command[:] = commands
-    begin_leapfrog(plant.model, data)
+    start_leapfrog(plant.model, data)
     stepper = Stepper(plant, data, steps)
     for row, time in enumerate(times):
-        recorder.take(row, time, data, stepper.shown() if stepper.late else None)
+        recorder.record_state(row, time, data, stepper.sensor_values() if stepper.has_delayed_sensors else None)
         if progress and row % 100 == 0:
             progress(time - times[0], times[-1] - times[0])
         stepper.advance(commands[row])
     if progress:
         progress(times[-1] - times[0], times[-1] - times[0])
-    return recorder.record()
+    return recorder.to_record()
 
 
 def _differences(log: Log, simulated: Log, machine: Machine) -> dict[str, ChannelDifference]:
     name = log.metadata.get("sensors", "")
-    sensors = sensor_set(machine, name) if name in machine.sensors else None
+    sensors = get_sensors(machine, name) if name in machine.sensors else None
     table = {}
     for channel in log.columns:
         kind = channel.partition(".")[0]
-        if kind not in PREDICTED or channel not in simulated:
+        if kind not in COMPARED_KINDS or channel not in simulated:
             continue
         error = simulated[channel] - log[channel]
-        span = _span(machine, channel) or float(np.ptp(log[channel]))
+        span = _full_scale(machine, channel) or float(np.ptp(log[channel]))
         table[channel] = ChannelDifference(
             rms=float(np.sqrt(np.mean(error**2))),
             max=float(np.abs(error).max()),
-            unit=log.units.get(channel) or usual_unit(channel),
+            unit=log.units.get(channel) or default_unit(channel),
             range=span,
             noise_rms=noise_rms(machine, sensors, channel),
         )
     return table
 
 
-def _span(machine: Machine, channel: str) -> float | None:
+def _full_scale(machine: Machine, channel: str) -> float | None:
     """Return the full scale: relief pressure for pressures, stroke for lengths, otherwise None."""
     kind, _, axis = channel.partition(".")
     if kind.startswith("pressure") and machine.supply:

@@ -22,70 +22,76 @@ import numpy as np
 from numba import boolean, int64, typeof
 
 import hydrotele
-from hydrotele.control.feedforward import force_references
+from hydrotele.control.feedforward import compute_force_references
 from hydrotele.control.plan import Plan, make_plan
 from hydrotele.control.resolved_motion import pose_to_joints
-from hydrotele.control.servo import drive_references, servo_parameters
-from hydrotele.control.tick import PLANNED, Controller, Planned, planned_record, planned_tick
-from hydrotele.core.compiled import compile_elsewhere, compiled
-from hydrotele.core.datafile import suggest
+from hydrotele.control.servo import compute_drive_references, servo_parameters
+from hydrotele.control.tick import (
+    PLANNED_RUN_DTYPE,
+    Controller,
+    PlannedRun,
+    planned_run_record,
+    step_planned_run,
+)
+from hydrotele.core.compiled import compile_in_background, compiled
+from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
-from hydrotele.core.memory import address_record, floats, integers, rows_of
+from hydrotele.core.memory import address_record, float64_view, int64_view, matrix_view
 from hydrotele.effects import apply_effect
-from hydrotele.hydraulics.circuit import ACTIVATIONS
+from hydrotele.hydraulics.circuit import ACTIVATIONS_PER_AXIS
 from hydrotele.logs.log import Log
-from hydrotele.machine.machine import Machine, sensor_set
+from hydrotele.machine.machine import Machine, get_sensors
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.scenario.scenario import Scenario, own_machine
+from hydrotele.scenario.scenario import Scenario, find_local_machine
 from hydrotele.scenario.teleoperation import TeleopPilot
-from hydrotele.simulate.audit import audit, full_state
-from hydrotele.simulate.closure import pin_sites, widest_pin
-from hydrotele.simulate.feedback import Feedback, feedback, measure
-from hydrotele.simulate.joystick import FLOTOR
+from hydrotele.simulate.audit import compute_balance_errors, full_physics_state
+from hydrotele.simulate.closure import max_pin_opening, pin_sites
+from hydrotele.simulate.feedback import Feedback, create_feedback, simulate_readings
+from hydrotele.simulate.joystick import FLOTOR_DTYPE
 from hydrotele.simulate.mechanism import flexible_axes
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
 from hydrotele.simulate.record import (
-    CONTACTS,
-    STATE_ROW,
+    CONTACTS_DTYPE,
+    STATE_ROW_DTYPE,
     Record,
     Recorder,
-    begin_leapfrog,
-    late_channels,
-    take_row,
+    delayed_channels,
+    record_row,
+    start_leapfrog,
     true_channels,
 )
-from hydrotele.simulate.stepping import SIMULATION, Stepper, delayed_commands
+from hydrotele.simulate.stepping import SIMULATION_DTYPE, Stepper, delayed_commands
 from hydrotele.simulate.surroundings import Surroundings
-from hydrotele.teleop.operator_model import Hand
-from hydrotele.teleop.round_trip import CHECKED, STATION, round_trip
-from hydrotele.teleop.station import Station, StationLog
+from hydrotele.teleop.operator_model import HandInput
+from hydrotele.teleop.round_trip import STATION_DTYPE, TICKS_PER_CHECK, step_teleoperation
+from hydrotele.teleop.station import TeleoperationLog, TeleoperationSystem
 
-TICKS = np.dtype(
+TICK_LOOP_RECORD = np.dtype(
     [(name, np.int64) for name in ("steps", "every", "rows", "sites", "pins")]
     + [("period", np.float64)]
     + [(name, np.int64) for name in ("places", "one", "two", "widest")],  # addresses
     align=True,
 )
-"""Record type of the compiled tick loop; see `ticks_of`."""
+"""Record type of the compiled tick loop; see `make_tick_loop`."""
 
 
-class Ticks(NamedTuple):
+class TickLoop(NamedTuple):
     """Arguments of the compiled tick loop, in addition to machine, plan and station.
 
     Attributes:
-        record: (1,) record of type `TICKS`.
-        widest: (1,) largest gap between the two points of a pin so far [m].
-        kept: arrays whose addresses are in the record; kept alive here.
+        record: (1,) record of type `TICK_LOOP_RECORD`.
+        max_pin_opening: (1,) largest gap between the two points of a pin so far [m].
+        referenced_arrays: arrays whose addresses are in the record; kept alive here.
     """
 
     record: np.ndarray
-    widest: np.ndarray
-    kept: dict[str, np.ndarray]
+    max_pin_opening: np.ndarray
+    referenced_arrays: dict[str, np.ndarray]
 
 
-def ticks_of(
+def make_tick_loop(
     model: mujoco.MjModel, data: mujoco.MjData, steps: int, every: int, rows: int, period: float
-) -> Ticks:  # fmt: skip
+) -> TickLoop:  # fmt: skip
     """Create the record of the compiled tick loop.
 
     Args:
@@ -100,19 +106,19 @@ def ticks_of(
     widest = np.zeros(1)
     kept = {"places": data.site_xpos, "one": one.astype(np.int64), "two": two.astype(np.int64),
             "widest": widest}  # fmt: skip
-    record = address_record(TICKS, kept)
+    record = address_record(TICK_LOOP_RECORD, kept)
     for name, value in {"steps": steps, "every": every, "rows": rows, "period": period,
                         "sites": model.nsite, "pins": len(one)}.items():  # fmt: skip
         record[name] = value
-    return Ticks(record, widest, kept)
+    return TickLoop(record, widest, kept)
 
 
 @compiled
-def planned_ticks(ticks, simulated, planned, row, contacts, first, last, stopped):
+def run_planned_ticks(ticks, simulated, planned, row, contacts, first, last, stopped):
     """Simulate control ticks of a planned run.
 
     Args:
-        ticks: `Ticks.record`, modified.
+        ticks: `TickLoop.record`, modified.
         simulated: record of `simulate.stepping.simulation_record`.
         planned: record of `control.tick.planned_record`.
         row: record of a `Recorder`.
@@ -127,15 +133,15 @@ def planned_ticks(ticks, simulated, planned, row, contacts, first, last, stopped
     Source: `control.tick`.
     """
     for tick in range(first, last):
-        if not _write_down(ticks[0], row, contacts, tick):
+        if not _record_row(ticks[0], row, contacts, tick):
             return -1 - tick
-        planned_tick(simulated, planned, tick, ticks[0].steps, stopped)
-        look_at_pins(ticks)
+        step_planned_run(simulated, planned, tick, ticks[0].steps, stopped)
+        update_max_pin_opening(ticks)
     return last
 
 
 @compiled
-def teleoperated_ticks(
+def run_teleoperated_ticks(
     ticks, simulated, planned, row, contacts, station, flotor, first, last, stopped
 ):  # fmt: skip
     """Simulate control ticks of a teleoperated run until Python must process the station.
@@ -143,11 +149,11 @@ def teleoperated_ticks(
     The loop stops before the physics of such a tick.
 
     Args:
-        ticks: see `planned_ticks`, modified.
-        simulated: see `planned_ticks`.
-        planned: see `planned_ticks`.
-        row: see `planned_ticks`.
-        contacts: see `planned_ticks`.
+        ticks: see `run_planned_ticks`, modified.
+        simulated: see `run_planned_ticks`.
+        planned: see `run_planned_ticks`.
+        row: see `run_planned_ticks`.
+        contacts: see `run_planned_ticks`.
         station: see `teleop.round_trip`.
         flotor: see `teleop.round_trip`.
         first: first control tick, already prepared by the station, scalar.
@@ -161,29 +167,29 @@ def teleoperated_ticks(
     Source: `control.tick`, `teleop.round_trip`.
     """
     for tick in range(first, last):
-        if not _write_down(ticks[0], row, contacts, tick):
+        if not _record_row(ticks[0], row, contacts, tick):
             return -1 - tick
-        if round_trip(station, flotor, tick, stopped) or tick % CHECKED == 0:
+        if step_teleoperation(station, flotor, tick, stopped) or tick % TICKS_PER_CHECK == 0:
             return tick
-        planned_tick(simulated, planned, tick, ticks[0].steps, stopped)
-        look_at_pins(ticks)
+        step_planned_run(simulated, planned, tick, ticks[0].steps, stopped)
+        update_max_pin_opening(ticks)
     return last
 
 
 @compiled
-def _write_down(r, row, contacts, tick):
+def _record_row(r, row, contacts, tick):
     """Write the log row of a tick, if one is due; return False if it is not finite."""
     if tick % r.every != 0 or tick // r.every >= r.rows:
         return True
-    return take_row(row, contacts, tick // r.every, tick * r.period)
+    return record_row(row, contacts, tick // r.every, tick * r.period)
 
 
 @compiled
-def look_at_pins(ticks):
+def update_max_pin_opening(ticks):
     """Update the largest pin opening of the run.
 
     Args:
-        ticks: `Ticks.record`, modified.
+        ticks: `TickLoop.record`, modified.
 
     Returns:
         Nothing.
@@ -191,21 +197,29 @@ def look_at_pins(ticks):
     Source: `simulate.closure`.
     """
     r = ticks[0]
-    widest, places = floats(r.widest, 1), rows_of(r.places, r.sites, 3)
-    one, two = integers(r.one, r.pins), integers(r.two, r.pins)
-    widest[0] = max(widest[0], widest_pin(places, one, two))
+    widest, places = float64_view(r.max_pin_opening, 1), matrix_view(r.places, r.sites, 3)
+    one, two = int64_view(r.one, r.pins), int64_view(r.two, r.pins)
+    widest[0] = max(widest[0], max_pin_opening(places, one, two))
 
 
-def compile_ahead() -> None:
+def start_compilation() -> None:
     """Start to compile the tick loop of a teleoperated run in a separate process."""
-    compile_elsewhere(teleoperated_ticks, f"from {__name__} import compile_ticks; compile_ticks()")
+    compile_in_background(run_teleoperated_ticks, f"from {__name__} import compile_ticks; compile_ticks()")
 
 
 def compile_ticks() -> None:
     """Compile the tick loop of a teleoperated run."""
-    records = TICKS, SIMULATION, PLANNED, STATE_ROW, CONTACTS, STATION, FLOTOR
+    records = (
+        TICK_LOOP_RECORD,
+        SIMULATION_DTYPE,
+        PLANNED_RUN_DTYPE,
+        STATE_ROW_DTYPE,
+        CONTACTS_DTYPE,
+        STATION_DTYPE,
+        FLOTOR_DTYPE,
+    )
     arguments = *(typeof(np.zeros(1, kind)) for kind in records), int64, int64, boolean
-    teleoperated_ticks.compile(arguments)
+    run_teleoperated_ticks.compile(arguments)
 
 
 class PreparedRun(NamedTuple):
@@ -215,13 +229,13 @@ class PreparedRun(NamedTuple):
         plant: the simulated machine.
         data: its MuJoCo data in the initial state.
         plan: reference and commands over time.
-        seen: sensor feedback of the controller.
+        sensor_feedback: sensor feedback of the controller.
     """
 
     plant: Plant
     data: mujoco.MjData
     plan: Plan
-    seen: Feedback
+    sensor_feedback: Feedback
 
 
 class SessionResult(NamedTuple):
@@ -231,8 +245,8 @@ class SessionResult(NamedTuple):
         plan: reference and commands of every axis.
         record: states at the log rows.
         commands: (n, nu) commands by control tick.
-        pins: largest pin opening [m].
-        wall: computing time [s] without the first tick, which loads compiled code.
+        max_pin_opening: largest pin opening [m].
+        computing_seconds: computing time [s] without the first tick, which loads compiled code.
         station: operator station of a teleoperated run, otherwise None.
         events: (time [s], description) of events in the surroundings, such as a falling tree.
     """
@@ -240,9 +254,9 @@ class SessionResult(NamedTuple):
     plan: Plan
     record: Record
     commands: np.ndarray
-    pins: float
-    wall: float
-    station: Station | None
+    max_pin_opening: float
+    computing_seconds: float
+    station: TeleoperationSystem | None
     events: tuple[tuple[float, str], ...]
 
 
@@ -253,16 +267,20 @@ class Session:
         plant: the simulated machine.
         data: its MuJoCo data, with positions and velocities staggered (`simulate.record`).
         scenario: the scenario.
-        seen: sensor feedback of the controller.
+        sensor_feedback: sensor feedback of the controller.
         station: operator station of a teleoperated run, otherwise None.
-        start: full physics state before the first tick.
-        before: (nu,) commands before the first tick.
+        initial_physics_state: full physics state before the first tick.
+        initial_commands: (nu,) commands before the first tick.
         tick: number of the next control tick.
-        every: control ticks per log row.
+        ticks_per_row: control ticks per log row.
     """
 
     def __init__(
-        self, prepared: PreparedRun, scenario: Scenario, nominal: Machine, hand: Hand | None = None
+        self,
+        prepared: PreparedRun,
+        scenario: Scenario,
+        nominal: Machine,
+        hand: HandInput | None = None,
     ) -> None:
         """Allocate the arrays of the whole run and prepare the first tick.
 
@@ -281,23 +299,26 @@ class Session:
             rate=np.ascontiguousarray(plan.rate, float),
             command=np.ascontiguousarray(plan.command, float),
         )  # fmt: skip
-        begin_leapfrog(plant.model, data)
-        self.plant, self.data, self.seen, self.scenario = plant, data, seen, scenario
-        self.start, self.before = full_state(plant.model, data), np.array(data.ctrl)
+        start_leapfrog(plant.model, data)
+        self.plant, self.data, self.sensor_feedback, self.scenario = plant, data, seen, scenario
+        self.initial_physics_state, self.initial_commands = (
+            full_physics_state(plant.model, data),
+            np.array(data.ctrl),
+        )
         self._plan, self._dt = plan, 1.0 / scenario.control_rate
-        self.every = round(scenario.control_rate / scenario.log_rate)
+        self.ticks_per_row = round(scenario.control_rate / scenario.log_rate)
         parameters = servo_parameters(plant.machine, plant.axes, scenario.servo, self._dt)
-        drives = drive_references(plant.machine, plan, scenario.servo)
+        drives = compute_drive_references(plant.machine, plan, scenario.servo)
         drives = drives._make(map(np.ascontiguousarray, drives))
-        forces = force_references(nominal, plan, scenario.servo)
-        k, ticks = len(plant.axes), scenario.ticks
-        self._recorder = Recorder(plant, scenario.rows)
+        forces = compute_force_references(nominal, plan, scenario.servo)
+        k, ticks = len(plant.axes), scenario.tick_count
+        self._recorder = Recorder(plant, scenario.row_count)
         self._stepper = Stepper(plant, data, round(self._dt / scenario.timestep))
-        self.seen.update(0, self._stepper)
+        self.sensor_feedback.update(0, self._stepper)
         load = parameters[:, 1] * seen.head - parameters[:, 2] * seen.rod - forces.force[0]
         self._commands = np.zeros((ticks, k))
-        self._run = Planned(
-            controller=Controller(parameters, plan.closed.astype(np.int64), load, np.zeros(k)),
+        self._run = PlannedRun(
+            controller=Controller(parameters, plan.closed_loop.astype(np.int64), load, np.zeros(k)),
             feedback=seen.table,
             drives=drives,
             forces=forces,
@@ -305,16 +326,16 @@ class Session:
             command=plan.command,
             given=self._commands,
         )
-        self._planned = planned_record(self._run)
+        self._planned = planned_run_record(self._run)
         self.station = None
         if isinstance(scenario.pilot, TeleopPilot):
-            self.station = Station(plant, data, scenario, plan, drives, seen, hand)
+            self.station = TeleoperationSystem(plant, data, scenario, plan, drives, seen, hand)
         self._around = Surroundings(plant.machine, plant.model, scenario.surroundings)
-        self._ticks = ticks_of(
-            plant.model, data, self._stepper.steps, self.every, scenario.rows, self._dt
+        self._ticks = make_tick_loop(
+            plant.model, data, self._stepper.steps, self.ticks_per_row, scenario.row_count, self._dt
         )
         self._records = (
-            self._ticks.record, self._stepper.record, self._planned, *self._recorder.records(data),
+            self._ticks.record, self._stepper.record, self._planned, *self._recorder.native_records(data),
             *(self.station.records if self.station else ()),
         )  # fmt: skip
         self._begin = 0.0
@@ -325,46 +346,46 @@ class Session:
         """Simulated time at the next tick [s]."""
         return self.tick / self.scenario.control_rate
 
-    def advance(self, most: int = 1) -> None:
+    def advance(self, n_ticks: int = 1) -> None:
         """Simulate control ticks.
 
         Args:
-            most: number of ticks.
+            n_ticks: number of ticks.
 
         Raises:
             SimulationFailed: states became infinite or not a number.
         """
-        end = self.tick + most
+        end = self.tick + n_ticks
         while self.tick < end:
-            self._go_on(end)
+            self._run_ticks(end)
             if not self._begin:
                 self._begin = clock.perf_counter()
 
-    def _go_on(self, end: int) -> None:
+    def _run_ticks(self, end: int) -> None:
         """Run compiled ticks until a given tick, or until Python must act."""
         first, station, stepper = self.tick, self.station, self._stepper
-        if self._around.changes or not first:
+        if self._around.has_trees_or_logs or not first:
             end = first + 1
-        if stepper.late:
-            row, left = divmod(first, self.every)
-            end = min(end, first + self.every - left)
+        if stepper.has_delayed_sensors:
+            row, left = divmod(first, self.ticks_per_row)
+            end = min(end, first + self.ticks_per_row - left)
             if not left and row < len(self._recorder.late):
-                self._recorder.show(row, stepper.shown())
+                self._recorder.record_sensor_values(row, stepper.sensor_values())
         if station is None:
-            self.tick = planned_ticks(*self._records, first, end, False)
+            self.tick = run_planned_ticks(*self._records, first, end, False)
         else:
-            station.prepare(first)
-            end = min(end, station.until(first))
-            self.tick = teleoperated_ticks(*self._records, first, end, station.tripped)
+            station.prepare_tick(first)
+            end = min(end, station.next_prepared_tick(first))
+            self.tick = run_teleoperated_ticks(*self._records, first, end, station.valves_closed)
         if self.tick < 0:
-            raise self._recorder.failure((-1 - self.tick) // self.every)
+            raise self._recorder.instability_error((-1 - self.tick) // self.ticks_per_row)
         if station and self.tick < end:
-            stopped = station.notice(self.tick)
-            planned_tick(stepper.record, self._planned, self.tick, stepper.steps, stopped)
-            look_at_pins(self._ticks.record)
+            stopped = station.check_safety(self.tick)
+            step_planned_run(stepper.record, self._planned, self.tick, stepper.steps, stopped)
+            update_max_pin_opening(self._ticks.record)
             self.tick += 1
         stepper.tick = self.tick
-        if self._around.changes:
+        if self._around.has_trees_or_logs:
             self._around.update(first * self._dt, self.data, self._dt)
 
     def set_command(self, axis: str, value: float) -> None:
@@ -376,7 +397,7 @@ class Session:
         """
         self._plan.command[self.tick :, self.plant.axes.index(axis)] = value
 
-    def command_of(self, tick: int) -> np.ndarray:
+    def commands_at(self, tick: int) -> np.ndarray:
         """Return the commands (nu,) of a past tick [1], or in the units of the drives."""
         return self._commands[tick]
 
@@ -392,24 +413,22 @@ class Session:
             InputError: the run has fewer than the ten rows that a log needs.
         """
         wall = clock.perf_counter() - self._begin
-        self._around.restore()
-        rows = min(self.tick // self.every, self.scenario.rows)
+        self._around.restore_model()
+        rows = min(self.tick // self.ticks_per_row, self.scenario.row_count)
         if rows < 10:
             message = f"stopped after {self.time:.2f} s: too short for a log, nothing is written"
             raise InputError(self.scenario.name, message)
-        whole = self._commands[: rows * self.every].reshape(rows, self.every, -1)
+        whole = self._commands[: rows * self.ticks_per_row].reshape(rows, self.ticks_per_row, -1)
         self._recorder.command[:rows] = whole.mean(axis=1)
         station, plan = self.station, self._plan
-        if self.tick < self.scenario.ticks:
+        if self.tick < self.scenario.tick_count:
             plan = _cut_plan(plan, self.tick)
             if station:
-                station.log.cut(self.tick)
-        record = self._recorder.record(rows)
+                station.log.truncate(self.tick)
+        record = self._recorder.to_record(rows)
         commands = self._commands[: self.tick]
         events = tuple(self._around.events)
-        return SessionResult(
-            plan, record, commands, float(self._ticks.widest[0]), wall, station, events
-        )
+        return SessionResult(plan, record, commands, float(self._ticks.max_pin_opening[0]), wall, station, events)
 
 
 def _cut_plan(plan: Plan, ticks: int) -> Plan:
@@ -420,11 +439,16 @@ def _cut_plan(plan: Plan, ticks: int) -> Plan:
     )  # fmt: skip
 
 
-_VACUUM = -1.0e5  # Pa relative to the atmosphere, the lowest physically possible pressure
+_MIN_PRESSURE = -1.0e5  # Pa relative to the atmosphere, the lowest physically possible pressure
 
 
 def summarise(
-    plant: Plant, scenario: Scenario, plan: Plan, record: Record, pins: float, wall: float
+    plant: Plant,
+    scenario: Scenario,
+    plan: Plan,
+    record: Record,
+    max_pin_opening: float,
+    computing_seconds: float,
 ) -> dict[str, Any]:
     """Return the content of `summary.json`, without the flow and energy balances.
 
@@ -433,8 +457,8 @@ def summarise(
         scenario: the scenario.
         plan: reference and commands of every axis.
         record: states at the log rows.
-        pins: largest pin opening at a control tick [m].
-        wall: computing time of the tick loop [s].
+        max_pin_opening: largest pin opening at a control tick [m].
+        computing_seconds: computing time of the tick loop [s].
 
     Returns:
         Numbers and texts; units are part of the keys, or given by `unit`.
@@ -447,26 +471,26 @@ def summarise(
         "seed": scenario.seed,
         "effects": [planted.model_dump() for planted in scenario.effects],
         "simulated_seconds": scenario.duration,
-        "wall_seconds": round(wall, 4),
-        "realtime_factor": round(scenario.duration / wall, 1),
+        "wall_seconds": round(computing_seconds, 4),
+        "realtime_factor": round(scenario.duration / computing_seconds, 1),
         "physics_steps": round(scenario.duration / scenario.timestep),
-        "largest_pin_opening_mm": pins * 1e3,
-        "notes": [*plan.notes, *_doubts(plant, record)],
+        "largest_pin_opening_mm": max_pin_opening * 1e3,
+        "notes": [*plan.notes, *_find_impossible_states(plant, record)],
         "largest_contact_force_N": float(np.linalg.norm(record.contact, axis=1).max()),
-        "tracking": _tracking(plant, plan, record),
-        "versions": dict(_versions()),
+        "tracking": _tracking_errors(plant, plan, record),
+        "versions": dict(_package_versions()),
         "git_commit": _git_commit(),
     }
 
 
-def _doubts(plant: Plant, record: Record) -> list[str]:
+def _find_impossible_states(plant: Plant, record: Record) -> list[str]:
     """Return warnings about physically impossible states."""
     if not plant.hydraulic:
         return []
-    act = record.act[:, : ACTIVATIONS * plant.hydraulic]
-    pressures = act.reshape(len(record.time), -1, ACTIVATIONS)[:, :, 2:]
+    act = record.act[:, : ACTIVATIONS_PER_AXIS * plant.hydraulic]
+    pressures = act.reshape(len(record.time), -1, ACTIVATIONS_PER_AXIS)[:, :, 2:]
     lowest = pressures.min(initial=0.0)
-    if lowest < _VACUUM:
+    if lowest < _MIN_PRESSURE:
         return [
             f"a chamber pressure falls to {lowest / 1e6:.1f} MPa, which is physically impossible:"
             " check the parameters of the machine"
@@ -474,16 +498,14 @@ def _doubts(plant: Plant, record: Record) -> list[str]:
     return []
 
 
-def _tracking(plant: Plant, plan: Plan, record: Record) -> dict[str, Any]:
+def _tracking_errors(plant: Plant, plan: Plan, record: Record) -> dict[str, Any]:
     """Return RMS and maximum tracking error of every closed-loop axis and of the tip pose."""
     rows = np.searchsorted(plan.time, record.time - 1e-9)
     result: dict[str, Any] = {}
     for i, name in enumerate(plan.axes):
-        if plan.closed[i]:
+        if plan.closed_loop[i]:
             error = record.qpos[:, plant.qpos[i]] - plan.reference[rows, i]
-            result[name] = _size(
-                error, "rad" if plant.machine.position_kind(name) == "angle" else "m"
-            )
+            result[name] = _error_statistics(error, "rad" if plant.machine.position_kind(name) == "angle" else "m")
     if plan.pose is not None and record.tip.shape[1]:
         desired = plan.pose[rows]
         r = np.hypot(record.tip[:, 0], record.tip[:, 1]) - desired[:, 0]
@@ -492,18 +514,18 @@ def _tracking(plant: Plant, plan: Plan, record: Record) -> dict[str, Any]:
         places = [plant.model.joint(j).qposadr[0] for j in joints]
         attitude = record.qpos[:, places].sum(axis=1) - desired[:, 3]
         z = record.tip[:, 2] - desired[:, 2]
-        result["tip_r"], result["tip_z"] = _size(r, "m"), _size(z, "m")
-        result["tip_attitude"] = _size(attitude, "rad")
+        result["tip_r"], result["tip_z"] = _error_statistics(r, "m"), _error_statistics(z, "m")
+        result["tip_attitude"] = _error_statistics(attitude, "rad")
     return result
 
 
-def _size(error: np.ndarray, unit: str) -> dict[str, Any]:
+def _error_statistics(error: np.ndarray, unit: str) -> dict[str, Any]:
     rms, largest = float(np.sqrt(np.mean(error**2))), float(np.abs(error).max())
     return {"rms": rms, "max": largest, "unit": unit}
 
 
 @functools.cache
-def _versions() -> dict[str, str]:
+def _package_versions() -> dict[str, str]:
     names = ("mujoco", "dm-control", "numpy", "scipy", "numba", "pyarrow", "rerun-sdk")
     return {"hydrotele": hydrotele.__version__, **{n: version(n) for n in names}}
 
@@ -525,7 +547,7 @@ def _git_commit() -> str | None:
 
 AUDIT_SECONDS = 5.0
 _PROGRESS_ROWS = 50
-_DEEPEST_START = 0.05  # m: contact is compliant, so a resting tool penetrates the ground a little
+_MAX_INITIAL_PENETRATION = 0.05  # m: contact is compliant, so a resting tool penetrates the ground a little
 Progress = Callable[[float, float], None]
 
 
@@ -549,25 +571,25 @@ class Run:
     measured: Log
     truth: Log
     summary: dict[str, Any]
-    station: Station | None = None
+    station: TeleoperationSystem | None = None
 
 
-def scenario_model(scenario: Scenario) -> Machine:
+def load_nominal_machine(scenario: Scenario) -> Machine:
     """Load the machine of a scenario without its planted effects.
 
     Raises:
         InputError: unknown machine or tool.
     """
-    return load_machine(own_machine(scenario) or scenario.machine, scenario.tool)
+    return load_machine(find_local_machine(scenario) or scenario.machine, scenario.tool)
 
 
-def scenario_machine(scenario: Scenario) -> Machine:
+def load_simulated_machine(scenario: Scenario) -> Machine:
     """Load the machine of a scenario with its planted effects.
 
     Raises:
         InputError: unknown machine, tool, effect or location.
     """
-    machine = scenario_model(scenario)
+    machine = load_nominal_machine(scenario)
     for planted in scenario.effects:
         machine = apply_effect(machine, planted.name, planted.location, planted.parameters)
     return machine
@@ -579,18 +601,15 @@ def prepare(scenario: Scenario) -> PreparedRun:
     Raises:
         InputError: the scenario does not fit the machine.
     """
-    machine = scenario_machine(scenario)
-    sensors = sensor_set(machine, scenario.sensors)
+    machine = load_simulated_machine(scenario)
+    sensors = get_sensors(machine, scenario.sensors)
     plant = build_plant(machine, scenario.timestep, scenario.ground, scenario.surroundings)
-    data, start = _start(plant, scenario)
-    times = np.arange(scenario.ticks) / scenario.control_rate
+    data, start = _initial_data(plant, scenario)
+    times = np.arange(scenario.tick_count) / scenario.control_rate
     plan = make_plan(machine, plant.axes, scenario.pilot, start, times)
-    seen = feedback(plant, sensors, scenario.seed, scenario.ticks, scenario.control_rate)
-    if sensors and round(scenario.control_rate / scenario.log_rate) % seen.every:
-        message = (
-            f"the sample rate {sensors.rate:g} Hz must be a multiple of log_rate"
-            f" {scenario.log_rate:g} Hz"
-        )
+    seen = create_feedback(plant, sensors, scenario.seed, scenario.tick_count, scenario.control_rate)
+    if sensors and round(scenario.control_rate / scenario.log_rate) % seen.ticks_per_sample:
+        message = f"the sample rate {sensors.rate:g} Hz must be a multiple of log_rate {scenario.log_rate:g} Hz"
         raise InputError(f"sensors {scenario.sensors}", message)
     return PreparedRun(plant, data, plan, seen)
 
@@ -609,18 +628,18 @@ def run_scenario(scenario: Scenario, progress: Progress | None = None) -> Run:
         InputError: the scenario does not fit the machine.
         SimulationFailed: states became infinite or not a number.
     """
-    session = begin(scenario)
-    stride = _PROGRESS_ROWS * session.every
-    while session.tick < scenario.ticks:
+    session = start_session(scenario)
+    stride = _PROGRESS_ROWS * session.ticks_per_row
+    while session.tick < scenario.tick_count:
         if progress and session.tick % stride == 0:
             progress(session.time, scenario.duration)
-        session.advance(min(stride - session.tick % stride, scenario.ticks - session.tick))
+        session.advance(min(stride - session.tick % stride, scenario.tick_count - session.tick))
     if progress:
         progress(scenario.duration, scenario.duration)
-    return finished(session, scenario)
+    return finish_run(session, scenario)
 
 
-def begin(scenario: Scenario, hand: Hand | None = None) -> Session:
+def start_session(scenario: Scenario, hand: HandInput | None = None) -> Session:
     """Prepare a scenario and return a session at its first tick.
 
     Args:
@@ -631,11 +650,11 @@ def begin(scenario: Scenario, hand: Hand | None = None) -> Session:
         InputError: the scenario does not fit the machine.
     """
     if isinstance(scenario.pilot, TeleopPilot):
-        compile_ahead()
-    return Session(prepare(scenario), scenario, scenario_model(scenario), hand)
+        start_compilation()
+    return Session(prepare(scenario), scenario, load_nominal_machine(scenario), hand)
 
 
-def finished(session: Session, scenario: Scenario) -> Run:
+def finish_run(session: Session, scenario: Scenario) -> Run:
     """Stop a session and return its run with logs, summary and balances.
 
     Args:
@@ -647,28 +666,26 @@ def finished(session: Session, scenario: Scenario) -> Run:
     """
     looped, plant = session.finish(), session.plant
     plan, record = looped.plan, looped.record
-    truth, measured = _logs(plant, scenario, record, session.seen)
-    summary = summarise(plant, scenario, plan, record, looped.pins, looped.wall)
+    truth, measured = _logs(plant, scenario, record, session.sensor_feedback)
+    summary = summarise(plant, scenario, plan, record, looped.max_pin_opening, looped.computing_seconds)
     if looped.station:
-        measured = _with_station(measured, looped.station.log, scenario)
-        truth = _with_station(truth, looped.station.log, scenario)
+        measured = _add_station_channels(measured, looped.station.log, scenario)
+        truth = _add_station_channels(truth, looped.station.log, scenario)
         summary["teleoperation"] = looped.station.summary()
         summary["notes"] += looped.station.notes
     summary["notes"] += [f"{said} at {time:.2f} s" for time, said in looped.events]
     steps = round(1.0 / (scenario.control_rate * scenario.timestep))
     window = looped.commands[: round(AUDIT_SECONDS * scenario.control_rate)]
-    controls = delayed_commands(plant, session.before, window, steps)
-    summary["balance"] = audit(plant, session.start, controls)
+    controls = delayed_commands(plant, session.initial_commands, window, steps)
+    summary["balance"] = compute_balance_errors(plant, session.initial_physics_state, controls)
     return Run(scenario, plant, plan, measured, truth, summary, looped.station)
 
 
-def _with_station(log: Log, station: StationLog, scenario: Scenario) -> Log:
+def _add_station_channels(log: Log, station: TeleoperationLog, scenario: Scenario) -> Log:
     """Return a log with the channels of the operator station added."""
     every = round(scenario.control_rate / scenario.log_rate)
-    columns, units = station.channels(every, scenario.rows)
-    return dataclasses.replace(
-        log, columns={**log.columns, **columns}, units={**log.units, **units}
-    )
+    columns, units = station.channels(every, scenario.row_count)
+    return dataclasses.replace(log, columns={**log.columns, **columns}, units={**log.units, **units})
 
 
 def _logs(plant: Plant, scenario: Scenario, record: Record, seen: Feedback) -> tuple[Log, Log]:
@@ -680,24 +697,25 @@ def _logs(plant: Plant, scenario: Scenario, record: Record, seen: Feedback) -> t
     things = json.dumps([thing.model_dump() for thing in scenario.surroundings])
     known = {"initial_state": state} | ({"surroundings": things} if scenario.surroundings else {})
     truth = dataclasses.replace(truth, metadata={**truth.metadata, **known})
-    per_row = round(scenario.control_rate / scenario.log_rate) // seen.every
-    errors = {name: e[::per_row][: scenario.rows] for name, e in seen.errors.items()}
+    per_row = round(scenario.control_rate / scenario.log_rate) // seen.ticks_per_sample
+    errors = {name: e[::per_row][: scenario.row_count] for name, e in seen.errors.items()}
     visible = {c: v for c, v in values.items() if not c.startswith(("truth.", "command."))}
-    sensors = sensor_set(machine, scenario.sensors)
+    sensors = get_sensors(machine, scenario.sensors)
     readings = {c: v for c, v in values.items() if c.startswith("command.")}
-    visible |= late_channels(plant, record)
-    readings |= measure(machine, sensors, scenario.seed, visible, errors, 1.0 / scenario.log_rate)
+    visible |= delayed_channels(plant, record)
+    readings |= simulate_readings(machine, sensors, scenario.seed, visible, errors, 1.0 / scenario.log_rate)
     units = {c: units[c] for c in readings}
     return truth, _log(scenario, machine, record.time, readings, units, scenario.sensors)
 
 
-def _start(plant: Plant, scenario: Scenario) -> tuple[mujoco.MjData, dict[str, float]]:
+def _initial_data(plant: Plant, scenario: Scenario) -> tuple[mujoco.MjData, dict[str, float]]:
     machine = plant.machine
     joints = {name: machine.home.get(name, 0.0) for name in machine.joints}
     for name, value in scenario.start.joints.items():
         if name not in joints:
             raise InputError(
-                "start.joints", f"{name!r} is not a joint of the machine; {suggest(name, joints)}"
+                "start.joints",
+                f"{name!r} is not a joint of the machine; {suggest_valid_name(name, joints)}",
             )
         joints[name] = value
     if scenario.start.pose:
@@ -710,13 +728,11 @@ def _start(plant: Plant, scenario: Scenario) -> tuple[mujoco.MjData, dict[str, f
     for name, joint in machine.joints.items():
         if joint.range and not joint.range[0] <= joints[name] <= joint.range[1]:
             low, high = joint.range
-            raise InputError(
-                "start", f"{name} {joints[name]:.4g} is outside its range {low:.4g} .. {high:.4g}"
-            )
+            raise InputError("start", f"{name} {joints[name]:.4g} is outside its range {low:.4g} .. {high:.4g}")
     data = rest_state(plant, joints)
     mujoco.mj_fwdPosition(plant.model, data)
     depth = -min((data.contact[k].dist for k in range(data.ncon)), default=0.0)
-    if depth > _DEEPEST_START:
+    if depth > _MAX_INITIAL_PENETRATION:
         things = "the ground or an object" if plant.surroundings else "the ground"
         raise InputError("start", f"the machine would penetrate {things} by {depth:.2f} m")
     return data, joints
@@ -740,7 +756,7 @@ def _log(scenario, machine, time, values, units, sensors: str) -> Log:
 
 
 def _initial_state(plant: Plant, record: Record) -> dict[str, Any]:
-    act = record.act[0, : ACTIVATIONS * plant.hydraulic].reshape(plant.hydraulic, ACTIVATIONS)
+    act = record.act[0, : ACTIVATIONS_PER_AXIS * plant.hydraulic].reshape(plant.hydraulic, ACTIVATIONS_PER_AXIS)
     keys = ("spool", "spool_rate", "pressure_head", "pressure_rod")
     driven = {axis.joint for axis in plant.machine.axes.values()}
     free = [n for n in plant.machine.joints if n not in driven]
@@ -757,14 +773,14 @@ def _initial_state(plant: Plant, record: Record) -> dict[str, Any]:
         **{key: act[:, column].tolist() for column, key in enumerate(keys)},
         "joints": {n: float(record.qpos[0, plant.model.joint(n).qposadr[0]]) for n in free},
         **(drives if flexible else {}),
-        **_remembered(plant, record),
+        **_internal_states(plant, record),
     }
 
 
-def _remembered(plant: Plant, record: Record) -> dict[str, dict[str, float]]:
+def _internal_states(plant: Plant, record: Record) -> dict[str, dict[str, float]]:
     """Return the internal states of bristles, pump and terms at the start, by kind and owner."""
     found: dict[str, dict[str, float]] = {}
-    for name, place in plant.memory.items():
+    for name, place in plant.extra_states.items():
         kind, _, owner = name.partition(".")
         found.setdefault(kind, {})[owner] = float(record.act[0, place])
     return found

@@ -34,35 +34,35 @@ import yaml
 import hydrotele
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import read_json
-from hydrotele.core.output import check_target, replacing, whole_folder
+from hydrotele.core.output import atomic_file, atomic_folder, check_output_folder
 from hydrotele.run.sweep_facts import (
-    Base,
-    Checked,
+    CheckedSweep,
     Point,
     Sweep,
+    SweepBase,
     SweepFile,
     check_points,
     fingerprint,
+    iterate_points,
     open_base,
-    points,
     scenario_of,
 )
 from hydrotele.run.sweep_runs import (
     FAILED,
     JOURNAL,
     OK,
-    Entry,
     Journal,
-    Keep,
+    JournalEntry,
     Outcome,
     RunTask,
+    WriteRun,
     check_figures,
-    failed,
+    execute_task,
+    failed_outcome,
     key_unit,
-    perform,
-    placed,
-    possible_results,
-    unpack,
+    possible_number_names,
+    with_resolved_paths,
+    write_files,
 )
 from hydrotele.scenario.scenario import save_scenario
 
@@ -73,18 +73,18 @@ class SweepTable(NamedTuple):
     Attributes:
         columns: column name -> values; None for a missing value.
         units: column name -> unit, for columns with a unit.
-        varied: names of the varied keys.
-        figures: names of the summary numbers.
+        varied_keys: names of the varied keys.
+        number_names: names of the summary numbers.
     """
 
     columns: dict[str, list[Any]]
     units: dict[str, str]
-    varied: tuple[str, ...]
-    figures: tuple[str, ...]
+    varied_keys: tuple[str, ...]
+    number_names: tuple[str, ...]
 
 
 def make_table(
-    sweep: Sweep, seed: int, entries: Mapping[int, Entry], effect_units: Mapping[str, str]
+    sweep: Sweep, seed: int, entries: Mapping[int, JournalEntry], effect_units: Mapping[str, str]
 ) -> SweepTable:
     """Create the table of all runs.
 
@@ -97,12 +97,12 @@ def make_table(
     Returns:
         Table with the columns `run`, varied keys, `seed`, `status`, `reason`, `notes`, numbers.
     """
-    rows = list(points(sweep))
-    varied = tuple(key for key in sweep.varied if key != "seed")
+    rows = list(iterate_points(sweep))
+    varied = tuple(key for key in sweep.varied_keys if key != "seed")
     units = {key: unit for key in varied if (unit := effect_units.get(key) or key_unit(key))}
     columns: dict[str, list[Any]] = {"run": [point.run for point in rows]}
     columns |= {key: [point.values[key] for point in rows] for key in varied}
-    columns["seed"] = [point.values.get("seed", seed) + point.copy for point in rows]
+    columns["seed"] = [point.values.get("seed", seed) + point.repetition_number for point in rows]
     found = [entries[point.run] for point in rows]
     for name in ("status", "reason", "notes"):
         columns[name] = [getattr(entry, name) for entry in found]
@@ -128,20 +128,20 @@ def save_table(table: SweepTable, name: str, path: Path) -> None:
 
     fields, arrays = [], []
     for column, values in table.columns.items():
-        array = _array(pa, values)
+        array = _to_arrow_array(pa, values)
         metadata = {"unit": table.units[column]} if column in table.units else None
         fields.append(pa.field(column, array.type, metadata=metadata))
         arrays.append(array)
     facts = {"sweep": name, "hydrotele": hydrotele.__version__,
-             "varied": json.dumps(table.varied)}  # fmt: skip
+             "varied": json.dumps(table.varied_keys)}  # fmt: skip
     schema = pa.schema(fields, metadata=facts)
-    with replacing(path, ".parquet") as part:
+    with atomic_file(path, ".parquet") as part:
         pq.write_table(pa.Table.from_arrays(arrays, schema=schema), part, compression="zstd")
         with open(part, "rb") as file:
             os.fsync(file.fileno())
 
 
-def _array(pa, values: Sequence[Any]):
+def _to_arrow_array(pa, values: Sequence[Any]):
     """Return a column as booleans, integers, floats, or JSON text for all other values."""
     kinds = {type(value) for value in values if value is not None}
     if kinds == {bool}:
@@ -150,39 +150,37 @@ def _array(pa, values: Sequence[Any]):
         return pa.array(values, pa.int64())
     if kinds <= {int, float} and kinds != {int}:
         return pa.array([None if v is None else float(v) for v in values], pa.float64())
-    return pa.array(
-        [v if v is None or isinstance(v, str) else json.dumps(v) for v in values], pa.string()
-    )
+    return pa.array([v if v is None or isinstance(v, str) else json.dumps(v) for v in values], pa.string())
 
 
-_MOST = 6
-_FIRST = ("tracking.tip_r.rms", "tracking.tip_z.rms", "tracking.tip_attitude.rms")
-_LAST = (
+_MAX_FIGURES = 6
+_TIP_FIGURES = ("tracking.tip_r.rms", "tracking.tip_z.rms", "tracking.tip_attitude.rms")
+_FORCE_AND_BALANCE_FIGURES = (
     "largest_contact_force_N", "teleoperation.largest_tip_force_N",
     "teleoperation.handle_least_energy_J", "largest_pin_opening_mm", "balance.energy_balance",
 )  # fmt: skip
 
 
-def default_figures(table: SweepTable) -> list[str]:
+def choose_figures(table: SweepTable) -> list[str]:
     """Return up to six numbers that differ between runs: tracking errors, forces, balances."""
-    axes = [n for n in table.figures if n.startswith("tracking.") and n.endswith(".rms")]
-    followed = [n for n in _FIRST if n in axes] or axes
-    ordered = dict.fromkeys([*followed, *(n for n in _LAST if n in table.figures), *axes])
-    return [name for name in ordered if len(set(_known(table, name).values())) > 1][:_MOST]
+    axes = [n for n in table.number_names if n.startswith("tracking.") and n.endswith(".rms")]
+    followed = [n for n in _TIP_FIGURES if n in axes] or axes
+    ordered = dict.fromkeys([*followed, *(n for n in _FORCE_AND_BALANCE_FIGURES if n in table.number_names), *axes])
+    return [name for name in ordered if len(set(_values_by_run(table, name).values())) > 1][:_MAX_FIGURES]
 
 
-def _known(table: SweepTable, name: str) -> dict[int, float]:
+def _values_by_run(table: SweepTable, name: str) -> dict[int, float]:
     """Return run number -> value of a column, without missing values."""
     values = table.columns.get(name, [])
     return {run: float(v) for run, v in zip(table.columns["run"], values, strict=False)
             if v is not None}  # fmt: skip
 
 
-def spread_statistics(table: SweepTable, figures: list[str]) -> dict[str, dict[str, Any]]:
+def compute_statistics(table: SweepTable, figures: list[str]) -> dict[str, dict[str, Any]]:
     """Return minimum, median and maximum of numbers, with the runs of the extremes."""
     found = {}
     for name in figures:
-        known = _known(table, name)
+        known = _values_by_run(table, name)
         if known:
             low, high = min(known, key=known.__getitem__), max(known, key=known.__getitem__)
             found[name] = {
@@ -192,11 +190,11 @@ def spread_statistics(table: SweepTable, figures: list[str]) -> dict[str, dict[s
     return found
 
 
-_WAIT = 30  # s, timeout for the scheduler and the first worker
-_WHERE = "--dask"
+_CLUSTER_TIMEOUT = 30  # s, timeout for the scheduler and the first worker
+_DASK_OPTION = "--dask"
 
 
-def cluster_outcomes(tasks: Iterable[RunTask], address: str) -> Generator[Outcome]:
+def run_on_cluster(tasks: Iterable[RunTask], address: str) -> Generator[Outcome]:
     """Execute runs on a dask cluster; more runs than threads are submitted at a time.
 
     Args:
@@ -214,31 +212,35 @@ def cluster_outcomes(tasks: Iterable[RunTask], address: str) -> Generator[Outcom
         from dask import distributed
     except ImportError:
         message = "needs dask.distributed: pip install 'hydrotele[cluster]'"
-        raise InputError(_WHERE, message) from None
+        raise InputError(_DASK_OPTION, message) from None
     for name in list(logging.root.manager.loggerDict):
         if name.split(".")[0] == "distributed":  # errors are reported below
             logging.getLogger(name).setLevel(logging.CRITICAL)
     there = "scheduler_file" if Path(address).is_file() else "address"
-    facts: dict[str, Any] = {there: address, "timeout": f"{_WAIT}s", "set_as_default": False}
+    facts: dict[str, Any] = {
+        there: address,
+        "timeout": f"{_CLUSTER_TIMEOUT}s",
+        "set_as_default": False,
+    }
     try:
         client = distributed.Client(**facts)
     except (OSError, ValueError, TypeError) as error:
-        raise InputError(_WHERE, f"no scheduler responds at {address}: {error}") from None
+        raise InputError(_DASK_OPTION, f"no scheduler responds at {address}: {error}") from None
     with client:
         try:
-            client.wait_for_workers(1, timeout=_WAIT)
+            client.wait_for_workers(1, timeout=_CLUSTER_TIMEOUT)
         except TimeoutError:
             message = f"the scheduler at {address} has no workers; start some with dask worker"
-            raise InputError(_WHERE, message) from None
-        yield from _outcomes(client, distributed, iter(tasks))
+            raise InputError(_DASK_OPTION, message) from None
+        yield from _run_on_client(client, distributed, iter(tasks))
 
 
-def _outcomes(client, distributed, waiting: Iterator[RunTask]) -> Iterator[Outcome]:
+def _run_on_client(client, distributed, waiting: Iterator[RunTask]) -> Iterator[Outcome]:
     ahead = 2 * max(sum(client.nthreads().values()), 1) + 8
     runs = {}
 
     def submit(task: RunTask):
-        future = client.submit(perform, task, pure=False, key=f"hydrotele-{task.run}-{id(runs)}")
+        future = client.submit(execute_task, task, pure=False, key=f"hydrotele-{task.run}-{id(runs)}")
         runs[future.key] = task.run
         return future
 
@@ -246,12 +248,12 @@ def _outcomes(client, distributed, waiting: Iterator[RunTask]) -> Iterator[Outco
     done = distributed.as_completed(first, loop=client.loop)
     for future in done:
         run = runs.pop(future.key)
-        yield _outcome(distributed, future, run)
+        yield _future_outcome(distributed, future, run)
         if (task := next(waiting, None)) is not None:
             done.add(submit(task))
 
 
-def _outcome(distributed, future, run: int) -> Outcome:
+def _future_outcome(distributed, future, run: int) -> Outcome:
     """Return the outcome of a cluster task.
 
     Raises:
@@ -261,34 +263,48 @@ def _outcome(distributed, future, run: int) -> Outcome:
         return future.result()
     error = None if future.status in ("cancelled", "lost") else future.exception()
     if isinstance(error, distributed.KilledWorker):
-        return failed(run, "all workers that executed it were lost")
+        return failed_outcome(run, "all workers that executed it were lost")
     if isinstance(error, ImportError):
         message = f"its workers need the same hydrotele as this computer: {error}"
-        raise InputError(_WHERE, message)
+        raise InputError(_DASK_OPTION, message)
     said = f"{type(error).__name__}: {error}" if error else "its scheduler may be gone"
     kept = "finished runs are kept, the same command continues the sweep"
-    raise InputError(_WHERE, f"the cluster aborted run {run}: {said}; {kept}")
+    raise InputError(_DASK_OPTION, f"the cluster aborted run {run}: {said}; {kept}")
 
 
 KIND = "sweep"
 SCRATCH = ".scratch"
-_FREE = ("name", "description", "figures", "scenario")  # the digest covers the scenario content
-_MAKERS = ("mujoco", "dm-control", "numpy", "scipy", "numba")  # packages that affect results
+_KEYS_WITHOUT_EFFECT = (
+    "name",
+    "description",
+    "figures",
+    "scenario",
+)  # the digest covers the scenario content
+_RESULT_PACKAGES = (
+    "mujoco",
+    "dm-control",
+    "numpy",
+    "scipy",
+    "numba",
+)  # packages that affect results
 
 
-def versions() -> dict[str, str]:
+def result_versions() -> dict[str, str]:
     """Return the versions of the packages that affect the results of a run."""
-    return {"hydrotele": hydrotele.__version__, **{name: version(name) for name in _MAKERS}}
+    return {
+        "hydrotele": hydrotele.__version__,
+        **{name: version(name) for name in _RESULT_PACKAGES},
+    }
 
 
-def identity(base: Base, checked: Checked) -> dict[str, Any]:
+def sweep_identity(base: SweepBase, checked: CheckedSweep) -> dict[str, Any]:
     """Return the data that must be equal for a sweep to continue in an existing folder."""
-    facts = base.file.sweep.model_dump(mode="json", exclude=set(_FREE))
-    return {"sweep": facts, "scenarios": checked.digest, "versions": versions()}
+    facts = base.file.sweep.model_dump(mode="json", exclude=set(_KEYS_WITHOUT_EFFECT))
+    return {"sweep": facts, "scenarios": checked.digest, "versions": result_versions()}
 
 
 @contextlib.contextmanager
-def sweep_folder(target: Path, base: Base, checked: Checked, fresh: bool) -> Iterator[None]:
+def sweep_folder(target: Path, base: SweepBase, checked: CheckedSweep, fresh: bool) -> Iterator[None]:
     """Create the folder of a sweep or continue an existing one, with exclusive access.
 
     Args:
@@ -300,44 +316,44 @@ def sweep_folder(target: Path, base: Base, checked: Checked, fresh: bool) -> Ite
     Raises:
         InputError: the folder has other content or another sweep, or another process uses it.
     """
-    check_target(target, KIND)
-    asked = identity(base, checked)
+    check_output_folder(target, KIND)
+    asked = sweep_identity(base, checked)
     if fresh and target.is_dir():
-        with _alone(target):
+        with _lock_folder(target):
             pass
     if fresh or not (target / "summary.json").is_file():
-        with whole_folder(target, KIND) as folder:
-            unpack(base.inputs.files(), folder)
+        with atomic_folder(target, KIND) as folder:
+            write_files(base.machine_copies.files(), folder)
             write_summary(folder, base, {"identity": asked})
     if not os.access(target, os.W_OK | os.X_OK):
         raise InputError(target, "cannot be written to; choose another --out")
-    with _alone(target):
+    with _lock_folder(target):
         there = read_json(target / "summary.json").get("identity", {})
-        if found := list(_differences(there, asked)):
+        if found := list(_describe_differences(there, asked)):
             more = f", and {len(found) - 4} more" if len(found) > 4 else ""
             message = "; ".join(found[:4]) + more + "; use --fresh, or choose another --out"
             raise InputError(target, f"contains another sweep: {message}")
         for left in target.glob(".*"):
             shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink()
         (target / SCRATCH).mkdir()
-        with replacing(target / "sweep.yaml", ".yaml") as part:
-            part.write_text(_resolved(base))
+        with atomic_file(target / "sweep.yaml", ".yaml") as part:
+            part.write_text(_resolved_yaml(base))
         try:
             yield
         finally:
             shutil.rmtree(target / SCRATCH, ignore_errors=True)
 
 
-def write_summary(folder: Path, base: Base, facts: dict[str, Any]) -> None:
+def write_summary(folder: Path, base: SweepBase, facts: dict[str, Any]) -> None:
     """Write `summary.json` with the kind and the identity of the sweep folder."""
     summary = {"kind": KIND, "name": base.file.name, "runs": base.file.sweep.runs, **facts}
-    with replacing(folder / "summary.json", ".json") as part:
+    with atomic_file(folder / "summary.json", ".json") as part:
         part.write_text(json.dumps(summary, indent=2) + "\n")
 
 
-def _resolved(base: Base) -> str:
+def _resolved_yaml(base: SweepBase) -> str:
     """Return the sweep with all defaults as YAML text that `load_sweep` reads from any folder."""
-    scenario = base.file.scenario()
+    scenario = base.file.find_scenario()
     named = scenario == base.file.sweep.scenario and not Path(scenario).suffix
     facts = base.file.sweep.model_dump(mode="json", exclude_none=True)
     facts |= {"name": base.file.name}
@@ -346,7 +362,7 @@ def _resolved(base: Base) -> str:
 
 
 @contextlib.contextmanager
-def _alone(target: Path) -> Iterator[None]:
+def _lock_folder(target: Path) -> Iterator[None]:
     """Lock the folder; the operating system releases the lock when the process ends."""
     handle = os.open(target, os.O_RDONLY)
     try:
@@ -360,9 +376,9 @@ def _alone(target: Path) -> Iterator[None]:
         os.close(handle)
 
 
-def _differences(old: dict[str, Any], new: dict[str, Any]) -> Iterator[str]:
+def _describe_differences(old: dict[str, Any], new: dict[str, Any]) -> Iterator[str]:
     """Yield the differences between two identities; the digest only without other differences."""
-    before, after = (_flat({k: i.get(k) for k in ("sweep", "versions")}) for i in (old, new))
+    before, after = (_flatten({k: i.get(k) for k in ("sweep", "versions")}) for i in (old, new))
     found = False
     for key in dict.fromkeys([*before, *after]):
         if before.get(key) != after.get(key):
@@ -373,17 +389,22 @@ def _differences(old: dict[str, Any], new: dict[str, Any]) -> Iterator[str]:
         yield "the base scenario, one of its files, or the order of the keys has changed"
 
 
-def _flat(data: dict[str, Any], above: str = "") -> dict[str, Any]:
+def _flatten(data: dict[str, Any], above: str = "") -> dict[str, Any]:
     result = {}
     for key, value in data.items():
         if isinstance(value, dict):
-            result |= _flat(value, f"{above}{key}.")
+            result |= _flatten(value, f"{above}{key}.")
         elif value is not None:
             result[f"{above}{key}"] = value
     return result
 
 
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+_THREAD_VARIABLES = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+)
 _READY = "ready"
 
 
@@ -393,13 +414,13 @@ class _Worker:
     def __init__(self, context) -> None:
         """Start the process; it sends `_READY` when it can accept runs."""
         self.connection, theirs = context.Pipe()
-        self.process = context.Process(target=_work, args=(theirs,), daemon=True)
-        with _starting():
+        self.process = context.Process(target=_worker_main, args=(theirs,), daemon=True)
+        with _child_process_environment():
             self.process.start()
         theirs.close()  # otherwise the death of the process is not detected
         self.ready, self.task = False, None
 
-    def give(self, task: RunTask) -> None:
+    def send_task(self, task: RunTask) -> None:
         """Send a run to the process; the next wait detects a dead process."""
         self.task = task
         with contextlib.suppress(OSError):
@@ -412,7 +433,7 @@ class _Worker:
         self.connection.close()
 
 
-def outcomes(tasks: Iterable[RunTask], jobs: int) -> Generator[Outcome]:
+def run_in_processes(tasks: Iterable[RunTask], jobs: int) -> Generator[Outcome]:
     """Execute runs in worker processes with one thread each.
 
     Args:
@@ -431,29 +452,29 @@ def outcomes(tasks: Iterable[RunTask], jobs: int) -> Generator[Outcome]:
     try:
         for task in waiting:
             workers.append(_Worker(context))
-            workers[-1].give(task)
+            workers[-1].send_task(task)
             if len(workers) == jobs:
                 break
         while busy := {w.connection: w for w in workers if w.task}:
             for connection in wait(list(busy)):
                 worker = busy[connection]
-                said = _heard(worker)
+                said = _receive(worker)
                 if said == _READY:
                     worker.ready = True
                     continue
                 if said is None:
-                    said = _dead(worker)
+                    said = _dead_worker_outcome(worker)
                     workers[workers.index(worker)] = worker = _Worker(context)
                 worker.task = None
                 yield said
                 if (task := next(waiting, None)) is not None:
-                    worker.give(task)
+                    worker.send_task(task)
     finally:
         for worker in workers:
             worker.stop()
 
 
-def _heard(worker: _Worker) -> Any:
+def _receive(worker: _Worker) -> Any:
     """Return the next message of a worker, None if its process is dead."""
     try:
         return worker.connection.recv()
@@ -461,7 +482,7 @@ def _heard(worker: _Worker) -> Any:
         return None
 
 
-def _dead(worker: _Worker) -> Outcome:
+def _dead_worker_outcome(worker: _Worker) -> Outcome:
     """Return the outcome of a run whose process died."""
     worker.stop()
     code = worker.process.exitcode or 0
@@ -470,15 +491,15 @@ def _dead(worker: _Worker) -> Outcome:
         raise InputError("--jobs", f"a worker process did not start ({how})")
     assert worker.task
     memory = "; is there enough memory?" if code == -signal.SIGKILL else ""
-    return failed(worker.task.run, f"its process was killed ({how}){memory}")
+    return failed_outcome(worker.task.run, f"its process was killed ({how}){memory}")
 
 
 @contextlib.contextmanager
-def _starting() -> Iterator[None]:
+def _child_process_environment() -> Iterator[None]:
     """Let child processes use one thread and ignore Ctrl-C, which this process handles."""
-    old = {name: os.environ.get(name) for name in _THREADS}
+    old = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
     try:
         yield
     finally:
@@ -490,17 +511,17 @@ def _starting() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
-def _work(connection: Connection) -> None:
+def _worker_main(connection: Connection) -> None:
     """Execute runs until the parent process ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     tasks: queue.SimpleQueue[RunTask] = queue.SimpleQueue()
-    threading.Thread(target=_listen, args=(connection, tasks), daemon=True).start()
+    threading.Thread(target=_receive_tasks, args=(connection, tasks), daemon=True).start()
     connection.send(_READY)
     while True:
-        connection.send(perform(tasks.get()))
+        connection.send(execute_task(tasks.get()))
 
 
-def _listen(connection: Connection, tasks: queue.SimpleQueue) -> None:
+def _receive_tasks(connection: Connection, tasks: queue.SimpleQueue) -> None:
     """Receive tasks; exit this process immediately when the parent process ends."""
     try:
         while True:
@@ -520,14 +541,14 @@ class SweepSettings(NamedTuple):
         dask: address or file of a dask scheduler; if given, replaces the local processes.
         fresh: delete the content of an earlier sweep in the folder.
         retry_failed: repeat failed runs.
-        keep: function that writes a run into a folder, for sweeps with `logs: true`.
+        write_run_files: function that writes a run into a folder, for sweeps with `logs: true`.
     """
 
     jobs: int | None = None
     dask: str | None = None
     fresh: bool = False
     retry_failed: bool = False
-    keep: Keep | None = None
+    write_run_files: WriteRun | None = None
 
 
 class SweepResult(NamedTuple):
@@ -536,18 +557,18 @@ class SweepResult(NamedTuple):
     Attributes:
         table: table with one row per run.
         failed: journal entries of the failed runs.
-        done: number of runs executed by this call.
+        n_executed: number of runs executed by this call.
     """
 
     table: SweepTable
-    failed: list[Entry]
-    done: int
+    failed: list[JournalEntry]
+    n_executed: int
 
 
 def run_sweep(
     file: SweepFile,
     target: Path,
-    how: SweepSettings | None = None,
+    sweep_settings: SweepSettings | None = None,
     progress: Progress | None = None,
 ) -> SweepResult:
     """Execute the missing runs of a sweep and write its table.
@@ -555,7 +576,7 @@ def run_sweep(
     Args:
         file: result of `load_sweep`.
         target: folder of the sweep; an interrupted sweep in it is continued.
-        how: execution settings.
+        sweep_settings: execution settings.
         progress: called with the stage ("check" or "run"), the number finished, the total number,
             and the number of failed runs.
 
@@ -566,93 +587,94 @@ def run_sweep(
         InputError: a point is invalid, the folder contains another sweep, or the cluster failed.
         KeyboardInterrupt: on Ctrl-C; finished runs are kept.
     """
-    how, base = how or SweepSettings(), open_base(file)
-    checked = check_points(
-        base, progress and (lambda done, total: progress("check", done, total, 0))
-    )
-    possible = possible_results(checked.axes, checked.teleoperated)
-    check_figures(file.sweep.figures, possible, file.place("figures"))
-    if how.dask:
-        base.inputs.refuse_bound("--dask")
-    with sweep_folder(target, base, checked, how.fresh):
+    sweep_settings, base = sweep_settings or SweepSettings(), open_base(file)
+    checked = check_points(base, progress and (lambda done, total: progress("check", done, total, 0)))
+    possible = possible_number_names(checked.axes, checked.teleoperated)
+    check_figures(file.sweep.figures, possible, file.format_location("figures"))
+    if sweep_settings.dask:
+        base.machine_copies.check_sendable("--dask")
+    with sweep_folder(target, base, checked, sweep_settings.fresh):
         with closing(Journal(target / JOURNAL)) as journal:
-            missing = _missing(base, journal, how.retry_failed)
-            _do(base, target, journal, missing, how, checked, progress)
+            missing = _missing(base, journal, sweep_settings.retry_failed)
+            _execute_runs(base, target, journal, missing, sweep_settings, checked, progress)
         entries = {run: journal.entries[run] for run in sorted(journal.entries)}
         failures = [entry for entry in entries.values() if entry.status == FAILED]
         table = make_table(file.sweep, checked.seed, entries, checked.units)
         save_table(table, file.name, target / "table.parquet")
         _save_timings(entries, target / "timings.csv")
         counts = {"ok": len(entries) - len(failures), "failed": len(failures)}
-        write_summary(target, base, {"identity": identity(base, checked), **counts})
+        write_summary(target, base, {"identity": sweep_identity(base, checked), **counts})
     return SweepResult(table, failures, len(missing))
 
 
-def _missing(base: Base, journal: Journal, retry_failed: bool) -> dict[int, Point]:
+def _missing(base: SweepBase, journal: Journal, retry_failed: bool) -> dict[int, Point]:
     """Return the runs to execute, by number."""
     if retry_failed:
         done = {run for run, entry in journal.entries.items() if entry.status == OK}
     else:
         done = set(journal.entries)
-    return {point.run: point for point in points(base.file.sweep) if point.run not in done}
+    return {point.run: point for point in iterate_points(base.file.sweep) if point.run not in done}
 
 
-def _do(
-    base: Base, target: Path, journal: Journal, missing: dict[int, Point], how: SweepSettings,
-    checked: Checked, progress: Progress | None,
+def _execute_runs(
+    base: SweepBase, target: Path, journal: Journal, missing: dict[int, Point], how: SweepSettings,
+    checked: CheckedSweep, progress: Progress | None,
 ) -> None:  # fmt: skip
     """Execute the missing runs and write each to the journal."""
     total, done = base.file.sweep.runs, base.file.sweep.runs - len(missing)
     failed = sum(e.status == FAILED for r, e in journal.entries.items() if r not in missing)
-    tasks = (_task(base, target, how, checked, point) for point in missing.values())
+    tasks = (_make_task(base, target, how, checked, point) for point in missing.values())
     jobs = min(how.jobs or os.cpu_count() or 1, max(len(missing), 1))
-    found = cluster_outcomes(tasks, how.dask) if how.dask and missing else outcomes(tasks, jobs)
+    found = run_on_cluster(tasks, how.dask) if how.dask and missing else run_in_processes(tasks, jobs)
     if progress:
         progress("run", done, total, failed)
     with closing(found):
         for outcome in found:
             _check_versions(outcome)
             if outcome.files:
-                _keep(base, target, missing[outcome.entry.run], outcome)
+                _write_run_folder(base, target, missing[outcome.entry.run], outcome)
             journal.add(outcome.entry)
             done, failed = done + 1, failed + (outcome.entry.status == FAILED)
             if progress:
                 progress("run", done, total, failed)
 
 
-def _task(base: Base, target: Path, how: SweepSettings, checked: Checked, point: Point) -> RunTask:
+def _make_task(base: SweepBase, target: Path, how: SweepSettings, checked: CheckedSweep, point: Point) -> RunTask:
     scenario = scenario_of(base, point)
     if fingerprint(scenario) != checked.fingerprints[point.run - 1]:
         message = "one of its files changed during the sweep; the finished runs are kept"
         raise InputError(base.scenario.path, message)
-    keep = how.keep if base.file.sweep.logs else None
+    keep = how.write_run_files if base.file.sweep.logs else None
     if how.dask:
-        return RunTask(point.run, scenario, None, base.inputs.files_of(scenario), keep, None)
+        return RunTask(point.run, scenario, None, base.machine_copies.files_of(scenario), keep, None)
     folder = target.resolve()
     return RunTask(point.run, scenario, str(folder), {}, keep, str(folder / SCRATCH))
 
 
 def _check_versions(outcome: Outcome) -> None:
     """Check that a worker has the same software versions, so that results are comparable."""
-    ours = versions()
+    ours = result_versions()
     for name, theirs in outcome.versions.items():
         if ours.get(name, theirs) != theirs:
             raise InputError("--dask", f"a worker has {name} {theirs}, this computer {ours[name]}")
 
 
-def _keep(base: Base, target: Path, point: Point, outcome: Outcome) -> None:
+def _write_run_folder(base: SweepBase, target: Path, point: Point, outcome: Outcome) -> None:
     """Write the folder of a run atomically."""
     name = f"{point.run:0{max(4, len(str(base.file.sweep.runs)))}d}"
-    with whole_folder(target / "runs" / name, "run") as folder:
+    with atomic_folder(target / "runs" / name, "run") as folder:
         for file, content in outcome.files.items():
             (folder / file).write_bytes(content)
         # the scenario written by a worker contains machine paths of that computer
-        save_scenario(placed(scenario_of(base, point), target.resolve()), folder / "scenario.yaml")
+        save_scenario(
+            with_resolved_paths(scenario_of(base, point), target.resolve()),
+            folder / "scenario.yaml",
+        )
 
 
-def _save_timings(entries: dict[int, Entry], path: Path) -> None:
+def _save_timings(entries: dict[int, JournalEntry], path: Path) -> None:
     """Write the computing times, which differ between equal runs, to a separate CSV file."""
-    with replacing(path, ".csv") as part, open(part, "w", newline="") as file:
+    with atomic_file(path, ".csv") as part, open(part, "w", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(["run", "wall [s]"])
         for entry in entries.values():

@@ -18,28 +18,28 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
-from hydrotele.core.datafile import Facts, Name, parse, read_yaml, suggest
+from hydrotele.core.datafile import Name, StrictModel, read_yaml, suggest_valid_name, validate_data
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import scenarios_folder
 from hydrotele.effects import EFFECTS, apply_effect
-from hydrotele.machine.machine import Machine, sensor_set
+from hydrotele.machine.machine import Machine, get_sensors
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.run.sweep_runs import Inputs
+from hydrotele.run.sweep_runs import MachineCopies
 from hydrotele.scenario.scenario import (
     Scenario,
     ScenarioFile,
-    own_machine,
+    find_local_machine,
+    make_scenario,
     read_scenario_file,
-    scenario_from,
     shipped_scenarios,
 )
 
 Key = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*(\.[A-Za-z0-9_]+)*$")]
-MOST_RUNS = 100_000
-_WAYS = ("uniform", "log_uniform", "normal", "choice")
+MAX_RUNS = 100_000
+_DISTRIBUTIONS = ("uniform", "log_uniform", "normal", "choice")
 
 
-def _checked_value(value: Any) -> Any:
+def _check_value(value: Any) -> Any:
     """Return a value after checking that it can be written to a scenario.
 
     Raises:
@@ -52,24 +52,24 @@ def _checked_value(value: Any) -> Any:
     return value
 
 
-def _checked_values(values: list[Any]) -> list[Any]:
+def _check_values(values: list[Any]) -> list[Any]:
     """Return the values of a grid after checking them.
 
     Raises:
         ValueError: a value cannot be written to a scenario, or occurs twice.
     """
-    texts = [json.dumps(_checked_value(value)) for value in values]
+    texts = [json.dumps(_check_value(value)) for value in values]
     for text in texts:
         if texts.count(text) > 1:
             raise ValueError(f"{text} occurs twice; use repeat for several runs of one value")
     return values
 
 
-Value = Annotated[Any, AfterValidator(_checked_value)]
-Values = Annotated[list[Any], Field(min_length=1), AfterValidator(_checked_values)]
+Value = Annotated[Any, AfterValidator(_check_value)]
+Values = Annotated[list[Any], Field(min_length=1), AfterValidator(_check_values)]
 
 
-class Distribution(Facts):
+class Distribution(StrictModel):
     """Distribution of a sampled key; exactly one of the four forms is given.
 
     uniform [low, high], log_uniform [low, high] with low > 0, normal [mean, standard deviation], in
@@ -83,9 +83,9 @@ class Distribution(Facts):
 
     @model_validator(mode="after")
     def _check(self):
-        given = [way for way in _WAYS if getattr(self, way) is not None]
+        given = [way for way in _DISTRIBUTIONS if getattr(self, way) is not None]
         if len(given) != 1:
-            raise ValueError(f"give exactly one of {', '.join(_WAYS)}")
+            raise ValueError(f"give exactly one of {', '.join(_DISTRIBUTIONS)}")
         low, high = self.uniform or self.log_uniform or (0.0, 1.0)
         if not low < high:
             raise ValueError(f"{given[0]} must be [low, high] with low < high")
@@ -96,15 +96,15 @@ class Distribution(Facts):
         return self
 
 
-class Sample(Facts):
+class Sample(StrictModel):
     """Random values: `count` joint samples of all `keys`, from the random seed `seed`."""
 
-    count: Annotated[int, Field(ge=1, le=MOST_RUNS)]
+    count: Annotated[int, Field(ge=1, le=MAX_RUNS)]
     seed: Annotated[int, Field(ge=0)] = 0
     keys: Annotated[dict[Key, Distribution], Field(min_length=1)]
 
 
-class Sweep(Facts):
+class Sweep(StrictModel):
     """A set of runs of one scenario with varied parameters.
 
     `set` applies to every run. `grid` gives all combinations of its values. Each combination is run
@@ -118,7 +118,7 @@ class Sweep(Facts):
     set: dict[Key, Value] = {}
     grid: dict[Key, Values] = {}
     sample: Sample | None = None
-    repeat: Annotated[int, Field(ge=1, le=MOST_RUNS)] = 1
+    repeat: Annotated[int, Field(ge=1, le=MAX_RUNS)] = 1
     figures: tuple[str, ...] = ()
     logs: bool = False
 
@@ -136,11 +136,8 @@ class Sweep(Facts):
                 raise ValueError(f"{below[0]} is part of {key}, which is varied as a whole")
         if self.repeat > 1 and "seed" in varied:
             raise ValueError("seed cannot be varied together with repeat, which increases the seed")
-        if self.runs > MOST_RUNS:
-            raise ValueError(
-                f"the sweep has {self.runs} runs, more than {MOST_RUNS}; give fewer values or use"
-                " a sample"
-            )
+        if self.runs > MAX_RUNS:
+            raise ValueError(f"the sweep has {self.runs} runs, more than {MAX_RUNS}; give fewer values or use a sample")
         return self
 
     @property
@@ -150,7 +147,7 @@ class Sweep(Facts):
         return math.prod(map(len, self.grid.values())) * count * self.repeat
 
     @property
-    def varied(self) -> tuple[str, ...]:
+    def varied_keys(self) -> tuple[str, ...]:
         """Keys that differ between runs, without the seed of repetitions."""
         return (*self.grid, *(self.sample.keys if self.sample else ()))
 
@@ -173,23 +170,23 @@ class SweepFile(NamedTuple):
         """Name of the sweep; by default the file name without its ending."""
         return self.sweep.name or self.path.stem
 
-    def place(self, *keys: str | int) -> str:
+    def format_location(self, *keys: str | int) -> str:
         """Return file, line and key path as text for messages."""
         found = (self.lines[keys[:k]] for k in range(len(keys), 0, -1) if keys[:k] in self.lines)
         line = next(found, None)
         return f"{self.path}{f':{line}' if line else ''}: {'.'.join(map(str, keys))}"
 
-    def places(self, key: str) -> Iterator[str]:
+    def locations_of(self, key: str) -> Iterator[str]:
         """Yield the places in this file that set a scenario key."""
         sample = self.sweep.sample
         if key in self.sweep.grid:
-            yield self.place("grid", key)
+            yield self.format_location("grid", key)
         if sample and key in sample.keys:
-            yield self.place("sample", "keys", key)
+            yield self.format_location("sample", "keys", key)
         if key in self.sweep.set:
-            yield self.place("set", key)
+            yield self.format_location("set", key)
 
-    def scenario(self) -> str:
+    def find_scenario(self) -> str:
         """Return the name of the shipped base scenario, or the path of its file.
 
         Raises:
@@ -202,7 +199,10 @@ class SweepFile(NamedTuple):
         if beside.is_file():
             return str(beside)
         message = f"{asked!r} is neither a shipped scenario nor a file in the same folder; "
-        raise InputError(self.place("scenario"), message + suggest(asked, shipped_scenarios()))
+        raise InputError(
+            self.format_location("scenario"),
+            message + suggest_valid_name(asked, shipped_scenarios()),
+        )
 
 
 def shipped_sweeps() -> list[str]:
@@ -223,13 +223,13 @@ def load_sweep(name_or_path: str | Path) -> SweepFile:
     if str(name_or_path) in shipped_sweeps():
         path = scenarios_folder() / "sweeps" / f"{name_or_path}.yaml"
     elif not path.is_file():
-        message = f"is neither a file nor a shipped sweep; {suggest(path.stem, shipped_sweeps())}"
+        message = f"is neither a file nor a shipped sweep; {suggest_valid_name(path.stem, shipped_sweeps())}"
         raise InputError(f"sweep {str(name_or_path)!r}", message)
     data, lines = read_yaml(path)
     if "pilot" in data:
         message = f"is a scenario; a sweep file refers to it by `scenario: {path.name}`"
         raise InputError(path, message)
-    return SweepFile(path, parse(Sweep, data, str(path), lines), lines)
+    return SweepFile(path, validate_data(Sweep, data, str(path), lines), lines)
 
 
 class Point(NamedTuple):
@@ -238,22 +238,22 @@ class Point(NamedTuple):
     Attributes:
         run: run number, starting at 1.
         values: varied key -> value.
-        copy: repetition number, starting at 0; it is added to the seed of the scenario.
+        repetition_number: repetition number, starting at 0; it is added to the seed of the scenario.
     """
 
     run: int
     values: dict[str, Any]
-    copy: int
+    repetition_number: int
 
 
-def points(sweep: Sweep) -> Iterator[Point]:
+def iterate_points(sweep: Sweep) -> Iterator[Point]:
     """Yield all points of a sweep: grid (last key fastest), then samples, then repetitions.
 
     >>> from hydrotele.run.sweep_facts import Sweep
-    >>> [p.values["servo.lead"] for p in points(Sweep(scenario="a", grid={"servo.lead": [0, 0.1]}))]
+    >>> [p.values["servo.lead"] for p in iterate_points(Sweep(scenario="a", grid={"servo.lead": [0, 0.1]}))]
     [0, 0.1]
     """
-    drawn = samples(sweep)
+    drawn = draw_samples(sweep)
     combinations = itertools.product(*sweep.grid.values())
     run = itertools.count(1)
     for values in combinations:
@@ -263,7 +263,7 @@ def points(sweep: Sweep) -> Iterator[Point]:
                 yield Point(next(run), here | sample, copy)
 
 
-def samples(sweep: Sweep) -> list[dict[str, Any]]:
+def draw_samples(sweep: Sweep) -> list[dict[str, Any]]:
     """Return the samples as varied key -> value; one empty sample if no key is sampled.
 
     Each number depends only on the seed, the sample number and the key. Adding samples or keys
@@ -273,12 +273,12 @@ def samples(sweep: Sweep) -> list[dict[str, Any]]:
     if sample is None:
         return [{}]
     return [
-        {key: _draw(sample.seed, k, key, where) for key, where in sample.keys.items()}
+        {key: _draw_value(sample.seed, k, key, where) for key, where in sample.keys.items()}
         for k in range(sample.count)
     ]
 
 
-def _draw(seed: int, k: int, key: str, where: Distribution) -> Any:
+def _draw_value(seed: int, k: int, key: str, where: Distribution) -> Any:
     chance = np.random.default_rng([seed, k, zlib.crc32(key.encode())])
     if where.choice is not None:
         return where.choice[int(chance.integers(len(where.choice)))]
@@ -296,7 +296,7 @@ def override_text(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-def overrides(sweep: Sweep, values: dict[str, Any]) -> dict[str, str]:
+def point_overrides(sweep: Sweep, values: dict[str, Any]) -> dict[str, str]:
     """Return the overrides of the base scenario: those of all runs, then those of one point."""
     return {key: override_text(value) for key, value in (sweep.set | values).items()}
 
@@ -305,21 +305,21 @@ Progress = Callable[[int, int], None]
 _Machines = dict[tuple[str, str | None], Machine]
 
 
-class Base(NamedTuple):
+class SweepBase(NamedTuple):
     """A sweep with its base scenario and user machines.
 
     Attributes:
         file: the sweep.
         scenario: file of the base scenario.
-        inputs: user machines.
+        machine_copies: user machines.
     """
 
     file: SweepFile
     scenario: ScenarioFile
-    inputs: Inputs
+    machine_copies: MachineCopies
 
 
-class Checked(NamedTuple):
+class CheckedSweep(NamedTuple):
     """Result of the check of all points.
 
     Attributes:
@@ -342,23 +342,25 @@ class Checked(NamedTuple):
         return hashlib.sha256(b"".join(self.fingerprints)).hexdigest()
 
 
-def open_base(file: SweepFile) -> Base:
+def open_base(file: SweepFile) -> SweepBase:
     """Read the base scenario of a sweep.
 
     Raises:
         InputError: the file is missing or is not a YAML mapping.
     """
-    return Base(file, read_scenario_file(file.scenario()), Inputs())
+    return SweepBase(file, read_scenario_file(file.find_scenario()), MachineCopies())
 
 
-def scenario_of(base: Base, point: Point) -> Scenario:
+def scenario_of(base: SweepBase, point: Point) -> Scenario:
     """Return the scenario of a point, with the paths of user machines in the sweep folder.
 
     Raises:
         InputError: the scenario is invalid.
     """
-    scenario = scenario_from(base.scenario, overrides(base.file.sweep, point.values))
-    return base.inputs.named(scenario.model_copy(update={"seed": scenario.seed + point.copy}))
+    scenario = make_scenario(base.scenario, point_overrides(base.file.sweep, point.values))
+    return base.machine_copies.with_copied_paths(
+        scenario.model_copy(update={"seed": scenario.seed + point.repetition_number})
+    )
 
 
 def fingerprint(scenario: Scenario) -> bytes:
@@ -366,7 +368,7 @@ def fingerprint(scenario: Scenario) -> bytes:
     return hashlib.sha256(scenario.model_dump_json().encode()).digest()[:16]
 
 
-def check_points(base: Base, progress: Progress | None = None) -> Checked:
+def check_points(base: SweepBase, progress: Progress | None = None) -> CheckedSweep:
     """Check the scenarios of all points of a sweep.
 
     Args:
@@ -382,73 +384,78 @@ def check_points(base: Base, progress: Progress | None = None) -> Checked:
     seed = 0
     units: dict[str, str] = {}
     teleoperated = False
-    for point in points(sweep):
+    for point in iterate_points(sweep):
         try:
-            if point.copy == 0:
-                scenario = _checked(base, point.values, machines)
+            if point.repetition_number == 0:
+                scenario = _check_values_of_point(base, point.values, machines)
                 teleoperated |= scenario.pilot.kind == "teleop"
-                units |= _effect_units(scenario, sweep.varied, machines)
+                units |= _effect_units(scenario, sweep.varied_keys, machines)
             whole = scenario_of(base, point)
         except InputError as error:
-            raise _blamed(base, point, machines, error) from None
+            raise _locate_error(base, point, machines, error) from None
         seed = seed if prints else whole.seed
         prints.append(fingerprint(whole))
         if progress and point.run % 100 == 0:
             progress(point.run, sweep.runs)
     axes = dict.fromkeys(axis for machine in machines.values() for axis in machine.axes)
-    return Checked(tuple(prints), seed, units, tuple(axes), teleoperated)
+    return CheckedSweep(tuple(prints), seed, units, tuple(axes), teleoperated)
 
 
-def _checked(base: Base, values: dict[str, Any], machines: _Machines) -> Scenario:
+def _check_values_of_point(base: SweepBase, values: dict[str, Any], machines: _Machines) -> Scenario:
     """Return the scenario for some values after checking its machine, effects and sensors."""
-    scenario = scenario_from(base.scenario, overrides(base.file.sweep, values))
+    scenario = make_scenario(base.scenario, point_overrides(base.file.sweep, values))
     machine = _machine_of(scenario, machines)
-    sensor_set(machine, scenario.sensors)
+    get_sensors(machine, scenario.sensors)
     for planted in scenario.effects:
         machine = apply_effect(machine, planted.name, planted.location, planted.parameters)
     return scenario
 
 
 def _machine_of(scenario: Scenario, machines: _Machines) -> Machine:
-    key = (str(own_machine(scenario) or scenario.machine), scenario.tool)
+    key = (str(find_local_machine(scenario) or scenario.machine), scenario.tool)
     if key not in machines:
         machines[key] = load_machine(*key)
     return machines[key]
 
 
-def _blamed(base: Base, point: Point, machines: _Machines, error: InputError) -> InputError:
+def _locate_error(base: SweepBase, point: Point, machines: _Machines, error: InputError) -> InputError:
     """Return the error of a point with the place in the sweep file that causes it."""
     file = base.file
     for values in ({}, *({key: value} for key, value in point.values.items())):
         try:
-            _checked(base, values, machines)
+            _check_values_of_point(base, values, machines)
         except InputError as alone:
-            if _said(alone) != _said(error):
+            if _message_without_options(alone) != _message_without_options(error):
                 continue
             if not values:
-                return InputError(file.place("set"), _said(error)) if file.sweep.set else error
+                return (
+                    InputError(file.format_location("set"), _message_without_options(error))
+                    if file.sweep.set
+                    else error
+                )
             ((key, value),) = values.items()
-            return InputError(_place(file, key, value), f"{override_text(value)}: {_said(error)}")
+            return InputError(
+                _value_location(file, key, value),
+                f"{override_text(value)}: {_message_without_options(error)}",
+            )
     said = ", ".join(f"{key} {override_text(value)}" for key, value in point.values.items())
-    return InputError(file.path, f"run {point.run} ({said}): {_said(error)}")
+    return InputError(file.path, f"run {point.run} ({said}): {_message_without_options(error)}")
 
 
-def _place(file: SweepFile, key: str, value: Any) -> str:
+def _value_location(file: SweepFile, key: str, value: Any) -> str:
     if key in file.sweep.grid:
         line = file.lines.get(("grid", key, file.sweep.grid[key].index(value)))
-        return f"{file.path}:{line}: grid.{key}" if line else file.place("grid", key)
-    return file.place("sample", "keys", key)
+        return f"{file.path}:{line}: grid.{key}" if line else file.format_location("grid", key)
+    return file.format_location("sample", "keys", key)
 
 
-def _said(error: InputError) -> str:
+def _message_without_options(error: InputError) -> str:
     """Return the error message without the override options that the sweep generated."""
     ours = error.where.startswith("--set ") or " with --set " in error.where
     return error.message if ours else str(error)
 
 
-def _effect_units(
-    scenario: Scenario, varied: tuple[str, ...], machines: _Machines
-) -> dict[str, str]:
+def _effect_units(scenario: Scenario, varied: tuple[str, ...], machines: _Machines) -> dict[str, str]:
     """Return the units of the varied effect parameters."""
     units = {}
     for key in varied:

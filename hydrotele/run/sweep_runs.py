@@ -19,14 +19,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hydrotele.core.datafile import read_yaml, suggest
+from hydrotele.core.datafile import read_yaml, suggest_valid_name
 from hydrotele.core.errors import InputError
-from hydrotele.core.files import json_value
-from hydrotele.core.output import replacing
+from hydrotele.core.files import parse_json
+from hydrotele.core.output import atomic_file
 from hydrotele.core.units import KEY_SUFFIXES
 from hydrotele.machine.machine_file import machine_path, shipped_machines
 from hydrotele.run.run import Run, run_scenario
-from hydrotele.scenario.scenario import Scenario, own_machine
+from hydrotele.scenario.scenario import Scenario, find_local_machine
 from hydrotele.simulate.native import stop_profiling_clock
 from hydrotele.simulate.record import SimulationFailed
 
@@ -34,60 +34,60 @@ Number = float | int | bool | None
 Numbers = dict[str, tuple[Number, str]]
 
 TIMINGS = ("wall_seconds", "realtime_factor")  # differ between runs of equal content
-_LEFT_OUT = (*TIMINGS, "kind", "seed", "versions", "git_commit")
-_ENDINGS = {"mm": "mm", "N": "N", "J": "J", "m": "m", "rad": "rad", "A": "A", "seconds": "s"}
-_SCENARIO = {
+_IGNORED_KEYS = (*TIMINGS, "kind", "seed", "versions", "git_commit")
+_UNIT_OF_SUFFIX = {"mm": "mm", "N": "N", "J": "J", "m": "m", "rad": "rad", "A": "A", "seconds": "s"}
+_UNIT_OF_SCENARIO_KEY = {
     "duration": "s", "timestep": "s", "control_rate": "Hz", "log_rate": "Hz",
     "servo.position_gain": "1/s", "servo.lead": "s", "servo.load_time": "s",
     "servo.pressure_feedback": "1/s", "pilot.acceleration": "m/s2", "pilot.settle": "s",
     "pilot.channel.delay_forward": "s", "pilot.channel.delay_back": "s",
 }  # fmt: skip
 
-_EVERY = (
+_COMMON_NUMBERS = (
     "simulated_seconds", "physics_steps", "largest_pin_opening_mm", "largest_contact_force_N",
     "balance.seconds", "balance.flow_balance", "balance.energy_balance",
 )  # fmt: skip
-_STATION = (
+_STATION_NUMBERS = (
     "handle_energy_J", "handle_least_energy_J", "largest_handle_displacement_m",
     "largest_handle_rotation_rad", "largest_coil_current_A", "largest_coil_heat",
     "periods_with_limited_currents", "largest_tip_force_N", "tripped",
 )  # fmt: skip
-_TIP = ("tip_r", "tip_z", "tip_attitude")
+_TIP_COORDINATES = ("tip_r", "tip_z", "tip_attitude")
 
 
-def numbers_of(summary: dict[str, Any]) -> Numbers:
+def flatten_summary(summary: dict[str, Any]) -> Numbers:
     """Flatten the summary of a run to dotted name -> (number, unit), without timings and versions.
 
-    >>> numbers_of({"scenario": "a", "tracking": {"boom": {"rms": 0.1, "unit": "rad"}}})
+    >>> flatten_summary({"scenario": "a", "tracking": {"boom": {"rms": 0.1, "unit": "rad"}}})
     {'tracking.boom.rms': (0.1, 'rad')}
     """
-    kept = {key: value for key, value in summary.items() if key not in _LEFT_OUT}
-    return dict(_flat(kept, "", None))
+    kept = {key: value for key, value in summary.items() if key not in _IGNORED_KEYS}
+    return dict(_flatten(kept, "", None))
 
 
-def _flat(part: dict[str, Any], above: str, unit: str | None):
+def _flatten(part: dict[str, Any], above: str, unit: str | None):
     unit = part.get("unit", unit)
     for key, value in part.items():
         name = f"{above}{key}"
         value = value.item() if isinstance(value, np.generic) else value  # JSON needs plain types
         if isinstance(value, dict):
-            yield from _flat(value, f"{name}.", unit)
+            yield from _flatten(value, f"{name}.", unit)
         elif value is None or isinstance(value, (bool, int, float)):
             finite = value if value is None or math.isfinite(value) else None
-            yield name, (finite, unit or _ENDINGS.get(key.rpartition("_")[2], "1"))
+            yield name, (finite, unit or _UNIT_OF_SUFFIX.get(key.rpartition("_")[2], "1"))
 
 
 def key_unit(key: str) -> str | None:
     """Return the unit of a scenario key, derived from its name; None if unknown."""
     found = (unit for suffix, unit in KEY_SUFFIXES.items() if key.endswith(suffix))
-    return next(found, None) or _SCENARIO.get(key)
+    return next(found, None) or _UNIT_OF_SCENARIO_KEY.get(key)
 
 
-def possible_results(axes: Iterable[str], teleoperated: bool) -> list[str]:
+def possible_number_names(axes: Iterable[str], teleoperated: bool) -> list[str]:
     """Return the names of all summary numbers that runs with these axes can contain."""
-    tracked = [f"tracking.{name}.{size}" for name in (*axes, *_TIP) for size in ("rms", "max")]
-    station = [f"teleoperation.{name}" for name in _STATION] if teleoperated else []
-    return [*_EVERY, *tracked, *station]
+    tracked = [f"tracking.{name}.{size}" for name in (*axes, *_TIP_COORDINATES) for size in ("rms", "max")]
+    station = [f"teleoperation.{name}" for name in _STATION_NUMBERS] if teleoperated else []
+    return [*_COMMON_NUMBERS, *tracked, *station]
 
 
 def check_figures(figures: Iterable[str], possible: list[str], where: str) -> None:
@@ -99,14 +99,14 @@ def check_figures(figures: Iterable[str], possible: list[str], where: str) -> No
     for name in figures:
         if name not in possible:
             message = f"{name!r} is not a number in the summary of a run"
-            raise InputError(where, f"{message}; {suggest(name, possible)}")
+            raise InputError(where, f"{message}; {suggest_valid_name(name, possible)}")
 
 
 OK, FAILED = "ok", "failed"
 JOURNAL = "journal.jsonl"
 
 
-class Entry(NamedTuple):
+class JournalEntry(NamedTuple):
     """Journal entry of a finished run.
 
     Attributes:
@@ -126,7 +126,7 @@ class Entry(NamedTuple):
     wall_seconds: float | None = None
 
 
-def finished(path: Path) -> int:
+def count_finished_runs(path: Path) -> int:
     """Return the number of finished runs in a journal file."""
     lines = path.read_bytes().split(b"\n")[:-1] if path.is_file() else []
     return len({line.partition(b",")[0] for line in lines})
@@ -145,24 +145,24 @@ class Journal:
         try:
             content = path.read_bytes() if path.exists() else b""
             lines = content.split(b"\n")
-            good = [line for line in lines[:-1] if self._take(line)]
+            good = [line for line in lines[:-1] if self._parse_line(line)]
             if b"".join(line + b"\n" for line in good) != content:
-                with replacing(path, ".jsonl") as part:
+                with atomic_file(path, ".jsonl") as part:
                     part.write_bytes(b"".join(line + b"\n" for line in good))
             self._file = open(path, "ab")
         except OSError as error:
             raise InputError(path, f"cannot be used: {error.strerror}") from None
 
-    def _take(self, line: bytes) -> bool:
+    def _parse_line(self, line: bytes) -> bool:
         try:
-            entry = Entry(**json_value(line))
+            entry = JournalEntry(**parse_json(line))
             numbers = {name: (value, unit) for name, (value, unit) in entry.numbers.items()}
         except (ValueError, TypeError, AttributeError):
             return False
         self.entries[entry.run] = entry._replace(numbers=numbers)
         return True
 
-    def add(self, entry: Entry) -> None:
+    def add(self, entry: JournalEntry) -> None:
         """Append the entry of a run and flush it to disk.
 
         Raises:
@@ -186,7 +186,7 @@ INPUTS = "inputs"
 Files = dict[str, bytes]
 
 
-class Copied(NamedTuple):
+class CopiedMachine(NamedTuple):
     """A user machine, copied into the folder of a sweep.
 
     Attributes:
@@ -199,33 +199,31 @@ class Copied(NamedTuple):
     files: Files
 
 
-class Inputs:
+class MachineCopies:
     """The user machines of a sweep, each read once."""
 
     def __init__(self) -> None:
         """Start without machines."""
-        self._known: dict[Path, Copied] = {}
+        self._known: dict[Path, CopiedMachine] = {}
 
-    def named(self, scenario: Scenario) -> Scenario:
+    def with_copied_paths(self, scenario: Scenario) -> Scenario:
         """Return the scenario with user machines replaced by their paths in the sweep folder.
 
         Raises:
             InputError: a machine file cannot be read.
         """
         changes: dict = {"folder": ""}
-        if own := own_machine(scenario):
-            changes["machine"] = self._copied(own).name
+        if own := find_local_machine(scenario):
+            changes["machine"] = self._copied_machine(own).name
         model = scenario.servo.force_model
         if model and model != "nominal" and model not in shipped_machines():
-            name = self._copied(Path(model)).name
+            name = self._copied_machine(Path(model)).name
             changes["servo"] = scenario.servo.model_copy(update={"force_model": name})
         return scenario.model_copy(update=changes)
 
     def files(self) -> Files:
         """Return path in the sweep folder -> content, for all machines so far."""
-        return {
-            name: text for copied in self._known.values() for name, text in copied.files.items()
-        }
+        return {name: text for copied in self._known.values() for name, text in copied.files.items()}
 
     def files_of(self, scenario: Scenario) -> Files:
         """Return path -> content of the machines of one scenario, a result of `named`."""
@@ -233,7 +231,7 @@ class Inputs:
         copied = [machine for machine in self._known.values() if machine.name in names]
         return {name: text for machine in copied for name, text in machine.files.items()}
 
-    def refuse_bound(self, where: str) -> None:
+    def check_sendable(self, where: str) -> None:
         """Check that all machines can be sent to other computers.
 
         Raises:
@@ -241,37 +239,33 @@ class Inputs:
         """
         for path, copied in self._known.items():
             if not copied.files:
-                message = (
-                    "needs files in addition to its MJCF, which cannot be sent; run without --dask"
-                )
+                message = "needs files in addition to its MJCF, which cannot be sent; run without --dask"
                 raise InputError(where, f"machine {path} {message}")
 
-    def _copied(self, path: Path) -> Copied:
+    def _copied_machine(self, path: Path) -> CopiedMachine:
         file = machine_path(path).resolve()
         if file not in self._known:
-            self._known[file] = _copy(file)
+            self._known[file] = _copy_machine(file)
         return self._known[file]
 
 
-def _copy(file: Path) -> Copied:
+def _copy_machine(file: Path) -> CopiedMachine:
     contents = {file.name: file.read_bytes()}
     mjcf = str(read_yaml(file)[0].get("mjcf") or "")
     if mjcf and (file.parent / mjcf).is_file():  # a resolved machine may name a shipped one
         text = (file.parent / mjcf).read_bytes()
         inside = not PurePosixPath(mjcf).is_absolute() and ".." not in PurePosixPath(mjcf).parts
         if not inside or b" file=" in text:
-            return Copied(str(file), {})
+            return CopiedMachine(str(file), {})
         contents[mjcf] = text
     digest = hashlib.sha256(b"\0".join(part for pair in sorted(contents.items())
                                        for part in (pair[0].encode(), pair[1])))  # fmt: skip
     folder = f"{INPUTS}/{file.parent.name}-{digest.hexdigest()[:12]}"
-    return Copied(
-        f"{folder}/{file.name}", {f"{folder}/{name}": text for name, text in contents.items()}
-    )
+    return CopiedMachine(f"{folder}/{file.name}", {f"{folder}/{name}": text for name, text in contents.items()})
 
 
-def placed(scenario: Scenario, folder: Path) -> Scenario:
-    """Resolve the machine paths of a scenario of `Inputs.named` relative to a folder."""
+def with_resolved_paths(scenario: Scenario, folder: Path) -> Scenario:
+    """Resolve the machine paths of a scenario of `MachineCopies.named` relative to a folder."""
     changes: dict = {"folder": str(folder)}
     model = scenario.servo.force_model
     if model and model.startswith(f"{INPUTS}/"):
@@ -280,7 +274,7 @@ def placed(scenario: Scenario, folder: Path) -> Scenario:
     return scenario.model_copy(update=changes)
 
 
-def unpack(files: Files, folder: Path) -> None:
+def write_files(files: Files, folder: Path) -> None:
     """Write files under a folder."""
     for name, text in files.items():
         path = folder / name
@@ -288,8 +282,8 @@ def unpack(files: Files, folder: Path) -> None:
         path.write_bytes(text)
 
 
-Keep = Callable[[Run, Path, bool], Any]
-_ONE = threading.Lock()  # cluster workers may use threads, but MuJoCo callbacks are global
+WriteRun = Callable[[Run, Path, bool], Any]
+_RUN_LOCK = threading.Lock()  # cluster workers may use threads, but MuJoCo callbacks are global
 
 
 class RunTask(NamedTuple):
@@ -297,10 +291,10 @@ class RunTask(NamedTuple):
 
     Attributes:
         run: run number.
-        scenario: scenario with machine paths of `Inputs.named`.
+        scenario: scenario with machine paths of `MachineCopies.named`.
         folder: folder that contains the user machines, None if `files` contains them.
         files: path -> content of the user machines.
-        keep: function that writes a run into a folder, as `cli.running.write_run`; None to keep no
+        write_run_files: function that writes a run into a folder, as `cli.running.write_run`; None to keep no
             logs.
         scratch: folder for temporary files; None for that of the system.
     """
@@ -309,7 +303,7 @@ class RunTask(NamedTuple):
     scenario: Scenario
     folder: str | None
     files: Files
-    keep: Keep | None
+    write_run_files: WriteRun | None
     scratch: str | None
 
 
@@ -322,42 +316,47 @@ class Outcome(NamedTuple):
         files: file name -> content of the run folder; empty if no logs are kept.
     """
 
-    entry: Entry
+    entry: JournalEntry
     versions: dict[str, str]
     files: Files
 
 
-def perform(task: RunTask) -> Outcome:
+def execute_task(task: RunTask) -> Outcome:
     """Execute a run; a failure gives an outcome with its reason instead of an exception."""
     try:
-        with _ONE, tempfile.TemporaryDirectory(prefix="sweep_", dir=task.scratch) as scratch:
-            return _perform(task, Path(scratch))
+        with _RUN_LOCK, tempfile.TemporaryDirectory(prefix="sweep_", dir=task.scratch) as scratch:
+            return _execute_task(task, Path(scratch))
     except SimulationFailed as error:
-        return failed(task.run, f"simulation failed: {error}")
+        return failed_outcome(task.run, f"simulation failed: {error}")
     except InputError as error:
-        return failed(task.run, str(error))
+        return failed_outcome(task.run, str(error))
     except Exception as error:  # a failed run must not stop the other runs
-        return failed(task.run, f"{type(error).__name__}: {error}")
+        return failed_outcome(task.run, f"{type(error).__name__}: {error}")
 
 
-def failed(run: int, reason: str) -> Outcome:
+def failed_outcome(run: int, reason: str) -> Outcome:
     """Return the outcome of a failed run, with the first line of the reason."""
-    return Outcome(Entry(run, FAILED, reason.strip().partition("\n")[0]), {}, {})
+    return Outcome(JournalEntry(run, FAILED, reason.strip().partition("\n")[0]), {}, {})
 
 
-def _perform(task: RunTask, scratch: Path) -> Outcome:
+def _execute_task(task: RunTask, scratch: Path) -> Outcome:
     stop_profiling_clock()
-    unpack(task.files, scratch)
+    write_files(task.files, scratch)
     there = Path(task.folder) if task.folder else scratch
-    result = run_scenario(placed(task.scenario, there))
+    result = run_scenario(with_resolved_paths(task.scenario, there))
     summary = result.summary
-    entry = Entry(
-        task.run, OK, "", numbers_of(summary), "; ".join(summary["notes"]), summary["wall_seconds"]
+    entry = JournalEntry(
+        task.run,
+        OK,
+        "",
+        flatten_summary(summary),
+        "; ".join(summary["notes"]),
+        summary["wall_seconds"],
     )
     files: Files = {}
-    if task.keep:
+    if task.write_run_files:
         folder = scratch / "run"
         folder.mkdir()
-        task.keep(result, folder, False)
+        task.write_run_files(result, folder, False)
         files = {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
     return Outcome(entry, summary["versions"], files)

@@ -13,24 +13,24 @@ import yaml
 from pydantic import Field, model_validator
 
 from hydrotele.core.datafile import (
-    Facts,
     Name,
-    NonNegative,
-    Positive,
+    NonNegativeFloat,
+    PositiveFloat,
+    StrictModel,
     Vector,
-    parse,
-    read_value,
+    parse_yaml_value,
     read_yaml,
-    suggest,
+    suggest_valid_name,
+    validate_data,
 )
 from hydrotele.core.errors import InputError
-from hydrotele.core.files import beyond, scenarios_folder
+from hydrotele.core.files import describe_excess, scenarios_folder
 from hydrotele.logs.log import load_log
 from hydrotele.machine.signals import parse_channel
 from hydrotele.scenario.teleoperation import TeleopPilot
 
 
-class Plate(Facts):
+class Plate(StrictModel):
     """A plate on a spring and a damper: an environment of known stiffness.
 
     `position` [m] is the centre of its face and `normal` the outward normal of the face (z is up,
@@ -41,13 +41,13 @@ class Plate(Facts):
     kind: Literal["plate"] = "plate"
     position: Vector
     normal: Literal["x", "-x", "y", "-y", "z"] = "z"
-    size: tuple[Positive, Positive] = (1.0, 1.0)
-    mass: Positive = 300.0
-    stiffness: Positive = 1.0e6
-    damping: NonNegative = 3.0e4
+    size: tuple[PositiveFloat, PositiveFloat] = (1.0, 1.0)
+    mass: PositiveFloat = 300.0
+    stiffness: PositiveFloat = 1.0e6
+    damping: NonNegativeFloat = 3.0e4
 
 
-class StandingTree(Facts):
+class StandingTree(StrictModel):
     """A standing tree that a disc saw cuts from its stump and a grab arm then holds.
 
     `position` [m] is on the ground, `kerf` [m] the height of the cut, and `energy` [J/m^3] the
@@ -57,17 +57,17 @@ class StandingTree(Facts):
 
     kind: Literal["tree"] = "tree"
     position: tuple[float, float]
-    diameter: Positive = 0.34
-    height: Positive = 9.0
-    density: Positive = 750.0
-    kerf: Positive = 0.30
-    energy: Positive = 2.0e7
+    diameter: PositiveFloat = 0.34
+    height: PositiveFloat = 9.0
+    density: PositiveFloat = 750.0
+    kerf: PositiveFloat = 0.30
+    energy: PositiveFloat = 2.0e7
     saw: Name = "saw"
     grab: Name = "grab"
     closed: float = 1.0
 
 
-class LogOnGround(Facts):
+class LogOnGround(StrictModel):
     """A log on the ground that a grapple picks up and puts down.
 
     `position` [m] is its centre, and `direction` [rad] the angle of its axis in the horizontal
@@ -79,9 +79,9 @@ class LogOnGround(Facts):
     kind: Literal["log"] = "log"
     position: tuple[float, float]
     direction: float = 0.0
-    diameter: Positive = 0.35
-    length: Positive = 4.0
-    density: Positive = 830.0
+    diameter: PositiveFloat = 0.35
+    length: PositiveFloat = 4.0
+    density: PositiveFloat = 830.0
     grab: Name = "claw"
     closed: float = 1.2
     open: float = 1.0
@@ -91,9 +91,7 @@ class LogOnGround(Facts):
         if self.open > self.closed:
             raise ValueError(f"open {self.open:g} rad must not exceed closed {self.closed:g} rad")
         if self.length < 2.0 * self.diameter:
-            raise ValueError(
-                f"length {self.length:g} m must be at least twice the diameter {self.diameter:g} m"
-            )
+            raise ValueError(f"length {self.length:g} m must be at least twice the diameter {self.diameter:g} m")
         return self
 
     @property
@@ -105,31 +103,31 @@ class LogOnGround(Facts):
 SurroundingObject = Annotated[Plate | StandingTree | LogOnGround, Field(discriminator="kind")]
 
 
-class Pose(Facts):
+class Pose(StrictModel):
     """Pose of the tip: r from the swing axis, z above ground [m], theta, attitude, head [rad]."""
 
-    r: Positive
+    r: PositiveFloat
     z: float
     theta: float = 0.0
     attitude: float | None = None
     head: float | None = None
 
 
-class Start(Facts):
+class StartState(StrictModel):
     """Start of a run: joint positions [rad] or [m], or a tip pose; the home position by default."""
 
     joints: dict[Name, float] = {}
     pose: Pose | None = None
 
 
-class ConstantPilot(Facts):
+class ConstantPilot(StrictModel):
     """Constant drive commands, open loop."""
 
     kind: Literal["constant"]
     commands: dict[Name, float] = {}
 
 
-class TablePilot(Facts):
+class TablePilot(StrictModel):
     """Commands or references from a table over time, given as columns or in a log file.
 
     `of: command` drives the valves open loop, `of: joint` gives joint references [rad] or [m].
@@ -139,7 +137,7 @@ class TablePilot(Facts):
 
     kind: Literal["table"]
     of: Literal["command", "joint"] = "command"
-    time: list[NonNegative] = []
+    time: list[NonNegativeFloat] = []
     columns: dict[Name, list[float]] = {}
     file: str | None = None
     interpolate: Literal["hold", "linear"] = "hold"
@@ -150,24 +148,22 @@ class TablePilot(Facts):
             raise ValueError("give either columns (with time) or file")
         for name, values in self.columns.items():
             if len(values) != len(self.time):
-                raise ValueError(
-                    f"columns.{name} has {len(values)} values, time has {len(self.time)}"
-                )
-        if self.columns and (not self.time or self.time[0] != 0.0 or any(_falls(self.time))):
+                raise ValueError(f"columns.{name} has {len(values)} values, time has {len(self.time)}")
+        if self.columns and (not self.time or self.time[0] != 0.0 or any(_find_nonrising_steps(self.time))):
             raise ValueError("time must start at 0 and rise strictly")
         return self
 
 
-def _falls(values) -> list[bool]:
+def _find_nonrising_steps(values) -> list[bool]:
     return [b <= a for a, b in zip(values, values[1:], strict=False)]
 
 
-def _refuse_beyond(name: str, amount: float) -> None:
-    if said := beyond(name, amount):
+def _check_capacity(name: str, amount: float) -> None:
+    if said := describe_excess(name, amount):
         raise ValueError(f"has {said}")
 
 
-class Harmonics(Facts):
+class FourierSeries(StrictModel):
     """Fourier reference of one joint: mean + sum_k sin_k sin(k w t) + cos_k cos(k w t)."""
 
     mean: float = 0.0
@@ -175,7 +171,7 @@ class Harmonics(Facts):
     cos: list[float] = []
 
 
-class FourierPilot(Facts):
+class FourierPilot(StrictModel):
     """Fourier references with a common period [s], faded in from the start over `fade` [s].
 
     The servo holds axes without a reference at their start, except those in `closed_valves`, whose
@@ -183,23 +179,21 @@ class FourierPilot(Facts):
     """
 
     kind: Literal["fourier"]
-    period: Positive
-    fade: NonNegative = 2.0
-    axes: dict[Name, Harmonics]
+    period: PositiveFloat
+    fade: NonNegativeFloat = 2.0
+    axes: dict[Name, FourierSeries]
     closed_valves: tuple[Name, ...] = ()
 
     @model_validator(mode="after")
     def _check(self):
         if both := sorted(set(self.closed_valves) & self.axes.keys()):
-            raise ValueError(
-                f"closed_valves: {both[0]} also has a reference in axes; name it in one of them"
-            )
+            raise ValueError(f"closed_valves: {both[0]} also has a reference in axes; name it in one of them")
         counts = [max(len(axis.sin), len(axis.cos)) for axis in self.axes.values()]
-        _refuse_beyond("HARMONICS", max(counts, default=0))
+        _check_capacity("HARMONICS", max(counts, default=0))
         return self
 
 
-class Move(Facts):
+class TipMove(StrictModel):
     """A straight move of the tip: signed distances of r, z [m], theta, attitude, head [rad]."""
 
     r: float = 0.0
@@ -208,10 +202,10 @@ class Move(Facts):
     attitude: float = 0.0
     head: float = 0.0
     speed: Annotated[float, Field(ge=1e-4, le=100)] = 0.5
-    pause: NonNegative = 0.5
+    pause: NonNegativeFloat = 0.5
 
 
-class LinesPilot(Facts):
+class LinesPilot(StrictModel):
     """Straight tip lines by resolved motion in cylindrical coordinates.
 
     `mode: rate` integrates rate commands like those of a joystick under rate control; `position`
@@ -221,35 +215,35 @@ class LinesPilot(Facts):
 
     kind: Literal["lines"]
     mode: Literal["rate", "position"] = "rate"
-    settle: NonNegative = 1.0
+    settle: NonNegativeFloat = 1.0
     acceleration: Annotated[float, Field(ge=1e-3, le=1000)] = 1.0
-    moves: Annotated[list[Move], Field(min_length=1)]
+    moves: Annotated[list[TipMove], Field(min_length=1)]
 
     @model_validator(mode="after")
     def _check(self):
-        _refuse_beyond("MOVES", len(self.moves))
+        _check_capacity("MOVES", len(self.moves))
         return self
 
 
-class Waypoint(Facts):
+class Waypoint(StrictModel):
     """Joint target or pose, reached `duration` [s] after the previous one and held for `pause`."""
 
-    duration: Positive
-    pause: NonNegative = 0.0
+    duration: PositiveFloat
+    pause: NonNegativeFloat = 0.0
     joints: dict[Name, float] = {}
     pose: Pose | None = None
 
 
-class WaypointsPilot(Facts):
+class WaypointsPilot(StrictModel):
     """Waypoints connected by quintic polynomials, in joint space or along the tip pose."""
 
     kind: Literal["waypoints"]
-    settle: NonNegative = 0.5
+    settle: NonNegativeFloat = 0.5
     points: Annotated[list[Waypoint], Field(min_length=1)]
 
     @model_validator(mode="after")
     def _check(self):
-        _refuse_beyond("MOVES", len(self.points))
+        _check_capacity("MOVES", len(self.points))
         return self
 
 
@@ -259,7 +253,7 @@ Pilot = Annotated[
 ]
 
 
-class Servo(Facts):
+class Servo(StrictModel):
     """Gains of the joint servo.
 
     `position_gain` [1/s]; `axis_gains` [1/s] for individual axes (such as a slewing house);
@@ -271,18 +265,18 @@ class Servo(Facts):
     or folder).
     """
 
-    position_gain: NonNegative = 4.0
-    axis_gains: dict[Name, NonNegative] = {}
-    velocity_gain: NonNegative = 0.0
+    position_gain: NonNegativeFloat = 4.0
+    axis_gains: dict[Name, NonNegativeFloat] = {}
+    velocity_gain: NonNegativeFloat = 0.0
     feedforward: Annotated[float, Field(ge=0, le=1.5)] = 1.0
     lead: Annotated[float, Field(ge=0, le=0.3)] = 0.05
     deadband_compensation: Annotated[float, Field(ge=0, le=1)] = 1.0
-    load_time: Positive = 0.2
-    pressure_feedback: NonNegative = 6.0
+    load_time: PositiveFloat = 0.2
+    pressure_feedback: NonNegativeFloat = 6.0
     force_model: str | None = None
 
 
-class PlantedEffect(Facts):
+class PlantedEffect(StrictModel):
     """An effect of the simulated machine that its nominal model does not have.
 
     `hydrotele list effects` lists the names.
@@ -293,7 +287,7 @@ class PlantedEffect(Facts):
     parameters: dict[str, float] = {}
 
 
-class Scenario(Facts):
+class Scenario(StrictModel):
     """Complete specification of one run; the same scenario gives bit-identical results."""
 
     name: Name
@@ -303,12 +297,12 @@ class Scenario(Facts):
     seed: Annotated[int, Field(ge=0)] = 0
     duration: Annotated[float, Field(gt=0, le=36000)]
     timestep: Annotated[float, Field(ge=1e-5, le=5e-3)] = 1.0e-3
-    control_rate: Positive = 200.0
-    log_rate: Positive = 50.0
+    control_rate: PositiveFloat = 200.0
+    log_rate: PositiveFloat = 50.0
     sensors: str = "ideal"
     ground: bool = True
     surroundings: tuple[SurroundingObject, ...] = ()
-    start: Start = Start()
+    start: StartState = StartState()
     pilot: Pilot
     servo: Servo = Servo()
     effects: tuple[PlantedEffect, ...] = ()
@@ -324,28 +318,26 @@ class Scenario(Facts):
             )
         ticks = self.control_rate / self.log_rate
         if ticks < 0.999 or abs(ticks - round(ticks)) > 1e-6:
-            raise ValueError(
-                f"log_rate {self.log_rate:g} Hz must divide control_rate {self.control_rate:g} Hz"
-            )
-        _refuse_beyond("RUN_TICKS", self.duration * self.control_rate)
-        _refuse_beyond("RUN_ROWS", self.duration * self.log_rate)
+            raise ValueError(f"log_rate {self.log_rate:g} Hz must divide control_rate {self.control_rate:g} Hz")
+        _check_capacity("RUN_TICKS", self.duration * self.control_rate)
+        _check_capacity("RUN_ROWS", self.duration * self.log_rate)
         if not self.ground and any(thing.kind == "log" for thing in self.surroundings):
             raise ValueError("a log needs ground to lie on: set ground: true or remove the log")
         if self.duration * self.control_rate > 2e7:
             raise ValueError("duration is too long: more than 2e7 control periods")
-        if self.rows < 10:
+        if self.row_count < 10:
             raise ValueError("duration is too short: a log needs at least 10 rows")
         return self
 
     @property
-    def ticks(self) -> int:
+    def tick_count(self) -> int:
         """Number of control periods of the run."""
         return round(self.duration * self.control_rate)
 
     @property
-    def rows(self) -> int:
+    def row_count(self) -> int:
         """Number of log rows of the run."""
-        return self.ticks // round(self.control_rate / self.log_rate)
+        return self.tick_count // round(self.control_rate / self.log_rate)
 
 
 def shipped_scenarios() -> list[str]:
@@ -353,7 +345,7 @@ def shipped_scenarios() -> list[str]:
     return sorted(path.stem for path in scenarios_folder().glob("*.yaml"))
 
 
-def scenario_path(name_or_path: str | Path) -> Path:
+def find_scenario(name_or_path: str | Path) -> Path:
     """Return the file of a shipped scenario, given by name, or of the user's scenario file.
 
     Raises:
@@ -366,7 +358,7 @@ def scenario_path(name_or_path: str | Path) -> Path:
         return path
     raise InputError(
         f"scenario {str(name_or_path)!r}",
-        f"is neither a file nor a shipped scenario; {suggest(path.stem, shipped_scenarios())}",
+        f"is neither a file nor a shipped scenario; {suggest_valid_name(path.stem, shipped_scenarios())}",
     )
 
 
@@ -385,12 +377,12 @@ class ScenarioFile(NamedTuple):
 
 
 def read_scenario_file(name_or_path: str | Path) -> ScenarioFile:
-    """Read a scenario file, from which `scenario_from` can make several scenarios.
+    """Read a scenario file, from which `make_scenario` can make several scenarios.
 
     Raises:
         InputError: the scenario does not exist, or the file is not a YAML mapping.
     """
-    path = scenario_path(name_or_path)
+    path = find_scenario(name_or_path)
     return ScenarioFile(path, *read_yaml(path))
 
 
@@ -407,10 +399,10 @@ def load_scenario(name_or_path: str | Path, overrides: dict[str, str] | None = N
     Raises:
         InputError: the file is not valid; the message names file, line, key path and valid values.
     """
-    return scenario_from(read_scenario_file(name_or_path), overrides)
+    return make_scenario(read_scenario_file(name_or_path), overrides)
 
 
-def scenario_from(file: ScenarioFile, overrides: dict[str, str] | None = None) -> Scenario:
+def make_scenario(file: ScenarioFile, overrides: dict[str, str] | None = None) -> Scenario:
     """Make a scenario from the content of its file, with overrides as in `load_scenario`.
 
     Raises:
@@ -418,26 +410,24 @@ def scenario_from(file: ScenarioFile, overrides: dict[str, str] | None = None) -
     """
     path, data, lines = file.path, copy.deepcopy(file.data), file.lines
     for key, text in (overrides or {}).items():
-        _override(data, key, text)
+        _apply_override(data, key, text)
     if "folder" in data:
-        raise InputError(_at(path, lines, "folder"), "is set automatically; remove the key")
+        raise InputError(_locate_key(path, lines, "folder"), "is set automatically; remove the key")
     data["folder"] = str(path.parent.resolve())
     kind = data["pilot"].get("kind") if isinstance(data.get("pilot"), dict) else None
     if isinstance(kind, str):  # the key paths of pydantic contain the kind of the pilot
-        lines = lines | {
-            ("pilot", kind, *k[1:]): n for k, n in lines.items() if k[:1] == ("pilot",)
-        }
+        lines = lines | {("pilot", kind, *k[1:]): n for k, n in lines.items() if k[:1] == ("pilot",)}
     source = f"{path} with --set {' '.join(overrides)}" if overrides else str(path)
-    scenario = parse(Scenario, data, source, {} if overrides else lines)
-    return _with_table(scenario, _at(path, lines, "pilot", "file"))
+    scenario = validate_data(Scenario, data, source, {} if overrides else lines)
+    return _load_table(scenario, _locate_key(path, lines, "pilot", "file"))
 
 
-def _at(path: Path, lines: dict[tuple, int], *keys: str) -> str:
+def _locate_key(path: Path, lines: dict[tuple, int], *keys: str) -> str:
     line = f":{lines[keys]}" if keys in lines else ""
     return f"{path}{line}: {'.'.join(keys)}"
 
 
-def _with_table(scenario: Scenario, where: str) -> Scenario:
+def _load_table(scenario: Scenario, where: str) -> Scenario:
     """Replace the file of a table pilot by its columns, so that the scenario is self-contained."""
     pilot = scenario.pilot
     if not isinstance(pilot, TablePilot) or pilot.file is None:
@@ -459,7 +449,7 @@ def _with_table(scenario: Scenario, where: str) -> Scenario:
     return scenario.model_copy(update={"pilot": table})
 
 
-def own_machine(scenario: Scenario) -> Path | None:
+def find_local_machine(scenario: Scenario) -> Path | None:
     """Return the machine file or folder next to the scenario file, None for a shipped machine."""
     path = Path(scenario.folder, scenario.machine)
     beside = scenario.folder and (path.is_file() or (path / "machine.yaml").is_file())
@@ -469,13 +459,13 @@ def own_machine(scenario: Scenario) -> Path | None:
 def save_scenario(scenario: Scenario, path: str | Path) -> None:
     """Write a scenario with all defaults as YAML that `load_scenario` can read."""
     data = scenario.model_dump(mode="json")
-    beside = own_machine(scenario)
+    beside = find_local_machine(scenario)
     data["machine"] = str(beside) if beside else scenario.machine
     data.pop("folder")
     Path(path).write_text(yaml.safe_dump(data, sort_keys=False))
 
 
-def _override(data: dict[str, Any], key: str, text: str) -> None:
+def _apply_override(data: dict[str, Any], key: str, text: str) -> None:
     where: Any = data
     parts = key.split(".")
     for part in parts[:-1]:
@@ -488,7 +478,7 @@ def _override(data: dict[str, Any], key: str, text: str) -> None:
         else:
             raise InputError(f"--set {key}", f"there is nothing below {part!r} to set")
     try:
-        value = read_value(text)
+        value = parse_yaml_value(text)
     except (yaml.YAMLError, ValueError):
         raise InputError(f"--set {key}", f"{text!r} is not a YAML value") from None
     if isinstance(where, list) and parts[-1].isdigit() and int(parts[-1]) < len(where):

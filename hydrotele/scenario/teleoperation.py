@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from hydrotele.core.datafile import Facts, Name, NonNegative, Positive
+from hydrotele.core.datafile import Name, NonNegativeFloat, PositiveFloat, StrictModel
 
 Coordinate = Literal["r", "theta", "z", "attitude", "head"]
 JoystickAxis = Literal["x", "y", "z", "rx", "ry", "rz"]
@@ -19,13 +19,13 @@ Reflection = Literal[
     "none", "stiffness", "direct_force", "coordinating_force", "four_channel", "impedance",
     "wave_variables", "passivity_control",
 ]  # fmt: skip
-_WHERE: dict[str, tuple[str, float]] = {
+_DEFAULT_AXES: dict[str, tuple[str, float]] = {
     "r": ("x", 1.0), "theta": ("y", 1.0), "z": ("z", 1.0), "attitude": ("ry", -1.0),
     "head": ("rx", 1.0),
 }  # fmt: skip
 
 
-class Coupling(Facts):
+class CoordinateMapping(StrictModel):
     """Mapping from the joystick to one task coordinate.
 
     Under rate control, the handle at its stop commands `speed` [m/s] or [rad/s]. Under position
@@ -36,16 +36,16 @@ class Coupling(Facts):
 
     axis: JoystickAxis | None = None
     sign: Literal[-1, 1] | None = None
-    speed: Positive = 0.5
-    scale: Positive = 100.0
+    speed: PositiveFloat = 0.5
+    scale: PositiveFloat = 100.0
 
-    def placed(self, coordinate: str) -> tuple[str, float]:
+    def resolve_axis(self, coordinate: str) -> tuple[str, float]:
         """Return the joystick axis and sign, with the defaults of the coordinate if not given."""
-        axis, sign = _WHERE[coordinate]
+        axis, sign = _DEFAULT_AXES[coordinate]
         return self.axis or axis, float(self.sign or sign)
 
 
-class Channel(Facts):
+class Channel(StrictModel):
     """Communication channel between operator and machine, with delays and packet loss.
 
     `delay_forward` and `delay_back` [s] are rounded to whole control periods; one packet is sent
@@ -61,7 +61,7 @@ class Channel(Facts):
     jitter: Annotated[float, Field(ge=0, le=1)] = 0.0
     trace: str | None = None
     lost: Annotated[float, Field(ge=0, le=1)] = 0.0
-    lost_from: NonNegative = 0.0
+    lost_from: NonNegativeFloat = 0.0
 
     @model_validator(mode="after")
     def _check(self):
@@ -70,7 +70,7 @@ class Channel(Facts):
         return self
 
 
-class Safety(Facts):
+class SafetyLimits(StrictModel):
     """Conditions under which the machine stops automatically.
 
     Without a new packet for `silence` [s], the rates go to zero and the reflected force fades out.
@@ -78,12 +78,12 @@ class Safety(Facts):
     reference, or if a noisy sensor gives the same value for `frozen` [s].
     """
 
-    silence: Positive = 0.15
-    following_error: Positive = 0.2
-    frozen: Positive = 0.5
+    silence: PositiveFloat = 0.15
+    following_error: PositiveFloat = 0.2
+    frozen: PositiveFloat = 0.5
 
 
-class TipOver(Facts):
+class TipOver(StrictModel):
     """Tip-over protection: push the joystick back above a fraction `share` of the tipping moment.
 
     The machine of `mass` [kg] has its centre of mass at `behind` [m] behind the swing axis. It tips
@@ -91,25 +91,25 @@ class TipOver(Facts):
     a spring with `stiffness` [N/m] and a damper with `damping` [N s/m].
     """
 
-    mass: Positive
+    mass: PositiveFloat
     behind: float = 0.0
-    edge: Positive = 1.6
+    edge: PositiveFloat = 1.6
     share: Annotated[float, Field(gt=0, lt=1)] = 0.7
-    stiffness: Positive = 8.0e3
-    damping: NonNegative = 100.0
+    stiffness: PositiveFloat = 8.0e3
+    damping: NonNegativeFloat = 100.0
 
 
-class Fault(Facts):
+class SensorFault(StrictModel):
     """A sensor that freezes at the time `at` [s], such as `angle.boom` or `pressure_rod.stick`."""
 
     channel: str
-    at: NonNegative
+    at: NonNegativeFloat
 
 
-class Button(Facts):
+class ButtonCommand(StrictModel):
     """Command of an axis that the joystick does not move (saw, grab), from `at` [s] on."""
 
-    at: NonNegative
+    at: NonNegativeFloat
     axis: Name
     command: float
 
@@ -120,11 +120,11 @@ def _check_time(time: list[float]) -> None:
         raise ValueError("time must start at 0 and rise strictly")
 
 
-class Follow(Facts):
+class FollowPath(StrictModel):
     """The operator moves the handle along a path of displacements [m] or [rad] over `time` [s]."""
 
     kind: Literal["follow"]
-    time: list[NonNegative] = [0.0]
+    time: list[NonNegativeFloat] = [0.0]
     path: dict[JoystickAxis, list[float]] = {}
     interpolate: Literal["hold", "linear"] = "linear"
 
@@ -137,14 +137,14 @@ class Follow(Facts):
         return self
 
 
-class ForceTarget(Facts):
+class ForceTarget(StrictModel):
     """Reference contact force along a coordinate: `force` [N] at `time` [s].
 
     The force is positive if the environment pushes the machine along the coordinate.
     """
 
     coordinate: Coordinate = "z"
-    time: list[NonNegative]
+    time: list[NonNegativeFloat]
     force: list[float]
 
     @model_validator(mode="after")
@@ -155,7 +155,7 @@ class ForceTarget(Facts):
         return self
 
 
-class Regulate(Facts):
+class RegulateForce(StrictModel):
     """The operator regulates a contact force by the reflected force alone.
 
     The operator knows how joystick and machine map the contact force to the hand (K_nom and K_r, or
@@ -164,10 +164,10 @@ class Regulate(Facts):
 
     kind: Literal["regulate"]
     target: ForceTarget
-    approach: Positive = 0.35
+    approach: PositiveFloat = 0.35
 
 
-class Track(Facts):
+class TrackForce(StrictModel):
     """The operator tracks a displayed force trajectory, seen with delay and noise.
 
     `display: both` shows the target and the contact force from the machine's sensors. `target`
@@ -176,11 +176,11 @@ class Track(Facts):
 
     kind: Literal["track"]
     target: ForceTarget
-    approach: Positive = 0.35
+    approach: PositiveFloat = 0.35
     display: Literal["target", "both"] = "target"
 
 
-class Steer(Facts):
+class SteerToPoses(StrictModel):
     """The operator steers the tip by sight to one pose after the other.
 
     `points` gives the values of every coordinate (r, z [m], theta, attitude, head [rad]), each of
@@ -188,7 +188,7 @@ class Steer(Facts):
     """
 
     kind: Literal["steer"]
-    time: list[NonNegative]
+    time: list[NonNegativeFloat]
     points: Annotated[dict[Coordinate, list[float]], Field(min_length=1)]
 
     @model_validator(mode="after")
@@ -196,19 +196,17 @@ class Steer(Facts):
         _check_time(self.time)
         for name, values in self.points.items():
             if len(values) != len(self.time):
-                raise ValueError(
-                    f"points.{name} has {len(values)} values, time has {len(self.time)}"
-                )
+                raise ValueError(f"points.{name} has {len(values)} values, time has {len(self.time)}")
         return self
 
 
-class Live(Facts):
+class LiveOperator(StrictModel):
     """A person moves the handle with an input device (`hydrotele drive`)."""
 
     kind: Literal["live"]
 
 
-class Recorded(Facts):
+class RecordedMotion(StrictModel):
     """The handle repeats the recorded motion of a person; `recorded` is a CSV or Parquet file.
 
     Its columns are `time` and `handle.x` ... `handle.rz` (or `x` ... `rz`), displacements in [m] or
@@ -219,7 +217,7 @@ class Recorded(Facts):
     recorded: str
 
 
-class Perception(Facts):
+class OperatorSettings(StrictModel):
     """Parameters of the simulated operator: perception, neuromuscular dynamics and arm impedance.
 
     `file` replaces `hydrotele/teleop/operator.yaml`, which documents every parameter. `drawn`
@@ -244,39 +242,39 @@ class Perception(Facts):
     drawn: Annotated[int, Field(ge=0)] | None = None
     grip: Name | None = None
     posture: Name | None = None
-    visual_delay: NonNegative | None = None
-    crossover: Positive | None = None
-    tracking_margin: Positive | None = None
-    placing_margin: Positive | None = None
+    visual_delay: NonNegativeFloat | None = None
+    crossover: PositiveFloat | None = None
+    tracking_margin: PositiveFloat | None = None
+    placing_margin: PositiveFloat | None = None
     gain_margin: Annotated[float, Field(gt=0, lt=1)] | None = None
-    neuromuscular_frequency: Positive | None = None
-    neuromuscular_damping: Positive | None = None
-    remnant: NonNegative | None = None
-    sight: NonNegative | None = None
-    sight_noise: NonNegative | None = None
-    touch: NonNegative | None = None
-    force_weber: NonNegative | None = None
-    position_weber: NonNegative | None = None
-    integration_weber: NonNegative | None = None
-    tremor: NonNegative | None = None
-    muscle: Positive | None = None
-    largest_force: Positive | None = None
+    neuromuscular_frequency: PositiveFloat | None = None
+    neuromuscular_damping: PositiveFloat | None = None
+    remnant: NonNegativeFloat | None = None
+    sight: NonNegativeFloat | None = None
+    sight_noise: NonNegativeFloat | None = None
+    touch: NonNegativeFloat | None = None
+    force_weber: NonNegativeFloat | None = None
+    position_weber: NonNegativeFloat | None = None
+    integration_weber: NonNegativeFloat | None = None
+    tremor: NonNegativeFloat | None = None
+    muscle: PositiveFloat | None = None
+    largest_force: PositiveFloat | None = None
     cocontraction: Annotated[float, Field(ge=0, le=1)] | None = None
-    usual_speed: Positive | None = None
-    usual_scale: Positive | None = None
-    task_stiffness: Positive | None = None
-    surprise: Positive | None = None
-    memory: Positive | None = None
-    imagination: NonNegative | None = None
-    dwell: Positive | None = None
+    usual_speed: PositiveFloat | None = None
+    usual_scale: PositiveFloat | None = None
+    task_stiffness: PositiveFloat | None = None
+    surprise: PositiveFloat | None = None
+    memory: PositiveFloat | None = None
+    imagination: NonNegativeFloat | None = None
+    dwell: PositiveFloat | None = None
 
     @model_validator(mode="before")
     @classmethod
-    def _rename(cls, data):
+    def _replace_deprecated_keys(cls, data):
         """Replace deprecated keys by their current names, with a warning."""
         if not isinstance(data, dict):
             return data
-        for old, new in _FORMER.items():
+        for old, new in _DEPRECATED_KEYS.items():
             if old in data:
                 if new in data:
                     raise ValueError(f"{old} is the former name of {new}; give one of them")
@@ -286,31 +284,31 @@ class Perception(Facts):
         return data
 
 
-_FORMER = {"reaction": "visual_delay", "force_noise": "force_weber", "skill": "crossover"}
+_DEPRECATED_KEYS = {"reaction": "visual_delay", "force_noise": "force_weber", "skill": "crossover"}
 
 
-def _kind_of(value: object) -> object:
+def _get_kind(value: object) -> object:
     """Return the kind of an operator; `recorded` if the kind is omitted but the file is given."""
     kind = value.get("kind") if isinstance(value, dict) else getattr(value, "kind", None)
     return "recorded" if kind is None and isinstance(value, dict) and "recorded" in value else kind
 
 
-Behaviour = Annotated[
-    Annotated[Follow, Tag("follow")]
-    | Annotated[Regulate, Tag("regulate")]
-    | Annotated[Track, Tag("track")]
-    | Annotated[Steer, Tag("steer")]
-    | Annotated[Live, Tag("live")]
-    | Annotated[Recorded, Tag("recorded")],
+OperatorBehaviour = Annotated[
+    Annotated[FollowPath, Tag("follow")]
+    | Annotated[RegulateForce, Tag("regulate")]
+    | Annotated[TrackForce, Tag("track")]
+    | Annotated[SteerToPoses, Tag("steer")]
+    | Annotated[LiveOperator, Tag("live")]
+    | Annotated[RecordedMotion, Tag("recorded")],
     Discriminator(
-        _kind_of,
+        _get_kind,
         custom_error_type="operator_kind",
         custom_error_message="needs kind: follow, regulate, track, steer, live; or recorded: FILE",
     ),
 ]
 
 
-class TeleopPilot(Facts):
+class TeleopPilot(StrictModel):
     """An operator controls the machine through the joystick, with force reflection.
 
     `mount: cab` mounts the joystick on the swinging link, whose motion excites it; `mount: table`
@@ -363,30 +361,30 @@ class TeleopPilot(Facts):
     mode: Literal["rate", "position"] = "rate"
     reflection: Reflection = "stiffness"
     detent: bool = False
-    ratio: NonNegative = 2.0e-4
-    force_limit: Positive | None = None
-    coupling: NonNegative | None = None
-    coupling_damping: NonNegative | None = None
+    ratio: NonNegativeFloat = 2.0e-4
+    force_limit: PositiveFloat | None = None
+    coupling: NonNegativeFloat | None = None
+    coupling_damping: NonNegativeFloat | None = None
     coordinating: Literal["handle", "reference"] = "handle"
     compliance: Literal["springs", "decoupled"] = "springs"
     resolved_motion: Literal["inverse_kinematics", "inverse_jacobian"] = "inverse_kinematics"
-    wave: Positive | None = None
-    virtual_mass: Positive = 2.0
+    wave: PositiveFloat | None = None
+    virtual_mass: PositiveFloat = 2.0
     force: Literal["static", "dynamic", "true"] = "dynamic"
     bandwidth: Annotated[float, Field(gt=0, le=10.0 * math.pi)] = 3.0 * math.pi
-    acceleration: Positive = 1.0
-    coordinates: dict[Coordinate, Coupling] = {}
+    acceleration: PositiveFloat = 1.0
+    coordinates: dict[Coordinate, CoordinateMapping] = {}
     stiffness: dict[JoystickAxis, dict[str, float]] = {}
-    operator: Behaviour
-    perception: Perception = Perception()
+    operator: OperatorBehaviour
+    perception: OperatorSettings = OperatorSettings()
     channel: Channel = Channel()
-    safety: Safety = Safety()
+    safety: SafetyLimits = SafetyLimits()
     tip_over: TipOver | None = None
-    buttons: list[Button] = []
-    faults: list[Fault] = []
+    buttons: list[ButtonCommand] = []
+    faults: list[SensorFault] = []
 
     @model_validator(mode="after")
-    def _passive_line(self):
+    def _check_mode(self):
         if self.reflection in ("wave_variables", "passivity_control") and self.mode == "rate":
             raise ValueError(
                 f"reflection {self.reflection} needs mode position: under rate control, force times"

@@ -9,19 +9,17 @@ import numpy as np
 import hydrotele
 from hydrotele.calibrate.arm import ArmFit, stage_residuals
 from hydrotele.calibrate.arm_poses import Poses
-from hydrotele.calibrate.bad_data import Region
-from hydrotele.calibrate.design import ARMS, FOREARMS, Design, Survey
-from hydrotele.calibrate.linkage import NAMES, LinkageFit, values_of
+from hydrotele.calibrate.bad_data import CorruptedRegion
+from hydrotele.calibrate.design import ARM_LENGTHS, FOREARM_LENGTHS, Design, DesignSurvey
+from hydrotele.calibrate.linkage import PARAMETER_NAMES, LinkageFit, linkage_parameters
 from hydrotele.calibrate.loop import unit_of
-from hydrotele.calibrate.mukca import LeftOut, SocketCalibration
-from hydrotele.show.report_html import Section, drawing, png, write_sections
+from hydrotele.calibrate.mukca import HeldOutPrediction, SocketCalibration
+from hydrotele.show.report_html import Section, png, report_figure, write_sections
 
-_MOST_TIP = 0.06  # m, upper limit of the colour scale of the designs
+_MAX_TIP_ERROR = 0.06  # m, upper limit of the colour scale of the designs
 
 
-def write_arm_report(
-    fit: ArmFit, stages: Sequence[Poses], regions: Sequence[Region], path: Path
-) -> None:
+def write_arm_report(fit: ArmFit, stages: Sequence[Poses], regions: Sequence[CorruptedRegion], path: Path) -> None:
     """Write the report of an arm calibration.
 
     Args:
@@ -31,12 +29,12 @@ def write_arm_report(
         path: HTML file to write.
     """
     rows = []
-    for name, value, deviation in zip(fit.names, fit.values, fit.deviations, strict=True):
+    for name, value, deviation in zip(fit.names, fit.values, fit.standard_deviations, strict=True):
         scale = np.degrees(1.0) if unit_of(name) == "rad" else 1e3
         unit = "deg" if unit_of(name) == "rad" else "mm"
-        rows.append((name, f"{scale * fit.start[name]:.2f} {unit}", f"{scale * value:.2f} {unit}",
+        rows.append((name, f"{scale * fit.start_parameters[name]:.2f} {unit}", f"{scale * value:.2f} {unit}",
                      f"{1.96 * scale * deviation:.2f} {unit}"))  # fmt: skip
-    kept = [(s.link, name, why) for s in fit.stages for name, why in s.fixed.items()]
+    kept = [(s.link, name, why) for s in fit.stages for name, why in s.hold_reasons.items()]
     sections = [
         Section("Parameters", head=("parameter", "nominal", "identified", "95 % +-"), rows=rows),
         Section("Fixed parameters", "Parameters that are not identifiable from the poses keep"
@@ -63,10 +61,10 @@ def write_arm_report(
 
 def draw_residuals(fit: ArmFit, stages: Sequence[Poses]) -> bytes:
     """Draw the residuals of both equations over the poses as PNG, one panel per moving link."""
-    with drawing(0.4 + 1.5 * len(stages)) as figure:
+    with report_figure(0.4 + 1.5 * len(stages)) as figure:
         places = figure.subplots(len(stages), 1, squeeze=False)[:, 0]
         for place, poses in zip(places, stages, strict=True):
-            rows = stage_residuals(fit.nominal, poses, fit.numbers)
+            rows = stage_residuals(fit.nominal, poses, fit.parameters)
             place.plot(rows[:, 0], ".", ms=3, color="#1769aa", label="distance")
             place.plot(rows[:, 1], ".", ms=3, color="#e07b00", label="height")
             place.set_title(f"residual / sensor noise [1], moving link {poses.link}")
@@ -84,17 +82,15 @@ def write_linkage_report(fits: Sequence[LinkageFit], path: Path) -> None:
     """
     sections = []
     for found in fits:
-        deviations = dict(zip(found.fit.names, found.fit.deviations, strict=True))
+        deviations = dict(zip(found.fit.names, found.fit.standard_deviations, strict=True))
         rows = []
-        for name, nominal, value in zip(NAMES, found.nominal, values_of(found), strict=True):
+        for name, nominal, value in zip(PARAMETER_NAMES, found.nominal, linkage_parameters(found), strict=True):
             scale, unit = (np.degrees(1.0), "deg") if name == "theta_off" else (1e3, "mm")
             wide = f"{1.96 * scale * deviations[name]:.2f} {unit}" if name in deviations else "held"
-            rows.append(
-                (name, f"{scale * nominal:.2f} {unit}", f"{scale * value:.2f} {unit}", wide)
-            )
+            rows.append((name, f"{scale * nominal:.2f} {unit}", f"{scale * value:.2f} {unit}", wide))
         said = (f"RMS displacement error {1e3 * found.rms:.2f} mm (lower is better) and variance"
                 f" accounted for (VAF) {found.vaf:.3f} % (higher is better) on held-out samples;"
-                f" {found.angles} joint angles.")  # fmt: skip
+                f" {found.angle_source} joint angles.")  # fmt: skip
         sections.append(Section(found.axis, said, ("parameter", "nominal", "identified", "95 % +-"),
                                 rows, picture=draw_linkage(found)))  # fmt: skip
     write_sections(
@@ -104,34 +100,32 @@ def write_linkage_report(fits: Sequence[LinkageFit], path: Path) -> None:
     )  # fmt: skip
 
 
-def draw_linkage(found: LinkageFit) -> bytes:
+def draw_linkage(fit: LinkageFit) -> bytes:
     """Draw the error of the piston displacement over the joint angle as PNG."""
-    with drawing(2.4) as figure:
+    with report_figure(2.4) as figure:
         place = figure.subplots()
-        place.plot(np.degrees(found.angle), 1e3 * found.residual, ".", ms=2, color="#1769aa")
-        place.set_title(f"{found.axis}: error of the piston displacement [mm]")
+        place.plot(np.degrees(fit.angle), 1e3 * fit.residual, ".", ms=2, color="#1769aa")
+        place.set_title(f"{fit.axis}: error of the piston displacement [mm]")
         place.set_xlabel("joint angle [deg]")
         return png(figure)
 
 
-def draw_designs(survey: Survey, best: Design) -> bytes:
+def draw_designs(survey: DesignSurvey, best: Design) -> bytes:
     """Draw tip error, information and reached poses over both arm lengths of designs as PNG."""
-    shape = len(FOREARMS), len(ARMS)
+    shape = len(FOREARM_LENGTHS), len(ARM_LENGTHS)
     tip = np.array([d.tip_error for d in survey.designs]).reshape(shape)
     told = np.array([d.information for d in survey.designs]).reshape(shape)
     reached = np.array([d.reached for d in survey.designs]).reshape(shape)
     told = np.where(np.isfinite(told), told, np.nan) / np.log(10.0)
     panels = (
         ("tip error of the calibrated arm,\nstandard deviation [mm]",
-         1e3 * np.minimum(tip, _MOST_TIP), "viridis_r", "%.0f"),
+         1e3 * np.minimum(tip, _MAX_TIP_ERROR), "viridis_r", "%.0f"),
         ("information on the parameters,\nlog10 of the determinant [1]", told, "viridis", "%.0f"),
         ("poses reached by the\ncalibrator [%]", 100.0 * reached, "viridis", "%.0f"),
     )  # fmt: skip
-    with drawing(4.0) as figure:
-        for place, (title, values, colours, form) in zip(
-            figure.subplots(1, 3, sharey=True), panels, strict=True
-        ):
-            shown = place.contourf(ARMS, FOREARMS, values, 12, cmap=colours)
+    with report_figure(4.0) as figure:
+        for place, (title, values, colours, form) in zip(figure.subplots(1, 3, sharey=True), panels, strict=True):
+            shown = place.contourf(ARM_LENGTHS, FOREARM_LENGTHS, values, 12, cmap=colours)
             figure.colorbar(shown, ax=place, format=form, shrink=0.7)
             for one, mark, label in ((survey.present, "o", "Khoshzaban 1992"), (best, "*", "best")):
                 place.plot(one.arm, one.forearm, mark, ms=10, mfc="white", mec="black", label=label)
@@ -144,36 +138,39 @@ def draw_designs(survey: Survey, best: Design) -> bytes:
         return png(figure)
 
 
-_BEFORE, _AFTER, _MARK = "#b9bfc7", "#1769aa", "#e07b00"
-_MOST = 3000  # maximum number of points of a scatter plot
-_LEVELS = (0.39, 0.86)  # probability within 1 and 2 standard deviations of a 2D normal distribution
+_NOMINAL_COLOUR, _CALIBRATED_COLOUR, _MARK_COLOUR = "#b9bfc7", "#1769aa", "#e07b00"
+_MAX_SCATTER_POINTS = 3000  # maximum number of points of a scatter plot
+_CONTOUR_PROBABILITIES = (
+    0.39,
+    0.86,
+)  # probability within 1 and 2 standard deviations of a 2D normal distribution
 
 
-def error_bars(errors: Mapping[str, tuple[np.ndarray, np.ndarray]], what: str) -> bytes:
+def draw_pose_errors(errors: Mapping[str, tuple[np.ndarray, np.ndarray]], description: str) -> bytes:
     """Draw the errors of each pose before and after calibration on a logarithmic scale.
 
     Args:
         errors: {title with unit: (errors before (n,), errors after (n,))}.
-        what: description of the poses.
+        description: description of the poses.
 
     Returns:
         A PNG.
     """
-    with drawing(0.3 + 1.9 * len(errors)) as figure:
+    with report_figure(0.3 + 1.9 * len(errors)) as figure:
         axes = figure.subplots(len(errors), 1, squeeze=False)[:, 0]
         for place, (title, (before, after)) in zip(axes, errors.items(), strict=True):
             at = np.arange(1, len(before) + 1)
-            place.bar(at - 0.2, before, 0.4, color=_BEFORE, label="nominal")
-            place.bar(at + 0.2, after, 0.4, color=_AFTER, label="calibrated")
+            place.bar(at - 0.2, before, 0.4, color=_NOMINAL_COLOUR, label="nominal")
+            place.bar(at + 0.2, after, 0.4, color=_CALIBRATED_COLOUR, label="calibrated")
             place.set_yscale("log")
-            place.set_title(f"{title}, {len(before)} {what}")
+            place.set_title(f"{title}, {len(before)} {description}")
             place.margins(x=0.01)
             place.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
         axes[-1].set_xlabel("pose")
         return png(figure)
 
 
-def corner(
+def draw_posterior(
     sample: np.ndarray, names: Sequence[str], mark: np.ndarray | None = None,
     mark_label: str = "", unit: str = "mm or mrad",
 ) -> bytes:  # fmt: skip
@@ -190,8 +187,8 @@ def corner(
         A PNG.
     """
     p = len(names)
-    thin = sample[:: max(1, len(sample) // _MOST)]
-    with drawing(1.5 * p) as figure:
+    thin = sample[:: max(1, len(sample) // _MAX_SCATTER_POINTS)]
+    with report_figure(1.5 * p) as figure:
         axes = figure.subplots(p, p, squeeze=False, sharex="col")
         for row in range(p):
             for column in range(p):
@@ -200,18 +197,25 @@ def corner(
                     place.axis("off")
                     continue
                 if row == column:
-                    place.hist(sample[:, row], 40, density=True, color=_AFTER, alpha=0.8)
+                    place.hist(sample[:, row], 40, density=True, color=_CALIBRATED_COLOUR, alpha=0.8)
                     place.set_yticks([])
                 else:
-                    place.plot(thin[:, column], thin[:, row], ".", ms=1.5, alpha=0.3, color=_AFTER)
-                    _contours(place, sample[:, column], sample[:, row])
+                    place.plot(
+                        thin[:, column],
+                        thin[:, row],
+                        ".",
+                        ms=1.5,
+                        alpha=0.3,
+                        color=_CALIBRATED_COLOUR,
+                    )
+                    _draw_contours(place, sample[:, column], sample[:, row])
                     share = np.corrcoef(sample[:, column], sample[:, row])[0, 1]
                     place.text(0.04, 0.96, f"{share:+.2f}", transform=place.transAxes, va="top",
                                fontsize=7)  # fmt: skip
                 if mark is not None:
-                    place.axvline(mark[column], color=_MARK, lw=1.0)
+                    place.axvline(mark[column], color=_MARK_COLOUR, lw=1.0)
                     if row != column:
-                        place.axhline(mark[row], color=_MARK, lw=1.0)
+                        place.axhline(mark[row], color=_MARK_COLOUR, lw=1.0)
                 if row == p - 1:
                     place.set_xlabel(f"{names[column]}")
                 if column == 0 and row > 0:
@@ -223,48 +227,56 @@ def corner(
         return png(figure)
 
 
-def _contours(place, x: np.ndarray, y: np.ndarray) -> None:
+def _draw_contours(place, x: np.ndarray, y: np.ndarray) -> None:
     """Draw contours that contain 39 % and 86 % of the samples."""
     counts, xs, ys = np.histogram2d(x, y, 30)
     order = np.sort(counts.ravel())[::-1]
     share = np.cumsum(order) / order.sum()
-    levels = sorted({float(order[np.searchsorted(share, level)]) for level in _LEVELS})
+    levels = sorted({float(order[np.searchsorted(share, level)]) for level in _CONTOUR_PROBABILITIES})
     middle = [0.5 * (edge[1:] + edge[:-1]) for edge in (xs, ys)]
     place.contour(*middle, counts.T, levels=levels, colors="#0d3f66", linewidths=0.8)
 
 
-NOMINAL, CALIBRATED = "#e07b00", "#1769aa"
+NOMINAL_POINTS_COLOUR, CALIBRATED_POINTS_COLOUR = "#e07b00", "#1769aa"
 
 
-def draw_sockets(found: SocketCalibration, left: Sequence[LeftOut]) -> bytes:
+def draw_sockets(calibration: SocketCalibration, heldout_parts: Sequence[HeldOutPrediction]) -> bytes:
     """Draw the distance of the ball from its mean position in the socket, and socket distances.
 
     Args:
-        found: the calibration.
-        left: predictions of held-out places; if empty, the fitted places are shown.
+        calibration: the calibration.
+        heldout_parts: predictions of held-out places; if empty, the fitted places are shown.
 
     Returns:
         A PNG.
     """
     before, after, apart = {}, {}, {}
-    for one in left:
-        before |= one.nominal.rows
-        after |= one.calibrated.rows
-        apart |= one.calibrated.distances
-    if not left:
-        before, after, apart = found.before.rows, found.after.rows, found.after.distances
+    for one in heldout_parts:
+        before |= one.nominal_errors.distances_by_socket
+        after |= one.calibrated_errors.distances_by_socket
+        apart |= one.calibrated_errors.socket_distances
+    if not heldout_parts:
+        before, after, apart = (
+            calibration.nominal_errors.distances_by_socket,
+            calibration.calibrated_errors.distances_by_socket,
+            calibration.calibrated_errors.socket_distances,
+        )
     names = list(after)
-    with drawing(6.4) as figure:
+    with report_figure(6.4) as figure:
         upper, lower = figure.subplots(2, 1, height_ratios=(1.7, 1.0))
         place = 0
         for k, name in enumerate(names):
             x = place + np.arange(len(after[name]))
             for rows, colour, label in (
-                (before[name], NOMINAL, "nominal robot, only the ball position fitted"),
+                (
+                    before[name],
+                    NOMINAL_POINTS_COLOUR,
+                    "nominal robot, only the ball position fitted",
+                ),
                 (
                     after[name],
-                    CALIBRATED,
-                    "calibrated on the other places" if left else "calibrated",
+                    CALIBRATED_POINTS_COLOUR,
+                    "calibrated on the other places" if heldout_parts else "calibrated",
                 ),
             ):
                 upper.plot(x, 1e3 * rows, ".", color=colour, ms=4, label="" if k else label)
@@ -283,28 +295,28 @@ def draw_sockets(found: SocketCalibration, left: Sequence[LeftOut]) -> bytes:
         upper.set_yscale("log")
         upper.yaxis.set_major_formatter("{x:g}")
         upper.set_ylabel("distance from mean\nball position [mm]")
-        upper.set_title(f"{found.nominal.name}: scatter of the predicted ball; lines: RMS")
+        upper.set_title(f"{calibration.nominal.name}: scatter of the predicted ball; lines: RMS")
         upper.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False,
                      fontsize=8.5, borderaxespad=0.1, markerscale=2.0)  # fmt: skip
-        _draw_distances(lower, apart, found.options.distance)
+        _draw_distances(lower, apart, calibration.options.distance)
         return png(figure)
 
 
-def _draw_distances(plot: Any, apart: dict[str, float], given: float | None) -> None:
-    if not apart:
+def _draw_distances(plot: Any, distances: dict[str, float], given_distance: float | None) -> None:
+    if not distances:
         plot.set_axis_off()
         plot.text(0.0, 0.5, "no place has two sockets", transform=plot.transAxes)
         return
-    values = 1e3 * np.array(list(apart.values()))
+    values = 1e3 * np.array(list(distances.values()))
     x = np.arange(len(values))
-    plot.plot(x, values, "o", color=CALIBRATED, ms=6)
-    if given is not None:
-        plot.axhspan(1e3 * given - 0.1, 1e3 * given + 0.1, color="0.5", alpha=0.15, lw=0)
-        plot.axhline(1e3 * given, color="0.4", lw=1.0)
-        reach = 1.25 * max(0.2, float(np.abs(values - 1e3 * given).max()))
-        plot.set_ylim(1e3 * given - reach, 1e3 * given + reach)
+    plot.plot(x, values, "o", color=CALIBRATED_POINTS_COLOUR, ms=6)
+    if given_distance is not None:
+        plot.axhspan(1e3 * given_distance - 0.1, 1e3 * given_distance + 0.1, color="0.5", alpha=0.15, lw=0)
+        plot.axhline(1e3 * given_distance, color="0.4", lw=1.0)
+        reach = 1.25 * max(0.2, float(np.abs(values - 1e3 * given_distance).max()))
+        plot.set_ylim(1e3 * given_distance - reach, 1e3 * given_distance + reach)
     plot.set_xticks(x)
-    plot.set_xticklabels(list(apart))
+    plot.set_xticklabels(list(distances))
     plot.set_xlim(-0.6, len(values) - 0.4)
     plot.grid(axis="x", visible=False)
     plot.set_ylabel("socket distance [mm]")
@@ -345,7 +357,7 @@ def write_robot_report(path: Path, document: dict[str, Any], picture: bytes) -> 
     notes = [*(f"{o['socket']}, row {o['row']}: {o['distance_mm']:.2f} mm from its socket, excluded"
                " from the fit" for o in document["outliers"]), *document["notes"],
              f"data: {document['data']}"]  # fmt: skip
-    sections += [_parameters(document), _told(document),
+    sections += [_parameter_section(document), _combination_section(document),
                  Section("Notes", "Excluded samples and remarks.", notes=notes)]  # fmt: skip
     write_sections(
         path, f"hydrotele {hydrotele.__version__} - closed-chain calibration from joint angles",
@@ -357,10 +369,10 @@ def write_robot_report(path: Path, document: dict[str, Any], picture: bytes) -> 
     )  # fmt: skip
 
 
-def _parameters(document: dict[str, Any]) -> Section:
+def _parameter_section(document: dict[str, Any]) -> Section:
     rows = []
     for one in document["parameters"]:
-        unit, factor = _customary(one["unit"])
+        unit, factor = _display_unit(one["unit"])
         reach = "" if one["std"] is None else f"{0.5 * factor * (one['high'] - one['low']):.2g}"
         told = {"full": "yes", "combination": "in a combination"}.get(one["told"], "no")
         rows.append((one["name"], f"{factor * one['value']:.4g}", reach, unit, told))
@@ -373,11 +385,11 @@ def _parameters(document: dict[str, Any]) -> Section:
     )  # fmt: skip
 
 
-def _told(document: dict[str, Any]) -> Section:
+def _combination_section(document: dict[str, Any]) -> Section:
     units = {one["name"]: one["unit"] for one in document["parameters"]}
     rows = []
     for one in document["told"]:
-        unit, factor = _customary(units[one["text"].split()[0]])
+        unit, factor = _display_unit(units[one["text"].split()[0]])
         reach = f"{0.5 * factor * (one['high'] - one['low']):.2g}"
         rows.append((one["text"], f"{factor * one['value']:.4g}", reach, unit))
     return Section(
@@ -390,5 +402,5 @@ def _told(document: dict[str, Any]) -> Section:
     )  # fmt: skip
 
 
-def _customary(unit: str) -> tuple[str, float]:
+def _display_unit(unit: str) -> tuple[str, float]:
     return {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}.get(unit, (unit, 1.0))

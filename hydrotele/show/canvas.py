@@ -17,7 +17,7 @@ import numpy as np
 
 from hydrotele.core.errors import InputError
 
-_GLOW = 0.4
+_MARKER_EMISSION = 0.4
 _Geom = mujoco.mjtGeom
 
 
@@ -31,7 +31,7 @@ class Marker(NamedTuple):
         size: (3,) size of the MuJoCo geom, or (1,) radius of a line or arrow [m].
         colour: (4,) red, green, blue, opacity, 0 .. 1.
         rotation: (9,) rotation matrix of a shape with a centre.
-        glow: emission, 0 .. 1, so that the marker is visible in shadows.
+        emission: emission, 0 .. 1, so that the marker is visible in shadows.
     """
 
     shape: int
@@ -40,7 +40,7 @@ class Marker(NamedTuple):
     size: np.ndarray
     colour: tuple[float, float, float, float]
     rotation: np.ndarray = np.eye(3).ravel()
-    glow: float = _GLOW
+    emission: float = _MARKER_EMISSION
 
 
 def ball(middle, radius: float, colour) -> Marker:
@@ -61,9 +61,7 @@ def arrow(start, end, radius: float, colour) -> Marker:
 def box(middle, half_sizes, colour, rotation: np.ndarray | None = None) -> Marker:
     """Return a box marker with a centre and half sizes [m], and a rotation matrix (3, 3)."""
     turn = np.eye(3) if rotation is None else rotation
-    return Marker(
-        _Geom.mjGEOM_BOX, np.array(middle), None, np.array(half_sizes), colour, turn.ravel()
-    )
+    return Marker(_Geom.mjGEOM_BOX, np.array(middle), None, np.array(half_sizes), colour, turn.ravel())
 
 
 def polyline(points, radius: float, colour) -> list[Marker]:
@@ -86,15 +84,15 @@ def write_markers(scene: mujoco.MjvScene, markers: Sequence[Marker]) -> None:
         if marker.end is not None:
             width = float(marker.size[0])
             mujoco.mjv_connector(geom, marker.shape, width, marker.start, marker.end)
-        geom.category, geom.emission = mujoco.mjtCatBit.mjCAT_DECOR.value, marker.glow
+        geom.category, geom.emission = mujoco.mjtCatBit.mjCAT_DECOR.value, marker.emission
         scene.ngeom += 1
 
 
 PACKAGES = "libegl1 and libgl1-mesa-dri, or libosmesa6"
 _OFFSCREEN = ("egl", "osmesa")
-_LARGEST = 8192  # pixel, maximum width and height of an image
-_SHADOW = 4096  # pixel, maximum size of the shadow map
-_MARKERS = 1000  # maximum number of markers
+_MAX_IMAGE_SIZE = 8192  # pixel, maximum width and height of an image
+_MAX_SHADOW_SIZE = 4096  # pixel, maximum size of the shadow map
+_MAX_MARKERS = 1000  # maximum number of markers
 
 
 class Canvas:
@@ -117,14 +115,14 @@ class Canvas:
         """
         self._gl = self._context = None
         for name, length in (("width", width), ("height", height)):
-            if not 1 <= length <= _LARGEST:
-                raise InputError(name, f"must be 1 to {_LARGEST} pixels, not {length}")
+            if not 1 <= length <= _MAX_IMAGE_SIZE:
+                raise InputError(name, f"must be 1 to {_MAX_IMAGE_SIZE} pixels, not {length}")
         self.size = width, height
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         # A shadow map needs no more pixels than the image.
-        model.vis.quality.shadowsize = min(_SHADOW, 1 << (max(width, height) - 1).bit_length())
+        model.vis.quality.shadowsize = min(_MAX_SHADOW_SIZE, 1 << (max(width, height) - 1).bit_length())
         self._gl, self._context = _open(model, width, height)
-        self._scene = mujoco.MjvScene(model, model.ngeom + _MARKERS)
+        self._scene = mujoco.MjvScene(model, model.ngeom + _MAX_MARKERS)
         self._option, self._rectangle = mujoco.MjvOption(), mujoco.MjrRect(0, 0, width, height)
         self._upright = np.empty((height, width, 3), np.uint8)
 
@@ -177,7 +175,7 @@ def has_screen() -> bool:
 def _open(model: mujoco.MjModel, width: int, height: int):
     """Return OpenGL context and MuJoCo render context of the first driver that works."""
     reasons = []
-    for name in _candidates():
+    for name in _candidate_drivers():
         gl = None
         try:
             with warnings.catch_warnings():
@@ -199,7 +197,7 @@ def _open(model: mujoco.MjModel, width: int, height: int):
     )
 
 
-def _candidates() -> tuple[str, ...]:
+def _candidate_drivers() -> tuple[str, ...]:
     wanted = os.environ.get("MUJOCO_GL", "").lower()
     if wanted in _OFFSCREEN:
         return (wanted,)

@@ -52,7 +52,7 @@ TITLES: Mapping[str, str] = {
     "tip_force": "measured force at the tip",
 }
 # Kinds shown in m and N: tip positions are large, hand forces are small.
-_PLAIN = ("tip", "tip_pose", "tip_reference", "hand_force", "handle_force")
+_UNSCALED_KINDS = ("tip", "tip_pose", "tip_reference", "hand_force", "handle_force")
 
 # Colours of the axes, distinguishable on dark and white and by the colour-blind (Okabe and Ito).
 _HUES = (
@@ -68,7 +68,7 @@ _HUES = (
 _SUPPLY_HUE = (200, 205, 210)
 
 # Minimum range of a plot [displayed unit]; smaller differences are rounding or sensor noise.
-_SMALLEST_SPANS: Mapping[str, float] = {"deg": 0.5, "mm": 5.0, "MPa": 0.5}
+_MIN_PLOT_RANGES: Mapping[str, float] = {"deg": 0.5, "mm": 5.0, "MPa": 0.5}
 
 
 class Trace(NamedTuple):
@@ -85,30 +85,30 @@ class Trace(NamedTuple):
     values: np.ndarray
 
     @property
-    def name(self) -> str:
+    def legend_name(self) -> str:
         """Name in a legend: the axis, or `supply`."""
         return self.channel.axis or "supply"
 
 
-def shown(log: Log, name: str) -> Trace:
+def scaled_channel(log: Log, name: str) -> Trace:
     """Return a channel of a log, scaled for a plot.
 
     Raises:
         InputError: the log has no such channel.
     """
     channel, values = parse_channel(name), log[name]
-    if channel.kind in _PLAIN and log.units[name] != "rad":
+    if channel.kind in _UNSCALED_KINDS and log.units[name] != "rad":
         return Trace(channel, log.units[name], values)
     unit, factor = axis_unit(log.units[name])
     return Trace(channel, unit, values * factor)
 
 
-def grouped(names: Iterable[str]) -> dict[str, list[str]]:
+def group_channels(names: Iterable[str]) -> dict[str, list[str]]:
     """Group channel names by kind, in the order of the signal path.
 
     A truth channel is in the group of its kind. It is omitted if the same channel was measured.
 
-    >>> grouped(["angle.boom", "truth.angle.boom", "command.boom", "truth.flow_head.boom"])
+    >>> group_channels(["angle.boom", "truth.angle.boom", "command.boom", "truth.flow_head.boom"])
     {'command': ['command.boom'], 'flow_head': ['truth.flow_head.boom'], 'angle': ['angle.boom']}
     """
     names = list(names)
@@ -156,7 +156,7 @@ def difference(first: Log, other: Log, name: str) -> tuple[np.ndarray, Trace]:
             f" {first.time[0]:.3f} to {first.time[-1]:.3f} s: shift one of them to a common clock",
         )
     time = first.time[inside]
-    ours, theirs = shown(first, name), shown(other, name)
+    ours, theirs = scaled_channel(first, name), scaled_channel(other, name)
     values = ours.values[inside] - np.interp(time, other.time, theirs.values)
     return time, ours._replace(values=values)
 
@@ -174,6 +174,6 @@ def padded_range(values: Iterable[np.ndarray], unit: str) -> tuple[float, float]
     values = [v for v in values if len(v)]
     low = min((float(v.min()) for v in values), default=0.0)
     high = max((float(v.max()) for v in values), default=0.0)
-    lacking = _SMALLEST_SPANS.get(unit, 1e-3) - (high - low)
+    lacking = _MIN_PLOT_RANGES.get(unit, 1e-3) - (high - low)
     room = max(0.05 * (high - low), 0.5 * lacking)
     return low - room, high + room

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import hydrotele
-from hydrotele.experiments.comparison import Comparison, Panel, summarize
+from hydrotele.experiments.comparison import Comparison, Panel, summarize_verdicts
 from hydrotele.show import report_html
-from hydrotele.show.calibration_report import corner
-from hydrotele.show.report_html import drawing, png, svg
+from hydrotele.show.calibration_report import draw_posterior
+from hydrotele.show.report_html import png, report_figure, svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,9 +24,9 @@ _STYLES = (
 )  # fmt: skip
 """Colour, line style and marker of each curve; distinguishable in black-and-white print."""
 _MAX_POINTS = 4000  # maximum number of points per curve; more are not visible
-_INCHES = 1.9  # inch, height of one panel
-_LABEL = 24  # characters per line of an axis label
-_MANY = 60  # number of points from which markers are smaller
+_PANEL_HEIGHT = 1.9  # inch, height of one panel
+_LABEL_WIDTH = 24  # characters per line of an axis label
+_MIN_POINTS_SMALL_MARKER = 60  # number of points from which markers are smaller
 
 
 class ReportFigure(NamedTuple):
@@ -47,9 +47,7 @@ class ReportFigure(NamedTuple):
     svg: bytes | None
 
 
-def write_experiment_report(
-    title: str, rows: Sequence[Comparison], drawings: Mapping[str, str], folder: Path
-) -> None:
+def write_experiment_report(title: str, rows: Sequence[Comparison], drawings: Mapping[str, str], folder: Path) -> None:
     """Write `report.html`, and `figures/` with an SVG and a PNG per figure and `captions.md`.
 
     Args:
@@ -70,7 +68,7 @@ def write_experiment_report(
         (folder / "figures" / "captions.md").write_text("\n".join(captions) + "\n", "utf-8")
     report_html.write_report(
         "experiments", folder / "report.html", title=f"Experiments of {title}",
-        version=hydrotele.__version__, document=title, summary=summarize(rows),
+        version=hydrotele.__version__, document=title, summary=summarize_verdicts(rows),
         counted=[row for row in rows if row.kind != "input"],
         inputs=[row for row in rows if row.kind == "input"],
         drawings=list(drawings.items()), figures=figures,
@@ -85,10 +83,10 @@ def draw_figures(rows: Sequence[Comparison]) -> list[ReportFigure]:
         if row.panels:
             made = draw_panels(row.panels)
             stem = f"{len(figures) + 1:02d}-{slug}"
-            figures.append(ReportFigure(row, stem, _caption(row, _describe(row.panels)), *made))
+            figures.append(ReportFigure(row, stem, _caption(row, _describe_panels(row.panels)), *made))
         if row.marginals:
             shown = row.marginals
-            picture = corner(shown.sample, shown.names, shown.truth, "truth", shown.unit)
+            picture = draw_posterior(shown.sample, shown.names, shown.truth, "truth", shown.unit)
             stem = f"{len(figures) + 1:02d}-{slug}-posterior"
             what = f"Posterior of {', '.join(shown.names)} [{shown.unit}]; lines: truth."
             figures.append(ReportFigure(row, stem, _caption(row, what), picture, None))
@@ -99,7 +97,7 @@ def _caption(row: Comparison, what: str) -> str:
     return f"{row.name[:1].upper()}{row.name[1:]} ({row.item}). {what}"
 
 
-def _describe(panels: Sequence[Panel]) -> str:
+def _describe_panels(panels: Sequence[Panel]) -> str:
     labels = dict.fromkeys(panel.label.split(" [")[0] for panel in panels)
     across = dict.fromkeys(panel.x_label.split(" [")[0] for panel in panels)
     return f"First repetition, plotted over {', '.join(across)}: {'; '.join(labels)}."
@@ -116,7 +114,7 @@ def draw_panels(panels: Sequence[Panel]) -> tuple[bytes, bytes]:
     """
     rows = [(panel, error) for panel in panels for error in (False, True)
             if not error or panel.errors]  # fmt: skip
-    with drawing(0.5 + _INCHES * len(rows)) as figure:
+    with report_figure(0.5 + _PANEL_HEIGHT * len(rows)) as figure:
         shared = len({panel.x_label for panel in panels}) == 1
         axes = figure.subplots(len(rows), 1, sharex=shared, squeeze=False)[:, 0]
         for (panel, error), place in zip(rows, axes, strict=True):
@@ -128,21 +126,21 @@ def draw_panels(panels: Sequence[Panel]) -> tuple[bytes, bytes]:
         return png(figure), svg(figure)
 
 
-def _draw_curves(place: "Axes", panel: Panel, error: bool) -> None:
-    curves = panel.errors if error else panel.curves
+def _draw_curves(place: "Axes", panel: Panel, draws_errors: bool) -> None:
+    curves = panel.errors if draws_errors else panel.curves
     every = max(1, len(panel.x) // _MAX_POINTS)
     order = list(dict.fromkeys([*panel.curves, *panel.errors]))
     for label, curve in curves.items():
         colour, line, marker = _STYLES[order.index(label) % len(_STYLES)]
         look = (
-            {"ls": "none", "marker": marker, "ms": 4.0 if len(curve) < _MANY else 2.0,
+            {"ls": "none", "marker": marker, "ms": 4.0 if len(curve) < _MIN_POINTS_SMALL_MARKER else 2.0,
              "mfc": "none"} if panel.discrete
-            else {"ls": "-" if error else line, "lw": 1.2}
+            else {"ls": "-" if draws_errors else line, "lw": 1.2}
         )  # fmt: skip
         place.plot(panel.x[::every], curve[::every], color=colour, label=label, **look)
-    name, _, unit = (panel.error_label if error else panel.label).rpartition(" [")
-    place.set_ylabel("\n".join([*textwrap.wrap(name, _LABEL), f"[{unit}"]) if name else unit)
-    if panel.log and not error:
+    name, _, unit = (panel.error_label if draws_errors else panel.label).rpartition(" [")
+    place.set_ylabel("\n".join([*textwrap.wrap(name, _LABEL_WIDTH), f"[{unit}"]) if name else unit)
+    if panel.log and not draws_errors:
         place.set_yscale("log")
-    if len(curves) > 1 or error:
+    if len(curves) > 1 or draws_errors:
         place.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)

@@ -18,22 +18,22 @@ from hydrotele.gap.patched import has_patch
 from hydrotele.gap.result import Gap, Prediction
 from hydrotele.logs.dataset import RunData
 from hydrotele.logs.log import Log
-from hydrotele.machine.signals import parse_channel, usual_unit
+from hydrotele.machine.signals import default_unit, parse_channel
 from hydrotele.show.channels import padded_range
 from hydrotele.show.recording import (
     Scene,
     _log_machines,
     _machine_view,
-    entity,
-    recording_file,
+    entity_path,
+    open_recording,
     time_column,
 )
 
-WINDOW = 0.5  # s, duration of a window
-_FALSE_ALARMS = 1e-3  # probability that a perfect model has any gap window in a run
+WINDOW_DURATION = 0.5  # s, duration of a window
+_FALSE_ALARM_PROBABILITY = 1e-3  # probability that a perfect model has any gap window in a run
 
 
-class Windows(NamedTuple):
+class WindowedErrors(NamedTuple):
     """RMS of whitened prediction errors in windows of equal length.
 
     Attributes:
@@ -52,18 +52,18 @@ class GapWindow(NamedTuple):
 
     Attributes:
         start: start time [s].
-        end: end time [s].
+        stop: end time [s].
         channel: channel with the largest error.
         rms: RMS of its whitened errors in the worst window [1].
     """
 
     start: float
-    end: float
+    stop: float
     channel: str
     rms: float
 
 
-def windowed(prediction: Prediction, window: float = WINDOW) -> Windows:
+def windowed_errors(prediction: Prediction, window: float = WINDOW_DURATION) -> WindowedErrors:
     """Return the RMS of the whitened errors in windows of about `window` seconds."""
     time = prediction.time
     period = float(np.median(np.diff(time)))
@@ -78,7 +78,7 @@ def windowed(prediction: Prediction, window: float = WINDOW) -> Windows:
     total = np.add.reduceat(squares, starts, axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
         rms = np.sqrt(total / count)
-    return Windows(edges, rms, count)
+    return WindowedErrors(edges, rms, count)
 
 
 def channel_rms(prediction: Prediction) -> np.ndarray:
@@ -104,9 +104,9 @@ def gap_windows(prediction: Prediction, noise_floor: float) -> list[GapWindow]:
     """
     from scipy.stats import chi2
 
-    found = windowed(prediction)
+    found = windowed_errors(prediction)
     known = found.count > 0
-    chance = _FALSE_ALARMS / max(1, known.sum())
+    chance = _FALSE_ALARM_PROBABILITY / max(1, known.sum())
     counts = np.maximum(found.count, 1)
     limit = noise_floor * np.sqrt(chi2.isf(chance, counts) / counts)
     size = np.where(known, found.rms, 0.0)
@@ -125,7 +125,7 @@ def gap_windows(prediction: Prediction, noise_floor: float) -> list[GapWindow]:
     return stretches
 
 
-def most_changed(before: Prediction, after: Prediction, count: int) -> list[str]:
+def most_changed_channels(before: Prediction, after: Prediction, count: int) -> list[str]:
     """Return the `count` channels with the largest decrease of the mean square error.
 
     If both predictions are equal, the channels with the largest mean square error are returned.
@@ -139,12 +139,12 @@ def most_changed(before: Prediction, after: Prediction, count: int) -> list[str]
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
 
-_LEAST_ERROR = 4.0  # times noise, minimum range of a plot of whitened errors
+_MIN_ERROR_RANGE = 4.0  # times noise, minimum range of a plot of whitened errors
 
 
 def gap_blueprint(
     scene: Scene, before: Prediction, models: Mapping[str, tuple[Prediction, Any]],
-    worst: Sequence[str],
+    channels: Sequence[str],
 ) -> "rrb.Blueprint":  # fmt: skip
     """Create the layout of a gap recording: machine and gap windows left, tabs of plots right.
 
@@ -152,7 +152,7 @@ def gap_blueprint(
         scene: 3D view.
         before: prediction of the given model.
         models: {`nominal` or `patched`: (prediction, any value)}.
-        worst: channels of the first tab.
+        channels: channels of the first tab.
 
     Returns:
         The blueprint; the time panel is paused on the timeline `time`.
@@ -164,19 +164,19 @@ def gap_blueprint(
         rrb.TextLogView(name="gap windows", origin="/gap/text"),
         row_shares=[3, 1],
     )
-    first = [_sizes(models)]
-    for channel in worst:
-        first += [_signal(before, models, channel, legend=channel == worst[0])]
-        first += [_errors(models, channel)]
-    shares = [1.2, *([1.3, 0.8] * len(worst))]
+    first = [_rms_view(models)]
+    for channel in channels:
+        first += [_channel_view(before, models, channel, legend=channel == channels[0])]
+        first += [_error_view(models, channel)]
+    shares = [1.2, *([1.3, 0.8] * len(channels))]
     tabs: list[Any] = [rrb.Vertical(*first, name="Gap", row_shares=shares)]
     axes = dict.fromkeys(parse_channel(channel).axis for channel in before.channels)
     for axis in axes:
         mine = [c for c in before.channels if parse_channel(c).axis == axis]
-        views = [_signal(before, models, c, legend=c == mine[0]) for c in mine]
+        views = [_channel_view(before, models, c, legend=c == mine[0]) for c in mine]
         command = [_command(axis)] if axis else []
         tabs.append(rrb.Vertical(*command, *views, name=axis or "supply"))
-    errors = [_errors(models, channel) for channel in before.channels]
+    errors = [_error_view(models, channel) for channel in before.channels]
     tabs.append(rrb.Grid(*errors, grid_columns=2, name="Residuals"))
     tabs.append(rrb.TextDocumentView(name="Verdict", origin="/about"))
     return rrb.Blueprint(
@@ -188,27 +188,27 @@ def gap_blueprint(
     )
 
 
-def _sizes(models) -> "rrb.TimeSeriesView":
+def _rms_view(models) -> "rrb.TimeSeriesView":
     paths = [f"/gap/{name}" for name in models]
     title = "RMS prediction error [x noise]; red: gap windows"
     return _view(title, [*paths, "/gap/perfect", "/gap/window"], None, legend=True)
 
 
-def _signal(before: Prediction, models, channel: str, legend: bool) -> "rrb.TimeSeriesView":
-    unit, factor = axis_unit(usual_unit(channel))
+def _channel_view(before: Prediction, models, channel: str, legend: bool) -> "rrb.TimeSeriesView":
+    unit, factor = axis_unit(default_unit(channel))
     column = before.channels.index(channel)
     values = [before.measured[:, column], *(p.predicted[:, column] for p, _ in models.values())]
     span = padded_range([factor * v[np.isfinite(v)] for v in values], unit)
-    paths = [entity(name, channel) for name in ("measured", *models)]
+    paths = [entity_path(name, channel) for name in ("measured", *models)]
     return _view(f"{channel_words(channel)} [{unit}]", paths, span, legend)
 
 
-def _errors(models, channel: str) -> "rrb.TimeSeriesView":
+def _error_view(models, channel: str) -> "rrb.TimeSeriesView":
     column = next(iter(models.values()))[0].channels.index(channel)
     values = [p.whitened[:, column] for p, _ in models.values()]
     largest = max(np.nanmax(np.abs(v), initial=0.0) for v in values)
-    span = 1.05 * max(_LEAST_ERROR, float(largest))
-    paths = [entity(f"residual/{name}", channel) for name in models]
+    span = 1.05 * max(_MIN_ERROR_RANGE, float(largest))
+    paths = [entity_path(f"residual/{name}", channel) for name in models]
     title = f"{channel_words(channel)}, error [x noise]"
     return _view(title, paths, (-span, span), legend=False)
 
@@ -217,9 +217,7 @@ def _command(axis: str) -> "rrb.TimeSeriesView":
     return _view(f"{axis} command", [f"/command/{axis}"], None, legend=False)
 
 
-def _view(
-    title: str, paths: Sequence[str], span: tuple[float, float] | None, legend: bool
-) -> "rrb.TimeSeriesView":
+def _view(title: str, paths: Sequence[str], span: tuple[float, float] | None, legend: bool) -> "rrb.TimeSeriesView":
     import rerun.blueprint as rrb
 
     return rrb.TimeSeriesView(
@@ -232,14 +230,12 @@ def _view(
     )
 
 
-_MEASURED, _NOMINAL, _PATCHED = (205, 210, 216), (240, 150, 0), (86, 160, 233)
-_LOUD, _FLOOR = (225, 70, 60), (120, 128, 136)
+_MEASURED_COLOUR, _NOMINAL_COLOUR, _PATCHED_COLOUR = (205, 210, 216), (240, 150, 0), (86, 160, 233)
+_WINDOW_COLOUR, _FLOOR_COLOUR = (225, 70, 60), (120, 128, 136)
 _WIDTHS = {"measured": 3.0, "nominal": 1.4, "patched": 1.4}
 
 
-def write_gap_recording(
-    path: str | os.PathLike, gap: Gap, run: RunData, axes: Sequence[str]
-) -> None:
+def write_gap_recording(path: str | os.PathLike, gap: Gap, run: RunData, axes: Sequence[str]) -> None:
     """Write the held-out run of a gap to one `.rrd` file, completely or not at all.
 
     Args:
@@ -253,24 +249,24 @@ def write_gap_recording(
             written.
     """
     before, after = gap.before[0], gap.after[0]
-    models = {"nominal": (before, _NOMINAL)}
+    models = {"nominal": (before, _NOMINAL_COLOUR)}
     if has_patch(gap):
-        models["patched"] = (after, _PATCHED)
+        models["patched"] = (after, _PATCHED_COLOUR)
     windows = gap_windows(before, gap.size.noise_floor or gap.size.before)
     identity = f"hydrotele gap {gap.machine.name} {gap.machine.tool}"
-    with recording_file(path, identity) as out:
+    with open_recording(path, identity) as out:
         out.send_recording_name(f"{gap.machine.name} {before.run}: {headline(gap)}")
-        scene = _log_machines(out, {"measured": (gap.machine, _filled(before, run))})
+        scene = _log_machines(out, {"measured": (gap.machine, _interpolated_log(before, run))})
         _log_commands(out, run, axes)
         _log_channels(out, models)
-        _log_sizes(out, models, gap.size.noise_floor)
+        _log_rms(out, models, gap.size.noise_floor)
         _log_windows(out, gap, windows, before)
-        out.log("about", _about(gap), static=True)
-        worst = most_changed(before, after, 2)
+        out.log("about", _verdict_document(gap), static=True)
+        worst = most_changed_channels(before, after, 2)
         out.send_blueprint(gap_blueprint(scene, before, models, worst))
 
 
-def _filled(prediction: Prediction, run: RunData) -> Log:
+def _interpolated_log(prediction: Prediction, run: RunData) -> Log:
     """Return the measurements as a log; missing samples are interpolated for the 3D view."""
     columns = {}
     for k, channel in enumerate(prediction.channels):
@@ -278,7 +274,7 @@ def _filled(prediction: Prediction, run: RunData) -> Log:
         known = np.isfinite(values)
         if known.any():
             columns[channel] = np.interp(prediction.time, prediction.time[known], values[known])
-    units = {channel: usual_unit(channel) for channel in columns}
+    units = {channel: default_unit(channel) for channel in columns}
     return Log(prediction.time, columns, units, run.log.metadata, run.log.source)
 
 
@@ -288,7 +284,7 @@ def _log_commands(out, run: RunData, axes: Sequence[str]) -> None:
     time = run.start + run.period * np.arange(len(run.command))
     for k, axis in enumerate(axes):
         path = f"/command/{axis}"
-        out.log(path, _style(_MEASURED, f"command {axis}", 1.4), static=True)
+        out.log(path, _style(_MEASURED_COLOUR, f"command {axis}", 1.4), static=True)
         columns = rr.Scalars.columns(scalars=run.command[:, k])
         out.send_columns(path, [time_column(time)], columns)
 
@@ -297,22 +293,22 @@ def _log_channels(out, models) -> None:
     """Log measurements, predictions and whitened errors, without missing samples."""
     before, _ = models["nominal"]
     for k, channel in enumerate(before.channels):
-        unit, factor = axis_unit(usual_unit(channel))
-        lines = {"measured": (before.measured[:, k], _MEASURED)}
+        unit, factor = axis_unit(default_unit(channel))
+        lines = {"measured": (before.measured[:, k], _MEASURED_COLOUR)}
         for name, (prediction, colour) in models.items():
             lines[name] = (prediction.predicted[:, k], colour)
             error = prediction.whitened[:, k]
-            path = entity(f"residual/{name}", channel)
+            path = entity_path(f"residual/{name}", channel)
             _send(out, path, prediction.time, error, _style(colour, f"{name} [x noise]", 1.2))
         for name, (values, colour) in lines.items():
             style = _style(colour, f"{name} [{unit}]", _WIDTHS[name])
-            _send(out, entity(name, channel), before.time, factor * values, style)
+            _send(out, entity_path(name, channel), before.time, factor * values, style)
 
 
-def _log_sizes(out, models, floor: float | None) -> None:
+def _log_rms(out, models, floor: float | None) -> None:
     """Log the windowed RMS error over all channels, for each model and for a perfect model."""
     for name, (prediction, colour) in models.items():
-        found = windowed(prediction)
+        found = windowed_errors(prediction)
         total = np.nansum(found.rms**2 * found.count, axis=1)
         size = np.sqrt(total / np.maximum(found.count.sum(axis=1), 1))
         middle = 0.5 * (found.edges[:-1] + found.edges[1:])
@@ -320,22 +316,25 @@ def _log_sizes(out, models, floor: float | None) -> None:
     if floor is None:
         return
     ends = models["nominal"][0].time[[0, -1]]
-    _send(out, "/gap/perfect", ends, np.full(2, floor), _style(_FLOOR, "perfect model", 1.2))
+    _send(out, "/gap/perfect", ends, np.full(2, floor), _style(_FLOOR_COLOUR, "perfect model", 1.2))
 
 
 def _log_windows(out, gap: Gap, windows: Sequence[GapWindow], before: Prediction) -> None:
     """Log the gap windows of the given model as a thick red line at zero and as texts."""
     import rerun as rr
 
-    time = np.array([t for w in windows for t in (w.start, w.end, w.end + 1e-6)])
+    time = np.array([t for w in windows for t in (w.start, w.stop, w.stop + 1e-6)])
     level = np.array([v for _ in windows for v in (0.0, 0.0, np.nan)])
     name = "significant error of the given model"
-    out.log("/gap/window", _style(_LOUD, name, 7.0), static=True)
+    out.log("/gap/window", _style(_WINDOW_COLOUR, name, 7.0), static=True)
     if len(time):
         columns = rr.Scalars.columns(scalars=level)
         out.send_columns("/gap/window", [time_column(time)], columns)
     said = [
-        (w.start, f"{w.start:.1f} to {w.end:.1f} s: {channel_words(w.channel)} {w.rms:.1f} x noise")
+        (
+            w.start,
+            f"{w.start:.1f} to {w.stop:.1f} s: {channel_words(w.channel)} {w.rms:.1f} x noise",
+        )
         for w in windows
     ]
     if gap.unknown:
@@ -365,7 +364,7 @@ def _style(colour: tuple[int, int, int], name: str, width: float):
     return rr.SeriesLines(colors=colour, names=name, widths=width, aggregation_policy=peaks)
 
 
-def _about(gap: Gap):
+def _verdict_document(gap: Gap):
     import rerun as rr
 
     laws = [f"- {learned_title(law)}: `{law.formula}` [{law.unit}]" for law in gap.learned]

@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 
 import hydrotele
-from hydrotele.core.units import axis_unit, customary
+from hydrotele.core.units import axis_unit, display_unit
 from hydrotele.effects import EFFECTS
 from hydrotele.gap.description import (
     channel_words,
@@ -43,16 +43,16 @@ from hydrotele.gap.result import (
     in_customary_units,
 )
 from hydrotele.machine.machine import Machine
-from hydrotele.machine.signals import usual_unit
+from hydrotele.machine.signals import default_unit
 from hydrotele.show import report_html
 from hydrotele.show.channels import padded_range
-from hydrotele.show.gap_recording import channel_rms, most_changed, windowed
-from hydrotele.show.report_html import drawing, dumbbell, interval, png
+from hydrotele.show.gap_recording import channel_rms, most_changed_channels, windowed_errors
+from hydrotele.show.report_html import png, report_figure, scale_dumbbell, scale_interval
 
-_CANDIDATES = 12
-_DARKEST = 10.0  # times sensor noise at which the colour of a cell is darkest
-_CHANNELS = 4
-_CHIPS = {
+_MAX_RANKED_EFFECTS = 12
+_MAX_COLOUR_RATIO = 10.0  # times sensor noise at which the colour of a cell is darkest
+_MAX_PLOTTED_CHANNELS = 4
+_VERDICT_LABELS = {
     "named": "Effect identified",
     "no_gap": "No gap",
     "ambiguous": "Ambiguous",
@@ -76,21 +76,21 @@ def write_report(gap: Gap, path: str | Path) -> None:
         over += f"  ·  held-out run {gap.before[0].run}" + (f", fitted on {runs}" if runs else "")
     report_html.write_report(
         "gap", path, title=f"{gap.machine.name}: {headline(gap)}", over=over, heading=headline(gap),
-        chip=(gap.verdict, _CHIPS[gap.verdict]), figures=_figures(gap), verdict=verdict_words(gap),
-        found=_found(gap), calibrated=_calibrated(gap), learned=[*map(_learned, gap.learned)],
-        unknown=_unknown(gap), lacks=_lacks(gap), patched=patched,
-        run=gap.before[0].run if gap.before else "", proof=_proof(gap) if gap.before else None,
+        chip=(gap.verdict, _VERDICT_LABELS[gap.verdict]), figures=_figures(gap), verdict=verdict_words(gap),
+        found=_effect_rows(gap), calibrated=_calibration_rows(gap), learned=[*map(_law_content, gap.learned)],
+        unknown=_unknown_content(gap), lacks=_residual_input_rows(gap), patched=patched,
+        run=gap.before[0].run if gap.before else "", proof=_validation_content(gap) if gap.before else None,
         laws=_laws(gap, patched) if gap.laws else None,
         heat_map=draw_heat_map(gap.before[0], gap.after[0], patched) if gap.before else None,
-        ranking=_ranking(gap), unlisted=len(gap.ranking) - _CANDIDATES, tests=_tests(gap),
-        proof_words=_PROOF[mechanism].format(gap.before[0].run if gap.before else ""),
+        ranking=_ranking(gap), unlisted=len(gap.ranking) - _MAX_RANKED_EFFECTS, tests=_tests(gap),
+        proof_words=_VALIDATION_TEXTS[mechanism].format(gap.before[0].run if gap.before else ""),
         commands=_COMMANDS[mechanism], open_loop=_open_loop(gap),
-        noise=_noise(gap), rivals=_rivals(gap), experiment=_experiment(gap), notes=gap.notes,
+        noise=_noise(gap), rivals=_alternative_rows(gap), experiment=_experiment(gap), notes=gap.notes,
         version=hydrotele.__version__, seconds=f"{gap.seconds:.0f}",
     )  # fmt: skip
 
 
-_PROOF = {
+_VALIDATION_TEXTS = {
     False: "RMS one-step prediction errors on run {}, which was not fitted, divided by the sensor"
     " noise (lower is better). From the measurements up to a row, the model predicts those of the"
     " next row. A perfect model has the value 1.0, which is sensor noise alone.",
@@ -135,11 +135,11 @@ def _figures(gap: Gap) -> list[tuple[str, str, str]]:
     return cards
 
 
-def _to_scale(estimate: Estimate) -> report_html.Interval | None:
-    return interval(estimate.value, estimate.low, estimate.high, estimate.nominal)
+def _scale_interval(estimate: Estimate) -> report_html.Interval | None:
+    return scale_interval(estimate.value, estimate.low, estimate.high, estimate.nominal)
 
 
-def _found(gap: Gap) -> list[dict[str, Any]]:
+def _effect_rows(gap: Gap) -> list[dict[str, Any]]:
     rows = []
     for effect in gap.effects:
         for name, estimate in effect.parameters.items():
@@ -148,23 +148,23 @@ def _found(gap: Gap) -> list[dict[str, Any]]:
                 "effect": effect_title(effect),
                 "texts": (name.replace("_", " "), s.nominal, s.value, f"{s.low} to {s.high}",
                            s.unit),
-                "drawn": _to_scale(estimate),
+                "drawn": _scale_interval(estimate),
                 "trust": (probability_text(effect.probability), share_words(effect.share)),
             })  # fmt: skip
     return rows
 
 
-def _calibrated(gap: Gap) -> list[dict[str, Any]]:
+def _calibration_rows(gap: Gap) -> list[dict[str, Any]]:
     """Return the calibrated parameters with their intervals, the largest changes first."""
     rows = []
     for key in most_moved(gap) if gap.calibration else ():
         s = in_customary_units(gap.calibration[key], key)
         values = (number_title(key), s.nominal, s.value, f"{s.low} to {s.high}", s.unit)
-        rows.append({"texts": values, "drawn": _to_scale(gap.calibration[key])})
+        rows.append({"texts": values, "drawn": _scale_interval(gap.calibration[key])})
     return rows
 
 
-def _learned(law: LearnedLaw) -> dict[str, Any]:
+def _law_content(law: LearnedLaw) -> dict[str, Any]:
     share = f" It closes {share_words(law.share)} of the gap on the held-out run."
     return {
         "title": learned_title(law), "unit": law.unit, "formula": law.formula,
@@ -173,7 +173,7 @@ def _learned(law: LearnedLaw) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _unknown(gap: Gap) -> dict[str, Any] | None:
+def _unknown_content(gap: Gap) -> dict[str, Any] | None:
     unknown = gap.unknown
     if unknown is None:
         return None
@@ -187,7 +187,7 @@ def _unknown(gap: Gap) -> dict[str, Any] | None:
     return {"description": unknown.description, "facts": facts}
 
 
-def _lacks(gap: Gap) -> list[tuple[str, str, float]]:
+def _residual_input_rows(gap: Gap) -> list[tuple[str, str, float]]:
     """Return the residual forces, flows and commands of the patched model, the largest first."""
     return [
         (lack_words(lack), f"{100 * lack.part:.2g} %", lack.part / gap.lacks[0].part)
@@ -195,13 +195,13 @@ def _lacks(gap: Gap) -> list[tuple[str, str, float]]:
     ]  # fmt: skip
 
 
-def _proof(gap: Gap) -> dict[str, Any]:
+def _validation_content(gap: Gap) -> dict[str, Any]:
     before, after, patched = gap.before[0], gap.after[0], has_patch(gap)
     return {
         "channels": _channels(before, after if patched else None),
         "pictures": [
-            (channel_words(name), draw_overlay(before, after, name, patched))
-            for name in most_changed(before, after, _CHANNELS)
+            (channel_words(name), draw_channel(before, after, name, patched))
+            for name in most_changed_channels(before, after, _MAX_PLOTTED_CHANNELS)
         ],
     }
 
@@ -217,15 +217,15 @@ def _channels(before: Prediction, after: Prediction | None) -> list[dict[str, An
         known = math.isfinite(b)
         sizes = [f"{b:.2f}" if known else "not measured"]
         sizes += [f"{a:.2f}" if known else ""] if after else []
-        drawn = dumbbell(float(b), float(a) if after else None, low, high) if known else None
+        drawn = scale_dumbbell(float(b), float(a) if after else None, low, high) if known else None
         rows.append({"texts": (channel_words(channel), *sizes), "drawn": drawn})
     return rows
 
 
-def _laws(gap: Gap, changed: bool) -> dict[str, Any]:
+def _laws(gap: Gap, is_patched: bool) -> dict[str, Any]:
     """Return the residuals of each law at each component, in multiples of the sensor noise."""
     places = list(dict.fromkeys(place for by_place in gap.laws.values() for place in by_place))
-    keys = {"before": "given", "after": "patched"} if changed else {"before": "given"}
+    keys = {"before": "given", "after": "patched"} if is_patched else {"before": "given"}
     rows = []
     for law, by_place in gap.laws.items():
         unit = gap.law_units.get(law, "1")
@@ -241,12 +241,16 @@ def _law_cell(residual: Mapping[str, float] | None, key: str, unit: str) -> dict
     size = amount(value, unit)
     if not (math.isfinite(noise) and noise > 0):
         return {"ratio": "-", "size": size, "colour": ""}
-    return {"ratio": f"{value / noise:.1f} ×", "size": size, "colour": _heat(value / noise)}
+    return {
+        "ratio": f"{value / noise:.1f} ×",
+        "size": size,
+        "colour": _residual_colour(value / noise),
+    }
 
 
-def _heat(ratio: float) -> str:
+def _residual_colour(ratio: float) -> str:
     """Return the cell colour of a residual: white at the noise level, then amber, then red."""
-    part = min(max(math.log(max(ratio, 1e-9) / 1.2) / math.log(_DARKEST / 1.2), 0.0), 1.0)
+    part = min(max(math.log(max(ratio, 1e-9) / 1.2) / math.log(_MAX_COLOUR_RATIO / 1.2), 0.0), 1.0)
     stops = ((255, 255, 255), (253, 226, 170), (240, 160, 110))
     low, high = (stops[0], stops[1]) if part < 0.5 else (stops[1], stops[2])
     mix = 2 * part if part < 0.5 else 2 * part - 1
@@ -255,7 +259,7 @@ def _heat(ratio: float) -> str:
 
 def _ranking(gap: Gap) -> list[dict[str, Any]]:
     """Return the single effects, ordered by their net gain in log likelihood."""
-    shown = gap.ranking[:_CANDIDATES]
+    shown = gap.ranking[:_MAX_RANKED_EFFECTS]
     best = max((c.gain - c.charge for c in shown), default=1.0)
     named = {(effect.name, effect.location) for effect in gap.effects}
     rows = []
@@ -264,13 +268,13 @@ def _ranking(gap: Gap) -> list[dict[str, Any]]:
         rows.append({
             "place": place, "title": effect_title(candidate), "gain": f"{net:,.0f}",
             "named": (candidate.name, candidate.location) in named,
-            "best": ", ".join(_value(gap, candidate, name) for name in candidate.parameters),
+            "best": ", ".join(_format_parameter(gap, candidate, name) for name in candidate.parameters),
             "part": net / best if best > 0 else 0.0,
         })  # fmt: skip
     return rows
 
 
-def _value(gap: Gap, candidate: Candidate, name: str) -> str:
+def _format_parameter(gap: Gap, candidate: Candidate, name: str) -> str:
     value, label = candidate.parameters[name], name.replace("_", " ")
     effect = EFFECTS.get(candidate.name)
     facts = {}
@@ -283,12 +287,17 @@ def _value(gap: Gap, candidate: Candidate, name: str) -> str:
 def _tests(gap: Gap) -> list[tuple[str, str, str, bool]]:
     """Return name, value, limit and result of the residual tests of the final model."""
     return [
-        (name, _plain(test.get("value")), _plain(test.get("limit")), bool(test.get("passed")))
+        (
+            name,
+            _format_number(test.get("value")),
+            _format_number(test.get("limit")),
+            bool(test.get("passed")),
+        )
         for name, test in gap.tests.items()
     ]
 
 
-def _plain(value: Any) -> str:
+def _format_number(value: Any) -> str:
     return f"{value:.3g}" if isinstance(value, int | float) and math.isfinite(value) else "-"
 
 
@@ -296,14 +305,14 @@ def _noise(gap: Gap) -> list[tuple[str, str, str, str]]:
     """Return the noise standard deviations per channel: estimated and stated by the machine."""
     rows = []
     for channel, (found, stated) in gap.noise.items():
-        unit, known = usual_unit(channel), math.isfinite(stated)
+        unit, known = default_unit(channel), math.isfinite(stated)
         ratio = f"{found / stated:.2f}" if known and stated > 0 else "-"
         rows.append((channel_words(channel), amount(found, unit),
                      amount(stated, unit) if known else "not stated", ratio))  # fmt: skip
     return rows
 
 
-def _rivals(gap: Gap) -> list[tuple[str, ...]]:
+def _alternative_rows(gap: Gap) -> list[tuple[str, ...]]:
     return [
         (effect_title(e), effect_title(a), probability_text(e.probability),
          probability_text(a.probability))
@@ -323,39 +332,45 @@ def _experiment(gap: Gap) -> dict[str, str] | None:
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-MEASURED, NOMINAL, PATCHED = "#262b33", "#e07b00", "#1769aa"
-_ADDED = {"force": "force", "command": "command"} | dict.fromkeys(
+MEASURED_COLOUR, NOMINAL_COLOUR, PATCHED_COLOUR = "#262b33", "#e07b00", "#1769aa"
+_ADDED_QUANTITIES = {"force": "force", "command": "command"} | dict.fromkeys(
     ("flow_head", "flow_rod", "flow_through", "flow_supply"), "flow"
 )
-_ZOOM = 2.0  # s, duration of the enlarged interval
-_LITTLE = 0.5  # value in the customary unit below which the SI unit is used, such as N for kN
-_LOUDEST = 6.0  # times sensor noise, maximum upper limit of the colour scale
+_ZOOM_DURATION = 2.0  # s, duration of the enlarged interval
+_MIN_CUSTOMARY_VALUE = 0.5  # value in the customary unit below which the SI unit is used, such as N for kN
+_MAX_HEAT_MAP_RATIO = 6.0  # times sensor noise, maximum upper limit of the colour scale
 
 
-def draw_heat_map(before: Prediction, after: Prediction, changed: bool) -> bytes:
+def draw_heat_map(before: Prediction, after: Prediction, is_patched: bool) -> bytes:
     """Channels over time: size of the whitened errors in windows, before and after.
 
     Args:
         before: predictions of the given model.
         after: predictions of the patched model.
-        changed: whether the models differ; otherwise only the first is drawn.
+        is_patched: whether the models differ; otherwise only the first is drawn.
 
     Returns:
         A PNG.
     """
-    pairs = [("given model", before), *([("patched model", after)] if changed else [])]
+    pairs = [("given model", before), *([("patched model", after)] if is_patched else [])]
     labels = [channel_words(channel) for channel in before.channels]
-    loudest = np.nanpercentile(windowed(before).rms, 99.5)
-    top = float(np.clip(np.ceil(loudest), 2.0, _LOUDEST))
-    with drawing(0.24 * len(labels) + 1.3) as figure:
+    loudest = np.nanpercentile(windowed_errors(before).rms, 99.5)
+    top = float(np.clip(np.ceil(loudest), 2.0, _MAX_HEAT_MAP_RATIO))
+    with report_figure(0.24 * len(labels) + 1.3) as figure:
         rows = figure.subplots(1, len(pairs), sharey=True, squeeze=False)[0]
         meshes = []
         for axes, (title, prediction) in zip(rows, pairs, strict=True):
-            found = windowed(prediction)
+            found = windowed_errors(prediction)
             places = np.arange(len(labels) + 1)
             size = np.ma.masked_invalid(found.rms.T)
             mesh = axes.pcolormesh(
-                found.edges, places, size, cmap=_colours(top), vmin=0.0, vmax=top, linewidth=0
+                found.edges,
+                places,
+                size,
+                cmap=_heat_colour_map(top),
+                vmin=0.0,
+                vmax=top,
+                linewidth=0,
             )
             meshes.append(mesh)
             axes.set_title(title)
@@ -371,34 +386,34 @@ def draw_heat_map(before: Prediction, after: Prediction, changed: bool) -> bytes
         return png(figure)
 
 
-def draw_overlay(before: Prediction, after: Prediction, channel: str, changed: bool) -> bytes:
+def draw_channel(before: Prediction, after: Prediction, channel: str, is_patched: bool) -> bytes:
     """Draw measurements, predictions and errors of a channel, and an enlarged worst window.
 
     Args:
         before: predictions of the given model.
         after: predictions of the patched model.
         channel: name of the channel.
-        changed: whether the models differ; otherwise only the first is drawn.
+        is_patched: whether the models differ; otherwise only the first is drawn.
 
     Returns:
         A PNG.
     """
     column = before.channels.index(channel)
-    unit, factor = axis_unit(usual_unit(channel))
-    if np.nanmax(np.abs(before.measured[:, column]), initial=0.0) * factor < _LITTLE:
-        unit, factor = usual_unit(channel), 1.0
+    unit, factor = axis_unit(default_unit(channel))
+    if np.nanmax(np.abs(before.measured[:, column]), initial=0.0) * factor < _MIN_CUSTOMARY_VALUE:
+        unit, factor = default_unit(channel), 1.0
     measured = factor * before.measured[:, column]
-    lines = [("given model", NOMINAL, factor * before.predicted[:, column])]
-    if changed:
-        lines.append(("patched model", PATCHED, factor * after.predicted[:, column]))
-    low, high = _worst(before, column)
-    with drawing(3.0) as figure:
+    lines = [("given model", NOMINAL_COLOUR, factor * before.predicted[:, column])]
+    if is_patched:
+        lines.append(("patched model", PATCHED_COLOUR, factor * after.predicted[:, column]))
+    low, high = _worst_interval(before, column)
+    with report_figure(3.0) as figure:
         places = figure.subplots(2, 2, height_ratios=(1.7, 1.0), width_ratios=(1.55, 1.0))
         for side, span in enumerate(((before.time[0], before.time[-1]), (low, high))):
             inside = (before.time >= span[0]) & (before.time <= span[1])
             upper, lower = places[0, side], places[1, side]
-            _signals(upper, before.time, measured, lines, inside, dots=side == 1)
-            _errors(lower, before.time, measured, lines, inside)
+            _plot_signals(upper, before.time, measured, lines, inside, dots=side == 1)
+            _plot_errors(lower, before.time, measured, lines, inside)
             upper.tick_params(labelbottom=False)
             for axes in (upper, lower):
                 axes.set_xlim(*span)
@@ -423,26 +438,26 @@ def draw_law(law: LearnedLaw) -> bytes:
         A PNG.
     """
     points, values, spread = (np.array(v) for v in (law.points, law.values, law.spread))
-    along, per_point = customary(law.variable_unit, float(np.max(np.abs(points))))
-    unit, per_value = customary(law.unit, float(np.max(np.abs(values))))
-    with drawing(2.6) as figure:
+    along, per_point = display_unit(law.variable_unit, float(np.max(np.abs(points))))
+    unit, per_value = display_unit(law.unit, float(np.max(np.abs(values))))
+    with report_figure(2.6) as figure:
         axes = figure.subplots()
         low, high = per_value * (values - 2.0 * spread), per_value * (values + 2.0 * spread)
-        axes.fill_between(per_point * points, low, high, color=PATCHED, alpha=0.2, lw=0)
-        axes.plot(per_point * points, per_value * values, color=PATCHED, lw=1.6)
+        axes.fill_between(per_point * points, low, high, color=PATCHED_COLOUR, alpha=0.2, lw=0)
+        axes.plot(per_point * points, per_value * values, color=PATCHED_COLOUR, lw=1.6)
         axes.axhline(0.0, color="0.6", lw=0.8)
         axes.set_xlabel(f"{variable_words(law.variable)} [{along}]")
-        axes.set_ylabel(f"added {_ADDED[law.balance]} [{unit}]")
+        axes.set_ylabel(f"added {_ADDED_QUANTITIES[law.balance]} [{unit}]")
         return png(figure)
 
 
-def _signals(axes: "Axes", time, measured, lines, inside, dots: bool) -> None:
+def _plot_signals(axes: "Axes", time, measured, lines, inside, dots: bool) -> None:
     style = {"ls": "none", "marker": "o", "ms": 2.6} if dots else {"lw": 2.2, "alpha": 0.55}
-    axes.plot(time, measured, color=MEASURED, label="measured", zorder=1, **style)  # pyright: ignore - matplotlib's stubs take no mixed keywords
+    axes.plot(time, measured, color=MEASURED_COLOUR, label="measured", zorder=1, **style)  # pyright: ignore - matplotlib's stubs take no mixed keywords
     for name, colour, values in lines:
         axes.plot(time, values, color=colour, lw=1.3 if dots else 0.9, label=name)
     values = [measured, *(values for _, _, values in lines)]
-    _limit(axes, [v[inside] for v in values])
+    _set_limits(axes, [v[inside] for v in values])
     if not dots:
         axes.legend(
             loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, frameon=False, borderaxespad=0.1,
@@ -450,30 +465,30 @@ def _signals(axes: "Axes", time, measured, lines, inside, dots: bool) -> None:
         )  # fmt: skip
 
 
-def _errors(axes: "Axes", time, measured, lines, inside) -> None:
+def _plot_errors(axes: "Axes", time, measured, lines, inside) -> None:
     axes.axhline(0.0, color="0.6", lw=0.8)
     for _, colour, values in lines:
         axes.plot(time, measured - values, color=colour, lw=0.9)
-    _limit(axes, [(measured - values)[inside] for _, _, values in lines])
+    _set_limits(axes, [(measured - values)[inside] for _, _, values in lines])
     axes.locator_params(axis="y", nbins=4)
 
 
-def _limit(axes: "Axes", values: list[np.ndarray]) -> None:
+def _set_limits(axes: "Axes", values: list[np.ndarray]) -> None:
     finite = [v[np.isfinite(v)] for v in values]
     axes.set_ylim(padded_range(finite, ""))
 
 
-def _worst(prediction: Prediction, column: int) -> tuple[float, float]:
+def _worst_interval(prediction: Prediction, column: int) -> tuple[float, float]:
     """Return start and stop of the enlarged interval around the worst window of a channel [s]."""
-    found = windowed(prediction)
+    found = windowed_errors(prediction)
     worst = int(np.argmax(np.nan_to_num(found.rms[:, column])))
     middle = 0.5 * (found.edges[worst] + found.edges[worst + 1])
     first, last = float(prediction.time[0]), float(prediction.time[-1])
-    low = max(first, min(middle - 0.5 * _ZOOM, last - _ZOOM))
-    return low, min(last, low + _ZOOM)
+    low = max(first, min(middle - 0.5 * _ZOOM_DURATION, last - _ZOOM_DURATION))
+    return low, min(last, low + _ZOOM_DURATION)
 
 
-def _colours(top: float):
+def _heat_colour_map(top: float):
     """Return a colour map: white for noise alone, amber, then dark red at `top` times noise."""
     from matplotlib.colors import LinearSegmentedColormap
 

@@ -12,23 +12,23 @@ import numpy as np
 
 import hydrotele
 from hydrotele.gap.result import Estimate, amount, in_customary_units
-from hydrotele.identify.hydraulic import Hydraulics
-from hydrotele.identify.identified_machine import Consistent
+from hydrotele.identify.hydraulic import HydraulicIdentification
+from hydrotele.identify.identified_machine import ConsistentParameters
 from hydrotele.identify.result import (
-    MEANING,
-    Forces,
-    HeldOut,
+    STATUS_DESCRIPTIONS,
+    HeldOutError,
+    HeldOutForces,
     Identification,
-    counts,
+    count_statuses,
     parameter_rows,
 )
 from hydrotele.show import report_html
-from hydrotele.show.report_html import drawing, png
+from hydrotele.show.report_html import png, report_figure
 
-MEASURED, NOMINAL, IDENTIFIED = "#262b33", "#e07b00", "#1769aa"
+MEASURED_COLOUR, NOMINAL_COLOUR, IDENTIFIED_COLOUR = "#262b33", "#e07b00", "#1769aa"
 
 
-def draw_forces(forces: Forces, drive: str, judged: HeldOut) -> bytes:
+def draw_forces(forces: HeldOutForces, drive: str, judged: HeldOutError) -> bytes:
     """Draw measured and predicted force of a drive, and the errors with the noise band.
 
     Args:
@@ -44,12 +44,12 @@ def draw_forces(forces: Forces, drive: str, judged: HeldOut) -> bytes:
         np.abs(forces.measured[:, k])) >= 2e3 else (judged.unit, 1.0)  # fmt: skip
     measured = factor * forces.measured[:, k]
     lines = [
-        ("given model", NOMINAL, factor * forces.nominal[:, k]),
-        ("identified model", IDENTIFIED, factor * forces.predicted[:, k]),
+        ("given model", NOMINAL_COLOUR, factor * forces.nominal[:, k]),
+        ("identified model", IDENTIFIED_COLOUR, factor * forces.predicted[:, k]),
     ]
-    with drawing(3.2) as figure:
+    with report_figure(3.2) as figure:
         upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(1.6, 1.0))
-        upper.plot(forces.time, measured, color=MEASURED, lw=2.2, alpha=0.5, label="measured")
+        upper.plot(forces.time, measured, color=MEASURED_COLOUR, lw=2.2, alpha=0.5, label="measured")
         for name, colour, values in lines:
             upper.plot(forces.time, values, color=colour, lw=0.9, label=name)
             lower.plot(forces.time, measured - values, color=colour, lw=0.9)
@@ -69,10 +69,10 @@ def draw_forces(forces: Forces, drive: str, judged: HeldOut) -> bytes:
         return png(figure)
 
 
-_MEMBERS = 6  # maximum number of listed members of a combination
+_MAX_MEMBERS = 6  # maximum number of listed members of a combination
 
 
-class LearnedFrom(NamedTuple):
+class ReportSource(NamedTuple):
     """Machine and logs of an identification.
 
     Attributes:
@@ -91,60 +91,59 @@ class LearnedFrom(NamedTuple):
 
 
 def write_identify_report(
-    learned: LearnedFrom, found: Identification | None, hydraulics: Hydraulics | None,
-    best: Consistent | None, path: str | Path,
+    source: ReportSource, identification: Identification | None, hydraulics: HydraulicIdentification | None,
+    consistent: ConsistentParameters | None, path: str | Path,
 ) -> None:  # fmt: skip
     """Write the report of an identification as one self-contained HTML file.
 
     Args:
-        learned: machine and logs.
-        found: identified mechanism, None if the logs contain no forces.
+        source: machine and logs.
+        identification: identified mechanism, None if the logs contain no forces.
         hydraulics: identified hydraulics, None if they were not identified.
-        best: nearest physically consistent parameters, None without a mechanism.
+        consistent: nearest physically consistent parameters, None without a mechanism.
         path: file to write.
     """
-    of = f"mechanism {learned.name}"
-    if learned.tool is not None:
-        of = f"machine {learned.name}, tool {learned.tool}"
-    status = found.status if found else hydraulics.status if hydraulics else ""
+    of = f"mechanism {source.name}"
+    if source.tool is not None:
+        of = f"machine {source.name}, tool {source.tool}"
+    status = identification.status if identification else hydraulics.status if hydraulics else ""
     good = status == "ok" and (hydraulics is None or hydraulics.status == "ok")
     report_html.write_report(
-        "identify", path, title=f"{learned.name}: identification",
-        over=f"IDENTIFICATION REPORT  ·  {of}  ·  held-out run {learned.heldout}, fitted on"
-        f" {', '.join(learned.fit)}",
+        "identify", path, title=f"{source.name}: identification",
+        over=f"IDENTIFICATION REPORT  ·  {of}  ·  held-out run {source.heldout}, fitted on"
+        f" {', '.join(source.fit)}",
         heading="Parameters identified from logs" if good else status,
         chip=("no_gap", "Identified") if good else ("ambiguous", "Incomplete"),
-        figures=_figures(found, hydraulics), found=_mechanism(found, best) if found else None,
+        figures=_figures(identification, hydraulics), found=_mechanism(identification,
+        consistent) if identification else None,
         hydraulics=_hydraulics(hydraulics) if hydraulics else None,
-        notes=found.notes if found else learned.notes, version=hydrotele.__version__,
-        runs=learned.tool is not None,
-        seconds=f"{sum(part.seconds for part in (found, hydraulics) if part):.1f}",
+        notes=identification.notes if identification else source.notes, version=hydrotele.__version__,
+        runs=source.tool is not None,
+        seconds=f"{sum(part.seconds for part in (identification, hydraulics) if part):.1f}",
     )  # fmt: skip
 
 
-def _figures(
-    found: Identification | None, hydraulics: Hydraulics | None
-) -> list[tuple[str, str, str]]:
+def _figures(found: Identification | None, hydraulics: HydraulicIdentification | None) -> list[tuple[str, str, str]]:
     cards = []
     for drive, h in list(found.heldout.items())[:3] if found else ():
         against = f"{h.rms / h.noise_rms:.2f} × noise, " if h.noise_rms > 0.0 else ""
-        what = f"{against}relative force error of {_name(drive)}"
-        cards.append(("after", f"{100 * h.relative:.2f} %", what))
+        what = f"{against}relative force error of {_display_name(drive)}"
+        cards.append(("after", f"{100 * h.relative_error:.2f} %", what))
     if hydraulics:
-        what = f"one-step prediction error ({hydraulics.before:.2f} with the given hydraulics)"
-        cards.append(("after", f"{hydraulics.after:.2f} × noise", what))
+        what = f"one-step prediction error ({hydraulics.nominal_rms_error:.2f} with the given hydraulics)"
+        cards.append(("after", f"{hydraulics.identified_rms_error:.2f} × noise", what))
     return cards
 
 
-def _name(drive: str) -> str:
+def _display_name(drive: str) -> str:
     return drive.replace("_", " ")
 
 
-def _mechanism(found: Identification, best: Consistent | None) -> dict[str, Any]:
+def _mechanism(found: Identification, best: ConsistentParameters | None) -> dict[str, Any]:
     forces = [
-        (_name(drive), amount(h.nominal_rms, h.unit), amount(h.rms, h.unit),
+        (_display_name(drive), amount(h.nominal_rms, h.unit), amount(h.rms, h.unit),
          amount(h.noise_rms, h.unit) if math.isfinite(h.noise_rms) else "not stated",
-         f"{100 * h.relative:.2f} %")
+         f"{100 * h.relative_error:.2f} %")
         for drive, h in found.heldout.items()
     ]  # fmt: skip
     return {
@@ -153,12 +152,13 @@ def _mechanism(found: Identification, best: Consistent | None) -> dict[str, Any]
                      for drive, h in found.heldout.items()],
         "condition": f"{found.estimate.condition:.3g}", "parameters": _parameters(found),
         "tests": _tests(found, best), "statuses": _statuses(found),
-        "correlation": ", ".join(f"{_name(drive)} {r:.2f}" for drive, r in found.whiteness.items()),
+        "correlation": ", ".join(f"{_display_name(drive)} {r:.2f}" for drive,
+        r in found.residual_autocorrelation.items()),
     }  # fmt: skip
 
 
-def _to_scale(estimate: Estimate) -> report_html.Interval | None:
-    return report_html.interval(estimate.value, estimate.low, estimate.high, estimate.nominal)
+def _scale_interval(estimate: Estimate) -> report_html.Interval | None:
+    return report_html.scale_interval(estimate.value, estimate.low, estimate.high, estimate.nominal)
 
 
 def _parameters(found: Identification) -> list[dict[str, Any]]:
@@ -169,50 +169,54 @@ def _parameters(found: Identification) -> list[dict[str, Any]]:
         estimate = Estimate(row.value, row.unit, *row.ci95, row.nominal)
         s = in_customary_units(estimate)
         rows.append({
-            "name": row.name, "combination": _short(row.combination), "status": row.status,
+            "name": row.name, "combination": _shorten_combination(row.combination), "status": row.status,
             "texts": (s.nominal, s.value, f"{s.low} to {s.high}", s.unit),
-            "drawn": _to_scale(estimate),
+            "drawn": _scale_interval(estimate),
         })  # fmt: skip
     return rows
 
 
-def _tests(found: Identification, best: Consistent | None) -> list[tuple[str, ...]]:
-    distance, limit = found.distance(found.nominal)
+def _tests(found: Identification, best: ConsistentParameters | None) -> list[tuple[str, ...]]:
+    distance, limit = found.squared_distance(found.nominal)
     verdict = "consistent with the logs" if distance <= limit else "rejected by the logs"
     rows = [("given parameters", f"{distance:.3g}", f"{limit:.3g}", verdict)]
     if best:
-        agree = best.loss <= limit
+        agree = best.squared_distance <= limit
         verdict = "consistent with the estimate" if agree else "differs from the estimate"
         name = "nearest physically consistent parameters"
-        rows.append((name, f"{best.loss:.3g}", f"{limit:.3g}", verdict))
+        rows.append((name, f"{best.squared_distance:.3g}", f"{limit:.3g}", verdict))
     return rows
 
 
 def _statuses(found: Identification) -> list[tuple[str, ...]]:
     rows = parameter_rows(found)
     parts = []
-    for status, number in counts(rows).items():
+    for status, number in count_statuses(rows).items():
         names = [row.name for row in rows if row.status == status and row.value is None]
-        parts.append((status, str(number), MEANING[status], ", ".join(names) or "-"))
+        parts.append((status, str(number), STATUS_DESCRIPTIONS[status], ", ".join(names) or "-"))
     return parts
 
 
-def _short(combination: str) -> str:
-    """Return a combination of parameters, shortened to `_MEMBERS` members."""
+def _shorten_combination(combination: str) -> str:
+    """Return a combination of parameters, shortened to `_MAX_MEMBERS` members."""
     parts = combination.replace(" - ", " + -").split(" + ")
-    if len(parts) <= _MEMBERS:
+    if len(parts) <= _MAX_MEMBERS:
         return combination
-    return " + ".join(parts[:_MEMBERS]).replace("+ -", "- ") + f" + {len(parts) - _MEMBERS} more"
+    return " + ".join(parts[:_MAX_MEMBERS]).replace("+ -", "- ") + f" + {len(parts) - _MAX_MEMBERS} more"
 
 
-def _hydraulics(found: Hydraulics) -> dict[str, Any]:
+def _hydraulics(found: HydraulicIdentification) -> dict[str, Any]:
     rows = []
-    for n in found.numbers:
+    for n in found.parameters:
         estimate = Estimate(n.value, n.unit, *n.ci95, n.nominal)
         s = in_customary_units(estimate, n.parameter)
-        values = (s.value, f"{s.low} to {s.high}") if n.told else ("not identifiable", "")
+        values = (s.value, f"{s.low} to {s.high}") if n.is_determined else ("not identifiable", "")
         rows.append({
-            "name": n.name, "texts": (_name(n.parameter), s.nominal, *values, s.unit),
-            "drawn": _to_scale(estimate) if n.told else None,
+            "name": n.qualified_name, "texts": (_display_name(n.parameter), s.nominal, *values, s.unit),
+            "drawn": _scale_interval(estimate) if n.is_determined else None,
         })  # fmt: skip
-    return {"before": f"{found.before:.2f}", "after": f"{found.after:.2f}", "numbers": rows}
+    return {
+        "before": f"{found.nominal_rms_error:.2f}",
+        "after": f"{found.identified_rms_error:.2f}",
+        "numbers": rows,
+    }

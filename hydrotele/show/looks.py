@@ -47,13 +47,13 @@ def box(half_sizes) -> Mesh:
     return Mesh(np.array(vertices) * np.asarray(half_sizes), np.array(normals), np.array(triangles))
 
 
-def lathe(radii, heights, slopes, segments: int = 24) -> Mesh:
+def revolution_mesh(radii, heights, profile_normals, segments: int = 24) -> Mesh:
     """Return the mesh of a surface of revolution about z.
 
     Args:
         radii: (k,) radii of the profile points [m], from the lower to the upper end.
         heights: (k,) heights of the profile points [m].
-        slopes: (k, 2) radial and axial component of the normal at each profile point. A sharp
+        profile_normals: (k, 2) radial and axial component of the normal at each profile point. A sharp
             edge consists of two equal points with different normals.
         segments: number of segments around the axis.
 
@@ -62,13 +62,13 @@ def lathe(radii, heights, slopes, segments: int = 24) -> Mesh:
     """
     around = np.linspace(0.0, 2.0 * np.pi, segments + 1)
     ring = np.stack([np.cos(around), np.sin(around)], axis=1)
-    radii, heights, slopes = (np.asarray(a, float) for a in (radii, heights, slopes))
+    radii, heights, profile_normals = (np.asarray(a, float) for a in (radii, heights, profile_normals))
     vertices = np.empty((len(radii), segments + 1, 3))
     vertices[..., :2] = radii[:, None, None] * ring
     vertices[..., 2] = heights[:, None]
     normals = np.empty_like(vertices)
-    normals[..., :2] = slopes[:, 0, None, None] * ring
-    normals[..., 2] = slopes[:, 1, None]
+    normals[..., :2] = profile_normals[:, 0, None, None] * ring
+    normals[..., 2] = profile_normals[:, 1, None]
     low = np.arange(len(radii) - 1)[:, None] * (segments + 1) + np.arange(segments)
     high = low + segments + 1
     quads = np.stack([low, low + 1, high + 1, low, high + 1, high], axis=-1).reshape(-1, 3)
@@ -79,7 +79,7 @@ def lathe(radii, heights, slopes, segments: int = 24) -> Mesh:
 def cylinder(radius: float, half_length: float, segments: int = 24) -> Mesh:
     """Return the mesh of a closed cylinder along z, with radius and half length [m]."""
     r, h = radius, half_length
-    return lathe(
+    return revolution_mesh(
         (0, r, r, r, r, 0),
         (-h, -h, -h, h, h, h),
         ((0, -1), (0, -1), (1, 0), (1, 0), (0, 1), (0, 1)),
@@ -94,7 +94,7 @@ def capsule(radius: float, half_length: float, segments: int = 16) -> Mesh:
     slopes = np.stack([np.cos(rise), np.sin(rise)], axis=1)
     upper = np.arange(len(rise)) >= len(rise) // 2
     heights = radius * slopes[:, 1] + np.where(upper, half_length, -half_length)
-    return lathe(radius * slopes[:, 0], heights, slopes, segments)
+    return revolution_mesh(radius * slopes[:, 0], heights, slopes, segments)
 
 
 def ellipsoid(radii, segments: int = 24) -> Mesh:
@@ -105,7 +105,7 @@ def ellipsoid(radii, segments: int = 24) -> Mesh:
     return Mesh(ball.vertices * np.asarray(radii), normals, ball.triangles)
 
 
-def flat(corners: np.ndarray) -> Mesh:
+def flat_triangles(corners: np.ndarray) -> Mesh:
     """Return a mesh of flat triangles from corners (t, 3, 3) [m].
 
     The corners are counter-clockwise as seen from outside.
@@ -133,11 +133,11 @@ def tiles(half_size: float, count: int) -> tuple[Mesh, np.ndarray]:
         np.stack([edges[i + a], edges[j + b], np.zeros((count, count))], axis=-1)
         for a, b in ((0, 0), (1, 0), (1, 1), (0, 0), (1, 1), (0, 1))
     ]
-    mesh = flat(np.stack(corners, axis=2).reshape(-1, 3, 3))
+    mesh = flat_triangles(np.stack(corners, axis=2).reshape(-1, 3, 3))
     return mesh, np.repeat(((i + j) % 2).ravel(), 6)
 
 
-def moved(mesh: Mesh, position, rotation) -> Mesh:
+def transform_mesh(mesh: Mesh, position, rotation) -> Mesh:
     """Return a mesh rotated by `rotation` (3, 3), then translated by `position` (3,) [m]."""
     rotation = np.asarray(rotation).reshape(3, 3)
     return Mesh(
@@ -147,7 +147,7 @@ def moved(mesh: Mesh, position, rotation) -> Mesh:
     )
 
 
-def joined(meshes: Sequence[Mesh]) -> Mesh:
+def join_meshes(meshes: Sequence[Mesh]) -> Mesh:
     """Combine several meshes into one mesh."""
     starts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
     return Mesh(
@@ -168,14 +168,14 @@ _DEFAULT_COLOUR = (0.5, 0.5, 0.5, 1.0)  # default of MuJoCo; the colour of a mat
 _Geom = mujoco.mjtGeom
 _PRIMITIVES: Mapping[int, Callable[[np.ndarray], Mesh]] = {
     int(_Geom.mjGEOM_BOX): lambda size: shapes.box(size),
-    int(_Geom.mjGEOM_CYLINDER): lambda size: shapes.cylinder(size[0], size[1], _around(size[0])),
-    int(_Geom.mjGEOM_CAPSULE): lambda size: shapes.capsule(size[0], size[1], _around(size[0])),
+    int(_Geom.mjGEOM_CYLINDER): lambda size: shapes.cylinder(size[0], size[1], _n_segments(size[0])),
+    int(_Geom.mjGEOM_CAPSULE): lambda size: shapes.capsule(size[0], size[1], _n_segments(size[0])),
     int(_Geom.mjGEOM_SPHERE): lambda size: shapes.ellipsoid((size[0],) * 3),
     int(_Geom.mjGEOM_ELLIPSOID): lambda size: shapes.ellipsoid(size),
 }
 
 
-class Look(NamedTuple):
+class BodyMesh(NamedTuple):
     """Visual geometry of a body with one opacity, as one mesh.
 
     Attributes:
@@ -191,7 +191,7 @@ class Look(NamedTuple):
     colours: np.ndarray
 
 
-def body_looks(model: mujoco.MjModel) -> list[Look]:
+def body_meshes(model: mujoco.MjModel) -> list[BodyMesh]:
     """Return one mesh per body and opacity, from all visible geoms except infinite planes.
 
     Args:
@@ -207,14 +207,14 @@ def body_looks(model: mujoco.MjModel) -> list[Look]:
         colour = geom_colour(model, geom)
         rotation = np.empty(9)
         mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
-        placed = shapes.moved(mesh, model.geom_pos[geom], rotation)
+        placed = shapes.transform_mesh(mesh, model.geom_pos[geom], rotation)
         painted = np.tile(np.round(255 * colour[:3]).astype(np.uint8), (len(mesh.vertices), 1))
         key = int(model.geom_bodyid[geom]), round(float(colour[3]), 3)
         parts.setdefault(key, []).append((placed, painted))
     looks = []
     for (body, opacity), some in sorted(parts.items()):
         meshes, painted = zip(*some, strict=True)
-        looks.append(Look(body, opacity, shapes.joined(meshes), np.concatenate(painted)))
+        looks.append(BodyMesh(body, opacity, shapes.join_meshes(meshes), np.concatenate(painted)))
     return looks
 
 
@@ -226,7 +226,7 @@ def geom_colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
     return model.mat_rgba[material]
 
 
-def bounds(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
+def visible_bounds(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
     """Return the lowest and highest corner (3,) [m] of a box around all visible geoms but planes.
 
     Args:
@@ -250,7 +250,7 @@ def ground_height(model: mujoco.MjModel) -> float | None:
     return float(model.geom_pos[planes][0, 2]) if planes.any() else None
 
 
-def _around(radius: float) -> int:
+def _n_segments(radius: float) -> int:
     """Return the number of segments around the axis of a cylinder; thin ones need fewer."""
     return 10 if radius < 0.06 else 24
 
@@ -258,16 +258,16 @@ def _around(radius: float) -> int:
 def _geom_mesh(model: mujoco.MjModel, geom: int) -> Mesh | None:
     kind = int(model.geom_type[geom])
     if kind == _Geom.mjGEOM_MESH:
-        return _file_mesh(model, int(model.geom_dataid[geom]))
+        return _mesh_asset(model, int(model.geom_dataid[geom]))
     if kind in _PRIMITIVES:
         return _PRIMITIVES[kind](model.geom_size[geom])
     return None
 
 
-def _file_mesh(model: mujoco.MjModel, mesh: int) -> Mesh:
+def _mesh_asset(model: mujoco.MjModel, mesh: int) -> Mesh:
     """Return a mesh asset with separate vertices per triangle; normals are indexed separately."""
     first = model.mesh_faceadr[mesh]
     faces = slice(first, first + model.mesh_facenum[mesh])
     corners = model.mesh_vert[model.mesh_vertadr[mesh] + model.mesh_face[faces]]
     normals = model.mesh_normal[model.mesh_normaladr[mesh] + model.mesh_facenormal[faces]]
-    return shapes.flat(corners)._replace(normals=normals.reshape(-1, 3))
+    return shapes.flat_triangles(corners)._replace(normals=normals.reshape(-1, 3))

@@ -15,10 +15,10 @@ import mujoco
 import numpy as np
 
 from hydrotele.core.errors import InputError
-from hydrotele.core.output import replacing
+from hydrotele.core.output import atomic_file
 from hydrotele.machine.machine import Machine
-from hydrotele.show.looks import bounds
-from hydrotele.show.pose import model_with_looks
+from hydrotele.show.looks import visible_bounds
+from hydrotele.show.pose import compile_visual_model
 from hydrotele.simulate.closure import close_loops
 
 _BACKENDS = ("egl", "osmesa")
@@ -50,7 +50,7 @@ def render_picture(
             without a screen (the message names the packages to install), or the file cannot be
             written.
     """
-    model = model_with_looks(machine)
+    model = compile_visual_model(machine)
     data = mujoco.MjData(model)
     close_loops(machine, model, data, dict(joints or {}))
     render_model(model, data, path, camera, size)
@@ -74,7 +74,7 @@ def render_model(
             names the packages to install), or the file cannot be written.
     """
     mujoco.mj_fwdPosition(model, data)
-    cameras = [model.camera(i).name for i in range(model.ncam)]
+    cameras = [model.find_camera(i).name for i in range(model.ncam)]
     if camera == _OVERVIEW and _OVERVIEW not in cameras:
         camera = _FREE
     if camera not in (*cameras, _FREE):
@@ -83,8 +83,8 @@ def render_model(
     model.vis.global_.offwidth, model.vis.global_.offheight = size
     model.vis.quality.offsamples = 8
     model.vis.quality.shadowsize = 8192
-    with replacing(path, ".png") as part:
-        save_png(part, _draw(model, data.qpos, view, size))
+    with atomic_file(path, ".png") as part:
+        save_png(part, _render_in_child(model, data.qpos, view, size))
 
 
 def save_png(path: Path, pixels: np.ndarray) -> None:
@@ -96,7 +96,7 @@ def save_png(path: Path, pixels: np.ndarray) -> None:
 
 def _free_view(model: mujoco.MjModel, data: mujoco.MjData, size: tuple[int, int]) -> dict:
     """Return a camera in front, to the side and above that shows the whole machine."""
-    low, high = bounds(model, data)
+    low, high = visible_bounds(model, data)
     radius = 0.5 * float(np.linalg.norm(high - low))
     narrow = np.radians(0.5 * _FIELD_OF_VIEW) * min(1.0, size[0] / size[1])
     distance = 0.65 * radius / np.sin(narrow)
@@ -105,7 +105,7 @@ def _free_view(model: mujoco.MjModel, data: mujoco.MjData, size: tuple[int, int]
     }  # fmt: skip
 
 
-def _draw(model: mujoco.MjModel, qpos: np.ndarray, view: dict, size: tuple[int, int]) -> np.ndarray:
+def _render_in_child(model: mujoco.MjModel, qpos: np.ndarray, view: dict, size: tuple[int, int]) -> np.ndarray:
     """Render pixels (height, width, 3), uint8, with the first OpenGL driver that works."""
     wanted = os.environ.get("MUJOCO_GL", "").lower()
     backends = dict.fromkeys((*((wanted,) if wanted in _BACKENDS else ()), *_BACKENDS))
@@ -118,9 +118,7 @@ def _draw(model: mujoco.MjModel, qpos: np.ndarray, view: dict, size: tuple[int, 
             environment = {**os.environ, "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
             worker = [sys.executable, str(Path(__file__).with_name("offscreen.py")), folder]
             try:
-                done = subprocess.run(
-                    worker, env=environment, capture_output=True, text=True, timeout=_TIMEOUT
-                )
+                done = subprocess.run(worker, env=environment, capture_output=True, text=True, timeout=_TIMEOUT)
             except subprocess.TimeoutExpired:
                 reasons.append(f"{backend}: no image within {_TIMEOUT:.0f} s")
                 continue

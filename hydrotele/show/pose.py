@@ -10,11 +10,11 @@ from pydantic import TypeAdapter
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import SurroundingObject
-from hydrotele.simulate.closure import follow_loops, following_joints
-from hydrotele.simulate.mechanism import assemble, mjcf_document
+from hydrotele.simulate.closure import close_along_motion, dependent_joints
+from hydrotele.simulate.mechanism import assemble_mjcf, mjcf_document
 from hydrotele.simulate.surroundings import object_joints
 
-_THINGS = TypeAdapter(list[SurroundingObject])
+_OBJECTS_ADAPTER = TypeAdapter(list[SurroundingObject])
 
 
 class Poses(NamedTuple):
@@ -31,7 +31,7 @@ class Poses(NamedTuple):
     quaternion: np.ndarray
 
 
-def model_with_looks(
+def compile_visual_model(
     machine: Machine, ground: bool = True, surroundings: tuple[SurroundingObject, ...] = ()
 ) -> mujoco.MjModel:
     """Compile a machine with its visual geometry, which simulated plants omit for speed.
@@ -44,7 +44,7 @@ def model_with_looks(
     Raises:
         InputError: the MJCF cannot be assembled.
     """
-    root = assemble(machine, ground=ground, surroundings=surroundings)
+    root = assemble_mjcf(machine, ground=ground, surroundings=surroundings)
     return mjcf_document(root).compile()
 
 
@@ -61,7 +61,7 @@ def logged_joints(machine: Machine, log: Log) -> dict[str, np.ndarray]:
     Returns:
         {joint name: (n,) angle [rad] or position [m]}.
     """
-    following = following_joints(machine)
+    following = dependent_joints(machine)
     axis_of = {axis.joint: name for name, axis in machine.axes.items()}
     found = {}
     for joint in machine.joints:
@@ -69,10 +69,7 @@ def logged_joints(machine: Machine, log: Log) -> dict[str, np.ndarray]:
             continue
         names = [n for n in (axis_of.get(joint), joint) if n]
         candidates = [
-            f"{truth}{kind}.{name}"
-            for truth in ("", "truth.")
-            for name in names
-            for kind in ("angle", "position")
+            f"{truth}{kind}.{name}" for truth in ("", "truth.") for name in names for kind in ("angle", "position")
         ]
         if column := next((c for c in candidates if c in log), None):
             found[joint] = log[column]
@@ -81,24 +78,24 @@ def logged_joints(machine: Machine, log: Log) -> dict[str, np.ndarray]:
 
 def logged_surroundings(log: Log) -> tuple[SurroundingObject, ...]:
     """Return the plates, trees and tree logs that are stored in a log of true states."""
-    return tuple(_THINGS.validate_json(log.metadata.get("surroundings", "[]")))
+    return tuple(_OBJECTS_ADAPTER.validate_json(log.metadata.get("surroundings", "[]")))
 
 
-def _place_things(model: mujoco.MjModel, log: Log, rows: np.ndarray) -> None:
+def _write_object_positions(model: mujoco.MjModel, log: Log, rows: np.ndarray) -> None:
     """Write the positions of surrounding objects from a log of true states to `rows` (n, nq)."""
     for joint, place in object_joints(model):
         name, kind = model.joint(joint).name, model.jnt_type[joint]
         if kind == mujoco.mjtJoint.mjJNT_FREE:
             for k, letter in enumerate("xyz"):
                 rows[:, place + k] = log[f"truth.position.{name}_{letter}"]
-            _turn(log, name, rows[:, place + 3 : place + 7])
+            _write_quaternions(log, name, rows[:, place + 3 : place + 7])
         elif kind == mujoco.mjtJoint.mjJNT_BALL:
-            _turn(log, name.removesuffix("_turn"), rows[:, place : place + 4])
+            _write_quaternions(log, name.removesuffix("_turn"), rows[:, place : place + 4])
         else:
             rows[:, place] = log[f"truth.position.{name}"]
 
 
-def _turn(log: Log, name: str, quaternions: np.ndarray) -> None:
+def _write_quaternions(log: Log, name: str, quaternions: np.ndarray) -> None:
     turns = np.column_stack([log[f"truth.angle.{name}_r{c}"] for c in "xyz"])
     for quaternion, turn in zip(quaternions, turns, strict=True):
         quaternion[:] = (1.0, 0.0, 0.0, 0.0)
@@ -113,16 +110,16 @@ def logged_positions(
 
     Args:
         machine: the machine.
-        model: model of the machine from `model_with_looks`.
+        model: model of the machine from `compile_visual_model`.
         joints: {joint name: (n,) angles [rad] or positions [m]}; others are in the home pose.
         log: log of true states; required if the model contains surrounding objects.
 
     Raises:
         InputError: a linkage cannot be closed in at least one row.
     """
-    rows = follow_loops(machine, model, mujoco.MjData(model), joints)
+    rows = close_along_motion(machine, model, mujoco.MjData(model), joints)
     if log is not None:
-        _place_things(model, log, rows)
+        _write_object_positions(model, log, rows)
     return rows
 
 
@@ -134,7 +131,7 @@ def body_poses(
 
     Args:
         machine: the machine.
-        model: model of the machine from `model_with_looks`.
+        model: model of the machine from `compile_visual_model`.
         joints: {joint name: (n,) angles [rad] or positions [m]}; others are in the home pose.
         log: log of true states; required if the model contains surrounding objects.
 
@@ -160,9 +157,7 @@ def body_names(model: mujoco.MjModel) -> tuple[str, ...]:
     return tuple(model.body(i).name or f"body_{i}" for i in range(model.nbody))
 
 
-def points_on_body(
-    poses: Poses, body: str, point: tuple[float, float, float] | np.ndarray
-) -> np.ndarray:
+def point_trajectory(poses: Poses, body: str, point: tuple[float, float, float] | np.ndarray) -> np.ndarray:
     """Return the trajectory of a point that is fixed to a body.
 
     Args:

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from hydrotele.core.errors import InputError
-from hydrotele.core.output import replacing
+from hydrotele.core.output import atomic_file
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine
 from hydrotele.show import looks as shapes
@@ -24,28 +24,28 @@ from hydrotele.show.channels import (
     colours,
     common_channels,
     difference,
-    grouped,
+    group_channels,
     padded_range,
-    shown,
+    scaled_channel,
 )
-from hydrotele.show.looks import Look, body_looks, bounds, ground_height
+from hydrotele.show.looks import BodyMesh, body_meshes, ground_height, visible_bounds
 from hydrotele.show.pose import (
     Poses,
     body_poses,
+    compile_visual_model,
     logged_joints,
     logged_surroundings,
-    model_with_looks,
-    points_on_body,
+    point_trajectory,
 )
 
 if TYPE_CHECKING:
     import rerun as rr
 
-_LONGEST_ID = 180  # maximum number of characters of an application id in rerun
+_MAX_ID_LENGTH = 180  # maximum number of characters of an application id in rerun
 
 
 @contextlib.contextmanager
-def recording_file(path: str | os.PathLike, application: str) -> Iterator["rr.RecordingStream"]:
+def open_recording(path: str | os.PathLike, application: str) -> Iterator["rr.RecordingStream"]:
     """Record to memory and write the file at the end.
 
     The writer of rerun is not used, because its thread does not report a full disk.
@@ -62,8 +62,8 @@ def recording_file(path: str | os.PathLike, application: str) -> Iterator["rr.Re
     """
     import rerun as rr
 
-    name = application.encode("ascii", "replace").decode()[:_LONGEST_ID]
-    with replacing(path, ".rrd") as part, rr.RecordingStream(name) as stream:
+    name = application.encode("ascii", "replace").decode()[:_MAX_ID_LENGTH]
+    with atomic_file(path, ".rrd") as part, rr.RecordingStream(name) as stream:
         memory = stream.binary_stream()
         yield stream
         part.write_bytes(memory.read(flush=True) or b"")
@@ -73,19 +73,19 @@ if TYPE_CHECKING:
     import rerun.blueprint as rrb
 
 # {tab: kinds of its plots, from top to bottom}
-_TABS: Mapping[str, tuple[str, ...]] = {
+_TAB_KINDS: Mapping[str, tuple[str, ...]] = {
     "Overview": ("command", "angle", "position", "pressure_head", "pressure_rod"),
     "Hydraulics": ("pressure_supply", "flow_supply", "flow_head", "flow_rod", "spool"),
     "Mechanics": ("length", "position", "force", "torque", "contact_force", "tip"),
     "Teleoperation": ("tip_force", "handle", "hand_force", "handle_stiffness", "tip_pose"),
     "Rates": ("velocity", "acceleration", "piston_velocity", "spool_rate", "reference"),
 }
-_COMPARED = ("angle", "position", "pressure_head", "pressure_rod", "length")
+_COMPARED_KINDS = ("angle", "position", "pressure_head", "pressure_rod", "length")
 _FIXED_RANGES = {"command": (-1.05, 1.05)}
 _SKY = (206, 217, 228)
 _GRID = (120, 125, 130, 90)
-_TRAIL = 5.0  # s, duration of the displayed part of a tip path
-_FIRST_SHARE = 1.5  # height of a plot with legend, relative to other plots
+_TRAIL_DURATION = 5.0  # s, duration of the displayed part of a tip path
+_LEGEND_PLOT_HEIGHT = 1.5  # height of a plot with legend, relative to other plots
 
 
 class Plot(NamedTuple):
@@ -115,7 +115,7 @@ class Scene(NamedTuple):
         title: title of the view.
         contents: entity paths.
         trails: entities of which only the last seconds are displayed.
-        eye: (3,) position of the camera [m].
+        camera_position: (3,) position of the camera [m].
         target: (3,) point at which the camera looks [m].
         ground: whether there is a ground; otherwise the viewer draws a grid.
     """
@@ -123,16 +123,16 @@ class Scene(NamedTuple):
     title: str
     contents: Sequence[str]
     trails: Sequence[str]
-    eye: np.ndarray
+    camera_position: np.ndarray
     target: np.ndarray
     ground: bool
 
 
-def blueprint(
+def make_blueprint(
     plots: Sequence[Plot],
     differences: Sequence[Plot],
     scene: Scene,
-    minus: str = "",
+    difference_name: str = "",
 ) -> "rrb.Blueprint":
     """Create the layout of a recording: 3D view on the left, tabs of plots on the right.
 
@@ -140,7 +140,7 @@ def blueprint(
         plots: one plot per kind of channel.
         differences: plots of the difference of two logs; may be empty.
         scene: 3D view.
-        minus: description of the differences, such as `measured - simulated`.
+        difference_name: description of the differences, such as `measured - simulated`.
 
     Returns:
         The blueprint; the time panel is paused on the timeline `time`.
@@ -148,7 +148,7 @@ def blueprint(
     import rerun.blueprint as rrb
 
     about = rrb.TextDocumentView(name="About", origin="/about")
-    tabs = [*_tabs(plots, differences, minus), about]
+    tabs = [*_tabs(plots, differences, difference_name), about]
     return rrb.Blueprint(
         rrb.Horizontal(_machine_view(scene), rrb.Tabs(*tabs, active_tab=0), column_shares=[11, 9]),
         rrb.BlueprintPanel(state="collapsed"),
@@ -161,7 +161,7 @@ def blueprint(
 def _machine_view(scene: Scene):
     import rerun.blueprint as rrb
 
-    start = rrb.TimeRangeBoundary.cursor_relative(seconds=-_TRAIL)
+    start = rrb.TimeRangeBoundary.cursor_relative(seconds=-_TRAIL_DURATION)
     recent = rrb.VisibleTimeRange("time", start=start, end=rrb.TimeRangeBoundary.cursor_relative())
     return rrb.Spatial3DView(
         name=scene.title,
@@ -172,7 +172,7 @@ def _machine_view(scene: Scene):
         line_grid=rrb.LineGrid3D(visible=not scene.ground, spacing=1.0, color=_GRID),
         eye_controls=rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
-            position=scene.eye,
+            position=scene.camera_position,
             look_target=scene.target,
             eye_up=(0, 0, 1),
         ),
@@ -184,11 +184,11 @@ def _tabs(plots: Sequence[Plot], differences: Sequence[Plot], minus: str):
     gap_of = {plot.kind: plot for plot in differences}
     tabs = []
     if differences:
-        kinds = [kind for kind in _COMPARED if kind in gap_of] or list(gap_of)
+        kinds = [kind for kind in _COMPARED_KINDS if kind in gap_of] or list(gap_of)
         pairs = [(by_kind[kind], gap_of[kind]) for kind in kinds[:3]]
         views = [plot for pair in pairs for plot in pair]
         tabs.append(_column("Comparison", views, minus, [2, 1] * len(pairs)))
-    for title, kinds in _TABS.items():
+    for title, kinds in _TAB_KINDS.items():
         if views := [by_kind[kind] for kind in kinds if kind in by_kind]:
             tabs.append(_column(title, views, minus))
     if differences:
@@ -196,9 +196,7 @@ def _tabs(plots: Sequence[Plot], differences: Sequence[Plot], minus: str):
     return tabs
 
 
-def _column(
-    title: str, plots: Sequence[Plot], minus: str, shares: Sequence[float] | None = None
-) -> "rrb.Vertical":
+def _column(title: str, plots: Sequence[Plot], minus: str, shares: Sequence[float] | None = None) -> "rrb.Vertical":
     """Arrange plots in a column; show a legend only for lines that no plot above has named."""
     import rerun.blueprint as rrb
 
@@ -209,7 +207,7 @@ def _column(
         if legend:
             named.update(plot.labels, (label.split()[-1] for label in plot.labels))
         views.append(_view(plot, minus if plot.is_difference else "", legend))
-        heights.append(share * (_FIRST_SHARE if legend else 1.0))
+        heights.append(share * (_LEGEND_PLOT_HEIGHT if legend else 1.0))
     return rrb.Vertical(*views, name=title, row_shares=heights)
 
 
@@ -260,7 +258,7 @@ def log_machine(
         ghost: draw only moving bodies, tinted and transparent.
     """
     moving = [i for i in range(model.nbody) if model.body_weldid[i] != 0]
-    for look in body_looks(model):
+    for look in body_meshes(model):
         if ghost and look.body not in moving:
             continue
         part = "shape" if look.opacity == 1.0 else f"glass_{round(100 * look.opacity)}"
@@ -268,10 +266,10 @@ def log_machine(
         stream.log(path, mesh_entity(look, ghost), static=True)
     for body, name in enumerate(poses.bodies):
         if body in moving or not ghost:
-            _log_way(stream, f"{root}/{name}", poses, body, clock, static=body not in moving)
+            _log_body_poses(stream, f"{root}/{name}", poses, body, clock, static=body not in moving)
 
 
-def mesh_entity(look: Look, ghost: bool = False) -> "rr.Mesh3D":
+def mesh_entity(look: BodyMesh, ghost: bool = False) -> "rr.Mesh3D":
     """Convert a body mesh to a rerun mesh; a ghost is tinted and transparent."""
     import rerun as rr
 
@@ -295,8 +293,8 @@ def log_ground(stream: "rr.RecordingStream", model: mujoco.MjModel) -> bool:
     if height is None:
         return False
     mesh, parity = shapes.tiles(_GROUND_HALF_SIZE, int(_GROUND_HALF_SIZE))
-    mesh = shapes.moved(mesh, (0.0, 0.0, height), np.eye(3))
-    stream.log("ground", mesh_entity(Look(0, 1.0, mesh, _GROUND_COLOURS[parity])), static=True)
+    mesh = shapes.transform_mesh(mesh, (0.0, 0.0, height), np.eye(3))
+    stream.log("ground", mesh_entity(BodyMesh(0, 1.0, mesh, _GROUND_COLOURS[parity])), static=True)
     return True
 
 
@@ -328,7 +326,7 @@ def log_tip(
     stream.send_columns(f"{root}/now", [clock], rr.Points3D.columns(positions=tip))
 
 
-def _log_way(stream, path: str, poses: Poses, body: int, clock, static: bool) -> None:
+def _log_body_poses(stream, path: str, poses: Poses, body: int, clock, static: bool) -> None:
     import rerun as rr
 
     position = poses.position[:, body]
@@ -345,9 +343,9 @@ if TYPE_CHECKING:
     import rerun as rr
 
 TIMELINE = "time"
-_ENTRY = re.compile(r"[a-z][a-z0-9_]*")
-_RESERVED = ("about", "difference", "ground")
-_PALENESS = 0.65  # fraction of white in the line colours of all logs but the first
+_ENTRY_NAME = re.compile(r"[a-z][a-z0-9_]*")
+_RESERVED_NAMES = ("about", "difference", "ground")
+_WHITE_FRACTION = 0.65  # fraction of white in the line colours of all logs but the first
 _EYE_DISTANCE = 1.4  # camera distance, relative to the radius of the scene
 
 
@@ -374,17 +372,15 @@ def write_recording(
     _check_names(entries)
     machine, _ = next(iter(entries.values()))
     runs = " and ".join(dict.fromkeys(entry_log.name for _, entry_log in entries.values()))
-    with recording_file(
-        path, f"hydrotele {machine.name} {machine.tool} {' '.join(entries)}"
-    ) as out:
+    with open_recording(path, f"hydrotele {machine.name} {machine.tool} {' '.join(entries)}") as out:
         out.send_recording_name(title or f"{machine.name} {runs}")
         scene = _log_machines(out, entries)
         plots = _log_channels(out, entries)
         differences = _log_differences(out, entries)
-        out.log("about", _about(entries), static=True)
+        out.log("about", _about_document(entries), static=True)
         first, *others = entries
         minus = f"{first} - {' or '.join(others)}"
-        out.send_blueprint(blueprint(plots, differences, scene, minus))
+        out.send_blueprint(make_blueprint(plots, differences, scene, minus))
 
 
 def time_column(time: np.ndarray) -> "rr.TimeColumn":
@@ -395,10 +391,10 @@ def time_column(time: np.ndarray) -> "rr.TimeColumn":
     return rr.TimeColumn(TIMELINE, duration=nanoseconds)
 
 
-def entity(root: str, channel: str) -> str:
+def entity_path(root: str, channel: str) -> str:
     """Return the entity path of a channel.
 
-    >>> entity("measured", "truth.flow_head.boom")
+    >>> entity_path("measured", "truth.flow_head.boom")
     '/measured/truth/flow_head/boom'
     """
     return "/".join(["", root, *channel.split(".")])
@@ -408,10 +404,10 @@ def _check_names(entries: Mapping[str, tuple[Machine, Log]]) -> None:
     if not entries:
         raise InputError("recording", "holds no log: give at least one machine with its log")
     for name in entries:
-        if not _ENTRY.fullmatch(name) or name in _RESERVED:
+        if not _ENTRY_NAME.fullmatch(name) or name in _RESERVED_NAMES:
             raise InputError(
                 f"recording entry {name!r}",
-                f"use lower-case letters, digits and _, and none of {', '.join(_RESERVED)}",
+                f"use lower-case letters, digits and _, and none of {', '.join(_RESERVED_NAMES)}",
             )
 
 
@@ -421,16 +417,16 @@ def _log_machines(stream, entries) -> Scene:
         things = logged_surroundings(log)
         key = machine.model_dump_json() + log.metadata.get("surroundings", "")
         if key not in models:
-            models[key] = model_with_looks(machine, surroundings=things)
+            models[key] = compile_visual_model(machine, surroundings=things)
         model = models[key]
         poses = body_poses(machine, model, logged_joints(machine, log), log)
-        clock, tip = time_column(log.time), _tip(machine, log, poses)
+        clock, tip = time_column(log.time), _tip_path(machine, log, poses)
         log_machine(stream, f"/{name}/machine", model, poses, clock, ghost=scene is not None)
         log_tip(stream, f"/{name}/tip_path", tip, clock, scene is not None)
         contents += [f"/{name}/machine/**", f"/{name}/tip_path/**"]
         trails.append(f"/{name}/tip_path/trail")
         if scene is None:
-            eye, target = _eye(model, tip)
+            eye, target = _camera_placement(model, tip)
             ground = log_ground(stream, model)
             scene = Scene(_scene_title(list(entries)), contents, trails, eye, target, ground)
     contents.append("/ground/**")
@@ -443,23 +439,23 @@ def _scene_title(names: list[str]) -> str:
     return f"{solid} (solid), {', '.join(glass)} (transparent blue)" if glass else "machine"
 
 
-def _tip(machine: Machine, log: Log, poses: Poses) -> np.ndarray | None:
+def _tip_path(machine: Machine, log: Log, poses: Poses) -> np.ndarray | None:
     recorded = [f"truth.tip.{component}" for component in "xyz"]
     if all(name in log for name in recorded):
         return np.stack([log[name] for name in recorded], axis=1)
     if machine.arm is None or machine.arm.tip.link not in poses.bodies:
         return None
-    return points_on_body(poses, machine.arm.tip.link, machine.arm.tip.position)
+    return point_trajectory(poses, machine.arm.tip.link, machine.arm.tip.position)
 
 
-def _eye(model: mujoco.MjModel, tip: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+def _camera_placement(model: mujoco.MjModel, tip: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
     """Return camera position and target (3,) [m] that show the machine and its whole tip path.
 
     The direction is that of the camera `overview` if the model has one.
     """
     data = mujoco.MjData(model)
     mujoco.mj_fwdPosition(model, data)
-    low, high = bounds(model, data)
+    low, high = visible_bounds(model, data)
     camera = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, "overview")
     way = data.cam_xpos[camera] - 0.5 * (low + high) if camera >= 0 else np.array([1.6, 1.4, 0.8])
     if tip is not None:
@@ -475,12 +471,12 @@ def _log_channels(stream, entries) -> list[Plot]:
     logs = [log for _, log in entries.values()]
     palette, drawn = colours(logs), {}
     for rank, (name, (_, log)) in enumerate(entries.items()):
-        clock, groups = time_column(log.time), grouped(log.columns)
+        clock, groups = time_column(log.time), group_channels(log.columns)
         members = {channel: kind for kind, some in groups.items() for channel in some}
         for channel in log.columns:
-            trace = shown(log, channel)
-            path = entity(name, channel)
-            label = f"{name} {trace.name}" if len(entries) > 1 else trace.name
+            trace = scaled_channel(log, channel)
+            path = entity_path(name, channel)
+            label = f"{name} {trace.legend_name}" if len(entries) > 1 else trace.legend_name
             width = 1.0 if rank else 3.0 if len(entries) > 1 else 1.6
             style = _line_style(palette[trace.channel.axis], f"{label} [{trace.unit}]", rank, width)
             stream.log(path, style, static=True)
@@ -496,12 +492,12 @@ def _log_differences(stream, entries) -> list[Plot]:
     (_, (_, log)), *others = entries.items()
     palette, drawn = colours([log]), {}
     for rank, (name, (_, other)) in enumerate(others):
-        groups = grouped(common_channels(log, other))
+        groups = group_channels(common_channels(log, other))
         for kind, channels in groups.items():
             for channel in channels:
                 time, trace = difference(log, other, channel)
-                path = entity(f"difference/{name}", channel)
-                label = f"{name} {trace.name}" if len(others) > 1 else trace.name
+                path = entity_path(f"difference/{name}", channel)
+                label = f"{name} {trace.legend_name}" if len(others) > 1 else trace.legend_name
                 style = _line_style(palette[trace.channel.axis], f"{label} [{trace.unit}]", rank)
                 stream.log(path, style, static=True)
                 columns = rr.Scalars.columns(scalars=trace.values)
@@ -524,12 +520,12 @@ def _line_style(colour: tuple[int, int, int], name: str, rank: int, width: float
     """Return the line style of a log: wide and dark for the first, thin and pale for others."""
     import rerun as rr
 
-    paler = [round(c + (_PALENESS if rank else 0.0) * (255 - c)) for c in colour]
+    paler = [round(c + (_WHITE_FRACTION if rank else 0.0) * (255 - c)) for c in colour]
     peaks = rr.components.AggregationPolicy.MinMax  # averages would hide peaks when zoomed out
     return rr.SeriesLines(colors=paler, names=name, widths=width, aggregation_policy=peaks)
 
 
-def _about(entries: Mapping[str, tuple[Machine, Log]]) -> "rr.TextDocument":
+def _about_document(entries: Mapping[str, tuple[Machine, Log]]) -> "rr.TextDocument":
     import rerun as rr
 
     lines = []

@@ -36,7 +36,7 @@ _STYLE = {
 }
 
 
-def _font() -> str:
+def _choose_font() -> str:
     """Return the font of the page if matplotlib has it, else the default font of matplotlib."""
     from matplotlib.font_manager import fontManager
 
@@ -62,13 +62,13 @@ def svg(figure: "Figure") -> bytes:
 
 
 @contextlib.contextmanager
-def drawing(height: float) -> Iterator["Figure"]:
+def report_figure(height: float) -> Iterator["Figure"]:
     """Create a figure in the style and width of a report, with a height in inches."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    with matplotlib.rc_context({**_STYLE, "font.family": _font()}):  # pyright: ignore - its keys are checked by matplotlib
+    with matplotlib.rc_context({**_STYLE, "font.family": _choose_font()}):  # pyright: ignore - its keys are checked by matplotlib
         figure = Figure(figsize=(_WIDTH, height), facecolor="white", layout="constrained")
         FigureCanvasAgg(figure)
         yield figure
@@ -125,21 +125,21 @@ class Section(NamedTuple):
 
 
 def write_sections(
-    path: str | Path, over: str, heading: str, lead: str, sections: Sequence[Section],
+    path: str | Path, overline: str, heading: str, lead: str, sections: Sequence[Section],
     figures: Sequence[tuple[str, str, str]] = (),
 ) -> None:  # fmt: skip
     """Write a report of sections.
 
     Args:
         path: HTML file to write.
-        over: line above the heading, and title of the browser window.
+        overline: line above the heading, and title of the browser window.
         heading: summary of the result in a few words.
         lead: one or two sentences below the heading.
         sections: sections of the report.
         figures: key figures as (class, number, label), shown large.
     """
     write_report(
-        "sections", path, title=over, over=over, heading=heading, lead=lead, sections=sections,
+        "sections", path, title=overline, over=overline, heading=heading, lead=lead, sections=sections,
         figures=figures,
     )  # fmt: skip
 
@@ -154,10 +154,10 @@ class Interval(NamedTuple):
     model: float | None
 
 
-def interval(value: float, low: float, high: float, model: float) -> Interval | None:
+def scale_interval(value: float, low: float, high: float, model: float) -> Interval | None:
     """Return positions of a value, its interval and the model value; None if none is finite.
 
-    >>> interval(1.5, 1.0, 2.0, 0.0)
+    >>> scale_interval(1.5, 1.0, 2.0, 0.0)
     Interval(width=220, value=159.0, start=110.0, length=98.0, model=12.0)
     """
     finite = [v for v in (value, low, high, model) if math.isfinite(v)]
@@ -182,7 +182,7 @@ class Dumbbell(NamedTuple):
     after: float | None
 
 
-def dumbbell(before: float, after: float | None, low: float, high: float) -> Dumbbell:
+def scale_dumbbell(before: float, after: float | None, low: float, high: float) -> Dumbbell:
     """Return the positions of 1 and of the values before and after on a scale `low` to `high`."""
     width = 440
 

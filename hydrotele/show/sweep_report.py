@@ -12,15 +12,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import hydrotele
-from hydrotele.core.output import replacing
+from hydrotele.core.output import atomic_file
 from hydrotele.show import report_html
-from hydrotele.show.report_html import drawing, png
+from hydrotele.show.report_html import png, report_figure
 
-DOT, MEAN, FAILED = "#9db4c8", "#1769aa", "#b5281c"
-_ACROSS, _MAPS = 4, 3
-_MOST_BINS, _PER_BIN = 8, 5
-_WIDE = 30.0  # ratio of largest and smallest value from which an axis is logarithmic
-_ANNOTATED = 60  # maximum number of cells of a map with printed values
+RUN_COLOUR, MEAN_COLOUR, FAILED_COLOUR = "#9db4c8", "#1769aa", "#b5281c"
+_MAX_COLUMNS, _MAX_MAP_COLUMNS = 4, 3
+_MAX_BINS, _MIN_RUNS_PER_BIN = 8, 5
+_MIN_LOG_SCALE_RATIO = 30.0  # ratio of largest and smallest value from which an axis is logarithmic
+_MAX_ANNOTATED_CELLS = 60  # maximum number of cells of a map with printed values
 
 
 class Study(NamedTuple):
@@ -34,7 +34,7 @@ class Study(NamedTuple):
         units: units of the columns, {name: unit}.
         grid: keys with given values.
         sampled: keys with random values.
-        logarithmic: sampled keys that are distributed on a logarithmic scale.
+        log_sampled: sampled keys that are distributed on a logarithmic scale.
         figures: names of the results to show.
         failed: failed runs as (run, reason).
     """
@@ -46,36 +46,36 @@ class Study(NamedTuple):
     units: Mapping[str, str]
     grid: tuple[str, ...]
     sampled: tuple[str, ...]
-    logarithmic: tuple[str, ...]
+    log_sampled: tuple[str, ...]
     figures: tuple[str, ...]
     failed: Sequence[tuple[int, str]]
 
     @property
-    def varied(self) -> tuple[str, ...]:
+    def varied_keys(self) -> tuple[str, ...]:
         """Keys with more than one value, or the seed if there is no such key."""
-        keys = [key for key in (*self.grid, *self.sampled) if len(levels(self.columns[key])) > 1]
+        keys = [key for key in (*self.grid, *self.sampled) if len(distinct_values(self.columns[key])) > 1]
         return tuple(keys) or ("seed",)
 
 
-class Shown(NamedTuple):
+class DisplayedResult(NamedTuple):
     """Result in display units: label with unit, and values (n,) with NaN for failed runs."""
 
     label: str
     values: np.ndarray
 
 
-def levels(values: Sequence[Any]) -> list[Any]:
+def distinct_values(values: Sequence[Any]) -> list[Any]:
     """Return the distinct values; numbers are sorted, other values keep their order."""
     found = list({json.dumps(value): value for value in values}.values())
-    return sorted(found) if numeric(found) else found
+    return sorted(found) if are_numbers(found) else found
 
 
-def numeric(values: Sequence[Any]) -> bool:
+def are_numbers(values: Sequence[Any]) -> bool:
     """Return whether all values are numbers."""
     return all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in values)
 
 
-def shown(study: Study, name: str) -> Shown:
+def displayed_result(study: Study, name: str) -> DisplayedResult:
     """Return a result in display units: mm below 2 m, deg, kN from 2 kN."""
     given = study.columns[name]
     values = np.array([math.nan if v is None else float(v) for v in given])
@@ -89,7 +89,7 @@ def shown(study: Study, name: str) -> Shown:
     elif unit == "N" and largest >= 2e3:
         unit, factor = "kN", 1e-3
     stem = name.removesuffix(f"_{study.units.get(name)}").replace("_", " ").replace(".", " ")
-    return Shown(f"{stem} [{unit}]" if unit != "1" else stem, factor * values)
+    return DisplayedResult(f"{stem} [{unit}]" if unit != "1" else stem, factor * values)
 
 
 def key_label(study: Study, key: str) -> str:
@@ -106,13 +106,13 @@ def draw_main_effects(study: Study) -> bytes:
     Returns:
         A PNG.
     """
-    keys, across = study.varied, min(_ACROSS, len(study.varied))
+    keys, across = study.varied_keys, min(_MAX_COLUMNS, len(study.varied_keys))
     per_figure = math.ceil(len(keys) / across)
     rows = per_figure * len(study.figures)
-    with drawing(0.3 + 2.35 * rows) as figure:
+    with report_figure(0.3 + 2.35 * rows) as figure:
         axes = figure.subplots(rows, across, squeeze=False)
         for number, name in enumerate(study.figures):
-            one = shown(study, name)
+            one = displayed_result(study, name)
             block = axes[number * per_figure : (number + 1) * per_figure].ravel()
             for place, key in zip(block, keys, strict=False):
                 _draw_effect(place, study, key, one)
@@ -120,49 +120,49 @@ def draw_main_effects(study: Study) -> bytes:
             for place in block[len(keys) :]:
                 place.set_visible(False)
             for row in axes[number * per_figure : (number + 1) * per_figure]:
-                row[0].set_ylabel(_folded(one.label))
+                row[0].set_ylabel(_fold_label(one.label))
         return png(figure)
 
 
-def _draw_effect(place, study: Study, key: str, one: Shown) -> None:
+def _draw_effect(place, study: Study, key: str, result: DisplayedResult) -> None:
     values = study.columns[key]
-    steps = levels(values)
-    spots = _spots(values, steps)
-    known = np.isfinite(one.values)
-    place.plot(spots[known], one.values[known], "o", color=DOT, ms=3.2, alpha=0.75, mew=0)
-    x, mean = _means(key in study.sampled and numeric(steps), spots[known], one.values[known])
-    place.plot(x, mean, "-o", color=MEAN, lw=1.6, ms=4.2)
+    steps = distinct_values(values)
+    spots = _axis_positions(values, steps)
+    known = np.isfinite(result.values)
+    place.plot(spots[known], result.values[known], "o", color=RUN_COLOUR, ms=3.2, alpha=0.75, mew=0)
+    x, mean = _mean_curve(key in study.sampled and are_numbers(steps), spots[known], result.values[known])
+    place.plot(x, mean, "-o", color=MEAN_COLOUR, lw=1.6, ms=4.2)
     lost = spots[~known]
     if len(lost):
-        place.plot(lost, np.full(len(lost), 0.03), "x", color=FAILED, ms=5, clip_on=False,
+        place.plot(lost, np.full(len(lost), 0.03), "x", color=FAILED_COLOUR, ms=5, clip_on=False,
                    transform=place.get_xaxis_transform())  # fmt: skip
-    if not numeric(steps):
-        place.set_xticks(range(len(steps)), [_short(step) for step in steps])
+    if not are_numbers(steps):
+        place.set_xticks(range(len(steps)), [_format_level(step) for step in steps])
         place.set_xlim(-0.5, len(steps) - 0.5)
-    elif key in study.logarithmic or (len(steps) > 2 and _is_wide(spots)):
+    elif key in study.log_sampled or (len(steps) > 2 and _is_wide(spots)):
         place.set_xscale("log")
-    if _is_wide(one.values[known]):
+    if _is_wide(result.values[known]):
         place.set_yscale("log")
     place.set_xlabel(key_label(study, key))
 
 
-def _spots(values: Sequence[Any], steps: list[Any]) -> np.ndarray:
+def _axis_positions(values: Sequence[Any], steps: list[Any]) -> np.ndarray:
     """Return axis positions: the value itself for numbers, else the index of the level."""
-    if numeric(steps):
+    if are_numbers(steps):
         return np.array([float(value) for value in values])
     texts = [json.dumps(step) for step in steps]
     return np.array([float(texts.index(json.dumps(value))) for value in values])
 
 
-def _means(binned: bool, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _mean_curve(binned: bool, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the means of y at each x, or over bins of x if few runs have the same x.
 
     Runs with the same x are in one bin, so that all values of the other keys contribute to it.
     """
     there = np.unique(x)
-    if not binned or len(x) >= _PER_BIN * len(there):
+    if not binned or len(x) >= _MIN_RUNS_PER_BIN * len(there):
         return there, np.array([y[x == value].mean() for value in there])
-    bins = min(_MOST_BINS, len(there) // 2, len(x) // _PER_BIN)
+    bins = min(_MAX_BINS, len(there) // 2, len(x) // _MIN_RUNS_PER_BIN)
     if bins < 2:
         return np.empty(0), np.empty(0)
     parts = [np.isin(x, part) for part in np.array_split(there, bins)]
@@ -170,12 +170,12 @@ def _means(binned: bool, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _is_wide(values: np.ndarray) -> bool:
-    return len(values) > 0 and values.min() > 0.0 and values.max() > _WIDE * values.min()
+    return len(values) > 0 and values.min() > 0.0 and values.max() > _MIN_LOG_SCALE_RATIO * values.min()
 
 
 def map_keys(study: Study) -> tuple[str, str] | None:
     """Return the two varied keys of the grid, or None if there are more or fewer."""
-    keys = [key for key in study.grid if len(levels(study.columns[key])) > 1]
+    keys = [key for key in study.grid if len(distinct_values(study.columns[key])) > 1]
     return (keys[0], keys[1]) if len(keys) == 2 else None
 
 
@@ -189,25 +189,28 @@ def draw_heat_maps(study: Study, keys: tuple[str, str]) -> bytes:
     Returns:
         A PNG.
     """
-    down, right = (levels(study.columns[key]) for key in keys)
-    rows, across = math.ceil(len(study.figures) / _MAPS), min(_MAPS, len(study.figures))
-    with drawing(rows * min(max(2.6, 0.9 + 0.32 * len(down)), 6.0)) as figure:
+    down, right = (distinct_values(study.columns[key]) for key in keys)
+    rows, across = (
+        math.ceil(len(study.figures) / _MAX_MAP_COLUMNS),
+        min(_MAX_MAP_COLUMNS, len(study.figures)),
+    )
+    with report_figure(rows * min(max(2.6, 0.9 + 0.32 * len(down)), 6.0)) as figure:
         axes = figure.subplots(rows, across, squeeze=False)
         for place, name in zip(axes.ravel(), study.figures, strict=False):
-            one = shown(study, name)
+            one = displayed_result(study, name)
             cells = _cells(study, keys, one.values)
             place.grid(False)
             place.set_facecolor("0.85")
             scale = "log" if _is_wide(cells[np.isfinite(cells)]) else "linear"
             image = place.imshow(cells, aspect="auto", origin="lower", cmap="viridis", norm=scale)
             figure.colorbar(image, ax=place, pad=0.02)
-            place.set_title(_folded(one.label))
-            place.set_xticks(range(len(right)), [_short(v) for v in right])
-            place.set_yticks(range(len(down)), [_short(v) for v in down])
+            place.set_title(_fold_label(one.label))
+            place.set_xticks(range(len(right)), [_format_level(v) for v in right])
+            place.set_yticks(range(len(down)), [_format_level(v) for v in down])
             place.set_xlabel(key_label(study, keys[1]))
             place.set_ylabel(key_label(study, keys[0]))
-            if cells.size <= _ANNOTATED:
-                _annotate(place, cells, image)
+            if cells.size <= _MAX_ANNOTATED_CELLS:
+                _print_cell_values(place, cells, image)
         for place in axes.ravel()[len(study.figures) :]:
             place.set_visible(False)
         return png(figure)
@@ -215,7 +218,7 @@ def draw_heat_maps(study: Study, keys: tuple[str, str]) -> bytes:
 
 def _cells(study: Study, keys: tuple[str, str], values: np.ndarray) -> np.ndarray:
     """Return mean values (levels of key 1, levels of key 2), NaN where no run succeeded."""
-    texts = [[json.dumps(v) for v in levels(study.columns[key])] for key in keys]
+    texts = [[json.dumps(v) for v in distinct_values(study.columns[key])] for key in keys]
     cells = np.full((len(texts[0]), len(texts[1])), np.nan)
     places = [np.array([t.index(json.dumps(v)) for v in study.columns[key]])
               for t, key in zip(texts, keys, strict=True)]  # fmt: skip
@@ -226,7 +229,7 @@ def _cells(study: Study, keys: tuple[str, str], values: np.ndarray) -> np.ndarra
     return cells
 
 
-def _annotate(place, cells: np.ndarray, image) -> None:
+def _print_cell_values(place, cells: np.ndarray, image) -> None:
     for (i, j), value in np.ndenumerate(cells):
         dark = np.isfinite(value) and image.norm(value) < 0.6
         text = f"{value:.3g}" if np.isfinite(value) else "failed"
@@ -234,14 +237,14 @@ def _annotate(place, cells: np.ndarray, image) -> None:
                    color="white" if dark else "#1d232b")  # fmt: skip
 
 
-def _short(value: Any) -> str:
+def _format_level(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     text = value if isinstance(value, str) else json.dumps(value)
     return text if len(text) <= 18 else f"{text[:17]}..."
 
 
-def _folded(label: str) -> str:
+def _fold_label(label: str) -> str:
     """Break a long label into two lines."""
     if len(label) <= 26:
         return label
@@ -252,7 +255,7 @@ def _folded(label: str) -> str:
 
 __all__ = ["Study", "write_sweep_report"]
 
-_LISTED = 200
+_MAX_LISTED_FAILURES = 200
 
 
 def write_sweep_report(study: Study, folder: Path) -> None:
@@ -266,17 +269,17 @@ def write_sweep_report(study: Study, folder: Path) -> None:
         InputError: the folder cannot be written.
     """
     images = {}
-    if any(np.isfinite(shown(study, name).values).any() for name in study.figures):
+    if any(np.isfinite(displayed_result(study, name).values).any() for name in study.figures):
         images["main_effects.png"] = draw_main_effects(study)
         if keys := map_keys(study):
             images["heat_map.png"] = draw_heat_maps(study, keys)
     for name in ("main_effects.png", "heat_map.png"):
         if name in images:
-            with replacing(folder / name, ".png") as part:
+            with atomic_file(folder / name, ".png") as part:
                 part.write_bytes(images[name])
         else:
             (folder / name).unlink(missing_ok=True)
-    with replacing(folder / "report.html", ".html") as part:
+    with atomic_file(folder / "report.html", ".html") as part:
         _write_page(study, images, part)
 
 
@@ -285,40 +288,40 @@ def _write_page(study: Study, images: dict[str, bytes], path: Path) -> None:
     report_html.write_report(
         "sweep", path, title=f"sweep {study.name}", heading=study.name.replace("_", " "),
         over=f"hydrotele {hydrotele.__version__} - sweep of {study.scenario}",
-        description=study.description, varied=_varied(study), spreads=_spreads(study),
+        description=study.description, varied=_key_rows(study), spreads=_range_rows(study),
         figures=[
             ("", runs, "runs"),
             ("after", runs - failed, "succeeded"),
             ("before" if failed else "", failed, "failed"),
-            ("", len(study.varied), "keys varied"),
+            ("", len(study.varied_keys), "keys varied"),
         ],
         main_effects=images.get("main_effects.png"), heat_map=images.get("heat_map.png"),
-        failures=_failures(study), unlisted=max(failed - _LISTED, 0),
+        failures=_failures(study), unlisted=max(failed - _MAX_LISTED_FAILURES, 0),
     )  # fmt: skip
 
 
-def _varied(study: Study) -> list[tuple[str, str]]:
+def _key_rows(study: Study) -> list[tuple[str, str]]:
     rows = []
     for key in (*study.grid, *study.sampled):
-        steps = levels(study.columns[key])
-        if key in study.sampled and numeric(steps):
+        steps = distinct_values(study.columns[key])
+        if key in study.sampled and are_numbers(steps):
             values = f"{len(steps)} random values from {steps[0]:.4g} to {steps[-1]:.4g}"
         else:
-            values = ", ".join(map(_text, steps[:12])) + (" ..." if len(steps) > 12 else "")
+            values = ", ".join(map(_format_value, steps[:12])) + (" ..." if len(steps) > 12 else "")
         rows.append((key_label(study, key), values))
-    seeds = levels(study.columns["seed"])
+    seeds = distinct_values(study.columns["seed"])
     rows.append(("seed", ", ".join(map(str, seeds[:12])) + (" ..." if len(seeds) > 12 else "")))
     return rows
 
 
-def _text(value) -> str:
+def _format_value(value) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _spreads(study: Study) -> list[dict[str, Any]]:
+def _range_rows(study: Study) -> list[dict[str, Any]]:
     rows = []
     for name in study.figures:
-        one = shown(study, name)
+        one = displayed_result(study, name)
         known = np.flatnonzero(np.isfinite(one.values))
         if not len(known):
             continue
@@ -326,21 +329,19 @@ def _spreads(study: Study) -> list[dict[str, Any]]:
         ends = [int(known[np.argmin(values)]), int(known[np.argmax(values)])]
         smallest, largest = (_run(study, one.values[row], row) for row in ends)
         median = f"{np.median(values):.4g}"
-        rows.append(
-            {"label": one.label, "smallest": smallest, "median": median, "largest": largest}
-        )
+        rows.append({"label": one.label, "smallest": smallest, "median": median, "largest": largest})
     return rows
 
 
 def _run(study: Study, value: float, row: int) -> tuple[str, str]:
     """Return a result as text, and the run it belongs to with its keys."""
-    keys = ", ".join(f"{key} {_text(study.columns[key][row])}" for key in study.varied[:3])
+    keys = ", ".join(f"{key} {_format_value(study.columns[key][row])}" for key in study.varied_keys[:3])
     return f"{value:.4g}", f"run {study.columns['run'][row]}: {keys}"
 
 
 def _failures(study: Study) -> list[tuple[int, str, str]]:
     rows = []
-    for run, reason in study.failed[:_LISTED]:
-        keys = ", ".join(f"{key} {_text(study.columns[key][run - 1])}" for key in study.varied)
+    for run, reason in study.failed[:_MAX_LISTED_FAILURES]:
+        keys = ", ".join(f"{key} {_format_value(study.columns[key][run - 1])}" for key in study.varied_keys)
         rows.append((run, keys, reason))
     return rows

@@ -13,44 +13,44 @@ import numpy as np
 
 import hydrotele
 from hydrotele.show import report_html
-from hydrotele.show.report_html import drawing, png
+from hydrotele.show.report_html import png, report_figure
 from hydrotele.teleop.analysis import stability_map
 from hydrotele.teleop.findings import (
-    Findings,
     ScenarioFindings,
+    TeleopFindings,
+    describe_stability,
     format_delay,
     format_error,
     format_factor,
     format_number,
-    why_unstable,
 )
-from hydrotele.teleop.switching import Spring, growth_map
+from hydrotele.teleop.switching import StiffnessAxis, growth_map
 from hydrotele.teleop.two_port import Impedance
 
-_INK, _SOFT = "#262b33", "#8a94a0"
-_GOOD, _SURE, _BAD = "#cfe3f4", "#7fb2dd", "#f6ddd3"
-_LOOKS = {
+_INK, _GREY_COLOUR = "#262b33", "#8a94a0"
+_WORST_CASE_STABLE_COLOUR, _STABLE_COLOUR, _UNSTABLE_COLOUR = "#cfe3f4", "#7fb2dd", "#f6ddd3"
+_LINE_STYLES = {
     "position_position": ("#1769aa", "-"), "rate_position": ("#1769aa", (0, (4, 1.6))),
     "position_force": ("#e07b00", "-"), "rate_force": ("#e07b00", (0, (4, 1.6))),
     "four_channel_position": ("#23794a", "-"), "four_channel_rate": ("#23794a", (0, (4, 1.6))),
 }  # fmt: skip
-_HYBRID = (
+_HYBRID_TITLES = (
     ("h11: impedance felt with a free slave [N s/m]", "h12: reflected force / task force [1]"),
     ("h21: slave velocity / hand velocity [1]", "h22: admittance of the slave [m/(N s)]"),
 )
-_NYQUIST = (-3.0, 1.5, -2.25, 2.25)
+_NYQUIST_LIMITS = (-3.0, 1.5, -2.25, 2.25)
 
 
-def plain_name(structure: str) -> str:
+def display_name(structure: str) -> str:
     """Return the name of a structure for display.
 
-    >>> plain_name("four_channel_rate")
+    >>> display_name("four_channel_rate")
     'four-channel rate'
     """
     return structure.replace("four_channel_", "four-channel ").replace("_", "-")
 
 
-def draw_hybrid(found: Findings) -> bytes:
+def draw_hybrid_matrix(found: TeleopFindings) -> bytes:
     """Draw the magnitudes of the elements of the hybrid matrix over frequency.
 
     Args:
@@ -59,35 +59,35 @@ def draw_hybrid(found: Findings) -> bytes:
     Returns:
         A PNG.
     """
-    with drawing(6.2) as figure:
+    with report_figure(6.2) as figure:
         axes = figure.subplots(2, 2, sharex=True)
         for row in range(2):
             for column in range(2):
                 panel = axes[row, column]
-                panel.set_title(_HYBRID[row][column])
+                panel.set_title(_HYBRID_TITLES[row][column])
                 if row != column:
-                    panel.axhline(1.0, color=_SOFT, lw=1.2, dashes=(1, 1.5))
+                    panel.axhline(1.0, color=_GREY_COLOUR, lw=1.2, dashes=(1, 1.5))
                 for one in found.analyses:
-                    _line(panel, one, np.abs(one.hybrid[:, row, column]))
-                _logarithmic(panel, 1e-4, 1e5)
+                    _plot_line(panel, one, np.abs(one.hybrid_matrices[:, row, column]))
+                _set_log_axes(panel, 1e-4, 1e5)
         for panel in axes[1]:
             panel.set_xlabel("frequency [Hz]")
         _legend(figure, axes[0, 0])
         return png(figure)
 
 
-def draw_felt(found: Findings) -> bytes:
+def draw_transmitted_impedance(found: TeleopFindings) -> bytes:
     """Draw magnitude and phase of the transmitted impedance and of the task impedance as PNG."""
-    with drawing(4.2) as figure:
+    with report_figure(4.2) as figure:
         left, right = figure.subplots(1, 2, sharex=True)
         first = found.analyses[0]
         hertz = first.frequencies / (2.0 * np.pi)
-        left.plot(hertz, np.abs(first.task), color=_INK, lw=4.0, alpha=0.25, label="task")
-        right.plot(hertz, np.degrees(np.angle(first.task)), color=_INK, lw=4.0, alpha=0.25)
+        left.plot(hertz, np.abs(first.task_impedance), color=_INK, lw=4.0, alpha=0.25, label="task")
+        right.plot(hertz, np.degrees(np.angle(first.task_impedance)), color=_INK, lw=4.0, alpha=0.25)
         for one in found.analyses:
-            _line(left, one, np.abs(one.transmitted))
-            _line(right, one, np.degrees(np.unwrap(np.angle(one.transmitted))))
-        _logarithmic(left, 1e-1, 1e7)
+            _plot_line(left, one, np.abs(one.transmitted_impedance))
+            _plot_line(right, one, np.degrees(np.unwrap(np.angle(one.transmitted_impedance))))
+        _set_log_axes(left, 1e-1, 1e7)
         left.set_title("magnitude of the felt impedance [N s/m]")
         right.set_title("phase of the felt impedance [deg]")
         right.set_ylim(-360.0, 180.0)
@@ -98,15 +98,15 @@ def draw_felt(found: Findings) -> bytes:
         return png(figure)
 
 
-def draw_scattering(found: Findings) -> bytes:
+def draw_scattering(found: TeleopFindings) -> bytes:
     """Draw the norm of the scattering matrix as PNG; above 1 the two-port can emit energy."""
-    with drawing(3.4) as figure:
+    with report_figure(3.4) as figure:
         panel = figure.subplots()
-        top = max(float(one.scattering.max()) for one in found.analyses)
-        panel.axhspan(1.0, 1.3 * top, color=_BAD, alpha=0.5, lw=0)
+        top = max(float(one.scattering_norms.max()) for one in found.analyses)
+        panel.axhspan(1.0, 1.3 * top, color=_UNSTABLE_COLOUR, alpha=0.5, lw=0)
         panel.axhline(1.0, color=_INK, lw=1.0)
         for one in found.analyses:
-            _line(panel, one, one.scattering)
+            _plot_line(panel, one, one.scattering_norms)
         panel.set_xscale("log")
         panel.set_yscale("log")
         panel.set_ylim(0.8, 1.3 * top)
@@ -116,50 +116,48 @@ def draw_scattering(found: Findings) -> bytes:
         return png(figure)
 
 
-def draw_nyquist(found: Findings) -> bytes:
+def draw_nyquist(found: TeleopFindings) -> bytes:
     """Draw Nyquist curves of the loop gain with the task and in free motion as PNG."""
-    with drawing(3.1 * _rows(found)) as figure:
+    with report_figure(3.1 * _rows(found)) as figure:
         for panel, one in zip(_panels(figure, found), found.analyses, strict=False):
-            colour = _LOOKS[one.structure][0]
+            colour = _LINE_STYLES[one.structure][0]
             for curve, look, name in (
-                (one.loop, {"color": colour, "lw": 1.4}, "with the task"),
-                (one.loop_free, {"color": _SOFT, "lw": 1.1}, "free motion"),
+                (one.loop_gains, {"color": colour, "lw": 1.4}, "with the task"),
+                (one.loop_free, {"color": _GREY_COLOUR, "lw": 1.1}, "free motion"),
             ):
                 panel.plot(np.real(curve), np.imag(curve), label=name, **look)
                 panel.plot(np.real(curve), -np.imag(curve), **(look | {"alpha": 0.35}))
             panel.plot(-1.0, 0.0, "+", color="#b5281c", ms=10, mew=2)
-            panel.axis(_NYQUIST)
+            panel.axis(_NYQUIST_LIMITS)
             panel.set_aspect("equal")
             panel.set(xlabel="real part [1]", ylabel="imaginary part [1]")
-            said = "stable" if one.stable else why_unstable(one).removeprefix("no, ")
-            panel.set_title(f"{plain_name(one.structure)}: {said}")
+            said = "stable" if one.is_stable_held else describe_stability(one).removeprefix("no, ")
+            panel.set_title(f"{display_name(one.structure)}: {said}")
             panel.legend(loc="upper right", fontsize=8, frameon=False)
         return png(figure)
 
 
-def draw_maps(found: Findings) -> bytes:
+def draw_stability_maps(found: TeleopFindings) -> bytes:
     """Draw the stability of each structure over delay and gain factor as PNG."""
-    with drawing(2.9 * _rows(found)) as figure:
-        seen = {one.structure: one.seen for one in found.agreements}
+    with report_figure(2.9 * _rows(found)) as figure:
+        seen = {one.structure: one.simulated for one in found.agreements}
         for panel, (name, cells) in zip(_panels(figure, found), found.maps.items(), strict=False):
-            _cells(panel, 1e3 * found.delays, found.factors, cells, (_BAD, _SURE))
+            _cells(panel, 1e3 * found.delays, found.factors, cells, (_UNSTABLE_COLOUR, _STABLE_COLOUR))
             panel.set_yscale("log")
-            _root_scale(panel, 1e3 * found.delays)
+            _set_root_scale(panel, 1e3 * found.delays)
             panel.plot(1e3 * found.case.delay, 1.0, "o", color=_INK, ms=6, clip_on=False)
             if name in seen:
                 row, column = np.nonzero(seen[name] != cells)
-                panel.plot(
-                    1e3 * found.delays[column], found.factors[row], "x", color="#b5281c", ms=5
-                )
-            panel.set_title(plain_name(name))
+                panel.plot(1e3 * found.delays[column], found.factors[row], "x", color="#b5281c", ms=5)
+            panel.set_title(display_name(name))
             panel.set_xlabel("one-way delay [ms]")
             panel.set_ylabel("factor on reflection [1]")
             panel.grid(False)
-        _key(figure)
+        _draw_map_legend(figure)
         return png(figure)
 
 
-def draw_stiffness(spring: Spring, held: Spring) -> bytes:
+def draw_stiffness(spring: StiffnessAxis, held: StiffnessAxis) -> bytes:
     """Draw the stability margin of stiffness feedback and its worst-case stability.
 
     Args:
@@ -169,21 +167,27 @@ def draw_stiffness(spring: Spring, held: Spring) -> bytes:
     Returns:
         A PNG.
     """
-    damping = np.linspace(0.0, 1.25 * max(held.enough_damping, held.damping), 91)
-    stiffest = np.geomspace(held.least or 1e-2 * held.most, 4.0 * held.most, 91)
-    growth = growth_map(held.mass, held.least, damping, stiffest)
+    damping = np.linspace(0.0, 1.25 * max(held.theorem_damping, held.damping), 91)
+    stiffest = np.geomspace(held.min_stiffness or 1e-2 * held.max_stiffness, 4.0 * held.max_stiffness, 91)
+    growth = growth_map(held.mass, held.min_stiffness, damping, stiffest)
     margin = damping[None, :] ** 2 - 4.0 * held.mass * stiffest[:, None]
-    with drawing(4.0) as figure:
+    with report_figure(4.0) as figure:
         left, right = figure.subplots(1, 2, sharey=True)
-        _margin(figure, left, damping, stiffest, margin)
+        _draw_margin(figure, left, damping, stiffest, margin)
         kinds = np.where(margin > 0.0, 2, np.where(growth < 1.0, 1, 0))
-        _cells(right, damping, stiffest, kinds, (_BAD, _GOOD, _SURE))
+        _cells(
+            right,
+            damping,
+            stiffest,
+            kinds,
+            (_UNSTABLE_COLOUR, _WORST_CASE_STABLE_COLOUR, _STABLE_COLOUR),
+        )
         right.set_title("stable by margin (dark), stable in worst case (light), unstable (red)")
         edge = 2.0 * np.sqrt(held.mass * stiffest)
         for panel in (left, right):
             panel.plot(edge, stiffest, color=_INK, lw=1.6)
-            panel.plot(held.damping, held.most, "o", color=_INK, ms=7)
-            panel.annotate("this case,\nheld", (held.damping, held.most), (9, -4),
+            panel.plot(held.damping, held.max_stiffness, "o", color=_INK, ms=7)
+            panel.annotate("this case,\nheld", (held.damping, held.max_stiffness), (9, -4),
                            textcoords="offset points", fontsize=8.5, va="top")  # fmt: skip
             panel.set(yscale="log", xlim=(0.0, damping[-1]), xlabel="damping B [N s/m]")
             panel.set_ylim(stiffest[0], stiffest[-1])
@@ -192,12 +196,10 @@ def draw_stiffness(spring: Spring, held: Spring) -> bytes:
         return png(figure)
 
 
-def _margin(figure: Any, panel: Any, damping: np.ndarray, stiffest: np.ndarray, margin: np.ndarray):
+def _draw_margin(figure: Any, panel: Any, damping: np.ndarray, stiffest: np.ndarray, margin: np.ndarray):
     """Draw the margin in thousands, with a colour scale that is symmetric about 0."""
     reach = float(np.percentile(np.abs(margin), 80.0)) / 1e3
-    shown = panel.pcolormesh(
-        damping, stiffest, margin / 1e3, cmap="RdBu", vmin=-reach, vmax=reach, shading="nearest"
-    )
+    shown = panel.pcolormesh(damping, stiffest, margin / 1e3, cmap="RdBu", vmin=-reach, vmax=reach, shading="nearest")
     figure.colorbar(shown, ax=panel, extend="both", pad=0.02)
     panel.set_title("margin B² - 4 M K [1000 (N s/m)²]")
 
@@ -212,7 +214,7 @@ def _cells(panel: Any, x: np.ndarray, y: np.ndarray, kinds: np.ndarray, colours:
     )  # fmt: skip
 
 
-def _root_scale(panel: Any, delays: np.ndarray) -> None:
+def _set_root_scale(panel: Any, delays: np.ndarray) -> None:
     """Set a square-root scale of the delay axis, which enlarges short delays."""
     panel.set_xscale("function", functions=(lambda x: np.sqrt(np.maximum(x, 0.0)), np.square))
     panel.set_xlim(0.0, delays[-1])
@@ -220,13 +222,13 @@ def _root_scale(panel: Any, delays: np.ndarray) -> None:
     panel.set_xticks(ticks, [str(tick) for tick in ticks])
 
 
-def _line(panel: Any, one: Any, values: np.ndarray) -> None:
-    colour, style = _LOOKS[one.structure]
+def _plot_line(panel: Any, one: Any, values: np.ndarray) -> None:
+    colour, style = _LINE_STYLES[one.structure]
     hertz = one.frequencies / (2.0 * np.pi)
-    panel.plot(hertz, values, color=colour, ls=style, lw=1.4, label=plain_name(one.structure))
+    panel.plot(hertz, values, color=colour, ls=style, lw=1.4, label=display_name(one.structure))
 
 
-def _logarithmic(panel: Any, least: float, most: float) -> None:
+def _set_log_axes(panel: Any, least: float, most: float) -> None:
     """Set logarithmic axes with limits that exclude rounding errors and unbounded resonances."""
     panel.set_xscale("log")
     panel.set_yscale("log")
@@ -239,23 +241,23 @@ def _legend(figure: Any, panel: Any) -> None:
     figure.legend(handles, labels, loc="outside upper left", ncols=4, frameon=False, fontsize=8.5)
 
 
-def _key(figure: Any) -> None:
+def _draw_map_legend(figure: Any) -> None:
     """Draw the legend of the stability maps."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     point = Line2D([], [], color=_INK, marker="o", ls="")
     figure.legend(
-        [Patch(color=_SURE), Patch(color=_BAD), point], ["stable", "unstable", "this case"],
+        [Patch(color=_STABLE_COLOUR), Patch(color=_UNSTABLE_COLOUR), point], ["stable", "unstable", "this case"],
         loc="outside upper left", ncols=3, frameon=False, fontsize=8.5,
     )  # fmt: skip
 
 
-def _rows(found: Findings) -> int:
+def _rows(found: TeleopFindings) -> int:
     return -(-len(found.analyses) // 3)
 
 
-def _panels(figure: Any, found: Findings) -> list:
+def _panels(figure: Any, found: TeleopFindings) -> list:
     """Return the panels of a figure with three panels per row; hide unused panels."""
     panels = list(figure.subplots(_rows(found), 3, squeeze=False).flat)
     for panel in panels[len(found.analyses) :]:
@@ -273,17 +275,17 @@ _CHANNELS = {
 }
 
 
-def write_teleop_report(found: Findings, maps: bytes, path: str | Path) -> None:
+def write_teleop_report(found: TeleopFindings, maps: bytes, path: str | Path) -> None:
     """Write the report of a teleoperator case as one self-contained HTML file.
 
     Args:
         found: results of the analysis.
-        maps: PNG of the stability maps, from `draw_maps`.
+        maps: PNG of the stability maps, from `draw_stability_maps`.
         path: file to write.
     """
     spring, case = found.spring, found.case
-    good, many = [one for one in found.analyses if one.stable], len(found.analyses)
-    gains, names = case.gains, ", ".join(plain_name(one.structure) for one in good)
+    good, many = [one for one in found.analyses if one.is_stable_held], len(found.analyses)
+    gains, names = case.gains, ", ".join(display_name(one.structure) for one in good)
     report_html.write_report(
         "two_port", path, title=f"{found.name}: teleoperator",
         over=f"TELEOPERATOR ANALYSIS  ·  {found.name}  ·  delay {1e3 * case.delay_forward:g} ms"
@@ -291,76 +293,76 @@ def write_teleop_report(found: Findings, maps: bytes, path: str | Path) -> None:
         heading=f"Stable: {names}" if good else "No structure is stable",
         chip=("no_gap", "All stable") if len(good) == many
         else ("ambiguous", "Some unstable") if good else ("unknown", "Unstable"),
-        figures=_figures(found), verdicts=_verdicts(found), confirmed=_confirmed(found),
+        figures=_figures(found), verdicts=_verdicts(found), confirmed=_confirmation_rows(found),
         pictures={
-            "maps": maps, "nyquist": draw_nyquist(found), "felt": draw_felt(found),
-            "scattering": draw_scattering(found), "hybrid": draw_hybrid(found),
+            "maps": maps, "nyquist": draw_nyquist(found), "felt": draw_transmitted_impedance(found),
+            "scattering": draw_scattering(found), "hybrid": draw_hybrid_matrix(found),
         },
-        stiffness=_stiffness(spring, spring.held(case.hand)) if spring else None,
+        stiffness=_stiffness(spring, spring.with_hand(case.hand)) if spring else None,
         gains=f"position {gains.position:g}, velocity {gains.velocity:g} 1/s, force"
         f" {gains.force:g}",
         impedances=_impedances(found), version=hydrotele.__version__,
     )  # fmt: skip
 
 
-def _figures(found: Findings) -> list[tuple[str, str, str]]:
-    many, good = len(found.analyses), sum(one.stable for one in found.analyses)
-    passive = sum(one.passive for one in found.analyses)
+def _figures(found: TeleopFindings) -> list[tuple[str, str, str]]:
+    many, good = len(found.analyses), sum(one.is_stable_held for one in found.analyses)
+    passive = sum(one.has_passive_port for one in found.analyses)
     cards = [
         ("after", f"{good} of {many}", "structures stable in contact and in free motion"),
         ("", f"{passive} of {many}", "passive two-ports: stable with any passive hand and task"),
     ]
     if found.agreements:
-        worst = min(one.share for one in found.agreements)
+        worst = min(one.agreement_fraction for one in found.agreements)
         what = "of the map cells confirmed by simulation (lowest of all structures)"
         cards.append(("after", f"{100 * worst:.1f} %", what))
-        errors = [s.error for s in found.sweeps if s.error is not None]
+        errors = [s.max_relative_error for s in found.sweeps if s.max_relative_error is not None]
         if errors:
             what = "largest impedance error of a sine sweep"
             cards.append(("after", f"{100 * max(errors):.2f} %", what))
     return cards
 
 
-def _verdicts(found: Findings) -> list[dict[str, Any]]:
+def _verdicts(found: TeleopFindings) -> list[dict[str, Any]]:
     return [
         {
-            "name": plain_name(one.structure), "channels": _CHANNELS[one.structure],
-            "stable": one.stable, "why": why_unstable(one), "passive": one.passive,
-            "texts": (format_factor(one.gain_margin), format_delay(one.largest_delay),
-                      f"{one.scattering.max():.3g}"),
+            "name": display_name(one.structure), "channels": _CHANNELS[one.structure],
+            "stable": one.is_stable_held, "why": describe_stability(one), "passive": one.has_passive_port,
+            "texts": (format_factor(one.gain_margin), format_delay(one.max_delay),
+                      f"{one.scattering_norms.max():.3g}"),
         }
         for one in found.analyses
     ]  # fmt: skip
 
 
-def _confirmed(found: Findings) -> list[tuple[str, ...]]:
+def _confirmation_rows(found: TeleopFindings) -> list[tuple[str, ...]]:
     rows = []
     for one in found.agreements:
-        errors = [format_error(s.error) for s in found.sweeps if s.structure == one.structure]
-        cells = f"{int((one.predicted == one.seen).sum())} of {one.seen.size}"
-        rows.append((plain_name(one.structure), *[*errors, "-"][:2], cells))
+        errors = [format_error(s.max_relative_error) for s in found.sweeps if s.structure == one.structure]
+        cells = f"{int((one.predicted == one.simulated).sum())} of {one.simulated.size}"
+        rows.append((display_name(one.structure), *[*errors, "-"][:2], cells))
     return rows
 
 
-def _stiffness(spring: Spring, held: Spring) -> dict[str, Any]:
+def _stiffness(spring: StiffnessAxis, held: StiffnessAxis) -> dict[str, Any]:
     rows = [
-        (name, f"{one.mass:.3g}", f"{one.damping:.4g}", f"{one.least:g} to {one.most:g}",
-         format_number(one.margin), f"{one.enough_damping:.4g}", f"{one.growth:.3g}")
+        (name, f"{one.mass:.3g}", f"{one.damping:.4g}", f"{one.min_stiffness:g} to {one.max_stiffness:g}",
+         format_number(one.theorem_margin), f"{one.theorem_damping:.4g}", f"{one.half_swing_growth:.3g}")
         for name, one in (("held", held), ("released", spring))
     ]  # fmt: skip
-    safe = held.growth < 1.0
+    safe = held.half_swing_growth < 1.0
     conclusion = (
         "The margin of the held joystick is positive: no change of the stiffness makes it unstable."
-        if held.margin > 0.0
+        if held.theorem_margin > 0.0
         else "The margin of the held joystick is not positive, so that the theorem does not decide"
         " its stability. Under the worst-case switching of the stiffness, each half oscillation"
-        f" {'shrinks' if safe else 'grows'} to {held.growth:.3g} times the previous one: the"
+        f" {'shrinks' if safe else 'grows'} to {held.half_swing_growth:.3g} times the previous one: the"
         f" joystick is {'stable' if safe else 'unstable'}."
     )
     return {"rows": rows, "conclusion": conclusion, "picture": draw_stiffness(spring, held)}
 
 
-def _impedances(found: Findings) -> list[tuple[str, ...]]:
+def _impedances(found: TeleopFindings) -> list[tuple[str, ...]]:
     case = found.case
     parts: list[tuple[str, Impedance]] = [
         ("master", case.master), ("controller of the master", case.master_control),
@@ -370,9 +372,9 @@ def _impedances(found: Findings) -> list[tuple[str, ...]]:
     return [(name, f"{z.mass:.4g}", f"{z.damping:.4g}", f"{z.stiffness:.6g}") for name, z in parts]
 
 
-_DELAYS, _FACTORS = 13, 25
-_LONGEST = 0.3  # s, maximum one-way delay of the map
-_SPAN = (0.05, 20.0)  # range of the map, relative to the maximum stable ratio
+_N_DELAYS, _N_FACTORS = 13, 25
+_MAX_DELAY = 0.3  # s, maximum one-way delay of the map
+_RATIO_RANGE = (0.05, 20.0)  # range of the map, relative to the maximum stable ratio
 
 
 def draw_loop_map(found: ScenarioFindings) -> bytes:
@@ -386,10 +388,10 @@ def draw_loop_map(found: ScenarioFindings) -> bytes:
     """
     case, loop = found.case, found.loop
     margin = loop.gain_margin if np.isfinite(loop.gain_margin) and loop.gain_margin > 0.0 else 1.0
-    delays = _LONGEST * np.linspace(0.0, 1.0, _DELAYS)
-    factors = margin * np.geomspace(*_SPAN, _FACTORS)
+    delays = _MAX_DELAY * np.linspace(0.0, 1.0, _N_DELAYS)
+    factors = margin * np.geomspace(*_RATIO_RANGE, _N_FACTORS)
     good = stability_map(case, loop.structure, delays, factors)
-    with drawing(3.4) as figure:
+    with report_figure(3.4) as figure:
         axes = figure.subplots()
         axes.pcolormesh(
             1e3 * delays, factors * case.ratio * case.force_limit, good, cmap="Blues", vmin=-0.3,
@@ -405,23 +407,26 @@ def draw_loop_map(found: ScenarioFindings) -> bytes:
 
 
 def write_loop_report(
-    found: ScenarioFindings, said: Sequence[tuple[str, str, str]], map_: bytes, path: Path
+    found: ScenarioFindings,
+    findings_rows: Sequence[tuple[str, str, str]],
+    map_png: bytes,
+    path: Path,
 ) -> None:
     """Write the report of a scenario analysis as one self-contained HTML file.
 
     Args:
         found: results of the analysis.
-        said: results as text: (quantity, value, remark).
-        map_: PNG of the stability map, from `draw_loop_map`.
+        findings_rows: results as text: (quantity, value, remark).
+        map_png: PNG of the stability map, from `draw_loop_map`.
         path: file to write.
     """
     springs = [
-        (name, f"{one.damping:g}", f"{one.most:g}", format_number(one.margin),
-         f"{one.enough_damping:.4g}", f"{one.growth:.3g}")
-        for name, one in (("held", found.held), ("released", found.free))
+        (name, f"{one.damping:g}", f"{one.max_stiffness:g}", format_number(one.theorem_margin),
+         f"{one.theorem_damping:.4g}", f"{one.half_swing_growth:.3g}")
+        for name, one in (("held", found.held_spring), ("released", found.released_spring))
     ]  # fmt: skip
     report_html.write_report(
         "loop", path, title=f"{found.name}: loop", over=f"TELEOPERATED SCENARIO  ·  {found.name}",
-        heading=f"{'Stable' if found.loop.stable else 'Unstable'}: {found.loop.structure}",
-        findings=said, map=map_, springs=springs,
+        heading=f"{'Stable' if found.loop.is_stable else 'Unstable'}: {found.loop.structure}",
+        findings=findings_rows, map=map_png, springs=springs,
     )  # fmt: skip

@@ -22,10 +22,10 @@ from typing import TYPE_CHECKING, NamedTuple
 from urllib.parse import quote
 
 from hydrotele.core.errors import InputError
-from hydrotele.core.output import replacing
+from hydrotele.core.output import atomic_file
 from hydrotele.show.recording import TIMELINE
 
-_PATIENCE = 5.0  # s, timeout for the program to end after SIGTERM
+_EXIT_TIMEOUT = 5.0  # s, timeout for the program to end after SIGTERM
 _PR_SET_PDEATHSIG = 1  # option of Linux prctl: signal to the child when the parent dies
 
 
@@ -40,12 +40,12 @@ class Viewer(NamedTuple):
     process: subprocess.Popen
     output: Path
 
-    def said(self) -> str:
+    def read_output(self) -> str:
         """Return the output of the program so far."""
         return self.output.read_text(errors="replace")
 
 
-def rerun_program() -> Path:
+def find_rerun_program() -> Path:
     """Return the path of the rerun program: RERUN_CLI_PATH, or that of the rerun-sdk wheel.
 
     Raises:
@@ -63,7 +63,7 @@ def rerun_program() -> Path:
     return program
 
 
-def recording_file(path: str | os.PathLike) -> Path:
+def find_recording(path: str | os.PathLike) -> Path:
     """Return the absolute path of an existing recording.
 
     Raises:
@@ -75,7 +75,7 @@ def recording_file(path: str | os.PathLike) -> Path:
     return path.resolve()
 
 
-def free_port() -> int:
+def find_free_port() -> int:
     """Return a free TCP port of this computer."""
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
@@ -83,21 +83,21 @@ def free_port() -> int:
 
 
 @contextlib.contextmanager
-def running(arguments: Sequence[str], clean: bool = False) -> Iterator[Viewer]:
+def run_rerun(arguments: Sequence[str], uses_temporary_home: bool = False) -> Iterator[Viewer]:
     """Run the rerun program during the context, then end it with all its child processes.
 
     Args:
         arguments: command-line arguments.
-        clean: use a temporary home folder, so that settings of the user are not read or written.
+        uses_temporary_home: use a temporary home folder, so that settings of the user are not read or written.
 
     Raises:
         InputError: the rerun program is not installed.
     """
-    program = rerun_program()
+    program = find_rerun_program()
     with tempfile.TemporaryDirectory(prefix="hydrotele_", ignore_cleanup_errors=True) as folder:
         output = Path(folder, "output.txt")
         environment = {**os.environ, "RERUN_APP_ONLY": "true", "NO_COLOR": "1"}
-        if clean:
+        if uses_temporary_home:
             environment["RUST_LOG"] = "warn"  # notifications would cover part of the image
             homes = ("HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME", "XDG_CACHE_HOME")
             environment |= dict.fromkeys((*homes, "XDG_RUNTIME_DIR"), folder)
@@ -109,7 +109,7 @@ def running(arguments: Sequence[str], clean: bool = False) -> Iterator[Viewer]:
                 stderr=subprocess.STDOUT,
                 env=environment,
                 start_new_session=True,
-                preexec_fn=_die_with_parent(),
+                preexec_fn=_parent_death_hook(),
             )
         try:
             yield Viewer(process, output)
@@ -117,7 +117,7 @@ def running(arguments: Sequence[str], clean: bool = False) -> Iterator[Viewer]:
             _end(process)
 
 
-def _die_with_parent() -> Callable[[], object] | None:
+def _parent_death_hook() -> Callable[[], object] | None:
     """Return a function that makes a child on Linux end when this program is killed."""
     if sys.platform != "linux":
         return None
@@ -128,11 +128,11 @@ def _die_with_parent() -> Callable[[], object] | None:
 def _end(process: subprocess.Popen) -> None:
     _signal(process, signal.SIGTERM)
     try:
-        process.wait(_PATIENCE)
+        process.wait(_EXIT_TIMEOUT)
     except subprocess.TimeoutExpired:
         pass
     _signal(process, getattr(signal, "SIGKILL", signal.SIGTERM))
-    process.wait(_PATIENCE)
+    process.wait(_EXIT_TIMEOUT)
 
 
 def _signal(process: subprocess.Popen, number: int) -> None:
@@ -148,9 +148,7 @@ _POLL = 0.1  # s
 
 
 @contextlib.contextmanager
-def web_viewer(
-    rrd: str | os.PathLike, port: int | None = None, timeout: float = 30.0
-) -> Iterator[str]:
+def web_viewer(rrd: str | os.PathLike, port: int | None = None, timeout: float = 30.0) -> Iterator[str]:
     """Serve a recording and the web viewer on this computer during the context.
 
     Args:
@@ -164,15 +162,15 @@ def web_viewer(
     Raises:
         InputError: the recording is missing, the port is in use, or the server does not start.
     """
-    rrd = recording_file(rrd)
-    data_port, port = free_port(), port or free_port()
+    rrd = find_recording(rrd)
+    data_port, port = find_free_port(), port or find_free_port()
     arguments = ["--serve-web", "--bind", "127.0.0.1", "--port", str(data_port)]
     arguments += ["--web-viewer-port", str(port), str(rrd)]
-    with running(arguments, clean=True) as viewer:
+    with run_rerun(arguments, uses_temporary_home=True) as viewer:
         page, deadline = f"http://127.0.0.1:{port}", time.monotonic() + timeout
-        while not _answers(page):
+        while not _is_answering(page):
             if viewer.process.poll() is not None or time.monotonic() > deadline:
-                last = " ".join(viewer.said().split()[-40:])
+                last = " ".join(viewer.read_output().split()[-40:])
                 raise InputError(rrd, f"the viewer cannot be served on port {port}: {last}")
             time.sleep(_POLL)
         source = f"rerun+http://127.0.0.1:{data_port}/proxy"
@@ -180,20 +178,20 @@ def web_viewer(
 
 
 def serve_recording(
-    rrd: str | os.PathLike, port: int | None = None, tell: Callable[[str], object] = print
+    rrd: str | os.PathLike, port: int | None = None, report_url: Callable[[str], object] = print
 ) -> None:
     """Serve a recording until the program is interrupted.
 
     Args:
         rrd: recording file.
         port: HTTP port on 127.0.0.1, default a free port.
-        tell: function that is called once with the URL to open in a browser.
+        report_url: function that is called once with the URL to open in a browser.
 
     Raises:
         InputError: the recording is missing, the port is in use, or the server does not start.
     """
     with web_viewer(rrd, port) as url, contextlib.suppress(KeyboardInterrupt):
-        tell(url)
+        report_url(url)
         while True:
             time.sleep(1.0)
 
@@ -207,11 +205,11 @@ def open_viewer(rrd: str | os.PathLike) -> int:
     Raises:
         InputError: the recording is missing or there is no viewer.
     """
-    with running([str(recording_file(rrd))]) as viewer:
+    with run_rerun([str(find_recording(rrd))]) as viewer:
         return viewer.process.wait()
 
 
-def _answers(page: str) -> bool:
+def _is_answering(page: str) -> bool:
     try:
         with urllib.request.urlopen(page, timeout=2.0) as answer:
             return answer.status == 200
@@ -222,10 +220,10 @@ def _answers(page: str) -> bool:
 if TYPE_CHECKING:
     from rerun.experimental import ViewerClient, ViewerState
 
-_LAST_WORDS = 3.0  # s, timeout for the error message of a failing viewer
-_SETTLING = 3  # minimum number of frames, because layout and data need a few frames
-_NO_DRIVER = ("render context", "graphics adapter")  # in the output if Vulkan is missing
-_DRIVER = (
+_ERROR_TIMEOUT = 3.0  # s, timeout for the error message of a failing viewer
+_MIN_FRAMES = 3  # minimum number of frames, because layout and data need a few frames
+_NO_DRIVER_SIGNS = ("render context", "graphics adapter")  # in the output if Vulkan is missing
+_DRIVER_ADVICE = (
     "needs Vulkan to render: install a graphics driver or, without a graphics card, that of Mesa"
     " (Debian: apt-get install mesa-vulkan-drivers)"
 )
@@ -235,7 +233,7 @@ def take_screenshot(
     rrd: str | os.PathLike,
     png: str | os.PathLike,
     size: tuple[int, int] = (1600, 1000),
-    at: float | None = None,
+    displayed_time: float | None = None,
     timeout: float = 90.0,
 ) -> tuple[str, ...]:
     """Save a screenshot of the viewer with a recording, without opening a window.
@@ -244,7 +242,7 @@ def take_screenshot(
         rrd: recording file.
         png: PNG file, written completely or not at all.
         size: width and height [pixel].
-        at: time on the timeline `time` [s], default the middle of the recording.
+        displayed_time: time on the timeline `time` [s], default the middle of the recording.
         timeout: maximum total duration [s].
 
     Returns:
@@ -255,14 +253,17 @@ def take_screenshot(
             package to install), or the timeout expires. No process is left running.
     """
     deadline = time.monotonic() + timeout
-    with replacing(png, ".png") as part, _viewing(rrd, size, deadline) as (client, state):
+    with (
+        atomic_file(png, ".png") as part,
+        _run_headless_viewer(rrd, size, deadline) as (client, state),
+    ):
         _hide_top_panel(client)
-        client.set_time(TIMELINE, duration=_moment(state, at, rrd), play_state="paused")
-        part.write_bytes(_settled_picture(client, deadline))
-        return _complaints(client)
+        client.set_time(TIMELINE, duration=_screenshot_time(state, displayed_time, rrd), play_state="paused")
+        part.write_bytes(_take_settled_screenshot(client, deadline))
+        return _viewer_reports(client)
 
 
-def _complaints(client: "ViewerClient") -> tuple[str, ...]:
+def _viewer_reports(client: "ViewerClient") -> tuple[str, ...]:
     """Return the warnings and errors that the viewer reports for the recording."""
     views = client.get_state().views
     shown = [f"{v.name}: {r.severity}: {r.summary}" for v in views for r in v.reports]
@@ -271,7 +272,7 @@ def _complaints(client: "ViewerClient") -> tuple[str, ...]:
 
 
 @contextlib.contextmanager
-def _viewing(
+def _run_headless_viewer(
     rrd: str | os.PathLike, size: tuple[int, int], deadline: float
 ) -> Iterator[tuple["ViewerClient", "ViewerState"]]:
     """Run a headless viewer that has loaded the recording.
@@ -279,21 +280,21 @@ def _viewing(
     Yields:
         Client and state of the viewer.
     """
-    rrd, port = recording_file(rrd), free_port()
+    rrd, port = find_recording(rrd), find_free_port()
     arguments = ["--headless", "--bind", "127.0.0.1", "--port", str(port)]
     arguments += ["--hide-welcome-screen", "--window-size", f"{size[0]}x{size[1]}", str(rrd)]
-    with running(arguments, clean=True) as viewer:
-        client = _connected(viewer, port, rrd, deadline)
+    with run_rerun(arguments, uses_temporary_home=True) as viewer:
+        client = _connect_client(viewer, port, rrd, deadline)
         try:
-            yield client, _loaded(viewer, client, rrd, deadline)
+            yield client, _wait_until_loaded(viewer, client, rrd, deadline)
         except (RuntimeError, ConnectionError) as error:
             with contextlib.suppress(subprocess.TimeoutExpired):
-                viewer.process.wait(_LAST_WORDS)
+                viewer.process.wait(_ERROR_TIMEOUT)
             _check(viewer, rrd, deadline)
             raise InputError(rrd, f"the viewer does not answer: {error}") from error
 
 
-def _connected(viewer: Viewer, port: int, rrd: Path, deadline: float) -> "ViewerClient":
+def _connect_client(viewer: Viewer, port: int, rrd: Path, deadline: float) -> "ViewerClient":
     from rerun.experimental import ViewerClient
 
     while True:
@@ -306,7 +307,7 @@ def _connected(viewer: Viewer, port: int, rrd: Path, deadline: float) -> "Viewer
             time.sleep(_POLL)
 
 
-def _loaded(viewer: Viewer, client: "ViewerClient", rrd: Path, deadline: float) -> "ViewerState":
+def _wait_until_loaded(viewer: Viewer, client: "ViewerClient", rrd: Path, deadline: float) -> "ViewerState":
     while True:
         _check(viewer, rrd, deadline)
         state = client.get_state()
@@ -320,9 +321,9 @@ def _loaded(viewer: Viewer, client: "ViewerClient", rrd: Path, deadline: float) 
 def _check(viewer: Viewer, rrd: Path, deadline: float) -> None:
     """Raise InputError if the viewer has ended or the deadline has passed."""
     if viewer.process.poll() is not None:
-        said = viewer.said()
-        if any(sign in said for sign in _NO_DRIVER):
-            raise InputError("rerun viewer", _DRIVER)
+        said = viewer.read_output()
+        if any(sign in said for sign in _NO_DRIVER_SIGNS):
+            raise InputError("rerun viewer", _DRIVER_ADVICE)
         last = " ".join(said.split()[-40:])
         message = f"the viewer ended with exit status {viewer.process.returncode}: {last}"
         raise InputError(rrd, message)
@@ -330,18 +331,18 @@ def _check(viewer: Viewer, rrd: Path, deadline: float) -> None:
         raise InputError(rrd, "the viewer does not show it in time: increase the timeout")
 
 
-def _settled_picture(client: "ViewerClient", deadline: float) -> bytes:
+def _take_settled_screenshot(client: "ViewerClient", deadline: float) -> bytes:
     """Return the first image that equals the previous one, when all data have been loaded."""
     previous, count = b"", 0
     while True:
         picture, count = client.take_screenshot(), count + 1
-        if count >= _SETTLING and (picture == previous or time.monotonic() > deadline):
+        if count >= _MIN_FRAMES and (picture == previous or time.monotonic() > deadline):
             return picture
         previous = picture
         time.sleep(_POLL)
 
 
-def _moment(state: "ViewerState", at: float | None, rrd: str | os.PathLike) -> float:
+def _screenshot_time(state: "ViewerState", at: float | None, rrd: str | os.PathLike) -> float:
     lines = {line.name: line for line in state.recordings[0].timelines}
     if TIMELINE not in lines:
         raise InputError(rrd, f"has no timeline {TIMELINE!r}; it has {', '.join(lines)}")

@@ -8,12 +8,16 @@ import numpy as np
 
 from hydrotele.core.errors import InputError
 from hydrotele.show.canvas import has_screen
-from hydrotele.show.pose import model_with_looks
+from hydrotele.show.pose import compile_visual_model
 from hydrotele.simulate.plant import Plant
 
-_ADVICE = "add --no-viewer and use --device gamepad, spacemouse or scripted:FILE"
-_PATIENCE = 5.0  # s, timeout for the last frame when the window is closed
-_DISTANCE, _AZIMUTH, _ELEVATION = 14.0, 120.0, -18.0  # m, deg, deg, initial camera position
+_NO_SCREEN_ADVICE = "add --no-viewer and use --device gamepad, spacemouse or scripted:FILE"
+_CLOSE_TIMEOUT = 5.0  # s, timeout for the last frame when the window is closed
+_CAMERA_DISTANCE, _CAMERA_AZIMUTH, _CAMERA_ELEVATION = (
+    14.0,
+    120.0,
+    -18.0,
+)  # m, deg, deg, initial camera position
 
 
 class Window:
@@ -32,7 +36,7 @@ class Window:
         check_screen()
         from mujoco import viewer
 
-        self._model = model_with_looks(plant.machine, plant.ground, plant.surroundings)
+        self._model = compile_visual_model(plant.machine, plant.ground, plant.surroundings)
         assert self._model.nq == plant.model.nq
         self._data = mujoco.MjData(self._model)
         self._handle = viewer.launch_passive(
@@ -41,11 +45,15 @@ class Window:
         with self._handle.lock():
             camera = self._handle.cam
             camera.lookat[:] = 4.0, 0.0, 1.5
-            camera.distance, camera.azimuth, camera.elevation = _DISTANCE, _AZIMUTH, _ELEVATION
+            camera.distance, camera.azimuth, camera.elevation = (
+                _CAMERA_DISTANCE,
+                _CAMERA_AZIMUTH,
+                _CAMERA_ELEVATION,
+            )
 
         self._newest: tuple[np.ndarray, Sequence[tuple[str, str]]] | None = None
         self._fresh, self._over = threading.Event(), False
-        self._painter = threading.Thread(target=self._paint, daemon=True)
+        self._painter = threading.Thread(target=self._draw_frames, daemon=True)
         self._painter.start()
 
     def show(self, qpos: np.ndarray, rows: Sequence[tuple[str, str]]) -> bool:
@@ -60,7 +68,7 @@ class Window:
         self._fresh.set()
         return True
 
-    def _paint(self) -> None:
+    def _draw_frames(self) -> None:
         """Draw the latest state in a separate thread, so that a slow screen does not block."""
         while self._fresh.wait() and not self._over:
             self._fresh.clear()
@@ -79,11 +87,11 @@ class Window:
         """Close the window."""
         self._over = True
         self._fresh.set()
-        self._painter.join(_PATIENCE)
+        self._painter.join(_CLOSE_TIMEOUT)
         self._handle.close()
 
 
-def check_screen(advice: str = _ADVICE) -> None:
+def check_screen(advice: str = _NO_SCREEN_ADVICE) -> None:
     """Check that a window can be opened, because MuJoCo's viewer hangs without a screen.
 
     Args:

@@ -9,26 +9,26 @@ import numpy as np
 from mujoco import rollout
 
 from hydrotele.core.compiled import compiled
-from hydrotele.hydraulics.circuit import ACTIVATIONS
+from hydrotele.hydraulics.circuit import ACTIVATIONS_PER_AXIS
 from hydrotele.hydraulics.laws import air_compliance, port_flow, pressure_without_air
-from hydrotele.hydraulics.pump import oil_compliance, switched_speed
-from hydrotele.simulate.closure import pin_count
+from hydrotele.hydraulics.pump import oil_compliance, speed_after_switching
+from hydrotele.simulate.closure import count_pins
 from hydrotele.simulate.mechanism import drive_and_load_dofs
-from hydrotele.simulate.plant import Plant, added_by_terms
+from hydrotele.simulate.plant import Plant, evaluate_terms
 from hydrotele.simulate.record import align_positions, drive_motion, state_flows
 
-_LOOK_EVERY = 10  # steps between two contact checks: a contact lasts longer
-_FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
+_CONTACT_CHECK_INTERVAL = 10  # steps between two contact checks: a contact lasts longer
+_FULL_PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
 
-def full_state(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+def full_physics_state(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
     """Return the full physics state (nstate,) in the format of `mujoco.rollout`."""
-    state = np.empty(mujoco.mj_stateSize(model, _FULL))
-    mujoco.mj_getState(model, data, state, _FULL)
+    state = np.empty(mujoco.mj_stateSize(model, _FULL_PHYSICS))
+    mujoco.mj_getState(model, data, state, _FULL_PHYSICS)
     return state
 
 
-def audit(plant: Plant, start: np.ndarray, controls: np.ndarray) -> dict[str, float | None]:
+def compute_balance_errors(plant: Plant, start: np.ndarray, controls: np.ndarray) -> dict[str, float | None]:
     """Compute the relative volume and energy balance errors over part of a run.
 
     Args:
@@ -44,9 +44,7 @@ def audit(plant: Plant, start: np.ndarray, controls: np.ndarray) -> dict[str, fl
     """
     model = plant.model
     data = mujoco.MjData(model)
-    states, _ = rollout.rollout(
-        model, data, start[None, :], controls[None, :, :], persistent_pool=False
-    )
+    states, _ = rollout.rollout(model, data, start[None, :], controls[None, :, :], persistent_pool=False)
     states = np.concatenate([start[None, :], states[0]])
     at = np.cumsum([1, model.nq, model.nv, model.na])
     qpos, qvel, act = states[:, 1 : at[1]], states[:, at[1] : at[2]], states[:, at[2] : at[3]]
@@ -54,7 +52,7 @@ def audit(plant: Plant, start: np.ndarray, controls: np.ndarray) -> dict[str, fl
     qpos = align_positions(model, qpos[1:], qvel[1:])  # states at equal times, see record.py
     qvel, act = 0.5 * (qvel[1:] + qvel[:-1]), act[1:]
     x, v = drive_motion(plant, qpos, qvel)
-    more = added_by_terms(plant.machine, states[1:, 0], act, x, v, controls)
+    more = evaluate_terms(plant.machine, states[1:, 0], act, x, v, controls)
     work, flow = _hydraulic_balance(plant, x, v, act, more, dt)
     return {
         "seconds": len(controls) * dt,
@@ -88,7 +86,7 @@ def _volume_errors(plant, i, table, act, x, v, more, dt):
     drive = axis.hydraulic_drive
     head, rod = drive.areas
     volume_head, volume_rod = drive.volumes(x[:, i])
-    p_head, p_rod = act[:, ACTIVATIONS * i + 2], act[:, ACTIVATIONS * i + 3]
+    p_head, p_rod = act[:, ACTIVATIONS_PER_AXIS * i + 2], act[:, ACTIVATIONS_PER_AXIS * i + 3]
     leak = drive.leakage * (p_head - p_rod)
     release = supply.dissolved_air * supply.bulk_modulus
     sides = (
@@ -124,9 +122,9 @@ def _chamber_laws(pressure, relief, gain, tank, makeup, air, release):
 
 def _flows_after_switching(plant, i, act, x, v):
     """Return `state_flows` at the start of every step, after the valve of axis i has switched."""
-    switched, a = act.copy(), ACTIVATIONS * i
+    switched, a = act.copy(), ACTIVATIONS_PER_AXIS * i
     switched[:-1, a] = [
-        switched_speed(speed, after) for speed, after in zip(act[:-1, a], act[1:, a], strict=True)
+        speed_after_switching(speed, after) for speed, after in zip(act[:-1, a], act[1:, a], strict=True)
     ]
     return state_flows(plant.model.actuator_user.ravel(), plant.hydraulic, switched, x, v)
 
@@ -134,7 +132,7 @@ def _flows_after_switching(plant, i, act, x, v):
 def _pumped_volume_errors(axis, i, table, began, act, x, v, more, dt):
     """Yield the relative volume balance errors of an axis with its own pump and aerated oil."""
     cylinder, pump = axis.cylinder, axis.pump
-    p_head, p_rod = act[:, ACTIVATIONS * i + 2], act[:, ACTIVATIONS * i + 3]
+    p_head, p_rod = act[:, ACTIVATIONS_PER_AXIS * i + 2], act[:, ACTIVATIONS_PER_AXIS * i + 3]
     leak = cylinder.leakage * (p_head - p_rod)
     head, rod = cylinder.volumes(x[:, i])
     sides = (
@@ -156,14 +154,14 @@ def _pumped_volume_errors(axis, i, table, began, act, x, v, more, dt):
 
 
 def _energy_balance(plant, qpos, qvel, work, dt):
-    """Return the relative energy balance error; None if it is not defined (see `audit`)."""
+    """Return the relative energy balance error; None if it is not defined (see `compute_balance_errors`)."""
     if plant.hydraulic < len(plant.axes):
         return None
     model = plant.model
     data = mujoco.MjData(model)
     last = len(qpos) - 1
-    energy, rows = np.empty(2), 3 * pin_count(model)
-    for row in (*range(0, last, _LOOK_EVERY), last):
+    energy, rows = np.empty(2), 3 * count_pins(model)
+    for row in (*range(0, last, _CONTACT_CHECK_INTERVAL), last):
         data.qpos[:], data.qvel[:] = qpos[row], qvel[row]
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)

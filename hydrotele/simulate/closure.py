@@ -18,9 +18,9 @@ from hydrotele.machine import machine as loops
 from hydrotele.machine.machine import Machine
 from hydrotele.multibody import closures
 from hydrotele.multibody.chain import Chain, load_chain
-from hydrotele.multibody.closures import close_from
+from hydrotele.multibody.closures import close_loops_from
 from hydrotele.simulate.mechanism import (
-    assemble,
+    assemble_mjcf,
     drive_and_load_dofs,
     lock_drives,
     mjcf_document,
@@ -28,39 +28,39 @@ from hydrotele.simulate.mechanism import (
     tilt_joint,
 )
 
-_STEP = 0.2  # largest move of an independent joint between two solutions [rad] or [m]
-_TURN = 0.3  # largest move of a dependent joint in an iteration of Newton's method [rad] or [m]
-_CLOSED = 1.0e-12  # pin opening that counts as closed [m]: rounding of a 10 m machine
-_FOLLOWED = 1.0e-9  # the same for poses that are only displayed [m]
+_MAX_JOINT_STEP = 0.2  # largest move of an independent joint between two solutions [rad] or [m]
+_MAX_NEWTON_STEP = 0.3  # largest move of a dependent joint in an iteration of Newton's method [rad] or [m]
+_CLOSED_TOLERANCE = 1.0e-12  # pin opening that counts as closed [m]: rounding of a 10 m machine
+_MOTION_TOLERANCE = 1.0e-9  # the same for poses that are only displayed [m]
 
 
-def following_joints(machine: Machine) -> tuple[str, ...]:
+def dependent_joints(machine: Machine) -> tuple[str, ...]:
     """Return the names of the dependent joints: tubes, rods and undriven links in a loop."""
     cylinders = [name for name, axis in machine.axes.items() if axis.cylinder]
     bars = [f"{name}_{part}" for name in cylinders for part in ("tube", "rod")]
     tilts = [tilt_joint(name) for name in cylinders if has_ball_ends(machine, name)]
-    return (*bars, *tilts, *loops.following_joints(machine))
+    return (*bars, *tilts, *loops.dependent_joints(machine))
 
 
-def shaping_joints(machine: Machine) -> list[str]:
+def loop_shaping_joints(machine: Machine) -> list[str]:
     """Return the names of the independent joints in a loop; others, as a saw's, affect no loop."""
-    following = following_joints(machine)
+    following = dependent_joints(machine)
     joints = [axis.joint for axis in machine.axes.values() if axis.cylinder]
     for closure in machine.closures.values():
-        for link in loops.links_of_loop(machine, closure.a.link, closure.b.link):
+        for link in loops.loop_links(machine, closure.a.link, closure.b.link):
             joint = machine.links[link].joint
             joints += [joint.name] if joint else []
     return [name for name in dict.fromkeys(joints) if name not in following]
 
 
-def pin_count(model: mujoco.MjModel) -> int:
+def count_pins(model: mujoco.MjModel) -> int:
     """Return the number of `connect` pins; equalities of surrounding objects come after them."""
     return int(np.count_nonzero(model.eq_type == mujoco.mjtEq.mjEQ_CONNECT))
 
 
 def pin_opening(model: mujoco.MjModel, data: mujoco.MjData) -> float:
     """Return the largest distance between the halves of a pin in the current `site_xpos` [m]."""
-    return widest_pin(data.site_xpos, *pin_sites(model))
+    return max_pin_opening(data.site_xpos, *pin_sites(model))
 
 
 def pin_sites(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
@@ -70,13 +70,13 @@ def pin_sites(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
 
 
 @compiled
-def widest_pin(places, one, two):
+def max_pin_opening(site_positions, first_sites, second_sites):
     """Return the largest distance between the two halves of a pin.
 
     Args:
-        places: (nsite, 3) positions of all sites [m].
-        one: (p,) site ids of the first halves, see `pin_sites`.
-        two: (p,) site ids of the second halves.
+        site_positions: (nsite, 3) positions of all sites [m].
+        first_sites: (p,) site ids of the first halves, see `pin_sites`.
+        second_sites: (p,) site ids of the second halves.
 
     Returns:
         The distance, scalar [m]; 0 without pins.
@@ -84,10 +84,10 @@ def widest_pin(places, one, two):
     Source: this module.
     """
     widest = 0.0
-    for k in range(len(one)):
+    for k in range(len(first_sites)):
         gap = 0.0
         for i in range(3):
-            gap += (places[one[k], i] - places[two[k], i]) ** 2
+            gap += (site_positions[first_sites[k], i] - site_positions[second_sites[k], i]) ** 2
         widest = max(widest, gap)
     return np.sqrt(widest)
 
@@ -100,12 +100,12 @@ class _Linkage(NamedTuple):
     following: np.ndarray
 
 
-def _linkage(machine: Machine, model: mujoco.MjModel) -> _Linkage:
-    chain, following = load_chain(model), following_joints(machine)
+def _make_linkage(machine: Machine, model: mujoco.MjModel) -> _Linkage:
+    chain, following = load_chain(model), dependent_joints(machine)
     return _Linkage(model, chain, np.array([chain.index(name) for name in following], np.int64))
 
 
-def closed_chain(machine: Machine, target: Mapping[str, float] | None = None) -> Chain:
+def load_closed_chain(machine: Machine, target: Mapping[str, float] | None = None) -> Chain:
     """Return the kinematic chain of a machine, starting from a position with closed loops.
 
     Args:
@@ -115,17 +115,15 @@ def closed_chain(machine: Machine, target: Mapping[str, float] | None = None) ->
     Raises:
         InputError: the linkages do not close at this position.
     """
-    root = assemble(machine, 1.0e-3, ground=False, looks=False)
+    root = assemble_mjcf(machine, 1.0e-3, ground=False, visuals=False)
     model = mjcf_document(root).compile()
     data = mujoco.MjData(model)
     close_loops(machine, model, data, target or {})
     chain = load_chain(model)
-    return dataclasses.replace(chain, start=data.qpos[chain.places])
+    return dataclasses.replace(chain, start=data.qpos[chain.qpos_indices])
 
 
-def close_loops(
-    machine: Machine, model: mujoco.MjModel, data: mujoco.MjData, target: Mapping[str, float]
-) -> None:
+def close_loops(machine: Machine, model: mujoco.MjModel, data: mujoco.MjData, target: Mapping[str, float]) -> None:
     """Move the independent joints to their target and close every loop.
 
     Starts from the machine's home position and moves to the target in small steps, so that each
@@ -140,12 +138,12 @@ def close_loops(
     Raises:
         InputError: a loop cannot be closed (the target is outside the reach of a linkage).
     """
-    _close_from_home(machine, model, data, target, _linkage(machine, model))
+    _close_from_home(machine, model, data, target, _make_linkage(machine, model))
 
 
 def _close_from_home(machine, model, data, target, linkage: _Linkage) -> None:
     """Move from the home position to the target in small steps and close the loops at each step."""
-    following = following_joints(machine)
+    following = dependent_joints(machine)
     names = [n for n in machine.joints if n not in following]
     places = [model.joint(n).qposadr[0] for n in names]
     home = np.array([machine.home.get(n, 0.0) for n in names])
@@ -153,19 +151,19 @@ def _close_from_home(machine, model, data, target, linkage: _Linkage) -> None:
     data.qpos[:] = model.qpos0
     for name in following:
         data.qpos[model.joint(name).qposadr[0]] = machine.home.get(name, 0.0)
-    shaping = np.isin(names, shaping_joints(machine))
-    parts = 1 + int(np.max(np.abs(goal - home)[shaping], initial=0.0) / _STEP)
+    shaping = np.isin(names, loop_shaping_joints(machine))
+    parts = 1 + int(np.max(np.abs(goal - home)[shaping], initial=0.0) / _MAX_JOINT_STEP)
     for part in range(parts + 1):
         data.qpos[places] = home + (goal - home) * part / parts
         if part == 0:
             _aim_cylinders(machine, model, data)
-        if not _close(linkage, data, _CLOSED):
+        if not _solve_closure(linkage, data, _CLOSED_TOLERANCE):
             where = ", ".join(f"{n} {v:.3f}" for n, v in zip(names, data.qpos[places], strict=True))
             raise InputError(f"machine {machine.name}", f"the linkages do not close at {where}")
     lock_drives(machine, model, data)
 
 
-def _close(linkage: _Linkage, data: mujoco.MjData, closed: float) -> bool:
+def _solve_closure(linkage: _Linkage, data: mujoco.MjData, closed: float) -> bool:
     """Close all loops by moving the dependent joints; return whether this succeeded.
 
     Updates the positions of bodies and sites in `data`.
@@ -173,15 +171,15 @@ def _close(linkage: _Linkage, data: mujoco.MjData, closed: float) -> bool:
     _, chain, following = linkage
     if not len(following):
         return True
-    q = data.qpos[chain.places]
-    left = close_from(chain.tree, q, following, closed, _TURN)
-    data.qpos[chain.places] = q
+    q = data.qpos[chain.qpos_indices]
+    left = close_loops_from(chain.tree, q, following, closed, _MAX_NEWTON_STEP)
+    data.qpos[chain.qpos_indices] = q
     mujoco.mj_kinematics(linkage.model, data)
     mujoco.mj_comPos(linkage.model, data)
     return bool(left < 1e3 * closed)
 
 
-def follow_loops(
+def close_along_motion(
     machine: Machine,
     model: mujoco.MjModel,
     data: mujoco.MjData,
@@ -204,7 +202,7 @@ def follow_loops(
     Raises:
         InputError: a joint is not independent, or a loop cannot be closed in some row.
     """
-    following, linkage = following_joints(machine), _linkage(machine, model)
+    following, linkage = dependent_joints(machine), _make_linkage(machine, model)
     free = [name for name in machine.joints if name not in following]
     if strange := [name for name in joints if name not in free]:
         raise InputError(f"joint {strange[0]}", f"cannot be set; the independent joints are {free}")
@@ -213,13 +211,13 @@ def follow_loops(
         _close_from_home(machine, model, data, {}, linkage)
         return np.tile(data.qpos, (0 if joints else 1, 1))
     places = [model.joint(n).qposadr[0] for n in joints]
-    shaping = np.isin(list(joints), shaping_joints(machine))
+    shaping = np.isin(list(joints), loop_shaping_joints(machine))
     poses = np.empty((len(values), model.nq))
     for row, target in enumerate(values):
         moved = np.abs(target - values[row - 1])[shaping]
-        near = row > 0 and moved.max(initial=0.0) <= _STEP
+        near = row > 0 and moved.max(initial=0.0) <= _MAX_JOINT_STEP
         data.qpos[places] = target
-        if not (near and _close(linkage, data, _FOLLOWED)):
+        if not (near and _solve_closure(linkage, data, _MOTION_TOLERANCE)):
             asked = dict(zip(joints, target.tolist(), strict=True))
             try:
                 _close_from_home(machine, model, data, asked, linkage)
@@ -255,7 +253,7 @@ def independent_dofs(machine: Machine, model: mujoco.MjModel) -> np.ndarray:
 
     Drive sides of transmissions are excluded: they count as locked to their loads.
     """
-    dependent = [model.joint(n).dofadr[0] for n in following_joints(machine)]
+    dependent = [model.joint(n).dofadr[0] for n in dependent_joints(machine)]
     drives, _ = drive_and_load_dofs(machine, model)
     return np.setdiff1d(np.arange(model.nv), [*dependent, *drives])
 
@@ -271,11 +269,11 @@ def motion_basis(machine: Machine, model: mujoco.MjModel, data: mujoco.MjData) -
     Returns:
         N, (nv, n), with `qvel = N @ qvel[independent_dofs]`; drive sides move with their loads.
     """
-    _, chain, following = _linkage(machine, model)
+    _, chain, following = _make_linkage(machine, model)
     free = np.setdiff1d(np.arange(len(chain.joints)), following)
     every = np.eye(model.nv)
-    moves = closures.motion_basis(chain, data.qpos[chain.places], free)
-    every[np.ix_(chain.dofs, chain.dofs[free])] = moves
+    moves = closures.motion_basis(chain, data.qpos[chain.qpos_indices], free)
+    every[np.ix_(chain.dof_indices, chain.dof_indices[free])] = moves
     basis = every[:, independent_dofs(machine, model)]
     drives, loads = drive_and_load_dofs(machine, model)
     basis[drives] = basis[loads]

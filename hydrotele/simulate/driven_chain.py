@@ -11,14 +11,12 @@ import numpy as np
 
 from hydrotele.core.errors import InputError
 from hydrotele.multibody.chain import Chain
-from hydrotele.multibody.inverse_dynamics import project
+from hydrotele.multibody.inverse_dynamics import project_on_drives
 
-_WHERE = "open loop"
+_ERROR_LOCATION = "open loop"
 
 
-def set_state(
-    model: mujoco.MjModel, data: mujoco.MjData, chain: Chain, position: np.ndarray, rate: np.ndarray
-) -> None:
+def set_state(model: mujoco.MjModel, data: mujoco.MjData, chain: Chain, position: np.ndarray, rate: np.ndarray) -> None:
     """Set the joint positions and velocities of a MuJoCo model from those of its chain.
 
     Args:
@@ -47,10 +45,10 @@ def set_state(
             at, dof = at + 3, dof + 3
         turns = [where[f"{name}_r{letter}"] for letter in "xyz"]
         mujoco.mju_euler2Quat(data.qpos[at : at + 4], position[turns], "xyz")
-        data.qvel[dof : dof + 3] = _spin(position[turns]) @ rate[turns]
+        data.qvel[dof : dof + 3] = _angular_velocity_matrix(position[turns]) @ rate[turns]
 
 
-def _spin(angles: np.ndarray) -> np.ndarray:
+def _angular_velocity_matrix(angles: np.ndarray) -> np.ndarray:
     """Return the (3, 3) matrix from rates of x-y-z Cardan angles to the body's angular velocity."""
     _, b, c = angles
     sb, cb, sc, cc = np.sin(b), np.cos(b), np.sin(c), np.cos(c)
@@ -58,7 +56,7 @@ def _spin(angles: np.ndarray) -> np.ndarray:
 
 
 def open_loop_errors(
-    model: mujoco.MjModel, chain: Chain, given: Sequence[str], motion: np.ndarray,
+    model: mujoco.MjModel, chain: Chain, known_joints: Sequence[str], motion: np.ndarray,
     force: np.ndarray, period: float, horizon: float = 0.25, starts: int = 30,
 ) -> Mapping[str, float]:  # fmt: skip
     """Compute the error of open-loop simulations that are driven by measured forces.
@@ -68,7 +66,7 @@ def open_loop_errors(
     Args:
         model: compiled model.
         chain: kinematic chain of the same mechanism.
-        given: names of the k joints with known motion.
+        known_joints: names of the k joints with known motion.
         motion: (3, n, k) positions, rates and accelerations of these joints.
         force: (n, k) measured forces of the drives [N] or [N m].
         period: time between rows [s].
@@ -84,14 +82,14 @@ def open_loop_errors(
     steps = round(horizon / model.opt.timestep)
     rows = round(horizon / period)
     if motion.shape[1] <= rows:
-        raise InputError(_WHERE, f"the run is shorter than {horizon:g} s")
+        raise InputError(_ERROR_LOCATION, f"the run is shorter than {horizon:g} s")
     firsts = np.unique(np.linspace(0, motion.shape[1] - rows - 1, starts).astype(int))
-    found = project(chain, tuple(given), *motion)
+    found = project_on_drives(chain, tuple(known_joints), *motion)
     flags = model.opt.disableflags
     model.opt.disableflags = flags | int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
     data, drives = mujoco.MjData(model), [chain.index(name) for name in chain.drives]
-    dofs = [int(chain.dofs[j]) for j in drives]
-    places = [int(chain.places[j]) for j in drives]
+    dofs = [int(chain.dof_indices[j]) for j in drives]
+    places = [int(chain.qpos_indices[j]) for j in drives]
     times = np.arange(motion.shape[1]) * period
     total = np.zeros(len(drives))
     for first in firsts:
@@ -102,7 +100,7 @@ def open_loop_errors(
             data.qfrc_applied[dofs] = row
             mujoco.mj_step(model, data)
         if not np.isfinite(data.qpos).all() or data.warning.number.any():
-            raise InputError(_WHERE, "the simulation of the mechanism became unstable")
+            raise InputError(_ERROR_LOCATION, "the simulation of the mechanism became unstable")
         total += (data.qpos[places] - found.position[first + rows, drives]) ** 2
     model.opt.disableflags = flags
     return dict(zip(chain.drives, np.sqrt(total / len(firsts)).tolist(), strict=True))

@@ -19,12 +19,12 @@ from hydrotele.machine.machine import (
     Sensor,
     SensorError,
     SensorSet,
+    channel_converter,
     channel_sensor,
-    converter,
 )
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.record import sensed_channels
-from hydrotele.simulate.stepping import Stepper, delayed_values, true_values
+from hydrotele.simulate.stepping import Stepper, apply_sensor_delays, true_sensor_values
 
 
 def sensor_errors(sensor: Sensor, seed: int, channel: str, count: int) -> np.ndarray:
@@ -48,7 +48,7 @@ def sensor_errors(sensor: Sensor, seed: int, channel: str, count: int) -> np.nda
 
 
 @compiled
-def convert(value, step, low, high):
+def quantise_reading(value, step, low, high):
     """Return the quantised and clipped reading of an analogue-to-digital converter.
 
     Args:
@@ -62,8 +62,10 @@ def convert(value, step, low, high):
 
     Source: nominal model, "Sensors".
 
-    >>> convert(0.30, 0.25, 0.0, 1.0), convert(1.2, 0.25, 0.0, 1.0), convert(0.3, 0.0, 0.0, 1.0)
-    (0.25, 1.0, 0.3)
+    >>> quantise_reading(0.30, 0.25, 0.0, 1.0), quantise_reading(1.2, 0.25, 0.0, 1.0)
+    (0.25, 1.0)
+    >>> quantise_reading(0.3, 0.0, 0.0, 1.0)
+    0.3
     """
     if step == 0.0:
         return value
@@ -71,17 +73,15 @@ def convert(value, step, low, high):
 
 
 @compiled
-def _convert_all(values, step, low, high):
-    """Apply `convert` to every value (n,)."""
+def _quantise_readings(values, step, low, high):
+    """Apply `quantise_reading` to every value (n,)."""
     readings = np.empty(len(values))
     for row in range(len(values)):
-        readings[row] = convert(values[row], step, low, high)
+        readings[row] = quantise_reading(values[row], step, low, high)
     return readings
 
 
-def apply_sensor_errors(
-    machine: Machine, truth: Mapping[str, np.ndarray], time: np.ndarray
-) -> dict[str, np.ndarray]:
+def apply_sensor_errors(machine: Machine, truth: Mapping[str, np.ndarray], time: np.ndarray) -> dict[str, np.ndarray]:
     """Apply the machine's deterministic sensor errors to true values.
 
     A tilted or loose coupling acts first (see `SensorError`), then `scale * value + offset`.
@@ -96,14 +96,14 @@ def apply_sensor_errors(
     """
     errors = machine.sensor_errors
     return {
-        c: errors[c].scale * _through_coupling(errors[c], v) + errors[c].offset_at(time)
+        c: errors[c].scale * _apply_coupling_errors(errors[c], v) + errors[c].offset_at(time)
         if c in errors
         else v
         for c, v in truth.items()
     }  # fmt: skip
 
 
-def _through_coupling(error: SensorError, values: np.ndarray) -> np.ndarray:
+def _apply_coupling_errors(error: SensorError, values: np.ndarray) -> np.ndarray:
     """Return the angles (n,) behind a coupling with tilt and initially centred backlash [rad]."""
     if error.tilt:
         turned = np.arctan2(np.sin(values) * np.cos(error.tilt), np.cos(values))
@@ -118,7 +118,7 @@ def _through_coupling(error: SensorError, values: np.ndarray) -> np.ndarray:
     return values
 
 
-def measure(
+def simulate_readings(
     machine: Machine, sensors: SensorSet | None, seed: int, truth: Mapping[str, np.ndarray],
     errors: Mapping[str, np.ndarray] | None = None, period: float = 0.0,
 ) -> dict[str, np.ndarray]:  # fmt: skip
@@ -145,24 +145,24 @@ def measure(
     for channel, values in apply_sensor_errors(machine, truth, time).items():
         if sensors and sensors.jitter and period:
             rows = np.arange(len(values))
-            values = np.interp(rows + _instants(sensors, seed, len(values)) / period, rows, values)
+            values = np.interp(rows + _sampling_jitter(sensors, seed, len(values)) / period, rows, values)
         sensor = channel_sensor(machine, sensors, channel)
         if sensor.error_rms or sensor.bits:
             error = (errors or {}).get(channel)
             if error is None:
                 error = sensor_errors(sensor, seed, channel, len(values))
-            values = _convert_all(values + error, *converter(sensor, channel))
+            values = _quantise_readings(values + error, *channel_converter(sensor, channel))
         readings[channel] = np.asarray(values, dtype=float)
     return readings
 
 
-def _instants(sensors: SensorSet, seed: int, count: int) -> np.ndarray:
+def _sampling_jitter(sensors: SensorSet, seed: int, count: int) -> np.ndarray:
     """Return the sampling jitter (n,) of the rows [s], which is the same for all channels."""
     stream = np.random.Generator(np.random.PCG64([seed, zlib.crc32(b"jitter")]))
     return stream.normal(0.0, sensors.jitter, count)
 
 
-class Sensors(NamedTuple):
+class SensorParameters(NamedTuple):
     """Parameters of c sensors.
 
     Attributes:
@@ -214,17 +214,17 @@ def read_sensors(sensors, values, errors):
     """
     for c in range(len(errors)):
         value = sensors.scale[c] * values[c] + sensors.offset[c] + errors[c]
-        values[c] = convert(value, sensors.step[c], sensors.low[c], sensors.high[c])
+        values[c] = quantise_reading(value, sensors.step[c], sensors.low[c], sensors.high[c])
 
 
 @compiled
-def hold_readings(values, hydraulic, span, readings):
+def store_readings(values, hydraulic, sample_time, readings):
     """Store a new sample and compute the rates by finite differences.
 
     Args:
         values: (c,) readings of k positions, head and rod pressures, supply pressure.
         hydraulic: number of hydraulic axes, scalar.
-        span: time since the last sample, scalar [s]; 0 for the first one, whose rates are 0.
+        sample_time: time since the last sample, scalar [s]; 0 for the first one, whose rates are 0.
         readings: Readings, written except for the supply pressure.
 
     Returns:
@@ -232,7 +232,7 @@ def hold_readings(values, hydraulic, span, readings):
     """
     k = len(readings.joint)
     for i in range(k):
-        readings.rate[i] = (values[i] - readings.joint[i]) / span if span > 0.0 else 0.0
+        readings.rate[i] = (values[i] - readings.joint[i]) / sample_time if sample_time > 0.0 else 0.0
         readings.joint[i] = values[i]
     for i in range(hydraulic):
         readings.head[i], readings.rod[i] = values[k + 2 * i], values[k + 2 * i + 1]
@@ -243,22 +243,22 @@ class FeedbackTable(NamedTuple):
     """Sensors of a controller and their errors for a whole run.
 
     Attributes:
-        every: control ticks per sample.
+        ticks_per_sample: control ticks per sample.
         period: time between samples [s].
         sensors: parameters of c sensors.
         errors: (samples, c) random errors and drifts [channel's unit].
         readings: sampled and held readings.
     """
 
-    every: int
+    ticks_per_sample: int
     period: float
-    sensors: Sensors
+    sensors: SensorParameters
     errors: np.ndarray
     readings: Readings
 
 
 @compiled
-def sample(table, sim, tick, steps):
+def sample_sensors(table, sim, tick, steps):
     """Take a new sample if one is due at this control tick; otherwise hold the last one.
 
     Args:
@@ -275,11 +275,11 @@ def sample(table, sim, tick, steps):
     if tick % table.every != 0:
         return
     values = np.empty(len(sim.past.before))
-    true_values(sim, values)
-    delayed_values(sim.past, tick * steps, values)
+    true_sensor_values(sim, values)
+    apply_sensor_delays(sim.past, tick * steps, values)
     read_sensors(table.sensors, values, table.errors[tick // table.every])
     span = table.period if tick > 0 else 0.0
-    table.readings.supply[0] = hold_readings(values, sim.hydraulic, span, table.readings)
+    table.readings.supply[0] = store_readings(values, sim.hydraulic, span, table.readings)
 
 
 class Feedback:
@@ -288,7 +288,7 @@ class Feedback:
     Attributes:
         table: sensors, errors and readings for compiled code.
         errors: channel -> (samples,) random errors, so that the log can use the same ones.
-        every: control ticks per sample.
+        ticks_per_sample: control ticks per sample.
         period: time between samples [s].
         joint: (k,) positions [rad] or [m].
         rate: (k,) difference quotients of the last two positions [rad/s] or [m/s].
@@ -299,7 +299,7 @@ class Feedback:
     def __init__(self, table: FeedbackTable, errors: Mapping[str, np.ndarray]) -> None:
         """Create the feedback, before its first sample."""
         self.table, self.errors = table, errors
-        self.every, self.period = table.every, table.period
+        self.ticks_per_sample, self.period = table.ticks_per_sample, table.period
         self.joint, self.rate, self.head, self.rod, self._supply = table.readings
 
     @property
@@ -314,12 +314,10 @@ class Feedback:
             tick: the control tick, equal to that of the stepper.
             stepper: the stepper of the plant.
         """
-        sample(self.table, stepper.sim, tick, stepper.steps)
+        sample_sensors(self.table, stepper.sim, tick, stepper.steps)
 
 
-def feedback(
-    plant: Plant, sensors: SensorSet | None, seed: int, ticks: int, control_rate: float
-) -> Feedback:
+def create_feedback(plant: Plant, sensors: SensorSet | None, seed: int, ticks: int, control_rate: float) -> Feedback:
     """Create the sensor feedback of a run's controller.
 
     Args:
@@ -336,7 +334,7 @@ def feedback(
     Raises:
         InputError: the control rate is not a multiple of the sensors' rate.
     """
-    every, k = samples_every(control_rate, sensors), len(plant.axes)
+    every, k = periods_per_sample(control_rate, sensors), len(plant.axes)
     names = sensed_channels(plant)[: k + 2 * plant.hydraulic + (1 if plant.hydraulic else 0)]
     kinds = {name: channel_sensor(plant.machine, sensors, name) for name in names}
     count = ticks // every + 1  # including the unused sample after the last tick
@@ -347,9 +345,9 @@ def feedback(
     table = FeedbackTable(
         every,
         every / control_rate,
-        Sensors(
+        SensorParameters(
             np.array([d.scale for d in defects]), np.array([d.offset for d in defects]),
-            *np.array([converter(kinds[name], name) for name in names]).T.copy(),
+            *np.array([channel_converter(kinds[name], name) for name in names]).T.copy(),
         ),
         np.column_stack(list(errors.values())) + np.column_stack(changes),
         Readings(np.zeros(k), np.zeros(k), np.zeros(k), np.zeros(k), np.zeros(1)),
@@ -357,7 +355,7 @@ def feedback(
     return Feedback(table, errors)
 
 
-def samples_every(rate: float, sensors: SensorSet | None) -> int:
+def periods_per_sample(rate: float, sensors: SensorSet | None) -> int:
     """Return the number of clock periods per sensor sample; 1 for fast or ideal sensors.
 
     Args:

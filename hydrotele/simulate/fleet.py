@@ -15,20 +15,20 @@ import numpy as np
 
 from hydrotele.simulate.layout import mujoco_library
 
-STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+STATE_KIND = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
 class _Config(ctypes.Structure):
     _fields_ = [("nthread", ctypes.c_int), ("persistent", ctypes.c_bool)]
 
 
-class _Native:
-    """Owner of MuJoCo's batch; frees it when neither a `Fleet` nor an array refers to it."""
+class _NativeBatch:
+    """Owner of MuJoCo's batch; frees it when neither a `SimulationBatch` nor an array refers to it."""
 
     def __init__(self, library: ctypes.CDLL, handle: int) -> None:
         self.library, self.handle, self.process = library, handle, os.getpid()
 
-    def seen(self, address: int, shape: tuple[int, ...], kind: type = np.float64) -> np.ndarray:
+    def view_memory(self, address: int, shape: tuple[int, ...], kind: type = np.float64) -> np.ndarray:
         """Return an array view of the batch's memory; the array keeps the batch alive."""
         size = int(np.prod(shape)) * np.dtype(kind).itemsize
         kept: Any = type("_Memory", (ctypes.c_char * size,), {})  # a subclass can have attributes
@@ -41,7 +41,7 @@ class _Native:
             self.library.mjb_deleteBatch(self.handle)
 
 
-class Fleet:
+class SimulationBatch:
     """Simulations of copies of one model.
 
     Attributes:
@@ -63,19 +63,19 @@ class Fleet:
             RuntimeError: MuJoCo cannot create the simulations; contains MuJoCo's message.
         """
         self._library = mujoco_library()
-        self._native: _Native | None = None
-        _declare(self._library)
+        self._native: _NativeBatch | None = None
+        _declare_signatures(self._library)
         said = ctypes.create_string_buffer(500)
         handle = self._library.mjb_makeBatch(
             model._address, count, ctypes.byref(_Config(threads, False)), said, len(said)
         )
         if not handle:
             raise RuntimeError(f"cannot create {count} simulations: {said.value.decode()}")
-        self._native, self.model, self.count = _Native(self._library, handle), model, count
+        self._native, self.model, self.count = _NativeBatch(self._library, handle), model, count
         size = self._library.mjb_nstate(handle)
-        self.state = self._native.seen(self._library.mjb_state(handle), (count, size))
+        self.state = self._native.view_memory(self._library.mjb_state(handle), (count, size))
 
-    def expand(self, name: str) -> np.ndarray:
+    def expand_field(self, name: str) -> np.ndarray:
         """Give a float field of the model a separate value for each simulation.
 
         Args:
@@ -87,13 +87,11 @@ class Fleet:
         Raises:
             ValueError: MuJoCo does not support separate values for this field.
         """
-        native, size, width = self._usable(), ctypes.c_int(), ctypes.c_int()
-        place = self._library.mjb_expand(
-            native.handle, name.encode(), ctypes.byref(size), ctypes.byref(width)
-        )
+        native, size, width = self._require_native(), ctypes.c_int(), ctypes.c_int()
+        place = self._library.mjb_expand(native.handle, name.encode(), ctypes.byref(size), ctypes.byref(width))
         if not place or width.value != 8:
             raise ValueError(f"field {name} cannot differ between simulations")
-        return native.seen(place, (self.count, size.value))
+        return native.view_memory(place, (self.count, size.value))
 
     def apply(self, function: int, argument: int, chosen: np.ndarray | None = None) -> None:
         """Call a C function `(mjModel*, mjData*, int simulation, void*)` for each simulation.
@@ -107,24 +105,24 @@ class Fleet:
             RuntimeError: the simulations were closed, this process was forked from the one that
                 created them, or MuJoCo reported an error in one of them.
         """
-        native = self._usable()
+        native = self._require_native()
         ids = None if chosen is None else chosen.ctypes.data
         count = self.count if chosen is None else len(chosen)
         if self._library.mjb_apply(native.handle, ids, count, function, argument, 1):
-            status = native.seen(self._library.mjb_status(native.handle), (self.count,), np.int32)
+            status = native.view_memory(self._library.mjb_status(native.handle), (self.count,), np.int32)
             first = int(np.flatnonzero(status)[0])
             words = self._library.mjb_error(native.handle, first).decode()
             raise RuntimeError(f"simulation {first}: {words}")
 
     def get_model(self, number: int, model: mujoco.MjModel) -> None:
         """Write the model of one simulation into `model`, which has the same sizes."""
-        self._library.mjb_getModel(self._usable().handle, number, model._address)
+        self._library.mjb_getModel(self._require_native().handle, number, model._address)
 
     def get_data(self, number: int, data: mujoco.MjData) -> None:
         """Write the state of one simulation into `data`, which has the same sizes."""
-        self._library.mjb_getData(self._usable().handle, number, data._address)
+        self._library.mjb_getData(self._require_native().handle, number, data._address)
 
-    def _usable(self) -> _Native:
+    def _require_native(self) -> _NativeBatch:
         """Return the native batch; raise an error if it is closed or of a parent process."""
         if self._native is None:
             raise RuntimeError("the simulations were closed: create new ones")
@@ -147,7 +145,7 @@ class Fleet:
         )
 
 
-def _declare(library: ctypes.CDLL) -> None:
+def _declare_signatures(library: ctypes.CDLL) -> None:
     """Declare the function signatures of mjbatch.h to ctypes."""
     place, number = ctypes.c_void_p, ctypes.c_int
     for name, result, *arguments in (

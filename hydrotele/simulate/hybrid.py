@@ -13,32 +13,35 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hydrotele.kinematics.hybrid import (
-    LEGS,
+    LEG_COUNT,
     REVOLUTE,
     ErrorModel,
-    Hybrid,
-    Pose,
-    Unreachable,
-    forward,
+    HybridRobot,
+    PlatformPose,
+    UnreachableError,
+    euler_to_rotation,
+    forward_kinematics,
     home_pose,
     leg_readings,
-    rotation_of_euler,
     zero_frames,
 )
-from hydrotele.kinematics.wires import Wires, pose_covariance, wire_lengths
+from hydrotele.kinematics.wires import WireGeometry, pose_covariance, wire_lengths
 
-REACH, TILT = 0.08, 0.25  # m, rad: range of random platform poses about the home pose
-_WIRES_LOSE = 20.0  # largest ratio of a pose coordinate's error [m or rad] to the wires' error [m]
-_TRIES = 200
-_CLOSED = 1e-12  # m
-_PIN = dict(solref=[0.002, 1.0], solimp=[0.9999, 0.9999, 0.001, 0.5, 2.0])  # nearly rigid
-_COLOURS = {
+PLATFORM_REACH, PLATFORM_TILT = (
+    0.08,
+    0.25,
+)  # m, rad: range of random platform poses about the home pose
+_MAX_ERROR_RATIO = 20.0  # largest ratio of a pose coordinate's error [m or rad] to the wires' error [m]
+_MAX_TRIALS = 200
+_CLOSED_TOLERANCE = 1e-12  # m
+_PIN_SOLVER = dict(solref=[0.002, 1.0], solimp=[0.9999, 0.9999, 0.001, 0.5, 2.0])  # nearly rigid
+_PART_COLOURS = {
     "rail": (0.35, 0.37, 0.40, 1.0), "carriage": (0.85, 0.60, 0.10, 1.0),
     "tube": (0.25, 0.30, 0.38, 1.0), "rod": (0.80, 0.82, 0.84, 1.0),
     "platform": (0.16, 0.45, 0.62, 1.0),
 }  # fmt: skip
 # Masses of links, tubes, rods and moving platform [kg].
-_MASS = {"slide": 400.0, "turn": 250.0, "tube": 18.0, "rod": 9.0, "platform": 60.0}
+_PART_MASSES = {"slide": 400.0, "turn": 250.0, "tube": 18.0, "rod": 9.0, "platform": 60.0}
 
 
 class MeasuredPoses(NamedTuple):
@@ -58,26 +61,26 @@ class MeasuredPoses(NamedTuple):
     wires: np.ndarray
     true_joints: np.ndarray
     true_legs: np.ndarray
-    pose: Pose
+    pose: PlatformPose
 
 
-def shipped_wires() -> Wires:
+def default_wires() -> WireGeometry:
     """Return six wires from a hexagon around the IWR's rails to three arms of the platform.
 
     The hexagon has a radius of 1.5 m and lies 1 m below frame 0, centred at half the length of the
     rails. The arms have a length of 0.45 m. The order of the wires gives the smallest measurement
     errors over the workspace among all orders.
     """
-    at = np.arange(LEGS) * np.pi / 3.0
-    corners = np.column_stack([np.full(LEGS, -1.0), 1.5 * np.cos(at), 1.45 + 1.5 * np.sin(at)])
+    at = np.arange(LEG_COUNT) * np.pi / 3.0
+    corners = np.column_stack([np.full(LEG_COUNT, -1.0), 1.5 * np.cos(at), 1.45 + 1.5 * np.sin(at)])
     arms = np.arange(3) * 2.0 * np.pi / 3.0
     points = np.column_stack([0.45 * np.cos(arms), 0.45 * np.sin(arms), np.full(3, 0.05)])
     corners, points = corners[[0, 2, 4, 1, 5, 3]].round(6), points[[1, 2, 0]].round(6)
-    return Wires(anchors=tuple(map(tuple, corners.tolist())),
+    return WireGeometry(anchors=tuple(map(tuple, corners.tolist())),
                  points=tuple(map(tuple, points.tolist())))  # fmt: skip
 
 
-def manufactured_errors(
+def sample_manufacturing_errors(
     model: ErrorModel, rng: np.random.Generator, names: tuple[str, ...] | None = None,
     size: float = 1.0,
 ) -> np.ndarray:  # fmt: skip
@@ -88,14 +91,14 @@ def manufactured_errors(
     errors = rng.normal(size=len(model.names)) * model.scales * size
     if names is not None:
         kept = np.zeros(len(errors), bool)
-        kept[model.index(names)] = True
+        kept[model.parameter_indices(names)] = True
         errors[~kept] = 0.0
     return errors
 
 
-def random_poses(
-    robot: Hybrid, count: int, rng: np.random.Generator, wires: Wires | None = None,
-    reach: float = REACH, tilt: float = TILT,
+def sample_poses(
+    robot: HybridRobot, count: int, rng: np.random.Generator, wires: WireGeometry | None = None,
+    reach: float = PLATFORM_REACH, tilt: float = PLATFORM_TILT,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Sample random commands: carriage over its whole range, platform about its home pose.
 
@@ -114,26 +117,26 @@ def random_poses(
         ValueError: too few poses are within the ranges.
     """
     low, high = robot.joint_range.T
-    joints, legs = np.empty((0, len(low))), np.empty((0, LEGS))
-    for _ in range(_TRIES):
+    joints, legs = np.empty((0, len(low))), np.empty((0, LEG_COUNT))
+    for _ in range(_MAX_TRIALS):
         q = rng.uniform(low, high, (count, len(low)))
         home = home_pose(robot, q)
         local = rng.uniform(-1.0, 1.0, (count, 6)) * np.repeat([reach, tilt], 3)
         place = np.einsum("nij,nj->ni", home.rotation, local[:, :3]) + home.position
-        pose = Pose(home.rotation @ rotation_of_euler(local[:, 3:]), place)
+        pose = PlatformPose(home.rotation @ euler_to_rotation(local[:, 3:]), place)
         readings = leg_readings(robot, q, pose)
         good = (readings > robot.leg_range[0]).all(1) & (readings < robot.leg_range[1]).all(1)
         if wires is not None:
             cov = pose_covariance(wires, pose, 1.0)
-            good &= np.sqrt(np.einsum("nii->ni", cov)).max(axis=1) < _WIRES_LOSE
+            good &= np.sqrt(np.einsum("nii->ni", cov)).max(axis=1) < _MAX_ERROR_RATIO
         joints, legs = np.vstack([joints, q[good]]), np.vstack([legs, readings[good]])
         if len(legs) >= count:
             return joints[:count], legs[:count]
     raise ValueError(f"robot {robot.name}: too few random poses are within the legs' range")
 
 
-def measured_poses(
-    robot: Hybrid, joints: np.ndarray, legs: np.ndarray, wires: Wires,
+def simulate_measured_poses(
+    robot: HybridRobot, joints: np.ndarray, legs: np.ndarray, wires: WireGeometry,
     noise: Mapping[str, float], rng: np.random.Generator,
 ) -> MeasuredPoses:  # fmt: skip
     """Simulate noisy sensor readings of a robot with manufacturing errors.
@@ -149,7 +152,7 @@ def measured_poses(
     Returns:
         Readings with noise, and the true values.
     """
-    pose = forward(robot, joints, legs)
+    pose = forward_kinematics(robot, joints, legs)
     sizes = np.where(robot.kinds == REVOLUTE, noise.get("turn", 0.0), noise.get("slide", 0.0))
     lengths = wire_lengths(wires, pose)
     return MeasuredPoses(
@@ -159,7 +162,7 @@ def measured_poses(
     )  # fmt: skip
 
 
-def hybrid_mechanism(robot: Hybrid) -> mujoco.MjSpec:
+def build_hybrid_mechanism(robot: HybridRobot) -> mujoco.MjSpec:
     """Build the closed-chain mechanism of a hybrid robot, carriage at zero, platform at home.
 
     In this pose all bodies have the axes of frame 0. Joints have the names of the robot's joints,
@@ -180,7 +183,7 @@ def hybrid_mechanism(robot: Hybrid) -> mujoco.MjSpec:
     spec.visual.headlight.ambient = [0.35] * 3
     spec.visual.global_.offwidth, spec.visual.global_.offheight = 1600, 1200
     base = spec.worldbody.add_body(name="frame0", pos=[0, 0, 0.3], quat=_world_quaternion())
-    _rails(base, robot)
+    _add_rails(base, robot)
     parent, links = base, []
     frames, last = zero_frames(robot)
     for i, (name, kind) in enumerate(zip(robot.joints, robot.kinds, strict=True)):
@@ -193,15 +196,15 @@ def hybrid_mechanism(robot: Hybrid) -> mujoco.MjSpec:
         )  # fmt: skip
         links.append(body)
         parent = body
-    _carriage_shapes(links, frames, last, robot)
+    _add_carriage_shapes(links, frames, last, robot)
     home = home_pose(robot, np.zeros(len(robot.joints)))
     lower = robot.universal @ last[:3, :3].T + last[:3, 3]
     upper = robot.spherical @ home.rotation.T + home.position
-    _legs(spec, links[-1], lower, upper, home, robot)
+    _add_legs(spec, links[-1], lower, upper, home, robot)
     for name in robot.joints:
-        _servo(spec, name, 4e6)
-    for leg in range(1, LEGS + 1):
-        _servo(spec, f"leg{leg}", 2e6)
+        _add_servo(spec, name, 4e6)
+    for leg in range(1, LEG_COUNT + 1):
+        _add_servo(spec, f"leg{leg}", 2e6)
     return spec
 
 
@@ -210,7 +213,7 @@ def _world_quaternion() -> list[float]:
     return Rotation.from_matrix(axes).as_quat(scalar_first=True).tolist()
 
 
-def _servo(spec: mujoco.MjSpec, joint: str, stiffness: float) -> None:
+def _add_servo(spec: mujoco.MjSpec, joint: str, stiffness: float) -> None:
     spec.add_actuator(
         name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT,
         gaintype=mujoco.mjtGain.mjGAIN_FIXED, biastype=mujoco.mjtBias.mjBIAS_AFFINE,
@@ -218,7 +221,7 @@ def _servo(spec: mujoco.MjSpec, joint: str, stiffness: float) -> None:
     )  # fmt: skip
 
 
-def _legs(spec, platform, lower, upper, home: Pose, robot: Hybrid) -> None:
+def _add_legs(spec, platform, lower, upper, home: PlatformPose, robot: HybridRobot) -> None:
     """Add the legs, the moving platform on the first leg and the closures of the other legs."""
     up = home.rotation[:, 2]
     moving = None
@@ -232,11 +235,11 @@ def _legs(spec, platform, lower, upper, home: Pose, robot: Hybrid) -> None:
         joint.mass, joint.inertia, joint.ipos = 3.0, [0.01] * 3, a
         joint.explicitinertial = True
         joint.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, pos=a, size=[0.035, 0, 0], mass=0.0,
-                       rgba=_COLOURS["tube"], **_NO_CONTACT)  # fmt: skip
+                       rgba=_PART_COLOURS["tube"], **_NO_CONTACT)  # fmt: skip
         tube = joint.add_body(name=f"leg{leg}_tube")
         tube.add_joint(name=f"leg{leg}.pitch", pos=a, axis=pitch, damping=20.0)
         length = float(np.linalg.norm(b - a))
-        _bar(tube, a, a + 0.62 * length * along, 0.032, _MASS["tube"], "tube")
+        _add_bar(tube, a, a + 0.62 * length * along, 0.032, _PART_MASSES["tube"], "tube")
         rod = tube.add_body(name=f"leg{leg}_rod")
         low, high = robot.leg_range
         reading = length - robot.offsets[leg - 1]
@@ -244,83 +247,89 @@ def _legs(spec, platform, lower, upper, home: Pose, robot: Hybrid) -> None:
             name=f"leg{leg}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=along, damping=2e3,
             limited=mujoco.mjtLimited.mjLIMITED_TRUE, range=[low - reading, high - reading],
         )  # fmt: skip
-        _bar(rod, a + 0.40 * length * along, b, 0.018, _MASS["rod"], "rod")
+        _add_bar(rod, a + 0.40 * length * along, b, 0.018, _PART_MASSES["rod"], "rod")
         rod.add_site(name=f"leg{leg}_end", pos=b, size=[0.02, 0, 0])
         if leg == 1:
             moving = rod.add_body(name="platform")
             moving.add_joint(name="ball", type=mujoco.mjtJoint.mjJNT_BALL, pos=b, damping=2.0)
             turn = Rotation.from_matrix(home.rotation).as_quat(scalar_first=True)
             moving.add_site(name="frame5", pos=home.position, size=[0.03, 0, 0], quat=turn)
-            _plate(moving, home.position, home.rotation, upper, 0.03, _MASS["platform"], "platform")
+            _add_plate(
+                moving,
+                home.position,
+                home.rotation,
+                upper,
+                0.03,
+                _PART_MASSES["platform"],
+                "platform",
+            )
         assert moving is not None
-        moving.add_site(name=f"b{leg}", pos=b, size=[0.025, 0, 0], rgba=_COLOURS["rod"])
+        moving.add_site(name=f"b{leg}", pos=b, size=[0.025, 0, 0], rgba=_PART_COLOURS["rod"])
         if leg > 1:
             pin = spec.add_equality(
                 name=f"leg{leg}", type=mujoco.mjtEq.mjEQ_CONNECT, name1=f"leg{leg}_end",
                 name2=f"b{leg}", objtype=mujoco.mjtObj.mjOBJ_SITE,
             )  # fmt: skip
-            pin.solref, pin.solimp = _PIN["solref"], _PIN["solimp"]
+            pin.solref, pin.solimp = _PIN_SOLVER["solref"], _PIN_SOLVER["solimp"]
 
 
 _NO_CONTACT = dict(contype=0, conaffinity=0)
 
 
-def _bar(body, start, end, radius: float, mass: float, colour: str) -> None:
+def _add_bar(body, start, end, radius: float, mass: float, colour: str) -> None:
     body.add_geom(
         type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[*start, *end], size=[radius, 0, 0], mass=mass,
-        rgba=_COLOURS[colour], **_NO_CONTACT,
+        rgba=_PART_COLOURS[colour], **_NO_CONTACT,
     )  # fmt: skip
 
 
-def _plate(body, middle, rotation, points, thickness, mass, colour) -> None:
+def _add_plate(body, middle, rotation, points, thickness, mass, colour) -> None:
     radius = float(np.linalg.norm(points - points.mean(axis=0), axis=1).max())
     body.add_geom(
         type=mujoco.mjtGeom.mjGEOM_CYLINDER, pos=middle, size=[radius, 0.5 * thickness, 0],
         quat=Rotation.from_matrix(rotation).as_quat(scalar_first=True), mass=mass,
-        rgba=_COLOURS[colour], **_NO_CONTACT,
+        rgba=_PART_COLOURS[colour], **_NO_CONTACT,
     )  # fmt: skip
 
 
-def _rails(base, robot: Hybrid) -> None:
+def _add_rails(base, robot: HybridRobot) -> None:
     """Add two rails along the first joint, at the height of frame 0."""
     low, high = robot.joint_range[0]
     for side in (-0.3, 0.3):
         base.add_geom(
             type=mujoco.mjtGeom.mjGEOM_BOX, pos=[-0.05, side, 0.5 * (low + high)],
-            size=[0.04, 0.05, 0.5 * (high - low) + 0.3], rgba=_COLOURS["rail"], **_NO_CONTACT,
+            size=[0.04, 0.05, 0.5 * (high - low) + 0.3], rgba=_PART_COLOURS["rail"], **_NO_CONTACT,
         )  # fmt: skip
 
 
-def _carriage_shapes(links, frames, last, robot: Hybrid) -> None:
+def _add_carriage_shapes(links, frames, last, robot: HybridRobot) -> None:
     """Add the carriage's geoms: bars between axes, blocks for slides, a plate below the legs."""
     places = [*frames[:, :3, 3], last[:3, 3]]
     for i, (body, kind) in enumerate(zip(links, robot.kinds, strict=True)):
-        mass = _MASS["turn"] if kind == REVOLUTE else _MASS["slide"]
+        mass = _PART_MASSES["turn"] if kind == REVOLUTE else _PART_MASSES["slide"]
         start, end = places[i], places[i + 1]
         if np.linalg.norm(end - start) > 0.05:
-            _bar(body, start, end, 0.075, mass, "carriage")
+            _add_bar(body, start, end, 0.075, mass, "carriage")
         else:
             body.add_geom(
                 type=mujoco.mjtGeom.mjGEOM_BOX, pos=start, size=[0.05 + 0.02 * i, 0.3 - 0.12 * i,
-                0.22], mass=mass, rgba=_COLOURS["carriage"], **_NO_CONTACT,
+                0.22], mass=mass, rgba=_PART_COLOURS["carriage"], **_NO_CONTACT,
             )  # fmt: skip
     points = robot.universal @ last[:3, :3].T + last[:3, 3]
-    _plate(
-        links[-1], last[:3, 3] - 0.03 * last[:3, 2], last[:3, :3], points, 0.05, 80.0, "carriage"
-    )
+    _add_plate(links[-1], last[:3, 3] - 0.03 * last[:3, 2], last[:3, :3], points, 0.05, 80.0, "carriage")
 
 
-def mechanism_pose(
-    model: mujoco.MjModel, data: mujoco.MjData, robot: Hybrid, joints: np.ndarray,
+def solve_mechanism_pose(
+    model: mujoco.MjModel, data: mujoco.MjData, robot: HybridRobot, joints: np.ndarray,
     legs: np.ndarray,
-) -> Pose:  # fmt: skip
+) -> PlatformPose:  # fmt: skip
     """Compute the platform pose of the MuJoCo model for given carriage positions and leg readings.
 
     Newton's method on MuJoCo's positions closes the loops. `multibody.chain` is not used, because
     it does not support the damped ball joints, and because MuJoCo's kinematics are to be tested.
 
     Args:
-        model: model of `hybrid_mechanism(robot)`.
+        model: model of `build_hybrid_mechanism(robot)`.
         data: its data; its configuration is the start value of the iteration.
         robot: the robot.
         joints: (n,) carriage positions [m] or [rad].
@@ -333,7 +342,7 @@ def mechanism_pose(
         Unreachable: the loops do not close.
     """
     zero = leg_readings(robot, np.zeros(len(robot.joints)), home_pose(robot, np.zeros(len(joints))))
-    driven = [*robot.joints, *(f"leg{k}" for k in range(1, LEGS + 1))]
+    driven = [*robot.joints, *(f"leg{k}" for k in range(1, LEG_COUNT + 1))]
     goal = np.concatenate([joints, legs - zero])
     at = np.array([model.joint(name).qposadr[0] for name in driven])
     begin = data.qpos[at].copy()
@@ -344,13 +353,13 @@ def mechanism_pose(
         data.qpos[at] = begin + (goal - begin) * part / parts
         for _ in range(30):
             error, jacobian = _loop_errors(model, data)
-            if np.abs(error).max() < _CLOSED:
+            if np.abs(error).max() < _CLOSED_TOLERANCE:
                 break
             step = np.zeros(model.nv)
             step[moving] = -np.linalg.lstsq(jacobian[:, moving], error, rcond=None)[0]
             mujoco.mj_integratePos(model, data.qpos, step, 1.0)
     if np.abs(error).max() > 1e-9:
-        raise Unreachable("the mechanism's loops do not close at these lengths")
+        raise UnreachableError("the mechanism's loops do not close at these lengths")
     return platform_pose(data)
 
 
@@ -370,8 +379,8 @@ def _loop_errors(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray
     return np.concatenate(errors), np.vstack(slopes)
 
 
-def platform_pose(data: mujoco.MjData) -> Pose:
+def platform_pose(data: mujoco.MjData) -> PlatformPose:
     """Return the pose of the site `frame5` in frame 0 from the current kinematics in `data`."""
     base, site = data.body("frame0"), data.site("frame5")
     turned = base.xmat.reshape(3, 3)
-    return Pose(turned.T @ site.xmat.reshape(3, 3), turned.T @ (site.xpos - base.xpos))
+    return PlatformPose(turned.T @ site.xmat.reshape(3, 3), turned.T @ (site.xpos - base.xpos))

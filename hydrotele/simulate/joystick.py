@@ -22,16 +22,16 @@ import numpy as np
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import read_xml
-from hydrotele.core.memory import address_record, floats, rows_of
-from hydrotele.machine.joystick import Joystick, principal
+from hydrotele.core.memory import address_record, float64_view, matrix_view
+from hydrotele.machine.joystick import Joystick, principal_values
 from hydrotele.simulate.layout import call_step, function_address
 
 GRAVITY = -9.81
-_COOL = 0.9  # relative heat below which the largest current is allowed again after overheating
-_STEPS = 2  # physics steps per control period of 5 ms: the stiffest spring's period is 30 ms
-_HALVES = 15  # number of inputs that change between periods: 6 currents, 6 forces, 3 of gravity
+_COOLED_HEAT = 0.9  # relative heat below which the largest current is allowed again after overheating
+_MIN_STEPS_PER_PERIOD = 2  # physics steps per control period of 5 ms: the stiffest spring's period is 30 ms
+_INPUT_COUNT = 15  # number of inputs that change between periods: 6 currents, 6 forces, 3 of gravity
 
-FLOTOR = np.dtype(
+FLOTOR_DTYPE = np.dtype(
     [(name, np.int64) for name in ("mj_step", "mj_forward", "model", "data")]
     + [(name, np.int64) for name in ("steps", "leaps", "started")]
     + [(name, np.float64) for name in ("timestep", "period", "mass", "continuous_current")]
@@ -55,12 +55,12 @@ class SimulatedFlotor:
         hand: whether the operator holds the handle.
         heat: (6,) relative heat of the coils, see `heat_step`.
         record: (1,) the simulation as a record for compiled code, see `flotor_step`.
-        weakens: whether coils lose force towards the end of their gap; `weaken_coils` must then be
+        has_edge_loss: whether coils lose force towards the end of their gap; `weaken_coils` must then be
             called before every period.
     """
 
     def __init__(
-        self, facts: Joystick, *, hand: bool = True, period: float | None = None, fine: int = 1,
+        self, facts: Joystick, *, hand: bool = True, period: float | None = None, refinement: int = 1,
         runge_kutta: bool = False,
     ) -> None:  # fmt: skip
         """Compile the joystick.
@@ -69,7 +69,7 @@ class SimulatedFlotor:
             facts: parameters of the joystick.
             hand: whether the operator holds the handle.
             period: control period [s]; by default that of the joystick.
-            fine: factor on the number of physics steps per period.
+            refinement: factor on the number of physics steps per period.
             runge_kutta: use fourth-order steps of four times the cost, for motion without contact
                 with the stops.
 
@@ -78,8 +78,11 @@ class SimulatedFlotor:
         """
         self.facts, self.hand = facts, hand
         self.period = period or 1.0 / facts.control_rate
-        steps = max(_STEPS, math.ceil(_STEPS * self.period * facts.control_rate - 1e-9))
-        self.steps = fine * steps
+        steps = max(
+            _MIN_STEPS_PER_PERIOD,
+            math.ceil(_MIN_STEPS_PER_PERIOD * self.period * facts.control_rate - 1e-9),
+        )
+        self.steps = refinement * steps
         spec = joystick_spec(facts, hand)
         spec.compiler.discardvisual = True
         spec.compiler.fusestatic = True
@@ -88,8 +91,8 @@ class SimulatedFlotor:
         self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
         self.data = mujoco.MjData(self.model)
         self.model.opt.gravity[:] = (0.0, 0.0, GRAVITY)
-        self.heat, self.weakens = np.zeros(6), facts.coils.edge_loss > 0.0
-        self._fill_record(0.5 * _damping(self.model), not runge_kutta)
+        self.heat, self.has_edge_loss = np.zeros(6), facts.coils.edge_loss > 0.0
+        self._fill_record(0.5 * _damping_matrix(self.model), not runge_kutta)
         if runge_kutta:
             self.model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
         else:  # MuJoCo's damping uses the velocity after a step: half of it goes there
@@ -99,9 +102,7 @@ class SimulatedFlotor:
                 self.model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         self._gear, self._full = self.model.actuator_gear, self.model.actuator_gear.copy()
         places = self.model.site_pos[self.model.actuator_trnid[:, 0]]
-        self._spots = places + np.array(
-            facts.flotor.handle
-        )  # from the flotor's to the coils' frame
+        self._spots = places + np.array(facts.flotor.handle)  # from the flotor's to the coils' frame
 
     def _fill_record(self, half_damping: np.ndarray, leaps: bool) -> None:
         """Create the record for compiled code and keep the arrays that it points to."""
@@ -116,10 +117,10 @@ class SimulatedFlotor:
         self._arrays = {
             "com": com, "inertia": inertia, "mount": np.array(self.facts.mount, float),
             "ctrl": data.ctrl, "applied": data.qfrc_applied, "gravity": model.opt.gravity,
-            "before": np.zeros((2, _HALVES)), "speed": data.qvel, "acceleration": data.qacc,
+            "before": np.zeros((2, _INPUT_COUNT)), "speed": data.qvel, "acceleration": data.qacc,
             "half_damping": half_damping, "heat": self.heat,
         }  # fmt: skip
-        self.record = address_record(FLOTOR, self._arrays)
+        self.record = address_record(FLOTOR_DTYPE, self._arrays)
         for name, value in {
             "mj_step": function_address("mj_step"), "mj_forward": function_address("mj_forward"),
             "model": model._address, "data": data._address, "steps": self.steps, "leaps": leaps,
@@ -130,12 +131,12 @@ class SimulatedFlotor:
             self.record[name] = value
 
     @property
-    def hottest(self) -> float:
+    def max_heat(self) -> float:
         """Largest relative heat of any coil so far, see `heat_step`."""
         return float(self.record["hottest"][0])
 
     @property
-    def allowed(self) -> float:
+    def current_limit(self) -> float:
         """Current limit of the coils at present [A].
 
         It is the maximum current, or the continuous current after a coil has become hot and until
@@ -151,11 +152,11 @@ class SimulatedFlotor:
             muscles: (6,) force of the operator on the handle along the stator's axes [N] and torque
                 about them [N m].
         """
-        if self.weakens:
+        if self.has_edge_loss:
             self.weaken_coils()
-        _step(self.record, np.asarray(currents, float), np.asarray(muscles, float))
+        _step_record(self.record, np.asarray(currents, float), np.asarray(muscles, float))
 
-    def shaken_step(
+    def step_in_cab(
         self, currents: np.ndarray, muscles: np.ndarray, mount: np.ndarray, spin: float,
         spin_rate: float,
     ) -> None:  # fmt: skip
@@ -168,11 +169,11 @@ class SimulatedFlotor:
             spin: angular velocity of the cab [rad/s].
             spin_rate: its angular acceleration [rad/s^2].
         """
-        if self.weakens:
+        if self.has_edge_loss:
             self.weaken_coils()
         self._arrays["mount"][:] = mount
         currents, muscles = np.asarray(currents, float), np.asarray(muscles, float)
-        _shaken_step(self.record, currents, muscles, float(spin), float(spin_rate))
+        _step_record_in_cab(self.record, currents, muscles, float(spin), float(spin_rate))
 
     def weaken_coils(self) -> None:
         """Reduce the force constants of the coils according to the flotor's pose."""
@@ -181,10 +182,10 @@ class SimulatedFlotor:
         turn = turn.reshape(3, 3)
         place = self.data.qpos[:3] + handle - turn @ handle
         gap = self.facts.workspace.translation
-        shares = field_shares(self._spots, place, turn, gap, self.facts.coils.edge_loss)
+        shares = coil_force_factors(self._spots, place, turn, gap, self.facts.coils.edge_loss)
         self._gear[:] = self._full * shares[:, None]
 
-    def place(self, pose: np.ndarray) -> None:
+    def set_pose(self, pose: np.ndarray) -> None:
         """Set the handle to a pose at rest, (6,) displacement [m] and rotation vector [rad]."""
         mujoco.mj_resetData(self.model, self.data)
         self.record["started"] = 0
@@ -194,7 +195,7 @@ class SimulatedFlotor:
         mujoco.mju_axisAngle2Quat(self.data.qpos[3:7], way, angle)
 
 
-def _damping(model: mujoco.MjModel) -> np.ndarray:
+def _damping_matrix(model: mujoco.MjModel) -> np.ndarray:
     """Return the damping matrix (nv, nv) of joints and fixed tendons."""
     found, way = np.diag(model.dof_damping), np.zeros((model.ntendon, model.nv))
     for k in range(model.ntendon):
@@ -218,14 +219,14 @@ def flotor_step(r, currents, muscles):
 
     Source: this module.
     """
-    applied = floats(r.applied, 6)
+    applied = float64_view(r.applied, 6)
     for i in range(6):
         applied[i] = muscles[i]
-    _go_on(r, currents)
+    _simulate_period(r, currents)
 
 
 @compiled
-def shaken_flotor_step(r, currents, muscles, spin, spin_rate):
+def flotor_step_in_cab(r, currents, muscles, spin, spin_rate):
     """Advance the flotor like `flotor_step` in a cab that rotates about a vertical axis.
 
     Args:
@@ -240,49 +241,49 @@ def shaken_flotor_step(r, currents, muscles, spin, spin_rate):
 
     Source: inertial forces in a rotating frame.
     """
-    _shake(
-        r.mass, floats(r.com, 3), rows_of(r.inertia, 3, 3), floats(r.mount, 3), spin, spin_rate,
-        muscles, floats(r.gravity, 3), floats(r.applied, 6),
+    _cab_forces(
+        r.mass, float64_view(r.com, 3), matrix_view(r.inertia, 3, 3), float64_view(r.mount, 3), spin, spin_rate,
+        muscles, float64_view(r.gravity, 3), float64_view(r.applied, 6),
     )  # fmt: skip
-    _go_on(r, currents)
+    _simulate_period(r, currents)
 
 
 @compiled
-def _go_on(r, currents):
+def _simulate_period(r, currents):
     """Simulate one period with constant currents; applied forces and gravity are already set."""
-    ctrl, heat = floats(r.ctrl, 6), floats(r.heat, 6)
+    ctrl, heat = float64_view(r.ctrl, 6), float64_view(r.heat, 6)
     for i in range(6):
         ctrl[i] = currents[i]
     hot = heat_step(heat, currents, r.continuous_current, r.thermal_time, r.period)
-    r.hottest = max(r.hottest, hot)
+    r.max_heat = max(r.max_heat, hot)
     if hot >= 1.0:
-        r.allowed = min(r.max_current, r.continuous_current)
-    elif hot < _COOL:
-        r.allowed = r.max_current
+        r.current_limit = min(r.max_current, r.continuous_current)
+    elif hot < _COOLED_HEAT:
+        r.current_limit = r.max_current
     if not r.leaps:
         for _ in range(r.steps):
             call_step(r.mj_step, r.model, r.data)
         return
-    inputs = ctrl, floats(r.applied, 6), floats(r.gravity, 3)
-    before, speed = rows_of(r.before, 2, _HALVES), floats(r.speed, 6)
-    damping = rows_of(r.half_damping, 6, 6)
-    _keep(inputs, before)
+    inputs = ctrl, float64_view(r.applied, 6), float64_view(r.gravity, 3)
+    before, speed = matrix_view(r.before, 2, _INPUT_COUNT), float64_view(r.speed, 6)
+    damping = matrix_view(r.half_damping, 6, 6)
+    _store_inputs(inputs, before)
     if not r.started:
         r.started = 1
-        for i in range(_HALVES):
+        for i in range(_INPUT_COUNT):
             before[0, i] = before[1, i]
-        _load(inputs, before, damping, speed, 0.0)
+        _set_step_inputs(inputs, before, damping, speed, 0.0)
         call_step(r.mj_forward, r.model, r.data)
-        acceleration = floats(r.acceleration, 6)
+        acceleration = float64_view(r.acceleration, 6)
         for i in range(6):
             speed[i] -= 0.5 * r.timestep * acceleration[i]
     for k in range(r.steps):
-        _load(inputs, before, damping, speed, 0.0 if k else 0.5)
+        _set_step_inputs(inputs, before, damping, speed, 0.0 if k else 0.5)
         call_step(r.mj_step, r.model, r.data)
 
 
 @compiled
-def _keep(inputs, before):
+def _store_inputs(inputs, before):
     """Move the second row of `before` (2, 15) to the first and store the inputs in the second."""
     at = 0
     for part in inputs:
@@ -292,15 +293,15 @@ def _keep(inputs, before):
 
 
 @compiled
-def _load(inputs, before, half_damping, speed, share):
+def _set_step_inputs(inputs, before, half_damping, speed, previous_weight):
     """Set the inputs of a step: a weighted mean of the last and this period, and half the damping.
 
-    `share` is the weight of the last period's inputs.
+    `previous_weight` is the weight of the last period's inputs.
     """
     at = 0
     for part in inputs:
         for i in range(len(part)):
-            part[i] = share * before[0, at] + (1.0 - share) * before[1, at]
+            part[i] = previous_weight * before[0, at] + (1.0 - previous_weight) * before[1, at]
             at += 1
     applied = inputs[1]
     for i in range(len(applied)):
@@ -309,13 +310,13 @@ def _load(inputs, before, half_damping, speed, share):
 
 
 @compiled
-def _step(record, currents, muscles):
+def _step_record(record, currents, muscles):
     flotor_step(record[0], currents, muscles)
 
 
 @compiled
-def _shaken_step(record, currents, muscles, spin, spin_rate):
-    shaken_flotor_step(record[0], currents, muscles, spin, spin_rate)
+def _step_record_in_cab(record, currents, muscles, spin, spin_rate):
+    flotor_step_in_cab(record[0], currents, muscles, spin, spin_rate)
 
 
 @compiled
@@ -344,8 +345,12 @@ def heat_step(heat, currents, continuous, time_constant, period):
     return hot
 
 
-def field_shares(
-    spots: np.ndarray, place: np.ndarray, turn: np.ndarray, gap: float, edge_loss: float
+def coil_force_factors(
+    coil_centres: np.ndarray,
+    displacement: np.ndarray,
+    rotation_matrix: np.ndarray,
+    gap: float,
+    edge_loss: float,
 ) -> np.ndarray:
     """Return the relative force constant of every coil in a pose of the flotor.
 
@@ -353,21 +358,21 @@ def field_shares(
     position. The function is even in d, because the magnets are symmetric about the gap's centre.
 
     Args:
-        spots: (6, 3) centres of the coils in their frame [m].
-        place: (3,) displacement of the coils' frame from its nominal position [m].
-        turn: (3, 3) rotation matrix from flotor to stator.
+        coil_centres: (6, 3) centres of the coils in their frame [m].
+        displacement: (3,) displacement of the coils' frame from its nominal position [m].
+        rotation_matrix: (3, 3) rotation matrix from flotor to stator.
         gap: displacement at which a coil has lost the fraction `edge_loss` [m].
         edge_loss: fraction of the force lost at this displacement [1].
 
     Returns:
         (6,) factors on the force per ampere, at least 0 [1].
     """
-    moved = place + spots @ turn.T - spots
+    moved = displacement + coil_centres @ rotation_matrix.T - coil_centres
     return np.maximum(0.0, 1.0 - edge_loss * np.sum(moved**2, axis=1) / gap**2)
 
 
 @compiled
-def _shake(mass, com, inertia, mount, w, a, muscles, gravity, out):
+def _cab_forces(mass, com, inertia, mount, w, a, muscles, gravity, out):
     """Write the apparent gravity at the mount and the inertial forces in the rotating frame."""
     gravity[0] = w * w * mount[0] + a * mount[1]
     gravity[1] = w * w * mount[1] - a * mount[0]
@@ -405,9 +410,7 @@ def joystick_spec(facts: Joystick, hand: bool = True) -> mujoco.MjSpec:
     flotor, grip = spec.body("flotor"), spec.body("hand")
     coils, joints = spec.body("coils"), {j.name: j for j in spec.joints}
     if not (flotor and grip and coils and {"x", "y", "z", "turn"} <= set(joints)):
-        raise InputError(
-            path, "must have bodies flotor, hand and coils, and joints x, y, z and turn"
-        )
+        raise InputError(path, "must have bodies flotor, hand and coils, and joints x, y, z and turn")
     facts_flotor = facts.flotor
     flotor.mass, flotor.inertia = facts_flotor.mass, facts_flotor.inertia
     flotor.ipos = np.subtract(facts_flotor.com, facts_flotor.handle)
@@ -422,11 +425,11 @@ def joystick_spec(facts: Joystick, hand: bool = True) -> mujoco.MjSpec:
         place, turn = spec.site(f"coil_{k + 1}"), 2.0 * math.pi * (k % 3) / 3.0
         place.pos = facts.coils.radius * np.array([math.cos(turn), math.sin(turn), 0.0])
     if hand and facts.hand.mass > 0.0:
-        grip.mass = facts.hand.carried
+        grip.mass = facts.hand.carried_mass
     else:
         spec.delete(grip)
     if hand:
-        _hold(spec, joints, facts)
+        _add_arm_impedance(spec, joints, facts)
     return spec
 
 
@@ -444,7 +447,7 @@ def _place_stops(spec: mujoco.MjSpec, facts: Joystick, path: Path) -> None:
         spec.geom(name).pos[axis] += way * (far + ball.size[0] + spec.geom(name).size[axis])
 
 
-def _hold(spec: mujoco.MjSpec, joints, facts: Joystick) -> None:
+def _add_arm_impedance(spec: mujoco.MjSpec, joints, facts: Joystick) -> None:
     """Add springs, dampers and mass of the operator's arm, except the mass on the handle itself.
 
     In the horizontal plane, stiffness and mass are ellipses. The slides have the values of the
@@ -455,16 +458,16 @@ def _hold(spec: mujoco.MjSpec, joints, facts: Joystick) -> None:
         turns = name == "turn"
         joints[name].stiffness[0] = hand.rotation_stiffness if turns else hand.stiffness
         joints[name].damping[0] = hand.rotation_damping if turns else hand.damping
-    firm, heavy = principal(hand.stiffness_shape), principal(hand.mass_shape)
-    joints["z"].armature = hand.mass - hand.carried
+    firm, heavy = principal_values(hand.stiffness_shape), principal_values(hand.mass_shape)
+    joints["z"].armature = hand.mass - hand.carried_mass
     for name in ("x", "y"):
-        joints[name].stiffness[0] *= firm.least
-        joints[name].damping[0] *= firm.least
-        joints[name].armature = heavy.least * hand.mass - hand.carried
+        joints[name].stiffness[0] *= firm.min_value
+        joints[name].damping[0] *= firm.min_value
+        joints[name].armature = heavy.min_value * hand.mass - hand.carried_mass
     for name, axis in (("stiff", firm), ("heavy", heavy)):
-        if axis.greatest <= axis.least * (1.0 + 1e-9):
+        if axis.max_value <= axis.min_value * (1.0 + 1e-9):
             continue
-        more, arm = axis.greatest - axis.least, spec.add_tendon(name=f"arm_{name}")
+        more, arm = axis.max_value - axis.min_value, spec.add_tendon(name=f"arm_{name}")
         arm.wrap_joint("x", math.cos(axis.angle))
         arm.wrap_joint("y", math.sin(axis.angle))
         if name == "stiff":

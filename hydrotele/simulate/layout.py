@@ -97,7 +97,7 @@ def struct_size(struct: str) -> int:
     return _struct_layout(structs.STRUCTS[struct].fields)[1]
 
 
-def _read(address: int, dtype) -> float:
+def _read_number(address: int, dtype) -> float:
     """Read a number of a numpy type at an address."""
     kinds = {np.float64: ctypes.c_double, np.int64: ctypes.c_int64, np.int32: ctypes.c_int32}
     kind = kinds[dtype]
@@ -111,8 +111,14 @@ def option_offset(name: str) -> int:
     return field_offsets("mjModel")["opt"] + option[name]
 
 
-_ARRAYS = ("actuator_user", "actuator_actadr", "numeric_adr", "numeric_size", "numeric_data")
-_PROBE = """<mujoco><option timestep="0.0123"/><custom><numeric name="n" data="1 2 3"/></custom>
+_CHECKED_ARRAYS = (
+    "actuator_user",
+    "actuator_actadr",
+    "numeric_adr",
+    "numeric_size",
+    "numeric_data",
+)
+_PROBE_MODEL = """<mujoco><option timestep="0.0123"/><custom><numeric name="n" data="1 2 3"/></custom>
 <worldbody><geom type="plane" size="1 1 1"/><body><joint name="j" type="slide"/>
 <geom size="0.1"/></body></worldbody><actuator>
 <general joint="j" dyntype="integrator" user="1 2 3"/><motor joint="j"/></actuator></mujoco>"""
@@ -126,27 +132,32 @@ def verify_layout() -> None:
         RuntimeError: the offset of a field is wrong; native hydraulics cannot run with this MuJoCo
             version.
     """
-    model = mujoco.MjModel.from_xml_string(_PROBE)
+    model = mujoco.MjModel.from_xml_string(_PROBE_MODEL)
     data = mujoco.MjData(model)
     mujoco.mj_fwdPosition(model, data)  # its body touches the plane
     data.time = 0.456
     in_model, in_data = field_offsets("mjModel"), field_offsets("mjData")
     wrong = [
         name
-        for name in (*_ARRAYS, "actuator_biastype", "actuator_dyntype", "actuator_ctrlrange")
-        if _read(model._address + in_model[name], np.int64) != getattr(model, name).ctypes.data
+        for name in (
+            *_CHECKED_ARRAYS,
+            "actuator_biastype",
+            "actuator_dyntype",
+            "actuator_ctrlrange",
+        )
+        if _read_number(model._address + in_model[name], np.int64) != getattr(model, name).ctypes.data
     ]
     wrong += [
         name
         for name in ("nu", "nuser_actuator", "nnumeric")
-        if _read(model._address + in_model[name], np.int64) != getattr(model, name)
+        if _read_number(model._address + in_model[name], np.int64) != getattr(model, name)
     ]
     wrong += [
         name
         for name in ("ctrl", "act", "act_dot", "actuator_velocity", "actuator_length")
-        if _read(data._address + in_data[name], np.int64) != getattr(data, name).ctypes.data
+        if _read_number(data._address + in_data[name], np.int64) != getattr(data, name).ctypes.data
     ]
-    contact, first = data.contact, _read(data._address + in_data["contact"], np.int64)
+    contact, first = data.contact, _read_number(data._address + in_data["contact"], np.int64)
     wrong += [
         f"contact.{name}"
         for name in ("frame", "geom")
@@ -154,13 +165,13 @@ def verify_layout() -> None:
     ]
     if struct_size("mjContact") != contact.frame.strides[0]:
         wrong.append("the next contact")
-    if _read(data._address + in_data["ncon"], np.int32) != data.ncon:
+    if _read_number(data._address + in_data["ncon"], np.int32) != data.ncon:
         wrong.append("ncon")
     if data._address + in_data["warning"] + 4 != data.warning.number.ctypes.data:
         wrong.append("warning")
-    if _read(model._address + option_offset("timestep"), np.float64) != 0.0123:
+    if _read_number(model._address + option_offset("timestep"), np.float64) != 0.0123:
         wrong.append("opt.timestep")
-    if _read(data._address + in_data["time"], np.float64) != 0.456:
+    if _read_number(data._address + in_data["time"], np.float64) != 0.456:
         wrong.append("time")
     if wrong:
         raise RuntimeError(

@@ -25,8 +25,13 @@ import numpy as np
 from hydrotele.core.datafile import Vector
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import check_assets, read_xml
-from hydrotele.hydraulics.circuit import ACTIVATIONS
-from hydrotele.hydraulics.parameters import SLOTS, Slot, actuator_parameters, terms_of
+from hydrotele.hydraulics.circuit import ACTIVATIONS_PER_AXIS
+from hydrotele.hydraulics.parameters import (
+    SLOT_COUNT,
+    Slot,
+    actuator_parameters,
+    machine_terms_table,
+)
 from hydrotele.kinematics.from_machine import (
     drive_travel,
     has_ball_ends,
@@ -38,19 +43,19 @@ from hydrotele.machine.machine import Link, Machine
 from hydrotele.scenario.scenario import SurroundingObject
 from hydrotele.simulate.surroundings import write_surroundings
 
-OWN = "hydrotele_"
+NAME_PREFIX = "hydrotele_"
 """Prefix of the names of all elements that are not named in user files."""
 
-GROUND = f"{OWN}ground"
+GROUND_NAME = f"{NAME_PREFIX}ground"
 """Name of the geom, texture and material of the ground."""
 
-TIP_SITE = f"{OWN}tip"
+TIP_SITE = f"{NAME_PREFIX}tip"
 """Name of the site at the arm's tip."""
 
 
 def pin_site(closure: str, end: str) -> str:
     """Return the name of the site at end a or b of a closure; a cylinder's is `<axis>_pin`."""
-    return f"{OWN}{closure}_{end}"
+    return f"{NAME_PREFIX}{closure}_{end}"
 
 
 class Mjcf(NamedTuple):
@@ -78,14 +83,14 @@ class Mjcf(NamedTuple):
             message = " ".join(str(error).split())
             raise InputError(f"machine {self.name}", f"does not compile: {message}") from None
 
-    def save(self, path: Path, beside: Path | None = None) -> None:
+    def save(self, path: Path, final_path: Path | None = None) -> None:
         """Write the document to a file, and its assets to the folder `<stem>_assets` next to it.
 
         Args:
             path: file to write.
-            beside: final path of the file, if `path` is temporary; names the asset folder.
+            final_path: final path of the file, if `path` is temporary; names the asset folder.
         """
-        folder = (beside or path).with_suffix("").name + "_assets"
+        folder = (final_path or path).with_suffix("").name + "_assets"
         text = self.text
         for name, content in self.assets.items():
             path.with_name(folder).mkdir(exist_ok=True)
@@ -97,7 +102,7 @@ class Mjcf(NamedTuple):
 Element = ElementTree.Element
 
 
-def without_looks(root: Element) -> None:
+def remove_visual_geometry(root: Element) -> None:
     """Remove geoms without contact, unused meshes, materials, cameras and lights, in place.
 
     Args:
@@ -106,8 +111,8 @@ def without_looks(root: Element) -> None:
     world = root.find("worldbody")
     if world is None:
         return
-    touching = _touching_by_class(root)
-    _prune(world, "main", touching)
+    touching = _contacts_by_class(root)
+    _remove_visual_elements(world, "main", touching)
     kept = {(kind, geom.get(kind)) for geom in world.iter("geom") for kind in ("mesh", "hfield")}
     for asset in root.findall("asset"):
         for element in list(asset):
@@ -133,7 +138,7 @@ def name_geoms(root: Element) -> None:
                 geom.set("name", f"{body.get('name', 'body')}_look{number}")
 
 
-def _touching_by_class(root: Element) -> dict[str, bool]:
+def _contacts_by_class(root: Element) -> dict[str, bool]:
     """Map each default class to whether its geoms can have contacts by default."""
     table: dict[str, bool] = {}
 
@@ -152,7 +157,7 @@ def _touching_by_class(root: Element) -> dict[str, bool]:
     return table
 
 
-def _prune(body: Element, inherited: str, touching: dict[str, bool]) -> None:
+def _remove_visual_elements(body: Element, inherited: str, touching: dict[str, bool]) -> None:
     """Remove geoms without contact, cameras and lights from a body and its children, in place."""
     childclass = body.get("childclass", inherited)
     for element in list(body):
@@ -165,7 +170,7 @@ def _prune(body: Element, inherited: str, touching: dict[str, bool]) -> None:
         elif element.tag in ("camera", "light"):
             body.remove(element)
         elif element.tag in ("body", "frame"):
-            _prune(element, childclass, touching)
+            _remove_visual_elements(element, childclass, touching)
 
 
 with warnings.catch_warnings():  # glfw warns if there is no screen; none is needed here
@@ -180,11 +185,11 @@ _CONTACT_SOLREF = (0.02, 1.0)  # s, 1: firm soil; impact forces grow inversely w
 _SOIL_FRICTION = (0.3, 0.02, 0.001)  # steel sliding on loam: friction angle of some 17 deg
 
 
-def assemble(
+def assemble_mjcf(
     machine: Machine,
     timestep: float = 1.0e-3,
     ground: bool = True,
-    looks: bool = True,
+    visuals: bool = True,
     surroundings: tuple[SurroundingObject, ...] = (),
 ) -> mjcf.RootElement:
     """Build the MJCF of a machine, with scene, closures and actuators.
@@ -193,7 +198,7 @@ def assemble(
         machine: the machine, with one tool.
         timestep: physics step [s].
         ground: whether the ground can be touched.
-        looks: whether to include visual geometry.
+        visuals: whether to include visual geometry.
         surroundings: objects around the machine.
 
     Returns:
@@ -202,16 +207,16 @@ def assemble(
     Raises:
         InputError: the machine's MJCF cannot be read, or a link's parent body is missing in it.
     """
-    root = _read_mjcf(machine, looks)
+    root = _read_mjcf(machine, visuals)
     try:
-        return _completed(root, machine, timestep, ground, looks, surroundings)
+        return _add_machine_elements(root, machine, timestep, ground, visuals, surroundings)
     except InputError:
         raise
     except ValueError as error:  # dm_control: duplicate name or invalid value
         raise InputError(f"machine {machine.name}", f"cannot be assembled: {error}") from None
 
 
-def _completed(
+def _add_machine_elements(
     root, machine: Machine, timestep: float, ground: bool, looks: bool,
     surroundings: tuple[SurroundingObject, ...],
 ) -> mjcf.RootElement:  # fmt: skip
@@ -220,7 +225,7 @@ def _completed(
     for name in machine.removed_bodies:
         if body := root.find("body", name):
             body.remove()
-    _refuse_foreign_parts(root, machine)
+    _reject_foreign_elements(root, machine)
     _set_options(root, machine, timestep)
     for name, link in machine.links.items():
         _write_link(root, name, link)
@@ -233,26 +238,26 @@ def _completed(
     for name in flexible_axes(machine):
         write_drive_side(root, machine, name)
     for name, closure in machine.closures.items():
-        _connect(root, name, closure.a, closure.b, timestep)
+        _add_pin(root, name, closure.a, closure.b, timestep)
     if machine.arm:
         tip = machine.arm.tip
-        body = _body(root, tip.link)
+        body = _find_body(root, tip.link)
         add_element(body, "site", name=TIP_SITE, pos=tip.position, size=(0.03,), group=4)
     _write_actuators(root, machine)
     if machine.terms:
-        _write_terms(root, terms_of(machine))
+        _write_terms(root, machine_terms_table(machine))
     _write_scene(root, ground, looks)
     write_surroundings(root, machine, surroundings, looks)
     return root
 
 
-_NUMERIC = 500  # largest size of a `numeric` element; larger ones overflow MuJoCo's stack
+_MAX_NUMERIC_SIZE = 500  # largest size of a `numeric` element; larger ones overflow MuJoCo's stack
 
 
 def _write_terms(root, table: np.ndarray) -> None:
     """Add the table of terms as consecutive `numeric` elements; MuJoCo stores them contiguously."""
-    for part, first in enumerate(range(0, len(table), _NUMERIC), start=1):
-        data = table[first : first + _NUMERIC]
+    for part, first in enumerate(range(0, len(table), _MAX_NUMERIC_SIZE), start=1):
+        data = table[first : first + _MAX_NUMERIC_SIZE]
         name = "hydrotele_terms" + (f"_{part}" if part > 1 else "")
         add_element(root.custom, "numeric", name=name, size=len(data), data=data)
 
@@ -275,10 +280,10 @@ def _read_mjcf(machine: Machine, looks: bool) -> mjcf.RootElement:
     try:
         tree = read_xml(path)
         for body, file in machine.attached.items():
-            _attach(tree, body, Path(machine.folder, file))
+            _attach_bodies(tree, body, Path(machine.folder, file))
         name_geoms(tree)
         if not looks:
-            without_looks(tree)
+            remove_visual_geometry(tree)
         check_assets(tree, path)
         text = ElementTree.tostring(tree, encoding="unicode")
         return mjcf.from_xml_string(text, model_dir=str(path.parent))
@@ -288,18 +293,16 @@ def _read_mjcf(machine: Machine, looks: bool) -> mjcf.RootElement:
         raise InputError(path, f"is not an MJCF that dm_control can read: {error}") from None
 
 
-def _attach(tree: Element, body: str, file: Path) -> None:
+def _attach_bodies(tree: Element, body: str, file: Path) -> None:
     """Attach the bodies of another MJCF file, without assets, to a body of a tree, in place."""
     place = next((element for element in tree.iter("body") if element.get("name") == body), None)
     world = read_xml(file).find("worldbody")
     if place is None or world is None:
-        raise InputError(
-            file, f"cannot be attached to {body!r}: no such body, or no worldbody in the file"
-        )
+        raise InputError(file, f"cannot be attached to {body!r}: no such body, or no worldbody in the file")
     place.extend(world.findall("body"))
 
 
-def _refuse_foreign_parts(root, machine: Machine) -> None:
+def _reject_foreign_elements(root, machine: Machine) -> None:
     """Reject elements that belong in the machine file or that logs would not contain."""
     known = set(machine.joints)
     for name, axis in machine.axes.items():
@@ -335,11 +338,11 @@ def _set_options(root, machine: Machine, timestep: float) -> None:
     root.option.iterations = 20
     root.option.tolerance = 1.0e-8
     root.option.cone = "pyramidal"
-    root.size.nuser_actuator = SLOTS
+    root.size.nuser_actuator = SLOT_COUNT
     root.option.flag.island = "disable"  # one machine is one island; the search costs 10 %
 
 
-def _body(root, name: str):
+def _find_body(root, name: str):
     """Return a body of the document, or the worldbody for `world`."""
     return root.worldbody if name == "world" else root.find("body", name)
 
@@ -348,7 +351,7 @@ def _write_link(root, name: str, link: Link) -> None:
     """Write inertia, position and joint of a link; create its body if it is missing."""
     body = root.find("body", name)
     if body is None:
-        parent = _body(root, link.parent)
+        parent = _find_body(root, link.parent)
         if parent is None:
             raise InputError(f"links.{name}", f"its parent {link.parent!r} has no body in the MJCF")
         body = parent.add("body", name=name)
@@ -367,14 +370,14 @@ def _write_link(root, name: str, link: Link) -> None:
         joint.range = np.degrees(link.joint.range) if turn else link.joint.range
     if link.joint.bending:
         stiffness = 1.0 / link.joint.bending
-        for letter, across in zip("ab", _across(link.joint.axis), strict=True):
+        for letter, across in zip("ab", _perpendicular_axes(link.joint.axis), strict=True):
             body.add(
-                "joint", name=f"{OWN}{link.joint.name}_bend_{letter}", type="hinge", axis=across,
+                "joint", name=f"{NAME_PREFIX}{link.joint.name}_bend_{letter}", type="hinge", axis=across,
                 stiffness=stiffness, damping=_BEND_DAMPING * stiffness, limited="false",
             )  # fmt: skip
 
 
-def _across(axis: Vector) -> tuple[np.ndarray, np.ndarray]:
+def _perpendicular_axes(axis: Vector) -> tuple[np.ndarray, np.ndarray]:
     """Return two unit vectors that are perpendicular to an axis and to each other."""
     way = np.array(axis)
     first = np.cross(way, np.eye(3)[int(np.argmin(np.abs(way)))])
@@ -392,7 +395,7 @@ def _write_cylinder(root, name: str, cylinder: Cylinder, pins: Vector, timestep:
     """Write tube, rod and rod pin of a cylinder."""
     tube = root.find("body", f"{name}_tube")
     if tube is None:
-        base = _body(root, cylinder.base_pin.link)
+        base = _find_body(root, cylinder.base_pin.link)
         tube = base.add("body", name=f"{name}_tube")
         tube.add("joint", name=f"{name}_tube", type="hinge", axis=pins)
     tube.pos = cylinder.base_pin.position
@@ -404,7 +407,7 @@ def _write_cylinder(root, name: str, cylinder: Cylinder, pins: Vector, timestep:
     rod.pos = (cylinder.closed_length, 0.0, 0.0)
     _set_inertial(rod, cylinder.rod.mass, (-cylinder.rod.com, 0, 0), cylinder.rod.inertia)
     rod_end = Pin(link=f"{name}_rod", position=(0.0, 0.0, 0.0))
-    _connect(root, f"{name}_pin", rod_end, cylinder.rod_pin, timestep)
+    _add_pin(root, f"{name}_pin", rod_end, cylinder.rod_pin, timestep)
 
 
 def _write_ball_end(root, name: str) -> None:
@@ -429,12 +432,10 @@ def _write_travel(root, machine: Machine, name: str) -> None:
         root.find("joint", machine.axes[name].joint).limited = "false"
 
 
-def _connect(root, name: str, a: Pin, b: Pin, timestep: float) -> None:
+def _add_pin(root, name: str, a: Pin, b: Pin, timestep: float) -> None:
     """Add the two sites and the `connect` constraint of a pin."""
     for end, pin in (("a", a), ("b", b)):
-        _body(root, pin.link).add(
-            "site", name=pin_site(name, end), pos=pin.position, size=(0.03,), group=4
-        )
+        _find_body(root, pin.link).add("site", name=pin_site(name, end), pos=pin.position, size=(0.03,), group=4)
     root.equality.add(
         "connect", name=name, site1=pin_site(name, "a"), site2=pin_site(name, "b"),
         solref=(2.0 * timestep, 1.0), solimp=_IMPEDANCE,
@@ -449,16 +450,16 @@ def _write_actuators(root, machine: Machine) -> None:
             "general", name=name, user=numbers, biastype="user",
             joint=drive_joint(machine, name),
         )  # fmt: skip
-        if axis.hydraulic:
+        if axis.is_hydraulic:
             last = name == list(machine.hydraulic_axes)[-1]  # owns the additional states
-            remembered = int(numbers[Slot.MEMORY]) if last else 0
-            actuator.dyntype, actuator.actdim = "user", ACTIVATIONS + remembered
+            remembered = int(numbers[Slot.EXTRA_STATES]) if last else 0
+            actuator.dyntype, actuator.actdim = "user", ACTIVATIONS_PER_AXIS + remembered
             actuator.gainprm = (0.0,)
             actuator.ctrlrange = (-1.0, 1.0)
         elif axis.force:
             actuator.gainprm = (axis.force.gain,)
             actuator.ctrlrange = (-axis.force.command_limit, axis.force.command_limit)
-            if axis.force.friction.presliding:
+            if axis.force.friction.has_presliding:
                 actuator.dyntype, actuator.actdim, actuator.actearly = "user", 2, True
 
 
@@ -467,7 +468,7 @@ def _write_scene(root, ground: bool, looks: bool) -> None:
     touch = {"contype": 1, "conaffinity": 2} if ground else {"contype": 0, "conaffinity": 0}
     if ground or looks:
         root.worldbody.add(
-            "geom", name=GROUND, type="plane", size=(40, 40, 1), friction=_SOIL_FRICTION,
+            "geom", name=GROUND_NAME, type="plane", size=(40, 40, 1), friction=_SOIL_FRICTION,
             solref=_CONTACT_SOLREF, priority=1, **touch,
         )  # fmt: skip
     if not looks:
@@ -477,23 +478,26 @@ def _write_scene(root, ground: bool, looks: bool) -> None:
     getattr(root.visual, "global").offwidth = 1920
     getattr(root.visual, "global").offheight = 1200
     root.asset.add(
-        "texture", name=f"{OWN}sky", type="skybox", builtin="gradient", rgb1=(0.62, 0.75, 0.88),
+        "texture", name=f"{NAME_PREFIX}sky", type="skybox", builtin="gradient", rgb1=(0.62, 0.75, 0.88),
         rgb2=(0.92, 0.94, 0.96), width=256, height=256,
     )  # fmt: skip
     root.asset.add(
-        "texture", name=GROUND, type="2d", builtin="checker", rgb1=(0.52, 0.47, 0.40),
+        "texture", name=GROUND_NAME, type="2d", builtin="checker", rgb1=(0.52, 0.47, 0.40),
         rgb2=(0.56, 0.51, 0.44), width=256, height=256,
     )  # fmt: skip
-    root.asset.add("material", name=GROUND, texture=GROUND, texrepeat=(40, 40), reflectance=0)
-    root.find("geom", GROUND).material = GROUND
+    root.asset.add("material", name=GROUND_NAME, texture=GROUND_NAME, texrepeat=(40, 40), reflectance=0)
+    root.find("geom", GROUND_NAME).material = GROUND_NAME
     root.worldbody.add(
-        "light", name=f"{OWN}sun", pos=(4, 8, 14), dir=(-0.25, -0.5, -1), directional=True,
+        "light", name=f"{NAME_PREFIX}sun", pos=(4, 8, 14), dir=(-0.25, -0.5, -1), directional=True,
         castshadow=True, diffuse=(0.6, 0.6, 0.55),
     )  # fmt: skip
 
 
-_SPECK = (1.0e-6, (1.0e-9, 1.0e-9, 1.0e-9))  # kg, kg m^2: MuJoCo rejects moving bodies without mass
-_SLACK = 1.0e-9  # m or rad: smaller static deflections count as no load inside the backlash
+_MIN_INERTIAL = (
+    1.0e-6,
+    (1.0e-9, 1.0e-9, 1.0e-9),
+)  # kg, kg m^2: MuJoCo rejects moving bodies without mass
+_MIN_DEFLECTION = 1.0e-9  # m or rad: smaller static deflections count as no load inside the backlash
 
 
 def drive_joint(machine: Machine, axis: str) -> str:
@@ -533,7 +537,7 @@ def write_drive_side(root, machine: Machine, axis: str) -> None:
     body = beside.parent.add("body", name=name, pos=beside.pos)
     for turn in ("quat", "euler", "axisangle", "xyaxes", "zaxis"):
         setattr(body, turn, getattr(beside, turn))
-    mass, inertia = _SPECK
+    mass, inertia = _MIN_INERTIAL
     body.add("inertial", mass=mass, pos=(0, 0, 0), diaginertia=inertia)
     body.add(
         "joint", name=name, type=load.type or "hinge", axis=load.axis, armature=facts.inertia,
@@ -579,7 +583,7 @@ def preload_transmissions(
         facts = machine.axes[axis].transmission
         assert facts
         deflection = force[axis] / facts.stiffness
-        if abs(deflection) > _SLACK:
+        if abs(deflection) > _MIN_DEFLECTION:
             deflection += np.sign(deflection) * facts.backlash / 2.0
         drive = model.joint(drive_joint(machine, axis)).qposadr[0]
         load = model.joint(load_joint(machine, axis)).qposadr[0]

@@ -27,56 +27,60 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from hydrotele.core.compiled import allocation_free, callback, compiled
-from hydrotele.core.memory import floats, pointer
-from hydrotele.hydraulics.actuator import bristle_friction, bristle_rate, settled_bristle_friction
+from hydrotele.core.memory import address_to_pointer, float64_view
+from hydrotele.hydraulics.actuator import bristle_friction, bristle_rate, implicit_bristle_friction
 from hydrotele.hydraulics.circuit import (
     MAX_AXES,
-    NO_MEMORY,
-    SCRATCH,
-    SLOTS,
-    Kind,
+    NO_EXTRA_STATES,
+    SCRATCH_SIZE,
+    SLOT_COUNT,
+    ActuatorKind,
     Slot,
     actuator_friction,
-    add_to_commands,
-    advance_memories,
-    circuit_supply,
-    delivered_share,
+    add_command_terms,
+    advance_term_states,
+    circuit_supply_pressure,
+    compute_ports,
+    delivered_flow_fraction,
     drive_state,
-    open_ports,
-    pumped_force,
-    settled_friction,
+    implicit_friction,
+    pump_drive_force,
     step_circuit,
 )
-from hydrotele.hydraulics.parameters import CURVE, CURVE_KNOTS, MARKER
+from hydrotele.hydraulics.parameters import ACTUATOR_MARKER, CURVE_KNOTS, CURVE_SIZE
 from hydrotele.simulate.layout import field_offsets, mujoco_library, option_offset, verify_layout
 from hydrotele.terms.law import Drives
-from hydrotele.terms.table import COMMAND, COUNT, FORCE, acts_on, added_with_slope
-from hydrotele.terms.table import MARKER as TERMS
+from hydrotele.terms.table import COMMAND, COUNT_INDEX, FORCE, has_term, sum_terms_with_slope
+from hydrotele.terms.table import TERMS_MARKER as TERMS
 
 _FIRST, _COUNT, _KIND = int(Slot.FIRST), int(Slot.COUNT), int(Slot.KIND)
 _AREA_HEAD, _AREA_ROD = int(Slot.AREA_HEAD), int(Slot.AREA_ROD)
 _OFFSET, _INERTIA = int(Slot.OFFSET), int(Slot.DRIVE_INERTIA)
-_STIFFNESS, _BRISTLE = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE)
-_FELT, _MEMORY = int(Slot.BRISTLE_INERTIA), int(Slot.MEMORY)
-_LAG, _DELIVERY, _CURVES = int(Slot.PUMP_TIME_CONSTANT), int(Slot.DELIVERY), int(Slot.CURVES)
+_BRISTLE_STIFFNESS, _BRISTLE = int(Slot.BRISTLE_STIFFNESS), int(Slot.BRISTLE)
+_BRISTLE_INERTIA, _EXTRA_STATES = int(Slot.BRISTLE_INERTIA), int(Slot.EXTRA_STATES)
+_PUMP_TIME_CONSTANT, _DELIVERY, _CURVES = (
+    int(Slot.PUMP_TIME_CONSTANT),
+    int(Slot.DELIVERY),
+    int(Slot.CURVES),
+)
 _ADDED = int(Slot.ADDED_DELIVERY)
-_FORCE, _PUMPED = float(Kind.FORCE), float(Kind.PUMPED)
-_GAINS = int(mujoco.mjNGAIN)
+_FORCE, _PUMPED = float(ActuatorKind.FORCE), float(ActuatorKind.PUMP_DRIVE)
+_GAIN_COUNT = int(mujoco.mjNGAIN)
 _SIGNATURE = types.float64(types.int64, types.int64, types.intc)
 # Separate callbacks for drives with bristles or further states keep the others fast.
-_ADVANCE_REMEMBERING = types.ExternalFunction("hydrotele_advance_remembering", _SIGNATURE)
-_FORCE_REMEMBERING = types.ExternalFunction("hydrotele_force_remembering", _SIGNATURE)
+_ADVANCE_EXTENDED = types.ExternalFunction("hydrotele_advance_remembering", _SIGNATURE)
+_FORCE_EXTENDED = types.ExternalFunction("hydrotele_force_remembering", _SIGNATURE)
 
 
-_kept: list = []  # keeps the callbacks behind these symbols alive
+_kept_callbacks: list = []  # keeps the callbacks behind these symbols alive
 
 
 @intrinsic
-def _stack(typingctx, size):
+def _stack_space(typingctx, size):
     """Return work space on the stack of the calling function, which is private to the thread."""
 
     def codegen(context, builder, signature, args):
-        space = cgutils.alloca_once(builder, cgutils.voidptr_t, size=2 * SCRATCH)
+        space = cgutils.alloca_once(builder, cgutils.voidptr_t, size=2 * SCRATCH_SIZE)
         return builder.bitcast(space, cgutils.voidptr_t)
 
     return types.voidptr(types.int64), codegen
@@ -88,44 +92,44 @@ def _passive_force(m, d, i, m_nu, m_nv, m_njnt, m_trnid, m_dofadr, d_passive):
 
     `m` and `d` are the addresses of mjModel and mjData; all further arguments are field offsets.
     """
-    nu = carray(pointer(m + m_nu), (1,), np.int64)[0]
-    nv = carray(pointer(m + m_nv), (1,), np.int64)[0]
-    joints = carray(pointer(m + m_njnt), (1,), np.int64)[0]
-    at_trnid = carray(pointer(m + m_trnid), (1,), np.int64)[0]
-    joint = carray(pointer(at_trnid), (2 * nu,), np.int32)[2 * i]
-    at_dofadr = carray(pointer(m + m_dofadr), (1,), np.int64)[0]
-    dof = carray(pointer(at_dofadr), (joints,), np.int32)[joint]
-    at_passive = carray(pointer(d + d_passive), (1,), np.int64)[0]
-    return carray(pointer(at_passive), (nv,), np.float64)[dof]
+    nu = carray(address_to_pointer(m + m_nu), (1,), np.int64)[0]
+    nv = carray(address_to_pointer(m + m_nv), (1,), np.int64)[0]
+    joints = carray(address_to_pointer(m + m_njnt), (1,), np.int64)[0]
+    at_trnid = carray(address_to_pointer(m + m_trnid), (1,), np.int64)[0]
+    joint = carray(address_to_pointer(at_trnid), (2 * nu,), np.int32)[2 * i]
+    at_dofadr = carray(address_to_pointer(m + m_dofadr), (1,), np.int64)[0]
+    dof = carray(address_to_pointer(at_dofadr), (joints,), np.int32)[joint]
+    at_passive = carray(address_to_pointer(d + d_passive), (1,), np.int64)[0]
+    return carray(address_to_pointer(at_passive), (nv,), np.float64)[dof]
 
 
 @compiled
-def _gain(m, i, m_gainprm):
+def _read_gain(m, i, m_gainprm):
     """Return the force per command of a force drive; 0 for a valve."""
-    at_gain = carray(pointer(m + m_gainprm), (1,), np.int64)[0]
-    return floats(at_gain + 8 * _GAINS * i, 1)[0]
+    at_gain = carray(address_to_pointer(m + m_gainprm), (1,), np.int64)[0]
+    return float64_view(at_gain + 8 * _GAIN_COUNT * i, 1)[0]
 
 
 @compiled
-def _terms_of(m, m_nnumeric, m_adr, m_size, m_data):
+def _read_terms(m, m_nnumeric, m_adr, m_size, m_data):
     """Return the table of terms of a model (n,); empty without terms."""
-    count = carray(pointer(m + m_nnumeric), (1,), np.int64)[0]
+    count = carray(address_to_pointer(m + m_nnumeric), (1,), np.int64)[0]
     if count > 0:
-        data = carray(pointer(m + m_data), (1,), np.int64)[0]
-        at = carray(pointer(m + m_adr), (1,), np.int64)[0]
-        sizes = carray(pointer(m + m_size), (1,), np.int64)[0]
+        data = carray(address_to_pointer(m + m_data), (1,), np.int64)[0]
+        at = carray(address_to_pointer(m + m_adr), (1,), np.int64)[0]
+        sizes = carray(address_to_pointer(m + m_size), (1,), np.int64)[0]
         for k in range(count):
-            place = data + 8 * np.int64(carray(pointer(at), (count,), np.int32)[k])
-            own = carray(pointer(sizes), (count,), np.int32)
-            if own[k] > COUNT and floats(place, 1)[0] == TERMS:
+            place = data + 8 * np.int64(carray(address_to_pointer(at), (count,), np.int32)[k])
+            own = carray(address_to_pointer(sizes), (count,), np.int32)
+            if own[k] > COUNT_INDEX and float64_view(place, 1)[0] == TERMS:
                 size = np.int64(0)
                 for part in range(k, count):  # a long table continues in the next elements
                     size += own[part]
-                return floats(place, size)
-    return floats(m, 0)
+                return float64_view(place, size)
+    return float64_view(m, 0)
 
 
-class _Fields(NamedTuple):
+class _DataOffsets(NamedTuple):
     """Offsets of fields of mjData [bytes]."""
 
     time: int
@@ -137,23 +141,23 @@ class _Fields(NamedTuple):
 
 
 @compiled
-def _state(d, at, i, user, gain, dt, nu, scratch):
+def _read_drive_state(d, at, i, user, gain, dt, nu, scratch):
     """Return the DriveState of drive i with end-of-step pressures, and the Drives."""
-    count, act = int(user[_COUNT]), floats(d, 0)
-    lengths = floats(carray(pointer(d + at.length), (1,), np.int64)[0], nu)
-    velocities = floats(carray(pointer(d + at.velocity), (1,), np.int64)[0], nu)
-    commands = floats(carray(pointer(d + at.ctrl), (1,), np.int64)[0], nu)
-    x, velocity, command = lengths[i], velocities[i], _given(commands, i)
-    time, supply = floats(d + at.time, 1)[0], 0.0
+    count, act = int(user[_COUNT]), float64_view(d, 0)
+    lengths = float64_view(carray(address_to_pointer(d + at.length), (1,), np.int64)[0], nu)
+    velocities = float64_view(carray(address_to_pointer(d + at.velocity), (1,), np.int64)[0], nu)
+    commands = float64_view(carray(address_to_pointer(d + at.ctrl), (1,), np.int64)[0], nu)
+    x, velocity, command = lengths[i], velocities[i], _command_or_zero(commands, i)
+    time, supply = float64_view(d + at.time, 1)[0], 0.0
     if count > 0:
-        size = 4 * count + int(user[_MEMORY])
-        start = floats(carray(pointer(d + at.act), (1,), np.int64)[0], size)
-        rate = floats(carray(pointer(d + at.act_dot), (1,), np.int64)[0], size)
-        act = scratch[SCRATCH:]
+        size = 4 * count + int(user[_EXTRA_STATES])
+        start = float64_view(carray(address_to_pointer(d + at.act), (1,), np.int64)[0], size)
+        rate = float64_view(carray(address_to_pointer(d + at.act_dot), (1,), np.int64)[0], size)
+        act = scratch[SCRATCH_SIZE:]
         for k in range(size):
             act[k] = start[k] + dt * rate[k]
-        open_ports(user, act, act, scratch, 0, count, 0.0, act)
-        supply = circuit_supply(user, 0, count, scratch, delivered_share(user, 0, act))
+        compute_ports(user, act, act, scratch, 0, count, 0.0, act)
+        supply = circuit_supply_pressure(user, 0, count, scratch, delivered_flow_fraction(user, 0, act))
     s = drive_state(user, i, count, act, supply, time, x, velocity, command, gain)
     return s, Drives(count, act, lengths, velocities, commands)
 
@@ -161,28 +165,28 @@ def _state(d, at, i, user, gain, dt, nu, scratch):
 @allocation_free
 def _advance_force_drive(user, u, act, rate, velocity, command, low, high, dt):
     """Write the rates of the two activations of a force drive: bristle state and command."""
-    rate[0] = bristle_rate(user, u, act[0], velocity, user[u + _FELT], dt)
+    rate[0] = bristle_rate(user, u, act[0], velocity, user[u + _BRISTLE_INERTIA], dt)
     rate[1] = (min(high, max(low, command)) - act[1]) / dt
 
 
 @allocation_free
-def _advance_with_memory(user, first, drives, dt, act_dot, scratch, terms, time, arrived):
+def _advance_extra_states(user, first, drives, dt, act_dot, scratch, terms, time, arrived):
     """Run `step_circuit` and write the rates of bristles and of the internal states of terms."""
     count, act, length, velocity, _ = drives
     memory = len(act) - 4 * count
     _, supply = step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, memory)
     for i in range(first, first + count):
-        u = i * SLOTS
-        if user[u + _STIFFNESS] > 0.0:
+        u = i * SLOT_COUNT
+        if user[u + _BRISTLE_STIFFNESS] > 0.0:
             at = int(user[u + _BRISTLE])
-            act_dot[at] = bristle_rate(user, u, act[at], velocity[i], user[u + _FELT], dt)
+            act_dot[at] = bristle_rate(user, u, act[at], velocity[i], user[u + _BRISTLE_INERTIA], dt)
     if len(terms) > 0 and first == 0:
         begun = Drives(count, act, length, velocity, arrived)
-        advance_memories(user, terms, begun, act_dot, dt, time, supply)
+        advance_term_states(user, terms, begun, act_dot, dt, time, supply)
 
 
 @allocation_free
-def _sound(user, first, count, nu, free):
+def _has_valid_indices(user, first, count, nu, free):
     """Return whether the indices in the parameters of a group of axes are within bounds.
 
     User code can change these parameters in a model. `free` is the number of activations from the
@@ -190,26 +194,26 @@ def _sound(user, first, count, nu, free):
     """
     if not (0 <= first and 1 <= count <= MAX_AXES and first + count <= nu):
         return False
-    group = first * SLOTS
-    size = 4.0 * count + user[group + _MEMORY]
+    group = first * SLOT_COUNT
+    size = 4.0 * count + user[group + _EXTRA_STATES]
     if not (4.0 * count <= size <= free):
         return False
-    if user[group + _LAG] != 0.0 and not (4.0 * count <= user[group + _DELIVERY] < size):
+    if user[group + _PUMP_TIME_CONSTANT] != 0.0 and not (4.0 * count <= user[group + _DELIVERY] < size):
         return False
     if user[group + _ADDED] != 0.0 and not (4.0 * count <= user[group + _ADDED] < size):
         return False
-    for u in range(group, (first + count) * SLOTS, SLOTS):
-        if user[u + _STIFFNESS] != 0.0 and not (4.0 * count <= user[u + _BRISTLE] < size):
+    for u in range(group, (first + count) * SLOT_COUNT, SLOT_COUNT):
+        if user[u + _BRISTLE_STIFFNESS] != 0.0 and not (4.0 * count <= user[u + _BRISTLE] < size):
             return False
         if not (0.0 <= user[u + _CURVES] <= CURVE_KNOTS):
             return False
-        if not (0.0 <= user[u + _CURVES + CURVE] <= CURVE_KNOTS):
+        if not (0.0 <= user[u + _CURVES + CURVE_SIZE] <= CURVE_KNOTS):
             return False
     return True
 
 
 @allocation_free
-def _given(command, k):
+def _command_or_zero(command, k):
     """Return the command of actuator k, or 0 if any command is NaN, as MuJoCo does."""
     for value in command:
         if value != value:
@@ -221,19 +225,17 @@ def _given(command, k):
 def _compile_callbacks():
     """Compile the activation and force callbacks for this MuJoCo, or load them from the cache."""
     verify_layout()
-    remembering = _callbacks(True)
-    for symbol, function in zip(
-        (_ADVANCE_REMEMBERING.symbol, _FORCE_REMEMBERING.symbol), remembering, strict=True
-    ):
+    remembering = _make_callbacks(True)
+    for symbol, function in zip((_ADVANCE_EXTENDED.symbol, _FORCE_EXTENDED.symbol), remembering, strict=True):
         binding.add_symbol(symbol, function.address)
-        _kept.append(function)
-    return _callbacks(False)
+        _kept_callbacks.append(function)
+    return _make_callbacks(False)
 
 
-def _callbacks(remembers):
+def _make_callbacks(has_extra_states):
     """Create the activation and force callbacks.
 
-    With `remembers`, they handle bristles and further states; otherwise they pass such drives on.
+    With `has_extra_states`, they handle bristles and further states; otherwise they pass such drives on.
     """
     model_at, data_at = field_offsets("mjModel"), field_offsets("mjData")
     m_user, m_actadr = model_at["actuator_user"], model_at["actuator_actadr"]
@@ -255,165 +257,165 @@ def _callbacks(remembers):
     @callback(_SIGNATURE)
     def advance(m, d, i):
         """Write the rates of all activations of the hydraulic axes (callback `mjcb_act_dyn`)."""
-        if carray(pointer(m + m_nuser), (1,), np.int64)[0] != SLOTS:
+        if carray(address_to_pointer(m + m_nuser), (1,), np.int64)[0] != SLOT_COUNT:
             return 0.0
         i = np.int64(i)
-        nu = carray(pointer(m + m_nu), (1,), np.int64)[0]
-        at_user = carray(pointer(m + m_user), (1,), np.int64)[0]
-        user = carray(pointer(at_user), (nu * SLOTS,), np.float64)
-        if user[i * SLOTS] != MARKER:
+        nu = carray(address_to_pointer(m + m_nu), (1,), np.int64)[0]
+        at_user = carray(address_to_pointer(m + m_user), (1,), np.int64)[0]
+        user = carray(address_to_pointer(at_user), (nu * SLOT_COUNT,), np.float64)
+        if user[i * SLOT_COUNT] != ACTUATOR_MARKER:
             return 0.0
-        first, count = int(user[i * SLOTS + _FIRST]), int(user[i * SLOTS + _COUNT])
+        first, count = int(user[i * SLOT_COUNT + _FIRST]), int(user[i * SLOT_COUNT + _COUNT])
         if i != first + count - 1:
-            if user[i * SLOTS + _KIND] != _FORCE or user[i * SLOTS + _STIFFNESS] == 0.0:
+            if user[i * SLOT_COUNT + _KIND] != _FORCE or user[i * SLOT_COUNT + _BRISTLE_STIFFNESS] == 0.0:
                 return 0.0
-            if not remembers:
-                return _ADVANCE_REMEMBERING(m, d, i)
+            if not has_extra_states:
+                return _ADVANCE_EXTENDED(m, d, i)
             else:
-                at_actadr = carray(pointer(m + m_actadr), (1,), np.int64)[0]
-                start = 8 * np.int64(carray(pointer(at_actadr), (nu,), np.int32)[i])
-                if start < 0 or start + 16 > 8 * carray(pointer(m + m_na), (1,), np.int64)[0]:
+                at_actadr = carray(address_to_pointer(m + m_actadr), (1,), np.int64)[0]
+                start = 8 * np.int64(carray(address_to_pointer(at_actadr), (nu,), np.int32)[i])
+                if start < 0 or start + 16 > 8 * carray(address_to_pointer(m + m_na), (1,), np.int64)[0]:
                     return 0.0
-                at_range = carray(pointer(m + m_range), (1,), np.int64)[0]
-                ends = floats(at_range + 16 * i, 2)
+                at_range = carray(address_to_pointer(m + m_range), (1,), np.int64)[0]
+                ends = float64_view(at_range + 16 * i, 2)
                 _advance_force_drive(
-                    user, i * SLOTS,
-                    floats(carray(pointer(d + d_act), (1,), np.int64)[0] + start, 2),
-                    floats(carray(pointer(d + d_act_dot), (1,), np.int64)[0] + start, 2),
-                    floats(carray(pointer(d + d_velocity), (1,), np.int64)[0], nu)[i],
-                    _given(floats(carray(pointer(d + d_ctrl), (1,), np.int64)[0], nu), i),
-                    ends[0], ends[1], floats(m + m_timestep, 1)[0],
+                    user, i * SLOT_COUNT,
+                    float64_view(carray(address_to_pointer(d + d_act), (1,), np.int64)[0] + start, 2),
+                    float64_view(carray(address_to_pointer(d + d_act_dot), (1,), np.int64)[0] + start, 2),
+                    float64_view(carray(address_to_pointer(d + d_velocity), (1,), np.int64)[0], nu)[i],
+                    _command_or_zero(float64_view(carray(address_to_pointer(d + d_ctrl), (1,), np.int64)[0], nu), i),
+                    ends[0], ends[1], float64_view(m + m_timestep, 1)[0],
                 )  # fmt: skip
             return 0.0
-        if not remembers:
-            if 0 <= first < nu and user[first * SLOTS + _MEMORY] > 0.0:
-                return _ADVANCE_REMEMBERING(m, d, i)
-        at_actadr = carray(pointer(m + m_actadr), (1,), np.int64)[0]
-        address = np.int64(carray(pointer(at_actadr), (nu,), np.int32)[max(0, min(first, nu - 1))])
-        na = carray(pointer(m + m_na), (1,), np.int64)[0]
-        if address < 0 or not _sound(user, first, count, nu, na - address):
+        if not has_extra_states:
+            if 0 <= first < nu and user[first * SLOT_COUNT + _EXTRA_STATES] > 0.0:
+                return _ADVANCE_EXTENDED(m, d, i)
+        at_actadr = carray(address_to_pointer(m + m_actadr), (1,), np.int64)[0]
+        address = np.int64(carray(address_to_pointer(at_actadr), (nu,), np.int32)[max(0, min(first, nu - 1))])
+        na = carray(address_to_pointer(m + m_na), (1,), np.int64)[0]
+        if address < 0 or not _has_valid_indices(user, first, count, nu, na - address):
             return 0.0
         start = 8 * address
-        at_act = carray(pointer(d + d_act), (1,), np.int64)[0]
-        at_act_dot = carray(pointer(d + d_act_dot), (1,), np.int64)[0]
-        at_ctrl = carray(pointer(d + d_ctrl), (1,), np.int64)[0]
-        at_length = carray(pointer(d + d_length), (1,), np.int64)[0]
-        at_velocity = carray(pointer(d + d_velocity), (1,), np.int64)[0]
+        at_act = carray(address_to_pointer(d + d_act), (1,), np.int64)[0]
+        at_act_dot = carray(address_to_pointer(d + d_act_dot), (1,), np.int64)[0]
+        at_ctrl = carray(address_to_pointer(d + d_ctrl), (1,), np.int64)[0]
+        at_length = carray(address_to_pointer(d + d_length), (1,), np.int64)[0]
+        at_velocity = carray(address_to_pointer(d + d_velocity), (1,), np.int64)[0]
         size = 4 * count
-        if remembers:
-            size += int(user[first * SLOTS + _MEMORY])
-        act = carray(pointer(at_act + start), (size,), np.float64)
-        act_dot = carray(pointer(at_act_dot + start), (size,), np.float64)
-        command = carray(pointer(at_ctrl), (nu,), np.float64)
-        length = carray(pointer(at_length), (nu,), np.float64)
-        velocity = carray(pointer(at_velocity), (nu,), np.float64)
-        dt = carray(pointer(m + m_timestep), (1,), np.float64)[0]
-        time = carray(pointer(d + d_time), (1,), np.float64)[0]
-        scratch = carray(_stack(0), (2 * SCRATCH,), np.float64)
-        given = scratch[SCRATCH:]
+        if has_extra_states:
+            size += int(user[first * SLOT_COUNT + _EXTRA_STATES])
+        act = carray(address_to_pointer(at_act + start), (size,), np.float64)
+        act_dot = carray(address_to_pointer(at_act_dot + start), (size,), np.float64)
+        command = carray(address_to_pointer(at_ctrl), (nu,), np.float64)
+        length = carray(address_to_pointer(at_length), (nu,), np.float64)
+        velocity = carray(address_to_pointer(at_velocity), (nu,), np.float64)
+        dt = carray(address_to_pointer(m + m_timestep), (1,), np.float64)[0]
+        time = carray(address_to_pointer(d + d_time), (1,), np.float64)[0]
+        scratch = carray(_stack_space(0), (2 * SCRATCH_SIZE,), np.float64)
+        given = scratch[SCRATCH_SIZE:]
         for k in range(nu):
             if command[k] != command[k]:  # MuJoCo then sets all commands to 0 and warns
                 for j in range(first, first + count):
                     given[j] = 0.0
                 command = given
                 break
-        terms, arrived = floats(m, 0), command
-        if carray(pointer(m + m_nnumeric), (1,), np.int64)[0] > 0:
-            terms = _terms_of(m, m_nnumeric, m_at, m_size, m_data)
+        terms, arrived = float64_view(m, 0), command
+        if carray(address_to_pointer(m + m_nnumeric), (1,), np.int64)[0] > 0:
+            terms = _read_terms(m, m_nnumeric, m_at, m_size, m_data)
         if len(terms) > 0 and first == 0:
             drives = Drives(count, act, length, velocity, command)
-            add_to_commands(user, terms, drives, dt, time, scratch, given)
+            add_command_terms(user, terms, drives, dt, time, scratch, given)
             command = given
         drives = Drives(count, act, length, velocity, command)
-        if not remembers:
+        if not has_extra_states:
             step_circuit(
                 user, first, drives, dt, act_dot, scratch, terms, time,
-                np.int64(NO_MEMORY),  # numba would compile again for a literal
+                np.int64(NO_EXTRA_STATES),  # numba would compile again for a literal
             )  # fmt: skip
         else:
-            _advance_with_memory(user, first, drives, dt, act_dot, scratch, terms, time, arrived)
+            _advance_extra_states(user, first, drives, dt, act_dot, scratch, terms, time, arrived)
         return 0.0
 
     @callback(_SIGNATURE)
     def force(m, d, i):
         """Return the bias force of actuator i after friction (callback `mjcb_act_bias`)."""
-        if carray(pointer(m + m_nuser), (1,), np.int64)[0] != SLOTS:
+        if carray(address_to_pointer(m + m_nuser), (1,), np.int64)[0] != SLOT_COUNT:
             return 0.0
         i = np.int64(i)
-        nu = carray(pointer(m + m_nu), (1,), np.int64)[0]
-        at_user = carray(pointer(m + m_user), (1,), np.int64)[0]
-        user = carray(pointer(at_user), (nu * SLOTS,), np.float64)
-        u = i * SLOTS
-        if user[u] != MARKER:
+        nu = carray(address_to_pointer(m + m_nu), (1,), np.int64)[0]
+        at_user = carray(address_to_pointer(m + m_user), (1,), np.int64)[0]
+        user = carray(address_to_pointer(at_user), (nu * SLOT_COUNT,), np.float64)
+        u = i * SLOT_COUNT
+        if user[u] != ACTUATOR_MARKER:
             return 0.0
-        if not remembers:
-            if user[u + _STIFFNESS] > 0.0:
-                return _FORCE_REMEMBERING(m, d, i)
-        at_velocity = carray(pointer(d + d_velocity), (1,), np.int64)[0]
-        velocity = carray(pointer(at_velocity), (nu,), np.float64)[i]
-        dt = carray(pointer(m + m_timestep), (1,), np.float64)[0]
+        if not has_extra_states:
+            if user[u + _BRISTLE_STIFFNESS] > 0.0:
+                return _FORCE_EXTENDED(m, d, i)
+        at_velocity = carray(address_to_pointer(d + d_velocity), (1,), np.int64)[0]
+        velocity = carray(address_to_pointer(at_velocity), (nu,), np.float64)[i]
+        dt = carray(address_to_pointer(m + m_timestep), (1,), np.float64)[0]
         drive, p_load, p_head, p_rod = 0.0, 0.0, 0.0, 0.0
         if user[u + _KIND] == _FORCE:  # MuJoCo's gain gives the drive force
             drive = -user[u + _OFFSET]
         else:
-            at_actadr = carray(pointer(m + m_actadr), (1,), np.int64)[0]
-            start = 8 * np.int64(carray(pointer(at_actadr), (nu,), np.int32)[i])
-            if start < 0 or start + 32 > 8 * carray(pointer(m + m_na), (1,), np.int64)[0]:
+            at_actadr = carray(address_to_pointer(m + m_actadr), (1,), np.int64)[0]
+            start = 8 * np.int64(carray(address_to_pointer(at_actadr), (nu,), np.int32)[i])
+            if start < 0 or start + 32 > 8 * carray(address_to_pointer(m + m_na), (1,), np.int64)[0]:
                 return 0.0
-            at_act = carray(pointer(d + d_act), (1,), np.int64)[0]
-            at_act_dot = carray(pointer(d + d_act_dot), (1,), np.int64)[0]
-            act = carray(pointer(at_act + start), (4,), np.float64)
-            rate = carray(pointer(at_act_dot + start), (4,), np.float64)
+            at_act = carray(address_to_pointer(d + d_act), (1,), np.int64)[0]
+            at_act_dot = carray(address_to_pointer(d + d_act_dot), (1,), np.int64)[0]
+            act = carray(address_to_pointer(at_act + start), (4,), np.float64)
+            rate = carray(address_to_pointer(at_act_dot + start), (4,), np.float64)
             p_load = act[1] + dt * rate[1]
             p_head, p_rod = act[2] + dt * rate[2], act[3] + dt * rate[3]
             drive = user[u + _AREA_HEAD] * p_head - user[u + _AREA_ROD] * p_rod
-        terms, more, steep = floats(m, 0), 0.0, 0.0
-        if carray(pointer(m + m_nnumeric), (1,), np.int64)[0] > 0:
-            terms = _terms_of(m, m_nnumeric, m_at, m_size, m_data)
-        gain = _gain(m, i, m_gainprm) if user[u + _KIND] == _FORCE else 0.0
+        terms, more, steep = float64_view(m, 0), 0.0, 0.0
+        if carray(address_to_pointer(m + m_nnumeric), (1,), np.int64)[0] > 0:
+            terms = _read_terms(m, m_nnumeric, m_at, m_size, m_data)
+        gain = _read_gain(m, i, m_gainprm) if user[u + _KIND] == _FORCE else 0.0
         if len(terms) > 0 and user[_COUNT] != 0.0:
             held = int(user[_COUNT])
-            if not _sound(user, 0, held, nu, carray(pointer(m + m_na), (1,), np.int64)[0]):
-                terms = floats(m, 0)
-        commanded = gain != 0.0 and acts_on(terms, COMMAND, i)
-        if commanded or acts_on(terms, FORCE, i):
-            at = _Fields(d_time, d_ctrl, d_act, d_act_dot, d_length, d_velocity)
-            scratch = carray(_stack(0), (2 * SCRATCH,), np.float64)
-            s, drives = _state(d, at, i, user, gain, dt, nu, scratch)
-            more, steep = added_with_slope(terms, FORCE, i, s, drives)
+            if not _has_valid_indices(user, 0, held, nu, carray(address_to_pointer(m + m_na), (1,), np.int64)[0]):
+                terms = float64_view(m, 0)
+        commanded = gain != 0.0 and has_term(terms, COMMAND, i)
+        if commanded or has_term(terms, FORCE, i):
+            at = _DataOffsets(d_time, d_ctrl, d_act, d_act_dot, d_length, d_velocity)
+            scratch = carray(_stack_space(0), (2 * SCRATCH_SIZE,), np.float64)
+            s, drives = _read_drive_state(d, at, i, user, gain, dt, nu, scratch)
+            more, steep = sum_terms_with_slope(terms, FORCE, i, s, drives)
             if commanded:
-                extra, slope = added_with_slope(terms, COMMAND, i, s, drives)
+                extra, slope = sum_terms_with_slope(terms, COMMAND, i, s, drives)
                 more += gain * extra
                 steep += gain * slope
         if user[u + _KIND] == _PUMPED:  # static friction also resists the terms
-            return more + pumped_force(user, u, p_load, p_head, p_rod, velocity, more, dt)
+            return more + pump_drive_force(user, u, p_load, p_head, p_rod, velocity, more, dt)
         drive += more
-        if not remembers:
+        if not has_extra_states:
             if user[u + _INERTIA] == 0.0:
                 return drive - actuator_friction(user, u, velocity)
         else:
             force_drive = user[u + _KIND] == _FORCE
-            at_actadr = carray(pointer(m + m_actadr), (1,), np.int64)[0]
+            at_actadr = carray(address_to_pointer(m + m_actadr), (1,), np.int64)[0]
             owner = i if force_drive else max(0, min(nu - 1, np.int64(user[u + _FIRST])))
-            place = np.int64(carray(pointer(at_actadr), (nu,), np.int32)[owner])
+            place = np.int64(carray(address_to_pointer(at_actadr), (nu,), np.int32)[owner])
             place += 0 if force_drive else np.int64(user[u + _BRISTLE])
-            if not 0 <= place < carray(pointer(m + m_na), (1,), np.int64)[0]:
+            if not 0 <= place < carray(address_to_pointer(m + m_na), (1,), np.int64)[0]:
                 return 0.0
-            share = floats(carray(pointer(d + d_act), (1,), np.int64)[0] + 8 * place, 1)[0]
-            rising = floats(carray(pointer(d + d_act_dot), (1,), np.int64)[0] + 8 * place, 1)[0]
+            share = float64_view(carray(address_to_pointer(d + d_act), (1,), np.int64)[0] + 8 * place, 1)[0]
+            rising = float64_view(carray(address_to_pointer(d + d_act_dot), (1,), np.int64)[0] + 8 * place, 1)[0]
             share += dt * rising
             if user[u + _INERTIA] == 0.0:
-                return drive - bristle_friction(user, u, share, velocity, user[u + _FELT], dt)[0]
+                return drive - bristle_friction(user, u, share, velocity, user[u + _BRISTLE_INERTIA], dt)[0]
         push = drive + _passive_force(m, d, i, m_nu, m_nv, m_njnt, m_trnid, m_dofadr, d_passive)
         if gain != 0.0:
-            at_ctrl = carray(pointer(d + d_ctrl), (1,), np.int64)[0]
-            push += gain * _given(carray(pointer(at_ctrl), (nu,), np.float64), i)
+            at_ctrl = carray(address_to_pointer(d + d_ctrl), (1,), np.int64)[0]
+            push += gain * _command_or_zero(carray(address_to_pointer(at_ctrl), (nu,), np.float64), i)
         damping = max(0.0, -steep)  # of the terms; implicit, because the drive side is light
         inertia = user[u + _INERTIA] + dt * damping
-        if not remembers:
-            rubbing = settled_friction(user, u, velocity, push, inertia, dt)
+        if not has_extra_states:
+            rubbing = implicit_friction(user, u, velocity, push, inertia, dt)
         else:
-            rubbing = settled_bristle_friction(user, u, share, velocity, push, inertia, dt)
+            rubbing = implicit_bristle_friction(user, u, share, velocity, push, inertia, dt)
         return drive - damping * (dt / inertia) * (push - rubbing) - rubbing
 
     return advance, force

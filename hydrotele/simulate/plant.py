@@ -21,12 +21,12 @@ import numpy as np
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
 from hydrotele.hydraulics.circuit import (
-    ACTIVATIONS,
-    SCRATCH,
-    circuit_supply,
-    delivered_share,
+    ACTIVATIONS_PER_AXIS,
+    SCRATCH_SIZE,
+    circuit_supply_pressure,
+    compute_ports,
+    delivered_flow_fraction,
     drive_state,
-    open_ports,
 )
 from hydrotele.hydraulics.laws import ATMOSPHERE, pressure_with_air
 from hydrotele.hydraulics.parameters import (
@@ -34,7 +34,7 @@ from hydrotele.hydraulics.parameters import (
     actuator_order,
     actuator_parameters,
     extra_state_names,
-    terms_of,
+    machine_terms_table,
 )
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import SurroundingObject
@@ -43,7 +43,7 @@ from hydrotele.simulate.mechanism import (
     TIP_SITE,
     Mjcf,
     add_element,
-    assemble,
+    assemble_mjcf,
     drive_joint,
     flexible_axes,
     load_joint,
@@ -52,10 +52,10 @@ from hydrotele.simulate.mechanism import (
 )
 from hydrotele.simulate.native import install_hydraulics
 from hydrotele.terms.law import Drives
-from hydrotele.terms.table import COMMAND, FLOW_HEAD, FLOW_ROD, FORCE, added
+from hydrotele.terms.table import COMMAND, FLOW_HEAD, FLOW_ROD, FORCE, sum_terms
 
 
-def set_bristles(machine: Machine, model: mujoco.MjModel) -> None:
+def set_bristle_inertias(machine: Machine, model: mujoco.MjModel) -> None:
     """Write the effective inertia of each drive with presliding friction into a model.
 
     Args:
@@ -70,7 +70,7 @@ def set_bristles(machine: Machine, model: mujoco.MjModel) -> None:
     """
     order = actuator_order(machine)
     axes = [machine.axes[name] for name in order]
-    if not any(axis.drive.friction.presliding for axis in axes):
+    if not any(axis.drive.friction.has_presliding for axis in axes):
         return
     data, mass = mujoco.MjData(model), np.zeros((model.nv, model.nv))
     close_loops(machine, model, data, {})
@@ -79,22 +79,26 @@ def set_bristles(machine: Machine, model: mujoco.MjModel) -> None:
     basis = motion_basis(machine, model, data)
     yielding = np.linalg.inv(basis.T @ mass @ basis)
     for i, (name, axis) in enumerate(zip(order, axes, strict=True)):
-        if axis.drive.friction.presliding:
+        if axis.drive.friction.has_presliding:
             lever = basis[model.joint(drive_joint(machine, name)).dofadr[0]]
             moved = 1.0 / float(lever @ yielding @ lever)
             own = axis.transmission.inertia if axis.transmission else moved
             model.actuator_user[i, Slot.BRISTLE_INERTIA] = own
 
 
-def write_bristles(root, machine: Machine, model: mujoco.MjModel) -> None:
-    """Copy the parameters written by `set_bristles` from a model to the machine's MJCF."""
+def write_bristle_inertias(root, machine: Machine, model: mujoco.MjModel) -> None:
+    """Copy the parameters written by `set_bristle_inertias` from a model to the machine's MJCF."""
     for i, name in enumerate(actuator_order(machine)):
-        if machine.axes[name].drive.friction.presliding:
+        if machine.axes[name].drive.friction.has_presliding:
             root.find("actuator", name).user = model.actuator_user[i]
 
 
 _IMPEDANCE = 1.0e-4, 0.9999  # range to which MuJoCo clips the impedance d
-_TRANSITION = (0.001, 0.5, 2.0)  # width, midpoint, power of the impedance; unused: d is constant
+_IMPEDANCE_TRANSITION = (
+    0.001,
+    0.5,
+    2.0,
+)  # width, midpoint, power of the impedance; unused: d is constant
 
 
 def stop_joints(machine: Machine) -> dict[str, str]:
@@ -102,7 +106,7 @@ def stop_joints(machine: Machine) -> dict[str, str]:
     return {name: load_joint(machine, name) for name in machine.axes if machine.end_stop(name)}
 
 
-def set_stops(machine: Machine, model: mujoco.MjModel) -> None:
+def set_end_stops(machine: Machine, model: mujoco.MjModel) -> None:
     """Set the joint limits of a model to the stiffness and damping of the machine's end stops.
 
     MuJoCo computes `R = (1 - d) / d A_0` from the impedance d and the inverse inertia A_0 at the
@@ -122,11 +126,11 @@ def set_stops(machine: Machine, model: mujoco.MjModel) -> None:
         weight = model.dof_invweight0[model.jnt_dofadr[joint]]
         d = float(np.clip(weight / (weight + 1.0 / (h * both)), *_IMPEDANCE))
         model.jnt_solref[joint] = -stop.stiffness / (h * both) * d, -d / h
-        model.jnt_solimp[joint] = d, d, *_TRANSITION
+        model.jnt_solimp[joint] = d, d, *_IMPEDANCE_TRANSITION
 
 
-def write_stops(root, machine: Machine, model: mujoco.MjModel) -> None:
-    """Copy the parameters written by `set_stops` from a model to the machine's MJCF."""
+def write_end_stops(root, machine: Machine, model: mujoco.MjModel) -> None:
+    """Copy the parameters written by `set_end_stops` from a model to the machine's MJCF."""
     for name in stop_joints(machine).values():
         joint, numbers = root.find("joint", name), model.joint(name).id
         joint.solreflimit = model.jnt_solref[numbers]
@@ -154,7 +158,7 @@ class Plant:
         drive_dof: (nu,) the same in `qvel`.
         rod_qpos: (nu,) index of the piston displacement in `qpos`, -1 without cylinder.
         hydraulic: number of hydraulic axes, which come first; axis i has activations 4 i .. 4 i+3.
-        memory: name of each additional state (`parameters.extra_state_names`) -> its index in
+        extra_states: name of each additional state (`parameters.extra_state_names`) -> its index in
             `act`.
     """
 
@@ -169,7 +173,7 @@ class Plant:
     drive_dof: np.ndarray
     rod_qpos: np.ndarray
     hydraulic: int
-    memory: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    extra_states: Mapping[str, int] = dataclasses.field(default_factory=dict)
 
     def spools(self, data: mujoco.MjData) -> np.ndarray:
         """Return the spool positions (h,) of the h hydraulic axes, -1 to 1, in the order of `axes`.
@@ -188,8 +192,8 @@ class Plant:
 
     def _activations(self, data: mujoco.MjData) -> np.ndarray:
         """Return the activations of the hydraulic axes as (h, 4)."""
-        count = ACTIVATIONS * self.hydraulic
-        return np.array(data.act[:count]).reshape(self.hydraulic, ACTIVATIONS)
+        count = ACTIVATIONS_PER_AXIS * self.hydraulic
+        return np.array(data.act[:count]).reshape(self.hydraulic, ACTIVATIONS_PER_AXIS)
 
     def tip(self, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
         """Return the pose of the arm's tip.
@@ -217,11 +221,9 @@ class Plant:
     @functools.cached_property
     def document(self) -> Mjcf:
         """The complete MJCF with visual geometry and the `home` keyframe; built on first access."""
-        root = assemble(
-            self.machine, self.model.opt.timestep, self.ground, surroundings=self.surroundings
-        )
-        write_stops(root, self.machine, self.model)
-        write_bristles(root, self.machine, self.model)
+        root = assemble_mjcf(self.machine, self.model.opt.timestep, self.ground, surroundings=self.surroundings)
+        write_end_stops(root, self.machine, self.model)
+        write_bristle_inertias(root, self.machine, self.model)
         home = rest_state(self)
         pressures = {"act": home.act} if self.model.na else {}
         add_element(root.keyframe, "key", name="home", qpos=home.qpos, **pressures)
@@ -255,10 +257,10 @@ def build_plant(
         RuntimeError: the native hydraulics cannot run with this MuJoCo.
     """
     install_hydraulics()
-    root = assemble(machine, timestep, ground, looks=False, surroundings=surroundings)
+    root = assemble_mjcf(machine, timestep, ground, visuals=False, surroundings=surroundings)
     model = mjcf_document(root).compile()
-    set_stops(machine, model)
-    set_bristles(machine, model)
+    set_end_stops(machine, model)
+    set_bristle_inertias(machine, model)
     if not _can_touch(model):  # saves the contact search, a tenth of a step
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     axes = tuple(actuator_order(machine))
@@ -278,16 +280,16 @@ def build_plant(
         drive_dof=np.array([joint.dofadr[0] for joint in drives], dtype=int),
         rod_qpos=np.where(piston, places, -1),
         hydraulic=len(machine.hydraulic_axes),
-        memory=_memory(machine, model),
+        extra_states=_extra_state_indices(machine, model),
     )
 
 
-def _memory(machine: Machine, model: mujoco.MjModel) -> dict[str, int]:
+def _extra_state_indices(machine: Machine, model: mujoco.MjModel) -> dict[str, int]:
     """Map each name of `extra_state_names` to its activation index.
 
     Bristle states of force drives are activations of their actuators.
     """
-    places, first = {}, ACTIVATIONS * len(machine.hydraulic_axes)
+    places, first = {}, ACTIVATIONS_PER_AXIS * len(machine.hydraulic_axes)
     for k, name in enumerate(extra_state_names(machine)):
         axis = machine.axes.get(name.partition(".")[2]) if name.startswith("bristle.") else None
         force = axis is not None and axis.force is not None
@@ -321,10 +323,8 @@ def rest_state(plant: Plant, joints: Mapping[str, float] | None = None) -> mujoc
     data = mujoco.MjData(plant.model)
     close_loops(plant.machine, plant.model, data, dict(joints or {}))
     forces = holding_forces(plant.machine, plant.model, data)
-    preload_transmissions(
-        plant.machine, plant.model, data, dict(zip(plant.axes, forces, strict=True))
-    )
-    forces = forces - terms_at_rest(plant.machine, data, plant.drive_qpos, forces)
+    preload_transmissions(plant.machine, plant.model, data, dict(zip(plant.axes, forces, strict=True)))
+    forces = forces - term_forces_at_rest(plant.machine, data, plant.drive_qpos, forces)
     for i, name in enumerate(plant.axes[: plant.hydraulic]):
         axis = plant.machine.axes[name]
         head, rod = axis.hydraulic_drive.areas
@@ -332,7 +332,7 @@ def rest_state(plant: Plant, joints: Mapping[str, float] | None = None) -> mujoc
         p_head, p_rod = (forces[i] + rod * rest) / head, rest
         if p_head < rest:
             p_head, p_rod = rest, (head * rest - forces[i]) / rod
-        data.act[ACTIVATIONS * i + 2 : ACTIVATIONS * i + 4] = p_head, p_rod
+        data.act[ACTIVATIONS_PER_AXIS * i + 2 : ACTIVATIONS_PER_AXIS * i + 4] = p_head, p_rod
     for i in range(plant.hydraulic, len(plant.axes)):
         drive = plant.machine.axes[plant.axes[i]].force
         assert drive
@@ -377,14 +377,14 @@ def initial_state(plant: Plant, state: Mapping) -> mujoco.MjData:
             if i < plant.hydraulic:
                 if key.startswith("pressure") and value <= -ATMOSPHERE:  # of oil without free air
                     value = pressure_with_air(value, plant.model.actuator_user[i, Slot.AIR_RELEASE])
-                data.act[ACTIVATIONS * i + column] = value
-    for name, place in plant.memory.items():
+                data.act[ACTIVATIONS_PER_AXIS * i + column] = value
+    for name, place in plant.extra_states.items():
         kind, _, owner = name.partition(".")
         data.act[place] = state.get(kind, {}).get(owner, 0.0)
     return data
 
 
-def added_by_terms(
+def evaluate_terms(
     machine: Machine, time: np.ndarray, act: np.ndarray, x: np.ndarray, v: np.ndarray,
     command: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
@@ -406,9 +406,9 @@ def added_by_terms(
     if machine.terms:
         order = actuator_order(machine)
         drives = [machine.axes[name].force for name in order]
-        _evaluate(
+        _evaluate_term_rows(
             np.concatenate(list(actuator_parameters(machine).values())),
-            terms_of(machine), len(machine.hydraulic_axes),
+            machine_terms_table(machine), len(machine.hydraulic_axes),
             np.array([drive.gain if drive else 0.0 for drive in drives]),
             np.ascontiguousarray(time, float), np.ascontiguousarray(act, float),
             np.ascontiguousarray(x, float), np.ascontiguousarray(v, float),
@@ -418,29 +418,29 @@ def added_by_terms(
 
 
 @compiled
-def _evaluate(user, terms, count, gain, time, act, x, v, command, out):
-    """Compute `added_by_terms` for all rows and write the result to `out`."""
-    scratch = np.zeros(SCRATCH)
+def _evaluate_term_rows(user, terms, count, gain, time, act, x, v, command, out):
+    """Compute `evaluate_terms` for all rows and write the result to `out`."""
+    scratch = np.zeros(SCRATCH_SIZE)
     for row in range(len(time)):
         supply = 0.0
         if count > 0:
-            open_ports(user, act[row], act[row], scratch, 0, count, 0.0, act[row])
-            share = delivered_share(user, 0, act[row])
-            supply = circuit_supply(user, 0, count, scratch, share)
+            compute_ports(user, act[row], act[row], scratch, 0, count, 0.0, act[row])
+            share = delivered_flow_fraction(user, 0, act[row])
+            supply = circuit_supply_pressure(user, 0, count, scratch, share)
         drives = Drives(count, act[row], x[row], v[row], command[row])
         for i in range(len(gain)):
             s = drive_state(
                 user, i, count, act[row], supply, time[row], x[row, i], v[row, i], command[row, i],
                 gain[i],
             )  # fmt: skip
-            out[row, i, 0] = added(terms, FORCE, i, s, drives)
+            out[row, i, 0] = sum_terms(terms, FORCE, i, s, drives)
             if i >= count:
-                out[row, i, 0] += gain[i] * added(terms, COMMAND, i, s, drives)
-            out[row, i, 1] = added(terms, FLOW_HEAD, i, s, drives)
-            out[row, i, 2] = added(terms, FLOW_ROD, i, s, drives)
+                out[row, i, 0] += gain[i] * sum_terms(terms, COMMAND, i, s, drives)
+            out[row, i, 1] = sum_terms(terms, FLOW_HEAD, i, s, drives)
+            out[row, i, 2] = sum_terms(terms, FLOW_ROD, i, s, drives)
 
 
-def terms_at_rest(
+def term_forces_at_rest(
     machine: Machine, data: mujoco.MjData, drive_qpos: np.ndarray, forces: np.ndarray
 ) -> np.ndarray:
     """Compute the forces that terms add to drives at rest, at time 0 and with zero commands.
@@ -457,9 +457,9 @@ def terms_at_rest(
     """
     if not machine.terms:
         return np.zeros(len(forces))
-    act = np.zeros((1, ACTIVATIONS * len(machine.hydraulic_axes) + len(extra_state_names(machine))))
+    act = np.zeros((1, ACTIVATIONS_PER_AXIS * len(machine.hydraulic_axes) + len(extra_state_names(machine))))
     for i, axis in enumerate(machine.hydraulic_axes.values()):
-        act[0, ACTIVATIONS * i + 2] = forces[i] / axis.hydraulic_drive.areas[0]
+        act[0, ACTIVATIONS_PER_AXIS * i + 2] = forces[i] / axis.hydraulic_drive.areas[0]
     still = np.zeros((1, len(forces)))
     x = data.qpos[drive_qpos][None, :]
-    return added_by_terms(machine, np.zeros(1), act, x, still, still)[0, :, 0]
+    return evaluate_terms(machine, np.zeros(1), act, x, still, still)[0, :, 0]

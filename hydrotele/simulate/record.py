@@ -16,18 +16,25 @@ import mujoco
 import numpy as np
 
 from hydrotele.core.compiled import compiled
-from hydrotele.core.memory import address_record, copy_to, floats, integers, rows_of, short_integers
-from hydrotele.hydraulics.circuit import (
-    ACTIVATIONS,
-    SCRATCH,
-    SLOTS,
-    Slot,
-    axis_state,
-    circuit_supply,
-    delivered_share,
-    open_ports,
+from hydrotele.core.memory import (
+    address_record,
+    copy_values,
+    float64_view,
+    int32_view,
+    int64_view,
+    matrix_view,
 )
-from hydrotele.simulate.closure import following_joints
+from hydrotele.hydraulics.circuit import (
+    ACTIVATIONS_PER_AXIS,
+    SCRATCH_SIZE,
+    SLOT_COUNT,
+    Slot,
+    axis_flows_and_force,
+    circuit_supply_pressure,
+    compute_ports,
+    delivered_flow_fraction,
+)
+from hydrotele.simulate.closure import dependent_joints
 from hydrotele.simulate.layout import (
     call_contact_force,
     field_offsets,
@@ -35,10 +42,10 @@ from hydrotele.simulate.layout import (
     struct_size,
 )
 from hydrotele.simulate.mechanism import TIP_SITE
-from hydrotele.simulate.plant import Plant, added_by_terms
+from hydrotele.simulate.plant import Plant, evaluate_terms
 from hydrotele.simulate.surroundings import is_surrounding_object, object_joints
 
-_WHOLE = 1.0e-9  # steps: rounding error up to which a delay counts as a whole number of steps
+_STEP_TOLERANCE = 1.0e-9  # steps: rounding error up to which a delay counts as a whole number of steps
 
 
 class SimulationFailed(RuntimeError):
@@ -59,7 +66,7 @@ class Record:
         contact: (n, 3) total contact force of ground and objects on the machine, world frame [N].
         contact_of: name of each surrounding object -> (n, 3) its force on the machine [N].
         tip: (n, 3) position of the arm's tip [m]; empty (n, 0) without an arm.
-        late: (n, c) delayed and filtered values of `sensed_channels`, without sensor errors; empty
+        delayed_readings: (n, c) delayed and filtered values of `sensed_channels`, without sensor errors; empty
             (n, 0) if no sensor has a delay or lag.
     """
 
@@ -72,10 +79,10 @@ class Record:
     contact: np.ndarray
     contact_of: dict[str, np.ndarray]
     tip: np.ndarray
-    late: np.ndarray
+    delayed_readings: np.ndarray
 
 
-def begin_leapfrog(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+def start_leapfrog(model: mujoco.MjModel, data: mujoco.MjData) -> None:
     """Convert a state at time t to the staggered state from which stepping starts.
 
     Args:
@@ -101,28 +108,28 @@ def align_positions(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray) -
     """Return staggered positions (..., nq) moved back by a step with velocities (..., nv)."""
     positions = np.array(qpos)
     rows, rates = positions.reshape(-1, model.nq), qvel.reshape(-1, model.nv)
-    _step_back(rows, rates, model.opt.timestep, _plain_positions(model))
+    _move_back_one_step(rows, rates, model.opt.timestep, _count_alignable_positions(model))
     return positions
 
 
 @compiled
-def _step_back(positions, velocities, timestep, plain):
+def _move_back_one_step(positions, velocities, timestep, plain):
     """Move the first `plain` positions of every row (n, nq) back by a step."""
     for row in range(len(positions)):
         for i in range(plain):
             positions[row, i] -= timestep * velocities[row, i]
 
 
-def _plain_positions(model: mujoco.MjModel) -> int:
+def _count_alignable_positions(model: mujoco.MjModel) -> int:
     """Return the number of leading positions whose time derivatives are the velocities."""
-    return model.nq if model.nq == model.nv else _plain_joints(model.jnt_type)
+    return model.nq if model.nq == model.nv else _count_single_dof_joints(model.jnt_type)
 
 
 _BALL, _FREE = int(mujoco.mjtJoint.mjJNT_BALL), int(mujoco.mjtJoint.mjJNT_FREE)
 
 
 @compiled
-def _plain_joints(kinds):
+def _count_single_dof_joints(kinds):
     """Count the joints of one degree of freedom before the first ball or free joint."""
     for k in range(len(kinds)):
         if kinds[k] == _BALL or kinds[k] == _FREE:
@@ -143,12 +150,12 @@ def sensed_channels(plant: Plant) -> tuple[str, ...]:
 
 def split_delay(delay: float, timestep: float) -> tuple[int, float]:
     """Split a delay [s] into whole steps and the remaining fraction of a step, in [0, 1) [1]."""
-    steps = math.floor(delay / timestep + _WHOLE)
+    steps = math.floor(delay / timestep + _STEP_TOLERANCE)
     rest = delay / timestep - steps
-    return steps, rest if rest > _WHOLE else 0.0
+    return steps, rest if rest > _STEP_TOLERANCE else 0.0
 
 
-STATE_ROW = np.dtype(
+STATE_ROW_DTYPE = np.dtype(
     [(name, np.int64) for name in ("rows", "nq", "nv", "na", "plain", "sites", "tip", "warning")]
     + [("timestep", np.float64)]
     + [(name, np.int64) for name in ("qpos", "qvel", "qacc", "act", "site")]  # addresses from here
@@ -158,11 +165,11 @@ STATE_ROW = np.dtype(
     align=True,
 )
 """Record type of a Recorder for compiled code."""
-_WARNINGS = int(mujoco.mjtWarning.mjNWARNING)
+_WARNING_COUNT = int(mujoco.mjtWarning.mjNWARNING)
 
 
 @compiled
-def take_row(record, contacts, row, time):
+def record_row(record, contacts, row, time):
     """Write the current state, aligned in time, to a row of the recorder's arrays.
 
     Args:
@@ -177,23 +184,27 @@ def take_row(record, contacts, row, time):
     Source: `Record`.
     """
     r = record[0]
-    velocity, acceleration, act = floats(r.qvel, r.nv), floats(r.qacc, r.nv), floats(r.act, r.na)
-    floats(r.to_time, r.rows)[row] = time
-    positions = rows_of(r.to_qpos, r.rows, r.nq)[row : row + 1]
-    copy_to(positions[0], floats(r.qpos, r.nq))
-    _step_back(positions, velocity.reshape((1, r.nv)), r.timestep, r.plain)
-    to_velocity = rows_of(r.to_qvel, r.rows, r.nv)[row]
+    velocity, acceleration, act = (
+        float64_view(r.qvel, r.nv),
+        float64_view(r.qacc, r.nv),
+        float64_view(r.act, r.na),
+    )
+    float64_view(r.to_time, r.rows)[row] = time
+    positions = matrix_view(r.to_qpos, r.rows, r.nq)[row : row + 1]
+    copy_values(positions[0], float64_view(r.qpos, r.nq))
+    _move_back_one_step(positions, velocity.reshape((1, r.nv)), r.timestep, r.plain)
+    to_velocity = matrix_view(r.to_qvel, r.rows, r.nv)[row]
     good = True
     for i in range(r.nv):
         to_velocity[i] = velocity[i] - 0.5 * r.timestep * acceleration[i]
         good = good and np.isfinite(acceleration[i])
-    copy_to(rows_of(r.to_qacc, r.rows, r.nv)[row], acceleration)
-    copy_to(rows_of(r.to_act, r.rows, r.na)[row], act)
+    copy_values(matrix_view(r.to_qacc, r.rows, r.nv)[row], acceleration)
+    copy_values(matrix_view(r.to_act, r.rows, r.na)[row], act)
     if r.tip >= 0:
-        copy_to(rows_of(r.to_tip, r.rows, 3)[row], rows_of(r.site, r.sites, 3)[r.tip])
-    _add_contact_forces(contacts[0], rows_of(r.to_contact, r.rows, 3 * r.groups)[row])
-    warnings = short_integers(r.warning, 2 * _WARNINGS)  # information and number of each
-    for kind in range(_WARNINGS):
+        copy_values(matrix_view(r.to_tip, r.rows, 3)[row], matrix_view(r.site, r.sites, 3)[r.tip])
+    _add_contact_forces(contacts[0], matrix_view(r.to_contact, r.rows, 3 * r.groups)[row])
+    warnings = int32_view(r.warning, 2 * _WARNING_COUNT)  # information and number of each
+    for kind in range(_WARNING_COUNT):
         good = good and warnings[2 * kind + 1] == 0
     return good
 
@@ -211,52 +222,50 @@ class Recorder:
         model = plant.model
         self.model, self._data = model, None
         self.tip_site = model.site(TIP_SITE).id if plant.machine.arm else -1
-        self.around, self.groups = surrounding_groups(plant)
+        self.geom_groups, self.group_names = surrounding_groups(plant)
         self.time = np.zeros(rows)
         self.qpos, self.qvel = np.zeros((rows, model.nq)), np.zeros((rows, model.nv))
         self.qacc, self.act = np.zeros((rows, model.nv)), np.zeros((rows, model.na))
         self.command = np.zeros((rows, model.nu))
-        self.contact = np.zeros((rows, len(self.groups), 3))
+        self.contact = np.zeros((rows, len(self.group_names), 3))
         self.tip = np.zeros((rows, 3 if self.tip_site >= 0 else 0))
-        late = any(error.late for error in plant.machine.sensor_errors.values())
+        late = any(error.is_delayed for error in plant.machine.sensor_errors.values())
         self.late = np.zeros((rows, len(sensed_channels(plant)) if late else 0))
 
-    def take(
-        self, row: int, time: float, data: mujoco.MjData, shown: np.ndarray | None = None
-    ) -> None:
+    def record_state(self, row: int, time: float, data: mujoco.MjData, shown: np.ndarray | None = None) -> None:
         """Record the current state; must be called before the next step.
 
         Args:
             row: index of the row.
             time: time of the row [s].
-            data: staggered state after `begin_leapfrog` or a step.
+            data: staggered state after `start_leapfrog` or a step.
             shown: (c,) delayed values of `sensed_channels`, if a sensor has a delay or lag.
 
         Raises:
             SimulationFailed: the state is not finite, or MuJoCo has issued a warning.
         """
-        self.records(data)
+        self.native_records(data)
         if shown is not None:
-            self.show(row, shown)
-        if not take_row(self._row, self._contacts, row, time):
-            raise self.failure(row)
+            self.record_sensor_values(row, shown)
+        if not record_row(self._row, self._contacts, row, time):
+            raise self.instability_error(row)
 
-    def show(self, row: int, shown: np.ndarray) -> None:
+    def record_sensor_values(self, row: int, shown: np.ndarray) -> None:
         """Record the delayed values (c,) of `sensed_channels`, if a sensor has a delay or lag."""
         if self.late.shape[1]:
             self.late[row] = shown
 
-    def records(self, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
-        """Return the records for `take_row`: that of the arrays and that of the contacts."""
+    def native_records(self, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
+        """Return the records for `record_row`: that of the arrays and that of the contacts."""
         if data is not self._data:
-            self._find(data)
+            self._create_records(data)
         return self._row, self._contacts
 
-    def _find(self, data: mujoco.MjData) -> None:
+    def _create_records(self, data: mujoco.MjData) -> None:
         """Create the records with the addresses of MuJoCo's data and of this recorder's arrays."""
         model, self._data = self.model, data
         self._row = address_record(
-            STATE_ROW,
+            STATE_ROW_DTYPE,
             {
                 "qpos": data.qpos, "qvel": data.qvel, "qacc": data.qacc, "act": data.act,
                 "site": data.site_xpos, "to_time": self.time, "to_qpos": self.qpos,
@@ -266,14 +275,14 @@ class Recorder:
         )  # fmt: skip
         for name, value in {
             "rows": len(self.time), "nq": model.nq, "nv": model.nv, "na": model.na,
-            "plain": _plain_positions(model), "sites": model.nsite, "tip": self.tip_site,
+            "plain": _count_alignable_positions(model), "sites": model.nsite, "tip": self.tip_site,
             "warning": data._address + field_offsets("mjData")["warning"],
-            "timestep": model.opt.timestep, "groups": len(self.groups),
+            "timestep": model.opt.timestep, "groups": len(self.group_names),
         }.items():  # fmt: skip
             self._row[name] = value
-        self._contacts = contact_record(model, data, self.around)
+        self._contacts = contact_record(model, data, self.geom_groups)
 
-    def failure(self, row: int) -> SimulationFailed:
+    def instability_error(self, row: int) -> SimulationFailed:
         """Create the exception for a row that is not finite, with the last states."""
         lines = [f"the simulation became unstable at {self.time[row]:.3f} s; the last states:"]
         for r in range(max(0, row - 3), row + 1):
@@ -281,10 +290,10 @@ class Recorder:
             lines += [f"  t={self.time[r]:.3f} qpos={qpos}", f"    spools and pressures={act}"]
         return SimulationFailed("\n".join(lines))
 
-    def record(self, rows: int | None = None) -> Record:
+    def to_record(self, rows: int | None = None) -> Record:
         """Return all rows, or the first `rows` rows, as a Record."""
         contact = self.contact[:rows]
-        single = {name: contact[:, k] for k, name in enumerate(self.groups) if k > 0}
+        single = {name: contact[:, k] for k, name in enumerate(self.group_names) if k > 0}
         return Record(
             self.time[:rows], self.qpos[:rows], self.qvel[:rows], self.qacc[:rows],
             self.act[:rows], self.command[:rows], contact.sum(axis=1), single, self.tip[:rows],
@@ -301,7 +310,7 @@ def surrounding_bodies(plant: Plant) -> np.ndarray:
 
 def surrounding_geoms(plant: Plant) -> np.ndarray:
     """Return whether each geom (ngeom,) belongs to such a body, as integers 0 and 1."""
-    return _of_geoms(plant.model, surrounding_bodies(plant))
+    return _geom_flags(plant.model, surrounding_bodies(plant))
 
 
 def surrounding_groups(plant: Plant) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -325,11 +334,11 @@ def surrounding_groups(plant: Plant) -> tuple[np.ndarray, tuple[str, ...]]:
     return numbers, tuple(names)
 
 
-def _of_geoms(model: mujoco.MjModel, around: np.ndarray) -> np.ndarray:
+def _geom_flags(model: mujoco.MjModel, around: np.ndarray) -> np.ndarray:
     return around[model.geom_bodyid].astype(np.int64)
 
 
-def contact_force(model: mujoco.MjModel, data: mujoco.MjData, around: np.ndarray) -> np.ndarray:
+def total_contact_force(model: mujoco.MjModel, data: mujoco.MjData, around: np.ndarray) -> np.ndarray:
     """Return the sum of all contact forces on the machine, (3,) [N] in the world frame.
 
     Args:
@@ -337,12 +346,12 @@ def contact_force(model: mujoco.MjModel, data: mujoco.MjData, around: np.ndarray
         data: its data, with contacts and contact forces.
         around: (nbody,) result of `surrounding_bodies`.
     """
-    total, around = np.zeros(3), _of_geoms(model, around)
+    total, around = np.zeros(3), _geom_flags(model, around)
     sum_contact_forces(contact_record(model, data, around), total)
     return total
 
 
-CONTACTS = np.dtype(
+CONTACTS_DTYPE = np.dtype(
     [(name, np.int64) for name in ("function", "model", "data", "count", "contacts", "geoms")]
     + [(name, np.int64) for name in ("size", "frame", "geom", "around")],
     align=True,
@@ -361,7 +370,7 @@ def contact_record(model: mujoco.MjModel, data: mujoco.MjData, around: np.ndarra
     Returns:
         (1,) record.
     """
-    found, in_data = address_record(CONTACTS, {"around": around}), field_offsets("mjData")
+    found, in_data = address_record(CONTACTS_DTYPE, {"around": around}), field_offsets("mjData")
     for name, value in {
         "function": function_address("mj_contactForce"), "model": model._address,
         "data": data._address, "count": data._address + in_data["ncon"],
@@ -384,7 +393,7 @@ def sum_contact_forces(record, total):
     Returns:
         Nothing.
 
-    Source: `contact_force`.
+    Source: `total_contact_force`.
     """
     _add_contact_forces(record[0], total)
 
@@ -396,16 +405,16 @@ def _add_contact_forces(r, totals):
     `totals` (3 n,) [N]: forces of group k are in the k-th triple; groups above n use the last one.
     """
     totals[:] = 0.0
-    around, wrench, groups = integers(r.around, r.geoms), np.empty(6), len(totals) // 3
-    first_contact = integers(r.contacts, 1)[0]
-    for k in range(short_integers(r.count, 1)[0]):
+    around, wrench, groups = int64_view(r.around, r.geoms), np.empty(6), len(totals) // 3
+    first_contact = int64_view(r.contacts, 1)[0]
+    for k in range(int32_view(r.count, 1)[0]):
         contact = first_contact + k * r.size
-        geom = short_integers(contact + r.geom, 2)
+        geom = int32_view(contact + r.geom, 2)
         first, second = around[geom[0]], around[geom[1]]
         if (first > 0) == (second > 0):
             continue  # contact within the machine or between surrounding objects
         call_contact_force(r.function, r.model, r.data, k, wrench.ctypes.data)
-        frame, sign = floats(contact + r.frame, 9), 1.0 if first > 0 else -1.0
+        frame, sign = float64_view(contact + r.frame, 9), 1.0 if first > 0 else -1.0
         start = 3 * (min(max(first, second), groups) - 1)
         for i in range(3):
             force = frame[i] * wrench[0] + frame[3 + i] * wrench[1]
@@ -413,7 +422,7 @@ def _add_contact_forces(r, totals):
 
 
 _BRISTLE, _STIFFNESS = int(Slot.BRISTLE), int(Slot.BRISTLE_STIFFNESS)
-_SPOOL = ("spool", "1"), ("spool_rate", "1/s")
+_SPOOL_CHANNELS = ("spool", "1"), ("spool_rate", "1/s")
 
 
 @compiled
@@ -431,8 +440,8 @@ def state_supply(user, count, act, scratch):
 
     Source: nominal model, "Supply".
     """
-    open_ports(user, act, act, scratch, 0, count, 0.0, act)
-    return circuit_supply(user, 0, count, scratch, delivered_share(user, 0, act))
+    compute_ports(user, act, act, scratch, 0, count, 0.0, act)
+    return circuit_supply_pressure(user, 0, count, scratch, delivered_flow_fraction(user, 0, act))
 
 
 @compiled
@@ -451,16 +460,16 @@ def state_flows(user, count, act, x, v):
 
     Source: nominal model.
     """
-    scratch = np.zeros(SCRATCH)
+    scratch = np.zeros(SCRATCH_SIZE)
     out = np.zeros((act.shape[0], 1 + 3 * count))
     for row in range(act.shape[0]):
         supply = state_supply(user, count, act[row], scratch)
         out[row, 0] = supply
         for i in range(count):
             share = 0.0
-            if user[i * SLOTS + _STIFFNESS] > 0.0:
-                share = act[row, int(user[i * SLOTS + _BRISTLE])]
-            q_head, q_rod, force = axis_state(
+            if user[i * SLOT_COUNT + _STIFFNESS] > 0.0:
+                share = act[row, int(user[i * SLOT_COUNT + _BRISTLE])]
+            q_head, q_rod, force = axis_flows_and_force(
                 user, i, supply, act[row, 4 * i : 4 * i + 4], x[row, i], v[row, i], share
             )
             out[row, 1 + 3 * i], out[row, 2 + 3 * i], out[row, 3 + 3 * i] = q_head, q_rod, force
@@ -477,25 +486,25 @@ def true_channels(plant: Plant, record: Record) -> tuple[dict[str, np.ndarray], 
     Returns:
         (channel -> (n,) values in SI, channel -> unit).
     """
-    values, units = _measurable(plant, record)
-    hidden, hidden_units = _hidden(plant, record)
+    values, units = _measurable_channels(plant, record)
+    hidden, hidden_units = _unmeasured_channels(plant, record)
     return {**values, **hidden}, {**units, **hidden_units}
 
 
-def _measurable(plant: Plant, record: Record):
+def _measurable_channels(plant: Plant, record: Record):
     """Return values and units of the measurable channels: commands, positions and pressures."""
     machine, values, units = plant.machine, {}, {}
     for i, name in enumerate(plant.axes):
         axis = machine.axes[name]
         values[f"command.{name}"] = record.command[:, i]
         units[f"command.{name}"] = axis.force.command_unit if axis.force else "1"
-    sensed = _sensed(plant, record.qpos, record.act)
+    sensed = _sensed_values(plant, record.qpos, record.act)
     sizes = {"angle": "rad", "position": "m", "length": "m"}
     units |= {name: sizes.get(name.partition(".")[0], "Pa") for name in sensed}
     return {**values, **sensed}, units
 
 
-def _sensed(plant: Plant, qpos: np.ndarray, act: np.ndarray) -> dict[str, np.ndarray]:
+def _sensed_values(plant: Plant, qpos: np.ndarray, act: np.ndarray) -> dict[str, np.ndarray]:
     """Return positions, lengths and chamber pressures from states (n, nq), (n, na)."""
     values = {}
     for i, name in enumerate(plant.axes):
@@ -507,11 +516,11 @@ def _sensed(plant: Plant, qpos: np.ndarray, act: np.ndarray) -> dict[str, np.nda
             values[f"length.{name}"] = qpos[:, plant.rod_qpos[i]]
     for i, name in enumerate(plant.axes[: plant.hydraulic]):
         for column, side in ((2, "head"), (3, "rod")):
-            values[f"pressure_{side}.{name}"] = act[:, ACTIVATIONS * i + column]
+            values[f"pressure_{side}.{name}"] = act[:, ACTIVATIONS_PER_AXIS * i + column]
     return values
 
 
-def late_channels(plant: Plant, record: Record) -> dict[str, np.ndarray]:
+def delayed_channels(plant: Plant, record: Record) -> dict[str, np.ndarray]:
     """Return the true values after delay and lag of the sensors that have a delay or lag.
 
     Args:
@@ -523,13 +532,13 @@ def late_channels(plant: Plant, record: Record) -> dict[str, np.ndarray]:
     """
     names = sensed_channels(plant)
     return {
-        channel: record.late[:, names.index(channel)]
+        channel: record.delayed_readings[:, names.index(channel)]
         for channel, error in plant.machine.sensor_errors.items()
-        if error.late and channel in names
+        if error.is_delayed and channel in names
     }
 
 
-def _hidden(plant: Plant, record: Record):
+def _unmeasured_channels(plant: Plant, record: Record):
     """Return values and units of the `truth.*` channels, which have no sensor."""
     machine, model = plant.machine, plant.model
     values: dict[str, np.ndarray] = {}
@@ -544,14 +553,14 @@ def _hidden(plant: Plant, record: Record):
         put(f"truth.acceleration.{name}", record.qacc[:, plant.dof[i]], f"{unit}/s^2")
     driven = {axis.joint for axis in machine.axes.values()}
     for name, joint in machine.joints.items():
-        if name not in driven and name not in following_joints(machine):
+        if name not in driven and name not in dependent_joints(machine):
             kind, unit = ("angle", "rad") if joint.type == "hinge" else ("position", "m")
             put(f"truth.{kind}.{name}", record.qpos[:, model.joint(name).qposadr[0]], unit)
-    for name, place in plant.memory.items():
+    for name, place in plant.extra_states.items():
         shown = name.removesuffix(".supply")
         put(f"truth.{shown}", record.act[:, place], "1")
-    _put_things(plant, record, put)
-    _put_hydraulics(plant, record, put)
+    _add_object_poses(plant, record, put)
+    _add_hydraulic_channels(plant, record, put)
     for name, force in record.contact_of.items():
         if np.any(force):
             for letter, column in zip("xyz", force.T, strict=True):
@@ -564,21 +573,21 @@ def _hidden(plant: Plant, record: Record):
     return values, units
 
 
-def _put_things(plant: Plant, record: Record, put) -> None:
+def _add_object_poses(plant: Plant, record: Record, put) -> None:
     """Add the poses of plates, trees and logs; rotations are rotation vectors."""
     for joint, place in object_joints(plant.model):
         name, kind = plant.model.joint(joint).name, plant.model.jnt_type[joint]
         if kind == mujoco.mjtJoint.mjJNT_FREE:
             for letter, column in zip("xyz", record.qpos[:, place : place + 3].T, strict=True):
                 put(f"truth.position.{name}_{letter}", column, "m")
-            _put_turning(name, record.qpos[:, place + 3 : place + 7], put)
+            _add_rotation(name, record.qpos[:, place + 3 : place + 7], put)
         elif kind == mujoco.mjtJoint.mjJNT_BALL:
-            _put_turning(name.removesuffix("_turn"), record.qpos[:, place : place + 4], put)
+            _add_rotation(name.removesuffix("_turn"), record.qpos[:, place : place + 4], put)
         else:
             put(f"truth.position.{name}", record.qpos[:, place], "m")
 
 
-def _put_turning(name: str, quaternions: np.ndarray, put) -> None:
+def _add_rotation(name: str, quaternions: np.ndarray, put) -> None:
     """Add rotations, given as quaternions (n, 4), as rotation vectors [rad]."""
     vectors = np.empty((len(quaternions), 3))
     for vector, quaternion in zip(vectors, quaternions, strict=True):
@@ -587,7 +596,7 @@ def _put_turning(name: str, quaternions: np.ndarray, put) -> None:
         put(f"truth.angle.{name}_r{letter}", column, "rad")
 
 
-def _put_hydraulics(plant: Plant, record: Record, put) -> None:
+def _add_hydraulic_channels(plant: Plant, record: Record, put) -> None:
     """Add spools, flows, forces and supply pressure of the hydraulic axes."""
     count = plant.hydraulic
     if not count:
@@ -597,13 +606,13 @@ def _put_hydraulics(plant: Plant, record: Record, put) -> None:
     table = state_flows(user, count, np.ascontiguousarray(record.act), x, v)
     if plant.machine.valve_axes:
         put("pressure_supply", table[:, 0], "Pa")
-    more = added_by_terms(plant.machine, record.time, record.act, x, v, record.command)
+    more = evaluate_terms(plant.machine, record.time, record.act, x, v, record.command)
     total = np.zeros(len(record.time))
     for i, name in enumerate(plant.axes[:count]):
         cylinder, pumped = plant.machine.axes[name].cylinder, plant.machine.axes[name].pump
-        kinds = (("speed", "rad/s"), ("pressure_load", "Pa")) if pumped else _SPOOL
+        kinds = (("speed", "rad/s"), ("pressure_load", "Pa")) if pumped else _SPOOL_CHANNELS
         for place, (kind, unit) in enumerate(kinds):
-            put(f"truth.{kind}.{name}", record.act[:, ACTIVATIONS * i + place], unit)
+            put(f"truth.{kind}.{name}", record.act[:, ACTIVATIONS_PER_AXIS * i + place], unit)
         put(f"truth.flow_head.{name}", table[:, 1 + 3 * i], "m^3/s")
         put(f"truth.flow_rod.{name}", table[:, 2 + 3 * i], "m^3/s")
         force = table[:, 3 + 3 * i] + more[:, i, 0]
@@ -612,7 +621,7 @@ def _put_hydraulics(plant: Plant, record: Record, put) -> None:
             put(f"truth.piston_velocity.{name}", v[:, i], "m/s")
         if pumped:  # has its own pump
             continue
-        fed_head = record.act[:, ACTIVATIONS * i] > 0.0
+        fed_head = record.act[:, ACTIVATIONS_PER_AXIS * i] > 0.0
         total += np.where(fed_head, table[:, 1 + 3 * i], table[:, 2 + 3 * i])
     if plant.machine.valve_axes:
         put("truth.flow_supply", total, "m^3/s")

@@ -14,15 +14,15 @@ import mujoco
 import numpy as np
 
 from hydrotele.core.compiled import compiled
-from hydrotele.core.memory import address_record, floats, integers, rows_of
-from hydrotele.hydraulics.circuit import SCRATCH, SLOTS
-from hydrotele.machine.machine import Machine, SensorError, first_order
+from hydrotele.core.memory import address_record, float64_view, int64_view, matrix_view
+from hydrotele.hydraulics.circuit import SCRATCH_SIZE, SLOT_COUNT
+from hydrotele.machine.machine import Machine, SensorError, step_first_order_lag
 from hydrotele.simulate.layout import call_step, function_address
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.record import sensed_channels, split_delay, state_supply
 
 
-class CommandLine(NamedTuple):
+class CommandDelayLine(NamedTuple):
     """Delay line of the commands to k valves and drives.
 
     Attributes:
@@ -36,7 +36,7 @@ class CommandLine(NamedTuple):
     delay: np.ndarray
 
 
-class SensorPast(NamedTuple):
+class SensorHistory(NamedTuple):
     """Past values of c sensors after each of the last physics steps, before their delays.
 
     Attributes:
@@ -72,8 +72,8 @@ class Simulation(NamedTuple):
         rod_qpos: (l,) indices in `qpos` of the cylinders with a length sensor.
         rod_dof: (l,) the same in `qvel`.
         user: (k SLOTS,) parameters of the actuators.
-        line: delay line of the commands.
-        past: past values of the sensors.
+        command_line: delay line of the commands.
+        sensor_history: past values of the sensors.
     """
 
     mj_step: int
@@ -91,12 +91,12 @@ class Simulation(NamedTuple):
     rod_qpos: np.ndarray
     rod_dof: np.ndarray
     user: np.ndarray
-    line: CommandLine
-    past: SensorPast
+    command_line: CommandDelayLine
+    sensor_history: SensorHistory
 
 
 _I = np.int64
-SIMULATION = np.dtype(
+SIMULATION_DTYPE = np.dtype(
     [(name, _I) for name in ("mj_step", "model", "data", "nq", "nv", "na", "nu")]
     + [("timestep", np.float64)]
     + [(name, _I) for name in ("axes", "hydraulic", "rods", "channels", "ticks", "back")]
@@ -111,9 +111,9 @@ SIMULATION = np.dtype(
 
 def simulation_record(sim: Simulation) -> np.ndarray:
     """Return the (1,) record of a Simulation; the arrays must outlive the record."""
-    line, past = sim.line, sim.past
+    line, past = sim.command_line, sim.sensor_history
     record = address_record(
-        SIMULATION,
+        SIMULATION_DTYPE,
         {
             "qpos": sim.qpos, "qvel": sim.qvel, "act": sim.act, "ctrl": sim.ctrl, "user": sim.user,
             "joint_qpos": sim.joint_qpos, "joint_dof": sim.joint_dof, "rod_qpos": sim.rod_qpos,
@@ -133,24 +133,24 @@ def simulation_record(sim: Simulation) -> np.ndarray:
 
 
 @compiled
-def simulation(r):
+def read_simulation(r):
     """Return the Simulation of a record of `simulation_record`."""
     k, c = r.axes, r.channels
-    line = CommandLine(rows_of(r.line_ring, r.ticks, k), rows_of(r.line_delay, k, 2))
-    past = SensorPast(
-        rows_of(r.past_ring, r.back, c), floats(r.past_before, c), rows_of(r.past_delay, c, 2),
-        floats(r.past_ratio, c),
+    line = CommandDelayLine(matrix_view(r.line_ring, r.ticks, k), matrix_view(r.line_delay, k, 2))
+    past = SensorHistory(
+        matrix_view(r.past_ring, r.back, c), float64_view(r.past_before, c), matrix_view(r.past_delay, c, 2),
+        float64_view(r.past_ratio, c),
     )  # fmt: skip
     return Simulation(
-        r.mj_step, r.model, r.data, floats(r.qpos, r.nq), floats(r.qvel, r.nv),
-        floats(r.act, r.na), floats(r.ctrl, r.nu), r.timestep, k, r.hydraulic,
-        integers(r.joint_qpos, k), integers(r.joint_dof, k), integers(r.rod_qpos, r.rods),
-        integers(r.rod_dof, r.rods), floats(r.user, k * SLOTS), line, past,
+        r.mj_step, r.model, r.data, float64_view(r.qpos, r.nq), float64_view(r.qvel, r.nv),
+        float64_view(r.act, r.na), float64_view(r.ctrl, r.nu), r.timestep, k, r.hydraulic,
+        int64_view(r.joint_qpos, k), int64_view(r.joint_dof, k), int64_view(r.rod_qpos, r.rods),
+        int64_view(r.rod_dof, r.rods), float64_view(r.user, k * SLOT_COUNT), line, past,
     )  # fmt: skip
 
 
 @compiled
-def true_values(sim, out):
+def true_sensor_values(sim, out):
     """Compute the true values of the sensed channels at the time of the activations.
 
     Args:
@@ -170,14 +170,14 @@ def true_values(sim, out):
         out[k + 2 * i], out[k + 2 * i + 1] = sim.act[4 * i + 2], sim.act[4 * i + 3]
     at = k + 2 * h
     if h > 0:
-        out[at] = state_supply(sim.user, h, sim.act, np.empty(SCRATCH))
+        out[at] = state_supply(sim.user, h, sim.act, np.empty(SCRATCH_SIZE))
         at += 1
     for i in range(len(sim.rod_qpos)):
         out[at + i] = sim.qpos[sim.rod_qpos[i]] - sim.timestep * sim.qvel[sim.rod_dof[i]]
 
 
 @compiled
-def begin_past(sim, command):
+def initialise_history(sim, command):
     """Initialise the delay line and the sensors' past with the current values.
 
     Args:
@@ -191,14 +191,14 @@ def begin_past(sim, command):
         for i in range(sim.axes):
             sim.line.ring[n, i] = command[i]
     if len(sim.past.ring) > 0:
-        true_values(sim, sim.past.before)
+        true_sensor_values(sim, sim.past.before)
         for n in range(len(sim.past.ring)):
             for c in range(len(sim.past.before)):
                 sim.past.ring[n, c] = sim.past.before[c]
 
 
 @compiled
-def arriving_commands(line, axes, tick, step, steps, out):
+def commands_of_step(line, axes, tick, step, steps, out):
     """Compute the delayed commands that act in one physics step.
 
     Args:
@@ -216,15 +216,15 @@ def arriving_commands(line, axes, tick, step, steps, out):
     """
     for i in range(axes):
         at, part = tick * steps + step - int(line.delay[i, 0]), line.delay[i, 1]
-        value = line.ring[_place(at, steps, tick, len(line.ring)), i]
+        value = line.ring[_ring_row(at, steps, tick, len(line.ring)), i]
         if part > 0.0:
-            before = line.ring[_place(at - 1, steps, tick, len(line.ring)), i]
+            before = line.ring[_ring_row(at - 1, steps, tick, len(line.ring)), i]
             value += part * (before - value)
         out[i] = value
 
 
 @compiled
-def _place(step, steps, tick, length):
+def _ring_row(step, steps, tick, length):
     """Return the ring's row with the command of a physics step; steps before the start map to 0."""
     return (min(max(step // steps, -1), tick) + 1) % length
 
@@ -253,29 +253,29 @@ def step_physics(sim, tick, steps, command):
             line.ring[(tick + 1) % len(line.ring), i] = command[i]
     for step in range(steps):
         if len(line.ring) > 0:
-            arriving_commands(line, sim.axes, tick, step, steps, sim.ctrl)
+            commands_of_step(line, sim.axes, tick, step, steps, sim.ctrl)
         call_step(sim.mj_step, sim.model, sim.data)
         if len(past.ring) > 0:
-            _keep(sim, tick * steps + step + 1)
+            _store_sensor_values(sim, tick * steps + step + 1)
 
 
 @compiled
-def _keep(sim, number):
+def _store_sensor_values(sim, number):
     """Store the lagged sensor values after physics step `number` in the ring."""
     past, size = sim.past, len(sim.past.before)
     now, last = number % len(past.ring), (number - 1) % len(past.ring)
     values = np.empty(size)
-    true_values(sim, values)
+    true_sensor_values(sim, values)
     for c in range(size):
         shown = values[c]
         if past.ratio[c] > 0.0:
-            shown = first_order(past.ring[last, c], past.before[c], values[c], past.ratio[c])
+            shown = step_first_order_lag(past.ring[last, c], past.before[c], values[c], past.ratio[c])
         past.ring[now, c] = shown
         past.before[c] = values[c]
 
 
 @compiled
-def delayed_values(past, number, values):
+def apply_sensor_delays(past, number, values):
     """Replace true values by delayed values, interpolated linearly between physics steps.
 
     Args:
@@ -306,9 +306,7 @@ def command_delays(machine: Machine, axes: tuple[str, ...], timestep: float) -> 
     return np.array([split_delay(machine.axes[n].command_delay, timestep) for n in axes], float)
 
 
-def sensor_delays(
-    machine: Machine, channels: tuple[str, ...], timestep: float
-) -> tuple[np.ndarray, np.ndarray]:
+def sensor_delays(machine: Machine, channels: tuple[str, ...], timestep: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the delays and first-order lags of c sensors.
 
     Args:
@@ -326,14 +324,14 @@ def sensor_delays(
     return delay, np.array(ratio)
 
 
-def line_length(delays: np.ndarray, steps: int) -> int:
+def delay_line_length(delays: np.ndarray, steps: int) -> int:
     """Return the number of ticks that a CommandLine must store; 0 without delays."""
     if not delays.any():
         return 0
     return int(np.ceil((delays[..., 0].max() + 1) / steps)) + 2
 
 
-def past_length(delays: np.ndarray, ratios: np.ndarray) -> int:
+def sensor_history_length(delays: np.ndarray, ratios: np.ndarray) -> int:
     """Return the number of physics steps that a SensorPast must store; 0 without delay or lag."""
     return int(delays[..., 0].max()) + 2 if delays.any() or ratios.any() else 0
 
@@ -352,20 +350,18 @@ def delayed_commands(plant: Plant, before: np.ndarray, held: np.ndarray, steps: 
     """
     delay = command_delays(plant.machine, plant.axes, plant.model.opt.timestep)
     out = np.repeat(np.asarray(held, float), steps, axis=0)
-    if length := line_length(delay, steps):
-        line = CommandLine(np.tile(np.asarray(before, float), (length, 1)), delay)
+    if length := delay_line_length(delay, steps):
+        line = CommandDelayLine(np.tile(np.asarray(before, float), (length, 1)), delay)
         for tick, command in enumerate(held):
             line.ring[(tick + 1) % length] = command
             for step in range(steps):
-                arriving_commands(
-                    line, len(plant.axes), tick, step, steps, out[tick * steps + step]
-                )
+                commands_of_step(line, len(plant.axes), tick, step, steps, out[tick * steps + step])
     return out
 
 
 @compiled
-def _step(record, tick, steps, command):
-    step_physics(simulation(record[0]), tick, steps, command)
+def _step_record(record, tick, steps, command):
+    step_physics(read_simulation(record[0]), tick, steps, command)
 
 
 class Stepper:
@@ -382,7 +378,7 @@ class Stepper:
         record: (1,) the same data as a record.
         steps: physics steps per tick.
         tick: number of the next tick.
-        late: whether any sensor has a delay or lag.
+        has_delayed_sensors: whether any sensor has a delay or lag.
     """
 
     def __init__(self, plant: Plant, data: mujoco.MjData, steps: int) -> None:
@@ -391,8 +387,11 @@ class Stepper:
         delay = command_delays(plant.machine, plant.axes, h)
         lag, ratio = sensor_delays(plant.machine, channels, h)
         rods = np.flatnonzero(plant.rod_qpos >= 0)
-        past = SensorPast(
-            np.zeros((past_length(lag, ratio), len(channels))), np.zeros(len(channels)), lag, ratio
+        past = SensorHistory(
+            np.zeros((sensor_history_length(lag, ratio), len(channels))),
+            np.zeros(len(channels)),
+            lag,
+            ratio,
         )
         self.sim = Simulation(
             mj_step=function_address("mj_step"),
@@ -410,22 +409,22 @@ class Stepper:
             rod_qpos=plant.rod_qpos[rods],
             rod_dof=plant.drive_dof[rods],
             user=plant.model.actuator_user.ravel(),
-            line=CommandLine(np.zeros((line_length(delay, steps), len(plant.axes))), delay),
-            past=past,
+            command_line=CommandDelayLine(np.zeros((delay_line_length(delay, steps), len(plant.axes))), delay),
+            sensor_history=past,
         )
         self._owners = plant.model, data  # keeps the memory behind the addresses alive
-        self.steps, self.tick, self.late = steps, 0, len(past.ring) > 0
+        self.steps, self.tick, self.has_delayed_sensors = steps, 0, len(past.ring) > 0
         self.record = simulation_record(self.sim)
-        begin_past(self.sim, np.array(data.ctrl))
+        initialise_history(self.sim, np.array(data.ctrl))
 
     def advance(self, command: np.ndarray) -> None:
         """Advance by one tick with a constant command (nu,)."""
-        _step(self.record, self.tick, self.steps, np.asarray(command, float))
+        _step_record(self.record, self.tick, self.steps, np.asarray(command, float))
         self.tick += 1
 
-    def shown(self) -> np.ndarray:
+    def sensor_values(self) -> np.ndarray:
         """Return the values (c,) of error-free sensors now, in the order of `sensed_channels`."""
-        values = np.empty(len(self.sim.past.before))
-        true_values(self.sim, values)
-        delayed_values(self.sim.past, self.tick * self.steps, values)
+        values = np.empty(len(self.sim.sensor_history.before))
+        true_sensor_values(self.sim, values)
+        apply_sensor_delays(self.sim.sensor_history, self.tick * self.steps, values)
         return values

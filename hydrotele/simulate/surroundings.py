@@ -17,37 +17,59 @@ import mujoco
 import numpy as np
 
 from hydrotele.core.compiled import allocation_free
-from hydrotele.core.datafile import suggest
+from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import LogOnGround, Plate, StandingTree, SurroundingObject
 
-CLOSED, OPEN, LINE, STRAIGHT, CENTRE, HALF, OWN, BEFORE, BEHIND = 0, 1, 2, 3, 4, 7, 10, 11, 12
-GRIP = 13
-ROW = 11  # number of values of a weld in `eq_data`
-LET_GO, UNCHANGED, TAKEN = -1, 0, 1
+(
+    CLOSE_ANGLE,
+    OPEN_ANGLE,
+    POCKET_AXIS,
+    MIN_COSINE,
+    POCKET_CENTRE,
+    POCKET_HALF_SIZE,
+    OBJECT_AXIS,
+    REACH_START,
+    REACH_STOP,
+) = 0, 1, 2, 3, 4, 7, 10, 11, 12
+GRIP_SIZE = 13
+WELD_SIZE = 11  # number of values of a weld in `eq_data`
+RELEASED, UNCHANGED, TAKEN = -1, 0, 1
 
 
 def grip_parameters(
-    closed: float, open: float, line: int, straight: float, centre: Sequence[float],
-    half: Sequence[float], own: int, reach: tuple[float, float] = (-math.inf, math.inf),
+    close_angle: float, open_angle: float, pocket_axis: int, max_angle: float, pocket_centre: Sequence[float],
+    pocket_half_size: Sequence[float], object_axis: int, reach: tuple[float, float] = (-math.inf, math.inf),
 ) -> np.ndarray:  # fmt: skip
     """Return the parameters of `grip_step` as an array.
 
     Args:
-        closed: jaw angle above which an object is taken [rad].
-        open: jaw angle below which the object is released [rad], at most `closed`.
-        line: axis of the grab's frame (0, 1, 2) along which objects lie in the pocket.
-        straight: largest angle between this axis and the object's long axis [rad].
-        centre: (3,) centre of the pocket, a box in the grab's frame [m].
-        half: (3,) half sizes of the pocket [m]; the one along `line` is ignored.
-        own: long axis of the object in its own frame (0, 1, 2).
+        close_angle: jaw angle above which an object is taken [rad].
+        open_angle: jaw angle below which the object is released [rad], at most `close_angle`.
+        pocket_axis: axis of the grab's frame (0, 1, 2) along which objects lie in the pocket.
+        max_angle: largest angle between this axis and the object's long axis [rad].
+        pocket_centre: (3,) centre of the pocket, a box in the grab's frame [m].
+        pocket_half_size: (3,) half sizes of the pocket [m]; the one along `pocket_axis` is ignored.
+        object_axis: long axis of the object in its own frame (0, 1, 2).
         reach: range along this axis in which the object can be held, from its origin [m].
 
     Returns:
         (GRIP,) parameters.
     """
-    return np.array([closed, open, line, math.cos(straight), *centre, *half, own, *reach], float)
+    return np.array(
+        [
+            close_angle,
+            open_angle,
+            pocket_axis,
+            math.cos(max_angle),
+            *pocket_centre,
+            *pocket_half_size,
+            object_axis,
+            *reach,
+        ],
+        float,
+    )
 
 
 @allocation_free
@@ -72,13 +94,13 @@ def grip_step(grip, hand_position, hand_quaternion, position, quaternion, angle,
         TAKEN, LET_GO or UNCHANGED.
     """
     if held:
-        return LET_GO if angle < grip[OPEN] else UNCHANGED
-    if not angle >= grip[CLOSED]:
+        return RELEASED if angle < grip[OPEN_ANGLE] else UNCHANGED
+    if not angle >= grip[CLOSE_ANGLE]:
         return UNCHANGED
     w, x, y, z = hand_quaternion[0], hand_quaternion[1], hand_quaternion[2], hand_quaternion[3]
     a, b, c, d = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
-    line, own = int(grip[LINE]), int(grip[OWN])
-    to_x, to_y, to_z = _turned(
+    line, own = int(grip[POCKET_AXIS]), int(grip[OBJECT_AXIS])
+    to_x, to_y, to_z = _rotate_vector(
         w, -x, -y, -z, position[0] - hand_position[0], position[1] - hand_position[1],
         position[2] - hand_position[2],
     )  # fmt: skip
@@ -87,21 +109,19 @@ def grip_step(grip, hand_position, hand_quaternion, position, quaternion, angle,
     f = w * b - x * a - y * d + z * c
     g = w * c + x * d - y * a - z * b
     h = w * d - x * c + y * b - z * a
-    way_x, way_y, way_z = _turned(
+    way_x, way_y, way_z = _rotate_vector(
         e, f, g, h, 1.0 if own == 0 else 0.0, 1.0 if own == 1 else 0.0, 1.0 if own == 2 else 0.0
     )
     along = way_x if line == 0 else (way_y if line == 1 else way_z)
-    if abs(along) < max(grip[STRAIGHT], 1.0e-6):
+    if abs(along) < max(grip[MIN_COSINE], 1.0e-6):
         return UNCHANGED
     level = to_x if line == 0 else (to_y if line == 1 else to_z)
-    far = (grip[CENTRE + line] - level) / along
-    if not grip[BEFORE] <= far <= grip[BEHIND]:
+    far = (grip[POCKET_CENTRE + line] - level) / along
+    if not grip[REACH_START] <= far <= grip[REACH_STOP]:
         return UNCHANGED
     for k in range(3):
-        at = (
-            to_x + far * way_x if k == 0 else (to_y + far * way_y if k == 1 else to_z + far * way_z)
-        )
-        if k != line and not abs(at - grip[CENTRE + k]) < grip[HALF + k]:
+        at = to_x + far * way_x if k == 0 else (to_y + far * way_y if k == 1 else to_z + far * way_z)
+        if k != line and not abs(at - grip[POCKET_CENTRE + k]) < grip[POCKET_HALF_SIZE + k]:
             return UNCHANGED
     row[0], row[1], row[2] = 0.0, 0.0, 0.0  # the anchor: the object's origin
     row[3], row[4], row[5] = to_x, to_y, to_z
@@ -111,7 +131,7 @@ def grip_step(grip, hand_position, hand_quaternion, position, quaternion, angle,
 
 
 @allocation_free
-def _turned(w, x, y, z, vx, vy, vz):
+def _rotate_vector(w, x, y, z, vx, vy, vz):
     """Rotate a vector by a unit quaternion."""
     tx, ty, tz = 2.0 * (y * vz - z * vy), 2.0 * (z * vx - x * vz), 2.0 * (x * vy - y * vx)
     return (
@@ -122,38 +142,36 @@ def _turned(w, x, y, z, vx, vy, vz):
 
 
 _PLATE_SOLREF = (0.01, 1.0)  # s, 1: firm steel on steel, stiffer than any plate's spring
-_GAP = 0.02  # m, width of the saw cut
+_CUT_WIDTH = 0.02  # m, width of the saw cut
 _GRAVITY = 9.81
-_ROOT, _ROOT_TURN = 4.0e6, 6.0e5  # N/m, N m/rad: stiffness of a tree's root
-_CUTTING = 30.0  # rad/s: lowest speed at which a saw cuts
-_HIGH = 0.15  # m: largest difference between the saw's height and that of the kerf
+_ROOT_STIFFNESS, _ROOT_ROTATION_STIFFNESS = 4.0e6, 6.0e5  # N/m, N m/rad: stiffness of a tree's root
+_MIN_CUTTING_SPEED = 30.0  # rad/s: lowest speed at which a saw cuts
+_MAX_HEIGHT_ERROR = 0.15  # m: largest difference between the saw's height and that of the kerf
 _NORMALS = {"x": (1, 0, 0), "-x": (-1, 0, 0), "y": (0, 1, 0), "-y": (0, -1, 0), "z": (0, 0, 1)}
-_RIM = 0.3  # feed force per cutting force at the rim of the disc
+_FEED_FORCE_RATIO = 0.3  # feed force per cutting force at the rim of the disc
 _STEM_POCKET = (0.325, 0.0, -0.62), (0.325, 0.35, 0.0)  # m, in front of a head, between its arms
-_LEANING = math.acos(0.9)  # rad: largest angle between stem and head
-_ASKEW = math.radians(20.0)  # rad: largest angle between a log and the jaws' axis
-_END = 0.3  # m: length at a log's end at which it cannot be held
-_ROLLING = 30.0  # N s/m and N m s/rad: soil damping; a rolling log stops within half a second
-_SINK = 1.0e-5  # m: static penetration of a log into the soft contact of the ground
+_MAX_STEM_ANGLE = math.acos(0.9)  # rad: largest angle between stem and head
+_MAX_LOG_ANGLE = math.radians(20.0)  # rad: largest angle between a log and the jaws' axis
+_LOG_END_LENGTH = 0.3  # m: length at a log's end at which it cannot be held
+_LOG_DAMPING = 30.0  # N s/m and N m s/rad: soil damping; a rolling log stops within half a second
+_LOG_PENETRATION = 1.0e-5  # m: static penetration of a log into the soft contact of the ground
 _PREFIXES = ("plate_", "tree_", "log_")
 
 
-def write_surroundings(
-    root, machine: Machine, things: tuple[SurroundingObject, ...], looks: bool = True
-) -> None:
+def write_surroundings(root, machine: Machine, objects: tuple[SurroundingObject, ...], visuals: bool = True) -> None:
     """Add plates, trees and logs to an assembled MJCF.
 
     Args:
         root: the MJCF document of the machine.
         machine: the machine.
-        things: plates, trees and logs.
-        looks: whether to add the visual geometry of logs.
+        objects: plates, trees and logs.
+        visuals: whether to add the visual geometry of logs.
 
     Raises:
         InputError: the machine does not have the given saw or grab, or the grab has no pocket for
             the log.
     """
-    for number, thing in enumerate(things):
+    for number, thing in enumerate(objects):
         where = f"surroundings.{number}"
         if isinstance(thing, Plate):
             _write_plate(root, f"plate_{number}", thing)
@@ -161,7 +179,7 @@ def write_surroundings(
             _write_tree(root, f"tree_{number}", thing, machine, where)
         else:
             body = _write_log(root, f"log_{number}", thing, machine, where)
-            if looks:
+            if visuals:
                 _draw_log(body, f"log_{number}", thing)
 
 
@@ -184,12 +202,12 @@ def _write_plate(root, name: str, plate: Plate) -> None:
     )  # fmt: skip
 
 
-def _need_axis(machine: Machine, axis: str, where: str) -> None:
+def _check_axis(machine: Machine, axis: str, where: str) -> None:
     if axis not in machine.axes:
-        raise InputError(where, f"the machine has no axis {axis!r}; {suggest(axis, machine.axes)}")
+        raise InputError(where, f"the machine has no axis {axis!r}; {suggest_valid_name(axis, machine.axes)}")
 
 
-def _hand(machine: Machine, grab: str) -> str:
+def _grab_body(machine: Machine, grab: str) -> str:
     """Return the name of the body to which a grab's jaw is hinged."""
     return machine.links[machine.link_of(machine.axes[grab].joint)].parent
 
@@ -197,15 +215,15 @@ def _hand(machine: Machine, grab: str) -> str:
 def _write_weld(root, machine: Machine, grab: str, name: str) -> None:
     """Add the inactive weld between a grab and an object."""
     root.equality.add(
-        "weld", name=f"{name}_held", body1=_hand(machine, grab), body2=name, active=False,
+        "weld", name=f"{name}_held", body1=_grab_body(machine, grab), body2=name, active=False,
         solref=(0.01, 1.0), solimp=(0.99, 0.999, 0.001, 0.5, 2),
     )  # fmt: skip
 
 
 def _write_log(root, name: str, log: LogOnGround, machine: Machine, where: str):
     """Add a log on the ground and return its body."""
-    _need_axis(machine, log.grab, f"{where}.grab")
-    hand = _hand(machine, log.grab)
+    _check_axis(machine, log.grab, f"{where}.grab")
+    hand = _grab_body(machine, log.grab)
     pocket = root.find("site", f"{log.grab}_pocket")
     if pocket is None:
         message = f"link {hand!r} needs a box site '{log.grab}_pocket' in the MJCF to hold a log"
@@ -215,13 +233,11 @@ def _write_log(root, name: str, log: LogOnGround, machine: Machine, where: str):
         raise InputError(f"{where}.diameter", message)
     radius, half, mass = log.diameter / 2.0, log.length / 2.0, log.mass
     turn = (math.cos(log.direction / 2.0), 0.0, 0.0, math.sin(log.direction / 2.0))
-    place = (*log.position, radius - _SINK)
+    place = (*log.position, radius - _LOG_PENETRATION)
     body = root.worldbody.add("body", name=name, pos=place, quat=turn)
     across = mass * (3.0 * radius**2 + log.length**2) / 12.0
-    body.add(
-        "inertial", mass=mass, pos=(0, 0, 0), diaginertia=(mass * radius**2 / 2, across, across)
-    )
-    body.add("joint", name=name, type="free", damping=_ROLLING, limited="false")
+    body.add("inertial", mass=mass, pos=(0, 0, 0), diaginertia=(mass * radius**2 / 2, across, across))
+    body.add("joint", name=name, type="free", damping=_LOG_DAMPING, limited="false")
     body.add(
         "geom", name=name, type="capsule", size=(radius,), contype=2, conaffinity=1, mass=0,
         fromto=(radius - half, 0, 0, half - radius, 0, 0), group=3,
@@ -246,7 +262,7 @@ def _draw_log(body, name: str, log: LogOnGround) -> None:
 def _write_tree(root, name: str, tree: StandingTree, machine: Machine, where: str) -> None:
     """Add stump, stem, crown and root springs of a tree."""
     for part in ("saw", "grab"):
-        _need_axis(machine, getattr(tree, part), f"{where}.{part}")
+        _check_axis(machine, getattr(tree, part), f"{where}.{part}")
     x, y = tree.position
     radius, half = tree.diameter / 2.0, tree.height / 2.0
     mass = tree.density * math.pi * radius**2 * tree.height
@@ -255,19 +271,18 @@ def _write_tree(root, name: str, tree: StandingTree, machine: Machine, where: st
         "geom", name=f"{name}_stump", type="cylinder", size=(radius * 1.05, tree.kerf / 2.0),
         pos=(x, y, tree.kerf / 2.0), contype=1, conaffinity=2, **bark,
     )  # fmt: skip
-    body = root.worldbody.add("body", name=name, pos=(x, y, tree.kerf + _GAP))
+    body = root.worldbody.add("body", name=name, pos=(x, y, tree.kerf + _CUT_WIDTH))
     across = mass * (3.0 * radius**2 + tree.height**2) / 12.0
-    body.add(
-        "inertial", mass=mass, pos=(0, 0, half), diaginertia=(across, across, mass * radius**2 / 2)
-    )
+    body.add("inertial", mass=mass, pos=(0, 0, half), diaginertia=(across, across, mass * radius**2 / 2))
     for axis, way in zip("xyz", np.eye(3), strict=True):
-        sag = mass * _GRAVITY / _ROOT if axis == "z" else 0.0  # springref cancels the tree's weight
+        sag = mass * _GRAVITY / _ROOT_STIFFNESS if axis == "z" else 0.0  # springref cancels the tree's weight
         body.add(
-            "joint", name=f"{name}_{axis}", type="slide", axis=way, stiffness=_ROOT,
-            damping=0.05 * _ROOT, limited="false", springref=sag,
+            "joint", name=f"{name}_{axis}", type="slide", axis=way, stiffness=_ROOT_STIFFNESS,
+            damping=0.05 * _ROOT_STIFFNESS, limited="false", springref=sag,
         )  # fmt: skip
     body.add(
-        "joint", name=f"{name}_turn", type="ball", stiffness=_ROOT_TURN, damping=0.05 * _ROOT_TURN,
+        "joint", name=f"{name}_turn", type="ball", stiffness=_ROOT_ROTATION_STIFFNESS,
+        damping=0.05 * _ROOT_ROTATION_STIFFNESS,
         limited="false",
     )  # fmt: skip
     body.add(
@@ -284,11 +299,7 @@ def _write_tree(root, name: str, tree: StandingTree, machine: Machine, where: st
 
 def object_joints(model: mujoco.MjModel) -> list[tuple[int, int]]:
     """Return (joint id, its index in `qpos`) of all joints of plates, trees and logs."""
-    return [
-        (j, int(model.jnt_qposadr[j]))
-        for j in range(model.njnt)
-        if is_surrounding_object(model.joint(j).name)
-    ]
+    return [(j, int(model.jnt_qposadr[j])) for j in range(model.njnt) if is_surrounding_object(model.joint(j).name)]
 
 
 def is_surrounding_object(name: str) -> bool:
@@ -310,9 +321,16 @@ def log_grip(model: mujoco.MjModel, log: LogOnGround) -> np.ndarray:
     """
     site, radius = model.site(f"{log.grab}_pocket"), log.diameter / 2.0
     low, high = site.pos - site.size + (radius, 0, radius), site.pos + site.size - (0, 0, radius)
-    reach = log.length / 2.0 - _END
+    reach = log.length / 2.0 - _LOG_END_LENGTH
     return grip_parameters(
-        log.closed, log.open, 1, _ASKEW, 0.5 * (low + high), 0.5 * (high - low), 0, (-reach, reach)
+        log.closed,
+        log.open,
+        1,
+        _MAX_LOG_ANGLE,
+        0.5 * (low + high),
+        0.5 * (high - low),
+        0,
+        (-reach, reach),
     )
 
 
@@ -323,9 +341,7 @@ class Surroundings:
         events: list of (time [s], description of the event).
     """
 
-    def __init__(
-        self, machine: Machine, model: mujoco.MjModel, things: tuple[SurroundingObject, ...]
-    ) -> None:
+    def __init__(self, machine: Machine, model: mujoco.MjModel, things: tuple[SurroundingObject, ...]) -> None:
         """Find the objects in the model.
 
         Args:
@@ -336,18 +352,18 @@ class Surroundings:
         self.events: list[tuple[float, str]] = []
         self._model = model
         self._trees = [
-            _Standing(machine, model, f"tree_{n}", thing)
+            _TreeState(machine, model, f"tree_{n}", thing)
             for n, thing in enumerate(things)
             if isinstance(thing, StandingTree)
         ]
         self._logs = [
-            _Grip(machine, model, f"log_{n}", thing.grab, log_grip(model, thing))
+            _Gripper(machine, model, f"log_{n}", thing.grab, log_grip(model, thing))
             for n, thing in enumerate(things)
             if isinstance(thing, LogOnGround)
         ]
 
     @property
-    def changes(self) -> bool:
+    def has_trees_or_logs(self) -> bool:
         """Whether there is any tree or log, so that `update` must be called."""
         return bool(self._trees or self._logs)
 
@@ -365,20 +381,20 @@ class Surroundings:
             change = log.update(data)
             if change == TAKEN:
                 self.events.append((time, "the grapple holds the log"))
-            elif change == LET_GO:
+            elif change == RELEASED:
                 self.events.append((time, "the grapple lets the log go"))
 
-    def restore(self) -> None:
+    def restore_model(self) -> None:
         """Undo the changes that cutting made to the model."""
         for tree in self._trees:
-            tree.plant()
+            tree.restore_model()
 
 
-class _Grip:
+class _Gripper:
     """A grab and one object that it can hold."""
 
     def __init__(self, machine: Machine, model: mujoco.MjModel, name: str, grab: str, grip) -> None:
-        self._hand, self._thing = model.body(_hand(machine, grab)).id, model.body(name).id
+        self._hand, self._thing = model.body(_grab_body(machine, grab)).id, model.body(name).id
         self._jaw = int(model.joint(machine.axes[grab].joint).qposadr[0])
         self._weld, self._rows, self._grip = model.equality(f"{name}_held").id, model.eq_data, grip
 
@@ -394,16 +410,14 @@ class _Grip:
         return change
 
 
-class _Standing:
+class _TreeState:
     """One tree of a run."""
 
-    def __init__(
-        self, machine: Machine, model: mujoco.MjModel, name: str, tree: StandingTree
-    ) -> None:
+    def __init__(self, machine: Machine, model: mujoco.MjModel, name: str, tree: StandingTree) -> None:
         self._model, self._tree, self.name = model, tree, name
         saw = machine.link_of(machine.axes[tree.saw].joint)
-        grip = grip_parameters(tree.closed, tree.closed, 2, _LEANING, *_STEM_POCKET, 2)
-        self._grip = _Grip(machine, model, name, tree.grab, grip)
+        grip = grip_parameters(tree.closed, tree.closed, 2, _MAX_STEM_ANGLE, *_STEM_POCKET, 2)
+        self._grip = _Gripper(machine, model, name, tree.grab, grip)
         self._saw = model.body(saw).id
         self._spin = model.joint(machine.axes[tree.saw].joint).dofadr[0]
         self._body = model.body(name).id
@@ -422,50 +436,48 @@ class _Standing:
         self._damping = model.dof_damping[self._dofs].copy()
         self.depth, self.cut = 0.0, False
 
-    def plant(self) -> None:
+    def restore_model(self) -> None:
         """Undo the changes that cutting made to the model."""
         self._model.jnt_stiffness[self._joints] = self._stiffness
         self._model.dof_damping[self._dofs] = self._damping
-        self._touch(True)
+        self._set_disc_contacts(True)
         self._model.geom_contype[self._stem] = self._model.geom_conaffinity[self._stem] = 3
 
-    def _touch(self, on: bool) -> None:
+    def _set_disc_contacts(self, on: bool) -> None:
         """Enable or disable the contacts of the saw disc."""
         model = self._model
-        model.geom_contype[self._disc], model.geom_conaffinity[self._disc] = (
-            self._solid if on else (0, 0)
-        )
+        model.geom_contype[self._disc], model.geom_conaffinity[self._disc] = self._solid if on else (0, 0)
 
     def update(self, data: mujoco.MjData, period: float) -> list[str]:
         """Update cutting and gripping of the tree; return descriptions of new events."""
         said: list[str] = []
         spin = abs(float(data.qvel[self._spin]))
         data.xfrc_applied[self._saw] = 0.0
-        self._touch(spin < _CUTTING)
-        if not self.cut and spin >= _CUTTING:
-            self._saw_on(data, period, spin)
+        self._set_disc_contacts(spin < _MIN_CUTTING_SPEED)
+        if not self.cut and spin >= _MIN_CUTTING_SPEED:
+            self._advance_cut(data, period, spin)
             if self.depth >= 0.98 * self._tree.diameter:
-                self._fell()
+                self._release_root()
                 said.append("the tree is cut")
         change = self._grip.update(data)
         if change == TAKEN:
             self._model.geom_contype[self._stem] = 2  # the ground only: head and stem are one
             self._model.geom_conaffinity[self._stem] = 1
             said.append("the grab holds the tree")
-        elif change == LET_GO:
+        elif change == RELEASED:
             said.append("the grab lets the tree go")
         return said
 
-    def _saw_on(self, data: mujoco.MjData, period: float, spin: float) -> None:
+    def _advance_cut(self, data: mujoco.MjData, period: float, spin: float) -> None:
         """Advance the cut to the edge of the disc and apply cutting torque and feed force."""
         stem, saw = data.xpos[self._body], data.xpos[self._saw]
         axis = data.xmat[self._saw].reshape(3, 3)[:, 2]
         height = saw[2] - (axis[:2] @ (stem[:2] - saw[:2])) / max(abs(axis[2]), 0.3)
-        if abs(height - self._tree.kerf) > _HIGH:
+        if abs(height - self._tree.kerf) > _MAX_HEIGHT_ERROR:
             return
         way = stem[:2] - saw[:2]
         far = float(np.hypot(*way))
-        if abs(float(saw[2]) - self._tree.kerf) > 2.0 * _HIGH + self._radius:
+        if abs(float(saw[2]) - self._tree.kerf) > 2.0 * _MAX_HEIGHT_ERROR + self._radius:
             return
         reach = self._radius - (far - self._tree.diameter / 2.0)
         fresh = min(reach, self._tree.diameter) - self.depth
@@ -474,14 +486,14 @@ class _Standing:
         self.depth += fresh
         radius = self._tree.diameter / 2.0
         chord = 2.0 * math.sqrt(max(radius**2 - (radius - self.depth) ** 2, 0.0))
-        power = self._tree.energy * _GAP * chord * fresh / period
+        power = self._tree.energy * _CUT_WIDTH * chord * fresh / period
         torque = power / spin
         direction = -math.copysign(1.0, float(data.qvel[self._spin]))
-        feed = _RIM * torque / self._radius
+        feed = _FEED_FORCE_RATIO * torque / self._radius
         data.xfrc_applied[self._saw, :2] = -feed * way / max(far, 1e-9)
         data.xfrc_applied[self._saw, 3:] = direction * torque * axis
 
-    def _fell(self) -> None:
+    def _release_root(self) -> None:
         """Remove the root's stiffness so that the tree can fall."""
         self._model.jnt_stiffness[self._joints] = 0.0
         self._model.dof_damping[self._dofs] = (5.0, 5.0, 5.0, 50.0, 50.0, 50.0)

@@ -1,6 +1,6 @@
 r"""Parameters of soil and bucket in SI units, their flat array, and the state of a bucket.
 
-The module provides three typical soils and the bucket of the CAT 215. `soil_parameters` packs soil,
+The module provides three typical soils and the bucket of the CAT 215. `pack_soil_parameters` packs soil,
 bucket and profile into a flat array for compiled functions; constants name its indices and those of
 the bucket state and of the result of a step.
 
@@ -39,7 +39,7 @@ import numpy as np
 import pydantic
 from pydantic import Field
 
-from hydrotele.core.datafile import Facts
+from hydrotele.core.datafile import StrictModel
 from hydrotele.core.errors import InputError
 
 
@@ -82,7 +82,7 @@ CAT215 = Bucket(
 edge thickness is assumed. It holds 0.59 m^3 struck and 0.91 m^3 heaped at 35 deg."""
 
 
-def outline_from_edge(bucket: Bucket) -> np.ndarray:
+def outline_relative_to_edge(bucket: Bucket) -> np.ndarray:
     """Return the outline (m, 2) of the interior relative to the edge [m].
 
     Raises:
@@ -97,7 +97,7 @@ def outline_from_edge(bucket: Bucket) -> np.ndarray:
 GRAVITY = 9.81  # m/s^2
 
 
-class Soil(Facts):
+class Soil(StrictModel):
     """A Mohr-Coulomb soil, with parameters of its loosened state.
 
     Attributes:
@@ -126,15 +126,13 @@ class Soil(Facts):
     damping_time: Annotated[float, Field(ge=0.0, le=0.05)] = 0.01
 
     @pydantic.model_validator(mode="after")
-    def _steel_is_smoother_than_soil(self) -> Self:
+    def _check_consistency(self) -> Self:
         if self.tool_friction > self.friction:
             raise ValueError("tool_friction exceeds friction: soil would fail before it slides")
         if self.adhesion > self.cohesion:
             raise ValueError("adhesion exceeds cohesion: soil would fail before it lets go")
         if self.cut_slope < self.repose:
-            raise ValueError(
-                "cut_slope is below repose: the bank stands at a steeper slope than loose soil"
-            )
+            raise ValueError("cut_slope is below repose: the bank stands at a steeper slope than loose soil")
         return self
 
 
@@ -165,29 +163,29 @@ pressure is mobilised after about 2 % of the height of a wall (Clough and Duncan
 
 (
     DENSITY, COHESION, FRICTION, TOOL_FRICTION, ADHESION, SWELL, REPOSE, CUT_SLOPE, STIFFNESS,
-    DAMPING, WIDTH, INNER_WIDTH, EDGE, FLOOR_ANGLE, FLOOR_LENGTH, HEEL_X, HEEL_Z, START, CELL,
-    SIZE, GRAVITY_AT, CORNERS,
+    DAMPING, WIDTH, INNER_WIDTH, EDGE_THICKNESS, FLOOR_ANGLE, FLOOR_LENGTH, HEEL_X, HEEL_Z, PROFILE_START, CELL_LENGTH,
+    BUCKET_SIZE, GRAVITY_INDEX, CORNER_COUNT,
 ) = range(22)  # fmt: skip
-OUTLINE = 22
+OUTLINE_START = 22
 
 (
-    CARRIED, FACE, TIP, FLOOR, HEEL, SLIDE, LAST_R, LAST_Z, LAST_HEEL_R, LAST_HEEL_Z, FRONT, PLACED,
-    LOW, HIGH, LOST, DEPTH,
+    CARRIED_VOLUME, FACE, TIP, FLOOR, HEEL, SLIDE, LAST_R, LAST_Z, LAST_HEEL_R, LAST_HEEL_Z, CUT_FRONT, IS_INITIALISED,
+    FIRST_SLIDING_CELL, LAST_SLIDING_CELL, LOST_VOLUME, DEPTH,
 ) = range(16)  # fmt: skip
-STATE = 16
+STATE_SIZE = 16
 """Indices of the bucket state: loose volume carried [m^3]; deflections of the soil against face,
 edge, floor, heel and along the heel [m]; previous positions of edge and heel [m]; radius to which
 soil has been cut [m]; whether the state is initialised; first and last cell that may still slide;
 loose volume that left the profile [m^3]; depth of the edge [m]."""
 
 (FORCE_R, FORCE_Z, MOMENT, MASS, MASS_R, MASS_Z) = range(6)
-OUT = 6
+RESULT_SIZE = 6
 """Indices of the result of a step: force of the soil on the bucket at its edge, outwards and up
 [N]; moment about the edge, positive if it raises the outboard end [N m]; mass carried [kg] and its
 centre relative to the edge, outwards and up [m]."""
 
 
-def soil_parameters(soil: Soil, bucket: Bucket, start: float, cell: float) -> np.ndarray:
+def pack_soil_parameters(soil: Soil, bucket: Bucket, start: float, cell: float) -> np.ndarray:
     """Pack the parameters of soil, bucket and profile into an array for compiled functions.
 
     Args:
@@ -206,7 +204,7 @@ def soil_parameters(soil: Soil, bucket: Bucket, start: float, cell: float) -> np
         raise InputError("soil profile", f"cells of {cell} m; 0.01 to 0.5 m are allowed")
     if not (math.isfinite(start) and start >= 0.0):
         raise InputError("soil profile", f"starts at a radius of {start} m; it must be at least 0")
-    outline = outline_from_edge(bucket)
+    outline = outline_relative_to_edge(bucket)
     edge_x, edge_z = bucket.outline[0]
     return np.array([
         soil.density, soil.cohesion, soil.friction, soil.tool_friction, soil.adhesion, soil.swell,
@@ -217,15 +215,15 @@ def soil_parameters(soil: Soil, bucket: Bucket, start: float, cell: float) -> np
     ])  # fmt: skip
 
 
-def bucket_state() -> np.ndarray:
+def make_bucket_state() -> np.ndarray:
     """Return the state (STATE,) of an empty bucket: zeros.
 
     The first step initialises the positions. Setting the array to zero restarts the bucket.
     """
-    return np.zeros(STATE)
+    return np.zeros(STATE_SIZE)
 
 
-def level_profile(count: int, height: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def make_level_profile(count: int, height: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Return a level profile of undisturbed soil.
 
     Args:
@@ -244,13 +242,13 @@ def level_profile(count: int, height: float = 0.0) -> tuple[np.ndarray, np.ndarr
     return np.full(count, float(height)), np.zeros(count)
 
 
-def soil_mass(numbers: np.ndarray, surface: np.ndarray, loose: np.ndarray,
+def soil_mass(parameters: np.ndarray, surface: np.ndarray, loose: np.ndarray,
               state: np.ndarray) -> float:  # fmt: skip
     """Return the total mass of soil above height 0, in the bucket and lost at the ends [kg].
 
     `soil_step` conserves it up to rounding.
     """
-    n = numbers
+    n = parameters
     thickness = np.sum(surface - loose) + np.sum(loose) / n[SWELL]
-    volume = thickness * n[CELL] * n[WIDTH] + (state[CARRIED] + state[LOST]) / n[SWELL]
+    volume = thickness * n[CELL_LENGTH] * n[WIDTH] + (state[CARRIED_VOLUME] + state[LOST_VOLUME]) / n[SWELL]
     return float(volume * n[DENSITY])

@@ -14,7 +14,7 @@ Fundamental Equation of Earthmoving (Reece 1964; McKyes and Ali 1977; McKyes 198
 The plane is the one with the minimum N_g. Luengo, Singh and Cannon (1998) tilt it by the slope of
 the surface and load it with the weight Q of the soil in the bucket. All angles are in radians.
 
-`bucket_wrench` converts forces and load to the wrench on a MuJoCo body about its centre of mass.
+`compute_bucket_wrench` converts forces and load to the wrench on a MuJoCo body about its centre of mass.
 """
 
 import math
@@ -23,44 +23,44 @@ from typing import NamedTuple
 from hydrotele.core.compiled import allocation_free
 from hydrotele.soil.facts import (
     ADHESION,
-    CARRIED,
-    CELL,
+    BUCKET_SIZE,
+    CARRIED_VOLUME,
+    CELL_LENGTH,
     COHESION,
-    CORNERS,
+    CORNER_COUNT,
+    CUT_FRONT,
     DAMPING,
     DENSITY,
     DEPTH,
-    EDGE,
+    EDGE_THICKNESS,
     FACE,
+    FIRST_SLIDING_CELL,
     FLOOR,
     FLOOR_ANGLE,
     FLOOR_LENGTH,
     FORCE_R,
     FORCE_Z,
     FRICTION,
-    FRONT,
     GRAVITY,
-    GRAVITY_AT,
+    GRAVITY_INDEX,
     HEEL,
     HEEL_X,
     HEEL_Z,
-    HIGH,
     INNER_WIDTH,
+    IS_INITIALISED,
     LAST_HEEL_R,
     LAST_HEEL_Z,
     LAST_R,
+    LAST_SLIDING_CELL,
     LAST_Z,
-    LOST,
-    LOW,
+    LOST_VOLUME,
     MASS,
     MASS_R,
     MASS_Z,
     MOMENT,
-    OUT,
-    OUTLINE,
-    PLACED,
+    OUTLINE_START,
     REPOSE,
-    SIZE,
+    RESULT_SIZE,
     SLIDE,
     STIFFNESS,
     SWELL,
@@ -68,11 +68,11 @@ from hydrotele.soil.facts import (
     TOOL_FRICTION,
     WIDTH,
 )
-from hydrotele.soil.terrain import cell_of, cut_cells_, lay_down_, slide_cells_, surface_height
+from hydrotele.soil.terrain import cut_cells, find_cell, lay_down, slide_cells, surface_height
 
 
 @allocation_free
-def held_soil(n, attitude, level, out):
+def compute_held_soil(n, attitude, level, out):
     """Compute the volume of soil that a tilted bucket holds, and its centre.
 
     The soil fills the bucket below a surface at the angle of repose, which rises from the lower rim
@@ -93,8 +93,8 @@ def held_soil(n, attitude, level, out):
     Source: geometry; the heap as in SAE J296, with the angle of repose for its 1:1.
     """
     c, s = math.cos(attitude), math.sin(attitude)
-    count = int(n[CORNERS])
-    last = OUTLINE + 2 * (count - 1)
+    count = int(n[CORNER_COUNT])
+    last = OUTLINE_START + 2 * (count - 1)
     rim_r, rim_z = c * n[last] - s * n[last + 1], s * n[last] + c * n[last + 1]
     low_r, low_z = (0.0, 0.0) if rim_z >= 0.0 else (rim_r, rim_z)
     out[3] = low_r
@@ -111,7 +111,7 @@ def held_soil(n, attitude, level, out):
     r0, z0 = rim_r, rim_z
     over0 = z0 - low_z - slope * (r0 - low_r)
     for i in range(count):
-        x, y = n[OUTLINE + 2 * i], n[OUTLINE + 2 * i + 1]
+        x, y = n[OUTLINE_START + 2 * i], n[OUTLINE_START + 2 * i + 1]
         r1, z1 = c * x - s * y, s * x + c * y
         over1 = z1 - low_z - slope * (r1 - low_r)
         for part in range(2):  # intersection of the side with the surface, then its end if below
@@ -152,15 +152,15 @@ def held_soil(n, attitude, level, out):
     out[2] = moment_z / area if area > 1e-9 else 0.0
 
 
-STEEPEST_RAKE = 0.5 * math.pi  # rad; soil that sticks to a steeper blade acts as the blade
-FLATTEST_RAKE = math.radians(15.0)  # rad, minimum rake
-WIDEST_FAN = math.radians(150.0)  # rad, rake + delta + phi above which Coulomb's plane fails
-STEEPEST_SLOPE = 0.6  # maximum slope as a fraction of the friction angle
-_LEAST_SQUARE = 0.05  # lower bound that avoids jamming of nearly parallel blade and surface
+MAX_RAKE = 0.5 * math.pi  # rad; soil that sticks to a steeper blade acts as the blade
+MIN_RAKE = math.radians(15.0)  # rad, minimum rake
+MAX_FAN_ANGLE = math.radians(150.0)  # rad, rake + delta + phi above which Coulomb's plane fails
+MAX_SLOPE_RATIO = 0.6  # maximum slope as a fraction of the friction angle
+_MIN_SQUARE = 0.05  # lower bound that avoids jamming of nearly parallel blade and surface
 
 
 @allocation_free
-def failure_plane(rake, slope, friction, tool_friction):
+def failure_plane_angle(rake, slope, friction, tool_friction):
     """Return the angle between surface and failure plane that minimises N_g.
 
     Setting the derivative of `N_g(cot beta)` to zero gives a quadratic equation.
@@ -177,7 +177,7 @@ def failure_plane(rake, slope, friction, tool_friction):
     Source: McKyes 1985, chapter 3; Coulomb's passive wedge.
 
     >>> import math
-    >>> smooth_wall = failure_plane(math.pi / 2, 0.0, math.radians(30), 0.0)
+    >>> smooth_wall = failure_plane_angle(math.pi / 2, 0.0, math.radians(30), 0.0)
     >>> round(math.degrees(smooth_wall), 6)  # 45 - phi / 2
     30.0
     """
@@ -185,7 +185,7 @@ def failure_plane(rake, slope, friction, tool_friction):
     square = (math.sin(tool_friction + friction) * math.sin(rake + tool_friction - slope)) / (
         math.sin(rake) * math.sin(friction + slope)
     )
-    root = math.sqrt(max(square, _LEAST_SQUARE))
+    root = math.sqrt(max(square, _MIN_SQUARE))
     plane = math.atan2(math.sin(fan), root - math.cos(fan))
     return min(max(plane, math.radians(5.0)), math.radians(85.0))
 
@@ -299,7 +299,7 @@ def bearing_pressure(overburden, cohesion, friction, tilt):
 
 
 @allocation_free
-def acting_rake(rake, slope, friction, tool_friction):
+def limit_rake(rake, slope, friction, tool_friction):
     """Return the effective rake relative to the surface, limited to the range of the equation.
 
     A wedge of soil sticks to a blade that is steeper than upright, or too steep for its friction
@@ -316,12 +316,12 @@ def acting_rake(rake, slope, friction, tool_friction):
 
     Source: see above.
     """
-    steepest = min(STEEPEST_RAKE, WIDEST_FAN - friction - tool_friction)
-    return min(max(rake + slope, FLATTEST_RAKE), steepest)
+    steepest = min(MAX_RAKE, MAX_FAN_ANGLE - friction - tool_friction)
+    return min(max(rake + slope, MIN_RAKE), steepest)
 
 
 @allocation_free
-def acting_slope(slope, friction):
+def limit_slope(slope, friction):
     """Return the slope of the surface, limited to the range in which a failure plane can form.
 
     Args:
@@ -333,21 +333,21 @@ def acting_slope(slope, friction):
 
     Source: Coulomb's forces grow without bound as the slope approaches phi.
     """
-    limit = STEEPEST_SLOPE * friction
+    limit = MAX_SLOPE_RATIO * friction
     return min(max(slope, -limit), limit)
 
 
-AHEAD = 1.5  # cells, distance ahead of the edge at which the depth of a cut is read: not yet cut
-PLAY = 0.02  # m, distance that the edge moves back before it pushes soil outwards
+DEPTH_READING_DISTANCE = 1.5  # cells, distance ahead of the edge at which the depth of a cut is read: not yet cut
+PUSH_DEAD_BAND = 0.02  # m, distance that the edge moves back before it pushes soil outwards
 SPILL_TIME = 0.3  # s, time constant with which excess soil falls out of a tilted bucket
-SPILL_LEAST = 0.2  # m^3/s, minimum spill rate, so that the spilling ends
-HEEL_CONTACT = 0.4  # m, maximum contact length of the heel, reached at a quarter of it in depth
-SWEEPS = 2  # sweeps of sliding soil per step
-EARTH_AT_REST = 0.5  # ratio of horizontal to vertical pressure next to a blade
+MIN_SPILL_RATE = 0.2  # m^3/s, minimum spill rate, so that the spilling ends
+MAX_HEEL_CONTACT = 0.4  # m, maximum contact length of the heel, reached at a quarter of it in depth
+SLIDE_SWEEPS = 2  # sweeps of sliding soil per step
+EARTH_PRESSURE_RATIO = 0.5  # ratio of horizontal to vertical pressure next to a blade
 
 
 @allocation_free
-def cutting_force(n, depth, loose, rake, slope, load, out):
+def compute_cutting_force(n, depth, loose, rake, slope, load, out):
     """Compute the force of the soil on a blade that is drawn towards the machine.
 
     Args:
@@ -368,12 +368,12 @@ def cutting_force(n, depth, loose, rake, slope, load, out):
     if depth <= 0.0:
         return
     phi, delta = n[FRICTION], n[TOOL_FRICTION]
-    slope = acting_slope(slope, phi)
-    rake = acting_rake(rake, slope, phi, delta)
-    plane = failure_plane(rake, slope, phi, delta)
+    slope = limit_slope(slope, phi)
+    rake = limit_rake(rake, slope, phi, delta)
+    plane = failure_plane_angle(rake, slope, phi, delta)
     across = depth * math.cos(slope)
     bank = min(max(depth - loose, 0.0), depth) * math.cos(slope)
-    weight = n[DENSITY] * n[GRAVITY_AT] * across * across * n[WIDTH]
+    weight = n[DENSITY] * n[GRAVITY_INDEX] * across * across * n[WIDTH]
     force = weight * wedge_weight_factor(rake, slope, phi, delta, plane)
     force += n[COHESION] * bank * n[WIDTH] * cohesion_factor(rake, phi, delta, plane)
     stuck = n[ADHESION] * bank * n[WIDTH]
@@ -387,7 +387,7 @@ def cutting_force(n, depth, loose, rake, slope, load, out):
 
 
 @allocation_free
-def yielding_force(n, state, place, along, rate, low, high):
+def update_yielding_force(n, state, place, along, rate, low, high):
     """Return the force of one surface along its direction, from a spring and damper that yield.
 
     Args:
@@ -411,21 +411,24 @@ def yielding_force(n, state, place, along, rate, low, high):
 
 
 @allocation_free
-def _spread(n, surface, loose, state, first, second, volume):
-    lost = lay_down_(n, surface, loose, first, 0.5 * volume)
-    lost += lay_down_(n, surface, loose, second, 0.5 * volume)
-    state[LOST] += lost
-    _touch(state, min(first, second), max(first, second), len(surface))
+def _drop_soil(n, surface, loose, state, first, second, volume):
+    lost = lay_down(n, surface, loose, first, 0.5 * volume)
+    lost += lay_down(n, surface, loose, second, 0.5 * volume)
+    state[LOST_VOLUME] += lost
+    _mark_cells(state, min(first, second), max(first, second), len(surface))
 
 
 @allocation_free
-def _touch(state, low, high, count):
+def _mark_cells(state, low, high, count):
     """Enlarge the range of cells that may slide."""
     low, high = max(low - 1, 0), min(high + 1, count - 1)
-    if state[HIGH] <= state[LOW]:
-        state[LOW], state[HIGH] = low, high
+    if state[LAST_SLIDING_CELL] <= state[FIRST_SLIDING_CELL]:
+        state[FIRST_SLIDING_CELL], state[LAST_SLIDING_CELL] = low, high
     else:
-        state[LOW], state[HIGH] = min(state[LOW], low), max(state[HIGH], high)
+        state[FIRST_SLIDING_CELL], state[LAST_SLIDING_CELL] = (
+            min(state[FIRST_SLIDING_CELL], low),
+            max(state[LAST_SLIDING_CELL], high),
+        )
 
 
 class EdgeMotion(NamedTuple):
@@ -447,14 +450,14 @@ class EdgeMotion(NamedTuple):
 
 
 @allocation_free
-def _press(n, surface, loose, state, edge, dt, out):
+def _compute_forces(n, surface, loose, state, edge, dt, out):
     """Compute the forces of all surfaces; return the edge depths on the inner and outer side."""
     r, z, r_rate, z_rate, attitude = edge
     phi, delta = n[FRICTION], n[TOOL_FRICTION]
-    reach = AHEAD * n[CELL]
+    reach = DEPTH_READING_DISTANCE * n[CELL_LENGTH]
     height = surface_height(n, surface, r - reach)
-    inside = min(height - z, n[SIZE])  # higher soil falls into the mouth
-    outside = min(surface_height(n, surface, r + reach) - z, n[SIZE])
+    inside = min(height - z, n[BUCKET_SIZE])  # higher soil falls into the mouth
+    outside = min(surface_height(n, surface, r + reach) - z, n[BUCKET_SIZE])
     dr, dz = r - state[LAST_R], z - state[LAST_Z]
     # the face
     if inside > 0.0:
@@ -462,11 +465,11 @@ def _press(n, surface, loose, state, edge, dt, out):
         over = surface_height(n, loose, r - reach)
         rake = attitude + math.pi - n[FLOOR_ANGLE]
         rake -= 2.0 * math.pi * math.floor((rake + math.pi) / (2.0 * math.pi))
-        load = state[CARRIED] / n[SWELL] * n[DENSITY] * n[GRAVITY_AT]
-        cutting_force(n, inside, over, rake, slope, load, out)
+        load = state[CARRIED_VOLUME] / n[SWELL] * n[DENSITY] * n[GRAVITY_INDEX]
+        compute_cutting_force(n, inside, over, rake, slope, load, out)
         limit = math.hypot(out[0], out[1])
         ar, az = (out[0] / limit, out[1] / limit) if limit > 0.0 else (1.0, 0.0)
-        f = yielding_force(n, state, FACE, -dr * ar - dz * az, -r_rate * ar - z_rate * az, 0.0,
+        f = update_yielding_force(n, state, FACE, -dr * ar - dz * az, -r_rate * ar - z_rate * az, 0.0,
                            limit)  # fmt: skip
         out[0], out[1] = f * ar, f * az
     else:
@@ -478,13 +481,13 @@ def _press(n, surface, loose, state, edge, dt, out):
     if deepest > 0.0:
         tilt = min(max(rake, 0.0), 0.5 * math.pi)
         c, s = math.cos(tilt), math.sin(tilt)
-        weight = n[DENSITY] * n[GRAVITY_AT]
+        weight = n[DENSITY] * n[GRAVITY_INDEX]
         contact = min(deepest / max(s, 0.1), n[FLOOR_LENGTH])
-        shear = n[ADHESION] + EARTH_AT_REST * 0.5 * weight * deepest * math.tan(delta)
+        shear = n[ADHESION] + EARTH_PRESSURE_RATIO * 0.5 * weight * deepest * math.tan(delta)
         rub = 2.0 * n[WIDTH] * contact * shear
-        sharp = n[EDGE] * n[WIDTH] * min(deepest / n[EDGE], 1.0)
+        sharp = n[EDGE_THICKNESS] * n[WIDTH] * min(deepest / n[EDGE_THICKNESS], 1.0)
         push = sharp * bearing_pressure(weight * deepest, n[COHESION], phi, 0.0) + rub
-        f = yielding_force(n, state, TIP, -dr * c - dz * s, -r_rate * c - z_rate * s, -rub, push)
+        f = update_yielding_force(n, state, TIP, -dr * c - dz * s, -r_rate * c - z_rate * s, -rub, push)
         out[0] += f * c
         out[1] += f * s
         yield_at = 0.0
@@ -492,7 +495,7 @@ def _press(n, surface, loose, state, edge, dt, out):
             contact = min(outside / max(s, 0.1), n[FLOOR_LENGTH])
             pressure = bearing_pressure(0.5 * weight * outside, n[COHESION], phi, tilt)
             yield_at = pressure * contact * n[WIDTH]
-        f = yielding_force(n, state, FLOOR, dr * s - dz * c, r_rate * s - z_rate * c, 0.0,
+        f = update_yielding_force(n, state, FLOOR, dr * s - dz * c, r_rate * s - z_rate * c, 0.0,
                            yield_at)  # fmt: skip
         out[0] -= f * s
         out[1] += f * c
@@ -502,14 +505,14 @@ def _press(n, surface, loose, state, edge, dt, out):
     c, s = math.cos(attitude), math.sin(attitude)
     from_edge_r, from_edge_z = n[HEEL_X] * c - n[HEEL_Z] * s, n[HEEL_X] * s + n[HEEL_Z] * c
     heel_r, heel_z = r + from_edge_r, z + from_edge_z
-    deep = min(surface_height(n, surface, heel_r) - heel_z, n[SIZE])
+    deep = min(surface_height(n, surface, heel_r) - heel_z, n[BUCKET_SIZE])
     if deep > 0.0:
         dr, dz = heel_r - state[LAST_HEEL_R], heel_z - state[LAST_HEEL_Z]
-        contact = min(4.0 * deep, HEEL_CONTACT)
-        pressure = bearing_pressure(0.5 * n[DENSITY] * n[GRAVITY_AT] * deep, n[COHESION], phi, 0.0)
-        up = yielding_force(n, state, HEEL, -dz, -dz / dt, 0.0, pressure * contact * n[WIDTH])
+        contact = min(4.0 * deep, MAX_HEEL_CONTACT)
+        pressure = bearing_pressure(0.5 * n[DENSITY] * n[GRAVITY_INDEX] * deep, n[COHESION], phi, 0.0)
+        up = update_yielding_force(n, state, HEEL, -dz, -dz / dt, 0.0, pressure * contact * n[WIDTH])
         rub = up * math.tan(delta)
-        back = yielding_force(n, state, SLIDE, -dr, -dr / dt, -rub, rub)
+        back = update_yielding_force(n, state, SLIDE, -dr, -dr / dt, -rub, rub)
         out[0] += back
         out[1] += up
         out[2] = from_edge_r * up - from_edge_z * back
@@ -521,7 +524,7 @@ def _press(n, surface, loose, state, edge, dt, out):
 
 
 @allocation_free
-def soil_step(n, surface, loose, state, edge, dt, out):
+def step_soil(n, surface, loose, state, edge, dt, out):
     """Move the bucket's edge through the soil and compute the force of the soil.
 
     The function allocates nothing and changes only its arguments, so every environment can run in
@@ -544,66 +547,69 @@ def soil_step(n, surface, loose, state, edge, dt, out):
     Source: this module and `terrain`.
     """
     r, z, attitude = edge.r, edge.z, edge.attitude
-    for i in range(OUT):
+    for i in range(RESULT_SIZE):
         out[i] = 0.0
-    if state[PLACED] == 0.0:
+    if state[IS_INITIALISED] == 0.0:
         c, s = math.cos(attitude), math.sin(attitude)
-        state[PLACED], state[LAST_R], state[LAST_Z], state[FRONT] = 1.0, r, z, r
+        state[IS_INITIALISED], state[LAST_R], state[LAST_Z], state[CUT_FRONT] = 1.0, r, z, r
         state[LAST_HEEL_R] = r + n[HEEL_X] * c - n[HEEL_Z] * s
         state[LAST_HEEL_Z] = z + n[HEEL_X] * s + n[HEEL_Z] * c
-        state[LOW], state[HIGH] = 0.0, len(surface) - 1.0
+        state[FIRST_SLIDING_CELL], state[LAST_SLIDING_CELL] = 0.0, len(surface) - 1.0
     z_before, count = state[LAST_Z], len(surface)
-    inside, outside = _press(n, surface, loose, state, edge, dt, out)
+    inside, outside = _compute_forces(n, surface, loose, state, edge, dt, out)
     state[DEPTH] = max(inside, 0.0)
     force_r, force_z, moment = out[FORCE_R], out[FORCE_Z], out[MOMENT]
-    here = cell_of(n, r)
+    here = find_cell(n, r)
     wall = here if inside > 0.0 or outside > 0.0 else -2  # cell that contains the bucket
     taken, pushed = 0.0, 0.0
-    if r < state[FRONT]:
-        taken = cut_cells_(n, surface, loose, state[FRONT], z_before, r, z)
-        state[FRONT] = r
-    elif r > state[FRONT] + PLAY:
-        pushed = cut_cells_(n, surface, loose, state[FRONT] + PLAY, z_before, r, z)
-        state[FRONT] = r - PLAY
+    if r < state[CUT_FRONT]:
+        taken = cut_cells(n, surface, loose, state[CUT_FRONT], z_before, r, z)
+        state[CUT_FRONT] = r
+    elif r > state[CUT_FRONT] + PUSH_DEAD_BAND:
+        pushed = cut_cells(n, surface, loose, state[CUT_FRONT] + PUSH_DEAD_BAND, z_before, r, z)
+        state[CUT_FRONT] = r - PUSH_DEAD_BAND
     if pushed > 0.0:
-        _spread(n, surface, loose, state, here + 1, here + 2, pushed)
-    state[CARRIED] += taken
-    if state[CARRIED] > 0.0:
-        held_soil(n, attitude, max(inside, 0.0), out)
+        _drop_soil(n, surface, loose, state, here + 1, here + 2, pushed)
+    state[CARRIED_VOLUME] += taken
+    if state[CARRIED_VOLUME] > 0.0:
+        compute_held_soil(n, attitude, max(inside, 0.0), out)
         most, rim = out[0], out[3]
         centre_r, centre_z = out[1], out[2]
-        excess = state[CARRIED] - most
+        excess = state[CARRIED_VOLUME] - most
         if excess > 0.0:
             if inside > 0.0:  # the pile ahead of the edge
                 falls = excess
-                _spread(n, surface, loose, state, here - 1, here - 2, falls)
+                _drop_soil(n, surface, loose, state, here - 1, here - 2, falls)
             else:
-                falls = min(excess, (excess / SPILL_TIME + SPILL_LEAST) * dt)
-                below = cell_of(n, r + rim)
-                _spread(n, surface, loose, state, below, below - 1, falls)
-            state[CARRIED] -= falls
-        out[MASS] = state[CARRIED] / n[SWELL] * n[DENSITY]
+                falls = min(excess, (excess / SPILL_TIME + MIN_SPILL_RATE) * dt)
+                below = find_cell(n, r + rim)
+                _drop_soil(n, surface, loose, state, below, below - 1, falls)
+            state[CARRIED_VOLUME] -= falls
+        out[MASS] = state[CARRIED_VOLUME] / n[SWELL] * n[DENSITY]
         out[MASS_R], out[MASS_Z] = centre_r, centre_z
     out[FORCE_R], out[FORCE_Z], out[MOMENT] = force_r, force_z, moment
     if wall > -2:
-        _touch(state, min(max(here - 1, 0), count - 1), min(max(here + 1, 0), count - 1), count)
-    if state[HIGH] > state[LOW]:
+        _mark_cells(state, min(max(here - 1, 0), count - 1), min(max(here + 1, 0), count - 1), count)
+    if state[LAST_SLIDING_CELL] > state[FIRST_SLIDING_CELL]:
         slid = False
-        low, high = int(state[LOW]), int(state[HIGH])
-        for _ in range(SWEEPS):
-            slid |= slide_cells_(n, surface, loose, low, high, wall)
+        low, high = int(state[FIRST_SLIDING_CELL]), int(state[LAST_SLIDING_CELL])
+        for _ in range(SLIDE_SWEEPS):
+            slid |= slide_cells(n, surface, loose, low, high, wall)
         if slid:
-            state[LOW], state[HIGH] = max(low - 1, 0), min(high + 1, count - 1)
+            state[FIRST_SLIDING_CELL], state[LAST_SLIDING_CELL] = (
+                max(low - 1, 0),
+                min(high + 1, count - 1),
+            )
         else:
-            state[LOW], state[HIGH] = 0.0, 0.0
+            state[FIRST_SLIDING_CELL], state[LAST_SLIDING_CELL] = 0.0, 0.0
 
 
 @allocation_free
-def bucket_wrench(out, edge, theta, centre, wrench):
+def compute_bucket_wrench(out, edge, theta, centre, wrench):
     """Compute the wrench of the soil and of the carried load on the bucket's body.
 
     Args:
-        out: (OUT,) of `soil_step` [N], [N m], [kg], [m].
+        out: (OUT,) of `step_soil` [N], [N m], [kg], [m].
         edge: (3,) position of the edge in the world [m].
         theta: azimuth of the edge about the swing axis, scalar [rad].
         centre: (3,) centre of mass of the bucket's body, `xipos` [m].

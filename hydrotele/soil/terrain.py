@@ -9,9 +9,9 @@ its ends, so that mass is conserved.
 import math
 
 from hydrotele.core.compiled import allocation_free
-from hydrotele.soil.facts import CELL, CUT_SLOPE, REPOSE, START, SWELL, WIDTH
+from hydrotele.soil.facts import CELL_LENGTH, CUT_SLOPE, PROFILE_START, REPOSE, SWELL, WIDTH
 
-SETTLED = 1e-4  # m, height difference above the stable one at which soil does not slide
+MIN_SLIDING_HEIGHT = 1e-4  # m, height difference above the stable one at which soil does not slide
 
 
 @allocation_free
@@ -28,7 +28,7 @@ def surface_height(n, surface, r):
 
     Source: linear interpolation.
     """
-    place = (r - n[START]) / n[CELL] - 0.5
+    place = (r - n[PROFILE_START]) / n[CELL_LENGTH] - 0.5
     last = len(surface) - 1
     if place <= 0.0:
         return surface[0]
@@ -39,7 +39,7 @@ def surface_height(n, surface, r):
 
 
 @allocation_free
-def cut_cells_(n, surface, loose, r0, z0, r1, z1):
+def cut_cells(n, surface, loose, r0, z0, r1, z1):
     """Remove the soil above the path of the edge in the cells that it sweeps.
 
     A partly swept cell has the mean height of its cut and uncut parts. A further sweep removes the
@@ -60,8 +60,8 @@ def cut_cells_(n, surface, loose, r0, z0, r1, z1):
     Source: conservation of volume.
     """
     last = len(surface) - 1
-    low = max((min(r0, r1) - n[START]) / n[CELL], 0.0)
-    high = min((max(r0, r1) - n[START]) / n[CELL], last + 1.0)
+    low = max((min(r0, r1) - n[PROFILE_START]) / n[CELL_LENGTH], 0.0)
+    high = min((max(r0, r1) - n[PROFILE_START]) / n[CELL_LENGTH], last + 1.0)
     if not low < high:
         return 0.0
     inwards = r1 < r0
@@ -72,7 +72,7 @@ def cut_cells_(n, surface, loose, r0, z0, r1, z1):
         if right <= left:
             continue
         remains = right - i if inwards else i + 1.0 - left
-        middle = n[START] + n[CELL] * 0.5 * (left + right)
+        middle = n[PROFILE_START] + n[CELL_LENGTH] * 0.5 * (left + right)
         over = surface[i] - (z0 + slope * (middle - r0))
         if over <= 0.0:
             continue
@@ -81,11 +81,11 @@ def cut_cells_(n, surface, loose, r0, z0, r1, z1):
         surface[i] -= depth
         loose[i] -= from_loose
         taken += from_loose + n[SWELL] * (depth - from_loose)
-    return taken * n[CELL] * n[WIDTH]
+    return taken * n[CELL_LENGTH] * n[WIDTH]
 
 
 @allocation_free
-def lay_down_(n, surface, loose, cell, volume):
+def lay_down(n, surface, loose, cell, volume):
     """Lay loose soil on a cell.
 
     Args:
@@ -102,14 +102,14 @@ def lay_down_(n, surface, loose, cell, volume):
     """
     if cell < 0 or cell >= len(surface):
         return volume
-    rise = volume / (n[CELL] * n[WIDTH])
+    rise = volume / (n[CELL_LENGTH] * n[WIDTH])
     surface[cell] += rise
     loose[cell] += rise
     return 0.0
 
 
 @allocation_free
-def cell_of(n, r):
+def find_cell(n, r):
     """Return the index of the cell at a radius; it may be outside the profile.
 
     Args:
@@ -121,11 +121,11 @@ def cell_of(n, r):
 
     Source: definition of the profile.
     """
-    return int(math.floor((r - n[START]) / n[CELL]))
+    return int(math.floor((r - n[PROFILE_START]) / n[CELL_LENGTH]))
 
 
 @allocation_free
-def slide_pair_(n, surface, loose, upper, lower):
+def slide_pair(n, surface, loose, upper, lower):
     """Let soil slide from one cell to its lower neighbour, at most to the stable slope.
 
     Args:
@@ -142,8 +142,8 @@ def slide_pair_(n, surface, loose, upper, lower):
     that breaks off is loose.
     """
     step = surface[upper] - surface[lower]
-    excess = step - n[REPOSE] * n[CELL]
-    if excess <= SETTLED:
+    excess = step - n[REPOSE] * n[CELL_LENGTH]
+    if excess <= MIN_SLIDING_HEIGHT:
         return False
     moved = min(0.5 * excess, loose[upper])
     if moved > 0.0:
@@ -151,8 +151,8 @@ def slide_pair_(n, surface, loose, upper, lower):
         loose[upper] -= moved
         surface[lower] += moved
         loose[lower] += moved
-    excess = step - 2.0 * moved - n[CUT_SLOPE] * n[CELL]
-    if excess > SETTLED and loose[upper] <= 0.0:
+    excess = step - 2.0 * moved - n[CUT_SLOPE] * n[CELL_LENGTH]
+    if excess > MIN_SLIDING_HEIGHT and loose[upper] <= 0.0:
         broken = excess / (1.0 + n[SWELL])
         surface[upper] -= broken
         surface[lower] += n[SWELL] * broken
@@ -162,7 +162,7 @@ def slide_pair_(n, surface, loose, upper, lower):
 
 
 @allocation_free
-def slide_cells_(n, surface, loose, low, high, wall):
+def slide_cells(n, surface, loose, low, high, wall):
     """Let the soil of a range of cells slide in one forward and one backward sweep.
 
     Args:
@@ -183,14 +183,14 @@ def slide_cells_(n, surface, loose, low, high, wall):
     for i in range(low, high):
         if i != wall and i + 1 != wall:
             if surface[i] >= surface[i + 1]:
-                slid |= slide_pair_(n, surface, loose, i, i + 1)
+                slid |= slide_pair(n, surface, loose, i, i + 1)
             else:
-                slid |= slide_pair_(n, surface, loose, i + 1, i)
+                slid |= slide_pair(n, surface, loose, i + 1, i)
     for j in range(low, high):
         i = high - 1 - (j - low)
         if i != wall and i + 1 != wall:
             if surface[i] >= surface[i + 1]:
-                slid |= slide_pair_(n, surface, loose, i, i + 1)
+                slid |= slide_pair(n, surface, loose, i, i + 1)
             else:
-                slid |= slide_pair_(n, surface, loose, i + 1, i)
+                slid |= slide_pair(n, surface, loose, i + 1, i)
     return slid

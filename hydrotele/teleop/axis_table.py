@@ -11,22 +11,32 @@ from typing import Any, TypeVar
 import numpy as np
 
 from hydrotele.core.compiled import compiled
-from hydrotele.core.datafile import parse, split_unit, suggest
+from hydrotele.core.datafile import split_unit, suggest_valid_name, validate_data
 from hydrotele.core.errors import InputError
 from hydrotele.machine.joystick import AXES, AxisGains, Joystick
-from hydrotele.scenario.teleoperation import Coupling, Regulate, Steer, TeleopPilot, Track
+from hydrotele.scenario.teleoperation import (
+    CoordinateMapping,
+    RegulateForce,
+    SteerToPoses,
+    TeleopPilot,
+    TrackForce,
+)
 
 # columns, SI; GAIN is the rate of a coordinate per displacement beyond the dead band [1/s], or its
 # position per displacement; WAVE is the impedance b of wave variables
-(NOMINAL, LEAST, MOST, SLOPE, DAMPING, LIMIT, DEADBAND, DROP, OUTSIDE, REACH, COORDINATE, SIGN,
- GAIN, RATIO, COUPLING, COUPLING_DAMPING, REFLECTED_MOST, WAVE) = range(18)  # fmt: skip
-COLUMNS = WAVE + 1
+(NOMINAL_STIFFNESS, MIN_STIFFNESS, MAX_STIFFNESS, STIFFNESS_PER_FORCE, DAMPING, FORCE_LIMIT, DEADBAND, DETENT_DROP,
+DETENT_STIFFNESS, HANDLE_RANGE, COORDINATE, SIGN,
+ GAIN, REFLECTION_RATIO, COUPLING, COUPLING_DAMPING, MAX_REFLECTED_FORCE, AXIS_WAVE_IMPEDANCE) = range(18)  # fmt: skip
+COLUMNS = AXIS_WAVE_IMPEDANCE + 1
 LEVER = 0.1  # m, lever arm of a hand: converts translational gains to rotational ones
-_SOFT = {"rate": 40.0, "position": 400.0}  # N/m, N per metre of machine or of handle
-_DAMPED = 0.1  # s, ratio of damping to stiffness of that coupling
+_DEFAULT_COUPLING_STIFFNESS = {
+    "rate": 40.0,
+    "position": 400.0,
+}  # N/m, N per metre of machine or of handle
+_COUPLING_TIME = 0.1  # s, ratio of damping to stiffness of that coupling
 
 
-def axis_table(joystick: Joystick, pilot: TeleopPilot, coordinates: tuple[str, ...]) -> np.ndarray:
+def build_axis_table(joystick: Joystick, pilot: TeleopPilot, coordinates: tuple[str, ...]) -> np.ndarray:
     """Build the parameter table of all joystick axes.
 
     Args:
@@ -42,15 +52,15 @@ def axis_table(joystick: Joystick, pilot: TeleopPilot, coordinates: tuple[str, .
             for two coordinates, or an operator's goal that the joystick cannot move.
     """
     if pilot.gains not in joystick.gains:
-        message = f"{pilot.gains!r}; {suggest(pilot.gains, joystick.gains)}"
+        message = f"{pilot.gains!r}; {suggest_valid_name(pilot.gains, joystick.gains)}"
         raise InputError("pilot.gains", message)
     table = np.zeros((6, COLUMNS))
     table[:, COORDINATE] = -1.0
-    soft = _SOFT[pilot.mode] if pilot.coupling is None else pilot.coupling
-    damped = _DAMPED * soft if pilot.coupling_damping is None else pilot.coupling_damping
+    soft = _DEFAULT_COUPLING_STIFFNESS[pilot.mode] if pilot.coupling is None else pilot.coupling
+    damped = _COUPLING_TIME * soft if pilot.coupling_damping is None else pilot.coupling_damping
     for number, name in enumerate(AXES):
-        law = _gains(joystick, pilot, name)
-        reach = joystick.reach[number]
+        law = _merge_gains(joystick, pilot, name)
+        reach = joystick.handle_travel[number]
         detent = law.detent if pilot.detent and pilot.mode == "rate" else None  # needs a dead band
         table[number, : COORDINATE] = (
             law.nominal, law.least, law.most, (law.most - law.nominal) / law.force_limit,
@@ -58,66 +68,66 @@ def axis_table(joystick: Joystick, pilot: TeleopPilot, coordinates: tuple[str, .
             detent.outside if detent else -1.0, reach,
         )  # fmt: skip
         lever = 1.0 if number < 3 else LEVER
-        table[number, RATIO:] = (
+        table[number, REFLECTION_RATIO:] = (
             lever * pilot.ratio, lever**2 * soft, lever**2 * damped,
             pilot.force_limit or law.force_limit, lever**2 * (pilot.wave or damped),
         )  # fmt: skip
-    _place_coordinates(pilot, table, coordinates)
+    _assign_coordinates(pilot, table, coordinates)
     _check_goals(pilot, table, coordinates)
     return table
 
 
-def _place_coordinates(pilot: TeleopPilot, table: np.ndarray, coordinates) -> None:
+def _assign_coordinates(pilot: TeleopPilot, table: np.ndarray, coordinates) -> None:
     """Assign every coordinate to its joystick axis."""
     where = "pilot.coordinates"
     if strange := set(pilot.coordinates) - set(coordinates):
         message = f"{', '.join(sorted(strange))}: the arm has {', '.join(coordinates)}"
         raise InputError(where, message)
     for number, coordinate in enumerate(coordinates):
-        coupling = pilot.coordinates.get(coordinate, Coupling())
-        axis, sign = coupling.placed(coordinate)
+        coupling = pilot.coordinates.get(coordinate, CoordinateMapping())
+        axis, sign = coupling.resolve_axis(coordinate)
         row = table[AXES.index(axis)]
         if row[COORDINATE] >= 0.0:
             raise InputError(where, f"joystick axis {axis} is assigned to two coordinates")
         gain = coupling.scale
         if pilot.mode == "rate":
-            if row[DEADBAND] >= row[REACH] and coordinate in pilot.coordinates:
+            if row[DEADBAND] >= row[HANDLE_RANGE] and coordinate in pilot.coordinates:
                 message = f"the dead band of {axis} covers its whole range: it cannot be moved"
                 raise InputError(f"{where}.{coordinate}", message)
-            gain = coupling.speed / max(row[REACH] - row[DEADBAND], 1e-9)
+            gain = coupling.speed / max(row[HANDLE_RANGE] - row[DEADBAND], 1e-9)
         row[[COORDINATE, SIGN, GAIN]] = number, sign, gain
 
 
-def _gains(joystick: Joystick, pilot: TeleopPilot, name: str) -> AxisGains:
+def _merge_gains(joystick: Joystick, pilot: TeleopPilot, name: str) -> AxisGains:
     """Return the gains of a joystick axis, with the overrides of the scenario."""
     usual = joystick.gains[pilot.gains][name].model_dump()
     own = {str(axis): gains for axis, gains in pilot.stiffness.items()}.get(name, {})
     said = {split_unit(key)[0] for key in own}
     kept = {key: value for key, value in usual.items() if key not in said}
-    return parse(AxisGains, kept | own, f"pilot.stiffness.{name}", {})
+    return validate_data(AxisGains, kept | own, f"pilot.stiffness.{name}", {})
 
 
 def _check_goals(pilot: TeleopPilot, table: np.ndarray, coordinates: tuple[str, ...]) -> None:
     """Raise InputError if the operator's goal is not a coordinate of the arm or cannot be moved."""
     goals: dict[str, str] = {}
     match pilot.operator:
-        case Regulate() | Track():
+        case RegulateForce() | TrackForce():
             goals = {pilot.operator.target.coordinate: "pilot.operator.target.coordinate"}
-        case Steer():
+        case SteerToPoses():
             goals = {name: f"pilot.operator.points.{name}" for name in pilot.operator.points}
     for name, where in goals.items():
         if name not in coordinates:
             raise InputError(where, f"{name!r}: the arm has {', '.join(coordinates)}")
         row = table[table[:, COORDINATE] == coordinates.index(name)][0]
-        if pilot.mode == "rate" and row[DEADBAND] >= row[REACH]:
+        if pilot.mode == "rate" and row[DEADBAND] >= row[HANDLE_RANGE]:
             axis = AXES[int(np.flatnonzero(table[:, COORDINATE] == row[COORDINATE])[0])]
             raise InputError(where, f"the dead band of {axis} covers its whole range")
 
 
-Kind = TypeVar("Kind", bound=tuple[Any, ...])
+StateType = TypeVar("StateType", bound=tuple[Any, ...])
 
 
-def flat_state(kind: type[Kind], shapes: list[tuple[int, ...]]) -> Kind:
+def make_flat_state(kind: type[StateType], shapes: list[tuple[int, ...]]) -> StateType:
     """Create a named tuple of zero arrays that are contiguous in memory.
 
     Args:
@@ -136,22 +146,22 @@ def flat_state(kind: type[Kind], shapes: list[tuple[int, ...]]) -> Kind:
     ))  # fmt: skip
 
 
-def flattened(parts: Kind) -> Kind:
+def flatten_state(parts: StateType) -> StateType:
     """Copy a tuple of arrays, as floats, into contiguous memory."""
     arrays = [np.asarray(part, float) for part in parts]
-    made = flat_state(type(parts), [array.shape for array in arrays])
+    made = make_flat_state(type(parts), [array.shape for array in arrays])
     for place, array in zip(made, arrays, strict=True):
         place[...] = array
     return made
 
 
 def flat_view(parts: tuple[Any, ...]) -> np.ndarray:
-    """Return the memory of a `flat_state` as one array."""
+    """Return the memory of a `make_flat_state` as one array."""
     base = parts[0].base
     return base if base.ndim == 1 else base.base
 
 
 @compiled
-def split(flat, size):
+def split_array(flat, size):
     """Split an array after its first `size` elements."""
     return flat[:size], flat[size:]

@@ -15,14 +15,14 @@ import numpy as np
 from hydrotele.core.errors import InputError
 
 _WHERE = "coils"
-_SINGULAR = 1e6  # condition number above which six coils do not span all wrenches
+_MAX_CONDITION_NUMBER = 1e6  # condition number above which six coils do not span all wrenches
 
 
-class Currents(NamedTuple):
+class CoilCurrents(NamedTuple):
     """Coil currents (6,) [A], and whether the requested wrench was reduced to the limits."""
 
     value: np.ndarray
-    limited: bool
+    is_limited: bool
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Coils:
                 _WHERE, "force per ampere and maximum current must be positive:"
                 f" {self.force_per_ampere} N/A, {self.max_current} A",
             )  # fmt: skip
-        if not self.condition < _SINGULAR:
+        if not self.condition < _MAX_CONDITION_NUMBER:
             raise InputError(_WHERE, "these coils cannot produce every force and torque")
 
     @property
@@ -69,12 +69,12 @@ class Coils:
         scale = np.array([1.0, 1.0, 1.0, *([1.0 / max(arm, 1e-12)] * 3)])
         return float(np.linalg.cond(scale[:, None] * self.wrench_map))
 
-    def wrench(self, currents: np.ndarray) -> np.ndarray:
+    def compute_wrench(self, currents: np.ndarray) -> np.ndarray:
         """Return the wrench (6,) [N], [N m] of currents (6,) [A], after limiting each current."""
         limit = self.max_current
         return self.wrench_map @ np.clip(np.asarray(currents, float), -limit, limit)
 
-    def currents(self, wrench: np.ndarray) -> Currents:
+    def compute_currents(self, wrench: np.ndarray) -> CoilCurrents:
         """Compute the coil currents for a force and torque.
 
         A wrench above the limits is scaled down as a whole, so that it keeps its direction. Coils
@@ -91,13 +91,13 @@ class Coils:
         """
         wanted = np.asarray(wrench, float)
         if not np.isfinite(wanted).all():
-            return Currents(np.zeros(6), True)
+            return CoilCurrents(np.zeros(6), True)
         value = np.linalg.solve(self.wrench_map, wanted)
         over = float(np.abs(value).max() / self.max_current)
-        return Currents(value / over, True) if over > 1.0 else Currents(value, False)
+        return CoilCurrents(value / over, True) if over > 1.0 else CoilCurrents(value, False)
 
 
-def three_stations(radius: float, force_per_ampere: float, max_current: float) -> Coils:
+def make_three_station_coils(radius: float, force_per_ampere: float, max_current: float) -> Coils:
     """Create three stations at 120 degrees, each with one vertical and one tangential coil.
 
     With torques divided by the radius, the condition number is the square root of 2.
@@ -110,19 +110,17 @@ def three_stations(radius: float, force_per_ampere: float, max_current: float) -
     Returns:
         The coils.
 
-    >>> round(three_stations(0.05, 8.0, 4.0).condition, 6)
+    >>> round(make_three_station_coils(0.05, 8.0, 4.0).condition, 6)
     1.414214
     """
     angles = 2.0 * np.pi * np.arange(3) / 3.0
     c, s, none = np.cos(angles), np.sin(angles), np.zeros(3)
     places = radius * np.column_stack([c, s, none])
     up, around = np.tile([0.0, 0.0, 1.0], (3, 1)), np.column_stack([-s, c, none])
-    return Coils(
-        np.vstack([places, places]), np.vstack([up, around]), force_per_ampere, max_current
-    )
+    return Coils(np.vstack([places, places]), np.vstack([up, around]), force_per_ampere, max_current)
 
 
-def heating(currents: np.ndarray, continuous: float) -> float:
+def relative_heating(currents: np.ndarray, continuous: float) -> float:
     """Return the steady-state temperature rise of the hottest coil, relative to its permitted rise.
 
     Args:
@@ -132,13 +130,13 @@ def heating(currents: np.ndarray, continuous: float) -> float:
     Returns:
         Ratio [1]; above 1 the coils overheat.
 
-    >>> heating(np.array([0.0, 3.0, -4.0, 0.0, 0.0, 0.0]), 2.0)
+    >>> relative_heating(np.array([0.0, 3.0, -4.0, 0.0, 0.0, 0.0]), 2.0)
     4.0
     """
     return float(np.max(np.square(np.asarray(currents, float) / continuous)))
 
 
-def seconds_until_hot(currents: np.ndarray, continuous: float, time_constant: float) -> float:
+def time_to_overheat(currents: np.ndarray, continuous: float, time_constant: float) -> float:
     """Return the time for which cold coils can carry currents.
 
     Args:
@@ -151,8 +149,8 @@ def seconds_until_hot(currents: np.ndarray, continuous: float, time_constant: fl
 
     Source: `simulate.joystick.heat_step`.
 
-    >>> round(seconds_until_hot(np.full(6, 4.0), 2.0, 60.0), 3)
+    >>> round(time_to_overheat(np.full(6, 4.0), 2.0, 60.0), 3)
     17.261
     """
-    end = heating(currents, continuous)
+    end = relative_heating(currents, continuous)
     return float(-time_constant * np.log1p(-1.0 / end)) if end > 1.0 else float("inf")

@@ -38,44 +38,44 @@ class Flotor:
 
 
 @dataclass(frozen=True)
-class Axes:
+class AxisDynamics:
     """Second-order systems of the three translations and the three rotations.
 
     Attributes:
         frequency: (6,) natural frequencies [rad/s].
-        ratio: (6,) damping ratios [1].
+        damping_ratio: (6,) damping ratios [1].
     """
 
     frequency: np.ndarray
-    ratio: np.ndarray
+    damping_ratio: np.ndarray
 
     def __post_init__(self) -> None:
         """Raise InputError unless all frequencies and damping ratios are positive."""
-        for name in ("frequency", "ratio"):
+        for name in ("frequency", "damping_ratio"):
             values = np.asarray(getattr(self, name), float)
             if values.shape != (6,) or not np.all(values > 0.0):
                 raise InputError(_WHERE, f"{name} needs six positive values, got {values}")
 
 
 @dataclass(frozen=True)
-class Motion:
+class FlotorMotion:
     """Pose and velocity of the flotor.
 
     Attributes:
         position: (3,) origin of the coils' frame [m].
         quaternion: (4,) orientation, scalar first.
         velocity: (3,) velocity of the origin [m/s].
-        rate: (3,) angular velocity, in its own axes [rad/s].
+        angular_velocity: (3,) angular velocity, in its own axes [rad/s].
     """
 
     position: np.ndarray
     quaternion: np.ndarray
     velocity: np.ndarray
-    rate: np.ndarray
+    angular_velocity: np.ndarray
 
 
 @compiled
-def turn_matrix(q, out):
+def quaternion_to_matrix(q, out):
     """Convert a unit quaternion to a rotation matrix.
 
     Args:
@@ -106,17 +106,28 @@ def turn_matrix(q, out):
 
 
 @compiled
-def driving_wrench(mass, arm, inertia, below, wanted, about, turn, rate, gravity, out):
+def free_flotor_wrench(
+    mass,
+    arm,
+    inertia,
+    centre_of_mass,
+    acceleration,
+    angular_acceleration,
+    rotation,
+    rate,
+    gravity,
+    out,
+):
     """Compute the coil wrench for given accelerations of the handle's point and the flotor.
 
     Args:
         mass: mass of the flotor, scalar [kg].
         arm: (3,) centre of mass relative to the handle's point, flotor axes [m].
         inertia: (3, 3) about the centre of mass [kg m^2].
-        below: (3,) centre of mass relative to the coils' frame, flotor axes [m].
-        wanted: (3,) acceleration of the handle's point, world axes [m/s^2].
-        about: (3,) angular acceleration, flotor axes [rad/s^2].
-        turn: (3, 3) rotation matrix, flotor to world.
+        centre_of_mass: (3,) centre of mass relative to the coils' frame, flotor axes [m].
+        acceleration: (3,) acceleration of the handle's point, world axes [m/s^2].
+        angular_acceleration: (3,) angular acceleration, flotor axes [rad/s^2].
+        rotation: (3, 3) rotation matrix, flotor to world.
         rate: (3,) angular velocity, flotor axes [rad/s].
         gravity: (3,) world axes [m/s^2].
         out: (6,) written: force [N] and torque about the coils' frame [N m], flotor axes.
@@ -129,14 +140,14 @@ def driving_wrench(mass, arm, inertia, below, wanted, about, turn, rate, gravity
     w0, w1, w2 = rate[0], rate[1], rate[2]
     # centripetal and tangential acceleration of the centre of mass relative to the handle's point
     s0, s1, s2 = w1 * arm[2] - w2 * arm[1], w2 * arm[0] - w0 * arm[2], w0 * arm[1] - w1 * arm[0]
-    d0 = about[1] * arm[2] - about[2] * arm[1] + w1 * s2 - w2 * s1
-    d1 = about[2] * arm[0] - about[0] * arm[2] + w2 * s0 - w0 * s2
-    d2 = about[0] * arm[1] - about[1] * arm[0] + w0 * s1 - w1 * s0
+    d0 = angular_acceleration[1] * arm[2] - angular_acceleration[2] * arm[1] + w1 * s2 - w2 * s1
+    d1 = angular_acceleration[2] * arm[0] - angular_acceleration[0] * arm[2] + w2 * s0 - w0 * s2
+    d2 = angular_acceleration[0] * arm[1] - angular_acceleration[1] * arm[0] + w0 * s1 - w1 * s0
     for i in range(3):
         own = d0 if i == 0 else (d1 if i == 1 else d2)
         drawn = 0.0
         for j in range(3):
-            drawn += turn[j, i] * (wanted[j] - gravity[j])
+            drawn += rotation[j, i] * (acceleration[j] - gravity[j])
         out[i] = mass * (drawn + own)
     m0 = inertia[0, 0] * w0 + inertia[0, 1] * w1 + inertia[0, 2] * w2
     m1 = inertia[1, 0] * w0 + inertia[1, 1] * w1 + inertia[1, 2] * w2
@@ -144,26 +155,26 @@ def driving_wrench(mass, arm, inertia, below, wanted, about, turn, rate, gravity
     for i in range(3):
         out[3 + i] = 0.0
         for j in range(3):
-            out[3 + i] += inertia[i, j] * about[j]
-    out[3] += w1 * m2 - w2 * m1 + below[1] * out[2] - below[2] * out[1]
-    out[4] += w2 * m0 - w0 * m2 + below[2] * out[0] - below[0] * out[2]
-    out[5] += w0 * m1 - w1 * m0 + below[0] * out[1] - below[1] * out[0]
+            out[3 + i] += inertia[i, j] * angular_acceleration[j]
+    out[3] += w1 * m2 - w2 * m1 + centre_of_mass[1] * out[2] - centre_of_mass[2] * out[1]
+    out[4] += w2 * m0 - w0 * m2 + centre_of_mass[2] * out[0] - centre_of_mass[0] * out[2]
+    out[5] += w0 * m1 - w1 * m0 + centre_of_mass[0] * out[1] - centre_of_mass[1] * out[0]
 
 
 @compiled
-def holding_wrench(mass, below, handle, push, turn, gravity, out):
+def held_flotor_wrench(mass, centre_of_mass, handle, push, rotation, gravity, out):
     """Compute the coil wrench that applies a force at the handle and carries the flotor's weight.
 
     Use it while a hand holds the handle: a spring made this way does not rotate the flotor when the
-    hand pushes straight. A wrench for a free flotor (`driving_wrench`) acts through the centre of
+    hand pushes straight. A wrench for a free flotor (`free_flotor_wrench`) acts through the centre of
     mass.
 
     Args:
         mass: mass of the flotor, scalar [kg].
-        below: (3,) centre of mass relative to the coils' frame, flotor axes [m].
+        centre_of_mass: (3,) centre of mass relative to the coils' frame, flotor axes [m].
         handle: (3,) handle's point relative to the coils' frame, flotor axes [m].
         push: (6,) force at the handle, world axes [N], and torque, flotor axes [N m].
-        turn: (3, 3) rotation matrix, flotor to world.
+        rotation: (3, 3) rotation matrix, flotor to world.
         gravity: (3,) world axes [m/s^2].
         out: (6,) written: force [N] and torque about the coils' frame [N m], flotor axes.
 
@@ -176,18 +187,18 @@ def holding_wrench(mass, below, handle, push, turn, gravity, out):
     for i in range(3):
         lift[i], own[i] = 0.0, 0.0
         for j in range(3):
-            lift[i] -= mass * turn[j, i] * gravity[j]
-            own[i] += turn[j, i] * push[j]
+            lift[i] -= mass * rotation[j, i] * gravity[j]
+            own[i] += rotation[j, i] * push[j]
         out[i] = lift[i] + own[i]
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
-        out[3 + i] = push[3 + i] + below[j] * lift[k] - below[k] * lift[j]
+        out[3 + i] = push[3 + i] + centre_of_mass[j] * lift[k] - centre_of_mass[k] * lift[j]
         out[3 + i] += handle[j] * own[k] - handle[k] * own[j]
 
 
 def compliance_wrench(
-    flotor: Flotor, axes: Axes, centre: np.ndarray, motion: Motion, target: np.ndarray,
-    turned: np.ndarray, gravity: Sequence[float] = GRAVITY,
+    flotor: Flotor, axes: AxisDynamics, centre: np.ndarray, motion: FlotorMotion, target: np.ndarray,
+    target_rotation: np.ndarray, gravity: Sequence[float] = GRAVITY,
 ) -> np.ndarray:  # fmt: skip
     """Compute the coil wrench that gives the handle the six second-order systems.
 
@@ -197,7 +208,7 @@ def compliance_wrench(
         centre: T in the coils' frame (3,) [m].
         motion: pose and velocity of the flotor.
         target: reference position of T (3,) [m].
-        turned: reference orientation, quaternion (4,), scalar first.
+        target_rotation: reference orientation, quaternion (4,), scalar first.
         gravity: (3,) [m/s^2].
 
     Returns:
@@ -205,27 +216,27 @@ def compliance_wrench(
 
     Source: Zhu 1994, 5.1.3 (Euler quaternions, forces moved from T over the centre of mass to F).
     """
-    spring, damper = axes.frequency**2, 2.0 * axes.ratio * axes.frequency
-    turn, w, out = np.empty((3, 3)), motion.rate, np.empty(6)
-    turn_matrix(motion.quaternion, turn)
+    spring, damper = axes.frequency**2, 2.0 * axes.damping_ratio * axes.frequency
+    turn, w, out = np.empty((3, 3)), motion.angular_velocity, np.empty(6)
+    quaternion_to_matrix(motion.quaternion, turn)
     place = motion.position + turn @ centre
     speed = motion.velocity + turn @ np.cross(w, centre)
     wanted = spring[:3] * (target - place) - damper[:3] * speed
-    scalar, vector = rotation_between(turned, motion.quaternion)
+    scalar, vector = rotation_between(target_rotation, motion.quaternion)
     vector_rate = 0.5 * (scalar * w + np.cross(vector, w))
     scalar_rate = -0.5 * vector @ w
     swing = -spring[3:] * vector - damper[3:] * vector_rate
     swing -= 0.5 * (scalar_rate * w + np.cross(vector_rate, w))
-    about = np.linalg.solve(0.5 * (scalar * np.eye(3) + _cross(vector)), swing)
+    about = np.linalg.solve(0.5 * (scalar * np.eye(3) + _skew_matrix(vector)), swing)
     below = np.asarray(flotor.centre_of_mass, float)
-    driving_wrench(
+    free_flotor_wrench(
         flotor.mass, below - centre, np.asarray(flotor.inertia, float), below, wanted, about, turn,
         w, np.asarray(gravity, float), out,
     )  # fmt: skip
     return out
 
 
-def _cross(v: np.ndarray) -> np.ndarray:
+def _skew_matrix(v: np.ndarray) -> np.ndarray:
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 

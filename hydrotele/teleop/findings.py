@@ -27,53 +27,56 @@ import numpy as np
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
 from hydrotele.teleop.analysis import (
-    LONGEST_TRIED,
-    MOST_TRIED,
-    Analysis,
-    Case,
-    analyse,
+    MAX_TESTED_DELAY,
+    MAX_TESTED_FACTOR,
+    StructureAnalysis,
+    TeleoperatorAxis,
+    analyse_structure,
+    find_max_delay,
     gain_margin,
-    largest_delay,
     loop_gain,
     stability_map,
 )
-from hydrotele.teleop.linear_case import STRUCTURES, LinearCase, local_ratio
+from hydrotele.teleop.linear_case import STRUCTURES, LinearCase, stiffness_feedback_ratio
 from hydrotele.teleop.robust import Robustness
-from hydrotele.teleop.switching import Spring
+from hydrotele.teleop.switching import StiffnessAxis
 from hydrotele.teleop.two_port import (
     Impedance,
-    OnTheAxis,
-    transmitted,
-    unstable_held,
-    unstable_poles,
+    PoleOnAxisError,
+    count_unstable_poles,
+    count_unstable_poles_held,
+    transmitted_impedance,
 )
 
 INT, X, V, A, IMPULSE, FORCE, Y, W, W1, W2 = range(10)
-_KNOWN = np.array([INT, X, V, IMPULSE, Y, W])
-_SOLVED = np.array([A, FORCE, W1, W2])
-_PER_RATE = 0.2  # steps per time constant of the fastest mode; the limit of Adams' method is 1
-_LARGEST = 5e-4  # s
+_KNOWN_SIGNALS = np.array([INT, X, V, IMPULSE, Y, W])
+_SOLVED_SIGNALS = np.array([A, FORCE, W1, W2])
+_STEP_RATIO = 0.2  # steps per time constant of the fastest mode; the limit of Adams' method is 1
+_MAX_STEP = 5e-4  # s
 _BLOCKS = 20  # number of parts of a run whose largest speeds are compared
-_GROWN, _GONE = 1e9, 1e-9  # factors on the initial speed beyond which a run is stopped
-_KICK = 0.1  # m/s
-_WHOLE = 1e-6  # tolerance, in steps, for a delay that is a whole number of steps
-_PERIODS = 2  # number of sine periods that are measured
-_SETTLE = (20.0, 40.0, 80.0, 160.0, 320.0)  # s before a sine is measured
-_SETTLED = 1e-3  # relative change of the measured impedance; the required accuracy is 3 %
-_TRIPS = 40  # minimum duration of a run in round-trip delays
-_FINEST = 2e-6  # s, minimum step; a run with a smaller one takes minutes
+_MAX_SPEED_RATIO, _MIN_SPEED_RATIO = (
+    1e9,
+    1e-9,
+)  # factors on the initial speed beyond which a run is stopped
+_INITIAL_SPEED = 0.1  # m/s
+_LAG_TOLERANCE = 1e-6  # tolerance, in steps, for a delay that is a whole number of steps
+_MEASURED_PERIODS = 2  # number of sine periods that are measured
+_SETTLING_TIMES = (20.0, 40.0, 80.0, 160.0, 320.0)  # s before a sine is measured
+_SETTLING_TOLERANCE = 1e-3  # relative change of the measured impedance; the required accuracy is 3 %
+_MIN_ROUND_TRIPS = 40  # minimum duration of a run in round-trip delays
+_MIN_STEP = 2e-6  # s, minimum step; a run with a smaller one takes minutes
 
 
 class ControlLaw(NamedTuple):
     """Coefficients of a control law on the signals (10,).
 
     Attributes:
-        own: force of the master's own controller.
+        master_own: force of the master's own controller.
         forward: force on the slave, C1 and C3, from delayed signals.
         back: force on the master, C2 and C4, from delayed signals.
     """
 
-    own: np.ndarray
+    master_own: np.ndarray
     forward: np.ndarray
     back: np.ndarray
 
@@ -82,16 +85,16 @@ class SimulatedRun(NamedTuple):
     """Results of a simulated run.
 
     Attributes:
-        largest: (20,) maximum of the sum of master's and slave's speed in each twentieth of the run
+        max_speeds: (20,) maximum of the sum of master's and slave's speed in each twentieth of the run
             [m/s].
-        felt: force over velocity of an imposed motion at its frequency [N s/m], otherwise 0.
+        impedance: force over velocity of an imposed motion at its frequency [N s/m], otherwise 0.
     """
 
-    largest: np.ndarray
-    felt: complex
+    max_speeds: np.ndarray
+    impedance: complex
 
 
-def control_law(case: Case, structure: str, reflected: float = 1.0) -> ControlLaw:
+def control_law(case: TeleoperatorAxis, structure: str, reflected: float = 1.0) -> ControlLaw:
     """Return the control law of a structure in the time domain.
 
     Args:
@@ -106,33 +109,33 @@ def control_law(case: Case, structure: str, reflected: float = 1.0) -> ControlLa
     """
     kv, gains = case.gains.velocity, case.gains
     rate = structure in ("rate_position", "rate_force", "four_channel_rate")
-    forward = on_motion(case.slave_control, INT if rate else X) * (kv if rate else gains.position)
-    own, back = on_motion(case.master_control, X), np.zeros(10)
+    forward = motion_coefficients(case.slave_control, INT if rate else X) * (kv if rate else gains.position)
+    own, back = motion_coefficients(case.master_control, X), np.zeros(10)
     if structure in ("rate_position", "four_channel_rate"):
-        own = kv * on_motion(case.master_control, INT)
+        own = kv * motion_coefficients(case.master_control, INT)
     if structure in ("position_position", "rate_position", "four_channel_rate"):
-        back = -on_motion(case.master_control, Y)
+        back = -motion_coefficients(case.master_control, Y)
     if structure in ("position_force", "rate_force"):
-        back = gains.force * on_motion(case.task, Y)
+        back = gains.force * motion_coefficients(case.task, Y)
     if structure == "four_channel_position":
-        forward = on_motion(case.slave, X) + on_motion(case.slave_control, X)
+        forward = motion_coefficients(case.slave, X) + motion_coefficients(case.slave_control, X)
         forward[FORCE] = 1.0
-        back = on_motion(case.task, Y) - on_motion(case.master, Y)
-        back -= on_motion(case.master_control, Y)
+        back = motion_coefficients(case.task, Y) - motion_coefficients(case.master, Y)
+        back -= motion_coefficients(case.master_control, Y)
     if structure == "four_channel_rate":
         forward[IMPULSE] = kv
-        back = back + on_motion(case.task, W) / kv
+        back = back + motion_coefficients(case.task, W) / kv
     return ControlLaw(own, forward, reflected * back)
 
 
-def on_motion(impedance: Impedance, position: int) -> np.ndarray:
+def motion_coefficients(impedance: Impedance, position: int) -> np.ndarray:
     """Return coefficients (10,) of an impedance on a position and its two derivatives."""
     made = np.zeros(10)
     made[position : position + 3] = impedance.stiffness, impedance.damping, impedance.mass
     return made
 
 
-def step_of(case: Case) -> float:
+def choose_time_step(case: TeleoperatorAxis) -> float:
     """Return a time step that resolves the fastest mode that the masses can have together [s].
 
     Raises:
@@ -143,10 +146,10 @@ def step_of(case: Case) -> float:
     rates = (
         sum(part.damping for part in parts) / lightest,
         math.sqrt(sum(part.stiffness for part in parts) / lightest),
-        1.0 / _LARGEST * _PER_RATE,
+        1.0 / _MAX_STEP * _STEP_RATIO,
     )
-    step = _PER_RATE / max(rates)
-    if step < _FINEST:
+    step = _STEP_RATIO / max(rates)
+    if step < _MIN_STEP:
         raise InputError(
             "teleoperator", f"modes are too fast to simulate: rates of {max(rates):.3g} 1/s with a"
             f" lightest mass of {lightest:g} kg; omit --confirm or give hand and sides a mass",
@@ -154,8 +157,8 @@ def step_of(case: Case) -> float:
     return step
 
 
-def impulse_response(
-    case: Case, structure: str, reflected: float = 1.0, seconds: float = 40.0
+def simulate_impulse(
+    case: TeleoperatorAxis, structure: str, reflected: float = 1.0, seconds: float = 40.0
 ) -> SimulatedRun:
     """Simulate the response to an initial velocity of the master, with hand and task.
 
@@ -169,19 +172,19 @@ def impulse_response(
     Returns:
         Results of the run.
     """
-    seconds = max(seconds, _TRIPS * 2.0 * case.delay)
-    return _simulated(case, control_law(case, structure, reflected), seconds, 0.0, 0.0)
+    seconds = max(seconds, _MIN_ROUND_TRIPS * 2.0 * case.delay)
+    return _simulate_case(case, control_law(case, structure, reflected), seconds, 0.0, 0.0)
 
 
 def is_growing(run: SimulatedRun) -> bool:
     """Return whether the motion grows: late speeds are larger than early ones."""
-    reached = run.largest[run.largest > 0.0]
+    reached = run.max_speeds[run.max_speeds > 0.0]
     if len(reached) < _BLOCKS:
-        return bool(reached[-1] > _KICK)
-    return bool(run.largest[-4:].max() > run.largest[4:8].max())
+        return bool(reached[-1] > _INITIAL_SPEED)
+    return bool(run.max_speeds[-4:].max() > run.max_speeds[4:8].max())
 
 
-def simulate_sine(case: Case, structure: str, frequency: float) -> complex:
+def simulate_sine(case: TeleoperatorAxis, structure: str, frequency: float) -> complex:
     """Return the impedance at the master while its motion is an imposed sine.
 
     The settling time is increased until the result no longer changes.
@@ -196,50 +199,54 @@ def simulate_sine(case: Case, structure: str, frequency: float) -> complex:
     """
     law, period = control_law(case, structure), 2.0 * math.pi / frequency
     felt = 0.0
-    for settle in _SETTLE:
-        before, seconds = felt, (math.ceil(settle / period) + _PERIODS) * period
-        felt = _simulated(case, law, seconds, frequency, _PERIODS * period).felt
-        if abs(felt - before) < _SETTLED * abs(felt):
+    for settle in _SETTLING_TIMES:
+        before, seconds = felt, (math.ceil(settle / period) + _MEASURED_PERIODS) * period
+        felt = _simulate_case(case, law, seconds, frequency, _MEASURED_PERIODS * period).impedance
+        if abs(felt - before) < _SETTLING_TOLERANCE * abs(felt):
             break
     return felt
 
 
-def _simulated(
-    case: Case, law: ControlLaw, seconds: float, frequency: float, measured: float
+def _simulate_case(
+    case: TeleoperatorAxis, law: ControlLaw, seconds: float, frequency: float, measured_time: float
 ) -> SimulatedRun:
-    step = step_of(case)
+    step = choose_time_step(case)
     if frequency:  # a whole number of steps per period, so that the mean of the sine is 0
         step = 2.0 * math.pi / frequency / math.ceil(2.0 * math.pi / frequency / step)
     elif case.delay_forward >= step:  # a whole number of steps per delay
         step = case.delay_forward / math.ceil(case.delay_forward / step)
     late = np.array([case.delay_forward, case.delay_back]) / step
-    late = np.where(np.abs(late - np.round(late)) < _WHOLE, np.round(late), late)
+    late = np.where(np.abs(late - np.round(late)) < _LAG_TOLERANCE, np.round(late), late)
     late[late < 1.0] = 0.0  # a delay of less than a step is neglected
     lags = int(late[0]), int(late[1])
-    now, delayed = _equations(case, law, lags, bool(frequency))
-    inverse = np.linalg.inv(now[:, _SOLVED])
-    largest, sums = _march(
-        inverse, inverse @ now[:, _KNOWN], inverse @ delayed, np.array(lags), late - lags, step,
-        round(seconds / step), round(measured / step), frequency,
+    now, delayed = _build_equations(case, law, lags, bool(frequency))
+    inverse = np.linalg.inv(now[:, _SOLVED_SIGNALS])
+    largest, sums = _integrate_case(
+        inverse, inverse @ now[:, _KNOWN_SIGNALS], inverse @ delayed, np.array(lags), late - lags, step,
+        round(seconds / step), round(measured_time / step), frequency,
     )  # fmt: skip
     return SimulatedRun(largest, complex(sums[0] / sums[1]) if frequency else 0.0)
 
 
-def _equations(
-    case: Case, law: ControlLaw, lags: tuple[int, int], imposed: bool
+def _build_equations(
+    case: TeleoperatorAxis, law: ControlLaw, lags: tuple[int, int], imposed: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return coefficients (4, 10) on current and (4, 20) on delayed signals: forward, then back.
 
     Rows: master, hand, slave, derivative of the slave's equation. The last row is used where the
     slave's jerk is needed, and is otherwise `w'' = 0`.
     """
-    own = on_motion(case.master, X) + law.own
+    own = motion_coefficients(case.master, X) + law.master_own
     own[FORCE] -= 1.0
-    hand = on_motion(case.hand, X)
+    hand = motion_coefficients(case.hand, X)
     hand[FORCE] = 1.0
     if imposed:
         hand = np.eye(10)[A]
-    slave = on_motion(case.slave, Y) + on_motion(case.slave_control, Y) + on_motion(case.task, Y)
+    slave = (
+        motion_coefficients(case.slave, Y)
+        + motion_coefficients(case.slave_control, Y)
+        + motion_coefficients(case.task, Y)
+    )
     jerk, still = np.eye(10)[W2], np.zeros(10)
     if law.back[W2]:
         jerk, still = np.roll(slave, 1), np.roll(law.forward, 1)
@@ -247,11 +254,11 @@ def _equations(
     there, here = np.array([still, still, law.forward, still]), np.zeros((4, 10))
     there[:2] = 0.0
     here[0] = -law.back
-    there, here = _if_late(there, here, now, lags)
+    there, here = _fold_undelayed(there, here, now, lags)
     return now, np.hstack([there, here])
 
 
-def _if_late(
+def _fold_undelayed(
     there: np.ndarray, here: np.ndarray, now: np.ndarray, lags: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return delayed coefficients; those without delay are moved to the current signals."""
@@ -265,19 +272,19 @@ def _if_late(
 
 
 @compiled
-def _march(inverse, known, delayed, lags, beyond, step, rows, measured, frequency):
+def _integrate_case(inverse, known, delayed, lags, beyond, step, rows, measured, frequency):
     """Integrate; return largest speeds (20,) and Fourier sums of force and velocity (2,)."""
     past = np.zeros((max(lags[0], lags[1]) + 2, 10))
     largest, sums = np.zeros(_BLOCKS), np.zeros(2, np.complex128)
     q, before, late = np.zeros(10), np.zeros(10), np.zeros(20)
     if frequency == 0.0:
-        q[V] = _KICK
+        q[V] = _INITIAL_SPEED
     for n in range(rows):
         angle = frequency * step * n
         if frequency != 0.0:
             q[INT], q[X] = -math.cos(angle) / frequency, math.sin(angle)
             q[V] = frequency * math.cos(angle)
-        _recall(past, n, lags, beyond, late)
+        _interpolate_delayed(past, n, lags, beyond, late)
         _solve(q, late, inverse, known, delayed, frequency)
         past[n % len(past)] = q
         block = n * _BLOCKS // rows
@@ -287,14 +294,17 @@ def _march(inverse, known, delayed, lags, beyond, step, rows, measured, frequenc
             sums[0] += q[FORCE] * wave
             sums[1] += q[V] * wave
         if frequency == 0.0 and n * _BLOCKS % rows < _BLOCKS and block > 0:
-            if largest[block - 1] < _GONE * _KICK or not largest[block - 1] < _GROWN * _KICK:
+            if (
+                largest[block - 1] < _MIN_SPEED_RATIO * _INITIAL_SPEED
+                or not largest[block - 1] < _MAX_SPEED_RATIO * _INITIAL_SPEED
+            ):
                 break
         _advance(q, before, step, n == 0)
     return largest, sums
 
 
 @compiled
-def _recall(past, n, lags, beyond, late):
+def _interpolate_delayed(past, n, lags, beyond, late):
     """Interpolate the delayed signals between two steps."""
     for side in range(2):
         if lags[side] > 0 and n > lags[side]:
@@ -312,10 +322,10 @@ def _solve(q, late, inverse, known, delayed, frequency):
         for j in range(20):
             total += delayed[i, j] * late[j]
         for j in range(6):
-            total -= known[i, j] * q[_KNOWN[j]]
+            total -= known[i, j] * q[_KNOWN_SIGNALS[j]]
         if frequency != 0.0:
             total -= inverse[i, 1] * frequency**2 * q[X]
-        q[_SOLVED[i]] = total  # _SOLVED and _KNOWN are disjoint
+        q[_SOLVED_SIGNALS[i]] = total  # _SOLVED and _KNOWN are disjoint
 
 
 @compiled
@@ -333,7 +343,7 @@ def _advance(q, before, step, first):
     q[INT] += 0.5 * step * (x + q[X])
 
 
-SWEPT = 2.0 * np.pi * np.geomspace(0.1, 5.0, 9)  # rad/s, frequency range of hand motion
+SWEEP_FREQUENCIES = 2.0 * np.pi * np.geomspace(0.1, 5.0, 9)  # rad/s, frequency range of hand motion
 
 
 @dataclass(frozen=True)
@@ -358,7 +368,7 @@ class SineSweep:
     measured: np.ndarray
 
     @property
-    def error(self) -> float | None:
+    def max_relative_error(self) -> float | None:
         """Largest relative error [1], None if no measurement is possible."""
         if not len(self.measured):
             return None
@@ -366,7 +376,7 @@ class SineSweep:
 
 
 @dataclass(frozen=True)
-class Agreement:
+class StabilityComparison:
     """Predicted and simulated stability on a grid.
 
     Attributes:
@@ -374,22 +384,22 @@ class Agreement:
         delays: (n,) delays in each direction [s].
         factors: (m,) factors on the return channels [1].
         predicted: (m, n) true where predicted stable.
-        seen: (m, n) true where stable in simulation.
+        simulated: (m, n) true where stable in simulation.
     """
 
     structure: str
     delays: np.ndarray
     factors: np.ndarray
     predicted: np.ndarray
-    seen: np.ndarray
+    simulated: np.ndarray
 
     @property
-    def share(self) -> float:
+    def agreement_fraction(self) -> float:
         """Fraction of the grid cells with equal prediction and simulation [1]."""
-        return float(np.mean(self.predicted == self.seen))
+        return float(np.mean(self.predicted == self.simulated))
 
 
-def sweep(case: Case, structure: str, frequencies: np.ndarray = SWEPT) -> SineSweep:
+def run_sine_sweep(case: TeleoperatorAxis, structure: str, frequencies: np.ndarray = SWEEP_FREQUENCIES) -> SineSweep:
     """Compute the transmitted impedance and measure it with imposed sines in simulation.
 
     Args:
@@ -400,17 +410,17 @@ def sweep(case: Case, structure: str, frequencies: np.ndarray = SWEPT) -> SineSw
     Returns:
         Predicted and measured impedances.
     """
-    port = case.port(structure)
-    expected = transmitted(port, 1j * frequencies, case.task)
+    port = case.make_port(structure)
+    expected = transmitted_impedance(port, 1j * frequencies, case.task)
     measured = []
-    if unstable_held(port, case.task) == 0:
+    if count_unstable_poles_held(port, case.task) == 0:
         measured = [simulate_sine(case, structure, float(w)) for w in frequencies]
-    return SineSweep(
-        structure, case.delay_forward, case.delay_back, frequencies, expected, np.array(measured)
-    )
+    return SineSweep(structure, case.delay_forward, case.delay_back, frequencies, expected, np.array(measured))
 
 
-def agreement(case: Case, structure: str, delays: np.ndarray, factors: np.ndarray) -> Agreement:
+def compare_stability(
+    case: TeleoperatorAxis, structure: str, delays: np.ndarray, factors: np.ndarray
+) -> StabilityComparison:
     """Predict and simulate stability in every cell of a stability map.
 
     Args:
@@ -423,22 +433,19 @@ def agreement(case: Case, structure: str, delays: np.ndarray, factors: np.ndarra
         Predicted and simulated stability.
     """
     seen = [
-        [
-            not is_growing(impulse_response(case.with_delay(float(t)), structure, float(k)))
-            for t in delays
-        ]
+        [not is_growing(simulate_impulse(case.with_delay(float(t)), structure, float(k))) for t in delays]
         for k in factors
     ]
     predicted = stability_map(case, structure, delays, factors)
-    return Agreement(structure, delays, factors, predicted, np.array(seen))
+    return StabilityComparison(structure, delays, factors, predicted, np.array(seen))
 
 
 Progress = Callable[[str, float], None]
-_EVERY = 40  # step of the frequencies that are written to the JSON
+_JSON_FREQUENCY_STEP = 40  # step of the frequencies that are written to the JSON
 
 
 @dataclass(frozen=True)
-class Findings:
+class TeleopFindings:
     """Results of an analysis of several structures.
 
     Attributes:
@@ -451,27 +458,27 @@ class Findings:
         spring: joystick axis with stiffness feedback, None without.
         sweeps: simulated sine sweeps, empty if not requested.
         agreements: simulated maps, empty if not requested.
-        robust: robustness of every sampled structure, empty if not requested.
+        robustness_results: robustness of every sampled structure, empty if not requested.
         period: sampling period [s].
     """
 
     name: str
-    case: Case
-    analyses: tuple[Analysis, ...]
+    case: TeleoperatorAxis
+    analyses: tuple[StructureAnalysis, ...]
     delays: np.ndarray
     factors: np.ndarray
     maps: dict[str, np.ndarray]
-    spring: Spring | None = None
+    spring: StiffnessAxis | None = None
     sweeps: tuple[SineSweep, ...] = ()
-    agreements: tuple[Agreement, ...] = ()
-    robust: tuple[Robustness, ...] = ()
+    agreements: tuple[StabilityComparison, ...] = ()
+    robustness_results: tuple[Robustness, ...] = ()
     period: float = 0.0
 
 
-def find(
-    name: str, case: Case, structures: tuple[str, ...], delays: np.ndarray, factors: np.ndarray,
-    spring: Spring | None = None, confirm: bool = False, progress: Progress | None = None,
-) -> Findings:  # fmt: skip
+def analyse_structures(
+    name: str, case: TeleoperatorAxis, structures: tuple[str, ...], delays: np.ndarray, factors: np.ndarray,
+    spring: StiffnessAxis | None = None, confirm: bool = False, progress: Progress | None = None,
+) -> TeleopFindings:  # fmt: skip
     """Analyse structures and, if requested, check the results by simulation.
 
     Args:
@@ -495,32 +502,30 @@ def find(
     for n, structure in enumerate(structures):
         if progress:
             progress(structure, n / len(structures))
-        analyses.append(analyse(case, structure))
+        analyses.append(analyse_structure(case, structure))
         if not confirm:
             maps[structure] = stability_map(case, structure, delays, factors)
             continue
         late = [case] if case.delay else []
-        sweeps += [sweep(one, structure) for one in (case.with_delay(0.0), *late)]
-        agreements.append(agreement(case, structure, delays, factors))
+        sweeps += [run_sine_sweep(one, structure) for one in (case.with_delay(0.0), *late)]
+        agreements.append(compare_stability(case, structure, delays, factors))
         maps[structure] = agreements[-1].predicted
-    return Findings(
-        name, case, tuple(analyses), delays, factors, maps, spring, tuple(sweeps), tuple(agreements)
-    )
+    return TeleopFindings(name, case, tuple(analyses), delays, factors, maps, spring, tuple(sweeps), tuple(agreements))
 
 
-def why_unstable(one: Analysis, let_go: bool = False) -> str:
+def describe_stability(analysis: StructureAnalysis, released: bool = False) -> str:
     """Return a short text on the stability of a structure and its unstable poles.
 
     Args:
-        one: the analysis.
-        let_go: whether to describe the released handle instead of the held one.
+        analysis: the analysis.
+        released: whether to describe the released handle instead of the held one.
 
     Returns:
         Text such as `no, 2 poles`; `yes` if the structure is stable.
     """
-    both = (one.unstable_poles, one.unstable_free)
-    if let_go:
-        both = (one.unstable_let_go, one.unstable_let_go_free)
+    both = (analysis.unstable_poles, analysis.unstable_poles_free)
+    if released:
+        both = (analysis.unstable_poles_released, analysis.unstable_poles_released_free)
     if both == (0, 0):
         return "yes"
     free = "" if both[0] != 0 else " when free"
@@ -536,7 +541,7 @@ def format_factor(margin: float) -> str:
     >>> format_factor(0.17), format_factor(math.inf)
     ('x 0.17', '> x 1000')
     """
-    return f"> x {MOST_TRIED:g}" if math.isinf(margin) else f"x {margin:.3g}"
+    return f"> x {MAX_TESTED_FACTOR:g}" if math.isinf(margin) else f"x {margin:.3g}"
 
 
 def format_delay(delay: float) -> str:
@@ -545,7 +550,7 @@ def format_delay(delay: float) -> str:
     >>> format_delay(0.12345), format_delay(math.inf)
     ('123 ms', '> 10 s')
     """
-    return f"> {LONGEST_TRIED:g} s" if math.isinf(delay) else f"{1e3 * delay:.3g} ms"
+    return f"> {MAX_TESTED_DELAY:g} s" if math.isinf(delay) else f"{1e3 * delay:.3g} ms"
 
 
 def format_number(value: float) -> str:
@@ -568,7 +573,7 @@ def format_error(error: float | None) -> str:
     return "< 0.01 %" if error < 1e-4 else f"{100.0 * error:.2g} %"
 
 
-def findings_document(found: Findings) -> dict:
+def findings_to_dict(found: TeleopFindings) -> dict:
     """Convert the results to plain data; infinite if no tested value changes stability.
 
     Args:
@@ -581,101 +586,103 @@ def findings_document(found: Findings) -> dict:
     document = {
         "name": found.name,
         "delay": {"forward": case.delay_forward, "back": case.delay_back},
-        "structures": {one.structure: _analysis(one) for one in found.analyses},
+        "structures": {one.structure: _analysis_to_dict(one) for one in found.analyses},
         "map": {
             "delay": found.delays, "factor": found.factors,
             "stable": {name: cells.astype(bool).tolist() for name, cells in found.maps.items()},
         },
     }  # fmt: skip
     if found.spring:
-        pair = {"held": found.spring.held(case.hand), "let_go": found.spring}
-        document["stiffness_feedback"] = {name: _spring(one) for name, one in pair.items()}
-    if found.robust:
+        pair = {"held": found.spring.with_hand(case.hand), "let_go": found.spring}
+        document["stiffness_feedback"] = {name: _spring_to_dict(one) for name, one in pair.items()}
+    if found.robustness_results:
         document["robust"] = {
             "period": found.period,
-            "structures": {one.structure: _robust(one) for one in found.robust},
+            "structures": {one.structure: _robustness_to_dict(one) for one in found.robustness_results},
         }
     if found.agreements:
         document["confirmed"] = {
-            "sweeps": [_sweep(one) for one in found.sweeps],
-            "agreement": {one.structure: one.share for one in found.agreements},
+            "sweeps": [_sweep_to_dict(one) for one in found.sweeps],
+            "agreement": {one.structure: one.agreement_fraction for one in found.agreements},
         }
     return document
 
 
-def _analysis(one: Analysis) -> dict:
-    at = slice(None, None, _EVERY)
-    worst = int(np.argmax(one.scattering))
+def _analysis_to_dict(one: StructureAnalysis) -> dict:
+    at = slice(None, None, _JSON_FREQUENCY_STEP)
+    worst = int(np.argmax(one.scattering_norms))
     return {
-        "stable": one.stable,
+        "stable": one.is_stable_held,
         "unstable_poles": one.unstable_poles,
-        "unstable_poles_free": one.unstable_free,
-        "stable_let_go": one.stable_let_go,
-        "unstable_poles_let_go": one.unstable_let_go,
-        "unstable_poles_let_go_free": one.unstable_let_go_free,
+        "unstable_poles_free": one.unstable_poles_free,
+        "stable_let_go": one.is_stable_released,
+        "unstable_poles_let_go": one.unstable_poles_released,
+        "unstable_poles_let_go_free": one.unstable_poles_released_free,
         "gain_margin": one.gain_margin,
-        "largest_delay": one.largest_delay,
-        "passive": one.passive,
-        "scattering_peak": one.scattering[worst],
+        "largest_delay": one.max_delay,
+        "passive": one.has_passive_port,
+        "scattering_peak": one.scattering_norms[worst],
         "scattering_peak_frequency": one.frequencies[worst],
         "frequency": one.frequencies[at],
-        "hybrid": _pairs(one.hybrid[at]),
-        "transmitted": _pairs(one.transmitted[at]),
-        "task": _pairs(one.task[at]),
-        "scattering": one.scattering[at],
-        "loop": _pairs(one.loop[at]),
+        "hybrid": _complex_to_pairs(one.hybrid_matrices[at]),
+        "transmitted": _complex_to_pairs(one.transmitted_impedance[at]),
+        "task": _complex_to_pairs(one.task_impedance[at]),
+        "scattering": one.scattering_norms[at],
+        "loop": _complex_to_pairs(one.loop_gains[at]),
     }
 
 
-def _robust(one: Robustness) -> dict:
+def _robustness_to_dict(one: Robustness) -> dict:
     names = ("held_task", "held_free", "let_go_task", "let_go_free")
     document = {
-        "absolutely_stable": one.absolutely_stable,
+        "absolutely_stable": one.has_absolute_stability,
         "llewellyn": one.llewellyn,
         "sampled": {
-            name: {"stable": told.stable, "reason": told.reason}
+            name: {"stable": told.is_stable, "reason": told.reason}
             for name, told in zip(names, one.sampled, strict=True)
         },
         "drawn": {
-            "pairs": one.worst.pairs, "unstable": one.worst.unstable,
-            "unstable_let_go": one.worst.unstable_let_go, "worst_growth_rate": one.worst.rate,
-            "worst_hand": vars(one.worst.hand), "worst_task": vars(one.worst.task),
+            "pairs": one.sampled_pairs.pair_count, "unstable": one.sampled_pairs.unstable_count,
+            "unstable_let_go": one.sampled_pairs.unstable_released_count,
+            "worst_growth_rate": one.sampled_pairs.worst_growth_rate,
+            "worst_hand": vars(one.sampled_pairs.worst_hand), "worst_task": vars(one.sampled_pairs.worst_task),
         },
     }  # fmt: skip
-    if one.width:
+    if one.z_width_result:
         document["z_width"] = {
-            "decades": one.width.decades, "stiffest_task_held": one.width.stiffest_held,
-            "stiffest_task_let_go": one.width.stiffest_let_go,
-            "stiffest_tried": one.width.most_tried,
+            "decades": one.z_width_result.decades, "stiffest_task_held": one.z_width_result.max_stiffness_held,
+            "stiffest_task_let_go": one.z_width_result.max_stiffness_released,
+            "stiffest_tried": one.z_width_result.max_tested_stiffness,
         }  # fmt: skip
-    if one.released:
+    if one.released_polynomial:
         document["master_let_go"] = {
-            "coefficients": one.released.coefficients, "unstable_poles": one.released.unstable,
+            "coefficients": one.released_polynomial.coefficients,
+            "unstable_poles": one.released_polynomial.unstable_zeros,
         }  # fmt: skip
     return document
 
 
-def _pairs(values: np.ndarray) -> list:
+def _complex_to_pairs(values: np.ndarray) -> list:
     return np.stack([np.real(values), np.imag(values)], axis=-1).tolist()
 
 
-def _spring(one: Spring) -> dict:
+def _spring_to_dict(one: StiffnessAxis) -> dict:
     return {
-        "mass": one.mass, "damping": one.damping, "least": one.least, "most": one.most,
-        "margin": one.margin, "damping_asked": one.enough_damping, "worst_growth": one.growth,
-        "least_damping": one.least_damping, "stable_by": one.stable_by,
+        "mass": one.mass, "damping": one.damping, "least": one.min_stiffness, "most": one.max_stiffness,
+        "margin": one.theorem_margin, "damping_asked": one.theorem_damping, "worst_growth": one.half_swing_growth,
+        "least_damping": one.min_stable_damping, "stable_by": one.stability_criterion,
     }  # fmt: skip
 
 
-def _sweep(one: SineSweep) -> dict:
+def _sweep_to_dict(one: SineSweep) -> dict:
     return {
         "structure": one.structure, "delay_forward": one.delay_forward,
-        "delay_back": one.delay_back, "error": one.error, "frequency": one.frequencies,
-        "expected": _pairs(one.expected), "measured": _pairs(one.measured),
+        "delay_back": one.delay_back, "error": one.max_relative_error, "frequency": one.frequencies,
+        "expected": _complex_to_pairs(one.expected), "measured": _complex_to_pairs(one.measured),
     }  # fmt: skip
 
 
-def deadband_share(deadband: float, amplitude: float) -> float:
+def deadband_gain(deadband: float, amplitude: float) -> float:
     """Return the gain of a dead band for a centred sine, relative to its slope outside the band.
 
     A loop that is unstable with the full slope still comes to rest inside the dead band. It can
@@ -690,7 +697,7 @@ def deadband_share(deadband: float, amplitude: float) -> float:
 
     Source: describing function of a dead zone; Gelb and Vander Velde 1968, appendix B.
 
-    >>> round(deadband_share(1.5e-3, 5.0e-3), 3), deadband_share(2.0, 1.0)
+    >>> round(deadband_gain(1.5e-3, 5.0e-3), 3), deadband_gain(2.0, 1.0)
     (0.624, 0.0)
     """
     ratio = deadband / amplitude
@@ -699,33 +706,33 @@ def deadband_share(deadband: float, amplitude: float) -> float:
     return 1.0 - 2.0 / math.pi * (math.asin(ratio) + ratio * math.sqrt(1.0 - ratio**2))
 
 
-_NAMES = {
+_STRUCTURE_NAMES = {
     ("direct_force", "rate"): "rate_force",
     ("direct_force", "position"): "position_force",
     ("coordinating_force", "rate"): "rate_position",
     ("coordinating_force", "position"): "position_position",
 }
-_CASE = "analyse a case file: hydrotele analyse teleop CASE.yaml --structure "
-_UNLINEAR = {
+_CASE_FILE_HINT = "analyse a case file: hydrotele analyse teleop CASE.yaml --structure "
+_NONLINEAR_REFLECTIONS = {
     "four_channel": (
         "its slave moves by an observed hand force, which is not modelled for a machine",
-        _CASE + "four_channel_{}",
+        _CASE_FILE_HINT + "four_channel_{}",
     ),
     "wave_variables": (
         "its channel transmits a wave only as far as received energy permits",
-        _CASE + "wave_variables --robust",
+        _CASE_FILE_HINT + "wave_variables --robust",
     ),
     "passivity_control": (
         "its channel adds damping in proportion to the missing energy",
-        _CASE + "passivity_control --robust",
+        _CASE_FILE_HINT + "passivity_control --robust",
     ),
     "impedance": (
         "the displayed stiffness is identified online and changes",
         "analyse it with pilot.reflection=direct_force, or simulate it: hydrotele run",
     ),
 }  # reflection: reason why it has no linear case, and the alternative
-_SEARCHED = 2.0 * np.pi * np.geomspace(0.02, 40.0, 4000)  # rad/s
-_STEPS, _NEWTON = 80, 8
+_SEARCH_FREQUENCIES = 2.0 * np.pi * np.geomspace(0.02, 40.0, 4000)  # rad/s
+_CONTINUATION_STEPS, _NEWTON_STEPS = 80, 8
 
 
 @dataclass(frozen=True)
@@ -733,33 +740,33 @@ class LoopFindings:
     """Results of the analysis of one structure of a scenario.
 
     structure: name of the structure.
-    own: whether it is the scenario's structure; otherwise direct force reflection replaces it.
+    is_scenario_structure: whether it is the scenario's structure; otherwise direct force reflection replaces it.
     unstable_poles: number of unstable poles with the task; None if poles lie on the imaginary
         axis.
     gain_margin: factor on the return channels up to which the loop is stable.
-    largest_delay: maximum delay in each direction [s].
+    max_delay: maximum delay in each direction [s].
     frequency: frequency of the oscillation at the margin [Hz]; NaN without a margin.
     pole: pole of that oscillation at the present gain [rad/s]; NaN without a margin.
-    largest_ratio: maximum stable ratio of hand force to machine force [N/N]; NaN if no force is
+    max_ratio: maximum stable ratio of hand force to machine force [N/N]; NaN if no force is
         reflected.
     hand_force: hand force at the machine's force limit with that ratio [N], [N m].
-    ratio_with_deadband: maximum stable ratio for an oscillation of the handle from stop to stop,
+    max_ratio_with_deadband: maximum stable ratio for an oscillation of the handle from stop to stop,
         with the reduced gain of the dead band [N/N]; NaN without a dead band.
     """
 
     structure: str
-    own: bool
+    is_scenario_structure: bool
     unstable_poles: int | None
     gain_margin: float
-    largest_delay: float
+    max_delay: float
     frequency: float
     pole: complex
-    largest_ratio: float
+    max_ratio: float
     hand_force: float
-    ratio_with_deadband: float
+    max_ratio_with_deadband: float
 
     @property
-    def stable(self) -> bool:
+    def is_stable(self) -> bool:
         """Whether no pole lies in the right half-plane."""
         return self.unstable_poles == 0
 
@@ -773,21 +780,21 @@ class ScenarioFindings:
         case: linear case of the scenario.
         task_source: source of the task's parameters.
         loop: results of the scenario's structure, or of direct force reflection in its place.
-        held: joystick axis under stiffness feedback, with the hand.
-        free: joystick axis under stiffness feedback, released.
-        edge_ratio: reflection ratio of stiffness feedback at the dead band's edge [N/N].
+        held_spring: joystick axis under stiffness feedback, with the hand.
+        released_spring: joystick axis under stiffness feedback, released.
+        deadband_edge_ratio: reflection ratio of stiffness feedback at the dead band's edge [N/N].
     """
 
     name: str
     case: LinearCase
     task_source: str
     loop: LoopFindings
-    held: Spring
-    free: Spring
-    edge_ratio: float
+    held_spring: StiffnessAxis
+    released_spring: StiffnessAxis
+    deadband_edge_ratio: float
 
 
-def find_loop(name: str, case: LinearCase, task_source: str) -> ScenarioFindings:
+def analyse_scenario_case(name: str, case: LinearCase, task_source: str) -> ScenarioFindings:
     """Analyse the linear case of a scenario.
 
     Args:
@@ -804,20 +811,20 @@ def find_loop(name: str, case: LinearCase, task_source: str) -> ScenarioFindings
     Source: Zhu 1994, chapters 3 and 4.
     """
     reflection, mode = case.pilot.reflection, case.pilot.mode
-    if reflection in _UNLINEAR:
-        why, instead = _UNLINEAR[reflection]
+    if reflection in _NONLINEAR_REFLECTIONS:
+        why, instead = _NONLINEAR_REFLECTIONS[reflection]
         message = f"{reflection!r} of a scenario has no linear case, because {why}"
         raise InputError("pilot.reflection", f"{message}; {instead.format(mode)}")
-    own = (reflection, mode) in _NAMES
-    structure = _NAMES.get((reflection, mode), f"{mode}_force")
+    own = (reflection, mode) in _STRUCTURE_NAMES
+    structure = _STRUCTURE_NAMES.get((reflection, mode), f"{mode}_force")
     spring = case.spring
     return ScenarioFindings(
-        name, case, task_source, structure_findings(case, structure, own), spring.held(case.held),
-        spring, local_ratio(case, case.deadband),
+        name, case, task_source, analyse_scenario_loop(case, structure, own), spring.with_hand(case.hand_impedance),
+        spring, stiffness_feedback_ratio(case, case.deadband),
     )  # fmt: skip
 
 
-def structure_findings(case: LinearCase, structure: str, own: bool = True) -> LoopFindings:
+def analyse_scenario_loop(case: LinearCase, structure: str, is_scenario_structure: bool = True) -> LoopFindings:
     """Analyse one structure of a case; see `LoopFindings`.
 
     Raises:
@@ -826,42 +833,42 @@ def structure_findings(case: LinearCase, structure: str, own: bool = True) -> Lo
     if structure not in STRUCTURES:
         raise InputError("structure", f"{structure!r}; known: {', '.join(STRUCTURES)}")
     try:
-        many = unstable_poles(case.port(structure), case.hand, case.task)
-    except OnTheAxis:
+        many = count_unstable_poles(case.make_port(structure), case.hand, case.task)
+    except PoleOnAxisError:
         many = None
     margin = gain_margin(case, structure)
-    frequency, pole = _swing(case, structure, margin)
+    frequency, pole = _find_oscillation(case, structure, margin)
     ratio = passing = math.nan
     if structure.endswith("force"):
         ratio = margin * case.ratio
-        share = deadband_share(case.deadband, case.reach)
+        share = deadband_gain(case.deadband, case.reach)
         passing = ratio / share if structure == "rate_force" and share > 0.0 else math.nan
     return LoopFindings(
-        structure, own, many, margin, largest_delay(case, structure), frequency, pole, ratio,
+        structure, is_scenario_structure, many, margin, find_max_delay(case, structure), frequency, pole, ratio,
         ratio * case.force_limit, passing,
     )  # fmt: skip
 
 
-def _swing(case: LinearCase, structure: str, margin: float) -> tuple[float, complex]:
+def _find_oscillation(case: LinearCase, structure: str, margin: float) -> tuple[float, complex]:
     """Return the oscillation frequency at the margin [Hz], and its pole at the present gain."""
     if not 0.0 < margin < math.inf:
         return math.nan, complex(math.nan, math.nan)
 
-    def returned(s: complex | np.ndarray, factor: float) -> np.ndarray:
-        return 1.0 + loop_gain(case.port(structure, factor), s, case.hand, case.task)
+    def characteristic(s: complex | np.ndarray, factor: float) -> np.ndarray:
+        return 1.0 + loop_gain(case.make_port(structure, factor), s, case.hand, case.task)
 
-    place = int(np.argmin(np.abs(returned(1j * _SEARCHED, margin))))
-    s = 1j * float(_SEARCHED[place])
-    for factor in np.geomspace(margin, 1.0, _STEPS):
-        for _ in range(_NEWTON):
+    place = int(np.argmin(np.abs(characteristic(1j * _SEARCH_FREQUENCIES, margin))))
+    s = 1j * float(_SEARCH_FREQUENCIES[place])
+    for factor in np.geomspace(margin, 1.0, _CONTINUATION_STEPS):
+        for _ in range(_NEWTON_STEPS):
             step = 1e-6 * abs(s)
-            here = complex(returned(s, factor))
-            slope = (complex(returned(s + step, factor)) - here) / step
+            here = complex(characteristic(s, factor))
+            slope = (complex(characteristic(s + step, factor)) - here) / step
             s -= here / slope
-    return float(_SEARCHED[place]) / (2.0 * math.pi), s
+    return float(_SEARCH_FREQUENCIES[place]) / (2.0 * math.pi), s
 
 
-def loop_document(found: ScenarioFindings) -> dict:
+def scenario_findings_to_dict(found: ScenarioFindings) -> dict:
     """Convert the results to plain data in SI units; missing values are infinite or NaN.
 
     Args:
@@ -871,7 +878,7 @@ def loop_document(found: ScenarioFindings) -> dict:
         A dictionary.
     """
     case, loop, tip = found.case, found.loop, found.case.tip
-    springs = {"held": found.held, "let_go": found.free}
+    springs = {"held": found.held_spring, "let_go": found.released_spring}
     return {
         "name": found.name,
         "coordinate": tip.coordinate,
@@ -884,22 +891,22 @@ def loop_document(found: ScenarioFindings) -> dict:
         },
         "delay": {"forward": case.delay_forward, "back": case.delay_back},
         "structure": {
-            "name": loop.structure, "of_the_scenario": loop.own, "stable": loop.stable,
+            "name": loop.structure, "of_the_scenario": loop.is_scenario_structure, "stable": loop.is_stable,
             "unstable_poles": loop.unstable_poles, "gain_margin": loop.gain_margin,
-            "largest_delay": loop.largest_delay, "frequency": loop.frequency,
+            "largest_delay": loop.max_delay, "frequency": loop.frequency,
             "pole": [loop.pole.real, loop.pole.imag], "ratio": case.ratio,
-            "largest_ratio": loop.largest_ratio, "force_limit": case.force_limit,
+            "largest_ratio": loop.max_ratio, "force_limit": case.force_limit,
             "hand_force_at_limit": loop.hand_force,
-            "largest_ratio_with_deadband": loop.ratio_with_deadband,
+            "largest_ratio_with_deadband": loop.max_ratio_with_deadband,
         },
         "stiffness_feedback": {
-            "ratio_at_deadband_edge": found.edge_ratio,
+            "ratio_at_deadband_edge": found.deadband_edge_ratio,
             **{
                 name: {
-                    "mass": one.mass, "damping": one.damping, "most": one.most,
-                    "margin": one.margin, "damping_asked": one.enough_damping,
-                    "worst_growth": one.growth, "least_damping": one.least_damping,
-                    "stable_by": one.stable_by,
+                    "mass": one.mass, "damping": one.damping, "most": one.max_stiffness,
+                    "margin": one.theorem_margin, "damping_asked": one.theorem_damping,
+                    "worst_growth": one.half_swing_growth, "least_damping": one.min_stable_damping,
+                    "stable_by": one.stability_criterion,
                 }
                 for name, one in springs.items()
             },

@@ -12,16 +12,27 @@ from scipy.signal import butter, sosfiltfilt
 from hydrotele.core.errors import InputError
 from hydrotele.identify.estimation import estimate
 from hydrotele.teleop.coils import Coils
-from hydrotele.teleop.compliance import GRAVITY, Flotor, rotation_between, turn_matrix
+from hydrotele.teleop.compliance import GRAVITY, Flotor, quaternion_to_matrix, rotation_between
 
-NAMES = ("mass", "com_x", "com_y", "com_z", "i_xx", "i_yy", "i_zz", "i_xy", "i_xz", "i_yz")
+FLOTOR_PARAMETERS = (
+    "mass",
+    "com_x",
+    "com_y",
+    "com_z",
+    "i_xx",
+    "i_yy",
+    "i_zz",
+    "i_xy",
+    "i_xz",
+    "i_yz",
+)
 _WHERE = "flotor"
 _CUTOFF = 12.0  # Hz, twice the fastest excitation tone; differentiation amplifies noise above it
-_SETTLE = 0.5  # s that are discarded at both ends because of filter transients
-_FROM_LIST = ((0, 3, 4), (3, 1, 5), (4, 5, 2))  # indices of xx yy zz xy xz yz in a matrix
-_LEFT = 0.2  # maximum residual relative to the wrench; above it the fit only follows noise
-_SIGMAS = 1.96
-_HELD = 1e-3  # relative error of difference quotients at 6 Hz: (w dt)^2 / 36
+_SETTLING_TIME = 0.5  # s that are discarded at both ends because of filter transients
+_INERTIA_INDICES = ((0, 3, 4), (3, 1, 5), (4, 5, 2))  # indices of xx yy zz xy xz yz in a matrix
+_MAX_RESIDUAL_RATIO = 0.2  # maximum residual relative to the wrench; above it the fit only follows noise
+_CONFIDENCE_SIGMAS = 1.96
+_DIFFERENCE_ERROR = 1e-3  # relative error of difference quotients at 6 Hz: (w dt)^2 / 36
 
 
 @dataclass(frozen=True)
@@ -30,25 +41,25 @@ class FlotorFit:
 
     Attributes:
         value: (10,) mass [kg], centre of mass [m], inertia about it [kg m^2].
-        interval: (10,) half widths of the 95 % confidence intervals.
+        interval_half_width: (10,) half widths of the 95 % confidence intervals.
         residual: (6,) root mean square residuals of force [N] and torque [N m].
         condition: condition number of the scaled equations.
-        rows: number of samples.
+        sample_count: number of samples.
     """
 
     value: np.ndarray
-    interval: np.ndarray
+    interval_half_width: np.ndarray
     residual: np.ndarray
     condition: float
-    rows: int
+    sample_count: int
 
-    def body(self) -> Flotor:
+    def to_flotor(self) -> Flotor:
         """Return the identified body for use in the control.
 
         Raises:
             InputError: the parameters are not physical.
         """
-        return Flotor(float(self.value[0]), self.value[1:4].copy(), _matrix(self.value[4:]))
+        return Flotor(float(self.value[0]), self.value[1:4].copy(), _inertia_matrix(self.value[4:]))
 
 
 def identify_flotor(
@@ -77,9 +88,9 @@ def identify_flotor(
     Source: Newton and Euler about a point of the body; Atkeson, An and Hollerbach 1986 (linear in
     ten parameters); Zhu 1994, 5.1.3 (the joystick was identified so).
     """
-    ends = round(_SETTLE / period)
+    ends = round(_SETTLING_TIME / period)
     if len(place) < 4 * ends:
-        raise InputError(_WHERE, f"needs at least {4 * _SETTLE:g} s, got {len(place) * period:g} s")
+        raise InputError(_WHERE, f"needs at least {4 * _SETTLING_TIME:g} s, got {len(place) * period:g} s")
     if not all(np.isfinite(part).all() for part in (place, quaternion, currents)):
         raise InputError(_WHERE, "poses and currents must be finite: remove faulty samples")
     matrix, wrench = flotor_equations(place, quaternion, currents, period, coils)
@@ -89,11 +100,11 @@ def identify_flotor(
     matrix, wrench = (sosfiltfilt(low, part, axis=0)[kept] for part in (matrix, wrench))
     moving = np.sqrt(np.sum(matrix**2, axis=(0, 1))).all()
     found = estimate(matrix, wrench) if moving else None
-    if found is None or (np.std(found.residual, axis=0) > _LEFT * np.std(wrench, axis=0)).any():
+    if found is None or (np.std(found.residual, axis=0) > _MAX_RESIDUAL_RATIO * np.std(wrench, axis=0)).any():
         raise InputError(_WHERE, "not all ten parameters are identifiable: rotate about every axis")
-    value, slope = _about_centre(found.value)
+    value, slope = _move_to_centre_of_mass(found.value)
     noise = np.diag(slope @ found.covariance @ slope.T)
-    interval = np.hypot(_SIGMAS * np.sqrt(noise), _of_differences(value))
+    interval = np.hypot(_CONFIDENCE_SIGMAS * np.sqrt(noise), _difference_errors(value))
     return FlotorFit(
         value, interval, np.sqrt(np.mean(found.residual**2, axis=0)),
         found.condition, len(wrench),
@@ -122,37 +133,37 @@ def flotor_equations(
     Source: see `identify_flotor`.
     """
     pairs = zip(quaternion[:-1], quaternion[1:], strict=True)
-    between = np.array([_turning(a, b) for a, b in pairs]) / period
+    between = np.array([_relative_rotation(a, b) for a, b in pairs]) / period
     spin, swing = 0.5 * (between[1:] + between[:-1]), np.diff(between, axis=0) / period
     lift = (place[2:] - 2.0 * place[1:-1] + place[:-2]) / period**2 - np.array(GRAVITY)
     turn = np.empty((len(spin), 3, 3))
     for q, out in zip(quaternion[1:-1], turn, strict=True):
-        turn_matrix(q, out)
+        quaternion_to_matrix(q, out)
     lift = np.einsum("nij,ni->nj", turn, lift)
     matrix = np.zeros((len(spin), 6, 10))
     matrix[:, :3, 0] = lift
-    matrix[:, :3, 1:4] = _cross(swing) + _cross(spin) @ _cross(spin)
-    matrix[:, 3:, 1:4] = -_cross(lift)
-    matrix[:, 3:, 4:] = _of_inertia(swing) + _cross(spin) @ _of_inertia(spin)
+    matrix[:, :3, 1:4] = _skew_matrices(swing) + _skew_matrices(spin) @ _skew_matrices(spin)
+    matrix[:, 3:, 1:4] = -_skew_matrices(lift)
+    matrix[:, 3:, 4:] = _inertia_regressor(swing) + _skew_matrices(spin) @ _inertia_regressor(spin)
     held = currents @ coils.wrench_map.T
     return matrix, 0.5 * (held[:-2] + held[1:-1])
 
 
-def _of_differences(value: np.ndarray) -> np.ndarray:
+def _difference_errors(value: np.ndarray) -> np.ndarray:
     """Return the errors (10,) of difference quotients, for tones up to 6 Hz at 200 Hz."""
     moment = value[4:7].sum() / 2.0
     radius = float(np.sqrt(moment / value[0]))
-    return _HELD * np.array([1e-3 * value[0], *[radius] * 3, *[moment] * 6])
+    return _DIFFERENCE_ERROR * np.array([1e-3 * value[0], *[radius] * 3, *[moment] * 6])
 
 
-def _turning(first: np.ndarray, then: np.ndarray) -> np.ndarray:
+def _relative_rotation(first: np.ndarray, then: np.ndarray) -> np.ndarray:
     """Return the rotation vector (3,) between two orientations, in the body's axes [rad]."""
     scalar, vector = rotation_between(first, then)
     size = float(np.linalg.norm(vector))
     return vector * (2.0 * np.arctan2(size, scalar) / size if size > 1e-12 else 2.0)
 
 
-def _cross(v: np.ndarray) -> np.ndarray:
+def _skew_matrices(v: np.ndarray) -> np.ndarray:
     """Return the matrices (n, 3, 3) of the cross products of v (n, 3)."""
     out = np.zeros((len(v), 3, 3))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
@@ -160,32 +171,32 @@ def _cross(v: np.ndarray) -> np.ndarray:
     return out
 
 
-def _of_inertia(v: np.ndarray) -> np.ndarray:
+def _inertia_regressor(v: np.ndarray) -> np.ndarray:
     """Return (n, 3, 6) that maps xx, yy, zz, xy, xz, yz to the inertia times v (n, 3)."""
     out = np.zeros((len(v), 3, 6))
-    for row, places in enumerate(_FROM_LIST):
+    for row, places in enumerate(_INERTIA_INDICES):
         for column, place in enumerate(places):
             out[:, row, place] = v[:, column]
     return out
 
 
-def _matrix(six: np.ndarray) -> np.ndarray:
-    return np.array([[six[k] for k in places] for places in _FROM_LIST])
+def _inertia_matrix(six: np.ndarray) -> np.ndarray:
+    return np.array([[six[k] for k in places] for places in _INERTIA_INDICES])
 
 
-def _about_centre(linear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _move_to_centre_of_mass(linear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Move first moments and inertia from the coils' frame to the centre of mass.
 
     Return the parameters (10,) and their Jacobian (10, 10), by central differences.
     """
 
-    def moved(p: np.ndarray) -> np.ndarray:
+    def convert(p: np.ndarray) -> np.ndarray:
         centre = p[1:4] / p[0]
         parallel = p[0] * (centre @ centre * np.eye(3) - np.outer(centre, centre))
-        inertia = _matrix(p[4:]) - parallel
+        inertia = _inertia_matrix(p[4:]) - parallel
         upper = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
         return np.concatenate([p[:1], centre, upper])
 
     steps = 1e-6 * np.diag(np.maximum(np.abs(linear), 1e-6))
-    slope = [(moved(linear + d) - moved(linear - d)) / (2.0 * d.sum()) for d in steps]
-    return moved(linear), np.column_stack(slope)
+    slope = [(convert(linear + d) - convert(linear - d)) / (2.0 * d.sum()) for d in steps]
+    return convert(linear), np.column_stack(slope)

@@ -23,39 +23,39 @@ import numpy as np
 from hydrotele.core.errors import InputError
 from hydrotele.machine.joystick import Joystick
 from hydrotele.simulate.joystick import SimulatedFlotor
-from hydrotele.teleop.coils import Coils, three_stations
+from hydrotele.teleop.coils import Coils, make_three_station_coils
 from hydrotele.teleop.compliance import (
-    Axes,
+    AxisDynamics,
     Flotor,
-    Motion,
+    FlotorMotion,
     compliance_wrench,
+    quaternion_to_matrix,
     rotation_between,
-    turn_matrix,
 )
 
-FROZEN = 0.1  # s: a reading with noise is never constant for twenty periods
-_NONE = np.zeros(6)
+MAX_FROZEN_TIME = 0.1  # s: a reading with noise is never constant for twenty periods
+_ZERO_CURRENTS = np.zeros(6)
 
 
 @dataclass(frozen=True)
-class Levitation:
+class LevitationControl:
     """Parameters of the control.
 
     Attributes:
-        body: model of the flotor in the control, in the coils' frame.
+        flotor_model: model of the flotor in the control, in the coils' frame.
         axes: designed second-order systems.
         coils: the coils.
         handle: (3,) centre of compliance in the coils' frame [m].
         period: control period [s].
-        frozen: maximum time for which a reading may be exactly constant [s].
+        max_frozen_time: maximum time for which a reading may be exactly constant [s].
     """
 
-    body: Flotor
-    axes: Axes
+    flotor_model: Flotor
+    axes: AxisDynamics
     coils: Coils
     handle: np.ndarray
     period: float
-    frozen: float = FROZEN
+    max_frozen_time: float = MAX_FROZEN_TIME
 
 
 class ControllerState(NamedTuple):
@@ -64,12 +64,12 @@ class ControllerState(NamedTuple):
     Attributes:
         place: (3,) last measured position of the coils' frame [m]; NaN if there was none.
         quaternion: (4,) last measured orientation, scalar first.
-        same: time for which the reading has not changed [s].
+        unchanged_time: time for which the reading has not changed [s].
     """
 
     place: np.ndarray
     quaternion: np.ndarray
-    same: float
+    unchanged_time: float
 
 
 class CoilOutput(NamedTuple):
@@ -77,24 +77,24 @@ class CoilOutput(NamedTuple):
 
     Attributes:
         currents: (6,) [A].
-        limited: whether the currents were scaled down.
-        blind: whether the coils are off because the reading is not finite or is frozen.
+        is_limited: whether the currents were scaled down.
+        is_blind: whether the coils are off because the reading is not finite or is frozen.
     """
 
     currents: np.ndarray
-    limited: bool
-    blind: bool
+    is_limited: bool
+    is_blind: bool
 
 
-def levitation(
-    joystick: Joystick, body: Flotor | None = None, frozen: float = FROZEN
-) -> Levitation:
+def make_levitation_control(
+    joystick: Joystick, body: Flotor | None = None, max_frozen_time: float = MAX_FROZEN_TIME
+) -> LevitationControl:
     """Build the control parameters of a joystick.
 
     Args:
         joystick: the joystick.
         body: model of the flotor in the control; the true parameters by default.
-        frozen: maximum time for which a reading may be exactly constant [s].
+        max_frozen_time: maximum time for which a reading may be exactly constant [s].
 
     Returns:
         Parameters of the control.
@@ -104,13 +104,13 @@ def levitation(
     """
     f, c, alone = joystick.flotor, joystick.coils, joystick.alone
     own = Flotor(f.mass, np.array(f.com), np.diag(f.inertia))
-    return Levitation(
-        body=body or own,
-        axes=Axes(np.array(alone.frequency), np.array(alone.ratio)),
-        coils=three_stations(c.radius, c.force_per_ampere, c.max_current),
+    return LevitationControl(
+        flotor_model=body or own,
+        axes=AxisDynamics(np.array(alone.frequency), np.array(alone.ratio)),
+        coils=make_three_station_coils(c.radius, c.force_per_ampere, c.max_current),
         handle=np.array(f.handle),
         period=1.0 / joystick.control_rate,
-        frozen=frozen,
+        max_frozen_time=max_frozen_time,
     )
 
 
@@ -119,9 +119,9 @@ def initial_controller_state() -> ControllerState:
     return ControllerState(np.full(3, np.nan), np.full(4, np.nan), 0.0)
 
 
-def levitation_step(
-    control: Levitation, before: ControllerState, place: np.ndarray, quaternion: np.ndarray,
-    target: np.ndarray, turned: np.ndarray,
+def step_levitation(
+    control: LevitationControl, before: ControllerState, place: np.ndarray, quaternion: np.ndarray,
+    target: np.ndarray, target_rotation: np.ndarray,
 ) -> tuple[ControllerState, CoilOutput]:  # fmt: skip
     """Run one control period: velocities by differences, wrench, currents.
 
@@ -135,7 +135,7 @@ def levitation_step(
         place: (3,) measured position of the coils' frame, from the handle's centre [m].
         quaternion: (4,) measured orientation, scalar first.
         target: (3,) reference position of the handle, from its centre [m].
-        turned: (4,) reference orientation of the flotor, scalar first.
+        target_rotation: (4,) reference orientation of the flotor, scalar first.
 
     Returns:
         The new state, and the currents.
@@ -143,22 +143,22 @@ def levitation_step(
     Source: Zhu 1994, 5.1.3.
     """
     if not (np.isfinite(place).all() and np.isfinite(quaternion).all()):
-        return initial_controller_state(), CoilOutput(_NONE, True, True)
+        return initial_controller_state(), CoilOutput(_ZERO_CURRENTS, True, True)
     same = np.array_equal(place, before.place) and np.array_equal(quaternion, before.quaternion)
-    after = ControllerState(place, quaternion, before.same + control.period if same else 0.0)
-    if after.same > control.frozen:
-        return after, CoilOutput(_NONE, True, True)
+    after = ControllerState(place, quaternion, before.unchanged_time + control.period if same else 0.0)
+    if after.unchanged_time > control.max_frozen_time:
+        return after, CoilOutput(_ZERO_CURRENTS, True, True)
     velocity, rate = np.zeros(3), np.zeros(3)
     if np.isfinite(before.place).all():
         velocity = (place - before.place) / control.period
         rate = 2.0 * rotation_between(before.quaternion, quaternion)[1] / control.period
-    motion = Motion(place, quaternion, velocity, rate)
-    wrench = compliance_wrench(control.body, control.axes, control.handle, motion, target, turned)
-    found = control.coils.currents(wrench)
-    return after, CoilOutput(found.value, found.limited, False)
+    motion = FlotorMotion(place, quaternion, velocity, rate)
+    wrench = compliance_wrench(control.flotor_model, control.axes, control.handle, motion, target, target_rotation)
+    found = control.coils.compute_currents(wrench)
+    return after, CoilOutput(found.value, found.is_limited, False)
 
 
-def coils_from_handle(handle: np.ndarray, place: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
+def coil_frame_position(handle: np.ndarray, place: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
     """Return the position of the coils' frame (3,) [m] from the pose of the handle.
 
     Args:
@@ -167,16 +167,19 @@ def coils_from_handle(handle: np.ndarray, place: np.ndarray, quaternion: np.ndar
         quaternion: (4,) orientation, scalar first.
     """
     turn = np.empty((3, 3))
-    turn_matrix(quaternion, turn)
+    quaternion_to_matrix(quaternion, turn)
     return place - turn @ handle
 
 
 _WHERE = "optical sensing"
-_ENOUGH, _MOST = 1e-12, 20  # tolerance [m], [rad], maximum Newton steps; 4 suffice in the range
-_ANGLES = np.pi * np.array([1.0, 3.0, 5.0]) / 3.0  # halfway between the stations of the coils
-_OUT = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES), np.zeros(3)])
-_ASIDE = np.column_stack([-np.sin(_ANGLES), np.cos(_ANGLES), np.zeros(3)])
-_UP = np.array([0.0, 0.0, 1.0])
+_NEWTON_TOLERANCE, _MAX_NEWTON_STEPS = (
+    1e-12,
+    20,
+)  # tolerance [m], [rad], maximum Newton steps; 4 suffice in the range
+_BEAM_ANGLES = np.pi * np.array([1.0, 3.0, 5.0]) / 3.0  # halfway between the stations of the coils
+_BEAM_DIRECTIONS = np.column_stack([np.cos(_BEAM_ANGLES), np.sin(_BEAM_ANGLES), np.zeros(3)])
+_LATERAL_DIRECTIONS = np.column_stack([-np.sin(_BEAM_ANGLES), np.cos(_BEAM_ANGLES), np.zeros(3)])
+_VERTICAL_DIRECTION = np.array([0.0, 0.0, 1.0])
 
 
 def diode_readings(place: np.ndarray, turn: np.ndarray, distance: float) -> np.ndarray:
@@ -200,10 +203,10 @@ def diode_readings(place: np.ndarray, turn: np.ndarray, distance: float) -> np.n
     >>> readings[1::2].tolist()
     [0.001, 0.001, 0.001]
     """
-    return _meet(np.asarray(place, float), turn, distance)[0]
+    return _trace_beams(np.asarray(place, float), turn, distance)[0]
 
 
-def pose_of_readings(readings: np.ndarray, distance: float) -> tuple[np.ndarray, np.ndarray]:
+def solve_flotor_pose(readings: np.ndarray, distance: float) -> tuple[np.ndarray, np.ndarray]:
     """Compute the flotor's pose from the six readings, by Newton's method from the centre.
 
     Args:
@@ -222,11 +225,11 @@ def pose_of_readings(readings: np.ndarray, distance: float) -> tuple[np.ndarray,
     place, turn = np.zeros(3), np.eye(3)
     if not np.isfinite(readings).all():
         return np.full(3, np.nan), np.full((3, 3), np.nan)
-    for _ in range(_MOST):
-        now, slope = _meet(place, turn, distance)
+    for _ in range(_MAX_NEWTON_STEPS):
+        now, slope = _trace_beams(place, turn, distance)
         step = np.linalg.solve(slope, readings - now)
-        place, turn = place + step[:3], _rotation(step[3:]) @ turn
-        if np.abs(step).max() < _ENOUGH:
+        place, turn = place + step[:3], _rotation_matrix(step[3:]) @ turn
+        if np.abs(step).max() < _NEWTON_TOLERANCE:
             return place, turn
     raise InputError(_WHERE, f"no pose corresponds to the readings {readings}")
 
@@ -244,15 +247,15 @@ def pose_resolution(distance: float, step: float) -> np.ndarray:
 
     Source: linear propagation through `diode_readings`.
     """
-    _, slope = _meet(np.zeros(3), np.eye(3), distance)
+    _, slope = _trace_beams(np.zeros(3), np.eye(3), distance)
     inverse = np.linalg.inv(slope)
     return step / np.sqrt(12.0) * np.sqrt(np.sum(inverse**2, axis=1))
 
 
-def _meet(place, turn, distance) -> tuple[np.ndarray, np.ndarray]:
+def _trace_beams(place, turn, distance) -> tuple[np.ndarray, np.ndarray]:
     """Return readings (6,) and Jacobian (6, 6) by position and a small rotation of the stator."""
     readings, slope = np.empty(6), np.empty((6, 6))
-    for k, (out, aside) in enumerate(zip(_OUT, _ASIDE, strict=True)):
+    for k, (out, aside) in enumerate(zip(_BEAM_DIRECTIONS, _LATERAL_DIRECTIONS, strict=True)):
         beam = turn @ out
         along = float(out @ beam)
         far = distance - float(out @ place)
@@ -260,7 +263,7 @@ def _meet(place, turn, distance) -> tuple[np.ndarray, np.ndarray]:
             raise InputError(_WHERE, f"the beam of diode {k + 1} misses its side of the stator")
         length = far / along
         spot = place + length * beam
-        for j, axis in enumerate((aside, _UP)):
+        for j, axis in enumerate((aside, _VERTICAL_DIRECTION)):
             row = 2 * k + j
             readings[row] = axis @ spot
             slope[row, :3] = axis - out * (axis @ beam) / along
@@ -268,7 +271,7 @@ def _meet(place, turn, distance) -> tuple[np.ndarray, np.ndarray]:
     return readings, slope
 
 
-def _rotation(vector: np.ndarray) -> np.ndarray:
+def _rotation_matrix(vector: np.ndarray) -> np.ndarray:
     """Convert a rotation vector to a rotation matrix."""
     angle = float(np.linalg.norm(vector))
     x, y, z = vector / angle if angle > 0.0 else vector
@@ -276,9 +279,9 @@ def _rotation(vector: np.ndarray) -> np.ndarray:
     return np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
 
 
-Reading = tuple[np.ndarray, np.ndarray]
-_FINE = 2  # factor on the physics steps of a run, with a negligible Runge-Kutta error
-_TONES = 6
+PoseReading = tuple[np.ndarray, np.ndarray]
+_PHYSICS_SUBSTEPS = 2  # factor on the physics steps of a run, with a negligible Runge-Kutta error
+_TONES_PER_AXIS = 6
 
 
 @dataclass(frozen=True)
@@ -330,23 +333,24 @@ class PoseSensor:
         if diodes:
             self._step = np.full(6, joystick.diodes.step)
 
-    def read(self, qpos: np.ndarray) -> Reading:
+    def read(self, qpos: np.ndarray) -> PoseReading:
         """Return position (3,) [m] from the handle's centre and quaternion (4,) of the coils."""
         if self._distance:
             turn = np.empty((3, 3))
-            turn_matrix(qpos[3:7], turn)
+            quaternion_to_matrix(qpos[3:7], turn)
             shift = qpos[:3] - turn @ self._handle + self._handle
-            found, turned = pose_of_readings(
-                self._rounded(diode_readings(shift, turn, self._distance)), self._distance
+            found, turned = solve_flotor_pose(
+                self._add_noise_and_round(diode_readings(shift, turn, self._distance)),
+                self._distance,
             )
             quaternion = np.empty(4)
             mujoco.mju_mat2Quat(quaternion, turned.ravel())
             return found - self._handle, quaternion
-        pose = self._rounded(np.concatenate([qpos[:3], rotation_vector(qpos[3:7])]))
-        quaternion = quaternion_of(pose[3:])
-        return coils_from_handle(self._handle, pose[:3], quaternion), quaternion
+        pose = self._add_noise_and_round(np.concatenate([qpos[:3], quaternion_to_vector(qpos[3:7])]))
+        quaternion = vector_to_quaternion(pose[3:])
+        return coil_frame_position(self._handle, pose[:3], quaternion), quaternion
 
-    def _rounded(self, values: np.ndarray) -> np.ndarray:
+    def _add_noise_and_round(self, values: np.ndarray) -> np.ndarray:
         values = values + self._noise * self._step * self._rng.uniform(-1.0, 1.0, 6)
         fine = self._step > 0.0
         values[fine] = np.rint(values[fine] / self._step[fine]) * self._step[fine]
@@ -354,10 +358,10 @@ class PoseSensor:
 
 
 def simulate_levitation(
-    joystick: Joystick, target: np.ndarray, *, control: Levitation | None = None,
+    joystick: Joystick, target: np.ndarray, *, control: LevitationControl | None = None,
     start: np.ndarray | None = None, noise: float = 1.0, diodes: bool = False, seed: int = 0,
-    cab: tuple[np.ndarray, np.ndarray] | None = None, push: np.ndarray | None = None,
-    spoil: Callable[[int, Reading], Reading] | None = None,
+    cab_motion: tuple[np.ndarray, np.ndarray] | None = None, handle_wrench: np.ndarray | None = None,
+    sensor_fault: Callable[[int, PoseReading], PoseReading] | None = None,
 ) -> LevitationRun:  # fmt: skip
     """Simulate the levitated flotor along a reference path.
 
@@ -369,43 +373,49 @@ def simulate_levitation(
         noise: maximum error of a reading before rounding, in steps of the resolution.
         diodes: whether the three diodes measure the pose, instead of rounding it.
         seed: seed of the noise.
-        cab: (n,) angular velocity [rad/s] and (n,) angular acceleration [rad/s^2] of the cab.
-        push: (n, 6) forces [N] and torques [N m] on the handle.
-        spoil: function that applies a sensor fault to the reading of a period.
+        cab_motion: (n,) angular velocity [rad/s] and (n,) angular acceleration [rad/s^2] of the cab.
+        handle_wrench: (n, 6) forces [N] and torques [N m] on the handle.
+        sensor_fault: function that applies a sensor fault to the reading of a period.
 
     Returns:
         Time histories of the run.
     """
-    control = control or levitation(joystick, frozen=FROZEN if noise > 0.0 else np.inf)
+    control = control or make_levitation_control(joystick, max_frozen_time=MAX_FROZEN_TIME if noise > 0.0 else np.inf)
     flotor = SimulatedFlotor(
-        joystick, hand=False, period=control.period, fine=_FINE, runge_kutta=True
+        joystick, hand=False, period=control.period, refinement=_PHYSICS_SUBSTEPS, runge_kutta=True
     )
     eye = PoseSensor(joystick, noise=noise, diodes=diodes, seed=seed)
-    flotor.place(np.zeros(6) if start is None else start)
+    flotor.set_pose(np.zeros(6) if start is None else start)
     n, memory, mount = len(target), initial_controller_state(), np.array(joystick.mount)
-    push = np.zeros((n, 6)) if push is None else push
+    handle_wrench = np.zeros((n, 6)) if handle_wrench is None else handle_wrench
     pose, place, quaternion = np.empty((n, 6)), np.empty((n, 3)), np.empty((n, 4))
     currents, limited, blind = np.empty((n, 6)), np.empty(n, bool), np.empty(n, bool)
     for k, goal in enumerate(target):
         qpos = flotor.data.qpos
-        pose[k, :3], pose[k, 3:] = qpos[:3], rotation_vector(qpos[3:7])
+        pose[k, :3], pose[k, 3:] = qpos[:3], quaternion_to_vector(qpos[3:7])
         seen = eye.read(qpos)
-        place[k], quaternion[k] = spoil(k, seen) if spoil else seen
-        memory, (currents[k], limited[k], blind[k]) = levitation_step(
+        place[k], quaternion[k] = sensor_fault(k, seen) if sensor_fault else seen
+        memory, (currents[k], limited[k], blind[k]) = step_levitation(
             control, memory, place[k].copy(), quaternion[k].copy(), goal[:3],
-            quaternion_of(goal[3:]),
+            vector_to_quaternion(goal[3:]),
         )  # fmt: skip
-        if cab:
-            flotor.shaken_step(currents[k], push[k], mount, float(cab[0][k]), float(cab[1][k]))
+        if cab_motion:
+            flotor.step_in_cab(
+                currents[k],
+                handle_wrench[k],
+                mount,
+                float(cab_motion[0][k]),
+                float(cab_motion[1][k]),
+            )
         else:
-            flotor.step(currents[k], push[k])
+            flotor.step(currents[k], handle_wrench[k])
     time = control.period * np.arange(n)
     warnings = int(np.sum(flotor.data.warning.number))
     return LevitationRun(time, pose, place, quaternion, currents, limited, blind, warnings)
 
 
-def excitation_path(
-    joystick: Joystick, seconds: float, seed: int = 0, share: float = 0.5
+def make_excitation_path(
+    joystick: Joystick, seconds: float, seed: int = 0, workspace_fraction: float = 0.5
 ) -> np.ndarray:
     """Generate an identification path: every axis with its own tones between 0.4 and 6 Hz.
 
@@ -413,25 +423,25 @@ def excitation_path(
         joystick: the joystick.
         seconds: duration [s].
         seed: seed of the phases.
-        share: fraction of the workspace that the targets may use [1].
+        workspace_fraction: fraction of the workspace that the targets may use [1].
 
     Returns:
         (n, 6) targets for `simulate_levitation` [m], [rad].
     """
     rng, time = np.random.default_rng(seed), np.arange(0.0, seconds, 1.0 / joystick.control_rate)
-    tones = 0.4 * 15.0 ** ((np.arange(6 * _TONES) + 0.5) / (6 * _TONES))  # all tones differ
+    tones = 0.4 * 15.0 ** ((np.arange(6 * _TONES_PER_AXIS) + 0.5) / (6 * _TONES_PER_AXIS))  # all tones differ
     path = np.empty((len(time), 6))
     for axis in range(6):
-        angles = 2.0 * np.pi * np.outer(time, tones[axis::6]) + rng.uniform(0, 2 * np.pi, _TONES)
+        angles = 2.0 * np.pi * np.outer(time, tones[axis::6]) + rng.uniform(0, 2 * np.pi, _TONES_PER_AXIS)
         path[:, axis] = np.sin(angles).sum(axis=1)
     path *= np.clip(time, 0.0, 1.0)[:, None]  # starts from rest within 1 s
-    for rows, far in ((slice(0, 3), min(joystick.reach[:3])),
-                      (slice(3, 6), min(joystick.reach[3:]))):  # fmt: skip
-        path[:, rows] *= share * far / np.linalg.norm(path[:, rows], axis=1).max()
+    for rows, far in ((slice(0, 3), min(joystick.handle_travel[:3])),
+                      (slice(3, 6), min(joystick.handle_travel[3:]))):  # fmt: skip
+        path[:, rows] *= workspace_fraction * far / np.linalg.norm(path[:, rows], axis=1).max()
     return path
 
 
-def designed_step(time: np.ndarray, frequency: float, ratio: float) -> np.ndarray:
+def second_order_step_response(time: np.ndarray, frequency: float, ratio: float) -> np.ndarray:
     """Return the unit step response of an underdamped second-order system.
 
     Args:
@@ -443,7 +453,7 @@ def designed_step(time: np.ndarray, frequency: float, ratio: float) -> np.ndarra
         (n,) from 0 to 1.
 
     >>> import numpy as np
-    >>> designed_step(np.array([0.0, 10.0]), 25.0, 0.8).round(6).tolist()
+    >>> second_order_step_response(np.array([0.0, 10.0]), 25.0, 0.8).round(6).tolist()
     [0.0, 1.0]
     """
     damped = frequency * np.sqrt(1.0 - ratio**2)
@@ -451,14 +461,14 @@ def designed_step(time: np.ndarray, frequency: float, ratio: float) -> np.ndarra
     return 1.0 - np.exp(-ratio * frequency * time) * wave
 
 
-def rotation_vector(quaternion: np.ndarray) -> np.ndarray:
+def quaternion_to_vector(quaternion: np.ndarray) -> np.ndarray:
     """Convert a quaternion (4,), scalar first, to a rotation vector (3,) [rad]."""
     out = np.zeros(3)
     mujoco.mju_quat2Vel(out, quaternion, 1.0)
     return out
 
 
-def quaternion_of(vector: np.ndarray) -> np.ndarray:
+def vector_to_quaternion(vector: np.ndarray) -> np.ndarray:
     """Convert a rotation vector (3,) [rad] to a quaternion (4,), scalar first."""
     angle = float(np.linalg.norm(vector))
     out = np.zeros(4)

@@ -36,49 +36,49 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.control.resolved_motion import COORDINATES, arm_axes, pose_to_joints
-from hydrotele.control.state_filter import butterworth
-from hydrotele.control.tip_balance import ArmBalance, arm_tables
+from hydrotele.control.state_filter import butterworth_response
+from hydrotele.control.tip_balance import ArmBalance, create_arm_balance
 from hydrotele.core.errors import InputError
 from hydrotele.estimate.reduced_model import X, place_mechanism
-from hydrotele.hydraulics.circuit import SLOTS, Kind, Slot
+from hydrotele.hydraulics.circuit import SLOT_COUNT, ActuatorKind, Slot
 from hydrotele.kinematics.task import task_jacobian
 from hydrotele.machine.joystick import AXES, Joystick
-from hydrotele.machine.machine import Machine, sensor_set
-from hydrotele.multibody.reduced_mechanism import gather_forces
+from hydrotele.machine.machine import Machine, get_sensors
+from hydrotele.multibody.reduced_mechanism import compute_mass_and_bias
 from hydrotele.scenario.scenario import Plate, Scenario, Servo
-from hydrotele.scenario.teleoperation import Regulate, TeleopPilot, Track
+from hydrotele.scenario.teleoperation import RegulateForce, TeleopPilot, TrackForce
 from hydrotele.teleop.axis_table import (
     COORDINATE,
     COUPLING,
     COUPLING_DAMPING,
     DAMPING,
     DEADBAND,
+    FORCE_LIMIT,
     GAIN,
-    LEAST,
-    LIMIT,
-    MOST,
-    NOMINAL,
-    RATIO,
-    REACH,
-    REFLECTED_MOST,
+    HANDLE_RANGE,
+    MAX_REFLECTED_FORCE,
+    MAX_STIFFNESS,
+    MIN_STIFFNESS,
+    NOMINAL_STIFFNESS,
+    REFLECTION_RATIO,
 )
-from hydrotele.teleop.master import Master, master
-from hydrotele.teleop.operator_model import DECISIONS, REFLEX
-from hydrotele.teleop.operator_parameters import held_joystick
-from hydrotele.teleop.slave import AHEAD, SMOOTH
-from hydrotele.teleop.switching import Spring
+from hydrotele.teleop.master import MasterParameters, build_master
+from hydrotele.teleop.operator_model import DECISION_RATE, REFLEX_DELAY
+from hydrotele.teleop.operator_parameters import attach_operator_hand
+from hydrotele.teleop.slave import LEAD_AVERAGING_TIME, SMOOTHING_BANDWIDTH
+from hydrotele.teleop.switching import StiffnessAxis
 from hydrotele.teleop.two_port import Impedance, TwoPort
 
 
 @dataclass(frozen=True)
-class TipDrive:
+class TipModel:
     """Linear model of the tip of an arm with k joints along one coordinate, about a pose.
 
     Attributes:
         coordinate: `r`, `theta`, `z`, `attitude` or `head`.
         mass: effective mass, `1 / (J M^-1 J')` [kg], [kg m^2].
         compliance: (k,) of every joint at the tip, with closed valves [m/N], [rad/(N m)].
-        share: (k,) contribution of every joint to the reference rate; their sum is 1.
+        rate_fractions: (k,) contribution of every joint to the reference rate; their sum is 1.
         gain: (k,) servo gains g [1/s].
         bandwidth: (k,) bandwidths of the valves [rad/s].
         damping: (k,) damping ratios of the valves [1].
@@ -88,7 +88,7 @@ class TipDrive:
     coordinate: str
     mass: float
     compliance: np.ndarray
-    share: np.ndarray
+    rate_fractions: np.ndarray
     gain: np.ndarray
     bandwidth: np.ndarray
     damping: np.ndarray
@@ -101,16 +101,14 @@ class TipDrive:
 
 
 @dataclass(frozen=True)
-class Clocks:
+class SamplingPeriods:
     """Control period and sampling period of the sensors [s]."""
 
-    control: float
-    samples: float
+    control_period: float
+    sensor_period: float
 
 
-def tip_drive(
-    machine: Machine, joints: dict[str, float], coordinate: str, servo: Servo
-) -> TipDrive:
+def linearise_tip(machine: Machine, joints: dict[str, float], coordinate: str, servo: Servo) -> TipModel:
     """Linearise the tip of a machine along one coordinate.
 
     Args:
@@ -129,16 +127,16 @@ def tip_drive(
     Source: this module's docstring; effective mass after Khatib 1987.
     """
     where, axes = f"linear model of {machine.name}", arm_axes(machine)
-    arm = arm_tables(machine, where)
+    arm = create_arm_balance(machine, where)
     for i, name in zip(arm.joint, axes, strict=True):
         arm.z[i] = joints.get(name, arm.z[i])
-    mass, lever, blend = _inertia(arm, COORDINATES.index(coordinate))
+    mass, lever, blend = _effective_mass(arm, COORDINATES.index(coordinate))
     valves = [list(machine.hydraulic_axes).index(name) for name in axes]
-    turning = np.array([_turning_stiffness(arm, valve) for valve in valves])
+    turning = np.array([_joint_stiffness(arm, valve) for valve in valves])
     if not np.any(lever):
         raise InputError(where, f"no joint moves {coordinate} in this pose")
-    user = arm.model.user.reshape(-1, SLOTS)[valves]
-    return TipDrive(
+    user = arm.model.user.reshape(-1, SLOT_COUNT)[valves]
+    return TipModel(
         coordinate, mass, lever**2 / turning, lever * blend,
         np.array([servo.axis_gains.get(name, servo.position_gain) for name in axes]),
         user[:, Slot.BANDWIDTH], user[:, Slot.DAMPING],
@@ -146,11 +144,11 @@ def tip_drive(
     )  # fmt: skip
 
 
-def _inertia(arm: ArmBalance, row: int) -> tuple[float, np.ndarray, np.ndarray]:
+def _effective_mass(arm: ArmBalance, row: int) -> tuple[float, np.ndarray, np.ndarray]:
     """Return effective mass, Jacobian row (k,), and joint rates (k,) per unit coordinate rate."""
     motion, k = arm.space.motion, len(arm.joint)
     place_mechanism(arm.model, arm.space, arm.z)
-    gather_forces(arm.model.mech, motion)
+    compute_mass_and_bias(arm.model.mech, motion)
     full = motion.basis.T @ motion.mass @ motion.basis
     own = full[np.ix_(arm.joint, arm.joint)]
     table = np.zeros((k, k))
@@ -160,15 +158,15 @@ def _inertia(arm: ArmBalance, row: int) -> tuple[float, np.ndarray, np.ndarray]:
     return mass, lever, np.linalg.solve(table, np.eye(k)[row])
 
 
-def _turning_stiffness(arm: ArmBalance, valve: int) -> float:
+def _joint_stiffness(arm: ArmBalance, valve: int) -> float:
     """Return the stiffness of a joint due to its drive's oil [N m/rad], after `place_mechanism`.
 
     Air content is neglected: it lowers the stiffness in a way that depends on the unknown
     pressures.
     """
-    user = arm.model.user[valve * SLOTS : (valve + 1) * SLOTS]
+    user = arm.model.user[valve * SLOT_COUNT : (valve + 1) * SLOT_COUNT]
     head, rod = user[Slot.VOLUME_HEAD], user[Slot.VOLUME_ROD]
-    if user[Slot.KIND] == Kind.CYLINDER:
+    if user[Slot.KIND] == ActuatorKind.CYLINDER:
         x = arm.space.drive[X, valve]
         head = head + user[Slot.AREA_HEAD] * x
         rod = rod + user[Slot.AREA_ROD] * (user[Slot.STROKE] - x)
@@ -178,7 +176,7 @@ def _turning_stiffness(arm: ArmBalance, valve: int) -> float:
     return float(user[Slot.BULK_MODULUS] * oil * lever**2)
 
 
-def drive_control(tip: TipDrive, servo: Servo, clocks: Clocks, s: np.ndarray) -> np.ndarray:
+def tip_controller_impedance(tip: TipModel, servo: Servo, clocks: SamplingPeriods, s: np.ndarray) -> np.ndarray:
     """Return C_s: force at the tip per velocity error of the tip.
 
     Args:
@@ -192,12 +190,12 @@ def drive_control(tip: TipDrive, servo: Servo, clocks: Clocks, s: np.ndarray) ->
 
     Source: this module's docstring.
     """
-    valve, place_lag, rubbing = _lags(tip, servo, clocks, s)
+    valve, place_lag, rubbing = _drive_lags(tip, servo, clocks, s)
     single = (1.0 + tip.gain * valve * place_lag / s[..., None]) / (s[..., None] + rubbing)
     return 1.0 / (tip.compliance / single).sum(axis=-1)
 
 
-def drive_follows(tip: TipDrive, servo: Servo, clocks: Clocks, s: np.ndarray) -> np.ndarray:
+def tip_tracking_response(tip: TipModel, servo: Servo, clocks: SamplingPeriods, s: np.ndarray) -> np.ndarray:
     """Return the velocity of the unloaded tip per reference velocity.
 
     Args:
@@ -211,25 +209,25 @@ def drive_follows(tip: TipDrive, servo: Servo, clocks: Clocks, s: np.ndarray) ->
 
     Source: this module's docstring; `teleop.slave.update_references` for the phase lead.
     """
-    valve, place_lag, _ = _lags(tip, servo, clocks, s)
-    held = np.exp(-0.5 * clocks.control * s)
-    ahead = servo.feedforward * held * (1.0 + servo.lead * s / (AHEAD * s + 1.0))
+    valve, place_lag, _ = _drive_lags(tip, servo, clocks, s)
+    held = np.exp(-0.5 * clocks.control_period * s)
+    ahead = servo.feedforward * held * (1.0 + servo.lead * s / (LEAD_AVERAGING_TIME * s + 1.0))
     back = tip.gain * place_lag / s[..., None]
-    return (tip.share * valve * (ahead[..., None] + back) / (1.0 + valve * back)).sum(axis=-1)
+    return (tip.rate_fractions * valve * (ahead[..., None] + back) / (1.0 + valve * back)).sum(axis=-1)
 
 
-def _lags(tip: TipDrive, servo: Servo, clocks: Clocks, s: np.ndarray):
+def _drive_lags(tip: TipModel, servo: Servo, clocks: SamplingPeriods, s: np.ndarray):
     """Return (..., k) valves with delay, hold of the sensors, and pressure feedback [1/s]."""
     at = s[..., None]
     valve = tip.bandwidth**2 / (at**2 + 2.0 * tip.damping * tip.bandwidth * at + tip.bandwidth**2)
     valve = valve * np.exp(-tip.delay * at)
-    held = np.exp(-0.5 * clocks.samples * at)
+    held = np.exp(-0.5 * clocks.sensor_period * at)
     passed = servo.load_time * at / (servo.load_time * at + 1.0)
     return valve, held, servo.pressure_feedback * passed * valve * held
 
 
 _WHERE = "linear case"
-FAST = 2.0  # bandwidth of the motion estimate over that of the force estimate (`station`)
+MOTION_BANDWIDTH_RATIO = 2.0  # bandwidth of the motion estimate over that of the force estimate (`station`)
 STRUCTURES = ("rate_force", "position_force", "rate_position", "position_position")
 
 
@@ -239,24 +237,24 @@ class LinearCase:
 
     Attributes:
         pilot: teleoperation settings of the scenario.
-        row: (17,) parameters of the joystick axis, see `teleop.master.Master.axis`.
+        axis_parameters: (17,) parameters of the joystick axis, see `teleop.master.Master.axis`.
         master: mass of the flotor [kg] or its moment of inertia about the handle [kg m^2].
-        held: mass, damper and spring of the hand.
+        hand_impedance: mass, damper and spring of the hand.
         tip: linear tip model of the machine.
         servo: gains of the servo.
-        clocks: control and sensor periods.
+        periods: control and sensor periods.
         task: impedance of the environment along the coordinate.
         delay_forward: delay from the master to the machine [s].
         delay_back: delay from the machine to the master [s].
     """
 
     pilot: TeleopPilot
-    row: np.ndarray
+    axis_parameters: np.ndarray
     master: Impedance
-    held: Impedance
-    tip: TipDrive
+    hand_impedance: Impedance
+    tip: TipModel
     servo: Servo
-    clocks: Clocks
+    periods: SamplingPeriods
     task: Impedance
     delay_forward: float = 0.0
     delay_back: float = 0.0
@@ -264,35 +262,39 @@ class LinearCase:
     @property
     def ratio(self) -> float:
         """Ratio of the reflected force at the hand to the machine's force [N/N], [N m/(N m)]."""
-        return float(self.row[RATIO])
+        return float(self.axis_parameters[REFLECTION_RATIO])
 
     @property
     def force_limit(self) -> float:
         """Machine force at which the reflected force saturates [N], [N m]."""
-        return float(self.row[REFLECTED_MOST])
+        return float(self.axis_parameters[MAX_REFLECTED_FORCE])
 
     @property
     def deadband(self) -> float:
         """Displacement of the handle up to which nothing is commanded [m], [rad]."""
-        return float(self.row[DEADBAND])
+        return float(self.axis_parameters[DEADBAND])
 
     @property
     def reach(self) -> float:
         """Displacement of the handle at its stop [m], [rad]."""
-        return float(self.row[REACH])
+        return float(self.axis_parameters[HANDLE_RANGE])
 
     @property
-    def spring(self) -> Spring:
+    def spring(self) -> StiffnessAxis:
         """Joystick axis under stiffness feedback, without the hand."""
-        r = self.row
-        return Spring(
-            self.master.mass, float(r[DAMPING]), float(r[NOMINAL]), float(r[LEAST]), float(r[MOST])
+        r = self.axis_parameters
+        return StiffnessAxis(
+            self.master.mass,
+            float(r[DAMPING]),
+            float(r[NOMINAL_STIFFNESS]),
+            float(r[MIN_STIFFNESS]),
+            float(r[MAX_STIFFNESS]),
         )
 
     @property
-    def leans(self) -> bool:
+    def has_force_control(self) -> bool:
         """Whether the operator controls the force, not the position, under direct reflection."""
-        pressing = isinstance(self.pilot.operator, Regulate | Track)
+        pressing = isinstance(self.pilot.operator, RegulateForce | TrackForce)
         return pressing and self.pilot.reflection != "coordinating_force"
 
     def with_delay(self, delay: float) -> "LinearCase":
@@ -301,13 +303,13 @@ class LinearCase:
 
     def hand(self, s: np.ndarray) -> np.ndarray:
         """Return the hand's impedance [N s/m], [N m s/rad] at complex frequencies [rad/s]."""
-        if not self.leans:
-            return self.held(s)
-        late = REFLEX + 0.5 / DECISIONS + 0.5 * self.clocks.control
-        own = self.held.stiffness / s * np.exp(-late * s)
-        return self.held(s) - own
+        if not self.has_force_control:
+            return self.hand_impedance(s)
+        late = REFLEX_DELAY + 0.5 / DECISION_RATE + 0.5 * self.periods.control_period
+        own = self.hand_impedance.stiffness / s * np.exp(-late * s)
+        return self.hand_impedance(s) - own
 
-    def port(self, structure: str, reflected: float = 1.0) -> TwoPort:
+    def make_port(self, structure: str, reflected: float = 1.0) -> TwoPort:
         """Return the two-port of a structure with the parameters of this case.
 
         Args:
@@ -325,72 +327,74 @@ class LinearCase:
         rate, feels_force = structure.startswith("rate"), structure.endswith("force")
         slave = Impedance(self.tip.mass)
 
-        def nothing(s: np.ndarray) -> np.ndarray:
+        def zero_block(s: np.ndarray) -> np.ndarray:
             return np.zeros_like(s)
 
         def control(s: np.ndarray) -> np.ndarray:
-            return drive_control(self.tip, self.servo, self.clocks, s)
+            return tip_controller_impedance(self.tip, self.servo, self.periods, s)
 
         def forward(s: np.ndarray) -> np.ndarray:
-            follows = drive_follows(self.tip, self.servo, self.clocks, s)
-            return (self.tip.mass * s + control(s)) * follows * self._asked(rate, s)
+            follows = tip_tracking_response(self.tip, self.servo, self.periods, s)
+            return (self.tip.mass * s + control(s)) * follows * self._commanded_velocity(rate, s)
 
         def back(s: np.ndarray) -> np.ndarray:
-            return reflected * self.ratio * self._felt(s)
+            return reflected * self.ratio * self._reflected_force_response(s)
 
-        def coupled(s: np.ndarray) -> np.ndarray:
-            return -reflected * self._coupling(rate, s)
+        def coupling_block(s: np.ndarray) -> np.ndarray:
+            return -reflected * self._coupling_impedance(rate, s)
 
-        def own(s: np.ndarray) -> np.ndarray:
+        def master_block(s: np.ndarray) -> np.ndarray:
             if feels_force:
-                return self._centred(rate, s)
+                return self._centring_impedance(rate, s)
             if self.pilot.coordinating == "handle":
-                asked = self.row[GAIN] / s if rate else self.row[GAIN]
-                linked = self._coupling(rate, s, self.clocks.control) * asked
+                asked = self.axis_parameters[GAIN] / s if rate else self.axis_parameters[GAIN]
+                linked = self._coupling_impedance(rate, s, self.periods.control_period) * asked
             else:
                 late = self.delay_forward + self.delay_back
-                asked = np.exp(-s * late) * self._asked(rate, s)
-                linked = self._coupling(rate, s) * asked
-            return self._centred(rate, s) + reflected * linked
+                asked = np.exp(-s * late) * self._commanded_velocity(rate, s)
+                linked = self._coupling_impedance(rate, s) * asked
+            return self._centring_impedance(rate, s) + reflected * linked
 
         return TwoPort(
-            self.master, slave, own, control, forward, back if feels_force else nothing, nothing,
-            nothing if feels_force else coupled, self.delay_forward, self.delay_back,
+            self.master, slave, master_block, control, forward, back if feels_force else zero_block, zero_block,
+            zero_block if feels_force else coupling_block, self.delay_forward, self.delay_back,
         )  # fmt: skip
 
-    def _asked(self, rate: bool, s: np.ndarray) -> np.ndarray:
+    def _commanded_velocity(self, rate: bool, s: np.ndarray) -> np.ndarray:
         """Return the commanded tip velocity per velocity of the handle."""
         if rate:
-            return self.row[GAIN] / s
-        return self.row[GAIN] * (SMOOTH / (s + SMOOTH)) ** 2
+            return self.axis_parameters[GAIN] / s
+        return self.axis_parameters[GAIN] * (SMOOTHING_BANDWIDTH / (s + SMOOTHING_BANDWIDTH)) ** 2
 
-    def _centred(self, rate: bool, s: np.ndarray) -> np.ndarray:
+    def _centring_impedance(self, rate: bool, s: np.ndarray) -> np.ndarray:
         """Return the sampled spring and damper of the coils; no spring under position control."""
-        held = np.exp(-0.5 * self.clocks.control * s)
-        return held * ((self.row[NOMINAL] if rate else 0.0) / s + self.row[DAMPING] * held)
+        held = np.exp(-0.5 * self.periods.control_period * s)
+        return held * (
+            (self.axis_parameters[NOMINAL_STIFFNESS] if rate else 0.0) / s + self.axis_parameters[DAMPING] * held
+        )
 
-    def _coupling(self, rate: bool, s: np.ndarray, period: float | None = None) -> np.ndarray:
+    def _coupling_impedance(self, rate: bool, s: np.ndarray, period: float | None = None) -> np.ndarray:
         """Return the coordinating force on the hand per velocity difference of the machine.
 
         The force is held for `period`; by default for the sum of the control and the sensor period.
         """
-        scale = 1.0 if rate else 1.0 / self.row[GAIN]
-        held = np.exp(-0.5 * (period or self.clocks.control + self.clocks.samples) * s)
-        return scale * held * (self.row[COUPLING] / s + self.row[COUPLING_DAMPING])
+        scale = 1.0 if rate else 1.0 / self.axis_parameters[GAIN]
+        held = np.exp(-0.5 * (period or self.periods.control_period + self.periods.sensor_period) * s)
+        return scale * held * (self.axis_parameters[COUPLING] / s + self.axis_parameters[COUPLING_DAMPING])
 
-    def _felt(self, s: np.ndarray) -> np.ndarray:
+    def _reflected_force_response(self, s: np.ndarray) -> np.ndarray:
         """Return the reflected force per task force: filters, sensor sample, and control period."""
-        held = np.exp(-0.5 * self.clocks.control * s)
+        held = np.exp(-0.5 * self.periods.control_period * s)
         if self.pilot.force == "true":
             return held
         hertz = self.pilot.bandwidth / (2.0 * math.pi)
-        late = butterworth(hertz, s) * butterworth(FAST * hertz, s)
-        return held * np.exp(-0.5 * self.clocks.samples * s) * late
+        late = butterworth_response(hertz, s) * butterworth_response(MOTION_BANDWIDTH_RATIO * hertz, s)
+        return held * np.exp(-0.5 * self.periods.sensor_period * s) * late
 
 
-def linear_case(
-    pilot: TeleopPilot, joystick: Joystick, numbers: Master, tip: TipDrive, servo: Servo,
-    clocks: Clocks, task: Impedance,
+def build_linear_case(
+    pilot: TeleopPilot, joystick: Joystick, numbers: MasterParameters, tip: TipModel, servo: Servo,
+    clocks: SamplingPeriods, task: Impedance,
 ) -> LinearCase:  # fmt: skip
     """Build the linear case of one coordinate.
 
@@ -414,15 +418,15 @@ def linear_case(
         raise InputError(_WHERE, f"no joystick axis moves {tip.coordinate}")
     axis, channel = int(place[0]), pilot.channel
     turns = AXES[axis].startswith("r")
-    flotor = float(numbers.turning[axis - 3]) if turns else float(numbers.mass[0])
-    held = Impedance(*joystick.hand.along(axis))
+    flotor = float(numbers.inertia[axis - 3]) if turns else float(numbers.mass[0])
+    held = Impedance(*joystick.hand.axis_impedance(axis))
     return LinearCase(
         pilot, numbers.axis[axis].copy(), Impedance(flotor), held, tip, servo, clocks, task,
         channel.delay_forward, channel.delay_back,
     )  # fmt: skip
 
 
-def local_ratio(case: LinearCase, displacement: float) -> float:
+def stiffness_feedback_ratio(case: LinearCase, displacement: float) -> float:
     """Return the reflection ratio of stiffness feedback for small force changes.
 
     Args:
@@ -435,12 +439,16 @@ def local_ratio(case: LinearCase, displacement: float) -> float:
     Source: derivative of `K(f) x` by f; Zhu 1994, 4.1.
     """
     spring = case.spring
-    return (spring.most - spring.nominal) / float(case.row[LIMIT]) * math.fabs(displacement)
+    return (
+        (spring.max_stiffness - spring.nominal_stiffness)
+        / float(case.axis_parameters[FORCE_LIMIT])
+        * math.fabs(displacement)
+    )
 
 
 DEFAULT_TASK = Impedance(damping=3.0e4, stiffness=1.0e6)  # stiff ground, a plate's default
-_NORMALS = {"z": ("z",), "r": ("x", "-x")}
-_PLACE = {"z": 2, "r": 0}
+_PLATE_NORMALS = {"z": ("z",), "r": ("x", "-x")}
+_POSITION_INDEX = {"z": 2, "r": 0}
 
 
 class Contact(NamedTuple):
@@ -457,7 +465,7 @@ class Contact(NamedTuple):
     source: str
 
 
-def scenario_case(
+def build_scenario_case(
     scenario: Scenario, machine: Machine, joystick: Joystick, coordinate: str | None = None
 ) -> tuple[LinearCase, Contact]:
     """Build the linear case of a scenario, with the hand of its simulated operator.
@@ -481,39 +489,39 @@ def scenario_case(
     if not pilot.ratio > 0.0:
         raise InputError("pilot.ratio", "no force is reflected; set a ratio, such as 1e-5")
     coordinates = COORDINATES[: len(arm_axes(machine))]
-    wanted = coordinate or _pressed(pilot)
+    wanted = coordinate or _default_coordinate(pilot)
     if wanted not in coordinates:
         message = f"no {wanted!r}; the arm has {', '.join(coordinates)}"
         raise InputError("--coordinate", message)
-    contact = _contact(scenario, machine, wanted)
-    sensors, period = sensor_set(machine, scenario.sensors), 1.0 / scenario.control_rate
-    clocks = Clocks(period, max(period, 1.0 / sensors.rate) if sensors else period)
-    joystick = held_joystick(joystick, pilot.perception, scenario.folder)
-    numbers, _ = master(joystick, pilot, coordinates)
-    tip = tip_drive(machine, contact.joints, wanted, scenario.servo)
-    case = linear_case(pilot, joystick, numbers, tip, scenario.servo, clocks, contact.task)
+    contact = _find_contact(scenario, machine, wanted)
+    sensors, period = get_sensors(machine, scenario.sensors), 1.0 / scenario.control_rate
+    clocks = SamplingPeriods(period, max(period, 1.0 / sensors.rate) if sensors else period)
+    joystick = attach_operator_hand(joystick, pilot.perception, scenario.folder)
+    numbers, _ = build_master(joystick, pilot, coordinates)
+    tip = linearise_tip(machine, contact.joints, wanted, scenario.servo)
+    case = build_linear_case(pilot, joystick, numbers, tip, scenario.servo, clocks, contact.task)
     return case, contact
 
 
-def joystick_of(scenario: Scenario) -> str:
+def scenario_joystick(scenario: Scenario) -> str:
     """Return the name or file of a scenario's joystick, relative to the scenario's file."""
     name = scenario.pilot.joystick if isinstance(scenario.pilot, TeleopPilot) else "joystick"
     path = Path(scenario.folder, name)
     return str(path) if name != "joystick" and path.is_file() else name
 
 
-def _pressed(pilot: TeleopPilot) -> str:
+def _default_coordinate(pilot: TeleopPilot) -> str:
     operator = pilot.operator
-    return operator.target.coordinate if isinstance(operator, Regulate | Track) else "z"
+    return operator.target.coordinate if isinstance(operator, RegulateForce | TrackForce) else "z"
 
 
-def _contact(scenario: Scenario, machine: Machine, coordinate: str) -> Contact:
+def _find_contact(scenario: Scenario, machine: Machine, coordinate: str) -> Contact:
     """Return the contact at the start pose, moved along the coordinate to the plate."""
     joints = machine.home | scenario.start.joints
     here = {name: joints.get(axis.joint, 0.0) for name, axis in machine.axes.items()}
-    pose, plate = scenario.start.pose, _plate(scenario, coordinate)
+    pose, plate = scenario.start.pose, _find_plate(scenario, coordinate)
     if pose and plate:
-        pose = pose.model_copy(update={coordinate: plate.position[_PLACE[coordinate]]})
+        pose = pose.model_copy(update={coordinate: plate.position[_POSITION_INDEX[coordinate]]})
     if pose:
         here |= pose_to_joints(machine, pose, here, "start.pose")
     if plate:
@@ -526,9 +534,9 @@ def _contact(scenario: Scenario, machine: Machine, coordinate: str) -> Contact:
     return Contact(here, turned, f"default, stiff ground {lever:g} m from the axis")
 
 
-def _plate(scenario: Scenario, coordinate: str) -> Plate | None:
+def _find_plate(scenario: Scenario, coordinate: str) -> Plate | None:
     """Return the first plate whose normal is along a coordinate."""
-    ways = _NORMALS.get(coordinate, ())
+    ways = _PLATE_NORMALS.get(coordinate, ())
     for thing in scenario.surroundings:
         if isinstance(thing, Plate) and thing.normal in ways:
             return thing

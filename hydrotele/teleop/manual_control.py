@@ -22,95 +22,95 @@ from hydrotele.teleop.operator_parameters import Operator
 
 GAIN, INTEGRATOR, DOUBLE_INTEGRATOR = range(3)
 FORMS = ("K", "K/s", "K/s^2")
-_LAGS = (0.0, 0.15, 0.3, 0.6, 1.0)  # s, first-order lags of the candidate elements
-_DELAYS = (0.0, 0.1, 0.2, 0.3, 0.45)  # s, dead times of the candidate elements
-LEAD = 2.5  # s, lead time constant of the operator for a double integrator
-_WASHOUT = 1.5  # rad/s: slower motion is drift, not an effect of the operator's input
-_SCATTER = 0.5  # s, correlation time of the prediction errors
-_VARIANCE = 5.0  # s, averaging time for the variance of the observed errors
-_FLOOR = 1e-24  # sum of squares below which nothing has moved
-# indices into `Loop.facts`
-STEP, DELAY, REMNANT, THRESHOLD, MEMORY, SURPRISE, MOST, FORM, PRIOR = range(9)
-ERROR_POWER, RATE_POWER, INTEGRAL, CHOSEN, BELIEVED_GAIN, NOTICED = range(6)  # in `Loop.state`
+_CANDIDATE_LAGS = (0.0, 0.15, 0.3, 0.6, 1.0)  # s, first-order lags of the candidate elements
+_CANDIDATE_DEAD_TIMES = (0.0, 0.1, 0.2, 0.3, 0.45)  # s, dead times of the candidate elements
+LEAD_TIME = 2.5  # s, lead time constant of the operator for a double integrator
+_WASHOUT_FREQUENCY = 1.5  # rad/s: slower motion is drift, not an effect of the operator's input
+_ERROR_CORRELATION_TIME = 0.5  # s, correlation time of the prediction errors
+_VARIANCE_TIME = 5.0  # s, averaging time for the variance of the observed errors
+_MIN_POWER = 1e-24  # sum of squares below which nothing has moved
+# indices into `VisualLoop.facts`
+STEP, DELAY, REMNANT, THRESHOLD, MEMORY, GAIN_UNCERTAINTY, MAX_OUTPUT, FORM, EXPECTED_GAIN = range(9)
+ERROR_POWER, RATE_POWER, INTEGRAL, SELECTED_CANDIDATE, ESTIMATED_GAIN, NOTICED_ERROR = range(6)  # in `VisualLoop.state`
 
 
-class Loop(NamedTuple):
+class VisualLoop(NamedTuple):
     """Parameters and state of a visually closed loop, with n candidate elements.
 
     Attributes:
-        facts: (9,) step [s], visual delay [s], remnant [1], threshold of the error, memory [s],
+        parameters: (9,) step [s], visual delay [s], remnant [1], threshold of the error, memory [s],
             surprise [1], maximum output, number of integrations, expected gain.
         lag: (n,) first-order lag of each candidate [s].
-        dead: (n,) dead time of each candidate [s].
-        action: (n,) operator gain for each candidate, for an element of unit gain.
-        past: (rows, 3) ring buffer of error, observed output and hand displacement.
+        dead_time: (n,) dead time of each candidate [s].
+        operator_gain: (n,) operator gain for each candidate, for an element of unit gain.
+        history: (rows, 3) ring buffer of error, observed output and hand displacement.
         noise: (m, 2) standard normal noise of error and rate.
         hand: (n, 4) hand displacement after each lag, and its three low-pass filters.
-        seen: (3,) low-pass filters of the observed output.
+        output_filter: (3,) low-pass filters of the observed output.
         sums: (n, 4) exponentially weighted sums of effect^2, effect times output, output^2, and of
             steps.
         state: (6,) mean square of error and rate, integral of the output, selected candidate, its
             gain, present noise-free observed error, 0 below the threshold.
     """
 
-    facts: np.ndarray
+    parameters: np.ndarray
     lag: np.ndarray
-    dead: np.ndarray
-    action: np.ndarray
-    past: np.ndarray
+    dead_time: np.ndarray
+    operator_gain: np.ndarray
+    history: np.ndarray
     noise: np.ndarray
     hand: np.ndarray
-    seen: np.ndarray
+    output_filter: np.ndarray
     sums: np.ndarray
     state: np.ndarray
 
 
-def visual_loop(
-    him: Operator, step: float, prior: float, rng: np.random.Generator, *,
-    form: int, margin: float | None = None, threshold: float = 0.0, most: float = math.inf,
+def make_visual_loop(
+    operator: Operator, step: float, expected_gain: float, rng: np.random.Generator, *,
+    form: int, margin: float | None = None, threshold: float = 0.0, max_output: float = math.inf,
     steps: int = 2**12,
-) -> Loop:  # fmt: skip
+) -> VisualLoop:  # fmt: skip
     """Create a visually closed loop in its initial state.
 
     Args:
-        him: parameters of the operator.
+        operator: parameters of the operator.
         step: time between two decisions [s].
-        prior: expected gain of the element.
+        expected_gain: expected gain of the element.
         rng: random generator of the observation noise and of the error of the expected gain.
         form: known form of the element: gain, integrator or double integrator.
         margin: required phase margin [rad]; by default the margin of tracking.
         threshold: error below which the operator does not act.
-        most: maximum displacement of the hand.
+        max_output: maximum displacement of the hand.
         steps: number of noise samples before they repeat.
 
     Returns:
         Parameters and initial state of the loop.
     """
-    off = math.exp(him.surprise * rng.standard_normal())
-    late = him.visual_delay + (him.lead_delay if form == DOUBLE_INTEGRATOR else 0.0)
-    rows = 4 + math.ceil((late + max(_DELAYS)) / step)
-    places = [(lag, dead) for lag in _LAGS for dead in _DELAYS]
-    margin = him.tracking_margin if margin is None else margin
+    off = math.exp(operator.surprise * rng.standard_normal())
+    late = operator.visual_delay + (operator.lead_delay if form == DOUBLE_INTEGRATOR else 0.0)
+    rows = 4 + math.ceil((late + max(_CANDIDATE_DEAD_TIMES)) / step)
+    places = [(lag, dead) for lag in _CANDIDATE_LAGS for dead in _CANDIDATE_DEAD_TIMES]
+    margin = operator.tracking_margin if margin is None else margin
     n = len(places)
-    return Loop(
-        facts=np.array([
-            step, late - 0.5 * step, him.remnant, threshold, him.memory, him.surprise, most, form,
-            off * prior,
+    return VisualLoop(
+        parameters=np.array([
+            step, late - 0.5 * step, operator.remnant, threshold, operator.memory, operator.surprise, max_output, form,
+            off * expected_gain,
         ]),
         lag=np.array([lag for lag, _ in places]),
-        dead=np.array([dead for _, dead in places]),
-        action=np.array([_action(him, form, lag, late + dead, margin) for lag, dead in places]),
-        past=np.zeros((rows, 3)),
+        dead_time=np.array([dead for _, dead in places]),
+        operator_gain=np.array([_max_operator_gain(operator, form, lag, late + dead, margin) for lag, dead in places]),
+        history=np.zeros((rows, 3)),
         noise=rng.standard_normal((steps, 2)),
         hand=np.zeros((n, 4)),
-        seen=np.zeros(3),
+        output_filter=np.zeros(3),
         sums=np.zeros((n, 4)),
-        state=np.array([0.0, 0.0, 0.0, 0.0, off * prior, 0.0]),
+        state=np.array([0.0, 0.0, 0.0, 0.0, off * expected_gain, 0.0]),
     )  # fmt: skip
 
 
 @inlined
-def _past(past, tick, back, column):
+def _past_value(past, tick, back, column):
     """Return a past value, interpolated between decisions; 0 before the first decision."""
     whole = int(back)
     if tick < whole + 1:
@@ -121,7 +121,7 @@ def _past(past, tick, back, column):
 
 
 @compiled
-def learn(loop, tick, late, seen):
+def update_element_fits(loop, tick, late, seen):
     """Update the fit of every candidate element with the latest hand motion and output.
 
     Hand and output pass through a third-order wash-out, so that each candidate's effect is a filter
@@ -138,7 +138,7 @@ def learn(loop, tick, late, seen):
 
     Source: recursive least squares with forgetting, over a bank of models.
     """
-    step, a = loop.facts[STEP], _WASHOUT
+    step, a = loop.facts[STEP], _WASHOUT_FREQUENCY
     share = 1.0 - np.exp(-a * step)
     keep = np.exp(-step / loop.facts[MEMORY])
     low = loop.seen
@@ -149,7 +149,7 @@ def learn(loop, tick, late, seen):
     best, least = 0, np.inf
     for i in range(len(loop.lag)):
         row, lag = loop.hand[i], loop.lag[i]
-        hand = _past(loop.past, tick, late + loop.dead[i] / step, 2)
+        hand = _past_value(loop.past, tick, late + loop.dead[i] / step, 2)
         row[0] += (1.0 - np.exp(-step / lag) if lag > 0.0 else 1.0) * (hand - row[0])
         row[1] += share * (row[0] - row[1])
         row[2] += share * (row[1] - row[2])
@@ -165,15 +165,15 @@ def learn(loop, tick, late, seen):
         sums[1] = keep * sums[1] + effect * output
         sums[2] = keep * sums[2] + output * output
         sums[3] = keep * sums[3] + 1.0
-        if sums[0] > _FLOOR and sums[1] > 0.0:
-            cost = (sums[2] - sums[1] * sums[1] / sums[0]) / max(sums[2], _FLOOR)
+        if sums[0] > _MIN_POWER and sums[1] > 0.0:
+            cost = (sums[2] - sums[1] * sums[1] / sums[0]) / max(sums[2], _MIN_POWER)
             if cost < least:
                 best, least = i, cost
-    loop.state[CHOSEN] = best
+    loop.state[SELECTED_CANDIDATE] = best
 
 
 @compiled
-def believe(loop):
+def estimate_element_gain(loop):
     """Compute the operator's gain estimate: fitted gain, weighted with the expected gain.
 
     Args:
@@ -184,22 +184,22 @@ def believe(loop):
 
     Source: normal posterior of the gain's logarithm.
     """
-    best = int(loop.state[CHOSEN])
-    sums, prior = loop.sums[best], loop.facts[PRIOR]
+    best = int(loop.state[SELECTED_CANDIDATE])
+    sums, prior = loop.sums[best], loop.facts[EXPECTED_GAIN]
     gain = prior
-    if sums[0] > _FLOOR and sums[1] > 0.0:
+    if sums[0] > _MIN_POWER and sums[1] > 0.0:
         fitted = sums[1] / sums[0]
         scatter = max(0.0, sums[2] - fitted * sums[1]) / sums[3]
-        doubt = scatter / (fitted * fitted * sums[0]) * (_SCATTER / loop.facts[STEP]) + 1e-4
-        surprise = loop.facts[SURPRISE] ** 2
+        doubt = scatter / (fitted * fitted * sums[0]) * (_ERROR_CORRELATION_TIME / loop.facts[STEP]) + 1e-4
+        surprise = loop.facts[GAIN_UNCERTAINTY] ** 2
         weight = surprise / (surprise + doubt)
         gain = np.exp(weight * np.log(fitted) + (1.0 - weight) * np.log(prior))
-    loop.state[BELIEVED_GAIN] = gain
+    loop.state[ESTIMATED_GAIN] = gain
     return gain
 
 
 @compiled
-def look_and_act(loop, tick, target, seen, hand):
+def decide_hand_reference(loop, tick, target, seen, hand):
     """Run one decision: update the element estimate and compute the hand's reference.
 
     Args:
@@ -222,38 +222,36 @@ def look_and_act(loop, tick, target, seen, hand):
     if tick < int(late) + 3:
         return 0.0
     middle = 0.5 if facts[FORM] == 0.0 else 0.0  # the integrator uses the middle of its step
-    error = _past(past, tick, late + middle, 0)
-    rate = (_past(past, tick, late - 0.5, 0) - _past(past, tick, late + 0.5, 0)) / step
-    learn(loop, tick, late, _past(past, tick, late, 1))
-    best = int(state[CHOSEN])
-    gain = believe(loop)
-    share = 1.0 - np.exp(-step / _VARIANCE)
+    error = _past_value(past, tick, late + middle, 0)
+    rate = (_past_value(past, tick, late - 0.5, 0) - _past_value(past, tick, late + 0.5, 0)) / step
+    update_element_fits(loop, tick, late, _past_value(past, tick, late, 1))
+    best = int(state[SELECTED_CANDIDATE])
+    gain = estimate_element_gain(loop)
+    share = 1.0 - np.exp(-step / _VARIANCE_TIME)
     state[ERROR_POWER] += share * (error * error - state[ERROR_POWER])
     state[RATE_POWER] += share * (rate * rate - state[RATE_POWER])
     density = np.sqrt(facts[REMNANT] * np.pi / step)
     noise = loop.noise[tick % len(loop.noise)]
-    state[NOTICED] = error if abs(error) >= facts[THRESHOLD] else 0.0
-    if state[NOTICED] == 0.0 and facts[THRESHOLD] > 0.0:
+    state[NOTICED_ERROR] = error if abs(error) >= facts[THRESHOLD] else 0.0
+    if state[NOTICED_ERROR] == 0.0 and facts[THRESHOLD] > 0.0:
         return state[INTEGRAL]  # no action on an unobserved error
     error += density * np.sqrt(state[ERROR_POWER]) * noise[0]
     action = loop.action[best] / gain
     if facts[FORM] == 0.0:
         state[INTEGRAL] += step * action * error
-        state[INTEGRAL] = min(facts[MOST], max(-facts[MOST], state[INTEGRAL]))
+        state[INTEGRAL] = min(facts[MAX_OUTPUT], max(-facts[MAX_OUTPUT], state[INTEGRAL]))
         return state[INTEGRAL]
     if facts[FORM] == 2.0:
         rate += density * np.sqrt(state[RATE_POWER]) * noise[1]
-        error += LEAD * rate
-    return min(facts[MOST], max(-facts[MOST], action * error))
+        error += LEAD_TIME * rate
+    return min(facts[MAX_OUTPUT], max(-facts[MAX_OUTPUT], action * error))
 
 
-def operator_response(
-    him: Operator, form: int, frequencies: np.ndarray, late: float | None = None
-) -> np.ndarray:
+def operator_response(operator: Operator, form: int, frequencies: np.ndarray, late: float | None = None) -> np.ndarray:
     """Return the operator's describing function for unit gain, including the neuromuscular lag.
 
     Args:
-        him: parameters of the operator.
+        operator: parameters of the operator.
         form: form of the controlled element.
         frequencies: (m,) [rad/s].
         late: delay, including that of lead generation [s]; by default the operator's.
@@ -263,23 +261,23 @@ def operator_response(
     """
     s = 1j * frequencies
     if late is None:
-        late = him.visual_delay + (him.lead_delay if form == DOUBLE_INTEGRATOR else 0.0)
-    equal = (1.0 / s, np.ones_like(s), 1.0 + LEAD * s)[form]
-    w, z = him.neuromuscular_frequency, him.neuromuscular_damping
+        late = operator.visual_delay + (operator.lead_delay if form == DOUBLE_INTEGRATOR else 0.0)
+    equal = (1.0 / s, np.ones_like(s), 1.0 + LEAD_TIME * s)[form]
+    w, z = operator.neuromuscular_frequency, operator.neuromuscular_damping
     return equal * np.exp(-late * s) * w**2 / (s**2 + 2.0 * z * w * s + w**2)
 
 
-def _action(him: Operator, form: int, lag: float, late: float, margin: float) -> float:
+def _max_operator_gain(operator: Operator, form: int, lag: float, late: float, margin: float) -> float:
     """Return the maximum operator gain that keeps both margins, for an element of unit gain."""
     w = np.geomspace(0.02, 60.0, 4000)
-    loop = operator_response(him, form, w, late) / (1j * w) ** form / (1.0 + lag * 1j * w)
+    loop = operator_response(operator, form, w, late) / (1j * w) ** form / (1.0 + lag * 1j * w)
     size, phase = np.abs(loop), np.unwrap(np.angle(loop))
     phase -= 2.0 * math.pi * round((phase[0] + math.pi * (1.0 if form == 2 else 0.5)) / math.tau)
     close = np.flatnonzero(phase >= margin - math.pi)
     turn = np.flatnonzero(phase >= -math.pi)
-    at = min(w[close[-1]] if len(close) else w[turn[-1]] / 3.0, him.crossover)
+    at = min(w[close[-1]] if len(close) else w[turn[-1]] / 3.0, operator.crossover)
     beyond = size[turn[-1] :].max()  # includes the neuromuscular peak
-    return float(min(1.0 / np.interp(at, w, size), him.gain_margin / beyond))
+    return float(min(1.0 / np.interp(at, w, size), operator.gain_margin / beyond))
 
 
 def neuromuscular_matrix(frequency: float, damping: float, step: float) -> np.ndarray:
@@ -319,7 +317,7 @@ class TrackingRecord(NamedTuple):
     hand: np.ndarray
 
 
-def sum_of_sines(time: np.ndarray, bandwidth: float = 1.5, duration: float = 120.0, seed: int = 0
+def make_sum_of_sines(time: np.ndarray, bandwidth: float = 1.5, duration: float = 120.0, seed: int = 0
                  ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Generate a target of ten sines, with ten times lower amplitudes above its bandwidth.
 
@@ -346,15 +344,15 @@ def sum_of_sines(time: np.ndarray, bandwidth: float = 1.5, duration: float = 120
 
 
 @compiled
-def _simulate(loop, lag, form, gain, target, fine, hand, response):
-    """Simulate the closed loop of `track`; `hand` and `response` are written."""
+def _simulate_tracking(loop, lag, form, gain, target, fine, hand, response):
+    """Simulate the closed loop of `simulate_tracking`; `hand` and `response` are written."""
     place, speed, output, rate = 0.0, 0.0, 0.0, 0.0
     step = loop.facts[STEP] / fine
     wanted = 0.0
     for k in range(len(target)):
         hand[k], response[k] = place, output
         if k % fine == 0:
-            wanted = look_and_act(loop, k // fine, target[k], output, place)
+            wanted = decide_hand_reference(loop, k // fine, target[k], output, place)
         before = place
         place, speed = (
             lag[0] * place + lag[1] * speed + lag[2] * wanted,
@@ -370,37 +368,44 @@ def _simulate(loop, lag, form, gain, target, fine, hand, response):
             rate += step * gain * middle
 
 
-def track(
-    him: Operator, form: int, gain: float, target: np.ndarray, *, step: float = 0.01, fine: int = 2,
-    seed: int = 0, surprised: bool = True,
+def simulate_tracking(
+    operator: Operator, form: int, gain: float, target: np.ndarray, *, step: float = 0.01, steps_per_decision: int = 2,
+    seed: int = 0, has_gain_error: bool = True,
 ) -> TrackingRecord:  # fmt: skip
     """Simulate an operator who tracks a displayed target with a simple controlled element.
 
     Args:
-        him: parameters of the operator.
+        operator: parameters of the operator.
         form: GAIN, INTEGRATOR or DOUBLE_INTEGRATOR.
         gain: gain of the element, unknown to the operator.
         target: (n,) at intervals of `step`.
         step: sampling period of the record [s].
-        fine: number of steps per decision.
+        steps_per_decision: number of steps per decision.
         seed: seed of the noise and of the expected gain.
-        surprised: whether the expected gain has the error given by `surprise`; otherwise it is
+        has_gain_error: whether the expected gain has the error given by `surprise`; otherwise it is
             exact.
 
     Returns:
         The record.
     """
     rng = np.random.default_rng([seed, 1967])
-    loop = visual_loop(him, fine * step, gain, rng, form=form, steps=len(target) // fine + 1)
-    if not surprised:
-        loop.facts[PRIOR] = loop.state[BELIEVED_GAIN] = gain
-    lag = neuromuscular_matrix(him.neuromuscular_frequency, him.neuromuscular_damping, step)
+    loop = make_visual_loop(
+        operator,
+        steps_per_decision * step,
+        gain,
+        rng,
+        form=form,
+        steps=len(target) // steps_per_decision + 1,
+    )
+    if not has_gain_error:
+        loop.parameters[EXPECTED_GAIN] = loop.state[ESTIMATED_GAIN] = gain
+    lag = neuromuscular_matrix(operator.neuromuscular_frequency, operator.neuromuscular_damping, step)
     hand, response = np.zeros((2, len(target)))
-    _simulate(loop, lag, form, gain, np.asarray(target, float), fine, hand, response)
+    _simulate_tracking(loop, lag, form, gain, np.asarray(target, float), steps_per_decision, hand, response)
     return TrackingRecord(step * np.arange(len(target)), np.asarray(target), response, hand)
 
 
-class Crossover(NamedTuple):
+class CrossoverProperties(NamedTuple):
     """Properties of an open loop `Yp Yc` around its crossover frequency.
 
     Attributes:
@@ -414,7 +419,7 @@ class Crossover(NamedTuple):
     slope: float
 
 
-def describing_function(
+def measure_describing_functions(
     records: Sequence[TrackingRecord], frequencies: np.ndarray, skip: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Measure describing functions at the frequencies of a sum of sines from records.
@@ -440,7 +445,7 @@ def describing_function(
     return output / error, acted / error
 
 
-def crossover_of(frequencies: np.ndarray, open_loop: np.ndarray) -> Crossover:
+def find_crossover(frequencies: np.ndarray, open_loop: np.ndarray) -> CrossoverProperties:
     """Compute crossover frequency, phase margin and slope of a measured open loop.
 
     The slope is that of a line through the points from half to twice the crossover frequency.
@@ -457,7 +462,7 @@ def crossover_of(frequencies: np.ndarray, open_loop: np.ndarray) -> Crossover:
     phase -= 2.0 * math.pi * np.round((phase[0] + 0.5 * math.pi) / (2.0 * math.pi))
     falls = np.flatnonzero((size[:-1] >= 0.0) & (size[1:] < 0.0))
     if not len(falls):
-        return Crossover(math.nan, math.nan, math.nan)
+        return CrossoverProperties(math.nan, math.nan, math.nan)
     k = falls[0]
     share = size[k] / (size[k] - size[k + 1])
     place = decades[k] + share * (decades[k + 1] - decades[k])
@@ -466,4 +471,4 @@ def crossover_of(frequencies: np.ndarray, open_loop: np.ndarray) -> Crossover:
     slope = float(np.polyfit(decades[near], size[near], 1)[0])
     angle = phase[k] + share * (phase[k + 1] - phase[k])
     margin = math.remainder(math.pi + angle, 2.0 * math.pi)  # sparse sines can hide a full turn
-    return Crossover(float(10.0**place), margin, slope)
+    return CrossoverProperties(float(10.0**place), margin, slope)

@@ -15,78 +15,106 @@ from hydrotele.core.compiled import compiled
 from hydrotele.machine.joystick import Joystick
 from hydrotele.scenario.teleoperation import TeleopPilot, TipOver
 from hydrotele.teleop.axis_table import (
+    AXIS_WAVE_IMPEDANCE,
     COLUMNS,
     COORDINATE,
     COUPLING,
     COUPLING_DAMPING,
     DAMPING,
     DEADBAND,
-    DROP,
+    DETENT_DROP,
+    DETENT_STIFFNESS,
+    FORCE_LIMIT,
     GAIN,
-    LEAST,
-    LIMIT,
-    MOST,
-    NOMINAL,
-    OUTSIDE,
-    RATIO,
-    REACH,
-    REFLECTED_MOST,
+    HANDLE_RANGE,
+    MAX_REFLECTED_FORCE,
+    MAX_STIFFNESS,
+    MIN_STIFFNESS,
+    NOMINAL_STIFFNESS,
+    REFLECTION_RATIO,
     SIGN,
-    SLOPE,
-    WAVE,
-    axis_table,
-    flat_state,
-    flattened,
-    split,
+    STIFFNESS_PER_FORCE,
+    build_axis_table,
+    flatten_state,
+    make_flat_state,
+    split_array,
 )
-from hydrotele.teleop.coils import three_stations
-from hydrotele.teleop.compliance import GRAVITY, driving_wrench, holding_wrench, turn_matrix
-from hydrotele.teleop.passive_line import END, GONE_IN, controlled_master, wave_master
+from hydrotele.teleop.coils import make_three_station_coils
+from hydrotele.teleop.compliance import (
+    GRAVITY,
+    free_flotor_wrench,
+    held_flotor_wrench,
+    quaternion_to_matrix,
+)
+from hydrotele.teleop.passive_line import (
+    END_SIZE,
+    ENERGY_IN,
+    step_passivity_master,
+    step_wave_master,
+)
 
-NONE, STIFFNESS, DIRECT, COORDINATING, FOUR_CHANNEL, IMPEDANCE, WAVES, CONTROLLED = range(8)
-KINDS = (
+(
+    NONE,
+    STIFFNESS,
+    DIRECT_FORCE,
+    COORDINATING,
+    FOUR_CHANNEL,
+    IMPEDANCE,
+    WAVE_VARIABLES,
+    PASSIVITY_CONTROL,
+) = range(8)
+REFLECTION_KINDS = (
     "none", "stiffness", "direct_force", "coordinating_force", "four_channel", "impedance",
     "wave_variables", "passivity_control",
 )  # fmt: skip
 RATE, POSITION = range(2)
 # rows of `Packet`
-FORCE, PLACE, SPEED, WANTED, WANTED_SPEED, TASK_STIFFNESS, TASK_DAMPING, TASK_MASS = range(8)
+(
+    TIP_FORCE,
+    TIP_POSITION,
+    TIP_SPEED,
+    REFERENCE_POSITION,
+    REFERENCE_SPEED,
+    TASK_STIFFNESS,
+    TASK_DAMPING,
+    TASK_MASS,
+) = range(8)
 # rows for a passive channel: sum of waves or force of the slave's controller, and its energy
-TOTAL, BUDGET = WANTED, WANTED_SPEED
-_OBSERVER = 60.0  # rad/s, bandwidth of the hand force observer, stable at 200 Hz
-_CHANGE = 20.0  # rad/s, bandwidth of the derivative of a force or speed
-_HEAVIER = 0.5  # maximum added apparent mass over the flotor's mass, because of the lag of _CHANGE
-SENT = END  # index in a row of `MasterState.line`: data of the next packet, then its energy
-WINDUP = 0.1  # m or rad at the machine, limit of the integral of the rate command
+CHANNEL_SIGNAL, CHANNEL_ENERGY = REFERENCE_POSITION, REFERENCE_SPEED
+_OBSERVER_BANDWIDTH = 60.0  # rad/s, bandwidth of the hand force observer, stable at 200 Hz
+_DERIVATIVE_BANDWIDTH = 20.0  # rad/s, bandwidth of the derivative of a force or speed
+_MAX_ADDED_MASS_RATIO = 0.5  # maximum added apparent mass over the flotor's mass, because of the lag of _CHANGE
+SENT_SIGNAL = END_SIZE  # index in a row of `MasterState.line`: data of the next packet, then its energy
+MAX_WINDUP = 0.1  # m or rad at the machine, limit of the integral of the rate command
 
 
-class Master(NamedTuple):
+class MasterParameters(NamedTuple):
     """Parameters of the master's control.
 
     Attributes:
         axis: (6, 18) parameters of every joystick axis, columns above; SI. GAIN is the coordinate's
             rate per displacement beyond the dead band [1/s], or its position per displacement.
         mass: (1,) mass of the flotor [kg].
-        turning: (3,) moments of inertia about the handle [kg m^2].
-        below: (3,) centre of mass in the coils' frame [m].
+        inertia: (3,) moments of inertia about the handle [kg m^2].
+        centre_of_mass: (3,) centre of mass in the coils' frame [m].
         handle: (3,) the handle's point in the coils' frame [m].
         gravity: (3,) [m/s^2].
         to_currents: (6, 6) inverse of the coils' map [A/N], [A/(N m)].
-        most: (1,) maximum current [A].
-        step: (6,) resolution of the sensing [m], [rad].
+        max_current: (1,) maximum current [A].
+        resolution: (6,) resolution of the sensing [m], [rad].
         kind: (4,) structure, mode, whether the coordinating force uses the handle's position, and
             whether the axes are decoupled.
     """
 
     axis: np.ndarray
     mass: np.ndarray
-    turning: np.ndarray
-    below: np.ndarray
+    inertia: np.ndarray
+    centre_of_mass: np.ndarray
     handle: np.ndarray
     gravity: np.ndarray
     to_currents: np.ndarray
-    most: np.ndarray
-    step: np.ndarray
+    max_current: np.ndarray
+    resolution: np.ndarray
     kind: np.ndarray
 
 
@@ -127,9 +155,9 @@ class MasterState(NamedTuple):
     line: np.ndarray
 
 
-def master(
+def build_master(
     joystick: Joystick, pilot: TeleopPilot, coordinates: tuple[str, ...]
-) -> tuple[Master, MasterState]:
+) -> tuple[MasterParameters, MasterState]:
     """Build parameters and initial state of the master's control.
 
     Args:
@@ -148,25 +176,25 @@ def master(
     com, handle, inertia = np.array(f.com), np.array(f.handle), np.diag(f.inertia)
     arm = com - handle
     turning = np.diag(inertia) + f.mass * (arm @ arm - arm**2)
-    lorentz = three_stations(coils.radius, coils.force_per_ampere, coils.max_current)
-    numbers = Master(
-        axis=axis_table(joystick, pilot, coordinates),
+    lorentz = make_three_station_coils(coils.radius, coils.force_per_ampere, coils.max_current)
+    numbers = MasterParameters(
+        axis=build_axis_table(joystick, pilot, coordinates),
         mass=np.array([f.mass]),
-        turning=turning,
-        below=com,
+        inertia=turning,
+        centre_of_mass=com,
         handle=handle,
         gravity=np.array(GRAVITY),
         to_currents=np.linalg.inv(lorentz.wrench_map),
-        most=np.array([coils.max_current]),
-        step=np.array([joystick.sensing.translation] * 3 + [joystick.sensing.rotation] * 3),
+        max_current=np.array([coils.max_current]),
+        resolution=np.array([joystick.sensing.translation] * 3 + [joystick.sensing.rotation] * 3),
         kind=np.array([
-            KINDS.index(pilot.reflection), RATE if pilot.mode == "rate" else POSITION,
+            REFLECTION_KINDS.index(pilot.reflection), RATE if pilot.mode == "rate" else POSITION,
             pilot.coordinating == "handle", pilot.compliance == "decoupled",
         ]),
     )  # fmt: skip
-    state = flat_state(MasterState, [(6,)] * 10 + [(1,), (2,), (6, SENT + 2)])
+    state = make_flat_state(MasterState, [(6,)] * 10 + [(1,), (2,), (6, SENT_SIGNAL + 2)])
     state.limited[:] = 1.0
-    return flattened(numbers), state
+    return flatten_state(numbers), state
 
 
 @compiled
@@ -181,16 +209,16 @@ def unpack_master(flat):
 
     Source: order and shapes of Master.
     """
-    axis, rest = split(flat, 6 * COLUMNS)
-    mass, rest = split(rest, 1)
-    turning, rest = split(rest, 3)
-    below, rest = split(rest, 3)
-    handle, rest = split(rest, 3)
-    gravity, rest = split(rest, 3)
-    to_currents, rest = split(rest, 36)
-    most, rest = split(rest, 1)
-    step, kind = split(rest, 6)
-    return Master(
+    axis, rest = split_array(flat, 6 * COLUMNS)
+    mass, rest = split_array(rest, 1)
+    turning, rest = split_array(rest, 3)
+    below, rest = split_array(rest, 3)
+    handle, rest = split_array(rest, 3)
+    gravity, rest = split_array(rest, 3)
+    to_currents, rest = split_array(rest, 36)
+    most, rest = split_array(rest, 1)
+    step, kind = split_array(rest, 6)
+    return MasterParameters(
         axis.reshape(6, COLUMNS), mass, turning, below, handle, gravity, to_currents.reshape(6, 6),
         most, step, kind,
     )  # fmt: skip
@@ -208,26 +236,26 @@ def unpack_master_state(flat):
 
     Source: order and shapes of MasterState.
     """
-    handle, rest = split(flat, 6)
-    speed, rest = split(rest, 6)
-    push, rest = split(rest, 6)
-    stiffness, rest = split(rest, 6)
-    hand, rest = split(rest, 6)
-    momentum, rest = split(rest, 6)
-    integral, rest = split(rest, 6)
-    before, rest = split(rest, 6)
-    currents, rest = split(rest, 6)
-    extra, rest = split(rest, 6)
-    limited, rest = split(rest, 1)
-    energy, line = split(rest, 2)
+    handle, rest = split_array(flat, 6)
+    speed, rest = split_array(rest, 6)
+    push, rest = split_array(rest, 6)
+    stiffness, rest = split_array(rest, 6)
+    hand, rest = split_array(rest, 6)
+    momentum, rest = split_array(rest, 6)
+    integral, rest = split_array(rest, 6)
+    before, rest = split_array(rest, 6)
+    currents, rest = split_array(rest, 6)
+    extra, rest = split_array(rest, 6)
+    limited, rest = split_array(rest, 1)
+    energy, line = split_array(rest, 2)
     return MasterState(
         handle, speed, push, stiffness, hand, momentum, integral, before, currents, extra, limited,
-        energy, line.reshape(6, SENT + 2),
+        energy, line.reshape(6, SENT_SIGNAL + 2),
     )  # fmt: skip
 
 
 @compiled
-def read_handle(numbers, qpos, period, s):
+def measure_handle(numbers, qpos, period, s):
     """Measure the handle with the sensing resolution, its rate by differences, and its energy.
 
     The energy from the hand follows from the kinetic energy and the work of the coils, without the
@@ -255,15 +283,15 @@ def read_handle(numbers, qpos, period, s):
             value = np.rint(value / numbers.step[i]) * numbers.step[i]
         speed = (value - s.handle[i]) / period if period > 0.0 else 0.0
         if period > 0.0:
-            own = numbers.mass[0] if i < 3 else numbers.turning[i - 3]
+            own = numbers.mass[0] if i < 3 else numbers.inertia[i - 3]
             gained = 0.5 * own * (speed**2 - s.speed[i] ** 2)
-            s.energy[0] += gained - _given(numbers, s, i) * (value - s.handle[i])
+            s.energy[0] += gained - _applied_force(numbers, s, i) * (value - s.handle[i])
         s.speed[i], s.handle[i] = speed, value
     s.energy[1] = min(s.energy[1], s.energy[0])
 
 
 @compiled
-def _given(numbers, s, i):
+def _applied_force(numbers, s, i):
     """Return the force of coils and weight on a handle axis since the last reading."""
     given = s.limited[0] * s.push[i]
     if i < 3:  # part of the flotor's weight that the limited currents do not carry
@@ -272,7 +300,7 @@ def _given(numbers, s, i):
 
 
 @compiled
-def reflect(numbers, packet, fresh, period, s):
+def compute_reflection(numbers, packet, fresh, period, s):
     """Compute the force on every axis of the handle with the selected structure.
 
     Args:
@@ -292,116 +320,120 @@ def reflect(numbers, packet, fresh, period, s):
     for i in range(6):
         row, x, v = numbers.axis[i], s.handle[i], s.speed[i]
         c, sign, gain = int(row[COORDINATE]), row[SIGN], row[GAIN]
-        stiff, rub, push = row[NOMINAL], row[DAMPING], 0.0
+        stiff, rub, push = row[NOMINAL_STIFFNESS], row[DAMPING], 0.0
         way = 1.0 if x > 0.0 else (-1.0 if x < 0.0 else 0.0)
         if c >= 0 and kind != NONE:
-            force = fresh * sign * packet[FORCE, c]
+            force = fresh * sign * packet[TIP_FORCE, c]
             if not np.isfinite(force):
                 force = 0.0
-            kept = min(row[REFLECTED_MOST], max(-row[REFLECTED_MOST], force))
+            kept = min(row[MAX_REFLECTED_FORCE], max(-row[MAX_REFLECTED_FORCE], force))
             if mode == POSITION and kind != STIFFNESS and kind != IMPEDANCE:
                 stiff = 0.0  # the spring's rest position is the slave's position
             if kind == STIFFNESS:
-                kept = min(row[LIMIT], max(-row[LIMIT], force))
-                stiff = min(row[MOST], max(row[LEAST], stiff - row[SLOPE] * kept * way))
-            elif kind == DIRECT:
-                push += row[RATIO] * kept
+                kept = min(row[FORCE_LIMIT], max(-row[FORCE_LIMIT], force))
+                stiff = min(
+                    row[MAX_STIFFNESS],
+                    max(row[MIN_STIFFNESS], stiff - row[STIFFNESS_PER_FORCE] * kept * way),
+                )
+            elif kind == DIRECT_FORCE:
+                push += row[REFLECTION_RATIO] * kept
             elif kind == COORDINATING and numbers.kind[2] > 0.0:
-                push -= fresh * _coordinating(row, mode, packet, period, s, i)
+                push -= fresh * _coordinating_force(row, mode, packet, period, s, i)
             elif kind == COORDINATING:
                 share = sign / gain if mode == POSITION else sign
-                behind = share * (packet[WANTED, c] - packet[PLACE, c])
-                slower = share * (packet[WANTED_SPEED, c] - packet[SPEED, c])
+                behind = share * (packet[REFERENCE_POSITION, c] - packet[TIP_POSITION, c])
+                slower = share * (packet[REFERENCE_SPEED, c] - packet[TIP_SPEED, c])
                 push -= fresh * (row[COUPLING] * behind + row[COUPLING_DAMPING] * slower)
             elif kind == FOUR_CHANNEL:
-                push += _four_channels(row, mode, kept, packet, fresh, period, s, i)
+                push += _four_channel_force(row, mode, kept, packet, fresh, period, s, i)
             elif kind == IMPEDANCE:
-                felt = fresh * row[RATIO] * gain
-                stiff = min(row[MOST], max(row[LEAST], stiff + felt * packet[TASK_STIFFNESS, c]))
+                felt = fresh * row[REFLECTION_RATIO] * gain
+                stiff = min(
+                    row[MAX_STIFFNESS],
+                    max(row[MIN_STIFFNESS], stiff + felt * packet[TASK_STIFFNESS, c]),
+                )
                 rub += min(rub, felt * packet[TASK_DAMPING, c])  # limited: sampling
-                own = numbers.mass[0] if i < 3 else numbers.turning[i - 3]
-                change = _CHANGE * (v - s.before[i])
+                own = numbers.mass[0] if i < 3 else numbers.inertia[i - 3]
+                change = _DERIVATIVE_BANDWIDTH * (v - s.before[i])
                 s.before[i] += period * change
                 heavier = felt * packet[TASK_MASS, c]
                 if heavier > 0.0:  # false for NaN
-                    push -= min(_HEAVIER * own, heavier) * change
-            elif kind == WAVES or kind == CONTROLLED:
-                push -= fresh * _passive_line(numbers, row, packet, period, s, i)
+                    push -= min(_MAX_ADDED_MASS_RATIO * own, heavier) * change
+            elif kind == WAVE_VARIABLES or kind == PASSIVITY_CONTROL:
+                push -= fresh * _passive_channel_force(numbers, row, packet, period, s, i)
         s.stiffness[i] = stiff
         beyond = abs(x) - row[DEADBAND]
-        if row[OUTSIDE] >= 0.0 and beyond > 0.0:
-            stiff_out = row[OUTSIDE] + max(stiff - row[NOMINAL], 0.0)
-            push -= way * (max(stiff * row[DEADBAND] - row[DROP], 0.0) + stiff_out * beyond)
+        if row[DETENT_STIFFNESS] >= 0.0 and beyond > 0.0:
+            stiff_out = row[DETENT_STIFFNESS] + max(stiff - row[NOMINAL_STIFFNESS], 0.0)
+            push -= way * (max(stiff * row[DEADBAND] - row[DETENT_DROP], 0.0) + stiff_out * beyond)
         else:
             push -= stiff * x
         total = push - rub * v + fresh * s.extra[i]
         s.push[i] = (
-            total if np.isfinite(total) else -row[NOMINAL] * x - row[DAMPING] * v
+            total if np.isfinite(total) else -row[NOMINAL_STIFFNESS] * x - row[DAMPING] * v
         )  # fallback: spring and damper only
 
 
 @compiled
-def _coordinating(row, mode, packet, period, s, i):
+def _coordinating_force(row, mode, packet, period, s, i):
     """Return the spring and damper force between the machine and its command from the handle."""
     gain, x, v, c, sign = row[GAIN], s.handle[i], s.speed[i], int(row[COORDINATE]), row[SIGN]
-    place, speed = sign * packet[PLACE, c], sign * packet[SPEED, c]
+    place, speed = sign * packet[TIP_POSITION, c], sign * packet[TIP_SPEED, c]
     if mode == POSITION:
         return row[COUPLING] * (x - place / gain) + row[COUPLING_DAMPING] * (v - speed / gain)
-    beyond = max(0.0, min(row[REACH], abs(x)) - row[DEADBAND])
+    beyond = max(0.0, min(row[HANDLE_RANGE], abs(x)) - row[DEADBAND])
     rate = gain * beyond if x > 0.0 else -gain * beyond
     asked = s.integral[i] + period * rate
-    s.integral[i] = min(place + WINDUP, max(place - WINDUP, asked))
+    s.integral[i] = min(place + MAX_WINDUP, max(place - MAX_WINDUP, asked))
     return row[COUPLING] * (s.integral[i] - place) + row[COUPLING_DAMPING] * (rate - speed)
 
 
 @compiled
-def _passive_line(numbers, row, packet, period, s, i):
+def _passive_channel_force(numbers, row, packet, period, s, i):
     """Return the force of a passive channel against the handle; write the next packet's data."""
     c, sign, v, end = int(row[COORDINATE]), row[SIGN], s.speed[i], s.line[i]
-    total, budget = sign * packet[TOTAL, c], packet[BUDGET, c]
-    if numbers.kind[0] == WAVES:
-        pushed, wave = wave_master(v, total, budget, row[WAVE], period, end)
-        end[SENT] += period * wave
-        end[SENT + 1] += period * wave * wave
+    total, budget = sign * packet[CHANNEL_SIGNAL, c], packet[CHANNEL_ENERGY, c]
+    if numbers.kind[0] == WAVE_VARIABLES:
+        pushed, wave = step_wave_master(v, total, budget, row[AXIS_WAVE_IMPEDANCE], period, end)
+        end[SENT_SIGNAL] += period * wave
+        end[SENT_SIGNAL + 1] += period * wave * wave
         return pushed
-    own = numbers.mass[0] if i < 3 else numbers.turning[i - 3]
-    pushed = controlled_master(v, total, budget, own, period, end)
-    end[SENT], end[SENT + 1] = s.handle[i], end[GONE_IN]
+    own = numbers.mass[0] if i < 3 else numbers.inertia[i - 3]
+    pushed = step_passivity_master(v, total, budget, own, period, end)
+    end[SENT_SIGNAL], end[SENT_SIGNAL + 1] = s.handle[i], end[ENERGY_IN]
     return pushed
 
 
 @compiled
-def _four_channels(row, mode, force, packet, fresh, period, s, i):
+def _four_channel_force(row, mode, force, packet, fresh, period, s, i):
     """Return the reflected force and velocity of the four-channel structures.
 
     Under rate control `C2 = s / k_v` differentiates the force, below 20 rad/s.
     """
     gain, spring, damper = row[GAIN], row[COUPLING], row[COUPLING_DAMPING]
     x, v, c, sign = s.handle[i], s.speed[i], int(row[COORDINATE]), row[SIGN]
-    place, speed = sign * packet[PLACE, c], sign * packet[SPEED, c]
-    reflected = row[RATIO] * force
+    place, speed = sign * packet[TIP_POSITION, c], sign * packet[TIP_SPEED, c]
+    reflected = row[REFLECTION_RATIO] * force
     if mode == POSITION:
         return reflected - fresh * (spring * (x - place / gain) + damper * (v - speed / gain))
     asked = s.integral[i] + period * gain * x
-    s.integral[i] = min(place + WINDUP, max(place - WINDUP, asked))
-    change = _CHANGE * (reflected - s.before[i])
+    s.integral[i] = min(place + MAX_WINDUP, max(place - MAX_WINDUP, asked))
+    change = _DERIVATIVE_BANDWIDTH * (reflected - s.before[i])
     s.before[i] += period * change
     apart = spring * (s.integral[i] - place) + damper * (gain * x - speed)
     return change / gain - fresh * apart
 
 
 @compiled
-def _decoupled(numbers, turn, s, wrench):
+def _decoupled_wrench(numbers, turn, s, wrench):
     """Compute the wrench that makes every axis an independent mass under its force."""
     mass, arm = numbers.mass[0], numbers.below - numbers.handle
     inertia, wanted, about = np.zeros((3, 3)), np.empty(3), np.empty(3)
     square = arm[0] ** 2 + arm[1] ** 2 + arm[2] ** 2
     for j in range(3):
-        inertia[j, j] = numbers.turning[j] - mass * (square - arm[j] ** 2)
-        wanted[j], about[j] = s.push[j] / mass, s.push[3 + j] / numbers.turning[j]
-    driving_wrench(
-        mass, arm, inertia, numbers.below, wanted, about, turn, s.speed[3:], numbers.gravity, wrench
-    )
+        inertia[j, j] = numbers.inertia[j] - mass * (square - arm[j] ** 2)
+        wanted[j], about[j] = s.push[j] / mass, s.push[3 + j] / numbers.inertia[j]
+    free_flotor_wrench(mass, arm, inertia, numbers.below, wanted, about, turn, s.speed[3:], numbers.gravity, wrench)
 
 
 @compiled
@@ -422,13 +454,11 @@ def drive_coils(numbers, quaternion, period, s):
     Source: Zhu 1994, 5.1.3; momentum observer after De Luca and Mattone 2005.
     """
     turn, wrench = np.empty((3, 3)), np.empty(6)
-    turn_matrix(quaternion, turn)
+    quaternion_to_matrix(quaternion, turn)
     if numbers.kind[3] > 0.0:
-        _decoupled(numbers, turn, s, wrench)
+        _decoupled_wrench(numbers, turn, s, wrench)
     else:
-        holding_wrench(
-            numbers.mass[0], numbers.below, numbers.handle, s.push, turn, numbers.gravity, wrench
-        )
+        held_flotor_wrench(numbers.mass[0], numbers.below, numbers.handle, s.push, turn, numbers.gravity, wrench)
     largest = numbers.most[0]
     for i in range(6):
         s.currents[i] = 0.0
@@ -440,13 +470,13 @@ def drive_coils(numbers, quaternion, period, s):
     s.limited[0] = numbers.most[0] / largest
     for i in range(6):
         s.currents[i] *= s.limited[0]
-        own = numbers.mass[0] if i < 3 else numbers.turning[i - 3]
-        s.hand[i] = _OBSERVER * (own * s.speed[i] - s.momentum[i])
-        s.momentum[i] += period * (_given(numbers, s, i) + s.hand[i])
+        own = numbers.mass[0] if i < 3 else numbers.inertia[i - 3]
+        s.hand[i] = _OBSERVER_BANDWIDTH * (own * s.speed[i] - s.momentum[i])
+        s.momentum[i] += period * (_applied_force(numbers, s, i) + s.hand[i])
 
 
 @compiled
-def _blind(s):
+def _reset_master(s):
     """Switch currents and command off; the next valid reading starts from rest."""
     for i in range(6):
         s.handle[i], s.speed[i], s.push[i] = 0.0, 0.0, 0.0
@@ -455,7 +485,7 @@ def _blind(s):
 
 
 @compiled
-def master_step(numbers, qpos, packet, fresh, period, first, s):
+def step_master(numbers, qpos, packet, fresh, period, first, s):
     """Run one period of the master: read the handle, reflect, drive the coils.
 
     A reading that is not finite switches the coils off and leaves the machine without a command.
@@ -463,8 +493,8 @@ def master_step(numbers, qpos, packet, fresh, period, first, s):
     Args:
         numbers: Master.
         qpos: (7,) flotor position [m] and quaternion.
-        packet: (8, k) see `reflect`.
-        fresh: see `reflect`, scalar.
+        packet: (8, k) see `compute_reflection`.
+        fresh: see `compute_reflection`, scalar.
         period: scalar [s].
         first: whether this is the first period, scalar.
         s: MasterState, written.
@@ -475,22 +505,22 @@ def master_step(numbers, qpos, packet, fresh, period, first, s):
     Source: this module.
     """
     if not np.isfinite(qpos).all():
-        _blind(s)
+        _reset_master(s)
         return
-    read_handle(numbers, qpos, 0.0 if first or s.limited[0] == 0.0 else period, s)
-    reflect(numbers, packet, fresh, period, s)
+    measure_handle(numbers, qpos, 0.0 if first or s.limited[0] == 0.0 else period, s)
+    compute_reflection(numbers, packet, fresh, period, s)
     drive_coils(numbers, qpos[3:7], period, s)
 
 
 _GRAVITY = 9.81
-_FULL = 0.1  # range of the tipping ratio, above the allowed one, over which the spring builds up
+_FULL_ACTION_RANGE = 0.1  # range of the tipping ratio, above the allowed one, over which the spring builds up
 
 
-def tipping_share(facts: TipOver, radius: float, force: float) -> float:
+def tipping_ratio(tip_over: TipOver, radius: float, force: float) -> float:
     """Return the ratio of a vertical tip force's moment to the tipping moment.
 
     Args:
-        facts: tip-over parameters of the machine.
+        tip_over: tip-over parameters of the machine.
         radius: distance of the tip from the swing axis [m].
         force: force of the environment on the tip, positive up [N].
 
@@ -499,17 +529,17 @@ def tipping_share(facts: TipOver, radius: float, force: float) -> float:
         edge if pulled down.
 
     >>> machine = TipOver(mass=20000.0, behind=0.4, edge=1.6)
-    >>> round(tipping_share(machine, 6.4, 29430.0), 3)
+    >>> round(tipping_ratio(machine, 6.4, 29430.0), 3)
     1.0
     """
-    weight = facts.mass * _GRAVITY
+    weight = tip_over.mass * _GRAVITY
     if force > 0.0:
-        return force * (radius + facts.edge) / (weight * (facts.edge - facts.behind))
-    return -force * max(radius - facts.edge, 0.0) / (weight * (facts.edge + facts.behind))
+        return force * (radius + tip_over.edge) / (weight * (tip_over.edge - tip_over.behind))
+    return -force * max(radius - tip_over.edge, 0.0) / (weight * (tip_over.edge + tip_over.behind))
 
 
-def push_back(
-    facts: TipOver, numbers: Master, packet: np.ndarray, start: np.ndarray, handle: np.ndarray,
+def tip_over_wrench(
+    tip_over: TipOver, numbers: MasterParameters, packet: np.ndarray, start: np.ndarray, handle: np.ndarray,
     speed: np.ndarray, extra: np.ndarray,
 ) -> None:  # fmt: skip
     """Compute a force on the handle's vertical axis that keeps the machine from tipping.
@@ -519,7 +549,7 @@ def push_back(
     dead band and never commands a motion.
 
     Args:
-        facts: tip-over parameters of the machine.
+        tip_over: tip-over parameters of the machine.
         numbers: parameters of the master.
         packet: (8, k) data from the machine.
         start: (5,) pose at the start.
@@ -530,13 +560,13 @@ def push_back(
     Source: Zhu 1994, chapter 6 (tip-over of an excavator that presses too hard).
     """
     extra[:] = 0.0
-    force, radius = float(packet[FORCE, 2]), float(packet[PLACE, 0] + start[0])
-    danger = min(1.0, (tipping_share(facts, radius, force) - facts.share) / _FULL)
+    force, radius = float(packet[TIP_FORCE, 2]), float(packet[TIP_POSITION, 0] + start[0])
+    danger = min(1.0, (tipping_ratio(tip_over, radius, force) - tip_over.share) / _FULL_ACTION_RANGE)
     if not danger > 0.0:
         return
     for axis in range(6):
         row = numbers.axis[axis]
         worse = -math.copysign(1.0, force) * row[SIGN]  # this direction increases the tip force
         if row[COORDINATE] == 2.0 and worse * handle[axis] > 0.0:
-            push = facts.stiffness * handle[axis] + facts.damping * speed[axis]
+            push = tip_over.stiffness * handle[axis] + tip_over.damping * speed[axis]
             extra[axis] = -danger * push

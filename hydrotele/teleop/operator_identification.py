@@ -32,15 +32,24 @@ from hydrotele.teleop.manual_control import FORMS, TrackingRecord
 from hydrotele.teleop.operator_parameters import load_operator_file
 
 EQUALISATIONS = ("integral", "lag", "gain", "lead")
-_SLOWEST, _FASTEST = 10.0, 25.0  # Hz, minimum and maximum sampling rate of the analysis
-_SHORTEST = 20.0  # s
-_MISSING = 0.05  # maximum fraction of samples that are interpolated
-_HIGHPASS = 0.15  # rad/s: slower motion of the hand is drift
-_SETTLES = 6.0  # s, settling time of the filters at the start of the record
-_MEMORY, _TAP = 3.0, 0.06  # s, length and tap spacing of the response of the error to the target
-_PARTS, _RANK = 6, 3e-3  # parts of the record; smallest relative singular value that is used
-_WHITENER = 0.6  # s of the autoregression of the remnant
-_FLOOR = 3e-2  # white noise relative to the variance of the remnant: limits the whitener's gain
+_MIN_SAMPLING_RATE, _MAX_SAMPLING_RATE = (
+    10.0,
+    25.0,
+)  # Hz, minimum and maximum sampling rate of the analysis
+_MIN_DURATION = 20.0  # s
+_MAX_MISSING_FRACTION = 0.05  # maximum fraction of samples that are interpolated
+_HIGHPASS_FREQUENCY = 0.15  # rad/s: slower motion of the hand is drift
+_SETTLING_TIME = 6.0  # s, settling time of the filters at the start of the record
+_RESPONSE_LENGTH, _TAP_SPACING = (
+    3.0,
+    0.06,
+)  # s, length and tap spacing of the response of the error to the target
+_INSTRUMENT_PARTS, _MIN_SINGULAR_RATIO = (
+    6,
+    3e-3,
+)  # parts of the record; smallest relative singular value that is used
+_WHITENER_LENGTH = 0.6  # s of the autoregression of the remnant
+_NOISE_FLOOR = 3e-2  # white noise relative to the variance of the remnant: limits the whitener's gain
 _BOUNDS = {
     "gain": (1e-9, 1e9), "delay": (0.02, 1.0), "time_constant": (0.02, 50.0),
     "neuromuscular_frequency": (3.0, 60.0), "neuromuscular_damping": (0.03, 2.0),
@@ -48,13 +57,13 @@ _BOUNDS = {
 _UNITS = {"delay": "s", "time_constant": "s", "neuromuscular_frequency": "rad/s",
           "neuromuscular_damping": "1", "remnant": "1", "crossover": "rad/s",
           "phase_margin": "rad", "gain_margin": "1"}  # fmt: skip
-_CERTAIN = 0.5  # maximum standard error of a logarithm for an identifiable parameter
+_MAX_LOG_ERROR = 0.5  # maximum standard error of a logarithm for an identifiable parameter
 _JACKKNIFE = 8  # parts of the record
-_QUANTILE = 2.36  # Student's t for 95 % with _JACKKNIFE - 1 degrees of freedom
-_DRAWS = 400
+_STUDENT_QUANTILE = 2.36  # Student's t for 95 % with _JACKKNIFE - 1 degrees of freedom
+_SAMPLE_COUNT = 400
 
 
-class Estimate(NamedTuple):
+class ParameterEstimate(NamedTuple):
     """An estimated parameter.
 
     Attributes:
@@ -81,7 +90,7 @@ class OperatorFit(NamedTuple):
             neuromuscular_frequency, neuromuscular_damping, remnant; crossover, phase_margin and
             gain_margin if the controlled element is one of the known forms.
             element: form of the controlled element, such as `K/s`; empty if it is not a known form.
-            explained: fraction of the hand's variance that the model predicts from the target [1].
+            explained_fraction: fraction of the hand's variance that the model predicts from the target [1].
             rate: sampling rate of the analysis [Hz].
             duration: analysed duration [s].
             notes: warnings for the user.
@@ -90,9 +99,9 @@ class OperatorFit(NamedTuple):
     """
 
     equalisation: str
-    estimates: Mapping[str, Estimate]
+    estimates: Mapping[str, ParameterEstimate]
     element: str
-    explained: float
+    explained_fraction: float
     rate: float
     duration: float
     notes: tuple[str, ...]
@@ -100,9 +109,7 @@ class OperatorFit(NamedTuple):
     response: np.ndarray
 
 
-def read_tracking(
-    path: Path, names: Mapping[str, str] | None = None
-) -> tuple[TrackingRecord, list[str]]:
+def read_tracking(path: Path, names: Mapping[str, str] | None = None) -> tuple[TrackingRecord, list[str]]:
     """Read a record of tracking from a CSV or Parquet file.
 
     Columns are `time`, `target`, `response` and `hand`, or the names in `names`. Without a column
@@ -139,22 +146,22 @@ def read_tracking(
             values *= to_si(unit)[1]
         if np.isinf(values).any():
             row = int(np.flatnonzero(np.isinf(values))[0])
-            raise InputError(table.where(str(name), row), "is infinite: remove the row")
+            raise InputError(table.location(str(name), row), "is infinite: remove the row")
         columns[key] = values
     time = columns.pop("time")
     if len(time) < 10:
-        raise InputError(path, f"has {len(time)} rows; a record needs at least {_SHORTEST:g} s")
+        raise InputError(path, f"has {len(time)} rows; a record needs at least {_MIN_DURATION:g} s")
     bad = np.flatnonzero(~(np.diff(time) > 0.0))
     if len(bad):
         message = "does not increase here: sort the rows and keep each time once"
-        raise InputError(table.where("time", int(bad[0]) + 1), message)
+        raise InputError(table.location("time", int(bad[0]) + 1), message)
     for key, values in columns.items():
         missing = np.isnan(values)
-        if missing.mean() > _MISSING:
+        if missing.mean() > _MAX_MISSING_FRACTION:
             share = 100.0 * missing.mean()
             row = int(np.flatnonzero(missing)[0])
-            message = f"has {share:.0f} % missing values; at most {100 * _MISSING:g} % are allowed"
-            raise InputError(table.where(given.get(key, key), row), message)
+            message = f"has {share:.0f} % missing values; at most {100 * _MAX_MISSING_FRACTION:g} % are allowed"
+            raise InputError(table.location(given.get(key, key), row), message)
         if missing.any():
             notes.append(f"{int(missing.sum())} missing values of {key} were interpolated")
             columns[key] = np.interp(time, time[~missing], values[~missing])
@@ -163,9 +170,7 @@ def read_tracking(
     return TrackingRecord(time, *(columns[k] for k in ("target", "response", "hand"))), notes
 
 
-def identify_operator(
-    record: TrackingRecord, equalisation: str | None = None, source: str = "record"
-) -> OperatorFit:
+def identify_operator(record: TrackingRecord, equalisation: str | None = None, source: str = "record") -> OperatorFit:
     """Fit the operator model to a record of compensatory tracking.
 
     Args:
@@ -182,52 +187,52 @@ def identify_operator(
     if equalisation is not None and equalisation not in EQUALISATIONS:
         message = f"{equalisation!r}; valid: {', '.join(EQUALISATIONS)}"
         raise InputError("--equalisation", message)
-    step, signals, notes = _uniform(record, source)
-    filtered = {name: _filter(values, step, _highpass) for name, values in signals.items()}
+    step, signals, notes = _resample_record(record, source)
+    filtered = {name: _filter(values, step, _highpass_response) for name, values in signals.items()}
     target, seen, hand = filtered["target"], filtered["error"], filtered["hand"]
-    from_target = _instrument(target, seen, step)
-    data = _Data(step, target, seen, from_target, hand)
+    from_target = _estimate_instrument(target, seen, step)
+    data = _TrackingData(step, target, seen, from_target, hand)
     kinds = (equalisation,) if equalisation else EQUALISATIONS
-    fits = [fit for kind in kinds if (fit := _fit(data, kind)) is not None]
+    fits = [fit for kind in kinds if (fit := _fit_equalisation(data, kind)) is not None]
     if not fits:
         raise InputError(source, "has no response of the hand to the target: check the columns")
-    best = min(fits, key=lambda fit: (not fit.settled, fit.criterion))
-    best = best._replace(covariance=_covariance(data, best))
-    if not best.settled:
+    best = min(fits, key=lambda fit: (not fit.has_converged, fit.criterion))
+    best = best._replace(covariance=_log_covariance(data, best))
+    if not best.has_converged:
         notes.append("the fit did not converge and is not valid: use a longer record, or a target"
                      " with more motion")  # fmt: skip
-    return _finished(best, data, signals, record, notes)
+    return _build_operator_fit(best, data, signals, record, notes)
 
 
-class _Data(NamedTuple):
+class _TrackingData(NamedTuple):
     step: float
     target: np.ndarray
     error: np.ndarray
-    from_target: np.ndarray
+    target_error: np.ndarray
     hand: np.ndarray
 
 
-class _Fit(NamedTuple):
+class _EqualisationFit(NamedTuple):
     kind: str
     names: tuple[str, ...]
     sign: float
-    logs: np.ndarray
-    covariance: np.ndarray  # empty before `_covariance`
+    log_parameters: np.ndarray
+    covariance: np.ndarray  # empty before `_log_covariance`
     noise: np.ndarray
-    white: np.ndarray
+    whitening_filter: np.ndarray
     criterion: float
-    settled: bool
+    has_converged: bool
 
 
-def _uniform(record: TrackingRecord, source: str) -> tuple[float, dict[str, np.ndarray], list[str]]:
+def _resample_record(record: TrackingRecord, source: str) -> tuple[float, dict[str, np.ndarray], list[str]]:
     """Resample to equidistant signals without mean; also return notes."""
     time, notes = record.time, []
     spacing = float(np.median(np.diff(time)))
-    if time[-1] - time[0] < _SHORTEST:
-        message = f"is {time[-1] - time[0]:.1f} s long; at least {_SHORTEST:g} s are needed"
+    if time[-1] - time[0] < _MIN_DURATION:
+        message = f"is {time[-1] - time[0]:.1f} s long; at least {_MIN_DURATION:g} s are needed"
         raise InputError(source, message)
-    if 1.0 / spacing < _SLOWEST:
-        message = f"has {1.0 / spacing:.2g} samples per second; at least {_SLOWEST:g} are needed"
+    if 1.0 / spacing < _MIN_SAMPLING_RATE:
+        message = f"has {1.0 / spacing:.2g} samples per second; at least {_MIN_SAMPLING_RATE:g} are needed"
         raise InputError(source, message)
     if (gap := float(np.diff(time).max())) > 0.5:
         at = float(time[int(np.argmax(np.diff(time)))])
@@ -236,7 +241,7 @@ def _uniform(record: TrackingRecord, source: str) -> tuple[float, dict[str, np.n
     if np.abs(np.diff(time) / spacing - 1.0).max() > 0.5:
         notes.append("samples are not equidistant: they were interpolated")
     error = record.target - record.response
-    every = max(1, math.ceil(1.0 / spacing / _FASTEST - 0.01))
+    every = max(1, math.ceil(1.0 / spacing / _MAX_SAMPLING_RATE - 0.01))
     grid = np.arange(time[0], time[-1], spacing)
     made = {}
     for name, values in (("target", record.target), ("error", error), ("hand", record.hand),
@@ -250,18 +255,18 @@ def _uniform(record: TrackingRecord, source: str) -> tuple[float, dict[str, np.n
     return spacing * every, made, notes
 
 
-def _highpass(s: np.ndarray) -> np.ndarray:
-    return s / (s + _HIGHPASS)
+def _highpass_response(s: np.ndarray) -> np.ndarray:
+    return s / (s + _HIGHPASS_FREQUENCY)
 
 
 def _filter(values: np.ndarray, step: float, response) -> np.ndarray:
     """Filter a signal with a transfer function of s, from rest."""
-    pad = len(values) + round(4.0 * _SETTLES / step)
+    pad = len(values) + round(4.0 * _SETTLING_TIME / step)
     s = 2j * np.pi * np.fft.rfftfreq(pad, step)
     return np.fft.irfft(np.fft.rfft(values, pad) * response(s), pad)[: len(values)]
 
 
-def _instrument(
+def _estimate_instrument(
     target: np.ndarray, seen: np.ndarray, step: float, kept: np.ndarray | None = None
 ) -> np.ndarray:  # fmt: skip
     """Estimate the part of the error that the target causes, by least squares on `kept` rows.
@@ -269,35 +274,35 @@ def _instrument(
     Each part of the record uses the response that is fitted to the other parts, so that its own
     remnant is not in its instrument (jackknife instrumental variables, Angrist et al. 1999).
     """
-    apart = max(1, round(_TAP / step))
-    lags = np.arange(0, round(_MEMORY / step), apart)
+    apart = max(1, round(_TAP_SPACING / step))
+    lags = np.arange(0, round(_RESPONSE_LENGTH / step), apart)
     table = np.zeros((len(target), len(lags)))
     for column, lag in enumerate(lags):
         table[lag:, column] = target[: len(target) - lag]
     rows = np.arange(len(target))
-    usable = rows >= round(_SETTLES / step)
+    usable = rows >= round(_SETTLING_TIME / step)
     usable = usable if kept is None else usable & kept
-    parts = np.array_split(rows, _PARTS)
+    parts = np.array_split(rows, _INSTRUMENT_PARTS)
     inside = [part[usable[part]] for part in parts]
     squares = [table[part].T @ table[part] for part in inside]
     products = [table[part].T @ seen[part] for part in inside]
     made = np.zeros(len(target))
     for part, square, product in zip(parts, squares, products, strict=True):
         size, way = np.linalg.eigh(sum(squares) - square)
-        known = size > _RANK**2 * size[-1]
+        known = size > _MIN_SINGULAR_RATIO**2 * size[-1]
         taps = (way[:, known].T @ (sum(products) - product)) / size[known]
         made[part] = table[part] @ (way[:, known] @ taps)
     return made
 
 
-def _names(kind: str) -> tuple[str, ...]:
+def _parameter_names(kind: str) -> tuple[str, ...]:
     timed = ("time_constant",) if kind in ("lead", "lag") else ()
     return ("gain", "delay", *timed, "neuromuscular_frequency", "neuromuscular_damping")
 
 
-def _response(kind: str, logs: np.ndarray, s: np.ndarray) -> np.ndarray:
+def _operator_response(kind: str, logs: np.ndarray, s: np.ndarray) -> np.ndarray:
     """Return the operator's describing function."""
-    p = dict(zip(_names(kind), np.exp(logs), strict=True))
+    p = dict(zip(_parameter_names(kind), np.exp(logs), strict=True))
     w, z = p["neuromuscular_frequency"], p["neuromuscular_damping"]
     made = p["gain"] * np.exp(-p["delay"] * s) * w**2 / (s**2 + 2.0 * z * w * s + w**2)
     if kind == "lead":
@@ -309,11 +314,11 @@ def _response(kind: str, logs: np.ndarray, s: np.ndarray) -> np.ndarray:
     return made
 
 
-def _slopes(kind: str, logs: np.ndarray, s: np.ndarray) -> list[np.ndarray]:
-    """Return the derivatives of `_response` with respect to the logarithms."""
-    p = dict(zip(_names(kind), np.exp(logs), strict=True))
+def _response_derivatives(kind: str, logs: np.ndarray, s: np.ndarray) -> list[np.ndarray]:
+    """Return the derivatives of `_operator_response` with respect to the logarithms."""
+    p = dict(zip(_parameter_names(kind), np.exp(logs), strict=True))
     w, z = p["neuromuscular_frequency"], p["neuromuscular_damping"]
-    whole = _response(kind, logs, s)
+    whole = _operator_response(kind, logs, s)
     lag = s**2 + 2.0 * z * w * s + w**2
     factor = {
         "gain": np.ones_like(s), "delay": -p["delay"] * s,
@@ -323,32 +328,32 @@ def _slopes(kind: str, logs: np.ndarray, s: np.ndarray) -> list[np.ndarray]:
     if kind in ("lead", "lag"):
         t = p["time_constant"] * s
         factor["time_constant"] = (1.0 if kind == "lead" else -1.0) * t / (1.0 + t)
-    return [whole * factor[name] for name in _names(kind)]
+    return [whole * factor[name] for name in _parameter_names(kind)]
 
 
-def _predicted(data: _Data, kind: str, logs: np.ndarray, values: np.ndarray) -> np.ndarray:
-    return _filter(values, data.step, lambda s: _response(kind, logs, s))
+def _predict_hand(data: _TrackingData, kind: str, logs: np.ndarray, values: np.ndarray) -> np.ndarray:
+    return _filter(values, data.step, lambda s: _operator_response(kind, logs, s))
 
 
-def _autoregression(noise: np.ndarray, step: float) -> np.ndarray:
+def _fit_whitening_filter(noise: np.ndarray, step: float) -> np.ndarray:
     """Return the whitening filter of a noise: 1 and the negative autoregression coefficients."""
     from scipy.linalg import solve_toeplitz
 
-    order = max(4, round(_WHITENER / step))
+    order = max(4, round(_WHITENER_LENGTH / step))
     noise = noise - noise.mean()
     size = len(noise)
     spectrum = np.abs(np.fft.rfft(noise, 2 * size)) ** 2
     r = np.fft.irfft(spectrum)[: order + 1] / size
-    r[0] *= 1.0 + _FLOOR
+    r[0] *= 1.0 + _NOISE_FLOOR
     return np.concatenate([[1.0], -solve_toeplitz(r[:order], r[1 : order + 1])])
 
 
-def _fit(data: _Data, kind: str) -> _Fit | None:
+def _fit_equalisation(data: _TrackingData, kind: str) -> _EqualisationFit | None:
     """Fit by refined instrumental variables from several delays; None if no start fits."""
     from scipy.optimize import least_squares
     from scipy.signal import lfilter
 
-    names, first = _names(kind), round(_SETTLES / data.step)
+    names, first = _parameter_names(kind), round(_SETTLING_TIME / data.step)
     low, high = (np.log([_BOUNDS[n][side] for n in names]) for side in (0, 1))
     starts = []
     for delay in (0.1, 0.2, 0.35, 0.5):
@@ -356,7 +361,7 @@ def _fit(data: _Data, kind: str) -> _Fit | None:
             usual = {"gain": 1.0, "delay": delay, "time_constant": constant,
                      "neuromuscular_frequency": 12.0, "neuromuscular_damping": 0.4}  # fmt: skip
             logs = np.log([usual[n] for n in names])
-            one = _predicted(data, kind, logs, data.from_target)[first:]
+            one = _predict_hand(data, kind, logs, data.target_error)[first:]
             gain = float(one @ data.hand[first:] / max(one @ one, 1e-300))
             rest = float(np.sum((data.hand[first:] - gain * one) ** 2))
             starts.append((rest, gain, logs))
@@ -368,30 +373,30 @@ def _fit(data: _Data, kind: str) -> _Fit | None:
     hand = sign * data.hand
     logs = np.clip(logs, low + 1e-6, high - 1e-6)
 
-    def miss(x: np.ndarray) -> np.ndarray:
-        return (hand - _predicted(data, kind, x, data.from_target))[first:]
+    def residual(x: np.ndarray) -> np.ndarray:
+        return (hand - _predict_hand(data, kind, x, data.target_error))[first:]
 
-    logs = least_squares(miss, logs, bounds=(low, high), x_scale=0.3).x
+    logs = least_squares(residual, logs, bounds=(low, high), x_scale=0.3).x
     noise, white, settled = hand, np.ones(1), False
     for turn in range(30):
-        noise = (hand - _predicted(data, kind, logs, data.error))[first:]
-        white = _autoregression(noise, data.step)
-        z, d, rest = _equations(data, kind, logs, sign, white, data.from_target)
-        move = _solution(z, d, rest)[: len(logs)]
+        noise = (hand - _predict_hand(data, kind, logs, data.error))[first:]
+        white = _fit_whitening_filter(noise, data.step)
+        z, d, rest = _instrument_equations(data, kind, logs, sign, white, data.target_error)
+        move = _solve_equations(z, d, rest)[: len(logs)]
         logs = np.clip(logs + np.clip(move, -0.3, 0.3) * (1.0 if turn < 20 else 0.5), low, high)
         settled = bool(np.abs(move).max() < 1e-3)
         if np.abs(move).max() < 1e-4:
             break
-    rest = miss(logs)
-    left = _autoregression(rest, data.step)
+    rest = residual(logs)
+    left = _fit_whitening_filter(rest, data.step)
     power = float(np.var(np.asarray(lfilter(left, [1.0], rest))[len(left) :]))
     size = len(rest)
     criterion = size * math.log(max(power, 1e-300)) + len(logs) * math.log(size)
-    return _Fit(kind, names, sign, logs, np.zeros((0, 0)), noise, white, criterion, settled)
+    return _EqualisationFit(kind, names, sign, logs, np.zeros((0, 0)), noise, white, criterion, settled)
 
 
-def _equations(
-    data: _Data, kind: str, logs: np.ndarray, sign: float, white: np.ndarray,
+def _instrument_equations(
+    data: _TrackingData, kind: str, logs: np.ndarray, sign: float, white: np.ndarray,
     instrument: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Return whitened instruments (n, m + 1), derivatives (n, m + 1), and remnant (n,).
@@ -401,37 +406,37 @@ def _equations(
     """
     from scipy.signal import lfilter
 
-    first = round(_SETTLES / data.step)
+    first = round(_SETTLING_TIME / data.step)
 
-    def whitened(values: np.ndarray) -> np.ndarray:
+    def apply_whitening(values: np.ndarray) -> np.ndarray:
         return np.asarray(lfilter(white, [1.0], values[first:]))[len(white) :]
 
-    begun = whitened(np.exp(-_HIGHPASS * data.step * np.arange(len(data.hand))))
+    begun = apply_whitening(np.exp(-_HIGHPASS_FREQUENCY * data.step * np.arange(len(data.hand))))
     z, d = (
-        np.column_stack([*(whitened(_slope_of(data, kind, logs, k, values))
+        np.column_stack([*(apply_whitening(_filtered_derivative(data, kind, logs, k, values))
                            for k in range(len(logs))), begun])
         for values in (instrument, data.error)
     )  # fmt: skip
-    rest = whitened(sign * data.hand - _predicted(data, kind, logs, data.error))
+    rest = apply_whitening(sign * data.hand - _predict_hand(data, kind, logs, data.error))
     return z, d, rest
 
 
-def _solution(z: np.ndarray, d: np.ndarray, rest: np.ndarray) -> np.ndarray:
+def _solve_equations(z: np.ndarray, d: np.ndarray, rest: np.ndarray) -> np.ndarray:
     """Solve `z^T (rest - d x) = 0` for x."""
     scale = np.linalg.norm(z, axis=0) + 1e-300
     matrix, right = (z / scale).T @ (d / scale), (z / scale).T @ rest
     return np.linalg.lstsq(matrix, right, rcond=1e-10)[0] / scale
 
 
-def _covariance(data: _Data, fit: _Fit) -> np.ndarray:
+def _log_covariance(data: _TrackingData, fit: _EqualisationFit) -> np.ndarray:
     """Return the covariance of the logarithms, scaled up to the jackknife's variances.
 
     The first estimate assumes a stationary whitened remnant and a known instrument. The jackknife
     leaves out each part of the record in turn and estimates instrument and parameters again, since
     the remnant varies with the error and is also in the instrument.
     """
-    arguments = data, fit.kind, fit.logs, fit.sign, fit.white
-    z, d, rest = _equations(*arguments, data.from_target)
+    arguments = data, fit.kind, fit.log_parameters, fit.sign, fit.whitening_filter
+    z, d, rest = _instrument_equations(*arguments, data.target_error)
     scale = np.linalg.norm(z, axis=0) + 1e-300
     inverse = np.linalg.pinv((z / scale).T @ (d / scale))
     equal = float(rest @ rest) / (len(rest) - z.shape[1])
@@ -440,70 +445,70 @@ def _covariance(data: _Data, fit: _Fit) -> np.ndarray:
     for part in np.array_split(np.arange(len(rest)), _JACKKNIFE):
         kept = np.ones(len(data.hand), bool)
         kept[gone + part] = False
-        anew = _instrument(data.target, data.error, data.step, kept)
-        z = _equations(*arguments, anew)[0]
-        moves.append(_solution(z[kept[gone:]], d[kept[gone:]], rest[kept[gone:]]))
+        anew = _estimate_instrument(data.target, data.error, data.step, kept)
+        z = _instrument_equations(*arguments, anew)[0]
+        moves.append(_solve_equations(z[kept[gone:]], d[kept[gone:]], rest[kept[gone:]]))
     apart = (_JACKKNIFE - 1) * np.var(moves, axis=0)
     larger = np.sqrt(np.maximum(1.0, apart / np.maximum(np.diag(equal), 1e-300)))
-    many = len(fit.logs)
+    many = len(fit.log_parameters)
     return (equal * np.outer(larger, larger))[:many, :many]
 
 
-def _slope_of(
-    data: _Data, kind: str, logs: np.ndarray, k: int, values: np.ndarray
+def _filtered_derivative(
+    data: _TrackingData, kind: str, logs: np.ndarray, k: int, values: np.ndarray
 ) -> np.ndarray:  # fmt: skip
-    return _filter(values, data.step, lambda s: _slopes(kind, logs, s)[k])
+    return _filter(values, data.step, lambda s: _response_derivatives(kind, logs, s)[k])
 
 
-def _finished(
-    fit: _Fit, data: _Data, signals: Mapping[str, np.ndarray], record: TrackingRecord,
+def _build_operator_fit(
+    fit: _EqualisationFit, data: _TrackingData, signals: Mapping[str, np.ndarray], record: TrackingRecord,
     notes: list[str],
 ) -> OperatorFit:  # fmt: skip
     """Build the fit: estimates with intervals, remnant, crossover and margins."""
     errors = np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
-    estimates: dict[str, Estimate] = {}
-    for name, log, error in zip(fit.names, fit.logs, errors, strict=True):
+    estimates: dict[str, ParameterEstimate] = {}
+    for name, log, error in zip(fit.names, fit.log_parameters, errors, strict=True):
         at_bound = min(abs(log - math.log(b)) for b in _BOUNDS[name]) < 1e-3
-        error = error if fit.settled else math.inf
-        estimates[name] = _estimate(log, error, _UNITS.get(name, "hand per error"), not at_bound)
-        if at_bound or error > _CERTAIN:
+        error = error if fit.has_converged else math.inf
+        estimates[name] = _make_estimate(log, error, _UNITS.get(name, "hand per error"), not at_bound)
+        if at_bound or error > _MAX_LOG_ERROR:
             notes.append(f"{name} is not identifiable from this record")
-    estimates["remnant"] = _remnant(fit, data)
+    estimates["remnant"] = _estimate_remnant(fit, data)
     if fit.sign < 0.0:
         notes.append("the sign of the hand is reversed: a positive error moves it backwards")
-    first = round(_SETTLES / data.step)
+    first = round(_SETTLING_TIME / data.step)
     hand = fit.sign * data.hand[first:]
-    rest = hand - _predicted(data, fit.kind, fit.logs, data.from_target)[first:]
+    rest = hand - _predict_hand(data, fit.kind, fit.log_parameters, data.target_error)[first:]
     explained = 1.0 - float(np.var(rest) / np.var(hand))
     if explained < 0.3:
         notes.append(f"the target explains only {100 * explained:.0f} % of the hand's motion")
     w = np.geomspace(0.1, 30.0, 600)
-    element = _close(fit, data, signals, w, estimates, notes) if fit.settled else ""
+    element = _estimate_crossover(fit, data, signals, w, estimates, notes) if fit.has_converged else ""
     return OperatorFit(
         fit.kind, estimates, element, explained, 1.0 / data.step,
         float(record.time[-1] - record.time[0]), tuple(dict.fromkeys(notes)), w,
-        _response(fit.kind, fit.logs, 1j * w),
+        _operator_response(fit.kind, fit.log_parameters, 1j * w),
     )  # fmt: skip
 
 
-def _estimate(log: float, error: float, unit: str, inside: bool = True) -> Estimate:
-    reach = min(_QUANTILE * error, 20.0)
+def _make_estimate(log: float, error: float, unit: str, inside: bool = True) -> ParameterEstimate:
+    reach = min(_STUDENT_QUANTILE * error, 20.0)
     low, high = math.exp(log - reach), math.exp(log + reach)
-    return Estimate(math.exp(log), low, high, unit, bool(inside and error <= _CERTAIN))
+    return ParameterEstimate(math.exp(log), low, high, unit, bool(inside and error <= _MAX_LOG_ERROR))
 
 
-def _remnant(fit: _Fit, data: _Data) -> Estimate:
+def _estimate_remnant(fit: _EqualisationFit, data: _TrackingData) -> ParameterEstimate:
     """Return the power density of the observation noise over pi times the observed variance."""
     from scipy.signal import welch
 
     length = min(len(fit.noise), round(15.0 / data.step))
     f, density = welch(fit.noise, 1.0 / data.step, nperseg=length, detrend="linear")
     w = 2.0 * np.pi * f
-    p = dict(zip(fit.names, np.exp(fit.logs), strict=True))
+    p = dict(zip(fit.names, np.exp(fit.log_parameters), strict=True))
     band = (w >= 1.0) & (w <= min(8.0, 0.8 * p["neuromuscular_frequency"]))
     s = 1j * w[band]
-    bare = np.abs(_response(fit.kind, fit.logs, s)) * np.abs(_highpass(s))
-    first = round(_SETTLES / data.step)
+    bare = np.abs(_operator_response(fit.kind, fit.log_parameters, s)) * np.abs(_highpass_response(s))
+    first = round(_SETTLING_TIME / data.step)
     seen = data.error[first:]
     power = np.full(len(s), float(np.var(seen)))
     if fit.kind == "lead":  # error and rate are both observed
@@ -512,32 +517,32 @@ def _remnant(fit: _Fit, data: _Data) -> Estimate:
         power = (power + lead**2 * rate) / (1.0 + (lead * w[band]) ** 2)
     share = density[band] / 2.0 / bare**2 / (np.pi * power)  # two-sided
     count = max(1.0, 1.8 * len(fit.noise) / length * band.sum() * 0.6)
-    whole = _response(fit.kind, fit.logs, s)  # only the product of gain and lead time counts
-    slopes = np.array([np.real(k / whole).mean() for k in _slopes(fit.kind, fit.logs, s)])
+    whole = _operator_response(fit.kind, fit.log_parameters, s)  # only the product of gain and lead time counts
+    slopes = np.array([np.real(k / whole).mean() for k in _response_derivatives(fit.kind, fit.log_parameters, s)])
     doubt = float(slopes @ fit.covariance @ slopes)
     error = math.sqrt(1.5 / count + 4.0 * max(0.0, doubt))
-    return _estimate(math.log(float(share.mean())), error if fit.settled else math.inf, "1")
+    return _make_estimate(math.log(float(share.mean())), error if fit.has_converged else math.inf, "1")
 
 
-def _close(
-    fit: _Fit, data: _Data, signals: Mapping[str, np.ndarray], w: np.ndarray,
-    estimates: dict[str, Estimate], notes: list[str],
+def _estimate_crossover(
+    fit: _EqualisationFit, data: _TrackingData, signals: Mapping[str, np.ndarray], w: np.ndarray,
+    estimates: dict[str, ParameterEstimate], notes: list[str],
 ) -> str:  # fmt: skip
     """Identify the controlled element; add crossover and margins with intervals to `estimates`."""
-    first, hand = round(_SETTLES / data.step), signals["hand"]
+    first, hand = round(_SETTLING_TIME / data.step), signals["hand"]
     best = (math.inf, 0, 1.0, 0.0)
 
-    def apart(s: np.ndarray) -> np.ndarray:
+    def output_filter(s: np.ndarray) -> np.ndarray:
         return (s / (s + 1.0)) ** 2
 
-    output = _filter(signals["response"], data.step, apart)[first:]
+    output = _filter(signals["response"], data.step, output_filter)[first:]
     for form in range(len(FORMS)):
         for late in np.arange(0.0, 0.61, 0.02):
 
-            def made(s: np.ndarray, form=form, late=late) -> np.ndarray:
+            def element_response(s: np.ndarray, form=form, late=late) -> np.ndarray:
                 return s ** (2 - form) / (s + 1.0) ** 2 * np.exp(-late * s)
 
-            effect = _filter(hand, data.step, made)[first:]
+            effect = _filter(hand, data.step, element_response)[first:]
             gain = float(effect @ output / max(effect @ effect, 1e-300))
             rest = float(np.sum((output - gain * effect) ** 2) / np.sum(output**2))
             best = min(best, (rest, form, gain, float(late)))
@@ -546,25 +551,25 @@ def _close(
         notes.append("the controlled element is not K, K/s or K/s^2: no crossover is estimated")
         return ""
     rng = np.random.default_rng(1967)
-    draws = rng.multivariate_normal(fit.logs, fit.covariance, _DRAWS, check_valid="ignore")
+    draws = rng.multivariate_normal(fit.log_parameters, fit.covariance, _SAMPLE_COUNT, check_valid="ignore")
     low, high = (np.log([_BOUNDS[n][side] for n in fit.names]) for side in (0, 1))
     draws = np.clip(draws, low, high)
     s = 1j * w
     element = abs(gain) * np.exp(-late * s) / s**form
-    found = [_margins(w, _response(fit.kind, x, s) * element, form) for x in (fit.logs, *draws)]
+    found = [_loop_margins(w, _operator_response(fit.kind, x, s) * element, form) for x in (fit.log_parameters, *draws)]
     for k, name in enumerate(("crossover", "phase_margin", "gain_margin")):
         values = np.array([one[k] for one in found[1:]])
         values = values[np.isfinite(values)]
-        if not math.isfinite(found[0][k]) or len(values) < _DRAWS // 2:
+        if not math.isfinite(found[0][k]) or len(values) < _SAMPLE_COUNT // 2:
             continue
         low, high = np.percentile(values, [2.5, 97.5])
         low, high = min(low, found[0][k]), max(high, found[0][k])
-        known = bool(low > 0.0 and high / low < math.exp(2.0 * _QUANTILE * _CERTAIN))
-        estimates[name] = Estimate(found[0][k], float(low), float(high), _UNITS[name], known)
+        known = bool(low > 0.0 and high / low < math.exp(2.0 * _STUDENT_QUANTILE * _MAX_LOG_ERROR))
+        estimates[name] = ParameterEstimate(found[0][k], float(low), float(high), _UNITS[name], known)
     return FORMS[form]
 
 
-def _margins(w: np.ndarray, loop: np.ndarray, form: int) -> tuple[float, float, float]:
+def _loop_margins(w: np.ndarray, loop: np.ndarray, form: int) -> tuple[float, float, float]:
     """Return crossover frequency, phase margin, and gain where the phase is -180 degrees."""
     size, phase = np.log(np.abs(loop)), np.unwrap(np.angle(loop))
     phase -= 2.0 * math.pi * round((phase[0] + math.pi * (1.0 if form == 2 else 0.5)) / math.tau)
@@ -580,7 +585,7 @@ def _margins(w: np.ndarray, loop: np.ndarray, form: int) -> tuple[float, float, 
     return crossover, margin, beyond
 
 
-def operator_file_of(fit: OperatorFit, name: str, source: str) -> str:
+def format_operator_file(fit: OperatorFit, name: str, source: str) -> str:
     """Convert a fit to an operator file, for `perception: {file: ...}` of a scenario.
 
     The file contains only the identifiable parameters; the others come from the default file.

@@ -30,64 +30,64 @@ from hydrotele.core.units import to_si
 from hydrotele.logs.log import read_table
 from hydrotele.machine.joystick import AXES, Joystick
 from hydrotele.scenario.teleoperation import (
-    Follow,
-    Live,
-    Recorded,
-    Regulate,
-    Steer,
+    FollowPath,
+    LiveOperator,
+    RecordedMotion,
+    RegulateForce,
+    SteerToPoses,
     TeleopPilot,
-    Track,
+    TrackForce,
 )
 from hydrotele.teleop.axis_table import (
     COORDINATE,
     DEADBAND,
-    DROP,
-    LEAST,
-    LIMIT,
-    NOMINAL,
-    OUTSIDE,
-    RATIO,
-    REACH,
+    DETENT_DROP,
+    DETENT_STIFFNESS,
+    FORCE_LIMIT,
+    HANDLE_RANGE,
+    MIN_STIFFNESS,
+    NOMINAL_STIFFNESS,
+    REFLECTION_RATIO,
     SIGN,
-    SLOPE,
-    flattened,
-    split,
+    STIFFNESS_PER_FORCE,
+    flatten_state,
+    split_array,
 )
 from hydrotele.teleop.manual_control import (
-    BELIEVED_GAIN,
+    ESTIMATED_GAIN,
     GAIN,
     INTEGRATOR,
-    NOTICED,
-    Loop,
-    look_and_act,
+    NOTICED_ERROR,
+    VisualLoop,
+    decide_hand_reference,
+    make_visual_loop,
     neuromuscular_matrix,
-    visual_loop,
 )
-from hydrotele.teleop.master import Master
-from hydrotele.teleop.operator_parameters import Operator, perceiving
+from hydrotele.teleop.master import MasterParameters
+from hydrotele.teleop.operator_parameters import Operator, scenario_operator
 
 
-class Feeling(NamedTuple):
+class PerceptionErrors(NamedTuple):
     """Perception errors of a hand in n decisions.
 
     Attributes:
         force: (n,) factor on the perceived force.
         displacement: (n,) factor on the perceived displacement.
         stiffness: (n,) factor due to the combination of both.
-        share: relative standard deviation of a perceived stiffness, known to the operator [1].
+        stiffness_deviation: relative standard deviation of a perceived stiffness, known to the operator [1].
     """
 
     force: np.ndarray
     displacement: np.ndarray
     stiffness: np.ndarray
-    share: float
+    stiffness_deviation: float
 
 
-def feeling(him: Operator, rng: np.random.Generator, count: int, step: float) -> Feeling:
+def draw_perception_errors(operator: Operator, rng: np.random.Generator, count: int, step: float) -> PerceptionErrors:
     """Draw the perception errors of a run, one set per exploration.
 
     Args:
-        him: operator with Weber fractions; an exploration lasts `dwell`.
+        operator: operator with Weber fractions; an exploration lasts `dwell`.
         rng: random generator of the errors.
         count: number of decisions.
         step: time between two decisions [s].
@@ -95,15 +95,15 @@ def feeling(him: Operator, rng: np.random.Generator, count: int, step: float) ->
     Returns:
         The errors.
     """
-    exploration = (step * np.arange(count) / him.dwell).astype(int)
+    exploration = (step * np.arange(count) / operator.dwell).astype(int)
     drawn = rng.standard_normal((exploration[-1] + 1, 3))[exploration]
-    weber = np.array([him.force_weber, him.position_weber, him.integration_weber])
+    weber = np.array([operator.force_weber, operator.position_weber, operator.integration_weber])
     errors = np.exp(weber * drawn)
-    return Feeling(*errors.T, share=math.hypot(*weber))
+    return PerceptionErrors(*errors.T, stiffness_deviation=math.hypot(*weber))
 
 
-def felt_stiffness(
-    force: float, displacement: float, errors: Feeling, number: int
+def perceive_stiffness(
+    force: float, displacement: float, errors: PerceptionErrors, decision: int
 ) -> float:  # fmt: skip
     """Return the stiffness of a spring as perceived by a hand.
 
@@ -111,32 +111,35 @@ def felt_stiffness(
         force: force on the hand [N].
         displacement: displacement of the hand [m], not 0.
         errors: perception errors.
-        number: number of the decision.
+        decision: number of the decision.
 
     Returns:
         The perceived stiffness [N/m].
     """
-    felt = force * errors.force[number] / (displacement * errors.displacement[number])
-    return float(felt * errors.stiffness[number])
+    felt = force * errors.force[decision] / (displacement * errors.displacement[decision])
+    return float(felt * errors.stiffness[decision])
 
 
-_THROUGH = 1.15  # factor on the force at a notch's edge, to overcome it
-_FINE, _FINE_TURN = 4e-4, 4e-3  # m, rad: limit on the position error that is integrated
+_NOTCH_FORCE_FACTOR = 1.15  # factor on the force at a notch's edge, to overcome it
+_MAX_POSITION_GAP, _MAX_ROTATION_GAP = (
+    4e-4,
+    4e-3,
+)  # m, rad: limit on the position error that is integrated
 
 
-class Muscles(NamedTuple):
+class NeuromuscularState(NamedTuple):
     """Parameters and state of the neuromuscular dynamics.
 
     Attributes:
-        wanted: (6,) reference displacement of the handle [m], [rad].
+        reference: (6,) reference displacement of the handle [m], [rad].
         spring: (6,) expected stiffness of the joystick [N/m], [N m/rad].
-        notch: (3, 6) detents: edge [m], [rad], force drop [N], [N m], stiffness outside [N/m], < 0
+        detent: (3, 6) detents: edge [m], [rad], force drop [N], [N m], stiffness outside [N/m], < 0
             without a detent.
         correction: (6,) learnt additional force [N], [N m].
         force: (6,) force on the handle [N], [N m].
         arm: (6,) stiffness of arm and hand [N/m], [N m/rad].
         cross: (1,) stiffness between x and y [N/m].
-        most: (6,) maximum force [N], [N m].
+        max_force: (6,) maximum force [N], [N m].
         weight: (6,) weight of the hand, which the muscles carry [N], [N m].
         gain: (1,) integral gain of the correction [1/s].
         rest: (6,) rest position of the arm after the neuromuscular lag [m], [rad].
@@ -144,14 +147,14 @@ class Muscles(NamedTuple):
         lag: (6,) discrete lag of `neuromuscular_matrix`, for one control period.
     """
 
-    wanted: np.ndarray
+    reference: np.ndarray
     spring: np.ndarray
-    notch: np.ndarray
+    detent: np.ndarray
     correction: np.ndarray
     force: np.ndarray
     arm: np.ndarray
     cross: np.ndarray
-    most: np.ndarray
+    max_force: np.ndarray
     weight: np.ndarray
     gain: np.ndarray
     rest: np.ndarray
@@ -160,7 +163,7 @@ class Muscles(NamedTuple):
 
 
 @compiled
-def unpack_muscles(flat):
+def unpack_neuromuscular_state(flat):
     """Return the parts of `flat_view(Muscles)`.
 
     Args:
@@ -171,31 +174,31 @@ def unpack_muscles(flat):
 
     Source: order and shapes of Muscles.
     """
-    wanted, rest = split(flat, 6)
-    spring, rest = split(rest, 6)
-    notch, rest = split(rest, 18)
-    correction, rest = split(rest, 6)
-    force, rest = split(rest, 6)
-    arm, rest = split(rest, 6)
-    cross, rest = split(rest, 1)
-    most, rest = split(rest, 6)
-    weight, rest = split(rest, 6)
-    gain, rest = split(rest, 1)
-    place, rest = split(rest, 6)
-    rate, lag = split(rest, 6)
-    return Muscles(
+    wanted, rest = split_array(flat, 6)
+    spring, rest = split_array(rest, 6)
+    notch, rest = split_array(rest, 18)
+    correction, rest = split_array(rest, 6)
+    force, rest = split_array(rest, 6)
+    arm, rest = split_array(rest, 6)
+    cross, rest = split_array(rest, 1)
+    most, rest = split_array(rest, 6)
+    weight, rest = split_array(rest, 6)
+    gain, rest = split_array(rest, 1)
+    place, rest = split_array(rest, 6)
+    rate, lag = split_array(rest, 6)
+    return NeuromuscularState(
         wanted, spring, notch.reshape(3, 6), correction, force, arm, cross, most, weight, gain,
         place, rate, lag,
     )  # fmt: skip
 
 
 @compiled
-def pull(muscles, past, tremor, handle, tick, period):
+def compute_muscle_forces(muscles, history, tremor, handle, tick, period):
     """Compute the muscle forces of one period from the reference displacement.
 
     Args:
         muscles: Muscles; `correction`, `force`, `rest` and `rate` are written.
-        past: (reflex + 1, 6) ring buffer of displacements, written [m], [rad].
+        history: (reflex + 1, 6) ring buffer of displacements, written [m], [rad].
         tremor: (n, 6) tremor forces [N], [N m].
         handle: (6,) present displacement [m], [rad].
         tick: number of the period, scalar.
@@ -207,28 +210,28 @@ def pull(muscles, past, tremor, handle, tick, period):
     Source: equilibrium-point control with a delayed integral; Feldman 1986. The rest position
         follows the reference through the neuromuscular lag; McRuer and Jex 1967.
     """
-    rows, lag = len(past), muscles.lag
+    rows, lag = len(history), muscles.lag
     noise = tick % len(tremor)
     for i in range(6):
         place, rate = muscles.rest[i], muscles.rate[i]
         muscles.rest[i] = lag[0] * place + lag[1] * rate + lag[2] * muscles.wanted[i]
         muscles.rate[i] = lag[3] * place + lag[4] * rate + lag[5] * muscles.wanted[i]
     for i in range(6):
-        past[tick % rows, i] = handle[i]
-        late = past[(tick + 1) % rows, i]
+        history[tick % rows, i] = handle[i]
+        late = history[(tick + 1) % rows, i]
         spring, most, wanted = muscles.spring[i], muscles.most[i], muscles.rest[i]
         firm = muscles.arm[i] + spring
         known = firm * wanted
-        beyond = abs(wanted) - muscles.notch[0, i]
-        if muscles.notch[2, i] >= 0.0 and beyond > 0.0:
-            firm = muscles.arm[i] + muscles.notch[2, i]
-            back = spring * muscles.notch[0, i] - muscles.notch[1, i] + muscles.notch[2, i] * beyond
-            if (late if wanted > 0.0 else -late) < muscles.notch[0, i]:
-                back = _THROUGH * spring * muscles.notch[0, i]  # force to overcome the notch's edge
+        beyond = abs(wanted) - muscles.detent[0, i]
+        if muscles.detent[2, i] >= 0.0 and beyond > 0.0:
+            firm = muscles.arm[i] + muscles.detent[2, i]
+            back = spring * muscles.detent[0, i] - muscles.detent[1, i] + muscles.detent[2, i] * beyond
+            if (late if wanted > 0.0 else -late) < muscles.detent[0, i]:
+                back = _NOTCH_FORCE_FACTOR * spring * muscles.detent[0, i]  # force to overcome the notch's edge
             known = muscles.arm[i] * wanted + (back if wanted > 0.0 else -back)
         if i < 2:
             known += muscles.cross[0] * muscles.rest[1 - i]
-        fine = _FINE if i < 3 else _FINE_TURN
+        fine = _MAX_POSITION_GAP if i < 3 else _MAX_ROTATION_GAP
         gap = min(fine, max(-fine, wanted - late))
         more = muscles.gain[0] * period * firm * gap
         muscles.correction[i] = min(most, max(-most, muscles.correction[i] + more))
@@ -236,29 +239,29 @@ def pull(muscles, past, tremor, handle, tick, period):
         muscles.force[i] = min(most, max(-most, force)) + muscles.weight[i]
 
 
-DECISIONS = 50.0  # Hz
-REFLEX = 0.05  # s, delay from hand position to muscle force: stretch reflex and cortex
-_HOLD = 0.8  # rest position of a hand that only feels, as a fraction of the dead band
-_CLOSE = 0.05  # force error that is not corrected, relative to the target
-_LEAST_CLOSE = 0.2  # lower limit of that error, relative to its value at the largest target
-_NOTICED = 0.2  # N: noticeable force on the hand, above its tremor and the spring's variation
-_PUSH = 0.3  # s, duration of a correcting push
-_CORRECTED = 0.45  # fraction of an error that one push corrects
-_LEAST_WAY = 3e-4  # m: minimum displacement from which a stiffness can be felt
-_LEANING = 0.3  # s, time constant with which a hand builds up a force
+DECISION_RATE = 50.0  # Hz
+REFLEX_DELAY = 0.05  # s, delay from hand position to muscle force: stretch reflex and cortex
+_REST_RATIO = 0.8  # rest position of a hand that only feels, as a fraction of the dead band
+_FORCE_TOLERANCE_RATIO = 0.05  # force error that is not corrected, relative to the target
+_MIN_TOLERANCE_RATIO = 0.2  # lower limit of that error, relative to its value at the largest target
+_MIN_NOTICED_FORCE = 0.2  # N: noticeable force on the hand, above its tremor and the spring's variation
+_PUSH_DURATION = 0.3  # s, duration of a correcting push
+_PUSH_CORRECTION_RATIO = 0.45  # fraction of an error that one push corrects
+_MIN_FELT_DISPLACEMENT = 3e-4  # m: minimum displacement from which a stiffness can be felt
+_FORCE_BUILDUP_TIME = 0.3  # s, time constant with which a hand builds up a force
 _TREMOR_BAND = 2.0 * math.pi * 8.0  # rad/s of a physiological tremor
-_SLOW = 2.0 * math.pi * 0.5  # rad/s, bandwidth of slow judgement errors
+_JUDGEMENT_BANDWIDTH = 2.0 * math.pi * 0.5  # rad/s, bandwidth of slow judgement errors
 _LEVERS = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])  # m: converts hand forces to torques
-_ROUND = 2**14  # number of tremor periods before they repeat
-_LOOKING = 0.67  # factor on the time between pushes by feel: a display is read faster
-_FURTHEST = 20.0  # limit of the learnt effect of a push over the expected effect
+_TREMOR_PERIODS = 2**14  # number of tremor periods before they repeat
+_DISPLAY_PAUSE_FACTOR = 0.67  # factor on the time between pushes by feel: a display is read faster
+_MAX_PUSH_GAIN_RATIO = 20.0  # limit of the learnt effect of a push over the expected effect
 
 
-Hand = Callable[[], np.ndarray]
+HandInput = Callable[[], np.ndarray]
 """Function that returns the handle reference of a live operator, (6,) [m], [rad]."""
 
 
-class Perceived(Protocol):
+class Observations(Protocol):
     """Observable quantities by tick (`StationLog`)."""
 
     touching: np.ndarray
@@ -279,25 +282,26 @@ class OperatorModel:
     Attributes:
         muscles: reference displacement and arm.
         tremor: (n, 6) tremor forces [N], [N m].
-        past: (reflex + 1, 6) recent displacements of the handle [m], [rad].
-        every: control ticks per decision.
-        believed: (decisions,) contact force that the operator estimates [N]; NaN if it is not
+        displacement_history: (reflex + 1, 6) recent displacements of the handle [m], [rad].
+        ticks_per_decision: control ticks per decision.
+        estimated_force: (decisions,) contact force that the operator estimates [N]; NaN if it is not
             relevant.
         loops: coordinate -> visually closed loop with the learnt element.
     """
 
     def __init__(
-        self, pilot: TeleopPilot, joystick: Joystick, numbers: Master, seen: Perceived, ticks: int,
-        period: float, seed: int, hand: Hand | None = None, folder: str = "",
+        self, pilot: TeleopPilot, joystick: Joystick, master_parameters: MasterParameters, observations: Observations,
+        ticks: int,
+        period: float, seed: int, hand: HandInput | None = None, folder: str = "",
     ) -> None:  # fmt: skip
         """Prepare the operator for a run.
 
         Args:
             pilot: teleoperation settings of the scenario.
             joystick: joystick with the parameters of the operator's hand.
-            numbers: parameters of the master's control. The operator uses the joystick's springs,
+            master_parameters: parameters of the master's control. The operator uses the joystick's springs,
                 dead bands, detents and reflection, not the machine's response.
-            seen: observable quantities, filled tick by tick.
+            observations: observable quantities, filled tick by tick.
             ticks: number of control periods.
             period: control period [s].
             seed: seed of the run.
@@ -307,64 +311,64 @@ class OperatorModel:
         Raises:
             InputError: a live operator without a hand, or an invalid file.
         """
-        if isinstance(pilot.operator, Live) and hand is None:
+        if isinstance(pilot.operator, LiveOperator) and hand is None:
             message = "a live operator needs an input device: use hydrotele drive SCENARIO"
             raise InputError("pilot.operator", message)
         self._live = hand
         self._pilot, self._behaviour = pilot, pilot.operator
-        self.him = him = perceiving(pilot.perception, folder)
-        self._numbers, self._period = numbers, period
-        self.every = max(1, round(1.0 / (DECISIONS * period)))
-        self._step = self.every * period
+        self.parameters = him = scenario_operator(pilot.perception, folder)
+        self._numbers, self._period = master_parameters, period
+        self.ticks_per_decision = max(1, round(1.0 / (DECISION_RATE * period)))
+        self._step = self.ticks_per_decision * period
         rng = np.random.default_rng([seed, 1994])
-        self.muscles = _muscles(pilot, joystick, numbers, him, period)
-        white = rng.standard_normal((_ROUND, 6)) * _LEVERS
-        self.tremor = him.tremor * _coloured(white, _TREMOR_BAND, period)
-        self.past = np.zeros((1 + max(1, round(REFLEX / period)), 6))
-        count = ticks // self.every + 1
-        self._feeling = feeling(him, rng, count, self._step)
-        sight = _coloured(rng.standard_normal(count), 4.0 * _SLOW, self._step)
+        self.muscles = _make_arm_at_rest(pilot, joystick, master_parameters, him, period)
+        white = rng.standard_normal((_TREMOR_PERIODS, 6)) * _LEVERS
+        self.tremor = him.tremor * _colour_noise(white, _TREMOR_BAND, period)
+        self.displacement_history = np.zeros((1 + max(1, round(REFLEX_DELAY / period)), 6))
+        count = ticks // self.ticks_per_decision + 1
+        self._feeling = draw_perception_errors(him, rng, count, self._step)
+        sight = _colour_noise(rng.standard_normal(count), 4.0 * _JUDGEMENT_BANDWIDTH, self._step)
         self._sight = him.sight_noise * sight
         self._imagined_gain = math.exp(him.imagination * rng.standard_normal())
         self._look = max(1, round(him.visual_delay / period))
         self._touch = max(1, round(him.touch / period))
-        self._reflex = max(1, round(REFLEX / period))
-        self.believed = np.full(count, np.nan)
+        self._reflex = max(1, round(REFLEX_DELAY / period))
+        self.estimated_force = np.full(count, np.nan)
         self._imagined, self._belief = 0.0, None
         self._met = 0.0
-        self._handle, self._hand = seen.master("handle"), seen.master("hand")
-        self._pose, self._touching = seen.slave("measured"), seen.touching
-        self._seen = seen
-        self.loops: dict[int, Loop] = {}
-        if isinstance(pilot.operator, Regulate | Track):
+        self._handle, self._hand = observations.master("handle"), observations.master("hand")
+        self._pose, self._touching = observations.slave("measured"), observations.touching
+        self._seen = observations
+        self.loops: dict[int, VisualLoop] = {}
+        if isinstance(pilot.operator, RegulateForce | TrackForce):
             time = self._step * np.arange(count)
-            self._target = _prepared(pilot.operator, pilot, numbers, time, self._sight, him)
-            self._look_at(COORDINATES.index(pilot.operator.target.coordinate), rng, count)
-            self._met = self._target.row[NOMINAL]
+            self._target = _prepare_force_target(pilot.operator, pilot, master_parameters, time, self._sight, him)
+            self._prepare_visual_loop(COORDINATES.index(pilot.operator.target.coordinate), rng, count)
+            self._met = self._target.axis_parameters[NOMINAL_STIFFNESS]
         self._pushing, self._until, self._errors = True, 0.0, []
-        if isinstance(pilot.operator, Follow):
-            self._path = _followed(pilot.operator, count, self._step)
-        if isinstance(pilot.operator, Recorded):
+        if isinstance(pilot.operator, FollowPath):
+            self._path = _sample_hand_path(pilot.operator, count, self._step)
+        if isinstance(pilot.operator, RecordedMotion):
             path = Path(folder, pilot.operator.recorded)
-            self._path = recorded_hand(path, self._step * np.arange(count))
-        if isinstance(pilot.operator, Steer):
-            self._goals = _steered(pilot.operator, count, self._step)
+            self._path = read_recorded_hand(path, self._step * np.arange(count))
+        if isinstance(pilot.operator, SteerToPoses):
+            self._goals = _sample_tip_targets(pilot.operator, count, self._step)
             for c in self._goals:
-                self._look_at(c, rng, count)
+                self._prepare_visual_loop(c, rng, count)
 
-    def _look_at(self, c: int, rng: np.random.Generator, count: int) -> None:
+    def _prepare_visual_loop(self, c: int, rng: np.random.Generator, count: int) -> None:
         """Prepare the visual control of a coordinate."""
-        axis = _axis_of(self._numbers, c)
-        row, rate, him = self._numbers.axis[axis], self._pilot.mode == "rate", self.him
+        axis = _find_joystick_axis(self._numbers, c)
+        row, rate, him = self._numbers.axis[axis], self._pilot.mode == "rate", self.parameters
         turns = COORDINATES[c] not in ("r", "z")
-        way = row[REACH] - row[DEADBAND]
+        way = row[HANDLE_RANGE] - row[DEADBAND]
         expected = him.usual_speed * (0.5 if turns else 1.0) / way
         if not rate:
-            way = row[REACH]
+            way = row[HANDLE_RANGE]
             expected = him.usual_scale * (1.0 if not turns else 0.2 if axis < 3 else 0.1)
-        self.loops[c] = visual_loop(
+        self.loops[c] = make_visual_loop(
             him, self._step, expected, rng, form=INTEGRATOR if rate else GAIN,
-            margin=him.placing_margin, threshold=him.sight, most=(0.95 if rate else 1.0) * way,
+            margin=him.placing_margin, threshold=him.sight, max_output=(0.95 if rate else 1.0) * way,
             steps=count,
         )  # fmt: skip
 
@@ -374,292 +378,317 @@ class OperatorModel:
         Args:
             tick: number of the control tick, a multiple of `every`.
         """
-        if isinstance(self._behaviour, Follow | Recorded):
-            self.muscles.wanted[:] = self._path[tick // self.every]
+        if isinstance(self._behaviour, FollowPath | RecordedMotion):
+            self.muscles.reference[:] = self._path[tick // self.ticks_per_decision]
         if self._live:
-            self.muscles.wanted[:] = self._live()
+            self.muscles.reference[:] = self._live()
         if tick == 0:
             return  # nothing has been observed yet
         match self._behaviour:
-            case Regulate() | Track() as pressing:
-                self._press(tick, pressing.approach)
-            case Steer():
-                self._steer(tick)
+            case RegulateForce() | TrackForce() as pressing:
+                self._control_force(tick, pressing.approach)
+            case SteerToPoses():
+                self._steer_tip(tick)
 
-    def _press(self, tick: int, approach: float) -> None:
+    def _control_force(self, tick: int, approach: float) -> None:
         """Control a contact force to its target by display, by feel or by imagination."""
-        press, number = self._target, tick // self.every
-        axis, row, wanted = press.axis, press.row, self.muscles.wanted
-        goal = press.goal[number]
+        press, number = self._target, tick // self.ticks_per_decision
+        axis, row, wanted = press.axis, press.axis_parameters, self.muscles.reference
+        goal = press.reference[number]
         felt, looked = max(0, tick - self._touch), max(0, tick - self._look)
         touching = bool(self._touching[looked])
         if not touching:
             c = int(row[COORDINATE])
             seen = float(self._pose[tick - 1, 0, c])
-            look_and_act(self.loops[c], number - 1, seen, seen, self._acting(axis, tick - 1))
-        judged = self._judge(tick, axis, press.way, felt, looked, touching)
+            decide_hand_reference(self.loops[c], number - 1, seen, seen, self._effective_displacement(axis, tick - 1))
+        judged = self._judge_force(tick, axis, press.push_direction, felt, looked, touching)
         belief = judged if self._belief is None else self._belief.force
-        self.believed[number] = press.side * belief
-        if not touching and judged < press.noticed:
+        self.estimated_force[number] = press.force_sign * belief
+        if not touching and judged < press.contact_threshold:
             self._belief = None
-            reach = row[DEADBAND] + approach * (row[REACH] - row[DEADBAND])
-            wanted[axis] = press.way * reach
-        elif self._pilot.reflection == "direct_force" and not press.shown:
-            self._lean(axis, press.way, row, abs(goal), max(0, tick - self._reflex))
+            reach = row[DEADBAND] + approach * (row[HANDLE_RANGE] - row[DEADBAND])
+            wanted[axis] = press.push_direction * reach
+        elif self._pilot.reflection == "direct_force" and not press.is_force_displayed:
+            self._apply_force(axis, press.push_direction, row, abs(goal), max(0, tick - self._reflex))
         else:
-            self._pulse_or_feel(tick, axis, press.way, press.side * goal, judged)
+            self._correct_by_pushes(tick, axis, press.push_direction, press.force_sign * goal, judged)
 
-    def _pulse_or_feel(
+    def _correct_by_pushes(
         self, tick: int, axis: int, way: float, goal: float, judged: float
     ) -> None:  # fmt: skip
         """Rest inside the dead band where contact is felt; correct by short pushes beyond it."""
-        row, now, wanted = self._target.row, tick * self._period, self.muscles.wanted
+        row, now, wanted = self._target.axis_parameters, tick * self._period, self.muscles.reference
         if self._belief is None:
-            push = self.loops[int(row[COORDINATE])].state[BELIEVED_GAIN] * self.him.task_stiffness
-            self._belief = _Belief(judged, math.inf, push, (self.him.surprise * push) ** 2)
+            push = self.loops[int(row[COORDINATE])].state[ESTIMATED_GAIN] * self.parameters.task_stiffness
+            self._belief = _ForceEstimate(judged, math.inf, push, (self.parameters.surprise * push) ** 2)
         self._errors.append(judged)
-        pause = self.him.dwell * (_LOOKING if self._target.shown else 1.0)
+        pause = self.parameters.dwell * (_DISPLAY_PAUSE_FACTOR if self._target.is_force_displayed else 1.0)
         if now >= self._until:
             late = self._errors[len(self._errors) // 2 :]
             self._errors.clear()
             if self._pushing:
                 self._pushing, self._until = False, now + pause
-                rest = 0.0 if self._target.shown else _HOLD * row[DEADBAND]
+                rest = 0.0 if self._target.is_force_displayed else _REST_RATIO * row[DEADBAND]
                 wanted[axis] = way * rest
             else:
-                felt = self._pilot.reflection != "none" or self._target.shown
+                felt = self._pilot.reflection != "none" or self._target.is_force_displayed
                 mean = sum(late) / len(late)
-                self._belief.judge(mean, self._doubt(row, mean) if felt else 0.0)
+                self._belief.update(mean, self._force_variance(row, mean) if felt else 0.0)
                 error = goal - self._belief.force
-                close = max(_CLOSE * abs(goal), _LEAST_CLOSE * self._target.close)
+                close = max(
+                    _FORCE_TOLERANCE_RATIO * abs(goal),
+                    _MIN_TOLERANCE_RATIO * self._target.tolerance,
+                )
                 if abs(error) < close:
                     self._until = now + 0.5 * pause
                 else:
-                    speed = _CORRECTED * error / (self._belief.push * _PUSH)
-                    most = 0.5 * (row[REACH] - row[DEADBAND])
+                    speed = _PUSH_CORRECTION_RATIO * error / (self._belief.push_gain * _PUSH_DURATION)
+                    most = 0.5 * (row[HANDLE_RANGE] - row[DEADBAND])
                     step = min(most, max(-most, speed))
                     wanted[axis] = way * (math.copysign(row[DEADBAND], step) + step)
-                    self._belief.pushed = step * _PUSH if felt else 0.0
-                    self._pushing, self._until = True, now + _PUSH
+                    self._belief.last_push = step * _PUSH_DURATION if felt else 0.0
+                    self._pushing, self._until = True, now + _PUSH_DURATION
         if self._pilot.reflection in ("stiffness", "impedance"):
-            stiff = self._load(axis, way, max(0, tick - self._reflex))
-            self.muscles.spring[axis] = stiff if way * wanted[axis] >= 0.0 else row[LEAST]
+            stiff = self._felt_load_stiffness(axis, way, max(0, tick - self._reflex))
+            self.muscles.spring[axis] = stiff if way * wanted[axis] >= 0.0 else row[MIN_STIFFNESS]
 
-    def _load(self, axis: int, way: float, felt: int) -> float:
+    def _felt_load_stiffness(self, axis: int, way: float, felt: int) -> float:
         """Return the stiffness that the muscles last worked against [N/m].
 
         It is free of perception errors, since reflexes need no judgement; muscle noise is in the
         tremor.
         """
-        row, x = self._target.row, float(self._handle[felt, axis])
-        if way * x > _LEAST_WAY:
+        row, x = self._target.axis_parameters, float(self._handle[felt, axis])
+        if way * x > _MIN_FELT_DISPLACEMENT:
             force = float(self._hand[felt, axis])
-            most = row[NOMINAL] + row[SLOPE] * row[LIMIT]
-            self._met = min(most, max(row[NOMINAL], force / x))
+            most = row[NOMINAL_STIFFNESS] + row[STIFFNESS_PER_FORCE] * row[FORCE_LIMIT]
+            self._met = min(most, max(row[NOMINAL_STIFFNESS], force / x))
         return self._met
 
-    def _doubt(self, row: list[float], force: float) -> float:
+    def _force_variance(self, row: list[float], force: float) -> float:
         """Return the variance of an estimated contact force as known to the operator [N^2]."""
-        him, largest = self.him, self._target.close / _CLOSE
-        if self._target.shown:
+        him, largest = self.parameters, self._target.tolerance / _FORCE_TOLERANCE_RATIO
+        if self._target.is_force_displayed:
             return (him.sight_noise * largest) ** 2
         if self._pilot.reflection in ("stiffness", "impedance"):
-            return (self._feeling.share * (row[NOMINAL] / row[SLOPE] + force)) ** 2
-        return (him.force_weber * max(force, _LEAST_CLOSE * largest)) ** 2
+            return (
+                self._feeling.stiffness_deviation * (row[NOMINAL_STIFFNESS] / row[STIFFNESS_PER_FORCE] + force)
+            ) ** 2
+        return (him.force_weber * max(force, _MIN_TOLERANCE_RATIO * largest)) ** 2
 
-    def _judge(
+    def _judge_force(
         self, tick: int, axis: int, way: float, felt: int, looked: int, touching: bool
     ) -> float:  # fmt: skip
         """Return the contact force that the operator estimates now, at least 0 [N]."""
-        row, reflection, number = self._target.row, self._pilot.reflection, tick // self.every
-        if self._target.shown:
-            shown = self._target.side * float(self._seen.force[looked, int(row[COORDINATE])])
-            largest = self._target.close / _CLOSE
+        row, reflection, number = (
+            self._target.axis_parameters,
+            self._pilot.reflection,
+            tick // self.ticks_per_decision,
+        )
+        if self._target.is_force_displayed:
+            shown = self._target.force_sign * float(self._seen.force[looked, int(row[COORDINATE])])
+            largest = self._target.tolerance / _FORCE_TOLERANCE_RATIO
             self._imagined = max(0.0, shown + largest * self._sight[number])
             return self._imagined
         if reflection == "none":
-            beyond = way * row[SIGN] * self._acting(axis, felt)
+            beyond = way * row[SIGN] * self._effective_displacement(axis, felt)
             if touching:
-                rate = self.loops[int(row[COORDINATE])].state[BELIEVED_GAIN]
-                change = beyond * rate * self.him.task_stiffness * self._imagined_gain
+                rate = self.loops[int(row[COORDINATE])].state[ESTIMATED_GAIN]
+                change = beyond * rate * self.parameters.task_stiffness * self._imagined_gain
                 self._imagined = max(0.0, self._imagined + self._step * change)
             return self._imagined
         x, force = float(self._handle[felt, axis]), float(self._hand[felt, axis])
         if reflection in ("stiffness", "impedance"):
-            if way * x > _LEAST_WAY:
-                stiffer = max(0.0, felt_stiffness(force, x, self._feeling, number) - row[NOMINAL])
-                self._imagined = min(row[LIMIT], stiffer / row[SLOPE])
+            if way * x > _MIN_FELT_DISPLACEMENT:
+                stiffer = max(
+                    0.0,
+                    perceive_stiffness(force, x, self._feeling, number) - row[NOMINAL_STIFFNESS],
+                )
+                self._imagined = min(row[FORCE_LIMIT], stiffer / row[STIFFNESS_PER_FORCE])
             return self._imagined
         x, force = x * self._feeling.displacement[number], force * self._feeling.force[number]
-        return max(0.0, (way * force - row[NOMINAL] * way * x) / max(row[RATIO], 1e-12))
+        return max(
+            0.0,
+            (way * force - row[NOMINAL_STIFFNESS] * way * x) / max(row[REFLECTION_RATIO], 1e-12),
+        )
 
-    def _lean(self, axis: int, way: float, row: list[float], goal: float, reflex: int) -> None:
+    def _apply_force(self, axis: int, way: float, row: list[float], goal: float, reflex: int) -> None:
         """Push with the expected reaction force of the target, and let the handle move freely."""
-        share = 1.0 - math.exp(-self._step / _LEANING)
-        wish = way * row[RATIO] * goal
+        share = 1.0 - math.exp(-self._step / _FORCE_BUILDUP_TIME)
+        wish = way * row[REFLECTION_RATIO] * goal
         self.muscles.correction[axis] += share * (wish - self.muscles.correction[axis])
         self.muscles.spring[axis] = 0.0
-        self.muscles.wanted[axis] = self._handle[reflex, axis]  # force control
+        self.muscles.reference[axis] = self._handle[reflex, axis]  # force control
 
-    def _acting(self, axis: int, tick: int) -> float:
+    def _effective_displacement(self, axis: int, tick: int) -> float:
         """Return the handle displacement beyond the dead band, along the coordinate."""
         row, x = self._numbers.axis[axis], float(self._handle[tick, axis])
         if self._pilot.mode == "rate":
             x = math.copysign(max(0.0, abs(x) - row[DEADBAND]), x)
         return float(row[SIGN]) * x
 
-    def _steer(self, tick: int) -> None:
+    def _steer_tip(self, tick: int) -> None:
         """Move the tip to its target by visual control."""
-        before, number = tick - 1, tick // self.every
+        before, number = tick - 1, tick // self.ticks_per_decision
         for c, goals in self._goals.items():
-            axis, loop = _axis_of(self._numbers, c), self.loops[c]
-            row, wanted = self._numbers.axis[axis], self.muscles.wanted
-            seen, acting = float(self._pose[before, 0, c]), self._acting(axis, before)
-            step = row[SIGN] * look_and_act(loop, number - 1, goals[number], seen, acting)
+            axis, loop = _find_joystick_axis(self._numbers, c), self.loops[c]
+            row, wanted = self._numbers.axis[axis], self.muscles.reference
+            seen, acting = (
+                float(self._pose[before, 0, c]),
+                self._effective_displacement(axis, before),
+            )
+            step = row[SIGN] * decide_hand_reference(loop, number - 1, goals[number], seen, acting)
             if self._pilot.mode == "position":
                 wanted[axis] = step
                 continue
-            way = row[SIGN] * loop.state[NOTICED]
+            way = row[SIGN] * loop.state[NOTICED_ERROR]
             wanted[axis] = 0.0 if way == 0.0 else math.copysign(row[DEADBAND], way) + step
 
 
 @dataclass
-class _Belief:
+class _ForceEstimate:
     """Operator's estimate of a contact force and of the effect of a push.
 
     Attributes:
         force: mean of the force [N].
         variance: variance of the force [N^2].
-        push: change of the force per displacement and time of a push [N/(m s)].
-        doubt: variance of `push`.
-        pushed: displacement times time of the last push [m s].
-        before: estimated force before the last push [N].
+        push_gain: change of the force per displacement and time of a push [N/(m s)].
+        push_gain_variance: variance of `push_gain`.
+        last_push: displacement times time of the last push [m s].
+        previous_force: estimated force before the last push [N].
     """
 
     force: float
     variance: float
-    push: float
-    doubt: float
-    pushed: float = 0.0
-    before: float = math.nan
+    push_gain: float
+    push_gain_variance: float
+    last_push: float = 0.0
+    previous_force: float = math.nan
 
     def __post_init__(self) -> None:
-        self._expected = self.push
+        self._expected = self.push_gain
 
-    def judge(self, judged: float, variance: float) -> None:
+    def update(self, judged: float, variance: float) -> None:
         """Update with an observed force [N], its variance [N^2] and the effect of the last push."""
-        if self.pushed and math.isfinite(self.before):
-            own = self.pushed**2 * self.doubt
-            share = self.pushed * self.doubt / (own + 2.0 * variance)
-            self.push += share * (judged - self.before - self.pushed * self.push)
-            self.doubt *= 1.0 - share * self.pushed
-            low, high = self._expected / _FURTHEST, self._expected * _FURTHEST
-            self.push = min(high, max(low, self.push))
-        change = self.pushed * self.push
+        if self.last_push and math.isfinite(self.previous_force):
+            own = self.last_push**2 * self.push_gain_variance
+            share = self.last_push * self.push_gain_variance / (own + 2.0 * variance)
+            self.push_gain += share * (judged - self.previous_force - self.last_push * self.push_gain)
+            self.push_gain_variance *= 1.0 - share * self.last_push
+            low, high = self._expected / _MAX_PUSH_GAIN_RATIO, self._expected * _MAX_PUSH_GAIN_RATIO
+            self.push_gain = min(high, max(low, self.push_gain))
+        change = self.last_push * self.push_gain
         self.force = max(0.0, self.force + change)
-        self.variance += self.pushed**2 * self.doubt + (_FADES * self.force) ** 2
+        self.variance += self.last_push**2 * self.push_gain_variance + (_FORCE_DRIFT_RATIO * self.force) ** 2
         share = 1.0 if math.isinf(self.variance) or not variance else (
             self.variance / (self.variance + variance)
         )  # fmt: skip
         self.force += share * (judged - self.force)
         self.variance = variance if share == 1.0 else (1.0 - share) * self.variance
-        self.before, self.pushed = judged, 0.0
+        self.previous_force, self.last_push = judged, 0.0
 
 
-_FADES = 0.05  # relative change of a force between two estimates without operator action
+_FORCE_DRIFT_RATIO = 0.05  # relative change of a force between two estimates without operator action
 
 
-class _Target(NamedTuple):
+class _ForceTarget(NamedTuple):
     """Reference force, as prepared by the operator.
 
     Attributes:
         axis: number of the joystick axis.
-        row: parameters of the axis.
-        side: sign of the force.
-        way: direction of the handle that increases the force.
-        goal: (decisions,) reference with visual delay and noise [N].
+        axis_parameters: parameters of the axis.
+        force_sign: sign of the force.
+        push_direction: direction of the handle that increases the force.
+        reference: (decisions,) reference with visual delay and noise [N].
         displayed: (decisions,) displayed reference [N]; NaN without a display.
-        close: uncorrected error at the largest target [N].
-        noticed: force above which the operator assumes a contact that is not visible [N].
-        shown: whether the contact force is displayed as well.
+        tolerance: uncorrected error at the largest target [N].
+        contact_threshold: force above which the operator assumes a contact that is not visible [N].
+        is_force_displayed: whether the contact force is displayed as well.
     """
 
     axis: int
-    row: list[float]
-    side: float
-    way: float
-    goal: list[float]
+    axis_parameters: list[float]
+    force_sign: float
+    push_direction: float
+    reference: list[float]
     displayed: np.ndarray
-    close: float
-    noticed: float
-    shown: bool
+    tolerance: float
+    contact_threshold: float
+    is_force_displayed: bool
 
 
-def _prepared(
-    pressing: Regulate | Track, pilot: TeleopPilot, numbers: Master, time: np.ndarray,
-    sight: np.ndarray, him: Operator,
-) -> _Target:  # fmt: skip
-    target, shown, late = pressing.target, isinstance(pressing, Track), him.visual_delay
-    axis = _axis_of(numbers, COORDINATES.index(target.coordinate))
+def _prepare_force_target(
+    pressing: RegulateForce | TrackForce, pilot: TeleopPilot, numbers: MasterParameters, time: np.ndarray,
+    sight: np.ndarray, operator: Operator,
+) -> _ForceTarget:  # fmt: skip
+    target, shown, late = pressing.target, isinstance(pressing, TrackForce), operator.visual_delay
+    axis = _find_joystick_axis(numbers, COORDINATES.index(target.coordinate))
     largest = max(abs(f) for f in target.force) or 1.0
     side = math.copysign(1.0, next((f for f in target.force if f), 1.0))
     goal = np.interp(np.maximum(time - late * shown, 0.0), target.time, target.force)
     displayed = np.interp(time, target.time, target.force) if shown else np.full(len(time), np.nan)
     goal = goal + shown * largest * sight
-    row, close = numbers.axis[axis].tolist(), _CLOSE * largest
+    row, close = numbers.axis[axis].tolist(), _FORCE_TOLERANCE_RATIO * largest
     direct = pilot.reflection == "direct_force"
-    noticed = max(close, _NOTICED / max(row[RATIO], 1e-12)) if direct else close
+    noticed = max(close, _MIN_NOTICED_FORCE / max(row[REFLECTION_RATIO], 1e-12)) if direct else close
     way = -side * row[SIGN]
-    both = isinstance(pressing, Track) and pressing.display == "both"
-    return _Target(axis, row, side, way, goal.tolist(), displayed, close, noticed, both)
+    both = isinstance(pressing, TrackForce) and pressing.display == "both"
+    return _ForceTarget(axis, row, side, way, goal.tolist(), displayed, close, noticed, both)
 
 
-def _axis_of(numbers: Master, coordinate: int) -> int:
+def _find_joystick_axis(numbers: MasterParameters, coordinate: int) -> int:
     return int(np.flatnonzero(numbers.axis[:, COORDINATE] == coordinate)[0])
 
 
-def _muscles(
-    pilot: TeleopPilot, joystick: Joystick, numbers: Master, him: Operator, period: float
-) -> Muscles:
+def _make_arm_at_rest(
+    pilot: TeleopPilot,
+    joystick: Joystick,
+    numbers: MasterParameters,
+    operator: Operator,
+    period: float,
+) -> NeuromuscularState:
     """Return the operator's arm at rest.
 
     A given path is the path of the hand itself, after the neuromuscular lag. A hand that applies a
     force to the handle follows it by its compliance, which is part of the arm.
     """
-    hand, lagging = joystick.hand, isinstance(pilot.operator, Regulate | Track | Steer)
-    if not isinstance(pilot.operator, Steer) and pilot.reflection == "direct_force":
+    hand, lagging = (
+        joystick.hand,
+        isinstance(pilot.operator, RegulateForce | TrackForce | SteerToPoses),
+    )
+    if not isinstance(pilot.operator, SteerToPoses) and pilot.reflection == "direct_force":
         lagging = False
-    frequency = him.neuromuscular_frequency if lagging else 0.0
-    tracking = isinstance(pilot.operator, Steer)
-    damping = him.neuromuscular_damping if tracking else 1.0  # single pushes do not overshoot
+    frequency = operator.neuromuscular_frequency if lagging else 0.0
+    tracking = isinstance(pilot.operator, SteerToPoses)
+    damping = operator.neuromuscular_damping if tracking else 1.0  # single pushes do not overshoot
     free = pilot.mode == "position" and pilot.reflection not in ("none", "stiffness", "impedance")
-    at_rest = Muscles(
-        wanted=np.zeros(6),
-        spring=np.zeros(6) if free else numbers.axis[:, NOMINAL].copy(),
-        notch=numbers.axis[:, [DEADBAND, DROP, OUTSIDE]].T.copy(),
+    at_rest = NeuromuscularState(
+        reference=np.zeros(6),
+        spring=np.zeros(6) if free else numbers.axis[:, NOMINAL_STIFFNESS].copy(),
+        detent=numbers.axis[:, [DEADBAND, DETENT_DROP, DETENT_STIFFNESS]].T.copy(),
         correction=np.zeros(6),
         force=np.zeros(6),
-        arm=np.array([hand.along(axis)[2] for axis in range(6)]),
+        arm=np.array([hand.axis_impedance(axis)[2] for axis in range(6)]),
         cross=np.array([hand.stiffness_shape[1] * hand.stiffness]),
-        most=him.largest_force * _LEVERS,
-        weight=np.array([0.0, 0.0, 9.81 * hand.carried, 0.0, 0.0, 0.0]),
-        gain=np.array([him.muscle]),
+        max_force=operator.largest_force * _LEVERS,
+        weight=np.array([0.0, 0.0, 9.81 * hand.carried_mass, 0.0, 0.0, 0.0]),
+        gain=np.array([operator.muscle]),
         rest=np.zeros(6),
         rate=np.zeros(6),
         lag=neuromuscular_matrix(frequency, damping, period),
     )
-    return flattened(at_rest)
+    return flatten_state(at_rest)
 
 
-def _coloured(white: np.ndarray, band: float, period: float) -> np.ndarray:
+def _colour_noise(white: np.ndarray, band: float, period: float) -> np.ndarray:
     """Filter white noise (n, ...) with a first-order low-pass, to unit standard deviation."""
     share = 1.0 - math.exp(-band * period)
     scale = math.sqrt((2.0 - share) / share)
-    return scale * _low_pass(white.reshape(len(white), -1), share).reshape(white.shape)
+    return scale * _filter_low_pass(white.reshape(len(white), -1), share).reshape(white.shape)
 
 
 @compiled
-def _low_pass(rows, share):
+def _filter_low_pass(rows, share):
     """Filter each column (n, c) by `y' = y + share (x - y)`; scipy.signal takes 2 s to import."""
     out, state = np.empty_like(rows), np.zeros(rows.shape[1])
     for n in range(len(rows)):
@@ -669,15 +698,15 @@ def _low_pass(rows, share):
     return out
 
 
-def _followed(behaviour: Follow, count: int, step: float) -> np.ndarray:
+def _sample_hand_path(behaviour: FollowPath, count: int, step: float) -> np.ndarray:
     """Return the reference displacements (n, 6) of a given path [m], [rad]."""
     time, path = step * np.arange(count), np.zeros((count, 6))
     for name, values in behaviour.path.items():
-        path[:, AXES.index(name)] = _at(time, behaviour.time, values, behaviour.interpolate)
+        path[:, AXES.index(name)] = _sample_signal(time, behaviour.time, values, behaviour.interpolate)
     return path
 
 
-def recorded_hand(path: Path, time: np.ndarray) -> np.ndarray:
+def read_recorded_hand(path: Path, time: np.ndarray) -> np.ndarray:
     """Read the recorded displacements of a handle.
 
     Args:
@@ -702,23 +731,23 @@ def recorded_hand(path: Path, time: np.ndarray) -> np.ndarray:
     record = columns.pop("time")
     if len(bad := np.flatnonzero(~(np.diff(record) > 0.0))):
         message = "does not increase here: sort the rows and keep each time once"
-        raise InputError(table.where("time", int(bad[0]) + 1), message)
+        raise InputError(table.location("time", int(bad[0]) + 1), message)
     made = np.zeros((len(time), 6))
     for axis, values in columns.items():
         made[:, AXES.index(axis)] = np.interp(time, record - record[0], values)
     return made
 
 
-def _steered(behaviour: Steer, count: int, step: float) -> dict[int, np.ndarray]:
+def _sample_tip_targets(behaviour: SteerToPoses, count: int, step: float) -> dict[int, np.ndarray]:
     """Return coordinate -> (n,) target of the tip [m], [rad]."""
     time = step * np.arange(count)
     return {
-        COORDINATES.index(name): _at(time, behaviour.time, values, "hold")
+        COORDINATES.index(name): _sample_signal(time, behaviour.time, values, "hold")
         for name, values in behaviour.points.items()
     }
 
 
-def _at(time: np.ndarray, times, values, how: str) -> np.ndarray:
+def _sample_signal(time: np.ndarray, times, values, how: str) -> np.ndarray:
     if how == "linear":
         return np.interp(time, times, values)
     row = np.searchsorted(times, time + 1e-9, side="right") - 1

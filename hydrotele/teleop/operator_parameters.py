@@ -15,16 +15,23 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from hydrotele.core.datafile import Facts, Name, Number, Positive, parse, read_yaml
-from hydrotele.core.datafile import suggest as suggest_name
+from hydrotele.core.datafile import (
+    Name,
+    Number,
+    PositiveFloat,
+    StrictModel,
+    read_yaml,
+    validate_data,
+)
+from hydrotele.core.datafile import suggest_valid_name as suggest_name
 from hydrotele.core.errors import InputError
-from hydrotele.machine.joystick import HandFacts, Joystick, Shape
-from hydrotele.scenario.teleoperation import Perception
+from hydrotele.machine.joystick import HandImpedance, Joystick, SymmetricMatrix
+from hydrotele.scenario.teleoperation import OperatorSettings
 
-SHIPPED = Path(__file__).resolve().with_name("operator.yaml")
+DEFAULT_OPERATOR_FILE = Path(__file__).resolve().with_name("operator.yaml")
 
 
-class OperatorParameter(Facts):
+class OperatorParameter(StrictModel):
     """Parameter of the operator: nominal value, range from `low` to `high`, and source.
 
     `basis` is the kind of source: measured in a study (`published`), a published value quoted from
@@ -39,19 +46,16 @@ class OperatorParameter(Facts):
     source: str
 
     @model_validator(mode="after")
-    def _check(self):
+    def _check_order(self):
         if not 0.0 <= self.low <= self.value <= self.high:
-            raise ValueError(
-                f"must be ordered, 0 <= low {self.low:g} <= value {self.value:g}"
-                f" <= high {self.high:g}"
-            )
+            raise ValueError(f"must be ordered, 0 <= low {self.low:g} <= value {self.value:g} <= high {self.high:g}")
         return self
 
 
-Pair = tuple[Positive, Positive]
+Pair = tuple[PositiveFloat, PositiveFloat]
 
 
-class ArmFacts(Facts):
+class ArmParameters(StrictModel):
     """Right arm with two links in a horizontal plane: shoulder, elbow, hand.
 
     `length` [m], `mass` [kg] and `inertia` [kg m^2] about the links' centres; `joint_stiffness`
@@ -62,11 +66,11 @@ class ArmFacts(Facts):
     length: Pair
     mass: Pair
     inertia: Pair
-    joint_stiffness: Shape
+    joint_stiffness: SymmetricMatrix
     usual: Name
 
 
-class OperatorFile(Facts):
+class OperatorFile(StrictModel):
     """File of operator parameters: parameters, `grips` of the hand, the `arm`, and its `postures`.
 
     A posture is the position of the hand relative to the shoulder: ahead and to the left [m].
@@ -75,15 +79,15 @@ class OperatorFile(Facts):
     name: Name
     description: str = ""
     parameters: dict[Name, OperatorParameter] = Field(min_length=1)
-    grips: dict[Name, HandFacts] = {}
-    arm: ArmFacts | None = None
+    grips: dict[Name, HandImpedance] = {}
+    arm: ArmParameters | None = None
     postures: dict[Name, tuple[Number, Number]] = {}
 
     @model_validator(mode="after")
-    def _check(self):
-        if strange := set(self.parameters) - set(_NAMES):
+    def _check_names(self):
+        if strange := set(self.parameters) - set(_PARAMETER_NAMES):
             name = min(strange)
-            raise ValueError(f"parameters.{name}: {suggest_name(name, _NAMES)}")
+            raise ValueError(f"parameters.{name}: {suggest_name(name, _PARAMETER_NAMES)}")
         return self
 
 
@@ -156,11 +160,11 @@ class Operator:
         return 2.0 * self.neuromuscular_damping / self.neuromuscular_frequency
 
 
-_NAMES = tuple(field.name for field in dataclasses.fields(Operator))
+_PARAMETER_NAMES = tuple(field.name for field in dataclasses.fields(Operator))
 
 
 @functools.cache
-def load_operator_file(path: Path = SHIPPED) -> OperatorFile:
+def load_operator_file(path: Path = DEFAULT_OPERATOR_FILE) -> OperatorFile:
     """Read a file of operator parameters.
 
     Args:
@@ -173,9 +177,9 @@ def load_operator_file(path: Path = SHIPPED) -> OperatorFile:
         InputError: the file is invalid; the message gives file, line and key.
     """
     data, lines = read_yaml(path)
-    found = parse(OperatorFile, data, str(path), lines)
-    if path == SHIPPED:
-        if lacking := [name for name in _NAMES if name not in found.parameters]:
+    found = validate_data(OperatorFile, data, str(path), lines)
+    if path == DEFAULT_OPERATOR_FILE:
+        if lacking := [name for name in _PARAMETER_NAMES if name not in found.parameters]:
             raise InputError(path, f"has no parameters {', '.join(lacking)}")
         return found
     usual = load_operator_file()
@@ -186,28 +190,28 @@ def load_operator_file(path: Path = SHIPPED) -> OperatorFile:
     })  # fmt: skip
 
 
-def drawn_operator(file: OperatorFile, number: int | None, **known: float) -> Operator:
+def make_operator(file: OperatorFile, number: int | None, **fixed_parameters: float) -> Operator:
     """Return the nominal or a sampled operator of a file.
 
     Args:
         file: result of `load_operator_file`.
         number: number of the sampled operator, which is reproducible; None for the nominal one.
-        known: parameters with given values, which are not sampled.
+        fixed_parameters: parameters with given values, which are not sampled.
 
     Returns:
         The operator.
     """
     values = {}
-    for place, name in enumerate(_NAMES):
+    for place, name in enumerate(_PARAMETER_NAMES):
         p = file.parameters[name]
         values[name] = p.value
         if number is not None and p.low < p.high:
             rng = np.random.default_rng([number, place, 1967])
             values[name] = float(rng.triangular(p.low, p.value, p.high))
-    return Operator(**values | known)
+    return Operator(**values | fixed_parameters)
 
 
-def perceiving(perception: Perception, folder: str = "") -> Operator:
+def scenario_operator(perception: OperatorSettings, folder: str = "") -> Operator:
     """Return the operator that a scenario specifies.
 
     Args:
@@ -220,12 +224,12 @@ def perceiving(perception: Perception, folder: str = "") -> Operator:
     Raises:
         InputError: the file is invalid.
     """
-    known = {name: getattr(perception, name) for name in _NAMES if hasattr(perception, name)}
+    known = {name: getattr(perception, name) for name in _PARAMETER_NAMES if hasattr(perception, name)}
     known = {name: value for name, value in known.items() if value is not None}
-    return drawn_operator(_file_of(perception, folder), perception.drawn, **known)
+    return make_operator(_load_perception_file(perception, folder), perception.drawn, **known)
 
 
-def held_joystick(joystick: Joystick, perception: Perception, folder: str = "") -> Joystick:
+def attach_operator_hand(joystick: Joystick, perception: OperatorSettings, folder: str = "") -> Joystick:
     """Return the joystick with the hand of the scenario's operator.
 
     Without `grip`, `posture` and co-contraction the hand of the joystick file is used.
@@ -244,7 +248,7 @@ def held_joystick(joystick: Joystick, perception: Perception, folder: str = "") 
 
     Source: `arm_impedance` for the posture; Hogan 1984 for co-contraction.
     """
-    file, him = _file_of(perception, folder), perceiving(perception, folder)
+    file, him = _load_perception_file(perception, folder), scenario_operator(perception, folder)
     hand = joystick.hand
     if perception.grip:
         if perception.grip not in file.grips:
@@ -256,11 +260,11 @@ def held_joystick(joystick: Joystick, perception: Perception, folder: str = "") 
         if perception.posture not in file.postures:
             message = f"{perception.posture!r}; {suggest_name(perception.posture, file.postures)}"
             raise InputError("pilot.perception.posture", message)
-        hand = postured(hand, file, perception.posture)
-    return joystick.model_copy(update={"hand": stiffened(hand, factor)})
+        hand = apply_posture(hand, file, perception.posture)
+    return joystick.model_copy(update={"hand": scale_hand_stiffness(hand, factor)})
 
 
-def postured(hand: HandFacts, file: OperatorFile, posture: str) -> HandFacts:
+def apply_posture(hand: HandImpedance, file: OperatorFile, posture: str) -> HandImpedance:
     """Return a hand with the arm's impedance in a posture.
 
     Args:
@@ -286,7 +290,7 @@ def postured(hand: HandFacts, file: OperatorFile, posture: str) -> HandFacts:
     return hand.model_copy(update={"mass_shape": shapes[0], "stiffness_shape": shapes[1]})
 
 
-def arm_impedance(arm: ArmFacts, place: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+def arm_impedance(arm: ArmParameters, place: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
     """Return mass and stiffness of an arm at its hand, `J^-T A J^-1` of the joints' matrices.
 
     Args:
@@ -327,7 +331,7 @@ def arm_impedance(arm: ArmFacts, place: tuple[float, float]) -> tuple[np.ndarray
     return inverse.T @ mass @ inverse, inverse.T @ stiffness @ inverse
 
 
-def stiffened(hand: HandFacts, factor: float) -> HandFacts:
+def scale_hand_stiffness(hand: HandImpedance, factor: float) -> HandImpedance:
     """Return a hand with `factor` times the stiffness and the same damping ratio.
 
     Antagonist muscles that contract together add stiffness and damping but no force (Hogan 1984).
@@ -347,7 +351,7 @@ def stiffened(hand: HandFacts, factor: float) -> HandFacts:
     })  # fmt: skip
 
 
-def _file_of(perception: Perception, folder: str) -> OperatorFile:
+def _load_perception_file(perception: OperatorSettings, folder: str) -> OperatorFile:
     if perception.file is None:
         return load_operator_file()
     return load_operator_file(Path(folder, perception.file).resolve())

@@ -26,14 +26,23 @@ from hydrotele.core.compiled import compiled
 # negative part, accumulated separately; sum of waves, or position, used so far; energy of the waves
 # used so far; force on the master, or energy reported by the last packet; deflection of the slave's
 # spring [m] or [rad]; last received position
-ENERGY, GONE_IN, GONE_OUT, USED, SPENT, PUSHED, STRETCH, GOAL = range(8)
-BUDGET_IN = PUSHED  # at the slave's end
-END = GOAL + 1
-_CATCH_UP = 2.0  # 1/s, rate at which a limited reference catches up
+(
+    STORED_ENERGY,
+    ENERGY_IN,
+    ENERGY_OUT,
+    USED_SIGNAL,
+    USED_ENERGY,
+    MASTER_FORCE,
+    SPRING_DEFLECTION,
+    RECEIVED_POSITION,
+) = range(8)
+REPORTED_ENERGY = MASTER_FORCE  # at the slave's end
+END_SIZE = RECEIVED_POSITION + 1
+_CATCH_UP_RATE = 2.0  # 1/s, rate at which a limited reference catches up
 
 
 @compiled
-def arrived_wave(total, budget, period, end):
+def take_received_wave(total, budget, period, end):
     """Return the received wave that is not used yet, limited by its energy.
 
     Args:
@@ -47,23 +56,23 @@ def arrived_wave(total, budget, period, end):
 
     Source: this module.
     """
-    wave = (total - end[USED]) / period
-    left = max(0.0, budget - end[SPENT]) / period
+    wave = (total - end[USED_SIGNAL]) / period
+    left = max(0.0, budget - end[USED_ENERGY]) / period
     if wave * wave > left:
         wave = math.copysign(math.sqrt(left), wave)
-    end[USED] += period * wave
-    end[SPENT] += period * wave * wave
+    end[USED_SIGNAL] += period * wave
+    end[USED_ENERGY] += period * wave * wave
     return wave
 
 
 @compiled
-def wave_master(v, total, budget, b, period, end):
+def step_wave_master(v, total, budget, b, period, end):
     """Compute force and outgoing wave at the master's end.
 
     Args:
         v: speed of the handle, scalar [m/s].
-        total: see `arrived_wave`, scalar.
-        budget: see `arrived_wave`, scalar.
+        total: see `take_received_wave`, scalar.
+        budget: see `take_received_wave`, scalar.
         b: wave impedance, scalar [N s/m].
         period: scalar [s].
         end: (8,) state, written.
@@ -74,20 +83,20 @@ def wave_master(v, total, budget, b, period, end):
     Source: Niemeyer and Slotine 1991.
     """
     root = math.sqrt(2.0 * b)
-    w = arrived_wave(total, budget, period, end)
+    w = take_received_wave(total, budget, period, end)
     pushed = b * v - root * w
-    end[ENERGY] += period * pushed * v
+    end[STORED_ENERGY] += period * pushed * v
     return pushed, root * v - w
 
 
 @compiled
-def wave_slave(v, total, budget, stiffness, damping, b, period, end):
+def step_wave_slave(v, total, budget, stiffness, damping, b, period, end):
     """Compute force and outgoing wave at the slave's end.
 
     Args:
         v: speed of the slave in the handle's scale, scalar [m/s].
-        total: see `arrived_wave`, scalar.
-        budget: see `arrived_wave`, scalar.
+        total: see `take_received_wave`, scalar.
+        budget: see `take_received_wave`, scalar.
         stiffness: stiffness of the slave's controller, scalar [N/m].
         damping: damping of the slave's controller, scalar [N s/m].
         b: wave impedance, scalar [N s/m].
@@ -100,17 +109,17 @@ def wave_slave(v, total, budget, stiffness, damping, b, period, end):
     Source: Niemeyer and Slotine 1991; backward differences.
     """
     less = math.sqrt(2.0 / b)
-    u = arrived_wave(total, budget, period, end)
+    u = take_received_wave(total, budget, period, end)
     stiff = damping + stiffness * period
-    pull = (stiffness * end[STRETCH] + stiff * (less * u - v)) / (1.0 + stiff / b)
+    pull = (stiffness * end[SPRING_DEFLECTION] + stiff * (less * u - v)) / (1.0 + stiff / b)
     asked = less * u - pull / b
-    end[STRETCH] += period * (asked - v)
-    end[ENERGY] -= period * pull * asked
+    end[SPRING_DEFLECTION] += period * (asked - v)
+    end[STORED_ENERGY] -= period * pull * asked
     return pull, u - less * pull
 
 
 @compiled
-def controlled_master(v, force, budget, mass, period, end):
+def step_passivity_master(v, force, budget, mass, period, end):
     """Compute the force at the master's end under passivity control.
 
     The motion of the mass in the next period is predicted from its speed and the channel's force.
@@ -130,23 +139,23 @@ def controlled_master(v, force, budget, mass, period, end):
 
     Source: Hannaford and Ryu 2002, solved for the force; see this module.
     """
-    gone = end[PUSHED] * v * period
-    end[ENERGY] += gone
-    end[GONE_IN] += max(gone, 0.0)
-    end[GONE_OUT] += max(-gone, 0.0)
-    firm, left = mass / period, budget - end[GONE_OUT]
+    gone = end[MASTER_FORCE] * v * period
+    end[STORED_ENERGY] += gone
+    end[ENERGY_IN] += max(gone, 0.0)
+    end[ENERGY_OUT] += max(-gone, 0.0)
+    firm, left = mass / period, budget - end[ENERGY_OUT]
     if left < 0.0:
-        end[PUSHED] = _damped(v, force, -left / period, 0.5 * firm)
-        return end[PUSHED]
-    now = v - 0.5 / firm * end[PUSHED]
+        end[MASTER_FORCE] = _damping_force(v, force, -left / period, 0.5 * firm)
+        return end[MASTER_FORCE]
+    now = v - 0.5 / firm * end[MASTER_FORCE]
     # -F x <= E with x = v T - F T^2 / (2 M) is quadratic in F
     root = math.sqrt(now * now + 2.0 * left / mass)
-    end[PUSHED] = min(firm * (now + root), max(firm * (now - root), force))
-    return end[PUSHED]
+    end[MASTER_FORCE] = min(firm * (now + root), max(firm * (now - root), force))
+    return end[MASTER_FORCE]
 
 
 @compiled
-def _damped(v, force, power, most):
+def _damping_force(v, force, power, most):
     """Return a force that dissipates a power, or the received force if that dissipates more."""
     speed = abs(v)
     if speed == 0.0:
@@ -157,7 +166,7 @@ def _damped(v, force, power, most):
 
 
 @compiled
-def controlled_slave(v, place, budget, stiffness, damping, trickle, period, end):
+def step_passivity_slave(v, place, budget, stiffness, damping, min_power, period, end):
     """Compute the force at the slave's end under passivity control.
 
     Args:
@@ -166,7 +175,7 @@ def controlled_slave(v, place, budget, stiffness, damping, trickle, period, end)
         budget: energy that had entered at the master at the time of sending, scalar [J].
         stiffness: stiffness of the slave's controller, scalar [N/m].
         damping: damping of the slave's controller, scalar [N s/m].
-        trickle: power that is always permitted, scalar [W].
+        min_power: power that is always permitted, scalar [W].
         period: scalar [s].
         end: (8,) state, written; GONE_IN is sent in the next packet.
 
@@ -175,19 +184,19 @@ def controlled_slave(v, place, budget, stiffness, damping, trickle, period, end)
 
     Source: Ryu, Artigas and Preusche 2010, solved for the reference; see this module.
     """
-    asked = _CATCH_UP * (end[GOAL] - end[USED]) + (place - end[GOAL]) / period
-    end[GOAL], end[BUDGET_IN] = place, budget
+    asked = _CATCH_UP_RATE * (end[RECEIVED_POSITION] - end[USED_SIGNAL]) + (place - end[RECEIVED_POSITION]) / period
+    end[RECEIVED_POSITION], end[REPORTED_ENERGY] = place, budget
     stiff = damping + stiffness * period
-    offset = stiffness * end[STRETCH] - stiff * v
-    power = trickle + max(0.0, budget - end[GONE_OUT]) / period
+    offset = stiffness * end[SPRING_DEFLECTION] - stiff * v
+    power = min_power + max(0.0, budget - end[ENERGY_OUT]) / period
     # (offset + stiff rate) rate <= power
     root = math.sqrt(offset * offset + 4.0 * stiff * power)
     asked = min((-offset + root) / (2.0 * stiff), max((-offset - root) / (2.0 * stiff), asked))
     pull = offset + stiff * asked
-    end[USED] += period * asked
-    end[STRETCH] += period * (asked - v)
+    end[USED_SIGNAL] += period * asked
+    end[SPRING_DEFLECTION] += period * (asked - v)
     gone = -pull * asked * period
-    end[ENERGY] += gone
-    end[GONE_IN] += max(gone, 0.0)
-    end[GONE_OUT] += max(-gone - trickle * period, 0.0)
+    end[STORED_ENERGY] += gone
+    end[ENERGY_IN] += max(gone, 0.0)
+    end[ENERGY_OUT] += max(-gone - min_power * period, 0.0)
     return pull

@@ -17,55 +17,62 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from hydrotele.core.compiled import compiled
-from hydrotele.machine.joystick import HandFacts
-from hydrotele.teleop.axis_table import flattened
+from hydrotele.machine.joystick import HandImpedance
+from hydrotele.teleop.axis_table import flatten_state
 from hydrotele.teleop.manual_control import neuromuscular_matrix
-from hydrotele.teleop.operator_model import REFLEX, Feeling, Muscles, feeling, felt_stiffness, pull
+from hydrotele.teleop.operator_model import (
+    REFLEX_DELAY,
+    NeuromuscularState,
+    PerceptionErrors,
+    compute_muscle_forces,
+    draw_perception_errors,
+    perceive_stiffness,
+)
 from hydrotele.teleop.operator_parameters import Operator
 
 _LEVELS = {
     "stiffness": (-0.6, -0.45, -0.3, -0.15, 0.0, 0.15, 0.3, 0.45, 0.6),
     "force": (-0.2, -0.15, -0.1, -0.05, 0.0, 0.05, 0.1, 0.15, 0.2),
 }
-ROVING = (2.0e-3, 4.5e-3)  # m, displacements of the handle
-_PERIOD, _FINE = 0.005, 10  # control period [s], integration steps of the handle per period
+DISPLACEMENT_RANGE = (2.0e-3, 4.5e-3)  # m, displacements of the handle
+_PERIOD, _SUBSTEPS = 0.005, 10  # control period [s], integration steps of the handle per period
 _MASS, _DAMPING = 0.85, 60.0  # kg, N s/m of the joystick's handle
-_DECISION = 0.02  # s
+_DECISION_PERIOD = 0.02  # s
 
-Sense = Literal["stiffness", "force"]
+ComparedQuantity = Literal["stiffness", "force"]
 
 
-class Discrimination(NamedTuple):
+class PsychometricFunction(NamedTuple):
     """Psychometric function of a discrimination experiment.
 
     Attributes:
         levels: (n,) comparison over reference, minus 1.
-        greater: (n,) fraction of the trials in which the comparison was reported as greater.
+        greater_fraction: (n,) fraction of the trials in which the comparison was reported as greater.
         trials: number of trials per level.
         jnd: difference with d' = 1 in one interval, relative to the reference.
-        error: standard error of `jnd`.
+        jnd_error: standard error of `jnd`.
         bias: level that is perceived as equal to the reference.
     """
 
     levels: np.ndarray
-    greater: np.ndarray
+    greater_fraction: np.ndarray
     trials: int
     jnd: float
-    error: float
+    jnd_error: float
     bias: float
 
 
 @compiled
-def _explore(muscles, past, tremor, spring, load, first, felt):
+def _simulate_exploration(muscles, past, tremor, spring, load, first, felt):
     """Simulate a handle with `spring` and `load`; write its force and position to `felt`."""
     mass, x, v = _MASS + muscles.weight[0], 0.0, 0.0
-    step = _PERIOD / _FINE
+    step = _PERIOD / _SUBSTEPS
     handle = np.zeros(6)
     for k in range(len(felt)):
         handle[0] = x
         before = v
-        pull(muscles, past, tremor, handle, first + k, _PERIOD)
-        for _ in range(_FINE):
+        compute_muscle_forces(muscles, past, tremor, handle, first + k, _PERIOD)
+        for _ in range(_SUBSTEPS):
             push = muscles.force[0] - muscles.weight[0] - muscles.arm[0] * x
             push -= (_DAMPING + muscles.weight[1]) * v + spring * x + load
             v += step * push / mass
@@ -74,26 +81,26 @@ def _explore(muscles, past, tremor, spring, load, first, felt):
         felt[k, 1] = x
 
 
-def _arm(him: Operator, hand: HandFacts, expected: float) -> Muscles:
+def _make_operator_arm(operator: Operator, hand: HandImpedance, expected: float) -> NeuromuscularState:
     """Return the operator's arm on axis 0 of a handle with an expected stiffness [N/m]."""
     zero = np.zeros(6)
-    return flattened(Muscles(
-        wanted=zero, spring=zero + expected, notch=np.full((3, 6), -1.0), correction=zero,
-        force=zero, arm=zero + hand.stiffness, cross=np.zeros(1), most=zero + him.largest_force,
+    return flatten_state(NeuromuscularState(
+        reference=zero, spring=zero + expected, detent=np.full((3, 6), -1.0), correction=zero,
+        force=zero, arm=zero + hand.stiffness, cross=np.zeros(1), max_force=zero + operator.largest_force,
         weight=np.array([hand.mass, hand.damping, 0.0, 0.0, 0.0, 0.0]),
-        gain=np.array([him.muscle]), rest=zero, rate=zero,
-        lag=neuromuscular_matrix(him.neuromuscular_frequency, 1.0, _PERIOD),
+        gain=np.array([operator.muscle]), rest=zero, rate=zero,
+        lag=neuromuscular_matrix(operator.neuromuscular_frequency, 1.0, _PERIOD),
     ))  # fmt: skip
 
 
-def discriminate(
-    him: Operator, hand: HandFacts, sense: Sense = "stiffness", reference: float = 1000.0,
+def measure_discrimination(
+    operator: Operator, hand: HandImpedance, sense: ComparedQuantity = "stiffness", reference: float = 1000.0,
     trials: int = 40, seed: int = 0,
-) -> Discrimination:  # fmt: skip
+) -> PsychometricFunction:  # fmt: skip
     """Measure the just noticeable difference of an operator.
 
     Args:
-        him: parameters of the operator.
+        operator: parameters of the operator.
         hand: parameters of the hand on the handle.
         sense: compared quantity: the handle's stiffness, or a constant opposing force.
         reference: reference stiffness [N/m] or force [N].
@@ -104,19 +111,19 @@ def discriminate(
         The psychometric function.
     """
     rng = np.random.default_rng([seed, 1995])
-    ticks = round(him.dwell / _PERIOD)
-    tremor = him.tremor * _shaking(rng, 2**12)
-    every, levels = round(_DECISION / _PERIOD), np.array(_LEVELS[sense])
+    ticks = round(operator.dwell / _PERIOD)
+    tremor = operator.tremor * _make_tremor(rng, 2**12)
+    every, levels = round(_DECISION_PERIOD / _PERIOD), np.array(_LEVELS[sense])
     decisions = ticks // every
 
-    def feels(value: float) -> float:
-        errors = feeling(him, rng, decisions, _DECISION)
+    def perceive(value: float) -> float:
+        errors = draw_perception_errors(operator, rng, decisions, _DECISION_PERIOD)
         spring, load = (value, 0.0) if sense == "stiffness" else (0.0, value)
-        muscles = _arm(him, hand, reference if sense == "stiffness" else 0.0)
-        muscles.wanted[0] = rng.uniform(*ROVING)
-        past, handle = np.zeros((1 + round(REFLEX / _PERIOD), 6)), np.zeros((ticks, 2))
-        _explore(muscles, past, tremor, spring, load, int(rng.integers(2**11)), handle)
-        return _judged(handle[::every], errors, sense)
+        muscles = _make_operator_arm(operator, hand, reference if sense == "stiffness" else 0.0)
+        muscles.reference[0] = rng.uniform(*DISPLACEMENT_RANGE)
+        past, handle = np.zeros((1 + round(REFLEX_DELAY / _PERIOD), 6)), np.zeros((ticks, 2))
+        _simulate_exploration(muscles, past, tremor, spring, load, int(rng.integers(2**11)), handle)
+        return _mean_perception(handle[::every], errors, sense)
 
     greater = np.zeros(len(levels))
     for k, level in enumerate(levels):
@@ -124,26 +131,26 @@ def discriminate(
             pair = [reference, reference * (1.0 + level)]
             if swapped := rng.random() < 0.5:
                 pair.reverse()
-            felt = [feels(value) for value in pair]
+            felt = [perceive(value) for value in pair]
             greater[k] += (felt[0] > felt[1]) == swapped
-    bias, spread, error = fit_psychometric(levels, greater, trials)
+    bias, spread, error = fit_psychometric_function(levels, greater, trials)
     root = math.sqrt(2.0)  # the responses contain the noise of both intervals
-    return Discrimination(levels, greater / trials, trials, spread / root, error / root, bias)
+    return PsychometricFunction(levels, greater / trials, trials, spread / root, error / root, bias)
 
 
-def _judged(handle: np.ndarray, errors: Feeling, sense: Sense) -> float:
+def _mean_perception(handle: np.ndarray, errors: PerceptionErrors, sense: ComparedQuantity) -> float:
     """Return the mean perceived quantity in the second half of the exploration."""
     felt = []
     for number in range(len(errors.force) // 2, len(errors.force)):
         force, x = (float(value) for value in handle[number])
         if sense == "stiffness":
-            felt.append(felt_stiffness(force, x, errors, number))
+            felt.append(perceive_stiffness(force, x, errors, number))
         else:
             felt.append(force * errors.force[number])
     return float(np.mean(felt))
 
 
-def _shaking(rng: np.random.Generator, count: int) -> np.ndarray:
+def _make_tremor(rng: np.random.Generator, count: int) -> np.ndarray:
     from scipy.signal import lfilter
 
     share = 1.0 - math.exp(-2.0 * math.pi * 8.0 * _PERIOD)
@@ -151,7 +158,7 @@ def _shaking(rng: np.random.Generator, count: int) -> np.ndarray:
     return np.asarray(lfilter([share], [1.0, share - 1.0], white, axis=0))
 
 
-def fit_psychometric(
+def fit_psychometric_function(
     levels: np.ndarray, greater: np.ndarray, trials: int, lapse: float = 0.01
 ) -> tuple[float, float, float]:  # fmt: skip
     """Fit a cumulative normal to the responses by maximum likelihood.
@@ -175,11 +182,9 @@ def fit_psychometric(
         p = share(x)
         return -float(np.sum(greater * np.log(p) + (trials - greater) * np.log(1.0 - p)))
 
-    found = minimize(
-        likelihood, np.array([0.0, math.log(0.3 * np.ptp(levels))]), method="Nelder-Mead"
-    ).x
+    found = minimize(likelihood, np.array([0.0, math.log(0.3 * np.ptp(levels))]), method="Nelder-Mead").x
     step = 1e-3
-    slopes = [_slope(share, found, k, step) for k in range(2)]
+    slopes = [_finite_difference(share, found, k, step) for k in range(2)]
     p = share(found)
     information = np.array([
         [np.sum(trials * a * b / (p * (1.0 - p))) for a in slopes] for b in slopes
@@ -188,7 +193,7 @@ def fit_psychometric(
     return float(found[0]), spread, spread * math.sqrt(np.linalg.pinv(information)[1, 1])
 
 
-def _slope(share: Callable, x: np.ndarray, k: int, step: float) -> np.ndarray:
+def _finite_difference(share: Callable, x: np.ndarray, k: int, step: float) -> np.ndarray:
     moved = np.zeros(2)
     moved[k] = step
     return (share(x + moved) - share(x - moved)) / (2.0 * step)

@@ -12,29 +12,34 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hydrotele.core.errors import InputError
-from hydrotele.teleop.analysis import Case, TeleopCase, first_change, holds
+from hydrotele.teleop.analysis import (
+    TeleopCaseFile,
+    TeleoperatorAxis,
+    find_first_change,
+    is_strictly_stable,
+)
 from hydrotele.teleop.sampled import (
     SAMPLED_STRUCTURES,
     PacketAges,
-    Prediction,
+    StabilityPrediction,
     growth_rate,
-    predict,
+    predict_stability,
 )
 from hydrotele.teleop.two_port import (
     RATE_STRUCTURES,
     STRUCTURES,
     Impedance,
-    OnTheAxis,
+    PoleOnAxisError,
     TwoPort,
-    hybrid,
-    unstable_held,
+    count_unstable_poles_held,
+    hybrid_matrix,
 )
 
-_FREE = Impedance()
-_SEARCHED = 2.0 * np.pi * np.geomspace(1e-3, 500.0, 3000)  # rad/s
-_FELT = 2.0 * np.pi * np.geomspace(0.1, 5.0, 200)  # rad/s, frequency range of hand motion
+_ZERO_IMPEDANCE = Impedance()
+_SEARCH_FREQUENCIES = 2.0 * np.pi * np.geomspace(1e-3, 500.0, 3000)  # rad/s
+_HAND_FREQUENCIES = 2.0 * np.pi * np.geomspace(0.1, 5.0, 200)  # rad/s, frequency range of hand motion
 _ROUNDING = 1e-6
-_STIFFER = np.geomspace(1e-3, 1e4, 57)  # tested factors on the task's stiffness
+_STIFFNESS_FACTORS = np.geomspace(1e-3, 1e4, 57)  # tested factors on the task's stiffness
 
 
 def llewellyn(port: TwoPort, s: np.ndarray | complex) -> np.ndarray:
@@ -55,7 +60,7 @@ def llewellyn(port: TwoPort, s: np.ndarray | complex) -> np.ndarray:
     >>> float(llewellyn(two_port("four_channel_position", body, body, firm, firm), 3j).round(6))
     1.0
     """
-    h = hybrid(port, np.asarray(s, complex))
+    h = hybrid_matrix(port, np.asarray(s, complex))
     across = h[..., 0, 1] * h[..., 1, 0]
     first, second = np.real(h[..., 0, 0]), np.real(h[..., 1, 1])
     slack = _ROUNDING * np.abs(h)
@@ -65,7 +70,7 @@ def llewellyn(port: TwoPort, s: np.ndarray | complex) -> np.ndarray:
     return np.where((first < -slack[..., 0, 0]) | (second < -slack[..., 1, 1]), -np.inf, found)
 
 
-def absolutely_stable(port: TwoPort) -> bool:
+def is_absolutely_stable(port: TwoPort) -> bool:
     """Return whether no passive hand and task make a two-port unstable.
 
     Args:
@@ -75,11 +80,11 @@ def absolutely_stable(port: TwoPort) -> bool:
         True if its hybrid matrix has no pole in the right half-plane and Llewellyn's parameter is
         nowhere below 1.
     """
-    if np.any(llewellyn(port, 1j * _SEARCHED) < 1.0 - _ROUNDING):
+    if np.any(llewellyn(port, 1j * _SEARCH_FREQUENCIES) < 1.0 - _ROUNDING):
         return False
     try:
-        return unstable_held(port, _FREE) == 0
-    except OnTheAxis:
+        return count_unstable_poles_held(port, _ZERO_IMPEDANCE) == 0
+    except PoleOnAxisError:
         return False
 
 
@@ -89,28 +94,28 @@ class ZWidth:
 
     Attributes:
         frequencies: (n,) [rad/s].
-        free: (n,) transmitted impedance without a task [N s/m].
-        clamped: (n,) transmitted impedance with a clamped slave [N s/m].
-        stiffest_held: maximum stable task stiffness with the hand on the handle [N/m]; infinite if
+        free_impedance: (n,) transmitted impedance without a task [N s/m].
+        clamped_impedance: (n,) transmitted impedance with a clamped slave [N s/m].
+        max_stiffness_held: maximum stable task stiffness with the hand on the handle [N/m]; infinite if
             all tested values are stable, 0 if the softest is unstable.
-        stiffest_let_go: maximum stable task stiffness with the handle released.
-        most_tried: largest tested stiffness [N/m].
+        max_stiffness_released: maximum stable task stiffness with the handle released.
+        max_tested_stiffness: largest tested stiffness [N/m].
     """
 
     frequencies: np.ndarray
-    free: np.ndarray
-    clamped: np.ndarray
-    stiffest_held: float
-    stiffest_let_go: float
-    most_tried: float
+    free_impedance: np.ndarray
+    clamped_impedance: np.ndarray
+    max_stiffness_held: float
+    max_stiffness_released: float
+    max_tested_stiffness: float
 
     @property
     def decades(self) -> float:
         """Mean of `log10 |clamped| / |free|` over the frequency range of hand motion [1]."""
-        return float(np.mean(np.log10(np.abs(self.clamped) / np.abs(self.free))))
+        return float(np.mean(np.log10(np.abs(self.clamped_impedance) / np.abs(self.free_impedance))))
 
 
-def z_width(case: Case, structure: str, frequencies: np.ndarray = _FELT) -> ZWidth:
+def compute_z_width(case: TeleoperatorAxis, structure: str, frequencies: np.ndarray = _HAND_FREQUENCIES) -> ZWidth:
     """Compute the Z-width of a structure.
 
     Args:
@@ -126,44 +131,51 @@ def z_width(case: Case, structure: str, frequencies: np.ndarray = _FELT) -> ZWid
 
     Source: Colgate and Brown 1994 (Z-width); Zhu 1994, 3.4 for the transmitted impedance.
     """
-    port = case.port(structure)
-    h = hybrid(port, 1j * frequencies)
+    port = case.make_port(structure)
+    h = hybrid_matrix(port, 1j * frequencies)
     clamped = h[:, 0, 0] - h[:, 0, 1] * h[:, 1, 0] / h[:, 1, 1]
     unit = case.task.stiffness or case.slave_control.stiffness or 1.0
 
-    def stiffest(hand: Impedance) -> float:
+    def find_max_stiffness(hand: Impedance) -> float:
         def right(factor: float) -> bool:
             task = replace(case.task, stiffness=factor * unit)
-            return holds(port_for(case, structure, task), hand, task)
+            return is_strictly_stable(port_with_task(case, structure, task), hand, task)
 
-        if not right(float(_STIFFER[0])):
+        if not right(float(_STIFFNESS_FACTORS[0])):
             return 0.0
-        found = first_change(right, _STIFFER)
+        found = find_first_change(right, _STIFFNESS_FACTORS)
         return math.inf if found is None else found * unit
 
-    most = float(_STIFFER[-1]) * unit
-    return ZWidth(frequencies, h[:, 0, 0], clamped, stiffest(case.hand), stiffest(_FREE), most)
+    most = float(_STIFFNESS_FACTORS[-1]) * unit
+    return ZWidth(
+        frequencies,
+        h[:, 0, 0],
+        clamped,
+        find_max_stiffness(case.hand),
+        find_max_stiffness(_ZERO_IMPEDANCE),
+        most,
+    )
 
 
-def port_for(case: Case, structure: str, task: Impedance) -> TwoPort:
+def port_with_task(case: TeleoperatorAxis, structure: str, task: Impedance) -> TwoPort:
     """Return the structure's two-port with another task."""
-    return replace(case, task=task).port(structure)
+    return replace(case, task=task).make_port(structure)
 
 
 @dataclass(frozen=True)
-class ReleasedMaster:
+class MasterPolynomial:
     """Characteristic polynomial of the master subsystem alone.
 
     Attributes:
         coefficients: coefficients of falling powers of s.
-        unstable: number of zeros in the right half-plane.
+        unstable_zeros: number of zeros in the right half-plane.
     """
 
     coefficients: np.ndarray
-    unstable: int
+    unstable_zeros: int
 
 
-def released_master(case: Case, structure: str, hand: Impedance = _FREE) -> ReleasedMaster:
+def master_polynomial(case: TeleoperatorAxis, structure: str, hand: Impedance = _ZERO_IMPEDANCE) -> MasterPolynomial:
     """Analyse the master without the return channels, held by a hand or released.
 
     Under position control, and rate control with direct force, `Z_m + C_m + Z_h = 0`. If the
@@ -196,11 +208,11 @@ def released_master(case: Case, structure: str, hand: Impedance = _FREE) -> Rele
         found = [mass, damping + control.damping, stiffness + control.stiffness]
     roots = np.roots(found)
     slack = 1e-9 * np.abs(roots).max()
-    return ReleasedMaster(np.array(found), int(np.sum(roots.real > slack)))
+    return MasterPolynomial(np.array(found), int(np.sum(roots.real > slack)))
 
 
 @dataclass(frozen=True)
-class Spread:
+class ImpedanceRanges:
     """Ranges of hands and tasks for random sampling, log-uniform between two impedances.
 
     Attributes:
@@ -211,19 +223,19 @@ class Spread:
     hand: tuple[Impedance, Impedance]
     task: tuple[Impedance, Impedance]
 
-    def draw(self, rng: np.random.Generator) -> tuple[Impedance, Impedance]:
+    def sample(self, rng: np.random.Generator) -> tuple[Impedance, Impedance]:
         """Sample a hand and a task; a parameter with a bound of 0 is sampled uniformly."""
-        hand, task = (_between(least, most, rng) for least, most in (self.hand, self.task))
+        hand, task = (_sample_impedance(least, most, rng) for least, most in (self.hand, self.task))
         return hand, task
 
 
 # loosely and firmly holding hand, near and far; orders of magnitude after Mussa-Ivaldi, Hogan and
 # Bizzi 1985 and Tsuji et al. 1995, the values are assumptions
-HANDS = (Impedance(0.4, 4.0, 80.0), Impedance(0.8, 17.0, 780.0))
-_TASKS = 3.0  # factor between the case's task and the softest and stiffest sampled task
+DEFAULT_HAND_RANGE = (Impedance(0.4, 4.0, 80.0), Impedance(0.8, 17.0, 780.0))
+_TASK_RANGE_FACTOR = 3.0  # factor between the case's task and the softest and stiffest sampled task
 
 
-def spread_of(facts: TeleopCase) -> Spread:
+def case_impedance_ranges(facts: TeleopCaseFile) -> ImpedanceRanges:
     """Return the ranges of hands and tasks of a case file.
 
     By default the hands are HANDS and the tasks are up to three times softer or stiffer.
@@ -236,20 +248,20 @@ def spread_of(facts: TeleopCase) -> Spread:
     """
     task = facts.task.impedance()
     hands, tasks = (
-        HANDS,
+        DEFAULT_HAND_RANGE,
         tuple(
             Impedance(task.mass, k * task.damping, k * task.stiffness)
-            for k in (1.0 / _TASKS, _TASKS)
+            for k in (1.0 / _TASK_RANGE_FACTOR, _TASK_RANGE_FACTOR)
         ),
     )
     if facts.hands:
         hands = facts.hands.least.impedance(), facts.hands.most.impedance()
     if facts.tasks:
         tasks = facts.tasks.least.impedance(), facts.tasks.most.impedance()
-    return Spread(hands, (tasks[0], tasks[1]))
+    return ImpedanceRanges(hands, (tasks[0], tasks[1]))
 
 
-def _between(least: Impedance, most: Impedance, rng: np.random.Generator) -> Impedance:
+def _sample_impedance(least: Impedance, most: Impedance, rng: np.random.Generator) -> Impedance:
     found = []
     for name in ("mass", "damping", "stiffness"):
         low, high = getattr(least, name), getattr(most, name)
@@ -261,29 +273,34 @@ def _between(least: Impedance, most: Impedance, rng: np.random.Generator) -> Imp
 
 
 @dataclass(frozen=True)
-class WorstCase:
+class SampledStability:
     """Stability of a structure over sampled hands and tasks.
 
     Attributes:
-        pairs: number of sampled pairs of hand and task.
-        unstable: number of unstable pairs with the hand on the handle.
-        unstable_let_go: number of unstable tasks with the handle released.
-        rate: growth rate of the worst pair with the hand on the handle [1/s].
-        hand: hand of the worst pair.
-        task: task of the worst pair.
+        pair_count: number of sampled pairs of hand and task.
+        unstable_count: number of unstable pairs with the hand on the handle.
+        unstable_released_count: number of unstable tasks with the handle released.
+        worst_growth_rate: growth rate of the worst pair with the hand on the handle [1/s].
+        worst_hand: hand of the worst pair.
+        worst_task: task of the worst pair.
     """
 
-    pairs: int
-    unstable: int
-    unstable_let_go: int
-    rate: float
-    hand: Impedance
-    task: Impedance
+    pair_count: int
+    unstable_count: int
+    unstable_released_count: int
+    worst_growth_rate: float
+    worst_hand: Impedance
+    worst_task: Impedance
 
 
-def worst_case(
-    case: Case, structure: str, line: PacketAges, spread: Spread, pairs: int, seed: int = 0
-) -> WorstCase:
+def evaluate_sampled_pairs(
+    case: TeleoperatorAxis,
+    structure: str,
+    line: PacketAges,
+    spread: ImpedanceRanges,
+    pairs: int,
+    seed: int = 0,
+) -> SampledStability:
     """Evaluate stability over sampled hands and tasks, with sampling and the channel's jitter.
 
     Args:
@@ -301,16 +318,16 @@ def worst_case(
         InputError: the structure is not known.
     """
     rng = np.random.default_rng([seed, 21])
-    unstable, free, worst = 0, 0, (-math.inf, _FREE, _FREE)
+    unstable, free, worst = 0, 0, (-math.inf, _ZERO_IMPEDANCE, _ZERO_IMPEDANCE)
     for _ in range(pairs):
-        hand, task = spread.draw(rng)
+        hand, task = spread.sample(rng)
         one = replace(case, hand=hand, task=task)
-        unstable += not predict(one, structure, line).stable
-        free += not predict(replace(one, hand=_FREE), structure, line).stable
+        unstable += not predict_stability(one, structure, line).is_stable
+        free += not predict_stability(replace(one, hand=_ZERO_IMPEDANCE), structure, line).is_stable
         rate = growth_rate(one, structure, line)
         if rate > worst[0]:
             worst = rate, hand, task
-    return WorstCase(pairs, unstable, free, *worst)
+    return SampledStability(pairs, unstable, free, *worst)
 
 
 @dataclass(frozen=True)
@@ -319,25 +336,29 @@ class Robustness:
 
     Attributes:
         structure: name of the structure.
-        absolutely_stable: Llewellyn's criterion; None without a linear two-port.
+        has_absolute_stability: Llewellyn's criterion; None without a linear two-port.
         llewellyn: minimum stability parameter [1]; NaN without a linear two-port.
-        width: Z-width, None without a linear two-port.
-        released: the released master alone; None for waves and passivity control.
+        z_width_result: Z-width, None without a linear two-port.
+        released_polynomial: the released master alone; None for waves and passivity control.
         sampled: with the hand (with task, without), released (with task, without).
-        worst: results over sampled hands and tasks.
+        sampled_pairs: results over sampled hands and tasks.
     """
 
     structure: str
-    absolutely_stable: bool | None
+    has_absolute_stability: bool | None
     llewellyn: float
-    width: ZWidth | None
-    released: ReleasedMaster | None
-    sampled: tuple[Prediction, Prediction, Prediction, Prediction]
-    worst: WorstCase
+    z_width_result: ZWidth | None
+    released_polynomial: MasterPolynomial | None
+    sampled: tuple[StabilityPrediction, StabilityPrediction, StabilityPrediction, StabilityPrediction]
+    sampled_pairs: SampledStability
 
 
-def robustness(
-    case: Case, structure: str, line: PacketAges, spread: Spread, pairs: int = 20
+def evaluate_robustness(
+    case: TeleoperatorAxis,
+    structure: str,
+    line: PacketAges,
+    spread: ImpedanceRanges,
+    pairs: int = 20,
 ) -> Robustness:
     """Evaluate the robustness of a structure.
 
@@ -357,17 +378,17 @@ def robustness(
     if structure not in SAMPLED_STRUCTURES:
         raise InputError("structure", f"{structure!r}; known: {', '.join(SAMPLED_STRUCTURES)}")
     linear = structure in STRUCTURES
-    port = case.port(structure) if linear else None
+    port = case.make_port(structure) if linear else None
     four = [
-        predict(replace(case, hand=hand, task=task), structure, line)
-        for hand in (case.hand, _FREE) for task in (case.task, _FREE)
+        predict_stability(replace(case, hand=hand, task=task), structure, line)
+        for hand in (case.hand, _ZERO_IMPEDANCE) for task in (case.task, _ZERO_IMPEDANCE)
     ]  # fmt: skip
     return Robustness(
         structure,
-        absolutely_stable(port) if port else None,
-        float(llewellyn(port, 1j * _SEARCHED).min()) if port else math.nan,
-        z_width(case, structure) if linear else None,
-        released_master(case, structure) if linear else None,
+        is_absolutely_stable(port) if port else None,
+        float(llewellyn(port, 1j * _SEARCH_FREQUENCIES).min()) if port else math.nan,
+        compute_z_width(case, structure) if linear else None,
+        master_polynomial(case, structure) if linear else None,
         (four[0], four[1], four[2], four[3]),
-        worst_case(case, structure, line, spread, pairs),
+        evaluate_sampled_pairs(case, structure, line, spread, pairs),
     )

@@ -14,37 +14,37 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.control.servo import DriveReference, drive_row
+from hydrotele.control.servo import DriveReference, interpolate_drive_reference
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
-from hydrotele.core.memory import copy_to, floats, integers, rows_of, short_integers
-from hydrotele.simulate.joystick import flotor_step, shaken_flotor_step
+from hydrotele.core.memory import copy_values, float64_view, int32_view, int64_view, matrix_view
+from hydrotele.simulate.joystick import flotor_step, flotor_step_in_cab
 from hydrotele.teleop.axis_table import DAMPING
 from hydrotele.teleop.master import (
-    CONTROLLED,
-    SENT,
-    WAVES,
-    master_step,
+    PASSIVITY_CONTROL,
+    SENT_SIGNAL,
+    WAVE_VARIABLES,
+    step_master,
     unpack_master,
     unpack_master_state,
 )
-from hydrotele.teleop.operator_model import pull, unpack_muscles
+from hydrotele.teleop.operator_model import compute_muscle_forces, unpack_neuromuscular_state
 from hydrotele.teleop.slave import (
-    BLOCKED,
     HAND,
     HANDLE,
     HANDLE_SPEED,
-    SILENT,
-    TRIPPED,
-    measure_task,
-    report,
-    slave_step,
+    HELD_AT_EDGE,
+    NO_PACKETS,
+    VALVES_CLOSED,
+    measure_tip,
+    step_slave,
     unpack_slave,
     unpack_slave_state,
+    write_machine_packet,
 )
 
 
-def ages_of(delays: np.ndarray) -> np.ndarray:
+def compute_packet_ages(delays: np.ndarray) -> np.ndarray:
     """Return the ages of the newest arrived packets; overtaken packets are dropped.
 
     Args:
@@ -53,7 +53,7 @@ def ages_of(delays: np.ndarray) -> np.ndarray:
     Returns:
         (n,) ages in periods; number of the period plus 1 before the first arrival.
 
-    >>> ages_of(np.array([2, 0, 3, 1, 0])).tolist()  # the first and the third are overtaken
+    >>> compute_packet_ages(np.array([2, 0, 3, 1, 0])).tolist()  # the first and the third are overtaken
     [1, 0, 1, 2, 0]
     """
     delays = np.asarray(delays)
@@ -66,27 +66,27 @@ def ages_of(delays: np.ndarray) -> np.ndarray:
     return sent - np.maximum.accumulate(newest)
 
 
-def arrivals(delays: np.ndarray) -> np.ndarray:
+def compute_arriving_ages(delays: np.ndarray) -> np.ndarray:
     """Return the ages of arriving packets that are newer than the packet in use.
 
     Args:
-        delays: (n,) see `ages_of`.
+        delays: (n,) see `compute_packet_ages`.
 
     Returns:
         (n,) age in periods of the arriving packet, -1 if no newer packet arrives. Before the first
         arrival it is the longest delay, as if the channel had transmitted zeros.
 
-    >>> arrivals(np.array([2, 0, 3, 1, 0])).tolist()
+    >>> compute_arriving_ages(np.array([2, 0, 3, 1, 0])).tolist()
     [3, 0, -1, -1, 0]
     """
     delays = np.asarray(delays)
-    ages, ticks = ages_of(delays), np.arange(len(delays))
+    ages, ticks = compute_packet_ages(delays), np.arange(len(delays))
     newest = ticks - ages
     fresh = np.diff(newest, prepend=-1) > 0
     return np.where(newest < 0, max(int(delays.max()), 0), np.where(fresh, ages, -1))
 
 
-def in_periods(delays: np.ndarray, period: float) -> np.ndarray:
+def delays_to_periods(delays: np.ndarray, period: float) -> np.ndarray:
     """Convert delays [s] to whole periods, -1 for lost packets (NaN)."""
     rounded = np.where(np.isnan(delays), -1.0, np.round(np.nan_to_num(delays) / period))
     return rounded.astype(int)
@@ -117,11 +117,11 @@ def load_delays(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
         if name not in rows[0]:
             have = ", ".join(map(str, rows[0]))
             raise InputError(path, f"has no column {name!r}; columns: {have}; delays are in s")
-        found.append(np.array([_delay(path, k + 2, name, row[name]) for k, row in enumerate(rows)]))
+        found.append(np.array([_parse_delay(path, k + 2, name, row[name]) for k, row in enumerate(rows)]))
     return found[0], found[1]
 
 
-def _delay(path: str | Path, line: int, name: str, cell: str | None) -> float:
+def _parse_delay(path: str | Path, line: int, name: str, cell: str | None) -> float:
     if cell is None or not cell.strip():
         return math.nan
     try:
@@ -134,8 +134,8 @@ def _delay(path: str | Path, line: int, name: str, cell: str | None) -> float:
     return value
 
 
-QUIET, SHARE, PERIOD, SILENCE, FADING = range(5)  # indices into `Line.state`
-CHECKED = 20  # ticks between two safety checks
+SILENT_TIME, PACKET_GAIN, PERIOD, MAX_SILENT_TIME, FADE_OUT_TIME = range(5)  # indices into `ChannelBuffers.state`
+TICKS_PER_CHECK = 20  # ticks between two safety checks
 
 
 class SlaveSide(NamedTuple):
@@ -156,7 +156,7 @@ class SlaveSide(NamedTuple):
     state: np.ndarray
 
 
-class Line(NamedTuple):
+class ChannelBuffers(NamedTuple):
     """Communication channel between joystick and machine.
 
     Attributes:
@@ -185,8 +185,8 @@ class MasterSide(NamedTuple):
         state: (123,) MasterState, written.
         qpos: (7,) flotor position [m] and quaternion.
         muscles: (80,) Muscles, written.
-        past: (reflex + 1, 6) see `pull`.
-        tremor: (n, 6) see `pull`.
+        past: (reflex + 1, 6) see `compute_muscle_forces`.
+        tremor: (n, 6) see `compute_muscle_forces`.
     """
 
     master: np.ndarray
@@ -198,7 +198,7 @@ class MasterSide(NamedTuple):
 
 
 @compiled
-def to_the_hand(tick, fresh, elapsed, tripped, machine, line, operator):
+def step_master_side(tick, fresh, elapsed, tripped, machine, line, operator):
     """Run the first half of a tick: send the machine's packet, compute coil and muscle forces.
 
     Args:
@@ -220,39 +220,42 @@ def to_the_hand(tick, fresh, elapsed, tripped, machine, line, operator):
     master_flat, master_state, qpos, hand_flat, past, tremor = operator
     k = len(columns)
     slave, s = unpack_slave(slave_flat, k), unpack_slave_state(state_flat, k)
-    m, hand = unpack_master_state(master_state), unpack_muscles(hand_flat)
+    m, hand = unpack_master_state(master_state), unpack_neuromuscular_state(hand_flat)
     period, rows = state[PERIOD], len(back)
     arm = np.empty(k)
     for i in range(k):
         arm[i] = joint[columns[i]]
-    measure_task(slave, arm, fresh, elapsed, s)
-    report(slave, force, s, back[tick % rows])
+    measure_tip(slave, arm, fresh, elapsed, s)
+    write_machine_packet(slave, force, s, back[tick % rows])
     late = age[tick % len(age), 1]
     if late < 0:
-        state[QUIET] += period
+        state[SILENT_TIME] += period
     else:
-        state[QUIET] = 0.0
+        state[SILENT_TIME] = 0.0
         come = back[(tick - late) % rows]
         for row in range(len(come)):
             for i in range(k):  # values that are not finite are ignored
                 if np.isfinite(come[row, i]):
                     packet[row, i] = come[row, i]
-    goal = 0.0 if tripped or state[QUIET] > state[SILENCE] else 1.0
-    state[SHARE] += (goal - state[SHARE]) * min(1.0, period / state[FADING])
+    goal = 0.0 if tripped or state[SILENT_TIME] > state[MAX_SILENT_TIME] else 1.0
+    state[PACKET_GAIN] += (goal - state[PACKET_GAIN]) * min(1.0, period / state[FADE_OUT_TIME])
     numbers = unpack_master(master_flat)
-    master_step(numbers, qpos, packet, state[SHARE], period, tick == 0, m)
-    pull(hand, past, tremor, m.handle, tick, period)
+    step_master(numbers, qpos, packet, state[PACKET_GAIN], period, tick == 0, m)
+    compute_muscle_forces(hand, past, tremor, m.handle, tick, period)
     ahead = forward[tick % len(forward)]
     for i in range(6):
         own = m.stiffness[i] * m.handle[i] + numbers.axis[i, DAMPING] * m.speed[i]
         ahead[HANDLE, i], ahead[HANDLE_SPEED, i] = m.handle[i], m.speed[i]
         ahead[HAND, i] = m.hand[i] - own
-        if numbers.kind[0] == WAVES or numbers.kind[0] == CONTROLLED:
-            ahead[HANDLE_SPEED, i], ahead[HAND, i] = m.line[i, SENT], m.line[i, SENT + 1]
+        if numbers.kind[0] == WAVE_VARIABLES or numbers.kind[0] == PASSIVITY_CONTROL:
+            ahead[HANDLE_SPEED, i], ahead[HAND, i] = (
+                m.line[i, SENT_SIGNAL],
+                m.line[i, SENT_SIGNAL + 1],
+            )
 
 
 @compiled
-def to_the_machine(tick, machine, line, grid, table, scale, reference, rate, drive):
+def step_slave_side(tick, machine, line, grid, table, scale, reference, rate, drive):
     """Run the second half of a tick: receive the master's packet, write joint and drive references.
 
     Args:
@@ -281,15 +284,15 @@ def to_the_machine(tick, machine, line, grid, table, scale, reference, rate, dri
         measured[i] = joint[columns[i]]
     late = age[tick % len(age), 0]
     come = forward[(tick - max(late, 0)) % rows]
-    slave_step(slave, come, late >= 0, force, measured, state[PERIOD], s)
+    step_slave(slave, come, late >= 0, force, measured, state[PERIOD], s)
     for i in range(k):
         reference[columns[i]], rate[columns[i]] = s.joint[i], s.joint_rate[i]
-    drive_row(grid, table, reference, rate, scale, velocity, arm, volume_head, volume_rod)
+    interpolate_drive_reference(grid, table, reference, rate, scale, velocity, arm, volume_head, volume_rod)
     for i in range(k):
         velocity[columns[i]] = scale * arm[columns[i]] * s.ahead[i]
 
 
-STATION = np.dtype(
+STATION_DTYPE = np.dtype(
     [(name, np.int64) for name in ("axes", "joints", "ticks", "dofs", "swing", "simulated")]
     + [(name, np.int64) for name in ("forward_rows", "back_rows", "ages", "past_rows")]
     + [(name, np.int64) for name in ("tremor_rows", "points", "pose_columns")]
@@ -310,67 +313,70 @@ STATION = np.dtype(
 
 
 @compiled
-def _sides(r):
+def _unpack_record(r):
     """Return SlaveSide, Line and MasterSide as views of a record."""
     k, rows, back = r.joints, r.forward_rows, r.back_rows
     machine = SlaveSide(
-        floats(r.joint, r.axes), floats(r.force, k), integers(r.columns, k),
-        floats(r.slave, r.slave_size), floats(r.slave_state, r.slave_state_size),
+        float64_view(r.joint, r.axes), float64_view(r.force, k), int64_view(r.columns, k),
+        float64_view(r.slave, r.slave_size), float64_view(r.slave_state, r.slave_state_size),
     )  # fmt: skip
-    line = Line(
-        floats(r.forward, rows * 18).reshape((rows, 3, 6)),
-        floats(r.back, back * 8 * k).reshape((back, 8, k)), rows_of(r.packet, 8, k),
-        integers(r.age, 2 * r.ages).reshape((r.ages, 2)), floats(r.line_state, FADING + 1),
+    line = ChannelBuffers(
+        float64_view(r.forward, rows * 18).reshape((rows, 3, 6)),
+        float64_view(r.back, back * 8 * k).reshape((back, 8, k)), matrix_view(r.packet, 8, k),
+        int64_view(r.age, 2 * r.ages).reshape((r.ages, 2)), float64_view(r.line_state, FADE_OUT_TIME + 1),
     )  # fmt: skip
     operator = MasterSide(
-        floats(r.master, r.master_size), floats(r.master_state, r.master_state_size),
-        floats(r.qpos, 7), floats(r.muscles, r.muscles_size), rows_of(r.past, r.past_rows, 6),
-        rows_of(r.tremor, r.tremor_rows, 6),
+        float64_view(r.master, r.master_size), float64_view(r.master_state, r.master_state_size),
+        float64_view(r.qpos, 7), float64_view(r.muscles, r.muscles_size), matrix_view(r.past, r.past_rows, 6),
+        matrix_view(r.tremor, r.tremor_rows, 6),
     )  # fmt: skip
     return machine, line, operator
 
 
 @compiled
-def round_trip(station, flotor, tick, tripped):
+def step_teleoperation(station, flotor, tick, tripped):
     """Run one tick: first half, a period of the simulated joystick, second half, logging.
 
     Args:
         station: record of a Station.
         flotor: `SimulatedFlotor.record`, written.
         tick: scalar.
-        tripped: see `to_the_hand`, scalar.
+        tripped: see `step_master_side`, scalar.
 
     Returns:
         Whether a flag of the slave is set: held at the workspace edge, no packets, valves closed.
 
-    Source: `to_the_hand`, `simulate.joystick`, `to_the_machine`.
+    Source: `step_master_side`, `simulate.joystick`, `step_slave_side`.
     """
     r = station[0]
-    machine, line, operator = _sides(r)
+    machine, line, operator = _unpack_record(r)
     fresh, elapsed = tick % r.sampled == 0, r.sample_period if tick > 0 else 0.0
-    to_the_hand(tick, fresh, elapsed, tripped, machine, line, operator)
+    step_master_side(tick, fresh, elapsed, tripped, machine, line, operator)
     s, m = unpack_slave_state(machine.state, r.joints), unpack_master_state(operator.state)
-    force, n, nu = unpack_muscles(operator.muscles).force, r.ticks, r.axes
+    force, n, nu = unpack_neuromuscular_state(operator.muscles).force, r.ticks, r.axes
     if r.simulated:
-        unpack_master(operator.master).most[0] = flotor[0].allowed
+        unpack_master(operator.master).most[0] = flotor[0].current_limit
         if r.swing < 0:
             flotor_step(flotor[0], m.currents, force)
         else:
-            spin, spin_rate = floats(r.qvel, r.dofs)[r.swing], floats(r.qacc, r.dofs)[r.swing]
-            shaken_flotor_step(flotor[0], m.currents, force, spin, spin_rate)
-    copy_to(rows_of(r.log_master, n, r.master_state_size)[tick], operator.state)
-    copy_to(rows_of(r.log_slave, n, r.slave_state_size)[tick], machine.state)
-    copy_to(rows_of(r.log_force, n, r.joints)[tick], machine.force)
-    copy_to(rows_of(r.log_muscles, n, 6)[tick], force)
+            spin, spin_rate = (
+                float64_view(r.qvel, r.dof_indices)[r.swing],
+                float64_view(r.qacc, r.dof_indices)[r.swing],
+            )
+            flotor_step_in_cab(flotor[0], m.currents, force, spin, spin_rate)
+    copy_values(matrix_view(r.log_master, n, r.master_state_size)[tick], operator.state)
+    copy_values(matrix_view(r.log_slave, n, r.slave_state_size)[tick], machine.state)
+    copy_values(matrix_view(r.log_force, n, r.joints)[tick], machine.force)
+    copy_values(matrix_view(r.log_muscles, n, 6)[tick], force)
     drive = DriveReference(
-        rows_of(r.velocity, n, nu)[tick], rows_of(r.arm, n, nu)[tick],
-        rows_of(r.volume_head, n, nu)[tick], rows_of(r.volume_rod, n, nu)[tick],
+        matrix_view(r.velocity, n, nu)[tick], matrix_view(r.arm, n, nu)[tick],
+        matrix_view(r.volume_head, n, nu)[tick], matrix_view(r.volume_rod, n, nu)[tick],
     )  # fmt: skip
-    to_the_machine(
-        tick, machine, line, rows_of(r.grid, nu, 2),
-        floats(r.table, nu * r.points * 3).reshape((nu, r.points, 3)), r.scale,
-        rows_of(r.reference, n, nu)[tick], rows_of(r.rate, n, nu)[tick], drive,
+    step_slave_side(
+        tick, machine, line, matrix_view(r.grid, nu, 2),
+        float64_view(r.table, nu * r.points * 3).reshape((nu, r.points, 3)), r.scale,
+        matrix_view(r.reference, n, nu)[tick], matrix_view(r.rate, n, nu)[tick], drive,
     )  # fmt: skip
-    copy_to(rows_of(r.pose, n, r.pose_columns)[tick], s.pose[: r.pose_columns])
-    integers(r.touching, n)[tick] = short_integers(r.contacts, 1)[0] > 0
-    return s.flags[BLOCKED] != 0.0 or s.flags[SILENT] != 0.0 or s.flags[TRIPPED] != 0.0
+    copy_values(matrix_view(r.pose, n, r.pose_columns)[tick], s.pose[: r.pose_columns])
+    int64_view(r.touching, n)[tick] = int32_view(r.contacts, 1)[0] > 0
+    return s.flags[HELD_AT_EDGE] != 0.0 or s.flags[NO_PACKETS] != 0.0 or s.flags[VALVES_CLOSED] != 0.0

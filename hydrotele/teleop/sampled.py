@@ -34,22 +34,22 @@ import numpy as np
 from scipy.linalg import expm
 
 from hydrotele.core.errors import InputError
-from hydrotele.teleop.analysis import Case
-from hydrotele.teleop.round_trip import ages_of, in_periods
+from hydrotele.teleop.analysis import TeleoperatorAxis
+from hydrotele.teleop.round_trip import compute_packet_ages, delays_to_periods
 from hydrotele.teleop.two_port import RATE_STRUCTURES, STRUCTURES, Impedance
 
-WAVE, PASSIVITY = "wave_variables", "passivity_control"
-SAMPLED_STRUCTURES = (*STRUCTURES, WAVE, PASSIVITY)
+WAVE_STRUCTURE, PASSIVITY_STRUCTURE = "wave_variables", "passivity_control"
+SAMPLED_STRUCTURES = (*STRUCTURES, WAVE_STRUCTURE, PASSIVITY_STRUCTURE)
 _WHERE = "sampled teleoperator"
-_TURN = 0.5  # rad, maximum phase change between neighbouring points of the circle
-_FIRST = 400
+_MAX_PHASE_STEP = 0.5  # rad, maximum phase change between neighbouring points of the circle
+_INITIAL_POINTS = 400
 _MOST = 400_000
-_NEUTRAL = 1e-3  # 1/s: slower growth is drift, such as that of a free handle
-_FASTEST = 2e3  # 1/s, maximum magnitude of a growth rate
+_MIN_GROWTH_RATE = 1e-3  # 1/s: slower growth is drift, such as that of a free handle
+_MAX_GROWTH_RATE = 2e3  # 1/s, maximum magnitude of a growth rate
 # jitter gain above which single runs grow: their power grows with the mean of its logarithm, which
 # for exponentially distributed power is the logarithm of the mean minus Euler's gamma
-_PATHS = math.exp(np.euler_gamma)
-_REFINED = 1e-3  # absolute [1/s] and relative tolerance of a growth rate
+_MAX_JITTER_GAIN = math.exp(np.euler_gamma)
+_RATE_TOLERANCE = 1e-3  # absolute [1/s] and relative tolerance of a growth rate
 
 
 @dataclass(frozen=True)
@@ -77,14 +77,14 @@ class PacketAges:
                 raise InputError(_WHERE, f"the fractions of ages {name} must sum to 1")
 
     @property
-    def mean(self) -> tuple[float, float]:
+    def mean_ages(self) -> tuple[float, float]:
         """Mean age of the packets in use, forward and back [s]."""
         ages = (self.period * np.arange(len(p)) @ p for p in (self.forward, self.back))
         forward, back = map(float, ages)
         return forward, back
 
 
-def steady_line(period: float, delay_forward: float, delay_back: float) -> PacketAges:
+def constant_delay_ages(period: float, delay_forward: float, delay_back: float) -> PacketAges:
     """Create a channel with constant delays, rounded to periods.
 
     Args:
@@ -95,16 +95,14 @@ def steady_line(period: float, delay_forward: float, delay_back: float) -> Packe
     Returns:
         The packet ages.
 
-    >>> steady_line(0.005, 0.01, 0.0).forward
+    >>> constant_delay_ages(0.005, 0.01, 0.0).forward
     array([0., 0., 1.])
     """
     share = [np.eye(1 + round(d / period))[-1] for d in (delay_forward, delay_back)]
     return PacketAges(period, *share)
 
 
-def jittering_line(
-    period: float, delays_forward: np.ndarray, delays_back: np.ndarray
-) -> PacketAges:
+def measured_delay_ages(period: float, delays_forward: np.ndarray, delays_back: np.ndarray) -> PacketAges:
     """Create a channel from the delays of successive packets, one per period.
 
     Args:
@@ -116,12 +114,13 @@ def jittering_line(
         The packet ages; delays are rounded to periods.
     """
     return PacketAges(
-        period, *(_shares(in_periods(d, period)) for d in (delays_forward, delays_back))
+        period,
+        *(_age_distribution(delays_to_periods(d, period)) for d in (delays_forward, delays_back)),
     )
 
 
-def _shares(delays: np.ndarray) -> np.ndarray:
-    ages = ages_of(delays)
+def _age_distribution(delays: np.ndarray) -> np.ndarray:
+    ages = compute_packet_ages(delays)
     started = np.flatnonzero(ages <= np.arange(len(ages)))
     if not len(started):
         raise InputError(_WHERE, "no packet arrives within the given delays")
@@ -130,31 +129,31 @@ def _shares(delays: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class _Side:
-    """A mass with damper and spring under a held force; numerators over `below`, at points q."""
+class _SampledSide:
+    """A mass with damper and spring under a held force; numerators over `denominator`, at points q."""
 
-    below: np.ndarray
-    place: np.ndarray
+    denominator: np.ndarray
+    position: np.ndarray
     speed: np.ndarray  # true speed
-    change: np.ndarray  # acceleration just before a step of the force
+    acceleration: np.ndarray  # acceleration just before a step of the force
     period: float
     q: np.ndarray
 
     @property
     def rate(self) -> np.ndarray:
         """Backward difference of the position."""
-        return self.place * (1.0 - self.q) / self.period
+        return self.position * (1.0 - self.q) / self.period
 
-    def digital(self, z: Impedance) -> np.ndarray:
+    def digital_force(self, z: Impedance) -> np.ndarray:
         """Return the force of a digital controller: acceleration, differences and positions."""
-        return z.mass * self.change + z.damping * self.rate + z.stiffness * self.place
+        return z.mass * self.acceleration + z.damping * self.rate + z.stiffness * self.position
 
-    def physical(self, z: Impedance) -> np.ndarray:
+    def physical_force(self, z: Impedance) -> np.ndarray:
         """Return the force of a body that moves with this side, as a sensor measures it."""
-        return z.mass * self.change + z.damping * self.speed + z.stiffness * self.place
+        return z.mass * self.acceleration + z.damping * self.speed + z.stiffness * self.position
 
 
-def _side(own: Impedance, held: Impedance, period: float, q: np.ndarray) -> _Side:
+def _make_sampled_side(own: Impedance, held: Impedance, period: float, q: np.ndarray) -> _SampledSide:
     mass, damping = own.mass + held.mass, own.damping + held.damping
     stiffness = own.stiffness + held.stiffness
     block = np.zeros((3, 3))
@@ -167,16 +166,16 @@ def _side(own: Impedance, held: Impedance, period: float, q: np.ndarray) -> _Sid
     place = q * ((1.0 - q * a[1, 1]) * b[0] + q * a[0, 1] * b[1])
     speed = q * (q * a[1, 0] * b[0] + (1.0 - q * a[0, 0]) * b[1])
     change = (q * below - damping * speed - stiffness * place) / mass
-    return _Side(below, place, speed, change, period, q)
+    return _SampledSide(below, place, speed, change, period, q)
 
 
-def wave_impedance(case: Case) -> float:
+def wave_impedance(case: TeleoperatorAxis) -> float:
     """Return the wave impedance b [N s/m]; by default the damping of the slave's controller."""
     return case.wave or case.slave_control.damping or 1.0
 
 
 def sampled_characteristic(
-    case: Case, structure: str, line: PacketAges, q: np.ndarray, reflected: float = 1.0
+    case: TeleoperatorAxis, structure: str, line: PacketAges, q: np.ndarray, reflected: float = 1.0
 ) -> np.ndarray:
     """Return the characteristic function of the loop, which is 0 at the poles `z = 1/q`.
 
@@ -201,20 +200,23 @@ def sampled_characteristic(
         message = f"{structure!r} is not known: {', '.join(SAMPLED_STRUCTURES)}"
         raise InputError(_WHERE, message)
     q = np.asarray(q, complex)
-    ahead, home = _late(line.forward, q), reflected * _late(line.back, q)
-    near = _side(case.master, case.hand, line.period, q)
-    far = _side(case.slave, case.task, line.period, q)
-    if structure in (WAVE, PASSIVITY):
-        home = reflected * _after_slave(line, q)
-        return _serial(case, structure == WAVE, near, far, ahead, home)
+    ahead, home = (
+        _mean_channel_response(line.forward, q),
+        reflected * _mean_channel_response(line.back, q),
+    )
+    near = _make_sampled_side(case.master, case.hand, line.period, q)
+    far = _make_sampled_side(case.slave, case.task, line.period, q)
+    if structure in (WAVE_STRUCTURE, PASSIVITY_STRUCTURE):
+        home = reflected * _mean_return_response(line, q)
+        return _series_characteristic(case, structure == WAVE_STRUCTURE, near, far, ahead, home)
     own, forward = _master_laws(case, structure, near)
-    own_slave = far.digital(case.slave_control)
+    own_slave = far.digital_force(case.slave_control)
     back = _slave_law(case, structure, far)
-    free = near.below * ((1.0 - q) if structure in RATE_STRUCTURES else 1.0)
-    return (free + own) * (far.below + own_slave) - ahead * home * forward * back
+    free = near.denominator * ((1.0 - q) if structure in RATE_STRUCTURES else 1.0)
+    return (free + own) * (far.denominator + own_slave) - ahead * home * forward * back
 
 
-def _late(share: np.ndarray, q: np.ndarray) -> np.ndarray:
+def _mean_channel_response(share: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Evaluate E(q) by Horner's rule."""
     total = np.zeros_like(q)
     for part in share[::-1]:
@@ -222,66 +224,71 @@ def _late(share: np.ndarray, q: np.ndarray) -> np.ndarray:
     return total
 
 
-def _after_slave(line: PacketAges, q: np.ndarray) -> np.ndarray:
+def _mean_return_response(line: PacketAges, q: np.ndarray) -> np.ndarray:
     """Evaluate E(q) of the return channel if the slave answers packets of the same period."""
-    return _late(line.back, q) - line.back[0] * (1.0 - q)
+    return _mean_channel_response(line.back, q) - line.back[0] * (1.0 - q)
 
 
-def _master_laws(case: Case, structure: str, near: _Side) -> tuple[np.ndarray, np.ndarray]:
+def _master_laws(case: TeleoperatorAxis, structure: str, near: _SampledSide) -> tuple[np.ndarray, np.ndarray]:
     """Return the force on the master and that on the slave; times `1 - q` under rate control."""
     firm, own, gains = case.slave_control, case.master_control, case.gains
     if structure not in RATE_STRUCTURES:
-        forward = gains.position * near.digital(firm)
+        forward = gains.position * near.digital_force(firm)
         if structure == "four_channel_position":
-            forward = near.digital(firm) + near.digital(case.slave) - near.physical(case.hand)
-        return near.digital(own), forward
+            forward = near.digital_force(firm) + near.digital_force(case.slave) - near.physical_force(case.hand)
+        return near.digital_force(own), forward
     step = 1.0 - near.q
 
-    def rated(z: Impedance) -> np.ndarray:
-        return gains.velocity * near.place * (z.damping * step + z.stiffness * near.period)
+    def rate_force(z: Impedance) -> np.ndarray:
+        return gains.velocity * near.position * (z.damping * step + z.stiffness * near.period)
 
-    forward = rated(firm)
+    forward = rate_force(firm)
     if structure == "rate_force":
-        return step * near.digital(own), forward
+        return step * near.digital_force(own), forward
     if structure == "four_channel_rate":
-        forward = forward - gains.velocity * near.period * near.physical(case.hand)
-    return rated(own), forward
+        forward = forward - gains.velocity * near.period * near.physical_force(case.hand)
+    return rate_force(own), forward
 
 
-def _slave_law(case: Case, structure: str, far: _Side) -> np.ndarray:
+def _slave_law(case: TeleoperatorAxis, structure: str, far: _SampledSide) -> np.ndarray:
     """Return the force on the master from the slave's signals."""
     if structure in ("position_force", "rate_force"):
-        return -case.gains.force * far.physical(case.task)
-    back = far.digital(case.master_control)
+        return -case.gains.force * far.physical_force(case.task)
+    back = far.digital_force(case.master_control)
     if structure == "four_channel_position":
-        back = back + far.digital(case.master) - far.physical(case.task)
+        back = back + far.digital_force(case.master) - far.physical_force(case.task)
     if structure == "four_channel_rate":
-        change = far.physical(case.task) * (1.0 - far.q) / far.period
+        change = far.physical_force(case.task) * (1.0 - far.q) / far.period
         back = back - change / case.gains.velocity
     return back
 
 
-def _serial(
-    case: Case, waves: bool, near: _Side, far: _Side, ahead: np.ndarray, home: np.ndarray
+def _series_characteristic(
+    case: TeleoperatorAxis,
+    waves: bool,
+    near: _SampledSide,
+    far: _SampledSide,
+    ahead: np.ndarray,
+    home: np.ndarray,
 ) -> np.ndarray:
     """Return the loop of channel and slave controller in series, with or without waves."""
     step, firm = 1.0 - near.q, case.slave_control
     held = firm.damping * step + firm.stiffness * near.period  # C = held / step
     if not waves:
-        alone = step * far.below + held * far.rate
-        return near.below * alone + ahead * home * held * near.rate * far.below
+        alone = step * far.denominator + held * far.rate
+        return near.denominator * alone + ahead * home * held * near.rate * far.denominator
     b = wave_impedance(case)
     share = b * step + held  # F_s = b held / share (sqrt(2 / b) U - v_s)
-    slave = share * far.below + b * held * far.rate
-    master = near.below + b * near.rate
+    slave = share * far.denominator + b * held * far.rate
+    master = near.denominator + b * near.rate
     # determinant of [master, -a home, 2 home D], [-a ahead n, 1 + ahead home, -c ahead home D],
     # [0, -b c held, slave] with a = sqrt(2 b), c = sqrt(2 / b)
-    first = (1.0 + ahead * home) * slave - ahead * home * 2.0 * held * far.below
-    second = 2.0 * b * near.rate * ahead * home * (slave - 2.0 * held * far.below)
+    first = (1.0 + ahead * home) * slave - ahead * home * 2.0 * held * far.denominator
+    second = 2.0 * b * near.rate * ahead * home * (slave - 2.0 * held * far.denominator)
     return master * first - second
 
 
-def growth_rate(case: Case, structure: str, line: PacketAges, reflected: float = 1.0) -> float:
+def growth_rate(case: TeleoperatorAxis, structure: str, line: PacketAges, reflected: float = 1.0) -> float:
     """Return the growth rate of the fastest growing motion, negative if all decay, without drift.
 
     Args:
@@ -296,32 +303,32 @@ def growth_rate(case: Case, structure: str, line: PacketAges, reflected: float =
     Raises:
         InputError: the structure is not known, or a pole lies on the contour.
     """
-    return _fastest(lambda q: sampled_characteristic(case, structure, line, q, reflected), line)
+    return _find_growth_rate(lambda q: sampled_characteristic(case, structure, line, q, reflected), line)
 
 
-def _fastest(function, line: PacketAges) -> float:
-    still = _inside(function, 0.5 * _NEUTRAL * line.period, centre=1.0)
+def _find_growth_rate(function, line: PacketAges) -> float:
+    still = _count_zeros_inside(function, 0.5 * _MIN_GROWTH_RATE * line.period, centre=1.0)
 
-    def grows(rate: float) -> bool:
-        many = _inside(function, math.exp(-rate * line.period))
+    def has_faster_growth(rate: float) -> bool:
+        many = _count_zeros_inside(function, math.exp(-rate * line.period))
         return many > (still if rate < 0.0 else 0)
 
-    least, most = (0.0, _FASTEST) if grows(_NEUTRAL) else (-_FASTEST, 0.0)
-    least, most = (_NEUTRAL, most) if most else (least, -_NEUTRAL)
-    if grows(most):
+    least, most = (0.0, _MAX_GROWTH_RATE) if has_faster_growth(_MIN_GROWTH_RATE) else (-_MAX_GROWTH_RATE, 0.0)
+    least, most = (_MIN_GROWTH_RATE, most) if most else (least, -_MIN_GROWTH_RATE)
+    if has_faster_growth(most):
         return most
-    while most - least > _REFINED * (1.0 + abs(most)):
+    while most - least > _RATE_TOLERANCE * (1.0 + abs(most)):
         middle = 0.5 * (least + most)
-        least, most = (middle, most) if grows(middle) else (least, middle)
+        least, most = (middle, most) if has_faster_growth(middle) else (least, middle)
     return 0.5 * (least + most)
 
 
-def _inside(function, radius: float, centre: float = 0.0) -> int:
+def _count_zeros_inside(function, radius: float, centre: float = 0.0) -> int:
     """Count the zeros of a function without poles inside a circle with a real centre."""
-    angle = np.concatenate([[0.0], np.geomspace(1e-7, math.pi, _FIRST)])
+    angle = np.concatenate([[0.0], np.geomspace(1e-7, math.pi, _INITIAL_POINTS)])
     values = function(centre + radius * np.exp(1j * angle))
     while True:
-        wide = np.flatnonzero(np.abs(np.angle(values[1:] / values[:-1])) > _TURN)
+        wide = np.flatnonzero(np.abs(np.angle(values[1:] / values[:-1])) > _MAX_PHASE_STEP)
         if not len(wide):
             break
         between = 0.5 * (angle[wide] + angle[wide + 1])
@@ -332,12 +339,12 @@ def _inside(function, radius: float, centre: float = 0.0) -> int:
     return round(float(np.angle(values[1:] / values[:-1]).sum()) / math.pi)
 
 
-def _angles() -> np.ndarray:
+def _unit_circle_points() -> np.ndarray:
     """Return points of the unit circle up to half the sampling rate."""
     return np.exp(-1j * np.geomspace(1e-6, math.pi, 4000))
 
 
-def passive_end(case: Case, line: PacketAges) -> bool:
+def is_slave_end_passive(case: TeleoperatorAxis, line: PacketAges) -> bool:
     """Return whether the slave's end of the channel is passive as it is sampled.
 
     The response of the slave's controller with mass and task from reference velocity to force,
@@ -353,31 +360,31 @@ def passive_end(case: Case, line: PacketAges) -> bool:
 
     Source: Colgate and Schenkel 1997 (passivity of sampled walls); passivity theorem.
     """
-    q = _angles()
-    far, firm = _side(case.slave, case.task, line.period, q), case.slave_control
+    q = _unit_circle_points()
+    far, firm = _make_sampled_side(case.slave, case.task, line.period, q), case.slave_control
     held = firm.damping * (1.0 - q) + firm.stiffness * line.period
-    port = held * far.below / ((1.0 - q) * far.below + held * far.rate)
-    grows = _inside(lambda p: slave_characteristic(case, line, p), math.exp(_NEUTRAL * line.period))
+    port = held * far.denominator / ((1.0 - q) * far.denominator + held * far.rate)
+    grows = _count_zeros_inside(lambda p: slave_characteristic(case, line, p), math.exp(_MIN_GROWTH_RATE * line.period))
     return bool(np.all(port.real > -1e-6 * np.abs(port))) and not grows
 
 
-def _answers(case: Case, structure: str, line: PacketAges, q: np.ndarray, reflected: float):
+def _side_responses(case: TeleoperatorAxis, structure: str, line: PacketAges, q: np.ndarray, reflected: float):
     """Return the transfer functions of master and slave from received to sent signals."""
-    near = _side(case.master, case.hand, line.period, q)
-    far = _side(case.slave, case.task, line.period, q)
-    if structure == WAVE:
+    near = _make_sampled_side(case.master, case.hand, line.period, q)
+    far = _make_sampled_side(case.slave, case.task, line.period, q)
+    if structure == WAVE_STRUCTURE:
         b, firm = wave_impedance(case), case.slave_control
         held = firm.damping * (1.0 - q) + firm.stiffness * line.period
-        master = (b * near.rate - near.below) / (b * near.rate + near.below)
+        master = (b * near.rate - near.denominator) / (b * near.rate + near.denominator)
         share = b * (1.0 - q) + held
-        return master, 1.0 - 2.0 * held * far.below / (share * far.below + b * held * far.rate)
+        return master, 1.0 - 2.0 * held * far.denominator / (share * far.denominator + b * held * far.rate)
     own, forward = _master_laws(case, structure, near)
-    free = near.below * ((1.0 - q) if structure in RATE_STRUCTURES else 1.0)
+    free = near.denominator * ((1.0 - q) if structure in RATE_STRUCTURES else 1.0)
     back = reflected * _slave_law(case, structure, far)
-    return forward / (free + own), back / (far.below + far.digital(case.slave_control))
+    return forward / (free + own), back / (far.denominator + far.digital_force(case.slave_control))
 
 
-def jitter_gain(case: Case, structure: str, line: PacketAges, reflected: float = 1.0) -> float:
+def jitter_gain(case: TeleoperatorAxis, structure: str, line: PacketAges, reflected: float = 1.0) -> float:
     """Return the mean-square loop gain of the noise that jitter causes.
 
     A signal of frequency w that passes a channel of random age leaves `E(q)` of it, and noise with
@@ -400,9 +407,9 @@ def jitter_gain(case: Case, structure: str, line: PacketAges, reflected: float =
     """
     angle = np.geomspace(1e-4, math.pi, 6000)
     q = np.exp(-1j * angle)
-    master, slave = _answers(case, structure, line, q, reflected)
-    ahead = _late(line.forward, q)
-    home = _after_slave(line, q) if structure == WAVE else _late(line.back, q)
+    master, slave = _side_responses(case, structure, line, q, reflected)
+    ahead = _mean_channel_response(line.forward, q)
+    home = _mean_return_response(line, q) if structure == WAVE_STRUCTURE else _mean_channel_response(line.back, q)
     left = 1.0 - master * slave * ahead * home
     powers = np.array([
         [master * home * slave / left, master / left],
@@ -413,7 +420,7 @@ def jitter_gain(case: Case, structure: str, line: PacketAges, reflected: float =
     return float(np.abs(np.linalg.eigvals(table)).max())
 
 
-def slave_characteristic(case: Case, line: PacketAges, q: np.ndarray) -> np.ndarray:
+def slave_characteristic(case: TeleoperatorAxis, line: PacketAges, q: np.ndarray) -> np.ndarray:
     """Return the characteristic function of slave, controller and task with a held reference.
 
     Args:
@@ -424,26 +431,28 @@ def slave_characteristic(case: Case, line: PacketAges, q: np.ndarray) -> np.ndar
     Returns:
         (...).
     """
-    far = _side(case.slave, case.task, line.period, np.asarray(q, complex))
-    return far.below + far.digital(case.slave_control)
+    far = _make_sampled_side(case.slave, case.task, line.period, np.asarray(q, complex))
+    return far.denominator + far.digital_force(case.slave_control)
 
 
 @dataclass(frozen=True)
-class Prediction:
+class StabilityPrediction:
     """Predicted stability of a sampled structure.
 
     Attributes:
-        stable: whether a disturbance decays; under passivity control, whether it stays bounded.
+        is_stable: whether a disturbance decays; under passivity control, whether it stays bounded.
         reason: `poles`, `jitter` (noise caused by jitter grows, though the mean does not), or for
             passivity control `slave alone` (its own controller is unstable), `no control needed`,
             `passive ends`, `bounded` (the slave's end is stable but not passive).
     """
 
-    stable: bool
+    is_stable: bool
     reason: str
 
 
-def predict(case: Case, structure: str, line: PacketAges, reflected: float = 1.0) -> Prediction:
+def predict_stability(
+    case: TeleoperatorAxis, structure: str, line: PacketAges, reflected: float = 1.0
+) -> StabilityPrediction:
     """Predict whether a sampled structure is stable.
 
     Args:
@@ -459,32 +468,32 @@ def predict(case: Case, structure: str, line: PacketAges, reflected: float = 1.0
         InputError: the structure is not known, or a pole lies on the contour.
     """
 
-    def whole(q: np.ndarray) -> np.ndarray:
+    def loop_function(q: np.ndarray) -> np.ndarray:
         return sampled_characteristic(case, structure, line, q, reflected)
 
-    def alone(q: np.ndarray) -> np.ndarray:
+    def slave_function(q: np.ndarray) -> np.ndarray:
         return slave_characteristic(case, line, q)
 
-    slowest = math.exp(-_NEUTRAL * line.period)
-    steady = _inside(whole, slowest) == 0
-    if structure != PASSIVITY:
+    slowest = math.exp(-_MIN_GROWTH_RATE * line.period)
+    steady = _count_zeros_inside(loop_function, slowest) == 0
+    if structure != PASSIVITY_STRUCTURE:
         if not steady:
-            return Prediction(False, "poles")
-        if jitter_gain(case, structure, line, reflected) >= _PATHS:
-            return Prediction(False, "jitter")
-        return Prediction(True, "poles")
+            return StabilityPrediction(False, "poles")
+        if jitter_gain(case, structure, line, reflected) >= _MAX_JITTER_GAIN:
+            return StabilityPrediction(False, "jitter")
+        return StabilityPrediction(True, "poles")
     if steady:
-        return Prediction(True, "no control needed")
-    if _inside(alone, slowest):
-        return Prediction(False, "slave alone")
-    return Prediction(True, "passive ends" if passive_end(case, line) else "bounded")
+        return StabilityPrediction(True, "no control needed")
+    if _count_zeros_inside(slave_function, slowest):
+        return StabilityPrediction(False, "slave alone")
+    return StabilityPrediction(True, "passive ends" if is_slave_end_passive(case, line) else "bounded")
 
 
-_UNBOUNDED = 1e6  # larger values of damping or inertia count as unbounded
-_FINE = 1e-9  # relative tolerance of the bisection
+_MAX_INERTIA = 1e6  # larger values of damping or inertia count as unbounded
+_BISECTION_TOLERANCE = 1e-9  # relative tolerance of the bisection
 
 
-class Body(NamedTuple):
+class HandleBody(NamedTuple):
     """Mass matrix of a handle in n coordinates, with the spring and damper of the hand.
 
     Attributes:
@@ -498,9 +507,7 @@ class Body(NamedTuple):
     damping: np.ndarray
 
 
-def tilting_body(
-    mass: float, arm: float, inertia: float, hand: tuple[float, ...] = (0.0,) * 5
-) -> Body:
+def make_tilting_body(mass: float, arm: float, inertia: float, hand: tuple[float, ...] = (0.0,) * 5) -> HandleBody:
     """Create a handle that translates and tilts in a vertical plane, x and ry.
 
     Args:
@@ -516,10 +523,10 @@ def tilting_body(
     """
     m, b, k, rub, spring = hand
     own = np.array([[mass + m, mass * arm], [mass * arm, inertia + mass * arm * arm]])
-    return Body(own, np.diag([k, spring]), np.diag([b, rub]))
+    return HandleBody(own, np.diag([k, spring]), np.diag([b, rub]))
 
 
-def spinning_body(inertia: float, damping: float = 0.0, stiffness: float = 0.0) -> Body:
+def make_spinning_body(inertia: float, damping: float = 0.0, stiffness: float = 0.0) -> HandleBody:
     """Create a handle that only rotates about its own axis.
 
     Args:
@@ -530,10 +537,10 @@ def spinning_body(inertia: float, damping: float = 0.0, stiffness: float = 0.0) 
     Returns:
         The body.
     """
-    return Body(np.array([[inertia]]), np.array([[stiffness]]), np.array([[damping]]))
+    return HandleBody(np.array([[inertia]]), np.array([[stiffness]]), np.array([[damping]]))
 
 
-def slowest_decay(body: Body, stiffness: np.ndarray, damping: np.ndarray, period: float) -> float:
+def max_loop_eigenvalue(body: HandleBody, stiffness: np.ndarray, damping: np.ndarray, period: float) -> float:
     """Return the largest eigenvalue of the sampled loop; below 1 the handle comes to rest.
 
     Args:
@@ -550,8 +557,8 @@ def slowest_decay(body: Body, stiffness: np.ndarray, damping: np.ndarray, period
 
     Source: zero-order hold by the matrix exponential; speed as the difference of two readings.
 
-    >>> held = slowest_decay(spinning_body(1.5e-3), np.array([6.0]), np.array([0.25]), 5e-3)
-    >>> shaken = slowest_decay(spinning_body(1.5e-3), np.array([6.0]), np.array([3.0]), 5e-3)
+    >>> held = max_loop_eigenvalue(make_spinning_body(1.5e-3), np.array([6.0]), np.array([0.25]), 5e-3)
+    >>> shaken = max_loop_eigenvalue(make_spinning_body(1.5e-3), np.array([6.0]), np.array([3.0]), 5e-3)
     >>> held < 1.0 < shaken
     True
     """
@@ -570,7 +577,7 @@ def slowest_decay(body: Body, stiffness: np.ndarray, damping: np.ndarray, period
     return float(np.abs(np.linalg.eigvals(loop)).max())
 
 
-def largest_damping(inertia: float, stiffness: float, period: float) -> float:
+def max_stable_damping(inertia: float, stiffness: float, period: float) -> float:
     """Return the maximum damping for which a spinning handle is stable.
 
     Args:
@@ -581,29 +588,29 @@ def largest_damping(inertia: float, stiffness: float, period: float) -> float:
     Returns:
         [N m s/rad]; 0 if no damping stabilises this spring.
 
-    Source: `slowest_decay`; without a spring it is 2 inertia / period.
+    Source: `max_loop_eigenvalue`; without a spring it is 2 inertia / period.
 
-    >>> round(largest_damping(1.5e-3, 0.0, 5e-3), 6)
+    >>> round(max_stable_damping(1.5e-3, 0.0, 5e-3), 6)
     0.6
     """
-    body = spinning_body(inertia)
+    body = make_spinning_body(inertia)
 
-    def holds(damping: float) -> bool:
-        decay = slowest_decay(body, np.array([stiffness]), np.array([damping]), period)
+    def is_stable(damping: float) -> bool:
+        decay = max_loop_eigenvalue(body, np.array([stiffness]), np.array([damping]), period)
         return decay < 1.0 + 1e-12
 
     tried = np.geomspace(1e-3, 1.0, 400) * 2.0 * inertia / period
-    good = [d for d in tried if holds(d)]
+    good = [d for d in tried if is_stable(d)]
     if not good:
         return 0.0
     low, high = good[-1], good[-1] * 1.05
-    while high - low > _FINE * high:
+    while high - low > _BISECTION_TOLERANCE * high:
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if holds(middle) else (low, middle)
+        low, high = (middle, high) if is_stable(middle) else (low, middle)
     return float(low)
 
 
-def least_inertia(damping: float, stiffness: float, period: float) -> float:
+def min_stable_inertia(damping: float, stiffness: float, period: float) -> float:
     """Return the minimum inertia for which a spinning handle is stable with a damping.
 
     Args:
@@ -614,24 +621,24 @@ def least_inertia(damping: float, stiffness: float, period: float) -> float:
     Returns:
         [kg m^2]; infinite if there is none below 1e6.
 
-    Source: `slowest_decay`; without a spring it is damping period / 2.
+    Source: `max_loop_eigenvalue`; without a spring it is damping period / 2.
 
-    >>> round(least_inertia(3.0, 0.0, 5e-3), 6)
+    >>> round(min_stable_inertia(3.0, 0.0, 5e-3), 6)
     0.0075
     """
 
-    def holds(inertia: float) -> bool:
-        body = spinning_body(inertia)
-        decay = slowest_decay(body, np.array([stiffness]), np.array([damping]), period)
+    def is_stable(inertia: float) -> bool:
+        body = make_spinning_body(inertia)
+        decay = max_loop_eigenvalue(body, np.array([stiffness]), np.array([damping]), period)
         return decay < 1.0 + 1e-12
 
     low = high = 0.5 * damping * period
-    while not holds(high):
+    while not is_stable(high):
         low, high = high, 2.0 * high
-        if high > _UNBOUNDED:
+        if high > _MAX_INERTIA:
             return float("inf")
     low = low if high > low else 0.5 * low
-    while high - low > _FINE * high:
+    while high - low > _BISECTION_TOLERANCE * high:
         middle = 0.5 * (low + high)
-        low, high = (low, middle) if holds(middle) else (middle, high)
+        low, high = (low, middle) if is_stable(middle) else (middle, high)
     return float(high)

@@ -13,56 +13,59 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.core.compiled import compiled
-from hydrotele.teleop.analysis import Case
+from hydrotele.teleop.analysis import TeleoperatorAxis
 from hydrotele.teleop.passive_line import (
-    END,
-    ENERGY,
-    GONE_IN,
-    controlled_master,
-    controlled_slave,
-    wave_master,
-    wave_slave,
+    END_SIZE,
+    ENERGY_IN,
+    STORED_ENERGY,
+    step_passivity_master,
+    step_passivity_slave,
+    step_wave_master,
+    step_wave_slave,
 )
-from hydrotele.teleop.round_trip import ages_of, in_periods
-from hydrotele.teleop.sampled import PASSIVITY, WAVE, wave_impedance
+from hydrotele.teleop.round_trip import compute_packet_ages, delays_to_periods
+from hydrotele.teleop.sampled import PASSIVITY_STRUCTURE, WAVE_STRUCTURE, wave_impedance
 from hydrotele.teleop.two_port import RATE_STRUCTURES, Impedance
 
 # signals of a side: sum, position, difference, acceleration, sum and difference of the force on
 # hand or task, that force
-SUM, X, V, A, IMPULSE, CHANGE, FORCE = range(7)
+SUM, X, V, A, IMPULSE, FORCE_RATE, FORCE = range(7)
 _SIGNALS = 7
-_PER_RATE = 0.1  # integration steps per time constant of the fastest mode
-_TRICKLE = 1e-5  # W of passivity control: in one run less than a tenth of the initial energy
-_KICK = np.array([0.1, 0.03])  # m/s, of master and slave
+_STEP_RATIO = 0.1  # integration steps per time constant of the fastest mode
+_MIN_POWER = 1e-5  # W of passivity control: in one run less than a tenth of the initial energy
+_INITIAL_SPEEDS = np.array([0.1, 0.03])  # m/s, of master and slave
 _BLOCKS = 40
-_GROWN, _GONE = 1e8, 1e-8  # factors on the initial speed beyond which a run is stopped
+_MAX_SPEED_RATIO, _MIN_SPEED_RATIO = (
+    1e8,
+    1e-8,
+)  # factors on the initial speed beyond which a run is stopped
 _LINEAR, _WAVES, _CONTROLLED = range(3)
 
 
-class Motion(NamedTuple):
+class KickResponse(NamedTuple):
     """Response to initial velocities.
 
     Attributes:
-        largest: (40,) maximum of the sum of both speeds in each fortieth of the run [m/s]; 0 after
+        max_speeds: (40,) maximum of the sum of both speeds in each fortieth of the run [m/s]; 0 after
             an early stop.
-        grows: whether late motion is larger than early motion; under passivity control, which
+        is_growing: whether late motion is larger than early motion; under passivity control, which
             bounds motions without damping them, whether it has more kinetic energy than at the
             start.
         line_energy: (periods,) energy that has entered the channel at both ends [J]; 0 for the six
             structures without waves or passivity control.
     """
 
-    largest: np.ndarray
-    grows: bool
+    max_speeds: np.ndarray
+    is_growing: bool
     line_energy: np.ndarray
 
     @property
-    def dies_out(self) -> bool:
+    def has_decayed(self) -> bool:
         """Whether less than a thousandth of the initial speed remains at the end."""
-        return bool(self.largest[self.largest > 0.0][-1] < 1e-3 * _KICK.max())
+        return bool(self.max_speeds[self.max_speeds > 0.0][-1] < 1e-3 * _INITIAL_SPEEDS.max())
 
 
-def laws(case: Case, structure: str, reflected: float = 1.0) -> np.ndarray:
+def control_coefficients(case: TeleoperatorAxis, structure: str, reflected: float = 1.0) -> np.ndarray:
     """Return the coefficients of the control laws on the signals of each side.
 
     Args:
@@ -100,15 +103,15 @@ def laws(case: Case, structure: str, reflected: float = 1.0) -> np.ndarray:
         add(back, case.master, X)
         forward[FORCE], back[FORCE] = -1.0, -1.0
     if structure == "four_channel_rate":
-        forward[IMPULSE], back[CHANGE] = -gains.velocity, -1.0 / gains.velocity
+        forward[IMPULSE], back[FORCE_RATE] = -gains.velocity, -1.0 / gains.velocity
     back *= reflected
     return made
 
 
-def kick(
-    case: Case, structure: str, period: float, delays_forward: np.ndarray, delays_back: np.ndarray,
+def simulate_kick(
+    case: TeleoperatorAxis, structure: str, period: float, delays_forward: np.ndarray, delays_back: np.ndarray,
     reflected: float = 1.0,
-) -> Motion:  # fmt: skip
+) -> KickResponse:  # fmt: skip
     """Simulate the response to initial velocities of master and slave.
 
     Args:
@@ -127,49 +130,49 @@ def kick(
     """
     way = _LINEAR
     table = np.zeros((4, _SIGNALS))
-    if structure in (WAVE, PASSIVITY):
-        way = _WAVES if structure == WAVE else _CONTROLLED
+    if structure in (WAVE_STRUCTURE, PASSIVITY_STRUCTURE):
+        way = _WAVES if structure == WAVE_STRUCTURE else _CONTROLLED
     else:
-        table = laws(case, structure, reflected)
-    ages = [ages_of(in_periods(d, period)) for d in (delays_forward, delays_back)]
+        table = control_coefficients(case, structure, reflected)
+    ages = [compute_packet_ages(delays_to_periods(d, period)) for d in (delays_forward, delays_back)]
     firm = case.slave_control
     bodies = np.array([
         [a.mass, a.damping, a.stiffness, b.mass, b.damping, b.stiffness]
         for a, b in ((case.master, case.hand), (case.slave, case.task))
     ])  # fmt: skip
-    steps = max(1, math.ceil(period * _fastest_rate(bodies) / _PER_RATE))
+    steps = max(1, math.ceil(period * _max_mode_rate(bodies) / _STEP_RATIO))
     numbers = np.array([period, firm.stiffness, firm.damping, wave_impedance(case)])
-    largest, moving, energy = _march(way, table, bodies, numbers, steps, ages[0], ages[1], _KICK)
-    given = 0.5 * float((bodies[:, 0] + bodies[:, 3]) @ _KICK**2)
-    grows = _beyond(moving, given) if way == _CONTROLLED else _grows(largest)
-    return Motion(largest, grows, energy)
+    largest, moving, energy = _integrate_run(way, table, bodies, numbers, steps, ages[0], ages[1], _INITIAL_SPEEDS)
+    given = 0.5 * float((bodies[:, 0] + bodies[:, 3]) @ _INITIAL_SPEEDS**2)
+    grows = _has_gained_energy(moving, given) if way == _CONTROLLED else _is_growing(largest)
+    return KickResponse(largest, grows, energy)
 
 
-def _fastest_rate(bodies: np.ndarray) -> float:
+def _max_mode_rate(bodies: np.ndarray) -> float:
     mass, damping, stiffness = bodies[:, :3].T + bodies[:, 3:].T
     return float(max((damping / mass).max(), np.sqrt(stiffness / mass).max()))
 
 
-_GROWTH = 1.05  # ratio of late to early motion above which motion grows; drift stays below
+_MIN_GROWTH_RATIO = 1.05  # ratio of late to early motion above which motion grows; drift stays below
 
 
-def _grows(largest: np.ndarray) -> bool:
+def _is_growing(largest: np.ndarray) -> bool:
     """Return whether the last quarter of the run moves more than the second one."""
     reached = int(np.count_nonzero(largest > 0.0))
     if reached < _BLOCKS:
-        return bool(largest[reached - 1] > _KICK.max())
+        return bool(largest[reached - 1] > _INITIAL_SPEEDS.max())
     quarter = _BLOCKS // 4
-    return bool(largest[-quarter:].max() > _GROWTH * largest[quarter : 2 * quarter].max())
+    return bool(largest[-quarter:].max() > _MIN_GROWTH_RATIO * largest[quarter : 2 * quarter].max())
 
 
-def _beyond(largest: np.ndarray, given: float) -> bool:
+def _has_gained_energy(largest: np.ndarray, given: float) -> bool:
     """Return whether late motion has more energy than the initial motion."""
     late = largest[largest > 0.0][-_BLOCKS // 4 :]
-    return bool(late.max() > _GROWTH * given)
+    return bool(late.max() > _MIN_GROWTH_RATIO * given)
 
 
 @compiled
-def _march(way, table, bodies, numbers, steps, age_forward, age_back, first):
+def _integrate_run(way, table, bodies, numbers, steps, age_forward, age_back, first):
     """Return largest speeds (40,) and kinetic energies (40,), and energy in the channel (n,)."""
     count = len(age_forward)
     period = numbers[0]
@@ -178,7 +181,7 @@ def _march(way, table, bodies, numbers, steps, age_forward, age_back, first):
     state = np.zeros((2, 2))  # position, speed
     state[0, 1], state[1, 1] = first[0], first[1]
     seen, force = np.zeros((2, _SIGNALS)), np.zeros(2)
-    ends, come = np.zeros((2, END)), np.zeros((2, _SIGNALS))
+    ends, come = np.zeros((2, END_SIZE)), np.zeros((2, _SIGNALS))
     for n in range(count):
         for side in range(2):
             _measure(bodies[side], state[side], force[side], period, seen[side])
@@ -194,10 +197,10 @@ def _march(way, table, bodies, numbers, steps, age_forward, age_back, first):
                     force[side] -= table[2 * side, j] * seen[side, j]
                     force[side] += table[3 - 2 * side, j] * come[1 - side, j]
         elif way == _WAVES:
-            _waves(n, newest[0], newest[1], numbers, seen, sent, ends, force)
+            _step_waves(n, newest[0], newest[1], numbers, seen, sent, ends, force)
         else:
-            _controlled(n, newest[0], newest[1], numbers, bodies[0, 0], seen, sent, ends, force)
-        energy[n] = ends[0, ENERGY] + ends[1, ENERGY]
+            _step_passivity_control(n, newest[0], newest[1], numbers, bodies[0, 0], seen, sent, ends, force)
+        energy[n] = ends[0, STORED_ENERGY] + ends[1, STORED_ENERGY]
         for side in range(2):
             _integrate(bodies[side], state[side], force[side], period, steps)
         block = n * _BLOCKS // count
@@ -208,7 +211,7 @@ def _march(way, table, bodies, numbers, steps, age_forward, age_back, first):
             kinetic += 0.5 * (bodies[side, 0] + bodies[side, 3]) * state[side, 1] ** 2
         moving[block] = max(moving[block], kinetic)
         if (n + 1) * _BLOCKS % count < _BLOCKS:
-            if largest[block] < _GONE * first[0] or not largest[block] < _GROWN * first[0]:
+            if largest[block] < _MIN_SPEED_RATIO * first[0] or not largest[block] < _MAX_SPEED_RATIO * first[0]:
                 break
     return largest, moving, energy
 
@@ -224,31 +227,31 @@ def _measure(body, state, force, period, seen):
     seen[V] = (x - seen[X]) / period
     seen[X], seen[A] = x, a
     seen[IMPULSE] += period * held
-    seen[CHANGE] = (held - seen[FORCE]) / period
+    seen[FORCE_RATE] = (held - seen[FORCE]) / period
     seen[FORCE] = held
 
 
 # elements of a packet: sum of waves, position of the master or force of the slave; their energy
-TOTAL, BUDGET = range(2)
+PACKET_SIGNAL, PACKET_ENERGY = range(2)
 
 
 @compiled
-def _newest(sent, row, n):
+def _read_packet(sent, row, n):
     """Return sum or signal, and energy, of a packet; zeros before the first arrival."""
     if row < 0:
         return 0.0, 0.0
-    return sent[min(row, n), TOTAL], sent[min(row, n), BUDGET]
+    return sent[min(row, n), PACKET_SIGNAL], sent[min(row, n), PACKET_ENERGY]
 
 
 @compiled
-def _waves(n, newest_forward, newest_back, numbers, seen, sent, ends, force):
+def _step_waves(n, newest_forward, newest_back, numbers, seen, sent, ends, force):
     """Run both ends of waves; the master acts first and uses the slave's previous period."""
     period, stiffness, damping, b = numbers[0], numbers[1], numbers[2], numbers[3]
-    total, budget = _newest(sent[1], newest_back, n - 1)
-    pushed, wave = wave_master(seen[0, V], total, budget, b, period, ends[0])
+    total, budget = _read_packet(sent[1], newest_back, n - 1)
+    pushed, wave = step_wave_master(seen[0, V], total, budget, b, period, ends[0])
     _send(sent[0], n, wave, period)
-    total, budget = _newest(sent[0], newest_forward, n)
-    pull, wave = wave_slave(seen[1, V], total, budget, stiffness, damping, b, period, ends[1])
+    total, budget = _read_packet(sent[0], newest_forward, n)
+    pull, wave = step_wave_slave(seen[1, V], total, budget, stiffness, damping, b, period, ends[1])
     _send(sent[1], n, wave, period)
     force[0], force[1] = -pushed, pull
 
@@ -257,23 +260,21 @@ def _waves(n, newest_forward, newest_back, numbers, seen, sent, ends, force):
 def _send(sent, n, wave, period):
     before, energy = 0.0, 0.0
     if n > 0:
-        before, energy = sent[n - 1, TOTAL], sent[n - 1, BUDGET]
-    sent[n, TOTAL] = before + period * wave
-    sent[n, BUDGET] = energy + period * wave * wave
+        before, energy = sent[n - 1, PACKET_SIGNAL], sent[n - 1, PACKET_ENERGY]
+    sent[n, PACKET_SIGNAL] = before + period * wave
+    sent[n, PACKET_ENERGY] = energy + period * wave * wave
 
 
 @compiled
-def _controlled(n, newest_forward, newest_back, numbers, mass, seen, sent, ends, force):
+def _step_passivity_control(n, newest_forward, newest_back, numbers, mass, seen, sent, ends, force):
     """Run both ends of passivity control; the master acts first, as for waves."""
     period, stiffness, damping = numbers[0], numbers[1], numbers[2]
-    total, budget = _newest(sent[1], newest_back, n - 1)
-    force[0] = -controlled_master(seen[0, V], total, budget, mass, period, ends[0])
-    sent[0, n, TOTAL], sent[0, n, BUDGET] = seen[0, X], ends[0, GONE_IN]
-    total, budget = _newest(sent[0], newest_forward, n)
-    force[1] = controlled_slave(
-        seen[1, V], total, budget, stiffness, damping, _TRICKLE, period, ends[1]
-    )
-    sent[1, n, TOTAL], sent[1, n, BUDGET] = force[1], ends[1, GONE_IN]
+    total, budget = _read_packet(sent[1], newest_back, n - 1)
+    force[0] = -step_passivity_master(seen[0, V], total, budget, mass, period, ends[0])
+    sent[0, n, PACKET_SIGNAL], sent[0, n, PACKET_ENERGY] = seen[0, X], ends[0, ENERGY_IN]
+    total, budget = _read_packet(sent[0], newest_forward, n)
+    force[1] = step_passivity_slave(seen[1, V], total, budget, stiffness, damping, _MIN_POWER, period, ends[1])
+    sent[1, n, PACKET_SIGNAL], sent[1, n, PACKET_ENERGY] = force[1], ends[1, ENERGY_IN]
 
 
 @compiled

@@ -14,61 +14,61 @@ import numpy as np
 
 from hydrotele.control.resolved_motion import (
     COORDINATES,
-    arm_facts,
+    arm_specification,
     follow_pose,
     follow_rate,
 )
 from hydrotele.core.compiled import compiled
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine import Machine
-from hydrotele.scenario.teleoperation import Coupling, TeleopPilot
+from hydrotele.scenario.teleoperation import CoordinateMapping, TeleopPilot
 from hydrotele.teleop.axis_table import (
+    AXIS_WAVE_IMPEDANCE,
     COORDINATE,
     COUPLING,
     COUPLING_DAMPING,
     DEADBAND,
     GAIN,
+    HANDLE_RANGE,
     LEVER,
-    RATIO,
-    REACH,
-    REFLECTED_MOST,
+    MAX_REFLECTED_FORCE,
+    REFLECTION_RATIO,
     SIGN,
-    WAVE,
-    flat_state,
-    flattened,
-    split,
+    flatten_state,
+    make_flat_state,
+    split_array,
 )
 from hydrotele.teleop.master import (
-    BUDGET,
-    CONTROLLED,
-    FORCE,
+    CHANNEL_ENERGY,
+    CHANNEL_SIGNAL,
     FOUR_CHANNEL,
-    PLACE,
+    MAX_WINDUP,
+    PASSIVITY_CONTROL,
     POSITION,
     RATE,
-    SENT,
-    SPEED,
-    TOTAL,
-    WANTED,
-    WANTED_SPEED,
-    WAVES,
-    WINDUP,
-    Master,
+    REFERENCE_POSITION,
+    REFERENCE_SPEED,
+    SENT_SIGNAL,
+    TIP_FORCE,
+    TIP_POSITION,
+    TIP_SPEED,
+    WAVE_VARIABLES,
+    MasterParameters,
 )
-from hydrotele.teleop.passive_line import GONE_IN, controlled_slave, wave_slave
+from hydrotele.teleop.passive_line import ENERGY_IN, step_passivity_slave, step_wave_slave
 
-BLOCKED, SILENT, TRIPPED, AGE = range(4)  # indices into `SlaveState.flags`
-JACOBIAN = 4  # index into `Slave.kind`
-# columns of `Slave.table`
-(AXIS, WAY, SCALE, EDGE, STOP, SPRING, DAMPER, SHARE, LEVERAGE, FASTEST, STRONGEST,
+HELD_AT_EDGE, NO_PACKETS, VALVES_CLOSED, PACKET_AGE = range(4)  # indices into `SlaveState.flags`
+USES_JACOBIAN = 4  # index into `SlaveParameters.kind`
+# columns of `SlaveParameters.table`
+(AXIS, AXIS_SIGN, AXIS_GAIN, DEADBAND_EDGE, HANDLE_STOP, SPRING, DAMPER, FORCE_RATIO, MASS_LEVER, MAX_SPEED, MAX_FORCE,
  WAVE_IMPEDANCE) = range(12)  # fmt: skip
-WIDTH = WAVE_IMPEDANCE + 1
-SILENCE, FOLLOWING, ACCELERATION, VIRTUAL_MASS, LEAD = range(5)  # indices into `Slave.limits`
+TABLE_COLUMNS = WAVE_IMPEDANCE + 1
+MAX_SILENCE, MAX_FOLLOWING_ERROR, ACCELERATION, VIRTUAL_MASS, LEAD = range(5)  # indices into `SlaveParameters.limits`
 # rows of a command packet
 HANDLE, HANDLE_SPEED, HAND = range(3)  # with a passive channel: handle, sum or position, energy
 
 
-class Slave(NamedTuple):
+class SlaveParameters(NamedTuple):
     """Parameters of the slave side, for k joints and task coordinates.
 
     Attributes:
@@ -136,12 +136,12 @@ def unpack_slave(flat, k):
 
     Source: order and shapes of Slave.
     """
-    arm, rest = split(flat, 9)
-    ranges, rest = split(rest, 2 * k)
-    start, rest = split(rest, 5)
-    table, rest = split(rest, WIDTH * k)
-    limits, kind = split(rest, 5)
-    return Slave(arm, ranges.reshape(k, 2), start, table.reshape(k, WIDTH), limits, kind)
+    arm, rest = split_array(flat, 9)
+    ranges, rest = split_array(rest, 2 * k)
+    start, rest = split_array(rest, 5)
+    table, rest = split_array(rest, TABLE_COLUMNS * k)
+    limits, kind = split_array(rest, 5)
+    return SlaveParameters(arm, ranges.reshape(k, 2), start, table.reshape(k, TABLE_COLUMNS), limits, kind)
 
 
 @compiled
@@ -157,32 +157,36 @@ def unpack_slave_state(flat, k):
 
     Source: order and shapes of SlaveState.
     """
-    pose, rest = split(flat, 5)
-    rate, rest = split(rest, 5)
-    joint, rest = split(rest, k)
-    joint_rate, rest = split(rest, k)
-    ahead, rest = split(rest, k)
-    measured, rest = split(rest, 10)
-    command, rest = split(rest, 18)
-    force_integral, rest = split(rest, 5)
-    asked, rest = split(rest, 5)
-    flags, line = split(rest, 4)
+    pose, rest = split_array(flat, 5)
+    rate, rest = split_array(rest, 5)
+    joint, rest = split_array(rest, k)
+    joint_rate, rest = split_array(rest, k)
+    ahead, rest = split_array(rest, k)
+    measured, rest = split_array(rest, 10)
+    command, rest = split_array(rest, 18)
+    force_integral, rest = split_array(rest, 5)
+    asked, rest = split_array(rest, 5)
+    flags, line = split_array(rest, 4)
     return SlaveState(
         pose, rate, joint, joint_rate, ahead, measured.reshape(2, 5), command.reshape(3, 6),
-        force_integral, asked, flags, line.reshape(5, SENT + 2),
+        force_integral, asked, flags, line.reshape(5, SENT_SIGNAL + 2),
     )  # fmt: skip
 
 
-SMOOTH = 15.0  # rad/s, smoothing of the 200 Hz command steps under position control
-_TRICKLE = 1e-3  # W of passivity control, not noticeable by a hand
-_BRAKE = 0.8  # fraction of the acceleration limit; the rest compensates the filter's lag
-AHEAD = 0.02  # s, averaging time of the rate's change for the phase lead
-_BLEND = 30.0  # rad/s, bandwidth of the measured task rates
+SMOOTHING_BANDWIDTH = 15.0  # rad/s, smoothing of the 200 Hz command steps under position control
+_MIN_POWER = 1e-3  # W of passivity control, not noticeable by a hand
+_BRAKING_FRACTION = 0.8  # fraction of the acceleration limit; the rest compensates the filter's lag
+LEAD_AVERAGING_TIME = 0.02  # s, averaging time of the rate's change for the phase lead
+_RATE_BANDWIDTH = 30.0  # rad/s, bandwidth of the measured task rates
 
 
-def slave(
-    machine: Machine, pilot: TeleopPilot, numbers: Master, joints: np.ndarray, lead: float = 0.0
-) -> tuple[Slave, SlaveState]:
+def build_slave(
+    machine: Machine,
+    pilot: TeleopPilot,
+    numbers: MasterParameters,
+    joints: np.ndarray,
+    lead: float = 0.0,
+) -> tuple[SlaveParameters, SlaveState]:
     """Build parameters and initial state of the slave side.
 
     Args:
@@ -198,34 +202,33 @@ def slave(
     Raises:
         InputError: the machine has no arm.
     """
-    arm, _, ranges = arm_facts(machine)
+    arm, _, ranges = arm_specification(machine)
     k, pose = len(joints), np.zeros(5)
     task_forward(arm, joints, pose)
-    table = np.zeros((k, WIDTH))
+    table = np.zeros((k, TABLE_COLUMNS))
     table[:, 0] = -1.0
     for axis, row in enumerate(numbers.axis):
         if row[COORDINATE] >= 0.0:
             lever = 1.0 if axis < 3 else LEVER**2
             name = COORDINATES[int(row[COORDINATE])]
-            speed = pilot.coordinates.get(name, Coupling()).speed  # pyright: ignore - a Coordinate
+            speed = pilot.coordinates.get(name, CoordinateMapping()).speed  # pyright: ignore - a Coordinate
             table[int(row[COORDINATE])] = (
-                axis, row[SIGN], row[GAIN], row[DEADBAND], row[REACH], row[COUPLING],
-                row[COUPLING_DAMPING], row[RATIO], lever, speed, row[REFLECTED_MOST], row[WAVE],
+                axis, row[SIGN], row[GAIN], row[DEADBAND], row[HANDLE_RANGE], row[COUPLING],
+                row[COUPLING_DAMPING], row[REFLECTION_RATIO], lever, speed, row[MAX_REFLECTED_FORCE],
+                row[AXIS_WAVE_IMPEDANCE],
             )  # fmt: skip
     safety = pilot.safety
-    limits = np.array(
-        [safety.silence, safety.following_error, pilot.acceleration, pilot.virtual_mass, lead]
-    )
-    state = flat_state(SlaveState, [
-        (5,), (5,), (k,), (k,), (k,), (2, 5), (3, 6), (5,), (5,), (4,), (5, SENT + 2),
+    limits = np.array([safety.silence, safety.following_error, pilot.acceleration, pilot.virtual_mass, lead])
+    state = make_flat_state(SlaveState, [
+        (5,), (5,), (k,), (k,), (k,), (2, 5), (3, 6), (5,), (5,), (4,), (5, SENT_SIGNAL + 2),
     ])  # fmt: skip
     state.pose[:], state.measured[0], state.joint[:] = pose, pose, joints
     kind = np.append(numbers.kind, float(pilot.resolved_motion == "inverse_jacobian"))
-    return flattened(Slave(arm, ranges, pose, table, limits, kind)), state
+    return flatten_state(SlaveParameters(arm, ranges, pose, table, limits, kind)), state
 
 
 @compiled
-def measure_task(numbers, joint, fresh, elapsed, s):
+def measure_tip(numbers, joint, fresh, elapsed, s):
     """Compute pose and rate of the tip from measured joint angles.
 
     Args:
@@ -247,7 +250,7 @@ def measure_task(numbers, joint, fresh, elapsed, s):
     for i in range(5):
         if not np.isfinite(pose[i]):
             return
-    share = min(1.0, _BLEND * elapsed)
+    share = min(1.0, _RATE_BANDWIDTH * elapsed)
     for i in range(5):
         if elapsed > 0.0:
             s.measured[1, i] += share * ((pose[i] - s.measured[0, i]) / elapsed - s.measured[1, i])
@@ -277,10 +280,10 @@ def update_references(numbers, packet, arrived, force, joint, period, s):
         for r in range(3):
             for i in range(6):
                 s.command[r, i] = packet[r, i] if np.isfinite(packet[r, i]) else 0.0
-        s.flags[AGE] = 0.0
+        s.flags[PACKET_AGE] = 0.0
     else:
-        s.flags[AGE] += period
-    s.flags[SILENT] = 1.0 if s.flags[AGE] > numbers.limits[SILENCE] else 0.0
+        s.flags[PACKET_AGE] += period
+    s.flags[NO_PACKETS] = 1.0 if s.flags[PACKET_AGE] > numbers.limits[MAX_SILENCE] else 0.0
     wanted, rate = np.zeros(5), np.zeros(5)
     for c in range(5):
         wanted[c] = s.pose[c]
@@ -288,32 +291,40 @@ def update_references(numbers, packet, arrived, force, joint, period, s):
             continue
         row = numbers.table[c]
         goal = 0.0
-        if row[AXIS] >= 0.0 and s.flags[SILENT] == 0.0:
+        if row[AXIS] >= 0.0 and s.flags[NO_PACKETS] == 0.0:
             i = int(row[AXIS])
             x, v, hand = s.command[0, i], s.command[1, i], s.command[2, i]
-            goal = _wanted_rate(
-                numbers, row, c, row[WAY] * x, row[WAY] * v, row[WAY] * hand, force[c], period, s
+            goal = _commanded_rate(
+                numbers,
+                row,
+                c,
+                row[AXIS_SIGN] * x,
+                row[AXIS_SIGN] * v,
+                row[AXIS_SIGN] * hand,
+                force[c],
+                period,
+                s,
             )
         else:
             s.asked[c], s.force_integral[c] = s.pose[c] - numbers.start[c], 0.0
-        goal = min(row[FASTEST], max(-row[FASTEST], goal))
+        goal = min(row[MAX_SPEED], max(-row[MAX_SPEED], goal))
         change = numbers.limits[ACCELERATION] * period
         rate[c] = min(s.rate[c] + change, max(s.rate[c] - change, goal))
         wanted[c] += period * rate[c]
     before = s.joint_rate.copy()
     arm, ranges = numbers.arm, numbers.ranges
-    if numbers.kind[JACOBIAN] > 0.0:
+    if numbers.kind[USES_JACOBIAN] > 0.0:
         held = follow_rate(arm, ranges, joint, rate, period, s.pose, s.joint, s.joint_rate)
     else:
-        blocked = s.flags[BLOCKED] > 0.0
+        blocked = s.flags[HELD_AT_EDGE] > 0.0
         held = follow_pose(arm, ranges, wanted, rate, blocked, s.pose, s.joint, s.joint_rate)
     lead = numbers.limits[LEAD]
     for i in range(k):
-        share = min(1.0, period / AHEAD)
+        share = min(1.0, period / LEAD_AVERAGING_TIME)
         change = (s.joint_rate[i] - before[i]) / period
         late = s.ahead[i] - before[i]
         s.ahead[i] = s.joint_rate[i] + late + share * (lead * change - late)
-    s.flags[BLOCKED] = 1.0 if held else 0.0
+    s.flags[HELD_AT_EDGE] = 1.0 if held else 0.0
     for c in range(5):
         s.rate[c] = 0.0 if held else rate[c]
         if held:
@@ -321,86 +332,84 @@ def update_references(numbers, packet, arrived, force, joint, period, s):
 
 
 @compiled
-def _wanted_rate(numbers, row, c, x, v, hand, force, period, s):
+def _commanded_rate(numbers, row, c, x, v, hand, force, period, s):
     """Return the rate of a coordinate that the handle commands."""
     if numbers.kind[0] == FOUR_CHANNEL:
-        return _virtual_rate(numbers, row, c, x, v, hand, force, period, s)
-    if numbers.kind[0] == WAVES or numbers.kind[0] == CONTROLLED:
-        return _pulled_rate(numbers, row, c, v, hand, force, period, s)
+        return _four_channel_rate(numbers, row, c, x, v, hand, force, period, s)
+    if numbers.kind[0] == WAVE_VARIABLES or numbers.kind[0] == PASSIVITY_CONTROL:
+        return _passive_channel_rate(numbers, row, c, v, hand, force, period, s)
     if numbers.kind[1] == POSITION:
-        return _placed_rate(numbers, row, c, x, period, s)
-    beyond = min(row[STOP], abs(x)) - row[EDGE]
+        return _position_control_rate(numbers, row, c, x, period, s)
+    beyond = min(row[HANDLE_STOP], abs(x)) - row[DEADBAND_EDGE]
     if beyond <= 0.0:
         return 0.0
-    return row[SCALE] * beyond if x > 0.0 else -row[SCALE] * beyond
+    return row[AXIS_GAIN] * beyond if x > 0.0 else -row[AXIS_GAIN] * beyond
 
 
 @compiled
-def _placed_rate(numbers, row, c, x, period, s):
+def _position_control_rate(numbers, row, c, x, period, s):
     """Return the rate under position control: a critically damped filter of the handle.
 
     Over long distances it moves at maximum speed and brakes within the acceleration limit.
     """
-    gap = row[SCALE] * x - (s.pose[c] - numbers.start[c])
+    gap = row[AXIS_GAIN] * x - (s.pose[c] - numbers.start[c])
     size = abs(gap)
     speed = min(
-        row[FASTEST],
-        0.5 * SMOOTH * size,
-        np.sqrt(2.0 * _BRAKE * numbers.limits[ACCELERATION] * size),
+        row[MAX_SPEED],
+        0.5 * SMOOTHING_BANDWIDTH * size,
+        np.sqrt(2.0 * _BRAKING_FRACTION * numbers.limits[ACCELERATION] * size),
     )
     speed = speed if gap > 0.0 else -speed
-    return s.rate[c] + 2.0 * SMOOTH * period * (speed - s.rate[c])
+    return s.rate[c] + 2.0 * SMOOTHING_BANDWIDTH * period * (speed - s.rate[c])
 
 
 @compiled
-def _virtual_rate(numbers, row, c, x, v, hand, force, period, s):
+def _four_channel_rate(numbers, row, c, x, v, hand, force, period, s):
     """Return the rate of the four-channel virtual slave, moved by hand, task and master position.
 
     Under position control `M z'' = hand + ratio F + K (x - z) + B (x' - z')` with z = y / scale,
     under rate control `M y'' = k_v int hand + ratio F + K (k_v int x - y) + B (k_v x - y')`.
     """
-    gain, spring, damper = row[SCALE], row[SPRING], row[DAMPER]
-    mass = numbers.limits[VIRTUAL_MASS] * row[LEVERAGE]
+    gain, spring, damper = row[AXIS_GAIN], row[SPRING], row[DAMPER]
+    mass = numbers.limits[VIRTUAL_MASS] * row[MASS_LEVER]
     scale = gain if numbers.kind[1] == POSITION else 1.0
     place, speed = (s.pose[c] - numbers.start[c]) / scale, s.rate[c] / scale
-    felt = (
-        row[SHARE] * min(row[STRONGEST], max(-row[STRONGEST], force)) if np.isfinite(force) else 0.0
-    )
+    felt = row[FORCE_RATIO] * min(row[MAX_FORCE], max(-row[MAX_FORCE], force)) if np.isfinite(force) else 0.0
     ahead, ahead_speed, push = x, v, hand
     if numbers.kind[1] == RATE:
-        most = row[SHARE] * row[STRONGEST] + mass * numbers.limits[ACCELERATION]
+        most = row[FORCE_RATIO] * row[MAX_FORCE] + mass * numbers.limits[ACCELERATION]
         total = s.force_integral[c] + period * gain * hand
         s.force_integral[c] = min(most, max(-most, total))
         asked = s.asked[c] + period * gain * x
-        s.asked[c] = min(place + WINDUP, max(place - WINDUP, asked))
+        s.asked[c] = min(place + MAX_WINDUP, max(place - MAX_WINDUP, asked))
         ahead, ahead_speed, push = s.asked[c], gain * x, s.force_integral[c]
     push += felt + spring * (ahead - place) + damper * (ahead_speed - speed)
     return scale * (speed + period * push / mass)
 
 
 @compiled
-def _pulled_rate(numbers, row, c, total, budget, force, period, s):
+def _passive_channel_rate(numbers, row, c, total, budget, force, period, s):
     """Return the virtual slave's rate at a passive channel: `M z'' = pull + ratio F`."""
-    gain, spring, damper, end = row[SCALE], row[SPRING], row[DAMPER], s.line[c]
-    speed, mass = s.rate[c] / gain, numbers.limits[VIRTUAL_MASS] * row[LEVERAGE]
-    if numbers.kind[0] == WAVES:
-        pull, wave = wave_slave(
-            speed, total, row[WAY] * budget, spring, damper, row[WAVE_IMPEDANCE], period, end
+    gain, spring, damper, end = row[AXIS_GAIN], row[SPRING], row[DAMPER], s.line[c]
+    speed, mass = s.rate[c] / gain, numbers.limits[VIRTUAL_MASS] * row[MASS_LEVER]
+    if numbers.kind[0] == WAVE_VARIABLES:
+        pull, wave = step_wave_slave(
+            speed, total, row[AXIS_SIGN] * budget, spring, damper, row[WAVE_IMPEDANCE], period, end
         )
-        end[SENT] += period * wave
-        end[SENT + 1] += period * wave * wave
+        end[SENT_SIGNAL] += period * wave
+        end[SENT_SIGNAL + 1] += period * wave * wave
     else:
-        budget = row[WAY] * budget
-        pull = controlled_slave(speed, total, budget, spring, damper, _TRICKLE, period, end)
-        end[SENT], end[SENT + 1] = pull, end[GONE_IN]
+        budget = row[AXIS_SIGN] * budget
+        pull = step_passivity_slave(speed, total, budget, spring, damper, _MIN_POWER, period, end)
+        end[SENT_SIGNAL], end[SENT_SIGNAL + 1] = pull, end[ENERGY_IN]
     push = pull
     if np.isfinite(force):
-        push += row[SHARE] * min(row[STRONGEST], max(-row[STRONGEST], force))
+        push += row[FORCE_RATIO] * min(row[MAX_FORCE], max(-row[MAX_FORCE], force))
     return gain * (speed + period * push / mass)
 
 
 @compiled
-def watch(numbers, joint, s):
+def check_following_error(numbers, joint, s):
     """Close the valves permanently if a joint does not follow its reference.
 
     Args:
@@ -414,12 +423,12 @@ def watch(numbers, joint, s):
     Source: following-error monitor, common in servo drives.
     """
     for i in range(len(joint)):
-        if not abs(joint[i] - s.joint[i]) <= numbers.limits[FOLLOWING]:
-            s.flags[TRIPPED] = 1.0
+        if not abs(joint[i] - s.joint[i]) <= numbers.limits[MAX_FOLLOWING_ERROR]:
+            s.flags[VALVES_CLOSED] = 1.0
 
 
 @compiled
-def report(numbers, force, s, packet):
+def write_machine_packet(numbers, force, s, packet):
     """Write the machine's packet: force, and positions and speeds relative to the start.
 
     Args:
@@ -434,21 +443,27 @@ def report(numbers, force, s, packet):
     Source: this module.
     """
     for c in range(len(force)):
-        packet[FORCE, c] = force[c]
-        packet[PLACE, c] = s.measured[0, c] - numbers.start[c]
-        packet[SPEED, c] = s.measured[1, c]
-        packet[WANTED, c] = s.pose[c] - numbers.start[c]
-        packet[WANTED_SPEED, c] = s.rate[c]
-    if numbers.kind[0] == WAVES or numbers.kind[0] == CONTROLLED:
+        packet[TIP_FORCE, c] = force[c]
+        packet[TIP_POSITION, c] = s.measured[0, c] - numbers.start[c]
+        packet[TIP_SPEED, c] = s.measured[1, c]
+        packet[REFERENCE_POSITION, c] = s.pose[c] - numbers.start[c]
+        packet[REFERENCE_SPEED, c] = s.rate[c]
+    if numbers.kind[0] == WAVE_VARIABLES or numbers.kind[0] == PASSIVITY_CONTROL:
         for c in range(len(force)):
-            packet[TOTAL, c], packet[BUDGET, c] = s.line[c, SENT], s.line[c, SENT + 1]
+            packet[CHANNEL_SIGNAL, c], packet[CHANNEL_ENERGY, c] = (
+                s.line[c, SENT_SIGNAL],
+                s.line[c, SENT_SIGNAL + 1],
+            )
     if numbers.kind[0] == FOUR_CHANNEL:
         for c in range(len(force)):
-            packet[PLACE, c], packet[SPEED, c] = packet[WANTED, c], packet[WANTED_SPEED, c]
+            packet[TIP_POSITION, c], packet[TIP_SPEED, c] = (
+                packet[REFERENCE_POSITION, c],
+                packet[REFERENCE_SPEED, c],
+            )
 
 
 @compiled
-def slave_step(numbers, packet, arrived, force, joint, period, s):
+def step_slave(numbers, packet, arrived, force, joint, period, s):
     """Run one period of the slave side: joint references and following-error check.
 
     Args:
@@ -466,4 +481,4 @@ def slave_step(numbers, packet, arrived, force, joint, period, s):
     Source: this module.
     """
     update_references(numbers, packet, arrived, force, joint, period, s)
-    watch(numbers, joint, s)
+    check_following_error(numbers, joint, s)

@@ -16,51 +16,51 @@ import numpy as np
 
 from hydrotele.control.endpoint_force import EndpointForce
 from hydrotele.control.plan import Plan
-from hydrotele.control.resolved_motion import COORDINATES, arm_facts
-from hydrotele.control.servo import DriveReferences, drive_tables
+from hydrotele.control.resolved_motion import COORDINATES, arm_specification
+from hydrotele.control.servo import DriveReferences, tabulate_drives
 from hydrotele.control.task_impedance import TaskImpedance
 from hydrotele.core.errors import InputError
 from hydrotele.core.memory import address_record
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.joystick import AXES, load_joystick
-from hydrotele.machine.machine import Machine, SensorSet, sensor_set
+from hydrotele.machine.machine import Machine, SensorSet, get_sensors
 from hydrotele.scenario.scenario import Scenario
-from hydrotele.scenario.teleoperation import Channel, Fault, TeleopPilot
+from hydrotele.scenario.teleoperation import Channel, SensorFault, TeleopPilot
 from hydrotele.simulate.feedback import Feedback
 from hydrotele.simulate.joystick import SimulatedFlotor
 from hydrotele.simulate.layout import field_offsets
 from hydrotele.simulate.plant import Plant
 from hydrotele.simulate.record import contact_record, sum_contact_forces, surrounding_geoms
-from hydrotele.teleop.axis_table import DEADBAND, REACH, flat_view
+from hydrotele.teleop.axis_table import DEADBAND, HANDLE_RANGE, flat_view
 from hydrotele.teleop.master import (
     TASK_DAMPING,
     TASK_MASS,
     TASK_STIFFNESS,
-    Master,
+    MasterParameters,
     MasterState,
-    master,
-    push_back,
+    build_master,
+    tip_over_wrench,
 )
-from hydrotele.teleop.operator_model import Hand, OperatorModel
-from hydrotele.teleop.operator_parameters import held_joystick
+from hydrotele.teleop.operator_model import HandInput, OperatorModel
+from hydrotele.teleop.operator_parameters import attach_operator_hand
 from hydrotele.teleop.round_trip import (
-    CHECKED,
-    SHARE,
-    STATION,
-    Line,
-    arrivals,
-    in_periods,
+    PACKET_GAIN,
+    STATION_DTYPE,
+    TICKS_PER_CHECK,
+    ChannelBuffers,
+    compute_arriving_ages,
+    delays_to_periods,
     load_delays,
 )
 from hydrotele.teleop.slave import (
-    BLOCKED,
-    SILENT,
-    TRIPPED,
+    HELD_AT_EDGE,
+    NO_PACKETS,
+    VALVES_CLOSED,
     SlaveState,
-    slave,
+    build_slave,
 )
 
-Exchange = Callable[[np.ndarray, np.ndarray, float, np.ndarray], None]
+DeviceExchange = Callable[[np.ndarray, np.ndarray, float, np.ndarray], None]
 """Function that connects a device, called once per control tick.
 
 It writes the handle's pose (7,) [m] and quaternion, NaN without a device. It receives the machine's
@@ -68,14 +68,14 @@ packet (rows, k), the factor on it, and the additional force on the handle (6,) 
 """
 
 
-_LENGTHS = ("m", "m", "m", "rad", "rad", "rad")
+_DISPLACEMENT_UNITS = ("m", "m", "m", "rad", "rad", "rad")
 _FORCES = ("N", "N", "N", "N m", "N m", "N m")
 _STIFFNESS = ("N/m", "N/m", "N/m", "N m/rad", "N m/rad", "N m/rad")
-_TASK = {"r": ("m", "N"), "theta": ("rad", "N m"), "z": ("m", "N"), "attitude": ("rad", "N m"),
+_TASK_UNITS = {"r": ("m", "N"), "theta": ("rad", "N m"), "z": ("m", "N"), "attitude": ("rad", "N m"),
          "head": ("rad", "N m")}  # fmt: skip
 
 
-class StationLog:
+class TeleoperationLog:
     """Recorded signals of a run of n ticks.
 
     Attributes:
@@ -85,9 +85,7 @@ class StationLog:
         touching: (n,) whether the machine is in contact.
     """
 
-    def __init__(
-        self, ticks: int, coordinates: tuple[str, ...], m: MasterState, s: SlaveState
-    ) -> None:
+    def __init__(self, ticks: int, coordinates: tuple[str, ...], m: MasterState, s: SlaveState) -> None:
         """Allocate the arrays.
 
         Args:
@@ -97,18 +95,18 @@ class StationLog:
             s: state of the slave, which is recorded every tick.
         """
         self.coordinates = coordinates
-        self._m, self._s, self._one, self._two = m, s, flat_view(m), flat_view(s)
-        self._master = np.zeros((ticks, len(self._one)))
-        self._slave = np.zeros((ticks, len(self._two)))
+        self._m, self._s, self._master_view, self._slave_view = m, s, flat_view(m), flat_view(s)
+        self._master = np.zeros((ticks, len(self._master_view)))
+        self._slave = np.zeros((ticks, len(self._slave_view)))
         self.force, self.muscles = np.zeros((ticks, len(coordinates))), np.zeros((ticks, 6))
         self.touching = np.zeros(ticks, np.int64)
 
-    def arrays(self) -> dict[str, np.ndarray]:
+    def tick_arrays(self) -> dict[str, np.ndarray]:
         """Return the arrays to which `round_trip` writes a row per tick."""
         return {"log_master": self._master, "log_slave": self._slave, "log_force": self.force,
                 "log_muscles": self.muscles, "touching": self.touching}  # fmt: skip
 
-    def cut(self, ticks: int) -> None:
+    def truncate(self, ticks: int) -> None:
         """Keep only the first ticks."""
         self._master, self._slave = self._master[:ticks], self._slave[:ticks]
         self.force, self.muscles = self.force[:ticks], self.muscles[:ticks]
@@ -116,11 +114,11 @@ class StationLog:
 
     def master(self, name: str) -> np.ndarray:
         """Return a field of MasterState, (n, ...), such as `handle`."""
-        return _field(self._master, self._m, name)
+        return _state_field(self._master, self._m, name)
 
     def slave(self, name: str) -> np.ndarray:
         """Return a field of SlaveState, (n, ...), such as `pose`."""
-        return _field(self._slave, self._s, name)
+        return _state_field(self._slave, self._s, name)
 
     def channels(self, every: int, rows: int) -> tuple[dict[str, np.ndarray], dict[str, str]]:
         """Return the channels of the measured log.
@@ -142,21 +140,21 @@ class StationLog:
         handle, hand, push = self.master("handle"), self.master("hand"), self.master("push")
         stiffness, current = self.master("stiffness"), self.master("currents")
         for i, axis in enumerate(AXES):
-            put(f"handle.{axis}", handle[:, i], _LENGTHS[i])
+            put(f"handle.{axis}", handle[:, i], _DISPLACEMENT_UNITS[i])
             put(f"hand_force.{axis}", hand[:, i], _FORCES[i])
             put(f"handle_force.{axis}", push[:, i], _FORCES[i])
             put(f"handle_stiffness.{axis}", stiffness[:, i], _STIFFNESS[i])
             put(f"coil_current.coil_{i + 1}", current[:, i], "A")
         pose, seen = self.slave("pose"), self.slave("measured")
         for i, name in enumerate(self.coordinates):
-            place, force = _TASK[name]
+            place, force = _TASK_UNITS[name]
             put(f"tip_force.{name}", self.force[:, i], force)
             put(f"tip_reference.{name}", pose[:, i], place)
             put(f"tip_pose.{name}", seen[:, 0, i], place)
         return values, units
 
 
-def _field(table: np.ndarray, state, name: str) -> np.ndarray:
+def _state_field(table: np.ndarray, state, name: str) -> np.ndarray:
     first = 0
     for part, key in zip(state, state._fields, strict=True):
         if key == name:
@@ -165,22 +163,22 @@ def _field(table: np.ndarray, state, name: str) -> np.ndarray:
     raise KeyError(name)
 
 
-_FADE = 0.2  # s, fade-out time of the reflected force when no packets arrive
+_FADE_TIME = 0.2  # s, fade-out time of the reflected force when no packets arrive
 
 
-class Station:
+class TeleoperationSystem:
     """Closed-loop teleoperation system of one run.
 
     Attributes:
         coordinates: task coordinates of the arm.
         log: recorded signals by control tick.
         notes: messages for the user: trips, missing packets, workspace edge.
-        tripped: whether the valves were closed permanently.
+        valves_closed: whether the valves were closed permanently.
     """
 
     def __init__(
         self, plant: Plant, data: mujoco.MjData, scenario: Scenario, plan: Plan,
-        drives: DriveReferences, seen: Feedback, hand: Hand | None = None,
+        drives: DriveReferences, feedback: Feedback, hand_input: HandInput | None = None,
     ) -> None:  # fmt: skip
         """Build the loop for a run.
 
@@ -190,8 +188,8 @@ class Station:
             scenario: scenario with a teleoperated pilot.
             plan: references of the run, written tick by tick.
             drives: references of the drives, written tick by tick.
-            seen: sensor readings of the machine, refreshed before every tick.
-            hand: input of a live operator.
+            feedback: sensor readings of the machine, refreshed before every tick.
+            hand_input: input of a live operator.
 
         Raises:
             InputError: joystick, gains and arm are not compatible, or a live operator has no input.
@@ -199,59 +197,62 @@ class Station:
         pilot = scenario.pilot
         assert isinstance(pilot, TeleopPilot)
         machine = plant.machine
-        self._pilot, self._plan, self._data, self._seen = pilot, plan, data, seen
+        self._pilot, self._plan, self._data, self._feedback = pilot, plan, data, feedback
         self._period = 1.0 / scenario.control_rate
-        joystick = load_joystick(_beside(scenario, pilot.joystick))
-        joystick = held_joystick(joystick, pilot.perception, scenario.folder)
-        _, axes, _ = arm_facts(machine)
+        joystick = load_joystick(_joystick_path(scenario, pilot.joystick))
+        joystick = attach_operator_hand(joystick, pilot.perception, scenario.folder)
+        _, axes, _ = arm_specification(machine)
         self.columns = np.array([plan.axes.index(a) for a in axes])
         self.coordinates = COORDINATES[: len(axes)]
-        self._master, self._m = master(joystick, pilot, self.coordinates)
+        self._master, self._m = build_master(joystick, pilot, self.coordinates)
         start = plan.reference[0, self.columns]
-        self._slave, self._s = slave(machine, pilot, self._master, start, scenario.servo.lead)
-        self._line = _line(pilot, scenario, len(axes))
+        self._slave, self._s = build_slave(machine, pilot, self._master, start, scenario.servo.lead)
+        self._line = _make_channel_buffers(pilot, scenario, len(axes))
         self._flotor = SimulatedFlotor(joystick, period=self._period)
         self._qpos = self._flotor.data.qpos
-        self._sensors = sensor_set(machine, scenario.sensors)
-        self._feel = _estimator(machine, plan.axes, pilot, seen, self._period, self._sensors)
-        self._task, self._pose = _task(pilot, seen, self._period, len(axes)), np.zeros(5)
-        self._true = pilot.force == "true"
-        self._force = self._feel.force if self._feel and not self._true else np.zeros(len(axes))
+        self._sensors = get_sensors(machine, scenario.sensors)
+        self._force_estimator = _make_force_estimator(machine, plan.axes, pilot, feedback, self._period, self._sensors)
+        self._task_estimator, self._pose = (
+            _make_task_estimator(pilot, feedback, self._period, len(axes)),
+            np.zeros(5),
+        )
+        self._uses_true_force = pilot.force == "true"
+        self._force = (
+            self._force_estimator.force if self._force_estimator and not self._uses_true_force else np.zeros(len(axes))
+        )
         self._owners = plant.model, surrounding_geoms(plant)  # keep the memory of addresses alive
         self._contacts = contact_record(plant.model, data, self._owners[1])
-        self.log = StationLog(scenario.ticks, self.coordinates, self._m, self._s)
+        self.log = TeleoperationLog(scenario.tick_count, self.coordinates, self._m, self._s)
         self.operator = OperatorModel(
-            pilot, joystick, self._master, self.log, scenario.ticks, self._period, scenario.seed,
-            hand, scenario.folder,
+            pilot, joystick, self._master, self.log, scenario.tick_count, self._period, scenario.seed,
+            hand_input, scenario.folder,
         )  # fmt: skip
         self.notes: list[str] = []
-        self._said: set[str] = set()
-        self.tripped = False
-        self._faults = [_Fault(fault, plan.axes) for fault in pilot.faults]
-        self._every_tick = bool(
-            self._faults or self._true or pilot.tip_over or self._flotor.weakens
-        )
-        self._exchange: Exchange | None = None
-        self._arrays = self._addressed(machine, drives)
-        self._record = address_record(STATION, self._arrays)
+        self._noted_keys: set[str] = set()
+        self.valves_closed = False
+        self._faults = [_FrozenSensor(fault, plan.axes) for fault in pilot.faults]
+        self._every_tick = bool(self._faults or self._uses_true_force or pilot.tip_over or self._flotor.has_edge_loss)
+        self._exchange: DeviceExchange | None = None
+        self._arrays = self._collect_arrays(machine, drives)
+        self._record = address_record(STATION_DTYPE, self._arrays)
         swing = int(plant.dof[self.columns[0]]) if pilot.mount == "cab" else -1
         self._fill_record(swing, scenario.servo.feedforward)
 
-    def _addressed(self, machine: Machine, drives: DriveReferences) -> dict[str, np.ndarray]:
+    def _collect_arrays(self, machine: Machine, drives: DriveReferences) -> dict[str, np.ndarray]:
         """Return the arrays whose addresses `round_trip` uses."""
         plan, data, line = self._plan, self._data, self._line
-        grid, table = drive_tables(machine, plan.axes)
+        grid, table = tabulate_drives(machine, plan.axes)
         assert plan.pose is not None
         return {
-            "joint": self._seen.joint, "force": self._force, "columns": self.columns,
+            "joint": self._feedback.joint, "force": self._force, "columns": self.columns,
             "slave": flat_view(self._slave), "slave_state": flat_view(self._s),
             "master": flat_view(self._master), "master_state": flat_view(self._m),
             "forward": line.forward, "back": line.back, "packet": line.packet, "age": line.age,
             "line_state": line.state, "qpos": self._qpos,
-            "muscles": flat_view(self.operator.muscles), "past": self.operator.past,
+            "muscles": flat_view(self.operator.muscles), "past": self.operator.displacement_history,
             "tremor": np.ascontiguousarray(self.operator.tremor), "qvel": data.qvel,
             "qacc": data.qacc, "grid": grid, "table": table, "reference": plan.reference,
-            "rate": plan.rate, "pose": plan.pose, **drives._asdict(), **self.log.arrays(),
+            "rate": plan.rate, "pose": plan.pose, **drives._asdict(), **self.log.tick_arrays(),
         }  # fmt: skip
 
     def _fill_record(self, swing: int, scale: float) -> None:
@@ -266,24 +267,24 @@ class Station:
             "master_size": sizes["master"], "master_state_size": sizes["master_state"],
             "muscles_size": sizes["muscles"], "points": self._arrays["table"].shape[1],
             "pose_columns": self._arrays["pose"].shape[1], "scale": scale,
-            "sampled": self._seen.every, "sample_period": self._seen.period,
+            "sampled": self._feedback.ticks_per_sample, "sample_period": self._feedback.period,
             "contacts": self._data._address + field_offsets("mjData")["ncon"],
         }.items():  # fmt: skip
             self._record[name] = value
 
-    def attach(self, exchange: Exchange) -> None:
+    def attach_device(self, exchange: DeviceExchange) -> None:
         """Replace the simulated joystick by a real device.
 
         The device's own loop computes its force; here the same law runs again, for the logs.
 
         Args:
-            exchange: called once per control tick, see `Exchange`.
+            exchange: called once per control tick, see `DeviceExchange`.
         """
         self._exchange = exchange
         self._record["simulated"] = 0
 
     @property
-    def numbers(self) -> Master:
+    def master_parameters(self) -> MasterParameters:
         """Parameters of the master's control."""
         return self._master
 
@@ -298,69 +299,69 @@ class Station:
         return self._line.packet
 
     @property
-    def span(self) -> np.ndarray:
+    def deadbands_and_stops(self) -> np.ndarray:
         """Dead-band edge and stop of every joystick axis (2, 6) [m], [rad]."""
-        return self._master.axis[:, [DEADBAND, REACH]].T
+        return self._master.axis[:, [DEADBAND, HANDLE_RANGE]].T
 
-    def prepare(self, tick: int) -> None:
+    def prepare_tick(self, tick: int) -> None:
         """Run the Python part of a tick before `round_trip`: estimate, decide, exchange data.
 
         Args:
             tick: number of the control tick.
         """
-        seen, operator, pilot = self._seen, self.operator, self._pilot
+        seen, operator, pilot = self._feedback, self.operator, self._pilot
         for fault in self._faults:
             fault.freeze(tick * self._period, seen)
-        fresh = tick % seen.every == 0
-        if fresh or self._true:
-            self._felt(fresh)
+        fresh = tick % seen.ticks_per_sample == 0
+        if fresh or self._uses_true_force:
+            self._update_forces(fresh)
         if pilot.tip_over:
-            push_back(
+            tip_over_wrench(
                 pilot.tip_over, self._master, self._line.packet, self._slave.start,
                 self._m.handle, self._m.speed, self._m.extra,
             )  # fmt: skip
         if self._exchange:
-            share = float(self._line.state[SHARE])
+            share = float(self._line.state[PACKET_GAIN])
             self._exchange(self._qpos, self._line.packet, share, self._m.extra)
-        elif self._flotor.weakens:
+        elif self._flotor.has_edge_loss:
             self._flotor.weaken_coils()
-        if tick % operator.every == 0:
+        if tick % operator.ticks_per_decision == 0:
             operator.decide(tick)
 
-    def until(self, tick: int) -> int:
-        """Return the next tick that needs `prepare`."""
+    def next_prepared_tick(self, tick: int) -> int:
+        """Return the next tick that needs `prepare_tick`."""
         if self._exchange or self._every_tick:
             return tick + 1
-        every = math.gcd(self.operator.every, self._seen.every)
+        every = math.gcd(self.operator.ticks_per_decision, self._feedback.ticks_per_sample)
         return tick - tick % every + every
 
-    def notice(self, tick: int) -> bool:
+    def check_safety(self, tick: int) -> bool:
         """Run the safety checks before the machine moves; return whether to close the valves.
 
         Args:
-            tick: one for which `round_trip` returned true, or a multiple of `CHECKED`.
+            tick: one for which `round_trip` returned true, or a multiple of `TICKS_PER_CHECK`.
         """
-        self._check(tick)
-        return self.tripped
+        self._update_trip(tick)
+        return self.valves_closed
 
     @property
     def records(self) -> tuple[np.ndarray, np.ndarray]:
         """Records of station and simulated joystick for `round_trip`."""
         return self._record, self._flotor.record
 
-    def _felt(self, fresh: bool) -> None:
+    def _update_forces(self, fresh: bool) -> None:
         """Update the tip force, and the task impedance if it is reflected."""
-        seen = self._seen
-        if self._feel and fresh:
-            self._feel.update(seen.joint, seen.head, seen.rod)
-        if self._true:
-            self._true_force()
-        if self._task and fresh:
+        seen = self._feedback
+        if self._force_estimator and fresh:
+            self._force_estimator.update(seen.joint, seen.head, seen.rod)
+        if self._uses_true_force:
+            self._update_true_force()
+        if self._task_estimator and fresh:
             task_forward(self._slave.arm, seen.joint[self.columns], self._pose)
-            self._task.update(self._force, self._pose[: len(self._force)])
-            self._line.back[:, TASK_STIFFNESS] = self._task.stiffness
-            self._line.back[:, TASK_DAMPING] = self._task.damping
-            self._line.back[:, TASK_MASS] = self._task.mass
+            self._task_estimator.update(self._force, self._pose[: len(self._force)])
+            self._line.back[:, TASK_STIFFNESS] = self._task_estimator.stiffness
+            self._line.back[:, TASK_DAMPING] = self._task_estimator.damping
+            self._line.back[:, TASK_MASS] = self._task_estimator.mass
 
     def summary(self) -> dict[str, float | int | bool | None]:
         """Return statistics of the run: handle energy, currents, largest displacements, trips."""
@@ -371,36 +372,36 @@ class Station:
             "largest_handle_displacement_m": float(handle[:, :3].max()),
             "largest_handle_rotation_rad": float(handle[:, 3:].max()),
             "largest_coil_current_A": float(np.abs(self.log.master("currents")).max()),
-            "largest_coil_heat": self._flotor.hottest,
+            "largest_coil_heat": self._flotor.max_heat,
             "periods_with_limited_currents": int((self.log.master("limited") < 1.0).sum()),
             "largest_tip_force_N": float(np.abs(self.log.force[:, [0, 2]]).max()),
-            "tripped": self.tripped,
+            "tripped": self.valves_closed,
         }
 
-    def _check(self, tick: int) -> None:
+    def _update_trip(self, tick: int) -> None:
         """Close the valves if a check fails, and report the reason once."""
         now, s = tick * self._period, self._s
-        if s.flags[BLOCKED] and "edge" not in self._said:
-            self._say("edge", f"resolved motion held at the edge of the workspace at {now:.2f} s")
-        if s.flags[SILENT] and "silent" not in self._said:
-            self._say("silent", f"packets are missing at {now:.2f} s: rates set to zero")
+        if s.flags[HELD_AT_EDGE] and "edge" not in self._noted_keys:
+            self._add_note("edge", f"resolved motion held at the edge of the workspace at {now:.2f} s")
+        if s.flags[NO_PACKETS] and "silent" not in self._noted_keys:
+            self._add_note("silent", f"packets are missing at {now:.2f} s: rates set to zero")
         why = ""
-        if s.flags[TRIPPED]:
-            error = np.abs(self._seen.joint[self.columns] - s.joint)
+        if s.flags[VALVES_CLOSED]:
+            error = np.abs(self._feedback.joint[self.columns] - s.joint)
             name = self._plan.axes[self.columns[int(np.argmax(np.nan_to_num(error, nan=np.inf)))]]
             why = f"{name} does not follow its reference"
-        elif self._feel and self._sensors and tick % CHECKED == 0:
-            frozen = self._feel.frozen(self._pilot.safety.frozen)
+        elif self._force_estimator and self._sensors and tick % TICKS_PER_CHECK == 0:
+            frozen = self._force_estimator.find_constant_channels(self._pilot.safety.frozen)
             why = f"the readings of sensor {frozen[0]} are constant" if frozen else ""
-        if why and not self.tripped:
-            self.tripped = True
-            self._say("trip", f"valves closed permanently at {now:.2f} s: {why}")
+        if why and not self.valves_closed:
+            self.valves_closed = True
+            self._add_note("trip", f"valves closed permanently at {now:.2f} s: {why}")
 
-    def _say(self, key: str, sentence: str) -> None:
-        self._said.add(key)
+    def _add_note(self, key: str, sentence: str) -> None:
+        self._noted_keys.add(key)
         self.notes.append(sentence)
 
-    def _true_force(self) -> None:
+    def _update_true_force(self) -> None:
         """Write the simulator's contact force in task coordinates, without moments of the tool."""
         self._force[:] = 0.0
         if not self._data.ncon:
@@ -413,23 +414,23 @@ class Station:
         self._force[:3] = x * c + y * s, r * (y * c - x * s), z
 
 
-class _Fault:
+class _FrozenSensor:
     """Freeze the reading of a sensor from a given time on."""
 
-    def __init__(self, fault: Fault, axes: tuple[str, ...]) -> None:
+    def __init__(self, fault: SensorFault, axes: tuple[str, ...]) -> None:
         kind, _, axis = fault.channel.partition(".")
         if axis not in axes:
             raise InputError("pilot.faults", f"{fault.channel!r}: axes are {', '.join(axes)}")
         kinds = {"angle": "joint", "pressure_head": "head", "pressure_rod": "rod"}
         if kind not in kinds:
             raise InputError("pilot.faults", f"{fault.channel!r}: kinds are {', '.join(kinds)}")
-        self._at, self._name, self._column = fault.at, kinds[kind], axes.index(axis)
+        self._start_time, self._name, self._column = fault.at, kinds[kind], axes.index(axis)
         self._value: float | None = None
 
     def freeze(self, time: float, seen: Feedback) -> None:
         """Replace the live reading by the frozen one."""
         readings = getattr(seen, self._name)
-        if time < self._at:
+        if time < self._start_time:
             return
         if self._value is None:
             self._value = float(readings[self._column])
@@ -438,7 +439,7 @@ class _Fault:
             seen.rate[self._column] = 0.0
 
 
-def _estimator(
+def _make_force_estimator(
     machine: Machine,
     axes: tuple[str, ...],
     pilot: TeleopPilot,
@@ -451,57 +452,57 @@ def _estimator(
         return None
     kind = "static" if pilot.force == "true" else pilot.force
     return EndpointForce(
-        machine, axes, kind, period * seen.every, sensors=sensors,
-        bandwidth=_hertz(pilot), fast=2.0 * _hertz(pilot),
+        machine, axes, kind, period * seen.ticks_per_sample, sensors=sensors,
+        bandwidth=_force_bandwidth_hz(pilot), motion_bandwidth=2.0 * _force_bandwidth_hz(pilot),
     )  # fmt: skip
 
 
-def _hertz(pilot: TeleopPilot) -> float:
+def _force_bandwidth_hz(pilot: TeleopPilot) -> float:
     return pilot.bandwidth / (2.0 * math.pi)
 
 
-def _task(pilot: TeleopPilot, seen: Feedback, period: float, k: int) -> TaskImpedance | None:
+def _make_task_estimator(pilot: TeleopPilot, seen: Feedback, period: float, k: int) -> TaskImpedance | None:
     """Create the estimator of the task impedance; None if it is not reflected."""
     if pilot.reflection != "impedance":
         return None
-    bands = (2.0 * _hertz(pilot), _hertz(pilot))
-    return TaskImpedance(k, period * seen.every, bands, late=pilot.force != "true")
+    bands = (2.0 * _force_bandwidth_hz(pilot), _force_bandwidth_hz(pilot))
+    return TaskImpedance(k, period * seen.ticks_per_sample, bands, force_is_filtered=pilot.force != "true")
 
 
-def _beside(scenario: Scenario, name: str) -> str:
+def _joystick_path(scenario: Scenario, name: str) -> str:
     """Return a joystick's file, relative to the scenario's folder."""
     path = Path(scenario.folder, name)
     return str(path) if name != "joystick" and path.is_file() else name
 
 
-def _line(pilot: TeleopPilot, scenario: Scenario, k: int) -> Line:
+def _make_channel_buffers(pilot: TeleopPilot, scenario: Scenario, k: int) -> ChannelBuffers:
     """Create empty delay buffers, and the ages of arriving packets."""
     channel, period = pilot.channel, 1.0 / scenario.control_rate
     for name in ("delay_forward", "delay_back"):
         if (delay := getattr(channel, name)) >= scenario.duration:
             message = f"{delay:g} s is not shorter than the run ({scenario.duration:g} s)"
             raise InputError(f"pilot.channel.{name}", message)
-    delays = _delays(scenario, channel, period)
+    delays = _packet_delays(scenario, channel, period)
     rng = np.random.default_rng([scenario.seed, 404])
-    lost = rng.random((scenario.ticks, 2)) < channel.lost
+    lost = rng.random((scenario.tick_count, 2)) < channel.lost
     lost[: round(channel.lost_from / period)] = False
-    age = np.stack([arrivals(delays[:, side]) for side in range(2)], axis=1)
+    age = np.stack([compute_arriving_ages(delays[:, side]) for side in range(2)], axis=1)
     age[lost] = -1
     age = np.ascontiguousarray(age, np.int64)
     longest = np.maximum(delays.max(axis=0), 0)
-    return Line(
+    return ChannelBuffers(
         np.zeros((1 + longest[0], 3, 6)), np.zeros((1 + longest[1], 8, k)), np.zeros((8, k)), age,
-        np.array([0.0, 1.0, period, pilot.safety.silence, _FADE]),
+        np.array([0.0, 1.0, period, pilot.safety.silence, _FADE_TIME]),
     )  # fmt: skip
 
 
-def _delays(scenario: Scenario, channel: Channel, period: float) -> np.ndarray:
+def _packet_delays(scenario: Scenario, channel: Channel, period: float) -> np.ndarray:
     """Return the delays of all packets in ticks (ticks, 2), forward and back; -1 if lost."""
-    ticks = scenario.ticks
+    ticks = scenario.tick_count
     if channel.trace:
         path = Path(scenario.folder, channel.trace)
         measured = np.stack(load_delays(path), axis=1)
-        found = in_periods(measured, period)
+        found = delays_to_periods(measured, period)
         if np.any(found.max(axis=0) < 0):
             raise InputError(path, "all packets of one direction are lost; steering is impossible")
         return np.resize(found, (ticks, 2))
@@ -509,4 +510,4 @@ def _delays(scenario: Scenario, channel: Channel, period: float) -> np.ndarray:
     if not channel.jitter:
         return np.broadcast_to(np.round(steady / period).astype(int), (ticks, 2))
     rng = np.random.default_rng([scenario.seed, 405])
-    return in_periods(steady + rng.exponential(channel.jitter, (ticks, 2)), period)
+    return delays_to_periods(steady + rng.exponential(channel.jitter, (ticks, 2)), period)

@@ -16,91 +16,91 @@ from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
 from hydrotele.teleop.two_port import Impedance, stiffness_margin
 
-_PER_RATE = 0.01  # integration steps per time constant of the fastest mode
-_DEAD = 1e-9  # minimum speed or displacement, relative to the start of a half swing
-_MOST_STEPS = 10_000_000
+_STEP_RATIO = 0.01  # integration steps per time constant of the fastest mode
+_MIN_MOTION_RATIO = 1e-9  # minimum speed or displacement, relative to the start of a half swing
+_MAX_STEPS = 10_000_000
 
 
 @dataclass(frozen=True)
-class Spring:
+class StiffnessAxis:
     """A joystick axis whose stiffness follows a force.
 
     Attributes:
         mass: M [kg].
         damping: B [N s/m].
-        nominal: stiffness without contact [N/m].
-        least: K_min [N/m].
-        most: K_max [N/m].
+        nominal_stiffness: stiffness without contact [N/m].
+        min_stiffness: K_min [N/m].
+        max_stiffness: K_max [N/m].
     """
 
     mass: float
     damping: float
-    nominal: float
-    least: float
-    most: float
+    nominal_stiffness: float
+    min_stiffness: float
+    max_stiffness: float
 
     def __post_init__(self) -> None:
         """Raise InputError unless mass, damping and stiffness range are valid."""
         if not (self.mass > 0.0 and self.damping >= 0.0):
             raise InputError("stiffness", "mass must be positive, damping not negative")
-        if not 0.0 <= self.least <= self.nominal <= self.most:
+        if not 0.0 <= self.min_stiffness <= self.nominal_stiffness <= self.max_stiffness:
             raise InputError(
                 "stiffness", "must be ordered, 0 <= least <= nominal <= most:"
-                f" {self.least:g}, {self.nominal:g}, {self.most:g}",
+                f" {self.min_stiffness:g}, {self.nominal_stiffness:g}, {self.max_stiffness:g}",
             )  # fmt: skip
 
-    def held(self, hand: Impedance) -> "Spring":
+    def with_hand(self, hand: Impedance) -> "StiffnessAxis":
         """Return the axis held by a hand, whose mass, damper and spring are added."""
         stiff = hand.stiffness
-        return Spring(
-            self.mass + hand.mass, self.damping + hand.damping, self.nominal + stiff,
-            self.least + stiff, self.most + stiff,
+        return StiffnessAxis(
+            self.mass + hand.mass, self.damping + hand.damping, self.nominal_stiffness + stiff,
+            self.min_stiffness + stiff, self.max_stiffness + stiff,
         )  # fmt: skip
 
     @property
-    def margin(self) -> float:
+    def theorem_margin(self) -> float:
         """`B^2 - 4 M K_max` [(N s/m)^2]; sufficient if positive and K_min > 0 (Zhu 1994, 4.14)."""
-        return stiffness_margin(self.mass, self.damping, self.most)
+        return stiffness_margin(self.mass, self.damping, self.max_stiffness)
 
     @property
-    def stable_by(self) -> str:
+    def stability_criterion(self) -> str:
         """Criterion that proves stability: `theorem`, `switching bound`, or `nothing`.
 
         Theorem 4-2 requires `B > 0`, `K_min > 0` and `B^2 > 4 M K_max`. The switching bound
         requires that the motion under the worst switching decays, which is necessary and
         sufficient.
         """
-        if self.least > 0.0 and self.damping > 0.0 and self.margin > 0.0:
+        if self.min_stiffness > 0.0 and self.damping > 0.0 and self.theorem_margin > 0.0:
             return "theorem"
-        return "switching bound" if self.least > 0.0 and self.growth < 1.0 else "nothing"
+        return "switching bound" if self.min_stiffness > 0.0 and self.half_swing_growth < 1.0 else "nothing"
 
     @property
-    def least_damping(self) -> float:
+    def min_stable_damping(self) -> float:
         """Damping at which motion under the worst switching neither grows nor decays [N s/m]."""
-        if self.least <= 0.0:
+        if self.min_stiffness <= 0.0:
             return math.inf
-        if self.least == self.most:
+        if self.min_stiffness == self.max_stiffness:
             return 0.0
 
         def growth(damping: float) -> float:
-            return worst_growth(self.mass, damping, self.least, self.most) - 1.0
+            return worst_switching_growth(self.mass, damping, self.min_stiffness, self.max_stiffness) - 1.0
 
-        most = self.enough_damping
+        most = self.theorem_damping
         found: float = brentq(growth, 0.0, most, xtol=1e-3 * most)  # pyright: ignore - not full
         return found
 
     @property
-    def growth(self) -> float:
-        """Speed ratio over half a swing, see `worst_growth`."""
-        return worst_growth(self.mass, self.damping, self.least, self.most)
+    def half_swing_growth(self) -> float:
+        """Speed ratio over half a swing, see `worst_switching_growth`."""
+        return worst_switching_growth(self.mass, self.damping, self.min_stiffness, self.max_stiffness)
 
     @property
-    def enough_damping(self) -> float:
+    def theorem_damping(self) -> float:
         """Minimum damping for which the theorem holds [N s/m]."""
-        return 2.0 * math.sqrt(self.mass * self.most)
+        return 2.0 * math.sqrt(self.mass * self.max_stiffness)
 
 
-def worst_growth(mass: float, damping: float, least: float, most: float) -> float:
+def worst_switching_growth(mass: float, damping: float, least: float, most: float) -> float:
     """Return the growth of the speed over half a swing under the worst switching.
 
     The motion is linear between switches, so that every half swing grows by the same factor. Below
@@ -118,15 +118,15 @@ def worst_growth(mass: float, damping: float, least: float, most: float) -> floa
 
     Source: Zhu 1994, 4.2 (the switching that drives a spring unstable).
 
-    >>> round(worst_growth(1.0, 0.0, 100.0, 400.0), 3)
+    >>> round(worst_switching_growth(1.0, 0.0, 100.0, 400.0), 3)
     2.0
-    >>> worst_growth(1.0, 41.0, 20.0, 400.0)
+    >>> worst_switching_growth(1.0, 41.0, 20.0, 400.0)
     0.0
     """
     if least == 0.0 and damping == 0.0:
         return math.inf
     rate = max(damping / mass, math.sqrt(most / mass))
-    return float(_half_swing(damping / mass, least / mass, most / mass, _PER_RATE / rate))
+    return float(_simulate_half_swing(damping / mass, least / mass, most / mass, _STEP_RATIO / rate))
 
 
 def growth_map(mass: float, least: float, dampings: np.ndarray, stiffest: np.ndarray) -> np.ndarray:
@@ -139,23 +139,23 @@ def growth_map(mass: float, least: float, dampings: np.ndarray, stiffest: np.nda
         stiffest: (m,) K_max [N/m], none below K_min.
 
     Returns:
-        (m, n), see `worst_growth`.
+        (m, n), see `worst_switching_growth`.
     """
-    return np.array([[worst_growth(mass, b, least, k) for b in dampings] for k in stiffest])
+    return np.array([[worst_switching_growth(mass, b, least, k) for b in dampings] for k in stiffest])
 
 
 @compiled
-def _half_swing(damping, least, most, step):
+def _simulate_half_swing(damping, least, most, step):
     x, v = 0.0, 1.0
-    for _ in range(_MOST_STEPS):
-        if v <= _DEAD:
+    for _ in range(_MAX_STEPS):
+        if v <= _MIN_MOTION_RATIO:
             break
         x, v = _runge_kutta(x, v, damping, least, step)
     peak, v = x, min(v, 0.0)
-    for _ in range(_MOST_STEPS):
+    for _ in range(_MAX_STEPS):
         if x <= 0.0:
             return -v
-        if x < _DEAD * peak:
+        if x < _MIN_MOTION_RATIO * peak:
             break
         x, v = _runge_kutta(x, v, damping, most, step)
     return 0.0

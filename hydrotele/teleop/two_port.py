@@ -16,8 +16,8 @@ from hydrotele.core.errors import InputError
 
 Block = Callable[[np.ndarray], np.ndarray]  # transfer function of the complex frequency [rad/s]
 RATE_STRUCTURES = ("rate_position", "rate_force", "four_channel_rate")
-_DIRECT = ("position_position", "position_force", "four_channel_position")
-STRUCTURES = (*_DIRECT, *RATE_STRUCTURES)
+_POSITION_STRUCTURES = ("position_position", "position_force", "four_channel_position")
+STRUCTURES = (*_POSITION_STRUCTURES, *RATE_STRUCTURES)
 _WHERE = "two-port"
 
 
@@ -78,7 +78,7 @@ class TwoPort:
 
 
 @dataclass(frozen=True)
-class Gains:
+class StructureGains:
     """Gains of the channels of a structure.
 
     Attributes:
@@ -92,9 +92,9 @@ class Gains:
     force: float = 1.0
 
 
-def two_port(
+def make_two_port(
     structure: str, master: Impedance, slave: Impedance, master_control: Impedance,
-    slave_control: Impedance, gains: Gains | None = None, *, delay_forward: float = 0.0,
+    slave_control: Impedance, gains: StructureGains | None = None, *, delay_forward: float = 0.0,
     delay_back: float = 0.0, jerk: bool = False,
 ) -> TwoPort:  # fmt: skip
     """Build the two-port of a teleoperator with a known structure.
@@ -123,11 +123,11 @@ def two_port(
     Source: Lawrence 1992; Zhu 1994, 3.9-3.62.
 
     >>> heavy, firm = Impedance(1.0), Impedance(0.0, 40.0, 400.0)
-    >>> clear = two_port("four_channel_position", heavy, heavy, firm, firm)
-    >>> bool(np.allclose(hybrid(clear, 3j), [[0, 1], [-1, 0]]))
+    >>> clear = make_two_port("four_channel_position", heavy, heavy, firm, firm)
+    >>> bool(np.allclose(hybrid_matrix(clear, 3j), [[0, 1], [-1, 0]]))
     True
     """
-    gains = gains or Gains()
+    gains = gains or StructureGains()
     if structure not in STRUCTURES:
         raise InputError(_WHERE, f"{structure!r} is not known: {', '.join(STRUCTURES)}")
     if min(delay_forward, delay_back) < 0.0:
@@ -136,17 +136,17 @@ def two_port(
         raise InputError(_WHERE, f"the velocity gain must be positive, got {gains.velocity} 1/s")
     k = gains.velocity
 
-    def nothing(s: np.ndarray) -> np.ndarray:
+    def zero_block(s: np.ndarray) -> np.ndarray:
         return np.zeros_like(s)
 
-    def rated(block: Block) -> Block:
+    def rate_block(block: Block) -> Block:
         return lambda s: block(s) * k / s
 
-    forward = _scaled(slave_control, gains.position)
+    forward = _scale_block(slave_control, gains.position)
     own: Block = master_control
-    back, ahead, feel = nothing, nothing, nothing
+    back, ahead, feel = zero_block, zero_block, zero_block
     if structure in ("position_position", "rate_position"):
-        feel = _scaled(master_control, -1.0)
+        feel = _scale_block(master_control, -1.0)
     if structure in ("position_force", "rate_force"):
         back = lambda s: gains.force * np.ones_like(s)  # noqa: E731 - a constant block
     if structure == "four_channel_position":
@@ -154,19 +154,17 @@ def two_port(
         back, ahead = np.ones_like, np.ones_like
         feel = lambda s: -(master(s) + master_control(s))  # noqa: E731
     if structure in ("rate_position", "rate_force"):
-        forward = rated(slave_control)
+        forward = rate_block(slave_control)
     if structure in ("rate_position", "four_channel_rate"):
-        own = rated(master_control)
+        own = rate_block(master_control)
     if structure == "four_channel_rate":
-        forward = rated(lambda s: slave(s) * jerk + slave_control(s))
+        forward = rate_block(lambda s: slave(s) * jerk + slave_control(s))
         back, ahead = (lambda s: s / k), (lambda s: k / s)
         feel = lambda s: -(master(s) * s / k * jerk + master_control(s))  # noqa: E731
-    return TwoPort(
-        master, slave, own, slave_control, forward, back, ahead, feel, delay_forward, delay_back
-    )
+    return TwoPort(master, slave, own, slave_control, forward, back, ahead, feel, delay_forward, delay_back)
 
 
-def hybrid(port: TwoPort, s: np.ndarray | complex) -> np.ndarray:
+def hybrid_matrix(port: TwoPort, s: np.ndarray | complex) -> np.ndarray:
     """Return the hybrid matrix H of `[F_h, -V_e] = H [V_h, F_e]`.
 
     Args:
@@ -185,7 +183,7 @@ def hybrid(port: TwoPort, s: np.ndarray | complex) -> np.ndarray:
     return np.moveaxis(np.array(rows) / (b - c3 * c4), (0, 1), (-2, -1))
 
 
-def transmitted(port: TwoPort, s: np.ndarray | complex, environment: Block) -> np.ndarray:
+def transmitted_impedance(port: TwoPort, s: np.ndarray | complex, environment: Block) -> np.ndarray:
     """Return the impedance that is transmitted to the operator.
 
     Args:
@@ -199,7 +197,7 @@ def transmitted(port: TwoPort, s: np.ndarray | complex, environment: Block) -> n
     Source: Zhu 1994, 3.12.
     """
     s = np.asarray(s, complex)
-    h, task = hybrid(port, s), environment(s)
+    h, task = hybrid_matrix(port, s), environment(s)
     return h[..., 0, 0] - h[..., 0, 1] * h[..., 1, 0] * task / (1.0 + h[..., 1, 1] * task)
 
 
@@ -217,7 +215,7 @@ def scattering_norm(port: TwoPort, s: np.ndarray | complex, unit: float = 1.0) -
 
     Source: Anderson and Spong 1989; Zhu 1994, chapter 3.
     """
-    return hybrid_scattering_norm(hybrid(port, s), unit)
+    return hybrid_scattering_norm(hybrid_matrix(port, s), unit)
 
 
 def hybrid_scattering_norm(matrix: np.ndarray, unit: float = 1.0) -> np.ndarray:
@@ -228,9 +226,7 @@ def hybrid_scattering_norm(matrix: np.ndarray, unit: float = 1.0) -> np.ndarray:
     return np.linalg.svd(scatter, compute_uv=False)[..., 0]
 
 
-def characteristic(
-    port: TwoPort, s: np.ndarray | complex, hand: Block, environment: Block
-) -> np.ndarray:
+def characteristic_function(port: TwoPort, s: np.ndarray | complex, hand: Block, environment: Block) -> np.ndarray:
     """Return the characteristic function of hand, teleoperator and task, which is 0 at the poles.
 
     Args:
@@ -274,23 +270,23 @@ def stiffness_margin(mass: float, damping: float, stiffest: float) -> float:
     return damping**2 - 4.0 * mass * stiffest
 
 
-def _scaled(block: Block, factor: float) -> Block:
+def _scale_block(block: Block, factor: float) -> Block:
     return lambda s: factor * block(s)
 
 
-_ORIGIN = 4  # maximum number of poles at 0 of blocks with springs and integrators
-_TURN = 0.3  # rad, maximum phase change between neighbouring frequencies
-_FIRST = 4000  # initial number of frequencies
-_MOST = 4_000_000
-_ASIDE = 1e-4  # distance of the contour from poles at 0, relative to the lowest frequency
+_MAX_POLES_AT_ORIGIN = 4  # maximum number of poles at 0 of blocks with springs and integrators
+_MAX_PHASE_STEP = 0.3  # rad, maximum phase change between neighbouring frequencies
+_INITIAL_FREQUENCIES = 4000  # initial number of frequencies
+_MAX_FREQUENCIES = 4_000_000
+_CONTOUR_OFFSET = 1e-4  # distance of the contour from poles at 0, relative to the lowest frequency
 _WHERE_STABILITY = "stability"
 
 
-class OnTheAxis(InputError):
+class PoleOnAxisError(InputError):
     """A pole lies on the imaginary axis, so that encirclements cannot be counted."""
 
 
-def unstable_poles(
+def count_unstable_poles(
     port: TwoPort, hand: Block, environment: Block, *, lowest: float = 1e-3, highest: float = 1e4,
     masses: int = 2,
 ) -> int:  # fmt: skip
@@ -317,79 +313,71 @@ def unstable_poles(
 
     Source: argument principle; Zhu 1994, 3.13 (loop transfer functions LG1 and LG2).
     """
-    return _zeros(lambda s: characteristic(port, s, hand, environment), lowest, highest, masses)
+    return _count_unstable_zeros(lambda s: characteristic_function(port, s, hand, environment), lowest, highest, masses)
 
 
-def unstable_held(
-    port: TwoPort, environment: Block, *, lowest: float = 1e-3, highest: float = 1e4
-) -> int:
+def count_unstable_poles_held(port: TwoPort, environment: Block, *, lowest: float = 1e-3, highest: float = 1e4) -> int:
     """Return the number of unstable poles while the master's motion is imposed.
 
     Args:
         port: the two-port.
         environment: impedance of the task.
-        lowest: see `unstable_poles`.
-        highest: see `unstable_poles`.
+        lowest: see `count_unstable_poles`.
+        highest: see `count_unstable_poles`.
 
     Returns:
         The number of zeros of `Z_s + C_s + Z_e - C3 (C2 Z_e + C4)` in the right half-plane.
 
     Raises:
-        InputError: see `unstable_poles`.
+        InputError: see `count_unstable_poles`.
     """
 
-    def whole(s: np.ndarray) -> np.ndarray:
+    def loop_function(s: np.ndarray) -> np.ndarray:
         _, c2, c3, c4 = port.channels(s)
         task = environment(s)
         return port.slave(s) + port.slave_control(s) + task - c3 * (c2 * task + c4)
 
-    return _zeros(whole, lowest, highest, 1)
+    return _count_unstable_zeros(loop_function, lowest, highest, 1)
 
 
-def stable(port: TwoPort, hand: Block, environment: Block) -> bool:
-    """Return whether no pole lies in the right half-plane; see `unstable_poles`."""
-    return unstable_poles(port, hand, environment) == 0
+def is_stable(port: TwoPort, hand: Block, environment: Block) -> bool:
+    """Return whether no pole lies in the right half-plane; see `count_unstable_poles`."""
+    return count_unstable_poles(port, hand, environment) == 0
 
 
-def _zeros(function: Block, lowest: float, highest: float, least_order: int) -> int:
+def _count_unstable_zeros(function: Block, lowest: float, highest: float, least_order: int) -> int:
     """Count the zeros in the right half-plane of a function that has poles only at 0."""
-    shift = _ASIDE * lowest
-    order = _order(function, highest, least_order)
+    shift = _CONTOUR_OFFSET * lowest
+    order = _growth_order(function, highest, least_order)
 
-    def turned(frequency: np.ndarray) -> np.ndarray:
+    def normalised_function(frequency: np.ndarray) -> np.ndarray:
         s = shift + 1j * frequency
-        whole = function(s) * (s / (s + lowest)) ** _ORIGIN
+        whole = function(s) * (s / (s + lowest)) ** _MAX_POLES_AT_ORIGIN
         return whole / (s + lowest) ** order
 
-    frequency = np.concatenate([[0.0], np.geomspace(1e-2 * shift, highest, _FIRST)])
-    values = turned(frequency)
+    frequency = np.concatenate([[0.0], np.geomspace(1e-2 * shift, highest, _INITIAL_FREQUENCIES)])
+    values = normalised_function(frequency)
     while True:
         turns = np.abs(np.angle(values[1:] / values[:-1]))
-        wide = np.flatnonzero(turns > _TURN)
+        wide = np.flatnonzero(turns > _MAX_PHASE_STEP)
         if not len(wide):
             break
-        if len(frequency) + len(wide) > _MOST:
-            raise OnTheAxis(
-                _WHERE_STABILITY, "the phase is not resolved: a pole lies on the imaginary axis"
-            )
+        if len(frequency) + len(wide) > _MAX_FREQUENCIES:
+            raise PoleOnAxisError(_WHERE_STABILITY, "the phase is not resolved: a pole lies on the imaginary axis")
         between = 0.5 * (frequency[wide] + frequency[wide + 1])
         if np.any(between == frequency[wide]):
-            raise OnTheAxis(
-                _WHERE_STABILITY, "the phase is not resolved: a pole lies on the imaginary axis"
-            )
+            raise PoleOnAxisError(_WHERE_STABILITY, "the phase is not resolved: a pole lies on the imaginary axis")
         frequency = np.insert(frequency, wide + 1, between)
-        values = np.insert(values, wide + 1, turned(between))
+        values = np.insert(values, wide + 1, normalised_function(between))
     phase = np.unwrap(np.angle(values))
     return round(-(phase[-1] - phase[0]) / math.pi)
 
 
-def _order(function: Block, highest: float, least: int) -> int:
+def _growth_order(function: Block, highest: float, least: int) -> int:
     """Return the power of s with which the function grows; delays vanish far to the right."""
     far = highest * np.array([1e2, 1e3], complex)
     sizes = np.abs(function(far))
     order = round(float(np.log10(sizes[1] / sizes[0])))
     if order < least:
-        raise InputError(
-            _WHERE_STABILITY, "master and slave need masses, a transparent one also hand or task"
-        )
+        raise InputError(_WHERE_STABILITY, "master and slave need masses, a transparent one also hand or task")
     return order

@@ -34,7 +34,13 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from pydantic import model_validator
 
-from hydrotele.core.datafile import Facts, Name, NonNegative, Positive, suggest
+from hydrotele.core.datafile import (
+    Name,
+    NonNegativeFloat,
+    PositiveFloat,
+    StrictModel,
+    suggest_valid_name,
+)
 from hydrotele.core.errors import InputError
 
 
@@ -134,7 +140,7 @@ class Law:
     translate: Callable[[Parameters], Parameters] | None = None
     source: str = ""
 
-    def numbers(self, parameters: Parameters) -> np.ndarray:
+    def encode_parameters(self, parameters: Parameters) -> np.ndarray:
         """Encode parameters as the array that is passed to the compiled law.
 
         Args:
@@ -149,9 +155,7 @@ class Law:
         """
         given = dict(self.translate(parameters)) if self.translate else dict(parameters)
         for name in given.keys() - self.kinds.keys():
-            raise ValueError(
-                f"law {self.name}: unknown parameter {name!r}; {suggest(name, self.kinds)}"
-            )
+            raise ValueError(f"law {self.name}: unknown parameter {name!r}; {suggest_valid_name(name, self.kinds)}")
         given = {**self.defaults, **given}
         if missing := [name for name in self.kinds if name not in given]:
             raise ValueError(f"law {self.name}: missing parameters {', '.join(missing)}")
@@ -160,7 +164,7 @@ class Law:
         size = 1 + sum(2 if kind is Numbers else 1 for kind in self.kinds.values())
         front, back = [0.0], []
         for name, kind in self.kinds.items():
-            values = _values(self.name, name, kind, given[name])
+            values = _encode_value(self.name, name, kind, given[name])
             if kind is Numbers:
                 front += [size + len(back), size + len(back) + len(values)]
                 back += values
@@ -170,12 +174,12 @@ class Law:
         return np.array(front + back, float)
 
 
-def _values(law: str, name: str, kind: type, value: Any) -> list[float]:
+def _encode_value(law: str, name: str, kind: type, value: Any) -> list[float]:
     """Convert one parameter to a list of numbers; raise ValueError for an invalid value."""
     where = f"law {law}: parameter {name}"
     if kind is Variable:
         if value not in VARIABLES:
-            raise ValueError(f"{where}: {value!r} is not a variable; {suggest(value, VARIABLES)}")
+            raise ValueError(f"{where}: {value!r} is not a variable; {suggest_valid_name(value, VARIABLES)}")
         return [float(VARIABLES[value])]
     try:
         flat = np.asarray(value, float)
@@ -190,7 +194,7 @@ def _values(law: str, name: str, kind: type, value: Any) -> list[float]:
 LAWS: dict[str, Law] = {}
 """Laws by name: those of `hydrotele.terms.law`, and those of user files and plug-ins."""
 
-_reading: list[str] = []  # stack of the files and plug-ins that are defining laws
+_law_sources: list[str] = []  # stack of the files and plug-ins that are defining laws
 
 
 def law(
@@ -213,7 +217,7 @@ def law(
     """
     if function is None:
         return lambda it: law(it, check=check, translate=translate)
-    name, source = function.__name__, _reading[-1] if _reading else ""
+    name, source = function.__name__, _law_sources[-1] if _law_sources else ""
     where = f"{source}: law {name}" if source else f"law {name}"
     if name in LAWS:
         owner = LAWS[name].source or "hydrotele"
@@ -228,7 +232,7 @@ def law(
     return function
 
 
-class defined_by:  # noqa: N801 - a context manager, named as it is read
+class LawSource:  # noqa: N801 - a context manager, named as it is read
     """Context manager that records the file or plug-in that defines laws."""
 
     def __init__(self, source: str) -> None:
@@ -236,10 +240,10 @@ class defined_by:  # noqa: N801 - a context manager, named as it is read
         self._source = source
 
     def __enter__(self) -> None:
-        _reading.append(self._source)
+        _law_sources.append(self._source)
 
     def __exit__(self, *_: object) -> None:
-        _reading.pop()
+        _law_sources.pop()
 
 
 FUNCTIONS = {
@@ -255,8 +259,8 @@ FUNCTIONS = {
 }
 """Basic function -> (its code, number of constants, its definition)."""
 
-_DIVIDES = {"sign": 0, "root": 0, "bump": 1, "rise": 0, "sin": 0, "cos": 0}
-_PLAIN, _NONE, _HIGHEST = 0, -1, 6
+_DIVISOR_CONSTANTS = {"sign": 0, "root": 0, "bump": 1, "rise": 0, "sin": 0, "cos": 0}
+_NO_FUNCTION, _NO_VARIABLE, _MAX_POWER = 0, -1, 6
 
 
 def formula_arguments(parameters: Mapping[str, float]) -> dict[str, list[float]]:
@@ -281,81 +285,81 @@ def formula_arguments(parameters: Mapping[str, float]) -> dict[str, list[float]]
     for text, coefficient in parameters.items():
         if isinstance(coefficient, bool) or not isinstance(coefficient, int | float):
             raise ValueError(f"formula {text!r}: the coefficient {coefficient!r} is not a number")
-        factors = _factors(text)
+        factors = _parse_product(text)
         numbers += [coefficient, len(factors)]
         for factor in factors:
             numbers += factor
     return {"numbers": numbers}
 
 
-def _factors(text: str) -> list[list[float]]:
+def _parse_product(text: str) -> list[list[float]]:
     """Parse a product into its encoded factors; the product `1` has none."""
     try:
         node = ast.parse(text.strip(), mode="eval").body
     except SyntaxError:
-        raise _wrong(text, "it cannot be parsed") from None
+        raise _formula_error(text, "it cannot be parsed") from None
     if isinstance(node, ast.Constant) and node.value == 1:
         return []
-    return [_factor(text, part) for part in _parts(node)]
+    return [_parse_factor(text, part) for part in _split_factors(node)]
 
 
-def _parts(node: ast.expr) -> list[ast.expr]:
+def _split_factors(node: ast.expr) -> list[ast.expr]:
     """Return the factors of a product as syntax nodes."""
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mult):
-        return [*_parts(node.left), *_parts(node.right)]
+        return [*_split_factors(node.left), *_split_factors(node.right)]
     return [node]
 
 
-def _factor(text: str, node: ast.expr) -> list[float]:
+def _parse_factor(text: str, node: ast.expr) -> list[float]:
     """Encode a factor: function, variables, constants and power."""
     power = 1
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow):
         exponent = node.right
-        if not (isinstance(exponent, ast.Constant) and exponent.value in range(1, _HIGHEST + 1)):
-            raise _wrong(text, f"a power must be a whole number from 1 to {_HIGHEST}")
+        if not (isinstance(exponent, ast.Constant) and exponent.value in range(1, _MAX_POWER + 1)):
+            raise _formula_error(text, f"a power must be a whole number from 1 to {_MAX_POWER}")
         node, power = node.left, int(str(exponent.value))
     if not isinstance(node, ast.Call):
-        return [_PLAIN, *_argument(text, node), 0.0, 0.0, power]
+        return [_NO_FUNCTION, *_parse_argument(text, node), 0.0, 0.0, power]
     name = node.func.id if isinstance(node.func, ast.Name) else "?"
     if name not in FUNCTIONS:
-        raise _wrong(text, f"{name!r} is not a function; {suggest(name, FUNCTIONS)}")
+        raise _formula_error(text, f"{name!r} is not a function; {suggest_valid_name(name, FUNCTIONS)}")
     code, count, words = FUNCTIONS[name]
     if len(node.args) != 1 + count or node.keywords:
-        raise _wrong(text, f"the function is {words}")
-    constants = [_number(text, argument) for argument in node.args[1:]]
-    if name in _DIVIDES and constants[_DIVIDES[name]] <= 0.0:
-        raise _wrong(text, f"a width, length or time must be positive: {words}")
+        raise _formula_error(text, f"the function is {words}")
+    constants = [_parse_number(text, argument) for argument in node.args[1:]]
+    if name in _DIVISOR_CONSTANTS and constants[_DIVISOR_CONSTANTS[name]] <= 0.0:
+        raise _formula_error(text, f"a width, length or time must be positive: {words}")
     constants += [0.0] * (2 - count)
-    return [code, *_argument(text, node.args[0]), *constants, power]
+    return [code, *_parse_argument(text, node.args[0]), *constants, power]
 
 
-def _argument(text: str, node: ast.expr) -> list[int]:
+def _parse_argument(text: str, node: ast.expr) -> list[int]:
     """Return the indices of a variable and of the variable to subtract, -1 for none."""
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub):
-        return [_variable(text, node.left), _variable(text, node.right)]
-    return [_variable(text, node), _NONE]
+        return [_parse_variable(text, node.left), _parse_variable(text, node.right)]
+    return [_parse_variable(text, node), _NO_VARIABLE]
 
 
-def _variable(text: str, node: ast.expr) -> int:
+def _parse_variable(text: str, node: ast.expr) -> int:
     """Return the index of a variable."""
     name = node.id if isinstance(node, ast.Name) else ast.unparse(node)
     if name not in VARIABLES:
-        raise _wrong(text, f"{name!r} is not a variable; {suggest(name, VARIABLES)}")
+        raise _formula_error(text, f"{name!r} is not a variable; {suggest_valid_name(name, VARIABLES)}")
     return VARIABLES[name]
 
 
-def _number(text: str, node: ast.expr) -> float:
+def _parse_number(text: str, node: ast.expr) -> float:
     """Return the value of a numeric constant."""
     try:
         value = ast.literal_eval(node)
     except ValueError:
         value = None
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise _wrong(text, f"{ast.unparse(node)!r} is not a number")
+        raise _formula_error(text, f"{ast.unparse(node)!r} is not a number")
     return float(value)
 
 
-def _wrong(text: str, why: str) -> ValueError:
+def _formula_error(text: str, why: str) -> ValueError:
     """Create the error for a formula that cannot be parsed."""
     return ValueError(
         f"formula {text!r}: {why}; write '1' or a product such as 'velocity * abs(velocity)' of"
@@ -411,7 +415,7 @@ def _check_points(given: Parameters, *names: str) -> None:
             raise ValueError(f"{name} must be at least two increasing numbers, not {points}")
 
 
-def _flat(values: Any) -> list[float]:
+def _flatten(values: Any) -> list[float]:
     return [x for row in values for x in (row if isinstance(row, list | tuple) else [row])]
 
 
@@ -424,7 +428,7 @@ def _check_table(given: Parameters) -> None:
 def _check_table2(given: Parameters) -> None:
     _check_points(given, "row_points", "column_points")
     rows, columns = len(given["row_points"]), len(given["column_points"])
-    if len(_flat(given["values"])) != rows * columns:
+    if len(_flatten(given["values"])) != rows * columns:
         raise ValueError(f"values must be {rows} rows of {columns} numbers")
 
 
@@ -545,9 +549,7 @@ def load_friction(s: DriveState, coefficient: float, smoothing_velocity: float) 
 
 
 @law
-def friction_bump(
-    s: DriveState, coulomb: float, centre: float, width: float, smoothing_velocity: float
-) -> float:
+def friction_bump(s: DriveState, coulomb: float, centre: float, width: float, smoothing_velocity: float) -> float:
     """Return dry friction at one position, `-F exp(-(x - c)^2 / (2 w^2)) tanh(v / v0)`."""
     far = (s.position - centre) / width
     return -coulomb * math.exp(-0.5 * far * far) * math.tanh(s.velocity / smoothing_velocity)
@@ -587,14 +589,14 @@ def leakage_drift(s: DriveState, leakage: float, ratio: float, time_constant: fl
 
 BALANCES = ("force", "flow_head", "flow_rod", "command", "flow_supply")
 Balance = Literal["force", "flow_head", "flow_rod", "command", "flow_supply"]
-OF_A_DRIVE = (
+DRIVE_VARIABLES = (
     "position", "velocity", "spool", "spool_rate", "pump_speed", "pressure_load", "pressure_head",
     "pressure_rod", "command", "force",
 )  # fmt: skip
 """Variables that a law can take from another drive."""
 
 
-class Play(Facts):
+class Play(StrictModel):
     """Backlash operator of a term: its output follows the variable at most `half_width` behind.
 
     The law reads the output as `played` and the difference between variable and output as `ahead`.
@@ -602,10 +604,10 @@ class Play(Facts):
     """
 
     variable: str
-    half_width: Positive
+    half_width: PositiveFloat
 
 
-class Switch(Facts):
+class Switch(StrictModel):
     """Relay with hysteresis that switches a law on and off.
 
     The law becomes active when the variable passes `on`, and inactive when it returns past `off`.
@@ -624,7 +626,7 @@ class Switch(Facts):
         return self
 
 
-class Term(Facts):
+class Term(StrictModel):
     """A law that adds to a balance of a drive.
 
     - `name`: origin of the term, such as the name of an effect.
@@ -650,7 +652,7 @@ class Term(Facts):
     window: tuple[float, float] | None = None
     play: Play | None = None
     switch: Switch | None = None
-    uncertainty: NonNegative | None = None
+    uncertainty: NonNegativeFloat | None = None
     description: str = ""
     source: str = ""
 
@@ -663,18 +665,15 @@ class Term(Facts):
                 " plug-in, install it"
             )
         if self.law not in LAWS:
-            raise ValueError(f"law {self.law!r} is not known; {suggest(self.law, LAWS)}")
+            raise ValueError(f"law {self.law!r} is not known; {suggest_valid_name(self.law, LAWS)}")
         for variable in self.of:
-            if variable not in OF_A_DRIVE:
+            if variable not in DRIVE_VARIABLES:
                 raise ValueError(
-                    f"of: {variable!r} is not a variable of a drive;"
-                    f" {suggest(variable, OF_A_DRIVE)}"
+                    f"of: {variable!r} is not a variable of a drive; {suggest_valid_name(variable, DRIVE_VARIABLES)}"
                 )
         for variable, (low, high) in self.domain.items():
             if variable not in VARIABLES:
-                raise ValueError(
-                    f"domain: {variable!r} is not a variable; {suggest(variable, VARIABLES)}"
-                )
+                raise ValueError(f"domain: {variable!r} is not a variable; {suggest_valid_name(variable, VARIABLES)}")
             if not low < high:
                 raise ValueError(f"domain of {variable}: [{low:g}, {high:g}] must be increasing")
         if self.play and self.switch:
@@ -682,9 +681,9 @@ class Term(Facts):
         for key, memory in (("play", self.play), ("switch", self.switch)):
             valid = VARIABLES.keys() - {"played", "ahead"}
             if memory and memory.variable not in valid:
-                known = suggest(memory.variable, valid)
+                known = suggest_valid_name(memory.variable, valid)
                 raise ValueError(f"{key}: {memory.variable!r} is not a variable; {known}")
         if self.window and not self.window[0] < self.window[1]:
             raise ValueError("window: [{:g}, {:g}] must be increasing".format(*self.window))
-        LAWS[self.law].numbers(self.parameters)
+        LAWS[self.law].encode_parameters(self.parameters)
         return self

@@ -24,10 +24,10 @@ from hydrotele.terms.law import BALANCES, LAWS, VARIABLES, DriveState, Law, Numb
 
 # numpy integers, since numba compiles a function again for every Python integer literal
 FORCE, FLOW_HEAD, FLOW_ROD, COMMAND, FLOW_SUPPLY = np.arange(len(BALANCES), dtype=np.int64)
-ANY = np.int64(-1)  # any drive
-MARKER = 215326.75  # first value of a table of terms, to find it among the custom numerics
+ANY_DRIVE = np.int64(-1)  # any drive
+TERMS_MARKER = 215326.75  # first value of a table of terms, to find it among the custom numerics
 NO_TERMS = np.zeros(0)
-COUNT = 1  # index of the number of terms, after the marker
+COUNT_INDEX = 1  # index of the number of terms, after the marker
 (
     _AXIS,
     _BALANCE,
@@ -37,33 +37,33 @@ COUNT = 1  # index of the number of terms, after the marker
     _DOMAIN,
     _RANGES,
     _OTHERS,
-    _BEGIN,
-    _END,
-    _WAY,
-    _PLACE,
-    _REMEMBERED,
+    _WINDOW_START,
+    _WINDOW_STOP,
+    _HYSTERESIS,
+    _STATE_INDEX,
+    _HYSTERESIS_VARIABLE,
     _SHIFT,
     _SCALE,
-    _ROW,
+    _ROW_SIZE,
 ) = range(16)  # columns of a term's row; _ROW is their number
 PLAY, SWITCH = 1, 2  # kinds of hysteresis of a term, 0 for none
-_BAND = 0.1  # width of a switch's ramps, as a fraction of the interval between its thresholds
-_HEAD = 2
-_OTHER = 4  # values of a variable of another drive: variable, drive, and the drive's two areas
-_MOST = 1024  # largest number of laws in a process
-_EDGE = 0.1  # s, duration of the ramps at the ends of a term's window
-_ALWAYS = (-1.0e18, 1.0e18)  # s, finite, because MJCF files store numbers as text
-_SPEED = 1.0e-6  # absolute [m/s or rad/s] and relative step of the velocity derivative
-_PRESSURE = 100.0  # Pa, step of pressure derivatives: small against the smoothing of an orifice
+_SWITCH_RAMP_FRACTION = 0.1  # width of a switch's ramps, as a fraction of the interval between its thresholds
+_HEADER_SIZE = 2
+_OTHER_SIZE = 4  # values of a variable of another drive: variable, drive, and the drive's two areas
+_MAX_LAWS = 1024  # largest number of laws in a process
+_WINDOW_RAMP = 0.1  # s, duration of the ramps at the ends of a term's window
+_NO_WINDOW = (-1.0e18, 1.0e18)  # s, finite, because MJCF files store numbers as text
+_VELOCITY_STEP = 1.0e-6  # absolute [m/s or rad/s] and relative step of the velocity derivative
+_PRESSURE_STEP = 100.0  # Pa, step of pressure derivatives: small against the smoothing of an orifice
 
-_registered = np.zeros((_MOST, 2), np.int64)  # address and checksum of every law
-_kept: list = []  # keeps the compiled functions at these addresses alive
-_places: dict[str, tuple[Law, int]] = {}
+_law_addresses = np.zeros((_MAX_LAWS, 2), np.int64)  # address and checksum of every law
+_kept_functions: list = []  # keeps the compiled functions at these addresses alive
+_law_indices: dict[str, tuple[Law, int]] = {}
 _lock = threading.Lock()
-binding.add_symbol("hydrotele_laws", _registered.ctypes.data)
+binding.add_symbol("hydrotele_laws", _law_addresses.ctypes.data)
 
 
-def law_place(name: str) -> int:
+def law_index(name: str) -> int:
     """Return the index of a law in the law table of this process; compile it on first use.
 
     Raises:
@@ -73,24 +73,24 @@ def law_place(name: str) -> int:
         if name not in LAWS:
             message = "is not known in this process; load the file that defines it first"
             raise InputError(f"law {name}", message)
-        law, place = _places.get(name, (None, 0))
+        law, place = _law_indices.get(name, (None, 0))
         if law is not LAWS[name]:
-            if len(_kept) == _MOST:
-                raise InputError(f"law {name}", f"exceeds the limit of {_MOST} laws in a process")
-            called = _callable_from_c(LAWS[name])
-            _registered[len(_kept)] = called.address, checksum(name)
-            _kept.append(called)
-            place = len(_kept) - 1
-            _places[name] = LAWS[name], place
+            if len(_kept_functions) == _MAX_LAWS:
+                raise InputError(f"law {name}", f"exceeds the limit of {_MAX_LAWS} laws in a process")
+            called = _compile_c_function(LAWS[name])
+            _law_addresses[len(_kept_functions)] = called.address, name_checksum(name)
+            _kept_functions.append(called)
+            place = len(_kept_functions) - 1
+            _law_indices[name] = LAWS[name], place
         return place
 
 
-def checksum(name: str) -> int:
+def name_checksum(name: str) -> int:
     """Return a checksum of a law's name that a float represents exactly."""
     return zlib.crc32(name.encode())
 
 
-def _callable_from_c(law: Law):
+def _compile_c_function(law: Law):
     """Compile a law to a C function `double(double *parameters, double *state)`."""
     places, arguments = 1, []
     for kind in law.kinds.values():
@@ -106,7 +106,7 @@ def _callable_from_c(law: Law):
         "    p = carray(parameters, (int(parameters[0]),))\n"
         f"    return float(function(DriveState({state}), {', '.join(arguments)}))\n"
     )
-    own = compiled(law.function) if not law.source else _compiled_anew(law.function)
+    own = compiled(law.function) if not law.source else _compile_uncached(law.function)
     names = {"carray": carray, "DriveState": DriveState, "function": own}
     exec(text, names)  # generated code, because the number of arguments differs between laws
     pointer = types.CPointer(types.float64)
@@ -120,7 +120,7 @@ def _callable_from_c(law: Law):
         raise InputError(f"{law.source}: law {law.name}", message) from None
 
 
-def _compiled_anew(function):
+def _compile_uncached(function):
     """Compile a user's function without cache, which would miss changes of the files it uses."""
     return njit(error_model="numpy", nogil=True)(function)
 
@@ -149,32 +149,32 @@ def terms_table(
     """
     if not terms:
         return NO_TERMS
-    rows, back, first = [], [], _HEAD + _ROW * len(terms)
-    places = {id(term): memory + k for k, term in enumerate(remembering(terms)) if memory}
+    rows, back, first = [], [], _HEADER_SIZE + _ROW_SIZE * len(terms)
+    places = {id(term): memory + k for k, term in enumerate(terms_with_hysteresis(terms)) if memory}
     for term in terms:
-        place = law_place(term.law)
-        numbers = LAWS[term.law].numbers(term.parameters)
+        place = law_index(term.law)
+        numbers = LAWS[term.law].encode_parameters(term.parameters)
         ranges = [x for name, ends in term.domain.items() for x in (VARIABLES[name], *ends)]
         at = first + len(back)
         rows += [
-            order.index(term.axis), BALANCES.index(term.balance), place, checksum(term.law), at,
-            at + len(numbers), len(term.domain), len(term.of), *(term.window or _ALWAYS),
-            *_memory_numbers(term, places.get(id(term), 0)),
+            order.index(term.axis), BALANCES.index(term.balance), place, name_checksum(term.law), at,
+            at + len(numbers), len(term.domain), len(term.of), *(term.window or _NO_WINDOW),
+            *_hysteresis_parameters(term, places.get(id(term), 0)),
         ]  # fmt: skip
         others = [
             x for name, axis in term.of.items()
             for x in (VARIABLES[name], order.index(axis), *(areas or {}).get(axis, (0.0, 0.0)))
         ]  # fmt: skip
         back += [*numbers, *ranges, *others]
-    return np.array([MARKER, len(terms), *rows, *back], float)
+    return np.array([TERMS_MARKER, len(terms), *rows, *back], float)
 
 
-def remembering(terms: Sequence[Term]) -> list[Term]:
+def terms_with_hysteresis(terms: Sequence[Term]) -> list[Term]:
     """Return the terms with hysteresis, in their order."""
     return [term for term in terms if term.play or term.switch]
 
 
-def _memory_numbers(term: Term, place: int) -> tuple[float, ...]:
+def _hysteresis_parameters(term: Term, place: int) -> tuple[float, ...]:
     """Return kind, activation index, variable, shift and scale of a term's hysteresis."""
     if term.play:
         return PLAY, place, VARIABLES[term.play.variable], 0.0, term.play.half_width
@@ -185,7 +185,7 @@ def _memory_numbers(term: Term, place: int) -> tuple[float, ...]:
 
 
 @intrinsic
-def _laws(typingctx):
+def _law_table_address(typingctx):
     """Return the address of the law table of this process."""
 
     def codegen(context, builder, signature, args):
@@ -197,7 +197,7 @@ def _laws(typingctx):
 
 
 @intrinsic
-def _word(typingctx, address):
+def _read_int64(typingctx, address):
     """Return the int64 at an address."""
 
     def codegen(context, builder, signature, args):
@@ -208,7 +208,7 @@ def _word(typingctx, address):
 
 
 @intrinsic
-def _call(typingctx, function, terms, at, state):
+def _call_law(typingctx, function, terms, at, state):
     """Call the law at an address with the parameters at an index of the table; return its value."""
 
     def codegen(context, builder, signature, args):
@@ -226,13 +226,13 @@ def _call(typingctx, function, terms, at, state):
 
 
 @allocation_free
-def _seen(terms, at, k, value, s, drives):
+def _law_variable(terms, at, k, value, s, drives):
     """Return a variable as the law of a term gets it: of the drive in `of`, clipped to `domain`."""
     first = int(terms[at + _DOMAIN])
     last = first + 3 * int(terms[at + _RANGES])
-    for j in range(last, last + _OTHER * int(terms[at + _OTHERS]), _OTHER):
+    for j in range(last, last + _OTHER_SIZE * int(terms[at + _OTHERS]), _OTHER_SIZE):
         if int(terms[j]) == k:
-            value = _of_drive(terms, j, s, drives)
+            value = _other_drive_variable(terms, j, s, drives)
     for j in range(first, last, 3):
         if int(terms[j]) == k:
             value = min(terms[j + 2], max(terms[j + 1], value))
@@ -240,30 +240,30 @@ def _seen(terms, at, k, value, s, drives):
 
 
 @allocation_free
-def _held(terms, at, drives):
+def _hysteresis_state(terms, at, drives):
     """Return the internal state of a term, scalar [1]; 0 if it has no activation."""
-    place = int(terms[at + _PLACE])
+    place = int(terms[at + _STATE_INDEX])
     return drives.act[place] if 0 < place < len(drives.act) else 0.0
 
 
 @allocation_free
-def _value(terms, at, s, drives):
+def _hysteresis_variable(terms, at, s, drives):
     """Return the current value of the variable of a term's hysteresis [its unit]."""
-    k = int(terms[at + _REMEMBERED])
+    k = int(terms[at + _HYSTERESIS_VARIABLE])
     last = int(terms[at + _DOMAIN]) + 3 * int(terms[at + _RANGES])
-    for j in range(last, last + _OTHER * int(terms[at + _OTHERS]), _OTHER):
+    for j in range(last, last + _OTHER_SIZE * int(terms[at + _OTHERS]), _OTHER_SIZE):
         if int(terms[j]) == k:
-            return _of_drive(terms, j, s, drives)
+            return _other_drive_variable(terms, j, s, drives)
     return s[k]
 
 
 @allocation_free
-def remembered(way, held, x):
+def update_hysteresis(kind, state, x):
     """Update the internal state of a play or switch for a new value of its variable.
 
     Args:
-        way: PLAY or SWITCH.
-        held: previous internal state, scalar [1].
+        kind: PLAY or SWITCH.
+        state: previous internal state, scalar [1].
         x: for a play the variable divided by the half width; for a switch the variable scaled to
             0 at the off threshold and 1 at the on threshold, scalar [1].
 
@@ -274,47 +274,47 @@ def remembered(way, held, x):
     Source: play and relay with hysteresis, Visintin 1994, Differential Models of Hysteresis; the
         relay's jumps are ramps.
     """
-    if way == PLAY:
-        return min(x + 1.0, max(x - 1.0, held))
-    low = min(1.0, max(0.0, (x - 1.0) / _BAND + 0.5))
-    high = min(1.0, max(0.0, x / _BAND + 0.5))
-    return min(high, max(low, held))
+    if kind == PLAY:
+        return min(x + 1.0, max(x - 1.0, state))
+    low = min(1.0, max(0.0, (x - 1.0) / _SWITCH_RAMP_FRACTION + 0.5))
+    high = min(1.0, max(0.0, x / _SWITCH_RAMP_FRACTION + 0.5))
+    return min(high, max(low, state))
 
 
 @allocation_free
-def remember(terms, term, value, held):
+def update_term_state(terms, term, value, state):
     """Update the internal state of a term for a new value of its variable.
 
     Args:
         terms: (n,) table of `terms_table`.
         term: index of a term with hysteresis.
         value: value of its variable, scalar [its unit].
-        held: previous internal state, scalar [1].
+        state: previous internal state, scalar [1].
 
     Returns:
         New internal state, scalar [1].
 
-    Source: `remembered`.
+    Source: `update_hysteresis`.
     """
-    at = _HEAD + _ROW * term
+    at = _HEADER_SIZE + _ROW_SIZE * term
     x = (value - terms[at + _SHIFT]) / terms[at + _SCALE]
-    return remembered(terms[at + _WAY], held, x)
+    return update_hysteresis(terms[at + _HYSTERESIS], state, x)
 
 
 @allocation_free
-def memory_of(terms, term):
+def hysteresis_location(terms, term):
     """Return (activation index, axis, variable) of a term's hysteresis; index 0 for none."""
-    at = _HEAD + _ROW * term
-    axis, k = int(terms[at + _AXIS]), int(terms[at + _REMEMBERED])
+    at = _HEADER_SIZE + _ROW_SIZE * term
+    axis, k = int(terms[at + _AXIS]), int(terms[at + _HYSTERESIS_VARIABLE])
     last = int(terms[at + _DOMAIN]) + 3 * int(terms[at + _RANGES])
-    for j in range(last, last + _OTHER * int(terms[at + _OTHERS]), _OTHER):
+    for j in range(last, last + _OTHER_SIZE * int(terms[at + _OTHERS]), _OTHER_SIZE):
         if int(terms[j]) == k:
             axis = int(terms[j + 1])
-    return int(terms[at + _PLACE]), axis, k
+    return int(terms[at + _STATE_INDEX]), axis, k
 
 
 @allocation_free
-def _of_drive(terms, j, s, drives):
+def _other_drive_variable(terms, j, s, drives):
     """Return the variable of another drive given by entry j; shared variables are those of s."""
     k, i = int(terms[j]), int(terms[j + 1])
     if i < 0 or i >= len(drives.velocity):
@@ -334,16 +334,16 @@ def _of_drive(terms, j, s, drives):
     return s[k]
 
 
-def acting(time, begin, end):
+def window_factor(time, begin, end):
     """Return the factor of a term's time window, 0 to 1, at a time or an array of times [s]."""
-    return np.minimum(1.0, np.maximum(0.0, 0.5 + np.minimum(time - begin, end - time) / _EDGE))
+    return np.minimum(1.0, np.maximum(0.0, 0.5 + np.minimum(time - begin, end - time) / _WINDOW_RAMP))
 
 
-_acting = allocation_free(acting)
+_window_factor = allocation_free(window_factor)
 
 
 @allocation_free
-def acts_on(terms, balance, axis):
+def has_term(terms, balance, axis):
     """Return whether any term adds to a balance of a drive, so that its inputs are needed.
 
     Args:
@@ -356,15 +356,15 @@ def acts_on(terms, balance, axis):
     """
     if len(terms) == 0:
         return False
-    for term in range(int(terms[COUNT])):
-        at = _HEAD + _ROW * term
-        if int(terms[at + _BALANCE]) == balance and (axis == ANY or int(terms[at + _AXIS]) == axis):
+    for term in range(int(terms[COUNT_INDEX])):
+        at = _HEADER_SIZE + _ROW_SIZE * term
+        if int(terms[at + _BALANCE]) == balance and (axis == ANY_DRIVE or int(terms[at + _AXIS]) == axis):
             return True
     return False
 
 
 @allocation_free
-def added(terms, balance, axis, s, drives):
+def sum_terms(terms, balance, axis, s, drives):
     """Return the sum of all terms of a balance of a drive.
 
     Args:
@@ -380,49 +380,49 @@ def added(terms, balance, axis, s, drives):
     total = 0.0
     if len(terms) == 0:
         return total
-    for term in range(int(terms[COUNT])):
-        at = _HEAD + _ROW * term
+    for term in range(int(terms[COUNT_INDEX])):
+        at = _HEADER_SIZE + _ROW_SIZE * term
         if int(terms[at + _AXIS]) != axis or int(terms[at + _BALANCE]) != balance:
             continue
-        share = _acting(s.time, terms[at + _BEGIN], terms[at + _END])
-        if terms[at + _WAY] == SWITCH:
-            share *= _held(terms, at, drives)
+        share = _window_factor(s.time, terms[at + _WINDOW_START], terms[at + _WINDOW_STOP])
+        if terms[at + _HYSTERESIS] == SWITCH:
+            share *= _hysteresis_state(terms, at, drives)
         if share == 0.0:
             continue
         place = int(terms[at + _LAW])
-        if place < 0 or place >= _MOST:
+        if place < 0 or place >= _MAX_LAWS:
             continue
-        entry = _laws() + 16 * place
-        address = _word(entry)
-        if address == 0 or _word(entry + 8) != int(terms[at + _CHECKSUM]):
+        entry = _law_table_address() + 16 * place
+        address = _read_int64(entry)
+        if address == 0 or _read_int64(entry + 8) != int(terms[at + _CHECKSUM]):
             continue
         seen = s
-        played = terms[at + _WAY] == PLAY
+        played = terms[at + _HYSTERESIS] == PLAY
         let_through, own = 0.0, 0.0
         if played:
-            let_through = terms[at + _SCALE] * _held(terms, at, drives)
-            own = _value(terms, at, s, drives)
+            let_through = terms[at + _SCALE] * _hysteresis_state(terms, at, drives)
+            own = _hysteresis_variable(terms, at, s, drives)
         if played or terms[at + _RANGES] > 0.0 or terms[at + _OTHERS] > 0.0:
             seen = DriveState(
-                _seen(terms, at, np.int64(0), s.time, s, drives),
-                _seen(terms, at, np.int64(1), s.position, s, drives),
-                _seen(terms, at, np.int64(2), s.velocity, s, drives),
-                _seen(terms, at, np.int64(3), s.spool, s, drives),
-                _seen(terms, at, np.int64(4), s.spool_rate, s, drives),
-                _seen(terms, at, np.int64(5), s.pressure_head, s, drives),
-                _seen(terms, at, np.int64(6), s.pressure_rod, s, drives),
-                _seen(terms, at, np.int64(7), s.pressure_supply, s, drives),
-                _seen(terms, at, np.int64(8), s.command, s, drives),
-                _seen(terms, at, np.int64(9), s.force, s, drives),
+                _law_variable(terms, at, np.int64(0), s.time, s, drives),
+                _law_variable(terms, at, np.int64(1), s.position, s, drives),
+                _law_variable(terms, at, np.int64(2), s.velocity, s, drives),
+                _law_variable(terms, at, np.int64(3), s.spool, s, drives),
+                _law_variable(terms, at, np.int64(4), s.spool_rate, s, drives),
+                _law_variable(terms, at, np.int64(5), s.pressure_head, s, drives),
+                _law_variable(terms, at, np.int64(6), s.pressure_rod, s, drives),
+                _law_variable(terms, at, np.int64(7), s.pressure_supply, s, drives),
+                _law_variable(terms, at, np.int64(8), s.command, s, drives),
+                _law_variable(terms, at, np.int64(9), s.force, s, drives),
                 let_through,
                 own - let_through,
             )
-        total += share * _call(address, terms, int(terms[at + _PARAMETERS]), seen)
+        total += share * _call_law(address, terms, int(terms[at + _PARAMETERS]), seen)
     return total
 
 
 @allocation_free
-def _moved(s, velocity, head, rod):
+def _shift_state(s, velocity, head, rod):
     """Return the state with increments added to velocity and chamber pressures."""
     return DriveState(
         s.time, s.position, s.velocity + velocity, s.spool, s.spool_rate, s.pressure_head + head,
@@ -432,7 +432,7 @@ def _moved(s, velocity, head, rod):
 
 
 @allocation_free
-def added_with_slope(terms, balance, axis, s, drives):
+def sum_terms_with_slope(terms, balance, axis, s, drives):
     """Return the sum of the force or command terms, and its derivative by the velocity.
 
     Args:
@@ -445,14 +445,14 @@ def added_with_slope(terms, balance, axis, s, drives):
     Returns:
         (sum, d sum / d velocity), by a forward difference.
     """
-    value = added(terms, balance, axis, s, drives)
-    step = _SPEED * (1.0 + abs(s.velocity))
-    beyond = added(terms, balance, axis, _moved(s, step, 0.0, 0.0), drives)
+    value = sum_terms(terms, balance, axis, s, drives)
+    step = _VELOCITY_STEP * (1.0 + abs(s.velocity))
+    beyond = sum_terms(terms, balance, axis, _shift_state(s, step, 0.0, 0.0), drives)
     return value, (beyond - value) / step
 
 
 @allocation_free
-def added_flows(terms, axis, s, drives):
+def sum_flow_terms(terms, axis, s, drives):
     """Return the flows that terms add to both chambers of an axis, and their slopes.
 
     Args:
@@ -465,8 +465,13 @@ def added_flows(terms, axis, s, drives):
         (q_head, q_rod [m^3/s], d q_head/d p_head, d q_rod/d p_rod [m^3/(s Pa)]). The slopes are
         forward differences, limited to values <= 0 for a stable implicit step.
     """
-    head = added(terms, FLOW_HEAD, axis, s, drives)
-    rod = added(terms, FLOW_ROD, axis, s, drives)
-    more = added(terms, FLOW_HEAD, axis, _moved(s, 0.0, _PRESSURE, 0.0), drives)
-    less = added(terms, FLOW_ROD, axis, _moved(s, 0.0, 0.0, _PRESSURE), drives)
-    return head, rod, min(0.0, (more - head) / _PRESSURE), min(0.0, (less - rod) / _PRESSURE)
+    head = sum_terms(terms, FLOW_HEAD, axis, s, drives)
+    rod = sum_terms(terms, FLOW_ROD, axis, s, drives)
+    more = sum_terms(terms, FLOW_HEAD, axis, _shift_state(s, 0.0, _PRESSURE_STEP, 0.0), drives)
+    less = sum_terms(terms, FLOW_ROD, axis, _shift_state(s, 0.0, 0.0, _PRESSURE_STEP), drives)
+    return (
+        head,
+        rod,
+        min(0.0, (more - head) / _PRESSURE_STEP),
+        min(0.0, (less - rod) / _PRESSURE_STEP),
+    )

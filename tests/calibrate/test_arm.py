@@ -11,24 +11,24 @@ from hydrotele.calibrate.arm import (
     identify_jointly,
     machine_with_loop,
 )
-from hydrotele.calibrate.arm_data import moving_link, stage_of, strokes_of
-from hydrotele.calibrate.arm_poses import with_drift
+from hydrotele.calibrate.arm_data import extract_strokes, find_moving_link, log_to_poses
+from hydrotele.calibrate.arm_poses import add_drift
 from hydrotele.calibrate.bad_data import identify_without_bad_data
-from hydrotele.calibrate.design import STILL, sweep_poses
+from hydrotele.calibrate.design import DRIFT_FREE_SWEEPS, generate_sweep_poses
 from hydrotele.calibrate.linkage import (
-    Strokes,
+    AxisStrokes,
     identify_linkage,
+    linkage_parameters,
     machine_with_linkage,
-    values_of,
 )
-from hydrotele.calibrate.loop import ball_from, closure, loop_of
+from hydrotele.calibrate.loop import ball_position_and_rates, build_loop, closure_error
 from hydrotele.core.errors import InputError
 from hydrotele.experiments.calibrator_readings import (
+    find_true_parameters,
     perturb_loop,
     simulate_readings,
-    true_numbers,
 )
-from hydrotele.experiments.khoshzaban_arm import LISTS
+from hydrotele.experiments.khoshzaban_arm import IDENTIFIABLE_PARAMETERS
 from hydrotele.experiments.khoshzaban_machine import TABLE_2
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.kinematics.linkages import TwoBar
@@ -36,7 +36,7 @@ from hydrotele.logs.log import Log
 from hydrotele.machine.machine_file import load_machine
 
 MACHINE = load_machine("calibrator")
-LOOP = loop_of(MACHINE)
+LOOP = build_loop(MACHINE)
 TRUE = perturb_loop(LOOP, np.random.default_rng(11))
 POSES = 120
 
@@ -44,7 +44,7 @@ POSES = 120
 @pytest.fixture(scope="module")
 def clean():
     """True poses of every link, held links fixed."""
-    return [sweep_poses(TRUE, n, s._replace(poses=POSES)) for n, s in STILL.items()]
+    return [generate_sweep_poses(TRUE, n, s._replace(poses=POSES)) for n, s in DRIFT_FREE_SWEEPS.items()]
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def test_chain_is_table_2():
 def test_derivatives_are_those_of_finite_differences():
     """By every parameter of every link, 1e-6 of a step of 1e-6."""
     theta = TRUE.home[None, 2:] + 0.1
-    place, by = ball_from(TRUE, 1, theta)
+    place, by = ball_position_and_rates(TRUE, 1, theta)
     for k in range(len(TRUE) - 1):
         for c in range(5):
             values, turned = TRUE.values.copy(), theta.copy()
@@ -72,18 +72,18 @@ def test_derivatives_are_those_of_finite_differences():
             if c == 0:
                 turned[:, k - 1] += 1e-6
             values[1 + k, c] += 1e-6
-            moved, _ = ball_from(dataclasses.replace(TRUE, values=values), 1, turned)
+            moved, _ = ball_position_and_rates(dataclasses.replace(TRUE, values=values), 1, turned)
             np.testing.assert_allclose((moved - place) / 1e-6, by[:, :, k, c], atol=2e-5)
 
 
 def test_poses_close_the_chain(clean):
     for one in clean:
-        assert np.abs(closure(TRUE, one.theta)[0]).max() < 1e-9
+        assert np.abs(closure_error(TRUE, one.theta)[0]).max() < 1e-9
 
 
 def test_without_error_exact(clean, exact):
     """Rounding only: 1e-9 is asked."""
-    truth = true_numbers(TRUE, LOOP, exact.names, clean)
+    truth = find_true_parameters(TRUE, LOOP, exact.names, clean)
     assert np.abs(exact.values - truth).max() < 1e-9
     joint = identify_jointly(exact, [simulate_readings(TRUE, one, None) for one in clean])
     assert np.abs(joint.values - truth).max() < 1e-9
@@ -93,7 +93,7 @@ def test_identifiable_sets_are_those_of_the_thesis(exact):
     """K section 3.6.4, besides the ball's distance and height."""
     for stage in exact.stages:
         found = {name for name in stage.names if not name.startswith("p_")}
-        assert found == LISTS[stage.link], stage.link
+        assert found == IDENTIFIABLE_PARAMETERS[stage.link], stage.link
         assert f"d.{stage.link}" in stage.fixed
 
 
@@ -105,11 +105,11 @@ def test_errors_are_as_large_as_said_and_joint_knows_more(clean):
         stages = [simulate_readings(TRUE, one, np.random.default_rng(seed)) for one in clean]
         one = identify_arm(LOOP, stages)
         fits = one, identify_jointly(one, stages)
-        truth = true_numbers(TRUE, LOOP, one.names, clean)
-        scores.append([(fit.values - truth) / fit.deviations for fit in fits])
+        truth = find_true_parameters(TRUE, LOOP, one.names, clean)
+        scores.append([(fit.values - truth) / fit.standard_deviations for fit in fits])
     rms = np.sqrt(np.mean(np.square(scores), axis=(0, 2)))
     assert np.all((0.7 < rms) & (rms < 1.3)), rms
-    ratio = fits[1].deviations / fits[0].deviations
+    ratio = fits[1].standard_deviations / fits[0].standard_deviations
     assert ratio.max() < 1.02  # the same readings at another estimate change a deviation slightly
     base = [fits[0].names.index(n) for n in ("p_xy.swing", "a.swing", "alpha.swing", "p_z.swing")]
     assert np.all(ratio[base] < 1.0)
@@ -117,7 +117,7 @@ def test_errors_are_as_large_as_said_and_joint_knows_more(clean):
 
 def test_corruption_is_found_and_left_out(clean):
     rng = np.random.default_rng(4)
-    stages = [with_drift(LOOP, simulate_readings(TRUE, one, rng)) for one in clean]
+    stages = [add_drift(LOOP, simulate_readings(TRUE, one, rng)) for one in clean]
     assert identify_without_bad_data(LOOP, stages).regions == []
     wrong = stages[1].theta.copy()
     wrong[40:70, 1] += np.radians(2.5)
@@ -128,8 +128,8 @@ def test_corruption_is_found_and_left_out(clean):
     assert abs(region.first - 40) <= 3 and abs(region.last - 69) <= 3
     assert region.size == pytest.approx(np.radians(2.5), rel=0.1)
     names = [n for n in found.fit.names if n.endswith((".stick", ".boom", ".swing"))]
-    truth = true_numbers(TRUE, LOOP, names, clean)
-    size = np.array([found.fit.deviations[found.fit.names.index(n)] for n in names])
+    truth = find_true_parameters(TRUE, LOOP, names, clean)
+    size = np.array([found.fit.standard_deviations[found.fit.names.index(n)] for n in names])
     bad, good = (
         np.sqrt(np.mean(((np.array([fit.value(n) for n in names]) - truth) / size) ** 2))
         for fit in (identify_arm(LOOP, stages), found.fit)
@@ -140,13 +140,13 @@ def test_corruption_is_found_and_left_out(clean):
 def test_calibrated_machine_has_the_chain(clean, exact):
     """Lengths and twists in links and axes, offsets in the sensors."""
     made = calibrated_machine(MACHINE, exact, [simulate_readings(TRUE, one, None) for one in clean])
-    again = loop_of(made)
+    again = build_loop(made)
     np.testing.assert_allclose(again.values[:3, 1:], TRUE.values[:3, 1:], atol=1e-9)
     np.testing.assert_allclose(again.ball, TRUE.ball, atol=1e-9)
     offset = made.sensor_errors["angle.calibrator_yoke"].offset
     assert offset == pytest.approx(LOOP.value("offset.calibrator_yoke")
                                    - TRUE.value("offset.calibrator_yoke"), abs=1e-9)  # fmt: skip
-    same = loop_of(machine_with_loop(MACHINE, LOOP, LOOP))
+    same = build_loop(machine_with_loop(MACHINE, LOOP, LOOP))
     np.testing.assert_allclose(same.values, LOOP.values, atol=1e-12)
 
 
@@ -160,9 +160,9 @@ def test_linkage_of_another_triangle_is_recovered(axis):
     low, high = MACHINE.joints[axis].range
     angle = np.linspace(low + 0.1, high - 0.1, 200)
     length = true.length(angle) - cylinder.closed_length - 0.01
-    found = identify_linkage(MACHINE, Strokes(axis, angle, length, 1e-6, 1e-6))
+    found = identify_linkage(MACHINE, AxisStrokes(axis, angle, length, 1e-6, 1e-6))
     np.testing.assert_allclose(
-        values_of(found),
+        linkage_parameters(found),
         [true.angle_offset, true.lower, cylinder.closed_length + 0.01, true.upper], atol=1e-6,
     )  # fmt: skip
     assert found.rms < 1e-8 and found.vaf > 99.9999
@@ -174,27 +174,27 @@ def test_linkage_of_another_triangle_is_recovered(axis):
 def log_of(count=200, **columns):
     """A log of the calibrator with angle channels."""
     time = np.arange(count) / 50.0
-    values = {f"angle.{n}": 0.1 * np.sin(time) for n in LOOP.links[LOOP.moved :]}
+    values = {f"angle.{n}": 0.1 * np.sin(time) for n in LOOP.links[LOOP.powered_count :]}
     values |= {name.replace("_of_", "."): value for name, value in columns.items()}
     return Log(time, values, dict.fromkeys(values, "rad"), {"machine": "calibrator"}, "logs/x.csv")
 
 
 def test_which_link_moved():
     time = np.arange(200) / 50.0
-    assert moving_link(log_of(angle_of_boom=0.2 * time, angle_of_stick=0.0 * time), LOOP) == "boom"
+    assert find_moving_link(log_of(angle_of_boom=0.2 * time, angle_of_stick=0.0 * time), LOOP) == "boom"
     with pytest.raises(InputError, match="moves more than one link"):
-        moving_link(log_of(angle_of_boom=0.2 * time, angle_of_stick=0.3 * time), LOOP)
+        find_moving_link(log_of(angle_of_boom=0.2 * time, angle_of_stick=0.3 * time), LOOP)
     with pytest.raises(InputError, match="does not say which link moves"):
-        moving_link(log_of(), LOOP)
+        find_moving_link(log_of(), LOOP)
 
 
 def test_unusable_data_say_why(clean):
     """Too few poses, only one pose, another machine, NaN, nothing moves."""
     stages = [simulate_readings(TRUE, one, None) for one in clean]
     with pytest.raises(InputError, match="3 poses of pitch are too few"):
-        identify_arm(LOOP, [stages[0].only(np.arange(3) * 40)])
+        identify_arm(LOOP, [stages[0].select(np.arange(3) * 40)])
     with pytest.raises(InputError, match="contains only one pose of pitch"):
-        identify_arm(LOOP, [stages[0].only(np.zeros(50, int))])
+        identify_arm(LOOP, [stages[0].select(np.zeros(50, int))])
     bad = stages[0].theta.copy()
     bad[7, 2] = np.nan
     with pytest.raises(InputError, match=r"column angle.calibrator_twist, row 8: is not a number"):
@@ -202,15 +202,15 @@ def test_unusable_data_say_why(clean):
     other = log_of()
     other = dataclasses.replace(other, metadata={"machine": "ec20"})
     with pytest.raises(InputError, match="is a log of machine ec20"):
-        stage_of(other, MACHINE, LOOP)
+        log_to_poses(other, MACHINE, LOOP)
     with pytest.raises(InputError, match="keep one of them"):
         identify_arm(LOOP, [stages[0], stages[0]])
-    still = Strokes("boom", np.full(50, 0.3), np.full(50, 0.4), 1e-3, 1e-3)
+    still = AxisStrokes("boom", np.full(50, 0.3), np.full(50, 0.4), 1e-3, 1e-3)
     with pytest.raises(InputError, match="l_l, l_c and l_u are not identifiable"):
         identify_linkage(MACHINE, still)
-    assert strokes_of(log_of(), MACHINE, ["boom"]) == []
+    assert extract_strokes(log_of(), MACHINE, ["boom"]) == []
 
 
 def test_a_machine_without_a_calibrator_is_refused():
     with pytest.raises(InputError, match="has no sensed_joints"):
-        loop_of(load_machine("cat215"))
+        build_loop(load_machine("cat215"))

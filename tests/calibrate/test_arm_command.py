@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from hydrotele.calibrate.loop import closure, loop_of
+from hydrotele.calibrate.loop import build_loop, closure_error
 from hydrotele.cli.main import app
-from hydrotele.effects.effect import changed
+from hydrotele.effects.effect import with_value
 from hydrotele.logs.log import save_log
 from hydrotele.machine.machine_file import load_machine, save_machine
 from hydrotele.run.run import run_scenario
@@ -41,12 +41,10 @@ def folder(runs, tmp_path_factory):
 @pytest.mark.nightly
 def test_mujoco_and_kinematics_are_one_chain(runs):
     """The closed chain of MuJoCo closes in Denavit-Hartenberg form, to its pins' softness."""
-    loop = loop_of(load_machine("calibrator"))
+    loop = build_loop(load_machine("calibrator"))
     for run in runs.values():
-        theta = np.stack(
-            [run.truth[c] * s for c, s in zip(loop.channels, loop.signs, strict=True)], 1
-        )
-        gap, _ = closure(loop, theta + loop.values[:, 0])
+        theta = np.stack([run.truth[c] * s for c, s in zip(loop.channels, loop.signs, strict=True)], 1)
+        gap, _ = closure_error(loop, theta + loop.values[:, 0])
         assert np.abs(gap).max() < 1e-5
         assert run.summary["largest_pin_opening_mm"] < 0.01
 
@@ -76,8 +74,8 @@ def test_linkage_command(folder):
 def test_machine_command_calibrates_kinematics_before_dynamics(folder, tmp_path):
     """A machine file with a stick 30 mm too long and 10 % too heavy a boom gets both back."""
     machine = load_machine("calibrator")
-    longer = changed(machine, "links.grapple_link.position", (1.83, 0.0, 0.0))
-    heavier = changed(longer, "links.boom.mass", 1.1 * machine.links["boom"].mass)
+    longer = with_value(machine, "links.grapple_link.position", (1.83, 0.0, 0.0))
+    heavier = with_value(longer, "links.boom.mass", 1.1 * machine.links["boom"].mass)
     (tmp_path / "given").mkdir()
     save_machine(heavier, tmp_path / "given" / "machine.yaml")
     target = tmp_path / "all"
@@ -87,9 +85,7 @@ def test_machine_command_calibrates_kinematics_before_dynamics(folder, tmp_path)
     ])  # fmt: skip
     assert made.exit_code == 0, made.output
     said = json.loads(made.stdout)
-    assert (
-        said["arm"]["heldout"]["rms_identified_mm"] < 0.6 * said["arm"]["heldout"]["rms_nominal_mm"]
-    )
+    assert said["arm"]["heldout"]["rms_identified_mm"] < 0.6 * said["arm"]["heldout"]["rms_nominal_mm"]
     assert set(said["linkages"]) == {"boom", "stick"}
     force = said["dynamics"]["heldout"]["boom_rod"]
     assert force["rms"] < 0.5 * force["nominal_rms"]

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from hydrotele.calibrate.estimation import (
-    TRUNCATION,
+    TRUNCATION_LEVELS,
     Prior,
-    identifiable,
+    classify_scaled_parameters,
     least_squares,
-    told_in_words,
+    list_identifiability,
 )
 from hydrotele.core.errors import InputError
 
@@ -21,13 +21,11 @@ def curve(p, x=X):
 
 
 def fit(y, **options):
-    return least_squares(
-        lambda p: curve(p) - y, [1.0, 0.0, 0.5], ["a", "b", "c"], [1.0, 1.0, 1.0], **options
-    )
+    return least_squares(lambda p: curve(p) - y, [1.0, 0.0, 0.5], ["a", "b", "c"], [1.0, 1.0, 1.0], **options)
 
 
 @pytest.mark.parametrize("jac", [None, "cs"])
-@pytest.mark.parametrize("truncation", [None, TRUNCATION])
+@pytest.mark.parametrize("truncation", [None, TRUNCATION_LEVELS])
 def test_planted_parameters_come_back(jac, truncation):
     found = fit(curve(TRUTH), jac=jac, truncation=truncation)
     assert found.converged
@@ -54,17 +52,17 @@ def test_what_the_equations_do_not_tell_keeps_its_start():
     found = least_squares(residual, [0.5, 0.1, 0.0, 7.0], ["a", "b", "c", "d"], [1.0] * 4)
     assert found.held.tolist() == [False, True, False, True]
     np.testing.assert_allclose(found.values, [0.8, 0.1, 3.0, 7.0], atol=1e-9)
-    words = told_in_words(found.told)
+    words = list_identifiability(found.identifiability)
     assert words["identifiable"] == ["c"]
     assert words["unknown"] == ["d"]
     assert words["combinations"] == ["a + 2 b"]
-    assert np.isinf(found.deviations[[1, 3]]).all()
+    assert np.isinf(found.standard_deviations[[1, 3]]).all()
 
 
 def test_words_do_not_depend_on_scales():
     matrix = np.column_stack([np.ones(9), 2.0 * np.ones(9), np.arange(9.0)])
-    told = identifiable(matrix, ["a", "b", "c"], [1e-3, 5.0, 1.0])
-    assert told_in_words(told)["combinations"] == ["a + 2 b"]
+    told = classify_scaled_parameters(matrix, ["a", "b", "c"], [1e-3, 5.0, 1.0])
+    assert list_identifiability(told)["combinations"] == ["a + 2 b"]
 
 
 def test_weak_directions_are_held_in_noise():
@@ -79,7 +77,7 @@ def test_weak_directions_are_held_in_noise():
     # b of its size moves the equations by 1e-4, a tenth of the noise.
     assert found.held.tolist() == [False, True]
     # a is told but for the mean of what b adds.
-    assert told_in_words(found.told)["combinations"] == ["a + 0.0005 b"]
+    assert list_identifiability(found.identifiability)["combinations"] == ["a + 0.0005 b"]
 
 
 def test_a_prior_pulls_by_its_weight():
@@ -94,7 +92,7 @@ def test_a_prior_pulls_by_its_weight():
     )
     # Precisions: 4 / 0.04 = 100 of the data about 1 and 100 of the prior about 0.
     assert found.values[0] == pytest.approx(0.5, abs=1e-9)
-    assert found.deviations[0] == pytest.approx(200**-0.5, rel=1e-9)
+    assert found.standard_deviations[0] == pytest.approx(200**-0.5, rel=1e-9)
 
 
 def test_differences_by_groups_are_those_one_by_one():

@@ -9,12 +9,12 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
-from hydrotele.calibrate.hybrid_data import COVARIANCE, read_measurement, save_measurement
+from hydrotele.calibrate.hybrid_data import COVARIANCE_COLUMNS, read_measurement, save_measurement
 from hydrotele.cli.main import app
 from hydrotele.core.errors import InputError
-from hydrotele.kinematics.hybrid import forward, load_hybrid, pose_difference
+from hydrotele.kinematics.hybrid import forward_kinematics, load_hybrid, pose_difference
 from hydrotele.kinematics.wires import pose_covariance
-from hydrotele.simulate.hybrid import shipped_wires
+from hydrotele.simulate.hybrid import default_wires
 
 IWR = load_hybrid("iwr")
 
@@ -22,9 +22,7 @@ IWR = load_hybrid("iwr")
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("hybrid") / "measured"
-    run = CliRunner().invoke(
-        app, ["calibrate", "hybrid", "--simulate", str(path), "--poses", "20", "--seed", "3"]
-    )
+    run = CliRunner().invoke(app, ["calibrate", "hybrid", "--simulate", str(path), "--poses", "20", "--seed", "3"])
     assert run.exit_code == 0, run.output
     shutil.rmtree(path / "truth")  # nothing reads it
     return path
@@ -52,7 +50,7 @@ def cell(row, column, value):
 
 def test_wires_and_poses_tell_the_same(folder, copied):
     measured, heldout = read_measurement(folder, IWR)
-    assert (len(measured), len(heldout), measured.stated) == (20, 25, True)
+    assert (len(measured), len(heldout), measured.noise_is_known) == (20, 25, True)
     (copied / "poses.csv").unlink()
     save_measurement(copied, "poses", IWR, measured.joints, measured.legs, pose=measured.pose)
     again, _ = read_measurement(copied, IWR)
@@ -65,22 +63,20 @@ def test_parquet_with_units_in_the_metadata_and_covariances(folder, copied):
     table = {f"joint.{n}": (v, "m" if n[0] == "d" else "rad")
              for n, v in zip(IWR.joints, measured.joints.T, strict=True)}  # fmt: skip
     table |= {f"leg.{k}": (1e3 * v, "mm") for k, v in enumerate(measured.legs.T, 1)}
-    from hydrotele.kinematics.hybrid import euler_of_rotation
+    from hydrotele.kinematics.hybrid import rotation_to_euler
 
-    angles = euler_of_rotation(measured.pose.rotation)
+    angles = rotation_to_euler(measured.pose.rotation)
     table |= {f"pose.{c}": (v, None) for c, v in zip("xyz", measured.pose.position.T, strict=True)}
     table |= {f"pose.r{c}": (v, None) for c, v in zip("xyz", angles.T, strict=True)}
-    upper = pose_covariance(shipped_wires(), measured.pose, 2e-5)[
-        (slice(None), *np.triu_indices(6))
-    ]
-    table |= {name: (v, None) for name, v in zip(COVARIANCE, upper.T, strict=True)}
+    upper = pose_covariance(default_wires(), measured.pose, 2e-5)[(slice(None), *np.triu_indices(6))]
+    table |= {name: (v, None) for name, v in zip(COVARIANCE_COLUMNS, upper.T, strict=True)}
     fields = [pa.field(n, pa.float64(), metadata={"unit": u} if u else None)
               for n, (_, u) in table.items()]  # fmt: skip
     (copied / "poses.csv").unlink()
     pq.write_table(pa.table([v for v, _ in table.values()], pa.schema(fields)),
                    copied / "poses.parquet")  # fmt: skip
     again, _ = read_measurement(copied, IWR)
-    assert again.stated
+    assert again.noise_is_known
     assert np.allclose(again.covariance, measured.covariance, rtol=1e-6)
 
 
@@ -127,9 +123,7 @@ def test_files_of_another_robot_are_refused(copied, tmp_path):
 
 def test_the_command_calibrates_and_its_robot_is_used_again(folder, tmp_path):
     out = tmp_path / "calibrated"
-    run = CliRunner().invoke(
-        app, ["calibrate", "hybrid", "--data", str(folder), "--out", str(out), "--json"]
-    )
+    run = CliRunner().invoke(app, ["calibrate", "hybrid", "--data", str(folder), "--out", str(out), "--json"])
     assert run.exit_code == 0, run.output
     found = json.loads(run.stdout)
     assert found["heldout"]["rms_mm"] < 0.15 < 1.0 < found["heldout"]["before_rms_mm"]
@@ -139,7 +133,7 @@ def test_the_command_calibrates_and_its_robot_is_used_again(folder, tmp_path):
         "calibration.json", "errors.png", "robot.yaml", "summary.json"
     }  # fmt: skip
     calibrated, (measured, _) = load_hybrid(out), read_measurement(folder, IWR)
-    errors = pose_difference(forward(calibrated, measured.joints, measured.legs), measured.pose)
+    errors = pose_difference(forward_kinematics(calibrated, measured.joints, measured.legs), measured.pose)
     rms = 1e3 * np.sqrt(np.mean(np.sum(errors[:, :3] ** 2, axis=1)))
     assert rms == pytest.approx(found["errors"]["after"]["position_rms_mm"], rel=1e-9)
 
@@ -163,9 +157,7 @@ def test_simulated_measurements_repeat_by_their_seed(folder, tmp_path):
     ],
 )
 def test_wrong_arguments_are_told(folder, arguments, message):
-    done = CliRunner().invoke(
-        app, ["calibrate", "hybrid", *(a.replace("{}", str(folder)) for a in arguments)]
-    )
+    done = CliRunner().invoke(app, ["calibrate", "hybrid", *(a.replace("{}", str(folder)) for a in arguments)])
     assert isinstance(done.exception, InputError)
     assert message in str(done.exception)
 

@@ -7,22 +7,22 @@ import pytest
 from typer.testing import CliRunner
 
 from hydrotele.calibrate.mukca import (
-    Options,
+    SocketOptions,
     calibrate_sockets,
     choose_robot,
-    judge,
-    leave_out,
+    evaluate_robot,
+    predict_held_out_places,
 )
 from hydrotele.calibrate.sockets import (
-    Errors,
+    RobotErrors,
+    add_random_errors,
     load_sockets,
-    robot_with_errors,
     save_sockets,
-    simulated_sockets,
+    simulate_sockets,
 )
 from hydrotele.cli.main import app
 from hydrotele.core.errors import InputError
-from hydrotele.kinematics.serial_robot import deflection_names, load_robot
+from hydrotele.kinematics.serial_robot import correction_names, load_robot
 from tests.measured import REAL, needs_real
 
 PLACES = {"left": (0.4, 0.3, 0.1), "right": (0.45, -0.3, 0.1), "front": (0.55, 0.0, 0.1)}
@@ -31,11 +31,11 @@ MEASURED = REAL / "mukca_panda_3"
 
 
 def simulated(robot="panda", rows=20, errors=None, seed=3, corrections=None):
-    errors = errors or Errors()
+    errors = errors or RobotErrors()
     rng = np.random.default_rng(seed)
     nominal = load_robot(robot)
-    true, values = robot_with_errors(nominal, errors, rng, corrections)
-    return nominal, true, values, simulated_sockets(true, PLACES, rows, errors, rng)
+    true, values = add_random_errors(nominal, errors, rng, corrections)
+    return nominal, true, values, simulate_sockets(true, PLACES, rows, errors, rng)
 
 
 @pytest.fixture(scope="module")
@@ -45,34 +45,34 @@ def noisy():
 
 @pytest.mark.nightly
 def test_without_noise_unseen_places_are_exact():
-    exact = Errors(play=0.0)
+    exact = RobotErrors(play=0.0)
     nominal, true, _, sockets = simulated(errors=exact, rows=12)
-    found = calibrate_sockets(nominal, sockets, Options(model="rigid", accuracy=1e-9))
-    unseen = simulated_sockets(true, UNSEEN, 10, exact, np.random.default_rng(0))
+    found = calibrate_sockets(nominal, sockets, SocketOptions(model="rigid", accuracy=1e-9))
+    unseen = simulate_sockets(true, UNSEEN, 10, exact, np.random.default_rng(0))
     # The prior's pull vanishes with the noise; what is left is the solver's tolerance.
-    assert judge(found.robot, unseen).rms < 1e-7
-    assert judge(nominal, unseen).rms > 1e-3
+    assert evaluate_robot(found.robot, unseen).rms < 1e-7
+    assert evaluate_robot(nominal, unseen).rms > 1e-3
 
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("robot", ["panda", "ur5e"])
 def test_noise_leaves_less_than_it_is_itself(robot):
     nominal, true, _, sockets = simulated(robot)
-    chosen, _ = choose_robot(sockets, Options())
+    chosen, _ = choose_robot(sockets, SocketOptions())
     assert chosen.name == robot
     found = calibrate_sockets(nominal, sockets)
-    unseen = simulated_sockets(true, UNSEEN, 20, Errors(play=0.0), np.random.default_rng(0))
-    judged = judge(found.robot, unseen)
+    unseen = simulate_sockets(true, UNSEEN, 20, RobotErrors(play=0.0), np.random.default_rng(0))
+    judged = evaluate_robot(found.robot, unseen)
     # Play of 0.1 mm per coordinate is 0.17 mm; 120 rows for some 30 parameters leave half of it.
     assert judged.rms < 0.087e-3
-    assert judged.distances["unseen"] == pytest.approx(0.05, abs=1e-4)
+    assert judged.socket_distances["unseen"] == pytest.approx(0.05, abs=1e-4)
     assert found.noise == pytest.approx(1e-4, rel=0.15)
 
 
 @pytest.mark.nightly
 def test_base_frame_and_what_no_posture_tells_is_named(noisy):
     nominal, _, _, sockets = noisy
-    told = calibrate_sockets(nominal, sockets, Options(model="rigid")).fit.told
+    told = calibrate_sockets(nominal, sockets, SocketOptions(model="rigid")).fit.identifiability
     status = dict(zip(told.names, told.status, strict=True))
     # The base frame may lie anywhere: its sockets are not known.
     for kind in ("tx", "ty", "tz", "rx", "ry", "rz"):
@@ -85,10 +85,10 @@ def test_base_frame_and_what_no_posture_tells_is_named(noisy):
 @pytest.mark.nightly
 def test_intervals_cover_most_of_what_was_planted(noisy):
     nominal, _, values, sockets = noisy
-    fit = calibrate_sockets(nominal, sockets, Options(model="rigid")).fit
+    fit = calibrate_sockets(nominal, sockets, SocketOptions(model="rigid")).fit
     error = fit.values - np.array([values[name] for name in fit.names])
-    order = [fit.names.index(name) for name in fit.told.names]
-    weights = fit.told.combination
+    order = [fit.names.index(name) for name in fit.identifiability.names]
+    weights = fit.identifiability.combination
     covariance = fit.covariance[np.ix_(order, order)]
     z = (weights @ error[order]) / np.sqrt(np.einsum("ij,jk,ik->i", weights, covariance, weights))
     # Of some 22 combinations 95 % are inside; fewer than 17 has a chance below 1 %.
@@ -98,14 +98,14 @@ def test_intervals_cover_most_of_what_was_planted(noisy):
 @pytest.mark.nightly
 def test_joints_that_yield_are_found():
     nominal = load_robot("panda")
-    names = deflection_names(nominal, True, False)
+    names = correction_names(nominal, True, False)
     planted = {name: 3e-4 for name in names if name.endswith(".tool")}
-    _, true, _, sockets = simulated(corrections=planted, errors=Errors(play=5e-5))
+    _, true, _, sockets = simulated(corrections=planted, errors=RobotErrors(play=5e-5))
     found = calibrate_sockets(nominal, sockets)
     assert found.model == "gravity"
-    unseen = simulated_sockets(true, UNSEEN, 20, Errors(play=0.0), np.random.default_rng(0))
-    rigid = calibrate_sockets(nominal, sockets, Options(model="rigid"))
-    assert judge(found.robot, unseen).rms < 0.7 * judge(rigid.robot, unseen).rms
+    unseen = simulate_sockets(true, UNSEEN, 20, RobotErrors(play=0.0), np.random.default_rng(0))
+    rigid = calibrate_sockets(nominal, sockets, SocketOptions(model="rigid"))
+    assert evaluate_robot(found.robot, unseen).rms < 0.7 * evaluate_robot(rigid.robot, unseen).rms
 
 
 @pytest.mark.nightly
@@ -114,25 +114,23 @@ def test_rows_with_the_ball_elsewhere_are_named_and_left_out(noisy):
     wrong = [s.joints.copy() for s in sockets]
     wrong[1][4] += 0.02
     wrong[3][7, 0] -= 0.01
-    changed = tuple(
-        type(s)(s.place, s.hole, s.path, q, s.lines) for s, q in zip(sockets, wrong, strict=True)
-    )
-    found = calibrate_sockets(nominal, changed, Options(model="rigid"))
+    changed = tuple(type(s)(s.place, s.hole, s.path, q, s.lines) for s, q in zip(sockets, wrong, strict=True))
+    found = calibrate_sockets(nominal, changed, SocketOptions(model="rigid"))
     assert {(o.socket, o.line) for o in found.outliers} == {("left/hole_1", 5), ("right/hole_1", 8)}
-    unseen = simulated_sockets(true, UNSEEN, 20, Errors(play=0.0), np.random.default_rng(0))
-    assert judge(found.robot, unseen).rms < 0.087e-3
+    unseen = simulate_sockets(true, UNSEEN, 20, RobotErrors(play=0.0), np.random.default_rng(0))
+    assert evaluate_robot(found.robot, unseen).rms < 0.087e-3
 
 
 @needs_real
 def test_measured_panda_reaches_the_published_accuracy():
     sockets, _ = load_sockets(MEASURED)
-    robot, _ = choose_robot(sockets, Options())
+    robot, _ = choose_robot(sockets, SocketOptions())
     assert robot.name == "panda"
-    (one,) = leave_out(robot, sockets, ["backleft"])
+    (one,) = predict_held_out_places(robot, sockets, ["backleft"])
     # The data's authors: 0.2 to 0.3 mm; asked for: 0.25 mm, and 0.1 mm of the sockets' distance.
-    assert one.calibrated.rms < 0.25e-3
-    assert one.given.rms > 3e-3
-    assert one.calibrated.distances["backleft"] == pytest.approx(0.05, abs=1e-4)
+    assert one.calibrated_errors.rms < 0.25e-3
+    assert one.given_errors.rms > 3e-3
+    assert one.calibrated_errors.socket_distances["backleft"] == pytest.approx(0.05, abs=1e-4)
 
 
 @pytest.fixture
@@ -156,7 +154,7 @@ def test_command_prints_json_and_writes_a_robot_that_is_read_again(folder, tmp_p
     again = load_robot(tmp_path / "out/calibrated.yaml")
     front = [s for s in load_sockets(folder)[0] if s.place == "front"]
     # Written with all digits: the file predicts what the command reported.
-    assert 1e3 * judge(again, front).rms == pytest.approx(document["heldout"]["rms_mm"], rel=1e-6)
+    assert 1e3 * evaluate_robot(again, front).rms == pytest.approx(document["heldout"]["rms_mm"], rel=1e-6)
     assert (tmp_path / "out/report.html").is_file()
 
 
@@ -178,7 +176,7 @@ def test_bad_files_are_refused_with_their_place(folder, damage):
     elif damage == "repeated":
         lines = [lines[0]] * 20
     elif damage == "file":
-        other = simulated_sockets(load_robot("iiwa14"), UNSEEN, 20, Errors(),
+        other = simulate_sockets(load_robot("iiwa14"), UNSEEN, 20, RobotErrors(),
                                   np.random.default_rng(1))  # fmt: skip
         lines = [",".join(map(str, row)) for row in other[0].joints]
     path.write_text("\n".join(lines) + "\n")
@@ -186,9 +184,7 @@ def test_bad_files_are_refused_with_their_place(folder, damage):
         for each in folder.glob("*/*.csv"):
             np.savetxt(each, np.degrees(np.loadtxt(each, delimiter=",")), delimiter=",")
     with pytest.raises(InputError, match=said[damage]):
-        CliRunner().invoke(
-            app, ["calibrate", "mukca", "--data", str(folder)], catch_exceptions=False
-        )
+        CliRunner().invoke(app, ["calibrate", "mukca", "--data", str(folder)], catch_exceptions=False)
 
 
 def test_degrees_are_read_where_they_are_said(folder):
@@ -203,10 +199,10 @@ def test_degrees_are_read_where_they_are_said(folder):
 def test_a_joint_that_never_moves_stays_unknown_by_name():
     nominal = load_robot("panda")
     rng = np.random.default_rng(5)
-    true, _ = robot_with_errors(nominal, Errors(), rng)
-    sockets = simulated_sockets(true, PLACES, 20, Errors(), rng, idle=2)
+    true, _ = add_random_errors(nominal, RobotErrors(), rng)
+    sockets = simulate_sockets(true, PLACES, 20, RobotErrors(), rng, idle=2)
     assert all(np.ptp(s.joints[:, 2]) == 0.0 for s in sockets)
-    told = calibrate_sockets(nominal, sockets, Options(model="rigid")).fit.told
+    told = calibrate_sockets(nominal, sockets, SocketOptions(model="rigid")).fit.identifiability
     alone = {n for n, s in zip(told.names, told.status, strict=True) if s == "full"}
     assert "rz.joint3" not in alone
 
@@ -224,9 +220,7 @@ def test_a_joint_that_never_moves_stays_unknown_by_name():
 )
 def test_bad_options_are_refused(folder, words, said):
     with pytest.raises(InputError, match=said):
-        CliRunner().invoke(
-            app, ["calibrate", "mukca", "--data", str(folder), *words], catch_exceptions=False
-        )
+        CliRunner().invoke(app, ["calibrate", "mukca", "--data", str(folder), *words], catch_exceptions=False)
 
 
 def test_a_head_line_and_other_separators_are_read(folder):

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from hydrotele.calibrate.design import observability, select_poses
+from hydrotele.calibrate.design import observability_index, select_poses
 from hydrotele.core.errors import InputError
 
 
@@ -22,8 +22,7 @@ def test_exchange_comes_near_the_best_of_all_subsets(criterion):
     rows = rng.standard_normal((12, 2, 3))
     each = np.einsum("nki,nkj->nij", rows, rows)
     best = max(
-        observability(each[list(some)].sum(axis=0), criterion, 8)
-        for some in itertools.combinations(range(12), 4)
+        observability_index(each[list(some)].sum(axis=0), criterion, 8) for some in itertools.combinations(range(12), 4)
     )
     found = select_poses(rows, 4, criterion)
     # An exchange of single poses ends in a local optimum; 5 % is what is lost at most here.

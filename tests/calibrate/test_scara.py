@@ -7,41 +7,41 @@ import pytest
 from typer.testing import CliRunner
 
 from hydrotele.calibrate.scara import (
-    MEASURED,
-    Positions,
-    ScaraFacts,
-    best_poses,
+    MEASURED_FILE,
+    MeasuredPositions,
+    ScaraSpec,
     calibrate_scara,
     fit_scara,
     scara_chain,
-    simulated_scara,
+    select_scara_poses,
+    simulate_scara,
 )
 from hydrotele.cli.main import app
 from hydrotele.core.errors import InputError
-from hydrotele.kinematics.serial_chain import forward
+from hydrotele.kinematics.serial_chain import chain_poses
 
-ARM = ScaraFacts(length_a=0.4, length_b=0.3)
+ARM = ScaraSpec(length_a=0.4, length_b=0.3)
 
 
 def test_chain_is_equation_1():
     theta, phi = 0.3, 1.1
-    end = forward(scara_chain(ARM), np.array([[theta, phi]])).position[0]
+    end = chain_poses(scara_chain(ARM), np.array([[theta, phi]])).position[0]
     u = 0.4 * np.cos(theta) + 0.3 * np.cos(theta + phi)
     v = 0.4 * np.sin(theta) + 0.3 * np.sin(theta + phi)
     np.testing.assert_allclose(end, [u, v, 0.0], atol=1e-15)
 
 
 def test_planted_lengths_come_back_without_noise():
-    found = calibrate_scara(ARM, simulated_scara(ARM, (0, 1e-3, 0, -2e-3), 8, 0.0, 0))
+    found = calibrate_scara(ARM, simulate_scara(ARM, (0, 1e-3, 0, -2e-3), 8, 0.0, 0))
     assert found.fit.value("length.a") == pytest.approx(0.401, abs=1e-12)
     assert found.fit.value("length.b") == pytest.approx(0.298, abs=1e-12)
 
 
 @pytest.mark.parametrize("offset", [0.0, 3e-3])
 def test_offsets_are_fitted_where_they_predict_better(offset):
-    measured = simulated_scara(ARM, (offset, 1e-3, -offset, -2e-3), 30, 5e-5, 4)
+    measured = simulate_scara(ARM, (offset, 1e-3, -offset, -2e-3), 30, 5e-5, 4)
     found = calibrate_scara(ARM, measured, heldout=range(20, 30))
-    assert found.offsets == (offset > 0.0)
+    assert found.has_offsets == (offset > 0.0)
     # Ten unseen poses: noise of 0.05 mm in two coordinates is 0.071 mm, known to a tenth.
     assert found.heldout_rms == pytest.approx(0.071e-3, rel=0.35)
 
@@ -50,7 +50,7 @@ def test_offsets_are_fitted_where_they_predict_better(offset):
 def test_intervals_cover_planted_lengths():
     inside = 0
     for seed in range(200):
-        measured = simulated_scara(ARM, (0, 1e-3, 0, -2e-3), 15, 5e-5, seed)
+        measured = simulate_scara(ARM, (0, 1e-3, 0, -2e-3), 15, 5e-5, seed)
         fit = fit_scara(scara_chain(ARM), measured, range(15), offsets=False)
         low, high = fit.intervals[list(fit.names).index("length.a")]
         inside += low <= 0.401 <= high
@@ -60,16 +60,16 @@ def test_intervals_cover_planted_lengths():
 
 def test_one_arm_posture_tells_lengths_only_together():
     joints = np.column_stack([np.linspace(-1, 1, 6), np.zeros(6)])
-    ends = forward(scara_chain(ARM), joints).position[:, :2] * 1.001
-    found = calibrate_scara(ARM, Positions(joints, ends))
+    ends = chain_poses(scara_chain(ARM), joints).position[:, :2] * 1.001
+    found = calibrate_scara(ARM, MeasuredPositions(joints, ends))
     assert "length.a + length.b" in [
-        found.fit.told.text(k) for k in range(len(found.fit.told.base))
+        found.fit.identifiability.format_combination(k) for k in range(len(found.fit.identifiability.base))
     ]
 
 
 def test_poses_that_tell_most_differ():
-    measured = simulated_scara(ARM, (0, 0, 0, 0), 40, 0.0, 2)
-    chosen = best_poses(ARM, measured, 6)
+    measured = simulate_scara(ARM, (0, 0, 0, 0), 40, 0.0, 2)
+    chosen = select_scara_poses(ARM, measured, 6)
     elbow = measured.joints[list(chosen.chosen), 1]
     assert np.ptp(elbow) > 1.0
 
@@ -97,8 +97,8 @@ def test_tutorial_commands(tmp_path):
 def test_bad_measurements_are_refused(tmp_path, row, said):
     folder = tmp_path / "measured"
     run("--simulate", folder)
-    lines = (folder / MEASURED).read_text().splitlines()
+    lines = (folder / MEASURED_FILE).read_text().splitlines()
     lines = lines[:1] if row is None else [*lines[:2], row, *lines[3:]]
-    (folder / MEASURED).write_text("\n".join(lines) + "\n")
+    (folder / MEASURED_FILE).write_text("\n".join(lines) + "\n")
     with pytest.raises(InputError, match=said):
         run("--data", folder, catch=False)

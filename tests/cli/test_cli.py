@@ -90,9 +90,7 @@ def finished_run(tmp_path_factory):
     """A run folder, the program's output and its processor time [s], made once by the program."""
     folder = tmp_path_factory.mktemp("runs") / "zhu_up"
     before = child_seconds()
-    code, out, err = hydrotele_run(
-        "run", "zhu_up", "--set", "duration=0.5", "--json", "--out", folder
-    )
+    code, out, err = hydrotele_run("run", "zhu_up", "--set", "duration=0.5", "--json", "--out", folder)
     assert code == 0, err
     return folder, out, child_seconds() - before
 
@@ -131,9 +129,7 @@ def test_overview_imports_nothing_but_the_standard_library():
         main()
         print([m for m in {HEAVY} if m in sys.modules], file=sys.stderr)
     """
-    found = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT, check=True
-    )
+    found = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT, check=True)
     assert found.stderr.strip() == "[]" and found.stdout == f"{format_overview(80)}\n"
 
 
@@ -194,7 +190,7 @@ def test_other_runtime_errors_are_not_hidden(monkeypatch):
     def fail(*_):
         raise RuntimeError("a mistake of ours")
 
-    monkeypatch.setattr("hydrotele.cli.catalogue.list_things", fail)
+    monkeypatch.setattr("hydrotele.cli.catalogue.list_items", fail)
     monkeypatch.setattr(sys, "argv", ["hydrotele", "list"])
     with pytest.raises(RuntimeError, match="a mistake of ours"):
         cli.main()
@@ -296,9 +292,7 @@ def test_killed_runs_leave_no_folder_of_the_final_name(attempts, tmp_path):
 
 
 def test_interrupt_exits_with_130_and_leaves_nothing(finished_run, tmp_path):
-    process = hydrotele_process(
-        "run", "hold", "--set", "duration=3000", "--no-review", "--out", tmp_path / "run"
-    )
+    process = hydrotele_process("run", "hold", "--set", "duration=3000", "--no-review", "--out", tmp_path / "run")
     # A whole short run takes longer than the start of this one, whose simulation takes 30 s.
     wait_for_work(process, finished_run[2])
     process.send_signal(signal.SIGINT)
@@ -370,9 +364,7 @@ def test_replay_prints_a_table_and_writes_into_runs_by_default(finished, tmp_pat
     assert code == 0 and "angle.boom" in out and "deg" in out
     made = names(tmp_path / "runs" / "replay_measured")
     assert any(n.endswith(".png") for n in made) and any(n.endswith(".rrd") for n in made)
-    assert json.loads((tmp_path / "runs/replay_measured/summary.json").read_text())["kind"] == (
-        "replay"
-    )
+    assert json.loads((tmp_path / "runs/replay_measured/summary.json").read_text())["kind"] == ("replay")
     assert (finished / "measured.parquet").is_file()
 
 
@@ -455,9 +447,7 @@ def test_a_joystick_is_validated_and_exported(tmp_path):
 
 
 def test_validate_takes_everything(finished, tmp_path):
-    (tmp_path / "log.csv").write_text(
-        "\n".join(["time,angle.boom", *(f"{k / 50},0.{k}" for k in range(10, 40))])
-    )
+    (tmp_path / "log.csv").write_text("\n".join(["time,angle.boom", *(f"{k / 50},0.{k}" for k in range(10, 40))]))
     files = ["cat215", "zhu_up", finished, finished / "scenario.yaml", finished / "machine.yaml",
              finished / "truth.parquet", tmp_path / "log.csv"]  # fmt: skip
     code, out, _ = invoke("validate", *files, "--json")
@@ -470,9 +460,7 @@ def test_validate_takes_everything(finished, tmp_path):
 
 
 def test_validate_refuses_what_does_not_run(tmp_path):
-    (tmp_path / "s.yaml").write_text(
-        "name: s\nduration: 1\npilot: {kind: constant, commands: {bom: 1}}\n"
-    )
+    (tmp_path / "s.yaml").write_text("name: s\nduration: 1\npilot: {kind: constant, commands: {bom: 1}}\n")
     code, out, err = invoke("validate", tmp_path / "s.yaml")
     assert code == 2 and "did you mean 'boom'" in err
     (tmp_path / "machine.yaml").write_text("name: m\nlinks: {}\naxes: {}\n")
@@ -487,9 +475,7 @@ def test_export_is_mjcf(tmp_path):
     code, out, _ = invoke("export", "rig")
     assert code == 0 and mujoco.MjModel.from_xml_string(out).nu == 1
     assert invoke("export", "rig", "--out", tmp_path / "rig.xml")[0] == 0
-    assert (tmp_path / "rig.xml").read_text().strip() == out.strip() and names(tmp_path) == [
-        "rig.xml"
-    ]
+    assert (tmp_path / "rig.xml").read_text().strip() == out.strip() and names(tmp_path) == ["rig.xml"]
 
 
 def test_a_library_that_makes_another_error_of_sigterm_changes_no_exit_status():

@@ -5,7 +5,7 @@ import time
 import pytest
 
 from hydrotele.cli import console
-from hydrotele.cli.console import _Console, progress_bar, stages
+from hydrotele.cli.console import _Console, show_simulation_progress, show_stages
 
 
 @pytest.mark.parametrize(
@@ -31,13 +31,11 @@ def test_own_styles_are_styles():
 
 
 @pytest.mark.parametrize(("bar", "told"), [
-    (stages, ("calibrate", 0.25, "job: 25 %, calibrate, 0 s")),
-    (progress_bar, (12.0, 60.0, "job: 12.0 of 60.0 s simulated, 0 s")),
+    (show_stages, ("calibrate", 0.25, "job: 25 %, calibrate, 0 s")),
+    (show_simulation_progress, (12.0, 60.0, "job: 12.0 of 60.0 s simulated, 0 s")),
 ])  # fmt: skip
-def test_off_a_terminal_a_line_says_now_and_then_how_far_a_command_is(
-    bar, told, monkeypatch, capsys
-):
-    monkeypatch.setattr(console, "_BEAT", 0.02)
+def test_off_a_terminal_a_line_says_now_and_then_how_far_a_command_is(bar, told, monkeypatch, capsys):
+    monkeypatch.setattr(console, "_STATUS_PERIOD", 0.02)
     with bar("job", False) as progress:
         progress(*told[:2])
         time.sleep(0.2)

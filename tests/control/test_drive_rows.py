@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 
 from hydrotele.control.plan import Plan
-from hydrotele.control.servo import drive_references, drive_row, drive_tables
+from hydrotele.control.servo import (
+    compute_drive_references,
+    interpolate_drive_reference,
+    tabulate_drives,
+)
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.scenario.scenario import Servo
 
@@ -17,18 +21,16 @@ def test_drive_row_is_the_servos(name, tool):
     ranges = [machine.joints[machine.axes[a].joint].range or (-1.0, 1.0) for a in axes]
     reference = np.array([rng.uniform(*r, n) for r in ranges]).T
     rate = rng.uniform(-0.5, 0.5, reference.shape)
-    closed = np.array([machine.axes[a].hydraulic is not None for a in axes])
+    closed = np.array([machine.axes[a].is_hydraulic is not None for a in axes])
     plan = Plan(np.arange(n) / 200.0, axes, np.zeros((n, len(axes))), reference, rate, closed)
     servo = Servo(feedforward=0.9, lead=0.0)
-    wanted = drive_references(machine, plan, servo)
-    grid, table = drive_tables(machine, axes)
+    wanted = compute_drive_references(machine, plan, servo)
+    grid, table = tabulate_drives(machine, axes)
     k = len(axes)
     for tick in range(n):
         got = [np.zeros(k) for _ in range(4)]
-        drive_row(grid, table, reference[tick], rate[tick], servo.feedforward, *got)
-        for made, name_of in zip(
-            got, ("velocity", "arm", "volume_head", "volume_rod"), strict=True
-        ):
+        interpolate_drive_reference(grid, table, reference[tick], rate[tick], servo.feedforward, *got)
+        for made, name_of in zip(got, ("velocity", "arm", "volume_head", "volume_rod"), strict=True):
             full = getattr(wanted, name_of)
             near = 1e-6 * np.abs(full).max(axis=0) + 1e-12
             assert np.all(np.abs(made - full[tick])[closed] <= near[closed]), name_of

@@ -11,12 +11,12 @@ from hydrotele.core.errors import InputError
 from hydrotele.kinematics.arm import ArmGeometry, jacobian
 from hydrotele.kinematics.task import task_jacobian
 from hydrotele.logs.log import Log
-from hydrotele.machine.machine import sensor_set
+from hydrotele.machine.machine import get_sensors
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
 from hydrotele.simulate.plant import build_plant, rest_state
-from hydrotele.simulate.record import aligned_positions, begin_leapfrog
+from hydrotele.simulate.record import aligned_positions, start_leapfrog
 
 CAT = load_machine("cat215", "bucket")
 REAL = "khoshzaban1992"
@@ -35,7 +35,7 @@ def felt_in_plant(machine, kind, force, command, seconds):
     """
     plant = build_plant(machine, 1.0e-3, ground=False)
     data = rest_state(plant)
-    begin_leapfrog(plant.model, data)
+    start_leapfrog(plant.model, data)
     felt = EndpointForce(plant.machine, plant.axes, kind, 0.005)
     site, out, tips = plant.model.site("hydrotele_tip"), [], []
     body = plant.model.site_bodyid[site.id]
@@ -109,7 +109,7 @@ def test_real_sensors_false_force_is_a_fifth_of_the_static_one(name):
     run = run_scenario(load_scenario(name, {"sensors": REAL, "ground": "false"}))
     size = {}
     for kind in ("static", "dynamic"):
-        sensors = sensor_set(CAT, REAL)
+        sensors = get_sensors(CAT, REAL)
         found = endpoint_force_of_log(CAT, run.measured, kind, sensors=sensors)
         r = np.hypot(run.truth["truth.tip.x"], run.truth["truth.tip.y"])
         square = found["r"] ** 2 + found["z"] ** 2 + (found["theta"] / r) ** 2
@@ -140,17 +140,17 @@ def readings():
 def test_a_lost_reading_holds_the_last_one(kind):
     felt = EndpointForce(CAT, tuple(CAT.axes), kind)
     joint, head, rod = readings()
-    assert not np.any(felt.update(np.full(4, np.nan), head, rod)) and not felt.healthy
+    assert not np.any(felt.update(np.full(4, np.nan), head, rod)) and not felt.is_healthy
     before = felt.update(joint, head, rod).copy()
-    assert felt.healthy and np.abs(before).min() > 100.0
+    assert felt.is_healthy and np.abs(before).min() > 100.0
     for bad in (np.nan, np.inf):
         head[1] = bad
         for _ in range(200):
             np.testing.assert_allclose(felt.update(joint, head, rod), before, rtol=1e-6)  # rounding
-        assert not felt.healthy
+        assert not felt.is_healthy
     head[1] = 4e6
     felt.update(joint, head, rod)
-    assert felt.healthy
+    assert felt.is_healthy
 
 
 def test_a_frozen_sensor_is_named():
@@ -161,8 +161,8 @@ def test_a_frozen_sensor_is_named():
         head += 1e4 * rng.standard_normal(4)
         rod[[0, 1, 3]] += 1e4 * rng.standard_normal(3)
         felt.update(joint, head, rod)
-    assert felt.frozen(0.5) == ("pressure_rod.stick",)
-    assert felt.frozen(1.0) == ()
+    assert felt.find_constant_channels(0.5) == ("pressure_rod.stick",)
+    assert felt.find_constant_channels(1.0) == ()
 
 
 def test_held_samples_change_nothing():

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from hydrotele.control.feedforward import force_references
+from hydrotele.control.feedforward import compute_force_references
 from hydrotele.control.plan import Plan
 from hydrotele.core.errors import InputError
 from hydrotele.machine.machine_file import load_machine, save_machine
@@ -28,7 +28,7 @@ def swinging(machine, axes, middle, wide=0.05, seconds=6.0):
 def test_a_slide_needs_mass_times_acceleration_friction_and_offset():
     machine = load_machine("emps")
     plan = swinging(machine, ["slide"], [0.0])
-    found = force_references(machine, plan, Servo(force_model="nominal"))
+    found = compute_force_references(machine, plan, Servo(force_model="nominal"))
     (axis,), (link,) = machine.axes.values(), machine.links.values()
     friction = axis.force.friction
     rate = plan.rate[:, 0]
@@ -42,14 +42,14 @@ def test_a_slide_needs_mass_times_acceleration_friction_and_offset():
 
 def test_without_a_model_nothing_is_expected():
     machine = load_machine("emps")
-    found = force_references(machine, swinging(machine, ["slide"], [0.0]), Servo())
-    assert not found.known and not found.force.any() and not found.rate.any()
+    found = compute_force_references(machine, swinging(machine, ["slide"], [0.0]), Servo())
+    assert not found.is_computed and not found.force.any() and not found.rate.any()
 
 
 def test_an_excavator_at_rest_holds_its_load():
     machine = load_machine("cat215")
     plan = swinging(machine, ["swing", "boom", "stick"], [0.1, 0.45, -1.6], wide=1e-6)
-    found = force_references(machine, plan, Servo(force_model="nominal"))
+    found = compute_force_references(machine, plan, Servo(force_model="nominal"))
     swing, boom, stick = found.force[len(plan.time) // 2]
     assert abs(swing) < 100.0 and 5e4 < boom < 3e5 and abs(stick) < 3e4  # weight is on the boom
 
@@ -64,9 +64,7 @@ def test_a_model_makes_a_plain_drive_follow(tmp_path):
     for model in ("nominal", str(tmp_path / "wrong"), None):
         text = {"servo.force_model": json.dumps(model)} if model else {}
         run = run_scenario(load_scenario("emps_track", text))
-        away = run.measured["position.slide"] - np.interp(
-            run.measured.time, run.plan.time, run.plan.reference[:, 0]
-        )
+        away = run.measured["position.slide"] - np.interp(run.measured.time, run.plan.time, run.plan.reference[:, 0])
         errors.append(np.std(away[run.measured.time > 1.0]))
     assert errors[0] < 0.5 * errors[1] < 0.5 * errors[2]
 
@@ -75,9 +73,9 @@ def test_refusals():
     machine = load_machine("emps")
     plan = swinging(machine, ["slide"], [0.0])
     with pytest.raises(InputError):
-        force_references(machine, plan, Servo(force_model="no_such_machine"))
+        compute_force_references(machine, plan, Servo(force_model="no_such_machine"))
     with pytest.raises(InputError, match="has the axes"):
-        force_references(machine, plan, Servo(force_model="ec20"))
+        compute_force_references(machine, plan, Servo(force_model="ec20"))
     opened = Plan(plan.time, plan.axes, plan.command, plan.reference, plan.rate, np.zeros(1, bool))
     with pytest.raises(InputError, match="slide has none"):
-        force_references(machine, opened, Servo(force_model="nominal"))
+        compute_force_references(machine, opened, Servo(force_model="nominal"))

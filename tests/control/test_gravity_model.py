@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from hydrotele.control.endpoint_force import (
-    gravity_from_masses,
-    gravity_rows,
+    extract_slow_motion,
+    fit_gravity_to_masses,
+    gravity_regressor,
     identify_gravity,
-    slow_moves,
 )
 from hydrotele.core.errors import InputError
 from hydrotele.logs.log import Log
@@ -33,7 +33,7 @@ def test_parameters_of_the_stick_follow_from_its_mass_and_its_cylinder():
     stick = 688 * np.array([0.90, 0.10])
     way = math.radians(145.0)
     pin = 100 * 0.72 * np.array([math.cos(way), math.sin(way)])
-    (along, up), found = G * (stick + pin), gravity_from_masses(load_machine("cat215"))
+    (along, up), found = G * (stick + pin), fit_gravity_to_masses(load_machine("cat215"))
     assert found.names == ("C2", "S2", "C23", "S23")
     assert found.value[2:] == pytest.approx([along, -up], rel=1e-9)
     assert found.residual.max() < 1e-6
@@ -52,9 +52,9 @@ def test_torques_are_those_that_hold_the_machine(joints):
         columns |= {f"pressure_head.{a}": np.full(60, act[i, 2])}
         columns |= {f"pressure_rod.{a}": np.full(60, act[i, 3])}
     units = {n: "rad" if n.startswith("angle") else "Pa" for n in columns}
-    moves = slow_moves(CAT, Log(time, columns, units))
-    gravity = gravity_from_masses(CAT)
-    modelled = gravity_rows(np.array(joints)) @ gravity.value
+    moves = extract_slow_motion(CAT, Log(time, columns, units))
+    gravity = fit_gravity_to_masses(CAT)
+    modelled = gravity_regressor(np.array(joints)) @ gravity.value
     np.testing.assert_allclose(moves.torque[-1], modelled, atol=200.0)
     assert np.any(np.abs(forces) > 1e4)
 
@@ -62,7 +62,7 @@ def test_torques_are_those_that_hold_the_machine(joints):
 @pytest.mark.nightly
 def test_slow_moves_with_real_sensors_give_the_parameters(slow_log):
     """Within 1 % of the largest, 1.4 kN m: inertia of the slow moves is left, 0.9 kN m."""
-    true, found = gravity_from_masses(CAT), identify_gravity(CAT, slow_log)
+    true, found = fit_gravity_to_masses(CAT), identify_gravity(CAT, slow_log)
     assert np.abs(found.value - true.value).max() < 0.01 * np.abs(true.value).max()
     plain = identify_gravity(CAT, slow_log, friction=False)
     assert np.linalg.norm(plain.residual) > 1.4 * np.linalg.norm(found.residual)
@@ -90,7 +90,7 @@ def test_the_head_of_a_feller_buncher_has_a_seventh_parameter():
         return np.append(pairs, math.cos(q[4]) * math.sin(angle[2]))
 
     slopes = [(energy(q + step * e) - energy(q - step * e)) / (2 * step) for e in np.eye(5)]
-    np.testing.assert_allclose(gravity_rows(q), slopes, atol=1e-8)
+    np.testing.assert_allclose(gravity_regressor(q), slopes, atol=1e-8)
 
 
 def test_a_short_log_is_refused(slow_log):
@@ -108,8 +108,8 @@ def test_outliers_of_a_dead_pressure_sensor_are_removed(slow_log):
     columns = dict(slow_log.columns)
     dead = (slow_log.time > 40.0) & (slow_log.time < 43.0)
     columns["pressure_head.boom"] = np.where(dead, 0.0, columns["pressure_head.boom"])
-    bad, true = Log(slow_log.time, columns, slow_log.units), gravity_from_masses(CAT).value
+    bad, true = Log(slow_log.time, columns, slow_log.units), fit_gravity_to_masses(CAT).value
     kept, removed = identify_gravity(CAT, bad), identify_gravity(CAT, bad, remove_outliers=True)
     assert np.abs(removed.value - true).max() < 0.01 * np.abs(true).max()
     assert np.abs(removed.value - true).max() < np.abs(kept.value - true).max()
-    assert len(kept.removed) == 0 and set(range(201, 214)) <= set(removed.removed.tolist())
+    assert len(kept.outlier_indices) == 0 and set(range(201, 214)) <= set(removed.outlier_indices.tolist())

@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from hydrotele.control.plan import lines_duration, make_plan, quintic
+from hydrotele.control.plan import lines_duration, make_plan, quintic_step
 from hydrotele.control.resolved_motion import pose_to_joints
 from hydrotele.core.errors import InputError
 from hydrotele.hydraulics.parameters import actuator_order
-from hydrotele.kinematics.arm import forward
+from hydrotele.kinematics.arm import forward_kinematics
 from hydrotele.kinematics.from_machine import arm_geometry
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.scenario.scenario import Pose, Scenario
@@ -30,7 +30,7 @@ def tip(plan, tool="bucket"):
     """r, theta, z, attitude of the references, (n, 4)."""
     geometry = arm_geometry(load_machine("cat215", tool))
     order = [plan.axes.index(a) for a in ("swing", "boom", "stick", "bucket") if a in plan.axes]
-    return np.array([forward(geometry, row) for row in plan.reference[:, order]])
+    return np.array([forward_kinematics(geometry, row) for row in plan.reference[:, order]])
 
 
 def start_at(tool="bucket", **pose):
@@ -47,17 +47,17 @@ def rates_of(values, dt):
 def test_quintic_is_smooth():
     """From 0 to 1 with no speed at either end, its rate the derivative of its value."""
     time = np.linspace(-0.5, 3.5, 4001)
-    s, ds = quintic(time, 3.0)
+    s, ds = quintic_step(time, 3.0)
     assert s[time <= 0].max() == 0.0 and s[time >= 3].min() == 1.0
     assert np.all(np.diff(s) >= 0) and np.all(ds >= 0)
     np.testing.assert_allclose(rates_of(s, 1e-3), ds[1:-1], atol=1e-5)  # h^2 of 1e-6 times s'''
     assert np.trapezoid(ds, time) == pytest.approx(1.0, abs=1e-9)
-    assert [v.tolist() for v in quintic(np.zeros(2), 0.0)] == [[1.0, 1.0], [0.0, 0.0]]
+    assert [v.tolist() for v in quintic_step(np.zeros(2), 0.0)] == [[1.0, 1.0], [0.0, 0.0]]
 
 
 def test_constant():
     plan = plan_of({"kind": "constant", "commands": {"boom": 0.3, "bucket": -1.0}})
-    assert plan.axes == ("swing", "boom", "stick", "bucket") and not plan.closed.any()
+    assert plan.axes == ("swing", "boom", "stick", "bucket") and not plan.closed_loop.any()
     assert np.all(plan.command == [0.0, 0.3, 0.0, -1.0])
 
 
@@ -69,7 +69,7 @@ def test_table_holds_between_its_times():
     for k in range(len(boom)):
         due = max(i for i, t in enumerate(table["time"]) if round(t * RATE) <= k)
         assert boom[k] == table["columns"]["boom"][due]
-    assert not np.delete(plan.command, 1, axis=1).any() and not plan.closed.any()
+    assert not np.delete(plan.command, 1, axis=1).any() and not plan.closed_loop.any()
 
 
 @pytest.mark.parametrize("rate", [50.0, 200.0, 333.3, 1000.0])
@@ -90,7 +90,7 @@ def test_table_of_its_own_ticks_is_itself(rate):
 def test_table_interpolates():
     table = {"time": [0.0, 0.1, 0.3], "columns": {"boom": [0.0, 0.1, 0.5], "stick": [-1, -1, -1]}}
     plan = plan_of({"kind": "table", "of": "joint", "interpolate": "linear", **table}, duration=0.5)
-    assert plan.closed.all()  # the others stay where they are
+    assert plan.closed_loop.all()  # the others stay where they are
     expected = np.interp(plan.time, table["time"], table["columns"]["boom"])
     np.testing.assert_allclose(plan.reference[:, 1], expected, atol=1e-15)
     inner = (plan.time > 0.11) & (plan.time < 0.29)
@@ -123,7 +123,7 @@ def test_lines_reach_their_end(mode):
     pilot = {"kind": "lines", "mode": mode, "settle": 0.5, "moves": moves}
     begin = start_at(r=5.5, z=1.0, attitude=-1.6)
     plan = plan_of(pilot, duration=9.0, start=begin)
-    assert not plan.notes and plan.closed.all()
+    assert not plan.notes and plan.closed_loop.all()
     pose, first = tip(plan), np.array([5.5, 0.0, 1.0, -1.6])
     total = np.array([0.1, 0.3, -0.4, -0.3])
     # 5 mm: speeds are held over ticks of 5 ms, so a ramp of 1 m/s^2 is off by up to v dt.
@@ -150,10 +150,7 @@ def test_lines_rates_are_the_derivative_of_the_references():
 def test_rate_and_position_commands_agree():
     """The same moves, integrated or commanded: the same joints to rounding of 1000 sums."""
     moves = [{"r": 0.4, "z": -0.3, "attitude": 0.2}, {"theta": 0.5, "speed": 0.3}]
-    both = [
-        plan_of({"kind": "lines", "mode": mode, "moves": moves}, duration=7.0)
-        for mode in ("rate", "position")
-    ]
+    both = [plan_of({"kind": "lines", "mode": mode, "moves": moves}, duration=7.0) for mode in ("rate", "position")]
     np.testing.assert_allclose(both[0].reference, both[1].reference, atol=1e-10)
     np.testing.assert_allclose(both[0].rate, both[1].rate, atol=1e-9)
 
@@ -230,7 +227,7 @@ def test_waypoint_pose_goes_straight():
     share = (pose[:, 0] - 5.0) / 0.8
     np.testing.assert_allclose(pose[:, 2], 0.5 + share, atol=1e-9)
     np.testing.assert_allclose(pose[:, 3], -1.8 + 0.6 * share, atol=1e-9)
-    np.testing.assert_allclose(share, quintic(plan.time, 2.0)[0], atol=1e-9)
+    np.testing.assert_allclose(share, quintic_step(plan.time, 2.0)[0], atol=1e-9)
     np.testing.assert_allclose(rates_of(plan.reference, 1e-3), plan.rate[1:-1], atol=1e-4)
 
 
@@ -238,9 +235,7 @@ def test_pose_way_through_the_edge_is_refused():
     """Straight up past the machine the stick would have to fold further than it can."""
     near, far = {"r": 3.6, "z": -0.5, "theta": 0.0}, {"r": 3.6, "z": 3.9, "theta": 0.0}
     pilot = {"kind": "waypoints", "points": [{"duration": 2.0, "pose": far}]}
-    with pytest.raises(
-        InputError, match=r"points\.0\.pose: the straight path leaves the workspace"
-    ):
+    with pytest.raises(InputError, match=r"points\.0\.pose: the straight path leaves the workspace"):
         plan_of(pilot, start=start_at("none", **near), tool="none")
 
 
@@ -267,7 +262,7 @@ def test_closed_valves_are_not_held_by_the_servo():
     pilot = {"kind": "fourier", "period": 5.0, "axes": {"stick": {"mean": -1.4, "sin": [0.1]}},
              "closed_valves": ["boom"]}  # fmt: skip
     plan = plan_of(pilot)
-    assert dict(zip(plan.axes, plan.closed, strict=True)) == {
+    assert dict(zip(plan.axes, plan.closed_loop, strict=True)) == {
         "swing": True, "boom": False, "stick": True, "bucket": True}  # fmt: skip
     assert not plan.command.any()
     with pytest.raises(InputError, match="did you mean 'boom'"):

@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from hydrotele.control.resolved_motion import (
     ResolvedMotion,
     arm_axes,
-    arm_facts,
+    arm_specification,
     follow_rate,
     pose_to_joints,
 )
 from hydrotele.core.errors import InputError
-from hydrotele.kinematics.arm import forward
+from hydrotele.kinematics.arm import forward_kinematics
 from hydrotele.kinematics.from_machine import arm_geometry
 from hydrotele.kinematics.task import task_forward
 from hydrotele.machine.machine_file import load_machine
@@ -28,22 +28,22 @@ RATE = st.floats(-1.0, 1.0)
 
 
 def begin(**joints):
-    return ResolvedMotion.begin(BUCKET, HOME | joints)
+    return ResolvedMotion.from_joints(BUCKET, HOME | joints)
 
 
 def test_begins_where_it_stands():
     motion = begin()
-    assert motion.axes == ("swing", "boom", "stick", "bucket") and not motion.blocked
+    assert motion.axes == ("swing", "boom", "stick", "bucket") and not motion.is_blocked
     assert motion.joints == tuple(HOME.values())
-    assert motion.pose == pytest.approx(forward(GEOMETRY, motion.joints), abs=1e-15)
+    assert motion.pose == pytest.approx(forward_kinematics(GEOMETRY, motion.joints), abs=1e-15)
 
 
 @given(rate=st.tuples(RATE, RATE, RATE, RATE))
 def test_one_step_moves_the_pose_by_rate_times_time(rate):
     """And the joint speeds are those of the joints: 1e-3 of 1 m/s over a step of 1 ms."""
-    motion, joints, speeds = begin().rate_step(rate, 1e-3)
-    assert not motion.blocked
-    moved = np.subtract(forward(GEOMETRY, list(joints.values())), begin().pose)
+    motion, joints, speeds = begin().step_by_rate(rate, 1e-3)
+    assert not motion.is_blocked
+    moved = np.subtract(forward_kinematics(GEOMETRY, list(joints.values())), begin().pose)
     np.testing.assert_allclose(moved, np.multiply(rate, 1e-3), atol=1e-12)
     way = np.subtract(list(joints.values()), list(HOME.values())) / 1e-3
     np.testing.assert_allclose(way, list(speeds.values()), atol=2e-3 * (1 + np.abs(way).max()))
@@ -53,36 +53,36 @@ def test_one_step_moves_the_pose_by_rate_times_time(rate):
 def test_swing_is_not_wrapped(turns, angle):
     """A machine that has slewed round twice does not slew back to move on."""
     swing = angle + turns * math.tau
-    motion, joints, _ = begin(swing=swing).rate_step((0, 0.1, 0, 0), 0.1)
+    motion, joints, _ = begin(swing=swing).step_by_rate((0, 0.1, 0, 0), 0.1)
     assert joints["swing"] == pytest.approx(swing + 0.01, abs=1e-9)
 
 
 def test_blocked_step_changes_nothing_but_the_flag():
     before = begin()
-    after, joints, speeds = before.position_step((30.0, 0.0, 0.0, -1.5), (1.0, 0, 0, 0))
-    assert after.blocked and after.pose == before.pose and after.joints == before.joints
+    after, joints, speeds = before.step_to_pose((30.0, 0.0, 0.0, -1.5), (1.0, 0, 0, 0))
+    assert after.is_blocked and after.pose == before.pose and after.joints == before.joints
     assert joints == HOME and set(speeds.values()) == {0.0}
 
 
 def test_blocked_goes_on_only_from_where_it_stands():
     """A command that comes back elsewhere would make the reference jump."""
-    held, _, _ = begin().position_step((30.0, 0.0, 0.0, -1.5), (0, 0, 0, 0))
+    held, _, _ = begin().step_to_pose((30.0, 0.0, 0.0, -1.5), (0, 0, 0, 0))
     r, theta, z, attitude = held.pose
-    elsewhere, joints, _ = held.position_step((r - 0.5, theta, z, attitude), (0, 0, 0, 0))
-    assert elsewhere.blocked and joints == HOME
-    near, _, _ = held.position_step((r - 0.01, theta, z, attitude), (0, 0, 0, 0))
-    assert not near.blocked and near.pose[0] == r - 0.01
-    free, _, _ = begin().position_step((r - 0.5, theta, z, attitude), (0, 0, 0, 0))
-    assert not free.blocked  # a command that was never blocked may ask for any step
+    elsewhere, joints, _ = held.step_to_pose((r - 0.5, theta, z, attitude), (0, 0, 0, 0))
+    assert elsewhere.is_blocked and joints == HOME
+    near, _, _ = held.step_to_pose((r - 0.01, theta, z, attitude), (0, 0, 0, 0))
+    assert not near.is_blocked and near.pose[0] == r - 0.01
+    free, _, _ = begin().step_to_pose((r - 0.5, theta, z, attitude), (0, 0, 0, 0))
+    assert not free.is_blocked  # a command that was never blocked may ask for any step
 
 
 def test_joint_limits_block():
     """The stick's range ends before the arm is straight."""
     motion, steps = begin(), 0
-    while not motion.blocked and steps < 20000:
-        motion, joints, _ = motion.rate_step((0.5, 0, 0, 0), 0.005)
+    while not motion.is_blocked and steps < 20000:
+        motion, joints, _ = motion.step_by_rate((0.5, 0, 0, 0), 0.005)
         steps += 1
-    assert motion.blocked and steps > 100
+    assert motion.is_blocked and steps > 100
     for axis, value in joints.items():
         low, high = BUCKET.joints[axis].range or (-9, 9)
         assert low <= value <= high
@@ -90,7 +90,7 @@ def test_joint_limits_block():
 
 def test_pose_to_joints():
     joints = pose_to_joints(BUCKET, Pose(r=5.5, z=1.0, theta=0.4, attitude=-1.7), HOME)
-    pose = forward(GEOMETRY, list(joints.values()))
+    pose = forward_kinematics(GEOMETRY, list(joints.values()))
     np.testing.assert_allclose(pose, [5.5, 0.4, 1.0, -1.7], atol=1e-12)
     kept = pose_to_joints(BUCKET, Pose(r=5.5, z=1.0), HOME)
     assert sum(kept[a] for a in ("boom", "stick", "bucket")) == pytest.approx(0.45 - 1.6 - 1.2)
@@ -114,7 +114,7 @@ def test_arm_with_a_joint_that_nothing_drives():
 
 def test_inverse_jacobian_follows_the_rate_and_stops_at_the_edge():
     """Euler's steps of 2.5 mm leave 0.1 mm of 0.5 m beside the line; one step at the edge."""
-    g, axes, ranges = arm_facts(BUCKET)
+    g, axes, ranges = arm_specification(BUCKET)
     q = np.array([(HOME | {"swing": 0.0})[axis] for axis in axes])
     pose, speed, rate = np.zeros(5), np.zeros(len(q)), np.array([0.0, 0.0, 0.5, 0.0, 0.0])
     task_forward(g, q, pose)

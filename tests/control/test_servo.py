@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from hydrotele.control.servo import (
     ComputedForce,
     DriveReference,
-    Measured,
-    feedforward_opening,
+    MeasuredState,
+    compute_valve_opening,
     servo_parameters,
     servo_step,
 )
@@ -44,7 +44,7 @@ def test_opening_keeps_the_force(axis, velocity, head, rod, place):
     area_head, area_rod = user[Slot.AREA_HEAD], user[Slot.AREA_ROD]
     volume_head = user[Slot.VOLUME_HEAD] + area_head * place * user[Slot.STROKE]
     volume_rod = user[Slot.VOLUME_ROD] + area_rod * (1 - place) * user[Slot.STROKE]
-    opening = feedforward_opening(
+    opening = compute_valve_opening(
         velocity, head, rod, SUPPLY, TANK, area_head, area_rod, volume_head, volume_rod,
         user[Slot.FLOW_GAIN],
     )  # fmt: skip
@@ -59,7 +59,7 @@ def test_opening_keeps_the_force(axis, velocity, head, rod, place):
 def test_opening_is_bounded_where_the_valve_has_nothing_to_drive():
     """Both chambers at the supply pressure: finite, and monotone in the wanted velocity."""
     opening = [
-        feedforward_opening(v, SUPPLY, TANK, SUPPLY, TANK, 0.02, 0.013, 0.01, 0.01, 2e-6)
+        compute_valve_opening(v, SUPPLY, TANK, SUPPLY, TANK, 0.02, 0.013, 0.01, 0.01, 2e-6)
         for v in np.linspace(-0.2, 0.2, 41)
     ]
     assert np.all(np.isfinite(opening)) and np.all(np.diff(opening) > 0)
@@ -77,7 +77,7 @@ def one_step(axis, servo=None, error=0.0, velocity=0.0, arm=1.0, rate=0.0, load=
     servo_step(
         numbers, np.arange(4) == k,
         DriveReference(full(velocity), full(arm), full(0.02), full(0.02)), reference,
-        Measured(full(0.0), full(rate), head, rod, SUPPLY),
+        MeasuredState(full(0.0), full(rate), head, rod, SUPPLY),
         forces if load is None else load * forces, ComputedForce(False, full(0.0), full(0.0)), out,
     )  # fmt: skip
     assert np.all(np.delete(out, k) == 0.123)  # what is not under feedback keeps its command
@@ -164,7 +164,5 @@ def test_force_drive_follows():
 def test_force_drive_stays_within_its_volts():
     pilot = {"kind": "table", "of": "joint", "time": [0.0], "columns": {"slide": [0.25]}}
     servo = {"position_gain": 100, "velocity_gain": 1e5}
-    run = run_scenario(
-        Scenario(name="t", machine="emps", duration=0.3, servo=servo, pilot=pilot, log_rate=200)
-    )
+    run = run_scenario(Scenario(name="t", machine="emps", duration=0.3, servo=servo, pilot=pilot, log_rate=200))
     assert np.abs(run.truth["command.slide"]).max() == 10.0

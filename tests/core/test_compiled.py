@@ -70,9 +70,7 @@ def test_a_changed_module_drops_the_caches_of_those_that_use_it_and_no_others(tm
     (package / "constant.py").write_text("HALF = 0.5\n")
     head = "from hydrotele.core.compiled import compiled\n"
     law = "@compiled\ndef law(x):\n    return {} * x\n"
-    (package / "made.py").write_text(
-        head + "from hydrotele.constant import HALF\n\n" + law.format("HALF")
-    )
+    (package / "made.py").write_text(head + "from hydrotele.constant import HALF\n\n" + law.format("HALF"))
     (package / "other.py").write_text(head + "\n" + law.format("3.0"))
     code = "from hydrotele.made import law; from hydrotele.other import law as other\n"
     code += "print(law(4.0), other(4.0), len(law.stats.cache_hits), len(other.stats.cache_hits))"

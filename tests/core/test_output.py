@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.core.output import check_target, replacing, whole_folder
+from hydrotele.core.output import atomic_file, atomic_folder, check_output_folder
 
 
 def names(folder: Path) -> list[str]:
@@ -17,13 +17,13 @@ def names(folder: Path) -> list[str]:
 
 
 def write(target: Path, text: str = "{}") -> None:
-    with whole_folder(target, "run") as folder:
+    with atomic_folder(target, "run") as folder:
         (folder / "measured.parquet").write_text(text)
         (folder / "summary.json").write_text('{"kind": "run"}')
 
 
 def test_appears_at_the_end(tmp_path):
-    with whole_folder(tmp_path / "deep" / "run", "run") as folder:
+    with atomic_folder(tmp_path / "deep" / "run", "run") as folder:
         (folder / "summary.json").write_text("{}")
         assert not (tmp_path / "deep" / "run").exists()
     assert names(tmp_path / "deep") == ["run"]
@@ -42,7 +42,7 @@ def test_keeps_what_no_run_wrote(tmp_path):
     """Notes in a run folder, and a run folder where a replay should go, are left alone."""
     write(tmp_path / "run", "1")
     with pytest.raises(InputError, match="was not written by a replay; choose another --out"):
-        check_target(tmp_path / "run", "replay")
+        check_output_folder(tmp_path / "run", "replay")
     (tmp_path / "run" / "notes.txt").write_text("mine")
     with pytest.raises(InputError, match="contains notes.txt, not written by a run"):
         write(tmp_path / "run", "2")
@@ -72,9 +72,7 @@ def test_link_is_followed(tmp_path):
     write(tmp_path / "run", "1")
     (tmp_path / "latest").symlink_to("run")
     write(tmp_path / "latest", "2")
-    assert (tmp_path / "latest").is_symlink() and (
-        tmp_path / "run" / "measured.parquet"
-    ).read_text() == "2"
+    assert (tmp_path / "latest").is_symlink() and (tmp_path / "run" / "measured.parquet").read_text() == "2"
     assert names(tmp_path) == ["latest", "run"]
 
 
@@ -82,7 +80,7 @@ def test_link_is_followed(tmp_path):
 def test_failure_leaves_nothing_and_the_old_one(failure, tmp_path):
     write(tmp_path / "run", "1")
     for target in ("run", "new"):
-        with pytest.raises(type(failure)), whole_folder(tmp_path / target, "run") as folder:
+        with pytest.raises(type(failure)), atomic_folder(tmp_path / target, "run") as folder:
             (folder / "measured.parquet").write_text("half")
             raise failure
     assert names(tmp_path) == ["run"] and (tmp_path / "run" / "measured.parquet").read_text() == "1"
@@ -91,7 +89,7 @@ def test_failure_leaves_nothing_and_the_old_one(failure, tmp_path):
 def test_full_disk_is_an_error_of_the_user(tmp_path):
     write(tmp_path / "run", "1")
     with pytest.raises(InputError, match="run: cannot be written, output removed: .*No space left"):
-        with whole_folder(tmp_path / "run", "run") as folder:
+        with atomic_folder(tmp_path / "run", "run") as folder:
             (folder / "measured.parquet").write_text("half")
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     assert names(tmp_path) == ["run"] and (tmp_path / "run" / "measured.parquet").read_text() == "1"
@@ -119,7 +117,7 @@ def test_place_where_nothing_can_be_made(tmp_path):
     (tmp_path / "file").write_text("x")
     for target in (tmp_path / "file" / "run", tmp_path / "file" / "a" / "run"):
         with pytest.raises(InputError, match="cannot be created: .*file is not a writable folder"):
-            check_target(target, "run")
+            check_output_folder(target, "run")
         with pytest.raises(InputError, match="cannot be created"):
             write(target)
 
@@ -128,7 +126,7 @@ def test_folder_without_permission(tmp_path, monkeypatch):
     """Seen before the simulation where the system tells, else when the folder is made."""
     monkeypatch.setattr(os, "access", lambda *_: False)
     with pytest.raises(InputError, match=f"cannot be created: {tmp_path} is not a writable folder"):
-        check_target(tmp_path / "run", "run")
+        check_output_folder(tmp_path / "run", "run")
     monkeypatch.undo()
 
     def refuse(*_, **__):
@@ -162,23 +160,17 @@ def test_odd_names(tmp_path):
 
 def test_file_appears_whole_or_not_at_all(tmp_path):
     (tmp_path / "measured.parquet").write_text("old")
-    with pytest.raises(RuntimeError), replacing(tmp_path / "measured.parquet", "") as part:
+    with pytest.raises(RuntimeError), atomic_file(tmp_path / "measured.parquet", "") as part:
         part.write_text("half")
         raise RuntimeError
-    assert (
-        names(tmp_path) == ["measured.parquet"]
-        and (tmp_path / "measured.parquet").read_text() == "old"
-    )
-    with replacing(tmp_path / "measured.parquet", ".parquet") as part:
+    assert names(tmp_path) == ["measured.parquet"] and (tmp_path / "measured.parquet").read_text() == "old"
+    with atomic_file(tmp_path / "measured.parquet", ".parquet") as part:
         part.write_text("new")
-    assert (
-        names(tmp_path) == ["measured.parquet"]
-        and (tmp_path / "measured.parquet").read_text() == "new"
-    )
+    assert names(tmp_path) == ["measured.parquet"] and (tmp_path / "measured.parquet").read_text() == "new"
     for path, suffix, message in (
         ("measured.parquet", ".png", "ends in .png"), ("no/measured.parquet", "", "not a folder"),
     ):  # fmt: skip
-        with pytest.raises(InputError, match=message), replacing(tmp_path / path, suffix):
+        with pytest.raises(InputError, match=message), atomic_file(tmp_path / path, suffix):
             pass
 
 
@@ -188,6 +180,6 @@ def test_a_users_own_hidden_folder_is_not_removed(tmp_path):
     for folder in (own, left):
         folder.mkdir()
         (folder / "notes.txt").write_text("kept")
-    with whole_folder(tmp_path / "a", "run") as part:
+    with atomic_folder(tmp_path / "a", "run") as part:
         (part / "summary.json").write_text('{"kind": "run"}')
     assert (own / "notes.txt").is_file() and not left.exists()

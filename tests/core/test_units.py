@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from hydrotele.core.units import UNITS, axis_unit, customary, to_si
+from hydrotele.core.units import UNITS, axis_unit, display_unit, to_si
 from hydrotele.machine import signals
 
 
@@ -27,9 +27,7 @@ def test_conversion_to_si(unit, si, factor):
 
 
 def test_units_of_channels_are_si_and_every_unit_leads_to_one():
-    known = {
-        u for table in (signals.MEASURED, signals.TRUTH) for k in table.values() for u in k.units
-    }
+    known = {u for table in (signals.MEASURED_KINDS, signals.TRUTH_KINDS) for k in table.values() for u in k.units}
     assert not known & UNITS.keys()
     assert not {si for si, _ in UNITS.values()} & UNITS.keys()
 
@@ -41,7 +39,7 @@ SI = ("1", "m", "rad", "s", "Pa", "m^3/s", "m^3/(s Pa)", "m^3/Pa", "N", "N m", "
 @pytest.mark.parametrize("unit", SI)
 @pytest.mark.parametrize("size", [1e-9, 1e-3, 2.0, 1e4, 1e9])
 def test_units_for_people_lead_back_to_the_si_unit(unit, size):
-    for shown, factor in (axis_unit(unit), customary(unit, size)):
+    for shown, factor in (axis_unit(unit), display_unit(unit, size)):
         assert to_si(shown)[0] == unit
         assert factor * to_si(shown)[1] == pytest.approx(1.0, rel=1e-14)  # rounding of a division
 

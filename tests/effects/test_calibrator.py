@@ -5,7 +5,7 @@ import pytest
 
 from hydrotele.effects import apply_effect
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.simulate.feedback import measure
+from hydrotele.simulate.feedback import simulate_readings
 from hydrotele.simulate.plant import build_plant, rest_state
 
 MACHINE = load_machine("calibrator")
@@ -15,7 +15,7 @@ ELBOW = "angle.calibrator_elbow"
 def shown(effect, parameter, value, angle):
     """What the elbow's sensor without noise shows."""
     machine = apply_effect(MACHINE, effect, "calibrator_elbow", {parameter: value})
-    return measure(machine, None, 1, {ELBOW: angle})[ELBOW]
+    return simulate_readings(machine, None, 1, {ELBOW: angle})[ELBOW]
 
 
 def test_tilted_coupling_errs_twice_a_turn():

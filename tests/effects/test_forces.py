@@ -158,9 +158,7 @@ def test_a_longer_stick_takes_its_linkage_and_load_along():
     machine = load_machine("cat215", "bucket")
     longer = apply_effect(machine, "link_length", "stick", {"length": 0.1})
     (plant, data), (other, moved) = at_rest(machine), at_rest(longer)
-    np.testing.assert_allclose(
-        moved.qpos[other.rod_qpos[1:]], data.qpos[plant.rod_qpos[1:]], atol=1e-9
-    )
+    np.testing.assert_allclose(moved.qpos[other.rod_qpos[1:]], data.qpos[plant.rod_qpos[1:]], atol=1e-9)
     loaded = apply_effect(load_machine("cat215"), "payload", "", {"mass": 100.0})
     loaded = apply_effect(loaded, "link_length", "stick", {"length": 0.1})
     assert loaded.links["payload"].position == loaded.arm.tip.position == pytest.approx((1.9, 0, 0))

@@ -80,7 +80,7 @@ FELT = [  # daily at the last of its places, which all of them change, at the fi
 def usual(machine, name, place, size=1.0):
     """Parameters `size` typical deviations away from those of the machine, inside their range."""
     numbers = EFFECTS[name].parameters(machine, place)
-    return {k: float(np.clip(p.nominal + size * p.scale, p.low, p.high))
+    return {k: float(np.clip(p.nominal + size * p.prior_std, p.lower_bound, p.upper_bound))
             for k, p in numbers.items()}  # fmt: skip
 
 
@@ -103,15 +103,15 @@ def test_names_and_places_are_those_agreed():
 @pytest.mark.parametrize(("machine", "tool", "name"), PLACED)
 def test_sizes_are_in_order(machine, tool, name):
     effect, facts = EFFECTS[name], machine_of(machine, tool)
-    assert effect.name == name and effect.sentence and effect.law in LAWS
+    assert effect.name == name and effect.description and effect.model_part in LAWS
     numbers = [effect.parameters(facts, place) for place in effect.locations(facts)]
     assert all(numbers)
     for p in (p for here in numbers for p in here.values()):
-        assert p.unit and p.low <= p.nominal <= p.high and p.low < p.high
-        assert 0 < p.least <= p.scale <= p.high - p.low
-        assert all(p.low <= start <= p.high for start in p.starts)
-        if not p.low < p.nominal:  # one-sided: the least one must fit on the other side
-            assert p.nominal + p.least <= p.high
+        assert p.unit and p.lower_bound <= p.nominal <= p.upper_bound and p.lower_bound < p.upper_bound
+        assert 0 < p.min_relevant_change <= p.prior_std <= p.upper_bound - p.lower_bound
+        assert all(p.lower_bound <= start <= p.upper_bound for start in p.start_values)
+        if not p.lower_bound < p.nominal:  # one-sided: the least one must fit on the other side
+            assert p.nominal + p.min_relevant_change <= p.upper_bound
 
 
 @pytest.mark.parametrize(("machine", "tool", "name"), PLACED)
@@ -145,10 +145,14 @@ def check_limits(machine, tool, name, place):
     facts = machine_of(machine, tool)
     given = usual(facts, name, place)
     for key, p in EFFECTS[name].parameters(facts, place).items():
-        for value in (p.low, p.high):
+        for value in (p.lower_bound, p.upper_bound):
             after = apply_effect(facts, name, place, given | {key: value})
             type(after).model_validate(after.model_dump())
-        for value in (math.nextafter(p.low, -math.inf), p.high * 1.001 + 1e-30, math.nan):
+        for value in (
+            math.nextafter(p.lower_bound, -math.inf),
+            p.upper_bound * 1.001 + 1e-30,
+            math.nan,
+        ):
             with pytest.raises(InputError, match=f"effect {name}: {key}: .* is outside"):
                 apply_effect(facts, name, place, given | {key: value})
 
@@ -185,9 +189,7 @@ def test_no_place_on_a_machine_without_oil_or_arm():
 def short(machine, tool, effects=()):
     """0.2 s with every drive at half command."""
     axes = machine_of(machine, tool).axes
-    commands = {
-        a: 0.5 * (axis.force.command_limit if axis.force else 1) for a, axis in axes.items()
-    }
+    commands = {a: 0.5 * (axis.force.command_limit if axis.force else 1) for a, axis in axes.items()}
     return Scenario(
         name="t", machine=machine, tool=tool, duration=0.2, ground=False, effects=tuple(effects),
         pilot={"kind": "constant", "commands": commands},
@@ -204,16 +206,14 @@ def test_is_felt(machine, tool, name, place):
     """A machine that has it moves, or is seen, and not as the one without it."""
     given = usual(machine_of(machine, tool), name, place)
     if name == "pump_droop":  # felt only where the pump's flow is short
-        given["droop"] = (
-            0.9 * EFFECTS[name].parameters(machine_of(machine, tool), place)["droop"].high
-        )
+        given["droop"] = 0.9 * EFFECTS[name].parameters(machine_of(machine, tool), place)["droop"].upper_bound
     if name == "pump_flow_limit":  # felt only where it is less than what the valves ask for
         given["pump_flow"] = 0.3 * machine_of(machine, tool).supply.pump_flow
     if name == "force_pulse":  # the usual one comes after the end of this run
         given["start"] = 0.05
     planted = {"name": name, "location": place, "parameters": given}
     plain, run = plain_run(machine, tool), run_scenario(short(machine, tool, [planted]))
-    seen = EFFECTS[name].law == "sensor"
+    seen = EFFECTS[name].model_part == "sensor"
     old, new = (plain.measured, run.measured) if seen else (plain.truth, run.truth)
     assert any(not np.array_equal(old[c], new[c]) for c in old.columns)
     assert all(np.isfinite(v).all() for v in run.truth.columns.values())
@@ -259,7 +259,7 @@ def test_one_new_file_is_a_new_effect(tmp_path, monkeypatch):
     (tmp_path / "sticky_makeup.py").write_text(NEW)
     (tmp_path / "_helper.py").write_text("raise RuntimeError('helpers are not effects')")
     monkeypatch.setattr(library, "__path__", [*library.__path__, str(tmp_path)])
-    found = library._discover()
+    found = library._discover_effects()
     monkeypatch.delitem(sys.modules, "hydrotele.effects.sticky_makeup")
     monkeypatch.setattr(library, "EFFECTS", found)
     assert found.keys() - EFFECTS.keys() == {"sticky_makeup"}
@@ -267,14 +267,12 @@ def test_one_new_file_is_a_new_effect(tmp_path, monkeypatch):
     assert after.axes["boom"].valve.makeup_gain == 1e-9
 
 
-@pytest.mark.parametrize(
-    ("text", "message"), [("X = 1", "neither EFFECT nor EFFECTS"), (NEW + "\n", "exists already")]
-)
+@pytest.mark.parametrize(("text", "message"), [("X = 1", "neither EFFECT nor EFFECTS"), (NEW + "\n", "exists already")])
 def test_an_empty_file_or_a_taken_name_is_refused(tmp_path, monkeypatch, text, message):
     (tmp_path / "zz_new.py").write_text(text.replace("sticky_makeup", "payload"))
     monkeypatch.setattr(library, "__path__", [*library.__path__, str(tmp_path)])
     with pytest.raises(RuntimeError, match=message):
-        library._discover()
+        library._discover_effects()
     sys.modules.pop("hydrotele.effects.zz_new", None)
 
 

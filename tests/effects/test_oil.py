@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from hydrotele.effects import apply_effect
-from hydrotele.hydraulics.circuit import ACTIVATIONS
+from hydrotele.hydraulics.circuit import ACTIVATIONS_PER_AXIS
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.plant import build_plant, rest_state
 from hydrotele.simulate.record import state_flows
@@ -18,7 +18,7 @@ def flows(machine, spool):
     """Supply pressure, and flow into the head side of the boom, with its spool held there."""
     plant = build_plant(machine, ground=False)
     data = rest_state(plant)
-    data.act[ACTIVATIONS * BOOM] = spool
+    data.act[ACTIVATIONS_PER_AXIS * BOOM] = spool
     count = plant.hydraulic
     user = plant.model.actuator_user.ravel()
     table = state_flows(user, count, data.act[None], np.full((1, count), 0.5), np.zeros((1, count)))
@@ -29,11 +29,11 @@ def pressure_rate(machine, velocity=0.0, difference=0.0):
     """Rate of the boom's head pressure with its valve closed [Pa/s], over the first microsecond."""
     plant = build_plant(machine, timestep=1e-6, ground=False)
     data = rest_state(plant)
-    data.act[ACTIVATIONS * BOOM + 2] = data.act[ACTIVATIONS * BOOM + 3] + difference
+    data.act[ACTIVATIONS_PER_AXIS * BOOM + 2] = data.act[ACTIVATIONS_PER_AXIS * BOOM + 3] + difference
     data.qvel[plant.drive_dof[BOOM]] = velocity
     mujoco.mj_forward(plant.model, data)
     x = data.qpos[plant.rod_qpos[BOOM]]
-    return data.act_dot[ACTIVATIONS * BOOM + 2], float(x)
+    return data.act_dot[ACTIVATIONS_PER_AXIS * BOOM + 2], float(x)
 
 
 def test_gain_scales_the_flow():
@@ -54,9 +54,7 @@ def test_a_slow_spool_follows_on_a_slower_clock():
 
     1e-6: `spool_step` promises 1e-8 a step.
     """
-    slow = apply_effect(
-        NOMINAL, "spool_lag", "boom", {"bandwidth": NOMINAL.axes["boom"].valve.bandwidth / 2}
-    )
+    slow = apply_effect(NOMINAL, "spool_lag", "boom", {"bandwidth": NOMINAL.axes["boom"].valve.bandwidth / 2})
     responses = []
     for machine in (NOMINAL, slow):
         plant = build_plant(machine, ground=False)
@@ -64,7 +62,7 @@ def test_a_slow_spool_follows_on_a_slower_clock():
         data.ctrl[BOOM], spool = 0.5, []
         for _ in range(200):
             mujoco.mj_step(plant.model, data)
-            spool.append(data.act[ACTIVATIONS * BOOM])
+            spool.append(data.act[ACTIVATIONS_PER_AXIS * BOOM])
         responses.append(np.array(spool))
     np.testing.assert_allclose(responses[1][1::2], responses[0][:100], atol=1e-6)
 
@@ -89,7 +87,7 @@ def test_spool_leakage_leaves_for_the_tank():
     (rate, x), (nominal, _) = pressure_rate(leaky), pressure_rate(NOMINAL)
     volume = NOMINAL.axes["boom"].cylinder.volumes(np.array(x))[0]
     plant = build_plant(NOMINAL, ground=False)
-    above = rest_state(plant).act[ACTIVATIONS * BOOM + 3] - NOMINAL.supply.tank_pressure
+    above = rest_state(plant).act[ACTIVATIONS_PER_AXIS * BOOM + 3] - NOMINAL.supply.tank_pressure
     wanted = -NOMINAL.supply.bulk_modulus / volume * leak * above
     assert rate - nominal == pytest.approx(wanted, rel=1e-4)
 

@@ -30,8 +30,8 @@ FILE = re.search(r"```python\n(.*?)```", PAGE, re.S)[1]
 @pytest.fixture
 def alone(monkeypatch):
     """Libraries that are as before after the test."""
-    monkeypatch.setattr(own, "_read", {})
-    monkeypatch.setenv(own.ENVIRONMENT, "")
+    monkeypatch.setattr(own, "_loaded_effects", {})
+    monkeypatch.setenv(own.ENVIRONMENT_VARIABLE, "")
     effects, laws = dict(EFFECTS), dict(LAWS)
     yield
     for library, before in ((EFFECTS, effects), (LAWS, laws)):
@@ -56,7 +56,7 @@ def steps(machine, **more):
 def test_a_file_adds_an_effect_that_runs_and_can_be_handed_on(gas_spring, tmp_path):
     rig = load_machine("rig")
     assert LAWS["gas_spring_force"].source == str(gas_spring)
-    assert os.environ[own.ENVIRONMENT] == str(gas_spring), "child processes load it, too"
+    assert os.environ[own.ENVIRONMENT_VARIABLE] == str(gas_spring), "child processes load it, too"
     patched = apply_effect(rig, "gas_spring", "slide", {"force": 400.0})
     folder = tmp_path / "patched"
     folder.mkdir()
@@ -104,7 +104,7 @@ def test_a_wrong_file_is_refused_and_leaves_nothing(text, message, tmp_path, alo
     with pytest.raises(InputError, match=message):
         load_effects(file)
     assert (effects, laws) == (EFFECTS, LAWS)
-    assert not os.environ[own.ENVIRONMENT]
+    assert not os.environ[own.ENVIRONMENT_VARIABLE]
 
 
 def test_a_missing_file_or_another_kind_is_refused(tmp_path, alone):
@@ -139,18 +139,16 @@ def test_nobody_runs_a_file_that_was_not_named(tmp_path, alone):
 def test_installed_packages_offer_effects_as_entry_points(monkeypatch, alone, tmp_path):
     (tmp_path / "rig_plugin.py").write_text(FILE, encoding="utf-8")
     monkeypatch.syspath_prepend(str(tmp_path))
-    entries = [importlib.metadata.EntryPoint("springs", "rig_plugin", own.GROUP)]
+    entries = [importlib.metadata.EntryPoint("springs", "rig_plugin", own.ENTRY_POINT_GROUP)]
     monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: entries)
     library: dict[str, Effect] = {}
-    own.add_plugins(library)
+    own.add_plugin_effects(library)
     sys.modules.pop("rig_plugin")
     assert list(library) == ["gas_spring"]
     assert LAWS["gas_spring_force"].source == "plug-in springs of the package ?"
-    entries[0] = importlib.metadata.EntryPoint("springs", "rig_plugin_2", own.GROUP)
-    with pytest.raises(
-        InputError, match="plug-in springs .*cannot be loaded: No module.*uninstall"
-    ):
-        own.add_plugins({})
+    entries[0] = importlib.metadata.EntryPoint("springs", "rig_plugin_2", own.ENTRY_POINT_GROUP)
+    with pytest.raises(InputError, match="plug-in springs .*cannot be loaded: No module.*uninstall"):
+        own.add_plugin_effects({})
 
 
 @pytest.mark.nightly
@@ -161,7 +159,7 @@ def test_the_page_is_true_as_written(tmp_path):
     program = f'hydrotele() {{ {shlex.quote(sys.executable)} -m hydrotele "$@"; }}\nset -e\n'
     paths = [str(Path(hydrotele.__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
-    environment.pop(own.ENVIRONMENT, None)
+    environment.pop(own.ENVIRONMENT_VARIABLE, None)
     done = subprocess.run(
         ["bash", "-c", program + commands], cwd=tmp_path, env=environment, capture_output=True,
         text=True, timeout=900, check=False,

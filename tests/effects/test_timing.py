@@ -15,9 +15,9 @@ from hydrotele.scenario.scenario import Scenario
 from hydrotele.simulate.plant import build_plant, rest_state
 from hydrotele.simulate.record import (
     Recorder,
-    begin_leapfrog,
-    late_channels,
+    delayed_channels,
     split_delay,
+    start_leapfrog,
     true_channels,
 )
 from hydrotele.simulate.stepping import Stepper
@@ -31,9 +31,7 @@ def scenario(*effects, machine="cat215", rate=50, log_rate=50, duration=1.0, **m
     """All axes driven by held sines."""
     axes = {"cat215": ("swing", "boom", "stick"), "emps": ("slide",), "rig": ("slide",)}[machine]
     time = (np.arange(round(50 * duration)) / 50.0).tolist()
-    columns = {
-        a: (0.1 + 0.5 * np.sin(6.0 * np.array(time) + i)).tolist() for i, a in enumerate(axes)
-    }
+    columns = {a: (0.1 + 0.5 * np.sin(6.0 * np.array(time) + i)).tolist() for i, a in enumerate(axes)}
     pilot = {
         "kind": "table",
         "of": "command",
@@ -69,9 +67,7 @@ def test_a_delayed_command_shifts_the_spool(delay, place):
         wanted = np.interp(prompt.time - shift, prompt.time, prompt[f"truth.spool.{axis}"])
         wanted[prompt.time < shift] = 0.0
         exact = abs(shift * 1000 - round(shift * 1000)) < 1e-9
-        np.testing.assert_allclose(
-            late[f"truth.spool.{axis}"], wanted, atol=1e-12 if exact else 2e-3
-        )
+        np.testing.assert_allclose(late[f"truth.spool.{axis}"], wanted, atol=1e-12 if exact else 2e-3)
         assert np.array_equal(late[f"command.{axis}"], prompt[f"command.{axis}"])
 
 
@@ -80,9 +76,7 @@ def test_a_delayed_force_shifts_the_whole_motion():
     fine = {"machine": "emps", "rate": 1000, "log_rate": 1000}
     late = run_scenario(scenario(("command_delay", "slide", {"delay": 0.013}), **fine)).truth
     prompt = run_scenario(scenario(**fine)).truth
-    np.testing.assert_allclose(
-        late["position.slide"][13:], prompt["position.slide"][:-13], atol=1e-12
-    )
+    np.testing.assert_allclose(late["position.slide"][13:], prompt["position.slide"][:-13], atol=1e-12)
     assert np.ptp(prompt["position.slide"]) > 1e-3
 
 
@@ -147,9 +141,7 @@ def test_the_log_shows_the_defects_and_the_truth_does_not():
     np.testing.assert_allclose(seen["angle.swing"], late("angle.swing", 0.013), atol=1e-12)
     for channel in ("pressure_head.stick", "pressure_rod.stick"):
         np.testing.assert_allclose(seen[channel], late(channel, 0.0275), atol=28.0)
-    np.testing.assert_allclose(
-        seen["pressure_rod.boom"], 0.98 * truth["pressure_rod.boom"], rtol=1e-14
-    )
+    np.testing.assert_allclose(seen["pressure_rod.boom"], 0.98 * truth["pressure_rod.boom"], rtol=1e-14)
     for channel in ("length.boom", "pressure_supply"):
         assert np.array_equal(seen[channel], truth[channel])
 
@@ -208,20 +200,18 @@ def test_the_supply_sensor_can_be_late_too():
 def supply_and_reading(machine, error):
     """Supply pressure and what its sensor shows of it, at every row or every step."""
     steps = 1 if "time_constant" in error else 20
-    machine = type(machine).model_validate(
-        machine.model_dump() | {"sensor_errors": {"pressure_supply": error}}
-    )
+    machine = type(machine).model_validate(machine.model_dump() | {"sensor_errors": {"pressure_supply": error}})
     plant = build_plant(machine, ground=False)
     data = rest_state(plant)
-    begin_leapfrog(plant.model, data)
+    start_leapfrog(plant.model, data)
     rows = 600 // steps
     stepper, recorder = Stepper(plant, data, steps), Recorder(plant, rows)
     for row in range(rows):
-        recorder.take(row, 0.02 * row, data, stepper.shown())
+        recorder.record_state(row, 0.02 * row, data, stepper.sensor_values())
         stepper.advance(np.array([0.9, 0.9, 0.9]))
-    record = recorder.record()
+    record = recorder.to_record()
     supply = true_channels(plant, record)[0]["pressure_supply"]
-    return supply, late_channels(plant, record)["pressure_supply"]
+    return supply, delayed_channels(plant, record)["pressure_supply"]
 
 
 def test_the_controller_sees_what_the_log_shows():
@@ -229,7 +219,7 @@ def test_the_controller_sees_what_the_log_shows():
     asked = scenario(*DEFECTS, sensors="khoshzaban1992")
     measured = run_scenario(asked).measured
     plant, data, plan, seen = prepare(asked)
-    begin_leapfrog(plant.model, data)
+    start_leapfrog(plant.model, data)
     stepper = Stepper(plant, data, 20)
     for tick in range(50):
         seen.update(tick, stepper)

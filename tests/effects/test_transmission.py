@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from hydrotele.effects import EFFECTS, apply_effect
-from hydrotele.effects.transmission import load_inertia, resolved_inertia
-from hydrotele.hydraulics.circuit import SLOTS, actuator_friction, settled_friction
+from hydrotele.effects.transmission import load_inertia, min_resolvable_inertia
+from hydrotele.hydraulics.circuit import SLOT_COUNT, actuator_friction, implicit_friction
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.replay import replay_log
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import Scenario
 from hydrotele.simulate.closure import holding_forces, independent_dofs
 from hydrotele.simulate.plant import build_plant, initial_state, rest_state
-from hydrotele.simulate.record import aligned_positions, begin_leapfrog
+from hydrotele.simulate.record import aligned_positions, start_leapfrog
 
 MACHINE = load_machine("cat215")
 GAP = 0.02
@@ -55,7 +55,7 @@ def test_the_rotor_crosses_the_gap_before_the_load_moves():
     data = rest_state(plant)
     rotor, ring = plant.drive_qpos[0], plant.qpos[0]
     assert data.qpos[rotor] == pytest.approx(data.qpos[ring], abs=1e-15)
-    begin_leapfrog(plant.model, data)
+    start_leapfrog(plant.model, data)
     lead, load, alone = [], [], True
     for step in range(4000):
         data.ctrl[0] = 0.4 if step < 2000 else -0.4
@@ -80,7 +80,7 @@ def test_backlash_shows_between_port_and_resolver():
     """The motor swallows oil for rotor and ring; over one reversal they differ by the gap."""
     plant = build_plant(with_gap(), ground=False)
     data = rest_state(plant)
-    begin_leapfrog(plant.model, data)
+    start_leapfrog(plant.model, data)
     lead = []
     for sign in (1, -1, 1):
         data.ctrl[0] = 0.4 * sign
@@ -132,8 +132,8 @@ def test_a_drive_as_heavy_as_usual_need_not_be_stated(compliance):
     """The rig's rod, 3 kg, is lighter than what its oil can be stepped with: 23 kg, then usual."""
     machine = load_machine("rig")
     table = EFFECTS["joint_flexibility"].parameters(machine, "slide")
-    least = resolved_inertia(machine, "slide", 0.0, 0.0)
-    assert table["drive_inertia"].nominal == table["drive_inertia"].low == least > 20.0
+    least = min_resolvable_inertia(machine, "slide", 0.0, 0.0)
+    assert table["drive_inertia"].nominal == table["drive_inertia"].lower_bound == least > 20.0
     given = {"compliance": compliance}
     stated = {**given, **{key: table[key].nominal for key in ("drive_inertia", "damping_ratio")}}
     short, long = (apply_effect(machine, "joint_flexibility", "slide", v) for v in (given, stated))
@@ -187,7 +187,7 @@ def motion(machine, timestep, seconds=3.0):
     """Joint positions every 20 ms of a machine with all valves worked."""
     plant = build_plant(machine, timestep, ground=False)
     data = rest_state(plant)
-    begin_leapfrog(plant.model, data)
+    start_leapfrog(plant.model, data)
     rows = []
     for row in range(round(seconds / 0.02)):
         rows.append(aligned_positions(plant.model, data)[plant.qpos])
@@ -220,7 +220,7 @@ def test_a_light_rod_on_stiff_seals_settles():
     machine = apply_effect(machine, "coulomb_friction", "stick", {"coulomb": 15000.0})
     plant = build_plant(machine, ground=False)
     data = rest_state(plant)
-    begin_leapfrog(plant.model, data)
+    start_leapfrog(plant.model, data)
     data.ctrl[2] = 0.3
     mujoco.mj_step(plant.model, data, nstep=500)
     data.ctrl[2], speeds = 0.0, []
@@ -234,15 +234,13 @@ def test_a_light_rod_on_stiff_seals_settles():
 def test_settled_friction_is_that_of_the_new_velocity():
     plant = build_plant(MACHINE, ground=False)
     user = plant.model.actuator_user.ravel()
-    u, dt = 1 * SLOTS, 1e-3
+    u, dt = 1 * SLOT_COUNT, 1e-3
     for inertia in (10.0, 100.0, 1e6):
         for v in (-0.3, -1e-3, 0.0, 2e-3, 0.5):
             for push in (-50e3, -1e3, 0.0, 4e3, 200e3):
-                force = settled_friction(user, u, v, push, inertia, dt)
+                force = implicit_friction(user, u, v, push, inertia, dt)
                 new = v + dt / inertia * (push - force)
-                assert force == pytest.approx(
-                    actuator_friction(user, u, new), rel=1e-6, abs=1e-6 * (1 + abs(push))
-                )
+                assert force == pytest.approx(actuator_friction(user, u, new), rel=1e-6, abs=1e-6 * (1 + abs(push)))
                 if push == 0.0:
                     assert abs(new) <= abs(v) and new * v >= 0.0, "friction never turns a motion"
 

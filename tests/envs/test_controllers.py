@@ -4,22 +4,24 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.envs.controllers.catalogue import CONTROLLERS, REFERENCES, make_controller
-from hydrotele.envs.controllers.controller import columns
-from hydrotele.envs.controllers.track import Preview, track_controller
+from hydrotele.envs.controllers.catalogue import (
+    CONTROLLER_NAMES,
+    REFERENCE_CONTROLLERS,
+    make_controller,
+)
+from hydrotele.envs.controllers.controller import find_columns
+from hydrotele.envs.controllers.track import ReferencePreview, make_track_controller
 from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import DISABLED, SAME_STEP
 from hydrotele.envs.making import TASKS
 from hydrotele.envs.task import Options
-from hydrotele.envs.track import PREVIEWS, track_reference
+from hydrotele.envs.track import PREVIEW_TIMES, track_reference
 
 _SHORT = Options(variants=2, duration=3.0)
 
 
 def _core(autoreset=DISABLED, **choices) -> TaskCore:
-    return TaskCore(
-        TASKS["TrackTrajectory"], Options(**{**vars(_SHORT), **choices}), 4, 1, autoreset
-    )
+    return TaskCore(TASKS["TrackTrajectory"], Options(**{**vars(_SHORT), **choices}), 4, 1, autoreset)
 
 
 def _errors(core, controller) -> np.ndarray:
@@ -40,7 +42,7 @@ def _errors(core, controller) -> np.ndarray:
 )
 def test_references_are_followed(action, most):
     core = _core(action=action)
-    followed = _errors(core, track_controller(core.setup))
+    followed = _errors(core, make_track_controller(core.setup))
     left = _errors(core, make_controller("zero", core.setup))
     assert np.sqrt(np.mean(followed**2)) < min(most, 0.5 * np.sqrt(np.mean(left**2)))
 
@@ -48,17 +50,15 @@ def test_references_are_followed(action, most):
 def test_references_between_those_shown_are_those_of_the_task():
     core = _core()
     core.reset(np.arange(4))
-    controller = track_controller(core.setup)
+    controller = make_track_controller(core.setup)
     controller.begin(4)
     for _ in range(120):  # past the fade, whose second derivative jumps
         core.step(controller(core.observation))
-    preview, now = Preview(core.setup), core.episodes["tick"][0] * core.setup.clock.period
-    for ahead in (0.0, 0.06, 0.3, PREVIEWS[-1]):
-        place, rate = preview.at(core.observation, ahead)
+    preview, now = ReferencePreview(core.setup), core.episodes["tick"][0] * core.setup.clock.period
+    for ahead in (0.0, 0.06, 0.3, PREVIEW_TIMES[-1]):
+        place, rate = preview.interpolate(core.observation, ahead)
         for n in range(4):
-            true = [
-                track_reference.py_func(core.episodes["goal"][n], i, now + ahead) for i in (0, 1, 2)
-            ]
+            true = [track_reference.py_func(core.episodes["goal"][n], i, now + ahead) for i in (0, 1, 2)]
             # fifth derivative of 0.3 rad at 2.4 rad/s over 0.4 s: some 1e-4
             assert place[n] == pytest.approx([t[0] for t in true], abs=5e-4)
             assert rate[n] == pytest.approx([t[1] for t in true], abs=5e-3)
@@ -67,7 +67,7 @@ def test_references_between_those_shown_are_those_of_the_task():
 @pytest.mark.parametrize("action", ["valve", "joint_rate"])
 def test_an_episode_begun_anew_is_controlled_as_a_first_one(action):
     core = _core(SAME_STEP, action=action, duration=0.2)
-    controller = track_controller(core.setup)
+    controller = make_track_controller(core.setup)
     core.reset(np.arange(4))
     controller.begin(4)
     while not core.truncated.any():
@@ -79,9 +79,9 @@ def test_an_episode_begun_anew_is_controlled_as_a_first_one(action):
 
 
 def test_every_task_has_controllers_and_others_are_refused():
-    assert set(REFERENCES) <= set(TASKS)
+    assert set(REFERENCE_CONTROLLERS) <= set(TASKS)
     setup = _core().setup
-    for name in CONTROLLERS:
+    for name in CONTROLLER_NAMES:
         controller = make_controller(name, setup)
         controller.begin(3)
         shape = np.shape(controller(np.zeros((3, len(setup.fields)), np.float32)))
@@ -89,4 +89,4 @@ def test_every_task_has_controllers_and_others_are_refused():
     with pytest.raises(InputError, match="pid"):
         make_controller("pid", setup)
     with pytest.raises(InputError, match="angle.boom"):
-        columns(setup, "angle", ["bom"])
+        find_columns(setup, "angle", ["bom"])

@@ -9,10 +9,10 @@ from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import DISABLED
 from hydrotele.envs.making import TASKS
 from hydrotele.envs.task import Options
-from hydrotele.simulate.feedback import feedback
-from hydrotele.simulate.fleet import STATE
+from hydrotele.simulate.feedback import create_feedback
+from hydrotele.simulate.fleet import STATE_KIND
 from hydrotele.simulate.plant import build_plant, rest_state
-from hydrotele.simulate.record import begin_leapfrog
+from hydrotele.simulate.record import start_leapfrog
 from hydrotele.simulate.stepping import Stepper
 
 TRACK = TASKS["TrackTrajectory"]
@@ -47,17 +47,17 @@ def test_a_step_is_that_of_a_scenario_run(effects):
     position = core.episodes["position"][0]
     names = [machine.axes[name].joint for name in plant.axes]
     data = rest_state(plant, dict(zip(names, position[:3].tolist(), strict=True)))
-    begin_leapfrog(plant.model, data)
-    start = np.zeros(mujoco.mj_stateSize(plant.model, STATE))
-    mujoco.mj_getState(plant.model, data, start, STATE)
+    start_leapfrog(plant.model, data)
+    start = np.zeros(mujoco.mj_stateSize(plant.model, STATE_KIND))
+    mujoco.mj_getState(plant.model, data, start, STATE_KIND)
     # the start is computed from aligned positions, which were rounded once on the way
     assert np.allclose(state_of(core), start, rtol=1e-9, atol=1e-9)
-    mujoco.mj_setState(plant.model, data, state_of(core), STATE)
+    mujoco.mj_setState(plant.model, data, state_of(core), STATE_KIND)
     stepper = Stepper(plant, data, 5)
     for command in commands(200):
         core.step(command)
         stepper.advance(command.astype(float))
-    mujoco.mj_getState(plant.model, data, start, STATE)
+    mujoco.mj_getState(plant.model, data, start, STATE_KIND)
     assert np.array_equal(state_of(core), start)
 
 
@@ -66,8 +66,8 @@ def test_readings_are_those_of_a_scenario_run():
     core.reset(np.array([4]))
     plant = build_plant(core.setup.variants.machines[0], ground=False)
     data = mujoco.MjData(plant.model)
-    mujoco.mj_setState(plant.model, data, state_of(core), STATE)
-    seen, stepper = feedback(plant, None, 0, 300, 200.0), Stepper(plant, data, 5)
+    mujoco.mj_setState(plant.model, data, state_of(core), STATE_KIND)
+    seen, stepper = create_feedback(plant, None, 0, 300, 200.0), Stepper(plant, data, 5)
     seen.update(0, stepper)
     for tick, command in enumerate(commands(200)):
         e = core.episodes[0]
@@ -155,12 +155,12 @@ def test_every_variant_behaves_as_its_own_machine():
     for number, variant in enumerate(chosen):
         plant = build_plant(machines[variant], ground=False)
         data = mujoco.MjData(plant.model)
-        mujoco.mj_setState(plant.model, data, starts[number], STATE)
+        mujoco.mj_setState(plant.model, data, starts[number], STATE_KIND)
         for action in actions:
             data.ctrl[:] = action
             mujoco.mj_step(plant.model, data, nstep=20)
         state = np.zeros_like(starts[number])
-        mujoco.mj_getState(plant.model, data, state, STATE)
+        mujoco.mj_getState(plant.model, data, state, STATE_KIND)
         assert np.array_equal(core.simulations.state[number], state)
 
 

@@ -47,7 +47,7 @@ def test_same_bits_as_gymnasium_over_episodes(name):
             step = theirs.step(action)
             seen, reward, terminated, truncated, info = ours.step(action)
             assert step.reward == reward
-            assert theirs.figures() == info
+            assert theirs.last_info() == info
             over = terminated or truncated
             assert step.last() == over
             assert step.discount == (0.0 if terminated else 1.0)
@@ -66,7 +66,7 @@ def test_a_task_that_ends_has_no_future():
     assert env.step(np.zeros(3)).first()
     env.core.simulations.state[0, 1] = np.nan
     broken = env.step(np.zeros(3))
-    assert broken.last() and broken.discount == 0.0 and env.figures()["fault"]
+    assert broken.last() and broken.discount == 0.0 and env.last_info()["fault"]
     assert env.step(np.zeros(3)).first()
     env.close()
 
@@ -128,7 +128,7 @@ def test_physics_shows_the_simulation():
     for _ in range(4):
         env.step(np.array([1.0, -1.0, 1.0]))
     physics = env.physics
-    model, data = env.core.model_and_data()
+    model, data = env.core.copy_model_and_data()
     assert physics.data.time == pytest.approx(0.08)
     for name in ("swing", "boom", "stick"):
         joint = env.core.setup.machine.axes[name].joint

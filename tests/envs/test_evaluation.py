@@ -7,9 +7,9 @@ from hydrotele.core.errors import InputError
 from hydrotele.envs.controllers.catalogue import make_controller
 from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import DISABLED, NEXT_STEP
-from hydrotele.envs.evaluation import compare, evaluate
+from hydrotele.envs.evaluation import compare_scores, evaluate
 from hydrotele.envs.making import TASKS
-from hydrotele.envs.stable_baselines import AgentView, difference_columns
+from hydrotele.envs.stable_baselines import AgentInterface, find_reference_pairs
 from hydrotele.envs.task import Options
 from hydrotele.envs.variants import typical_variation
 from hydrotele.machine.machine_file import load_machine
@@ -33,14 +33,14 @@ def test_figures_are_those_of_the_episodes():
             alone.step(action[number : number + 1])
             total += alone.reward[0]
             errors.append(alone.measures[0, 0])
-        assert scores.figures["return"][number] == pytest.approx(total, rel=1e-12)
-        found = [scores.figures[f"tip_error {what}"][number] for what in ("mean", "RMS", "final")]
+        assert scores.results["return"][number] == pytest.approx(total, rel=1e-12)
+        found = [scores.results[f"tip_error {what}"][number] for what in ("mean", "RMS", "final")]
         squared = np.sqrt(np.mean(np.square(errors)))
         assert found == pytest.approx([np.mean(errors), squared, errors[-1]], rel=1e-9)
-    assert len(scores.figures["return"]) == 6
-    assert scores.figures["length"] == pytest.approx(np.full(6, 0.5))
-    assert scores.error("return") == pytest.approx(scores.figures["return"].std(ddof=1) / 6**0.5)
-    assert f"{scores.mean('return'):.4g} ±" in compare([("random", scores)], ["return"])
+    assert len(scores.results["return"]) == 6
+    assert scores.results["length"] == pytest.approx(np.full(6, 0.5))
+    assert scores.standard_error("return") == pytest.approx(scores.results["return"].std(ddof=1) / 6**0.5)
+    assert f"{scores.mean('return'):.4g} ±" in compare_scores([("random", scores)], ["return"])
 
 
 def test_an_episode_that_ended_early_counts_no_further(monkeypatch):
@@ -54,8 +54,8 @@ def test_an_episode_that_ended_early_counts_no_further(monkeypatch):
 
     monkeypatch.setattr(core, "step", faulty)
     scores = evaluate(core, make_controller("zero", core.setup), 3)
-    assert scores.figures["length"] == pytest.approx([0.5, 0.14, 0.5])
-    assert scores.figures["return"][1] <= 7.0
+    assert scores.results["length"] == pytest.approx([0.5, 0.14, 0.5])
+    assert scores.results["return"][1] <= 7.0
 
 
 def test_a_core_that_begins_anew_by_itself_is_refused():
@@ -76,35 +76,38 @@ def test_the_usual_spread_suits_every_task_and_changes_the_machine():
 def test_an_agent_sees_errors_and_the_past_and_corrects_a_law():
     core = _core()
     law = make_controller("reference", core.setup)
-    view, alone = AgentView(core.setup, 3, law, share=0.25), AgentView(core.setup, 2)
+    view, alone = (
+        AgentInterface(core.setup, 3, law, max_fraction=0.25),
+        AgentInterface(core.setup, 2),
+    )
     fields = [field.name for field in core.setup.fields]
-    asked, measured = difference_columns(core.setup)
+    asked, measured = find_reference_pairs(core.setup)
     pairs = {(fields[a], fields[m]) for a, m in zip(asked, measured, strict=True)}
     assert ("reference.boom", "angle.boom") in pairs
     assert ("reference_rate.boom", "rate.boom") in pairs
     core.reset(np.arange(3))
     view.begin(3)
     alone.begin(3)
-    seen = view.see(core.observation)
-    width = alone.size // 2
-    assert seen.shape == (3, view.size) == (3, 3 * width + 3)
+    seen = view.observe(core.observation)
+    width = alone.observation_size // 2
+    assert seen.shape == (3, view.observation_size) == (3, 3 * width + 3)
     first = core.observation.copy()
-    given = view.act(np.ones((3, 3)))
+    given = view.convert_action(np.ones((3, 3)))
     law.begin(3)
     assert given == pytest.approx(np.clip(np.clip(law(first), -1, 1) + 0.25, -1, 1), abs=1e-6)
-    assert np.array_equal(alone.act(2.0 * np.ones((3, 3))), np.ones((3, 3)))
-    alone.see(core.observation)
+    assert np.array_equal(alone.convert_action(2.0 * np.ones((3, 3))), np.ones((3, 3)))
+    alone.observe(core.observation)
     core.step(given)
-    later = alone.see(core.observation)
+    later = alone.observe(core.observation)
     assert np.array_equal(later[:, : len(fields)], core.observation)
     assert np.array_equal(later[:, width : width + len(fields)], first)
     place = len(fields) + list(asked).index(fields.index("reference.boom"))
     error = core.observation[:, fields.index("reference.boom")]
     error = error - core.observation[:, fields.index("angle.boom")]
     assert np.array_equal(later[:, place], error)
-    last = alone.last(core.observation, np.array([1]))
+    last = alone.observe_final(core.observation, np.array([1]))
     assert np.array_equal(last[0, :width], later[1, :width])
     assert np.array_equal(last[0, width:], later[1, :width])
     alone.reset(np.array([False, True, False]))
-    anew = alone.see(core.observation)
+    anew = alone.observe(core.observation)
     assert np.array_equal(anew[1, :width], anew[1, width:])

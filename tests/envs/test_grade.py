@@ -7,55 +7,55 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.envs.controllers.controller import columns
-from hydrotele.envs.controllers.grade import DUMP, Grade
+from hydrotele.envs.controllers.controller import find_columns
+from hydrotele.envs.controllers.grade import DUMP, GradeController
 from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import DISABLED
 from hydrotele.envs.grade import (
-    CELL,
-    CELLS,
-    DEEPEST,
-    ERROR,
-    FAILURE,
-    FAR,
+    CELL_COUNT,
+    CELL_LENGTH,
+    ERROR_PER_REWARD,
+    FAILURE_DEPTH,
+    FAILURE_REWARD,
     GRADE_SOILS,
-    GRADED,
-    MIDDLE,
-    NEAR,
-    PLANE,
-    POINTS,
-    SCALE,
-    SOIL,
-    START,
-    SUCCESS,
-    TERRAIN,
-    TILT,
+    LAST_ERROR,
+    MAX_GRADED_ERROR,
+    MAX_RADIUS,
+    MEAN_RADIUS,
+    MIN_RADIUS,
+    PLANE_HEIGHT,
+    PLANE_SLOPE,
+    PROFILE_START,
+    SECTION_COUNT,
+    SOIL_INDEX,
+    SUCCESS_REWARD,
+    TERRAIN_SIZE,
     TIME_COST,
     bed_parameters,
-    grade_radii,
+    section_radii,
 )
 from hydrotele.envs.making import TASKS
 from hydrotele.envs.task import Options
 from hydrotele.kinematics.task import REACHED, task_inverse
 from hydrotele.soil.facts import (
-    CARRIED,
+    CARRIED_VOLUME,
     CAT215,
     DENSITY,
     FORCE_R,
     FORCE_Z,
     GRAVITY,
     MASS,
-    OUT,
+    RESULT_SIZE,
     SOILS,
-    STATE,
+    STATE_SIZE,
     SWELL,
+    pack_soil_parameters,
     soil_mass,
-    soil_parameters,
 )
-from hydrotele.soil.step import bucket_wrench
+from hydrotele.soil.step import compute_bucket_wrench
 
 TASK = TASKS["Grade"]
-RADII = START + CELL * (np.arange(CELLS) + 0.5)
+RADII = PROFILE_START + CELL_LENGTH * (np.arange(CELL_COUNT) + 0.5)
 
 
 def core_of(count: int = 4, autoreset: int = DISABLED, **choices) -> TaskCore:
@@ -66,7 +66,7 @@ def core_of(count: int = 4, autoreset: int = DISABLED, **choices) -> TaskCore:
 
 def parts(core: TaskCore, number: int):
     """Surface, loose, state, result and numbers of the soil of an episode."""
-    ends = np.cumsum([CELLS, CELLS, STATE, OUT])
+    ends = np.cumsum([CELL_COUNT, CELL_COUNT, STATE_SIZE, RESULT_SIZE])
     return np.split(core.terrain[number], ends)
 
 
@@ -78,8 +78,8 @@ def mass(core: TaskCore, number: int) -> float:
 def error(core: TaskCore, number: int) -> np.ndarray:
     """Heights over the plane in the stretch, from the goal's numbers."""
     goal = core.episodes["goal"][number]
-    plane = goal[PLANE] + math.tan(goal[TILT]) * (RADII - MIDDLE)
-    return (parts(core, number)[0] - plane)[(RADII > NEAR) & (RADII < FAR)]
+    plane = goal[PLANE_HEIGHT] + math.tan(goal[PLANE_SLOPE]) * (RADII - MEAN_RADIUS)
+    return (parts(core, number)[0] - plane)[(RADII > MIN_RADIUS) & (RADII < MAX_RADIUS)]
 
 
 @pytest.fixture(scope="module")
@@ -87,8 +87,8 @@ def graded():
     """Three soils by the reference controller until all have been dumped once."""
     core = core_of(4, duration=60.0)
     before = [mass(core, n) for n in range(4)]
-    start = core.episodes["goal"][:, ERROR].copy()
-    controller = Grade(core.setup)
+    start = core.episodes["goal"][:, LAST_ERROR].copy()
+    controller = GradeController(core.setup)
     controller.begin(4)
     total, live, dumped = np.zeros(4), np.ones(4, bool), np.zeros(4, bool)
     least = np.full(4, np.inf)
@@ -106,15 +106,15 @@ def graded():
 @pytest.mark.nightly
 def test_reference_controller_halves_the_error_in_every_soil(graded):
     core, _, start, total, least = graded
-    assert set(core.episodes["goal"][:, SOIL]) == set(range(len(GRADE_SOILS)))
+    assert set(core.episodes["goal"][:, SOIL_INDEX]) == set(range(len(GRADE_SOILS)))
     assert (least < 0.5 * start).all()
     done = core.measures[:, 4] > 0.0
     assert done.any()
-    assert (core.measures[done, 0] < GRADED).all()
+    assert (core.measures[done, 0] < MAX_GRADED_ERROR).all()
     # what is paid is the error that went, less time, and the end's bonus
     time = core.episodes["step"] / core.setup.options.control_rate
-    gone = (start - core.measures[:, 0]) / SCALE
-    assert total == pytest.approx(gone - TIME_COST * time + SUCCESS * done, abs=1e-6)
+    gone = (start - core.measures[:, 0]) / ERROR_PER_REWARD
+    assert total == pytest.approx(gone - TIME_COST * time + SUCCESS_REWARD * done, abs=1e-6)
 
 
 def test_no_soil_is_lost_or_made(graded):
@@ -133,7 +133,7 @@ def test_what_acts_on_the_bucket_is_the_wrench_of_soil_and_load():
     for step in range(600):
         action = down if step < 300 else np.array([0.0, 0.3, 0.3, 0.6])
         core.step(action)
-        model, data = core.model_and_data()
+        model, data = core.copy_model_and_data()
         body = model.body("bucket").id
         acting = data.xfrc_applied.copy()
         # the force was computed where mj_step last evaluated positions: a physics step ago
@@ -143,7 +143,7 @@ def test_what_acts_on_the_bucket_is_the_wrench_of_soil_and_load():
         out, wrench = parts(core, 0)[3], np.zeros(6)
         tip = data.site("hydrotele_tip").xpos
         theta = math.atan2(tip[1], tip[0])
-        bucket_wrench(out, tip, theta, data.xipos[body], wrench)
+        compute_bucket_wrench(out, tip, theta, data.xipos[body], wrench)
         scale = max(1.0, np.abs(wrench).max())
         # closed chains: loop joints' integration and the given positions differ by rounding
         assert acting[body] / scale == pytest.approx(wrench / scale, abs=1e-9)
@@ -152,7 +152,7 @@ def test_what_acts_on_the_bucket_is_the_wrench_of_soil_and_load():
         seen = max(seen, float(math.hypot(out[FORCE_R], out[FORCE_Z])))
     assert seen > 3.0e3
     out = parts(core, 0)[3]
-    load = parts(core, 0)[2][CARRIED]
+    load = parts(core, 0)[2][CARRIED_VOLUME]
     numbers = parts(core, 0)[4]
     assert load > 0.01
     assert out[MASS] == pytest.approx(load / numbers[SWELL] * numbers[DENSITY])
@@ -163,16 +163,16 @@ def test_error_and_observation_are_those_of_the_profile():
     core = core_of(6)
     for n in range(6):
         over = error(core, n)
-        assert core.episodes["goal"][n, ERROR] == pytest.approx(np.sqrt(np.mean(over**2)))
-        assert core.measures[n, 0] == core.episodes["goal"][n, ERROR]
-        seen = core.observation[n, columns(core.setup, "profile_error", map(str, range(POINTS)))]
-        assert seen == pytest.approx(over.reshape(POINTS, -1).mean(1), abs=1e-6)
-        middles = RADII[(RADII > NEAR) & (RADII < FAR)].reshape(POINTS, -1).mean(1)
-        assert middles == pytest.approx(grade_radii())
+        assert core.episodes["goal"][n, LAST_ERROR] == pytest.approx(np.sqrt(np.mean(over**2)))
+        assert core.measures[n, 0] == core.episodes["goal"][n, LAST_ERROR]
+        seen = core.observation[n, find_columns(core.setup, "profile_error", map(str, range(SECTION_COUNT)))]
+        assert seen == pytest.approx(over.reshape(SECTION_COUNT, -1).mean(1), abs=1e-6)
+        middles = RADII[(RADII > MIN_RADIUS) & (RADII < MAX_RADIUS)].reshape(SECTION_COUNT, -1).mean(1)
+        assert middles == pytest.approx(section_radii())
         # cut, never filled: the ground lies over the plane everywhere, which lies over z = 0
         assert (over > 0.0).all()
-        r, z = core.observation[n, columns(core.setup, "tip", "rz")]
-        height = core.observation[n, columns(core.setup, "edge_height", [""])[0]]
+        r, z = core.observation[n, find_columns(core.setup, "tip", "rz")]
+        height = core.observation[n, find_columns(core.setup, "edge_height", [""])[0]]
         assert z - height == pytest.approx(np.interp(r, RADII, parts(core, n)[0]), abs=1e-5)
 
 
@@ -182,11 +182,11 @@ def test_a_new_episode_has_fresh_ground():
     for step in range(150):
         core.step(np.array([1.0, -1.0 if step < 100 else 0.0, 0.0, 0.0]))
     assert (core.terrain != fresh).any(1).all()
-    assert np.abs(core.model_and_data(0)[1].xfrc_applied).max() > 0.0
+    assert np.abs(core.copy_model_and_data(0)[1].xfrc_applied).max() > 0.0
     core.reset(np.arange(3))
     assert np.array_equal(core.terrain, fresh)
     for n in range(3):
-        assert not core.model_and_data(n)[1].xfrc_applied.any()
+        assert not core.copy_model_and_data(n)[1].xfrc_applied.any()
 
 
 @pytest.mark.parametrize("action", ["valve", "joint_rate", "resolved_motion"])
@@ -209,19 +209,19 @@ def test_an_edge_deep_below_the_plane_ends_the_episode():
     ended = np.flatnonzero(core.terminated)
     assert len(ended)
     for n in ended:
-        depth = core.episodes["goal"][n, PLANE] - core.episodes["tip"][n, 2]
-        assert depth > DEEPEST - 0.1  # the plane slopes by up to 0.06 over 1.5 m
+        depth = core.episodes["goal"][n, PLANE_HEIGHT] - core.episodes["tip"][n, 2]
+        assert depth > FAILURE_DEPTH - 0.1  # the plane slopes by up to 0.06 over 1.5 m
         assert core.measures[n, 5] == 1.0
-        assert core.reward[n] < FAILURE + 1.0
+        assert core.reward[n] < FAILURE_REWARD + 1.0
 
 
 def test_all_planes_that_are_drawn_can_be_reached():
     core = core_of(64, variants=1)
-    arm, ranges, q = core.facts["arm"], core.facts["ranges"][:4], np.zeros(4)
+    arm, ranges, q = core.parameters["arm"], core.parameters["ranges"][:4], np.zeros(4)
     for n in range(64):
         goal = core.episodes["goal"][n]
-        for r, attitude in ((NEAR, -121.0), (MIDDLE, -113.0), (FAR, -106.0)):
-            z = goal[PLANE] + math.tan(goal[TILT]) * (r - MIDDLE)
+        for r, attitude in ((MIN_RADIUS, -121.0), (MEAN_RADIUS, -113.0), (MAX_RADIUS, -106.0)):
+            z = goal[PLANE_HEIGHT] + math.tan(goal[PLANE_SLOPE]) * (r - MEAN_RADIUS)
             pose = np.array([r, 0.0, z, math.radians(attitude), 0.0])
             assert task_inverse(arm, pose, 0.0, q) == REACHED
             assert ((ranges[:, 0] < q) & (q < ranges[:, 1])).all()
@@ -231,7 +231,7 @@ def test_episodes_have_the_soils_they_are_said_to_have():
     core = core_of(32, variants=1)
     for n in range(32):
         soil = SOILS[GRADE_SOILS[int(core.measures[n, 3])]]
-        assert np.array_equal(parts(core, n)[4], soil_parameters(soil, CAT215, START, CELL))
-    assert core.terrain.shape[1] == TERRAIN
+        assert np.array_equal(parts(core, n)[4], pack_soil_parameters(soil, CAT215, PROFILE_START, CELL_LENGTH))
+    assert core.terrain.shape[1] == TERRAIN_SIZE
     with pytest.raises(InputError, match="1 to 3 soils"):
         bed_parameters([SOILS["firm"]] * 4)

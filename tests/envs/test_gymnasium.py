@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode
 import hydrotele.envs
 from hydrotele.core.errors import InputError
 from hydrotele.envs.episode import ACTIONS
-from hydrotele.envs.facts import KINDS
+from hydrotele.envs.facts import TASK_CODES
 from hydrotele.envs.making import TASKS
 
 TRACK = "hydrotele/TrackTrajectory-v0"
@@ -23,9 +23,7 @@ DAILY = {"joint_rate": "TrackTrajectory", "resolved_motion": "PlaceLog"}
 EVERY_TASK_AND_ACTION = pytest.mark.parametrize(
     ("task", "action"),
     [
-        (task, action)
-        if DAILY.get(action, task) == task
-        else pytest.param(task, action, marks=pytest.mark.nightly)
+        (task, action) if DAILY.get(action, task) == task else pytest.param(task, action, marks=pytest.mark.nightly)
         for task in hydrotele.envs.TASK_NAMES
         for action in ACTIONS
     ],
@@ -43,7 +41,7 @@ def batched(name: str, count: int, **options):
 
 def test_every_task_is_registered_and_has_native_code():
     assert set(hydrotele.envs.TASK_NAMES) == set(TASKS)
-    assert sorted(task.kind for task in TASKS.values()) == sorted(KINDS)
+    assert sorted(task.kind for task in TASKS.values()) == sorted(TASK_CODES)
 
 
 def test_importing_them_registers_them_and_nothing_heavy_comes_along():
@@ -110,9 +108,7 @@ def assert_same_info(left: dict, right: dict) -> None:
 
 def test_a_new_episode_in_the_same_step_shows_the_end_of_the_old_one():
     one = batched(TRACK, 3, autoreset_mode="SameStep", **SHORT)
-    many = gymnasium.make_vec(
-        TRACK, 3, "sync", vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP}, **SHORT
-    )
+    many = gymnasium.make_vec(TRACK, 3, "sync", vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP}, **SHORT)
     assert one.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     one.reset(seed=5), many.reset(seed=5)
     ends = 0

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from hydrotele.envs.core import TaskCore
-from hydrotele.envs.episode import ARM
-from hydrotele.envs.facts import full_rate
-from hydrotele.envs.line import SETTLE, line_pose, line_way
+from hydrotele.envs.episode import MAX_ARM_AXES
+from hydrotele.envs.facts import full_action_rate
+from hydrotele.envs.line import SETTLE_TIME, compute_line_pose, line_travel
 from hydrotele.envs.making import TASKS
 from hydrotele.envs.task import Options
 from hydrotele.kinematics.task import REACHED, task_inverse
@@ -32,14 +32,14 @@ def goals(core) -> np.ndarray:
 
 
 def place(goal, time) -> tuple[np.ndarray, np.ndarray]:
-    pose, rate = np.empty(ARM), np.empty(ARM)
-    line_pose(goal, time, pose, rate)
+    pose, rate = np.empty(MAX_ARM_AXES), np.empty(MAX_ARM_AXES)
+    compute_line_pose(goal, time, pose, rate)
     return pose, rate
 
 
 def test_every_line_lies_in_the_workspace_and_asks_less_than_the_drives_have(core, goals):
     arm, ranges = core.facts["arm"], core.facts["ranges"][:4]
-    fastest = [full_rate(core.setup.machine, axis) for axis in core.setup.axes]
+    fastest = [full_action_rate(core.setup.machine, axis) for axis in core.setup.axes]
     times = np.arange(0.0, core.setup.clock.horizon * 0.02, 0.1)
     for goal in goals:
         joints = np.zeros((len(times), 4))
@@ -56,7 +56,7 @@ def test_every_line_lies_in_the_workspace_and_asks_less_than_the_drives_have(cor
 def test_lines_are_as_long_and_as_fast_as_they_say(goals):
     lengths = []
     for goal in goals:
-        (begin, _), (end, rate) = place(goal, SETTLE), place(goal, 16.0)
+        (begin, _), (end, rate) = place(goal, SETTLE_TIME), place(goal, 16.0)
         lengths.append(np.hypot(end[0] - begin[0], end[2] - begin[2]))
         assert not rate.any()
         assert end[3] == begin[3]
@@ -71,7 +71,7 @@ def test_the_speed_is_that_of_the_way_and_changes_no_faster_than_drawn(goals):
     step = 1e-3
     times = np.arange(0.0, 16.0, step)
     for goal in goals[:5]:
-        way, speed = np.array([line_way(goal, time) for time in times]).T
+        way, speed = np.array([line_travel(goal, time) for time in times]).T
         # a trapezoid's mean over a step is its middle, but for the steps with a corner
         assert np.allclose(np.diff(way) / step, 0.5 * (speed[1:] + speed[:-1]), atol=step)
         assert 0.5 <= np.abs(np.diff(speed)).max() / step <= 1.0 + 1e-9

@@ -97,7 +97,7 @@ def test_after_closing_nothing_is_simulated_and_what_was_seen_stays():
     with pytest.raises(RuntimeError, match="closed"):
         env.step(np.zeros((2, 3)))
     with pytest.raises(RuntimeError, match="closed"):
-        env.core.model_and_data()
+        env.core.copy_model_and_data()
     assert len(trash) == 200
     env.close()
 

@@ -9,6 +9,4 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def test_the_page_is_that_of_the_present_tasks():
     written = (ROOT / "docs" / "environments.md").read_text(encoding="utf-8")
-    assert written.endswith(page()), (
-        "python tools/release/environments_page.py --out docs/environments.md"
-    )
+    assert written.endswith(page()), "python tools/release/environments_page.py --out docs/environments.md"

@@ -8,22 +8,22 @@ import numpy as np
 import pytest
 
 from hydrotele.envs.controllers.catalogue import make_controller
-from hydrotele.envs.controllers.place import PERIOD, course
+from hydrotele.envs.controllers.place import SWING_PERIOD, move_fraction
 from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import DISABLED, SAME_STEP
 from hydrotele.envs.making import TASKS
 from hydrotele.envs.place import (
-    GOAL_PLACE,
-    LEANING,
-    LOST,
-    STRAIGHT,
-    SUCCESS,
-    TAKING,
-    TIME,
-    yaw_between,
+    GOAL_POSE,
+    GRIP_REWARD,
+    LOST_REWARD,
+    MAX_YAW_ERROR,
+    STEP_COST,
+    SUCCESS_REWARD,
+    TILT_COST,
+    yaw_difference,
 )
 from hydrotele.envs.task import Options
-from hydrotele.simulate.fleet import STATE
+from hydrotele.simulate.fleet import STATE_KIND
 
 TASK = TASKS["PlaceLog"]
 DISTANCE, YAW, HELD, PLACED, SWING = range(5)  # measures
@@ -43,18 +43,18 @@ def make(task=NEARLY, count=1, threads=1, mode=DISABLED, **options) -> TaskCore:
 
 
 def data_of(core: TaskCore, number: int = 0) -> mujoco.MjData:
-    return core.model_and_data(number)[1]
+    return core.copy_model_and_data(number)[1]
 
 
 def lay(core: TaskCore, number: int, x: float, y: float, yaw: float) -> None:
     """Put the log of a simulation elsewhere."""
     model = core.setup.variants.plant.model
     data, state = mujoco.MjData(model), core.simulations.state[number]
-    mujoco.mj_setState(model, data, state, STATE)
+    mujoco.mj_setState(model, data, state, STATE_KIND)
     at = model.joint("log_0").qposadr[0]
     data.qpos[at : at + 2] = x, y
     data.qpos[at + 3 : at + 7] = math.cos(yaw / 2.0), 0.0, 0.0, math.sin(yaw / 2.0)
-    mujoco.mj_getState(model, data, state, STATE)
+    mujoco.mj_getState(model, data, state, STATE_KIND)
 
 
 def lay_in_pocket(core: TaskCore, number: int, along: float = 0.0, aside: float = 0.0) -> None:
@@ -135,7 +135,7 @@ def test_an_episode_after_one_that_held_its_log_is_as_a_first_one():
             core.step(LIFT)
     assert np.array_equal(used.simulations.state, fresh.simulations.state)
     assert np.array_equal(used.observation, fresh.observation)
-    models = [core.model_and_data()[0] for core in (used, fresh)]
+    models = [core.copy_model_and_data()[0] for core in (used, fresh)]
     assert np.array_equal(models[0].eq_data, models[1].eq_data)
     assert np.array_equal(models[0].eq_data, used.setup.variants.plant.model.eq_data)
 
@@ -149,13 +149,13 @@ def test_taking_and_nearing_pay_and_time_and_swinging_cost():
     while not core.measures[0, HELD]:
         core.step(SHUT)
         total += core.reward[0]
-        costs += TIME + LEANING * core.measures[0, SWING]
-    assert total > TAKING - costs
+        costs += STEP_COST + TILT_COST * core.measures[0, SWING]
+    assert total > GRIP_REWARD - costs
     before = core.measures[0].copy()
     core.step(LIFT)
     now = core.measures[0]
     nearer = before[DISTANCE] + before[YAW] - now[DISTANCE] - now[YAW]
-    assert core.reward[0] == pytest.approx(nearer - TIME - LEANING * now[SWING], abs=1e-12)
+    assert core.reward[0] == pytest.approx(nearer - STEP_COST - TILT_COST * now[SWING], abs=1e-12)
     assert start[DISTANCE] == pytest.approx(before[DISTANCE], abs=0.05)
 
 
@@ -164,14 +164,14 @@ def test_taking_and_nearing_pay_and_time_and_swinging_cost():
     [
         (0.25, 0.0, True),
         (0.25, math.pi, True),
-        (0.25, math.pi - 0.9 * STRAIGHT, True),
+        (0.25, math.pi - 0.9 * MAX_YAW_ERROR, True),
         (0.35, 0.0, False),
-        (0.0, 1.1 * STRAIGHT, False),
+        (0.0, 1.1 * MAX_YAW_ERROR, False),
     ],
 )
 def test_a_log_that_lies_at_its_goal_for_half_a_second_ends_the_episode(off, turned, ends):
     core = make()
-    x, y, yaw = core.episodes["goal"][0, GOAL_PLACE]
+    x, y, yaw = core.episodes["goal"][0, GOAL_POSE]
     lay(core, 0, x + off, y, yaw + turned)
     paid = []
     for _ in range(27):
@@ -181,14 +181,14 @@ def test_a_log_that_lies_at_its_goal_for_half_a_second_ends_the_episode(off, tur
             break
     assert bool(core.terminated[0]) is ends is bool(core.measures[0, PLACED])
     if ends:
-        assert len(paid) == 25 and paid[-1] == pytest.approx(SUCCESS, abs=0.05)
+        assert len(paid) == 25 and paid[-1] == pytest.approx(SUCCESS_REWARD, abs=0.05)
 
 
 def test_a_log_out_of_reach_ends_the_episode():
     core = make()
     lay(core, 0, 9.0, 0.0, 0.0)
     core.step(0.0 * OPEN)
-    assert core.terminated[0] and core.reward[0] == pytest.approx(LOST, abs=0.05)
+    assert core.terminated[0] and core.reward[0] == pytest.approx(LOST_REWARD, abs=0.05)
     assert core.measures[0, PLACED] == 0.0
 
 
@@ -203,7 +203,7 @@ def test_what_is_observed_is_what_stands_in_the_simulation():
         x, y, z = data.body("log_0").xpos
         axis = data.body("log_0").xmat.reshape(3, 3)[:, 0]
         yaw = math.atan2(axis[1], axis[0])
-        gx, gy, goal = core.episodes["goal"][number, GOAL_PLACE]
+        gx, gy, goal = core.episodes["goal"][number, GOAL_POSE]
         for what, true in (
             ("log.r", math.hypot(x, y)), ("log.theta", math.atan2(y, x)), ("log.z", z),
             ("log.sin_2_yaw", math.sin(2.0 * yaw)), ("log.cos_2_yaw", math.cos(2.0 * yaw)),
@@ -239,17 +239,17 @@ def test_goals_lie_where_a_log_can_be_brought():
      (math.pi - 0.1, 0.2, 0.3)],
 )  # fmt: skip
 def test_ends_of_a_log_are_alike(first, second, between):
-    angle = yaw_between.py_func(math.sin(2.0 * first), math.cos(2.0 * first), second)
+    angle = yaw_difference.py_func(math.sin(2.0 * first), math.cos(2.0 * first), second)
     assert angle == pytest.approx(between, abs=1e-12)
 
 
 @pytest.mark.parametrize("length", [0.7, 3.1])
 def test_moves_leave_a_pendulum_of_their_period_at_rest(length):
     """X'' + (2 pi / T)^2 x = -a(t), a the move's acceleration, by small exact steps."""
-    step, turning = 1.0e-3, 2.0 * math.pi / PERIOD
-    time = np.arange(-5, int((length + PERIOD) / step) + 5) * step
+    step, turning = 1.0e-3, 2.0 * math.pi / SWING_PERIOD
+    time = np.arange(-5, int((length + SWING_PERIOD) / step) + 5) * step
     one = np.ones(len(time))
-    share = course(time, length * one, PERIOD * one)
+    share = move_fraction(time, length * one, SWING_PERIOD * one)
     assert share[0] == 0.0 and share[-1] == pytest.approx(1.0)
     push = -np.diff(share, 2) / step**2
     c, s = math.cos(turning * step), math.sin(turning * step)

@@ -5,9 +5,9 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.envs.core import TaskCore
-from hydrotele.envs.episode import ARM, DISABLED
+from hydrotele.envs.episode import DISABLED, MAX_ARM_AXES
 from hydrotele.envs.making import TASKS
-from hydrotele.envs.reach import SUCCESS, TIME
+from hydrotele.envs.reach import STEP_COST, SUCCESS_REWARD
 from hydrotele.envs.task import Options, draw_start
 from hydrotele.kinematics.task import REACHED, task_forward, task_inverse
 
@@ -21,14 +21,14 @@ def core() -> TaskCore:
 
 
 def true_pose(core: TaskCore, n: int) -> np.ndarray:
-    pose = np.zeros(ARM)
-    task_forward(core.facts["arm"], core.episodes["position"][n, :5], pose)
+    pose = np.zeros(MAX_ARM_AXES)
+    task_forward(core.parameters["arm"], core.episodes["position"][n, :5], pose)
     return pose
 
 
 def left(core: TaskCore) -> tuple[np.ndarray, np.ndarray]:
     """Distance and largest angle that are left, of all episodes, by places in space."""
-    e, target = core.episodes, core.episodes["goal"][:, :ARM]
+    e, target = core.episodes, core.episodes["goal"][:, :MAX_ARM_AXES]
     place = np.stack([target[:, 0] * np.cos(target[:, 1]), target[:, 0] * np.sin(target[:, 1]),
                       target[:, 2]], axis=1)  # fmt: skip
     attitude = np.abs(e["position"][:, 1:4].sum(axis=1) - target[:, 3])
@@ -43,7 +43,7 @@ def test_the_straight_way_to_every_pose_lies_in_the_workspace(core):
     for _ in range(6):
         core.reset()
         for n in range(COUNT):
-            start, goal = true_pose(core, n), core.episodes["goal"][n, :ARM].copy()
+            start, goal = true_pose(core, n), core.episodes["goal"][n, :MAX_ARM_AXES].copy()
             for part in np.linspace(0.0, 1.0, 50):
                 pose = start + part * (goal - start)
                 assert task_inverse(arm, pose, pose[1], joints) == REACHED
@@ -68,18 +68,18 @@ def test_the_way_pays_by_its_metres_and_time_costs(core):
         assert np.allclose(core.measures[:, 0], distance, atol=1e-9)
         assert np.allclose(core.measures[:, 1], angle, atol=1e-9)
         # rounding of sixty steps
-        assert np.allclose(paid, before - distance - angle - TIME * step, atol=1e-9)
+        assert np.allclose(paid, before - distance - angle - STEP_COST * step, atol=1e-9)
     assert np.ptp(paid) > 0.5
 
 
 def test_a_pose_that_is_kept_for_half_a_second_is_success(core):
     core.reset(np.arange(COUNT))
-    offset = np.zeros((COUNT, ARM))
+    offset = np.zeros((COUNT, MAX_ARM_AXES))
     offset[0::3, 2] = 0.04
     offset[1::3, 2] = 0.06
     offset[2::3, 4] = 0.035
     for n in range(COUNT):
-        core.episodes["goal"][n, :ARM] = true_pose(core, n) + offset[n]
+        core.episodes["goal"][n, :MAX_ARM_AXES] = true_pose(core, n) + offset[n]
     core.episodes["goal"][:, 6] = sum(left(core))
     for step in range(1, 25):
         core.step(np.zeros((COUNT, 5)))
@@ -90,13 +90,13 @@ def test_a_pose_that_is_kept_for_half_a_second_is_success(core):
     reached = np.arange(COUNT) % 3 == 0
     assert np.array_equal(core.terminated != 0, reached)
     assert np.array_equal(core.measures[:, 2] == 1.0, reached)
-    assert (core.reward[reached] > SUCCESS - 0.05).all()
+    assert (core.reward[reached] > SUCCESS_REWARD - 0.05).all()
 
 
 def test_leaving_the_pose_begins_the_time_anew(core):
     core.reset(np.arange(COUNT))
     for n in range(COUNT):
-        core.episodes["goal"][n, :ARM] = true_pose(core, n)
+        core.episodes["goal"][n, :MAX_ARM_AXES] = true_pose(core, n)
     for _ in range(10):
         core.step(np.zeros((COUNT, 5)))
     core.episodes["goal"][:, 2] += 0.2

@@ -16,7 +16,7 @@ from gymnasium.wrappers import AddRenderObservation, RenderCollection
 import hydrotele.envs
 from hydrotele.core.errors import InputError
 from hydrotele.envs.making import MachineEnv, MachineVectorEnv
-from hydrotele.envs.stage import Stage, goal_markers
+from hydrotele.envs.stage import TaskRenderer, goal_markers
 from hydrotele.show.canvas import Canvas
 
 
@@ -81,12 +81,12 @@ def test_a_picture_of_every_task_shows_machine_and_goal_and_changes_with_them(na
     assert 0.01 < yellow.mean() < 0.5
     again = env.render()
     assert np.array_equal(again, first) and not np.shares_memory(again, first)
-    stage = Stage(env.core)
+    stage = TaskRenderer(env.core)
     canvas = Canvas(stage.model, 160, 120)
-    stage.show()
-    bare = canvas.draw(stage.model, stage.data, stage.camera())
+    stage.update()
+    bare = canvas.draw(stage.model, stage.data, stage.find_camera())
     assert (bare != first).any()
-    marked = canvas.draw(stage.model, stage.data, stage.camera(), stage.markers())
+    marked = canvas.draw(stage.model, stage.data, stage.find_camera(), stage.markers())
     assert np.array_equal(marked, first)
     canvas.close()
     for _ in range(50):
@@ -99,16 +99,16 @@ def test_a_picture_of_every_task_shows_machine_and_goal_and_changes_with_them(na
 def test_every_task_marks_its_goal(name):
     env = MachineEnv(name, action="joint_rate", **SMALL)
     env.reset(seed=1)
-    assert Stage(env.core).markers()
+    assert TaskRenderer(env.core).markers()
     env.close()
 
 
 def test_the_drawn_machine_stands_where_the_simulated_one_does(env):
     for _ in range(5):
         env.step(np.array([1.0, -1.0, 0.5], np.float32))
-    stage = Stage(env.core)
-    stage.show()
-    model, data = env.core.model_and_data()
+    stage = TaskRenderer(env.core)
+    stage.update()
+    model, data = env.core.copy_model_and_data()
     for body in range(model.nbody):
         drawn = stage.data.body(model.body(body).name).xpos
         assert np.array_equal(drawn, data.xpos[body])
@@ -130,10 +130,10 @@ def test_each_episode_is_drawn_with_its_own_machine():
     worn = {"name": "pin_offset", "location": "boom", "parameters": ranges}
     env = MachineVectorEnv("TrackTrajectory", 8, randomise=[worn], **SMALL)
     env.reset(seed=2)
-    stage, pins = Stage(env.core), set()
+    stage, pins = TaskRenderer(env.core), set()
     for number in range(8):
-        stage.show(number)
-        model, data = env.core.model_and_data(number)
+        stage.update(number)
+        model, data = env.core.copy_model_and_data(number)
         for body in range(model.nbody):
             drawn = stage.data.body(model.body(body).name).xpos
             assert np.array_equal(drawn, data.xpos[body])
@@ -274,9 +274,7 @@ def test_nothing_is_drawn_unasked_and_no_driver_says_what_to_install():
     hidden = ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY")
     environment = {k: v for k, v in os.environ.items() if k not in hidden}
     environment["PYOPENGL_PLATFORM"] = "wgl"
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
-    )
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     unasked, _, message = done.stdout.partition("\n")
     assert unasked == "False"
     assert "libegl1" in message and "MUJOCO_GL=osmesa" in message

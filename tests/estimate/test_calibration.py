@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hydrotele.effects import EFFECTS
-from hydrotele.effects.effect import changed
+from hydrotele.effects.effect import with_value
 from hydrotele.estimate.evidence import Evidence
 from hydrotele.estimate.hypothesis import Guess, calibration, numbers
 from hydrotele.machine.machine_file import load_machine
@@ -53,7 +53,7 @@ def test_the_machine_file_states_what_is_uncertain():
     machine = load_machine("cat215").model_copy(update={"uncertainty": stated})
     found = numbers(machine)
     shares = {
-        key: number.parameter.scale / abs(number.parameter.nominal)
+        key: number.parameter.prior_std / abs(number.parameter.nominal)
         for key, number in found.items() if number.parameter.nominal
     }  # fmt: skip
     assert np.isclose(shares["mass.stick"], 0.2) and np.isclose(shares["mass.boom"], 0.03)
@@ -63,16 +63,16 @@ def test_the_machine_file_states_what_is_uncertain():
 
 def test_a_loss_that_a_data_sheet_leaves_out_is_uncertain_if_the_file_says_so():
     """A number that is 0 has no relative size: its effect's typical size takes the place."""
-    machine = changed(load_machine("eha"), "axes.piston.pump.motor.drag", 0.0)
-    silent = numbers(changed(machine, "uncertainty", {}))
+    machine = with_value(load_machine("eha"), "axes.piston.pump.motor.drag", 0.0)
+    silent = numbers(with_value(machine, "uncertainty", {}))
     assert "motor_drag.piston.drag" not in silent
     assert "pressure_offset.piston.rod.offset" not in silent
-    stated = numbers(changed(machine, "uncertainty", {"motor_drag": 2.0, "pressure_offset": 1.0}))
-    typical = EFFECTS["motor_drag"].parameters(machine, "piston")["drag"].scale
-    assert stated["motor_drag.piston.drag"].parameter.scale == 2.0 * typical
-    assert stated["motor_drag.piston.drag"].parameter.low == 0.0  # drag drives nothing
+    stated = numbers(with_value(machine, "uncertainty", {"motor_drag": 2.0, "pressure_offset": 1.0}))
+    typical = EFFECTS["motor_drag"].parameters(machine, "piston")["drag"].prior_std
+    assert stated["motor_drag.piston.drag"].parameter.prior_std == 2.0 * typical
+    assert stated["motor_drag.piston.drag"].parameter.lower_bound == 0.0  # drag drives nothing
     offset = stated["pressure_offset.piston.rod.offset"].parameter
-    assert offset.scale == pytest.approx(abs(offset.nominal))  # not 0 in this machine: relative
+    assert offset.prior_std == pytest.approx(abs(offset.nominal))  # not 0 in this machine: relative
     dragged = stated["motor_drag.piston.drag"].change(machine, 0.4)
     assert dragged.axes["piston"].pump.motor.drag == 0.4
 
@@ -101,7 +101,7 @@ def test_a_scale_of_all_areas_flows_and_masses_does_not_show():
     finally:
         evidence.close()
     percent = np.array([
-        0.01 * p.nominal / p.scale if key.split(".")[0] in scaled else 0.0
+        0.01 * p.nominal / p.prior_std if key.split(".")[0] in scaled else 0.0
         for key, p in group.parameters.items()
     ])  # fmt: skip
     alone = np.linalg.norm(slopes * percent, axis=0)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hydrotele.effects import EFFECTS, Parameter, apply_effect, changed
+from hydrotele.effects import EFFECTS, Parameter, apply_effect, with_value
 from hydrotele.estimate import evidence as evidence_module
 from hydrotele.estimate.evidence import MIDDLE, Evidence, _beyond_dents, _move, _threads
 from hydrotele.estimate.hypothesis import Guess, Hypothesis, hypotheses
@@ -38,9 +38,7 @@ def test_a_coarse_step_changes_nothing_for_the_base(evidence):
         np.testing.assert_allclose(evidence.errors(Guess(), step), own, atol=1e-9)  # rounding
 
 
-@pytest.mark.parametrize(
-    ("name", "deviation"), [("angle_offset", (0.2,)), ("pin_offset", (0.1, 0.1))]
-)
+@pytest.mark.parametrize(("name", "deviation"), [("angle_offset", (0.2,)), ("pin_offset", (0.1, 0.1))])
 def test_the_gain_of_an_effect_does_not_depend_on_the_step(evidence, name, deviation):
     """At 10 ms the integrator's own errors would change the loss by more than the effect does."""
     effect = guess(evidence, name, *deviation)
@@ -73,9 +71,7 @@ def test_where_a_number_ends_the_others_move_as_is_best_with_it_there():
     tried = np.stack(np.meshgrid(*grids, indexing="ij"), axis=-1).reshape(-1, 3)
     assert loss(found) <= loss(tried).min()
     assert found[0] == -1.0 and found[1] < 9.0
-    free = here.deviation - np.linalg.solve(
-        slopes.T @ slopes + np.eye(3), slopes.T @ errors + here.deviation
-    )
+    free = here.deviation - np.linalg.solve(slopes.T @ slopes + np.eye(3), slopes.T @ errors + here.deviation)
     assert loss(found) < 0.9 * loss(here.at(free).deviation)  # each number cut off by itself
 
 
@@ -89,9 +85,7 @@ def test_a_guess_of_nothing_is_fitted_as_it_is(evidence):
     ("jobs", "processors", "runs", "threads"),
     [(2, 2, 3, 3), (2, 2, 1, 2), (2, 2, 20, 4), (1, 2, 3, 1), (1, 1, 3, 1), (2, 8, 3, 2)],
 )
-def test_runs_take_turns_where_the_jobs_are_all_processors(
-    monkeypatch, jobs, processors, runs, threads
-):
+def test_runs_take_turns_where_the_jobs_are_all_processors(monkeypatch, jobs, processors, runs, threads):
     """Three runs on two processors take 1.5 times as long as one, not twice; no job more else."""
     monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(processors)), raising=False)
     assert _threads(jobs, runs) == threads
@@ -119,7 +113,7 @@ def test_a_number_among_dents_is_told_no_better_than_they_are_deep(evidence, mon
     def track_run(depth):
         def run(machine, *_, **__):
             value = machine.axes["swing"].transmission.backlash
-            z = ((value - gap.nominal) / gap.scale - 0.5) / alone[0]
+            z = ((value - gap.nominal) / gap.prior_std - 0.5) / alone[0]
             loss = z**2 + 0.5 * depth * (1.0 - np.cos(19.0 * z))
             return SimpleNamespace(loss=loss / len(evidence.tracks))
 
@@ -187,7 +181,7 @@ def test_leakage_to_tank_is_recovered_and_not_mistaken_for_leakage_across_the_pi
 def test_a_drift_is_recovered_and_not_mistaken_for_an_offset():
     """A sensor that warms up within the 12 s, its time constant known, as in a search."""
     slow = {"angle.boom": SensorError(drift_time_constant=5.0)}
-    nominal = changed(load_machine("cat215"), "sensor_errors", slow)
+    nominal = with_value(load_machine("cat215"), "sensor_errors", slow)
     data, _ = machine_data(nominal, apply_effect(nominal, "angle_drift", "boom", {"drift": 0.02}))
     losses, best = {}, {}
     with closing(Evidence(data, data.fit, 1, 4e-3)) as found:

@@ -210,10 +210,7 @@ def test_errors_of_lagging_transducers_are_white_and_of_size_one(first):
 def test_a_time_constant_is_found_without_bias(name, place, constant):
     """The likelihood is a parabola over the time constant; three of its widths are allowed."""
     nominal = load_machine("cat215")
-    slow = [
-        apply_effect(nominal, name, place, {"time_constant": constant + d})
-        for d in (-1e-3, 0.0, 1e-3)
-    ]
+    slow = [apply_effect(nominal, name, place, {"time_constant": constant + d}) for d in (-1e-3, 0.0, 1e-3)]
     data, _ = machine_data(nominal, slow[1], seed=2)
     below, there, above = (track_run(m, data, data.heldout) for m in slow)
     curvature = (above.loss + below.loss - 2.0 * there.loss) / 1e-3**2
@@ -265,7 +262,7 @@ def test_a_drive_that_rests_in_the_middle_of_its_backlash_is_not_looked_for_agai
     """A track remembers where it rested, the middle (0) as well; NaN says that nobody looked."""
     machine = apply_effect(load_machine("cat215"), "backlash", "swing", {"gap": 0.01})
     data, _ = machine_data(machine, machine)
-    run, searches = data.heldout.part(0, 5), []
+    run, searches = data.heldout.select_rows(0, 5), []
 
     def find(loss, free):
         searches.append(free)

@@ -63,9 +63,7 @@ def test_a_constant_input_moves_the_state_as_a_constant_term_does(track, balance
     term = Term(name="extra", axis="boom", balance=balance, law="constant",
                 parameters={"value": size})  # fmt: skip
     changed = machine.model_copy(update={"terms": (term,)})
-    columns = input_columns(
-        machine, track.states, track.flow, PERIOD, [Input(balance, "boom")], track.run.command
-    )
+    columns = input_columns(machine, track.states, track.flow, PERIOD, [Input(balance, "boom")], track.run.command)
     own = [s for s, name in enumerate(state_names(machine)) if name.startswith(f"{kind}.")]
     for row in (100, 250, 400):
         moved = (row_later(changed, track, row) - row_later(machine, track, row))[own] / size

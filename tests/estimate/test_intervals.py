@@ -17,7 +17,7 @@ def fitted(name, location, values, step=1e-3):
     nominal = load_machine("cat215")
     data, _ = machine_data(nominal, apply_effect(nominal, name, location, values))
     (hypothesis,) = [h for h in hypotheses(nominal, [name]) if h.location == location]
-    numbers = [(values[key] - p.nominal) / p.scale for key, p in hypothesis.parameters.items()]
+    numbers = [(values[key] - p.nominal) / p.prior_std for key, p in hypothesis.parameters.items()]
     guess = Guess(((hypothesis, np.array(numbers)),))
     evidence = Evidence(data, data.fit, 1, step)
     evidence.set_base(guess)

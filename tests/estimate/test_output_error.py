@@ -38,9 +38,9 @@ def test_numbers_have_the_priors_that_the_machine_states():
     stated = {"delay": 0.02, "linkage.stick": 0.3}
     machine = load_machine("ec20").model_copy(update={"uncertainty": stated})
     found = {(h.name, h.location): h.parameters for h, _ in uncertain_parameters(machine).parts}
-    assert found["timing", "boom"]["delay"].scale == 0.02
-    assert found["linkage", "stick"]["base"].scale == 0.3
-    assert found["linkage", "boom"]["base"].scale == 0.15
+    assert found["timing", "boom"]["delay"].prior_std == 0.02
+    assert found["linkage", "stick"]["base"].prior_std == 0.3
+    assert found["linkage", "boom"]["base"].prior_std == 0.15
 
 
 def test_a_stretched_table_keeps_its_shape_and_never_falls():
@@ -147,9 +147,7 @@ def test_windows_that_contradict_each_other_widen_intervals():
     for pull in pulls:
         error = columns[:, :, 0] * np.repeat(pull, 50)[:, None]
         guess = SimpleNamespace(deviation=np.zeros(1))
-        slope, curvature = _normal_equations(
-            SimpleNamespace(errors=error, guess=guess), columns, weights, scale
-        )
+        slope, curvature = _normal_equations(SimpleNamespace(errors=error, guess=guess), columns, weights, scale)
         guess.deviation = -np.linalg.solve(curvature, slope)
         left = error + columns @ guess.deviation
         point = SimpleNamespace(errors=left, guess=guess)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from hydrotele.effects import apply_effect, changed
+from hydrotele.effects import apply_effect, with_value
 from hydrotele.estimate.reduced_model import predicted_channels, simulate_rows, state_names
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.replay import replay_log
@@ -23,7 +23,7 @@ STIFFNESS, DAMPING = 4.0e5, 2.0e3  # N/m, N s/m: breaks away after some 50 um
 def emps(stiffness=STIFFNESS, damping=DAMPING):
     machine = load_machine("emps")
     for name, value in (("stiffness", stiffness), ("damping", damping)):
-        machine = changed(machine, f"axes.slide.force.friction.presliding_{name}", value)
+        machine = with_value(machine, f"axes.slide.force.friction.presliding_{name}", value)
     return machine
 
 
@@ -85,7 +85,7 @@ def test_the_plant_moves_as_scipy_says():
     truth = integrated(volts)
     # velocities stand half a step before positions at the start: 1.25e-4 s of 20 mm/s, and friction
     assert np.abs(np.array(shown) - truth).max() < 4e-3 * np.ptp(truth)
-    assert plant.memory == {"bristle.slide": 0}
+    assert plant.extra_states == {"bristle.slide": 0}
 
 
 def test_stiff_bristles_hold_at_coarse_steps(reduced_of):
@@ -166,8 +166,7 @@ def test_open_loop_the_plant_and_the_reduced_model_are_one(reduced_of, name, eff
                     assert np.median(np.abs(states[:, s] - kept)) < 0.01
     channels = [c for c in shown[True] if np.ptp(run.truth[c]) > 0.0]
     with_it, without = (
-        {c: np.abs(shown[which][c] - run.truth[c]) / np.ptp(run.truth[c]) for c in channels}
-        for which in (True, False)
+        {c: np.abs(shown[which][c] - run.truth[c]) / np.ptp(run.truth[c]) for c in channels} for which in (True, False)
     )
     for c in channels:  # of second order: a quarter of it at half the step, see the other tests
         assert with_it[c].max() < 4e-3 and np.sqrt(np.mean(with_it[c] ** 2)) < 5e-4, c

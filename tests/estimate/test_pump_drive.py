@@ -5,15 +5,15 @@ import math
 import numpy as np
 import pytest
 
-from hydrotele.effects.effect import changed
+from hydrotele.effects.effect import with_value
 from hydrotele.estimate.filter import Input, input_columns
 from hydrotele.estimate.levels import rough_noise
 from hydrotele.estimate.reduced_model import model_space, reduced_model, simulate_rows, state_names
 from hydrotele.estimate.track import STEP, steps_per_row, track_run
-from hydrotele.hydraulics.parameters import longest_step
+from hydrotele.hydraulics.parameters import max_time_step
 from hydrotele.logs.dataset import Dataset, RunData
 from hydrotele.logs.log import Log
-from hydrotele.logs.rows import Rows, averaged
+from hydrotele.logs.rows import RunRows, average_rows
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.terms.law import Term
 
@@ -42,7 +42,7 @@ def dataset(machine, shown, noise=NOISE, behind=None):
     """A dataset of one run that shows these readings."""
     run = RunData(
         "made", 0.0, PERIOD, duty(), np.ones(ROWS, bool), shown,
-        Log(time=PERIOD * np.arange(ROWS), columns={}, units={}), behind=behind,
+        Log(time=PERIOD * np.arange(ROWS), columns={}, units={}), readings_per_mean=behind,
     )  # fmt: skip
     return Dataset(machine, ("piston",), CHANNELS, noise, (run,), run, ())
 
@@ -56,9 +56,9 @@ def machine():
 def stiff(machine):
     """The same without compliance of its lines, without air, and with little friction."""
     for side in ("head", "rod"):
-        machine = changed(machine, f"axes.piston.pump.compliance_{side}", 0.0)
-        machine = changed(machine, f"axes.piston.pump.air_{side}", 0.0)
-    return changed(machine, "axes.piston.cylinder.friction.viscous", 1.0e3)
+        machine = with_value(machine, f"axes.piston.pump.compliance_{side}", 0.0)
+        machine = with_value(machine, f"axes.piston.pump.air_{side}", 0.0)
+    return with_value(machine, "axes.piston.cylinder.friction.viscous", 1.0e3)
 
 
 @pytest.mark.parametrize("kind", ["machine", "stiff"])
@@ -101,9 +101,7 @@ def moved(machine, term, row, states):
         command = np.tile(duty()[row], (2, 1))
         out, later = np.empty((2, 0)), np.empty((2, states.shape[1]))
         # the row before already had this command, so that its delay changes nothing
-        simulate_rows(
-            model, model_space(model), states[row].copy(), command, PERIOD, 20, out, later
-        )
+        simulate_rows(model, model_space(model), states[row].copy(), command, PERIOD, 20, out, later)
         ends.append(later[1])
     return ends[1] - ends[0]
 
@@ -138,14 +136,14 @@ def test_friction_that_holds_resists_a_term(machine):
 
 def test_longest_step_halves_until_the_oil_is_followed(machine, stiff):
     """`h = 1 / omega` with little friction; at that step a free run stays with a fine one."""
-    h = longest_step(stiff, "piston")
+    h = max_time_step(stiff, "piston")
     assert math.log2(h / 1.0e-3) == round(math.log2(h / 1.0e-3))
     area_head, area_rod = stiff.axes["piston"].cylinder.areas
     volume, stroke = 30.0e-6, 0.075
     oil = 1.0e9 * (area_head**2 / volume + area_rod**2 / (volume + area_rod * stroke))
     omega = math.sqrt((oil + 3.0e7) / 50.0)
     assert 0.4 / omega < h <= 1.05 / omega  # friction allows a little more than 1 / omega
-    assert h < longest_step(machine, "piston")
+    assert h < max_time_step(machine, "piston")
     coarse, fine = (simulated(stiff, round(PERIOD / step))[0] for step in (h, h / 8))
     assert np.abs(coarse - fine)[:, 0].max() < 2.0e-4  # m, over 5 s
 
@@ -154,9 +152,9 @@ def test_readings_that_repeat_count_once():
     """Ten equal readings of an encoder at rest say no more than one; ten noisy ones do."""
     still = np.zeros(1000)
     noisy = np.random.default_rng(0).normal(size=1000)
-    rows = Rows(0.0, 1e-3, np.zeros((1000, 1)), np.ones(1000, bool),
+    rows = RunRows(0.0, 1e-3, np.zeros((1000, 1)), np.ones(1000, bool),
                 np.column_stack([still, noisy]), np.ones(1000, bool))  # fmt: skip
-    _, behind, count = averaged(rows, 100.0)
+    _, behind, count = average_rows(rows, 100.0)
     assert count == 10
     assert behind[0] == 1.0
     assert behind[1] == pytest.approx(10.5, rel=0.01)  # half weights at the ends

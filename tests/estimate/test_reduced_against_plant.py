@@ -8,7 +8,7 @@ import pytest
 from hydrotele.effects import apply_effect
 from hydrotele.estimate.reduced_model import predicted_channels, simulate_rows, state_names
 from hydrotele.hydraulics.laws import ATMOSPHERE
-from hydrotele.hydraulics.parameters import SLOTS, Slot
+from hydrotele.hydraulics.parameters import SLOT_COUNT, Slot
 from hydrotele.machine.drives import EndStop
 from hydrotele.machine.machine_file import save_machine
 from hydrotele.run.run import run_scenario
@@ -70,9 +70,7 @@ CASES = {
     ),
     "load_holding": (("load_holding", "boom.head", {"setting": 40e6}),),
     "pump_droop": (("pump_droop", "supply", {"droop": 7e-11}),),
-    "relief_override": (
-        ("relief_pressure", "supply", {"relief_pressure": 20e6, "relief_override": 9e8}),
-    ),
+    "relief_override": (("relief_pressure", "supply", {"relief_pressure": 20e6, "relief_override": 9e8}),),
     "presliding": (
         ("presliding", "swing", {"compliance": 5e-7}),
         ("presliding", "boom", {"compliance": 1e-7}),
@@ -154,9 +152,7 @@ def beyond(found):
     }
 
 
-@pytest.mark.daily(
-    "valves", "joint_flexibility", "pump_lag", "presliding", "tank_leakage", "load_holding"
-)
+@pytest.mark.daily("valves", "joint_flexibility", "pump_lag", "presliding", "tank_leakage", "load_holding")
 @pytest.mark.parametrize("case", CASES)
 def test_readings_are_those_of_the_plant(case, machine_of, reduced_of):
     name = case if "/" in case else "cat215/none"
@@ -216,7 +212,7 @@ def test_a_chamber_that_is_drawn_empty(machine_of, reduced_of):
     def without_air(machine, channels):
         model, space, z = reduced_of(machine, channels)
         user = model.user.copy()
-        user[Slot.AIR_RELEASE :: SLOTS] = 0.0
+        user[Slot.AIR_RELEASE :: SLOT_COUNT] = 0.0
         return model._replace(user=user), space, z
 
     assert beyond(differences_of(without_air, machine, run, 40)), "the air would not be missed"

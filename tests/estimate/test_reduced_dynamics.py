@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hydrotele.effects.effect import changed
+from hydrotele.effects.effect import with_value
 from hydrotele.estimate.reduced_model import (
     accelerate,
     advance,
@@ -21,7 +21,7 @@ from hydrotele.estimate.reduced_model import (
     supply_of,
     write_trail,
 )
-from hydrotele.hydraulics.circuit import SLOTS, Slot, actuator_friction
+from hydrotele.hydraulics.circuit import SLOT_COUNT, Slot, actuator_friction
 from hydrotele.logs.log import load_log
 from hydrotele.machine.machine import SensorError
 from hydrotele.multibody.reduced_mechanism import (
@@ -31,8 +31,8 @@ from hydrotele.multibody.reduced_mechanism import (
     MASS,
     ORIGIN,
     RATE,
-    TURN,
-    gather_forces,
+    ROTATION,
+    compute_mass_and_bias,
 )
 from tests.measured import TRUTH
 
@@ -86,7 +86,7 @@ def test_rest_is_rest(name, machine_of, reduced_of):
     machine = machine_of(name)
     model, space, z = reduced_of(machine)
     place(model, space, z)
-    gather_forces(model.mech, space.motion)
+    compute_mass_and_bias(model.mech, space.motion)
     load = space.motion.basis.T @ space.motion.joint[BIAS]
     forces, first = np.linalg.solve(space.row.T, load), 2 * len(load)
     for i, axis in enumerate(machine.hydraulic_axes.values()):
@@ -105,16 +105,16 @@ def test_rest_is_rest(name, machine_of, reduced_of):
 def energy(model, space, z):
     """Kinetic and potential energy [J], and the power of drives and dampers [W]."""
     place(model, space, z)
-    gather_forces(model.mech, space.motion)
+    compute_mass_and_bias(model.mech, space.motion)
     mech, m = model.mech, space.motion
     n, rates, total = len(mech.free), m.joint[RATE], 0.5 * m.joint[RATE] @ m.mass @ m.joint[RATE]
     for i in range(1, mech.bodies):
-        turn, com = m.frame[i, TURN : TURN + 9].reshape(3, 3), mech.shape[i, COM : COM + 3]
+        turn, com = m.frame[i, ROTATION : ROTATION + 9].reshape(3, 3), mech.shape[i, COM : COM + 3]
         place_of_mass = m.frame[i, ORIGIN : ORIGIN + 3] + turn @ com
         total -= mech.shape[i, MASS] * mech.gravity @ place_of_mass
     power = -np.sum(mech.joint[DAMPING] * rates**2)
     for i, velocity in enumerate(space.row @ z[n : 2 * n]):
-        u, a = i * SLOTS, 2 * n + 4 * i
+        u, a = i * SLOT_COUNT, 2 * n + 4 * i
         force = model.user[u + Slot.AREA_HEAD] * z[a + 2] - model.user[u + Slot.AREA_ROD] * z[a + 3]
         power += velocity * (force - actuator_friction(model.user, u, velocity))
     return total, power
@@ -167,7 +167,7 @@ def test_late_scaled_and_shifted_channels(machine_of, reduced_of):
         "pressure_supply": SensorError(scale=1.1, delay=0.004),
     }
     plain = machine_of("cat215/none")
-    machine, channels = changed(plain, "sensor_errors", errors), predicted_channels(plain)
+    machine, channels = with_value(plain, "sensor_errors", errors), predicted_channels(plain)
     (model, space, z), (ideal, room, _) = (reduced_of(m, channels) for m in (machine, plain))
     rng, steps, rows = np.random.default_rng(5), 10, 8
     h, command = PERIOD / steps, rng.uniform(-0.5, 0.5, (rows, 3))
@@ -192,7 +192,7 @@ def test_late_scaled_and_shifted_channels(machine_of, reduced_of):
 
 def test_keeping_a_trail_changes_nothing(machine_of, reduced_of):
     error = {"angle.boom": SensorError(delay=0.01)}
-    machine = changed(machine_of("cat215/none"), "sensor_errors", error)
+    machine = with_value(machine_of("cat215/none"), "sensor_errors", error)
     model, space, z = reduced_of(machine, ("angle.boom",))
     other, command = z.copy(), np.full((1, 3), 0.3)
     advance(model, space, z, command, 0, PERIOD, 10, np.zeros((11, 1)))

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from hydrotele.effects import Term, changed, with_terms
+from hydrotele.effects import Term, with_terms, with_value
 from hydrotele.estimate.reduced_model import simulate_rows
-from hydrotele.hydraulics.circuit import NO_MEMORY, circuit_scratch, step_circuit
+from hydrotele.hydraulics.circuit import NO_EXTRA_STATES, circuit_scratch, step_circuit
 from hydrotele.hydraulics.parameters import actuator_order, actuator_parameters
 from hydrotele.terms.law import Drives
 from hydrotele.terms.table import terms_table
@@ -30,9 +30,9 @@ def free_run(reduced_of, machine, rows, steps, command=0.0):
 @pytest.fixture(scope="module")
 def slide(machine_of):
     """EMPS without friction: a mass on rails and nothing else."""
-    machine = changed(machine_of("emps"), "axes.slide.force.offset", 0.0)
+    machine = with_value(machine_of("emps"), "axes.slide.force.offset", 0.0)
     for field in ("coulomb", "viscous"):
-        machine = changed(machine, f"axes.slide.force.friction.{field}", 0.0)
+        machine = with_value(machine, f"axes.slide.force.friction.{field}", 0.0)
     return machine
 
 
@@ -97,14 +97,14 @@ def still_circuit(machine, terms, pressures, dt, end):
     x = np.full(count, 0.5)
     for k in range(round(end / dt)):
         drives = Drives(count, act, x, zeros, zeros)
-        step_circuit(user, 0, drives, dt, rate, circuit_scratch(), table, k * dt, NO_MEMORY)
+        step_circuit(user, 0, drives, dt, rate, circuit_scratch(), table, k * dt, NO_EXTRA_STATES)
         act += dt * rate
     return act.reshape(-1, 4)[:, 2:]
 
 
 def test_pressures_even_out_through_an_orifice(machine_of):
     """Between two equal chambers the root of the difference falls at a constant rate."""
-    machine = changed(machine_of("cat215/none"), "axes.swing.motor.leakage", 0.0)
+    machine = with_value(machine_of("cat215/none"), "axes.swing.motor.leakage", 0.0)
     gain, high, low, end = 2.0e-8, 20.0e6, 5.0e6, 0.05
     terms = [
         term("swing", "flow_rod", "orifice_leakage", flow_gain=gain, smoothing=1.0e3),
@@ -123,7 +123,7 @@ def test_pressures_even_out_through_an_orifice(machine_of):
 
 def test_a_flow_in_time_fills_a_chamber(machine_of):
     """A closed chamber integrates a ramp of flow: `dp = beta r t^2 / (2 V)`."""
-    machine = changed(machine_of("cat215/none"), "axes.swing.motor.leakage", 0.0)
+    machine = with_value(machine_of("cat215/none"), "axes.swing.motor.leakage", 0.0)
     rate, end = 1.0e-3, 0.1
     terms = [term("swing", "flow_head", "ramp", rate=rate)]
     before, after = 5.0e6, still_circuit(machine, terms, (5.0e6, 5.0e6), 1e-3, end)
@@ -148,8 +148,7 @@ def test_second_order_in_the_step(kind, machine_of, reduced_of):
     machine = machine_of("cat215/none")
     with_it = with_terms(machine, "t", [CURVED[kind]])
     effects = [
-        free_run(reduced_of, with_it, 25, steps, 0.3)[:, :3]
-        - free_run(reduced_of, machine, 25, steps, 0.3)[:, :3]
+        free_run(reduced_of, with_it, 25, steps, 0.3)[:, :3] - free_run(reduced_of, machine, 25, steps, 0.3)[:, :3]
         for steps in (10, 20, 40, 80)
     ]
     assert np.abs(effects[-1]).max() > 1e-3, "the term is felt"

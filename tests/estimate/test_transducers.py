@@ -5,16 +5,16 @@ import pytest
 from scipy.signal import lsim, lti
 
 from hydrotele.estimate.reduced_model import advance, follow_channel, simulate_rows
-from hydrotele.machine.machine import SensorError, first_order
+from hydrotele.machine.machine import SensorError, step_first_order_lag
 
 
 @pytest.mark.parametrize("ratio", [1e-9, 1e-3, 0.3, 1.0, 50.0])
 def test_one_step_is_the_analytic_response(ratio):
     """Step: `1 - exp(-t/T)`; ramp of rate 1/T: `t/T - 1 + exp(-t/T)`; rounding apart."""
-    assert first_order(0.0, 1.0, 1.0, ratio) == pytest.approx(-np.expm1(-ratio), rel=1e-12)
+    assert step_first_order_lag(0.0, 1.0, 1.0, ratio) == pytest.approx(-np.expm1(-ratio), rel=1e-12)
     wanted = ratio + np.expm1(-ratio) if ratio > 1e-6 else 0.5 * ratio**2
-    assert first_order(0.0, 0.0, ratio, ratio) == pytest.approx(wanted, rel=1e-9, abs=1e-15)
-    assert first_order(2.0, 0.0, 0.0, ratio) == pytest.approx(2.0 * np.exp(-ratio), rel=1e-12)
+    assert step_first_order_lag(0.0, 0.0, ratio, ratio) == pytest.approx(wanted, rel=1e-9, abs=1e-15)
+    assert step_first_order_lag(2.0, 0.0, 0.0, ratio) == pytest.approx(2.0 * np.exp(-ratio), rel=1e-12)
 
 
 @pytest.mark.parametrize("steps", [1, 7, 100])

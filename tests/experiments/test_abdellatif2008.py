@@ -8,16 +8,16 @@ from hydrotele.experiments import abdellatif2008 as study
 from hydrotele.experiments import abdellatif_processing as processing
 from hydrotele.experiments import abdellatif_trials as trials
 from hydrotele.experiments import palida_base
-from hydrotele.experiments.comparison import BROKEN_REPETITIONS, Experiment
+from hydrotele.experiments.comparison import FAULT_REPETITIONS, Experiment
 from hydrotele.experiments.palida import (
     CHI2_LIMIT,
     HOME_POSE,
+    PUBLISHED_PARAMETERS,
     SAMPLE_RATE,
-    TABLE,
-    drive_limits,
-    force_covariance,
+    compute_force_covariance,
     load_excitation,
     load_robot,
+    make_drive_limits,
     plan_circle,
     plan_square,
     simulate_excitation,
@@ -41,7 +41,7 @@ def judge_repeatedly(one: Experiment, count: int, changes=None) -> dict:
 
 def test_every_table_and_figure_is_present():
     present = {
-        *study.SERIES.drawings,
+        *study.SERIES.items_without_result,
         *(c.item.split(",")[0] for c in study.SERIES.claims.values()),
     }
     assert set(ITEMS) <= present
@@ -51,7 +51,7 @@ def test_every_table_and_figure_is_present():
 def test_every_judged_claim_can_be_broken():
     claims = study.SERIES.claims.values()
     assert len(study.SERIES.claims) == sum(len(one.claims) for one in study.SERIES.experiments)
-    assert all(c.broken and c.broken_how for c in claims if c.kind in ("document", "additional"))
+    assert all(c.fault and c.fault_description for c in claims if c.kind in ("document", "additional"))
 
 
 @pytest.mark.parametrize("one", study.SERIES.experiments, ids=lambda one: one.name)
@@ -87,7 +87,7 @@ def test_moved_frame_leaves_the_kinetic_energy():
     carrier = palida_base.transfer_parameters(rotation, offset) @ body
 
     def energy(parameters, spin, speed):
-        tensor = palida_base._tensor(parameters[4:])
+        tensor = palida_base._build_inertia_tensor(parameters[4:])
         return (0.5 * parameters[0] * speed @ speed + speed @ np.cross(spin, parameters[1:4])
                 + 0.5 * spin @ tensor @ spin)  # fmt: skip
 
@@ -99,9 +99,9 @@ def test_moved_frame_leaves_the_kinetic_energy():
 def test_designed_motion_keeps_all_limits_and_is_better_than_random_ones():
     (row,) = judge_repeatedly(study.DESIGN, 4).values()
     assert row.verdict == "agrees", row.simulated
-    motion = load_excitation().motion(np.linspace(0.0, load_excitation().period, 500))
-    assert drive_limits().use(motion, motion).max() <= 1.0
-    (row,) = judge_repeatedly(study.DESIGN, BROKEN_REPETITIONS, {"amplitude": 0.1}).values()
+    motion = load_excitation().evaluate(np.linspace(0.0, load_excitation().period, 500))
+    assert make_drive_limits().compute_utilisation(motion, motion).max() <= 1.0
+    (row,) = judge_repeatedly(study.DESIGN, FAULT_REPETITIONS, {"amplitude": 0.1}).values()
     assert row.verdict == "differs"
 
 
@@ -120,12 +120,12 @@ def test_dry_friction_is_merged_where_hinges_are_equal(scatter, left):
 @pytest.mark.nightly
 def test_frequency_domain_predicts_best_and_time_domain_better_than_raw():
     sample = processing.measure_processing(1, {})
-    variances = [sample.values[f"{way} true variance"] for way in processing.WAYS]
+    variances = [sample.values[f"{way} true variance"] for way in processing.METHOD_NAMES]
     assert variances[0] > variances[1] > variances[2]
     assert sample.values["periodic 2"] < processing.MAX_VISIBLE_ERROR
     shown = {panel.label for panel in sample.panels}
     for claim in processing.PROCESSING.claims:
-        assert claim.panels and set(claim.panels) <= shown
+        assert claim.panel_labels and set(claim.panel_labels) <= shown
 
 
 def test_too_wide_window_is_found():
@@ -139,7 +139,7 @@ def test_too_wide_window_is_found():
 def test_normal_equations_give_the_gauss_markov_estimate():
     cycle, rng = simulate_excitation(), np.random.default_rng(1)
     rows = slice(None, None, 10)
-    matrix, covariance = cycle.matrix[rows], force_covariance()
+    matrix, covariance = cycle.matrix[rows], compute_force_covariance()
     force = cycle.force[rows] + rng.normal(0.0, 10.0, (len(matrix), 6))
     equations = trials.NormalEquations(matrix)
     weight = np.linalg.inv(covariance)[None]
@@ -157,7 +157,7 @@ def test_normal_equations_give_the_gauss_markov_estimate():
 def test_distances_of_the_trials_have_their_distribution():
     settings = trials.TRIAL_SETTINGS | {"friction_excess": 0.0, "trials": 60}
     found = trials.simulate_trials(1, settings)
-    distance = trials.square_distance(found.value - load_robot().truth, found.information)
+    distance = trials.compute_square_distance(found.value - load_robot().truth, found.information)
     total = float(distance.sum())  # chi^2 with 24 degrees of freedom per trial
     assert 1e-3 < chi2.sf(total, 24 * 60) < 1.0 - 1e-3
     assert abs(chi2.ppf(0.95, 24) - CHI2_LIMIT) < 0.005  # two printed decimals
@@ -198,7 +198,7 @@ def test_bias_is_found_where_it_is_and_not_where_it_is_not():
 
 @pytest.mark.nightly
 def test_encoder_noise_that_controllers_pass_on_biases_samples_but_not_periods():
-    arrays = trials.measure_reaction(1, {}).arrays
+    arrays = trials.measure_encoder_feedback(1, {}).arrays
     rms = {name: float(np.sqrt(np.mean(error**2))) for name, error in arrays.items()}
     assert rms["samples, least squares"] > 10.0 < rms["samples, Gauss-Markov"]
     # two periods instead of four, and forces with the controllers' noise
@@ -208,11 +208,11 @@ def test_encoder_noise_that_controllers_pass_on_biases_samples_but_not_periods()
 def test_simulated_noise_has_its_covariance():
     record = simulate_measurement(simulate_excitation(), 8, np.random.default_rng(0))
     rest = record.force - np.tile(simulate_excitation().force, (8, 1))
-    np.testing.assert_allclose(np.cov(rest.T), force_covariance(), rtol=0.1)  # 24 000 rows
+    np.testing.assert_allclose(np.cov(rest.T), compute_force_covariance(), rtol=0.1)  # 24 000 rows
 
 
 def test_printed_intervals_are_about_the_printed_estimates():
-    for one in TABLE:
+    for one in PUBLISHED_PARAMETERS:
         # the four decimals of the interval and of the estimate
         assert np.mean(one.interval) == pytest.approx(one.value, abs=1.5e-4)
 
@@ -228,7 +228,7 @@ def test_paths_have_their_size_and_speed(plan, width):
 
 def test_nominal_model_helps_and_the_true_one_more():
     motion = plan_circle(0.75, laps=0.25)[:, : round(1.2 * SAMPLE_RATE)]
-    prior = np.array([one.prior for one in TABLE])
+    prior = np.array([one.prior for one in PUBLISHED_PARAMETERS])
     found = [track_path(motion, model) for model in (None, prior, load_robot().truth)]
     none, nominal, identified = (np.sqrt(np.mean(f.error**2)) for f in found)
     assert identified < 0.5 * nominal < 0.5 * none

@@ -10,19 +10,19 @@ from hydrotele.cli import experimenting
 from hydrotele.cli.main import app
 from hydrotele.core.errors import InputError
 from hydrotele.experiments.comparison import (
-    BROKEN_REPETITIONS,
+    FAULT_REPETITIONS,
     Check,
     Claim,
     Comparison,
+    Evaluation,
     Experiment,
-    Judgement,
     Panel,
     Sample,
     Series,
-    break_series,
     compare_by_seeds,
     run_series,
-    summarize,
+    run_with_faults,
+    summarize_verdicts,
 )
 from hydrotele.experiments.intervals import (
     check_exact,
@@ -30,7 +30,7 @@ from hydrotele.experiments.intervals import (
     check_mean,
     check_population,
     check_statistic,
-    collect,
+    collect_values,
     format_values,
 )
 
@@ -51,11 +51,11 @@ def test_quantity_that_is_not_a_number_differs():
 def test_judgement_needs_all_checks():
     good, bad = check_exact("a", 1.0, (0.0, 2.0), ""), check_exact("b", 3.0, (0.0, 2.0), "")
     open_ = check_mean("c", np.array([1.0]), (0.0, 2.0), "")
-    assert Judgement((good, good)).verdict == "agrees"
-    assert Judgement((good, bad, open_)).verdict == "differs"
-    assert Judgement((good, open_)).verdict == "undecided"
-    assert Judgement().verdict == "no verdict"
-    assert Judgement((good,), unavailable="the text ends").verdict == "cannot be computed"
+    assert Evaluation((good, good)).verdict == "agrees"
+    assert Evaluation((good, bad, open_)).verdict == "differs"
+    assert Evaluation((good, open_)).verdict == "undecided"
+    assert Evaluation().verdict == "no verdict"
+    assert Evaluation((good,), unavailable="the text ends").verdict == "cannot be computed"
 
 
 @pytest.mark.nightly
@@ -88,8 +88,8 @@ def test_published_figure_is_compared_with_the_population():
 
 
 def test_failures_of_a_broken_run_are_decided():
-    assert check_fraction("", [False] * BROKEN_REPETITIONS).verdict == "differs"
-    assert check_fraction("", [False] * (BROKEN_REPETITIONS - 1)).verdict == "undecided"
+    assert check_fraction("", [False] * FAULT_REPETITIONS).verdict == "differs"
+    assert check_fraction("", [False] * (FAULT_REPETITIONS - 1)).verdict == "undecided"
 
 
 def measure_length(seed, changes):
@@ -102,21 +102,19 @@ def measure_length(seed, changes):
 
 
 def judge_length(samples):
-    check = check_mean("length", collect(samples, "length"), (1.5, 2.5), "as printed", unit="m",
+    check = check_mean("length", collect_values(samples, "length"), (1.5, 2.5), "as printed", unit="m",
                        published=2.0)  # fmt: skip
-    return Judgement((check,), note=f"values {format_values(samples, 'length')}")
+    return Evaluation((check,), note=f"values {format_values(samples, 'length')}")
 
 
-CLAIM = Claim(
-    "length", "2 m", "p. 1, Table 1", "document", judge_length, {"error": 3.0}, "3 m longer"
-)
+CLAIM = Claim("length", "2 m", "p. 1, Table 1", "document", judge_length, {"error": 3.0}, "3 m longer")
 INPUT = Claim("mass", "3 kg", "p. 2, Table 2", "input",
-              lambda samples: Judgement((check_exact("mass", 3.0, (2.9, 3.1), "digits"),)),
+              lambda samples: Evaluation((check_exact("mass", 3.0, (2.9, 3.1), "digits"),)),
               {"error": 1.0}, "")  # fmt: skip
 SERIES = Series(
     "wang2012", "A. Author, 2000", 8,
     (Experiment("lengths", measure_length, (CLAIM, INPUT), max_repetitions=30),),
-    (Comparison("force", "p. 3, Fig. 1", "5 N", "document", Judgement(unavailable="no text")),),
+    (Comparison("force", "p. 3, Fig. 1", "5 N", "document", Evaluation(unavailable="no text")),),
     {"Fig. 2": "photograph"},
 )  # fmt: skip
 
@@ -124,8 +122,8 @@ SERIES = Series(
 def test_series_is_judged_and_can_be_broken():
     rows = run_series(SERIES, 8, jobs=1)
     assert [row.verdict for row in rows] == ["agrees", "agrees", "cannot be computed"]
-    assert summarize(rows).startswith("of 2 published results 1 agree, 0 differ")
-    ((claim, broken),) = break_series(SERIES, ["length"], jobs=1)
+    assert summarize_verdicts(rows).startswith("of 2 published results 1 agree, 0 differ")
+    ((claim, broken),) = run_with_faults(SERIES, ["length"], jobs=1)
     assert claim is CLAIM and broken.verdict == "differs"
     counts = compare_by_seeds(SERIES, (1, 8), jobs=1)
     assert [counts[n][0].verdict for n in (1, 8)] == ["undecided", "agrees"]
@@ -134,7 +132,7 @@ def test_series_is_judged_and_can_be_broken():
 
 @pytest.mark.nightly
 def test_processes_give_the_same_samples():
-    alone, shared = (run_series(SERIES, 3, jobs)[0].judgement for jobs in (1, 2))
+    alone, shared = (run_series(SERIES, 3, jobs)[0].evaluation for jobs in (1, 2))
     assert alone == shared
 
 
@@ -160,7 +158,7 @@ def test_command_writes_table_report_and_figures(monkeypatch, tmp_path):
 
 def test_a_difference_is_the_exit_status(monkeypatch):
     check = check_exact("length", 2.0, (2.9, 3.1), "")
-    long = Claim("length", "3 m", "p. 1", "document", lambda samples: Judgement((check,)))
+    long = Claim("length", "3 m", "p. 1", "document", lambda samples: Evaluation((check,)))
     monkeypatch.setattr(experimenting, "load_series", lambda name: Series(
         "wang2012", "", 1, (Experiment("lengths", measure_length, (long,)),)))  # fmt: skip
     result = CliRunner().invoke(app, ["experiments", "wang2012", "--json", "--jobs", "1"])

@@ -5,23 +5,26 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.experiments import khoshzaban_arm, khoshzaban_experiment, khoshzaban_machine
-from hydrotele.experiments.comparison import BROKEN_REPETITIONS, Sample
+from hydrotele.experiments.comparison import FAULT_REPETITIONS, Sample
 from hydrotele.experiments.khoshzaban1992 import SERIES
 from hydrotele.experiments.khoshzaban_arm import (
-    LENGTHS,
-    MOVED,
+    LENGTH_PARAMETERS,
     PUBLISHED_TWISTS,
-    TWISTS,
-    Condition,
-    identify_under,
-    judge_drift,
-    judge_iterations,
-    measure_exact,
-    published_error,
+    SIMULATED_STAGES,
+    TWIST_PARAMETERS,
+    Disturbance,
+    evaluate_drift,
+    evaluate_iterations,
+    find_published_error,
+    identify_with_disturbance,
+    measure_exact_readings,
 )
-from hydrotele.experiments.khoshzaban_calibration import measure_calibration, measure_search
-from hydrotele.experiments.khoshzaban_experiment import changed_range, measure_printed
-from hydrotele.experiments.khoshzaban_machine import measure_lists, measure_machine
+from hydrotele.experiments.khoshzaban_calibration import measure_bend_detection, measure_calibration
+from hydrotele.experiments.khoshzaban_experiment import (
+    compute_accepted_change,
+    measure_printed_parameters,
+)
+from hydrotele.experiments.khoshzaban_machine import measure_identifiable_lists, measure_machine
 
 ROWS = {
     "Table 1": "masses of the links",
@@ -65,7 +68,7 @@ def test_every_table_and_figure_has_its_place():
     items = {f"Table {n}" for n in range(1, 13)} | {f"Fig. {n}" for n in range(1, 30)}
     assert set(ROWS) | set(DRAWINGS) == items
     assert not set(ROWS) & set(DRAWINGS)
-    assert set(DRAWINGS) <= set(SERIES.drawings)
+    assert set(DRAWINGS) <= set(SERIES.items_without_result)
     assert set(ROWS.values()) <= set(SERIES.claims)
 
 
@@ -74,7 +77,7 @@ def test_every_claim_with_a_verdict_can_be_broken():
     assert len(claims) == len(SERIES.claims)
     for claim in claims:
         if claim.kind in ("document", "input"):
-            assert claim.broken is not None and claim.broken_how, claim.name
+            assert claim.fault is not None and claim.fault_description, claim.name
 
 
 def test_dimensions_agree_and_other_dimensions_differ():
@@ -82,20 +85,20 @@ def test_dimensions_agree_and_other_dimensions_differ():
     for claim in khoshzaban_machine.EXPERIMENTS[0].claims:
         assert claim.kind == "input"
         assert claim.compare([sample]).verdict == "agrees", claim.compare([sample]).simulated
-        broken = claim.compare([measure_machine(1, claim.broken or {})])
+        broken = claim.compare([measure_machine(1, claim.fault or {})])
         assert broken.verdict == "differs", broken.simulated
 
 
 @pytest.mark.nightly
 def test_identifiable_lists_are_those_of_the_document():
     claim = khoshzaban_machine.EXPERIMENTS[1].claims[0]
-    assert claim.compare([measure_lists(1, {})]).verdict == "agrees"
-    assert claim.compare([measure_lists(1, claim.broken or {})]).verdict == "differs"
+    assert claim.compare([measure_identifiable_lists(1, {})]).verdict == "agrees"
+    assert claim.compare([measure_identifiable_lists(1, claim.fault or {})]).verdict == "differs"
 
 
 @pytest.mark.parametrize("measure", [
-    khoshzaban_arm.measure_simulations, khoshzaban_arm.measure_starts, measure_exact,
-    measure_calibration, measure_search, measure_printed, measure_lists,
+    khoshzaban_arm.measure_simulations, khoshzaban_arm.measure_initial_estimates, measure_exact_readings,
+    measure_calibration, measure_bend_detection, measure_printed_parameters, measure_identifiable_lists,
 ])  # fmt: skip
 def test_unknown_settings_are_refused(measure):
     with pytest.raises(InputError, match="setting moon"):
@@ -104,7 +107,7 @@ def test_unknown_settings_are_refused(measure):
 
 def test_printed_parameters_give_some_of_the_printed_position_errors():
     """Table 7, stick 0.212 m (p. 66): 0.213 m; Table 9, stick 0.153 m (p. 71): not near."""
-    values = measure_printed(1, {}).values
+    values = measure_printed_parameters(1, {}).values
     assert values["identified.manipulator.stick"] == pytest.approx(0.212, abs=0.002)
     assert values["reidentified.manipulator.stick"] > 0.25
     for model in ("identified", "reidentified"):  # p. 67: 0.000 m, whatever is identified
@@ -116,13 +119,11 @@ def make_samples(case: str, scale: float, count: int, spread: float = 0.02) -> l
     rng = np.random.default_rng(0)
     samples = []
     for _ in range(count):
-        lengths = {
-            n: scale * published_error(case, n) + spread * rng.standard_normal() for n in LENGTHS
-        }
+        lengths = {n: scale * find_published_error(case, n) + spread * rng.standard_normal() for n in LENGTH_PARAMETERS}
         values = {f"{case}.error.{n}": v for n, v in lengths.items()}
         values |= {
             f"{case}.error.{n}": np.radians(scale * v) + spread * rng.standard_normal()
-            for n, v in zip(TWISTS, PUBLISHED_TWISTS[case], strict=True)
+            for n, v in zip(TWIST_PARAMETERS, PUBLISHED_TWISTS[case], strict=True)
         }
         values[f"{case}.largest"] = max(map(abs, lengths.values()))
         samples.append(Sample(values))
@@ -130,9 +131,9 @@ def make_samples(case: str, scale: float, count: int, spread: float = 0.02) -> l
 
 
 def test_table_4_agrees_with_its_own_errors_only():
-    assert judge_drift(make_samples("drift", 1.0, 40)).verdict == "agrees"
-    assert judge_drift(make_samples("drift", 3.0, 40)).verdict == "differs"
-    assert judge_drift(make_samples("drift", 0.0, BROKEN_REPETITIONS, 1e-9)).verdict == "differs"
+    assert evaluate_drift(make_samples("drift", 1.0, 40)).verdict == "agrees"
+    assert evaluate_drift(make_samples("drift", 3.0, 40)).verdict == "differs"
+    assert evaluate_drift(make_samples("drift", 0.0, FAULT_REPETITIONS, 1e-9)).verdict == "differs"
 
 
 def test_iterations_have_to_grow_as_much_as_published():
@@ -141,25 +142,25 @@ def test_iterations_have_to_grow_as_much_as_published():
         values = {}
         for case, count in counts.items():
             values |= {f"{case}.iterations.{link}": count * (2.0 if link == "boom" else 1.0)
-                       for link in MOVED}  # fmt: skip
+                       for link in SIMULATED_STAGES}  # fmt: skip
             values[f"{case}.total"] = 4.0 * count
         return [Sample(values)] * 10
 
-    assert judge_iterations(samples(1.0)).verdict == "agrees"
-    assert judge_iterations(samples(0.3)).verdict == "differs"
+    assert evaluate_iterations(samples(1.0)).verdict == "agrees"
+    assert evaluate_iterations(samples(0.3)).verdict == "differs"
 
 
 def test_changed_range_needs_half_of_the_published_decrease():
-    assert changed_range(0.8) == pytest.approx((0.6, 0.9))
-    assert changed_range(0.2)[0] == 0.0
+    assert compute_accepted_change(0.8) == pytest.approx((0.6, 0.9))
+    assert compute_accepted_change(0.2)[0] == 0.0
 
 
 def test_drift_alone_leaves_errors_of_the_published_size():
     """Table 4 (p. 59), d0 68 mm: one trajectory here lies within 0.04 to 0.14 m, 5 deviations."""
-    loop = khoshzaban_arm.loop_of(khoshzaban_arm.load_machine("calibrator"))
-    drifting = identify_under(loop, Condition(True), 1, 0.2)
+    loop = khoshzaban_arm.build_loop(khoshzaban_arm.load_machine("calibrator"))
+    drifting = identify_with_disturbance(loop, Disturbance(True), 1, 0.2)
     assert 0.04 < -drifting["error.p_z.swing"] < 0.14
-    still = identify_under(loop, Condition(False), 1, 0.2)
+    still = identify_with_disturbance(loop, Disturbance(False), 1, 0.2)
     errors = [abs(v) for name, v in still.items() if name.startswith("error.")]
     assert max(errors) < 1e-9  # rounding
 
@@ -174,4 +175,4 @@ def test_bent_joints_are_left_out_and_leave_smaller_errors():
     claims = {claim.name: claim for claim in khoshzaban_experiment.EXPERIMENTS[1].claims}
     labels = {panel.label for panel in measure_calibration(1, {"poses": 0.1}).panels}
     for claim in claims.values():
-        assert set(claim.panels or ()) <= labels, claim.name
+        assert set(claim.panel_labels or ()) <= labels, claim.name

@@ -14,23 +14,23 @@ from hydrotele.experiments.comparison import Experiment
 from hydrotele.experiments.khoshzaban_dynamics import (
     DRAWINGS,
     EXPERIMENTS,
-    FORCES,
+    FORCE_COMPARISON,
     IDENTIFIABILITY,
-    ITEMS,
-    NOISE,
     PREDICTION,
+    SENSOR_NOISE_EXPERIMENT,
+    TABLES_AND_FIGURES,
     UNAVAILABLE,
 )
 from hydrotele.experiments.khoshzaban_models import (
-    document_setup,
     draw_motion,
     draw_states,
     find_base,
+    make_document_setup,
     make_regressor,
     stack_rows,
 )
-from hydrotele.identify.identifiability import identifiability
-from hydrotele.multibody.tree_motion import move_tree, new_frames, wrenches
+from hydrotele.identify.identifiability import classify_parameters
+from hydrotele.multibody.tree_motion import compute_frames, compute_wrenches, make_frames
 
 BODIES = ("swing", "boom", "stick", "stick_tube", "stick_rod", "boom_tube", "boom_rod")
 
@@ -57,14 +57,14 @@ class Recursion:
         self.axis = np.empty((n, len(chain.joints), 3))
         self.force = {b: np.zeros((n, 3, 70)) for b in BODIES}
         self.torque = {b: np.zeros((n, 3, 70)) for b in BODIES}
-        frames, one, two = new_frames(tree), np.empty((3, 10)), np.empty((3, 10))
+        frames, one, two = make_frames(tree), np.empty((3, 10)), np.empty((3, 10))
         for row in range(n):
             motion = (found.position[row], found.rate[row], found.acceleration[row])
-            move_tree(tree, *motion, still, frames)
+            compute_frames(tree, *motion, still, frames)
             self.axis[row] = frames.axis
             for k, body in enumerate(BODIES):
                 b = chain.bodies.index(body) + 1
-                wrenches(frames, b, one, two)
+                compute_wrenches(frames, b, one, two)
                 own = slice(10 * k, 10 * k + 10)
                 self.place[body][row], self.x_axis[body][row] = (
                     frames.place[b],
@@ -120,9 +120,9 @@ class Recursion:
 
 @pytest.mark.parametrize("ball_joints", [True, False])
 def test_the_regressor_is_that_of_the_documents_recursion(ball_joints):
-    setup = document_setup("complete", ball_joints)
+    setup = make_document_setup("complete", ball_joints)
     found = setup.project(*draw_states(60))
-    table = setup.table(found)
+    table = setup.compute_regressor(found)
     places = [table.names.index(f"{n}.{b}") for b in BODIES for n in _PARAMETERS]
     by_recursion = Recursion(setup, found, axial_moment=not ball_joints).drives()
     matrix = table.matrix[:, :, places]
@@ -144,10 +144,10 @@ _PARAMETERS = ("mass", "moment_x", "moment_y", "moment_z", "inertia_xx", "inerti
 @pytest.mark.parametrize("seed", [1, 2])
 def test_counts_do_not_depend_on_the_states(seed):
     for ball_joints, rank, full in ((True, 51, 27), (False, 45, 20)):
-        table = make_regressor(document_setup("complete", ball_joints), draw_states(200, seed))
-        told = identifiability(stack_rows(table), table.names, table.units)
-        assert (len(told.base), told.counts["full"]) == (rank, full)
-        assert told.gap[0] > 1e6 * told.gap[1]
+        table = make_regressor(make_document_setup("complete", ball_joints), draw_states(200, seed))
+        told = classify_parameters(stack_rows(table), table.names, table.units)
+        assert (len(told.base), told.status_counts["full"]) == (rank, full)
+        assert told.singular_value_gap[0] > 1e6 * told.singular_value_gap[1]
 
 
 def test_motions_fit_the_axes_of_the_figures():
@@ -174,7 +174,9 @@ def test_parameters_come_back_from_forces_without_errors():
 
 
 @pytest.mark.daily("identifiability", "complete and reduced model")
-@pytest.mark.parametrize("experiment", [FORCES, IDENTIFIABILITY, NOISE], ids=lambda e: e.name)
+@pytest.mark.parametrize(
+    "experiment", [FORCE_COMPARISON, IDENTIFIABILITY, SENSOR_NOISE_EXPERIMENT], ids=lambda e: e.name
+)
 def test_a_broken_run_differs(experiment: Experiment):
     seeds = range(1, experiment.repetitions(3) + 1)
     samples = [experiment.measure(seed, {}) for seed in seeds]
@@ -185,11 +187,11 @@ def test_a_broken_run_differs(experiment: Experiment):
         "five times better pressure sensors, reduced model",
     }
     for claim in experiment.claims:
-        if claim.broken is None:
+        if claim.fault is None:
             assert verdicts[claim.name] == "no verdict"
             continue
         assert (verdicts[claim.name] == "differs") <= (claim.name in known)
-        broken = [experiment.measure(seed, claim.broken) for seed in seeds]
+        broken = [experiment.measure(seed, claim.fault) for seed in seeds]
         assert claim.compare(broken).verdict == "differs", claim.name
 
 
@@ -202,7 +204,7 @@ def test_a_setting_that_is_not_there_is_refused():
 def test_every_table_and_figure_is_there():
     rows = [c.item for e in EXPERIMENTS for c in e.claims] + [row.item for row in UNAVAILABLE]
     text = " ".join(rows)
-    for item in ITEMS:
+    for item in TABLES_AND_FIGURES:
         kind, number = item.split()
         assert item in DRAWINGS or _names(text, kind, int(number)), item
     assert not [item for item in DRAWINGS if _names(text, *item.split())]
@@ -210,9 +212,7 @@ def test_every_table_and_figure_is_there():
 
 def _names(text: str, kind: str, number) -> bool:
     """Whether a text such as `Figs 35 and 36, pp. 1 to 2; Tables 13 to 15` names an item."""
-    for plural, first, link, last in re.findall(
-        rf"{kind.rstrip('.')}(s?)\.? (\d+)(?: (and|to) (\d+))?", text
-    ):
+    for plural, first, link, last in re.findall(rf"{kind.rstrip('.')}(s?)\.? (\d+)(?: (and|to) (\d+))?", text):
         numbers = {int(first)}
         if plural and last:
             numbers |= set(range(int(first), int(last) + 1)) if link == "to" else {int(last)}
@@ -224,17 +224,15 @@ def _names(text: str, kind: str, number) -> bool:
 def test_every_claim_with_a_verdict_has_a_broken_run():
     for experiment in EXPERIMENTS:
         for claim in experiment.claims:
-            assert (claim.broken is None) == (claim.kind == "caption"), claim.name
-            assert bool(claim.broken_how) == (claim.broken is not None)
+            assert (claim.fault is None) == (claim.kind == "caption"), claim.name
+            assert bool(claim.fault_description) == (claim.fault is not None)
 
 
 @pytest.mark.nightly
 def test_a_prediction_by_the_reduced_model_is_as_good():
     (sample,) = [PREDICTION.measure(1, {})]
     for drive in ("swing", "boom", "stick"):
-        complete, reduced, nominal = (
-            sample.values[f"{m}.{drive}"] for m in ("complete", "reduced", "nominal")
-        )
+        complete, reduced, nominal = (sample.values[f"{m}.{drive}"] for m in ("complete", "reduced", "nominal"))
         # what the reduced model cannot reproduce is 0.3 % of the cylinders' forces at most
         assert sample.values[f"unexplained.{drive}"] < 3e-3
         assert reduced == pytest.approx(complete, rel=0.02)

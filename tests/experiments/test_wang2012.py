@@ -7,19 +7,19 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.experiments import wang_calibration, wang_identification, wang_models
-from hydrotele.experiments.comparison import BROKEN_REPETITIONS, Experiment, Judgement, Sample
+from hydrotele.experiments.comparison import FAULT_REPETITIONS, Evaluation, Experiment, Sample
 from hydrotele.experiments.wang2012 import SERIES
 from hydrotele.show.experiment_report import write_experiment_report
 
 # Repetitions of a right and of a broken run. Nightly 8: 95 % intervals of fractions of 1 then
 # exclude one half. Daily fewer, so that fewer faults contradict a row, but broken runs still do.
-DAILY, NIGHTLY = (4, 3), (8, BROKEN_REPETITIONS)
+DAILY, NIGHTLY = (4, 3), (8, FAULT_REPETITIONS)
 ALL_ITEMS = {f"Table {k}" for k in range(1, 16)} | {f"Fig. {k}" for k in range(1, 31)}
 
 FAST = (
     wang_models.KINEMATICS, wang_models.FIRST_ORDER, wang_models.PROPORTIONALITY,
-    wang_calibration.REFINED, wang_calibration.POE,
-    wang_calibration.POSES, wang_calibration.WIRE_CALIBRATION, wang_identification.RANK,
+    wang_calibration.REFINED_MODEL, wang_calibration.POE_MODEL,
+    wang_calibration.WIRE_POSES, wang_calibration.WIRE_CALIBRATION, wang_identification.RANK_EXPERIMENT,
 )  # fmt: skip
 DIFFERS = {"54 parameters are refined to 36"}  # the rank of the 54 is 50, whatever the seed
 
@@ -37,16 +37,16 @@ def items_of(text: str) -> set[str]:
 
 def test_every_table_and_figure_is_a_row_or_a_drawing():
     rows = set().union(*(items_of(claim.item) for claim in SERIES.claims.values()))
-    assert rows | set(SERIES.drawings) == ALL_ITEMS
-    assert not rows & set(SERIES.drawings)
+    assert rows | set(SERIES.items_without_result) == ALL_ITEMS
+    assert not rows & set(SERIES.items_without_result)
 
 
 def test_names_are_unique_and_captions_have_no_checks():
     claims = [claim for one in SERIES.experiments for claim in one.claims]
     assert len(claims) == len(SERIES.claims)
     for claim in claims:
-        assert (claim.broken is None) == (claim.kind == "caption")
-        assert bool(claim.broken_how) == (claim.broken is not None)
+        assert (claim.fault is None) == (claim.kind == "caption")
+        assert bool(claim.fault_description) == (claim.fault is not None)
 
 
 def measure(one: Experiment, changes, count: int) -> list[Sample]:
@@ -54,9 +54,7 @@ def measure(one: Experiment, changes, count: int) -> list[Sample]:
 
 
 @pytest.mark.daily("20 poses with wires-few")
-@pytest.mark.parametrize(
-    "counts", [DAILY, pytest.param(NIGHTLY, marks=pytest.mark.nightly)], ids=["few", "many"]
-)
+@pytest.mark.parametrize("counts", [DAILY, pytest.param(NIGHTLY, marks=pytest.mark.nightly)], ids=["few", "many"])
 @pytest.mark.parametrize("one", FAST, ids=lambda one: one.name)
 def test_rows_agree_and_their_broken_runs_differ(one: Experiment, counts):
     samples = measure(one, {}, counts[0])
@@ -68,8 +66,8 @@ def test_rows_agree_and_their_broken_runs_differ(one: Experiment, counts):
         # intervals of few repetitions may hold both verdicts, but must not contradict
         wrong = "agrees" if claim.name in DIFFERS else "differs"
         assert row.verdict != wrong, row.simulated
-        assert claim.broken is not None
-        broken = claim.compare(measure(one, claim.broken, counts[1]))
+        assert claim.fault is not None
+        broken = claim.compare(measure(one, claim.fault, counts[1]))
         assert broken.verdict == "differs", (claim.name, broken.simulated)
 
 
@@ -79,8 +77,8 @@ def test_an_unknown_setting_is_refused(one: Experiment):
         one.measure(1, {"magic": 1})
 
 
-def judge(name: str, *values: dict[str, float]) -> Judgement:
-    return SERIES.claims[name].judge([Sample(one) for one in values])
+def judge(name: str, *values: dict[str, float]) -> Evaluation:
+    return SERIES.claims[name].evaluate([Sample(one) for one in values])
 
 
 def test_a_search_that_ends_too_high_differs():
@@ -116,7 +114,7 @@ def test_forward_kinematics_that_miss_differ():
 
 
 def test_every_posterior_figure_shows_the_parameters_of_its_caption(tmp_path):
-    captions = wang_identification.CAPTIONS
+    captions = wang_identification.FIGURE_CAPTIONS
     names = np.unique([name for _, shown, _ in captions.values() for name in shown])
     values = {f"{figure} {name}": 0.1 for figure, (_, shown, _) in
               captions.items() for name in shown[1:]}  # fmt: skip

@@ -8,7 +8,7 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.experiments import zhu_felling, zhu_forces, zhu_motion, zhu_tables
-from hydrotele.experiments.comparison import Sample, break_series
+from hydrotele.experiments.comparison import Sample, run_with_faults
 from hydrotele.experiments.zhu1994 import SERIES
 
 SEED = Path(__file__).parents[3] / "shared" / "seeds" / "zhu1994_teleoperation.txt"
@@ -64,18 +64,16 @@ def test_claims_are_named_once_and_can_be_broken():
     assert len(SERIES.claims) == sum(len(one.claims) for one in SERIES.experiments)
     for claim in SERIES.claims.values():
         judged = claim.kind in ("document", "additional")
-        assert not judged or (claim.broken and claim.broken_how), claim.name
+        assert not judged or (claim.fault and claim.fault_description), claim.name
         additional = claim.item.startswith("additional")
         assert additional == (claim.kind == "additional"), claim.name
 
 
-@pytest.mark.parametrize(
-    ("kind", "number"), [("Table", n) for n in TABLES] + [("Fig", n) for n in FIGURES]
-)
+@pytest.mark.parametrize(("kind", "number"), [("Table", n) for n in TABLES] + [("Fig", n) for n in FIGURES])
 def test_every_table_and_figure_is_there(kind, number):
     """As `Fig. 6.45`, `Figs 3.15, 3.16`, `Figs 6.37-6.40` or `Figure 1.1` of a row or a drawing."""
     items = [claim.item for claim in SERIES.claims.values()]
-    items += [row.item for row in SERIES.unavailable] + list(SERIES.drawings)
+    items += [row.item for row in SERIES.unavailable] + list(SERIES.items_without_result)
     chapter, place = map(int, number.split("."))
     for item in items:
         for words in re.findall(rf"{kind}[a-z.]* ([\d., -]+)", item):
@@ -87,8 +85,8 @@ def test_every_table_and_figure_is_there(kind, number):
 
 @pytest.mark.nightly
 def test_criteria_fail_on_a_broken_run():
-    names = {c.name for c in zhu_tables.TABLES.claims}
-    rows = [row for _, row in break_series(SERIES, sorted(names), jobs=1)]
+    names = {c.name for c in zhu_tables.TABLE_COMPARISON.claims}
+    rows = [row for _, row in run_with_faults(SERIES, sorted(names), jobs=1)]
     assert {row.name for row in rows} == names
     assert {row.verdict for row in rows} == {"differs"}
 
@@ -96,7 +94,7 @@ def test_criteria_fail_on_a_broken_run():
 def test_tables_of_the_models_agree_but_for_the_rotational_damping():
     """The joystick's rotational damping is an assumption, which the rows of its gains say."""
     sample = zhu_tables.measure_tables(1, {})
-    verdicts = {c.name: c.compare([sample]).verdict for c in zhu_tables.TABLES.claims}
+    verdicts = {c.name: c.compare([sample]).verdict for c in zhu_tables.TABLE_COMPARISON.claims}
     differ = {"joystick gains for the excavator", "joystick gains for the feller-buncher"}
     assert {name for name, verdict in verdicts.items() if verdict == "differs"} == differ
     assert set(verdicts.values()) == {"agrees", "differs"}
@@ -116,9 +114,7 @@ def test_centring_force_is_a_line_and_detents_are_not():
     Each row's broken run is the other row's run.
     """
     rows = SERIES.claims["conventional centring force"], SERIES.claims["detents"]
-    assert rows[0].broken == {"pilot.detent": "true"} and rows[1].broken == {
-        "pilot.detent": "false"
-    }
+    assert rows[0].fault == {"pilot.detent": "true"} and rows[1].fault == {"pilot.detent": "false"}
     for detent, verdicts in (("false", ("agrees", "differs")), ("true", ("differs", "undecided"))):
         samples = [zhu_motion.measure_handle_ramp(detent, seed, {}) for seed in (1, 2, 3)]
         assert tuple(row.compare(samples).verdict for row in rows) == verdicts
@@ -134,7 +130,7 @@ def test_a_line_is_straight():
 
 @pytest.mark.nightly
 def test_direct_force_is_unstable_when_large():
-    assert zhu_forces.measure_direct(4.0e-4, 1, {}).values["ripple"] > 0.5
+    assert zhu_forces.measure_direct_feedback(4.0e-4, 1, {}).values["ripple"] > 0.5
 
 
 _CASES = ("rate", "calm", "fast", "slow_rate", "slow_position")
@@ -203,4 +199,4 @@ def test_head_presses_on_the_stem_and_not_on_the_stump():
     values = zhu_felling.measure_felling(2, {"duration": "14.0"}).values
     assert values["touched"] < 14.0 < values["saw"]
     assert values["stem"] > 500.0 and values["stump"] == 0.0
-    assert values["stiffness_change"] > zhu_felling.JUST_NOTICEABLE
+    assert values["stiffness_change"] > zhu_felling.JUST_NOTICEABLE_DIFFERENCE

@@ -9,7 +9,7 @@ import pytest
 from hydrotele.core.errors import InputError
 from hydrotele.experiments import zhu_control, zhu_identification
 from hydrotele.experiments.zhu_identification import fail_sensors, measure_outliers
-from hydrotele.experiments.zhu_two_port import read_settings
+from hydrotele.experiments.zhu_two_port import merge_settings
 from hydrotele.logs.log import Log
 
 EXPERIMENTS = (*zhu_control.EXPERIMENTS, *zhu_identification.EXPERIMENTS)
@@ -65,19 +65,19 @@ def test_claims_can_be_broken_and_begin_with_their_page():
         additional = claim.kind == "additional"
         assert claim.item.startswith("additional" if additional else "p. "), claim.name
         if claim.kind in ("document", "additional"):
-            assert claim.broken is not None and claim.broken_how, claim.name
+            assert claim.fault is not None and claim.fault_description, claim.name
 
 
 @pytest.mark.daily("inverse kinematics", "force feed-forward error")
-@pytest.mark.parametrize("one", [e for e in EXPERIMENTS if e.repetitions_fixed == 1],
+@pytest.mark.parametrize("one", [e for e in EXPERIMENTS if e.fixed_repetitions == 1],
                          ids=lambda one: one.name)  # fmt: skip
 def test_exact_rows_agree_and_differ_when_broken(one):
     samples = [one.measure(1, {})]
     for claim in one.claims:
         expected = "differs" if claim.name in EXPECTED_TO_DIFFER else "agrees"
         assert claim.compare(samples).verdict == expected, claim.name
-        if claim.broken is not None:
-            assert claim.compare([one.measure(1, claim.broken)]).verdict == "differs", claim.name
+        if claim.fault is not None:
+            assert claim.compare([one.measure(1, claim.fault)]).verdict == "differs", claim.name
 
 
 @pytest.mark.parametrize("name", ["theorem 4-2", "task identification"])
@@ -86,7 +86,7 @@ def test_drawn_rows_agree_and_differ_when_broken(name):
     samples = [one.measure(seed, {}) for seed in range(1, 7)]
     for claim in one.claims:
         assert claim.compare(samples).verdict == "agrees"
-        broken = [one.measure(seed, claim.broken) for seed in range(1, 7)]
+        broken = [one.measure(seed, claim.fault) for seed in range(1, 7)]
         assert claim.compare(broken).verdict == "differs"
 
 
@@ -94,7 +94,7 @@ def test_unknown_changes_are_refused():
     with pytest.raises(InputError, match="valid: failures, remove"):
         measure_outliers(1, {"remove_outliers": True})
     with pytest.raises(InputError, match="unknown"):
-        read_settings({"delay": 1.0}, damping=2.0)
+        merge_settings({"delay": 1.0}, damping=2.0)
 
 
 def test_failed_sensors_read_zero_for_a_while():

@@ -21,7 +21,7 @@ from hydrotele.gap.result import (
 from hydrotele.logs.dataset import RunData
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.machine.signals import usual_unit
+from hydrotele.machine.signals import default_unit
 from hydrotele.terms.law import Term
 
 NOISE = {"angle": 1.0e-3, "length": 1.2e-3, "pressure_head": 1e5, "pressure_rod": 1e5}
@@ -43,7 +43,7 @@ def made_up_log(rows: int = _ROWS) -> Log:
     for name in columns:
         if not name.startswith("command"):
             columns[name] = columns[name] + NOISE[name.split(".")[0]] * rng.normal(size=rows)
-    units = {name: usual_unit(name) for name in columns}
+    units = {name: default_unit(name) for name in columns}
     return Log(time, columns, units, {"machine": "cat215", "tool": "none"}, "data/test_1.parquet")
 
 
@@ -84,9 +84,7 @@ def patched_machine(machine):
     return machine
 
 
-_PAYLOAD = NamedEffect(
-    "payload", "tool", 0.9997, {"mass": Estimate(251.3, "kg", 247.9, 254.6, 0.0)}, share=0.63
-)
+_PAYLOAD = NamedEffect("payload", "tool", 0.9997, {"mass": Estimate(251.3, "kg", 247.9, 254.6, 0.0)}, share=0.63)
 _KNOT = 0.55  # m, where the learned law begins
 _PER_METRE = 3.0e5  # N/m, its slope from there
 

@@ -6,7 +6,7 @@ import functools
 import numpy as np
 import pytest
 
-from hydrotele.effects.effect import changed
+from hydrotele.effects.effect import with_value
 from hydrotele.estimate.reduced_model import (
     advance,
     model_space,
@@ -20,9 +20,9 @@ from hydrotele.gap.balances import balances, peak_lag, pump_lack, window_lags
 from hydrotele.gap.law_tables import Table, lack_regression
 from hydrotele.logs.log import Log, load_log
 from hydrotele.machine.drives import Transmission
-from hydrotele.machine.machine import SensorError, noise_rms, sensor_set
+from hydrotele.machine.machine import SensorError, get_sensors, noise_rms
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.machine.signals import usual_unit
+from hydrotele.machine.signals import default_unit
 from hydrotele.simulate.plant import build_plant, rest_state
 from hydrotele.terms.law import Term
 from tests.estimate.test_filter import machine_data
@@ -38,7 +38,7 @@ def recorded(machine, seconds=20.0, seed=0):
     rest, channels = rest_state(plant), predicted_channels(machine)
     model = reduced_model(machine, channels)
     space, z = model_space(model), np.zeros(state_size(model))
-    free, total = len(model.mech.free), (len(z) - 4 * model.hydraulic) // 2
+    free, total = len(model.mech.independent), (len(z) - 4 * model.hydraulic) // 2
     z[:free], z[2 * total :] = rest.qpos[plant.qpos], rest.act
     z[free:total] = rest.qpos[plant.drive_qpos[model.gear >= 0]]
     rows, steps, home = round(seconds / PERIOD), 40, z[:free].copy()
@@ -52,12 +52,12 @@ def recorded(machine, seconds=20.0, seed=0):
         error = (wanted - z[:free]) * np.where(np.arange(free) > 1, -1, 1)  # stick: out = angle up
         command[row] = np.clip(0.05 * np.tanh(200 * error) + 4 * error, -1, 1)
         advance(model, space, z, command, row, PERIOD, steps, trail)
-    rng, sensors = np.random.default_rng(seed), sensor_set(machine, SENSORS)
+    rng, sensors = np.random.default_rng(seed), get_sensors(machine, SENSORS)
     columns = {f"command.{axis}": command[:, i] for i, axis in enumerate(plant.axes)}
     for i, name in enumerate(channels):
         bound = np.sqrt(3) * noise_rms(machine, sensors, name)
         columns[name] = out[:, i] + rng.uniform(-bound, bound, rows)
-    units = {name: usual_unit(name) for name in columns}
+    units = {name: default_unit(name) for name in columns}
     return Log(PERIOD * np.arange(rows), columns, units)
 
 
@@ -69,9 +69,7 @@ def clean_log():
 def judged(machine, log, sensors=SENSORS):
     """(law, axis) -> normalised RMS."""
     found = balances(machine, log, sensors)
-    return {
-        (law, axis): b.normalised_rms for law, axes in found.items() for axis, b in axes.items()
-    }
+    return {(law, axis): b.normalised_rms for law, axes in found.items() for axis, b in axes.items()}
 
 
 def without(log, *kinds):
@@ -112,7 +110,7 @@ CHANGES = {  # of the real machine: (path, value, places that must stand out)
 def test_a_changed_machine_stands_out_in_its_law_alone(case):
     path, value, places = CHANGES[case]
     nominal = load_machine("cat215")
-    real = changed(nominal, path, value)
+    real = with_value(nominal, path, value)
     log = recorded(real)
     found = judged(nominal, log)
     assert min(found[place] for place in places) > 2.5
@@ -127,7 +125,7 @@ def test_a_changed_machine_stands_out_in_its_law_alone(case):
 
 def test_the_force_balance_sees_a_drive_behind_its_transmission():
     gear = Transmission(inertia=2000.0, stiffness=3e7, damping=1e5)
-    real = changed(load_machine("cat215"), "axes.swing.transmission", gear)
+    real = with_value(load_machine("cat215"), "axes.swing.transmission", gear)
     assert judged(real, recorded(real))["force", "swing"] < 1.5
 
 
@@ -186,9 +184,7 @@ def test_a_residual_has_its_unit_and_its_numbers_fit_together():
     balance = found["force"]["stick"]
     assert balance.residual.shape == balance.noise.shape == balance.time.shape == (1000,)
     assert balance.rms == pytest.approx(np.sqrt(np.mean(balance.residual**2)))
-    assert balance.normalised_rms == pytest.approx(
-        np.sqrt(np.mean((balance.residual / balance.noise) ** 2))
-    )
+    assert balance.normalised_rms == pytest.approx(np.sqrt(np.mean((balance.residual / balance.noise) ** 2)))
 
 
 def test_a_plain_drive_needs_no_pressures():
@@ -199,7 +195,7 @@ def test_a_plain_drive_needs_no_pressures():
     f, drive = axis.drive.friction, axis.force
     dry = f.coulomb * np.tanh(rate / f.smoothing_velocity)
     force = link.mass * acceleration + dry + f.viscous * rate + drive.offset
-    mass_only = changed(machine, f"axes.{name}.force.friction", type(f)(**{
+    mass_only = with_value(machine, f"axes.{name}.force.friction", type(f)(**{
         "coulomb": f.coulomb, "viscous": f.viscous, "smoothing_velocity": f.smoothing_velocity
     }))  # fmt: skip
     middle = 0.13  # m, far from both ends of the travel
@@ -280,8 +276,8 @@ def test_the_delay_of_open_03_is_read_off_in_seconds():
 def test_what_a_pump_lacks_is_read_off_where_it_is_short(slow):
     nominal = load_machine("cat215")
     if slow:
-        nominal = changed(nominal, "supply.time_constant", 0.1)
-    nominal = changed(nominal, "supply.pump_flow", 0.6 * nominal.supply.pump_flow)
+        nominal = with_value(nominal, "supply.time_constant", 0.1)
+    nominal = with_value(nominal, "supply.pump_flow", 0.6 * nominal.supply.pump_flow)
     law = {"velocity": 4.0e-3}
     term = Term(name="more", axis="boom", balance="flow_supply", law="formula", parameters=law,
                 of={"velocity": "swing"})  # fmt: skip
@@ -313,7 +309,7 @@ def test_a_pump_lacks_nothing_that_cannot_be_read():
     lack, deviation = pump_lack(nominal, data, data.heldout, data.noise)
     short = np.isfinite(lack)
     assert not short.any() or np.median(np.abs(lack[short])) < 3.0 * np.median(deviation[short])
-    senses = changed(nominal, "supply.kind", "load_sensing")  # a load that swings is no short flow
+    senses = with_value(nominal, "supply.kind", "load_sensing")  # a load that swings is no short flow
     data, _ = machine_data(senses, senses)
     lack, _ = pump_lack(senses, data, data.heldout, data.noise)
     assert np.count_nonzero(np.isfinite(lack)) <= 2  # of 600: the first rows are a start

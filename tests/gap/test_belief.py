@@ -16,9 +16,7 @@ def effect(name, location, probability=0.95):
 
 
 def law(axis, share):
-    return LearnedLaw(
-        "force", axis, "", "", "", "", np.zeros(0), np.zeros(0), np.zeros(0), "N", "", share
-    )
+    return LearnedLaw("force", axis, "", "", "", "", np.zeros(0), np.zeros(0), np.zeros(0), "N", "", share)
 
 
 def chances(named, laws=(), left=LEFT, lost=("stick",)):
@@ -62,9 +60,7 @@ def test_effects_of_all_axes_are_judged_by_all_channels():
     assert found["bulk_modulus"] < 0.01
 
 
-@pytest.mark.parametrize(
-    ("part", "low", "high"), [(0.1, 0, 0.1), (0.35, 0.49, 0.51), (0.7, 0.9, 1)]
-)
+@pytest.mark.parametrize(("part", "low", "high"), [(0.1, 0, 0.1), (0.35, 0.49, 0.51), (0.7, 0.9, 1)])
 def test_the_part_of_what_was_lacking(part, low, high):
     assert low < believed_part(part) < high
 

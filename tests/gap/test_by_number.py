@@ -77,10 +77,8 @@ def test_friction_of_all_positions_is_coulomb_friction(monkeypatch, width, names
     group = calibration(evidence.data.machine, frozenset())
     (own,) = (p for key, p in group.parameters.items() if key == NUMBER)
     size = np.zeros(group.size)
-    size[list(group.parameters).index(NUMBER)] = 500.0 / own.scale
-    rest = (TRUE - own.nominal - 500.0 - effect.parameters["coulomb"].nominal) / effect.parameters[
-        "coulomb"
-    ].scale
+    size[list(group.parameters).index(NUMBER)] = 500.0 / own.prior_std
+    rest = (TRUE - own.nominal - 500.0 - effect.parameters["coulomb"].nominal) / effect.parameters["coulomb"].prior_std
     bump = np.array([rest if key == "coulomb" else 0.0 for key in effect.parameters])
     now, fit = settled(evidence, evidence.judged(Guess(((effect, bump), (group, size)))))
     found = search._by_number(evidence, search._Grown(now, fit), candidates)
@@ -88,8 +86,6 @@ def test_friction_of_all_positions_is_coulomb_friction(monkeypatch, width, names
     if PLACE not in names:
         value = dict(zip(found.now.guess.names, found.now.guess.deviation, strict=True))
         plain = next(h for h in found.now.guess.hypotheses if h.name == "coulomb_friction")
-        told = (
-            plain.parameters["coulomb"].nominal + value[NUMBER] * plain.parameters["coulomb"].scale
-        )
+        told = plain.parameters["coulomb"].nominal + value[NUMBER] * plain.parameters["coulomb"].prior_std
         assert told == pytest.approx(TRUE, rel=0.01)  # the bump falls by 0.04 % within the range
         assert not any(CALIBRATION in n and NUMBER in n for n in found.now.guess.names)

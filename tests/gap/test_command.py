@@ -85,9 +85,7 @@ def test_the_patched_machine_runs_and_is_replayed(site, searching):
     code, _, err = invoke("run", "steps", "--machine", patched, *short)
     assert code == 0, err
     assert load_machine(site / "again").links["payload"].mass == 250.0
-    code, out, err = invoke(
-        "replay", "again/measured.parquet", "--machine", patched, "--json", "--out", "replayed"
-    )
+    code, out, err = invoke("replay", "again/measured.parquet", "--machine", patched, "--json", "--out", "replayed")
     assert code == 0, err
     assert "summary.json" in names(site / "replayed")
     channels = json.loads(out)["channels"]

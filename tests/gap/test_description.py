@@ -40,9 +40,7 @@ def learned(table, entries, balance="force", axis="boom", covariance=None):
 
 def test_a_curve_is_its_table_with_the_band_of_its_entries():
     covariance = np.array([[4.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 9.0]])
-    found = learned(
-        Table(("position",), ((0.3, 0.5, 0.7),)), [100.0, -200.0, 300.0], covariance=covariance
-    )
+    found = learned(Table(("position",), ((0.3, 0.5, 0.7),)), [100.0, -200.0, 300.0], covariance=covariance)
     x = np.array(found.points)
     np.testing.assert_allclose(found.values, np.interp(x, (0.3, 0.5, 0.7), (100, -200, 300)))
     part = np.clip((x - 0.3) / 0.2, 0.0, 1.0)
@@ -83,9 +81,7 @@ def predictions(loud):
     inside = (time >= loud[0]) & (time < loud[1])
     whitened[inside, 1] *= 10.0
     nothing = np.zeros((1000, 2))
-    return Prediction(
-        "made", time, ("angle.boom", "pressure_head.boom"), nothing, nothing, whitened
-    )
+    return Prediction("made", time, ("angle.boom", "pressure_head.boom"), nothing, nothing, whitened)
 
 
 def test_what_is_left_is_located_in_balance_channel_and_time():

@@ -40,7 +40,7 @@ from hydrotele.machine.machine_file import load_machine, save_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import Scenario
 from hydrotele.terms.law import Drives, DriveState, Term
-from hydrotele.terms.table import FORCE, PLAY, SWITCH, added, remember, terms_table
+from hydrotele.terms.table import FORCE, PLAY, SWITCH, sum_terms, terms_table, update_term_state
 from tests.estimate.test_filter import machine_data
 
 PERIOD, SECONDS = 0.01, 7.0
@@ -172,9 +172,7 @@ def test_every_table_is_a_term_that_adds_what_its_columns_say(made_up):
             act[0] = made_up["spool.swing"][row]
             act[10:] = made_up["force.stick"][row] * np.array([2.0, 2.0])
             drives = Drives(3, act, np.zeros(3), np.array([swing, 0, 0]), np.array([0, 0, stick]))
-            got = added(
-                written, FORCE, 1, DriveState(**own, spool_rate=0.0, played=0.0, ahead=0.0), drives
-            )
+            got = sum_terms(written, FORCE, 1, DriveState(**own, spool_rate=0.0, played=0.0, ahead=0.0), drives)
             assert got == pytest.approx(columns[row] @ entries, rel=1e-9, abs=1e-12)
 
 
@@ -203,11 +201,7 @@ def test_every_table_with_a_memory_is_such_a_term():
         for t in paired_tables([values], 0.01, others=True)
         if t.variables in (("velocity", "spool.swing"), ("velocity", "velocity.swing"))
     ]
-    tables = [
-        t
-        for table in first + second
-        for t in remembering_tables(table, [values], list(_OF_MEMORIES))
-    ]
+    tables = [t for table in first + second for t in remembering_tables(table, [values], list(_OF_MEMORIES))]
     ways = {(t.memory.way, t.memory.variable, len(t.variables)) for t in tables}
     assert ways >= {(PLAY, "velocity", 1), (PLAY, "velocity", 2), (SWITCH, "command.stick", 1),
                     (SWITCH, "velocity", 2)}  # fmt: skip
@@ -220,14 +214,14 @@ def test_every_table_with_a_memory_is_such_a_term():
         columns, told = table.columns(values), []
         for row in range(400):
             now = {name: column[row] for name, column in values.items()}
-            held = remember(written, 0, now[table.memory.variable], held)
+            held = update_term_state(written, 0, now[table.memory.variable], held)
             act = np.append(np.zeros(12), held)
             act[0] = now["spool.swing"]
             drives = Drives(3, act, np.zeros(3), np.array([now["velocity.swing"], 0, 0]),
                             np.array([0, 0, now["command.stick"]]))  # fmt: skip
             own = {name: now[name] for name in now if "." not in name}
             state = DriveState(**own, spool_rate=0.0, force=0.0, played=0.0, ahead=0.0)
-            told.append(added(written, FORCE, 1, state, drives))
+            told.append(sum_terms(written, FORCE, 1, state, drives))
         assert told == pytest.approx(columns @ entries, rel=1e-9, abs=1e-9)
         assert np.ptp(told) > 0.0
 
@@ -340,10 +334,7 @@ def test_a_smooth_surface_is_found_among_other_tables():
     x, y = values["velocity"], values["pressure_rod"]
     told = np.cos(1.5 * x + y) + rng.normal(size=6000)
     parts = cut(told, values)
-    shares = {
-        table.variables: at_a_glance(table, parts).sum()
-        for table in paired_tables([values], 0.01, others=True)
-    }
+    shares = {table.variables: at_a_glance(table, parts).sum() for table in paired_tables([values], 0.01, others=True)}
     assert max(shares, key=shares.__getitem__) in (
         ("velocity", "pressure_rod"), ("pressure_rod", "velocity")
     )  # fmt: skip
@@ -375,9 +366,7 @@ def test_one_lost_window_says_little_and_what_is_below_noise_nothing(monkeypatch
     found = SimpleNamespace(horizons={"1": near})
     monkeypatch.setattr(discover, "machine_runner", lambda *_: lambda run: None)
     monkeypatch.setattr(discover, "free_run_errors", lambda *_, to_end: found)
-    evidence: Any = SimpleNamespace(
-        data=SimpleNamespace(machine=None), map=lambda f, x: [*map(f, x)]
-    )
+    evidence: Any = SimpleNamespace(data=SimpleNamespace(machine=None), map=lambda f, x: [*map(f, x)])
     judged: Any = SimpleNamespace(guess=SimpleNamespace(machine=lambda machine: machine))
     run: Any = None
     ahead = discover.open_loop(evidence, [run], judged, np.ones(2))

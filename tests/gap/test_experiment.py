@@ -8,7 +8,7 @@ import yaml
 
 from hydrotele.effects import EFFECTS
 from hydrotele.gap.experiment import MOTIONS, OF_EFFECT, OF_LAW, next_experiment
-from hydrotele.kinematics.arm import forward
+from hydrotele.kinematics.arm import forward_kinematics
 from hydrotele.kinematics.from_machine import arm_geometry
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
@@ -45,7 +45,7 @@ def folder(tmp_path_factory):
 
 def test_every_effect_and_every_law_has_a_motion():
     assert OF_EFFECT.keys() == EFFECTS.keys()
-    assert OF_LAW.keys() >= {effect.law for effect in EFFECTS.values()}
+    assert OF_LAW.keys() >= {effect.model_part for effect in EFFECTS.values()}
     used = {name for names in (*OF_EFFECT.values(), *OF_LAW.values()) for name in names}
     assert used == MOTIONS.keys() == EXAMPLES.keys()
 
@@ -63,7 +63,7 @@ def test_experiment_runs_inside_the_ranges_and_above_the_ground(motion, folder):
     geometry = arm_geometry(CAT)
     poses = np.column_stack([truth[f"angle.{a}"] for a in ("swing", "boom", "stick")])
     # 0.4 m are planned; servos overshoot and ways between two poses bend.
-    assert min(forward(geometry, q)[2] for q in poses[::10]) > 0.1
+    assert min(forward_kinematics(geometry, q)[2] for q in poses[::10]) > 0.1
 
 
 @pytest.mark.nightly

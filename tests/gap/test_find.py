@@ -21,7 +21,7 @@ from hydrotele.gap.discover import Discovery, OpenLoop
 from hydrotele.gap.find import find_gap, without_details
 from hydrotele.gap.result import Estimate, NamedEffect
 from hydrotele.gap.search import Found
-from hydrotele.logs.dataset import Dataset, busiest, load_dataset
+from hydrotele.logs.dataset import Dataset, load_dataset, select_exciting_segments
 from hydrotele.logs.log import Log, load_log, save_log
 from hydrotele.machine.machine_file import load_machine
 from tests.measured import MEASURED
@@ -29,7 +29,7 @@ from tests.measured import MEASURED
 
 def half(folder, seconds: float = 60.0) -> Dataset:
     """The logs of a folder, 20 of the 40 s of every fitted run."""
-    return busiest(load_dataset([folder], load_machine("cat215")), seconds)
+    return select_exciting_segments(load_dataset([folder], load_machine("cat215")), seconds)
 
 
 def found(folder):
@@ -171,11 +171,7 @@ class Learning:
 
 def searched(without: float) -> Any:
     """A search that found an offset, with a loss of 50 and one of its own without it."""
-    (offset,) = (
-        h
-        for h in hypotheses(load_machine("cat215", "none"), ("command_offset",))
-        if h.location == "boom"
-    )
+    (offset,) = (h for h in hypotheses(load_machine("cat215", "none"), ("command_offset",)) if h.location == "boom")
     effect = Judged(Guess(((offset, np.ones(1)),)), (), 50.0)
     track: Any = SimpleNamespace(levels=SimpleNamespace(noise=np.ones(2)))
     base = Judged(Guess(), (track,), without)
@@ -190,9 +186,7 @@ def discovery(search, effect: bool, loss: float, charge: float | None, *ahead: f
     return Discovery(Judged(guess, (), loss), laws, 0, errors, before)
 
 
-def learned(
-    monkeypatch, search, beside: Discovery, alone: Discovery, again: Discovery | None = None
-):
+def learned(monkeypatch, search, beside: Discovery, alone: Discovery, again: Discovery | None = None):
     """Whether the effect stays, and what is taken to be learned; `again`: its laws without it."""
     monkeypatch.setattr(find, "discover", Learning(beside, alone))
     none = discovery(search, False, 1000.0, None, *BARE)
@@ -209,9 +203,7 @@ def learned(
     (52.6, None, GOOD, False),  # they do not
     (500.0, 20.0, NEAR, True),  # an effect that can be believed stays
 ])  # fmt: skip
-def test_laws_are_learned_of_all_that_lacks_where_no_effect_can_be_believed(
-    monkeypatch, without, by_laws, ahead, kept
-):
+def test_laws_are_learned_of_all_that_lacks_where_no_effect_can_be_believed(monkeypatch, without, by_laws, ahead, kept):
     search = searched(without)
     charge = None if by_laws is None else 1.0
     alone = discovery(search, False, by_laws or without, charge, *ahead)
@@ -229,9 +221,7 @@ def test_laws_are_learned_of_all_that_lacks_where_no_effect_can_be_believed(
     (-20.0, 19.0, GOOD, False),  # laws that need more cost more than the effect saves
     (-2.0, 4.0, GOOD, False),  # they leave more
 ])  # fmt: skip
-def test_laws_alone_stand_for_an_effect_that_does_a_part_of_their_work(
-    monkeypatch, loss, charge, ahead, stands
-):
+def test_laws_alone_stand_for_an_effect_that_does_a_part_of_their_work(monkeypatch, loss, charge, ahead, stands):
     search = searched(140.0)  # without the effect, which takes 64 % of what is lacking
     alone = discovery(search, False, loss, charge, *ahead)
     beside = discovery(search, True, -20.0, 1.0, *GOOD)
@@ -268,9 +258,7 @@ def test_laws_alone_are_not_tried_where_an_effect_does_most(monkeypatch, without
     (True, 0.5, False),
     (False, 1.2, False),  # effects alone are judged on the held-out run
 ])  # fmt: skip
-def test_laws_are_learned_without_a_calibration_whose_machine_runs_away(
-    monkeypatch, calibrated, errors, emptied
-):
+def test_laws_are_learned_without_a_calibration_whose_machine_runs_away(monkeypatch, calibrated, errors, emptied):
     search = searched(500.0)
     if calibrated:
         group = Hypothesis(CALIBRATION, "all", {}, None)
@@ -290,9 +278,7 @@ def test_laws_are_learned_without_a_calibration_whose_machine_runs_away(
 
 @pytest.mark.daily("True")
 @pytest.mark.parametrize("after_laws", [False, True])
-def test_effects_that_make_the_held_out_run_worse_are_taken_back_and_laws_learned_without(
-    monkeypatch, after_laws
-):
+def test_effects_that_make_the_held_out_run_worse_are_taken_back_and_laws_learned_without(monkeypatch, after_laws):
     learned_of = []
 
     def searched(evidence, candidates, progress):
@@ -328,9 +314,7 @@ def test_truth_columns_change_nothing(tmp_path):
 def test_what_may_only_make_up_for_something_else_is_a_detail():
     """Not where it is of another axis and nothing is lacking, or closes more of the gap."""
 
-    def effect(
-        name: str, location: str, share: float, low: float = 0.5, probability: float = 0.99
-    ) -> NamedEffect:
+    def effect(name: str, location: str, share: float, low: float = 0.5, probability: float = 0.99) -> NamedEffect:
         numbers = {"size": Estimate(1.0, "N", low, 1.5, 0.0)}
         return NamedEffect(name, location, probability, numbers, (), share)
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hydrotele.effects.effect import changed
+from hydrotele.effects.effect import with_value
 from hydrotele.estimate.hypothesis import numbers
 from hydrotele.gap.calibrating import calibrate_freely
 from hydrotele.logs.dataset import Dataset, RunData
@@ -11,9 +11,7 @@ from hydrotele.logs.log import Log
 from hydrotele.machine.machine_file import load_machine
 from tests.estimate.test_pump_drive import CHANNELS, NOISE, PERIOD, simulated
 
-DUTY = np.repeat(
-    [0.0, 0.7, 0.0, -0.5, 0.0, 0.5, 0.8, -0.6, 0.0], [220, 150, 50, 100, 50, 80, 60, 150, 40]
-)
+DUTY = np.repeat([0.0, 0.7, 0.0, -0.5, 0.0, 0.5, 0.8, -0.6, 0.0], [220, 150, 50, 100, 50, 80, 60, 150, 40])
 WRONG = {  # path -> factor: what the data sheet says over what is right
     "axes.piston.cylinder.area_rod": 1.12, "axes.piston.pump.motor.emf": 1.2,
     "axes.piston.pump.motor.inertia": 2.0,
@@ -37,12 +35,12 @@ def value(machine, path):
 @pytest.mark.nightly
 def test_wrong_figures_of_a_data_sheet_are_found():
     """Each within a third of what it was off by, of 9 s of motion; the rest stays uncertain."""
-    truth = changed(load_machine("eha", "load_30_bar"), "sensor_errors", {})
+    truth = with_value(load_machine("eha", "load_30_bar"), "sensor_errors", {})
     sheet = truth
     for path, factor in WRONG.items():
-        sheet = changed(sheet, path, factor * value(truth, path))
+        sheet = with_value(sheet, path, factor * value(truth, path))
     share = {"area.piston.area_rod": 0.1, "motor_constant": 0.2, "motor_inertia": 0.5}
-    sheet = changed(sheet, "uncertainty", share)
+    sheet = with_value(sheet, "uncertainty", share)
     data = dataset(sheet, truth)
     found = calibrate_freely(data, 1)
     assert found
@@ -52,20 +50,18 @@ def test_wrong_figures_of_a_data_sheet_are_found():
     # what is left uncertain is what the interval says, and the search begins with that
     before, after = numbers(sheet), numbers(found.machine)
     for key, told in found.numbers.items():
-        scale, reach = after[key].parameter.scale, 1.96 * before[key].parameter.scale
+        scale, reach = after[key].parameter.prior_std, 1.96 * before[key].parameter.prior_std
         wide = told.high - told.low
         assert wide <= 2.0 * 1.96 * scale * (1.0 + 1e-6) and 1.96 * scale <= reach * (1.0 + 1e-6)
-    assert after["area.piston.area_rod"].parameter.scale < 0.3 * (
-        before["area.piston.area_rod"].parameter.scale
+    assert after["area.piston.area_rod"].parameter.prior_std < 0.3 * (
+        before["area.piston.area_rod"].parameter.prior_std
     )
     assert found.undone_by(data, sheet, 1) and not found.undone_by(data, found.machine, 1)
-    assert calibrate_freely(dataset(changed(sheet, "uncertainty", {}), truth), 1) is None
+    assert calibrate_freely(dataset(with_value(sheet, "uncertainty", {}), truth), 1) is None
 
 
 def test_runs_that_are_too_short_are_left_to_the_search():
     truth = load_machine("eha", "load_30_bar")
     short = dataset(truth, truth)
-    part = short.fit[0].part(0, 400)
-    assert calibrate_freely(Dataset(truth, ("piston",), CHANNELS, NOISE, (part,), part, ()), 1) is (
-        None
-    )
+    part = short.fit[0].select_rows(0, 400)
+    assert calibrate_freely(Dataset(truth, ("piston",), CHANNELS, NOISE, (part,), part, ()), 1) is (None)

@@ -38,9 +38,7 @@ def test_an_effect_in_full(gap_of):
         "mechanism_probability": 0.62,
         "share": None,
         "parameters": {"offset": {"value": -0.0061, "unit": "m", "ci95": [-0.0066, -0.0056]}},
-        "alternatives": [
-            {"name": "pin_offset", "location": "boom", "probability": 0.37, "same": False}
-        ],
+        "alternatives": [{"name": "pin_offset", "location": "boom", "probability": 0.37, "same": False}],
     }
 
 
@@ -80,9 +78,7 @@ def test_laws_carry_unit_and_null_for_what_is_not_known(gap_of):
 def test_numbers_of_any_kind_come_out_plain(gap_of):
     size = dataclasses.replace(gap_of("named").size, before=np.float32(2.5), after=np.inf)
     experiment = {"reason": "x", "scenario": {"time": np.arange(3), "loud": np.bool_(True)}}
-    gap = dataclasses.replace(
-        gap_of("named"), size=size, next_experiment=experiment, seconds=np.nan
-    )
+    gap = dataclasses.replace(gap_of("named"), size=size, next_experiment=experiment, seconds=np.nan)
     document = _read(gap)
     assert document["gap"]["before"] == 2.5 and document["gap"]["after"] is None
     assert document["next_experiment"]["scenario"] == {"time": [0, 1, 2], "loud": True}

@@ -5,7 +5,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from hydrotele.effects import apply_effect
-from hydrotele.effects.effect import changed
+from hydrotele.effects.effect import with_value
 from hydrotele.estimate.evidence import Evidence
 from hydrotele.estimate.hypothesis import Guess
 from hydrotele.estimate.levels import with_jitter
@@ -13,11 +13,11 @@ from hydrotele.gap.find import find_gap
 from hydrotele.gap.result import gap_document
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.log import Log, save_log
-from hydrotele.machine.machine import noise_rms, sensor_set
+from hydrotele.machine.machine import get_sensors, noise_rms
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
-from hydrotele.simulate.feedback import measure
+from hydrotele.simulate.feedback import simulate_readings
 
 SITE, JITTER = "khoshzaban1992", 0.003
 
@@ -39,7 +39,7 @@ def dataset(truth, machine, folder, jitter: float):
                 continue
             columns[name] = truth[name]
             if not name.startswith("command."):
-                sigma = noise_rms(machine, sensor_set(machine, SITE), name)
+                sigma = noise_rms(machine, get_sensors(machine, SITE), name)
                 shown = CubicSpline(truth.time, truth[name])(at)
                 columns[name] = shown + sigma * rng.normal(size=len(at))
         units = {name: truth.units[name] for name in columns}
@@ -71,7 +71,7 @@ def test_jitter_and_noise_are_told_apart(truth, tmp_path):
 @pytest.mark.nightly
 @pytest.mark.parametrize("stated", [0.0, 0.002])
 def test_a_steady_clock_is_left_alone(truth, tmp_path, stated):
-    machine = changed(load_machine("cat215"), f"sensors.{SITE}.jitter", stated)
+    machine = with_value(load_machine("cat215"), f"sensors.{SITE}.jitter", stated)
     assert levels(dataset(truth, machine, tmp_path, 0.0)).jitter == 0.0
 
 
@@ -104,14 +104,14 @@ def test_jitter_that_another_lack_hides_is_found_with_it(truth, tmp_path):
 
 def test_a_logger_that_jitters_reads_all_channels_at_its_own_instants():
     machine = load_machine("cat215")
-    sensors = sensor_set(machine, SITE)
+    sensors = get_sensors(machine, SITE)
     assert sensors
     plain = type(sensors)(jitter=0.004)
     ramp = np.linspace(0.0, 2.0, 201)  # 1 unit/s
     truth = {"angle.boom": ramp, "angle.stick": 3.0 * ramp}
-    read = measure(machine, plain, 5, truth, period=0.01)
+    read = simulate_readings(machine, plain, 5, truth, period=0.01)
     late = read["angle.boom"] - ramp
     np.testing.assert_allclose(read["angle.stick"] - 3.0 * ramp, 3.0 * late, atol=1e-12)
     # 201 draws: the spread of a standard deviation is 5 %; four times that
     assert np.std(late[1:-1]) == pytest.approx(0.004, rel=0.2)
-    assert np.array_equal(measure(machine, plain, 5, truth)["angle.boom"], ramp)  # no clock
+    assert np.array_equal(simulate_readings(machine, plain, 5, truth)["angle.boom"], ramp)  # no clock

@@ -14,11 +14,11 @@ from hydrotele.gap.mechanism_columns import build_columns, common_band, tilted
 from hydrotele.gap.mechanism_evidence import find_noise
 from hydrotele.gap.mechanism_find import find_mechanism_gap
 from hydrotele.gap.patched import Patch, patched_mjcf
-from hydrotele.identify.mechanism import load_mechanism, mechanism_records
+from hydrotele.identify.mechanism import load_mechanism, load_mechanism_records
 from hydrotele.identify.record import IdentificationRecord
 from hydrotele.machine.machine import SensorError
 from hydrotele.multibody.chain import load_chain
-from hydrotele.multibody.inverse_dynamics import project
+from hydrotele.multibody.inverse_dynamics import project_on_drives
 from hydrotele.simulate.driven_chain import open_loop_errors
 from tools.validation.blind import hexapod
 
@@ -55,8 +55,8 @@ def logs(folder, xml=ARM, late=0.0, law=None, noise=0.15, seed=0):
     (folder / "logs").mkdir()
     for number, name in enumerate(("first", "second", "test")):
         t, moved = motion(10 * seed + number)
-        found = project(chain, chain.drives, *moved)
-        force = found.bodies @ chain.inertia.ravel() + chain.damping * moved[1]
+        found = project_on_drives(chain, chain.drives, *moved)
+        force = found.body_projection @ chain.inertia.ravel() + chain.damping * moved[1]
         force += chain.frictionloss * np.sign(moved[1])
         if law is not None:
             force[:, 0] += law(moved[0], moved[1])
@@ -71,7 +71,7 @@ def logs(folder, xml=ARM, late=0.0, law=None, noise=0.15, seed=0):
 
 def found_gap(folder, **choices):
     mechanism = load_mechanism(folder / "robot.xml")
-    fit, judge, said = mechanism_records([folder / "logs"], mechanism, as_measured=True)
+    fit, judge, said = load_mechanism_records([folder / "logs"], mechanism, keep_measured_joints=True)
     return find_mechanism_gap(folder / "robot.xml", None, fit, judge, notes=said, **choices)
 
 
@@ -94,10 +94,10 @@ def test_the_command_names_a_payload_and_the_patched_model_has_no_gap(tmp_path):
     assert "payload of the fore" in (out / "report.html").read_text()
     patched = find_mechanism_gap(
         out / "patched" / "robot.xml", out / "patched" / "columns.yaml",
-        *mechanism_records(
+        *load_mechanism_records(
             [tmp_path / "logs"],
             load_mechanism(out / "patched" / "robot.xml", out / "patched" / "columns.yaml"),
-            as_measured=True,
+            keep_measured_joints=True,
         )[:2],
     )  # fmt: skip
     assert patched.verdict == "no_gap" and not patched.effects
@@ -147,7 +147,7 @@ def test_constants_that_differ_from_run_to_run_are_not_noise(tmp_path):
     turns = iter((-1.5, 3.0, 0.5))  # N m, run by run
     logs(tmp_path, law=lambda q, v: next(turns) + 0.0 * q[:, 0])
     mechanism = load_mechanism(tmp_path / "robot.xml")
-    fit, _, _ = mechanism_records([tmp_path / "logs"], mechanism, as_measured=True)
+    fit, _, _ = load_mechanism_records([tmp_path / "logs"], mechanism, keep_measured_joints=True)
     columns = build_columns(fit, mechanism, common_band(fit, mechanism))
     assert find_noise(columns).std.max() < 0.2  # N m; 0.15 at 200 Hz is 0.05 below 10 Hz
 
@@ -177,8 +177,8 @@ def test_an_unknown_effect_is_refused(tmp_path):
 def test_an_arm_driven_by_its_own_forces_follows_its_motion(tmp_path):
     (tmp_path / "robot.xml").write_text(ARM)
     chain, (t, moved) = load_chain(tmp_path / "robot.xml"), motion(3, 3.0)
-    found = project(chain, chain.drives, *moved)
-    force = found.bodies @ chain.inertia.ravel() + chain.damping * moved[1]
+    found = project_on_drives(chain, chain.drives, *moved)
+    force = found.body_projection @ chain.inertia.ravel() + chain.damping * moved[1]
     force += chain.frictionloss * np.sign(moved[1])
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "robot.xml"))
     errors = open_loop_errors(model, chain, chain.drives, moved, force, t[1], starts=5)
@@ -189,7 +189,7 @@ def test_columns_are_what_sensors_defects_do(tmp_path):
     """Each column of a late or displaced sensor against the readings without its defect."""
     logs(tmp_path, noise=0.0)
     mechanism = load_mechanism(tmp_path / "robot.xml")
-    fit, _, _ = mechanism_records([tmp_path / "logs"], mechanism, as_measured=True)
+    fit, _, _ = load_mechanism_records([tmp_path / "logs"], mechanism, keep_measured_joints=True)
     band = common_band(fit, mechanism)
     given = build_columns(fit, mechanism, band)
     for kind, value in (("offset", 0.002), ("delay", 0.012)):

@@ -45,9 +45,7 @@ def test_only_what_was_named_is_patched(gap_of):
     }  # fmt: skip
     assert {verdict: has_patch(gap_of(verdict)) for verdict in wanted} == wanted
     for part in ("effects", "calibration", "learned"):
-        assert has_patch(
-            dataclasses.replace(gap_of("unknown"), **{part: getattr(gap_of("partly"), part)})
-        )
+        assert has_patch(dataclasses.replace(gap_of("unknown"), **{part: getattr(gap_of("partly"), part)}))
 
 
 def test_calibrated_numbers_and_learned_laws_come_back(tmp_path, gap_of):

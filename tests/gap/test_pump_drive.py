@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from hydrotele.cli.main import app
 from hydrotele.effects import apply_effect
-from hydrotele.effects.effect import changed
+from hydrotele.effects.effect import with_value
 from hydrotele.estimate.hypothesis import numbers
 from hydrotele.estimate.levels import rough_noise
 from hydrotele.gap.balances import run_balances
@@ -48,7 +48,7 @@ def test_the_force_of_the_load_cylinder_closes_the_balance(site):
     data = load_dataset(site, machine)
     noise = rough_noise(data)
     with_load = run_balances(machine, data, data.heldout, noise)["force"]["piston"]
-    bare = changed(machine, "loads", {})
+    bare = with_value(machine, "loads", {})
     without = run_balances(bare, data, data.heldout, noise)["force"]["piston"]
     assert without.rms > 1.0e3
     # friction at rest, of any sign and up to 1 kN here, is not in a balance

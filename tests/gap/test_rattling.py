@@ -18,7 +18,7 @@ def looked(truth):
     """What is found in readings of a machine by a search that knows the CAT 215."""
     machine = load_machine("cat215")
     data, _ = machine_data(machine, truth, twist=0.5 * GAP)
-    data = dataclasses.replace(data, fit=(data.heldout.part(0, 300),))
+    data = dataclasses.replace(data, fit=(data.heldout.select_rows(0, 300),))
     evidence = Evidence(data, data.fit, 2, lacking=True)
     try:
         base = evidence.set_base(Guess())

@@ -17,7 +17,7 @@ from hydrotele.estimate.hypothesis import hypotheses
 from hydrotele.gap import find
 from hydrotele.gap.calibrating import calibrate_freely
 from hydrotele.gap.find import find_gap
-from hydrotele.logs.dataset import busiest, load_dataset
+from hydrotele.logs.dataset import load_dataset, select_exciting_segments
 from hydrotele.machine.machine_file import load_machine
 from tests.measured import REAL, needs_real
 from tools.validation.real_machines import (
@@ -115,10 +115,10 @@ def test_a_machine_that_states_no_open_numbers_is_not_fitted_to_free_runs():
 @pytest.mark.nightly
 def test_long_records_are_cut_to_where_the_commands_change():
     data = load_dataset(REAL / "emps" / "main.parquet", load_machine("emps"))
-    short = busiest(data, 6.0)
+    short = select_exciting_segments(data, 6.0)
     (run,), (whole,) = short.fit, data.fit
     assert len(run.command) == 6000 and short.heldout is data.heldout
     first = round((run.start - whole.start) / run.period)
     assert np.array_equal(run.reading, whole.reading[first : first + 6000])
     assert any("only the interval from" in note for note in short.notes)
-    assert busiest(data, 60.0) is data
+    assert select_exciting_segments(data, 60.0) is data

@@ -10,7 +10,12 @@ import numpy as np
 import pytest
 
 from hydrotele.show import gap_report
-from hydrotele.show.gap_recording import channel_rms, gap_windows, most_changed, windowed
+from hydrotele.show.gap_recording import (
+    channel_rms,
+    gap_windows,
+    most_changed_channels,
+    windowed_errors,
+)
 from hydrotele.show.gap_report import write_report
 
 _VOID = {"meta", "img", "line", "circle", "rect", "i", "br"}
@@ -159,11 +164,11 @@ def test_no_data_beside_the_verdict_is_enough(page_of):
 def test_windows_find_what_is_planted(gap_of):
     gap = gap_of("named")
     before, after = gap.before[0], gap.after[0]
-    found = windowed(before)
+    found = windowed_errors(before)
     total = np.nansum(found.rms**2 * found.count)
     assert total == pytest.approx(np.nansum(before.whitened**2), rel=1e-12)  # rounding
     loud = gap_windows(before, 1.0)
     # six deviations are added from 3.0 to 4.6 s with a wave that is loud all through
-    assert any(w.start <= 3.0 and w.end >= 4.6 and w.channel.endswith(".boom") for w in loud)
+    assert any(w.start <= 3.0 and w.stop >= 4.6 and w.channel.endswith(".boom") for w in loud)
     assert gap_windows(after, 1.0) == []
-    assert {name.partition(".")[2] for name in most_changed(before, after, 4)} == {"boom"}
+    assert {name.partition(".")[2] for name in most_changed_channels(before, after, 4)} == {"boom"}

@@ -67,7 +67,7 @@ def test_what_shapes_an_effect_does_not_make_it_one(gap, worth):
     (teeth,) = (h for h in hypotheses(machine, ("backlash",)) if h.location == "swing")
     whole = with_shape(teeth, machine)
     assert isinstance(whole, Hypothesis) and whole.size > teeth.size
-    deviation = np.array([gap / whole.parameters["gap"].scale, -0.9, 3.0, 0.0])
+    deviation = np.array([gap / whole.parameters["gap"].prior_std, -0.9, 3.0, 0.0])
     assert worth_naming(Guess(((whole, deviation),)), 0, 1e4) is worth
 
 

@@ -51,9 +51,7 @@ def parts():
 
 def test_a_straight_signature_is_rated_by_its_best_size(parts):
     noise, signature, other = parts
-    evidence = MadeUp(
-        noise + 0.7 * signature, {"true": lambda d: d * signature, "other": lambda d: d * other}
-    )
+    evidence = MadeUp(noise + 0.7 * signature, {"true": lambda d: d * signature, "other": lambda d: d * other})
     best, _ = screen(evidence, Guess(), [candidate("other"), candidate("true")])
     assert best.hypothesis.name == "true"
     # 1200 readings with a signature of size 1: known to 0.03
@@ -68,9 +66,7 @@ def test_friction_that_sticks_on_one_side_only_is_rated_by_what_was_tried(parts)
     def funnel(d):
         return np.sqrt(min(-d, 1.0)) * signature if d < 0.0 else 3.0 * d * elsewhere
 
-    evidence = MadeUp(
-        noise + signature, {"true": funnel, "decoy": lambda d: d * (signature + 2.0 * elsewhere)}
-    )
+    evidence = MadeUp(noise + signature, {"true": funnel, "decoy": lambda d: d * (signature + 2.0 * elsewhere)})
     best, second = screen(evidence, Guess(), [candidate("decoy"), candidate("true")])
     assert (best.hypothesis.name, second.hypothesis.name) == ("true", "decoy")
     assert best.start[0] < 0.0
@@ -81,9 +77,7 @@ def test_what_is_there_may_follow_a_candidate(parts):
     """A candidate that looks like a named effect brings nothing on top of it."""
     noise, signature, other = parts
     there = candidate("there")
-    evidence = MadeUp(
-        noise, {"there": lambda d: d * signature, "twin": lambda d: d * (signature + 0.01 * other)}
-    )
+    evidence = MadeUp(noise, {"there": lambda d: d * signature, "twin": lambda d: d * (signature + 0.01 * other)})
     (twin,) = screen(evidence, Guess(((there, np.array([0.3])),)), [there, candidate("twin")])
     assert twin.gain < 5.0  # noise alone: chi-square of one degree
 
@@ -141,7 +135,7 @@ def test_a_rare_size_with_a_curved_signature_is_rated_where_it_shows(parts):
     The far start costs 25^2 = 625 by a unit-normal prior, more than the evidence that there is.
     """
     noise, signature, _ = parts
-    ratio = Parameter("1", 1.0, 0.05, 20.0, 0.2, 0.05, starts=(1.0, 6.0))
+    ratio = Parameter("1", 1.0, 0.05, 20.0, 0.2, 0.05, start_values=(1.0, 6.0))
     inertia = Hypothesis("inertia_error", "boom", {"ratio": ratio})
 
     def curved(d):

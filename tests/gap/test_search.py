@@ -60,9 +60,7 @@ def test_a_constant_in_all_changes_nothing():
         ("com_offset", "pin_offset", 0.49, False),
     ],
 )
-def test_what_is_plainer_stands_unless_it_is_much_unlikelier(
-    monkeypatch, own, other, chance, replaced
-):
+def test_what_is_plainer_stands_unless_it_is_much_unlikelier(monkeypatch, own, other, chance, replaced):
     machine = load_machine("cat215", "none")
     named = {h.name: h for h in hypotheses(machine, (own, other)) if h.location == "boom"}
     guess = Guess(((named[own], np.ones(named[own].size)),))
@@ -146,9 +144,7 @@ def test_a_calibration_is_tried_again_beside_effects_that_take_little(monkeypatc
     (("force", "command"), 100.0, False),  # one that explains most
     (("force", "flow_head"), None, False),
 ])  # fmt: skip
-def test_numbers_are_wrong_where_forces_and_commands_of_all_axes_lack_something(
-    monkeypatch, balances, early, expected
-):
+def test_numbers_are_wrong_where_forces_and_commands_of_all_axes_lack_something(monkeypatch, balances, early, expected):
     axes = ("boom", "stick")
     levels = SimpleNamespace(inputs=[Input(kind, axis) for kind in balances for axis in axes])
     base: Any = Judged(Guess(), (SimpleNamespace(levels=levels),), 1000.0)  # type: ignore
@@ -172,6 +168,4 @@ def test_beside_a_calibration_all_effects_are_tried_beside_an_effect_those_of_ax
     named = calibrated.plus(known[0], np.zeros(known[0].size))
     left = search._lacked(evidence, known, Judged(named, tracks, 0.0))
     assert {h.location for h in left if h.name == "friction_asymmetry"} == {"stick"}
-    assert [h for h in left if h.name == "pressure_offset"] == [
-        h for h in known if h.name == "pressure_offset"
-    ]
+    assert [h for h in left if h.name == "pressure_offset"] == [h for h in known if h.name == "pressure_offset"]

@@ -20,7 +20,7 @@ def early(truth):
     """Options for data of another machine, and the loss of the given one."""
     nominal = load_machine("cat215")
     data, _ = machine_data(nominal, truth)
-    data = dataclasses.replace(data, fit=(data.heldout.part(0, 300),))
+    data = dataclasses.replace(data, fit=(data.heldout.select_rows(0, 300),))
     evidence = Evidence(data, data.fit, 2, STEP, lacking=True)
     try:
         base = evidence.set_base(Guess())

@@ -29,7 +29,7 @@ def test_a_named_effect_is_said_with_size_interval_and_proof(gap_of):
     assert "247.9 to 254.6 kg; the model has 0 kg" in words
     assert "over 99.9 %" in words and "run test_1, which was not fitted" in words
     assert f"from {gap.size.before:.2f} to {gap.size.after:.2f} times" in words
-    assert EFFECTS["payload"].sentence in words
+    assert EFFECTS["payload"].description in words
     assert "nan" not in words and "explanation is incomplete" not in words
 
 
@@ -78,12 +78,8 @@ def test_a_mechanism_of_open_form_is_named_with_both_forms(gap_of):
     words = text_of(dataclasses.replace(gap_of("named"), effects=(late,)))
     assert "do not distinguish angle delay of the swing from angle lag of the swing (38 %)" in words
     sure = dataclasses.replace(late, probability=0.99)
-    assert "form is not identifiable" not in text_of(
-        dataclasses.replace(gap_of("named"), effects=(sure,))
-    )
-    unlike = NamedEffect(
-        "length_offset", "boom", 0.61, {}, (Alternative("pin_offset", "boom", 0.3),)
-    )
+    assert "form is not identifiable" not in text_of(dataclasses.replace(gap_of("named"), effects=(sure,)))
+    unlike = NamedEffect("length_offset", "boom", 0.61, {}, (Alternative("pin_offset", "boom", 0.3),))
     assert unlike.other_forms == () and unlike.mechanism_probability == 0.61
     same = Alternative("com_offset", "swing", 0.54, same=True)  # about a vertical axis
     inertia = NamedEffect("inertia_error", "swing", 0.45, {}, (same,))
@@ -92,10 +88,7 @@ def test_a_mechanism_of_open_form_is_named_with_both_forms(gap_of):
 
 def test_a_partly_named_gap_says_what_is_named_learned_and_left(gap_of):
     gap = gap_of("partly")
-    assert (
-        headline(gap)
-        == "Payload at the tool: mass 251.3 kg; the remaining difference has no known cause"
-    )
+    assert headline(gap) == "Payload at the tool: mass 251.3 kg; the remaining difference has no known cause"
     words = text_of(gap)
     for piece in (
         "one place with an identified effect",
@@ -113,10 +106,7 @@ def test_numbers_off_alone_are_no_gap_but_said(gap_of):
     gap = dataclasses.replace(gap_of("no_gap"), calibration=gap_of("partly").calibration)
     assert headline(gap) == "Model and machine agree within the uncertainty of its parameters"
     words = text_of(gap)
-    assert (
-        "2 uncertain parameters were calibrated" in words
-        and "The model needs no change" not in words
-    )
+    assert "2 uncertain parameters were calibrated" in words and "The model needs no change" not in words
 
 
 def test_failed_tests_are_not_kept_quiet(gap_of):
@@ -171,5 +161,5 @@ def test_every_effect_has_a_title_and_known_units():
             title = effect_title(Alternative(effect.name, location, 1.0))
             assert "_" not in title and "." not in title and title.startswith(effect.name[:3])
             for name, facts in effect.parameters(machine, location).items():
-                size = max(abs(facts.nominal), facts.scale)
+                size = max(abs(facts.nominal), facts.prior_std)
                 assert "Pa" not in amount(size, facts.unit, name).replace("MPa", ""), facts.unit

@@ -7,7 +7,7 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.haptics.device import ForceDimension
-from hydrotele.haptics.server import open_haptic
+from hydrotele.haptics.server import open_haptic_device
 
 
 class Dhd:
@@ -64,9 +64,7 @@ def test_its_axes_are_turned_by_half_a_turn_about_z():
 def test_a_turn_about_its_x_is_one_about_minus_x():
     dhd, c, s = Dhd(), np.cos(0.2), np.sin(0.2)
     dhd.turn = np.array([[1.0, 0, 0], [0, c, -s], [0, s, c]])
-    assert ForceDimension(dhd).read().quaternion == pytest.approx(
-        [np.cos(0.1), -np.sin(0.1), 0.0, 0.0]
-    )
+    assert ForceDimension(dhd).read().quaternion == pytest.approx([np.cos(0.1), -np.sin(0.1), 0.0, 0.0])
 
 
 def test_forces_are_on_while_it_is_open():
@@ -76,9 +74,9 @@ def test_forces_are_on_while_it_is_open():
 
 
 def test_abilities_are_those_of_the_model_and_small_for_an_unknown_one():
-    assert ForceDimension(Dhd("sigma.7")).abilities.rotation > 0.0
-    assert ForceDimension(Dhd("omega.6")).abilities.torque == 0.0
-    assert ForceDimension(Dhd("brand new")).abilities.force <= 8.0
+    assert ForceDimension(Dhd("sigma.7")).limits.max_rotation > 0.0
+    assert ForceDimension(Dhd("omega.6")).limits.max_torque == 0.0
+    assert ForceDimension(Dhd("brand new")).limits.max_force <= 8.0
 
 
 def test_no_device_and_one_that_is_lost():
@@ -96,9 +94,9 @@ def test_no_device_and_one_that_is_lost():
 def test_without_the_package_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "forcedimension_core", None)
     with pytest.raises(InputError, match="pip install forcedimension-core"):
-        open_haptic("force-dimension", 1e-3)
+        open_haptic_device("force-dimension", 1e-3)
 
 
 def test_no_such_kind():
     with pytest.raises(InputError, match="valid: simulated, force-dimension, haption"):
-        open_haptic("phantom", 1e-3)
+        open_haptic_device("phantom", 1e-3)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.haptics.device import LIBRARY, Haption
-from hydrotele.haptics.server import open_haptic
+from hydrotele.haptics.device import LIBRARY_VARIABLE, Haption
+from hydrotele.haptics.server import open_haptic_device
 
 CONTEXT, INT, FLOAT = ctypes.c_void_p, ctypes.c_int, ctypes.c_float
 FLOATS, INTS = ctypes.POINTER(FLOAT), ctypes.POINTER(INT)
@@ -21,9 +21,7 @@ class VirtuoseAPI:
         self.place, self.turn, self.pressed = [0.5, 0.1, 0.3], [0.0, 0.0, 0.0, 1.0], {1: 0, 2: 1}
         self.virtOpen = self._function(CONTEXT, self._open, ctypes.c_char_p)
         self.virtGetErrorCode = self._function(INT, lambda context: 7, CONTEXT)
-        self.virtGetErrorMessage = self._function(
-            CONTEXT, lambda code: ctypes.cast(self._message, CONTEXT).value, INT
-        )
+        self.virtGetErrorMessage = self._function(CONTEXT, lambda code: ctypes.cast(self._message, CONTEXT).value, INT)
         self._message = ctypes.c_char_p(b"cable is out")
         for name in ("IndexingMode", "CommandType", "PowerOn"):
             setattr(self, f"virtSet{name}", self._setter(name, INT))
@@ -110,11 +108,11 @@ def test_no_device_one_that_is_lost_and_no_library(monkeypatch, tmp_path):
     with pytest.raises(InputError, match="the device rejects its settings .cable is out"):
         Haption(1e-3, library=api)
     assert api.calls[-1] == ("Close", 42)
-    monkeypatch.delenv(LIBRARY, raising=False)
+    monkeypatch.delenv(LIBRARY_VARIABLE, raising=False)
     with pytest.raises(InputError, match="needs the vendor's libVirtuoseAPI"):
-        open_haptic("haption", 1e-3)
-    monkeypatch.setenv(LIBRARY, str(tmp_path / "none.so"))
+        open_haptic_device("haption", 1e-3)
+    monkeypatch.setenv(LIBRARY_VARIABLE, str(tmp_path / "none.so"))
     with pytest.raises(InputError, match="cannot load the vendor's library"):
-        open_haptic("haption:lab#5000", 1e-3)
+        open_haptic_device("haption:lab#5000", 1e-3)
     with pytest.raises(InputError, match="has no virtOpen: is it VirtuoseAPI"):
         Haption(1e-3, library=object())

@@ -8,37 +8,37 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.haptics import packets
-from hydrotele.haptics.device import Abilities, SimulatedDevice, SimulatedFacts
+from hydrotele.haptics.device import DeviceLimits, SimulatedDevice, SimulatedDeviceParameters
 from hydrotele.haptics.link import (
-    GAIN,
-    LAST,
+    FORCE_GAIN,
+    FORCE_RAMP_TIME,
+    FORCE_TIMEOUT,
+    LAST_POSE,
     LATE,
     LOST,
     MALFORMED,
-    OFF,
-    RAMP,
-    STARTS,
-    Link,
+    SERVER_STARTS,
+    HapticLink,
     answer_pose,
-    scaled_pose,
+    scale_pose,
 )
 from hydrotele.haptics.packets import (
-    ABLE,
-    ANSWERED,
-    MOST,
-    ON,
+    ANSWERED_POSE,
+    CAN_APPLY_FORCE,
+    FORCES_ON,
+    MAX_WRENCH,
     PERIOD,
-    PLACE,
     POSE_MAGIC,
+    POSITION,
     QUATERNION,
     TRAVEL,
     WRENCH,
 )
-from hydrotele.haptics.server import serve
+from hydrotele.haptics.server import run_server
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.scenario.scenario import load_scenario
-from hydrotele.teleop.axis_table import NOMINAL, REACH
-from hydrotele.teleop.master import master
+from hydrotele.teleop.axis_table import HANDLE_RANGE, NOMINAL_STIFFNESS
+from hydrotele.teleop.master import build_master
 
 STEP = 1e-3
 MS = 1_000_000
@@ -49,13 +49,13 @@ COORDINATES = ("r", "theta", "z", "attitude")
 @pytest.fixture(scope="module")
 def numbers():
     pilot = load_scenario("press_stiffness").pilot
-    return master(load_joystick(), pilot, COORDINATES)
+    return build_master(load_joystick(), pilot, COORDINATES)
 
 
 @pytest.fixture
 def link(numbers, monkeypatch):
     """A link whose thread answers nobody, so that the test moves its clock."""
-    made = Link("127.0.0.1", 9)
+    made = HapticLink("127.0.0.1", 9)
     monkeypatch.setattr("threading.Thread.start", lambda self: None)
     monkeypatch.setattr("threading.Thread.join", lambda self, timeout=None: None)
     made.start(*numbers, PACKET)
@@ -72,17 +72,17 @@ class Stand:
 
     def machine(self, share=1.0):
         """The machine has just written."""
-        self.link.box.stamp[1], self.link.box.share[0] = self.now, share
+        self.link.mailbox.stamp[1], self.link.mailbox.share[0] = self.now, share
 
     def pose(self, x=0.0, **changes):
         line = self.link.line
         whole, real = line.pose, line.pose_real
         whole[:8] = POSE_MAGIC, 5, self.sequence, self.now, 0, -1, 0, 0
-        real[PLACE:QUATERNION], real[QUATERNION:TRAVEL] = (x, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
-        real[TRAVEL : PERIOD + 1], real[ABLE] = (0.05, 0.5, 12.0, 0.4, STEP), 1.0
+        real[POSITION:QUATERNION], real[QUATERNION:TRAVEL] = (x, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
+        real[TRAVEL : PERIOD + 1], real[CAN_APPLY_FORCE] = (0.05, 0.5, 12.0, 0.4, STEP), 1.0
         for name, value in changes.items():
             (real if name in ("ABLE", "PLACE") else whole)[getattr(packets, name)] = value
-        answered = answer_pose(line, self.link.box, self.now, self.two)
+        answered = answer_pose(line, self.link.mailbox, self.now, self.two)
         self.now, self.sequence = self.now + MS, self.sequence + 1
         return answered
 
@@ -101,9 +101,9 @@ def test_the_spring_of_the_joystick_acts_on_the_scale_of_the_device(stand, numbe
         stand.machine()
         assert stand.pose(x=0.01)
     axis, line = numbers[0].axis[0], stand.link.line
-    expected = -axis[NOMINAL] * 0.01 * axis[REACH] / 0.05
+    expected = -axis[NOMINAL_STIFFNESS] * 0.01 * axis[HANDLE_RANGE] / 0.05
     assert stand.force == pytest.approx([expected, 0, 0, 0, 0, 0], abs=1e-9)
-    assert line.reply[ON] == 1 and line.reply[ANSWERED] == stand.sequence - 1
+    assert line.reply[FORCES_ON] == 1 and line.reply[ANSWERED_POSE] == stand.sequence - 1
 
 
 def test_forces_come_in_slowly_and_go_at_once_when_the_machine_is_silent(stand):
@@ -114,12 +114,10 @@ def test_forces_come_in_slowly_and_go_at_once_when_the_machine_is_silent(stand):
         stand.pose(x=0.01)
         sizes.append(abs(stand.force[0]))
     # From rest the damper does not act, so the force is the ramp's share of the spring's.
-    assert np.all(np.diff(sizes[1:]) >= -1e-12) and sizes[1] == pytest.approx(
-        2 * STEP / RAMP * sizes[-1]
-    )
-    for _ in range(round(OFF / STEP) + 1):
+    assert np.all(np.diff(sizes[1:]) >= -1e-12) and sizes[1] == pytest.approx(2 * STEP / FORCE_RAMP_TIME * sizes[-1])
+    for _ in range(round(FORCE_TIMEOUT / STEP) + 1):
         stand.pose(x=0.01)
-    assert stand.link.line.reply[ON] == 0 and not stand.force.any()
+    assert stand.link.line.reply[FORCES_ON] == 0 and not stand.force.any()
 
 
 def test_old_repeated_lost_and_foreign_packets(stand):
@@ -127,7 +125,7 @@ def test_old_repeated_lost_and_foreign_packets(stand):
     assert stand.pose() and stand.pose()
     assert not stand.pose(SEQUENCE=1) and not stand.pose(SEQUENCE=0)
     assert stand.pose(SEQUENCE=9)
-    assert (count[LATE], count[LOST], count[LAST]) == (2, 7, 9)
+    assert (count[LATE], count[LOST], count[LAST_POSE]) == (2, 7, 9)
     assert not stand.pose(MAGIC=1)
     assert count[MALFORMED] == 1
 
@@ -136,28 +134,28 @@ def test_a_server_that_starts_anew_begins_again(stand):
     for _ in range(500):
         stand.machine()
         stand.pose(x=0.01)
-    assert stand.link.line.ramp[GAIN] == 1.0
+    assert stand.link.line.ramp[FORCE_GAIN] == 1.0
     stand.machine()
     assert stand.pose(x=0.01, SESSION=6, SEQUENCE=0)
-    assert stand.link.line.count[STARTS] == 2 and stand.link.line.ramp[GAIN] < 0.01
+    assert stand.link.line.count[SERVER_STARTS] == 2 and stand.link.line.ramp[FORCE_GAIN] < 0.01
 
 
 def test_a_device_that_is_unable_gets_no_force_and_gives_no_pose(stand):
     stand.machine()
     stand.pose(x=0.01)
     stand.pose(x=0.01, ABLE=0.0)
-    assert not stand.force.any() and np.isnan(stand.link.box.handle[0])
+    assert not stand.force.any() and np.isnan(stand.link.mailbox.handle[0])
 
 
 def test_a_wrench_stays_within_what_the_device_may_give(stand):
     for _ in range(500):
         stand.machine()
-        stand.link.box.packet[0] = 1e7
-        stand.link.box.extra[:] = 1e4
+        stand.link.mailbox.packet[0] = 1e7
+        stand.link.mailbox.extra[:] = 1e4
         stand.pose(x=0.05)
     assert np.linalg.norm(stand.force[:3]) == pytest.approx(12.0)
     assert np.linalg.norm(stand.force[3:]) == pytest.approx(0.4)
-    assert stand.link.line.pose_real[MOST] == 12.0
+    assert stand.link.line.pose_real[MAX_WRENCH] == 12.0
 
 
 def test_how_long_it_takes_until_a_wrench_is_known_to_be_taken(stand):
@@ -173,10 +171,10 @@ def test_how_long_it_takes_until_a_wrench_is_known_to_be_taken(stand):
 def test_scaled_pose_turns_by_a_share_of_the_angle():
     out, half = np.zeros(7), 0.5 * 0.6
     q = np.array([np.cos(half), 0.0, np.sin(half), 0.0])
-    scaled_pose(np.array([0.01, 0.0, -0.02]), -q, 0.1, 0.25, out)  # -q is the same orientation
+    scale_pose(np.array([0.01, 0.0, -0.02]), -q, 0.1, 0.25, out)  # -q is the same orientation
     assert out[:3] == pytest.approx([1e-3, 0.0, -2e-3])
     assert out[3:] == pytest.approx([np.cos(0.25 * half), 0.0, np.sin(0.25 * half), 0.0])
-    scaled_pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), 0.1, 0.25, out)
+    scale_pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), 0.1, 0.25, out)
     assert out.tolist() == [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
 
 
@@ -185,8 +183,8 @@ def test_the_machine_has_no_command_until_the_handle_was_centred(link, monkeypat
     monkeypatch.setattr("hydrotele.haptics.link.clock.monotonic_ns", lambda: now)
 
     def exchange(x, age=0):
-        link.box.handle[:] = x, 0, 0, 1, 0, 0, 0, 0
-        link.box.stamp[0] = now - age
+        link.mailbox.handle[:] = x, 0, 0, 1, 0, 0, 0, 0
+        link.mailbox.stamp[0] = now - age
         link.exchange(qpos, np.zeros(PACKET), 1.0, np.zeros(6))
         return qpos[0]
 
@@ -199,15 +197,15 @@ def test_the_machine_has_no_command_until_the_handle_was_centred(link, monkeypat
 
 def test_a_structure_that_needs_more_than_a_packet_is_refused():
     pilot = load_scenario("press_stiffness", {"pilot.reflection": "four_channel"}).pilot
-    made = Link("127.0.0.1", 9)
+    made = HapticLink("127.0.0.1", 9)
     with pytest.raises(InputError, match="'four_channel' does not support haptic devices; valid"):
-        made.start(*master(load_joystick(), pilot, COORDINATES), PACKET)
+        made.start(*build_master(load_joystick(), pilot, COORDINATES), PACKET)
     made.close()
 
 
 def test_no_such_host():
     with pytest.raises(InputError, match=r"haptic:no\.such\.host\.invalid:1"):
-        Link("no.such.host.invalid", 1)
+        HapticLink("no.such.host.invalid", 1)
 
 
 def until(happened, most=20.0):
@@ -220,18 +218,16 @@ def until(happened, most=20.0):
 
 def test_device_and_machine_on_the_loopback(numbers):
     """A hand of 250 N/m that wants 30 mm of 50 is held by a spring of 4 kN/m on a tenth of it."""
-    facts = SimulatedFacts(
-        abilities=Abilities(0.05, 0.5, 20.0, 0.4),
-        motion=(0.6, 0, 0, 0, 0, 0),
-        frequency=(0.25,) * 6,
+    facts = SimulatedDeviceParameters(
+        limits=DeviceLimits(0.05, 0.5, 20.0, 0.4),
+        motion_amplitudes=(0.6, 0, 0, 0, 0, 0),
+        motion_frequencies=(0.25,) * 6,
     )
     device, over, where = SimulatedDevice(STEP, facts), threading.Event(), []
-    server = threading.Thread(
-        target=serve, args=(device, ("127.0.0.1", 0), STEP, over.is_set, where.append)
-    )
+    server = threading.Thread(target=run_server, args=(device, ("127.0.0.1", 0), STEP, over.is_set, where.append))
     server.start()
     until(lambda: where)
-    link, qpos = Link(*where[0]), np.zeros(7)
+    link, qpos = HapticLink(*where[0]), np.zeros(7)
     try:
         link.start(*numbers, PACKET)
         seen = []
@@ -243,8 +239,8 @@ def test_device_and_machine_on_the_loopback(numbers):
 
         until(moved)
         assert seen[-1][1] < -0.5  # the spring pushes back
-        assert link.engaged and link.figures()["device_starts"] == 1
-        link.line.count[0] = 1  # the machine's thread dies: nobody answers
+        assert link.engaged and link.statistics()["device_starts"] == 1
+        link.buffers.count[0] = 1  # the machine's thread dies: nobody answers
         until(lambda: not device.wrench.any())
         over.set()  # and the device's server, too
         server.join(20.0)

@@ -4,24 +4,29 @@ import numpy as np
 import pytest
 
 from hydrotele.haptics import packets
-from hydrotele.haptics.device import Abilities, SimulatedDevice, SimulatedFacts, within_limits
+from hydrotele.haptics.device import (
+    DeviceLimits,
+    SimulatedDevice,
+    SimulatedDeviceParameters,
+    limit_wrench,
+)
 from hydrotele.haptics.packets import (
-    ABLE,
-    ANSWERED,
+    ANSWERED_POSE,
+    CAN_APPLY_FORCE,
+    FORCES_ON,
+    LAST_ACCEPTED,
     MAGIC,
     MISSED,
-    ON,
-    PLACE,
+    POSITION,
     SEQUENCE,
     SESSION,
-    TAKEN,
     UNANSWERED,
     WRENCH,
     WRENCH_MAGIC,
     WRENCH_WORDS,
-    packet,
+    make_packet,
 )
-from hydrotele.haptics.server import FORGET, STALE, WATCHDOG, Exchange
+from hydrotele.haptics.server import CLIENT_TIMEOUT, MAX_POSE_AGE, WATCHDOG_TIMEOUT, DeviceSession
 
 PERIOD, SESSION_NUMBER = 1e-3, 77
 HERE, ELSEWHERE = ("127.0.0.1", 4000), ("127.0.0.1", 4001)
@@ -33,23 +38,28 @@ class Stand:
 
     def __init__(self, device=None):
         self.device = device or SimulatedDevice(PERIOD)
-        self.exchange = Exchange(self.device, PERIOD, SESSION_NUMBER)
+        self.exchange = DeviceSession(self.device, PERIOD, SESSION_NUMBER)
         self.now, self.sequence = 10**12, 0
 
     def period(self):
         self.now += MS
-        self.exchange.next_pose(self.now)
+        self.exchange.update_pose(self.now)
         return self.exchange.pose
 
     def send(self, force=(0.0,) * 6, sender=HERE, **changes):
-        whole, real = packet(WRENCH_WORDS)
-        whole[[MAGIC, SESSION, SEQUENCE, ON]] = WRENCH_MAGIC, SESSION_NUMBER, self.sequence, 1
-        whole[ANSWERED] = self.exchange.pose.whole[SEQUENCE]
+        whole, real = make_packet(WRENCH_WORDS)
+        whole[[MAGIC, SESSION, SEQUENCE, FORCES_ON]] = (
+            WRENCH_MAGIC,
+            SESSION_NUMBER,
+            self.sequence,
+            1,
+        )
+        whole[ANSWERED_POSE] = self.exchange.pose.integers[SEQUENCE]
         real[WRENCH:] = force
         for name, value in changes.items():
             whole[getattr(packets, name)] = value
         self.sequence += 1
-        return self.exchange.take(whole.tobytes(), sender, self.now)
+        return self.exchange.accept_packet(whole.tobytes(), sender, self.now)
 
     def open(self):
         self.period()
@@ -68,14 +78,14 @@ def test_a_wrench_is_given_from_the_next_period_on(stand):
     assert stand.send((1.0, 2.0, 3.0, 0.1, 0.0, 0.0))
     stand.period()
     assert stand.device.wrench.tolist() == [1.0, 2.0, 3.0, 0.1, 0.0, 0.0]
-    assert stand.exchange.pose.whole[TAKEN] == 1
+    assert stand.exchange.pose.whole[LAST_ACCEPTED] == 1
 
 
 def test_nobody_who_has_not_asked_moves_the_device():
     stand = Stand()
     stand.period()
     assert not stand.send((1.0,) * 6)
-    assert stand.exchange.refused["stranger"] == 1 and not stand.exchange.wrench.any()
+    assert stand.exchange.rejected_packets["stranger"] == 1 and not stand.exchange.wrench.any()
 
 
 def test_a_second_machine_is_refused_until_the_first_is_silent(stand):
@@ -83,7 +93,7 @@ def test_a_second_machine_is_refused_until_the_first_is_silent(stand):
     assert not stand.send(sender=ELSEWHERE, SESSION=0)
     assert not stand.send((5.0,) * 6, sender=ELSEWHERE)
     assert stand.exchange.refused["stranger"] == 2
-    for _ in range(round(FORGET / PERIOD) + 2):
+    for _ in range(round(CLIENT_TIMEOUT / PERIOD) + 2):
         stand.period()
     assert stand.exchange.client is None
     assert stand.send(sender=ELSEWHERE, SESSION=0)
@@ -105,7 +115,7 @@ def test_packets_out_of_order_again_or_from_another_session_are_refused(stand):
 
 def test_an_answer_to_a_pose_of_long_ago_is_stale(stand):
     old = int(stand.exchange.pose.whole[SEQUENCE])
-    for _ in range(round(STALE / PERIOD)):
+    for _ in range(round(MAX_POSE_AGE / PERIOD)):
         stand.period()
         stand.send()
     assert stand.send(ANSWERED=old)
@@ -136,16 +146,16 @@ def test_random_packets_never_move_the_device(stand):
 
 
 def test_limits_keep_the_direction(stand):
-    most = stand.device.abilities
+    most = stand.device.limits
     stand.send((300.0, 400.0, 0.0, 0.0, 0.0, -9.0))
     assert stand.exchange.wrench[:3] == pytest.approx([0.6 * most.force, 0.8 * most.force, 0.0])
     assert stand.exchange.wrench[5] == pytest.approx(-most.torque)
-    assert not within_limits(np.full(6, np.nan), most).any()
+    assert not limit_wrench(np.full(6, np.nan), most).any()
 
 
 def test_the_watchdog_takes_the_force_off_and_a_wrench_brings_it_back(stand):
     stand.send((1.0,) * 6)
-    for _ in range(round(WATCHDOG / PERIOD)):
+    for _ in range(round(WATCHDOG_TIMEOUT / PERIOD)):
         stand.period()
         assert stand.device.wrench.any()
     stand.period()
@@ -191,19 +201,19 @@ def test_a_device_that_does_not_answer_is_told_to_be_unable():
     stand.send((1.0,) * 6)
     stand.device.pulled = True
     pose = stand.period()
-    assert pose.real[ABLE] == 0.0 and np.isnan(pose.real[PLACE]) and not stand.exchange.wrench.any()
+    assert pose.reals[CAN_APPLY_FORCE] == 0.0 and np.isnan(pose.reals[POSITION]) and not stand.exchange.wrench.any()
     stand.device.pulled = False
-    assert stand.period().real[ABLE] == 1.0
+    assert stand.period().reals[CAN_APPLY_FORCE] == 1.0
 
 
 def test_the_simulated_handle_rests_where_hand_and_force_balance():
-    facts = SimulatedFacts(motion=(0.0,) * 6)
+    facts = SimulatedDeviceParameters(motion_amplitudes=(0.0,) * 6)
     device = SimulatedDevice(PERIOD, facts)
     wrench = np.array([2.0, 0.0, -1.0, 0.0, 0.1, 0.0])
     for _ in range(6000):
         device.write(wrench, True)
         pose = device.read()
-    k, kr = facts.hand_stiffness
+    k, kr = facts.arm_stiffness
     # 6 s are 27 time constants 2 m / b of 0.9 kg and 8 N s/m: 1e-9 m is beyond what is left
     assert pose.place == pytest.approx([2.0 / k, 0.0, -1.0 / k], abs=1e-9)
     turn = 2.0 * np.arctan2(pose.quaternion[2], pose.quaternion[0])
@@ -211,7 +221,7 @@ def test_the_simulated_handle_rests_where_hand_and_force_balance():
 
 
 def test_the_simulated_handle_stays_within_its_stops():
-    facts = SimulatedFacts(abilities=Abilities(0.01, 0.1, 50.0, 1.0), motion=(0.0,) * 6)
+    facts = SimulatedDeviceParameters(limits=DeviceLimits(0.01, 0.1, 50.0, 1.0), motion_amplitudes=(0.0,) * 6)
     device = SimulatedDevice(PERIOD, facts)
     for _ in range(2000):
         device.write(np.array([50.0, 0, 0, 0, 0, 0]), True)

@@ -7,8 +7,8 @@ from scipy.optimize import brentq
 
 from hydrotele.gap.balances import chamber_residuals
 from hydrotele.hydraulics.circuit import (
-    NO_MEMORY,
-    SLOTS,
+    NO_EXTRA_STATES,
+    SLOT_COUNT,
     Slot,
     axis_opening,
     circuit_scratch,
@@ -17,9 +17,9 @@ from hydrotele.hydraulics.circuit import (
 )
 from hydrotele.hydraulics.laws import (
     ATMOSPHERE,
+    air_softening_factor,
     pressure_with_air,
     pressure_without_air,
-    softening,
 )
 from hydrotele.hydraulics.parameters import actuator_parameters
 from hydrotele.machine.machine_file import load_machine
@@ -46,7 +46,7 @@ def run(user, motion, dt, seconds, command=CLOSED, start=(1.0e6, 1.0e6)):
         before, after = motion(k * dt)[0], motion((k + 1) * dt)[0]
         x, v = np.array([after]), np.array([(after - before) / dt])
         drives = Drives(1, act, x, v, command)
-        step_circuit(user, 0, drives, dt, rate, scratch, NO_TERMS, 0.0, NO_MEMORY)
+        step_circuit(user, 0, drives, dt, rate, scratch, NO_TERMS, 0.0, NO_EXTRA_STATES)
         act += dt * rate
         states.append(act[2:].copy())
     return np.array(states)
@@ -207,14 +207,14 @@ def test_axes_that_share_a_supply_stay_sound_while_one_of_them_is_empty():
     for _ in range(1500):
         x = x + 1e-3 * v
         drives = Drives(3, act, x, v, command)
-        step_circuit(user, 0, drives, 1e-3, rate, scratch, NO_TERMS, 0.0, NO_MEMORY)
+        step_circuit(user, 0, drives, 1e-3, rate, scratch, NO_TERMS, 0.0, NO_EXTRA_STATES)
         act = act + 1e-3 * rate
         least.append(act[4 * BOOM + 2])
         assert np.isfinite(act).all()
         assert min(act[2::4].min(), act[3::4].min()) > -ATMOSPHERE
     assert min(least) < 0.0, "the boom is not drawn empty here"
     assert np.ptp(least[-100:]) < 1e3, "the fed chamber hunts"
-    assert len(user) == 3 * SLOTS
+    assert len(user) == 3 * SLOT_COUNT
 
 
 def test_a_balance_of_readings_misses_no_oil_where_a_chamber_gives_off_air(boom):
@@ -222,16 +222,14 @@ def test_a_balance_of_readings_misses_no_oil_where_a_chamber_gives_off_air(boom)
     pressures, x, v, spool = np.array([-6.0e4, 2.0e6]), 0.5, 0.3, 0.2
     numbers = (boom, 0, axis_opening(boom, 0, spool), 20.0e6, *pressures, x, v, 0.0, (0.0,) * 4)
     oil = np.array(pressure_rates(*numbers)[:2])
-    soft = np.array([softening(p, boom[Slot.AIR_RELEASE]) for p in pressures])
+    soft = np.array([air_softening_factor(p, boom[Slot.AIR_RELEASE]) for p in pressures])
     assert soft[0] < 1e-3 and soft[1] == 1.0
     volumes = np.array([
         [boom[Slot.VOLUME_HEAD] + boom[Slot.AREA_HEAD] * x],
         [boom[Slot.VOLUME_ROD] + boom[Slot.AREA_ROD] * (boom[Slot.STROKE] - x)],
     ])  # fmt: skip
     sides = np.stack([pressures, oil * soft], axis=1)[:, :, None]
-    lacks = chamber_residuals(
-        boom, np.array([spool]), np.array([20.0e6]), *sides, volumes, np.array([v])
-    )
+    lacks = chamber_residuals(boom, np.array([spool]), np.array([20.0e6]), *sides, volumes, np.array([v]))
     assert np.abs(lacks).max() < 1e-12 * boom[Slot.AREA_HEAD] * v
 
 

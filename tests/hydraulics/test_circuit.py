@@ -6,13 +6,13 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from hydrotele.hydraulics.circuit import (
-    NO_MEMORY,
-    SLOTS,
+    NO_EXTRA_STATES,
+    SLOT_COUNT,
     Slot,
-    _relieved,
-    axis_state,
+    _relief_limited_rate,
+    axis_flows_and_force,
     circuit_scratch,
-    open_ports,
+    compute_ports,
     step_circuit,
     supply_pressure,
 )
@@ -40,7 +40,7 @@ def run(user, act, command, x, v, dt, steps, count=3):
     states, rate, scratch = [act.copy()], np.zeros_like(act), circuit_scratch()
     for k in range(steps):
         drives = Drives(count, act, x + (k + 1) * dt * v, v, command)
-        step_circuit(user, 0, drives, dt, rate, scratch, NO_TERMS, 0.0, NO_MEMORY)
+        step_circuit(user, 0, drives, dt, rate, scratch, NO_TERMS, 0.0, NO_EXTRA_STATES)
         act = act + dt * rate
         states.append(act)
     return np.array(states)
@@ -48,7 +48,7 @@ def run(user, act, command, x, v, dt, steps, count=3):
 
 def reference(user, act, command, x, v, end, stiff_tolerance=1e-10):
     """The nominal model written anew and integrated by scipy; state at `end`."""
-    rows = user.reshape(-1, SLOTS)
+    rows = user.reshape(-1, SLOT_COUNT)
     x, v = np.array(x, float), np.array(v, float)
 
     def g(drop):
@@ -63,9 +63,7 @@ def reference(user, act, command, x, v, end, stiff_tolerance=1e-10):
         def excess(p):
             return np.sum(k * abs(o) * g(np.maximum(0, p - fed))) - PUMP
 
-        p_s = (
-            RELIEF if excess(RELIEF) <= 0 else brentq(excess, fed[o != 0].min(), RELIEF, xtol=1e-6)
-        )
+        p_s = RELIEF if excess(RELIEF) <= 0 else brentq(excess, fed[o != 0].min(), RELIEF, xtol=1e-6)
         q_in = k * abs(o) * g(np.maximum(0, p_s - fed))
         q_out = k * abs(o) * g(np.where(o > 0, p_b, p_a) - TANK)
         q_a, q_b = np.where(o > 0, q_in, -q_out), np.where(o > 0, -q_out, q_in)
@@ -133,7 +131,7 @@ def test_a_wide_open_valve_shares_a_short_pump_with_others(user):
 
 
 def test_one_axis_alone_agrees_with_the_independent_integration(user):
-    boom = user[SLOTS : 2 * SLOTS].copy()
+    boom = user[SLOT_COUNT : 2 * SLOT_COUNT].copy()
     start = dict(act=LIFTING["act"][4:8], command=np.array([0.9]), x=[0.4], v=[0.1])
     exact = reference(boom, end=0.064, **start)
     final = run(boom, dt=2.5e-4, steps=256, count=1, **start)[-1]
@@ -144,11 +142,11 @@ def test_one_axis_alone_agrees_with_the_independent_integration(user):
 def flows(user, state, x, v):
     """Supply flows and, per chamber of every axis, all oil that enters, [m^3/s]."""
     ports, fed, net = np.zeros(12), 0.0, []
-    open_ports(user, state, state, ports, 0, 3, 0.0, state)
+    compute_ports(user, state, state, ports, 0, 3, 0.0, state)
     p_s = supply_pressure(ports, 3, SMOOTHING, RELIEF, PUMP)
     for i in range(3):
-        row, act = user[i * SLOTS : (i + 1) * SLOTS], state[4 * i : 4 * i + 4]
-        q_a, q_b, _ = axis_state(user, i, p_s, act, x[i], v[i])
+        row, act = user[i * SLOT_COUNT : (i + 1) * SLOT_COUNT], state[4 * i : 4 * i + 4]
+        q_a, q_b, _ = axis_flows_and_force(user, i, p_s, act, x[i], v[i])
         leak = LEAK * (act[2] - act[3])
         r_a, r_b = (port_flow(p, PORT, K_RELIEF, TANK, K_MAKEUP)[0] for p in act[2:])
         fed += max(q_a, 0) + max(q_b, 0)
@@ -158,7 +156,7 @@ def flows(user, state, x, v):
 
 
 def volumes(user, x):
-    rows = user.reshape(-1, SLOTS)
+    rows = user.reshape(-1, SLOT_COUNT)
     cylinder = rows[:, Slot.KIND] == 1
     head = rows[:, Slot.VOLUME_HEAD] + cylinder * rows[:, Slot.AREA_HEAD] * x
     rod = rows[:, Slot.VOLUME_ROD] + cylinder * rows[:, Slot.AREA_ROD] * (rows[:, Slot.STROKE] - x)
@@ -178,7 +176,7 @@ def balance_error(user, dt, end):
         middle = volumes(user, x0 + (k + 0.5) * dt * v)
         stored = stored + middle / BETA * rise
         before = after
-    rows = user.reshape(-1, SLOTS)
+    rows = user.reshape(-1, SLOT_COUNT)
     swept = np.column_stack([rows[:, Slot.AREA_HEAD], rows[:, Slot.AREA_ROD]])
     displaced = (swept * np.abs(v)[:, None]).ravel() * end
     return np.abs(entered - stored) / displaced
@@ -200,7 +198,7 @@ def test_valves_draw_exactly_the_pump_flow_when_it_is_short(user):
 
 
 def swing(user):
-    numbers = user[:SLOTS].copy()
+    numbers = user[:SLOT_COUNT].copy()
     numbers[Slot.COUNT] = 1
     return numbers
 
@@ -248,7 +246,7 @@ def test_overrunning_motor_with_half_open_valve_settles_without_limit_cycle(user
 
 @pytest.mark.parametrize("speed", [0.05, 0.2])
 def test_port_relief_limits_the_pressure_of_a_pushed_piston(user, speed):
-    boom = user[SLOTS : 2 * SLOTS].copy()
+    boom = user[SLOT_COUNT : 2 * SLOT_COUNT].copy()
     states = run(boom, [0, 0, 10e6, 2e6], np.zeros(1), [0.8], [-speed], 1e-3, 1000, count=1)
     # all oil of the head side can leave over the relief at p_port + A_h v / k_r; 1e-9 for rounding
     limit = PORT + boom[Slot.AREA_HEAD] * speed / K_RELIEF
@@ -259,7 +257,7 @@ def test_port_relief_limits_the_pressure_of_a_pushed_piston(user, speed):
 
 @pytest.mark.parametrize("dt", [1e-3, 2.5e-4])
 def test_oil_locked_in_is_compressed_by_the_logarithm_of_its_volume(user, dt):
-    boom = user[SLOTS : 2 * SLOTS].copy()
+    boom = user[SLOT_COUNT : 2 * SLOT_COUNT].copy()
     boom[Slot.LEAKAGE] = 0.0
     x, v, end = 0.2, -0.05, 0.08
     states = run(boom, [0, 0, 2e6, 20e6], np.zeros(1), [x], [v], dt, round(end / dt), count=1)
@@ -268,12 +266,8 @@ def test_oil_locked_in_is_compressed_by_the_logarithm_of_its_volume(user, dt):
     v_rod = boom[Slot.VOLUME_ROD] + rod * (boom[Slot.STROKE] - np.array([x, x + v * end]))
     # beta ln(V_0 / V); trapezium rule: T h^2 / 12 of the second derivative 2 beta (A v / V)^3
     error = end * dt**2 / 12 * 2 * BETA * (head * abs(v) / v_head.min()) ** 3
-    assert states[-1, 2] - 2e6 == pytest.approx(
-        BETA * np.log(v_head[0] / v_head[1]), abs=error + 1e-4
-    )
-    assert states[-1, 3] - 20e6 == pytest.approx(
-        BETA * np.log(v_rod[0] / v_rod[1]), abs=error + 1e-4
-    )
+    assert states[-1, 2] - 2e6 == pytest.approx(BETA * np.log(v_head[0] / v_head[1]), abs=error + 1e-4)
+    assert states[-1, 3] - 20e6 == pytest.approx(BETA * np.log(v_rod[0] / v_rod[1]), abs=error + 1e-4)
 
 
 def test_leakage_equalises_a_standing_motor(user):
@@ -286,10 +280,7 @@ def test_leakage_equalises_a_standing_motor(user):
 
 
 def test_command_is_clipped(user):
-    one, ten = (
-        run(user, **{**LIFTING, "command": np.array([0.7, u, -0.8])}, dt=1e-3, steps=5)
-        for u in (1.0, 10.0)
-    )
+    one, ten = (run(user, **{**LIFTING, "command": np.array([0.7, u, -0.8])}, dt=1e-3, steps=5) for u in (1.0, 10.0))
     assert np.array_equal(one, ten)
 
 
@@ -301,4 +292,4 @@ def test_a_relief_that_opens_within_a_step_takes_its_part_of_it(rate, quick):
         lambda t, e: rate - quick * np.maximum(0.0, e), (0.0, dt), [-room], max_step=1e-6,
         rtol=1e-8,
     )  # fmt: skip
-    assert _relieved(room, rate, quick, dt) * dt - room == pytest.approx(answer.y[0, -1], rel=1e-4)
+    assert _relief_limited_rate(room, rate, quick, dt) * dt - room == pytest.approx(answer.y[0, -1], rel=1e-4)

@@ -14,8 +14,8 @@ from scipy.linalg import expm
 from hydrotele.hydraulics import circuit, supply
 from hydrotele.hydraulics import laws as hydraulics
 from hydrotele.hydraulics.laws import (
-    friction,
-    orifice,
+    friction_force,
+    orifice_flow,
     port_flow,
     spool_step,
     valve_opening,
@@ -30,9 +30,7 @@ def laws(module):
     return {
         name: law
         for name, law in vars(module).items()
-        if hasattr(law, "py_func")
-        and law.py_func.__module__ == module.__name__
-        and not name.startswith("_")
+        if hasattr(law, "py_func") and law.py_func.__module__ == module.__name__ and not name.startswith("_")
     }
 
 
@@ -60,9 +58,7 @@ def test_docstring_names_every_argument_with_its_unit(name):
 def test_doctests_run():
     examples = failures = 0
     for name, law in LAWS.items():
-        for test in doctest.DocTestFinder().find(
-            law.py_func, name, globs=dict(law.py_func.__globals__)
-        ):
+        for test in doctest.DocTestFinder().find(law.py_func, name, globs=dict(law.py_func.__globals__)):
             result = doctest.DocTestRunner().run(test)
             examples, failures = examples + result.attempted, failures + result.failed
     assert failures == 0
@@ -77,9 +73,7 @@ def test_valve_opening_has_a_dead_band_and_unit_slope_to_one(spool, deadband):
         assert o == 0.0
     else:
         # rounding: the difference |s| - db keeps 1e-16 of s, divided by 1 - db >= 0.1
-        assert o * (1 - deadband) + math.copysign(deadband, spool) == pytest.approx(
-            spool, abs=1e-14
-        )
+        assert o * (1 - deadband) + math.copysign(deadband, spool) == pytest.approx(spool, abs=1e-14)
 
 
 def test_valve_is_fully_open_at_full_command():
@@ -89,26 +83,26 @@ def test_valve_is_fully_open_at_full_command():
 
 @given(st.floats(-30e6, 30e6), st.floats(1e-8, 1e-5), st.floats(1e3, 1e6))
 def test_orifice_slope_is_the_derivative(drop, gain, smoothing):
-    flow, slope = orifice(drop, gain, smoothing)
+    flow, slope = orifice_flow(drop, gain, smoothing)
     step = 1e-4 * math.hypot(drop, smoothing)
-    above, below = (orifice(drop + s, gain, smoothing)[0] for s in (step, -step))
+    above, below = (orifice_flow(drop + s, gain, smoothing)[0] for s in (step, -step))
     # central difference: truncation (step/scale)^2 = 1e-8 and cancellation 1e-16 / 1e-4
     assert slope == pytest.approx((above - below) / (2 * step), rel=1e-7)
     assert slope > 0
-    assert orifice(-drop, gain, smoothing)[0] == -flow
+    assert orifice_flow(-drop, gain, smoothing)[0] == -flow
 
 
 @given(st.floats(1e5, 30e6), st.floats(1e-8, 1e-5))
 def test_orifice_is_the_square_root_law_far_from_zero(drop, gain):
     smoothing = 5.0e4
-    flow, _ = orifice(drop, gain, smoothing)
+    flow, _ = orifice_flow(drop, gain, smoothing)
     deficit = 1.0 - flow / (gain * math.sqrt(drop))
     # 0 <= 1 - (1 + e^2)^(-1/4) <= e^2 / 4 with e = d / dp; 1e-15 for rounding
     assert -1e-15 <= deficit <= 0.25 * (smoothing / drop) ** 2 + 1e-15
 
 
 def test_orifice_passes_the_rated_flow_at_the_rated_drop():
-    flow, _ = orifice(7.0e6, 6.0e-3 / math.sqrt(7.0e6), 5.0e4)
+    flow, _ = orifice_flow(7.0e6, 6.0e-3 / math.sqrt(7.0e6), 5.0e4)
     assert flow == pytest.approx(6.0e-3, rel=1.3e-5)  # (d / dp)^2 / 4 = 1.28e-5
 
 
@@ -132,8 +126,8 @@ def test_port_flow_is_continuous_where_the_valves_open():
 @given(st.floats(-2, 2))
 def test_friction_is_odd_and_dissipates(velocity):
     numbers = (3000.0, 1500.0, 0.02, 6000.0, 0.005)
-    force = friction(velocity, *numbers)
-    assert force == -friction(-velocity, *numbers)
+    force = friction_force(velocity, *numbers)
+    assert force == -friction_force(-velocity, *numbers)
     assert force * velocity >= 0.0
     assert abs(force) <= 4500.0 + 6000.0 * abs(velocity)
 
@@ -143,16 +137,16 @@ def test_friction_in_its_three_limits():
     # at rest a damper (F_c + F_s) / v_0 + b; the next term of tanh is (v / v_0)^2 / 3 = 1.3e-9,
     # that of the Stribeck curve (v / v_s)^2 / 4
     v = 1e-6 * 0.02
-    assert friction(v, *numbers) / v == pytest.approx(4500 / 0.005 + 6000, rel=1e-8)
+    assert friction_force(v, *numbers) / v == pytest.approx(4500 / 0.005 + 6000, rel=1e-8)
     # sliding: exp(-25) = 1.4e-11 of F_s and 1 - tanh(20) are all that is left
-    assert friction(0.1, *numbers) == pytest.approx(3000 + 600, rel=1e-10)
+    assert friction_force(0.1, *numbers) == pytest.approx(3000 + 600, rel=1e-10)
     # the Stribeck curve falls: breakaway peak above the sliding force
-    peak = max(friction(x, *numbers) for x in np.linspace(0.001, 0.02, 50))
-    assert peak > friction(0.04, *numbers) + 500
+    peak = max(friction_force(x, *numbers) for x in np.linspace(0.001, 0.02, 50))
+    assert peak > friction_force(0.04, *numbers) + 500
 
 
 def test_friction_without_stribeck_is_coulomb_and_viscous():
-    assert friction(0.3, 4000.0, 0.0, 0.05, 2000.0, 0.005) == 4600.0
+    assert friction_force(0.3, 4000.0, 0.0, 0.05, 2000.0, 0.005) == 4600.0
 
 
 @given(

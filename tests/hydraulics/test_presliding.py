@@ -4,21 +4,21 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from hydrotele.effects import EFFECTS, apply_effect, changed
+from hydrotele.effects import EFFECTS, apply_effect, with_value
 from hydrotele.hydraulics.actuator import (
     actuator_friction,
     bristle_friction,
     bristle_rate,
     bristle_step,
-    settled_bristle_friction,
-    sliding_level,
+    implicit_bristle_friction,
+    sliding_friction,
 )
 from hydrotele.hydraulics.circuit import (
-    SCRATCH,
+    SCRATCH_SIZE,
     Slot,
-    circuit_supply,
-    demanded_share,
-    open_ports,
+    circuit_supply_pressure,
+    compute_ports,
+    demanded_flow_fraction,
     step_circuit,
 )
 from hydrotele.hydraulics.parameters import actuator_parameters, extra_state_names
@@ -38,7 +38,7 @@ def friction(**more):
              "coulomb_asymmetry": UNEQUAL, "viscous_asymmetry": 0.1, **more}  # fmt: skip
     machine = load_machine("rig")
     for name, value in facts.items():
-        machine = changed(machine, f"axes.slide.cylinder.friction.{name}", value)
+        machine = with_value(machine, f"axes.slide.cylinder.friction.{name}", value)
     return actuator_parameters(machine)["slide"]
 
 
@@ -62,7 +62,7 @@ def test_hysteresis_is_that_of_an_independent_integration(size):
     way = size * np.sin(w * time)
     force = np.zeros(len(time))
     for k, v in enumerate(np.diff(way) / dt):
-        level = sliding_level(v, COULOMB, STRIBECK, SLOW, UNEQUAL)
+        level = sliding_friction(v, COULOMB, STRIBECK, SLOW, UNEQUAL)
         force[k + 1] = bristle_step(force[k], v, level, STIFFNESS, dt)
     truth = integrated(way, lambda t: size * w * np.cos(w * t), 2.0, time).y[0]
     # velocities are held over a step: 1e-3 of the breakaway force is second order in 6e-3 rad
@@ -113,9 +113,7 @@ def test_slopes_are_those_of_the_force():
     user, share, dt = friction(), 0.4, 1e-7
     for v in (-2e-3, 2e-3):
         _, damping, stiffness = bristle_friction(user, 0, share, v, 0.0, 0.0)
-        faster, slower = (
-            bristle_friction(user, 0, share, v + d, 0.0, 0.0)[0] for d in (1e-6, -1e-6)
-        )
+        faster, slower = (bristle_friction(user, 0, share, v + d, 0.0, 0.0)[0] for d in (1e-6, -1e-6))
         # the level's own slope, which an implicit step does without, is 1 % here
         assert damping == pytest.approx((faster - slower) / 2e-6, rel=0.02)
         rate = bristle_rate(user, 0, share, v, 0.0, dt)
@@ -138,7 +136,7 @@ def test_stiff_bristles_count_as_soft_as_a_step_can_follow():
 def test_a_light_drive_side_is_stepped_implicitly():
     user = friction(viscous=1e5)
     v, mass, dt = 0.1, 3.0, 1e-3  # an explicit step would turn it round: b dt / m = 33
-    after = v - dt / mass * settled_bristle_friction(user, 0, 0.0, v, 0.0, mass, dt)
+    after = v - dt / mass * implicit_bristle_friction(user, 0, 0.0, v, 0.0, mass, dt)
     assert 0.0 < after < v
 
 
@@ -154,7 +152,7 @@ def test_what_is_remembered_stands_behind_the_activations():
     machine = apply_effect(load_machine("cat325"), "pump_lag", "", {"time_constant": 0.2})
     order = [n for n, a in machine.axes.items() if not a.pump]
     for name in order:
-        usual = EFFECTS["presliding"].parameters(machine, name)["compliance"].scale
+        usual = EFFECTS["presliding"].parameters(machine, name)["compliance"].prior_std
         machine = apply_effect(machine, "presliding", name, {"compliance": usual})
     names, valves = extra_state_names(machine), list(machine.hydraulic_axes)
     drives = [n for n, a in machine.axes.items() if a.force]
@@ -162,7 +160,7 @@ def test_what_is_remembered_stands_behind_the_activations():
                      *(f"bristle.{n}" for n in drives)]  # fmt: skip
     numbers = actuator_parameters(machine)
     assert numbers[valves[0]][Slot.BRISTLE] == 4 * len(valves)
-    assert all(numbers[n][Slot.MEMORY] == len(valves) + 1 for n in valves)
+    assert all(numbers[n][Slot.EXTRA_STATES] == len(valves) + 1 for n in valves)
     assert all(numbers[n][Slot.DELIVERY] == 5 * len(valves) for n in valves)
 
 
@@ -183,22 +181,22 @@ def slow_pump(time_constant):
     supply = {"time_constant": time_constant}
     machine = load_machine("rig")
     for name, value in supply.items():
-        machine = changed(machine, f"supply.{name}", value)
+        machine = with_value(machine, f"supply.{name}", value)
     return actuator_parameters(machine)["slide"]
 
 
 def test_the_pump_follows_by_its_exponential_and_arrives_at_todays_pressure():
     """What is drawn is 0.5 of what the pump gives; 63 % of it after the time constant."""
     user, dt, lag = slow_pump(0.1), 2.5e-4, 0.1
-    now, scratch, rates = slow_pump(0.0), np.zeros(SCRATCH), np.zeros(5)
+    now, scratch, rates = slow_pump(0.0), np.zeros(SCRATCH_SIZE), np.zeros(5)
     act = np.array([0.6, 0.0, 2e6, 2e6, 0.0])
-    open_ports(user, act, act, scratch, 0, 1, 0.0, act)
-    wanted = demanded_share(user, 0, 1, scratch)
-    without = circuit_supply(now, 0, 1, scratch, 1.0)
+    compute_ports(user, act, act, scratch, 0, 1, 0.0, act)
+    wanted = demanded_flow_fraction(user, 0, 1, scratch)
+    without = circuit_supply_pressure(now, 0, 1, scratch, 1.0)
     assert 0.2 < wanted < 1.0
-    low = circuit_supply(user, 0, 1, scratch, 0.5 * wanted)
+    low = circuit_supply_pressure(user, 0, 1, scratch, 0.5 * wanted)
     assert low < without, "a pump that is not there yet falls short"
-    assert circuit_supply(user, 0, 1, scratch, wanted) == pytest.approx(without, rel=1e-9)
+    assert circuit_supply_pressure(user, 0, 1, scratch, wanted) == pytest.approx(without, rel=1e-9)
     shares = []
     for _ in range(400):
         act[:4] = 0.6, 0.0, 2e6, 2e6

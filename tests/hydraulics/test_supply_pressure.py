@@ -5,7 +5,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hydrotele.hydraulics.circuit import SLOTS, Slot, axis_state, open_ports, supply_pressure
+from hydrotele.hydraulics.circuit import (
+    SLOT_COUNT,
+    Slot,
+    axis_flows_and_force,
+    compute_ports,
+    supply_pressure,
+)
 
 RELIEF, SMOOTHING = 28.0e6, 5.0e4
 GAINS = st.one_of(st.just(0.0), st.floats(1e-9, 1e-5))  # [m^3/(s sqrt(Pa))], rated 2.3e-6
@@ -76,9 +82,9 @@ def test_one_valve_has_the_pressure_of_the_square_root_law():
 
 
 def user_of(*gains):
-    user = np.zeros(SLOTS * len(gains))
+    user = np.zeros(SLOT_COUNT * len(gains))
     for i, gain in enumerate(gains):
-        numbers = user[SLOTS * i : SLOTS * (i + 1)]
+        numbers = user[SLOT_COUNT * i : SLOT_COUNT * (i + 1)]
         numbers[Slot.FLOW_GAIN], numbers[Slot.ORIFICE_SMOOTHING] = gain, SMOOTHING
         numbers[Slot.STRIBECK_VELOCITY] = numbers[Slot.COULOMB_VELOCITY] = 1.0
         numbers[Slot.TANK_PRESSURE] = 0.3e6
@@ -90,12 +96,12 @@ def user_of(*gains):
 def test_two_open_valves_share_the_pump_flow(opening):
     user, ports = user_of(2.3e-6, 2.3e-6), np.zeros(8)
     act = np.array([opening[0], 0, 8e6, 3e6, opening[1], 0, 6e6, 4e6])
-    open_ports(user, act, act, ports, 0, 2, 0.0, np.zeros(8))
+    compute_ports(user, act, act, ports, 0, 2, 0.0, np.zeros(8))
     pressure = supply_pressure(ports, 2, SMOOTHING, RELIEF, 5e-3)
     assert pressure < RELIEF
     drawn, loads = [], []
     for i in range(2):
-        head, rod, _ = axis_state(user, i, pressure, act[4 * i : 4 * i + 4], 0.0, 0.0)
+        head, rod, _ = axis_flows_and_force(user, i, pressure, act[4 * i : 4 * i + 4], 0.0, 0.0)
         fed, drained = (head, rod) if opening[i] > 0 else (rod, head)
         loads.append(act[4 * i + (2 if opening[i] > 0 else 3)])
         drawn.append(fed)
@@ -108,11 +114,11 @@ def test_two_open_valves_share_the_pump_flow(opening):
 def test_load_check_keeps_a_heavy_load_from_feeding_a_light_one():
     user, ports = user_of(2.3e-6, 6e-6), np.zeros(8)
     act = np.array([1.0, 0, 25e6, 3e6, 1.0, 0, 1e6, 2e6])
-    open_ports(user, act, act, ports, 0, 2, 0.0, np.zeros(8))
+    compute_ports(user, act, act, ports, 0, 2, 0.0, np.zeros(8))
     pressure = supply_pressure(ports, 2, SMOOTHING, RELIEF, 5e-3)
     assert pressure < 25e6
-    assert axis_state(user, 0, pressure, act[:4], 0.0, 0.0)[0] == 0.0
-    assert axis_state(user, 1, pressure, act[4:], 0.0, 0.0)[0] == pytest.approx(5e-3, rel=1e-9)
+    assert axis_flows_and_force(user, 0, pressure, act[:4], 0.0, 0.0)[0] == 0.0
+    assert axis_flows_and_force(user, 1, pressure, act[4:], 0.0, 0.0)[0] == pytest.approx(5e-3, rel=1e-9)
 
 
 def test_pressure_is_found_where_plain_newton_cycles():

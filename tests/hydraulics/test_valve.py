@@ -8,18 +8,18 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from hydrotele.hydraulics.circuit import (
-    NO_MEMORY,
-    SLOTS,
+    NO_EXTRA_STATES,
+    SLOT_COUNT,
     circuit_scratch,
-    circuit_supply,
-    open_ports,
+    circuit_supply_pressure,
+    compute_ports,
     step_circuit,
     supply_coupling,
 )
 from hydrotele.hydraulics.laws import (
     axis_opening,
     chamber_flows,
-    holding_share,
+    counterbalance_opening,
     spool_step,
     stop_force,
     valve_opening,
@@ -66,9 +66,7 @@ def test_a_flow_curve_is_interpolated_and_goes_on_beyond_its_end():
     user = record(valve={"deadband": 0.1, "negative": {"curve": CURVE, "deadband": 0.0}})
     travel = np.linspace(0.0, 1.0, 41)
     found = [axis_opening(user, 0, -t) for t in travel]
-    np.testing.assert_allclose(
-        found, -np.interp(travel, CURVE["travel"], CURVE["opening"]), rtol=1e-14, atol=1e-16
-    )
+    np.testing.assert_allclose(found, -np.interp(travel, CURVE["travel"], CURVE["opening"]), rtol=1e-14, atol=1e-16)
     assert axis_opening(user, 0, -1.2) == pytest.approx(-(0.8 + 0.2 * 0.5 / 0.5), rel=1e-12)
     assert axis_opening(user, 0, 0.4) == valve_opening(0.4, 0.1), "the other direction is straight"
 
@@ -133,9 +131,7 @@ def test_a_counterbalance_valve_holds_back_what_the_spool_leaks():
     held = {"head": {"setting": 24e6, "pilot_ratio": 3.0, "override": 0.25}}
     user = record(load_holding=held, valve={"tank_leakage": 1e-13})
     assert chamber_flows(user, 0, 0.0, 20e6, 12e6, TANK)[0] == 0.0
-    assert chamber_flows(user, 0, 0.0, 20e6, 12e6, 5e6)[0] == pytest.approx(
-        -0.5e-13 * (12e6 - TANK)
-    )
+    assert chamber_flows(user, 0, 0.0, 20e6, 12e6, 5e6)[0] == pytest.approx(-0.5e-13 * (12e6 - TANK))
     assert chamber_flows(user, 0, 0.0, 20e6, 0.1e6, TANK)[0] > 0, "its check lets oil in"
 
 
@@ -173,12 +169,12 @@ def test_a_held_load_comes_down_as_fast_as_the_pilot_allows():
 
     p_rod = brentq(excess, 0.4e6, 27e6)
     p_head = (load + rod * p_rod) / head
-    assert 0.0 < holding_share(p_head, p_rod, 20e6, 4.0, 4e6)[0] < 1.0
+    assert 0.0 < counterbalance_opening(p_head, p_rod, 20e6, 4.0, 4e6)[0] < 1.0
     user[Slot.LEAKAGE], v = 0.0, -speed(p_rod)
     act, rate = np.array([-0.5, 0.0, p_head, p_rod]), np.zeros(4)
     # both chambers must be in balance: no rate, within rounding of beta / V times the flow
     drives = Drives(1, act, np.array([0.5 + 1e-4 * v]), np.array([v]), np.array([-0.5]))
-    step_circuit(user, 0, drives, 1e-4, rate, circuit_scratch(), NO_TERMS, 0.0, NO_MEMORY)
+    step_circuit(user, 0, drives, 1e-4, rate, circuit_scratch(), NO_TERMS, 0.0, NO_EXTRA_STATES)
     stiff = user[Slot.BULK_MODULUS] / user[Slot.VOLUME_HEAD] * head * abs(v)
     assert np.abs(rate[2:]).max() < 1e-9 * stiff
 
@@ -224,7 +220,7 @@ def test_the_step_converges_with_second_order_where_everything_is_in_it():
         for n in range(round(0.032 / dt)):
             x = np.array([x0 + (n + 1) * dt * v])
             drives = Drives(1, act, x, np.array([v]), np.array([command]))
-            step_circuit(user, 0, drives, dt, rate, scratch, NO_TERMS, 0.0, NO_MEMORY)
+            step_circuit(user, 0, drives, dt, rate, scratch, NO_TERMS, 0.0, NO_EXTRA_STATES)
             act = act + dt * rate
         errors.append(np.abs(act - exact)[2:].max())
     # 2 in the limit; a kink of the curve or the compensator inside a step costs some of it
@@ -261,8 +257,8 @@ def supply_of(act, **supply):
     user = np.concatenate(list(actuator_parameters(changed_machine(supply=supply)).values()))
     ports = circuit_scratch()
     act = np.array(act, float)
-    open_ports(user, act, act, ports, 0, 3, 0.0, act)
-    return circuit_supply(user, 0, 3, ports, 1.0), user, ports
+    compute_ports(user, act, act, ports, 0, 3, 0.0, act)
+    return circuit_supply_pressure(user, 0, 3, ports, 1.0), user, ports
 
 
 CALM = [0.0, 0, 9e6, 9e6, 0.1, 0, 8e6, 5e6, -0.08, 0, 6e6, 7e6]
@@ -357,7 +353,7 @@ def test_chambers_keep_their_volume_beyond_the_ends():
         act, rate = np.array([0.0, 0.0, 4e6, 4e6]), np.zeros(4)
         for _ in range(200):
             drives = Drives(1, act, np.array([x]), np.array([v]), np.zeros(1))
-            step_circuit(user, 0, drives, 1e-3, rate, circuit_scratch(), NO_TERMS, 0.0, NO_MEMORY)
+            step_circuit(user, 0, drives, 1e-3, rate, circuit_scratch(), NO_TERMS, 0.0, NO_EXTRA_STATES)
             act = act + 1e-3 * rate
         assert np.isfinite(act).all()
         squeezed = act[2] if v < 0 else act[3]
@@ -383,4 +379,4 @@ def test_stroke_and_joint_range_end_the_travel():
     assert 0.0 < low < 0.1 and 1.04 < high < 1.05, "-42 .. 58 deg lie inside the stroke"
     force = 28e6 * CYLINDER.area_head
     assert numbers["boom"][Slot.STOP_STIFFNESS] == pytest.approx(force / 1e-3)
-    assert len(numbers["boom"]) == SLOTS
+    assert len(numbers["boom"]) == SLOT_COUNT

@@ -8,14 +8,14 @@ from hydrotele.core.errors import InputError
 from hydrotele.identify.estimation import METHODS, Estimator
 from hydrotele.identify.identification import identify_dynamics
 from hydrotele.identify.motion import Processing
-from hydrotele.identify.record import beginning, records
+from hydrotele.identify.record import build_records, cut_beginning
 from hydrotele.identify.setup import machine_setup
 from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
-from hydrotele.simulate.closure import closed_chain
+from hydrotele.simulate.closure import load_closed_chain
 from tools.studies.identify_coverage import one_trial
 
 PERIOD = 20.0  # s, of the scenario `excitation`
@@ -29,8 +29,8 @@ def repeated():
     for name, duration in (("excitation", "60.0"), ("excitation_fast", "20.0")):
         own = {"seed": "3", "sensors": sensors, "duration": duration}
         files.append(RunFiles(name, (run_scenario(load_scenario(name, own)).measured,)))
-    fit, heldout, _ = records(make_dataset(files, machine, sensors, "excitation_fast"))
-    return fit, heldout, machine_setup(machine, closed_chain(machine))
+    fit, heldout, _ = build_records(make_dataset(files, machine, sensors, "excitation_fast"))
+    return fit, heldout, machine_setup(machine, load_closed_chain(machine))
 
 
 @pytest.fixture(scope="module")
@@ -53,17 +53,14 @@ def test_weights_make_the_intervals_narrower(found):
     plain, others = found["least_squares"], [found[m] for m in METHODS if m != "least_squares"]
     for other in others:
         both = set(plain.told.base) & set(other.told.base)
-        stds = [
-            [np.log(f.estimate.std[list(f.told.base).index(b)]) for b in sorted(both)]
-            for f in (plain, other)
-        ]
+        stds = [[np.log(f.estimate.std[list(f.told.base).index(b)]) for b in sorted(both)] for f in (plain, other)]
         assert np.mean(stds[1]) < np.mean(stds[0])
 
 
 @pytest.mark.nightly
 def test_the_bias_taken_off_is_what_noise_of_positions_does_to_friction(repeated, found):
     corrected = found["weighted"]
-    kept = identify_dynamics(*repeated, Processing(period=PERIOD), Estimator(pairs=0))
+    kept = identify_dynamics(*repeated, Processing(period=PERIOD), Estimator(noise_pairs=0))
     assert not kept.bias.any()
     where = [corrected.names[b] for b in corrected.told.base].index("stribeck.boom_rod")
     # noise hides on which side of zero a slow rate is; more than the interval's half
@@ -77,7 +74,7 @@ def test_instruments_ask_for_a_repeated_motion(repeated):
         identify_dynamics(fit, heldout, setup, Processing(), Estimator("instruments"))
     with pytest.raises(InputError, match="repeat"):
         identify_dynamics(fit, heldout, setup, Processing(period=0.1), Estimator("instruments"))
-    once = [beginning(fit[0], 25.0)]
+    once = [cut_beginning(fit[0], 25.0)]
     with pytest.raises(InputError, match="does not repeat"):
         identify_dynamics(once, heldout, setup, Processing(period=PERIOD), Estimator("instruments"))
 

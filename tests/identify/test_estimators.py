@@ -47,7 +47,7 @@ def test_intervals_cover_the_truth_even_where_errors_are_correlated(share):
         y = equations(rng, 1600)
         found = estimate(y, y @ TRUTH + correlated(rng, 1600, 2, share))
         inside.append((found.ci95[:, 0] < TRUTH) & (found.ci95[:, 1] > TRUTH))
-        distances.append(found.ellipsoid(TRUTH))
+        distances.append(found.squared_distance(TRUTH))
     assert np.mean(inside) == pytest.approx(0.95, abs=0.02)
     # chi-square of 4 degrees: 9.49 at 95 %
     assert np.mean(np.array(distances) < 9.49) == pytest.approx(0.95, abs=0.04)
@@ -87,7 +87,7 @@ def test_truncation_and_ridge_keep_the_prior_where_the_data_are_silent():
         found = estimate(y, forces, prior=prior, **options).value
         assert found[:2] == pytest.approx(TRUTH[:2], rel=1e-5)
         assert found[2] + 2 * found[3] == pytest.approx(TRUTH[2] + 2 * TRUTH[3], rel=1e-5)
-    assert estimate(y, forces, prior=prior, cut=1e-6).condition > 1e12
+    assert estimate(y, forces, prior=prior, truncation=1e-6).condition > 1e12
 
 
 def test_rows_without_a_reading_are_left_out():

@@ -5,9 +5,9 @@ import dataclasses
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.effects.effect import changed
-from hydrotele.identify.hydraulic import HYDRAULIC, identify_hydraulics
-from hydrotele.identify.identified_machine import identify_document
+from hydrotele.effects.effect import with_value
+from hydrotele.identify.hydraulic import HYDRAULIC_EFFECTS, identify_hydraulics
+from hydrotele.identify.identified_machine import build_identify_document
 from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
 from hydrotele.machine.machine_file import load_machine
@@ -30,7 +30,7 @@ def found():
         for key in path.split("."):
             node = node[key] if isinstance(node, dict) else getattr(node, key)
         given[path] = float(node)
-        wrong = changed(wrong, path, node / factor)
+        wrong = with_value(wrong, path, node / factor)
     for name, seed in (("a", 1), ("b", 2)):
         scenario = load_scenario("rig_steps", {"seed": str(seed)})
         log = run_scenario(scenario).measured
@@ -61,7 +61,7 @@ def test_hidden_numbers_are_found_with_honest_intervals(found):
 
 
 def test_the_document_lists_them_with_the_others(found):
-    document = identify_document(None, found[0])
+    document = build_identify_document(None, found[0])
     names = [p["name"] for p in document["parameters"]]
     assert "valve_gain.slide" in names
     for entry in document["parameters"]:
@@ -81,7 +81,7 @@ def test_all_effects_here_have_one_parameter():
     from hydrotele.effects import EFFECTS
 
     machine = load_machine("cat215")
-    for name in HYDRAULIC:
+    for name in HYDRAULIC_EFFECTS:
         effect = EFFECTS[name]
         for place in effect.locations(machine):
             needed = [p for p in effect.parameters(machine, place).values() if not p.optional]

@@ -5,10 +5,20 @@ import dataclasses
 import numpy as np
 import pytest
 
-from hydrotele.identify.identifiability import COMBINATION, FULL, UNIDENTIFIABLE, identifiability
+from hydrotele.identify.identifiability import (
+    STATUS_COMBINATION,
+    STATUS_FULL,
+    STATUS_UNIDENTIFIABLE,
+    classify_parameters,
+)
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.multibody.chain import load_chain
-from hydrotele.multibody.inverse_dynamics import FrictionTerm, pin_friction, project, regressor
+from hydrotele.multibody.inverse_dynamics import (
+    FrictionTerm,
+    make_regressor,
+    passive_friction_terms,
+    project_on_drives,
+)
 from hydrotele.simulate.plant import build_plant, rest_state
 from tests.multibody.test_inverse_dynamics import panda
 
@@ -27,17 +37,17 @@ def test_the_panda_has_43_base_parameters():
     chain = load_chain(panda())
     motion = random_motion(np.zeros(7), 2.0, 60, 3)
     motion[0] = np.sort(motion[0], axis=0)
-    found = project(chain, chain.joints, *motion, drives=chain.joints)
+    found = project_on_drives(chain, chain.joints, *motion, drives=chain.joints)
     for rubbing, offsets, rank in (
         ((), False, 43),
         ([FrictionTerm(j) for j in chain.joints], True, 64),
     ):
-        table = regressor(chain, found, drives=chain.joints, rubbing=rubbing, offsets=offsets)
-        told = identifiability(table.matrix.reshape(-1, len(table.names)), table.names, table.units)
+        table = make_regressor(chain, found, drives=chain.joints, friction=rubbing, offsets=offsets)
+        told = classify_parameters(table.matrix.reshape(-1, len(table.names)), table.names, table.units)
         assert len(told.base) == rank
-        assert told.gap[0] > 1e3 * told.gap[1], "the rank must not be a matter of taste"
-    assert told.status[told.names.index("mass.link1")] == UNIDENTIFIABLE
-    assert told.status[told.names.index("offset.joint4")] == FULL
+        assert told.singular_value_gap[0] > 1e3 * told.singular_value_gap[1], "the rank must not be a matter of taste"
+    assert told.status[told.names.index("mass.link1")] == STATUS_UNIDENTIFIABLE
+    assert told.status[told.names.index("offset.joint4")] == STATUS_FULL
 
 
 @pytest.fixture(scope="module")
@@ -54,22 +64,22 @@ def complete():
         (width * rate * np.cos(rate * t + phase)).sum(0),
         -(width * rate**2 * np.sin(rate * t + phase)).sum(0),
     ]
-    found = project(chain, ("swing", "boom", "stick"), *motion)
+    found = project_on_drives(chain, ("swing", "boom", "stick"), *motion)
     drives = [FrictionTerm(joint, {"coulomb": 0.0}) for joint in chain.drives]
-    return regressor(
+    return make_regressor(
         chain, found, bodies=[b for b in chain.bodies if b != "chassis"],
-        rubbing=[*drives, *pin_friction(chain)],
+        friction=[*drives, *passive_friction_terms(chain)],
     )  # fmt: skip
 
 
 def test_counts_of_the_complete_model(complete):
     """Of cylinders that end in pins; Khoshzaban's Table 13 has ball joints."""
-    told = identifiability(complete.matrix.reshape(-1, 82), complete.names, complete.units)
-    assert told.counts == {UNIDENTIFIABLE: 9, COMBINATION: 53, FULL: 20}
-    assert told.gap[0] > 1e5 * told.gap[1]
-    lost = [n for n, s in zip(told.names, told.status, strict=True) if s == UNIDENTIFIABLE]
+    told = classify_parameters(complete.matrix.reshape(-1, 82), complete.names, complete.units)
+    assert told.status_counts == {STATUS_UNIDENTIFIABLE: 9, STATUS_COMBINATION: 53, STATUS_FULL: 20}
+    assert told.singular_value_gap[0] > 1e5 * told.singular_value_gap[1]
+    lost = [n for n, s in zip(told.names, told.status, strict=True) if s == STATUS_UNIDENTIFIABLE]
     assert lost == [n for n in complete.names if n.endswith(".swing")][:9], "all but Izz"
-    (text,) = [told.text(k) for k, b in enumerate(told.base) if told.names[b] == "moment_x.boom"]
+    (text,) = [told.format_combination(k) for k, b in enumerate(told.base) if told.names[b] == "moment_x.boom"]
     # lever arms of the pins along the boom, as drawn
     arms = {"5.18 mass.stick", "5.18 mass.stick_rod", "2.95961 mass.stick_tube"}
     assert set(text.split(" + ")) == {"moment_x.boom", "1.59727 mass.boom_rod", *arms}
@@ -77,7 +87,7 @@ def test_counts_of_the_complete_model(complete):
 
 def test_base_parameters_carry_all_there_is(complete):
     flat = complete.matrix.reshape(-1, 82)
-    told = identifiability(flat, complete.names, complete.units)
+    told = classify_parameters(flat, complete.names, complete.units)
     some = np.random.default_rng(0).normal(size=82) * 1e3
     forces = flat @ some
     by_base = flat[:, told.base] @ (told.combination @ some)
@@ -86,7 +96,7 @@ def test_base_parameters_carry_all_there_is(complete):
 
 def test_a_wanted_parameter_stands_for_its_combination(complete):
     flat = complete.matrix.reshape(-1, 82)
-    told = identifiability(flat, complete.names, complete.units, first=("inertia_zz.boom",))
+    told = classify_parameters(flat, complete.names, complete.units, preferred=("inertia_zz.boom",))
     assert "inertia_zz.boom" in [complete.names[k] for k in told.base]
     assert len(told.base) == 45
 
@@ -95,9 +105,9 @@ def test_no_motion_tells_gravity_only():
     plant = build_plant(load_machine("cat215"))
     chain = dataclasses.replace(load_chain(plant.model), start=rest_state(plant).qpos.copy())
     still = np.tile([[0.0, 0.3, -1.6]], (50, 1))
-    found = project(chain, ("swing", "boom", "stick"), still, 0 * still, 0 * still)
-    table = regressor(chain, found, rubbing=[FrictionTerm(j) for j in chain.drives])
-    told = identifiability(table.matrix.reshape(-1, len(table.names)), table.names, table.units)
+    found = project_on_drives(chain, ("swing", "boom", "stick"), still, 0 * still, 0 * still)
+    table = make_regressor(chain, found, friction=[FrictionTerm(j) for j in chain.drives])
+    told = classify_parameters(table.matrix.reshape(-1, len(table.names)), table.names, table.units)
     # one pose: a torque of the swing, a force of each cylinder
     assert len(told.base) == 3
-    assert told.counts[FULL] == 1  # the swing's offset; gravity does not reach it
+    assert told.status_counts[STATUS_FULL] == 1  # the swing's offset; gravity does not reach it

@@ -7,16 +7,16 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.identify.estimation import Estimator
-from hydrotele.identify.identifiability import FULL, WEAK
-from hydrotele.identify.identification import identify_dynamics, identify_with_shapes
+from hydrotele.identify.identifiability import STATUS_FULL, STATUS_WEAK
+from hydrotele.identify.identification import identify_dynamics, identify_with_friction_shapes
 from hydrotele.identify.motion import Processing
-from hydrotele.identify.record import beginning, records
-from hydrotele.identify.result import counts, parameter_rows
+from hydrotele.identify.record import build_records, cut_beginning
+from hydrotele.identify.result import count_statuses, parameter_rows
 from hydrotele.identify.setup import machine_setup
 from hydrotele.logs.dataset import load_dataset
 from hydrotele.logs.log import load_log, save_log
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.simulate.closure import closed_chain
+from hydrotele.simulate.closure import load_closed_chain
 from tests.measured import MEASURED, REAL, needs_real
 
 
@@ -24,8 +24,8 @@ from tests.measured import MEASURED, REAL, needs_real
 def clean():
     """The unchanged machine, recorded by an independent simulator."""
     machine = load_machine("cat215")
-    fit, heldout, _ = records(load_dataset(MEASURED / "open_04", machine))
-    return fit, heldout, machine_setup(machine, closed_chain(machine))
+    fit, heldout, _ = build_records(load_dataset(MEASURED / "open_04", machine))
+    return fit, heldout, machine_setup(machine, load_closed_chain(machine))
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def found(clean):
 def short(clean):
     """The first half of every run: enough for what a fault of the data changes."""
     fit, heldout, setup = clean
-    return [beginning(run, 20.0) for run in fit], beginning(heldout, 20.0), setup
+    return [cut_beginning(run, 20.0) for run in fit], cut_beginning(heldout, 20.0), setup
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def test_intervals_hold_the_parameters_of_the_machine_that_was_recorded(found):
     # of 29 numbers 1.5 lie outside by chance, more than 4 in 2 % of all cases
     assert np.sum(away > 1.96) <= 4
     # chi^2 of 29 degrees of freedom exceeds 49.6 in 1 % of all cases
-    assert len(away) > 25 and found.estimate.ellipsoid(truth) < 49.6
+    assert len(away) > 25 and found.estimate.squared_distance(truth) < 49.6
 
 
 def test_held_out_forces_differ_by_noise(found):
@@ -70,13 +70,8 @@ def test_held_out_forces_differ_by_noise(found):
 def test_a_wrong_machine_is_found_out_and_mended(short, found_short):
     fit, heldout, setup = short
     wrong = dataclasses.replace(setup.chain, inertia=setup.chain.inertia * 0.8)
-    rubbing = tuple(
-        dataclasses.replace(r, nominal={k: 0.5 * v for k, v in r.nominal.items()})
-        for r in setup.rubbing
-    )
-    again = identify_dynamics(
-        fit, heldout, dataclasses.replace(setup, chain=wrong, rubbing=rubbing)
-    )
+    rubbing = tuple(dataclasses.replace(r, nominal={k: 0.5 * v for k, v in r.nominal.items()}) for r in setup.rubbing)
+    again = identify_dynamics(fit, heldout, dataclasses.replace(setup, chain=wrong, rubbing=rubbing))
     for drive, judged in again.heldout.items():
         assert judged.rms < 0.4 * judged.nominal_rms, drive
         assert judged.rms < 1.1 * found_short.heldout[drive].rms, drive  # weak ones stay wrong
@@ -96,8 +91,8 @@ def test_the_complete_model_is_at_least_as_good_as_the_reduced_one(clean, found)
 @pytest.mark.nightly
 def test_with_perfect_sensors_tubes_and_rods_show():
     machine = load_machine("cat215")
-    fit, heldout, _ = records(load_dataset([MEASURED / "nominal_truth"], machine, "ideal"))
-    chain = closed_chain(machine)
+    fit, heldout, _ = build_records(load_dataset([MEASURED / "nominal_truth"], machine, "ideal"))
+    chain = load_closed_chain(machine)
     complete, reduced = (
         identify_dynamics(fit, heldout, machine_setup(machine, chain, model)).heldout
         for model in ("complete", "reduced")
@@ -105,7 +100,7 @@ def test_with_perfect_sensors_tubes_and_rods_show():
     for drive in complete:
         assert complete[drive].rms < reduced[drive].rms, drive
         # differentiating samples of 50 Hz leaves 0.1 to 0.5 %, friction near reversals most
-        assert complete[drive].relative < 0.006, drive
+        assert complete[drive].relative_error < 0.006, drive
 
 
 @pytest.mark.nightly
@@ -166,10 +161,10 @@ def test_readings_of_a_saturated_sensor_are_left_out(clean, tmp_path):
         save_log(dataclasses.replace(log, columns=columns), tmp_path / file.name)
     data = load_dataset(tmp_path, load_machine("cat215"))
     assert any("pressure_head.boom is saturated at" in note for note in data.notes)
-    fit, heldout, _ = records(data)
+    fit, heldout, _ = build_records(data)
     found = identify_dynamics(fit, heldout, clean[2])
     # chi^2 of 25 degrees of freedom exceeds 44.3 in 1 % of all cases
-    assert 20 < len(found.told.base) <= 25 and found.distance(found.nominal)[0] < 44.3
+    assert 20 < len(found.data_identifiability.base) <= 25 and found.squared_distance(found.nominal)[0] < 44.3
 
 
 def test_unknown_forces_everywhere_are_refused(clean):
@@ -184,15 +179,15 @@ def test_unknown_forces_everywhere_are_refused(clean):
 def test_emps_has_the_published_numbers(asymmetry, error):
     """Janot, Gautier and Brunot: 95.11 kg, 203.5 N s/m, 20.39 N, -3.165 N, 4.08 and 3.11 %."""
     machine = load_machine("emps")
-    fit, heldout, _ = records(load_dataset(REAL / "emps" / "main.parquet", machine))
-    setup = machine_setup(machine, closed_chain(machine), asymmetry=asymmetry)
-    found = identify_with_shapes(fit, heldout, setup)
+    fit, heldout, _ = build_records(load_dataset(REAL / "emps" / "main.parquet", machine))
+    setup = machine_setup(machine, load_closed_chain(machine), asymmetry=asymmetry)
+    found = identify_with_friction_shapes(fit, heldout, setup)
     rows = {row.name: row for row in parameter_rows(found)}
     assert rows["mass.carriage"].value == pytest.approx(95.11, rel=0.01)
     assert rows["viscous.slide"].value == pytest.approx(203.5, rel=0.02)
     assert rows["coulomb.slide"].value == pytest.approx(20.39, rel=0.02)
-    assert found.heldout["slide"].relative < error
-    assert {row.status for row in rows.values() if row.value is not None} == {FULL}
+    assert found.heldout["slide"].relative_error < error
+    assert {row.status for row in rows.values() if row.value is not None} == {STATUS_FULL}
     if asymmetry:
         low, high = rows["viscous_asymmetry.slide"].ci95
         assert low < (166.7 - 240.4) / 2 < high
@@ -203,10 +198,10 @@ def test_emps_has_the_published_numbers(asymmetry, error):
 def test_rows_say_of_every_parameter_what_is_known(found):
     rows = parameter_rows(found)
     assert [row.name for row in rows] == list(found.names)
-    assert sum(counts(rows).values()) == len(rows)
+    assert sum(count_statuses(rows).values()) == len(rows)
     for row in rows:
         assert (row.value is None) == (row.std is None) == (row.ci95 is None)
-        if row.status == WEAK:
+        if row.status == STATUS_WEAK:
             assert row.value is None
         if row.ci95:
             assert row.ci95[0] < row.value < row.ci95[1]
@@ -231,7 +226,7 @@ def test_pressures_that_are_read_half_as_often_are_enough(short):
         return dataclasses.replace(record, force=force)
 
     again = identify_dynamics([slower(r) for r in fit], slower(heldout), setup)
-    truth = again.told.combination @ again.nominal
+    truth = again.data_identifiability.combination @ again.nominal
     away = np.abs(again.estimate.value - truth) / again.estimate.std
     # as above; bridged samples carry twice the noise's variance
     assert np.sum(away > 1.96) <= 4
@@ -239,16 +234,12 @@ def test_pressures_that_are_read_half_as_often_are_enough(short):
 
 def test_a_short_run_is_left_out_with_a_note(short):
     fit, heldout, setup = short
-    blink = dataclasses.replace(
-        fit[0], name="blink", position=fit[0].position[:60], force=fit[0].force[:60]
-    )
+    blink = dataclasses.replace(fit[0], name="blink", position=fit[0].position[:60], force=fit[0].force[:60])
     found = identify_dynamics([*fit[1:], blink], heldout, setup)
     assert any("blink is too short" in note for note in found.notes)
 
 
-@pytest.mark.parametrize(
-    "options", [{"ridge": -1.0}, {"cut": 1.0}, {"cut": -0.1}, {"method": "magic"}, {"pairs": -1}]
-)
+@pytest.mark.parametrize("options", [{"ridge": -1.0}, {"cut": 1.0}, {"cut": -0.1}, {"method": "magic"}, {"pairs": -1}])
 def test_options_without_sense_are_refused(options):
     with pytest.raises(InputError, match="estimator"):
         Estimator(**options)

@@ -5,18 +5,22 @@ import dataclasses
 import numpy as np
 import pytest
 
-from hydrotele.effects.effect import changed
+from hydrotele.effects.effect import with_value
 from hydrotele.identify.estimation import Estimate
-from hydrotele.identify.identifiability import identifiability
-from hydrotele.identify.identified_machine import Freedom, consistent, identified_machine
+from hydrotele.identify.identifiability import classify_parameters
+from hydrotele.identify.identified_machine import (
+    AllowedDeformation,
+    build_identified_machine,
+    find_consistent_parameters,
+)
 from hydrotele.identify.result import (
-    Forces,
+    HeldOutForces,
     Identification,
 )
 from hydrotele.identify.setup import cylinder_bars, machine_setup
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.multibody.chain import load_chain
-from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, project, regressor
+from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, make_regressor, project_on_drives
 from hydrotele.simulate.plant import build_plant, rest_state
 
 
@@ -34,11 +38,15 @@ def table_of(machine, seed=0):
         middle + width * np.sin(9 * steps + rng.uniform(0, 6, 3)),
         rng.uniform(-0.5, 0.5, (90, 3)), rng.uniform(-1.0, 1.0, (90, 3)),
     ]  # fmt: skip
-    found = project(setup.chain, setup.given, *motion)
-    table = regressor(
-        setup.chain, found, bodies=setup.bodies, rubbing=setup.rubbing, offsets=setup.offsets
+    found = project_on_drives(setup.chain, setup.given_joints, *motion)
+    table = make_regressor(
+        setup.chain,
+        found,
+        bodies=setup.bodies,
+        friction=setup.friction_terms,
+        offsets=setup.offsets,
     )
-    told = identifiability(table.matrix.reshape(-1, len(table.names)), table.names, table.units)
+    told = classify_parameters(table.matrix.reshape(-1, len(table.names)), table.names, table.units)
     return table, told
 
 
@@ -56,7 +64,7 @@ def as_found(table, told, value, share=1e-3):
         np.eye(len(base)),
         len(base),
     )
-    nothing = Forces("", (), *(np.zeros((0,)) for _ in range(4)))
+    nothing = HeldOutForces("", (), *(np.zeros((0,)) for _ in range(4)))
     return Identification(
         table.names, table.units, table.nominal, value, told, told, estimate,
         np.zeros(len(base)), {}, nothing, 1.0, {}, "ok", (), 0.0,
@@ -74,7 +82,7 @@ def truth():
         ("axes.stick.cylinder.friction.viscous", 3100.0),
         ("axes.boom.cylinder.friction.stribeck_extra", 1100.0),
     ):  # fmt: skip
-        machine = changed(machine, path, value)
+        machine = with_value(machine, path, value)
     return machine
 
 
@@ -83,9 +91,9 @@ def test_a_machine_of_the_family_is_found_again(truth):
     table, told = table_of(load_machine("cat215"))
     other, _ = table_of(truth)
     found = as_found(table, told, other.nominal)
-    machine, best = identified_machine(load_machine("cat215"), found, cylinder_bars(truth))
+    machine, best = build_identified_machine(load_machine("cat215"), found, cylinder_bars(truth))
     # the prior pulls by less than a standard deviation in every direction
-    assert best.loss < len(told.base)
+    assert best.squared_distance < len(told.base)
     again, _ = table_of(machine)
     np.testing.assert_allclose(again.nominal, best.value, rtol=1e-9, atol=1e-6)
     base, true = told.combination @ again.nominal, told.combination @ other.nominal
@@ -102,7 +110,7 @@ def test_impossible_numbers_become_the_nearest_possible_ones():
     names = list(table.names)
     value[names.index("inertia_yy.stick")] = -300.0  # no body has this
     value[names.index("coulomb.swing")] = -500.0  # nor does friction drive
-    best = consistent(as_found(table, told, value, 0.01))
+    best = find_consistent_parameters(as_found(table, told, value, 0.01))
     for body in ("boom", "stick", "boom_tube"):
         p = best.value[[names.index(f"{kind}.{body}") for kind in BODY_PARAMETERS]]
         inertia = np.array([[p[4], p[5], p[6]], [p[5], p[7], p[8]], [p[6], p[8], p[9]]])
@@ -112,7 +120,7 @@ def test_impossible_numbers_become_the_nearest_possible_ones():
         pseudo[3, 3] = p[0]
         assert np.linalg.eigvalsh(pseudo).min() > 0.0, body
     assert best.value[names.index("coulomb.swing")] >= 0.0
-    assert best.loss > len(told.base), "it must say that the estimate itself cannot be"
+    assert best.squared_distance > len(told.base), "it must say that the estimate itself cannot be"
 
 
 @pytest.mark.nightly
@@ -121,8 +129,8 @@ def test_freedom_keeps_axes_and_lines():
     value = table.nominal.copy()
     names = list(table.names)
     value[names.index("moment_x.stick")] *= 1.2
-    freedom = {"stick": Freedom(shear=False, axis=np.array([1.0, 0.0, 0.0]))}
-    best = consistent(as_found(table, told, value), freedom)
+    freedom = {"stick": AllowedDeformation(can_rotate_axes=False, shift_direction=np.array([1.0, 0.0, 0.0]))}
+    best = find_consistent_parameters(as_found(table, told, value), freedom)
     p = best.value[[names.index(f"{kind}.stick") for kind in BODY_PARAMETERS]]
     com = p[1:4] / p[0]
     products = p[[5, 6, 8]] + p[0] * np.array([com[0] * com[1], com[0] * com[2], com[1] * com[2]])

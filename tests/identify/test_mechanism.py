@@ -11,9 +11,9 @@ from hydrotele.cli.main import app
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import models_folder
 from hydrotele.identify.identification import identify_dynamics
-from hydrotele.identify.mechanism import ColumnMapping, load_mechanism, mechanism_records
+from hydrotele.identify.mechanism import ColumnMapping, load_mechanism, load_mechanism_records
 from hydrotele.multibody.chain import load_chain
-from hydrotele.multibody.inverse_dynamics import project
+from hydrotele.multibody.inverse_dynamics import project_on_drives
 from tests.measured import REAL, needs_real
 
 FOUR_BAR = """\
@@ -71,15 +71,13 @@ def logged(folder, xml, size, frequency, noise, seed=0, rate=200.0, seconds=20.0
         for k in range(5):
             w = 2.0 * np.pi * frequency * (k + 1)
             angle = w * t[:, None] + phase[k]
-            for order, shape in enumerate(
-                (np.sin(angle), w * np.cos(angle), -(w**2) * np.sin(angle))
-            ):
+            for order, shape in enumerate((np.sin(angle), w * np.cos(angle), -(w**2) * np.sin(angle))):
                 motion[order] += size / (k + 1) * shape
-        found = project(chain, chain.drives, *motion)
-        forces = found.bodies @ chain.inertia.ravel()
+        found = project_on_drives(chain, chain.drives, *motion)
+        forces = found.body_projection @ chain.inertia.ravel()
         joint = chain.damping * found.rate + chain.frictionloss * np.sign(found.rate)
         joint += chain.armature * found.acceleration
-        forces += np.einsum("nkv,nv->nk", found.share, joint)
+        forces += np.einsum("nkv,nv->nk", found.joint_projection, joint)
         angles = motion[0] + 1e-5 * rng.standard_normal(motion[0].shape)
         forces += noise * rng.standard_normal(forces.shape)
         head = [
@@ -117,9 +115,9 @@ def test_a_closed_chain_is_identified_by_the_command(tmp_path, xml, size, freque
 def test_truth_lies_in_the_ellipsoid(tmp_path):
     logged(tmp_path, FOUR_BAR, 0.5, 0.2, 0.02)
     mechanism = load_mechanism(tmp_path / "robot.xml", tmp_path / "columns.yaml")
-    fit, heldout, _ = mechanism_records([tmp_path / "logs"], mechanism)
+    fit, heldout, _ = load_mechanism_records([tmp_path / "logs"], mechanism)
     found = identify_dynamics(fit, heldout, mechanism.setup)
-    distance, limit = found.distance(found.nominal)
+    distance, limit = found.squared_distance(found.nominal)
     assert heldout.name == "test" and distance < 1.5 * limit  # the given numbers are the true ones
 
 
@@ -130,7 +128,7 @@ def test_a_single_run_is_split_and_columns_with_usual_names_need_no_mapping(tmp_
     np.savetxt(tmp_path / "one.csv", table, delimiter=",", comments="",
                header="time [s],angle.crank,torque.crank")  # fmt: skip
     mechanism = load_mechanism(tmp_path / "robot.xml")
-    fit, heldout, notes = mechanism_records([tmp_path / "one.csv"], mechanism)
+    fit, heldout, notes = load_mechanism_records([tmp_path / "one.csv"], mechanism)
     assert len(fit[0].force) + len(heldout.force) == len(t) and "only run" in notes[-1]
     np.testing.assert_allclose(heldout.position[-1, 0], np.sin(t[-1]))
 
@@ -151,7 +149,7 @@ def test_refusals(tmp_path, mapping, message):
     rows = "\n".join(f"{0.01 * k:.2f},{k}" for k in range(20))
     (tmp_path / "log.csv").write_text(f"time,angle.crank [rad]\n{rows}\n")
     with pytest.raises(InputError, match=message):
-        mechanism_records([tmp_path / "log.csv"], load_mechanism(tmp_path / "robot.xml", mapping))
+        load_mechanism_records([tmp_path / "log.csv"], load_mechanism(tmp_path / "robot.xml", mapping))
 
 
 def test_a_machine_option_is_refused_beside_mjcf(tmp_path):
@@ -166,11 +164,11 @@ def test_a_machine_option_is_refused_beside_mjcf(tmp_path):
 def test_the_panda_set_is_predicted():
     """Published relative error 1.41 % with 43 coefficients; here below a third not fitted."""
     mechanism = load_mechanism(models_folder() / "panda" / "panda.xml")
-    fit, heldout, _ = mechanism_records([REAL / "panda"], mechanism)
+    fit, heldout, _ = load_mechanism_records([REAL / "panda"], mechanism)
     found = identify_dynamics(fit, heldout, mechanism.setup)
     error = np.sqrt(sum(h.rms**2 for h in found.heldout.values()))
-    force = np.sqrt(sum((h.rms / h.relative) ** 2 for h in found.heldout.values()))
-    assert len(found.structure.base) == 64  # 43 and 21 of friction, as others find
+    force = np.sqrt(sum((h.rms / h.relative_error) ** 2 for h in found.heldout.values()))
+    assert len(found.motion_identifiability.base) == 64  # 43 and 21 of friction, as others find
     assert error / force < 0.015
 
 

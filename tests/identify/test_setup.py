@@ -11,8 +11,8 @@ from hydrotele.identify.mechanism import load_mechanism
 from hydrotele.identify.setup import machine_setup, mechanism_setup
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.multibody.chain import load_chain
-from hydrotele.multibody.inverse_dynamics import project
-from hydrotele.simulate.closure import closed_chain
+from hydrotele.multibody.inverse_dynamics import project_on_drives
+from hydrotele.simulate.closure import load_closed_chain
 
 FOLDER = models_folder() / "palida"
 
@@ -22,8 +22,8 @@ def test_merged_columns_give_the_same_forces():
     whole = replace(own, alike=(), absent=())
     rng = np.random.default_rng(0)
     pose = np.array([0, 0, 0.55, 0, 0, 0]) + 0.05 * rng.normal(size=(5, 6))
-    found = project(own.chain, own.given, pose, rng.normal(size=(5, 6)), rng.normal(size=(5, 6)))
-    some, every = own.table(found), whole.table(found)
+    found = project_on_drives(own.chain, own.given_joints, pose, rng.normal(size=(5, 6)), rng.normal(size=(5, 6)))
+    some, every = own.compute_regressor(found), whole.compute_regressor(found)
     assert len(some.names) == 35 and len(every.names) > 200
     # the legs of the model are the same, and what is absent is 0 there
     np.testing.assert_allclose(some.matrix @ some.nominal, every.matrix @ every.nominal, atol=1e-9)
@@ -33,24 +33,30 @@ def test_what_is_not_there_is_refused():
     chain = load_chain(FOLDER / "palida.xml")
     still = np.zeros((1, 6))
     for setup, message in (
-        (mechanism_setup(chain, alike=[("ring_1", "wing")]), "alike: wing has no parameters"),
-        (mechanism_setup(chain, absent=["mass.wing"]), "absent: mass.wing is not a parameter"),
+        (
+            mechanism_setup(chain, equal_groups=[("ring_1", "wing")]),
+            "alike: wing has no parameters",
+        ),
+        (
+            mechanism_setup(chain, zero_parameters=["mass.wing"]),
+            "absent: mass.wing is not a parameter",
+        ),
     ):
         legs = chain.start[[chain.index(d) for d in chain.drives]][None]
-        found = project(chain, chain.drives, legs, still, still)
+        found = project_on_drives(chain, chain.drives, legs, still, still)
         with pytest.raises(InputError, match=message):
-            setup.table(found)
+            setup.compute_regressor(found)
 
 
 def test_ball_joints_carry_no_moment_about_a_cylinders_axis():
     machine = load_machine("cat215")
-    chain = closed_chain(machine)
+    chain = load_closed_chain(machine)
     pose = np.array([[0.1, 0.4, -1.5]])
     columns = {}
     for ball_joints in (True, False):
         setup = machine_setup(machine, chain, ball_joints=ball_joints)
         # the swing accelerates alone, so that tubes and rods are turned about their axes
-        table = setup.table(setup.project(pose, 0.0 * pose, np.array([[1.0, 0.0, 0.0]])))
+        table = setup.compute_regressor(setup.project(pose, 0.0 * pose, np.array([[1.0, 0.0, 0.0]])))
         column = [n.endswith("_tube") and n.startswith("inertia_xx") for n in table.names]
         columns[ball_joints] = table.matrix[0, 0, np.flatnonzero(column)]
     assert np.all(np.abs(columns[True]) < 1e-15), "rounding"

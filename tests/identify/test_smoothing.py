@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.identify.smoothing import error_draws, smooth, transition
+from hydrotele.identify.smoothing import sample_errors, smooth, transition_matrices
 
 DT = 0.02
 
 
 def chain(rows, input_std, order, seed):
     """A signal of the model itself: states (rows, order) with the input held per sample."""
-    forward, _, drive = transition(order)
+    forward, _, drive = transition_matrices(order)
     scale, rng = DT ** np.arange(order), np.random.default_rng(seed)
     state, states = np.zeros(order), np.empty((rows, order))
     for j in range(rows):
@@ -31,7 +31,7 @@ def test_it_is_the_minimum_of_the_penalised_squares(order):
     rows, ratio, rng = 40, 0.03, np.random.default_rng(1)
     samples = np.cumsum(rng.normal(size=rows))
     samples[[0, 7, 8, 39]] = np.nan
-    forward, _, drive = transition(order)
+    forward, _, drive = transition_matrices(order)
     # unknowns: the first state and all inputs; the value is linear in them
     value = np.zeros((rows, order + rows - 1))
     state = np.zeros((order, order + rows - 1))
@@ -149,7 +149,7 @@ def test_drawn_errors_have_the_stated_deviations():
     samples = chain(500, 3.0, 3, 11)[:, 0] + np.random.default_rng(12).normal(0, 1e-3, 500)
     samples[100:130] = np.nan
     found = smooth(samples, DT, noise=1e-3)
-    draws = error_draws(found, 400, seed=1)[..., 0]
+    draws = sample_errors(found, 400, seed=1)[..., 0]
     assert draws.shape == (400, 3, 500)
     for k, spread in enumerate((found.value_std, found.rate_std, found.acceleration_std)):
         # 400 draws know a deviation to 3.5 %; the largest of 500 correlated ones lies near 4 sigma

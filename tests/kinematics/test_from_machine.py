@@ -8,16 +8,14 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.kinematics.arm import forward, inverse, jacobian
+from hydrotele.kinematics.arm import forward_kinematics, inverse_kinematics, jacobian
 from hydrotele.kinematics.from_machine import arm_geometry, axis_linkage
 from hydrotele.machine.machine_file import load_machine, shipped_machines
 from hydrotele.simulate.closure import independent_dofs, motion_basis
 from hydrotele.simulate.plant import build_plant, rest_state
 
 MACHINES = {
-    f"{name}-{tool}": load_machine(name, tool)
-    for name in shipped_machines()
-    for tool in load_machine(name).tools
+    f"{name}-{tool}": load_machine(name, tool) for name in shipped_machines() for tool in load_machine(name).tools
 }
 # A tool adds the joints of the tool only: daily each machine with one tool, and the CAT 215, whose
 # bucket hangs on a four-bar, with two.
@@ -134,14 +132,14 @@ def test_arm_puts_the_tip_where_mujoco_does(name):
     for _, q, data in arm_samples(name):
         mujoco.mj_kinematics(plant.model, data)
         x, y, z = data.site("hydrotele_tip").xpos
-        pose = forward(geometry, q)
+        pose = forward_kinematics(geometry, q)
         assert pose[0] == pytest.approx(math.hypot(x, y), abs=1e-10)
         assert math.remainder(pose[1] - math.atan2(y, x), math.tau) == pytest.approx(0, abs=1e-10)
         assert pose[2] == pytest.approx(z, abs=1e-10)
-        if geometry.tool_joint:
+        if geometry.has_tool_joint:
             along = data.site("hydrotele_tip").xmat.reshape(3, 3)[:, 0]
             assert math.sin(pose[3]) == pytest.approx(along[2], abs=1e-10)
-        back = inverse(geometry, pose)
+        back = inverse_kinematics(geometry, pose)
         turn = math.remainder(back[0] - q[0], math.tau)
         np.testing.assert_allclose([turn, *np.subtract(back, q)[1:]], 0, atol=1e-7)
         seen += 1

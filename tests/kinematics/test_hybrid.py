@@ -7,35 +7,35 @@ from scipy.spatial.transform import Rotation
 from hydrotele.core.errors import InputError
 from hydrotele.kinematics.hybrid import (
     REVOLUTE,
-    Pose,
-    Unreachable,
+    PlatformPose,
+    UnreachableError,
+    apply_errors,
     batch_readings,
+    build_error_model,
     carriage_pose,
-    corrected,
-    document_parameters,
-    error_model,
-    first_order,
-    forward,
-    forward_evolution,
+    convert_to_axes,
+    euler_to_rotation,
+    first_order_carriage_pose,
+    forward_by_evolution,
+    forward_kinematics,
     home_pose,
-    inverse,
+    inverse_kinematics,
     leg_jacobian,
     leg_readings,
     load_hybrid,
     pose_difference,
-    predicted_readings,
-    rotation_of_euler,
+    predict_leg_readings,
+    refined_model_parameters,
     save_hybrid,
-    with_axes,
 )
 from hydrotele.kinematics.wires import (
-    NoIntersection,
+    NoIntersectionError,
     pose_covariance,
-    pose_of_wires,
+    pose_from_wires,
     wire_jacobian,
     wire_lengths,
 )
-from hydrotele.simulate.hybrid import random_poses, shipped_wires
+from hydrotele.simulate.hybrid import default_wires, sample_poses
 
 IWR = load_hybrid("iwr")
 ROUNDING = 1e-12  # m and rad: 1e4 times the rounding of numbers of 1 m
@@ -43,8 +43,8 @@ ROUNDING = 1e-12  # m and rad: 1e4 times the rounding of numbers of 1 m
 
 def poses(count=20, seed=1):
     rng = np.random.default_rng(seed)
-    joints, legs = random_poses(IWR, count, rng)
-    return joints, legs, forward(IWR, joints, legs)
+    joints, legs = sample_poses(IWR, count, rng)
+    return joints, legs, forward_kinematics(IWR, joints, legs)
 
 
 def test_carriage_is_the_product_of_elementary_motions():
@@ -52,7 +52,7 @@ def test_carriage_is_the_product_of_elementary_motions():
     joints, _, _ = poses()
     for q, found in zip(joints, carriage_pose(IWR, joints), strict=True):
         rotation, place = Rotation.identity(), np.zeros(3)
-        for row, kind, value in zip(IWR.facts.carriage, IWR.kinds, q, strict=True):
+        for row, kind, value in zip(IWR.specification.carriage, IWR.kinds, q, strict=True):
             theta, d = row.theta, row.d
             theta, d = (theta + value, d) if kind == REVOLUTE else (theta, d + value)
             rotation = rotation * Rotation.from_rotvec([0, 0, theta])
@@ -64,9 +64,9 @@ def test_carriage_is_the_product_of_elementary_motions():
 
 def test_forward_undoes_inverse_by_newton_and_by_differential_evolution():
     joints, legs, pose = poses()
-    assert np.allclose(inverse(IWR, pose, joints), legs, atol=ROUNDING)
-    one = Pose(pose.rotation[0], pose.position[0])
-    evolved = forward_evolution(IWR, joints[0], legs[0], seed=3)
+    assert np.allclose(inverse_kinematics(IWR, pose, joints), legs, atol=ROUNDING)
+    one = PlatformPose(pose.rotation[0], pose.position[0])
+    evolved = forward_by_evolution(IWR, joints[0], legs[0], seed=3)
     assert np.abs(pose_difference(evolved, one)).max() < 1e-6  # a hundredth of 0.1 mm
 
 
@@ -79,15 +79,15 @@ def test_leg_jacobian_is_the_derivative():
             move = np.zeros(6)
             move[k] = sign
             turn = Rotation.from_rotvec(move[3:]).as_matrix()
-            ends.append(leg_readings(IWR, joints, Pose(turn @ pose.rotation,
+            ends.append(leg_readings(IWR, joints, PlatformPose(turn @ pose.rotation,
                                                        pose.position + move[:3])))  # fmt: skip
         assert np.allclose((ends[0] - ends[1]) / (2 * step), jacobian[..., k], atol=1e-8)  # step^2
 
 
 def test_axes_and_dh_rows_are_one_robot(tmp_path):
     joints, legs, pose = poses()
-    assert np.allclose(leg_readings(with_axes(IWR), joints, pose), legs, atol=ROUNDING)
-    for robot in (IWR, with_axes(IWR)):
+    assert np.allclose(leg_readings(convert_to_axes(IWR), joints, pose), legs, atol=ROUNDING)
+    for robot in (IWR, convert_to_axes(IWR)):
         save_hybrid(robot, tmp_path / "robot.yaml")
         again = load_hybrid(tmp_path)
         assert np.allclose(leg_readings(again, joints, pose), legs, atol=ROUNDING)
@@ -95,10 +95,10 @@ def test_axes_and_dh_rows_are_one_robot(tmp_path):
 
 def test_what_cannot_be_reached_says_so():
     joints, legs, pose = poses(3)
-    with pytest.raises(Unreachable, match=r"a leg would read .* its range is 0.62 to 0.98 m"):
-        inverse(IWR, Pose(pose.rotation, pose.position + 0.5), joints)
-    with pytest.raises(Unreachable):
-        forward(IWR, joints, legs * [0.3, 1, 1, 1, 1, 1])
+    with pytest.raises(UnreachableError, match=r"a leg would read .* its range is 0.62 to 0.98 m"):
+        inverse_kinematics(IWR, PlatformPose(pose.rotation, pose.position + 0.5), joints)
+    with pytest.raises(UnreachableError):
+        forward_kinematics(IWR, joints, legs * [0.3, 1, 1, 1, 1, 1])
 
 
 @pytest.mark.parametrize(
@@ -127,16 +127,16 @@ def test_a_wrong_file_is_refused_by_name(tmp_path, change, message):
 def test_errors_in_batches_are_those_of_the_robot_as_built(kind):
     """54 parameters of both models; the batch is what a corrected robot of its own computes."""
     joints, _, pose = poses()
-    model = error_model(IWR, kind)
+    model = build_error_model(IWR, kind)
     assert len(model.names) == len(set(model.names)) == 54
     assert model.carriage_count == 12
     rng = np.random.default_rng(2)
     errors = rng.normal(size=(3, 54)) * model.scales
-    batch = predicted_readings(model, errors, joints, pose.rotation, pose.position)
+    batch = predict_leg_readings(model, errors, joints, pose.rotation, pose.position)
     for one, found in zip(errors, batch, strict=True):
-        built = corrected(model, one)
+        built = apply_errors(model, one)
         assert np.allclose(leg_readings(built, joints, pose), found, atol=ROUNDING)
-    zero = predicted_readings(model, np.zeros(54), joints, pose.rotation, pose.position)
+    zero = predict_leg_readings(model, np.zeros(54), joints, pose.rotation, pose.position)
     assert np.allclose(zero[0], leg_readings(IWR, joints, pose), atol=ROUNDING)
 
 
@@ -155,47 +155,45 @@ def test_cost_is_linear_in_poses_by_construction():
 def test_first_order_model_is_the_derivative_of_the_exact_one():
     """Wang Eqs 12 to 26: what is left is of second order, a quarter at half the errors."""
     joints, _, _ = poses()
-    model = error_model(IWR, "dh")
+    model = build_error_model(IWR, "dh")
     errors = np.random.default_rng(4).normal(size=54) * model.scales
     left = []
     for share in (1.0, 0.5):
-        exact = carriage_pose(corrected(model, share * errors), joints)
-        straight = first_order(IWR, share * errors[:12], joints)
+        exact = carriage_pose(apply_errors(model, share * errors), joints)
+        straight = first_order_carriage_pose(IWR, share * errors[:12], joints)
         left.append(np.abs(exact - straight).max())
     assert left[0] / left[1] == pytest.approx(4.0, rel=0.02)  # third order: 1 mrad of the second
 
 
 def test_the_document_s_36_are_the_54_without_universal_joints():
-    names = document_parameters(error_model(IWR, "dh"))
+    names = refined_model_parameters(build_error_model(IWR, "dh"))
     assert len(names) == 36
     assert {"a4", "theta4", "b1x", "b6z"} <= set(names)  # Fig. 18
     assert not {f"a{leg}{c}" for leg in range(1, 7) for c in "xyz"} & set(names)
 
 
 def test_wires_give_the_pose_and_its_covariance():
-    wires = shipped_wires()
+    wires = default_wires()
     rng = np.random.default_rng(5)
-    pose = forward(IWR, *random_poses(IWR, 30, rng, wires))
+    pose = forward_kinematics(IWR, *sample_poses(IWR, 30, rng, wires))
     lengths = wire_lengths(wires, pose)
-    near = Pose(pose.rotation @ rotation_of_euler([0.05, 0.05, 0.05]), pose.position + 0.05)
-    found = pose_of_wires(wires, lengths, near)
-    assert (
-        np.abs(pose_difference(found, pose)).max() < 1e-9
-    )  # m: roots of squares lose half a digit
+    near = PlatformPose(pose.rotation @ euler_to_rotation([0.05, 0.05, 0.05]), pose.position + 0.05)
+    found = pose_from_wires(wires, lengths, near)
+    assert np.abs(pose_difference(found, pose)).max() < 1e-9  # m: roots of squares lose half a digit
     step = 1e-6
-    moved = Pose(pose.rotation, pose.position + [step, 0, 0])
+    moved = PlatformPose(pose.rotation, pose.position + [step, 0, 0])
     change = (wire_lengths(wires, moved) - lengths) / step
     assert np.allclose(change, wire_jacobian(wires, pose)[..., 0], atol=1e-5)  # step over 1 m
     sigma, squares = 2e-5, []
     inverse_ = np.linalg.inv(pose_covariance(wires, pose, sigma))
     for _ in range(40):
         noisy = lengths + sigma * rng.normal(size=lengths.shape)
-        away = pose_difference(pose_of_wires(wires, noisy, pose), pose)
+        away = pose_difference(pose_from_wires(wires, noisy, pose), pose)
         squares.append(np.einsum("ni,nij,nj->n", away, inverse_, away) / 6.0)
     # 1200 values of chi-squared of 6 over 6: a mean of 1 +- 0.017
     assert np.mean(squares) == pytest.approx(1.0, abs=0.07)
-    with pytest.raises(NoIntersection, match="pose 1"):
-        pose_of_wires(wires, 0.1 * lengths, pose)
+    with pytest.raises(NoIntersectionError, match="pose 1"):
+        pose_from_wires(wires, 0.1 * lengths, pose)
 
 
 def test_home_is_where_the_file_says():

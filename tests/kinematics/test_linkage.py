@@ -11,7 +11,7 @@ from scipy.integrate import quad
 from scipy.linalg import null_space
 from scipy.optimize import root
 
-from hydrotele.kinematics.linkages import FourBar, LoopOpen, TwoBar, two_bar_from_points
+from hydrotele.kinematics.linkages import FourBar, LoopOpenError, TwoBar, two_bar_from_points
 
 BOOM = TwoBar(0.625, 2.000, math.radians(78.6), 1)
 STICK = TwoBar(2.444, 0.720, math.radians(10.3), -1)
@@ -132,7 +132,7 @@ def test_cat215_bucket_is_a_sound_linkage():
     theta = np.linspace(*BUCKET_RANGE, 1001)
     assert np.degrees(BUCKET_RANGE) == pytest.approx([-137.4, 14.4], abs=0.1)  # printed digits
     assert np.all(BUCKET.rate(theta) < -0.10)
-    assert np.all(BUCKET.pins(theta)[1][1] > 0.3)
+    assert np.all(BUCKET.pin_positions(theta)[1][1] > 0.3)
     assert BUCKET_STROKE < 0.95 * BUCKET_CLOSED
     assert BUCKET_CLOSED > BUCKET_STROKE + 0.25
     assert math.dist(BUCKET.output_pivot, BUCKET.rocker_pivot) == pytest.approx(0.3249, abs=1e-6)
@@ -197,7 +197,7 @@ def test_four_bar_against_a_mujoco_closed_chain():
     data = mujoco.MjData(model)
     address = {model.joint(i).name: i for i in range(model.njnt)}
     for theta in np.linspace(*BUCKET_RANGE, 40):
-        pose, (_, rod_pin) = BUCKET.pose(float(theta)), BUCKET.pins(float(theta))
+        pose, (_, rod_pin) = BUCKET.pose(float(theta)), BUCKET.pin_positions(float(theta))
         x, z = np.subtract(rod_pin, BUCKET.cylinder_base)
         data.qpos[address["output"]] = theta
         data.qpos[address["coupler"]] = pose.coupler_angle - theta
@@ -231,12 +231,10 @@ def test_four_bar_against_a_mujoco_closed_chain():
 def test_any_four_bar_round_trips(ground, direction, rocker, coupler, arm, assembly, theta):
     """Where it closes and 3 deg from dead points, so that 1 / rate is below 1e4 rad/m."""
     pivot = polar(ground, direction)
-    linkage = FourBar(
-        (0.0, 0.0), pivot, (-1.8, 0.1), rocker, coupler, (arm, 0.0), assembly, working_angle=theta
-    )
+    linkage = FourBar((0.0, 0.0), pivot, (-1.8, 0.1), rocker, coupler, (arm, 0.0), assembly, working_angle=theta)
     try:
-        q, r = linkage.pins(theta)
-    except LoopOpen:
+        q, r = linkage.pin_positions(theta)
+    except LoopOpenError:
         low, high = abs(rocker - coupler), rocker + coupler
         assert not low < math.dist(pivot, polar(arm, math.degrees(theta))) < high
         return
@@ -253,16 +251,16 @@ def test_any_four_bar_round_trips(ground, direction, rocker, coupler, arm, assem
 
 def test_errors_name_the_length_and_the_interval():
     """Every way in which a loop can stay open is refused, for floats and inside arrays."""
-    with pytest.raises(LoopOpen, match=r"3 m requested, the bars allow \[1\.375, 2\.625\] m"):
+    with pytest.raises(LoopOpenError, match=r"3 m requested, the bars allow \[1\.375, 2\.625\] m"):
         BOOM.angle(3.0)
-    with pytest.raises(LoopOpen, match=r"1 m requested"):
+    with pytest.raises(LoopOpenError, match=r"1 m requested"):
         BOOM.angle(np.array([2.0, 1.0]))
-    with pytest.raises(LoopOpen):
+    with pytest.raises(LoopOpenError):
         BOOM.angle(math.nan)
-    with pytest.raises(LoopOpen, match=r"cylinder length 2\.5 m requested"):
+    with pytest.raises(LoopOpenError, match=r"cylinder length 2\.5 m requested"):
         BUCKET.angle(2.5)
     short = FourBar((1.8, 0.0), (1.5, 0.1), (-0.1, 0.2), 0.2, 0.2, (-0.2, 0.35), 1, 1.8)
-    with pytest.raises(LoopOpen, match="two bars join"):
+    with pytest.raises(LoopOpenError, match="two bars join"):
         short.length(np.array([1.0, -1.0]))
     with pytest.raises(ValueError, match="in line"):
         two_bar_from_points((-1.0, 0.0), (2.0, 0.0))

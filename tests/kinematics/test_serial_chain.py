@@ -10,9 +10,9 @@ from hydrotele.kinematics.serial_chain import (
     SerialChain,
     chain_from_dh,
     chain_from_frames,
+    chain_poses,
+    chain_poses_and_rates,
     exponential,
-    forward,
-    forward_and_rates,
     joint_axes,
     product_of_exponentials,
 )
@@ -39,13 +39,11 @@ def dh_matrix(row, q):
 
 
 def test_denavit_hartenberg_is_the_textbook_matrix():
-    poses = forward(CHAIN, Q)
+    poses = chain_poses(CHAIN, Q)
     for q, position, rotation in zip(Q, *poses, strict=True):
         whole = np.linalg.multi_dot([dh_matrix(r, v) for r, v in zip(ROWS, q, strict=True)])
         np.testing.assert_allclose(rotation, whole[:3, :3], atol=1e-14)
-        np.testing.assert_allclose(
-            position, whole[:3, :3] @ [0.01, 0.02, 0.1] + whole[:3, 3], atol=1e-14
-        )
+        np.testing.assert_allclose(position, whole[:3, :3] @ [0.01, 0.02, 0.1] + whole[:3, 3], atol=1e-14)
 
 
 @pytest.mark.parametrize("form", ["dh", "frames"])
@@ -55,12 +53,12 @@ def test_derivatives_are_those_of_complex_steps(form):
     chain = CHAIN if form == "dh" else chain_from_frames(
         frames, ["rz", "ry", "tx", "rz"], ["a", "b", "c", "d"], (0.0, 0.0, 0.1)
     )  # fmt: skip
-    values = chain.nominal + rng.uniform(-0.1, 0.1, len(chain.nominal))
-    exact = forward_and_rates(chain, Q, values)
+    values = chain.nominal_values + rng.uniform(-0.1, 0.1, len(chain.nominal_values))
+    exact = chain_poses_and_rates(chain, Q, values)
     for k in range(len(values)):
         step = values.astype(complex)
         step[k] += 1e-30j
-        poses = forward(chain, Q, step)
+        poses = chain_poses(chain, Q, step)
         moved, turned = poses.position.imag / 1e-30, poses.rotation.imag / 1e-30
         np.testing.assert_allclose(exact.position_by_parameter[:, :, k], moved, atol=1e-13)
         spin = turned @ np.swapaxes(exact.rotation, 1, 2)
@@ -69,18 +67,16 @@ def test_derivatives_are_those_of_complex_steps(form):
     for k in range(4):
         step = Q.astype(complex)
         step[:, k] += 1e-30j
-        moved = forward(chain, step, values).position.imag / 1e-30
+        moved = chain_poses(chain, step, values).position.imag / 1e-30
         np.testing.assert_allclose(exact.position_by_joint[:, :, k], moved, atol=1e-13)
 
 
 def test_joint_derivatives_follow_from_the_axes():
     points, ways = joint_axes(CHAIN, Q)
-    exact = forward_and_rates(CHAIN, Q)
+    exact = chain_poses_and_rates(CHAIN, Q)
     for k in (0, 1, 3):
         arm = exact.position - points[:, k]
-        np.testing.assert_allclose(
-            exact.position_by_joint[:, :, k], np.cross(ways[:, k], arm), atol=1e-13
-        )
+        np.testing.assert_allclose(exact.position_by_joint[:, :, k], np.cross(ways[:, k], arm), atol=1e-13)
 
 
 def test_exponential_is_the_matrix_exponential():
@@ -96,12 +92,12 @@ def test_exponential_is_the_matrix_exponential():
 def test_product_of_exponentials_is_the_chain():
     points, ways = joint_axes(CHAIN, np.zeros((1, 4)))
     home = np.eye(4)
-    at_home = forward(CHAIN, np.zeros((1, 4)))
+    at_home = chain_poses(CHAIN, np.zeros((1, 4)))
     home[:3, :3], home[:3, 3] = at_home.rotation[0], at_home.position[0]
     twists = np.column_stack([np.cross(points[0], ways[0]), ways[0]])
     twists[2] = np.concatenate([ways[0, 2], np.zeros(3)])
     found = product_of_exponentials(twists, home, Q)
-    expected = forward(CHAIN, Q)
+    expected = chain_poses(CHAIN, Q)
     np.testing.assert_allclose(found[:, :3, 3], expected.position, atol=1e-13)
     np.testing.assert_allclose(found[:, :3, :3], expected.rotation, atol=1e-13)
 

@@ -4,20 +4,20 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.kinematics.serial_chain import forward
+from hydrotele.kinematics.serial_chain import chain_poses
 from hydrotele.kinematics.serial_robot import (
-    corrected_robot,
-    corrected_urdf,
-    deflection_names,
-    deflections,
-    frame,
-    joints_for_places,
+    correct_robot,
+    correct_urdf,
+    correction_derivatives,
+    correction_names,
+    frame_from_rpy,
     load_robot,
     robot_chain,
     robot_poses,
-    robot_yaml,
-    rpy_of,
+    robot_to_yaml,
+    rotation_to_rpy,
     shipped_robots,
+    solve_ball_positions,
 )
 
 URDF = """<robot name="two">
@@ -54,17 +54,17 @@ def files(tmp_path):
 
 def by_hand(q):
     turn = np.eye(4)
-    turn[:3, :3] = frame((0, 0, 0), (0, q[0], 0))[:3, :3]
-    slide = frame(q[1] * np.array([1, 1, 0]) / 2**0.5)
-    parts = [frame((0, 0, 0.1), (0, 0, 0.3)), frame((0, 0, 0.2), (0.4, 0, 0)), turn,
-             frame((0.3, 0, 0), (0, 0.2, 0)), slide, frame((0.05, 0, 0.02))]  # fmt: skip
+    turn[:3, :3] = frame_from_rpy((0, 0, 0), (0, q[0], 0))[:3, :3]
+    slide = frame_from_rpy(q[1] * np.array([1, 1, 0]) / 2**0.5)
+    parts = [frame_from_rpy((0, 0, 0.1), (0, 0, 0.3)), frame_from_rpy((0, 0, 0.2), (0.4, 0, 0)), turn,
+             frame_from_rpy((0.3, 0, 0), (0, 0.2, 0)), slide, frame_from_rpy((0.05, 0, 0.02))]  # fmt: skip
     return np.linalg.multi_dot(parts)[:3, 3]
 
 
 @pytest.mark.parametrize("name", ["two.urdf", "two.xml"])
 def test_urdf_and_mjcf_are_the_same_chain(files, name):
     robot = load_robot(files / name, 2)
-    assert robot.names == ("turn", "push")
+    assert robot.joint_names == ("turn", "push")
     expected = [by_hand(q) for q in Q]
     np.testing.assert_allclose(robot_poses(robot, Q).position, expected, atol=1e-12)
 
@@ -72,12 +72,12 @@ def test_urdf_and_mjcf_are_the_same_chain(files, name):
 def test_corrections_are_the_chain_with_errors_and_survive_files(files):
     robot = load_robot(files / "two.urdf", 2)
     chain = robot_chain(robot)
-    values = chain.nominal + np.random.default_rng(1).normal(0.0, 0.01, len(chain.nominal))
-    expected = forward(chain, Q, values).position
-    made = corrected_robot(robot, dict(zip(chain.parameters, values, strict=True)), {})
+    values = chain.nominal_values + np.random.default_rng(1).normal(0.0, 0.01, len(chain.nominal_values))
+    expected = chain_poses(chain, Q, values).position
+    made = correct_robot(robot, dict(zip(chain.parameters, values, strict=True)), {})
     np.testing.assert_allclose(robot_poses(made, Q).position, expected, atol=1e-12)
-    (files / "new.yaml").write_text(robot_yaml(made, "test"))
-    (files / "new.urdf").write_text(corrected_urdf(made, URDF))
+    (files / "new.yaml").write_text(robot_to_yaml(made, "test"))
+    (files / "new.urdf").write_text(correct_urdf(made, URDF))
     for name in ("new.yaml", "new.urdf"):
         again = load_robot(files / name, 2)
         np.testing.assert_allclose(robot_poses(again, Q).position, expected, atol=1e-12)
@@ -89,23 +89,23 @@ def test_shipped_robots_reach_places_by_resolved_motion(name):
     rng = np.random.default_rng(2)
     joints = rng.uniform(-1.5, 1.5, (20, len(robot.joints)))
     target = robot_poses(robot, joints).position + rng.normal(0.0, 0.01, (20, 3))
-    reached = joints_for_places(robot, target, joints)
+    reached = solve_ball_positions(robot, target, joints)
     # Targets a centimetre away may lie out of reach at full stretch only.
-    assert np.median(reached.missed) < 1e-9
+    assert np.median(reached.remaining_distance) < 1e-9
 
 
 def test_resolved_motion_with_the_corrections_ends_where_it_should():
     nominal = load_robot("panda")
     rng = np.random.default_rng(3)
     chain = robot_chain(nominal)
-    values = chain.nominal + rng.normal(0.0, 1e-3, len(chain.nominal))
-    sag = {name: 3e-4 for name in deflection_names(nominal, True, False)}
-    true = corrected_robot(nominal, dict(zip(chain.parameters, values, strict=True)), sag)
+    values = chain.nominal_values + rng.normal(0.0, 1e-3, len(chain.nominal_values))
+    sag = {name: 3e-4 for name in correction_names(nominal, True, False)}
+    true = correct_robot(nominal, dict(zip(chain.parameters, values, strict=True)), sag)
     start = np.tile([0.0, -0.3, 0.0, -2.0, 0.0, 1.8, 0.8], (9, 1))
     target = robot_poses(nominal, start).position + rng.normal(0.0, 0.05, (9, 3))
     missed = {
         name: np.linalg.norm(
-            robot_poses(true, joints_for_places(robot, target, start).joints).position - target,
+            robot_poses(true, solve_ball_positions(robot, target, start).joints).position - target,
             axis=1,
         ).max()
         for name, robot in {"nominal": nominal, "calibrated": true}.items()
@@ -117,16 +117,16 @@ def test_resolved_motion_with_the_corrections_ends_where_it_should():
 def test_sag_is_the_weight_times_its_lever():
     robot = load_robot("ur5e")
     joints = np.zeros((1, 6))
-    names = [n for n in deflection_names(robot, True, False) if n == "sag.joint2.tool"]
+    names = [n for n in correction_names(robot, True, False) if n == "sag.joint2.tool"]
     # At zero the arm is stretched along -x: 0.425 + 0.3922 m and the ball 0.0 beyond in x.
     lever = abs(robot_poses(robot, joints).position[0, 0])
-    assert abs(deflections(robot, joints, names)[0, 1, 0]) == pytest.approx(9.81 * lever, rel=1e-9)
+    assert abs(correction_derivatives(robot, joints, names)[0, 1, 0]) == pytest.approx(9.81 * lever, rel=1e-9)
 
 
 @pytest.mark.parametrize("rpy", [(0.1, -0.4, 2.0), (0.3, np.pi / 2, 0.0), (-0.2, -np.pi / 2, 0.0)])
 def test_angles_of_a_rotation(rpy):
-    rotation = frame((0, 0, 0), rpy)[:3, :3]
-    again = frame((0, 0, 0), tuple(rpy_of(rotation)))[:3, :3]
+    rotation = frame_from_rpy((0, 0, 0), rpy)[:3, :3]
+    again = frame_from_rpy((0, 0, 0), tuple(rotation_to_rpy(rotation)))[:3, :3]
     np.testing.assert_allclose(again, rotation, atol=1e-12)
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from hydrotele.kinematics import arm, five_dof
 from hydrotele.kinematics.task import (
-    BEYOND,
+    OUT_OF_REACH,
     REACHED,
     SINGULAR,
     arm_parameters,
@@ -21,7 +21,7 @@ FELLER = five_dof.FellerGeometry(
 )  # fmt: skip
 BARE = arm.ArmGeometry(
     base_radius=0.34, lateral_offset=-0.11, boom_pin_height=1.9, boom_length=5.18,
-    stick_length=1.8, tool_offset=(0.2, 0.1), tool_joint=False,
+    stick_length=1.8, tool_offset=(0.2, 0.1), has_tool_joint=False,
 )  # fmt: skip
 DIGGER = arm.ArmGeometry(
     base_radius=0.34, lateral_offset=-0.11, boom_pin_height=1.9, boom_length=5.18,
@@ -48,11 +48,11 @@ def test_it_is_the_closed_form_of_the_arm(name):
     for q in angles(k):
         pose = forward(geometry, q)
         if name == "feller":
-            x, y, z, attitude, head = five_dof.forward(geometry, q)
+            x, y, z, attitude, head = five_dof.forward_kinematics(geometry, q)
             turn = np.remainder(pose[1] - np.arctan2(y, x) + np.pi, 2 * np.pi) - np.pi
             wanted = np.array([np.hypot(x, y), pose[1] - turn, z, attitude, head])
         else:
-            wanted = np.array(arm.forward(geometry, q))
+            wanted = np.array(arm.forward_kinematics(geometry, q))
         assert np.abs(pose[:k] - wanted).max() < 1e-12  # rounding of lengths of 10 m
 
 
@@ -78,7 +78,7 @@ def test_inverse_and_rates_go_back(name):
 def test_beyond_reach_nothing_is_written_and_a_straight_elbow_is_told():
     g, q = arm_parameters(DIGGER), np.full(4, 7.0)
     for r in (30.0, 0.05, np.nan):
-        assert task_inverse(g, np.array([r, 0.0, 1.0, 0.0, 0.0]), 0.0, q) == BEYOND
+        assert task_inverse(g, np.array([r, 0.0, 1.0, 0.0, 0.0]), 0.0, q) == OUT_OF_REACH
         assert np.all(q == 7.0)
     straight = np.array([0.0, 0.3, 0.0, -0.5])
     assert task_rates(g, straight, forward(DIGGER, straight), np.ones(5), q) == SINGULAR

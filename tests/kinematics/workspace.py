@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 
-from hydrotele.kinematics.arm import ArmGeometry, Unreachable, tool_pin
+from hydrotele.kinematics.arm import ArmGeometry, UnreachableError, outer_bar_end
 
 
 def reach(geometry: ArmGeometry, pose: Sequence[float]) -> float:
@@ -28,7 +28,7 @@ def reach(geometry: ArmGeometry, pose: Sequence[float]) -> float:
     beside = pose[0] - abs(geometry.lateral_offset)
     if not beside >= 0:
         return beside
-    x, z, outer, _ = tool_pin(geometry, pose)
+    x, z, outer, _ = outer_bar_end(geometry, pose)
     distance = math.hypot(x, z)
     return min(
         distance - abs(geometry.boom_length - outer),
@@ -61,12 +61,10 @@ def radial_interval(geometry: ArmGeometry, z: float, phi: float = 0.0) -> tuple[
     [3.72, 7.32]
     """
     side = geometry.lateral_offset
-    pin_x, height, outer, _ = tool_pin(
-        geometry, (abs(side), 0.0, z, phi)[: 3 + geometry.tool_joint]
-    )
+    pin_x, height, outer, _ = outer_bar_end(geometry, (abs(side), 0.0, z, phi)[: 3 + geometry.has_tool_joint])
     stretched = geometry.boom_length + outer
     if not abs(height) <= stretched:
-        raise Unreachable(
+        raise UnreachableError(
             f"the tool pin would be {height:.6g} m above the boom pin, "
             f"reachable is [{-stretched:.6g}, {stretched:.6g}] m"
         )
@@ -74,7 +72,5 @@ def radial_interval(geometry: ArmGeometry, z: float, phi: float = 0.0) -> tuple[
     near = ahead + math.sqrt(max(0.0, (geometry.boom_length - outer) ** 2 - height**2))
     far = ahead + math.sqrt((stretched - height) * (stretched + height))
     if far < 0:
-        raise Unreachable(
-            f"at height {z:.6g} m the point would be at most {far:.6g} m ahead of the swing axis"
-        )
+        raise UnreachableError(f"at height {z:.6g} m the point would be at most {far:.6g} m ahead of the swing axis")
     return math.hypot(max(near, 0.0), side), math.hypot(far, side)

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.logs.cleaning import refreshed_every, stale
+from hydrotele.logs.cleaning import find_repeated, readings_per_update
 from hydrotele.logs.dataset import Dataset, load_dataset, make_dataset
 from hydrotele.logs.files import RunFiles
 from hydrotele.logs.log import Log, save_log
-from hydrotele.logs.rows import Masked, Rows, averaged, fit_clock, read_mask
+from hydrotele.logs.rows import MaskedInterval, RunRows, average_rows, fit_clock, read_mask
 from hydrotele.machine.machine import Sensor, SensorSet
 from hydrotele.machine.machine_file import load_machine, save_machine
 
@@ -37,9 +37,7 @@ def dataset(*logs: Log, machine=RIG, masks=()) -> Dataset:
 
 
 def with_column(log: Log, name: str, values, unit="1") -> Log:
-    return dataclasses.replace(
-        log, columns={**log.columns, name: values}, units={**log.units, name: unit}
-    )
+    return dataclasses.replace(log, columns={**log.columns, name: values}, units={**log.units, name: unit})
 
 
 def csv(path, header, rows):
@@ -69,9 +67,7 @@ def test_one_row_and_constant_channels():
     still = dataclasses.replace(log, columns=flat)
     data = dataset(still, stroke(seed=1))
     assert any("a: nothing moves" in note or "frozen" in note for note in data.notes)
-    one = dataclasses.replace(
-        log, time=log.time[:2], columns={c: v[:2] for c, v in log.columns.items()}
-    )
+    one = dataclasses.replace(log, time=log.time[:2], columns={c: v[:2] for c, v in log.columns.items()})
     with pytest.raises(InputError, match="2 rows.*record a longer run, or remove this one"):
         dataset(one, log)
 
@@ -101,8 +97,8 @@ def test_averaging_damps_what_would_alias():
     time = np.arange(20_000) / 10_000.0
     ripple = np.sin(2 * np.pi * 4900.0 * time)[:, None]
     n = len(time)
-    rows = Rows(0.0, 1e-4, np.zeros((n, 1)), np.ones(n, bool), ripple, np.ones(n, bool))
-    slow, behind, count = averaged(rows)
+    rows = RunRows(0.0, 1e-4, np.zeros((n, 1)), np.ones(n, bool), ripple, np.ones(n, bool))
+    slow, behind, count = average_rows(rows)
     assert count == 10 and behind[0] == pytest.approx(10.0, rel=0.1)
     assert np.abs(slow.reading[1:-1]).max() < 0.03 < np.abs(ripple[::10]).max()
 
@@ -111,7 +107,7 @@ def test_averaging_damps_what_would_alias():
 def test_rates_about_one_kilohertz(rate, count):
     run = dataset(stroke(2.0, rate), stroke(2.0, 50.0, 1)).fit[0]
     assert run.period == pytest.approx(count / rate, rel=1e-6)
-    assert (run.behind is None) == (count == 1)
+    assert (run.readings_per_mean is None) == (count == 1)
 
 
 @pytest.mark.parametrize(("rate", "held"), [(1000.0, 20), (10_000.0, 10), (100.0, 25)])
@@ -135,9 +131,9 @@ def test_a_clock_that_runs_apart_refreshes_after_two_or_three_rows():
     value = np.random.default_rng(0).normal(size=400)
     value[200:300] = value[200]
     held = value[(np.arange(1000) * 0.4 + 0.1).astype(int)]
-    every = refreshed_every(held)
+    every = readings_per_update(held)
     assert every == pytest.approx(2.5, abs=0.02)
-    fresh = ~stale(held, every)
+    fresh = ~find_repeated(held, every)
     assert fresh.sum() == pytest.approx(400, abs=2)
     assert np.array_equal(fresh[1:500], np.diff(held[:500]) != 0.0)
     assert fresh[500:750].sum() == pytest.approx(100, abs=2)
@@ -184,7 +180,7 @@ def test_a_short_mask_takes_readings_out_and_a_long_one_cuts():
 
 def test_a_part_of_a_run():
     run = dataset(with_column(stroke(), "valid", np.ones(400)), stroke(seed=1)).fit[0]
-    part = run.part(100, 150)
+    part = run.select_rows(100, 150)
     assert part.start == pytest.approx(1.0) and len(part.valid) == len(part.command) == 50
     assert np.array_equal(part.reading, run.reading[100:150])
 
@@ -207,7 +203,7 @@ def test_a_mask_file(tmp_path):
         save_log(stroke(5.0, seed=seed), tmp_path / f"{name}.parquet")
     mask = tmp_path / "mask.csv"
     mask.write_text("# bucket in the soil\nrun,begin,end\na,1.0,1.1\n,4.5,\n")
-    assert read_mask(mask) == (Masked("a", 1.0, 1.1), Masked("", 4.5, np.inf))
+    assert read_mask(mask) == (MaskedInterval("a", 1.0, 1.1), MaskedInterval("", 4.5, np.inf))
     data = load_dataset(
         [tmp_path / "a.parquet", tmp_path / "b.parquet"], RIG, mask=mask
     )  # fmt: skip
@@ -264,9 +260,7 @@ def test_rows_that_wander_off_any_clock_stand_at_their_own_times():
     run = data.fit[0]
     read = np.isfinite(run.reading).any(axis=1)
     assert read.sum() == 2800 and (~run.command_known).mean() < 0.01
-    wanted = np.interp(
-        run.start + run.period * np.flatnonzero(read), time, columns["position.slide"]
-    )
+    wanted = np.interp(run.start + run.period * np.flatnonzero(read), time, columns["position.slide"])
     error = run.reading[read, data.channels.index("position.slide")] - wanted
     # a tenth of a step at 0.63 m/s is 0.66 mm at most, 0.37 mm RMS; half a step would be 3 mm
     assert np.abs(error).max() < 0.9e-3
@@ -313,9 +307,7 @@ def written(tmp_path, factor, offset, header="command.slide"):
         log = stroke(seed=seed)
         values = {**log.columns, "command.slide": factor * log["command.slide"] + offset}
         names = ["time", *(header if c == "command.slide" else c for c in values)]
-        csv(
-            tmp_path / f"{name}.csv", ",".join(names), np.column_stack([log.time, *values.values()])
-        )
+        csv(tmp_path / f"{name}.csv", ",".join(names), np.column_stack([log.time, *values.values()]))
     return tmp_path
 
 

@@ -14,11 +14,11 @@ from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.logs.dataset import Dataset, load_dataset, make_dataset
 from hydrotele.logs.files import RunFiles
 from hydrotele.logs.log import Log, load_log, save_log
-from hydrotele.logs.rows import clock_offset, fit_clock
-from hydrotele.machine.machine import IDEAL, noise_rms
+from hydrotele.logs.rows import estimate_clock_offset, fit_clock
+from hydrotele.machine.machine import IDEAL_SENSORS, noise_rms
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.machine.signals import usual_unit
-from hydrotele.simulate.feedback import measure
+from hydrotele.machine.signals import default_unit
+from hydrotele.simulate.feedback import simulate_readings
 from tests.measured import MEASURED, REAL, needs_real
 
 CAT = load_machine("cat215")
@@ -49,9 +49,9 @@ def made_up(seed: int = 0, seconds: float = 20.0, rate: float = 50.0, sensors=SE
         truth |= {f"pressure_{side}.{axis}": wave(8e6, 3e6) for side in ("head", "rod")}
     truth["pressure_supply"] = np.full_like(time, 28e6)
     columns = {f"command.{a}": np.rint(2048 * wave(0.0, 0.8)) / 2048 for a in AXES}
-    columns |= measure(CAT, sensors, seed, truth)
+    columns |= simulate_readings(CAT, sensors, seed, truth)
     stated = {"machine": "cat215", "tool": "none", "sensors": "khoshzaban1992"}
-    return Log(time, columns, {c: usual_unit(c) for c in columns}, stated, "made up")
+    return Log(time, columns, {c: default_unit(c) for c in columns}, stated, "made up")
 
 
 def changed(log: Log, **channels) -> Log:
@@ -124,7 +124,7 @@ def test_draws_of_noise_have_no_stuck_sensor(draws):
         runs = {}
         for number, truth in enumerate(truths):
             true = {c: v for c, v in truth.columns.items() if not c.startswith("command")}
-            read = measure(CAT, SENSORS, 2 * seed + number, true)
+            read = simulate_readings(CAT, SENSORS, 2 * seed + number, true)
             log = changed(truth, **{c.replace(".", "_"): v for c, v in read.items() if "." in c})
             log.columns["pressure_supply"] = read["pressure_supply"]  # type: ignore[index]
             runs[f"run_{number}"] = dataclasses.replace(log, metadata={"sensors": "khoshzaban1992"})
@@ -133,7 +133,7 @@ def test_draws_of_noise_have_no_stuck_sensor(draws):
 
 def test_true_values_have_unknown_noise_and_no_stuck_sensor():
     logs = {name: made_up(k, sensors=None) for k, name in enumerate(RUNS)}
-    logs = {n: dataclasses.replace(v, metadata={"sensors": IDEAL}) for n, v in logs.items()}
+    logs = {n: dataclasses.replace(v, metadata={"sensors": IDEAL_SENSORS}) for n, v in logs.items()}
     data = dataset(**logs)
     assert np.isnan(data.noise).all() and len(data.notes) == 1 and "noise" in data.notes[0]
     assert all(np.isfinite(run.reading).all() for run in runs_of(data))
@@ -265,7 +265,7 @@ def test_offset_between_files_that_sampled_the_commands_apart():
     other = Log(later, columns, pressures.units, {}, "other")
     (mine, _), (theirs, _) = fit_clock(angles.time, "a"), fit_clock(other.time, "b")
     names = [f"command.{a}" for a in AXES]
-    found = clock_offset(mine, np.column_stack([angles[c] for c in names]),
+    found = estimate_clock_offset(mine, np.column_stack([angles[c] for c in names]),
                          theirs, np.column_stack([other[c] for c in names]))  # fmt: skip
     # The commands change slowly and are rounded to 1/2048: a tenth of a row is what they tell.
     assert found == pytest.approx(-7.0, abs=2e-3)
@@ -375,9 +375,7 @@ def test_missing_rod_pressures_are_no_channels():
     assert np.isnan(column(half, "b", "pressure_rod.boom")).all()
 
 
-@pytest.mark.parametrize(
-    "channel", ["angle_boom", "length_stick", "pressure_head_swing", "pressure_rod_boom"]
-)
+@pytest.mark.parametrize("channel", ["angle_boom", "length_stick", "pressure_head_swing", "pressure_rod_boom"])
 def test_stuck_sensor_is_found_by_its_noise(channel):
     log = made_up(1)
     kind, _, axis = channel.rpartition("_")
@@ -407,12 +405,11 @@ def quiet(seed: int, moves: bool = True) -> Log:
     """A log of sensors without noise but a step, at rest for the second half."""
     log = made_up(seed, sensors=None)
     columns = {
-        c: np.rint(v / 1e-4) * 1e-4 if c.startswith(("angle", "length")) else v.copy()
-        for c, v in log.columns.items()
+        c: np.rint(v / 1e-4) * 1e-4 if c.startswith(("angle", "length")) else v.copy() for c, v in log.columns.items()
     }
     for values in columns.values():
         values[500:] = values[500]
-    return dataclasses.replace(log, columns=columns, metadata={"sensors": IDEAL})
+    return dataclasses.replace(log, columns=columns, metadata={"sensors": IDEAL_SENSORS})
 
 
 def test_quiet_sensors_may_rest():

@@ -3,18 +3,18 @@
 import numpy as np
 import pytest
 
-from hydrotele.logs.dataset import split
-from hydrotele.logs.rows import Rows
+from hydrotele.logs.dataset import split_runs
+from hydrotele.logs.rows import RunRows
 
 
 def rows(command):
     n = len(command)
-    return Rows(0.0, 0.02, np.asarray(command, float)[:, None], np.ones(n, bool), np.zeros((n, 1)),
+    return RunRows(0.0, 0.02, np.asarray(command, float)[:, None], np.ones(n, bool), np.zeros((n, 1)),
                 np.ones(n, bool))  # fmt: skip
 
 
 def parts(command):
-    found, _ = split({"run": rows(command)}, {"run": "run"}, None)
+    found, _ = split_runs({"run": rows(command)}, {"run": "run"}, None)
     return sum(len(p.rows.command) for p in found.fit), len(found.heldout.rows.command)
 
 

@@ -7,11 +7,22 @@ import pytest
 from scipy import stats
 
 from hydrotele.core.errors import InputError
-from hydrotele.machine.machine import Sensor, channel_sensor, converter, noise_rms, sensor_set
+from hydrotele.machine.machine import (
+    Sensor,
+    channel_converter,
+    channel_sensor,
+    get_sensors,
+    noise_rms,
+)
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import prepare, run_scenario
 from hydrotele.scenario.scenario import load_scenario
-from hydrotele.simulate.feedback import _convert_all, feedback, measure, sensor_errors
+from hydrotele.simulate.feedback import (
+    _quantise_readings,
+    create_feedback,
+    sensor_errors,
+    simulate_readings,
+)
 from hydrotele.simulate.stepping import Stepper
 
 
@@ -23,7 +34,7 @@ def run():
 
 def sensor_of(run, channel):
     machine = run.plant.machine
-    return channel_sensor(machine, sensor_set(machine, run.scenario.sensors), channel)
+    return channel_sensor(machine, get_sensors(machine, run.scenario.sensors), channel)
 
 
 def measurable(run):
@@ -57,7 +68,7 @@ def test_scatter_is_that_of_the_specification(run):
         assert error.std() == pytest.approx(expected, rel=0.05)
         assert abs(error.mean()) < 4 * expected / math.sqrt(len(error))
         machine = run.plant.machine
-        stated = noise_rms(machine, sensor_set(machine, "khoshzaban1992"), channel)
+        stated = noise_rms(machine, get_sensors(machine, "khoshzaban1992"), channel)
         assert stated == pytest.approx(expected, rel=0.005)  # three digits are given
 
 
@@ -82,12 +93,12 @@ def test_errors_are_white_and_independent():
 
 def test_leaving_out_channels_changes_no_other():
     machine = load_machine("cat215")
-    sensors = sensor_set(machine, "khoshzaban1992")
+    sensors = get_sensors(machine, "khoshzaban1992")
     names = ["angle.boom", "length.boom", "pressure_head.boom", "pressure_supply"]
     truth = {name: np.full(50, 0.5) for name in names}
-    whole = measure(machine, sensors, 3, truth)
+    whole = simulate_readings(machine, sensors, 3, truth)
     for name in names:
-        assert np.array_equal(measure(machine, sensors, 3, {name: truth[name]})[name], whole[name])
+        assert np.array_equal(simulate_readings(machine, sensors, 3, {name: truth[name]})[name], whole[name])
 
 
 def test_longer_run_begins_like_the_shorter_one():
@@ -99,14 +110,14 @@ def test_longer_run_begins_like_the_shorter_one():
 def test_converter_ends_and_goes_round():
     """Lengths and pressures end at 0 and the span; an angle goes on."""
     sensor, values = Sensor(bits=4, span=1.6), np.array([-0.3, 0.04, 0.06, 0.149, 9.0])
-    clipped = _convert_all(values, *converter(sensor, "pressure_rod.boom"))
+    clipped = _quantise_readings(values, *channel_converter(sensor, "pressure_rod.boom"))
     np.testing.assert_allclose(clipped, [0, 0, 0.1, 0.1, 1.6], atol=1e-15)
-    free = _convert_all(values, *converter(sensor, "angle.boom"))
+    free = _quantise_readings(values, *channel_converter(sensor, "angle.boom"))
     np.testing.assert_allclose(free, [-0.3, 0, 0.1, 0.1, 9], atol=1e-15)
-    assert np.array_equal(_convert_all(values, *converter(Sensor(), "length.boom")), values)
+    assert np.array_equal(_quantise_readings(values, *channel_converter(Sensor(), "length.boom")), values)
     machine = load_machine("cat215")
-    readings = measure(
-        machine, sensor_set(machine, "khoshzaban1992"), 1,
+    readings = simulate_readings(
+        machine, get_sensors(machine, "khoshzaban1992"), 1,
         {"length.boom": np.array([-1.0, 5.0]), "pressure_head.boom": np.array([-1e6, 1e9]),
          "angle.swing": np.array([50.0, -50.0])},
     )  # fmt: skip
@@ -117,7 +128,7 @@ def test_converter_ends_and_goes_round():
 
 def test_length_spans_its_own_stroke():
     machine = load_machine("cat215", "bucket")
-    sensors = sensor_set(machine, "khoshzaban1992")
+    sensors = get_sensors(machine, "khoshzaban1992")
     for axis in ("boom", "stick", "bucket"):
         stroke = machine.axes[axis].cylinder.stroke
         assert channel_sensor(machine, sensors, f"length.{axis}").span == stroke
@@ -125,16 +136,16 @@ def test_length_spans_its_own_stroke():
 
 def test_ideal_and_unknown_sensors():
     machine = load_machine("cat215")
-    assert sensor_set(machine, "ideal") is None
+    assert get_sensors(machine, "ideal") is None
     assert noise_rms(machine, None, "angle.boom") == 0.0
     with pytest.raises(InputError, match="did you mean 'khoshzaban1992'"):
-        sensor_set(machine, "khoshzaban92")
+        get_sensors(machine, "khoshzaban92")
 
 
 def test_slow_sensors_are_held_for_the_controller():
     """50 Hz sensors under a 200 Hz controller: four ticks see one reading, then a new one."""
     plant, data, _, seen = prepare(load_scenario("zhu_up"))
-    assert seen.every == 4 and seen.period == pytest.approx(0.02)
+    assert seen.ticks_per_sample == 4 and seen.period == pytest.approx(0.02)
     readings, stepper = [], Stepper(plant, data, 5)
     for tick in range(9):
         data.qpos[plant.qpos] += 0.01
@@ -175,7 +186,7 @@ def test_a_drifting_sensor_warms_up_in_logs_and_in_what_the_controller_sees():
     more = run.measured["angle.boom"] - run.truth["angle.boom"]
     np.testing.assert_allclose(more, 0.02 * (1.0 - np.exp(-time / 2.0)), atol=1e-15)
     np.testing.assert_array_equal(run.measured["angle.stick"], run.truth["angle.stick"])
-    seen = feedback(run.plant, None, 1, 250, 50.0).table
+    seen = create_feedback(run.plant, None, 1, 250, 50.0).table
     boom = run.plant.axes.index("boom")
     shown = seen.sensors.offset[boom] + seen.errors[:250, boom]
     np.testing.assert_allclose(shown, 0.02 * (1.0 - np.exp(-np.arange(250) / 100.0)), atol=1e-15)

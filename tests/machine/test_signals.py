@@ -28,20 +28,18 @@ def test_imports_nothing_of_ours():
 
 @given(
     st.booleans().flatmap(
-        lambda t: st.tuples(
-            st.sampled_from(list(signals.TRUTH if t else signals.MEASURED)), st.just(t)
-        )
+        lambda t: st.tuples(st.sampled_from(list(signals.TRUTH_KINDS if t else signals.MEASURED_KINDS)), st.just(t))
     ),
     AXES,
 )
 def test_every_kind_survives_naming_and_parsing(kind_and_truth, axis):
     kind, truth = kind_and_truth
-    axes = (signals.TRUTH if truth else signals.MEASURED)[kind].axes
+    axes = (signals.TRUTH_KINDS if truth else signals.MEASURED_KINDS)[kind].axes
     axis = {"free": axis, "xyz": "z", "none": ""}[axes]
     name = signals.channel_name(kind, axis, truth=truth)
     assert signals.parse_channel(name) == (kind, axis, truth)
     assert signals.parse_channel(name).name == name
-    assert signals.usual_unit(name) in signals.allowed_units(name)
+    assert signals.default_unit(name) in signals.allowed_units(name)
 
 
 @pytest.mark.parametrize(
@@ -101,18 +99,18 @@ def test_allowed_units(name, units):
 
 
 def test_usual_unit_follows_the_joint():
-    assert signals.usual_unit("reference.slide") == "rad"
-    assert signals.usual_unit("reference.slide", ["position.slide"]) == "m"
-    assert signals.usual_unit("truth.velocity.slide", ["truth.position.slide"]) == "m/s"
-    assert signals.usual_unit("command.slide", ["position.slide"]) == "1"
+    assert signals.default_unit("reference.slide") == "rad"
+    assert signals.default_unit("reference.slide", ["position.slide"]) == "m"
+    assert signals.default_unit("truth.velocity.slide", ["truth.position.slide"]) == "m/s"
+    assert signals.default_unit("command.slide", ["position.slide"]) == "1"
 
 
 def test_limits_are_wider_where_the_unit_is_stated():
     for unit in ("rad", "rad/s", "m", "m/s", "Pa", "N"):
         stated = signals.magnitude_limits("angle.boom", unit)
         unstated = signals.magnitude_limits("angle.boom", unit, stated=False)
-        assert stated.smallest <= unstated.smallest
-        assert stated.largest >= unstated.largest
+        assert stated.min_magnitude <= unstated.min_magnitude
+        assert stated.max_magnitude >= unstated.max_magnitude
 
 
 def test_input_error_says_where_and_survives_pickling():

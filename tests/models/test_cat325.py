@@ -89,7 +89,7 @@ def test_closed_form_puts_tip_and_head_where_mujoco_does():
     assert tuple(vars(geometry).values()) == pytest.approx(lengths, abs=1e-12)
     for q, data in random_poses(60):
         mujoco.mj_kinematics(PLANT.model, data)
-        pose, tip = five_dof.forward(geometry, q), data.site("hydrotele_tip")
+        pose, tip = five_dof.forward_kinematics(geometry, q), data.site("hydrotele_tip")
         assert pose[:3] == pytest.approx(tip.xpos, abs=1e-9)
         frame = tip.xmat.reshape(3, 3)
         assert five_dof.tool_direction(q) == pytest.approx(frame[:, 0], abs=1e-9)
@@ -137,9 +137,7 @@ def test_linkage_follows_the_cylinder_over_the_whole_range(axis):
     assert 0.0 <= pistons[0] < 0.008 and 0.0 <= cylinder.stroke - pistons[-1] < 0.012
 
 
-@pytest.mark.parametrize(
-    ("boom", "stick", "tilt"), [(0.35, -1.65, 1.30), (0.2, -0.7, 0.5), (1.0, -2.2, 0.0)]
-)
+@pytest.mark.parametrize(("boom", "stick", "tilt"), [(0.35, -1.65, 1.30), (0.2, -0.7, 0.5), (1.0, -2.2, 0.0)])
 def test_stands_still_with_closed_valves(boom, stick, tilt):
     """2 s; leakage of 1e-12 m^3/(s Pa) at 22 MPa: 1 mm/s of the boom's piston, 15 mm/s of the tip.
 

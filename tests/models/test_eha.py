@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from hydrotele.effects.effect import changed
+from hydrotele.effects.effect import with_value
 from hydrotele.estimate.reduced_model import model_space, reduced_model, simulate_rows, state_names
 from hydrotele.logs.log import load_log
 from hydrotele.machine.machine import Machine
@@ -18,8 +18,8 @@ CHANNELS = ("position.piston", "pressure_head.piston", "pressure_rod.piston")
 
 def ideal(tool: str) -> Machine:
     """The machine without delay and sensor errors, so that channels are states."""
-    machine = changed(load_machine("eha", tool), "axes.piston.command_delay", 0.0)
-    return changed(machine, "sensor_errors", {})
+    machine = with_value(load_machine("eha", tool), "axes.piston.command_delay", 0.0)
+    return with_value(machine, "sensor_errors", {})
 
 
 def in_mujoco(machine: Machine, duty: np.ndarray) -> np.ndarray:
@@ -79,7 +79,7 @@ def test_speed_drives_it_without_a_motor():
 
     Below 1 % is the compression while the pressures still settle.
     """
-    machine = changed(ideal("none"), "axes.piston.pump.motor", None)
+    machine = with_value(ideal("none"), "axes.piston.pump.motor", None)
     pump, cylinder = machine.axes["piston"].pump, machine.axes["piston"].cylinder
     assert pump and cylinder
     rows = in_mujoco(machine, np.full(3000, 0.5))

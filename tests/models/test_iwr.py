@@ -6,20 +6,20 @@ import pytest
 
 from hydrotele.core.files import models_folder
 from hydrotele.kinematics.hybrid import (
-    Pose,
-    Unreachable,
-    corrected,
-    error_model,
-    forward,
+    PlatformPose,
+    UnreachableError,
+    apply_errors,
+    build_error_model,
+    forward_kinematics,
     load_hybrid,
     pose_difference,
 )
 from hydrotele.simulate.closure import pin_opening
 from hydrotele.simulate.hybrid import (
-    hybrid_mechanism,
-    manufactured_errors,
-    mechanism_pose,
-    random_poses,
+    build_hybrid_mechanism,
+    sample_manufacturing_errors,
+    sample_poses,
+    solve_mechanism_pose,
 )
 
 IWR = load_hybrid("iwr")
@@ -27,13 +27,13 @@ FILE = models_folder() / "iwr" / "iwr.xml"
 
 
 def robots():
-    model = error_model(IWR, "dh")
-    return IWR, corrected(model, manufactured_errors(model, np.random.default_rng(7)))
+    model = build_error_model(IWR, "dh")
+    return IWR, apply_errors(model, sample_manufacturing_errors(model, np.random.default_rng(7)))
 
 
 def test_file_is_what_the_numbers_make():
     """iwr.xml holds six digits, so that its places are within 1e-6 m of iwr.yaml's."""
-    filed, made = mujoco.MjModel.from_xml_path(str(FILE)), hybrid_mechanism(IWR).compile()
+    filed, made = mujoco.MjModel.from_xml_path(str(FILE)), build_hybrid_mechanism(IWR).compile()
     assert (filed.nv, filed.neq, filed.nu) == (made.nv, made.neq, made.nu) == (25, 5, 10)
     for field in ("body_pos", "jnt_pos", "jnt_axis", "site_pos", "body_mass", "jnt_range"):
         assert np.allclose(getattr(filed, field), getattr(made, field), atol=2e-6), field
@@ -43,21 +43,21 @@ def test_file_is_what_the_numbers_make():
 @pytest.mark.parametrize("place", [0, 1])
 def test_closed_chain_agrees_with_newton_for_the_nominal_and_a_built_robot(place):
     robot = robots()[place]
-    model = hybrid_mechanism(robot).compile()
+    model = build_hybrid_mechanism(robot).compile()
     data = mujoco.MjData(model)
-    joints, legs = random_poses(IWR, 5, np.random.default_rng(8))
-    pose = forward(robot, joints, legs)
+    joints, legs = sample_poses(IWR, 5, np.random.default_rng(8))
+    pose = forward_kinematics(robot, joints, legs)
     for k in range(5):
-        found = mechanism_pose(model, data, robot, joints[k], legs[k])
-        away = pose_difference(found, Pose(pose.rotation[k], pose.position[k]))
+        found = solve_mechanism_pose(model, data, robot, joints[k], legs[k])
+        away = pose_difference(found, PlatformPose(pose.rotation[k], pose.position[k]))
         assert np.abs(away).max() < 1e-9  # m and rad: both close to 1e-12
 
 
 def test_impossible_lengths_do_not_close():
-    model = hybrid_mechanism(IWR).compile()
+    model = build_hybrid_mechanism(IWR).compile()
     legs = np.array([0.3, 1.2, 0.3, 1.2, 0.3, 1.2])
-    with pytest.raises(Unreachable):
-        mechanism_pose(model, mujoco.MjData(model), IWR, np.zeros(4), legs)
+    with pytest.raises(UnreachableError):
+        solve_mechanism_pose(model, mujoco.MjData(model), IWR, np.zeros(4), legs)
 
 
 def test_it_steps_with_noise_without_warnings_and_its_loops_stay_closed():

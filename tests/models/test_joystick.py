@@ -36,17 +36,13 @@ def test_gains_are_those_of_the_tables(name, table):
         found, (most, nominal, least, damping, band) = JOYSTICK.gains[name][axis], table[axis]
         turns = number >= 3
         unit = 100.0 if turns else 1e3
-        assert (found.most, found.nominal, found.least) == pytest.approx(
-            (unit * most, unit * nominal, unit * least)
-        )
+        assert (found.most, found.nominal, found.least) == pytest.approx((unit * most, unit * nominal, unit * least))
         assert found.deadband == pytest.approx(band * (1e-4 if turns else 1e-3))
         # rotational damping is ours: the printed one shakes this flotor at 200 Hz (see README)
         assert found.damping == pytest.approx(0.25 if turns else 1e3 * damping)
         if name == "feller" and axis in DETENT:
             drop, outside = DETENT[axis]
-            assert (found.detent.drop, found.detent.outside) == pytest.approx(
-                (drop, unit * outside)
-            )
+            assert (found.detent.drop, found.detent.outside) == pytest.approx((drop, unit * outside))
 
 
 def test_the_mjcf_alone_has_the_numbers_of_the_yaml():
@@ -55,9 +51,7 @@ def test_the_mjcf_alone_has_the_numbers_of_the_yaml():
     alone = mujoco.MjModel.from_xml_path(str(folder / "joystick.xml"))
     made = joystick_spec(JOYSTICK).compile()
     for name in ("body_mass", "body_ipos", "jnt_range", "geom_pos", "actuator_gear", "site_pos"):
-        np.testing.assert_allclose(
-            getattr(alone, name), getattr(made, name), atol=1e-9, err_msg=name
-        )
+        np.testing.assert_allclose(getattr(alone, name), getattr(made, name), atol=1e-9, err_msg=name)
     turn = np.empty(9)
     for model in (alone, made):
         body = model.body("flotor")
@@ -79,7 +73,7 @@ def test_nothing_of_its_looks_has_mass_or_touches():
 
 def test_the_handle_turns_about_itself_until_the_coils_are_at_the_end_of_their_gap():
     """Zhu 1994, 5.1.2: the workspace is limited by the magnetic gap, +-5 mm and +-7 deg."""
-    reach = JOYSTICK.reach
+    reach = JOYSTICK.handle_travel
     assert reach[:3] == (5e-3,) * 3 and reach[5] == pytest.approx(np.deg2rad(7.0))
     assert reach[3] == reach[4] == pytest.approx(2.0 * np.arcsin(2.5e-3 / 0.12))  # 2.39 deg
     # The published dead band of the feller-buncher's rotations, 0.035 rad, has to be left: a

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from hydrotele.core import datafile
-from hydrotele.core.datafile import read_yaml, split_unit, suggest
+from hydrotele.core.datafile import read_yaml, split_unit, suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import models_folder
 from hydrotele.core.units import KEY_SUFFIXES, PSI, to_si
@@ -23,7 +23,7 @@ from hydrotele.machine.machine_file import (
     save_machine,
     shipped_machines,
 )
-from hydrotele.simulate.mechanism import assemble, mjcf_document
+from hydrotele.simulate.mechanism import assemble_mjcf, mjcf_document
 from hydrotele.simulate.plant import build_plant, rest_state
 
 ANY = settings(
@@ -391,7 +391,7 @@ def test_round_trip(tmp_path, name, tool):
     again = load_machine(path)
     moved = {"folder": "", "mjcf": None, "attached": {}, "tools": ()}
     assert again.model_copy(update=moved) == machine.model_copy(update=moved)
-    assert mjcf_document(assemble(again)) == mjcf_document(assemble(machine))
+    assert mjcf_document(assemble_mjcf(again)) == mjcf_document(assemble_mjcf(machine))
     save_machine(again, tmp_path / "twice.yaml")
     assert (tmp_path / "twice.yaml").read_text() == path.read_text()
 
@@ -518,8 +518,8 @@ def test_yaml_traps_are_refused(write, text):
 
 def test_suggest_takes_names_of_any_type():
     """A YAML key may be a number."""
-    assert suggest(3, [30, "a"]) == "did you mean '30'? valid: 30, a"
-    assert suggest("x", []) == "valid: (none)"
+    assert suggest_valid_name(3, [30, "a"]) == "did you mean '30'? valid: 30, a"
+    assert suggest_valid_name("x", []) == "valid: (none)"
 
 
 def test_line_numbers_are_those_of_the_keys(write):
@@ -570,7 +570,5 @@ def test_a_drive_without_gain_is_refused(tmp_path):
 def test_stroke_must_span_the_range_of_the_joint(write):
     """The piston would leave its tube at an end of the joint's range."""
     check_strokes(load_machine(write(edited(("range_deg: [-20, 60]", "range_deg: [-10, 30]")))))
-    with pytest.raises(
-        InputError, match="at jib = 1.047 its piston would be at .* outside its str"
-    ):
+    with pytest.raises(InputError, match="at jib = 1.047 its piston would be at .* outside its str"):
         check_strokes(load_machine(write(edited(("range_deg: [-20, 60]", "range_deg: [-10, 60]")))))

@@ -48,9 +48,7 @@ def samples(plant):
         SAMPLES[key] = [
             (axis, float(value), rest_state(plant, {axis.joint: float(value)}))
             for axis in plant.machine.axes.values()
-            for value in np.linspace(
-                *(plant.machine.joints[axis.joint].range or (-math.pi, math.pi)), 9
-            )
+            for value in np.linspace(*(plant.machine.joints[axis.joint].range or (-math.pi, math.pi)), 9)
         ]
     return SAMPLES[key]
 
@@ -116,9 +114,7 @@ def test_holding_forces_are_the_slope_of_potential_energy(plant):
             energy.append(moved.energy[0])
         slope = (energy[1] - energy[0]) / (2.0 * h)
         rates = basis[:, free.index(plant.dof[axis])]
-        moved_by = [
-            rates[model.jnt_dofadr[model.actuator_trnid[i, 0]]] for i in range(len(plant.axes))
-        ]
+        moved_by = [rates[model.jnt_dofadr[model.actuator_trnid[i, 0]]] for i in range(len(plant.axes))]
         assert np.dot(forces, moved_by) == pytest.approx(slope, rel=1e-5, abs=0.05)
 
 

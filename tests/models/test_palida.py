@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from hydrotele.core.files import models_folder
-from hydrotele.experiments.palida import TABLE, load_excitation, load_robot
-from hydrotele.multibody.inverse_dynamics import project
+from hydrotele.experiments.palida import PUBLISHED_PARAMETERS, load_excitation, load_robot
+from hydrotele.multibody.inverse_dynamics import project_on_drives
 
 
 def compiled(name):
@@ -37,7 +37,7 @@ def test_a_hexapod_has_19_bodies_and_the_published_base_parameters():
     chain = load_robot().setup.chain
     assert len(chain.bodies) == 19 and len(chain.closures) == 6 and len(chain.drives) == 6
     # rounding of the file's decimals
-    np.testing.assert_allclose(load_robot().truth, [one.value for one in TABLE], atol=1e-9)
+    np.testing.assert_allclose(load_robot().truth, [one.value for one in PUBLISHED_PARAMETERS], atol=1e-9)
 
 
 def test_drive_forces_are_those_of_the_simulator():
@@ -48,9 +48,12 @@ def test_drive_forces_are_those_of_the_simulator():
     """
     own, model = load_robot(), compiled("palida")
     motion = load_excitation()
-    whole = motion.motion(np.linspace(0.0, motion.period, 40))
+    whole = motion.evaluate(np.linspace(0.0, motion.period, 40))
     setup = own.setup
-    found, forces = project(setup.chain, setup.given, *whole), own.matrix(whole) @ own.truth
+    found, forces = (
+        project_on_drives(setup.chain, setup.given_joints, *whole),
+        own.matrix(whole) @ own.truth,
+    )
     data, mass, worst = mujoco.MjData(model), np.zeros((24, 24)), 0.0
     selector = np.zeros((24, 6))
     selector[[model.joint(name).dofadr[0] for name in setup.chain.drives], range(6)] = 1.0

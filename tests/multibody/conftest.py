@@ -27,7 +27,7 @@ def reduced_of():
 
     def reduced(machine, channels=()):
         model = reduced_model(machine, tuple(channels))
-        z, free = np.zeros(state_size(model)), model.mech.free
+        z, free = np.zeros(state_size(model)), model.mech.independent
         z[: len(free)] = model.mech.joint[HOME][free]
         for s, name in enumerate(state_names(machine)):
             z[s] = 4e6 if name.startswith("pressure") else z[s]

@@ -6,7 +6,7 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.multibody.chain import cardan_angles, load_chain
-from hydrotele.multibody.inverse_dynamics import project, regressor
+from hydrotele.multibody.inverse_dynamics import make_regressor, project_on_drives
 from tests.multibody.test_inverse_dynamics import CRANK
 
 MIDDLE = (0.02, -0.03, 0.8)  # m, of the platform
@@ -96,9 +96,9 @@ def test_leg_forces_of_a_hexapod_are_those_of_mujoco_with_multipliers(platform):
     model, step = hexapod(platform), 2e-3
     chain = load_chain(model)
     assert len(chain.bodies) == 19 and len(chain.joints) == 24 and len(chain.closures) == 6
-    found = project(chain, chain.drives, *legs())
-    forces = found.bodies @ chain.inertia.ravel()
-    whole = regressor(chain, found, offsets=False)
+    found = project_on_drives(chain, chain.drives, *legs())
+    forces = found.body_projection @ chain.inertia.ravel()
+    whole = make_regressor(chain, found, offsets=False)
     np.testing.assert_allclose(whole.matrix @ whole.nominal, forces, rtol=1e-12)
     selector = np.zeros((model.nv, 6))
     selector[[model.joint(name).dofadr[0] for name in chain.drives], range(6)] = 1.0
@@ -152,28 +152,24 @@ def test_a_weld_to_a_body_that_turns_in_the_pin_is_the_connect():
     for xml in (CRANK, by_bodies):
         model = mujoco.MjModel.from_xml_string(xml)
         chain = load_chain(model)
-        moved = project(chain, ("yaw", "lift", "crank"), *motion, drives=("yaw", "lift", "crank"))
+        moved = project_on_drives(chain, ("yaw", "lift", "crank"), *motion, drives=("yaw", "lift", "crank"))
         data = mujoco.MjData(model)
         data.qpos[:] = moved.position[100]
         mujoco.mj_forward(model, data)
-        assert (
-            np.abs(data.efc_pos[data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY]).max()
-            < 1e-9
-        )
-        found.append(moved.bodies @ chain.inertia.ravel())
+        assert np.abs(data.efc_pos[data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY]).max() < 1e-9
+        found.append(moved.body_projection @ chain.inertia.ravel())
     np.testing.assert_allclose(found[1], found[0], rtol=1e-6, atol=1e-6)  # the pin's own mass
 
 
 def test_what_lies_beside_a_mechanism_has_no_joints_in_its_chain():
     xml = CRANK.replace(
         "<worldbody>",
-        "<worldbody><body name='stone' pos='3 0 0'><joint type='free' damping='1'/>"
-        "<geom size='0.1'/></body>",
+        "<worldbody><body name='stone' pos='3 0 0'><joint type='free' damping='1'/><geom size='0.1'/></body>",
     )
     chain, plain = (load_chain(mujoco.MjModel.from_xml_string(x)) for x in (xml, CRANK))
     assert chain.joints == plain.joints and "stone" in chain.bodies
     model = mujoco.MjModel.from_xml_string(xml)
-    for name, place in zip(chain.joints, chain.places, strict=True):
+    for name, place in zip(chain.joints, chain.qpos_indices, strict=True):
         assert place == model.joint(name).qposadr[0]
 
 

@@ -10,7 +10,7 @@ import pytest
 from hydrotele.core.errors import InputError
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.multibody.chain import load_chain
-from hydrotele.multibody.inverse_dynamics import project
+from hydrotele.multibody.inverse_dynamics import project_on_drives
 from hydrotele.simulate.plant import build_plant, rest_state
 
 # Franka Panda, joint by joint: orientation of the frame [rad], its place [m]
@@ -134,21 +134,19 @@ def test_the_regressor_of_a_tree_is_that_of_pinocchio(name):
     chain = opened(load_chain(model))
     rng, v = np.random.default_rng(2), model.nv
     motion = [rng.uniform(-1.5, 1.5, (20, v)) for _ in range(3)]
-    found = project(chain, chain.joints, *motion, drives=chain.joints)
+    found = project_on_drives(chain, chain.joints, *motion, drives=chain.joints)
     twin, bodies = in_pinocchio(model)
     data = twin.createData()
     for row in range(20):
         q, rate, acceleration = (part[row] for part in motion)
-        theirs = pinocchio.computeJointTorqueRegressor(
-            twin, data, q - model.qpos0, rate, acceleration
-        )
+        theirs = pinocchio.computeJointTorqueRegressor(twin, data, q - model.qpos0, rate, acceleration)
         for joint, body in enumerate(bodies):
             if body < 0:
                 continue
             # theirs is about the anchor of the body's last joint, ours about the body's origin
             last = model.body_jntadr[body] + model.body_jntnum[body] - 1
             block = theirs[:, 10 * joint : 10 * joint + 10][:, ORDER]
-            ours = found.bodies[row][:, 10 * (body - 1) : 10 * body]
+            ours = found.body_projection[row][:, 10 * (body - 1) : 10 * body]
             expected = block @ moved(model.jnt_pos[last])
             np.testing.assert_allclose(ours, expected, atol=1e-9 * np.abs(expected).max())
 
@@ -196,19 +194,19 @@ def closed(name):
 def test_drive_forces_of_closed_loops_are_those_of_mujoco(name):
     """Its inverse dynamics knows only the tree; virtual work carries it to the drives."""
     model, chain, given, *motion = closed(name)
-    found = project(chain, given, *motion)
-    forces = found.bodies @ chain.inertia.ravel()
+    found = project_on_drives(chain, given, *motion)
+    forces = found.body_projection @ chain.inertia.ravel()
     for row in range(0, 400, 37):
         joints = inverse(model, chain, found, row) - chain.damping * found.rate[row]
         joints -= chain.armature * found.acceleration[row]
-        expected = found.share[row] @ joints
+        expected = found.joint_projection[row] @ joints
         np.testing.assert_allclose(forces[row], expected, atol=1e-9 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("name", CLOSED)
 def test_the_motion_of_hidden_joints_closes_the_loops_and_is_its_own_derivative(name):
     model, chain, given, *motion = closed(name)
-    found, step = project(chain, given, *motion), 0.02
+    found, step = project_on_drives(chain, given, *motion), 0.02
     data = mujoco.MjData(model)
     for row in (0, 150, 399):
         data.qpos[:] = found.position[row]
@@ -225,27 +223,25 @@ def test_the_motion_of_hidden_joints_closes_the_loops_and_is_its_own_derivative(
 def test_virtual_work_of_joints_and_pins():
     """Friction in a joint or a closure takes from the drives the power that it burns."""
     _, chain, given, *motion = closed("bucket")
-    found = project(chain, given, *motion)
+    found = project_on_drives(chain, given, *motion)
     drives = [chain.index(name) for name in chain.drives]
-    burnt = np.einsum("nkc,nk->nc", found.pins, found.rate[:, drives])
-    np.testing.assert_allclose(burnt, found.twist**2, atol=1e-9)
-    spent = np.einsum("nkv,nk->nv", found.share, found.rate[:, drives])
+    burnt = np.einsum("nkc,nk->nc", found.closure_projection, found.rate[:, drives])
+    np.testing.assert_allclose(burnt, found.closure_rate**2, atol=1e-9)
+    spent = np.einsum("nkv,nk->nv", found.joint_projection, found.rate[:, drives])
     np.testing.assert_allclose(spent, found.rate, atol=1e-9)
 
 
 def test_refusals_say_what_is_wrong():
     _, chain, given, q, v, a = closed("none")
     with pytest.raises(InputError, match="row 3 has no motion"):
-        project(chain, given, np.where(np.arange(400)[:, None] == 3, np.nan, q), v, a)
+        project_on_drives(chain, given, np.where(np.arange(400)[:, None] == 3, np.nan, q), v, a)
     with pytest.raises(InputError, match="2 joints are given but 3 have a drive"):
-        project(chain, given[:2], q[:, :2], v[:, :2], a[:, :2])
+        project_on_drives(chain, given[:2], q[:, :2], v[:, :2], a[:, :2])
     with pytest.raises(InputError, match="cat215 has no joint bom"):
-        project(chain, ("swing", "bom", "stick"), q, v, a)
+        project_on_drives(chain, ("swing", "bom", "stick"), q, v, a)
     _, linkage, four, *motion = closed("bucket")
     motion[0][7, 3] = 1.5  # rad; the four-bar linkage ends at 0.25
     with pytest.raises(InputError, match="row 7: the loops of cat215 cannot be closed"):
-        project(linkage, four, *motion)
-    with pytest.raises(
-        InputError, match="neither given nor determined by a closure: boom_rod|stick_tube"
-    ):
-        project(opened(chain), given, q, v, a)
+        project_on_drives(linkage, four, *motion)
+    with pytest.raises(InputError, match="neither given nor determined by a closure: boom_rod|stick_tube"):
+        project_on_drives(opened(chain), given, q, v, a)

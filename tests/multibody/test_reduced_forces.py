@@ -6,7 +6,7 @@ import pinocchio as pin
 import pytest
 
 from hydrotele.estimate.reduced_model import place
-from hydrotele.multibody.inverse_dynamics import project
+from hydrotele.multibody.inverse_dynamics import project_on_drives
 from hydrotele.multibody.reduced_mechanism import (
     BIAS,
     DRIFT,
@@ -14,10 +14,10 @@ from hydrotele.multibody.reduced_mechanism import (
     MASS,
     RATE,
     Q,
+    compute_mass_and_bias,
     coordinate_names,
-    gather_forces,
 )
-from hydrotele.simulate.closure import closed_chain, independent_dofs, motion_basis
+from hydrotele.simulate.closure import independent_dofs, load_closed_chain, motion_basis
 from hydrotele.simulate.plant import build_plant, rest_state
 
 MACHINES = ("cat215/none", "cat215/bucket", "cat215/grapple", "cat325", "ec20", "rig", "emps")
@@ -27,7 +27,7 @@ DIFFERENCE = 1e-5  # [s] of central differences: truncation 1e-10, cancellation 
 def reduced_forces(model, space, z):
     """(mass matrix, bias forces) in independent coordinates."""
     place(model, space, z)
-    gather_forces(model.mech, space.motion)
+    compute_mass_and_bias(model.mech, space.motion)
     m = space.motion
     bias = m.joint[BIAS] + m.mass @ m.joint[DRIFT]
     return m.basis.T @ m.mass @ m.basis, m.basis.T @ bias
@@ -60,9 +60,7 @@ def mujoco_forces(machine, model, z):
 
 @pytest.mark.parametrize("name", MACHINES)
 @pytest.mark.parametrize("seed", range(4))
-def test_mass_matrix_and_bias_are_those_of_mujoco(
-    name, seed, machine_of, reduced_of, move_at_random
-):
+def test_mass_matrix_and_bias_are_those_of_mujoco(name, seed, machine_of, reduced_of, move_at_random):
     machine = machine_of(name)
     model, space, z = reduced_of(machine)
     move_at_random(model, z, seed)
@@ -76,9 +74,7 @@ def test_mass_matrix_and_bias_are_those_of_mujoco(
 
 
 @pytest.mark.parametrize("name", MACHINES)
-def test_reduced_coordinates_and_the_chain_ask_for_the_same_forces(
-    name, machine_of, reduced_of, move_at_random
-):
+def test_reduced_coordinates_and_the_chain_ask_for_the_same_forces(name, machine_of, reduced_of, move_at_random):
     """The two implementations of a closed chain, `reduced_mechanism` and `inverse_dynamics`."""
     machine = machine_of(name)
     model, space, z = reduced_of(machine)
@@ -88,15 +84,15 @@ def test_reduced_coordinates_and_the_chain_ask_for_the_same_forces(
     move_at_random(model, z, 5)
     rates, accelerations = z[n : 2 * n], rng.uniform(-1.0, 1.0, n)
     mass, bias = reduced_forces(model, space, z)
-    chain = closed_chain(machine, dict(zip(free, z[:n], strict=True)))
-    found = project(chain, free, z[None, :n], rates[None], accelerations[None], drives=free)
+    chain = load_closed_chain(machine, dict(zip(free, z[:n], strict=True)))
+    found = project_on_drives(chain, free, z[None, :n], rates[None], accelerations[None], drives=free)
     for k, joint in enumerate(names):
         j, m = chain.index(joint), space.motion.joint
         assert found.position[0, j] == pytest.approx(m[Q, k], abs=1e-9)
         assert found.rate[0, j] == pytest.approx(m[RATE, k], abs=1e-9)
         moved = m[DRIFT, k] + space.motion.basis[k] @ accelerations
         assert found.acceleration[0, j] == pytest.approx(moved, abs=1e-8)
-    expected = found.bodies[0] @ chain.inertia.ravel()
+    expected = found.body_projection[0] @ chain.inertia.ravel()
     largest = max(np.abs(expected).max(), np.abs(mass).max())
     # loops are closed to 1e-11 m and 1e-12 m
     np.testing.assert_allclose(mass @ accelerations + bias, expected, atol=1e-9 * largest)
@@ -135,7 +131,7 @@ def test_spanning_tree_is_that_of_pinocchio(name, machine_of, reduced_of, move_a
     shape[1 + model.mech.links :, INERTIA : INERTIA + 3] = 0.0
     shape[1 + model.mech.links :, MASS] = 0.0  # cylinders without mass
     place(model, space, z)
-    gather_forces(model.mech._replace(shape=shape), space.motion)
+    compute_mass_and_bias(model.mech._replace(shape=shape), space.motion)
     tree = spanning_tree(machine)
     data, joint = tree.createData(), space.motion.joint
     order = [list(tree.names)[1:].index(name) for name in coordinate_names(machine)]

@@ -6,6 +6,7 @@ import pytest
 from hydrotele.estimate.reduced_model import place
 from hydrotele.multibody.reduced_mechanism import (
     ACCELERATION,
+    COORDINATE_END,
     DRIFT,
     JOINT,
     LENGTH,
@@ -14,10 +15,9 @@ from hydrotele.multibody.reduced_mechanism import (
     LENGTH_ROW,
     ORIGIN,
     RATE,
-    REACH,
+    ROTATION,
     SPIN,
     SPIN_RATE,
-    TURN,
     VELOCITY,
     Q,
 )
@@ -65,9 +65,9 @@ def test_velocities_are_slopes_of_places(name, passing):
     found = slope(before, after)[:, ORIGIN : ORIGIN + 3]
     np.testing.assert_allclose(found, frame[:, VELOCITY : VELOCITY + 3], atol=CLOSE)
     for i in range(mech.bodies):
-        turn = frame[i, TURN : TURN + 9].reshape(3, 3)
+        turn = frame[i, ROTATION : ROTATION + 9].reshape(3, 3)
         np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-13)  # rounding
-        found = slope(before, after)[i, TURN : TURN + 9].reshape(3, 3)
+        found = slope(before, after)[i, ROTATION : ROTATION + 9].reshape(3, 3)
         expected = crossed(frame[i, SPIN : SPIN + 3]) @ turn
         np.testing.assert_allclose(found, expected, atol=CLOSE)
 
@@ -113,7 +113,7 @@ def test_bound_coordinates_follow(passing):
 
 def test_frames_do_not_move_with_coordinates_outside_their_reach(passing):
     mech, (_, (*_, jacobian, _), _) = passing("cat215/bucket")
-    for i, reach in enumerate(mech.tree[:, REACH]):
+    for i, reach in enumerate(mech.tree[:, COORDINATE_END]):
         assert not jacobian[i, reach:].any()
         if reach:
             assert jacobian[i, reach - 1].any()

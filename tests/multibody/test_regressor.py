@@ -7,14 +7,19 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.effects.effect import changed
-from hydrotele.hydraulics.laws import friction
+from hydrotele.effects.effect import with_value
+from hydrotele.hydraulics.laws import friction_force
 from hydrotele.identify.estimation import estimate
-from hydrotele.identify.identifiability import identifiability, reference_sizes
-from hydrotele.identify.setup import drive_friction, machine_setup
+from hydrotele.identify.identifiability import classify_parameters, reference_sizes
+from hydrotele.identify.setup import drive_friction_terms, machine_setup
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.multibody.chain import load_chain
-from hydrotele.multibody.inverse_dynamics import FrictionTerm, pin_friction, project, regressor
+from hydrotele.multibody.inverse_dynamics import (
+    FrictionTerm,
+    make_regressor,
+    passive_friction_terms,
+    project_on_drives,
+)
 from hydrotele.simulate.closure import independent_dofs, motion_basis
 from hydrotele.simulate.plant import build_plant, rest_state
 
@@ -53,7 +58,7 @@ def friction_of(machine, velocities):
     for axis, velocity in zip(machine.hydraulic_axes.values(), velocities, strict=True):
         f = axis.drive.friction
         found.append(
-            friction(velocity, f.coulomb, f.stribeck_extra, f.stribeck_velocity, f.viscous,
+            friction_force(velocity, f.coulomb, f.stribeck_extra, f.stribeck_velocity, f.viscous,
                      f.smoothing_velocity, f.coulomb_asymmetry, f.viscous_asymmetry)
         )  # fmt: skip
     return np.array(found)
@@ -68,15 +73,15 @@ def of_machine(machine, positions, rates, accelerations, **more):
     """Regressor of a machine with the friction of its drives."""
     chain, plant = closed_chain(machine)
     given = tuple(machine.axes[name].joint for name in plant.axes)
-    found = project(chain, given, positions, rates, accelerations)
-    return regressor(chain, found, rubbing=drive_friction(machine, chain), **more)
+    found = project_on_drives(chain, given, positions, rates, accelerations)
+    return make_regressor(chain, found, friction=drive_friction_terms(machine, chain), **more)
 
 
 @pytest.mark.parametrize("tool", POSES)
 def test_regressor_times_parameters_is_the_inverse_dynamics_of_mujoco(tool):
     machine = load_machine("cat215", tool)
-    machine = changed(machine, "axes.boom.cylinder.friction.coulomb_asymmetry", 0.3)
-    machine = changed(machine, "axes.stick.cylinder.friction.viscous_asymmetry", -0.2)
+    machine = with_value(machine, "axes.boom.cylinder.friction.coulomb_asymmetry", 0.3)
+    machine = with_value(machine, "axes.stick.cylinder.friction.viscous_asymmetry", -0.2)
     plant, rng = build_plant(machine), np.random.default_rng(4)
     width = len(POSES[tool][0])
     rates, accelerations = rng.uniform(-0.8, 0.8, (3, width)), rng.uniform(-3, 3, (3, width))
@@ -104,7 +109,7 @@ def test_noise_free_forces_of_mujoco_tell_every_combination_exactly():
         force, velocities = mujoco_forces(plant, pose, rate, acceleration)
         forces.append(force + friction_of(machine, velocities))
     flat = found.matrix.reshape(-1, found.matrix.shape[2])
-    told = identifiability(flat, found.names, found.units)
+    told = classify_parameters(flat, found.names, found.units)
     assert len(told.base) > 40
     base = estimate(found.matrix[:, :, told.base], np.array(forces), order=0)
     truth = told.combination @ found.nominal
@@ -133,8 +138,8 @@ def test_columns_are_named_with_their_units_and_values():
 def test_any_parameters_can_be_told_from_a_machine_that_has_them():
     """A machine with other masses: its own regressor's forces come from the first one's matrix."""
     first, rng = load_machine("cat215"), np.random.default_rng(0)
-    other = changed(changed(first, "links.stick.mass", 900.0), "links.boom.com", (2.0, 0.1, 0.3))
-    other = changed(other, "axes.boom.cylinder.rod.mass", 170.0)
+    other = with_value(with_value(first, "links.stick.mass", 900.0), "links.boom.com", (2.0, 0.1, 0.3))
+    other = with_value(other, "axes.boom.cylinder.rod.mass", 170.0)
     motion = [rng.uniform(-0.5, 0.5, (20, 3)) + shift for shift in ((0, 0.3, -1.5), 0, 0)]
     one, two = of_machine(first, *motion), of_machine(other, *motion)
     assert np.abs(one.nominal - two.nominal).max() > 100
@@ -169,11 +174,11 @@ def test_friction_of_a_pin_resists_whichever_way_it_turns():
     chain, _ = closed_chain(machine)
     pose = np.array([[0.0, 0.4, -1.5]])
     for sign in (1.0, -1.0):
-        found = project(chain, chain.joints[:3], pose, sign * np.array([[0, 0.2, 0]]), 0 * pose)
-        table = regressor(chain, found, bodies=(), rubbing=pin_friction(chain), offsets=False)
+        found = project_on_drives(chain, chain.joints[:3], pose, sign * np.array([[0, 0.2, 0]]), 0 * pose)
+        table = make_regressor(chain, found, bodies=(), friction=passive_friction_terms(chain), offsets=False)
         boom_pin = table.matrix[0, :, table.names.index("coulomb.boom_pin")]
         speed = found.rate[0, chain.index("boom_rod")]
-        assert boom_pin[1] == pytest.approx(found.twist[0, 0] / speed)
+        assert boom_pin[1] == pytest.approx(found.closure_rate[0, 0] / speed)
         assert np.sign(boom_pin[1]) == np.sign(speed)
     assert set(table.names) == {
         f"coulomb.{p}" for p in
@@ -183,14 +188,14 @@ def test_friction_of_a_pin_resists_whichever_way_it_turns():
 
 def test_refuses_what_it_cannot_tell():
     chain, _ = closed_chain(load_machine("cat215"))
-    found = project(chain, chain.joints[:3], *(np.zeros((1, 3)) + v for v in (0.3, 0.0, 0.0)))
+    found = project_on_drives(chain, chain.joints[:3], *(np.zeros((1, 3)) + v for v in (0.3, 0.0, 0.0)))
     with pytest.raises(InputError, match="cat215 has no body bucket"):
-        regressor(chain, found, bodies=("bucket",))
+        make_regressor(chain, found, bodies=("bucket",))
     with pytest.raises(InputError, match="friction has no sticky"):
-        regressor(chain, found, rubbing=[FrictionTerm("boom", {"sticky": 0.0})])
+        make_regressor(chain, found, friction=[FrictionTerm("boom", {"sticky": 0.0})])
     with pytest.raises(InputError, match="closure, which has no sides"):
-        regressor(chain, found, rubbing=[FrictionTerm("boom_pin", {"viscous_asymmetry": 0.0})])
+        make_regressor(chain, found, friction=[FrictionTerm("boom_pin", {"viscous_asymmetry": 0.0})])
     grapple, plant = closed_chain(load_machine("cat215", "grapple"))
     given = tuple(plant.machine.axes[a].joint for a in plant.axes)
     with pytest.raises(InputError, match="closure: grapple_pitch, grapple_roll"):
-        project(grapple, given, *np.zeros((3, 2, len(given))))
+        project_on_drives(grapple, given, *np.zeros((3, 2, len(given))))

@@ -38,6 +38,6 @@ def done(tmp_path_factory) -> Path:
 
     folder = tmp_path_factory.mktemp("sweep")
     file = load_sweep(write_sweep(folder, logs=True))
-    run_sweep(file, folder / "out", SweepSettings(jobs=1, keep=write_run))
+    run_sweep(file, folder / "out", SweepSettings(jobs=1, write_run_files=write_run))
     assert json.loads((folder / "out" / "summary.json").read_text())["failed"] == 0
     return folder / "out"

@@ -12,8 +12,8 @@ from hydrotele.run.devices import (
     LAYOUTS,
     QUIT_KEY,
     SWITCH_KEYS,
+    JoystickDevice,
     Keyboard,
-    Pad,
     load_script,
     open_device,
 )
@@ -96,7 +96,7 @@ def test_every_key_is_there_once_and_both_ways():
 
 def test_gamepad_has_a_dead_zone_and_goes_all_the_way():
     stick = Stick()
-    pad = Pad("gamepad", Sticks(stick), 2)
+    pad = JoystickDevice("gamepad", Sticks(stick), 2)
     stick.axes[1], stick.axes[0] = -0.11, 1.0
     reading = asked(pad.read(0.0))
     assert reading["x"] == 0.0 and reading["y"] == -1.0  # left is positive
@@ -108,7 +108,7 @@ def test_gamepad_has_a_dead_zone_and_goes_all_the_way():
 
 def test_gamepad_switches_once_for_each_press():
     stick = Stick()
-    pad = Pad("gamepad", Sticks(stick), 2)
+    pad = JoystickDevice("gamepad", Sticks(stick), 2)
     stick.hat = (0, 1)
     assert [pad.read(0.0).commands for _ in range(3)] == [(1.0, 0.0)] * 3  # held, not repeated
     stick.hat = (-1, 0)
@@ -121,7 +121,7 @@ def test_gamepad_switches_once_for_each_press():
 
 def test_spacemouse_turns_a_command_on_off_and_back():
     stick = Stick(buttons=2, hats=0)
-    mouse = Pad("spacemouse", Sticks(stick), 1)
+    mouse = JoystickDevice("spacemouse", Sticks(stick), 1)
     seen = []
     for pressed in (1, 0, 1, 0, 1, 0):
         stick.buttons[0] = pressed
@@ -136,16 +136,16 @@ def test_spacemouse_turns_a_command_on_off_and_back():
 def test_unplugged_pad_lets_go_says_so_once_and_comes_back():
     stick = Stick()
     sticks = Sticks(stick)
-    pad = Pad("gamepad", sticks, 1)
+    pad = JoystickDevice("gamepad", sticks, 1)
     stick.axes[1], stick.hat = -1.0, (0, 1)
     assert asked(pad.read(0.0))["x"] == 1.0
     sticks.plug(None)
     gone = pad.read(0.1)
-    assert gone.axes == (0.0,) * 6 and gone.commands == (0.0,) and "unplugged" in gone.said
-    assert pad.read(0.2).said == ""
+    assert gone.axes == (0.0,) * 6 and gone.commands == (0.0,) and "unplugged" in gone.user_message
+    assert pad.read(0.2).user_message == ""
     sticks.plug(stick)
     back = pad.read(0.3)
-    assert asked(back)["x"] == 1.0 and "is connected again" in back.said
+    assert asked(back)["x"] == 1.0 and "is connected again" in back.user_message
     pad.close()
     assert sticks.closed
 
@@ -154,14 +154,14 @@ def test_small_pad_lacks_what_it_lacks():
     """A pad of two axes and one button asks for no more than it can."""
     stick = Stick(axes=2, buttons=1, hats=0)
     stick.axes[:] = 0.0, -1.0
-    assert asked(Pad("gamepad", Sticks(stick), 1).read(0.0))["x"] == 1.0
+    assert asked(JoystickDevice("gamepad", Sticks(stick), 1).read(0.0))["x"] == 1.0
 
 
 @pytest.mark.parametrize("kind", LAYOUTS)
 def test_nothing_plugged_in(kind):
     sticks = Sticks(None)
     with pytest.raises(InputError, match=f"--device {kind}: is not connected"):
-        Pad(kind, sticks, 0)
+        JoystickDevice(kind, sticks, 0)
     assert sticks.closed
 
 

@@ -7,12 +7,12 @@ import signal
 import numpy as np
 import pytest
 
-from hydrotele.cli.driving import DriveOptions, drive_to_folder, first_interrupt
+from hydrotele.cli.driving import DriveOptions, catch_first_interrupt, drive_to_folder
 from hydrotele.core.errors import InputError
 from hydrotele.logs.log import load_log
 from hydrotele.run.devices import Reading
-from hydrotele.run.live import PATIENCE, Pacer, drive, further_axes
-from hydrotele.run.run import run_scenario, scenario_machine
+from hydrotele.run.live import MAX_LATENESS, Pacer, additional_axes, drive_scenario
+from hydrotele.run.run import load_simulated_machine, run_scenario
 from hydrotele.scenario.scenario import load_scenario
 
 OUT = "time,x,y\n0,0,0\n0.3,0.8,0\n2.3,0,0.6\n3.4,0,0\n4,0,0\n"
@@ -56,23 +56,23 @@ def test_pacer_waits_for_the_clock():
     pacer = Pacer(1.0, clock.now, clock.sleep)
     for tick in range(1, 201):
         clock.time += 0.001  # of computing
-        assert pacer.wait(0.005 * tick) == 0.0
+        assert pacer.wait_for_tick(0.005 * tick) == 0.0
     assert clock.time == pytest.approx(100.001 + 0.995)
-    assert pacer.pauses == 0 and pacer.late == 0.0
+    assert pacer.pauses == 0 and pacer.total_delay == 0.0
 
 
 def test_pacer_makes_up_for_a_hiccup_but_not_for_more():
     clock = Clock()
     pacer = Pacer(1.0, clock.now, clock.sleep)
-    pacer.wait(0.0)
-    clock.time += 0.9 * PATIENCE
-    assert pacer.wait(0.005) == 0.0 and pacer.pauses == 0
-    pacer.wait(0.9 * PATIENCE)
+    pacer.wait_for_tick(0.0)
+    clock.time += 0.9 * MAX_LATENESS
+    assert pacer.wait_for_tick(0.005) == 0.0 and pacer.pauses == 0
+    pacer.wait_for_tick(0.9 * MAX_LATENESS)
     assert not clock.slept  # has caught up just now
     clock.time += 2.0
-    set_back = pacer.wait(0.9 * PATIENCE + 0.005)
-    assert set_back == pytest.approx(2.0 - 0.005) == pacer.late and pacer.pauses == 1
-    pacer.wait(0.9 * PATIENCE + 0.105)
+    set_back = pacer.wait_for_tick(0.9 * MAX_LATENESS + 0.005)
+    assert set_back == pytest.approx(2.0 - 0.005) == pacer.total_delay and pacer.pauses == 1
+    pacer.wait_for_tick(0.9 * MAX_LATENESS + 0.105)
     assert clock.slept == [pytest.approx(0.1)]  # no race to make up for the two seconds
 
 
@@ -80,8 +80,8 @@ def test_pacer_makes_up_for_a_hiccup_but_not_for_more():
 def test_pacer_at_another_speed(speed, expected):
     clock = Clock()
     pacer = Pacer(speed, clock.now, clock.sleep)
-    pacer.wait(0.0)
-    pacer.wait(1.0)
+    pacer.wait_for_tick(0.0)
+    pacer.wait_for_tick(1.0)
     assert sum(clock.slept) == pytest.approx(expected)
 
 
@@ -133,12 +133,15 @@ def test_same_script_same_bits_and_the_scenario_repeats_it(driven):
 def test_buttons_of_the_feller_and_their_repetition():
     """The saw spins up, the grab closes; the notes and the repeating scenario know of it."""
     scenario = load_scenario("fell_tree", {"duration": "3"})
-    machine = scenario_machine(scenario)
-    assert further_axes(machine) == {"grab": 1.0, "saw": 1.0}
+    machine = load_simulated_machine(scenario)
+    assert additional_axes(machine) == {"grab": 1.0, "saw": 1.0}
     device = Script(
         (0.0, Reading(commands=(0.0, 0.0))),
         (0.1, Reading(commands=(0.0, 1.0))),
-        (1.14, Reading(commands=(0.8, 1.0), said="hello")),  # tick 228: 228 * 0.005 is not 1.14
+        (
+            1.14,
+            Reading(commands=(0.8, 1.0), user_message="hello"),
+        ),  # tick 228: 228 * 0.005 is not 1.14
         (1.16, Reading(commands=(0.8, 1.0))),
         (2.0, Reading(commands=(0.8, 1.0), quit=True)),
     )
@@ -149,7 +152,7 @@ def test_buttons_of_the_feller_and_their_repetition():
             shown.append(dict(status().rows()))
         return True
 
-    run = drive(scenario, machine, device, Pacer(0.0), watch, said.append)
+    run = drive_scenario(scenario, machine, device, Pacer(0.0), watch, said.append)
     assert run.scenario.duration == 2.0 and "hello" in said
     assert run.measured["command.saw"][4] == 0.0 and run.measured["command.saw"][6] == 1.0
     assert run.measured["angle.grab"][-1] > run.measured["angle.grab"][57] + 0.05
@@ -169,9 +172,9 @@ def test_slow_computer_pauses_and_says_so():
     scenario = load_scenario("steer", {"duration": "0.5"})
     device = Script((0.0, Reading()))
     pacer = Pacer(1.0, clock.now, clock.sleep)
-    run = drive(scenario, scenario_machine(scenario), device, pacer, watch, said.append)
+    run = drive_scenario(scenario, load_simulated_machine(scenario), device, pacer, watch, said.append)
     assert run.summary["pauses"] > 10
-    assert run.summary["late_seconds"] == pytest.approx(99 * 0.095, abs=PATIENCE)
+    assert run.summary["late_seconds"] == pytest.approx(99 * 0.095, abs=MAX_LATENESS)
     assert len(run.measured) == 25 and not clock.slept
     told = [sentence for sentence in said if sentence.startswith("computer too slow")]
     assert 3 <= len(told) <= 6  # of 10 s, every two
@@ -179,7 +182,7 @@ def test_slow_computer_pauses_and_says_so():
 
 def test_first_interrupt_ends_the_drive_and_the_second_everything():
     before = signal.getsignal(signal.SIGINT)  # a job in the background of a shell ignores it
-    with pytest.raises(KeyboardInterrupt), first_interrupt() as interrupted:
+    with pytest.raises(KeyboardInterrupt), catch_first_interrupt() as interrupted:
         assert not interrupted()
         signal.raise_signal(signal.SIGINT)
         assert interrupted()
@@ -189,14 +192,14 @@ def test_first_interrupt_ends_the_drive_and_the_second_everything():
 
 def test_interrupted_drive_writes_a_whole_folder(tmp_path, monkeypatch):
     """Ctrl-C at 0.51 s of simulated time: whole rows, complete folder."""
-    real = Pacer.wait
+    real = Pacer.wait_for_tick
 
-    def wait(self, simulated):
+    def wait_for_tick(self, simulated):
         if abs(simulated - 0.51) < 1e-9:
             signal.raise_signal(signal.SIGINT)
         return real(self, simulated)
 
-    monkeypatch.setattr(Pacer, "wait", wait)
+    monkeypatch.setattr(Pacer, "wait_for_tick", wait_for_tick)
     (tmp_path / "s.yaml").write_text("time: [0, 100]\n")
     drive_to_folder(wishes(tmp_path / "run", device=f"scripted:{tmp_path / 's.yaml'}"))
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())

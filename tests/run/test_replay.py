@@ -41,9 +41,7 @@ def with_state(log: Log, state) -> Log:
 
 def without(log: Log, *channels: str) -> Log:
     kept = [c for c in log.columns if c not in channels]
-    return dataclasses.replace(
-        log, columns={c: log[c] for c in kept}, units={c: log.units[c] for c in kept}
-    )
+    return dataclasses.replace(log, columns={c: log[c] for c in kept}, units={c: log.units[c] for c in kept})
 
 
 @pytest.mark.daily("dig", "grapple_log")
@@ -56,18 +54,14 @@ def test_own_run_replays_itself(name):
     """
     run = run_scenario(load_scenario(name, CASES[name]))
     replay = replay_log(run.truth, load_machine(run.scenario.machine, run.scenario.tool))
-    assert replay.channels.keys() == {
-        c for c in run.truth.columns if not c.startswith(("truth.", "command."))
-    }
+    assert replay.channels.keys() == {c for c in run.truth.columns if not c.startswith(("truth.", "command."))}
     for channel, found in replay.channels.items():
         assert found.max < 1e-9 * found.range, channel
         assert found.noise_rms == 0.0
     hidden = [c for c in run.truth.columns if c.startswith("truth.velocity.")]
     for channel in hidden:
         scale = np.abs(run.truth[channel]).max()
-        np.testing.assert_allclose(
-            replay.simulated[channel], run.truth[channel], atol=1e-7 * max(scale, 1e-3)
-        )
+        np.testing.assert_allclose(replay.simulated[channel], run.truth[channel], atol=1e-7 * max(scale, 1e-3))
 
 
 def test_own_contact_replays_because_the_log_names_its_ground():
@@ -215,9 +209,7 @@ def test_jitter_of_the_clock_does_not_add_up(excitation):
 def test_replay_converges_to_an_independent_simulator(run):
     """Half the step, less than 0.6 of the error; 10 s, as nothing forgets slower than 4 s."""
     log = load_log(MEASURED / "nominal_truth" / f"{run}.parquet")
-    short = dataclasses.replace(
-        log, time=log.time[:500], columns={c: v[:500] for c, v in log.columns.items()}
-    )
+    short = dataclasses.replace(log, time=log.time[:500], columns={c: v[:500] for c, v in log.columns.items()})
     machine = load_machine("cat215")
     errors = []
     for step in (1e-3, 5e-4, 2.5e-4):
@@ -230,9 +222,7 @@ def test_replay_converges_to_an_independent_simulator(run):
 
 
 @pytest.mark.parametrize("pressure", [-0.4e6, -101325.0, -2.9e6])
-def test_pressures_below_vacuum_of_another_program_start_a_chamber_that_lacks_that_oil(
-    excitation, pressure
-):
+def test_pressures_below_vacuum_of_another_program_start_a_chamber_that_lacks_that_oil(excitation, pressure):
     """As state, and where there is none as first reading: noise, or a model without air."""
     log, truth = excitation.measured, excitation.truth
     state = json.loads(truth.metadata["initial_state"])

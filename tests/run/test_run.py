@@ -11,10 +11,16 @@ import pytest
 import hydrotele
 from hydrotele.core.errors import InputError
 from hydrotele.logs.log import Log, load_log, save_log
-from hydrotele.run.run import begin, finished, prepare, run_scenario, scenario_machine
+from hydrotele.run.run import (
+    finish_run,
+    load_simulated_machine,
+    prepare,
+    run_scenario,
+    start_session,
+)
 from hydrotele.scenario.scenario import Scenario, load_scenario, save_scenario
-from hydrotele.simulate.audit import audit, full_state
-from hydrotele.simulate.record import SimulationFailed, begin_leapfrog
+from hydrotele.simulate.audit import compute_balance_errors, full_physics_state
+from hydrotele.simulate.record import SimulationFailed, start_leapfrog
 
 OPEN = {"duration": "3.2", "sensors": "khoshzaban1992"}  # of `steps`: the swing's first step
 
@@ -64,10 +70,10 @@ def test_progress_and_timing_do_not_change_the_run():
 def test_ticks_one_by_one_are_those_of_a_run(asked):
     """What native code does by itself is what it does tick by tick, also where valves close."""
     scenario = load_scenario(*asked)
-    session = begin(scenario)
-    while session.tick < scenario.ticks:
+    session = start_session(scenario)
+    while session.tick < scenario.tick_count:
         session.advance()
-    one, run = finished(session, scenario), run_scenario(scenario)
+    one, run = finish_run(session, scenario), run_scenario(scenario)
     assert same(one.truth, run.truth) and same(one.measured, run.measured)
     assert one.summary["notes"] == run.summary["notes"]
     if "pilot.safety.following_error" in asked[1]:
@@ -114,7 +120,7 @@ def test_rows_are_whole(duration):
     """The log holds as many whole rows as the control ticks give, 0.02 s apart."""
     facts = {"duration": duration, "ground": False, "pilot": {"kind": "constant"}}
     run = run_scenario(Scenario(name="t", **facts))
-    assert len(run.truth) == run.scenario.ticks // 4 == run.scenario.rows
+    assert len(run.truth) == run.scenario.tick_count // 4 == run.scenario.row_count
     np.testing.assert_allclose(run.truth.time, 0.02 * np.arange(len(run.truth)), atol=1e-12)
 
 
@@ -237,8 +243,7 @@ def test_books_close(name):
 
 def test_books_close_better_with_smaller_steps():
     found = [
-        run_scenario(load_scenario("excitation", {"duration": "5", "timestep": step}))
-        for step in ("1.0e-3", "2.5e-4")
+        run_scenario(load_scenario("excitation", {"duration": "5", "timestep": step})) for step in ("1.0e-3", "2.5e-4")
     ]
     coarse, fine = (run.summary["balance"] for run in found)
     for book in ("flow_balance", "energy_balance"):
@@ -255,13 +260,13 @@ def test_books_of_a_run_with_contact_claim_nothing():
 def _books(change=None, swap=None):
     """The audit of two seconds of motion, after forging the model or the machine."""
     plant, data, *_ = prepare(load_scenario("excitation", {"duration": "2"}))
-    begin_leapfrog(plant.model, data)
-    start = full_state(plant.model, data)
+    start_leapfrog(plant.model, data)
+    start = full_physics_state(plant.model, data)
     window = np.zeros((2000, plant.model.nu))
     window[:] = 0.3, 0.2, -0.3
     if change:
         change(plant.model)
-    return audit(swap(plant) if swap else plant, start, window)
+    return compute_balance_errors(swap(plant) if swap else plant, start, window)
 
 
 def test_audit_accepts_honest_books():
@@ -301,16 +306,14 @@ def test_audit_finds_energy_from_nowhere():
 
 def test_failed_simulation_tells_its_last_states():
     """Teranewtons on a hundred kilograms leave MuJoCo's numbers within a step."""
-    scenario = Scenario(
-        name="t", machine="emps", duration=1.0, pilot={"kind": "constant", "commands": {"slide": 9}}
-    )
-    machine = scenario_machine(scenario)
+    scenario = Scenario(name="t", machine="emps", duration=1.0, pilot={"kind": "constant", "commands": {"slide": 9}})
+    machine = load_simulated_machine(scenario)
     axis = machine.axes["slide"]
     force = axis.force.model_copy(update={"gain": 1e12})
     axes = {"slide": axis.model_copy(update={"force": force})}
     wild = machine.model_copy(update={"axes": axes})
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hydrotele.run.run.scenario_machine", lambda _: wild)
+        patch.setattr("hydrotele.run.run.load_simulated_machine", lambda _: wild)
         with pytest.raises(SimulationFailed, match=r"(?s)unstable at 0\.\d+ s.*qpos=") as failure:
             run_scenario(scenario)
     assert "t=0." in str(failure.value)

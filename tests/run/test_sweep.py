@@ -18,24 +18,24 @@ from hydrotele.core.files import models_folder, scenarios_folder
 from hydrotele.logs.log import save_log
 from hydrotele.run import sweep_runs as running
 from hydrotele.run.run import run_scenario
-from hydrotele.run.sweep import SweepSettings, outcomes, run_sweep, sweep_folder
+from hydrotele.run.sweep import SweepSettings, run_in_processes, run_sweep, sweep_folder
 from hydrotele.run.sweep_facts import (
     check_points,
+    iterate_points,
     load_sweep,
     open_base,
-    overrides,
-    points,
+    point_overrides,
     scenario_of,
 )
 from hydrotele.run.sweep_runs import (
     FAILED,
     OK,
-    Entry,
     Journal,
+    JournalEntry,
     RunTask,
-    numbers_of,
-    perform,
-    possible_results,
+    execute_task,
+    flatten_summary,
+    possible_number_names,
 )
 from hydrotele.scenario.scenario import load_scenario
 from hydrotele.simulate.record import SimulationFailed
@@ -61,22 +61,20 @@ def test_rows_and_logs_are_those_of_single_runs(done, tmp_path):
     file = load_sweep(done.parent / "tiny.yaml")
     rows = rows_of(done)
     assert [row["run"] for row in rows] == list(range(1, 9))
-    for point in list(points(file.sweep))[1::5]:
-        words = overrides(file.sweep, point.values)
-        seed = load_scenario("rig_steps", words).seed + point.copy
+    for point in list(iterate_points(file.sweep))[1::5]:
+        words = point_overrides(file.sweep, point.values)
+        seed = load_scenario("rig_steps", words).seed + point.repetition_number
         single = run_scenario(load_scenario("rig_steps", {**words, "seed": str(seed)}))
         row = rows[point.run - 1]
         assert row["status"] == OK and row["reason"] == "" and row["seed"] == seed
         assert {key: row[key] for key in point.values} == point.values
-        numbers = {name: value for name, (value, _) in numbers_of(single.summary).items()}
+        numbers = {name: value for name, (value, _) in flatten_summary(single.summary).items()}
         assert {name: row[name] for name in numbers} == numbers
         assert "tracking.slide.rms" in numbers and "wall_seconds" not in row
         kept = done / "runs" / f"{point.run:04d}"
         for log in ("measured", "truth"):
             save_log(getattr(single, log), tmp_path / f"{log}.parquet")
-            assert (kept / f"{log}.parquet").read_bytes() == (
-                tmp_path / f"{log}.parquet"
-            ).read_bytes()
+            assert (kept / f"{log}.parquet").read_bytes() == (tmp_path / f"{log}.parquet").read_bytes()
 
 
 def test_the_table_states_units(done):
@@ -139,18 +137,18 @@ def test_a_failed_run_says_why(error, reason, monkeypatch, tmp_path):
 
     monkeypatch.setattr(running, "run_scenario", fail)
     base = open_base(load_sweep(write_sweep(tmp_path)))
-    scenario = scenario_of(base, next(points(base.file.sweep)))
-    outcome = perform(RunTask(7, scenario, str(tmp_path), {}, None, str(tmp_path)))
-    assert outcome.entry == Entry(7, FAILED, reason)
+    scenario = scenario_of(base, next(iterate_points(base.file.sweep)))
+    outcome = execute_task(RunTask(7, scenario, str(tmp_path), {}, None, str(tmp_path)))
+    assert outcome.entry == JournalEntry(7, FAILED, reason)
 
 
 def test_a_journal_survives_being_cut_anywhere(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "fsync", lambda _: None)  # hundreds of them take seconds
     path = tmp_path / "journal.jsonl"
     entries = [
-        Entry(1, OK, "", {"a": (0.1, "m")}, "x", 1.0),
-        Entry(2, FAILED, "é: no"),
-        Entry(3, OK),
+        JournalEntry(1, OK, "", {"a": (0.1, "m")}, "x", 1.0),
+        JournalEntry(2, FAILED, "é: no"),
+        JournalEntry(3, OK),
     ]
     journal = Journal(path)
     for entry in entries:
@@ -214,13 +212,13 @@ def own(tmp_path) -> Path:
 def test_a_machine_of_ones_own_travels_as_content(own, tmp_path):
     base = open_base(load_sweep(own))
     checked = check_points(base)
-    mine, shipped = (scenario_of(base, point) for point in points(base.file.sweep))
-    files = base.inputs.files_of(mine)
+    mine, shipped = (scenario_of(base, point) for point in iterate_points(base.file.sweep))
+    files = base.machine_copies.files_of(mine)
     assert sorted(Path(name).name for name in files) == ["machine.yaml", "rig.xml"]
-    assert base.inputs.files_of(shipped) == {}
+    assert base.machine_copies.files_of(shipped) == {}
     shutil.rmtree(tmp_path / "mine")
     found = [
-        perform(RunTask(k, scenario, None, files, None, str(tmp_path))).entry
+        execute_task(RunTask(k, scenario, None, files, None, str(tmp_path))).entry
         for k, scenario in enumerate((mine, shipped))
     ]
     assert found[0].status == OK and found[0].numbers == found[1].numbers
@@ -235,28 +233,26 @@ def test_a_machine_with_further_files_is_refused_on_a_cluster(own, tmp_path):
     model = tmp_path / "mine" / "rig.xml"
     text = model.read_text()
     model.write_text(text.replace("<worldbody>", '<!-- mesh file="a.stl" --><worldbody>', 1))
-    with pytest.raises(
-        InputError, match="needs files in addition to its MJCF, which cannot be sent"
-    ):
+    with pytest.raises(InputError, match="needs files in addition to its MJCF, which cannot be sent"):
         run_sweep(load_sweep(own), tmp_path / "out", SweepSettings(dask="tcp://127.0.0.1:1"))
     assert not (tmp_path / "out").exists()
 
 
 def test_all_numbers_that_runs_have_are_known_beforehand():
     teleoperated = run_scenario(load_scenario("joystick_up", {"duration": "0.5"}))
-    possible = possible_results(teleoperated.plant.axes, True)
-    names = set(numbers_of(teleoperated.summary))
+    possible = possible_number_names(teleoperated.plant.axes, True)
+    names = set(flatten_summary(teleoperated.summary))
     assert names <= set(possible) and "teleoperation.handle_energy_J" in names
 
 
 @pytest.mark.nightly
 def test_a_killed_process_costs_its_run_alone(tmp_path):
     base = open_base(load_sweep(write_sweep(tmp_path)))
-    quick = [scenario_of(base, point) for point in list(points(base.file.sweep))[:2]]
+    quick = [scenario_of(base, point) for point in list(iterate_points(base.file.sweep))[:2]]
     endless = quick[0].model_copy(update={"duration": 3600.0, "control_rate": 1000.0})
     scenarios = [quick[0], endless, quick[1]]
     tasks = [RunTask(k, s, str(tmp_path), {}, None, str(tmp_path)) for k, s in enumerate(scenarios)]
-    found = outcomes(iter(tasks), 1)
+    found = run_in_processes(iter(tasks), 1)
     assert next(found).entry.status == OK
     (process,) = multiprocessing.active_children()
     threading.Timer(0.3, os.kill, (process.pid, signal.SIGKILL)).start()

@@ -4,7 +4,7 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import scenarios_folder
-from hydrotele.run.sweep_facts import MOST_RUNS, check_points, load_sweep, open_base, shipped_sweeps
+from hydrotele.run.sweep_facts import MAX_RUNS, check_points, load_sweep, open_base, shipped_sweeps
 from hydrotele.scenario.scenario import shipped_scenarios
 
 EFFECT = "set: {effects: [{name: payload, location: tool, parameters: {mass: 100}}]}\n"
@@ -71,7 +71,7 @@ def test_too_many_points_are_refused_without_making_them(tmp_path):
     values = list(range(1000))
     path = tmp_path / "huge.yaml"
     path.write_text(f"scenario: zhu_up\ngrid: {{servo.lead: {values}, seed: {values}}}\n")
-    with pytest.raises(InputError, match=f"1000000 runs, more than {MOST_RUNS}"):
+    with pytest.raises(InputError, match=f"1000000 runs, more than {MAX_RUNS}"):
         load_sweep(path)
 
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from hydrotele.run.sweep_facts import Sweep, overrides, points, samples
+from hydrotele.run.sweep_facts import Sweep, draw_samples, iterate_points, point_overrides
 
 KEYS = {
     "servo.lead": {"uniform": [0.0, 0.2]},
@@ -16,9 +16,7 @@ KEYS = {
 
 
 def sampled(count: int, keys=None, seed: int = 5) -> Sweep:
-    return Sweep.model_validate(
-        {"scenario": "zhu_up", "sample": {"count": count, "seed": seed, "keys": keys or KEYS}}
-    )
+    return Sweep.model_validate({"scenario": "zhu_up", "sample": {"count": count, "seed": seed, "keys": keys or KEYS}})
 
 
 def test_a_grid_is_the_full_product_with_every_sample_and_repeat():
@@ -26,14 +24,14 @@ def test_a_grid_is_the_full_product_with_every_sample_and_repeat():
         "scenario": "zhu_up", "grid": {"servo.lead": [0, 0.1], "tool": ["bucket", "none", "x"]},
         "sample": {"count": 4, "keys": {"servo.load_time": {"uniform": [0.1, 1]}}}, "repeat": 5,
     })  # fmt: skip
-    found = list(points(sweep))
+    found = list(iterate_points(sweep))
     assert len(found) == sweep.runs == 2 * 3 * 4 * 5
     assert [point.run for point in found] == list(range(1, sweep.runs + 1))
-    seen = {(*point.values.values(), point.copy) for point in found}
+    seen = {(*point.values.values(), point.repetition_number) for point in found}
     assert len(seen) == sweep.runs
     at_each = {tuple(p.values[k] for k in sweep.grid): [] for p in found}
     for point in found:
-        if point.copy == 0:
+        if point.repetition_number == 0:
             key = tuple(point.values[k] for k in sweep.grid)
             at_each[key].append(point.values["servo.load_time"])
     assert len(at_each) == 6  # and the same samples everywhere, so that differences are the grid's
@@ -41,22 +39,22 @@ def test_a_grid_is_the_full_product_with_every_sample_and_repeat():
 
 
 def samples_of(sweep: Sweep) -> list[float]:
-    return [sample["servo.load_time"] for sample in samples(sweep)]
+    return [sample["servo.load_time"] for sample in draw_samples(sweep)]
 
 
 def test_samples_are_reproducible_and_independent_of_count_order_and_other_keys():
-    few, many = samples(sampled(3)), samples(sampled(50))
+    few, many = draw_samples(sampled(3)), draw_samples(sampled(50))
     assert few == many[:3]
     turned = dict(reversed(KEYS.items()))
-    assert samples(sampled(3, turned)) == [dict(reversed(s.items())) for s in few]
-    alone = samples(sampled(3, {"servo.lead": KEYS["servo.lead"]}))
+    assert draw_samples(sampled(3, turned)) == [dict(reversed(s.items())) for s in few]
+    alone = draw_samples(sampled(3, {"servo.lead": KEYS["servo.lead"]}))
     assert [s["servo.lead"] for s in alone] == [s["servo.lead"] for s in few]
-    assert samples(sampled(3, seed=6)) != few
+    assert draw_samples(sampled(3, seed=6)) != few
 
 
 def test_samples_are_distributed_as_asked():
     # Of 4000 samples a mean is off by less than 5 standard errors, but for one time in a million.
-    drawn = samples(sampled(4000))
+    drawn = draw_samples(sampled(4000))
     error = 5.0 / math.sqrt(4000)
     lead = np.array([s["servo.lead"] for s in drawn])
     assert lead.min() >= 0.0 and lead.max() <= 0.2
@@ -77,9 +75,9 @@ def test_samples_are_distributed_as_asked():
     "value", [1, 1e-7, 2.5e300, True, None, "yes", "1.0", "a: b # c", 'x"\n', [1, {"a": [2]}], "é"]
 )
 def test_values_survive_the_way_into_overrides(value):
-    from hydrotele.core.datafile import read_value
+    from hydrotele.core.datafile import parse_yaml_value
 
     sweep = Sweep.model_validate({"scenario": "a", "grid": {"servo.lead": [value]}, "repeat": 2})
-    (text,) = overrides(sweep, next(points(sweep)).values).values()
-    read = read_value(text)
+    (text,) = point_overrides(sweep, next(iterate_points(sweep)).values).values()
+    read = parse_yaml_value(text)
     assert read == value and type(read) is type(value)

@@ -79,7 +79,7 @@ def test_interrupted_sweep_ends_as_an_uninterrupted_one(signals, done, tmp_path)
     journal.write_bytes(b"".join(kept[:-1]) + kept[-1][:100])
     (out / ".table.0a.parquet").write_bytes(b"half")
     swept = run_sweep(load_sweep(file), out, SweepSettings(jobs=2))  # another number of processes
-    assert swept.done == 8 - len(kept[:-1])  # nothing is done twice
+    assert swept.n_executed == 8 - len(kept[:-1])  # nothing is done twice
     assert (out / "table.parquet").read_bytes() == (done / "table.parquet").read_bytes()
     assert lines(journal) == 8 and not list(out.glob(".*"))
 
@@ -112,7 +112,7 @@ def test_a_cluster_gives_the_same_table(done, tmp_path):
 
 def test_a_cluster_that_is_not_there_is_said(tmp_path, monkeypatch):
     pytest.importorskip("distributed", reason="needs the extra 'cluster'")
-    monkeypatch.setattr(cluster, "_WAIT", 1)
+    monkeypatch.setattr(cluster, "_CLUSTER_TIMEOUT", 1)
     with pytest.raises(InputError, match="no scheduler responds at tcp://127.0.0.1:1"):
         run_sweep(
             load_sweep(write_sweep(tmp_path)),

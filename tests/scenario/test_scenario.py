@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.run.run import begin, finished, prepare, run_scenario
+from hydrotele.run.run import finish_run, prepare, run_scenario, start_session
 from hydrotele.scenario.scenario import Scenario, load_scenario, save_scenario, shipped_scenarios
 from hydrotele.simulate.closure import pin_opening
 from hydrotele.simulate.record import SimulationFailed
@@ -56,14 +56,14 @@ def watched(name, seconds):
 
     asked = load_scenario(name)
     asked = load_scenario(name, {"duration": str(min(seconds, asked.duration))})
-    session = begin(asked)
+    session = start_session(asked)
     mujoco.set_mjcb_control(look)
     try:
-        while session.tick < asked.ticks:
+        while session.tick < asked.tick_count:
             session.advance()
     finally:
         mujoco.set_mjcb_control(None)
-    return finished(session, asked), worst[0]
+    return finish_run(session, asked), worst[0]
 
 
 def scenario(**facts):
@@ -107,7 +107,7 @@ def test_shipped_scenario_lasts_until_its_pilot_is_done(name):
 def test_shipped_scenario_runs(name, begun):
     """Its log is whole, nothing is infinite, its pins stay closed."""
     run = shipped(name, duration=begun) if begun else shipped(name)
-    assert len(run.measured) == run.scenario.rows == len(run.truth)
+    assert len(run.measured) == run.scenario.row_count == len(run.truth)
     assert all(np.isfinite(v).all() for v in run.truth.columns.values())
     assert run.summary["largest_pin_opening_mm"] < 1e3 * PIN
 
@@ -190,9 +190,7 @@ def test_a_held_boom_sinks_without_end_only_if_its_spool_leaks(effect, leakage, 
     asked = load_scenario("hold", {"start.joints.stick": "-2.2"})
     run = run_scenario(type(asked).model_validate(asked.model_dump() | {"effects": effects}))
     time, x = run.truth.time, run.truth["length.boom"]
-    first, middle, last = (
-        np.ptp(x[(time >= begin) & (time < begin + 6.0)]) / 6.0 for begin in (0.0, 30.0, 54.0)
-    )
+    first, middle, last = (np.ptp(x[(time >= begin) & (time < begin + 6.0)]) / 6.0 for begin in (0.0, 30.0, 54.0))
     machine = run.plant.machine
     above = run.truth["pressure_head.boom"][-1] - machine.supply.tank_pressure
     steady = leakage * above / machine.axes["boom"].cylinder.area_head

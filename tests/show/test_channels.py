@@ -5,12 +5,19 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.logs.log import Log
-from hydrotele.machine.signals import MEASURED, TRUTH
-from hydrotele.show.channels import TITLES, colours, difference, grouped, padded_range, shown
+from hydrotele.machine.signals import MEASURED_KINDS, TRUTH_KINDS
+from hydrotele.show.channels import (
+    TITLES,
+    colours,
+    difference,
+    group_channels,
+    padded_range,
+    scaled_channel,
+)
 
 
 def test_every_kind_has_a_title():
-    assert set(TITLES) == {*MEASURED, *TRUTH} - {"time"}
+    assert set(TITLES) == {*MEASURED_KINDS, *TRUTH_KINDS} - {"time"}
 
 
 @pytest.mark.parametrize(
@@ -24,14 +31,14 @@ def test_every_kind_has_a_title():
     ],
 )
 def test_channels_are_shown_in_the_units_of_the_field(log, name, unit, factor):
-    trace = shown(log, name)
+    trace = scaled_channel(log, name)
     assert trace.unit == unit
     assert trace.values == pytest.approx(factor * log[name], rel=1e-12)
 
 
 def test_truth_stands_back_where_it_was_measured():
     names = ["angle.boom", "truth.angle.boom", "truth.angle.grapple_pitch"]
-    assert grouped(names) == {"angle": ["angle.boom", "truth.angle.grapple_pitch"]}
+    assert group_channels(names) == {"angle": ["angle.boom", "truth.angle.grapple_pitch"]}
 
 
 def test_an_axis_keeps_its_colour_with_more_recorded(log):

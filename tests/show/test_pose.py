@@ -5,21 +5,21 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.show.pose import body_poses, logged_joints, model_with_looks, points_on_body
-from hydrotele.simulate.closure import close_loops, follow_loops, pin_opening
+from hydrotele.show.pose import body_poses, compile_visual_model, logged_joints, point_trajectory
+from hydrotele.simulate.closure import close_along_motion, close_loops, pin_opening
 
 
 @pytest.fixture(scope="module")
 def model(machine):
     """The model with its looks."""
-    return model_with_looks(machine)
+    return compile_visual_model(machine)
 
 
 @pytest.mark.nightly
 def test_following_closes_all_pins_on_the_branch_of_close_loops(machine, model, log):
     joints, data = logged_joints(machine, log), mujoco.MjData(model)
     assert set(joints) == {"swing", "boom", "stick", "bucket"}
-    poses = follow_loops(machine, model, data, joints)
+    poses = close_along_motion(machine, model, data, joints)
     assert poses.shape == (len(log), model.nq)
     for row in (0, 20, len(log) - 1):
         data.qpos[:] = poses[row]
@@ -40,7 +40,7 @@ def test_poses_are_those_of_mujoco(machine, model, log):
     assert poses.position[row] == pytest.approx(data.xpos, abs=1e-6)
     cosine = np.abs(np.einsum("ij,ij->i", poses.quaternion[row], data.xquat))  # q and -q are one
     assert cosine == pytest.approx(1.0, abs=1e-9)
-    tip = points_on_body(poses, machine.arm.tip.link, machine.arm.tip.position)[row]
+    tip = point_trajectory(poses, machine.arm.tip.link, machine.arm.tip.position)[row]
     body = data.body(machine.arm.tip.link)
     expected = body.xpos + body.xmat.reshape(3, 3) @ machine.arm.tip.position
     assert tip == pytest.approx(expected, abs=1e-6)
@@ -53,13 +53,13 @@ def test_without_joints_the_machine_is_at_home(machine, model):
 
 def test_an_impossible_pose_names_its_row(stuck):
     with pytest.raises(InputError, match="row 1: .*do not close.*bucket"):
-        body_poses(stuck, model_with_looks(stuck), {"bucket": np.array([-1.2, 1.0])})
+        body_poses(stuck, compile_visual_model(stuck), {"bucket": np.array([-1.2, 1.0])})
 
 
 def test_a_jump_does_not_change_the_branch(machine, model):
     data = mujoco.MjData(model)
-    jump = follow_loops(machine, model, data, {"bucket": np.array([-2.3, 0.2, -2.3])})
-    slow = follow_loops(machine, model, data, {"bucket": np.linspace(-2.3, 0.2, 100)})
+    jump = close_along_motion(machine, model, data, {"bucket": np.array([-2.3, 0.2, -2.3])})
+    slow = close_along_motion(machine, model, data, {"bucket": np.linspace(-2.3, 0.2, 100)})
     assert jump[[0, 1, 2]] == pytest.approx(slow[[0, -1, 0]], abs=1e-7)  # as above
 
 

@@ -10,8 +10,8 @@ import pytest
 import rerun as rr
 
 from hydrotele.core.errors import InputError
-from hydrotele.show.pose import body_poses, logged_joints, model_with_looks
-from hydrotele.show.recording import recording_file, write_recording
+from hydrotele.show.pose import body_poses, compile_visual_model, logged_joints
+from hydrotele.show.recording import open_recording, write_recording
 
 
 @pytest.fixture(scope="module")
@@ -43,9 +43,7 @@ def _floats(column) -> np.ndarray:
 @pytest.mark.nightly
 def test_channels_come_back_in_shown_units(chunks, log):
     chunk = chunks["/measured/pressure_head/boom", False]
-    assert np.asarray(chunk["time"]).astype(np.int64).tolist() == [
-        20_000_000 * row for row in range(len(log))
-    ]
+    assert np.asarray(chunk["time"]).astype(np.int64).tolist() == [20_000_000 * row for row in range(len(log))]
     values = _floats(chunk["Scalars:scalars"])
     assert values == pytest.approx(1e-6 * log["pressure_head.boom"], rel=1e-12)
     style = chunks["/measured/pressure_head/boom", True]
@@ -58,7 +56,7 @@ def test_all_channels_are_there(chunks, log):
 
 
 def test_bodies_move_as_in_mujoco(chunks, machine, log):
-    model = model_with_looks(machine)
+    model = compile_visual_model(machine)
     poses = body_poses(machine, model, logged_joints(machine, log))
     for body in ("boom", "stick_rod", "bucket_coupler"):
         index = model.body(body).id
@@ -150,7 +148,7 @@ def test_a_full_disk_is_one_sentence_at_once_and_leaves_nothing(tmp_path, monkey
     monkeypatch.setattr(Path, "write_bytes", _no_space)
     with (
         pytest.raises(InputError, match=r"review\.rrd: cannot be written: No space left"),
-        recording_file(tmp_path / "review.rrd", "full") as out,
+        open_recording(tmp_path / "review.rrd", "full") as out,
     ):
         for _ in range(300):
             out.log("points", rr.Points3D(np.zeros((2000, 3))))

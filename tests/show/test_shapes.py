@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from hydrotele.show import looks as shapes
-from hydrotele.show.looks import body_looks, geom_colour
+from hydrotele.show.looks import body_meshes, geom_colour
 
 _BODIES = {
     "box": (shapes.box((0.5, 1.0, 1.5)), 6.0),
@@ -40,8 +40,8 @@ def test_triangles_are_wound_like_their_normals(mesh):
 
 def test_joined_meshes_keep_their_parts():
     one, other = shapes.box((1, 1, 1)), shapes.cylinder(1.0, 1.0)
-    turned = shapes.moved(other, (5.0, 0.0, 0.0), np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]]))
-    both = shapes.joined([one, turned])
+    turned = shapes.transform_mesh(other, (5.0, 0.0, 0.0), np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]]))
+    both = shapes.join_meshes([one, turned])
     assert _volume(both) == pytest.approx(_volume(one) + _volume(other), rel=1e-12)
 
 
@@ -57,7 +57,7 @@ MJCF = """<mujoco><asset><material name="red" rgba="1 0 0 1"/>
 
 def test_a_body_becomes_one_mesh_per_opacity():
     model = mujoco.MjModel.from_xml_string(MJCF)
-    glass, solid = body_looks(model)
+    glass, solid = body_meshes(model)
     assert (glass.body, glass.opacity, solid.body, solid.opacity) == (1, 0.5, 1, 1.0)
     assert _volume(glass.mesh) == pytest.approx(1 / 6, rel=1e-6)  # float32 in the model
     assert (glass.colours == (0, 255, 0)).all()
@@ -69,7 +69,7 @@ def test_a_body_becomes_one_mesh_per_opacity():
 
 def test_mesh_geoms_stand_where_mujoco_puts_them():
     model = mujoco.MjModel.from_xml_string(MJCF)
-    glass, _ = body_looks(model)
+    glass, _ = body_meshes(model)
     low, high = glass.mesh.vertices.min(axis=0), glass.mesh.vertices.max(axis=0)
     # MuJoCo moves a mesh to its centre of mass and turns it; in the body's frame it is as written
     assert low == pytest.approx([0, 0, 0], abs=1e-6) and high == pytest.approx([1, 1, 1], abs=1e-6)

@@ -4,12 +4,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from hydrotele.effects.effect import changed
+from hydrotele.effects.effect import with_value
 from hydrotele.kinematics.from_machine import axis_linkage, has_ball_ends
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.multibody.reduced_mechanism import mechanism
+from hydrotele.multibody.reduced_mechanism import make_reduced_mechanism
 from hydrotele.simulate.closure import close_loops, holding_forces, pin_opening
-from hydrotele.simulate.mechanism import assemble, mjcf_document, tilt_joint
+from hydrotele.simulate.mechanism import assemble_mjcf, mjcf_document, tilt_joint
 
 TILT = np.radians(1.0)
 
@@ -18,12 +18,12 @@ TILT = np.radians(1.0)
 def tilted():
     """The excavator with a boom joint whose axis is one degree off the cylinder's pins."""
     axis = (float(np.sin(TILT)), -float(np.cos(TILT)), 0.0)
-    return changed(load_machine("cat215", "none"), "links.boom.joint.axis", axis)
+    return with_value(load_machine("cat215", "none"), "links.boom.joint.axis", axis)
 
 
 @pytest.fixture(scope="module")
 def placed(tilted):
-    model = mjcf_document(assemble(tilted, 1e-3, ground=False, looks=False)).compile()
+    model = mjcf_document(assemble_mjcf(tilted, 1e-3, ground=False, visuals=False)).compile()
     return model, mujoco.MjData(model)
 
 
@@ -68,4 +68,6 @@ def test_holding_force_follows_from_virtual_work(tilted, placed):
 
 def test_reduced_model_has_the_same_tables(tilted):
     """The reduced model takes the length from the pins in space and needs no further joint."""
-    assert mechanism(tilted).tree.shape == mechanism(load_machine("cat215", "none")).tree.shape
+    assert (
+        make_reduced_mechanism(tilted).tree.shape == make_reduced_mechanism(load_machine("cat215", "none")).tree.shape
+    )

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from hydrotele.simulate.surroundings import (
-    LET_GO,
-    ROW,
+    RELEASED,
     TAKEN,
     UNCHANGED,
+    WELD_SIZE,
     grip_parameters,
     grip_step,
 )
@@ -29,7 +29,7 @@ def turned(axis, angle, quaternion):
 
 
 def step(position=CENTRE, quaternion=ACROSS, angle=1.25, held=False):
-    row = np.full(ROW, np.nan)
+    row = np.full(WELD_SIZE, np.nan)
     said = grip_step(GRIP, np.zeros(3), LEVEL, np.array(position), quaternion, angle, held, row)
     return said, row
 
@@ -87,7 +87,7 @@ def test_held_until_the_jaw_opens():
     """Between the two angles nothing changes either way, and where it is does not matter."""
     assert step(angle=1.1)[0] == UNCHANGED
     assert step(position=(9.0, 9.0, 9.0), angle=1.1, held=True)[0] == UNCHANGED
-    assert step(angle=0.99, held=True)[0] == LET_GO
+    assert step(angle=0.99, held=True)[0] == RELEASED
 
 
 def test_the_weld_keeps_the_pose_in_which_it_was_taken():

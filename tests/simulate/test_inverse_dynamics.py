@@ -75,9 +75,7 @@ class Tree:
             out = (cylinder.closed_length, 0, 0)
             at_rod = self._joint(f"{name}_rod", f"{name}_tube", out, (1, 0, 0), "slide")
             self._mass(at_rod, rod.mass, (-rod.com, 0, 0), rod.inertia)
-            self._pin(
-                (f"{name}_rod", (0, 0, 0)), (cylinder.rod_pin.link, cylinder.rod_pin.position)
-            )
+            self._pin((f"{name}_rod", (0, 0, 0)), (cylinder.rod_pin.link, cylinder.rod_pin.position))
         for closure in machine.closures.values():
             self._pin(*((end.link, end.position) for end in (closure.a, closure.b)))
         self.data = self.model.createData()

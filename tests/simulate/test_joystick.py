@@ -6,8 +6,8 @@ import pytest
 
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.simulate.joystick import SimulatedFlotor, joystick_spec
-from hydrotele.teleop.coils import three_stations
-from hydrotele.teleop.levitation import rotation_vector
+from hydrotele.teleop.coils import make_three_station_coils
+from hydrotele.teleop.levitation import quaternion_to_vector
 
 JOYSTICK = load_joystick()
 REST = np.zeros(6)
@@ -17,9 +17,9 @@ def lifting(flotor):
     """Currents that carry the flotor's weight and leave it without torque about its handle."""
     f, c = JOYSTICK.flotor, JOYSTICK.coils
     weight = np.array([0.0, 0.0, 9.81 * f.mass, 0.0, 0.0, 0.0])
-    coils = three_stations(c.radius, c.force_per_ampere, c.max_current)
+    coils = make_three_station_coils(c.radius, c.force_per_ampere, c.max_current)
     assert flotor.model.nu == 6
-    return coils.currents(weight).value
+    return coils.compute_currents(weight).value
 
 
 def test_coils_push_as_their_map_says():
@@ -30,7 +30,7 @@ def test_coils_push_as_their_map_says():
         flotor.data.ctrl[:] = np.eye(6)[k]
         mujoco.mj_forward(flotor.model, flotor.data)
         made[:, k] = flotor.data.qfrc_actuator
-    expected = three_stations(c.radius, c.force_per_ampere, c.max_current).wrench_map
+    expected = make_three_station_coils(c.radius, c.force_per_ampere, c.max_current).wrench_map
     expected[3:] -= np.cross(f.handle, expected[:3], axis=0)  # about the handle, as MuJoCo counts
     np.testing.assert_allclose(made, expected, atol=1e-12)
 
@@ -59,7 +59,7 @@ def test_random_currents_break_nothing():
         data, most = flotor.data, np.zeros(2)
         for _ in range(2000):
             flotor.step(rng.uniform(-4.0, 4.0, 6), REST)
-            turned = np.linalg.norm(rotation_vector(data.qpos[3:7]))
+            turned = np.linalg.norm(quaternion_to_vector(data.qpos[3:7]))
             most = np.maximum(most, [np.abs(coils_moved(flotor)).max(), turned])
         assert not np.any(data.warning.number) and np.isfinite(data.qpos).all()
         assert 5e-3 < most[0] < 13e-3 and np.deg2rad(7.0) < most[1] < np.deg2rad(14.0), most
@@ -84,7 +84,7 @@ def test_stops_hold_20_newton(axis, way):
         found = coils_moved(flotor)
         assert 5.0e-3 < way * found[axis] < 5.08e-3, found
     else:
-        found = rotation_vector(flotor.data.qpos[3:7])
+        found = quaternion_to_vector(flotor.data.qpos[3:7])
         assert np.deg2rad(7.0) < way * found[axis - 3] < np.deg2rad(7.05), np.rad2deg(found)
 
 
@@ -108,14 +108,14 @@ def heights(rng_seed=1, periods=200, **kind):
     """
     flotor, rng = SimulatedFlotor(JOYSTICK, **kind), np.random.default_rng(rng_seed)
     f, c, last, found = JOYSTICK.flotor, JOYSTICK.coils, 0.0, []
-    coils = three_stations(c.radius, c.force_per_ampere, c.max_current)
+    coils = make_three_station_coils(c.radius, c.force_per_ampere, c.max_current)
     for _ in range(periods):
         z = float(flotor.data.qpos[2])
         wrench, muscles = np.zeros(6), np.zeros(6)
         wrench[2] = 9.81 * f.mass - 600.0 * z - 30.0 * (z - last) / flotor.period
         last = z
         muscles[2] = 9.81 * JOYSTICK.hand.mass + rng.normal(0.0, 1.5)
-        flotor.step(coils.currents(wrench).value, muscles)
+        flotor.step(coils.compute_currents(wrench).value, muscles)
         found.append(float(flotor.data.qpos[2]))
     return np.array(found)
 
@@ -167,7 +167,7 @@ def test_an_arm_is_as_heavy_and_stiff_as_its_ellipses_say():
     expected = hand.mass * np.array([[1.1, 0.5, 0.0], [0.5, 1.2, 0.0], [0.0, 0.0, 1.0]])
     np.testing.assert_allclose(m1 - m0, expected, atol=1e-9)
     np.testing.assert_allclose(k1 - k0, hand.stiffness * np.array([[2.5, 0.4], [0.4, 0.6]]))
-    assert w1 - w0 == pytest.approx(hand.carried) and hand.carried < hand.mass
+    assert w1 - w0 == pytest.approx(hand.carried_mass) and hand.carried_mass < hand.mass
 
 
 def test_steps_of_a_slanted_arm_converge_with_their_second_order():
@@ -182,7 +182,7 @@ def test_steps_of_a_slanted_arm_converge_with_their_second_order():
         flotor, rng = SimulatedFlotor(heavy, **kind), np.random.default_rng(5)
         muscles, found, currents = np.zeros(6), [], lifting(flotor)
         for _ in range(100):
-            muscles[:2], muscles[2] = rng.normal(0.0, 0.3, 2), 9.81 * SLANTED.hand.carried
+            muscles[:2], muscles[2] = rng.normal(0.0, 0.3, 2), 9.81 * SLANTED.hand.carried_mass
             flotor.step(currents, muscles)
             found.append(flotor.data.qpos[:2].copy())
         return np.array(found)
@@ -207,7 +207,7 @@ def test_a_turning_cab_does_what_it_does_in_a_whole_model():
     0.07 of the 1.2 m/s^2 that push it aside, 6 %.
     """
     spin, rate, mount = 0.6, 1.5, np.array(JOYSTICK.mount)
-    flotor = SimulatedFlotor(JOYSTICK, hand=False, fine=8)
+    flotor = SimulatedFlotor(JOYSTICK, hand=False, refinement=8)
     currents = lifting(flotor)
     inside = joystick_spec(JOYSTICK, hand=False)
     world, inside.option = mujoco.MjSpec(), mujoco.MjSpec().option
@@ -220,7 +220,7 @@ def test_a_turning_cab_does_what_it_does_in_a_whole_model():
     data = mujoco.MjData(model)
     data.qvel[0], data.qfrc_applied[0], data.ctrl[:] = spin, 1e9 * rate, currents
     for _ in range(40):
-        flotor.shaken_step(currents, REST, mount, data.qvel[0], rate)
+        flotor.step_in_cab(currents, REST, mount, data.qvel[0], rate)
         mujoco.mj_step(model, data, nstep=flotor.steps)
         if np.abs(data.qpos[1:4]).max() > 4e-3:
             break
@@ -228,5 +228,5 @@ def test_a_turning_cab_does_what_it_does_in_a_whole_model():
     far = np.abs(whole[:3]).max()
     assert far > 2e-3  # it was shaken
     assert np.abs(own[:3] - whole[:3]).max() < 0.06 * far, (own, whole)
-    turned = rotation_vector(whole[3:])
-    assert np.abs(rotation_vector(own[3:]) - turned).max() < 0.06 * np.abs(turned).max()
+    turned = quaternion_to_vector(whole[3:])
+    assert np.abs(quaternion_to_vector(own[3:]) - turned).max() < 0.06 * np.abs(turned).max()

@@ -27,9 +27,9 @@ def test_layout_is_that_of_the_installed_mujoco(fresh):
     ["actuator_user", "actuator_actadr", "nuser_actuator", "nu", "nnumeric", "numeric_data"],
 )
 def test_model_fields_lie_where_the_bindings_show_them(field):
-    model = mujoco.MjModel.from_xml_string(layout._PROBE)
+    model = mujoco.MjModel.from_xml_string(layout._PROBE_MODEL)
     address = model._address + layout.field_offsets("mjModel")[field]
-    value = layout._read(address, np.int64)
+    value = layout._read_number(address, np.int64)
     shown = getattr(model, field)
     assert value == (shown if np.isscalar(shown) else shown.ctypes.data)
 

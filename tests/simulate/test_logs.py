@@ -6,11 +6,11 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.run.run import begin, prepare, run_scenario
+from hydrotele.run.run import prepare, run_scenario, start_session
 from hydrotele.scenario.scenario import LogOnGround, Scenario, load_scenario
-from hydrotele.show.pose import body_poses, logged_joints, logged_surroundings, model_with_looks
+from hydrotele.show.pose import body_poses, compile_visual_model, logged_joints, logged_surroundings
 from hydrotele.simulate.plant import build_plant, rest_state
-from hydrotele.simulate.surroundings import CENTRE, HALF, log_grip
+from hydrotele.simulate.surroundings import POCKET_CENTRE, POCKET_HALF_SIZE, log_grip
 
 END = np.array([6.03 * np.cos(np.pi / 3), 6.03 * np.sin(np.pi / 3)])  # slewed by 60 deg
 
@@ -31,7 +31,7 @@ def lowered(**log) -> Scenario:
 
 def gone(scenario):
     """Session after its last tick, and the log's place in `qpos` (n, 7) by tick."""
-    session, way = begin(scenario), []
+    session, way = start_session(scenario), []
     place = session.plant.model.joint("log_0").qposadr[0]
     while session.tick < scenario.ticks:
         session.advance()
@@ -103,7 +103,7 @@ def test_pick_log_puts_it_down_where_it_should():
     assert place[:, 2].max() > 1.2 and place[-1, 2] == pytest.approx(0.175, abs=1e-3)
     assert run.summary["largest_pin_opening_mm"] < 0.05
     machine, truth = run.plant.machine, run.truth
-    model = model_with_looks(machine, surroundings=logged_surroundings(truth))
+    model = compile_visual_model(machine, surroundings=logged_surroundings(truth))
     poses = body_poses(machine, model, logged_joints(machine, truth), truth)
     shown = poses.bodies.index("log_0")
     np.testing.assert_allclose(poses.position[:, shown], place, atol=1e-12)
@@ -118,8 +118,8 @@ def test_the_pocket_lies_in_the_middle_of_the_jaws():
     log = LogOnGround(position=(6.0, 0.0), diameter=0.4)
     plant = build_plant(load_machine("cat215", "grapple_claw"), surroundings=(log,))
     grip = log_grip(plant.model, log)
-    np.testing.assert_allclose(grip[CENTRE : CENTRE + 3], [0.7, 0.0, 0.0], atol=1e-12)
-    np.testing.assert_allclose(grip[HALF : HALF + 3 : 2], [0.14, 0.15], atol=1e-12)
+    np.testing.assert_allclose(grip[POCKET_CENTRE : POCKET_CENTRE + 3], [0.7, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(grip[POCKET_HALF_SIZE : POCKET_HALF_SIZE + 3 : 2], [0.14, 0.15], atol=1e-12)
 
 
 def test_a_log_needs_a_grab_with_a_pocket():

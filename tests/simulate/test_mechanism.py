@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from mujoco.batch import Batch
 
-from hydrotele.hydraulics.circuit import Kind, Slot
+from hydrotele.hydraulics.circuit import ActuatorKind, Slot
 from hydrotele.simulate.closure import independent_dofs, motion_basis, pin_opening
 from hydrotele.simulate.plant import REST_PRESSURE, rest_state
 
@@ -60,9 +60,7 @@ def holding_pressures(boom, stick):
     stick_arm = 0.90 * math.cos(hang) - 0.10 * math.sin(hang)
     boom_arm = 2.30 * math.cos(boom) - 0.20 * math.sin(boom)
     moment_stick = 9.81 * (688 * stick_arm + 100 * crank)
-    moment_boom = 9.81 * (
-        1830 * boom_arm + 688 * (knee + stick_arm) + 100 * pin_z + 100 * (tail + knee + crank)
-    )
+    moment_boom = 9.81 * (1830 * boom_arm + 688 * (knee + stick_arm) + 100 * pin_z + 100 * (tail + knee + crank))
     force_boom = moment_boom / lever(0.625, 2.000, boom + deg(78.6))
     force_stick = -moment_stick / lever(2.444, 0.720, deg(10.3) - stick)  # extending curls it in
     return [
@@ -126,7 +124,7 @@ def test_standing_machine_sinks_by_its_leakage(plant_of, tool):
     leak = rows[:, Slot.LEAKAGE] * (p_head - p_rod)
     # constant force, A_h p_A' = A_r p_B', with the chamber equations for closed valves
     sinking = -leak * (head / v_head + rod / v_rod) / (head**2 / v_head + rod**2 / v_rod)
-    cylinders = rows[:, Slot.KIND] == Kind.CYLINDER
+    cylinders = rows[:, Slot.KIND] == ActuatorKind.CYLINDER
     found = ((x - before) / 0.2)[cylinders]
     # 3 %: load and friction still change a little
     assert found == pytest.approx(sinking[cylinders], rel=0.03)

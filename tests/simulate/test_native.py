@@ -11,9 +11,9 @@ from mujoco import rollout
 from mujoco.batch import Batch
 
 from hydrotele.hydraulics.circuit import (
-    ACTIVATIONS,
-    NO_MEMORY,
-    SLOTS,
+    ACTIVATIONS_PER_AXIS,
+    NO_EXTRA_STATES,
+    SLOT_COUNT,
     Slot,
     actuator_friction,
     circuit_scratch,
@@ -46,14 +46,14 @@ def test_step_is_the_pure_circuit_bit_for_bit(plant_of, tool):
             mujoco.mj_fwdVelocity(model, data)
             act, velocity = data.act.copy(), data.actuator_velocity.copy()
             drives = Drives(plant.hydraulic, act, data.actuator_length, velocity, data.ctrl)
-            step_circuit(user, 0, drives, dt, rate, scratch, NO_TERMS, 0.0, NO_MEMORY)
+            step_circuit(user, 0, drives, dt, rate, scratch, NO_TERMS, 0.0, NO_EXTRA_STATES)
             mujoco.mj_step(model, data)
             assert np.array_equal(data.act, act + dt * rate)
-            ends = (act + dt * rate).reshape(-1, ACTIVATIONS)
+            ends = (act + dt * rate).reshape(-1, ACTIVATIONS_PER_AXIS)
             force = [
-                user[i * SLOTS + Slot.AREA_HEAD] * ends[i, 2]
-                - user[i * SLOTS + Slot.AREA_ROD] * ends[i, 3]
-                - actuator_friction(user, i * SLOTS, velocity[i])
+                user[i * SLOT_COUNT + Slot.AREA_HEAD] * ends[i, 2]
+                - user[i * SLOT_COUNT + Slot.AREA_ROD] * ends[i, 3]
+                - actuator_friction(user, i * SLOT_COUNT, velocity[i])
                 for i in range(plant.hydraulic)
             ]
             assert np.array_equal(data.actuator_force, force)

@@ -59,22 +59,16 @@ def locked_frequencies(plant, joints):
     return {int(a): np.sqrt(s) / 2 / np.pi for a, s in zip(of_axis, squares, strict=True)}
 
 
-@pytest.mark.parametrize(
-    "joints", [HOME, {"boom": 0.0, "stick": -1.6}, {"boom": 0.45, "stick": -2.4}]
-)
+@pytest.mark.parametrize("joints", [HOME, {"boom": 0.0, "stick": -1.6}, {"boom": 0.45, "stick": -2.4}])
 def test_boom_rings_for_over_four_seconds_after_its_valve_closes(plant_of, joints):
     plant, closed = plant_of(), 0.4
-    velocity, _, _, final = simulate(
-        plant, lambda t: (0, 0.5 * (t < closed), 0), closed + 5.0, joints
-    )
+    velocity, _, _, final = simulate(plant, lambda t: (0, 0.5 * (t < closed), 0), closed + 5.0, joints)
     ringing = velocity[round(1000 * closed) + 400 :, BOOM]  # the spool has closed
     found = frequency(ringing[:3000], (1, 10))
     assert 2.5 < found < 3.1
     # 1 %: the grid of the spectrum is 0.02 Hz; gravity and damping shift less than that
     assert found == pytest.approx(locked_frequencies(plant, final)[BOOM], rel=0.01)
-    assert (
-        np.abs(ringing[3600:4000]).max() > 0.05 * np.abs(ringing[:400]).max()
-    )  # 4 s after closing
+    assert np.abs(ringing[3600:4000]).max() > 0.05 * np.abs(ringing[:400]).max()  # 4 s after closing
 
 
 def test_swing_rings_at_its_oil_spring(plant_of):
@@ -87,9 +81,7 @@ def test_swing_rings_at_its_oil_spring(plant_of):
 
 
 def test_lowering_under_power_puts_20_mpa_into_both_boom_chambers(plant_of):
-    _, pressure, _, _ = simulate(
-        plant_of(), lambda t: (0, -0.5, 0), 1.6, {"boom": 0.8, "stick": -1.6}
-    )
+    _, pressure, _, _ = simulate(plant_of(), lambda t: (0, -0.5, 0), 1.6, {"boom": 0.8, "stick": -1.6})
     steady = pressure[600:, BOOM].mean(axis=0)
     assert np.all((steady > 18e6) & (steady < 22e6))  # "about 20 MPa"
 

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.run.run import begin, prepare, run_scenario
+from hydrotele.run.run import prepare, run_scenario, start_session
 from hydrotele.scenario.scenario import Scenario, load_scenario
-from hydrotele.simulate.record import contact_force, surrounding_bodies
+from hydrotele.simulate.record import surrounding_bodies, total_contact_force
 
 PLATE = {"kind": "plate", "position": [6.0, -0.11, 0.3], "size": [0.8, 0.9]}
 TREE = {"kind": "tree", "position": [8.0, 0.0]}
@@ -37,11 +37,11 @@ def test_a_plate_is_a_spring():
 
     Contact itself is firm: the bucket sinks less than 1 mm into the face.
     """
-    session = begin(press(stiffness=1.0e6))
-    while session.tick < session.scenario.ticks:
+    session = start_session(press(stiffness=1.0e6))
+    while session.tick < session.scenario.tick_count:
         session.advance()
     plant, data = session.plant, session.data
-    force = contact_force(plant.model, data, surrounding_bodies(plant))
+    force = total_contact_force(plant.model, data, surrounding_bodies(plant))
     depth = -data.joint("plate_0").qpos[0]
     assert force[2] > 5e3
     assert force[2] == pytest.approx(1.0e6 * depth, rel=2e-3)
@@ -101,7 +101,7 @@ SAW, CLOSE, OPEN = (0.0, "saw", 1.0), (8.5, "grab", 0.8), (14.5, "grab", -0.8)
 
 def gone(scenario):
     """Session after its last tick, and the way of the stem's foot (n, 3) [m] by tick."""
-    session, way = begin(scenario), []
+    session, way = start_session(scenario), []
     places = [session.plant.model.joint(f"tree_0_{c}").qposadr[0] for c in "xyz"]
     while session.tick < scenario.ticks:
         session.advance()

@@ -10,17 +10,23 @@ from hypothesis import strategies as st
 
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import models_folder
-from hydrotele.soil.facts import CAT215, SOILS, level_profile, outline_from_edge, soil_parameters
-from hydrotele.soil.step import held_soil
+from hydrotele.soil.facts import (
+    CAT215,
+    SOILS,
+    make_level_profile,
+    outline_relative_to_edge,
+    pack_soil_parameters,
+)
+from hydrotele.soil.step import compute_held_soil
 
 DEGREE = math.pi / 180.0
 SOIL = SOILS["sandy_loam"]
-NUMBERS = soil_parameters(SOIL, CAT215, 3.0, 0.05)
+NUMBERS = pack_soil_parameters(SOIL, CAT215, 3.0, 0.05)
 
 
 def held(attitude, level=0.0):
     out = np.empty(4)
-    held_soil(NUMBERS, attitude, level, out)
+    compute_held_soil(NUMBERS, attitude, level, out)
     return out
 
 
@@ -39,7 +45,7 @@ def inside(points, polygon):
 def test_held_volume_is_what_lies_below_the_surface(attitude, level):
     a = attitude * DEGREE
     turn = np.array([[math.cos(a), math.sin(a)], [-math.sin(a), math.cos(a)]])
-    polygon = outline_from_edge(CAT215) @ turn
+    polygon = outline_relative_to_edge(CAT215) @ turn
     rim = polygon[-1]
     tilt = math.atan2(abs(rim[1]), rim[0])
     volume, r, z, low = held(a, level)
@@ -94,10 +100,10 @@ def test_shape_is_that_of_the_model():
 
 def test_unusable_profiles_and_buckets_are_refused():
     with pytest.raises(InputError, match="0.01 to 0.5"):
-        soil_parameters(SOIL, CAT215, 3.0, 0.0)
+        pack_soil_parameters(SOIL, CAT215, 3.0, 0.0)
     with pytest.raises(InputError, match="at least 0"):
-        soil_parameters(SOIL, CAT215, -1.0, 0.05)
+        pack_soil_parameters(SOIL, CAT215, -1.0, 0.05)
     with pytest.raises(InputError, match="3 to 16"):
-        soil_parameters(SOIL, CAT215._replace(outline=CAT215.outline[:2]), 3.0, 0.05)
+        pack_soil_parameters(SOIL, CAT215._replace(outline=CAT215.outline[:2]), 3.0, 0.05)
     with pytest.raises(InputError, match="at least 8"):
-        level_profile(3)
+        make_level_profile(3)

@@ -16,15 +16,15 @@ from hydrotele.soil import step, terrain
 from hydrotele.soil import step as bucket
 from hydrotele.soil import step as cutting
 from hydrotele.soil import step as wrench
-from hydrotele.soil.facts import CAT215, SOILS, Soil, soil_parameters
+from hydrotele.soil.facts import CAT215, SOILS, Soil, pack_soil_parameters
 from hydrotele.soil.step import (
-    acting_rake,
-    acting_slope,
     adhesion_factor,
     bearing_pressure,
     cohesion_factor,
-    cutting_force,
-    failure_plane,
+    compute_cutting_force,
+    failure_plane_angle,
+    limit_rake,
+    limit_slope,
     surcharge_factor,
     wedge_weight_factor,
 )
@@ -38,9 +38,7 @@ def laws(module):
     return {
         name: law
         for name, law in vars(module).items()
-        if hasattr(law, "py_func")
-        and law.py_func.__module__ == module.__name__
-        and not name.startswith("_")
+        if hasattr(law, "py_func") and law.py_func.__module__ == module.__name__ and not name.startswith("_")
     }
 
 
@@ -70,7 +68,7 @@ def test_doctests_run():
 def passive(phi, delta, slope, batter):
     """Coulomb's K_p from our wedge: over half the specific weight and the wall's height squared."""
     rake = 0.5 * math.pi - batter
-    plane = failure_plane(rake + slope, slope, phi, delta)
+    plane = failure_plane_angle(rake + slope, slope, phi, delta)
     factor = wedge_weight_factor(rake + slope, slope, phi, delta, plane)
     return 2.0 * factor * (math.sin(rake + slope) / math.sin(rake)) ** 2
 
@@ -79,7 +77,7 @@ def passive(phi, delta, slope, batter):
 def test_smooth_upright_wall_is_rankines(phi):
     expected = math.tan((45 + phi / 2) * DEGREE) ** 2
     assert passive(phi * DEGREE, 0.0, 0.0, 0.0) == pytest.approx(expected, rel=1e-12)
-    plane = failure_plane(0.5 * math.pi, 0.0, phi * DEGREE, 0.0)
+    plane = failure_plane_angle(0.5 * math.pi, 0.0, phi * DEGREE, 0.0)
     cohesion = cohesion_factor(0.5 * math.pi, phi * DEGREE, 0.0, plane)
     assert cohesion == pytest.approx(2.0 * math.sqrt(expected), rel=1e-12)  # Bell 1915
 
@@ -160,9 +158,9 @@ angles = {
 @given(**angles, share=st.floats(0.02, 0.98))
 def test_plane_has_the_least_weight_factor(rake, slope, phi, delta, share):
     slope, phi, delta = slope * DEGREE, phi * DEGREE, delta * DEGREE
-    rake = acting_rake(rake * DEGREE, slope, phi, delta)
+    rake = limit_rake(rake * DEGREE, slope, phi, delta)
     widest = math.pi - rake - delta - phi
-    best = failure_plane(rake, slope, phi, delta)
+    best = failure_plane_angle(rake, slope, phi, delta)
     assume(6 * DEGREE < best < 84 * DEGREE)  # not at its bounds
     assume(rake + delta - slope > 20 * DEGREE)  # not where the wedge is kept from jamming
     other = share * min(widest, 0.5 * math.pi)
@@ -199,12 +197,12 @@ def test_wedge_is_in_equilibrium(rake, slope, phi, delta, plane, c, a):
 
 
 def numbers():
-    return soil_parameters(SOILS["sandy_loam"], CAT215, 3.0, 0.05)
+    return pack_soil_parameters(SOILS["sandy_loam"], CAT215, 3.0, 0.05)
 
 
 def force(n, depth, rake=48 * DEGREE, slope=0.0, loose=0.0, load=0.0):
     out = np.empty(2)
-    cutting_force(n, depth, loose, rake, slope, load, out)
+    compute_cutting_force(n, depth, loose, rake, slope, load, out)
     return out
 
 
@@ -214,7 +212,7 @@ def force(n, depth, rake=48 * DEGREE, slope=0.0, loose=0.0, load=0.0):
 )  # fmt: skip
 def test_cutting_force_is_bounded(rake, slope, depth, loose, load, name):
     s = SOILS[name]
-    out = force(soil_parameters(s, CAT215, 3.0, 0.05), depth, rake, slope, loose, load)
+    out = force(pack_soil_parameters(s, CAT215, 3.0, 0.05), depth, rake, slope, loose, load)
     assert np.isfinite(out).all()
     weight = s.density * 9.81 * depth * depth * CAT215.width
     # No factor exceeds 60: that of a rough upright blade in a steep surface is the largest.
@@ -248,7 +246,7 @@ def test_units_fit():
     wide = CAT215._replace(width=2.0 * CAT215.width)
     loam = SOILS["sandy_loam"]
     strong = loam.model_copy(update={"cohesion": 2 * loam.cohesion, "adhesion": 2 * loam.adhesion})
-    large = force(soil_parameters(strong, wide, 3.0, 0.05), 0.2, load=8.0e3)
+    large = force(pack_soil_parameters(strong, wide, 3.0, 0.05), 0.2, load=8.0e3)
     assert large == pytest.approx(8.0 * small, rel=1e-12)
 
 
@@ -259,9 +257,9 @@ def test_soil_in_the_bucket_and_loose_soil_change_the_force():
 
 
 def test_slope_and_rake_stay_where_the_equation_holds():
-    assert acting_slope(1.0, 0.5) == pytest.approx(0.3)
-    assert acting_rake(2.5, 0.0, 0.5, 0.3) == pytest.approx(0.5 * math.pi)
-    assert acting_rake(0.0, 0.0, 0.5, 0.3) == pytest.approx(15 * DEGREE)
+    assert limit_slope(1.0, 0.5) == pytest.approx(0.3)
+    assert limit_rake(2.5, 0.0, 0.5, 0.3) == pytest.approx(0.5 * math.pi)
+    assert limit_rake(0.0, 0.0, 0.5, 0.3) == pytest.approx(15 * DEGREE)
 
 
 @pytest.mark.parametrize(

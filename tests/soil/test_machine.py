@@ -11,20 +11,20 @@ from hydrotele.kinematics.task import arm_parameters, task_forward, task_inverse
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.plant import build_plant, rest_state
 from hydrotele.soil.facts import (
-    CARRIED,
+    CARRIED_VOLUME,
     CAT215,
     FORCE_R,
     FORCE_Z,
     GRAVITY,
     MASS,
-    OUT,
+    RESULT_SIZE,
     SOILS,
-    bucket_state,
-    level_profile,
+    make_bucket_state,
+    make_level_profile,
+    pack_soil_parameters,
     soil_mass,
-    soil_parameters,
 )
-from hydrotele.soil.step import EdgeMotion, bucket_wrench, soil_step
+from hydrotele.soil.step import EdgeMotion, compute_bucket_wrench, step_soil
 
 AXES = ("swing", "boom", "stick", "bucket")
 DEGREE = math.pi / 180.0
@@ -45,8 +45,12 @@ def dig(plant, steps, seconds=2.5, draw=1.2):
     joints = [plant.machine.axes[name].joint for name in AXES]
     data = rest_state(plant, dict(zip(joints, q.tolist(), strict=True)))
     data.ctrl[:] = 0.0
-    n = soil_parameters(SOILS["firm"], CAT215, 3.0, 0.05)
-    (surface, loose), state, out = level_profile(140), bucket_state(), np.zeros(OUT)
+    n = pack_soil_parameters(SOILS["firm"], CAT215, 3.0, 0.05)
+    (surface, loose), state, out = (
+        make_level_profile(140),
+        make_bucket_state(),
+        np.zeros(RESULT_SIZE),
+    )
     body, wrench, rows = model.body("bucket").id, np.zeros(6), []
     mass = soil_mass(n, surface, loose, state)
     period = steps * model.opt.timestep
@@ -55,9 +59,9 @@ def dig(plant, steps, seconds=2.5, draw=1.2):
         task_jacobian(g, data.qpos[plant.qpos[order]], jacobian)
         rate = jacobian @ data.qvel[plant.dof[order]]
         motion = EdgeMotion(pose[0], pose[2], rate[0], rate[2], pose[3])
-        soil_step(n, surface, loose, state, motion, period, out)
+        step_soil(n, surface, loose, state, motion, period, out)
         edge = np.array([pose[0] * math.cos(pose[1]), pose[0] * math.sin(pose[1]), pose[2]])
-        bucket_wrench(out, edge, pose[1], data.xipos[body], wrench)
+        compute_bucket_wrench(out, edge, pose[1], data.xipos[body], wrench)
         data.xfrc_applied[body] = wrench
         data.ctrl[plant.axes.index("stick")] = 0.25 if k * period < draw else 0.0
         mujoco.mj_step(model, data, nstep=steps)
@@ -71,11 +75,11 @@ def test_digging_machine_does_not_chatter(plant):
     fine, fine_state, _ = dig(plant, 1)
     assert rows[0, 0] - rows[-1, 0] > 0.2  # m, drawn in
     assert 1.5e4 < rows[:, 2].max() < 8e4  # N
-    assert state[CARRIED] > 0.02
+    assert state[CARRIED_VOLUME] > 0.02
     assert surface.min() < -0.05
     # Held over 5 ms or renewed every 1 ms, the machine goes the same way.
     assert rows[:, :2] == pytest.approx(fine[::5, :2], abs=5e-3)
-    assert state[CARRIED] == pytest.approx(fine_state[CARRIED], rel=0.05)
+    assert state[CARRIED_VOLUME] == pytest.approx(fine_state[CARRIED_VOLUME], rel=0.05)
     # At the end the valves are closed: the soil holds the bucket, and nothing moves.
     still = rows[-60:]
     assert np.ptp(still[:, :2], axis=0).max() < 2e-3
@@ -96,7 +100,7 @@ def test_wrench_does_the_work_of_its_parts(plant):
     out = np.array([3e4, -1e4, 5e3, 400.0, 0.5, 0.2])
     edge = np.array([pose[0] * math.cos(pose[1]), pose[0] * math.sin(pose[1]), pose[2]])
     wrench = np.zeros(6)
-    bucket_wrench(out, edge, pose[1], data.xipos[body], wrench)
+    compute_bucket_wrench(out, edge, pose[1], data.xipos[body], wrench)
     force, torque = np.zeros((3, model.nv)), np.zeros((3, model.nv))
     mujoco.mj_jacBodyCom(model, data, force, torque, body)
     found = (wrench[:3] @ force + wrench[3:] @ torque)[plant.dof[order]]

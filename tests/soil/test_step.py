@@ -15,32 +15,32 @@ from numba import (
 
 from hydrotele.core.compiled import callback
 from hydrotele.soil.facts import (
-    CARRIED,
+    CARRIED_VOLUME,
     CAT215,
-    CELL,
+    CELL_LENGTH,
     FORCE_R,
     FORCE_Z,
     GRAVITY,
     HEEL,
     HEEL_X,
     HEEL_Z,
-    LOST,
+    LOST_VOLUME,
     MASS,
     MASS_R,
     MASS_Z,
     MOMENT,
-    OUT,
+    RESULT_SIZE,
     SLIDE,
     SOILS,
-    STATE,
+    STATE_SIZE,
     STIFFNESS,
     SWELL,
-    bucket_state,
-    level_profile,
+    make_bucket_state,
+    make_level_profile,
+    pack_soil_parameters,
     soil_mass,
-    soil_parameters,
 )
-from hydrotele.soil.step import EdgeMotion, soil_step
+from hydrotele.soil.step import EdgeMotion, step_soil
 
 DEGREE = math.pi / 180.0
 DT = 0.005
@@ -50,9 +50,9 @@ class Ground:
     """A profile of 140 cells of 5 cm from 3 m on, and a bucket over it."""
 
     def __init__(self, soil="sandy_loam", height=0.0):
-        self.numbers = soil_parameters(SOILS[soil], CAT215, 3.0, 0.05)
-        self.surface, self.loose = level_profile(140, height)
-        self.state, self.out = bucket_state(), np.zeros(OUT)
+        self.numbers = pack_soil_parameters(SOILS[soil], CAT215, 3.0, 0.05)
+        self.surface, self.loose = make_level_profile(140, height)
+        self.state, self.out = make_bucket_state(), np.zeros(RESULT_SIZE)
         self.last = None
 
     def go(self, r, z, attitude, dt=DT):
@@ -60,7 +60,7 @@ class Ground:
         a, b = self.last or (r, z)
         self.last = (r, z)
         edge = EdgeMotion(r, z, (r - a) / dt, (z - b) / dt, attitude * DEGREE)
-        soil_step(self.numbers, self.surface, self.loose, self.state, edge, dt, self.out)
+        step_soil(self.numbers, self.surface, self.loose, self.state, edge, dt, self.out)
         return self.out.copy()
 
     def path(self, *points, speed=0.5):
@@ -70,9 +70,7 @@ class Ground:
             start, end = np.array(start), np.array(end)
             length = max(np.hypot(*(end - start)[:2]), abs(end - start)[2] * DEGREE)
             steps = max(int(length / (speed * DT)), 1)
-            outs += [
-                self.go(*(start + (end - start) * k / steps).tolist()) for k in range(1, steps + 1)
-            ]
+            outs += [self.go(*(start + (end - start) * k / steps).tolist()) for k in range(1, steps + 1)]
         return np.array(outs)
 
     def mass(self):
@@ -89,7 +87,7 @@ def test_nothing_happens_in_the_air():
     outs = ground.path((6.0, 0.8, -90.0), (4.0, 0.8, -120.0), (6.0, 1.0, -60.0))
     assert not outs.any()
     assert not ground.surface.any()
-    assert ground.state[CARRIED] == 0.0
+    assert ground.state[CARRIED_VOLUME] == 0.0
 
 
 @pytest.mark.parametrize(("soil", "low", "high"), [("sandy_loam", 6e3, 2e4), ("firm", 2e4, 6e4)])
@@ -110,8 +108,8 @@ def test_bucket_cuts_fills_carries_and_drops(soil, low, high):
     ground.path(*DUMP)
     for _ in range(400):
         ground.go(7.5, 1.5, -60.0)
-    assert ground.state[CARRIED] == 0.0
-    assert ground.state[LOST] == 0.0
+    assert ground.state[CARRIED_VOLUME] == 0.0
+    assert ground.state[LOST_VOLUME] == 0.0
     assert ground.surface[60:].max() > 0.05  # a heap where it fell
     assert ground.mass() == pytest.approx(before, abs=1e-9)
 
@@ -130,16 +128,16 @@ def test_full_bucket_pushes_a_pile_ahead():
     ground.path((9.5, 0.1, -80.0), (9.3, -0.2, -90.0), (4.5, -0.2, -110.0))
     ahead = ground.surface[:30]  # up to 4.5 m
     assert ahead.max() > 0.15
-    last = ground.state[CARRIED]
+    last = ground.state[CARRIED_VOLUME]
     ground.path((4.5, -0.2, -110.0), (4.2, -0.2, -110.0))
-    assert ground.state[CARRIED] < last + 0.5 * 0.3 * 0.2 * CAT215.width * ground.numbers[SWELL]
+    assert ground.state[CARRIED_VOLUME] < last + 0.5 * 0.3 * 0.2 * CAT215.width * ground.numbers[SWELL]
 
 
 def test_pushing_outwards_heaps_soil_outside():
     ground = Ground()
     before = ground.mass()
     ground.path((5.0, 0.1, -137.0), (5.0, -0.05, -137.0), (6.0, -0.05, -137.0))
-    assert ground.state[CARRIED] == 0.0
+    assert ground.state[CARRIED_VOLUME] == 0.0
     assert ground.surface[61:75].max() > 0.03
     assert ground.surface[42:58] == pytest.approx(-0.05, abs=0.01)
     assert ground.mass() == pytest.approx(before, abs=1e-9)
@@ -213,9 +211,7 @@ def test_bucket_that_rests_is_held_and_one_that_is_pressed_does_not_sink():
 def test_curled_bucket_rests_on_its_heel():
     ground = Ground("firm")
     place = -150.0
-    drop = CAT215.heel[1] * math.cos(place * DEGREE) + (CAT215.heel[0] - 1.35) * math.sin(
-        place * DEGREE
-    )
+    drop = CAT215.heel[1] * math.cos(place * DEGREE) + (CAT215.heel[0] - 1.35) * math.sin(place * DEGREE)
     outs = ground.path((6.0, 0.1 - drop, place), (6.0, -0.03 - drop, place))
     assert outs[-1, FORCE_Z] > 1e4
     assert outs[-1, MOMENT] > 0.3 * outs[-1, FORCE_Z]  # it acts outside of the edge
@@ -223,16 +219,16 @@ def test_curled_bucket_rests_on_its_heel():
 
 def test_tilted_bucket_spills_only_what_it_cannot_hold():
     ground = Ground()
-    ground.state[CARRIED] = 0.6
+    ground.state[CARRIED_VOLUME] = 0.6
     for _ in range(600):
         ground.go(6.0, 2.0, -140.0)
-    assert 0.5 < ground.state[CARRIED] < 0.6
+    assert 0.5 < ground.state[CARRIED_VOLUME] < 0.6
     for _ in range(600):
         ground.go(6.0, 2.0, -80.0)
-    assert ground.state[CARRIED] == 0.0
-    fallen = np.sum(ground.surface) * ground.numbers[CELL] * CAT215.width
+    assert ground.state[CARRIED_VOLUME] == 0.0
+    fallen = np.sum(ground.surface) * ground.numbers[CELL_LENGTH] * CAT215.width
     assert fallen == pytest.approx(0.6, rel=1e-12)
-    slopes = np.abs(np.diff(ground.surface)) / ground.numbers[CELL]
+    slopes = np.abs(np.diff(ground.surface)) / ground.numbers[CELL_LENGTH]
     assert slopes.max() < math.tan(SOILS["sandy_loam"].repose) + 0.01
 
 
@@ -249,7 +245,7 @@ def test_mass_is_conserved_and_all_stays_finite_in_wild_motion(data):
     outs = ground.path(*points, speed=2.0)
     assert np.isfinite(outs).all()
     assert np.abs(outs[:, :2]).max() < 3e6  # N: floor and heel of a buried bucket in firm soil
-    assert ground.state[CARRIED] >= 0.0
+    assert ground.state[CARRIED_VOLUME] >= 0.0
     assert (ground.loose >= -1e-12).all()
     # Rounding of sums over some thousand steps of masses of some tonnes.
     assert ground.mass() == pytest.approx(before, rel=1e-10)
@@ -267,7 +263,7 @@ def test_environments_in_threads_do_not_touch_each_other():
 
 def test_weight_of_what_is_carried_is_given_apart():
     ground = Ground()
-    ground.state[CARRIED] = 0.5
+    ground.state[CARRIED_VOLUME] = 0.5
     out = ground.go(6.0, 2.0, -180.0)
     soil = SOILS["sandy_loam"]
     assert out[MASS] == pytest.approx(0.5 / soil.swell * soil.density)
@@ -284,7 +280,15 @@ def _native(numbers, profile, count, state, move, out):
     cells = carray(profile, 2 * count)
     m = carray(move, 6)
     edge = EdgeMotion(m[0], m[1], m[2], m[3], m[4])
-    soil_step(n, cells[:count], cells[count:], carray(state, STATE), edge, m[5], carray(out, OUT))
+    step_soil(
+        n,
+        cells[:count],
+        cells[count:],
+        carray(state, STATE_SIZE),
+        edge,
+        m[5],
+        carray(out, RESULT_SIZE),
+    )
 
 
 def test_native_callback_gives_the_same():
@@ -295,7 +299,7 @@ def test_native_callback_gives_the_same():
     for k in range(300):
         z = 0.02 - 0.001 * min(k, 100)
         move = np.array([6.0 - 0.002 * k, z, -0.4, 0.0, -95.0 * DEGREE, DT])
-        soil_step(
+        step_soil(
             python.numbers, python.surface, python.loose, python.state, EdgeMotion(*move[:5]),
             move[5], python.out,
         )  # fmt: skip

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from hydrotele.cli import main as cli
 from hydrotele.core.errors import InputError
-from hydrotele.teleop.analysis import SHIPPED, load_teleop_case
+from hydrotele.teleop.analysis import DEFAULT_CASE_FILE, load_teleop_case
 from hydrotele.teleop.two_port import STRUCTURES
 
 SMALL = "map: {points: 3}\n"  # nine cells
@@ -28,7 +28,7 @@ def invoke(*words):
 def case(tmp_path):
     """A copy of the shipped case with a small map."""
     path = tmp_path / "case.yaml"
-    path.write_text(SHIPPED.read_text("utf-8") + SMALL, "utf-8")
+    path.write_text(DEFAULT_CASE_FILE.read_text("utf-8") + SMALL, "utf-8")
     return path
 
 

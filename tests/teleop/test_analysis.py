@@ -8,39 +8,39 @@ from scipy.optimize import brentq
 
 from hydrotele.core.errors import InputError
 from hydrotele.teleop.analysis import (
-    Case,
-    analyse,
+    TeleoperatorAxis,
+    analyse_structure,
+    find_max_delay,
     gain_margin,
     is_passive,
-    largest_delay,
     load_teleop_case,
     loop_gain,
     stability_map,
 )
 from hydrotele.teleop.findings import (
-    find,
-    findings_document,
-    impulse_response,
+    analyse_structures,
+    choose_time_step,
+    describe_stability,
+    findings_to_dict,
     is_growing,
+    simulate_impulse,
     simulate_sine,
-    step_of,
-    why_unstable,
 )
-from hydrotele.teleop.switching import Spring, worst_growth
+from hydrotele.teleop.switching import StiffnessAxis, worst_switching_growth
 from hydrotele.teleop.two_port import (
     STRUCTURES,
-    Gains,
     Impedance,
-    characteristic,
-    stable,
-    transmitted,
-    unstable_held,
+    StructureGains,
+    characteristic_function,
+    count_unstable_poles_held,
+    is_stable,
+    transmitted_impedance,
 )
 
-CASE = Case(
+CASE = TeleoperatorAxis(
     Impedance(0.8, 0.5), Impedance(2.0, 3.0), Impedance(0.0, 12.0, 150.0),
     Impedance(0.0, 60.0, 900.0), Impedance(0.6, 8.0, 250.0), Impedance(0.0, 20.0, 3000.0),
-    Gains(1.0, 0.7, 0.5),
+    StructureGains(1.0, 0.7, 0.5),
 )  # fmt: skip
 REFINED = 2e-3  # margins are bisected to 1e-3
 
@@ -65,44 +65,47 @@ def test_gain_margin_is_that_of_the_phase_crossing(structure):
 
 def test_largest_delay_is_that_of_the_gain_crossing():
     """The delay turns the loop's phase to -180 degrees where its gain is 1."""
-    case, port = CASE, CASE.port("rate_force")
+    case, port = CASE, CASE.make_port("rate_force")
     w = np.geomspace(0.1, 1e3, 20_000)
     values = loop_gain(port, 1j * w, case.hand, case.task)
     k = np.flatnonzero((np.abs(values[:-1]) > 1.0) & (np.abs(values[1:]) <= 1.0))
     assert len(k) == 1
     left = math.pi + np.unwrap(np.angle(values))[k[0]]
     delay = (left % (2.0 * math.pi)) / w[k[0]] / 2.0
-    assert largest_delay(case, "rate_force") == pytest.approx(delay, rel=REFINED)
+    assert find_max_delay(case, "rate_force") == pytest.approx(delay, rel=REFINED)
 
 
 def test_loop_gain_and_characteristic_are_one():
-    port, s = CASE.with_delay(0.03).port("four_channel_rate"), 1j * np.geomspace(0.1, 100.0, 30)
+    port, s = (
+        CASE.with_delay(0.03).make_port("four_channel_rate"),
+        1j * np.geomspace(0.1, 100.0, 30),
+    )
     near = port.master(s) + port.master_control(s) + CASE.hand(s)
     far = port.slave(s) + port.slave_control(s) + CASE.task(s)
     whole = near * far * (1.0 + loop_gain(port, s, CASE.hand, CASE.task))
-    assert np.allclose(whole, characteristic(port, s, CASE.hand, CASE.task))
+    assert np.allclose(whole, characteristic_function(port, s, CASE.hand, CASE.task))
 
 
 def test_passive_are_equal_springs_and_the_transparent_one_without_delay():
-    firm = Case(CASE.master, CASE.slave, CASE.slave_control, CASE.slave_control, CASE.hand,
+    firm = TeleoperatorAxis(CASE.master, CASE.slave, CASE.slave_control, CASE.slave_control, CASE.hand,
                 CASE.task)  # fmt: skip
     for structure in ("position_position", "four_channel_position"):
-        assert is_passive(firm.port(structure))
-        assert not is_passive(firm.with_delay(0.1).port(structure))
-    assert not is_passive(firm.port("rate_position"))
+        assert is_passive(firm.make_port(structure))
+        assert not is_passive(firm.with_delay(0.1).make_port(structure))
+    assert not is_passive(firm.make_port("rate_position"))
 
 
 def test_an_analysis_agrees_with_itself():
     for structure in STRUCTURES:
-        found = analyse(CASE.with_delay(0.02), structure)
-        assert found.hybrid.shape == (*found.frequencies.shape, 2, 2)
-        assert found.stable == (found.gain_margin > 1.0)  # this case is stable when free
-        assert found.stable == (found.largest_delay > 0.02)
-        assert found.passive <= (found.scattering.max() < 1.0 + 1e-6)
+        found = analyse_structure(CASE.with_delay(0.02), structure)
+        assert found.hybrid_matrices.shape == (*found.frequencies.shape, 2, 2)
+        assert found.is_stable_held == (found.gain_margin > 1.0)  # this case is stable when free
+        assert found.is_stable_held == (found.max_delay > 0.02)
+        assert found.has_passive_port <= (found.scattering_norms.max() < 1.0 + 1e-6)
         edge = found.gain_margin
         case = CASE.with_delay(0.02)
         if 0.0 < edge < math.inf:
-            sides = [stable(case.port(structure, edge * k), CASE.hand, CASE.task)
+            sides = [is_stable(case.make_port(structure, edge * k), CASE.hand, CASE.task)
                      for k in (0.99, 1.01)]  # fmt: skip
             assert sides == [True, False]
 
@@ -114,16 +117,16 @@ def test_a_map_has_its_rows_over_factors():
 
 
 def test_poles_on_the_axis_are_not_stable():
-    bare = Case(Impedance(1.0), Impedance(1.0), Impedance(0.0, 0.0, 100.0),
+    bare = TeleoperatorAxis(Impedance(1.0), Impedance(1.0), Impedance(0.0, 0.0, 100.0),
                 Impedance(0.0, 0.0, 100.0), Impedance(), Impedance(0.0, 0.0, 50.0))  # fmt: skip
-    found = analyse(bare, "position_position")
-    assert not found.stable and "axis" in why_unstable(found)
+    found = analyse_structure(bare, "position_position")
+    assert not found.is_stable_held and "axis" in describe_stability(found)
 
 
 def test_an_undamped_swing_grows_by_the_root_of_the_stiffnesses():
     # half a step at each of two switches, with steps of 0.01 of the time constant: below 1e-3
-    assert worst_growth(2.0, 0.0, 50.0, 800.0) == pytest.approx(4.0, rel=1e-3)
-    assert worst_growth(1.0, 0.0, 0.0, 1.0) == math.inf
+    assert worst_switching_growth(2.0, 0.0, 50.0, 800.0) == pytest.approx(4.0, rel=1e-3)
+    assert worst_switching_growth(1.0, 0.0, 0.0, 1.0) == math.inf
 
 
 def test_growth_is_that_of_the_damped_oscillations():
@@ -135,7 +138,7 @@ def test_growth_is_that_of_the_damped_oscillations():
     peak = math.exp(-decay * out) * math.sin(soft * out) / soft
     back = (math.pi - math.atan2(firm, decay)) / firm  # time from there to the centre
     speed = peak * (most / mass) / firm * math.exp(-decay * back) * math.sin(firm * back)
-    assert worst_growth(mass, damping, least, most) == pytest.approx(speed, rel=1e-3)
+    assert worst_switching_growth(mass, damping, least, most) == pytest.approx(speed, rel=1e-3)
 
 
 def test_the_theorem_is_sufficient_and_not_necessary():
@@ -143,62 +146,62 @@ def test_the_theorem_is_sufficient_and_not_necessary():
     for _ in range(50):
         mass, most = rng.uniform(0.1, 5.0), rng.uniform(100.0, 5e3)
         least = rng.uniform(0.02, 1.0) * most
-        firm = Spring(mass, 2.05 * math.sqrt(mass * most), least, least, most)
-        assert firm.margin > 0.0 and firm.growth < 1e-6  # never crosses the centre again
-    between = Spring(0.85, 60.0, 600.0, 300.0, 4000.0)  # Zhu 1994, Table 6.7
-    assert between.margin < 0.0 and between.growth < 1.0
-    loose = Spring(0.85, 2.0, 600.0, 300.0, 4000.0)
-    assert loose.growth > 1.0
+        firm = StiffnessAxis(mass, 2.05 * math.sqrt(mass * most), least, least, most)
+        assert firm.theorem_margin > 0.0 and firm.half_swing_growth < 1e-6  # never crosses the centre again
+    between = StiffnessAxis(0.85, 60.0, 600.0, 300.0, 4000.0)  # Zhu 1994, Table 6.7
+    assert between.theorem_margin < 0.0 and between.half_swing_growth < 1.0
+    loose = StiffnessAxis(0.85, 2.0, 600.0, 300.0, 4000.0)
+    assert loose.half_swing_growth > 1.0
 
 
 def test_what_holds_a_spring_adds_to_it():
-    held = Spring(1.0, 10.0, 100.0, 50.0, 200.0).held(Impedance(0.5, 2.0, 30.0))
-    assert held == Spring(1.5, 12.0, 130.0, 80.0, 230.0)
+    held = StiffnessAxis(1.0, 10.0, 100.0, 50.0, 200.0).with_hand(Impedance(0.5, 2.0, 30.0))
+    assert held == StiffnessAxis(1.5, 12.0, 130.0, 80.0, 230.0)
     with pytest.raises(InputError, match="ordered"):
-        Spring(1.0, 1.0, 100.0, 200.0, 300.0)
+        StiffnessAxis(1.0, 1.0, 100.0, 200.0, 300.0)
 
 
 def test_a_kick_without_a_loop_decays_as_its_poles_say():
     """No reflection: the master alone, whose slowest pole ends the motion."""
-    run = impulse_response(CASE, "position_force", 0.0, 4.0)
+    run = simulate_impulse(CASE, "position_force", 0.0, 4.0)
     assert not is_growing(run)
     mass = CASE.master.mass + CASE.hand.mass
     damping = CASE.master.damping + CASE.hand.damping + CASE.master_control.damping
     decay = damping / (2.0 * mass)  # under-damped
     # the largest of one block over that two blocks later; phases within blocks differ by less
-    ratio = math.log(run.largest[2] / run.largest[8]) / (6 * 4.0 / 20)
+    ratio = math.log(run.max_speeds[2] / run.max_speeds[8]) / (6 * 4.0 / 20)
     assert ratio == pytest.approx(decay, rel=0.15)
 
 
 def test_what_is_too_fast_is_not_simulated():
-    light = Case(Impedance(1e-9), CASE.slave, CASE.master_control, CASE.slave_control, CASE.hand,
+    light = TeleoperatorAxis(Impedance(1e-9), CASE.slave, CASE.master_control, CASE.slave_control, CASE.hand,
                  CASE.task)  # fmt: skip
     with pytest.raises(InputError, match="too fast"):
-        step_of(light)
+        choose_time_step(light)
     with pytest.raises(InputError, match="without mass"):
-        Case(CASE.master, CASE.slave, Impedance(1.0), CASE.slave_control, CASE.hand, CASE.task)
+        TeleoperatorAxis(CASE.master, CASE.slave, Impedance(1.0), CASE.slave_control, CASE.hand, CASE.task)
 
 
 @pytest.mark.nightly
 def test_different_delays_there_and_back():
     """What is felt depends on both, stability on their sum only."""
-    uneven = Case(**{**vars(CASE), "delay_forward": 0.08, "delay_back": 0.0})
+    uneven = TeleoperatorAxis(**{**vars(CASE), "delay_forward": 0.08, "delay_back": 0.0})
     w = 6.0
-    expected = transmitted(uneven.port("rate_force"), 1j * w, uneven.task)
+    expected = transmitted_impedance(uneven.make_port("rate_force"), 1j * w, uneven.task)
     # 3 % are asked for; the delay is rounded to steps
     assert abs(simulate_sine(uneven, "rate_force", w) / expected - 1.0) < 0.01
     for structure in STRUCTURES:
         same = CASE.with_delay(0.04)
-        assert analyse(uneven, structure).unstable_poles == analyse(same, structure).unstable_poles
+        assert analyse_structure(uneven, structure).unstable_poles == analyse_structure(same, structure).unstable_poles
 
 
 def test_the_document_of_the_shipped_case_is_complete():
     facts = load_teleop_case()
-    found = find(
-        facts.name, facts.case(), ("rate_force",), np.array([0.0, 0.1]), np.array([0.1, 1.0]),
-        facts.stiffness.spring(), confirm=True,
+    found = analyse_structures(
+        facts.name, facts.to_axis(), ("rate_force",), np.array([0.0, 0.1]), np.array([0.1, 1.0]),
+        facts.stiffness.to_spring(), confirm=True,
     )  # fmt: skip
-    document = findings_document(found)
+    document = findings_to_dict(found)
     assert document["structures"]["rate_force"]["stable"]
     assert document["confirmed"]["agreement"] == {"rate_force": 1.0}
     assert [s["error"] < 0.03 for s in document["confirmed"]["sweeps"]] == [True, True]
@@ -208,17 +211,17 @@ def test_the_document_of_the_shipped_case_is_complete():
 @pytest.mark.parametrize("structure", STRUCTURES)
 def test_tasks_with_mass_and_sides_with_springs(structure):
     """A task with a mass needs the slave's jerk under rate control with all four channels."""
-    heavy = Case(
+    heavy = TeleoperatorAxis(
         Impedance(0.8, 0.5, 30.0), Impedance(2.0, 3.0, 40.0), CASE.master_control,
-        CASE.slave_control, CASE.hand, Impedance(0.5, 20.0, 3000.0), Gains(1.0, 0.4, 0.5),
+        CASE.slave_control, CASE.hand, Impedance(0.5, 20.0, 3000.0), StructureGains(1.0, 0.4, 0.5),
     )  # fmt: skip
     w = 9.0
     for delay in (0.0, 0.0207):  # no whole number of steps
         case = heavy.with_delay(delay)
-        if unstable_held(case.port(structure), case.task):
+        if count_unstable_poles_held(case.make_port(structure), case.task):
             continue  # nothing settles
-        expected = transmitted(case.port(structure), 1j * w, case.task)
+        expected = transmitted_impedance(case.make_port(structure), 1j * w, case.task)
         # second order in steps of at most 0.5 ms: (w h)^2 is 2e-5; settled to 1e-3
         assert abs(simulate_sine(case, structure, w) / expected - 1.0) < 2e-3
-        kick = impulse_response(case, structure)
-        assert is_growing(kick) != stable(case.port(structure), case.hand, case.task)
+        kick = simulate_impulse(case, structure)
+        assert is_growing(kick) != is_stable(case.make_port(structure), case.hand, case.task)

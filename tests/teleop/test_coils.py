@@ -8,15 +8,15 @@ from hypothesis import strategies as st
 
 from hydrotele.core.errors import InputError
 from hydrotele.machine.joystick import load_joystick
-from hydrotele.simulate.joystick import SimulatedFlotor, field_shares, heat_step
+from hydrotele.simulate.joystick import SimulatedFlotor, coil_force_factors, heat_step
 from hydrotele.teleop.coils import (
     Coils,
-    heating,
-    seconds_until_hot,
-    three_stations,
+    make_three_station_coils,
+    relative_heating,
+    time_to_overheat,
 )
 
-COILS = three_stations(0.05, 8.0, 4.0)
+COILS = make_three_station_coils(0.05, 8.0, 4.0)
 WRENCH = st.lists(st.floats(-100.0, 100.0), min_size=6, max_size=6)
 
 
@@ -31,16 +31,16 @@ def test_the_map_is_what_mujoco_makes_of_forces_at_the_coils():
     currents, total = np.array([1.0, -0.5, 0.3, 2.0, -1.5, 0.7]), np.zeros(6)
     for place, way, current in zip(COILS.position, COILS.direction, currents, strict=True):
         mujoco.mj_applyFT(model, data, 8.0 * current * way, np.zeros(3), place, 1, total)
-    assert COILS.wrench(currents) == pytest.approx(total, abs=1e-12)
+    assert COILS.compute_wrench(currents) == pytest.approx(total, abs=1e-12)
 
 
 @given(WRENCH)
 def test_currents_make_the_wrench_or_a_smaller_one_of_its_direction(wrench):
     wanted = np.array(wrench) * [1, 1, 1, 0.05, 0.05, 0.05]
-    found = COILS.currents(wanted)
+    found = COILS.compute_currents(wanted)
     assert np.abs(found.value).max() <= 4.0 * (1 + 1e-12)
-    made = COILS.wrench(found.value)
-    if not found.limited:
+    made = COILS.compute_wrench(found.value)
+    if not found.is_limited:
         assert np.allclose(made, wanted, atol=1e-9)
     else:
         assert np.allclose(made * np.linalg.norm(wanted), wanted * np.linalg.norm(made), atol=1e-6)
@@ -48,13 +48,13 @@ def test_currents_make_the_wrench_or_a_smaller_one_of_its_direction(wrench):
 
 
 def test_the_weight_of_the_flotor_takes_a_tenth_of_the_current():
-    found = COILS.currents(np.array([0.0, 0.0, 0.85 * 9.81, 0.0, 0.0, 0.0]))
-    assert not found.limited and np.abs(found.value).max() == pytest.approx(0.3474, abs=1e-3)
+    found = COILS.compute_currents(np.array([0.0, 0.0, 0.85 * 9.81, 0.0, 0.0, 0.0]))
+    assert not found.is_limited and np.abs(found.value).max() == pytest.approx(0.3474, abs=1e-3)
 
 
 def test_a_wrench_that_is_no_number_gets_no_current():
-    found = COILS.currents(np.array([1.0, np.nan, 0.0, 0.0, 0.0, 0.0]))
-    assert found.limited and not found.value.any()
+    found = COILS.compute_currents(np.array([1.0, np.nan, 0.0, 0.0, 0.0, 0.0]))
+    assert found.is_limited and not found.value.any()
 
 
 def test_coils_that_cannot_make_every_wrench_are_refused():
@@ -67,7 +67,7 @@ def test_coils_that_cannot_make_every_wrench_are_refused():
     with pytest.raises(InputError, match="six positions"):
         Coils(place[:3], up[:3], 8.0, 4.0)
     with pytest.raises(InputError, match="positive"):
-        three_stations(0.05, 0.0, 4.0)
+        make_three_station_coils(0.05, 0.0, 4.0)
 
 
 def test_coils_heat_as_the_exact_solution_does():
@@ -80,9 +80,9 @@ def test_coils_heat_as_the_exact_solution_does():
 
 def test_heating_and_the_time_that_is_left():
     currents = np.full(6, 3.0)
-    assert heating(currents, 2.0) == pytest.approx(2.25)
-    assert seconds_until_hot(np.full(6, 2.0), 2.0, 60.0) == np.inf
-    left, heat = seconds_until_hot(currents, 2.0, 60.0), np.zeros(6)
+    assert relative_heating(currents, 2.0) == pytest.approx(2.25)
+    assert time_to_overheat(np.full(6, 2.0), 2.0, 60.0) == np.inf
+    left, heat = time_to_overheat(currents, 2.0, 60.0), np.zeros(6)
     heat_step(heat, currents, 2.0, 60.0, left)
     assert heat == pytest.approx(np.ones(6))
 
@@ -91,7 +91,7 @@ def test_a_detent_keeps_the_coils_cool_where_one_slope_would_not():
     """Zhu 1994, 6.3: a stiff joystick heats; Table 6.11's detent of the feller-buncher's x."""
     joystick = load_joystick()
     c, x = joystick.coils, 4.5e-3
-    coils = three_stations(c.radius, c.force_per_ampere, c.max_current)
+    coils = make_three_station_coils(c.radius, c.force_per_ampere, c.max_current)
     gains = joystick.gains["feller"]["x"]
     assert gains.detent
     slope = gains.nominal * x
@@ -101,21 +101,19 @@ def test_a_detent_keeps_the_coils_cool_where_one_slope_would_not():
     for force in (slope, notch):
         wrench = np.array([force, 0.0, 9.81 * joystick.flotor.mass, 0.0, 0.0, 0.0])
         wrench[4] = force * joystick.flotor.handle[2]
-        hot.append(heating(coils.currents(wrench).value, c.continuous_current))
+        hot.append(relative_heating(coils.compute_currents(wrench).value, c.continuous_current))
     assert hot[0] > 2.0 and hot[1] < 1.0
 
 
 def test_the_field_is_that_of_the_middle_there_and_even_about_it():
-    coils = three_stations(0.05, 8.0, 4.0).position
-    assert field_shares(coils, np.zeros(3), np.eye(3), 5e-3, 0.2).tolist() == [1.0] * 6
-    moved = field_shares(coils, np.array([3e-3, 0.0, 4e-3]), np.eye(3), 5e-3, 0.2)
+    coils = make_three_station_coils(0.05, 8.0, 4.0).position
+    assert coil_force_factors(coils, np.zeros(3), np.eye(3), 5e-3, 0.2).tolist() == [1.0] * 6
+    moved = coil_force_factors(coils, np.array([3e-3, 0.0, 4e-3]), np.eye(3), 5e-3, 0.2)
     assert moved == pytest.approx(np.full(6, 0.8))
-    back = field_shares(coils, np.array([-3e-3, 0.0, -4e-3]), np.eye(3), 5e-3, 0.2)
+    back = coil_force_factors(coils, np.array([-3e-3, 0.0, -4e-3]), np.eye(3), 5e-3, 0.2)
     assert back == pytest.approx(moved)
     c, s = np.cos(0.02), np.sin(0.02)
-    turned = field_shares(
-        coils, np.zeros(3), np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), 5e-3, 0.2
-    )
+    turned = coil_force_factors(coils, np.zeros(3), np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), 5e-3, 0.2)
     assert turned == pytest.approx(np.full(6, 1.0 - 0.2 * (2 * 0.05 * np.sin(0.01) / 5e-3) ** 2))
 
 
@@ -123,14 +121,14 @@ def test_hot_coils_get_less_until_they_have_cooled():
     flotor, full = SimulatedFlotor(load_joystick(), hand=False), np.full(6, 4.0)
     c = flotor.facts.coils
     steps = 0
-    while flotor.allowed == c.max_current:
+    while flotor.current_limit == c.max_current:
         flotor.step(full, np.zeros(6))
         steps += 1
-    expected = seconds_until_hot(full, c.continuous_current, c.thermal_time)
+    expected = time_to_overheat(full, c.continuous_current, c.thermal_time)
     assert steps * flotor.period == pytest.approx(expected, abs=flotor.period)
-    assert flotor.allowed == c.continuous_current and flotor.hottest >= 1.0
+    assert flotor.current_limit == c.continuous_current and flotor.max_heat >= 1.0
     steps = 0
-    while flotor.allowed < c.max_current:
+    while flotor.current_limit < c.max_current:
         flotor.step(np.zeros(6), np.zeros(6))
         steps += 1
     assert steps * flotor.period == pytest.approx(-c.thermal_time * np.log(0.9), abs=0.02)
@@ -140,6 +138,6 @@ def test_a_coil_that_leaves_its_field_pushes_less():
     joystick = load_joystick()
     coils = joystick.coils.model_copy(update={"edge_loss": 0.2})
     flotor = SimulatedFlotor(joystick.model_copy(update={"coils": coils}), hand=False)
-    flotor.place(np.array([5e-3, 0, 0, 0, 0, 0]))
+    flotor.set_pose(np.array([5e-3, 0, 0, 0, 0, 0]))
     flotor.step(np.zeros(6), np.zeros(6))
     assert np.abs(flotor.model.actuator_gear).max(axis=1) == pytest.approx(np.full(6, 6.4))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.teleop.compliance import Axes, Flotor, Motion, compliance_wrench
+from hydrotele.teleop.compliance import AxisDynamics, Flotor, FlotorMotion, compliance_wrench
 
 BODY = Flotor(
     0.85,
@@ -16,7 +16,7 @@ BODY = Flotor(
     np.array([[1.2e-3, 1e-4, 0.0], [1e-4, 1.1e-3, -5e-5], [0.0, -5e-5, 1.5e-3]]),
 )
 HANDLE = np.array([0.01, 0.0, 0.12])
-AXES = Axes(np.array([25.0, 20.0, 30.0, 25.0, 35.0, 15.0]), np.full(6, 0.8))
+AXES = AxisDynamics(np.array([25.0, 20.0, 30.0, 25.0, 35.0, 15.0]), np.full(6, 0.8))
 MJCF = """<mujoco><worldbody><body name="flotor"><freejoint/>
 <inertial pos="0.003 -0.004 0.02" mass="0.85"
  fullinertia="0.0012 0.0011 0.0015 0.0001 0 -0.00005"/></body></worldbody></mujoco>"""
@@ -34,7 +34,7 @@ def test_every_axis_accelerates_as_its_own_second_order_system():
             quaternion / np.linalg.norm(quaternion),
         )
         data.qvel[:] = rng.uniform(-1.0, 1.0, 6) * ([0.1] * 3 + [1.0] * 3)
-        motion = Motion(data.qpos[:3], data.qpos[3:], data.qvel[:3], data.qvel[3:])
+        motion = FlotorMotion(data.qpos[:3], data.qpos[3:], data.qvel[:3], data.qvel[3:])
         target, turned = rng.uniform(-0.01, 0.01, 3), np.array([1.0, 0.0, 0.0, 0.0])
         wrench = compliance_wrench(BODY, AXES, HANDLE, motion, target, turned)
         turn = np.zeros(9)
@@ -46,7 +46,7 @@ def test_every_axis_accelerates_as_its_own_second_order_system():
         handle = data.qpos[:3] + turn @ HANDLE
         speed = data.qvel[:3] + turn @ np.cross(w, HANDLE)
         swing = np.cross(about, HANDLE) + np.cross(w, np.cross(w, HANDLE))
-        spring, damper = AXES.frequency**2, 2.0 * AXES.ratio * AXES.frequency
+        spring, damper = AXES.frequency**2, 2.0 * AXES.damping_ratio * AXES.frequency
         asked = spring[:3] * (target - handle) - damper[:3] * speed
         # rounding of forces of 10 N over masses of 1 kg and inertias of 1e-3 kg m^2
         np.testing.assert_allclose(data.qacc[:3] + turn @ swing, asked, atol=1e-10)
@@ -60,4 +60,4 @@ def test_bodies_and_axes_that_cannot_be_are_refused():
     with pytest.raises(InputError, match="not physical"):
         Flotor(0.85, np.zeros(3), np.diag([1e-3, 1e-3, 5e-3]))
     with pytest.raises(InputError, match="six positive"):
-        Axes(np.full(6, 25.0), np.zeros(6))
+        AxisDynamics(np.full(6, 25.0), np.zeros(6))

@@ -7,7 +7,11 @@ from hydrotele.core.errors import InputError
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.teleop.compliance import Flotor
 from hydrotele.teleop.flotor import identify_flotor
-from hydrotele.teleop.levitation import excitation_path, levitation, simulate_levitation
+from hydrotele.teleop.levitation import (
+    make_excitation_path,
+    make_levitation_control,
+    simulate_levitation,
+)
 
 GUESS = Flotor(0.9, np.zeros(3), 2e-3 * np.eye(3))  # of the control while nothing is known
 
@@ -24,25 +28,21 @@ def with_com(com):
 def test_planted_numbers_are_found(diodes):
     """12 s of wobbling under a control that takes the flotor for another one."""
     joystick = with_com((0.002, -0.001, 0.02))
-    control = levitation(joystick, GUESS)
-    flight = simulate_levitation(
-        joystick, excitation_path(joystick, 12.0), control=control, diodes=diodes
-    )
+    control = make_levitation_control(joystick, GUESS)
+    flight = simulate_levitation(joystick, make_excitation_path(joystick, 12.0), control=control, diodes=diodes)
     assert not flight.limited.any() and np.abs(flight.pose[:, :3]).max() < 5e-3
-    found = identify_flotor(
-        flight.place, flight.quaternion, flight.currents, control.period, control.coils
-    )
+    found = identify_flotor(flight.place, flight.quaternion, flight.currents, control.period, control.coils)
     truth = np.array([0.85, 0.002, -0.001, 0.02, 1.2e-3, 1.2e-3, 1.5e-3, 0.0, 0.0, 0.0])
-    assert (np.abs(found.value - truth) < found.interval).all()
+    assert (np.abs(found.value - truth) < found.interval_half_width).all()
     # asked for: 0.5 %, 0.5 mm and 5 %; what is told is finer by an order of magnitude and more
     asked = np.array([5e-3 * 0.85, *[5e-4] * 3, *[0.05 * 1.2e-3] * 6])
-    assert (found.interval < 0.2 * asked).all()
-    assert found.body().inertia[0, 1] == found.value[7]
+    assert (found.interval_half_width < 0.2 * asked).all()
+    assert found.to_flotor().inertia[0, 1] == found.value[7]
 
 
 def test_motions_that_tell_too_little_are_refused():
     joystick = with_com((0.0, 0.0, 0.02))
-    control = levitation(joystick)
+    control = make_levitation_control(joystick)
     period, coils = control.period, control.coils
     still = simulate_levitation(joystick, np.zeros((500, 6)))
     with pytest.raises(InputError, match="not all ten parameters"):  # only noise

@@ -34,7 +34,7 @@ def swing(name, overrides):
 @pytest.mark.nightly
 def test_direct_force_is_stable_below_the_prediction_and_unstable_above():
     """Within a factor of 2: friction, loss of contact and stops are not in the linear loop."""
-    ratio = analyse_scenario(load_scenario("press_direct", BARE)).loop.largest_ratio
+    ratio = analyse_scenario(load_scenario("press_direct", BARE)).loop.max_ratio
     assert swing("press_direct", BARE | {"pilot.ratio": str(0.5 * ratio)}) < 0.25
     assert swing("press_direct", BARE | {"pilot.ratio": str(2.0 * ratio)}) > 0.25
 
@@ -47,7 +47,7 @@ def test_stiffness_feedback_with_150_ms_each_way_holds_the_ground():
         "pilot.channel.delay_forward": "0.15", "pilot.channel.delay_back": "0.15",
         "pilot.operator.target.time": "[0.0]", "pilot.operator.target.force": f"[{TARGET}]",
     }  # fmt: skip
-    assert analyse_scenario(load_scenario("press_stiffness", overrides)).held.margin > 0.0
+    assert analyse_scenario(load_scenario("press_stiffness", overrides)).held_spring.theorem_margin > 0.0
     assert swing("press_stiffness", overrides) < 0.25
 
 

@@ -66,9 +66,7 @@ def test_recursion_ends_where_least_squares_does():
 def test_a_task_that_changes_is_followed_and_rest_does_no_harm():
     """An impedance [M, B, K] that hardens at once, then 50 s without motion."""
     rng = np.random.default_rng(4)
-    found = RecursiveLeastSquares(
-        np.zeros(3), np.array([10.0, 100.0, 1e4]), forgetting=0.995, reset=8.0
-    )
+    found = RecursiveLeastSquares(np.zeros(3), np.array([10.0, 100.0, 1e4]), forgetting=0.995, reset_ratio=8.0)
     soft, hard = np.array([1.0, 20.0, 500.0]), np.array([1.0, 60.0, 5000.0])
     for k in range(3000):
         t = 0.005 * k
@@ -90,9 +88,7 @@ def test_a_task_that_changes_is_followed_and_rest_does_no_harm():
     assert np.array_equal(found.value, before)
 
 
-@pytest.mark.parametrize(
-    "options", [{"forgetting": 0.0}, {"forgetting": 1.1}, {"reset": 1.0}, {"spread": [1.0, 0.0]}]
-)
+@pytest.mark.parametrize("options", [{"forgetting": 0.0}, {"forgetting": 1.1}, {"reset": 1.0}, {"spread": [1.0, 0.0]}])
 def test_recursion_refuses_nonsense(options):
     spread = options.pop("spread", [1.0, 1.0])
     with pytest.raises(InputError):

@@ -6,18 +6,18 @@ import math
 import numpy as np
 import pytest
 
-from hydrotele.control.state_filter import butterworth, filter_table, filtered
+from hydrotele.control.state_filter import butterworth_response, filter_signal, filter_table
 from hydrotele.core.errors import InputError
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.scenario.scenario import load_scenario
-from hydrotele.teleop.findings import find_loop, structure_findings
+from hydrotele.teleop.findings import analyse_scenario_case, analyse_scenario_loop
 from hydrotele.teleop.linear_case import (
     DEFAULT_TASK,
-    drive_control,
-    drive_follows,
-    joystick_of,
-    scenario_case,
+    build_scenario_case,
+    scenario_joystick,
+    tip_controller_impedance,
+    tip_tracking_response,
 )
 from hydrotele.teleop.two_port import Impedance
 
@@ -28,7 +28,7 @@ def made(name="press_direct", coordinate=None, **overrides):
     pairs = {key.replace("__", "."): value for key, value in overrides.items()}
     scenario = load_scenario(name, pairs)
     machine = load_machine(scenario.machine, scenario.tool)
-    return scenario_case(scenario, machine, load_joystick(joystick_of(scenario)), coordinate)
+    return build_scenario_case(scenario, machine, load_joystick(scenario_joystick(scenario)), coordinate)
 
 
 @pytest.fixture(scope="module")
@@ -47,28 +47,28 @@ def test_tip_weighs_as_much_as_a_boom_that_turns(case):
 
 def test_drive_keeps_its_reference_and_yields_to_nothing_for_long(case):
     s = np.array([SLOW])
-    arguments = (case.tip, case.servo, case.clocks, s)
-    assert drive_follows(*arguments)[0] == pytest.approx(1.0, abs=1e-3)  # first order of SLOW
+    arguments = (case.tip, case.servo, case.periods, s)
+    assert tip_tracking_response(*arguments)[0] == pytest.approx(1.0, abs=1e-3)  # first order of SLOW
     # K (s + g) / s^2 / (1 + p T): the position loop integrates through the oil
     slow = case.tip.stiffness * 8.0 / (SLOW**2 * (1.0 + 6.0 * 0.2))
-    assert drive_control(*arguments)[0] == pytest.approx(slow, rel=1e-3)
+    assert tip_controller_impedance(*arguments)[0] == pytest.approx(slow, rel=1e-3)
 
 
 def test_drive_is_oil_and_mass_when_fast(case):
     s = np.array([1e4j])
     oil = case.tip.stiffness / s
-    assert drive_control(case.tip, case.servo, case.clocks, s) == pytest.approx(oil, rel=0.01)
+    assert tip_controller_impedance(case.tip, case.servo, case.periods, s) == pytest.approx(oil, rel=0.01)
 
 
 def test_filter_is_what_the_estimator_does():
     """A sine through the sampled filter has the transfer function's size and phase."""
     period, frequency, bandwidth = 0.02, 1.0, 1.5
     time = period * np.arange(2000)
-    out = filtered(filter_table(bandwidth, period), np.sin(2.0 * np.pi * frequency * time))[:, 0]
+    out = filter_signal(filter_table(bandwidth, period), np.sin(2.0 * np.pi * frequency * time))[:, 0]
     late = slice(1000, None)  # 20 whole periods
     wave = np.exp(-2j * np.pi * frequency * time[late])
     seen = 2j * np.mean(out[late] * wave)
-    expected = butterworth(bandwidth, np.array([2j * np.pi * frequency]))[0]
+    expected = butterworth_response(bandwidth, np.array([2j * np.pi * frequency]))[0]
     assert seen == pytest.approx(expected, abs=2e-3)  # chords of a sine are (w T)^2 / 12 too low
 
 
@@ -84,16 +84,16 @@ def test_task_is_the_plate_or_said_to_be_the_default():
 @pytest.mark.nightly
 def test_limit_falls_with_speed_stiffness_delay_and_lag():
     """What makes the loop faster or later leaves less reflection; by speed, in proportion."""
-    ratio = structure_findings(made()[0], "rate_force").largest_ratio
+    ratio = analyse_scenario_loop(made()[0], "rate_force").max_ratio
     assert 2e-5 < ratio < 4e-5  # as simulated: smooth at 4e-5 only for its dead band
     for changed in (
         {"surroundings__0__stiffness": "2.0e+6"},
         {"pilot__channel__delay_back": "0.1"}, {"pilot__bandwidth_hz": "0.75"},
     ):  # fmt: skip
-        assert structure_findings(made(**changed)[0], "rate_force").largest_ratio < 0.9 * ratio
+        assert analyse_scenario_loop(made(**changed)[0], "rate_force").max_ratio < 0.9 * ratio
     # Twice the speed.
-    double = structure_findings(made(pilot__coordinates__z__speed="0.6")[0], "rate_force")
-    assert double.largest_ratio == pytest.approx(0.5 * ratio, rel=2e-3)  # two margins' rounding
+    double = analyse_scenario_loop(made(pilot__coordinates__z__speed="0.6")[0], "rate_force")
+    assert double.max_ratio == pytest.approx(0.5 * ratio, rel=2e-3)  # two margins' rounding
 
 
 def test_hand_is_that_of_the_scenarios_operator(case):
@@ -101,38 +101,36 @@ def test_hand_is_that_of_the_scenarios_operator(case):
     usual = load_joystick().hand
     assert case.held == Impedance(usual.mass, usual.damping, usual.stiffness)
     firm = made(pilot__perception="{grip: firm, cocontraction: 0.4}")[0]
-    assert firm.held.mass == pytest.approx(0.8)  # operator.yaml: firm
-    assert firm.held.stiffness == pytest.approx(600.0 * 1.8)  # stiffening 3: 1 + 2 x 0.4
+    assert firm.hand_impedance.mass == pytest.approx(0.8)  # operator.yaml: firm
+    assert firm.hand_impedance.stiffness == pytest.approx(600.0 * 1.8)  # stiffening 3: 1 + 2 x 0.4
     far = made(pilot__perception="{grip: normal, posture: far}", coordinate="r")[0]
-    assert far.held.stiffness > 2.0 * 250.0  # towards the shoulder
-    ratios = [structure_findings(c, "rate_force").largest_ratio for c in (case, firm)]
+    assert far.hand_impedance.stiffness > 2.0 * 250.0  # towards the shoulder
+    ratios = [analyse_scenario_loop(c, "rate_force").max_ratio for c in (case, firm)]
     assert ratios[1] != pytest.approx(ratios[0], rel=0.02)
     with pytest.raises(InputError, match="pilot.perception.grip"):
         made(pilot__perception="{grip: frm}")
 
 
 def test_pole_lies_on_the_axis_at_the_limit(case):
-    found = structure_findings(case, "rate_force")
-    assert found.unstable_poles == 2 and not found.stable
-    assert found.pole.real > 0.0 and found.largest_delay == 0.0
+    found = analyse_scenario_loop(case, "rate_force")
+    assert found.unstable_poles == 2 and not found.is_stable
+    assert found.pole.real > 0.0 and found.max_delay == 0.0
     row = case.row.copy()
-    row[13] = found.largest_ratio
-    at = structure_findings(dataclasses.replace(case, row=row), "rate_force")
+    row[13] = found.max_ratio
+    at = analyse_scenario_loop(dataclasses.replace(case, row=row), "rate_force")
     assert at.gain_margin == pytest.approx(1.0, abs=3e-3)  # the margin is refined to 1e-3
     assert abs(at.pole.real) < 0.01 * abs(at.pole.imag)
     assert at.pole.imag / (2.0 * math.pi) == pytest.approx(found.frequency, rel=0.02)
 
 
 def test_theorem_counts_the_hand_and_its_damping():
-    scenario_gains = find_loop("a", *made("press_stiffness")[:1], "")
-    assert scenario_gains.held.margin == pytest.approx(68.0**2 - 4.0 * 1.45 * 4250.0)
-    assert not scenario_gains.loop.own
-    damped = find_loop(
-        "a", made("press_stiffness", pilot__stiffness="{z: {damping: 150.0}}")[0], ""
-    )
-    assert damped.held.margin > 0.0
+    scenario_gains = analyse_scenario_case("a", *made("press_stiffness")[:1], "")
+    assert scenario_gains.held_spring.theorem_margin == pytest.approx(68.0**2 - 4.0 * 1.45 * 4250.0)
+    assert not scenario_gains.loop.is_scenario_structure
+    damped = analyse_scenario_case("a", made("press_stiffness", pilot__stiffness="{z: {damping: 150.0}}")[0], "")
+    assert damped.held_spring.theorem_margin > 0.0
     # K_r x: 3400 N/m over 50 kN, 1.5 mm
-    assert damped.edge_ratio == pytest.approx(3400.0 / 5e4 * 1.5e-3)
+    assert damped.deadband_edge_ratio == pytest.approx(3400.0 / 5e4 * 1.5e-3)
 
 
 @pytest.mark.daily("position-direct_force", "rate-coordinating_force")
@@ -140,8 +138,8 @@ def test_theorem_counts_the_hand_and_its_damping():
 @pytest.mark.parametrize("mode", ["rate", "position"])
 def test_every_structure_has_a_margin(reflection, mode):
     case = made(pilot__reflection=reflection, pilot__mode=mode)[0]
-    found = find_loop("a", case, "").loop
-    assert found.own and found.gain_margin > 0.0
+    found = analyse_scenario_case("a", case, "").loop
+    assert found.is_scenario_structure and found.gain_margin > 0.0
 
 
 @pytest.mark.parametrize(
@@ -157,7 +155,7 @@ def test_structures_without_a_linear_case_say_why_and_what_to_do(reflection, mod
     case = made()[0]
     pilot = case.pilot.model_copy(update={"reflection": reflection, "mode": mode})
     with pytest.raises(InputError, match=message):
-        find_loop("a", dataclasses.replace(case, pilot=pilot), "")
+        analyse_scenario_case("a", dataclasses.replace(case, pilot=pilot), "")
 
 
 @pytest.mark.parametrize(

@@ -9,13 +9,13 @@ from hydrotele.core.errors import InputError
 from hydrotele.machine.joystick import AXES, load_joystick
 from hydrotele.scenario.teleoperation import TeleopPilot
 from hydrotele.simulate.joystick import SimulatedFlotor
-from hydrotele.teleop.axis_table import COORDINATE, DEADBAND, SIGN, axis_table, flat_view
-from hydrotele.teleop.coils import three_stations
+from hydrotele.teleop.axis_table import COORDINATE, DEADBAND, SIGN, build_axis_table, flat_view
+from hydrotele.teleop.coils import make_three_station_coils
 from hydrotele.teleop.master import (
+    build_master,
+    compute_reflection,
     drive_coils,
-    master,
-    master_step,
-    reflect,
+    step_master,
     unpack_master,
     unpack_master_state,
 )
@@ -32,11 +32,11 @@ def pilot(**changed) -> TeleopPilot:
 
 
 def built(**changed):
-    return master(STICK, pilot(**changed), NAMES)
+    return build_master(STICK, pilot(**changed), NAMES)
 
 
 def pushed(numbers, s, packet=None, fresh=1.0):
-    reflect(numbers, np.zeros((8, 4)) if packet is None else packet, fresh, PERIOD, s)
+    compute_reflection(numbers, np.zeros((8, 4)) if packet is None else packet, fresh, PERIOD, s)
     return s.push
 
 
@@ -102,9 +102,7 @@ def test_coils_put_the_push_on_the_handle_and_carry_the_weight(seed):
     w, v = quaternion[0], quaternion[1:]
     cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
     turn = np.eye(3) + 2 * w * cross + 2 * cross @ cross
-    coils = three_stations(
-        STICK.coils.radius, STICK.coils.force_per_ampere, STICK.coils.max_current
-    )
+    coils = make_three_station_coils(STICK.coils.radius, STICK.coils.force_per_ampere, STICK.coils.max_current)
     made = coils.wrench_map @ s.currents
     weight = turn.T @ np.array([0, 0, -9.81 * STICK.flotor.mass])
     handle, com = np.array(STICK.flotor.handle), np.array(STICK.flotor.com)
@@ -130,7 +128,7 @@ def levitated(push, seconds=1.5, **changed):
     flotor, packet = SimulatedFlotor(STICK), np.zeros((8, 4))
     muscles = np.asarray(push, float) + np.array([0, 0, 9.81 * STICK.hand.mass, 0, 0, 0])
     for tick in range(round(seconds / PERIOD)):
-        master_step(numbers, flotor.data.qpos, packet, 1.0, PERIOD, tick == 0, s)
+        step_master(numbers, flotor.data.qpos, packet, 1.0, PERIOD, tick == 0, s)
         flotor.step(s.currents, muscles)
     return numbers, s, flotor
 
@@ -201,9 +199,9 @@ def test_identified_damping_stays_below_what_a_sampled_flotor_bears():
     packet[5:] = 1e9
     flotor = SimulatedFlotor(STICK)
     muscles = np.array([0, 0, 9.81 * STICK.hand.mass, 0, 0, 0])
-    flotor.place(np.array([0.0, 0.0, 2e-3, 0.0, 0.0, 0.0]))
+    flotor.set_pose(np.array([0.0, 0.0, 2e-3, 0.0, 0.0, 0.0]))
     for tick in range(200):
-        master_step(numbers, flotor.data.qpos, packet, 1.0, PERIOD, tick == 0, s)
+        step_master(numbers, flotor.data.qpos, packet, 1.0, PERIOD, tick == 0, s)
         flotor.step(s.currents, muscles)
     assert np.abs(s.currents).max() < 0.5 * STICK.coils.max_current
     assert abs(flotor.data.qpos[2]) < 1e-4
@@ -243,5 +241,5 @@ def test_impossible_gains_are_refused_by_name(changed, where):
 
 
 def test_gains_of_the_scenario_may_carry_units():
-    table = axis_table(STICK, pilot(stiffness={"z": {"deadband_mm": 2.0}}), NAMES)
+    table = build_axis_table(STICK, pilot(stiffness={"z": {"deadband_mm": 2.0}}), NAMES)
     assert table[2, DEADBAND] == pytest.approx(2e-3)

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from hydrotele.cli.main import app
 from hydrotele.core.errors import InputError
-from hydrotele.scenario.teleoperation import Perception
+from hydrotele.scenario.teleoperation import OperatorSettings
 from hydrotele.teleop import operator_identification
 from hydrotele.teleop.manual_control import (
     DOUBLE_INTEGRATOR,
@@ -16,18 +16,22 @@ from hydrotele.teleop.manual_control import (
     GAIN,
     INTEGRATOR,
     TrackingRecord,
-    sum_of_sines,
-    track,
+    make_sum_of_sines,
+    simulate_tracking,
 )
 from hydrotele.teleop.operator_identification import identify_operator, read_tracking
-from hydrotele.teleop.operator_parameters import drawn_operator, load_operator_file, perceiving
+from hydrotele.teleop.operator_parameters import (
+    load_operator_file,
+    make_operator,
+    scenario_operator,
+)
 
 FILE = load_operator_file()
 
 
 def record(number, duration=120.0, form=INTEGRATOR):
-    target, _ = sum_of_sines(np.arange(0.0, duration + 30.0, 0.01), 1.5, 120.0, number)
-    made = track(drawn_operator(FILE, number), form, 2.0, target, seed=40 + number)
+    target, _ = make_sum_of_sines(np.arange(0.0, duration + 30.0, 0.01), 1.5, 120.0, number)
+    made = simulate_tracking(make_operator(FILE, number), form, 2.0, target, seed=40 + number)
     return TrackingRecord(*(values[3000:] for values in made))
 
 
@@ -35,22 +39,18 @@ def noisy(made, seed):
     """0.5 % of noise on everything, as a laboratory has it; samples at 40 Hz."""
     rng, time = np.random.default_rng(seed), np.arange(made.time[0], made.time[-1] - 0.1, 0.025)
     values = [np.interp(time, made.time, v) for v in made[1:]]
-    return TrackingRecord(
-        time, *(v + 0.005 * v.std() * rng.standard_normal(len(v)) for v in values)
-    )
+    return TrackingRecord(time, *(v + 0.005 * v.std() * rng.standard_normal(len(v)) for v in values))
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize(
-    ("form", "kind"), [(GAIN, "integral"), (INTEGRATOR, "gain"), (DOUBLE_INTEGRATOR, "lead")]
-)
+@pytest.mark.parametrize(("form", "kind"), [(GAIN, "integral"), (INTEGRATOR, "gain"), (DOUBLE_INTEGRATOR, "lead")])
 def test_drawn_operators_are_recovered_within_their_intervals(form, kind):
     """16 intervals of 95 %: three misses or fewer in 99 % of all cases."""
     misses = []
     for number in range(4):
-        him = drawn_operator(FILE, number)
+        him = make_operator(FILE, number)
         fit = identify_operator(noisy(record(number, form=form), number), kind)
-        assert fit.element == FORMS[form] and fit.explained > 0.3
+        assert fit.element == FORMS[form] and fit.explained_fraction > 0.3
         late = him.visual_delay + him.lead_delay * (form == DOUBLE_INTEGRATOR)
         truth = {"delay": late, "remnant": him.remnant,
                  "neuromuscular_frequency": him.neuromuscular_frequency,
@@ -65,12 +65,12 @@ def test_drawn_operators_are_recovered_within_their_intervals(form, kind):
 
 def test_a_fit_that_did_not_settle_tells_nothing(monkeypatch):
     """Its intervals are endless and no parameter counts as identified."""
-    settled = operator_identification._fit
+    settled = operator_identification._fit_equalisation
 
     def unsettled(data, kind):
-        return settled(data, kind)._replace(settled=False)
+        return settled(data, kind)._replace(has_converged=False)
 
-    monkeypatch.setattr(operator_identification, "_fit", unsettled)
+    monkeypatch.setattr(operator_identification, "_fit_equalisation", unsettled)
     fit = identify_operator(record(0), "gain")
     assert not any(one.identified for one in fit.estimates.values())
     assert all(one.high > 1e6 * one.low for one in fit.estimates.values())
@@ -101,7 +101,7 @@ def test_command_writes_an_operator_that_a_scenario_takes(tmp_path):
     found = json.loads(done.stdout)
     assert found["controlled_element"] == "K/s"
     assert any("2 missing values of hand" in note for note in found["notes"])
-    him = perceiving(Perception(file="o/operator.yaml"), str(tmp_path))
+    him = scenario_operator(OperatorSettings(file="o/operator.yaml"), str(tmp_path))
     assert him.visual_delay == pytest.approx(found["estimates"]["delay"]["value"], abs=1e-4)
     assert CliRunner().invoke(app, [*words[:2], "--equalisation", "gain"]).exit_code == 0
 

@@ -5,9 +5,9 @@ import pytest
 
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.scenario.teleoperation import TeleopPilot
-from hydrotele.teleop.axis_table import NOMINAL, REACH
-from hydrotele.teleop.master import master
-from hydrotele.teleop.operator_model import OperatorModel, pull
+from hydrotele.teleop.axis_table import HANDLE_RANGE, NOMINAL_STIFFNESS
+from hydrotele.teleop.master import build_master
+from hydrotele.teleop.operator_model import OperatorModel, compute_muscle_forces
 
 STICK, PERIOD, TICKS = load_joystick(), 0.005, 400
 CARRIED = 9.81 * STICK.hand.mass
@@ -32,7 +32,7 @@ class Views:
 
 def person(operator, seed=1, views=None, **changed):
     pilot = TeleopPilot.model_validate({"kind": "teleop", "operator": operator, **changed})
-    numbers = master(STICK, pilot, ("r", "theta", "z", "attitude"))[0]
+    numbers = build_master(STICK, pilot, ("r", "theta", "z", "attitude"))[0]
     return OperatorModel(pilot, STICK, numbers, views or Views(), TICKS, PERIOD, seed), numbers
 
 
@@ -50,45 +50,45 @@ def test_he_acts_on_what_he_saw_a_reaction_time_ago(mode):
         views.values["measured"][200:, 0, 2] += jump
         him, _ = person(STEER, views=views, mode=mode, perception=calm)
         wanted.append([])
-        for tick in range(0, TICKS, him.every):
+        for tick in range(0, TICKS, him.ticks_per_decision):
             him.decide(tick)
-            wanted[-1].append(him.muscles.wanted[2])
+            wanted[-1].append(him.muscles.reference[2])
     same = np.equal(*wanted)
-    first = np.flatnonzero(~same)[0] * him.every
-    late = him.every / 2 if mode == "position" else 0
-    assert 250 - him.every / 2 <= first - late <= 250 + him.every
+    first = np.flatnonzero(~same)[0] * him.ticks_per_decision
+    late = him.ticks_per_decision / 2 if mode == "position" else 0
+    assert 250 - him.ticks_per_decision / 2 <= first - late <= 250 + him.ticks_per_decision
 
 
 def test_his_hand_stays_within_the_way_of_the_handle():
     views = Views()
     views.values["measured"][:, 0, 2] = -50.0
     him, numbers = person(STEER, views=views, mode="position", perception={"crossover": 50.0})
-    for tick in range(0, TICKS, him.every):
+    for tick in range(0, TICKS, him.ticks_per_decision):
         him.decide(tick)
-        assert abs(him.muscles.wanted[2]) <= numbers.axis[2, REACH]
+        assert abs(him.muscles.reference[2]) <= numbers.axis[2, HANDLE_RANGE]
 
 
 def test_he_follows_a_path():
     him, _ = person(FOLLOW)
     for tick, place in ((0, 0.0), (52, 0.00208), (100, 0.004), (200, 0.002), (300, 0.002)):
         him.decide(tick)
-        assert him.muscles.wanted[2] == pytest.approx(place)
+        assert him.muscles.reference[2] == pytest.approx(place)
 
 
 def test_muscles_hold_a_spring_and_do_not_exceed_their_strength():
     """What the spring asks for plus tremor, five times its 0.05 N; never more than the largest."""
     him, numbers = person(FOLLOW)
-    him.muscles.wanted[2] = 0.004
+    him.muscles.reference[2] = 0.004
     handle = np.array([0.0, 0, 0.004, 0, 0, 0])
     for tick in range(60):
-        him.past[:] = handle
-        pull(him.muscles, him.past, him.tremor, handle, tick, PERIOD)
-    spring = numbers.axis[2, NOMINAL] + STICK.hand.stiffness
+        him.displacement_history[:] = handle
+        compute_muscle_forces(him.muscles, him.displacement_history, him.tremor, handle, tick, PERIOD)
+    spring = numbers.axis[2, NOMINAL_STIFFNESS] + STICK.hand.stiffness
     assert him.muscles.force[2] - CARRIED == pytest.approx(spring * 0.004, abs=0.25)
-    him.muscles.wanted[:] = 100.0
+    him.muscles.reference[:] = 100.0
     for tick in range(400):
-        pull(him.muscles, him.past, him.tremor, handle, tick, PERIOD)
-    assert np.all(np.abs(him.muscles.force - him.muscles.weight) <= him.muscles.most + 1e-12)
+        compute_muscle_forces(him.muscles, him.displacement_history, him.tremor, handle, tick, PERIOD)
+    assert np.all(np.abs(him.muscles.force - him.muscles.weight) <= him.muscles.max_force + 1e-12)
 
 
 def test_same_seed_same_person():

@@ -7,13 +7,13 @@ from hypothesis import strategies as st
 
 from hydrotele.core.errors import InputError
 from hydrotele.machine.joystick import load_joystick
-from hydrotele.teleop.compliance import rotation_between, turn_matrix
+from hydrotele.teleop.compliance import quaternion_to_matrix, rotation_between
 from hydrotele.teleop.levitation import (
     diode_readings,
-    pose_of_readings,
     pose_resolution,
-    quaternion_of,
-    rotation_vector,
+    quaternion_to_vector,
+    solve_flotor_pose,
+    vector_to_quaternion,
 )
 
 JOYSTICK = load_joystick()
@@ -22,16 +22,14 @@ FAR, STEP = JOYSTICK.diodes.distance, JOYSTICK.diodes.step
 
 def turned(vector):
     out = np.empty((3, 3))
-    turn_matrix(quaternion_of(np.asarray(vector, float)), out)
+    quaternion_to_matrix(vector_to_quaternion(np.asarray(vector, float)), out)
     return out
 
 
 def apart(first, then):
     """Angle between two rotation matrices [rad]."""
     cosine = (np.trace(first.T @ then) - 1.0) / 2.0
-    return float(
-        np.linalg.norm((first.T @ then - then.T @ first)[[2, 0, 1], [1, 2, 0]]) / 2.0
-    ), cosine
+    return float(np.linalg.norm((first.T @ then - then.T @ first)[[2, 0, 1], [1, 2, 0]]) / 2.0), cosine
 
 
 PLACE = st.tuples(*[st.floats(-0.02, 0.02)] * 3)  # 5 mm at the handle and 7 deg on 0.12 m
@@ -41,7 +39,7 @@ TURN = st.tuples(*[st.floats(-0.07, 0.07)] * 3)
 @given(PLACE, TURN)
 def test_the_pose_comes_back_from_its_readings(place, vector):
     turn = turned(vector)
-    found, back = pose_of_readings(diode_readings(np.array(place), turn, FAR), FAR)
+    found, back = solve_flotor_pose(diode_readings(np.array(place), turn, FAR), FAR)
     # Newton ends below 1e-12 m and rad
     np.testing.assert_allclose(found, place, atol=1e-11)
     assert apart(turn, back)[0] < 1e-11
@@ -59,7 +57,7 @@ def test_steps_of_the_diodes_give_the_stated_resolution():
         place, vector = rng.uniform(-5e-3, 5e-3, 3), rng.uniform(-0.07, 0.07, 3)
         turn = turned(vector)
         readings = STEP * np.rint(diode_readings(place, turn, FAR) / STEP)
-        found, back = pose_of_readings(readings, FAR)
+        found, back = solve_flotor_pose(readings, FAR)
         skew = (back @ turn.T - turn @ back.T)[[2, 0, 1], [1, 2, 0]] / 2.0
         errors.append(np.concatenate([found - place, skew]))
     spread = np.std(errors, axis=0)
@@ -73,13 +71,13 @@ def test_beams_that_miss_and_readings_that_fit_no_pose():
     with pytest.raises(InputError, match="misses"):
         diode_readings(np.array([-0.2, 0.0, 0.0]), np.eye(3), FAR)
     with pytest.raises(InputError):
-        pose_of_readings(np.array([1.0, -1.0, 1.0, 1.0, -1.0, 1.0]), FAR)
-    place, turn = pose_of_readings(np.array([np.nan, 0, 0, 0, 0, 0]), FAR)
+        solve_flotor_pose(np.array([1.0, -1.0, 1.0, 1.0, -1.0, 1.0]), FAR)
+    place, turn = solve_flotor_pose(np.array([np.nan, 0, 0, 0, 0, 0]), FAR)
     assert np.isnan(place).all() and np.isnan(turn).all()
 
 
 def test_rotation_between_takes_the_shorter_way():
-    first = quaternion_of(np.array([0.0, 0.1, 0.0]))
-    scalar, vector = rotation_between(first, -quaternion_of(np.array([0.0, 0.3, 0.0])))
-    back = rotation_vector(np.array([scalar, *vector]))
+    first = vector_to_quaternion(np.array([0.0, 0.1, 0.0]))
+    scalar, vector = rotation_between(first, -vector_to_quaternion(np.array([0.0, 0.3, 0.0])))
+    back = quaternion_to_vector(np.array([scalar, *vector]))
     np.testing.assert_allclose(back, [0.0, 0.2, 0.0], atol=1e-12)

@@ -3,28 +3,28 @@
 import numpy as np
 import pytest
 
-from hydrotele.control.resolved_motion import arm_facts
-from hydrotele.control.servo import DriveReference, drive_tables
+from hydrotele.control.resolved_motion import arm_specification
+from hydrotele.control.servo import DriveReference, tabulate_drives
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.scenario.teleoperation import TeleopPilot
-from hydrotele.teleop.axis_table import flat_view, flattened
-from hydrotele.teleop.master import master
-from hydrotele.teleop.operator_model import Muscles
+from hydrotele.teleop.axis_table import flat_view, flatten_state
+from hydrotele.teleop.master import build_master
+from hydrotele.teleop.operator_model import NeuromuscularState
 from hydrotele.teleop.round_trip import (
-    QUIET,
-    SHARE,
-    Line,
+    PACKET_GAIN,
+    SILENT_TIME,
+    ChannelBuffers,
     MasterSide,
     SlaveSide,
-    to_the_hand,
-    to_the_machine,
+    step_master_side,
+    step_slave_side,
 )
-from hydrotele.teleop.slave import AGE, slave
+from hydrotele.teleop.slave import PACKET_AGE, build_slave
 
 CAT, STICK, PERIOD, FADE = load_machine("cat215", "bucket"), load_joystick(), 0.005, 0.2
 AXES = tuple(CAT.axes)
-COLUMNS = np.array([AXES.index(axis) for axis in arm_facts(CAT)[1]])
+COLUMNS = np.array([AXES.index(axis) for axis in arm_specification(CAT)[1]])
 HOME = np.array([CAT.home.get(CAT.axes[a].joint, 0.0) for a in AXES])
 
 
@@ -33,12 +33,11 @@ class RoundTrip:
 
     def __init__(self, forward=0, back=0, lost=(), ticks=400, **changed):
         pilot = TeleopPilot.model_validate(
-            {"kind": "teleop", "operator": {"kind": "follow"}, "reflection": "direct_force"}
-            | changed
+            {"kind": "teleop", "operator": {"kind": "follow"}, "reflection": "direct_force"} | changed
         )
-        self.m, self.ms = master(STICK, pilot, ("r", "theta", "z", "attitude"))
-        self.s, self.ss = slave(CAT, pilot, self.m, HOME[COLUMNS])
-        self.hand = flattened(Muscles(*(np.zeros(6) for _ in range(2)), np.full((3, 6), -1.0),
+        self.m, self.ms = build_master(STICK, pilot, ("r", "theta", "z", "attitude"))
+        self.s, self.ss = build_slave(CAT, pilot, self.m, HOME[COLUMNS])
+        self.hand = flatten_state(NeuromuscularState(*(np.zeros(6) for _ in range(2)), np.full((3, 6), -1.0),
                                       *(np.zeros(6) for _ in range(3)), np.zeros(1),
                                       *(np.zeros(6) for _ in range(2)), np.zeros(1),
                                       *(np.zeros(6) for _ in range(3))))  # fmt: skip
@@ -49,21 +48,21 @@ class RoundTrip:
         self.state = np.array([0.0, 1.0, PERIOD, pilot.safety.silence, FADE])
         self.qpos, self.force = np.array([0.0, 0, 0, 1, 0, 0, 0]), np.zeros(4)
         self.joint = HOME.copy()
-        self.grid, self.table = drive_tables(CAT, AXES)
+        self.grid, self.table = tabulate_drives(CAT, AXES)
         self.tick = 0
 
     def step(self, tripped=False):
         flat, k = flat_view, len(AXES)
         machine = SlaveSide(self.joint, self.force, COLUMNS, flat(self.s), flat(self.ss))
-        line = Line(self.forward, self.back, self.packet, self.age, self.state)
+        line = ChannelBuffers(self.forward, self.back, self.packet, self.age, self.state)
         operator = MasterSide(
             flat(self.m), flat(self.ms), self.qpos, flat(self.hand), np.zeros((2, 6)),
             np.zeros((8, 6)),
         )  # fmt: skip
-        to_the_hand(self.tick, True, PERIOD, tripped, machine, line, operator)
+        step_master_side(self.tick, True, PERIOD, tripped, machine, line, operator)
         reference, rate = np.zeros(k), np.zeros(k)
         drive = DriveReference(*(np.zeros(k) for _ in range(4)))
-        to_the_machine(self.tick, machine, line, self.grid, self.table, 1.0, reference, rate, drive)
+        step_slave_side(self.tick, machine, line, self.grid, self.table, 1.0, reference, rate, drive)
         self.tick += 1
         return self
 
@@ -100,15 +99,15 @@ def test_silence_fades_the_force_and_is_forgotten_when_packets_come(late):
     silent = round(line.state[3] / PERIOD) - 1  # the sum of periods may round up
     for _ in range(100 + silent):
         line.step()
-    assert line.packet[0, 2] == 1e4 and line.state[SHARE] == pytest.approx(1.0)
+    assert line.packet[0, 2] == 1e4 and line.state[PACKET_GAIN] == pytest.approx(1.0)
     for _ in range(round(FADE / PERIOD)):
         line.step()
-    assert line.state[SHARE] == pytest.approx(np.exp(-1.0), rel=0.06)
+    assert line.state[PACKET_GAIN] == pytest.approx(np.exp(-1.0), rel=0.06)
     assert abs(line.ms.push[2]) < 0.45 * 1e4 * 2e-4
     while line.tick < 260:
         line.step()
-    assert line.state[QUIET] == 0.0 and line.ss.flags[AGE] == 0.0
-    assert line.state[SHARE] > 0.7
+    assert line.state[SILENT_TIME] == 0.0 and line.ss.flags[PACKET_AGE] == 0.0
+    assert line.state[PACKET_GAIN] > 0.7
 
 
 def test_a_machine_that_tripped_lets_the_hand_go():

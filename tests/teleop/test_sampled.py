@@ -8,23 +8,23 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.teleop.analysis import gain_margin, load_teleop_case
-from hydrotele.teleop.round_trip import ages_of, arrivals, load_delays
+from hydrotele.teleop.round_trip import compute_arriving_ages, compute_packet_ages, load_delays
 from hydrotele.teleop.sampled import (
-    PASSIVITY,
+    PASSIVITY_STRUCTURE,
     SAMPLED_STRUCTURES,
-    WAVE,
+    WAVE_STRUCTURE,
     PacketAges,
+    constant_delay_ages,
     growth_rate,
     jitter_gain,
-    jittering_line,
-    predict,
-    steady_line,
+    measured_delay_ages,
+    predict_stability,
 )
-from hydrotele.teleop.sampled_run import kick
+from hydrotele.teleop.sampled_run import simulate_kick
 from hydrotele.teleop.two_port import STRUCTURES, Impedance
 from tools.studies import stability_study
 
-CASE = load_teleop_case().case()
+CASE = load_teleop_case().to_axis()
 PERIOD = 0.005
 
 
@@ -39,9 +39,9 @@ def jitter(seed, mean, count, lost=0.02):
 def test_fine_sampling_gives_the_margin_of_the_continuous_loop(structure):
     """2 %: half a period of hold and half one of differences, of delays of 20 ms each way."""
     period = 2e-4
-    line = steady_line(period, CASE.delay_forward, CASE.delay_back)
+    line = constant_delay_ages(period, CASE.delay_forward, CASE.delay_back)
     margin = gain_margin(CASE, structure)
-    told = [predict(CASE, structure, line, k * margin).stable for k in (0.98, 1.02)]
+    told = [predict_stability(CASE, structure, line, k * margin).is_stable for k in (0.98, 1.02)]
     assert told == [True, False]
 
 
@@ -87,7 +87,7 @@ def spectral_rate(case, period, forward, back):
 @pytest.mark.parametrize("force", [0.02, 0.2])
 def test_growth_is_that_of_a_periods_matrix(forward, back, force):
     case = replace(CASE, gains=replace(CASE.gains, force=force))
-    line = steady_line(PERIOD, forward * PERIOD, back * PERIOD)
+    line = constant_delay_ages(PERIOD, forward * PERIOD, back * PERIOD)
     exact = spectral_rate(case, PERIOD, forward, back)
     # the rate is bisected to 1e-3 of it
     assert growth_rate(case, "position_force", line) == pytest.approx(exact, rel=3e-3, abs=3e-3)
@@ -123,8 +123,8 @@ def test_a_line_of_waves_gives_no_energy_whatever_its_jitter(seed):
     case = replace(CASE, hand=Impedance()) if seed == 0 else CASE
     period = 0.001 if seed == 0 else PERIOD
     delays = [jitter((seed, way), 0.1, round(20.0 / period)) for way in range(2)]
-    run = kick(case, WAVE, period, *delays)
-    assert not run.grows and run.dies_out
+    run = simulate_kick(case, WAVE_STRUCTURE, period, *delays)
+    assert not run.is_growing and run.has_decayed
     assert run.line_energy.min() > -1e-12
 
 
@@ -133,36 +133,36 @@ def test_passivity_control_holds_a_line_that_is_unstable_without(hand):
     """Without, it grows; with it, the line gives no more than its trickle, 0.01 mW for 30 s."""
     case = replace(CASE, hand=CASE.hand if hand else Impedance())
     delays = [jitter((7, way), 0.1, 6000) for way in range(2)]
-    line = jittering_line(PERIOD, *delays)
-    assert growth_rate(case, PASSIVITY, line) > 1.0
-    run = kick(case, PASSIVITY, PERIOD, *delays)
-    assert not run.grows
+    line = measured_delay_ages(PERIOD, *delays)
+    assert growth_rate(case, PASSIVITY_STRUCTURE, line) > 1.0
+    run = simulate_kick(case, PASSIVITY_STRUCTURE, PERIOD, *delays)
+    assert not run.is_growing
     assert run.line_energy.min() > -3.1e-4  # and what a hand adds within a period, of 11 mJ
 
 
 def test_jitter_is_noise_and_a_steady_line_is_none():
     delays = [jitter((3, way), 0.04, 8000, 0.0) for way in range(2)]
-    line = jittering_line(PERIOD, *delays)
-    steady = steady_line(PERIOD, *line.mean)
-    assert jitter_gain(CASE, WAVE, steady) < 1e-9 < jitter_gain(CASE, WAVE, line)
+    line = measured_delay_ages(PERIOD, *delays)
+    steady = constant_delay_ages(PERIOD, *line.mean_ages)
+    assert jitter_gain(CASE, WAVE_STRUCTURE, steady) < 1e-9 < jitter_gain(CASE, WAVE_STRUCTURE, line)
 
 
 def test_lost_and_overtaken_packets():
     delays = np.array([1, 1, -1, 0, 4, 0, 0])
-    assert ages_of(delays).tolist() == [1, 1, 1, 0, 1, 0, 0]
-    assert arrivals(delays).tolist() == [4, 1, 1, 0, -1, 0, 0]
-    assert set(arrivals(np.full(9, 3)).tolist()) == {3}  # a steady line: one packet every period
+    assert compute_packet_ages(delays).tolist() == [1, 1, 1, 0, 1, 0, 0]
+    assert compute_arriving_ages(delays).tolist() == [4, 1, 1, 0, -1, 0, 0]
+    assert set(compute_arriving_ages(np.full(9, 3)).tolist()) == {3}  # a steady line: one packet every period
 
 
 def test_shares_of_ages():
-    line = jittering_line(0.01, np.array([0.01] * 10), np.array([0.0, 0.02] * 50))
+    line = measured_delay_ages(0.01, np.array([0.01] * 10), np.array([0.0, 0.02] * 50))
     assert line.forward.tolist() == [0.0, 1.0]
     assert line.back.tolist() == pytest.approx([0.5, 0.5], abs=0.02)
-    assert line.mean == pytest.approx((0.01, 0.005), abs=2e-4)
+    assert line.mean_ages == pytest.approx((0.01, 0.005), abs=2e-4)
     with pytest.raises(InputError, match="sum to 1"):
         PacketAges(0.01, np.array([0.5]), np.array([1.0]))
     with pytest.raises(InputError, match="no packet arrives"):
-        jittering_line(0.01, np.full(5, np.nan), np.zeros(5))
+        measured_delay_ages(0.01, np.full(5, np.nan), np.zeros(5))
 
 
 def test_measured_delays(tmp_path):
@@ -185,5 +185,5 @@ def test_measured_delays(tmp_path):
 
 def test_unknown_structures():
     with pytest.raises(InputError, match="not known"):
-        predict(CASE, "telepathy", steady_line(PERIOD, 0.0, 0.0))
+        predict_stability(CASE, "telepathy", constant_delay_ages(PERIOD, 0.0, 0.0))
     assert set(STRUCTURES) < set(SAMPLED_STRUCTURES)

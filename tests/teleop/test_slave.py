@@ -3,20 +3,20 @@
 import numpy as np
 import pytest
 
-from hydrotele.control.resolved_motion import arm_facts, pose_to_joints
+from hydrotele.control.resolved_motion import arm_specification, pose_to_joints
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.scenario.scenario import Pose
 from hydrotele.scenario.teleoperation import TeleopPilot
 from hydrotele.teleop.axis_table import flat_view
-from hydrotele.teleop.master import master
+from hydrotele.teleop.master import build_master
 from hydrotele.teleop.slave import (
-    BLOCKED,
-    SILENT,
-    TRIPPED,
-    measure_task,
-    slave,
-    slave_step,
+    HELD_AT_EDGE,
+    NO_PACKETS,
+    VALVES_CLOSED,
+    build_slave,
+    measure_tip,
+    step_slave,
     unpack_slave,
     unpack_slave_state,
 )
@@ -40,20 +40,20 @@ class Side:
         })  # fmt: skip
         here = {axis: CAT.home.get(CAT.axes[axis].joint, 0.0) for axis in CAT.axes}
         there = pose_to_joints(CAT, start or Pose(r=6.0, z=1.4, attitude=-1.745), here)
-        joints = np.array([there[axis] for axis in arm_facts(CAT)[1]])
-        self.master = master(STICK, pilot, NAMES)[0]
-        self.numbers, self.s = slave(CAT, pilot, self.master, joints)
+        joints = np.array([there[axis] for axis in arm_specification(CAT)[1]])
+        self.master = build_master(STICK, pilot, NAMES)[0]
+        self.numbers, self.s = build_slave(CAT, pilot, self.master, joints)
         self.packet, self.force = np.zeros((3, 6)), np.zeros(4)
         self.pose, self.rate, self.joint, self.held = [], [], [], []
 
     def go(self, seconds, arrived=True):
         for _ in range(round(seconds / PERIOD)):
             s = self.s
-            slave_step(self.numbers, self.packet, arrived, self.force, s.joint, PERIOD, s)
+            step_slave(self.numbers, self.packet, arrived, self.force, s.joint, PERIOD, s)
             self.pose.append(s.pose.copy())
             self.rate.append(s.rate.copy())
             self.joint.append(s.joint.copy())
-            self.held.append(s.flags[BLOCKED] > 0.0)
+            self.held.append(s.flags[HELD_AT_EDGE] > 0.0)
         return self
 
     def check_continuous(self):
@@ -114,12 +114,12 @@ def test_silence_stops_it_and_packets_bring_it_back_without_a_jump(mode, kind):
     assert abs(side.s.rate[2]) > 0.05
     silence = side.numbers.limits[0]
     side.go(silence + SPEED / ACCELERATION + 2 * PERIOD, arrived=False)
-    assert side.s.flags[SILENT] == 1.0 and np.all(side.s.rate == 0.0)
+    assert side.s.flags[NO_PACKETS] == 1.0 and np.all(side.s.rate == 0.0)
     stood = side.s.pose.copy()
     side.go(2.0, arrived=False)
     np.testing.assert_array_equal(side.s.pose, stood)
     side.go(3.0)
-    assert side.s.flags[SILENT] == 0.0
+    assert side.s.flags[NO_PACKETS] == 0.0
     if (mode, kind) == ("position", "none"):
         assert side.s.pose[2] - side.numbers.start[2] == pytest.approx(0.3, abs=1e-4)
     side.check_continuous()
@@ -147,12 +147,12 @@ def test_out_of_reach_it_stands_at_the_edge_and_comes_back(mode):
     side.packet[0, 0] = 5e-3
     side.go(8.0)
     edge = side.s.pose.copy()
-    assert side.s.flags[BLOCKED] == 1.0 and np.all(side.s.joint_rate == 0.0)
+    assert side.s.flags[HELD_AT_EDGE] == 1.0 and np.all(side.s.joint_rate == 0.0)
     side.go(1.0)
     np.testing.assert_allclose(side.s.pose, edge, atol=SPEED * PERIOD)
     side.packet[0, 0] = -5e-3
     side.go(2.0)
-    assert side.s.flags[BLOCKED] == 0.0 and side.s.pose[0] < edge[0] - 0.3
+    assert side.s.flags[HELD_AT_EDGE] == 0.0 and side.s.pose[0] < edge[0] - 0.3
     assert np.abs(np.diff(side.joint, axis=0)).max() < 0.03
 
 
@@ -161,16 +161,16 @@ def test_a_joint_that_does_not_follow_trips(wrong):
     side = Side()
     joint = side.s.joint.copy()
     joint[1] += wrong
-    slave_step(side.numbers, side.packet, True, side.force, joint, PERIOD, side.s)
-    assert side.s.flags[TRIPPED] == 1.0
-    slave_step(side.numbers, side.packet, True, side.force, side.s.joint, PERIOD, side.s)
-    assert side.s.flags[TRIPPED] == 1.0  # for good
+    step_slave(side.numbers, side.packet, True, side.force, joint, PERIOD, side.s)
+    assert side.s.flags[VALVES_CLOSED] == 1.0
+    step_slave(side.numbers, side.packet, True, side.force, side.s.joint, PERIOD, side.s)
+    assert side.s.flags[VALVES_CLOSED] == 1.0  # for good
 
 
 def test_a_reading_that_is_none_leaves_the_measured_pose():
     side = Side()
     before = side.s.measured.copy()
-    measure_task(side.numbers, np.full(4, np.nan), True, PERIOD, side.s)
+    measure_tip(side.numbers, np.full(4, np.nan), True, PERIOD, side.s)
     np.testing.assert_array_equal(side.s.measured, before)
 
 

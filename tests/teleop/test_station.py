@@ -11,7 +11,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.logs.log import load_log, save_log
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.run.replay import replay_log
-from hydrotele.run.run import begin, run_scenario
+from hydrotele.run.run import run_scenario, start_session
 from hydrotele.scenario.scenario import Scenario
 from hydrotele.teleop.axis_table import (
     COUPLING,
@@ -19,10 +19,10 @@ from hydrotele.teleop.axis_table import (
     DAMPING,
     DEADBAND,
     GAIN,
-    REFLECTED_MOST,
+    MAX_REFLECTED_FORCE,
 )
-from hydrotele.teleop.levitation import rotation_vector
-from hydrotele.teleop.master import master
+from hydrotele.teleop.levitation import quaternion_to_vector
+from hydrotele.teleop.master import build_master
 
 PERIOD = 0.005
 REFLECTIONS = (
@@ -52,13 +52,13 @@ def scenario(duration=4.0, plate=None, z=0.40, sensors="ideal", **pilot) -> Scen
 
 
 def numbers_of(run):
-    return master(load_joystick(), run.scenario.pilot, run.station.coordinates)[0]
+    return build_master(load_joystick(), run.scenario.pilot, run.station.coordinates)[0]
 
 
 def check_sound(run, speeds=SPEEDS):
     """Finite, no trip, and task references that keep to speed and acceleration."""
     log = run.station.log
-    assert np.isfinite(run.plan.reference).all() and not run.station.tripped
+    assert np.isfinite(run.plan.reference).all() and not run.station.valves_closed
     pose, rate = log.slave("pose"), log.slave("rate")
     for c, name in enumerate(run.station.coordinates):
         assert np.abs(np.diff(pose[:, c])).max() <= speeds[name] * PERIOD + 1e-9
@@ -103,7 +103,7 @@ def test_direct_force_is_ratio_times_force():
     """The coils push ratio times the force at the tip, less spring and damper of the handle."""
     run = run_scenario(scenario(plate={}, reflection="direct_force", ratio=1e-4))
     log, row = run.station.log, numbers_of(run).axis[2]
-    counted = np.clip(log.force[:, 2], -row[REFLECTED_MOST], row[REFLECTED_MOST])
+    counted = np.clip(log.force[:, 2], -row[MAX_REFLECTED_FORCE], row[MAX_REFLECTED_FORCE])
     wanted = 1e-4 * counted - row[0] * log.master("handle")[:, 2]
     wanted -= row[DAMPING] * log.master("speed")[:, 2]
     np.testing.assert_allclose(log.master("push")[:, 2], wanted, atol=1e-9)
@@ -111,9 +111,7 @@ def test_direct_force_is_ratio_times_force():
 
 
 def test_coordinating_force_against_the_reference_is_what_the_machine_lags():
-    run = run_scenario(
-        scenario(plate={}, reflection="coordinating_force", coordinating="reference")
-    )
+    run = run_scenario(scenario(plate={}, reflection="coordinating_force", coordinating="reference"))
     log, row = run.station.log, numbers_of(run).axis[2]
     start = log.slave("pose")[0, 2]
     pose, seen = log.slave("pose")[:, 2] - start, log.slave("measured")[:, :, 2]
@@ -183,9 +181,7 @@ def test_a_trace_of_measured_delays(tmp_path):
     steady = run_scenario(scenario(2.0, channel={"delay_forward": 0.05, "delay_back": 0.1}))
     case = scenario(2.0, channel={"trace": str(tmp_path / "delays.csv")})
     traced = run_scenario(case)
-    np.testing.assert_array_equal(
-        steady.station.log.slave("pose"), traced.station.log.slave("pose")
-    )
+    np.testing.assert_array_equal(steady.station.log.slave("pose"), traced.station.log.slave("pose"))
     (tmp_path / "delays.csv").write_text("forward,back\n,0.1\n", "utf-8")
     with pytest.raises(InputError, match="all packets of one direction are lost"):
         run_scenario(case)
@@ -272,15 +268,15 @@ def worked(duration, **pilot):
     Of MuJoCo: the work of the muscles, which are held for a period, less what the hand's own
     spring, damper and mass have taken; only the speed within a period is a mean.
     """
-    session = begin(scenario(duration, **pilot))
+    session = start_session(scenario(duration, **pilot))
     flotor, joystick = session.station._flotor, load_joystick()
     hand, data = joystick.hand, flotor.data
     true, told, before, turn = [0.0], [0.0], np.zeros(3), np.zeros(3)
-    while session.tick < session.scenario.ticks:
+    while session.tick < session.scenario.tick_count:
         place = data.qpos[:3].copy()
         session.advance()
         speed = (data.qpos[:3] - place) / PERIOD
-        turn, turned = rotation_vector(data.qpos[3:7]), turn
+        turn, turned = quaternion_to_vector(data.qpos[3:7]), turn
         spin = (turn - turned) / PERIOD
         force = session.station.operator.muscles.force[:3].copy()
         force[2] -= 9.81 * hand.mass
@@ -340,7 +336,7 @@ def test_frozen_sensor_closes_the_valves(channel, force):
         3.0, sensors="khoshzaban1992", force=force, faults=[{"channel": channel, "at": 1.0}], z=1.4,
         operator={"kind": "follow", "time": [0, 3], "path": {"z": [0.003, 0.003]}},
     ))  # fmt: skip
-    assert run.station.tripped
+    assert run.station.valves_closed
     commands = np.column_stack([run.measured[f"command.{a}"] for a in run.plant.axes])
     moving = np.flatnonzero(np.any(commands != 0.0, axis=1))
     assert run.measured.time[moving[-1]] < 1.0 + 0.5 + 0.1 + 0.05
@@ -374,10 +370,7 @@ def test_a_dead_line_stops_the_machine_softly(mode):
 def test_half_of_the_packets_do_as_well():
     """A held packet now and then is no jump; the tip comes 2 cm near where it comes with all."""
     hand = {"kind": "follow", "time": [0, 3], "path": {"z": [0.003, 0.003]}}
-    whole, half = (
-        run_scenario(scenario(3.0, z=1.4, operator=hand, channel={"lost": lost}))
-        for lost in (0.0, 0.5)
-    )
+    whole, half = (run_scenario(scenario(3.0, z=1.4, operator=hand, channel={"lost": lost})) for lost in (0.0, 0.5))
     check_sound(half)
     ends = [run.station.log.slave("pose")[-1, 2] for run in (whole, half)]
     assert ends[0] == pytest.approx(ends[1], abs=0.02)
@@ -390,7 +383,7 @@ def test_steered_out_of_reach_it_stands_at_the_edge():
     data["start"] = {"pose": {"r": 7.4, "z": 1.4, "attitude": -1.2}}
     run = run_scenario(Scenario.model_validate(data))
     assert any("edge of the workspace" in note for note in run.summary["notes"])
-    assert not run.station.tripped
+    assert not run.station.valves_closed
     pose = run.station.log.slave("pose")[:, 0]
     assert np.abs(np.diff(pose)).max() < SPEEDS["r"] * PERIOD + 1e-9
     assert pose[-1] < pose.max() - 0.2

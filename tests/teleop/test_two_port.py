@@ -6,21 +6,21 @@ import numpy as np
 import pytest
 
 from hydrotele.core.errors import InputError
-from hydrotele.teleop.analysis import Case
-from hydrotele.teleop.findings import agreement, impulse_response, is_growing, simulate_sine
+from hydrotele.teleop.analysis import TeleoperatorAxis
+from hydrotele.teleop.findings import compare_stability, is_growing, simulate_impulse, simulate_sine
 from hydrotele.teleop.two_port import (
     STRUCTURES,
-    Gains,
     Impedance,
-    characteristic,
-    hybrid,
+    StructureGains,
+    characteristic_function,
+    count_unstable_poles,
+    count_unstable_poles_held,
+    hybrid_matrix,
+    is_stable,
+    make_two_port,
     scattering_norm,
-    stable,
     stiffness_margin,
-    transmitted,
-    two_port,
-    unstable_held,
-    unstable_poles,
+    transmitted_impedance,
 )
 
 MASTER, SLAVE = Impedance(0.8, 0.5), Impedance(2.0, 3.0)
@@ -30,46 +30,53 @@ S = 1j * np.geomspace(0.05, 200.0, 60)
 
 
 def test_transparent_under_position_control():
-    port = two_port("four_channel_position", MASTER, SLAVE, CM, CS)
-    assert np.allclose(hybrid(port, S), [[0.0, 1.0], [-1.0, 0.0]])
-    assert np.allclose(transmitted(port, S, TASK), TASK(S))
+    port = make_two_port("four_channel_position", MASTER, SLAVE, CM, CS)
+    assert np.allclose(hybrid_matrix(port, S), [[0.0, 1.0], [-1.0, 0.0]])
+    assert np.allclose(transmitted_impedance(port, S, TASK), TASK(S))
 
 
 def test_transparent_under_rate_control_needs_jerk():
     kv = 1.7
-    port = two_port("four_channel_rate", SLAVE, SLAVE, CS, CS, Gains(velocity=kv), jerk=True)
-    found = hybrid(port, S)
+    port = make_two_port("four_channel_rate", SLAVE, SLAVE, CS, CS, StructureGains(velocity=kv), jerk=True)
+    found = hybrid_matrix(port, S)
     assert np.allclose(found[:, 0, 1], S / kv) and np.allclose(found[:, 1, 0], -kv / S)
     assert np.allclose(found[:, [0, 1], [0, 1]], 0.0, atol=1e-6)
-    assert np.allclose(transmitted(port, S, TASK), TASK(S))
+    assert np.allclose(transmitted_impedance(port, S, TASK), TASK(S))
     # the form without jerk leaves the master itself (Zhu 1994, 3.61)
-    port = two_port("four_channel_rate", SLAVE, SLAVE, CS, CS, Gains(velocity=kv))
-    assert np.allclose(transmitted(port, S, TASK), SLAVE(S) + TASK(S))
+    port = make_two_port("four_channel_rate", SLAVE, SLAVE, CS, CS, StructureGains(velocity=kv))
+    assert np.allclose(transmitted_impedance(port, S, TASK), SLAVE(S) + TASK(S))
 
 
 @pytest.mark.parametrize("structure", STRUCTURES)
 def test_the_transmitted_impedance_is_that_of_the_thesis(structure):
-    port = two_port(
-        structure, MASTER, SLAVE, CM, CS, Gains(0.8, 1.3, 0.6), delay_forward=0.03, delay_back=0.07
+    port = make_two_port(
+        structure,
+        MASTER,
+        SLAVE,
+        CM,
+        CS,
+        StructureGains(0.8, 1.3, 0.6),
+        delay_forward=0.03,
+        delay_back=0.07,
     )
     c1, c2, c3, c4 = port.channels(S)
     near, far, task = MASTER(S) + port.master_control(S), SLAVE(S) + CS(S), TASK(S)
     over = near * far + c1 * c4 + task * (near + c1 * c2)
-    assert np.allclose(transmitted(port, S, TASK), over / (far - c3 * c4 + task * (1.0 - c2 * c3)))
+    assert np.allclose(transmitted_impedance(port, S, TASK), over / (far - c3 * c4 + task * (1.0 - c2 * c3)))
     # the loop's poles are where hand and transmitted impedance cancel
-    whole = (HAND(S) + transmitted(port, S, TASK)) * (far - c3 * c4 + task * (1.0 - c2 * c3))
-    assert np.allclose(characteristic(port, S, HAND, TASK), whole)
+    whole = (HAND(S) + transmitted_impedance(port, S, TASK)) * (far - c3 * c4 + task * (1.0 - c2 * c3))
+    assert np.allclose(characteristic_function(port, S, HAND, TASK), whole)
 
 
 def test_passivity_is_lost_by_delay_and_by_rate_control():
     """Position-position with equal controllers is a spring and damper between two masses."""
     slow = 1j * np.geomspace(0.05, 50.0, 80)
-    passive = two_port("position_position", MASTER, SLAVE, CS, CS)
+    passive = make_two_port("position_position", MASTER, SLAVE, CS, CS)
     assert scattering_norm(passive, slow).max() < 1.0 + 1e-9
     for changed in (
-        two_port("position_position", MASTER, SLAVE, CS, CS, delay_forward=0.1, delay_back=0.1),
-        two_port("rate_position", MASTER, SLAVE, CS, CS),
-        two_port("position_force", MASTER, SLAVE, CM, CS),
+        make_two_port("position_position", MASTER, SLAVE, CS, CS, delay_forward=0.1, delay_back=0.1),
+        make_two_port("rate_position", MASTER, SLAVE, CS, CS),
+        make_two_port("position_force", MASTER, SLAVE, CM, CS),
     ):
         assert scattering_norm(changed, slow).max() > 1.001
     # whether a norm is above 1 does not depend on the unit
@@ -80,14 +87,14 @@ def test_passivity_is_lost_by_delay_and_by_rate_control():
 def test_poles_are_those_of_a_polynomial():
     """Position-force without delay: a polynomial whose roots numpy finds."""
     for force in (0.1, 1.0, 3.0, 10.0, 40.0):
-        port = two_port("position_force", MASTER, SLAVE, CM, CS, Gains(force=force))
+        port = make_two_port("position_force", MASTER, SLAVE, CM, CS, StructureGains(force=force))
         near = np.array([MASTER.mass + HAND.mass, MASTER.damping + CM.damping + HAND.damping,
                          CM.stiffness + HAND.stiffness])  # fmt: skip
         far = np.array([SLAVE.mass, SLAVE.damping + CS.damping + TASK.damping,
                         CS.stiffness + TASK.stiffness])  # fmt: skip
         cross = force * np.polymul([TASK.damping, TASK.stiffness], [CS.damping, CS.stiffness])
         roots = np.roots(np.polyadd(np.polymul(near, far), cross))
-        assert unstable_poles(port, HAND, TASK) == int(np.sum(roots.real > 0))
+        assert count_unstable_poles(port, HAND, TASK) == int(np.sum(roots.real > 0))
 
 
 @pytest.mark.parametrize("structure", STRUCTURES)
@@ -96,23 +103,23 @@ def test_what_is_felt_in_a_sine_sweep(structure, turns):
     """Force over velocity of an imposed sine of some turns a second, within the 3 % asked for."""
     w = 2.0 * np.pi * turns
     for delay in (0.0, 0.05):
-        case = Case(MASTER, SLAVE, CM, CS, HAND, TASK, Gains(1.0, 0.4, 0.4), delay, delay)
-        if unstable_held(case.port(structure), TASK):
+        case = TeleoperatorAxis(MASTER, SLAVE, CM, CS, HAND, TASK, StructureGains(1.0, 0.4, 0.4), delay, delay)
+        if count_unstable_poles_held(case.make_port(structure), TASK):
             assert structure == "four_channel_position" and delay  # nothing settles then
             continue
-        expected = transmitted(case.port(structure), 1j * w, TASK)
+        expected = transmitted_impedance(case.make_port(structure), 1j * w, TASK)
         assert abs(simulate_sine(case, structure, w) - expected) < 0.03 * abs(expected)
 
 
 @pytest.mark.parametrize("structure", STRUCTURES)
 def test_predicted_stability_is_that_of_a_simulation(structure):
     """A grid of delays and of gains that reaches both kinds; at least the 95 % asked for."""
-    case = Case(MASTER, SLAVE, CM, CS, HAND, TASK, Gains(1.0, 0.7, 0.5))
+    case = TeleoperatorAxis(MASTER, SLAVE, CM, CS, HAND, TASK, StructureGains(1.0, 0.7, 0.5))
     delays, factors = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4]), np.geomspace(0.03, 30.0, 7)
-    found = agreement(case, structure, delays, factors)
-    wrong = np.argwhere(found.predicted != found.seen)
-    assert found.share >= 0.95, wrong
-    assert 0.1 < np.mean(found.seen) < 0.95  # both kinds are there
+    found = compare_stability(case, structure, delays, factors)
+    wrong = np.argwhere(found.predicted != found.simulated)
+    assert found.agreement_fraction >= 0.95, wrong
+    assert 0.1 < np.mean(found.simulated) < 0.95  # both kinds are there
 
 
 @pytest.mark.parametrize(
@@ -128,12 +135,9 @@ def test_predicted_stability_over_the_gains_themselves(structure, gains):
     """The same where not the reflection but the force gain or the velocity gain changes."""
     agree = []
     for gain, delay in itertools.product(gains, (0.0, 0.02, 0.05, 0.1, 0.2, 0.4)):
-        own = Gains(velocity=gain) if "rate" in structure else Gains(force=gain)
-        case = Case(MASTER, SLAVE, CM, CS, HAND, TASK, own, delay, delay)
-        agree.append(
-            stable(case.port(structure), HAND, TASK)
-            != is_growing(impulse_response(case, structure))
-        )
+        own = StructureGains(velocity=gain) if "rate" in structure else StructureGains(force=gain)
+        case = TeleoperatorAxis(MASTER, SLAVE, CM, CS, HAND, TASK, own, delay, delay)
+        agree.append(is_stable(case.make_port(structure), HAND, TASK) != is_growing(simulate_impulse(case, structure)))
     assert np.mean(agree) >= 0.95
 
 
@@ -156,11 +160,11 @@ def test_the_theorem_of_stiffness_feedback_holds_where_stiffness_jumps():
 
 def test_nonsense_is_refused():
     with pytest.raises(InputError, match="not known"):
-        two_port("telepathy", MASTER, SLAVE, CM, CS)
+        make_two_port("telepathy", MASTER, SLAVE, CM, CS)
     with pytest.raises(InputError, match="delays"):
-        two_port("rate_force", MASTER, SLAVE, CM, CS, delay_back=-0.1)
+        make_two_port("rate_force", MASTER, SLAVE, CM, CS, delay_back=-0.1)
     with pytest.raises(InputError, match="velocity gain"):
-        two_port("rate_force", MASTER, SLAVE, CM, CS, Gains(velocity=0.0))
+        make_two_port("rate_force", MASTER, SLAVE, CM, CS, StructureGains(velocity=0.0))
     light = Impedance(0.0, 1.0, 1.0)
     with pytest.raises(InputError, match="masses"):
-        stable(two_port("position_position", light, light, CM, CS), light, light)
+        is_stable(make_two_port("position_position", light, light, CM, CS), light, light)

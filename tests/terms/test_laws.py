@@ -22,19 +22,19 @@ from hydrotele.terms.law import (
     law,
 )
 from hydrotele.terms.table import (
-    ANY,
+    ANY_DRIVE,
     COMMAND,
     FLOW_HEAD,
     FLOW_ROD,
     FLOW_SUPPLY,
     FORCE,
     NO_TERMS,
-    acts_on,
-    added,
-    added_flows,
-    added_with_slope,
-    remember,
+    has_term,
+    sum_flow_terms,
+    sum_terms,
+    sum_terms_with_slope,
     terms_table,
+    update_term_state,
 )
 
 STATE = DriveState(
@@ -95,12 +95,10 @@ def test_every_law_of_the_package_is_tried_here():
 def test_compiled_laws_are_those_by_hand(name):
     table = terms_table([force_term(name, USED[name])], ["a"])
     # smoothing of the orifice over its pressure drop squared: 1e-4 / 4
-    assert added(table, FORCE, 0, STATE, NO_DRIVES) == pytest.approx(
-        by_hand(name, USED[name]), rel=3e-5
-    )
-    assert added(table, FORCE, 1, STATE, NO_DRIVES) == 0.0, "another axis"
-    assert added(table, FLOW_ROD, 0, STATE, NO_DRIVES) == 0.0, "another balance"
-    assert added(NO_TERMS, FORCE, 0, STATE, NO_DRIVES) == 0.0
+    assert sum_terms(table, FORCE, 0, STATE, NO_DRIVES) == pytest.approx(by_hand(name, USED[name]), rel=3e-5)
+    assert sum_terms(table, FORCE, 1, STATE, NO_DRIVES) == 0.0, "another axis"
+    assert sum_terms(table, FLOW_ROD, 0, STATE, NO_DRIVES) == 0.0, "another balance"
+    assert sum_terms(NO_TERMS, FORCE, 0, STATE, NO_DRIVES) == 0.0
 
 
 @pytest.mark.parametrize("text", [
@@ -119,7 +117,7 @@ def test_basic_functions_of_formulas(text):
     }  # fmt: skip
     table = terms_table([force_term("formula", {text: -2.5})], ["a"])
     expected = -2.5 * eval(text, functions, s)
-    assert added(table, FORCE, 0, STATE, NO_DRIVES) == pytest.approx(expected, rel=1e-12)
+    assert sum_terms(table, FORCE, 0, STATE, NO_DRIVES) == pytest.approx(expected, rel=1e-12)
     assert expected != 0.0
 
 
@@ -128,7 +126,7 @@ def test_terms_add_up_and_know_their_slopes():
         force_term("quadratic_drag", {"coefficient": 40.0}),
         force_term("constant", USED["constant"]),
     ]
-    value, slope = added_with_slope(terms_table(terms, ["a"]), FORCE, 0, STATE, NO_DRIVES)
+    value, slope = sum_terms_with_slope(terms_table(terms, ["a"]), FORCE, 0, STATE, NO_DRIVES)
     assert value == pytest.approx(12.0 + 40.0 * 0.21**2)
     assert slope == pytest.approx(-80.0 * 0.21, rel=1e-4)  # a forward difference of 1e-6
     leak = [
@@ -136,7 +134,7 @@ def test_terms_add_up_and_know_their_slopes():
              parameters={"flow_gain": k, "smoothing": 1e3})
         for b, k in (("flow_rod", 1e-8), ("flow_head", -1e-8))
     ]  # fmt: skip
-    head, rod, by_head, by_rod = added_flows(terms_table(leak, ["a"]), 0, STATE, NO_DRIVES)
+    head, rod, by_head, by_rod = sum_flow_terms(terms_table(leak, ["a"]), 0, STATE, NO_DRIVES)
     assert -head == rod == pytest.approx(1e-8 * math.sqrt(5e6))
     exact = -0.5e-8 / math.sqrt(5e6)
     assert [by_head, by_rod] == pytest.approx([exact, exact], rel=1e-4)  # differences of 100 Pa
@@ -151,26 +149,30 @@ def test_balances_and_drives_that_terms_act_on():
     told = {
         (balance, drive)
         for balance in (FORCE, FLOW_HEAD, FLOW_ROD, COMMAND, FLOW_SUPPLY)
-        for drive in (0, 1, 2, ANY)
-        if acts_on(table, balance, drive)
+        for drive in (0, 1, 2, ANY_DRIVE)
+        if has_term(table, balance, drive)
     }
-    assert told == {(FORCE, 0), (FORCE, 1), (FORCE, ANY), (FLOW_ROD, 1), (FLOW_ROD, ANY)}
-    assert not acts_on(NO_TERMS, FORCE, ANY)
+    assert told == {
+        (FORCE, 0),
+        (FORCE, 1),
+        (FORCE, ANY_DRIVE),
+        (FLOW_ROD, 1),
+        (FLOW_ROD, ANY_DRIVE),
+    }
+    assert not has_term(NO_TERMS, FORCE, ANY_DRIVE)
 
 
 def test_beyond_its_domain_a_variable_counts_with_the_nearer_end():
     law_ = ("formula", {"velocity": 1.0, "position": 10.0})
     bounded = force_term(*law_, domain={"velocity": (-0.1, 0.1), "position": (0.0, 1.0)})
     table = terms_table([bounded], ["a"])
-    assert added(table, FORCE, 0, STATE, NO_DRIVES) == pytest.approx(-0.1 + 4.3)
-    assert added(table, FORCE, 0, STATE._replace(velocity=0.05), NO_DRIVES) == pytest.approx(
-        0.05 + 4.3
-    )
+    assert sum_terms(table, FORCE, 0, STATE, NO_DRIVES) == pytest.approx(-0.1 + 4.3)
+    assert sum_terms(table, FORCE, 0, STATE._replace(velocity=0.05), NO_DRIVES) == pytest.approx(0.05 + 4.3)
 
 
 def test_with_a_window_a_term_acts_for_a_while():
     table = terms_table([force_term("constant", {"value": 4.0}, window=(2.0, 3.0))], ["a"])
-    at = {t: added(table, FORCE, 0, STATE._replace(time=t), NO_DRIVES)
+    at = {t: sum_terms(table, FORCE, 0, STATE._replace(time=t), NO_DRIVES)
           for t in (1.9, 1.975, 2.0, 2.5, 3.0, 3.1)}  # fmt: skip
     assert list(at.values()) == pytest.approx([0.0, 1.0, 2.0, 4.0, 2.0, 0.0])
     with pytest.raises(ValidationError, match=r"window: \[3, 2\] must be increasing"):
@@ -180,16 +182,14 @@ def test_with_a_window_a_term_acts_for_a_while():
 def test_a_law_may_see_variables_of_another_drive():
     law_ = ("formula", {"velocity": 1.0, "pressure_rod": 1e-6, "position": 10.0})
     term = force_term(*law_, of={"velocity": "b", "pressure_rod": "b"}, domain={"velocity": (0, 2)})
-    drives = Drives(
-        2, np.arange(8.0) * 1e6, np.array([0.1, 0.2]), np.array([-0.3, 0.5]), np.zeros(2)
-    )
+    drives = Drives(2, np.arange(8.0) * 1e6, np.array([0.1, 0.2]), np.array([-0.3, 0.5]), np.zeros(2))
     table = terms_table([term], ["a", "b"])
-    assert added(table, FORCE, 0, STATE, drives) == pytest.approx(0.5 + 7.0 + 4.3)
+    assert sum_terms(table, FORCE, 0, STATE, drives) == pytest.approx(0.5 + 7.0 + 4.3)
     faster = drives._replace(velocity=np.array([0.0, 3.0]))
-    assert added(table, FORCE, 0, STATE, faster) == pytest.approx(2.0 + 7.0 + 4.3)
-    assert added_with_slope(table, FORCE, 0, STATE, drives)[1] == 0.0, "not its own velocity"
+    assert sum_terms(table, FORCE, 0, STATE, faster) == pytest.approx(2.0 + 7.0 + 4.3)
+    assert sum_terms_with_slope(table, FORCE, 0, STATE, drives)[1] == 0.0, "not its own velocity"
     lone = force_term(*law_, of={"velocity": "b"})
-    assert added(terms_table([lone], ["a", "b"]), FORCE, 0, STATE, NO_DRIVES) == 4.0 + 4.3
+    assert sum_terms(terms_table([lone], ["a", "b"]), FORCE, 0, STATE, NO_DRIVES) == 4.0 + 4.3
     with pytest.raises(ValidationError, match="of: 'time'"):
         force_term(*law_, of={"time": "b"})
 
@@ -199,16 +199,16 @@ def test_a_law_may_see_the_force_of_another_drive():
     act = np.array([0.0, 0.0, 9e6, 9e6, 0.0, 0.0, 3e6, 1e6])
     drives = Drives(2, act, np.zeros(2), np.zeros(2), np.zeros(2))
     table = terms_table([term], ["a", "b"], areas={"a": (1.0, 1.0), "b": (0.01, 0.006)})
-    assert added(table, FORCE, 0, STATE, drives) == pytest.approx(2.0 * (30e3 - 6e3))
+    assert sum_terms(table, FORCE, 0, STATE, drives) == pytest.approx(2.0 * (30e3 - 6e3))
     none = drives._replace(count=1)
-    assert added(table, FORCE, 0, STATE, none) == 0.0, "b has no chambers"
+    assert sum_terms(table, FORCE, 0, STATE, none) == 0.0, "b has no chambers"
 
 
 def carried(term, values):
     """What a term of axis a remembers along values of its variable."""
     table, held, told = terms_table([term], ["a"], 4), 0.0, []
     for value in values:
-        held = remember(table, 0, value, held)
+        held = update_term_state(table, 0, value, held)
         told.append(held)
     return table, told
 
@@ -219,13 +219,13 @@ def test_a_play_follows_half_a_width_behind():
     table, told = carried(term, [0.1, 0.5, 0.4, 0.2, 0.0, -0.3])
     assert 0.2 * np.array(told) == pytest.approx([0.0, 0.3, 0.3, 0.3, 0.2, -0.1])
     drives = Drives(1, np.array([0.0, 0, 0, 0, 1.5]), np.zeros(1), np.zeros(1), np.zeros(1))
-    assert added(table, FORCE, 0, STATE, drives) == pytest.approx(10.0 * 0.3 - 0.21)
-    assert added(table, FORCE, 0, STATE, NO_DRIVES) == pytest.approx(-0.21), "nothing keeps it"
+    assert sum_terms(table, FORCE, 0, STATE, drives) == pytest.approx(10.0 * 0.3 - 0.21)
+    assert sum_terms(table, FORCE, 0, STATE, NO_DRIVES) == pytest.approx(-0.21), "nothing keeps it"
     other, _ = carried(force_term("formula", {"ahead": 10.0}, play=play), [])
-    assert added(other, FORCE, 0, STATE, drives) == pytest.approx(10.0 * (-0.21 - 0.3))
+    assert sum_terms(other, FORCE, 0, STATE, drives) == pytest.approx(10.0 * (-0.21 - 0.3))
     place_at = 13
     table[place_at] = 1e9  # as anyone may write it into a model
-    assert added(table, FORCE, 0, STATE, drives) == pytest.approx(-0.21)
+    assert sum_terms(table, FORCE, 0, STATE, drives) == pytest.approx(-0.21)
 
 
 @pytest.mark.parametrize(
@@ -243,7 +243,7 @@ def test_a_switch_has_a_hysteresis(on, off, values, shares):
     for share in shares:
         act = np.array([0.0, 0, 0, 0, share])
         drives = Drives(1, act, np.zeros(1), np.zeros(1), np.zeros(1))
-        assert added(table, FORCE, 0, STATE, drives) == pytest.approx(5.0 * share)
+        assert sum_terms(table, FORCE, 0, STATE, drives) == pytest.approx(5.0 * share)
 
 
 def test_memories_that_cannot_be_are_refused():
@@ -271,14 +271,14 @@ def test_a_wrong_place_or_the_place_of_another_law_adds_nothing():
     """As in a file that another process has exported."""
     table = terms_table([force_term("constant", {"value": 12.0})], ["a"])
     law_at, checksum_at = 4, 5
-    assert added(table, FORCE, 0, STATE, NO_DRIVES) == 12.0
+    assert sum_terms(table, FORCE, 0, STATE, NO_DRIVES) == 12.0
     for place in (-1.0, 500.0, 1023.0, 1024.0, 1e9, -1e9):
         wrong = table.copy()
         wrong[law_at] = place
-        assert added(wrong, FORCE, 0, STATE, NO_DRIVES) == 0.0
+        assert sum_terms(wrong, FORCE, 0, STATE, NO_DRIVES) == 0.0
     wrong = table.copy()
     wrong[checksum_at] += 1
-    assert added(wrong, FORCE, 0, STATE, NO_DRIVES) == 0.0
+    assert sum_terms(wrong, FORCE, 0, STATE, NO_DRIVES) == 0.0
 
 
 @pytest.mark.parametrize(
@@ -311,9 +311,7 @@ def test_refused_with_what_is_valid(law_, parameters, message):
         force_term(law_, parameters)
 
 
-@pytest.mark.parametrize(
-    ("machine", "axis"), [("emps", "slide"), ("eha", "piston"), ("cat215", "boom")]
-)
+@pytest.mark.parametrize(("machine", "axis"), [("emps", "slide"), ("eha", "piston"), ("cat215", "boom")])
 def test_a_flow_of_the_pump_needs_valves_and_a_pump_that_gives_so_much(machine, axis):
     facts = load_machine(machine)
     term = Term(name="more", axis=axis, balance="flow_supply", law="constant",

@@ -24,10 +24,7 @@ CAT = load_machine("cat215")
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     folder, rng = tmp_path_factory.mktemp("logs"), np.random.default_rng(3)
-    runs = [
-        record_run(nominal_world(CAT), CAT, asked, Noise({}), rng)
-        for asked in references(CAT, rng, 6.0)
-    ]
+    runs = [record_run(nominal_world(CAT), CAT, asked, Noise({}), rng) for asked in references(CAT, rng, 6.0)]
     for run in runs:
         save_log(run.log, folder / f"{run.name}.parquet")
     return make_problem(folder, CAT, 60.0), runs

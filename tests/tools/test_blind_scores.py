@@ -99,16 +99,12 @@ def test_coverage_counts_intervals_of_what_was_named_rightly():
     inside = judge(key("single", A, value=1.4), result("named", effect(*A)))
     outside = judge(key("single", A, value=1.6), result("named", effect(*A)))
     wrong = judge(key("single", B), result("named", effect(*C)))
-    assert score([inside, inside, outside, wrong])["coverage"]["share"] == pytest.approx(
-        2 / 3, 1e-3
-    )
+    assert score([inside, inside, outside, wrong])["coverage"]["share"] == pytest.approx(2 / 3, 1e-3)
 
 
 def test_closure_regards_gaps_clear_of_the_floor():
     rng = np.random.default_rng(0)
-    clean = [
-        judge(key("clean"), result("no_gap", before=1 + s)) for s in 0.01 * rng.normal(size=200)
-    ]
+    clean = [judge(key("clean"), result("no_gap", before=1 + s)) for s in 0.01 * rng.normal(size=200)]
     assert floor_scatter(clean) == pytest.approx(0.01, rel=0.2)  # 200 draws know it to 5 %
     near = judge(key("single", A), result("named", effect(*A), before=1.05, after=1.05))
     far = judge(key("single", A), result("named", effect(*A), before=2.0, after=1.02))

@@ -51,8 +51,8 @@ def test_drawn_sizes_are_plausible_and_never_tiny():
         assert planted.parameters.keys() == {key for key, p in known.items() if not p.optional}
         for name, value in planted.parameters.items():
             p = known[name]
-            assert p.low <= value <= p.high
-            assert abs(value - p.nominal) >= 0.999 * SMALLEST * p.least
+            assert p.lower_bound <= value <= p.upper_bound
+            assert abs(value - p.nominal) >= 0.999 * SMALLEST * p.min_relevant_change
             signs.add((planted.name, np.sign(value - p.nominal)))
     assert {("angle_offset", -1.0), ("angle_offset", 1.0)} <= signs
     here = [effect for effect in EFFECTS.values() if effect.locations(MACHINE)]

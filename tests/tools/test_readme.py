@@ -53,9 +53,7 @@ def test_scripts_that_files_name_exist():
         named = set(SCRIPT.findall(text))
         named |= {f"{module.replace('.', '/')}.py" for module in MODULE.findall(text)}
         # tests/conftest.py names tests by their path below tests/.
-        absent = [
-            n for n in named if not (ROOT / n).is_file() and not (ROOT / "tests" / n).is_file()
-        ]
+        absent = [n for n in named if not (ROOT / n).is_file() and not (ROOT / "tests" / n).is_file()]
         missing += [f"{path.relative_to(ROOT)}: {name}" for name in sorted(absent)]
     assert missing == []
 

@@ -23,9 +23,7 @@ COUNTS = (64, 256, 1024, 4096)
 
 
 def main() -> None:
-    asked = options(
-        __doc__, task="TrackTrajectory", turns=5, seconds=1.0, loop=64, processes=16, batch=1024
-    )
+    asked = options(__doc__, task="TrackTrajectory", turns=5, seconds=1.0, loop=64, processes=16, batch=1024)
     name = f"hydrotele/{asked.task}-v0"
     text = [
         "Speed and memory of the batched environments, compared with the vector environments of"
@@ -116,10 +114,7 @@ def _speeds(jobs: list[Callable[[], float]], turns: int) -> list[float]:
 
 
 def _sizes(name: str, asked) -> list[str]:
-    made = [
-        gymnasium.make_vec(name, count, "vector_entry_point", sensors="real", duration=1.0e4)
-        for count in COUNTS
-    ]
+    made = [gymnasium.make_vec(name, count, "vector_entry_point", sensors="real", duration=1.0e4) for count in COUNTS]
     speeds = _speeds([_stepper(env, asked.seconds) for env in made], asked.turns)
     lines = ["| environments | us per environment and step of 20 ms | relative to 64 |"]
     lines += ["| --- | --- | --- |"]

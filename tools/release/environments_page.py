@@ -3,7 +3,7 @@
 python tools/release/environments_page.py --out docs/environments.md
 """
 
-from hydrotele.envs.core import set_up
+from hydrotele.envs.core import make_setup
 from hydrotele.envs.episode import ACTIONS
 from hydrotele.envs.facts import TaskSetup
 from hydrotele.envs.making import TASKS
@@ -61,11 +61,11 @@ def _options() -> str:
 
 
 def _section(task: Task) -> str:
-    setup = set_up(task, Options(variants=1))
+    setup = make_setup(task, Options(variants=1))
     lines = [
         f"## {task.name}",
         "",
-        f"{task.sentence} {task.reward}",
+        f"{task.description} {task.reward}",
         "",
         f"Machine `{task.machine}`, tool `{setup.machine.tool}`, {setup.options.duration:g} s,"
         f' `action="{setup.options.action}"` by default.',
@@ -76,10 +76,7 @@ def _section(task: Task) -> str:
         "| observation | unit | from | to |",
         "| --- | --- | --- | --- |",
     ]
-    lines += [
-        f"| {field.name} | {field.unit} | {field.low:.4g} | {field.high:.4g} |"
-        for field in setup.fields
-    ]
+    lines += [f"| {field.name} | {field.unit} | {field.low:.4g} | {field.high:.4g} |" for field in setup.fields]
     return "\n".join(lines)
 
 

@@ -20,10 +20,10 @@ import numpy as np
 from hydrotele.identify.setup import machine_setup
 from hydrotele.logs.log import Log, save_log
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.multibody.inverse_dynamics import project, regressor
+from hydrotele.multibody.inverse_dynamics import make_regressor, project_on_drives
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
-from hydrotele.simulate.closure import closed_chain
+from hydrotele.simulate.closure import load_closed_chain
 from tools.studies.study import options, publish
 
 CHILD = """
@@ -66,28 +66,28 @@ def throughput(rows: int) -> list[tuple[str, float]]:
     import pinocchio
 
     machine = load_machine("cat215")
-    setup = machine_setup(machine, closed_chain(machine))
+    setup = machine_setup(machine, load_closed_chain(machine))
     t = 0.02 * np.arange(rows)[:, None]
     wave = np.array([0.5, 0.2, 0.3]), np.array([0.9, 0.7, 1.1])
     motion = [
         np.array([0.0, 0.4, -1.6]) + wave[0] * np.sin(wave[1] * t),
         wave[0] * wave[1] * np.cos(wave[1] * t), -wave[0] * wave[1] ** 2 * np.sin(wave[1] * t),
     ]  # fmt: skip
-    project(setup.chain, setup.given, *(m[:10] for m in motion))  # compiled code is loaded
+    project_on_drives(setup.chain, setup.given_joints, *(m[:10] for m in motion))  # compiled code is loaded
     started = time.perf_counter()
-    found = project(setup.chain, setup.given, *motion)
+    found = project_on_drives(setup.chain, setup.given_joints, *motion)
     middle = time.perf_counter()
-    regressor(setup.chain, found, bodies=setup.bodies, rubbing=setup.rubbing)
+    make_regressor(setup.chain, found, bodies=setup.bodies, friction=setup.friction_terms)
     ours = time.perf_counter() - started
     model = pinocchio.Model()
     tree, parents = setup.chain.tree, {}
     for b in range(1, len(tree.parent)):
-        place = pinocchio.SE3(tree.turn[b], tree.offset[b])
+        place = pinocchio.SE3(tree.rotation[b], tree.offset[b])
         parent = parents.get(int(tree.parent[b]), (0, pinocchio.SE3.Identity()))
         place = parent[1] * place
         joint = parent[0]
-        for j in range(tree.first[b], tree.first[b + 1]):
-            kind = pinocchio.JointModelPrismaticUnaligned if tree.slides[j] else (
+        for j in range(tree.first_joint[b], tree.first_joint[b + 1]):
+            kind = pinocchio.JointModelPrismaticUnaligned if tree.is_slide[j] else (
                 pinocchio.JointModelRevoluteUnaligned)  # fmt: skip
             joint = model.addJoint(joint, kind(tree.axis[j]), place, setup.chain.joints[j])
             place = pinocchio.SE3.Identity()

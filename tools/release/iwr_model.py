@@ -10,13 +10,13 @@ import mujoco
 import numpy as np
 
 from hydrotele.kinematics.hybrid import (
-    Pose,
+    PlatformPose,
+    euler_to_rotation,
     home_pose,
     leg_readings,
     load_hybrid,
-    rotation_of_euler,
 )
-from hydrotele.simulate.hybrid import hybrid_mechanism, mechanism_pose
+from hydrotele.simulate.hybrid import build_hybrid_mechanism, solve_mechanism_pose
 
 FOLDER = Path(__file__).resolve().parents[2] / "models" / "iwr"
 JOINTS = np.array([0.9, 0.05, -0.35, 0.12])  # m and rad, of the picture
@@ -25,13 +25,11 @@ LOCAL = np.array([0.05, -0.03, 0.03]), np.array([0.15, -0.10, 0.1])  # m and rad
 
 def main() -> None:
     robot = load_hybrid("iwr")
-    spec = hybrid_mechanism(robot)
+    spec = build_hybrid_mechanism(robot)
     text = spec.to_xml()
-    note = (
-        "<!-- Written by tools/release/iwr_model.py from iwr.yaml; a test compares the two. -->\n"
-    )
+    note = "<!-- Written by tools/release/iwr_model.py from iwr.yaml; a test compares the two. -->\n"
     (FOLDER / "iwr.xml").write_text(note + text, encoding="utf-8")
-    scene = hybrid_mechanism(robot)
+    scene = build_hybrid_mechanism(robot)
     scene.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=64, height=384,
                       builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, rgb1=[0.93, 0.95, 0.97],
                       rgb2=[0.75, 0.80, 0.85])  # fmt: skip
@@ -47,9 +45,9 @@ def main() -> None:
     model = scene.compile()
     data = mujoco.MjData(model)
     home = home_pose(robot, JOINTS)
-    pose = Pose(home.rotation @ rotation_of_euler(LOCAL[1]),
+    pose = PlatformPose(home.rotation @ euler_to_rotation(LOCAL[1]),
                 home.position + home.rotation @ LOCAL[0])  # fmt: skip
-    mechanism_pose(model, data, robot, JOINTS, leg_readings(robot, JOINTS, pose))
+    solve_mechanism_pose(model, data, robot, JOINTS, leg_readings(robot, JOINTS, pose))
     mujoco.mj_forward(model, data)
     camera = mujoco.MjvCamera()
     camera.lookat, camera.distance = [1.1, -0.1, 0.8], 2.9

@@ -74,9 +74,7 @@ def passed_by(words: list[str]) -> tuple[Counter[str], int]:
 
 def main() -> int:
     """Print the counts; the exit status is that of the command."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--arrows", action="store_true", help="list every dependency")
     parser.add_argument("command", nargs="*", help="command of hydrotele, after --")
     args = parser.parse_args()
@@ -93,9 +91,7 @@ def main() -> int:
         names = " ".join(others) if args.arrows else len(others)
         print(f"{room:12} {modules[room]:7} {lines[room]:6}  {names}")
     total = sum(modules.values()), sum(lines.values())
-    print(
-        f"{len(modules)} packages, {total[0]} modules, {total[1]} lines, {len(arrows)} dependencies"
-    )
+    print(f"{len(modules)} packages, {total[0]} modules, {total[1]} lines, {len(arrows)} dependencies")
     if not args.command:
         return 0
     calls, status = passed_by(args.command)

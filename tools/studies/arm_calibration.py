@@ -16,15 +16,15 @@ import time
 import numpy as np
 
 from hydrotele.calibrate.arm import identify_arm, identify_jointly, machine_with_loop
-from hydrotele.calibrate.arm_poses import with_drift
+from hydrotele.calibrate.arm_poses import add_drift
 from hydrotele.calibrate.bad_data import identify_without_bad_data
-from hydrotele.calibrate.design import STILL, SWEEPS, sweep_poses
-from hydrotele.calibrate.loop import loop_of, unit_of
+from hydrotele.calibrate.design import DRIFT_FREE_SWEEPS, PUBLISHED_SWEEPS, generate_sweep_poses
+from hydrotele.calibrate.loop import build_loop, unit_of
 from hydrotele.experiments.calibrator_readings import (
+    compute_tip_errors,
+    find_true_parameters,
     perturb_loop,
     simulate_readings,
-    tip_errors,
-    true_numbers,
 )
 from hydrotele.machine.machine_file import load_machine
 
@@ -33,9 +33,9 @@ TRUTH = 1992  # seed of the machine whose noise is studied
 
 def noise(seeds: int) -> str:
     """Bias, spread and coverage of both identifications over seeds of sensor noise."""
-    nominal = loop_of(load_machine("calibrator"))
+    nominal = build_loop(load_machine("calibrator"))
     true = perturb_loop(nominal, np.random.default_rng(TRUTH))
-    clean = [sweep_poses(true, link, sweep) for link, sweep in STILL.items()]
+    clean = [generate_sweep_poses(true, link, sweep) for link, sweep in DRIFT_FREE_SWEEPS.items()]
     errors, inside, spreads = [], [], []
     names: tuple[str, ...] = ()
     for seed in range(seeds):
@@ -44,9 +44,9 @@ def noise(seeds: int) -> str:
         one = identify_arm(nominal, stages)
         both = [one, identify_jointly(one, stages)]
         names = one.names
-        truth = true_numbers(true, nominal, names, clean)
+        truth = find_true_parameters(true, nominal, names, clean)
         errors.append([fit.values - truth for fit in both])
-        spreads.append([fit.deviations for fit in both])
+        spreads.append([fit.standard_deviations for fit in both])
         inside.append([(fit.intervals[:, 0] <= truth) & (truth <= fit.intervals[:, 1])
                        for fit in both])  # fmt: skip
     error, cover, spread = np.array(errors), np.array(inside), np.array(spreads)
@@ -103,17 +103,17 @@ def corrupted(theta: np.ndarray, rng: np.random.Generator, joint: int) -> tuple[
 
 def bad_data(trials: int, clean_trials: int, poses: int = 150) -> str:
     """Hidden corruption: found regions and joints, false alarms, errors with and without."""
-    nominal = loop_of(load_machine("calibrator"))
+    nominal = build_loop(load_machine("calibrator"))
     lines, alarms = [], {}
-    cases = {"fixed": STILL, "drifting": SWEEPS}
+    cases = {"fixed": DRIFT_FREE_SWEEPS, "drifting": PUBLISHED_SWEEPS}
     for word, sweeps in cases.items():
         alarms[word] = 0
         for trial in range(clean_trials // 2):
             rng = np.random.default_rng([1, trial])
             true = perturb_loop(nominal, rng)
-            clean = [sweep_poses(true, n, s._replace(poses=poses), trial)
+            clean = [generate_sweep_poses(true, n, s._replace(poses=poses), trial)
                      for n, s in sweeps.items()]  # fmt: skip
-            stages = [with_drift(nominal, simulate_readings(true, c, rng)) for c in clean]
+            stages = [add_drift(nominal, simulate_readings(true, c, rng)) for c in clean]
             alarms[word] += bool(identify_without_bad_data(nominal, stages).regions)
     places = joints = possible = 0
     before, after = [], []
@@ -121,12 +121,12 @@ def bad_data(trials: int, clean_trials: int, poses: int = 150) -> str:
     for trial in range(trials):
         rng = np.random.default_rng([2, trial])
         true = perturb_loop(nominal, rng)
-        clean = [sweep_poses(true, n, s._replace(poses=poses), trial) for n, s in STILL.items()]
-        stages = [with_drift(nominal, simulate_readings(true, c, rng)) for c in clean]
+        clean = [generate_sweep_poses(true, n, s._replace(poses=poses), trial) for n, s in DRIFT_FREE_SWEEPS.items()]
+        stages = [add_drift(nominal, simulate_readings(true, c, rng)) for c in clean]
         which, joint = int(rng.integers(len(stages))), int(rng.integers(4))
         theta, region = corrupted(stages[which].theta, rng, joint)
         stages[which] = dataclasses.replace(stages[which], theta=theta)
-        link, name = stages[which].link, nominal.links[nominal.moved + joint]
+        link, name = stages[which].link, nominal.links[nominal.powered_count + joint]
         cleaned = identify_without_bad_data(nominal, stages)
         plain = identify_arm(nominal, stages)
         marked = np.zeros(poses, bool)
@@ -141,12 +141,10 @@ def bad_data(trials: int, clean_trials: int, poses: int = 150) -> str:
         maybe = found and all(name in r.possible for r in cleaned.regions)
         places, joints, possible = places + found, joints + right, possible + maybe
         if not right:
-            said = "; ".join(
-                f"{r.joint or 'arm sensor'} {r.first}-{r.last}" for r in cleaned.regions
-            )
+            said = "; ".join(f"{r.joint or 'arm sensor'} {r.first}-{r.last}" for r in cleaned.regions)
             misses.append(f"trial {trial}: {link}, {name} {region.start}-{region.stop - 1}, found"
                           f" {said or 'nothing'}, overlap {overlap:.2f}")  # fmt: skip
-        truth = true_numbers(true, nominal, plain.names, clean)
+        truth = find_true_parameters(true, nominal, plain.names, clean)
         scale = identify_scale(plain)
         before.append(np.mean(((plain.values - truth) / scale) ** 2))
         after.append(np.mean(((cleaned.fit.values - truth) / scale) ** 2))
@@ -185,12 +183,12 @@ def tip(machines: int) -> str:
     pairs = []
     nominal = load_machine("calibrator")
     for seed in range(machines):
-        loop = loop_of(nominal)
+        loop = build_loop(nominal)
         rng = np.random.default_rng([3, seed])
-        true = perturb_loop(loop, rng, sensors=0.5)
-        clean = [sweep_poses(true, link, sweep) for link, sweep in STILL.items()]
+        true = perturb_loop(loop, rng, sensor_offset=0.5)
+        clean = [generate_sweep_poses(true, link, sweep) for link, sweep in DRIFT_FREE_SWEEPS.items()]
         stages = [simulate_readings(true, one, rng) for one in clean]
-        pairs.append(tip_errors(nominal, machine_with_loop(nominal, loop, true), true, stages))
+        pairs.append(compute_tip_errors(nominal, machine_with_loop(nominal, loop, true), true, stages))
         rows.append(f"| {seed} | {1e3 * pairs[-1][0]:.1f} | {1e3 * pairs[-1][1]:.1f} |")
     one, two = np.sqrt(np.mean(np.square(pairs), axis=0))
     rows += ["", f"RMS of all machines: {1e3 * one:.1f} mm nominal, {1e3 * two:.1f} mm calibrated,"
@@ -200,14 +198,14 @@ def tip(machines: int) -> str:
 
 def speed() -> str:
     """Time of the hierarchical and the joint identification over the number of poses."""
-    nominal = loop_of(load_machine("calibrator"))
+    nominal = build_loop(load_machine("calibrator"))
     true = perturb_loop(nominal, np.random.default_rng(TRUTH))
     rows = ["CPU time of one process with one thread.", ""]
     rows += ["| poses | hierarchical [s] | then joint [s] |", "| --- | --- | --- |"]
     for poses in (100, 200, 400, 800):
         rng = np.random.default_rng(5)
-        stages = [simulate_readings(true, sweep_poses(true, n, s._replace(poses=poses)), rng)
-                  for n, s in STILL.items()]  # fmt: skip
+        stages = [simulate_readings(true, generate_sweep_poses(true, n, s._replace(poses=poses)), rng)
+                  for n, s in DRIFT_FREE_SWEEPS.items()]  # fmt: skip
         times = []
         for _ in range(3):
             begin = time.process_time()

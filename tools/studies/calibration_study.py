@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hydrotele.calibrate.mukca import Options, calibrate_sockets, judge
-from hydrotele.calibrate.sockets import Errors, robot_with_errors, simulated_sockets
-from hydrotele.identify.identifiability import COMBINATION, FULL
+from hydrotele.calibrate.mukca import SocketOptions, calibrate_sockets, evaluate_robot
+from hydrotele.calibrate.sockets import RobotErrors, add_random_errors, simulate_sockets
+from hydrotele.identify.identifiability import STATUS_COMBINATION, STATUS_FULL
 from hydrotele.kinematics.serial_robot import load_robot
 
 PLACES = {
@@ -42,34 +42,34 @@ class Trial:
     seconds: float
 
 
-def mukca_trial(seed: int, robot_name: str, rows: int, errors: Errors, same: bool) -> Trial:
+def mukca_trial(seed: int, robot_name: str, rows: int, errors: RobotErrors, same: bool) -> Trial:
     rng = np.random.default_rng([19, seed])
     nominal = load_robot(robot_name)
     drawn = np.random.default_rng(19) if same else rng
-    true, values = robot_with_errors(nominal, errors, drawn)
-    sockets = simulated_sockets(true, PLACES, rows, errors, rng)
+    true, values = add_random_errors(nominal, errors, drawn)
+    sockets = simulate_sockets(true, PLACES, rows, errors, rng)
     begin = time.perf_counter()
-    found = calibrate_sockets(nominal, sockets, Options(model="rigid"))
+    found = calibrate_sockets(nominal, sockets, SocketOptions(model="rigid"))
     seconds = time.perf_counter() - begin
     fit = found.fit
     error = fit.values - np.array([values[name] for name in fit.names])
-    told = dict(zip(fit.told.names, fit.told.status, strict=True))
-    order = [fit.names.index(name) for name in fit.told.names]
-    weights = fit.told.combination
+    told = dict(zip(fit.identifiability.names, fit.identifiability.status, strict=True))
+    order = [fit.names.index(name) for name in fit.identifiability.names]
+    weights = fit.identifiability.combination
     spread = np.sqrt(np.einsum("ij,jk,ik->i", weights, fit.covariance[np.ix_(order, order)],
                                weights))  # fmt: skip
-    unseen = simulated_sockets(true, JUDGED, rows, errors, rng)
+    unseen = simulate_sockets(true, JUDGED, rows, errors, rng)
     exact = dataclasses.replace(errors, play=0.0, encoder=0.0)
-    clean = simulated_sockets(true, JUDGED, rows, exact, rng)
+    clean = simulate_sockets(true, JUDGED, rows, exact, rng)
     return Trial(
-        fit.names, tuple(told[name] for name in fit.names), error, fit.deviations,
-        weights @ error[order] / spread, 1e3 * judge(found.robot, unseen).rms,
-        1e3 * judge(found.robot, clean).rms, seconds,
+        fit.names, tuple(told[name] for name in fit.names), error, fit.standard_deviations,
+        weights @ error[order] / spread, 1e3 * evaluate_robot(found.robot, unseen).rms,
+        1e3 * evaluate_robot(found.robot, clean).rms, seconds,
     )  # fmt: skip
 
 
 def mukca(asked: argparse.Namespace) -> str:
-    errors = Errors(encoder=asked.encoder, play=asked.play)
+    errors = RobotErrors(encoder=asked.encoder, play=asked.play)
     seeds = range(asked.seed, asked.seed + asked.trials)
     many = len(seeds)
     with ProcessPoolExecutor(asked.jobs) as pool:
@@ -81,8 +81,8 @@ def mukca(asked: argparse.Namespace) -> str:
                 print(f"{len(trials)} of {many}", file=sys.stderr, flush=True)
     error = np.array([t.error for t in trials])
     inside = np.abs(error) <= 1.959964 * np.array([t.std for t in trials])
-    full = np.array([[s == FULL for s in t.told] for t in trials])
-    some = np.array([[s in (FULL, COMBINATION) for s in t.told] for t in trials])
+    full = np.array([[s == STATUS_FULL for s in t.told] for t in trials])
+    some = np.array([[s in (STATUS_FULL, STATUS_COMBINATION) for s in t.told] for t in trials])
     z = np.concatenate([t.combinations for t in trials])
     ball = inside[:, [k for k, n in enumerate(trials[0].names) if n.endswith(".tool")]]
     heldout = np.array([t.heldout for t in trials])
@@ -121,9 +121,7 @@ STUDIES = {"mukca": mukca}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("study", choices=STUDIES)
     parser.add_argument("--trials", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0, help="of the first trial")

@@ -13,7 +13,7 @@ import numpy as np
 
 from hydrotele.machine.machine import Machine
 from hydrotele.simulate.plant import build_plant, initial_state
-from hydrotele.simulate.record import begin_leapfrog
+from hydrotele.simulate.record import start_leapfrog
 from hydrotele.simulate.stepping import Stepper
 from tools.studies.eha_runs import CHANNELS, FIRMWARE_RPM, EhaRun, true_start
 
@@ -71,7 +71,7 @@ def under_control(machine: Machine, run: EhaRun) -> np.ndarray:
     start = true_start(machine, run)
     pressures = {c.partition(".")[0]: [value] for c, value in start.items()}
     data = initial_state(plant, {"order": ["piston"], "angle": [0.0], **pressures})
-    begin_leapfrog(plant.model, data)
+    start_leapfrog(plant.model, data)
     stepper, controller, turned = Stepper(plant, data, 1), Controller(), 0.0
     reference = run.log["reference.piston"]
     shown = np.empty((len(reference), 3))

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
-from hydrotele.effects.effect import changed
+from hydrotele.effects.effect import with_value
 from hydrotele.estimate.reduced_model import model_space, reduced_model, simulate_rows, state_names
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
@@ -73,15 +73,15 @@ def _number(machine: Machine, path: str) -> float:
 def with_values(machine: Machine, group: int, values: dict[str, float]) -> Machine:
     """The machine of a load group with other values."""
     for path in _PATHS:
-        machine = changed(machine, path, values[path])
+        machine = with_value(machine, path, values[path])
     rod = machine.sensor_errors[_ROD].model_copy(update={"offset": values[_ZERO]})
-    machine = changed(machine, "sensor_errors", {**machine.sensor_errors, _ROD: rod})
+    machine = with_value(machine, "sensor_errors", {**machine.sensor_errors, _ROD: rod})
     if group == 1:
         return machine
     update = {name: values[f"load.{name}"] for name in _LOAD}
     update |= {"relief_pressure": _TABLE[group] - values[_BELOW]}
     update |= {"return_force": values[_RETURN]} if group == 5 else {}
-    return changed(machine, "loads", {"piston": machine.loads["piston"].model_copy(update=update)})
+    return with_value(machine, "loads", {"piston": machine.loads["piston"].model_copy(update=update)})
 
 
 def free_run(machine: Machine, run: EhaRun, by_speed: bool, coarse: int = 1) -> np.ndarray:
@@ -116,9 +116,7 @@ def _errors(run: EhaRun, coarse: np.ndarray) -> np.ndarray:
     return (error / UNIT)[first:stop:_EVERY]
 
 
-def fit(
-    runs: list[EhaRun], rounds: int, say: Callable[[str], None]
-) -> tuple[dict[str, float], dict[str, float]]:
+def fit(runs: list[EhaRun], rounds: int, say: Callable[[str], None]) -> tuple[dict[str, float], dict[str, float]]:
     """Least squares over all runs; returns values and standard errors as a share of them.
 
     The standard errors count one row in 500 as independent.
@@ -170,9 +168,7 @@ def table(runs: list[EhaRun], values: dict[str, float]) -> None:
 
 def main() -> None:
     """Fit, print the values and how far free runs are off."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="with run_<group>_<stroke>.parquet")
     parser.add_argument("--rounds", type=int, default=12)
     parser.add_argument("--without", nargs="*", default=[], help="runs to leave out of the fit")

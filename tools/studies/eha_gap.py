@@ -10,7 +10,7 @@ load group. Prints what the search names, calibrates and learns, where it puts e
 import argparse
 from pathlib import Path
 
-from hydrotele.effects.effect import changed
+from hydrotele.effects.effect import with_value
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.result import Gap
 from hydrotele.logs.dataset import load_dataset
@@ -40,8 +40,8 @@ def published(group: int) -> Machine:
     if group > 1:  # packings and the pressure of the return are nothing that the authors have
         bare = {"friction": 0.0, "return_force": 0.0}
         load = machine.loads["piston"].model_copy(update=bare)
-        machine = changed(machine, "loads", {"piston": load})
-    return changed(machine, "uncertainty", _UNCERTAINTY)
+        machine = with_value(machine, "loads", {"piston": load})
+    return with_value(machine, "uncertainty", _UNCERTAINTY)
 
 
 def tell(gap: Gap, fitted: Machine) -> None:
@@ -51,8 +51,7 @@ def tell(gap: Gap, fitted: Machine) -> None:
           f" {gap.size.after:.2f} (perfect model: {floor}); {gap.seconds:.0f} s")  # fmt: skip
     for effect in gap.effects:
         values = ", ".join(
-            f"{k} {e.value:.4g} ({e.low:.4g} .. {e.high:.4g}) {e.unit}"
-            for k, e in effect.parameters.items()
+            f"{k} {e.value:.4g} ({e.low:.4g} .. {e.high:.4g}) {e.unit}" for k, e in effect.parameters.items()
         )
         print(f"named: {effect.name} at {effect.location}, probability {effect.probability:.2f},"
               f" share {effect.share:.2f}: {values}")  # fmt: skip
@@ -94,9 +93,7 @@ def tell_free_runs(path: Path, machines: dict[str, Machine]) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="with run_<group>_<stroke>.parquet")
     parser.add_argument("--group", type=int, default=3, help="load group, 1 to 5")
     parser.add_argument("--fitted", action="store_true", help="look at the fitted machine instead")
@@ -104,9 +101,7 @@ if __name__ == "__main__":
     fitted_machine = load_machine("eha", LOADS[words.group])
     machine = fitted_machine if words.fitted else published(words.group)
     runs = sorted(words.folder.glob(f"run_{words.group}_*.parquet"))
-    found = find_gap(
-        load_dataset(runs, machine), lambda what, share: print(f"{share:4.0%} {what}", flush=True)
-    )
+    found = find_gap(load_dataset(runs, machine), lambda what, share: print(f"{share:4.0%} {what}", flush=True))
     tell(found, fitted_machine)
     machines = {"given": machine, "patched": found.patched, "fitted": fitted_machine}
     tell_free_runs(runs[-1], machines)

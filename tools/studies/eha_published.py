@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hydrotele.effects.effect import changed
+from hydrotele.effects.effect import with_value
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
 from tools.studies.eha_fit import free_run
@@ -24,9 +24,7 @@ PUBLISHED = {  # what -> path -> value in SI
     "volumetric efficiency 0.92 at 1500 rpm, 250 bar": {f"{_PUMP}.leakage": 1.28e-13},
     "9 mV/rpm": {f"{_PUMP}.motor.emf": 0.0859},
     "inertia 0.01 kg m2": {f"{_PUMP}.motor.inertia": 0.01},
-    "no friction": {
-        f"axes.piston.cylinder.friction.{name}": 0.0 for name in ("coulomb", "stribeck_extra")
-    }
+    "no friction": {f"axes.piston.cylinder.friction.{name}": 0.0 for name in ("coulomb", "stribeck_extra")}
     | {"axes.piston.cylinder.friction.viscous": 1.0e3},
     "no torque losses": {
         f"{_PUMP}.torque_loss": 0.0,
@@ -47,12 +45,12 @@ TABLE = {2: 20.0e5, 3: 30.0e5, 4: 40.0e5, 5: 50.0e5}  # Pa
 def as_published(machine: Machine, group: int, what: str) -> Machine:
     """The machine with what the authors say."""
     for path, value in PUBLISHED.get(what, {}).items():
-        machine = changed(machine, path, value)
+        machine = with_value(machine, path, value)
     if what == "pressure zeros of the calibration":
-        machine = changed(machine, "sensor_errors", {})
+        machine = with_value(machine, "sensor_errors", {})
     if what == "load table" and group > 1:
         load = machine.loads["piston"].model_copy(update={"relief_pressure": TABLE[group]})
-        machine = changed(machine, "loads", {"piston": load})
+        machine = with_value(machine, "loads", {"piston": load})
     return machine
 
 
@@ -68,9 +66,7 @@ def figures(runs: list[EhaRun], what: str, by_speed: bool) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="with run_<group>_<stroke>.parquet")
     the_runs = load_runs(parser.parse_args().folder)
     others = ["speed as logged", "pressure zeros of the calibration", "load table"]

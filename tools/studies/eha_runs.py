@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.effects.effect import changed
+from hydrotele.effects.effect import with_value
 from hydrotele.logs.log import Log, load_log
 from hydrotele.machine.machine import Machine, SensorError
 from hydrotele.machine.machine_file import load_machine
@@ -97,4 +97,4 @@ def true_start(machine: Machine, run: EhaRun) -> dict[str, float]:
 
 def without_motor(machine: Machine) -> Machine:
     """The machine whose command is the speed of its pump over the rated one."""
-    return changed(machine, "axes.piston.pump.motor", None)
+    return with_value(machine, "axes.piston.pump.motor", None)

@@ -14,20 +14,20 @@ import mujoco
 import numpy as np
 
 from hydrotele.control.endpoint_force import (
-    BANDWIDTH,
-    FAST,
+    FORCE_BANDWIDTH_HZ,
+    MOTION_BANDWIDTH_HZ,
     EndpointForce,
-    Gravity,
+    GravityModel,
     endpoint_force_of_log,
-    gravity_from_masses,
+    fit_gravity_to_masses,
     identify_gravity,
 )
-from hydrotele.control.state_filter import LOW, filter_delay, filter_table, filtered
-from hydrotele.machine.machine import Machine, sensor_set
+from hydrotele.control.state_filter import VALUE, filter_delay, filter_signal, filter_table
+from hydrotele.machine.machine import Machine, get_sensors
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import Run, prepare, run_scenario
 from hydrotele.scenario.scenario import Scenario, load_scenario
-from hydrotele.simulate.record import begin_leapfrog
+from hydrotele.simulate.record import start_leapfrog
 from tools.studies.study import options, publish, side_by_side
 
 REAL, IDEAL, KINDS = "khoshzaban1992", "ideal", ("static", "dynamic")
@@ -96,13 +96,15 @@ def rms(error: np.ndarray) -> float:
     return math.sqrt(float(np.mean(np.sum(error**2, axis=1))))
 
 
-def false_force(run: Run, gravity: Gravity, sensors: str, bands=(BANDWIDTH, FAST)) -> list[float]:
+def false_force(
+    run: Run, gravity: GravityModel, sensors: str, bands=(FORCE_BANDWIDTH_HZ, MOTION_BANDWIDTH_HZ)
+) -> list[float]:
     """RMS of the false force of the static and the dynamic estimate in free motion [N]."""
     settled, out = run.measured.time >= SETTLED, []
     for kind in KINDS:
         found = endpoint_force_of_log(
-            machine(), run.measured, kind, gravity, bandwidth=bands[0], fast=bands[1],
-            sensors=sensor_set(machine(), sensors),
+            machine(), run.measured, kind, gravity, bandwidth=bands[0], motion_bandwidth=bands[1],
+            sensors=get_sensors(machine(), sensors),
         )  # fmt: skip
         out.append(rms(at_the_tip(run, found)[settled]))
     return out
@@ -113,16 +115,24 @@ def other_ways(run: Run) -> list[float]:
 
     The momentum observer's first-order lag acts on the balance with the rate of the fast filter.
     """
-    late, settled = filter_delay(BANDWIDTH) + filter_delay(FAST), run.measured.time >= SETTLED
-    sensors, out = sensor_set(machine(), REAL), []
+    late, settled = (
+        filter_delay(FORCE_BANDWIDTH_HZ) + filter_delay(MOTION_BANDWIDTH_HZ),
+        run.measured.time >= SETTLED,
+    )
+    sensors, out = get_sensors(machine(), REAL), []
     one = filter_delay(1.0) / (late - filter_delay(OPEN))
-    lag = 1.0 - math.exp(-(run.measured.rate**-1) / (late - filter_delay(FAST)))
-    for fast in (one, FAST):
+    lag = 1.0 - math.exp(-(run.measured.rate**-1) / (late - filter_delay(MOTION_BANDWIDTH_HZ)))
+    for fast in (one, MOTION_BANDWIDTH_HZ):
         found = endpoint_force_of_log(
-            machine(), run.measured, "dynamic", bandwidth=OPEN, fast=fast, sensors=sensors
+            machine(),
+            run.measured,
+            "dynamic",
+            bandwidth=OPEN,
+            motion_bandwidth=fast,
+            sensors=sensors,
         )
         felt = at_the_tip(run, found)
-        for row in range(1, len(felt) if fast == FAST else 0):
+        for row in range(1, len(felt) if fast == MOTION_BANDWIDTH_HZ else 0):
             felt[row] = felt[row - 1] + lag * (felt[row] - felt[row - 1])
         out.append(rms(felt[settled]))
     return out
@@ -135,7 +145,7 @@ def true_contact(scenario: Scenario, run: Run) -> np.ndarray:
     """
     prepared = prepare(scenario)
     model, data = prepared.plant.model, prepared.data
-    begin_leapfrog(model, data)
+    start_leapfrog(model, data)
     steps = round(1.0 / (scenario.control_rate * scenario.timestep))
     names, wrench = prepared.plant.axes, np.zeros(6)
     commands = np.column_stack([run.truth[f"command.{a}"] for a in names])
@@ -158,9 +168,9 @@ def true_contact(scenario: Scenario, run: Run) -> np.ndarray:
 
 def through_filters(signal: np.ndarray, period: float) -> np.ndarray:
     """Apply the filters of the estimate to a signal (n, 3)."""
-    for band in (FAST, BANDWIDTH):
+    for band in (MOTION_BANDWIDTH_HZ, FORCE_BANDWIDTH_HZ):
         table = filter_table(band, period)
-        signal = np.column_stack([filtered(table, c.copy())[:, LOW] for c in signal.T])
+        signal = np.column_stack([filter_signal(table, c.copy())[:, VALUE] for c in signal.T])
     return signal
 
 
@@ -179,9 +189,7 @@ def one_trial(seed: int, number: int) -> dict:
             if sensors == REAL:
                 out["ways"][name] = other_ways(run)
         coulomb = WIDER * machine().axes["boom"].drive.friction.coulomb
-        planted = (
-            f"[{{name: coulomb_friction, location: boom, parameters: {{coulomb: {coulomb}}}}}]"
-        )
+        planted = f"[{{name: coulomb_friction, location: boom, parameters: {{coulomb: {coulomb}}}}}]"
         run = asked_run(name, REAL, draw, planted)
         out["free"][name, "friction"] = false_force(run, gravity, REAL)
     for sensors in (IDEAL, REAL):
@@ -189,7 +197,7 @@ def one_trial(seed: int, number: int) -> dict:
     return out
 
 
-def contact_errors(gravity: Gravity, sensors: str, seed: int) -> dict[str, list[float]]:
+def contact_errors(gravity: GravityModel, sensors: str, seed: int) -> dict[str, list[float]]:
     """Window -> size of the true force, then error of static and dynamic, at once and filtered."""
     scenario = Scenario.model_validate(PRESS | {"sensors": sensors, "seed": seed})
     run = run_scenario(scenario)
@@ -197,9 +205,7 @@ def contact_errors(gravity: Gravity, sensors: str, seed: int) -> dict[str, list[
     late = through_filters(true, 1.0 / scenario.log_rate)
     errors = []
     for kind in KINDS:
-        found = endpoint_force_of_log(
-            machine(), run.measured, kind, gravity, sensors=sensor_set(machine(), sensors)
-        )
+        found = endpoint_force_of_log(machine(), run.measured, kind, gravity, sensors=get_sensors(machine(), sensors))
         errors += [at_the_tip(run, found, true), at_the_tip(run, found, late)]
     for name, (begin, end) in WINDOWS.items():
         rows = (run.truth.time >= begin) & (run.truth.time < end)
@@ -223,7 +229,7 @@ def cost() -> list[float]:
     return out
 
 
-def links_only() -> Gravity:
+def links_only() -> GravityModel:
     """Static model of the machine with cylinders that weigh nothing."""
     bare, axes = machine(), {}
     for name, axis in bare.axes.items():
@@ -233,12 +239,12 @@ def links_only() -> Gravity:
                      for p in ("tube", "rod")}  # fmt: skip
             axis = axis.model_copy(update={"cylinder": cylinder.model_copy(update=parts)})
         axes[name] = axis
-    return gravity_from_masses(bare.model_copy(update={"axes": axes}))
+    return fit_gravity_to_masses(bare.model_copy(update={"axes": axes}))
 
 
 def parameters(results: list[dict]) -> list[str]:
     """Table of the static model's parameters."""
-    exact, bare = gravity_from_masses(machine()), links_only()
+    exact, bare = fit_gravity_to_masses(machine()), links_only()
     first = results[0]
     spread = {key: np.array([r[key].value for r in results]) for key in ("gravity", "plain")}
     lines = [
@@ -347,14 +353,11 @@ def contact(results: list[dict]) -> list[str]:
     for name in WINDOWS:
         for sensors, said in ((IDEAL, "ideal"), (REAL, "real")):
             v = np.mean([r["contact"][sensors][name] for r in results], axis=0)
-            lines.append(
-                f"| {name} | {said} | {v[0]:.0f} | {v[1]:.0f} | {v[3]:.0f} | {v[2]:.0f} |"
-                f" {v[4]:.0f} |"
-            )
+            lines.append(f"| {name} | {said} | {v[0]:.0f} | {v[1]:.0f} | {v[3]:.0f} | {v[2]:.0f} | {v[4]:.0f} |")
     return [*lines, ""]
 
 
-def draw(found: Gravity, path: Path) -> None:
+def draw(found: GravityModel, path: Path) -> None:
     """Picture of the recursion."""
     import matplotlib
 
@@ -362,7 +365,7 @@ def draw(found: Gravity, path: Path) -> None:
     from matplotlib import pyplot
 
     figure, panels = pyplot.subplots(2, 3, figsize=(9.0, 4.5), sharex=True)
-    exact = gravity_from_masses(machine())
+    exact = fit_gravity_to_masses(machine())
     for i, panel in enumerate(panels.ravel()[: len(found.names)]):
         panel.plot(found.history[:, i] / 1e3, linewidth=1.0)
         panel.axhline(exact.value[i] / 1e3, color="black", linewidth=0.8, linestyle="--")
@@ -387,9 +390,9 @@ def report(results: list[dict]) -> str:
         "model, and compared with the force in the simulation. Such an estimate needs no force "
         "sensor. Errors: lower is better.",
         "",
-        f"Filters of {BANDWIDTH:g} and {FAST:g} Hz unless stated otherwise, with a delay of "
-        f"{filter_delay(BANDWIDTH) + filter_delay(FAST):.2f} s. One update takes {took[0]:.0f} us "
-        f"(static) and {took[1]:.0f} us (dynamic).",
+        f"Filters of {FORCE_BANDWIDTH_HZ:g} and {MOTION_BANDWIDTH_HZ:g} Hz unless stated otherwise, with a delay of "
+        f"{filter_delay(FORCE_BANDWIDTH_HZ) + filter_delay(MOTION_BANDWIDTH_HZ):.2f} s. One update takes "
+        f"{took[0]:.0f} us (static) and {took[1]:.0f} us (dynamic).",
         "",
         *parameters(results),
         "![Convergence](endpoint_force.png)", "",

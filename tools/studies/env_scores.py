@@ -7,12 +7,16 @@ import sys
 
 import numpy as np
 
-from hydrotele.envs.controllers.catalogue import CONTROLLERS, REFERENCES, make_controller
+from hydrotele.envs.controllers.catalogue import (
+    CONTROLLER_NAMES,
+    REFERENCE_CONTROLLERS,
+    make_controller,
+)
 from hydrotele.envs.core import TaskCore
 from hydrotele.envs.episode import DISABLED
 from hydrotele.envs.evaluation import SUCCESS, Scores, evaluate
 from hydrotele.envs.making import TASKS
-from hydrotele.envs.task import REAL, Options
+from hydrotele.envs.task import REAL_SENSORS, Options
 from hydrotele.envs.variants import typical_variation
 from hydrotele.machine.machine_file import load_machine
 from tools.studies.study import options, publish
@@ -37,14 +41,14 @@ Limit: all machines are simulated; randomised scores hold for this distribution 
 def names(scores: Scores) -> list[str]:
     """Return the column names: RMS of continuous measures, final value of flags."""
     found = ["return"]
-    for name in scores.figures:
+    for name in scores.results:
         measure, _, what = name.rpartition(" ")
-        flag = scores.units[name] == "1" and np.isin(scores.figures[name], (0.0, 1.0)).all()
+        flag = scores.units[name] == "1" and np.isin(scores.results[name], (0.0, 1.0)).all()
         if what == "final" and flag:
             found.append(name)
         elif what == "final":
             found.append(f"{measure} RMS")
-    return found + [name for name in (SUCCESS,) if name in scores.figures]
+    return found + [name for name in (SUCCESS,) if name in scores.results]
 
 
 def row(cells: list[str]) -> str:
@@ -59,14 +63,12 @@ def table(name: str, asked) -> list[str]:
     actions = asked.actions.split(",") if asked.actions else [task.action]
     columns: list[str] = []
     for action in actions:
-        for sensors in ("ideal", REAL):
+        for sensors in ("ideal", REAL_SENSORS):
             for machine, randomise in (("nominal", ()), ("randomised", spread)):
-                choices = Options(
-                    action=action, sensors=sensors, randomise=randomise, variants=asked.variants
-                )
+                choices = Options(action=action, sensors=sensors, randomise=randomise, variants=asked.variants)
                 core = TaskCore(task, choices, min(asked.episodes, asked.batch), 0, DISABLED)
-                for kind in CONTROLLERS:
-                    if kind == "reference" and name not in REFERENCES:
+                for kind in CONTROLLER_NAMES:
+                    if kind == "reference" and name not in REFERENCE_CONTROLLERS:
                         continue
                     controller = make_controller(kind, core.setup)
                     scores = evaluate(core, controller, asked.episodes, asked.seed)
@@ -75,16 +77,14 @@ def table(name: str, asked) -> list[str]:
                         heads = [f"{column} [{scores.units[column]}]" for column in columns]
                         heads = ["actions", "sensors", "machine", "controller", *heads]
                         lines += [row(heads), row(["---"] * len(heads))]
-                    cells = [f"{scores.mean(c):.4g} ± {scores.error(c):.2g}" for c in columns]
+                    cells = [f"{scores.mean(c):.4g} ± {scores.standard_error(c):.2g}" for c in columns]
                     lines.append(row([action, sensors, machine, kind, *cells]))
                 core.close()
     return lines
 
 
 def main() -> None:
-    asked = options(
-        __doc__, tasks="all", actions="", episodes=64, batch=64, variants=32, seed=10**6
-    )
+    asked = options(__doc__, tasks="all", actions="", episodes=64, batch=64, variants=32, seed=10**6)
     chosen = list(TASKS) if asked.tasks == "all" else asked.tasks.split(",")
     if strange := sorted(set(chosen) - set(TASKS)):
         raise SystemExit(f"--tasks {strange[0]}: choose of {', '.join(TASKS)}")

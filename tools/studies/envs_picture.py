@@ -30,9 +30,7 @@ rows = -(-len(tasks) // columns)
 whole = Image.new("RGB", (columns * SIZE[0], rows * SIZE[1]), (255, 255, 255))
 font = ImageFont.load_default(24)
 for number, task in enumerate(tasks):
-    env = gymnasium.make(
-        f"hydrotele/{task}-v0", render_mode="rgb_array", width=SIZE[0], height=SIZE[1]
-    )
+    env = gymnasium.make(f"hydrotele/{task}-v0", render_mode="rgb_array", width=SIZE[0], height=SIZE[1])
     setup = env.unwrapped.core.setup
     try:
         controller = make_controller("reference", setup)
@@ -52,6 +50,4 @@ for number, task in enumerate(tasks):
     print(task, f"reward {reward:.2f}", {k: round(float(v), 3) for k, v in info.items()})
     env.close()
 # markers are few pixels of colours that nothing else has
-whole.quantize(COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
-    picture, optimize=True
-)
+whole.quantize(COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(picture, optimize=True)

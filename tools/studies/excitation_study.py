@@ -18,12 +18,12 @@ import yaml
 from hydrotele.identify.excitation import (
     Excitation,
     MachineLimits,
+    compute_information,
     design_motion,
-    information,
-    informative_base,
+    select_informative_base,
 )
 from hydrotele.identify.identification import identify_dynamics
-from hydrotele.identify.record import force_noise, records
+from hydrotele.identify.record import build_records, compute_force_noise
 from hydrotele.identify.result import parameter_rows
 from hydrotele.identify.setup import machine_setup
 from hydrotele.logs.dataset import make_dataset
@@ -31,7 +31,7 @@ from hydrotele.logs.files import RunFiles
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import Scenario, load_scenario
-from hydrotele.simulate.closure import closed_chain
+from hydrotele.simulate.closure import load_closed_chain
 from tools.studies.study import options, publish
 
 SENSORS, OLD, HELD_OUT = "khoshzaban1992", "excitation", "excitation_fast"
@@ -61,8 +61,8 @@ def spreads(scenario: Scenario, trials: int) -> dict[str, float]:
             seeded = one.model_copy(update={"seed": 1000 + trial})
             logs.append(RunFiles(one.name, (run_scenario(seeded).measured,)))
         data = make_dataset(sorted(logs), machine, SENSORS, HELD_OUT)
-        fit, heldout, _ = records(data)
-        setup = machine_setup(machine, closed_chain(machine))
+        fit, heldout, _ = build_records(data)
+        setup = machine_setup(machine, load_closed_chain(machine))
         rows = parameter_rows(identify_dynamics(fit, heldout, setup))
         found.append({row.name: row.std for row in rows if row.std is not None})
     names = set.intersection(*(set(f) for f in found))
@@ -73,9 +73,9 @@ def main() -> None:
     """Design, compare, print."""
     asked = options(__doc__, harmonics=10, starts=4, seed=0, trials=5)
     machine = load_machine("cat215")
-    setup = machine_setup(machine, closed_chain(machine))
-    noise = force_noise(machine, SENSORS)
-    base = informative_base(machine, setup, noise)
+    setup = machine_setup(machine, load_closed_chain(machine))
+    noise = compute_force_noise(machine, SENSORS)
+    base = select_informative_base(machine, setup, noise)
     old = motion_of(load_scenario(OLD))
     new = design_motion(
         MachineLimits(machine, setup), setup, noise, base, period=old.period,
@@ -83,14 +83,11 @@ def main() -> None:
         progress=lambda said, share: print(said, flush=True),
     )  # fmt: skip
     time = np.arange(0.0, old.period, 0.05)
-    logs = [
-        np.linalg.slogdet(information(setup, one.motion(time), noise, base))[1]
-        for one in (old, new)
-    ]
+    logs = [np.linalg.slogdet(compute_information(setup, one.evaluate(time), noise, base))[1] for one in (old, new)]
     better = float(np.exp((logs[1] - logs[0]) / len(base)))
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "designed.yaml"
-        file.write_text(yaml.safe_dump(new.scenario("designed", machine, 2.75, sensors=SENSORS)))
+        file.write_text(yaml.safe_dump(new.to_scenario("designed", machine, 2.75, sensors=SENSORS)))
         designed = load_scenario(file)
         tracked = run_scenario(designed).summary
     long = load_scenario(OLD, {"duration": "60.0"})
@@ -104,7 +101,7 @@ def main() -> None:
         " smaller standard deviation is better; a ratio above 1 favours the designed motion.", "",
         "| | |", "| --- | ---: |",
         f"| ratio of the determinant criterion per parameter, designed to `{OLD}` | {better:.1f} |",
-        f"| largest utilisation of a limit by the designed motion | {100 * new.worst:.0f} % |",
+        f"| largest utilisation of a limit by the designed motion | {100 * new.max_utilisation:.0f} % |",
         f"| parameters identifiable with both motions | {len(both)} |",
         f"| parameters identifiable with `{OLD}` / with the designed motion |"
         f" {len(stds[0])} / {len(stds[1])} |",

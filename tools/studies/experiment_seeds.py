@@ -13,7 +13,7 @@ import importlib
 import sys
 from pathlib import Path
 
-from hydrotele.cli.experimenting import write_results
+from hydrotele.cli.experimenting import write_comparison_files
 from hydrotele.experiments.comparison import Series, compare_by_seeds
 
 
@@ -28,9 +28,7 @@ def report_progress(name: str, fraction: float) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("name")
     parser.add_argument("--counts", type=int, nargs="+", default=[10, 20, 40])
     parser.add_argument("--jobs", type=int, default=2)
@@ -42,7 +40,7 @@ def main() -> None:
     found = compare_by_seeds(series, counts, arguments.jobs, report_progress)
     if arguments.folder and series.repetitions in counts:
         arguments.folder.mkdir(parents=True, exist_ok=True)
-        write_results(arguments.folder, series, series.repetitions, found[series.repetitions])
+        write_comparison_files(arguments.folder, series, series.repetitions, found[series.repetitions])
     words = " ".join(map(str, counts))
     lines = [
         f"# Verdicts of {arguments.name} by number of repetitions", "",

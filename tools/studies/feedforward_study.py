@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from hydrotele.effects.effect import changed
+from hydrotele.effects.effect import with_value
 from hydrotele.identify.identification import identify_dynamics
-from hydrotele.identify.identified_machine import identified_machine
-from hydrotele.identify.record import records
+from hydrotele.identify.identified_machine import build_identified_machine
+from hydrotele.identify.record import build_records
 from hydrotele.identify.setup import machine_setup
-from hydrotele.kinematics.arm import forward_cartesian, inverse
+from hydrotele.kinematics.arm import forward_cartesian, inverse_kinematics
 from hydrotele.kinematics.from_machine import arm_geometry
 from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
@@ -29,7 +29,7 @@ from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine, save_machine
 from hydrotele.run.run import Run, run_scenario
 from hydrotele.scenario.scenario import Scenario, load_scenario
-from hydrotele.simulate.closure import closed_chain
+from hydrotele.simulate.closure import load_closed_chain
 from tools.studies.study import options, publish
 
 SENSORS = "khoshzaban1992"
@@ -69,7 +69,7 @@ def other_machine(machine: Machine) -> Machine:
         ("axes.boom.force.friction.coulomb", 3600.0),
         ("axes.stick.force.friction.viscous", 3000.0),
     ):  # fmt: skip
-        machine = changed(machine, path, value)
+        machine = with_value(machine, path, value)
     return machine
 
 
@@ -95,7 +95,7 @@ def track(machine: Machine, folder: Path, shape: str, lap: float, model: str | N
     since = np.maximum(time - SETTLE, 0.0)
     soft = 0.25 * lap
     phase = (since - soft * (1.0 - np.exp(-since / soft))) / lap
-    joints = np.array([inverse(geometry, tuple(point))[:3] for point in path_of(shape, phase)])
+    joints = np.array([inverse_kinematics(geometry, tuple(point))[:3] for point in path_of(shape, phase)])
     pilot = {
         "kind": "table", "of": "joint", "interpolate": "linear", "time": time.tolist(),
         "columns": {a: joints[:, k].tolist() for k, a in enumerate(AXES)},
@@ -157,9 +157,9 @@ def main() -> None:
                 log.metadata, name),))
             for name, rows in parts
         ]  # fmt: skip
-        fit, heldout, _ = records(make_dataset(files, model, SENSORS, "b"))
-        found = identify_dynamics(fit, heldout, machine_setup(model, closed_chain(model)))
-        better, _ = identified_machine(model, found, {})
+        fit, heldout, _ = build_records(make_dataset(files, model, SENSORS, "b"))
+        found = identify_dynamics(fit, heldout, machine_setup(model, load_closed_chain(model)))
+        better, _ = build_identified_machine(model, found, {})
         (folder / "identified").mkdir()
         save_machine(better, folder / "identified" / "machine.yaml")
         models = [None, *(str(folder / name) for name in ("given", "identified", "driven"))]

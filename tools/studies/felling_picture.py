@@ -15,10 +15,10 @@ from PIL import Image
 from hydrotele.logs.log import load_log
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.show.pose import (
+    compile_visual_model,
     logged_joints,
     logged_positions,
     logged_surroundings,
-    model_with_looks,
 )
 
 MOMENTS = (11.0, 29.0, 38.0, 60.0, 74.0, 85.5)  # s
@@ -27,7 +27,7 @@ COLUMNS = 3
 
 folder, picture = Path(sys.argv[1]), Path(sys.argv[2])
 machine, log = load_machine(folder / "machine.yaml"), load_log(folder / "truth.parquet")
-model = model_with_looks(machine, surroundings=logged_surroundings(log))
+model = compile_visual_model(machine, surroundings=logged_surroundings(log))
 rows = np.searchsorted(log.time, MOMENTS)
 positions = logged_positions(machine, model, logged_joints(machine, log), log)[rows]
 data, camera = mujoco.MjData(model), mujoco.MjvCamera()

@@ -24,9 +24,7 @@ PLATE = 0.03  # s, damping over stiffness of every plate
 PRESS = {"duration": "30", "pilot.operator.target.time": "[0.0]",
          "pilot.operator.target.force": f"[{TARGET}]"}  # fmt: skip
 AXES = ("swing", "boom", "stick", "bucket")
-NO_OVERLAP = ", ".join(
-    f"{{name: valve_deadband, location: {axis}, parameters: {{deadband: 0.0}}}}" for axis in AXES
-)
+NO_OVERLAP = ", ".join(f"{{name: valve_deadband, location: {axis}, parameters: {{deadband: 0.0}}}}" for axis in AXES)
 
 SETTINGS = {
     "as shipped: z 0.3 m/s, 1 MN/m, no delay, 1.5 Hz": {},
@@ -79,22 +77,22 @@ def limit(number: int, bare: bool) -> tuple[float, float, float, float]:
     loop = analyse_scenario(load_scenario("press_direct", overrides)).loop
 
     def unstable(factor: float) -> bool:
-        ratio = {"pilot.ratio": str(factor * loop.largest_ratio)}
+        ratio = {"pilot.ratio": str(factor * loop.max_ratio)}
         return swing("press_direct", overrides | ratio) > SHARE
 
     found = next((f for f in LADDER if unstable(float(f))), np.inf) / np.sqrt(LADDER[1] / LADDER[0])
     return (
-        loop.largest_ratio,
-        loop.ratio_with_deadband,
+        loop.max_ratio,
+        loop.max_ratio_with_deadband,
         loop.frequency,
-        float(found * loop.largest_ratio),
+        float(found * loop.max_ratio),
     )
 
 
 def side(number: int, seed: int) -> tuple[float, float, float]:
     """Direct force and stiffness feedback that reflect as much, swings; and that ratio."""
     overrides = changes(list(SETTINGS.values())[number], False) | {"seed": str(seed)}
-    ratio = analyse_scenario(load_scenario("press_stiffness", overrides)).edge_ratio
+    ratio = analyse_scenario(load_scenario("press_stiffness", overrides)).deadband_edge_ratio
     direct = swing("press_direct", overrides | {"pilot.ratio": str(ratio)})
     return direct, swing("press_stiffness", overrides), ratio
 
@@ -108,7 +106,7 @@ def delayed(delay: float, damping: float, seed: int) -> tuple[float, float, floa
     handle = station.log.master("handle")[:, 2]
     last, late = force[2 * len(force) // 3 :], handle[2 * len(handle) // 3 :]
     low, high = np.percentile(last, [5.0, 95.0])
-    margin = analyse_scenario(load_scenario("press_stiffness", overrides)).held.margin
+    margin = analyse_scenario(load_scenario("press_stiffness", overrides)).held_spring.theorem_margin
     return 0.5 * float(high - low) / TARGET, float(np.std(late)), margin
 
 
@@ -154,8 +152,7 @@ def sides_table(found: list, seeds: int) -> list[str]:
         table = np.array(found[number * seeds : (number + 1) * seeds])[:, :2]
         many, most = (table > SHARE).sum(axis=0), table.max(axis=0)
         lines.append(
-            f"| {name} | {many[0]} of {seeds} | {100 * most[0]:.0f} % | {many[1]} of {seeds} |"
-            f" {100 * most[1]:.0f} % |"
+            f"| {name} | {many[0]} of {seeds} | {100 * most[0]:.0f} % | {many[1]} of {seeds} | {100 * most[1]:.0f} % |"
         )
     return lines
 
@@ -191,9 +188,9 @@ def held_table(found: list) -> list[str]:
 
 def draw(bare: list, path: Path) -> None:
     """Limits, predicted and simulated; contact forces of both structures."""
-    from hydrotele.show.report_html import drawing, png
+    from hydrotele.show.report_html import png, report_figure
 
-    with drawing(3.2) as figure:
+    with report_figure(3.2) as figure:
         left, right = figure.subplots(1, 2, width_ratios=(1, 1.6))
         table = np.array([(one[0], one[3]) for one in bare])
         table = table[np.isfinite(table[:, 1]) & (table[:, 1] > 0.0)]

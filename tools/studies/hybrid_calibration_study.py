@@ -8,31 +8,37 @@ import time
 
 import numpy as np
 
-from hydrotele.calibrate.hybrid import Equations, calibrate, equations, informative_poses, subset
-from hydrotele.calibrate.hybrid_data import measurement_of_wires
+from hydrotele.calibrate.hybrid import (
+    PoseEquations,
+    build_equations,
+    calibrate_hybrid_robot,
+    fitted_equations,
+    select_informative_poses,
+)
+from hydrotele.calibrate.hybrid_data import measurement_from_wires
 from hydrotele.calibrate.posterior import sample_posterior
 from hydrotele.experiments.wang_robots import (
     SENSOR_NOISE,
-    pose_errors_at_test_poses,
+    compute_test_errors,
     simulate_robot,
 )
 from hydrotele.kinematics.hybrid import (
-    corrected,
-    document_parameters,
-    error_model,
-    forward,
+    apply_errors,
+    build_error_model,
+    forward_kinematics,
     load_hybrid,
+    refined_model_parameters,
 )
 from hydrotele.kinematics.wires import wire_lengths
 from hydrotele.simulate.hybrid import (
-    manufactured_errors,
-    measured_poses,
-    random_poses,
-    shipped_wires,
+    default_wires,
+    sample_manufacturing_errors,
+    sample_poses,
+    simulate_measured_poses,
 )
 
 IWR = load_hybrid("iwr")
-DOCUMENT = document_parameters(error_model(IWR, "dh"))
+DOCUMENT = refined_model_parameters(build_error_model(IWR, "dh"))
 PARTS = ("coverage", "all54", "noise", "poses", "choice", "posterior", "speed")
 
 
@@ -41,15 +47,15 @@ def coverage(trials: int) -> None:
     found, truth, deviations, inside, before, after = [], [], [], [], [], []
     for seed in range(trials):
         one = simulate_robot(3000 + seed, 25)
-        fit = (done := calibrate(IWR, one.measurement, "dh", DOCUMENT)).fit
-        at = one.model.index(fit.names)
+        fit = (done := calibrate_hybrid_robot(IWR, one.measurement, "dh", DOCUMENT)).fit
+        at = one.model.parameter_indices(fit.names)
         found.append(fit.values)
         truth.append(one.errors[at])
-        deviations.append(fit.deviations)
+        deviations.append(fit.standard_deviations)
         low, high = fit.intervals.T
         inside.append((one.errors[at] > low) & (one.errors[at] < high))
-        before.append(pose_errors_at_test_poses(one, IWR)[0])
-        after.append(pose_errors_at_test_poses(one, done.robot)[0])
+        before.append(compute_test_errors(one, IWR)[0])
+        after.append(compute_test_errors(one, done.robot)[0])
     away = (np.array(found) - truth) / np.array(deviations)
     share = np.mean(inside, axis=0)
     bias = away.mean(axis=0) * np.sqrt(trials)
@@ -82,17 +88,17 @@ def all54(trials: int) -> None:
     for kind in ("dh", "poe"):
         inside, chi, before, after, ranks = [], [], [], [], set()
         for seed in range(trials):
-            one = simulate_robot(4000 + seed, 25, kind, document=False)
-            done = calibrate(IWR, one.measurement, kind)
-            fit, told = done.fit, done.fit.told
+            one = simulate_robot(4000 + seed, 25, kind, refined_only=False)
+            done = calibrate_hybrid_robot(IWR, one.measurement, kind)
+            fit, told = done.fit, done.fit.identifiability
             row = told.combination
             estimate = row @ fit.values
             size = np.sqrt(np.einsum("ij,jk,ik->i", row, fit.covariance, row))
-            inside.append(np.abs(estimate - row @ one.errors) < fit.critical * size)
+            inside.append(np.abs(estimate - row @ one.errors) < fit.interval_quantile * size)
             chi.append(fit.chi)
             ranks.add(done.redundancy.rank)
-            before.append(pose_errors_at_test_poses(one, IWR)[0])
-            after.append(pose_errors_at_test_poses(one, done.robot)[0])
+            before.append(compute_test_errors(one, IWR)[0])
+            after.append(compute_test_errors(one, done.robot)[0])
         print(
             f"{trials} trials, {kind}, 54 errors, rank {ranks}: 95 % intervals of the"
             f" combinations contain {100 * np.mean(inside):.2f} %; chi {np.mean(chi):.3f}"
@@ -107,12 +113,9 @@ def noise(trials: int) -> None:
         errors = []
         for seed in range(trials):
             one = simulate_robot(5000 + seed, 25, noise=factor)
-            done = calibrate(IWR, one.measurement, "dh", DOCUMENT)
-            errors.append(pose_errors_at_test_poses(one, done.robot)[0])
-        print(
-            f"| {factor:g} x | {1e3 * np.sqrt(np.mean(np.square(errors))):.4f} |"
-            f" {1e3 * np.max(errors):.4f} |"
-        )
+            done = calibrate_hybrid_robot(IWR, one.measurement, "dh", DOCUMENT)
+            errors.append(compute_test_errors(one, done.robot)[0])
+        print(f"| {factor:g} x | {1e3 * np.sqrt(np.mean(np.square(errors))):.4f} | {1e3 * np.max(errors):.4f} |")
 
 
 def poses(trials: int) -> None:
@@ -124,45 +127,38 @@ def poses(trials: int) -> None:
         for seed in range(trials):
             one = simulate_robot(6000 + seed, count)
             begin = time.process_time()
-            done = calibrate(IWR, one.measurement, "dh", DOCUMENT)
+            done = calibrate_hybrid_robot(IWR, one.measurement, "dh", DOCUMENT)
             took += time.process_time() - begin
-            errors.append(pose_errors_at_test_poses(one, done.robot)[0])
-            other = simulate_robot(6500 + seed, count, document=False)
-            whole.append(
-                pose_errors_at_test_poses(other, calibrate(IWR, other.measurement, "dh").robot)[0]
-            )
+            errors.append(compute_test_errors(one, done.robot)[0])
+            other = simulate_robot(6500 + seed, count, refined_only=False)
+            whole.append(compute_test_errors(other, calibrate_hybrid_robot(IWR, other.measurement, "dh").robot)[0])
         sizes = [1e3 * np.sqrt(np.mean(np.square(e))) for e in (errors, whole)]
         print(f"| {count} | {sizes[0]:.4f} | {sizes[1]:.4f} | {took / trials:.2f} |")
 
 
 def choice(trials: int) -> None:
     """Chosen poses against random ones, 20 of 200."""
-    wires, model = shipped_wires(), error_model(IWR, "dh")
+    wires, model = default_wires(), build_error_model(IWR, "dh")
     errors: dict[str, list] = {"random": [], "D": [], "O1": [], "O3": [], "O5": []}
     for seed in range(trials):
         rng = np.random.default_rng([77, seed])
-        planted = manufactured_errors(model, rng)
-        built = corrected(model, planted)
-        joints, legs = random_poses(IWR, 200, rng, wires)
-        lengths = wire_lengths(wires, forward(IWR, joints, legs))
-        exact = measurement_of_wires(IWR, joints, legs, lengths, wires, SENSOR_NOISE, "candidates")
-        unused = random_poses(IWR, 50, rng, wires)
+        planted = sample_manufacturing_errors(model, rng)
+        built = apply_errors(model, planted)
+        joints, legs = sample_poses(IWR, 200, rng, wires)
+        lengths = wire_lengths(wires, forward_kinematics(IWR, joints, legs))
+        exact = measurement_from_wires(IWR, joints, legs, lengths, wires, SENSOR_NOISE, "candidates")
+        unused = sample_poses(IWR, 50, rng, wires)
         for name, found in errors.items():
             places = (np.arange(20) if name == "random"
-                      else informative_poses(model, exact, 20, name))  # fmt: skip
-            read = measured_poses(built, joints[places], legs[places], wires, SENSOR_NOISE, rng)
-            measured = measurement_of_wires(
-                IWR, read.joints, read.legs, read.wires, wires, SENSOR_NOISE, name
-            )
-            robot = calibrate(IWR, measured, "dh").robot
-            away = forward(robot, *unused).position - forward(built, *unused).position
+                      else select_informative_poses(model, exact, 20, name))  # fmt: skip
+            read = simulate_measured_poses(built, joints[places], legs[places], wires, SENSOR_NOISE, rng)
+            measured = measurement_from_wires(IWR, read.joints, read.legs, read.wires, wires, SENSOR_NOISE, name)
+            robot = calibrate_hybrid_robot(IWR, measured, "dh").robot
+            away = forward_kinematics(robot, *unused).position - forward_kinematics(built, *unused).position
             found.append(np.linalg.norm(away, axis=1))
     print("| 20 poses | RMS at 50 test poses [mm] | largest [mm] |\n| --- | ---: | ---: |")
     for name, found in errors.items():
-        print(
-            f"| {name} | {1e3 * np.sqrt(np.mean(np.square(found))):.4f} |"
-            f" {1e3 * np.max(found):.4f} |"
-        )
+        print(f"| {name} | {1e3 * np.sqrt(np.mean(np.square(found))):.4f} | {1e3 * np.max(found):.4f} |")
 
 
 def posterior(trials: int) -> None:
@@ -170,16 +166,16 @@ def posterior(trials: int) -> None:
     inside, agree = [], []
     for seed in range(trials):
         one = simulate_robot(7000 + seed, 25)
-        done = calibrate(IWR, one.measurement, "dh", DOCUMENT)
-        eq, fit = subset(done), done.fit
+        done = calibrate_hybrid_robot(IWR, one.measurement, "dh", DOCUMENT)
+        eq, fit = fitted_equations(done), done.fit
         sample = sample_posterior(
-            lambda x, eq=eq: -eq.misfit(x), fit.values, fit.covariance, eq.names, steps=4000,
-            burn=500, seed=seed,
+            lambda x, eq=eq: -eq.negative_log_likelihood(x), fit.values, fit.covariance, eq.names, steps=4000,
+            burn_in=500, seed=seed,
         )  # fmt: skip
         low, high = sample.intervals.T
-        truth = one.errors[one.model.index(fit.names)]
+        truth = one.errors[one.model.parameter_indices(fit.names)]
         inside.append((truth > low) & (truth < high))
-        agree.append(np.abs(sample.mean - fit.values) / fit.deviations)
+        agree.append(np.abs(sample.mean - fit.values) / fit.standard_deviations)
     print(
         f"{trials} trials of MCMC: central 95 % contain {100 * np.mean(inside):.1f} % of the true"
         f" errors; means differ from least squares by at most {np.max(agree):.2f} standard"
@@ -193,13 +189,13 @@ def speed(trials: int) -> None:
     print("| model | poses | CPU time of 1e5 likelihoods on one core [s] |\n| --- | ---: | ---: |")
     for kind in ("dh", "poe"):
         for count in (25, 50, 100, 200):
-            one = simulate_robot(8000, count, kind, document=False)
-            eq: Equations = equations(error_model(IWR, kind), one.measurement)
+            one = simulate_robot(8000, count, kind, refined_only=False)
+            eq: PoseEquations = build_equations(build_error_model(IWR, kind), one.measurement)
             values = rng.normal(size=(100, 54)) * eq.scales
-            eq.misfit(values)
+            eq.negative_log_likelihood(values)
             begin = time.process_time()
             for _ in range(100):
-                eq.misfit(values)
+                eq.negative_log_likelihood(values)
             print(f"| {kind} | {count} | {10 * (time.process_time() - begin):.2f} |")
 
 

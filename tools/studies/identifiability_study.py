@@ -27,12 +27,12 @@ def report() -> str:
         "| Khoshzaban, Table 13 | | " + " | ".join(map(str, TABLE_13.values())) + " | |",
     ]
     for said, base in bases.items():
-        counts = " | ".join(str(n) for n in count_parameters(base.told).values())
-        gap = "{:.1g}, {:.1g}".format(*base.told.gap)
-        lines.append(f"| {said} | {len(base.told.base)} | {counts} | {gap} |")
+        counts = " | ".join(str(n) for n in count_parameters(base.classification).values())
+        gap = "{:.1g}, {:.1g}".format(*base.classification.singular_value_gap)
+        lines.append(f"| {said} | {len(base.classification.base)} | {counts} | {gap} |")
     lines += ["", TEXT, "", "Fully identifiable parameters:", ""]
     for said, base in bases.items():
-        told = zip(base.told.names, base.told.status, strict=True)
+        told = zip(base.classification.names, base.classification.status, strict=True)
         lines.append(f"- {said}: {', '.join(n for n, status in told if status == 'full')}")
     return "\n".join(lines) + "\n"
 

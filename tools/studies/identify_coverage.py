@@ -17,14 +17,14 @@ import numpy as np
 from scipy.stats import chi2
 
 from hydrotele.identify.identification import identify_dynamics
-from hydrotele.identify.record import records
+from hydrotele.identify.record import build_records
 from hydrotele.identify.setup import RegressorSetup, machine_setup
 from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
-from hydrotele.simulate.closure import closed_chain
+from hydrotele.simulate.closure import load_closed_chain
 from tools.studies.study import options, publish, side_by_side
 
 FIT, HELD_OUT = ("excitation", "excitation_fast"), "excitation_stick"
@@ -36,10 +36,8 @@ def wrong_setup(setup: RegressorSetup, rng: np.random.Generator) -> RegressorSet
     inertia = setup.chain.inertia * rng.uniform(1 - OFF, 1 + OFF, (len(setup.chain.inertia), 1))
     inertia[:, 1:4] *= rng.uniform(1 - OFF, 1 + OFF, (len(inertia), 1))
     rubbing = tuple(
-        dataclasses.replace(
-            one, nominal={k: v * rng.uniform(1 - OFF, 1 + OFF) for k, v in one.nominal.items()}
-        )
-        for one in setup.rubbing
+        dataclasses.replace(one, nominal={k: v * rng.uniform(1 - OFF, 1 + OFF) for k, v in one.nominal.items()})
+        for one in setup.friction_terms
     )
     chain = dataclasses.replace(setup.chain, inertia=inertia)
     return dataclasses.replace(setup, chain=chain, rubbing=rubbing)
@@ -53,18 +51,18 @@ def one_trial(seed: int, number: int, sensors: str) -> dict[str, Any]:
         own = {"seed": str(int(rng.integers(2**31))), "sensors": sensors}
         logs.append(RunFiles(name, (run_scenario(load_scenario(name, own)).measured,)))
     dataset = make_dataset(sorted(logs), machine, sensors, HELD_OUT)
-    fit, heldout, _ = records(dataset)
-    setup = machine_setup(machine, closed_chain(machine))
+    fit, heldout, _ = build_records(dataset)
+    setup = machine_setup(machine, load_closed_chain(machine))
     found = identify_dynamics(fit, heldout, wrong_setup(setup, rng))
     known = np.concatenate([setup.chain.inertia[setup.chain.bodies.index(b)] for b in setup.bodies]
-                           + [list(one.nominal.values()) for one in setup.rubbing]
+                           + [list(one.nominal.values()) for one in setup.friction_terms]
                            + [np.zeros(len(setup.chain.drives))])  # fmt: skip
-    truth = found.told.combination @ known
-    names = [found.names[b] for b in found.told.base]
+    truth = found.data_identifiability.combination @ known
+    names = [found.names[b] for b in found.data_identifiability.base]
     away = (found.estimate.value - truth) / found.estimate.std
     return {
         "away": dict(zip(names, away.tolist(), strict=True)),
-        "ellipsoid": found.estimate.ellipsoid(truth) / float(chi2.ppf(0.95, len(names))),
+        "ellipsoid": found.estimate.squared_distance(truth) / float(chi2.ppf(0.95, len(names))),
         "heldout": {d: [h.rms, h.noise_rms] for d, h in found.heldout.items()},
         "status": found.status,
     }
@@ -95,10 +93,7 @@ def report(results: list[dict[str, Any]]) -> str:
     names = dict.fromkeys(n for r in results for n in r["away"])
     for name in names:
         own = np.array([r["away"][name] for r in results if name in r["away"]])
-        lines.append(
-            f"| {name} | {len(own)} | {100 * np.mean(np.abs(own) <= 1.959964):.1f} % |"
-            f" {own.mean():+.2f} |"
-        )
+        lines.append(f"| {name} | {len(own)} | {100 * np.mean(np.abs(own) <= 1.959964):.1f} % | {own.mean():+.2f} |")
     return "\n".join(lines) + "\n"
 
 

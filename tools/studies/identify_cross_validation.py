@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from hydrotele.identify.identification import identify_dynamics
-from hydrotele.identify.record import IdentificationRecord, records
+from hydrotele.identify.record import IdentificationRecord, build_records
 from hydrotele.identify.result import Identification
 from hydrotele.identify.setup import machine_setup
 from hydrotele.logs.dataset import load_dataset, make_dataset
@@ -25,7 +25,7 @@ from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
-from hydrotele.simulate.closure import closed_chain
+from hydrotele.simulate.closure import load_closed_chain
 from tools.studies.identify_coverage import wrong_setup
 from tools.studies.study import options, publish, side_by_side
 
@@ -37,17 +37,13 @@ THESIS = {  # Khoshzaban 1992, cross-validation of the CAT 215's models
 Errors = dict[str, tuple[float, float, float, float]]  # of a drive: complete, reduced, given, noise
 
 
-def judged(
-    machine: Machine, fit: Sequence[IdentificationRecord], heldout: IdentificationRecord, rng
-) -> Errors:
+def judged(machine: Machine, fit: Sequence[IdentificationRecord], heldout: IdentificationRecord, rng) -> Errors:
     """Errors of the three models on a run."""
-    chain, found = closed_chain(machine), []
+    chain, found = load_closed_chain(machine), []
     state = rng.bit_generator.state
     for model in ("complete", "reduced"):
         rng.bit_generator.state = state  # both start from the same wrong machine
-        found.append(
-            identify_dynamics(fit, heldout, wrong_setup(machine_setup(machine, chain, model), rng))
-        )
+        found.append(identify_dynamics(fit, heldout, wrong_setup(machine_setup(machine, chain, model), rng)))
     complete, reduced = found
     return {drive: _errors(complete, reduced, drive) for drive in complete.heldout}
 
@@ -66,7 +62,7 @@ def one_trial(seed: int, number: int) -> list[Errors]:
         files.append(RunFiles(name, (run_scenario(load_scenario(name, own)).measured,)))
     out = []
     for name in MOTIONS:
-        fit, heldout, _ = records(make_dataset(files, machine, SENSORS, name))
+        fit, heldout, _ = build_records(make_dataset(files, machine, SENSORS, name))
         out.append(judged(machine, fit, heldout, rng))
     return out
 
@@ -76,7 +72,7 @@ def independent(folder: Path, seed: int) -> list[Errors]:
     machine, rng, out = load_machine("cat215"), np.random.default_rng([seed]), []
     data = load_dataset([folder], machine)
     for name in sorted(run.name for run in (*data.fit, data.heldout)):
-        fit, heldout, _ = records(load_dataset([folder], machine, heldout=name))
+        fit, heldout, _ = build_records(load_dataset([folder], machine, heldout=name))
         out.append(judged(machine, fit, heldout, rng))
     return out
 
@@ -84,8 +80,7 @@ def independent(folder: Path, seed: int) -> list[Errors]:
 def rows(results: Sequence[Errors]) -> list[str]:
     """RMS over results, drive by drive."""
     lines = [
-        "| force of | complete | reduced | as given | noise alone | complete over noise |"
-        " as given over complete |",
+        "| force of | complete | reduced | as given | noise alone | complete over noise | as given over complete |",
         "| --- | ---: | ---: | ---: | ---: | ---: | ---: |",
     ]
     for drive in results[0]:

@@ -13,9 +13,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from hydrotele.identify.identification import identify_with_shapes
+from hydrotele.identify.identification import identify_with_friction_shapes
 from hydrotele.identify.motion import Processing
-from hydrotele.identify.record import IdentificationRecord, records
+from hydrotele.identify.record import IdentificationRecord, build_records
 from hydrotele.identify.result import Identification, parameter_rows
 from hydrotele.identify.setup import RegressorSetup, machine_setup
 from hydrotele.logs.dataset import load_dataset
@@ -23,7 +23,7 @@ from hydrotele.logs.log import load_log
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.multibody.chain import Chain, load_chain
 from hydrotele.multibody.inverse_dynamics import FrictionTerm
-from hydrotele.simulate.closure import closed_chain
+from hydrotele.simulate.closure import load_closed_chain
 
 HELD_OUT = 0.25
 WIDE = 10.0  # Hz: the whole of what is in the Panda's torques besides noise
@@ -92,9 +92,9 @@ def panda(real: Path) -> None:
             ("held out: last quarter", (fit, heldout), None),
             ("held out: last quarter", (fit, heldout), WIDE),
         ):
-            found = identify_with_shapes([learned], judged, setup, Processing(band=band))
-            print(f"  {name}: rank {len(found.structure.base)} of {len(found.names)},"
-                  f" {len(found.told.base)} identifiable with noise, relative torque error"
+            found = identify_with_friction_shapes([learned], judged, setup, Processing(band=band))
+            print(f"  {name}: rank {len(found.motion_identifiability.base)} of {len(found.names)},"
+                  f" {len(found.data_identifiability.base)} identifiable with noise, relative torque error"
                   f" {100 * relative(found):.2f} % (below {found.band:.3g} Hz),"
                   f" {found.seconds:.1f} s")  # fmt: skip
 
@@ -102,37 +102,29 @@ def panda(real: Path) -> None:
 def relative(found: Identification) -> float:
     """Norm of all drives' errors over that of their forces, held-out run."""
     forces = found.forces
-    return float(
-        np.linalg.norm(forces.measured - forces.predicted) / np.linalg.norm(forces.measured)
-    )
+    return float(np.linalg.norm(forces.measured - forces.predicted) / np.linalg.norm(forces.measured))
 
 
 def emps(real: Path) -> None:
     """Parameters against the published ones, and the force error."""
     machine = load_machine("emps")
-    fit, heldout, _ = records(load_dataset(real / "emps" / "main.parquet", machine))
+    fit, heldout, _ = build_records(load_dataset(real / "emps" / "main.parquet", machine))
     for asymmetry in (False, True):
-        setup = machine_setup(machine, closed_chain(machine), asymmetry=asymmetry)
-        found = identify_with_shapes(fit, heldout, setup)
-        print(
-            f"EMPS, viscous friction {'by direction' if asymmetry else 'equal in both directions'}"
-        )
+        setup = machine_setup(machine, load_closed_chain(machine), asymmetry=asymmetry)
+        found = identify_with_friction_shapes(fit, heldout, setup)
+        print(f"EMPS, viscous friction {'by direction' if asymmetry else 'equal in both directions'}")
         for row in parameter_rows(found):
             if row.value is None:
                 continue
             known = PUBLISHED.get(row.name)
-            away = (
-                f", {100 * (row.value / known - 1):+.2f} % from published {known}" if known else ""
-            )
+            away = f", {100 * (row.value / known - 1):+.2f} % from published {known}" if known else ""
             print(f"  {row.name:24s} {row.value:9.3f} +- {row.std:.3f} {row.unit}{away}")
-        print(f"  relative force error, held out: {100 * found.heldout['slide'].relative:.2f} %"
+        print(f"  relative force error, held out: {100 * found.heldout['slide'].relative_error:.2f} %"
               f" (below {found.band:.3g} Hz)")  # fmt: skip
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("real", type=Path, help="folder with the records")
     parser.add_argument("--only", choices=["emps", "panda"])
     asked = parser.parse_args()

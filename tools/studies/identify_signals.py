@@ -17,18 +17,18 @@ import numpy as np
 from hydrotele.identify.estimation import Estimator
 from hydrotele.identify.identification import identify_dynamics
 from hydrotele.identify.motion import Processing
-from hydrotele.identify.record import records
+from hydrotele.identify.record import build_records
 from hydrotele.identify.setup import RegressorSetup, machine_setup
-from hydrotele.kinematics.arm import inverse
+from hydrotele.kinematics.arm import inverse_kinematics
 from hydrotele.kinematics.from_machine import arm_geometry
 from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.multibody.inverse_dynamics import project, regressor
+from hydrotele.multibody.inverse_dynamics import make_regressor, project_on_drives
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
-from hydrotele.simulate.closure import closed_chain
+from hydrotele.simulate.closure import load_closed_chain
 from tools.studies.identify_coverage import wrong_setup
 from tools.studies.study import options, publish, side_by_side
 
@@ -53,7 +53,7 @@ def circle(machine: Machine, lap: float) -> np.ndarray:
     def pose(t: float) -> tuple[float, ...]:
         angle = 2.0 * np.pi * t / lap
         r, z = REACH + RADIUS * np.cos(angle), HEIGHT + RADIUS * np.sin(angle)
-        return inverse(geometry, (r, TURN * np.sin(angle), z))[:3]
+        return inverse_kinematics(geometry, (r, TURN * np.sin(angle), z))[:3]
 
     before, now, after = (np.array([pose(t + d) for t in time]) for d in (-step, 0.0, step))
     return np.stack([now, (after - before) / (2 * step), (after - 2 * now + before) / step**2])
@@ -61,9 +61,13 @@ def circle(machine: Machine, lap: float) -> np.ndarray:
 
 def forces(setup: RegressorSetup, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Regressor (n, k, m) along a motion and the given parameters (m,)."""
-    found = project(setup.chain, setup.given, *motion)
-    table = regressor(
-        setup.chain, found, bodies=setup.bodies, rubbing=setup.rubbing, offsets=setup.offsets or {}
+    found = project_on_drives(setup.chain, setup.given_joints, *motion)
+    table = make_regressor(
+        setup.chain,
+        found,
+        bodies=setup.bodies,
+        friction=setup.friction_terms,
+        offsets=setup.offsets or {},
     )
     return table.matrix, table.nominal
 
@@ -76,14 +80,14 @@ def one_trial(seed: int, number: int, cycles: int) -> dict[str, list[list[float]
         own = {"seed": str(int(rng.integers(2**31))), "duration": str(duration)}
         logs.append(RunFiles(name, (run_scenario(load_scenario(name, own)).measured,)))
     dataset = make_dataset(logs, machine, "khoshzaban1992", "excitation_fast")
-    fit, heldout, _ = records(dataset)
-    setup = machine_setup(machine, closed_chain(machine))
+    fit, heldout, _ = build_records(dataset)
+    setup = machine_setup(machine, load_closed_chain(machine))
     laps = [forces(setup, circle(machine, lap)) for lap in LAPS]
     wrong = wrong_setup(setup, rng)  # what a way does not tell is not kept at the truth
     out = {}
     for way, (method, pairs) in WAYS.items():
         how = Processing(method, period=PERIOD)
-        found = identify_dynamics(fit, heldout, wrong, how, Estimator(pairs=pairs))
+        found = identify_dynamics(fit, heldout, wrong, how, Estimator(noise_pairs=pairs))
         errors = [matrix @ (found.value - truth) for matrix, truth in laps]
         out[way] = [np.sqrt(np.mean(e**2, axis=0)).tolist() for e in errors]
     return out

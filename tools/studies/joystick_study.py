@@ -14,26 +14,26 @@ from hydrotele.machine.joystick import AXES, load_joystick
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
 from hydrotele.scenario.teleoperation import TeleopPilot
-from hydrotele.simulate.joystick import SimulatedFlotor, field_shares
-from hydrotele.teleop.coils import heating, seconds_until_hot, three_stations
-from hydrotele.teleop.compliance import Flotor, turn_matrix
+from hydrotele.simulate.joystick import SimulatedFlotor, coil_force_factors
+from hydrotele.teleop.coils import make_three_station_coils, relative_heating, time_to_overheat
+from hydrotele.teleop.compliance import Flotor, quaternion_to_matrix
 from hydrotele.teleop.flotor import FlotorFit, identify_flotor
 from hydrotele.teleop.levitation import (
     LevitationRun,
-    designed_step,
-    excitation_path,
-    levitation,
+    make_excitation_path,
+    make_levitation_control,
     pose_resolution,
-    rotation_vector,
+    quaternion_to_vector,
+    second_order_step_response,
     simulate_levitation,
 )
-from hydrotele.teleop.master import master, master_step
+from hydrotele.teleop.master import build_master, step_master
 from hydrotele.teleop.sampled import (
-    largest_damping,
-    least_inertia,
-    slowest_decay,
-    spinning_body,
-    tilting_body,
+    make_spinning_body,
+    make_tilting_body,
+    max_loop_eigenvalue,
+    max_stable_damping,
+    min_stable_inertia,
 )
 from tools.studies.handle_laws import Detent
 from tools.studies.study import options, publish, side_by_side
@@ -61,7 +61,7 @@ def step(axis: int, joystick=JOYSTICK, **how) -> LevitationRun:
 def step_figures(flight: LevitationRun, axis: int) -> tuple[float, float, float]:
     """Deviation from the designed response, cross motion (fractions), largest current [A]."""
     alone, share = JOYSTICK.alone, flight.pose / SIZES
-    designed = designed_step(flight.time, alone.frequency[axis], alone.ratio[axis])
+    designed = second_order_step_response(flight.time, alone.frequency[axis], alone.ratio[axis])
     deviation = np.abs(share[:, axis] - designed).max()
     cross = np.abs(np.delete(share, axis, axis=1)).max()
     return float(deviation), float(cross), float(np.abs(flight.currents).max())
@@ -69,8 +69,8 @@ def step_figures(flight: LevitationRun, axis: int) -> tuple[float, float, float]
 
 def coils_and_sensing() -> list[str]:
     """Condition of M; resolution of the diodes."""
-    coils, diodes = levitation(JOYSTICK).coils, JOYSTICK.diodes
-    weight = coils.currents(np.array([0, 0, 9.81 * JOYSTICK.flotor.mass, 0, 0, 0])).value
+    coils, diodes = make_levitation_control(JOYSTICK).coils, JOYSTICK.diodes
+    weight = coils.compute_currents(np.array([0, 0, 9.81 * JOYSTICK.flotor.mass, 0, 0, 0])).value
     spread = pose_resolution(diodes.distance, diodes.step) * MICRO
     sensing = JOYSTICK.sensing
     stated = np.array([sensing.translation] * 3 + [sensing.rotation] * 3) / np.sqrt(12.0) * MICRO
@@ -135,13 +135,15 @@ def crooked():
 def identified(seed: int, diodes: bool = False) -> tuple[FlotorFit, LevitationRun]:
     """12 s of wobbling under a control that takes the flotor for another one."""
     joystick = crooked()
-    control = levitation(joystick, GUESS)
+    control = make_levitation_control(joystick, GUESS)
     flight = simulate_levitation(
-        joystick, excitation_path(joystick, 12.0, seed), control=control, seed=seed, diodes=diodes
+        joystick,
+        make_excitation_path(joystick, 12.0, seed),
+        control=control,
+        seed=seed,
+        diodes=diodes,
     )
-    fit = identify_flotor(
-        flight.place, flight.quaternion, flight.currents, control.period, control.coils
-    )
+    fit = identify_flotor(flight.place, flight.quaternion, flight.currents, control.period, control.coils)
     return fit, flight
 
 
@@ -171,11 +173,9 @@ def identification(results: list[tuple[FlotorFit, FlotorFit]]) -> list[str]:
     ]  # fmt: skip
     for i, (name, unit, scale) in enumerate(ROWS):
         cells = [f"{scale * truth[i]:.6f}", f"{scale * first.value[i]:.6f}"]
-        cells += [f"{scale * v[i]:.1e}" for v in (first.interval, *worst)]
+        cells += [f"{scale * v[i]:.1e}" for v in (first.interval_half_width, *worst)]
         lines.append(f"| {name} [{unit}] | {' | '.join(cells)} |")
-    inside = [
-        np.mean([np.abs(r[k].value - truth) <= r[k].interval for r in results]) for k in (0, 1)
-    ]
+    inside = [np.mean([np.abs(r[k].value - truth) <= r[k].interval_half_width for r in results]) for k in (0, 1)]
     lines += [
         "",
         f"{100 * inside[0]:.0f} % of the intervals contain the true value, {100 * inside[1]:.0f} "
@@ -185,12 +185,10 @@ def identification(results: list[tuple[FlotorFit, FlotorFit]]) -> list[str]:
         "| control assumes | height at rest, error [um] | worst deviation of a step [%] |"
         " worst cross motion [%] |", "| --- | ---: | ---: | ---: |",
     ]  # fmt: skip
-    for name, body in (("the assumed flotor", GUESS), ("the identified flotor", first.body()),
+    for name, body in (("the assumed flotor", GUESS), ("the identified flotor", first.to_flotor()),
                        ("the true flotor", None)):  # fmt: skip
-        control = levitation(crooked(), body)
-        rest = (
-            simulate_levitation(crooked(), np.zeros((600, 6)), control=control).pose[200:, 2].mean()
-        )
+        control = make_levitation_control(crooked(), body)
+        rest = simulate_levitation(crooked(), np.zeros((600, 6)), control=control).pose[200:, 2].mean()
         figures = np.array([
             step_figures(step(axis, crooked(), control=control), axis)
             for axis in range(6)
@@ -202,10 +200,8 @@ def identification(results: list[tuple[FlotorFit, FlotorFit]]) -> list[str]:
 
 def seated(**keys):
     """Parameters and state of the haptic device, without a machine."""
-    pilot = TeleopPilot.model_validate(
-        {"kind": "teleop", "operator": {"kind": "follow"}, "reflection": "none", **keys}
-    )
-    return master(JOYSTICK, pilot, ("r", "theta", "z"))
+    pilot = TeleopPilot.model_validate({"kind": "teleop", "operator": {"kind": "follow"}, "reflection": "none", **keys})
+    return build_master(JOYSTICK, pilot, ("r", "theta", "z"))
 
 
 def detent() -> list[str]:
@@ -229,7 +225,7 @@ def detent() -> list[str]:
         flotor.model.qpos_spring[0] = place
         forces = []
         for k in range(200):
-            master_step(numbers, flotor.data.qpos, QUIET, 1.0, PERIOD, k == 0, s)
+            step_master(numbers, flotor.data.qpos, QUIET, 1.0, PERIOD, k == 0, s)
             flotor.step(s.currents, np.zeros(6))
             forces.append(2e4 * (place - flotor.data.qpos[0]))
         now, felt = float(flotor.data.qpos[0]), float(np.mean(forces[-40:]))
@@ -241,13 +237,13 @@ def detent() -> list[str]:
 def coils_moved(qpos: np.ndarray) -> np.ndarray:
     """Displacement (3,) of the coils' centre in its gap [m]."""
     turn, handle = np.empty((3, 3)), np.array(JOYSTICK.flotor.handle)
-    turn_matrix(qpos[3:7], turn)
+    quaternion_to_matrix(qpos[3:7], turn)
     return qpos[:3] + handle - turn @ handle
 
 
 def travel() -> list[str]:
     """Position of the stops, travel of the handle, and penetration of a stop under 20 N."""
-    reach, limits = JOYSTICK.reach, JOYSTICK.workspace
+    reach, limits = JOYSTICK.handle_travel, JOYSTICK.workspace
     deg = np.rad2deg(reach[3:])
     bound = limits.translation / JOYSTICK.gains["feller"]["ry"].deadband
     lines = [
@@ -268,7 +264,7 @@ def travel() -> list[str]:
         "",
         "| axis | beyond the stop |", "| --- | ---: |",
     ]  # fmt: skip
-    lift = levitation(JOYSTICK).coils.currents(
+    lift = make_levitation_control(JOYSTICK).coils.compute_currents(
         np.array([0.0, 0.0, 9.81 * JOYSTICK.flotor.mass, 0.0, 0.0, 0.0])
     ).value  # fmt: skip
 
@@ -288,7 +284,7 @@ def travel() -> list[str]:
         if axis < 3:
             shown = f"{1e3 * (coils_moved(qpos)[axis] - limits.translation):.3f} mm"
         else:
-            deep = rotation_vector(qpos[3:7])[axis - 3] - limits.rotation
+            deep = quaternion_to_vector(qpos[3:7])[axis - 3] - limits.rotation
             shown = f"{np.rad2deg(deep):.3f} deg"
         lines.append(f"| {name} | {shown} |")
     qpos = pushed(np.array([20.0, 0, 0, 0, 0, 0]))
@@ -324,18 +320,21 @@ def damping() -> list[str]:
             for rate in (200.0, 1000.0):
                 springs, dampers = np.array([stiff, turn]), np.array([60.0, damped])
                 decays = [
-                    slowest_decay(
-                        tilting_body(f.mass, arm, f.inertia[0], held), springs, dampers, 1 / rate
+                    max_loop_eigenvalue(
+                        make_tilting_body(f.mass, arm, f.inertia[0], held),
+                        springs,
+                        dampers,
+                        1 / rate,
                     )
                     for held in ((0.0,) * 5, HELD)
                 ]
-                spin = spinning_body(f.inertia[2])
-                decays.append(slowest_decay(spin, np.array([about]), dampers[1:], 1 / rate))
+                spin = make_spinning_body(f.inertia[2])
+                decays.append(max_loop_eigenvalue(spin, np.array([about]), dampers[1:], 1 / rate))
                 cells = " | ".join(f"{d:.3f}" for d in decays)
                 lines.append(f"| {name} | {damped:g} ({what}) | {rate:g} | {cells} |")
-    needed = [least_inertia(rub, about, PERIOD) for _, _, about, rub in printed.values()]
+    needed = [min_stable_inertia(rub, about, PERIOD) for _, _, about, rub in printed.values()]
     radii = [1e3 * np.sqrt(i / f.mass) for i in needed]
-    fast = [least_inertia(rub, about, 1e-3) for _, _, about, rub in printed.values()]
+    fast = [min_stable_inertia(rub, about, 1e-3) for _, _, about, rub in printed.values()]
     return [
         *lines, "",
         "Half: the damper acts on the rate of the Euler vector of 5.1.3, which is half of the "
@@ -348,7 +347,7 @@ def damping() -> list[str]:
         f"{1e3 * JOYSTICK.coils.radius:g} mm. The library's flotor has {1e3 * f.inertia[0]:g} and "
         f"{1e3 * f.inertia[2]:g} g m^2. At 1 kHz, {1e3 * fast[0]:.1f} and {1e3 * fast[1]:.1f} g "
         "m^2 would be enough. The largest damping at which rz of this flotor is stable at 200 Hz "
-        f"with 6 N m/rad is {largest_damping(f.inertia[2], 6.0, PERIOD):.2f} N m s/rad.",
+        f"with 6 N m/rad is {max_stable_damping(f.inertia[2], 6.0, PERIOD):.2f} N m s/rad.",
         "",
     ]  # fmt: skip
 
@@ -356,7 +355,7 @@ def damping() -> list[str]:
 def heat() -> list[str]:
     """Currents and temperatures of a handle that is held out, with and without a detent."""
     c = JOYSTICK.coils
-    coils = three_stations(c.radius, c.force_per_ampere, c.max_current)
+    coils = make_three_station_coils(c.radius, c.force_per_ampere, c.max_current)
     handle, weight = JOYSTICK.flotor.handle[2], 9.81 * JOYSTICK.flotor.mass
     lines = [
         "## Heat", "",
@@ -373,7 +372,7 @@ def heat() -> list[str]:
     for axis in (0, 2, 4):
         gains = JOYSTICK.gains["feller"][AXES[axis]]
         assert gains.detent
-        x = 0.9 * JOYSTICK.reach[axis]
+        x = 0.9 * JOYSTICK.handle_travel[axis]
         law = Detent(gains.deadband, gains.detent.drop, gains.nominal, gains.detent.outside)
         cells = []
         for force in (gains.nominal * x, -law.force(x)):
@@ -381,10 +380,10 @@ def heat() -> list[str]:
             wrench[axis] += force
             wrench[4] += force * handle if axis == 0 else 0.0
             asked = np.linalg.solve(coils.wrench_map, wrench)
-            left = seconds_until_hot(asked, c.continuous_current, c.thermal_time)
+            left = time_to_overheat(asked, c.continuous_current, c.thermal_time)
             current = f"{np.abs(asked).max():.2f}"
             current += " (cut to 4)" if np.abs(asked).max() > c.max_current else ""
-            cells += [f"{force:.2f}", current, f"{heating(asked, c.continuous_current):.2f}",
+            cells += [f"{force:.2f}", current, f"{relative_heating(asked, c.continuous_current):.2f}",
                       "unlimited" if np.isinf(left) else f"{left:.0f}"]  # fmt: skip
         lines.append(f"| {AXES[axis]} | {' | '.join(cells)} |")
     return [*lines, ""]
@@ -393,7 +392,7 @@ def heat() -> list[str]:
 def force_over_the_gap() -> list[str]:
     """Force error of a field that decreases towards the ends of the gap."""
     c, limits = JOYSTICK.coils, JOYSTICK.workspace
-    coils = three_stations(c.radius, c.force_per_ampere, c.max_current)
+    coils = make_three_station_coils(c.radius, c.force_per_ampere, c.max_current)
     weight, handle = 9.81 * JOYSTICK.flotor.mass, JOYSTICK.flotor.handle[2]
     lines = [
         "## Force over the gap", "",
@@ -410,13 +409,10 @@ def force_over_the_gap() -> list[str]:
         errors = []
         for x in (4.5e-3, 2e-3):
             wrench = np.array([4.8, 0.0, weight, 0.0, 4.8 * handle, 0.0])
-            shares = field_shares(
-                coils.position, np.array([x, 0.0, 0.0]), np.eye(3), limits.translation, loss
-            )
-            errors.append(coils.wrench_map @ (shares * coils.currents(wrench).value) - wrench)
+            shares = coil_force_factors(coils.position, np.array([x, 0.0, 0.0]), np.eye(3), limits.translation, loss)
+            errors.append(coils.wrench_map @ (shares * coils.compute_currents(wrench).value) - wrench)
         lines.append(
-            f"| {100 * loss:g} | {errors[0][0]:.2f} | {-1e6 * errors[0][2] / stiff:.0f} |"
-            f" {errors[1][0]:.2f} |"
+            f"| {100 * loss:g} | {errors[0][0]:.2f} | {-1e6 * errors[0][2] / stiff:.0f} | {errors[1][0]:.2f} |"
         )
     return [*lines, "", "The shipped joystick has no loss (`coils.edge_loss: 0`).", ""]
 
@@ -438,11 +434,9 @@ def held(spin: np.ndarray, change: np.ndarray) -> np.ndarray:
     muscles[2] = 9.81 * JOYSTICK.hand.mass
     for k in range(len(spin)):
         pose[k, :3] = flotor.data.qpos[:3]
-        pose[k, 3:] = rotation_vector(flotor.data.qpos[3:7])
-        master_step(numbers, flotor.data.qpos, QUIET, 1.0, PERIOD, k == 0, s)
-        flotor.shaken_step(
-            s.currents, muscles, np.array(JOYSTICK.mount), float(spin[k]), float(change[k])
-        )
+        pose[k, 3:] = quaternion_to_vector(flotor.data.qpos[3:7])
+        step_master(numbers, flotor.data.qpos, QUIET, 1.0, PERIOD, k == 0, s)
+        flotor.step_in_cab(s.currents, muscles, np.array(JOYSTICK.mount), float(spin[k]), float(change[k]))
     return pose
 
 
@@ -452,7 +446,7 @@ def shaking() -> list[str]:
     still = np.zeros_like(spin)
     target = np.zeros((len(spin), 6))
     poses = {
-        "in the cab, no hand": simulate_levitation(JOYSTICK, target, cab=(spin, change)).pose,
+        "in the cab, no hand": simulate_levitation(JOYSTICK, target, cab_motion=(spin, change)).pose,
         "in the cab, a hand rests on it": held(spin, change),
         "on a table, no hand": simulate_levitation(JOYSTICK, target).pose,
         "on a table, a hand rests on it": held(still, still),
@@ -470,10 +464,7 @@ def shaking() -> list[str]:
     for name, pose in poses.items():
         far = np.linalg.norm(pose[:, :3], axis=1)
         turn = np.rad2deg(np.linalg.norm(pose[:, 3:], axis=1).max())
-        lines.append(
-            f"| {name} | {1e3 * far.max():.4f} | {1e3 * np.sqrt(np.mean(far**2)):.4f} |"
-            f" {turn:.4f} |"
-        )
+        lines.append(f"| {name} | {1e3 * far.max():.4f} | {1e3 * np.sqrt(np.mean(far**2)):.4f} | {turn:.4f} |")
     return [*lines, ""]
 
 
@@ -491,7 +482,7 @@ def draw(path: Path) -> None:
         fine = np.linspace(0.0, flight.time[-1], 400)
         alone = JOYSTICK.alone
         panel.plot(
-            fine, designed_step(fine, alone.frequency[axis], alone.ratio[axis]), color="black",
+            fine, second_order_step_response(fine, alone.frequency[axis], alone.ratio[axis]), color="black",
             linewidth=0.9, linestyle="--", label="designed",
         )  # fmt: skip
         panel.plot(flight.time, share[:, axis], linewidth=1.4, label="simulated")

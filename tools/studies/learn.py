@@ -16,15 +16,15 @@ from typing import Any
 
 import numpy as np
 
-from hydrotele.envs.controllers.catalogue import make_controller, tune
+from hydrotele.envs.controllers.catalogue import make_controller, tune_gains
 from hydrotele.envs.controllers.controller import Controller
 from hydrotele.envs.controllers.track import TrackByValves
-from hydrotele.envs.core import TaskCore, set_up
+from hydrotele.envs.core import TaskCore, make_setup
 from hydrotele.envs.episode import DISABLED
-from hydrotele.envs.evaluation import Scores, compare, evaluate
+from hydrotele.envs.evaluation import Scores, compare_scores, evaluate
 from hydrotele.envs.facts import TaskSetup
 from hydrotele.envs.making import TASKS
-from hydrotele.envs.stable_baselines import AgentView
+from hydrotele.envs.stable_baselines import AgentInterface
 from hydrotele.envs.task import Options
 from hydrotele.envs.variants import typical_variation
 from hydrotele.machine.machine_file import load_machine
@@ -104,7 +104,7 @@ RECIPES = {
 class Learned:
     """A policy from its files, as a controller."""
 
-    def __init__(self, folder: Path, view: AgentView) -> None:
+    def __init__(self, folder: Path, view: AgentInterface) -> None:
         self._policy = PPO.load(folder / "policy.zip", device="cpu").policy
         kept = np.load(folder / "normalisation.npz")
         self._mean, self._scale, self._most = kept["mean"], kept["scale"], float(kept["most"])
@@ -112,9 +112,9 @@ class Learned:
         self.begin, self.reset = view.begin, view.reset
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        seen = (self._view.see(observation) - self._mean) / self._scale
+        seen = (self._view.observe(observation) - self._mean) / self._scale
         seen = np.clip(seen, -self._most, self._most).astype(np.float32)
-        return self._view.act(self._policy.predict(seen, deterministic=True)[0])
+        return self._view.convert_action(self._policy.predict(seen, deterministic=True)[0])
 
 
 class Clock(BaseCallback):
@@ -161,17 +161,17 @@ def choices(name: str, variants: int) -> dict[str, Any]:
     return {**recipe.options, "randomise": spread, "variants": variants}
 
 
-def make_view(name: str, setup: TaskSetup) -> AgentView:
+def make_view(name: str, setup: TaskSetup) -> AgentInterface:
     recipe = RECIPES[name]
     law = recipe.law(setup, recipe.gains) if recipe.corrects else None
-    return AgentView(setup, recipe.history, law, recipe.share)
+    return AgentInterface(setup, recipe.history, law, recipe.share)
 
 
 def train(name: str, asked: argparse.Namespace) -> None:
     """Learn, and write the policy."""
     recipe, task = RECIPES[name], TASKS[name]
     taken = {**choices(name, asked.variants), "variant_seed": TRAINED, "duration": recipe.seconds}
-    setup = set_up(task, Options(**taken))
+    setup = make_setup(task, Options(**taken))
     plain = StableVecEnv(name, asked.envs, asked.threads, make_view(name, setup), **taken)
     plain.seed(asked.seed)
     env = VecNormalize(plain, gamma=recipe.gamma)
@@ -216,21 +216,19 @@ def tuned(name: str, asked: argparse.Namespace) -> Gains:
         print(f"{found:8.2f}  {said}", file=sys.stderr, flush=True)
         return found
 
-    return tune(value, recipe.gains, most=recipe.most)[0]
+    return tune_gains(value, recipe.gains, upper_bounds=recipe.most)[0]
 
 
 def difference(scores: list[tuple[str, Scores]], figure: str) -> str:
     """How much the first differs from the second on the same episodes, in standard errors."""
-    ours, theirs = (score.figures[figure] for _, score in scores[:2])
+    ours, theirs = (score.results[figure] for _, score in scores[:2])
     gap = ours - theirs
     error = gap.std(ddof=1) / np.sqrt(len(gap))
     return f"{figure}: {gap.mean():+.4g}, {abs(gap.mean()) / error:.1f} standard errors"
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("task", choices=RECIPES)
     parser.add_argument("--out", type=Path, required=True, metavar="FOLDER")
     parser.add_argument("--tune", action="store_true", help="tune the reference's gains, no more")
@@ -250,7 +248,7 @@ def main() -> None:
     scores = judge(asked.task, asked)
     figures = ["return", RECIPES[asked.task].figure]
     lines = [
-        compare(scores, figures),
+        compare_scores(scores, figures),
         "",
         "Learned controller minus tuned reference, paired by episode:\n",
     ]

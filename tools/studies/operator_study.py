@@ -11,26 +11,26 @@ from concurrent.futures import ProcessPoolExecutor
 
 import numpy as np
 
-from hydrotele.experiments.scenario_runs import cylindrical_pose
+from hydrotele.experiments.scenario_runs import compute_cylindrical_pose
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
-from hydrotele.scenario.teleoperation import Perception
+from hydrotele.scenario.teleoperation import OperatorSettings
 from hydrotele.teleop.manual_control import (
     FORMS,
     TrackingRecord,
-    crossover_of,
-    describing_function,
-    sum_of_sines,
-    track,
+    find_crossover,
+    make_sum_of_sines,
+    measure_describing_functions,
+    simulate_tracking,
 )
 from hydrotele.teleop.operator_identification import identify_operator
 from hydrotele.teleop.operator_parameters import (
-    drawn_operator,
-    held_joystick,
+    attach_operator_hand,
     load_operator_file,
+    make_operator,
 )
-from hydrotele.teleop.psychophysics import discriminate
+from hydrotele.teleop.psychophysics import measure_discrimination
 from tools.studies.study import options, publish
 
 FILE, HAND = load_operator_file(), load_joystick().hand
@@ -48,21 +48,21 @@ DISPLAYED = {"pilot.operator.display": "both"}
 
 def crossover(number: int | None, form: int, records: int, seed: int = 0, **known: float):
     """Crossover of the mean describing function of several simulated records."""
-    him = drawn_operator(FILE, number, **known)
+    him = make_operator(FILE, number, **known)
     time = np.arange(0.0, LEARNING + PERIOD, 0.01)
     done = []
     for k in range(records):
-        target, frequencies = sum_of_sines(time, BANDWIDTH, PERIOD, seed + k)
-        done.append(track(him, form, 2.0, target, seed=1000 * (number or 0) + seed + k))
-    return crossover_of(frequencies, describing_function(done, frequencies, LEARNING)[0])
+        target, frequencies = make_sum_of_sines(time, BANDWIDTH, PERIOD, seed + k)
+        done.append(simulate_tracking(him, form, 2.0, target, seed=1000 * (number or 0) + seed + k))
+    return find_crossover(frequencies, measure_describing_functions(done, frequencies, LEARNING)[0])
 
 
 def recovered(number: int, form: int) -> list[tuple[str, bool, float]]:
     """(parameter, whether its interval contains the true value, width) of a laboratory's record."""
-    him, rng = drawn_operator(FILE, number), np.random.default_rng([number, form, 7])
+    him, rng = make_operator(FILE, number), np.random.default_rng([number, form, 7])
     length = LEARNING + 1.5 * PERIOD
-    target, _ = sum_of_sines(np.arange(0.0, length, 0.01), duration=PERIOD, seed=50 + number)
-    record = track(him, form, 2.0, target, seed=5000 + 10 * number + form)
+    target, _ = make_sum_of_sines(np.arange(0.0, length, 0.01), duration=PERIOD, seed=50 + number)
+    record = simulate_tracking(him, form, 2.0, target, seed=5000 + 10 * number + form)
     rate = rng.uniform(30.0, 100.0)  # Hz, with jitter, of which the fit knows nothing
     time = np.arange(LEARNING, length - 0.1, 1.0 / rate)
     time = time + rng.uniform(-0.2, 0.2, len(time)) / rate
@@ -109,7 +109,7 @@ def tracked(changes: dict[str, str]) -> float:
 def restless(changes: dict[str, str]) -> float:
     """RMS speed of the tip where it should rest [m/s]."""
     run = run_scenario(load_scenario("steer", changes))
-    pose, time = cylindrical_pose(run), run.truth.time
+    pose, time = compute_cylindrical_pose(run), run.truth.time
     rest = np.zeros(len(time), bool)
     for begin, end in RESTING:
         rest |= (time > begin) & (time < end)
@@ -142,8 +142,7 @@ CONFIGURATIONS = {
 def scenario_results(number: int) -> list[float]:
     """All configurations with one drawn operator."""
     found = [
-        factor * function(more | person(number, 100 + number))
-        for function, more, factor in CONFIGURATIONS.values()
+        factor * function(more | person(number, 100 + number)) for function, more, factor in CONFIGURATIONS.values()
     ]
     say(f"operator {number}: {', '.join(f'{x:.3g}' for x in found)}")
     return found
@@ -156,12 +155,12 @@ def sensitivity(
     known, hand = {name: value} if name else {}, HAND
     bench: dict[str, float] = {}
     if isinstance(value, str):  # grip or posture
-        hand = held_joystick(load_joystick(), Perception(**{name: value})).hand
+        hand = attach_operator_hand(load_joystick(), OperatorSettings(**{name: value})).hand
     elif name:
         bench = {name: value}
     one = crossover(None, 1, records, **bench)
-    him = drawn_operator(FILE, None, **bench)
-    felt = discriminate(him, hand, trials=trials).jnd
+    him = make_operator(FILE, None, **bench)
+    felt = measure_discrimination(him, hand, trials=trials).jnd
     scenario = {} if name in _BENCH_ONLY else known
     rows = []
     for seed in range(1, seeds + 1):
@@ -219,7 +218,7 @@ def crossover_part(asked, pool) -> str:
 
 def discrimination_part(asked, pool) -> str:
     n, rows = asked.operators, []
-    people = [drawn_operator(FILE, k) for k in range(n)]
+    people = [make_operator(FILE, k) for k in range(n)]
     blunt = [dataclasses.replace(p, integration_weber=0.0) for p in people]
     vague = [dataclasses.replace(p, integration_weber=0.4) for p in people]
     for words, group, sense, reference, (low, high) in (
@@ -231,7 +230,7 @@ def discrimination_part(asked, pool) -> str:
         ("stiffness, with twice the error of integration (control)", vague, "stiffness", 1e3,
          (17.0, 27.0)),
     ):  # fmt: skip
-        jnd = list(pool.map(discriminate, group, [HAND] * n, [sense] * n, [reference] * n,
+        jnd = list(pool.map(measure_discrimination, group, [HAND] * n, [sense] * n, [reference] * n,
                             [asked.trials] * n, range(n)))  # fmt: skip
         share = [100.0 * one.jnd for one in jnd]
         mean = float(np.mean(share))

@@ -20,13 +20,13 @@ from hydrotele.core.files import models_folder
 from hydrotele.experiments.palida import (
     HOME_POSE,
     STROKE,
-    drive_limits,
-    force_covariance,
+    compute_force_covariance,
     load_excitation,
     load_robot,
+    make_drive_limits,
 )
 from hydrotele.identify.excitation import design_motion
-from hydrotele.multibody.closures import assemblies, jacobian, joint_positions
+from hydrotele.multibody.closures import find_assemblies, joint_jacobian, solve_joint_positions
 from tools.studies.study import options, publish
 
 RADIUS = 0.085  # m, at which rotations count
@@ -58,11 +58,11 @@ def cut(
         poses = np.tile(HOME_POSE, (CELLS, 1))
         poses[:, first], poses[:, second] = a, value
         middle = CELLS // 2
-        out = joint_positions(chain, own.setup.given, poses[middle:])
-        back = joint_positions(chain, own.setup.given, poses[middle::-1])
+        out = solve_joint_positions(chain, own.setup.given_joints, poses[middle:])
+        back = solve_joint_positions(chain, own.setup.given_joints, poses[middle::-1])
         q = np.concatenate([back[:0:-1], out])
         for column in range(CELLS):
-            inverse = jacobian(chain, q[column], chain.drives, own.setup.given) / scale
+            inverse = joint_jacobian(chain, q[column], chain.drives, own.setup.given_joints) / scale
             condition[row, column] = np.linalg.cond(inverse)
             legs = q[column, drives]
             good = np.all((legs > STROKE[0]) & (legs < STROKE[1]))
@@ -105,7 +105,7 @@ def draw(target: Path) -> None:
 def speed() -> tuple[int, float]:
     """Rows and processor seconds of the regressor of 20 s at 1 kHz."""
     own, motion = load_robot(), load_excitation()
-    whole = motion.motion(np.arange(20_000) / 1000.0)
+    whole = motion.evaluate(np.arange(20_000) / 1000.0)
     own.matrix(whole[:, :10])  # compiled before
     started = time.process_time()
     own.matrix(whole)
@@ -116,13 +116,13 @@ def design(seed: int, iterations: int) -> None:
     """Design the excitation and write it beside the model."""
     own = load_robot()
     found = design_motion(
-        drive_limits(), own.setup, force_covariance(), own.structure.base, period=3.0, harmonics=5,
+        make_drive_limits(), own.setup, compute_force_covariance(), own.base_parameters.base, period=3.0, harmonics=5,
         starts=1, iterations=iterations, seed=seed,
         progress=lambda stage, fraction: print(stage, f"{fraction:.2f}"),
     )  # fmt: skip
     parts = {
         "period": found.period, "mean": found.mean.tolist(), "sin": found.sin.tolist(),
-        "cos": found.cos.tolist(), "criterion": found.criterion, "worst": found.worst,
+        "cos": found.cos.tolist(), "criterion": found.criterion, "worst": found.max_utilisation,
     }  # fmt: skip
     target = models_folder() / "palida" / "excitation.json"
     target.write_text(json.dumps(parts, indent=1) + "\n", encoding="utf-8")
@@ -138,18 +138,15 @@ def main() -> None:
         draw(Path(asked.picture))
     own, rows = load_robot(), [INTRODUCTION, "", "| quantity | value |", "| --- | --- |"]
     chain = own.setup.chain
-    q = joint_positions(chain, own.setup.given, HOME_POSE[None])[0]
+    q = solve_joint_positions(chain, own.setup.given_joints, HOME_POSE[None])[0]
     legs = q[[chain.index(name) for name in chain.drives]]
     scale = np.array([1.0, 1.0, 1.0, RADIUS, RADIUS, RADIUS])
-    home = np.linalg.cond(jacobian(chain, q, chain.drives, own.setup.given) / scale)
-    found = assemblies(chain, chain.drives, legs, body="platform", starts=2000)
+    home = np.linalg.cond(joint_jacobian(chain, q, chain.drives, own.setup.given_joints) / scale)
+    found = find_assemblies(chain, chain.drives, legs, body="platform", starts=2000)
     rows.append(f"| condition number of the inverse Jacobian at the home pose | {home:.1f} |")
     rows.append(f"| poses with the leg lengths of the home pose, from 2000 starts | {len(found)} |")
     count, seconds = speed()
-    rows.append(
-        f"| time of the regressor, {count} rows, 24 joints, 19 bodies |"
-        f" {seconds:.2f} s on one core |"
-    )
+    rows.append(f"| time of the regressor, {count} rows, 24 joints, 19 bodies | {seconds:.2f} s on one core |")
     publish("\n".join(rows) + "\n", "Kinematics of the hexapod PaLiDA", asked)
 
 

@@ -15,20 +15,20 @@ from dataclasses import replace
 
 import numpy as np
 
-from hydrotele.identify.equations import build_equations, stacked
+from hydrotele.identify.equations import build_equations, concatenate_field
 from hydrotele.identify.estimation import estimate
-from hydrotele.identify.identifiability import identifiability, reference_sizes
-from hydrotele.identify.motion import Processing, resolution
-from hydrotele.identify.record import IdentificationRecord, records
+from hydrotele.identify.identifiability import classify_parameters, reference_sizes
+from hydrotele.identify.motion import Processing, estimate_resolution
+from hydrotele.identify.record import IdentificationRecord, build_records
 from hydrotele.identify.setup import RegressorSetup, machine_setup
 from hydrotele.logs.dataset import make_dataset
 from hydrotele.logs.files import RunFiles
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.multibody.inverse_dynamics import project, regressor
+from hydrotele.multibody.inverse_dynamics import make_regressor, project_on_drives
 from hydrotele.run.run import Run, run_scenario
 from hydrotele.scenario.scenario import load_scenario
-from hydrotele.simulate.closure import closed_chain
+from hydrotele.simulate.closure import load_closed_chain
 from tools.studies.study import options, publish, side_by_side
 
 RUNS, HELD_OUT = ("excitation", "excitation_fast"), "excitation_stick"
@@ -57,10 +57,14 @@ def measured_motion(setup: RegressorSetup, records_of: list[IdentificationRecord
         position = record.position + rng.uniform(-angle, angle, record.position.shape)
         noise = np.full(len(record.axes), angle / np.sqrt(3.0))
         one = replace(record, position=position, position_noise=noise)
-        resolved = resolution(position, record.period, noise)
+        resolved = estimate_resolution(position, record.period, noise)
         made.append(build_equations(one, setup, Processing(band=BAND), resolved))
     runs = [e for e, _ in made]
-    return stacked(runs, lambda e: e.matrix), stacked(runs, lambda e: e.force), made[0][1]
+    return (
+        concatenate_field(runs, lambda e: e.matrix),
+        concatenate_field(runs, lambda e: e.force),
+        made[0][1],
+    )
 
 
 def true_motion(setup: RegressorSetup, runs: list[Run], forces: list[np.ndarray]):
@@ -72,9 +76,9 @@ def true_motion(setup: RegressorSetup, runs: list[Run], forces: list[np.ndarray]
             np.column_stack([run.truth[f"{kind}.{axis}"] for axis in axes])
             for kind in ("angle", "truth.velocity", "truth.acceleration")
         ]
-        found = project(setup.chain, setup.given, *motion)
-        tables.append(regressor(
-            setup.chain, found, bodies=setup.bodies, rubbing=setup.rubbing, offsets=True
+        found = project_on_drives(setup.chain, setup.given_joints, *motion)
+        tables.append(make_regressor(
+            setup.chain, found, bodies=setup.bodies, friction=setup.friction_terms, offsets=True
         ))  # fmt: skip
     return np.concatenate([t.matrix for t in tables]), np.concatenate(forces), tables[0]
 
@@ -87,8 +91,8 @@ def one_trial(seed: int, number: int) -> dict[tuple[str, str, str], dict[str, fl
         own = {"seed": str(int(rng.integers(2**31))), "sensors": "ideal"}
         runs.append(run_scenario(load_scenario(name, own)))
     files = [RunFiles(run.scenario.name, (run.measured,)) for run in runs]
-    fit, _, _ = records(make_dataset(sorted(files), machine, "ideal", HELD_OUT))
-    chain, out = closed_chain(machine), {}
+    fit, _, _ = build_records(make_dataset(sorted(files), machine, "ideal", HELD_OUT))
+    chain, out = load_closed_chain(machine), {}
     for model in ("complete", "reduced"):
         setup = machine_setup(machine, chain, model)
         for said, level in LEVELS.items():
@@ -100,7 +104,7 @@ def one_trial(seed: int, number: int) -> dict[tuple[str, str, str], dict[str, fl
                 else:
                     matrix, force, table = true_motion(setup, runs[: len(RUNS)], forces)
                 flat = matrix.reshape(-1, matrix.shape[2])
-                told = identifiability(flat, table.names, table.units)
+                told = classify_parameters(flat, table.names, table.units)
                 sizes = reference_sizes(table, setup, np.sqrt(np.mean(force**2, axis=0)))
                 found = estimate(matrix[:, :, told.base], force, order=0)
                 truth = told.combination @ table.nominal
@@ -115,10 +119,7 @@ def report(results: list[dict[tuple[str, str, str], dict[str, float]]]) -> str:
 
     def errors(model: str, level: str, where: str) -> dict[str, float]:
         names = set.intersection(*(set(r[model, level, where]) for r in results))
-        return {
-            n: float(np.sqrt(np.mean([r[model, level, where][n] ** 2 for r in results])))
-            for n in sorted(names)
-        }
+        return {n: float(np.sqrt(np.mean([r[model, level, where][n] ** 2 for r in results]))) for n in sorted(names)}
 
     lines = [
         "Tables 14 and 15 of Khoshzaban 1992 ask how much better pressure sensors improve the"

@@ -10,18 +10,18 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.machine.joystick import load_joystick
-from hydrotele.teleop.analysis import Case, load_teleop_case
-from hydrotele.teleop.robust import robustness, spread_of
+from hydrotele.teleop.analysis import TeleoperatorAxis, load_teleop_case
+from hydrotele.teleop.robust import case_impedance_ranges, evaluate_robustness
 from hydrotele.teleop.sampled import (
     SAMPLED_STRUCTURES,
     PacketAges,
-    jittering_line,
-    predict,
-    steady_line,
+    constant_delay_ages,
+    measured_delay_ages,
+    predict_stability,
 )
-from hydrotele.teleop.sampled_run import kick
-from hydrotele.teleop.switching import Spring
-from hydrotele.teleop.two_port import STRUCTURES, Gains, Impedance
+from hydrotele.teleop.sampled_run import simulate_kick
+from hydrotele.teleop.switching import StiffnessAxis
+from hydrotele.teleop.two_port import STRUCTURES, Impedance, StructureGains
 from tools.studies.study import options, publish, side_by_side
 
 SPREAD = 0.5  # decades by which every parameter of the shipped case is varied, up and down
@@ -35,9 +35,9 @@ REACH, ASIDE = (0.03, 30.0), 0.4  # factors searched for a limit; e-folds aimed 
 NEAR = 0.1  # relative distance to the predicted limit within which a case is close to it
 
 
-def drawn_case(rng: np.random.Generator) -> tuple[Case, float, float]:
+def drawn_case(rng: np.random.Generator) -> tuple[TeleoperatorAxis, float, float]:
     """A case, its period and the factor on the returned signal."""
-    shipped = load_teleop_case().case()
+    shipped = load_teleop_case().to_axis()
 
     def drawn(value: float) -> float:
         return value * 10.0 ** rng.uniform(-SPREAD, SPREAD)
@@ -51,7 +51,7 @@ def drawn_case(rng: np.random.Generator) -> tuple[Case, float, float]:
         sides["hand"] = Impedance()
     if rng.random() < 0.3:
         sides["task"] = Impedance()
-    gains = Gains(drawn(1.0), drawn(1.0), drawn(1.0))
+    gains = StructureGains(drawn(1.0), drawn(1.0), drawn(1.0))
     case = replace(shipped, **sides, gains=gains, wave=drawn(sides["slave_control"].damping))
     period = float(np.exp(rng.uniform(*np.log(PERIODS))))
     return case, period, float(10.0 ** rng.uniform(*FACTORS))
@@ -68,7 +68,7 @@ def drawn_delays(rng: np.random.Generator, count: int, period: float) -> np.ndar
     return delays
 
 
-def scaled(case: Case, factor: float, linear: bool) -> tuple[Case, float]:
+def scaled(case: TeleoperatorAxis, factor: float, linear: bool) -> tuple[TeleoperatorAxis, float]:
     """Case and factor on the returned signal; without such a factor, scaled slave gains."""
     if linear:
         return case, factor
@@ -77,12 +77,12 @@ def scaled(case: Case, factor: float, linear: bool) -> tuple[Case, float]:
     return replace(case, slave_control=firm, wave=factor * case.wave), 1.0
 
 
-def limit(case: Case, name: str, line: PacketAges, linear: bool) -> float | None:
+def limit(case: TeleoperatorAxis, name: str, line: PacketAges, linear: bool) -> float | None:
     """Smallest factor at which the prediction changes."""
 
     def holds(factor: float) -> bool:
         one, back = scaled(case, factor, linear)
-        return predict(one, name, line, back).stable
+        return predict_stability(one, name, line, back).is_stable
 
     points = np.geomspace(*REACH, 13)
     told = [holds(float(p)) for p in points]
@@ -117,7 +117,7 @@ def trial(seed: int, number: int) -> list[Row]:
     count = round(max(SECONDS, TRIPS * 2.0 * DELAYS[1]) / period)
     there, back = (drawn_delays(rng, 2 * count, period) for _ in range(2))
     # the prediction uses the first half of the packets, the simulation the second half
-    line = jittering_line(period, there[:count], back[:count])
+    line = measured_delay_ages(period, there[:count], back[:count])
     rows = []
     for name in SAMPLED_STRUCTURES:
         linear = name in STRUCTURES
@@ -125,19 +125,19 @@ def trial(seed: int, number: int) -> list[Row]:
         if number % 2:
             found = limit(case, name, line, linear)
             k = k if found is None else aside * found
-        told = predict(*scaled_for(case, name, line, k, linear))
+        told = predict_stability(*scaled_for(case, name, line, k, linear))
         one, back_factor = scaled(case, k, linear)
-        motion = kick(one, name, period, there[count:], back[count:], back_factor)
-        sides = [predict(*scaled_for(case, name, line, m * k, linear)).stable
+        motion = simulate_kick(one, name, period, there[count:], back[count:], back_factor)
+        sides = [predict_stability(*scaled_for(case, name, line, m * k, linear)).is_stable
                  for m in (1.0 - NEAR, 1.0 + NEAR)]  # fmt: skip
         held, touching = bool(case.hand.mass), bool(case.task.stiffness)
-        rows.append(Row(held, touching, told.stable, not motion.grows, sides[0] != sides[1],
-                        told.reason, motion.dies_out))  # fmt: skip
+        rows.append(Row(held, touching, told.is_stable, not motion.is_growing, sides[0] != sides[1],
+                        told.reason, motion.has_decayed))  # fmt: skip
     return rows
 
 
-def scaled_for(case: Case, name: str, line: PacketAges, factor: float, linear: bool) -> tuple:
-    """Arguments of `predict`."""
+def scaled_for(case: TeleoperatorAxis, name: str, line: PacketAges, factor: float, linear: bool) -> tuple:
+    """Arguments of `predict_stability`."""
     one, back = scaled(case, factor, linear)
     return one, name, line, back
 
@@ -174,22 +174,22 @@ def table(found: list[list[Row]]) -> list[str]:
 def robust_table(period: float = 0.005, pairs: int = 100) -> list[str]:
     """Robustness of the shipped case."""
     facts = load_teleop_case()
-    case, spread = facts.case(), spread_of(facts)
-    line = steady_line(period, case.delay_forward, case.delay_back)
+    case, spread = facts.to_axis(), case_impedance_ranges(facts)
+    line = constant_delay_ages(period, case.delay_forward, case.delay_back)
     lines = ["| structure | handle held: with task, free motion |"
              " released: with task, free motion | master alone, released |"
              " stable operators | same tasks, released | Llewellyn | Z-width [decades] |",
              "| --- |" + " ---: |" * 7]  # fmt: skip
     for name in SAMPLED_STRUCTURES:
-        one = robustness(case, name, line, spread, pairs)
-        told = ["stable" if p.stable else "unstable" for p in one.sampled]
-        alone = f"{one.released.unstable} unstable poles" if one.released else "-"
-        worst = one.worst
+        one = evaluate_robustness(case, name, line, spread, pairs)
+        told = ["stable" if p.is_stable else "unstable" for p in one.sampled]
+        alone = f"{one.released_polynomial.unstable_zeros} unstable poles" if one.released_polynomial else "-"
+        worst = one.sampled_pairs
         lines.append(
             f"| `{name}` | {told[0]}, {told[1]} | {told[2]}, {told[3]} | {alone} |"
-            f" {pairs - worst.unstable} of {pairs} | {pairs - worst.unstable_let_go} of {pairs} |"
+            f" {pairs - worst.unstable_count} of {pairs} | {pairs - worst.unstable_released_count} of {pairs} |"
             f" {'-' if np.isnan(one.llewellyn) else f'{one.llewellyn:.3g}'} |"
-            f" {f'{one.width.decades:.2f}' if one.width else '-'} |"
+            f" {f'{one.z_width_result.decades:.2f}' if one.z_width_result else '-'} |"
         )
     return lines
 
@@ -205,13 +205,13 @@ def spring_table() -> list[str]:
     for gains in stick.gains:
         for axis in ("x", "y", "z"):
             row = stick.gains[gains][axis]
-            free = Spring(stick.flotor.mass, row.damping, row.nominal, row.least, row.most)
-            held = free.held(Impedance(hand.mass, hand.damping, hand.stiffness))
+            free = StiffnessAxis(stick.flotor.mass, row.damping, row.nominal, row.least, row.most)
+            held = free.with_hand(Impedance(hand.mass, hand.damping, hand.stiffness))
             for name, one in (("held", held), ("released", free)):
                 lines.append(
                     f"| {gains} | {axis} | {name} | {one.damping:g} | {one.mass:g} |"
-                    f" {one.least:g} | {one.most:g} | {one.margin:.0f} | {one.enough_damping:.0f} |"
-                    f" {one.growth:.2f} | {one.least_damping:.0f} | {one.stable_by} |"
+                    f" {one.min_stiffness:g} | {one.max_stiffness:g}"
+                    f" | {one.theorem_margin:.0f} | {one.theorem_damping:.0f} | {one.half_swing_growth:.2f} | {one.min_stable_damping:.0f} | {one.stability_criterion} |"
                 )
     return lines
 

@@ -54,11 +54,9 @@ def trial(seed: int, number: int) -> Row:
     }  # fmt: skip
     mean = f"{{delay_forward: {there + jitter}, delay_back: {back + jitter}}}"
     told = load_scenario("press_direct", keys | {"pilot.channel": mean})
-    ratio = factor * analyse_scenario(told).loop.largest_ratio
+    ratio = factor * analyse_scenario(told).loop.max_ratio
     line = f"{{delay_forward: {there}, delay_back: {back}, jitter: {jitter}}}"
-    run = run_scenario(
-        load_scenario("press_direct", keys | {"pilot.channel": line, "pilot.ratio": f"{ratio}"})
-    )
+    run = run_scenario(load_scenario("press_direct", keys | {"pilot.channel": line, "pilot.ratio": f"{ratio}"}))
     force = run.truth["truth.contact_force.z"]
     low, high = np.percentile(force[2 * len(force) // 3 :], [5.0, 95.0])
     return Row(factor, float(0.5 * (high - low) / TARGET))

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from hydrotele.teleop.analysis import Case, load_teleop_case
-from hydrotele.teleop.findings import agreement, sweep
-from hydrotele.teleop.two_port import STRUCTURES, Gains, Impedance
+from hydrotele.teleop.analysis import TeleoperatorAxis, load_teleop_case
+from hydrotele.teleop.findings import compare_stability, run_sine_sweep
+from hydrotele.teleop.two_port import STRUCTURES, Impedance, StructureGains
 from tools.studies.study import options, publish, side_by_side
 
 SPREAD = 0.5  # decades by which every parameter of the shipped case is varied, up and down
@@ -18,7 +18,7 @@ FACTORS = (0.01, 100.0)  # on the returned signal
 SWEPT = 0.1  # s each way, the largest delay of a sweep
 
 
-def varied(case: Case, rng: np.random.Generator) -> Case:
+def varied(case: TeleoperatorAxis, rng: np.random.Generator) -> TeleoperatorAxis:
     def drawn(value: float) -> float:
         return value * 10.0 ** rng.uniform(-SPREAD, SPREAD)
 
@@ -26,28 +26,28 @@ def varied(case: Case, rng: np.random.Generator) -> Case:
         return Impedance(drawn(z.mass), drawn(z.damping), drawn(z.stiffness))
 
     names = ("master", "slave", "master_control", "slave_control", "hand", "task")
-    gains = Gains(drawn(1.0), drawn(1.0), drawn(1.0))
+    gains = StructureGains(drawn(1.0), drawn(1.0), drawn(1.0))
     delay = rng.uniform(0.0, SWEPT)
     sides = {name: side(getattr(case, name)) for name in names}
     return replace(case, **sides, gains=gains).with_delay(delay)
 
 
-def compared(case: Case, points: int) -> list[tuple]:
+def compared(case: TeleoperatorAxis, points: int) -> list[tuple]:
     """For every structure: cells, cells that agree, stable ones, errors of the sweeps."""
     delays = LONGEST * np.linspace(0.0, 1.0, points) ** 2
     factors = np.geomspace(*FACTORS, points)
     rows = []
     for name in STRUCTURES:
-        map_ = agreement(case, name, delays, factors)
-        errors = [sweep(one, name).error for one in (case.with_delay(0.0), case)]
-        agree = int((map_.predicted == map_.seen).sum())
-        rows.append((map_.seen.size, agree, int(map_.seen.sum()), errors))
+        map_ = compare_stability(case, name, delays, factors)
+        errors = [run_sine_sweep(one, name).max_relative_error for one in (case.with_delay(0.0), case)]
+        agree = int((map_.predicted == map_.simulated).sum())
+        rows.append((map_.simulated.size, agree, int(map_.simulated.sum()), errors))
     return rows
 
 
 def trial(seed: int, number: int, points: int) -> list[tuple]:
     rng = np.random.default_rng([seed, number])
-    return compared(varied(load_teleop_case().case(), rng), points)
+    return compared(varied(load_teleop_case().to_axis(), rng), points)
 
 
 def percent(error: float | None) -> str:
@@ -58,7 +58,7 @@ def shipped_table(points: int) -> list[str]:
     lines = ["| structure | impedance error, no delay | impedance error, 20 ms each way |"
              " cells that agree |",
              "| --- | ---: | ---: | ---: |"]  # fmt: skip
-    for name, row in zip(STRUCTURES, compared(load_teleop_case().case(), points), strict=True):
+    for name, row in zip(STRUCTURES, compared(load_teleop_case().to_axis(), points), strict=True):
         many, agree, _, errors = row
         lines.append(f"| `{name}` | {' | '.join(map(percent, errors))} | {agree} of {many} |")
     return lines

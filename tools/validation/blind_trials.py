@@ -48,10 +48,7 @@ def run_all(places: Sequence[Place], args: argparse.Namespace, series: Series) -
         return
     workflow = shlex.split(args.workflow) if args.workflow else WORKFLOW
     with ThreadPoolExecutor(args.jobs) as pool:
-        tasks = [
-            pool.submit(run_trial, p, series.machine, workflow, args.limit, args.threads)
-            for p in places
-        ]
+        tasks = [pool.submit(run_trial, p, series.machine, workflow, args.limit, args.threads) for p in places]
         try:
             for task in as_completed(tasks):
                 yield task.result()["trial"]
@@ -123,9 +120,7 @@ def score_series(out: Path) -> list[str]:
 
 def main() -> int:
     """Parse the arguments, run what is missing, score."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder of the series")
     for kind in CLASSES:
         parser.add_argument(f"--{kind}", type=int, help=f"number of {kind} trials")

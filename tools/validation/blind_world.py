@@ -42,9 +42,7 @@ def commit() -> str:
     """Commit of the checkout that searches, with `+changed` if files differ from it."""
 
     def git(*arguments: str) -> str:
-        done = subprocess.run(
-            ["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=True
-        )
+        done = subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=True)
         return done.stdout.strip()
 
     return git("rev-parse", "HEAD") + ("+changed" if git("status", "--porcelain", "-uno") else "")
@@ -129,9 +127,7 @@ def read_counts(kinds: str, count: int) -> dict[str, int]:
 
 def main() -> int:
     """Parse the arguments, run what is missing, score."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder of the series")
     parser.add_argument("--kinds", help="of a new series: near,noise or near:30,noise:20")
     parser.add_argument("--count", type=int, default=10, help="of each kind (default 10)")

@@ -9,14 +9,12 @@ fail in the way that it should: exit status 1.
 import argparse
 import sys
 
-from hydrotele.experiments.comparison import break_series
+from hydrotele.experiments.comparison import run_with_faults
 from tools.studies.experiment_seeds import import_series, report_progress
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("name")
     parser.add_argument("--only", default="", help="rows, separated by commas; all by default")
     parser.add_argument("--jobs", type=int, default=2)
@@ -28,7 +26,7 @@ def main() -> None:
     unknown = set(names) - set(series.claims)
     if unknown:
         parser.error(f"no row {unknown.pop()!r}; valid: {', '.join(series.claims)}")
-    judged = break_series(series, names, arguments.jobs, report_progress)
+    judged = run_with_faults(series, names, arguments.jobs, report_progress)
 
     lines = [
         f"# Broken runs of {arguments.name}", "",
@@ -37,11 +35,11 @@ def main() -> None:
         "| row | fault | simulated with the fault | verdict |", "| --- | --- | --- | --- |",
     ]  # fmt: skip
     for claim, row in judged:
-        cells = (claim.name, claim.broken_how, row.simulated, row.verdict)
+        cells = (claim.name, claim.fault_description, row.simulated, row.verdict)
         lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
     failed = [claim.name for claim, row in judged if row.verdict != "differs"]
     lines += ["", f"{len(judged) - len(failed)} of {len(judged)} rows say differs.", ""]
-    unbroken = [name for name, claim in series.claims.items() if claim.broken is None]
+    unbroken = [name for name, claim in series.claims.items() if claim.fault is None]
     if unbroken and not names:
         lines += [f"Rows without a verdict have no fault: {', '.join(unbroken)}.", ""]
     text = "\n".join(lines)

@@ -43,9 +43,7 @@ def main() -> None:
 
 
 def _soak(name: str, action: str, sensors: str, steps: int, asked) -> list[str]:
-    env = gymnasium.make_vec(
-        f"hydrotele/{name}-v0", asked.batch, "vector_entry_point", action=action, sensors=sensors
-    )
+    env = gymnasium.make_vec(f"hydrotele/{name}-v0", asked.batch, "vector_entry_point", action=action, sensors=sensors)
     core = env.unwrapped.core  # pyright: ignore
     chance, space = np.random.default_rng(asked.seed), env.observation_space
     seen, _ = env.reset(seed=asked.seed)

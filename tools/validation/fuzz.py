@@ -36,7 +36,7 @@ import yaml
 
 from hydrotele.core.files import models_folder, scenarios_folder
 from hydrotele.logs.log import Log, load_log, save_log
-from hydrotele.teleop.analysis import SHIPPED
+from hydrotele.teleop.analysis import DEFAULT_CASE_FILE
 
 SECONDS, MEMORY, LETTERS = 60.0, 4_000_000_000, 2048  # limits of a case
 _FINE = (0, 2, 3)  # done, the user's mistake, a simulation that left the finite numbers
@@ -221,13 +221,9 @@ def _torn(dice: random.Random, text: str) -> str:
             case 2:
                 lines.insert(a, lines[b])
             case 3:
-                lines[a] += dice.choice(
-                    ["[" * 3000, "{a: " * 500, "&x [*x]", "\t", "\x1b[31m", "': "]
-                )
+                lines[a] += dice.choice(["[" * 3000, "{a: " * 500, "&x [*x]", "\t", "\x1b[31m", "': "])
             case 4:
-                lines[a] = "".join(
-                    chr(dice.randint(1, 0x2FFF)) if dice.random() < 0.05 else c for c in lines[a]
-                )
+                lines[a] = "".join(chr(dice.randint(1, 0x2FFF)) if dice.random() < 0.05 else c for c in lines[a])
             case 5:
                 lines = lines[:a] or [""]
             case 6:
@@ -304,7 +300,7 @@ def _joystick(dice: random.Random, folder: Path) -> list[str]:
 
 
 def _teleop(dice: random.Random, folder: Path) -> list[str]:
-    _yaml_file(dice, SHIPPED, folder / "case.yaml")
+    _yaml_file(dice, DEFAULT_CASE_FILE, folder / "case.yaml")
     return ["analyse", "teleop", "case.yaml", "--json"]
 
 
@@ -330,9 +326,7 @@ def _parquet(dice: random.Random, folder: Path) -> list[str]:
 
     file = folder / "log.parquet"
     if dice.random() < 0.3:
-        column = dice.choice(
-            [pa.array([0.0]), pa.array(["x"]), pa.array([[1.0]]), pa.array([None])]
-        )
+        column = dice.choice([pa.array([0.0]), pa.array(["x"]), pa.array([[1.0]]), pa.array([None])])
         values = pa.concat_arrays([column] * dice.choice([3, 1000]))
         table = pa.table({"time": values, dice.choice(["angle.boom", "", "é", "time"]): values})
         pq.write_table(table, file)
@@ -355,9 +349,7 @@ def _csv(dice: random.Random, folder: Path) -> list[str]:
     head = ",".join(["time [s]", *(f"{n} [{u}]" for n, u in log.units.items())])
     rows = [",".join(map(str, row)) for row in zip(log.time, *log.columns.values(), strict=True)]
     text = _torn(dice, "\n".join([head, *rows]))
-    (folder / "log.csv").write_bytes(
-        text.encode(dice.choice(["utf-8", "utf-16", "latin-1"]), "replace")
-    )
+    (folder / "log.csv").write_bytes(text.encode(dice.choice(["utf-8", "utf-16", "latin-1"]), "replace"))
     return ["validate", "log.csv"]
 
 
@@ -498,15 +490,11 @@ def _compile_once() -> None:
 
 def main() -> None:
     """Judge cases, print the defects and how many there were of each kind."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0, help="of the first case; others count up")
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument(
-        "--only", type=int, metavar="SEED", help="make this case, and keep its files"
-    )
+    parser.add_argument("--only", type=int, metavar="SEED", help="make this case, and keep its files")
     args = parser.parse_args()
     if args.only is not None:
         folder = Path(tempfile.mkdtemp(prefix="hydrotele_fuzz_"))

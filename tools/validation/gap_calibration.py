@@ -119,9 +119,7 @@ def summary(noted: dict[str, dict]) -> tuple[dict, str]:
 
 def main() -> None:
     """Parse the arguments, measure what is missing, summarise."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder of the series")
     parser.add_argument("--trials", type=int, help="of a new series (default 100)")
     parser.add_argument("--pulls", type=int, default=30, help="trials with every effect's pull")
@@ -135,10 +133,7 @@ def main() -> None:
     series = load_series(args.out)
     missing = [n for n in series.names() if not _note(args.out, n).is_file()]
     with ProcessPoolExecutor(args.jobs, get_context("spawn")) as pool:
-        tasks = [
-            pool.submit(measure_trial, args.out, n, series.machine, int(n) < args.pulls)
-            for n in missing
-        ]
+        tasks = [pool.submit(measure_trial, args.out, n, series.machine, int(n) < args.pulls) for n in missing]
         for count, task in enumerate(tasks, 1):
             print(f"{task.result()} measured ({count}/{len(tasks)})", flush=True)
     noted = {n: json.loads(_note(args.out, n).read_text()) for n in series.names()}

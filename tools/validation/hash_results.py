@@ -15,7 +15,7 @@ import numpy as np
 
 from hydrotele.envs import TASK_NAMES
 from hydrotele.gap.find import find_gap
-from hydrotele.logs.dataset import busiest, load_dataset
+from hydrotele.logs.dataset import load_dataset, select_exciting_segments
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.run.run import run_scenario
 from hydrotele.scenario.scenario import load_scenario
@@ -51,16 +51,14 @@ def hash_environment(name: str, steps: int = 60) -> str:
 
 def hash_gap() -> str:
     """Digest of prediction errors, noise and calibration of a search with two effects."""
-    data = busiest(load_dataset([MEASURED / "open_04"], load_machine("cat215")), 10.0)
+    data = select_exciting_segments(load_dataset([MEASURED / "open_04"], load_machine("cat215")), 10.0)
     gap = find_gap(data, effects=("valve_gain", "command_delay"))
     return hashlib.sha256(repr((gap.size, gap.noise, gap.calibration)).encode()).hexdigest()[:16]
 
 
 def main() -> None:
     """Print all digests."""
-    argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    ).parse_args()
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     for name, seconds in SCENARIOS.items():
         print(f"scenario {name} {hash_scenario(name, seconds)}", flush=True)
     for name in TASK_NAMES:

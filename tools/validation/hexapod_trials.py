@@ -127,9 +127,7 @@ def _summary(verdicts: list[Verdict], answers) -> list[str]:
     for v in verdicts:
         loop = answers[v.trial].get("open_loop") or {}
         if v.kind == "single" and v.right and "after" in loop:
-            before, after = (
-                sum(x**2 for x in loop[k].values()) ** 0.5 for k in ("before", "after")
-            )
+            before, after = (sum(x**2 for x in loop[k].values()) ** 0.5 for k in ("before", "after"))
             loops.append(after / before)
     if loops:
         loops.sort()
@@ -165,9 +163,7 @@ def _rows(verdicts: list[Verdict], keys, answers) -> list[str]:
 
 def main() -> int:
     """Parse the arguments, run what is missing, score."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder of the series")
     for kind in KINDS:
         parser.add_argument(f"--{kind}", type=int, help=f"number of {kind} trials")

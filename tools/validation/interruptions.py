@@ -254,9 +254,7 @@ def _fill(bench: Bench, name: str, out: Path, dice: random.Random) -> Iterator[s
 
 def main() -> None:
     """Disturb, print every defect and a table of how often what was done."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=25)
     parser.add_argument("--terms", type=int, default=0)
     parser.add_argument("--full", type=int, default=0)

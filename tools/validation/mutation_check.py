@@ -81,9 +81,7 @@ def list_changes(path: Path) -> list[Mutant]:
             return
         before = data[first:last].decode().strip()
         after = (data[first:begin] + text.encode() + data[end:last]).decode().strip()
-        found.append(
-            Mutant(path.relative_to(ROOT).as_posix(), line, begin, end, text, before, after)
-        )
+        found.append(Mutant(path.relative_to(ROOT).as_posix(), line, begin, end, text, before, after))
 
     def replace_between(left: ast.AST, right: ast.AST, kind: type) -> None:
         if kind not in OPERATORS:
@@ -202,11 +200,7 @@ def judge_mutant(mutant: Mutant, suite: Path, only: list[str]) -> dict:
                 failed = "timeout"
                 break
             if done.returncode not in (0, 5):
-                lines = [
-                    line
-                    for line in done.stdout.splitlines()
-                    if line.startswith(("FAILED", "ERROR"))
-                ]
+                lines = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
                 failed = lines[0][:200] if lines else (done.stdout + done.stderr)[-300:]
                 break
     return {
@@ -219,17 +213,13 @@ def judge_mutant(mutant: Mutant, suite: Path, only: list[str]) -> dict:
 
 def main() -> int:
     """Judge the mutants."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=ROOT / "runs" / "mutation")
     parser.add_argument("--suite", type=Path, default=ROOT, help="checkout whose tests are run")
     parser.add_argument("--count", type=int, default=40)
     parser.add_argument("--seed", type=int, default=58)
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument(
-        "--survivors", type=Path, help="judge only what OUT/mutants.jsonl says survived"
-    )
+    parser.add_argument("--survivors", type=Path, help="judge only what OUT/mutants.jsonl says survived")
     parser.add_argument("--list", action="store_true", help="print the changes, judge nothing")
     parser.add_argument("tests", nargs="*", help="pytest arguments instead of the whole suite")
     args = parser.parse_args()
@@ -244,9 +234,7 @@ def main() -> int:
         return 0
     args.out.mkdir(parents=True, exist_ok=True)
     record = args.out / "mutants.jsonl"
-    done = (
-        [json.loads(line) for line in record.read_text().splitlines()] if record.is_file() else []
-    )
+    done = [json.loads(line) for line in record.read_text().splitlines()] if record.is_file() else []
     seen = {(d["path"], d["line"], d["after"]) for d in done}
     todo = [m for m in mutants if (m.path, m.line, m.after) not in seen]
     with ThreadPoolExecutor(args.jobs) as pool, record.open("a") as out:

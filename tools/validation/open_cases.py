@@ -90,10 +90,7 @@ if __name__ == "__main__":
     args = parser.parse_args()
     answers = yaml.safe_load((args.folder / "answers.yaml").read_text())
     machine = load_machine("cat215")
-    print(
-        "| case | hidden effect | verdict | found | error before | after | perfect model"
-        " | time [s] | correct |"
-    )
+    print("| case | hidden effect | verdict | found | error before | after | perfect model | time [s] | correct |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
     wrong = 0
     for case, answer in answers.items():

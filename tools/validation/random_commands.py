@@ -12,11 +12,11 @@ import numpy as np
 from mujoco.batch import Batch
 
 from hydrotele.core.errors import InputError
-from hydrotele.hydraulics.circuit import ACTIVATIONS
+from hydrotele.hydraulics.circuit import ACTIVATIONS_PER_AXIS
 from hydrotele.hydraulics.laws import ATMOSPHERE
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.simulate.closure import following_joints
+from hydrotele.simulate.closure import dependent_joints
 from hydrotele.simulate.plant import Plant, build_plant, rest_state
 
 
@@ -31,7 +31,7 @@ def reachable_states(plant: Plant, count: int, rng: np.random.Generator) -> np.n
     Returns:
         (count, nq + na): `qpos` and `act`.
     """
-    following = following_joints(plant.machine)
+    following = dependent_joints(plant.machine)
     free = {n: j for n, j in plant.machine.joints.items() if n not in following}
     states = []
     for _ in range(200 * count):
@@ -62,7 +62,7 @@ class Pressures:
     def __init__(self, plant: Plant) -> None:
         """Look at no state yet."""
         machine = plant.machine
-        axes = [machine.axes[n] for n in actuator_order(machine) if machine.axes[n].hydraulic]
+        axes = [machine.axes[n] for n in actuator_order(machine) if machine.axes[n].is_hydraulic]
         self.least, self.most, self.beyond = np.inf, -np.inf, -np.inf
         self._count = len(axes)
         self._areas = np.array([a.hydraulic_drive.areas for a in axes]).reshape(-1, 2)
@@ -76,7 +76,7 @@ class Pressures:
         """Take the present states in; `fresh` where they do not follow from those seen last."""
         if not self._count:
             return
-        act = batch.act[:, : ACTIVATIONS * self._count].reshape(-1, self._count, ACTIVATIONS)
+        act = batch.act[:, : ACTIVATIONS_PER_AXIS * self._count].reshape(-1, self._count, ACTIVATIONS_PER_AXIS)
         chambers = act[:, :, 2:]
         self.least = min(self.least, float(chambers.min()) + ATMOSPHERE)
         self.most = max(self.most, float(chambers.max()) + ATMOSPHERE)

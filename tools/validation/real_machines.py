@@ -23,12 +23,12 @@ from hydrotele.estimate.free_run import Prepare, free_run_errors, machine_runner
 from hydrotele.estimate.output_error import fit_free_runs, uncertain_parameters
 from hydrotele.gap.find import find_gap
 from hydrotele.gap.result import Gap
-from hydrotele.identify.smoothing import zero_phase
-from hydrotele.logs.dataset import Dataset, RunData, busiest_rows, load_dataset
+from hydrotele.identify.smoothing import filter_zero_phase
+from hydrotele.logs.dataset import Dataset, RunData, find_exciting_segment, load_dataset
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.terms.law import NO_DRIVES, DriveState
-from hydrotele.terms.table import FORCE, added, terms_table
+from hydrotele.terms.table import FORCE, sum_terms, terms_table
 
 WINDOW, LEAD = 5.0, 0.5  # s; of each window the lead has readings, the rest none
 PUSH = (176.0, 7.3, 0.7)  # N, s, s: half of the drive's largest force
@@ -47,8 +47,8 @@ def force_error(machine: Machine, run: RunData, cutoff: float) -> float:
     """
     axis = machine.axes["slide"]
     drive, friction = axis.force, axis.force.friction
-    motion = zero_phase(run.reading[:, 0], run.period, cutoff)
-    force = zero_phase(drive.gain * run.command[:, 0], run.period, cutoff).value
+    motion = filter_zero_phase(run.reading[:, 0], run.period, cutoff)
+    force = filter_zero_phase(drive.gain * run.command[:, 0], run.period, cutoff).value
     v, way = motion.rate, np.tanh(motion.rate / friction.smoothing_velocity)
     modelled = (
         machine.links["carriage"].mass * motion.acceleration
@@ -72,7 +72,7 @@ def _added(machine: Machine, run: RunData, position: np.ndarray, rate: np.ndarra
             time=run.start + row * run.period, position=x, velocity=v, command=command,
             force=machine.axes["slide"].force.gain * command,
         )  # fmt: skip
-        total[row] = added(table, FORCE, 0, state, NO_DRIVES)
+        total[row] = sum_terms(table, FORCE, 0, state, NO_DRIVES)
     return total
 
 
@@ -84,16 +84,16 @@ def velocity_fit(prepare: Prepare, run: RunData, cutoff: float) -> np.ndarray:
     velocities pass the same zero-phase filter.
     """
     known = np.flatnonzero(np.isfinite(run.reading).all(axis=1))
-    run = run.part(known[0], known[-1] + 1)
+    run = run.select_rows(known[0], known[-1] + 1)
     rows, lead = round(WINDOW / run.period), round(LEAD / run.period)
     starts = np.arange(lead, len(run.reading) - rows, rows)
     bridge = round(_GAP / run.period)
-    reading = zero_phase(run.reading, run.period, cutoff, bridge=bridge)
+    reading = filter_zero_phase(run.reading, run.period, cutoff, max_gap=bridge)
     measured = reading.rate[starts[0] : starts[-1] + rows]
     made = prepare(run).run(starts, rows)
     rates = np.diff(made, axis=1, prepend=made[:, :1]) / run.period
     rates[:, 0] = rates[:, 1]
-    modelled = zero_phase(rates.reshape(measured.shape), run.period, cutoff).value
+    modelled = filter_zero_phase(rates.reshape(measured.shape), run.period, cutoff).value
     judged = np.arange(len(measured)) % rows >= lead
     gone = np.linalg.norm((measured - modelled)[judged], axis=0)
     whole = np.linalg.norm((measured - measured.mean(axis=0))[judged], axis=0)
@@ -143,16 +143,13 @@ def emps(folder: Path, jobs: int) -> None:
         for cutoff in (20.0, 40.0, 100.0):
             before = force_error(machine, data.heldout, cutoff)
             after = force_error(gap.patched, data.heldout, cutoff)
-            print(
-                f"  relative force error, held out, {cutoff:.0f} Hz: {before:.2f} -> {after:.2f} %"
-            )
+            print(f"  relative force error, held out, {cutoff:.0f} Hz: {before:.2f} -> {after:.2f} %")
 
 
 def joined(runs: Sequence[RunData]) -> RunData:
     """Pieces of one record as one run again."""
     tables = {
-        name: np.concatenate([getattr(run, name) for run in runs])
-        for name in ("command", "command_known", "reading")
+        name: np.concatenate([getattr(run, name) for run in runs]) for name in ("command", "command_known", "reading")
     }
     valid = None
     if any(run.valid is not None for run in runs):
@@ -171,13 +168,12 @@ def ec20_splits(data: Dataset) -> dict[str, Dataset]:
         FIRST_THREE_QUARTERS: (quarters[:3], quarters[3:]),
     }
     splits = {
-        name: dataclasses.replace(data, fit=(joined(fit),), heldout=joined(held))
-        for name, (fit, held) in parts.items()
+        name: dataclasses.replace(data, fit=(joined(fit),), heldout=joined(held)) for name, (fit, held) in parts.items()
     }
     whole = splits[FIRST_THREE_QUARTERS]
     run = whole.fit[0]
-    rows = busiest_rows(run, round(_MINUTE / run.period))
-    minute = run.part(rows.start, rows.stop)
+    rows = find_exciting_segment(run, round(_MINUTE / run.period))
+    minute = run.select_rows(rows.start, rows.stop)
     return splits | {MINUTE: dataclasses.replace(whole, fit=(minute,))}
 
 
@@ -265,9 +261,7 @@ def eha(folder: Path, _jobs: int) -> None:
 STUDIES = {"emps": emps, "ec20": ec20, "eha": eha}
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="with emps/, volvo_ec20/ and eha/")
     parser.add_argument("--only", choices=STUDIES, nargs="+", default=list(STUDIES))
     parser.add_argument("--jobs", type=int, default=2)

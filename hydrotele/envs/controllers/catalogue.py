@@ -2,30 +2,30 @@
 
 from collections.abc import Callable, Mapping
 
-from hydrotele.core.datafile import suggest
+from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
-from hydrotele.envs.controllers.controller import Controller, Random, Zero
-from hydrotele.envs.controllers.grade import grade_controller
-from hydrotele.envs.controllers.place import place_controller
+from hydrotele.envs.controllers.controller import Controller, RandomController, ZeroController
+from hydrotele.envs.controllers.grade import make_grade_controller
+from hydrotele.envs.controllers.place import make_place_controller
 from hydrotele.envs.controllers.track import (
-    line_controller,
-    press_controller,
-    reach_controller,
-    track_controller,
+    make_line_controller,
+    make_press_controller,
+    make_reach_controller,
+    make_track_controller,
 )
 from hydrotele.envs.facts import TaskSetup
 
-REFERENCES: dict[str, Callable[[TaskSetup], Controller]] = {
-    "TrackTrajectory": track_controller,
-    "Grade": grade_controller,
-    "StraightLine": line_controller,
-    "HoldForce": press_controller,
-    "ReachFeller": reach_controller,
-    "PlaceLog": place_controller,
+REFERENCE_CONTROLLERS: dict[str, Callable[[TaskSetup], Controller]] = {
+    "TrackTrajectory": make_track_controller,
+    "Grade": make_grade_controller,
+    "StraightLine": make_line_controller,
+    "HoldForce": make_press_controller,
+    "ReachFeller": make_reach_controller,
+    "PlaceLog": make_place_controller,
 }
 """Task name -> function that makes its reference controller for the chosen kind of actions."""
 
-CONTROLLERS = ("reference", "zero", "random")
+CONTROLLER_NAMES = ("reference", "zero", "random")
 
 
 def make_controller(name: str, setup: TaskSetup) -> Controller:
@@ -42,43 +42,43 @@ def make_controller(name: str, setup: TaskSetup) -> Controller:
         InputError: the controller does not exist, or the task has no reference controller.
     """
     if name == "zero":
-        return Zero(setup)
+        return ZeroController(setup)
     if name == "random":
-        return Random(setup)
+        return RandomController(setup)
     if name != "reference":
-        raise InputError(f"controller {name!r}", suggest(name, CONTROLLERS))
-    if setup.task.name not in REFERENCES:
+        raise InputError(f"controller {name!r}", suggest_valid_name(name, CONTROLLER_NAMES))
+    if setup.task.name not in REFERENCE_CONTROLLERS:
         raise InputError(f"task {setup.task.name}", "has no reference controller")
-    return REFERENCES[setup.task.name](setup)
+    return REFERENCE_CONTROLLERS[setup.task.name](setup)
 
 
-def tune(
-    value: Callable[[dict[str, float]], float], start: Mapping[str, float], factor: float = 1.5,
-    rounds: int = 2, gain: float = 0.0, most: Mapping[str, float] | None = None,
+def tune_gains(
+    evaluate: Callable[[dict[str, float]], float], initial_gains: Mapping[str, float], factor: float = 1.5,
+    passes: int = 2, min_improvement: float = 0.0, upper_bounds: Mapping[str, float] | None = None,
 ) -> tuple[dict[str, float], float]:  # fmt: skip
     """Improve controller gains by a coordinate search.
 
     Args:
-        value: function that returns the score of a set of gains, larger is better; it must always
+        evaluate: function that returns the score of a set of gains, larger is better; it must always
             use the same episodes.
-        start: initial gains, all positive.
+        initial_gains: initial gains, all positive.
         factor: factor by which a gain is changed, repeatedly while the score improves.
-        rounds: number of passes through all gains.
-        gain: minimum improvement of the score that a change must bring.
-        most: upper bounds of the gains.
+        passes: number of passes through all gains.
+        min_improvement: minimum improvement of the score that a change must bring.
+        upper_bounds: upper bounds of the gains.
 
     Returns:
         (gains, their score).
     """
-    best, score = dict(start), value(dict(start))
-    for _ in range(rounds):
-        for name in start:
+    best, score = dict(initial_gains), evaluate(dict(initial_gains))
+    for _ in range(passes):
+        for name in initial_gains:
             for step in (factor, 1.0 / factor):
                 moved = False
                 while True:
-                    trial = min(best[name] * step, (most or {}).get(name, float("inf")))
-                    found = value({**best, name: trial}) if trial != best[name] else score
-                    if found <= score + gain:
+                    trial = min(best[name] * step, (upper_bounds or {}).get(name, float("inf")))
+                    found = evaluate({**best, name: trial}) if trial != best[name] else score
+                    if found <= score + min_improvement:
                         break
                     best[name], score, moved = trial, found, True
                 if moved:

@@ -1,6 +1,6 @@
 """Controller protocol, zero and random controllers, and the joint servo for valve actions.
 
-`columns` finds the observation columns of named fields. `ValveLaw` computes valve commands at the
+`find_columns` finds the observation columns of named fields. `ValveServo` computes valve commands at the
 environment rate with the joint servo of `control.servo`: velocity feedforward through the flow gain
 at the measured pressures, dead-band compensation, position feedback and dynamic pressure feedback.
 Its integral term compensates leakage and deviations of dead band and flow gain from the nominal
@@ -15,11 +15,11 @@ import numpy as np
 from hydrotele.control.servo import (
     ComputedForce,
     DriveReference,
-    Measured,
-    drive_row,
-    drive_tables,
+    MeasuredState,
+    interpolate_drive_reference,
     servo_parameters,
     servo_step,
+    tabulate_drives,
 )
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
@@ -55,7 +55,7 @@ class Controller(Protocol):
         ...
 
 
-class Zero:
+class ZeroController:
     """Controller that returns zero actions: closed valves, or zero rates."""
 
     def __init__(self, setup: TaskSetup) -> None:
@@ -73,7 +73,7 @@ class Zero:
         return np.zeros((len(observation), self._actions), np.float32)
 
 
-class Random:
+class RandomController:
     """Controller that returns independent uniform random actions in every step."""
 
     def __init__(self, setup: TaskSetup, seed: int = 0) -> None:
@@ -82,14 +82,14 @@ class Random:
 
     def begin(self, count: int) -> None:
         """Seed the random generator."""
-        self._chance = np.random.default_rng(self._seed)
+        self._rng = np.random.default_rng(self._seed)
 
     def reset(self, mask: np.ndarray) -> None:
         """Do nothing: the random stream continues."""
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Return random actions (n, a) from -1 to 1 for observations (n, o)."""
-        return self._chance.uniform(-1.0, 1.0, (len(observation), self._actions))
+        return self._rng.uniform(-1.0, 1.0, (len(observation), self._actions))
 
 
 def step_time(setup: TaskSetup) -> float:
@@ -97,7 +97,7 @@ def step_time(setup: TaskSetup) -> float:
     return setup.clock.ticks * setup.clock.period
 
 
-def columns(setup: TaskSetup, what: str, where: Iterable[str]) -> np.ndarray:
+def find_columns(setup: TaskSetup, what: str, where: Iterable[str]) -> np.ndarray:
     """Return the observation columns of the fields `what.where`.
 
     Args:
@@ -118,15 +118,15 @@ def columns(setup: TaskSetup, what: str, where: Iterable[str]) -> np.ndarray:
     return np.array([places[name] for name in names], int)
 
 
-def position_columns(setup: TaskSetup) -> np.ndarray:
+def find_position_columns(setup: TaskSetup) -> np.ndarray:
     """Return the observation columns (k,) of the measured positions of the driven axes."""
     return np.concatenate([
-        columns(setup, setup.machine.position_kind(axis), [axis]) for axis in setup.axes
+        find_columns(setup, setup.machine.position_kind(axis), [axis]) for axis in setup.axes
     ])  # fmt: skip
 
 
 @compiled
-def servo_commands(numbers, grid, table, reference, rate_ahead, measured, load, out):
+def compute_servo_commands(numbers, grid, table, reference, rate_ahead, measured, load, out):
     """Compute the joint servo commands of n episodes.
 
     Args:
@@ -148,12 +148,12 @@ def servo_commands(numbers, grid, table, reference, rate_ahead, measured, load, 
     closed, none = np.ones(k), np.zeros(k)
     velocity, arm, volume_head, volume_rod = np.empty(k), np.empty(k), np.empty(k), np.empty(k)
     for i in range(len(reference)):
-        drive_row(
+        interpolate_drive_reference(
             grid, table, reference[i], rate_ahead[i], 1.0, velocity, arm, volume_head, volume_rod
         )
         drive = DriveReference(velocity, arm, volume_head, volume_rod)
         computed = ComputedForce(False, none, none)
-        now = Measured(
+        now = MeasuredState(
             measured.joint[i], measured.rate[i], measured.head[i], measured.rod[i],
             measured.supply[i],
         )  # fmt: skip
@@ -161,7 +161,7 @@ def servo_commands(numbers, grid, table, reference, rate_ahead, measured, load, 
 
 
 @compiled
-def forward_poses(arm, q, pose):
+def compute_poses(arm, q, pose):
     """Compute the tip poses of n episodes from their joint angles.
 
     Args:
@@ -179,7 +179,7 @@ def forward_poses(arm, q, pose):
 
 
 @compiled
-def inverse_joints(arm, ranges, pose, q):
+def compute_joint_angles(arm, ranges, pose, q):
     """Compute the joint angles of n episodes from tip poses; unreachable poses leave `q` unchanged.
 
     Args:
@@ -203,10 +203,10 @@ def inverse_joints(arm, ranges, pose, q):
             q[i] = found
 
 
-_MOST = 0.05  # rad/s or m/s, limit of the integral term
+_MAX_INTEGRAL = 0.05  # rad/s or m/s, limit of the integral term
 
 
-class ValveLaw:
+class ValveServo:
     """Joint servo that returns valve (or force drive) actions for axis references."""
 
     def __init__(self, setup: TaskSetup, servo: Servo, integral_gain: float = 0.0) -> None:
@@ -219,30 +219,28 @@ class ValveLaw:
         """
         machine, self._dt = setup.machine, step_time(setup)
         self._axes, self._integral_gain = setup.axes, integral_gain
-        self._numbers = servo_parameters(machine, setup.axes, servo, self._dt)
-        self._grid, self._table = drive_tables(machine, setup.axes)
-        valves = [i for i, name in enumerate(setup.axes) if machine.axes[name].hydraulic]
+        self._parameters = servo_parameters(machine, setup.axes, servo, self._dt)
+        self._grid, self._table = tabulate_drives(machine, setup.axes)
+        valves = [i for i, name in enumerate(setup.axes) if machine.axes[name].is_hydraulic]
         names = [setup.axes[i] for i in valves]
         self._valves = np.array(valves, int)
-        self._joint = position_columns(setup)
-        self._rate = columns(setup, "rate", setup.axes)
-        self._head = columns(setup, "pressure_head", names)
-        self._rod = columns(setup, "pressure_rod", names)
-        self._supply = columns(setup, "pressure_supply", [""] if names else [])
+        self._joint = find_position_columns(setup)
+        self._rate = find_columns(setup, "rate", setup.axes)
+        self._head = find_columns(setup, "pressure_head", names)
+        self._rod = find_columns(setup, "pressure_rod", names)
+        self._supply = find_columns(setup, "pressure_supply", [""] if names else [])
 
     def begin(self, count: int) -> None:
         """Allocate the state of `count` episodes."""
         shape = (count, len(self._axes))
-        self._load, self._integral, self._out = (np.zeros(shape) for _ in range(3))
-        self._fresh = np.ones(count, bool)
+        self._load, self._integral, self._commands = (np.zeros(shape) for _ in range(3))
+        self._is_new = np.ones(count, bool)
 
     def reset(self, mask: np.ndarray) -> None:
         """Reset the state of the episodes selected by the mask (n,)."""
-        self._fresh |= mask
+        self._is_new |= mask
 
-    def __call__(
-        self, observation: np.ndarray, reference: np.ndarray, rate_ahead: np.ndarray
-    ) -> np.ndarray:
+    def __call__(self, observation: np.ndarray, reference: np.ndarray, rate_ahead: np.ndarray) -> np.ndarray:
         """Return the actions of this step.
 
         Args:
@@ -257,16 +255,16 @@ class ValveLaw:
         head, rod = np.zeros_like(joint), np.zeros_like(joint)
         head[:, self._valves], rod[:, self._valves] = seen[:, self._head], seen[:, self._rod]
         supply = seen[:, self._supply[0]] if len(self._supply) else np.zeros(len(seen))
-        force = self._numbers[:, 1] * head - self._numbers[:, 2] * rod
-        self._load[self._fresh], self._integral[self._fresh] = force[self._fresh], 0.0
-        self._out[self._fresh], self._fresh[:] = 0.0, False
-        limit = self._numbers[:, 6]
-        free = np.abs(self._out) < limit  # anti-windup for a saturated drive
+        force = self._parameters[:, 1] * head - self._parameters[:, 2] * rod
+        self._load[self._is_new], self._integral[self._is_new] = force[self._is_new], 0.0
+        self._commands[self._is_new], self._is_new[:] = 0.0, False
+        limit = self._parameters[:, 6]
+        free = np.abs(self._commands) < limit  # anti-windup for a saturated drive
         self._integral += self._integral_gain * self._dt * free * (reference - joint)
-        np.clip(self._integral, -_MOST, _MOST, out=self._integral)
-        servo_commands(
-            self._numbers, self._grid, self._table, np.ascontiguousarray(reference, float),
+        np.clip(self._integral, -_MAX_INTEGRAL, _MAX_INTEGRAL, out=self._integral)
+        compute_servo_commands(
+            self._parameters, self._grid, self._table, np.ascontiguousarray(reference, float),
             np.ascontiguousarray(rate_ahead + self._integral),
-            Measured(joint, seen[:, self._rate], head, rod, supply), self._load, self._out,
+            MeasuredState(joint, seen[:, self._rate], head, rod, supply), self._load, self._commands,
         )  # fmt: skip
-        return self._out / limit
+        return self._commands / limit

@@ -8,37 +8,40 @@ controller approaches the plate slowly and then sets the speed from the force er
 
 import numpy as np
 
-from hydrotele.control.resolved_motion import COORDINATES, arm_facts
+from hydrotele.control.resolved_motion import COORDINATES, arm_specification
 from hydrotele.core.errors import InputError
 from hydrotele.envs.controllers.controller import (
     Controller,
-    ValveLaw,
-    columns,
-    forward_poses,
-    inverse_joints,
-    position_columns,
+    ValveServo,
+    compute_joint_angles,
+    compute_poses,
+    find_columns,
+    find_position_columns,
     step_time,
 )
-from hydrotele.envs.episode import ARM
+from hydrotele.envs.episode import MAX_ARM_AXES
 from hydrotele.envs.facts import (
-    ACCELERATION,
-    POSE_ACCELERATIONS,
+    MAX_ACCELERATION,
+    MAX_POSE_ACCELERATIONS,
     TaskSetup,
-    full_rate,
+    full_action_rate,
 )
-from hydrotele.envs.line import PREVIEWS as LINE_PREVIEWS
-from hydrotele.envs.track import PREVIEWS
+from hydrotele.envs.line import PREVIEW_TIMES as LINE_PREVIEWS
+from hydrotele.envs.track import PREVIEW_TIMES
 from hydrotele.scenario.scenario import Servo
 
-SERVO = Servo()
-_INTEGRAL = 2.0  # 1/s^2, integral gain of valve actions
-_LEAD = 0.06  # s, phase lead of valve actions: the spool lag and half a step
-_JOINTS = (8.0, 1.0)  # 1/s, gains of `RateFeedback` for joints: tracking, model correction
-_POSE = (3.0, 3.0)  # 1/s, the same for a tip whose rates often saturate
-_NEAR = 0.02  # s, half width of the central difference quotient
+DEFAULT_SERVO = Servo()
+_INTEGRAL_GAIN = 2.0  # 1/s^2, integral gain of valve actions
+_PHASE_LEAD = 0.06  # s, phase lead of valve actions: the spool lag and half a step
+_JOINT_RATE_GAINS = (
+    8.0,
+    1.0,
+)  # 1/s, gains of `RateFeedback` for joints: tracking, model correction
+_POSE_RATE_GAINS = (3.0, 3.0)  # 1/s, the same for a tip whose rates often saturate
+_DIFFERENCE_STEP = 0.02  # s, half width of the central difference quotient
 
 
-class Preview:
+class ReferencePreview:
     """Interpolate the observed references in time by a polynomial.
 
     The polynomial of fourth order matches the positions now and at the PREVIEWS, and the rate now.
@@ -46,19 +49,17 @@ class Preview:
 
     def __init__(self, setup: TaskSetup) -> None:
         """Look up the observation columns and invert the interpolation matrix."""
-        ahead = [f"reference_in_{time * 1000:.0f}_ms" for time in PREVIEWS]
-        self._columns = [
-            columns(setup, what, setup.axes) for what in ("reference", "reference_rate", *ahead)
-        ]
+        ahead = [f"reference_in_{time * 1000:.0f}_ms" for time in PREVIEW_TIMES]
+        self._columns = [find_columns(setup, what, setup.axes) for what in ("reference", "reference_rate", *ahead)]
         powers = np.arange(len(self._columns))
         rows = [[float(p == 0) for p in powers], [float(p == 1) for p in powers]]
-        self._solved = np.linalg.inv(np.array(rows + [[t**p for p in powers] for t in PREVIEWS]))
+        self._inverse = np.linalg.inv(np.array(rows + [[t**p for p in powers] for t in PREVIEW_TIMES]))
 
-    def at(self, observation: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
+    def interpolate(self, observation: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the references and their rates, (n, k) each, `time` [s] from now."""
         powers = np.arange(len(self._columns))
-        place = time**powers @ self._solved
-        rate = (powers[1:] * time ** (powers[1:] - 1)) @ self._solved[1:]
+        place = time**powers @ self._inverse
+        rate = (powers[1:] * time ** (powers[1:] - 1)) @ self._inverse[1:]
         shown = np.stack([observation[:, c] for c in self._columns]).astype(float)
         return np.tensordot(place, shown, 1), np.tensordot(rate, shown, 1)
 
@@ -69,9 +70,9 @@ class TrackByValves:
     def __init__(
         self,
         setup: TaskSetup,
-        servo: Servo = SERVO,
-        integral: float = _INTEGRAL,
-        lead: float = _LEAD,
+        servo: Servo = DEFAULT_SERVO,
+        integral: float = _INTEGRAL_GAIN,
+        lead: float = _PHASE_LEAD,
     ) -> None:
         """Read the parameters of the nominal machine.
 
@@ -81,15 +82,18 @@ class TrackByValves:
             integral: gain of the integral term [1/s^2].
             lead: phase lead of the reference rates [s].
         """
-        self._law, self._preview = ValveLaw(setup, servo, integral), Preview(setup)
+        self._valve_servo, self._preview = (
+            ValveServo(setup, servo, integral),
+            ReferencePreview(setup),
+        )
         self._lead = lead
-        self.begin, self.reset = self._law.begin, self._law.reset
+        self.begin, self.reset = self._valve_servo.begin, self._valve_servo.reset
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Return the actions (n, k) for observations (n, o)."""
-        now, _ = self._preview.at(observation, 0.0)
-        _, rate = self._preview.at(observation, self._lead)
-        return self._law(observation, now, rate)
+        now, _ = self._preview.interpolate(observation, 0.0)
+        _, rate = self._preview.interpolate(observation, self._lead)
+        return self._valve_servo(observation, now, rate)
 
 
 class RateFeedback:
@@ -100,9 +104,7 @@ class RateFeedback:
     The model is corrected slowly towards the measured position.
     """
 
-    def __init__(
-        self, setup: TaskSetup, fastest: np.ndarray, accelerations: np.ndarray, gains
-    ) -> None:
+    def __init__(self, setup: TaskSetup, fastest: np.ndarray, accelerations: np.ndarray, gains) -> None:
         """Store clocks, limits and gains.
 
         Args:
@@ -112,22 +114,22 @@ class RateFeedback:
             gains: position gain of the model, gain of its correction towards the measured position
                 [1/s].
         """
-        self._stiff, self._slow = gains
+        self._tracking_gain, self._correction_gain = gains
         self._fastest, self._dt = fastest, step_time(setup)
         self._period, self._ticks = setup.clock.period, setup.clock.ticks
-        self._change = accelerations * self._period
+        self._max_rate_change = accelerations * self._period
 
     def begin(self, count: int) -> None:
         """Allocate the state of `count` episodes."""
         shape = (count, len(self._fastest))
-        self._place, self._rate = np.zeros(shape), np.zeros(shape)
-        self._fresh = np.ones(count, bool)
+        self._model_position, self._model_rate = np.zeros(shape), np.zeros(shape)
+        self._is_new = np.ones(count, bool)
 
     def reset(self, mask: np.ndarray) -> None:
         """Reset the state of the episodes selected by the mask (n,)."""
-        self._fresh |= mask
+        self._is_new |= mask
 
-    def rates(self, measured: np.ndarray, place: np.ndarray, rate: np.ndarray) -> np.ndarray:
+    def compute_rates(self, measured: np.ndarray, place: np.ndarray, rate: np.ndarray) -> np.ndarray:
         """Return the rate commands, scaled to +-1.
 
         Args:
@@ -138,14 +140,18 @@ class RateFeedback:
         Returns:
             (n, k) commands.
         """
-        self._place[self._fresh] = measured[self._fresh]
-        self._rate[self._fresh], self._fresh[:] = 0.0, False
-        self._place += self._slow * self._dt * (measured - self._place)
-        wanted = (rate + self._stiff * (place - self._place)) / self._fastest
+        self._model_position[self._is_new] = measured[self._is_new]
+        self._model_rate[self._is_new], self._is_new[:] = 0.0, False
+        self._model_position += self._correction_gain * self._dt * (measured - self._model_position)
+        wanted = (rate + self._tracking_gain * (place - self._model_position)) / self._fastest
         action = np.clip(wanted, -1.0, 1.0)
         for _ in range(self._ticks):
-            self._rate += np.clip(action * self._fastest - self._rate, -self._change, self._change)
-            self._place += self._period * self._rate
+            self._model_rate += np.clip(
+                action * self._fastest - self._model_rate,
+                -self._max_rate_change,
+                self._max_rate_change,
+            )
+            self._model_position += self._period * self._model_rate
         return action
 
 
@@ -154,15 +160,15 @@ class TrackByJointRates:
 
     def __init__(self, setup: TaskSetup) -> None:
         """Read the parameters of the nominal machine."""
-        self._preview, self._joint = Preview(setup), position_columns(setup)
-        fastest = np.array([full_rate(setup.machine, axis) for axis in setup.axes])
-        self._asked = RateFeedback(setup, fastest, np.full(len(fastest), ACCELERATION), _JOINTS)
-        self.begin, self.reset = self._asked.begin, self._asked.reset
+        self._preview, self._joint = ReferencePreview(setup), find_position_columns(setup)
+        fastest = np.array([full_action_rate(setup.machine, axis) for axis in setup.axes])
+        self._rate_feedback = RateFeedback(setup, fastest, np.full(len(fastest), MAX_ACCELERATION), _JOINT_RATE_GAINS)
+        self.begin, self.reset = self._rate_feedback.begin, self._rate_feedback.reset
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Return the actions (n, k) for observations (n, o)."""
         measured = observation[:, self._joint].astype(float)
-        return self._asked.rates(measured, *self._preview.at(observation, 0.0))
+        return self._rate_feedback.compute_rates(measured, *self._preview.interpolate(observation, 0.0))
 
 
 class TrackByResolvedMotion:
@@ -177,29 +183,29 @@ class TrackByResolvedMotion:
         k = setup.arm_axes
         if k < len(setup.axes):
             raise InputError(f"task {setup.task.name}", "drives axes that are not part of the arm")
-        self._preview, self._arm = Preview(setup), arm_facts(setup.machine)[0]
-        self._tip = columns(setup, "tip", COORDINATES[:k])
+        self._preview, self._arm = ReferencePreview(setup), arm_specification(setup.machine)[0]
+        self._tip = find_columns(setup, "tip", COORDINATES[:k])
         fastest = np.array(setup.task.pose_rates[:k])
-        self._asked = RateFeedback(setup, fastest, np.array(POSE_ACCELERATIONS[:k]), _POSE)
-        self.begin, self.reset = self._asked.begin, self._asked.reset
+        self._rate_feedback = RateFeedback(setup, fastest, np.array(MAX_POSE_ACCELERATIONS[:k]), _POSE_RATE_GAINS)
+        self.begin, self.reset = self._rate_feedback.begin, self._rate_feedback.reset
 
     def _pose(self, observation: np.ndarray, time: float) -> np.ndarray:
         """Return the tip pose (n, k) of the references `time` [s] from now."""
-        q = self._preview.at(observation, time)[0]
-        pose = np.zeros((len(q), ARM))
-        forward_poses(self._arm, np.ascontiguousarray(q), pose)
+        q = self._preview.interpolate(observation, time)[0]
+        pose = np.zeros((len(q), MAX_ARM_AXES))
+        compute_poses(self._arm, np.ascontiguousarray(q), pose)
         return pose[:, : q.shape[1]]
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Return the actions (n, k) for observations (n, o)."""
-        after = self._pose(observation, _NEAR)
-        before = self._pose(observation, -_NEAR)
+        after = self._pose(observation, _DIFFERENCE_STEP)
+        before = self._pose(observation, -_DIFFERENCE_STEP)
         measured = observation[:, self._tip].astype(float)
-        rate = (after - before) / (2.0 * _NEAR)
-        return self._asked.rates(measured, self._pose(observation, 0.0), rate)
+        rate = (after - before) / (2.0 * _DIFFERENCE_STEP)
+        return self._rate_feedback.compute_rates(measured, self._pose(observation, 0.0), rate)
 
 
-def track_controller(setup: TaskSetup) -> Controller:
+def make_track_controller(setup: TaskSetup) -> Controller:
     """Make the controller of the task `TrackTrajectory` for the chosen kind of actions."""
     kinds = {"valve": TrackByValves, "joint_rate": TrackByJointRates}
     return kinds.get(setup.options.action or "", TrackByResolvedMotion)(setup)
@@ -209,10 +215,10 @@ _LINE_GAIN = 0.5  # 1/s, position gain on a line
 _REACH_GAINS = (1.0, 0.45, 1.0, 1.0, 1.0)  # 1/s, gains of r, theta, z, attitude, head
 _JOINT_GAINS = (0.45, 1.0, 1.0, 1.0, 1.0)  # 1/s, gains of the joints, from swing outwards
 _TIP_INTEGRAL = 1.2  # 1/s^2, integral gain to hold a pose against leakage and dead bands
-_GENTLY = 0.6  # maximum joint rate of a reach, as a fraction of the full rate
+_REACH_RATE_FRACTION = 0.6  # maximum joint rate of a reach, as a fraction of the full rate
 
 
-class Tip:
+class TipController:
     """Base of the controllers that track a tip pose with any kind of actions."""
 
     def __init__(self, setup: TaskSetup, integral: float = 0.0) -> None:
@@ -224,14 +230,12 @@ class Tip:
         """
         k = self._k = setup.arm_axes
         self._kind = setup.options.action
-        self._arm, _, self._ranges = arm_facts(setup.machine)
-        self._joint = position_columns(setup)[:k]
-        self._tip = columns(setup, "tip", COORDINATES[:k])
-        self._fastest = np.array([full_rate(setup.machine, axis) for axis in setup.axes[:k]])
+        self._arm, _, self._ranges = arm_specification(setup.machine)
+        self._joint = find_position_columns(setup)[:k]
+        self._tip = find_columns(setup, "tip", COORDINATES[:k])
+        self._fastest = np.array([full_action_rate(setup.machine, axis) for axis in setup.axes[:k]])
         self._fastest_pose = np.array(setup.task.pose_rates[:k])
-        self._valves = (
-            ValveLaw(setup, setup.task.servo, integral) if self._kind == "valve" else None
-        )
+        self._valves = ValveServo(setup, setup.task.servo, integral) if self._kind == "valve" else None
 
     def begin(self, count: int) -> None:
         """Allocate the state of `count` episodes."""
@@ -243,86 +247,88 @@ class Tip:
         if self._valves:
             self._valves.reset(mask)
 
-    def joints(self, observation: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    def solve_joints(self, observation: np.ndarray, pose: np.ndarray) -> np.ndarray:
         """Return the joint angles (n, k) for poses (n, k)."""
         found = np.ascontiguousarray(observation[:, self._joint], float)
-        whole = np.zeros((len(pose), ARM))
+        whole = np.zeros((len(pose), MAX_ARM_AXES))
         whole[:, : self._k] = pose
-        inverse_joints(self._arm, self._ranges, whole, found)
+        compute_joint_angles(self._arm, self._ranges, whole, found)
         return found
 
 
-class LineController(Tip):
+class LineController(TipController):
     """Track a line by the reference rate shortly ahead and the current error."""
 
     def __init__(self, setup: TaskSetup) -> None:
         """Look up the observation columns."""
         super().__init__(setup)
-        self._wanted = columns(setup, "wanted", COORDINATES[: self._k])
-        self._ahead = [
-            columns(setup, f"wanted_in_{time * 1000:.0f}_ms", COORDINATES[:3])
-            for time in LINE_PREVIEWS[:2]
+        self._reference_columns = find_columns(setup, "wanted", COORDINATES[: self._k])
+        self._preview_columns = [
+            find_columns(setup, f"wanted_in_{time * 1000:.0f}_ms", COORDINATES[:3]) for time in LINE_PREVIEWS[:2]
         ]
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Return the actions (n, k) for observations (n, o)."""
         seen = observation.astype(float)
-        wanted = seen[:, self._wanted]
-        later = [np.concatenate([seen[:, c], wanted[:, 3:]], axis=1) for c in self._ahead]
+        wanted = seen[:, self._reference_columns]
+        later = [np.concatenate([seen[:, c], wanted[:, 3:]], axis=1) for c in self._preview_columns]
         if self._kind == "resolved_motion":
             rate = (later[1] - later[0]) / (LINE_PREVIEWS[1] - LINE_PREVIEWS[0])
             off = wanted - seen[:, self._tip]
             return (rate + _LINE_GAIN * off) / self._fastest_pose
-        now, soon = self.joints(observation, wanted), self.joints(observation, later[0])
+        now, soon = self.solve_joints(observation, wanted), self.solve_joints(observation, later[0])
         rate = (soon - now) / LINE_PREVIEWS[0]
         if self._valves:
             return self._valves(observation, now, rate)
         return (rate + _LINE_GAIN * (now - seen[:, self._joint])) / self._fastest
 
 
-class ReachController(Tip):
+class ReachController(TipController):
     """Move to a pose with a rate proportional to the remaining error."""
 
     def __init__(self, setup: TaskSetup) -> None:
         """Look up the observation columns."""
         super().__init__(setup, _TIP_INTEGRAL)
-        self._wanted = columns(setup, "wanted", COORDINATES[: self._k])
+        self._reference_columns = find_columns(setup, "wanted", COORDINATES[: self._k])
         servo = setup.task.servo
         gains = [servo.axis_gains.get(axis, servo.position_gain) for axis in setup.axes[: self._k]]
-        self._stiff = np.array(gains)
+        self._position_gains = np.array(gains)
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Return the actions (n, k) for observations (n, o)."""
         seen = observation.astype(float)
-        wanted = seen[:, self._wanted]
+        wanted = seen[:, self._reference_columns]
         if self._kind == "resolved_motion":
             off = wanted - seen[:, self._tip]
             return np.array(_REACH_GAINS) * off / self._fastest_pose
         joint = seen[:, self._joint]
-        most = _GENTLY * self._fastest
-        rate = np.array(_JOINT_GAINS) * (self.joints(observation, wanted) - joint)
+        most = _REACH_RATE_FRACTION * self._fastest
+        rate = np.array(_JOINT_GAINS) * (self.solve_joints(observation, wanted) - joint)
         rate = np.clip(rate, -most, most)
         if self._valves:
-            return self._valves(observation, joint + rate / self._stiff, np.zeros_like(rate))
+            return self._valves(observation, joint + rate / self._position_gains, np.zeros_like(rate))
         return rate / self._fastest
 
 
-def line_controller(setup: TaskSetup) -> Controller:
+def make_line_controller(setup: TaskSetup) -> Controller:
     """Make the controller of the task `StraightLine` for the chosen kind of actions."""
     return LineController(setup)
 
 
-def reach_controller(setup: TaskSetup) -> Controller:
+def make_reach_controller(setup: TaskSetup) -> Controller:
     """Make the controller of the task `ReachFeller` for the chosen kind of actions."""
     return ReachController(setup)
 
 
-_TOUCH = 1.5e3  # N, measured force that counts as contact, above the error of the load cell
-_APPROACH, _MOST = 0.08, 0.10  # m/s, speed without contact, maximum speed with contact
-_GAIN = 2.0e-6  # m/s per N: a loop gain of 2 /s on 1e6 N/m
+_CONTACT_FORCE = 1.5e3  # N, measured force that counts as contact, above the error of the load cell
+_APPROACH_SPEED, _MAX_PRESS_SPEED = (
+    0.08,
+    0.10,
+)  # m/s, speed without contact, maximum speed with contact
+_FORCE_GAIN = 2.0e-6  # m/s per N: a loop gain of 2 /s on 1e6 N/m
 
 
-class Press:
+class PressController:
     """Set the vertical speed of the tip proportional to the force error."""
 
     def __init__(self, setup: TaskSetup) -> None:
@@ -333,8 +339,8 @@ class Press:
         """
         if setup.options.action != "resolved_motion":
             raise InputError(f"action {setup.options.action!r}", "must be resolved_motion")
-        self._force = columns(setup, "force", [""])[0]
-        self._wanted = columns(setup, "wanted_force", [""])[0]
+        self._force_column = find_columns(setup, "force", [""])[0]
+        self._reference_column = find_columns(setup, "wanted_force", [""])[0]
         self._fastest, self._actions = setup.task.pose_rates[2], len(setup.axes)
 
     def begin(self, count: int) -> None:
@@ -345,13 +351,13 @@ class Press:
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Return the actions (n, k) for observations (n, o)."""
-        force, wanted = observation[:, self._force], observation[:, self._wanted]
-        speed = np.clip(_GAIN * (force - wanted), -_MOST, _MOST)
+        force, wanted = observation[:, self._force_column], observation[:, self._reference_column]
+        speed = np.clip(_FORCE_GAIN * (force - wanted), -_MAX_PRESS_SPEED, _MAX_PRESS_SPEED)
         actions = np.zeros((len(observation), self._actions))
-        actions[:, 2] = np.where(force < _TOUCH, -_APPROACH, speed) / self._fastest
+        actions[:, 2] = np.where(force < _CONTACT_FORCE, -_APPROACH_SPEED, speed) / self._fastest
         return actions
 
 
-def press_controller(setup: TaskSetup) -> Controller:
+def make_press_controller(setup: TaskSetup) -> Controller:
     """Make the controller of the task `HoldForce`; its actions must be `resolved_motion`."""
-    return Press(setup)
+    return PressController(setup)

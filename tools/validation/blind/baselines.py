@@ -33,7 +33,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.effects import EFFECTS, apply_effect
 from hydrotele.logs.log import Log, load_log
 from hydrotele.machine.machine import Machine as Facts
-from hydrotele.machine.machine import noise_rms, sensor_set
+from hydrotele.machine.machine import get_sensors, noise_rms
 from hydrotele.machine.machine_file import load_machine
 from tools.validation.blind.score import share
 from tools.validation.blind.spreads import SIZES
@@ -105,7 +105,7 @@ def make_problem(folder: Path, facts: Facts, limit: float) -> Problem:
         The problem.
     """
     logs = [load_log(folder / f"{name}.parquet") for name in ("fit_1", "fit_2", "fit_3", "test_1")]
-    sensors, names = sensor_set(facts, SENSORS[facts.name]), channels(facts)
+    sensors, names = get_sensors(facts, SENSORS[facts.name]), channels(facts)
     size = np.array([noise_rms(facts, sensors, name) for name in names])
     commands = [np.column_stack([log[f"command.{a}"] for a in facts.axes]) for log in logs]
     readings = [np.column_stack([log[name] for name in names]) for log in logs]
@@ -185,16 +185,14 @@ def floor(problem: Problem, rng: np.random.Generator) -> float:
     names = [f"command.{a}" for a in facts.axes] + channels(facts)
     values = dict(zip(names, [*u.T, *readings.T], strict=True))
     log = Log(problem.period * np.arange(len(u)), values, dict.fromkeys(names, "1") | _units(names))
-    perfect = problem._replace(
-        readings=[readings], commands=[u], states=[_smoothed(facts, log, u, problem.period)]
-    )
+    perfect = problem._replace(readings=[readings], commands=[u], states=[_smoothed(facts, log, u, problem.period)])
     return float(np.sqrt(np.mean(errors(perfect, world_prediction(problem, facts), 0) ** 2)))
 
 
 def _units(names: list[str]) -> dict[str, str]:
-    from hydrotele.machine.signals import usual_unit
+    from hydrotele.machine.signals import default_unit
 
-    return {name: usual_unit(name, names) for name in names}
+    return {name: default_unit(name, names) for name in names}
 
 
 class Number(NamedTuple):
@@ -218,7 +216,7 @@ def library_numbers(facts: Facts) -> list[list[Number]]:
             if name == "joint_flexibility" and facts.axes[place].cylinder:
                 continue
             found.append([
-                Number(name, place, key, p.nominal, p.low, p.high, p.scale)
+                Number(name, place, key, p.nominal, p.lower_bound, p.upper_bound, p.prior_std)
                 for key, p in effect.parameters(facts, place).items()
             ])  # fmt: skip
     return found
@@ -227,8 +225,7 @@ def library_numbers(facts: Facts) -> list[list[Number]]:
 def changed(facts: Facts, group: list[Number], deviations: np.ndarray) -> Facts:
     """Facts with an effect, whose numbers deviate by multiples of their scales."""
     values = {
-        p.key: float(np.clip(p.nominal + d * p.scale, p.low, p.high))
-        for p, d in zip(group, deviations, strict=True)
+        p.key: float(np.clip(p.nominal + d * p.scale, p.low, p.high)) for p, d in zip(group, deviations, strict=True)
     }
     return apply_effect(facts, group[0].effect, group[0].place, values)
 
@@ -308,9 +305,7 @@ def evolution(problem: Problem) -> Answer:
             return 1e6
         return float(np.mean(np.log1p(_output_error(problem, facts) ** 2)))
 
-    strategy = cma.CMAEvolutionStrategy(
-        np.zeros(len(numbers)), 0.3, {"bounds": [low, high], "seed": 1, "verbose": -9}
-    )
+    strategy = cma.CMAEvolutionStrategy(np.zeros(len(numbers)), 0.3, {"bounds": [low, high], "seed": 1, "verbose": -9})
     while not strategy.stop() and time.process_time() < problem.until:
         asked = strategy.ask()
         strategy.tell(asked, [loss(x) for x in asked])
@@ -469,9 +464,7 @@ def network(problem: Problem) -> Answer:
     features, targets = _training(problem)
     flat, wanted = features[:, :, 1:].reshape(len(features), -1), targets.reshape(len(targets), -1)
     inputs, outputs = StandardScaler().fit(flat), StandardScaler().fit(wanted)
-    model = MLPRegressor(
-        hidden_layer_sizes=(48, 48), early_stopping=True, max_iter=400, random_state=1, alpha=1e-3
-    )
+    model = MLPRegressor(hidden_layer_sizes=(48, 48), early_stopping=True, max_iter=400, random_state=1, alpha=1e-3)
     model.fit(inputs.transform(flat), outputs.transform(wanted))
     machine, n = nominal_world(problem.facts), targets.shape[1]
 
@@ -532,9 +525,7 @@ def table(rows: list[dict[str, Any]]) -> str:
             planted = share([r["right"] for r in chosen if r["planted"]])
             bare = share([r["named"] is not None for r in chosen if not r["planted"]])
             gaps = [r["closed"] for r in chosen if r["closed"] is not None]
-            cells = [
-                f"{100 * p['share']:.0f} % of {p['of']}" if p else "-" for p in (planted, bare)
-            ]
+            cells = [f"{100 * p['share']:.0f} % of {p['of']}" if p else "-" for p in (planted, bare)]
             shut = f"{np.median(gaps):.2f}" if gaps else "-"
             seconds = np.median([r["seconds"] for r in chosen])
             lines.append(f"| {method} | {kind} | {len(chosen)} | {cells[0]} | {cells[1]} | {shut} |"
@@ -544,15 +535,11 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     """Run the methods on a series and write `baselines.md`."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder of a series")
     parser.add_argument("--methods", default=",".join(METHODS))
     parser.add_argument("--only", nargs="+", metavar="ID", help="these trials")
-    parser.add_argument(
-        "--limit", type=float, default=600.0, help="processor time per method and trial [s]"
-    )
+    parser.add_argument("--limit", type=float, default=600.0, help="processor time per method and trial [s]")
     args = parser.parse_args()
     series = load_world_series(args.out)
     facts, rows = load_machine(series.machine), []

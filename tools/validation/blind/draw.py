@@ -28,8 +28,7 @@ class Planted:
         if self.name in EFFECTS:
             known = EFFECTS[self.name].parameters(machine, self.location)
             facts["parameters"] = {
-                k: {"value": v, "unit": known[k].unit, "nominal": known[k].nominal}
-                for k, v in self.parameters.items()
+                k: {"value": v, "unit": known[k].unit, "nominal": known[k].nominal} for k, v in self.parameters.items()
             }
         else:
             facts["parameters"] = {k: {"value": v} for k, v in self.parameters.items()}
@@ -42,8 +41,11 @@ def draw_value(parameter: Parameter, rng: np.random.Generator) -> float:
     The sign is random where both sides have room for the smallest deviation; the largest one ends
     where the plausible range does.
     """
-    least, most = SMALLEST * parameter.least, LARGEST * parameter.scale
-    room = {-1.0: parameter.nominal - parameter.low, 1.0: parameter.high - parameter.nominal}
+    least, most = SMALLEST * parameter.min_relevant_change, LARGEST * parameter.prior_std
+    room = {
+        -1.0: parameter.nominal - parameter.lower_bound,
+        1.0: parameter.upper_bound - parameter.nominal,
+    }
     signs = [sign for sign, space in room.items() if space >= least]
     sign = float(rng.choice(signs))
     most = min(max(most, least), room[sign])

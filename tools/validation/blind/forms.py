@@ -163,9 +163,7 @@ def _tustin(machine, facts, place, rng):
         "extra": d.coulomb[i] * log_uniform(rng, 1.0, 4.0),
         "velocity": log_uniform(rng, 0.01, 0.08),
     }
-    machine = _drives(
-        machine, i, stribeck=d.stribeck[i] + p["extra"], stribeck_velocity=p["velocity"]
-    )
+    machine = _drives(machine, i, stribeck=d.stribeck[i] + p["extra"], stribeck_velocity=p["velocity"])
     return _forms(machine, i, exponential=1.0), p
 
 

@@ -55,8 +55,7 @@ def make_trial(place: Place, series: Series) -> None:
         planted = _draw(machine, series, number, rng)
         try:
             runs = {
-                scenario.name: record(machine, scenario, planted)
-                for scenario in motions(machine, rng, series.duration)
+                scenario.name: record(machine, scenario, planted) for scenario in motions(machine, rng, series.duration)
             }
             break
         except (InputError, SimulationFailed) as error:

@@ -177,9 +177,7 @@ def plant(
             spec.joint(one.location).stiffness[0] = numbers["stiffness"]
             spec.joint(one.location).springref = numbers["rest"]
         case "payload":
-            body = spec.body(one.location).add_body(
-                name="load", pos=[numbers["x"], numbers["y"], numbers["z"]]
-            )
+            body = spec.body(one.location).add_body(name="load", pos=[numbers["x"], numbers["y"], numbers["z"]])
             body.mass, body.inertia, body.ipos = numbers["mass"], [1e-6] * 3, [0.0] * 3
             body.explicitinertial = True
         case "com_offset":
@@ -213,10 +211,7 @@ def plant(
             return (
                 sensors,
                 lambda q, v, f, t: (
-                    -legs
-                    * numbers["stribeck"]
-                    * np.exp(-((v / numbers["velocity"]) ** 2))
-                    * np.tanh(v / 0.001)
+                    -legs * numbers["stribeck"] * np.exp(-((v / numbers["velocity"]) ** 2)) * np.tanh(v / 0.001)
                 ),
             )
         case "friction_asymmetry":

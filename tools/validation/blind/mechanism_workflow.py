@@ -11,11 +11,11 @@ import dataclasses
 import json
 from pathlib import Path
 
-from hydrotele.cli.gapping import mechanism_open_loop
+from hydrotele.cli.gapping import simulate_open_loop
 from hydrotele.core.errors import InputError
 from hydrotele.gap.mechanism_find import find_mechanism_gap
 from hydrotele.gap.result import gap_document
-from hydrotele.identify.mechanism import load_mechanism, mechanism_records
+from hydrotele.identify.mechanism import load_mechanism, load_mechanism_records
 
 
 def main() -> None:
@@ -28,9 +28,9 @@ def main() -> None:
     mechanism = load_mechanism(asked.mjcf, asked.columns)
     for folder in asked.data:
         try:
-            fit, judge, said = mechanism_records([folder], mechanism, as_measured=True)
+            fit, judge, said = load_mechanism_records([folder], mechanism, keep_measured_joints=True)
             gap = find_mechanism_gap(asked.mjcf, asked.columns, fit, judge, notes=said)
-            loop = mechanism_open_loop(gap, [folder], mechanism, None)
+            loop = simulate_open_loop(gap, [folder], mechanism, None)
             document = gap_document(dataclasses.replace(gap, open_loop=loop))
         except InputError as error:
             document = {"error": str(error)}

@@ -5,7 +5,7 @@ import numpy as np
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.machine.machine import Machine
-from hydrotele.scenario.scenario import Scenario, Servo, Start, TablePilot
+from hydrotele.scenario.scenario import Scenario, Servo, StartState, TablePilot
 
 RATE = 50.0  # Hz, of controller, sensors and log
 SENSORS = "khoshzaban1992"
@@ -64,13 +64,11 @@ def motions(machine: Machine, rng: np.random.Generator, duration: float = 40.0) 
 def _scenario(machine, name, time, path, servo, seed) -> Scenario:
     joints = {machine.axes[axis].joint: float(q[0]) for axis, q in path.items()}
     columns = {axis: q.tolist() for axis, q in path.items()}
-    pilot = TablePilot(
-        kind="table", of="joint", interpolate="linear", time=time.tolist(), columns=columns
-    )
+    pilot = TablePilot(kind="table", of="joint", interpolate="linear", time=time.tolist(), columns=columns)
     return Scenario(
         name=name, machine=machine.name, tool=machine.tool, seed=seed,
         duration=len(time) / RATE, control_rate=RATE, log_rate=RATE, sensors=SENSORS,
-        ground=False, start=Start(joints=joints), pilot=pilot, servo=servo,
+        ground=False, start=StartState(joints=joints), pilot=pilot, servo=servo,
     )  # fmt: skip
 
 

@@ -17,9 +17,7 @@ from hydrotele.machine.machine import Machine
 HORIZON = 5.0  # s
 
 
-def open_loop_error(
-    machine: Machine, data: Dataset, run: RunData, horizon: float = HORIZON
-) -> dict[str, float]:
+def open_loop_error(machine: Machine, data: Dataset, run: RunData, horizon: float = HORIZON) -> dict[str, float]:
     """RMS error of predictions over a horizon, by channel, in units of one reading's noise.
 
     Windows follow each other along the run; each starts from the state that the filter of the same
@@ -51,6 +49,4 @@ def open_loop_error(
                     trail[row * steps :])  # fmt: skip
     sizes = np.abs(np.array(errors)) / data.noise
     sizes[~np.isfinite(sizes) & np.isfinite(run.reading[: len(sizes)])] = np.inf
-    return {
-        name: float(np.sqrt(np.nanmean(sizes[:, k] ** 2))) for k, name in enumerate(data.channels)
-    }
+    return {name: float(np.sqrt(np.nanmean(sizes[:, k] ** 2))) for k, name in enumerate(data.channels)}

@@ -44,9 +44,7 @@ def _at(places: tuple[str, ...] | None, **ranges: tuple[float, float]) -> Draw:
 
     def draw(machine: Machine, rng: np.random.Generator) -> tuple[str, dict[str, float]]:
         location = str(rng.choice(places or tuple(machine.hydraulic_axes)))
-        return location, {
-            name: float(np.exp(rng.uniform(*np.log(ends)))) for name, ends in ranges.items()
-        }
+        return location, {name: float(np.exp(rng.uniform(*np.log(ends)))) for name, ends in ranges.items()}
 
     return draw
 

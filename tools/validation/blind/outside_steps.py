@@ -8,7 +8,7 @@ change the actuators' numbers, activations or applied forces, and no code of the
 import math
 
 from hydrotele.hydraulics.circuit import Slot, circuit_scratch
-from hydrotele.hydraulics.laws import axis_opening, orifice
+from hydrotele.hydraulics.laws import axis_opening, orifice_flow
 from hydrotele.simulate.record import state_supply
 
 _WARM_UP = 40.0  # s
@@ -152,7 +152,7 @@ class _Chambers:
         edge = user[Slot.METERING_BT if opening > 0.0 else Slot.METERING_AT]
         drop = data.act[4 * self.i + 2 + side] - user[Slot.TANK_PRESSURE]
         gain = user[Slot.FLOW_GAIN] * edge * abs(opening)
-        return side, max(0.0, orifice(drop, gain, user[Slot.ORIFICE_SMOOTHING])[0])
+        return side, max(0.0, orifice_flow(drop, gain, user[Slot.ORIFICE_SMOOTHING])[0])
 
     def add(self, data, side: int, flow: float) -> None:
         """Let more oil [m^3/s] into a chamber over the coming step."""

@@ -11,10 +11,10 @@ from scipy.signal import lsim, lti
 from hydrotele.hydraulics.circuit import circuit_scratch
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.logs.log import Log
-from hydrotele.machine.machine import Machine, SensorError, sensor_set
+from hydrotele.machine.machine import Machine, SensorError, get_sensors
 from hydrotele.run.run import Run, run_scenario
 from hydrotele.scenario.scenario import PlantedEffect, Scenario
-from hydrotele.simulate.feedback import measure
+from hydrotele.simulate.feedback import simulate_readings
 from hydrotele.simulate.record import state_supply
 from tools.validation.blind.draw import Planted
 from tools.validation.blind.outside import OUTSIDE
@@ -50,9 +50,7 @@ def record(machine: Machine, scenario: Scenario, planted: list[Planted]) -> Reco
     """
     inside = [p for p in planted if p.name not in OUTSIDE]
     beyond = next((p for p in planted if p.name in OUTSIDE), None)
-    effects = tuple(
-        PlantedEffect(name=p.name, location=p.location, parameters=p.parameters) for p in inside
-    )
+    effects = tuple(PlantedEffect(name=p.name, location=p.location, parameters=p.parameters) for p in inside)
     scenario = scenario.model_copy(update={"effects": effects})
     disturbance = _Disturbance(machine, beyond, scenario)
     run = run_scenario(scenario, disturbance.progress)
@@ -62,7 +60,7 @@ def record(machine: Machine, scenario: Scenario, planted: list[Planted]) -> Reco
     changed = _misread(run.truth.time, channels, beyond)
     columns = dict(run.measured.columns)
     redone = {c: v for c, v in changed.items() if v is not run.truth[c]}
-    columns |= measure(machine, sensor_set(machine, scenario.sensors), scenario.seed, redone)
+    columns |= simulate_readings(machine, get_sensors(machine, scenario.sensors), scenario.seed, redone)
     readings = {c: _read(run, c, v) for c, v in changed.items() if not c.startswith("command.")}
     metadata = {k: v for k, v in run.measured.metadata.items() if k in _KEPT}
     log = dataclasses.replace(run.measured, columns=columns, metadata=metadata)

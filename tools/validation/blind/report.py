@@ -53,9 +53,7 @@ def summary_lines(scores: dict[str, Any], control: dict[str, Any]) -> list[str]:
     return [*lines, f"     with the keys swapped (must collapse): {part}"]
 
 
-def markdown(
-    series: Any, scores: dict[str, Any], control: dict[str, Any], verdicts: Sequence[Verdict]
-) -> str:
+def markdown(series: Any, scores: dict[str, Any], control: dict[str, Any], verdicts: Sequence[Verdict]) -> str:
     """The page."""
     lines = [
         "# Blind validation on the library's own simulation",

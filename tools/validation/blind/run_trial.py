@@ -51,9 +51,7 @@ def run_trial(
         _make_data(place)
     begin = time.perf_counter()
     filled = {"machine": machine, "threads": threads}
-    answer, error = ask(
-        place.data, [part.format(data="{data}", **filled) for part in workflow], limit
-    )
+    answer, error = ask(place.data, [part.format(data="{data}", **filled) for part in workflow], limit)
     result = {"trial": place.trial, "answer": answer, "error": error,
               "wall_seconds": round(time.perf_counter() - begin, 2)}  # fmt: skip
     write_json(place.result, result)
@@ -67,9 +65,7 @@ def _make_data(place: Place) -> None:
         raise InputError(f"trial {place.trial}", f"no data: {done.stderr[-2000:]}")
 
 
-def ask(
-    data: Path, workflow: Sequence[str], limit: float
-) -> tuple[dict[str, Any] | None, str | None]:
+def ask(data: Path, workflow: Sequence[str], limit: float) -> tuple[dict[str, Any] | None, str | None]:
     """Let the workflow answer, from a read-only copy of the logs in an unnamed folder.
 
     That folder takes the place of `{data}` in the command. The workflow sees neither the key's nor

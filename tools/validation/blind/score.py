@@ -54,10 +54,7 @@ def swapped(keys: dict[str, Document], results: dict[str, Document]) -> list[Ver
     order = sorted(results, key=lambda trial: truths[trial])
     listed = list(truths.values())
     shift = max((listed.count(text) for text in listed), default=0)
-    return [
-        judge(keys[order[(k + shift) % len(order)]], results[trial])
-        for k, trial in enumerate(order)
-    ]
+    return [judge(keys[order[(k + shift) % len(order)]], results[trial]) for k, trial in enumerate(order)]
 
 
 def share(flags: Sequence[bool]) -> dict[str, Any] | None:

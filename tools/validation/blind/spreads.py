@@ -180,7 +180,7 @@ def draw_library_effect(machine: Machine, rng: Rng, but: tuple[str, ...] = ()) -
     values = SIZES[name](machine, place, rng)
     known = EFFECTS[name].parameters(machine, place)
     return name, place, {
-        k: float(np.clip(v, known[k].low, known[k].high)) for k, v in values.items()
+        k: float(np.clip(v, known[k].lower_bound, known[k].upper_bound)) for k, v in values.items()
     }  # fmt: skip
 
 
@@ -233,8 +233,7 @@ def off_everywhere(machine: Machine, rng: Rng) -> tuple[Machine, dict[str, tuple
                 update[key] = tuple(part * ratio for part in item)
             elif key in OFF and isinstance(item, tuple):
                 update[key] = tuple(
-                    v if _idle(here, k) else wrong(f"{here}.{k}", key, v)
-                    for k, v in zip("xyz", item, strict=True)
+                    v if _idle(here, k) else wrong(f"{here}.{k}", key, v) for k, v in zip("xyz", item, strict=True)
                 )
             elif key in OFF and isinstance(item, float | int):
                 update[key] = wrong(here, key, float(item))

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from hydrotele.core.errors import InputError
-from hydrotele.core.output import replacing
+from hydrotele.core.output import atomic_file
 
 CLASSES = ("single", "double", "clean", "outside")
 
@@ -75,7 +75,7 @@ class Place:
 def write_json(path: Path, document) -> None:
     """Write strict JSON, whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path, ".json") as part:
+    with atomic_file(path, ".json") as part:
         part.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 

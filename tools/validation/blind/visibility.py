@@ -11,10 +11,10 @@ import mujoco
 import numpy as np
 
 from hydrotele.logs.log import Log
-from hydrotele.machine.machine import Machine, SensorError, noise_rms, sensor_set
+from hydrotele.machine.machine import Machine, SensorError, get_sensors, noise_rms
 from hydrotele.simulate.mechanism import flexible_axes
 from hydrotele.simulate.plant import Plant, build_plant, initial_state
-from hydrotele.simulate.record import Recorder, begin_leapfrog, true_channels
+from hydrotele.simulate.record import Recorder, start_leapfrog, true_channels
 from hydrotele.simulate.stepping import delayed_commands
 from tools.validation.blind.plant import Recorded, shown
 
@@ -50,7 +50,7 @@ def visibility(model: Machine, runs: dict[str, Recorded]) -> dict[str, Any]:
 
 def _differences(plant: Plant, run: Recorded) -> dict[str, np.ndarray]:
     machine = plant.machine
-    sensors = sensor_set(machine, run.log.metadata["sensors"])
+    sensors = get_sensors(machine, run.log.metadata["sensors"])
     predicted = _restarted(plant, run.truth, np.column_stack(
         [run.log[f"command.{axis}"] for axis in plant.axes]
     ))  # fmt: skip
@@ -85,12 +85,12 @@ def _restarted(plant: Plant, truth: Log, commands: np.ndarray) -> dict[str, np.n
     for row in range(len(commands)):
         if row % every == 0:
             data = initial_state(plant, _state(plant, truth, row))
-            begin_leapfrog(plant.model, data)
-        recorder.take(row, truth.time[row], data)
+            start_leapfrog(plant.model, data)
+        recorder.record_state(row, truth.time[row], data)
         for control in controls[row]:
             data.ctrl[:] = control
             mujoco.mj_step(plant.model, data)
-    return true_channels(plant, recorder.record())[0]
+    return true_channels(plant, recorder.to_record())[0]
 
 
 def _state(plant: Plant, truth: Log, row: int) -> dict[str, Any]:

@@ -139,9 +139,7 @@ def judge_world(key: Document, result: Document) -> Outcome:
     )  # fmt: skip
 
 
-def closed(
-    before: float | None, after: float | None, floor: float | None, clear: float = _CLEAR
-) -> float | None:
+def closed(before: float | None, after: float | None, floor: float | None, clear: float = _CLEAR) -> float | None:
     """Share of a gap that is closed, in mean squares above the floor; None where there is no gap.
 
     A model that got worse has a negative share; one that diverged, -1.

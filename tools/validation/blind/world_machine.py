@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from hydrotele.machine.machine import Machine as Facts
-from hydrotele.machine.machine import SensorError, SensorSet, channel_sensor, converter
+from hydrotele.machine.machine import SensorError, SensorSet, channel_converter, channel_sensor
 from tools.validation.blind.world import Added, Drives, Forms, Machine, Mechanism, Sensors
 
 
@@ -59,7 +59,7 @@ def stated_errors(facts: Facts, sensors: SensorSet) -> tuple[np.ndarray, np.ndar
     """Bound of the uniform error and converter step of every channel, (c,) each."""
     names = channels(facts)
     kinds = [channel_sensor(facts, sensors, name) for name in names]
-    steps = [converter(s, name).step for s, name in zip(kinds, names, strict=True)]
+    steps = [channel_converter(s, name).step for s, name in zip(kinds, names, strict=True)]
     return np.array([s.accuracy for s in kinds]), np.array(steps)
 
 
@@ -167,9 +167,7 @@ def _with_transmissions(facts: Facts, forms: Forms) -> Forms:
         if (t := axis.transmission) is None:
             continue
         if axis.cylinder:
-            raise ValueError(
-                "the independent machine has no spring between a cylinder and its link"
-            )
+            raise ValueError("the independent machine has no spring between a cylinder and its link")
         columns["drive_inertia"][i], columns["gap"][i] = t.inertia, t.backlash
         columns["contact"][i] = t.stiffness
         # Hunt and Crossley's factor that takes a tap of 0.05 rad/s as the linear damper does
@@ -181,7 +179,7 @@ def _with_transmissions(facts: Facts, forms: Forms) -> Forms:
 def _sensors(facts: Facts, sensors: SensorSet) -> Sensors:
     names = channels(facts)
     errors = [facts.sensor_errors.get(name, SensorError()) for name in names]
-    converters = [converter(channel_sensor(facts, sensors, name), name) for name in names]
+    converters = [channel_converter(channel_sensor(facts, sensors, name), name) for name in names]
     return Sensors(
         scale=np.array([e.scale for e in errors]),
         offset=np.array([e.offset for e in errors]),

@@ -9,7 +9,7 @@ from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.logs.log import Log
 from hydrotele.machine import signals
 from hydrotele.machine.machine import Machine as Facts
-from hydrotele.machine.machine import noise_rms, sensor_set
+from hydrotele.machine.machine import get_sensors, noise_rms
 from tools.validation.blind.motions import RATE, motions
 from tools.validation.blind.world import (
     PA,
@@ -101,7 +101,7 @@ class WorldRun:
 
 
 def _sensors(facts: Facts):
-    found = sensor_set(facts, SENSORS[facts.name])
+    found = get_sensors(facts, SENSORS[facts.name])
     assert found
     return found
 
@@ -248,7 +248,7 @@ def _log(model: Facts, reference: Reference, commands, readings) -> Log:
     return Log(
         time=reference.period * np.arange(len(commands)),
         columns=dict(zip(names, values, strict=True)),
-        units={name: signals.usual_unit(name, names) for name in names},
+        units={name: signals.default_unit(name, names) for name in names},
         metadata=metadata,
     )
 

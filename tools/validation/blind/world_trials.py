@@ -231,7 +231,7 @@ def refuse_uncertain(model: Facts, drawn: Drawn) -> None:
         name, place = part["name"], part["location"]
         values = truth.get(f"{name}({place})", {})
         known = [uncertain.get((name, place, key)) for key in part["parameters"]]
-        if all(p and key in values and abs(values[key] - p.nominal) < _APART * p.scale
+        if all(p and key in values and abs(values[key] - p.nominal) < _APART * p.prior_std
                for key, p in zip(part["parameters"], known, strict=True)):  # fmt: skip
             raise InputError("trial", f"{name} of {place} is within what its numbers may be off by")
 
