@@ -211,7 +211,8 @@ def spring_table() -> list[str]:
                 lines.append(
                     f"| {gains} | {axis} | {name} | {one.damping:g} | {one.mass:g} |"
                     f" {one.min_stiffness:g} | {one.max_stiffness:g}"
-                    f" | {one.theorem_margin:.0f} | {one.theorem_damping:.0f} | {one.half_swing_growth:.2f} | {one.min_stable_damping:.0f} | {one.stability_criterion} |"
+                    f" | {one.theorem_margin:.0f} | {one.theorem_damping:.0f}"
+                    f" | {one.half_swing_growth:.2f} | {one.min_stable_damping:.0f} | {one.stability_criterion} |"
                 )
     return lines
 
