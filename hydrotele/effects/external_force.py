@@ -52,11 +52,11 @@ def _pulse_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     second is detectable. A pulse without amplitude has no time: see `_PULSE_START_S`.
     """
 
-    def present(parameter: str, absent: float) -> float:
+    def present_value(parameter: str, absent: float) -> float:
         return term_parameter(machine, FORCE_PULSE, location, "force", parameter, absent)
 
-    size, whole = present("size", 0.0), max_drive_force(machine, location)
-    start, duration = present("start", _PULSE_START_S), present("duration", _PULSE_DURATION_S)
+    size, whole = present_value("size", 0.0), max_drive_force(machine, location)
+    start, duration = present_value("start", _PULSE_START_S), present_value("duration", _PULSE_DURATION_S)
     return {
         "size": Parameter(
             force_unit(machine, location), size, size - 2.0 * whole, size + 2.0 * whole,

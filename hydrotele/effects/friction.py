@@ -137,13 +137,13 @@ def _bump_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     travel.
     """
 
-    def present(parameter: str, absent: float) -> float:
+    def present_value(parameter: str, absent: float) -> float:
         return term_parameter(machine, POSITION_FRICTION, location, "force", parameter, absent)
 
     low, high = _position_range(machine, location)
     span, whole = high - low, max_drive_force(machine, location)
-    coulomb, centre = present("coulomb", 0.0), present("centre", low + 0.5 * span)
-    width = present("width", 0.1 * span)
+    coulomb, centre = present_value("coulomb", 0.0), present_value("centre", low + 0.5 * span)
+    width = present_value("width", 0.1 * span)
     unit = "m" if force_unit(machine, location) == "N" else "rad"
     return {
         "coulomb": Parameter(

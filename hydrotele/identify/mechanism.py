@@ -286,7 +286,7 @@ def _build_record(
                  f" {1.0 / period:.4g} Hz.",)  # fmt: skip
     ticks = time[0] + period * np.arange(round((time[-1] - time[0]) / period) + 1)
 
-    def spread(values: np.ndarray | None) -> np.ndarray:
+    def interpolate_values(values: np.ndarray | None) -> np.ndarray:
         if values is None:
             return np.full(len(ticks), np.nan)
         known = np.isfinite(values[clock.row])
@@ -311,8 +311,8 @@ def _build_record(
                 log.source, f"has no column for the position of {joint}: name it in the mapping, as"
                 f" `position: {{{joint}: COLUMN}}`",
             )  # fmt: skip
-        position.append(spread(values))
-    force = [spread(values_of("force", drive)) for drive in chain.drives]
+        position.append(interpolate_values(values))
+    force = [interpolate_values(values_of("force", drive)) for drive in chain.drives]
     if not np.isfinite(force).any():
         raise InputError(
             log.source, "has no column of a drive force: name the columns in the mapping, as"

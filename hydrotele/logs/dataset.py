@@ -599,7 +599,7 @@ def downsample(data: Dataset) -> Dataset:
     bandwidths = [a.valve.bandwidth / (2.0 * np.pi) for a in data.machine.axes.values() if a.valve]
     rate = max(_MIN_RATE, _ROWS_PER_CYCLE * max(bandwidths, default=0.0))
 
-    def thin(run: RunData) -> RunData:
+    def downsample_run(run: RunData) -> RunData:
         if run.period * rate > 0.75 or len(run.command) * run.period < _MIN_DOWNSAMPLED_SECONDS:
             return run
         valid = np.ones(len(run.command), bool) if run.valid is None else run.valid
@@ -612,8 +612,8 @@ def downsample(data: Dataset) -> Dataset:
             reading=rows.reading, valid=rows.valid, readings_per_mean=behind,
         )  # fmt: skip
 
-    fit = tuple(map(thin, data.fit))
-    return dataclasses.replace(data, fit=fit, heldout=thin(data.heldout))
+    fit = tuple(map(downsample_run, data.fit))
+    return dataclasses.replace(data, fit=fit, heldout=downsample_run(data.heldout))
 
 
 def find_exciting_segment(run: RunData, rows: int) -> slice:

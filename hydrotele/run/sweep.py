@@ -595,7 +595,7 @@ def run_sweep(
         base.machine_copies.check_sendable("--dask")
     with sweep_folder(target, base, checked, sweep_settings.fresh):
         with closing(Journal(target / JOURNAL)) as journal:
-            missing = _missing(base, journal, sweep_settings.retry_failed)
+            missing = _find_missing_runs(base, journal, sweep_settings.retry_failed)
             _execute_runs(base, target, journal, missing, sweep_settings, checked, progress)
         entries = {run: journal.entries[run] for run in sorted(journal.entries)}
         failures = [entry for entry in entries.values() if entry.status == FAILED]
@@ -607,7 +607,7 @@ def run_sweep(
     return SweepResult(table, failures, len(missing))
 
 
-def _missing(base: SweepBase, journal: Journal, retry_failed: bool) -> dict[int, Point]:
+def _find_missing_runs(base: SweepBase, journal: Journal, retry_failed: bool) -> dict[int, Point]:
     """Return the runs to execute, by number."""
     if retry_failed:
         done = {run for run, entry in journal.entries.items() if entry.status == OK}

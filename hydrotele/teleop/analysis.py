@@ -112,10 +112,10 @@ class TeleoperatorAxis:
 
 
 def _scale_block(block: Block, factor: float) -> Block:
-    def scaled(s: np.ndarray) -> np.ndarray:
+    def evaluate_scaled(s: np.ndarray) -> np.ndarray:
         return factor * block(s)
 
-    return scaled
+    return evaluate_scaled
 
 
 DEFAULT_CASE_FILE = Path(__file__).resolve().with_name("cat215_axis.yaml")

@@ -56,7 +56,7 @@ IDIOMS = {
     r"unknown inputs?": "residual inputs",
     r"by far": "state the ratio",
 }  # fmt: skip
-"""Idiom as a regular expression -> the term to use instead. docs/contributing names the reasons."""
+"""Idiom as a regular expression -> the term to use instead."""
 
 LONE_WORDS = frozenset(
     """able absent ahead alike alive allowed alone along apart around aside asked bad begun behind
@@ -67,7 +67,7 @@ LONE_WORDS = frozenset(
     holds idle inside joined judged just kept known lacking last late latest lean learned least
     left less like likely little loaded long loose lost loud low made many masked mended merged
     missing mistaken more most moved moving much named near nearest needed never new newest next
-    none nothing off old once one only open opened other others ours out outer outside over own
+    none nothing off old once one only opened other others ours out outer outside over own
     past placed plain pressed quick ranked rare rated rather reached ready really refined refused
     released renamed replaced rest returned rough same seen sent several shaken shaped shown side
     slow small smallest smoothed soft some soon spoken spread stacked standing started steady steep
@@ -79,8 +79,8 @@ LONE_WORDS = frozenset(
 )
 """Words that say nothing as the whole name of a function or class."""
 SUFFIXES = ("ed", "ly", "est")
-"""Endings of participles, adverbs and superlatives; words of `NOUNS` end alike."""
-NOUNS = frozenset("bed feed need seed speed supply assembly family request reply test rest".split())
+"""Endings of participles, adverbs and superlatives; nouns and verbs of `NOUNS` end alike."""
+NOUNS = frozenset("apply assembly bed digest family feed need reply request rest seed speed supply test".split())
 
 HISTORY = re.compile(
     r"\b(?=[0-9a-f]*[0-9])(?=[0-9a-f]*[a-f])[0-9a-f]{7}\b|was tried|ways? tried|slow host"
@@ -89,7 +89,9 @@ HISTORY = re.compile(
 )
 _PHRASE = re.compile("|".join(rf"(?P<i{k}>\b(?:{p})\b)" for k, p in enumerate(IDIOMS)), re.I)
 _CODE = re.compile(r"`[^`]*`")
-_SENTENCE_END = re.compile(r"(?<=[.!?])\s+(?=[A-Z`])")
+_TEMPLATE_CODE = re.compile(r"\{%.*?%\}|\{\{.*?\}\}|\{#.*?#\}", re.S)
+_SENTENCE_END = re.compile(r"(?<=[.!?:;])[*\"]*\s+(?=[A-Z`\[*a-z0-9(+-])")
+"""A list after a colon or semicolon counts as a sentence."""
 
 
 class Finding(NamedTuple):
@@ -195,7 +197,8 @@ def find_all(root: Path = ROOT) -> list[Finding]:
         elif file.suffix == ".md":
             found += check_page(path, text)
         else:
-            found += check_text(path, 1, "message", text)
+            plain = _TEMPLATE_CODE.sub(lambda code: "\n" * code[0].count("\n"), text)
+            found += check_text(path, 1, "message", plain)
     return found
 
 

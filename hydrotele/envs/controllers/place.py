@@ -56,11 +56,11 @@ def move_fraction(time: np.ndarray, length: np.ndarray, ramp: np.ndarray) -> np.
         spectrum is zero at the frequency 1 / `ramp`.
     """
 
-    def gone(t):
+    def travelled_distance(t):
         part = np.clip(t / length, 0.0, 1.0)
         return 0.5 * length * part**2 + np.maximum(0.0, t - length)
 
-    return (gone(time) - gone(time - ramp)) / ramp
+    return (travelled_distance(time) - travelled_distance(time - ramp)) / ramp
 
 
 def _wrap_angle(angle: np.ndarray, period: float) -> np.ndarray:
