@@ -87,7 +87,7 @@ def test_all_runs_and_their_mean(site):
     ("more", "said"),
     [
         (("--horizons", "1,x"), "positive numbers"),
-        (("--horizons", "0.001"), "one row"),
+        (("--horizons", "0.001"), "at least 0.02 s, the log's sample period"),
         (("--baseline", "tables"), "table"),
         (("cat215",), "axes"),
         (("--heldout", "test_9"), "test_1"),

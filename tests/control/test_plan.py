@@ -267,5 +267,5 @@ def test_closed_valves_are_not_held_by_the_servo():
     assert not plan.command.any()
     with pytest.raises(InputError, match="did you mean 'boom'"):
         plan_of({**pilot, "closed_valves": ["bom"]})
-    with pytest.raises(ValueError, match="stick has a reference"):
+    with pytest.raises(ValueError, match="stick also has a reference"):
         plan_of({**pilot, "closed_valves": ["stick"]})

@@ -143,7 +143,7 @@ def test_command_writes_table_report_and_figures(monkeypatch, tmp_path):
     result = CliRunner().invoke(app, asked)
     assert result.exit_code == 0 and "1 agree, 0 differ" in result.stdout
     table = (folder / "table.md").read_text()
-    for words in ("2 m", "agrees", "cannot be computed | no text", "built from", "photograph"):
+    for words in ("2 m", "agrees", "cannot be computed | no text", "inputs of the model", "photograph"):
         assert words in table
     report = (folder / "report.html").read_text()
     assert "data:image/png" in report and "photograph" in report and "no text" in report

@@ -65,7 +65,7 @@ def test_without_a_patch_there_is_none(tmp_path, gap_of, heldout):
     found = _read(tmp_path / "gap.rrd")
     assert not any(entity.startswith(("/patched", "/residual/patched")) for entity, _ in found)
     ((text,),) = found["/gap/text", False]["TextLog:text"].to_pylist()
-    assert "no window" in text
+    assert "the model has no significant errors" in text
 
 
 def test_missing_readings_are_left_out(tmp_path, gap_of, heldout):

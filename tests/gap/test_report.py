@@ -105,7 +105,7 @@ def test_numbers_appear(named, gap_of):
 def test_no_gap_has_no_patch_and_shows_one_model(page_of):
     page, _ = page_of("no_gap", rastered=False)
     assert "Model and machine agree" in page.text and "patched/" not in page.text
-    assert "Identified effects" not in page.text
+    assert "Effects that explain the difference" not in page.text
 
 
 def test_an_unknown_has_its_section(page_of):

@@ -88,7 +88,7 @@ def test_a_joystick_without_the_stops_at_its_coils_is_refused(tmp_path):
     text = (tmp_path / "joystick.xml").read_text()
     lines = [line for line in text.splitlines() if 'name="gap_x_low"' not in line]
     (tmp_path / "joystick.xml").write_text("\n".join(lines))
-    with pytest.raises(InputError, match="has no geoms gap_x_low, which are the stops"):
+    with pytest.raises(InputError, match="has no geoms gap_x_low, which are the end stops"):
         joystick_spec(load_joystick(tmp_path))
 
 

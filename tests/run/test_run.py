@@ -197,7 +197,7 @@ def test_table_of_a_log_that_starts_late_starts_at_once(tmp_path):
         ("time,angle.boom\n0,0\n0.1,0\n0.2,0\n", r"t\.csv has no command\.<axis>; it has angle"),
         ("time,command.boom\n0,0\n0.1,nan\n0.2,0\n", "t.csv, column 'command.boom', row 1"),
         ("time,command.boom\n0,0\n0.1,5\n0.2,0\n", "percent"),
-        ("time,command.bom\n0,0\n0.1,0\n0.2,0\n", "'bom' is no axis.*'boom'"),
+        ("time,command.bom\n0,0\n0.1,0\n0.2,0\n", "'bom' is not an axis.*'boom'"),
         ("time,command.boom\n0,0\n", "too short"),
         ("", "is empty"),
     ],

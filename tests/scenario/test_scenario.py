@@ -384,7 +384,7 @@ REFUSED = {
     ),
     "effect_parameter": (
         {"effects": [{"name": "payload", "parameters": {"mas": 3}}]},
-        "has the parameters mass; .mas. is none",
+        "has the parameters mass; .mas. is not one of them",
     ),
     "effect_out_of_range": (
         {"effects": [{"name": "payload", "parameters": {"mass": -3}}]}, "-3.* is outside 0",
@@ -419,7 +419,7 @@ REFUSED = {
     "no_table": ({"pilot": {"kind": "table"}}, "either columns"),
     "two_tables": ({"pilot": TABLE | {"file": "a.csv"}}, "either columns"),
     "no_file": ({"pilot": {"kind": "table", "file": "a.csv"}}, r":\d+: pilot\.file: .*not a file"),
-    "command": ({"pilot": {"kind": "constant", "commands": {"boom": 3}}}, "boom with 3.*-1 .. 1"),
+    "command": ({"pilot": {"kind": "constant", "commands": {"boom": 3}}}, "command of boom is 3.*-1 .. 1"),
     "command_nan": ({"pilot": {"kind": "constant", "commands": {"boom": NAN}}}, "finite"),
     "command_volts": (
         {"machine": "emps", "tool": None,

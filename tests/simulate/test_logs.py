@@ -127,7 +127,7 @@ def test_a_log_needs_a_grab_with_a_pocket():
     with pytest.raises(InputError, match="no axis 'clew'; did you mean 'claw'") as error:
         prepare(scenario)
     assert error.value.where == "surroundings.0.grab"
-    with pytest.raises(InputError, match="no box site 'grapple_pocket'"):
+    with pytest.raises(InputError, match="needs a box site 'grapple_pocket'"):
         prepare(lowered(grab="grapple"))
     with pytest.raises(InputError, match="0.9 m does not fit between jaws 0.7 m apart"):
         prepare(lowered(diameter=0.9))

@@ -148,7 +148,7 @@ def test_every_structure_has_a_margin(reflection, mode):
         ("four_channel", "rate", "observed hand force.*--structure four_channel_rate"),
         ("wave_variables", "position", "as received energy.*--structure wave_variables --robust"),
         ("passivity_control", "position", "--structure passivity_control --robust"),
-        ("impedance", "rate", "identified and changes; .*direct_force"),
+        ("impedance", "rate", "identified online and changes; .*direct_force"),
     ],
 )
 def test_structures_without_a_linear_case_say_why_and_what_to_do(reflection, mode, message):
