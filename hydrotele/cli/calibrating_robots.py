@@ -504,8 +504,8 @@ CRITERIA = ("D", "O1", "O2", "O3", "O4", "O5")
 CANDIDATES = 200  # number of random poses from which the most informative are selected
 SENSOR_NOISE = {
     "leg": 1e-5,
-    "slide": 1e-5,
-    "turn": 2e-5,
+    "prismatic": 1e-5,
+    "revolute": 2e-5,
     "wire": 2e-5,
 }  # m, rad: models/iwr/README.md
 SEARCH_BOX_SIGMAS = 8.0  # half width of the search box, in expected sizes of the manufacturing errors

@@ -168,7 +168,7 @@ class Table(NamedTuple):
     def law(self, entries: np.ndarray) -> dict[str, Any]:
         """Law, parameters, variables and window of a term with some entries (K,)."""
         plain, points = [v.partition(".")[0] for v in self.variables], self.points
-        where = {"of": self.of, "window": self.window or None}
+        where = {"variables_from": self.of, "window": self.window or None}
         where |= self.memory.facts if self.memory else {}
         if len(plain) == 1:
             table = {"variable": plain[0], "points": points[0], "values": tuple(entries.tolist())}

@@ -633,8 +633,8 @@ class Term(StrictModel):
     - `balance`: `force` (on the drive [N] or [N m]), `flow_head` or `flow_rod` (into a chamber
       [m^3/s]), `command` (to valve or drive [1] or [V]) or `flow_supply` (flow of the shared pump,
       which follows with a time constant of 20 ms [m^3/s]).
-    - `of`: variables taken from another drive; with `{velocity: swing}` the variable `velocity` of
-      the law is that of the swing.
+    - `variables_from`: variables taken from another drive; with `{velocity: swing}` the variable
+      `velocity` of the law is that of the swing.
     - `domain`: variable -> range to which it is clipped.
     - `window`: start and stop time between which the term is active [s], each with a ramp of 0.1 s.
     - `play`, `switch`: hysteresis of the term, in a machine with hydraulic axes.
@@ -642,12 +642,14 @@ class Term(StrictModel):
     - `source`: file or plug-in that defines the law; empty for laws of hydrotele.
     """
 
+    renamed = {"of": "variables_from"}
+
     name: Name
     axis: Name
     balance: Balance
     law: str
     parameters: Mapping[str, Value] = {}
-    of: dict[str, Name] = {}
+    variables_from: dict[str, Name] = {}
     domain: dict[str, tuple[float, float]] = {}
     window: tuple[float, float] | None = None
     play: Play | None = None
@@ -666,10 +668,11 @@ class Term(StrictModel):
             )
         if self.law not in LAWS:
             raise ValueError(f"law {self.law!r} is not known; {suggest_valid_name(self.law, LAWS)}")
-        for variable in self.of:
+        for variable in self.variables_from:
             if variable not in DRIVE_VARIABLES:
                 raise ValueError(
-                    f"of: {variable!r} is not a variable of a drive; {suggest_valid_name(variable, DRIVE_VARIABLES)}"
+                    f"variables_from: {variable!r} is not a variable of a drive;"
+                    f" {suggest_valid_name(variable, DRIVE_VARIABLES)}"
                 )
         for variable, (low, high) in self.domain.items():
             if variable not in VARIABLES:

@@ -36,7 +36,7 @@ def site(tmp_path_factory):
         time = np.arange(600) / 50.0
         volts = 2.0 * np.sin((4.0 + 0.3 * k) * time) + 0.15  # stays clear of the end stops
         pilot = {
-            "kind": "table", "of": "command", "interpolate": "hold", "time": time.tolist(),
+            "kind": "table", "quantity": "command", "interpolate": "hold", "time": time.tolist(),
             "columns": {"slide": volts.tolist()},
         }  # fmt: skip
         name_, place, parameters = ASYMMETRY

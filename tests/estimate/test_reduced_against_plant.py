@@ -102,7 +102,7 @@ def scenario(name, axes, effects, timestep, size=0.4, shape=np.sin):
         "timestep": timestep,
         "pilot": {
             "kind": "table",
-            "of": "command",
+            "quantity": "command",
             "interpolate": "hold",
             "time": time.tolist(),
             "columns": columns,
@@ -267,7 +267,7 @@ def test_terms_with_variables_of_another_drive(machine_of, reduced_of, tmp_path)
          {"velocity": "swing"}),
     )  # fmt: skip
     terms = tuple(
-        Term(name="t", axis=axis, balance=balance, law="formula", parameters=law, of=of)
+        Term(name="t", axis=axis, balance=balance, law="formula", parameters=law, variables_from=of)
         for axis, balance, law, of in laws
     )
     plan = scenario("cat215/none", nominal.axes, (), 1.25e-4)
@@ -298,7 +298,7 @@ def test_terms_with_a_memory(machine_of, reduced_of, tmp_path):
     terms = tuple(
         Term.model_validate({
             "name": "t", "axis": axis, "balance": balance, "law": "formula", "parameters": law,
-            "of": of, **memory,
+            "variables_from": of, **memory,
         })
         for axis, balance, law, of, memory in laws
     )  # fmt: skip

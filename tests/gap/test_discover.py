@@ -66,7 +66,7 @@ def data(tmp_path_factory):
         scenario = Scenario(
             name=f"run_{seed}", machine=str(path), control_rate=100, log_rate=100, seed=seed,
             duration=SECONDS, sensors="laboratory", ground=False,
-            pilot={"kind": "table", "of": "command", "interpolate": "hold", "time": time.tolist(),
+            pilot={"kind": "table", "quantity": "command", "interpolate": "hold", "time": time.tolist(),
                    "columns": {"slide": np.where(time > 0.2, waves, 0.0).tolist()}},
         )  # fmt: skip
         save_log(run_scenario(scenario).measured, logs / f"run_{seed}.parquet")

@@ -437,7 +437,7 @@ REFUSED = {
         "the reference of boom is 2 at .* its joint range is",
     ),
     "reference_table": (
-        {"pilot": TABLE | {"of": "joint", "columns": {"boom": [0.45, 2.0]}}},
+        {"pilot": TABLE | {"quantity": "joint", "columns": {"boom": [0.45, 2.0]}}},
         "the reference of boom is 2",
     ),
 }  # fmt: skip
@@ -517,7 +517,7 @@ def pilots(draw, axes, arm):
         of = draw(st.sampled_from(["command", "joint"]))
         columns = {a: [draw(inside[a] if of == "joint" else numbers) for _ in time] for a in some}
         mode = draw(st.sampled_from(["hold", "linear"]))
-        return {"kind": kind, "of": of, "interpolate": mode, "time": time, "columns": columns}
+        return {"kind": kind, "quantity": of, "interpolate": mode, "time": time, "columns": columns}
     if kind == "fourier":
         waves = {}
         for a in some:

@@ -140,7 +140,7 @@ def test_a_log_needs_ground():
 
 @pytest.mark.parametrize(
     ("log", "message"),
-    [({"open": 1.3}, "must not exceed closed"), ({"length": 0.5}, "at least twice the diameter")],
+    [({"open_angle": 1.3}, "must not exceed closed_angle"), ({"length": 0.5}, "at least twice the diameter")],
 )
 def test_impossible_logs_are_refused(log, message):
     with pytest.raises(ValueError, match=message):

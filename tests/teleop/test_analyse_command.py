@@ -108,7 +108,7 @@ def test_wrong_words(words, message):
 
 def test_the_shipped_case_has_its_joystick_from_the_thesis():
     facts = load_teleop_case()
-    assert facts.stiffness and facts.master_control.stiffness == facts.stiffness.nominal
+    assert facts.stiffness and facts.master_control.stiffness == facts.stiffness.nominal_stiffness
     assert facts.structures == STRUCTURES
     assert facts.stiffness.mass == facts.master.mass
 

@@ -181,21 +181,21 @@ def test_with_a_window_a_term_acts_for_a_while():
 
 def test_a_law_may_see_variables_of_another_drive():
     law_ = ("formula", {"velocity": 1.0, "pressure_rod": 1e-6, "position": 10.0})
-    term = force_term(*law_, of={"velocity": "b", "pressure_rod": "b"}, domain={"velocity": (0, 2)})
+    term = force_term(*law_, variables_from={"velocity": "b", "pressure_rod": "b"}, domain={"velocity": (0, 2)})
     drives = Drives(2, np.arange(8.0) * 1e6, np.array([0.1, 0.2]), np.array([-0.3, 0.5]), np.zeros(2))
     table = terms_table([term], ["a", "b"])
     assert sum_terms(table, FORCE, 0, STATE, drives) == pytest.approx(0.5 + 7.0 + 4.3)
     faster = drives._replace(velocity=np.array([0.0, 3.0]))
     assert sum_terms(table, FORCE, 0, STATE, faster) == pytest.approx(2.0 + 7.0 + 4.3)
     assert sum_terms_with_slope(table, FORCE, 0, STATE, drives)[1] == 0.0, "not its own velocity"
-    lone = force_term(*law_, of={"velocity": "b"})
+    lone = force_term(*law_, variables_from={"velocity": "b"})
     assert sum_terms(terms_table([lone], ["a", "b"]), FORCE, 0, STATE, NO_DRIVES) == 4.0 + 4.3
-    with pytest.raises(ValidationError, match="of: 'time'"):
-        force_term(*law_, of={"time": "b"})
+    with pytest.raises(ValidationError, match="variables_from: 'time'"):
+        force_term(*law_, variables_from={"time": "b"})
 
 
 def test_a_law_may_see_the_force_of_another_drive():
-    term = force_term("formula", {"force": 2.0}, of={"force": "b"})
+    term = force_term("formula", {"force": 2.0}, variables_from={"force": "b"})
     act = np.array([0.0, 0.0, 9e6, 9e6, 0.0, 0.0, 3e6, 1e6])
     drives = Drives(2, act, np.zeros(2), np.zeros(2), np.zeros(2))
     table = terms_table([term], ["a", "b"], areas={"a": (1.0, 1.0), "b": (0.01, 0.006)})
