@@ -388,7 +388,7 @@ def drive_scenario(
     while session.tick % session.ticks_per_row:  # the logs hold whole rows
         session.advance()
     run = finish_run(session, hand.recorded_scenario(session.scenario, session.time))
-    run.summary.update(late_seconds=round(pacer.total_delay, 3), pauses=pacer.pauses)
+    run.summary.update(paused_seconds=round(pacer.total_delay, 3), pauses=pacer.pauses)
     if haptic:
         run.summary["haptic"] = seen
     return run

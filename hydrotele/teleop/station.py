@@ -368,13 +368,13 @@ class TeleoperationSystem:
         handle, energy = np.abs(self.log.master("handle")), self._m.energy
         return {
             "handle_energy_J": float(energy[0]),
-            "handle_least_energy_J": float(energy[1]),
-            "largest_handle_displacement_m": float(handle[:, :3].max()),
-            "largest_handle_rotation_rad": float(handle[:, 3:].max()),
-            "largest_coil_current_A": float(np.abs(self.log.master("currents")).max()),
-            "largest_coil_heat": self._flotor.max_heat,
+            "min_handle_energy_J": float(energy[1]),
+            "max_handle_displacement_m": float(handle[:, :3].max()),
+            "max_handle_rotation_rad": float(handle[:, 3:].max()),
+            "max_coil_current_A": float(np.abs(self.log.master("currents")).max()),
+            "max_coil_heat": self._flotor.max_heat,
             "periods_with_limited_currents": int((self.log.master("limited") < 1.0).sum()),
-            "largest_tip_force_N": float(np.abs(self.log.force[:, [0, 2]]).max()),
+            "max_tip_force_N": float(np.abs(self.log.force[:, [0, 2]]).max()),
             "tripped": self.valves_closed,
         }
 

@@ -58,7 +58,7 @@ def test_the_patched_machine_is_better_in_json_table_and_folder(site):
     code, stdout, stderr = invoke(*words, "--json")
     assert code == 0, stderr
     found = json.loads(stdout)
-    assert found["judged"] == ["test_1"] and found["fitted"] == ["fit_1", "fit_2"]
+    assert found["evaluated_runs"] == ["test_1"] and found["fitted_runs"] == ["fit_1", "fit_2"]
     nominal, patched, table = found["models"]
     assert (nominal["kind"], patched["name"], table["kind"]) == ("machine", str(gap), "baseline")
     for horizon in ("1", "5", "end"):  # 60 s do not fit into 12 s

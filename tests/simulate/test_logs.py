@@ -101,7 +101,7 @@ def test_pick_log_puts_it_down_where_it_should():
     place = np.column_stack([run.truth[f"truth.position.log_0_{c}"] for c in "xyz"])
     assert np.hypot(*(place[-1, :2] - END)) < 0.1
     assert place[:, 2].max() > 1.2 and place[-1, 2] == pytest.approx(0.175, abs=1e-3)
-    assert run.summary["largest_pin_opening_mm"] < 0.05
+    assert run.summary["max_pin_opening_mm"] < 0.05
     machine, truth = run.plant.machine, run.truth
     model = compile_visual_model(machine, surroundings=logged_surroundings(truth))
     poses = body_poses(machine, model, logged_joints(machine, truth), truth)

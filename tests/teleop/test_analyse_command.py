@@ -66,7 +66,7 @@ def test_json_is_all_that_is_printed_and_nothing_is_written(case, tmp_path, monk
     assert document["delay"] == {"forward": 0.3, "back": 0.3}
     found = document["structures"]["rate_force"]
     assert not found["stable"] and found["unstable_poles"] > 0 and found["gain_margin"] < 1.0
-    assert 0.1 < found["largest_delay"] < 0.15  # 123 ms
+    assert 0.1 < found["max_delay"] < 0.15  # 123 ms
     assert [p.name for p in tmp_path.iterdir()] == ["case.yaml"]
 
 
@@ -124,11 +124,11 @@ def test_robust_has_waves_and_passivity_control(case, tmp_path):
     )  # fmt: skip
     document = json.loads(out)
     assert code == 0 and set(document["structures"]) == {"rate_position"}
-    assert not document["structures"]["rate_position"]["stable_let_go"]
-    assert document["structures"]["rate_position"]["unstable_poles_let_go"] == 2
+    assert not document["structures"]["rate_position"]["stable_released"]
+    assert document["structures"]["rate_position"]["unstable_poles_released"] == 2
     robust = document["robust"]["structures"]
     assert set(robust) == {"rate_position", "passivity_control"}
-    assert robust["rate_position"]["master_let_go"]["unstable_poles"] == 2
+    assert robust["rate_position"]["released_master"]["unstable_poles"] == 2
     assert not robust["rate_position"]["sampled"]["let_go_task"]["stable"]
     assert robust["passivity_control"]["sampled"]["let_go_task"]["stable"]
     assert document["stiffness_feedback"]["held"]["stable_by"] == "switching bound"
