@@ -64,8 +64,8 @@ def measure_speed(repeats: int) -> dict:
         repeats: number of repetitions; `hydraulics_to_mechanism_ratio` uses six times as many.
 
     Returns:
-        mechanism_us, hydraulics_us, hydraulics_to_mechanism_ratio, scenario_realtime_factor, teleoperation_realtime_factor
-        by scenario, batch_steps_per_s by thread count, batch_scaling, help_s, run_s.
+        mechanism_us, hydraulics_us, hydraulics_to_mechanism_ratio, scenario_realtime_factor,
+        teleoperation_realtime_factor by scenario, batch_steps_per_s by thread count, batch_scaling, help_s, run_s.
     """
     stop_profiling_clock()
     stderr_console.print("mechanism with and without hydraulics ...", style="dim")

@@ -9,6 +9,7 @@ import math
 import re
 from collections.abc import Hashable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, TypeVar
 
 import pydantic
@@ -60,8 +61,13 @@ def split_unit(key: str) -> tuple[str, float | None]:
     return key, None
 
 
-def suggest_valid_name(name: object, valid) -> str:
-    """Return a hint for an error message: the closest valid name, if any, and all valid names."""
+def suggest_valid_name(name: object, valid, renamed: Mapping[str, str] = MappingProxyType({})) -> str:
+    """Return a hint for an error message: the closest valid name, if any, and all valid names.
+
+    For a former name, a key of `renamed`, the hint is the present name.
+    """
+    if name in renamed:
+        return f"it is now called {renamed[str(name)]!r}"
     names = sorted(map(str, valid))
     close = difflib.get_close_matches(str(name), names, n=1)
     hint = f"did you mean {close[0]!r}? " if close else ""

@@ -36,7 +36,7 @@ _OWN = (
 )  # fmt: skip
 
 
-PLAYED, AHEAD = "played", "ahead"
+PLAYED, AHEAD = "play_output", "play_difference"
 """What a law's play lets through of its variable, and by how much the variable is ahead of it."""
 
 
@@ -178,7 +178,7 @@ class Table(NamedTuple):
             "row_variable": plain[0], "column_variable": plain[1], "row_points": points[0],
             "column_points": points[1], "values": tuple(tuple(row) for row in rows.tolist()),
         }  # fmt: skip
-        return {"law": "table2", "parameters": table, **where}
+        return {"law": "bilinear_table", "parameters": table, **where}
 
 
 @functools.cache

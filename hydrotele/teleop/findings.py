@@ -668,8 +668,9 @@ def _complex_to_pairs(values: np.ndarray) -> list:
 
 def _spring_to_dict(one: StiffnessAxis) -> dict:
     return {
-        "mass": one.mass, "damping": one.damping, "min_stiffness": one.min_stiffness, "max_stiffness": one.max_stiffness,
-        "margin": one.theorem_margin, "theorem_damping": one.theorem_damping, "worst_growth": one.half_swing_growth,
+        "mass": one.mass, "damping": one.damping, "min_stiffness": one.min_stiffness,
+        "max_stiffness": one.max_stiffness, "margin": one.theorem_margin,
+        "theorem_damping": one.theorem_damping, "worst_growth": one.half_swing_growth,
         "min_stable_damping": one.min_stable_damping, "stable_by": one.stability_criterion,
     }  # fmt: skip
 

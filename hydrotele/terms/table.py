@@ -426,8 +426,8 @@ def _shift_state(s, velocity, head, rod):
     """Return the state with increments added to velocity and chamber pressures."""
     return DriveState(
         s.time, s.position, s.velocity + velocity, s.spool, s.spool_rate, s.pressure_head + head,
-        s.pressure_rod + rod, s.pressure_supply, s.command, s.force, s.played,
-        s.ahead,
+        s.pressure_rod + rod, s.pressure_supply, s.command, s.force, s.play_output,
+        s.play_difference,
     )  # fmt: skip
 
 

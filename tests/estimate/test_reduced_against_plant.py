@@ -286,11 +286,11 @@ def test_terms_with_a_memory(machine_of, reduced_of, tmp_path):
     """Force, flow and command that see a variable through a play, or that a relay switches."""
     nominal = machine_of("cat215/none")
     laws = (
-        ("boom", "force", {"played": -2e5}, {},
+        ("boom", "force", {"play_output": -2e5}, {},
          {"play": {"variable": "velocity", "half_width": 0.02}}),
         ("stick", "flow_head", {"1": 4e-4}, {"pressure_rod": "boom"},
          {"switch": {"variable": "pressure_rod", "on": 3.0e6, "off": 1.5e6}}),
-        ("swing", "command", {"played": 0.3}, {},
+        ("swing", "command", {"play_output": 0.3}, {},
          {"play": {"variable": "command", "half_width": 0.1}}),
         ("swing", "force", {"1": 3e3}, {"position": "boom"},
          {"switch": {"variable": "position", "on": 0.81, "off": 0.795}}),
