@@ -107,7 +107,7 @@ def test_stolen_time_is_the_kernels(tmp_path):
 )
 def test_report_says_whose_the_missed_deadlines_are(alone, own, said):
     computer = {"seconds": 10.0, "ticks": 10000, "missed": alone,
-                "late": summarise_durations(np.full(alone, 2_000_000))}  # fmt: skip
+                "lateness": summarise_durations(np.full(alone, 2_000_000))}  # fmt: skip
     found = describe_computer({"ticks": 10000, "missed": own}, computer)
     assert len(found) == len(said)
     for sentence, words in zip(found, said, strict=True):

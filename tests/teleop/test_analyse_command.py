@@ -79,7 +79,7 @@ def test_json_is_all_that_is_printed_and_nothing_is_written(case, tmp_path, monk
         ("velocity: 1,", "velocity: 0,", r"gains\.velocity.*greater than 0"),
         ("force: 1}", "force: -2}", r"gains\.force.*greater than or equal to 0"),
         ("forward: 0.02", "forward: 99", r"delays\.forward.*less than or equal to 10"),
-        ("least: 300", "least: 700", "least <= nominal <= most: 700, 600, 4000"),
+        ("min_stiffness: 300", "min_stiffness: 700", "nominal_stiffness <= max_stiffness: 700, 600, 4000"),
         ("name: cat215_axis", "structures: [rate_farce]\nname: x", "did you mean 'rate_force'"),
         ("master_control: {damping", "master_control: {mass: 1, damping", "unknown key 'mass'"),
     ],
@@ -129,8 +129,8 @@ def test_robust_has_waves_and_passivity_control(case, tmp_path):
     robust = document["robust"]["structures"]
     assert set(robust) == {"rate_position", "passivity_control"}
     assert robust["rate_position"]["released_master"]["unstable_poles"] == 2
-    assert not robust["rate_position"]["sampled"]["let_go_task"]["stable"]
-    assert robust["passivity_control"]["sampled"]["let_go_task"]["stable"]
+    assert not robust["rate_position"]["sampled"]["released_task"]["stable"]
+    assert robust["passivity_control"]["sampled"]["released_task"]["stable"]
     assert document["stiffness_feedback"]["held"]["stable_by"] == "switching bound"
 
 
