@@ -249,11 +249,11 @@ def list_identifiability(identifiability: Identifiability) -> dict[str, list[str
 
     Returns:
         `identifiable`: parameters identifiable alone. `combinations`: identifiable combinations as
-        text. `unknown`: unidentifiable parameters.
+        text. `not_identifiable`: unidentifiable parameters.
 
     >>> matrix = np.array([[1.0, 2.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1.0, 2.0, 1.0, 0.0]])
     >>> list_identifiability(classify_scaled_parameters(matrix, ["a", "b", "c", "d"], [1.0] * 4))
-    {'identifiable': ['c'], 'combinations': ['a + 2 b'], 'unknown': ['d']}
+    {'identifiable': ['c'], 'combinations': ['a + 2 b'], 'not_identifiable': ['d']}
     """
     status = dict(zip(identifiability.names, identifiability.status, strict=True))
     return {
@@ -262,7 +262,7 @@ def list_identifiability(identifiability: Identifiability) -> dict[str, list[str
             identifiability.format_combination(row) for row, base in enumerate(identifiability.base)
             if status[identifiability.names[base]] == STATUS_COMBINATION
         ],
-        "unknown": [n for n in identifiability.names if status[n] not in (STATUS_FULL, STATUS_COMBINATION)],
+        "not_identifiable": [n for n in identifiability.names if status[n] not in (STATUS_FULL, STATUS_COMBINATION)],
     }  # fmt: skip
 
 

@@ -66,16 +66,18 @@ class SensorNoise(StrictModel):
 
     Attributes:
         leg: of a leg reading [m].
-        slide: of a prismatic carriage joint [m].
-        turn: of a revolute carriage joint [rad].
+        prismatic: of a prismatic carriage joint [m].
+        revolute: of a revolute carriage joint [rad].
         wire: of a wire length [m].
         position: of a measured pose's coordinates [m].
         orientation: of a measured pose's rotation vector [rad].
     """
 
+    renamed = {"slide": "prismatic", "turn": "revolute"}
+
     leg: PositiveFloat | None = None
-    slide: PositiveFloat | None = None
-    turn: PositiveFloat | None = None
+    prismatic: PositiveFloat | None = None
+    revolute: PositiveFloat | None = None
     wire: PositiveFloat | None = None
     position: PositiveFloat | None = None
     orientation: PositiveFloat | None = None
@@ -319,7 +321,7 @@ def _leg_residual_covariance(robot: HybridRobot, joints, pose: PlatformPose, of_
         step[k] = 1e-6
         change = leg_readings(robot, joints + step, pose) - leg_readings(robot, joints - step, pose)
         by_joint[..., k] = change / 2e-6
-    sizes = np.where(robot.kinds == REVOLUTE, noise.turn or 0.0, noise.slide or 0.0)
+    sizes = np.where(robot.kinds == REVOLUTE, noise.revolute or 0.0, noise.prismatic or 0.0)
     by_joint = by_joint * sizes
     return (
         (noise.leg or 1e-5) ** 2 * np.eye(LEG_COUNT)
@@ -383,7 +385,7 @@ def measurement_text(robot: str, wires: WireGeometry | None, noise: Mapping[str,
     """
     import yaml
 
-    angles = ("turn", "orientation")
+    angles = ("revolute", "orientation")
     data: dict = {"robot": robot}
     if wires is not None:
         data["wires"] = {f"{key}_mm": [[round(1e3 * c, 6) for c in p] for p in getattr(wires, key)]

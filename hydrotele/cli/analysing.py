@@ -163,8 +163,8 @@ def analyse_case(
             raise InputError("--delay", f"must be from 0 to {MAX_DELAY:g} s, got {delay:g}")
         case = case.with_delay(delay)
     reach = specification.map
-    delays = max(reach.longest_delay, case.delay) * np.linspace(0.0, 1.0, reach.points) ** 2
-    factors = np.geomspace(reach.least_factor, reach.most_factor, reach.points)
+    delays = max(reach.max_delay, case.delay) * np.linspace(0.0, 1.0, reach.points) ** 2
+    factors = np.geomspace(reach.min_factor, reach.max_factor, reach.points)
     spring = specification.stiffness.to_spring() if specification.stiffness else None
     linear = tuple(name for name in names if name in STRUCTURES) if names else specification.structures
     with show_stages(f"analyse {specification.name}", quiet) as progress:

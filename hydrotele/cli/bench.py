@@ -61,11 +61,11 @@ def measure_speed(repeats: int) -> dict:
     """Return all benchmark results; each time is the shortest of several repetitions.
 
     Args:
-        repeats: number of repetitions; `ratio` uses six times as many.
+        repeats: number of repetitions; `hydraulics_to_mechanism_ratio` uses six times as many.
 
     Returns:
-        mechanism_us, hydraulics_us, ratio, scenario_realtime_factor, teleoperation_realtime_factor
-        by scenario, batch_steps_per_s by thread count, batch_scaling, help_s, run_s.
+        mechanism_us, hydraulics_us, hydraulics_to_mechanism_ratio, scenario_realtime_factor,
+        teleoperation_realtime_factor by scenario, batch_steps_per_s by thread count, batch_scaling, help_s, run_s.
     """
     stop_profiling_clock()
     stderr_console.print("mechanism with and without hydraulics ...", style="dim")
@@ -85,7 +85,7 @@ def measure_speed(repeats: int) -> dict:
     return {
         "mechanism_us": round(bare / STEPS * 1e6, 3),
         "hydraulics_us": round(full / STEPS * 1e6, 3),
-        "ratio": round(full / bare, 4),
+        "hydraulics_to_mechanism_ratio": round(full / bare, 4),
         "scenario_realtime_factor": round(factor, 1),
         "teleoperation_realtime_factor": teleoperated,
         "batch_steps_per_s": {"1": round(steps / one), "2": round(steps / two)},
@@ -179,8 +179,8 @@ def _measure_start_time(*arguments: str) -> float:
 def _read(path: Path) -> dict:
     try:
         figures = read_json(path)
-        if not isinstance(figures, dict) or "ratio" not in figures:
-            raise ValueError("it has no key 'ratio'")
+        if not isinstance(figures, dict) or "hydraulics_to_mechanism_ratio" not in figures:
+            raise ValueError("it has no key 'hydraulics_to_mechanism_ratio'")
     except ValueError as error:
         raise InputError(path, f"is not a saved benchmark: {error}") from None
     return figures

@@ -174,7 +174,7 @@ def socket_document(
     alone = {name for name, told in status.items() if told == STATUS_FULL}
     parameters = [
         {
-            "name": name, "value": value, "unit": _unit(name, angular), "told": status[name],
+            "name": name, "value": value, "unit": _unit(name, angular), "identifiability": status[name],
             "std": std if name in alone else None, "low": low if name in alone else None,
             "high": high if name in alone else None,
         }
@@ -201,11 +201,11 @@ def socket_document(
             "noise_mm": 1e3 * calibration.noise,
             "model": calibration.model,
             "model_errors_mm": _millimetres(calibration.model_errors),
-            "sizes": calibration.sizes,
+            "expected_sizes": calibration.sizes,
             "parameters": parameters,
             "effective_parameters": len(calibration.fit.residual) - calibration.fit.degrees_of_freedom,
             **list_identifiability(fit.identifiability),
-            "told": [asdict(one) for one in estimate_combinations(fit)],
+            "identifiable_combinations": [asdict(one) for one in estimate_combinations(fit)],
             "outliers": _outlier_rows(calibration.outliers),
             "status": fit.status,
             "notes": list(notes),
@@ -220,10 +220,10 @@ def _heldout_document(heldout_parts: Sequence[HeldOutPrediction], rows: dict[str
 
     distances = {k: v for one in heldout_parts for k, v in one.calibrated_errors.socket_distances.items()}
     return {
-        "rms_mm": rms_over_parts("calibrated", "rms"),
-        "rms_without_outliers_mm": rms_over_parts("calibrated", "rms_without_outliers"),
-        "nominal_rms_mm": rms_over_parts("nominal", "rms"),
-        "given_rms_mm": rms_over_parts("given", "rms"),
+        "rms_mm": rms_over_parts("calibrated_errors", "rms"),
+        "rms_without_outliers_mm": rms_over_parts("calibrated_errors", "rms_without_outliers"),
+        "nominal_rms_mm": rms_over_parts("nominal_errors", "rms"),
+        "given_rms_mm": rms_over_parts("given_errors", "rms"),
         "socket_distance_mm": _millimetres(distances),
         "parts": {
             one.name: {
@@ -348,7 +348,7 @@ def _print_combinations(document: dict[str, Any]) -> None:
     units = {one["name"]: one["unit"] for one in document["parameters"]}
     title = "Identifiable parameters and combinations"
     rows = make_table(title, "parameter or combination", "value", "95 % +-", "unit")
-    told = sorted(document["told"], key=lambda one: len(one["text"]))
+    told = sorted(document["identifiable_combinations"], key=lambda one: len(one["text"]))
     for one in told[:_MAX_PRINTED_ROWS]:
         unit = units[one["text"].split()[0]]
         shown, factor = {"m": ("mm", 1e3), "rad": ("mrad", 1e3)}.get(unit, (unit, 1.0))
@@ -358,7 +358,7 @@ def _print_combinations(document: dict[str, Any]) -> None:
     stdout_console.print(rows)
     if len(told) > _MAX_PRINTED_ROWS:
         stdout_console.print(f"... and {len(told) - _MAX_PRINTED_ROWS} longer combinations; --out or --json lists all")
-    stdout_console.print("not identifiable: " + (", ".join(document["unknown"]) or "none"))
+    stdout_console.print("not identifiable: " + (", ".join(document["not_identifiable"]) or "none"))
 
 
 def _unit(name: str, angular: Sequence[str]) -> str:
@@ -494,8 +494,8 @@ def _print_scara(document: dict[str, Any]) -> None:
         stdout_console.print("most informative poses: " + ", ".join(map(str, document["best_poses"])))
     for text in document["combinations"]:
         stdout_console.print(f"[yellow]identifiable only as a combination[/] {text}")
-    if document["unknown"]:
-        stdout_console.print("[yellow]not identifiable[/] " + ", ".join(document["unknown"]))
+    if document["not_identifiable"]:
+        stdout_console.print("[yellow]not identifiable[/] " + ", ".join(document["not_identifiable"]))
 
 
 KIND = "hybrid calibration"
@@ -504,8 +504,8 @@ CRITERIA = ("D", "O1", "O2", "O3", "O4", "O5")
 CANDIDATES = 200  # number of random poses from which the most informative are selected
 SENSOR_NOISE = {
     "leg": 1e-5,
-    "slide": 1e-5,
-    "turn": 2e-5,
+    "prismatic": 1e-5,
+    "revolute": 2e-5,
     "wire": 2e-5,
 }  # m, rad: models/iwr/README.md
 SEARCH_BOX_SIGMAS = 8.0  # half width of the search box, in expected sizes of the manufacturing errors
@@ -603,24 +603,24 @@ def _hybrid_document(data, calibration: Calibration, heldout, evolved, posterior
     result: dict[str, Any] = {
         "robot": model.nominal.name, "data": str(data), "hydrotele": hydrotele.__version__,
         "model": model.kind, "poses": len(calibration.equations.measurement),
-        "poses_left_out_as_wrong": list(calibration.inconsistent_rows),
+        "excluded_poses": list(calibration.inconsistent_rows),
         "noise": "stated" if calibration.equations.measurement.noise_is_known else "estimated",
         "chi": fit.chi, "degrees_of_freedom": fit.degrees_of_freedom, "iterations": fit.iterations,
         "converged": fit.converged, "status": fit.status, "warnings": list(calibration.warnings),
         "redundancy": {
             "parameters": len(fit.names), "rank": calibration.redundancy.rank,
             "redundant": list(calibration.redundancy.held_names),
-            "take_part": list(calibration.redundancy.redundant_names),
-            "words": list(calibration.redundancy.explanations),
-            "told_at_this_noise": len(calibration.redundancy.determined_names),
-            "hidden_by_the_noise": weak,
+            "involved": list(calibration.redundancy.redundant_names),
+            "explanations": list(calibration.redundancy.explanations),
+            "identifiable_at_noise": len(calibration.redundancy.determined_names),
+            "poorly_identifiable": weak,
             "singular_values": calibration.redundancy.singular_values,
         },
-        "unknown": [n for n in fit.names if held[n]],
+        "not_identifiable": [n for n in fit.names if held[n]],
         "errors": {"before": calibration.nominal_errors.summarize(), "after": calibration.calibrated_errors.summarize(),
-                   "left_out": calibration.leave_one_out_errors.summarize()},
+                   "leave_one_out": calibration.leave_one_out_errors.summarize()},
         "parameters": [
-            {"name": name, "words": words, "unit": unit, "identified": not held[name],
+            {"name": name, "description": words, "unit": unit, "identified": not held[name],
              "value": values[name], "standard_deviation": deviations[name],
              "interval_95": intervals[name]}
             for name, words, unit in zip(model.names, model.descriptions, model.units, strict=True)
@@ -638,7 +638,7 @@ def _hybrid_document(data, calibration: Calibration, heldout, evolved, posterior
             "converged": evolved.converged, "misfit": evolved.cost,
             "misfit_least_squares": float(
                 fitted_equations(calibration).negative_log_likelihood(fit.values[free][None])[0]),
-            "largest_difference_in_deviations": float(away.max()),
+            "max_difference_in_std": float(away.max()),
             "values": dict(zip(fitted_equations(calibration).names, evolved.values.tolist(), strict=True)),
         }  # fmt: skip
     if posterior is not None:
@@ -647,10 +647,10 @@ def _hybrid_document(data, calibration: Calibration, heldout, evolved, posterior
             "converged": posterior.converged, "status": posterior.status,
             "steps": posterior.steps, "evaluations": posterior.evaluations,
             "acceptance": posterior.acceptance_fraction,
-            "largest_autocorrelation_time": posterior.autocorrelation.max(),
-            "largest_split_rhat": posterior.rhat.max(),
-            "least_effective_size": posterior.effective.min(),
-            "largest_difference_in_deviations": float(away.max()),
+            "max_autocorrelation_time": posterior.autocorrelation.max(),
+            "max_split_rhat": posterior.rhat.max(),
+            "min_effective_size": posterior.effective.min(),
+            "max_difference_in_std": float(away.max()),
             "parameters": [
                 {"name": n, "mean": m, "standard_deviation": s, "interval_95": i,
                  "split_rhat": r, "effective_size": e}
@@ -712,7 +712,7 @@ def _print_hybrid(result: dict[str, Any]) -> None:
     shown = make_table(f"{result['robot']}: {result['poses']} poses, model {result['model']}",
                   "pose errors (lower is better)", "RMS mm", "max mm", "RMS mrad")  # fmt: skip
     rows = [("nominal", errors["before"]), ("calibrated", errors["after"]),
-            ("leave-one-out prediction", errors["left_out"])]  # fmt: skip
+            ("leave-one-out prediction", errors["leave_one_out"])]  # fmt: skip
     for name, e in rows:
         shown.add_row(name, f"{e['position_rms_mm']:.3f}", f"{e['position_max_mm']:.3f}",
                       f"{e['orientation_rms_mrad']:.3f}")  # fmt: skip
@@ -727,15 +727,15 @@ def _print_hybrid(result: dict[str, Any]) -> None:
         f"{told['parameters']} parameters, {told['rank']} independent; noise {result['noise']};"
         f" ratio of residuals to noise {result['chi']:.2f}"
     )
-    for words in told["words"][:12]:
+    for words in told["explanations"][:12]:
         stdout_console.print(f"  {words}")
-    if result["unknown"]:
+    if result["not_identifiable"]:
         stdout_console.print(f"kept at their nominal values: {', '.join(result['unknown'])}")
-    if told["hidden_by_the_noise"]:
-        names = ", ".join(told["hidden_by_the_noise"])
+    if told["poorly_identifiable"]:
+        names = ", ".join(told["poorly_identifiable"])
         stdout_console.print(f"poorly identifiable at this noise: {names}")
-    if result["poses_left_out_as_wrong"]:
-        rows_ = ", ".join(map(str, result["poses_left_out_as_wrong"]))
+    if result["excluded_poses"]:
+        rows_ = ", ".join(map(str, result["excluded_poses"]))
         stdout_console.print(f"excluded, because their measurements fit no calibration: rows {rows_}")
     for words in result["warnings"]:
         stdout_console.print(f"[yellow]warning[/] {words}")
@@ -743,7 +743,7 @@ def _print_hybrid(result: dict[str, Any]) -> None:
         if key in result:
             one = result[key]
             said = one.get("status", "converged" if one["converged"] else "not converged")
-            away = one["largest_difference_in_deviations"]
+            away = one["max_difference_in_std"]
             stdout_console.print(
                 f"{name}: {said}; differs from least squares by at most {away:.2f} standard deviations"
             )

@@ -109,7 +109,7 @@ def _effect_rows() -> list[dict]:
         rows.append(
             {
                 "name": effect.name,
-                "what": effect.description,
+                "description": effect.description,
                 "machine": machine.name if places else "",
                 "locations": list(places),
                 "parameters": {
@@ -134,7 +134,7 @@ def _environment_rows() -> list[dict]:
         {
             "name": f"hydrotele/{task.name}-v0",
             "machine": f"{task.machine}, {task.tool or 'its first tool'}",
-            "what": task.description,
+            "description": task.description,
             "reward": task.reward,
         }
         for task in TASKS.values()

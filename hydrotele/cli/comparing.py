@@ -186,8 +186,8 @@ def compare_document(
         {
             "machine": dataset.machine.name,
             "data": [str(path) for path in data],
-            "fitted": [run.name for run in dataset.fit],
-            "judged": [errors.run for errors in comparisons[0].runs],
+            "fitted_runs": [run.name for run in dataset.fit],
+            "evaluated_runs": [errors.run for errors in comparisons[0].runs],
             "units": {channel: default_unit(channel) for channel in dataset.channels},
             "models": models,
             "notes": list(dataset.notes),
@@ -285,7 +285,7 @@ def _write(
         "machine": document["machine"],
         "data": document["data"],
         "models": [model.name for model in comparisons],
-        "judged": document["judged"],
+        "evaluated_runs": document["evaluated_runs"],
         "hydrotele": hydrotele.__version__,
     }
     write_json(folder / "summary.json", summary)

@@ -124,11 +124,11 @@ def _drive_once(options: DriveOptions, idle_test: Mapping[str, Any] = MappingPro
     if isinstance(pacer, RealTimePacer):
         machine_side = {
             "control_rate": scenario.control_rate, "ticks": pacer.ticks, "missed": pacer.missed,
-            "late": summarise_durations(pacer.delays()), "priority": pacer.priority,
+            "lateness": summarise_durations(pacer.delays()), "priority": pacer.priority,
             "load": load_of_machine(),
         }  # fmt: skip
         result.summary["haptic"] = {
-            "machine": machine_side, "line": result.summary["haptic"],
+            "machine": machine_side, "channel": result.summary["haptic"],
             "computer": {**idle_test, **_measure_stolen_time(stolen, clock.monotonic() - begun)},
         }  # fmt: skip
     _write(result, target, options)
@@ -185,7 +185,7 @@ def _write(result: Run, target: Path, options: DriveOptions) -> None:
     if "haptic" in result.summary:
         print_latency(result.summary["haptic"])
     if result.summary["pauses"]:
-        said = f"{result.summary['late_seconds']:.2f} s late in {result.summary['pauses']} pauses"
+        said = f"{result.summary['paused_seconds']:.2f} s late in {result.summary['pauses']} pauses"
         stdout_console.print(f"[yellow]note[/] the simulation was slower than real time: {said}")
     alike = "a similar run" if "haptic" in result.summary else "this run"
     stdout_console.print(f"written to [bold]{target}[/]; hydrotele run with its scenario.yaml repeats {alike}")

@@ -70,10 +70,10 @@ def serve_device(options: HapticOptions) -> None:
     if options.json or options.until_eof:
         print_json(seen._asdict())
         return
-    refused = ", ".join(f"{count} {why}" for why, count in seen.refused.items() if count)
+    refused = ", ".join(f"{count} {why}" for why, count in seen.rejected.items() if count)
     stdout_console.print(
         f"{seen.periods} periods: {seen.missed} deadlines missed, {seen.unanswered} without an"
-        f" answer in time, force switched off {seen.limp} times; rejected packets:"
+        f" answer in time, force switched off {seen.watchdog_trips} times; rejected packets:"
         f" {refused or 'none'}"
     )
 
@@ -121,7 +121,7 @@ def print_latency(figures: dict) -> None:
     Args:
         figures: item `haptic` of the summary of a drive.
     """
-    machine, line, computer = figures["machine"], figures["line"], figures.get("computer", {})
+    machine, line, computer = figures["machine"], figures["channel"], figures.get("computer", {})
     title = "Missed deadlines (lower is better)"
     missed = make_table(title, "deadline", "total", "missed", "fraction")
     rows: list[tuple[str, int, int]] = []
@@ -142,10 +142,10 @@ def print_latency(figures: dict) -> None:
         missed.add_row(name, str(of), str(count), f"{100.0 * count / max(of, 1):.3f} %")
     stdout_console.print(missed)
     spans = {said: line[key] for key, said in _TIME_LABELS.items()}
-    spans["lateness of the machine"] = machine["late"]
-    if "late" in computer:
-        spans["lateness of the idle loop"] = computer["late"]
-    names = ("p50", "p90", "p99", "p99.9", "largest")
+    spans["lateness of the machine"] = machine["lateness"]
+    if "lateness" in computer:
+        spans["lateness of the idle loop"] = computer["lateness"]
+    names = ("p50", "p90", "p99", "p99.9", "max")
     times = make_table("Percentiles of times [us] (lower is better)", "time", *names)
     for said, found in spans.items():
         times.add_row(said, *(f"{found['percentiles_us'].get(n, 0.0):g}" for n in names))
@@ -182,7 +182,7 @@ def describe_computer(machine: dict, computer: dict) -> list[str]:
     if "missed" not in computer:
         return said
     alone, own = (x["missed"] / max(x["ticks"], 1) for x in (computer, machine))
-    largest = computer["late"]["percentiles_us"].get("largest", 0.0)
+    largest = computer["lateness"]["percentiles_us"].get("max", 0.0)
     if alone > MAX_MISSED_FRACTION:
         said.append(
             f"[yellow]note[/] the computer alone missed {100.0 * alone:.2g} % of its deadlines in"

@@ -366,7 +366,7 @@ def design_excitation_file(
     if as_json:
         print_json({
             "file": str(target), "criterion": found.criterion, "parameters": found.parameters,
-            "largest_use_of_a_limit": found.max_utilisation,
+            "max_limit_utilisation": found.max_utilisation,
         })  # fmt: skip
     else:
         stdout_console.print(

@@ -171,7 +171,7 @@ A sweep file:
     seed: 1
     keys: {effects.0.parameters.mass: {uniform: [0, 1500]}}   # log_uniform, normal, choice
   repeat: 2                                         # with successive seeds of the scenario
-  figures: [tracking.tip_z.rms, largest_pin_opening_mm]       # plotted; default: a selection
+  figures: [tracking.tip_z.rms, max_pin_opening_mm]       # plotted; default: a selection
   logs: false                                       # true: keep the folder of each run
 
 \b

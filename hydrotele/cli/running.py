@@ -103,13 +103,13 @@ def print_summary(summary: dict[str, Any]) -> None:
     rows.add_row("real-time factor", f"{summary['realtime_factor']:.0f}")
     if summary["effects"]:
         rows.add_row("added effects", ", ".join(e["name"] for e in summary["effects"]))
-    rows.add_row("largest pin opening", f"{summary['largest_pin_opening_mm']:.4f} mm")
-    rows.add_row("largest contact force", f"{summary['largest_contact_force_N'] / 1e3:.1f} kN")
+    rows.add_row("largest pin opening", f"{summary['max_pin_opening_mm']:.4f} mm")
+    rows.add_row("largest contact force", f"{summary['max_contact_force_N'] / 1e3:.1f} kN")
     for key, label in (("flow_balance", "flow balance"), ("energy_balance", "energy balance")):
         value = summary["balance"][key]
         rows.add_row(label, "-" if value is None else f"{value:.1e}")
     if station := summary.get("teleoperation"):
-        gone, least = station["handle_energy_J"], station["handle_least_energy_J"]
+        gone, least = station["handle_energy_J"], station["min_handle_energy_J"]
         rows.add_row("energy into the handle", f"{gone:.2f} J, minimum {least:.2f} J")
     for name, error in summary["tracking"].items():
         unit, factor = ("mm", 1e3) if error["unit"] == "m" else ("deg", 57.29577951308232)
@@ -225,7 +225,7 @@ def _print_sweep(file: SweepFile, target: Path, swept: SweepResult, figures: lis
     if as_json:
         print_json({
             "kind": "sweep", "name": file.name, "folder": str(target), "runs": file.sweep.runs,
-            "done_now": swept.n_executed, "failed": len(swept.failed),
+            "runs_done": swept.n_executed, "failed": len(swept.failed),
             "failures": [{"run": e.run, "reason": e.reason, **_values(swept, e)}
                          for e in swept.failed],
             "figures": found,

@@ -167,11 +167,11 @@ def _build_plan(
 def _plan_teleoperation(plan: Plan, machine: Machine, pilot: TeleopPilot) -> Plan:
     """Return a plan whose references are written during the run; buttons command their axes."""
     closed = np.array([machine.axes[a].force is None for a in plan.axes])
-    for button in sorted(pilot.buttons, key=lambda button: button.at):
+    for button in sorted(pilot.buttons, key=lambda button: button.start):
         column = _find_column(plan.axes, button.axis, "pilot.buttons")
         if button.axis in arm_axes(machine):
             raise InputError("pilot.buttons", f"{button.axis} is controlled by the joystick; name another axis")
-        plan.command[plan.time >= button.at, column] = button.command
+        plan.command[plan.time >= button.start, column] = button.command
         closed[column] = False
     pose = np.zeros((len(plan.time), max(4, len(arm_axes(machine)))))
     return dataclasses.replace(plan, closed_loop=closed, pose=pose)
@@ -193,13 +193,13 @@ def _plan_table(plan: Plan, pilot: TablePilot) -> Plan:
         else:
             row = np.searchsorted(times, plan.time * (1 + 1e-12) + 1e-9, side="right") - 1
             wanted = np.array(values)[np.clip(row, 0, len(values) - 1)]
-        if pilot.of == "command":
+        if pilot.quantity == "command":
             plan.command[:, column] = wanted
         else:
             plan.reference[:, column] = wanted
             if pilot.interpolate == "linear":
                 plan.rate[:, column] = np.gradient(wanted, plan.time)
-    return dataclasses.replace(plan, closed_loop=closed | (pilot.of == "joint"))
+    return dataclasses.replace(plan, closed_loop=closed | (pilot.quantity == "joint"))
 
 
 def _plan_fourier(plan: Plan, pilot: FourierPilot) -> Plan:

@@ -109,7 +109,7 @@ def compute_drive_references(machine: Machine, plan: Plan, servo: Servo) -> Driv
             continue
         if machine.axes[name].pump:
             message = f"{name} has its own pump, which the servo does not control"
-            raise InputError("pilot", f"{message}: give its commands (kind: table, of: command)")
+            raise InputError("pilot", f"{message}: give its commands (kind: table, quantity: command)")
         linkage = axis_linkage(machine, name)
         arm[:, column] = linkage.rate(plan.reference[:, column])
         speed = arm[:, column] * plan.rate[:, column]

@@ -7,9 +7,10 @@ are converted to SI here and nowhere else.
 import difflib
 import math
 import re
-from collections.abc import Hashable
+from collections.abc import Hashable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from types import MappingProxyType
+from typing import Annotated, Any, ClassVar, TypeVar
 
 import pydantic
 import yaml
@@ -60,16 +61,44 @@ def split_unit(key: str) -> tuple[str, float | None]:
     return key, None
 
 
-def suggest_valid_name(name: object, valid) -> str:
-    """Return a hint for an error message: the closest valid name, if any, and all valid names."""
+def suggest_valid_name(name: object, valid, renamed: Mapping[str, str] = MappingProxyType({})) -> str:
+    """Return a hint for an error message: the closest valid name, if any, and all valid names.
+
+    For a former name, a key of `renamed`, the hint is the present name.
+    """
+    if name in renamed:
+        return f"it is now called {renamed[str(name)]!r}"
     names = sorted(map(str, valid))
     close = difflib.get_close_matches(str(name), names, n=1)
     hint = f"did you mean {close[0]!r}? " if close else ""
     return f"{hint}valid: {', '.join(names) or '(none)'}"
 
 
+def describe_unknown_key(key: str, valid, renamed: Mapping[str, str]) -> str:
+    """Return the error message for an unknown key.
+
+    Args:
+        key: the key, which may have a unit suffix.
+        valid: the valid keys.
+        renamed: former key -> present key, both without unit suffix.
+
+    >>> describe_unknown_key("kerf_mm", ["cut_height"], {"kerf": "cut_height"})
+    "unknown key 'kerf_mm': it is now called 'cut_height_mm'"
+    """
+    for former in (key, split_unit(key)[0]):
+        if former in renamed:
+            return f"unknown key {key!r}: it is now called {renamed[former] + key.removeprefix(former)!r}"
+    return f"unknown key {key!r}; {suggest_valid_name(key, valid)}"
+
+
 class StrictModel(pydantic.BaseModel):
-    """Base class of all data read from YAML: immutable, finite, in SI units, no unknown keys."""
+    """Base class of all data read from YAML: immutable, finite, in SI units, no unknown keys.
+
+    `renamed` maps former keys to present ones, both without unit suffix. A former key is refused
+    with a message that names the present one.
+    """
+
+    renamed: ClassVar[dict[str, str]] = {}
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -88,7 +117,7 @@ class StrictModel(pydantic.BaseModel):
             elif factor is not None and name in fields:
                 value = scale_numbers(value, factor)
             else:
-                raise ValueError(f"unknown key {key!r}; {suggest_valid_name(key, fields)}")
+                raise ValueError(describe_unknown_key(str(key), fields, cls.renamed))
             if name in result:
                 raise ValueError(f"{name!r} is given twice, as {key!r} and with another unit")
             result[name] = value

@@ -78,7 +78,7 @@ def _motor_constant_parameters(machine: Machine, location: str) -> dict[str, Par
 
     Magnets and windings scatter by 10 %; heating reduces the constant by 2 %.
     """
-    present = _motor(machine, location).emf
+    present = _motor(machine, location).torque_constant
     return {"emf": _ratio_parameter("V s/rad", present, 0.1, 0.02, 5.0)}
 
 
@@ -93,7 +93,7 @@ def _inertia_parameters(machine: Machine, location: str) -> dict[str, Parameter]
 
 def _stall_torque(machine: Machine, location: str) -> float:
     motor = _motor(machine, location)
-    return motor.emf * motor.voltage / motor.resistance
+    return motor.torque_constant * motor.voltage / motor.resistance
 
 
 def _drag_parameters(machine: Machine, location: str) -> dict[str, Parameter]:

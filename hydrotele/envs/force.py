@@ -52,7 +52,7 @@ def force_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationFie
     """Return the fields that `observe_force` writes: measured and reference force, time."""
     return [
         ObservationField("force", "N", -_CELL_RANGE, _CELL_RANGE),
-        ObservationField("wanted_force", "N", 0.0, MAX_FORCE),
+        ObservationField("reference_force", "N", 0.0, MAX_FORCE),
         ObservationField("time_since_change", "s", 0.0, 3600.0),
     ]
 
@@ -247,7 +247,7 @@ HOLD_FORCE = Task(
     duration=20.0,
     start=_draw_start,
     fields=force_fields,
-    measures=(("force_error", "N"), ("contact", "1"), ("overload", "1"), ("beside", "1")),
+    measures=(("force_error", "N"), ("contact", "1"), ("overload", "1"), ("off_plate", "1")),
     surroundings=_make_plate,
     parameters=_make_parameters,
     servo=Servo(position_gain=5.0),  # a higher gain lets the boom hammer on the plate

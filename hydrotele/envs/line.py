@@ -68,11 +68,11 @@ _RATE_BOUND = 1.0  # m/s, rad/s: bound of the reference rates
 def line_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
     """Return the fields that `observe_line` writes: reference pose, rates, preview, errors."""
     k, far = len(axes), max_reach(machine)
-    fields = pose_fields(machine, k, "wanted")
-    fields += [ObservationField(f"wanted_rate.{c}", unit, -_RATE_BOUND, _RATE_BOUND)
+    fields = pose_fields(machine, k, "reference")
+    fields += [ObservationField(f"reference_rate.{c}", unit, -_RATE_BOUND, _RATE_BOUND)
                for c, unit in (("r", "m/s"), ("theta", "rad/s"), ("z", "m/s"))]  # fmt: skip
     for ahead in PREVIEW_TIMES:
-        fields += pose_fields(machine, k, f"wanted_in_{ahead * 1000:.0f}_ms")[:3]
+        fields += pose_fields(machine, k, f"reference_in_{ahead * 1000:.0f}_ms")[:3]
     return [
         *fields,
         ObservationField("along_track_error", "m", -2.0 * far, 2.0 * far),

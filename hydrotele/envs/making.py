@@ -365,7 +365,7 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def __init__(
         self, task: str, num_envs: int = 1, render_mode: str | None = None, threads: int = 0,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP, width: int = 640,
-        height: int = 480, camera: Camera = None, shown: int | None = None, **options: Any,
+        height: int = 480, camera: Camera = None, render_count: int | None = None, **options: Any,
     ) -> None:  # fmt: skip
         """Compile the machines.
 
@@ -380,7 +380,7 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             height: height of images [pixel].
             camera: a camera of the machine; None for a free camera that shows the whole workspace
                 of the arm.
-            shown: number of environments to render, from the first one; None for all.
+            render_count: number of environments to render, from the first one; None for all.
             **options: fields of `hydrotele.envs.task.Options`.
 
         Raises:
@@ -398,7 +398,7 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._autoreset_mode, self._is_started = mode, False
         self._image_settings: tuple[int, int, Camera] = width, height, camera
         self._stage: TaskRenderer | None = None
-        self._render_count = num_envs if shown is None else min(shown, num_envs)
+        self._render_count = num_envs if render_count is None else min(render_count, num_envs)
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -490,7 +490,7 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Render the machines and their goals.
 
         Returns:
-            `shown` images (height, width, 3) uint8, or None without `render_mode`.
+            `render_count` images (height, width, 3) uint8, or None without `render_mode`.
 
         Raises:
             InputError: the camera does not exist, or OpenGL does not work.

@@ -56,7 +56,7 @@ _TARGET, _TIME_HELD, _REMAINING_DISTANCE = 0, 5, 6  # indices in `goal`
 def reach_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
     """Return the fields that `observe_reach` writes: goal pose, measured distance, time held."""
     return [
-        *pose_fields(machine, len(axes), "wanted"),
+        *pose_fields(machine, len(axes), "reference"),
         ObservationField("distance", "m", 0.0, 2.0 * max_reach(machine)),
         ObservationField("held", "s", 0.0, 2.0 * HOLD_TIME),
     ]

@@ -17,8 +17,6 @@ from hydrotele.envs.episode import SAME_STEP
 from hydrotele.envs.facts import TaskSetup
 from hydrotele.envs.making import make_action_space, make_core, make_observation_space
 
-_REFERENCE_PREFIXES = ("reference", "wanted")  # prefixes of the fields that hold references
-
 
 def find_reference_pairs(setup: TaskSetup) -> tuple[np.ndarray, np.ndarray]:
     """Return the observation columns of all references and of the matching measured values.
@@ -27,14 +25,14 @@ def find_reference_pairs(setup: TaskSetup) -> tuple[np.ndarray, np.ndarray]:
         setup: the task with its options.
 
     Returns:
-        (columns of the fields `reference...` and `wanted...`, columns of the measured values).
+        (columns of the fields `reference...`, columns of the measured values).
     """
     places = {field.name: number for number, field in enumerate(setup.fields)}
     asked, measured = [], []
     for number, field in enumerate(setup.fields):
         what, _, where = field.name.partition(".")
         start, _, rest = what.partition("_")
-        if start not in _REFERENCE_PREFIXES:
+        if start != "reference":
             continue
         twins = (rest,) if rest in ("rate", "force") else ("angle", "length", "tip")
         for twin in twins:

@@ -72,8 +72,8 @@ def load_complete_setup() -> RegressorSetup:
     complete = ColumnMapping(
         position=mapping.position, force=mapping.force, coordinates=mapping.coordinates,
         passive_friction=mapping.passive_friction, offsets=False,
-        alike=tuple(g for g in mapping.alike if not g[0].startswith(HINGES)),
-        absent=tuple(a for a in mapping.absent if not a.startswith("viscous")),
+        equal_parameters=tuple(g for g in mapping.equal_parameters if not g[0].startswith(HINGES)),
+        zero_parameters=tuple(a for a in mapping.zero_parameters if not a.startswith("viscous")),
     )  # fmt: skip
     return load_mechanism(folder / "palida.xml", complete).setup
 

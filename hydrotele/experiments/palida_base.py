@@ -172,8 +172,8 @@ def list_table_1(joints: np.ndarray) -> dict[str, dict[str, float]]:
 
 
 _BODY_ASSUMPTIONS = {
-    "19 bodies": {"alike": (), "absent": ()},
-    "equal legs": {"absent": ()},
+    "19 bodies": {"equal_groups": (), "zero_parameters": ()},
+    "equal legs": {"zero_parameters": ()},
     "equal legs, symmetrical bodies": {},
 }
 """Assumption about the bodies -> changes of the model's regressor.

@@ -44,4 +44,4 @@ def make_operator_changes(seed: int) -> dict[str, str]:
     Args:
         seed: seed of the operator and of the sensor noise.
     """
-    return {"seed": str(seed), "pilot.perception.drawn": str(seed)}
+    return {"seed": str(seed), "pilot.perception.sample": str(seed)}

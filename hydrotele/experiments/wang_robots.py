@@ -42,7 +42,7 @@ from hydrotele.simulate.hybrid import (
     simulate_measured_poses,
 )
 
-SENSOR_NOISE = {"leg": 1e-5, "slide": 1e-5, "turn": 2e-5, "wire": 2e-5}
+SENSOR_NOISE = {"leg": 1e-5, "prismatic": 1e-5, "revolute": 2e-5, "wire": 2e-5}
 """Standard deviations of the sensor noise [m] or [rad]."""
 
 REQUIRED_ACCURACY = 1e-4

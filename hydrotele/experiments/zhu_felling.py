@@ -53,7 +53,7 @@ def measure_felling(seed: int, changes: Changes) -> Sample:
         for key, word in _EVENT_WORDS.items()
     }
     assert isinstance(scenario.pilot, TeleopPilot)
-    saw = min((b.at for b in scenario.pilot.buttons if b.axis == "saw" and b.command), default=0.0)
+    saw = min((b.start for b in scenario.pilot.buttons if b.axis == "saw" and b.command), default=0.0)
     on_stem = contact["tree_0"] > _MIN_CONTACT_FORCE
     touched = float(time[np.argmax(on_stem)]) if on_stem.any() else _NO_EVENT_TIME
     free = (m.time > 0.5) & (m.time < min(touched, saw) - 0.2)
@@ -169,7 +169,7 @@ def _evaluate_process(samples: Sequence[Sample]) -> Evaluation:
     return Evaluation(checks, explanation, note)
 
 
-_FELLER_TIP_OVER = TipOver(mass=25.0e3, edge=1.6)
+_FELLER_TIP_OVER = TipOver(mass=25.0e3, tipping_edge=1.6)
 """The mass of 25 t is from the feller-buncher's data sheet; half the track gauge is assumed."""
 _DEADBAND_WIDTH = 1.5e-3  # m, Table 6.9
 _SOFT_SOIL = "[{kind: plate, position: [6.8, 0.0, 0.3], size: [1.0, 1.0], stiffness: 3.0e+5, damping: 3.0e+4}]"  # noqa: E501
@@ -199,7 +199,7 @@ def measure_pushing(seed: int, changes: Changes) -> Sample:
         "with": {"pilot.reflection": "stiffness"},
         "without": {"pilot.reflection": "none"},
         "soil": {"surroundings": _SOFT_SOIL},
-        "stiff_hand": {"pilot.perception.muscle": "6.0"},
+        "stiff_hand": {"pilot.perception.handle_position_gain": "6.0"},
     }
     values, panels = {}, []
     for name, keys in cases.items():
@@ -268,7 +268,7 @@ def measure_protection(seed: int, changes: Changes) -> Sample:
     for name, keys in (("spring", {}), ("bare", {"pilot.tip_over": "null"})):
         scenario, run = run_shipped("tip_over", make_operator_changes(seed) | too_large | keys | dict(changes))
         assert isinstance(scenario.pilot, TeleopPilot)
-        facts = scenario.pilot.tip_over or TipOver(mass=20.0e3, edge=1.6)
+        facts = scenario.pilot.tip_over or TipOver(mass=20.0e3, tipping_edge=1.6)
         share, handle = _compute_tipping_fraction(run, facts), run.measured["handle.z"]
         values[f"{name}_share"] = float(share.max())
         late = run.measured.time > 10.0
@@ -340,7 +340,7 @@ FELLING = (
             "p. 105, Fig. 6.55",
             "document",
             _evaluate_contact,
-            {"pilot.buttons": "[{at: 0.0, axis: saw, command: 1.0}]"},
+            {"pilot.buttons": "[{start: 0.0, axis: saw, command: 1.0}]"},
             "the saw runs from the start and cuts the stem before contact",
         ),
         Claim(
@@ -360,7 +360,7 @@ FELLING = (
             "p. 105",
             "document",
             _evaluate_process,
-            {"pilot.buttons": "[{at: 16.0, axis: saw, command: 1.0}]"},
+            {"pilot.buttons": "[{start: 16.0, axis: saw, command: 1.0}]"},
             "the grab arm never closes",
         ),
     ), 8),

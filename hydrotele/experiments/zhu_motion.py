@@ -153,8 +153,8 @@ def measure_steering(seed: int, changes: Changes) -> Sample:
             "pilot.coordinates": _FAST_COORDINATES,
             "pilot.acceleration": "5.0",
         },
-        "slow_rate": {"pilot.mode": "rate", "pilot.perception.crossover": "1.5"},
-        "slow_position": {"pilot.mode": "position", "pilot.perception.crossover": "1.5"},
+        "slow_rate": {"pilot.mode": "rate", "pilot.perception.max_crossover_frequency": "1.5"},
+        "slow_position": {"pilot.mode": "position", "pilot.perception.max_crossover_frequency": "1.5"},
     }
     if seed > _CAUSE_OPERATORS:
         cases = {name: cases[name] for name in ("rate", "position")}

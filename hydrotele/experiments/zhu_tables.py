@@ -164,7 +164,7 @@ def _compare_joystick_gains(name: str, printed: dict[str, tuple[float, ...]]) ->
     for axis, values in printed.items():
         gains = load_joystick().gains[name][axis]
         stiff, far = (1e3, 1e3) if len(axis) == 1 else (1e2, 1e4)
-        model = (gains.most / stiff, gains.nominal / stiff, gains.least / stiff,
+        model = (gains.max_stiffness / stiff, gains.nominal_stiffness / stiff, gains.min_stiffness / stiff,
                  gains.damping / stiff, gains.deadband * far)  # fmt: skip
         words = ("Kp max", "Kp nom", "Kp min", "Kd", "dead band")
         for word, one, value in zip(words, model, values, strict=True):
@@ -189,9 +189,9 @@ def _compare_detents() -> TableEntries:
     for axis, (drop, inside, outside) in printed.items():
         gains = load_joystick().gains["feller"][axis]
         scale = 1e3 if len(axis) == 1 else 1e2
-        model = (gains.detent.drop, gains.detent.outside) if gains.detent else (0.0, gains.nominal)
+        model = (gains.detent.drop, gains.detent.slope) if gains.detent else (0.0, gains.nominal_stiffness)
         entries[f"{axis} force drop"] = model[0], drop, 0.005
-        entries[f"{axis} Kp"] = gains.nominal / scale, inside, 0.005
+        entries[f"{axis} Kp"] = gains.nominal_stiffness / scale, inside, 0.005
         entries[f"{axis} Kp1"] = model[1] / scale, outside, 0.005
     return entries
 

@@ -524,7 +524,7 @@ def _formula(law: Learned) -> str:
     else:
         ways = (f"{v}: {len(p)} points from {p[0]:.3g} to {p[-1]:.3g}"
                 for v, p in zip(table.variables, table.points, strict=True))  # fmt: skip
-        text = f"table2({'; '.join(ways)})"
+        text = f"bilinear_table({'; '.join(ways)})"
     if table.memory:
         ((kind, facts),) = table.memory.facts.items()
         facts = {**facts, "variable": table.memory.variable}

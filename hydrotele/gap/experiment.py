@@ -459,7 +459,7 @@ def next_experiment(machine: Machine, reason: str, effects: Sequence[tuple[str, 
         "ground": False,
         "start": {"joints": {machine.axes[a].joint: round(q, 4) for a, q in s.home.items()}},
         "pilot": {
-            "kind": "table", "of": "joint", "interpolate": "linear", "time": time,
+            "kind": "table", "quantity": "joint", "interpolate": "linear", "time": time,
             "columns": moved,
         },
         "servo": _servo(machine, any(name in _STILL for name in plan)),

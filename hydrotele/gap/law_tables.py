@@ -36,7 +36,7 @@ _OWN = (
 )  # fmt: skip
 
 
-PLAYED, AHEAD = "played", "ahead"
+PLAYED, AHEAD = "play_output", "play_difference"
 """What a law's play lets through of its variable, and by how much the variable is ahead of it."""
 
 
@@ -168,7 +168,7 @@ class Table(NamedTuple):
     def law(self, entries: np.ndarray) -> dict[str, Any]:
         """Law, parameters, variables and window of a term with some entries (K,)."""
         plain, points = [v.partition(".")[0] for v in self.variables], self.points
-        where = {"of": self.of, "window": self.window or None}
+        where = {"variables_from": self.of, "window": self.window or None}
         where |= self.memory.facts if self.memory else {}
         if len(plain) == 1:
             table = {"variable": plain[0], "points": points[0], "values": tuple(entries.tolist())}
@@ -178,7 +178,7 @@ class Table(NamedTuple):
             "row_variable": plain[0], "column_variable": plain[1], "row_points": points[0],
             "column_points": points[1], "values": tuple(tuple(row) for row in rows.tolist()),
         }  # fmt: skip
-        return {"law": "table2", "parameters": table, **where}
+        return {"law": "bilinear_table", "parameters": table, **where}
 
 
 @functools.cache

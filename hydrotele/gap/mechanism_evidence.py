@@ -662,7 +662,7 @@ def possible_errors(mechanism: Mechanism, columns: Columns, share: float = 1.0) 
     Returns:
         The standard deviations.
     """
-    off, chain, out = share * mechanism.mapping.uncertainty, mechanism.setup.chain, {}
+    off, chain, out = share * mechanism.mapping.relative_uncertainty, mechanism.setup.chain, {}
     for body, ten in zip(chain.bodies, chain.inertia, strict=True):
         mass, spread = float(ten[0]), float(ten[4] + ten[7] + ten[9]) / 2.0
         reach = np.sqrt(max(spread, 0.0) * max(mass, 0.0))

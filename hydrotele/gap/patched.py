@@ -314,10 +314,10 @@ def patched_mapping(given: ColumnMapping, patch: Patch) -> ColumnMapping:
             delay=old.delay + one.delay, time_constant=old.time_constant, drift=old.drift,
             drift_time_constant=old.drift_time_constant,
         )  # fmt: skip
-    keep = () if touched else given.alike
+    keep = () if touched else given.equal_parameters
     return given.model_copy(update={
-        "friction": friction, "sensor_errors": errors, "alike": keep,
-        "absent": () if touched else given.absent,
+        "friction": friction, "sensor_errors": errors, "equal_parameters": keep,
+        "zero_parameters": () if touched else given.zero_parameters,
     })  # fmt: skip
 
 

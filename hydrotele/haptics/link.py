@@ -498,7 +498,7 @@ class HapticLink:
         self._counters_at_restart = line.pose[[MISSED, UNANSWERED]]
 
     def statistics(self) -> dict[str, Any]:
-        """Return the statistics: counts, and times as from `timing.summary_of`."""
+        """Return the statistics: counts, and times as from `timing.summarise_durations`."""
         line, count = self.buffers, self.buffers.count
         return {
             "poses": int(count[RECEIVED]),

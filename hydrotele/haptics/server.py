@@ -64,7 +64,7 @@ CLIENT_TIMEOUT = 1.0  # s without packets after which another machine may connec
 _PRIORITY = 40
 _MAX_SAMPLES = 700_000  # number of times that are kept: 11 minutes at 1 kHz
 
-_REJECTION_REASONS = ("malformed", "stranger", "session", "late", "stale")
+_REJECTION_REASONS = ("malformed", "other_client", "session", "late", "stale")
 
 Address = tuple[str, int]
 
@@ -76,9 +76,9 @@ class ServerSummary(NamedTuple):
         periods: number of periods.
         missed: number of periods that were skipped or started more than a period late.
         unanswered: number of periods that started without the answer to the previous pose.
-        refused: number of rejected packets, by reason.
-        limp: number of times that the watchdog switched the force off.
-        wake: delay of the start of a period, see `summarise_durations`.
+        rejected: number of rejected packets, by reason.
+        watchdog_trips: number of times that the watchdog switched the force off.
+        wake_delay: delay of the start of a period, see `summarise_durations`.
         round_trip: time from sending a pose to receiving its answer, see `summarise_durations`.
         priority: whether real-time priority was granted.
         load: load averages of the computer, see `load_of_machine`.
@@ -87,9 +87,9 @@ class ServerSummary(NamedTuple):
     periods: int
     missed: int
     unanswered: int
-    refused: dict[str, int]
-    limp: int
-    wake: dict
+    rejected: dict[str, int]
+    watchdog_trips: int
+    wake_delay: dict
     round_trip: dict
     priority: bool
     load: list[float] | None
@@ -199,7 +199,7 @@ class DeviceSession:
         if whole[SESSION] == 0 and self.client in (None, sender):
             return ""
         if sender != self.client:
-            return "stranger"
+            return "other_client"
         if whole[SESSION] != self.pose.integers[SESSION]:
             return "session"
         if whole[SEQUENCE] <= self._last_wrench:

@@ -50,7 +50,7 @@ def summarise_durations(nanoseconds: np.ndarray) -> dict:
             "histogram": {"edges_us": HISTOGRAM_EDGES_US, "count": []},
         }
     values = np.percentile(micro, PERCENTILES)
-    names = [f"p{p:g}" if p < 100.0 else "largest" for p in PERCENTILES]
+    names = [f"p{p:g}" if p < 100.0 else "max" for p in PERCENTILES]
     counts = np.histogram(micro, [-np.inf, *HISTOGRAM_EDGES_US, np.inf])[0]
     return {
         "count": len(micro),
@@ -166,7 +166,7 @@ def measure_idle_deadlines(
     finally:
         pacer.close()
     return {"seconds": seconds, "ticks": pacer.ticks, "missed": pacer.missed,
-            "late": summarise_durations(pacer.delays()), "priority": pacer.priority}  # fmt: skip
+            "lateness": summarise_durations(pacer.delays()), "priority": pacer.priority}  # fmt: skip
 
 
 def read_steal_time(stat: Path = _STAT_FILE) -> float | None:

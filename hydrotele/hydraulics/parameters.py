@@ -346,7 +346,7 @@ def _write_pump(block: np.ndarray, pump: Pump, moved: float) -> None:
     if motor is None:
         return
     block[PumpSlot.VOLTAGE], block[PumpSlot.RESISTANCE] = motor.voltage, motor.resistance
-    block[PumpSlot.EMF], block[PumpSlot.INERTIA] = motor.emf, motor.inertia
+    block[PumpSlot.EMF], block[PumpSlot.INERTIA] = motor.torque_constant, motor.inertia
     block[PumpSlot.DRAG], block[PumpSlot.BREAKAWAY] = motor.drag, motor.breakaway
     block[PumpSlot.BREAKAWAY_SPEED] = motor.breakaway_speed
     block[PumpSlot.VISCOUS_DRAG] = motor.viscous
@@ -354,8 +354,8 @@ def _write_pump(block: np.ndarray, pump: Pump, moved: float) -> None:
 
 def _write_load_cylinder(block: np.ndarray, load: LoadCylinder) -> None:
     block[PumpSlot.LOAD_AREA], block[PumpSlot.LOAD_RELIEF] = load.area, load.relief_pressure
-    block[PumpSlot.LOAD_OVERRIDE], block[PumpSlot.LOAD_STIFFNESS] = load.override, load.stiffness
-    block[PumpSlot.LOAD_VOID], block[PumpSlot.LOAD_VOID_PRESSURE] = load.void, load.void_pressure
+    block[PumpSlot.LOAD_OVERRIDE], block[PumpSlot.LOAD_STIFFNESS] = load.relief_override, load.stiffness
+    block[PumpSlot.LOAD_VOID], block[PumpSlot.LOAD_VOID_PRESSURE] = load.unfilled_travel, load.air_pressure
     block[PumpSlot.LOAD_FRICTION], block[PumpSlot.LOAD_RETURN] = load.friction, load.return_force
 
 

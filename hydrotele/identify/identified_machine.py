@@ -317,7 +317,7 @@ def build_identify_document(
         "seconds": found.seconds if found else 0.0,
         "band_hz": found.band if found else None,
         "whiteness": found.residual_autocorrelation if found else {},
-        "given": {"distance": distance, "limit95": limit},
+        "nominal": {"distance": distance, "limit95": limit},
         "consistent": {
             "distance": best.squared_distance, "limit95": limit,
             "parameters": dict(zip(found.names, best.value.tolist(), strict=True)),
@@ -335,7 +335,7 @@ def build_identify_document(
             for n in hydraulics.parameters
         ]  # fmt: skip
         document["hydraulics"] = {
-            "before": hydraulics.nominal_rms_error, "after": hydraulics.identified_rms_error,
+            "nominal_rms_error": hydraulics.nominal_rms_error, "identified_rms_error": hydraulics.identified_rms_error,
             "status": hydraulics.status,
             "seconds": hydraulics.seconds,
         }  # fmt: skip

@@ -53,16 +53,20 @@ class ColumnMapping(StrictModel):
         coordinates: joints in which the motion is described and filtered, such as those of a
             platform, if they differ from the measured joints.
         passive_friction: joints without drive, and closures, that have friction.
-        alike: groups of bodies or joints that have the same parameters.
-        absent: parameters known to be 0, such as `moment_x.stator_*`.
+        equal_parameters: groups of bodies or joints that have the same parameters.
+        zero_parameters: parameters known to be 0, such as `moment_x.stator_*`.
         offsets: whether drives may have constant forces.
         friction: joint -> friction that an MJCF cannot state, such as `stribeck`, `quadratic`,
             `viscous_asymmetry`; see `FrictionTerm`. `stribeck_velocity` is that of `stribeck`.
         sensor_errors: `position.JOINT` or `force.DRIVE` -> known defect of its sensor, which is
             removed from the readings (after a sign reversal by the mapping).
-        uncertainty: relative uncertainty of masses, inertias and friction of the MJCF. A gap search
+        relative_uncertainty: relative uncertainty of masses, inertias and friction of the MJCF. A gap search
             first calibrates them within this range.
     """
+
+    renamed = {
+        "alike": "equal_parameters", "absent": "zero_parameters", "uncertainty": "relative_uncertainty",
+    }  # fmt: skip
 
     time: str = "time"
     position: str | dict[str, str] | None = None
@@ -71,12 +75,12 @@ class ColumnMapping(StrictModel):
     force_noise: float | dict[str, float] | None = None
     coordinates: tuple[str, ...] = ()
     passive_friction: tuple[str, ...] = ()
-    alike: tuple[tuple[str, ...], ...] = ()
-    absent: tuple[str, ...] = ()
+    equal_parameters: tuple[tuple[str, ...], ...] = ()
+    zero_parameters: tuple[str, ...] = ()
     offsets: bool = True
     friction: dict[str, dict[str, float]] = Field(default_factory=dict)
     sensor_errors: dict[str, SensorError] = Field(default_factory=dict)
-    uncertainty: Annotated[float, Field(ge=0.0, le=0.5)] = 0.03
+    relative_uncertainty: Annotated[float, Field(ge=0.0, le=0.5)] = 0.03
 
 
 @dataclass(frozen=True)
@@ -129,7 +133,8 @@ def load_mechanism(mjcf: str | Path, mapping: str | Path | ColumnMapping | None 
     places = (*chain.joints, *chain.closures)
     bodies = [f"{kind}.{body}" for body in chain.bodies for kind in BODY_PARAMETERS]
     alike = tuple(
-        tuple(_match_names((*chain.bodies, *places), group, source, "body or joint")) for group in facts.alike
+        tuple(_match_names((*chain.bodies, *places), group, source, "body or joint"))
+        for group in facts.equal_parameters
     )
     passive = _match_names(
         [p for p in places if p not in chain.drives], facts.passive_friction, source,
@@ -139,7 +144,7 @@ def load_mechanism(mjcf: str | Path, mapping: str | Path | ColumnMapping | None 
     firsts = {name: group[0] for group in alike for name in group}
     absent = [
         name
-        for name in _match_names([*bodies, *rubbed], facts.absent, source, "parameter")
+        for name in _match_names([*bodies, *rubbed], facts.zero_parameters, source, "parameter")
         if firsts.get(name.partition(".")[2], name.partition(".")[2]) == name.partition(".")[2]
     ]
     given = _match_names(chain.joints, facts.coordinates, source, "joint") or measured

@@ -152,9 +152,9 @@ def _merge_columns(whole: Regressor, alike: Sequence[Sequence[str]], absent: Seq
         members.setdefault(stands, []).append(k)
     places = {name.partition(".")[2] for name in whole.names}
     if strange := [place for place in first if place not in places]:
-        raise InputError("setup", f"alike: {strange[0]} has no parameters; remove it")
+        raise InputError("setup", f"equal_parameters: {strange[0]} has no parameters; remove it")
     if strange := [name for name in absent if name not in members]:
-        raise InputError("setup", f"absent: {strange[0]} is not a parameter; remove it")
+        raise InputError("setup", f"zero_parameters: {strange[0]} is not a parameter; remove it")
     kept = [name for name in names if name not in absent]
     groups = [members[name] for name in kept]
     sums = np.zeros((len(whole.names), len(kept)))

@@ -220,15 +220,17 @@ class Valve(StrictModel):
 class ElectricMotor(StrictModel):
     """A brushed DC motor on an H-bridge, with the drag torques of motor and pump.
 
-    `voltage` [V] of the bridge at full duty, `resistance` [ohm], `emf` constant [V s/rad], equal to
-    the torque constant [N m/A], `inertia` [kg m^2] of rotor and pump. Drag torques: constant
-    `drag` [N m], additional `breakaway` [N m] at rest, which decays with `breakaway_speed` [rad/s],
-    and `viscous` [N m s/rad].
+    `voltage` [V] of the bridge at full duty, `resistance` [ohm], `torque_constant`
+    [N m/A], equal to the constant of the back-EMF [V s/rad], `inertia` [kg m^2] of rotor and pump.
+    Drag torques: constant `drag` [N m], additional `breakaway` [N m] at rest, which decays with
+    `breakaway_speed` [rad/s], and `viscous` [N m s/rad].
     """
+
+    renamed = {"emf": "torque_constant"}
 
     voltage: PositiveFloat
     resistance: PositiveFloat
-    emf: PositiveFloat
+    torque_constant: PositiveFloat
     inertia: PositiveFloat
     drag: NonNegativeFloat = 0.0
     breakaway: NonNegativeFloat = 0.0
@@ -288,25 +290,29 @@ class Pump(StrictModel):
         motor = self.motor
         if motor is None:
             return _DEFAULT_STALL_PRESSURE
-        torque = motor.emf * motor.voltage / motor.resistance - motor.drag
+        torque = motor.torque_constant * motor.voltage / motor.resistance - motor.drag
         return max(torque, 0.0) / (self.displacement * (1.0 + self.torque_loss))
 
 
 class LoadCylinder(StrictModel):
     """A cylinder that resists extension because its oil leaves through a relief valve.
 
-    `area` [m^2]; `relief_pressure` [Pa] and its increase with the flow, `override` [Pa s/m^3];
-    `stiffness` [N/m] of the oil; `void` [m], the travel in which oil does not yet fill the chamber,
-    with air at `void_pressure` [Pa]. Seal `friction` [1] is a fraction of the force;
+    `area` [m^2]; `relief_pressure` [Pa] and its increase with the flow, `relief_override`
+    [Pa s/m^3]; `stiffness` [N/m] of the oil; `unfilled_travel` [m], in which oil does not yet fill
+    the chamber, with air at `air_pressure` [Pa]. Seal `friction` [1] is a fraction of the force;
     `return_force` [N] is an additional resistance while the cylinder returns.
     """
 
+    renamed = {
+        "override": "relief_override", "void": "unfilled_travel", "void_pressure": "air_pressure",
+    }  # fmt: skip
+
     area: PositiveFloat
     relief_pressure: NonNegativeFloat
-    override: NonNegativeFloat = 0.0
+    relief_override: NonNegativeFloat = 0.0
     stiffness: PositiveFloat
-    void: NonNegativeFloat = 0.0
-    void_pressure: PositiveFloat = 2.0e4
+    unfilled_travel: NonNegativeFloat = 0.0
+    air_pressure: PositiveFloat = 2.0e4
     friction: NonNegativeFloat = 0.0
     return_force: NonNegativeFloat = 0.0
 

@@ -161,19 +161,24 @@ def principal_values(shape: SymmetricMatrix) -> PrincipalValues:
 class Detent(StrictModel):
     """Perceptible edge of the dead band: force drop [N] or [N m], slope outside [N/m]."""
 
+    renamed = {"outside": "slope"}
+
     drop: NonNegativeFloat
-    outside: NonNegativeFloat
+    slope: NonNegativeFloat
 
 
 class AxisGains(StrictModel):
     """Stiffness feedback of one joystick axis, [N, m] or [N m, rad].
 
-    `force_limit` [N] or [N m] is the machine force at which the stiffness reaches `most`.
+    `force_limit` [N] or [N m] is the machine force at which the stiffness reaches
+    `max_stiffness`.
     """
 
-    nominal: PositiveFloat
-    least: NonNegativeFloat
-    most: PositiveFloat
+    renamed = {"nominal": "nominal_stiffness", "least": "min_stiffness", "most": "max_stiffness"}
+
+    nominal_stiffness: PositiveFloat
+    min_stiffness: NonNegativeFloat
+    max_stiffness: PositiveFloat
     damping: NonNegativeFloat
     deadband: NonNegativeFloat
     force_limit: PositiveFloat
@@ -181,20 +186,23 @@ class AxisGains(StrictModel):
 
     @model_validator(mode="after")
     def _check(self):
-        if not self.least <= self.nominal <= self.most:
+        if not self.min_stiffness <= self.nominal_stiffness <= self.max_stiffness:
             raise ValueError(
-                f"stiffnesses must satisfy least {self.least:g} <= nominal {self.nominal:g} <= most {self.most:g}"
+                "must be ordered, min_stiffness <= nominal_stiffness <= max_stiffness:"
+                f" {self.min_stiffness:g}, {self.nominal_stiffness:g}, {self.max_stiffness:g}"
             )
-        if self.detent and self.detent.drop > self.nominal * self.deadband:
+        if self.detent and self.detent.drop > self.nominal_stiffness * self.deadband:
             raise ValueError(
                 f"detent.drop {self.detent.drop:g} exceeds the spring force"
-                f" {self.nominal * self.deadband:g} at the edge of the dead band"
+                f" {self.nominal_stiffness * self.deadband:g} at the edge of the dead band"
             )
         return self
 
 
 class Joystick(StrictModel):
     """A six-DOF levitated joystick; `mount` [m] is its position in the cab, `control_rate` [Hz]."""
+
+    renamed = {"alone": "closed_loop"}
 
     name: Name
     description: str = ""
@@ -207,7 +215,7 @@ class Joystick(StrictModel):
     control_rate: Annotated[PositiveFloat, Field(ge=1.0, le=1.0e5)]
     flotor: Flotor
     coils: Coils
-    alone: UnheldDynamics
+    closed_loop: UnheldDynamics
     hand: HandImpedance
     mount: Vector
     gains: dict[Name, dict[Name, AxisGains]] = Field(min_length=1)

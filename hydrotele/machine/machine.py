@@ -439,14 +439,14 @@ def _check_terms(terms: tuple[Term, ...], axes: dict[str, Axis], supply: Supply 
                 f"terms.{k}: flow_supply adds to the flow of a shared pump: it needs an axis with a"
                 " valve and a supply of kind constant_flow or load_sensing"
             )
-        for variable, axis in term.of.items():
-            _check_known(axis, axes, f"terms.{k}.of.{variable}")
+        for variable, axis in term.variables_from.items():
+            _check_known(axis, axes, f"terms.{k}.variables_from.{variable}")
             if variable not in ("position", "velocity", "command") and not axes[axis].is_hydraulic:
-                raise ValueError(f"terms.{k}.of: axis {axis} has no {variable}")
+                raise ValueError(f"terms.{k}.variables_from: axis {axis} has no {variable}")
         memory = term.play or term.switch
         if memory and not any(axis.is_hydraulic for axis in axes.values()):
             raise ValueError(f"terms.{k}: play or switch needs a machine with hydraulic axes")
-        pushed = axes[term.of.get("force", term.axis)]
+        pushed = axes[term.variables_from.get("force", term.axis)]
         if memory and memory.variable == "force" and not pushed.is_hydraulic:
             raise ValueError(f"terms.{k}: play or switch of the force needs a hydraulic axis")
         key = (term.name, term.axis, term.balance)

@@ -214,7 +214,7 @@ class LiveHandReference:
         self._further, self._reference = further, np.zeros(6)
         self._before = Reading(commands=(0.0,) * len(further))
         self._time, self._path = [0.0], [(0.0,) * 6]
-        self._buttons = [ButtonCommand(at=0.0, axis=name, command=0.0) for name in further]
+        self._buttons = [ButtonCommand(start=0.0, axis=name, command=0.0) for name in further]
 
     def __call__(self) -> np.ndarray:
         """Return the current reference position of the handle, (6,) [m], [rad]."""
@@ -231,7 +231,7 @@ class LiveHandReference:
         for (name, most), old, new in news:
             if new != old:
                 session.set_command(name, most * new)
-                self._buttons.append(ButtonCommand(at=session.time, axis=name, command=most * new))
+                self._buttons.append(ButtonCommand(start=session.time, axis=name, command=most * new))
         self._before = reading
 
     def record_handle(self, handle: np.ndarray, time: float) -> None:
@@ -326,7 +326,7 @@ def with_live_operator(scenario: Scenario, further: Iterable[str]) -> Scenario:
     if not isinstance(pilot, TeleopPilot):
         message = f"pilot kind {pilot.kind} has no joystick; use a scenario with `kind: teleop`"
         raise InputError(f"scenario {scenario.name}", message)
-    buttons = [ButtonCommand(at=0.0, axis=name, command=0.0) for name in further]
+    buttons = [ButtonCommand(start=0.0, axis=name, command=0.0) for name in further]
     update = {"operator": LiveOperator(kind="live"), "buttons": buttons}
     return scenario.model_copy(update={"pilot": pilot.model_copy(update=update)})
 
@@ -388,7 +388,7 @@ def drive_scenario(
     while session.tick % session.ticks_per_row:  # the logs hold whole rows
         session.advance()
     run = finish_run(session, hand.recorded_scenario(session.scenario, session.time))
-    run.summary.update(late_seconds=round(pacer.total_delay, 3), pauses=pacer.pauses)
+    run.summary.update(paused_seconds=round(pacer.total_delay, 3), pauses=pacer.pauses)
     if haptic:
         run.summary["haptic"] = seen
     return run

@@ -156,8 +156,8 @@ def _to_arrow_array(pa, values: Sequence[Any]):
 _MAX_FIGURES = 6
 _TIP_FIGURES = ("tracking.tip_r.rms", "tracking.tip_z.rms", "tracking.tip_attitude.rms")
 _FORCE_AND_BALANCE_FIGURES = (
-    "largest_contact_force_N", "teleoperation.largest_tip_force_N",
-    "teleoperation.handle_least_energy_J", "largest_pin_opening_mm", "balance.energy_balance",
+    "max_contact_force_N", "teleoperation.max_tip_force_N",
+    "teleoperation.min_handle_energy_J", "max_pin_opening_mm", "balance.energy_balance",
 )  # fmt: skip
 
 

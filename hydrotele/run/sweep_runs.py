@@ -44,13 +44,13 @@ _UNIT_OF_SCENARIO_KEY = {
 }  # fmt: skip
 
 _COMMON_NUMBERS = (
-    "simulated_seconds", "physics_steps", "largest_pin_opening_mm", "largest_contact_force_N",
+    "simulated_seconds", "physics_steps", "max_pin_opening_mm", "max_contact_force_N",
     "balance.seconds", "balance.flow_balance", "balance.energy_balance",
 )  # fmt: skip
 _STATION_NUMBERS = (
-    "handle_energy_J", "handle_least_energy_J", "largest_handle_displacement_m",
-    "largest_handle_rotation_rad", "largest_coil_current_A", "largest_coil_heat",
-    "periods_with_limited_currents", "largest_tip_force_N", "tripped",
+    "handle_energy_J", "min_handle_energy_J", "max_handle_displacement_m",
+    "max_handle_rotation_rad", "max_coil_current_A", "max_coil_heat",
+    "periods_with_limited_currents", "max_tip_force_N", "tripped",
 )  # fmt: skip
 _TIP_COORDINATES = ("tip_r", "tip_z", "tip_attitude")
 

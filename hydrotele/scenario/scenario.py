@@ -50,21 +50,23 @@ class Plate(StrictModel):
 class StandingTree(StrictModel):
     """A standing tree that a disc saw cuts from its stump and a grab arm then holds.
 
-    `position` [m] is on the ground, `kerf` [m] the height of the cut, and `energy` [J/m^3] the
-    cutting energy per volume. `saw` and `grab` are axes of the machine; a grab at more than
-    `closed` [rad] holds a stem in its pocket.
+    `position` [m] is on the ground, `cut_height` [m] the height of the cut, and
+    `cutting_energy` [J/m^3] the energy per cut volume. `saw` and `grab` are axes of the machine; a
+    grab at more than `closed_angle` [rad] holds a stem in its pocket.
     """
+
+    renamed = {"kerf": "cut_height", "energy": "cutting_energy", "closed": "closed_angle"}
 
     kind: Literal["tree"] = "tree"
     position: tuple[float, float]
     diameter: PositiveFloat = 0.34
     height: PositiveFloat = 9.0
     density: PositiveFloat = 750.0
-    kerf: PositiveFloat = 0.30
-    energy: PositiveFloat = 2.0e7
+    cut_height: PositiveFloat = 0.30
+    cutting_energy: PositiveFloat = 2.0e7
     saw: Name = "saw"
     grab: Name = "grab"
-    closed: float = 1.0
+    closed_angle: float = 1.0
 
 
 class LogOnGround(StrictModel):
@@ -72,9 +74,11 @@ class LogOnGround(StrictModel):
 
     `position` [m] is its centre, and `direction` [rad] the angle of its axis in the horizontal
     plane, 0 along x; diameter and length are in [m], density in [kg/m^3]. `grab` is the axis of the
-    machine that closes the jaw. A log in the pocket is gripped at more than `closed` [rad] and
-    released at less than `open` [rad].
+    machine that closes the jaw. A log in the pocket is gripped at more than `closed_angle` [rad]
+    and released at less than `open_angle` [rad].
     """
+
+    renamed = {"closed": "closed_angle", "open": "open_angle"}
 
     kind: Literal["log"] = "log"
     position: tuple[float, float]
@@ -83,13 +87,15 @@ class LogOnGround(StrictModel):
     length: PositiveFloat = 4.0
     density: PositiveFloat = 830.0
     grab: Name = "claw"
-    closed: float = 1.2
-    open: float = 1.0
+    closed_angle: float = 1.2
+    open_angle: float = 1.0
 
     @model_validator(mode="after")
     def _check(self):
-        if self.open > self.closed:
-            raise ValueError(f"open {self.open:g} rad must not exceed closed {self.closed:g} rad")
+        if self.open_angle > self.closed_angle:
+            raise ValueError(
+                f"open_angle {self.open_angle:g} rad must not exceed closed_angle {self.closed_angle:g} rad"
+            )
         if self.length < 2.0 * self.diameter:
             raise ValueError(f"length {self.length:g} m must be at least twice the diameter {self.diameter:g} m")
         return self
@@ -130,13 +136,15 @@ class ConstantPilot(StrictModel):
 class TablePilot(StrictModel):
     """Commands or references from a table over time, given as columns or in a log file.
 
-    `of: command` drives the valves open loop, `of: joint` gives joint references [rad] or [m].
-    `file` is a CSV or Parquet log, of which the columns `command.<axis>` or `reference.<axis>`
-    (otherwise `angle.<axis>`, `position.<axis>`) are used.
+    `quantity: command` drives the valves open loop, `quantity: joint` gives joint references [rad]
+    or [m]. `file` is a CSV or Parquet log, of which the columns `command.<axis>` or
+    `reference.<axis>` (otherwise `angle.<axis>`, `position.<axis>`) are used.
     """
 
+    renamed = {"of": "quantity"}
+
     kind: Literal["table"]
-    of: Literal["command", "joint"] = "command"
+    quantity: Literal["command", "joint"] = "command"
     time: list[NonNegativeFloat] = []
     columns: dict[Name, list[float]] = {}
     file: str | None = None
@@ -436,7 +444,7 @@ def _load_table(scenario: Scenario, where: str) -> Scenario:
         log = load_log(Path(scenario.folder, pilot.file), minimum_rows=2, maximum_dropped=1.0)
     except InputError as error:
         raise InputError(where, str(error)) from None
-    kinds = ("command",) if pilot.of == "command" else ("position", "angle", "reference")
+    kinds = ("command",) if pilot.quantity == "command" else ("position", "angle", "reference")
     found = {c.axis: c.name for k in kinds for c in map(parse_channel, log.columns)
              if c.kind == k and not c.truth}  # fmt: skip
     if not found:

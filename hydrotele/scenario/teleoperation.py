@@ -6,7 +6,6 @@ suffixes.
 """
 
 import math
-import warnings
 from typing import Annotated, Literal
 
 from pydantic import Discriminator, Field, Tag, model_validator
@@ -49,19 +48,21 @@ class Channel(StrictModel):
     """Communication channel between operator and machine, with delays and packet loss.
 
     `delay_forward` and `delay_back` [s] are rounded to whole control periods; one packet is sent
-    per period. From `lost_from` [s] on, every packet is lost with the probability `lost`. Every
-    packet has an additional, exponentially distributed delay with the mean `jitter` [s]; overtaken
-    packets are discarded. `trace` is a CSV file of measured delays with the columns `forward` and
-    `back` [s] and one row per packet, empty for a lost packet. It repeats if the run is longer, and
-    replaces delays and jitter.
+    per period. From `loss_start` [s] on, every packet is lost with the probability
+    `loss_probability`. Every packet has an additional, exponentially distributed delay with the
+    mean `jitter` [s]; overtaken packets are discarded. `trace` is a CSV file of measured delays
+    with the columns `forward` and `back` [s] and one row per packet, empty for a lost packet. It
+    repeats if the run is longer, and replaces delays and jitter.
     """
+
+    renamed = {"lost": "loss_probability", "lost_from": "loss_start"}
 
     delay_forward: Annotated[float, Field(ge=0, le=2)] = 0.0
     delay_back: Annotated[float, Field(ge=0, le=2)] = 0.0
     jitter: Annotated[float, Field(ge=0, le=1)] = 0.0
     trace: str | None = None
-    lost: Annotated[float, Field(ge=0, le=1)] = 0.0
-    lost_from: NonNegativeFloat = 0.0
+    loss_probability: Annotated[float, Field(ge=0, le=1)] = 0.0
+    loss_start: NonNegativeFloat = 0.0
 
     @model_validator(mode="after")
     def _check(self):
@@ -73,43 +74,54 @@ class Channel(StrictModel):
 class SafetyLimits(StrictModel):
     """Conditions under which the machine stops automatically.
 
-    Without a new packet for `silence` [s], the rates go to zero and the reflected force fades out.
-    The valves close permanently if a joint is further than `following_error` [rad] or [m] from its
-    reference, or if a noisy sensor gives the same value for `frozen` [s].
+    Without a new packet for `packet_timeout` [s], the rates go to zero and the reflected force
+    fades out. The valves close permanently if a joint is further than `following_error` [rad] or
+    [m] from its reference, or if a noisy sensor gives the same value for `frozen_time` [s].
     """
 
-    silence: PositiveFloat = 0.15
+    renamed = {"silence": "packet_timeout", "frozen": "frozen_time"}
+
+    packet_timeout: PositiveFloat = 0.15
     following_error: PositiveFloat = 0.2
-    frozen: PositiveFloat = 0.5
+    frozen_time: PositiveFloat = 0.5
 
 
 class TipOver(StrictModel):
-    """Tip-over protection: push the joystick back above a fraction `share` of the tipping moment.
+    """Tip-over protection: push the joystick back above `moment_fraction` of the tipping moment.
 
-    The machine of `mass` [kg] has its centre of mass at `behind` [m] behind the swing axis. It tips
-    about the edge of its tracks, `edge` [m] in front of or behind the axis. The reaction is that of
-    a spring with `stiffness` [N/m] and a damper with `damping` [N s/m].
+    The machine of `mass` [kg] has its centre of mass at `centre_of_mass_behind` [m] behind the
+    swing axis. It tips about the edge of its tracks, `tipping_edge` [m] in front of or behind the
+    axis. The reaction is that of a spring with `stiffness` [N/m] and a damper with `damping`
+    [N s/m].
     """
 
+    renamed = {
+        "behind": "centre_of_mass_behind", "edge": "tipping_edge", "share": "moment_fraction",
+    }  # fmt: skip
+
     mass: PositiveFloat
-    behind: float = 0.0
-    edge: PositiveFloat = 1.6
-    share: Annotated[float, Field(gt=0, lt=1)] = 0.7
+    centre_of_mass_behind: float = 0.0
+    tipping_edge: PositiveFloat = 1.6
+    moment_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.7
     stiffness: PositiveFloat = 8.0e3
     damping: NonNegativeFloat = 100.0
 
 
 class SensorFault(StrictModel):
-    """A sensor that freezes at the time `at` [s], such as `angle.boom` or `pressure_rod.stick`."""
+    """A sensor that freezes at the time `start` [s], such as `angle.boom` or `pressure_rod.stick`."""
+
+    renamed = {"at": "start"}
 
     channel: str
-    at: NonNegativeFloat
+    start: NonNegativeFloat
 
 
 class ButtonCommand(StrictModel):
-    """Command of an axis that the joystick does not move (saw, grab), from `at` [s] on."""
+    """Command of an axis that the joystick does not move (saw, grab), from `start` [s] on."""
 
-    at: NonNegativeFloat
+    renamed = {"at": "start"}
+
+    start: NonNegativeFloat
     axis: Name
     command: float
 
@@ -217,74 +229,71 @@ class RecordedMotion(StrictModel):
     recorded: str
 
 
+RENAMED_OPERATOR_PARAMETERS = {
+    "reaction": "visual_delay", "force_noise": "force_weber", "skill": "max_crossover_frequency",
+    "sight": "visual_threshold", "sight_noise": "display_noise", "touch": "haptic_delay",
+    "crossover": "max_crossover_frequency", "placing_margin": "positioning_margin",
+    "largest_force": "max_force", "stiffening": "cocontraction_stiffness_factor",
+    "usual_speed": "expected_speed", "usual_scale": "expected_scale",
+    "surprise": "new_gain_log_std", "memory": "memory_time", "imagination": "unfelt_gain_std",
+    "dwell": "correction_interval", "muscle": "handle_position_gain",
+}  # fmt: skip
+"""Former name of an operator parameter -> present name."""
+
+
 class OperatorSettings(StrictModel):
     """Parameters of the simulated operator: perception, neuromuscular dynamics and arm impedance.
 
-    `file` replaces `hydrotele/teleop/operator.yaml`, which documents every parameter. `drawn`
+    `file` replaces `hydrotele/teleop/operator.yaml`, which documents every parameter. `sample`
     selects a random operator, with that number, from the distributions in the file. `grip`
     (relaxed, normal, firm) replaces the arm impedance of the joystick file; `posture` (near, mid,
     far) adds the stiffness ellipses of an arm. Parameters that are set here replace those of the
     file:
 
-    visual_delay: delay from vision to action [s]; touch: delay from haptic perception to action
-    [s]; crossover: maximum crossover frequency of loops that the operator closes by vision [rad/s];
-    force_weber, position_weber, integration_weber: Weber fractions of perceived forces,
-    displacements and stiffnesses; remnant: noise-to-signal ratio of the operator's observations;
-    sight: visual resolution of a position [m] or [rad]; sight_noise: noise of a displayed force, as
-    a fraction of its maximum; tremor: noise of the muscle force [N]; muscle: gain of the position
-    control of the handle [1/s]; cocontraction: fraction of the maximum; imagination: relative
-    standard deviation of the expected effect of a command without force feedback; task_stiffness:
-    stiffness that the operator is used to [N/m]; dwell: time between corrective pushes [s].
-    `Operator` in `hydrotele.teleop.operator_parameters` documents all of them.
+    visual_delay: delay from vision to action [s]; haptic_delay: delay from haptic perception to
+    action [s]; max_crossover_frequency: maximum crossover frequency of loops that the operator
+    closes by vision [rad/s]; force_weber, position_weber, integration_weber: Weber fractions of
+    perceived forces, displacements and stiffnesses; remnant: noise-to-signal ratio of the
+    operator's observations; visual_threshold: visual resolution of a position [m] or [rad];
+    display_noise: noise of a displayed force, as a fraction of its maximum; tremor: noise of the
+    muscle force [N]; handle_position_gain: gain of the position control of the handle [1/s];
+    cocontraction: fraction of the maximum; unfelt_gain_std: relative standard deviation of the
+    expected effect of a command without force feedback; task_stiffness: stiffness that the operator
+    is used to [N/m]; correction_interval: time between corrective pushes [s]. `Operator` in
+    `hydrotele.teleop.operator_parameters` documents all of them.
     """
 
+    renamed = {"drawn": "sample"} | RENAMED_OPERATOR_PARAMETERS
+
     file: str | None = None
-    drawn: Annotated[int, Field(ge=0)] | None = None
+    sample: Annotated[int, Field(ge=0)] | None = None
     grip: Name | None = None
     posture: Name | None = None
     visual_delay: NonNegativeFloat | None = None
-    crossover: PositiveFloat | None = None
+    max_crossover_frequency: PositiveFloat | None = None
     tracking_margin: PositiveFloat | None = None
-    placing_margin: PositiveFloat | None = None
+    positioning_margin: PositiveFloat | None = None
     gain_margin: Annotated[float, Field(gt=0, lt=1)] | None = None
     neuromuscular_frequency: PositiveFloat | None = None
     neuromuscular_damping: PositiveFloat | None = None
     remnant: NonNegativeFloat | None = None
-    sight: NonNegativeFloat | None = None
-    sight_noise: NonNegativeFloat | None = None
-    touch: NonNegativeFloat | None = None
+    visual_threshold: NonNegativeFloat | None = None
+    display_noise: NonNegativeFloat | None = None
+    haptic_delay: NonNegativeFloat | None = None
     force_weber: NonNegativeFloat | None = None
     position_weber: NonNegativeFloat | None = None
     integration_weber: NonNegativeFloat | None = None
     tremor: NonNegativeFloat | None = None
-    muscle: PositiveFloat | None = None
-    largest_force: PositiveFloat | None = None
+    handle_position_gain: PositiveFloat | None = None
+    max_force: PositiveFloat | None = None
     cocontraction: Annotated[float, Field(ge=0, le=1)] | None = None
-    usual_speed: PositiveFloat | None = None
-    usual_scale: PositiveFloat | None = None
+    expected_speed: PositiveFloat | None = None
+    expected_scale: PositiveFloat | None = None
     task_stiffness: PositiveFloat | None = None
-    surprise: PositiveFloat | None = None
-    memory: PositiveFloat | None = None
-    imagination: NonNegativeFloat | None = None
-    dwell: PositiveFloat | None = None
-
-    @model_validator(mode="before")
-    @classmethod
-    def _replace_deprecated_keys(cls, data):
-        """Replace deprecated keys by their current names, with a warning."""
-        if not isinstance(data, dict):
-            return data
-        for old, new in _DEPRECATED_KEYS.items():
-            if old in data:
-                if new in data:
-                    raise ValueError(f"{old} is the former name of {new}; give one of them")
-                message = f"pilot.perception: {old} is deprecated and was read as {new}; rename it"
-                warnings.warn(message, FutureWarning, stacklevel=2)
-                data = {new if key == old else key: value for key, value in data.items()}
-        return data
-
-
-_DEPRECATED_KEYS = {"reaction": "visual_delay", "force_noise": "force_weber", "skill": "crossover"}
+    new_gain_log_std: PositiveFloat | None = None
+    memory_time: PositiveFloat | None = None
+    unfelt_gain_std: NonNegativeFloat | None = None
+    correction_interval: PositiveFloat | None = None
 
 
 def _get_kind(value: object) -> object:
@@ -331,8 +340,8 @@ class TeleopPilot(StrictModel):
       stiffness of hand and joystick.
     - `coordinating_force`: reflects the lag of the machine; a stiff servo hides the environment
       from it, and under rate control it needs a smaller coupling with delay. It compares the
-      position of the machine with that of the handle (`coordinating: handle`, Zhu 1994, 3.52 and
-      3.53), or with the reference of the machine (`reference`), which channel delay retards.
+      position of the machine with that of the handle (`coordinating_position: handle`, Zhu 1994,
+      3.52 and 3.53), or with the reference of the machine (`reference`), which channel delay retards.
     - `four_channel` under position control: in the mean, hand force = ratio x contact force and
       position = scale x handle. On a valve-controlled machine it bounces unless ratio x scale x
       environment stiffness is below the coupling, about 400 N/m. Under rate control it does not
@@ -341,7 +350,7 @@ class TeleopPilot(StrictModel):
       per displacement, for one second) x the identified environment stiffness to the stiffness of
       the joystick, within its bounds. It likewise adds damping, at most that of the joystick, and
       mass, at most half of that of the flotor.
-    - `wave_variables` (impedance `wave` [N s/m]) and `passivity_control`: make the channel passive
+    - `wave_variables` (impedance `wave_impedance` [N s/m]) and `passivity_control`: make the channel passive
       with any delay and jitter, under position control. A virtual mass follows the handle through
       the coupling, whose force is sent back, and the contact force moves it. The channel cannot
       compensate a delayed estimate of the contact force.
@@ -354,6 +363,8 @@ class TeleopPilot(StrictModel):
     errors accumulate (Zhu 1994, Eq. 2.1). The second is provided for comparison.
     """
 
+    renamed = {"coordinating": "coordinating_position", "wave": "wave_impedance"}
+
     kind: Literal["teleop"]
     joystick: str = "joystick"
     gains: Name = "excavator"
@@ -365,10 +376,10 @@ class TeleopPilot(StrictModel):
     force_limit: PositiveFloat | None = None
     coupling: NonNegativeFloat | None = None
     coupling_damping: NonNegativeFloat | None = None
-    coordinating: Literal["handle", "reference"] = "handle"
+    coordinating_position: Literal["handle", "reference"] = "handle"
     compliance: Literal["springs", "decoupled"] = "springs"
     resolved_motion: Literal["inverse_kinematics", "inverse_jacobian"] = "inverse_kinematics"
-    wave: PositiveFloat | None = None
+    wave_impedance: PositiveFloat | None = None
     virtual_mass: PositiveFloat = 2.0
     force: Literal["static", "dynamic", "true"] = "dynamic"
     bandwidth: Annotated[float, Field(gt=0, le=10.0 * math.pi)] = 3.0 * math.pi

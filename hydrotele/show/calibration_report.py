@@ -374,7 +374,7 @@ def _parameter_section(document: dict[str, Any]) -> Section:
     for one in document["parameters"]:
         unit, factor = _display_unit(one["unit"])
         reach = "" if one["std"] is None else f"{0.5 * factor * (one['high'] - one['low']):.2g}"
-        told = {"full": "yes", "combination": "in a combination"}.get(one["told"], "no")
+        told = {"full": "yes", "combination": "in a combination"}.get(one["identifiability"], "no")
         rows.append((one["name"], f"{factor * one['value']:.4g}", reach, unit, told))
     return Section(
         "Parameters", "t and r: displacement along and rotation about the axes of a joint frame;"
@@ -388,7 +388,7 @@ def _parameter_section(document: dict[str, Any]) -> Section:
 def _combination_section(document: dict[str, Any]) -> Section:
     units = {one["name"]: one["unit"] for one in document["parameters"]}
     rows = []
-    for one in document["told"]:
+    for one in document["identifiable_combinations"]:
         unit, factor = _display_unit(units[one["text"].split()[0]])
         reach = f"{0.5 * factor * (one['high'] - one['low']):.2g}"
         rows.append((one["text"], f"{factor * one['value']:.4g}", reach, unit))
@@ -398,7 +398,7 @@ def _combination_section(document: dict[str, Any]) -> Section:
         " values of the single members of a combination follow from their expected sizes, not from"
         " the data.",
         ("parameter or combination", "value", "95 % +-", "unit"), rows, "-nn",
-        notes=(f"not identifiable: {', '.join(document['unknown']) or 'none'}",),
+        notes=(f"not identifiable: {', '.join(document['not_identifiable']) or 'none'}",),
     )  # fmt: skip
 
 

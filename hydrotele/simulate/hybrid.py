@@ -41,7 +41,7 @@ _PART_COLOURS = {
     "platform": (0.16, 0.45, 0.62, 1.0),
 }  # fmt: skip
 # Masses of links, tubes, rods and moving platform [kg].
-_PART_MASSES = {"slide": 400.0, "turn": 250.0, "tube": 18.0, "rod": 9.0, "platform": 60.0}
+_PART_MASSES = {"prismatic": 400.0, "revolute": 250.0, "tube": 18.0, "rod": 9.0, "platform": 60.0}
 
 
 class MeasuredPoses(NamedTuple):
@@ -153,7 +153,7 @@ def simulate_measured_poses(
         Readings with noise, and the true values.
     """
     pose = forward_kinematics(robot, joints, legs)
-    sizes = np.where(robot.kinds == REVOLUTE, noise.get("turn", 0.0), noise.get("slide", 0.0))
+    sizes = np.where(robot.kinds == REVOLUTE, noise.get("revolute", 0.0), noise.get("prismatic", 0.0))
     lengths = wire_lengths(wires, pose)
     return MeasuredPoses(
         joints + sizes * rng.normal(size=joints.shape),
@@ -306,7 +306,7 @@ def _add_carriage_shapes(links, frames, last, robot: HybridRobot) -> None:
     """Add the carriage's geoms: bars between axes, blocks for slides, a plate below the legs."""
     places = [*frames[:, :3, 3], last[:3, 3]]
     for i, (body, kind) in enumerate(zip(links, robot.kinds, strict=True)):
-        mass = _PART_MASSES["turn"] if kind == REVOLUTE else _PART_MASSES["slide"]
+        mass = _PART_MASSES["revolute"] if kind == REVOLUTE else _PART_MASSES["prismatic"]
         start, end = places[i], places[i + 1]
         if np.linalg.norm(end - start) > 0.05:
             _add_bar(body, start, end, 0.075, mass, "carriage")

@@ -146,7 +146,7 @@ _CUT_WIDTH = 0.02  # m, width of the saw cut
 _GRAVITY = 9.81
 _ROOT_STIFFNESS, _ROOT_ROTATION_STIFFNESS = 4.0e6, 6.0e5  # N/m, N m/rad: stiffness of a tree's root
 _MIN_CUTTING_SPEED = 30.0  # rad/s: lowest speed at which a saw cuts
-_MAX_HEIGHT_ERROR = 0.15  # m: largest difference between the saw's height and that of the kerf
+_MAX_HEIGHT_ERROR = 0.15  # m: largest difference between the saw's height and that of the cut
 _NORMALS = {"x": (1, 0, 0), "-x": (-1, 0, 0), "y": (0, 1, 0), "-y": (0, -1, 0), "z": (0, 0, 1)}
 _FEED_FORCE_RATIO = 0.3  # feed force per cutting force at the rim of the disc
 _STEM_POCKET = (0.325, 0.0, -0.62), (0.325, 0.35, 0.0)  # m, in front of a head, between its arms
@@ -268,10 +268,10 @@ def _write_tree(root, name: str, tree: StandingTree, machine: Machine, where: st
     mass = tree.density * math.pi * radius**2 * tree.height
     bark = {"rgba": (0.36, 0.27, 0.18, 1), "mass": 0}
     root.worldbody.add(
-        "geom", name=f"{name}_stump", type="cylinder", size=(radius * 1.05, tree.kerf / 2.0),
-        pos=(x, y, tree.kerf / 2.0), contype=1, conaffinity=2, **bark,
+        "geom", name=f"{name}_stump", type="cylinder", size=(radius * 1.05, tree.cut_height / 2.0),
+        pos=(x, y, tree.cut_height / 2.0), contype=1, conaffinity=2, **bark,
     )  # fmt: skip
-    body = root.worldbody.add("body", name=name, pos=(x, y, tree.kerf + _CUT_WIDTH))
+    body = root.worldbody.add("body", name=name, pos=(x, y, tree.cut_height + _CUT_WIDTH))
     across = mass * (3.0 * radius**2 + tree.height**2) / 12.0
     body.add("inertial", mass=mass, pos=(0, 0, half), diaginertia=(across, across, mass * radius**2 / 2))
     for axis, way in zip("xyz", np.eye(3), strict=True):
@@ -323,8 +323,8 @@ def log_grip(model: mujoco.MjModel, log: LogOnGround) -> np.ndarray:
     low, high = site.pos - site.size + (radius, 0, radius), site.pos + site.size - (0, 0, radius)
     reach = log.length / 2.0 - _LOG_END_LENGTH
     return grip_parameters(
-        log.closed,
-        log.open,
+        log.closed_angle,
+        log.open_angle,
         1,
         _MAX_LOG_ANGLE,
         0.5 * (low + high),
@@ -416,7 +416,7 @@ class _TreeState:
     def __init__(self, machine: Machine, model: mujoco.MjModel, name: str, tree: StandingTree) -> None:
         self._model, self._tree, self.name = model, tree, name
         saw = machine.link_of(machine.axes[tree.saw].joint)
-        grip = grip_parameters(tree.closed, tree.closed, 2, _MAX_STEM_ANGLE, *_STEM_POCKET, 2)
+        grip = grip_parameters(tree.closed_angle, tree.closed_angle, 2, _MAX_STEM_ANGLE, *_STEM_POCKET, 2)
         self._grip = _Gripper(machine, model, name, tree.grab, grip)
         self._saw = model.body(saw).id
         self._spin = model.joint(machine.axes[tree.saw].joint).dofadr[0]
@@ -473,11 +473,11 @@ class _TreeState:
         stem, saw = data.xpos[self._body], data.xpos[self._saw]
         axis = data.xmat[self._saw].reshape(3, 3)[:, 2]
         height = saw[2] - (axis[:2] @ (stem[:2] - saw[:2])) / max(abs(axis[2]), 0.3)
-        if abs(height - self._tree.kerf) > _MAX_HEIGHT_ERROR:
+        if abs(height - self._tree.cut_height) > _MAX_HEIGHT_ERROR:
             return
         way = stem[:2] - saw[:2]
         far = float(np.hypot(*way))
-        if abs(float(saw[2]) - self._tree.kerf) > 2.0 * _MAX_HEIGHT_ERROR + self._radius:
+        if abs(float(saw[2]) - self._tree.cut_height) > 2.0 * _MAX_HEIGHT_ERROR + self._radius:
             return
         reach = self._radius - (far - self._tree.diameter / 2.0)
         fresh = min(reach, self._tree.diameter) - self.depth
@@ -486,7 +486,7 @@ class _TreeState:
         self.depth += fresh
         radius = self._tree.diameter / 2.0
         chord = 2.0 * math.sqrt(max(radius**2 - (radius - self.depth) ** 2, 0.0))
-        power = self._tree.energy * _CUT_WIDTH * chord * fresh / period
+        power = self._tree.cutting_energy * _CUT_WIDTH * chord * fresh / period
         torque = power / spin
         direction = -math.copysign(1.0, float(data.qvel[self._spin]))
         feed = _FEED_FORCE_RATIO * torque / self._radius

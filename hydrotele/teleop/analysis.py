@@ -178,56 +178,67 @@ class Delays(StrictModel):
 class StiffnessFeedbackAxis(StrictModel):
     """Joystick axis with stiffness feedback, without the hand, which is added to it."""
 
-    nominal: NonNegativeFloat
-    least: NonNegativeFloat
-    most: PositiveFloat
+    renamed = {"nominal": "nominal_stiffness", "least": "min_stiffness", "most": "max_stiffness"}
+
+    nominal_stiffness: NonNegativeFloat
+    min_stiffness: NonNegativeFloat
+    max_stiffness: PositiveFloat
     damping: NonNegativeFloat
     mass: PositiveFloat
 
     @model_validator(mode="after")
     def _check_order(self):
-        if not self.least <= self.nominal <= self.most:
+        if not self.min_stiffness <= self.nominal_stiffness <= self.max_stiffness:
             raise ValueError(
-                f"must be ordered, least <= nominal <= most: {self.least:g}, {self.nominal:g}, {self.most:g}"
+                "must be ordered, min_stiffness <= nominal_stiffness <= max_stiffness:"
+                f" {self.min_stiffness:g}, {self.nominal_stiffness:g}, {self.max_stiffness:g}"
             )
         return self
 
     def to_spring(self) -> StiffnessAxis:
         """Return the axis as input of the stability theorem."""
-        return StiffnessAxis(self.mass, self.damping, self.nominal, self.least, self.most)
+        return StiffnessAxis(self.mass, self.damping, self.nominal_stiffness, self.min_stiffness, self.max_stiffness)
 
 
 class MapRange(StrictModel):
     """Range of the stability map: delay in each direction [s], factor on the return channels."""
 
-    longest_delay: Annotated[float, Field(gt=0, le=MAX_DELAY)] = 0.5
-    least_factor: PositiveFloat = 0.01
-    most_factor: PositiveFloat = 100.0
+    renamed = {
+        "longest_delay": "max_delay", "least_factor": "min_factor", "most_factor": "max_factor",
+    }  # fmt: skip
+
+    max_delay: Annotated[float, Field(gt=0, le=MAX_DELAY)] = 0.5
+    min_factor: PositiveFloat = 0.01
+    max_factor: PositiveFloat = 100.0
     points: Annotated[int, Field(ge=3, le=200)] = 25
 
     @model_validator(mode="after")
     def _check_order(self):
-        if not self.least_factor < self.most_factor:
-            raise ValueError("least_factor must be below most_factor")
+        if not self.min_factor < self.max_factor:
+            raise ValueError("min_factor must be below max_factor")
         return self
 
 
 class ImpedanceRange(StrictModel):
-    """Range of impedances for random sampling, log-uniform between least and most."""
+    """Range of impedances for random sampling, log-uniform between `min` and `max`."""
 
-    least: ImpedanceParameters
-    most: ImpedanceParameters
+    renamed = {"least": "min", "most": "max"}
+
+    min: ImpedanceParameters
+    max: ImpedanceParameters
 
     @model_validator(mode="after")
     def _check_order(self):
         for name in ("mass", "damping", "stiffness"):
-            if not getattr(self.least, name) <= getattr(self.most, name):
-                raise ValueError(f"{name}: least must not be above most")
+            if not getattr(self.min, name) <= getattr(self.max, name):
+                raise ValueError(f"{name}: min must not be above max")
         return self
 
 
 class TeleopCaseFile(StrictModel):
     """Complete input of an analysis: one axis, all in one scale of lengths and forces."""
+
+    renamed = {"wave": "wave_impedance"}
 
     name: Name
     master: BodyParameters
@@ -240,7 +251,7 @@ class TeleopCaseFile(StrictModel):
     delays: Delays = Field(default_factory=Delays)
     structures: Annotated[tuple[str, ...], Field(min_length=1)] = STRUCTURES
     stiffness: StiffnessFeedbackAxis | None = None
-    wave: NonNegativeFloat = 0.0
+    wave_impedance: NonNegativeFloat = 0.0
     hands: ImpedanceRange | None = None
     tasks: ImpedanceRange | None = None
     map: MapRange = Field(default_factory=MapRange)
@@ -256,7 +267,7 @@ class TeleopCaseFile(StrictModel):
         return TeleoperatorAxis(
             self.master.impedance(), self.slave.impedance(), self.master_control.impedance(),
             self.slave_control.impedance(), self.hand.impedance(), self.task.impedance(), gains,
-            self.delays.forward, self.delays.back, self.wave,
+            self.delays.forward, self.delays.back, self.wave_impedance,
         )  # fmt: skip
 
 

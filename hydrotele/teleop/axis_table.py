@@ -63,14 +63,15 @@ def build_axis_table(joystick: Joystick, pilot: TeleopPilot, coordinates: tuple[
         reach = joystick.handle_travel[number]
         detent = law.detent if pilot.detent and pilot.mode == "rate" else None  # needs a dead band
         table[number, : COORDINATE] = (
-            law.nominal, law.least, law.most, (law.most - law.nominal) / law.force_limit,
+            law.nominal_stiffness, law.min_stiffness, law.max_stiffness,
+            (law.max_stiffness - law.nominal_stiffness) / law.force_limit,
             law.damping, law.force_limit, law.deadband, detent.drop if detent else 0.0,
-            detent.outside if detent else -1.0, reach,
+            detent.slope if detent else -1.0, reach,
         )  # fmt: skip
         lever = 1.0 if number < 3 else LEVER
         table[number, REFLECTION_RATIO:] = (
             lever * pilot.ratio, lever**2 * soft, lever**2 * damped,
-            pilot.force_limit or law.force_limit, lever**2 * (pilot.wave or damped),
+            pilot.force_limit or law.force_limit, lever**2 * (pilot.wave_impedance or damped),
         )  # fmt: skip
     _assign_coordinates(pilot, table, coordinates)
     _check_goals(pilot, table, coordinates)

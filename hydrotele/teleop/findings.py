@@ -593,7 +593,7 @@ def findings_to_dict(found: TeleopFindings) -> dict:
         },
     }  # fmt: skip
     if found.spring:
-        pair = {"held": found.spring.with_hand(case.hand), "let_go": found.spring}
+        pair = {"held": found.spring.with_hand(case.hand), "released": found.spring}
         document["stiffness_feedback"] = {name: _spring_to_dict(one) for name, one in pair.items()}
     if found.robustness_results:
         document["robust"] = {
@@ -615,11 +615,11 @@ def _analysis_to_dict(one: StructureAnalysis) -> dict:
         "stable": one.is_stable_held,
         "unstable_poles": one.unstable_poles,
         "unstable_poles_free": one.unstable_poles_free,
-        "stable_let_go": one.is_stable_released,
-        "unstable_poles_let_go": one.unstable_poles_released,
-        "unstable_poles_let_go_free": one.unstable_poles_released_free,
+        "stable_released": one.is_stable_released,
+        "unstable_poles_released": one.unstable_poles_released,
+        "unstable_poles_released_free": one.unstable_poles_released_free,
         "gain_margin": one.gain_margin,
-        "largest_delay": one.max_delay,
+        "max_delay": one.max_delay,
         "passive": one.has_passive_port,
         "scattering_peak": one.scattering_norms[worst],
         "scattering_peak_frequency": one.frequencies[worst],
@@ -633,7 +633,7 @@ def _analysis_to_dict(one: StructureAnalysis) -> dict:
 
 
 def _robustness_to_dict(one: Robustness) -> dict:
-    names = ("held_task", "held_free", "let_go_task", "let_go_free")
+    names = ("held_task", "held_free", "released_task", "released_free")
     document = {
         "absolutely_stable": one.has_absolute_stability,
         "llewellyn": one.llewellyn,
@@ -641,21 +641,21 @@ def _robustness_to_dict(one: Robustness) -> dict:
             name: {"stable": told.is_stable, "reason": told.reason}
             for name, told in zip(names, one.sampled, strict=True)
         },
-        "drawn": {
+        "sampled_pairs": {
             "pairs": one.sampled_pairs.pair_count, "unstable": one.sampled_pairs.unstable_count,
-            "unstable_let_go": one.sampled_pairs.unstable_released_count,
+            "unstable_released": one.sampled_pairs.unstable_released_count,
             "worst_growth_rate": one.sampled_pairs.worst_growth_rate,
             "worst_hand": vars(one.sampled_pairs.worst_hand), "worst_task": vars(one.sampled_pairs.worst_task),
         },
     }  # fmt: skip
     if one.z_width_result:
         document["z_width"] = {
-            "decades": one.z_width_result.decades, "stiffest_task_held": one.z_width_result.max_stiffness_held,
-            "stiffest_task_let_go": one.z_width_result.max_stiffness_released,
-            "stiffest_tried": one.z_width_result.max_tested_stiffness,
+            "decades": one.z_width_result.decades, "max_stiffness_held": one.z_width_result.max_stiffness_held,
+            "max_stiffness_released": one.z_width_result.max_stiffness_released,
+            "max_tested_stiffness": one.z_width_result.max_tested_stiffness,
         }  # fmt: skip
     if one.released_polynomial:
-        document["master_let_go"] = {
+        document["released_master"] = {
             "coefficients": one.released_polynomial.coefficients,
             "unstable_poles": one.released_polynomial.unstable_zeros,
         }  # fmt: skip
@@ -668,9 +668,10 @@ def _complex_to_pairs(values: np.ndarray) -> list:
 
 def _spring_to_dict(one: StiffnessAxis) -> dict:
     return {
-        "mass": one.mass, "damping": one.damping, "least": one.min_stiffness, "most": one.max_stiffness,
-        "margin": one.theorem_margin, "damping_asked": one.theorem_damping, "worst_growth": one.half_swing_growth,
-        "least_damping": one.min_stable_damping, "stable_by": one.stability_criterion,
+        "mass": one.mass, "damping": one.damping, "min_stiffness": one.min_stiffness,
+        "max_stiffness": one.max_stiffness, "margin": one.theorem_margin,
+        "theorem_damping": one.theorem_damping, "worst_growth": one.half_swing_growth,
+        "min_stable_damping": one.min_stable_damping, "stable_by": one.stability_criterion,
     }  # fmt: skip
 
 
@@ -878,7 +879,7 @@ def scenario_findings_to_dict(found: ScenarioFindings) -> dict:
         A dictionary.
     """
     case, loop, tip = found.case, found.loop, found.case.tip
-    springs = {"held": found.held_spring, "let_go": found.released_spring}
+    springs = {"held": found.held_spring, "released": found.released_spring}
     return {
         "name": found.name,
         "coordinate": tip.coordinate,
@@ -893,19 +894,19 @@ def scenario_findings_to_dict(found: ScenarioFindings) -> dict:
         "structure": {
             "name": loop.structure, "of_the_scenario": loop.is_scenario_structure, "stable": loop.is_stable,
             "unstable_poles": loop.unstable_poles, "gain_margin": loop.gain_margin,
-            "largest_delay": loop.max_delay, "frequency": loop.frequency,
+            "max_delay": loop.max_delay, "frequency": loop.frequency,
             "pole": [loop.pole.real, loop.pole.imag], "ratio": case.ratio,
-            "largest_ratio": loop.max_ratio, "force_limit": case.force_limit,
+            "max_ratio": loop.max_ratio, "force_limit": case.force_limit,
             "hand_force_at_limit": loop.hand_force,
-            "largest_ratio_with_deadband": loop.max_ratio_with_deadband,
+            "max_ratio_with_deadband": loop.max_ratio_with_deadband,
         },
         "stiffness_feedback": {
             "ratio_at_deadband_edge": found.deadband_edge_ratio,
             **{
                 name: {
-                    "mass": one.mass, "damping": one.damping, "most": one.max_stiffness,
-                    "margin": one.theorem_margin, "damping_asked": one.theorem_damping,
-                    "worst_growth": one.half_swing_growth, "least_damping": one.min_stable_damping,
+                    "mass": one.mass, "damping": one.damping, "max_stiffness": one.max_stiffness,
+                    "margin": one.theorem_margin, "theorem_damping": one.theorem_damping,
+                    "worst_growth": one.half_swing_growth, "min_stable_damping": one.min_stable_damping,
                     "stable_by": one.stability_criterion,
                 }
                 for name, one in springs.items()

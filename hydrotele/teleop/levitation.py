@@ -102,7 +102,7 @@ def make_levitation_control(
     Raises:
         InputError: the parameters are not physical.
     """
-    f, c, alone = joystick.flotor, joystick.coils, joystick.alone
+    f, c, alone = joystick.flotor, joystick.coils, joystick.closed_loop
     own = Flotor(f.mass, np.array(f.com), np.diag(f.inertia))
     return LevitationControl(
         flotor_model=body or own,

@@ -346,7 +346,7 @@ class LinearCase:
         def master_block(s: np.ndarray) -> np.ndarray:
             if feels_force:
                 return self._centring_impedance(rate, s)
-            if self.pilot.coordinating == "handle":
+            if self.pilot.coordinating_position == "handle":
                 asked = self.axis_parameters[GAIN] / s if rate else self.axis_parameters[GAIN]
                 linked = self._coupling_impedance(rate, s, self.periods.control_period) * asked
             else:

@@ -86,7 +86,7 @@ def make_visual_loop(
     Returns:
         Parameters and initial state of the loop.
     """
-    off = math.exp(operator.surprise * rng.standard_normal())
+    off = math.exp(operator.new_gain_log_std * rng.standard_normal())
     late = operator.visual_delay + (operator.lead_delay if form == DOUBLE_INTEGRATOR else 0.0)
     rows = 4 + math.ceil((late + max(_CANDIDATE_DEAD_TIMES)) / step)
     places = [(lag, dead) for lag in _CANDIDATE_LAGS for dead in _CANDIDATE_DEAD_TIMES]
@@ -94,8 +94,8 @@ def make_visual_loop(
     n = len(places)
     return VisualLoop(
         parameters=np.array([
-            step, late - 0.5 * step, operator.remnant, threshold, operator.memory, operator.surprise, max_output, form,
-            off * expected_gain,
+            step, late - 0.5 * step, operator.remnant, threshold, operator.memory_time, operator.new_gain_log_std,
+            max_output, form, off * expected_gain,
         ]),
         lag=np.array([lag for lag, _ in places]),
         dead_time=np.array([dead for _, dead in places]),
@@ -275,7 +275,7 @@ def _max_operator_gain(operator: Operator, form: int, lag: float, late: float, m
     phase -= 2.0 * math.pi * round((phase[0] + math.pi * (1.0 if form == 2 else 0.5)) / math.tau)
     close = np.flatnonzero(phase >= margin - math.pi)
     turn = np.flatnonzero(phase >= -math.pi)
-    at = min(w[close[-1]] if len(close) else w[turn[-1]] / 3.0, operator.crossover)
+    at = min(w[close[-1]] if len(close) else w[turn[-1]] / 3.0, operator.max_crossover_frequency)
     beyond = size[turn[-1] :].max()  # includes the neuromuscular peak
     return float(min(1.0 / np.interp(at, w, size), operator.gain_margin / beyond))
 
@@ -382,8 +382,8 @@ def simulate_tracking(
         step: sampling period of the record [s].
         steps_per_decision: number of steps per decision.
         seed: seed of the noise and of the expected gain.
-        has_gain_error: whether the expected gain has the error given by `surprise`; otherwise it is
-            exact.
+        has_gain_error: whether the expected gain has the error given by `new_gain_log_std`; otherwise it
+            is exact.
 
     Returns:
         The record.

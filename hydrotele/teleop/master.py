@@ -189,7 +189,7 @@ def build_master(
         resolution=np.array([joystick.sensing.translation] * 3 + [joystick.sensing.rotation] * 3),
         kind=np.array([
             REFLECTION_KINDS.index(pilot.reflection), RATE if pilot.mode == "rate" else POSITION,
-            pilot.coordinating == "handle", pilot.compliance == "decoupled",
+            pilot.coordinating_position == "handle", pilot.compliance == "decoupled",
         ]),
     )  # fmt: skip
     state = make_flat_state(MasterState, [(6,)] * 10 + [(1,), (2,), (6, SENT_SIGNAL + 2)])
@@ -532,14 +532,22 @@ def tipping_ratio(tip_over: TipOver, radius: float, force: float) -> float:
         1 if the machine tips: backwards about its rear edge if pushed up, forwards about the front
         edge if pulled down.
 
-    >>> machine = TipOver(mass=20000.0, behind=0.4, edge=1.6)
+    >>> machine = TipOver(mass=20000.0, centre_of_mass_behind=0.4, tipping_edge=1.6)
     >>> round(tipping_ratio(machine, 6.4, 29430.0), 3)
     1.0
     """
     weight = tip_over.mass * _GRAVITY
     if force > 0.0:
-        return force * (radius + tip_over.edge) / (weight * (tip_over.edge - tip_over.behind))
-    return -force * max(radius - tip_over.edge, 0.0) / (weight * (tip_over.edge + tip_over.behind))
+        return (
+            force
+            * (radius + tip_over.tipping_edge)
+            / (weight * (tip_over.tipping_edge - tip_over.centre_of_mass_behind))
+        )
+    return (
+        -force
+        * max(radius - tip_over.tipping_edge, 0.0)
+        / (weight * (tip_over.tipping_edge + tip_over.centre_of_mass_behind))
+    )
 
 
 def tip_over_wrench(
@@ -565,7 +573,7 @@ def tip_over_wrench(
     """
     extra[:] = 0.0
     force, radius = float(packet[TIP_FORCE, 2]), float(packet[TIP_POSITION, 0] + start[0])
-    danger = min(1.0, (tipping_ratio(tip_over, radius, force) - tip_over.share) / _FULL_ACTION_RANGE)
+    danger = min(1.0, (tipping_ratio(tip_over, radius, force) - tip_over.moment_fraction) / _FULL_ACTION_RANGE)
     if not danger > 0.0:
         return
     for axis in range(6):

@@ -87,7 +87,7 @@ def draw_perception_errors(operator: Operator, rng: np.random.Generator, count: 
     """Draw the perception errors of a run, one set per exploration.
 
     Args:
-        operator: operator with Weber fractions; an exploration lasts `dwell`.
+        operator: operator with Weber fractions; an exploration lasts `correction_interval`.
         rng: random generator of the errors.
         count: number of decisions.
         step: time between two decisions [s].
@@ -95,7 +95,7 @@ def draw_perception_errors(operator: Operator, rng: np.random.Generator, count: 
     Returns:
         The errors.
     """
-    exploration = (step * np.arange(count) / operator.dwell).astype(int)
+    exploration = (step * np.arange(count) / operator.correction_interval).astype(int)
     drawn = rng.standard_normal((exploration[-1] + 1, 3))[exploration]
     weber = np.array([operator.force_weber, operator.position_weber, operator.integration_weber])
     errors = np.exp(weber * drawn)
@@ -328,10 +328,10 @@ class OperatorModel:
         count = ticks // self.ticks_per_decision + 1
         self._feeling = draw_perception_errors(him, rng, count, self._step)
         sight = _colour_noise(rng.standard_normal(count), 4.0 * _JUDGEMENT_BANDWIDTH, self._step)
-        self._sight = him.sight_noise * sight
-        self._imagined_gain = math.exp(him.imagination * rng.standard_normal())
+        self._sight = him.display_noise * sight
+        self._imagined_gain = math.exp(him.unfelt_gain_std * rng.standard_normal())
         self._look = max(1, round(him.visual_delay / period))
-        self._touch = max(1, round(him.touch / period))
+        self._touch = max(1, round(him.haptic_delay / period))
         self._reflex = max(1, round(REFLEX_DELAY / period))
         self.estimated_force = np.full(count, np.nan)
         self._imagined, self._belief = 0.0, None
@@ -362,13 +362,13 @@ class OperatorModel:
         row, rate, him = self._numbers.axis[axis], self._pilot.mode == "rate", self.parameters
         turns = COORDINATES[c] not in ("r", "z")
         way = row[HANDLE_RANGE] - row[DEADBAND]
-        expected = him.usual_speed * (0.5 if turns else 1.0) / way
+        expected = him.expected_speed * (0.5 if turns else 1.0) / way
         if not rate:
             way = row[HANDLE_RANGE]
-            expected = him.usual_scale * (1.0 if not turns else 0.2 if axis < 3 else 0.1)
+            expected = him.expected_scale * (1.0 if not turns else 0.2 if axis < 3 else 0.1)
         self.loops[c] = make_visual_loop(
             him, self._step, expected, rng, form=INTEGRATOR if rate else GAIN,
-            margin=him.placing_margin, threshold=him.sight, max_output=(0.95 if rate else 1.0) * way,
+            margin=him.positioning_margin, threshold=him.visual_threshold, max_output=(0.95 if rate else 1.0) * way,
             steps=count,
         )  # fmt: skip
 
@@ -420,9 +420,11 @@ class OperatorModel:
         row, now, wanted = self._target.axis_parameters, tick * self._period, self.muscles.reference
         if self._belief is None:
             push = self.loops[int(row[COORDINATE])].state[ESTIMATED_GAIN] * self.parameters.task_stiffness
-            self._belief = _ForceEstimate(judged, math.inf, push, (self.parameters.surprise * push) ** 2)
+            self._belief = _ForceEstimate(judged, math.inf, push, (self.parameters.new_gain_log_std * push) ** 2)
         self._errors.append(judged)
-        pause = self.parameters.dwell * (_DISPLAY_PAUSE_FACTOR if self._target.is_force_displayed else 1.0)
+        pause = self.parameters.correction_interval * (
+            _DISPLAY_PAUSE_FACTOR if self._target.is_force_displayed else 1.0
+        )
         if now >= self._until:
             late = self._errors[len(self._errors) // 2 :]
             self._errors.clear()
@@ -469,7 +471,7 @@ class OperatorModel:
         """Return the variance of an estimated contact force as known to the operator [N^2]."""
         him, largest = self.parameters, self._target.tolerance / _FORCE_TOLERANCE_RATIO
         if self._target.is_force_displayed:
-            return (him.sight_noise * largest) ** 2
+            return (him.display_noise * largest) ** 2
         if self._pilot.reflection in ("stiffness", "impedance"):
             return (
                 self._feeling.stiffness_deviation * (row[NOMINAL_STIFFNESS] / row[STIFFNESS_PER_FORCE] + force)
@@ -670,9 +672,9 @@ def _make_arm_at_rest(
         force=np.zeros(6),
         arm=np.array([hand.axis_impedance(axis)[2] for axis in range(6)]),
         cross=np.array([hand.stiffness_shape[1] * hand.stiffness]),
-        max_force=operator.largest_force * _LEVERS,
+        max_force=operator.max_force * _LEVERS,
         weight=np.array([0.0, 0.0, 9.81 * hand.carried_mass, 0.0, 0.0, 0.0]),
-        gain=np.array([operator.muscle]),
+        gain=np.array([operator.handle_position_gain]),
         rest=np.zeros(6),
         rate=np.zeros(6),
         lag=neuromuscular_matrix(frequency, damping, period),

@@ -3,7 +3,7 @@
 `hydrotele/teleop/operator.yaml` is the default file. A scenario can name another file
 (`perception: {file: my_operator.yaml}`, as `hydrotele identify-operator` writes it), which needs
 only the parameters that differ. It can also sample an operator from the parameter ranges
-(`drawn: 3`), and set single parameters.
+(`sample: 3`), and set single parameters.
 """
 
 import dataclasses
@@ -20,13 +20,14 @@ from hydrotele.core.datafile import (
     Number,
     PositiveFloat,
     StrictModel,
+    describe_unknown_key,
     read_yaml,
     validate_data,
 )
 from hydrotele.core.datafile import suggest_valid_name as suggest_name
 from hydrotele.core.errors import InputError
 from hydrotele.machine.joystick import HandImpedance, Joystick, SymmetricMatrix
-from hydrotele.scenario.teleoperation import OperatorSettings
+from hydrotele.scenario.teleoperation import RENAMED_OPERATOR_PARAMETERS, OperatorSettings
 
 DEFAULT_OPERATOR_FILE = Path(__file__).resolve().with_name("operator.yaml")
 
@@ -59,15 +60,17 @@ class ArmParameters(StrictModel):
     """Right arm with two links in a horizontal plane: shoulder, elbow, hand.
 
     `length` [m], `mass` [kg] and `inertia` [kg m^2] about the links' centres; `joint_stiffness`
-    [N m/rad] of the shoulder, between both, and of the elbow; `usual` is the posture to which the
-    grips' parameters apply.
+    [N m/rad] of the shoulder, between both, and of the elbow; `reference_posture` is the
+    posture to which the grips' parameters apply.
     """
+
+    renamed = {"usual": "reference_posture"}
 
     length: Pair
     mass: Pair
     inertia: Pair
     joint_stiffness: SymmetricMatrix
-    usual: Name
+    reference_posture: Name
 
 
 class OperatorFile(StrictModel):
@@ -86,8 +89,8 @@ class OperatorFile(StrictModel):
     @model_validator(mode="after")
     def _check_names(self):
         if strange := set(self.parameters) - set(_PARAMETER_NAMES):
-            name = min(strange)
-            raise ValueError(f"parameters.{name}: {suggest_name(name, _PARAMETER_NAMES)}")
+            message = describe_unknown_key(min(strange), _PARAMETER_NAMES, RENAMED_OPERATOR_PARAMETERS)
+            raise ValueError(f"parameters: {message}")
         return self
 
 
@@ -98,61 +101,61 @@ class Operator:
     Attributes:
         visual_delay: delay from visual stimulus to motion, without the neuromuscular lag [s].
         lead_delay: additional delay while generating lead [s].
-        crossover: maximum crossover frequency [rad/s].
+        max_crossover_frequency: maximum crossover frequency [rad/s].
         tracking_margin: phase margin in tracking [rad].
-        placing_margin: phase margin in positioning the tip [rad].
+        positioning_margin: phase margin in positioning the tip [rad].
         gain_margin: maximum loop gain where the phase is -180 degrees [1].
         neuromuscular_frequency: natural frequency of limb and reflexes [rad/s].
         neuromuscular_damping: damping ratio of limb and reflexes [1].
         remnant: power density of the observation noise over pi times the variance of the observed
             quantity.
-        sight: visual position threshold [m] or [rad].
-        sight_noise: reading noise of a display, relative to its largest value.
-        touch: delay from touch to motion [s].
+        visual_threshold: visual position threshold [m] or [rad].
+        display_noise: reading noise of a display, relative to its largest value.
+        haptic_delay: delay from touch to motion [s].
         force_weber: relative standard deviation of a felt force.
         position_weber: relative standard deviation of a felt displacement.
         integration_weber: additional relative standard deviation of a felt stiffness.
         tremor: standard deviation of the muscles' force [N].
-        muscle: integral gain of the handle's position control [1/s].
-        largest_force: maximum force [N].
+        handle_position_gain: integral gain of the handle's position control [1/s].
+        max_force: maximum force [N].
         cocontraction: co-contraction, relative to its maximum.
-        stiffening: factor on the arm stiffness at full co-contraction.
-        usual_speed: expected speed with the handle at its stop [m/s], [rad/s].
-        usual_scale: expected gain under position control [m/m], [rad/rad].
+        cocontraction_stiffness_factor: factor on the arm stiffness at full co-contraction.
+        expected_speed: expected speed with the handle at its stop [m/s], [rad/s].
+        expected_scale: expected gain under position control [m/m], [rad/rad].
         task_stiffness: expected ground stiffness [N/m].
-        surprise: standard deviation of the logarithm of an unknown gain.
-        memory: time constant with which experience fades [s].
-        imagination: relative error of the imagined effect of a push that is not felt.
-        dwell: time between correcting pushes by feel [s].
+        new_gain_log_std: standard deviation of the logarithm of an unknown gain.
+        memory_time: time constant with which experience fades [s].
+        unfelt_gain_std: relative error of the imagined effect of a push that is not felt.
+        correction_interval: time between correcting pushes by feel [s].
     """
 
     visual_delay: float
     lead_delay: float
-    crossover: float
+    max_crossover_frequency: float
     tracking_margin: float
-    placing_margin: float
+    positioning_margin: float
     gain_margin: float
     neuromuscular_frequency: float
     neuromuscular_damping: float
     remnant: float
-    sight: float
-    sight_noise: float
-    touch: float
+    visual_threshold: float
+    display_noise: float
+    haptic_delay: float
     force_weber: float
     position_weber: float
     integration_weber: float
     tremor: float
-    muscle: float
-    largest_force: float
+    handle_position_gain: float
+    max_force: float
     cocontraction: float
-    stiffening: float
-    usual_speed: float
-    usual_scale: float
+    cocontraction_stiffness_factor: float
+    expected_speed: float
+    expected_scale: float
     task_stiffness: float
-    surprise: float
-    memory: float
-    imagination: float
-    dwell: float
+    new_gain_log_std: float
+    memory_time: float
+    unfelt_gain_std: float
+    correction_interval: float
 
     @property
     def neuromuscular_delay(self) -> float:
@@ -226,7 +229,7 @@ def scenario_operator(perception: OperatorSettings, folder: str = "") -> Operato
     """
     known = {name: getattr(perception, name) for name in _PARAMETER_NAMES if hasattr(perception, name)}
     known = {name: value for name, value in known.items() if value is not None}
-    return make_operator(_load_perception_file(perception, folder), perception.drawn, **known)
+    return make_operator(_load_perception_file(perception, folder), perception.sample, **known)
 
 
 def attach_operator_hand(joystick: Joystick, perception: OperatorSettings, folder: str = "") -> Joystick:
@@ -255,7 +258,7 @@ def attach_operator_hand(joystick: Joystick, perception: OperatorSettings, folde
             message = f"{perception.grip!r}; {suggest_name(perception.grip, file.grips)}"
             raise InputError("pilot.perception.grip", message)
         hand = file.grips[perception.grip]
-    factor = 1.0 + (him.stiffening - 1.0) * min(1.0, him.cocontraction)
+    factor = 1.0 + (him.cocontraction_stiffness_factor - 1.0) * min(1.0, him.cocontraction)
     if perception.posture:
         if perception.posture not in file.postures:
             message = f"{perception.posture!r}; {suggest_name(perception.posture, file.postures)}"
@@ -283,7 +286,7 @@ def apply_posture(hand: HandImpedance, file: OperatorFile, posture: str) -> Hand
     shapes = []
     for matrix, usual in zip(
         arm_impedance(arm, file.postures[posture]),
-        arm_impedance(arm, file.postures[arm.usual]), strict=True,
+        arm_impedance(arm, file.postures[arm.reference_posture]), strict=True,
     ):  # fmt: skip
         shape = matrix / math.sqrt(np.linalg.det(usual))
         shapes.append((float(shape[0, 0]), float(shape[0, 1]), float(shape[1, 1])))

@@ -86,9 +86,9 @@ def _make_operator_arm(operator: Operator, hand: HandImpedance, expected: float)
     zero = np.zeros(6)
     return flatten_state(NeuromuscularState(
         reference=zero, spring=zero + expected, detent=np.full((3, 6), -1.0), correction=zero,
-        force=zero, arm=zero + hand.stiffness, cross=np.zeros(1), max_force=zero + operator.largest_force,
+        force=zero, arm=zero + hand.stiffness, cross=np.zeros(1), max_force=zero + operator.max_force,
         weight=np.array([hand.mass, hand.damping, 0.0, 0.0, 0.0, 0.0]),
-        gain=np.array([operator.muscle]), rest=zero, rate=zero,
+        gain=np.array([operator.handle_position_gain]), rest=zero, rate=zero,
         lag=neuromuscular_matrix(operator.neuromuscular_frequency, 1.0, _PERIOD),
     ))  # fmt: skip
 
@@ -111,7 +111,7 @@ def measure_discrimination(
         The psychometric function.
     """
     rng = np.random.default_rng([seed, 1995])
-    ticks = round(operator.dwell / _PERIOD)
+    ticks = round(operator.correction_interval / _PERIOD)
     tremor = operator.tremor * _make_tremor(rng, 2**12)
     every, levels = round(_DECISION_PERIOD / _PERIOD), np.array(_LEVELS[sense])
     decisions = ticks // every

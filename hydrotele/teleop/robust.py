@@ -255,9 +255,9 @@ def case_impedance_ranges(facts: TeleopCaseFile) -> ImpedanceRanges:
         ),
     )
     if facts.hands:
-        hands = facts.hands.least.impedance(), facts.hands.most.impedance()
+        hands = facts.hands.min.impedance(), facts.hands.max.impedance()
     if facts.tasks:
-        tasks = facts.tasks.least.impedance(), facts.tasks.most.impedance()
+        tasks = facts.tasks.min.impedance(), facts.tasks.max.impedance()
     return ImpedanceRanges(hands, (tasks[0], tasks[1]))
 
 

@@ -79,7 +79,7 @@ class SlaveParameters(NamedTuple):
             band, range, coupling stiffness, coupling damping, hand per machine force, lever of the
             virtual mass [1] or [m^2], maximum speed [m/s] or [rad/s], limit of the reflected force
             [N] or [N m], wave impedance [N s/m].
-        limits: (5,) silence [s], following error [rad], acceleration [m/s^2] or [rad/s^2], virtual
+        limits: (5,) packet timeout [s], following error [rad], acceleration [m/s^2] or [rad/s^2], virtual
             mass [kg], phase lead of the drives [s].
         kind: (5,) of `master.Master.kind`, then 1 if the inverse Jacobian resolves the motion.
     """
@@ -218,7 +218,7 @@ def build_slave(
                 row[AXIS_WAVE_IMPEDANCE],
             )  # fmt: skip
     safety = pilot.safety
-    limits = np.array([safety.silence, safety.following_error, pilot.acceleration, pilot.virtual_mass, lead])
+    limits = np.array([safety.packet_timeout, safety.following_error, pilot.acceleration, pilot.virtual_mass, lead])
     state = make_flat_state(SlaveState, [
         (5,), (5,), (k,), (k,), (k,), (2, 5), (3, 6), (5,), (5,), (4,), (5, SENT_SIGNAL + 2),
     ])  # fmt: skip

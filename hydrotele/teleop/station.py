@@ -368,13 +368,13 @@ class TeleoperationSystem:
         handle, energy = np.abs(self.log.master("handle")), self._m.energy
         return {
             "handle_energy_J": float(energy[0]),
-            "handle_least_energy_J": float(energy[1]),
-            "largest_handle_displacement_m": float(handle[:, :3].max()),
-            "largest_handle_rotation_rad": float(handle[:, 3:].max()),
-            "largest_coil_current_A": float(np.abs(self.log.master("currents")).max()),
-            "largest_coil_heat": self._flotor.max_heat,
+            "min_handle_energy_J": float(energy[1]),
+            "max_handle_displacement_m": float(handle[:, :3].max()),
+            "max_handle_rotation_rad": float(handle[:, 3:].max()),
+            "max_coil_current_A": float(np.abs(self.log.master("currents")).max()),
+            "max_coil_heat": self._flotor.max_heat,
             "periods_with_limited_currents": int((self.log.master("limited") < 1.0).sum()),
-            "largest_tip_force_N": float(np.abs(self.log.force[:, [0, 2]]).max()),
+            "max_tip_force_N": float(np.abs(self.log.force[:, [0, 2]]).max()),
             "tripped": self.valves_closed,
         }
 
@@ -391,7 +391,7 @@ class TeleoperationSystem:
             name = self._plan.axes[self.columns[int(np.argmax(np.nan_to_num(error, nan=np.inf)))]]
             why = f"{name} does not follow its reference"
         elif self._force_estimator and self._sensors and tick % TICKS_PER_CHECK == 0:
-            frozen = self._force_estimator.find_constant_channels(self._pilot.safety.frozen)
+            frozen = self._force_estimator.find_constant_channels(self._pilot.safety.frozen_time)
             why = f"the readings of sensor {frozen[0]} are constant" if frozen else ""
         if why and not self.valves_closed:
             self.valves_closed = True
@@ -424,7 +424,7 @@ class _FrozenSensor:
         kinds = {"angle": "joint", "pressure_head": "head", "pressure_rod": "rod"}
         if kind not in kinds:
             raise InputError("pilot.faults", f"{fault.channel!r}: kinds are {', '.join(kinds)}")
-        self._start_time, self._name, self._column = fault.at, kinds[kind], axes.index(axis)
+        self._start_time, self._name, self._column = fault.start, kinds[kind], axes.index(axis)
         self._value: float | None = None
 
     def freeze(self, time: float, seen: Feedback) -> None:
@@ -484,15 +484,15 @@ def _make_channel_buffers(pilot: TeleopPilot, scenario: Scenario, k: int) -> Cha
             raise InputError(f"pilot.channel.{name}", message)
     delays = _packet_delays(scenario, channel, period)
     rng = np.random.default_rng([scenario.seed, 404])
-    lost = rng.random((scenario.tick_count, 2)) < channel.lost
-    lost[: round(channel.lost_from / period)] = False
+    lost = rng.random((scenario.tick_count, 2)) < channel.loss_probability
+    lost[: round(channel.loss_start / period)] = False
     age = np.stack([compute_arriving_ages(delays[:, side]) for side in range(2)], axis=1)
     age[lost] = -1
     age = np.ascontiguousarray(age, np.int64)
     longest = np.maximum(delays.max(axis=0), 0)
     return ChannelBuffers(
         np.zeros((1 + longest[0], 3, 6)), np.zeros((1 + longest[1], 8, k)), np.zeros((8, k)), age,
-        np.array([0.0, 1.0, period, pilot.safety.silence, _FADE_TIME]),
+        np.array([0.0, 1.0, period, pilot.safety.packet_timeout, _FADE_TIME]),
     )  # fmt: skip
 
 

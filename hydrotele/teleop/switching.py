@@ -45,7 +45,7 @@ class StiffnessAxis:
             raise InputError("stiffness", "mass must be positive, damping not negative")
         if not 0.0 <= self.min_stiffness <= self.nominal_stiffness <= self.max_stiffness:
             raise InputError(
-                "stiffness", "must be ordered, 0 <= least <= nominal <= most:"
+                "stiffness", "must be ordered, 0 <= min_stiffness <= nominal_stiffness <= max_stiffness:"
                 f" {self.min_stiffness:g}, {self.nominal_stiffness:g}, {self.max_stiffness:g}",
             )  # fmt: skip
 

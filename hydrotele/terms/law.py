@@ -60,8 +60,9 @@ class DriveState(NamedTuple):
         pressure_supply: pressure at the inlet of the valves [Pa].
         command: command to the valve or drive after its delay, without terms [1], [V].
         force: force of the oil on the piston, or of a force drive, before friction [N] or [N m].
-        played: output of the term's backlash operator (`play`) [unit of its variable]; 0 without.
-        ahead: difference between the variable and this output, at most half the backlash width.
+        play_output: output of the term's backlash operator (`play`) [unit of its variable]; 0 without.
+        play_difference: difference between the variable and this output, at most half the backlash
+            width.
     """
 
     time: float
@@ -74,8 +75,8 @@ class DriveState(NamedTuple):
     pressure_supply: float
     command: float
     force: float
-    played: float
-    ahead: float
+    play_output: float
+    play_difference: float
 
 
 class Drives(NamedTuple):
@@ -102,6 +103,12 @@ NO_DRIVES = Drives(0, np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0))
 VARIABLES = {name: index for index, name in enumerate(DriveState._fields)}
 """Name of a state variable in files -> its index in `DriveState`."""
 VARIABLES |= {"pump_speed": VARIABLES["spool"], "pressure_load": VARIABLES["spool_rate"]}
+_RENAMED_VARIABLES = {"played": "play_output", "ahead": "play_difference"}
+_RENAMED_LAWS = {"table2": "bilinear_table"}
+
+
+def _suggest_variable(name: str) -> str:
+    return suggest_valid_name(name, VARIABLES, _RENAMED_VARIABLES)
 
 
 class Variable(int):
@@ -179,7 +186,7 @@ def _encode_value(law: str, name: str, kind: type, value: Any) -> list[float]:
     where = f"law {law}: parameter {name}"
     if kind is Variable:
         if value not in VARIABLES:
-            raise ValueError(f"{where}: {value!r} is not a variable; {suggest_valid_name(value, VARIABLES)}")
+            raise ValueError(f"{where}: {value!r} is not a variable; {_suggest_variable(value)}")
         return [float(VARIABLES[value])]
     try:
         flat = np.asarray(value, float)
@@ -344,7 +351,7 @@ def _parse_variable(text: str, node: ast.expr) -> int:
     """Return the index of a variable."""
     name = node.id if isinstance(node, ast.Name) else ast.unparse(node)
     if name not in VARIABLES:
-        raise _formula_error(text, f"{name!r} is not a variable; {suggest_valid_name(name, VARIABLES)}")
+        raise _formula_error(text, f"{name!r} is not a variable; {_suggest_variable(name)}")
     return VARIABLES[name]
 
 
@@ -425,7 +432,7 @@ def _check_table(given: Parameters) -> None:
         raise ValueError(f"values must have as many numbers as points, {len(given['points'])}")
 
 
-def _check_table2(given: Parameters) -> None:
+def _check_bilinear_table(given: Parameters) -> None:
     _check_points(given, "row_points", "column_points")
     rows, columns = len(given["row_points"]), len(given["column_points"])
     if len(_flatten(given["values"])) != rows * columns:
@@ -457,8 +464,8 @@ def linear_table(s: DriveState, variable: Variable, points: Numbers, values: Num
     return values[low] + part * (values[high] - values[low])
 
 
-@law(check=_check_table2)
-def table2(
+@law(check=_check_bilinear_table)
+def bilinear_table(
     s: DriveState, row_variable: Variable, column_variable: Variable, row_points: Numbers,
     column_points: Numbers, values: Numbers,
 ) -> float:  # fmt: skip
@@ -469,7 +476,7 @@ def table2(
     >>> import numpy as np
     >>> state = DriveState(*[0.0] * 12)._replace(position=0.5, velocity=9.0)
     >>> axis = np.array([0.0, 1.0])
-    >>> float(table2(state, 1, 2, axis, axis, np.array([0.0, 1.0, 10.0, 21.0])))
+    >>> float(bilinear_table(state, 1, 2, axis, axis, np.array([0.0, 1.0, 10.0, 21.0])))
     11.0
     """
     x, y = s[row_variable], s[column_variable]
@@ -599,7 +606,8 @@ DRIVE_VARIABLES = (
 class Play(StrictModel):
     """Backlash operator of a term: its output follows the variable at most `half_width` behind.
 
-    The law reads the output as `played` and the difference between variable and output as `ahead`.
+    The law reads the output as `play_output` and the difference between variable and output as
+    `play_difference`.
     The initial output is 0, or the nearest value that the variable allows.
     """
 
@@ -633,8 +641,8 @@ class Term(StrictModel):
     - `balance`: `force` (on the drive [N] or [N m]), `flow_head` or `flow_rod` (into a chamber
       [m^3/s]), `command` (to valve or drive [1] or [V]) or `flow_supply` (flow of the shared pump,
       which follows with a time constant of 20 ms [m^3/s]).
-    - `of`: variables taken from another drive; with `{velocity: swing}` the variable `velocity` of
-      the law is that of the swing.
+    - `variables_from`: variables taken from another drive; with `{velocity: swing}` the variable
+      `velocity` of the law is that of the swing.
     - `domain`: variable -> range to which it is clipped.
     - `window`: start and stop time between which the term is active [s], each with a ramp of 0.1 s.
     - `play`, `switch`: hysteresis of the term, in a machine with hydraulic axes.
@@ -642,12 +650,14 @@ class Term(StrictModel):
     - `source`: file or plug-in that defines the law; empty for laws of hydrotele.
     """
 
+    renamed = {"of": "variables_from"}
+
     name: Name
     axis: Name
     balance: Balance
     law: str
     parameters: Mapping[str, Value] = {}
-    of: dict[str, Name] = {}
+    variables_from: dict[str, Name] = {}
     domain: dict[str, tuple[float, float]] = {}
     window: tuple[float, float] | None = None
     play: Play | None = None
@@ -665,21 +675,22 @@ class Term(StrictModel):
                 " plug-in, install it"
             )
         if self.law not in LAWS:
-            raise ValueError(f"law {self.law!r} is not known; {suggest_valid_name(self.law, LAWS)}")
-        for variable in self.of:
+            raise ValueError(f"law {self.law!r} is not known; {suggest_valid_name(self.law, LAWS, _RENAMED_LAWS)}")
+        for variable in self.variables_from:
             if variable not in DRIVE_VARIABLES:
                 raise ValueError(
-                    f"of: {variable!r} is not a variable of a drive; {suggest_valid_name(variable, DRIVE_VARIABLES)}"
+                    f"variables_from: {variable!r} is not a variable of a drive;"
+                    f" {suggest_valid_name(variable, DRIVE_VARIABLES)}"
                 )
         for variable, (low, high) in self.domain.items():
             if variable not in VARIABLES:
-                raise ValueError(f"domain: {variable!r} is not a variable; {suggest_valid_name(variable, VARIABLES)}")
+                raise ValueError(f"domain: {variable!r} is not a variable; {_suggest_variable(variable)}")
             if not low < high:
                 raise ValueError(f"domain of {variable}: [{low:g}, {high:g}] must be increasing")
         if self.play and self.switch:
             raise ValueError("play and switch: a term can have only one of them")
         for key, memory in (("play", self.play), ("switch", self.switch)):
-            valid = VARIABLES.keys() - {"played", "ahead"}
+            valid = VARIABLES.keys() - {"play_output", "play_difference"}
             if memory and memory.variable not in valid:
                 known = suggest_valid_name(memory.variable, valid)
                 raise ValueError(f"{key}: {memory.variable!r} is not a variable; {known}")

@@ -158,11 +158,11 @@ def terms_table(
         at = first + len(back)
         rows += [
             order.index(term.axis), BALANCES.index(term.balance), place, name_checksum(term.law), at,
-            at + len(numbers), len(term.domain), len(term.of), *(term.window or _NO_WINDOW),
+            at + len(numbers), len(term.domain), len(term.variables_from), *(term.window or _NO_WINDOW),
             *_hysteresis_parameters(term, places.get(id(term), 0)),
         ]  # fmt: skip
         others = [
-            x for name, axis in term.of.items()
+            x for name, axis in term.variables_from.items()
             for x in (VARIABLES[name], order.index(axis), *(areas or {}).get(axis, (0.0, 0.0)))
         ]  # fmt: skip
         back += [*numbers, *ranges, *others]
@@ -426,8 +426,8 @@ def _shift_state(s, velocity, head, rod):
     """Return the state with increments added to velocity and chamber pressures."""
     return DriveState(
         s.time, s.position, s.velocity + velocity, s.spool, s.spool_rate, s.pressure_head + head,
-        s.pressure_rod + rod, s.pressure_supply, s.command, s.force, s.played,
-        s.ahead,
+        s.pressure_rod + rod, s.pressure_supply, s.command, s.force, s.play_output,
+        s.play_difference,
     )  # fmt: skip
 
 

@@ -46,7 +46,7 @@ def test_mujoco_and_kinematics_are_one_chain(runs):
         theta = np.stack([run.truth[c] * s for c, s in zip(loop.channels, loop.signs, strict=True)], 1)
         gap, _ = closure_error(loop, theta + loop.values[:, 0])
         assert np.abs(gap).max() < 1e-5
-        assert run.summary["largest_pin_opening_mm"] < 0.01
+        assert run.summary["max_pin_opening_mm"] < 0.01
 
 
 def test_arm_command(folder, tmp_path):

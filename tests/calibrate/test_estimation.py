@@ -54,7 +54,7 @@ def test_what_the_equations_do_not_tell_keeps_its_start():
     np.testing.assert_allclose(found.values, [0.8, 0.1, 3.0, 7.0], atol=1e-9)
     words = list_identifiability(found.identifiability)
     assert words["identifiable"] == ["c"]
-    assert words["unknown"] == ["d"]
+    assert words["not_identifiable"] == ["d"]
     assert words["combinations"] == ["a + 2 b"]
     assert np.isinf(found.standard_deviations[[1, 3]]).all()
 

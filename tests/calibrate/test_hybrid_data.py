@@ -127,7 +127,7 @@ def test_the_command_calibrates_and_its_robot_is_used_again(folder, tmp_path):
     assert run.exit_code == 0, run.output
     found = json.loads(run.stdout)
     assert found["heldout"]["rms_mm"] < 0.15 < 1.0 < found["heldout"]["before_rms_mm"]
-    assert found["redundancy"]["rank"] == 50 and len(found["unknown"]) == 4
+    assert found["redundancy"]["rank"] == 50 and len(found["not_identifiable"]) == 4
     assert json.loads((out / "calibration.json").read_text()) == found
     assert {p.name for p in out.iterdir()} == {
         "calibration.json", "errors.png", "robot.yaml", "summary.json"

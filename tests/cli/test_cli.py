@@ -206,7 +206,7 @@ def test_run_writes_everything_that_is_promised(finished_run):
     ]  # fmt: skip
     kept = json.loads((folder / "summary.json").read_text())
     assert {**kept, "folder": summary["folder"]} == summary
-    assert {"versions", "seed", "git_commit", "realtime_factor", "largest_pin_opening_mm",
+    assert {"versions", "seed", "git_commit", "realtime_factor", "max_pin_opening_mm",
             "balance"} <= kept.keys()  # fmt: skip
 
 

@@ -36,7 +36,7 @@ def site(tmp_path_factory):
         time = np.arange(600) / 50.0
         volts = 2.0 * np.sin((4.0 + 0.3 * k) * time) + 0.15  # stays clear of the end stops
         pilot = {
-            "kind": "table", "of": "command", "interpolate": "hold", "time": time.tolist(),
+            "kind": "table", "quantity": "command", "interpolate": "hold", "time": time.tolist(),
             "columns": {"slide": volts.tolist()},
         }  # fmt: skip
         name_, place, parameters = ASYMMETRY
@@ -58,7 +58,7 @@ def test_the_patched_machine_is_better_in_json_table_and_folder(site):
     code, stdout, stderr = invoke(*words, "--json")
     assert code == 0, stderr
     found = json.loads(stdout)
-    assert found["judged"] == ["test_1"] and found["fitted"] == ["fit_1", "fit_2"]
+    assert found["evaluated_runs"] == ["test_1"] and found["fitted_runs"] == ["fit_1", "fit_2"]
     nominal, patched, table = found["models"]
     assert (nominal["kind"], patched["name"], table["kind"]) == ("machine", str(gap), "baseline")
     for horizon in ("1", "5", "end"):  # 60 s do not fit into 12 s

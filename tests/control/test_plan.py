@@ -89,7 +89,7 @@ def test_table_of_its_own_ticks_is_itself(rate):
 
 def test_table_interpolates():
     table = {"time": [0.0, 0.1, 0.3], "columns": {"boom": [0.0, 0.1, 0.5], "stick": [-1, -1, -1]}}
-    plan = plan_of({"kind": "table", "of": "joint", "interpolate": "linear", **table}, duration=0.5)
+    plan = plan_of({"kind": "table", "quantity": "joint", "interpolate": "linear", **table}, duration=0.5)
     assert plan.closed_loop.all()  # the others stay where they are
     expected = np.interp(plan.time, table["time"], table["columns"]["boom"])
     np.testing.assert_allclose(plan.reference[:, 1], expected, atol=1e-15)

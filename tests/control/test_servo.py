@@ -130,7 +130,7 @@ def test_every_axis_goes_where_it_is_told(tool):
     machine = load_machine("cat215", tool)
     for sign in (1, -1):
         goal = {a: machine.home.get(x.joint, 0.0) + 0.05 * sign for a, x in machine.axes.items()}
-        table = {"of": "joint", "time": [0.0], "columns": {a: [q] for a, q in goal.items()}}
+        table = {"quantity": "joint", "time": [0.0], "columns": {a: [q] for a, q in goal.items()}}
         run = run_scenario(
             Scenario(name="t", tool=tool, duration=1.5, ground=False,
                      pilot={"kind": "table", **table})
@@ -162,7 +162,7 @@ def test_force_drive_follows():
 
 
 def test_force_drive_stays_within_its_volts():
-    pilot = {"kind": "table", "of": "joint", "time": [0.0], "columns": {"slide": [0.25]}}
+    pilot = {"kind": "table", "quantity": "joint", "time": [0.0], "columns": {"slide": [0.25]}}
     servo = {"position_gain": 100, "velocity_gain": 1e5}
     run = run_scenario(Scenario(name="t", machine="emps", duration=0.3, servo=servo, pilot=pilot, log_rate=200))
     assert np.abs(run.truth["command.slide"]).max() == 10.0

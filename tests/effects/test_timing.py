@@ -34,7 +34,7 @@ def scenario(*effects, machine="cat215", rate=50, log_rate=50, duration=1.0, **m
     columns = {a: (0.1 + 0.5 * np.sin(6.0 * np.array(time) + i)).tolist() for i, a in enumerate(axes)}
     pilot = {
         "kind": "table",
-        "of": "command",
+        "quantity": "command",
         "interpolate": "hold",
         "time": time,
         "columns": columns,

@@ -33,7 +33,7 @@ def press(core: TaskCore, seconds: float) -> None:
     action = np.zeros((core.count, 4))
     for _ in range(round(50 * seconds)):
         force = seen(core, "force")
-        speed = np.where(force < 1.0e3, -0.08, 2.0e-6 * (force - seen(core, "wanted_force")))
+        speed = np.where(force < 1.0e3, -0.08, 2.0e-6 * (force - seen(core, "reference_force")))
         action[:, 2] = speed / FORCE.pose_rates[2]
         core.step(action)
 
@@ -52,7 +52,7 @@ def test_the_load_cell_reads_the_contact_force_of_every_plate(core):
         # the slow approach of the last seconds moves a plate of 300 kg by next to nothing
         assert seen(core, "force")[n] == pytest.approx(up, rel=0.01)
         assert up > 8.0e3
-        assert core.measures[n, 0] == pytest.approx(up - seen(core, "wanted_force")[n], abs=400.0)
+        assert core.measures[n, 0] == pytest.approx(up - seen(core, "reference_force")[n], abs=400.0)
         plates.add(float(model.joint("plate_0").stiffness[0]))
         height = core.setup.variants.start_tips[core.episodes["variant"][n], 2] - model.body("plate_0").pos[2]
         assert 0.1 < height < 0.2  # 50 to 150 mm, and 50 mm from the plate's middle to its face
@@ -65,7 +65,7 @@ def test_the_load_cell_errs_by_one_per_cent_of_50_kn():
     read = []
     for _ in range(40):
         core.step(np.zeros((COUNT, 4)))
-        assert np.abs(core.measures[:, 0] + seen(core, "wanted_force")).max() < 0.01
+        assert np.abs(core.measures[:, 0] + seen(core, "reference_force")).max() < 0.01
         read.append(seen(core, "force").copy())
     assert 0.9 * MAX_CELL_ERROR < np.abs(read).max() <= MAX_CELL_ERROR  # 240 uniform numbers
 
@@ -89,7 +89,7 @@ def test_forces_wanted_lie_in_their_range_and_change_once(core):
         core.step(np.zeros((COUNT, 4)))
         now = 0.02 * step
         asked = core.episodes["goal"][:, 0 if now < 0.09 else 1]
-        assert np.allclose(seen(core, "wanted_force"), asked, rtol=1e-6)
+        assert np.allclose(seen(core, "reference_force"), asked, rtol=1e-6)
         since = now if now < 0.09 else now - 0.09
         assert np.allclose(seen(core, "time_since_change"), since, atol=1e-6)
 
@@ -98,7 +98,7 @@ def test_reward_is_one_less_the_error_as_a_share(core):
     core.reset(np.arange(COUNT))
     for _ in range(3):
         press(core, 0.7)
-        wanted = seen(core, "wanted_force").astype(float)
+        wanted = seen(core, "reference_force").astype(float)
         force = core.episodes["goal"][:, 3]
         expected = np.maximum(-1.0, 1.0 - np.abs(force - wanted) / wanted)
         assert np.allclose(core.reward, expected, atol=1e-6)  # float32 of what is wanted

@@ -81,17 +81,17 @@ def test_the_speed_is_that_of_the_way_and_changes_no_faster_than_drawn(goals):
 def test_the_preview_is_what_is_wanted_later(core):
     core.reset(np.arange(COUNT))
     names = [field.name for field in core.setup.fields]
-    now = [names.index(f"wanted.{c}") for c in ("r", "theta", "z")]
+    now = [names.index(f"reference.{c}") for c in ("r", "theta", "z")]
     seen = []
     for _ in range(60):
         core.step(np.zeros((COUNT, 4)))
         seen.append(core.observation.copy())
     for steps in (5, 10, 20):
-        ahead = [names.index(f"wanted_in_{20 * steps}_ms.{c}") for c in ("r", "theta", "z")]
+        ahead = [names.index(f"reference_in_{20 * steps}_ms.{c}") for c in ("r", "theta", "z")]
         for early, late in zip(seen, seen[steps:], strict=False):
             # both are float32 of the same number but for the last bits of the time
             assert np.allclose(early[:, ahead], late[:, now], rtol=0.0, atol=1e-6)
-    rate = names.index("wanted_rate.r")
+    rate = names.index("reference_rate.r")
     slope = (seen[41][:, now[0]] - seen[39][:, now[0]]) / 0.04
     # float32 of 7 m over 40 ms, and a corner of the trapezoid between the two
     assert np.allclose(slope, seen[40][:, rate], atol=0.02)

@@ -144,7 +144,7 @@ def test_each_episode_is_drawn_with_its_own_machine():
 
 @pytest.mark.nightly
 def test_pictures_of_the_first_environments():
-    env = MachineVectorEnv("TrackTrajectory", 8, "rgb_array", shown=2, **SMALL)
+    env = MachineVectorEnv("TrackTrajectory", 8, "rgb_array", render_count=2, **SMALL)
     env.reset(seed=2)
     frames = env.render()
     assert isinstance(frames, tuple) and len(frames) == 2

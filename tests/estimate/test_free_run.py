@@ -103,7 +103,7 @@ def simulated(folder, *effects):
     folder.mkdir()
     for seed, name in enumerate(("fit_1", "test_1")):
         pilot = {
-            "kind": "table", "of": "command", "interpolate": "hold",
+            "kind": "table", "quantity": "command", "interpolate": "hold",
             "time": (PERIOD * np.arange(400)).tolist(), "columns": COMMANDS,
         }  # fmt: skip
         scenario = Scenario(

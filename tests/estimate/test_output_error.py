@@ -109,7 +109,7 @@ def planted(tmp_path_factory):
             name=f"run{seed}", machine="ec20", control_rate=50, log_rate=50, duration=20.0,
             ground=False, seed=seed, sensors="record", effects=effects,
             pilot={
-                "kind": "table", "of": "command", "interpolate": "hold", "time": time.tolist(),
+                "kind": "table", "quantity": "command", "interpolate": "hold", "time": time.tolist(),
                 "columns": {"boom": held[:, 0].tolist(), "stick": held[:, 1].tolist()},
             },
         )  # fmt: skip

@@ -115,7 +115,7 @@ def test_stiff_bristles_hold_at_coarse_steps(reduced_of):
 def scenario(name, commands, effects, steps):
     """A machine driven open loop by held commands."""
     time = PERIOD * np.arange(ROWS)
-    pilot = {"kind": "table", "of": "command", "interpolate": "hold", "time": time.tolist(),
+    pilot = {"kind": "table", "quantity": "command", "interpolate": "hold", "time": time.tolist(),
              "columns": {"slide": commands.tolist()}}  # fmt: skip
     return Scenario(
         name="t", machine=name, control_rate=1 / PERIOD, log_rate=1 / PERIOD, ground=False,

@@ -102,7 +102,7 @@ def scenario(name, axes, effects, timestep, size=0.4, shape=np.sin):
         "timestep": timestep,
         "pilot": {
             "kind": "table",
-            "of": "command",
+            "quantity": "command",
             "interpolate": "hold",
             "time": time.tolist(),
             "columns": columns,
@@ -267,7 +267,7 @@ def test_terms_with_variables_of_another_drive(machine_of, reduced_of, tmp_path)
          {"velocity": "swing"}),
     )  # fmt: skip
     terms = tuple(
-        Term(name="t", axis=axis, balance=balance, law="formula", parameters=law, of=of)
+        Term(name="t", axis=axis, balance=balance, law="formula", parameters=law, variables_from=of)
         for axis, balance, law, of in laws
     )
     plan = scenario("cat215/none", nominal.axes, (), 1.25e-4)
@@ -286,11 +286,11 @@ def test_terms_with_a_memory(machine_of, reduced_of, tmp_path):
     """Force, flow and command that see a variable through a play, or that a relay switches."""
     nominal = machine_of("cat215/none")
     laws = (
-        ("boom", "force", {"played": -2e5}, {},
+        ("boom", "force", {"play_output": -2e5}, {},
          {"play": {"variable": "velocity", "half_width": 0.02}}),
         ("stick", "flow_head", {"1": 4e-4}, {"pressure_rod": "boom"},
          {"switch": {"variable": "pressure_rod", "on": 3.0e6, "off": 1.5e6}}),
-        ("swing", "command", {"played": 0.3}, {},
+        ("swing", "command", {"play_output": 0.3}, {},
          {"play": {"variable": "command", "half_width": 0.1}}),
         ("swing", "force", {"1": 3e3}, {"position": "boom"},
          {"switch": {"variable": "position", "on": 0.81, "off": 0.795}}),
@@ -298,7 +298,7 @@ def test_terms_with_a_memory(machine_of, reduced_of, tmp_path):
     terms = tuple(
         Term.model_validate({
             "name": "t", "axis": axis, "balance": balance, "law": "formula", "parameters": law,
-            "of": of, **memory,
+            "variables_from": of, **memory,
         })
         for axis, balance, law, of, memory in laws
     )  # fmt: skip

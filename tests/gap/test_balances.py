@@ -280,7 +280,7 @@ def test_what_a_pump_lacks_is_read_off_where_it_is_short(slow):
     nominal = with_value(nominal, "supply.pump_flow", 0.6 * nominal.supply.pump_flow)
     law = {"velocity": 4.0e-3}
     term = Term(name="more", axis="boom", balance="flow_supply", law="formula", parameters=law,
-                of={"velocity": "swing"})  # fmt: skip
+                variables_from={"velocity": "swing"})  # fmt: skip
     data, states = machine_data(nominal, nominal.model_copy(update={"terms": (term,)}))
     run, swing = data.heldout, state_names(nominal).index("rate.swing")
     lack, deviation = pump_lack(nominal, data, run, data.noise)

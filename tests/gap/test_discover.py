@@ -66,7 +66,7 @@ def data(tmp_path_factory):
         scenario = Scenario(
             name=f"run_{seed}", machine=str(path), control_rate=100, log_rate=100, seed=seed,
             duration=SECONDS, sensors="laboratory", ground=False,
-            pilot={"kind": "table", "of": "command", "interpolate": "hold", "time": time.tolist(),
+            pilot={"kind": "table", "quantity": "command", "interpolate": "hold", "time": time.tolist(),
                    "columns": {"slide": np.where(time > 0.2, waves, 0.0).tolist()}},
         )  # fmt: skip
         save_log(run_scenario(scenario).measured, logs / f"run_{seed}.parquet")
@@ -172,7 +172,9 @@ def test_every_table_is_a_term_that_adds_what_its_columns_say(made_up):
             act[0] = made_up["spool.swing"][row]
             act[10:] = made_up["force.stick"][row] * np.array([2.0, 2.0])
             drives = Drives(3, act, np.zeros(3), np.array([swing, 0, 0]), np.array([0, 0, stick]))
-            got = sum_terms(written, FORCE, 1, DriveState(**own, spool_rate=0.0, played=0.0, ahead=0.0), drives)
+            got = sum_terms(
+                written, FORCE, 1, DriveState(**own, spool_rate=0.0, play_output=0.0, play_difference=0.0), drives
+            )
             assert got == pytest.approx(columns[row] @ entries, rel=1e-9, abs=1e-12)
 
 
@@ -205,7 +207,7 @@ def test_every_table_with_a_memory_is_such_a_term():
     ways = {(t.memory.way, t.memory.variable, len(t.variables)) for t in tables}
     assert ways >= {(PLAY, "velocity", 1), (PLAY, "velocity", 2), (SWITCH, "command.stick", 1),
                     (SWITCH, "velocity", 2)}  # fmt: skip
-    assert any(t.variables == ("velocity", "ahead") for t in tables)
+    assert any(t.variables == ("velocity", "play_difference") for t in tables)
     order = ["swing", "boom", "stick"]
     for table in [t for k, t in enumerate(tables) if k % 3 == 0]:
         entries = rng.normal(size=table.size)
@@ -220,7 +222,7 @@ def test_every_table_with_a_memory_is_such_a_term():
             drives = Drives(3, act, np.zeros(3), np.array([now["velocity.swing"], 0, 0]),
                             np.array([0, 0, now["command.stick"]]))  # fmt: skip
             own = {name: now[name] for name in now if "." not in name}
-            state = DriveState(**own, spool_rate=0.0, force=0.0, played=0.0, ahead=0.0)
+            state = DriveState(**own, spool_rate=0.0, force=0.0, play_output=0.0, play_difference=0.0)
             told.append(sum_terms(written, FORCE, 1, state, drives))
         assert told == pytest.approx(columns @ entries, rel=1e-9, abs=1e-9)
         assert np.ptp(told) > 0.0

@@ -13,7 +13,7 @@ from tests.estimate.test_pump_drive import CHANNELS, NOISE, PERIOD, simulated
 
 DUTY = np.repeat([0.0, 0.7, 0.0, -0.5, 0.0, 0.5, 0.8, -0.6, 0.0], [220, 150, 50, 100, 50, 80, 60, 150, 40])
 WRONG = {  # path -> factor: what the data sheet says over what is right
-    "axes.piston.cylinder.area_rod": 1.12, "axes.piston.pump.motor.emf": 1.2,
+    "axes.piston.cylinder.area_rod": 1.12, "axes.piston.pump.motor.torque_constant": 1.2,
     "axes.piston.pump.motor.inertia": 2.0,
 }  # fmt: skip
 

@@ -21,7 +21,7 @@ def logs(folder, machine, sensors, planted, commands):
         scenario = Scenario(
             name=name, machine=machine, control_rate=RATE, log_rate=RATE, duration=SECONDS,
             ground=False, sensors=sensors, effects=[planted], seed=round(10 * phase),
-            pilot={"kind": "table", "of": "command", "interpolate": "hold", "time": time.tolist(),
+            pilot={"kind": "table", "quantity": "command", "interpolate": "hold", "time": time.tolist(),
                    "columns": {"slide": column}},
         )  # fmt: skip
         save_log(run_scenario(scenario).measured, folder / f"{name}.parquet")

@@ -31,7 +31,7 @@ def site(tmp_path_factory):
     for name, out, back in (("fit_1", 0.7, -0.6), ("test_1", 0.55, -0.7)):
         duty = np.repeat([0.0, out, 0.6 * out, 0.0, back], round(RATE * SECONDS / 5))
         pilot = {
-            "kind": "table", "of": "command", "interpolate": "hold",
+            "kind": "table", "quantity": "command", "interpolate": "hold",
             "time": (np.arange(len(duty)) / RATE).tolist(), "columns": {"piston": duty.tolist()},
         }  # fmt: skip
         scenario = Scenario(
@@ -72,8 +72,8 @@ def test_a_weaker_motor_is_named_or_calibrated(site):
     gap = find_gap(load_dataset(site, machine), effects=("motor_constant", "load_relief"))
     assert gap.verdict != "no_gap"
     motor = gap.patched.axes["piston"].pump.motor
-    present = machine.axes["piston"].pump.motor.emf
-    assert abs(motor.emf - LESS) < 0.25 * abs(present - LESS)
+    present = machine.axes["piston"].pump.motor.torque_constant
+    assert abs(motor.torque_constant - LESS) < 0.25 * abs(present - LESS)
     assert gap.size.after < gap.size.before
 
 

@@ -85,14 +85,14 @@ def test_nobody_who_has_not_asked_moves_the_device():
     stand = Stand()
     stand.period()
     assert not stand.send((1.0,) * 6)
-    assert stand.exchange.rejected_packets["stranger"] == 1 and not stand.exchange.wrench.any()
+    assert stand.exchange.rejected_packets["other_client"] == 1 and not stand.exchange.wrench.any()
 
 
 def test_a_second_machine_is_refused_until_the_first_is_silent(stand):
     stand.send()
     assert not stand.send(sender=ELSEWHERE, SESSION=0)
     assert not stand.send((5.0,) * 6, sender=ELSEWHERE)
-    assert stand.exchange.refused["stranger"] == 2
+    assert stand.exchange.refused["other_client"] == 2
     for _ in range(round(CLIENT_TIMEOUT / PERIOD) + 2):
         stand.period()
     assert stand.exchange.client is None

@@ -95,7 +95,7 @@ def test_excite_writes_a_scenario_that_runs(tmp_path):
     done = call("excite", "rig", "--out", file, "--period", 6, "--harmonics", 2, "--starts", 1,
                 "--cycles", 1, "--json")  # fmt: skip
     assert done.exit_code == 0, done.output
-    assert json.loads(done.stdout)["largest_use_of_a_limit"] <= 1.0
+    assert json.loads(done.stdout)["max_limit_utilisation"] <= 1.0
     assert load_scenario(file).duration == pytest.approx(7.5)
     with pytest.raises(InputError, match="yaml"):
         call("excite", "rig", "--out", Path(tmp_path / "designed.txt"), "--starts", 1)

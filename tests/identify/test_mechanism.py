@@ -139,7 +139,7 @@ def test_a_single_run_is_split_and_columns_with_usual_names_need_no_mapping(tmp_
         (ColumnMapping(position={"crnk": "a"}), "has no joint 'crnk': did you mean 'crank'"),
         (ColumnMapping(force={"rocker": "a"}), "has no drive 'rocker'"),
         (ColumnMapping(passive_friction=("x_*",)), "has no joint without drive 'x_"),
-        (ColumnMapping(absent=("mass.wing",)), "has no parameter 'mass.wing'"),
+        (ColumnMapping(zero_parameters=("mass.wing",)), "has no parameter 'mass.wing'"),
         (ColumnMapping(position="q_{joint}"), "has no column 'q_crank'"),
         (ColumnMapping(force={"crank": "tau"}), "has no column 'tau'"),
     ],

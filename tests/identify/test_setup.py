@@ -35,11 +35,11 @@ def test_what_is_not_there_is_refused():
     for setup, message in (
         (
             mechanism_setup(chain, equal_groups=[("ring_1", "wing")]),
-            "alike: wing has no parameters",
+            "equal_parameters: wing has no parameters",
         ),
         (
             mechanism_setup(chain, zero_parameters=["mass.wing"]),
-            "absent: mass.wing is not a parameter",
+            "zero_parameters: mass.wing is not a parameter",
         ),
     ):
         legs = chain.start[[chain.index(d) for d in chain.drives]][None]

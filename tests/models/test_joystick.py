@@ -36,13 +36,15 @@ def test_gains_are_those_of_the_tables(name, table):
         found, (most, nominal, least, damping, band) = JOYSTICK.gains[name][axis], table[axis]
         turns = number >= 3
         unit = 100.0 if turns else 1e3
-        assert (found.most, found.nominal, found.least) == pytest.approx((unit * most, unit * nominal, unit * least))
+        assert (found.max_stiffness, found.nominal_stiffness, found.min_stiffness) == pytest.approx(
+            (unit * most, unit * nominal, unit * least)
+        )
         assert found.deadband == pytest.approx(band * (1e-4 if turns else 1e-3))
         # rotational damping is ours: the printed one shakes this flotor at 200 Hz (see README)
         assert found.damping == pytest.approx(0.25 if turns else 1e3 * damping)
         if name == "feller" and axis in DETENT:
             drop, outside = DETENT[axis]
-            assert (found.detent.drop, found.detent.outside) == pytest.approx((drop, unit * outside))
+            assert (found.detent.drop, found.detent.slope) == pytest.approx((drop, unit * outside))
 
 
 def test_the_mjcf_alone_has_the_numbers_of_the_yaml():

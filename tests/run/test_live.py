@@ -111,7 +111,7 @@ def test_folder_is_that_of_a_run(driven):
                      "summary.json", "truth.parquet"}  # fmt: skip
     summary = json.loads((driven / "a" / "summary.json").read_text())
     assert summary["kind"] == "run" and summary["simulated_seconds"] == 4.0
-    assert summary["pauses"] == 0 and summary["late_seconds"] == 0.0
+    assert summary["pauses"] == 0 and summary["paused_seconds"] == 0.0
     assert summary["balance"]["seconds"] == 4.0
     for name in ("measured", "truth"):
         log = load_log(driven / "a" / f"{name}.parquet")
@@ -174,7 +174,7 @@ def test_slow_computer_pauses_and_says_so():
     pacer = Pacer(1.0, clock.now, clock.sleep)
     run = drive_scenario(scenario, load_simulated_machine(scenario), device, pacer, watch, said.append)
     assert run.summary["pauses"] > 10
-    assert run.summary["late_seconds"] == pytest.approx(99 * 0.095, abs=MAX_LATENESS)
+    assert run.summary["paused_seconds"] == pytest.approx(99 * 0.095, abs=MAX_LATENESS)
     assert len(run.measured) == 25 and not clock.slept
     told = [sentence for sentence in said if sentence.startswith("computer too slow")]
     assert 3 <= len(told) <= 6  # of 10 s, every two

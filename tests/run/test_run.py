@@ -63,7 +63,7 @@ def test_progress_and_timing_do_not_change_the_run():
 @pytest.mark.daily("asked0", "asked3")
 @pytest.mark.parametrize("asked", [
     ("zhu_in", {"duration": "2"}),
-    ("press_stiffness", {"duration": "3", "pilot.channel.lost": "0.3"}),
+    ("press_stiffness", {"duration": "3", "pilot.channel.loss_probability": "0.3"}),
     ("press_stiffness", {"duration": "1", "pilot.safety.following_error": "1e-3"}),
     ("fell_tree", {"duration": "1"}),
 ])  # fmt: skip
@@ -104,7 +104,7 @@ def test_controller_reads_what_the_log_shows():
 
     A pure position loop of the EMPS without rate feedback: u = gain_v gain_p (ref - y) / drive.
     """
-    pilot = {"kind": "table", "of": "joint", "time": [0.0], "columns": {"slide": [0.01]}}
+    pilot = {"kind": "table", "quantity": "joint", "time": [0.0], "columns": {"slide": [0.01]}}
     servo = {"position_gain": 5.0, "velocity_gain": 500.0, "lead": 0.0}
     facts = {"machine": "emps", "control_rate": 500, "log_rate": 500, "pilot": pilot}
     run = run_scenario(Scenario(name="t", duration=0.5, servo=servo, **facts))
@@ -176,7 +176,7 @@ def test_table_from_csv_drives_joints(tmp_path):
     rows = [f"{t / 10:.1f},{20 + t},0,{-86 - t}" for t in range(11)]
     header = "time,reference.boom [deg],angle.boom [deg],angle.stick [deg]"
     (tmp_path / "r.csv").write_text("\n".join([header, *rows]))
-    pilot = {"of": "joint", "interpolate": "linear"}
+    pilot = {"quantity": "joint", "interpolate": "linear"}
     scenario = load_scenario(table_of("r.csv", tmp_path, pilot=pilot, duration=1.0))
     plan = prepare(scenario).plan
     boom = plan.reference[:, plan.axes.index("boom")]

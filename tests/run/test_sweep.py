@@ -81,7 +81,7 @@ def test_the_table_states_units(done):
     schema = pq.read_schema(done / "table.parquet")
     units = {field.name: (field.metadata or {}).get(b"unit", b"").decode() for field in schema}
     assert units["servo.lead"] == "s" and units["tracking.slide.rms"] == "m"
-    assert units["largest_pin_opening_mm"] == "mm" and units["balance.flow_balance"] == "1"
+    assert units["max_pin_opening_mm"] == "mm" and units["balance.flow_balance"] == "1"
     assert units["status"] == "" and str(schema.field("run").type) == "int64"
 
 
@@ -90,18 +90,18 @@ def test_a_finished_sweep_is_reported_without_running_anything(done, tmp_path, m
     monkeypatch.setattr("hydrotele.run.sweep._Worker", None)  # must not be started
     code, said, _ = invoke("sweep", file, "--out", out, "--json")
     facts = json.loads(said)
-    assert code == 0 and facts["runs"] == 8 and facts["done_now"] == facts["failed"] == 0
+    assert code == 0 and facts["runs"] == 8 and facts["runs_done"] == facts["failed"] == 0
     assert facts["figures"]["tracking.slide.rms"]["unit"] == "m"
     page = (out / "report.html").read_text()
     assert "servo.position_gain" in page and page.count("data:image/png") == 1
     assert (out / "main_effects.png").read_bytes().startswith(b"\x89PNG")
     assert (out / "table.parquet").read_bytes() == (done / "table.parquet").read_bytes()
-    file.write_text(file.read_text() + "figures: [largest_pin_opening_mm]\n")  # changes no run
+    file.write_text(file.read_text() + "figures: [max_pin_opening_mm]\n")  # changes no run
     code, said, _ = invoke("sweep", file, "--out", out)
-    assert code == 0 and "largest_pin_opening_mm" in said and "tracking" not in said
+    assert code == 0 and "max_pin_opening_mm" in said and "tracking" not in said
     file.write_text(file.read_text().replace("opening_mm]", "opening]"))
     code, _, said = invoke("sweep", file, "--out", out)
-    assert code == 2 and "did you mean 'largest_pin_opening_mm'" in said
+    assert code == 2 and "did you mean 'max_pin_opening_mm'" in said
 
 
 @pytest.mark.nightly
@@ -119,7 +119,7 @@ def test_a_two_key_grid_gets_a_map_and_failed_runs_are_listed(tmp_path):
     before = (tmp_path / "out" / "table.parquet").read_bytes()
     words = ["sweep", file, "--out", tmp_path / "out", "--jobs", "1", "--json"]
     code, said, _ = invoke(*words, "--retry-failed", "--strict")
-    assert code == 3 and json.loads(said)["done_now"] == json.loads(said)["failed"] == 2
+    assert code == 3 and json.loads(said)["runs_done"] == json.loads(said)["failed"] == 2
     assert (tmp_path / "out" / "table.parquet").read_bytes() == before
 
 

@@ -83,7 +83,7 @@ def test_what_a_run_reports_of_its_pins_is_what_every_step_shows(seconds, name):
     """Seen after every physics step, not only where the run itself looks."""
     run, worst = watched(name, seconds)
     assert worst < PIN
-    reported = run.summary["largest_pin_opening_mm"] * 1e-3
+    reported = run.summary["max_pin_opening_mm"] * 1e-3
     # It is read once per control period, and a pin rings through many of them.
     rounded = worst * (1.0 + 1e-12)  # to millimetres and back
     assert 0.5 * worst <= reported <= rounded or run.plant.model.neq == 0
@@ -109,7 +109,7 @@ def test_shipped_scenario_runs(name, begun):
     run = shipped(name, duration=begun) if begun else shipped(name)
     assert len(run.measured) == run.scenario.row_count == len(run.truth)
     assert all(np.isfinite(v).all() for v in run.truth.columns.values())
-    assert run.summary["largest_pin_opening_mm"] < 1e3 * PIN
+    assert run.summary["max_pin_opening_mm"] < 1e3 * PIN
 
 
 @pytest.mark.parametrize(
@@ -437,7 +437,7 @@ REFUSED = {
         "the reference of boom is 2 at .* its joint range is",
     ),
     "reference_table": (
-        {"pilot": TABLE | {"of": "joint", "columns": {"boom": [0.45, 2.0]}}},
+        {"pilot": TABLE | {"quantity": "joint", "columns": {"boom": [0.45, 2.0]}}},
         "the reference of boom is 2",
     ),
 }  # fmt: skip
@@ -517,7 +517,7 @@ def pilots(draw, axes, arm):
         of = draw(st.sampled_from(["command", "joint"]))
         columns = {a: [draw(inside[a] if of == "joint" else numbers) for _ in time] for a in some}
         mode = draw(st.sampled_from(["hold", "linear"]))
-        return {"kind": kind, "of": of, "interpolate": mode, "time": time, "columns": columns}
+        return {"kind": kind, "quantity": of, "interpolate": mode, "time": time, "columns": columns}
     if kind == "fourier":
         waves = {}
         for a in some:

@@ -101,7 +101,7 @@ def test_pick_log_puts_it_down_where_it_should():
     place = np.column_stack([run.truth[f"truth.position.log_0_{c}"] for c in "xyz"])
     assert np.hypot(*(place[-1, :2] - END)) < 0.1
     assert place[:, 2].max() > 1.2 and place[-1, 2] == pytest.approx(0.175, abs=1e-3)
-    assert run.summary["largest_pin_opening_mm"] < 0.05
+    assert run.summary["max_pin_opening_mm"] < 0.05
     machine, truth = run.plant.machine, run.truth
     model = compile_visual_model(machine, surroundings=logged_surroundings(truth))
     poses = body_poses(machine, model, logged_joints(machine, truth), truth)
@@ -140,7 +140,7 @@ def test_a_log_needs_ground():
 
 @pytest.mark.parametrize(
     ("log", "message"),
-    [({"open": 1.3}, "must not exceed closed"), ({"length": 0.5}, "at least twice the diameter")],
+    [({"open_angle": 1.3}, "must not exceed closed_angle"), ({"length": 0.5}, "at least twice the diameter")],
 )
 def test_impossible_logs_are_refused(log, message):
     with pytest.raises(ValueError, match=message):

@@ -91,7 +91,7 @@ def fell(duration, buttons, r=7.4, times=(0.0, 5.5), points=None) -> Scenario:
             "coordinates": {"r": {"speed": 0.2}, "z": {"speed": 0.4}},
             "operator": {"kind": "steer", "time": list(times),
                          "points": points or {"r": [r, 8.0], "z": [0.75, 0.75]}},
-            "buttons": [{"at": t, "axis": a, "command": c} for t, a, c in buttons],
+            "buttons": [{"start": t, "axis": a, "command": c} for t, a, c in buttons],
         },
     })  # fmt: skip
 
@@ -127,7 +127,7 @@ def test_a_saw_that_stands_does_not_cut():
 def test_a_saw_above_the_kerf_does_not_cut():
     scenario = fell(9.0, [SAW])
     data = scenario.model_dump(mode="json")
-    data["surroundings"][0]["kerf"] = 0.8
+    data["surroundings"][0]["cut_height"] = 0.8
     session, _ = gone(Scenario.model_validate(data))
     assert not any("cut" in said for _, said in session.events)
 

@@ -66,7 +66,7 @@ def test_json_is_all_that_is_printed_and_nothing_is_written(case, tmp_path, monk
     assert document["delay"] == {"forward": 0.3, "back": 0.3}
     found = document["structures"]["rate_force"]
     assert not found["stable"] and found["unstable_poles"] > 0 and found["gain_margin"] < 1.0
-    assert 0.1 < found["largest_delay"] < 0.15  # 123 ms
+    assert 0.1 < found["max_delay"] < 0.15  # 123 ms
     assert [p.name for p in tmp_path.iterdir()] == ["case.yaml"]
 
 
@@ -79,7 +79,7 @@ def test_json_is_all_that_is_printed_and_nothing_is_written(case, tmp_path, monk
         ("velocity: 1,", "velocity: 0,", r"gains\.velocity.*greater than 0"),
         ("force: 1}", "force: -2}", r"gains\.force.*greater than or equal to 0"),
         ("forward: 0.02", "forward: 99", r"delays\.forward.*less than or equal to 10"),
-        ("least: 300", "least: 700", "least <= nominal <= most: 700, 600, 4000"),
+        ("min_stiffness: 300", "min_stiffness: 700", "nominal_stiffness <= max_stiffness: 700, 600, 4000"),
         ("name: cat215_axis", "structures: [rate_farce]\nname: x", "did you mean 'rate_force'"),
         ("master_control: {damping", "master_control: {mass: 1, damping", "unknown key 'mass'"),
     ],
@@ -108,7 +108,7 @@ def test_wrong_words(words, message):
 
 def test_the_shipped_case_has_its_joystick_from_the_thesis():
     facts = load_teleop_case()
-    assert facts.stiffness and facts.master_control.stiffness == facts.stiffness.nominal
+    assert facts.stiffness and facts.master_control.stiffness == facts.stiffness.nominal_stiffness
     assert facts.structures == STRUCTURES
     assert facts.stiffness.mass == facts.master.mass
 
@@ -124,13 +124,13 @@ def test_robust_has_waves_and_passivity_control(case, tmp_path):
     )  # fmt: skip
     document = json.loads(out)
     assert code == 0 and set(document["structures"]) == {"rate_position"}
-    assert not document["structures"]["rate_position"]["stable_let_go"]
-    assert document["structures"]["rate_position"]["unstable_poles_let_go"] == 2
+    assert not document["structures"]["rate_position"]["stable_released"]
+    assert document["structures"]["rate_position"]["unstable_poles_released"] == 2
     robust = document["robust"]["structures"]
     assert set(robust) == {"rate_position", "passivity_control"}
-    assert robust["rate_position"]["master_let_go"]["unstable_poles"] == 2
-    assert not robust["rate_position"]["sampled"]["let_go_task"]["stable"]
-    assert robust["passivity_control"]["sampled"]["let_go_task"]["stable"]
+    assert robust["rate_position"]["released_master"]["unstable_poles"] == 2
+    assert not robust["rate_position"]["sampled"]["released_task"]["stable"]
+    assert robust["passivity_control"]["sampled"]["released_task"]["stable"]
     assert document["stiffness_feedback"]["held"]["stable_by"] == "switching bound"
 
 

@@ -94,9 +94,9 @@ def test_a_detent_keeps_the_coils_cool_where_one_slope_would_not():
     coils = make_three_station_coils(c.radius, c.force_per_ampere, c.max_current)
     gains = joystick.gains["feller"]["x"]
     assert gains.detent
-    slope = gains.nominal * x
-    notch = gains.nominal * gains.deadband - gains.detent.drop
-    notch += gains.detent.outside * (x - gains.deadband)
+    slope = gains.nominal_stiffness * x
+    notch = gains.nominal_stiffness * gains.deadband - gains.detent.drop
+    notch += gains.detent.slope * (x - gains.deadband)
     hot = []
     for force in (slope, notch):
         wrench = np.array([force, 0.0, 9.81 * joystick.flotor.mass, 0.0, 0.0, 0.0])

@@ -65,8 +65,8 @@ def test_command_analyses_a_scenario(tmp_path):
     document = json.loads((target / "analysis.json").read_text())
     found = document["structure"]
     assert found["stable"] and found["gain_margin"] > 1.0 and found["of_the_scenario"]
-    assert found["largest_ratio"] == pytest.approx(found["ratio"] * found["gain_margin"])
-    assert found["largest_ratio_with_deadband"] > found["largest_ratio"]
+    assert found["max_ratio"] == pytest.approx(found["ratio"] * found["gain_margin"])
+    assert found["max_ratio_with_deadband"] > found["max_ratio"]
     assert document["stiffness_feedback"]["held"]["margin"] < 0.0
 
 

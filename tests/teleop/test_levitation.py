@@ -24,7 +24,7 @@ def test_every_axis_steps_as_designed_and_leaves_the_others_alone(axis, diodes):
     target = np.zeros((121, 6))
     target[:, axis] = STEPS[axis]
     flight = simulate_levitation(JOYSTICK, target, diodes=diodes)
-    alone = JOYSTICK.alone
+    alone = JOYSTICK.closed_loop
     designed = second_order_step_response(flight.time, alone.frequency[axis], alone.ratio[axis])
     share = flight.pose / STEPS
     # a control that holds for 5 ms and differences that are 2.5 ms old are late by 5 ms in all,

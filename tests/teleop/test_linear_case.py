@@ -102,7 +102,7 @@ def test_hand_is_that_of_the_scenarios_operator(case):
     assert case.held == Impedance(usual.mass, usual.damping, usual.stiffness)
     firm = made(pilot__perception="{grip: firm, cocontraction: 0.4}")[0]
     assert firm.hand_impedance.mass == pytest.approx(0.8)  # operator.yaml: firm
-    assert firm.hand_impedance.stiffness == pytest.approx(600.0 * 1.8)  # stiffening 3: 1 + 2 x 0.4
+    assert firm.hand_impedance.stiffness == pytest.approx(600.0 * 1.8)  # factor 3: 1 + 2 x 0.4
     far = made(pilot__perception="{grip: normal, posture: far}", coordinate="r")[0]
     assert far.hand_impedance.stiffness > 2.0 * 250.0  # towards the shoulder
     ratios = [analyse_scenario_loop(c, "rate_force").max_ratio for c in (case, firm)]

@@ -121,23 +121,21 @@ def test_every_number_has_a_source():
         assert len(p.source) > 20, name
 
 
-def test_former_keys_are_read_with_a_warning():
-    with pytest.warns(FutureWarning, match="skill is deprecated and was read as crossover"):
-        assert OperatorSettings.model_validate({"skill": 0.8}).crossover == 0.8
-    with pytest.raises(ValueError, match="give one of them"):
-        OperatorSettings.model_validate({"skill": 0.8, "crossover": 1.0})
-
-
 def test_an_own_file_changes_what_it_names(tmp_path):
     (tmp_path / "me.yaml").write_text(
         "name: me\nparameters:\n  tremor: {value: 0.2, low: 0.1, high: 0.3, unit: N,"
         " basis: identified, source: a record of mine}\n"
     )
-    him = scenario_operator(OperatorSettings(file="me.yaml", touch=0.2), str(tmp_path))
-    assert (him.tremor, him.touch, him.remnant) == (0.2, 0.2, HIM.remnant)
+    him = scenario_operator(OperatorSettings(file="me.yaml", haptic_delay=0.2), str(tmp_path))
+    assert (him.tremor, him.haptic_delay, him.remnant) == (0.2, 0.2, HIM.remnant)
     (tmp_path / "bad.yaml").write_text("name: me\nparameters: {tremors: {value: 1}}\n")
     with pytest.raises(InputError, match="bad.yaml"):
         scenario_operator(OperatorSettings(file="bad.yaml"), str(tmp_path))
+    (tmp_path / "old.yaml").write_text(
+        "name: me\nparameters:\n  touch: {value: 0.2, low: 0.1, high: 0.3, basis: identified, source: a record}\n"
+    )
+    with pytest.raises(InputError, match="old.yaml:1: .*unknown key 'touch': it is now called 'haptic_delay'"):
+        scenario_operator(OperatorSettings(file="old.yaml"), str(tmp_path))
 
 
 @pytest.mark.parametrize("form", range(3))
@@ -184,13 +182,13 @@ def test_posture_makes_ellipses_of_the_hand():
 
 
 def test_grip_posture_and_cocontraction_make_the_hand():
-    """Full co-contraction: stiffness times `stiffening`, the damping ratio stays."""
+    """Full co-contraction: stiffness times `cocontraction_stiffness_factor`, the damping ratio stays."""
     stick = load_joystick()
     assert attach_operator_hand(stick, OperatorSettings()).hand == stick.hand
     firm = attach_operator_hand(stick, OperatorSettings(grip="firm")).hand
     assert firm.stiffness > stick.hand.stiffness
     tense = attach_operator_hand(stick, OperatorSettings(cocontraction=1.0)).hand
-    assert tense.stiffness == pytest.approx(HIM.stiffening * stick.hand.stiffness)
+    assert tense.stiffness == pytest.approx(HIM.cocontraction_stiffness_factor * stick.hand.stiffness)
     ratio = [h.damping / math.sqrt(h.mass * h.stiffness) for h in (tense, stick.hand)]
     assert ratio[0] == pytest.approx(ratio[1])
     with pytest.raises(InputError, match="did you mean 'firm'"):

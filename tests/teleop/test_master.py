@@ -51,8 +51,8 @@ def test_stiffness_feedback_is_the_plain_law(number, x, v, force):
     numbers, s = built(reflection="stiffness")
     row, gains = numbers.axis[number], STICK.gains["excavator"][AXES[number]]
     law = StiffnessFeedback(
-        gains.nominal, gains.least, gains.most,
-        (gains.most - gains.nominal) / gains.force_limit, gains.damping, gains.force_limit,
+        gains.nominal_stiffness, gains.min_stiffness, gains.max_stiffness,
+        (gains.max_stiffness - gains.nominal_stiffness) / gains.force_limit, gains.damping, gains.force_limit,
         gains.deadband,
     )  # fmt: skip
     packet = np.zeros((8, 4))
@@ -69,14 +69,14 @@ def test_detent_is_the_plain_law(number, x):
     """1e-9 N: the same sums in another order."""
     numbers, s = built(reflection="none", gains="feller", detent=True)
     gains = STICK.gains["feller"][AXES[number]]
-    law = Detent(gains.deadband, gains.detent.drop, gains.nominal, gains.detent.outside)
+    law = Detent(gains.deadband, gains.detent.drop, gains.nominal_stiffness, gains.detent.slope)
     s.handle[number] = x * (1.0 if number < 3 else 20.0)
     assert pushed(numbers, s)[number] == pytest.approx(law.force(s.handle[number]), abs=1e-9)
 
 
 def test_detent_never_pushes_outwards_and_needs_rate_control():
     """A task that softens the spring below what the drop takes leaves no force, not a push out."""
-    numbers, s = built(gains="feller", detent=True, stiffness={"z": {"least": 0.0}})
+    numbers, s = built(gains="feller", detent=True, stiffness={"z": {"min_stiffness": 0.0}})
     packet = np.zeros((8, 4))
     packet[0, 2] = 1e6
     s.handle[2] = 1.6e-3
@@ -211,9 +211,9 @@ def test_identified_damping_stays_below_what_a_sampled_flotor_bears():
     ("changed", "where"),
     [
         ({"gains": "digger"}, "pilot.gains"),
-        ({"stiffness": {"z": {"least": 700.0}}}, "pilot.stiffness.z"),
-        ({"stiffness": {"z": {"least": -1.0}}}, "pilot.stiffness.z"),
-        ({"stiffness": {"z": {"most": 10.0}}}, "pilot.stiffness.z"),
+        ({"stiffness": {"z": {"min_stiffness": 700.0}}}, "pilot.stiffness.z"),
+        ({"stiffness": {"z": {"min_stiffness": -1.0}}}, "pilot.stiffness.z"),
+        ({"stiffness": {"z": {"max_stiffness": 10.0}}}, "pilot.stiffness.z"),
         ({"stiffness": {"z": {"force_limit": 0.0}}}, "pilot.stiffness.z"),
         ({"stiffness": {"z": {"damping": -1.0}}}, "pilot.stiffness.z"),
         ({"stiffness": {"z": {"stifness": 1.0}}}, "pilot.stiffness.z"),

@@ -99,7 +99,7 @@ def test_the_detent_is_felt_as_it_was_designed(axis, far):
     """
     numbers, s = seated(gains="feller", detent=True)
     gains = JOYSTICK.gains["feller"]["x" if axis == 0 else "rx"]
-    law = Detent(gains.deadband, gains.detent.drop, gains.nominal, gains.detent.outside)
+    law = Detent(gains.deadband, gains.detent.drop, gains.nominal_stiffness, gains.detent.slope)
     flotor, joint = SimulatedFlotor(JOYSTICK, hand=False), 0 if axis == 0 else 3
     flotor.model.jnt_stiffness[:] = [2e4] * 3 + [200.0]
     flotor.model.dof_damping[:] = [100.0] * 3 + [2.0] * 3

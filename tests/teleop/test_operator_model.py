@@ -62,7 +62,7 @@ def test_he_acts_on_what_he_saw_a_reaction_time_ago(mode):
 def test_his_hand_stays_within_the_way_of_the_handle():
     views = Views()
     views.values["measured"][:, 0, 2] = -50.0
-    him, numbers = person(STEER, views=views, mode="position", perception={"crossover": 50.0})
+    him, numbers = person(STEER, views=views, mode="position", perception={"max_crossover_frequency": 50.0})
     for tick in range(0, TICKS, him.ticks_per_decision):
         him.decide(tick)
         assert abs(him.muscles.reference[2]) <= numbers.axis[2, HANDLE_RANGE]

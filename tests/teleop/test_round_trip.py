@@ -45,7 +45,7 @@ class RoundTrip:
         self.back, self.packet = np.zeros((1 + back, 8, 4)), np.zeros((8, 4))
         self.age = np.tile([forward, back], (ticks, 1))
         self.age[list(lost)] = -1
-        self.state = np.array([0.0, 1.0, PERIOD, pilot.safety.silence, FADE])
+        self.state = np.array([0.0, 1.0, PERIOD, pilot.safety.packet_timeout, FADE])
         self.qpos, self.force = np.array([0.0, 0, 0, 1, 0, 0, 0]), np.zeros(4)
         self.joint = HOME.copy()
         self.grid, self.table = tabulate_drives(CAT, AXES)

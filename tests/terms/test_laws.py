@@ -40,7 +40,7 @@ from hydrotele.terms.table import (
 STATE = DriveState(
     time=1.7, position=0.43, velocity=-0.21, spool=0.3, spool_rate=-2.0, pressure_head=9.0e6,
     pressure_rod=4.0e6, pressure_supply=2.0e7, command=0.4, force=1.2e5,
-    played=0.0, ahead=0.0,
+    play_output=0.0, play_difference=0.0,
 )  # fmt: skip
 USED = {
     "constant": {"value": 12.0},
@@ -48,7 +48,7 @@ USED = {
     "ramp": {"rate": 3.0, "start": 0.2},
     "exponential_drift": {"value": 7.0, "time_constant": 2.0},
     "linear_table": {"variable": "velocity", "points": [-1, -0.2, 0.5], "values": [4, 1, -2]},
-    "table2": {
+    "bilinear_table": {
         "row_variable": "position", "column_variable": "velocity", "row_points": [0, 0.5, 1],
         "column_points": [-1, 0], "values": [[1, 2], [3, 5], [7, 11]],
     },
@@ -76,7 +76,7 @@ def by_hand(name, p):
         "ramp": 3.0 * 1.5,
         "exponential_drift": 7.0 * (1 - math.exp(-0.85)),
         "linear_table": np.interp(-0.21, [-1, -0.2, 0.5], [4, 1, -2]),
-        "table2": 0.14 * (0.21 * 1 + 0.79 * 2) + 0.86 * (0.21 * 3 + 0.79 * 5),
+        "bilinear_table": 0.14 * (0.21 * 1 + 0.79 * 2) + 0.86 * (0.21 * 3 + 0.79 * 5),
         "formula": 2.0 + 3.0 * 0.21**2 + 1e3 * 0.03**2,
         "quadratic_drag": 40.0 * 0.21**2,
         "load_friction": 0.04 * 1.2e5 * math.tanh(2.1),
@@ -181,21 +181,21 @@ def test_with_a_window_a_term_acts_for_a_while():
 
 def test_a_law_may_see_variables_of_another_drive():
     law_ = ("formula", {"velocity": 1.0, "pressure_rod": 1e-6, "position": 10.0})
-    term = force_term(*law_, of={"velocity": "b", "pressure_rod": "b"}, domain={"velocity": (0, 2)})
+    term = force_term(*law_, variables_from={"velocity": "b", "pressure_rod": "b"}, domain={"velocity": (0, 2)})
     drives = Drives(2, np.arange(8.0) * 1e6, np.array([0.1, 0.2]), np.array([-0.3, 0.5]), np.zeros(2))
     table = terms_table([term], ["a", "b"])
     assert sum_terms(table, FORCE, 0, STATE, drives) == pytest.approx(0.5 + 7.0 + 4.3)
     faster = drives._replace(velocity=np.array([0.0, 3.0]))
     assert sum_terms(table, FORCE, 0, STATE, faster) == pytest.approx(2.0 + 7.0 + 4.3)
     assert sum_terms_with_slope(table, FORCE, 0, STATE, drives)[1] == 0.0, "not its own velocity"
-    lone = force_term(*law_, of={"velocity": "b"})
+    lone = force_term(*law_, variables_from={"velocity": "b"})
     assert sum_terms(terms_table([lone], ["a", "b"]), FORCE, 0, STATE, NO_DRIVES) == 4.0 + 4.3
-    with pytest.raises(ValidationError, match="of: 'time'"):
-        force_term(*law_, of={"time": "b"})
+    with pytest.raises(ValidationError, match="variables_from: 'time'"):
+        force_term(*law_, variables_from={"time": "b"})
 
 
 def test_a_law_may_see_the_force_of_another_drive():
-    term = force_term("formula", {"force": 2.0}, of={"force": "b"})
+    term = force_term("formula", {"force": 2.0}, variables_from={"force": "b"})
     act = np.array([0.0, 0.0, 9e6, 9e6, 0.0, 0.0, 3e6, 1e6])
     drives = Drives(2, act, np.zeros(2), np.zeros(2), np.zeros(2))
     table = terms_table([term], ["a", "b"], areas={"a": (1.0, 1.0), "b": (0.01, 0.006)})
@@ -215,13 +215,13 @@ def carried(term, values):
 
 def test_a_play_follows_half_a_width_behind():
     play = {"variable": "velocity", "half_width": 0.2}
-    term = force_term("formula", {"played": 10.0, "velocity": 1.0}, play=play)
+    term = force_term("formula", {"play_output": 10.0, "velocity": 1.0}, play=play)
     table, told = carried(term, [0.1, 0.5, 0.4, 0.2, 0.0, -0.3])
     assert 0.2 * np.array(told) == pytest.approx([0.0, 0.3, 0.3, 0.3, 0.2, -0.1])
     drives = Drives(1, np.array([0.0, 0, 0, 0, 1.5]), np.zeros(1), np.zeros(1), np.zeros(1))
     assert sum_terms(table, FORCE, 0, STATE, drives) == pytest.approx(10.0 * 0.3 - 0.21)
     assert sum_terms(table, FORCE, 0, STATE, NO_DRIVES) == pytest.approx(-0.21), "nothing keeps it"
-    other, _ = carried(force_term("formula", {"ahead": 10.0}, play=play), [])
+    other, _ = carried(force_term("formula", {"play_difference": 10.0}, play=play), [])
     assert sum_terms(other, FORCE, 0, STATE, drives) == pytest.approx(10.0 * (-0.21 - 0.3))
     place_at = 13
     table[place_at] = 1e9  # as anyone may write it into a model
@@ -254,7 +254,7 @@ def test_memories_that_cannot_be_are_refused():
     for memory, message in (
         ({"play": play, "switch": switch}, "a term can have only one of them"),
         ({"play": play | {"half_width": 0.0}}, "greater than 0"),
-        ({"play": play | {"variable": "played"}}, "play: 'played' is not a variable"),
+        ({"play": play | {"variable": "play_output"}}, "play: 'play_output' is not a variable"),
         ({"switch": switch | {"variable": "sppol"}}, "did you mean 'spool'"),
         ({"switch": switch | {"off": 1}}, "they must be different"),
     ):
@@ -290,12 +290,16 @@ def test_a_wrong_place_or_the_place_of_another_law_adds_nothing():
         ("constant", {"value": [1.0, 2.0]}, "must be a finite number, not"),
         ("constant", {"value": "much"}, "must be a finite number, not 'much'"),
         ("linear_table", {"variable": "speed", "points": [0, 1], "values": [0, 1]},
-         "'speed' is not a variable; .*valid: ahead, command"),
+         "'speed' is not a variable; .*valid: command"),
         ("linear_table", {"variable": "velocity", "points": [0, 1, 1], "values": [0, 1, 2]},
          "must be at least two increasing numbers"),
         ("linear_table", {"variable": "velocity", "points": [0, 1], "values": [0, 1, 2]},
          "values must have as many numbers as points, 2"),
-        ("table2", USED["table2"] | {"values": [1.0, 2.0]}, "must be 3 rows of 2 numbers"),
+        ("bilinear_table", USED["bilinear_table"] | {"values": [1.0, 2.0]}, "must be 3 rows of 2 numbers"),
+        ("table2", USED["bilinear_table"], "law 'table2' is not known; it is now called 'bilinear_table'"),
+        ("formula", {"played": 1.0}, "'played' is not a variable; it is now called 'play_output'"),
+        ("linear_table", {"variable": "ahead", "points": [0, 1], "values": [0, 1]},
+         "'ahead' is not a variable; it is now called 'play_difference'"),
         ("formula", {}, "at least one product"),
         ("formula", {"velocity +": 1.0}, "it cannot be parsed"),
         ("formula", {"speed": 1.0}, "'speed' is not a variable"),

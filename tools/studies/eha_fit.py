@@ -46,10 +46,10 @@ _CYLINDER = ("area_rod", "friction.coulomb", "friction.viscous")
 _PUMP = (
     "displacement", "leakage", "torque_loss", "compliance_head", "compliance_rod", "air_head",
     "air_rod", "accumulator.pressure", "accumulator.line_extending",
-    "accumulator.line_retracting", "motor.emf", "motor.inertia", "motor.drag", "motor.breakaway",
+    "accumulator.line_retracting", "motor.torque_constant", "motor.inertia", "motor.drag", "motor.breakaway",
     "motor.breakaway_speed", "motor.viscous",
 )  # fmt: skip
-_LOAD = ("void", "void_pressure", "override", "friction")
+_LOAD = ("unfilled_travel", "air_pressure", "relief_override", "friction")
 _PATHS = [f"axes.piston.cylinder.{n}" for n in _CYLINDER] + [f"axes.piston.pump.{n}" for n in _PUMP]
 _ROD = "pressure_rod.piston"
 

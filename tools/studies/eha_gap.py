@@ -71,7 +71,7 @@ def tell(gap: Gap, fitted: Machine) -> None:
     for what, value, target in [
         ("rod side area", now.cylinder.area_rod, best.cylinder.area_rod),
         ("displacement", now.pump.displacement, best.pump.displacement),
-        ("motor constant", now.pump.motor.emf, best.pump.motor.emf),
+        ("motor constant", now.pump.motor.torque_constant, best.pump.motor.torque_constant),
         ("inertia", now.pump.motor.inertia, best.pump.motor.inertia),
         ("drag", now.pump.motor.drag, best.pump.motor.drag),
         ("coulomb friction", now.drive.friction.coulomb, best.drive.friction.coulomb),

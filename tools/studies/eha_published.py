@@ -22,7 +22,7 @@ PUBLISHED = {  # what -> path -> value in SI
     "rod 20 mm": {"axes.piston.cylinder.area_rod": 1649.336e-6},
     "1.6 cm3 per turn": {f"{_PUMP}.displacement": 1.6e-6 / (2.0 * np.pi)},
     "volumetric efficiency 0.92 at 1500 rpm, 250 bar": {f"{_PUMP}.leakage": 1.28e-13},
-    "9 mV/rpm": {f"{_PUMP}.motor.emf": 0.0859},
+    "9 mV/rpm": {f"{_PUMP}.motor.torque_constant": 0.0859},
     "inertia 0.01 kg m2": {f"{_PUMP}.motor.inertia": 0.01},
     "no friction": {f"axes.piston.cylinder.friction.{name}": 0.0 for name in ("coulomb", "stribeck_extra")}
     | {"axes.piston.cylinder.friction.viscous": 1.0e3},

@@ -97,7 +97,7 @@ def track(machine: Machine, folder: Path, shape: str, lap: float, model: str | N
     phase = (since - soft * (1.0 - np.exp(-since / soft))) / lap
     joints = np.array([inverse_kinematics(geometry, tuple(point))[:3] for point in path_of(shape, phase)])
     pilot = {
-        "kind": "table", "of": "joint", "interpolate": "linear", "time": time.tolist(),
+        "kind": "table", "quantity": "joint", "interpolate": "linear", "time": time.tolist(),
         "columns": {a: joints[:, k].tolist() for k, a in enumerate(AXES)},
     }  # fmt: skip
     run = run_scenario(scenario(folder, joints[0], float(time[-1]), pilot, model, "ideal", STIFF))

@@ -60,7 +60,7 @@ def step(axis: int, joystick=JOYSTICK, **how) -> LevitationRun:
 
 def step_figures(flight: LevitationRun, axis: int) -> tuple[float, float, float]:
     """Deviation from the designed response, cross motion (fractions), largest current [A]."""
-    alone, share = JOYSTICK.alone, flight.pose / SIZES
+    alone, share = JOYSTICK.closed_loop, flight.pose / SIZES
     designed = second_order_step_response(flight.time, alone.frequency[axis], alone.ratio[axis])
     deviation = np.abs(share[:, axis] - designed).max()
     cross = np.abs(np.delete(share, axis, axis=1)).max()
@@ -208,7 +208,7 @@ def detent() -> list[str]:
     """Force that a clamp needs to lead the handle through the notch of x."""
     gains = JOYSTICK.gains["feller"]["x"]
     assert gains.detent
-    law = Detent(gains.deadband, gains.detent.drop, gains.nominal, gains.detent.outside)
+    law = Detent(gains.deadband, gains.detent.drop, gains.nominal_stiffness, gains.detent.slope)
     numbers, s = seated(gains="feller", detent=True)
     flotor = SimulatedFlotor(JOYSTICK, hand=False)
     flotor.model.jnt_stiffness[:3], flotor.model.dof_damping[:3] = 2e4, 100.0
@@ -373,9 +373,9 @@ def heat() -> list[str]:
         gains = JOYSTICK.gains["feller"][AXES[axis]]
         assert gains.detent
         x = 0.9 * JOYSTICK.handle_travel[axis]
-        law = Detent(gains.deadband, gains.detent.drop, gains.nominal, gains.detent.outside)
+        law = Detent(gains.deadband, gains.detent.drop, gains.nominal_stiffness, gains.detent.slope)
         cells = []
-        for force in (gains.nominal * x, -law.force(x)):
+        for force in (gains.nominal_stiffness * x, -law.force(x)):
             wrench = np.array([0.0, 0.0, weight, 0.0, 0.0, 0.0])
             wrench[axis] += force
             wrench[4] += force * handle if axis == 0 else 0.0
@@ -404,7 +404,7 @@ def force_over_the_gap() -> list[str]:
         " hovering flotor there [um] | error of 4.8 N at x = 2 mm [N] |",
         "| ---: | ---: | ---: | ---: |",
     ]  # fmt: skip
-    stiff = JOYSTICK.gains["feller"]["z"].nominal
+    stiff = JOYSTICK.gains["feller"]["z"].nominal_stiffness
     for loss in (0.0, 0.05, 0.1, 0.2):
         errors = []
         for x in (4.5e-3, 2e-3):
@@ -480,7 +480,7 @@ def draw(path: Path) -> None:
         flight = step(axis)
         share = flight.pose / SIZES
         fine = np.linspace(0.0, flight.time[-1], 400)
-        alone = JOYSTICK.alone
+        alone = JOYSTICK.closed_loop
         panel.plot(
             fine, second_order_step_response(fine, alone.frequency[axis], alone.ratio[axis]), color="black",
             linewidth=0.9, linestyle="--", label="designed",

@@ -121,7 +121,7 @@ def person(number: int | None, seed: int, **known: float) -> dict[str, str]:
     """Overrides of a scenario for an operator."""
     made = {"seed": str(seed)}
     if number is not None:
-        made["pilot.perception.drawn"] = str(number)
+        made["pilot.perception.sample"] = str(number)
     return made | {f"pilot.perception.{name}": str(value) for name, value in known.items()}
 
 
@@ -174,7 +174,7 @@ def sensitivity(
     return [one.frequency, math.degrees(one.margin), 100.0 * felt, *machine]
 
 
-_BENCH_ONLY = ("lead_delay", "stiffening")  # not keys of a scenario, or without effect alone
+_BENCH_ONLY = ("lead_delay", "cocontraction_stiffness_factor")  # not keys of a scenario, or without effect alone
 _SHORT = {"duration": "40", "pilot.operator.target.time": "[0.0, 20.0, 20.01, 40.0]"}
 
 

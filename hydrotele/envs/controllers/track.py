@@ -262,9 +262,9 @@ class LineController(TipController):
     def __init__(self, setup: TaskSetup) -> None:
         """Look up the observation columns."""
         super().__init__(setup)
-        self._reference_columns = find_columns(setup, "wanted", COORDINATES[: self._k])
+        self._reference_columns = find_columns(setup, "reference", COORDINATES[: self._k])
         self._preview_columns = [
-            find_columns(setup, f"wanted_in_{time * 1000:.0f}_ms", COORDINATES[:3]) for time in LINE_PREVIEWS[:2]
+            find_columns(setup, f"reference_in_{time * 1000:.0f}_ms", COORDINATES[:3]) for time in LINE_PREVIEWS[:2]
         ]
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
@@ -289,7 +289,7 @@ class ReachController(TipController):
     def __init__(self, setup: TaskSetup) -> None:
         """Look up the observation columns."""
         super().__init__(setup, _TIP_INTEGRAL)
-        self._reference_columns = find_columns(setup, "wanted", COORDINATES[: self._k])
+        self._reference_columns = find_columns(setup, "reference", COORDINATES[: self._k])
         servo = setup.task.servo
         gains = [servo.axis_gains.get(axis, servo.position_gain) for axis in setup.axes[: self._k]]
         self._position_gains = np.array(gains)
@@ -340,7 +340,7 @@ class PressController:
         if setup.options.action != "resolved_motion":
             raise InputError(f"action {setup.options.action!r}", "must be resolved_motion")
         self._force_column = find_columns(setup, "force", [""])[0]
-        self._reference_column = find_columns(setup, "wanted_force", [""])[0]
+        self._reference_column = find_columns(setup, "reference_force", [""])[0]
         self._fastest, self._actions = setup.task.pose_rates[2], len(setup.axes)
 
     def begin(self, count: int) -> None:

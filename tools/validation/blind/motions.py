@@ -64,7 +64,7 @@ def motions(machine: Machine, rng: np.random.Generator, duration: float = 40.0) 
 def _scenario(machine, name, time, path, servo, seed) -> Scenario:
     joints = {machine.axes[axis].joint: float(q[0]) for axis, q in path.items()}
     columns = {axis: q.tolist() for axis, q in path.items()}
-    pilot = TablePilot(kind="table", of="joint", interpolate="linear", time=time.tolist(), columns=columns)
+    pilot = TablePilot(kind="table", quantity="joint", interpolate="linear", time=time.tolist(), columns=columns)
     return Scenario(
         name=name, machine=machine.name, tool=machine.tool, seed=seed,
         duration=len(time) / RATE, control_rate=RATE, log_rate=RATE, sensors=SENSORS,
