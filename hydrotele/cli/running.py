@@ -195,7 +195,7 @@ def sweep_to_folder(name: str, target: Path | None, options: SweepOptions) -> No
         done = count_finished_runs(target / JOURNAL)
         said = f"{done} of {file.sweep.runs} runs are finished and saved in {target}"
         message = f"stopped: {said}; repeat the command to continue"
-        stderr_console.print(message, markup=False, soft_wrap=True)
+        typer.echo(message, err=True)
         code = stop.code if isinstance(stop, SystemExit) else 130
         raise typer.Exit(code if isinstance(code, int) else 1) from None
     figures = list(file.sweep.figures) or choose_figures(swept.table)

@@ -67,6 +67,14 @@ class Replay:
     channels: dict[str, ChannelDifference]
     realtime_factor: float
 
+    def __repr__(self) -> str:
+        """Return the logs that were compared and the channel with the largest error."""
+        text = f"Replay({self.measured.source!r}, {len(self.channels)} channels"
+        if self.channels:
+            name, worst = max(self.channels.items(), key=lambda item: item[1].rms / (item[1].range or math.inf))
+            text += f", largest error relative to the range: {name} RMS {worst.rms:.4g} {worst.unit}"
+        return f"{text})"
+
 
 def replay_log(
     log: Log,

@@ -573,6 +573,11 @@ class Run:
     summary: dict[str, Any]
     station: TeleoperationSystem | None = None
 
+    def __repr__(self) -> str:
+        """Return scenario, machine and duration of the run."""
+        machine = f"machine={self.plant.machine.name!r}, tool={self.plant.machine.tool!r}"
+        return f"Run({self.scenario.name!r}, {machine}, {self.measured.time[-1]:g} s)"
+
 
 def load_nominal_machine(scenario: Scenario) -> Machine:
     """Load the machine of a scenario without its planted effects.
