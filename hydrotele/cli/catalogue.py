@@ -68,7 +68,9 @@ def format_summary(names: dict[str, list[str]], width: int) -> str:
         text = f"{kind} ({len(some)}): " + ", ".join([*some[:count], *left])
         return _wrap_text(text, width, "  ")
 
-    hint = _wrap_text("hydrotele list KIND describes the items of a kind, hydrotele list all those of all kinds.", width)
+    hint = _wrap_text(
+        "hydrotele list KIND describes the items of a kind, hydrotele list all those of all kinds.", width
+    )
     lines = {kind: wrap_names(kind) for kind in names}
     while sum(map(len, lines.values())) + len(hint) > _MAX_SUMMARY_LINES:
         longest = max(lines, key=lambda kind: (len(lines[kind]), shown[kind]))

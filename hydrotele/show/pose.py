@@ -9,7 +9,7 @@ from pydantic import TypeAdapter
 
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine
-from hydrotele.scenario.scenario import SurroundingObject
+from hydrotele.scenario.scenario import SurroundingObject, logged_soil
 from hydrotele.simulate.closure import close_along_motion, dependent_joints
 from hydrotele.simulate.mechanism import assemble_mjcf, mjcf_document
 from hydrotele.simulate.surroundings import object_joints
@@ -77,8 +77,10 @@ def logged_joints(machine: Machine, log: Log) -> dict[str, np.ndarray]:
 
 
 def logged_surroundings(log: Log) -> tuple[SurroundingObject, ...]:
-    """Return the plates, trees and tree logs that are stored in a log of true states."""
-    return tuple(_OBJECTS_ADAPTER.validate_json(log.metadata.get("surroundings", "[]")))
+    """Return plates, trees, tree logs and soil of a log of true states; soil alone of other logs."""
+    if "surroundings" in log.metadata:
+        return tuple(_OBJECTS_ADAPTER.validate_json(log.metadata["surroundings"]))
+    return logged_soil(log)
 
 
 def _write_object_positions(model: mujoco.MjModel, log: Log, rows: np.ndarray) -> None:
