@@ -143,8 +143,12 @@ def body_poses(
     Raises:
         InputError: a linkage cannot be closed in at least one row.
     """
+    return poses_at_positions(model, logged_positions(machine, model, joints, log))
+
+
+def poses_at_positions(model: mujoco.MjModel, rows: np.ndarray) -> Poses:
+    """Return the poses of all bodies at joint positions (n, nq)."""
     data = mujoco.MjData(model)
-    rows = logged_positions(machine, model, joints, log)
     position = np.empty((len(rows), model.nbody, 3))
     quaternion = np.empty((len(rows), model.nbody, 4))
     for row, qpos in enumerate(rows):

@@ -471,7 +471,7 @@ def _log_machines(stream, entries) -> Scene:
             models[key] = compile_visual_model(machine, surroundings=things)
         model = models[key]
         poses = body_poses(machine, model, logged_joints(machine, log), log)
-        clock, tip = time_column(log.time), _tip_path(machine, log, poses)
+        clock, tip = time_column(log.time), tip_path(machine, log, poses)
         log_machine(stream, f"/{name}/machine", model, poses, clock, ghost=scene is not None)
         log_tip(stream, f"/{name}/tip_path", tip, clock, scene is not None)
         grounds = [thing for thing in things if isinstance(thing, SoilGround)]
@@ -479,7 +479,7 @@ def _log_machines(stream, entries) -> Scene:
         contents += [f"/{name}/machine/**", f"/{name}/tip_path/**"]
         trails.append(f"/{name}/tip_path/trail")
         if scene is None:
-            eye, target = _camera_placement(model, tip)
+            eye, target = view_of_machine(model, tip)
             ground = log_ground(stream, model, soil)
             if soil and machine.arm:
                 log_soil(stream, f"/{name}/machine", machine.arm.tip.link, soil, log.time)
@@ -494,7 +494,8 @@ def _scene_title(names: list[str]) -> str:
     return f"{solid} (solid), {', '.join(glass)} (transparent blue)" if glass else "machine"
 
 
-def _tip_path(machine: Machine, log: Log, poses: Poses) -> np.ndarray | None:
+def tip_path(machine: Machine, log: Log, poses: Poses) -> np.ndarray | None:
+    """Return the path (n, 3) of the tip [m], true if the log contains it; None without an arm."""
     recorded = [f"truth.tip.{component}" for component in "xyz"]
     if all(name in log for name in recorded):
         return np.stack([log[name] for name in recorded], axis=1)
@@ -503,7 +504,7 @@ def _tip_path(machine: Machine, log: Log, poses: Poses) -> np.ndarray | None:
     return point_trajectory(poses, machine.arm.tip.link, machine.arm.tip.position)
 
 
-def _camera_placement(model: mujoco.MjModel, tip: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+def view_of_machine(model: mujoco.MjModel, tip: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
     """Return camera position and target (3,) [m] that show the machine and its whole tip path.
 
     The direction is that of the camera `overview` if the model has one.

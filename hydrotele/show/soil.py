@@ -7,20 +7,25 @@ the model of the simulation. The shapes are boxes for images and meshes for reco
 import math
 from typing import NamedTuple
 
+import mujoco
 import numpy as np
 
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine
 from hydrotele.scenario.scenario import SoilGround
+from hydrotele.show.canvas import Marker, box
 from hydrotele.show.looks import Mesh, flat_triangles
 from hydrotele.show.pose import Poses, point_trajectory
 from hydrotele.simulate.soil_bed import SoilBed
 from hydrotele.soil.facts import CARRIED_VOLUME, INNER_WIDTH, REPOSE
 
 BANK_COLOUR, LOOSE_COLOUR = np.array([92.0, 64.0, 38.0]), np.array([158.0, 120.0, 76.0])
+_GROUND_COLOUR = np.array([139.0, 126.0, 108.0])
+_GROUND_HALF_SIZE = 40.0  # m
+_LOAD_SLICES = 24  # boxes that fill the bucket
 MIN_LOOSE_THICKNESS = 1.0e-3  # m, thickness up to which loose soil is not drawn
 _MIN_DRAWN_AREA = 1.0e-3  # m^2, area of the side view up to which soil in the bucket is not drawn
-_BISECTIONS = 30  # halve the interval of the fill level to 1e-9 of the bucket's height
+_BISECTIONS = 12  # halve the interval of the fill level to below 1 mm
 
 
 class SoilShape(NamedTuple):
@@ -195,3 +200,61 @@ def surrounding_tiles(bed: SoilBed, half_size: float, tile: float) -> tuple[Mesh
     c, s = math.cos(bed.azimuth), math.sin(bed.azimuth)
     turned = np.array(triangles) @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     return flat_triangles(turned), np.repeat(parity, 6)
+
+
+def soil_markers(history: SoilHistory, row: int, poses: Poses, machine: Machine) -> list[Marker]:
+    """Return boxes for the ground, the strip of soil and the soil in the bucket at a row.
+
+    Args:
+        history: soil at the rows of a log.
+        row: index of the row.
+        poses: poses of the machine at the rows.
+        machine: machine with a bucket.
+
+    Returns:
+        The boxes, in the world frame.
+    """
+    bed, shape = history.bed, history.shapes[row]
+    c, s = math.cos(bed.azimuth), math.sin(bed.azimuth)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    half, cell = 0.5 * bed.bucket.width, bed.radii[1] - bed.radii[0]
+    start, end = bed.radii[0] - 0.5 * cell, bed.radii[-1] + 0.5 * cell
+    bottom = min(0.0, float(bed.surface.min())) - 0.1
+    far, aside = _GROUND_HALF_SIZE, 0.5 * (_GROUND_HALF_SIZE - half)
+    ground = [
+        (-far, start, 0.0, far), (end, far, 0.0, far),
+        (start, end, half + aside, aside), (start, end, -half - aside, aside),
+    ]  # fmt: skip
+
+    def slab(low_r: float, high_r: float, side: float, width: float, low: float, high: float, colour) -> Marker:
+        middle = turn @ [0.5 * (low_r + high_r), side, 0.5 * (low + high)]
+        sizes = (0.5 * (high_r - low_r), width, 0.5 * (high - low))
+        return box(middle, sizes, (*(colour / 255.0), 1.0), turn)._replace(emission=0.0)
+
+    markers = [slab(low, high, side, width, bottom, 0.0, _GROUND_COLOUR) for low, high, side, width in ground]
+    for r, surface, loose in zip(bed.radii, shape.surface, shape.loose, strict=True):
+        low, high = r - 0.5 * cell, r + 0.5 * cell
+        markers.append(slab(low, high, 0.0, half, bottom, surface - loose, BANK_COLOUR))
+        if loose > MIN_LOOSE_THICKNESS:
+            markers.append(slab(low, high, 0.0, half, surface - loose, surface, LOOSE_COLOUR))
+    return markers + _load_markers(history, row, poses, machine)
+
+
+def _load_markers(history: SoilHistory, row: int, poses: Poses, machine: Machine) -> list[Marker]:
+    """Return thin boxes that fill the side view of the soil in the bucket."""
+    corners = history.shapes[row].load
+    if len(corners) < 3 or machine.arm is None:
+        return []
+    body = poses.bodies.index(machine.arm.tip.link)
+    rotation = np.empty(9)
+    mujoco.mju_quat2Mat(rotation, poses.quaternion[row, body])
+    frame = rotation.reshape(3, 3) @ history.axes.T  # columns: ahead, left and up of the bucket
+    half, colour = 0.5 * history.bed.bucket.inner_width, (*(LOOSE_COLOUR / 255.0), 1.0)
+    edges, markers = np.linspace(corners[:, 0].min(), corners[:, 0].max(), _LOAD_SLICES + 1), []
+    for low, high in zip(edges[:-1], edges[1:], strict=True):
+        column = _cut_above(_cut_above(corners, np.array([1.0, 0.0]), high), np.array([-1.0, 0.0]), -low)
+        bottom, top = column[:, 1].min(), column[:, 1].max()
+        middle = poses.position[row, body] + frame @ [0.5 * (low + high), 0.0, 0.5 * (bottom + top)]
+        sizes = (0.5 * (high - low), half, 0.5 * (top - bottom))
+        markers.append(box(middle, sizes, colour, frame)._replace(emission=0.0))
+    return markers
