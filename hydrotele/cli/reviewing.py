@@ -8,11 +8,11 @@ import contextlib
 import dataclasses
 import re
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 from hydrotele.cli.console import (
+    announce_output,
     make_table,
     print_json,
     show_simulation_progress,
@@ -71,7 +71,7 @@ def review_logs(
     if time is not None and not screenshot:
         raise InputError("--at", "is the time of a screenshot: give --screenshot FILE.png as well")
     if plot:
-        with _announce("plot", plot):
+        with announce_output("plot", plot):
             _plot(first, second, machine, tool, plot)
     if video:
         _film(first, second, machine, tool, video)
@@ -82,12 +82,12 @@ def review_logs(
         if not (made.is_file() and not any((second, recording, machine, tool))):
             folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="hydrotele_"))
             made = recording or Path(folder, "review.rrd")
-            with _announce("recording", recording):
+            with announce_output("recording", recording):
                 _record(first, second, machine, tool, made)
         if screenshot:
             from hydrotele.show.viewer import take_screenshot
 
-            with _announce("screenshot", screenshot):
+            with announce_output("screenshot", screenshot):
                 complaints = take_screenshot(made, screenshot, displayed_time=time)
             for complaint in complaints:
                 stderr_console.print(f"[yellow]viewer[/] {complaint}", soft_wrap=True)
@@ -102,15 +102,6 @@ def review_logs(
             if open_viewer(made):
                 message = "no viewer can be opened on this computer; try --serve or --screenshot PNG"
                 raise InputError("review", message)
-
-
-@contextlib.contextmanager
-def _announce(what: str, path: Path | None) -> Iterator[None]:
-    """Print on stderr that an output is being made, and on stdout where it has been written, if at all."""
-    stderr_console.print(f"making the {what} ...", style="dim")
-    yield
-    if path:
-        stdout_console.print(f"written to [bold]{path}[/]", soft_wrap=True)
 
 
 def _film(first, second, machine, tool, path: Path) -> None:
@@ -215,7 +206,8 @@ def replay_logs(
             for number, (the_machine, result) in enumerate(results):
                 prefix = f"{number}_" if len(paths) > 1 else ""
                 name = prefix + result.measured.name
-                _write(folder, name, the_machine, result)
+                with announce_output(f"plot and recording of {result.measured.name}", None, quiet=as_json):
+                    _write(folder, name, the_machine, result)
             data = {"kind": "replay", "replays": [replay_document(result) for _, result in results]}
             write_json(folder / "summary.json", data)
         stderr_console.print(f"written to {target}")

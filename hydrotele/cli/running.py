@@ -15,6 +15,7 @@ from hydrotele.cli.catalogue import export_machine
 from hydrotele.cli.console import (
     make_table,
     print_json,
+    print_status_regularly,
     show_simulation_progress,
     stderr_console,
     stdout_console,
@@ -265,13 +266,17 @@ def _format_value(value: Any) -> str:
 
 @contextlib.contextmanager
 def _show_sweep_progress(name: str, quiet: bool) -> Iterator[Progress | None]:
-    """Show a progress bar with the remaining time on stderr.
+    """Show a progress bar with the remaining time on stderr, or lines if stderr is not a terminal.
 
     Yields:
-        A function that updates the bar, None if `quiet` or if stderr is not a terminal.
+        A function that updates the display, None if `quiet`.
     """
-    if quiet or not stderr_console.is_terminal:
+    if quiet:
         yield None
+        return
+    if not stderr_console.is_terminal:
+        with print_status_regularly(f"sweep {name}") as tell:
+            yield lambda stage, done, total, failed: tell(f"{stage}, {done} of {total} runs, {failed} failed")
         return
     from rich.progress import (
         BarColumn,
