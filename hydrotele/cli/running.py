@@ -106,6 +106,9 @@ def print_summary(summary: dict[str, Any]) -> None:
         rows.add_row("added effects", ", ".join(e["name"] for e in summary["effects"]))
     rows.add_row("largest pin opening", f"{summary['largest_pin_opening_mm']:.4f} mm")
     rows.add_row("largest contact force", f"{summary['largest_contact_force_N'] / 1e3:.1f} kN")
+    if soil := summary.get("soil"):
+        rows.add_row("soil in the bucket", f"{soil['carried_mass_kg']:.0f} kg")
+        rows.add_row("depth of the trench", f"{soil['trench_depth_m']:.2f} m")
     for key, label in (("flow_balance", "flow balance"), ("energy_balance", "energy balance")):
         value = summary["balance"][key]
         rows.add_row(label, "-" if value is None else f"{value:.1e}")
