@@ -45,7 +45,7 @@ def write_video(
             or the file cannot be written.
     """
     try:
-        import imageio_ffmpeg
+        import imageio_ffmpeg  # pyright: ignore[reportMissingImports]
     except ImportError:
         message = "needs the package imageio-ffmpeg: pip install 'hydrotele[video]'"
         raise InputError("the video", message) from None

@@ -28,15 +28,15 @@ def test_key_with_dots(machine):
 @pytest.mark.parametrize(
     ("path", "value", "message"),
     [
-        ("supply.pump_flw", 1.0, "supply.pump_flw: does not exist; did you mean 'supply.pump_flow'? valid: supply.bulk_"),
+        ("supply.pump_flw", 1.0, "supply.pump_flw: does not exist; did you mean 'supply.pump_flow'? valid: "),
         ("axes.bom.valve", 1.0, "axes.bom: does not exist; did you mean 'axes.boom'? "
          "valid: axes.boom, axes.bucket, axes.stick, axes.swing"),
-        ("gravity.3", 0.0, "gravity.3: does not exist; did you mean 'gravity.2'? valid: gravity.0, gravity.1, gravity.2"),
+        ("gravity.3", 0.0, "gravity.3: does not exist; did you mean 'gravity.2'? valid: gravity.0, gravity.1"),
         ("", 0.0, ": does not exist; valid: arm, attached, axes,"),
-        ("axes.boom.motor.x", 0.0, "axes.boom.motor.x: axes.boom.motor is None and has no parts: replace axes.boom.motor"),
+        ("axes.boom.motor.x", 0.0, "axes.boom.motor.x: axes.boom.motor is None and has no parts: "),
         ("links.boom.mass", -1.0, "links.boom.mass: cannot be -1.0: Input should be greater than 0"),
-        ("axes.boom.joint", "bom", "axes.boom.joint: cannot be 'bom': axes.boom.joint: 'bom' is not known; did you mean"),
-        ("supply.tank_pressure", 1e9, "supply.tank_pressure: cannot be 1000000000.0: tank_pressure 1e+09 Pa is not below"),
+        ("axes.boom.joint", "bom", "axes.boom.joint: cannot be 'bom': axes.boom.joint: 'bom' is not known"),
+        ("supply.tank_pressure", 1e9, "supply.tank_pressure: cannot be 1000000000.0: tank_pressure 1e+09 Pa is"),
     ],
 )  # fmt: skip
 def test_wrong_path_or_value(machine, path, value, message):
