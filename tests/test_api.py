@@ -61,3 +61,34 @@ def test_pressures_spools_and_tip_are_those_that_the_log_has():
     with pytest.raises(hydrotele.InputError, match="no arm"):
         rig = hydrotele.build_plant(hydrotele.load_machine("rig"))
         rig.tip(hydrotele.rest_state(rig))
+
+
+def test_a_log_is_read_from_a_run_folder_and_given_as_an_arrow_table(tmp_path):
+    time = np.arange(20) / 50.0
+    log = hydrotele.Log(
+        time, {"angle.boom": 0.1 * time}, {"angle.boom": "rad"}, {"machine": "cat215", "hydrotele": "0"}
+    )
+    hydrotele.save_log(log, tmp_path / "measured.parquet")
+    read = hydrotele.load_log(tmp_path)
+    assert read.source == str(tmp_path / "measured.parquet")
+    table = read.to_arrow()
+    assert table.column_names == ["time", "angle.boom"]
+    assert np.array_equal(table["angle.boom"].to_numpy(), 0.1 * time)
+    assert [table.schema.field(name).metadata for name in table.column_names] == [{b"unit": b"s"}, {b"unit": b"rad"}]
+    assert table.schema.metadata[b"machine"] == b"cat215"
+    assert repr(read) == f"Log({read.source!r}, 20 rows at 50 Hz, channels=[angle.boom])"
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(hydrotele.InputError, match="empty: is not a file and holds no measured.parquet; give a log"):
+        hydrotele.load_log(tmp_path / "empty")
+
+
+def test_repr_of_a_replay_names_the_channel_with_the_largest_error():
+    from hydrotele.run.replay import ChannelDifference, Replay
+
+    log = hydrotele.Log(np.arange(3) / 50.0, {}, {}, source="a.parquet")
+    channels = {
+        "angle.boom": ChannelDifference(0.01, 0.02, "rad", 1.0, 0.0),
+        "pressure_head.boom": ChannelDifference(5.0e5, 9.0e5, "Pa", 1.0e7, 0.0),
+    }
+    text = "Replay('a.parquet', 2 channels, largest error relative to the range: pressure_head.boom RMS 5e+05 Pa)"
+    assert repr(Replay(log, log, channels, 10.0)) == text

@@ -5,9 +5,10 @@ from typing import Annotated
 
 import typer
 
+from hydrotele.cli.option_values import CommandGroup
 from hydrotele.core.errors import InputError
 
-app = typer.Typer(
+app = CommandGroup(
     help="Calibrate the kinematics of a mechanism from measured poses.",
     no_args_is_help=True,
 )  # fmt: skip

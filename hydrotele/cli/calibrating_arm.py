@@ -36,7 +36,16 @@ from hydrotele.calibrate.linkage import (
     machine_with_linkage,
 )
 from hydrotele.calibrate.loop import CalibrationLoop, build_loop, unit_of
-from hydrotele.cli.console import make_table, print_json, stdout_console, to_json_types, write_json
+from hydrotele.cli.console import (
+    StageReport,
+    ignore_stage,
+    make_table,
+    print_json,
+    show_stages,
+    stdout_console,
+    to_json_types,
+    write_json,
+)
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import atomic_folder, check_output_folder
 from hydrotele.logs.log import load_logs
@@ -109,7 +118,8 @@ def calibrate_arm(data: Path, machine: str, choices: ArmChoices, target: Path | 
     if target:
         check_output_folder(target, "arm calibration")
     nominal = load_machine(machine)
-    result = fit_arm(nominal, data, choices, every)
+    with show_stages("calibrate arm", as_json) as progress:
+        result = fit_arm(nominal, data, choices, every, progress or ignore_stage)
     said = arm_as_data(result)
     if target:
         _write(target, said, result.calibrated, lambda folder: write_arm_report(folder, result))
@@ -130,20 +140,27 @@ def _parse_heldout_interval(text: str | None) -> int:
     return int(text)
 
 
-def fit_arm(nominal: Machine, data: Path, choices: ArmChoices, heldout_interval: int) -> ArmResult:
+def fit_arm(
+    nominal: Machine, data: Path, choices: ArmChoices, heldout_interval: int, report: StageReport = ignore_stage
+) -> ArmResult:
     """Calibrate an arm without printing or writing; every N-th pose is held out, N = `heldout_interval`.
+
+    `report` is called with the name of each stage and the completed fraction.
 
     Raises:
         InputError: the logs or options are not usable.
     """
     loop = build_loop(nominal)
     accuracy = None if choices.accuracy_deg is None else float(np.radians(choices.accuracy_deg))
+    report("read the logs", 0.0)
     stages = read_stages(data, nominal, loop, choices.poses, accuracy)
     if choices.drift:
+        report("remove the drift of the sensors", 0.1)
         stages = [add_drift(loop, poses) for poses in stages]
     regions: list[CorruptedRegion] = []
     kept = stages
     if choices.bad_data:
+        report("find corrupted samples", 0.2)
         cleaned = identify_without_bad_data(loop, stages)
         regions, kept = cleaned.regions, cleaned.stages
     fitted, judged = split_poses(kept, heldout_interval)
@@ -152,12 +169,15 @@ def fit_arm(nominal: Machine, data: Path, choices: ArmChoices, heldout_interval:
         fit = identify_arm(loop, stages)
         return identify_jointly(fit, stages) if choices.method == "joint" else fit
 
+    report("fit the links", 0.5)
     fit, flexibility = identify(fitted), None
     if choices.flexibility:
+        report("fit the links with the flexibility of the calibrator", 0.7)
         fit, flexibility = refit_with_flexibility(loop, fitted, fit, identify)
         bend = flexibility.at_full_load
         judged = [add_flexibility(loop, poses, fit, bend) for poses in judged]
     made = calibrated_machine(nominal, fit, fitted)
+    report("predict the held-out poses", 0.9)
     errors = _heldout_errors(loop, fit, judged)
     return ArmResult(nominal, fit, fitted, regions, errors, made, flexibility)
 
@@ -321,7 +341,8 @@ def calibrate_linkage(data: Path, machine: str, angles: str, target: Path | None
     if target:
         check_output_folder(target, "arm calibration")
     nominal = load_machine(machine)
-    fits = fit_linkages(nominal, data, angles)
+    with show_stages("calibrate linkage", as_json) as progress:
+        fits = fit_linkages(nominal, data, angles, progress or ignore_stage)
     said = to_json_types({"machine": nominal.name, "angles": angles, "axes": {
         found.axis: linkage_as_data(found) for found in fits}})  # fmt: skip
     made = nominal
@@ -339,13 +360,16 @@ def calibrate_linkage(data: Path, machine: str, angles: str, target: Path | None
     return fits
 
 
-def fit_linkages(nominal: Machine, data: Path, angles: str) -> list[LinkageFit]:
+def fit_linkages(nominal: Machine, data: Path, angles: str, report: StageReport = ignore_stage) -> list[LinkageFit]:
     """Calibrate the cylinder linkages without printing or writing.
+
+    `report` is called with the name of each stage and the completed fraction.
 
     Raises:
         InputError: no linkage moves, or the logs are not usable.
     """
     axes = [name for name, axis in nominal.axes.items() if axis.cylinder and not axis.four_bar]
+    report("read the logs", 0.0)
     logs = load_logs(data)
     for log in logs:
         if (of := log.metadata.get("machine", nominal.name)) != nominal.name:
@@ -353,6 +377,7 @@ def fit_linkages(nominal: Machine, data: Path, angles: str) -> list[LinkageFit]:
             raise InputError(log.source, message)
     strokes = [s for log in logs for s in extract_strokes(log, nominal, axes)]
     if angles == "identified":
+        report("identify the joint angles", 0.1)
         loop = build_loop(nominal)
         stages = read_stages(data, nominal, loop)
         fit = identify_jointly(identify_arm(loop, stages), stages)
@@ -372,7 +397,11 @@ def fit_linkages(nominal: Machine, data: Path, angles: str) -> list[LinkageFit]:
         message = f"no cylinder turns its joint by 5 deg or more: log {names} during a motion"
         raise InputError(data, message)
     longest = {s.axis: s for s in sorted(strokes, key=lambda s: np.ptp(s.angle))}
-    return [identify_linkage(nominal, s) for s in longest.values()]
+    fits = []
+    for number, stroke in enumerate(longest.values()):
+        report(f"fit the linkage of {stroke.axis}", 0.5 + 0.5 * number / len(longest))
+        fits.append(identify_linkage(nominal, stroke))
+    return fits
 
 
 def linkage_as_data(fit: LinkageFit) -> dict[str, Any]:
@@ -421,8 +450,12 @@ def design_calibrator(machine: str, accuracy_deg: float, target: Path | None, as
         check_output_folder(target, "arm calibration")
     nominal = load_machine(machine)
     loop = build_loop(nominal)
-    survey = survey_designs(loop, float(np.radians(accuracy_deg)))
-    best = optimize_design(loop, survey, float(np.radians(accuracy_deg)))
+    with show_stages("calibrate design", as_json) as progress:
+        report = progress or ignore_stage
+        report("evaluate the designs of a grid", 0.0)
+        survey = survey_designs(loop, float(np.radians(accuracy_deg)))
+        report("optimise the best design", 0.5)
+        best = optimize_design(loop, survey, float(np.radians(accuracy_deg)))
     said = to_json_types({
         "machine": machine, "present": survey.present._asdict(), "best": best._asdict(),
         "designs": [d._asdict() for d in survey.designs],

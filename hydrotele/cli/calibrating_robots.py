@@ -43,7 +43,6 @@ from hydrotele.calibrate.mukca import (
     choose_robot,
     held_out_names,
     predict_held_out_place,
-    predict_held_out_places,
 )
 from hydrotele.calibrate.posterior import (
     EvolutionResult,
@@ -61,9 +60,10 @@ from hydrotele.calibrate.scara import (
 )
 from hydrotele.calibrate.sockets import Socket, find_idle_joints, load_sockets, place_names
 from hydrotele.cli.console import (
+    ignore_stage,
     make_table,
     print_json,
-    stderr_console,
+    show_stages,
     stdout_console,
     to_json_types,
     write_json,
@@ -142,12 +142,19 @@ def calibrate_mukca(data: Path, choices: SocketChoices, target: Path | None, as_
     robot, said = _find_robot(data, choices.robot, sockets, options)
     check_robot(robot, sockets)
     notes = [*said, *notes, *_identifiability_notes(robot, sockets, options)]
-    if choices.heldout is not None:
-        one, found = predict_held_out_place(robot, sockets, choices.heldout, options)
-        left: tuple[HeldOutPrediction, ...] = (one,)
-    else:
-        found = calibrate_sockets(robot, sockets, options)
-        left = predict_held_out_places(robot, sockets, held_out_names(sockets), options)
+    left: list[HeldOutPrediction] = []
+    with show_stages("calibrate mukca", as_json) as progress:
+        report = progress or ignore_stage
+        report("fit the robot", 0.0)
+        if choices.heldout is not None:
+            one, found = predict_held_out_place(robot, sockets, choices.heldout, options)
+            left.append(one)
+        else:
+            found = calibrate_sockets(robot, sockets, options)
+            names = held_out_names(sockets)
+            for number, name in enumerate(names, start=1):
+                report(f"predict {name}, held out", number / (len(names) + 1))
+                left.append(predict_held_out_place(robot, sockets, name, options)[0])
     document = socket_document(data, sockets, found, left, notes)
     if target is not None:
         with atomic_folder(target, "robot calibration") as folder:
@@ -541,12 +548,17 @@ def calibrate_hybrid(
     nominal = load_hybrid(robot or find_robot_file(Path(data)) or "iwr")
     measurement, heldout = read_measurement(data, nominal)
     names = _parameter_names(nominal, kind, parameters)
-    if kind == "auto":
-        done = calibrate_best_model(nominal, measurement, names)
-    else:
-        done = calibrate_hybrid_robot(nominal, measurement, "dh" if kind == "dh" else "poe", names)
-    evolved = _run_evolution(done, seed) if evolution else None
-    posterior = _run_mcmc(done, steps, seed) if steps else None
+    with show_stages("calibrate hybrid", as_json) as progress:
+        report = progress or ignore_stage
+        report("fit the robot", 0.0)
+        if kind == "auto":
+            done = calibrate_best_model(nominal, measurement, names)
+        else:
+            done = calibrate_hybrid_robot(nominal, measurement, "dh" if kind == "dh" else "poe", names)
+        report("differential evolution", 0.3)
+        evolved = _run_evolution(done, seed) if evolution else None
+        report("MCMC", 0.6)
+        posterior = _run_mcmc(done, steps, seed) if steps else None
     result = _hybrid_document(data, done, heldout, evolved, posterior)
     if target:
         with atomic_folder(target, KIND) as folder:
@@ -573,7 +585,6 @@ def _parameter_names(nominal: HybridRobot, kind: str, parameters: str) -> tuple[
 
 def _run_evolution(calibration: Calibration, seed: int) -> EvolutionResult:
     eq = fitted_equations(calibration)
-    stderr_console.print("differential evolution ...", style="dim")
     return minimize_by_evolution(
         eq.negative_log_likelihood,
         -SEARCH_BOX_SIGMAS * eq.scales,
@@ -584,7 +595,6 @@ def _run_evolution(calibration: Calibration, seed: int) -> EvolutionResult:
 
 def _run_mcmc(calibration: Calibration, steps: int, seed: int) -> Posterior:
     eq, fit = fitted_equations(calibration), calibration.fit
-    stderr_console.print("MCMC ...", style="dim")
     free = ~fit.held
     noise = 1.0 if calibration.equations.measurement.noise_is_known else fit.noise
     return sample_posterior(

@@ -5,54 +5,130 @@ writes the MJCF or an image of a machine.
 """
 
 from pathlib import Path
+from textwrap import wrap
 
-from rich.markup import escape
+import typer
 
-from hydrotele.cli.console import make_table, print_json, stderr_console, stdout_console
+from hydrotele.cli.console import print_json, stderr_console, stdout_console
 from hydrotele.core.datafile import read_yaml, suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.machine.joystick import JOYSTICK_FILE, load_joystick, shipped_joysticks
 from hydrotele.machine.machine_file import load_machine, machine_path, shipped_machines
 from hydrotele.simulate.mechanism import Mjcf
 
+_DESCRIPTIONS = ("description", "what")  # keys of the text that describes an item
 _KINDS = ("machines", "joysticks", "scenarios", "sweeps", "effects", "environments")
 
 
-def list_items(item_kind: str, as_json: bool) -> None:
+def list_items(item_kind: str | None, as_json: bool) -> None:
     """Print the available machines, joysticks, scenarios, sweeps, effects or environments.
 
     Args:
-        item_kind: kind of the items, such as `machines`, or `all`.
-        as_json: print JSON instead of tables.
+        item_kind: kind of the items, such as `machines`; `all` for all kinds; None for a summary
+            with the names of all kinds.
+        as_json: print JSON instead of text; all kinds with all their data if `item_kind` is None.
 
     Raises:
         InputError: `item_kind` is not a valid kind.
     """
-    if item_kind not in (*_KINDS, "all"):
+    if item_kind not in (None, *_KINDS, "all"):
         raise InputError(f"list {item_kind}", suggest_valid_name(item_kind, [*_KINDS, "all"]))
-    wanted = _KINDS if item_kind == "all" else (item_kind,)
+    wanted = (item_kind,) if item_kind in _KINDS else _KINDS
     tables = {
         "machines": _machine_rows, "joysticks": _joystick_rows, "scenarios": _scenario_rows,
         "sweeps": _sweep_rows, "effects": _effect_rows, "environments": _environment_rows,
     }  # fmt: skip
+    if item_kind is None and not as_json:
+        print(format_summary({kind: _item_names(kind) for kind in _KINDS}, stdout_console.width))
+        return
     data = {kind: tables[kind]() for kind in wanted}
     if as_json:
-        print_json(data if item_kind == "all" else data[item_kind])
+        print_json(data[item_kind] if item_kind in _KINDS else data)
         return
-    for kind, rows in data.items():
-        columns = list(rows[0]) if rows else ["name"]
-        shown = make_table(kind, *columns)
-        for column in shown.columns:
-            column.justify = "left"
-        for row in rows:
-            shown.add_row(*(_format_cell(row[c]) for c in columns))
-        stdout_console.print(shown)
+    print("\n\n".join(format_items(kind, rows, stdout_console.width) for kind, rows in data.items()))
 
 
-def _format_cell(value) -> str:
+_MAX_SUMMARY_LINES = 30  # a summary fits a terminal window
+_MIN_TEXT_WIDTH = 30  # characters beside the names; a narrower text starts below its name
+
+
+def format_summary(names: dict[str, list[str]], width: int) -> str:
+    """Return the names of all items in at most `_MAX_SUMMARY_LINES` lines, without cutting a name.
+
+    Args:
+        names: kind of the items -> their names. If they need too many lines, the last names of the
+            kind with most lines are replaced by their number.
+        width: line length [characters].
+    """
+    shown = {kind: len(some) for kind, some in names.items()}
+
+    def wrap_names(kind: str) -> list[str]:
+        some, count = names[kind], shown[kind]
+        left = [f"and {len(some) - count} more (hydrotele list {kind})"] if count < len(some) else []
+        text = f"{kind} ({len(some)}): " + ", ".join([*some[:count], *left])
+        return _wrap_text(text, width, "  ")
+
+    hint = _wrap_text(
+        "hydrotele list KIND describes the items of a kind, hydrotele list all those of all kinds.", width
+    )
+    lines = {kind: wrap_names(kind) for kind in names}
+    while sum(map(len, lines.values())) + len(hint) > _MAX_SUMMARY_LINES:
+        longest = max(lines, key=lambda kind: (len(lines[kind]), shown[kind]))
+        if shown[longest] == 0:
+            break
+        shown[longest] -= 1
+        lines[longest] = wrap_names(longest)
+    return "\n".join([*(line for some in lines.values() for line in some), *hint])
+
+
+def format_items(kind: str, rows: list[dict], width: int) -> str:
+    """Return a list of items with their descriptions; names are never cut or broken.
+
+    Args:
+        kind: kind of the items, the title.
+        rows: data of each item, with the key `name`.
+        width: line length [characters].
+    """
+    indent = min(max((len(row["name"]) for row in rows), default=0) + 4, max(4, width - _MIN_TEXT_WIDTH))
+    blank = " " * indent
+    lines = [f"{kind}:"]
+    for row in rows:
+        head = f"  {row['name']}"
+        keys = sorted(row.keys() - {"name"}, key=lambda key: (key not in _DESCRIPTIONS, list(row).index(key)))
+        texts = [_format_value(key, row[key]) for key in keys if row[key] not in ("", [], {})]
+        texts = [line for text in texts for line in _wrap_text(text, width - indent, "  ")]
+        if texts and len(head) + 2 <= indent:
+            head = head.ljust(indent) + texts.pop(0)
+        lines += [head, *(blank + line for line in texts)]
+    return "\n".join(lines)
+
+
+def _wrap_text(text: str, width: int, further_indent: str = "") -> list[str]:
+    """Wrap a text at its spaces; a word that is longer than the line stays whole."""
+    return wrap(text, max(width, 1), subsequent_indent=further_indent, break_long_words=False, break_on_hyphens=False)
+
+
+def _format_value(name: str, value) -> str:
+    """Return `name: value` of one item; the description has no name."""
     if isinstance(value, dict):
-        return escape(", ".join(f"{n} [{p['unit']}] {p['low']:.4g} .. {p['high']:.4g}" for n, p in value.items()))
-    return ", ".join(value) if isinstance(value, list) else str(value)
+        value = ", ".join(f"{n} [{p['unit']}] {p['low']:.4g} .. {p['high']:.4g}" for n, p in value.items())
+    text = ", ".join(value) if isinstance(value, list) else str(value)
+    return text if name in _DESCRIPTIONS else f"{name}: {text}"
+
+
+def _item_names(kind: str) -> list[str]:
+    """Return the names of the items of a kind, without reading their files."""
+    from hydrotele.effects import EFFECTS
+    from hydrotele.envs.making import TASKS
+    from hydrotele.run.sweep_facts import shipped_sweeps
+    from hydrotele.scenario.scenario import shipped_scenarios
+
+    names = {
+        "machines": shipped_machines, "joysticks": shipped_joysticks, "scenarios": shipped_scenarios,
+        "sweeps": shipped_sweeps, "effects": lambda: list(EFFECTS),
+        "environments": lambda: [f"hydrotele/{task.name}-v0" for task in TASKS.values()],
+    }  # fmt: skip
+    return list(names[kind]())
 
 
 def _machine_rows() -> list[dict]:
@@ -165,7 +241,7 @@ def validate_files(paths: list[Path], as_json: bool) -> None:
     if as_json:
         print_json(checked)
     for error in wrong[:-1]:
-        stderr_console.print(f"error {error}", markup=False, soft_wrap=True)
+        typer.echo(f"error {error}", err=True)
     if wrong:
         raise wrong[-1]
 
@@ -265,8 +341,8 @@ def export_machine(name: str, tool: str | None, target: Path | None, picture: Pa
     Args:
         name: shipped name, file or folder of a machine or joystick.
         tool: tool of the machine, None for its first tool.
-        target: MJCF file, None for standard output.
-        picture: PNG file to write instead of the MJCF.
+        target: MJCF file, None for standard output, or for no MJCF if there is a picture.
+        picture: PNG file to write, or None.
         camera: camera of the image.
 
     Raises:
@@ -283,7 +359,8 @@ def export_machine(name: str, tool: str | None, target: Path | None, picture: Pa
 
         render_picture(machine, picture, camera=camera)
         stderr_console.print(f"written to {picture}")
-        return
+        if target is None:
+            return
     from hydrotele.simulate.plant import build_plant
 
     _write(build_plant(machine).document, target)
@@ -296,13 +373,13 @@ def _export_joystick(name: str, target: Path | None, picture: Path | None, camer
 
     spec = joystick_spec(load_joystick(name), hand=False)
     model = spec.compile()
-    if not picture:
-        _write(Mjcf(name, spec.to_xml(), {}), target)
-        return
-    from hydrotele.show.picture import render_model
+    if picture:
+        from hydrotele.show.picture import render_model
 
-    render_model(model, mujoco.MjData(model), picture, camera)
-    stderr_console.print(f"written to {picture}")
+        render_model(model, mujoco.MjData(model), picture, camera)
+        stderr_console.print(f"written to {picture}")
+    if target or not picture:
+        _write(Mjcf(name, spec.to_xml(), {}), target)
 
 
 def _write(document: Mjcf, target: Path | None) -> None:

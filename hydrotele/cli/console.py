@@ -20,7 +20,9 @@ from rich.table import Table
 from rich.text import Text
 
 Progress = Callable[[float, float], None]
+StageReport = Callable[[str, float], None]
 _STATUS_PERIOD = 15.0  # s between progress lines if standard error is not a terminal
+_FIRST_STATUS_TIME = 2.0  # s after which the first progress line is printed
 
 _STYLES = "bold|dim|red|green|yellow|blue|magenta"
 _UNKNOWN_TAG = re.compile(rf"(?<!\\)\[(?!/\]|(?:{_STYLES})(?: (?:{_STYLES}))*\])")
@@ -91,12 +93,18 @@ def make_table(title: str, *columns: str) -> Table:
 
 
 @contextlib.contextmanager
-def _print_status_regularly(label: str) -> Iterator[Callable[[str], None]]:
-    """Print the latest status text and the elapsed time on stderr every `_STATUS_PERIOD` seconds."""
+def print_status_regularly(label: str) -> Iterator[Callable[[str], None]]:
+    """Print the latest status text and the elapsed time on stderr after `_FIRST_STATUS_TIME`, then regularly.
+
+    Yields:
+        A function that sets the status text.
+    """
     begin, last, over = time.perf_counter(), ["starts"], threading.Event()
 
     def beat() -> None:
-        while not over.wait(_STATUS_PERIOD):
+        pause = min(_FIRST_STATUS_TIME, _STATUS_PERIOD)
+        while not over.wait(pause):
+            pause = _STATUS_PERIOD
             line = f"{label}: {last[0]}, {time.perf_counter() - begin:.0f} s"
             stderr_console.print(line, markup=False, soft_wrap=True)
 
@@ -125,7 +133,7 @@ def show_simulation_progress(label: str, quiet: bool = False) -> Iterator[Progre
         yield None
         return
     if not stderr_console.is_terminal:
-        with _print_status_regularly(label) as tell:
+        with print_status_regularly(label) as tell:
             yield lambda done, total: tell(f"{done:.1f} of {total:.1f} s simulated")
         return
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -151,7 +159,7 @@ def show_simulation_progress(label: str, quiet: bool = False) -> Iterator[Progre
 
 
 @contextlib.contextmanager
-def show_stages(label: str, quiet: bool) -> Iterator[Callable[[str, float], None] | None]:
+def show_stages(label: str, quiet: bool) -> Iterator[StageReport | None]:
     """Show the current stage of a computation on stderr, as a progress bar or as lines.
 
     Yields:
@@ -161,7 +169,7 @@ def show_stages(label: str, quiet: bool) -> Iterator[Callable[[str, float], None
         yield None
         return
     if not stderr_console.is_terminal:
-        with _print_status_regularly(label) as tell:
+        with print_status_regularly(label) as tell:
             yield lambda said, fraction: tell(f"{100.0 * fraction:.0f} %, {said}")
         return
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
@@ -175,6 +183,20 @@ def show_stages(label: str, quiet: bool) -> Iterator[Callable[[str, float], None
             bar.update(task, completed=fraction, description=said)
 
         yield update
+
+
+def ignore_stage(stage: str, fraction: float) -> None:
+    """Do nothing, where a stage of a computation may be reported but nobody wants to know it."""
+
+
+@contextlib.contextmanager
+def announce_output(what: str, path: Path | None, quiet: bool = False) -> Iterator[None]:
+    """Print on stderr that an output is being made, and on stdout where it has been written, if at all."""
+    if not quiet:
+        stderr_console.print(f"making the {what} ...", style="dim")
+    yield
+    if path and not quiet:
+        stdout_console.print(f"written to [bold]{path}[/]", soft_wrap=True)
 
 
 @contextlib.contextmanager

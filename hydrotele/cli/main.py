@@ -16,7 +16,13 @@ from typer.core import TyperGroup
 
 from hydrotele.cli.calibrating import app as calibrate_app
 from hydrotele.cli.operator_identifying import IDENTIFY_OPERATOR_EPILOG, identify_operator
-from hydrotele.cli.option_values import machine_overrides, parse_numbers, parse_overrides
+from hydrotele.cli.option_values import (
+    CommandGroup,
+    QuietOption,
+    machine_overrides,
+    parse_numbers,
+    parse_overrides,
+)
 from hydrotele.cli.overview import DESCRIPTION, format_overview
 from hydrotele.cli.serving import HAPTIC_EPILOG, haptic_device
 from hydrotele.core.errors import InputError
@@ -85,8 +91,6 @@ def compare(
     """Compare open-loop predictions of several models with logs: RMS error per channel."""
     from hydrotele.cli.comparing import compare_models
 
-    pass
-
     compare_models(
         machine, data, tool, heldout, sensors, parse_numbers("--horizons", horizons), baseline or [],
         every, out, json, force,
@@ -138,8 +142,6 @@ def drive(
 ) -> None:
     """Drive a machine in real time; write the same files as `run`."""
     from hydrotele.cli.driving import DriveOptions, drive_to_folder
-
-    pass
 
     drive_to_folder(
         DriveOptions(
@@ -209,7 +211,7 @@ class OverviewGroup(TyperGroup):
         typer.echo(format_overview())
 
 
-app = typer.Typer(
+app = CommandGroup(
     name="hydrotele",
     cls=OverviewGroup,
     help=DESCRIPTION,
@@ -219,7 +221,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-analyse_app = typer.Typer(help="Analyse a teleoperator by linear two-port theory.", no_args_is_help=True)
+analyse_app = CommandGroup(help="Analyse a teleoperator by linear two-port theory.", no_args_is_help=True)
 app.add_typer(analyse_app, name="analyse")
 app.add_typer(calibrate_app, name="calibrate")
 
@@ -491,7 +493,10 @@ def analyse_teleop(
     analyse_any_to_folder(file, out, structure, delay, confirm, coordinate, pairs, json, how)
 
 
-@app.command(epilog="Examples:  hydrotele review runs/zhu_up   |   hydrotele review a.parquet b.parquet")
+@app.command(
+    epilog="Examples:  hydrotele review runs/zhu_up   |   hydrotele review a.parquet b.parquet   |   "
+    "hydrotele review runs/dig --screenshot dig.png --at 8   |   hydrotele review runs/dig --video dig.mp4"
+)
 def review(
     log: Annotated[Path, typer.Argument(help="Run folder or log file.")],
     log2: Annotated[Path | None, typer.Argument(help="Second log with the same time base, for comparison.")] = None,
@@ -504,21 +509,39 @@ def review(
         Path | None,
         typer.Option("--screenshot", help="Write a PNG of the viewer without opening a window."),
     ] = None,
-    plot: Annotated[Path | None, typer.Option("--plot", help="Write a PNG of all channels instead.")] = None,
+    at: Annotated[
+        float | None,
+        typer.Option("--at", help="With --screenshot: displayed time [s]; default: the middle of the log."),
+    ] = None,
+    plot: Annotated[
+        Path | None,
+        typer.Option("--plot", help="Write a PNG of all channels, or of both logs and their difference."),
+    ] = None,
+    video: Annotated[
+        Path | None,
+        typer.Option("--video", help="Write a video (.mp4) of the machine; needs pip install 'hydrotele[video]'."),
+    ] = None,
     effects: EffectFilesOption = None,
 ) -> None:
-    """Show a run in the rerun viewer: 3D machine, joints, pressures, flows and forces."""
-    from hydrotele.cli.reviewing import review_logs
+    """Show a run in the rerun viewer: 3D machine, joints, pressures, flows and forces.
 
-    review_logs(log, log2, machine, tool, out, serve, port, screenshot, plot)
+    Each of --out, --screenshot, --plot and --video writes a file. If one of them is given, no window
+    is opened; several can be given together.
+    """
+    from hydrotele.cli.reviewing import ReviewOutputs, review_logs
+
+    review_logs(log, log2, machine, tool, ReviewOutputs(out, screenshot, at, plot, video, port if serve else None))
 
 
 @app.command("list", epilog="Example:  hydrotele list scenarios --json")
 def list_(
     what: Annotated[
-        str,
-        typer.Argument(help="machines, joysticks, scenarios, sweeps, effects, environments or all."),
-    ] = "all",
+        str | None,
+        typer.Argument(
+            help="machines, joysticks, scenarios, sweeps, effects, environments or all, with their"
+            " descriptions; default: the names only."
+        ),
+    ] = None,
     effects: EffectFilesOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -544,8 +567,11 @@ def validate(
 def export(
     machine: Annotated[str, typer.Argument(help="Shipped machine or joystick, or a folder.")],
     tool: ToolOption = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="MJCF file; default: standard output.")] = None,
-    picture: Annotated[Path | None, typer.Option("--picture", help="Write a PNG image instead.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="MJCF file; default: standard output, none with --picture."),
+    ] = None,
+    picture: Annotated[Path | None, typer.Option("--picture", help="Write a PNG image.")] = None,
     camera: Annotated[str, typer.Option(help="Camera of the image.")] = "overview",
     effects: EffectFilesOption = None,
 ) -> None:
@@ -624,6 +650,7 @@ def demo(
 @app.callback(invoke_without_command=True)
 def _options(
     version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
+    quiet: QuietOption = False,
 ) -> None:
     if version:
         import hydrotele

@@ -9,27 +9,11 @@ from pathlib import Path
 
 from hydrotele.core.errors import InputError
 from hydrotele.logs.files import command_ranges
-from hydrotele.logs.log import Log, load_log
+from hydrotele.logs.log import Log, find_log_file, load_log
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import MACHINE_FILE, load_machine
 
 _LOGS = (".parquet", ".csv")
-
-
-def find_log_file(path: Path, which: str = "measured") -> Path:
-    """Return the log file of a path: the file itself, or `<which>.parquet` in a run folder.
-
-    Raises:
-        InputError: the log file does not exist.
-    """
-    if path.is_dir():
-        inside = path / f"{which}.parquet"
-        if inside.is_file():
-            return inside
-        raise InputError(path, f"holds no {which}.parquet; give a log file or a run folder")
-    if not path.is_file():
-        raise InputError(path, "is neither a log file (.parquet, .csv) nor a run folder")
-    return path
 
 
 def open_log(

@@ -1,7 +1,15 @@
-"""Parse values of command-line options: scenario overrides and lists of numbers."""
+"""Parse values of command-line options, and define the option that all commands have: `--quiet`."""
 
+import copy
+import functools
+import inspect
+from collections.abc import Callable
 from json import dumps as json_text
 from pathlib import Path
+from typing import Annotated, Any, get_args
+
+import typer
+from rich.markup import escape
 
 from hydrotele.core.errors import InputError
 
@@ -53,3 +61,56 @@ def parse_numbers(option: str, text: str) -> list[float]:
     if not numbers or not all(0.0 < number < float("inf") for number in numbers):
         raise InputError(f"{option} {text}", "must be positive numbers, for example 1,5,30")
     return numbers
+
+
+def _set_quiet(context: typer.Context, value: bool) -> bool:
+    """Silence notes and progress if a command or the program was called with `--quiet`."""
+    if context.parent is not None:
+        from hydrotele.cli.console import stderr_console
+
+        stderr_console.quiet = value or bool(context.find_root().params.get("quiet"))
+    return value
+
+
+QuietOption = Annotated[
+    bool,
+    typer.Option(
+        "--quiet", "-q", callback=_set_quiet,
+        help="Print only results, warnings and errors: no progress and no notes.",
+    ),
+]  # fmt: skip
+
+
+class CommandGroup(typer.Typer):
+    """A group whose commands have the additional option `--quiet`.
+
+    Help texts are printed as they are: a unit such as [s] is not a style of rich.
+    """
+
+    def command(self, name: str | None = None, *, epilog: str | None = None, **options: Any) -> Any:
+        """Return a decorator that registers a function as a command and returns the function."""
+        register = super().command(name, epilog=escape(epilog or ""), **options)
+
+        def register_with_quiet(function: Callable) -> Callable:
+            @functools.wraps(function)
+            def run(quiet: bool, **values: Any) -> Any:
+                return function(**values)
+
+            own = inspect.signature(function).parameters.values()
+            own = [parameter.replace(annotation=_escape_help(parameter.annotation)) for parameter in own]
+            added = inspect.Parameter("quiet", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=QuietOption)
+            run.__dict__["__signature__"] = inspect.Signature([*own, added])
+            run.__annotations__ = {parameter.name: parameter.annotation for parameter in (*own, added)}
+            register(run)
+            return function
+
+        return register_with_quiet
+
+
+def _escape_help(annotation: Any) -> Any:
+    """Return the annotation of a parameter with a help text in which brackets are no styles."""
+    type_, *facts = get_args(annotation)
+    facts = [copy.copy(fact) for fact in facts]
+    for fact in facts:
+        fact.help = escape(fact.help or "")
+    return Annotated[type_, *facts]

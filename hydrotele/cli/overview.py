@@ -10,33 +10,48 @@ USAGE = "Usage: hydrotele [OPTIONS] COMMAND [ARGS]..."
 DESCRIPTION = "Simulation and teleoperation testbed for heavy hydraulic machines, built on MuJoCo."
 OPTIONS = {
     "--version": "Print the version and exit.",
+    "-q, --quiet": "Print only results, warnings and errors; also an option of each command.",
     "--install-completion": "Install completion for the current shell.",
     "--show-completion": "Print the completion script of the current shell.",
     "-h, --help": "Show this message and exit.",
 }
-COMMANDS = {
-    "run": "Simulate a scenario; write logs, a rerun recording, a summary and the MJCF.",
-    "drive": "Drive a machine in real time; write the same files as `run`.",
-    "haptic-device": "Serve a haptic device over UDP: send poses, apply wrenches, watchdog.",
-    "sweep": "Run variations of a scenario (grid or random samples); collect the results in a table.",
-    "compare": "Compare open-loop predictions of several models with logs: RMS error per channel.",
-    "identify-operator": "Fit the operator model to a tracking log: delay, margins, lag, remnant.",
-    "replay": "Simulate the model with the commands of a log; print the prediction errors.",
-    "gap": "Find differences between model and logs, identify their cause, correct the model.",
-    "identify": "Identify masses, friction and hydraulics from logs; write the identified machine.",
-    "excite": "Design the most informative trajectory within a machine's limits.",
-    "review": "Show a run in the rerun viewer: 3D machine, joints, pressures, flows and forces.",
-    "list": "List the available machines, scenarios, sweeps, effects and environments.",
-    "validate": "Check a machine, joystick, scenario, sweep or log; report errors with file and line.",
-    "export": "Write the complete MJCF of a machine or joystick, or an image of it.",
-    "experiments": "Repeat the experiments of a publication; compare its tables and figures with simulation.",
-    "compile": "Compile all numerical functions now, so that later commands start without delay.",
-    "bench": "Measure the speed of the simulation: mechanism, hydraulics, scenarios, batches, start-up.",
-    "demo": "Simulate an excavator, replay its log and draw the results.",
-    "analyse": "Analyse a teleoperator by linear two-port theory.",
-    "calibrate": "Calibrate the kinematics of a mechanism from measured poses.",
+COMMAND_GROUPS = {
+    "Simulate and drive": {
+        "run": "Simulate a scenario; write logs, a rerun recording, a summary and the MJCF.",
+        "sweep": "Run variations of a scenario (grid or random samples); collect the results in a table.",
+        "drive": "Drive a machine in real time; write the same files as `run`.",
+        "haptic-device": "Serve a haptic device over UDP: send poses, apply wrenches, watchdog.",
+        "demo": "Simulate an excavator, replay its log and draw the results.",
+    },
+    "Compare with measurements": {
+        "replay": "Simulate the model with the commands of a log; print the prediction errors.",
+        "compare": "Compare open-loop predictions of several models with logs: RMS error per channel.",
+        "gap": "Find differences between model and logs, identify their cause, correct the model.",
+        "review": "Show a run in the rerun viewer: 3D machine, joints, pressures, flows and forces.",
+    },
+    "Identify and calibrate": {
+        "excite": "Design the most informative trajectory within a machine's limits.",
+        "identify": "Identify masses, friction and hydraulics from logs; write the identified machine.",
+        "identify-operator": "Fit the operator model to a tracking log: delay, margins, lag, remnant.",
+        "calibrate": "Calibrate the kinematics of a mechanism from measured poses.",
+    },
+    "Analyse": {
+        "analyse": "Analyse a teleoperator by linear two-port theory.",
+        "experiments": "Repeat the experiments of a publication; compare its tables and figures with simulation.",
+    },
+    "Models and files": {
+        "list": "List the available machines, scenarios, sweeps, effects and environments.",
+        "validate": "Check a machine, joystick, scenario, sweep or log; report errors with file and line.",
+        "export": "Write the complete MJCF of a machine or joystick, or an image of it.",
+    },
+    "Installation": {
+        "compile": "Compile all numerical functions now, so that later commands start without delay.",
+        "bench": "Measure the speed of the simulation: mechanism, hydraulics, scenarios, batches, start-up.",
+    },
 }
-"""Summary of each command: the first line of its help text."""
+"""Summary of each command by group: the first line of its help text."""
+COMMANDS = {name: text for group in COMMAND_GROUPS.values() for name, text in group.items()}
+"""Summary of each command."""
 
 
 def format_overview(width: int | None = None) -> str:
@@ -47,8 +62,8 @@ def format_overview(width: int | None = None) -> str:
     """
     width = min(width or shutil.get_terminal_size().columns, 120)
     parts = [fill(text, width) for text in (USAGE, DESCRIPTION)]
-    for title, rows in ("Options", OPTIONS), ("Commands", COMMANDS):
-        indent = max(map(len, rows)) + 4
+    indent = max(map(len, (*OPTIONS, *COMMANDS))) + 4
+    for title, rows in {"Options": OPTIONS, **COMMAND_GROUPS}.items():
         lines = [
             fill(text, width, initial_indent=f"  {name}".ljust(indent),
                  subsequent_indent=" " * indent, break_on_hyphens=False)

@@ -9,8 +9,10 @@ import dataclasses
 import re
 import tempfile
 from pathlib import Path
+from typing import NamedTuple
 
 from hydrotele.cli.console import (
+    announce_output,
     make_table,
     print_json,
     show_simulation_progress,
@@ -18,71 +20,104 @@ from hydrotele.cli.console import (
     stdout_console,
     write_json,
 )
-from hydrotele.cli.opening import find_log_file, open_log
+from hydrotele.cli.opening import open_log
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import atomic_folder, check_output_folder
-from hydrotele.logs.log import Log, save_log
+from hydrotele.logs.log import Log, find_log_file, find_log_in_folder, save_log
 from hydrotele.machine.machine import Machine
 from hydrotele.run.replay import Replay, replay_log
 from hydrotele.simulate.native import stop_profiling_clock
 
 
+class ReviewOutputs(NamedTuple):
+    """Files and views that `hydrotele review` makes; None for those that are not wanted.
+
+    Attributes:
+        recording: rerun recording.
+        screenshot: PNG of the viewer, without opening a window.
+        displayed_time: time in the screenshot [s], None for the middle of the log.
+        plot: PNG of all channels of one log, or of both logs and their difference.
+        video: MP4 of the machine.
+        port: port of the web viewer, which is served until the user interrupts it.
+    """
+
+    recording: Path | None = None
+    screenshot: Path | None = None
+    displayed_time: float | None = None
+    plot: Path | None = None
+    video: Path | None = None
+    port: int | None = None
+
+
 def review_logs(
-    first: Path, second: Path | None, machine: str | None, tool: str | None, target: Path | None,
-    serve: bool, port: int, screenshot: Path | None, plot: Path | None,
-) -> None:  # fmt: skip
-    """Record one or two logs for the rerun viewer and show them.
+    first: Path, second: Path | None, machine: str | None, tool: str | None, outputs: ReviewOutputs
+) -> None:
+    """Record one or two logs for the rerun viewer, and show them or write files.
 
     Args:
         first: run folder or log file.
         second: second log with the same time base, or None.
         machine: machine of both logs, None to find it by the logs.
         tool: tool of the machine.
-        target: recording to write, default review.rrd in the run folder or a temporary file.
-        serve: serve the web viewer until interrupted.
-        port: port of the web viewer.
-        screenshot: PNG of the viewer to write, without opening a window.
-        plot: PNG to write instead: all channels of one log, or both logs and their difference.
+        outputs: files to write; without any, the viewer is opened.
 
     Raises:
         InputError: a log, machine or viewer is not usable.
     """
-    if screenshot and screenshot.suffix.lower() != ".png":
-        raise InputError(screenshot, "the name must end in .png")
+    recording, screenshot, time, plot, video, port = outputs
+    for path, suffix in ((recording, ".rrd"), (screenshot, ".png"), (plot, ".png"), (video, ".mp4")):
+        if path and path.suffix.lower() != suffix:
+            raise InputError(path, f"the name must end in {suffix}")
+    if time is not None and not screenshot:
+        raise InputError("--at", "is the time of a screenshot: give --screenshot FILE.png as well")
     if plot:
-        _plot(first, second, machine, tool, plot)
-        stdout_console.print(f"written to [bold]{plot}[/]")
+        with announce_output("plot", plot):
+            _plot(first, second, machine, tool, plot)
+    if video:
+        _film(first, second, machine, tool, video)
+    if (plot or video) and not (recording or screenshot or port is not None):
         return
     with contextlib.ExitStack() as stack:
         made = first / "review.rrd"
-        if not (made.is_file() and not any((second, target, machine, tool))):
+        if not (made.is_file() and not any((second, recording, machine, tool))):
             folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="hydrotele_"))
-            made = target or Path(folder, "review.rrd")
-            _record(first, second, machine, tool, made)
-        _show(made, serve, port, screenshot, quiet=target is not None)
+            made = recording or Path(folder, "review.rrd")
+            with announce_output("recording", recording):
+                _record(first, second, machine, tool, made)
+        if screenshot:
+            from hydrotele.show.viewer import take_screenshot
+
+            with announce_output("screenshot", screenshot):
+                complaints = take_screenshot(made, screenshot, displayed_time=time)
+            for complaint in complaints:
+                stderr_console.print(f"[yellow]viewer[/] {complaint}", soft_wrap=True)
+        if port is not None:
+            from hydrotele.show.viewer import serve_recording
+
+            tell = "open {} in a browser on this computer; Ctrl-C stops the server"
+            serve_recording(made, port, lambda url: stdout_console.print(tell.format(url), soft_wrap=True))
+        elif not (recording or screenshot):
+            from hydrotele.show.viewer import open_viewer
+
+            if open_viewer(made):
+                message = "no viewer can be opened on this computer; try --serve or --screenshot PNG"
+                raise InputError("review", message)
 
 
-def _show(recording: Path, serve: bool, port: int, screenshot: Path | None, quiet: bool) -> None:
-    if screenshot:
-        from hydrotele.show.viewer import take_screenshot
+def _film(first, second, machine, tool, path: Path) -> None:
+    from hydrotele.show.video import write_video
 
-        stderr_console.print("taking a screenshot ...", style="dim")
-        for complaint in take_screenshot(recording, screenshot):
-            stderr_console.print(f"[yellow]viewer[/] {complaint}", soft_wrap=True)
-        stdout_console.print(f"written to [bold]{screenshot}[/]")
-    elif serve:
-        from hydrotele.show.viewer import serve_recording
+    if second is not None:
+        raise InputError("--video", "shows one log: omit the second log")
+    found, log = open_log(first, machine, tool, _most_complete_log(first))
+    with show_simulation_progress(f"video {path.name}") as progress:
+        write_video(found, log, path, progress=progress)
+    stdout_console.print(f"written to [bold]{path}[/]", soft_wrap=True)
 
-        tell = "open {} in a browser on this computer; Ctrl-C stops the server"
-        serve_recording(recording, port, lambda url: stdout_console.print(tell.format(url), soft_wrap=True))
-    elif quiet:
-        stdout_console.print(f"written to [bold]{recording}[/]")
-    else:
-        from hydrotele.show.viewer import open_viewer
 
-        if open_viewer(recording):
-            message = "no viewer can be opened on this computer; try --serve or --screenshot PNG"
-            raise InputError("review", message)
+def _most_complete_log(path: Path) -> str:
+    """Return `truth` for a run folder with the true states, which contain all joints and objects."""
+    return "truth" if find_log_in_folder(path, "truth") else "measured"
 
 
 def _plot(first, second, machine, tool, path: Path) -> None:
@@ -100,7 +135,7 @@ def _record(first, second, machine, tool, path: Path) -> None:
     from hydrotele.show.recording import write_recording
 
     if second is None:
-        which = "truth" if (first / "truth.parquet").is_file() else "measured"
+        which = _most_complete_log(first)
         entries = {which: open_log(first, machine, tool, which)}
     else:
         entries = _open_log_pair(first, second, machine, tool, "measured")
@@ -171,7 +206,8 @@ def replay_logs(
             for number, (the_machine, result) in enumerate(results):
                 prefix = f"{number}_" if len(paths) > 1 else ""
                 name = prefix + result.measured.name
-                _write(folder, name, the_machine, result)
+                with announce_output(f"plot and recording of {result.measured.name}", None, quiet=as_json):
+                    _write(folder, name, the_machine, result)
             data = {"kind": "replay", "replays": [replay_document(result) for _, result in results]}
             write_json(folder / "summary.json", data)
         stderr_console.print(f"written to {target}")

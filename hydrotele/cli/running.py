@@ -15,6 +15,7 @@ from hydrotele.cli.catalogue import export_machine
 from hydrotele.cli.console import (
     make_table,
     print_json,
+    print_status_regularly,
     show_simulation_progress,
     stderr_console,
     stdout_console,
@@ -105,6 +106,9 @@ def print_summary(summary: dict[str, Any]) -> None:
         rows.add_row("added effects", ", ".join(e["name"] for e in summary["effects"]))
     rows.add_row("largest pin opening", f"{summary['max_pin_opening_mm']:.4f} mm")
     rows.add_row("largest contact force", f"{summary['max_contact_force_N'] / 1e3:.1f} kN")
+    if soil := summary.get("soil"):
+        rows.add_row("soil in the bucket", f"{soil['carried_mass_kg']:.0f} kg")
+        rows.add_row("depth of the trench", f"{soil['trench_depth_m']:.2f} m")
     for key, label in (("flow_balance", "flow balance"), ("energy_balance", "energy balance")):
         value = summary["balance"][key]
         rows.add_row(label, "-" if value is None else f"{value:.1e}")
@@ -195,7 +199,7 @@ def sweep_to_folder(name: str, target: Path | None, options: SweepOptions) -> No
         done = count_finished_runs(target / JOURNAL)
         said = f"{done} of {file.sweep.runs} runs are finished and saved in {target}"
         message = f"stopped: {said}; repeat the command to continue"
-        stderr_console.print(message, markup=False, soft_wrap=True)
+        typer.echo(message, err=True)
         code = stop.code if isinstance(stop, SystemExit) else 130
         raise typer.Exit(code if isinstance(code, int) else 1) from None
     figures = list(file.sweep.figures) or choose_figures(swept.table)
@@ -265,13 +269,17 @@ def _format_value(value: Any) -> str:
 
 @contextlib.contextmanager
 def _show_sweep_progress(name: str, quiet: bool) -> Iterator[Progress | None]:
-    """Show a progress bar with the remaining time on stderr.
+    """Show a progress bar with the remaining time on stderr, or lines if stderr is not a terminal.
 
     Yields:
-        A function that updates the bar, None if `quiet` or if stderr is not a terminal.
+        A function that updates the display, None if `quiet`.
     """
-    if quiet or not stderr_console.is_terminal:
+    if quiet:
         yield None
+        return
+    if not stderr_console.is_terminal:
+        with print_status_regularly(f"sweep {name}") as tell:
+            yield lambda stage, done, total, failed: tell(f"{stage}, {done} of {total} runs, {failed} failed")
         return
     from rich.progress import (
         BarColumn,

@@ -290,3 +290,58 @@ def validate_data(model: type[Model], data: dict, source: str, lines: dict[tuple
             problems.append(f"{'.'.join(map(str, path)) or '(top)'}: {message}")
         where = f"{source}:{first_line}" if first_line else source
         raise InputError(where, "; ".join(problems[:5])) from None
+
+
+def replace_at_path(model: Model, path: str, value: Any, validate: bool = True) -> Model:
+    """Return a copy of a model with the value at a dotted path replaced.
+
+    Args:
+        model: the model; it may contain models, mappings and tuples, also nested.
+        path: field names, keys of mappings and indices of tuples, joined by dots.
+        value: the new value, in SI units.
+        validate: check the new value and everything that depends on it.
+
+    Returns:
+        The changed copy.
+
+    Raises:
+        InputError: the path does not exist (the message lists the valid ones), or the value is not valid.
+    """
+    try:
+        return _replace_in_node(model, path.split("."), "", value, validate)
+    except pydantic.ValidationError as error:
+        reasons = [item["msg"].removeprefix("Value error, ") for item in error.errors()]
+        raise InputError(path, f"cannot be {value!r}: {'; '.join(dict.fromkeys(reasons))}") from None
+
+
+def _replace_in_node(node: Any, words: list[str], parent: str, value: Any, validate: bool) -> Any:
+    """Replace the value at the path `words`, which starts at `node`; `parent` is the path of `node`."""
+    if not words:
+        return value
+    children = _children_of_node(node)
+    paths = {name: f"{parent}.{name}" if parent else name for name in children}
+    # The longest name counts, because a key such as `angle.boom` can contain dots.
+    count = next((k for k in range(len(words), 0, -1) if ".".join(words[:k]) in children), 0)
+    if not count:
+        if not children:
+            raise InputError(f"{parent}.{'.'.join(words)}", f"{parent} is {node!r} and has no parts: replace {parent}")
+        wrong = f"{parent}.{words[0]}" if parent else words[0]
+        raise InputError(wrong, f"does not exist; {suggest_valid_name(wrong, paths.values())}")
+    name = ".".join(words[:count])
+    child = _replace_in_node(children[name], words[count:], paths[name], value, validate)
+    if isinstance(node, dict):
+        return {**node, name: child}
+    if isinstance(node, tuple):
+        return (*node[: int(name)], child, *node[int(name) + 1 :])
+    if not validate:
+        return node.model_copy(update={name: child})
+    given = {field: getattr(node, field) for field in node.model_fields_set}
+    return type(node).model_validate({**given, name: child})
+
+
+def _children_of_node(node: Any) -> dict[str, Any]:
+    if isinstance(node, pydantic.BaseModel):
+        return {name: getattr(node, name) for name in type(node).model_fields}
+    if isinstance(node, tuple):
+        return {str(place): item for place, item in enumerate(node)}
+    return node if isinstance(node, dict) else {}

@@ -72,22 +72,15 @@ class Effect:
 
 
 def with_value(machine: Machine, path: str, value: Any) -> Machine:
-    """Return a copy of a machine with the value at a dotted path replaced.
+    """Return a copy of a machine with the value at a dotted path replaced, without checking the value.
 
-    Args:
-        machine: the machine.
-        path: such as `supply.pump_flow` or `all_axes.boom.valve.deadband`.
-        value: the new value.
+    See `Machine.replace`. A function that applies an effect may replace several values one after
+    another; the machines in between need not be valid.
+
+    Raises:
+        InputError: the path does not exist; the message lists the valid paths.
     """
-    return _replace_at_path(machine, path.split("."), value)
-
-
-def _replace_at_path(node: Any, path: list[str], value: Any) -> Any:
-    if not path:
-        return value
-    if isinstance(node, dict):
-        return {**node, path[0]: _replace_at_path(node[path[0]], path[1:], value)}
-    return node.model_copy(update={path[0]: _replace_at_path(getattr(node, path[0]), path[1:], value)})
+    return machine.replace(path, value, validate=False)
 
 
 _MAX_LATERAL_OFFSET_RATIO = 1.0e-3  # offset over length up to which a cylinder counts as parallel to its slide

@@ -11,10 +11,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from hydrotele.core.errors import InputError
-from hydrotele.logs.log import CommandRange, Log, load_log
+from hydrotele.logs.log import MEASURED_STEM, CommandRange, Log, find_log_in_folder, load_log
 from hydrotele.machine.machine import Machine
 
-MEASURED_STEM = "measured"  # stem of the measured log in a run folder
 _KINDS = (".parquet", ".csv")
 
 
@@ -93,20 +92,14 @@ def _find_logs(path: Path) -> list[tuple[str, Path]]:
     if not path.is_dir():
         raise InputError(path, "is neither a file nor a folder: give log files or a folder")
     seen = sorted(p for p in path.iterdir() if not p.name.startswith("."))
-    if record := _find_measured_log(path):
+    if record := find_log_in_folder(path):
         return [(path.resolve().name, record)]
     files = [(p.stem, p) for p in seen if p.is_file() and p.suffix.lower() in _KINDS]
     if not files:
-        files = [(p.name, f) for p in seen if p.is_dir() and (f := _find_measured_log(p))]
+        files = [(p.name, f) for p in seen if p.is_dir() and (f := find_log_in_folder(p))]
     if not files:
         raise InputError(path, "the folder contains no log: add .parquet or .csv files")
     return files
-
-
-def _find_measured_log(folder: Path) -> Path | None:
-    """Return the measured log of a run folder, or None for other folders."""
-    kinds = (folder / f"{MEASURED_STEM}{kind}" for kind in _KINDS)
-    return next((file for file in kinds if file.is_file()), None)
 
 
 def _sensor_channels(log: Log) -> set[str]:

@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -25,6 +25,11 @@ from hydrotele.core.units import canonical_unit, to_si
 from hydrotele.machine import signals
 from hydrotele.machine.signals import allowed_units, default_unit, magnitude_limits, parse_channel
 
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+MEASURED_STEM = "measured"  # stem of the measured log in a run folder
+_KINDS = (".parquet", ".csv")
 _MAX_RANGE_EXCESS = 0.02  # fraction of half a command range that converter readings may exceed it
 _MAX_STEP = 1.0  # [s] longer than any sample period of a hydraulic machine
 _DEAD_SENSOR_PRESSURE = 1e-2  # [Pa] maxima below it mean a dead sensor, not a wrong unit
@@ -493,10 +498,49 @@ class Log:
         """Rows (k,) before which samples are missing, or whose time is off by half a step."""
         return np.flatnonzero(count_missing_samples(self.time)) + 1
 
+    def __repr__(self) -> str:
+        """Return source, size and channels of the log, without its values."""
+        rate = f" at {self.rate:g} Hz" if len(self) > 1 else ""
+        return f"Log({self.source!r}, {len(self)} rows{rate}, channels=[{', '.join(self.columns)}])"
+
+    def to_arrow(self) -> "pa.Table":
+        """Return the log as a pyarrow table: `time` and one column per channel, of type float64.
+
+        The metadata of each field contain its `unit`; the metadata of the schema are those of the log.
+        `pyarrow.Table.to_pandas` makes a data frame of it.
+        """
+        import pyarrow as pa
+
+        columns = {"time": self.time, **self.columns}
+        units = {"time": "s", **self.units}
+        fields = [pa.field(name, pa.float64(), nullable=False, metadata={"unit": units[name]}) for name in columns]
+        schema = pa.schema(fields, metadata=dict(self.metadata))
+        return pa.Table.from_arrays([pa.array(values) for values in columns.values()], schema=schema)
+
     def without_truth(self) -> "Log":
         """Return the log with measured channels only, as identification code may use them."""
         kept = [name for name in self.columns if not signals.parse_channel(name).truth]
         return replace(self, columns={k: self.columns[k] for k in kept}, units={k: self.units[k] for k in kept})
+
+
+def find_log_file(path: Path, stem: str = MEASURED_STEM) -> Path:
+    """Return the log file of a path: the file itself, or the log called `stem` in a run folder.
+
+    Raises:
+        InputError: the log file does not exist.
+    """
+    if path.is_dir():
+        if found := find_log_in_folder(path, stem):
+            return found
+        raise InputError(path, f"is not a file and holds no {stem}.parquet; give a log file or a run folder")
+    if not path.is_file():
+        raise InputError(path, "is not a file: it is neither a log file (.parquet, .csv) nor a run folder")
+    return path
+
+
+def find_log_in_folder(folder: Path, stem: str = MEASURED_STEM) -> Path | None:
+    """Return the log called `stem` in a run folder, or None for other folders."""
+    return next((file for kind in _KINDS if (file := folder / f"{stem}{kind}").is_file()), None)
 
 
 def load_log(
@@ -509,10 +553,10 @@ def load_log(
     missing: bool = False,
     commands: Mapping[str, CommandRange] | None = None,
 ) -> Log:
-    """Read and check one run from a `.parquet` or `.csv` file.
+    """Read and check one run from a `.parquet` or `.csv` file or from a run folder.
 
     Args:
-        path: the file.
+        path: the file, or the folder of a run, whose measured log is read.
         aliases: column name in the file -> channel name. A minus before the channel name inverts
             the sign. The column name `a * b` means the product of two columns without unit. The
             channel name `none` skips a column. Unknown column names are ignored. Logs written by
@@ -528,7 +572,7 @@ def load_log(
     Raises:
         InputError: the file is invalid; the message gives file, column, row and remedy.
     """
-    path = Path(path)
+    path = find_log_file(Path(path))
     table = read_table(path, missing)
     if "hydrotele" not in table.metadata:
         table = mask_to_valid(_apply_aliases(table, aliases or {}))
@@ -617,26 +661,20 @@ def save_log(log: Log, path: str | os.PathLike) -> None:
     names, values = ["time", *log.columns], [log.time, *log.columns.values()]
     table = Table(str(path), names, values, ["s", *log.units.values()], log.metadata)
     check_values(table, maximum_dropped=np.inf)
-    content = _parquet_bytes(table)
+    content = _parquet_bytes(log.to_arrow())
     with atomic_file(path, ".parquet") as part, open(part, "xb") as file:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
 
 
-def _parquet_bytes(table: Table) -> memoryview:
+def _parquet_bytes(table: "pa.Table") -> memoryview:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    fields = [
-        pa.field(name, pa.float64(), nullable=False, metadata={"unit": str(unit)})
-        for name, unit in zip(table.names, table.units, strict=True)
-    ]
-    schema = pa.schema(fields, metadata=dict(table.metadata))
-    arrays = [pa.array(values) for values in table.values]
     stream = pa.BufferOutputStream()
     pq.write_table(
-        pa.Table.from_arrays(arrays, schema=schema),
+        table,
         stream,
         compression="zstd",
         use_dictionary=False,  # measured values rarely repeat

@@ -6,7 +6,7 @@ provides the sensor model: sensor of a channel, converter, noise, lag and drift.
 """
 
 import math
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -18,6 +18,7 @@ from hydrotele.core.datafile import (
     PositiveFloat,
     StrictModel,
     Vector,
+    replace_at_path,
     suggest_valid_name,
 )
 from hydrotele.core.errors import InputError
@@ -288,6 +289,29 @@ class Machine(StrictModel):
     removed_bodies: tuple[str, ...] = ()
     uncertainty: dict[str, NonNegativeFloat] = {}
     terms: tuple[Term, ...] = ()
+
+    def __repr__(self) -> str:
+        """Return name, tool and axes; `model_dump()` returns all values."""
+        return f"Machine({self.name!r}, tool={self.tool!r}, axes=[{', '.join(self.axes)}])"
+
+    __str__ = __repr__
+
+    def replace(self, path: str, value: Any, validate: bool = True) -> "Machine":
+        """Return a copy of the machine with the value at a dotted path replaced.
+
+        Args:
+            path: such as `supply.pump_flow`, `axes.boom.valve.deadband` or `gravity.2`.
+            value: the new value, in SI units.
+            validate: check the new value and the whole machine. Without the check, a series of
+                replacements may pass through machines that are not valid.
+
+        Returns:
+            The changed machine.
+
+        Raises:
+            InputError: the path does not exist (the message lists the valid ones), or the value is not valid.
+        """
+        return replace_at_path(self, path, value, validate)
 
     @property
     def joints(self) -> dict[str, Joint]:

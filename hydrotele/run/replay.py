@@ -16,6 +16,7 @@ from hydrotele.core.files import parse_json
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine, SensorError, get_sensors, noise_rms
 from hydrotele.machine.signals import default_unit
+from hydrotele.scenario.scenario import logged_soil
 from hydrotele.simulate.feedback import apply_sensor_errors
 from hydrotele.simulate.mechanism import flexible_axes
 from hydrotele.simulate.plant import Plant, build_plant, initial_state
@@ -27,6 +28,7 @@ from hydrotele.simulate.record import (
     true_channels,
 )
 from hydrotele.simulate.stepping import Stepper
+from hydrotele.simulate.surroundings import Surroundings
 
 COMPARED_KINDS = ("angle", "position", "length", "pressure_head", "pressure_rod", "pressure_supply")
 
@@ -67,6 +69,14 @@ class Replay:
     channels: dict[str, ChannelDifference]
     realtime_factor: float
 
+    def __repr__(self) -> str:
+        """Return the logs that were compared and the channel with the largest error."""
+        text = f"Replay({self.measured.source!r}, {len(self.channels)} channels"
+        if self.channels:
+            name, worst = max(self.channels.items(), key=lambda item: item[1].rms / (item[1].range or math.inf))
+            text += f", largest error relative to the range: {name} RMS {worst.rms:.4g} {worst.unit}"
+        return f"{text})"
+
 
 def replay_log(
     log: Log,
@@ -79,7 +89,8 @@ def replay_log(
     The simulation starts from the `initial_state` metadata of the log. Without it, the first row
     gives the positions and pressures; velocities are zero and spools are closed. Before the first
     row the machine is assumed to be at rest with its rest commands, which matters for delayed
-    commands. The scene contains a ground only if the metadata of the log has `ground: yes`.
+    commands. The scene contains a ground only if the metadata of the log has `ground: yes`, and soil
+    to dig only if they name it; the soil then moves once per row.
 
     The compared values are the sensor readings without noise, including offsets, scales and delays.
     For a log with `truth.*` columns they are the true values.
@@ -108,7 +119,8 @@ def replay_log(
         raise InputError(log.source, message)
     period = float(log.time[-1] - log.time[0]) / (len(log) - 1)
     steps = max(1, math.ceil(period / timestep - 1e-6))
-    plant = build_plant(machine, period / steps, ground=log.metadata.get("ground") == "yes")
+    ground = log.metadata.get("ground") == "yes"
+    plant = build_plant(machine, period / steps, ground, logged_soil(log) if ground else ())
     missing = [c for c in _required_channels(plant) if c not in log]
     if missing:
         raise InputError(
@@ -198,13 +210,17 @@ def _read_finite_vector(state: dict, key: str, *sizes: int) -> np.ndarray:
 def _simulate_commands(plant: Plant, data, times, commands, steps, progress) -> Record:
     recorder = Recorder(plant, len(times))
     recorder.command[:] = commands
+    around, period = Surroundings(plant.machine, plant.model, plant.surroundings), steps * plant.model.opt.timestep
     start_leapfrog(plant.model, data)
     stepper = Stepper(plant, data, steps)
     for row, time in enumerate(times):
         recorder.record_state(row, time, data, stepper.sensor_values() if stepper.has_delayed_sensors else None)
         if progress and row % 100 == 0:
             progress(time - times[0], times[-1] - times[0])
+        recorder.contact[row, 0] += around.soil_force
         stepper.advance(commands[row])
+        if around.needs_update:
+            around.update(time, data, period)
     if progress:
         progress(times[-1] - times[0], times[-1] - times[0])
     return recorder.to_record()

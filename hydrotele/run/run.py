@@ -60,6 +60,7 @@ from hydrotele.simulate.record import (
     start_leapfrog,
     true_channels,
 )
+from hydrotele.simulate.soil_bed import SoilBed
 from hydrotele.simulate.stepping import SIMULATION_DTYPE, Stepper, delayed_commands
 from hydrotele.simulate.surroundings import Surroundings
 from hydrotele.teleop.operator_model import HandInput
@@ -249,6 +250,7 @@ class SessionResult(NamedTuple):
         computing_seconds: computing time [s] without the first tick, which loads compiled code.
         station: operator station of a teleoperated run, otherwise None.
         events: (time [s], description) of events in the surroundings, such as a falling tree.
+        soil: soil that the bucket has dug, None if there is none.
     """
 
     plan: Plan
@@ -258,6 +260,7 @@ class SessionResult(NamedTuple):
     computing_seconds: float
     station: TeleoperationSystem | None
     events: tuple[tuple[float, str], ...]
+    soil: SoilBed | None
 
 
 class Session:
@@ -364,7 +367,7 @@ class Session:
     def _run_ticks(self, end: int) -> None:
         """Run compiled ticks until a given tick, or until Python must act."""
         first, station, stepper = self.tick, self.station, self._stepper
-        if self._around.has_trees_or_logs or not first:
+        if self._around.needs_update or not first:
             end = first + 1
         if stepper.has_delayed_sensors:
             row, left = divmod(first, self.ticks_per_row)
@@ -385,7 +388,10 @@ class Session:
             update_max_pin_opening(self._ticks.record)
             self.tick += 1
         stepper.tick = self.tick
-        if self._around.has_trees_or_logs:
+        if self._around.needs_update:
+            row, left = divmod(first, self.ticks_per_row)
+            if not left and row < len(self._recorder.contact):
+                self._recorder.contact[row, 0] += self._around.soil_force
             self._around.update(first * self._dt, self.data, self._dt)
 
     def set_command(self, axis: str, value: float) -> None:
@@ -428,7 +434,8 @@ class Session:
         record = self._recorder.to_record(rows)
         commands = self._commands[: self.tick]
         events = tuple(self._around.events)
-        return SessionResult(plan, record, commands, float(self._ticks.max_pin_opening[0]), wall, station, events)
+        opening = float(self._ticks.max_pin_opening[0])
+        return SessionResult(plan, record, commands, opening, wall, station, events, self._around.soil)
 
 
 def _cut_plan(plan: Plan, ticks: int) -> Plan:
@@ -573,6 +580,11 @@ class Run:
     summary: dict[str, Any]
     station: TeleoperationSystem | None = None
 
+    def __repr__(self) -> str:
+        """Return scenario, machine and duration of the run."""
+        machine = f"machine={self.plant.machine.name!r}, tool={self.plant.machine.tool!r}"
+        return f"Run({self.scenario.name!r}, {machine}, {self.measured.time[-1]:g} s)"
+
 
 def load_nominal_machine(scenario: Scenario) -> Machine:
     """Load the machine of a scenario without its planted effects.
@@ -674,10 +686,17 @@ def finish_run(session: Session, scenario: Scenario) -> Run:
         summary["teleoperation"] = looped.station.summary()
         summary["notes"] += looped.station.notes
     summary["notes"] += [f"{said} at {time:.2f} s" for time, said in looped.events]
+    if looped.soil:
+        summary["soil"] = {
+            "carried_mass_kg": looped.soil.carried_mass,
+            "trench_depth_m": max(0.0, -float(looped.soil.surface.min())),
+        }
     steps = round(1.0 / (scenario.control_rate * scenario.timestep))
     window = looped.commands[: round(AUDIT_SECONDS * scenario.control_rate)]
     controls = delayed_commands(plant, session.initial_commands, window, steps)
     summary["balance"] = compute_balance_errors(plant, session.initial_physics_state, controls)
+    if looped.soil:  # the audit simulates the machine without it
+        summary["balance"]["energy_balance"] = None
     return Run(scenario, plant, plan, measured, truth, summary, looped.station)
 
 
@@ -750,8 +769,10 @@ def _log(scenario, machine, time, values, units, sensors: str) -> Log:
         "hydrotele": hydrotele.__version__,
         "command": "held" if scenario.control_rate == scenario.log_rate else "mean over the row",
     }
-    if scenario.surroundings:
-        metadata["things"] = ", ".join(thing.kind for thing in scenario.surroundings)
+    if things := [thing.kind for thing in scenario.surroundings if thing.kind != "soil"]:
+        metadata["things"] = ", ".join(things)
+    if soils := [thing for thing in scenario.surroundings if thing.kind == "soil"]:
+        metadata["soil"] = soils[0].model_dump_json()
     return Log(time=time, columns=values, units=units, metadata=metadata, source=scenario.name)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import yaml
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from hydrotele.core.datafile import (
     Name,
@@ -25,7 +25,7 @@ from hydrotele.core.datafile import (
 )
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import describe_excess, scenarios_folder
-from hydrotele.logs.log import load_log
+from hydrotele.logs.log import Log, load_log
 from hydrotele.machine.signals import parse_channel
 from hydrotele.scenario.teleoperation import TeleopPilot
 
@@ -106,7 +106,17 @@ class LogOnGround(StrictModel):
         return self.density * math.pi * self.diameter**2 / 4.0 * self.length
 
 
-SurroundingObject = Annotated[Plate | StandingTree | LogOnGround, Field(discriminator="kind")]
+class SoilGround(StrictModel):
+    """Ground that the bucket of the machine can dig up: a strip of soil in the plane of the arm.
+
+    `soil` names one of the soils of `soil.facts`. Other links of the machine touch firm ground.
+    """
+
+    kind: Literal["soil"] = "soil"
+    soil: Literal["soft", "sandy_loam", "firm"] = "sandy_loam"
+
+
+SurroundingObject = Annotated[Plate | StandingTree | LogOnGround | SoilGround, Field(discriminator="kind")]
 
 
 class Pose(StrictModel):
@@ -331,6 +341,8 @@ class Scenario(StrictModel):
         _check_capacity("RUN_ROWS", self.duration * self.log_rate)
         if not self.ground and any(thing.kind == "log" for thing in self.surroundings):
             raise ValueError("a log needs ground to lie on: set ground: true or remove the log")
+        if sum(thing.kind == "soil" for thing in self.surroundings) > (1 if self.ground else 0):
+            raise ValueError("soil can be given once, and only with ground: true")
         if self.duration * self.control_rate > 2e7:
             raise ValueError("duration is too long: more than 2e7 control periods")
         if self.row_count < 10:
@@ -495,3 +507,17 @@ def _apply_override(data: dict[str, Any], key: str, text: str) -> None:
         where[parts[-1]] = value
     else:
         raise InputError(f"--set {key}", "there is nothing to set at this key")
+
+
+def logged_soil(log: Log) -> tuple[SoilGround, ...]:
+    """Return the soil that the bucket could dig during a run, from the metadata of its log; empty if there was none.
+
+    Raises:
+        InputError: the metadata are damaged.
+    """
+    if "soil" not in log.metadata:
+        return ()
+    try:
+        return (SoilGround.model_validate_json(log.metadata["soil"]),)
+    except ValidationError as error:
+        raise InputError(f"{log.source}: metadata soil", f"is invalid: {error.errors()[0]['msg']}") from None

@@ -9,7 +9,7 @@ from pydantic import TypeAdapter
 
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine
-from hydrotele.scenario.scenario import SurroundingObject
+from hydrotele.scenario.scenario import SurroundingObject, logged_soil
 from hydrotele.simulate.closure import close_along_motion, dependent_joints
 from hydrotele.simulate.mechanism import assemble_mjcf, mjcf_document
 from hydrotele.simulate.surroundings import object_joints
@@ -77,8 +77,10 @@ def logged_joints(machine: Machine, log: Log) -> dict[str, np.ndarray]:
 
 
 def logged_surroundings(log: Log) -> tuple[SurroundingObject, ...]:
-    """Return the plates, trees and tree logs that are stored in a log of true states."""
-    return tuple(_OBJECTS_ADAPTER.validate_json(log.metadata.get("surroundings", "[]")))
+    """Return plates, trees, tree logs and soil of a log of true states; soil alone of other logs."""
+    if "surroundings" in log.metadata:
+        return tuple(_OBJECTS_ADAPTER.validate_json(log.metadata["surroundings"]))
+    return logged_soil(log)
 
 
 def _write_object_positions(model: mujoco.MjModel, log: Log, rows: np.ndarray) -> None:
@@ -141,8 +143,12 @@ def body_poses(
     Raises:
         InputError: a linkage cannot be closed in at least one row.
     """
+    return poses_at_positions(model, logged_positions(machine, model, joints, log))
+
+
+def poses_at_positions(model: mujoco.MjModel, rows: np.ndarray) -> Poses:
+    """Return the poses of all bodies at joint positions (n, nq)."""
     data = mujoco.MjData(model)
-    rows = logged_positions(machine, model, joints, log)
     position = np.empty((len(rows), model.nbody, 3))
     quaternion = np.empty((len(rows), model.nbody, 4))
     for row, qpos in enumerate(rows):

@@ -18,6 +18,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.core.output import atomic_file
 from hydrotele.logs.log import Log
 from hydrotele.machine.machine import Machine
+from hydrotele.scenario.scenario import SoilGround
 from hydrotele.show import looks as shapes
 from hydrotele.show.channels import (
     TITLES,
@@ -36,6 +37,15 @@ from hydrotele.show.pose import (
     logged_joints,
     logged_surroundings,
     point_trajectory,
+)
+from hydrotele.show.soil import (
+    LOOSE_COLOUR,
+    SoilHistory,
+    SoilShape,
+    load_mesh,
+    soil_history,
+    surrounding_tiles,
+    trench_mesh,
 )
 
 if TYPE_CHECKING:
@@ -235,7 +245,8 @@ _GHOST_TINT = 0.7  # fraction of the ghost colour in the displayed colour
 _GHOST_OPACITY = 0.35
 _GHOST_INSET = 0.01  # m, reduction in size, so that the solid machine hides an equal ghost
 _GROUND_COLOURS = np.array([[134, 122, 104], [144, 131, 112]], dtype=np.uint8)
-_GROUND_HALF_SIZE = 20.0  # m
+_GROUND_HALF_SIZE, _TILE_LENGTH = 20.0, 2.0  # m
+_SOIL_PERIOD = 0.1  # s between two meshes of the same trench
 _TIP_COLOUR, _GHOST_TIP_COLOUR = (215, 40, 30), (40, 110, 230)
 
 
@@ -287,15 +298,55 @@ def mesh_entity(look: BodyMesh, ghost: bool = False) -> "rr.Mesh3D":
     )
 
 
-def log_ground(stream: "rr.RecordingStream", model: mujoco.MjModel) -> bool:
-    """Log a chequered ground with tiles of 2 m; return whether the model has a ground plane."""
+def log_ground(stream: "rr.RecordingStream", model: mujoco.MjModel, soil: SoilHistory | None = None) -> bool:
+    """Log a chequered ground with tiles of 2 m; return whether the model has a ground plane.
+
+    Where the bucket can dig, the ground has a gap for the soil.
+    """
     height = ground_height(model)
     if height is None:
         return False
-    mesh, parity = shapes.tiles(_GROUND_HALF_SIZE, int(_GROUND_HALF_SIZE))
+    if soil:
+        mesh, parity = surrounding_tiles(soil.bed, _GROUND_HALF_SIZE, _TILE_LENGTH)
+    else:
+        mesh, parity = shapes.tiles(_GROUND_HALF_SIZE, round(2.0 * _GROUND_HALF_SIZE / _TILE_LENGTH))
     mesh = shapes.transform_mesh(mesh, (0.0, 0.0, height), np.eye(3))
     stream.log("ground", mesh_entity(BodyMesh(0, 1.0, mesh, _GROUND_COLOURS[parity])), static=True)
     return True
+
+
+def log_soil(stream: "rr.RecordingStream", root: str, bucket: str, soil: SoilHistory, time: np.ndarray) -> None:
+    """Log trench and heaps at least `_SOIL_PERIOD` apart, and the soil in the bucket at every row that changes it.
+
+    Args:
+        stream: recording stream.
+        root: parent entity of the machine.
+        bucket: name of the bucket's body.
+        soil: soil at the rows of the log.
+        time: (n,) times of the rows [s].
+    """
+    import rerun as rr
+
+    drawn_at, drawn, load = -np.inf, None, np.empty((0, 2))
+    for row, shape in enumerate(soil.shapes):
+        stream.set_time(TIMELINE, duration=float(time[row]))
+        is_last = row == len(time) - 1
+        if drawn is None or ((time[row] - drawn_at >= _SOIL_PERIOD or is_last) and _has_moved(drawn, shape)):
+            mesh, colours = trench_mesh(soil.bed, shape)
+            stream.log(f"{root}/soil", mesh_entity(BodyMesh(0, 1.0, mesh, colours.astype(np.uint8))))
+            drawn_at, drawn = time[row], shape
+        if not np.array_equal(load, shape.load):
+            load, path = shape.load, f"{root}/{bucket}/load"
+            if (mesh := load_mesh(soil, row)) is None:
+                stream.log(path, rr.Clear(recursive=False))
+            else:
+                colours = np.tile(LOOSE_COLOUR, (len(mesh.vertices), 1)).astype(np.uint8)
+                stream.log(path, mesh_entity(BodyMesh(0, 1.0, mesh, colours)))
+    stream.reset_time()
+
+
+def _has_moved(before: SoilShape, now: SoilShape) -> bool:
+    return not (np.array_equal(before.surface, now.surface) and np.array_equal(before.loose, now.loose))
 
 
 def log_tip(
@@ -420,14 +471,18 @@ def _log_machines(stream, entries) -> Scene:
             models[key] = compile_visual_model(machine, surroundings=things)
         model = models[key]
         poses = body_poses(machine, model, logged_joints(machine, log), log)
-        clock, tip = time_column(log.time), _tip_path(machine, log, poses)
+        clock, tip = time_column(log.time), tip_path(machine, log, poses)
         log_machine(stream, f"/{name}/machine", model, poses, clock, ghost=scene is not None)
         log_tip(stream, f"/{name}/tip_path", tip, clock, scene is not None)
+        grounds = [thing for thing in things if isinstance(thing, SoilGround)]
+        soil = soil_history(machine, grounds[0], log, poses) if grounds and len(log) > 1 else None
         contents += [f"/{name}/machine/**", f"/{name}/tip_path/**"]
         trails.append(f"/{name}/tip_path/trail")
         if scene is None:
-            eye, target = _camera_placement(model, tip)
-            ground = log_ground(stream, model)
+            eye, target = view_of_machine(model, tip)
+            ground = log_ground(stream, model, soil)
+            if soil and machine.arm:
+                log_soil(stream, f"/{name}/machine", machine.arm.tip.link, soil, log.time)
             scene = Scene(_scene_title(list(entries)), contents, trails, eye, target, ground)
     contents.append("/ground/**")
     assert scene is not None  # there is at least one entry
@@ -439,7 +494,8 @@ def _scene_title(names: list[str]) -> str:
     return f"{solid} (solid), {', '.join(glass)} (transparent blue)" if glass else "machine"
 
 
-def _tip_path(machine: Machine, log: Log, poses: Poses) -> np.ndarray | None:
+def tip_path(machine: Machine, log: Log, poses: Poses) -> np.ndarray | None:
+    """Return the path (n, 3) of the tip [m], true if the log contains it; None without an arm."""
     recorded = [f"truth.tip.{component}" for component in "xyz"]
     if all(name in log for name in recorded):
         return np.stack([log[name] for name in recorded], axis=1)
@@ -448,7 +504,7 @@ def _tip_path(machine: Machine, log: Log, poses: Poses) -> np.ndarray | None:
     return point_trajectory(poses, machine.arm.tip.link, machine.arm.tip.position)
 
 
-def _camera_placement(model: mujoco.MjModel, tip: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+def view_of_machine(model: mujoco.MjModel, tip: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
     """Return camera position and target (3,) [m] that show the machine and its whole tip path.
 
     The direction is that of the camera `overview` if the model has one.

@@ -221,6 +221,7 @@ if TYPE_CHECKING:
     from rerun.experimental import ViewerClient, ViewerState
 
 _ERROR_TIMEOUT = 3.0  # s, timeout for the error message of a failing viewer
+_TOO_SLOW = "the viewer does not show it in time: close other programs and try again"
 _MIN_FRAMES = 3  # minimum number of frames, because layout and data need a few frames
 _NO_DRIVER_SIGNS = ("render context", "graphics adapter")  # in the output if Vulkan is missing
 _DRIVER_ADVICE = (
@@ -259,7 +260,7 @@ def take_screenshot(
     ):
         _hide_top_panel(client)
         client.set_time(TIMELINE, duration=_screenshot_time(state, displayed_time, rrd), play_state="paused")
-        part.write_bytes(_take_settled_screenshot(client, deadline))
+        part.write_bytes(_take_settled_screenshot(client, rrd, deadline))
         return _viewer_reports(client)
 
 
@@ -328,14 +329,23 @@ def _check(viewer: Viewer, rrd: Path, deadline: float) -> None:
         message = f"the viewer ended with exit status {viewer.process.returncode}: {last}"
         raise InputError(rrd, message)
     if time.monotonic() > deadline:
-        raise InputError(rrd, "the viewer does not show it in time: increase the timeout")
+        raise InputError(rrd, _TOO_SLOW)
 
 
-def _take_settled_screenshot(client: "ViewerClient", deadline: float) -> bytes:
-    """Return the first image that equals the previous one, when all data have been loaded."""
+def _take_settled_screenshot(client: "ViewerClient", rrd: str | os.PathLike, deadline: float) -> bytes:
+    """Return the first image that equals the previous one, when all data have been loaded.
+
+    Raises:
+        InputError: there is no image before the deadline.
+    """
     previous, count = b"", 0
     while True:
-        picture, count = client.take_screenshot(), count + 1
+        try:
+            picture, count = client.take_screenshot(), count + 1
+        except TimeoutError:  # of one image; a busy computer without a graphics card can be slow
+            if time.monotonic() > deadline:
+                raise InputError(rrd, _TOO_SLOW) from None
+            continue
         if count >= _MIN_FRAMES and (picture == previous or time.monotonic() > deadline):
             return picture
         previous = picture

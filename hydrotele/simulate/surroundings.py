@@ -20,7 +20,8 @@ from hydrotele.core.compiled import allocation_free
 from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.machine.machine import Machine
-from hydrotele.scenario.scenario import LogOnGround, Plate, StandingTree, SurroundingObject
+from hydrotele.scenario.scenario import LogOnGround, Plate, SoilGround, StandingTree, SurroundingObject
+from hydrotele.simulate.soil_bed import BedInSimulation, SoilBed, machine_bucket
 
 (
     CLOSE_ANGLE,
@@ -159,17 +160,17 @@ _PREFIXES = ("plate_", "tree_", "log_")
 
 
 def write_surroundings(root, machine: Machine, objects: tuple[SurroundingObject, ...], visuals: bool = True) -> None:
-    """Add plates, trees and logs to an assembled MJCF.
+    """Add plates, trees and logs to an assembled MJCF; soil replaces the contact of bucket and ground.
 
     Args:
         root: the MJCF document of the machine.
         machine: the machine.
-        objects: plates, trees and logs.
+        objects: plates, trees, logs and soil.
         visuals: whether to add the visual geometry of logs.
 
     Raises:
         InputError: the machine does not have the given saw or grab, or the grab has no pocket for
-            the log.
+            the log, or there is soil but no bucket.
     """
     for number, thing in enumerate(objects):
         where = f"surroundings.{number}"
@@ -177,6 +178,10 @@ def write_surroundings(root, machine: Machine, objects: tuple[SurroundingObject,
             _write_plate(root, f"plate_{number}", thing)
         elif isinstance(thing, StandingTree):
             _write_tree(root, f"tree_{number}", thing, machine, where)
+        elif isinstance(thing, SoilGround):
+            machine_bucket(machine)
+            assert machine.arm  # it has a bucket
+            root.contact.add("exclude", name=f"soil_{number}", body1="world", body2=machine.arm.tip.link)
         else:
             body = _write_log(root, f"log_{number}", thing, machine, where)
             if visuals:
@@ -335,7 +340,7 @@ def log_grip(model: mujoco.MjModel, log: LogOnGround) -> np.ndarray:
 
 
 class Surroundings:
-    """Trees and logs of a run, and their cutting, gripping and release.
+    """Trees, logs and soil of a run, and their cutting, gripping, release and digging.
 
     Attributes:
         events: list of (time [s], description of the event).
@@ -361,11 +366,22 @@ class Surroundings:
             for n, thing in enumerate(things)
             if isinstance(thing, LogOnGround)
         ]
+        self._beds = [BedInSimulation(machine, model, thing) for thing in things if isinstance(thing, SoilGround)]
 
     @property
-    def has_trees_or_logs(self) -> bool:
-        """Whether there is any tree or log, so that `update` must be called."""
-        return bool(self._trees or self._logs)
+    def needs_update(self) -> bool:
+        """Whether there is any tree, log or soil, so that `update` must be called."""
+        return bool(self._trees or self._logs or self._beds)
+
+    @property
+    def soil(self) -> SoilBed | None:
+        """The soil that the bucket digs, or None."""
+        return self._beds[0].bed if self._beds else None
+
+    @property
+    def soil_force(self) -> np.ndarray:
+        """Force (3,) of the soil on the machine until the next update, without the weight carried [N]."""
+        return sum((one.bed.force for one in self._beds), np.zeros(3))
 
     def update(self, time: float, data: mujoco.MjData, period: float) -> None:
         """Update cutting and gripping; to be called once per control period.
@@ -383,6 +399,8 @@ class Surroundings:
                 self.events.append((time, "the grapple holds the log"))
             elif change == RELEASED:
                 self.events.append((time, "the grapple lets the log go"))
+        for one in self._beds:
+            one.update(data, period)
 
     def restore_model(self) -> None:
         """Undo the changes that cutting made to the model."""

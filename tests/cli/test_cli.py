@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 
 import hydrotele
 from hydrotele.cli import main as cli
+from hydrotele.cli.catalogue import format_items, format_summary
 from hydrotele.cli.overview import COMMANDS as SUMMARIES
 from hydrotele.cli.overview import format_overview
 from hydrotele.core.errors import InputError
@@ -423,7 +424,70 @@ def test_list(what, whole_list):
     assert code == 0 and len(rows) >= (1 if what in ("joysticks", "sweeps", "environments") else 4)
     assert whole_list[what] == rows and list(whole_list) == LISTS
     code, text, _ = invoke("list", what)
-    assert code == 0 and all(row["name"][:6] in text for row in rows)
+    assert code == 0 and all(re.search(rf"^  {row['name']}(  |$)", text, re.MULTILINE) for row in rows)
+
+
+@pytest.mark.parametrize("width", [40, 80, 200])
+def test_summary_of_the_list_has_thirty_lines_and_whole_names(width, whole_list):
+    every = {kind: [row["name"] for row in rows] for kind, rows in whole_list.items()}
+    lines = format_summary(every, width).splitlines()
+    assert len(lines) <= 30
+    shown = set(" ".join(lines).replace(",", " ").split())
+    known = {name for some in every.values() for name in some}
+    for kind, some in every.items():
+        count = sum(name in shown for name in some)
+        left = re.search(rf"and (\d+) more \(hydrotele list {kind}\)", " ".join(" ".join(lines).split()))
+        assert count + int(left[1] if left else 0) == len(some)
+    if width >= 80:
+        assert known <= shown
+
+
+def test_list_without_a_kind_is_the_summary(whole_list, monkeypatch):
+    monkeypatch.setattr("hydrotele.cli.catalogue.stdout_console.width", 80)
+    code, out, _ = invoke("list")
+    assert code == 0 and len(out.splitlines()) <= 30
+    assert all(row["name"] in out for rows in whole_list.values() for row in rows)
+
+
+def test_long_name_is_not_broken():
+    name = "hydrotele/" + "a" * 60 + "-v0"
+    text = format_items("environments", [{"name": name, "what": "a task", "reward": "x " * 30}], 50)
+    assert text.splitlines()[1] == f"  {name}" and "reward: x" in text
+
+
+def test_quiet_prints_the_result_only(finished, tmp_path):
+    code, out, err = invoke("--quiet", "review", finished, "--plot", tmp_path / "a.png")
+    assert (code, err) == (0, "") and "written to" in out
+    _, out, err = invoke("review", finished, "--plot", tmp_path / "a.png")
+    assert "making the plot" in err and "written to" in out
+    _, out, err = invoke("review", finished, "--plot", tmp_path / "b.png", "--quiet")
+    assert err == "" and "written to" in out
+    _, _, err = invoke("review", finished, "--plot", tmp_path / "c.png")
+    assert "making the plot" in err  # the next call is not quiet
+
+
+def test_review_writes_every_file_that_is_named(finished, tmp_path, monkeypatch):
+    shots = []
+
+    def take(recording, png, displayed_time):
+        shots.append((recording, displayed_time))
+        png.write_bytes(b"")
+        return ()
+
+    monkeypatch.setattr("hydrotele.show.viewer.take_screenshot", take)
+    files = [tmp_path / name for name in ("a.png", "b.png", "c.rrd")]
+    options = ["--plot", files[0], "--screenshot", files[1], "--at", 0.25, "--out", files[2]]
+    code, out, _ = invoke("review", finished, *options)
+    assert code == 0 and all(file.is_file() for file in files) and out.count("written to") == 3
+    assert shots == [(files[2], 0.25)]
+    code, _, err = invoke("review", finished, "--at", 0.25)
+    assert code == 2 and err == "--at: is the time of a screenshot: give --screenshot FILE.png as well"
+    code, _, err = invoke("review", finished, "--video", tmp_path / "a.avi")
+    assert code == 2 and err.endswith("a.avi: the name must end in .mp4")
+
+
+def test_help_prints_units_in_brackets():
+    assert "displayed time [s]" in " ".join(invoke("review", "--help")[1].split())
 
 
 def test_a_joystick_is_validated_and_exported(tmp_path):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from hydrotele.scenario.scenario import load_scenario
 from hydrotele.simulate.record import SimulationFailed
 from tests.measured import MEASURED
 
+DATA = Path(__file__).parents[1] / "data"
 HELD = {"control_rate": "50"}  # commands held over each row of the log
 CASES = {
     "excitation": {"duration": "6"},
@@ -66,7 +68,7 @@ def test_own_run_replays_itself(name):
 
 def test_own_contact_replays_because_the_log_names_its_ground():
     """Without that ground the bucket goes through, which the replay must show."""
-    run = run_scenario(load_scenario("dig", CASES["dig"]))
+    run = run_scenario(load_scenario(DATA / "press_ground.yaml", CASES["dig"]))
     assert run.truth["truth.contact_force.z"].max() > 1e4
     machine = load_machine("cat215", "bucket")
     metadata = {k: v for k, v in run.truth.metadata.items() if k != "ground"}

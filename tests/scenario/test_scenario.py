@@ -19,6 +19,7 @@ from hydrotele.scenario.scenario import Scenario, load_scenario, save_scenario, 
 from hydrotele.simulate.closure import pin_opening
 from hydrotele.simulate.record import SimulationFailed
 
+DATA = Path(__file__).parents[1] / "data"
 PIN = 1.0e-4  # m, asked for by the project: a tenth of a millimetre
 SHORTER = {"hold": "10", "emps_track": "6"}  # s; their later parts repeat the earlier ones
 # Simulated time [s] of the daily run, for scenarios that take long; nightly they run in full.
@@ -200,15 +201,33 @@ def test_a_held_boom_sinks_without_end_only_if_its_spool_leaks(effect, leakage, 
         assert last < 0.05 * first
 
 
-def test_dig_presses_on_the_ground():
+def test_bucket_presses_on_firm_ground():
     """Off the ground at first, then more than the bucket's weight and less than the machine's."""
-    run = shipped("dig")
+    run = run_scenario(load_scenario(DATA / "press_ground.yaml"))
     force, height = run.truth["truth.contact_force.z"], run.truth["truth.tip.z"]
     assert np.all(force[height > 0.3] == 0.0)
     assert 800 * 9.81 < force.max() < 20e3 * 9.81
     assert force.min() >= 0.0  # the ground only pushes
     forward = run.truth["truth.contact_force.x"][(force > 1e3) & (height < 0.02)]
     assert forward.mean() > 0.0  # the bucket is drawn in, the ground drags it out
+
+
+def test_dig_fills_the_bucket_and_leaves_a_trench():
+    """The soil carried is a heaped load at most; nothing but its weight acts above the ground."""
+    run = shipped("dig")
+    force, height = run.truth["truth.contact_force.z"], run.truth["truth.tip.z"]
+    assert np.all(force[height > 0.7] == 0.0)  # above the heap ahead of the trench
+    assert run.summary["soil"]["trench_depth_m"] > 0.3
+    heaped = 0.91 * 1700.0 / 1.24  # kg: volume of the bucket, density of the loosened sandy loam
+    assert 0.5 * heaped < run.summary["soil"]["carried_mass_kg"] < 1.05 * heaped
+    assert run.summary["balance"]["energy_balance"] is None  # the ground takes energy
+
+
+def test_soil_needs_a_bucket_and_ground():
+    with pytest.raises(InputError, match="cat215 with tool none has no bucket to dig with"):
+        prepare(load_scenario("dig", {"tool": "none", "pilot": "{kind: constant, commands: {}}", "start": "{}"}))
+    with pytest.raises(InputError, match="soil can be given once, and only with ground: true"):
+        load_scenario("dig", {"ground": "false"})
 
 
 def test_grapple_swings_as_a_compound_pendulum():
