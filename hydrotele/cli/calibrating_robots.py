@@ -659,14 +659,14 @@ def _hybrid_document(data, calibration: Calibration, heldout, evolved, posterior
             "acceptance": posterior.acceptance_fraction,
             "max_autocorrelation_time": posterior.autocorrelation.max(),
             "max_split_rhat": posterior.rhat.max(),
-            "min_effective_size": posterior.effective.min(),
+            "min_effective_size": posterior.effective_size.min(),
             "max_difference_in_std": float(away.max()),
             "parameters": [
                 {"name": n, "mean": m, "standard_deviation": s, "interval_95": i,
                  "split_rhat": r, "effective_size": e}
                 for n, m, s, i, r, e in zip(posterior.names, posterior.mean, posterior.standard_deviations,
                                             posterior.intervals, posterior.rhat,
-                                            posterior.effective, strict=True)
+                                            posterior.effective_size, strict=True)
             ],
         }  # fmt: skip
     return result
