@@ -463,7 +463,8 @@ def identify_with_friction_shapes(
     """Identify with the form of dry friction near zero speed that the data select, without wild readings.
 
     Dry friction is as smooth as the machine states, or changes its sign sharply: the smoothing velocity of a machine
-    often serves only the simulation. Deviations near zero speed are added if they improve Schwarz's criterion.
+    often serves only the simulation. Deviations near zero speed are added if they improve Schwarz's criterion. They
+    need a wider band than the motion, which is also the band of the result.
 
     Args:
         fit: as in `identify_dynamics`.
@@ -495,12 +496,22 @@ def identify_with_friction_shapes(
         if (criterion := compute_schwarz_criterion(some, sharp, processing, estimator)) < best:
             setup, best = sharp, criterion
             notes = (*notes, "Sharp Coulomb friction fits these data better than the given smoothing.")
-    free = add_deviations(setup, speeds)
-    if compute_schwarz_criterion(some, free, processing, estimator) < best:
-        setup = free
+    free, wide = add_deviations(setup, speeds), _widen_band(fit, processing)
+    if wide != processing:
+        best = compute_schwarz_criterion(some, setup, wide, estimator)
+    if compute_schwarz_criterion(some, free, wide, estimator) < best:
+        setup, processing = free, wide
         notes = (*notes, "Friction near zero speed deviates from the given law; the deviation was estimated as well.")
     found = identify_dynamics(fit, heldout, setup, processing, estimator, notes=notes)
     return replace(found, seconds=time.perf_counter() - started)
+
+
+def _widen_band(fit: Sequence[IdentificationRecord], processing: Processing) -> Processing:
+    """Return the processing with a band that contains the changes of dry friction, if the user states no band."""
+    if processing.band or processing.method == "periodic":
+        return processing
+    found = [estimate_resolution(r.position, r.period, r.position_noise) for r in fit]
+    return replace(processing, band=min(one.friction_band for one in found))
 
 
 def _select_first_runs(fit: Sequence[IdentificationRecord], period: float | None) -> list[IdentificationRecord]:
@@ -520,17 +531,22 @@ def compute_schwarz_criterion(
     processing: Processing,
     estimator: Estimator,
 ) -> float:
-    """Return Schwarz's criterion of a fit, per row and without constants.
+    """Return Schwarz's criterion of a fit, per row and without constants; infinite if there are too few rows.
 
     Args:
         fit: as in `identify_dynamics`.
         setup: as in `identify_dynamics`.
         processing: as in `identify_dynamics`.
         estimator: as in `identify_dynamics`.
+
+    Source: McQuarrie and Tsai 1998, Regression and time series model selection (correction for few rows).
     """
     found = fit_runs(fit, setup, processing, estimator)
-    rows = len(found.estimate.residual)
+    rows, drives = found.estimate.residual.shape
+    parameters = len(found.estimate.value)
+    if (free := rows - parameters / drives - 2.0) <= 0.0:
+        return math.inf
     # weights are inverse standard deviations; without them the most uncertain shape would win
     doubted = np.sum(np.mean(np.log(found.equations.weights**2), axis=0))
     misfit = np.sum(np.log(np.mean(found.estimate.residual**2, axis=0))) - doubted
-    return float(misfit + len(found.estimate.value) * np.log(rows) / rows)
+    return float(misfit + parameters * np.log(rows) / free)
