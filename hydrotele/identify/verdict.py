@@ -16,7 +16,7 @@ _MIN_SKILL_STD = 2.0  # standard deviations by which a prediction must be better
 _MIN_REST_FRACTION = 0.05  # of the compared rows: less rest is not reported
 _MIN_REST_UNCERTAINTY = 0.5  # uncertainty of the sign of friction, 0 .. 1, above which a row counts as at rest
 _MIN_CORRELATION = 0.8  # of measured and given force, above which their ratio tells a wrong sign or unit
-_MAX_FORCE_RATIO = 3.0  # of measured and given force: larger ratios are wrong units rather than wrong masses
+_MAX_FORCE_RATIO = 8.0  # of measured and given force: larger ratios are wrong units (kgf: 9.8) rather than masses
 _SIGNIFICANT_STD = 1.959964  # standard deviations, 95 % interval
 _POSITIVE_PARAMETERS = ("mass", "inertia_xx", "inertia_yy", "inertia_zz", "drive_inertia", "coulomb", "viscous")
 

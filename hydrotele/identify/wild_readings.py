@@ -36,9 +36,11 @@ def find_wild_readings(values: np.ndarray) -> np.ndarray:
     if len(known) <= 2 * _NEIGHBOURS + 1:
         return wild
     reading = values[known]
-    padded = np.pad(reading, _NEIGHBOURS, mode="reflect")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _NEIGHBOURS + 1)
-    others = np.sort(np.delete(windows, _NEIGHBOURS, axis=1), axis=1)
+    width = 2 * _NEIGHBOURS + 1
+    first = np.clip(np.arange(len(reading)) - _NEIGHBOURS, 0, len(reading) - width)  # near the ends, one-sided
+    windows = np.lib.stride_tricks.sliding_window_view(reading, width)[first]
+    is_own = np.arange(width) == (np.arange(len(reading)) - first)[:, None]
+    others = np.sort(windows[~is_own].reshape(-1, width - 1), axis=1)
     low, high = others[:, 1], others[:, -2]  # a second wild reading among the neighbours does not widen the range
     outside = np.maximum(low - reading, reading - high)
     from_median = reading - np.median(windows, axis=1)
