@@ -399,7 +399,7 @@ def identify(
         model="reduced" if reduced else "complete", pins=pins, asymmetry=asymmetry,
         processing=Processing(processing, band, period, harmonics),  # pyright: ignore - checks itself
         estimator=Estimator(
-            estimator, ridge, truncate, **({"pairs": 0} if keep_bias else {})  # pyright: ignore
+            estimator, ridge, truncate, **({"noise_pairs": 0} if keep_bias else {})  # pyright: ignore
         ),
         hydraulics=hydraulics,
     )  # fmt: skip
