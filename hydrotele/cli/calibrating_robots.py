@@ -140,7 +140,7 @@ def calibrate_mukca(data: Path, choices: SocketChoices, target: Path | None, as_
     sockets, notes = load_sockets(data, choices.unit == "deg")
     options = SocketOptions(choices.distance or None, choices.accuracy, choices.model)
     robot, said = _find_robot(data, choices.robot, sockets, options)
-    check_robot(robot, sockets)
+    check_robot(robot, sockets, options)
     notes = [*said, *notes, *_identifiability_notes(robot, sockets, options)]
     if choices.heldout is not None:
         one, found = predict_held_out_place(robot, sockets, choices.heldout, options)

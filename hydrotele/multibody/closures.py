@@ -277,6 +277,7 @@ _MAX_ITERATION_STEP = 1.5  # rad or m, maximum joint step per iteration from a d
 _ASSEMBLY_TOLERANCE = 1e-6  # m and 1, maximum difference of positions and orientations of equal assemblies
 _KINEMATICS_CONTEXT = "kinematics"
 _START_SEARCHES = 100  # random starts of the search for assemblies at the first row
+_MAX_SHOWN_POSES = 4  # assemblies listed in a message
 _OPENING_SEARCHES = 8  # starts of the search for the smallest opening
 
 
@@ -286,7 +287,7 @@ def find_start_pose(
     """Return a pose with closed loops from which the motion of the given joints can be followed.
 
     This is the start pose, with its loops closed by all joints. If they do not close there, or if
-    the pose is singular, it is the assembly at the first row that is closest to the start pose.
+    the pose is singular, it is the assembly at the first row, which must then be the only one.
 
     Args:
         chain: the chain.
@@ -299,8 +300,9 @@ def find_start_pose(
         (v,) [rad] or [m].
 
     Raises:
-        InputError: the loops cannot be closed at the first row, or the closures do not determine
-            the other joints at any of these poses; the message names the closure and the joints.
+        InputError: the loops cannot be closed at the first row or in several ways, or the closures
+            do not determine the other joints at any of these poses; the message names the closure,
+            its opening and the joints.
     """
     columns = np.array([chain.index(name) for name in given], np.int64)
     begin = np.array(chain.start if start is None else start, float)
@@ -310,14 +312,14 @@ def find_start_pose(
         if not undetermined:
             return q
     if len(chain.closures) and len(position):
-        found = find_assemblies(chain, given, position[0], starts=_START_SEARCHES, seed=seed)
-        poses = sorted(found, key=lambda pose: float(np.linalg.norm(pose - begin)))
-        for pose in poses:
-            undetermined = find_undetermined_joints(chain, pose, columns)
-            if not undetermined:
-                return pose
-        if not poses:
+        poses = find_assemblies(chain, given, position[0], starts=_START_SEARCHES, seed=seed)
+        if not len(poses):
             raise InputError(chain.source or _KINEMATICS_CONTEXT, describe_opening(chain, given, position[0], 0))
+        regular = [pose for pose in poses if not find_undetermined_joints(chain, pose, columns)]
+        if len(regular) == 1:
+            return regular[0]
+        if regular:
+            raise InputError(chain.source or _KINEMATICS_CONTEXT, _describe_choice(chain, begin, regular))
     raise InputError(
         chain.source or _ERROR_CONTEXT, f"neither given nor determined by a closure: {', '.join(undetermined)}"
     )
@@ -345,19 +347,39 @@ def describe_opening(chain: Chain, given: Sequence[str], position: np.ndarray, r
         return _loop_residuals(chain.tree, q)[0][:, 0]
 
     starts = [chain.start[others] + k * rng.uniform(-1.0, 1.0, len(others)) for k in range(_OPENING_SEARCHES)]
-    left = residual(min((scipy.optimize.least_squares(residual, x) for x in starts), key=lambda one: one.cost).x)
-    rows = chain.tree.first_equation[:-1]
-    openings = [float(np.linalg.norm(left[first : first + 3])) for first in rows]
-    worst = int(np.argmax(openings))
+    q[others] = min((scipy.optimize.least_squares(residual, x) for x in starts), key=lambda one: one.cost).x
+    closure, opening = _largest_opening(chain, q)
     values = ", ".join(
         f"{name} {value:.4g} {'m' if chain.tree.is_slide[j] else 'rad'}"
         for name, value, j in zip(given, position, columns, strict=True)
     )
     return (
-        f"row {row}: the loops of {chain.name} cannot be closed at {values}: {chain.closures[worst]} stays"
-        f" {1e3 * openings[worst]:.3g} mm open. Check the unit and zero of these joints and the points of the"
+        f"row {row}: the loops of {chain.name} cannot be closed at {values}: {closure} stays"
+        f" {1e3 * opening:.3g} mm open. Check the unit and zero of these joints and the points of the"
         " closure (an anchor in an MJCF applies to the reference pose; two sites do not), or"
         " add a <keyframe> with a closed pose"
+    )
+
+
+def _largest_opening(chain: Chain, q: np.ndarray) -> tuple[str, float]:
+    """Return the name of the closure whose points are farthest apart at a pose, and their distance [m]."""
+    left = _loop_residuals(chain.tree, q)[0][:, 0]
+    openings = [float(np.linalg.norm(left[first : first + 3])) for first in chain.tree.first_equation[:-1]]
+    worst = int(np.argmax(openings))
+    return chain.closures[worst], openings[worst]
+
+
+def _describe_choice(chain: Chain, start: np.ndarray, poses: Sequence[np.ndarray]) -> str:
+    """Describe that the start pose does not select one of several assemblies, for an error message."""
+    closure, opening = _largest_opening(chain, start)
+    state = f"{closure} is {1e3 * opening:.3g} mm open" if opening > CLOSURE_TOLERANCE else "the pose is singular"
+    shown = "; or ".join(
+        ", ".join(f"{name} {value:.4g}" for name, value in zip(chain.joints, pose, strict=True))
+        for pose in poses[:_MAX_SHOWN_POSES]
+    )
+    return (
+        f"at the start pose of {chain.name} {state}, and its loops can be closed in {len(poses)} ways at the first"
+        f" row: {shown}. Add the correct one as <keyframe><key qpos=\"...\"/></keyframe>"
     )
 
 
