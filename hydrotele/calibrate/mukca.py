@@ -41,7 +41,7 @@ from hydrotele.kinematics.serial_robot import (
 )
 
 _MIN_SIZE_RATIO = 1e-7  # minimum size relative to its start: the kind has no errors
-_MAX_SIZE_RATIO = 1e3
+_MAX_SIZE_RATIO = 1e2  # 0.1 m and 0.1 rad: larger sizes make all points coincide, which fits any data
 _MAX_ROUNDS, _SIZE_TOLERANCE = 200, 1e-4
 
 
@@ -123,8 +123,9 @@ def estimate_sizes(
 
 
 def cross_validation_error(
-    matrix: np.ndarray, right_hand_side: np.ndarray, folds: np.ndarray, sizes: ErrorSizes
-) -> float:
+    matrix: np.ndarray, right_hand_side: np.ndarray, folds: np.ndarray, sizes: ErrorSizes,
+    known: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
+) -> float:  # fmt: skip
     """Return the RMS error of equations predicted by cross-validation.
 
     Args:
@@ -132,6 +133,9 @@ def cross_validation_error(
         right_hand_side: (m,) right-hand side of the equations.
         folds: (m,) fold of each equation.
         sizes: standard deviations of parameters and noise, the same for all folds.
+        known: equations (r, p) with an error of standard deviation 1, their right-hand side (r,) and
+            folds (r,). They are fitted with the other folds but not predicted. Without the distance
+            of the sockets, equal shrinking of all lengths would predict any ball position.
 
     Returns:
         The error, in the unit of the equations.
@@ -144,15 +148,18 @@ def cross_validation_error(
     """
     # Each fold is compressed to its triangular factor. Normal equations would square the condition
     # number, which is large for frames far from the robot.
-    scaled = np.column_stack([matrix * (sizes.std / sizes.noise), right_hand_side])
+    scaled = np.column_stack([matrix * (sizes.std / sizes.noise), right_hand_side / sizes.noise])
     factors = [np.linalg.qr(scaled[folds == fold], mode="r") for fold in np.unique(folds)]
     prior = np.eye(scaled.shape[1])[:-1]
+    stated, of = prior[:0], np.empty(0)
+    if known is not None:
+        stated, of = np.column_stack([known[0] * sizes.std, known[1]]), known[2]
     total = 0.0
-    for k, own in enumerate(factors):
-        rest = np.vstack([prior, *factors[:k], *factors[k + 1 :]])
+    for k, (fold, own) in enumerate(zip(np.unique(folds), factors, strict=True)):
+        rest = np.vstack([prior, stated[of != fold], *factors[:k], *factors[k + 1 :]])
         value = np.linalg.lstsq(rest[:, :-1], rest[:, -1], rcond=None)[0]
         total += float(np.sum((own[:, -1] - own[:, :-1] @ value) ** 2))
-    return float(np.sqrt(total / len(right_hand_side)))
+    return sizes.noise * float(np.sqrt(total / len(right_hand_side)))
 
 
 JOINT_MODELS = {
@@ -713,7 +720,9 @@ def _unit_hint(robots: dict[str, SerialRobot], sockets: Sequence[Socket]) -> str
             scatter = _ball_scatter(robot, other)
             if scatter.relative <= _MAX_RELATIVE_SCATTER:
                 named = {"deg": "degrees", "rad": "radians"}[unit]
-                return f"; read as {named}, the ball of {name} scatters by {_format_scatter(scatter)}: give --unit {unit}"
+                return (
+                    f"; read as {named}, the ball of {name} scatters by {_format_scatter(scatter)}: give --unit {unit}"
+                )
     return ""
 
 
@@ -770,7 +779,8 @@ def _select_model(problem: _SocketProblem, state: _FitState) -> tuple[str, dict[
             matrix[:many], rest[:many], _parameter_kinds(full), begun.sizes.std, full.degrees_of_freedom,
             state.sizes.noise, matrix[many:] * weight[:, None], rest[many:] * weight, _MIN_NOISE,
         )  # fmt: skip
-        errors[model] = cross_validation_error(matrix[:many], rest[:many], folds, sizes)
+        known = (matrix[many:] * weight[:, None], rest[many:] * weight, np.array(part)[[a for a, _ in full.pairs]])
+        errors[model] = cross_validation_error(matrix[:many], rest[:many], folds, sizes, known if full.pairs else None)
     return wanted or min(errors, key=lambda model: errors[model]), errors
 
 

@@ -46,6 +46,8 @@ from hydrotele.calibrate.mukca import (
     predict_held_out_places,
 )
 from hydrotele.calibrate.posterior import (
+    MAX_STEPS,
+    MIN_STEPS,
     EvolutionResult,
     Posterior,
     minimize_by_evolution,
@@ -68,6 +70,7 @@ from hydrotele.cli.console import (
     to_json_types,
     write_json,
 )
+from hydrotele.cli.option_values import check_range
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import read_text
 from hydrotele.core.output import atomic_folder, check_output_folder
@@ -84,6 +87,8 @@ from hydrotele.kinematics.serial_robot import SerialRobot, correct_urdf, load_ro
 from hydrotele.kinematics.wires import wire_lengths
 
 _ROBOT_FILES = ("robot.yaml", "robot.yml", "*.urdf", "*.xml")
+MAX_SOCKET_DISTANCE = 10_000.0  # mm: larger than the reach of a robot
+MAX_SCARA_NOISE = 100.0  # mm: a larger position error is not noise for links of 0.4 and 0.3 m
 _EXAMPLE = ScaraSpec(length_a=0.4, length_b=0.3)
 _EXAMPLE_ERRORS = (
     0.0,
@@ -135,6 +140,8 @@ def calibrate_mukca(data: Path, choices: SocketChoices, target: Path | None, as_
     """
     if choices.unit not in ("rad", "deg"):
         raise InputError(f"--unit {choices.unit}", "must be rad or deg")
+    check_range("--distance", 1e3 * choices.distance, 0.0, MAX_SOCKET_DISTANCE, "distance [mm]")
+    check_range("--accuracy", 1e3 * choices.accuracy, 1e-6, MAX_SOCKET_DISTANCE, "standard deviation [mm]")
     if target is not None:
         check_output_folder(target, "robot calibration")
     sockets, notes = load_sockets(data, choices.unit == "deg")
@@ -393,6 +400,9 @@ def simulate_scara_to_folder(folder: Path, poses: int, noise: float, seed: int) 
     Raises:
         InputError: the folder is not empty.
     """
+    check_range("--seed", seed, 0, MAX_SEED, "random seed")
+    check_range("--noise", 1e3 * noise, 0.0, MAX_SCARA_NOISE, "standard deviation [mm]")
+    check_range("--poses", poses, 4, MAX_POSES, "number of poses")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(folder, "exists; give another folder to --simulate")
     save_scara(folder, _EXAMPLE, simulate_scara(_EXAMPLE, _EXAMPLE_ERRORS, poses, noise, seed))
@@ -501,6 +511,10 @@ def _print_scara(document: dict[str, Any]) -> None:
 KIND = "hybrid calibration"
 MEASUREMENT = "hybrid measurement"
 CRITERIA = ("D", "O1", "O2", "O3", "O4", "O5")
+MAX_SEED = 2**32 - 1  # of NumPy's RandomState, which emcee uses
+MAX_ERROR_FACTOR = 50.0  # of 1 mm and 1 mrad: with larger errors the legs do not reach the poses
+MAX_NOISE_FACTOR = 1000.0  # of 0.01 mm: larger noise is not that of a sensor
+MAX_POSES = 100_000  # poses: 100 MB of equations
 CANDIDATES = 200  # number of random poses from which the most informative are selected
 SENSOR_NOISE = {
     "leg": 1e-5,
@@ -536,6 +550,9 @@ def calibrate_hybrid(
     """
     if kind not in ("auto", "dh", "poe"):
         raise InputError(f"--model {kind}", "valid: auto, dh, poe")
+    check_range("--seed", seed, 0, MAX_SEED, "random seed")
+    if steps:
+        check_range("--posterior", steps, MIN_STEPS, MAX_STEPS, "number of MCMC steps")
     if target:
         check_output_folder(target, KIND)
     nominal = load_hybrid(robot or find_robot_file(Path(data)) or "iwr")
@@ -782,6 +799,11 @@ def simulate_hybrid(
 
     if choose not in ("random", *CRITERIA):
         raise InputError(f"--choose {choose}", f"valid: random, {', '.join(CRITERIA)}")
+    check_range("--seed", seed, 0, MAX_SEED, "random seed")
+    check_range("--errors", errors, 0.0, MAX_ERROR_FACTOR, "factor on errors of 1 mm and 1 mrad")
+    check_range("--noise", noise, 0.0, MAX_NOISE_FACTOR, "factor on the noise of the sensors")
+    check_range("--poses", poses, 1, MAX_POSES, "number of poses")
+    check_range("--heldout", heldout, 0, MAX_POSES, "number of poses")
     check_output_folder(target, MEASUREMENT)
     nominal = load_hybrid(robot or "iwr")
     kind = "dh" if kind == "auto" and nominal.specification.carriage else "poe" if kind == "auto" else kind

@@ -379,7 +379,7 @@ def _describe_choice(chain: Chain, start: np.ndarray, poses: Sequence[np.ndarray
     )
     return (
         f"at the start pose of {chain.name} {state}, and its loops can be closed in {len(poses)} ways at the first"
-        f" row: {shown}. Add the correct one as <keyframe><key qpos=\"...\"/></keyframe>"
+        f' row: {shown}. Add the correct one as <keyframe><key qpos="..."/></keyframe>'
     )
 
 

@@ -123,7 +123,10 @@ def project_on_drives(
         if len(chain.closures) and not len(find_assemblies(chain, given, tables[0][failed])):
             message = describe_opening(chain, given, tables[0][failed], failed)
         else:
-            message = f"row {failed}: the pose is singular for the drives {', '.join(drives)}"
+            message = (
+                f"row {failed}: the loops of {chain.name} cannot be closed there without a jump to another"
+                f" assembly, or the pose is singular for the drives {', '.join(drives)}"
+            )
         raise InputError(chain.source or _ERROR_CONTEXT, message)
     return out
 
