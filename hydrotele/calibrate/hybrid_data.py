@@ -338,8 +338,8 @@ def _check_covariance(file: Path, covariance: np.ndarray) -> None:
         size = np.sqrt(max(smallest, 0.0))
         raise InputError(
             file.with_name(MEASUREMENT_FILE), f"the stated noise gives the legs a standard deviation of"
-            f" {1e3 * size:.3g} mm: state noise from {1e3 * _MIN_NOISE:.0e} mm to {1e3 * _MAX_NOISE:.0f} mm, or leave it out to"
-            " estimate it",
+            f" {1e3 * size:.3g} mm: state noise from {1e3 * _MIN_NOISE:.0e} mm to {1e3 * _MAX_NOISE:.0f} mm,"
+            " or leave it out to estimate it",
         )  # fmt: skip
 
 

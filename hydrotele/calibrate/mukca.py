@@ -447,6 +447,7 @@ def calibrate_sockets(
             of the sockets or needs errors that are not due to manufacturing.
     """
     options = options or SocketOptions()
+    nominal, robot = robot, place_frames_near(robot, sockets)
     problem = _SocketProblem(robot, sockets, (), options)
     _check_count(problem)
     robust, gone = _remove_gross_outliers(problem)
@@ -475,9 +476,42 @@ def calibrate_sockets(
     plain = _SocketProblem(robot, sockets, (), options)
     before = _evaluate_balls(plain, plain.predict_balls(_fit_nominal_ball(plain)))
     return SocketCalibration(
-        robot, made, model, rivals, fit, sizes, found.sizes.noise, before,
+        nominal, made, model, rivals, fit, sizes, found.sizes.noise, before,
         evaluate_robot(made, sockets), tuple(outliers), options,
     )  # fmt: skip
+
+
+def place_frames_near(robot: SerialRobot, sockets: Sequence[Socket]) -> SerialRobot:
+    """Return the same robot without frames that are farther along their joint axes than the robot reaches.
+
+    A frame may lie anywhere on its axis. The factory calibration of robots with parallel axes puts
+    frames hundreds of metres away, where a small tilt is a large displacement: the equations are
+    badly scaled, and errors of one kind have no common size.
+
+    Args:
+        robot: the robot.
+        sockets: postures, from which the reach follows.
+
+    Returns:
+        The robot with such frames at the point of their axis closest to the frame before.
+    """
+    problem = _SocketProblem(robot, sockets, (), SocketOptions(distance=None))
+    reach = _median_reach(problem)
+    joints, back = [], np.eye(4)
+    for joint in robot.joints:
+        origin, slide = back @ joint.origin, np.eye(4)
+        along = origin[:3, :3] @ joint.axis
+        if abs(along @ origin[:3, 3]) > reach:
+            slide[:3, 3] = -(along @ origin[:3, 3]) * joint.axis
+        joints.append(replace(joint, origin=origin @ slide))
+        back = np.linalg.inv(slide)
+    return replace(robot, joints=tuple(joints), tool=back @ robot.tool)
+
+
+def _median_reach(problem: _SocketProblem) -> float:
+    """Return the median distance of the ball from the first joint [m]."""
+    balls = problem.predict_balls(problem.start)
+    return float(np.median(np.linalg.norm(balls - problem.robot.joints[0].origin[:3, 3], axis=1)))
 
 
 def evaluate_robot(robot: SerialRobot, sockets: Sequence[Socket]) -> SocketErrors:
@@ -739,8 +773,7 @@ def _check_fit(problem: _SocketProblem, fit: ParameterFit, noise: float) -> None
                 f" {problem.sockets[a].name}, not {1e3 * problem.options.distance:.4g} mm:"
                 " correct --distance, the robot or the unit of the joints, or state the --accuracy of the distance"
             )  # fmt: skip
-    balls = problem.predict_balls(problem.start)
-    reach = float(np.median(np.linalg.norm(balls - problem.robot.joints[0].origin[:3, 3], axis=1)))
+    reach = _median_reach(problem)
     for name, value in zip(problem.names, fit.values - problem.start, strict=True):
         kind, _, joint = name.partition(".")
         if joint == "tool" or kind not in ("tx", "ty", "tz", "rx", "ry", "rz"):

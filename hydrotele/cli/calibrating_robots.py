@@ -77,6 +77,7 @@ from hydrotele.core.output import atomic_folder, check_output_folder
 from hydrotele.identify.identifiability import STATUS_FULL
 from hydrotele.kinematics.hybrid import (
     HybridRobot,
+    UnreachableError,
     build_error_model,
     forward_kinematics,
     load_hybrid,
@@ -84,7 +85,7 @@ from hydrotele.kinematics.hybrid import (
     save_hybrid,
 )
 from hydrotele.kinematics.serial_robot import SerialRobot, correct_urdf, load_robot, robot_to_yaml
-from hydrotele.kinematics.wires import wire_lengths
+from hydrotele.kinematics.wires import NoIntersectionError, wire_lengths
 
 _ROBOT_FILES = ("robot.yaml", "robot.yml", "*.urdf", "*.xml")
 MAX_SOCKET_DISTANCE = 10_000.0  # mm: larger than the reach of a robot
@@ -820,7 +821,12 @@ def simulate_hybrid(
                 joints, legs = sample_poses(nominal, count, rng, wires)
                 if stem == POSES_STEM and choose != "random":
                     joints, legs = _select_poses(model, wires, count, rng, choose)
-                read = simulate_measured_poses(true, joints, legs, wires, sizes, rng)
+                try:
+                    read = simulate_measured_poses(true, joints, legs, wires, sizes, rng)
+                except (UnreachableError, NoIntersectionError) as error:
+                    raise InputError(
+                        f"--errors {errors:g} --noise {noise:g}", f"{error}: reduce the errors or the noise"
+                    ) from None
                 save_measurement(folder, stem, nominal, read.joints, read.legs, wires=read.wires)
         (folder / "measurement.yaml").write_text(measurement_text(nominal.name, wires, stated))
         save_hybrid(nominal, folder / "robot.yaml", "nominal robot")
