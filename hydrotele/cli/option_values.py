@@ -114,3 +114,22 @@ def _escape_help(annotation: Any) -> Any:
     for fact in facts:
         fact.help = escape(fact.help or "")
     return Annotated[type_, *facts]
+
+
+def check_range(option: str, value: float, low: float, high: float, what: str) -> None:
+    """Raise an error if an option is not a number within a range.
+
+    Args:
+        option: name of the option.
+        value: its value.
+        low: smallest valid value.
+        high: largest valid value.
+        what: name of the quantity and its unit, for the message.
+
+    Raises:
+        InputError: the value is outside the range, infinite or not a number.
+
+    >>> check_range("--seed", 3, 0, 10, "random seed")
+    """
+    if not low <= value <= high:
+        raise InputError(f"{option} {value:g}", f"must be a {what} from {low:g} to {high:g}")

@@ -110,7 +110,7 @@ def robot_chain(robot: SerialRobot) -> SerialChain:
     tool = robot.tool
     frames.append(end)
     kinds = ["rz" if joint.kind == "revolute" else "tz" for joint in robot.joints]
-    return chain_from_frames(frames, kinds, robot.names, tool[:3, 3])  # type: ignore[arg-type]
+    return chain_from_frames(frames, kinds, robot.joint_names, tool[:3, 3])  # type: ignore[arg-type]
 
 
 def correct_robot(robot: SerialRobot, values: Mapping[str, float], corrections: Mapping[str, float]) -> SerialRobot:

@@ -79,6 +79,7 @@ class Chain:
         drives: joints that an actuator moves, in the order of the actuators.
         qpos_indices: (v,) index of a joint in MuJoCo's `qpos`, -1 for parts of ball and free joints.
         dof_indices: (v,) index of a joint in MuJoCo's `qvel`, -1 likewise.
+        source: file that it was read from, empty for a compiled model.
     """
 
     name: str
@@ -96,6 +97,7 @@ class Chain:
     drives: tuple[str, ...]
     qpos_indices: np.ndarray
     dof_indices: np.ndarray
+    source: str = ""
 
     def index(self, joint: str) -> int:
         """Return the index of a joint.
@@ -208,6 +210,7 @@ def load_chain(source: str | Path | mujoco.MjModel) -> Chain:
         drives=tuple(dict.fromkeys(whole[int(model.jnt_qposadr[j])] for j in moved)) or names,
         qpos_indices=np.array([joint.qpos_index for joint in joints], np.int64),
         dof_indices=np.array([joint.dof_index for joint in joints], np.int64),
+        source=str(source) if isinstance(source, str | Path) else "",
     )
 
 

@@ -20,11 +20,11 @@ from hydrotele.core.compiled import allocation_free, compiled
 from hydrotele.core.errors import InputError
 from hydrotele.multibody.chain import Chain
 from hydrotele.multibody.closures import (
-    CLOSURE_TOLERANCE,
-    check_joints_determined,
-    close_loops_from,
     close_loops_near,
     compute_closure_acceleration,
+    describe_opening,
+    find_assemblies,
+    find_start_pose,
     make_loop_workspace,
 )
 from hydrotele.multibody.tree_motion import (
@@ -111,10 +111,7 @@ def project_on_drives(
     for body, axis in (moment_free or {}).items():
         axes[_body_index(chain, body) + 1] = axis
     others = np.setdiff1d(np.arange(v), columns)
-    q = np.array(chain.start if start is None else start, float)
-    if not close_loops_from(chain.tree, q, np.arange(v), CLOSURE_TOLERANCE, np.inf) < CLOSURE_TOLERANCE:
-        raise InputError(_ERROR_CONTEXT, f"the loops of {chain.name} cannot be closed from the start positions")
-    check_joints_determined(chain, q, columns)
+    q = find_start_pose(chain, given, tables[0], start)
     out = Projection(
         np.empty((n, v)), np.empty((n, v)), np.empty((n, v)), np.empty((n, k, v)),
         np.empty((n, k, 10 * len(chain.bodies))), np.empty((n, len(chain.tree.closure_bodies))),
@@ -123,11 +120,14 @@ def project_on_drives(
     given_rows = _GivenMotion(columns, *tables)
     failed = _project_rows(chain.tree, given_rows, others, moved, axes, q, out)
     if failed >= 0:
-        raise InputError(
-            _ERROR_CONTEXT,
-            f"row {failed}: the loops of {chain.name} cannot be closed there, or the pose is"
-            f" singular for the drives {', '.join(drives)}",
-        )
+        if len(chain.closures) and not len(find_assemblies(chain, given, tables[0][failed])):
+            message = describe_opening(chain, given, tables[0][failed], failed)
+        else:
+            message = (
+                f"row {failed}: the loops of {chain.name} cannot be closed there without a jump to another"
+                f" assembly, or the pose is singular for the drives {', '.join(drives)}"
+            )
+        raise InputError(chain.source or _ERROR_CONTEXT, message)
     return out
 
 
