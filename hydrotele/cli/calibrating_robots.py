@@ -216,7 +216,7 @@ def socket_document(
 
 def _heldout_document(heldout_parts: Sequence[HeldOutPrediction], rows: dict[str, int]) -> dict[str, Any]:
     def rms_over_parts(kind: str, what: str) -> float:
-        squares = [getattr(getattr(one, kind), what) ** 2 * rows[one.name] for one in heldout_parts]
+        squares = [getattr(getattr(one, f"{kind}_errors"), what) ** 2 * rows[one.name] for one in heldout_parts]
         return 1e3 * float(np.sqrt(np.sum(squares) / sum(rows.values())))
 
     distances = {k: v for one in heldout_parts for k, v in one.calibrated_errors.socket_distances.items()}
@@ -650,14 +650,14 @@ def _hybrid_document(data, calibration: Calibration, heldout, evolved, posterior
             "acceptance": posterior.acceptance_fraction,
             "largest_autocorrelation_time": posterior.autocorrelation.max(),
             "largest_split_rhat": posterior.rhat.max(),
-            "least_effective_size": posterior.effective.min(),
+            "least_effective_size": posterior.effective_size.min(),
             "largest_difference_in_deviations": float(away.max()),
             "parameters": [
                 {"name": n, "mean": m, "standard_deviation": s, "interval_95": i,
                  "split_rhat": r, "effective_size": e}
                 for n, m, s, i, r, e in zip(posterior.names, posterior.mean, posterior.standard_deviations,
                                             posterior.intervals, posterior.rhat,
-                                            posterior.effective, strict=True)
+                                            posterior.effective_size, strict=True)
             ],
         }  # fmt: skip
     return result
@@ -701,7 +701,7 @@ def _write_hybrid_files(folder: Path, result, calibration: Calibration, heldout,
         chosen = np.sort(place)
         sizes = [1e-3] * len(chosen)
         truth = calibration.fit.values[[calibration.fit.names.index(posterior.names[k]) for k in chosen]]
-        image = draw_posterior(posterior.flat[:, chosen] / sizes, [posterior.names[k] for k in chosen],
+        image = draw_posterior(posterior.flat_sample[:, chosen] / sizes, [posterior.names[k] for k in chosen],
                        truth / sizes, "least squares")  # fmt: skip
         (folder / "posterior.png").write_bytes(image)
     summary = {"kind": KIND, "name": result["robot"], "hydrotele": hydrotele.__version__}

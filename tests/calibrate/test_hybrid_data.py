@@ -177,5 +177,5 @@ def test_the_command_draws_a_posterior(folder, tmp_path):
         # 600 steps of 12 walkers with correlations of some 30: means within 0.3 deviations
         assert abs(one["mean"] - other["value"]) < 0.5 * other["standard_deviation"]
     # three parameters do not describe a robot with errors in 54
-    assert "this error model (or choice of parameters) does not describe" in found["warnings"][-1]
+    assert "the error model (or its selected parameters) does not describe" in found["warnings"][-1]
     assert (tmp_path / "out" / "posterior.png").stat().st_size > 10000
