@@ -29,7 +29,7 @@ LIMITS: Mapping[str, tuple[float, str]] = MappingProxyType({
     "MOVES": (1e4, "moves or waypoints of a pilot"),
     "HARMONICS": (1e3, "harmonics of a joint's reference"),
     "ASSET_BYTES": (256e6, "bytes of the meshes, textures and height fields of an MJCF"),
-    "MJCF_ELEMENTS": (1e4, "elements of an MJCF, with the copies that replicate, flexcomp, attach and nkey make"),
+    "MJCF_ELEMENTS": (1e4, "elements of an MJCF with all copies by replicate, flexcomp, composite, attach and nkey"),
     "MJCF_VALUES": (1e8, "pixels, height field points and user values of an MJCF"),
     "LINKS": (200, "links of a machine"),
 })  # fmt: skip

@@ -42,6 +42,13 @@ _BYTES_PER_FLEX_VERTEX = 32  # least bytes of a mesh file for a vertex and its t
 _VALUES_PER_MESH_VERTEX = 100  # coordinates, normals, triangles, hull and bounding boxes
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 _LINE = re.compile(r",? *\bline (\d+)")
+_MUJOCO_PHRASES = (
+    (re.compile(r"^((XML )?Error: )+"), ""),
+    (re.compile(r" Element name '', id -?\d+"), ""),
+    (re.compile(r" Element name ('[^']*'), id -?\d+"), r" (element \1)"),
+    (re.compile(r" Element '([^']*)'"), r" (element <\1>)"),
+)
+"""Parts of MuJoCo's messages that are not sentences, and their replacements."""
 
 
 @dataclass(frozen=True)
@@ -156,6 +163,8 @@ def translate_mujoco_errors(where: object, document: MjcfDocument | None = None)
             origin = document.find_origin(int(lines[-1][1]))
             said = said[: lines[-1].start()] + said[lines[-1].end() :]
             where = f"{origin[0]}:{origin[1]}" if origin else where
+        for phrase, replacement in _MUJOCO_PHRASES:
+            said = phrase.sub(replacement, said)
         raise InputError(where, f"MuJoCo cannot read it: {said}") from None
 
 

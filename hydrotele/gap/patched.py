@@ -251,7 +251,7 @@ def patched_mjcf(mjcf: str | Path, patch: Patch) -> str:
         spec.joint(place).springref = rest
     if any(patch.tilt):
         spec.option.gravity = tilted(np.array(spec.option.gravity), np.array(patch.tilt))
-    spec.compile()
+    document.compile(spec)
     return spec.to_xml()
 
 

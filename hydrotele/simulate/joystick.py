@@ -22,7 +22,7 @@ import numpy as np
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
 from hydrotele.core.memory import address_record, float64_view, matrix_view
-from hydrotele.core.mjcf import load_spec, translate_mujoco_errors
+from hydrotele.core.mjcf import load_spec, read_mjcf
 from hydrotele.machine.joystick import Joystick, principal_values
 from hydrotele.simulate.layout import call_step, function_address
 
@@ -87,8 +87,7 @@ class SimulatedFlotor:
         spec.compiler.discardvisual = True
         spec.compiler.fusestatic = True
         spec.option.timestep = self.period / self.steps
-        with translate_mujoco_errors(Path(facts.folder, facts.mjcf)):
-            self.model = spec.compile()
+        self.model = compile_joystick(facts, spec)
         self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
         self.data = mujoco.MjData(self.model)
         self.model.opt.gravity[:] = (0.0, 0.0, GRAVITY)
@@ -426,6 +425,15 @@ def joystick_spec(facts: Joystick, hand: bool = True) -> mujoco.MjSpec:
     if hand:
         _add_arm_impedance(spec, joints, facts)
     return spec
+
+
+def compile_joystick(facts: Joystick, spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compile a spec of `joystick_spec`.
+
+    Raises:
+        InputError: MuJoCo refuses it; names file and line.
+    """
+    return read_mjcf(Path(facts.folder, facts.mjcf)).compile(spec)
 
 
 def _place_stops(spec: mujoco.MjSpec, facts: Joystick, path: Path) -> None:

@@ -132,7 +132,7 @@ def test_angles_of_a_rotation(rpy):
 
 @pytest.mark.parametrize(
     ("text", "said"),
-    [("<robot", "not valid XML"), ("<sdf/>", "is not a robot file"),
+    [("<robot", "is not XML"), ("<sdf/>", "is not a robot file"),
      ("<robot/>", "no moving joint"), (URDF.replace("0 0 0.2", "0 0 x"), "three numbers")],
 )  # fmt: skip
 def test_bad_files_are_refused(tmp_path, text, said):

@@ -91,7 +91,7 @@ def test_a_saved_machine_takes_its_files_along(gate, tmp_path):
         ("parts/meshes/more/leaf.stl", None, r"mesh file='more/leaf.stl'.*No such file"),
         ("parts/rust.png", None, r"texture file='rust.png'.*No such file"),
         ("parts/meshes/leaf.stl", b"not a mesh", r"machine gate: .*"),
-        ("gate.xml", "<mujoco>" * 300 + "</mujoco>" * 300, r"300 levels"),
+        ("gate.xml", "<mujoco>" * 300 + "</mujoco>" * 300, r"300 nested levels"),
         ("gate.xml", MJCF.replace('mesh="other"', 'mesh="none"'), r"machine gate: .*none"),
         ("gate.xml", MJCF.replace('name="other"', 'name="leaf"'), r"gate.xml.*leaf"),
     ],
