@@ -420,8 +420,16 @@ def _count_elements(
         InputError: there are too many elements or values.
     """
     tags: Counter[str] = Counter()
-    sizes: dict[str, float] = {}  # values per element of a kind; "" for elements of any kind
-    keys = sum(models.values())
+    sizes: dict[str, float] = {}  # values per element of a kind, from the defaults
+    user_values: dict[Element, float] = {}  # values per element of any kind, from <size nuser_...>
+    most_elements: dict[Element, float] = {}
+    most_values: dict[Element, float] = {}
+
+    def locate(amounts: Mapping[Element, float]) -> str:
+        """Return the place of the element with the largest amount."""
+        element = max(amounts, key=lambda element: amounts[element])
+        file, line = origins.get(element, (path, 0))
+        return f"{file}:{line}: <{element.tag}>"
 
     def read(element: Element, attribute: str) -> list[float]:
         try:
@@ -435,22 +443,18 @@ def _count_elements(
         return found
 
     def walk(element: Element, copies: float, is_default: bool) -> None:
-        nonlocal values, keys
-        file, line = origins.get(element, (path, 0))
-        where = f"{file}:{line}: <{element.tag}>"
+        nonlocal values
         tag, own = element.tag, 1.0
         if tag in _GENERATORS:
             own += math.prod(number for key in _GRID_ATTRIBUTES for number in read(element, key))
             own += vertices.get(element, 0.0)
         elif tag == "attach":
             own += models.get(element.get("model", ""), 0.0)
-        elif tag == "replicate":
-            copies *= max(1.0, math.prod(read(element, "count")))
         elif tag == "size":
-            keys += sum(read(element, "nkey"))
+            own += sum(read(element, "nkey"))
             for key in element.attrib:
                 if key.startswith("nuser_"):
-                    sizes[""] = sizes.get("", 0.0) + sum(read(element, key))
+                    user_values[element] = user_values.get(element, 0.0) + sum(read(element, key))
                 elif key == "nuserdata":
                     values += sum(read(element, key))
         stored = [number for key in _SIZE_ATTRIBUTES if key in element.attrib for number in read(element, key)]
@@ -461,13 +465,18 @@ def _count_elements(
             sizes[tag] = max(sizes.get(tag, 0.0), stated)
         tags[tag] += copies * own  # type: ignore[assignment]
         values += copies * stated
-        check_limit(where, "MJCF_ELEMENTS", tags.total() + keys)
-        check_limit(where, "MJCF_VALUES", values)
+        most_elements[element], most_values[element] = copies * own, copies * stated
+        if tag == "replicate":
+            copies *= max(1.0, math.prod(read(element, "count")))
         for child in element:
             walk(child, copies, is_default or tag == "default")
 
     walk(root, 1.0, False)
-    elements = tags.total() + keys
-    values += sum(size * (tags[tag] if tag else elements) for tag, size in sizes.items())
-    check_limit(path, "MJCF_VALUES", values)
+    elements = tags.total() + sum(models.values())
+    check_limit(locate(most_elements), "MJCF_ELEMENTS", elements)
+    values += sum(size * tags[tag] for tag, size in sizes.items())
+    for element, size in user_values.items():
+        most_values[element] += size * elements
+        values += size * elements
+    check_limit(locate(most_values), "MJCF_VALUES", values)
     return elements

@@ -772,7 +772,7 @@ def _read_joint_equalities(path: Path, model: Any, chain: Sequence[int]) -> dict
         return {j for j in range(model.njnt) if _is_ancestor(model, int(model.jnt_bodyid[j]), body)}
 
     def constrained(e: int) -> set[int]:
-        first, second, kind = int(model.eq_obj1id[e]), int(model.eq_obj2id[e]), model.eq_type[e]
+        first, second, kind = int(model.eq_obj1id[e]), int(model.eq_obj2id[e]), mujoco.mjtEq(int(model.eq_type[e]))
         if kind == mujoco.mjtEq.mjEQ_JOINT:
             return {first}
         if kind == mujoco.mjtEq.mjEQ_TENDON:

@@ -306,8 +306,8 @@ MJCF_REFUSALS = {
         None,
         r"links.jib: joint.range_deg is also given in crane.xml",
     ),
-    "not XML": (None, ("<worldbody>", "<worldbody"), r"mjcf: .*crane.xml cannot be read"),
-    "not MJCF": (None, ("<worldbody>", "<worldboddy>"), r"mjcf: .*crane.xml cannot be read"),
+    "not XML": (None, ("<worldbody>", "<worldbody"), r"mjcf: .*crane.xml: is not XML"),
+    "not MJCF": (None, ("<worldbody>", "<worldboddy>"), r"mjcf: .*crane.xml: is not XML"),
     "joint without name": (
         None,
         ('name="jib" range', "range"),
