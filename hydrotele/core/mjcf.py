@@ -261,7 +261,7 @@ class _Reader:
         for element, attribute in references:
             if element.tag == "model":
                 name, document, count = self._read_model(element, path, (*parents, path.resolve()))
-                models |= document.models | {name: document}
+                models |= {**document.models, name: document}
                 element.set("name", element.get("name") or Path(str(element.get("file"))).stem)
                 sizes[element.attrib["name"]] = count
                 element.set("file", name)

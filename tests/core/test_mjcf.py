@@ -48,7 +48,8 @@ def values(amount: str) -> str:
 PIPE = "is not a regular file but a pipe or device"
 REFUSED = {
     "model of itself": (
-        '<asset><model name="s" file="m.xml"/></asset>', {}, "m.xml:1: <model file='m.xml'>: m.xml is a model inside itself"
+        '<asset><model name="s" file="m.xml"/></asset>', {},
+        "m.xml:1: <model file='m.xml'>: m.xml is a model inside itself",
     ),
     "models of each other": (
         MODEL, {"n.xml": '<asset><model name="s" file="m.xml"/></asset>'},
@@ -56,7 +57,8 @@ REFUSED = {
     ),
     "include of itself": (
         '<include file="n.xml"/>', {"n.xml": '<include file="m.xml"/>'},
-        "n.xml:1: <include file='m.xml'>: m.xml is already included; a document can be included once, and not in itself",
+        "n.xml:1: <include file='m.xml'>: m.xml is already included; a document can be included once,"
+        " and not in itself",
     ),
     "pipe as include": ('<include file="pipe"/>', {}, f"m.xml:1: <include file='pipe'>: pipe: {PIPE}"),
     "pipe as model": ('<asset><model file="pipe"/></asset>', {}, f"m.xml:1: <model file='pipe'>: pipe: {PIPE}"),
@@ -125,7 +127,7 @@ def write_nested(folder):
     """Write an MJCF with an include in a subfolder, a nested model and two meshes of one name."""
     (folder / "sub/meshes").mkdir(parents=True)
     (folder / "meshes").mkdir()
-    (folder / "main.xml").write_text(f"""<mujoco><compiler meshdir="meshes"/><include file="sub/assets.xml"/>
+    (folder / "main.xml").write_text("""<mujoco><compiler meshdir="meshes"/><include file="sub/assets.xml"/>
         <worldbody><attach model="s" body="b" prefix="p_"/><geom type="mesh" mesh="leaf"/></worldbody></mujoco>""")
     (folder / "sub/assets.xml").write_text("""<mujoco><asset><mesh file="leaf.stl"/>
         <model name="s" file="n.xml"/></asset><include file="bodies.xml"/></mujoco>""")
