@@ -6,7 +6,7 @@ two links from measured positions. `hybrid` calibrates a serial robot that carri
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -84,7 +84,7 @@ from hydrotele.kinematics.hybrid import (
     refined_model_parameters,
     save_hybrid,
 )
-from hydrotele.kinematics.serial_robot import SerialRobot, correct_urdf, load_robot, robot_to_yaml
+from hydrotele.kinematics.serial_robot import SerialRobot, correct_urdf, expand_joints, load_robot, robot_to_yaml
 from hydrotele.kinematics.wires import NoIntersectionError, wire_lengths
 
 _ROBOT_FILES = ("robot.yaml", "robot.yml", "*.urdf", "*.xml")
@@ -148,6 +148,7 @@ def calibrate_mukca(data: Path, choices: SocketChoices, target: Path | None, as_
     sockets, notes = load_sockets(data, choices.unit == "deg")
     options = SocketOptions(choices.distance or None, choices.accuracy, choices.model)
     robot, said = _find_robot(data, choices.robot, sockets, options)
+    sockets = tuple(replace(one, joints=expand_joints(robot, one.joints)) for one in sockets)
     check_robot(robot, sockets, options)
     notes = [*said, *notes, *_identifiability_notes(robot, sockets, options)]
     left: list[HeldOutPrediction] = []

@@ -369,10 +369,11 @@ def export_machine(name: str, tool: str | None, target: Path | None, picture: Pa
 def _export_joystick(name: str, target: Path | None, picture: Path | None, camera: str) -> None:
     import mujoco
 
-    from hydrotele.simulate.joystick import joystick_spec
+    from hydrotele.simulate.joystick import compile_joystick, joystick_spec
 
-    spec = joystick_spec(load_joystick(name), hand=False)
-    model = spec.compile()
+    facts = load_joystick(name)
+    spec = joystick_spec(facts, hand=False)
+    model = compile_joystick(facts, spec)
     if picture:
         from hydrotele.show.picture import render_model
 

@@ -22,7 +22,8 @@ from hydrotele.core.datafile import (
     validate_data,
 )
 from hydrotele.core.errors import InputError
-from hydrotele.core.files import copy_mjcf, models_folder, read_xml
+from hydrotele.core.files import models_folder
+from hydrotele.core.mjcf import copy_mjcf, load_spec
 from hydrotele.core.units import PSI
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.law import LAWS
@@ -105,8 +106,8 @@ def save_machine(machine: Machine, path: str | Path) -> None:
         machine: the machine.
         path: file to write. A shipped MJCF is referenced relative to the shipped models, so that
             the file works with any installation. A user MJCF is copied to `<stem>.tree.xml`, with
-            meshes, textures and height fields in `<stem>_assets`, unless it includes other
-            documents. User files that define laws of terms are copied as well.
+            meshes, textures and height fields in `<stem>_assets`. User files that define laws of
+            terms are copied as well.
     """
     machine = _with_law_files(machine, Path(path).parent)
     data = machine.model_dump(mode="json", exclude_defaults=True)
@@ -126,10 +127,9 @@ def save_machine(machine: Machine, path: str | Path) -> None:
         copy = Path(path).with_suffix(".tree.xml")
         if mjcf.is_relative_to(shipped):
             data["mjcf"] = str(mjcf.relative_to(shipped))
-        elif copy_mjcf(mjcf, copy, f"{Path(path).stem}_assets"):
-            data["mjcf"] = copy.name
         else:
-            data["mjcf"] = str(mjcf)
+            copy_mjcf(mjcf, copy, f"{Path(path).stem}_assets")
+            data["mjcf"] = copy.name
     Path(path).write_text(yaml.safe_dump(data, sort_keys=False, default_flow_style=None))
 
 
@@ -240,15 +240,9 @@ def _complete_links(data: dict, path: Path, lines) -> None:
         return
     mjcf = path.parent / str(data["mjcf"])
     try:
-        read_xml(mjcf)
+        spec = load_spec(mjcf)
     except InputError as error:
-        message = f"{mjcf} cannot be read: {error.message}"
-        raise InputError(_format_location(path, lines, "mjcf"), message) from None
-    try:
-        spec = mujoco.MjSpec.from_file(str(mjcf))
-    except (OSError, ValueError) as error:
-        message = f"{mjcf} cannot be read: {error}"
-        raise InputError(_format_location(path, lines, "mjcf"), message) from None
+        raise InputError(_format_location(path, lines, "mjcf"), str(error)) from None
     for name, link in _section_entries(data, "links").items():
         body = spec.body(name)
         if body is None or name == "world" or not isinstance(link, dict):

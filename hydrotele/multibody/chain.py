@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from hydrotele.core.errors import InputError
+from hydrotele.core.mjcf import load_model
 
 _FREE, _BALL, _SLIDE, _HINGE = (
     int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "BALL", "SLIDE", "HINGE")
@@ -148,7 +149,7 @@ def load_chain(source: str | Path | mujoco.MjModel) -> Chain:
 
     Source: MuJoCo manual, `mj_kinematics` and `mjData`.
     """
-    model = _read_model(source) if isinstance(source, str | Path) else source
+    model = load_model(source) if isinstance(source, str | Path) else source
     closures = _read_closures(model)
     moved = [
         int(model.actuator_trnid[a, 0])
@@ -212,13 +213,6 @@ def load_chain(source: str | Path | mujoco.MjModel) -> Chain:
         dof_indices=np.array([joint.dof_index for joint in joints], np.int64),
         source=str(source) if isinstance(source, str | Path) else "",
     )
-
-
-def _read_model(path: str | Path) -> mujoco.MjModel:
-    try:
-        return mujoco.MjModel.from_xml_path(str(path))
-    except ValueError as error:
-        raise InputError(str(path), str(error)) from error
 
 
 _AXES = tuple(enumerate("xyz"))

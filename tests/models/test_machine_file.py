@@ -306,8 +306,8 @@ MJCF_REFUSALS = {
         None,
         r"links.jib: joint.range_deg is also given in crane.xml",
     ),
-    "not XML": (None, ("<worldbody>", "<worldbody"), r"mjcf: .*crane.xml cannot be read"),
-    "not MJCF": (None, ("<worldbody>", "<worldboddy>"), r"mjcf: .*crane.xml cannot be read"),
+    "not XML": (None, ("<worldbody>", "<worldbody"), r"mjcf: .*crane.xml: is not XML"),
+    "not MJCF": (None, ("<worldbody>", "<worldboddy>"), r"mjcf: .*crane.xml: is not XML"),
     "joint without name": (
         None,
         ('name="jib" range', "range"),
@@ -438,6 +438,14 @@ def load_or_refuse(path) -> None:
 
 @ANY
 @given(st.text(max_size=200))
+def test_a_chain_of_too_many_links_is_refused(write):
+    data = yaml.safe_load(CRANE)
+    first = next(iter(data["links"]))
+    data["links"] |= {f"q{k}": {"parent": f"q{k - 1}" if k else first, "mass": 1.0} for k in range(1500)}
+    message = refusal(write(yaml.safe_dump(data)))
+    assert f"links: {len(data['links'])} links of a machine, at most 200; HYDROTELE_MAX_LINKS=" in message
+
+
 def test_any_text_is_read_or_refused(write, text):
     """Garbage gives InputError and nothing else."""
     path = write("", name="any.yaml")
