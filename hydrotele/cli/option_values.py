@@ -1,9 +1,9 @@
 """Parse values of command-line options: scenario overrides and lists of numbers."""
 
 from json import dumps as json_text
-from pathlib import Path
 
 from hydrotele.core.errors import InputError
+from hydrotele.core.files import resolve_path
 
 
 def parse_overrides(items: list[str]) -> dict[str, str]:
@@ -31,7 +31,7 @@ def machine_overrides(machine: str | None, tool: str | None) -> dict[str, str]:
     pairs = {}
     if machine is not None:
         named = machine in shipped_machines()
-        pairs["machine"] = json_text(machine if named else str(Path(machine).resolve()))
+        pairs["machine"] = json_text(machine if named else str(resolve_path(machine)))
     if tool is not None:
         pairs["tool"] = json_text(tool)
     return pairs

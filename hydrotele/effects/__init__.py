@@ -38,6 +38,7 @@ from typing import Any
 
 from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
+from hydrotele.core.files import resolve_path
 from hydrotele.effects.effect import Effect, Parameter, term_parameter, with_terms, with_value
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.law import LAWS, DriveState, LawSource, Numbers, Term, Variable, law
@@ -71,7 +72,7 @@ def add_effects_from_file(path: Path, library: dict[str, Effect]) -> tuple[str, 
     if path.suffix != ".py":
         raise InputError(path, "is not a Python file: define custom effects in a .py file")
     if digest not in _loaded_effects:
-        source = str(path.resolve())
+        source = str(resolve_path(path))
         try:
             with LawSource(source):
                 module = _execute_file(path, digest)
@@ -131,8 +132,8 @@ def _add_to_library(library: dict[str, Effect], family: tuple[Any, ...], where: 
 def _export_to_children(path: Path) -> None:
     """Add a file to the environment variable from which child processes load effects."""
     known = os.environ.get(ENVIRONMENT_VARIABLE, "").split(os.pathsep)
-    if str(path.resolve()) not in known:
-        paths = [*filter(None, known), str(path.resolve())]
+    if str(resolve_path(path)) not in known:
+        paths = [*filter(None, known), str(resolve_path(path))]
         os.environ[ENVIRONMENT_VARIABLE] = os.pathsep.join(paths)
 
 
