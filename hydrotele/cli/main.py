@@ -4,6 +4,7 @@ Each function parses its options and calls the module that does the work. Slow i
 the functions, so that `--help` and completion stay fast.
 """
 
+import io
 import os
 import signal
 import sys
@@ -655,6 +656,9 @@ def main() -> None:
         sys.exit(ended[0])  # SystemExit runs the cleanup code
 
     signal.signal(signal.SIGTERM, end)
+    for stream in (sys.stdout, sys.stderr):  # file names may be no valid text
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="backslashreplace")
     warnings.showwarning = lambda message, *_, **__: typer.echo(f"warning {message}", err=True)
     try:
         _run()
@@ -665,15 +669,33 @@ def main() -> None:
 
 def _run() -> None:
     try:
+        _check_arguments(sys.argv[1:])
         app()
-    except (InputError, OSError) as error:
-        if isinstance(error, OSError):  # for example a file name that is too long
-            error = InputError(error.filename or "the system", error.strerror or str(error))
-        typer.secho("error ", fg="red", bold=True, err=True, nl=False)
-        typer.echo(str(error), err=True)
-        sys.exit(2)
-    except RuntimeError as error:
-        if type(error).__name__ != "SimulationFailed":
+    except (Exception, SystemExit) as error:
+        if type(error).__name__ == "SimulationFailed":
+            typer.echo(f"simulation failed: {error}", err=True)
+            sys.exit(3)
+        if not (said := _find_input_error(error)):
             raise
-        typer.echo(f"simulation failed: {error}", err=True)
-        sys.exit(3)
+        typer.secho("error ", fg="red", bold=True, err=True, nl=False)
+        typer.echo(str(said), err=True)
+        sys.exit(2)
+
+
+def _find_input_error(error: BaseException) -> InputError | None:
+    """Return the error in the user's input or files that an exception reports, None for any other."""
+    if isinstance(error, InputError):
+        return error
+    effects = sys.modules.get("hydrotele.effects")
+    if own := effects and effects.describe_user_error(error):
+        return own
+    if isinstance(error, OSError):  # for example a file name that is too long
+        return InputError(error.filename or "the system", error.strerror or str(error))
+    return None
+
+
+def _check_arguments(words: list[str]) -> None:
+    """Raise an error for arguments that are not valid UTF-8; Python keeps their bytes as surrogates."""
+    for word in words:
+        if any("\ud800" <= character <= "\udfff" for character in word):
+            raise InputError(word, "is not valid UTF-8: rename the file or folder")

@@ -105,7 +105,7 @@ def check_output_folder(target: str | Path, kind: str) -> None:
     """
     place = resolve_path(target)
     if not place.exists():
-        above = next(p for p in place.parents if p.exists())
+        above = next(p for p in (place, *place.parents) if os.path.lexists(p))  # a link in a loop exists, too
         if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
             raise InputError(target, f"cannot be created: {above} is not a writable folder")
         return

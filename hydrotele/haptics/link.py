@@ -229,7 +229,9 @@ def answer_pose(line, box, now, two):
     )
     count[RECEIVED] += 1
     if pose[LAST_ACCEPTED] > count[LAST_ACKNOWLEDGED]:
-        line.round_trip_times[count[ROUNDS] % len(line.round_trip_times)] = now - line.sent[pose[LAST_ACCEPTED] % _MAX_SENT_TIMES]
+        line.round_trip_times[count[ROUNDS] % len(line.round_trip_times)] = (
+            now - line.sent[pose[LAST_ACCEPTED] % _MAX_SENT_TIMES]
+        )
         count[ROUNDS] += 1
         count[LAST_ACKNOWLEDGED] = pose[LAST_ACCEPTED]
     _compute_reflection(line, box, now, two, first, period)

@@ -433,7 +433,9 @@ def _decoupled_wrench(numbers, turn, s, wrench):
     for j in range(3):
         inertia[j, j] = numbers.inertia[j] - mass * (square - arm[j] ** 2)
         wanted[j], about[j] = s.push[j] / mass, s.push[3 + j] / numbers.inertia[j]
-    free_flotor_wrench(mass, arm, inertia, numbers.centre_of_mass, wanted, about, turn, s.speed[3:], numbers.gravity, wrench)
+    free_flotor_wrench(
+        mass, arm, inertia, numbers.centre_of_mass, wanted, about, turn, s.speed[3:], numbers.gravity, wrench
+    )
 
 
 @compiled
@@ -458,7 +460,9 @@ def drive_coils(numbers, quaternion, period, s):
     if numbers.kind[3] > 0.0:
         _decoupled_wrench(numbers, turn, s, wrench)
     else:
-        held_flotor_wrench(numbers.mass[0], numbers.centre_of_mass, numbers.handle, s.push, turn, numbers.gravity, wrench)
+        held_flotor_wrench(
+            numbers.mass[0], numbers.centre_of_mass, numbers.handle, s.push, turn, numbers.gravity, wrench
+        )
     largest = numbers.max_current[0]
     for i in range(6):
         s.currents[i] = 0.0
