@@ -89,7 +89,7 @@ class ArmBalance(NamedTuple):
 
 
 _ARRAY_FIELDS = {
-    "mech": ("tree", "shape", "joint", "free", "bound", "gravity", "drive"),
+    "mech": ("tree", "shape", "joint", "independent", "dependent", "gravity", "drive"),
     "model": ("user", "gear", "transmission"),
     "motion": ("frame", "jacobian", "momentum", "bar", "mass", "joint", "basis", "loop", "normal"),
     "space": ("drive", "row"),
@@ -132,15 +132,15 @@ def read_arm_record(r):
     f, c, n, m = r.frames, r.coordinates, r.free, r.joints
     mech = ReducedMechanism(
         int64_view(r.mech_tree, 4 * f).reshape((f, 4)), matrix_view(r.mech_shape, f, r.shape_width),
-        r.links, r.bar_count, matrix_view(r.mech_joint, 2, c), int64_view(r.mech_free, n),
-        int64_view(r.mech_bound, c - n), float64_view(r.mech_gravity, 3),
+        r.links, r.bars, matrix_view(r.mech_joint, 2, c), int64_view(r.mech_independent, n),
+        int64_view(r.mech_dependent, c - n), float64_view(r.mech_gravity, 3),
         int64_view(r.mech_drive, 2 * r.drives).reshape((r.drives, 2)),
     )  # fmt: skip
     motion = ReducedMotion(
         matrix_view(r.motion_frame, f, r.frame_width),
         float64_view(r.motion_jacobian, 6 * f * c).reshape((f, c, 6)),
         float64_view(r.motion_momentum, 6 * f * c).reshape((f, c, 6)),
-        matrix_view(r.motion_bar, r.bar_count, r.bar_width), matrix_view(r.motion_mass, c, c),
+        matrix_view(r.motion_bar, r.bars, r.bar_width), matrix_view(r.motion_mass, c, c),
         matrix_view(r.motion_joint, 4, c), matrix_view(r.motion_basis, c, n),
         matrix_view(r.motion_loop, r.loops, c + 2), matrix_view(r.motion_normal, c - n + 1, c - n),
     )  # fmt: skip

@@ -221,7 +221,7 @@ def measure_structure(seed: int, changes: Changes) -> Sample:
     printed = list_table_1(settings["joint_radius"] * chain.tree.closure_points[:, 1])
     structure = own.base_parameters
     if not settings["declare_symmetry"]:
-        table = replace(own.setup, absent=()).compute_regressor(found)
+        table = replace(own.setup, zero_parameters=()).compute_regressor(found)
         rows = table.matrix.reshape(-1, len(table.names))
         structure = classify_parameters(rows, table.names, table.units, [one.column for one in PUBLISHED_PARAMETERS])
     values |= _compare_with_table_1(structure, printed)

@@ -125,7 +125,9 @@ def separate_setup(setup: RegressorSetup) -> RegressorSetup:
         for one in setup.friction_terms
     )
     inertia = dict.fromkeys((*setup.drive_inertia, *drives))
-    return replace(setup, alike=(), absent=(), offsets={}, rubbing=rubbing, drive_inertia=tuple(inertia))
+    return replace(
+        setup, equal_groups=(), zero_parameters=(), offsets={}, friction_terms=rubbing, drive_inertia=tuple(inertia)
+    )
 
 
 def corrected(record: IdentificationRecord, drives: Sequence[str], errors: Errors):
@@ -620,7 +622,7 @@ class _Builder:
         """
         (facts,) = one.parameters.values()
         least = max(facts.min_relevant_change, _FORM * self.nominal.get(f"coulomb.{one.location}", 0.0))
-        return replace(one, parameters={"stribeck": replace(facts, least=least)})
+        return replace(one, parameters={"stribeck": replace(facts, min_relevant_change=least)})
 
     def spring(self, drive: str) -> MechanismEffect | None:
         force, length, _, _ = self.units(drive)

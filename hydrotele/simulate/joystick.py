@@ -255,11 +255,11 @@ def _simulate_period(r, currents):
     for i in range(6):
         ctrl[i] = currents[i]
     hot = heat_step(heat, currents, r.continuous_current, r.thermal_time, r.period)
-    r.max_heat = max(r.max_heat, hot)
+    r.hottest = max(r.hottest, hot)
     if hot >= 1.0:
-        r.current_limit = min(r.max_current, r.continuous_current)
+        r.allowed = min(r.max_current, r.continuous_current)
     elif hot < _COOLED_HEAT:
-        r.current_limit = r.max_current
+        r.allowed = r.max_current
     if not r.leaps:
         for _ in range(r.steps):
             call_step(r.mj_step, r.model, r.data)

@@ -355,13 +355,13 @@ def step_teleoperation(station, flotor, tick, tripped):
     s, m = unpack_slave_state(machine.state, r.joints), unpack_master_state(operator.state)
     force, n, nu = unpack_neuromuscular_state(operator.muscles).force, r.ticks, r.axes
     if r.simulated:
-        unpack_master(operator.master).max_current[0] = flotor[0].current_limit
+        unpack_master(operator.master).max_current[0] = flotor[0].allowed
         if r.swing < 0:
             flotor_step(flotor[0], m.currents, force)
         else:
             spin, spin_rate = (
-                float64_view(r.qvel, r.dof_indices)[r.swing],
-                float64_view(r.qacc, r.dof_indices)[r.swing],
+                float64_view(r.qvel, r.dofs)[r.swing],
+                float64_view(r.qacc, r.dofs)[r.swing],
             )
             flotor_step_in_cab(flotor[0], m.currents, force, spin, spin_rate)
     copy_values(matrix_view(r.log_master, n, r.master_state_size)[tick], operator.state)

@@ -19,7 +19,7 @@ FOLDER = models_folder() / "palida"
 
 def test_merged_columns_give_the_same_forces():
     own = load_mechanism(FOLDER / "palida.xml", FOLDER / "columns.yaml").setup
-    whole = replace(own, alike=(), absent=())
+    whole = replace(own, equal_groups=(), zero_parameters=())
     rng = np.random.default_rng(0)
     pose = np.array([0, 0, 0.55, 0, 0, 0]) + 0.05 * rng.normal(size=(5, 6))
     found = project_on_drives(own.chain, own.given_joints, pose, rng.normal(size=(5, 6)), rng.normal(size=(5, 6)))
