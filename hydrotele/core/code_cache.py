@@ -38,7 +38,7 @@ def _note_once(kind: str, text: str) -> None:
     """Log a warning, once for each kind in a process."""
     if kind not in _notes:
         _notes.add(kind)
-        _LOG.warning("warning %s", text)
+        _LOG.warning(text)
 
 
 def file_stem(function) -> str:

@@ -144,7 +144,7 @@ def test_damaged_cache_files_are_compiled_again_with_one_line_of_notice(cached_m
     assert answers == ["2.0", "2.0", "4.0", "0", "0"]
     (note,) = notes
     assert re.fullmatch(
-        "warning damaged compiled code is compiled again: "
+        "damaged compiled code is compiled again: "
         rf"{files[0].parent}/(law|twice)-\d+\.\w+\.code: its checksum is wrong", note,
     )  # fmt: skip
     content = [file.read_bytes() for file in files]
@@ -166,7 +166,7 @@ def test_a_full_disk_keeps_compiled_code_in_memory(cached_module):
     for file in files:
         file.unlink()
     where = f"{files[0].parent} cannot be written, No space left on device"
-    note = f"warning compiled functions are kept in memory only: {where}"
+    note = f"compiled functions are kept in memory only: {where}"
     assert run(FULL_DISK) == (["2.0", "2.0", "4.0", "0", "0"], [note])
 
 
@@ -175,7 +175,7 @@ def test_an_unusable_cache_folder_keeps_compiled_code_in_memory(cached_module, t
     shutil.rmtree(tmp_path / "hydrotele/compiled")
     (tmp_path / "hydrotele/compiled").write_text("")  # a file where the folder has to be
     why = "no cache folder is writable by you alone; set XDG_CACHE_HOME to such a folder"
-    note = f"warning compiled functions are kept in memory only: {why}"
+    note = f"compiled functions are kept in memory only: {why}"
     assert run() == (["2.0", "2.0", "4.0", "0", "0"], [note])
 
 
