@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from hydrotele.core.errors import InputError
-from hydrotele.core.files import read_text
+from hydrotele.core.files import read_text, resolve_path
 from hydrotele.kinematics.serial_robot import (
     SerialRobot,
     correct_robot,
@@ -79,7 +79,7 @@ def load_sockets(folder: str | Path, degrees: bool = False) -> tuple[tuple[Socke
     for path in paths:
         found = _FILE_PATTERN.fullmatch(path.name)
         assert found is not None
-        place = path.parent.resolve().name
+        place = resolve_path(path.parent).name
         joints, lines = _read_joints(path)
         if degrees:
             joints = np.radians(joints)

@@ -27,6 +27,7 @@ from hydrotele.cli.console import (
 )
 from hydrotele.cli.opening import find_machine, name_of_data
 from hydrotele.core.errors import InputError
+from hydrotele.core.files import resolve_path
 from hydrotele.core.output import atomic_file, atomic_folder, check_output_folder
 from hydrotele.identify.estimation import Estimator
 from hydrotele.identify.excitation import MachineLimits, design_motion, select_informative_base
@@ -362,7 +363,7 @@ def design_excitation_file(
     name = re.sub(r"[^a-z0-9_]", "_", target.stem.lower()).lstrip("_0123456789") or "excitation"
     if target.suffix.lower() != ".yaml" or not target.parent.is_dir():
         raise InputError(target, "must be a .yaml file in an existing folder")
-    place = machine if machine in shipped_machines() else str(Path(machine).resolve())
+    place = machine if machine in shipped_machines() else str(resolve_path(machine))
     setup = machine_setup(model, load_closed_chain(model))
     noise = np.maximum(compute_force_noise(model, named), 1e-9)
     base = select_informative_base(model, setup, noise, period, seed)

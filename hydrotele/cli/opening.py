@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from hydrotele.core.errors import InputError
+from hydrotele.core.files import resolve_path
 from hydrotele.logs.files import command_ranges
 from hydrotele.logs.log import Log, find_log_file, load_log
 from hydrotele.machine.machine import Machine
@@ -60,7 +61,7 @@ def open_log(
 
 def name_of_data(data: Sequence[Path]) -> str:
     """Return the name of the data folder, or of the folder that contains the first file."""
-    first = data[0].resolve()
+    first = resolve_path(data[0])
     return first.name if first.is_dir() else first.parent.name or first.stem
 
 

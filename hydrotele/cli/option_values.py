@@ -5,13 +5,13 @@ import functools
 import inspect
 from collections.abc import Callable
 from json import dumps as json_text
-from pathlib import Path
 from typing import Annotated, Any, get_args
 
 import typer
 from rich.markup import escape
 
 from hydrotele.core.errors import InputError
+from hydrotele.core.files import resolve_path
 
 
 def parse_overrides(items: list[str]) -> dict[str, str]:
@@ -39,7 +39,7 @@ def machine_overrides(machine: str | None, tool: str | None) -> dict[str, str]:
     pairs = {}
     if machine is not None:
         named = machine in shipped_machines()
-        pairs["machine"] = json_text(machine if named else str(Path(machine).resolve()))
+        pairs["machine"] = json_text(machine if named else str(resolve_path(machine)))
     if tool is not None:
         pairs["tool"] = json_text(tool)
     return pairs

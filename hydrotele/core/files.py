@@ -206,6 +206,20 @@ def read_json(path: str | Path) -> Any:
         raise InputError(path, f"is not valid JSON: {error}") from None
 
 
+def resolve_path(path: str | Path) -> Path:
+    """Return the absolute path without symbolic links; a link in a loop is kept.
+
+    `Path.resolve` raises a RuntimeError for such a link. Here the next access to the file fails, with
+    an OSError that says why.
+
+    Raises:
+        InputError: the path contains a null character.
+    """
+    if "\0" in str(path):
+        raise InputError(path, "is not a valid file name")
+    return Path(os.path.realpath(path))
+
+
 def _find_data_folder(name: str) -> Path:
     """Return a data folder inside the installed package, or next to the package in a checkout."""
     package = Path(__file__).resolve().parent.parent

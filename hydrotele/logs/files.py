@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from hydrotele.core.errors import InputError
+from hydrotele.core.files import resolve_path
 from hydrotele.logs.log import MEASURED_STEM, CommandRange, Log, find_log_in_folder, load_log
 from hydrotele.machine.machine import Machine
 
@@ -88,12 +89,12 @@ def _find_logs(path: Path) -> list[tuple[str, Path]]:
     if not path.exists():
         raise InputError(path, "does not exist: give log files or a folder with logs")
     if path.is_file():
-        return [(path.stem if path.stem != MEASURED_STEM else path.resolve().parent.name, path)]
+        return [(path.stem if path.stem != MEASURED_STEM else resolve_path(path).parent.name, path)]
     if not path.is_dir():
         raise InputError(path, "is neither a file nor a folder: give log files or a folder")
     seen = sorted(p for p in path.iterdir() if not p.name.startswith("."))
     if record := find_log_in_folder(path):
-        return [(path.resolve().name, record)]
+        return [(resolve_path(path).name, record)]
     files = [(p.stem, p) for p in seen if p.is_file() and p.suffix.lower() in _KINDS]
     if not files:
         files = [(p.name, f) for p in seen if p.is_dir() and (f := find_log_in_folder(p))]

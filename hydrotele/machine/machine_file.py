@@ -22,7 +22,7 @@ from hydrotele.core.datafile import (
     validate_data,
 )
 from hydrotele.core.errors import InputError
-from hydrotele.core.files import models_folder
+from hydrotele.core.files import models_folder, resolve_path
 from hydrotele.core.mjcf import copy_mjcf, load_spec
 from hydrotele.core.units import PSI
 from hydrotele.machine.machine import Machine
@@ -87,11 +87,11 @@ def load_machine(name_or_path: str | Path, tool: str | None = None) -> Machine:
             f"no tool {tool!r}; {suggest_valid_name(tool, tools)}",
         )
     lines = _merge_tool(data, tool, tools[tool] or {}, path, lines)
-    data |= {"tool": tool, "tools": sorted(tools), "folder": str(path.parent.resolve())}
+    data |= {"tool": tool, "tools": sorted(tools), "folder": str(resolve_path(path.parent))}
     others += [fragment for name, fragment in tools.items() if name != tool and fragment]
     kept = _body_names([data])
     if data.get("resolved") and not (path.parent / str(data.get("mjcf"))).exists():
-        data["folder"] = str(models_folder().resolve())
+        data["folder"] = str(resolve_path(models_folder()))
     elif not data.get("resolved"):
         data["removed_bodies"] = [name for name in _body_names(others) if name not in kept]
     _complete_links(data, path, lines)
@@ -115,15 +115,15 @@ def save_machine(machine: Machine, path: str | Path) -> None:
     for key in ("folder", "tools"):
         data.pop(key, None)
     data |= {"tool": tool, "tools": {tool: {}}, "resolved": True}
-    shipped = models_folder().resolve()
-    attached = {b: Path(machine.folder, f).resolve() for b, f in machine.attached.items()}
+    shipped = resolve_path(models_folder())
+    attached = {b: resolve_path(Path(machine.folder, f)) for b, f in machine.attached.items()}
     if attached:
         data["attached"] = {
             body: str(file.relative_to(shipped) if file.is_relative_to(shipped) else file)
             for body, file in attached.items()
         }
     if machine.mjcf:
-        mjcf = Path(machine.folder, machine.mjcf).resolve()
+        mjcf = resolve_path(Path(machine.folder, machine.mjcf))
         copy = Path(path).with_suffix(".tree.xml")
         if mjcf.is_relative_to(shipped):
             data["mjcf"] = str(mjcf.relative_to(shipped))
