@@ -461,7 +461,7 @@ def _minimize_with_scipy(search: _ScaledProblem, begin: _SearchState, max_steps:
     base, problem = begin.x, search.problem
     found = scipy.optimize.least_squares(
         lambda u: search.weighted_residual(search.all_parameters(base, u)), np.zeros(len(search.free)),
-        jac=lambda u: search.weighted_jacobian(problem.jacobian(search.all_parameters(base, u))),
+        jac=lambda u: search.weighted_jacobian(problem.jacobian(search.all_parameters(base, u))),  # type: ignore
         method="lm", ftol=1e-14, xtol=1e-12, gtol=1e-14, max_nfev=10 * max_steps,
     )  # fmt: skip
     good = found.status > 0

@@ -149,7 +149,7 @@ def cross_validation_error(
     # Each fold is compressed to its triangular factor. Normal equations would square the condition
     # number, which is large for frames far from the robot.
     scaled = np.column_stack([matrix * (sizes.std / sizes.noise), right_hand_side / sizes.noise])
-    factors = [np.linalg.qr(scaled[folds == fold], mode="r") for fold in np.unique(folds)]
+    factors = [np.linalg.qr(scaled[folds == fold])[1] for fold in np.unique(folds)]
     prior = np.eye(scaled.shape[1])[:-1]
     stated, of = prior[:0], np.empty(0)
     if known is not None:
