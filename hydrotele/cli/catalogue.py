@@ -49,7 +49,7 @@ def list_items(item_kind: str | None, as_json: bool) -> None:
 
 
 _MAX_SUMMARY_LINES = 30  # a summary fits a terminal window
-_MIN_TEXT_WIDTH = 30  # characters beside the names; a narrower text starts below its name
+_MIN_TEXT_WIDTH = 30  # characters next to the names; a narrower text starts below its name
 
 
 def format_summary(names: dict[str, list[str]], width: int) -> str:

@@ -30,7 +30,7 @@ from hydrotele.simulate.native import stop_profiling_clock
 
 
 class ReviewOutputs(NamedTuple):
-    """Files and views that `hydrotele review` makes; None for those that are not wanted.
+    """Files and views that `hydrotele review` makes; None for those that are not requested.
 
     Attributes:
         recording: rerun recording.

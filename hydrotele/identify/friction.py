@@ -1,6 +1,6 @@
 """Friction near zero speed: deviations from the friction law, drives at rest, and the friction force by speed.
 
-`adapt_friction_terms` adds parameters for what a friction law near zero speed may lack. Without them an error of the
+`adapt_friction_terms` adds parameters for the error of a friction law near zero speed. Without them an error of the
 law there, such as that of a smooth or elastic contact, biases the friction at all speeds. `compute_friction_forces`
 evaluates the identified friction at round speeds, with its standard deviation.
 """

@@ -119,11 +119,11 @@ def compare_with_given_forces(forces: HeldOutForces, heldout: dict[str, HeldOutE
     return tuple(notes)
 
 
-def find_implausible_parameters(told: Identifiability, table: Regressor, found: Estimate) -> tuple[str, ...]:
+def find_implausible_parameters(identifiability: Identifiability, table: Regressor, found: Estimate) -> tuple[str, ...]:
     """Find masses, moments of inertia and friction that are negative with 95 % confidence.
 
     Args:
-        told: base parameters.
+        identifiability: base parameters.
         table: names, units and nominal values of the parameters.
         found: estimate of the base parameters.
 
@@ -132,15 +132,15 @@ def find_implausible_parameters(told: Identifiability, table: Regressor, found: 
         effect on its sign are such parameters with positive factors.
     """
     notes = []
-    for k, b in enumerate(told.base):
-        members = np.flatnonzero(told.combination[k])
+    for k, b in enumerate(identifiability.base):
+        members = np.flatnonzero(identifiability.combination[k])
         kinds = {table.names[m].partition(".")[0] for m in members}
         own, place = table.names[b].partition(".")[::2]
         is_friction = own in FRICTION_TERMS
         if own not in _POSITIVE_PARAMETERS or found.value[k] + _SIGNIFICANT_STD * found.std[k] >= 0.0:
             continue
-        given = float(told.combination[k] @ table.nominal)
-        positive = kinds <= set(_POSITIVE_PARAMETERS) and (told.combination[k, members] > 0.0).all()
+        given = float(identifiability.combination[k] @ table.nominal)
+        positive = kinds <= set(_POSITIVE_PARAMETERS) and (identifiability.combination[k, members] > 0.0).all()
         if positive or (is_friction and given >= 0.0):
             notes.append(
                 f"{own}.{place} is negative, {found.value[k]:.3g} +- {_SIGNIFICANT_STD * found.std[k]:.2g}"

@@ -8,7 +8,7 @@ Robots are read from YAML, URDF or MJCF, and written with corrections. A YAML fi
 direction of gravity and the joint corrections, which URDF cannot express.
 
 A joint can follow another one, as `mimic` of a URDF states: q_i = multiplier q_j + offset. The
-parallel linkage of a palletiser is an example. Such a joint needs no reading of its own.
+parallel linkage of a palletiser is an example. Such a joint needs no separate reading.
 """
 
 import math
@@ -771,7 +771,7 @@ def _read_joint_equalities(path: Path, model: Any, chain: Sequence[int]) -> dict
     def moved_by(body: int) -> set[int]:
         return {j for j in range(model.njnt) if _is_ancestor(model, int(model.jnt_bodyid[j]), body)}
 
-    def constrained(e: int) -> set[int]:
+    def constrained_joints(e: int) -> set[int]:
         first, second, kind = int(model.eq_obj1id[e]), int(model.eq_obj2id[e]), mujoco.mjtEq(int(model.eq_type[e]))
         if kind == mujoco.mjtEq.mjEQ_JOINT:
             return {first}
@@ -786,7 +786,7 @@ def _read_joint_equalities(path: Path, model: Any, chain: Sequence[int]) -> dict
 
     mimics: dict[int, Mimic] = {}
     for e in range(model.neq):
-        concerned = constrained(e) & set(chain)
+        concerned = constrained_joints(e) & set(chain)
         if not model.eq_active0[e] or not concerned:
             continue
         first, second, values = int(model.eq_obj1id[e]), int(model.eq_obj2id[e]), model.eq_data[e]
