@@ -577,6 +577,7 @@ def test_stroke_must_span_the_range_of_the_joint(write):
 def test_a_chain_of_too_many_links_is_refused(write):
     data = yaml.safe_load(CRANE)
     first = next(iter(data["links"]))
-    data["links"] |= {f"q{k}": {"parent": f"q{k - 1}" if k else first, "mass": 1.0} for k in range(1500)}
+    body = {"mass": 1.0, "com": [0.0, 0.0, 0.0], "inertia": [0.1, 0.1, 0.1]}
+    data["links"] |= {f"q{k}": body | {"parent": f"q{k - 1}" if k else first} for k in range(1500)}
     message = refusal(write(yaml.safe_dump(data)))
     assert f"links: {len(data['links'])} links of a machine, at most 200; HYDROTELE_MAX_LINKS=" in message
