@@ -12,8 +12,8 @@ from rich.markup import escape
 from hydrotele.cli.console import make_table, print_json, print_notes, stderr_console, stdout_console
 from hydrotele.core.datafile import read_yaml, suggest_valid_name
 from hydrotele.core.errors import InputError
-from hydrotele.machine.joystick import JOYSTICK_FILE, load_joystick, shipped_joysticks
 from hydrotele.logs.log import LOG_SUFFIXES, MEASURED_STEM, find_logs
+from hydrotele.machine.joystick import JOYSTICK_FILE, load_joystick, shipped_joysticks
 from hydrotele.machine.machine_file import MACHINE_FILE, load_machine, machine_path, shipped_machines
 from hydrotele.simulate.mechanism import Mjcf
 
@@ -157,13 +157,13 @@ class LogMachine(NamedTuple):
     force: bool = False
 
 
-def validate_files(paths: list[Path], as_json: bool, log_machine: LogMachine = LogMachine()) -> None:
+def validate_files(paths: list[Path], as_json: bool, log_machine: LogMachine | None = None) -> None:
     """Check machines with all their tools, joysticks, scenarios, sweeps and logs.
 
     Args:
         paths: files, folders or shipped names to check.
         as_json: print JSON instead of text.
-        log_machine: machine of the logs.
+        log_machine: machine of the logs, None to find it by the logs.
 
     Raises:
         InputError: a file is not valid; it is raised after all files were checked.
@@ -173,7 +173,7 @@ def validate_files(paths: list[Path], as_json: bool, log_machine: LogMachine = L
     for path in paths:
         try:
             notes: list[str] = []
-            kind, said = _validate_file(path, log_machine, notes)
+            kind, said = _validate_file(path, log_machine or LogMachine(), notes)
             entry = {"file": str(path), "kind": kind, "valid": True, "contents": said}
             checked.append(entry | ({"notes": notes} if kind == "log" else {}))
             if not as_json:

@@ -265,7 +265,7 @@ app.command("identify-operator", epilog=IDENTIFY_OPERATOR_EPILOG)(identify_opera
 
 @app.command(epilog="Example:  hydrotele replay measured/fit_1.parquet --machine cat215 --out overlay")
 def replay(
-    logs: Annotated[list[Path], typer.Argument(help="Log files (.parquet, .csv) or run folders.")],
+    logs: Annotated[list[Path], typer.Argument(help="Log files (.parquet, .csv), folders of them, run folders.")],
     machine: MachineOption = None,
     tool: ToolOption = None,
     timestep: Annotated[float, typer.Option(help="Simulation time step [s].")] = 1.0e-3,
@@ -279,11 +279,12 @@ def replay(
     ] = None,
     effects: EffectFilesOption = None,
     json: JsonOption = False,
+    force: ForceOption = False,
 ) -> None:
     """Simulate the model with the commands of a log; print the prediction errors."""
     from hydrotele.cli.reviewing import replay_logs
 
-    replay_logs(logs, machine, tool, timestep, out, json)
+    replay_logs(logs, machine, tool, timestep, out, json, force)
 
 
 @app.command(
@@ -493,7 +494,7 @@ def analyse_teleop(
 
 @app.command(epilog="Examples:  hydrotele review runs/zhu_up   |   hydrotele review a.parquet b.parquet")
 def review(
-    log: Annotated[Path, typer.Argument(help="Run folder or log file.")],
+    log: Annotated[Path, typer.Argument(help="Log file, run folder, folder of gap, or recording (.rrd).")],
     log2: Annotated[Path | None, typer.Argument(help="Second log with the same time base, for comparison.")] = None,
     machine: MachineOption = None,
     tool: ToolOption = None,
@@ -505,12 +506,16 @@ def review(
         typer.Option("--screenshot", help="Write a PNG of the viewer without opening a window."),
     ] = None,
     plot: Annotated[Path | None, typer.Option("--plot", help="Write a PNG of all channels instead.")] = None,
+    force: ForceOption = False,
     effects: EffectFilesOption = None,
 ) -> None:
-    """Show a run in the rerun viewer: 3D machine, joints, pressures, flows and forces."""
+    """Show a run in the rerun viewer: 3D machine, joints, pressures, flows and forces.
+
+    A folder with a recording, as that of run or gap, is shown by this recording.
+    """
     from hydrotele.cli.reviewing import review_logs
 
-    review_logs(log, log2, machine, tool, out, serve, port, screenshot, plot)
+    review_logs(log, log2, machine, tool, out, serve, port, screenshot, plot, force)
 
 
 @app.command("list", epilog="Example:  hydrotele list scenarios --json")
@@ -530,14 +535,21 @@ def list_(
 
 @app.command(epilog="Example:  hydrotele validate my_machine/machine.yaml")
 def validate(
-    files: Annotated[list[Path], typer.Argument(help="Machines, joysticks, scenarios, sweeps or logs.")],
+    files: Annotated[list[Path], typer.Argument(help="Machines, joysticks, scenarios, sweeps, logs, folders of logs.")],
+    machine: MachineOption = None,
+    tool: ToolOption = None,
+    force: ForceOption = False,
     effects: EffectFilesOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Check a machine, joystick, scenario, sweep or log; report errors with file and line."""
-    from hydrotele.cli.catalogue import validate_files
+    """Check a machine, joystick, scenario, sweep or log; report errors with file and line.
 
-    validate_files(files, json)
+    Logs are checked as by gap, with the column names and ranges of --machine. Default: the machine
+    next to the log, or that of its metadata.
+    """
+    from hydrotele.cli.catalogue import LogMachine, validate_files
+
+    validate_files(files, json, LogMachine(machine, tool, force))
 
 
 @app.command(epilog="Example:  hydrotele export cat215 --tool bucket --out scene.xml")

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
 from hydrotele.logs.dataset import MergedRuns, merge_runs
 from hydrotele.logs.files import RunFiles, read_runs

@@ -360,7 +360,7 @@ def load_log(
 
 def _apply_aliases(table: Table, aliases: Mapping[str, str]) -> Table:
     """Rename columns, convert signs, state units and skip columns."""
-    for product, channel in aliases.items():
+    for product in aliases:
         factors = product.split(" * ")
         if len(factors) == 2 and set(factors) <= set(table.names):
             a, b = (table.values[table.names.index(name)] for name in factors)

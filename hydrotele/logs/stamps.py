@@ -13,7 +13,8 @@ from hydrotele.logs.table import Table
 
 CUT_SECONDS = 2.0  # [s] pause placed at a cut; twice the 1 s at which runs are split
 _MAX_START_SECONDS = 1.0e6  # [s] 11 days: later stamps are calendar time, steps longer than it a set clock
-_MIN_SORTED_STEP = 0.75  # of a step: rows out of order have mean steps of 1 when sorted, two moments of 0.5
+_MIN_SORTED_STEP = 0.75  # of a step: sorting gives new steps of 1 for rows out of order, 0.5 to 0.67 for a set clock
+_MAX_SORTED_STEP = 2.0  # of a step: longer ones join parts of the file that are in order each
 _MAX_STEP = 1.0  # [s] longer than any sample period of a hydraulic machine
 _MAX_DISCARDED_FRACTION = 0.5  # of the readings: more rows per stamp mean that the stamps are too coarse
 
@@ -72,9 +73,10 @@ def _sort_rows(table: Table) -> tuple[Table, tuple[str, ...]]:
         return table, ()
     order = np.argsort(time, kind="stable")
     moved = order != np.arange(len(time))
-    beside = moved[1:] | moved[:-1]
     period = float(np.median(np.abs(step[step != 0.0])))
-    if np.diff(time[order])[beside].mean() < _MIN_SORTED_STEP * period:
+    new_steps = np.diff(time[order])[np.diff(order) != 1]  # between rows that were no neighbours
+    fitting = np.where(new_steps <= _MAX_SORTED_STEP * period, np.minimum(new_steps, period), 0.0)
+    if fitting.mean() < _MIN_SORTED_STEP * period:
         return table, ()
     first = int(np.flatnonzero(step < 0.0)[0]) + 1
     note = f"{table.location('time', first)}: {moved.sum()} rows are not in the order of time; they were sorted."

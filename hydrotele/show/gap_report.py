@@ -85,7 +85,8 @@ def write_report(gap: Gap, path: str | Path) -> None:
         ranking=_ranking(gap), unlisted=len(gap.ranking) - _MAX_RANKED_EFFECTS, tests=_tests(gap),
         proof_words=_VALIDATION_TEXTS[mechanism].format(gap.before[0].run if gap.before else ""),
         commands=_COMMANDS[mechanism], open_loop=_open_loop(gap),
-        noise=_noise(gap), rivals=_alternative_rows(gap), experiment=_experiment(gap), notes=gap.notes, unused=gap.unused_channels,
+        noise=_noise(gap), rivals=_alternative_rows(gap), experiment=_experiment(gap), notes=gap.notes,
+        unused=gap.unused_channels,
         version=hydrotele.__version__, seconds=f"{gap.seconds:.0f}",
     )  # fmt: skip
 
