@@ -516,14 +516,14 @@ def _list_unused_channels(data: _CleaningData, before: Mapping[str, RunRows]) ->
     reasons: dict[tuple[str, str], list[str]] = {}
     for column, channel in enumerate(data.channels):
         for run, rows in data.runs.items():
-            if np.isfinite(rows.reading[:, column]).any():
+            logged = int((~np.isnan(before[run].reading[:, column])).sum())
+            if not logged or np.isfinite(rows.reading[:, column]).any():
                 continue
-            logged = np.isfinite(before[run].reading[:, column]).sum() + np.isinf(before[run].reading[:, column]).sum()
             counts = data.removed.get((channel, run), {})
             listed = ", ".join(
                 f"{100 * count / logged:.0f} % of its readings are {why}" for why, count in counts.items()
             )
-            reasons.setdefault((channel, listed or "it has no reading"), []).append(run)
+            reasons.setdefault((channel, listed), []).append(run)
     return tuple(
         f"{channel} is not used{'' if len(runs) == len(data.runs) else ' in ' + ', '.join(runs)}: {reason}."
         for (channel, reason), runs in reasons.items()

@@ -132,6 +132,16 @@ def note_unknown_columns(files: Sequence[RunFiles], machine: Machine) -> list[st
     return notes
 
 
+def note_empty_columns(files: Sequence[RunFiles], channels: Sequence[str]) -> list[str]:
+    """Return notes on channels whose columns have no reading."""
+    notes = []
+    for channel in channels:
+        empty = [r.name for r in files for log in r.logs if channel in log and np.isnan(log[channel]).all()]
+        if empty:
+            notes.append(f"{channel} is not used in {', '.join(empty)}: its column is empty.")
+    return notes
+
+
 def note_averaged_commands(files: Sequence[RunFiles]) -> list[str]:
     """Return a note on runs whose commands are means."""
     averaged = [r.name for r in files if r.logs[0].metadata.get("command", "held") != "held"]
@@ -519,7 +529,7 @@ def make_dataset(
     merged = merge_runs(files, machine, masks)
     runs, short = _remove_short_runs(merged)
     mended, more, unused = remove_faults(machine, known, axes, channels, noise, runs)
-    unused = (*note_unknown_columns(files, machine), *unused)
+    unused = (*note_unknown_columns(files, machine), *note_empty_columns(files, channels), *unused)
     notes += [*note_averaged_commands(files), *merged.notes, *short, *more, *unused]
     notes += note_runs_without_motion(mended, channels, noise)
     kept = np.array([any(np.isfinite(rows.reading[:, column]).any() for rows in mended.values())

@@ -298,7 +298,7 @@ def test_a_channel_that_is_dropped_is_listed_with_the_reason(tmp_path):
     data = load_dataset(tmp_path, machine)
     assert data.channels == ("position.slide",)
     assert data.unused_channels == (
+        "pressure_rod.slide is not used in a, b: its column is empty.",
         "pressure_head.slide is not used: 100 % of its readings are at the limit of the sensor, which the machine file"
         " states as its span.",
-        "pressure_rod.slide is not used: it has no reading.",
     )

@@ -570,7 +570,7 @@ def test_degrees_that_are_stated_as_radians_are_seen_by_the_joint_range(tmp_path
 
 def test_missing_command_teaches(tmp_path):
     write(tmp_path, {"a": changed(made_up(1), command_boom=None), "b": made_up(2)})
-    with pytest.raises(InputError, match=r"a\.parquet: needs the column command\.boom.*with 0"):
+    with pytest.raises(InputError, match=r"a\.parquet: needs the column command\.boom.*use 0 in all rows"):
         load_dataset(tmp_path, CAT)
 
 
