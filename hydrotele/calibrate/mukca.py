@@ -591,7 +591,7 @@ def _final_fit(problem: _SocketProblem, state: _FitState) -> ParameterFit:
     told = classify_scaled_parameters(
         fit.jacobian[:, order], [problem.names[k] for k in order], scales[order], sigma=sigma
     )
-    return replace(fit, told=told, scales=scales)
+    return replace(fit, identifiability=told, scales=scales)
 
 
 def _representative_rank(name: str) -> int:

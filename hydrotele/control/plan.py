@@ -174,7 +174,7 @@ def _plan_teleoperation(plan: Plan, machine: Machine, pilot: TeleopPilot) -> Pla
         plan.command[plan.time >= button.at, column] = button.command
         closed[column] = False
     pose = np.zeros((len(plan.time), max(4, len(arm_axes(machine)))))
-    return dataclasses.replace(plan, closed=closed, pose=pose)
+    return dataclasses.replace(plan, closed_loop=closed, pose=pose)
 
 
 def _find_column(axes: tuple[str, ...], name: str, where: str) -> int:
@@ -199,7 +199,7 @@ def _plan_table(plan: Plan, pilot: TablePilot) -> Plan:
             plan.reference[:, column] = wanted
             if pilot.interpolate == "linear":
                 plan.rate[:, column] = np.gradient(wanted, plan.time)
-    return dataclasses.replace(plan, closed=closed | (pilot.of == "joint"))
+    return dataclasses.replace(plan, closed_loop=closed | (pilot.of == "joint"))
 
 
 def _plan_fourier(plan: Plan, pilot: FourierPilot) -> Plan:
@@ -221,7 +221,7 @@ def _plan_fourier(plan: Plan, pilot: FourierPilot) -> Plan:
     closed = np.ones(len(plan.axes), bool)
     for name in pilot.closed_valves:
         closed[_find_column(plan.axes, name, "pilot.closed_valves")] = False
-    return dataclasses.replace(plan, closed=closed)
+    return dataclasses.replace(plan, closed_loop=closed)
 
 
 def quintic_step(time: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray]:
@@ -275,7 +275,7 @@ def _plan_lines(plan: Plan, machine: Machine, pilot: LinesPilot) -> Plan:
         seconds = blocked * (plan.time[1] - plan.time[0])
         notes += (f"resolved motion was held at the edge of the workspace for {seconds:.3g} s",)
     closed = np.ones(len(plan.axes), bool)
-    return dataclasses.replace(plan, closed=closed, pose=pose, notes=notes)
+    return dataclasses.replace(plan, closed_loop=closed, pose=pose, notes=notes)
 
 
 def _rate_commands(time: np.ndarray, pilot: LinesPilot) -> np.ndarray:
@@ -328,7 +328,7 @@ def _plan_waypoints(plan: Plan, machine: Machine, pilot: WaypointsPilot) -> Plan
         begin += point.pause
         here = target
     notes = note_early_end(plan.time, begin)
-    return dataclasses.replace(plan, closed=np.ones(len(plan.axes), bool), notes=notes)
+    return dataclasses.replace(plan, closed_loop=np.ones(len(plan.axes), bool), notes=notes)
 
 
 def _waypoint_joints(machine, axes, current: dict, point: Waypoint, where: str) -> dict[str, float]:

@@ -248,21 +248,21 @@ def servo_step(parameters, closed, drive, reference, measured, load, computed, o
         if parameters[i, 0] == _FORCE_DRIVE:
             if closed[i]:
                 force = rate_gain * (gain * error + velocity[i] - rate[i])
-                if computed.known:
+                if computed.is_computed:
                     force += computed.force[i]
                 limit = parameters[i, 6]
                 out[i] = min(limit, max(-limit, force / parameters[i, 7]))
             continue
         area_head, area_rod = parameters[i, 1], parameters[i, 2]
         force = area_head * head[i] - area_rod * rod[i]
-        model = computed.force[i] if computed.known else 0.0
+        model = computed.force[i] if computed.is_computed else 0.0
         load[i] += parameters[i, 11] * (force - model - load[i])
         if not closed[i]:
             continue
         stiffness = parameters[i, 12] * (area_head**2 / volume_head[i] + area_rod**2 / volume_rod[i])
         wanted = velocity[i] + gain * arm[i] * error
         wanted -= parameters[i, 13] * (force - model - load[i]) / stiffness
-        if computed.known:
+        if computed.is_computed:
             wanted += computed.rate[i] / stiffness
         opening = compute_valve_opening(
             wanted, head[i], rod[i], supply, parameters[i, 5], area_head, area_rod, volume_head[i],

@@ -185,8 +185,8 @@ def step_planned_run(simulated, planned, tick, steps, stopped):
     drives, forces = run.drives, run.forces
     drive = DriveReference(drives.velocity[tick], drives.arm[tick], drives.volume_head[tick], drives.volume_rod[tick])
     reference = TickReference(
-        run.reference[tick - tick % run.feedback.every], drive,
-        ComputedForce(forces.known, forces.force[tick], forces.rate[tick]), stopped,
+        run.reference[tick - tick % run.feedback.ticks_per_sample], drive,
+        ComputedForce(forces.is_computed, forces.force[tick], forces.rate[tick]), stopped,
     )  # fmt: skip
     measured = MeasuredState(readings.joint, readings.rate, readings.head, readings.rod, readings.supply[0])
     control_tick(sim, tick, steps, controller, reference, measured)

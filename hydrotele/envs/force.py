@@ -92,7 +92,7 @@ def begin_force(f, e, w):
 
     Source: this module.
     """
-    g = e.reference
+    g = e.goal
     g[_FIRST_FORCE] = draw_uniform_between(e, MIN_FORCE, MAX_FORCE)
     # uniform over all forces that differ from the first by at least _CHANGE
     below = max(0.0, g[_FIRST_FORCE] - _MIN_FORCE_CHANGE - MIN_FORCE)
@@ -107,10 +107,10 @@ def begin_force(f, e, w):
 @compiled
 def _sample_force(f, e, w):
     """Update the true force, and sample the load cell if a sensor sample is due."""
-    e.reference[_TRUE_FORCE] = plate_force(f, w)
+    e.goal[_TRUE_FORCE] = plate_force(f, w)
     if e.tick % f.every == 0:
         error = draw_uniform_between(e, -MAX_CELL_ERROR, MAX_CELL_ERROR) if f.noisy else 0.0
-        e.reference[MEASURED_FORCE] = e.reference[_TRUE_FORCE] + error
+        e.goal[MEASURED_FORCE] = e.goal[_TRUE_FORCE] + error
 
 
 @compiled
@@ -128,7 +128,7 @@ def update_force(f, e, w):
     Source: this module.
     """
     _sample_force(f, e, w)
-    e.reference[_PEAK_FORCE] = max(e.reference[_PEAK_FORCE], e.reference[_TRUE_FORCE])
+    e.goal[_PEAK_FORCE] = max(e.goal[_PEAK_FORCE], e.goal[_TRUE_FORCE])
 
 
 @compiled
@@ -164,8 +164,8 @@ def observe_force(f, e, out, at):
 
     Source: `force_fields`.
     """
-    out[at] = e.reference[MEASURED_FORCE]
-    out[at + 1], out[at + 2] = reference_force(e.reference, e.tick * f.period)
+    out[at] = e.goal[MEASURED_FORCE]
+    out[at + 1], out[at + 2] = reference_force(e.goal, e.tick * f.period)
 
 
 @compiled
@@ -183,7 +183,7 @@ def reward_force(f, e, w):
 
     Source: this module.
     """
-    g, n = e.reference, f.parameters
+    g, n = e.goal, f.parameters
     wanted = reference_force(g, e.tick * f.period)[0]
     overload = g[_PEAK_FORCE] > OVERLOAD_FORCE
     aside = math.fabs(e.tip[0] - n[CENTRE_X]) > n[HALF_X]

@@ -346,7 +346,7 @@ def begin_grade(f, e, w):
 
     Source: this module.
     """
-    g = e.reference
+    g = e.goal
     soils = int(f.parameters[len(f.parameters) - 1])
     soil = int(draw_uniform(e) * soils)
     g[SOIL_INDEX] = soil
@@ -392,7 +392,7 @@ def observe_grade(f, e, w, out, at):
 
     Source: `grade_fields`; the position of the edge follows from the measured joint angles.
     """
-    g, surface = e.reference, surface_view(w)
+    g, surface = e.goal, surface_view(w)
     pose = np.empty(MAX_ARM_AXES)
     task_forward(f.arm, e.joint[: f.arm_axes], pose)
     scan, scales = (MAX_SCANNER_ERROR, MAX_MASS_ERROR) if f.noisy else (0.0, 0.0)
@@ -423,7 +423,7 @@ def reward_grade(f, e, w):
 
     Source: this module.
     """
-    g, out = e.reference, result_view(w)
+    g, out = e.goal, result_view(w)
     dt = f.ticks * f.period
     error = profile_error(g, surface_view(w), FIRST_CELL, END_CELL)[1]
     reward = (g[LAST_ERROR] - error) / ERROR_PER_REWARD - TIME_COST * dt

@@ -93,7 +93,7 @@ def begin_line(f, e):
 
     Source: this module.
     """
-    g, start, change = e.reference, np.zeros(MAX_ARM_AXES), np.zeros(MAX_ARM_AXES)
+    g, start, change = e.goal, np.zeros(MAX_ARM_AXES), np.zeros(MAX_ARM_AXES)
     task_forward(f.arm, e.position[: f.arm_axes], start)
     for c in range(4):
         g[_START + c] = start[c]
@@ -218,16 +218,16 @@ def observe_line(f, e, out, at):
         np.empty(MAX_ARM_AXES),
         np.empty(MAX_ARM_AXES),
     )
-    compute_line_pose(e.reference, now, pose, rate)
+    compute_line_pose(e.goal, now, pose, rate)
     measure_pose(f, e, tip)
     for c in range(4):
         out[at + _POSE_COLUMN + c] = pose[c]
     for c in range(3):
         out[at + _RATE_COLUMN + c] = rate[c]
-    along, across = line_errors(e.reference, pose, tip[_R], tip[_THETA], tip[_Z])
+    along, across = line_errors(e.goal, pose, tip[_R], tip[_THETA], tip[_Z])
     out[at + _ALONG_COLUMN], out[at + _CROSS_COLUMN] = along, across
     for p in range(len(PREVIEW_TIMES)):
-        compute_line_pose(e.reference, now + PREVIEW_TIMES[p], pose, rate)
+        compute_line_pose(e.goal, now + PREVIEW_TIMES[p], pose, rate)
         for c in range(3):
             out[at + _PREVIEW_COLUMN + 3 * p + c] = pose[c]
 
@@ -255,9 +255,9 @@ def reward_line(f, e, w):
     Source: `reward_from_errors`.
     """
     pose, rate = np.empty(MAX_ARM_AXES), np.empty(MAX_ARM_AXES)
-    compute_line_pose(e.reference, e.tick * f.period, pose, rate)
+    compute_line_pose(e.goal, e.tick * f.period, pose, rate)
     r, theta = math.hypot(e.tip[0], e.tip[1]), math.atan2(e.tip[1], e.tip[0])
-    along, across = line_errors(e.reference, pose, r, theta, e.tip[2])
+    along, across = line_errors(e.goal, pose, r, theta, e.tip[2])
     attitude = e.position[1] + e.position[2] + e.position[3] - pose[_ATTITUDE]
     w.measures[0], w.measures[1], w.measures[2] = across, along, attitude
     return reward_from_errors(across, along, attitude), False

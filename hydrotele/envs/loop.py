@@ -83,12 +83,12 @@ def _integrate_joint_rates(f, e, action, first):
         i = f.driven_axis[a]
         goal = _clip_action(f, action, a) * f.fastest[i]
         rate = _limit_change(e.reference_rate[i], goal, f.acceleration * f.period)
-        place = e.reference[i] + f.period * rate
+        place = e.goal[i] + f.period * rate
         low = max(f.ranges[i, 0], e.joint[i] - _MAX_REFERENCE_LEAD)
         high = min(f.ranges[i, 1], e.joint[i] + _MAX_REFERENCE_LEAD)
         if place < low or place > high:
-            place, rate = min(high, max(low, e.reference[i])), 0.0
-        e.reference[i], e.reference_rate[i] = place, rate
+            place, rate = min(high, max(low, e.goal[i])), 0.0
+        e.goal[i], e.reference_rate[i] = place, rate
 
 
 @compiled
@@ -103,19 +103,19 @@ def _integrate_pose_rates(f, e, action):
         wanted[c] = e.pose[c] + f.period * e.pose_rate[c]
     far = False
     for i in range(k):
-        far = far or abs(e.reference[i] - e.joint[i]) > _MAX_REFERENCE_LEAD
+        far = far or abs(e.goal[i] - e.joint[i]) > _MAX_REFERENCE_LEAD
     held = far or follow_pose(
-        f.arm, f.ranges[:k], wanted, e.pose_rate, False, e.pose, e.reference[:k],
+        f.arm, f.ranges[:k], wanted, e.pose_rate, False, e.pose, e.goal[:k],
         e.reference_rate[:k],
     )  # fmt: skip
-    e.is_blocked = 1 if held else 0
+    e.blocked = 1 if held else 0
     if held:
         e.pose_rate[:] = 0.0
         e.reference_rate[:k] = 0.0
     if far:  # the arm is blocked by an obstacle: continue from its measured position
         for i in range(k):
-            e.reference[i] = _limit_change(e.joint[i], e.reference[i], _MAX_REFERENCE_LEAD)
-        task_forward(f.arm, e.reference[:k], e.pose)
+            e.goal[i] = _limit_change(e.joint[i], e.goal[i], _MAX_REFERENCE_LEAD)
+        task_forward(f.arm, e.goal[:k], e.pose)
 
 
 @compiled
@@ -146,7 +146,7 @@ def apply_action(f, e, action):
     k = f.axes
     table = float64_view(f.table, k * TABLE_POINTS * 3).reshape((k, TABLE_POINTS, 3))
     interpolate_drive_reference(
-        f.grid[:k], table, e.reference[:k], e.reference_rate[:k], f.feedforward, e.drive[0, :k],
+        f.grid[:k], table, e.goal[:k], e.reference_rate[:k], f.feedforward, e.drive[0, :k],
         e.drive[1, :k], e.drive[2, :k], e.drive[3, :k],
     )  # fmt: skip
 
@@ -174,8 +174,8 @@ def update_sensors(f, e, sim):
     true_sensor_values(sim, values)
     for i in range(k):
         e.position[i] = values[i]
-        e.sampled_reference[i] = e.reference[i]
-    apply_sensor_delays(sim.past, e.tick * f.substeps, values)
+        e.sampled_reference[i] = e.goal[i]
+    apply_sensor_delays(sim.sensor_history, e.tick * f.substeps, values)
     for i in range(c):
         e.error[i] = f.accuracy[i] * (2.0 * draw_uniform(e) - 1.0) if f.noisy else 0.0
     sensors = SensorParameters(
@@ -202,19 +202,19 @@ _SIGNATURE = types.void(types.int64, types.int64, types.intc, types.int64)
 @compiled
 def _make_simulation(f, e, w):
     """Return the simulation record of an episode for `simulate.stepping`."""
-    ring = float64_view(f.commands + 8 * w.number * f.delayed_command * MAX_AXES, f.delayed_command * MAX_AXES).reshape(
+    ring = float64_view(f.commands + 8 * w.index * f.delayed_command * MAX_AXES, f.delayed_command * MAX_AXES).reshape(
         (f.delayed_command, MAX_AXES)
     )
     delays = float64_view(f.delays + 8 * e.variant * MAX_AXES * 2, MAX_AXES * 2).reshape((MAX_AXES, 2))
     c = f.axes + 2 * f.hydraulic + (1 if f.hydraulic > 0 else 0)
     sensed = float64_view(
-        f.by_readings + 8 * w.number * f.delayed_sensor * MAX_CHANNELS,
+        f.sensed + 8 * w.index * f.delayed_sensor * MAX_CHANNELS,
         f.delayed_sensor * MAX_CHANNELS,
     ).reshape((f.delayed_sensor, MAX_CHANNELS))
     lags = float64_view(f.lags + 8 * e.variant * MAX_CHANNELS * 2, MAX_CHANNELS * 2).reshape((MAX_CHANNELS, 2))
     past = SensorHistory(
-        sensed, float64_view(f.sensed_before + 8 * w.number * MAX_CHANNELS, c), lags,
-        float64_view(f.lag_ratios + 8 * e.variant * MAX_CHANNELS, MAX_CHANNELS),
+        sensed, float64_view(f.sensed_before + 8 * w.index * MAX_CHANNELS, c), lags,
+        float64_view(f.ratios + 8 * e.variant * MAX_CHANNELS, MAX_CHANNELS),
     )  # fmt: skip
     none = f.qpos[:0]
     user = float64_view(f.users + 8 * e.variant * f.axes * SLOT_COUNT, f.axes * SLOT_COUNT)
@@ -261,11 +261,11 @@ def _begin_episode(f, e, w):
     for n in range(f.fields):
         size = places[3 * n + 2]
         given = float64_view(places[3 * n] + 8 * e.variant * size, size)
-        taken = float64_view(places[3 * n + 1] + 8 * w.number * size, size)
+        taken = float64_view(places[3 * n + 1] + 8 * w.index * size, size)
         for c in range(size):
             taken[c] = given[c]
     e.episode += 1
-    e.step, e.tick, e.over, e.fault, e.is_blocked = 0, 0, 0, 0, 0
+    e.step, e.tick, e.over, e.fault, e.blocked = 0, 0, 0, 0, 0
     e.command[:] = 0.0
     for i in range(f.axes):
         e.command[i] = w.ctrl[i]
@@ -276,9 +276,9 @@ def _begin_episode(f, e, w):
     e.reference_rate[:], e.pose_rate[:] = 0.0, 0.0
     update_sensors(f, e, sim)
     for i in range(len(e.joint)):
-        e.reference[i] = e.sampled_reference[i] = e.joint[i]
+        e.goal[i] = e.sampled_reference[i] = e.joint[i]
     if f.arm_axes > 0:
-        task_forward(f.arm, e.reference[: f.arm_axes], e.pose)
+        task_forward(f.arm, e.goal[: f.arm_axes], e.pose)
     for i in range(f.hydraulic):
         e.load[i] = f.servo[i, 1] * e.head[i] - f.servo[i, 2] * e.rod[i]
     w.measures[:] = 0.0
@@ -289,11 +289,11 @@ def _begin_episode(f, e, w):
 def _write_observation(f, e, w, address):
     """Write the observation, clipped to its bounds."""
     n = f.observations
-    out = carray(address_to_pointer(address + 4 * w.number * n), (n,), np.float32)
+    out = carray(address_to_pointer(address + 4 * w.index * n), (n,), np.float32)
     low = carray(address_to_pointer(f.low), (n,), np.float32)
     high = carray(address_to_pointer(f.high), (n,), np.float32)
     at = observe_machine(f, e, out)
-    call_task(f, w, OBSERVE, address + 4 * (w.number * n + at))
+    call_task(f, w, OBSERVE, address + 4 * (w.index * n + at))
     for c in range(n):
         if not low[c] <= out[c] <= high[c]:
             e.saturated += 1

@@ -141,9 +141,9 @@ def measure_free_joints(f, e, w):
         if f.noisy:
             value += f.accuracy[0] * (2.0 * draw_uniform(e) - 1.0)
             value = quantise_reading(value, f.converters[0, 0], f.converters[1, 0], f.converters[2, 0])
-        past = e.reference[MEASURED_START + j]
-        e.reference[MEASURED_START + 2 + j] = (value - past) / (f.every * f.period) if e.tick > 0 else 0.0
-        e.reference[MEASURED_START + j] = value
+        past = e.goal[MEASURED_START + j]
+        e.goal[MEASURED_START + 2 + j] = (value - past) / (f.every * f.period) if e.tick > 0 else 0.0
+        e.goal[MEASURED_START + j] = value
 
 
 @compiled
@@ -278,7 +278,7 @@ def begin_place(f, e, w):
 
     Source: this module.
     """
-    g, pose, at = e.reference, np.empty(MAX_ARM_AXES), int(f.parameters[LOG_QPOS])
+    g, pose, at = e.goal, np.empty(MAX_ARM_AXES), int(f.parameters[LOG_QPOS])
     task_forward(f.arm, e.position[: f.arm_axes], pose)
     radius, theta = (
         draw_uniform_between(e, _GOAL_RADII[0], _GOAL_RADII[1]),
@@ -360,7 +360,7 @@ def observe_place(f, e, w, out, at):
 
     Source: `place_fields`.
     """
-    g = e.reference
+    g = e.goal
     x, y, z, sine, cosine, _ = log_pose(f, w)
     out[at], out[at + 1], out[at + 2] = math.hypot(x, y), math.atan2(y, x), z
     out[at + 3], out[at + 4] = sine, cosine
@@ -386,7 +386,7 @@ def reward_place(f, e, w):
 
     Source: this module.
     """
-    g, held = e.reference, is_held(f, w)
+    g, held = e.goal, is_held(f, w)
     x, y, z, sine, cosine, slope = log_pose(f, w)
     height = z - f.parameters[LOG_RADIUS]
     distance = math.sqrt((x - g[_X]) ** 2 + (y - g[_Y]) ** 2 + height**2)

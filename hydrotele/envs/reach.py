@@ -75,7 +75,7 @@ def begin_reach(f, e):
 
     Source: this module.
     """
-    g, start, change = e.reference, np.empty(MAX_ARM_AXES), np.empty(MAX_ARM_AXES)
+    g, start, change = e.goal, np.empty(MAX_ARM_AXES), np.empty(MAX_ARM_AXES)
     task_forward(f.arm, e.position[: f.arm_axes], start)
     size = 1.0
     for n in range(_MAX_DRAWS):
@@ -126,7 +126,7 @@ def remaining_distance(distance, angle):
 @compiled
 def _true_errors(f, e):
     attitude = e.position[1] + e.position[2] + e.position[3]
-    target = e.reference[_TARGET : _TARGET + MAX_ARM_AXES]
+    target = e.goal[_TARGET : _TARGET + MAX_ARM_AXES]
     return reach_errors(target, e.tip[0], e.tip[1], e.tip[2], attitude, e.position[4])
 
 
@@ -148,11 +148,11 @@ def observe_reach(f, e, out, at):
     tip = np.empty(MAX_ARM_AXES)
     measure_pose(f, e, tip)
     for c in range(MAX_ARM_AXES):
-        out[at + c] = e.reference[_TARGET + c]
+        out[at + c] = e.goal[_TARGET + c]
     x, y = tip[0] * math.cos(tip[1]), tip[0] * math.sin(tip[1])
-    target = e.reference[_TARGET : _TARGET + MAX_ARM_AXES]
+    target = e.goal[_TARGET : _TARGET + MAX_ARM_AXES]
     out[at + MAX_ARM_AXES] = reach_errors(target, x, y, tip[2], tip[3], tip[4])[0]
-    out[at + MAX_ARM_AXES + 1] = e.reference[_TIME_HELD]
+    out[at + MAX_ARM_AXES + 1] = e.goal[_TIME_HELD]
 
 
 @compiled
@@ -170,7 +170,7 @@ def reward_reach(f, e, w):
 
     Source: this module.
     """
-    g = e.reference
+    g = e.goal
     distance, angle = _true_errors(f, e)
     left = remaining_distance(distance, angle)
     reward = REWARD_PER_METRE * (g[_REMAINING_DISTANCE] - left) - STEP_COST

@@ -68,11 +68,11 @@ def begin_track(f, e):
 
     Source: this module.
     """
-    g = e.reference
+    g = e.goal
     g[_FREQUENCY] = 2.0 * math.pi / draw_uniform_between(e, _MIN_PERIOD, _MAX_PERIOD)
     for a in range(f.axes_driven):
         i = f.driven_axis[a]
-        g[_BASE + i] = e.reference[i]
+        g[_BASE + i] = e.goal[i]
         fastest = draw_uniform_between(e, _MIN_RATE_FRACTION, _MAX_RATE_FRACTION) * f.fastest[i]
         total, rate = 0.0, 0.0
         for h in range(_HARMONIC_COUNT):
@@ -141,9 +141,9 @@ def observe_track(f, e, out, at):
     now, n = e.tick * f.period, f.axes_driven
     for a in range(n):
         i = f.driven_axis[a]
-        out[at + a], out[at + n + a] = track_reference(e.reference, i, now)
+        out[at + a], out[at + n + a] = track_reference(e.goal, i, now)
         for p in range(len(PREVIEW_TIMES)):
-            out[at + (2 + p) * n + a] = track_reference(e.reference, i, now + PREVIEW_TIMES[p])[0]
+            out[at + (2 + p) * n + a] = track_reference(e.goal, i, now + PREVIEW_TIMES[p])[0]
 
 
 @compiled
@@ -163,7 +163,7 @@ def reward_track(f, e, w):
     now = e.tick * f.period
     q, pose = np.empty(f.arm_axes), np.empty(MAX_ARM_AXES)
     for i in range(f.arm_axes):
-        q[i] = track_reference(e.reference, i, now)[0]
+        q[i] = track_reference(e.goal, i, now)[0]
     task_forward(f.arm, q, pose)
     x, y = pose[0] * math.cos(pose[1]), pose[0] * math.sin(pose[1])
     square = (e.tip[0] - x) ** 2 + (e.tip[1] - y) ** 2 + (e.tip[2] - pose[2]) ** 2

@@ -159,7 +159,7 @@ def call_task(f, w, part, out):
 
     Source: this module.
     """
-    return _call_address(f.task, part, w.model, w.data, w.number, w.parameters_address, out)
+    return _call_address(f.task, part, w.model, w.data, w.index, w.parameters_address, out)
 
 
 @compiled

@@ -137,7 +137,7 @@ def _turns(machine: Machine, axis: str) -> bool:
 @compiled
 def _drive_responses(model, sp, states, position, response):
     """Drive positions (n, nu), and accelerations per unit drive force (n, nu, rates)."""
-    n, t = len(model.mech.free), len(model.transmission)
+    n, t = len(model.mech.independent), len(model.transmission)
     column = np.zeros(n + t)
     for row in range(len(states)):
         place(model, sp, states[row])
@@ -446,9 +446,9 @@ class Gains(NamedTuple):
 @allocation_free
 def _slopes(model, sp, z, nudge, slope, moved):
     """Slopes of the readings in a state that was just read."""
-    first = 2 * (len(model.mech.free) + len(model.transmission))
+    first = 2 * (len(model.mech.independent) + len(model.transmission))
     slope[:] = 0.0
-    n = len(model.mech.free)
+    n = len(model.mech.independent)
     for c in range(len(model.kind)):
         i = model.drive[c]
         if model.kind[c] == 0:
@@ -710,7 +710,7 @@ def filter_run(model, sp, late, z, covariance, rows, variances, lines, inputs, o
 @allocation_free
 def _correct(model, sp, z, own, delta):
     """Add a correction to a state; drives that it does not know follow their loads."""
-    n, t = len(model.mech.free), len(model.transmission)
+    n, t = len(model.mech.independent), len(model.transmission)
     if len(own) == len(z):
         for s in range(len(z)):
             z[s] += delta[s]
@@ -739,7 +739,7 @@ def _correct(model, sp, z, own, delta):
 @allocation_free
 def _bound_memory(model, z):
     """Keep bristles within their breakaway force, and a pump between no flow and all of it."""
-    act = z[2 * (len(model.mech.free) + len(model.transmission)) :]
+    act = z[2 * (len(model.mech.independent) + len(model.transmission)) :]
     for i in range(len(model.gear)):
         u = i * SLOT_COUNT
         if model.user[u + _BRISTLE_STIFFNESS] > 0.0:

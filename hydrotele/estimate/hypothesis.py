@@ -305,7 +305,9 @@ def _states(machine: Machine, kind: str) -> bool:
 
 def _narrow(p: Parameter, scale: float, widest: float = _WIDEST) -> Parameter:
     low, high = p.nominal - widest * scale, p.nominal + widest * scale
-    return replace(p, low=max(p.lower_bound, low), high=min(p.upper_bound, high), scale=scale, starts=())
+    return replace(
+        p, lower_bound=max(p.lower_bound, low), upper_bound=min(p.upper_bound, high), prior_std=scale, start_values=()
+    )
 
 
 def _of_effects(machine: Machine) -> list[Number]:
@@ -377,7 +379,7 @@ def _of_facts(machine: Machine) -> list[Number]:
             continue
         p = Parameter(unit, value, 0.2 * value, 5.0 * value, share * abs(value), 0.0)
         if value < 0.0:
-            p = replace(p, low=5.0 * value, high=0.2 * value)
+            p = replace(p, lower_bound=5.0 * value, upper_bound=0.2 * value)
         p = _narrow(p, p.prior_std, _PLAIN)
         found.append(Number(f"{kind}.{place}", share, p, None, partial(_set, path)))
     return found

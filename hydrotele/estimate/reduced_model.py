@@ -250,7 +250,7 @@ def set_activations(model, sp, z):
 
     Source: `laws.pressure_with_air`.
     """
-    first = 2 * (len(model.mech.free) + len(model.transmission))
+    first = 2 * (len(model.mech.independent) + len(model.transmission))
     for k in range(len(sp.act)):
         sp.act[k] = z[first + k]
     for i in range(model.hydraulic):
@@ -273,7 +273,7 @@ def store_activations(model, sp, z):
 
     Source: `laws.pressure_without_air`.
     """
-    first = 2 * (len(model.mech.free) + len(model.transmission))
+    first = 2 * (len(model.mech.independent) + len(model.transmission))
     for k in range(len(sp.act)):
         z[first + k] = sp.act[k]
     for i in range(model.hydraulic):
@@ -445,20 +445,20 @@ def place_mechanism(model, sp, z):
     Source: kinematics of the closed chains.
     """
     mech, m = model.mech, sp.motion
-    n, t, nt = len(mech.free), len(model.transmission), m.joint.shape[1]
+    n, t, nt = len(mech.independent), len(model.transmission), m.joint.shape[1]
     for f in range(n):
-        m.joint[RATE, mech.free[f]] = z[n + t + f]
+        m.joint[RATE, mech.independent[f]] = z[n + t + f]
     if nt > n:
         close_loops(mech, m, z)
     else:
         for f in range(n):
             m.joint[Q, f] = z[f]
-        compute_link_frames(mech.tree, mech.shape, mech.links, m.joint, m.frame, m.jacobian)
-    compute_link_motion(mech.tree, mech.links, m.joint, m.frame, m.jacobian)
+        compute_link_frames(mech.tree, mech.shape, mech.link_count, m.joint, m.frame, m.jacobian)
+    compute_link_motion(mech.tree, mech.link_count, m.joint, m.frame, m.jacobian)
     if nt > n:
         compute_drift(mech, m)
-    compute_bar_frames(mech.tree, mech.shape, 1 + mech.links, m.frame, m.jacobian, m.bar)
-    compute_bar_motion(mech.tree, 1 + mech.links, m.frame, m.bar)
+    compute_bar_frames(mech.tree, mech.shape, 1 + mech.link_count, m.frame, m.jacobian, m.bar)
+    compute_bar_motion(mech.tree, 1 + mech.link_count, m.frame, m.bar)
     for i in range(len(model.gear)):
         bar, joint = mech.drive[i, BAR], mech.drive[i, JOINT]
         for f in range(n):
@@ -484,7 +484,7 @@ def load_position(model, sp, i):
     mech, bar = model.mech, model.mech.drive[i, BAR]
     if bar < 0:
         return sp.motion.joint[Q, mech.drive[i, JOINT]]
-    return sp.motion.bar[bar, BAR_LENGTH] - mech.shape[1 + mech.links + 2 * bar, CLOSED_LENGTH]
+    return sp.motion.bar[bar, BAR_LENGTH] - mech.shape[1 + mech.link_count + 2 * bar, CLOSED_LENGTH]
 
 
 @allocation_free
@@ -507,7 +507,7 @@ def accelerate(model, sp, z, dt):
     Source: linearly implicit midpoint rule.
     """
     mech, m, user = model.mech, sp.motion, model.user
-    n, t, half = len(mech.free), len(model.transmission), 0.5 * dt
+    n, t, half = len(mech.independent), len(model.transmission), 0.5 * dt
     compute_mass_and_bias(mech, m)
     _project(mech.joint, m.mass, m.joint, m.basis, half, n, sp.mass, sp.force)
     first = n + t  # of the rates
@@ -567,7 +567,7 @@ def accelerate(model, sp, z, dt):
 @allocation_free
 def _drive_velocity(model, sp, z, i):
     """Velocity of a drive, its own where it has a transmission, scalar [m/s] or [rad/s]."""
-    n, first = len(model.mech.free), len(model.mech.free) + len(model.transmission)
+    n, first = len(model.mech.independent), len(model.mech.independent) + len(model.transmission)
     if model.gear[i] >= 0:
         return z[first + n + model.gear[i]]
     v = 0.0
@@ -582,7 +582,7 @@ def _inertia(model, sp, i):
     if model.gear[i] >= 0:
         return model.transmission[model.gear[i], GEAR_INERTIA]
     least = math.inf
-    for f in range(len(model.mech.free)):
+    for f in range(len(model.mech.independent)):
         lever = sp.row[i, f]
         if lever != 0.0:
             least = min(least, sp.mass[f, f] / (lever * lever))
@@ -677,7 +677,7 @@ def advance(model, sp, z, command, row, period, steps, trail):
 
     Source: velocity Verlet; circuit: `hydraulics.circuit.step_circuit`.
     """
-    total = len(model.mech.free) + len(model.transmission)
+    total = len(model.mech.independent) + len(model.transmission)
     nu, count, h = len(model.gear), model.hydraulic, period / steps
     act, drive, given = sp.act, sp.drive, COMMAND
     sp.time[0] = sp.time[1] + row * period

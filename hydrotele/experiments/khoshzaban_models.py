@@ -83,7 +83,7 @@ def make_document_setup(
     rubbing = [FrictionTerm(joint, {"coulomb": 0.0}) for joint in chain.drives]
     if model == "complete":
         rubbing += passive_friction_terms(chain)
-    return replace(setup, rubbing=tuple(rubbing))
+    return replace(setup, friction_terms=tuple(rubbing))
 
 
 def make_regressor(setup: RegressorSetup, motion: Motion) -> Regressor:

@@ -108,7 +108,7 @@ def measure_prediction(seed: int, changes: Changes) -> Sample:
     for model in ("complete", "reduced"):
         setup = machine_setup(machine, chain, model)
         if not settings["friction_identified"]:
-            setup = replace(setup, rubbing=())
+            setup = replace(setup, friction_terms=())
         found = fit_runs(fit, setup, Processing(), Estimator())
         predicted[model] = predict_forces(setup, np.stack(judged), found.expand_parameters())
         base = find_base(model)
@@ -186,7 +186,7 @@ def _add_model_errors(setup: RegressorSetup, mass_error: float, rng: np.random.G
     inertia *= rng.uniform(1.0 - mass_error, 1.0 + mass_error, (len(inertia), 1))
     inertia[:, 1:4] *= rng.uniform(1.0 - mass_error, 1.0 + mass_error, (len(inertia), 1))
     rubbing = tuple(replace(r, nominal=dict.fromkeys(r.nominal, 0.0)) for r in setup.friction_terms)
-    return replace(setup, chain=replace(setup.chain, inertia=inertia), rubbing=rubbing)
+    return replace(setup, chain=replace(setup.chain, inertia=inertia), friction_terms=rubbing)
 
 
 def _find_plant_parameters(base: BaseParameters, swing_friction: float) -> np.ndarray:

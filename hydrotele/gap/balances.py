@@ -91,7 +91,7 @@ def load_forces(model, space, motion):
     Source: virtual work on the closed chains.
     """
     mech, m = model.mech, space.motion
-    rows, free, drives = len(motion), len(mech.free), len(model.gear)
+    rows, free, drives = len(motion), len(mech.independent), len(model.gear)
     total = free + len(model.transmission)
     z, load = np.zeros(2 * total + 4 * model.hydraulic), np.zeros(free)
     forces = np.empty((rows, drives))

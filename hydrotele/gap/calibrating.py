@@ -575,10 +575,10 @@ def widened(guess: Guess, calibration: bool = False) -> Guess:
             if (hypothesis.name == CALIBRATION) != calibration:
                 continue
             if values[key] >= p.upper_bound:
-                table[key] = replace(p, high=p.nominal + _ROOM * (p.upper_bound - p.nominal))
+                table[key] = replace(p, upper_bound=p.nominal + _ROOM * (p.upper_bound - p.nominal))
             elif values[key] <= p.lower_bound and p.lower_bound != 0.0:
                 low = p.lower_bound / _ROOM if p.lower_bound > 0.0 else p.nominal - _ROOM * (p.nominal - p.lower_bound)
-                table[key] = replace(p, low=low)
+                table[key] = replace(p, lower_bound=low)
         if table != hypothesis.parameters:
             hypothesis = replace(hypothesis, parameters=table)
         parts.append((hypothesis, deviation))

@@ -124,7 +124,7 @@ def input_of(balance: str, axis: str) -> Input:
 @compiled
 def _drives_of(model, sp, states, position, velocity, act, supply):
     """Positions, velocities (n, nu), activations (n, 4 h) and supply (n,) along states (n, nz)."""
-    n, t = len(model.mech.free), len(model.transmission)
+    n, t = len(model.mech.independent), len(model.transmission)
     for row in range(len(states)):
         place(model, sp, states[row])
         for i in range(len(model.gear)):

@@ -620,7 +620,7 @@ class _Builder:
         """
         (facts,) = one.parameters.values()
         least = max(facts.min_relevant_change, _FORM * self.nominal.get(f"coulomb.{one.location}", 0.0))
-        return replace(one, parameters={"stribeck": replace(facts, least=least)})
+        return replace(one, parameters={"stribeck": replace(facts, min_relevant_change=least)})
 
     def spring(self, drive: str) -> MechanismEffect | None:
         force, length, _, _ = self.units(drive)

@@ -232,7 +232,7 @@ def timed(candidates: Sequence[Hypothesis], base: Judged) -> list[Hypothesis]:
         columns = zip(("size", "start", "duration"), zip(*spans, strict=True), strict=True)
         for key, values in columns:
             nominal = table[key].nominal if key == "size" else values[0]
-            table[key] = replace(table[key], nominal=nominal, starts=values)
+            table[key] = replace(table[key], nominal=nominal, start_values=values)
         found.append(replace(candidate, parameters=table))
     return found
 

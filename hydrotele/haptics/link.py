@@ -229,7 +229,9 @@ def answer_pose(line, box, now, two):
     )
     count[RECEIVED] += 1
     if pose[LAST_ACCEPTED] > count[LAST_ACKNOWLEDGED]:
-        line.rounds[count[ROUNDS] % len(line.rounds)] = now - line.sent[pose[LAST_ACCEPTED] % _MAX_SENT_TIMES]
+        line.round_trip_times[count[ROUNDS] % len(line.round_trip_times)] = (
+            now - line.sent[pose[LAST_ACCEPTED] % _MAX_SENT_TIMES]
+        )
         count[ROUNDS] += 1
         count[LAST_ACKNOWLEDGED] = pose[LAST_ACCEPTED]
     _compute_reflection(line, box, now, two, first, period)
@@ -282,7 +284,7 @@ def _compute_reflection(line, box, now, two, first, period):
     able = np.isfinite(box.handle[0])
     line.ramp[FORCE_GAIN] = min(1.0, line.ramp[FORCE_GAIN] + period / FORCE_RAMP_TIME) if alive and able else 0.0
     fresh = share if age < REFLECTION_TIMEOUT else 0.0
-    step_master(unpack_master(box.numbers), box.handle[:7], packet, fresh, period, first, state)
+    step_master(unpack_master(box.parameters), box.handle[:7], packet, fresh, period, first, state)
 
 
 @compiled

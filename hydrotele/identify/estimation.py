@@ -186,11 +186,11 @@ def _solve_once(x, y, z, shape: _SolverOptions):
     flat, rest = (x / size).reshape(-1, p), (y - x @ shape.prior).ravel()
     if z is None:
         inverse, solved = _pseudo_inverse(flat, shape.ridge, shape.truncation)
-        solved = solved._replace(normal=solved.inverse_normal_matrix / np.outer(size, size))
+        solved = solved._replace(inverse_normal_matrix=solved.inverse_normal_matrix / np.outer(size, size))
     else:
         length = np.sqrt(np.einsum("nkp,nkp->p", z, z))
         inverse, solved = _solve_by_instruments((z / length).reshape(-1, p), flat)
-        solved = solved._replace(normal=solved.inverse_normal_matrix / np.outer(size, length))
+        solved = solved._replace(inverse_normal_matrix=solved.inverse_normal_matrix / np.outer(size, length))
     inverse = inverse / size[:, None]
     return shape.prior + inverse @ rest, inverse.reshape(p, n, k), solved
 

@@ -549,7 +549,7 @@ def identify_with_friction_shapes(
     started = time.perf_counter()
     processing, estimator = processing or Processing(), estimator or Estimator()
     if any(one.smoothing for one in setup.friction_terms):
-        sharp = replace(setup, rubbing=tuple(replace(one, smoothing=0.0) for one in setup.friction_terms))
+        sharp = replace(setup, friction_terms=tuple(replace(one, smoothing=0.0) for one in setup.friction_terms))
         some = _select_first_runs(fit, processing.period)
         misfits = [_negative_log_likelihood(some, s, processing, estimator) for s in (setup, sharp)]
         if misfits[1] < misfits[0]:

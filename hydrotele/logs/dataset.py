@@ -701,7 +701,7 @@ def downsample(data: Dataset) -> Dataset:
         behind = behind * (1.0 if run.readings_per_mean is None else run.readings_per_mean)
         return dataclasses.replace(
             run, period=rows.period, command=rows.command, command_known=rows.known,
-            reading=rows.reading, valid=rows.valid, behind=behind,
+            reading=rows.reading, valid=rows.valid, readings_per_mean=behind,
         )  # fmt: skip
 
     fit = tuple(map(thin, data.fit))

@@ -28,7 +28,7 @@ class Tree(NamedTuple):
         parent: (b,) index of the parent body.
         offset: (b, 3) origin of the body frame in the parent frame [m].
         rotation: (b, 3, 3) orientation of the body frame in the parent frame.
-        first_joint: (b + 1,) index of the first joint of a body; `first[i + 1]` is the end.
+        first_joint: (b + 1,) index of the first joint of a body; `first_joint[i + 1]` is the end.
         is_slide: (v,) whether a joint is a slide; otherwise it is a hinge.
         axis: (v, 3) joint axis in the body frame.
         anchor: (v, 3) point on the axis in the body frame [m].

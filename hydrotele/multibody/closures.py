@@ -57,13 +57,13 @@ def compute_loop_residuals(tree, frames, error, error_jacobian):
     """
     error_jacobian[:, :] = 0.0
     error[:, 0] = 0.0
-    for c in range(len(tree.ends)):
-        first = tree.row[c]
-        weld = tree.row[c + 1] - first == 6
+    for c in range(len(tree.closure_bodies)):
+        first = tree.first_equation[c]
+        weld = tree.first_equation[c + 1] - first == 6
         for side in range(2):
-            body, sign = tree.ends[c, side], 1.0 - 2.0 * side
-            arm = rotate(get_rotation(frames.turn, body), get_vector(tree.points[c], side))
-            point = add(get_vector(frames.place, body), arm)
+            body, sign = tree.closure_bodies[c, side], 1.0 - 2.0 * side
+            arm = rotate(get_rotation(frames.rotation, body), get_vector(tree.closure_points[c], side))
+            point = add(get_vector(frames.origin, body), arm)
             for k in range(3):
                 error[first + k, 0] += sign * point[k]
             for j in range(len(frames.axis)):
@@ -84,10 +84,10 @@ def compute_loop_residuals(tree, frames, error, error_jacobian):
 def _rotation_error(tree, frames, c):
     """Return the sine of the rotation angle between both frames of a weld, times its axis."""
     one, two = (
-        get_rotation(frames.turn, tree.ends[c, 0]),
-        get_rotation(frames.turn, tree.ends[c, 1]),
+        get_rotation(frames.rotation, tree.closure_bodies[c, 0]),
+        get_rotation(frames.rotation, tree.closure_bodies[c, 1]),
     )
-    own, other = tree.turns[c, 0], tree.turns[c, 1]
+    own, other = tree.closure_rotations[c, 0], tree.closure_rotations[c, 1]
     total = (0.0, 0.0, 0.0)
     for k in range(3):
         a = rotate(one, (own[0, k], own[1, k], own[2, k]))
@@ -103,12 +103,12 @@ def compute_closure_acceleration(tree, frames, out):
     Source: second derivative of the loop equations.
     """
     out[:, 0] = 0.0
-    for c in range(len(tree.ends)):
-        first = tree.row[c]
-        weld = tree.row[c + 1] - first == 6
+    for c in range(len(tree.closure_bodies)):
+        first = tree.first_equation[c]
+        weld = tree.first_equation[c + 1] - first == 6
         for side in range(2):
-            body, sign = tree.ends[c, side], 1.0 - 2.0 * side
-            arm = rotate(get_rotation(frames.turn, body), get_vector(tree.points[c], side))
+            body, sign = tree.closure_bodies[c, side], 1.0 - 2.0 * side
+            arm = rotate(get_rotation(frames.rotation, body), get_vector(tree.closure_points[c], side))
             w, dw = (
                 get_vector(frames.angular_velocity, body),
                 get_vector(frames.angular_acceleration, body),
@@ -147,7 +147,7 @@ class LoopWorkspace(NamedTuple):
 @compiled
 def make_loop_workspace(tree, unknowns, columns):
     """Allocate the workspace for `unknowns` unknown joints and solutions with `columns` columns."""
-    v, r = len(tree.reference_position), tree.row[-1]
+    v, r = len(tree.reference_position), tree.first_equation[-1]
     return LoopWorkspace(
         np.zeros(v), np.zeros(3), make_frames(tree), np.zeros((r, 1)), np.zeros((r, v)),
         np.empty((r, unknowns)), np.empty((unknowns, unknowns)), np.empty((unknowns, max(columns, 1))),
@@ -170,13 +170,13 @@ def close_loops_near(tree, q, unknowns, space):
 
     Source: Gauss-Newton.
     """
-    error, part = space.error, space.part
+    error, part = space.error, space.solution
     for _ in range(_MAX_ITERATIONS):
-        compute_frames(tree, q, space.still, space.still, space.zero_vector, space.frames)
+        compute_frames(tree, q, space.zero_rates, space.zero_rates, space.zero_vector, space.frames)
         if len(error) == 0:
             return True
-        compute_loop_residuals(tree, space.frames, error, space.slope)
-        if not qr_factor(space.slope, unknowns, space.q_factor, space.r_factor):
+        compute_loop_residuals(tree, space.frames, error, space.error_jacobian)
+        if not qr_factor(space.error_jacobian, unknowns, space.q_factor, space.r_factor):
             return False
         open_by = 0.0
         for m in range(len(error)):
@@ -220,7 +220,7 @@ def close_loops_from(tree: Tree, q: np.ndarray, unknowns: np.ndarray, tolerance:
 @compiled
 def _loop_residuals(tree, q):
     """Return the loop residuals (r, 1) at positions (v,), and their Jacobian (r, v)."""
-    v, r = len(q), tree.row[-1]
+    v, r = len(q), tree.first_equation[-1]
     frames, gap, slope, still = make_frames(tree), np.zeros((r, 1)), np.zeros((r, v)), np.zeros(v)
     compute_frames(tree, q, still, still, np.zeros(3), frames)
     compute_loop_residuals(tree, frames, gap, slope)
@@ -411,7 +411,7 @@ def _flatten_frames(chain: Chain, q: np.ndarray, body: str | None) -> np.ndarray
     frames, still = make_frames(chain.tree), np.zeros(len(q))
     compute_frames(chain.tree, q, still, still, np.zeros(3), frames)
     some = slice(1, None) if body is None else chain.bodies.index(body) + 1
-    return np.concatenate([frames.place[some].ravel(), frames.turn[some].ravel()])
+    return np.concatenate([frames.origin[some].ravel(), frames.rotation[some].ravel()])
 
 
 def joint_jacobian(chain: Chain, q: np.ndarray, outputs: Sequence[str], inputs: Sequence[str]) -> np.ndarray:

@@ -161,7 +161,7 @@ def _project_rows(tree, given, others, drives, moment_free, q, out):
     """Compute a `Projection` row by row; return the index of the failed row, or -1."""
     b, v, k = len(tree.parent), len(tree.reference_position), len(given.joints)
     hidden, space = len(others), make_loop_workspace(tree, len(others), k)
-    frames, part, ground = space.frames, space.part, -tree.gravity
+    frames, part, ground = space.frames, space.solution, -tree.gravity
     moves = np.zeros((v, k))  # rates of all joints per unit rate of the given joints
     q_drive, r_drive, unit = np.empty((k, k)), np.empty((k, k)), np.eye(k)
     inverse, every = np.empty((k, k)), np.arange(k)
@@ -180,7 +180,7 @@ def _project_rows(tree, given, others, drives, moment_free, q, out):
             if not close_loops_near(tree, q, others, space):
                 return row
         for i in range(k if hidden else 0):
-            qr_solve(space.q_factor, space.r_factor, hidden, space.slope, given.joints[i], part, i)
+            qr_solve(space.q_factor, space.r_factor, hidden, space.error_jacobian, given.joints[i], part, i)
             for o in range(hidden):
                 moves[others[o], i] = -part[o, i]
         rate, acceleration = out.rate[row], out.acceleration[row]
@@ -189,7 +189,7 @@ def _project_rows(tree, given, others, drives, moment_free, q, out):
             for i in range(k):
                 rate[j] += moves[j, i] * given.rate[row, i]
         if hidden:
-            compute_frames(tree, q, rate, space.still, space.zero_vector, frames)
+            compute_frames(tree, q, rate, space.zero_rates, space.zero_vector, frames)
             compute_closure_acceleration(tree, frames, space.error)
             qr_solve(space.q_factor, space.r_factor, hidden, space.error, 0, part, 0)
             for o in range(hidden):
@@ -203,7 +203,7 @@ def _project_rows(tree, given, others, drives, moment_free, q, out):
             return row
         for i in range(k):
             qr_solve(q_drive, r_drive, k, unit, i, inverse, i)
-        share = out.share[row]
+        share = out.joint_projection[row]
         for i in range(k):
             for j in range(v):
                 total = 0.0
@@ -213,16 +213,16 @@ def _project_rows(tree, given, others, drives, moment_free, q, out):
         for body in range(1, b):
             compute_wrenches(frames, body, forces, torques)
             _remove_moment(frames, body, get_vector(moment_free, body), torques)
-            _project_wrench(tree, frames, body, forces, torques, share, out.bodies[row])
-        for m in range(len(tree.ends)):
-            out.closure_rate[row, m] = _project_closure_friction(tree, frames, m, share, out.pins[row])
+            _project_wrench(tree, frames, body, forces, torques, share, out.body_projection[row])
+        for m in range(len(tree.closure_bodies)):
+            out.closure_rate[row, m] = _project_closure_friction(tree, frames, m, share, out.closure_projection[row])
     return -1
 
 
 @allocation_free
 def _remove_moment(frames, body, axis, torques):
     """Remove the component along a unit axis from torques (3, 10); a zero axis has no effect."""
-    way = rotate(get_rotation(frames.turn, body), axis)
+    way = rotate(get_rotation(frames.rotation, body), axis)
     for m in range(10):
         along = way[0] * torques[0, m] + way[1] * torques[1, m] + way[2] * torques[2, m]
         for k in range(3):
@@ -232,7 +232,7 @@ def _remove_moment(frames, body, axis, torques):
 @allocation_free
 def _project_wrench(tree, frames, body, forces, torques, share, out):
     """Project the wrench of a body on the drives, through the joints that move it."""
-    first, point = 10 * (body - 1), get_vector(frames.place, body)
+    first, point = 10 * (body - 1), get_vector(frames.origin, body)
     for i in range(len(share)):
         for m in range(10):
             out[i, first + m] = 0.0
@@ -251,7 +251,7 @@ def _project_wrench(tree, frames, body, forces, torques, share, out):
 @allocation_free
 def _project_closure_friction(tree, frames, closure, share, out):
     """Project viscous friction in a closure on the drives; return its relative rotation rate."""
-    one, two = tree.ends[closure, 0], tree.ends[closure, 1]
+    one, two = tree.closure_bodies[closure, 0], tree.closure_bodies[closure, 1]
     spin = subtract(get_vector(frames.angular_velocity, one), get_vector(frames.angular_velocity, two))
     for i in range(len(share)):
         out[i, closure] = 0.0

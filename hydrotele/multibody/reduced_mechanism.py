@@ -196,7 +196,7 @@ def close_loops(mech, m, z):
 
     Source: Newton's method on the loop equations; J_b r_b = -J_f r_f for the rates.
     """
-    joint, free, bound = m.joint, mech.free, mech.dependent
+    joint, free, bound = m.joint, mech.independent, mech.dependent
     n, nb, lost, far, worst = len(free), len(bound), False, 0.0, 0.0
     for k in range(joint.shape[1]):
         lost = lost or not math.isfinite(joint[Q, k])
@@ -217,7 +217,7 @@ def close_loops(mech, m, z):
             for b in range(nb):
                 joint[Q, bound[b]] += m.basis[bound[b], f] * move
         for _ in range(_MAX_ITERATIONS):
-            compute_link_frames(mech.tree, mech.shape, mech.links, joint, m.frame, m.jacobian)
+            compute_link_frames(mech.tree, mech.shape, mech.link_count, joint, m.frame, m.jacobian)
             first = len(mech.tree) - 2 * len(m.loop) // 3
             worst = _compute_residuals(mech.tree, mech.shape, first, m.frame, m.jacobian, m.loop)
             _factorise_loops(bound, m.loop, m.normal)
@@ -729,7 +729,7 @@ def compute_mass_and_bias(mech, m):
 
     Source: Kane and Levinson 1985, Dynamics.
     """
-    bodies, n = 1 + mech.links + 2 * mech.bar_count, m.mass.shape[0]
+    bodies, n = 1 + mech.link_count + 2 * mech.bar_count, m.mass.shape[0]
     frame, jacobian, momentum = m.frame, m.jacobian, m.momentum
     for b in range(1, bodies):
         _compute_body_wrench(mech.shape, frame, jacobian, b, mech.tree[b, COORDINATE_END], momentum)

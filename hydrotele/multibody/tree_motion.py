@@ -197,23 +197,23 @@ def compute_frames(tree, q, rate, acceleration, ground, frames):
 
     `ground` (3,) is the acceleration of the world, such as minus gravity.
     """
-    set_vector(frames.place, 0, (0.0, 0.0, 0.0))
+    set_vector(frames.origin, 0, (0.0, 0.0, 0.0))
     set_vector(frames.angular_velocity, 0, (0.0, 0.0, 0.0))
     set_vector(frames.angular_acceleration, 0, (0.0, 0.0, 0.0))
     set_vector(frames.acceleration, 0, (ground[0], ground[1], ground[2]))
-    set_rotation(frames.turn, 0, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+    set_rotation(frames.rotation, 0, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
     for b in range(1, len(tree.parent)):
         up = tree.parent[b]
         t, w, dw = (
-            get_rotation(frames.turn, up),
+            get_rotation(frames.rotation, up),
             get_vector(frames.angular_velocity, up),
             get_vector(frames.angular_acceleration, up),
         )
         arm = rotate(t, get_vector(tree.offset, b))
-        p = add(get_vector(frames.place, up), arm)
+        p = add(get_vector(frames.origin, up), arm)
         a = add(get_vector(frames.acceleration, up), point_acceleration(w, dw, arm))
-        t = compose_rotations(t, get_rotation(tree.turn, b))
-        for j in range(tree.first[b], tree.first[b + 1]):
+        t = compose_rotations(t, get_rotation(tree.rotation, b))
+        for j in range(tree.first_joint[b], tree.first_joint[b + 1]):
             own, center = get_vector(tree.axis, j), get_vector(tree.anchor, j)
             way, arm = rotate(t, own), rotate(t, center)
             set_vector(frames.axis, j, way)
@@ -232,8 +232,8 @@ def compute_frames(tree, q, rate, acceleration, ground, frames):
             back = scale_vector(-1.0, rotate(t, center))
             a = add(a, point_acceleration(w, dw, back))
             p = add(add(p, arm), back)
-        set_vector(frames.place, b, p)
-        set_rotation(frames.turn, b, t)
+        set_vector(frames.origin, b, p)
+        set_rotation(frames.rotation, b, t)
         set_vector(frames.angular_velocity, b, w)
         set_vector(frames.angular_acceleration, b, dw)
         set_vector(frames.acceleration, b, a)
@@ -253,7 +253,7 @@ def compute_wrenches(frames, body, forces, torques):
     Forces and torques are in the world frame:
     `f = m a + alpha x s + w x (w x s)` and `n = I alpha + w x I w + s x a` with s = m c.
     """
-    t, a = get_rotation(frames.turn, body), get_vector(frames.acceleration, body)
+    t, a = get_rotation(frames.rotation, body), get_vector(frames.acceleration, body)
     w, dw = get_vector(frames.angular_velocity, body), get_vector(frames.angular_acceleration, body)
     for k in range(3):
         forces[k, 0], torques[k, 0] = a[k], 0.0

@@ -272,12 +272,12 @@ def sample_sensors(table, sim, tick, steps):
 
     Source: nominal model, "Sensors".
     """
-    if tick % table.every != 0:
+    if tick % table.ticks_per_sample != 0:
         return
-    values = np.empty(len(sim.past.before))
+    values = np.empty(len(sim.sensor_history.before))
     true_sensor_values(sim, values)
-    apply_sensor_delays(sim.past, tick * steps, values)
-    read_sensors(table.sensors, values, table.errors[tick // table.every])
+    apply_sensor_delays(sim.sensor_history, tick * steps, values)
+    read_sensors(table.sensors, values, table.errors[tick // table.ticks_per_sample])
     span = table.period if tick > 0 else 0.0
     table.readings.supply[0] = store_readings(values, sim.hydraulic, span, table.readings)
 

@@ -187,14 +187,14 @@ def initialise_history(sim, command):
     Returns:
         Nothing.
     """
-    for n in range(len(sim.line.ring)):
+    for n in range(len(sim.command_line.ring)):
         for i in range(sim.axes):
-            sim.line.ring[n, i] = command[i]
-    if len(sim.past.ring) > 0:
-        true_sensor_values(sim, sim.past.before)
-        for n in range(len(sim.past.ring)):
-            for c in range(len(sim.past.before)):
-                sim.past.ring[n, c] = sim.past.before[c]
+            sim.command_line.ring[n, i] = command[i]
+    if len(sim.sensor_history.ring) > 0:
+        true_sensor_values(sim, sim.sensor_history.before)
+        for n in range(len(sim.sensor_history.ring)):
+            for c in range(len(sim.sensor_history.before)):
+                sim.sensor_history.ring[n, c] = sim.sensor_history.before[c]
 
 
 @compiled
@@ -244,7 +244,7 @@ def step_physics(sim, tick, steps, command):
 
     Source: MuJoCo manual, `mj_step`.
     """
-    line, past = sim.line, sim.past
+    line, past = sim.command_line, sim.sensor_history
     if len(line.ring) == 0:
         for i in range(sim.axes):
             sim.ctrl[i] = command[i]
@@ -262,7 +262,7 @@ def step_physics(sim, tick, steps, command):
 @compiled
 def _store_sensor_values(sim, number):
     """Store the lagged sensor values after physics step `number` in the ring."""
-    past, size = sim.past, len(sim.past.before)
+    past, size = sim.sensor_history, len(sim.sensor_history.before)
     now, last = number % len(past.ring), (number - 1) % len(past.ring)
     values = np.empty(size)
     true_sensor_values(sim, values)

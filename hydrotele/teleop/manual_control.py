@@ -138,10 +138,10 @@ def update_element_fits(loop, tick, late, seen):
 
     Source: recursive least squares with forgetting, over a bank of models.
     """
-    step, a = loop.facts[STEP], _WASHOUT_FREQUENCY
+    step, a = loop.parameters[STEP], _WASHOUT_FREQUENCY
     share = 1.0 - np.exp(-a * step)
-    keep = np.exp(-step / loop.facts[MEMORY])
-    low = loop.seen
+    keep = np.exp(-step / loop.parameters[MEMORY])
+    low = loop.output_filter
     low[0] += share * (seen - low[0])
     low[1] += share * (low[0] - low[1])
     low[2] += share * (low[1] - low[2])
@@ -149,14 +149,14 @@ def update_element_fits(loop, tick, late, seen):
     best, least = 0, np.inf
     for i in range(len(loop.lag)):
         row, lag = loop.hand[i], loop.lag[i]
-        hand = _past_value(loop.past, tick, late + loop.dead[i] / step, 2)
+        hand = _past_value(loop.history, tick, late + loop.dead_time[i] / step, 2)
         row[0] += (1.0 - np.exp(-step / lag) if lag > 0.0 else 1.0) * (hand - row[0])
         row[1] += share * (row[0] - row[1])
         row[2] += share * (row[1] - row[2])
         row[3] += share * (row[2] - row[3])
-        if loop.facts[FORM] == 0.0:
+        if loop.parameters[FORM] == 0.0:
             effect = row[0] - 3.0 * row[1] + 3.0 * row[2] - row[3]
-        elif loop.facts[FORM] == 1.0:
+        elif loop.parameters[FORM] == 1.0:
             effect = (row[1] - 2.0 * row[2] + row[3]) / a
         else:
             effect = (row[2] - row[3]) / (a * a)
@@ -185,13 +185,13 @@ def estimate_element_gain(loop):
     Source: normal posterior of the gain's logarithm.
     """
     best = int(loop.state[SELECTED_CANDIDATE])
-    sums, prior = loop.sums[best], loop.facts[EXPECTED_GAIN]
+    sums, prior = loop.sums[best], loop.parameters[EXPECTED_GAIN]
     gain = prior
     if sums[0] > _MIN_POWER and sums[1] > 0.0:
         fitted = sums[1] / sums[0]
         scatter = max(0.0, sums[2] - fitted * sums[1]) / sums[3]
-        doubt = scatter / (fitted * fitted * sums[0]) * (_ERROR_CORRELATION_TIME / loop.facts[STEP]) + 1e-4
-        surprise = loop.facts[GAIN_UNCERTAINTY] ** 2
+        doubt = scatter / (fitted * fitted * sums[0]) * (_ERROR_CORRELATION_TIME / loop.parameters[STEP]) + 1e-4
+        surprise = loop.parameters[GAIN_UNCERTAINTY] ** 2
         weight = surprise / (surprise + doubt)
         gain = np.exp(weight * np.log(fitted) + (1.0 - weight) * np.log(prior))
     loop.state[ESTIMATED_GAIN] = gain
@@ -214,7 +214,7 @@ def decide_hand_reference(loop, tick, target, seen, hand):
 
     Source: McRuer and Jex 1967; Levison, Baron and Kleinman 1969.
     """
-    facts, past, state = loop.facts, loop.past, loop.state
+    facts, past, state = loop.parameters, loop.history, loop.state
     step, rows = facts[STEP], len(past)
     here = past[tick % rows]
     here[0], here[1], here[2] = target - seen, seen, hand
@@ -236,7 +236,7 @@ def decide_hand_reference(loop, tick, target, seen, hand):
     if state[NOTICED_ERROR] == 0.0 and facts[THRESHOLD] > 0.0:
         return state[INTEGRAL]  # no action on an unobserved error
     error += density * np.sqrt(state[ERROR_POWER]) * noise[0]
-    action = loop.action[best] / gain
+    action = loop.operator_gain[best] / gain
     if facts[FORM] == 0.0:
         state[INTEGRAL] += step * action * error
         state[INTEGRAL] = min(facts[MAX_OUTPUT], max(-facts[MAX_OUTPUT], state[INTEGRAL]))
@@ -347,7 +347,7 @@ def make_sum_of_sines(time: np.ndarray, bandwidth: float = 1.5, duration: float 
 def _simulate_tracking(loop, lag, form, gain, target, fine, hand, response):
     """Simulate the closed loop of `simulate_tracking`; `hand` and `response` are written."""
     place, speed, output, rate = 0.0, 0.0, 0.0, 0.0
-    step = loop.facts[STEP] / fine
+    step = loop.parameters[STEP] / fine
     wanted = 0.0
     for k in range(len(target)):
         hand[k], response[k] = place, output

@@ -279,8 +279,8 @@ def measure_handle(numbers, qpos, period, s):
         factor = factor * np.arctan2(size, abs(w)) / size
     for i in range(6):
         value = qpos[i] if i < 3 else factor * qpos[i + 1]
-        if numbers.step[i] > 0.0:
-            value = np.rint(value / numbers.step[i]) * numbers.step[i]
+        if numbers.resolution[i] > 0.0:
+            value = np.rint(value / numbers.resolution[i]) * numbers.resolution[i]
         speed = (value - s.handle[i]) / period if period > 0.0 else 0.0
         if period > 0.0:
             own = numbers.mass[0] if i < 3 else numbers.inertia[i - 3]
@@ -427,13 +427,15 @@ def _four_channel_force(row, mode, force, packet, fresh, period, s, i):
 @compiled
 def _decoupled_wrench(numbers, turn, s, wrench):
     """Compute the wrench that makes every axis an independent mass under its force."""
-    mass, arm = numbers.mass[0], numbers.below - numbers.handle
+    mass, arm = numbers.mass[0], numbers.centre_of_mass - numbers.handle
     inertia, wanted, about = np.zeros((3, 3)), np.empty(3), np.empty(3)
     square = arm[0] ** 2 + arm[1] ** 2 + arm[2] ** 2
     for j in range(3):
         inertia[j, j] = numbers.inertia[j] - mass * (square - arm[j] ** 2)
         wanted[j], about[j] = s.push[j] / mass, s.push[3 + j] / numbers.inertia[j]
-    free_flotor_wrench(mass, arm, inertia, numbers.below, wanted, about, turn, s.speed[3:], numbers.gravity, wrench)
+    free_flotor_wrench(
+        mass, arm, inertia, numbers.centre_of_mass, wanted, about, turn, s.speed[3:], numbers.gravity, wrench
+    )
 
 
 @compiled
@@ -458,8 +460,10 @@ def drive_coils(numbers, quaternion, period, s):
     if numbers.kind[3] > 0.0:
         _decoupled_wrench(numbers, turn, s, wrench)
     else:
-        held_flotor_wrench(numbers.mass[0], numbers.below, numbers.handle, s.push, turn, numbers.gravity, wrench)
-    largest = numbers.most[0]
+        held_flotor_wrench(
+            numbers.mass[0], numbers.centre_of_mass, numbers.handle, s.push, turn, numbers.gravity, wrench
+        )
+    largest = numbers.max_current[0]
     for i in range(6):
         s.currents[i] = 0.0
         for j in range(6):
@@ -467,7 +471,7 @@ def drive_coils(numbers, quaternion, period, s):
         if not np.isfinite(s.currents[i]):
             s.currents[i] = 0.0
         largest = max(largest, abs(s.currents[i]))
-    s.limited[0] = numbers.most[0] / largest
+    s.limited[0] = numbers.max_current[0] / largest
     for i in range(6):
         s.currents[i] *= s.limited[0]
         own = numbers.mass[0] if i < 3 else numbers.inertia[i - 3]

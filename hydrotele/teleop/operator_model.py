@@ -214,12 +214,12 @@ def compute_muscle_forces(muscles, history, tremor, handle, tick, period):
     noise = tick % len(tremor)
     for i in range(6):
         place, rate = muscles.rest[i], muscles.rate[i]
-        muscles.rest[i] = lag[0] * place + lag[1] * rate + lag[2] * muscles.wanted[i]
-        muscles.rate[i] = lag[3] * place + lag[4] * rate + lag[5] * muscles.wanted[i]
+        muscles.rest[i] = lag[0] * place + lag[1] * rate + lag[2] * muscles.reference[i]
+        muscles.rate[i] = lag[3] * place + lag[4] * rate + lag[5] * muscles.reference[i]
     for i in range(6):
         history[tick % rows, i] = handle[i]
         late = history[(tick + 1) % rows, i]
-        spring, most, wanted = muscles.spring[i], muscles.most[i], muscles.rest[i]
+        spring, most, wanted = muscles.spring[i], muscles.max_force[i], muscles.rest[i]
         firm = muscles.arm[i] + spring
         known = firm * wanted
         beyond = abs(wanted) - muscles.detent[0, i]

@@ -355,7 +355,7 @@ def step_teleoperation(station, flotor, tick, tripped):
     s, m = unpack_slave_state(machine.state, r.joints), unpack_master_state(operator.state)
     force, n, nu = unpack_neuromuscular_state(operator.muscles).force, r.ticks, r.axes
     if r.simulated:
-        unpack_master(operator.master).most[0] = flotor[0].current_limit
+        unpack_master(operator.master).max_current[0] = flotor[0].current_limit
         if r.swing < 0:
             flotor_step(flotor[0], m.currents, force)
         else:

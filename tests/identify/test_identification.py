@@ -71,7 +71,7 @@ def test_a_wrong_machine_is_found_out_and_mended(short, found_short):
     fit, heldout, setup = short
     wrong = dataclasses.replace(setup.chain, inertia=setup.chain.inertia * 0.8)
     rubbing = tuple(dataclasses.replace(r, nominal={k: 0.5 * v for k, v in r.nominal.items()}) for r in setup.rubbing)
-    again = identify_dynamics(fit, heldout, dataclasses.replace(setup, chain=wrong, rubbing=rubbing))
+    again = identify_dynamics(fit, heldout, dataclasses.replace(setup, chain=wrong, friction_terms=rubbing))
     for drive, judged in again.heldout.items():
         assert judged.rms < 0.4 * judged.nominal_rms, drive
         assert judged.rms < 1.1 * found_short.heldout[drive].rms, drive  # weak ones stay wrong

@@ -74,7 +74,11 @@ def panda():
 def opened(chain):
     """The chain's tree, without its closures."""
     tree = chain.tree
-    tree = tree._replace(ends=tree.ends[:0], points=tree.points[:0], row=tree.row[:1])
+    tree = tree._replace(
+        closure_bodies=tree.closure_bodies[:0],
+        closure_points=tree.closure_points[:0],
+        first_equation=tree.first_equation[:1],
+    )
     return dataclasses.replace(chain, tree=tree)
 
 

@@ -74,7 +74,7 @@ def test_a_wrong_weight_is_a_wrong_place():
     """5 % too heavy in mind: up by `0.05 g / w^2`, 0.79 mm."""
     body = make_levitation_control(JOYSTICK).flotor_model
     heavy = Flotor(1.05 * body.mass, body.centre_of_mass, body.inertia)
-    control = dataclasses.replace(make_levitation_control(JOYSTICK), body=heavy)
+    control = dataclasses.replace(make_levitation_control(JOYSTICK), flotor_model=heavy)
     found = simulate_levitation(JOYSTICK, np.zeros((400, 6)), control=control).pose[-1, 2]
     # the spring is stiffer by the same 5 %
     assert found == pytest.approx(0.05 * 9.81 / 25.0**2 / 1.05, rel=0.01)

@@ -117,7 +117,7 @@ def test_pole_lies_on_the_axis_at_the_limit(case):
     assert found.pole.real > 0.0 and found.max_delay == 0.0
     row = case.row.copy()
     row[13] = found.max_ratio
-    at = analyse_scenario_loop(dataclasses.replace(case, row=row), "rate_force")
+    at = analyse_scenario_loop(dataclasses.replace(case, axis_parameters=row), "rate_force")
     assert at.gain_margin == pytest.approx(1.0, abs=3e-3)  # the margin is refined to 1e-3
     assert abs(at.pole.real) < 0.01 * abs(at.pole.imag)
     assert at.pole.imag / (2.0 * math.pi) == pytest.approx(found.frequency, rel=0.02)

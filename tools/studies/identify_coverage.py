@@ -40,7 +40,7 @@ def wrong_setup(setup: RegressorSetup, rng: np.random.Generator) -> RegressorSet
         for one in setup.friction_terms
     )
     chain = dataclasses.replace(setup.chain, inertia=inertia)
-    return dataclasses.replace(setup, chain=chain, rubbing=rubbing)
+    return dataclasses.replace(setup, chain=chain, friction_terms=rubbing)
 
 
 def one_trial(seed: int, number: int, sensors: str) -> dict[str, Any]:
