@@ -197,7 +197,7 @@ def update_max_pin_opening(ticks):
     Source: `simulate.closure`.
     """
     r = ticks[0]
-    widest, places = float64_view(r.max_pin_opening, 1), matrix_view(r.places, r.sites, 3)
+    widest, places = float64_view(r.widest, 1), matrix_view(r.places, r.sites, 3)
     one, two = int64_view(r.one, r.pins), int64_view(r.two, r.pins)
     widest[0] = max(widest[0], max_pin_opening(places, one, two))
 
