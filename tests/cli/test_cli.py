@@ -400,7 +400,7 @@ def test_a_run_of_ones_own_machine_can_be_handed_on(tmp_path):
 
 def test_review_refuses_a_log_of_another_machine(finished):
     code, _, err = invoke("review", finished, "--machine", "rig", "--plot", "x.png")
-    assert code == 2 and "is not a log of rig: it has none of position.slide" in err
+    assert code == 2 and "is a log of the machine 'cat215', the model is 'rig'" in err
 
 
 def test_validate_reports_every_file(tmp_path):

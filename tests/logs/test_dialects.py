@@ -192,7 +192,7 @@ def test_a_clock_set_back_cuts_the_run(tmp_path):
     time = np.where(np.arange(120) < 60, TIME, TIME - 0.1)
     log = load(tmp_path, table(time=time))
     assert log.notes == (
-        f"{tmp_path / 'run.csv'}, column 'time', row 60 (line 62): the clock is set back by 0.08 s; the run is cut"
+        f"{tmp_path / 'run.csv'}, column 'time', row 60 (line 62): the clock is set back by 0.1 s; the run is cut"
         " there, and the later rows follow after a pause of 2 s.",
     )
     assert np.array_equal(log["angle.boom"], ANGLE)
