@@ -1,4 +1,4 @@
-"""One rule for logs: validate, replay, review, gap and calibrate accept or refuse the same files with the same notes."""
+"""One rule for logs: all commands accept or refuse the same files, with the same notes."""
 
 import json
 from pathlib import Path
@@ -62,7 +62,7 @@ ACCEPTED = {
 }
 REFUSED = {
     "empty time": (changed(40, 0, np.nan), "column 'time', row 40 (line 42): is nan: remove the row or enter a value"),
-    "beyond the stroke": (changed(slice(40, 80), 2, 9.0), "position.slide"),
+    "beyond the stroke": (rig_rows() * [1.0, 1.0, 30.0], "column 'position.slide'"),
     "command in volts": (rig_rows() * [1.0, 500.0, 1.0], "looks like percent, counts or volts"),
     "no clock": (np.column_stack([np.cumsum(np.random.default_rng(1).exponential(0.01, 300)), rig_rows()[:, 1:]]),
                  "the time stamps follow no clock"),
