@@ -136,8 +136,10 @@ def _cut_at_set_clock(table: Table, minimum_rows: int) -> tuple[Table, tuple[str
     cuts = np.flatnonzero(set_clock) + 1
     back = step[cuts - 1] < 0.0
     if np.diff(cuts, prepend=0, append=len(time)).max() < minimum_rows:
-        message = f"the time stamps go back {back.sum()} times, so that no {minimum_rows} successive rows are in the order"
-            " of time: log the time of a clock that is not set"
+        message = (
+            f"the time stamps go back {back.sum()} times, so that no {minimum_rows} successive rows are in the"
+            " order of time: log the time of a clock that is not set"
+        )
         raise InputError(table.location("time", int(cuts[back][0])), message)
     period = float(np.median(step[~set_clock]))
     pause = math.ceil(CUT_SECONDS / period) * period
