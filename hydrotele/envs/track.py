@@ -72,7 +72,7 @@ def begin_track(f, e):
     g[_FREQUENCY] = 2.0 * math.pi / draw_uniform_between(e, _MIN_PERIOD, _MAX_PERIOD)
     for a in range(f.axes_driven):
         i = f.driven_axis[a]
-        g[_BASE + i] = e.goal[i]
+        g[_BASE + i] = e.reference[i]
         fastest = draw_uniform_between(e, _MIN_RATE_FRACTION, _MAX_RATE_FRACTION) * f.fastest[i]
         total, rate = 0.0, 0.0
         for h in range(_HARMONIC_COUNT):
