@@ -49,7 +49,7 @@ from hydrotele.kinematics.wires import (
     pose_covariance,
     pose_from_wires,
 )
-from hydrotele.logs.log import Table, read_table
+from hydrotele.logs.table import Table, read_table
 
 POSE_COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
 COVARIANCE_COLUMNS = tuple(f"covariance.{a}.{b}" for a, b in combinations_with_replacement(POSE_COORDINATES, 2))

@@ -268,7 +268,7 @@ app.command("identify-operator", epilog=IDENTIFY_OPERATOR_EPILOG)(identify_opera
 
 @app.command(epilog="Example:  hydrotele replay measured/fit_1.parquet --machine cat215 --out overlay")
 def replay(
-    logs: Annotated[list[Path], typer.Argument(help="Log files (.parquet, .csv) or run folders.")],
+    logs: Annotated[list[Path], typer.Argument(help="Log files (.parquet, .csv), folders of them, run folders.")],
     machine: MachineOption = None,
     tool: ToolOption = None,
     timestep: Annotated[float, typer.Option(min=1e-6, help="Simulation time step [s].")] = 1.0e-3,
@@ -282,11 +282,12 @@ def replay(
     ] = None,
     effects: EffectFilesOption = None,
     json: JsonOption = False,
+    force: ForceOption = False,
 ) -> None:
     """Simulate the model with the commands of a log; print the prediction errors."""
     from hydrotele.cli.reviewing import replay_logs
 
-    replay_logs(logs, machine, tool, timestep, out, json)
+    replay_logs(logs, machine, tool, timestep, out, json, force)
 
 
 @app.command(
@@ -507,7 +508,7 @@ def analyse_teleop(
     "hydrotele review runs/dig --screenshot dig.png --at 8   |   hydrotele review runs/dig --video dig.mp4"
 )
 def review(
-    log: Annotated[Path, typer.Argument(help="Run folder or log file.")],
+    log: Annotated[Path, typer.Argument(help="Log file, run folder, folder of gap, or recording (.rrd).")],
     log2: Annotated[Path | None, typer.Argument(help="Second log with the same time base, for comparison.")] = None,
     machine: MachineOption = None,
     tool: ToolOption = None,
@@ -530,16 +531,19 @@ def review(
         Path | None,
         typer.Option("--video", help="Write a video (.mp4) of the machine; needs pip install 'hydrotele[video]'."),
     ] = None,
+    force: ForceOption = False,
     effects: EffectFilesOption = None,
 ) -> None:
     """Show a run in the rerun viewer: 3D machine, joints, pressures, flows and forces.
 
-    Each of --out, --screenshot, --plot and --video writes a file. If one of them is given, no window
-    is opened; several can be given together.
+    A folder with a recording, as that of run or gap, is shown by this recording. Each of --out,
+    --screenshot, --plot and --video writes a file. If one of them is given, no window is opened;
+    several can be given together.
     """
     from hydrotele.cli.reviewing import ReviewOutputs, review_logs
 
-    review_logs(log, log2, machine, tool, ReviewOutputs(out, screenshot, at, plot, video, port if serve else None))
+    outputs = ReviewOutputs(out, screenshot, at, plot, video, port if serve else None)
+    review_logs(log, log2, machine, tool, outputs, force)
 
 
 @app.command("list", epilog="Example:  hydrotele list scenarios --json")
@@ -562,14 +566,21 @@ def list_(
 
 @app.command(epilog="Example:  hydrotele validate my_machine/machine.yaml")
 def validate(
-    files: Annotated[list[Path], typer.Argument(help="Machines, joysticks, scenarios, sweeps or logs.")],
+    files: Annotated[list[Path], typer.Argument(help="Machines, joysticks, scenarios, sweeps, logs, folders of logs.")],
+    machine: MachineOption = None,
+    tool: ToolOption = None,
+    force: ForceOption = False,
     effects: EffectFilesOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Check a machine, joystick, scenario, sweep or log; report errors with file and line."""
-    from hydrotele.cli.catalogue import validate_files
+    """Check a machine, joystick, scenario, sweep or log; report errors with file and line.
 
-    validate_files(files, json)
+    Logs are checked as by gap, with the column names and ranges of --machine. Default: the machine
+    next to the log, or that of its metadata.
+    """
+    from hydrotele.cli.catalogue import LogMachine, validate_files
+
+    validate_files(files, json, LogMachine(machine, tool, force))
 
 
 @app.command(epilog="Example:  hydrotele export cat215 --tool bucket --out scene.xml")

@@ -24,6 +24,7 @@ LIMITS: Mapping[str, tuple[float, str]] = MappingProxyType({
     "FILE_DEPTH": (100, "nested levels of lists, mappings or elements"),
     "FILE_VALUES": (2e6, "values of a YAML file, after alias expansion"),
     "LOG_VALUES": (1e8, "values of a log, rows times columns"),
+    "LOG_COLUMNS": (1e4, "columns of a log"),
     "RUN_TICKS": (2e7, "controller ticks of a run"),
     "RUN_ROWS": (2e6, "logged rows of a run"),
     "MOVES": (1e4, "moves or waypoints of a pilot"),

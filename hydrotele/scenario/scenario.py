@@ -453,7 +453,7 @@ def _load_table(scenario: Scenario, where: str) -> Scenario:
     if not isinstance(pilot, TablePilot) or pilot.file is None:
         return scenario
     try:
-        log = load_log(Path(scenario.folder, pilot.file), minimum_rows=2, maximum_dropped=1.0)
+        log = load_log(Path(scenario.folder, pilot.file), minimum_rows=2, complete=True)
     except InputError as error:
         raise InputError(where, str(error)) from None
     kinds = ("command",) if pilot.quantity == "command" else ("position", "angle", "reference")

@@ -27,7 +27,7 @@ from hydrotele.control.resolved_motion import COORDINATES
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
 from hydrotele.core.units import to_si
-from hydrotele.logs.log import read_table
+from hydrotele.logs.table import read_table
 from hydrotele.machine.joystick import AXES, Joystick
 from hydrotele.scenario.teleoperation import (
     FollowPath,
