@@ -93,7 +93,7 @@ def review_logs(
 
 
 def _show(made: Path, outputs: ReviewOutputs) -> None:
-    """Take the screenshot of a recording, serve it, or open the viewer if no file was wanted."""
+    """Take the screenshot of a recording, serve it, or open the viewer if no file was requested."""
     if outputs.screenshot:
         from hydrotele.show.viewer import take_screenshot
 
