@@ -18,9 +18,9 @@ from hydrotele.identify.setup import RegressorSetup
 from hydrotele.multibody.inverse_dynamics import DEVIATION_TERMS
 
 _DEVIATION_SPEEDS = (1 / 32, 1 / 16, 1 / 8, 1 / 4)  # of the RMS speed: widths of the deviations near zero speed
-_REST_SPEED = 0.01  # of the RMS speed: below it, the fitted runs do not contain the friction
+_REST_SPEED = 0.002  # of the RMS speed: smaller than any speed but for an instant at a reversal
 _MAX_ROWS = 4000  # rows of a run from which its speeds are computed
-_ROUND_SPEEDS = np.outer(10.0 ** np.arange(-6, 4), [1.0, 3.0]).ravel()  # rad/s or m/s
+_ROUND_SPEEDS = np.array([float(f"{digit}e{power}") for power in range(-6, 4) for digit in (1, 3)])  # rad/s or m/s
 
 
 class FrictionForce(NamedTuple):

@@ -343,15 +343,14 @@ def identify_dynamics(
     predicted = compute_heldout_errors(judged, table, value, data.drive_columns, setup)
     forces = compute_heldout_forces(judged, table, value)
     found_friction = compute_friction_forces(setup, compute_speeds(fit, setup), table.names, value, told.base, found)
-    implausible = find_implausible_parameters(told, table, found)
-    hints = compare_with_given_forces(forces, predicted)
+    findings = (*compare_with_given_forces(forces, predicted), *find_implausible_parameters(told, table, found))
     return Identification(
         names=table.names, units=table.units, nominal=table.nominal, value=value, data_identifiability=told,
         motion_identifiability=fitted.motion_identifiability, estimate=found, bias=bias, heldout=predicted,
         friction=found_friction, forces=forces, band=judged.band,
         residual_autocorrelation=dict(zip(data.drives, residual_autocorrelation(found.residual).tolist(), strict=True)),
-        status=describe_status(predicted, _residual_rms(fitted), fitted.joints_at_rest, setup, implausible),
-        notes=(*notes, *data.notes, *implausible, *hints, *describe_heldout_errors(predicted, heldout.name)),
+        status=describe_status(predicted, _residual_rms(fitted), fitted.joints_at_rest, setup, findings),
+        notes=(*notes, *data.notes, *findings, *describe_heldout_errors(predicted, heldout.name)),
         seconds=time.perf_counter() - started,
     )  # fmt: skip
 

@@ -11,7 +11,7 @@ from hydrotele.multibody.inverse_dynamics import FRICTION_TERMS, Regressor
 
 _MAX_ERROR_OVER_NOISE = 1.5  # prediction error over noise above which the model is incomplete
 _MAX_ERROR_OVER_RESIDUAL = 3.0  # prediction error over fitted residuals above which the model is overfitted
-_MAX_RELATIVE_ERROR = 0.71  # of the force: above it, less than half of its power is explained
+_MAX_RELATIVE_ERROR = 0.5  # of the force: above it, less than three quarters of its power are explained
 _MIN_SKILL_STD = 2.0  # standard deviations by which a prediction must be better than zero force
 _MIN_REST_FRACTION = 0.05  # of the compared rows: less rest is not reported
 _MIN_REST_UNCERTAINTY = 0.5  # uncertainty of the sign of friction, 0 .. 1, above which a row counts as at rest
@@ -176,7 +176,7 @@ def describe_status(
     fitted: dict[str, float],
     resting: np.ndarray,
     setup: RegressorSetup,
-    implausible: tuple[str, ...] = (),
+    findings: tuple[str, ...] = (),
 ) -> str:
     """Evaluate the result of an identification.
 
@@ -185,7 +185,7 @@ def describe_status(
         fitted: drive -> RMS of the residuals of the fitted runs [N] or [N m].
         resting: (k,) whether a given joint was at rest in all fitted runs.
         setup: definition of the regressor.
-        implausible: sentences on implausible parameters.
+        findings: sentences on forces with a wrong sign or unit and on implausible parameters.
 
     Returns:
         `ok`, or a sentence that names the problem and the remedy.
@@ -215,8 +215,8 @@ def describe_status(
             f"on the held-out run the model explains only {parts} (squared force): the force depends mostly on"
             " something else, or is noise; search for missing effects with `hydrotele gap`"
         )
-    if implausible:
-        return implausible[0].removesuffix(".")
+    if findings:
+        return findings[0].removesuffix(".")
     worse = [d for d, h in heldout.items() if h.excess_rms > _MAX_ERROR_OVER_RESIDUAL * fitted[d]]
     if worse:
         ratios = ", ".join(f"{heldout[d].excess_rms / max(fitted[d], 1e-300):.1f} times for {d}" for d in worse)

@@ -9,7 +9,8 @@ from hydrotele.identify.record import IdentificationRecord
 
 _NEIGHBOURS = 3  # rows on each side of a reading
 _MIN_NOISE_RATIO = 8.0  # robust standard deviations of the noise: normal noise exceeds it in 1e-15 of all rows
-_MIN_RANGE_FRACTION = 0.1  # of the central 90 % of the signal: smaller errors hardly move an estimate
+_MIN_RANGE_FRACTION = 0.5  # of the central 90 % of the signal: smaller jumps may be friction at a short reversal
+_END_FACTOR = 4.0  # of the limit, for the first and last rows: a slope leaves their one-sided neighbours, too
 _STD_OVER_MAD = 1.4826  # standard deviation over median absolute deviation of normal noise
 
 
@@ -17,7 +18,7 @@ def find_wild_readings(values: np.ndarray) -> np.ndarray:
     """Find readings that lie far outside their neighbours.
 
     A reading is wild if it lies outside the inner range of its six neighbours by more than the width of that range,
-    by more than the noise, and by more than a tenth of the signal's range. Steps and smooth peaks are not wild. Up to
+    by more than the noise, and by more than half of the signal's range. Steps and smooth peaks are not wild. Up to
     two wild readings in a row are found.
 
     Args:
@@ -47,7 +48,8 @@ def find_wild_readings(values: np.ndarray) -> np.ndarray:
     noise = _STD_OVER_MAD * np.median(np.abs(from_median))
     least, most = np.quantile(reading, [0.05, 0.95])
     limit = np.maximum(high - low, max(_MIN_NOISE_RATIO * noise, _MIN_RANGE_FRACTION * (most - least)))
-    wild[known] = outside > limit
+    is_at_end = first != np.arange(len(reading)) - _NEIGHBOURS
+    wild[known] = outside > np.where(is_at_end, _END_FACTOR, 1.0) * limit
     return wild
 
 

@@ -25,15 +25,15 @@ LAWS = ("tanh", "stribeck", "lugre", "frictionloss")
 SPEEDS = (0.3, 1.0)  # rad/s
 COULOMB, DAMPING = 1.5, 0.4  # N m, N m s/rad
 STICTION, STRIBECK_SPEED = 2.1, 0.08  # N m, rad/s
-SMOOTHING_SPEED, STRIBECK_SMOOTHING_SPEED = 0.05, 0.02  # rad/s, of the laws `tanh` and `stribeck`
+SMOOTHING_SPEED, STRIBECK_SMOOTHING_SPEED = 0.05, 0.03  # rad/s, of the laws `tanh` and `stribeck`
 BRISTLE_STIFFNESS, BRISTLE_DAMPING = 600.0, 8.0  # N m/rad, N m s/rad
 TORQUE_NOISE, POSITION_NOISE = 0.05, 1e-5  # N m, rad
-JOINTS, RUNS, SECONDS, RATE, STEP = ("shoulder", "elbow"), 3, 20.0, 200.0, 5e-4  # s, Hz, s of a physics step
+JOINTS, RUNS, SECONDS, RATE, STEP = ("shoulder", "elbow"), 3, 20.0, 200.0, 1e-3  # s, Hz, s of a physics step
 LOWEST_FREQUENCY, HARMONICS, AMPLITUDE = 0.1, 5, 0.6  # Hz, number, rad
 STIFFNESS, CONTROL_DAMPING = 900.0, 60.0  # 1/s^2 and 1/s, of the joint controller
 
 ARM = """\
-<mujoco model="arm"><compiler angle="radian"/><option timestep="0.0005" integrator="implicitfast"/>
+<mujoco model="arm"><compiler angle="radian"/><option timestep="0.001" integrator="implicitfast"/>
 <worldbody>
   <body name="upper"><joint name="shoulder" axis="0 1 0" damping="{damping}" frictionloss="{loss}"/>
     <inertial pos="0.2 0 0" mass="4" diaginertia="0.01 0.06 0.06"/>
