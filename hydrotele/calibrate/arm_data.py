@@ -149,9 +149,9 @@ def find_moving_link(log: Log, loop: CalibrationLoop) -> str:
         InputError: no link or more than one link moves, or the log does not determine the link.
 
     >>> from hydrotele.machine.machine_file import load_machine
-    >>> from hydrotele.calibrate.loop import loop_of
+    >>> from hydrotele.calibrate.loop import build_loop
     >>> log = Log(np.arange(3.0), {"angle.boom": np.array([0.1, 0.3, 0.6])}, {"angle.boom": "rad"})
-    >>> find_moving_link(log, loop_of(load_machine("calibrator")))
+    >>> find_moving_link(log, build_loop(load_machine("calibrator")))
     'boom'
     """
     links = loop.links[: loop.powered_count]

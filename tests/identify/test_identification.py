@@ -241,7 +241,9 @@ def test_a_short_run_is_left_out_with_a_note(short):
     assert any("blink is too short" in note for note in found.notes)
 
 
-@pytest.mark.parametrize("options", [{"ridge": -1.0}, {"cut": 1.0}, {"cut": -0.1}, {"method": "magic"}, {"pairs": -1}])
+@pytest.mark.parametrize(
+    "options", [{"ridge": -1.0}, {"truncation": 1.0}, {"truncation": -0.1}, {"method": "magic"}, {"noise_pairs": -1}]
+)
 def test_options_without_sense_are_refused(options):
     with pytest.raises(InputError, match="estimator"):
         Estimator(**options)

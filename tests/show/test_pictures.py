@@ -64,7 +64,7 @@ def test_an_unknown_camera_is_refused_with_the_valid_ones(tmp_path, machine):
 
 def test_a_screenshot_shows_the_recording_without_complaints(tmp_path, recording):
     path = tmp_path / "review.png"
-    assert _drawn(take_screenshot, recording, path, size=(800, 600), at=0.5) == ()
+    assert _drawn(take_screenshot, recording, path, size=(800, 600), displayed_time=0.5) == ()
     assert _size(path) == (800, 600)
     pixels = _pixels(path)
     assert pixels[:, :400].std() > 20 and pixels[:, 450:].std() > 10  # machine and plots
