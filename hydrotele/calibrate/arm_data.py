@@ -10,7 +10,9 @@ from hydrotele.calibrate.arm_poses import Poses
 from hydrotele.calibrate.linkage import AxisStrokes
 from hydrotele.calibrate.loop import CalibrationLoop
 from hydrotele.core.errors import InputError
-from hydrotele.logs.log import Log, load_logs
+from hydrotele.logs.files import read_runs
+from hydrotele.logs.log import Log, missing_channels_message
+from hydrotele.logs.rows import merge_run
 from hydrotele.machine.machine import IDEAL_SENSORS, Machine, get_sensors, noise_rms
 
 MAX_POSES = 300
@@ -31,7 +33,7 @@ def read_stages(
     """Read the logs of a folder, one per moving link.
 
     Args:
-        path: folder of logs, or one log.
+        path: folder of logs, run folder, or one log.
         machine: the machine with its calibrator.
         loop: the closed chain of this machine.
         poses: maximum number of poses per log.
@@ -44,8 +46,33 @@ def read_stages(
     Raises:
         InputError: a channel is missing, the machine differs, or the moving link is unknown.
     """
-    logs = load_logs(path, required=loop.channels[loop.powered_count :])
-    return [log_to_poses(log, machine, loop, poses, accuracy) for log in logs]
+    return [log_to_poses(log, machine, loop, poses, accuracy) for log in read_calibration_logs(path, machine)[0]]
+
+
+def read_calibration_logs(path: Path, machine: Machine) -> tuple[tuple[Log, ...], tuple[str, ...]]:
+    """Read the logs of a calibration by the rule of all commands, see `merge_run`.
+
+    Args:
+        path: folder of logs, run folder, or one log.
+        machine: the machine, which defines column names and command ranges.
+
+    Returns:
+        (logs, notes on repairs).
+
+    Raises:
+        InputError: a log is invalid, is from another machine, or its time stamps follow no clock.
+    """
+    logs: list[Log] = []
+    notes: list[str] = []
+    for run in read_runs([path], machine, machine.log_columns, force=True):
+        axes, channels = tuple(machine.axes), [c for log in run.logs for c in log.columns if c != "valid"]
+        notes += [note for log in run.logs for note in log.notes] + list(merge_run(run, axes, channels)[1])
+        for log in run.logs:
+            if (of := log.metadata.get("machine", machine.name)) != machine.name:
+                message = f"is a log of machine {of}, not of {machine.name}: give --machine {of}"
+                raise InputError(log.source, message)
+            logs.append(log)
+    return tuple(logs), tuple(notes)
 
 
 def log_to_poses(
@@ -70,18 +97,20 @@ def log_to_poses(
     Raises:
         InputError: as in `read_stages`.
     """
-    of = log.metadata.get("machine", machine.name)
-    if of != machine.name:
-        message = f"is a log of machine {of}, not of {machine.name}: name the machine with --machine"
-        raise InputError(log.source, message)
-    rows = np.arange(len(log))
+    sensed = loop.channels[loop.powered_count :]
+    if lacking := [name for name in sensed if name not in log]:
+        raise InputError(log.source, missing_channels_message(lacking, log.columns))
+    powered = [name for name in loop.channels[: loop.powered_count] if name in log]
+    usable = np.isfinite([log[name] for name in (*sensed, *powered)]).all(axis=0)
+    if usable.sum() < 2:
+        raise InputError(log.source, f"has no two rows with readings of {', '.join((*sensed, *powered))}")
     if "valid" in log:
-        rows = rows[log["valid"] > 0.5]
+        usable &= log["valid"] > 0.5
+    rows = np.flatnonzero(usable)
     if len(rows) < 2:
         raise InputError(f"{log.source}, column valid", "leaves no rows: mark valid rows with 1")
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(poses, len(rows))).round().astype(int))]
     link = find_moving_link(log, loop)
-    sensed = loop.channels[loop.powered_count :]
     theta = np.stack([log[name][rows] for name in sensed], axis=1) * loop.signs[loop.powered_count :]
     own = {
         name: log[channel][rows] * sign
@@ -120,14 +149,15 @@ def find_moving_link(log: Log, loop: CalibrationLoop) -> str:
         InputError: no link or more than one link moves, or the log does not determine the link.
 
     >>> from hydrotele.machine.machine_file import load_machine
-    >>> from hydrotele.calibrate.loop import loop_of
+    >>> from hydrotele.calibrate.loop import build_loop
     >>> log = Log(np.arange(3.0), {"angle.boom": np.array([0.1, 0.3, 0.6])}, {"angle.boom": "rad"})
-    >>> find_moving_link(log, loop_of(load_machine("calibrator")))
+    >>> find_moving_link(log, build_loop(load_machine("calibrator")))
     'boom'
     """
     links = loop.links[: loop.powered_count]
     for kind, still in (("angle", _MAX_HELD_DRIFT), ("length", 0.02), ("command", 0.1)):
-        span = {n: float(np.ptp(log[f"{kind}.{n}"])) for n in links if f"{kind}.{n}" in log}
+        channels = {n: log[f"{kind}.{n}"] for n in links if f"{kind}.{n}" in log}
+        span = {n: float(np.ptp(v[np.isfinite(v)])) for n, v in channels.items() if np.isfinite(v).any()}
         moving = [name for name, size in span.items() if size > still]
         if len(moving) > 1 and kind == "angle":
             sizes = ", ".join(f"{n} by {np.degrees(span[n]):.1f} deg" for n in moving)
@@ -176,12 +206,15 @@ def extract_strokes(log: Log, machine: Machine, axes: Sequence[str], poses: int 
         One item per axis that moves by at least 5 deg.
     """
     found = []
-    rows = np.flatnonzero(log["valid"] > 0.5) if "valid" in log else np.arange(len(log))
-    if poses and len(rows) > poses:
-        rows = rows[np.linspace(0, len(rows) - 1, poses).round().astype(int)]
+    valid = log["valid"] > 0.5 if "valid" in log else np.ones(len(log), dtype=bool)
     for axis in axes:
         channels = f"angle.{axis}", f"length.{axis}"
-        if not all(c in log for c in channels) or np.ptp(log[channels[0]][rows]) < np.radians(5.0):
+        if not all(c in log for c in channels):
+            continue
+        rows = np.flatnonzero(valid & np.isfinite([log[c] for c in channels]).all(axis=0))
+        if poses and len(rows) > poses:
+            rows = rows[np.linspace(0, len(rows) - 1, poses).round().astype(int)]
+        if not len(rows) or np.ptp(log[channels[0]][rows]) < np.radians(5.0):
             continue
         angle, length = (log[c][rows] for c in channels)
         sigma = _angle_deviation(log, machine, channels[0], None)

@@ -163,7 +163,7 @@ def least_squares(
     >>> y = 2.0 + 3.0 * x
     >>> fit = least_squares(lambda p: p[0] + p[1] * x + p[2] - y, [0.0, 0.0, 0.0],
     ...                     ["a", "b", "c"], [1.0, 1.0, 1.0], jac="cs")
-    >>> fit.values.round(9).tolist(), fit.identifiability.text(0)
+    >>> fit.values.round(9).tolist(), fit.identifiability.format_combination(0)
     ([2.0, 3.0, 0.0], 'a + c')
 
     Source: Khoshzaban 1992, 3.37-3.43 (truncation, 5 % lowered on convergence); Khalil and Gautier
@@ -461,7 +461,7 @@ def _minimize_with_scipy(search: _ScaledProblem, begin: _SearchState, max_steps:
     base, problem = begin.x, search.problem
     found = scipy.optimize.least_squares(
         lambda u: search.weighted_residual(search.all_parameters(base, u)), np.zeros(len(search.free)),
-        jac=lambda u: search.matrix(problem.matrix(search.full(base, u))),  # type: ignore
+        jac=lambda u: search.weighted_jacobian(problem.jacobian(search.all_parameters(base, u))),  # type: ignore
         method="lm", ftol=1e-14, xtol=1e-12, gtol=1e-14, max_nfev=10 * max_steps,
     )  # fmt: skip
     good = found.status > 0

@@ -49,7 +49,7 @@ from hydrotele.kinematics.wires import (
     pose_covariance,
     pose_from_wires,
 )
-from hydrotele.logs.log import Table, read_table
+from hydrotele.logs.table import Table, read_table
 
 POSE_COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
 COVARIANCE_COLUMNS = tuple(f"covariance.{a}.{b}" for a, b in combinations_with_replacement(POSE_COORDINATES, 2))
@@ -58,6 +58,7 @@ _FILE_SUFFIXES = (".csv", ".parquet")
 _RANGE_MARGIN = 0.2  # fraction of a joint's range by which a reading may exceed it
 _MAX_LEG_DIFFERENCE = 0.05  # m: median leg difference from the nominal robot above which it is another robot
 _DEFAULT_WIRE_DEVIATION = 1e-4  # m: default of a wire's deviation; only its ratio to the other errors matters
+_MIN_NOISE, _MAX_NOISE = 1e-9, 1.0  # m: noise below rounding of the poses, and noise of the robot's size
 _POSE_RESOLUTION = 1e-5  # m or rad: resolution at which poses count as repeated
 
 
@@ -222,6 +223,7 @@ def _read_poses(file: Path, facts: MeasurementSpec, robot: HybridRobot) -> Measu
         of_pose, known = _pose_covariance(table, columns, noise, len(legs))
     _check_robot(table, robot, joints, legs, pose)
     whole = _leg_residual_covariance(robot, joints, pose, of_pose, noise)
+    _check_covariance(file, whole)
     return Measurement(
         str(file), np.arange(len(legs)), joints, legs, pose, whole,
         known and noise.leg is not None,
@@ -305,7 +307,7 @@ def _pose_covariance(table, columns, noise, count) -> tuple[np.ndarray, bool]:
         for row, matrix in enumerate(result):
             if np.linalg.eigvalsh(matrix)[0] < 0.0:
                 said = "the covariance of this pose is not positive semidefinite"
-                raise InputError(table.where("covariance.x.x", row), said)
+                raise InputError(table.location("covariance.x.x", row), said)
         return result, True
     position, orientation = noise.position or 5e-5, noise.orientation or 1e-4
     known = noise.position is not None and noise.orientation is not None
@@ -328,6 +330,19 @@ def _leg_residual_covariance(robot: HybridRobot, joints, pose: PlatformPose, of_
         + by_pose @ of_pose @ np.swapaxes(by_pose, 1, 2)
         + by_joint @ np.swapaxes(by_joint, 1, 2)
     )
+
+
+def _check_covariance(file: Path, covariance: np.ndarray) -> None:
+    """Raise an error if a stated noise is below the resolution of a length, or not finite."""
+    finite = np.isfinite(covariance).all()
+    smallest = float(np.linalg.eigvalsh(covariance)[:, 0].min()) if finite else np.inf
+    if not _MIN_NOISE**2 <= smallest <= _MAX_NOISE**2:
+        size = np.sqrt(max(smallest, 0.0))
+        raise InputError(
+            file.with_name(MEASUREMENT_FILE), f"the stated noise gives the legs a standard deviation of"
+            f" {1e3 * size:.3g} mm: state noise from {1e3 * _MIN_NOISE:.0e} mm to {1e3 * _MAX_NOISE:.0f} mm,"
+            " or leave it out to estimate it",
+        )  # fmt: skip
 
 
 def _check_robot(table: Table, robot: HybridRobot, joints, legs, pose: PlatformPose) -> None:

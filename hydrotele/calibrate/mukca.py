@@ -41,7 +41,7 @@ from hydrotele.kinematics.serial_robot import (
 )
 
 _MIN_SIZE_RATIO = 1e-7  # minimum size relative to its start: the kind has no errors
-_MAX_SIZE_RATIO = 1e3
+_MAX_SIZE_RATIO = 1e2  # 0.1 m and 0.1 rad: larger sizes make all points coincide, which fits any data
 _MAX_ROUNDS, _SIZE_TOLERANCE = 200, 1e-4
 
 
@@ -123,8 +123,9 @@ def estimate_sizes(
 
 
 def cross_validation_error(
-    matrix: np.ndarray, right_hand_side: np.ndarray, folds: np.ndarray, sizes: ErrorSizes
-) -> float:
+    matrix: np.ndarray, right_hand_side: np.ndarray, folds: np.ndarray, sizes: ErrorSizes,
+    known: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
+) -> float:  # fmt: skip
     """Return the RMS error of equations predicted by cross-validation.
 
     Args:
@@ -132,6 +133,9 @@ def cross_validation_error(
         right_hand_side: (m,) right-hand side of the equations.
         folds: (m,) fold of each equation.
         sizes: standard deviations of parameters and noise, the same for all folds.
+        known: equations (r, p) with an error of standard deviation 1, their right-hand side (r,) and
+            folds (r,). They are fitted with the other folds but not predicted. Without the distance
+            of the sockets, equal shrinking of all lengths would predict any ball position.
 
     Returns:
         The error, in the unit of the equations.
@@ -142,17 +146,20 @@ def cross_validation_error(
     >>> cross_validation_error(line, 1.0 + 2.0 * x, np.arange(40) % 4, sizes) < 1e-4
     True
     """
-    std = sizes.std / sizes.noise
-    scaled = matrix * std
-    normal, right = scaled.T @ scaled, scaled.T @ right_hand_side
+    # Each fold is compressed to its triangular factor. Normal equations would square the condition
+    # number, which is large for frames far from the robot.
+    scaled = np.column_stack([matrix * (sizes.std / sizes.noise), right_hand_side / sizes.noise])
+    factors = [np.linalg.qr(scaled[folds == fold])[1] for fold in np.unique(folds)]
+    prior = np.eye(scaled.shape[1])[:-1]
+    stated, of = prior[:0], np.empty(0)
+    if known is not None:
+        stated, of = np.column_stack([known[0] * sizes.std, known[1]]), known[2]
     total = 0.0
-    for fold in np.unique(folds):
-        inside = folds == fold
-        own, wanted = scaled[inside], right_hand_side[inside]
-        left = normal - own.T @ own + np.eye(len(std))
-        value = np.linalg.solve(left, right - own.T @ wanted)
-        total += float(np.sum((wanted - own @ value) ** 2))
-    return float(np.sqrt(total / len(right_hand_side)))
+    for k, (fold, own) in enumerate(zip(np.unique(folds), factors, strict=True)):
+        rest = np.vstack([prior, stated[of != fold], *factors[:k], *factors[k + 1 :]])
+        value = np.linalg.lstsq(rest[:, :-1], rest[:, -1], rcond=None)[0]
+        total += float(np.sum((own[:, -1] - own[:, :-1] @ value) ** 2))
+    return sizes.noise * float(np.sqrt(total / len(right_hand_side)))
 
 
 JOINT_MODELS = {
@@ -170,7 +177,14 @@ _MIN_NOISE = 1e-8  # m, minimum noise: below it rounding determines the result
 _MAX_PASSES, _NOISE_TOLERANCE = 6, 1e-3
 _MEDIAN_CHI3 = 1.5382  # median length of three standard normal errors
 _FALSE_ALARM_PROBABILITY = 1e-3  # probability that normal noise causes an outlier in any row of a data set
-_MAX_BALL_SCATTER = 30e-3  # m, scatter of the ball above which the nominal robot is another robot
+# Scatter of the ball relative to its travel if the joints moved independently. It is below 0.02 for
+# the nominal robot and close to 1 for another robot, unit or sign, whatever the robot's size.
+_MAX_RELATIVE_SCATTER = 0.05
+_MAX_SCATTER_RATIO = 5.0  # ratio of a file's scatter to that of the others above which it is of another robot
+_MAX_DISTANCE_SIGMAS = 3.0  # in scatters of the nominal robot's ball, for the distance of two sockets
+_MAX_FITTED_DISTANCE_SIGMAS = 10.0  # in standard deviations of the fitted distance; effects that are not modelled
+_MAX_LENGTH_RATIO = 0.1  # error of a length relative to the robot's reach: not due to manufacturing
+_MAX_ANGLE_ERROR = 0.3  # rad, error of an angle that is not due to assembly or the zero of an encoder
 _KIND_BY_LETTER = {"t": "length", "r": "tilt"}
 
 
@@ -285,6 +299,7 @@ class _SocketProblem:
         self.joints = np.vstack([s.joints for s in sockets])
         self.index = np.repeat(np.arange(len(sockets)), [len(s.joints) for s in sockets])
         self.count = np.bincount(self.index)
+        self.first = np.concatenate([[0], np.cumsum(self.count)[:-1]])
         self.basis = correction_derivatives(robot, self.joints, self.extra)
         self.start = np.concatenate([self.chain.nominal_values, np.zeros(len(self.extra))])
         self.options = options
@@ -297,8 +312,7 @@ class _SocketProblem:
 
     def socket_means(self, values: np.ndarray) -> np.ndarray:
         """Return the mean of rows (n, ...) over every socket."""
-        total = np.zeros((len(self.count), *values.shape[1:]))
-        np.add.at(total, self.index, values)
+        total = np.add.reduceat(values, self.first, axis=0)
         return total / self.count.reshape(-1, *[1] * (values.ndim - 1))
 
     def predict_balls(self, x: np.ndarray) -> np.ndarray:
@@ -355,56 +369,63 @@ def choose_robot(sockets: Sequence[Socket], options: SocketOptions) -> tuple[Ser
         InputError: no shipped robot has this number of joints, or all have a large scatter.
     """
     count, folder = sockets[0].joints.shape[1], sockets[0].path.parent
-    spreads: dict[str, float] = {}
-    robots = {}
-    for name in shipped_robots():
-        robot = load_robot(name)
-        if len(robot.joints) == count:
-            robots[name] = robot
-            spreads[name] = _nominal_scatter(robot, sockets)
-    if not spreads:
+    robots = {name: load_robot(name) for name in shipped_robots()}
+    robots = {name: robot for name, robot in robots.items() if len(robot.joints) == count}
+    if not robots:
         raise InputError(
             folder, f"has {count} columns, but no shipped robot has {count} joints:"
             f" give --robot FILE (YAML, URDF or MJCF)"
         )  # fmt: skip
-    best = min(spreads, key=lambda name: spreads[name])
-    if spreads[best] > _MAX_BALL_SCATTER:
-        said = ", ".join(f"{name} {1e3 * spread:.0f} mm" for name, spread in spreads.items())
+    found = {name: _ball_scatter(robot, sockets) for name, robot in robots.items()}
+    best = min(found, key=lambda name: found[name].relative)
+    if found[best].relative > _MAX_RELATIVE_SCATTER:
+        said = ", ".join(f"{name} {_format_scatter(one)}" for name, one in found.items())
         raise InputError(
             folder, f"no shipped robot fits the measurements (median scatter of the ball: {said}):"
-            f" give --robot FILE (YAML, URDF or MJCF){_degrees_hint(robots, sockets)}"
+            f" give --robot FILE (YAML, URDF or MJCF){_unit_hint(robots, sockets)}"
         )  # fmt: skip
-    return robots[best], spreads
+    return robots[best], {name: one.distance for name, one in found.items()}
 
 
-def check_robot(robot: SerialRobot, sockets: Sequence[Socket]) -> None:
+def check_robot(robot: SerialRobot, sockets: Sequence[Socket], options: SocketOptions | None = None) -> None:
     """Raise an error if the measurements do not fit a robot.
+
+    The scatter of the ball is compared with its travel if the joints moved independently. In a
+    socket, the motions of the joints cancel; with another unit, sign or order they do not.
 
     Args:
         robot: nominal robot.
         sockets: the measurements.
+        options: options of the calibration; by default the distance of the sockets is unknown.
 
     Raises:
-        InputError: the ball positions of all files, or of one file, scatter by centimetres.
+        InputError: the ball positions of all files, or of one file, scatter too much, or the
+            distance of two sockets differs from the stated one.
     """
-    problem = _SocketProblem(robot, sockets, (), SocketOptions(distance=None))
-    apart = problem.subtract_means(problem.predict_balls(_fit_nominal_ball(problem)))
-    typical = np.array([
-        np.median(np.linalg.norm(apart[problem.index == k], axis=1)) for k in range(len(sockets))
-    ])  # fmt: skip
-    usual = float(np.median(typical))
-    if usual > _MAX_BALL_SCATTER:
+    scatter = _ball_scatter(robot, sockets)
+    if scatter.relative > _MAX_RELATIVE_SCATTER:
         raise InputError(
-            sockets[0].path.parent, f"the ball of robot {robot.name} scatters by"
-            f" {1e3 * usual:.0f} mm: another robot, another order or sign of joints"
-            f"{_degrees_hint({robot.name: robot}, sockets)}"
+            sockets[0].path.parent, f"the ball of robot {robot.name} scatters by {_format_scatter(scatter)}"
+            f" (at most {100.0 * _MAX_RELATIVE_SCATTER:.0f} %): another robot, another order, sign or unit of joints,"
+            f" or postures that differ too little{_unit_hint({robot.name: robot}, sockets)}"
         )  # fmt: skip
-    for socket, spread in zip(sockets, typical, strict=True):
-        if spread > max(_MAX_BALL_SCATTER, 5.0 * usual):
+    for socket, ratio, spread in zip(sockets, scatter.relative_by_socket, scatter.distance_by_socket, strict=True):
+        if ratio > max(_MAX_RELATIVE_SCATTER, _MAX_SCATTER_RATIO * scatter.relative):
             raise InputError(
-                socket.path, f"the ball of robot {robot.name} scatters by {1e3 * spread:.0f} mm, in"
-                f" the other files by {1e3 * usual:.1f} mm: a file of another robot or unit, or"
+                socket.path, f"the ball of robot {robot.name} scatters by {1e3 * spread:.3g} mm, in"
+                f" the other files by {1e3 * scatter.distance:.3g} mm: a file of another robot or unit, or"
                 " postures with the ball outside the socket"
+            )  # fmt: skip
+    if options is None or options.distance is None:
+        return
+    limit = _MAX_DISTANCE_SIGMAS * (scatter.distance + options.accuracy)
+    for a, b in _neighbour_pairs(sockets):
+        apart = float(np.linalg.norm(scatter.means[a] - scatter.means[b]))
+        if abs(apart - options.distance) > limit:
+            raise InputError(
+                sockets[b].path, f"with robot {robot.name} this socket is {1e3 * apart:.4g} mm from"
+                f" {sockets[a].name}, not {1e3 * options.distance:.4g} mm: correct --distance (0 if it is not known),"
+                " the robot or the unit of the joints"
             )  # fmt: skip
 
 
@@ -422,9 +443,11 @@ def calibrate_sockets(
         The calibration.
 
     Raises:
-        InputError: there are fewer equations than parameters.
+        InputError: there are fewer equations than parameters, or the fit contradicts the distance
+            of the sockets or needs errors that are not due to manufacturing.
     """
     options = options or SocketOptions()
+    nominal, robot = robot, place_frames_near(robot, sockets)
     problem = _SocketProblem(robot, sockets, (), options)
     _check_count(problem)
     robust, gone = _remove_gross_outliers(problem)
@@ -444,6 +467,7 @@ def calibrate_sockets(
         gone = names
         robust = _remove_rows(sockets, gone)
     fit = _final_fit(full, found)
+    _check_fit(full, fit, found.sizes.noise)
     p = len(full.chain.nominal_values)
     values = dict(zip(full.names, fit.values.tolist(), strict=True))
     made = correct_robot(robot, values, dict(zip(extra, fit.values[p:].tolist(), strict=True)))
@@ -452,9 +476,42 @@ def calibrate_sockets(
     plain = _SocketProblem(robot, sockets, (), options)
     before = _evaluate_balls(plain, plain.predict_balls(_fit_nominal_ball(plain)))
     return SocketCalibration(
-        robot, made, model, rivals, fit, sizes, found.sizes.noise, before,
+        nominal, made, model, rivals, fit, sizes, found.sizes.noise, before,
         evaluate_robot(made, sockets), tuple(outliers), options,
     )  # fmt: skip
+
+
+def place_frames_near(robot: SerialRobot, sockets: Sequence[Socket]) -> SerialRobot:
+    """Return the same robot without frames that are farther along their joint axes than the robot reaches.
+
+    A frame may lie anywhere on its axis. The factory calibration of robots with parallel axes puts
+    frames hundreds of metres away, where a small tilt is a large displacement: the equations are
+    badly scaled, and errors of one kind have no common size.
+
+    Args:
+        robot: the robot.
+        sockets: postures, from which the reach follows.
+
+    Returns:
+        The robot with such frames at the point of their axis closest to the frame before.
+    """
+    problem = _SocketProblem(robot, sockets, (), SocketOptions(distance=None))
+    reach = _median_reach(problem)
+    joints, back = [], np.eye(4)
+    for joint in robot.joints:
+        origin, slide = back @ joint.origin, np.eye(4)
+        along = origin[:3, :3] @ joint.axis
+        if abs(along @ origin[:3, 3]) > reach:
+            slide[:3, 3] = -(along @ origin[:3, 3]) * joint.axis
+        joints.append(replace(joint, origin=origin @ slide))
+        back = np.linalg.inv(slide)
+    return replace(robot, joints=tuple(joints), tool=back @ robot.tool)
+
+
+def _median_reach(problem: _SocketProblem) -> float:
+    """Return the median distance of the ball from the first joint [m]."""
+    balls = problem.predict_balls(problem.start)
+    return float(np.median(np.linalg.norm(balls - problem.robot.joints[0].origin[:3, 3], axis=1)))
 
 
 def evaluate_robot(robot: SerialRobot, sockets: Sequence[Socket]) -> SocketErrors:
@@ -649,23 +706,86 @@ def _fit_nominal_ball(problem: _SocketProblem) -> np.ndarray:
     return x
 
 
-def _nominal_scatter(robot: SerialRobot, sockets: Sequence[Socket]) -> float:
-    """Return the median over sockets of the median distance from the mean [m], ball fitted."""
+@dataclass(frozen=True)
+class _BallScatter:
+    """Scatter of the ball of the nominal robot in its sockets, with the ball position fitted.
+
+    Attributes:
+        distance: median over sockets of the median distance from the mean [m].
+        relative: the same relative to the travel of the ball if the joints moved independently.
+        distance_by_socket: (k,) median distance from the mean [m].
+        relative_by_socket: (k,) the same relative to the travel.
+        means: (k, 3) mean positions [m].
+    """
+
+    distance: float
+    relative: float
+    distance_by_socket: np.ndarray
+    relative_by_socket: np.ndarray
+    means: np.ndarray
+
+
+def _ball_scatter(robot: SerialRobot, sockets: Sequence[Socket]) -> _BallScatter:
+    """Return the scatter of a nominal robot's ball; the travel is that of permuted joint columns."""
     problem = _SocketProblem(robot, sockets, (), SocketOptions(distance=None))
-    apart = np.linalg.norm(problem.subtract_means(problem.predict_balls(_fit_nominal_ball(problem))), axis=1)
-    return float(np.median([np.median(apart[problem.index == k]) for k in range(len(sockets))]))
+    x = _fit_nominal_ball(problem)
+    balls = problem.predict_balls(x)
+    rng = np.random.default_rng(0)
+    mixed = np.vstack([rng.permuted(socket.joints, axis=0) for socket in sockets])
+    loose = chain_poses(problem.chain, mixed, x[: len(problem.chain.nominal_values)]).position
+    parts = [slice(first, first + n) for first, n in zip(problem.first, problem.count, strict=True)]
+    apart, travel = (
+        np.array([np.median(np.linalg.norm(problem.subtract_means(rows)[part], axis=1)) for part in parts])
+        for rows in (balls, loose)
+    )
+    ratio = apart / np.maximum(travel, np.finfo(float).tiny)
+    return _BallScatter(float(np.median(apart)), float(np.median(ratio)), apart, ratio, problem.socket_means(balls))
 
 
-def _degrees_hint(robots: dict[str, SerialRobot], sockets: Sequence[Socket]) -> str:
-    radians = [Socket(s.place, s.hole, s.path, np.radians(s.joints), s.lines) for s in sockets]
-    for name, robot in robots.items():
-        spread = _nominal_scatter(robot, radians)
-        if spread < _MAX_BALL_SCATTER:
-            return (
-                f"; read as degrees, the ball of {name} scatters by {1e3 * spread:.1f} mm:"
-                " convert the angles to radians or give --unit deg"
-            )
+def _format_scatter(scatter: _BallScatter) -> str:
+    return f"{1e3 * scatter.distance:.3g} mm, {100.0 * scatter.relative:.2g} % of its free travel"
+
+
+def _unit_hint(robots: dict[str, SerialRobot], sockets: Sequence[Socket]) -> str:
+    """Return a hint to the unit of the angles if the other unit fits, otherwise an empty text."""
+    for unit, convert in (("deg", np.radians), ("rad", np.degrees)):
+        other = [replace(s, joints=convert(s.joints)) for s in sockets]
+        for name, robot in robots.items():
+            scatter = _ball_scatter(robot, other)
+            if scatter.relative <= _MAX_RELATIVE_SCATTER:
+                named = {"deg": "degrees", "rad": "radians"}[unit]
+                return (
+                    f"; read as {named}, the ball of {name} scatters by {_format_scatter(scatter)}: give --unit {unit}"
+                )
     return ""
+
+
+def _check_fit(problem: _SocketProblem, fit: ParameterFit, noise: float) -> None:
+    """Raise an error if a fit contradicts the socket distance, or has implausible errors."""
+    folder = problem.sockets[0].path.parent
+    many = 3 * len(problem.joints)
+    gaps, sigma = fit.residual[many:], problem.equation_deviations(noise)[many:]
+    for (a, b), gap, deviation in zip(problem.pairs, gaps, sigma, strict=True):
+        if abs(gap) > _MAX_FITTED_DISTANCE_SIGMAS * deviation:
+            found = 1e3 * (problem.options.distance + gap)
+            raise InputError(
+                problem.sockets[b].path, f"the calibrated robot puts this socket {found:.4g} mm from"
+                f" {problem.sockets[a].name}, not {1e3 * problem.options.distance:.4g} mm:"
+                " correct --distance, the robot or the unit of the joints, or state the --accuracy of the distance"
+            )  # fmt: skip
+    reach = _median_reach(problem)
+    for name, value in zip(problem.names, fit.values - problem.start, strict=True):
+        kind, _, joint = name.partition(".")
+        if joint == "tool" or kind not in ("tx", "ty", "tz", "rx", "ry", "rz"):
+            continue
+        limit = _MAX_LENGTH_RATIO * reach if kind[0] == "t" else _MAX_ANGLE_ERROR
+        if abs(value) > limit:
+            unit, factor = ("mm", 1e3) if kind[0] == "t" else ("deg", float(np.degrees(1.0)))
+            raise InputError(
+                folder, f"the fit needs an error of {factor * value:.3g} {unit} in {name} of robot"
+                f" {problem.robot.name}, beyond {factor * limit:.3g} {unit}: it is not accepted."
+                " Correct the robot, --distance, or the unit, order or sign of the joints"
+            )  # fmt: skip
 
 
 def _select_model(problem: _SocketProblem, state: _FitState) -> tuple[str, dict[str, float]]:
@@ -692,7 +812,8 @@ def _select_model(problem: _SocketProblem, state: _FitState) -> tuple[str, dict[
             matrix[:many], rest[:many], _parameter_kinds(full), begun.sizes.std, full.degrees_of_freedom,
             state.sizes.noise, matrix[many:] * weight[:, None], rest[many:] * weight, _MIN_NOISE,
         )  # fmt: skip
-        errors[model] = cross_validation_error(matrix[:many], rest[:many], folds, sizes)
+        known = (matrix[many:] * weight[:, None], rest[many:] * weight, np.array(part)[[a for a, _ in full.pairs]])
+        errors[model] = cross_validation_error(matrix[:many], rest[:many], folds, sizes, known if full.pairs else None)
     return wanted or min(errors, key=lambda model: errors[model]), errors
 
 

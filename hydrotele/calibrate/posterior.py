@@ -19,6 +19,8 @@ from hydrotele.core.errors import InputError
 Cost = Callable[[np.ndarray], np.ndarray]  # (S, p) -> (S,)
 _MAX_RHAT = 1.05  # maximum split R-hat of mixed chains
 _MIN_AUTOCORRELATION_TIMES = 50.0  # minimum chain length in autocorrelation times, as recommended by emcee
+MIN_STEPS = 40  # steps: four draws of every tenth step, so that each half chain has a variance
+MAX_STEPS = 100_000  # steps: a chain of 1 GB for 54 parameters
 _JUMP_FRACTION = 0.1  # fraction of DE moves with the full difference, which jump between modes
 
 

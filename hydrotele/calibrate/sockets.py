@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from hydrotele.core.errors import InputError
-from hydrotele.core.files import read_text
+from hydrotele.core.files import read_text, resolve_path
 from hydrotele.kinematics.serial_robot import (
     SerialRobot,
     correct_robot,
@@ -28,6 +28,7 @@ _FILE_PATTERN = re.compile(r"hole_?(\d+)\.(csv|txt)", re.IGNORECASE)
 _SEPARATOR_PATTERN = re.compile(r"[,;\t ]\s*|\s+")
 _POSTURE_TOLERANCE = 1e-6  # rad or m: postures that differ by less count as repeated
 _MIN_POSTURES = 3  # postures, minimum for a mean and a scatter
+_MAX_POSTURES = 2000  # postures per socket that are used: a log at 1 kHz contains no more information
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ def load_sockets(folder: str | Path, degrees: bool = False) -> tuple[tuple[Socke
     for path in paths:
         found = _FILE_PATTERN.fullmatch(path.name)
         assert found is not None
-        place = path.parent.resolve().name
+        place = resolve_path(path.parent).name
         joints, lines = _read_joints(path)
         if degrees:
             joints = np.radians(joints)
@@ -139,12 +140,9 @@ def _parse_number(word: str) -> float | None:
 
 
 def _remove_repeated(socket: Socket, notes: list[str]) -> Socket:
-    """Return a socket without repeated postures."""
-    kept: list[int] = []
-    for row in range(len(socket.joints)):
-        away = np.abs(socket.joints[kept] - socket.joints[row]).max(axis=1)
-        if not (away < _POSTURE_TOLERANCE).any():
-            kept.append(row)
+    """Return a socket without repeated postures, with at most `_MAX_POSTURES` of them."""
+    cells = np.round(socket.joints / _POSTURE_TOLERANCE)
+    kept = np.sort(np.unique(cells, axis=0, return_index=True)[1])
     if len(kept) < _MIN_POSTURES:
         raise InputError(
             socket.path,
@@ -156,6 +154,9 @@ def _remove_repeated(socket: Socket, notes: list[str]) -> Socket:
         rows = ", ".join(str(socket.lines[row]) for row in gone[:8])
         more = " ..." if len(gone) > 8 else ""
         notes.append(f"{socket.path}: rows {rows}{more} repeat earlier ones and are left out")
+    if len(kept) > _MAX_POSTURES:
+        notes.append(f"{socket.path}: {_MAX_POSTURES} of {len(kept)} rows are used, evenly spaced")
+        kept = kept[np.linspace(0, len(kept) - 1, _MAX_POSTURES).astype(int)]
     return replace(socket, joints=socket.joints[kept], lines=socket.lines[kept])
 
 

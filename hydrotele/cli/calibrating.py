@@ -114,7 +114,9 @@ def hybrid(
     model: Annotated[str, typer.Option(help="Error model: dh, poe, or auto (the better of the two).")] = "auto",
     parameters: Annotated[str, typer.Option(help="all, document (the 36 of Wang 2012), or names with commas.")] = "all",
     evolution: Annotated[bool, typer.Option("--evolution", help="Also search by differential evolution.")] = False,
-    posterior: Annotated[int, typer.Option(min=0, metavar="STEPS", help="Also sample the posterior by MCMC.")] = 0,
+    posterior: Annotated[
+        int, typer.Option(min=0, metavar="STEPS", help="Also sample the posterior by MCMC, 40 steps or more.")
+    ] = 0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 0,
     simulate: Annotated[Path | None, typer.Option(help="Write a simulated measurement to this folder instead.")] = None,
     poses: Annotated[int, typer.Option(min=1, help="Number of simulated poses.")] = 25,
@@ -155,7 +157,7 @@ def scara(
         float,
         typer.Option(min=0.0, help="Standard deviation of simulated positions [mm]."),
     ] = 0.05,
-    seed: Annotated[int, typer.Option(help="Random seed of the simulation.")] = 1,
+    seed: Annotated[int, typer.Option(help="Random seed of the simulation, 0 or more.")] = 1,
     choose: Annotated[int | None, typer.Option(min=2, help="Also list this many most informative poses.")] = None,
     out: OutOption = None,
     json: JsonOption = False,

@@ -18,7 +18,7 @@ from hydrotele.calibrate.arm import (
     identify_jointly,
     stage_residuals,
 )
-from hydrotele.calibrate.arm_data import extract_strokes, read_stages, split_poses
+from hydrotele.calibrate.arm_data import extract_strokes, log_to_poses, read_calibration_logs, split_poses
 from hydrotele.calibrate.arm_poses import Poses, add_drift
 from hydrotele.calibrate.bad_data import CorruptedRegion, identify_without_bad_data
 from hydrotele.calibrate.flexibility import (
@@ -41,6 +41,7 @@ from hydrotele.cli.console import (
     ignore_stage,
     make_table,
     print_json,
+    print_notes,
     show_stages,
     stdout_console,
     to_json_types,
@@ -48,7 +49,6 @@ from hydrotele.cli.console import (
 )
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import atomic_folder, check_output_folder
-from hydrotele.logs.log import load_logs
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import MACHINE_FILE, load_machine, save_machine
 
@@ -153,7 +153,9 @@ def fit_arm(
     loop = build_loop(nominal)
     accuracy = None if choices.accuracy_deg is None else float(np.radians(choices.accuracy_deg))
     report("read the logs", 0.0)
-    stages = read_stages(data, nominal, loop, choices.poses, accuracy)
+    logs, notes = read_calibration_logs(data, nominal)
+    print_notes(notes)
+    stages = [log_to_poses(log, nominal, loop, choices.poses, accuracy) for log in logs]
     if choices.drift:
         report("remove the drift of the sensors", 0.1)
         stages = [add_drift(loop, poses) for poses in stages]
@@ -370,16 +372,13 @@ def fit_linkages(nominal: Machine, data: Path, angles: str, report: StageReport 
     """
     axes = [name for name, axis in nominal.axes.items() if axis.cylinder and not axis.four_bar]
     report("read the logs", 0.0)
-    logs = load_logs(data)
-    for log in logs:
-        if (of := log.metadata.get("machine", nominal.name)) != nominal.name:
-            message = f"is a log of machine {of}, not of {nominal.name}: give --machine {of}"
-            raise InputError(log.source, message)
+    logs, notes = read_calibration_logs(data, nominal)
+    print_notes(notes)
     strokes = [s for log in logs for s in extract_strokes(log, nominal, axes)]
     if angles == "identified":
         report("identify the joint angles", 0.1)
         loop = build_loop(nominal)
-        stages = read_stages(data, nominal, loop)
+        stages = [log_to_poses(log, nominal, loop) for log in logs]
         fit = identify_jointly(identify_arm(loop, stages), stages)
         by_source = {log.source: log for log in logs}
         strokes = []

@@ -6,7 +6,7 @@ two links from measured positions. `hybrid` calibrates a serial robot that carri
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +45,8 @@ from hydrotele.calibrate.mukca import (
     predict_held_out_place,
 )
 from hydrotele.calibrate.posterior import (
+    MAX_STEPS,
+    MIN_STEPS,
     EvolutionResult,
     Posterior,
     minimize_by_evolution,
@@ -68,22 +70,26 @@ from hydrotele.cli.console import (
     to_json_types,
     write_json,
 )
+from hydrotele.cli.option_values import check_range
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import read_text
 from hydrotele.core.output import atomic_folder, check_output_folder
 from hydrotele.identify.identifiability import STATUS_FULL
 from hydrotele.kinematics.hybrid import (
     HybridRobot,
+    UnreachableError,
     build_error_model,
     forward_kinematics,
     load_hybrid,
     refined_model_parameters,
     save_hybrid,
 )
-from hydrotele.kinematics.serial_robot import SerialRobot, correct_urdf, load_robot, robot_to_yaml
-from hydrotele.kinematics.wires import wire_lengths
+from hydrotele.kinematics.serial_robot import SerialRobot, correct_urdf, expand_joints, load_robot, robot_to_yaml
+from hydrotele.kinematics.wires import NoIntersectionError, wire_lengths
 
 _ROBOT_FILES = ("robot.yaml", "robot.yml", "*.urdf", "*.xml")
+MAX_SOCKET_DISTANCE = 10_000.0  # mm: larger than the reach of a robot
+MAX_SCARA_NOISE = 100.0  # mm: a larger position error is not noise for links of 0.4 and 0.3 m
 _EXAMPLE = ScaraSpec(length_a=0.4, length_b=0.3)
 _EXAMPLE_ERRORS = (
     0.0,
@@ -135,12 +141,15 @@ def calibrate_mukca(data: Path, choices: SocketChoices, target: Path | None, as_
     """
     if choices.unit not in ("rad", "deg"):
         raise InputError(f"--unit {choices.unit}", "must be rad or deg")
+    check_range("--distance", 1e3 * choices.distance, 0.0, MAX_SOCKET_DISTANCE, "distance [mm]")
+    check_range("--accuracy", 1e3 * choices.accuracy, 1e-6, MAX_SOCKET_DISTANCE, "standard deviation [mm]")
     if target is not None:
         check_output_folder(target, "robot calibration")
     sockets, notes = load_sockets(data, choices.unit == "deg")
     options = SocketOptions(choices.distance or None, choices.accuracy, choices.model)
     robot, said = _find_robot(data, choices.robot, sockets, options)
-    check_robot(robot, sockets)
+    sockets = tuple(replace(one, joints=expand_joints(robot, one.joints)) for one in sockets)
+    check_robot(robot, sockets, options)
     notes = [*said, *notes, *_identifiability_notes(robot, sockets, options)]
     left: list[HeldOutPrediction] = []
     with show_stages("calibrate mukca", as_json) as progress:
@@ -222,7 +231,7 @@ def socket_document(
 
 def _heldout_document(heldout_parts: Sequence[HeldOutPrediction], rows: dict[str, int]) -> dict[str, Any]:
     def rms_over_parts(kind: str, what: str) -> float:
-        squares = [getattr(getattr(one, kind), what) ** 2 * rows[one.name] for one in heldout_parts]
+        squares = [getattr(getattr(one, f"{kind}_errors"), what) ** 2 * rows[one.name] for one in heldout_parts]
         return 1e3 * float(np.sqrt(np.sum(squares) / sum(rows.values())))
 
     distances = {k: v for one in heldout_parts for k, v in one.calibrated_errors.socket_distances.items()}
@@ -400,6 +409,9 @@ def simulate_scara_to_folder(folder: Path, poses: int, noise: float, seed: int) 
     Raises:
         InputError: the folder is not empty.
     """
+    check_range("--seed", seed, 0, MAX_SEED, "random seed")
+    check_range("--noise", 1e3 * noise, 0.0, MAX_SCARA_NOISE, "standard deviation [mm]")
+    check_range("--poses", poses, 4, MAX_POSES, "number of poses")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(folder, "exists; give another folder to --simulate")
     save_scara(folder, _EXAMPLE, simulate_scara(_EXAMPLE, _EXAMPLE_ERRORS, poses, noise, seed))
@@ -508,6 +520,10 @@ def _print_scara(document: dict[str, Any]) -> None:
 KIND = "hybrid calibration"
 MEASUREMENT = "hybrid measurement"
 CRITERIA = ("D", "O1", "O2", "O3", "O4", "O5")
+MAX_SEED = 2**32 - 1  # of NumPy's RandomState, which emcee uses
+MAX_ERROR_FACTOR = 50.0  # of 1 mm and 1 mrad: with larger errors the legs do not reach the poses
+MAX_NOISE_FACTOR = 1000.0  # of 0.01 mm: larger noise is not that of a sensor
+MAX_POSES = 100_000  # poses: 100 MB of equations
 CANDIDATES = 200  # number of random poses from which the most informative are selected
 SENSOR_NOISE = {
     "leg": 1e-5,
@@ -543,6 +559,9 @@ def calibrate_hybrid(
     """
     if kind not in ("auto", "dh", "poe"):
         raise InputError(f"--model {kind}", "valid: auto, dh, poe")
+    check_range("--seed", seed, 0, MAX_SEED, "random seed")
+    if steps:
+        check_range("--posterior", steps, MIN_STEPS, MAX_STEPS, "number of MCMC steps")
     if target:
         check_output_folder(target, KIND)
     nominal = load_hybrid(robot or find_robot_file(Path(data)) or "iwr")
@@ -710,7 +729,7 @@ def _write_hybrid_files(folder: Path, result, calibration: Calibration, heldout,
         chosen = np.sort(place)
         sizes = [1e-3] * len(chosen)
         truth = calibration.fit.values[[calibration.fit.names.index(posterior.names[k]) for k in chosen]]
-        image = draw_posterior(posterior.flat[:, chosen] / sizes, [posterior.names[k] for k in chosen],
+        image = draw_posterior(posterior.flat_sample[:, chosen] / sizes, [posterior.names[k] for k in chosen],
                        truth / sizes, "least squares")  # fmt: skip
         (folder / "posterior.png").write_bytes(image)
     summary = {"kind": KIND, "name": result["robot"], "hydrotele": hydrotele.__version__}
@@ -792,6 +811,11 @@ def simulate_hybrid(
 
     if choose not in ("random", *CRITERIA):
         raise InputError(f"--choose {choose}", f"valid: random, {', '.join(CRITERIA)}")
+    check_range("--seed", seed, 0, MAX_SEED, "random seed")
+    check_range("--errors", errors, 0.0, MAX_ERROR_FACTOR, "factor on errors of 1 mm and 1 mrad")
+    check_range("--noise", noise, 0.0, MAX_NOISE_FACTOR, "factor on the noise of the sensors")
+    check_range("--poses", poses, 1, MAX_POSES, "number of poses")
+    check_range("--heldout", heldout, 0, MAX_POSES, "number of poses")
     check_output_folder(target, MEASUREMENT)
     nominal = load_hybrid(robot or "iwr")
     kind = "dh" if kind == "auto" and nominal.specification.carriage else "poe" if kind == "auto" else kind
@@ -808,7 +832,12 @@ def simulate_hybrid(
                 joints, legs = sample_poses(nominal, count, rng, wires)
                 if stem == POSES_STEM and choose != "random":
                     joints, legs = _select_poses(model, wires, count, rng, choose)
-                read = simulate_measured_poses(true, joints, legs, wires, sizes, rng)
+                try:
+                    read = simulate_measured_poses(true, joints, legs, wires, sizes, rng)
+                except (UnreachableError, NoIntersectionError) as error:
+                    raise InputError(
+                        f"--errors {errors:g} --noise {noise:g}", f"{error}: reduce the errors or the noise"
+                    ) from None
                 save_measurement(folder, stem, nominal, read.joints, read.legs, wires=read.wires)
         (folder / "measurement.yaml").write_text(measurement_text(nominal.name, wires, stated))
         save_hybrid(nominal, folder / "robot.yaml", "nominal robot")

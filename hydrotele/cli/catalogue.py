@@ -6,14 +6,16 @@ writes the MJCF or an image of a machine.
 
 from pathlib import Path
 from textwrap import wrap
+from typing import NamedTuple
 
 import typer
 
-from hydrotele.cli.console import print_json, stderr_console, stdout_console
+from hydrotele.cli.console import print_json, print_notes, stderr_console, stdout_console
 from hydrotele.core.datafile import read_yaml, suggest_valid_name
 from hydrotele.core.errors import InputError
+from hydrotele.logs.log import LOG_SUFFIXES, MEASURED_STEM, find_logs
 from hydrotele.machine.joystick import JOYSTICK_FILE, load_joystick, shipped_joysticks
-from hydrotele.machine.machine_file import load_machine, machine_path, shipped_machines
+from hydrotele.machine.machine_file import MACHINE_FILE, load_machine, machine_path, shipped_machines
 from hydrotele.simulate.mechanism import Mjcf
 
 _DESCRIPTIONS = ("description", "what")  # keys of the text that describes an item
@@ -49,7 +51,7 @@ def list_items(item_kind: str | None, as_json: bool) -> None:
 
 
 _MAX_SUMMARY_LINES = 30  # a summary fits a terminal window
-_MIN_TEXT_WIDTH = 30  # characters beside the names; a narrower text starts below its name
+_MIN_TEXT_WIDTH = 30  # characters next to the names; a narrower text starts below its name
 
 
 def format_summary(names: dict[str, list[str]], width: int) -> str:
@@ -217,12 +219,27 @@ def _environment_rows() -> list[dict]:
     ]
 
 
-def validate_files(paths: list[Path], as_json: bool) -> None:
+class LogMachine(NamedTuple):
+    """Machine against which logs are checked.
+
+    Attributes:
+        name: name or folder of the machine, None to find it by the logs.
+        tool: tool of the machine, None for that of the logs.
+        force: accept logs whose metadata names another machine or tool.
+    """
+
+    name: str | None = None
+    tool: str | None = None
+    force: bool = False
+
+
+def validate_files(paths: list[Path], as_json: bool, log_machine: LogMachine | None = None) -> None:
     """Check machines with all their tools, joysticks, scenarios, sweeps and logs.
 
     Args:
         paths: files, folders or shipped names to check.
         as_json: print JSON instead of text.
+        log_machine: machine of the logs, None to find it by the logs.
 
     Raises:
         InputError: a file is not valid; it is raised after all files were checked.
@@ -231,10 +248,13 @@ def validate_files(paths: list[Path], as_json: bool) -> None:
     wrong: list[InputError] = []
     for path in paths:
         try:
-            kind, said = _validate_file(path)
-            checked.append({"file": str(path), "kind": kind, "valid": True, "contents": said})
+            notes: list[str] = []
+            kind, said = _validate_file(path, log_machine or LogMachine(), notes)
+            entry = {"file": str(path), "kind": kind, "valid": True, "contents": said}
+            checked.append(entry | ({"notes": notes} if kind == "log" else {}))
             if not as_json:
                 stdout_console.print(f"[green]valid[/] {kind} {path}: {said}", soft_wrap=True)
+                print_notes(notes)
         except InputError as error:
             checked.append({"file": str(path), "valid": False, "error": str(error)})
             wrong.append(error)
@@ -246,14 +266,10 @@ def validate_files(paths: list[Path], as_json: bool) -> None:
         raise wrong[-1]
 
 
-def _validate_file(path: Path) -> tuple[str, str]:
-    if path.suffix.lower() in (".parquet", ".csv"):
-        from hydrotele.logs.log import load_log
-
-        log = load_log(path)
-        return "log", f"{len(log)} rows at {log.rate:g} Hz, {len(log.columns)} columns"
-    if path.is_dir() and (path / "summary.json").is_file():
-        return _validate_file(path / "measured.parquet")
+def _validate_file(path: Path, log_machine: LogMachine, notes: list[str]) -> tuple[str, str]:
+    """Return kind and content of a valid file, and append notes on repairs of a log to `notes`."""
+    if path.suffix.lower() in LOG_SUFFIXES or _is_log_folder(path):
+        return "log", _check_logs(path, log_machine, notes)
     from hydrotele.scenario.scenario import load_scenario, shipped_scenarios
 
     name = str(path)
@@ -268,8 +284,47 @@ def _validate_file(path: Path) -> tuple[str, str]:
     if path.is_file():
         return "machine", _check_machine(path)
     names = [*shipped_machines(), *shipped_joysticks(), *shipped_scenarios(), *_sweep_names()]
-    message = "is not a file, machine, joystick, scenario or sweep"
+    message = (
+        "does not exist"
+        if path.parent != Path() or path.suffix
+        else "is not a file, machine, joystick, scenario or sweep"
+    )
     raise InputError(path, f"{message}; {suggest_valid_name(name, names)}")
+
+
+def _is_log_folder(path: Path) -> bool:
+    """Return whether a path is a run folder, or a folder with logs that is not a machine or joystick."""
+    if not path.is_dir():
+        return False
+    if (path / "summary.json").is_file() or (path / f"{MEASURED_STEM}.parquet").is_file():
+        return True
+    if (path / MACHINE_FILE).is_file() or (path / JOYSTICK_FILE).is_file():
+        return False
+    try:
+        return bool(find_logs(path))
+    except InputError:
+        return False
+
+
+def _check_logs(path: Path, log_machine: LogMachine, notes: list[str]) -> str:
+    """Check the logs of a path by the rule of all commands, and return a summary of their content."""
+    from hydrotele.cli.opening import name_machine, open_logs
+    from hydrotele.logs.dataset import make_dataset, merge_runs_without_machine
+
+    if name_machine([path], log_machine.name)[0] is None:
+        logs, said = merge_runs_without_machine(path)
+        notes += said
+        checked = "; not checked against a machine: give --machine"
+    else:
+        opened = open_logs([path], *log_machine)
+        logs, checked = opened.logs, f"; checked against {opened.machine.name}"
+        notes += opened.notes
+        try:
+            notes += (n for n in make_dataset(opened.runs, opened.machine).notes if n not in notes)
+        except InputError as error:
+            notes.append(f"gap, identify and compare need more than this path alone: {error}")
+    first = f"{len(logs[0])} rows at {logs[0].rate:g} Hz, {len(logs[0].columns)} columns"
+    return first + checked if len(logs) == 1 else f"{len(logs)} logs; {logs[0].name}: {first}{checked}"
 
 
 def _sweep_names() -> list[str]:
@@ -369,10 +424,11 @@ def export_machine(name: str, tool: str | None, target: Path | None, picture: Pa
 def _export_joystick(name: str, target: Path | None, picture: Path | None, camera: str) -> None:
     import mujoco
 
-    from hydrotele.simulate.joystick import joystick_spec
+    from hydrotele.simulate.joystick import compile_joystick, joystick_spec
 
-    spec = joystick_spec(load_joystick(name), hand=False)
-    model = spec.compile()
+    facts = load_joystick(name)
+    spec = joystick_spec(facts, hand=False)
+    model = compile_joystick(facts, spec)
     if picture:
         from hydrotele.show.picture import render_model
 

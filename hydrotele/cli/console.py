@@ -9,7 +9,7 @@ import re
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +82,12 @@ def to_json_types(data: Any) -> Any:
     if isinstance(data, np.integer):
         return int(data)
     return data
+
+
+def print_notes(notes: Iterable[str]) -> None:
+    """Print notes on the data to standard error."""
+    for note in notes:
+        stderr_console.print(f"[yellow]note[/] {note}", soft_wrap=True)
 
 
 def make_table(title: str, *columns: str) -> Table:

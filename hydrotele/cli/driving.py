@@ -81,8 +81,6 @@ def drive_to_folder(options: DriveOptions) -> Path:
     stop_profiling_clock()
     if _is_haptic_device(options) and options.speed != 1.0:
         raise InputError("--speed", "must be 1 with a haptic device, which runs in real time")
-    if not options.speed >= 0.0:
-        raise InputError("--speed", "must be 0 (as fast as possible) or more; 1 is real time")
     if options.device == "keyboard" and not options.viewer and not options.latency:
         message = "needs the viewer window to read keys; omit --no-viewer or use another device"
         raise InputError("--device keyboard", message)

@@ -276,6 +276,8 @@ def _run_search(dataset: Dataset, effects: Sequence[str], jobs: int | None, quie
 
 def _print(gap: Gap) -> None:
     stdout_console.print(f"[bold {_COLOURS[gap.verdict]}]{headline(gap)}[/]", soft_wrap=True)
+    for words in gap.unused_channels:
+        stdout_console.print(f"[yellow]not used[/] {words}", soft_wrap=True)
     for words in verdict_words(gap):
         stdout_console.print(words, markup=False)
     if gap.effects:
@@ -288,4 +290,5 @@ def _print(gap: Gap) -> None:
         rows.columns[4].no_wrap = True
         stdout_console.print(rows)
     for note in gap.notes:
-        stdout_console.print(f"[yellow]note[/] {note}")
+        if note not in gap.unused_channels:
+            stdout_console.print(f"[yellow]note[/] {note}")

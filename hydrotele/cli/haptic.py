@@ -51,7 +51,7 @@ def serve_device(options: HapticOptions) -> None:
     ended = threading.Event()
     if options.until_eof:
         threading.Thread(target=_wait_for_stdin_close, args=(ended,), daemon=True).start()
-    end = clock.monotonic() + (options.duration or float("inf"))
+    end = clock.monotonic() + (float("inf") if options.duration is None else options.duration)
 
     def announce_address(where: tuple[str, int]) -> None:
         if options.until_eof:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import typer
 import yaml
 
 import hydrotele
@@ -26,6 +27,7 @@ from hydrotele.cli.console import (
 )
 from hydrotele.cli.opening import find_machine, name_of_data
 from hydrotele.core.errors import InputError
+from hydrotele.core.files import resolve_path
 from hydrotele.core.output import atomic_file, atomic_folder, check_output_folder
 from hydrotele.identify.estimation import Estimator
 from hydrotele.identify.excitation import MachineLimits, design_motion, select_informative_base
@@ -123,6 +125,7 @@ def identify_to_folder(
 
     Raises:
         InputError: data, machine or target are not usable.
+        typer.Exit: status 1 if the identified model predicts no held-out force better than zero force does.
     """
     target = target or Path(f"identify_{name_of_data(data)}")
     check_output_folder(target, "identify")
@@ -146,6 +149,8 @@ def identify_to_folder(
         lambda: _print(mechanism, hydraulics, dataset),
         target,
     )
+    if mechanism.identification and not mechanism.identification.explains_force:
+        raise typer.Exit(1)
     return target
 
 
@@ -170,6 +175,7 @@ def identify_mjcf_to_folder(
 
     Raises:
         InputError: data, mechanism, mapping or target are not usable.
+        typer.Exit: status 1 if the identified model predicts no held-out force better than zero force does.
     """
     from hydrotele.show.identify_report import ReportSource, write_identify_report
 
@@ -196,6 +202,8 @@ def identify_mjcf_to_folder(
         }  # fmt: skip
         write_json(folder / "summary.json", summary)
     print_result(build_identify_document(found), as_json, lambda: _print_mechanism(found, judge.name), target)
+    if not found.explains_force:
+        raise typer.Exit(1)
     return target
 
 
@@ -303,9 +311,15 @@ def _print_mechanism(identification: Identification, heldout: str) -> None:
         "drive", "given model", "identified", "noise alone", "unit", "relative",
     )  # fmt: skip
     for drive, h in identification.heldout.items():
-        judged.add_row(drive, f"{h.nominal_rms:.4g}", f"{h.rms:.4g}", f"{h.noise_rms:.4g}", h.unit,
+        noise = f"{h.noise_rms:.4g}" if np.isfinite(h.noise_rms) else "-"
+        judged.add_row(drive, f"{h.nominal_rms:.4g}", f"{h.rms:.4g}", noise, h.unit,
                        f"{100 * h.relative_error:.2f} %")  # fmt: skip
     stdout_console.print(judged)
+    if identification.friction:
+        friction = make_table("friction force at constant speed", "drive", "speed", "friction", "std. dev.", "unit")
+        for f in identification.friction:
+            friction.add_row(f.drive, f"{f.speed:g}", f"{f.force:.4g}", f"{f.std:.2g}", f.unit)
+        stdout_console.print(friction)
     distance, limit = identification.squared_distance(identification.nominal)
     stdout_console.print(
         f"the given parameters lie {'in' if distance <= limit else 'out'}side the joint 95 %"
@@ -349,7 +363,7 @@ def design_excitation_file(
     name = re.sub(r"[^a-z0-9_]", "_", target.stem.lower()).lstrip("_0123456789") or "excitation"
     if target.suffix.lower() != ".yaml" or not target.parent.is_dir():
         raise InputError(target, "must be a .yaml file in an existing folder")
-    place = machine if machine in shipped_machines() else str(Path(machine).resolve())
+    place = machine if machine in shipped_machines() else str(resolve_path(machine))
     setup = machine_setup(model, load_closed_chain(model))
     noise = np.maximum(compute_force_noise(model, named), 1e-9)
     base = select_informative_base(model, setup, noise, period, seed)

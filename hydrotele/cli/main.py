@@ -4,6 +4,7 @@ Each function parses its options and calls the module that does the work. Slow i
 the functions, so that `--help` and completion stay fast.
 """
 
+import io
 import os
 import signal
 import sys
@@ -12,9 +13,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from typer.core import TyperGroup
 
 from hydrotele.cli.calibrating import app as calibrate_app
+from hydrotele.cli.number_options import MAX_PROCESSES, NumberCheckingGroup
 from hydrotele.cli.operator_identifying import IDENTIFY_OPERATOR_EPILOG, identify_operator
 from hydrotele.cli.option_values import (
     CommandGroup,
@@ -133,8 +134,8 @@ def drive(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Output folder; default: runs/SCENARIO.")] = None,
     set_: Annotated[list[str] | None, typer.Option("--set", help="Scenario override KEY=VALUE. Repeatable.")] = None,
     viewer: Annotated[bool, typer.Option(help="Open the MuJoCo viewer.")] = True,
-    duration: Annotated[float | None, typer.Option(help="Maximum simulated time [s]; default: 600.")] = None,
-    speed: Annotated[float, typer.Option(help="Simulated time per real time; 0: as fast as possible.")] = 1.0,
+    duration: Annotated[float | None, typer.Option(min=1e-3, help="Maximum simulated time [s]; default: 600.")] = None,
+    speed: Annotated[float, typer.Option(min=0.0, help="Simulated time per real time; 0: as fast as possible.")] = 1.0,
     review: Annotated[bool, typer.Option(help="Write the rerun recording review.rrd.")] = True,
     effects: EffectFilesOption = None,
     latency: Annotated[bool, typer.Option("--latency", help="Print latency, jitter and missed deadlines.")] = False,
@@ -188,7 +189,7 @@ def sweep(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Output folder; default: runs/NAME.")] = None,
     jobs: Annotated[
         int | None,
-        typer.Option("--jobs", "-j", min=1, help="Number of processes; default: one per core."),
+        typer.Option("--jobs", "-j", min=1, max=MAX_PROCESSES, help="Number of processes; default: one per core."),
     ] = None,
     dask: Annotated[str | None, typer.Option(help="Scheduler of a dask cluster (address or scheduler file).")] = None,
     fresh: Annotated[bool, typer.Option("--fresh", help="Discard earlier results in the output folder.")] = False,
@@ -203,7 +204,7 @@ def sweep(
     sweep_to_folder(file, out, SweepOptions(jobs, dask, fresh, retry_failed, strict, json))
 
 
-class OverviewGroup(TyperGroup):
+class OverviewGroup(NumberCheckingGroup):
     """Command group whose help is the text of `cli.overview`."""
 
     def format_help(self, ctx, formatter) -> None:
@@ -267,10 +268,10 @@ app.command("identify-operator", epilog=IDENTIFY_OPERATOR_EPILOG)(identify_opera
 
 @app.command(epilog="Example:  hydrotele replay measured/fit_1.parquet --machine cat215 --out overlay")
 def replay(
-    logs: Annotated[list[Path], typer.Argument(help="Log files (.parquet, .csv) or run folders.")],
+    logs: Annotated[list[Path], typer.Argument(help="Log files (.parquet, .csv), folders of them, run folders.")],
     machine: MachineOption = None,
     tool: ToolOption = None,
-    timestep: Annotated[float, typer.Option(help="Simulation time step [s].")] = 1.0e-3,
+    timestep: Annotated[float, typer.Option(min=1e-6, help="Simulation time step [s].")] = 1.0e-3,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -281,11 +282,12 @@ def replay(
     ] = None,
     effects: EffectFilesOption = None,
     json: JsonOption = False,
+    force: ForceOption = False,
 ) -> None:
     """Simulate the model with the commands of a log; print the prediction errors."""
     from hydrotele.cli.reviewing import replay_logs
 
-    replay_logs(logs, machine, tool, timestep, out, json)
+    replay_logs(logs, machine, tool, timestep, out, json, force)
 
 
 @app.command(
@@ -311,7 +313,7 @@ def gap(
         list[str] | None,
         typer.Option("--effect", help="Test only the effect of this name. Repeatable."),
     ] = None,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes.")] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, max=MAX_PROCESSES, help="Number of processes.")] = None,
     mask: Annotated[Path | None, typer.Option(help="CSV of masked intervals: run,begin,end [s].")] = None,
     force: ForceOption = False,
     recording: Annotated[bool, typer.Option(help="Write the rerun recording.")] = True,
@@ -366,9 +368,11 @@ def identify(
     processing: Annotated[
         str, typer.Option(help="Filter: zero_phase, optimal, periodic (needs --period) or raw.")
     ] = "zero_phase",
-    band: Annotated[float | None, typer.Option(help="Compare forces below this frequency [Hz].")] = None,
-    period: Annotated[float | None, typer.Option(help="Period of a repeated motion [s].")] = None,
-    harmonics: Annotated[int, typer.Option(help="Number of harmonics of --period to keep; 0: automatic.")] = 0,
+    band: Annotated[float | None, typer.Option(min=1e-6, help="Compare forces below this frequency [Hz].")] = None,
+    period: Annotated[float | None, typer.Option(min=1e-6, help="Period of a repeated motion [s].")] = None,
+    harmonics: Annotated[
+        int, typer.Option(min=0, max=10_000, help="Number of harmonics of --period to keep; 0: automatic.")
+    ] = 0,
     estimator: Annotated[
         str,
         typer.Option(help="weighted, gauss_markov, least_squares or instruments (needs --period)."),
@@ -376,8 +380,12 @@ def identify(
     keep_bias: Annotated[
         bool, typer.Option("--keep-bias", help="Do not correct the bias due to position noise.")
     ] = False,
-    ridge: Annotated[float, typer.Option(help="Ridge term as a fraction of the largest singular value.")] = 0.0,
-    truncate: Annotated[float, typer.Option(help="Discard singular values below this fraction of the largest.")] = 0.0,
+    ridge: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="Ridge term as a fraction of the largest singular value.")
+    ] = 0.0,
+    truncate: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="Discard singular values below this fraction of the largest.")
+    ] = 0.0,
     force: ForceOption = False,
     effects: EffectFilesOption = None,
     json: JsonOption = False,
@@ -399,7 +407,7 @@ def identify(
         model="reduced" if reduced else "complete", pins=pins, asymmetry=asymmetry,
         processing=Processing(processing, band, period, harmonics),  # pyright: ignore - checks itself
         estimator=Estimator(
-            estimator, ridge, truncate, **({"pairs": 0} if keep_bias else {})  # pyright: ignore
+            estimator, ridge, truncate, **({"noise_pairs": 0} if keep_bias else {})  # pyright: ignore
         ),
         hydraulics=hydraulics,
     )  # fmt: skip
@@ -428,9 +436,9 @@ def excite(
     sensors: SensorsOption = None,
     period: Annotated[float, typer.Option(min=1.0, help="Period of the trajectory [s].")] = 20.0,
     harmonics: Annotated[int, typer.Option(min=1, max=30, help="Number of harmonics of the trajectory.")] = 8,
-    starts: Annotated[int, typer.Option(min=1, help="Number of searches from random trajectories.")] = 2,
-    seed: Annotated[int, typer.Option(help="Random seed of the searches.")] = 0,
-    cycles: Annotated[float, typer.Option(min=1.0, help="Number of periods that the scenario runs.")] = 3.0,
+    starts: Annotated[int, typer.Option(min=1, max=1000, help="Number of searches from random trajectories.")] = 2,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed of the searches.")] = 0,
+    cycles: Annotated[float, typer.Option(min=1.0, max=1e6, help="Number of periods that the scenario runs.")] = 3.0,
     effects: EffectFilesOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -461,7 +469,7 @@ def analyse_teleop(
             "passivity_control. Repeatable. Default: those of the case.",
         ),
     ] = None,
-    delay: Annotated[float | None, typer.Option(help="One-way delay [s]; default: that of the case.")] = None,
+    delay: Annotated[float | None, typer.Option(min=0.0, help="One-way delay [s]; default: that of the case.")] = None,
     confirm: Annotated[
         bool,
         typer.Option("--confirm", help="Verify by simulation: sine sweeps and the stability map."),
@@ -470,12 +478,14 @@ def analyse_teleop(
         bool,
         typer.Option("--robust", help="Include sampling, jitter, random operators and Z-width."),
     ] = False,
-    period: Annotated[float, typer.Option(help="With --robust: sampling period [s].")] = 0.005,
+    period: Annotated[float, typer.Option(min=1e-6, help="With --robust: sampling period [s].")] = 0.005,
     delays: Annotated[
         Path | None,
         typer.Option(help="With --robust: CSV of measured delays [s], columns forward and back."),
     ] = None,
-    operators: Annotated[int, typer.Option(help="With --robust: number of sampled pairs of operator and task.")] = 20,
+    operators: Annotated[
+        int, typer.Option(min=1, help="With --robust: number of sampled pairs of operator and task.")
+    ] = 20,
     coordinate: Annotated[
         str | None, typer.Option(help="For a scenario: coordinate of the arm: r, theta, z ...")
     ] = None,
@@ -498,13 +508,13 @@ def analyse_teleop(
     "hydrotele review runs/dig --screenshot dig.png --at 8   |   hydrotele review runs/dig --video dig.mp4"
 )
 def review(
-    log: Annotated[Path, typer.Argument(help="Run folder or log file.")],
+    log: Annotated[Path, typer.Argument(help="Log file, run folder, folder of gap, or recording (.rrd).")],
     log2: Annotated[Path | None, typer.Argument(help="Second log with the same time base, for comparison.")] = None,
     machine: MachineOption = None,
     tool: ToolOption = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Recording file to write (.rrd).")] = None,
     serve: Annotated[bool, typer.Option("--serve", help="Serve the web viewer.")] = False,
-    port: Annotated[int, typer.Option(help="Port of the web viewer.")] = 9090,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the web viewer.")] = 9090,
     screenshot: Annotated[
         Path | None,
         typer.Option("--screenshot", help="Write a PNG of the viewer without opening a window."),
@@ -521,16 +531,19 @@ def review(
         Path | None,
         typer.Option("--video", help="Write a video (.mp4) of the machine; needs pip install 'hydrotele[video]'."),
     ] = None,
+    force: ForceOption = False,
     effects: EffectFilesOption = None,
 ) -> None:
     """Show a run in the rerun viewer: 3D machine, joints, pressures, flows and forces.
 
-    Each of --out, --screenshot, --plot and --video writes a file. If one of them is given, no window
-    is opened; several can be given together.
+    A folder with a recording, as that of run or gap, is shown by this recording. Each of --out,
+    --screenshot, --plot and --video writes a file. If one of them is given, no window is opened;
+    several can be given together.
     """
     from hydrotele.cli.reviewing import ReviewOutputs, review_logs
 
-    review_logs(log, log2, machine, tool, ReviewOutputs(out, screenshot, at, plot, video, port if serve else None))
+    outputs = ReviewOutputs(out, screenshot, at, plot, video, port if serve else None)
+    review_logs(log, log2, machine, tool, outputs, force)
 
 
 @app.command("list", epilog="Example:  hydrotele list scenarios --json")
@@ -553,14 +566,21 @@ def list_(
 
 @app.command(epilog="Example:  hydrotele validate my_machine/machine.yaml")
 def validate(
-    files: Annotated[list[Path], typer.Argument(help="Machines, joysticks, scenarios, sweeps or logs.")],
+    files: Annotated[list[Path], typer.Argument(help="Machines, joysticks, scenarios, sweeps, logs, folders of logs.")],
+    machine: MachineOption = None,
+    tool: ToolOption = None,
+    force: ForceOption = False,
     effects: EffectFilesOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Check a machine, joystick, scenario, sweep or log; report errors with file and line."""
-    from hydrotele.cli.catalogue import validate_files
+    """Check a machine, joystick, scenario, sweep or log; report errors with file and line.
 
-    validate_files(files, json)
+    Logs are checked as by gap, with the column names and ranges of --machine. Default: the machine
+    next to the log, or that of its metadata.
+    """
+    from hydrotele.cli.catalogue import LogMachine, validate_files
+
+    validate_files(files, json, LogMachine(machine, tool, force))
 
 
 @app.command(epilog="Example:  hydrotele export cat215 --tool bucket --out scene.xml")
@@ -598,7 +618,7 @@ def experiments(
             help="Repetitions (operators, noise seeds or trials); default: 20, or 100 trials.",
         ),
     ] = None,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes.")] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, max=MAX_PROCESSES, help="Number of processes.")] = None,
     json: JsonOption = False,
 ) -> None:
     """Repeat the experiments of a publication; compare its tables and figures with simulation.
@@ -629,7 +649,9 @@ def bench(
 
 @app.command("compile", epilog="Example:  hydrotele compile --jobs 4")
 def compile_functions(
-    jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes; default: one per core.")] = None,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, max=MAX_PROCESSES, help="Number of processes; default: one per core.")
+    ] = None,
 ) -> None:
     """Compile all numerical functions now, so that later commands start without delay."""
     from hydrotele.cli.compiling import compile_all
@@ -672,6 +694,9 @@ def main() -> None:
         sys.exit(ended[0])  # SystemExit runs the cleanup code
 
     signal.signal(signal.SIGTERM, end)
+    for stream in (sys.stdout, sys.stderr):  # file names may be no valid text
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="backslashreplace")
     warnings.showwarning = lambda message, *_, **__: typer.echo(f"warning {message}", err=True)
     try:
         _run()
@@ -682,15 +707,33 @@ def main() -> None:
 
 def _run() -> None:
     try:
+        _check_arguments(sys.argv[1:])
         app()
-    except (InputError, OSError) as error:
-        if isinstance(error, OSError):  # for example a file name that is too long
-            error = InputError(error.filename or "the system", error.strerror or str(error))
-        typer.secho("error ", fg="red", bold=True, err=True, nl=False)
-        typer.echo(str(error), err=True)
-        sys.exit(2)
-    except RuntimeError as error:
-        if type(error).__name__ != "SimulationFailed":
+    except (Exception, SystemExit) as error:
+        if type(error).__name__ == "SimulationFailed":
+            typer.echo(f"simulation failed: {error}", err=True)
+            sys.exit(3)
+        if not (said := _find_input_error(error)):
             raise
-        typer.echo(f"simulation failed: {error}", err=True)
-        sys.exit(3)
+        typer.secho("error ", fg="red", bold=True, err=True, nl=False)
+        typer.echo(str(said), err=True)
+        sys.exit(2)
+
+
+def _find_input_error(error: BaseException) -> InputError | None:
+    """Return the error in the user's input or files that an exception reports, None for any other."""
+    if isinstance(error, InputError):
+        return error
+    effects = sys.modules.get("hydrotele.effects")
+    if own := effects and effects.describe_user_error(error):
+        return own
+    if isinstance(error, OSError):  # for example a file name that is too long
+        return InputError(error.filename or "the system", error.strerror or str(error))
+    return None
+
+
+def _check_arguments(words: list[str]) -> None:
+    """Raise an error for arguments that are not valid UTF-8; Python keeps their bytes as surrogates."""
+    for word in words:
+        if any("\ud800" <= character <= "\udfff" for character in word):
+            raise InputError(word, "is not valid UTF-8: rename the file or folder")

@@ -1,67 +1,118 @@
 """Open the logs and machines named on the command line.
 
-Logs are given as run folders, folders of logs or log files. If no machine is given, it is found
-next to the log or by the metadata of the log.
+Logs are given as log files, folders of logs, run folders or folders of run folders. If no machine is
+given, it is found next to the log or by the metadata of the log.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from hydrotele.core.errors import InputError
-from hydrotele.logs.files import command_ranges
-from hydrotele.logs.log import Log, find_log_file, load_log
+from hydrotele.core.files import resolve_path
+from hydrotele.logs.dataset import MergedRuns, merge_runs
+from hydrotele.logs.files import RunFiles, read_runs
+from hydrotele.logs.log import Log, find_log_in_folder, find_logs
+from hydrotele.logs.table import read_metadata
 from hydrotele.machine.machine import Machine
 from hydrotele.machine.machine_file import MACHINE_FILE, load_machine
 
-_LOGS = (".parquet", ".csv")
+
+class OpenedLogs(NamedTuple):
+    """Logs that were accepted for a machine.
+
+    Attributes:
+        machine: the machine.
+        runs: the runs, with the channels that only a simulator knows.
+        merged: the runs on uniform clocks.
+    """
+
+    machine: Machine
+    runs: tuple[RunFiles, ...]
+    merged: MergedRuns
+
+    @property
+    def logs(self) -> tuple[Log, ...]:
+        """All log files."""
+        return tuple(log for run in self.runs for log in run.logs)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Repairs of the logs, one sentence each."""
+        return self.merged.notes
 
 
-def open_log(
-    path: Path, machine: str | None = None, tool: str | None = None, which: str = "measured"
-) -> tuple[Machine, Log]:
-    """Load a log and its machine.
-
-    If no machine is given, `machine.yaml` in the folder of the log is used, else the shipped
-    machine that the metadata of the log names.
+def open_logs(
+    paths: Sequence[Path], machine: str | None = None, tool: str | None = None, force: bool = False
+) -> OpenedLogs:
+    """Load logs and their machine, and check them by the rule of all commands, see `merge_runs`.
 
     Args:
-        path: log file or run folder.
+        paths: log files, folders of logs, run folders.
         machine: name or folder of a machine, None to find it.
         tool: tool of the machine, None for the tool of the log if the machine has it.
-        which: `measured` or `truth`, for run folders.
-
-    Returns:
-        (machine, log).
+        force: accept logs whose metadata names another machine or tool.
 
     Raises:
-        InputError: the log is not usable, or its machine is not known.
+        InputError: a log is not usable, or its machine is not known.
     """
-    file = find_log_file(path, which)
-    beside = file.parent / MACHINE_FILE
-    chosen = machine or (str(beside) if beside.is_file() else None)
-    if chosen:
-        first = load_machine(chosen, tool)
-        log = load_log(file, aliases=first.log_columns, commands=command_ranges(first))
-    else:
-        log = load_log(file)
-        chosen = log.metadata.get("machine")
-        if not chosen:
-            raise InputError(file, "its metadata does not name a machine: give --machine")
-    found = load_machine(chosen, tool)
-    logged = log.metadata.get("tool")
-    if tool is None and logged in found.tools:
-        found = load_machine(chosen, logged)
-    positions = [f"{found.position_kind(axis)}.{axis}" for axis in found.axes]
-    if not any(name in log for name in positions):
-        message = f"is not a log of {found.name}: it has none of {', '.join(positions)}"
-        raise InputError(file, message)
-    return found, log
+    found = find_machine(paths, machine, tool)
+    runs = read_runs(paths, found, found.log_columns, force, keep_truth=True)
+    return OpenedLogs(found, runs, merge_runs(runs, found))
+
+
+def open_log(path: Path, machine: str | None = None, tool: str | None = None, force: bool = False) -> OpenedLogs:
+    """Load the only log of a path and its machine; the arguments are those of `open_logs`.
+
+    Raises:
+        InputError: as `open_logs`, or the path has several logs.
+    """
+    files = find_logs(path)
+    if len(files) > 1:
+        names = ", ".join(str(file) for _, file in files[:5])
+        raise InputError(path, f"contains {len(files)} logs; give one of them: {names}")
+    return open_logs([path], machine, tool, force)
+
+
+def find_run_log(path: Path, which: str) -> Path:
+    """Return the log `which` of a run folder, or the path itself if it has none."""
+    return find_log_in_folder(path, which) or path
+
+
+def find_recording(path: Path) -> Path | None:
+    """Return the recording at a path: an `.rrd` file, or the one in a result folder; None without one.
+
+    Raises:
+        InputError: the folder has several recordings, or the file does not exist.
+    """
+    if path.suffix.lower() == ".rrd":
+        if not path.exists():
+            raise InputError(path, "does not exist: give a recording, log file or run folder")
+        return path
+    found = sorted(path.glob("*.rrd")) if path.is_dir() else []
+    if len(found) > 1:
+        names = ", ".join(map(str, found[:5]))
+        raise InputError(path, f"contains {len(found)} recordings; give one of them: {names}")
+    return found[0] if found else None
 
 
 def name_of_data(data: Sequence[Path]) -> str:
     """Return the name of the data folder, or of the folder that contains the first file."""
-    first = data[0].resolve()
+    first = resolve_path(data[0])
     return first.name if first.is_dir() else first.parent.name or first.stem
+
+
+def name_machine(data: Sequence[Path], name: str | None) -> tuple[str | None, str | None]:
+    """Return machine and tool: `name`, else the machine next to the first log, else that of its metadata.
+
+    Raises:
+        InputError: there is no log at the path, or it cannot be read.
+    """
+    file = find_logs(data[0])[0][1]
+    metadata = read_metadata(file)
+    beside = file.parent / MACHINE_FILE
+    name = name or (str(beside) if beside.is_file() else metadata.get("machine"))
+    return name or None, metadata.get("tool")
 
 
 def find_machine(data: Sequence[Path], name: str | None, tool: str | None) -> Machine:
@@ -70,26 +121,10 @@ def find_machine(data: Sequence[Path], name: str | None, tool: str | None) -> Ma
     Raises:
         InputError: no machine is known, or the machine is not usable.
     """
-    log = _find_first_log(data[0])
-    metadata: Mapping[str, str] = {}
-    if name is None and log and (log.parent / MACHINE_FILE).is_file():
-        name = str(log.parent / MACHINE_FILE)
-    if log and log.suffix.lower() == ".parquet":
-        known = load_machine(name, tool) if name else None
-        metadata = load_log(
-            log, aliases=known.log_columns if known else None, maximum_dropped=1.0, missing=True,
-            commands=command_ranges(known) if known else None,
-        ).metadata  # fmt: skip
-    name = name or metadata.get("machine")
+    if not data:
+        raise InputError("the data", "no path was given: give log files or a folder with logs")
+    name, logged = name_machine(data, name)
     if not name:
         raise InputError(data[0], "its metadata does not name a machine: give --machine")
     found = load_machine(name, tool)
-    logged = metadata.get("tool")
     return load_machine(name, logged) if tool is None and logged in found.tools else found
-
-
-def _find_first_log(path: Path) -> Path | None:
-    if not path.is_dir():
-        return path if path.is_file() else None
-    files = [p for p in sorted(path.rglob("*")) if p.suffix.lower() in _LOGS]
-    return next((p for p in files if not p.stem.startswith((".", "truth"))), None)

@@ -5,13 +5,13 @@ import functools
 import inspect
 from collections.abc import Callable
 from json import dumps as json_text
-from pathlib import Path
 from typing import Annotated, Any, get_args
 
 import typer
 from rich.markup import escape
 
 from hydrotele.core.errors import InputError
+from hydrotele.core.files import resolve_path
 
 
 def parse_overrides(items: list[str]) -> dict[str, str]:
@@ -39,7 +39,7 @@ def machine_overrides(machine: str | None, tool: str | None) -> dict[str, str]:
     pairs = {}
     if machine is not None:
         named = machine in shipped_machines()
-        pairs["machine"] = json_text(machine if named else str(Path(machine).resolve()))
+        pairs["machine"] = json_text(machine if named else str(resolve_path(machine)))
     if tool is not None:
         pairs["tool"] = json_text(tool)
     return pairs
@@ -114,3 +114,22 @@ def _escape_help(annotation: Any) -> Any:
     for fact in facts:
         fact.help = escape(fact.help or "")
     return Annotated[type_, *facts]
+
+
+def check_range(option: str, value: float, low: float, high: float, what: str) -> None:
+    """Raise an error if an option is not a number within a range.
+
+    Args:
+        option: name of the option.
+        value: its value.
+        low: smallest valid value.
+        high: largest valid value.
+        what: name of the quantity and its unit, for the message.
+
+    Raises:
+        InputError: the value is outside the range, infinite or not a number.
+
+    >>> check_range("--seed", 3, 0, 10, "random seed")
+    """
+    if not low <= value <= high:
+        raise InputError(f"{option} {value:g}", f"must be a {what} from {low:g} to {high:g}")

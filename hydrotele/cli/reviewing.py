@@ -15,22 +15,25 @@ from hydrotele.cli.console import (
     announce_output,
     make_table,
     print_json,
+    print_notes,
     show_simulation_progress,
     stderr_console,
     stdout_console,
     write_json,
 )
-from hydrotele.cli.opening import open_log
+from hydrotele.cli.opening import OpenedLogs, find_recording, find_run_log, open_log, open_logs
 from hydrotele.core.errors import InputError
 from hydrotele.core.output import atomic_folder, check_output_folder
-from hydrotele.logs.log import Log, find_log_file, find_log_in_folder, save_log
+from hydrotele.logs.dataset import make_complete_logs
+from hydrotele.logs.files import align_origins, check_commands
+from hydrotele.logs.log import Log, find_log_in_folder, save_log
 from hydrotele.machine.machine import Machine
 from hydrotele.run.replay import Replay, replay_log
 from hydrotele.simulate.native import stop_profiling_clock
 
 
 class ReviewOutputs(NamedTuple):
-    """Files and views that `hydrotele review` makes; None for those that are not wanted.
+    """Files and views that `hydrotele review` makes; None for those that are not requested.
 
     Attributes:
         recording: rerun recording.
@@ -50,16 +53,18 @@ class ReviewOutputs(NamedTuple):
 
 
 def review_logs(
-    first: Path, second: Path | None, machine: str | None, tool: str | None, outputs: ReviewOutputs
-) -> None:
-    """Record one or two logs for the rerun viewer, and show them or write files.
+    first: Path, second: Path | None, machine: str | None, tool: str | None, outputs: ReviewOutputs,
+    force: bool = False,
+) -> None:  # fmt: skip
+    """Record one or two logs for the rerun viewer, or take an existing recording; show it or write files.
 
     Args:
-        first: run folder or log file.
+        first: log file, folder with one log, run folder, recording, or result folder with a recording.
         second: second log with the same time base, or None.
         machine: machine of both logs, None to find it by the logs.
         tool: tool of the machine.
         outputs: files to write; without any, the viewer is opened.
+        force: accept logs whose metadata names another machine or tool.
 
     Raises:
         InputError: a log, machine or viewer is not usable.
@@ -72,44 +77,49 @@ def review_logs(
         raise InputError("--at", "is the time of a screenshot: give --screenshot FILE.png as well")
     if plot:
         with announce_output("plot", plot):
-            _plot(first, second, machine, tool, plot)
+            _plot(first, second, machine, tool, plot, force)
     if video:
-        _film(first, second, machine, tool, video)
+        _film(first, second, machine, tool, video, force)
     if (plot or video) and not (recording or screenshot or port is not None):
         return
     with contextlib.ExitStack() as stack:
-        made = first / "review.rrd"
-        if not (made.is_file() and not any((second, recording, machine, tool))):
+        made = None if any((second, recording, machine, tool)) else find_recording(first)
+        if made is None:
             folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="hydrotele_"))
             made = recording or Path(folder, "review.rrd")
             with announce_output("recording", recording):
-                _record(first, second, machine, tool, made)
-        if screenshot:
-            from hydrotele.show.viewer import take_screenshot
-
-            with announce_output("screenshot", screenshot):
-                complaints = take_screenshot(made, screenshot, displayed_time=time)
-            for complaint in complaints:
-                stderr_console.print(f"[yellow]viewer[/] {complaint}", soft_wrap=True)
-        if port is not None:
-            from hydrotele.show.viewer import serve_recording
-
-            tell = "open {} in a browser on this computer; Ctrl-C stops the server"
-            serve_recording(made, port, lambda url: stdout_console.print(tell.format(url), soft_wrap=True))
-        elif not (recording or screenshot):
-            from hydrotele.show.viewer import open_viewer
-
-            if open_viewer(made):
-                message = "no viewer can be opened on this computer; try --serve or --screenshot PNG"
-                raise InputError("review", message)
+                _record(first, second, machine, tool, made, force)
+        _show(made, outputs)
 
 
-def _film(first, second, machine, tool, path: Path) -> None:
+def _show(made: Path, outputs: ReviewOutputs) -> None:
+    """Take the screenshot of a recording, serve it, or open the viewer if no file was requested."""
+    if outputs.screenshot:
+        from hydrotele.show.viewer import take_screenshot
+
+        with announce_output("screenshot", outputs.screenshot):
+            complaints = take_screenshot(made, outputs.screenshot, displayed_time=outputs.displayed_time)
+        for complaint in complaints:
+            stderr_console.print(f"[yellow]viewer[/] {complaint}", soft_wrap=True)
+    if outputs.port is not None:
+        from hydrotele.show.viewer import serve_recording
+
+        tell = "open {} in a browser on this computer; Ctrl-C stops the server"
+        serve_recording(made, outputs.port, lambda url: stdout_console.print(tell.format(url), soft_wrap=True))
+    elif not (outputs.recording or outputs.screenshot):
+        from hydrotele.show.viewer import open_viewer
+
+        if open_viewer(made):
+            message = "no viewer can be opened on this computer; try --serve or --screenshot PNG"
+            raise InputError("review", message)
+
+
+def _film(first, second, machine, tool, path: Path, force: bool) -> None:
     from hydrotele.show.video import write_video
 
     if second is not None:
         raise InputError("--video", "shows one log: omit the second log")
-    found, log = open_log(first, machine, tool, _most_complete_log(first))
+    found, log = _open_log(find_run_log(first, _most_complete_log(first)), machine, tool, force)
     with show_simulation_progress(f"video {path.name}") as progress:
         write_video(found, log, path, progress=progress)
     stdout_console.print(f"written to [bold]{path}[/]", soft_wrap=True)
@@ -120,35 +130,56 @@ def _most_complete_log(path: Path) -> str:
     return "truth" if find_log_in_folder(path, "truth") else "measured"
 
 
-def _plot(first, second, machine, tool, path: Path) -> None:
+def _plot(first, second, machine, tool, path: Path, force: bool) -> None:
     from hydrotele.show.overlay import plot_log, plot_overlay
 
     if second is None:
-        _, log = open_log(first, machine, tool)
+        _, log = _open_log(first, machine, tool, force)
         plot_log(log, path, title=log.metadata.get("run", log.name))
     else:
-        (a, (_, one)), (b, (_, two)) = _open_log_pair(first, second, machine, tool, "measured").items()
+        (a, (_, one)), (b, (_, two)) = _open_log_pair(first, second, machine, tool, force).items()
         plot_overlay(one, two, path, names=(a, b), title=f"{a} and {b}")
 
 
-def _record(first, second, machine, tool, path: Path) -> None:
+def _record(first, second, machine, tool, path: Path, force: bool) -> None:
     from hydrotele.show.recording import write_recording
 
     if second is None:
         which = _most_complete_log(first)
-        entries = {which: open_log(first, machine, tool, which)}
+        entries = {which: _open_log(find_run_log(first, which), machine, tool, force)}
     else:
-        entries = _open_log_pair(first, second, machine, tool, "measured")
+        entries = _open_log_pair(first, second, machine, tool, force)
     write_recording(path, entries)
 
 
-def _open_log_pair(first, second, machine, tool, which: str) -> dict[str, tuple[Machine, Log]]:
+def _open_log(path: Path, machine: str | None, tool: str | None, force: bool) -> tuple[Machine, Log]:
+    """Load the only log of a path as logged, and its machine; print the notes.
+
+    Raises:
+        InputError: the log is not usable or has no position of the machine.
+    """
+    if path.suffix.lower() == ".rrd":
+        message = "is a recording, not a log: give it alone, without --plot, --video, --out, --machine and --tool"
+        raise InputError(path, message)
+    opened = open_log(path, machine, tool, force)
+    print_notes(opened.notes)
+    (log,) = opened.logs
+    positions = [f"{opened.machine.position_kind(axis)}.{axis}" for axis in opened.machine.axes]
+    if not any(name in log for name in positions):
+        message = f"is not a log of {opened.machine.name}: it has none of {', '.join(positions)}"
+        raise InputError(log.source, message)
+    return opened.machine, log
+
+
+def _open_log_pair(first, second, machine, tool, force: bool) -> dict[str, tuple[Machine, Log]]:
     """Load two logs of the same machine and return them under different names.
 
     Raises:
         InputError: the logs belong to different machines.
     """
-    logs = [open_log(path, machine, tool, which) for path in (first, second)]
+    logs = [_open_log(path, machine, tool, force) for path in (first, second)]
+    aligned = align_origins([log for _, log in logs])
+    logs = [(found, log) for (found, _), log in zip(logs, aligned, strict=True)]
     kinds = [found.name for found, _ in logs]
     if kinds[0] != kinds[1]:
         message = f"is a log of machine {kinds[1]}, but {first} is a log of machine {kinds[0]}"
@@ -160,51 +191,54 @@ def _open_log_pair(first, second, machine, tool, which: str) -> dict[str, tuple[
     return dict(zip(names, logs, strict=True))
 
 
+_MIN_REPLAY_ROWS = 10  # minimum number of rows of a log
 _DISPLAY_UNITS = {"rad": ("deg", 57.29577951308232), "m": ("mm", 1e3), "Pa": ("kPa", 1e-3)}
 
 
 def replay_logs(
     paths: list[Path], machine: str | None, tool: str | None, timestep: float, target: Path | None,
-    as_json: bool,
+    as_json: bool, force: bool = False,
 ) -> None:  # fmt: skip
     """Simulate the commands of logs and print the prediction errors of the model.
 
     Args:
-        paths: log files or run folders.
+        paths: log files, folders of logs, run folders.
         machine: machine to simulate, None for the machine of each log.
         tool: tool of the machine, None for that of the log.
         timestep: simulation time step [s].
         target: folder for plots and recordings, default `runs/replay_<log>`, or none with
             `as_json`.
         as_json: print JSON: one object for one log, a list for several.
+        force: accept logs whose metadata names another machine or tool.
 
     Raises:
         InputError: a log or machine is not usable.
     """
     if target is None and not as_json:
-        one = find_log_file(paths[0])
-        name = one.parent.name if paths[0].is_dir() else one.stem
+        name = paths[0].resolve().name if paths[0].is_dir() else paths[0].stem
         target = Path("runs", f"replay_{name}" if len(paths) == 1 else "replay_logs")
     if target:
         check_output_folder(target, "replay")
     stop_profiling_clock()
     results = []
     for path in paths:
-        the_machine, log = open_log(path, machine, tool)
-        with show_simulation_progress(f"replay {log.name}", quiet=as_json) as progress:
-            result = replay_log(log, the_machine, timestep, progress)
-        results.append((the_machine, result))
-        if log.metadata.get("command", "held") != "held":
-            stderr_console.print(
-                f"[yellow]note[/] {path}: the commands changed faster than the log rate, so their"
-                " means are replayed; log with log_rate = control_rate for an exact replay"
-            )
-        if not as_json:
-            _print(str(find_log_file(path)), result)
+        opened = open_logs([path], machine, tool, force)
+        print_notes(opened.notes)
+        for log in _replayable_logs(opened):
+            with show_simulation_progress(f"replay {log.name}", quiet=as_json) as progress:
+                result = replay_log(log, opened.machine, timestep, progress)
+            results.append((opened.machine, result))
+            if log.metadata.get("command", "held") != "held":
+                print_notes([
+                    f"{log.source}: the commands changed faster than the log rate, so their"
+                    " means are replayed; log with log_rate = control_rate for an exact replay"
+                ])  # fmt: skip
+            if not as_json:
+                _print(log.source, result)
     if target:
         with atomic_folder(target, "replay") as folder:
             for number, (the_machine, result) in enumerate(results):
-                prefix = f"{number}_" if len(paths) > 1 else ""
+                prefix = f"{number}_" if len(results) > 1 else ""
                 name = prefix + result.measured.name
                 with announce_output(f"plot and recording of {result.measured.name}", None, quiet=as_json):
                     _write(folder, name, the_machine, result)
@@ -214,6 +248,21 @@ def replay_logs(
     if as_json:
         data = [replay_document(result) for _, result in results]
         print_json(data[0] if len(data) == 1 else data)
+
+
+def _replayable_logs(opened: OpenedLogs) -> list[Log]:
+    """Return the runs and pieces of runs that have at least two rows.
+
+    Raises:
+        InputError: a run has no command of an axis.
+    """
+    for run in opened.runs:
+        check_commands(run, opened.machine)
+    logs = make_complete_logs(opened.runs, opened.merged, opened.machine)
+    for log in logs:
+        if len(log) < _MIN_REPLAY_ROWS:
+            print_notes([f"{log.name} has only {len(log)} rows; it is not replayed."])
+    return [log for log in logs if len(log) >= _MIN_REPLAY_ROWS]
 
 
 def replay_document(result: Replay) -> dict:

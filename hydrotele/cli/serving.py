@@ -24,7 +24,9 @@ def haptic_device(
     host: Annotated[str, typer.Option("--host", help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="UDP port; 0: any free port.")] = 5610,
     rate: Annotated[float, typer.Option("--rate", min=50, max=4000, help="Sampling rate [Hz].")] = 1000,
-    duration: Annotated[float | None, typer.Option("--duration", help="Duration [s]; default: until Ctrl-C.")] = None,
+    duration: Annotated[
+        float | None, typer.Option("--duration", min=1e-3, help="Duration [s]; default: until Ctrl-C.")
+    ] = None,
     until_eof: Annotated[
         bool, typer.Option("--until-eof", help="Stop when standard input is closed.", hidden=True)
     ] = False,

@@ -1,11 +1,10 @@
 """Compilation of numerical functions with numba, with a cache on disk.
 
-numba checks only the file of a function to decide whether its cached code is valid. Compiled code
-here contains functions and constants of other files. Each module therefore has a separate cache
-folder for each version of its source and of all sources of the package that it imports, directly or
-indirectly. A changed module does not invalidate the caches of unrelated modules, and checkouts with
+Compiled code contains functions and constants of several files. Each module therefore has a separate
+cache folder for each version of its source and of all sources of the package that it imports,
+directly or indirectly. A changed module does not invalidate the caches of unrelated modules, and checkouts with
 the same sources share a cache. The cache contains executable code: it lies in the user's cache
-folder, and no other user may write to it.
+folder, and no other user may write to it. Damaged cache files are not used (`core.code_cache`).
 
 Only one process compiles a function; other processes that need it wait. Callbacks for C are
 compiled on first use of their address, not at import. Division by zero is not checked.
@@ -13,7 +12,6 @@ compiled on first use of their address, not at import. Division by zero is not c
 
 import atexit
 import contextlib
-import fcntl
 import functools
 import hashlib
 import os
@@ -23,22 +21,20 @@ import stat
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from numba import njit
-from numba.core import config as _numba_config
 from numba.core import event
-from numba.core.caching import FunctionCache, UserProvidedCacheLocator
+from numba.core.caching import NullCache
 from numba.core.ccallback import CFunc
 from numba.core.sigutils import normalize_signature
 
-from hydrotele.core.compile_progress import SECONDS_BEFORE_BAR, CompileProgress, ProgressLine
-from hydrotele.core.linking import Callee, LinkedCache
+from hydrotele.core.code_cache import CodeCache, file_stem
+from hydrotele.core.compile_progress import CompileProgress
+from hydrotele.core.linking import Callee
 from hydrotele.core.references import argument_type
 
-_CONFIG: Any = _numba_config  # its attributes are created at run time
 _MAX_UNUSED_AGE = 30 * 24 * 3600.0  # s, after which an unused cache of an older source version is removed
 
 
@@ -75,16 +71,15 @@ def _compile(function, **options: Any):
     The second one has no wrapper that converts Python objects. The wrapper takes a fifth of the
     compile time, and most functions are never called from Python.
     """
-    with _module_cache(function.__module__) as cache:
-        options |= {
-            "cache": cache, "error_model": "numpy", "nogil": True,
-            "no_cfunc_wrapper": True,  # the unused wrapper takes a fifth of the compile time
-        }  # fmt: skip
-        compile_with: Any = njit  # its type annotation omits some options
-        made = compile_with(**options)(function)
-        called = compile_with(**options, no_cpython_wrapper=True)(function)
-        if cache:
-            made._cache, called._cache = _SharedCache(function), _CalleeCache(function)
+    options |= {
+        "error_model": "numpy", "nogil": True,
+        "no_cfunc_wrapper": True,  # the unused wrapper takes a fifth of the compile time
+    }  # fmt: skip
+    compile_with: Any = njit  # its type annotation omits some options
+    made = compile_with(**options)(function)
+    called = compile_with(**options, no_cpython_wrapper=True)(function)
+    made._cache = _function_cache(function, "python")
+    called._cache = _function_cache(function, "called")
     callee = Callee(called, inline=options.get("forceinline", False))
     made.get_call_template, made.get_overload = callee.call_template, callee.overload_key
     type_of = made.typeof_pyval
@@ -114,13 +109,10 @@ class Callback:
 
     @functools.cached_property
     def _compiled(self) -> Any:
-        with _module_cache(self._function.__module__) as cache:
-            signature = normalize_signature(self._signature)
-            made: Any = CFunc(self._function, signature, {}, {"error_model": "numpy"})
-            if cache:
-                made._cache = _SharedCache(self._function)
-            made.compile()
-            return made
+        made: Any = CFunc(self._function, normalize_signature(self._signature), {}, {"error_model": "numpy"})
+        made._cache = _function_cache(self._function, "callback")
+        made.compile()
+        return made
 
     @property
     def address(self) -> int:
@@ -141,9 +133,8 @@ def compile_in_background(function, code: str) -> None:
         code: Python code that compiles it.
     """
     function = getattr(function, "py_func", function)
-    with _module_cache(function.__module__) as cache:
-        folder = Path(_CONFIG.CACHE_DIR)
-    if not cache or code in _background_processes or any(folder.glob(_cache_index_pattern(function))):
+    folder = _module_cache_folder(function.__module__)
+    if folder is None or code in _background_processes or _is_cached(function):
         return
     path = os.pathsep.join([str(_PACKAGE_FOLDER.parent), *filter(None, sys.path)])
     _background_processes[code] = process = subprocess.Popen(
@@ -161,9 +152,11 @@ def _stop_process(process: subprocess.Popen) -> None:
     process.wait()
 
 
-def _cache_index_pattern(function) -> str:
-    """Return the file pattern of numba's cache index of a function."""
-    return f"*{function.__name__}-{_first_line(function)}.*.nbi"
+def _function_cache(function, form: str) -> NullCache:
+    """Return the cache of one form of compiled code; it stores nothing for functions of other packages."""
+    if _read_source(function.__module__) is None:
+        return NullCache()
+    return CodeCache(function, _module_cache_folder(function.__module__), form)
 
 
 def cache_folder() -> Path | None:
@@ -243,108 +236,14 @@ def source_digest(module: str) -> str:
     return text.hexdigest()[:16]
 
 
-class CacheLocator(UserProvidedCacheLocator):
-    """numba cache locator that selects the cache folder set by `_module_cache`."""
-
-    def __init__(self, py_func, py_file):
-        super().__init__(py_func, py_file)
-        self._cache_path = _CONFIG.CACHE_DIR
-
-    def get_source_stamp(self):
-        """Return a constant stamp, because each folder belongs to one version of the sources."""
-        return ""
-
-
-class _SharedCache(FunctionCache):
-    """Cache of a function with a lock, so that only one process compiles a missing overload."""
-
-    _impl_class = LinkedCache
-    _held: int | None = None
-
-    def load_overload(self, sig, target_context):
-        """Return compiled code of a signature, or None if this process has to compile it."""
-        found = super().load_overload(sig, target_context)
-        if found is None and self._held is None:
-            self._held = _acquire_lock(self.cache_path, self._py_func)
-            found = super().load_overload(sig, target_context)
-            if found is not None:
-                self._let_go()
-        return found
-
-    def save_overload(self, sig, data):
-        """Store compiled code and release the lock."""
-        try:
-            super().save_overload(sig, data)
-        finally:
-            self._let_go()
-
-    def _let_go(self) -> None:
-        _close_lock(self._held)
-        self._held = None
-
-
-class _CalleeCache(_SharedCache):
-    """Cache of code without a Python wrapper."""
-
-    def _index_key(self, sig, codegen):
-        return *super()._index_key(sig, codegen), "called"
-
-
-def _first_line(function) -> int:
-    return function.__code__.co_firstlineno
-
-
-def _acquire_lock(folder: str, function) -> int | None:
-    """Lock a function against other processes and return the file handle; None after a timeout."""
-    try:
-        path = Path(folder, f"{function.__name__}-{_first_line(function)}.lock")
-        handle = os.open(path, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
-    except OSError:
-        return None
-    began, line = time.monotonic(), ProgressLine()
-    while (waited := time.monotonic() - began) < _MAX_LOCK_WAIT:
-        with contextlib.suppress(BlockingIOError):
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            line.clear()
-            return handle
-        time.sleep(0.02)
-        if waited > SECONDS_BEFORE_BAR:
-            name = function.__name__.strip("_")
-            line.show(f"waiting for another process to compile {name} ({waited:.0f} s)")
-    os.close(handle)
-    return None
-
-
-def _close_lock(handle: int | None) -> None:
-    if handle is not None:
-        os.close(handle)
-
-
-_MAX_LOCK_WAIT = 300.0  # s, longest wait for another process, which may have failed without exiting
-
-
-@contextlib.contextmanager
-def _module_cache(module: str) -> Iterator[bool]:
-    """Point numba to the cache folder of a module in this context; yield whether there is one."""
-    names = ("CACHE_DIR", "CACHE_LOCATOR_CLASSES")
-    given = {name: getattr(_CONFIG, name, "") for name in names}
-    own = _module_cache_folder(module) if _CACHE_FOLDER and _read_source(module) is not None else None
-    _CONFIG.CACHE_DIR = str(own or "")
-    _CONFIG.CACHE_LOCATOR_CLASSES = f"{__name__}.{CacheLocator.__name__}" if own else ""
-    try:
-        yield own is not None
-    finally:
-        for name, value in given.items():
-            setattr(_CONFIG, name, value)
-
-
 @functools.cache
 def _module_cache_folder(module: str) -> Path | None:
     """Return a module's cache folder, mark it as used and delete unused folders of the module.
 
-    Returns None if the folder cannot be created.
+    Returns None for modules of other packages, and if the folder cannot be created.
     """
-    assert _CACHE_FOLDER
+    if _CACHE_FOLDER is None or _read_source(module) is None:
+        return None
     folder = _CACHE_FOLDER / f"{module}_{source_digest(module)}"
     try:
         if not folder.exists():
@@ -360,10 +259,8 @@ def _module_cache_folder(module: str) -> Path | None:
 
 def _is_cached(function) -> bool:
     """Return whether the cache contains any code of a function of this package."""
-    if not _CACHE_FOLDER or _read_source(function.__module__) is None:
-        return False
     folder = _module_cache_folder(function.__module__)
-    return folder is not None and any(folder.glob(_cache_index_pattern(function)))
+    return folder is not None and any(folder.glob(f"{file_stem(function)}.*.code"))
 
 
 event.register("numba:compile", CompileProgress(_is_cached))

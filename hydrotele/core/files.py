@@ -2,21 +2,20 @@
 
 `LIMITS` bounds the size of user input before memory is allocated for it. An environment variable
 changes a limit, for example `HYDROTELE_MAX_LOG_VALUES=1e9`. The module also locates the shipped
-models and scenarios, and checks and copies the asset files (meshes, textures, height fields) of an
-MJCF.
+models and scenarios. `hydrotele.core.mjcf` reads MJCF and URDF.
 """
 
 import contextlib
 import json
 import math
 import os
-import shutil
 import stat
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, BinaryIO
+from xml.parsers import expat
 
 from hydrotele.core.errors import InputError
 
@@ -25,11 +24,15 @@ LIMITS: Mapping[str, tuple[float, str]] = MappingProxyType({
     "FILE_DEPTH": (100, "nested levels of lists, mappings or elements"),
     "FILE_VALUES": (2e6, "values of a YAML file, after alias expansion"),
     "LOG_VALUES": (1e8, "values of a log, rows times columns"),
+    "LOG_COLUMNS": (1e4, "columns of a log"),
     "RUN_TICKS": (2e7, "controller ticks of a run"),
     "RUN_ROWS": (2e6, "logged rows of a run"),
     "MOVES": (1e4, "moves or waypoints of a pilot"),
     "HARMONICS": (1e3, "harmonics of a joint's reference"),
-    "ASSET_BYTES": (256e6, "bytes of a mesh, texture or height field"),
+    "ASSET_BYTES": (256e6, "bytes of the meshes, textures and height fields of an MJCF"),
+    "MJCF_ELEMENTS": (1e4, "elements of an MJCF with all copies by replicate, flexcomp, composite, attach and nkey"),
+    "MJCF_VALUES": (1e8, "pixels, height field points and user values of an MJCF"),
+    "LINKS": (200, "links of a machine"),
 })  # fmt: skip
 """Name -> (largest allowed amount, description of the counted quantity)."""
 
@@ -130,26 +133,52 @@ def read_xml(path: str | Path) -> ElementTree.Element:
     """Read a regular file as XML and return the root element.
 
     Raises:
-        InputError: as `read_bytes`, or the content is not XML or is nested too deeply for MuJoCo.
+        InputError: the file cannot be read, is not XML, is nested too deeply or declares a
+            document type.
     """
-    content = read_bytes(path)
-    depth = deepest = 0
-    root: ElementTree.Element | None = None
+    return parse_xml(path, read_bytes(path), {})
+
+
+def parse_xml(
+    path: str | Path, content: bytes, origins: dict[ElementTree.Element, tuple[Path, int]]
+) -> ElementTree.Element:
+    """Parse XML and return the root element.
+
+    Args:
+        path: file of the content, for messages.
+        content: the bytes of the file.
+        origins: receives file and line of every element.
+
+    Raises:
+        InputError: the content is not XML, is nested too deeply or declares a document type.
+    """
+    parser, builder, depth, deepest = expat.ParserCreate(), ElementTree.TreeBuilder(), 0, 0
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal depth, deepest
+        depth += 1
+        deepest = max(depth, deepest)
+        origins[builder.start(tag, attributes)] = Path(path), parser.CurrentLineNumber
+
+    def end(tag: str) -> None:
+        nonlocal depth
+        depth -= 1
+        builder.end(tag)
+
+    def refuse(*_: Any) -> None:
+        raise InputError(path, "declares a document type, which MuJoCo does not read; remove <!DOCTYPE ...>")
+
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.StartDoctypeDeclHandler = refuse
+    parser.CharacterDataHandler = builder.data
     try:
-        parser = ElementTree.XMLPullParser(("start", "end"))
-        parser.feed(content)
-        parser.close()
-        events: Any = parser.read_events()
-        for event, element in events:
-            root = element if root is None else root
-            depth += 1 if event == "start" else -1
-            deepest = max(deepest, depth)
-    except (ElementTree.ParseError, ValueError, LookupError) as error:  # LookupError: bad encoding
+        parser.Parse(content, True)
+        check_limit(path, "FILE_DEPTH", deepest)
+        return builder.close()
+    except InputError:
+        raise
+    except (expat.ExpatError, ValueError, LookupError) as error:  # LookupError: unknown encoding
         raise InputError(path, f"is not XML: {error}") from None
-    if root is None:
-        raise InputError(path, "is not XML: it has no element")
-    check_limit(path, "FILE_DEPTH", deepest)
-    return root
 
 
 def parse_json(text: str | bytes) -> Any:
@@ -178,6 +207,20 @@ def read_json(path: str | Path) -> Any:
         raise InputError(path, f"is not valid JSON: {error}") from None
 
 
+def resolve_path(path: str | Path) -> Path:
+    """Return the absolute path without symbolic links; a link in a loop is kept.
+
+    `Path.resolve` raises a RuntimeError for such a link. Here the next access to the file fails, with
+    an OSError that says why.
+
+    Raises:
+        InputError: the path contains a null character.
+    """
+    if "\0" in str(path):
+        raise InputError(path, "is not a valid file name")
+    return Path(os.path.realpath(path))
+
+
 def _find_data_folder(name: str) -> Path:
     """Return a data folder inside the installed package, or next to the package in a checkout."""
     package = Path(__file__).resolve().parent.parent
@@ -195,80 +238,3 @@ def models_folder() -> Path:
 def scenarios_folder() -> Path:
     """Return the folder of the shipped scenarios."""
     return _find_data_folder("scenarios")
-
-
-_FOLDER_ATTRIBUTES = {"texture": "texturedir"}  # element -> compiler attribute; all others use `meshdir`
-_FILE_ATTRIBUTES = (
-    "file",
-    *(f"file{side}" for side in ("right", "left", "up", "down", "front", "back")),
-)
-
-
-def asset_files(tree: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, str, str]]:
-    """Iterate over the asset files of an MJCF: (element, attribute, path relative to the MJCF)."""
-    folders: dict[str, str] = {}
-    for compiler in tree.findall("compiler"):
-        folders |= compiler.attrib
-    for assets in tree.findall("asset"):
-        for element in assets:
-            kind = _FOLDER_ATTRIBUTES.get(element.tag, "meshdir")
-            folder = folders.get(kind, folders.get("assetdir", ""))
-            for attribute in _FILE_ATTRIBUTES:
-                if file := element.get(attribute):
-                    yield element, attribute, os.path.join(folder, file)
-
-
-def check_assets(tree: ElementTree.Element, mjcf: Path) -> None:
-    """Check that all asset files of an MJCF exist, are regular files and are not too large.
-
-    Args:
-        tree: root element of the MJCF.
-        mjcf: file of the MJCF; asset paths are relative to it.
-
-    Raises:
-        InputError: a file fails the check; names the MJCF, the element and the file.
-    """
-    for element, attribute, file in asset_files(tree):
-        where = f"{mjcf}: <{element.tag} {attribute}={element.get(attribute)!r}>"
-        try:
-            with open_regular(mjcf.parent / file) as opened:
-                check_limit(where, "ASSET_BYTES", os.fstat(opened.fileno()).st_size)
-        except InputError as error:
-            raise InputError(where, error.message) from None
-
-
-def copy_mjcf(mjcf: Path, target: Path, folder: str) -> bool:
-    """Copy an MJCF together with its asset files, so that the copy does not depend on the original.
-
-    Args:
-        mjcf: the MJCF file.
-        target: path of the copy.
-        folder: name of the folder for the asset files, created next to the copy if needed.
-
-    Returns:
-        True if it was copied; False for an MJCF with `include` elements, which is not copied.
-
-    Raises:
-        InputError: a file is missing or too large.
-    """
-    tree = read_xml(mjcf)
-    if tree.find(".//include") is not None:
-        return False
-    check_assets(tree, mjcf)
-    files = list(asset_files(tree))
-    if not files:
-        shutil.copyfile(mjcf, target)
-        return True
-    target.with_name(folder).mkdir(exist_ok=True)
-    for number, (element, attribute, file) in enumerate(files):
-        source = mjcf.parent / file
-        if attribute == "file" and not element.get("name"):
-            element.set("name", source.stem)  # MuJoCo's default: the file name
-        copy = f"{folder}/{number}_{source.name}"
-        shutil.copyfile(source, target.parent / copy)
-        element.set(attribute, copy)
-    for compiler in tree.findall("compiler"):
-        for key in ("meshdir", "texturedir", "assetdir"):
-            compiler.attrib.pop(key, None)
-    ElementTree.ElementTree(tree).write(target, encoding="unicode")
-    return True

@@ -9,7 +9,6 @@ the functions whose symbols it refers to.
 import importlib
 from typing import Any
 
-from numba.core.caching import CompileResultCacheImpl
 from numba.core.typing.templates import make_concrete_template
 
 from hydrotele.core.references import argument_type, check_result_type
@@ -76,24 +75,26 @@ _symbols: dict[str, tuple[tuple, tuple]] = {}
 """Symbol of a function -> its module, name and line, and the types of its arguments."""
 
 
-class LinkedCache(CompileResultCacheImpl):
-    """Cache of compiled code that also stores which functions its external symbols refer to."""
+def external_callees(result: Any) -> dict[str, tuple[tuple, tuple]]:
+    """Return the functions that the external symbols of compiled code refer to.
 
-    def reduce(self, cres: Any) -> Any:
-        """Return the data to store for a compilation result."""
-        module = cres.library._final_module
-        declared = [f.name for f in module.functions if f.is_declaration]
-        needed = {name: _symbols[name] for name in declared if name in _symbols}
-        return needed, super().reduce(cres)
+    Args:
+        result: numba's result of a compilation.
 
-    def rebuild(self, target_context: Any, payload: Any) -> Any:
-        """Load compiled code and its callees; return None if a callee's symbol has changed."""
-        needed, code = payload
-        for symbol, (place, args) in needed.items():
-            importlib.import_module(place[0])
-            callee = _callees[place]
-            found = callee.compile(args)
-            if found.fndesc.mangled_name != symbol:
-                return None
-            callee._symbol_key(found)
-        return super().rebuild(target_context, code)
+    Returns:
+        Symbol -> module, name and line of the function, and the types of its arguments.
+    """
+    declared = [f.name for f in result.library._final_module.functions if f.is_declaration]
+    return {name: _symbols[name] for name in declared if name in _symbols}
+
+
+def load_callees(needed: dict[str, tuple[tuple, tuple]]) -> bool:
+    """Load the functions that cached code refers to; return False if a symbol has changed."""
+    for symbol, (place, args) in needed.items():
+        importlib.import_module(place[0])
+        callee = _callees[place]
+        found = callee.compile(args)
+        if found.fndesc.mangled_name != symbol:
+            return False
+        callee._symbol_key(found)
+    return True

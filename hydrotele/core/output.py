@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from hydrotele.core.errors import InputError
-from hydrotele.core.files import read_json
+from hydrotele.core.files import read_json, resolve_path
 
 OUTPUT_FILES = {
     "run": ("measured.parquet", "truth.parquet", "review.rrd", "scenario.yaml", "machine.*",
@@ -61,7 +61,7 @@ def atomic_folder(target: str | Path, kind: str) -> Iterator[Path]:
     Raises:
         InputError: as `check_output_folder`, or the folder cannot be created or written.
     """
-    asked, target = target, Path(target).resolve()
+    asked, target = target, resolve_path(target)
     check_output_folder(asked, kind)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -103,18 +103,18 @@ def check_output_folder(target: str | Path, kind: str) -> None:
         InputError: the target is a file, a folder of another kind, a folder with unknown files, or
             it cannot be created.
     """
-    place = Path(target).resolve()
+    place = resolve_path(target)
     if not place.exists():
-        above = next(p for p in place.parents if p.exists())
+        above = next(p for p in (place, *place.parents) if os.path.lexists(p))  # a link in a loop exists, too
         if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
             raise InputError(target, f"cannot be created: {above} is not a writable folder")
         return
     if not place.is_dir():
         raise InputError(target, f"exists and was not written by a {kind}; choose another --out")
-    inside = sorted(path.relative_to(place).as_posix() for path in place.rglob("*"))
-    if inside and _read_kind(place) != kind:
+    if any(place.iterdir()) and _read_kind(place) != kind:
         raise InputError(target, f"exists and was not written by a {kind}; choose another --out")
     patterns = ("summary.json", *OUTPUT_FILES[kind])
+    inside = sorted(path.relative_to(place).as_posix() for path in place.rglob("*"))
     strange = [name for name in inside if not any(_is_match(name, p) for p in patterns)]
     if strange:
         listed = ", ".join(strange[:3])

@@ -38,6 +38,7 @@ from typing import Any
 
 from hydrotele.core.datafile import suggest_valid_name
 from hydrotele.core.errors import InputError
+from hydrotele.core.files import read_bytes, resolve_path
 from hydrotele.effects.effect import Effect, Parameter, term_parameter, with_terms, with_value
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.law import LAWS, DriveState, LawSource, Numbers, Term, Variable, law
@@ -64,18 +65,14 @@ def add_effects_from_file(path: Path, library: dict[str, Effect]) -> tuple[str, 
     Raises:
         InputError: the file cannot be read or run, defines nothing, or uses an existing name.
     """
-    try:
-        digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError as error:
-        raise InputError(path, f"cannot be read: {error.strerror}") from None
+    digest = hashlib.sha256(read_bytes(path)).hexdigest()
     if path.suffix != ".py":
         raise InputError(path, "is not a Python file: define custom effects in a .py file")
     if digest not in _loaded_effects:
-        source = str(path.resolve())
+        source = str(resolve_path(path))
         try:
             with LawSource(source):
-                module = _execute_file(path, digest)
-            family = _collect_effects(module)
+                family = _execute_file(path, digest)
             if family or not any(law.source == source for law in LAWS.values()):
                 _add_to_library(library, family, path)
         except InputError:
@@ -87,24 +84,50 @@ def add_effects_from_file(path: Path, library: dict[str, Effect]) -> tuple[str, 
     return _loaded_effects[digest]
 
 
-def _execute_file(path: Path, digest: str) -> ModuleType:
+def _execute_file(path: Path, digest: str) -> tuple[Any, ...]:
+    """Run an effect file as a module and return its effects."""
     name = f"hydrotele_effects_{path.stem}_{digest[:8]}"
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec and spec.loader
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
+    _effect_files[os.path.abspath(path)] = path
     try:
         spec.loader.exec_module(module)
+        return _collect_effects(module)
     except InputError:
         raise
-    except Exception as error:  # any error of the user's code
+    except (Exception, SystemExit) as error:  # any error of the user's code, also exit()
         del sys.modules[name]
-        lines = [f.lineno for f in traceback.extract_tb(error.__traceback__)
-                 if f.filename == str(path)]  # fmt: skip
-        line = getattr(error, "lineno", None) or (lines[-1] if lines else None)
-        where = f"{path}:{line}" if line else path
-        raise InputError(where, f"cannot be run: {type(error).__name__}: {error}") from error
-    return module
+        found = describe_user_error(error) or InputError(path, _describe_exception(error))
+        raise InputError(found.where, f"cannot be run: {found.message}") from error
+
+
+_effect_files: dict[str, Path] = {}  # absolute path of every effect file that was run -> path as given
+
+
+def describe_user_error(error: BaseException) -> InputError | None:
+    """Return the error of a user's effect file with its traceback, cut to that file.
+
+    Args:
+        error: exception of any kind.
+
+    Returns:
+        The error with file and line; None if no effect file raised the exception or called the
+        function that raised it.
+    """
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename in _effect_files]
+    message = _describe_exception(error)
+    if isinstance(error, SyntaxError) and error.filename in _effect_files:
+        return InputError(f"{_effect_files[error.filename]}:{error.lineno}", message)
+    if not frames:
+        return None
+    path = _effect_files[frames[-1].filename]
+    return InputError(f"{path}:{frames[-1].lineno}", f"{message}\n{''.join(traceback.format_list(frames)).rstrip()}")
+
+
+def _describe_exception(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}"
 
 
 def _collect_effects(content: Any) -> tuple[Any, ...]:
@@ -122,6 +145,8 @@ def _add_to_library(library: dict[str, Effect], family: tuple[Any, ...], where: 
         if not isinstance(effect, Effect):
             message = f"{effect!r} is not a hydrotele.effects.Effect"
             raise InputError(where, message)
+        if not isinstance(effect.name, str):
+            raise InputError(where, f"the name of an effect must be text, not {effect.name!r}")
         if effect.name in library:
             message = f"effect {effect.name!r} exists already; choose another name"
             raise InputError(where, message)
@@ -131,8 +156,8 @@ def _add_to_library(library: dict[str, Effect], family: tuple[Any, ...], where: 
 def _export_to_children(path: Path) -> None:
     """Add a file to the environment variable from which child processes load effects."""
     known = os.environ.get(ENVIRONMENT_VARIABLE, "").split(os.pathsep)
-    if str(path.resolve()) not in known:
-        paths = [*filter(None, known), str(path.resolve())]
+    if str(resolve_path(path)) not in known:
+        paths = [*filter(None, known), str(resolve_path(path))]
         os.environ[ENVIRONMENT_VARIABLE] = os.pathsep.join(paths)
 
 
@@ -148,8 +173,8 @@ def add_plugin_effects(library: dict[str, Effect]) -> None:
         with LawSource(where):
             try:
                 content = entry.load()
-            except (ImportError, AttributeError) as error:
-                message = f"cannot be loaded: {error}; update or uninstall the package"
+            except (Exception, SystemExit) as error:  # any error of the package's code
+                message = f"cannot be loaded: {_describe_exception(error)}; update or uninstall the package"
                 raise InputError(where, message) from error
         _add_to_library(library, _collect_effects(content), where)
 

@@ -79,7 +79,7 @@ def _motor_constant_parameters(machine: Machine, location: str) -> dict[str, Par
     Magnets and windings scatter by 10 %; heating reduces the constant by 2 %.
     """
     present = _motor(machine, location).torque_constant
-    return {"emf": _ratio_parameter("V s/rad", present, 0.1, 0.02, 5.0)}
+    return {"torque_constant": _ratio_parameter("V s/rad", present, 0.1, 0.02, 5.0)}
 
 
 def _inertia_parameters(machine: Machine, location: str) -> dict[str, Parameter]:

@@ -32,6 +32,23 @@ from hydrotele.simulate.fleet import SimulationBatch
 from hydrotele.simulate.native import stop_profiling_clock
 from hydrotele.simulate.stepping import delay_line_length, sensor_history_length
 
+MAX_ENVIRONMENTS = 100_000
+"""Largest number of parallel episodes; each needs about 100 kB of memory."""
+MAX_VARIANTS = 10_000
+"""Largest number of variants; each takes some milliseconds to prepare."""
+MAX_THREADS = 1024
+"""Largest number of threads that step the episodes."""
+
+
+def check_count(name: str, count: int, least: int, most: int) -> None:
+    """Raise an error unless a count is an integer in a range.
+
+    Raises:
+        InputError: the count is not an integer, or out of range.
+    """
+    if isinstance(count, bool) or not isinstance(count, int | np.integer) or not least <= count <= most:
+        raise InputError(name, f"must be a whole number from {least} to {most}, not {count!r}")
+
 
 def make_setup(task: Task, options: Options) -> TaskSetup:
     """Combine a task with the user's options: load its machines, observation and clocks.
@@ -50,8 +67,7 @@ def make_setup(task: Task, options: Options) -> TaskSetup:
         options, action=options.action or task.action,
         duration=task.duration if options.duration is None else options.duration,
     )  # fmt: skip
-    if options.variants < 1:
-        raise InputError("variants", f"must be at least 1, not {options.variants}")
+    check_count("variants", options.variants, 1, MAX_VARIANTS)
     machine, clock = load_machine(task.machine, task.tool), make_timing(options)
     arm = arm_axes(machine)
     axes = (*arm, *task.extra_axes)
@@ -97,9 +113,9 @@ class TaskCore:
             InputError: an option is not valid for the task.
         """
         stop_profiling_clock()
-        self.count, self.setup = count, make_setup(task, options)
-        if count < 1:
-            raise InputError("num_envs", f"must be at least 1, not {count}")
+        check_count("num_envs", count, 1, MAX_ENVIRONMENTS)
+        check_count("threads", threads, 0, MAX_THREADS)
+        self.count, self.setup = int(count), make_setup(task, options)
         self.simulations = SimulationBatch(self.setup.variants.plant.model, count, threads)
         self._make_arrays()
         self.parameters = make_task_parameters(self.setup, count, autoreset)
@@ -203,17 +219,19 @@ class TaskCore:
             action: (n, a), or (a,) for all episodes; values outside +-1 are clipped.
 
         Raises:
-            ValueError: the shape is wrong, or an action is not finite.
+            ValueError: the shape is wrong, or an action is not a finite real number.
             RuntimeError: the episodes have not been reset, or the simulations were closed.
         """
         if not self._is_started.all():
             raise RuntimeError("reset before the first step")
-        wanted = self.action.shape
-        if np.shape(action) not in (wanted, wanted[1:]):
-            raise ValueError(f"the action must have shape {wanted}, not {np.shape(action)}")
-        self.action[...] = action
-        if not np.isfinite(self.action).all():
+        values, wanted = np.asarray(action), self.action.shape
+        if values.shape not in (wanted, wanted[1:]):
+            raise ValueError(f"the action must have shape {wanted}, not {values.shape}")
+        if values.dtype.kind not in "fiub":
+            raise ValueError(f"the action must consist of real numbers, not of {values.dtype}")
+        if not np.isfinite(values).all():
             raise ValueError("all actions must be finite numbers")
+        np.clip(values, -1.0, 1.0, out=self.action, casting="unsafe")  # large float64 numbers exceed float32
         self.parameters["call"] = STEP
         self.simulations.apply(advance.address, self.parameters.ctypes.data)
 

@@ -171,6 +171,10 @@ class MachineEnvironment(dm_env.Environment):
         mujoco.mj_copyData(self._physics.data.ptr, stage.model, stage.data)
         return self._physics
 
+    def __reduce__(self):
+        """Raise TypeError: the simulations can be neither copied nor pickled."""
+        return self.core.__reduce__()
+
     def close(self) -> None:
         """Close the renderer and free the memory of the simulation."""
         if self._physics is not None:

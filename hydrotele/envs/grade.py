@@ -470,8 +470,8 @@ GRADE = Task(
     kind="grade",
     description=(
         "An excavator cuts a low bank of soft, loamy or firm soil down to a plane of given height"
-        " and slope, 3.8 to 5.8 m in front of it, and carries the soil away. The swing is locked;"
-        " its action has no effect."
+        " and slope and carries the soil away. The plane lies 3.8 to 5.8 m in front of it. The swing"
+        " is locked; its action has no effect."
     ),
     reward=(
         "The reward is 1 for every 0.01 m by which the RMS error of the profile decreases, minus"

@@ -299,8 +299,11 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
         Raises:
             ValueError: the action has the wrong shape, or is not finite.
+            RuntimeError: the episode is over.
         """
         core = self.core
+        if core.terminated[0] or core.truncated[0]:
+            raise RuntimeError("the episode is over: call reset() before the next step")
         core.step_single(action)
         self._show_step()
         return (
@@ -340,6 +343,10 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if self._window is None:
             self._window = TaskWindow(self._get_stage(), self._image_settings[2], self.metadata["render_fps"])
         self._window.show()
+
+    def __reduce__(self):
+        """Raise TypeError: the simulations can be neither copied nor pickled."""
+        return self.core.__reduce__()
 
     def close(self) -> None:
         """Close the window and the renderer, and free the memory of the simulation."""
@@ -501,6 +508,10 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if self._stage is None:
             self._stage = TaskRenderer(self.core)
         return tuple(self._stage.render(n, *self._image_settings) for n in range(self._render_count))
+
+    def __reduce__(self):
+        """Raise TypeError: the simulations can be neither copied nor pickled."""
+        return self.core.__reduce__()
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the renderer and free the memory of the simulations."""

@@ -7,6 +7,7 @@ the plane of the arm; the undisturbed bank is darker than the loose soil on top.
 
 import copy
 import math
+import threading
 from collections.abc import Callable
 
 import mujoco
@@ -266,6 +267,7 @@ class TaskRenderer:
         self.model = copy.copy(self._current_model)
         self.data = mujoco.MjData(self.model)
         self._canvas: Canvas | None = None
+        self._lock = threading.Lock()  # of the images
 
     def _get_visual_model(self, variant: int) -> mujoco.MjModel:
         """Return the model of a variant with visual geometry; compile it on first use."""
@@ -322,7 +324,7 @@ class TaskRenderer:
             InputError: the camera does not exist.
         """
         camera = mujoco.MjvCamera()
-        names = [self.model.find_camera(i).name for i in range(self.model.ncam)]
+        names = [self.model.camera(i).name for i in range(self.model.ncam)]
         if which is None or which == FREE_CAMERA or which == "free":
             mujoco.mjv_defaultFreeCamera(self.model, camera)
             return camera
@@ -350,11 +352,12 @@ class TaskRenderer:
                 work.
         """
         view = self.find_camera(camera)
-        if self._canvas is None or self._canvas.size != (width, height):
-            self.close()
-            self._canvas = Canvas(self.model, width, height)
-        self.update(number)
-        return self._canvas.draw(self.model, self.data, view, self.markers(number))
+        with self._lock:
+            if self._canvas is None or self._canvas.size != (width, height):
+                self.close()
+                self._canvas = Canvas(self.model, width, height)
+            self.update(number)
+            return self._canvas.draw(self.model, self.data, view, self.markers(number))
 
     def close(self) -> None:
         """Free the OpenGL context."""

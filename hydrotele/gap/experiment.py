@@ -9,10 +9,9 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
-from hydrotele.core.files import models_folder
+from hydrotele.core.files import models_folder, resolve_path
 from hydrotele.kinematics import five_dof
 from hydrotele.kinematics.arm import forward_kinematics
 from hydrotele.kinematics.from_machine import arm_geometry, axis_linkage, feller_geometry
@@ -531,8 +530,8 @@ def _inertia(machine: Machine, axis: str) -> float:
 
 def _reference(machine: Machine) -> str:
     """Name of a shipped machine, else the folder of a user's."""
-    own = Path(machine.folder).resolve()
-    shipped = (models_folder() / machine.name).is_dir() and models_folder().resolve() in (
+    own = resolve_path(machine.folder)
+    shipped = (models_folder() / machine.name).is_dir() and resolve_path(models_folder()) in (
         own, *own.parents)  # fmt: skip
     return machine.name if shipped or not machine.folder else str(own)
 

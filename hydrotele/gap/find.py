@@ -199,6 +199,7 @@ def find_gap(
         jitter=jitter,
         notes=(*data.notes, *notes, *map(detail_words, details),
                *_notes(found, data, judge.levels, floor)),
+        unused_channels=data.unused_channels,
         seconds=time.perf_counter() - begin,
     )  # fmt: skip
 

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.core.errors import InputError
+from hydrotele.core.mjcf import read_mjcf
 from hydrotele.gap.description import channel_words, lack_words
 from hydrotele.gap.find import Progress, detail_words, verdict_of, without_details
 from hydrotele.gap.mechanism_columns import (
@@ -221,7 +222,7 @@ def find_mechanism_gap(
     nominal = nominal_parameters(mechanism)
     found = _searched(fit, mechanism, band, nominal, effects, tell)
     tell("patch the model and evaluate it on the held-out run", 0.8)
-    given = MechanismModel(mechanism.setup.chain.name, Path(mjcf).read_text(encoding="utf-8"), mechanism.mapping)
+    given = MechanismModel(mechanism.setup.chain.name, read_mjcf(mjcf).flatten(), mechanism.mapping)
     then = build_columns([heldout], mechanism, band)
     patching = _Patching(mjcf, mechanism, given, nominal, heldout, band, then)
     found, untrue, varies = _constant(found)

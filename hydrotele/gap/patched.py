@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 import yaml
 
+from hydrotele.core.mjcf import read_mjcf
 from hydrotele.gap.description import effect_title, learned_title, number_title
 from hydrotele.gap.mechanism_columns import STRIBECK, MechanismEffect, tilted
 from hydrotele.gap.result import (
@@ -227,11 +228,9 @@ def patched_mjcf(mjcf: str | Path, patch: Patch) -> str:
         The XML. Bodies that cannot exist are made so: every moment of inertia at least positive and
         at most the sum of the others.
     """
-    spec = mujoco.MjSpec.from_file(str(mjcf))
-    for kind in ("meshdir", "texturedir"):
-        if hasattr(spec, kind):
-            setattr(spec, kind, str((Path(mjcf).parent / getattr(spec, kind)).resolve()))
-    model = spec.compile()
+    document = read_mjcf(mjcf)
+    spec = document.load_spec()
+    model = document.compile(spec)
     by_body: dict[str, dict[str, float]] = {}
     for name, value in patch.parameters.items():
         kind, _, place = name.partition(".")
@@ -252,7 +251,7 @@ def patched_mjcf(mjcf: str | Path, patch: Patch) -> str:
         spec.joint(place).springref = rest
     if any(patch.tilt):
         spec.option.gravity = tilted(np.array(spec.option.gravity), np.array(patch.tilt))
-    spec.compile()
+    document.compile(spec)
     return spec.to_xml()
 
 

@@ -253,6 +253,7 @@ class Gap(Generic[Model]):
         noise: channel -> (found, stated) standard deviation of a reading [SI]; NaN if not stated.
         jitter: (found, stated) standard deviation of the instants at which rows are read [s].
         notes: what was left out or mended in the data, one sentence each.
+        unused_channels: logged channels that were not used, with the reason, one sentence each.
         seconds: wall time of the search.
         open_loop: how far the models run away from the measured motion when the measured forces
             drive them: `horizon` [s], `before` and `after` (joint -> RMS [rad] or [m]); or None.
@@ -279,6 +280,7 @@ class Gap(Generic[Model]):
     notes: tuple[str, ...] = ()
     seconds: float = 0.0
     open_loop: Mapping[str, Any] | None = None
+    unused_channels: tuple[str, ...] = ()
 
 
 def gap_document(gap: Gap) -> dict[str, Any]:
@@ -309,6 +311,7 @@ def gap_document(gap: Gap) -> dict[str, Any]:
         `tests`: residual test -> `value`, `limit`, `passed`.
         `laws`: balance -> `unit` and `places`, place -> RMS `before`, `after` and `noise`.
         `next_experiment`: `reason` and `scenario`, or null. `notes`: on the data. `seconds`.
+        `unused_channels`: logged channels that were not used, with the reason.
         Of a mechanism also `open_loop`: `horizon` [s], `before` and `after` (joint -> RMS [rad] or
         [m] by which a model runs away within it when the measured forces drive it), or null.
     """
@@ -348,6 +351,7 @@ def gap_document(gap: Gap) -> dict[str, Any]:
         "tests": gap.tests,
         "laws": laws,
         "next_experiment": gap.next_experiment,
+        "unused_channels": list(gap.unused_channels),
         "notes": list(gap.notes),
         "seconds": gap.seconds,
     })  # fmt: skip

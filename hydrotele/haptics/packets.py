@@ -66,8 +66,8 @@ def make_packet(words: int) -> Packet:
         words: length in words of 8 bytes.
 
     >>> p = make_packet(2)
-    >>> p.real[1] = 1.0
-    >>> hex(int(p.whole[1]))
+    >>> p.reals[1] = 1.0
+    >>> hex(int(p.integers[1]))
     '0x3ff0000000000000'
     """
     whole = np.zeros(words, "<i8")

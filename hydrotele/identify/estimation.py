@@ -14,6 +14,7 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.signal import lfilter
 from scipy.stats import norm
+from scipy.stats import t as student
 
 from hydrotele.core.errors import InputError
 from hydrotele.identify.equations import StackedEquations
@@ -23,10 +24,9 @@ from hydrotele.identify.identifiability import (
     reference_sizes,
 )
 from hydrotele.identify.setup import RegressorSetup
-from hydrotele.multibody.inverse_dynamics import FRICTION_TERMS, Regressor
+from hydrotele.multibody.inverse_dynamics import FRICTION_TERMS, Regressor, is_deviation
 
 _ESTIMATE_CONTEXT = "estimate"
-_NORMAL95 = 1.959964
 _MAX_AUTOREGRESSION_ORDER = 30  # rows, highest order of the autoregression of the errors
 _MIN_RELATIVE_RESIDUAL = 1e-12  # of a force: rounding
 
@@ -62,9 +62,18 @@ class Estimate:
         return np.sqrt(np.diag(self.covariance))
 
     @property
+    def interval_factor(self) -> float:
+        """Half width of a 95 % interval over the standard deviation, from Student's distribution.
+
+        Its degrees of freedom are the rows minus the average number of parameters per drive.
+        """
+        rows, drives = self.residual.shape
+        return float(student.ppf(0.975, max(rows - self.rank / drives, 1.0)))
+
+    @property
     def ci95(self) -> np.ndarray:
         """95 % intervals (p, 2)."""
-        reach = _NORMAL95 * self.std
+        reach = self.interval_factor * self.std
         return np.column_stack([self.value - reach, self.value + reach])
 
     def squared_distance(self, parameters: np.ndarray) -> float:
@@ -437,8 +446,10 @@ def find_identifiable_parameters(
     noise = _long_run_std(plain.estimate_base(structure, order=0).residual)
     table = data.table
     sizes = reference_sizes(table, setup, np.sqrt(np.mean(data.force**2, axis=0)), drives)
-    held = {f"{kind}.{drive}" for kind in FRICTION_TERMS for drive in resting}
-    asked = np.array([name not in held for name in table.names])
+    asked = np.array([
+        name.partition(".")[2] not in resting
+        or not (name.partition(".")[0] in FRICTION_TERMS or is_deviation(name)) for name in table.names
+    ])  # fmt: skip
     rows = (data.matrix / noise[:, None]).reshape(-1, data.matrix.shape[2])
     told = classify_noisy_parameters(rows, table.names, sizes, asked)
     if not len(told.base):

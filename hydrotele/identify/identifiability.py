@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hydrotele.identify.setup import RegressorSetup
-from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, Regressor
+from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, Regressor, is_deviation
 
 STATUS_UNIDENTIFIABLE, STATUS_COMBINATION, STATUS_FULL = "unidentifiable", "combination", "full"
 STATUS_WEAK = "weak"  # influence below the noise
@@ -207,7 +207,8 @@ def reference_sizes(
     """Return the reference sizes of all parameters.
 
     Sizes of a body follow from its given mass and radius of gyration. Sizes of friction are the
-    given values, at least a fraction of the drive force.
+    given values, at least a fraction of the drive force. Deviations of friction near zero speed have
+    the size of the drive force, so that they are left out only if nothing is known of them.
 
     Args:
         table: the parameters.
@@ -230,7 +231,8 @@ def reference_sizes(
         elif kind == "drive_inertia":
             sizes.append(max(float(chain.armature[chain.index(place)]), usual))
         else:
-            size = _DEFAULT_FORCE_FRACTION * known.get(place, _PIN_LEVER_ARM_M * usual)
+            part = 1.0 if is_deviation(name) else _DEFAULT_FORCE_FRACTION
+            size = part * known.get(place, _PIN_LEVER_ARM_M * usual)
             sizes.append(max(abs(given), size / _REFERENCE_SPEED if kind.startswith("viscous") else size))
     return np.maximum(sizes, 1e-12)
 

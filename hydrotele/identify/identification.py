@@ -19,7 +19,6 @@ from scipy.signal import fftconvolve
 
 from hydrotele.core.errors import InputError
 from hydrotele.identify.equations import (
-    Equations,
     StackedEquations,
     build_equations,
     design_low_pass,
@@ -36,6 +35,12 @@ from hydrotele.identify.estimation import (
     find_identifiable_parameters,
     weight_equations,
 )
+from hydrotele.identify.friction import (
+    add_deviations,
+    compute_friction_forces,
+    compute_speeds,
+    set_rest_speeds,
+)
 from hydrotele.identify.identifiability import Identifiability, classify_parameters
 from hydrotele.identify.motion import (
     Processing,
@@ -50,10 +55,19 @@ from hydrotele.identify.record import (
     cut_beginning,
     cut_to_whole_cycles,
 )
-from hydrotele.identify.result import HeldOutError, HeldOutForces, Identification
+from hydrotele.identify.result import Identification
 from hydrotele.identify.setup import RegressorSetup
 from hydrotele.identify.smoothing import SmoothedSignal, smooth
-from hydrotele.multibody.inverse_dynamics import Regressor
+from hydrotele.identify.verdict import (
+    compare_with_given_forces,
+    compute_heldout_errors,
+    compute_heldout_forces,
+    describe_heldout_errors,
+    describe_status,
+    find_implausible_parameters,
+    residual_autocorrelation,
+)
+from hydrotele.identify.wild_readings import remove_wild_readings
 
 _MAX_SENSITIVITY_ROWS = 8000  # rows, largest number at which force sensitivities are computed
 _PARAMETERS_PER_BLOCK = 4  # parameters per block, to limit memory for long logs
@@ -244,92 +258,6 @@ def _iterate_segments(
                 yield cut, found, noise
 
 
-_MAX_ERROR_OVER_NOISE = 1.5  # prediction error over noise above which the model is incomplete
-_MAX_ERROR_OVER_RESIDUAL = 3.0  # prediction error over fitted residuals above which the runs are not informative
-
-
-def compute_heldout_errors(
-    equations: Equations,
-    table: Regressor,
-    value: np.ndarray,
-    columns: list[int],
-    setup: RegressorSetup,
-) -> dict[str, HeldOutError]:
-    """Return the prediction errors of the held-out run for each drive at `columns`.
-
-    Drives without known forces are omitted.
-    """
-    noise = equations.noise_rms(value)
-    out = {}
-    for k in columns:
-        force = equations.force[:, k]
-        known = np.isfinite(force)
-        if not known.any():
-            continue
-        sizes = [
-            float(np.sqrt(np.mean((force - equations.matrix[:, k] @ p)[known] ** 2))) for p in (value, table.nominal)
-        ]
-        whole = float(np.sqrt(np.mean(force[known] ** 2)))
-        unit = "N" if setup.chain.tree.is_slide[setup.chain.index(table.drives[k])] else "N m"
-        out[table.drives[k]] = HeldOutError(sizes[0], unit, float(noise[k]), sizes[0] / max(whole, 1e-300), sizes[1])
-    return out
-
-
-def compute_heldout_forces(equations: Equations, table: Regressor, value: np.ndarray) -> HeldOutForces:
-    """Return measured and predicted forces of the held-out run."""
-    return HeldOutForces(
-        equations.name, table.drives, equations.time, equations.force, equations.matrix @ value,
-        equations.matrix @ table.nominal,
-    )  # fmt: skip
-
-
-def residual_autocorrelation(residual: np.ndarray) -> np.ndarray:
-    """Return the correlation (k,) of successive residuals (n, k)."""
-    error = residual - residual.mean(axis=0)
-    return np.sum(error[1:] * error[:-1], axis=0) / np.sum(error**2, axis=0)
-
-
-def describe_status(
-    heldout: dict[str, HeldOutError],
-    fitted: dict[str, float],
-    resting: np.ndarray,
-    setup: RegressorSetup,
-) -> str:
-    """Evaluate the result of an identification.
-
-    Args:
-        heldout: prediction errors of the held-out run.
-        fitted: drive -> RMS of the residuals of the fitted runs [N] or [N m].
-        resting: (k,) whether a given joint was at rest in all fitted runs.
-        setup: definition of the regressor.
-
-    Returns:
-        `ok`, or a sentence that names the problem and the remedy.
-    """
-    if resting.any():
-        names = ", ".join(j for j, stands in zip(setup.given_joints, resting, strict=True) if stands)
-        return (
-            f"{names} did not move: parameters that need its motion keep their given values;"
-            " log a fast motion of all axes in many poses"
-        )
-    if not heldout:
-        return "the held-out run has no known force, so nothing was validated: hold out another run"
-    worse = [d for d, h in heldout.items() if h.rms > _MAX_ERROR_OVER_NOISE * h.noise_rms]
-    if worse:
-        return (
-            f"on the held-out run the force error of {', '.join(worse)} exceeds the sensor noise:"
-            " the model is incomplete; search for missing effects with `hydrotele gap`"
-        )
-    worse = [d for d, h in heldout.items() if h.rms > _MAX_ERROR_OVER_RESIDUAL * fitted[d]]
-    if worse:
-        return (
-            f"on the held-out run the force error of {', '.join(worse)} is more than"
-            f" {_MAX_ERROR_OVER_RESIDUAL:g} times that on the fitted runs: their motion is not informative enough;"
-            " fit runs like the held-out run as well"
-        )
-    return "ok"
-
-
 _RELATIVE_BIAS_UNCERTAINTY = 0.2  # relative uncertainty of a bias: it is computed with a smoothed motion
 _MAX_PROPAGATED_GAINS = 2e7  # readings times parameters, above which only residuals give the covariance
 
@@ -413,13 +341,16 @@ def identify_dynamics(
     resolved = estimate_resolution(heldout.position, heldout.period, heldout.position_noise)
     judged, _ = build_equations(heldout, setup, judging, resolved, with_noise=True)
     predicted = compute_heldout_errors(judged, table, value, data.drive_columns, setup)
+    forces = compute_heldout_forces(judged, table, value)
+    found_friction = compute_friction_forces(setup, compute_speeds(fit, setup), table.names, value, told.base, found)
+    findings = (*compare_with_given_forces(forces, predicted), *find_implausible_parameters(told, table, found))
     return Identification(
         names=table.names, units=table.units, nominal=table.nominal, value=value, data_identifiability=told,
         motion_identifiability=fitted.motion_identifiability, estimate=found, bias=bias, heldout=predicted,
-        forces=compute_heldout_forces(judged, table, value), band=judged.band,
+        friction=found_friction, forces=forces, band=judged.band,
         residual_autocorrelation=dict(zip(data.drives, residual_autocorrelation(found.residual).tolist(), strict=True)),
-        status=describe_status(predicted, _residual_rms(fitted), fitted.joints_at_rest, setup),
-        notes=(*notes, *data.notes),
+        status=describe_status(predicted, _residual_rms(fitted), fitted.joints_at_rest, setup, findings),
+        notes=(*notes, *data.notes, *findings, *describe_heldout_errors(predicted, heldout.name)),
         seconds=time.perf_counter() - started,
     )  # fmt: skip
 
@@ -528,9 +459,11 @@ def identify_with_friction_shapes(
     processing: Processing | None = None, estimator: Estimator | None = None, *,
     notes: Sequence[str] = (),
 ) -> Identification:  # fmt: skip
-    """Identify with dry friction as smooth as the machine states, or with a sharp sign change.
+    """Identify with the form of dry friction near zero speed that the data select, without wild readings.
 
-    The smoothing velocity of a machine often serves only the simulation; Coulomb friction is sharp.
+    Dry friction is as smooth as the machine states, or changes its sign sharply: the smoothing velocity of a machine
+    often serves only the simulation. Deviations near zero speed are added if they improve Schwarz's criterion. They
+    need a wider band than the motion, which is also the band of the result.
 
     Args:
         fit: as in `identify_dynamics`.
@@ -541,23 +474,43 @@ def identify_with_friction_shapes(
         notes: as in `identify_dynamics`.
 
     Returns:
-        The identification with the larger likelihood; a note says if sharp friction was selected.
+        The identification with the best criterion; notes name the selected form and wild readings.
 
     Raises:
         InputError: as in `identify_dynamics`.
+
+    Source: Schwarz 1978, Estimating the dimension of a model.
     """
     started = time.perf_counter()
     processing, estimator = processing or Processing(), estimator or Estimator()
+    cleaned = [remove_wild_readings(record, setup.chain.drives) for record in (*fit, heldout)]
+    fit, heldout = [record for record, _ in cleaned[:-1]], cleaned[-1][0]
+    notes = (*notes, *(note for _, said in cleaned for note in said))
+    speeds = compute_speeds(fit, setup)
+    setup = set_rest_speeds(setup, speeds)
+    some = _select_first_runs(fit, processing.period)
+    best = compute_schwarz_criterion(some, setup, processing, estimator)
     if any(one.smoothing for one in setup.friction_terms):
         sharp = replace(setup, friction_terms=tuple(replace(one, smoothing=0.0) for one in setup.friction_terms))
-        some = _select_first_runs(fit, processing.period)
-        misfits = [_negative_log_likelihood(some, s, processing, estimator) for s in (setup, sharp)]
-        if misfits[1] < misfits[0]:
-            setup = sharp
-            said = "Sharp Coulomb friction fits these data better than the given smoothing."
-            notes = (*notes, said)
+        if (criterion := compute_schwarz_criterion(some, sharp, processing, estimator)) < best:
+            setup, best = sharp, criterion
+            notes = (*notes, "Sharp Coulomb friction fits these data better than the given smoothing.")
+    free, wide = add_deviations(setup, speeds), _widen_band(fit, processing)
+    if wide != processing:
+        best = compute_schwarz_criterion(some, setup, wide, estimator)
+    if compute_schwarz_criterion(some, free, wide, estimator) < best:
+        setup, processing = free, wide
+        notes = (*notes, "Friction near zero speed deviates from the given law; the deviation was estimated as well.")
     found = identify_dynamics(fit, heldout, setup, processing, estimator, notes=notes)
     return replace(found, seconds=time.perf_counter() - started)
+
+
+def _widen_band(fit: Sequence[IdentificationRecord], processing: Processing) -> Processing:
+    """Return the processing with a band that contains the changes of dry friction, if the user states no band."""
+    if processing.band or processing.method == "periodic":
+        return processing
+    found = [estimate_resolution(r.position, r.period, r.position_noise) for r in fit]
+    return replace(processing, band=min(one.friction_band for one in found))
 
 
 def _select_first_runs(fit: Sequence[IdentificationRecord], period: float | None) -> list[IdentificationRecord]:
@@ -571,14 +524,28 @@ def _select_first_runs(fit: Sequence[IdentificationRecord], period: float | None
     return some
 
 
-def _negative_log_likelihood(
+def compute_schwarz_criterion(
     fit: Sequence[IdentificationRecord],
     setup: RegressorSetup,
     processing: Processing,
     estimator: Estimator,
 ) -> float:
-    """Return minus twice the log likelihood of the residuals, per row and without constants."""
+    """Return Schwarz's criterion of a fit, per row and without constants; infinite if there are too few rows.
+
+    Args:
+        fit: as in `identify_dynamics`.
+        setup: as in `identify_dynamics`.
+        processing: as in `identify_dynamics`.
+        estimator: as in `identify_dynamics`.
+
+    Source: McQuarrie and Tsai 1998, Regression and time series model selection (correction for few rows).
+    """
     found = fit_runs(fit, setup, processing, estimator)
+    rows, drives = found.estimate.residual.shape
+    parameters = len(found.estimate.value)
+    if (free := rows - parameters / drives - 2.0) <= 0.0:
+        return math.inf
     # weights are inverse standard deviations; without them the most uncertain shape would win
     doubted = np.sum(np.mean(np.log(found.equations.weights**2), axis=0))
-    return float(np.sum(np.log(np.mean(found.estimate.residual**2, axis=0))) - doubted)
+    misfit = np.sum(np.log(np.mean(found.estimate.residual**2, axis=0))) - doubted
+    return float(misfit + parameters * np.log(rows) / free)

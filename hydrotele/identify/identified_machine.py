@@ -289,7 +289,7 @@ def build_identify_document(
         best: the nearest physically consistent parameters.
 
     Returns:
-        Keys `parameters`, `condition`, `heldout`, `count_statuses`, `status`, `seconds`, `band_hz`,
+        Keys `parameters`, `condition`, `heldout`, `friction`, `counts`, `status`, `seconds`, `band_hz`,
         `whiteness`, `given`, `find_consistent_parameters`, `notes`; `hydraulics` if requested.
     """
     distance, limit = found.squared_distance(found.nominal) if found else (None, None)
@@ -308,10 +308,15 @@ def build_identify_document(
         "heldout": {
             drive: {
                 "rms": h.rms, "unit": h.unit, "noise_rms": h.noise_rms, "relative": h.relative_error,
-                "nominal_rms": h.nominal_rms,
+                "nominal_rms": h.nominal_rms, "explained": h.is_explained,
+                "rest": {"fraction": h.rest_fraction, "friction": h.rest_friction, "excess_rms": h.excess_rms},
             }
             for drive, h in (found.heldout.items() if found else ())
         },
+        "friction": [
+            {"drive": f.drive, "speed": f.speed, "force": f.force, "std": f.std, "ci95": list(f.ci95), "unit": f.unit}
+            for f in (found.friction if found else ())
+        ],
         "counts": count_statuses(rows),
         "status": found.status if found else "no force is known",
         "seconds": found.seconds if found else 0.0,

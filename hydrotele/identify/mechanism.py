@@ -23,9 +23,11 @@ from hydrotele.identify.record import (
     trim_missing_positions,
 )
 from hydrotele.identify.setup import RegressorSetup, mechanism_setup
-from hydrotele.logs.log import SKIP_COLUMN, Log, load_log, read_table
+from hydrotele.logs.log import SKIP_COLUMN, Log, find_logs, load_log
 from hydrotele.logs.rows import fit_clock
+from hydrotele.logs.table import read_table
 from hydrotele.machine.machine import SensorError
+from hydrotele.machine.signals import close_matches
 from hydrotele.multibody.chain import load_chain
 from hydrotele.multibody.closures import solve_joint_positions
 from hydrotele.multibody.inverse_dynamics import BODY_PARAMETERS, FRICTION_TERMS
@@ -180,7 +182,7 @@ def load_mechanism_records(
     """Read logs of a mechanism.
 
     Args:
-        paths: log files (.csv, .parquet) and folders of them.
+        paths: log files (.csv, .parquet), folders of them, run folders.
         mechanism: the mechanism.
         heldout: name of the held-out run. By default it is the first one that begins with `test`,
             otherwise the last. A single run is split in time.
@@ -194,13 +196,16 @@ def load_mechanism_records(
         InputError: a file cannot be read, a column is missing, or there is no such run.
     """
     runs, notes = {}, []
-    for path in _list_log_files(paths):
+    files = [pair for path in paths for pair in find_logs(Path(path))]
+    if not files:
+        raise InputError("the data", "no file was given: name log files, or a folder with logs")
+    for name, path in files:
         log, columns = _load_with_columns(path, mechanism)
-        if log.name in runs:
-            raise InputError(log.source, f"the run name {log.name!r} is used twice: rename one")
-        run, said = _build_record(log, columns, mechanism)
-        runs[log.name] = run if keep_measured_joints else convert_coordinates(run, mechanism.setup)
-        notes += said
+        if name in runs:
+            raise InputError(log.source, f"the run name {name!r} is used twice: rename one")
+        run, said = _build_record(log, name, columns, mechanism)
+        runs[name] = run if keep_measured_joints else convert_coordinates(run, mechanism.setup)
+        notes += [*log.notes, *said]
     if heldout is not None and heldout not in runs:
         raise InputError("--heldout", f"there is no run {heldout!r}; {suggest_valid_name(heldout, runs)}")
     if len(runs) == 1:
@@ -219,21 +224,6 @@ def load_mechanism_records(
     return tuple(runs[n] for n in named if n != chosen), runs[chosen], tuple(notes)
 
 
-def _list_log_files(paths: Sequence[str | Path]) -> list[Path]:
-    out: list[Path] = []
-    for path in map(Path, paths):
-        if not path.is_dir():
-            out.append(path)
-            continue
-        some = sorted(p for p in path.iterdir() if p.suffix.lower() in (".csv", ".parquet"))
-        if not some:
-            raise InputError(path, "the folder contains no log: add .parquet or .csv files")
-        out += some
-    if not out:
-        raise InputError("the data", "no file was given: name log files, or a folder with logs")
-    return out
-
-
 class _Column(NamedTuple):
     """Channel name and sign of a column."""
 
@@ -248,8 +238,9 @@ def _load_with_columns(path: Path, mechanism: Mechanism) -> tuple[Log, dict[tupl
     names, ours = raw.names, "hydrotele" in raw.metadata  # logs of hydrotele keep their names
     aliases = dict.fromkeys(names, SKIP_COLUMN)
     if mapping.time not in names:
+        hint = next((f" {name}" for name in names if "time" in close_matches(name)[:1]), "")
         raise InputError(path, f"has no time column {mapping.time!r}: name it in the"
-                         f" mapping, as `time: COLUMN`; columns: {', '.join(names)}")  # fmt: skip
+                         f" mapping, as `time:{hint or ' COLUMN'}`; columns: {', '.join(names)}")  # fmt: skip
     aliases[mapping.time] = "time"
     for what, joints, stated, usual in (
         ("position", mechanism.measured_joints, mapping.position, _POSITION_PATTERNS),
@@ -275,19 +266,19 @@ def _load_with_columns(path: Path, mechanism: Mechanism) -> tuple[Log, dict[tupl
             kinds = {"position": ("angle", "position"), "force": ("torque", "force")}[what]
             aliases[name] = f"{kinds[int(straight)]}.{what[0]}{number}"
             columns[what, joint] = _Column(name if ours else aliases[name], sign)
-    log = load_log(path, aliases=aliases, maximum_dropped=1.0, missing=True)
+    log = load_log(path, aliases=aliases)
     return log, columns
 
 
 def _build_record(
-    log: Log, columns: dict[tuple[str, str], _Column], mechanism: Mechanism
+    log: Log, name: str, columns: dict[tuple[str, str], _Column], mechanism: Mechanism
 ) -> tuple[IdentificationRecord, tuple[str, ...]]:
     chain = mechanism.setup.chain
     clock, notes = fit_clock(log.time, log.source)
     time, period = log.time[clock.row], clock.period
     if clock.tick[-1] > _MAX_TICKS_PER_ROW * len(time):  # no common clock: use the median period
         period = float(np.median(np.diff(time)))
-        notes = (f"{log.name}: {notes[0].rpartition('; ')[0].partition(': ')[2]}; interpolated to"
+        notes = (f"{name}: {notes[0].rpartition('; ')[0].partition(': ')[2]}; interpolated to"
                  f" {1.0 / period:.4g} Hz.",)  # fmt: skip
     ticks = time[0] + period * np.arange(round((time[-1] - time[0]) / period) + 1)
 
@@ -325,7 +316,7 @@ def _build_record(
         )  # fmt: skip
     mapping = mechanism.mapping
     record = IdentificationRecord(
-        log.name, period, mechanism.measured_joints, np.array(position).T,
+        name, period, mechanism.measured_joints, np.array(position).T,
         _expand_noise(mapping.position_noise, mechanism.measured_joints), np.array(force).T,
         _expand_noise(mapping.force_noise, chain.drives),
     )  # fmt: skip

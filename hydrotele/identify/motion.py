@@ -107,6 +107,7 @@ METHODS = ("optimal", "zero_phase", "periodic", "raw")
 _CUTOFF_OVER_BANDWIDTH = 2.5  # filter cutoff over resolved bandwidth: there the signal is a thousandth of the noise
 _BAND_OVER_BANDWIDTH = 0.5  # band of the equations over bandwidth: there accelerations exceed their noise
 _ACCELERATION_POWER_FRACTION = 0.98  # of the accelerations' power: above it, forces depend on more than the motion
+_FRICTION_HARMONICS = 5.0  # harmonics of the motion: 90 % of the power of a sign change are in the first and third
 _MIN_SPECTRAL_LINES = 10.0  # smallest number of the record's spectral lines in the band
 _MIN_MOTION_OVER_NOISE = 10.0  # standard deviations of the noise: smallest amplitude of a moving joint
 MAX_GAP_S = 0.1  # s, longest gap that a filter may interpolate
@@ -168,6 +169,11 @@ class Resolution:
     def band(self) -> float:
         """Band of the equations [Hz]."""
         return min(_BAND_OVER_BANDWIDTH * self.bandwidth, self.acceleration_bandwidth)
+
+    @property
+    def friction_band(self) -> float:
+        """Band that also contains the changes of dry friction near reversals [Hz]."""
+        return min(_BAND_OVER_BANDWIDTH * self.bandwidth, _FRICTION_HARMONICS * self.acceleration_bandwidth)
 
 
 def estimate_resolution(positions: np.ndarray, period: float, noise: np.ndarray, cycles: int = 1) -> Resolution:

@@ -1,11 +1,12 @@
 """Result types of an identification, and its parameters as table rows for reports and files."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2
 
 from hydrotele.identify.estimation import Estimate
+from hydrotele.identify.friction import FrictionForce
 from hydrotele.identify.identifiability import (
     STATUS_COMBINATION,
     STATUS_FULL,
@@ -13,6 +14,7 @@ from hydrotele.identify.identifiability import (
     STATUS_WEAK,
     Identifiability,
 )
+from hydrotele.multibody.inverse_dynamics import is_deviation
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,11 @@ class HeldOutError:
         noise_rms: RMS error of a perfect model with these sensors; NaN if unknown.
         relative_error: RMS error over RMS force [1].
         nominal_rms: RMS error with the given parameters.
+        is_explained: whether the identified model predicts the force better than zero force does, by more than
+            two standard deviations of the difference.
+        rest_fraction: fraction of the compared rows in which the drive is at rest [1].
+        rest_friction: Coulomb friction [N] or [N m]; at rest, friction is any force within plus and minus this value.
+        excess_rms: RMS error beyond that interval; equal to `rms` if the drive is never at rest.
     """
 
     rms: float
@@ -32,6 +39,10 @@ class HeldOutError:
     noise_rms: float
     relative_error: float
     nominal_rms: float
+    is_explained: bool
+    rest_fraction: float
+    rest_friction: float
+    excess_rms: float
 
 
 @dataclass(frozen=True)
@@ -69,6 +80,7 @@ class Identification:
         estimate: estimate of the base parameters `data_identifiability`, with covariance and residuals.
         bias: (r,) bias caused by position noise, already subtracted.
         heldout: drive -> prediction error of the held-out run.
+        friction: friction force of the drives at round speeds, deviations near zero speed included.
         forces: forces of the held-out run.
         band: band of the equations [Hz].
         residual_autocorrelation: drive -> correlation of successive residuals.
@@ -86,6 +98,7 @@ class Identification:
     estimate: Estimate
     bias: np.ndarray
     heldout: dict[str, HeldOutError]
+    friction: tuple[FrictionForce, ...]
     forces: HeldOutForces
     band: float
     residual_autocorrelation: dict[str, float]
@@ -93,8 +106,15 @@ class Identification:
     notes: tuple[str, ...]
     seconds: float
 
+    @property
+    def explains_force(self) -> bool:
+        """Whether the identified model predicts the held-out force of any drive better than zero force does."""
+        return not self.heldout or any(h.is_explained for h in self.heldout.values())
+
     def squared_distance(self, value: np.ndarray) -> tuple[float, float]:
         """Test whether other parameters lie in the confidence ellipsoid of the estimate.
+
+        Deviations of the friction near zero speed are marginalised.
 
         Args:
             value: (m,) parameters.
@@ -103,8 +123,14 @@ class Identification:
             The squared Mahalanobis distance from the estimate, and the limit below which 95 % of
             true parameters lie.
         """
-        limit = float(chi2.ppf(0.95, self.estimate.rank))
-        return self.estimate.squared_distance(self.data_identifiability.combination @ value), limit
+        told = self.data_identifiability
+        kept = np.array([not is_deviation(self.names[b]) for b in told.base])
+        estimate = replace(
+            self.estimate, value=self.estimate.value[kept], covariance=self.estimate.covariance[np.ix_(kept, kept)],
+            rank=min(self.estimate.rank, int(kept.sum())),
+        )  # fmt: skip
+        limit = float(chi2.ppf(0.95, estimate.rank))
+        return estimate.squared_distance((told.combination @ value)[kept]), limit
 
 
 STATUSES = (STATUS_UNIDENTIFIABLE, STATUS_COMBINATION, STATUS_FULL, STATUS_WEAK)
@@ -146,7 +172,7 @@ class ParameterRow:
 
 
 def parameter_rows(found: Identification) -> list[ParameterRow]:
-    """Return the table rows of all parameters in their order.
+    """Return the table rows of all parameters in their order, without deviations of friction near zero speed.
 
     Args:
         found: the identification.
@@ -158,6 +184,8 @@ def parameter_rows(found: Identification) -> list[ParameterRow]:
     given = found.data_identifiability.combination @ found.nominal
     rows = []
     for m, name in enumerate(found.names):
+        if is_deviation(name):
+            continue
         status, unit, nominal = (
             found.data_identifiability.status[m],
             found.units[m],

@@ -360,7 +360,7 @@ class FourBar:
             LoopOpen: rocker and coupler cannot meet at a requested angle.
 
         >>> bucket = FourBar((1.8, 0.0), (1.5, 0.1), (-0.1, 0.2), 0.55, 0.48, (-0.2, 0.35))
-        >>> q, r = bucket.pins(-1.0)
+        >>> q, r = bucket.pin_positions(-1.0)
         >>> [round(v, 4) for v in (*q, *r)]
         [1.9865, 0.3574, 1.5992, 0.641]
         """

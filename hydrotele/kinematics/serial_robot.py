@@ -6,14 +6,19 @@ encoder readings: joints deflect under gravity, and an eccentric encoder has an 
 
 Robots are read from YAML, URDF or MJCF, and written with corrections. A YAML file adds the
 direction of gravity and the joint corrections, which URDF cannot express.
+
+A joint can follow another one, as `mimic` of a URDF states: q_i = multiplier q_j + offset. The
+parallel linkage of a palletiser is an example. Such a joint needs no separate reading.
 """
 
 import math
+import re
 import xml.etree.ElementTree as ElementTree
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import yaml
@@ -27,7 +32,7 @@ from hydrotele.core.datafile import (
     validate_data,
 )
 from hydrotele.core.errors import InputError
-from hydrotele.core.files import models_folder, read_text
+from hydrotele.core.files import models_folder, read_xml
 from hydrotele.kinematics.serial_chain import (
     ChainPoses,
     SerialChain,
@@ -44,6 +49,17 @@ _AXIS_TOLERANCE = 1e-12  # tolerance for an axis that is parallel to a coordinat
 _MIN_TORQUE = 1e-5  # N m per kilogram: rounding
 
 
+class Mimic(NamedTuple):
+    """Coupling of a joint: its position is `multiplier` times that of `joint` plus `offset`.
+
+    `offset` is in [rad] or [m] of the joint that follows.
+    """
+
+    joint: str
+    multiplier: float = 1.0
+    offset: float = 0.0
+
+
 @dataclass(frozen=True)
 class RobotJoint:
     """One joint of a robot.
@@ -53,12 +69,14 @@ class RobotJoint:
         kind: `revolute` or `prismatic`.
         origin: (4, 4) its frame in the frame after the joint before [m].
         axis: (3,) unit vector in that frame.
+        mimic: the joint of the robot that it follows, or None.
     """
 
     name: str
     kind: Literal["revolute", "prismatic"]
     origin: np.ndarray
     axis: np.ndarray
+    mimic: Mimic | None = None
 
 
 @dataclass(frozen=True)
@@ -87,6 +105,70 @@ class SerialRobot:
         """Names of the joints."""
         return tuple(joint.name for joint in self.joints)
 
+    @property
+    def independent_joint_names(self) -> tuple[str, ...]:
+        """Names of the joints that follow no other joint."""
+        return tuple(joint.name for joint in self.joints if joint.mimic is None)
+
+
+class JointCoupling(NamedTuple):
+    """Affine map from the k independent joints of a robot to all its n joints.
+
+    `matrix` is (n, k); `offset` is (n,) in [rad] or [m].
+    """
+
+    matrix: np.ndarray
+    offset: np.ndarray
+
+
+def couple_joints(robot: SerialRobot) -> JointCoupling:
+    """Return the map from the independent joints of a robot to all its joints.
+
+    Raises:
+        InputError: a joint follows a joint that the robot does not have, or follows itself.
+    """
+    joints = {joint.name: joint for joint in robot.joints}
+    column = {name: k for k, name in enumerate(robot.independent_joint_names)}
+    matrix, offset = np.zeros((len(joints), len(column))), np.zeros(len(joints))
+    for i, joint in enumerate(robot.joints):
+        at, factor = joint, 1.0
+        followed: list[str] = []
+        while at.mimic is not None:
+            followed.append(at.name)
+            source = joints.get(at.mimic.joint)
+            if source is None:
+                message = f"joint {at.name} mimics joint {at.mimic.joint!r}, which does not move the ball"
+                raise InputError(robot.source or robot.name, f"{message}; name a moving joint between base and ball")
+            if source.name in followed:
+                raise InputError(robot.source or robot.name, f"joint {joint.name} mimics itself")
+            offset[i] += factor * at.mimic.offset
+            at, factor = source, factor * at.mimic.multiplier
+        matrix[i, column[at.name]] = factor
+    return JointCoupling(matrix, offset)
+
+
+def expand_joints(robot: SerialRobot, readings: np.ndarray) -> np.ndarray:
+    """Return the positions of all joints from readings, which may omit the joints that follow others.
+
+    Args:
+        robot: the robot.
+        readings: (m, n) readings of all n joints, which are returned as they are, or (m, k) of the
+            independent ones [rad] or [m].
+
+    Returns:
+        (m, n) positions.
+
+    Raises:
+        ValueError: the number of columns is neither.
+    """
+    count = readings.shape[1]
+    if count == len(robot.joints):
+        return readings
+    if count != len(robot.independent_joint_names):
+        raise ValueError(f"{count} columns, but {robot.name} has {len(robot.joints)} joints")
+    coupling = couple_joints(robot)
+    return readings @ coupling.matrix.T + coupling.offset
+
 
 def robot_chain(robot: SerialRobot) -> SerialChain:
     """Build the chain of a robot with six errors in front of every joint and the ball position.
@@ -110,7 +192,7 @@ def robot_chain(robot: SerialRobot) -> SerialChain:
     tool = robot.tool
     frames.append(end)
     kinds = ["rz" if joint.kind == "revolute" else "tz" for joint in robot.joints]
-    return chain_from_frames(frames, kinds, robot.names, tool[:3, 3])  # type: ignore[arg-type]
+    return chain_from_frames(frames, kinds, robot.joint_names, tool[:3, 3])  # type: ignore[arg-type]
 
 
 def correct_robot(robot: SerialRobot, values: Mapping[str, float], corrections: Mapping[str, float]) -> SerialRobot:
@@ -249,7 +331,7 @@ def solve_ball_positions(
     Args:
         robot: nominal or calibrated robot.
         places: (n, 3) ball positions in the base frame [m].
-        start: (n, k) start of the joints.
+        start: (n, k) start of the joints; joints that follow others are set from these.
         iterations: maximum number of steps.
         idle: column of a joint that does not move, or None.
 
@@ -258,8 +340,12 @@ def solve_ball_positions(
 
     Source: Wampler 1986 (damped least squares).
     """
-    chain = robot_chain(robot)
-    joints = np.array(start, float)
+    chain, coupling = robot_chain(robot), couple_joints(robot)
+    independent = [joint.mimic is None for joint in robot.joints]
+    joints = expand_joints(robot, np.asarray(start, float)[:, independent])
+    motion = coupling.matrix
+    if idle is not None:
+        motion = motion * (motion[idle] == 0.0)
     gap = np.zeros_like(places)
     for _ in range(iterations + 1):
         found = chain_poses_and_rates(chain, _apply_corrections(robot, joints))
@@ -267,12 +353,10 @@ def solve_ball_positions(
         size = np.sum(gap**2, axis=1)
         if size.max(initial=0.0) < 1e-24:
             break
-        rates = found.position_by_joint.copy()
-        if idle is not None:
-            rates[:, :, idle] = 0.0
+        rates = found.position_by_joint @ motion
         square = rates @ np.swapaxes(rates, 1, 2) + (1e-3 * size)[:, None, None] * np.eye(3)
         step = np.swapaxes(rates, 1, 2) @ np.linalg.solve(square, gap[:, :, None])
-        joints += step[:, :, 0]
+        joints = joints + step[:, :, 0] @ motion.T
     return PositionSolution(joints, np.linalg.norm(gap, axis=1))
 
 
@@ -351,10 +435,13 @@ def load_robot(name_or_path: str | Path, joints: int | None = None) -> SerialRob
 
     Args:
         name_or_path: a shipped robot, or a file: YAML, URDF or MJCF (.yaml, .urdf, .xml).
-        joints: number of moving joints that the chain must have; None for the longest chain.
+        joints: number of columns of the readings; joints that follow others may have none. None
+            for any number.
 
     Returns:
-        The robot.
+        The robot. The chain of a URDF or MJCF ends at the link, body or site that `_BALL_NAMES`
+        name, whatever `joints` is. If there is no such name, it ends at the last link of the
+        branch with this number of joints, or of the longest branch.
 
     Raises:
         InputError: there is no such robot, its file is invalid, or its number of joints differs.
@@ -370,16 +457,39 @@ def load_robot(name_or_path: str | Path, joints: int | None = None) -> SerialRob
     if path.suffix in (".yaml", ".yml"):
         robot = _read_yaml_robot(path)
     else:
-        root = _parse_xml(path)
+        root = read_xml(path)
         if root.tag == "mujoco":
             robot = _read_mjcf(path, joints)
         elif root.tag == "robot":
             robot = _read_urdf(path, root, joints)
         else:
             raise InputError(path, f"is not a robot file: its first element is <{root.tag}>")
-    if joints is not None and len(robot.joints) != joints:
-        raise InputError(path, f"has {len(robot.joints)} moving joints, but the data have {joints} columns")
+    names = robot.joint_names
+    _check_names(path, names)
+    couple_joints(robot)
+    if joints is not None and joints not in (len(names), len(robot.independent_joint_names)):
+        raise InputError(path, _describe_joint_count(robot, joints))
     return robot
+
+
+def _check_names(path: Path, names: Sequence[str]) -> None:
+    if repeated := next((name for name, count in Counter(names).items() if count > 1), None):
+        raise InputError(path, f"has two joints with the name {repeated!r}; give every joint its own name")
+
+
+def _describe_joint_count(robot: SerialRobot, columns: int) -> str:
+    """Return the message for readings whose number of columns does not suit the robot."""
+    names, independent = robot.joint_names, robot.independent_joint_names
+    said = f"has {len(names)} moving joints up to the ball ({', '.join(names)}), but the data have {columns} columns"
+    if len(independent) < len(names):
+        said += f"; {len(independent)} columns suffice, because the others follow by mimic: {', '.join(independent)}"
+    return said
+
+
+class _MimicSpec(StrictModel):
+    joint: str
+    multiplier: float = 1.0
+    offset: float = 0.0
 
 
 class _JointSpec(StrictModel):
@@ -388,6 +498,7 @@ class _JointSpec(StrictModel):
     position: Vector = (0.0, 0.0, 0.0)
     rpy: Vector = (0.0, 0.0, 0.0)
     axis: Vector = (0.0, 0.0, 1.0)
+    mimic: _MimicSpec | None = None
 
 
 class _BallSpec(StrictModel):
@@ -410,9 +521,12 @@ def _read_yaml_robot(path: Path) -> SerialRobot:
     if not facts.joints:
         raise InputError(path, "has no joints")
     joints = tuple(
-        RobotJoint(j.name, j.type, frame_from_rpy(j.position, j.rpy), _unit_vector(path, j.name, j.axis))
+        RobotJoint(
+            j.name, j.type, frame_from_rpy(j.position, j.rpy), _unit_vector(path, j.name, j.axis),
+            Mimic(j.mimic.joint, j.mimic.multiplier, j.mimic.offset) if j.mimic else None,
+        )
         for j in facts.joints
-    )
+    )  # fmt: skip
     return SerialRobot(
         facts.name, joints, frame_from_rpy(facts.ball.position, facts.ball.rpy), np.array(facts.gravity),
         dict(facts.corrections), str(path),
@@ -431,7 +545,8 @@ def robot_to_yaml(robot: SerialRobot, source: str) -> str:
     """
     joints = [
         {"name": j.name, "type": j.kind, "position": _to_floats(j.origin[:3, 3]),
-         "rpy": _to_floats(rotation_to_rpy(j.origin[:3, :3])), "axis": _to_floats(j.axis)}
+         "rpy": _to_floats(rotation_to_rpy(j.origin[:3, :3])), "axis": _to_floats(j.axis),
+         **({"mimic": j.mimic._asdict()} if j.mimic else {})}
         for j in robot.joints
     ]  # fmt: skip
     data = {
@@ -477,11 +592,63 @@ def correct_urdf(robot: SerialRobot, text: str) -> str:
     return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
-def _read_urdf(path: Path, root: ElementTree.Element, count: int | None) -> SerialRobot:
+class _End(NamedTuple):
+    """A possible end of a robot's chain: the part that has the ball, and what leads there.
+
+    `name` is that of the part, `count` the number of moving joints, `is_last` whether no other
+    part follows, `way` the joints from the base.
+    """
+
+    name: str
+    count: int
+    is_last: bool
+    way: Any
+
+
+def _choose_end(path: Path, ends: Sequence[_End], columns: int | None) -> _End:
+    """Choose the end of a robot's chain: by its name, then by the number of columns, then the longest.
+
+    Args:
+        path: file of the robot.
+        ends: all links of a URDF, or all bodies and sites of an MJCF.
+        columns: number of columns of the readings, or None.
+
+    Returns:
+        The end. If several are equal, the one with the longest way, then the first.
+
+    Raises:
+        InputError: no end has a moving joint.
+    """
+    ends = [end for end in ends if end.count]
+    if not ends:
+        raise InputError(path, "has no moving joint")
+    ranks = [_rank_ball_name(end.name) for end in ends]
+    if min(ranks) < len(_BALL_NAMES):
+        ends = [end for end, rank in zip(ends, ranks, strict=True) if rank == min(ranks)]
+    else:
+        ends = [end for end in ends if end.is_last]
+    fitting = [end for end in ends if end.count == columns]
+    return max(fitting or ends, key=lambda end: (end.count, end.is_last, len(end.way)))
+
+
+def _rank_ball_name(name: str) -> int:
+    """Return the place in `_BALL_NAMES` of the first of its words in a name, else the number of words."""
+    words = (rf"(?<![a-z]){word}(?![a-z])" for word in _BALL_NAMES)
+    return next((k for k, word in enumerate(words) if re.search(word, name.lower())), len(_BALL_NAMES))
+
+
+def _read_urdf(path: Path, root: ElementTree.Element, columns: int | None) -> SerialRobot:
     joints = root.findall("joint")
-    by_child = {_link_name(joint, "child"): joint for joint in joints}
+    _check_names(path, [str(joint.get("name")) for joint in joints])
+    by_child: dict[str, ElementTree.Element] = {}
+    for joint in joints:
+        first = by_child.setdefault(_link_name(joint, "child"), joint)
+        if first is not joint:
+            name, other = first.get("name"), joint.get("name")
+            message = f"link {_link_name(joint, 'child')!r} is the child of two joints, {name} and {other}"
+            raise InputError(path, f"{message}; a URDF is a tree")
     parents = {_link_name(joint, "parent") for joint in joints}
-    ways: list[list[ElementTree.Element]] = []
+    ends: list[_End] = []
     for link in by_child:
         way, at = [], link
         while at in by_child and len(way) <= len(joints):
@@ -489,49 +656,55 @@ def _read_urdf(path: Path, root: ElementTree.Element, count: int | None) -> Seri
             at = _link_name(by_child[at], "parent")
         if len(way) > len(joints):
             raise InputError(path, f"joints around link {link!r} form a closed loop")
-        ways.append(way)
-
-    def count_moving(way: list[ElementTree.Element]) -> int:
-        return sum(joint.get("type") in _MOVING_JOINT_KINDS for joint in way)
-
-    most = max((count_moving(way) for way in ways), default=0)
-    if not most:
-        raise InputError(path, "has no moving joint")
-    wanted = count if count in {count_moving(way) for way in ways} else most
-    ways = [way for way in ways if count_moving(way) == wanted]
-
-    def rank(way: list[ElementTree.Element]) -> tuple:
-        end = _link_name(way[-1], "child").lower()
-        named = next((k for k, word in enumerate(_BALL_NAMES) if word in end), len(_BALL_NAMES))
-        return named, end in parents, -len(way)
-
-    way = min(ways, key=rank)
+        ends.append(_End(link, sum(joint.get("type") != "fixed" for joint in way), link not in parents, way))
+    way = _choose_end(path, ends, columns).way
     made, back = [], np.eye(4)
     for joint in way:
         back = back @ _read_origin(joint)
-        kind = _MOVING_JOINT_KINDS.get(str(joint.get("type")))
-        if kind is None:
+        stated, name = joint.get("type"), str(joint.get("name"))
+        if stated == "fixed":
             continue
+        kind = _MOVING_JOINT_KINDS.get(str(stated))
+        if kind is None:
+            valid = ", ".join(("fixed", *_MOVING_JOINT_KINDS))
+            raise InputError(path, f"joint {name}: the type {stated!r} is not supported; valid: {valid}")
         element = joint.find("axis")
         axis = _read_numbers(path, joint, element, "xyz", (1.0, 0.0, 0.0))
-        name = str(joint.get("name"))
-        made.append(RobotJoint(name, kind, back, _unit_vector(path, name, axis)))  # type: ignore[arg-type]
+        mimic = _read_mimic(path, joint)
+        made.append(RobotJoint(name, kind, back, _unit_vector(path, name, axis), mimic))  # type: ignore[arg-type]
         back = np.eye(4)
     return SerialRobot(str(root.get("name") or path.stem), tuple(made), back, source=str(path))
 
 
-def _read_mjcf(path: Path, count: int | None) -> SerialRobot:
+def _read_mimic(path: Path, joint: ElementTree.Element) -> Mimic | None:
+    """Read the `mimic` element of a URDF joint."""
+    element = joint.find("mimic")
+    if element is None:
+        return None
+    numbers = []
+    for key, default in (("multiplier", "1"), ("offset", "0")):
+        said = element.get(key, default)
+        try:
+            numbers.append(float(said))
+        except ValueError:
+            numbers.append(math.nan)
+        if not math.isfinite(numbers[-1]):
+            raise InputError(path, f"joint {joint.get('name')}: mimic {key}={said!r} must be a number")
+    return Mimic(element.get("joint", ""), *numbers)
+
+
+def _read_mjcf(path: Path, columns: int | None) -> SerialRobot:
     import mujoco
 
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
-        for unneeded in (*spec.geoms, *spec.meshes, *spec.sensors, *spec.keys, *spec.excludes):
-            spec.delete(unneeded)
-        for body in spec.bodies[1:]:
-            body.explicitinertial, body.mass, body.inertia = True, 1.0, (1.0, 1.0, 1.0)
-        model = spec.compile()
-    except (ValueError, mujoco.FatalError) as error:
-        raise InputError(path, f"cannot be read by MuJoCo: {str(error).strip()}") from None
+    from hydrotele.core.mjcf import read_mjcf
+
+    document = read_mjcf(path)
+    spec = document.load_spec()
+    for unneeded in (*spec.geoms, *spec.meshes, *spec.sensors, *spec.keys, *spec.excludes):
+        spec.delete(unneeded)
+    for body in spec.bodies[1:]:
+        body.explicitinertial, body.mass, body.inertia = True, 1.0, (1.0, 1.0, 1.0)
+    model = document.compile(spec)
     data = mujoco.MjData(model)
     data.qpos[:] = 0.0
     mujoco.mj_kinematics(model, data)
@@ -548,18 +721,14 @@ def _read_mjcf(path: Path, count: int | None) -> SerialRobot:
             body = int(model.body_parentid[body])
         return joints
 
-    found = [(kind, k, chain(body)) for kind, k, body in ends]
-    found = [one for one in found if all(int(model.jnt_type[j]) in kinds for j in one[2])]
-    sizes = {len(joints) for _, _, joints in found} - {0}
-    if not sizes:
-        raise InputError(path, "has no chain of hinge and slide joints")
-    wanted = count if count in sizes else max(sizes)
-
-    def rank(one) -> tuple:
-        name = (getattr(model, one[0])(one[1]).name or "").lower()
-        return next((k for k, word in enumerate(_BALL_NAMES) if word in name), len(_BALL_NAMES)), one[1]
-
-    kind, k, joints = min((one for one in found if len(one[2]) == wanted), key=rank)
+    parents = set(model.body_parentid.tolist())
+    found = [
+        _End(getattr(model, kind)(k).name or "", len(chain(body)), body not in parents, (kind, k, chain(body)))
+        for kind, k, body in ends
+        if all(int(model.jnt_type[j]) in kinds for j in chain(body))
+    ]
+    kind, k, joints = _choose_end(path, found, columns).way
+    mimics = _read_joint_equalities(path, model, joints)
     made, last = [], np.eye(4)
     for j in joints:
         body = int(model.jnt_bodyid[j])
@@ -568,8 +737,8 @@ def _read_mjcf(path: Path, count: int | None) -> SerialRobot:
         world[:3, 3] = data.xanchor[j]
         way = world[:3, :3].T @ data.xaxis[j]
         origin = np.linalg.inv(last) @ world
-        name = model.joint(j).name or f"joint{j + 1}"
-        made.append(RobotJoint(name, kinds[int(model.jnt_type[j])], origin, way))  # type: ignore[arg-type]
+        name = _mjcf_joint_name(model, j)
+        made.append(RobotJoint(name, kinds[int(model.jnt_type[j])], origin, way, mimics.get(j)))  # type: ignore[arg-type]
         last = world
     end = np.eye(4)
     place, turn = (data.site_xpos, data.site_xmat) if kind == "site" else (data.xpos, data.xmat)
@@ -580,14 +749,62 @@ def _read_mjcf(path: Path, count: int | None) -> SerialRobot:
     )  # fmt: skip
 
 
-def _parse_xml(path: Path) -> ElementTree.Element:
-    text = read_text(path)
-    if "<!ENTITY" in text:
-        raise InputError(path, "declares XML entities, which are not supported")
-    try:
-        return ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        raise InputError(path, f"is not valid XML: {error}") from None
+def _mjcf_joint_name(model: Any, joint: int) -> str:
+    return model.joint(joint).name or f"joint{joint + 1}"
+
+
+def _read_joint_equalities(path: Path, model: Any, chain: Sequence[int]) -> dict[int, Mimic]:
+    """Read the linear joint couplings of an MJCF; refuse other constraints between joints of the chain.
+
+    A `joint` constraint is q1 - r1 = a0 + a1 (q2 - r2) + ..., with the reference positions r.
+
+    Args:
+        path: the MJCF.
+        model: the compiled model.
+        chain: joints of the robot.
+
+    Returns:
+        Joint of the chain -> the joint that it follows.
+    """
+    import mujoco
+
+    def moved_by(body: int) -> set[int]:
+        return {j for j in range(model.njnt) if _is_ancestor(model, int(model.jnt_bodyid[j]), body)}
+
+    def constrained_joints(e: int) -> set[int]:
+        first, second, kind = int(model.eq_obj1id[e]), int(model.eq_obj2id[e]), mujoco.mjtEq(int(model.eq_type[e]))
+        if kind == mujoco.mjtEq.mjEQ_JOINT:
+            return {first}
+        if kind == mujoco.mjtEq.mjEQ_TENDON:
+            steps = range(model.tendon_adr[first], model.tendon_adr[first] + model.tendon_num[first])
+            return {int(model.wrap_objid[w]) for w in steps if model.wrap_type[w] == mujoco.mjtWrap.mjWRAP_JOINT}
+        if kind not in (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD):
+            return set()
+        if model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE:
+            first, second = int(model.site_bodyid[first]), int(model.site_bodyid[second])
+        return moved_by(first) ^ moved_by(second)
+
+    mimics: dict[int, Mimic] = {}
+    for e in range(model.neq):
+        concerned = constrained_joints(e) & set(chain)
+        if not model.eq_active0[e] or not concerned:
+            continue
+        first, second, values = int(model.eq_obj1id[e]), int(model.eq_obj2id[e]), model.eq_data[e]
+        if model.eq_type[e] != mujoco.mjtEq.mjEQ_JOINT or second < 0 or np.any(values[2:5]) or first in mimics:
+            names = ", ".join(_mjcf_joint_name(model, j) for j in sorted(concerned))
+            message = f"the equality constraint {model.equality(e).name or e} determines the joints {names}"
+            raise InputError(path, f"{message}; only a linear <joint> constraint with joint2 is supported")
+        rest = model.qpos0[model.jnt_qposadr[[first, second]]]
+        offset = rest[0] + values[0] - values[1] * rest[1]
+        mimics[first] = Mimic(_mjcf_joint_name(model, second), float(values[1]), float(offset))
+    return mimics
+
+
+def _is_ancestor(model: Any, ancestor: int, body: int) -> bool:
+    """Return whether a body is another body or between it and the world."""
+    while body and body != ancestor:
+        body = int(model.body_parentid[body])
+    return body == ancestor
 
 
 def _link_name(joint: ElementTree.Element, end: str) -> str:

@@ -423,11 +423,15 @@ _MIN_KEPT_FRACTION = 0.1  # minimum fraction of readings that a channel must kee
 _LIMIT_NOISE_RATIO = 3.0  # noise standard deviations from a sensor limit within which readings are removed
 _MAX_SATURATED_FRACTION = 0.02  # fraction of a run; any machine has some chamber pressures of 0
 _DEFAULT_RESOLUTION = 1.0e-4  # worst resolution of a sensor without a stated converter, relative to its span
+_REASONS = {
+    "at the limit of the sensor": "at the limit of the sensor, which the machine file states as its span",
+    "that are physically impossible": "physically impossible for the machine",
+}
 _STARVED_PRESSURE = 0.5e6  # [Pa] above tank pressure, range in which a make-up valve may hold a pressure
 
 
 class _CleaningData(NamedTuple):
-    """All runs of one machine, with its sensors and noise."""
+    """All runs of one machine, with its sensors and noise, and the number of removed readings by reason."""
 
     machine: Machine
     sensors: SensorSet | None
@@ -435,6 +439,12 @@ class _CleaningData(NamedTuple):
     channels: Sequence[str]
     noise: np.ndarray
     runs: dict[str, RunRows]
+    removed: dict[tuple[str, str], dict[str, int]]
+
+    def count_removed(self, channel: str, run: str, reason: str, count: int) -> None:
+        """Count removed readings of a channel in a run by reason."""
+        counts = self.removed.setdefault((channel, run), {})
+        counts[reason] = counts.get(reason, 0) + count
 
     def column(self, channel: str, run: str) -> np.ndarray | None:
         """Return the readings (n,) of a channel in a run; None if the channel is unknown."""
@@ -453,10 +463,24 @@ class _CleaningData(NamedTuple):
         return channel_sensor(self.machine, self.sensors, channel)
 
 
+class CleanedRuns(NamedTuple):
+    """Runs without faulty readings.
+
+    Attributes:
+        runs: run -> rows; removed readings are NaN.
+        notes: one sentence per removal.
+        unused_channels: one sentence per channel without a usable reading in a run, with the reason.
+    """
+
+    runs: dict[str, RunRows]
+    notes: tuple[str, ...]
+    unused_channels: tuple[str, ...]
+
+
 def remove_faults(
     machine: Machine, sensors: SensorSet | None, axes: Sequence[str], channels: Sequence[str],
     noise: np.ndarray, runs: Mapping[str, RunRows],
-) -> tuple[dict[str, RunRows], tuple[str, ...]]:  # fmt: skip
+) -> CleanedRuns:  # fmt: skip
     """Replace saturated, impossible, frozen, repeated and duplicated readings by NaN.
 
     Args:
@@ -468,10 +492,10 @@ def remove_faults(
         runs: run -> rows.
 
     Returns:
-        (run -> cleaned rows, notes).
+        The cleaned runs.
     """
     copies = {name: rows._replace(reading=rows.reading.copy()) for name, rows in runs.items()}
-    data = _CleaningData(machine, sensors, axes, channels, noise, copies)
+    data = _CleaningData(machine, sensors, axes, channels, noise, copies, {})
     notes: list[str] = []
     for column, channel in enumerate(channels):
         for run in data.runs:
@@ -484,7 +508,26 @@ def remove_faults(
     for run in data.runs:
         notes += _remove_duplicated_rows(data, run)
         notes += _remove_sparse_channels(data, run, fresh[run])
-    return data.runs, tuple(notes)
+    return CleanedRuns(data.runs, tuple(notes), _list_unused_channels(data, runs))
+
+
+def _list_unused_channels(data: _CleaningData, before: Mapping[str, RunRows]) -> tuple[str, ...]:
+    """Return one sentence per channel and reason for which a run has no usable reading of it."""
+    reasons: dict[tuple[str, str], list[str]] = {}
+    for column, channel in enumerate(data.channels):
+        for run, rows in data.runs.items():
+            logged = int((~np.isnan(before[run].reading[:, column])).sum())
+            if not logged or np.isfinite(rows.reading[:, column]).any():
+                continue
+            counts = data.removed.get((channel, run), {})
+            listed = ", ".join(
+                f"{100 * count / logged:.0f} % of its readings are {why}" for why, count in counts.items()
+            )
+            reasons.setdefault((channel, listed), []).append(run)
+    return tuple(
+        f"{channel} is not used{'' if len(runs) == len(data.runs) else ' in ' + ', '.join(runs)}: {reason}."
+        for (channel, reason), runs in reasons.items()
+    )
 
 
 def _remove_impossible_readings(data: _CleaningData, run: str, channel: str, noise: float) -> list[str]:
@@ -493,6 +536,7 @@ def _remove_impossible_readings(data: _CleaningData, run: str, channel: str, noi
     if bad := int(np.isinf(reading).sum()):
         reading[np.isinf(reading)] = np.nan
         notes.append(f"{run}: {bad} infinite readings of {channel} were removed.")
+        data.count_removed(channel, run, "infinite", bad)
     for what, noted, rows in (
         ("at the limit of the sensor", _MAX_SATURATED_FRACTION,
          value_range.find_saturated(data.sensor(channel), channel, reading, period)),
@@ -503,6 +547,8 @@ def _remove_impossible_readings(data: _CleaningData, run: str, channel: str, noi
             first = data.runs[run].start + period * int(np.flatnonzero(rows)[0])
             notes.append(f"{run}: {rows.sum()} readings of {channel} {what} were removed, the"
                          f" first at {first:.6g} s.")  # fmt: skip
+        if rows.any():
+            data.count_removed(channel, run, _REASONS[what], int(rows.sum()))
         reading[rows] = np.nan
     return notes
 
@@ -515,7 +561,9 @@ def _remove_repeated_readings(data: _CleaningData, run: str, channel: str) -> li
     if every == 1.0:
         return []
     step = period * float(np.median(np.diff(np.flatnonzero(np.isfinite(reading)))))
-    reading[find_repeated(reading, every)] = np.nan
+    repeated = find_repeated(reading, every)
+    data.count_removed(channel, run, "repetitions of a slow channel", int(repeated.sum()))
+    reading[repeated] = np.nan
     lasts = 1e3 * every * step
     return [f"{run}: {channel} is updated only every {lasts:.3g} ms; the repeated values in"
             " between count as missing."]  # fmt: skip
@@ -589,13 +637,16 @@ def _remove_frozen_readings(data: _CleaningData, run: str, channel: str, parts) 
     listed = ", ".join(spans[:3]) + (f" and {len(spans) - 3} more times" if spans[3:] else "")
     value = np.nanmedian(reading[slice(*parts[0])])
     said = f"{run}: {channel} is frozen at {value:.6g} {listed}; these readings were removed."
+    before, reason = np.isfinite(reading).sum(), "frozen"
     if is_saturated(reading, parts):
         noise = float(data.noise[list(data.channels).index(channel)])
         near = np.abs(reading - value) <= _LIMIT_NOISE_RATIO * (noise if math.isfinite(noise) else 0.0)
         reading[near] = np.nan
+        reason = "saturated"
         said = f"{run}: {channel} is saturated at {value:.6g} {listed}; these readings were removed."
     for part in parts:
         reading[slice(*part)] = np.nan
+    data.count_removed(channel, run, reason, int(before - np.isfinite(reading).sum()))
     return [said]
 
 
@@ -621,6 +672,7 @@ def _remove_sparse_channels(data: _CleaningData, run: str, before: np.ndarray) -
         if not 0 < has[column] < _MIN_KEPT_FRACTION * had[column]:
             continue
         after[:, column] = np.nan
+        data.count_removed(channel, run, "too few to be used", int(has[column]))
         notes.append(f"{run}: {channel} has too few usable readings and was removed from this"
                      " run.")  # fmt: skip
     return notes

@@ -19,7 +19,7 @@ from hydrotele.core.errors import InputError
 from hydrotele.hydraulics.parameters import actuator_order
 from hydrotele.logs.cleaning import check_range, remove_faults
 from hydrotele.logs.files import RunFiles, check_commands, read_runs
-from hydrotele.logs.log import Log
+from hydrotele.logs.log import Log, find_logs, load_log
 from hydrotele.logs.rows import (
     MaskedInterval,
     RunRows,
@@ -121,7 +121,7 @@ def channel_noise(machine: Machine, sensors: SensorSet | None, channel: str) -> 
 
 
 def note_unknown_columns(files: Sequence[RunFiles], machine: Machine) -> list[str]:
-    """Return notes on channels that the machine does not have, and on averaged commands."""
+    """Return notes on channels that the machine does not have."""
     valid = (*predicted_channels(machine), *(f"command.{axis}" for axis in machine.axes))
     kinds = {name.partition(".")[0] for name in valid} | {"angle", "position"}
     notes = []
@@ -129,11 +129,26 @@ def note_unknown_columns(files: Sequence[RunFiles], machine: Machine) -> list[st
         if channel not in valid and parse_channel(channel).kind in kinds:
             notes.append(f"{channel} is ignored: {machine.name} has no such channel;"
                          f" {suggest_valid_name(channel, valid)}.")  # fmt: skip
-    averaged = [r.name for r in files if r.logs[0].metadata.get("command", "held") != "held"]
-    if averaged:
-        notes.append(f"{', '.join(averaged)}: commands are means over each row, not held values;"
-                     " delays can be estimated to within one row only.")  # fmt: skip
     return notes
+
+
+def note_empty_columns(files: Sequence[RunFiles], channels: Sequence[str]) -> list[str]:
+    """Return notes on channels whose columns have no reading."""
+    notes = []
+    for channel in channels:
+        empty = [r.name for r in files for log in r.logs if channel in log and np.isnan(log[channel]).all()]
+        if empty:
+            notes.append(f"{channel} is not used in {', '.join(empty)}: its column is empty.")
+    return notes
+
+
+def note_averaged_commands(files: Sequence[RunFiles]) -> list[str]:
+    """Return a note on runs whose commands are means."""
+    averaged = [r.name for r in files if r.logs[0].metadata.get("command", "held") != "held"]
+    if not averaged:
+        return []
+    return [f"{', '.join(averaged)}: commands are means over each row, not held values;"
+            " delays can be estimated to within one row only."]  # fmt: skip
 
 
 def note_runs_without_motion(runs: Mapping[str, RunRows], channels: Sequence[str], noise: np.ndarray) -> list[str]:
@@ -348,6 +363,32 @@ def make_piece_log(
     return Log(time, columns, units, first.metadata, name)
 
 
+def make_complete_logs(files: Sequence[RunFiles], merged: "MergedRuns", machine: Machine) -> tuple[Log, ...]:
+    """Return one log per run or piece, with a command in every row and all positions in the first row.
+
+    A run of uniform rows without missing cells is returned as logged, with all columns.
+
+    Args:
+        files: the runs.
+        merged: the result of `merge_runs` for them.
+        machine: the machine.
+    """
+    axes, channels = tuple(actuator_order(machine)), common_channels(files, machine)
+    by_name, logs = {run.name: run for run in files}, []
+    first = [channels.index(c) for axis in axes if (c := f"{machine.position_kind(axis)}.{axis}") in channels]
+    for name, rows in merged.pieces.items():
+        run = by_name[merged.origin[name]]
+        begin = int(np.argmax(np.isfinite(rows.reading[:, first]).all(axis=1)))
+        part = slice_rows(rows, begin, len(rows.command))
+        whole = make_piece_log(run.logs, name, part, axes, channels)
+        complete = len(whole) == len(part.command) and part.known.all() and np.isfinite(part.reading[0, first]).all()
+        log = whole if complete else make_piece_log(run.logs, name, part, axes, channels, as_logged=False)
+        if log.time[0] > run.logs[0].time[0]:  # metadata of the simulator belong to the first row
+            log = remove_truth(RunFiles(name, (log,))).logs[0]
+        logs.append(log if len(merged.pieces) == 1 else dataclasses.replace(log, source=name))
+    return tuple(logs)
+
+
 _MAX_MISSING_FRACTION = 0.3  # maximum fraction of missing rows; beyond it the commands are too uncertain
 
 
@@ -403,6 +444,7 @@ class Dataset:
         fit: runs to fit.
         heldout: run for validation.
         notes: one sentence per removed or repaired part of the data.
+        unused_channels: one sentence per logged channel that is not used, in all or some runs.
         sensors: name of the sensors of the machine, or None if their noise is unknown.
     """
 
@@ -414,6 +456,7 @@ class Dataset:
     heldout: RunData
     notes: tuple[str, ...]
     sensors: str | None = None
+    unused_channels: tuple[str, ...] = ()
 
     def noise_of(self, run: RunData) -> np.ndarray:
         """Return the noise standard deviations (c,) of a run [SI]; averaging reduces them."""
@@ -477,20 +520,20 @@ def make_dataset(
         InputError: see `load_dataset`.
     """
     files = [remove_truth(run) for run in files]
-    axes, channels = tuple(actuator_order(machine)), common_channels(files, machine)
     for run in files:
         check_commands(run, machine)
+    axes, channels = tuple(actuator_order(machine)), common_channels(files, machine)
     check_mask_runs(masks, [run.name for run in files])
     known, notes = determine_sensors(files, machine, sensors)
     noise = np.array([channel_noise(machine, known, channel) for channel in channels])
-    runs, origin, said = _collect_runs(files, machine, axes, channels, masks)
-    mended, more = remove_faults(machine, known, axes, channels, noise, runs)
-    notes += note_unknown_columns(files, machine) + said + list(more)
+    merged = merge_runs(files, machine, masks)
+    runs, short = _remove_short_runs(merged)
+    mended, more, unused = remove_faults(machine, known, axes, channels, noise, runs)
+    unused = (*note_unknown_columns(files, machine), *note_empty_columns(files, channels), *unused)
+    notes += [*note_averaged_commands(files), *merged.notes, *short, *more, *unused]
     notes += note_runs_without_motion(mended, channels, noise)
     kept = np.array([any(np.isfinite(rows.reading[:, column]).any() for rows in mended.values())
                      for column in range(len(channels))])  # fmt: skip
-    notes += [f"{c} has no usable reading in any run; it was removed."
-              for c, keep in zip(channels, kept, strict=True) if not keep]  # fmt: skip
     if not kept.any():
         raise InputError(
             ", ".join(mended), "no channel has a usable reading: check the columns, their units"
@@ -506,14 +549,14 @@ def make_dataset(
         if count > 1:
             notes.append(f"{name}: is logged at {1 / rows.period:.6g} Hz; {count} rows each were"
                          f" averaged, giving {1 / whole[name].period:.6g} Hz.")  # fmt: skip
-    parts, left = split_runs(whole, origin, heldout)
+    parts, left = split_runs(whole, merged.origin, heldout)
     logs = {run.name: run.logs for run in files}
     made = {}
     for part in (*parts.fit, parts.heldout):
         rows = part.rows
         means = behind[part.piece] if (behind[part.piece] > 1.0).any() else None
         as_logged = means is None and bool(rows.valid.all())
-        log = make_piece_log(logs[origin[part.piece]], part.name, rows, axes, channels, as_logged)
+        log = make_piece_log(logs[merged.origin[part.piece]], part.name, rows, axes, channels, as_logged)
         made[part.name] = RunData(
             part.name, rows.start, rows.period, rows.command, rows.known & rows.valid,
             rows.reading, log, rows.valid, means,
@@ -521,42 +564,91 @@ def make_dataset(
     judge = made.pop(parts.heldout.name)
     notes += left
     return Dataset(machine, axes, channels, noise[kept], tuple(made.values()), judge, tuple(notes),
-                   next((n for n, s in machine.sensors.items() if s is known), None))  # fmt: skip
+                   next((n for n, s in machine.sensors.items() if s is known), None), unused)  # fmt: skip
 
 
-def _collect_runs(
-    files: Sequence[RunFiles], machine: Machine, axes: Sequence[str], channels: Sequence[str],
-    masks: Sequence[MaskedInterval],
-) -> tuple[dict[str, RunRows], dict[str, str], list[str]]:  # fmt: skip
-    """Return runs and pieces by name, the logged run of each, and notes."""
-    runs, origin, notes = {}, {}, []
+class MergedRuns(NamedTuple):
+    """Runs on uniform clocks.
+
+    Attributes:
+        pieces: name of run or piece -> rows.
+        origin: the same names -> name of the logged run.
+        notes: repairs by the reader and by merging, one sentence each.
+    """
+
+    pieces: dict[str, RunRows]
+    origin: dict[str, str]
+    notes: tuple[str, ...]
+
+
+def merge_runs(files: Sequence[RunFiles], machine: Machine, masks: Sequence[MaskedInterval] = ()) -> MergedRuns:
+    """Put runs on uniform clocks and check them against a machine.
+
+    This is the rule by which all commands accept or refuse logs of a machine. Some need more: a command of
+    every axis, or a minimum duration.
+
+    Raises:
+        InputError: no channel is of the machine, the time stamps follow no clock, too many rows are
+            missing, or values are outside the range of the machine.
+    """
+    axes, channels = tuple(actuator_order(machine)), common_channels(files, machine)
+    pieces, origin, notes = {}, {}, []
     for run in files:
-        pieces, said = merge_run(run, axes, channels, masks)
+        parts, said = merge_run(run, axes, channels, masks)
+        notes += [note for log in run.logs for note in log.notes]
         notes += said
         where = ", ".join(log.source for log in run.logs)
-        for number, rows in enumerate(pieces, start=1):
-            name = run.name if len(pieces) == 1 else f"{run.name}_part{number}"
-            if (short := describe_short_run(rows)) and len(pieces) == 1:
-                raise InputError(where, f"is {short}: record a longer run, or remove this one")
-            if short:
-                notes.append(f"{name} is only {short}; it was removed.")
-            elif np.mean(~rows.known) > _MAX_MISSING_FRACTION:
+        for number, rows in enumerate(parts, start=1):
+            if np.mean(~rows.known) > _MAX_MISSING_FRACTION and describe_short_run(rows) is None:
                 raise InputError(
                     where, f"{100 * np.mean(~rows.known):.0f} % of the rows are missing, and with"
                     f" them the commands; at most {100 * _MAX_MISSING_FRACTION:.0f} % are allowed: log"
                     " every row",
                 )  # fmt: skip
-            else:
-                for channel, reading in zip(channels, rows.reading.T, strict=True):
-                    check_range(machine, channel, reading, where)
-                runs[name], origin[name] = rows, run.name
+            for channel, reading in zip(channels, rows.reading.T, strict=True):
+                check_range(machine, channel, reading, where)
+            name = run.name if len(parts) == 1 else f"{run.name}_part{number}"
+            pieces[name], origin[name] = rows, run.name
+    return MergedRuns(pieces, origin, tuple(notes))
+
+
+def merge_runs_without_machine(path: Path) -> tuple[tuple[Log, ...], tuple[str, ...]]:
+    """Read the logs of a path and put each on a clock, if no machine is known.
+
+    Returns:
+        (logs, notes on repairs).
+
+    Raises:
+        InputError: a log is invalid, or its time stamps follow no clock.
+    """
+    logs, notes = [], []
+    for name, file in find_logs(path):
+        log = load_log(file)
+        axes = [c.removeprefix("command.") for c in log.columns if c.startswith("command.")]
+        channels = [c for c in log.columns if not c.startswith(("command.", "valid"))]
+        notes += [*log.notes, *merge_run(RunFiles(name, (log,)), axes, channels)[1]]
+        logs.append(log)
+    return tuple(logs), tuple(notes)
+
+
+def _remove_short_runs(merged: MergedRuns) -> tuple[dict[str, RunRows], list[str]]:
+    """Return the runs that are long enough to identify parameters, and notes on the others."""
+    runs, notes = {}, []
+    whole = [name for name, run in merged.origin.items() if name == run]
+    for name, rows in merged.pieces.items():
+        if (short := describe_short_run(rows)) is None:
+            runs[name] = rows
+        elif name in whole:
+            raise InputError(name, f"is {short}: record a longer run, or remove this one")
+        else:
+            notes.append(f"{name} is only {short}; it was removed.")
     if not runs:
         message = (
             f"no run has {MIN_RUN_SECONDS:g} s and {MIN_RUN_ROWS} rows without a gap or a masked interval:"
             " record longer runs"
         )
         raise InputError("the data", message)
-    return runs, origin, notes
+    return runs, notes
 
 
 _MIN_RATE, _ROWS_PER_CYCLE = 100.0, 6.0  # minimum rate [Hz]; rows per cycle of the fastest valve

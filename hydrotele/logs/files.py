@@ -6,27 +6,27 @@ Supported paths are `.parquet` and `.csv` files, folders of them, run folders of
 two of them have the same sensor channel, because repeated runs often have the same name.
 """
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from hydrotele.core.errors import InputError
-from hydrotele.logs.log import MEASURED_STEM, CommandRange, Log, find_log_in_folder, load_log
+from hydrotele.logs.log import CommandRange, Log, find_logs, load_log
 from hydrotele.machine.machine import Machine
-
-_KINDS = (".parquet", ".csv")
 
 
 class RunFiles(NamedTuple):
-    """The logs of one run without truth channels; several if the run has several files."""
+    """The logs of one run; several if the run has several files."""
 
     name: str
     logs: tuple[Log, ...]
 
 
 def read_runs(
-    paths: Sequence[str | Path], machine: Machine, aliases: Mapping[str, str], force: bool
-) -> tuple[RunFiles, ...]:
+    paths: Sequence[str | Path], machine: Machine, aliases: Mapping[str, str], force: bool,
+    keep_truth: bool = False,
+) -> tuple[RunFiles, ...]:  # fmt: skip
     """Read all logs and group them into runs.
 
     Args:
@@ -34,6 +34,7 @@ def read_runs(
         machine: the machine that the logs must belong to.
         aliases: column name in a file -> channel.
         force: accept logs whose metadata names another machine or tool.
+        keep_truth: keep channels that only a simulator knows.
 
     Returns:
         The runs, sorted by name.
@@ -42,20 +43,17 @@ def read_runs(
         InputError: a file is invalid or from another machine, or a run exists twice.
     """
     groups: dict[str, list[Log]] = {}
-    named = [pair for path in paths for pair in _find_logs(Path(path))]
+    named = [pair for path in paths for pair in find_logs(Path(path))]
     if not named:
         raise InputError("the data", "no path was given: give log files or a folder with logs")
     if twice := {str(f) for i, (_, f) in enumerate(named) if f in [g for _, g in named[:i]]}:
         raise InputError(min(twice), "is given twice: give it once")
     logs = []
     for name, file in named:
-        log = load_log(
-            file, aliases=aliases, maximum_dropped=1.0, missing=True,
-            commands=command_ranges(machine),
-        ).without_truth()  # fmt: skip
+        log = load_log(file, aliases=aliases, commands=command_ranges(machine))
         if not force:
             _check_machine(log, machine)
-        logs.append((name, log))
+        logs.append((name, log if keep_truth else log.without_truth()))
     for name, log in logs:
         groups.setdefault(name.partition(".")[0], []).append(log)
     runs = []
@@ -71,7 +69,16 @@ def read_runs(
             if other == name:
                 message = f"run {name!r} exists twice, also as {others[0].source}: rename one"
                 raise InputError(found[0].source, message)
-    return tuple(RunFiles(*run) for run in sorted(runs, key=lambda run: run[0]))
+    return tuple(RunFiles(name, align_origins(found)) for name, found in sorted(runs, key=lambda run: run[0]))
+
+
+def align_origins(logs: Sequence[Log]) -> tuple[Log, ...]:
+    """Return logs whose times have the same origin, if all or none of them have stamps of calendar time."""
+    origins = [log.origin for log in logs]
+    first = min(origins, key=abs)
+    if len(set(origins)) == 1 or first == 0.0:
+        return tuple(logs)
+    return tuple(dataclasses.replace(log, time=log.time + (log.origin - first), origin=first) for log in logs)
 
 
 def command_ranges(machine: Machine) -> dict[str, CommandRange]:
@@ -81,25 +88,6 @@ def command_ranges(machine: Machine) -> dict[str, CommandRange]:
         for name, axis in machine.axes.items()
         if axis.command_range != (-1.0, 1.0)
     }
-
-
-def _find_logs(path: Path) -> list[tuple[str, Path]]:
-    """Return (run name, file) of every log at a path."""
-    if not path.exists():
-        raise InputError(path, "does not exist: give log files or a folder with logs")
-    if path.is_file():
-        return [(path.stem if path.stem != MEASURED_STEM else path.resolve().parent.name, path)]
-    if not path.is_dir():
-        raise InputError(path, "is neither a file nor a folder: give log files or a folder")
-    seen = sorted(p for p in path.iterdir() if not p.name.startswith("."))
-    if record := find_log_in_folder(path):
-        return [(path.resolve().name, record)]
-    files = [(p.stem, p) for p in seen if p.is_file() and p.suffix.lower() in _KINDS]
-    if not files:
-        files = [(p.name, f) for p in seen if p.is_dir() and (f := find_log_in_folder(p))]
-    if not files:
-        raise InputError(path, "the folder contains no log: add .parquet or .csv files")
-    return files
 
 
 def _sensor_channels(log: Log) -> set[str]:

@@ -77,11 +77,12 @@ def fit_clock(time: np.ndarray, where: str) -> tuple[Clock, tuple[str, ...]]:
         tick = np.arange(len(time))
     else:
         tick = _track_ticks(time, period)
-    period, start = np.polyfit(tick, time, 1)
+    since_first = time - time[0]  # more exact than the time of a calendar clock
+    period, start = np.polyfit(tick, since_first, 1)
     for _ in range(3):  # alternate between assigning ticks and fitting the line
-        tick = np.rint((time - start) / period).astype(int)
-        period, start = np.polyfit(tick, time, 1)
-    period, start = float(period), float(start)
+        tick = np.rint((since_first - start) / period).astype(int)
+        period, start = np.polyfit(tick, since_first, 1)
+    period, start = float(period), float(start + time[0])
     off = (time - start) / period - tick
     shared = np.mean(np.diff(tick) == 0)
     if np.sqrt(np.mean(off**2)) > _MAX_CLOCK_RMS or shared > _MAX_SHARED_FRACTION:
@@ -405,7 +406,7 @@ def merge_run(
         np.diff(every) * period > MAX_GAP_SECONDS))  # fmt: skip
     if lost := [every[p[0]] - every[p[0] - 1] for p in pieces[1:]]:
         seconds = ", ".join(f"{n * period:.3g} s" for n in lost)
-        notes.append(f"{run.name}: nothing was logged for {seconds}; the run was split there.")
+        notes.append(f"{run.name}: the time stamps have pauses of {seconds}; the run was split there.")
     fine *= clocks[0].hold
     rows = tuple(
         _fill_ticks(clocks[0].start, period, fine, every[p], command[p], commanded[p], reading[p]) for p in pieces
@@ -429,7 +430,7 @@ def merge_run(
 def _apply_masks(run: RunFiles, logs, clocks, rows: RunRows, masks: Sequence[MaskedInterval]) -> RunRows:
     """Set the readings of masked and invalid rows to NaN."""
     time = rows.start + rows.period * np.arange(len(rows.command))
-    valid = find_unmasked_rows(masks, run.name, time)
+    valid = find_unmasked_rows(masks, run.name, time + logs[0].origin)
     for log, clock in zip(logs, clocks, strict=True):
         if "valid" in log:
             stamps = clock.start + clock.period * clock.tick
@@ -483,6 +484,11 @@ def _align_clock(run: RunFiles, main: Log, clock: Clock, log: Log, other: Clock,
             clock, np.column_stack([main[c] for c in both])[clock.row],
             other, np.column_stack([log[c] for c in both])[other.row],
         )  # fmt: skip
+    if offset is None and _are_disjoint(clock, other):
+        return clock.start - other.start, [
+            f"{named}: its time stamps do not overlap with those of {main.source}; both are taken to begin at the"
+            " same time. An offset would appear as a common delay of all its channels."
+        ]
     if offset is None:
         why = "its commands do not determine" if both else "it has no command to determine"
         return 0.0, [
@@ -494,6 +500,11 @@ def _align_clock(run: RunFiles, main: Log, clock: Clock, log: Log, other: Clock,
     return offset, [
         f"{named}: its clock was shifted by {offset:+.6g} s, which aligns its commands with those of {main.source}."
     ]
+
+
+def _are_disjoint(clock: Clock, other: Clock) -> bool:
+    ends = [c.start + c.period * float(c.tick[-1]) for c in (clock, other)]
+    return ends[0] < other.start or ends[1] < clock.start
 
 
 def _common_period(clocks: Sequence[Clock]) -> tuple[float, int, float]:

@@ -22,7 +22,7 @@ from hydrotele.core.datafile import (
     validate_data,
 )
 from hydrotele.core.errors import InputError
-from hydrotele.core.files import models_folder
+from hydrotele.core.files import models_folder, resolve_path
 
 JOYSTICK_FILE = "joystick.yaml"
 AXES = ("x", "y", "z", "rx", "ry", "rz")
@@ -268,4 +268,4 @@ def load_joystick(name_or_path: str | Path = "joystick") -> Joystick:
         known = suggest_valid_name(str(name_or_path), shipped_joysticks())
         raise InputError(f"joystick {str(name_or_path)!r}", f"no such file; {known}")
     data, lines = read_yaml(path)
-    return validate_data(Joystick, data | {"folder": str(path.parent.resolve())}, str(path), lines)
+    return validate_data(Joystick, data | {"folder": str(resolve_path(path.parent))}, str(path), lines)

@@ -22,6 +22,7 @@ from hydrotele.core.datafile import (
     suggest_valid_name,
 )
 from hydrotele.core.errors import InputError
+from hydrotele.core.files import describe_excess
 from hydrotele.machine.drives import Axis, EndStop, LoadCylinder, Pin
 from hydrotele.terms.law import Term
 
@@ -391,6 +392,8 @@ class Machine(StrictModel):
 
     @model_validator(mode="after")
     def _check(self):
+        if excess := describe_excess("LINKS", len(self.links)):
+            raise ValueError(f"links: {excess}")
         _check_names(self.links)
         known = {"world", *self.links}
         for name, link in self.links.items():

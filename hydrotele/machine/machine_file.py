@@ -22,7 +22,8 @@ from hydrotele.core.datafile import (
     validate_data,
 )
 from hydrotele.core.errors import InputError
-from hydrotele.core.files import copy_mjcf, models_folder, read_xml
+from hydrotele.core.files import models_folder, resolve_path
+from hydrotele.core.mjcf import copy_mjcf, load_spec
 from hydrotele.core.units import PSI
 from hydrotele.machine.machine import Machine
 from hydrotele.terms.law import LAWS
@@ -86,11 +87,11 @@ def load_machine(name_or_path: str | Path, tool: str | None = None) -> Machine:
             f"no tool {tool!r}; {suggest_valid_name(tool, tools)}",
         )
     lines = _merge_tool(data, tool, tools[tool] or {}, path, lines)
-    data |= {"tool": tool, "tools": sorted(tools), "folder": str(path.parent.resolve())}
+    data |= {"tool": tool, "tools": sorted(tools), "folder": str(resolve_path(path.parent))}
     others += [fragment for name, fragment in tools.items() if name != tool and fragment]
     kept = _body_names([data])
     if data.get("resolved") and not (path.parent / str(data.get("mjcf"))).exists():
-        data["folder"] = str(models_folder().resolve())
+        data["folder"] = str(resolve_path(models_folder()))
     elif not data.get("resolved"):
         data["removed_bodies"] = [name for name in _body_names(others) if name not in kept]
     _complete_links(data, path, lines)
@@ -105,8 +106,8 @@ def save_machine(machine: Machine, path: str | Path) -> None:
         machine: the machine.
         path: file to write. A shipped MJCF is referenced relative to the shipped models, so that
             the file works with any installation. A user MJCF is copied to `<stem>.tree.xml`, with
-            meshes, textures and height fields in `<stem>_assets`, unless it includes other
-            documents. User files that define laws of terms are copied as well.
+            meshes, textures and height fields in `<stem>_assets`. User files that define laws of
+            terms are copied as well.
     """
     machine = _with_law_files(machine, Path(path).parent)
     data = machine.model_dump(mode="json", exclude_defaults=True)
@@ -114,22 +115,21 @@ def save_machine(machine: Machine, path: str | Path) -> None:
     for key in ("folder", "tools"):
         data.pop(key, None)
     data |= {"tool": tool, "tools": {tool: {}}, "resolved": True}
-    shipped = models_folder().resolve()
-    attached = {b: Path(machine.folder, f).resolve() for b, f in machine.attached.items()}
+    shipped = resolve_path(models_folder())
+    attached = {b: resolve_path(Path(machine.folder, f)) for b, f in machine.attached.items()}
     if attached:
         data["attached"] = {
             body: str(file.relative_to(shipped) if file.is_relative_to(shipped) else file)
             for body, file in attached.items()
         }
     if machine.mjcf:
-        mjcf = Path(machine.folder, machine.mjcf).resolve()
+        mjcf = resolve_path(Path(machine.folder, machine.mjcf))
         copy = Path(path).with_suffix(".tree.xml")
         if mjcf.is_relative_to(shipped):
             data["mjcf"] = str(mjcf.relative_to(shipped))
-        elif copy_mjcf(mjcf, copy, f"{Path(path).stem}_assets"):
-            data["mjcf"] = copy.name
         else:
-            data["mjcf"] = str(mjcf)
+            copy_mjcf(mjcf, copy, f"{Path(path).stem}_assets")
+            data["mjcf"] = copy.name
     Path(path).write_text(yaml.safe_dump(data, sort_keys=False, default_flow_style=None))
 
 
@@ -240,15 +240,9 @@ def _complete_links(data: dict, path: Path, lines) -> None:
         return
     mjcf = path.parent / str(data["mjcf"])
     try:
-        read_xml(mjcf)
+        spec = load_spec(mjcf)
     except InputError as error:
-        message = f"{mjcf} cannot be read: {error.message}"
-        raise InputError(_format_location(path, lines, "mjcf"), message) from None
-    try:
-        spec = mujoco.MjSpec.from_file(str(mjcf))
-    except (OSError, ValueError) as error:
-        message = f"{mjcf} cannot be read: {error}"
-        raise InputError(_format_location(path, lines, "mjcf"), message) from None
+        raise InputError(_format_location(path, lines, "mjcf"), str(error)) from None
     for name, link in _section_entries(data, "links").items():
         body = spec.body(name)
         if body is None or name == "world" or not isinstance(link, dict):

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 _AXIS_PATTERN = re.compile(r"[a-z][a-z0-9_]*")
 _TRUTH_PREFIX = "truth."
+_TIME_NAME = re.compile(r"t|t_?s|time.*|.*_time|.*stamp.*|zeit.*|(seconds?|secs?)")  # names of time columns in loggers
 
 
 class ChannelKind(NamedTuple):
@@ -218,6 +219,8 @@ def close_matches(name: str, present: Iterable[str] = ()) -> list[str]:
     'angle.boom'
     """
     plain = re.sub(r"[^a-z0-9_.]+", "_", name.strip().lower())
+    if _TIME_NAME.fullmatch(plain):
+        return ["time"]
     truth = plain.startswith(_TRUTH_PREFIX)
     kinds = TRUTH_KINDS if truth else MEASURED_KINDS
     words = [word for word in plain.removeprefix(_TRUTH_PREFIX).split(".") if _AXIS_PATTERN.fullmatch(word)]

@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from hydrotele.core.errors import InputError
+from hydrotele.core.mjcf import load_model
 
 _FREE, _BALL, _SLIDE, _HINGE = (
     int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "BALL", "SLIDE", "HINGE")
@@ -79,6 +80,7 @@ class Chain:
         drives: joints that an actuator moves, in the order of the actuators.
         qpos_indices: (v,) index of a joint in MuJoCo's `qpos`, -1 for parts of ball and free joints.
         dof_indices: (v,) index of a joint in MuJoCo's `qvel`, -1 likewise.
+        source: file that it was read from, empty for a compiled model.
     """
 
     name: str
@@ -96,6 +98,7 @@ class Chain:
     drives: tuple[str, ...]
     qpos_indices: np.ndarray
     dof_indices: np.ndarray
+    source: str = ""
 
     def index(self, joint: str) -> int:
         """Return the index of a joint.
@@ -146,7 +149,7 @@ def load_chain(source: str | Path | mujoco.MjModel) -> Chain:
 
     Source: MuJoCo manual, `mj_kinematics` and `mjData`.
     """
-    model = _read_model(source) if isinstance(source, str | Path) else source
+    model = load_model(source) if isinstance(source, str | Path) else source
     closures = _read_closures(model)
     moved = [
         int(model.actuator_trnid[a, 0])
@@ -208,14 +211,8 @@ def load_chain(source: str | Path | mujoco.MjModel) -> Chain:
         drives=tuple(dict.fromkeys(whole[int(model.jnt_qposadr[j])] for j in moved)) or names,
         qpos_indices=np.array([joint.qpos_index for joint in joints], np.int64),
         dof_indices=np.array([joint.dof_index for joint in joints], np.int64),
+        source=str(source) if isinstance(source, str | Path) else "",
     )
-
-
-def _read_model(path: str | Path) -> mujoco.MjModel:
-    try:
-        return mujoco.MjModel.from_xml_path(str(path))
-    except ValueError as error:
-        raise InputError(str(path), str(error)) from error
 
 
 _AXES = tuple(enumerate("xyz"))

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
+import scipy.optimize
 
 from hydrotele.core.compiled import allocation_free, compiled
 from hydrotele.core.errors import InputError
@@ -257,29 +258,129 @@ def motion_basis(chain: Chain, q: np.ndarray, independent: np.ndarray) -> np.nda
     return basis
 
 
-def check_joints_determined(chain: Chain, q: np.ndarray, independent: np.ndarray) -> None:
-    """Check that the independent joints and the closures determine all other joints.
+def find_undetermined_joints(chain: Chain, q: np.ndarray, independent: np.ndarray) -> tuple[str, ...]:
+    """Return the joints that the independent joints and the closures do not determine at a pose.
 
     Args:
         chain: the chain.
         q: (v,) positions with closed loops [rad] or [m].
         independent: (n,) indices of the independent joints.
-
-    Raises:
-        InputError: some joints are undetermined; the message names them.
     """
     others = np.setdiff1d(np.arange(len(q)), independent)
-    loose = np.linalg.svd(_loop_residuals(chain.tree, q)[1][:, others], full_matrices=True)
-    hidden = np.linalg.norm(loose[2][np.sum(loose[1] > _MIN_SINGULAR_RATIO) :], axis=0)
-    if (hidden > _MIN_SINGULAR_RATIO).any():
-        names = ", ".join(chain.joints[j] for j in others[hidden > _MIN_SINGULAR_RATIO])
-        raise InputError(_ERROR_CONTEXT, f"neither given nor determined by a closure: {names}")
+    _, s, v = np.linalg.svd(_loop_residuals(chain.tree, q)[1][:, others], full_matrices=True)
+    hidden = np.linalg.norm(v[np.sum(s > _MIN_SINGULAR_RATIO) :], axis=0)
+    return tuple(chain.joints[j] for j in others[hidden > _MIN_SINGULAR_RATIO])
 
 
 _MAX_GIVEN_STEP = 0.1  # rad or m, maximum step of the given joints
 _MAX_ITERATION_STEP = 1.5  # rad or m, maximum joint step per iteration from a distant position
 _ASSEMBLY_TOLERANCE = 1e-6  # m and 1, maximum difference of positions and orientations of equal assemblies
 _KINEMATICS_CONTEXT = "kinematics"
+_START_SEARCHES = 100  # random starts of the search for assemblies at the first row
+_MAX_SHOWN_POSES = 4  # assemblies listed in a message
+_OPENING_SEARCHES = 8  # starts of the search for the smallest opening
+
+
+def find_start_pose(
+    chain: Chain, given: Sequence[str], position: np.ndarray, start: np.ndarray | None = None, seed: int = 0
+) -> np.ndarray:
+    """Return a pose with closed loops from which the motion of the given joints can be followed.
+
+    This is the start pose, with its loops closed by all joints. If they do not close there, or if
+    the pose is singular, it is the assembly at the first row, which must then be the only one.
+
+    Args:
+        chain: the chain.
+        given: the k joints with known positions.
+        position: (n, k) their positions [rad] or [m].
+        start: (v,) start pose; that of the chain by default.
+        seed: seed of the search for all assemblies.
+
+    Returns:
+        (v,) [rad] or [m].
+
+    Raises:
+        InputError: the loops cannot be closed at the first row or in several ways, or the closures
+            do not determine the other joints at any of these poses; the message names the closure,
+            its opening and the joints.
+    """
+    columns = np.array([chain.index(name) for name in given], np.int64)
+    begin = np.array(chain.start if start is None else start, float)
+    q, undetermined = begin.copy(), ()
+    if close_loops_from(chain.tree, q, np.arange(len(q)), CLOSURE_TOLERANCE, np.inf) < CLOSURE_TOLERANCE:
+        undetermined = find_undetermined_joints(chain, q, columns)
+        if not undetermined:
+            return q
+    if len(chain.closures) and len(position):
+        poses = find_assemblies(chain, given, position[0], starts=_START_SEARCHES, seed=seed)
+        if not len(poses):
+            raise InputError(chain.source or _KINEMATICS_CONTEXT, describe_opening(chain, given, position[0], 0))
+        regular = [pose for pose in poses if not find_undetermined_joints(chain, pose, columns)]
+        if len(regular) == 1:
+            return regular[0]
+        if regular:
+            raise InputError(chain.source or _KINEMATICS_CONTEXT, _describe_choice(chain, begin, regular))
+    raise InputError(
+        chain.source or _ERROR_CONTEXT, f"neither given nor determined by a closure: {', '.join(undetermined)}"
+    )
+
+
+def describe_opening(chain: Chain, given: Sequence[str], position: np.ndarray, row: int) -> str:
+    """Describe by how much a loop stays open at a row, for an error message.
+
+    Args:
+        chain: the chain.
+        given: the k joints with known positions.
+        position: (k,) their positions [rad] or [m].
+        row: number of the row.
+
+    Returns:
+        The closure with the largest opening, the opening in mm, and what to do.
+    """
+    columns = np.array([chain.index(name) for name in given], np.int64)
+    others = np.setdiff1d(np.arange(len(chain.joints)), columns)
+    q, rng = np.array(chain.start, float), np.random.default_rng(0)
+    q[columns] = position
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        q[others] = x
+        return _loop_residuals(chain.tree, q)[0][:, 0]
+
+    starts = [chain.start[others] + k * rng.uniform(-1.0, 1.0, len(others)) for k in range(_OPENING_SEARCHES)]
+    q[others] = min((scipy.optimize.least_squares(residual, x) for x in starts), key=lambda one: one.cost).x
+    closure, opening = _largest_opening(chain, q)
+    values = ", ".join(
+        f"{name} {value:.4g} {'m' if chain.tree.is_slide[j] else 'rad'}"
+        for name, value, j in zip(given, position, columns, strict=True)
+    )
+    return (
+        f"row {row}: the loops of {chain.name} cannot be closed at {values}: {closure} stays"
+        f" {1e3 * opening:.3g} mm open. Check the unit and zero of these joints and the points of the"
+        " closure (an anchor in an MJCF applies to the reference pose; two sites do not), or"
+        " add a <keyframe> with a closed pose"
+    )
+
+
+def _largest_opening(chain: Chain, q: np.ndarray) -> tuple[str, float]:
+    """Return the name of the closure whose points are farthest apart at a pose, and their distance [m]."""
+    left = _loop_residuals(chain.tree, q)[0][:, 0]
+    openings = [float(np.linalg.norm(left[first : first + 3])) for first in chain.tree.first_equation[:-1]]
+    worst = int(np.argmax(openings))
+    return chain.closures[worst], openings[worst]
+
+
+def _describe_choice(chain: Chain, start: np.ndarray, poses: Sequence[np.ndarray]) -> str:
+    """Describe that the start pose does not select one of several assemblies, for an error message."""
+    closure, opening = _largest_opening(chain, start)
+    state = f"{closure} is {1e3 * opening:.3g} mm open" if opening > CLOSURE_TOLERANCE else "the pose is singular"
+    shown = "; or ".join(
+        ", ".join(f"{name} {value:.4g}" for name, value in zip(chain.joints, pose, strict=True))
+        for pose in poses[:_MAX_SHOWN_POSES]
+    )
+    return (
+        f"at the start pose of {chain.name} {state}, and its loops can be closed in {len(poses)} ways at the first"
+        f' row: {shown}. Add the correct one as <keyframe><key qpos="..."/></keyframe>'
+    )
 
 
 def solve_joint_positions(
@@ -315,13 +416,7 @@ def solve_joint_positions(
         row = int(np.argwhere(~np.isfinite(table))[0, 0])
         raise InputError(_KINEMATICS_CONTEXT, f"row {row} has missing positions of the given joints")
     others = np.setdiff1d(np.arange(len(chain.joints)), columns)
-    q = np.array(chain.start if start is None else start, float)
-    if not close_loops_from(chain.tree, q, np.arange(len(q)), CLOSURE_TOLERANCE, np.inf) < CLOSURE_TOLERANCE:
-        raise InputError(
-            _KINEMATICS_CONTEXT,
-            f"the loops of {chain.name} cannot be closed from the start positions",
-        )
-    check_joints_determined(chain, q, columns)
+    q = find_start_pose(chain, given, table, start, seed)
     out, first = np.empty((len(table), len(q))), 0
     while first < len(table):
         failed = _follow_motion(chain.tree, columns, table[first:], others, q, out[first:])
@@ -331,10 +426,7 @@ def solve_joint_positions(
         last = out[first - 1] if first else np.array(chain.start, float)
         found = find_assemblies(chain, given, table[first], seed=seed)
         if not len(found):
-            raise InputError(
-                _KINEMATICS_CONTEXT,
-                f"row {first}: the loops of {chain.name} cannot be closed there",
-            )
+            raise InputError(chain.source or _KINEMATICS_CONTEXT, describe_opening(chain, given, table[first], first))
         q = found[np.argmin(np.linalg.norm(found - last, axis=1))].copy()
         out[first] = q
         first += 1

@@ -20,11 +20,11 @@ from hydrotele.core.compiled import allocation_free, compiled
 from hydrotele.core.errors import InputError
 from hydrotele.multibody.chain import Chain
 from hydrotele.multibody.closures import (
-    CLOSURE_TOLERANCE,
-    check_joints_determined,
-    close_loops_from,
     close_loops_near,
     compute_closure_acceleration,
+    describe_opening,
+    find_assemblies,
+    find_start_pose,
     make_loop_workspace,
 )
 from hydrotele.multibody.tree_motion import (
@@ -111,10 +111,7 @@ def project_on_drives(
     for body, axis in (moment_free or {}).items():
         axes[_body_index(chain, body) + 1] = axis
     others = np.setdiff1d(np.arange(v), columns)
-    q = np.array(chain.start if start is None else start, float)
-    if not close_loops_from(chain.tree, q, np.arange(v), CLOSURE_TOLERANCE, np.inf) < CLOSURE_TOLERANCE:
-        raise InputError(_ERROR_CONTEXT, f"the loops of {chain.name} cannot be closed from the start positions")
-    check_joints_determined(chain, q, columns)
+    q = find_start_pose(chain, given, tables[0], start)
     out = Projection(
         np.empty((n, v)), np.empty((n, v)), np.empty((n, v)), np.empty((n, k, v)),
         np.empty((n, k, 10 * len(chain.bodies))), np.empty((n, len(chain.tree.closure_bodies))),
@@ -123,11 +120,14 @@ def project_on_drives(
     given_rows = _GivenMotion(columns, *tables)
     failed = _project_rows(chain.tree, given_rows, others, moved, axes, q, out)
     if failed >= 0:
-        raise InputError(
-            _ERROR_CONTEXT,
-            f"row {failed}: the loops of {chain.name} cannot be closed there, or the pose is"
-            f" singular for the drives {', '.join(drives)}",
-        )
+        if len(chain.closures) and not len(find_assemblies(chain, given, tables[0][failed])):
+            message = describe_opening(chain, given, tables[0][failed], failed)
+        else:
+            message = (
+                f"row {failed}: the loops of {chain.name} cannot be closed there without a jump to another"
+                f" assembly, or the pose is singular for the drives {', '.join(drives)}"
+            )
+        raise InputError(chain.source or _ERROR_CONTEXT, message)
     return out
 
 
@@ -283,25 +283,50 @@ class FrictionTerm:
 
     With `way = tanh(v/v_0)`, the friction is `(coulomb + stribeck exp(-(v/v_s)^2)) way + viscous v
     + quadratic v^2 way`, plus asymmetry terms in which `way` is replaced by `way^2` and `v` by
-    `v way`.
+    `v way`. Near zero speed the friction may deviate from this law by
+    `low_speed_i exp(-(v/w_i)^2) way + reversal_i exp(-(v/w_i)^2) sign(dv/dt)`: the first is a
+    function of the speed, the second differs before and after a reversal, as with elastic contacts.
 
     Attributes:
         location: name of a joint, or of a closure whose bodies rotate relative to each other.
         nominal: parameter -> value; each parameter has one column. See `FRICTION_TERMS`.
         smoothing: v_0 [rad/s] or [m/s]; 0 uses the sign of v.
         stribeck: v_s [rad/s] or [m/s].
+        low_speeds: w_1, w_2, ... [rad/s] or [m/s].
+        rest_speed: speed below which the joint is at rest [rad/s] or [m/s]. Its dry friction is then any
+            force within the Coulomb friction, and 0 here.
     """
 
     location: str
     nominal: Mapping[str, float] = field(default_factory=lambda: {"coulomb": 0.0, "viscous": 0.0})
     smoothing: float = 0.0
     stribeck: float = 0.02
+    low_speeds: tuple[float, ...] = ()
+    rest_speed: float = 0.0
+
+    def unit_forces(self, velocity: np.ndarray, acceleration: np.ndarray | float = 0.0) -> dict[str, np.ndarray]:
+        """Return the friction per unit of each parameter.
+
+        Args:
+            velocity: velocities of any shape [rad/s] or [m/s].
+            acceleration: accelerations at these velocities; 0 averages motion away from and towards zero speed.
+
+        Returns:
+            Parameter -> friction per unit of the parameter, in the shape of `velocity`.
+        """
+        return {kind: _unit_friction(self, kind, velocity, acceleration) for kind in self.nominal}
 
 
 FRICTION_TERMS = (
     "coulomb", "stribeck", "coulomb_asymmetry", "stribeck_asymmetry", "viscous",
     "viscous_asymmetry", "quadratic",
 )  # fmt: skip
+DEVIATION_TERMS = ("low_speed", "reversal")  # deviations near zero speed, with a number: `low_speed_1`
+
+
+def is_deviation(name: str) -> bool:
+    """Return whether a parameter, such as `low_speed_1.knee`, is a friction deviation near zero speed."""
+    return name.partition(".")[0].rpartition("_")[0] in DEVIATION_TERMS
 
 
 @dataclass(frozen=True)
@@ -412,41 +437,51 @@ def sign_uncertainty(
         way = _unit_friction(one, "coulomb", projection.rate[:, j, None] + rate_std[:, j, None] * _NODES)
         mean = way @ weights
         spread = np.sqrt(np.maximum(way**2 @ weights - mean**2, 0.0))
+        spread[np.abs(projection.rate[:, j]) < one.rest_speed] = 1.0
         out[:, list(drives).index(one.location)] = spread
     return out
 
 
 def _friction_columns(chain: Chain, projection: Projection, term: FrictionTerm, rate_std: np.ndarray | None):
     """Return the columns of a friction term: parameter -> (column (n, k), unit)."""
-    strange = [kind for kind in term.nominal if kind not in FRICTION_TERMS]
+    strange = [kind for kind in term.nominal if kind not in FRICTION_TERMS and not is_deviation(kind)]
     if strange:
         message = f"friction has no {strange[0]}; valid: {', '.join(FRICTION_TERMS)}"
         raise InputError(_REGRESSOR_CONTEXT, message)
     if term.location in chain.closures:
         return _closure_friction_columns(chain.closures.index(term.location), projection, term)
     j = chain.index(term.location)
-    velocity, share = projection.rate[:, j], projection.joint_projection[:, :, j]
+    velocity, acceleration = projection.rate[:, j], projection.acceleration[:, j]
+    share = projection.joint_projection[:, :, j]
     if rate_std is None:
-        shapes = {kind: _unit_friction(term, kind, velocity) for kind in term.nominal}
+        shapes = term.unit_forces(velocity, acceleration)
     else:
         maybe = velocity[:, None] + rate_std[:, j, None] * _NODES
         weights = _WEIGHTS / _WEIGHTS.sum()
-        shapes = {kind: _unit_friction(term, kind, maybe) @ weights for kind in term.nominal}
+        shapes = {kind: unit @ weights for kind, unit in term.unit_forces(maybe, acceleration[:, None]).items()}
     dry, wet = ("N", "N s/m") if chain.tree.is_slide[j] else ("N m", "N m s/rad")
-    units: dict[str, str] = {kind: wet if kind in _VISCOUS_TERMS else dry for kind in FRICTION_TERMS}
+    units: dict[str, str] = {kind: wet if kind in _VISCOUS_TERMS else dry for kind in term.nominal}
     units["quadratic"] = "N s^2/m^2" if chain.tree.is_slide[j] else "N m s^2/rad^2"
     return {kind: (share * shapes[kind][:, None], units[kind]) for kind in term.nominal}
 
 
-def _unit_friction(term: FrictionTerm, kind: str, velocity: np.ndarray) -> np.ndarray:
+def _unit_friction(
+    term: FrictionTerm, kind: str, velocity: np.ndarray, acceleration: np.ndarray | float = 0.0
+) -> np.ndarray:
     """Return the friction per unit of a parameter at velocities of any shape."""
     if kind == "viscous":
         return velocity
     way = np.tanh(velocity / term.smoothing) if term.smoothing else np.sign(velocity)
+    if term.rest_speed:
+        way = np.where(np.abs(velocity) < term.rest_speed, 0.0, way)
     if kind == "viscous_asymmetry":
         return velocity * way
     if kind == "quadratic":
         return velocity**2 * way
+    if is_deviation(kind):
+        shape, _, number = kind.rpartition("_")
+        near = np.exp(-((velocity / term.low_speeds[int(number) - 1]) ** 2))
+        return near * (way if shape == "low_speed" else np.abs(np.sign(way)) * np.sign(acceleration))
     side = way**2 if kind.endswith("_asymmetry") else way
     if kind.startswith("stribeck"):
         return np.exp(-((velocity / term.stribeck) ** 2)) * side

@@ -127,6 +127,9 @@ def replay_log(
             log.source,
             f"a replay of {machine.name} needs {', '.join(missing)}; the log has {', '.join(sorted(log.columns))}",
         )
+    unknown = [c for c in _required_channels(plant) if not np.isfinite(log[c]).all(where=_used_rows(log, c))]
+    if unknown:
+        raise InputError(log.source, f"a replay needs all commands and the first positions; missing in {unknown[0]}")
     data = initial_state(plant, _initial_state_from_log(plant, log))
     commands = np.column_stack([log[f"command.{a}"] for a in plant.axes])
     begin = clock.perf_counter()
@@ -140,6 +143,11 @@ def replay_log(
         metadata={"machine": machine.name, "tool": machine.tool, "run": f"replay {log.name}"},
     )  # fmt: skip
     return Replay(log, simulated, _differences(log, simulated, machine), factor)
+
+
+def _used_rows(log: Log, channel: str) -> np.ndarray:
+    """Return (n,) whether a replay uses a row of a required channel: all commands, first positions."""
+    return np.full(len(log), True) if channel.startswith("command.") else np.arange(len(log)) == 0
 
 
 def _required_channels(plant: Plant) -> list[str]:
@@ -157,7 +165,7 @@ def _initial_state_from_log(plant: Plant, log: Log) -> dict[str, Any]:
     }
     valves = axes[: plant.hydraulic]
     names = [f"pressure_{side}.{a}" for side in ("head", "rod") for a in valves]
-    if valves and all(n in log for n in names):
+    if valves and all(n in log and math.isfinite(log[n][0]) for n in names):
         for side in ("pressure_head", "pressure_rod"):  # readings below 0 are sensor noise
             state[side] = [max(0.0, _first_true_value(plant, log, f"{side}.{a}")) for a in valves]
     return state
@@ -234,8 +242,11 @@ def _differences(log: Log, simulated: Log, machine: Machine) -> dict[str, Channe
         kind = channel.partition(".")[0]
         if kind not in COMPARED_KINDS or channel not in simulated:
             continue
-        error = simulated[channel] - log[channel]
-        span = _full_scale(machine, channel) or float(np.ptp(log[channel]))
+        known = np.isfinite(log[channel])
+        if not known.any():
+            continue
+        error = (simulated[channel] - log[channel])[known]
+        span = _full_scale(machine, channel) or float(np.ptp(log[channel][known]))
         table[channel] = ChannelDifference(
             rms=float(np.sqrt(np.mean(error**2))),
             max=float(np.abs(error).max()),

@@ -33,7 +33,7 @@ import yaml
 
 import hydrotele
 from hydrotele.core.errors import InputError
-from hydrotele.core.files import read_json
+from hydrotele.core.files import read_json, resolve_path
 from hydrotele.core.output import atomic_file, atomic_folder, check_output_folder
 from hydrotele.run.sweep_facts import (
     CheckedSweep,
@@ -357,7 +357,7 @@ def _resolved_yaml(base: SweepBase) -> str:
     named = scenario == base.file.sweep.scenario and not Path(scenario).suffix
     facts = base.file.sweep.model_dump(mode="json", exclude_none=True)
     facts |= {"name": base.file.name}
-    facts |= {"scenario": scenario if named else str(Path(scenario).resolve())}
+    facts |= {"scenario": scenario if named else str(resolve_path(scenario))}
     return yaml.safe_dump(facts, sort_keys=False, allow_unicode=True)
 
 
@@ -647,7 +647,7 @@ def _make_task(base: SweepBase, target: Path, how: SweepSettings, checked: Check
     keep = how.write_run_files if base.file.sweep.logs else None
     if how.dask:
         return RunTask(point.run, scenario, None, base.machine_copies.files_of(scenario), keep, None)
-    folder = target.resolve()
+    folder = resolve_path(target)
     return RunTask(point.run, scenario, str(folder), {}, keep, str(folder / SCRATCH))
 
 
@@ -667,7 +667,7 @@ def _write_run_folder(base: SweepBase, target: Path, point: Point, outcome: Outc
             (folder / file).write_bytes(content)
         # the scenario written by a worker contains machine paths of that computer
         save_scenario(
-            with_resolved_paths(scenario_of(base, point), target.resolve()),
+            with_resolved_paths(scenario_of(base, point), resolve_path(target)),
             folder / "scenario.yaml",
         )
 

@@ -11,6 +11,7 @@ import itertools
 import json
 import math
 import zlib
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -18,7 +19,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
-from hydrotele.core.datafile import Name, StrictModel, read_yaml, suggest_valid_name, validate_data
+from hydrotele.core.datafile import Name, Number, StrictModel, read_yaml, suggest_valid_name, validate_data
 from hydrotele.core.errors import InputError
 from hydrotele.core.files import scenarios_folder
 from hydrotele.effects import EFFECTS, apply_effect
@@ -58,10 +59,12 @@ def _check_values(values: list[Any]) -> list[Any]:
     Raises:
         ValueError: a value cannot be written to a scenario, or occurs twice.
     """
-    texts = [json.dumps(_check_value(value)) for value in values]
-    for text in texts:
-        if texts.count(text) > 1:
+    seen = set()
+    for value in values:
+        text = json.dumps(_check_value(value))
+        if text in seen:
             raise ValueError(f"{text} occurs twice; use repeat for several runs of one value")
+        seen.add(text)
     return values
 
 
@@ -76,9 +79,9 @@ class Distribution(StrictModel):
     the key's unit, or choice [values], all equally likely.
     """
 
-    uniform: tuple[float, float] | None = None
-    log_uniform: tuple[float, float] | None = None
-    normal: tuple[float, float] | None = None
+    uniform: tuple[Number, Number] | None = None
+    log_uniform: tuple[Number, Number] | None = None
+    normal: tuple[Number, Number] | None = None
     choice: Annotated[list[Value], Field(min_length=1)] | None = None
 
     @model_validator(mode="after")
@@ -127,13 +130,15 @@ class Sweep(StrictModel):
         sampled = self.sample.keys if self.sample else {}
         if not self.grid and not sampled and self.repeat == 1:
             raise ValueError("no key is varied; give a grid, a sample or repeat")
-        varied = [*self.grid, *sampled]
-        for key in varied:
-            others = [*self.set, *varied]
-            if others.count(key) > 1:
+        varied = {*self.grid, *sampled}
+        given = Counter([*self.set, *self.grid, *sampled])
+        for key, count in given.items():
+            if count > 1 and key in varied:
                 raise ValueError(f"{key} is given more than once in set, grid and sample")
-            if below := [k for k in others if k.startswith(f"{key}.")]:
-                raise ValueError(f"{below[0]} is part of {key}, which is varied as a whole")
+        # After sorting, a key is directly before one of its parts, if it has any.
+        for whole, part in itertools.pairwise(sorted(key.split(".") for key in given)):
+            if part[: len(whole)] == whole and (key := ".".join(whole)) in varied:
+                raise ValueError(f"{'.'.join(part)} is part of {key}, which is varied as a whole")
         if self.repeat > 1 and "seed" in varied:
             raise ValueError("seed cannot be varied together with repeat, which increases the seed")
         if self.runs > MAX_RUNS:
@@ -358,9 +363,13 @@ def scenario_of(base: SweepBase, point: Point) -> Scenario:
         InputError: the scenario is invalid.
     """
     scenario = make_scenario(base.scenario, point_overrides(base.file.sweep, point.values))
-    return base.machine_copies.with_copied_paths(
-        scenario.model_copy(update={"seed": scenario.seed + point.repetition_number})
-    )
+    return _repeat_scenario(base, scenario, point.repetition_number)
+
+
+def _repeat_scenario(base: SweepBase, scenario: Scenario, repetition_number: int) -> Scenario:
+    """Return a repetition of a scenario, with the paths of user machines in the sweep folder."""
+    seed = scenario.seed + repetition_number
+    return base.machine_copies.with_copied_paths(scenario.model_copy(update={"seed": seed}))
 
 
 def fingerprint(scenario: Scenario) -> bytes:
@@ -384,13 +393,14 @@ def check_points(base: SweepBase, progress: Progress | None = None) -> CheckedSw
     seed = 0
     units: dict[str, str] = {}
     teleoperated = False
+    scenario: Scenario
     for point in iterate_points(sweep):
         try:
             if point.repetition_number == 0:
                 scenario = _check_values_of_point(base, point.values, machines)
                 teleoperated |= scenario.pilot.kind == "teleop"
                 units |= _effect_units(scenario, sweep.varied_keys, machines)
-            whole = scenario_of(base, point)
+            whole = _repeat_scenario(base, scenario, point.repetition_number)
         except InputError as error:
             raise _locate_error(base, point, machines, error) from None
         seed = seed if prints else whole.seed

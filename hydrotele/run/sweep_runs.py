@@ -21,7 +21,7 @@ import numpy as np
 
 from hydrotele.core.datafile import read_yaml, suggest_valid_name
 from hydrotele.core.errors import InputError
-from hydrotele.core.files import parse_json
+from hydrotele.core.files import parse_json, resolve_path
 from hydrotele.core.output import atomic_file
 from hydrotele.core.units import KEY_SUFFIXES
 from hydrotele.machine.machine_file import machine_path, shipped_machines
@@ -243,7 +243,7 @@ class MachineCopies:
                 raise InputError(where, f"machine {path} {message}")
 
     def _copied_machine(self, path: Path) -> CopiedMachine:
-        file = machine_path(path).resolve()
+        file = resolve_path(machine_path(path))
         if file not in self._known:
             self._known[file] = _copy_machine(file)
         return self._known[file]

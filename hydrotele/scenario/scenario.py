@@ -24,7 +24,7 @@ from hydrotele.core.datafile import (
     validate_data,
 )
 from hydrotele.core.errors import InputError
-from hydrotele.core.files import describe_excess, scenarios_folder
+from hydrotele.core.files import describe_excess, resolve_path, scenarios_folder
 from hydrotele.logs.log import Log, load_log
 from hydrotele.machine.signals import parse_channel
 from hydrotele.scenario.teleoperation import TeleopPilot
@@ -433,9 +433,9 @@ def make_scenario(file: ScenarioFile, overrides: dict[str, str] | None = None) -
         _apply_override(data, key, text)
     if "folder" in data:
         raise InputError(_locate_key(path, lines, "folder"), "is set automatically; remove the key")
-    data["folder"] = str(path.parent.resolve())
+    data["folder"] = str(resolve_path(path.parent))
     kind = data["pilot"].get("kind") if isinstance(data.get("pilot"), dict) else None
-    if isinstance(kind, str):  # the key paths of pydantic contain the kind of the pilot
+    if isinstance(kind, str) and not overrides:  # the key paths of pydantic contain the kind of the pilot
         lines = lines | {("pilot", kind, *k[1:]): n for k, n in lines.items() if k[:1] == ("pilot",)}
     source = f"{path} with --set {' '.join(overrides)}" if overrides else str(path)
     scenario = validate_data(Scenario, data, source, {} if overrides else lines)
@@ -453,7 +453,7 @@ def _load_table(scenario: Scenario, where: str) -> Scenario:
     if not isinstance(pilot, TablePilot) or pilot.file is None:
         return scenario
     try:
-        log = load_log(Path(scenario.folder, pilot.file), minimum_rows=2, maximum_dropped=1.0)
+        log = load_log(Path(scenario.folder, pilot.file), minimum_rows=2, complete=True)
     except InputError as error:
         raise InputError(where, str(error)) from None
     kinds = ("command",) if pilot.quantity == "command" else ("position", "angle", "reference")

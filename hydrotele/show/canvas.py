@@ -10,7 +10,7 @@ import os
 import sys
 import warnings
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -98,6 +98,8 @@ _MAX_MARKERS = 1000  # maximum number of markers
 class Canvas:
     """Off-screen renderer for models of equal structure, whose meshes are loaded once.
 
+    Any thread may use it, but only one at a time: its OpenGL context is current during a call only.
+
     Attributes:
         size: width and height [pixel].
     """
@@ -147,8 +149,11 @@ class Canvas:
         mujoco.mjv_updateScene(model, data, self._option, None, camera, everything, self._scene)
         write_markers(self._scene, markers)
         self._gl.make_current()
-        mujoco.mjr_render(self._rectangle, self._scene, self._context)
-        mujoco.mjr_readPixels(self._upright, None, self._rectangle, self._context)
+        try:
+            mujoco.mjr_render(self._rectangle, self._scene, self._context)
+            mujoco.mjr_readPixels(self._upright, None, self._rectangle, self._context)
+        finally:
+            _release_context(self._gl)
         return self._upright[::-1].copy()
 
     def close(self) -> None:
@@ -184,6 +189,7 @@ def _open(model: mujoco.MjModel, width: int, height: int):
                 gl.make_current()
             context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
             mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, context)
+            _release_context(gl)
             return gl, context
         except Exception as error:  # drivers raise many types of exceptions
             reasons.append(f"{name}: {error}")
@@ -195,6 +201,16 @@ def _open(model: mujoco.MjModel, width: int, height: int):
         f" (Debian: {PACKAGES}), or select another driver by the environment variable"
         f" MUJOCO_GL=egl or MUJOCO_GL=osmesa. {'; '.join(reasons)}",
     )
+
+
+def _release_context(gl: Any) -> None:
+    """Release the OpenGL context from this thread, so that another thread can make it current."""
+    driver = sys.modules[type(gl).__module__]
+    if egl := getattr(driver, "EGL", None):
+        egl.eglBindAPI(egl.EGL_OPENGL_API)  # a state of the thread
+        egl.eglMakeCurrent(driver.EGL_DISPLAY, egl.EGL_NO_SURFACE, egl.EGL_NO_SURFACE, egl.EGL_NO_CONTEXT)
+    elif glfw := getattr(driver, "glfw", None):
+        glfw.make_context_current(None)
 
 
 def _candidate_drivers() -> tuple[str, ...]:

@@ -171,7 +171,7 @@ def padded_range(values: Iterable[np.ndarray], unit: str) -> tuple[float, float]
     Returns:
         (low, high) [unit].
     """
-    values = [v for v in values if len(v)]
+    values = [known for v in values if len(known := v[np.isfinite(v)])]
     low = min((float(v.min()) for v in values), default=0.0)
     high = max((float(v.max()) for v in values), default=0.0)
     lacking = _MIN_PLOT_RANGES.get(unit, 1e-3) - (high - low)

@@ -86,6 +86,7 @@ def write_report(gap: Gap, path: str | Path) -> None:
         proof_words=_VALIDATION_TEXTS[mechanism].format(gap.before[0].run if gap.before else ""),
         commands=_COMMANDS[mechanism], open_loop=_open_loop(gap),
         noise=_noise(gap), rivals=_alternative_rows(gap), experiment=_experiment(gap), notes=gap.notes,
+        unused=gap.unused_channels,
         version=hydrotele.__version__, seconds=f"{gap.seconds:.0f}",
     )  # fmt: skip
 

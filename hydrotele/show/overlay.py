@@ -26,7 +26,7 @@ from hydrotele.show.channels import (
     padded_range,
     scaled_channel,
 )
-from hydrotele.show.report_html import png, report_figure
+from hydrotele.show.report_html import png, report_figure, show_dollar_signs
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -171,6 +171,7 @@ def _png_figure(path: str | os.PathLike, size: tuple[int, int]) -> Iterator["Fig
         figure = Figure(figsize=(size[0] / _DPI, size[1] / _DPI), dpi=_DPI, facecolor="white")
         FigureCanvasAgg(figure)
         yield figure
+        show_dollar_signs(figure)
         figure.savefig(part, dpi=_DPI)
 
 

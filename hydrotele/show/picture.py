@@ -74,7 +74,7 @@ def render_model(
             names the packages to install), or the file cannot be written.
     """
     mujoco.mj_fwdPosition(model, data)
-    cameras = [model.find_camera(i).name for i in range(model.ncam)]
+    cameras = [model.camera(i).name for i in range(model.ncam)]
     if camera == _OVERVIEW and _OVERVIEW not in cameras:
         camera = _FREE
     if camera not in (*cameras, _FREE):

@@ -72,8 +72,17 @@ def logged_joints(machine: Machine, log: Log) -> dict[str, np.ndarray]:
             f"{truth}{kind}.{name}" for truth in ("", "truth.") for name in names for kind in ("angle", "position")
         ]
         if column := next((c for c in candidates if c in log), None):
-            found[joint] = log[column]
+            found[joint] = _hold_missing(log[column])
     return found
+
+
+def _hold_missing(values: np.ndarray) -> np.ndarray:
+    """Return values (n,) in which a missing value repeats the last one; 0 if there is none."""
+    known = np.flatnonzero(np.isfinite(values))
+    if len(known) in (0, len(values)):
+        return values if len(known) else np.zeros(len(values))
+    latest = np.searchsorted(known, np.arange(len(values)), side="right") - 1
+    return values[known[np.maximum(latest, 0)]]
 
 
 def logged_surroundings(log: Log) -> tuple[SurroundingObject, ...]:

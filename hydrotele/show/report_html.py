@@ -44,8 +44,25 @@ def _choose_font() -> str:
     return next((name for name in _FONTS if name in present), "DejaVu Sans")
 
 
+def show_dollar_signs(figure: "Figure") -> None:
+    """Show names that contain dollar signs as they are, not as mathematical formulas.
+
+    A name such as `$x` may be no valid formula. Only the labels of logarithmic axes are formulas.
+    """
+    from matplotlib.text import Text
+    from matplotlib.ticker import LogFormatter
+
+    axes = (axis for each in figure.axes for axis in (each.xaxis, each.yaxis))
+    logarithmic = [axis for axis in axes if isinstance(axis.get_major_formatter(), LogFormatter)]
+    powers = {text for axis in logarithmic for text in (*axis.get_majorticklabels(), *axis.get_minorticklabels())}
+    for text in figure.findobj(Text):
+        if isinstance(text, Text) and "$" in text.get_text() and text not in powers:
+            text.set_parse_math(False)
+
+
 def png(figure: "Figure") -> bytes:
     """Return a figure as PNG bytes."""
+    show_dollar_signs(figure)
     stream = io.BytesIO()
     figure.savefig(stream, dpi=_DPI, format="png")
     return stream.getvalue()
@@ -55,6 +72,7 @@ def svg(figure: "Figure") -> bytes:
     """Return a figure as SVG bytes, which are reproducible."""
     import matplotlib
 
+    show_dollar_signs(figure)
     stream = io.BytesIO()
     with matplotlib.rc_context({"svg.hashsalt": "hydrotele"}):
         figure.savefig(stream, format="svg", metadata={"Date": None})

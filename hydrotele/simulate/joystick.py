@@ -21,8 +21,8 @@ import numpy as np
 
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
-from hydrotele.core.files import read_xml
 from hydrotele.core.memory import address_record, float64_view, matrix_view
+from hydrotele.core.mjcf import load_spec, read_mjcf
 from hydrotele.machine.joystick import Joystick, principal_values
 from hydrotele.simulate.layout import call_step, function_address
 
@@ -87,7 +87,7 @@ class SimulatedFlotor:
         spec.compiler.discardvisual = True
         spec.compiler.fusestatic = True
         spec.option.timestep = self.period / self.steps
-        self.model = spec.compile()
+        self.model = compile_joystick(facts, spec)
         self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
         self.data = mujoco.MjData(self.model)
         self.model.opt.gravity[:] = (0.0, 0.0, GRAVITY)
@@ -400,13 +400,7 @@ def joystick_spec(facts: Joystick, hand: bool = True) -> mujoco.MjSpec:
         InputError: the MJCF cannot be read or is incomplete.
     """
     path = Path(facts.folder, facts.mjcf)
-    try:
-        read_xml(path)
-        spec = mujoco.MjSpec.from_file(str(path))
-    except InputError:
-        raise
-    except (OSError, ValueError) as error:
-        raise InputError(path, f"cannot be read: {error}") from None
+    spec = load_spec(path)
     flotor, grip = spec.body("flotor"), spec.body("hand")
     coils, joints = spec.body("coils"), {j.name: j for j in spec.joints}
     if not (flotor and grip and coils and {"x", "y", "z", "turn"} <= set(joints)):
@@ -431,6 +425,15 @@ def joystick_spec(facts: Joystick, hand: bool = True) -> mujoco.MjSpec:
     if hand:
         _add_arm_impedance(spec, joints, facts)
     return spec
+
+
+def compile_joystick(facts: Joystick, spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compile a spec of `joystick_spec`.
+
+    Raises:
+        InputError: MuJoCo refuses it; names file and line.
+    """
+    return read_mjcf(Path(facts.folder, facts.mjcf)).compile(spec)
 
 
 def _place_stops(spec: mujoco.MjSpec, facts: Joystick, path: Path) -> None:

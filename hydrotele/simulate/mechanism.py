@@ -24,7 +24,7 @@ import numpy as np
 
 from hydrotele.core.datafile import Vector
 from hydrotele.core.errors import InputError
-from hydrotele.core.files import check_assets, read_xml
+from hydrotele.core.mjcf import read_mjcf, translate_mujoco_errors
 from hydrotele.hydraulics.circuit import ACTIVATIONS_PER_AXIS
 from hydrotele.hydraulics.parameters import (
     SLOT_COUNT,
@@ -77,11 +77,8 @@ class Mjcf(NamedTuple):
         Raises:
             InputError: MuJoCo cannot compile it.
         """
-        try:
+        with translate_mujoco_errors(f"machine {self.name}"):
             return mujoco.MjModel.from_xml_string(self.text, dict(self.assets))
-        except ValueError as error:
-            message = " ".join(str(error).split())
-            raise InputError(f"machine {self.name}", f"does not compile: {message}") from None
 
     def save(self, path: Path, final_path: Path | None = None) -> None:
         """Write the document to a file, and its assets to the folder `<stem>_assets` next to it.
@@ -278,13 +275,12 @@ def _read_mjcf(machine: Machine, looks: bool) -> mjcf.RootElement:
         return mjcf.RootElement(model=machine.name)
     path = Path(machine.folder, machine.mjcf)
     try:
-        tree = read_xml(path)
+        tree = read_mjcf(path).root
         for body, file in machine.attached.items():
             _attach_bodies(tree, body, Path(machine.folder, file))
         name_geoms(tree)
         if not looks:
             remove_visual_geometry(tree)
-        check_assets(tree, path)
         text = ElementTree.tostring(tree, encoding="unicode")
         return mjcf.from_xml_string(text, model_dir=str(path.parent))
     except InputError:
@@ -296,7 +292,7 @@ def _read_mjcf(machine: Machine, looks: bool) -> mjcf.RootElement:
 def _attach_bodies(tree: Element, body: str, file: Path) -> None:
     """Attach the bodies of another MJCF file, without assets, to a body of a tree, in place."""
     place = next((element for element in tree.iter("body") if element.get("name") == body), None)
-    world = read_xml(file).find("worldbody")
+    world = read_mjcf(file).root.find("worldbody")
     if place is None or world is None:
         raise InputError(file, f"cannot be attached to {body!r}: no such body, or no worldbody in the file")
     place.extend(world.findall("body"))

@@ -8,14 +8,14 @@ Nothing is allocated during a step:
 
 >>> import numpy as np
 >>> from hydrotele.soil.facts import SOILS
->>> from hydrotele.soil.facts import OUT, FORCE_R, bucket_state, level_profile, soil_parameters
+>>> from hydrotele.soil.facts import RESULT_SIZE, FORCE_R, make_bucket_state, make_level_profile, pack_soil_parameters
 >>> from hydrotele.soil.facts import CAT215
->>> from hydrotele.soil.step import EdgeMotion, soil_step
->>> numbers = soil_parameters(SOILS["firm"], CAT215, start=3.0, cell=0.05)
->>> (surface, loose), state, out = level_profile(140), bucket_state(), np.zeros(OUT)
+>>> from hydrotele.soil.step import EdgeMotion, step_soil
+>>> numbers = pack_soil_parameters(SOILS["firm"], CAT215, start=3.0, cell=0.05)
+>>> (surface, loose), state, out = make_level_profile(140), make_bucket_state(), np.zeros(RESULT_SIZE)
 >>> for r in np.arange(6.0, 5.5, -0.002):  # drawn in at 0.4 m/s, 0.15 m deep, upright
 ...     edge = EdgeMotion(r, -0.15, -0.4, 0.0, -1.5)
-...     soil_step(numbers, surface, loose, state, edge, 0.005, out)
+...     step_soil(numbers, surface, loose, state, edge, 0.005, out)
 >>> bool(20e3 < out[FORCE_R] < 50e3)  # N, against the motion
 True
 

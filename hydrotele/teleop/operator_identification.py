@@ -27,7 +27,7 @@ import yaml
 
 from hydrotele.core.errors import InputError
 from hydrotele.core.units import to_si
-from hydrotele.logs.log import read_table
+from hydrotele.logs.table import read_table
 from hydrotele.teleop.manual_control import FORMS, TrackingRecord
 from hydrotele.teleop.operator_parameters import load_operator_file
 
@@ -140,6 +140,8 @@ def read_tracking(path: Path, names: Mapping[str, str] | None = None) -> tuple[T
             has = ", ".join(table.names)
             message = f"has no column {name or key!r}; columns: {has}; name it with --{key} COLUMN"
             raise InputError(path, message)
+        if name in table.faults:
+            raise table.faults[name]
         place = table.names.index(name)
         unit, values = table.units[place], np.array(table.values[place], float)
         if unit is not None:

@@ -27,7 +27,7 @@ from hydrotele.control.resolved_motion import COORDINATES
 from hydrotele.core.compiled import compiled
 from hydrotele.core.errors import InputError
 from hydrotele.core.units import to_si
-from hydrotele.logs.log import read_table
+from hydrotele.logs.table import read_table
 from hydrotele.machine.joystick import AXES, Joystick
 from hydrotele.scenario.teleoperation import (
     FollowPath,
@@ -722,15 +722,21 @@ def read_recorded_hand(path: Path, time: np.ndarray) -> np.ndarray:
         InputError: the file cannot be read or has no such column.
     """
     table = read_table(path)
-    columns = {}
+    columns, names = {}, {}
     for name, values, unit in zip(table.names, table.values, table.units, strict=True):
         if name == "time" or name.removeprefix("handle.") in AXES:
             columns[name.removeprefix("handle.")] = values * (to_si(unit)[1] if unit else 1.0)
+            names[name.removeprefix("handle.")] = name
     if len(columns) < 2 or "time" not in columns:
         wanted = ", ".join(f"handle.{axis}" for axis in AXES)
         has = ", ".join(table.names)
         raise InputError(path, f"needs time and a displacement ({wanted}); columns: {has}")
     record = columns.pop("time")
+    for axis, values in columns.items():
+        if len(bad := np.flatnonzero(~np.isfinite(values))):
+            raise InputError(table.location(names[axis], int(bad[0])), "is not a finite number")
+    if not len(record):
+        raise InputError(path, "has no rows: give at least one position of the handle")
     if len(bad := np.flatnonzero(~(np.diff(record) > 0.0))):
         message = "does not increase here: sort the rows and keep each time once"
         raise InputError(table.location("time", int(bad[0]) + 1), message)

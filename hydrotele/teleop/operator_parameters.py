@@ -26,6 +26,7 @@ from hydrotele.core.datafile import (
 )
 from hydrotele.core.datafile import suggest_valid_name as suggest_name
 from hydrotele.core.errors import InputError
+from hydrotele.core.files import resolve_path
 from hydrotele.machine.joystick import HandImpedance, Joystick, SymmetricMatrix
 from hydrotele.scenario.teleoperation import RENAMED_OPERATOR_PARAMETERS, OperatorSettings
 
@@ -357,4 +358,4 @@ def scale_hand_stiffness(hand: HandImpedance, factor: float) -> HandImpedance:
 def _load_perception_file(perception: OperatorSettings, folder: str) -> OperatorFile:
     if perception.file is None:
         return load_operator_file()
-    return load_operator_file(Path(folder, perception.file).resolve())
+    return load_operator_file(resolve_path(Path(folder, perception.file)))

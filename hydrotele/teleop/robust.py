@@ -55,9 +55,9 @@ def llewellyn(port: TwoPort, s: np.ndarray | complex) -> np.ndarray:
 
     Source: Llewellyn 1952; Haykin 1970, Active network theory; with `[F_h, -V_e] = H [V_h, F_e]`.
 
-    >>> from hydrotele.teleop.two_port import two_port
+    >>> from hydrotele.teleop.two_port import make_two_port
     >>> body, firm = Impedance(1.0), Impedance(0.0, 40.0, 400.0)
-    >>> float(llewellyn(two_port("four_channel_position", body, body, firm, firm), 3j).round(6))
+    >>> float(llewellyn(make_two_port("four_channel_position", body, body, firm, firm), 3j).round(6))
     1.0
     """
     h = hybrid_matrix(port, np.asarray(s, complex))

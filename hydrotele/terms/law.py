@@ -35,6 +35,7 @@ import numpy as np
 from pydantic import model_validator
 
 from hydrotele.core.datafile import (
+    MAX_MAGNITUDE,
     Name,
     NonNegativeFloat,
     PositiveFloat,
@@ -190,7 +191,7 @@ def _encode_value(law: str, name: str, kind: type, value: Any) -> list[float]:
         return [float(VARIABLES[value])]
     try:
         flat = np.asarray(value, float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):  # OverflowError: an integer beyond any float
         flat = np.array(math.nan)
     if not np.isfinite(flat).all() or (kind is float) != (flat.ndim == 0):
         what = "a list of finite numbers" if kind is Numbers else "a finite number"
@@ -268,6 +269,7 @@ FUNCTIONS = {
 
 _DIVISOR_CONSTANTS = {"sign": 0, "root": 0, "bump": 1, "rise": 0, "sin": 0, "cos": 0}
 _NO_FUNCTION, _NO_VARIABLE, _MAX_POWER = 0, -1, 6
+_MAX_PRODUCT_LENGTH = 1000  # characters of a product; Python's parser needs stack memory in proportion
 
 
 def formula_arguments(parameters: Mapping[str, float]) -> dict[str, list[float]]:
@@ -301,30 +303,40 @@ def formula_arguments(parameters: Mapping[str, float]) -> dict[str, list[float]]
 
 def _parse_product(text: str) -> list[list[float]]:
     """Parse a product into its encoded factors; the product `1` has none."""
+    text = text.strip()
+    if len(text) > _MAX_PRODUCT_LENGTH:
+        raise _formula_error(text, f"it has {len(text)} characters, at most {_MAX_PRODUCT_LENGTH}")
     try:
-        node = ast.parse(text.strip(), mode="eval").body
-    except SyntaxError:
+        node = ast.parse(text, mode="eval").body
+    except (SyntaxError, ValueError):  # ValueError: a null character
         raise _formula_error(text, "it cannot be parsed") from None
-    if isinstance(node, ast.Constant) and node.value == 1:
+    except (RecursionError, MemoryError):  # raised by Python's parser
+        raise _formula_error(text, "it is nested too deeply") from None
+    if _number_of(node) == 1.0:
         return []
     return [_parse_factor(text, part) for part in _split_factors(node)]
 
 
 def _split_factors(node: ast.expr) -> list[ast.expr]:
     """Return the factors of a product as syntax nodes."""
-    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mult):
-        return [*_split_factors(node.left), *_split_factors(node.right)]
-    return [node]
+    factors, waiting = [], [node]
+    while waiting:
+        part = waiting.pop()
+        if isinstance(part, ast.BinOp) and isinstance(part.op, ast.Mult):
+            waiting += [part.right, part.left]
+        else:
+            factors.append(part)
+    return factors
 
 
 def _parse_factor(text: str, node: ast.expr) -> list[float]:
     """Encode a factor: function, variables, constants and power."""
     power = 1
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow):
-        exponent = node.right
-        if not (isinstance(exponent, ast.Constant) and exponent.value in range(1, _MAX_POWER + 1)):
+        exponent = _number_of(node.right)
+        if exponent not in range(1, _MAX_POWER + 1):
             raise _formula_error(text, f"a power must be a whole number from 1 to {_MAX_POWER}")
-        node, power = node.left, int(str(exponent.value))
+        node, power = node.left, int(exponent)
     if not isinstance(node, ast.Call):
         return [_NO_FUNCTION, *_parse_argument(text, node), 0.0, 0.0, power]
     name = node.func.id if isinstance(node.func, ast.Name) else "?"
@@ -349,7 +361,7 @@ def _parse_argument(text: str, node: ast.expr) -> list[int]:
 
 def _parse_variable(text: str, node: ast.expr) -> int:
     """Return the index of a variable."""
-    name = node.id if isinstance(node, ast.Name) else ast.unparse(node)
+    name = node.id if isinstance(node, ast.Name) else ast.get_source_segment(text, node) or text
     if name not in VARIABLES:
         raise _formula_error(text, f"{name!r} is not a variable; {_suggest_variable(name)}")
     return VARIABLES[name]
@@ -357,13 +369,21 @@ def _parse_variable(text: str, node: ast.expr) -> int:
 
 def _parse_number(text: str, node: ast.expr) -> float:
     """Return the value of a numeric constant."""
-    try:
-        value = ast.literal_eval(node)
-    except ValueError:
-        value = None
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise _formula_error(text, f"{ast.unparse(node)!r} is not a number")
+    value = _number_of(node)
+    if not abs(value) <= MAX_MAGNITUDE:
+        segment = ast.get_source_segment(text, node) or text
+        raise _formula_error(text, f"{segment!r} is not a number from -{MAX_MAGNITUDE:g} to {MAX_MAGNITUDE:g}")
     return float(value)
+
+
+def _number_of(node: ast.expr) -> float:
+    """Return the number that a syntax node states, with or without a sign; NaN for other nodes."""
+    sign = 1
+    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.UAdd):
+        sign, node = -1 if isinstance(node.op, ast.USub) else 1, node.operand
+    if isinstance(node, ast.Constant) and type(node.value) in (int, float):
+        return sign * node.value  # pyright: ignore[reportOperatorIssue, reportReturnType] - a number
+    return math.nan
 
 
 def _formula_error(text: str, why: str) -> ValueError:

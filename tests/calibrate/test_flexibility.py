@@ -30,7 +30,7 @@ def clean(loop):
     made = []
     for link in ("stick", "boom", "swing"):
         true = generate_sweep_poses(loop, link, DRIFT_FREE_SWEEPS[link])
-        sensors = (true.theta - loop.values[:, 0])[:, loop.moved :]
+        sensors = (true.theta - loop.values[:, 0])[:, loop.powered_count :]
         sigma = np.full(sensors.shape[1], ACCURACY / np.sqrt(3.0))
         made.append(Poses(link, sensors, sigma, {}))
     return made

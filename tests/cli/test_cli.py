@@ -157,13 +157,15 @@ def test_errors_of_the_user_exit_with_two_and_no_traceback(tmp_path):
         (["run", "zhu_up", "--set", "=1"], "must be key=value"),
         (["run", "zhu_up", "--set", "sed=1"], "unknown key 'sed'; did you mean 'seed'"),
         (["run", "zhu_up", "--set", "duration=-1"], "duration"),
-        (["replay", "no.parquet"], "neither a log file"),
-        (["replay", "."], "holds no measured.parquet"),
+        (["replay", "no.parquet"], "no.parquet: does not exist"),
+        (["replay", "."], "contains no log"),
         (["list", "machine"], "did you mean 'machines'"),
         (["validate", "zhu_upp"], "did you mean 'zhu_up'"),
         (["export", "cat216"], "did you mean 'cat215'"),
         (["export", "cat215", "--tool", "spoon"], "no tool 'spoon'; .*bucket"),
-        (["review", "no.parquet"], "neither a log file"),
+        (["review", "no.parquet"], "no.parquet: does not exist"),
+        (["validate", "no.csv"], "no.csv: does not exist"),
+        (["review", "no.rrd"], "no.rrd: does not exist"),
     ],
 )
 def test_errors_of_the_user(words, message, tmp_path, monkeypatch):
@@ -399,7 +401,7 @@ def test_a_run_of_ones_own_machine_can_be_handed_on(tmp_path):
 
 def test_review_refuses_a_log_of_another_machine(finished):
     code, _, err = invoke("review", finished, "--machine", "rig", "--plot", "x.png")
-    assert code == 2 and "is not a log of rig: it has none of position.slide" in err
+    assert code == 2 and "is a log of the machine 'cat215', the model is 'rig'" in err
 
 
 def test_validate_reports_every_file(tmp_path):

@@ -98,6 +98,87 @@ def test_another_form_of_the_cache_is_never_read(tmp_path):
     assert _run(tmp_path, tmp_path, code)[0] == ["10.0", "0"]
 
 
+CACHE_FAULTS = """
+from hydrotele.core.compiled import callback, compiled
+
+
+@compiled
+def law(x):
+    return 2.0 * x
+
+
+@callback("float64(float64)")
+def twice(x):
+    return 2.0 * x
+
+
+print(law(1.0), law(1), twice.ctypes(2.0), sum(law.stats.cache_hits.values()), twice._compiled._cache_hits)
+"""
+
+
+@pytest.fixture
+def cached_module(tmp_path):
+    """Return a function that runs a module with cached functions, and the files of its cache."""
+    package = tmp_path / "hydrotele"
+    shutil.copytree(PACKAGE / "core", package / "core")
+    (package / "__init__.py").write_text("")
+    (package / "made.py").write_text(CACHE_FAULTS)
+
+    def run(before=""):
+        answers, notes = _run(tmp_path, tmp_path, f"{before}\nimport hydrotele.made")
+        return answers, [line for line in notes.splitlines() if not line.startswith("compiling")]
+
+    assert run() == (["2.0", "2.0", "4.0", "0", "0"], [])
+    files = sorted((tmp_path / "hydrotele/compiled").rglob("*.code"))
+    assert len(files) == 3  # two signatures of `law`, one of `twice`
+    return run, files
+
+
+def test_damaged_cache_files_are_compiled_again_with_one_line_of_notice(cached_module):
+    run, files = cached_module
+    content = [file.read_bytes() for file in files]
+    damaged = b"", content[1][:900], bytes([*content[2][:2000], content[2][2000] ^ 1, *content[2][2001:]])
+    for file, bad in zip(files, damaged, strict=True):
+        file.write_bytes(bad)
+    answers, notes = run()
+    assert answers == ["2.0", "2.0", "4.0", "0", "0"]
+    (note,) = notes
+    assert re.fullmatch(
+        "damaged compiled code is compiled again: "
+        rf"{files[0].parent}/(law|twice)-\d+\.\w+\.code: its checksum is wrong", note,
+    )  # fmt: skip
+    content = [file.read_bytes() for file in files]
+    files[0].write_bytes(content[1])  # intact, but of another signature
+    files[1].write_bytes(content[0])
+    assert run() == (["2.0", "2.0", "4.0", "0", "1"], [])
+
+
+FULL_DISK = """
+import errno, os
+from hydrotele.core import code_cache
+def fail(*_): raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+code_cache._write_atomically = os.open = fail
+"""
+
+
+def test_a_full_disk_keeps_compiled_code_in_memory(cached_module):
+    run, files = cached_module
+    for file in files:
+        file.unlink()
+    where = f"{files[0].parent} cannot be written, No space left on device"
+    note = f"compiled functions are kept in memory only: {where}"
+    assert run(FULL_DISK) == (["2.0", "2.0", "4.0", "0", "0"], [note])
+
+
+def test_an_unusable_cache_folder_keeps_compiled_code_in_memory(cached_module, tmp_path):
+    run, _ = cached_module
+    shutil.rmtree(tmp_path / "hydrotele/compiled")
+    (tmp_path / "hydrotele/compiled").write_text("")  # a file where the folder has to be
+    why = "no cache folder is writable by you alone; set XDG_CACHE_HOME to such a folder"
+    note = f"compiled functions are kept in memory only: {why}"
+    assert run() == (["2.0", "2.0", "4.0", "0", "0"], [note])
+
+
 def test_two_processes_compile_a_function_once(tmp_path):
     package = tmp_path / "hydrotele"
     shutil.copytree(PACKAGE / "core", package / "core")
@@ -131,7 +212,7 @@ def test_two_processes_compile_a_function_once(tmp_path):
 PROGRESS = """
 from hydrotele.core import compile_progress, compiled
 compile_progress.SECONDS_BEFORE_BAR = compile_progress.SECONDS_BETWEEN_LINES = 0.0
-compile_progress._REDRAW = 0.01
+compile_progress._REDRAW_INTERVAL = 0.01
 inner = compiled.compiled(lambda x: 2.0 * x)
 @compiled.compiled
 def law(x):
@@ -160,11 +241,11 @@ from hydrotele.simulate.closure import widest_pin
 code = "import numpy as np; from hydrotele.simulate.closure import widest_pin as f"
 code += "; f(np.zeros((2, 3)), np.zeros(1, int), np.ones(1, int))"
 for _ in range(2):
-    compiled.compile_elsewhere(widest_pin, code)
-for process in compiled._ELSEWHERE.values():
+    compiled.compile_in_background(widest_pin, code)
+for process in compiled._background_processes.values():
     assert process.wait() == 0
 widest_pin(np.zeros((2, 3)), np.zeros(1, int), np.ones(1, int))
-print(len(compiled._ELSEWHERE), sum(widest_pin.stats.cache_hits.values()))
+print(len(compiled._background_processes), sum(widest_pin.stats.cache_hits.values()))
 """
 
 

@@ -19,7 +19,7 @@ PACKAGE = Path(hydrotele.__file__).parent
 
 CHAIN = """
 from hydrotele.core import linking
-linking.LINKED_BYTECODE = 0
+linking.MAX_INLINED_BYTECODE = 0
 from hydrotele.core.compiled import callback, compiled
 
 @compiled

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from hydrotele.core.errors import InputError
+from hydrotele.core.files import resolve_path
 from hydrotele.core.output import atomic_file, atomic_folder, check_output_folder
 
 
@@ -65,6 +66,22 @@ def test_refuses_what_is_not_its_own(tmp_path):
             write(tmp_path / target)
     assert (tmp_path / "mine" / "thesis.txt").read_text() == "years of work"
     assert names(tmp_path) == ["file", "mine"]
+
+
+def test_a_link_in_a_loop_is_refused(tmp_path):
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    for target in ("a", "a/run"):
+        with pytest.raises(InputError, match=f"{target}: cannot be created: {tmp_path}/[ab] is not a writable folder"):
+            check_output_folder(tmp_path / target, "run")
+    assert resolve_path(tmp_path / "a") == tmp_path / "a"
+
+
+def test_a_folder_that_is_not_of_the_kind_is_not_searched(monkeypatch):
+    """`--out /` would list all files of the computer."""
+    monkeypatch.setattr(Path, "rglob", lambda *_: pytest.fail("searched"))
+    with pytest.raises(InputError, match="^/: exists and was not written by a run; choose another --out$"):
+        check_output_folder("/", "run")
 
 
 def test_link_is_followed(tmp_path):

@@ -93,6 +93,8 @@ def test_the_force_of_the_example_is_that_of_a_gas_spring(gas_spring):
         ("x = 1", "defines neither EFFECT = Effect.* nor EFFECTS = .* nor a law"),
         ("import math\nx = 1 / 0", r"bad.py:2: cannot be run: ZeroDivisionError"),
         ("x = (", r"bad.py:1: cannot be run: SyntaxError"),
+        ("raise SystemExit(0)", r"bad.py:1: cannot be run: SystemExit: 0\n  File .*bad.py., line 1"),
+        ("EFFECTS = (1 / k for k in (1, 0))", r"bad.py:1: cannot be run: ZeroDivisionError"),
         (FILE.replace('"gas_spring", "a gas', '"payload", "a gas'), "'payload' exists already"),
         (FILE.replace("def gas_spring_force", "def pulse"), "law pulse: is already defined by hyd"),
         (FILE.replace("(s, force, length)", "(s, force: str)"), "is not float, Variable or Num"),
@@ -113,6 +115,35 @@ def test_a_missing_file_or_another_kind_is_refused(tmp_path, alone):
     (tmp_path / "effects.yaml").write_text("a: 1")
     with pytest.raises(InputError, match=r"define custom effects in a \.py file"):
         load_effects(tmp_path / "effects.yaml")
+
+
+def test_a_pipe_or_a_device_is_no_effects_file(tmp_path, alone):
+    os.mkfifo(tmp_path / "pipe.py")
+    (tmp_path / "zero.py").symlink_to("/dev/zero")
+    for name in ("pipe.py", "zero.py"):
+        with pytest.raises(InputError, match=f"{name}: is not a regular file but a pipe or device"):
+            load_effects(tmp_path / name)
+
+
+@pytest.mark.parametrize("line", ["1 / 0", "exit(0)", "open('missing.yaml')"])
+def test_an_error_inside_a_file_of_effects_ends_a_command_with_the_traceback_of_that_file(
+    line, tmp_path, alone, monkeypatch, capsys
+):
+    from hydrotele.cli import main
+
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "import dataclasses\nfrom hydrotele.effects import EFFECTS\n\n\ndef locate(machine):\n"
+        f"    return {line}\n\n\nEFFECT = dataclasses.replace(EFFECTS['payload'], name='mine', locations=locate)\n"
+    )
+    monkeypatch.setattr(sys, "argv", ["hydrotele", "list", "effects", "--effects", str(file)])
+    with pytest.raises(SystemExit, match="2"):
+        main._run()
+    error = capsys.readouterr().err.splitlines()
+    kind = {"1 / 0": "ZeroDivisionError", "exit(0)": "SystemExit"}.get(line, "FileNotFoundError")
+    assert error[0].startswith(f"error {file}:6: {kind}: ")
+    assert error[1] == f'  File "{file}", line 6, in locate' and error[2] == f"    return {line}"
+    assert not any("hydrotele/" in text for text in error[1:]), "only of the user's file"
 
 
 def test_a_law_that_numba_cannot_compile_is_named(tmp_path, alone):
@@ -147,7 +178,9 @@ def test_installed_packages_offer_effects_as_entry_points(monkeypatch, alone, tm
     assert list(library) == ["gas_spring"]
     assert LAWS["gas_spring_force"].source == "plug-in springs of the package ?"
     entries[0] = importlib.metadata.EntryPoint("springs", "rig_plugin_2", own.ENTRY_POINT_GROUP)
-    with pytest.raises(InputError, match="plug-in springs .*cannot be loaded: No module.*uninstall"):
+    with pytest.raises(
+        InputError, match="plug-in springs .*cannot be loaded: ModuleNotFoundError: No module.*uninstall"
+    ):
         own.add_plugin_effects({})
 
 

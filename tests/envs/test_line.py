@@ -38,7 +38,7 @@ def place(goal, time) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_every_line_lies_in_the_workspace_and_asks_less_than_the_drives_have(core, goals):
-    arm, ranges = core.facts["arm"], core.facts["ranges"][:4]
+    arm, ranges = core.parameters["arm"], core.parameters["ranges"][:4]
     fastest = [full_action_rate(core.setup.machine, axis) for axis in core.setup.axes]
     times = np.arange(0.0, core.setup.clock.horizon * 0.02, 0.1)
     for goal in goals:

@@ -117,8 +117,54 @@ def test_a_forked_child_is_told_so(three):
     three.step(np.zeros((3, 3)))
 
 
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"num_envs": 0}, "^num_envs: must be a whole number from 1 to 100000, not 0$"),
+        ({"num_envs": 10**9}, "^num_envs: must be a whole number from 1 to 100000, not 1000000000$"),
+        ({"num_envs": 2.0}, "^num_envs: must be a whole number from 1 to 100000, not 2.0$"),
+        ({"threads": 10**6}, "^threads: must be a whole number from 0 to 1024, not 1000000$"),
+        ({"variants": 10**9}, "^variants: must be a whole number from 1 to 10000, not 1000000000$"),
+    ],
+)
+def test_counts_beyond_memory_are_refused(options, said):
+    with pytest.raises(InputError, match=said):
+        MachineVectorEnv(TASK, **options)
+
+
+@pytest.mark.parametrize(
+    "action", [["0", "0", "0"], np.zeros(3, complex), np.zeros(3, object), np.zeros(3, "datetime64[s]"), [None] * 3]
+)
+def test_actions_are_real_numbers(three, action):
+    with pytest.raises(ValueError, match="the action must consist of real numbers, not of "):
+        three.step(np.tile(action, (3, 1)))
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("dtype", [np.float64, np.float16, np.int64, np.uint8, bool])
+def test_actions_of_any_real_type_count_and_large_ones_are_full(three, dtype):
+    three.reset(seed=0)
+    expected = three.step(np.ones((3, 3), np.float32))
+    three.reset(seed=0)
+    large = 1e300 if dtype == np.float64 else 1
+    np.testing.assert_array_equal(three.step(np.full((3, 3), large, dtype))[0], expected[0])
+
+
+def test_no_step_follows_the_end_of_an_episode():
+    env = MachineEnv(TASK, variants=1, duration=0.1)
+    env.reset(seed=0)
+    while not any(env.step(np.zeros(3))[2:4]):
+        pass
+    for _ in range(2):
+        with pytest.raises(RuntimeError, match=r"^the episode is over: call reset\(\) before the next step$"):
+            env.step(np.zeros(3))
+    env.reset()
+    assert not any(env.step(np.zeros(3))[2:4])
+    env.close()
+
+
 def test_copies_and_pickles_are_refused_with_a_reason(three):
     for env in (three, MachineEnv(TASK, variants=1), load(TASK, variants=1)):
-        for duplicate in (copy.deepcopy, pickle.dumps):
+        for duplicate in (copy.copy, copy.deepcopy, pickle.dumps):
             with pytest.raises(TypeError, match="neither copied nor pickled"):
                 duplicate(env)

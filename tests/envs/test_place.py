@@ -115,7 +115,7 @@ def test_threads_company_and_episodes_before_change_no_bit(sensors):
         for number, core in enumerate(alone):
             core.step(action[number])
         were_held = max(were_held, int(cores[0].final_measures[:, HELD].sum()))
-        for name in ("observation", "final", "reward", "truncated", "measures"):
+        for name in ("observation", "final_observation", "reward", "truncated", "measures"):
             first = getattr(cores[0], name)
             assert np.array_equal(first, getattr(cores[1], name))
             assert np.array_equal(first, np.concatenate([getattr(c, name) for c in alone]))

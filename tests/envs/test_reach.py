@@ -37,7 +37,7 @@ def left(core: TaskCore) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_the_straight_way_to_every_pose_lies_in_the_workspace(core):
-    arm, ranges, joints = core.facts["arm"], core.facts["ranges"][:5], np.zeros(5)
+    arm, ranges, joints = core.parameters["arm"], core.parameters["ranges"][:5], np.zeros(5)
     core.reset(np.arange(COUNT))
     far = []
     for _ in range(6):

@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 
 import gymnasium
 import mujoco
@@ -65,6 +66,18 @@ def env():
 
 
 DRAWN = ("TrackTrajectory", "PlaceLog")  # daily; their machines and goals differ most
+
+
+def test_any_thread_may_render():
+    env = MachineEnv("TrackTrajectory", render_mode="rgb_array", variants=1, width=64, height=48)
+    env.reset(seed=0)
+    with ThreadPoolExecutor(2) as pool:
+        images = [env.render(), *pool.map(lambda _: env.render(), range(2)), env.render()]
+    assert images[0].std() > 1.0
+    for image in images[1:]:
+        np.testing.assert_array_equal(image, images[0])
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(env.close).result()
 
 
 @pytest.mark.daily("TrackTrajectory")

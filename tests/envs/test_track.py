@@ -36,7 +36,7 @@ def test_rates_are_derivatives_and_it_begins_at_rest_where_the_arm_stands(core):
 
 
 def test_references_stay_in_range_and_leave_the_drives_some_speed(core):
-    facts, times = core.facts, np.arange(0.0, 32.0, 0.05)
+    facts, times = core.parameters, np.arange(0.0, 32.0, 0.05)
     for number in range(64):
         for axis in range(3):
             place, rate = course(core, number, axis, times).T

@@ -168,7 +168,7 @@ def test_leakage_to_tank_is_recovered_and_not_mistaken_for_leakage_across_the_pi
             fits[name] = found.fit(first, 0.0)
         spread = float(np.linalg.inv(fits["tank_leakage"].information)[0, 0]) ** 0.5
         ((part, deviation),) = fits["tank_leakage"].guess.parts
-        scale = part.parameters["leakage"].scale
+        scale = part.parameters["leakage"].prior_std
         # four standard deviations of the fit, and the known value is as far from none as 100
         assert deviation[0] * scale == pytest.approx(leak, abs=4.0 * spread * scale)
         assert leak > 20.0 * spread * scale
@@ -191,7 +191,7 @@ def test_a_drift_is_recovered_and_not_mistaken_for_an_offset():
             losses[name] = float(np.sum(found.errors(best[name].guess, 4e-3) ** 2))
         losses[""] = float(np.sum(found.errors(Guess(), 4e-3) ** 2))
     ((part, deviation),) = best["angle_drift"].guess.parts
-    scale = part.parameters["drift"].scale
+    scale = part.parameters["drift"].prior_std
     spread = float(np.linalg.inv(best["angle_drift"].information)[0, 0]) ** 0.5
     # four standard deviations of the fit
     assert deviation[0] * scale == pytest.approx(0.02, abs=4.0 * spread * scale)

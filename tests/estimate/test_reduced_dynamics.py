@@ -107,8 +107,8 @@ def energy(model, space, z):
     place(model, space, z)
     compute_mass_and_bias(model.mech, space.motion)
     mech, m = model.mech, space.motion
-    n, rates, total = len(mech.free), m.joint[RATE], 0.5 * m.joint[RATE] @ m.mass @ m.joint[RATE]
-    for i in range(1, mech.bodies):
+    n, rates, total = len(mech.independent), m.joint[RATE], 0.5 * m.joint[RATE] @ m.mass @ m.joint[RATE]
+    for i in range(1, mech.body_count):
         turn, com = m.frame[i, ROTATION : ROTATION + 9].reshape(3, 3), mech.shape[i, COM : COM + 3]
         place_of_mass = m.frame[i, ORIGIN : ORIGIN + 3] + turn @ com
         total -= mech.shape[i, MASS] * mech.gravity @ place_of_mass

@@ -67,8 +67,8 @@ class Recursion:
                 compute_wrenches(frames, b, one, two)
                 own = slice(10 * k, 10 * k + 10)
                 self.place[body][row], self.x_axis[body][row] = (
-                    frames.place[b],
-                    frames.turn[b][:, 0],
+                    frames.origin[b],
+                    frames.rotation[b][:, 0],
                 )
                 self.force[body][row, :, own], self.torque[body][row, :, own] = one, two
 

@@ -27,7 +27,7 @@ LESS = 0.047  # V s/rad: 20 % under the model's
 def site(tmp_path_factory):
     """Two runs of MuJoCo's plant with a weaker motor: out, hold, back, at other duties each."""
     folder = tmp_path_factory.mktemp("pump")
-    planted = {"name": "motor_constant", "location": "piston", "parameters": {"emf": LESS}}
+    planted = {"name": "motor_constant", "location": "piston", "parameters": {"torque_constant": LESS}}
     for name, out, back in (("fit_1", 0.7, -0.6), ("test_1", 0.55, -0.7)):
         duty = np.repeat([0.0, out, 0.6 * out, 0.0, back], round(RATE * SECONDS / 5))
         pilot = {
@@ -59,7 +59,7 @@ def test_every_number_of_pump_motor_and_load_can_be_calibrated():
     keys = numbers(load_machine("eha", TOOL)).keys()
     assert {
         "area.piston.area_rod", "pump_displacement.piston.displacement",
-        "motor_constant.piston.emf", "motor_inertia.piston.inertia",
+        "motor_constant.piston.torque_constant", "motor_inertia.piston.inertia",
         "load_relief.piston.relief_pressure",
         "line_compliance.piston.head.air", "accumulator_pressure.piston.pressure",
     } <= keys  # fmt: skip
@@ -79,7 +79,7 @@ def test_a_weaker_motor_is_named_or_calibrated(site):
 
 def test_compare_judges_free_runs(site, tmp_path):
     """With the weaker motor a second ahead is right to a fifth: half a step between integrators."""
-    weaker = apply_effect(load_machine("eha", TOOL), "motor_constant", "piston", {"emf": LESS})
+    weaker = apply_effect(load_machine("eha", TOOL), "motor_constant", "piston", {"torque_constant": LESS})
     (tmp_path / "weaker").mkdir()
     save_machine(weaker, tmp_path / "weaker" / "machine.yaml")
     words = ["compare", "eha", str(tmp_path / "weaker"), "--data", str(site), "--horizons", "1"]

@@ -75,7 +75,7 @@ class Stand:
         self.link.mailbox.stamp[1], self.link.mailbox.share[0] = self.now, share
 
     def pose(self, x=0.0, **changes):
-        line = self.link.line
+        line = self.link.buffers
         whole, real = line.pose, line.pose_real
         whole[:8] = POSE_MAGIC, 5, self.sequence, self.now, 0, -1, 0, 0
         real[POSITION:QUATERNION], real[QUATERNION:TRAVEL] = (x, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
@@ -88,7 +88,7 @@ class Stand:
 
     @property
     def force(self):
-        return self.link.line.reply_real[WRENCH:]
+        return self.link.buffers.reply_real[WRENCH:]
 
 
 @pytest.fixture
@@ -100,7 +100,7 @@ def test_the_spring_of_the_joystick_acts_on_the_scale_of_the_device(stand, numbe
     for _ in range(2000):
         stand.machine()
         assert stand.pose(x=0.01)
-    axis, line = numbers[0].axis[0], stand.link.line
+    axis, line = numbers[0].axis[0], stand.link.buffers
     expected = -axis[NOMINAL_STIFFNESS] * 0.01 * axis[HANDLE_RANGE] / 0.05
     assert stand.force == pytest.approx([expected, 0, 0, 0, 0, 0], abs=1e-9)
     assert line.reply[FORCES_ON] == 1 and line.reply[ANSWERED_POSE] == stand.sequence - 1
@@ -117,11 +117,11 @@ def test_forces_come_in_slowly_and_go_at_once_when_the_machine_is_silent(stand):
     assert np.all(np.diff(sizes[1:]) >= -1e-12) and sizes[1] == pytest.approx(2 * STEP / FORCE_RAMP_TIME * sizes[-1])
     for _ in range(round(FORCE_TIMEOUT / STEP) + 1):
         stand.pose(x=0.01)
-    assert stand.link.line.reply[FORCES_ON] == 0 and not stand.force.any()
+    assert stand.link.buffers.reply[FORCES_ON] == 0 and not stand.force.any()
 
 
 def test_old_repeated_lost_and_foreign_packets(stand):
-    count = stand.link.line.count
+    count = stand.link.buffers.count
     assert stand.pose() and stand.pose()
     assert not stand.pose(SEQUENCE=1) and not stand.pose(SEQUENCE=0)
     assert stand.pose(SEQUENCE=9)
@@ -134,10 +134,10 @@ def test_a_server_that_starts_anew_begins_again(stand):
     for _ in range(500):
         stand.machine()
         stand.pose(x=0.01)
-    assert stand.link.line.ramp[FORCE_GAIN] == 1.0
+    assert stand.link.buffers.ramp[FORCE_GAIN] == 1.0
     stand.machine()
     assert stand.pose(x=0.01, SESSION=6, SEQUENCE=0)
-    assert stand.link.line.count[SERVER_STARTS] == 2 and stand.link.line.ramp[FORCE_GAIN] < 0.01
+    assert stand.link.buffers.count[SERVER_STARTS] == 2 and stand.link.buffers.ramp[FORCE_GAIN] < 0.01
 
 
 def test_a_device_that_is_unable_gets_no_force_and_gives_no_pose(stand):
@@ -155,16 +155,16 @@ def test_a_wrench_stays_within_what_the_device_may_give(stand):
         stand.pose(x=0.05)
     assert np.linalg.norm(stand.force[:3]) == pytest.approx(12.0)
     assert np.linalg.norm(stand.force[3:]) == pytest.approx(0.4)
-    assert stand.link.line.pose_real[MAX_WRENCH] == 12.0
+    assert stand.link.buffers.pose_real[MAX_WRENCH] == 12.0
 
 
 def test_how_long_it_takes_until_a_wrench_is_known_to_be_taken(stand):
-    line = stand.link.line
+    line = stand.link.buffers
     stand.pose()
     line.sent[0] = stand.now
     stand.now += 3 * MS
     stand.pose(TAKEN=0)
-    found = stand.link.figures()["loop"]
+    found = stand.link.statistics()["loop"]
     assert found["count"] == 1 and found["percentiles_us"]["max"] == pytest.approx(3000.0)
 
 

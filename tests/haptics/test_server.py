@@ -78,7 +78,7 @@ def test_a_wrench_is_given_from_the_next_period_on(stand):
     assert stand.send((1.0, 2.0, 3.0, 0.1, 0.0, 0.0))
     stand.period()
     assert stand.device.wrench.tolist() == [1.0, 2.0, 3.0, 0.1, 0.0, 0.0]
-    assert stand.exchange.pose.whole[LAST_ACCEPTED] == 1
+    assert stand.exchange.pose.integers[LAST_ACCEPTED] == 1
 
 
 def test_nobody_who_has_not_asked_moves_the_device():
@@ -92,7 +92,7 @@ def test_a_second_machine_is_refused_until_the_first_is_silent(stand):
     stand.send()
     assert not stand.send(sender=ELSEWHERE, SESSION=0)
     assert not stand.send((5.0,) * 6, sender=ELSEWHERE)
-    assert stand.exchange.refused["other_client"] == 2
+    assert stand.exchange.rejected_packets["other_client"] == 2
     for _ in range(round(CLIENT_TIMEOUT / PERIOD) + 2):
         stand.period()
     assert stand.exchange.client is None
@@ -108,13 +108,13 @@ def test_packets_out_of_order_again_or_from_another_session_are_refused(stand):
     stand.sequence = 3
     assert not stand.send((9.0,) * 6)
     assert not stand.send((9.0,) * 6, SESSION=SESSION_NUMBER + 1)
-    refused = stand.exchange.refused
+    refused = stand.exchange.rejected_packets
     assert (refused["late"], refused["session"]) == (2, 1)
     assert np.linalg.norm(stand.exchange.wrench[:3]) == pytest.approx(2.0 * 3**0.5)
 
 
 def test_an_answer_to_a_pose_of_long_ago_is_stale(stand):
-    old = int(stand.exchange.pose.whole[SEQUENCE])
+    old = int(stand.exchange.pose.integers[SEQUENCE])
     for _ in range(round(MAX_POSE_AGE / PERIOD)):
         stand.period()
         stand.send()
@@ -122,34 +122,34 @@ def test_an_answer_to_a_pose_of_long_ago_is_stale(stand):
     stand.period()
     assert not stand.send(ANSWERED=old)
     assert not stand.send(ANSWERED=old + 10_000)  # a pose that was never sent
-    assert stand.exchange.refused["stale"] == 2
+    assert stand.exchange.rejected_packets["stale"] == 2
 
 
 @pytest.mark.parametrize("force", [np.nan, np.inf, -np.inf])
 def test_what_is_no_number_is_refused(stand, force):
     assert not stand.send((force, 0.0, 0.0, 0.0, 0.0, 0.0))
-    assert stand.exchange.refused["malformed"] == 1 and not stand.exchange.wrench.any()
+    assert stand.exchange.rejected_packets["malformed"] == 1 and not stand.exchange.wrench.any()
 
 
 def test_packets_of_another_size_or_kind_are_refused(stand):
     for data in (b"", b"x" * 8, b"x" * 8 * WRENCH_WORDS, b"x" * 8 * (WRENCH_WORDS + 1)):
-        assert not stand.exchange.take(data, HERE, stand.now)
-    assert stand.exchange.refused["malformed"] == 4
+        assert not stand.exchange.accept_packet(data, HERE, stand.now)
+    assert stand.exchange.rejected_packets["malformed"] == 4
 
 
 def test_random_packets_never_move_the_device(stand):
     rng = np.random.default_rng(1)
     for _ in range(500):
         data = rng.bytes(8 * WRENCH_WORDS)
-        assert not stand.exchange.take(data, HERE, stand.now)
+        assert not stand.exchange.accept_packet(data, HERE, stand.now)
     assert not stand.exchange.wrench.any()
 
 
 def test_limits_keep_the_direction(stand):
     most = stand.device.limits
     stand.send((300.0, 400.0, 0.0, 0.0, 0.0, -9.0))
-    assert stand.exchange.wrench[:3] == pytest.approx([0.6 * most.force, 0.8 * most.force, 0.0])
-    assert stand.exchange.wrench[5] == pytest.approx(-most.torque)
+    assert stand.exchange.wrench[:3] == pytest.approx([0.6 * most.max_force, 0.8 * most.max_force, 0.0])
+    assert stand.exchange.wrench[5] == pytest.approx(-most.max_torque)
     assert not limit_wrench(np.full(6, np.nan), most).any()
 
 
@@ -159,7 +159,7 @@ def test_the_watchdog_takes_the_force_off_and_a_wrench_brings_it_back(stand):
         stand.period()
         assert stand.device.wrench.any()
     stand.period()
-    assert not stand.device.wrench.any() and stand.exchange.limp == 1
+    assert not stand.device.wrench.any() and stand.exchange.watchdog_trips == 1
     stand.send((1.0,) * 6)
     stand.period()
     assert stand.device.wrench.any()
@@ -181,7 +181,7 @@ def test_periods_without_an_answer_are_counted_and_told(stand):
     stand.exchange.missed = 4
     pose = stand.period()
     assert stand.exchange.unanswered == before + 2
-    assert (pose.whole[UNANSWERED], pose.whole[MISSED]) == (before + 2, 4)
+    assert (pose.integers[UNANSWERED], pose.integers[MISSED]) == (before + 2, 4)
 
 
 class Unplugged(SimulatedDevice):

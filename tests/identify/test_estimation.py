@@ -42,18 +42,21 @@ def found(repeated):
 @pytest.mark.parametrize("method", METHODS)
 def test_every_estimator_finds_the_recorded_machine_within_its_ellipsoid(found, method):
     one = found[method]
-    distance, limit = one.distance(one.nominal)
-    assert limit == pytest.approx(chi2.ppf(0.95, len(one.told.base)))
+    distance, limit = one.squared_distance(one.nominal)
+    assert limit == pytest.approx(chi2.ppf(0.95, len(one.data_identifiability.base)))
     # one in a thousand right ones lies further away
-    assert len(one.told.base) > 20 and distance < chi2.ppf(0.999, len(one.told.base))
+    assert len(one.data_identifiability.base) > 20 and distance < chi2.ppf(0.999, len(one.data_identifiability.base))
 
 
 def test_weights_make_the_intervals_narrower(found):
     """In the mean over the parameters that both tell."""
     plain, others = found["least_squares"], [found[m] for m in METHODS if m != "least_squares"]
     for other in others:
-        both = set(plain.told.base) & set(other.told.base)
-        stds = [[np.log(f.estimate.std[list(f.told.base).index(b)]) for b in sorted(both)] for f in (plain, other)]
+        both = set(plain.data_identifiability.base) & set(other.data_identifiability.base)
+        stds = [
+            [np.log(f.estimate.std[list(f.data_identifiability.base).index(b)]) for b in sorted(both)]
+            for f in (plain, other)
+        ]
         assert np.mean(stds[1]) < np.mean(stds[0])
 
 
@@ -62,7 +65,7 @@ def test_the_bias_taken_off_is_what_noise_of_positions_does_to_friction(repeated
     corrected = found["weighted"]
     kept = identify_dynamics(*repeated, Processing(period=PERIOD), Estimator(noise_pairs=0))
     assert not kept.bias.any()
-    where = [corrected.names[b] for b in corrected.told.base].index("stribeck.boom_rod")
+    where = [corrected.names[b] for b in corrected.data_identifiability.base].index("stribeck.boom_rod")
     # noise hides on which side of zero a slow rate is; more than the interval's half
     assert corrected.bias[where] > 0.5 * corrected.estimate.std[where]
     assert np.allclose(kept.estimate.value - corrected.bias, corrected.estimate.value)

@@ -83,7 +83,7 @@ def test_truncation_and_ridge_keep_the_prior_where_the_data_are_silent():
     y[:, :, 3] = 2.0 * y[:, :, 2]  # only 2 p_3 + p_2 shows
     forces = y @ TRUTH
     prior = np.array([90.0, 190.0, 21.0, -2.5])
-    for options in ({"cut": 1e-6}, {"ridge": 1e-10}):
+    for options in ({"truncation": 1e-6}, {"ridge": 1e-10}):
         found = estimate(y, forces, prior=prior, **options).value
         assert found[:2] == pytest.approx(TRUTH[:2], rel=1e-5)
         assert found[2] + 2 * found[3] == pytest.approx(TRUTH[2] + 2 * TRUTH[3], rel=1e-5)

@@ -42,7 +42,7 @@ def found():
 @pytest.mark.nightly
 def test_hidden_numbers_are_found_with_honest_intervals(found):
     result, given = found
-    numbers = {n.name: n for n in result.numbers}
+    numbers = {n.qualified_name: n for n in result.parameters}
     assert set(numbers) >= {"valve_gain.slide", "spool_lag.slide", "bulk_modulus.all"}
     expected = {
         "valve_gain.slide": TRUTH["axes.slide.valve.rated_flow"],
@@ -52,12 +52,12 @@ def test_hidden_numbers_are_found_with_honest_intervals(found):
     }  # fmt: skip
     for name, truth in expected.items():
         n = numbers[name]
-        if not n.told:
+        if not n.is_determined:
             continue
         # four standard deviations and a share for steps of the filter's integrator
         assert abs(n.value - truth) < 4.0 * n.std + 0.01 * abs(truth), name
-    assert sum(numbers[name].told for name in expected) >= 3
-    assert result.status == "ok" and result.after < 1.1 < result.before
+    assert sum(numbers[name].is_determined for name in expected) >= 3
+    assert result.status == "ok" and result.identified_rms_error < 1.1 < result.nominal_rms_error
 
 
 def test_the_document_lists_them_with_the_others(found):

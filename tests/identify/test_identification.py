@@ -47,7 +47,7 @@ def found_short(short):
 
 @pytest.mark.nightly
 def test_intervals_hold_the_parameters_of_the_machine_that_was_recorded(found):
-    truth = found.told.combination @ found.nominal
+    truth = found.data_identifiability.combination @ found.nominal
     away = np.abs(found.estimate.value - truth) / found.estimate.std
     # of 29 numbers 1.5 lie outside by chance, more than 4 in 2 % of all cases
     assert np.sum(away > 1.96) <= 4
@@ -70,7 +70,9 @@ def test_held_out_forces_differ_by_noise(found):
 def test_a_wrong_machine_is_found_out_and_mended(short, found_short):
     fit, heldout, setup = short
     wrong = dataclasses.replace(setup.chain, inertia=setup.chain.inertia * 0.8)
-    rubbing = tuple(dataclasses.replace(r, nominal={k: 0.5 * v for k, v in r.nominal.items()}) for r in setup.rubbing)
+    rubbing = tuple(
+        dataclasses.replace(r, nominal={k: 0.5 * v for k, v in r.nominal.items()}) for r in setup.friction_terms
+    )
     again = identify_dynamics(fit, heldout, dataclasses.replace(setup, chain=wrong, friction_terms=rubbing))
     for drive, judged in again.heldout.items():
         assert judged.rms < 0.4 * judged.nominal_rms, drive
@@ -239,7 +241,9 @@ def test_a_short_run_is_left_out_with_a_note(short):
     assert any("blink is too short" in note for note in found.notes)
 
 
-@pytest.mark.parametrize("options", [{"ridge": -1.0}, {"cut": 1.0}, {"cut": -0.1}, {"method": "magic"}, {"pairs": -1}])
+@pytest.mark.parametrize(
+    "options", [{"ridge": -1.0}, {"truncation": 1.0}, {"truncation": -0.1}, {"method": "magic"}, {"noise_pairs": -1}]
+)
 def test_options_without_sense_are_refused(options):
     with pytest.raises(InputError, match="estimator"):
         Estimator(**options)

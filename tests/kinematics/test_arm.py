@@ -60,7 +60,7 @@ GEOMETRY = st.builds(
     boom_length=st.floats(2.0, 7.0),
     stick_length=st.floats(0.8, 4.0),
     tool_offset=st.tuples(st.floats(-1.5, 1.5), st.floats(-1.5, 1.5)),
-    tool_joint=st.booleans(),
+    has_tool_joint=st.booleans(),
 )
 
 

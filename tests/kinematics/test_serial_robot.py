@@ -10,6 +10,7 @@ from hydrotele.kinematics.serial_robot import (
     correct_urdf,
     correction_derivatives,
     correction_names,
+    expand_joints,
     frame_from_rpy,
     load_robot,
     robot_chain,
@@ -132,10 +133,99 @@ def test_angles_of_a_rotation(rpy):
 
 @pytest.mark.parametrize(
     ("text", "said"),
-    [("<robot", "not valid XML"), ("<sdf/>", "is not a robot file"),
+    [("<robot", "is not XML"), ("<sdf/>", "is not a robot file"),
      ("<robot/>", "no moving joint"), (URDF.replace("0 0 0.2", "0 0 x"), "three numbers")],
 )  # fmt: skip
 def test_bad_files_are_refused(tmp_path, text, said):
     (tmp_path / "bad.urdf").write_text(text)
     with pytest.raises(InputError, match=said):
         load_robot(tmp_path / "bad.urdf")
+
+
+PALLETISER = """<robot name="pal">
+  <joint name="swing" type="revolute"><parent link="l0"/><child link="l1"/><axis xyz="0 0 1"/></joint>
+  <joint name="shoulder" type="revolute"><parent link="l1"/><child link="l2"/>
+    <origin xyz="0.1 0 0.2"/><axis xyz="0 1 0"/></joint>
+  <joint name="elbow" type="revolute"><parent link="l2"/><child link="l3"/>
+    <origin xyz="0 0 0.6"/><axis xyz="0 1 0"/></joint>
+  <joint name="level" type="revolute"><parent link="l3"/><child link="l4"/>
+    <origin xyz="0.6 0 0"/><axis xyz="0 1 0"/><mimic joint="elbow" multiplier="-2" offset="0.1"/></joint>
+  <joint name="wrist" type="revolute"><parent link="l4"/><child link="l5"/>
+    <origin xyz="0.1 0 0"/><axis xyz="0 0 1"/></joint>
+  <joint name="t" type="fixed"><parent link="l5"/><child link="tool0"/><origin xyz="0.12 0 -0.1"/></joint>
+</robot>
+"""
+COUPLED = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="elbow" axis="0 1 0" ref="0.3"/>
+  <geom size="0.1"/><body pos="0.6 0 0"><joint name="level" axis="0 1 0"/><geom size="0.1"/>
+  <body name="wheel"><joint name="roll"/><geom size="0.1"/></body><site name="tool0" pos="0.1 0 0"/></body></body>
+</worldbody><equality>{}</equality></mujoco>
+"""
+
+
+def test_a_joint_that_mimics_another_needs_no_reading(tmp_path):
+    (tmp_path / "pal.urdf").write_text(PALLETISER)
+    robot = load_robot(tmp_path / "pal.urdf", 4)
+    assert robot.independent_joint_names == ("swing", "shoulder", "elbow", "wrist")
+    four = np.random.default_rng(0).uniform(-1.0, 1.0, (6, 4))
+    five = np.insert(four, 3, -2.0 * four[:, 2] + 0.1, axis=1)
+    np.testing.assert_allclose(expand_joints(robot, four), five, atol=1e-15)
+    assert expand_joints(load_robot(tmp_path / "pal.urdf", 5), five) is five
+    target = robot_poses(robot, five).position + 0.01
+    reached = solve_ball_positions(robot, target, five)
+    assert reached.remaining_distance.max() < 1e-9
+    np.testing.assert_allclose(reached.joints[:, 3], -2.0 * reached.joints[:, 2] + 0.1, atol=1e-12)
+    (tmp_path / "new.yaml").write_text(robot_to_yaml(robot, "test"))
+    again = load_robot(tmp_path / "new.yaml", 4)
+    np.testing.assert_allclose(robot_poses(again, five).position, robot_poses(robot, five).position, atol=1e-12)
+
+
+def test_an_equality_of_an_mjcf_couples_joints_or_is_refused(tmp_path):
+    path = tmp_path / "coupled.xml"
+    path.write_text(COUPLED.format('<joint joint1="level" joint2="elbow" polycoef="0.1 -2 0 0 0"/>'))
+    robot = load_robot(path, 1)
+    # MuJoCo's constraint is level - 0 = 0.1 - 2 (elbow - 0.3).
+    np.testing.assert_allclose(expand_joints(robot, np.array([[0.5]])), [[0.5, 0.1 - 2.0 * 0.2]])
+    path.write_text(COUPLED.format('<joint name="e" joint1="level" joint2="elbow" polycoef="0 1 1 0 0"/>'))
+    with pytest.raises(InputError, match="the equality constraint e determines the joints level; only a linear"):
+        load_robot(path, 1)
+    path.write_text(COUPLED.format('<connect name="e" body1="wheel" body2="world" anchor="0 0 0"/>'))
+    with pytest.raises(InputError, match="constraint e determines the joints elbow, level; only a linear"):
+        load_robot(path, 2)
+
+
+REFUSED_ROBOTS = {
+    "a column less than the named tool has joints": (
+        PALLETISER.replace('<mimic joint="elbow" multiplier="-2" offset="0.1"/>', ""), 4,
+        "has 5 moving joints up to the ball (swing, shoulder, elbow, level, wrist), but the data have 4 columns",
+    ),
+    "too few columns beside a mimic": (
+        PALLETISER, 3,
+        "has 5 moving joints up to the ball (swing, shoulder, elbow, level, wrist), but the data have 3 columns;"
+        " 4 columns suffice, because the others follow by mimic: swing, shoulder, elbow, wrist",
+    ),
+    "a chain is not cut": (URDF.replace("ball", "plate").replace("hand", "cross"), 1,
+                           "has 3 moving joints up to the ball (turn, push, grip), but the data have 1 columns"),
+    "joint name": (PALLETISER.replace('"shoulder"', '"swing"'), 5,
+                   "has two joints with the name 'swing'; give every joint its own name"),
+    "child": (PALLETISER.replace('<child link="l3"/>', '<child link="l2"/>'), 5,
+              "link 'l2' is the child of two joints, shoulder and elbow; a URDF is a tree"),
+    "mimic of a joint elsewhere": (
+        PALLETISER.replace('mimic joint="elbow"', 'mimic joint="t"'), 4,
+        "joint level mimics joint 't', which does not move the ball; name a moving joint between base and ball",
+    ),
+    "mimic of itself": (PALLETISER.replace('mimic joint="elbow"', 'mimic joint="level"'), 4,
+                        "joint level mimics itself"),
+    "multiplier": (PALLETISER.replace('"-2"', '"x"'), 4, "joint level: mimic multiplier='x' must be a number"),
+    "kind": (PALLETISER.replace('"wrist" type="revolute"', '"wrist" type="planar"'), 4,
+             "joint wrist: the type 'planar' is not supported; valid: fixed, revolute, continuous, prismatic"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", REFUSED_ROBOTS)
+def test_a_urdf_that_leaves_the_joints_open_is_refused_by_name(tmp_path, kind):
+    text, columns, message = REFUSED_ROBOTS[kind]
+    path = tmp_path / "robot.urdf"
+    path.write_text(text)
+    with pytest.raises(InputError) as refused:
+        load_robot(path, columns)
+    assert (refused.value.where, refused.value.message) == (str(path), message)

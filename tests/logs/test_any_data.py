@@ -282,16 +282,6 @@ def test_the_piece_that_judges_is_no_scrap():
     assert [r.name for r in data.fit] == ["a_part1", "a_part2", "a_part4"]
 
 
-def test_unsorted_time_is_refused(tmp_path):
-    log = stroke()
-    time = log.time.copy()
-    time[7] = time[3]
-    rows = np.column_stack([time, *log.columns.values()])
-    path = csv(tmp_path / "a.csv", ",".join(["time", *log.columns]), rows)
-    with pytest.raises(InputError, match="'time', row 7.*goes back.*sort the rows by time"):
-        load_dataset(path, RIG)
-
-
 # Commands in the unit of the log
 
 

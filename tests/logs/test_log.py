@@ -131,9 +131,7 @@ def test_volvo_loads_though_its_joystick_passes_one():
 
 @needs_real
 def test_panda_lacks_samples_and_says_so():
-    path = REAL / "panda" / "exciting_1.parquet"
-    assert "missing or have irregular times" in refusal(path)
-    log = load_log(path, maximum_dropped=0.05)
+    log = load_log(REAL / "panda" / "exciting_1.parquet")
     assert len(log.axes) == 7
     assert len(log.gaps) > 0
 
@@ -257,30 +255,15 @@ def test_a_kill_in_the_middle_leaves_no_file_of_that_name(tmp_path):
 
 
 REFUSED = {
-    "NaN": (changed("angle.boom", 5, np.nan), {}, ["'angle.boom', row 5", "nan", "remove"]),
     "infinity": (changed("command.boom", 0, np.inf), {}, ["'command.boom', row 0", "inf"]),
-    "null": (good(angle__boom=[0.1] * 3 + [None] * 17), {}, ["'angle.boom', row 3", "null"]),
     "text": (good(angle__boom=["a"] * 20), {}, ["'angle.boom'", "string", "float64"]),
     "truth value": (good(angle__boom=[True] * 20), {}, ["'angle.boom'", "bool"]),
-    "time goes back": (changed("time", 9, 0.01), {}, ["'time', row 9", "goes back", "sort"]),
-    "time repeats": (changed("time", 9, 0.16), {}, ["'time', row 9", "repeats"]),
-    "samples dropped": (
-        {k: np.delete(v, [4, 5]) for k, v in good().items()},
-        {},
-        ["'time', row 4", "missing or have irregular times", "0.06 s", "0.02 s", "Resample"],
-    ),
     "milliseconds": (good(time=20.0 * np.arange(20)), {}, ["'time'", "milliseconds"]),
     "unknown kind": (
         good(angel__boom=np.zeros(20)),
         {},
         ["'angel.boom'", "did you mean angle.boom", "pressure_supply"],
     ),
-    "unit of Parquet": (
-        good(),
-        {"angle.boom": "deg"},
-        ["'angle.boom'", "'deg'", "rad", "multiply by 0.01745329"],
-    ),
-    "pressure unit": (good(), {"pressure_head.boom": "bar"}, ["multiply by 100000", "Pa"]),
     "wrong dimension": (good(), {"angle.boom": "m"}, ["'angle.boom'", "'m'", "rad", "correct"]),
     "unknown unit": (good(), {"angle.boom": "furlong"}, ["'furlong'", "rad"]),
     "degrees": (changed("angle.boom", 11, 10100.0), {}, ["'angle.boom', row 11", "degrees"]),
@@ -324,7 +307,7 @@ def test_parquet_is_refused_with_place_and_remedy(case, tmp_path):
 
 
 def test_refusals_of_what_is_no_log_file(tmp_path):
-    assert "is not a file" in refusal(tmp_path / "absent.parquet")
+    assert "does not exist" in refusal(tmp_path / "absent.parquet")
     assert "is not a file" in refusal(tmp_path)
     for name, content in {
         "empty.parquet": b"",
@@ -353,11 +336,10 @@ def test_missing_required_columns_list_what_is_there(tmp_path):
     assert "angle.stick, pressure_supply; it has time, command.boom, angle.boom" in message
 
 
-def test_dropped_samples_can_be_allowed(tmp_path):
+def test_missing_rows_are_listed_as_gaps(tmp_path):
     time = np.delete(0.02 * np.arange(400), [100, 200, 201])
-    log = load_log(write(tmp_path / "run.parquet", {"time": time}), maximum_dropped=0.01)
-    assert log.gaps.tolist() == [100, 199]
-    assert "0.75 %" in refusal(tmp_path / "run.parquet", maximum_dropped=0.005)
+    log = load_log(write(tmp_path / "run.parquet", {"time": time}))
+    assert (log.gaps.tolist(), log.notes) == ([100, 199], ())
 
 
 def test_integers_float32_missing_units_and_pandas_keys_are_read(tmp_path):
@@ -425,14 +407,11 @@ def test_csv_without_units_is_si_bit_by_bit(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
+        ("\n80,4,104", "\n,4,104", ["'time', row 4 (line 9)", "is nan"]),
         ("\n80,4,104", "\n80,four,104", ["'angle.boom', row 4 (line 9)", "'four'", "not a number"]),
-        ("\n80,4,104", "\n80,,104", ["'angle.boom', row 4 (line 9)", "empty cell"]),
-        ("\n80,4,104", "\n80,nan,104", ["'angle.boom', row 4 (line 9)", "nan"]),
         ("\n80,4,104", "\n80,1_0,104", ["'angle.boom', row 4 (line 9)", "'1_0'"]),
         ("\n80,4,104", "\n80,4", ["row 4 (line 9)", "2 cells", "3"]),
         ("\n80,4,104", "\n80,4,1,04", ["row 4 (line 9)", "4 cells"]),
-        ("\n80,4,104", "\n", ["'time', row 4 (line 10)", "missing or have irregular times"]),
-        ("\n80,4,104", "\n60,4,104", ["'time', row 4 (line 9)", "repeats"]),
         ("[deg]", "[kPa]", ["'angle.boom'", "'kPa'", "rad"]),
         ("[deg]", "[deg/s]", ["'angle.boom'", "'deg/s'", "rad"]),
         ("[deg]", "[parsec]", ["'angle.boom'", "'parsec'"]),
@@ -451,12 +430,6 @@ def test_csv_is_refused_with_line(tmp_path, old, new, expected):
     assert [part for part in expected if part not in message] == [], message
 
 
-def test_decimal_commas_are_explained(tmp_path):
-    rows = "\n".join(f"0,0{k};1,5" for k in range(20))
-    (tmp_path / "run.csv").write_text("time;angle.boom\n" + rows)
-    assert "decimals with a point" in refusal(tmp_path / "run.csv")
-
-
 # Damage: whatever the bytes, a Log or an InputError
 
 
@@ -467,7 +440,7 @@ def load_or_refuse(path: Path, content: bytes) -> None:
     except InputError as error:
         assert str(path) in str(error)
     else:
-        assert all(np.isfinite(log[name]).all() for name in log.columns)
+        assert not any(np.isinf(log[name]).any() for name in log.columns)
         assert (np.diff(log.time) > 0).all()
 
 

@@ -306,8 +306,8 @@ MJCF_REFUSALS = {
         None,
         r"links.jib: joint.range_deg is also given in crane.xml",
     ),
-    "not XML": (None, ("<worldbody>", "<worldbody"), r"mjcf: .*crane.xml cannot be read"),
-    "not MJCF": (None, ("<worldbody>", "<worldboddy>"), r"mjcf: .*crane.xml cannot be read"),
+    "not XML": (None, ("<worldbody>", "<worldbody"), r"mjcf: .*crane.xml: is not XML"),
+    "not MJCF": (None, ("<worldbody>", "<worldboddy>"), r"mjcf: .*crane.xml: is not XML"),
     "joint without name": (
         None,
         ('name="jib" range', "range"),
@@ -572,3 +572,12 @@ def test_stroke_must_span_the_range_of_the_joint(write):
     check_strokes(load_machine(write(edited(("range_deg: [-20, 60]", "range_deg: [-10, 30]")))))
     with pytest.raises(InputError, match="at jib = 1.047 its piston would be at .* outside its str"):
         check_strokes(load_machine(write(edited(("range_deg: [-20, 60]", "range_deg: [-10, 60]")))))
+
+
+def test_a_chain_of_too_many_links_is_refused(write):
+    data = yaml.safe_load(CRANE)
+    first = next(iter(data["links"]))
+    body = {"mass": 1.0, "com": [0.0, 0.0, 0.0], "inertia": [0.1, 0.1, 0.1]}
+    data["links"] |= {f"q{k}": body | {"parent": f"q{k - 1}" if k else first} for k in range(1500)}
+    message = refusal(write(yaml.safe_dump(data)))
+    assert f"links: {len(data['links'])} links of a machine, at most 200; HYDROTELE_MAX_LINKS=" in message

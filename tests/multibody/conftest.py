@@ -41,7 +41,7 @@ def move_at_random():
     """Put a state near home and in motion, by seed."""
 
     def move(model, z, seed):
-        rng, n = np.random.default_rng(seed), len(model.mech.free)
+        rng, n = np.random.default_rng(seed), len(model.mech.independent)
         first = n + len(model.transmission)
         z[:n] += rng.uniform(-0.2, 0.2, n)
         z[first : first + n] = rng.uniform(-0.8, 0.8, n)

@@ -75,8 +75,8 @@ def legs(n=301, step=2e-3):
 
 def in_mujoco(model, chain, row):
     """`qpos` of MuJoCo for positions (v,) of a chain whose one free or ball joint is `platform`."""
-    qpos, here = np.zeros(model.nq), chain.places >= 0
-    qpos[chain.places[here]] = row[here]
+    qpos, here = np.zeros(model.nq), chain.qpos_indices >= 0
+    qpos[chain.qpos_indices[here]] = row[here]
     angles = {name: row[chain.index(f"platform_r{name}")] for name in "xyz"}
     joint = model.joint("platform")
     place, quaternion, one = joint.qposadr[0], np.array([1.0, 0, 0, 0]), np.empty(4)

@@ -36,7 +36,7 @@ def reduced_forces(model, space, z):
 def mujoco_forces(machine, model, z):
     """The same from MuJoCo's open tree, with the closures' basis of `simulate.closure`."""
     plant, names = build_plant(machine, ground=False), coordinate_names(machine)
-    free = [names[i] for i in model.mech.free]
+    free = [names[i] for i in model.mech.independent]
     n, own = len(free), plant.model
     dofs = independent_dofs(machine, own)
     order = [free.index(own.joint(own.dof_jntid[dof]).name) for dof in dofs]
@@ -79,7 +79,7 @@ def test_reduced_coordinates_and_the_chain_ask_for_the_same_forces(name, machine
     machine = machine_of(name)
     model, space, z = reduced_of(machine)
     names = coordinate_names(machine)
-    free = tuple(names[i] for i in model.mech.free)
+    free = tuple(names[i] for i in model.mech.independent)
     n, rng = len(free), np.random.default_rng(5)
     move_at_random(model, z, 5)
     rates, accelerations = z[n : 2 * n], rng.uniform(-1.0, 1.0, n)
@@ -128,8 +128,8 @@ def test_spanning_tree_is_that_of_pinocchio(name, machine_of, reduced_of, move_a
     model, space, z = reduced_of(machine)
     move_at_random(model, z, 7)
     shape = model.mech.shape.copy()
-    shape[1 + model.mech.links :, INERTIA : INERTIA + 3] = 0.0
-    shape[1 + model.mech.links :, MASS] = 0.0  # cylinders without mass
+    shape[1 + model.mech.link_count :, INERTIA : INERTIA + 3] = 0.0
+    shape[1 + model.mech.link_count :, MASS] = 0.0  # cylinders without mass
     place(model, space, z)
     compute_mass_and_bias(model.mech._replace(shape=shape), space.motion)
     tree = spanning_tree(machine)

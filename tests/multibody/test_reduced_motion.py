@@ -39,7 +39,7 @@ def passing(machine_of, reduced_of, move_at_random):
     def passing(name):
         model, space, z = reduced_of(machine_of(name))
         move_at_random(model, z, 3)
-        n, found = len(model.mech.free), []
+        n, found = len(model.mech.independent), []
         for time in (-STEP, 0.0, STEP):
             there = z.copy()
             there[:n] += time * z[n : 2 * n]
@@ -64,7 +64,7 @@ def test_velocities_are_slopes_of_places(name, passing):
     mech, ((before, *_), (frame, *_), (after, *_)) = passing(name)
     found = slope(before, after)[:, ORIGIN : ORIGIN + 3]
     np.testing.assert_allclose(found, frame[:, VELOCITY : VELOCITY + 3], atol=CLOSE)
-    for i in range(mech.bodies):
+    for i in range(mech.body_count):
         turn = frame[i, ROTATION : ROTATION + 9].reshape(3, 3)
         np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-13)  # rounding
         found = slope(before, after)[i, ROTATION : ROTATION + 9].reshape(3, 3)
@@ -123,7 +123,7 @@ def test_a_far_place_is_reached_on_the_same_branch(machine_of, reduced_of):
     """A linkage put far away at once stands as if it had been led there; a lost one recovers."""
     model, space, z = reduced_of(machine_of("cat215/bucket"))
     tool, home = int(model.mech.drive[-1, JOINT]), z.copy()
-    at = int(np.flatnonzero(model.mech.free == tool)[0])
+    at = int(np.flatnonzero(model.mech.independent == tool)[0])
     for angle in np.linspace(home[at], -0.2, 40):
         z[at] = angle
         place(model, space, z)

@@ -51,6 +51,13 @@ EFFECT = "set: {effects: [{name: payload, location: tool, parameters: {mass: 100
         ("sample: {count: 3, keys: {servo.lead: {}}}", ":2: sample.k", "exactly one of"),
         ("sample: {count: 3, keys: {servo.lead: {uniform: [1, 2]}}}", ":2: sample.k", "less than"),
         ("sample: {count: 0, keys: {servo.lead: {uniform: [0, 1]}}}", ":2: sample.count", "than"),
+        (
+            "sample: {count: 2, keys: {servo.lead: {uniform: [-1.7e+308, 1.7e+308]}}}",
+            ":2: sample.keys.servo.lead.uniform.0",
+            "greater than or equal to -1",
+        ),
+        ("sample: {count: 2, keys: {servo.lead: {normal: [0, 1e+300]}}}", ":2: sample.k", "less than"),
+        ("grid: {servo.lead: [1], servo.lead.x.y: [0]}", ":1", "servo.lead.x.y is part of servo.lead"),
         ("grid: {seed: [1, 2]}\nrepeat: 2", ":1", "seed cannot be varied"),
         ("set: {duration: -1}\nrepeat: 2", ":2: set", "duration: .*greater than 0"),
         ("repeat: 1000000", ":2: repeat", "less than or equal to 100000"),

@@ -38,6 +38,14 @@ def test_a_grid_is_the_full_product_with_every_sample_and_repeat():
     assert all(drawn == samples_of(sweep) for drawn in at_each.values())
 
 
+def test_many_values_and_many_keys_are_checked_in_linear_time():
+    """Comparing all pairs would take minutes."""
+    values = {"scenario": "zhu_up", "grid": {"servo.lead": list(range(30_000))}}
+    assert Sweep.model_validate(values).runs == 30_000
+    keys = {f"servo.k{i}": [0] for i in range(10_000)} | {"servo.lead": [0, 1]}
+    assert Sweep.model_validate({"scenario": "zhu_up", "grid": keys}).runs == 2
+
+
 def samples_of(sweep: Sweep) -> list[float]:
     return [sample["servo.load_time"] for sample in draw_samples(sweep)]
 

@@ -5,12 +5,14 @@ import struct
 
 import numpy as np
 import pytest
+from matplotlib.text import Text
 
 from hydrotele.core.errors import InputError
 from hydrotele.machine.machine_file import load_machine
-from hydrotele.show.overlay import plot_log, plot_overlay
+from hydrotele.show.overlay import _png_figure, plot_log, plot_overlay
 from hydrotele.show.picture import render_picture
 from hydrotele.show.recording import write_recording
+from hydrotele.show.report_html import png, report_figure, svg
 from hydrotele.show.viewer import take_screenshot, web_viewer
 
 
@@ -62,7 +64,7 @@ def test_an_unknown_camera_is_refused_with_the_valid_ones(tmp_path, machine):
 
 def test_a_screenshot_shows_the_recording_without_complaints(tmp_path, recording):
     path = tmp_path / "review.png"
-    assert _drawn(take_screenshot, recording, path, size=(800, 600), at=0.5) == ()
+    assert _drawn(take_screenshot, recording, path, size=(800, 600), displayed_time=0.5) == ()
     assert _size(path) == (800, 600)
     pixels = _pixels(path)
     assert pixels[:, :400].std() > 20 and pixels[:, 450:].std() > 10  # machine and plots
@@ -114,3 +116,20 @@ def test_logs_without_a_common_channel_are_refused(tmp_path, log):
 def test_a_log_is_drawn_at_a_glance(tmp_path, log):
     plot_log(log, tmp_path / "log.png", size=(800, 600))
     assert _size(tmp_path / "log.png") == (800, 600)
+
+
+def test_a_name_with_dollar_signs_is_no_formula(tmp_path):
+    """Matplotlib raises an error for a formula that is not complete; labels of powers of ten stay formulas."""
+    path = tmp_path / "log.png"
+    with _png_figure(path, (200, 100)) as figure:
+        figure.text(0.1, 0.5, r"$\frac{1}{$")
+    assert path.stat().st_size > 1000
+    with report_figure(2.0) as figure:
+        axes = figure.subplots()
+        axes.loglog([1.0, 1e3], [1.0, 1e3], label=r"$\frac{1}{$")
+        axes.legend()
+        axes.set_title(r"a$b$")
+        assert png(figure) and svg(figure)
+        labels = axes.get_xticklabels() + axes.get_yticklabels()
+        formulas = {t for t in figure.findobj(Text) if "$" in t.get_text() and t.get_parse_math()}
+        assert formulas and formulas <= set(labels)

@@ -126,8 +126,8 @@ def test_steps_converge_with_their_second_order():
     With the two steps of a run the error is 1.6e-4 of the motion. Plain Euler steps had 4 % of it
     at the same cost, as half a step less delay has.
     """
-    exact = heights(fine=8, runge_kutta=True)
-    errors = [np.abs(heights(fine=fine) - exact).max() for fine in (1, 2, 4)]
+    exact = heights(refinement=8, runge_kutta=True)
+    errors = [np.abs(heights(refinement=fine) - exact).max() for fine in (1, 2, 4)]
     assert errors[0] < 2e-4 * np.abs(exact).max(), errors
     ratios = np.array(errors[:-1]) / errors[1:]
     assert (np.abs(ratios - 4.0) < 0.1).all(), ratios
@@ -187,8 +187,8 @@ def test_steps_of_a_slanted_arm_converge_with_their_second_order():
             found.append(flotor.data.qpos[:2].copy())
         return np.array(found)
 
-    exact = places(fine=16)
-    errors = [np.abs(places(fine=fine) - exact).max() for fine in (1, 2, 4)]
+    exact = places(refinement=16)
+    errors = [np.abs(places(refinement=fine) - exact).max() for fine in (1, 2, 4)]
     assert np.abs(exact).max() < 4e-3 and errors[0] < 2e-3 * np.abs(exact).max(), errors
     assert (np.array(errors[:-1]) / errors[1:] > 3.5).all(), errors
 

@@ -33,7 +33,7 @@ def gone(scenario):
     """Session after its last tick, and the log's place in `qpos` (n, 7) by tick."""
     session, way = start_session(scenario), []
     place = session.plant.model.joint("log_0").qposadr[0]
-    while session.tick < scenario.ticks:
+    while session.tick < scenario.tick_count:
         session.advance()
         way.append(session.data.qpos[place : place + 7].copy())
     assert not session.data.warning.number.any()

@@ -103,7 +103,7 @@ def gone(scenario):
     """Session after its last tick, and the way of the stem's foot (n, 3) [m] by tick."""
     session, way = start_session(scenario), []
     places = [session.plant.model.joint(f"tree_0_{c}").qposadr[0] for c in "xyz"]
-    while session.tick < scenario.ticks:
+    while session.tick < scenario.tick_count:
         session.advance()
         way.append(session.data.qpos[places].copy())
     assert not session.data.warning.number.any()

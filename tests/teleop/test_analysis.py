@@ -47,7 +47,7 @@ REFINED = 2e-3  # margins are bisected to 1e-3
 
 def crossings(case, structure):
     """(frequency, loop gain) where the loop's phase without delay is -180 degrees."""
-    port, w = case.port(structure), np.geomspace(0.1, 1e3, 20_000)
+    port, w = case.make_port(structure), np.geomspace(0.1, 1e3, 20_000)
     values = loop_gain(port, 1j * w, case.hand, case.task)
     found = []
     for k in np.flatnonzero((np.diff(np.sign(values.imag)) != 0) & (values.real[1:] < 0.0)):

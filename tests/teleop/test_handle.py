@@ -88,7 +88,9 @@ def test_a_task_that_changes_is_followed_and_rest_does_no_harm():
     assert np.array_equal(found.value, before)
 
 
-@pytest.mark.parametrize("options", [{"forgetting": 0.0}, {"forgetting": 1.1}, {"reset": 1.0}, {"spread": [1.0, 0.0]}])
+@pytest.mark.parametrize(
+    "options", [{"forgetting": 0.0}, {"forgetting": 1.1}, {"reset_ratio": 1.0}, {"spread": [1.0, 0.0]}]
+)
 def test_recursion_refuses_nonsense(options):
     spread = options.pop("spread", [1.0, 1.0])
     with pytest.raises(InputError):

@@ -40,7 +40,7 @@ def test_tip_weighs_as_much_as_a_boom_that_turns(case):
     """916 kg: 1.5 t of arm beyond the boom's pin, their distances from it, and its tool."""
     assert case.tip.coordinate == "z"
     assert 500.0 < case.tip.mass < 1500.0  # kg; the arm with its tool weighs 3.3 t
-    assert case.tip.share.sum() == pytest.approx(1.0, abs=1e-12)  # rounding
+    assert case.tip.rate_fractions.sum() == pytest.approx(1.0, abs=1e-12)  # rounding
     boom = case.tip.compliance[1] / case.tip.compliance.sum()
     assert boom > 0.9  # at 6 m up and down is the boom's affair
 
@@ -99,7 +99,7 @@ def test_limit_falls_with_speed_stiffness_delay_and_lag():
 def test_hand_is_that_of_the_scenarios_operator(case):
     """Grip and co-contraction of the scenario are in the loop, as the station simulates them."""
     usual = load_joystick().hand
-    assert case.held == Impedance(usual.mass, usual.damping, usual.stiffness)
+    assert case.hand_impedance == Impedance(usual.mass, usual.damping, usual.stiffness)
     firm = made(pilot__perception="{grip: firm, cocontraction: 0.4}")[0]
     assert firm.hand_impedance.mass == pytest.approx(0.8)  # operator.yaml: firm
     assert firm.hand_impedance.stiffness == pytest.approx(600.0 * 1.8)  # factor 3: 1 + 2 x 0.4
@@ -115,7 +115,7 @@ def test_pole_lies_on_the_axis_at_the_limit(case):
     found = analyse_scenario_loop(case, "rate_force")
     assert found.unstable_poles == 2 and not found.is_stable
     assert found.pole.real > 0.0 and found.max_delay == 0.0
-    row = case.row.copy()
+    row = case.axis_parameters.copy()
     row[13] = found.max_ratio
     at = analyse_scenario_loop(dataclasses.replace(case, axis_parameters=row), "rate_force")
     assert at.gain_margin == pytest.approx(1.0, abs=3e-3)  # the margin is refined to 1e-3

@@ -206,6 +206,12 @@ def test_a_recorded_hand_replaces_the_model(tmp_path):
     path.write_text("time,elbow\n0,1\n1,2\n")
     with pytest.raises(InputError, match="handle.x"):
         read_recorded_hand(path, np.zeros(2))
+    path.write_text("time,x,y,z\n")
+    with pytest.raises(InputError, match="hand.csv: has no rows: give at least one position of the handle"):
+        read_recorded_hand(path, np.zeros(2))
+    path.write_text("time,x\n0,0.1\n1,nan\n")
+    with pytest.raises(InputError, match=r"hand.csv.*x.*: is not a finite number"):
+        read_recorded_hand(path, np.zeros(2))
     pilot = TeleopPilot.model_validate({"kind": "teleop", "operator": {"recorded": "hand.csv"}})
     assert pilot.operator.kind == "recorded"
     with pytest.raises(ValueError, match="recorded: FILE"):

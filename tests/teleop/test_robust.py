@@ -119,8 +119,8 @@ def test_the_theorem_needs_a_least_stiffness():
     (StiffnessAxis(0.85, 60.0, 4000.0, 3000.0, 9000.0), -49_026.0),  # Table 6.9
 ])  # fmt: skip
 def test_the_published_gains_are_stable_by_the_switching_bound(spring, margin):
-    held = spring.held(CASE.hand)
-    assert held.margin == pytest.approx(margin)
+    held = spring.with_hand(CASE.hand)
+    assert held.theorem_margin == pytest.approx(margin)
     assert held.stability_criterion == "switching bound" and held.half_swing_growth < 1.0
     edge = replace(held, damping=held.min_stable_damping)
     assert edge.half_swing_growth == pytest.approx(1.0, abs=0.01) and edge.damping < held.damping

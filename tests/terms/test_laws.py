@@ -308,6 +308,19 @@ def test_a_wrong_place_or_the_place_of_another_law_adds_nothing():
         ("formula", {"sign(velocity, 0)": 1.0}, "must be positive"),
         ("formula", {"__import__('os')": 1.0}, "is not a function; .*abs"),
         ("formula", {"velocity": "fast"}, "the coefficient 'fast' is not a number"),
+        ("formula", {"velocity" + "*velocity" * 20000: 1.0}, "it has 180008 characters, at most 1000"),
+        ("formula", {"velocity" + "*velocity" * 90: 1.0, "-" * 900 + "velocity": 1.0},
+         "(is not a variable|nested too deeply)"),
+        ("formula", {"(" * 400 + "velocity" + ")" * 400: 1.0}, "cannot be parsed|nested too deeply"),
+        ("formula", {"bump(position, {[]: 1}, 1)": 1.0},
+         r"'\{\[\]: 1\}' is not a number from -1e\+20 to 1e\+20"),
+        ("formula", {f"bump(position, {'9' * 400}, 1)": 1.0}, "'9+' is not a number from -1e"),
+        ("formula", {f"bump(position, {'9' * 5000}, 1)": 1.0}, "it has 5019 characters"),
+        ("formula", {"bump(position, 1e999, 1)": 1.0}, "'1e999' is not a number from -1e"),
+        ("formula", {"velocity ** True": 1.0}, "whole number from 1 to 6"),
+        ("formula", {"velocity ** [1]": 1.0}, "whole number from 1 to 6"),
+        ("formula", {"\0": 1.0}, "it cannot be parsed"),
+        ("formula", {"velocity": 10**400}, "finite number|valid"),
     ],
 )  # fmt: skip
 def test_refused_with_what_is_valid(law_, parameters, message):
@@ -348,6 +361,11 @@ def test_a_taken_name_or_an_unknown_kind_of_argument_is_refused():
     with pytest.raises(InputError, match="not float, Variable or Numbers"):
         law(odd)
     assert LAWS["constant"].function is laws.constant
+
+
+def test_a_power_may_be_written_as_a_decimal_number():
+    assert formula_arguments({"velocity ** 2.0": 1.0}) == formula_arguments({"velocity ** 2": 1.0})
+    assert formula_arguments({"bump(position, -0.5, 1)": 1.0})["numbers"][-3:] == [-0.5, 1.0, 1]
 
 
 def test_formulas_have_as_many_numbers_as_they_say():

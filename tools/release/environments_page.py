@@ -25,7 +25,8 @@ the tip (r, theta, z, attitude, head), both followed by the joint servo at 200 H
 acceleration.
 
 **Episode**: `truncated` when its duration is over; `terminated` where the task says so, or if the
-simulation became unstable (`info["fault"]`, never seen in ten million random steps).
+simulation became unstable (`info["fault"]`, never seen in ten million random steps). A step of a
+single environment after the end is an error: call `reset` first.
 `reset(seed=...)` gives the same bits again, alone, batched, on any number of threads; a batch's
 environment i has the seed of the first one plus i.
 

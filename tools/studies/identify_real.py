@@ -55,7 +55,7 @@ def panda_chain() -> Chain:
 
 def panda_records(path: Path) -> list[IdentificationRecord]:
     """The record on a uniform clock, whole, without its last quarter, and that quarter."""
-    log = load_log(path, maximum_dropped=1.0)
+    log = load_log(path)
     period = float(np.median(np.diff(log.time)))
     time = np.arange(log.time[0], log.time[-1], period)
     names = [f"joint{k}" for k in range(1, 8)]

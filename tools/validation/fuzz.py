@@ -5,8 +5,9 @@
 A case is a shipped or made file with a few changes that keep most of its structure (numbers that
 are huge, wrong types, keys that are deleted, doubled or nested, lines cut or exchanged, bytes
 flipped), read by the command that is for it in a forked child with limits of time and memory. What
-counts as a defect: a traceback, a signal, a time over 60 s, more than 4 GB, a message over 2 kB, or
-another exit status than 0, 2 and 3. Defects are printed with their seed; `--only SEED` makes one
+counts as a defect: a traceback, a signal, a time over 60 s, more than 4 GB, a message over 2 kB,
+another exit status than 0, 2 and 3, or a processor time that grows with the square of the size of a
+file (measured at n and 4 n). Defects are printed with their seed; `--only SEED` makes one
 again and keeps its files.
 """
 
@@ -29,7 +30,7 @@ from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
 
 import numpy as np
 import yaml
@@ -53,6 +54,10 @@ class Case(NamedTuple):
 
     kind: str
     arguments: tuple[str, ...]
+    larger: tuple[str, ...] = ()
+    """The same command for a file of four times the size; its processor time is compared."""
+    program: tuple[str, ...] = ()
+    """A program that is run in place of a command."""
 
 
 class Verdict(NamedTuple):
@@ -79,7 +84,8 @@ def make_case(seed: int, folder: Path) -> Case:
     kind = dice.choice(sorted(_MAKERS))
     if kind in _LONG and dice.random() < 0.7:
         kind = dice.choice(sorted(_MAKERS.keys() - _LONG))
-    return Case(kind, tuple(_MAKERS[kind](dice, folder)))
+    made = _MAKERS[kind](dice, folder)
+    return made if isinstance(made, Case) else Case(kind, tuple(made))
 
 
 def judge(seed: int) -> Verdict:
@@ -88,35 +94,50 @@ def judge(seed: int) -> Verdict:
     try:
         case = make_case(seed, folder)
         begin = time.monotonic()
-        status, words = _in_child(case, folder)
+        status, words, used = _in_child(case, folder)
         seconds = time.monotonic() - begin
-        return Verdict(seed, case.kind, _defect(status, words, seconds), words, seconds)
+        defect = _defect(status, words, seconds)
+        if case.larger and not defect:
+            status, words, more = _in_child(case._replace(arguments=case.larger), folder)
+            seconds = time.monotonic() - begin
+            defect = _defect(status, words, seconds) or _growth_defect(used, more)
+        return Verdict(seed, case.kind, defect, words, seconds)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _in_child(case: Case, folder: Path) -> tuple[int, str]:
-    """Exit status (negative: a signal) of a case, and what it said on stderr."""
+def _growth_defect(used: float, more: float) -> str:
+    """Whether the processor time at 4 n [s] exceeds that at n by more than a linear share.
+
+    A time in proportion to n grows by 4, its square by 16; 10 is between, and 2 s exclude the noise
+    of short times.
+    """
+    return f"square growth: {used:.1f} s, {more:.1f} s" if more > max(10.0 * used, 2.0) else ""
+
+
+def _in_child(case: Case, folder: Path) -> tuple[int, str, float]:
+    """Exit status (negative: a signal) of a case, what it said on stderr, and its processor time."""
     said = folder / "said.txt"
     child = os.fork()
     if child == 0:
         _read(case, folder, said)
     deadline = time.monotonic() + SECONDS
     while time.monotonic() < deadline:
-        done, status = os.waitpid(child, os.WNOHANG)
+        done, status, used = os.wait4(child, os.WNOHANG)
         if done:
-            return os.waitstatus_to_exitcode(status), said.read_text(errors="replace")
+            seconds = used.ru_utime + used.ru_stime
+            return os.waitstatus_to_exitcode(status), said.read_text(errors="replace"), seconds
         time.sleep(0.005)
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
-    return -signal.SIGKILL, said.read_text(errors="replace")
+    return -signal.SIGKILL, said.read_text(errors="replace"), SECONDS
 
 
 def _read(case: Case, folder: Path, said: Path) -> None:
     """What a child does: the command, and nothing that its parent would do."""
     status = 99
     try:
-        handle = os.open(said, os.O_WRONLY | os.O_CREAT)
+        handle = os.open(said, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
         os.dup2(handle, 2)
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         sys.stdout, sys.stderr = (open(n, "w", closefd=False) for n in (1, 2))
@@ -124,6 +145,8 @@ def _read(case: Case, folder: Path, said: Path) -> None:
         resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, used + MEMORY))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         os.chdir(folder)
+        if case.program:
+            os.execv(case.program[0], case.program)
         sys.argv = ["hydrotele", *case.arguments]
         from hydrotele.cli.main import main
 
@@ -454,14 +477,238 @@ def _run_folder(dice: random.Random, folder: Path) -> list[str]:
                         ["run", "zhu_up", "--set", "duration=0.3", "--out", "run"]])  # fmt: skip
 
 
-_MAKERS: dict[str, Callable[[random.Random, Path], list[str]]] = {
+def _nested_mjcf(dice: random.Random, folder: Path) -> list[str]:
+    """A machine whose MJCF includes or attaches documents: missing, cyclic, deep, or no files."""
+    shutil.copytree(models_folder() / "rig", folder / "m")
+    outer = folder / "m/rig.xml"
+    names = [f"part{k}.xml" for k in range(dice.choice([1, 2, 5, 200]))]
+    link = dice.choice(
+        [
+            '<include file="{}"/>',
+            '<asset><model name="s" file="{}"/></asset>',
+            '<asset><mesh name="z" file="{}"/></asset>',
+            '<asset><texture type="2d" name="t" file="{}"/></asset>',
+        ]
+    )
+    last = dice.choice([names[0], "rig.xml", "none.xml", "/dev/zero", "pipe", "."])
+    for name, below in zip(names, [*names[1:], last], strict=True):
+        (folder / "m" / name).write_text(f"<mujoco>{link.format(below)}</mujoco>")
+    os.mkfifo(folder / "m/pipe")
+    if dice.random() < 0.3:
+        (folder / "m" / dice.choice(names)).write_text(_torn(dice, outer.read_text()))
+    outer.write_text(outer.read_text().replace("<worldbody>", f"{link.format(names[0])}<worldbody>", 1))
+    if dice.random() < 0.5:
+        return ["validate", "./m"]
+    (folder / "log.csv").write_text("time,slide\n" + "".join(f"{k / 100},0\n" for k in range(50)))
+    return ["identify", "--mjcf", "m/rig.xml", "--data", "log.csv", "--json"]
+
+
+_LAW = """
+from hydrotele.core.compiled import callback, compiled
+
+@compiled
+def law(x):
+    return 2.0 * x
+
+@callback("float64(float64)")
+def twice(x):
+    return 2.0 * x
+
+assert (law(1.0), law(1), twice.ctypes(2.0)) == (2.0, 2.0, 4.0)
+"""
+
+
+def _cache(dice: random.Random, folder: Path) -> Case:
+    """Damaged files of compiled code of a small copy of the package."""
+    import hydrotele
+
+    shutil.copytree(Path(hydrotele.__file__).parent / "core", folder / "hydrotele/core")
+    (folder / "hydrotele/__init__.py").write_text("")
+    (folder / "hydrotele/law.py").write_text(_LAW)
+    code = f"import os, sys; os.environ['XDG_CACHE_HOME'] = {str(folder)!r}; sys.path.insert(0, {str(folder)!r})"
+    program = sys.executable, "-c", f"{code}; import hydrotele.law"
+    subprocess.run(program, check=True, cwd=folder, capture_output=True)
+    files = [path for path in (folder / "hydrotele/compiled").rglob("*") if path.is_file()]
+    for path in dice.sample(files, dice.randint(1, len(files))):
+        content = bytearray(path.read_bytes())
+        match dice.randrange(6):
+            case 0:
+                path.write_bytes(content[: dice.randint(0, len(content))])
+            case 1 if content:
+                content[dice.randrange(len(content))] ^= 1 << dice.randrange(8)
+                path.write_bytes(content)
+            case 2:
+                path.write_bytes(dice.choice(files).read_bytes())
+            case 3:
+                path.unlink()
+            case 4:
+                path.unlink()
+                path.mkdir()
+            case _:
+                path.chmod(0)
+    return Case("cache", (), program=program)
+
+
+def _plain_log(dice: random.Random) -> list[list[str]]:
+    """Header and rows of a log of the rig as text."""
+    rows = dice.choice([12, 50, 400])
+    columns = [0.01 * np.arange(rows), *(np.sin(0.05 * np.arange(rows) + k) for k in range(2))]
+    return [
+        ["time", "command.slide", "position.slide"],
+        *([f"{x:.4f}" for x in row] for row in zip(*columns, strict=True)),
+    ]
+
+
+def _time_column(dice: random.Random, folder: Path) -> list[str]:
+    """A log whose clock has another unit, origin, form or order, or holes."""
+    table = _plain_log(dice)
+    time_ = np.array([float(row[0]) for row in table[1:]])
+    how = dice.randrange(9)
+    a, b = sorted(dice.sample(range(len(time_)), 2))
+    origin, factor = dice.choice([0.0, -5.0, 1.7e9, 1e15]), dice.choice([1.0, 1e3, 1e6, 1e9, -1.0, 0.0])
+    texts = [repr(origin + factor * float(t)) for t in time_]
+    if how == 1:
+        texts = [f"2026-0{dice.choice([1, 9])}-01T12:{int(t) // 60 % 60:02d}:{t % 60:06.3f}Z" for t in time_]
+    elif how == 2:
+        texts[a] = dice.choice(["", "nan", "inf", "-", "2026-13-45", "1e999", "00:00:01", "0x10", "１"])
+    elif how == 3:
+        texts[a:b] = texts[a:b][::-1]
+    elif how == 4:
+        texts[b:] = [texts[a]] * len(texts[b:])
+    elif how == 5:
+        texts = texts[a:] + texts[:a]
+    elif how == 6:
+        table[0][0] = dice.choice(["", "Time [ms]", "t", "stamp", "time [furlong]", "time (s)", "TIME", "time.1"])
+    elif how == 7:
+        table[0][1] = table[0][0]
+    for row, text in zip(table[1:], texts, strict=True):
+        row[0] = text
+    (folder / "log.csv").write_text("\n".join(",".join(row) for row in table), encoding="utf-8")
+    return dice.choice([["validate", "log.csv"], ["replay", "log.csv", "--machine", "rig", "--json"]])
+
+
+def _dialect(dice: random.Random, folder: Path) -> list[str]:
+    """A log in another CSV dialect: separator, decimal comma, quotes, comments, line ends, encoding."""
+    table = _plain_log(dice)
+    separator, decimal = dice.choice(",;\t| :"), dice.choice("..,'")
+    quote, end = dice.choice(["", "", '"', "'"]), dice.choice(["\n", "\r\n", "\r", "\n\n"])
+    lines = [separator.join(f"{quote}{x.replace('.', decimal) if k else x}{quote}" for x in row)
+             + dice.choice(["", "", separator]) for k, row in enumerate(table)]  # fmt: skip
+    for _ in range(dice.choice([0, 0, 1, 3])):
+        odd = ["# comment", "", "sep=;", "units;s;1;m", quote, "\ufeff", "Zähler; é", '"' * 3, ",".join("1" * 900)]
+        lines.insert(dice.randrange(len(lines)), dice.choice(odd))
+    encoding = dice.choice(["utf-8", "utf-8-sig", "utf-16", "latin-1", "cp1252", "utf-32"])
+    (folder / "log.csv").write_bytes(end.join(lines).encode(encoding, "replace"))
+    return dice.choice([["validate", "log.csv"], ["replay", "log.csv", "--machine", "rig", "--json"]])
+
+
+_BASES = {
+    "identify": ["--data", "data", "--machine", "rig", "--json", "--out", "out"],
+    "replay": ["data/fit_2.parquet", "--machine", "rig", "--json"],
+    "compare": ["rig", "--data", "data", "--json"],
+    "validate": ["data/fit_2.parquet"],
+    "review": ["data/fit_2.parquet", "--out", "out.rrd"],
+    "export": ["rig", "--out", "scene.xml"],
+    "list": [],
+    "run": ["rig_steps", "--set", "duration=0.3", "--no-review", "--out", "out"],
+}
+_LASTING = {"--serve", "--screenshot", "--video", "--version", "--effects"}
+_OPTION_VALUES: dict[type, tuple[str, ...]] = {
+    float: ("nan", "inf", "-inf", "-1", "0", "1e-320", "1e308", "1e999", "0.5", "x", ""),
+    int: ("-1", "0", "1", "65535", "99999999999", "9" * 5000, "1.5", "x"),
+    str: ("", "x", "nan", "1,5", "a=b", "seed=-1", "=", "é", "[/red]", "../..", "servo.lead=nan", "0" * 5000),
+    Path: ("missing", ".", "/dev/null", "/dev/zero", "data", "loop", "/", "x" * 300, "out.png", ""),
+}
+
+
+def _options(dice: random.Random, folder: Path) -> list[str]:
+    """A command with one to three options, with values of their declared types and others."""
+    from hydrotele.cli.main import app
+
+    (folder / "data").mkdir()
+    for name, log in _rig_runs().items():
+        save_log(log, folder / f"data/{name}.parquet")
+    (folder / "loop").symlink_to("loop")
+    command = dice.choice(sorted(_BASES))
+    function = next(c.callback for c in app.registered_commands
+                    if c.callback and (c.name or c.callback.__name__) == command)  # fmt: skip
+    words = [command, *_BASES[command]]
+    declared = []
+    for name, hint in get_type_hints(function, include_extras=True).items():
+        kind, *facts = get_args(hint) if get_origin(hint) is Annotated else (None,)
+        option = next((f for f in facts if type(f).__name__ == "OptionInfo"), None)
+        names = option and [
+            d for d in option.param_decls or (f"--{name.strip('_').replace('_', '-')}",) if d.startswith("--")
+        ]
+        if names and names[0] not in _LASTING:
+            kinds = {kind, *get_args(kind), *(k for part in get_args(kind) for k in get_args(part))}
+            declared.append((names[0], next((t for t in _OPTION_VALUES if t in kinds), bool)))
+    for name, kind in dice.sample(declared, min(len(declared), dice.randint(1, 3))):
+        values = _OPTION_VALUES.get(kind, ()) if dice.random() < 0.9 else _OPTION_VALUES[str]
+        words += [name, dice.choice(values)] if values else [name]
+    return words
+
+
+def _growth(dice: random.Random, folder: Path) -> Case:
+    """A file of n and of 4 n entries."""
+    form = dice.choice(sorted(_GROWING))
+    names = [_GROWING[form](size, folder / f"{k}_{form}") for k, size in enumerate((1000, 4000))]
+    return Case("growth", ("validate", names[0]), ("validate", names[1]))
+
+
+def _growing_sweep(text: Callable[[int], str], size: int, path: Path) -> str:
+    path.with_suffix(".yaml").write_text(f"scenario: rig_steps\n{text(size)}")
+    return str(path.with_suffix(".yaml"))
+
+
+def _growing_machine(text: Callable[[int], str], size: int, path: Path) -> str:
+    shutil.copytree(models_folder() / "rig", path)
+    with (path / "machine.yaml").open("a") as file:
+        file.write(text(size))
+    return str(path)
+
+
+def _growing_log(size: int, path: Path) -> str:
+    rows = "".join(f"{0.01 * k:.2f},{k % 7}\n" for k in range(20 * size))
+    path.with_suffix(".csv").write_text("time,position.slide\n" + rows)
+    return str(path.with_suffix(".csv"))
+
+
+_GROWING: dict[str, Callable[[int, Path], str]] = {
+    "grid values": functools.partial(
+        _growing_sweep, lambda n: f"grid: {{servo.lead: {[k / 1e5 for k in range(n)]}}}\n"
+    ),
+    "grid keys": functools.partial(
+        _growing_sweep, lambda n: "repeat: 2\nset:\n" + "".join(f"  servo.k{k}: 1\n" for k in range(n))
+    ),
+    "choices": functools.partial(
+        _growing_sweep,
+        lambda n: f"sample: {{count: {n}, keys: {{servo.lead: {{choice: {[k / 1e5 for k in range(n)]}}}}}}}\n",
+    ),
+    "terms": functools.partial(
+        _growing_machine,
+        lambda n: (
+            "terms:\n"
+            + "".join(
+                f"- {{name: w{k}, axis: slide, balance: force, law: constant, parameters: {{value: 0.0}}}}\n"
+                for k in range(n // 4)
+            )
+        ),
+    ),
+    "log rows": _growing_log,
+}
+
+
+_MAKERS: dict[str, Callable[[random.Random, Path], list[str] | Case]] = {
     "machine": _machine, "mjcf": _mjcf, "scenario": _scenario, "sweep": _sweep,
     "joystick": _joystick, "teleop case": _teleop, "parquet": _parquet, "csv": _csv,
-    "run folder": _run_folder, "data folder": _data_folder,
+    "run folder": _run_folder, "data folder": _data_folder, "nested mjcf": _nested_mjcf,
+    "cache": _cache, "time column": _time_column, "dialect": _dialect, "options": _options,
+    "growth": _growth,
 }  # fmt: skip
 
 
-_LONG = {"teleop case", "data folder"}  # take seconds: fewer of them
+_LONG = {"teleop case", "data folder", "cache", "options", "growth"}  # take seconds: fewer of them
 
 
 def _ready() -> None:

@@ -1,0 +1,175 @@
+"""Store compiled code on disk, one file for each function and signature, and verify it before use.
+
+A file begins with a checksum of the rest. The rest contains the key of the code: signature,
+processor, versions and bytecode. Damaged files, for example after a power cut, and files of another
+key count as missing, so that their code never reaches LLVM. If nothing can be stored, the code is
+kept in memory only.
+"""
+
+import contextlib
+import fcntl
+import hashlib
+import logging
+import os
+import pickle
+import platform
+import secrets
+import time
+from pathlib import Path
+from typing import Any
+
+import llvmlite
+import numba
+import numpy
+from numba.core.caching import NullCache
+from numba.core.compiler import CompileResult
+from numba.core.serialize import dumps
+
+from hydrotele.core.compile_progress import SECONDS_BEFORE_BAR, ProgressLine
+from hydrotele.core.linking import external_callees, load_callees
+
+_VERSIONS = platform.python_version(), numba.__version__, llvmlite.__version__, numpy.__version__
+_MAX_LOCK_WAIT = 300.0  # s, longest wait for another process, which may have failed without exiting
+_LOG = logging.getLogger("hydrotele")
+_notes: set[str] = set()
+
+
+def _note_once(kind: str, text: str) -> None:
+    """Log a warning, once for each kind in a process."""
+    if kind not in _notes:
+        _notes.add(kind)
+        _LOG.warning(text)
+
+
+def file_stem(function) -> str:
+    """Return the beginning of the names of a function's cache files."""
+    return f"{function.__name__}-{function.__code__.co_firstlineno}"
+
+
+class CodeCache(NullCache):
+    """Cache of a function with a lock, so that only one process compiles a missing signature.
+
+    Args:
+        function: the Python function.
+        folder: folder of the cache of its module; None if no folder is usable.
+        form: distinguishes several forms of compiled code of the function.
+    """
+
+    def __init__(self, function, folder: Path | None, form: str) -> None:
+        self._function, self._folder, self._form = function, folder, form
+        self._lock_handle: int | None = None
+
+    @property
+    def cache_path(self) -> str | None:
+        """Folder of the cache."""
+        return self._folder and str(self._folder)
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return compiled code of a signature, or None if this process has to compile it."""
+        if self._folder is None:
+            return None
+        target_context.refresh()
+        found = self._load(sig, target_context)
+        if found is None and self._lock_handle is None:
+            self._lock_handle = _acquire_lock(self._folder, self._function)
+            found = self._load(sig, target_context)
+            if found is not None:
+                self._release_lock()
+        return found
+
+    def save_overload(self, sig: Any, cres: Any) -> None:
+        """Store compiled code, if possible, and release the lock."""
+        try:
+            if self._folder is None:
+                reason = "no cache folder is writable by you alone; set XDG_CACHE_HOME to such a folder"
+                _note_once("memory", f"compiled functions are kept in memory only: {reason}")
+            elif not cres.lifted and not cres.library.has_dynamic_globals:
+                key = self._key(sig, cres.library.codegen)
+                content = dumps((key, external_callees(cres), cres._reduce()))
+                _write_atomically(self._path(key), hashlib.sha256(content).digest() + content)
+        except OSError as error:
+            reason = f"{self._folder} cannot be written, {error.strerror or error}"
+            _note_once("memory", f"compiled functions are kept in memory only: {reason}")
+        finally:
+            self._release_lock()
+
+    def _load(self, sig: Any, target_context: Any) -> Any:
+        key = self._key(sig, target_context.codegen())
+        content = _read_verified(self._path(key))
+        if content is None:
+            return None
+        stored_key, callees, code = pickle.loads(content)
+        if stored_key != key or not load_callees(callees):
+            return None
+        return CompileResult._rebuild(target_context, *code)
+
+    def _key(self, sig: Any, codegen: Any) -> tuple:
+        """Return all that determines the compiled code, apart from the sources that it uses."""
+        closure = [cell.cell_contents for cell in self._function.__closure__ or ()]
+        parts = self._function.__code__.co_code, dumps(closure) if closure else b""
+        digests = [hashlib.sha256(part).hexdigest() for part in parts]
+        return self._form, _VERSIONS, sig, codegen.magic_tuple(), self._function.__qualname__, *digests
+
+    def _path(self, key: tuple) -> Path:
+        assert self._folder
+        digest = hashlib.sha256(repr(key).encode()).hexdigest()
+        return self._folder / f"{file_stem(self._function)}.{digest[:16]}.code"
+
+    def _release_lock(self) -> None:
+        if self._lock_handle is not None:
+            os.close(self._lock_handle)
+        self._lock_handle = None
+
+
+def _read_verified(path: Path) -> bytes | None:
+    """Return the content of a cache file after its checksum; None if it is missing or damaged."""
+    size = hashlib.sha256().digest_size
+    try:
+        stored = path.read_bytes()
+        if hashlib.sha256(stored[size:]).digest() == stored[:size]:
+            return stored[size:]
+        reason = "its checksum is wrong"
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        reason = error.strerror or str(error)
+    _note_once("damaged", f"damaged compiled code is compiled again: {path}: {reason}")
+    return None
+
+
+def _write_atomically(path: Path, content: bytes) -> None:
+    """Write a file under a temporary name and rename it."""
+    part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
+    try:
+        part.write_bytes(content)
+        os.replace(part, path)
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+
+
+def _acquire_lock(folder: Path, function) -> int | None:
+    """Lock a function against other processes and return the file handle.
+
+    Returns None after a timeout, and if the file system allows no lock.
+    """
+    try:
+        handle = os.open(folder / f"{file_stem(function)}.lock", os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
+    except OSError:
+        return None
+    began, line = time.monotonic(), ProgressLine()
+    while (waited := time.monotonic() - began) < _MAX_LOCK_WAIT:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            line.clear()
+            return handle
+        except BlockingIOError:
+            time.sleep(0.02)
+        except OSError:
+            break
+        if waited > SECONDS_BEFORE_BAR:
+            name = function.__name__.strip("_")
+            line.show(f"waiting for another process to compile {name} ({waited:.0f} s)")
+    line.clear()
+    os.close(handle)
+    return None

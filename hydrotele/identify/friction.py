@@ -1,0 +1,147 @@
+"""Friction near zero speed: deviations from the friction law, drives at rest, and the friction force by speed.
+
+`adapt_friction_terms` adds parameters for the error of a friction law near zero speed. Without them an error of the
+law there, such as that of a smooth or elastic contact, biases the friction at all speeds. `compute_friction_forces`
+evaluates the identified friction at round speeds, with its standard deviation.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from hydrotele.identify.estimation import Estimate
+from hydrotele.identify.motion import Processing, compute_joint_motion, estimate_resolution
+from hydrotele.identify.record import IdentificationRecord
+from hydrotele.identify.setup import RegressorSetup
+from hydrotele.multibody.inverse_dynamics import DEVIATION_TERMS
+
+_DEVIATION_SPEEDS = (1 / 32, 1 / 16, 1 / 8, 1 / 4)  # of the RMS speed: widths of the deviations near zero speed
+_REST_SPEED = 0.002  # of the RMS speed: smaller than any speed but for an instant at a reversal
+_MAX_ROWS = 4000  # rows of a run from which its speeds are computed
+_ROUND_SPEEDS = np.array([float(f"{digit}e{power}") for power in range(-6, 4) for digit in (1, 3)])  # rad/s or m/s
+
+
+class FrictionForce(NamedTuple):
+    """Friction of a drive at a constant speed.
+
+    Attributes:
+        drive: name of the drive.
+        speed: speed [rad/s] or [m/s], positive.
+        force: friction force [N] or [N m] without its asymmetry.
+        std: its standard deviation.
+        ci95: its 95 % interval.
+        unit: unit of the force.
+    """
+
+    drive: str
+    speed: float
+    force: float
+    std: float
+    ci95: tuple[float, float]
+    unit: str
+
+
+def compute_speeds(fit: Sequence[IdentificationRecord], setup: RegressorSetup) -> dict[str, tuple[float, float]]:
+    """Return the RMS and the maximum speed of each moving drive [rad/s] or [m/s].
+
+    Args:
+        fit: the fitted runs.
+        setup: definition of the regressor.
+
+    Returns:
+        Drive -> RMS and maximum speed; drives at rest are omitted.
+    """
+    square, highest, count = np.zeros(len(setup.chain.joints)), np.zeros(len(setup.chain.joints)), 0
+    is_moving = np.zeros(len(setup.given_joints), bool)
+    for record in fit:
+        resolved = estimate_resolution(record.position, record.period, record.position_noise)
+        motion = compute_joint_motion(record.position, record.period, resolved, Processing("optimal"))
+        thin = max(1, len(record.force) // _MAX_ROWS)
+        rate = setup.project(motion.value[::thin], motion.rate[::thin], motion.acceleration[::thin]).rate
+        square, count = square + np.sum(rate**2, axis=0), count + len(rate)
+        highest = np.maximum(highest, np.abs(rate).max(axis=0))
+        is_moving |= resolved.is_moving
+    out = {}
+    for drive in setup.chain.drives if is_moving.any() else ():
+        if drive in setup.given_joints and not is_moving[setup.given_joints.index(drive)]:
+            continue
+        j = setup.chain.index(drive)
+        if square[j] > 0.0:
+            out[drive] = (float(np.sqrt(square[j] / count)), float(highest[j]))
+    return out
+
+
+def set_rest_speeds(setup: RegressorSetup, speeds: dict[str, tuple[float, float]]) -> RegressorSetup:
+    """Return a setup in which drives much slower than in the fitted runs are at rest, without a known dry friction.
+
+    Args:
+        setup: definition of the regressor.
+        speeds: as returned by `compute_speeds`.
+
+    Returns:
+        The setup.
+    """
+    terms = tuple(
+        replace(term, rest_speed=_REST_SPEED * speeds[term.location][0]) if term.location in speeds else term
+        for term in setup.friction_terms
+    )
+    return replace(setup, friction_terms=terms)
+
+
+def add_deviations(setup: RegressorSetup, speeds: dict[str, tuple[float, float]]) -> RegressorSetup:
+    """Return a setup with deviations of the drives' friction near zero speed.
+
+    Args:
+        setup: definition of the regressor.
+        speeds: as returned by `compute_speeds`.
+
+    Returns:
+        The setup.
+    """
+    terms = []
+    for term in setup.friction_terms:
+        if term.location in speeds and "coulomb" in term.nominal:
+            widths = tuple(part * speeds[term.location][0] for part in _DEVIATION_SPEEDS)
+            more = {f"{kind}_{k + 1}": 0.0 for kind in DEVIATION_TERMS for k in range(len(widths))}
+            term = replace(term, nominal={**term.nominal, **more}, low_speeds=widths)
+        terms.append(term)
+    return replace(setup, friction_terms=tuple(terms))
+
+
+def compute_friction_forces(
+    setup: RegressorSetup, speeds: dict[str, tuple[float, float]], names: Sequence[str], value: np.ndarray,
+    base: np.ndarray, estimate: Estimate,
+) -> tuple[FrictionForce, ...]:  # fmt: skip
+    """Compute the friction force of the drives at round speeds within those of the fitted runs.
+
+    Args:
+        setup: definition of the regressor.
+        speeds: as returned by `compute_speeds`.
+        names: names of the m parameters.
+        value: (m,) identified values.
+        base: (r,) indices of the base parameters.
+        estimate: estimate of the base parameters.
+
+    Returns:
+        The friction forces by drive and speed; none for drives whose Coulomb friction is not identifiable.
+    """
+    first = {place: group[0] for group in setup.equal_groups for place in group}
+    out = []
+    for term in setup.friction_terms:
+        place = first.get(term.location, term.location)
+        if term.location not in speeds or f"coulomb.{place}" not in {names[b] for b in base}:
+            continue
+        rms, highest = speeds[term.location]
+        unit = "N" if setup.chain.tree.is_slide[setup.chain.index(term.location)] else "N m"
+        for speed in _ROUND_SPEEDS[(_ROUND_SPEEDS >= _DEVIATION_SPEEDS[0] * rms) & (_ROUND_SPEEDS <= highest)]:
+            sides = [term.unit_forces(np.array(side * speed)) for side in (1.0, -1.0)]
+            weights = np.zeros(len(names))
+            for kind in term.nominal:
+                if f"{kind}.{place}" in names:
+                    weights[list(names).index(f"{kind}.{place}")] = 0.5 * float(sides[0][kind] - sides[1][kind])
+            force, std = float(weights @ value), float(np.sqrt(weights[base] @ estimate.covariance @ weights[base]))
+            reach = estimate.interval_factor * std
+            out.append(FrictionForce(term.location, float(speed), force, std, (force - reach, force + reach), unit))
+    return tuple(out)
