@@ -81,7 +81,7 @@ class Stand:
         real[POSITION:QUATERNION], real[QUATERNION:TRAVEL] = (x, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
         real[TRAVEL : PERIOD + 1], real[CAN_APPLY_FORCE] = (0.05, 0.5, 12.0, 0.4, STEP), 1.0
         for name, value in changes.items():
-            (real if name in ("ABLE", "PLACE") else whole)[getattr(packets, name)] = value
+            (real if name in ("CAN_APPLY_FORCE", "PLACE") else whole)[getattr(packets, name)] = value
         answered = answer_pose(line, self.link.mailbox, self.now, self.two)
         self.now, self.sequence = self.now + MS, self.sequence + 1
         return answered
@@ -143,7 +143,7 @@ def test_a_server_that_starts_anew_begins_again(stand):
 def test_a_device_that_is_unable_gets_no_force_and_gives_no_pose(stand):
     stand.machine()
     stand.pose(x=0.01)
-    stand.pose(x=0.01, ABLE=0.0)
+    stand.pose(x=0.01, CAN_APPLY_FORCE=0.0)
     assert not stand.force.any() and np.isnan(stand.link.mailbox.handle[0])
 
 
@@ -163,7 +163,7 @@ def test_how_long_it_takes_until_a_wrench_is_known_to_be_taken(stand):
     stand.pose()
     line.sent[0] = stand.now
     stand.now += 3 * MS
-    stand.pose(TAKEN=0)
+    stand.pose(LAST_ACCEPTED=0)
     found = stand.link.statistics()["loop"]
     assert found["count"] == 1 and found["percentiles_us"]["max"] == pytest.approx(3000.0)
 

@@ -118,10 +118,10 @@ def test_an_answer_to_a_pose_of_long_ago_is_stale(stand):
     for _ in range(round(MAX_POSE_AGE / PERIOD)):
         stand.period()
         stand.send()
-    assert stand.send(ANSWERED=old)
+    assert stand.send(ANSWERED_POSE=old)
     stand.period()
-    assert not stand.send(ANSWERED=old)
-    assert not stand.send(ANSWERED=old + 10_000)  # a pose that was never sent
+    assert not stand.send(ANSWERED_POSE=old)
+    assert not stand.send(ANSWERED_POSE=old + 10_000)  # a pose that was never sent
     assert stand.exchange.rejected_packets["stale"] == 2
 
 
@@ -167,7 +167,7 @@ def test_the_watchdog_takes_the_force_off_and_a_wrench_brings_it_back(stand):
 
 def test_a_machine_that_is_not_in_control_makes_the_device_limp(stand):
     stand.send((1.0,) * 6)
-    stand.send((1.0,) * 6, ON=0)
+    stand.send((1.0,) * 6, FORCES_ON=0)
     stand.period()
     assert not stand.device.wrench.any()
 
