@@ -425,7 +425,7 @@ def _hold_reason(identifiability: Identifiability, name: str, loop: CalibrationL
 
 def assemble_fit(loop, parameters, start, names, covariance, stages, method) -> ArmFit:
     """Assemble the fit; update the ball position if the innermost stage identified it."""
-    values = {name: parameters[name] for name in loop.names}
+    values = {name: parameters[name] for name in loop.parameter_names}
     calibrated = loop.with_values(values)
     first = loop.links[0]
     if f"p_xy.{first}" in names:

@@ -66,8 +66,8 @@ def suggest_valid_name(name: object, valid, renamed: Mapping[str, str] = Mapping
 
     For a former name, a key of `renamed`, the hint is the present name.
     """
-    if name in renamed:
-        return f"it is now called {renamed[str(name)]!r}"
+    if isinstance(name, str) and name in renamed:
+        return f"it is now called {renamed[name]!r}"
     names = sorted(map(str, valid))
     close = difflib.get_close_matches(str(name), names, n=1)
     hint = f"did you mean {close[0]!r}? " if close else ""

@@ -199,10 +199,6 @@ def test_unusable_data_say_why(clean):
     bad[7, 2] = np.nan
     with pytest.raises(InputError, match=r"column angle.calibrator_twist, row 8: is not a number"):
         identify_arm(LOOP, [dataclasses.replace(stages[0], theta=bad)])
-    other = log_of()
-    other = dataclasses.replace(other, metadata={"machine": "ec20"})
-    with pytest.raises(InputError, match="is a log of machine ec20"):
-        log_to_poses(other, MACHINE, LOOP)
     with pytest.raises(InputError, match="keep one of them"):
         identify_arm(LOOP, [stages[0], stages[0]])
     still = AxisStrokes("boom", np.full(50, 0.3), np.full(50, 0.4), 1e-3, 1e-3)

@@ -199,7 +199,7 @@ def test_variants_stand_still_under_their_own_load():
         (Options(control_rate=300.0), "whole physics steps"),
         (Options(control_rate=float("nan")), "Hz"),
         (Options(duration=0.001), "shorter than one step"),
-        (Options(variants=0), "at least 1"),
+        (Options(variants=0), "variants: must be a whole number from 1 to 10000, not 0"),
         (Options(effects=({"name": "payload", "mass": 3},)), "parameters"),
         (Options(effects=({"name": "pay_load"},)), "payload"),
         (Options(randomise=({"name": "payload", "parameters": {"mass": 3.0}},)), "range"),
