@@ -11,7 +11,7 @@ from hydrotele.calibrate.arm import (
     identify_jointly,
     machine_with_loop,
 )
-from hydrotele.calibrate.arm_data import extract_strokes, find_moving_link, log_to_poses
+from hydrotele.calibrate.arm_data import extract_strokes, find_moving_link
 from hydrotele.calibrate.arm_poses import add_drift
 from hydrotele.calibrate.bad_data import identify_without_bad_data
 from hydrotele.calibrate.design import DRIFT_FREE_SWEEPS, generate_sweep_poses
