@@ -94,7 +94,7 @@ def test_identifiable_sets_are_those_of_the_thesis(exact):
     for stage in exact.stages:
         found = {name for name in stage.names if not name.startswith("p_")}
         assert found == IDENTIFIABLE_PARAMETERS[stage.link], stage.link
-        assert f"d.{stage.link}" in stage.fixed
+        assert f"d.{stage.link}" in stage.hold_reasons
 
 
 @pytest.mark.nightly
