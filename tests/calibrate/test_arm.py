@@ -11,7 +11,7 @@ from hydrotele.calibrate.arm import (
     identify_jointly,
     machine_with_loop,
 )
-from hydrotele.calibrate.arm_data import extract_strokes, find_moving_link
+from hydrotele.calibrate.arm_data import extract_strokes, find_moving_link, read_calibration_logs
 from hydrotele.calibrate.arm_poses import add_drift
 from hydrotele.calibrate.bad_data import identify_without_bad_data
 from hydrotele.calibrate.design import DRIFT_FREE_SWEEPS, generate_sweep_poses
@@ -32,7 +32,7 @@ from hydrotele.experiments.khoshzaban_arm import IDENTIFIABLE_PARAMETERS
 from hydrotele.experiments.khoshzaban_machine import TABLE_2
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.kinematics.linkages import TwoBar
-from hydrotele.logs.log import Log
+from hydrotele.logs.log import Log, save_log
 from hydrotele.machine.machine_file import load_machine
 
 MACHINE = load_machine("calibrator")
@@ -205,6 +205,12 @@ def test_unusable_data_say_why(clean):
     with pytest.raises(InputError, match="l_l, l_c and l_u are not identifiable"):
         identify_linkage(MACHINE, still)
     assert extract_strokes(log_of(), MACHINE, ["boom"]) == []
+
+
+def test_a_log_of_another_machine_is_refused(tmp_path):
+    save_log(dataclasses.replace(log_of(), metadata={"machine": "ec20"}), tmp_path / "sweep.parquet")
+    with pytest.raises(InputError, match="is a log of machine ec20, not of calibrator: give --machine ec20"):
+        read_calibration_logs(tmp_path, MACHINE)
 
 
 def test_a_machine_without_a_calibrator_is_refused():
