@@ -41,7 +41,11 @@ class Flexibility(NamedTuple):
 
 
 def joint_loads(loop: CalibrationLoop, poses: Poses, fit: ArmFit) -> np.ndarray:
-    """Return the loads (M, S) of the calibrator's joints, 0 .. 1, in the poses of a stage."""
+    """Return the lever arm of the ball about each sensed joint of the calibrator, relative to its reach.
+
+    Returns:
+        (M, S) relative loads from 0 to 1 for the M poses of one stage (one moving link) and the S sensed joints.
+    """
     equations = StageEquations(loop, poses)
     chain, theta = equations.chain_and_angles(fit.parameters)
     place = equations.place

@@ -180,7 +180,7 @@ def add_plugin_effects(library: dict[str, Effect]) -> None:
 
 
 def add_environment_effects(library: dict[str, Effect]) -> None:
-    """Add the effects of the files that the parent process loaded."""
+    """Add to a library the custom effects of the files that the parent process loaded (`--effects`)."""
     for path in filter(None, os.environ.get(ENVIRONMENT_VARIABLE, "").split(os.pathsep)):
         add_effects_from_file(Path(path), library)
 

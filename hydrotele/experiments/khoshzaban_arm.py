@@ -58,10 +58,10 @@ STAGE_PARAMETERS = {
 """Parameters identified in each stage, including the ball's distance and height."""
 
 LENGTH_PARAMETERS = ("p_z.swing", "p_xy.swing", "a.swing", "a.boom", "d.boom", "a.stick")
-"""Identified lengths of Tables 4 to 6; `p_z.swing` is -d0 and `p_xy.swing` is -a0."""
+"""Identified lengths of Khoshzaban 1992, Tables 4 to 6; `p_z.swing` is -d0 and `p_xy.swing` is -a0."""
 
 TWIST_PARAMETERS = ("alpha.swing", "alpha.boom", "beta.boom", "alpha.stick", "beta.stick")
-"""Identified twists of Tables 4 to 6."""
+"""Identified twists of Khoshzaban 1992, Tables 4 to 6."""
 
 LENGTH_SYMBOLS = {"p_z.swing": "d0", "p_xy.swing": "a0", "a.swing": "a1", "a.boom": "a2", "d.boom": "d2",
          "a.stick": "a3"}  # fmt: skip
@@ -85,7 +85,7 @@ PUBLISHED_ITERATIONS = {"drift": (6, 11, 5), "sensor": (6, 14, 7), "flexible": (
 
 
 def find_published_error(case: str, name: str) -> float:
-    """Return the error of a length in Tables 4 to 6 relative to Table 2 [m]."""
+    """Return the error of a length in Khoshzaban 1992, Tables 4 to 6 relative to Table 2 [m]."""
     return PUBLISHED_LENGTHS[case][LENGTH_PARAMETERS.index(name)] - NOMINAL_LENGTHS[name]
 
 
@@ -249,7 +249,7 @@ def measure_exact_readings(seed: int, changes: Changes) -> Sample:
 
 
 def check_lengths(samples: Sequence[Sample], case: str) -> list[Check]:
-    """Return checks whether the published length errors agree with the repetitions."""
+    """Return checks whether the published link-length errors lie within those of the repeated simulations."""
     return [
         check_population(
             f"error of {LENGTH_SYMBOLS[name]}", 1e3 * collect_values(samples, f"{case}.error.{name}"),
@@ -295,7 +295,7 @@ A3_ERROR_REASON = (
 
 
 def evaluate_drift(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the errors under drift alone with Table 4."""
+    """Compare the errors under drift alone with Khoshzaban 1992, Table 4."""
     # alpha 1 is the only twist that drift changes; it is printed as -90.0 deg.
     twist = check_population(
         "error of alpha 1", np.degrees(collect_values(samples, "drift.error.alpha.swing")), 0.0, "deg",
@@ -309,7 +309,7 @@ def evaluate_drift(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_sensor_errors(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the errors under drift and sensor errors with Table 5."""
+    """Compare the errors under drift and sensor errors with Khoshzaban 1992, Table 5."""
     twists = check_population(
         "RMS error of alpha and beta", np.degrees(collect_values(samples, "sensor.twists")),
         compute_rms(PUBLISHED_TWISTS["sensor"]), "deg",
@@ -331,7 +331,7 @@ def evaluate_sensor_errors(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_bent_joints(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the errors under drift and bent joints with Table 6."""
+    """Compare the errors under drift and bent joints with Khoshzaban 1992, Table 6."""
     largest = {case: max(abs(find_published_error(case, n)) for n in LENGTH_PARAMETERS)
                for case in ("flexible", "sensor")}  # fmt: skip
     ratio = largest["flexible"] / largest["sensor"]
@@ -367,7 +367,10 @@ def evaluate_bent_joints(samples: Sequence[Sample]) -> Evaluation:
 
 
 def check_constant_bend_ratio(samples: Sequence[Sample]) -> Check:
-    """Return a check of the largest error if a joint has one error in all bent poses of a stage."""
+    """Check the largest length error when all bent poses of a stage have the same angle error.
+
+    It is divided by the largest length error with sensor errors and drift only.
+    """
     ratio = 838.0 / 73.0
     return check_rms_ratio(
         "the largest length error over that with sensors and drift", samples,
@@ -377,12 +380,12 @@ def check_constant_bend_ratio(samples: Sequence[Sample]) -> Check:
 
 
 def evaluate_constant_bends(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the errors under drift and constantly bent joints with Table 6."""
+    """Compare the errors under drift and constantly bent joints with Khoshzaban 1992, Table 6."""
     return Evaluation((check_constant_bend_ratio(samples),), note=describe_lengths(samples, "lasting"))
 
 
 def evaluate_relative_error(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the relative error of a1 with p. 60."""
+    """Compare the relative error of a1 with Khoshzaban 1992, p. 60."""
     size = NOMINAL_LENGTHS["a.swing"]
     half = 100.0 * collect_values(samples, "half.error.a.swing") / size
     both = 100.0 * np.abs(collect_values(samples, "sensor.error.a.swing")) / size
@@ -398,7 +401,7 @@ def evaluate_relative_error(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_sensor_fraction(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the fraction of a1's error due to the sensors with p. 60."""
+    """Compare the fraction of a1's error due to the sensors with Khoshzaban 1992, p. 60."""
     rows = np.column_stack([collect_values(samples, f"{case}.error.a.swing")
                             for case in ("half", "sensor", "drift")])  # fmt: skip
 
@@ -415,7 +418,7 @@ def evaluate_sensor_fraction(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_iterations(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the numbers of iterations with p. 62."""
+    """Compare the numbers of iterations with Khoshzaban 1992, p. 62."""
     totals = {case: sum(counts) for case, counts in PUBLISHED_ITERATIONS.items()}
     checks = []
     for case in ("sensor", "flexible"):
@@ -442,7 +445,7 @@ def evaluate_iterations(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_all_relative_errors(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the relative errors under drift and sensor errors of 0.1 deg with p. 122."""
+    """Compare the relative errors under drift and sensor errors of 0.1 deg with Khoshzaban 1992, p. 122."""
     errors = np.array([[abs(s.values[f"sensor.error.{n}"] / NOMINAL_LENGTHS[n]) for n in LENGTH_PARAMETERS]
                        for s in samples])  # fmt: skip
     rms = [f"{LENGTH_SYMBOLS[n]} {100 * compute_rms(errors[:, k]):.1f}" for k, n in enumerate(LENGTH_PARAMETERS)]

@@ -81,7 +81,7 @@ END_POINT_LINKS = {"stick": 3, "grapple": 5}
 
 SIDES = ("manipulator", "calibrator")
 MIN_VISIBLE_DIFFERENCE = np.radians(1.0)
-"""Difference at the yoke above which a pose is excluded [rad]; the axes of Fig. 20 span 30 deg."""
+"""Difference at the yoke above which a pose is excluded [rad]; the axes of Khoshzaban 1992, Fig. 20 span 30 deg."""
 
 _TAPED_DISTANCES = 19  # number of taped distances, p. 65
 

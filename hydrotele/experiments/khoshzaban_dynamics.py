@@ -268,7 +268,7 @@ def measure_identifiability(seed: int, changes: Changes) -> Sample:
 
 
 def evaluate_table_13(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the counts with Table 13."""
+    """Compare the counts with Khoshzaban 1992, Table 13."""
     values = samples[0].values
     words = {"deleted": "unidentifiable", "combined": "linearly identifiable",
              "full": "fully identifiable"}  # fmt: skip

@@ -75,7 +75,7 @@ PUBLISHED_DISTANCE_ERRORS = {
 
 
 def find_printed_length_errors(model: str) -> dict[str, float]:
-    """Return the printed lengths minus those of Table 2 [m]."""
+    """Return the printed lengths minus those of Khoshzaban 1992, Table 2 [m]."""
     return {n: v - NOMINAL_LENGTHS[n] for n, v in zip(LENGTH_PARAMETERS, _PRINTED_LENGTHS[model], strict=True)}
 
 
@@ -138,7 +138,7 @@ def evaluate_printed_parameters(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_parameters(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the sizes of the parameter errors with Table 7."""
+    """Compare the sizes of the parameter errors with Khoshzaban 1992, Table 7."""
     outer = np.array([[s.values[f"identified.error.{n}"] for n in _PRINTED_OUTER] for s in samples])
     offsets = np.array([[s.values[f"identified.error.{n}"] for n in _OFFSET_PARAMETERS] for s in samples])
     checks = (
@@ -159,7 +159,7 @@ def evaluate_parameters(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_iterations(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the iterations of links 2 and 3 with Table 7."""
+    """Compare the iterations of links 2 and 3 with Khoshzaban 1992, Table 7."""
     return Evaluation((check_rms_ratio(
         "iterations of link 2 over those of link 3", samples,
         ("identified.iterations.boom", "identified.iterations.stick"),
@@ -196,7 +196,7 @@ def _describe_links(samples: Sequence[Sample], model: str) -> str:
 
 
 def evaluate_error_change(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the change of the parameter errors from Table 7 to Table 9."""
+    """Compare the change of the parameter errors from Khoshzaban 1992, Table 7 to Table 9."""
     before, after = (find_printed_length_errors(m) for m in ("identified", "reidentified"))
     checks = []
     for name in ("a.swing", "d.boom"):
@@ -223,7 +223,7 @@ def evaluate_error_change(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_remaining_errors(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the sizes of the remaining parameter errors with Table 9."""
+    """Compare the sizes of the remaining parameter errors with Khoshzaban 1992, Table 9."""
     return Evaluation(
         tuple(_check_links(samples, "reidentified")),
         "after the removal only sensor noise affects alpha and beta here; the thesis also names"
@@ -277,7 +277,7 @@ def evaluate_end_points(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_position_decrease(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the decrease of the position errors from Table 7 to Table 9."""
+    """Compare the decrease of the position errors from Khoshzaban 1992, Table 7 to Table 9."""
     names = ("identified", "reidentified")
     return Evaluation(
         tuple(_check_decrease(samples, names, PUBLISHED_POSITION_ERRORS, "manipulator", _POSITION_KEY)),
@@ -320,7 +320,7 @@ def evaluate_calibrator_ends(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_distances(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the distance errors from the manipulator side with Table 8 and Fig. 19."""
+    """Compare the distance errors from the manipulator side with Khoshzaban 1992, Table 8 and Fig. 19."""
     checks = [
         check
         for model in ("nominal", "identified")
@@ -337,7 +337,7 @@ def evaluate_distances(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_model_order(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the distance errors of the nominal and the identified model with Fig. 19."""
+    """Compare the distance errors of the nominal and the identified model with Khoshzaban 1992, Fig. 19."""
     checks = []
     for end in END_POINT_LINKS:
         ratio = (
@@ -371,7 +371,7 @@ def _describe_vaf(samples: Sequence[Sample], side: str) -> str:
 
 
 def evaluate_calibrator_distances(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the distance errors from the calibrator side with Table 8."""
+    """Compare the distance errors from the calibrator side with Khoshzaban 1992, Table 8."""
     checks = [
         check
         for model in ("nominal", "identified")
@@ -398,7 +398,7 @@ def evaluate_calibrator_distances(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_new_distances(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the sizes of the distance errors with Table 10."""
+    """Compare the sizes of the distance errors with Khoshzaban 1992, Table 10."""
     return Evaluation(
         tuple(_check_rms_errors(samples, "reidentified", "manipulator", PUBLISHED_DISTANCE_ERRORS, _DISTANCE_KEY)),
         "after the bent poses are excluded, the drift of held links is the only large error here",
@@ -407,7 +407,7 @@ def evaluate_new_distances(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_distance_decrease(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the change of the distance errors from Table 8 to Table 10."""
+    """Compare the change of the distance errors from Khoshzaban 1992, Table 8 to Table 10."""
     models = ("identified", "reidentified")
     checks = _check_decrease(samples, models, PUBLISHED_DISTANCE_ERRORS, "manipulator", _DISTANCE_KEY)
     for end in END_POINT_LINKS:

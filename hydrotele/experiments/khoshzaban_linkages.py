@@ -32,7 +32,7 @@ _PRINTED_RMS_ERRORS = {("boom", "measured"): 0.0004, ("boom", "identified"): 0.0
 
 
 def evaluate_triangles(samples: Sequence[Sample], kind: str) -> Evaluation:
-    """Compare the cylinder triangles from measured or computed angles with Table 11."""
+    """Compare the cylinder triangles from measured or computed angles with Khoshzaban 1992, Table 11."""
     checks = []
     for axis in ("boom", "stick"):
         checks += [
@@ -97,7 +97,7 @@ def evaluate_angle_sources(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_displacements(samples: Sequence[Sample], kind: str) -> Evaluation:
-    """Compare the displacement errors from measured or computed angles with Table 12."""
+    """Compare the displacement errors from measured or computed angles with Khoshzaban 1992, Table 12."""
     checks = [
         check_statistic(f"RMS error of the {axis}", 1e3 * collect_values(samples, f"{axis}.{kind}.rms"),
                         compute_rms, (0.5e3 * published, 2e3 * published),

@@ -126,7 +126,7 @@ def _check_published_value(
 
 
 def evaluate_masses(samples: Sequence[Sample]) -> Evaluation:
-    """Compare masses and centres of mass with Table 1."""
+    """Compare masses and centres of mass with Khoshzaban 1992, Table 1."""
     values = samples[0].values
     checks = [_check_published_value(f"mass of the {n}", values[f"mass.{n}"], v, 0.5, "last digit", "kg")
               for n, v in _PUBLISHED_MASSES.items()]  # fmt: skip
@@ -178,7 +178,7 @@ def evaluate_triangles(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_mobility(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the numbers of extra links and the mobility with Eq. 3.5."""
+    """Compare the numbers of extra links and the mobility with Khoshzaban 1992, Eq. 3.5."""
     wanted = (("extra links of the machine with grapple", "links_machine", 1.0),
               ("extra links of the excavator", "links_excavator", 3.0),
               ("mobility with one moving and four sensed links", "mobility", 2.0))  # fmt: skip
@@ -189,7 +189,7 @@ def evaluate_mobility(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_chain(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the Denavit-Hartenberg parameters with Table 2."""
+    """Compare the Denavit-Hartenberg parameters with Khoshzaban 1992, Table 2."""
     return Evaluation((check_exact(
         "largest difference of 36 numbers", samples[0].values["table_2"], (0.0, 5e-4),
         "last printed digit of a length", unit="m or deg",
@@ -197,7 +197,7 @@ def evaluate_chain(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_pressures(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the errors of torque and forces with Eq. 4.61."""
+    """Compare the errors of torque and forces with Khoshzaban 1992, Eq. 4.61."""
     return Evaluation(tuple(
         _check_published_value(f"error of the {name}", samples[0].values[f"torque.{name}"], published, 60.0,
                     "5747 N is printed as 5700", "N m" if name == "swing" else "N")
@@ -275,7 +275,7 @@ def measure_drift(seed: int, changes: Changes) -> Sample:
 
 
 def _compute_closure_error(loop: CalibrationLoop, truth) -> float:
-    """Return the largest closure error of Table 2's chain for simulated angles [m]."""
+    """Return the largest closure error of Khoshzaban 1992, Table 2's chain for simulated angles [m]."""
     angles = np.stack([truth[c] * s for c, s in zip(loop.channels, loop.signs, strict=True)], 1)
     return float(np.abs(closure_error(loop, angles + loop.values[:, 0])[0]).max())
 

@@ -269,4 +269,4 @@ FORCE_ACCURACY = Experiment(
     ),
     fixed_repetitions=1,
 )  # fmt: skip
-"""Force errors assumed in Tables 14 and 15."""
+"""Force errors assumed in Khoshzaban 1992, Tables 14 and 15."""

@@ -182,7 +182,7 @@ def _describe_estimates(names: tuple[str, ...]):
 
 
 REFINED_NAMES = ("a4", "theta4", "b1x", "b6z")
-"""Parameters of the caption of Fig. 18."""
+"""Parameters of the caption of Wang 2012, Fig. 18."""
 
 
 def measure_refined_posterior(seed: int, changes: Changes) -> Sample:

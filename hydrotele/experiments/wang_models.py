@@ -54,7 +54,7 @@ MAX_ROUNDING = 1e-9  # [m] or [rad]: below the resolution of any sensor, above r
 
 
 def measure_kinematics(seed: int, changes: Changes) -> Sample:
-    """Compare the product of the D-H matrices with Eq. 7, and count the parameter errors.
+    """Compare the product of the D-H matrices with Wang 2012, Eq. 7, and count the parameter errors.
 
     Args:
         seed: seed of the poses.

@@ -68,7 +68,7 @@ def _build_link_transform(turn: float, along: float, length: float, twist: float
 
 
 def compute_tool_position(g: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return the position of the tool by the chains of Tables 2.1 and 2.2.
+    """Return the position of the tool by the chains of Zhu 1994, Tables 2.1 and 2.2.
 
     Args:
         g: (9,) parameters as in `kinematics.task.arm_parameters`.

@@ -212,7 +212,7 @@ def _evaluate_steering(samples: Sequence[Sample]) -> Evaluation:
 
 _MAX_NONLINEARITY = 0.03  # RMS deviation over the largest force
 _RAMPS = {"x": (1.0, 7.0, 4.0, 0.3, 2.0), "z": (9.0, 15.0, 4.0, 0.4, 2.0)}
-"""Axis -> (start, end [s], and Kp, Kp1 [N/mm] and force drop [N] of Table 6.11)."""
+"""Axis -> (start, end [s], and Kp, Kp1 [N/mm] and force drop [N] of Zhu 1994, Table 6.11)."""
 _DEADBAND_EDGE = 1.5  # mm, Table 6.9
 
 

@@ -99,7 +99,7 @@ def compute_relative_error(found: np.ndarray, expected: np.ndarray) -> float:
 
 
 def measure_hybrid_matrix(changes: Changes) -> Sample:
-    """Compare hybrid matrix and felt impedance with a numerical solution of Fig. 3.13.
+    """Compare hybrid matrix and felt impedance with a numerical solution of Zhu 1994, Fig. 3.13.
 
     Args:
         changes: `velocity_back_sign`: sign of the returned velocity in the numerical solution.
@@ -313,7 +313,7 @@ def evaluate_position_error(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_stiffness_law(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the joystick's stiffness with (4.1) and the values of Tables 6.7 and 6.8."""
+    """Compare the joystick's stiffness with (4.1) and the values of Zhu 1994, Tables 6.7 and 6.8."""
     return Evaluation((
         check_mean("RMS difference of the stiffness along z from (4.1), relative",
                    collect_values(samples, "law"), (-np.inf, 0.05),

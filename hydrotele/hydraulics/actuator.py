@@ -317,12 +317,13 @@ def bristle_rate(user, u, fraction, velocity, inertia, dt):
 def bristle_friction(user, u, fraction, velocity, inertia, dt):
     """Return the friction of a drive with bristles, and its derivatives.
 
-    `F = r (F_c + F_s) + sigma_1 z' + b v (1 + a_v t)`, with the viscous part of `laws.friction`.
+    `F = r (F_c + F_s) + sigma_1 z' + b v (1 + a_v t)`, where z is the bristle deflection,
+    a_v the asymmetry of the viscous friction and `t = tanh(v/v_0)`; see `laws.friction`.
 
     Args:
         user: (nu * SLOTS,) actuator parameters.
         u: index of the first parameter of this actuator in `user`.
-        fraction: r, scalar [1].
+        fraction: r, elastic bristle force relative to the breakaway friction, scalar [1].
         velocity: v, scalar [m/s] or [rad/s].
         inertia: inertia moved by the drive, see `bristle_rate`.
         dt: time step, scalar [s]; 0 means no limit of stiffness and damping.
@@ -355,7 +356,7 @@ def implicit_bristle_friction(user, u, fraction, velocity, other_force, inertia,
     Args:
         user: (nu * SLOTS,) actuator parameters.
         u: index of the first parameter of this actuator in `user`.
-        fraction: r, scalar [1].
+        fraction: r, elastic bristle force relative to the breakaway friction, scalar [1].
         velocity: at the start of the step, scalar [m/s] or [rad/s].
         other_force: all other force, scalar [N] or [N m].
         inertia: inertia of the body, scalar [kg] or [kg m^2], > 0.

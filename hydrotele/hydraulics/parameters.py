@@ -226,7 +226,10 @@ def actuator_parameters(machine: Machine) -> dict[str, np.ndarray]:
 
 
 def machine_terms_table(machine: Machine) -> np.ndarray:
-    """Return the machine's terms as an array for compiled code, see `terms.table.terms_table`."""
+    """Return the additional force and flow laws (terms) of a machine as an array for compiled code.
+
+    See `terms.table.terms_table` for its layout.
+    """
     names, first = extra_state_names(machine), 4 * len(machine.hydraulic_axes)
     own = [k for k, name in enumerate(names) if name.startswith("memory.")]
     areas = {name: machine.axes[name].hydraulic_drive.areas for name in machine.hydraulic_axes}

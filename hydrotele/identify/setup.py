@@ -119,7 +119,7 @@ class RegressorSetup:
         """Compute the regressor along a motion.
 
         Args:
-            projection: projection of the chain along the motion.
+            projection: matrices that map body wrenches to drive forces, for every row of the motion.
             rate_std: (n, v) standard deviations of the rates [rad/s] or [m/s]; None if exact.
 
         Returns:

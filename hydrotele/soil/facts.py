@@ -244,7 +244,7 @@ def make_level_profile(count: int, height: float = 0.0) -> tuple[np.ndarray, np.
 
 def soil_mass(parameters: np.ndarray, surface: np.ndarray, loose: np.ndarray,
               state: np.ndarray) -> float:  # fmt: skip
-    """Return the total mass of soil above height 0, in the bucket and lost at the ends [kg].
+    """Return the soil mass [kg]: on the ground above height 0, in the bucket, and fallen off the ends of the profile.
 
     `soil_step` conserves it up to rounding.
     """
