@@ -30,7 +30,7 @@ def identify_operator(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--stdout_console", "-o", help="Folder for operator.yaml and fit.json."),
+        typer.Option("--out", "-o", help="Folder for operator.yaml and fit.json."),
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")] = False,
 ) -> None:

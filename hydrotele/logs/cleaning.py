@@ -265,7 +265,7 @@ def find_repeats(reading: np.ndarray, min_length: int) -> list[Interval]:
     """Find intervals of at least `min_length` equal readings; missing readings count as equal.
 
     >>> find_repeats(np.array([1.0, 2.0, 2.0, np.nan, 2.0, 3.0]), 3)
-    [Stretch(first=1, last=5)]
+    [Interval(first=1, last=5)]
     """
     rows = np.flatnonzero(np.isfinite(reading))
     if not len(rows):

@@ -245,12 +245,12 @@ def test_patched_machine_is_a_file_that_runs_the_same(machine, tool, tmp_path):
 
 NEW = """
 from hydrotele.effects.effect import valve_axes
-from hydrotele.effects.effect import Effect, Parameter, changed
+from hydrotele.effects.effect import Effect, Parameter, with_value
 
 EFFECT = Effect(
     "sticky_makeup", "make-up valves that hardly open", "flow", valve_axes,
     lambda machine, place: {"gain": Parameter("m^3/(s Pa)", 5e-9, 0, 5e-9, 2e-9, 1e-10)},
-    lambda machine, place, v: changed(machine, f"axes.{place}.valve.makeup_gain", v["gain"]),
+    lambda machine, place, v: with_value(machine, f"axes.{place}.valve.makeup_gain", v["gain"]),
 )
 """
 

@@ -10,7 +10,7 @@ from hydrotele.gap.result import gap_document
 
 _KEYS = {
     "verdict", "effects", "calibration", "learned", "unknown", "lacks", "noise", "jitter", "gap",
-    "tests", "laws", "next_experiment", "notes", "seconds",
+    "tests", "laws", "next_experiment", "unused_channels", "notes", "seconds",
 }  # fmt: skip
 
 

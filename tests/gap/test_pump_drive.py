@@ -86,6 +86,6 @@ def test_compare_judges_free_runs(site, tmp_path):
     done = CliRunner().invoke(app, [*words, "--json"])
     assert done.exit_code == 0, done.output
     document = json.loads(done.stdout)
-    assert document["judged"] == ["test_1"]
+    assert document["evaluated_runs"] == ["test_1"]
     nominal, planted = (m["mean"]["horizons"]["1"]["position.piston"] for m in document["models"])
     assert planted < 0.2 * nominal
