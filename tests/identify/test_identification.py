@@ -183,7 +183,7 @@ def test_emps_has_the_published_numbers(asymmetry, error):
     machine = load_machine("emps")
     fit, heldout, _ = build_records(load_dataset(REAL / "emps" / "main.parquet", machine))
     setup = machine_setup(machine, load_closed_chain(machine), asymmetry=asymmetry)
-    found = identify_with_friction_shapes(fit, heldout, setup)
+    found = identify_dynamics(fit, heldout, setup)  # with the published friction law
     rows = {row.name: row for row in parameter_rows(found)}
     assert rows["mass.carriage"].value == pytest.approx(95.11, rel=0.01)
     assert rows["viscous.slide"].value == pytest.approx(203.5, rel=0.02)
@@ -195,6 +195,10 @@ def test_emps_has_the_published_numbers(asymmetry, error):
         assert low < (166.7 - 240.4) / 2 < high
     else:
         assert rows["offset.slide"].value == pytest.approx(-3.165, rel=0.05)
+    extended = identify_with_friction_shapes(fit, heldout, setup)
+    assert any("near zero speed deviates" in note for note in extended.notes)
+    same_band = identify_dynamics(fit, heldout, setup, Processing(band=extended.band))
+    assert extended.heldout["slide"].relative_error < same_band.heldout["slide"].relative_error
 
 
 def test_rows_say_of_every_parameter_what_is_known(found):
