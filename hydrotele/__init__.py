@@ -19,7 +19,7 @@ def _ignore_configuration() -> None:
 
     The working folder holds data, which must not be able to run code. A numba file can name a
     folder of compiled code, and a matplotlib file can name programs. If such a file exists, the
-    library is imported from another folder.
+    library is imported here while another folder is the working folder.
     """
     for library, file in _CONFIGURATION.items():
         if os.path.lexists(file):

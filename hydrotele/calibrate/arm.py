@@ -5,6 +5,8 @@ moves, the ball keeps its distance p_xy from the axis of joint i and its height 
 are two equations per pose without the angle of joint i (Khoshzaban 1992, Eq. 3.25). Links are
 identified one after the other from the outermost inwards, then optionally all together. The
 module also writes the identified lengths, axes and sensor offsets into the machine.
+
+A stage is the set of poses recorded while one link moves and the other links of the arm are held.
 """
 
 import dataclasses
@@ -113,12 +115,12 @@ class ArmFit:
         return np.column_stack([self.values - reach, self.values + reach])
 
     def value(self, name: str) -> float:
-        """Return a parameter by name, identified or nominal [rad] or [m]."""
+        """Return the value of a parameter by name [rad] or [m], nominal if it was not identified."""
         return float(self.parameters[name])
 
 
 def sort_stages(loop: CalibrationLoop, stages: Sequence[Poses]) -> list[Poses]:
-    """Sort stages from the outermost moving link inwards.
+    """Sort stages, each the poses of one moving link, from the outermost link to the chassis.
 
     Raises:
         InputError: a link cannot be calibrated, or two stages move the same link.
@@ -137,14 +139,15 @@ def sort_stages(loop: CalibrationLoop, stages: Sequence[Poses]) -> list[Poses]:
 
 
 def candidate_parameters(loop: CalibrationLoop, link: str) -> list[str]:
-    """Return the parameters that the poses of a moving link may identify, in order of preference.
+    """Return the names of the parameters that poses of one moving link may identify, by preference.
 
     Args:
         loop: the chain.
         link: the moving link.
 
     Returns:
-        Parameter names. If only a combination is identifiable, its first parameter is identified.
+        Names such as `alpha.boom`, the most preferred first. If only a combination of several
+        parameters is identifiable, the first of them is identified and the others keep their values.
     """
     place = loop.links.index(link)
     first = [f"p_xy.{link}", f"p_z.{link}"]
@@ -165,7 +168,11 @@ def candidate_parameters(loop: CalibrationLoop, link: str) -> list[str]:
 
 
 def expected_error(loop: CalibrationLoop, name: str) -> float:
-    """Return the expected error of a parameter's start value [rad] or [m]."""
+    """Return the expected error of a parameter's nominal value before calibration [rad] or [m].
+
+    It is larger for parameters measured on the machine than for those of the calibrator's links,
+    which are measured in a laboratory.
+    """
     kind, _, link = name.partition(".")
     known = loop.links[loop.powered_count + 1 :]
     if link in known and not (kind == "offset" and link != known[-1]):
@@ -174,7 +181,10 @@ def expected_error(loop: CalibrationLoop, name: str) -> float:
 
 
 class StageEquations:
-    """The two residual equations per pose of one stage."""
+    """The two residual equations of each of M poses while one link moves.
+
+    The ball keeps its distance p_xy from the moving joint's axis and its height p_z along that axis.
+    """
 
     MIN_DEVIATION = 1.0e-4
     """Minimum standard deviation [m] of an equation; bounds the weight of insensitive poses."""
@@ -185,9 +195,10 @@ class StageEquations:
         self.outer = loop.links[self.place :]
 
     def chain_and_angles(self, parameters: Mapping[str, float]) -> tuple[CalibrationLoop, np.ndarray]:
-        """Return the chain with given parameters, and the joint angles beyond the moving link.
+        """Insert parameters into the chain, and compute the joint angles beyond the moving link.
 
-        The angles have shape (M, number of links beyond the moving one) [rad]. The moving link's
+        Angles of held joints are parameters; those of the calibrator are readings plus offsets. The
+        angles have shape (M, number of links beyond the moving one) [rad]. The moving link's
         own d keeps its nominal value, because only the difference p_z - d is identifiable.
         """
         loop, poses = self.loop, self.poses
@@ -210,12 +221,12 @@ class StageEquations:
         return error - self.poses.drift.ball[:, :2] if self.poses.drift else error
 
     def residual(self, parameters: Mapping[str, float]) -> np.ndarray:
-        """Return the residuals of both equations (M, 2) [m]."""
+        """Return the errors of both equations (M, 2) [m]: ball distance minus p_xy, height minus p_z."""
         loop, theta = self.chain_and_angles(parameters)
         return self._error(ball_position(loop, self.place, theta), parameters)
 
     def residual_and_jacobian(self, parameters: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return residuals and their derivatives.
+        """Compute the errors of both equations at every pose, and their derivatives.
 
         Returns:
             (residuals (M, 2) [m], derivatives by link parameters (M, 2, links, 5),
@@ -229,9 +240,15 @@ class StageEquations:
         return self._error(s, parameters), rows, rows[:, :, loop.powered_count - self.place :, 0]
 
     def select_columns(self, by: np.ndarray, names: Sequence[str], own_d: bool = False) -> np.ndarray:
-        """Return the derivatives (M, 2, p) by named parameters; zero for parameters without effect.
+        """Select the derivatives of the residuals by p named parameters.
 
-        The column of the moving link's d is zero unless `own_d` is set.
+        Args:
+            by: (M, 2, links, 5) derivatives by all link parameters, from `residual_and_jacobian`.
+            names: names of the parameters.
+            own_d: whether to include the moving link's own d; otherwise its column is zero.
+
+        Returns:
+            (M, 2, p) derivatives; zero for parameters without effect.
         """
         out = np.zeros((*by.shape[:2], len(names)))
         for column, name in enumerate(names):
@@ -251,17 +268,21 @@ class StageEquations:
         return out
 
     def whitening_factors(self, by_readings: np.ndarray) -> np.ndarray:
-        """Return upper factors (M, 2, 2) that give both equations of a pose unit covariance."""
+        """Return matrices (M, 2, 2) that scale the two residuals of each pose to unit covariance.
+
+        The covariance follows from the noise of the S readings and the derivatives `by_readings` (M, 2, S).
+        """
         spread = by_readings * self.poses.sigma[..., None, :]
         covariance = spread @ spread.transpose(0, 2, 1) + self.MIN_DEVIATION**2 * np.eye(2)
         return np.linalg.cholesky(np.linalg.inv(covariance)).transpose(0, 2, 1)
 
 
 def initial_parameters(loop: CalibrationLoop, stages: Sequence[Poses]) -> ParameterValues:
-    """Return start values of all parameters.
+    """Compute the start values of all parameters of an arm identification.
 
-    Held angles are the median readings of the manipulator's sensors if it has any, otherwise the
-    home angles. The ball positions are computed from each stage's readings and the nominal chain.
+    Link parameters are nominal. Held angles are the median readings of the manipulator's sensors if
+    it has any, otherwise the home angles. The ball positions are computed from each stage's readings
+    and the nominal chain.
 
     Args:
         loop: the nominal chain.
@@ -288,7 +309,7 @@ def identify_arm(
     loop: CalibrationLoop, stages: Sequence[Poses], *, weighted: bool = True,
     parameters_by_link: Mapping[str, Sequence[str]] | None = None,
 ) -> ArmFit:  # fmt: skip
-    """Identify the arm link by link, from the outermost stage inwards.
+    """Identify the geometric parameters of the arm link by link, from the outermost link inwards.
 
     Args:
         loop: the nominal chain.
@@ -327,7 +348,10 @@ def identify_arm(
 def classify_candidates(
     equations: StageEquations, parameters: ParameterValues, names: Sequence[str]
 ) -> Identifiability:
-    """Classify the candidate parameters of a stage by identifiability, at given parameters."""
+    """Classify the candidate parameters `names` of a stage: identifiable, in combination only, or not.
+
+    The derivatives of the stage's equations are evaluated at the values `parameters`.
+    """
     loop = equations.loop
     _, by, sensed = equations.residual_and_jacobian(parameters)
     matrix = equations.whitening_factors(sensed) @ equations.select_columns(by, names, own_d=True)
@@ -340,7 +364,7 @@ def identify_stage(
     covariance: np.ndarray, identifiability: Identifiability, candidates: Sequence[str], weighted: bool = True,
     start_is_close: bool = False,
 ) -> tuple[StageFit, ParameterValues, np.ndarray]:  # fmt: skip
-    """Identify the parameters of one stage.
+    """Identify the parameters of one stage by least squares on the poses of its moving link.
 
     Args:
         equations: equations of the stage.
@@ -354,7 +378,8 @@ def identify_stage(
         start_is_close: whether the start is close to the solution, so that no truncation is needed.
 
     Returns:
-        (the stage, all parameters, covariance (q + p, q + p) of earlier and own parameters).
+        (result of the stage, values of all parameters, covariance (q + p, q + p) of earlier and own
+        parameters).
 
     Raises:
         InputError: there are too few poses.
@@ -411,7 +436,7 @@ def identify_stage(
 
 
 def _hold_reason(identifiability: Identifiability, name: str, loop: CalibrationLoop) -> str:
-    """Return a short reason why a candidate keeps its value."""
+    """Return the reason why a candidate parameter keeps its nominal value, as a short text."""
     kind, _, link = name.partition(".")
     if link in loop.links[loop.powered_count + 1 :] and expected_error(loop, name) == LABORATORY_ERRORS[unit_of(name)]:
         if identifiability.status[identifiability.names.index(name)] != "unidentifiable":
@@ -424,7 +449,10 @@ def _hold_reason(identifiability: Identifiability, name: str, loop: CalibrationL
 
 
 def assemble_fit(loop, parameters, start, names, covariance, stages, method) -> ArmFit:
-    """Assemble the fit; update the ball position if the innermost stage identified it."""
+    """Build the result of an arm calibration from the values and covariance of its parameters.
+
+    If the stage of the link nearest to the chassis identified the ball position, the chain contains it.
+    """
     values = {name: parameters[name] for name in loop.parameter_names}
     calibrated = loop.with_values(values)
     first = loop.links[0]
@@ -441,17 +469,17 @@ def assemble_fit(loop, parameters, start, names, covariance, stages, method) -> 
 
 
 def identify_jointly(fit: ArmFit, stages: Sequence[Poses]) -> ArmFit:
-    """Identify all stages together, starting from the hierarchical fit.
+    """Refit the parameters of all stages together, starting from the link-by-link fit.
 
     A parameter enters the equations of every stage that depends on it; each stage has its own ball
     position. The Jacobian is sparse: a stage does not depend on links inside its moving link.
 
     Args:
-        fit: the hierarchical fit.
-        stages: the same poses.
+        fit: the link-by-link (hierarchical) fit.
+        stages: the poses of that fit.
 
     Returns:
-        The joint fit of the same parameters.
+        The fit of the same parameters to all stages at once.
 
     Raises:
         InputError: the search does not converge.
@@ -511,7 +539,7 @@ def identify_jointly(fit: ArmFit, stages: Sequence[Poses]) -> ArmFit:
 
 
 def check_poses(loop: CalibrationLoop, poses: Poses) -> None:
-    """Raise an error for readings that are not finite, or for poses that are all the same."""
+    """Raise InputError if readings are not finite, or no calibrator joint moves by 2 deg or more."""
     bad = np.argwhere(~np.isfinite(poses.theta))
     if len(bad):
         row, column = bad[0]
@@ -527,7 +555,7 @@ def check_poses(loop: CalibrationLoop, poses: Poses) -> None:
 
 
 def stage_residuals(loop: CalibrationLoop, poses: Poses, parameters: Mapping[str, float]) -> np.ndarray:
-    """Return the residuals of a stage in units of their standard deviations from sensor noise.
+    """Compute the two equation residuals of each pose of a stage, whitened by the sensor noise.
 
     Args:
         loop: the nominal chain.
@@ -543,7 +571,7 @@ def stage_residuals(loop: CalibrationLoop, poses: Poses, parameters: Mapping[str
 
 
 def machine_with_loop(machine: Machine, nominal: CalibrationLoop, loop: CalibrationLoop) -> Machine:
-    """Return a machine with the link positions and joint axes of a chain.
+    """Return a machine whose link positions and joint axes are those of a calibrated chain.
 
     The joint zeros of the machine are kept; a changed offset in the chain is a sensor error.
     Cylinder pins keep their positions on their links.
@@ -607,7 +635,10 @@ def _sort_links_by_depth(machine: Machine) -> list[str]:
 
 
 def _move_tip(machine: Machine, before: Mapping, origin: Mapping) -> Machine:
-    """Move the arm's tip together with the link that is attached to it."""
+    """Move the arm's tip if a link is attached at it, so that both stay at the same point.
+
+    `before` and `origin` are the origins of the links before and after the calibration [m].
+    """
     if machine.arm is None:
         return machine
     tip = machine.arm.tip
@@ -620,7 +651,7 @@ def _move_tip(machine: Machine, before: Mapping, origin: Mapping) -> Machine:
 
 
 def calibrated_machine(machine: Machine, fit: ArmFit, stages: Sequence[Poses]) -> Machine:
-    """Return the machine with all results of a calibration.
+    """Return the machine with all results of an arm calibration: geometry and sensor offsets.
 
     Args:
         machine: the nominal machine.

@@ -30,18 +30,18 @@ def read_stages(
     poses: int = MAX_POSES,
     accuracy: float | None = None,
 ) -> list[Poses]:
-    """Read the logs of a folder, one per moving link.
+    """Read the calibration logs of a folder, one per moving link, and convert them to poses.
 
     Args:
         path: folder of logs, run folder, or one log.
         machine: the machine with its calibrator.
-        loop: the closed chain of this machine.
+        loop: the closed chain of this machine and its calibrator.
         poses: maximum number of poses per log.
         accuracy: standard deviation of an angle reading [rad]; by default that of the sensors named
             in the log, or of Khoshzaban's resolvers.
 
     Returns:
-        The stages, in the order of the files.
+        One set of poses per log, in the order of the files.
 
     Raises:
         InputError: a channel is missing, the machine differs, or the moving link is unknown.
@@ -50,7 +50,7 @@ def read_stages(
 
 
 def read_calibration_logs(path: Path, machine: Machine) -> tuple[tuple[Log, ...], tuple[str, ...]]:
-    """Read the logs of a calibration by the rule of all commands, see `merge_run`.
+    """Read the logs of a calibration, and check that they are of the machine and have a common clock.
 
     Args:
         path: folder of logs, run folder, or one log.
@@ -82,20 +82,21 @@ def log_to_poses(
     poses: int = MAX_POSES,
     accuracy: float | None = None,
 ) -> Poses:
-    """Convert one log to the poses of a stage.
+    """Convert a log, in which one link moves, to calibrator poses.
 
     Args:
         log: log of one moving link.
         machine: the machine with its calibrator.
         loop: the closed chain of this machine.
         poses: maximum number of poses.
-        accuracy: standard deviation of an angle reading [rad], or None as in `read_stages`.
+        accuracy: standard deviation of an angle reading [rad]; None for that of the log's sensors, or
+            of Khoshzaban's resolvers.
 
     Returns:
         The poses, evenly spaced over the valid rows.
 
     Raises:
-        InputError: as in `read_stages`.
+        InputError: a channel is missing, fewer than two rows are valid, or the moving link is unknown.
     """
     sensed = loop.channels[loop.powered_count :]
     if lacking := [name for name in sensed if name not in log]:
@@ -123,7 +124,10 @@ def log_to_poses(
 
 
 def _angle_deviation(log: Log, machine: Machine, channel: str, accuracy: float | None) -> float:
-    """Return the standard deviation of a channel's readings [rad]."""
+    """Return the noise of an angle channel's readings, a standard deviation [rad].
+
+    It is `accuracy` if given, otherwise that of the log's sensors or of a resolver.
+    """
     if accuracy is not None:
         return accuracy
     name = log.metadata.get("sensors", "")
@@ -134,7 +138,7 @@ def _angle_deviation(log: Log, machine: Machine, channel: str, accuracy: float |
 
 
 def find_moving_link(log: Log, loop: CalibrationLoop) -> str:
-    """Return the name of the powered link that moves in a log while the others are held.
+    """Find the name of the powered link that moves in a log while the others are held.
 
     It is found from joint angles, else from cylinder lengths or commands, else from the file name.
 
@@ -181,7 +185,7 @@ def split_poses(stages: Sequence[Poses], every: int = 5) -> tuple[list[Poses], l
 
     Args:
         stages: all poses.
-        every: every n-th pose of a stage is used for validation; 0 for no validation set.
+        every: every n-th pose of a stage is used for validation; 0 or 1 for no validation set.
 
     Returns:
         (stages for fitting, stages for validation).
@@ -194,7 +198,7 @@ def split_poses(stages: Sequence[Poses], every: int = 5) -> tuple[list[Poses], l
 
 
 def extract_strokes(log: Log, machine: Machine, axes: Sequence[str], poses: int = 0) -> list[AxisStrokes]:
-    """Return joint angles and cylinder displacements of the axes that move in a log.
+    """Extract joint angles and cylinder displacements of the axes that move in a log.
 
     Args:
         log: log with channels `angle.AXIS` and `length.AXIS`.
@@ -226,7 +230,7 @@ def extract_strokes(log: Log, machine: Machine, axes: Sequence[str], poses: int 
 
 
 def _length_deviation(log: Log, machine: Machine, channel: str) -> float:
-    """Return the standard deviation of a displacement reading [m]."""
+    """Return the noise of a displacement channel's readings, a standard deviation [m]."""
     name = log.metadata.get("sensors", "")
     if name in machine.sensors and name != IDEAL_SENSORS:
         return noise_rms(machine, get_sensors(machine, name), channel) or _TRANSDUCER_DEVIATION

@@ -25,7 +25,9 @@ class Drift(NamedTuple):
 
 @dataclass(frozen=True)
 class Poses:
-    """Readings while one link moves and the others are held, with K's signs.
+    """Readings of M poses while one link moves and the others are held.
+
+    Angles have the signs of Khoshzaban's (K) D-H convention, see `hydrotele.calibrate.loop`.
 
     Attributes:
         link: the moving link.
@@ -70,10 +72,11 @@ _TREND_DEGREE = 2  # polynomial degree over the poses: leakage decreases while p
 
 
 def add_drift(loop: CalibrationLoop, poses: Poses) -> Poses:
-    """Add the drift of held links, a smooth trend of the manipulator's own sensors, to poses.
+    """Estimate how held links drift during a measurement, and add this drift to the poses.
 
-    Only changes of the readings are used, so sensor offsets have no effect. The ball displacement
-    caused by drift of links inside the moving one is computed with the nominal chain.
+    The drift is a polynomial of degree 2 through the readings of the manipulator's own sensors. Only
+    changes of the readings are used, so sensor offsets have no effect. The ball displacement caused
+    by drift of links inside the moving one is computed with the nominal chain.
 
     Args:
         loop: the nominal chain.

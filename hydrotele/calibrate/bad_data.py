@@ -78,7 +78,7 @@ class CleanedFit(NamedTuple):
 
 
 class WhitenedResiduals(NamedTuple):
-    """Whitened equations of all poses of a stage, of unit variance if only sensor noise acts.
+    """Residuals of all M poses of a stage, scaled to unit variance if sensor noise is the only error.
 
     Attributes:
         rows: (M, E) residuals; E is 3 with the moving joint's sensor, otherwise 2.
@@ -104,10 +104,12 @@ def whitened_residuals(
     parameters: Mapping[str, float],
     known: ParameterUncertainty | None = None,
 ) -> WhitenedResiduals:
-    """Return the whitened residuals of a stage, with the angle equation if it is measured.
+    """Compute the residuals of a stage's poses, scaled to unit variance by the sensor noise.
 
-    The angle equation is not part of the identification. Residuals due to parameter uncertainty
-    are removed: the parameters are moved within their covariance to fit the majority of the poses.
+    Each pose has the equations of the ball's distance and height, and that of its angle about the
+    moving axis if that joint has a sensor. The angle equation is not part of the identification.
+    Residuals due to parameter uncertainty are removed: the parameters are moved within their
+    covariance to fit the majority of the poses.
 
     Args:
         loop: the nominal chain.
@@ -152,7 +154,16 @@ def whitened_residuals(
 
 
 def _remove_parameter_errors(rows: np.ndarray, slopes: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return residuals (M, E) after parameters moved within their covariance, without outliers."""
+    """Subtract the part of the residuals (M, E) that parameter errors within their covariance explain.
+
+    Args:
+        rows: (M, E) whitened residuals.
+        slopes: (M, E, p) their derivatives by the parameters.
+        covariance: (p, p) covariance of the parameters.
+
+    Returns:
+        (M, E) remaining residuals. Poses with outlying residuals do not affect the parameter change.
+    """
     root = np.linalg.cholesky(covariance + 1.0e-18 * np.eye(len(covariance)))
     scaled = slopes @ root
     if rows.shape[1] == 3:  # the zero of the third equation is unknown
@@ -175,7 +186,7 @@ def find_regions(
     false_alarm: float = FALSE_ALARM_PROBABILITY,
     known: ParameterUncertainty | None = None,
 ) -> list[CorruptedRegion]:  # fmt: skip
-    """Find sequences of poses whose residuals are too large to be sensor noise.
+    """Find sequences of poses (regions) whose residuals are too large to be sensor noise.
 
     The cumulative sum of squared residuals less twice their expected value is followed along the
     poses. Its largest rises are regions if they exceed the level that noise reaches in a fraction
@@ -190,7 +201,7 @@ def find_regions(
         known: uncertainty of the fit's parameters.
 
     Returns:
-        The regions, in order.
+        The regions in the order of the poses, each with the joint whose sensor is probably wrong.
 
     Source: Karlin and Altschul 1990 (high-scoring segments).
     """
@@ -211,7 +222,7 @@ def find_regions(
 
 
 def _find_high_segments(score: np.ndarray, threshold: float) -> list[tuple[int, int]]:
-    """Return disjoint index ranges with the largest sums, each above a threshold."""
+    """Return disjoint ranges (first, last index) with the largest sums of scores, each above a threshold."""
     found: list[tuple[int, int]] = []
     waiting = [(0, len(score))]
     while waiting:
@@ -239,7 +250,7 @@ def _max_sum_segment(score: np.ndarray) -> tuple[float, int, int]:
 def _assign_joint(
     loop: CalibrationLoop, poses: Poses, found: WhitenedResiduals, first: int, last: int
 ) -> CorruptedRegion:
-    """Return a region with the joint whose sensor error explains most of its residuals."""
+    """Build the region of poses `first` to `last`, and find the joint whose sensor error explains it best."""
     inside = slice(first, last + 1)
     rows = found.rows[inside]
     whole = float(np.sum(rows**2))
@@ -267,7 +278,7 @@ def _assign_joint(
 def identify_without_bad_data(
     loop: CalibrationLoop, stages: Sequence[Poses], false_alarm: float = FALSE_ALARM_PROBABILITY
 ) -> CleanedFit:
-    """Identify link by link, leaving out the corrupted regions of each link before the next one.
+    """Identify the arm link by link without corrupted poses, which are found in each stage first.
 
     A stage with regions is refitted to its most consistent poses first, so that a fit to corrupted
     poses does not mask them. Regions in which only the manipulator's own sensor is wrong are kept,
@@ -324,7 +335,13 @@ def identify_without_bad_data(
 
 
 def _iterate_regions(loop, poses, solve, found, total, false_alarm, names, own):
-    """Repeat fit and search, starting from the most consistent poses, until regions are stable."""
+    """Alternate between the fit and the search for corrupted regions until the regions stay the same.
+
+    The first fits use only the poses with the smallest residuals.
+
+    Returns:
+        (last fit, as returned by `identify_stage`; list of corrupted regions).
+    """
     for _ in range(3):
         known = ParameterUncertainty(names, found[2])
         square = np.sum(whitened_residuals(loop, poses, found[1], known).rows ** 2, axis=1)
@@ -344,7 +361,7 @@ def _iterate_regions(loop, poses, solve, found, total, false_alarm, names, own):
 
 
 def _mask_regions(regions: Sequence[CorruptedRegion], count: int) -> np.ndarray:
-    """Return a mask (count,) of the poses outside all regions of calibrator joints."""
+    """Return a mask (count,) of the poses to keep: outside all regions that a calibrator joint corrupts."""
     kept = np.ones(count, bool)
     for region in regions:
         if region.joint:
@@ -353,7 +370,7 @@ def _mask_regions(regions: Sequence[CorruptedRegion], count: int) -> np.ndarray:
 
 
 def predict_readings(loop: CalibrationLoop, poses: Poses, parameters: Mapping[str, float]) -> np.ndarray:
-    """Return the expected reading of each calibrator sensor, given the other sensors' readings.
+    """Predict the reading of each calibrator sensor from those of the other sensors at the same pose.
 
     Args:
         loop: the nominal chain.

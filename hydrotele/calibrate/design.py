@@ -165,7 +165,7 @@ class Design(NamedTuple):
 
 
 class DesignSurvey(NamedTuple):
-    """Designs over a grid of arm and forearm lengths, and the present design."""
+    """Evaluated calibrator designs over a grid of arm and forearm lengths, and the present design."""
 
     designs: tuple[Design, ...]
     present: Design
@@ -174,7 +174,9 @@ class DesignSurvey(NamedTuple):
 def evaluate_design(
     loop: CalibrationLoop, arm: float, forearm: float, ball_x: float, ball_z: float, accuracy: float
 ) -> Design:
-    """Evaluate a calibrator of given dimensions.
+    """Evaluate how accurately a calibrator of given dimensions would calibrate the arm.
+
+    A complete measurement with one sweep per link is simulated; reach and covariance follow from it.
 
     Args:
         loop: the nominal chain.
@@ -213,7 +215,7 @@ def evaluate_design(
 
 
 def _stacked_jacobian(loop: CalibrationLoop, stages: list[Poses]) -> tuple[list[str], np.ndarray]:
-    """Return the identifiable parameters and the weighted Jacobian of all stages."""
+    """Return names of the p identifiable parameters and the noise-weighted Jacobian (rows, p) of all stages."""
     numbers = initial_parameters(loop, stages)
     names: list[str] = []
     parts = []
@@ -230,7 +232,10 @@ def _stacked_jacobian(loop: CalibrationLoop, stages: list[Poses]) -> tuple[list[
 
 
 def _tip_error(loop: CalibrationLoop, names: list[str], covariance: np.ndarray) -> float:
-    """Return the RMS standard deviation of the arm's tip over a set of arm poses [m]."""
+    """Return the uncertainty of the arm's tip position due to a parameter covariance (p, p) [m].
+
+    It is the root mean square standard deviation over a few arm poses.
+    """
     count = loop.powered_count - 1
     chain = link_chain(loop.values[:count])
     total = 0.0
@@ -248,7 +253,7 @@ def _tip_error(loop: CalibrationLoop, names: list[str], covariance: np.ndarray) 
 
 
 def survey_designs(loop: CalibrationLoop, accuracy: float) -> DesignSurvey:
-    """Evaluate designs over a grid of both lengths, with the ball joint at its present position.
+    """Evaluate calibrators over a grid of arm and forearm lengths, with the ball joint where it is.
 
     Args:
         loop: the nominal chain.
@@ -265,7 +270,9 @@ def survey_designs(loop: CalibrationLoop, accuracy: float) -> DesignSurvey:
 
 
 def optimize_design(loop: CalibrationLoop, survey: DesignSurvey, accuracy: float) -> Design:
-    """Find the reachable design with minimum tip error; lengths and ball joint are free.
+    """Find the calibrator lengths and ball joint position with the smallest error of the arm's tip.
+
+    At least 98 % of the poses must be within the calibrator's reach.
 
     Args:
         loop: the nominal chain.
@@ -316,7 +323,9 @@ class PoseSelection:
 
 
 def observability_index(information: np.ndarray, criterion: Criterion, equations: int) -> float:
-    """Return an observability index of scaled parameters; larger is better.
+    """Compute an observability index, which rates how well measured poses determine parameters.
+
+    A larger index is better.
 
     With singular values s1 >= ... >= sp of the scaled identification Jacobian of m equations:
     D = O1 = (s1 ... sp)^(1/p) / sqrt(m), O2 = sp / s1, O3 = sp, O4 = sp^2 / s1,
@@ -412,7 +421,15 @@ def select_poses(
 
 
 def _log_det_gains(total: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return the increase of log det from each candidate's (n, k, p) rows: log det(I + J P J')."""
+    """Return by how much each candidate's rows J (k, p) would increase the log determinant.
+
+    Args:
+        total: (p, p) present information matrix.
+        rows: (n, k, p) rows of the n candidates.
+
+    Returns:
+        (n,) log det(I + J total^-1 J').
+    """
     factor = np.linalg.cholesky(total)
     half = np.linalg.solve(factor, np.swapaxes(rows, 1, 2).transpose(1, 0, 2).reshape(len(total), -1))
     half = half.reshape(len(total), len(rows), -1)
@@ -424,7 +441,7 @@ def leave_one_out(
     groups: Iterable[Key], fit: Callable[[Sequence[Key]], Fitted],
     evaluate: Callable[[Fitted, Key], float],
 ) -> dict[Key, float]:  # fmt: skip
-    """Return the prediction error of each group by a fit to all other groups.
+    """Cross-validate: compute the error of each group with a fit to all other groups.
 
     Args:
         groups: names of poses, or of groups of poses that are left out together.

@@ -129,7 +129,7 @@ def least_squares(
     truncation: Sequence[float] | None = None, select: Selection = "structure",
     preferred: Sequence[str] = (), max_iterations: int = 100,
 ) -> ParameterFit:  # fmt: skip
-    """Fit parameters to equations `residual(x) = noise`.
+    """Fit p parameters to m nonlinear equations `residual(x) = noise` by weighted least squares.
 
     Without `sigma`, all equations have the same standard deviation, estimated from the residuals.
     With a prior, this estimate is repeated until it is consistent with the weight of the prior.
@@ -153,7 +153,7 @@ def least_squares(
         max_iterations: maximum number of iterations.
 
     Returns:
-        The fit.
+        The fit with covariance, intervals and identifiability of the parameters.
 
     Raises:
         InputError: shapes do not match, scales are not positive, a residual is not finite, there
@@ -242,7 +242,7 @@ def classify_scaled_parameters(
 
 
 def list_identifiability(identifiability: Identifiability) -> dict[str, list[str]]:
-    """Return lists of identifiable parameters, combinations and unidentifiable parameters.
+    """List the parameters by identifiability: identifiable alone, in combinations, or not at all.
 
     Args:
         identifiability: identifiability of the parameters.
@@ -286,7 +286,7 @@ class CombinationEstimate:
 
 
 def estimate_combinations(fit: ParameterFit) -> tuple[CombinationEstimate, ...]:
-    """Return all identifiable combinations with their intervals.
+    """Compute values and 95 % intervals of all identifiable parameters and combinations of a fit.
 
     A parameter that is identifiable only in a combination has no separate interval: its part of the
     combination depends on the prior, or on the held parameters.
@@ -311,7 +311,7 @@ def estimate_combinations(fit: ParameterFit) -> tuple[CombinationEstimate, ...]:
 
 @dataclass(frozen=True)
 class _SearchState:
-    """State of a search at its end."""
+    """Parameters `x` (p,) at the end of a search, with counters of its steps and its outcome."""
 
     x: np.ndarray
     iterations: int = 0
@@ -340,7 +340,7 @@ class _Problem:
         self.groups = np.arange(p) if self.hits is None else _group_columns(self.hits)
 
     def residual_vector(self, x: np.ndarray) -> np.ndarray:
-        """Return the residual (m,)."""
+        """Return the residuals (m,) at parameters x (p,); raise InputError if one is not finite."""
         rows = np.asarray(self.residual(x))
         if np.iscomplexobj(x):
             return rows
@@ -357,7 +357,7 @@ class _Problem:
         return self.residual_vector(x), self.jacobian(x)
 
     def jacobian(self, x: np.ndarray) -> np.ndarray:
-        """Return the dense Jacobian (m, p)."""
+        """Return the dense Jacobian (m, p), given, or by complex steps or central differences."""
         if callable(self.jac):
             return _to_dense(self.jac(x))
         if self.jac == "cs":
@@ -370,7 +370,10 @@ class _Problem:
         return self._central_differences(x)
 
     def _central_differences(self, x: np.ndarray) -> np.ndarray:
-        """Return central differences; parameters without a common equation are moved together."""
+        """Return the Jacobian (m, p) by central differences.
+
+        Parameters that affect no common equation are changed at the same time, which saves evaluations.
+        """
         steps = _CENTRAL_STEP * np.maximum(np.abs(x), self.scales)
         columns: list[np.ndarray] = [np.empty(0)] * len(x)
         for group in range(self.groups.max() + 1):
@@ -387,7 +390,7 @@ def _to_dense(matrix) -> np.ndarray:
 
 
 def _group_columns(hits: np.ndarray) -> np.ndarray:
-    """Return the group number (p,) of each column; columns of a group have no row in common."""
+    """Assign the columns of a mask (m, p) to groups without a common row; return group numbers (p,)."""
     groups: list[int] = []
     taken: list[np.ndarray] = []
     for column in hits.T:
@@ -400,7 +403,10 @@ def _group_columns(hits: np.ndarray) -> np.ndarray:
 
 
 class _ScaledProblem:
-    """A weighted problem in its free, scaled parameters, with one extra row per prior."""
+    """A least-squares problem in its free parameters over their scales, with weights and priors.
+
+    Each free parameter with a prior adds one row to the residuals.
+    """
 
     def __init__(self, problem: _Problem, weight, prior: Prior | None, free) -> None:
         self.problem, self.weight, self.free = problem, weight, np.flatnonzero(free)
@@ -414,7 +420,7 @@ class _ScaledProblem:
         self.has_prior = self.prior_weight > 0.0
 
     def all_parameters(self, base: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Return all parameters (p,) from base values and scaled steps of the free parameters."""
+        """Return base values (p,) with steps `u`, in units of the scales, added to the free parameters."""
         x = base.copy()
         x[self.free] += u * self.scales
         return x
@@ -425,18 +431,21 @@ class _ScaledProblem:
         return np.concatenate([self.problem.residual_vector(x) * self.weight, away[self.has_prior]])
 
     def weighted_jacobian(self, matrix: np.ndarray) -> np.ndarray:
-        """Return the Jacobian of `rows` by the scaled free parameters."""
+        """Convert a Jacobian (m, p) to that of `weighted_residual` by the scaled free parameters."""
         weighted = matrix[:, self.free] * self.weight[:, None] * self.scales
         return np.vstack([weighted, np.diag(self.prior_weight)[self.has_prior]])
 
     def effective_parameters(self, matrix: np.ndarray) -> float:
-        """Return the effective number of parameters determined by the equations, not the prior."""
+        """Return the effective number of parameters that the equations determine rather than the prior.
+
+        It is the trace of the hat matrix over the rows of the equations with the Jacobian `matrix` (m, p).
+        """
         whole = self.weighted_jacobian(matrix)
         q = np.linalg.qr(whole)[0][: len(matrix)]
         return float(np.sum(q**2))
 
     def solve(self, begin: _SearchState, truncation: Sequence[float] | None, max_steps: int) -> _SearchState:
-        """Continue the search from the end of a previous one."""
+        """Search for the minimum from the end of a previous search, with or without truncation."""
         found = (
             _minimize_truncated(self, begin, truncation, max_steps)
             if truncation
@@ -445,7 +454,7 @@ class _ScaledProblem:
         return replace(found, rounds=begin.rounds + 1)
 
     def covariance(self, matrix: np.ndarray, truncation) -> tuple[np.ndarray, int]:
-        """Return the covariance (p, p), zero for held parameters, and the rank."""
+        """Return the covariance (p, p) for the Jacobian `matrix`, zero for held parameters, and the rank."""
         whole = self.weighted_jacobian(matrix)
         _, s, v = np.linalg.svd(whole, full_matrices=False)
         cut = truncation[-1] if truncation else len(self.free) * np.finfo(float).eps
@@ -475,7 +484,9 @@ def _minimize_with_scipy(search: _ScaledProblem, begin: _SearchState, max_steps:
 def _minimize_truncated(
     search: _ScaledProblem, begin: _SearchState, thresholds: Sequence[float], max_steps: int
 ) -> _SearchState:
-    """Run Gauss-Newton steps with truncated singular values; the threshold is lowered in steps.
+    """Minimise by Gauss-Newton steps that omit directions with small singular values.
+
+    The threshold of a small singular value starts high and is lowered after each convergence.
 
     A step that does not reduce the residual is halved. If halving fails, or a step is small, the
     next threshold follows.
@@ -516,7 +527,7 @@ def _equation_weights(sigma: float | np.ndarray | None, m: int) -> np.ndarray:
 
 
 def _representative_mask(identifiability: Identifiability) -> np.ndarray:
-    """Return (p,) whether each parameter represents an identifiable combination."""
+    """Return a mask (p,) of the parameters that are estimated, one for each identifiable combination."""
     return np.isin(np.arange(len(identifiability.names)), identifiability.base)
 
 
@@ -538,7 +549,7 @@ def _classify_in_noise(matrix: np.ndarray, problem: _Problem, identifiability: I
 
 
 def _remove_scales(identifiability: Identifiability, sizes: np.ndarray) -> Identifiability:
-    """Convert a classification of scaled parameters to one of unscaled parameters."""
+    """Convert combinations of parameters over their sizes to combinations of the parameters themselves."""
     combination = identifiability.combination * sizes[identifiability.base][:, None] / sizes
     return Identifiability(
         identifiability.names,

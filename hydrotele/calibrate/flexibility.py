@@ -41,7 +41,7 @@ class Flexibility(NamedTuple):
 
 
 def joint_loads(loop: CalibrationLoop, poses: Poses, fit: ArmFit) -> np.ndarray:
-    """Return the lever arm of the ball about each sensed joint of the calibrator, relative to its reach.
+    """Compute the relative load of each calibrator joint: horizontal distance to the ball over maximum reach.
 
     Returns:
         (M, S) relative loads from 0 to 1 for the M poses of one stage (one moving link) and the S sensed joints.
@@ -68,7 +68,11 @@ def joint_loads(loop: CalibrationLoop, poses: Poses, fit: ArmFit) -> np.ndarray:
 
 
 def add_flexibility(loop: CalibrationLoop, poses: Poses, fit: ArmFit, flexibility: np.ndarray) -> Poses:
-    """Return the poses with sensor standard deviations (M, S) that include joint flexibility."""
+    """Return poses whose sensor noise includes the bending of the calibrator's joints under load.
+
+    The noise `sigma` (M, S) is the sensors' own and the flexibility (S,) [rad] times the relative load,
+    added as squares.
+    """
     loads = joint_loads(loop, poses, fit)
     return replace(poses, sigma=np.hypot(poses.sigma, flexibility * loads))
 
@@ -116,7 +120,7 @@ def estimate_flexibility(loop: CalibrationLoop, stages: Sequence[Poses], fit: Ar
 def refit_with_flexibility(
     loop: CalibrationLoop, stages: Sequence[Poses], fit: ArmFit, refit: Refit
 ) -> tuple[ArmFit, Flexibility]:
-    """Estimate flexibility and arm parameters alternately.
+    """Estimate the calibrator's joint flexibility and the arm parameters in turn, three times.
 
     Args:
         loop: the nominal chain.

@@ -53,7 +53,9 @@ _MIN_NULL_COMPONENT = 1e-4  # minimum component of a null direction for a parame
 
 @dataclass(frozen=True)
 class PoseEquations:
-    """Whitened equations of a measurement: N poses, six each, for q of p parameters.
+    """Equations of leg readings at N measured poses, six each, for q free of p error parameters.
+
+    The residuals are predicted minus measured leg readings, scaled (whitened) to unit covariance.
 
     Attributes:
         model: error model.
@@ -80,7 +82,7 @@ class PoseEquations:
         return whole
 
     def residuals(self, values: np.ndarray) -> np.ndarray:
-        """Return the whitened residuals of many parameter sets.
+        """Compute the whitened residuals, predicted minus measured leg readings, of W parameter sets.
 
         Args:
             values: (W, q) free errors.
@@ -94,11 +96,17 @@ class PoseEquations:
         return np.matmul(self.whitening, away[..., None])[..., 0].reshape(len(away), -1)
 
     def negative_log_likelihood(self, values: np.ndarray) -> np.ndarray:
-        """Return half the sum of squared whitened residuals (W,), minus the log likelihood."""
+        """Return minus the log likelihood (W,) of W parameter sets (W, q), up to a constant.
+
+        It is half the sum of squared whitened residuals.
+        """
         return 0.5 * np.einsum("wr,wr->w", *(2 * [self.residuals(values)]))
 
     def jacobian(self, values: np.ndarray) -> np.ndarray:
-        """Return the derivatives (6 N, q) of the whitened residuals by central differences."""
+        """Return the derivatives (6 N, q) of the whitened residuals at free errors (q,).
+
+        They are computed by central differences.
+        """
         steps = np.diag(_DIFFERENCE_STEP * self.scales)
         both = self.residuals(np.vstack([values + steps, values - steps]))
         q = len(self.names)
@@ -106,7 +114,7 @@ class PoseEquations:
 
 
 def build_equations(model: ErrorModel, measurement: Measurement, names: Sequence[str] | None = None) -> PoseEquations:
-    """Build the equations of a measurement.
+    """Build the equations that compare measured leg readings with those predicted by an error model.
 
     Args:
         model: error model.
@@ -145,7 +153,7 @@ class Redundancy(NamedTuple):
 
 
 def find_redundancy(eq: PoseEquations, values: np.ndarray | None = None) -> Redundancy:
-    """Find redundant parameters of equations from singular values and QR of the Jacobian.
+    """Find parameters that the measured poses cannot separate, from the Jacobian's null space and QR.
 
     Args:
         eq: the equations.
@@ -178,7 +186,7 @@ def find_redundancy(eq: PoseEquations, values: np.ndarray | None = None) -> Redu
 
 
 def null_directions(identifiability: Identifiability) -> np.ndarray:
-    """Return orthonormal parameter changes (null, p) that leave all base parameters unchanged."""
+    """Return orthonormal parameter changes (null, p) that change none of the identifiable combinations."""
     _, s, v = np.linalg.svd(identifiability.combination, full_matrices=True)
     return v[int(np.sum(s > 1e-9 * s[0])) :] if len(identifiability.base) else np.eye(len(identifiability.names))
 
@@ -207,11 +215,11 @@ def _explain_redundancy(eq: PoseEquations, identifiability: Identifiability, hel
 
 
 class PoseErrors(NamedTuple):
-    """Errors of predicted poses.
+    """Errors of N predicted platform poses relative to the measured ones.
 
     Attributes:
-        position: (N,) distances [m].
-        orientation: (N,) angles [rad].
+        position: (N,) distances of the platform's origin [m].
+        orientation: (N,) angles of the relative rotation [rad].
     """
 
     position: np.ndarray
@@ -228,7 +236,9 @@ class PoseErrors(NamedTuple):
 
 
 def pose_errors(robot: HybridRobot, measurement: Measurement) -> PoseErrors:
-    """Compare the forward kinematics of the readings with the measured poses.
+    """Compute the errors of platform poses computed from joint and leg readings by forward kinematics.
+
+    They are relative to the measured poses.
 
     Args:
         robot: nominal or calibrated robot.
@@ -273,7 +283,7 @@ class Calibration:
 
     @cached_property
     def leave_one_out_errors(self) -> PoseErrors:
-        """Errors of each pose predicted by a calibration without this pose."""
+        """Errors of each pose, predicted by a calibration to all other poses."""
         return _leave_one_out_errors(self.equations, self.fit)
 
     @property
@@ -326,10 +336,11 @@ def calibrate_hybrid_robot(
 
 def calibrate_best_model(robot: HybridRobot, measurement: Measurement, names: Sequence[str] | None = None
          ) -> Calibration:  # fmt: skip
-    """Calibrate with both error models; return the one that predicts left-out poses better.
+    """Calibrate with both error models; return the calibration that predicts left-out poses better.
 
-    `dh` is preferred unless `poe` is better by more than 5 %. A robot specified by its axes has the
-    `poe` model only.
+    The models are `dh` (errors of D-H rows) and `poe` (errors of axis lines). `dh` is
+    preferred unless `poe` is better by more than 5 %. A robot specified by its axes has the `poe`
+    model only.
 
     Args:
         robot: nominal robot.
@@ -384,7 +395,7 @@ def _fit_equations(eq: PoseEquations, prior: Prior | None) -> ParameterFit:
 
 
 def _check_poses(eq: PoseEquations) -> None:
-    """Raise an error if there are not more equations than independent parameters."""
+    """Raise InputError unless the different poses give more equations than independent parameters."""
     m, q = eq.measurement, len(eq.names)
     matrix = eq.jacobian(np.zeros(q)) * eq.scales
     rank = len(classify_scaled_parameters(matrix, eq.names, np.ones(q)).base)
@@ -399,7 +410,7 @@ def _check_poses(eq: PoseEquations) -> None:
 
 
 def _find_inconsistent_pose(eq: PoseEquations, fit: ParameterFit) -> int | None:
-    """Return the index of the pose whose residual is not noise, or None.
+    """Find the pose whose residual is least likely to be noise; return None if all can be noise.
 
     The influence of each pose on the fit is removed from its six residuals. Relative to the noise
     of the other poses, their mean square follows an F(6, rest) distribution.
@@ -430,7 +441,7 @@ def _find_inconsistent_pose(eq: PoseEquations, fit: ParameterFit) -> int | None:
 
 
 def _leave_one_out_errors(eq: PoseEquations, fit: ParameterFit) -> PoseErrors:
-    """Return each pose's prediction error by a calibration without it, for at most 200 poses.
+    """Compute the error of each pose, predicted by a calibration without it, for at most 200 poses.
 
     The equations are linear over changes smaller than the parameters' standard deviations. With
     the Jacobian Q R, the six rows Q_k and the residuals r_k of the pose, the change of parameters
@@ -459,7 +470,7 @@ def _leave_one_out_errors(eq: PoseEquations, fit: ParameterFit) -> PoseErrors:
 
 
 def fitted_equations(calibration: Calibration) -> PoseEquations:
-    """Return the equations of a calibration restricted to its fitted parameters."""
+    """Return a calibration's equations with only the parameters that were fitted, without held ones."""
     eq, held = calibration.equations, calibration.fit.held
     return replace(eq, names=tuple(n for n, h in zip(eq.names, held, strict=True) if not h))
 
@@ -467,7 +478,7 @@ def fitted_equations(calibration: Calibration) -> PoseEquations:
 def select_informative_poses(
     model: ErrorModel, candidates: Measurement, count: int, criterion: Criterion = "D"
 ) -> np.ndarray:
-    """Select the most informative poses from candidates.
+    """Select the candidate poses whose measurement determines the error parameters best.
 
     Args:
         model: error model.

@@ -138,7 +138,7 @@ def measurement_from_wires(
     robot: HybridRobot, joints: np.ndarray, legs: np.ndarray, lengths: np.ndarray, wires: WireGeometry,
     noise: Mapping[str, float], source: str,
 ) -> Measurement:  # fmt: skip
-    """Build a measurement from readings of carriage, legs and wires.
+    """Build a measurement whose platform poses are computed from six wire lengths per pose.
 
     Args:
         robot: nominal robot; its forward kinematics select the solution of the wire equations.
@@ -150,8 +150,8 @@ def measurement_from_wires(
         source: name of the measurement, for messages.
 
     Raises:
-        NoIntersection: the wires do not meet.
-        Unreachable: the legs do not fit this robot.
+        NoIntersectionError: the wires do not meet.
+        UnreachableError: the legs do not fit this robot.
     """
     pose = pose_from_wires(wires, lengths, forward_kinematics(robot, joints, legs))
     stated = SensorNoise(**noise)
@@ -162,16 +162,16 @@ def measurement_from_wires(
 
 
 def find_robot_file(folder: Path) -> Path | None:
-    """Return the path of the nominal robot in a measurement folder, or None."""
+    """Return the path of `robot.yaml`, the nominal robot, in a measurement folder; None without it."""
     path = folder / "robot.yaml"
     return path if path.is_file() else None
 
 
 def read_measurement(folder: Path, robot: HybridRobot) -> tuple[Measurement, Measurement | None]:
-    """Read a folder of measurements.
+    """Read the measured poses of a folder: those for calibration and, if present, for validation.
 
     Args:
-        folder: folder in the format of this module's docstring.
+        folder: folder with `poses.csv` or `.parquet`, and optionally `heldout` and `measurement.yaml`.
         robot: nominal robot.
 
     Returns:
@@ -231,7 +231,7 @@ def _read_poses(file: Path, facts: MeasurementSpec, robot: HybridRobot) -> Measu
 
 
 def _read_columns(table: Table, robot: HybridRobot, facts: MeasurementSpec) -> dict[str, np.ndarray]:
-    """Return the columns by name in SI units, after checks of names, units and values."""
+    """Return the columns of a pose table by name in SI units; raise InputError for invalid ones."""
     joints = dict(zip((f"joint.{n}" for n in robot.joints), robot.kinds, strict=True))
     legs, wires = ([f"{what}.{k}" for k in range(1, LEG_COUNT + 1)] for what in ("leg", "wire"))
     poses = [f"pose.{c}" for c in POSE_COORDINATES]
@@ -315,7 +315,11 @@ def _pose_covariance(table, columns, noise, count) -> tuple[np.ndarray, bool]:
 
 
 def _leg_residual_covariance(robot: HybridRobot, joints, pose: PlatformPose, of_pose: np.ndarray, noise: SensorNoise):
-    """Return the covariance (N, 6, 6) of leg readings minus predictions, from all sensors."""
+    """Return the covariance (N, 6, 6) of measured minus predicted leg readings [m^2].
+
+    It adds the noise of the legs, of the carriage joints, and of the measured pose with covariance
+    `of_pose` (N, 6, 6).
+    """
     by_pose = leg_jacobian(robot, joints, pose)
     by_joint = np.empty((len(joints), LEG_COUNT, len(robot.joints)))
     for k in range(len(robot.joints)):
@@ -333,7 +337,7 @@ def _leg_residual_covariance(robot: HybridRobot, joints, pose: PlatformPose, of_
 
 
 def _check_covariance(file: Path, covariance: np.ndarray) -> None:
-    """Raise an error if a stated noise is below the resolution of a length, or not finite."""
+    """Raise InputError if the stated noise gives the legs a standard deviation outside 1e-9 to 1 m."""
     finite = np.isfinite(covariance).all()
     smallest = float(np.linalg.eigvalsh(covariance)[:, 0].min()) if finite else np.inf
     if not _MIN_NOISE**2 <= smallest <= _MAX_NOISE**2:
@@ -346,7 +350,10 @@ def _check_covariance(file: Path, covariance: np.ndarray) -> None:
 
 
 def _check_robot(table: Table, robot: HybridRobot, joints, legs, pose: PlatformPose) -> None:
-    """Raise an error if the leg readings do not fit the nominal robot at the measured poses."""
+    """Raise InputError if the leg readings differ from the nominal robot's at the measured poses.
+
+    The limit is a median difference of 0.05 m; then the data are of another robot, unit or frame.
+    """
     away = np.abs(leg_readings(robot, joints, pose) - legs)
     if np.median(away) > _MAX_LEG_DIFFERENCE:
         row = int(np.argmax(away.max(axis=1)))
@@ -361,7 +368,7 @@ def save_measurement(
     folder: Path, stem: str, robot: HybridRobot, joints: np.ndarray, legs: np.ndarray,
     pose: PlatformPose | None = None, wires: np.ndarray | None = None,
 ) -> None:  # fmt: skip
-    """Write a table of poses in mm and degrees, in the format of `read_measurement`.
+    """Write measured poses as a CSV table in mm and degrees, which `read_measurement` reads.
 
     Args:
         folder: existing folder.
@@ -391,7 +398,7 @@ def save_measurement(
 
 
 def measurement_text(robot: str, wires: WireGeometry | None, noise: Mapping[str, float]) -> str:
-    """Return the text of `measurement.yaml`, with lengths in mm and angles in degrees.
+    """Return the YAML text of `measurement.yaml`: robot, wires and noise, in mm and degrees.
 
     Args:
         robot: name of the robot.

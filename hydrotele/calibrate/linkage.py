@@ -97,7 +97,9 @@ def piston_displacement(values: np.ndarray, direction: int, angle: np.ndarray) -
 
 
 def identify_linkage(machine: Machine, strokes: AxisStrokes, fixed: Sequence[str] | None = None) -> LinkageFit:
-    """Identify the triangle of a cylinder linkage.
+    """Identify the triangle of a cylinder linkage by fitting piston displacements over joint angles.
+
+    Its parameters are both pin distances, the angle offset and the closed length of the cylinder.
 
     Args:
         machine: the nominal machine.
@@ -110,7 +112,7 @@ def identify_linkage(machine: Machine, strokes: AxisStrokes, fixed: Sequence[str
         The fit, validated on every fifth sample, which is not fitted.
 
     Raises:
-        InputError: the axis has no triangle, or does not move enough.
+        InputError: the axis has no cylinder across its joint, or moves by less than 5 deg.
     """
     linkage = axis_linkage(machine, strokes.axis)
     cylinder = machine.axes[strokes.axis].cylinder
@@ -163,7 +165,10 @@ def identify_linkage(machine: Machine, strokes: AxisStrokes, fixed: Sequence[str
 
 
 def linkage_parameters(found: LinkageFit) -> np.ndarray:
-    """Return all parameters (4,) in the order of `PARAMETER_NAMES`; fixed ones are nominal."""
+    """Return all parameters (4,) of a fitted linkage: angle offset, lower pin, closed length, upper pin.
+
+    Parameters that were not fitted are nominal.
+    """
     values = found.nominal.copy()
     for name, value in zip(found.fit.names, found.fit.values, strict=True):
         values[PARAMETER_NAMES.index(name)] = value
@@ -171,7 +176,7 @@ def linkage_parameters(found: LinkageFit) -> np.ndarray:
 
 
 def machine_with_linkage(machine: Machine, found: LinkageFit) -> Machine:
-    """Return a machine with the identified pin distances, pin angle and closed length.
+    """Return a machine whose cylinder pins and closed length are those of an identified linkage.
 
     The base pin keeps its direction from the joint. The rod pin is rotated about the joint axis by
     the change of the angle offset.
@@ -210,7 +215,7 @@ def machine_with_linkage(machine: Machine, found: LinkageFit) -> Machine:
 
 
 def identify_joint_angles(fit: ArmFit, poses: Poses) -> np.ndarray:
-    """Compute the angle of the moving joint from the calibrator's readings alone.
+    """Compute the moving joint's angle at every pose from the calibrator's readings alone.
 
     The ball's direction relative to the joint's axis rotates opposite to the joint. Its zero is
     known up to the parameters of the links inside; the linkage's angle offset absorbs this error.

@@ -74,11 +74,11 @@ class CalibrationLoop:
         return self.links.index(link), _KIND_COLUMNS[kind]
 
     def value(self, name: str) -> float:
-        """Return a parameter by name [rad] or [m]."""
+        """Return the value of a link parameter by name, such as `a.boom` [rad] or [m]."""
         return float(self.values[self.parameter_index(name)])
 
     def with_values(self, parameters: dict[str, float]) -> "CalibrationLoop":
-        """Return the chain with some parameters replaced."""
+        """Return the chain with some link parameters, given by name, replaced."""
         values = self.values.copy()
         for name, number in parameters.items():
             values[self.parameter_index(name)] = number
@@ -86,17 +86,17 @@ class CalibrationLoop:
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Names of all parameters, link by link."""
+        """Names of all link parameters, such as `a.boom`, link by link."""
         return tuple(f"{kind}.{link}" for link in self.links for kind in PARAMETER_KINDS)
 
 
 def unit_of(name: str) -> str:
-    """Return the unit of a parameter: `m` for a, d, p_xy and p_z, otherwise `rad`."""
+    """Return the unit of a parameter such as `a.boom`: `m` for a, d, p_xy and p_z, otherwise `rad`."""
     return "m" if name.partition(".")[0] in ("a", "d", "p_xy", "p_z") else "rad"
 
 
 def link_chain(values: np.ndarray) -> SerialChain:
-    """Return the serial chain of consecutive links; its joint coordinates include the offsets.
+    """Build the serial chain of consecutive links; its joint coordinates are angles with offsets.
 
     Args:
         values: (k, 5) rows of `CalibrationLoop.values`; the offsets are not used.
@@ -129,7 +129,7 @@ _CHAIN_TO_KINDS = [
 
 
 def frame_after_links(loop: CalibrationLoop, count: int, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the frame at the end of the first links.
+    """Compute the frame at the end of the first `count` links for M poses.
 
     Args:
         loop: the chain.
@@ -143,13 +143,24 @@ def frame_after_links(loop: CalibrationLoop, count: int, theta: np.ndarray) -> t
 
 
 def ball_position(loop: CalibrationLoop, first: int, theta: np.ndarray) -> np.ndarray:
-    """Return the ball position (M, 3) [m] as `ball_position_and_rates` does, without derivatives."""
+    """Compute the ball position in the frame of joint axis `first`, without that joint's angle.
+
+    Args:
+        loop: the chain.
+        first: index of the joint's link in the chain, from 0.
+        theta: (M, N - first - 1) angles of the joints beyond it, with their offsets [rad].
+
+    Returns:
+        (M, 3) positions [m], z along the axis.
+    """
     angles = np.concatenate([np.zeros((len(theta), 1)), theta], axis=1)
     return chain_poses(link_chain(loop.values[first:]), angles).position
 
 
 def ball_position_and_rates(loop: CalibrationLoop, first: int, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ball position relative to a joint axis, without that joint's angle, and its rates.
+    """Compute the ball position in the frame of a joint axis, and its derivatives by link parameters.
+
+    The joint's own angle is taken as 0.
 
     `s = Tx(a_i) Rx(alpha_i) Ry(beta_i) A_(i+1) ... A_N [0 0 0 1]'` of K Eqs 3.23 and 3.24, with
     `d_i` added to its z.
@@ -170,7 +181,7 @@ def ball_position_and_rates(loop: CalibrationLoop, first: int, theta: np.ndarray
 
 
 def closure_error(loop: CalibrationLoop, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the closure error of the chain and its derivatives by the joint angles.
+    """Compute the distance between chain end and ball, and its derivatives by the joint angles.
 
     Args:
         loop: the chain.
@@ -218,7 +229,11 @@ def close_chain(
 
 
 def _close_by_newton(loop: CalibrationLoop, theta: np.ndarray, free: list[int]) -> np.ndarray:
-    """Close all rows in place; return whether each row closes."""
+    """Change the `free` angles of theta (M, N) in place so that the chain ends at the ball.
+
+    Returns:
+        (M,) whether each row closes to 1e-9 m.
+    """
     for _ in range(40):
         gap, by = closure_error(loop, theta)
         if np.abs(gap).max() < 1.0e-12:
@@ -297,7 +312,14 @@ def _ancestors(machine: Machine, link: str) -> list[str]:
 def _denavit_hartenberg(
     directions: np.ndarray, points: np.ndarray, tip: np.ndarray, parallel: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return parameters (N, 5) of axes through points, and the origin of frame 0 (3,)."""
+    """Compute the D-H parameters (N, 5) of N joint axes, and the origin of frame 0 (3,) [m].
+
+    Args:
+        directions: (N, 3) unit vectors of the axes in the machine's frame.
+        points: (N, 3) points on the axes [m].
+        tip: (3,) end of the chain, the ball [m].
+        parallel: (N,) whether an axis is nominally parallel to the next one; then beta is used.
+    """
     count = len(directions)
     values = np.zeros((count, 5))
     foot, _ = _common_normal_feet(points[0], directions[0], points[1], directions[1])
@@ -339,7 +361,10 @@ def _denavit_hartenberg(
 
 
 def _perpendicular_axes(way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return two unit vectors perpendicular to a direction: one near the machine's x, and y."""
+    """Return two unit vectors perpendicular to a direction `way` and to each other.
+
+    The first is the machine's x axis (or z axis, if the direction is near x) projected across it.
+    """
     x = np.array([1.0, 0.0, 0.0]) if abs(way[0]) < 0.9 else np.array([0.0, 0.0, 1.0])
     x = x - way * (way @ x)
     x /= np.linalg.norm(x)
@@ -347,7 +372,7 @@ def _perpendicular_axes(way: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _common_normal_feet(p, u, q, v) -> tuple[np.ndarray, np.ndarray]:
-    """Return the feet of the common normal of the lines p + s u and q + t v."""
+    """Return the points of the lines p + s u and q + t v that are closest to each other."""
     between, cosine = q - p, u @ v
     square = 1.0 - cosine**2
     s = (between @ u - cosine * (between @ v)) / square
@@ -356,7 +381,7 @@ def _common_normal_feet(p, u, q, v) -> tuple[np.ndarray, np.ndarray]:
 
 
 def solve_calibrator_angles(loop: CalibrationLoop, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find the last three joint angles that close the chain, with a hanging elbow.
+    """Compute the calibrator's three joint angles that put the chain's end at the ball, elbow hanging.
 
     The closed-form solution for a yoke, twist and elbow with axes that intersect at right angles is
     the start of Newton's method for the actual chain.

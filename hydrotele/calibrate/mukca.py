@@ -47,7 +47,7 @@ _MAX_ROUNDS, _SIZE_TOLERANCE = 200, 1e-4
 
 @dataclass(frozen=True)
 class ErrorSizes:
-    """Standard deviations of the parameters by kind, and of the noise.
+    """Estimated standard deviations of the parameters' priors (their sizes) and of the noise.
 
     Attributes:
         std: (p,) prior standard deviation of each parameter.
@@ -67,9 +67,9 @@ def estimate_sizes(
     degrees_of_freedom: float, noise: float, known: np.ndarray | None = None,
     known_right_hand_side: np.ndarray | None = None, min_noise: float = 0.0,
 ) -> ErrorSizes:  # fmt: skip
-    """Estimate the standard deviation of each kind of parameters by maximum evidence.
+    """Estimate the prior standard deviation of each kind of parameters, and the noise, by maximum evidence.
 
-    For `rest = matrix x + error` with x ~ N(0, s_kind^2), iterates the fixed point
+    For `right_hand_side = matrix x + error` with x ~ N(0, s_kind^2), iterates the fixed point
     `s^2 = sum x^2 / sum g`, `noise^2 = |error|^2 / (freedom - sum g)` with `g = 1 - S_ii / s^2`,
     the fraction of a parameter determined by the measurements, and S its covariance.
 
@@ -311,29 +311,32 @@ class _SocketProblem:
         return 3 * (len(self.joints) - len(self.sockets))
 
     def socket_means(self, values: np.ndarray) -> np.ndarray:
-        """Return the mean of rows (n, ...) over every socket."""
+        """Return the mean of each socket's rows, (sockets, ...) from (n, ...)."""
         total = np.add.reduceat(values, self.first, axis=0)
         return total / self.count.reshape(-1, *[1] * (values.ndim - 1))
 
     def predict_balls(self, x: np.ndarray) -> np.ndarray:
-        """Return the predicted ball positions (n, 3)."""
+        """Compute the ball positions (n, 3) [m] of all rows for parameters x (p,)."""
         p = len(self.chain.nominal_values)
         joints = self.joints + self.basis @ x[p:] if self.extra else self.joints
         return chain_poses(self.chain, joints, x[:p]).position
 
     def subtract_means(self, balls: np.ndarray) -> np.ndarray:
-        """Return the balls (n, 3) relative to their socket's mean."""
+        """Return ball positions (n, 3) minus the mean position of their socket [m]."""
         return balls - self.socket_means(balls)[self.index]
 
     def residual(self, x: np.ndarray) -> np.ndarray:
-        """Return the balls relative to their means, then the socket distance errors [m]."""
+        """Return the residuals [m]: ball positions minus their socket's mean, then socket distance errors.
+
+        A distance error is the distance of two neighbouring means minus the stated one.
+        """
         balls = self.predict_balls(x)
         means = self.socket_means(balls)
         gaps = [np.linalg.norm(means[a] - means[b]) - self.options.distance for a, b in self.pairs]
         return np.concatenate([(balls - means[self.index]).ravel(), gaps])
 
     def jacobian(self, x: np.ndarray) -> np.ndarray:
-        """Return the derivatives of `residual`."""
+        """Return the derivatives (equations, p) of the ball positions and socket distances in `residual`."""
         p = len(self.chain.nominal_values)
         joints = self.joints + self.basis @ x[p:] if self.extra else self.joints
         rates = chain_poses_and_rates(self.chain, joints, x[:p])
@@ -349,14 +352,14 @@ class _SocketProblem:
         return np.vstack(rows)
 
     def equation_deviations(self, noise: float) -> np.ndarray:
-        """Return the standard deviation of every equation."""
+        """Return the standard deviation of each equation of `residual` [m] for ball noise `noise` [m]."""
         means = [1.0 / self.count[a] + 1.0 / self.count[b] for a, b in self.pairs]
         gaps = np.sqrt(self.options.accuracy**2 + noise**2 * np.array(means))
         return np.concatenate([np.full(3 * len(self.joints), noise), gaps])
 
 
 def choose_robot(sockets: Sequence[Socket], options: SocketOptions) -> tuple[SerialRobot, dict[str, float]]:
-    """Select the shipped robot whose nominal chain has the smallest scatter of the ball.
+    """Select the shipped robot that puts the ball most consistently at one position per socket.
 
     Args:
         sockets: the measurements.
@@ -388,7 +391,7 @@ def choose_robot(sockets: Sequence[Socket], options: SocketOptions) -> tuple[Ser
 
 
 def check_robot(robot: SerialRobot, sockets: Sequence[Socket], options: SocketOptions | None = None) -> None:
-    """Raise an error if the measurements do not fit a robot.
+    """Raise InputError if a robot's ball positions scatter too much within the sockets.
 
     The scatter of the ball is compared with its travel if the joints moved independently. In a
     socket, the motions of the joints cancel; with another unit, sign or order they do not.
@@ -482,7 +485,7 @@ def calibrate_sockets(
 
 
 def place_frames_near(robot: SerialRobot, sockets: Sequence[Socket]) -> SerialRobot:
-    """Return the same robot without frames that are farther along their joint axes than the robot reaches.
+    """Return the same robot with far joint frames moved along their axes to within the robot's reach.
 
     A frame may lie anywhere on its axis. The factory calibration of robots with parallel axes puts
     frames hundreds of metres away, where a small tilt is a large displacement: the equations are
@@ -515,7 +518,7 @@ def _median_reach(problem: _SocketProblem) -> float:
 
 
 def evaluate_robot(robot: SerialRobot, sockets: Sequence[Socket]) -> SocketErrors:
-    """Evaluate the predictions of a robot at sockets, without any fit.
+    """Compute how far a robot's ball positions are from their socket means, without any fit.
 
     Args:
         robot: nominal or calibrated robot, with its corrections.
@@ -535,7 +538,7 @@ def predict_held_out_places(
     names: Sequence[str],
     options: SocketOptions | None = None,
 ) -> tuple[HeldOutPrediction, ...]:
-    """Predict each named place, or socket, by a calibration on all others.
+    """Cross-validate: evaluate each named place, or socket, with a robot calibrated on all others.
 
     Args:
         robot: nominal robot.
@@ -555,7 +558,7 @@ def predict_held_out_places(
 def predict_held_out_place(
     robot: SerialRobot, sockets: Sequence[Socket], name: str, options: SocketOptions | None = None
 ) -> tuple[HeldOutPrediction, SocketCalibration]:
-    """Predict one place, or socket, by a calibration on all others.
+    """Evaluate one place, or socket, with a robot that was calibrated on all other sockets.
 
     Args:
         robot: nominal robot.
@@ -590,7 +593,10 @@ def predict_held_out_place(
 
 
 def held_out_names(sockets: Sequence[Socket]) -> tuple[str, ...]:
-    """Return the places if there are several, else the sockets if several, else nothing."""
+    """Return the names to leave out in turn for validation.
+
+    They are the places if there are several, otherwise the sockets; empty for a single socket.
+    """
     places = place_names(sockets)
     if len(places) > 1:
         return places
@@ -599,14 +605,17 @@ def held_out_names(sockets: Sequence[Socket]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class _FitState:
-    """Parameter values with sizes and noise."""
+    """Parameter values `x` (p,) with their prior standard deviations (sizes) and the noise."""
 
     x: np.ndarray
     sizes: ErrorSizes
 
 
 def _iterate_sizes(problem: _SocketProblem, begin: _FitState | None) -> _FitState:
-    """Iterate parameters, sizes and noise until they are consistent."""
+    """Alternate between a fit of the parameters and an estimate of prior sizes and noise.
+
+    It stops when the noise changes by less than 0.1 %.
+    """
     kinds = _parameter_kinds(problem)
     if begin is None:
         start = np.array([_START_SAG_SIZE if k.startswith("sag") else _START_SIZE for k in kinds])
@@ -637,7 +646,7 @@ def _iterate_sizes(problem: _SocketProblem, begin: _FitState | None) -> _FitStat
 
 
 def _final_fit(problem: _SocketProblem, state: _FitState) -> ParameterFit:
-    """Return the final fit with intervals and identifiability at the estimated noise."""
+    """Fit the parameters with the estimated noise and prior sizes, and classify their identifiability."""
     sigma = problem.equation_deviations(state.sizes.noise)
     fit = least_squares(
         problem.residual, state.x, problem.names, np.maximum(state.sizes.std, 1e-12), sigma=sigma,
@@ -652,7 +661,10 @@ def _final_fit(problem: _SocketProblem, state: _FitState) -> ParameterFit:
 
 
 def _representative_rank(name: str) -> int:
-    """Return a parameter's rank as representative: ball, joint offsets, lengths, then tilts."""
+    """Return the rank of a parameter for representing a combination; a smaller rank is preferred.
+
+    The order is ball position, joint offsets, lengths, tilts, then joint corrections.
+    """
     kind, _, place = name.partition(".")
     if place == "tool":
         return 0
@@ -661,13 +673,19 @@ def _representative_rank(name: str) -> int:
 
 
 def _identifiability_scales(problem: _SocketProblem, state: _FitState) -> np.ndarray:
-    """Return the scales that decide identifiability: estimated sizes with a lower bound."""
+    """Return the sizes (p,) below which a parameter's uncertainty must be for it to be identifiable.
+
+    They are the estimated prior standard deviations with a lower bound.
+    """
     sag = np.array([name.startswith("sag") for name in problem.names])
     return np.maximum(state.sizes.std, np.where(sag, 0.1 * _START_SAG_SIZE, 0.1 * _START_SIZE))
 
 
 def _parameter_kinds(problem: _SocketProblem) -> list[str]:
-    """Return the kind of every parameter, empty for the ball; each kind has one size."""
+    """Return the kind of each parameter: offset, length, tilt, sag or eccentricity; empty for the ball.
+
+    All parameters of a kind have the same prior standard deviation.
+    """
     kinds = []
     for name in problem.names:
         first, _, joint = name.partition(".")
@@ -688,7 +706,7 @@ def _axis_letter(robot: SerialRobot, joint: str) -> str:
 
 
 def _fit_nominal_ball(problem: _SocketProblem) -> np.ndarray:
-    """Return start values, with the ball position that minimises its scatter."""
+    """Return nominal parameters with the ball position fitted so that it scatters least in the sockets."""
     x = problem.start.copy()
     places = [problem.names.index(f"{c}.tool") for c in "xyz"]
     rates = chain_poses_and_rates(problem.chain, problem.joints, problem.chain.nominal_values)
@@ -726,7 +744,10 @@ class _BallScatter:
 
 
 def _ball_scatter(robot: SerialRobot, sockets: Sequence[Socket]) -> _BallScatter:
-    """Return the scatter of a nominal robot's ball; the travel is that of permuted joint columns."""
+    """Compute how far the nominal robot's ball scatters in its sockets, also relative to its free travel.
+
+    The free travel is the scatter after each joint's readings are permuted at random.
+    """
     problem = _SocketProblem(robot, sockets, (), SocketOptions(distance=None))
     x = _fit_nominal_ball(problem)
     balls = problem.predict_balls(x)
@@ -747,7 +768,7 @@ def _format_scatter(scatter: _BallScatter) -> str:
 
 
 def _unit_hint(robots: dict[str, SerialRobot], sockets: Sequence[Socket]) -> str:
-    """Return a hint to the unit of the angles if the other unit fits, otherwise an empty text."""
+    """Return advice to state degrees or radians if a robot then fits the data, otherwise an empty text."""
     for unit, convert in (("deg", np.radians), ("rad", np.degrees)):
         other = [replace(s, joints=convert(s.joints)) for s in sockets]
         for name, robot in robots.items():
@@ -761,7 +782,7 @@ def _unit_hint(robots: dict[str, SerialRobot], sockets: Sequence[Socket]) -> str
 
 
 def _check_fit(problem: _SocketProblem, fit: ParameterFit, noise: float) -> None:
-    """Raise an error if a fit contradicts the socket distance, or has implausible errors."""
+    """Raise InputError if a fit contradicts the stated socket distance, or an error is implausibly large."""
     folder = problem.sockets[0].path.parent
     many = 3 * len(problem.joints)
     gaps, sigma = fit.residual[many:], problem.equation_deviations(noise)[many:]
@@ -789,7 +810,11 @@ def _check_fit(problem: _SocketProblem, fit: ParameterFit, noise: float) -> None
 
 
 def _select_model(problem: _SocketProblem, state: _FitState) -> tuple[str, dict[str, float]]:
-    """Select the joint model with the smallest cross-validated error; also return all errors."""
+    """Select the joint model (rigid, gravity, eccentricity, both) with the smallest cross-validated error.
+
+    Returns:
+        (name of the model, cross-validated RMS error [m] by model). A model in the options is kept.
+    """
     wanted = problem.options.model
     if wanted is not None and wanted not in JOINT_MODELS:
         raise InputError(f"--model {wanted}", f"is not known: {', '.join(JOINT_MODELS)}")
@@ -818,14 +843,14 @@ def _select_model(problem: _SocketProblem, state: _FitState) -> tuple[str, dict[
 
 
 def _extend_state(problem: _SocketProblem, state: _FitState) -> _FitState:
-    """Extend a state of the rigid model to a problem with joint corrections."""
+    """Append joint correction parameters, with value 0 and start sizes, to a state of the rigid model."""
     more = [_START_SAG_SIZE if name.startswith("sag") else _START_SIZE for name in problem.extra]
     sizes = ErrorSizes(np.append(state.sizes.std, more), state.sizes.noise, state.sizes.effective_parameters, 0)
     return _FitState(np.append(state.x, np.zeros(len(more))), sizes)
 
 
 def _outlier_distance(noise: float, rows: int) -> float:
-    """Return the distance [m] that any row exceeds in one of a thousand data sets."""
+    """Return the outlier limit [m]: noise alone exceeds it in any row in one of a thousand data sets."""
     return noise * float(np.sqrt(scipy.stats.chi2.isf(_FALSE_ALARM_PROBABILITY / rows, 3)))
 
 
@@ -837,7 +862,7 @@ def _find_outliers(
 
 
 def _outlier_rows(problem: _SocketProblem, balls: np.ndarray, noise: float) -> list[Outlier]:
-    """Return rows that are beyond the limit from the mean of the other rows of their socket."""
+    """Find rows whose ball is too far from the mean of its socket's other rows to be noise [m]."""
     found = []
     limit = _outlier_distance(noise, len(balls))
     for k, socket in enumerate(problem.sockets):
@@ -856,7 +881,11 @@ def _outlier_rows(problem: _SocketProblem, balls: np.ndarray, noise: float) -> l
 def _remove_gross_outliers(
     problem: _SocketProblem,
 ) -> tuple[tuple[Socket, ...], set[tuple[str, int]]]:
-    """Remove rows that are outliers already with the nominal robot."""
+    """Remove rows that are outliers already with the nominal robot.
+
+    Returns:
+        (the remaining sockets, the removed rows as (socket name, line number)).
+    """
     balls = problem.predict_balls(_fit_nominal_ball(problem))
     away = np.empty(len(balls))
     for k in range(len(problem.sockets)):
@@ -909,7 +938,7 @@ def _evaluate_balls(problem: _SocketProblem, balls: np.ndarray) -> SocketErrors:
 
 
 def _neighbour_pairs(sockets: Sequence[Socket]) -> list[tuple[int, int]]:
-    """Return index pairs of neighbouring sockets of one tool."""
+    """Return pairs of indices of sockets at the same place with successive numbers."""
     return [
         (k, k + 1) for k in range(len(sockets) - 1)
         if sockets[k].place == sockets[k + 1].place and sockets[k + 1].hole == sockets[k].hole + 1

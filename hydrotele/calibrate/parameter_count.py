@@ -28,7 +28,7 @@ _SUBSPACES = {
 
 
 def count_serial_parameters(revolute: int, prismatic: int, pose: int = 6) -> int:
-    """Count the parameters of a serial robot: C = 4 R + 2 P + T (Wang Eq. 4).
+    """Count the identifiable kinematic parameters of a serial robot: C = 4 R + 2 P + T (Wang Eq. 4).
 
     Args:
         revolute: number of revolute joints, R.
@@ -47,7 +47,7 @@ def count_serial_parameters(revolute: int, prismatic: int, pose: int = 6) -> int
 def count_parallel_parameters(
     *, revolute: int, prismatic: int, spherical_pairs: int, encoders: int, loops: int, frames: int
 ) -> int:
-    """Count the parameters of a mechanism with loops (Wang Eq. 5).
+    """Count the identifiable kinematic parameters of a mechanism with closed loops (Wang Eq. 5).
 
     C = 3 R + P + SS + E + 6 L + 6 (F - 1). Without loops, with all joints measured and two frames
     this is Eq. 4 with T = 6.
@@ -134,18 +134,18 @@ class Mechanism:
 
 
 def serial_mechanism(name: str, kinds: tuple[JointKind, ...]) -> Mechanism:
-    """Build a serial robot with an encoder at every joint."""
+    """Build the mechanism of a serial robot from the kinds of its joints, all with an encoder."""
     joints = tuple(Joint(f"joint{k}", kind, True) for k, kind in enumerate(kinds))
     return Mechanism(name, (Chain(tuple(f"link{k}" for k in range(len(kinds) + 1)), joints),))
 
 
 def hexapod_mechanism(name: str, kinds: tuple[JointKind, ...], straight: tuple[int, ...] = ()) -> Mechanism:
-    """Build a hexapod of six equal legs whose prismatic joints are measured.
+    """Build the mechanism of a hexapod: six equal legs whose prismatic joints have encoders.
 
     Args:
         name: name of the mechanism.
         kinds: joints of a leg, from the base to the platform.
-        straight: indices of a leg's links that are straight.
+        straight: indices of a leg's links that join two parallel axes on one line.
 
     Returns:
         The mechanism.
@@ -160,7 +160,7 @@ def hexapod_mechanism(name: str, kinds: tuple[JointKind, ...], straight: tuple[i
 
 
 def delta_mechanism() -> Mechanism:
-    """Build a Delta robot: three measured arms, each with two rods between spherical joints."""
+    """Build the mechanism of a Delta robot: three measured arms, each with two rods between spherical joints."""
     chains = tuple(
         Chain((f"base{arm}", f"arm{arm}.{rod}", f"rod{arm}.{rod}", f"platform{arm}.{rod}"),
               (Joint(f"arm{arm}", "revolute", True), Joint(f"lower{arm}.{rod}", "spherical"),
@@ -174,7 +174,7 @@ def identifiable_rank(
     mechanism: Mechanism, rng: np.random.Generator, poses: int = 60, motion: float = 0.4,
     fixed_joints: frozenset[str] = frozenset(),
 ) -> int:  # fmt: skip
-    """Return the number of parameters identifiable from measured poses and encoders.
+    """Compute the number of identifiable parameters as the rank of a Jacobian at random poses.
 
     At each pose the errors of links x and of passive joints y satisfy P x + Q y = e, six equations
     per chain, where e are errors of the measured pose. The columns of y are eliminated. The rank of
@@ -188,7 +188,7 @@ def identifiable_rank(
         fixed_joints: names of joints that do not move, to test a poor choice of poses.
 
     Returns:
-        The rank.
+        The number of parameters that measured poses and encoder readings determine.
     """
     links, state = _arbitrary_geometry(mechanism, rng)
     passive = [name for name, joint in mechanism.joints.items() if not joint.measured]
@@ -207,7 +207,7 @@ def identifiable_rank(
 def _arbitrary_geometry(
     mechanism: Mechanism, rng: np.random.Generator
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Return links (4, 4) and joint positions (4, 4) by name for which all loops are closed."""
+    """Generate random transforms (4, 4) of links and joints, by name, for which all loops are closed."""
     links, state = {}, {}
     for name, joint in mechanism.joints.items():
         state[name] = _exponential(_SUBSPACES[joint.kind] @ _random_coordinates(rng, joint.kind, 1.0))
@@ -237,7 +237,11 @@ def _move_joints(mechanism, state, rng, motion, unmoved) -> dict[str, np.ndarray
 
 
 def _close_loops(mechanism, links, state, unmoved) -> dict[str, np.ndarray]:
-    """Close the loops by Gauss-Newton steps of all movable joints."""
+    """Change all joints except `unmoved` by Gauss-Newton steps until all chains end at the same pose.
+
+    Raises:
+        ValueError: the loops do not close within 60 steps.
+    """
     free = [name for name in mechanism.joints if name not in unmoved]
     first = mechanism.chains[0]
     for _ in range(60):
@@ -270,7 +274,12 @@ def _end_jacobians(
     mechanism: Mechanism, links: Mapping, state: Mapping, link_names: list[str],
     joint_names: list[str],
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Return the Jacobians of the chain ends' twists, six rows per chain, by links and joints."""
+    """Compute the derivatives of each chain's end pose by link errors and joint coordinates.
+
+    Returns:
+        ((6 chains, 6 links), (6 chains, joint coordinates)): six rows per chain, a twist (rotation,
+        translation) in the fixed frame.
+    """
     joints = mechanism.joints
     sizes = [_SUBSPACES[joints[name].kind].shape[1] for name in joint_names]
     start = dict(zip(joint_names, np.cumsum(sizes) - sizes, strict=True))
@@ -309,7 +318,7 @@ def _adjoint(pose: np.ndarray) -> np.ndarray:
 
 
 def _exponential(twist: np.ndarray) -> np.ndarray:
-    """Return a pose (4, 4): rotation by the first three elements, translation by the last three."""
+    """Return the transform (4, 4) with the rotation vector `twist[:3]` and the translation `twist[3:]`."""
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_rotvec(twist[:3]).as_matrix()
     pose[:3, 3] = twist[3:]

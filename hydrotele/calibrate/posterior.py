@@ -217,7 +217,7 @@ def diagnose_chain(
     names: Sequence[str], chain: np.ndarray, log_probability: np.ndarray, acceptance: float,
     evaluations: int, thin: int = 1,
 ) -> Posterior:  # fmt: skip
-    """Compute the convergence diagnostics of a chain.
+    """Compute the convergence diagnostics of MCMC chains, and return them with the sample.
 
     Args:
         names: the p parameters.

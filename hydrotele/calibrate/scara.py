@@ -71,7 +71,10 @@ class ScaraCalibration:
 
 
 def scara_chain(nominal: ScaraSpec) -> SerialChain:
-    """Return the arm of Eq. 2 with offsets of both joints."""
+    """Build the chain of a planar arm with two revolute joints, theta and phi, and two links, a and b.
+
+    Its parameters are the joint offsets (nominally 0) and the link lengths.
+    """
     return SerialChain(
         ("theta", "phi"),
         (
@@ -84,7 +87,7 @@ def scara_chain(nominal: ScaraSpec) -> SerialChain:
 
 
 def load_scara(folder: Path) -> tuple[ScaraSpec, MeasuredPositions]:
-    """Read nominal lengths and measured poses.
+    """Read the nominal link lengths and the measured poses of a two-joint arm from a folder.
 
     Args:
         folder: folder with `nominal.yaml` and `measured.csv` (theta, phi [rad], u, v [m], with a
@@ -126,7 +129,9 @@ def load_scara(folder: Path) -> tuple[ScaraSpec, MeasuredPositions]:
 
 
 def calibrate_scara(nominal: ScaraSpec, measured: MeasuredPositions, heldout: Sequence[int] = ()) -> ScaraCalibration:
-    """Fit the arm by least squares on the distances of Eq. 3.
+    """Calibrate a two-joint arm by least squares on its end positions, with or without joint offsets.
+
+    The model that predicts left-out poses better is returned.
 
     Args:
         nominal: nominal lengths.
@@ -166,7 +171,7 @@ def calibrate_scara(nominal: ScaraSpec, measured: MeasuredPositions, heldout: Se
 
 
 def fit_scara(chain: SerialChain, measured: MeasuredPositions, poses: Sequence[int], offsets: bool) -> ParameterFit:
-    """Fit lengths, or lengths and offsets, to some poses.
+    """Fit link lengths, or lengths and joint offsets, of a two-joint arm to some measured poses.
 
     Args:
         chain: chain of the nominal arm.
@@ -236,7 +241,7 @@ def simulate_scara(
 
 
 def save_scara(folder: Path, nominal: ScaraSpec, measured: MeasuredPositions) -> None:
-    """Write `nominal.yaml` and `measured.csv`."""
+    """Write the nominal lengths to `nominal.yaml` and the measured poses to `measured.csv` in a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     text = f"length_a: {nominal.length_a!r}\nlength_b: {nominal.length_b!r}\n"
     (folder / NOMINAL_FILE).write_text(text, encoding="utf-8")

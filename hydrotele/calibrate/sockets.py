@@ -56,7 +56,7 @@ class Socket:
 
 
 def load_sockets(folder: str | Path, degrees: bool = False) -> tuple[tuple[Socket, ...], list[str]]:
-    """Read all sockets of a folder.
+    """Read the postures (joint angles) of all sockets of a measurement folder.
 
     Args:
         folder: folder with places or files.
@@ -93,18 +93,18 @@ def load_sockets(folder: str | Path, degrees: bool = False) -> tuple[tuple[Socke
 
 
 def place_names(sockets: Sequence[Socket]) -> tuple[str, ...]:
-    """Return the names of the places, in order."""
+    """Return the names of the places of the sockets, without repetition, in order."""
     return tuple(dict.fromkeys(socket.place for socket in sockets))
 
 
 def find_idle_joints(sockets: Sequence[Socket]) -> list[int]:
-    """Return the columns with one value in all files: joints that never move."""
+    """Return the column indices of joints that never move: one value in all postures of all sockets."""
     joints = np.vstack([socket.joints for socket in sockets])
     return [int(k) for k in np.flatnonzero(np.ptp(joints, axis=0) < _POSTURE_TOLERANCE)]
 
 
 def _read_joints(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return the numbers (n, k) of a file and their line numbers (n,)."""
+    """Read the joint readings (n, k) of a text file of n postures, and their line numbers (n,)."""
     rows, lines = [], []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         line = line.strip().lstrip("\ufeff")
@@ -140,7 +140,7 @@ def _parse_number(word: str) -> float | None:
 
 
 def _remove_repeated(socket: Socket, notes: list[str]) -> Socket:
-    """Return a socket without repeated postures, with at most `_MAX_POSTURES` of them."""
+    """Return a socket without repeated postures, at most 2000 evenly spaced ones; append notes on it."""
     cells = np.round(socket.joints / _POSTURE_TOLERANCE)
     kept = np.sort(np.unique(cells, axis=0, return_index=True)[1])
     if len(kept) < _MIN_POSTURES:
@@ -196,7 +196,7 @@ def add_random_errors(
         robot: nominal robot.
         errors: standard deviations of the errors.
         rng: random generator.
-        corrections: joint corrections, with names as from `deflection_names`.
+        corrections: joint corrections (deflection, eccentricity) with names as from `correction_names`.
 
     Returns:
         The robot and its true parameters, named as those of `robot_chain`.
@@ -261,7 +261,14 @@ def _solve_postures(
     robot: SerialRobot, middle: np.ndarray, rows: int, errors: RobotErrors, rng: np.random.Generator,
     limit: float, place: str, idle: int | None,
 ) -> np.ndarray:  # fmt: skip
-    """Return encoder readings (rows, k) of postures that put the ball into a socket."""
+    """Find random postures that put the ball into a socket at `middle` (3,) [m].
+
+    Returns:
+        (rows, k) encoder readings [rad] or [m], without noise.
+
+    Raises:
+        InputError: too few postures are found.
+    """
     found: list[np.ndarray] = []
     for _ in range(_MAX_TRIES):
         start = rng.uniform(-limit, limit, (4 * rows, len(robot.joints)))

@@ -1,7 +1,8 @@
 """Implement `hydrotele analyse teleop`: analyse a linear teleoperator or a scenario.
 
-A case describes a teleoperator as a two-port with operator, task and delays. A scenario is
-linearised about its contact pose, and its force-reflection loop is analysed.
+A case describes a teleoperator (joystick, channel and slave machine) as a linear two-port between
+operator and task. A scenario is linearised about its contact pose, and its force-reflection loop is
+analysed.
 """
 
 import math
@@ -83,10 +84,10 @@ _ROBUST_LEGEND = (
 
 
 class RobustnessOptions(NamedTuple):
-    """Options of the robustness analysis.
+    """Options of the robustness analysis: sampling, jitter of the delays and random operators.
 
     Attributes:
-        period: sampling period [s].
+        period: sampling period of both sides [s].
         delays: CSV file of measured delays, None for the delays of the case.
         operators: number of random pairs of operator and task.
     """
@@ -102,12 +103,14 @@ def analyse_case_to_folder(
 ) -> Path | None:  # fmt: skip
     """Analyse a teleoperator case, print the result and write a report with figures.
 
-    The output folder is written completely or not at all.
+    A case describes operator, joystick, slave and task as linear impedances, with delays between
+    them. The output folder is written completely or not at all.
 
     Args:
         file: case file, None for the shipped case.
         target: output folder, default `runs/analyse_<name>`, or none with `as_json`.
-        structures: control structures to analyse; if empty, those of the case.
+        structures: control structures to analyse, such as `position_force`; if empty, those of the
+            case.
         delay: one-way delay [s], None for that of the case.
         confirm: whether to verify the predictions by simulation.
         as_json: print `analysis.json` instead of text.
@@ -136,18 +139,19 @@ def analyse_case(
     specification: TeleopCaseFile, structures: Sequence[str], delay: float | None, confirm: bool, quiet: bool,
     robustness_options: RobustnessOptions | None = None,
 ) -> TeleopFindings:  # fmt: skip
-    """Analyse a teleoperator case.
+    """Compute stability, margins and passivity of a teleoperator under several control structures.
 
     Args:
-        specification: specification of the case.
-        structures: control structures to analyse; if empty, those of the case.
+        specification: content of the case file.
+        structures: control structures to analyse, such as `position_force`; if empty, those of the
+            case.
         delay: one-way delay [s], None for that of the case.
         confirm: whether to verify the predictions by simulation.
         quiet: whether to omit the progress bar.
         robustness_options: options of the robustness analysis, None to omit it.
 
     Returns:
-        Stability, margins and passivity of each structure.
+        Results for each structure, with stability maps and, if requested, robustness.
 
     Raises:
         InputError: structures or delay are not usable.
@@ -182,7 +186,13 @@ def analyse_case(
 
 
 def _packet_ages(case: TeleoperatorAxis, robustness_options: RobustnessOptions) -> PacketAges:
-    """Return the packet ages from measured delays, or from the constant delays of the case."""
+    """Return the distribution of the packet ages at the sampling instants, in sampling periods.
+
+    The delays are those of the CSV file in the options, else the constant delays of the case.
+
+    Raises:
+        InputError: period, number of operators or file are not usable.
+    """
     if not 1e-4 <= robustness_options.period <= 0.1:
         raise InputError("--period", f"must be from 0.0001 to 0.1 s, got {robustness_options.period:g}")
     if not 1 <= robustness_options.operators <= 10_000:
@@ -279,7 +289,7 @@ _KIND = "loop analysis"
 
 
 def is_scenario(file: Path | None) -> bool:
-    """Return whether a name is that of a shipped scenario, or a file contains a pilot."""
+    """Return whether an argument is a shipped scenario or a YAML file with the key `pilot`."""
     if file is None:
         return False
     if str(file) in shipped_scenarios():
@@ -295,7 +305,12 @@ def analyse_any_to_folder(
     confirm: bool, coordinate: str | None, overrides: dict[str, str], as_json: bool,
     robustness_options: RobustnessOptions | None = None,
 ) -> Path | None:  # fmt: skip
-    """Analyse a case by `analyse_case_to_folder` or a scenario by `analyse_scenario_to_folder`.
+    """Analyse a teleoperator case or a scenario, whichever the file is; print and write the result.
+
+    The arguments are those of `analyse_case_to_folder` and `analyse_scenario_to_folder`.
+
+    Returns:
+        The output folder, None if nothing was written.
 
     Raises:
         InputError: an option does not apply to this kind of file, or the analysis raises it.
@@ -311,11 +326,11 @@ def analyse_any_to_folder(
 
 
 def analyse_scenario(scenario: Scenario, coordinate: str | None = None) -> ScenarioFindings:
-    """Analyse the linear loop of a teleoperated scenario.
+    """Linearise a teleoperated scenario about its contact pose and analyse its force-reflection loop.
 
     Args:
         scenario: the scenario.
-        coordinate: coordinate of the arm; default that of the operator's force target, else z.
+        coordinate: coordinate of the arm, such as `r` or `z`; default that of the operator's force target, else z.
 
     Returns:
         Stability, margins and limits of the loop.
@@ -333,7 +348,7 @@ def analyse_scenario_to_folder(
     name: str, target: Path | None, coordinate: str | None, overrides: dict[str, str],
     as_json: bool,
 ) -> Path | None:  # fmt: skip
-    """Analyse the loop of a scenario, print the result and write a report.
+    """Analyse the force-reflection loop of a scenario, print the result and write a report.
 
     The output folder is written completely or not at all.
 
@@ -370,7 +385,7 @@ def analyse_scenario_to_folder(
 
 
 def format_findings(findings: ScenarioFindings) -> list[tuple[str, str, str]]:
-    """Return the findings as rows of text: (quantity, value, remark)."""
+    """Format the results of a scenario analysis as rows of text: (quantity, value, remark)."""
     case, loop, tip = findings.case, findings.loop, findings.case.tip
     pole, turns = loop.pole, tip.coordinate not in ("r", "z")
     force, mass, oil = ("N m", "kg m^2", "N m/rad") if turns else ("N", "kg", "N/m")

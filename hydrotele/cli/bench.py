@@ -58,14 +58,16 @@ def run_benchmarks(save: Path | None, compare: Path | None, quick: bool, as_json
 
 
 def measure_speed(repeats: int) -> dict:
-    """Return all benchmark results; each time is the shortest of several repetitions.
+    """Measure simulation speed and start-up time; each time is the shortest of several repetitions.
 
     Args:
         repeats: number of repetitions; `hydraulics_to_mechanism_ratio` uses six times as many.
 
     Returns:
-        mechanism_us, hydraulics_us, hydraulics_to_mechanism_ratio, scenario_realtime_factor,
-        teleoperation_realtime_factor by scenario, batch_steps_per_s by thread count, batch_scaling, help_s, run_s.
+        mechanism_us, hydraulics_us: time of one step without and with hydraulics [us];
+        hydraulics_to_mechanism_ratio; scenario_realtime_factor; teleoperation_realtime_factor by
+        scenario; batch_steps_per_s by thread count; batch_scaling: speed ratio of two threads to
+        one; help_s, run_s: duration of two commands in a new process [s].
     """
     stop_profiling_clock()
     stderr_console.print("mechanism with and without hydraulics ...", style="dim")
@@ -96,7 +98,12 @@ def measure_speed(repeats: int) -> dict:
 
 
 def shortest_times(repeats: int, jobs: list[Callable[[], float]]) -> list[float]:
-    """Return the shortest time of each job [s], running the jobs alternately."""
+    """Run jobs alternately and return the shortest time of each [s].
+
+    Args:
+        repeats: number of runs of each job.
+        jobs: functions that measure and return their own duration [s].
+    """
     best = [float("inf")] * len(jobs)
     for _ in range(repeats):
         best = [min(b, job()) for b, job in zip(best, jobs, strict=True)]
@@ -110,7 +117,7 @@ def _make_hydraulic_job(plant: Plant) -> Callable[[], float]:
 
 
 def _make_mechanism_job(plant: Plant) -> Callable[[], float]:
-    """Return a job that steps the mechanism without actuators and gravity."""
+    """Return a function that steps the mechanism without hydraulics and gravity, and returns its duration [s]."""
     root = assemble_mjcf(plant.machine, plant.model.opt.timestep, plant.ground, visuals=False)
     for actuator in root.find_all("actuator"):
         actuator.remove()
@@ -152,7 +159,10 @@ def _make_batch_job(plant: Plant, threads: int) -> Callable[[], float]:
 
 
 def _measure_scenario_factor() -> float:
-    """Return the real-time factor of the excitation scenario with control, sensors and log."""
+    """Return the real-time factor (simulated per computing time) of the shipped scenario `excitation`.
+
+    The run includes control, sensors and logging.
+    """
     scenario = load_scenario("excitation")
     begin = time.perf_counter()
     run_scenario(scenario)
@@ -160,7 +170,10 @@ def _measure_scenario_factor() -> float:
 
 
 def _measure_teleop_factor(name: str) -> float:
-    """Return the real-time factor of a teleoperated scenario, including operator and channel."""
+    """Return the real-time factor (simulated per computing time) of a teleoperated scenario.
+
+    The run includes the models of the operator and of the communication channel.
+    """
     return run_scenario(load_scenario(name)).summary["realtime_factor"]
 
 

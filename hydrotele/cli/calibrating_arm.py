@@ -56,10 +56,10 @@ _MAX_RESIDUAL_RATIO = 1.5  # ratio of residuals to sensor noise above which a no
 
 
 class ArmChoices(NamedTuple):
-    """Options of the arm calibration.
+    """Options of the arm calibration with an external calibrator.
 
     Attributes:
-        method: `joint` or `hierarchical`.
+        method: `joint` fits all links together, `hierarchical` one link after the other.
         poses: number of poses used of each log.
         accuracy_deg: standard deviation of an angle sensor [deg], None for that of the log.
         bad_data: whether corrupted samples are detected and excluded.
@@ -100,7 +100,9 @@ class ArmResult(NamedTuple):
 
 
 def calibrate_arm(data: Path, machine: str, choices: ArmChoices, target: Path | None, as_json: bool) -> ArmResult:
-    """Calibrate an arm from a folder of logs; print and write the result.
+    """Calibrate the links of an arm from a folder of logs; print and write the result.
+
+    The calibrator is a passive linkage with angle sensors that connects the arm to the chassis.
 
     Args:
         data: folder of logs; one link moves in each log.
@@ -108,6 +110,9 @@ def calibrate_arm(data: Path, machine: str, choices: ArmChoices, target: Path | 
         choices: options of the calibration.
         target: output folder, None to write nothing.
         as_json: print JSON instead of text.
+
+    Returns:
+        Fitted parameters, calibrated machine and errors on held-out poses.
 
     Raises:
         InputError: logs, machine, options or target are not usable.
@@ -143,9 +148,17 @@ def _parse_heldout_interval(text: str | None) -> int:
 def fit_arm(
     nominal: Machine, data: Path, choices: ArmChoices, heldout_interval: int, report: StageReport = ignore_stage
 ) -> ArmResult:
-    """Calibrate an arm without printing or writing; every N-th pose is held out, N = `heldout_interval`.
+    """Calibrate the links of an arm from logs of an external calibrator; write no files.
 
-    `report` is called with the name of each stage and the completed fraction.
+    Args:
+        nominal: nominal machine with a calibrator.
+        data: folder of logs; one link moves in each log.
+        choices: options of the calibration.
+        heldout_interval: N; every N-th pose is held out.
+        report: called with the name of each stage and the completed fraction.
+
+    Returns:
+        Fitted parameters, calibrated machine and errors on held-out poses.
 
     Raises:
         InputError: the logs or options are not usable.
@@ -185,7 +198,12 @@ def fit_arm(
 
 
 def _heldout_errors(loop: CalibrationLoop, fit: ArmFit, heldout_poses: list[Poses]) -> dict[str, Any]:
-    """Return closure errors on held-out poses with nominal and identified parameters."""
+    """Return how well the kinematic loop of arm and calibrator closes on held-out poses.
+
+    Returns:
+        Number of poses; RMS closure error with nominal parameters (mean removed) and with identified
+        ones [mm]; chi: RMS of the latter divided by sensor noise. Empty without held-out poses.
+    """
     if not heldout_poses:
         return {}
     from hydrotele.calibrate.arm import StageEquations
@@ -247,7 +265,7 @@ def arm_as_data(result: ArmResult) -> dict[str, Any]:
 
 
 def _links_without_log(fit: ArmFit) -> dict[str, list[str]]:
-    """Return the links that move in no log, with the parameters that stay nominal."""
+    """Return {link that moves in no log: its parameters, which keep their nominal values}."""
     moved = {stage.link for stage in fit.stages}
     return {
         link: [f"{kind}.{link}" for kind in ("alpha", "a", "beta" if parallel else "d")]
@@ -326,14 +344,17 @@ def write_arm_report(folder: Path, result: ArmResult) -> None:
 
 
 def calibrate_linkage(data: Path, machine: str, angles: str, target: Path | None, as_json: bool) -> list[LinkageFit]:
-    """Calibrate the cylinder linkages that move in a folder of logs; print and write the result.
+    """Calibrate the pin triangles of the cylinders that move in a folder of logs; print and write them.
 
     Args:
         data: folder of logs.
         machine: nominal machine, as a shipped name or a folder.
-        angles: source of the joint angles: `measured` or `identified`.
+        angles: source of the joint angles: `measured` by sensors or `identified` by the calibrator.
         target: output folder, None to write nothing.
         as_json: print JSON instead of text.
+
+    Returns:
+        One fit per axis that moves.
 
     Raises:
         InputError: no linkage moves, or the logs are not usable.
@@ -363,9 +384,16 @@ def calibrate_linkage(data: Path, machine: str, angles: str, target: Path | None
 
 
 def fit_linkages(nominal: Machine, data: Path, angles: str, report: StageReport = ignore_stage) -> list[LinkageFit]:
-    """Calibrate the cylinder linkages without printing or writing.
+    """Fit the pin triangle of each cylinder to joint angles and cylinder lengths; write no files.
 
-    `report` is called with the name of each stage and the completed fraction.
+    Args:
+        nominal: nominal machine.
+        data: folder of logs.
+        angles: source of the joint angles: `measured` by sensors or `identified` by the calibrator.
+        report: called with the name of each stage and the completed fraction.
+
+    Returns:
+        One fit per axis that moves by 5 deg or more.
 
     Raises:
         InputError: no linkage moves, or the logs are not usable.
@@ -435,7 +463,9 @@ def _print_linkages(document: Mapping[str, Any]) -> None:
 
 
 def design_calibrator(machine: str, accuracy_deg: float, target: Path | None, as_json: bool) -> None:
-    """Evaluate calibrator designs; print the present and the best design and draw all of them.
+    """Evaluate lengths and ball-joint positions of a calibrator; print the present and the best design.
+
+    With a target, all designs are drawn and written as JSON.
 
     Args:
         machine: machine with a calibrator, as a shipped name or a folder.

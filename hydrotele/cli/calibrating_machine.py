@@ -67,7 +67,7 @@ def calibrate_machine(
     kinematics: Path, dynamics: Sequence[Path], machine: str, heldout: str | None, target: Path,
     as_json: bool,
 ) -> MachineCalibration:  # fmt: skip
-    """Calibrate kinematics, then identify dynamics with the calibrated kinematics.
+    """Calibrate arm and cylinder linkages, then identify masses and friction with the result.
 
     Args:
         kinematics: folder of logs; one link moves in each log, measured by the calibrator.

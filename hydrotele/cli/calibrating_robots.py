@@ -1,7 +1,8 @@
 """Implement `hydrotele calibrate mukca`, `scara` and `hybrid`.
 
-`mukca` calibrates a serial robot whose ball tool is held in sockets. `scara` calibrates an arm with
-two links from measured positions. `hybrid` calibrates a serial robot that carries a hexapod.
+`mukca` calibrates a serial robot whose ball tool is held in fixed sockets. `scara` calibrates a
+planar arm with two links from measured positions. `hybrid` calibrates a serial robot that carries a
+hexapod (parallel robot with six legs).
 """
 
 import json
@@ -109,7 +110,7 @@ class SocketChoices:
 
     Attributes:
         robot: shipped robot or file, None to find one.
-        heldout: held-out place or socket, None for each in turn.
+        heldout: held-out place or socket, None for each place in turn.
         distance: distance of neighbouring sockets [m], 0 if not known.
         accuracy: standard deviation of that distance [m].
         unit: unit of the joint angles, `rad` or `deg`.
@@ -125,10 +126,12 @@ class SocketChoices:
 
 
 def calibrate_mukca(data: Path, choices: SocketChoices, target: Path | None, as_json: bool) -> dict[str, Any]:
-    """Calibrate a robot from joint angles with its ball in sockets; print and write the result.
+    """Calibrate a serial robot from joint angles while its ball tool sits in fixed sockets.
+
+    The result is printed and written, with predictions of held-out places.
 
     Args:
-        data: folder with a subfolder for each place.
+        data: folder with a subfolder for each place of the sockets; it has one CSV file per socket.
         choices: options of the calibration.
         target: output folder, written completely or not at all; None to write nothing.
         as_json: print JSON instead of text.
@@ -181,9 +184,16 @@ def socket_document(
     data: Path, sockets: Sequence[Socket], calibration: SocketCalibration, heldout_parts: Sequence[HeldOutPrediction],
     notes: Sequence[str],
 ) -> dict[str, Any]:  # fmt: skip
-    """Return a socket calibration in the form of `calibration.json`.
+    """Return a calibration of a robot with its ball in sockets in the form of `calibration.json`.
 
     Errors and distances are in mm, parameters in SI units.
+
+    Args:
+        data: folder of the measurements.
+        sockets: measured joint angles of each socket.
+        calibration: calibration from the fitted sockets.
+        heldout_parts: predictions of held-out places or sockets.
+        notes: sentences for the user.
     """
     fit, angular = calibration.fit, ("r", "s", "c")
     status = dict(zip(fit.identifiability.names, fit.identifiability.status, strict=True))
@@ -258,7 +268,11 @@ def _heldout_document(heldout_parts: Sequence[HeldOutPrediction], rows: dict[str
 def _find_robot(
     data: Path, robot_option: str | None, sockets: Sequence[Socket], options: SocketOptions
 ) -> tuple[SerialRobot, list[str]]:
-    """Load the given robot, that of the data folder or the best-fitting one, with a note on it."""
+    """Load the robot of the option, else the file in the data folder, else the best shipped robot.
+
+    Returns:
+        The robot, and a note if it was not given by the option.
+    """
     count = sockets[0].joints.shape[1]
     if robot_option is not None:
         return load_robot(robot_option, count), []
@@ -396,7 +410,7 @@ def _outlier_rows(outliers: Sequence[Outlier]) -> list[dict[str, Any]]:
 
 
 def simulate_scara_to_folder(folder: Path, poses: int, noise: float, seed: int) -> None:
-    """Write simulated measurements of an arm with links of 0.4 m and 0.3 m.
+    """Write simulated measurements of a planar arm with two links of nominally 0.4 m and 0.3 m.
 
     The first link is 0.8 mm longer and the second one 0.5 mm shorter than nominal.
 
@@ -420,11 +434,11 @@ def simulate_scara_to_folder(folder: Path, poses: int, noise: float, seed: int) 
 def calibrate_scara_to_folder(
     data: Path, heldout: str | None, choose: int | None, target: Path | None, as_json: bool
 ) -> dict[str, Any]:
-    """Calibrate a SCARA arm from measured positions; print and write the result.
+    """Calibrate the link lengths of a planar SCARA arm from measured positions; print and write them.
 
     Args:
         data: folder with `nominal.yaml` and `measured.csv`.
-        heldout: numbers of the held-out poses, None for each in turn.
+        heldout: numbers of the held-out poses, from 1, separated by commas; None for each in turn.
         choose: number of most informative poses to list, None for none.
         target: output folder, written completely or not at all; None to write nothing.
         as_json: print JSON instead of text.
@@ -538,13 +552,13 @@ def calibrate_hybrid(
     data: Path, robot: str | None, kind: str, parameters: str, evolution: bool, steps: int,
     seed: int, target: Path | None, as_json: bool,
 ) -> Calibration:  # fmt: skip
-    """Calibrate a hybrid robot from a folder of measurements; print and write the result.
+    """Calibrate a serial robot that carries a hexapod from measured poses; print and write the result.
 
     Args:
         data: folder with `poses.csv` or `poses.parquet`.
         robot: nominal robot, None for that of the folder, else `iwr`.
-        kind: error model: `auto`, `dh` or `poe`.
-        parameters: `all`, `document` or names separated by commas.
+        kind: error model: `dh` (Denavit-Hartenberg), `poe` (product of exponentials) or `auto`.
+        parameters: `all`, `document` (the 36 of Wang 2012) or names separated by commas.
         evolution: whether to search by differential evolution as well.
         steps: number of MCMC steps, 0 for no MCMC.
         seed: random seed of differential evolution and MCMC.
@@ -782,7 +796,7 @@ def simulate_hybrid(
     target: Path, robot: str | None, poses: int, heldout: int, seed: int, noise: float,
     errors: float, parameters: str, kind: str, choose: str = "random",
 ) -> None:  # fmt: skip
-    """Simulate the measurement of a robot with manufacturing errors and write it to a folder.
+    """Simulate the measurement of a hexapod-carrying robot with manufacturing errors; write it to a folder.
 
     The true errors and the true robot are written to the subfolder `truth`.
 
@@ -851,7 +865,10 @@ def simulate_hybrid(
 
 
 def _select_poses(model, wires, count: int, rng: np.random.Generator, criterion: Any):
-    """Return joint values and leg lengths of the most informative of many random poses."""
+    """Return joint values and leg lengths of the `count` most informative of many random poses.
+
+    `criterion` is the observability criterion to maximise: D or O1 to O5.
+    """
     from hydrotele.simulate.hybrid import sample_poses
 
     robot = model.nominal

@@ -55,7 +55,7 @@ _MIN_TEXT_WIDTH = 30  # characters next to the names; a narrower text starts bel
 
 
 def format_summary(names: dict[str, list[str]], width: int) -> str:
-    """Return the names of all items in at most `_MAX_SUMMARY_LINES` lines, without cutting a name.
+    """Format the names of all items of all kinds in at most 30 lines, without cutting a name.
 
     Args:
         names: kind of the items -> their names. If they need too many lines, the last names of the
@@ -84,7 +84,7 @@ def format_summary(names: dict[str, list[str]], width: int) -> str:
 
 
 def format_items(kind: str, rows: list[dict], width: int) -> str:
-    """Return a list of items with their descriptions; names are never cut or broken.
+    """Format a list of items with their descriptions and properties; names are never cut or broken.
 
     Args:
         kind: kind of the items, the title.
@@ -111,7 +111,10 @@ def _wrap_text(text: str, width: int, further_indent: str = "") -> list[str]:
 
 
 def _format_value(name: str, value) -> str:
-    """Return `name: value` of one item; the description has no name."""
+    """Format a property of an item as `name: value`, or a description as it is.
+
+    A dict is the parameters of an effect, {name: unit, low and high}.
+    """
     if isinstance(value, dict):
         value = ", ".join(f"{n} [{p['unit']}] {p['low']:.4g} .. {p['high']:.4g}" for n, p in value.items())
     text = ", ".join(value) if isinstance(value, list) else str(value)
@@ -171,9 +174,10 @@ def _sweep_rows() -> list[dict]:
 
 
 def _effect_rows() -> list[dict]:
-    """Return a row for each effect, with its locations on the first machine that supports it.
+    """Return a row for each effect, with the components of a machine that it can change.
 
-    The CAT 215 with bucket is tried first. The parameter ranges are those of the last location.
+    The machine is the first that supports the effect, beginning with the CAT 215 with bucket. The
+    parameter ranges are those of the last component.
     """
     from hydrotele.effects import EFFECTS
 
@@ -267,7 +271,13 @@ def validate_files(paths: list[Path], as_json: bool, log_machine: LogMachine | N
 
 
 def _validate_file(path: Path, log_machine: LogMachine, notes: list[str]) -> tuple[str, str]:
-    """Return kind and content of a valid file, and append notes on repairs of a log to `notes`."""
+    """Check a file, folder or shipped name; return its kind and a summary of its content.
+
+    Notes on repairs of a log are appended to `notes`.
+
+    Raises:
+        InputError: the file is not valid or does not exist.
+    """
     if path.suffix.lower() in LOG_SUFFIXES or _is_log_folder(path):
         return "log", _check_logs(path, log_machine, notes)
     from hydrotele.scenario.scenario import load_scenario, shipped_scenarios
@@ -307,7 +317,10 @@ def _is_log_folder(path: Path) -> bool:
 
 
 def _check_logs(path: Path, log_machine: LogMachine, notes: list[str]) -> str:
-    """Check the logs of a path by the rule of all commands, and return a summary of their content."""
+    """Check the logs of a path, against their machine if it is known; return a summary of their content.
+
+    Notes on repairs are appended to `notes`.
+    """
     from hydrotele.cli.opening import name_machine, open_logs
     from hydrotele.logs.dataset import make_dataset, merge_runs_without_machine
 

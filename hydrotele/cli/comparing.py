@@ -69,7 +69,14 @@ class ModelComparison:
     plotted_prediction: np.ndarray
 
     def mean_errors(self, horizon: str) -> np.ndarray:
-        """Return the (c,) RMS errors at a horizon or `_ONE_STEP`, averaged over the runs."""
+        """Return the RMS prediction errors of the c channels at a horizon, averaged over the runs.
+
+        Args:
+            horizon: name of a prediction horizon, or `one row` for one-step predictions.
+
+        Returns:
+            (c,) errors in SI units, NaN without measurements.
+        """
         if horizon == _ONE_STEP:
             found = [errors.one_step for errors in self.runs]
         else:
@@ -78,7 +85,7 @@ class ModelComparison:
         return np.array([column.mean() if len(column) else math.nan for column in columns])
 
     def count_diverged(self, horizon: str) -> tuple[int, int]:
-        """Return the number of diverged predictions at a horizon and the number of predictions."""
+        """Return how many predictions over a horizon diverged, and the number of all predictions."""
         found = [e.horizons[horizon] for e in self.runs if horizon in e.horizons]
         return sum(h.diverged for h in found), sum(h.windows for h in found)
 
@@ -88,7 +95,7 @@ def compare_models(
     sensors: str | None, horizons: Sequence[float], baselines: Sequence[str], include_fitted: bool,
     target: Path | None, as_json: bool, force: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
-    """Compare models on runs that were not used to fit them.
+    """Compare open-loop predictions of several models on runs that were not used to fit them.
 
     Args:
         machines: names or folders of machines, or result folders of `gap` and `identify`. The
@@ -141,7 +148,10 @@ def compare_models(
 
 
 def machine_folder(name: str) -> str:
-    """Return the folder of the machine in a result folder of `gap` or `identify`, else `name`."""
+    """Return the subfolder with the corrected machine of a result folder of `gap` or `identify`.
+
+    Any other name or folder is returned unchanged.
+    """
     for inside in _MACHINE_SUBFOLDERS:
         if (Path(name) / inside / MACHINE_FILE).is_file():
             return str(Path(name) / inside)
@@ -244,13 +254,16 @@ def _check_horizons(horizons: Sequence[float], evaluated_runs: Sequence[RunData]
 
 
 def _available_horizons(comparisons: Sequence[ModelComparison]) -> list[str]:
-    """Return the horizons that fit into at least one evaluated run, in ascending order."""
+    """Return the prediction horizons that fit into at least one evaluated run, in ascending order."""
     found = {name: h.seconds for m in comparisons for e in m.runs for name, h in e.horizons.items()}
     return sorted(found, key=lambda name: math.inf if name == TO_THE_END else found[name])
 
 
 def _plot_horizon(horizons: Sequence[float], run: RunData) -> float:
-    """Return the longest horizon that fits three times into the plot, else a third of it [s]."""
+    """Return the time after which the plotted prediction restarts from the measurements [s].
+
+    It is the longest horizon that fits three times into the plot, else a third of the plot.
+    """
     seconds = min(_MAX_PLOT_SECONDS, len(run.reading) * run.period)
     return max([h for h in horizons if 3.0 * h <= seconds], default=seconds / 3.0)
 
@@ -333,7 +346,7 @@ def _format_horizon(horizon: str) -> str:
 
 
 def _format_error(model: ModelComparison, horizon: str, error: float) -> str:
-    """Format an error in customary units, or the number of diverged predictions."""
+    """Format an error of a model; NaN gives `-`, infinity the number of diverged predictions."""
     if math.isnan(error):
         return "-"
     if math.isinf(error):

@@ -91,12 +91,14 @@ JOBS = (
 
 
 def run_job(name: str) -> None:
-    """Run the job of the given name in this process."""
+    """Run the compilation job of the given name in this process, which fills the cache."""
     next(job for job in JOBS if job.name == name).run()
 
 
 def compile_all(processes: int | None = None) -> None:
-    """Compile all functions by running all jobs, the longest first.
+    """Compile all numerical functions by running jobs in child processes, the longest first.
+
+    A marker file in the cache folder records completion, so that a repeated call does nothing.
 
     Args:
         processes: number of parallel processes, default one per core.
@@ -147,7 +149,7 @@ def compile_all(processes: int | None = None) -> None:
 
 
 def _digest() -> str:
-    """Return a digest of Python, numba, processor and sources, which determine compiled code."""
+    """Return a hash of all that determines the compiled code: Python, numba, processor and sources."""
     package = Path(hydrotele.__file__).parent
     text = hashlib.sha256(f"{sys.version} {numba.__version__} {get_host_cpu_name()}".encode())
     for path in sorted(package.rglob("*.py")):

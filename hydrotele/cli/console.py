@@ -72,7 +72,7 @@ def print_result(document: Any, as_json: bool, show: Callable[[], None], target:
 
 
 def to_json_types(data: Any) -> Any:
-    """Convert data to Python types for JSON; NaN and infinity become None."""
+    """Convert nested data with NumPy arrays and numbers to JSON types; NaN and infinity become None."""
     if isinstance(data, dict):
         return {str(key): to_json_types(value) for key, value in data.items()}
     if isinstance(data, (list, tuple, np.ndarray)):
@@ -100,7 +100,7 @@ def make_table(title: str, *columns: str) -> Table:
 
 @contextlib.contextmanager
 def print_status_regularly(label: str) -> Iterator[Callable[[str], None]]:
-    """Print the latest status text and the elapsed time on stderr after `_FIRST_STATUS_TIME`, then regularly.
+    """Print the latest status text and the elapsed time on stderr after 2 s, then every 15 s.
 
     Yields:
         A function that sets the status text.
@@ -130,7 +130,7 @@ def print_status_regularly(label: str) -> Iterator[Callable[[str], None]]:
 def show_simulation_progress(label: str, quiet: bool = False) -> Iterator[Progress | None]:
     """Show simulated time and real-time factor on stderr while a simulation runs.
 
-    On a terminal this is a progress bar, otherwise a line every `_STATUS_PERIOD` seconds.
+    On a terminal this is a progress bar, otherwise a line every 15 s.
 
     Yields:
         A function of simulated and total time [s] that updates the display, None if `quiet`.
@@ -166,7 +166,7 @@ def show_simulation_progress(label: str, quiet: bool = False) -> Iterator[Progre
 
 @contextlib.contextmanager
 def show_stages(label: str, quiet: bool) -> Iterator[StageReport | None]:
-    """Show the current stage of a computation on stderr, as a progress bar or as lines.
+    """Show the current stage of a computation on stderr: a bar on a terminal, else a line every 15 s.
 
     Yields:
         A function of stage name and completed fraction that updates the display, None if `quiet`.
@@ -192,12 +192,18 @@ def show_stages(label: str, quiet: bool) -> Iterator[StageReport | None]:
 
 
 def ignore_stage(stage: str, fraction: float) -> None:
-    """Do nothing, where a stage of a computation may be reported but nobody wants to know it."""
+    """Do nothing; default for computations that report the name of a stage and the completed fraction."""
 
 
 @contextlib.contextmanager
 def announce_output(what: str, path: Path | None, quiet: bool = False) -> Iterator[None]:
-    """Print on stderr that an output is being made, and on stdout where it has been written, if at all."""
+    """Print before the context that an output is being made (stderr), after it its path (stdout).
+
+    Args:
+        what: name of the output, such as `plot`.
+        path: file of the output; None prints no path.
+        quiet: whether to print nothing.
+    """
     if not quiet:
         stderr_console.print(f"making the {what} ...", style="dim")
     yield

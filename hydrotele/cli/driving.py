@@ -52,7 +52,20 @@ _WINDOW_RATE, _STATUS_LINE_RATE = 30.0, 5.0  # Hz, update rates of window and st
 
 
 class DriveOptions(NamedTuple):
-    """Options of `hydrotele drive`, as `cli.main.drive` describes them."""
+    """Options of `hydrotele drive`.
+
+    Attributes:
+        scenario: teleoperated scenario, None for that of the machine.
+        overrides: scenario overrides, {key path: YAML text}.
+        device: input device, such as `keyboard` or `haptic:HOST:PORT`.
+        target: output folder, None for `runs/<scenario>`.
+        viewer: whether to open a window.
+        duration: duration [s], None for the default.
+        speed: simulated time per real time [1].
+        review: whether to write the rerun recording.
+        json: print JSON instead of text.
+        latency: whether to measure and print latencies of a haptic device.
+    """
 
     scenario: str | None
     overrides: dict[str, str]
@@ -67,7 +80,7 @@ class DriveOptions(NamedTuple):
 
 
 def drive_to_folder(options: DriveOptions) -> Path:
-    """Drive a machine in real time, and write the results to a folder.
+    """Let an operator drive a simulated machine in real time, and write the results to a folder.
 
     The output folder is written completely or not at all.
 
@@ -90,7 +103,7 @@ def drive_to_folder(options: DriveOptions) -> Path:
 
 
 def _drive_once(options: DriveOptions, idle_test: Mapping[str, Any] = MappingProxyType({})) -> Path:
-    """Drive the machine once and write the results.
+    """Run one drive: load the scenario, open the device, simulate, and write the results.
 
     Args:
         options: options of the command.
@@ -134,7 +147,15 @@ def _drive_once(options: DriveOptions, idle_test: Mapping[str, Any] = MappingPro
 
 
 def _measure_stolen_time(before: float | None, seconds: float) -> dict[str, float | None]:
-    """Return the processor time taken by the host since `before` [s] and its fraction [1]."""
+    """Return the processor time that the host has taken from this virtual machine during a drive.
+
+    Args:
+        before: time taken until the start of the drive [s], None if the system does not report it.
+        seconds: duration of the drive [s].
+
+    Returns:
+        Time taken [s] and its fraction of the time of all cores [1]; None if unknown.
+    """
     after = read_steal_time()
     if before is None or after is None:
         return {"stolen_seconds": None, "stolen_share": None}
@@ -144,7 +165,13 @@ def _measure_stolen_time(before: float | None, seconds: float) -> dict[str, floa
 
 
 def _drive_with_latency_test(options: DriveOptions) -> Path:
-    """Drive with a haptic device and print latencies; start a simulated device if none is given."""
+    """Drive with a haptic device and print latencies, after an idle loop that tests the computer.
+
+    If no device is given, a simulated one is started in a separate process.
+
+    Raises:
+        InputError: the given device has no force output.
+    """
     if _is_haptic_device(options):
         return _drive_once(options, _run_idle_test(_load_drive_scenario(options).duration))
     if options.device != "keyboard":
@@ -159,10 +186,10 @@ def _drive_with_latency_test(options: DriveOptions) -> Path:
 
 
 def _run_idle_test(duration: float) -> dict[str, Any]:
-    """Measure the deadlines that an idle loop misses on this computer.
+    """Count the deadlines that an idle loop misses on this computer, without a simulation.
 
     Args:
-        duration: duration of the drive [s]; the loop runs for a third of it, within `_IDLE_TEST_LIMITS`.
+        duration: duration of the drive [s]; the loop runs for a third of it, but 1 to 20 s.
     """
     seconds = min(_IDLE_TEST_LIMITS[1], max(_IDLE_TEST_LIMITS[0], duration / 3.0))
     stderr_console.print(f"running an idle loop for {seconds:.0f} s before the drive", style="dim")
@@ -190,7 +217,10 @@ def _write(result: Run, target: Path, options: DriveOptions) -> None:
 
 
 def _load_drive_scenario(options: DriveOptions) -> Scenario:
-    """Load the given scenario, or the default scenario of the machine."""
+    """Load the given scenario, or the default scenario of the machine, with all overrides applied.
+
+    Duration and, for a haptic device, the control rate are set from the options.
+    """
     overrides, name = dict(options.overrides), options.scenario
     duration = DEFAULT_DURATION if options.duration is None else options.duration
     if name is None:
@@ -209,7 +239,7 @@ def _load_drive_scenario(options: DriveOptions) -> Scenario:
 
 
 def _passive_joints(scenario: Scenario) -> list[str]:
-    """Return the passive joints without a drive or a closure.
+    """Return the joints that neither a drive nor a closed kinematic loop determines.
 
     With such joints, the force at the tip cannot be computed from the pressures.
     """
@@ -231,10 +261,11 @@ def _print_message(sentence: str) -> None:
 
 @contextlib.contextmanager
 def _show_progress(options: DriveOptions, device: Device, interrupted: Callable[[], bool]) -> Iterator[TickCallback]:
-    """Show viewer window and status line during a drive.
+    """Show the viewer window and a status line during a drive.
 
     Yields:
-        The callback of the drive; it returns False when the drive must stop.
+        Function to call at each control tick; it returns False when the drive must stop, after
+        Ctrl-C or when the user closes the window.
     """
     from hydrotele.show.window import Window, check_screen
 

@@ -27,7 +27,7 @@ _COLOURS = {"agrees": "green", "differs": "red", "undecided": "yellow"}
 
 
 def load_series(name: str) -> Series:
-    """Return the experiments of a publication.
+    """Import the experiments and claims of a publication by its name, such as `zhu1994`.
 
     Raises:
         InputError: there is no publication of this name.
@@ -40,7 +40,7 @@ def load_series(name: str) -> Series:
 def experiments_to_folder(
     name: str, target: Path | None, seeds: int | None, jobs: int | None, as_json: bool
 ) -> list[Comparison]:
-    """Run the experiments of a publication; write a table, a report and figures.
+    """Repeat the experiments of a publication in simulation; write a table, a report and figures.
 
     The output folder is written completely or not at all.
 

@@ -52,9 +52,10 @@ def gap_to_folder(
     effects: Sequence[str] = (), jobs: int | None = None, force: bool = False,
     mask: Path | None = None,
 ) -> Path:  # fmt: skip
-    """Find the gap between a machine model and logs, and write the results to a folder.
+    """Find the effects that explain the differences (gap) between a machine model and its logs.
 
-    The output folder is written completely or not at all.
+    The results are printed and written to a folder, with the corrected machine. The output folder is
+    written completely or not at all.
 
     Args:
         data: log files, folders of logs, run folders.
@@ -94,7 +95,9 @@ def gap_to_folder(
 def write_gap_files(
     gap: Gap, dataset: Dataset, folder: Path, recording: bool = True, data: Sequence[Path] = ()
 ) -> None:
-    """Write `gap.json`, report, patched machine, next experiment and recording of a gap.
+    """Write the result of a search for model errors: JSON, report, corrected machine and recording.
+
+    If the search proposes a next experiment, its scenario is written as well.
 
     Args:
         gap: result of the search.
@@ -139,7 +142,9 @@ def gap_mjcf_to_folder(
     data: Sequence[Path], mjcf: Path, columns: Path | None, heldout: str | None,
     target: Path | None, as_json: bool, effects: Sequence[str] = (),
 ) -> Path:  # fmt: skip
-    """Find the gap between a mechanism without hydraulics and its logs, and write the results.
+    """Find the effects that explain the differences (gap) between an MJCF mechanism and its logs.
+
+    The mechanism has no hydraulics. The results are printed and written to a folder.
 
     Args:
         data: log files, folders of logs.
@@ -195,7 +200,7 @@ def gap_mjcf_to_folder(
 def find_mechanism_files(
     machine: str | None, mjcf: Path | None, columns: Path | None
 ) -> tuple[Path | None, Path | None]:
-    """Return the files of the mechanism that the options select, if they select a mechanism.
+    """Return MJCF and column file if the options select a mechanism without hydraulics.
 
     Args:
         machine: name of a machine, or of a shipped model without `machine.yaml`.
@@ -229,16 +234,19 @@ _OPEN_LOOP_HORIZON = 0.25  # s; short, because an unstable mechanism diverges wi
 def simulate_open_loop(
     gap: Gap, data: Sequence[Path], mechanism: Mechanism, heldout: str | None
 ) -> dict[str, Any]:  # fmt: skip
-    """Compute the open-loop errors of the given and the patched model under measured forces.
+    """Compute position errors of open-loop simulations of the given and the corrected model.
+
+    The simulations are driven by the measured forces of the held-out run and last 0.25 s each.
 
     Args:
-        gap: result for a mechanism.
+        gap: result of the search for model errors of a mechanism.
         data: log files, folders of logs.
         mechanism: the given model.
         heldout: name of the held-out run, None for `test*`, else the last run.
 
     Returns:
-        Errors in the form of `Gap.open_loop`.
+        `horizon` [s], and `before` and `after`: {drive: RMS position error [rad] or [m]}; `after` only
+        if the model was corrected.
 
     Raises:
         InputError: forces are missing in the held-out run, or a simulation fails.

@@ -29,7 +29,17 @@ _TIME_LABELS = {
 
 
 class HapticOptions(NamedTuple):
-    """Options of `hydrotele haptic-device`, as `cli.serving` describes them."""
+    """Options of `hydrotele haptic-device`.
+
+    Attributes:
+        kind: kind of device, such as `simulated` or `force-dimension`.
+        host: address to listen on.
+        port: UDP port, 0 for any free port.
+        rate: sampling rate [Hz].
+        duration: duration [s], None to run until Ctrl-C.
+        until_eof: print the address as JSON, and stop when standard input is closed.
+        json: print the result as JSON.
+    """
 
     kind: str
     host: str
@@ -41,7 +51,9 @@ class HapticOptions(NamedTuple):
 
 
 def serve_device(options: HapticOptions) -> None:
-    """Serve a haptic device until Ctrl-C, the end of the duration or the end of standard input.
+    """Serve a haptic device by UDP until Ctrl-C, the end of the duration or of standard input.
+
+    Counts of missed deadlines and rejected packets are printed at the end.
 
     Raises:
         InputError: there is no such device, or the address cannot be used.
@@ -85,7 +97,7 @@ def _wait_for_stdin_close(ended: threading.Event) -> None:
 
 @contextlib.contextmanager
 def run_simulated_device() -> Iterator[tuple[str, int]]:
-    """Run a simulated haptic device in a separate process.
+    """Run a simulated haptic device in a separate process during the context.
 
     Yields:
         Host and port of the device.
@@ -116,7 +128,7 @@ def run_simulated_device() -> Iterator[tuple[str, int]]:
 
 
 def print_latency(figures: dict) -> None:
-    """Print tables of missed deadlines, percentiles and histograms.
+    """Print missed deadlines, and percentiles and histograms of latencies, of a drive with a haptic device.
 
     Args:
         figures: item `haptic` of the summary of a drive.
@@ -166,7 +178,7 @@ def print_latency(figures: dict) -> None:
 
 
 def describe_computer(machine: dict, computer: dict) -> list[str]:
-    """Describe stolen processor time and the deadlines that the idle computer missed.
+    """Describe the processor time taken by the host, and whether computer or program missed deadlines.
 
     Args:
         machine: item `haptic.machine` of the summary of a drive.

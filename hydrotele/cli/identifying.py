@@ -105,9 +105,9 @@ def identify_to_folder(
     sensors: str | None, target: Path | None, as_json: bool, choices: IdentificationOptions,
     force: bool = False,
 ) -> Path:  # fmt: skip
-    """Identify a machine from logs and write the results to a folder.
+    """Identify masses, friction and, if requested, hydraulics of a machine from logs.
 
-    The output folder is written completely or not at all.
+    The results are printed and written to a folder. The output folder is written completely or not at all.
 
     Args:
         data: log files, folders of logs, run folders.
@@ -158,7 +158,7 @@ def identify_mjcf_to_folder(
     data: Sequence[Path], mjcf: Path, columns: Path | None, heldout: str | None,
     target: Path | None, as_json: bool, processing: Processing, estimator: Estimator,
 ) -> Path:  # fmt: skip
-    """Identify a mechanism given as an MJCF file and write the results to a folder.
+    """Identify masses and friction of an MJCF mechanism from logs; print the results, write a folder.
 
     Args:
         data: log files, folders of logs.
@@ -208,7 +208,7 @@ def identify_mjcf_to_folder(
 
 
 def identify_mechanism(dataset: Dataset, choices: IdentificationOptions) -> MechanismIdentification:
-    """Identify bodies, friction and offsets of a machine.
+    """Identify masses, inertias, friction and force offsets of a machine from logs.
 
     Args:
         dataset: logs of the machine.
@@ -241,7 +241,16 @@ def write_identification(
     folder: Path, dataset: Dataset, mechanism: MechanismIdentification, hydraulics: HydraulicIdentification | None,
     data: Sequence[Path], choices: IdentificationOptions,
 ) -> None:  # fmt: skip
-    """Write `identify.json`, `report.html`, the identified machine and `summary.json`."""
+    """Write the results of an identification into a folder: JSON, report and identified machine.
+
+    Args:
+        folder: existing output folder.
+        dataset: logs that were used.
+        mechanism: identified masses and friction.
+        hydraulics: identified hydraulics, None if they were not identified.
+        data: paths of the logs, stored in `summary.json`.
+        choices: options of the identification.
+    """
     found, patched = (
         mechanism.identification,
         hydraulics.machine if hydraulics else mechanism.machine,
@@ -336,7 +345,7 @@ def design_excitation_file(
     machine: str, tool: str | None, sensors: str | None, target: Path, period: float,
     harmonics: int, starts: int, seed: int, cycles: float, as_json: bool,
 ) -> Path:  # fmt: skip
-    """Design the most informative trajectory of a machine and write it as a scenario.
+    """Design the periodic trajectory that best determines a machine's parameters; write it as a scenario.
 
     Args:
         machine: name or folder of the machine.

@@ -682,7 +682,7 @@ def _options(
 
 
 def main() -> None:
-    """Run the command line.
+    """Run the command given by the arguments of the program, and end with its exit status.
 
     The exit status is 2 for errors in the input, 3 for failed simulations, 130 or 143 for signals.
     """
@@ -721,7 +721,7 @@ def _run() -> None:
 
 
 def _find_input_error(error: BaseException) -> InputError | None:
-    """Return the error in the user's input or files that an exception reports, None for any other."""
+    """Convert an exception caused by the user's input or files to an InputError; None for any other."""
     if isinstance(error, InputError):
         return error
     effects = sys.modules.get("hydrotele.effects")
@@ -733,7 +733,7 @@ def _find_input_error(error: BaseException) -> InputError | None:
 
 
 def _check_arguments(words: list[str]) -> None:
-    """Raise an error for arguments that are not valid UTF-8; Python keeps their bytes as surrogates."""
+    """Raise InputError for arguments that are not valid UTF-8, whose bytes Python keeps as surrogates."""
     for word in words:
         if any("\ud800" <= character <= "\udfff" for character in word):
             raise InputError(word, "is not valid UTF-8: rename the file or folder")

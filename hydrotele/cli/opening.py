@@ -23,7 +23,7 @@ class OpenedLogs(NamedTuple):
 
     Attributes:
         machine: the machine.
-        runs: the runs, with the channels that only a simulator knows.
+        runs: files of each run, with all channels, also the true states of a simulation.
         merged: the runs on uniform clocks.
     """
 
@@ -38,14 +38,14 @@ class OpenedLogs(NamedTuple):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Repairs of the logs, one sentence each."""
+        """Sentences on repairs of the logs, such as interpolated samples."""
         return self.merged.notes
 
 
 def open_logs(
     paths: Sequence[Path], machine: str | None = None, tool: str | None = None, force: bool = False
 ) -> OpenedLogs:
-    """Load logs and their machine, and check them by the rule of all commands, see `merge_runs`.
+    """Load logs and their machine, check the logs against it, and put them on uniform clocks.
 
     Args:
         paths: log files, folders of logs, run folders.
@@ -62,10 +62,16 @@ def open_logs(
 
 
 def open_log(path: Path, machine: str | None = None, tool: str | None = None, force: bool = False) -> OpenedLogs:
-    """Load the only log of a path and its machine; the arguments are those of `open_logs`.
+    """Load the log of a path that contains exactly one, and its machine, and check them.
+
+    Args:
+        path: log file, folder with one log, or run folder.
+        machine: name or folder of a machine, None to find it.
+        tool: tool of the machine, None for the tool of the log if the machine has it.
+        force: accept a log whose metadata names another machine or tool.
 
     Raises:
-        InputError: as `open_logs`, or the path has several logs.
+        InputError: the log is not usable, its machine is not known, or the path has several logs.
     """
     files = find_logs(path)
     if len(files) > 1:
@@ -75,7 +81,7 @@ def open_log(path: Path, machine: str | None = None, tool: str | None = None, fo
 
 
 def find_run_log(path: Path, which: str) -> Path:
-    """Return the log `which` of a run folder, or the path itself if it has none."""
+    """Return the log file called `which`, such as `truth`, of a run folder; for other paths the path itself."""
     return find_log_in_folder(path, which) or path
 
 
@@ -97,13 +103,16 @@ def find_recording(path: Path) -> Path | None:
 
 
 def name_of_data(data: Sequence[Path]) -> str:
-    """Return the name of the data folder, or of the folder that contains the first file."""
+    """Return a name for outputs: that of the first data folder, or of the folder of the first file."""
     first = resolve_path(data[0])
     return first.name if first.is_dir() else first.parent.name or first.stem
 
 
 def name_machine(data: Sequence[Path], name: str | None) -> tuple[str | None, str | None]:
-    """Return machine and tool: `name`, else the machine next to the first log, else that of its metadata.
+    """Return the names of machine and tool of logs, None if unknown.
+
+    The machine is `name`, else the file `machine.yaml` next to the first log, else that of the log's
+    metadata. The tool is that of the metadata.
 
     Raises:
         InputError: there is no log at the path, or it cannot be read.
@@ -116,7 +125,10 @@ def name_machine(data: Sequence[Path], name: str | None) -> tuple[str | None, st
 
 
 def find_machine(data: Sequence[Path], name: str | None, tool: str | None) -> Machine:
-    """Load the machine called `name`, else that next to the first log, else that of its metadata.
+    """Load the machine of logs, with the given tool or else that of the logs.
+
+    The machine is `name`, else the file `machine.yaml` next to the first log, else that of the log's
+    metadata.
 
     Raises:
         InputError: no machine is known, or the machine is not usable.

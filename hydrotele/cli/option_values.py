@@ -46,7 +46,7 @@ def machine_overrides(machine: str | None, tool: str | None) -> dict[str, str]:
 
 
 def parse_numbers(option: str, text: str) -> list[float]:
-    """Return the positive numbers of an option value, which are separated by commas.
+    """Parse an option value that consists of positive numbers separated by commas.
 
     Raises:
         InputError: the text is empty or contains something other than positive numbers.
@@ -108,7 +108,7 @@ class CommandGroup(typer.Typer):
 
 
 def _escape_help(annotation: Any) -> Any:
-    """Return the annotation of a parameter with a help text in which brackets are no styles."""
+    """Return a parameter's annotation whose help text has escaped brackets, which rich prints as they are."""
     type_, *facts = get_args(annotation)
     facts = [copy.copy(fact) for fact in facts]
     for fact in facts:

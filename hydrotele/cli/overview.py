@@ -55,7 +55,7 @@ COMMANDS = {name: text for group in COMMAND_GROUPS.values() for name, text in gr
 
 
 def format_overview(width: int | None = None) -> str:
-    """Return the help text of the program.
+    """Format the output of `hydrotele --help`: usage, options, and a summary of each command.
 
     Args:
         width: line length [characters], default that of the terminal; at most 120.

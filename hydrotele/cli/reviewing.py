@@ -56,7 +56,7 @@ def review_logs(
     first: Path, second: Path | None, machine: str | None, tool: str | None, outputs: ReviewOutputs,
     force: bool = False,
 ) -> None:  # fmt: skip
-    """Record one or two logs for the rerun viewer, or take an existing recording; show it or write files.
+    """Show one or two logs, or an existing recording, in the rerun viewer, or write the requested files.
 
     Args:
         first: log file, folder with one log, run folder, recording, or result folder with a recording.
@@ -126,7 +126,7 @@ def _film(first, second, machine, tool, path: Path, force: bool) -> None:
 
 
 def _most_complete_log(path: Path) -> str:
-    """Return `truth` for a run folder with the true states, which contain all joints and objects."""
+    """Return `truth` if the run folder has a log of true states, with all joints and objects; else `measured`."""
     return "truth" if find_log_in_folder(path, "truth") else "measured"
 
 
@@ -153,7 +153,7 @@ def _record(first, second, machine, tool, path: Path, force: bool) -> None:
 
 
 def _open_log(path: Path, machine: str | None, tool: str | None, force: bool) -> tuple[Machine, Log]:
-    """Load the only log of a path as logged, and its machine; print the notes.
+    """Load the only log of a path, without resampling, and its machine; print notes on the log.
 
     Raises:
         InputError: the log is not usable or has no position of the machine.
@@ -172,7 +172,10 @@ def _open_log(path: Path, machine: str | None, tool: str | None, force: bool) ->
 
 
 def _open_log_pair(first, second, machine, tool, force: bool) -> dict[str, tuple[Machine, Log]]:
-    """Load two logs of the same machine and return them under different names.
+    """Load two logs of the same machine, on one time origin.
+
+    Returns:
+        {name derived from the path, else `first` and `second`: (machine, log)}.
 
     Raises:
         InputError: the logs belong to different machines.
@@ -199,7 +202,7 @@ def replay_logs(
     paths: list[Path], machine: str | None, tool: str | None, timestep: float, target: Path | None,
     as_json: bool, force: bool = False,
 ) -> None:  # fmt: skip
-    """Simulate the commands of logs and print the prediction errors of the model.
+    """Simulate a machine with the commands of logs; print the differences from the measurements.
 
     Args:
         paths: log files, folders of logs, run folders.
@@ -251,7 +254,7 @@ def replay_logs(
 
 
 def _replayable_logs(opened: OpenedLogs) -> list[Log]:
-    """Return the runs and pieces of runs that have at least two rows.
+    """Return the runs, and pieces of interrupted runs, that have at least 10 rows; note the shorter ones.
 
     Raises:
         InputError: a run has no command of an axis.
@@ -266,7 +269,7 @@ def _replayable_logs(opened: OpenedLogs) -> list[Log]:
 
 
 def replay_document(result: Replay) -> dict:
-    """Return a replay in the form that `--json` prints."""
+    """Return the prediction errors of a replay as JSON data: log, machine, errors of each channel."""
     return {
         "log": result.measured.source,
         "machine": result.simulated.metadata["machine"],

@@ -43,7 +43,7 @@ from hydrotele.simulate.native import stop_profiling_clock
 
 
 def run_to_folder(name: str, target: Path | None, overrides: dict[str, str], review: bool, as_json: bool) -> Path:
-    """Run a scenario and write the results to a folder.
+    """Simulate a scenario, write the results to a folder and print a summary.
 
     The output folder is written completely or not at all.
 
@@ -125,7 +125,7 @@ def print_summary(summary: dict[str, Any]) -> None:
 
 
 def run_demo(target: Path) -> None:
-    """Run three scenarios, replay one of them and draw the machine.
+    """Simulate three scenarios, replay the log of one of them and draw the machine.
 
     Args:
         target: output folder.
@@ -178,7 +178,7 @@ class SweepOptions(NamedTuple):
 
 
 def sweep_to_folder(name: str, target: Path | None, options: SweepOptions) -> None:
-    """Run a sweep, write its report and print the results.
+    """Run a sweep (many variations of a scenario), write its report and print the results.
 
     Args:
         name: sweep file, or name of a shipped sweep.
@@ -214,7 +214,7 @@ def sweep_to_folder(name: str, target: Path | None, options: SweepOptions) -> No
 
 
 def _sweep_study(file: SweepFile, swept: SweepResult, figures: list[str]) -> Study:
-    """Return the data of the sweep report."""
+    """Return the data of the sweep report: result table, varied keys, results to show, failed runs."""
     sampled = tuple(file.sweep.sample.keys) if file.sweep.sample else ()
     logarithmic = [k for k in sampled if file.sweep.sample.keys[k].log_uniform]  # pyright: ignore - it has one
     return Study(
@@ -272,7 +272,7 @@ def _show_sweep_progress(name: str, quiet: bool) -> Iterator[Progress | None]:
     """Show a progress bar with the remaining time on stderr, or lines if stderr is not a terminal.
 
     Yields:
-        A function that updates the display, None if `quiet`.
+        A function of stage, finished, total and failed runs that updates the display; None if `quiet`.
     """
     if quiet:
         yield None

@@ -85,13 +85,15 @@ class GravityModel:
 
 
 def gravity_regressor(q: np.ndarray) -> np.ndarray:
-    """Return the regressor Y of the static model `tau = Y(q) P`.
+    """Return the regressor Y of the static model `tau = Y(q) P` of an arm's gravity torques tau [N m].
+
+    P are the gravity parameters [N m].
 
     Args:
         q: (m,) joint angles of the arm, swing first [rad].
 
     Returns:
-        (m, p) regressor [1].
+        (m, p) regressor of m joints and p parameters [1].
 
     Source: Zhu 1994, 6.8 and 6.9.
     """
@@ -110,7 +112,7 @@ def fit_gravity_to_masses(machine: Machine) -> GravityModel:
         machine: machine with an arm whose joints are driven by valves.
 
     Returns:
-        The parameters.
+        The gravity parameters and the residual torques of the fit.
 
     Raises:
         InputError: the arm's joints are not all driven.
@@ -137,7 +139,7 @@ def fit_gravity_to_masses(machine: Machine) -> GravityModel:
 
 @compiled
 def _gravity_torques(arm, poses, torque):
-    """Compute the gravity torques (r, m) on the arm's joints in poses (r, m)."""
+    """Compute the gravity torques (r, m) [N m] on the m joints of an arm in r poses (r, m) [rad]."""
     outside = np.zeros(len(arm.work))
     for row in range(len(poses)):
         for i in range(len(arm.joint)):
@@ -257,7 +259,16 @@ def identify_gravity(
 def _solve_recursively(
     rows: np.ndarray, torque: np.ndarray, size: int
 ) -> tuple[RecursiveLeastSquares, list[np.ndarray]]:
-    """Process equations (r, m - 1, p); return the estimate and the parameter history."""
+    """Solve the equations `rows @ P = torque` by recursive least squares.
+
+    Args:
+        rows: (r, m - 1, p) regressors of r instants, without the swing joint.
+        torque: (r, m - 1) torques of the drives [N m].
+        size: number of gravity parameters, which come first; the others are dry friction.
+
+    Returns:
+        The estimate, and the gravity parameters (size,) after every instant [N m].
+    """
     spread = np.append(np.full(size, _INITIAL_GRAVITY_STD), np.full(rows.shape[2] - size, _INITIAL_FRICTION_STD))
     found, history = RecursiveLeastSquares(np.zeros(rows.shape[2]), spread), []
     for table, torques in zip(rows, torque, strict=True):
@@ -268,7 +279,10 @@ def _solve_recursively(
 
 
 def _are_outliers(left: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """Return for each equation (r,) whether its residuals (r, m - 1) fail Chauvenet's criterion."""
+    """Return for each instant (r,) whether a residual `left` (r, m - 1) is an outlier (Chauvenet's criterion).
+
+    The scale of the residuals is that of the instants that are `kept` (r,).
+    """
     from scipy.special import ndtri  # imported here, because runs do not need it
 
     scale = np.median(np.abs(left[kept]), axis=0) / ndtri(0.75)
@@ -281,7 +295,7 @@ _JOINT_ROW, _HEAD_ROW, _ROD_ROW = range(3)  # rows of `DriveReadings.last`
 
 
 class DriveReadings(NamedTuple):
-    """State of the reading filters: n independent coordinates, h valves, k axes.
+    """Filters and last valid readings of the force estimator: n coordinates, h valves, k axes, m task forces.
 
     Attributes:
         period: time between two readings of the sensors [s].
@@ -308,7 +322,7 @@ class DriveReadings(NamedTuple):
 
 @allocation_free
 def endpoint_force_step(arm, readings, dynamic, count, joint, head, rod, out):
-    """Process new readings and update the force at the tip.
+    """Filter new sensor readings and estimate the force of the environment on the arm's tip.
 
     Args:
         arm: ArmBalance.
@@ -322,8 +336,9 @@ def endpoint_force_step(arm, readings, dynamic, count, joint, head, rod, out):
         out: (m,) written: r [N], theta [N m], z [N], then attitude and head [N m].
 
     Returns:
-        WAITING until every channel has a reading, GOOD, BAD if a reading was not finite and was
-        replaced by the last one, SINGULAR if the arm is singular and `out` is unchanged.
+        STATUS_WAITING until every channel has a reading, STATUS_GOOD, STATUS_BAD if a reading was not
+        finite and was replaced by the last one, STATUS_SINGULAR if the arm is singular and `out` is
+        unchanged.
 
     Source: Zhu 1994, 6.1.
     """
@@ -362,7 +377,7 @@ def endpoint_force_step(arm, readings, dynamic, count, joint, head, rod, out):
 
 @allocation_free
 def _reset_filter(state, value):
-    """Set a filter to a constant value."""
+    """Set the state of a filter as if its input had always been `value`; both derivatives are 0."""
     state[VALUE], state[RATE], state[SECOND_DERIVATIVE], state[LAST_READING] = (
         value,
         0.0,
@@ -373,9 +388,9 @@ def _reset_filter(state, value):
 
 @allocation_free
 def _get_reading(r, c):
-    """Return the index in the arm's state and the last valid value of signal c.
+    """Return the index of signal c in the arm's state vector, and the last valid reading of its sensor.
 
-    Positions come first, then pressures.
+    The signals are the joint positions, then head and rod pressure of every valve.
     """
     n = len(r.position)
     if c < n:
@@ -386,7 +401,17 @@ def _get_reading(r, c):
 
 @allocation_free
 def _store_readings(last, still, used, values):
-    """Store finite readings; return False if a used reading is not finite."""
+    """Store the finite ones of new readings, and count how long each channel has not changed.
+
+    Args:
+        last: (k,) last valid readings, updated.
+        still: (k,) number of readings since the last change, updated.
+        used: indices of the channels that are used.
+        values: (k,) new readings.
+
+    Returns:
+        Whether all used readings are finite.
+    """
     good = True
     for c in range(len(used)):
         i = used[c]
@@ -403,7 +428,7 @@ def _store_readings(last, still, used, values):
 
 @allocation_free
 def _has_all_readings(readings):
-    """Return whether all used channels have a reading."""
+    """Return whether all used channels have had a finite reading."""
     for i in readings.position:
         if math.isnan(readings.last[_JOINT_ROW, i]):
             return False
@@ -423,7 +448,7 @@ _READINGS_DTYPE = np.dtype(
 
 
 def _readings_record(r: DriveReadings) -> np.ndarray:
-    """Return a record (1,) of DriveReadings; their arrays must outlive it."""
+    """Pack DriveReadings into a record (1,) of sizes and array addresses; the arrays must outlive it."""
     arrays = {name: part for name, part in r._asdict().items() if isinstance(part, np.ndarray)}
     record = address_record(_READINGS_DTYPE, arrays)
     (record["signals"], _), (_, record["axes"]) = r.state.shape, r.last.shape
@@ -434,10 +459,10 @@ def _readings_record(r: DriveReadings) -> np.ndarray:
 
 @compiled
 def _step_records(arm, kept, dynamic, count, joint, head, rod, out):
-    """Call `endpoint_force_step` with records.
+    """Unpack the records of arm and readings and update the force at the tip (`endpoint_force_step`).
 
     Returns:
-        Its status, and the largest number of readings since a channel changed.
+        Status of the update, and the number of readings since the longest constant channel changed.
     """
     r = kept[0]
     still = int64_view(r.still, 3 * r.axes).reshape((3, r.axes))
@@ -482,7 +507,7 @@ class EndpointForce:
             axes: order of the readings, as in `Feedback.joint`.
             kind: `static` models gravity only, `dynamic` uses the complete model.
             period: time between two updates [s].
-            every: updates per sample of the sensors, as in `Feedback.every`. The first update uses
+            every: updates per sample of the sensors, as in `Feedback.ticks_per_sample`. The first update uses
                 a new sample, the following ones have no effect.
             sensors: sensor set of the machine; its noise affects friction in the dynamic estimate.
                 None for ideal sensors.
@@ -521,7 +546,7 @@ class EndpointForce:
         self._records = arm_record(self._arm), _readings_record(self._readings)
 
     def update(self, joint: np.ndarray, head: np.ndarray, rod: np.ndarray) -> np.ndarray:
-        """Process the readings of one instant.
+        """Update the estimate of the force at the tip with the sensor readings of one instant.
 
         A reading that is not finite is replaced by the last valid one of its channel, and `is_healthy`
         is then False.
@@ -574,7 +599,16 @@ def _create_readings(
     motion_bandwidth: float,
     context: str,
 ) -> DriveReadings:
-    """Create the reading filters and the columns of the used readings."""
+    """Create the filters of positions, pressures and force, and select the readings that are used.
+
+    Args:
+        machine: the machine.
+        axes: order of the readings.
+        period: time between two readings [s].
+        bandwidth: of the force filter [Hz].
+        motion_bandwidth: of the filter of positions and pressures [Hz].
+        context: name of the caller, for messages.
+    """
     free, valves = (
         independent_axes(machine, context),
         actuator_order(machine)[: len(machine.hydraulic_axes)],
@@ -600,19 +634,20 @@ def endpoint_force_of_log(
     bandwidth: float = FORCE_BANDWIDTH_HZ, motion_bandwidth: float = MOTION_BANDWIDTH_HZ,
     sensors: SensorSet | None = None,
 ) -> dict[str, np.ndarray]:  # fmt: skip
-    """Run the online estimator over a log, one update per row.
+    """Estimate the force at the arm's tip over a log by the online estimator, one update per row.
 
     Args:
         machine: the machine.
         log: positions and pressures of all its axes, measured.
-        kind: see `EndpointForce`.
-        gravity: see `EndpointForce`.
-        bandwidth: see `EndpointForce`.
-        motion_bandwidth: see `EndpointForce`.
-        sensors: see `EndpointForce`.
+        kind: `static` models gravity only, `dynamic` uses the complete model.
+        gravity: parameters of the static model; None to compute them from the machine's masses.
+        bandwidth: of the force estimate [Hz].
+        motion_bandwidth: of the filter of positions and pressures [Hz].
+        sensors: sensor set, whose noise affects friction in the dynamic estimate; None for ideal ones.
 
     Returns:
-        `r` [N], `theta` [N m], `z` [N], `attitude` [N m] ... and `is_healthy` [1], (n,) each.
+        Force along the task coordinates `r` [N], `theta` [N m], `z` [N] and, as the arm has them,
+        `attitude` and `head` [N m]; and `healthy`, 1 where the estimate is valid [1]; (n,) each.
 
     Raises:
         InputError: a channel is missing, or the tip force of the arm cannot be estimated.

@@ -21,7 +21,7 @@ _REFERENCE_CUTOFF_HZ = 8.0  # Hz, cutoff that removes steps and corners of table
 
 
 def compute_force_references(machine: Machine, plan: Plan, servo: Servo) -> ForceReferences:
-    """Compute the drive forces along a plan with the machine that the servo names.
+    """Compute the drive forces that a plan requires, by inverse dynamics of the model that the servo names.
 
     Args:
         machine: machine of the scenario, without added effects.
@@ -70,7 +70,10 @@ def compute_force_references(machine: Machine, plan: Plan, servo: Servo) -> Forc
 
 
 def _differentiate_reference(reference: np.ndarray, step: float) -> SmoothedSignal:
-    """Filter and differentiate a reference (n, k); if it is too short, do not filter."""
+    """Return a joint reference (n, k) with its rates and accelerations, low-pass filtered without delay.
+
+    `step` is the time between rows [s]. A reference that is too short is not filtered.
+    """
     if len(reference) > 5.0 / (_REFERENCE_CUTOFF_HZ * step):
         return filter_zero_phase(reference, step, _REFERENCE_CUTOFF_HZ)
     rate = np.gradient(reference, step, axis=0)

@@ -77,14 +77,14 @@ def check_command(machine: Machine, name: str, command: np.ndarray) -> None:
 
 
 def note_early_end(time: np.ndarray, pilot_duration: float) -> tuple[str, ...]:
-    """Return a note if the run ends before its pilot.
+    """Return a message if the run ends before all motions of its pilot are finished.
 
     Args:
         time: (n,) times of the control ticks [s].
         pilot_duration: time that the pilot needs [s].
 
     Returns:
-        One sentence, or an empty tuple.
+        A tuple with one sentence, or an empty tuple.
     """
     missing = pilot_duration - (2 * time[-1] - time[-2])
     return (f"the run ends {missing:.3g} s before its pilot",) if missing > 1e-6 else ()
@@ -116,12 +116,12 @@ class Plan:
 
 
 def make_plan(machine: Machine, axes: tuple[str, ...], pilot: Pilot, start: dict[str, float], time: np.ndarray) -> Plan:
-    """Convert a pilot to a plan.
+    """Convert a scenario's pilot to commands and joint references at every control tick.
 
     Args:
         machine: the machine.
         axes: axis names in column order.
-        pilot: the scenario's pilot.
+        pilot: the scenario's pilot, which describes the intended motion.
         start: joint name -> position at t = 0 [rad] or [m].
         time: (n,) times of the control ticks [s].
 
@@ -165,7 +165,10 @@ def _build_plan(
 
 
 def _plan_teleoperation(plan: Plan, machine: Machine, pilot: TeleopPilot) -> Plan:
-    """Return a plan whose references are written during the run; buttons command their axes."""
+    """Return the plan of a teleoperated run, whose joint references are written during the run.
+
+    Buttons of the operator set open-loop commands of their axes from given times on.
+    """
     closed = np.array([machine.axes[a].force is None for a in plan.axes])
     for button in sorted(pilot.buttons, key=lambda button: button.start):
         column = _find_column(plan.axes, button.axis, "pilot.buttons")
@@ -203,7 +206,10 @@ def _plan_table(plan: Plan, pilot: TablePilot) -> Plan:
 
 
 def _plan_fourier(plan: Plan, pilot: FourierPilot) -> Plan:
-    """Return references with a fade-in: `start + s(t) (wave - start)` with a quintic s."""
+    """Return a plan with Fourier series as joint references, faded in from the start position.
+
+    `reference = start + s(t) (wave - start)` with the smooth step s of `quintic_step`.
+    """
     s, ds = quintic_step(plan.time, pilot.fade)
     omega = 2.0 * math.pi / pilot.period
     for name, harmonics in pilot.axes.items():
@@ -244,7 +250,10 @@ def quintic_step(time: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndar
 
 
 def _trapezoidal_speed(time: np.ndarray, distance: float, speed: float, acceleration: float):
-    """Return the speed (n,) of a move with a trapezoidal profile, and its duration."""
+    """Return the speed (n,) at given times of a move with a trapezoidal speed profile, and its duration [s].
+
+    `time` (n,) counts from the start of the move [s]. `distance` [m] or [rad] is its length.
+    """
     ramp = min(speed / acceleration, math.sqrt(distance / acceleration))
     cruise = distance / (ramp * acceleration) - ramp
     rise = np.clip(time / ramp, 0, 1) - np.clip((time - ramp - cruise) / ramp, 0, 1)
@@ -294,7 +303,7 @@ def _rate_commands(time: np.ndarray, pilot: LinesPilot) -> np.ndarray:
 
 
 def lines_duration(pilot: LinesPilot) -> float:
-    """Return the time that a lines pilot needs for all moves and pauses [s]."""
+    """Return the time [s] that a lines pilot (straight moves of the tip) needs for all moves and pauses."""
     total = pilot.settle
     for move in pilot.moves:
         total += move.pause + _move_duration(move, pilot.acceleration)

@@ -38,13 +38,13 @@ _RELEASE_DISTANCE = 0.02  # m or rad, release distance of a blocked reference: a
 
 @compiled
 def follow_pose(g, ranges, target, rate, blocked, pose, q, speed):
-    """Move joint references to a pose, or hold them if it cannot be reached.
+    """Set joint references to the inverse kinematics of a target pose, or hold them if it is out of reach.
 
     Args:
-        g: (9,) of `kinematics.task.arm_parameters`.
+        g: (9,) parameters of the arm, of `kinematics.task.arm_parameters`.
         ranges: (k, 2) joint ranges [rad].
         target: (5,) target pose: r [m], theta [rad], z [m], attitude [rad], head [rad].
-        rate: (5,) its rate [m/s], [rad/s].
+        rate: (5,) time derivative of the target [m/s], [rad/s].
         blocked: whether the last step was held, scalar; then only a pose near the held one releases
             the references.
         pose: (5,) pose of the references, updated.
@@ -83,13 +83,13 @@ def follow_pose(g, ranges, target, rate, blocked, pose, q, speed):
 
 @compiled
 def follow_rate(g, ranges, measured, rate, period, pose, q, speed):
-    """Integrate joint rates of the inverse Jacobian, or hold the references at a limit.
+    """Convert a rate of the tip to joint rates and integrate the joint references, or hold them at a limit.
 
     Args:
-        g: (9,) of `kinematics.task.arm_parameters`.
+        g: (9,) parameters of the arm, of `kinematics.task.arm_parameters`.
         ranges: (k, 2) joint ranges [rad].
         measured: (k,) joint angles at which the Jacobian is evaluated [rad].
-        rate: (5,) rate of the pose [m/s], [rad/s].
+        rate: (5,) rate of r, theta, z, attitude and head [m/s], [rad/s].
         period: integration period, scalar [s].
         pose: (5,) pose of the references, updated [m], [rad].
         q: (k,) joint references, updated [rad].
@@ -144,7 +144,7 @@ class ResolvedMotion:
 
     @staticmethod
     def from_joints(machine: Machine, joints: dict[str, float]) -> "ResolvedMotion":
-        """Create a controller at the given axis positions [rad].
+        """Create the state of the controller at given positions of the axes (name -> [rad]).
 
         Raises:
             InputError: the machine has no arm.
@@ -156,7 +156,7 @@ class ResolvedMotion:
         return ResolvedMotion(numbers, axes, ranges, q, tuple(pose[: max(4, len(axes))].tolist()))
 
     def step_by_rate(self, rate, dt: float) -> tuple["ResolvedMotion", dict, dict]:
-        """Move by a rate command that is constant for dt.
+        """Advance the references by a rate command of the tip that is constant for dt.
 
         Args:
             rate: (4,) or (5,) dr/dt [m/s], dtheta/dt [rad/s], dz/dt [m/s], dattitude/dt [rad/s],
@@ -170,11 +170,11 @@ class ResolvedMotion:
         return self.step_to_pose(wanted, rate)
 
     def step_to_pose(self, target, rate) -> tuple["ResolvedMotion", dict, dict]:
-        """Move to a pose and convert its rate to joint rates.
+        """Set the references to a target pose of the tip and convert its rate to joint rates.
 
         Args:
             target: (4,) or (5,) target r [m], theta [rad], z [m], attitude [rad], head [rad].
-            rate: time derivative of the pose.
+            rate: (4,) or (5,) time derivative of the target [m/s], [rad/s].
 
         Returns:
             (next state, axis -> position [rad], axis -> velocity [rad/s]).
@@ -224,7 +224,7 @@ def arm_axes(machine: Machine) -> tuple[str, ...]:
 
 
 def arm_specification(machine: Machine) -> tuple[np.ndarray, tuple[str, ...], np.ndarray]:
-    """Return parameters (9,) of the arm, its k axis names, and its joint ranges (k, 2) [rad].
+    """Return kinematic parameters (9,) of the arm, its k axis names, and its joint ranges (k, 2) [rad].
 
     The axes are ordered from swing outwards.
 
@@ -240,7 +240,7 @@ def arm_specification(machine: Machine) -> tuple[np.ndarray, tuple[str, ...], np
 
 
 def pose_to_joints(machine: Machine, pose: Pose, current: dict[str, float], where: str = "pose") -> dict[str, float]:
-    """Solve the inverse kinematics of a pose of the tip.
+    """Compute the axis positions at which the tip has a pose (inverse kinematics).
 
     The joint axes of a calibrated arm may be twisted out of its plane. For an arm of three joints,
     Newton's method then refines the solution of the planar arm.

@@ -32,18 +32,19 @@ _MIN_PRESSURE_DROP_RATIO = 0.02  # of the supply: smallest assumed pressure drop
 
 
 def servo_parameters(machine: Machine, axes: tuple[str, ...], servo: Servo, dt: float) -> np.ndarray:
-    """Return the constants of the servo, one row per axis.
+    """Return gains and drive parameters of the joint servo as a table, one row per axis.
 
     Args:
         machine: the machine.
         axes: axis names in column order.
-        servo: gains.
+        servo: gains of the servo.
         dt: control period [s].
 
     Returns:
-        (k, 14): hydraulic, area_head, area_rod, flow gain [m^3/(s sqrt(Pa))], deadband, tank [Pa],
-        command limit, drive gain, position gain [1/s], velocity gain, deadband compensation,
-        load filter coefficient, bulk modulus [Pa], pressure feedback [1/s].
+        (k, 14): kind (1 hydraulic with valve, 0 force drive), head and rod area [m^2], flow gain
+        [m^3/(s sqrt(Pa))], deadband [1], tank pressure [Pa], command limit, force per command, position
+        gain [1/s], velocity gain (force drives), deadband compensation [1], coefficient of the load
+        filter [1], bulk modulus [Pa], pressure feedback [1/s].
 
     Raises:
         InputError: a gain is given for an unknown axis.
@@ -93,7 +94,8 @@ def compute_drive_references(machine: Machine, plan: Plan, servo: Servo) -> Driv
     Args:
         machine: the machine.
         plan: joint references.
-        servo: `lead` [s] compensates for the spool's lag, `feedforward` scales the velocities.
+        servo: its `lead` [s] shifts the velocities forward in time, against the spool's lag; its
+            `feedforward` [1] scales them.
 
     Returns:
         The references.
@@ -223,14 +225,14 @@ class ForceReferences(NamedTuple):
 
 @compiled
 def servo_step(parameters, closed, drive, reference, measured, load, computed, out):
-    """Compute the commands of all axes for one control period.
+    """Compute the servo commands of all axes for one control period.
 
     Args:
         parameters: (k, 14) of `servo_parameters`.
         closed: (k,) whether the axis is under feedback; the others keep `out`.
         drive: DriveReference.
         reference: (k,) joint reference at the time of the joint measurement [rad] or [m].
-        measured: Measured.
+        measured: MeasuredState.
         load: (k,) slow mean of the drive force, updated [N] or [N m].
         computed: ComputedForce.
         out: (k,) commands, written where closed [1] or in the drive's unit.
@@ -286,8 +288,8 @@ def tabulate_drives(machine: Machine, axes: tuple[str, ...]) -> tuple[np.ndarray
         axes: axis names in column order.
 
     Returns:
-        (grid (k, 2): lowest joint position and step, table (k, POINTS, 3): d(drive)/d(joint), head
-        and rod chamber volume [m^3]).
+        (grid (k, 2): lowest joint position and step [rad] or [m]; table (k, TABLE_POINTS, 3): moment
+        arm d(drive)/d(joint), head and rod chamber volume [m^3]).
     """
     grid, table = np.zeros((len(axes), 2)), np.ones((len(axes), TABLE_POINTS, 3))
     for i, name in enumerate(axes):
@@ -307,11 +309,11 @@ def tabulate_drives(machine: Machine, axes: tuple[str, ...]) -> tuple[np.ndarray
 
 @compiled
 def interpolate_drive_reference(grid, table, reference, rate, scale, velocity, arm, volume_head, volume_rod):
-    """Compute the drive references of one control period from tables.
+    """Interpolate moment arms and chamber volumes in tables and compute drive velocities for one tick.
 
     Args:
         grid: (k, 2) of `tabulate_drives`.
-        table: (k, POINTS, 3) of `tabulate_drives`.
+        table: (k, TABLE_POINTS, 3) of `tabulate_drives`.
         reference: (k,) joint references [rad] or [m].
         rate: (k,) rates of the references [rad/s] or [m/s].
         scale: factor of the velocities, the servo's feedforward; scalar.

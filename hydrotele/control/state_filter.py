@@ -17,10 +17,10 @@ _REAL, _SQUARE, _CUBE = 2.0, 2.0, 1.0  # coefficients of the third-order Butterw
 
 
 def filter_table(bandwidth: float, period: float) -> np.ndarray:
-    """Return the matrix of one filter step.
+    """Return the matrix that advances the low-pass filter and its two derivatives by one period.
 
-    The filter is `y''' = w^3 (u - y) - 2 w^2 y' - 2 w y''` (Butterworth). It is solved exactly for
-    an input u that is linear between the last and the new reading.
+    The filter is `y''' = w^3 (u - y) - 2 w^2 y' - 2 w y''` (Butterworth), with input u and output y.
+    It is solved exactly for an input u that is linear between the last and the new reading.
 
     Args:
         bandwidth: w / (2 pi), scalar [Hz], > 0.
@@ -55,7 +55,7 @@ def filter_delay(bandwidth: float) -> float:
 
 
 def butterworth_response(bandwidth: float, s: np.ndarray) -> np.ndarray:
-    """Return the transfer function of the filter for linearly interpolated readings.
+    """Return the transfer function of the third-order Butterworth filter at complex frequencies.
 
     Args:
         bandwidth: w / (2 pi), scalar [Hz], > 0.
@@ -74,13 +74,13 @@ def butterworth_response(bandwidth: float, s: np.ndarray) -> np.ndarray:
 
 
 def noise_gains(table: np.ndarray) -> np.ndarray:
-    """Return the standard deviations of y, y', y'' for white readings of standard deviation 1.
+    """Return the standard deviations of filter output and derivatives for white noise of unit deviation.
 
     Args:
         table: (3, 5) of `filter_table`.
 
     Returns:
-        (3,) standard deviations [1], [1/s], [1/s^2].
+        (3,) standard deviations of output [1], rate [1/s] and second derivative [1/s^2].
 
     Source: root of the summed squares of the response to a single reading.
     """
@@ -98,7 +98,7 @@ def filter_step(table, state, reading):
 
     Args:
         table: (3, 5) of `filter_table`.
-        state: (4,) of the signal: LOW, RATE, CHANGE, LAST reading; updated.
+        state: (4,) VALUE, RATE, SECOND_DERIVATIVE and LAST_READING of the signal; updated.
         reading: u, scalar.
 
     Returns:
@@ -121,14 +121,14 @@ def filter_step(table, state, reading):
 
 @compiled
 def filter_signal(table, readings):
-    """Filter a whole signal, with the filter initially at rest at the first reading.
+    """Low-pass filter a whole signal and compute its derivatives, starting at rest at the first reading.
 
     Args:
         table: (3, 5) of `filter_table`.
         readings: (r,) signal.
 
     Returns:
-        (r, 3) low-pass LOW, its RATE and its CHANGE.
+        (r, 3) low-pass VALUE, its RATE and its SECOND_DERIVATIVE.
 
     Source: `filter_table`.
     """

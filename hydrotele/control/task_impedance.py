@@ -20,7 +20,7 @@ _ERROR_CONTEXT = "recursive least squares"
 
 
 class RecursiveLeastSquares:
-    """Recursive least squares for `y = phi . theta` with forgetting and covariance resetting.
+    """Recursive least squares for `y = phi . theta` with regressor phi and parameters theta.
 
     A forgetting factor below 1 reduces the weight of old equations, so that parameters may drift.
     Without excitation, forgetting would increase the covariance without limit, so its trace is
@@ -35,7 +35,7 @@ class RecursiveLeastSquares:
 
         Args:
             start: (p,) initial parameters.
-            initial_std: (p,) their standard deviations, in units of the equations' error.
+            initial_std: (p,) their standard deviations, relative to that of the equations' error.
             forgetting: forgetting factor per equation, above 0, at most 1.
             reset_ratio: multiple of the usual error above which the covariance is reset.
 
@@ -65,8 +65,8 @@ class RecursiveLeastSquares:
         """Update the parameters with one equation; skip it if it is not finite.
 
         Args:
-            row: (p,) phi.
-            measured: y.
+            row: (p,) regressor phi.
+            measured: measured value y.
 
         Returns:
             The prediction error before the update; NaN if the equation was skipped.
@@ -91,7 +91,7 @@ class RecursiveLeastSquares:
         return error
 
     def _detect_sudden_change(self, error: float) -> bool:
-        """Return whether an error is far above the usual size; otherwise update that size."""
+        """Return whether a prediction error is far above its usual size; otherwise update the usual size."""
         known = self._count >= 5 * len(self.value)
         if known and error**2 > self._reset_ratio**2 * self._mean_square_error:
             return True
@@ -110,7 +110,10 @@ _RESET_ERROR_RATIO = 8.0  # multiple of the usual error that resets the covarian
 
 
 class TaskImpedance:
-    """Estimator of `F = -(K x + B v + M a + c)` along every task coordinate.
+    """Online estimator of stiffness K, damping B and mass M of the environment along every task coordinate.
+
+    The model is `F = -(K x + B v + M a + c)` with force F, displacement x since contact, velocity v,
+    acceleration a and offset c.
 
     Force, position, rate and acceleration pass the same filters, so that they have equal delay.
 
@@ -163,7 +166,10 @@ class TaskImpedance:
             self._fit(c, felt, *motion)
 
     def _filter_reading(self, states: np.ndarray, c: int, reading: float) -> tuple[float, float, float]:
-        """Return the filtered reading with two derivatives; filters start at the first reading."""
+        """Pass a reading of coordinate c through all filters; return its value and two derivatives.
+
+        The filters start at rest at the first reading.
+        """
         for table, state in zip(self._tables, states[:, c], strict=True):
             if np.isnan(state[VALUE]):
                 state[:] = 0.0
@@ -173,7 +179,10 @@ class TaskImpedance:
         return reading, rate, change
 
     def _fit(self, c: int, force: float, place: float, rate: float, change: float) -> None:
-        """Update one coordinate with one equation; reset it without contact."""
+        """Update the impedance of coordinate c with one equation; reset it to 0 without contact.
+
+        `place`, `rate` and `change` are position, velocity and acceleration.
+        """
         if not abs(force) > _MIN_CONTACT_FORCE_N:
             self._fits[c] = None
             self.stiffness[c] = self.damping[c] = self.mass[c] = 0.0

@@ -55,7 +55,7 @@ class TickReference(NamedTuple):
 
 @compiled
 def control_tick(sim, tick, steps, controller, reference, measured):
-    """Compute the servo commands of all axes and step the physics through one tick.
+    """Compute the servo commands of all axes and simulate the physics of one control tick.
 
     Args:
         sim: Simulation.
@@ -63,7 +63,7 @@ def control_tick(sim, tick, steps, controller, reference, measured):
         steps: physics steps per tick, scalar.
         controller: Controller.
         reference: TickReference.
-        measured: Measured.
+        measured: MeasuredState.
 
     Returns:
         Nothing.
@@ -117,7 +117,7 @@ PLANNED_RUN_DTYPE = np.dtype(
 
 
 def planned_run_record(run: PlannedRun) -> np.ndarray:
-    """Return a record (1,) of a `PlannedRun`; its arrays must outlive it."""
+    """Pack a `PlannedRun` into a record (1,) of sizes and array addresses; its arrays must outlive it."""
     table, controller = run.feedback, run.controller
     arrays = {
         "parameters": controller.parameters, "closed": controller.closed, "load": controller.load,
@@ -135,7 +135,7 @@ def planned_run_record(run: PlannedRun) -> np.ndarray:
 
 @compiled
 def _read_planned_run(r):
-    """Return the `PlannedRun` of a record."""
+    """Unpack a record of `planned_run_record` to a `PlannedRun` whose arrays share its memory."""
     n, k, c = r.ticks, r.axes, r.channels
     controller = Controller(
         matrix_view(r.parameters, k, _SERVO_COLUMNS), int64_view(r.closed, k), float64_view(r.load, k),
@@ -164,7 +164,7 @@ def _read_planned_run(r):
 
 @compiled
 def step_planned_run(simulated, planned, tick, steps, stopped):
-    """Simulate one tick and sample the sensors that are due after it.
+    """Simulate one control tick of a run along a plan, and sample the sensors that are due after it.
 
     Args:
         simulated: record of `simulate.stepping.simulation_record`.

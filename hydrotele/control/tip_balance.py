@@ -37,9 +37,9 @@ _MIN_PIVOT_RATIO = 1.0e-6  # pivot over largest entry, below which a Jacobian is
 
 
 class BalanceModel(NamedTuple):
-    """Required attributes of `estimate.reduced_model.Model`.
+    """The attributes of `estimate.reduced_model.Model` that a force balance needs.
 
-    Passing an array from Python takes a tenth of a microsecond.
+    Only these are passed, because each array passed from Python takes a tenth of a microsecond.
     """
 
     mech: ReducedMechanism
@@ -50,7 +50,7 @@ class BalanceModel(NamedTuple):
 
 
 class BalanceSpace(NamedTuple):
-    """Required attributes of `estimate.reduced_model.Space`."""
+    """The attributes of `estimate.reduced_model.Space`, its work arrays, that a force balance needs."""
 
     motion: ReducedMotion
     drive: np.ndarray
@@ -108,7 +108,10 @@ _ARM_DTYPE = np.dtype(
 
 
 def arm_record(arm: ArmBalance) -> np.ndarray:
-    """Return a record (1,) of an ArmBalance for `read_arm_record`; the arrays must outlive it."""
+    """Pack an ArmBalance into a record (1,) of sizes and array addresses, which is fast to pass.
+
+    The arrays must outlive it. `read_arm_record` unpacks it.
+    """
     mech, motion = arm.model.mech, arm.space.motion
     parts = {"mech": mech, "model": arm.model, "motion": motion, "space": arm.space, "arm": arm}
     arrays = {f"{p}_{n}": getattr(parts[p], n) for p, names in _ARRAY_FIELDS.items() for n in names}
@@ -128,7 +131,7 @@ def arm_record(arm: ArmBalance) -> np.ndarray:
 
 @compiled
 def read_arm_record(r):
-    """Return the ArmBalance of a record of `arm_record`."""
+    """Unpack a record of `arm_record` to an ArmBalance whose arrays share its memory."""
     f, c, n, m = r.frames, r.coordinates, r.free, r.joints
     mech = ReducedMechanism(
         int64_view(r.mech_tree, 4 * f).reshape((f, 4)), matrix_view(r.mech_shape, f, r.shape_width),
@@ -161,9 +164,11 @@ def read_arm_record(r):
 
 @allocation_free
 def dynamic_balance(arm, external_force):
-    """Compute external forces by the complete model: inertia, gravity, friction, closed chains.
+    """Compute external forces on an arm by the complete model: inertia, gravity, friction, closed chains.
 
-    `tau = B' (M (B q'' + d) + h + D q') - sum r_i (F_i - f_i(v_i))`
+    `tau = B' (M (B a + d) + h + D q') - sum r_i (F_i - f_i(v_i))` with basis B of the independent
+    coordinates, mass matrix M, their accelerations a, drift d, bias forces h, damping D, joint rates
+    q', and moment arms r_i, forces F_i and friction f_i of the drives.
 
     Args:
         arm: ArmBalance; z and acceleration are read.
@@ -194,9 +199,10 @@ def dynamic_balance(arm, external_force):
 
 @allocation_free
 def static_balance(arm, external_force):
-    """Compute external forces by the static model, which includes only gravity.
+    """Compute external forces on an arm by the static model, which includes only gravity.
 
-    `tau = Y(q) P - sum r_i F_i`
+    `tau = Y(q) P - sum r_i F_i` with gravity torques Y(q) P, and moment arms r_i and forces F_i of the
+    drives.
 
     Args:
         arm: ArmBalance; z and gravity are read.
@@ -221,7 +227,7 @@ def motion_probability(velocity, variance):
     """Return the probability that a drive moves, given its measured velocity.
 
     Rest and motion have equal prior probability. The velocity of a moving drive is uniform over a
-    range of _ODDS sqrt(2 pi) times the noise.
+    range of _VELOCITY_RANGE_RATIO sqrt(2 pi) times the noise.
 
     Args:
         velocity: measured velocity, scalar [m/s] or [rad/s].
@@ -242,7 +248,11 @@ def motion_probability(velocity, variance):
 
 @allocation_free
 def _subtract_drives(arm, with_friction, external_force):
-    """Subtract the drive forces from the external forces."""
+    """Subtract the forces of the hydraulic drives from the external forces (n,), through their moment arms.
+
+    With `with_friction`, the friction is subtracted from a drive's force, weighted by the probability
+    that the drive moves.
+    """
     model, sp, n = arm.model, arm.space, len(external_force)
     for i in range(model.hydraulic):
         u, a = i * SLOT_COUNT, 2 * n + 4 * i
@@ -259,7 +269,7 @@ def _subtract_drives(arm, with_friction, external_force):
 
 @allocation_free
 def static_torque(q, joint, gravity, i):
-    """Return the gravity torque of a joint of the arm.
+    """Return the gravity torque on a joint of the arm, by the static model.
 
     Each link from the boom outwards has two parameters, for the cosine and the sine of its
     attitude, which act on all joints before it. The seventh parameter belongs to the head of a
@@ -294,7 +304,7 @@ def static_torque(q, joint, gravity, i):
 
 @allocation_free
 def solve_tip_force(arm, external_force, out):
-    """Compute the force at the tip from external forces on the coordinates.
+    """Compute the force at the tip that is equivalent to external forces on the coordinates.
 
     Args:
         arm: ArmBalance; z is read, table and work are overwritten.
@@ -305,7 +315,7 @@ def solve_tip_force(arm, external_force, out):
     Returns:
         Whether `out` was written.
 
-    Source: Zhu 1994, 6.6: `F = J^-T tau`.
+    Source: Zhu 1994, 6.6: `F = J^-T tau` with the Jacobian J of the tip.
     """
     m, most = len(out), 0.0
     for i in range(m):
@@ -326,7 +336,10 @@ def solve_tip_force(arm, external_force, out):
 
 @allocation_free
 def _solve_by_elimination(table, right, m, min_pivot):
-    """Solve linear equations in place by elimination; return False if a pivot is below `min_pivot`."""
+    """Solve m linear equations `table x = right` in place by Gaussian elimination with pivoting.
+
+    The solution overwrites `right`. Returns False if a pivot is not above `min_pivot`.
+    """
     for i in range(m):
         best = i
         for r in range(i + 1, m):
@@ -350,7 +363,7 @@ def _solve_by_elimination(table, right, m, min_pivot):
 
 
 def arm_joints(machine: Machine) -> tuple[str, ...]:
-    """Return the joints of the arm from swing outwards.
+    """Return the names of the arm's joints from the swing joint outwards.
 
     Raises:
         InputError: the machine has no arm.
@@ -362,12 +375,12 @@ def arm_joints(machine: Machine) -> tuple[str, ...]:
 
 
 def gravity_parameter_count(joints: int) -> int:
-    """Return the number of parameters of the static model of an arm with that many joints."""
+    """Return the number of parameters of the static gravity model of an arm with a number of joints."""
     return 7 if joints == 5 else 2 * (joints - 1)
 
 
 def independent_axes(machine: Machine, context: str) -> tuple[str, ...]:
-    """Return the axes of the independent coordinates.
+    """Return the axes that drive the independent coordinates, after checks for estimating the tip force.
 
     Args:
         machine: the machine.
@@ -390,7 +403,7 @@ def independent_axes(machine: Machine, context: str) -> tuple[str, ...]:
 
 
 def create_arm_balance(machine: Machine, context: str) -> ArmBalance:
-    """Create the model of an arm, with transmissions assumed rigid and massless.
+    """Create the force balance model of an arm, with transmissions assumed rigid and massless.
 
     Args:
         machine: the machine.

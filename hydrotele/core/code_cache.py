@@ -35,14 +35,14 @@ _notes: set[str] = set()
 
 
 def _note_once(kind: str, text: str) -> None:
-    """Log a warning, once for each kind in a process."""
+    """Log a warning text; only the first warning of each kind in a process is logged."""
     if kind not in _notes:
         _notes.add(kind)
         _LOG.warning(text)
 
 
 def file_stem(function) -> str:
-    """Return the beginning of the names of a function's cache files."""
+    """Return the beginning of the names of a function's cache files: its name and line number."""
     return f"{function.__name__}-{function.__code__.co_firstlineno}"
 
 
@@ -65,7 +65,11 @@ class CodeCache(NullCache):
         return self._folder and str(self._folder)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return compiled code of a signature, or None if this process has to compile it."""
+        """Return the stored compiled code for a signature, or None if this process has to compile it.
+
+        In the latter case this process holds the function's lock until `save_overload`. If another
+        process is compiling the function, its result is awaited.
+        """
         if self._folder is None:
             return None
         target_context.refresh()
@@ -104,7 +108,11 @@ class CodeCache(NullCache):
         return CompileResult._rebuild(target_context, *code)
 
     def _key(self, sig: Any, codegen: Any) -> tuple:
-        """Return all that determines the compiled code, apart from the sources that it uses."""
+        """Return a tuple of all that determines the compiled code of a signature.
+
+        It contains form, versions, signature, processor, name, bytecode and closure, but not the sources of
+        called functions; these determine the cache folder.
+        """
         closure = [cell.cell_contents for cell in self._function.__closure__ or ()]
         parts = self._function.__code__.co_code, dumps(closure) if closure else b""
         digests = [hashlib.sha256(part).hexdigest() for part in parts]

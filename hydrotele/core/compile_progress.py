@@ -50,7 +50,7 @@ class ProgressLine:
         self._print_time, self._width = 0.0, 0
 
     def show(self, text: str) -> None:
-        """Redraw the line in a terminal; elsewhere print it if the last one is two seconds old."""
+        """Show a text: redraw the line in a terminal; elsewhere print it at most every two seconds."""
         if not _LOG.isEnabledFor(logging.WARNING):
             return
         if sys.stderr.isatty():
@@ -115,7 +115,11 @@ class CompileProgress(event.Listener):
                 self._line.clear()
 
     def _find_pending(self, dispatcher: Any) -> dict[FunctionType, int]:
-        """Return the weight of each function that has to be compiled for a dispatcher."""
+        """Return the functions that have to be compiled for numba's dispatcher of a function.
+
+        They are the function and all uncached functions that it calls, directly or indirectly. The values
+        are their estimated work, in bytes of bytecode.
+        """
         found, left = dict[FunctionType, int](), [dispatcher]
         while left:
             function = left.pop().py_func

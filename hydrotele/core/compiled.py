@@ -39,16 +39,17 @@ _MAX_UNUSED_AGE = 30 * 24 * 3600.0  # s, after which an unused cache of an older
 
 
 def compiled(function):
-    """Compile a function on its first call with each argument type, with a cache on disk.
+    """Compile a numerical function with numba; a decorator.
 
-    If no cache folder is writable, every process compiles the function again. The compiled function
-    releases Python's global interpreter lock, so that threads run in parallel.
+    The function is compiled on its first call with each combination of argument types, and the code is
+    cached on disk. If no cache folder is writable, every process compiles the function again. The
+    compiled function releases Python's global interpreter lock, so that threads run in parallel.
     """
     return _compile(function)
 
 
 def allocation_free(function):
-    """Compile like `compiled` a function that neither creates nor returns arrays.
+    """Compile a function that neither creates nor returns arrays; a decorator like `compiled`.
 
     This omits reference counting of arrays, which takes half the run time of small functions. A
     function that does create or return an array raises an error on its first call.
@@ -57,19 +58,20 @@ def allocation_free(function):
 
 
 def inlined(function):
-    """Compile like `allocation_free` a small function that is inlined into every caller.
+    """Compile a small function whose code is copied into every caller; a decorator.
 
-    Results that a caller does not use, such as a derivative, are then not computed, and constant
-    arguments are folded.
+    The function must neither create nor return arrays. Results that a caller does not use, such as a
+    derivative, are then not computed, and constant arguments are folded.
     """
     return _compile(function, _nrt=False, forceinline=True)
 
 
 def _compile(function, **options: Any):
-    """Create a dispatcher for calls from Python and one for calls from compiled functions.
+    """Create numba's dispatchers of a function: one for calls from Python, one for compiled callers.
 
-    The second one has no wrapper that converts Python objects. The wrapper takes a fifth of the
-    compile time, and most functions are never called from Python.
+    A dispatcher compiles the function for each combination of argument types. The second one has no
+    wrapper that converts Python objects. The wrapper takes a fifth of the compile time, and most
+    functions are never called from Python.
     """
     options |= {
         "error_model": "numpy", "nogil": True,
@@ -99,7 +101,7 @@ class Callback:
         self._function, self._signature = function, signature
 
     def compile_in_background(self, follow_up_code: str = "") -> None:
-        """Start to compile in a background process, see the function `compile_in_background`.
+        """Start to compile this callback in a background process, unless it is cached already.
 
         Args:
             follow_up_code: Python code that the process runs afterwards.
@@ -153,7 +155,14 @@ def _stop_process(process: subprocess.Popen) -> None:
 
 
 def _function_cache(function, form: str) -> NullCache:
-    """Return the cache of one form of compiled code; it stores nothing for functions of other packages."""
+    """Return the disk cache for the compiled code of a function.
+
+    For a function of another package it is a cache that stores nothing.
+
+    Args:
+        function: the Python function.
+        form: name of the form of code: "python", "called" or "callback".
+    """
     if _read_source(function.__module__) is None:
         return NullCache()
     return CodeCache(function, _module_cache_folder(function.__module__), form)
@@ -193,7 +202,7 @@ _IMPORT_PATTERN = re.compile(rb"^\s*(?:from|import) +(hydrotele[\w.]*)(?: +impor
 
 @functools.cache
 def _read_source(module: str) -> bytes | None:
-    """Return the source of a module of this package; None if there is no such module."""
+    """Return the source code of a module of this package as bytes; None if there is no such module."""
     package, *parts = module.split(".")
     if package != _PACKAGE_FOLDER.name:
         return None
@@ -219,7 +228,7 @@ def _find_imports(module: str) -> frozenset[str]:
 
 @functools.cache
 def source_digest(module: str) -> str:
-    """Return a digest of the sources of a module, of its imports and of this module.
+    """Return a hash of the sources of a module, of its direct and indirect imports and of this module.
 
     A change of any of these sources selects another cache folder. This module is always included,
     since a module whose functions another one compiles need not import it.

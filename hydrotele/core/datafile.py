@@ -48,7 +48,7 @@ def scale_numbers(value: Any, factor: float) -> Any:
 
 
 def split_unit(key: str) -> tuple[str, float | None]:
-    """Split a key into its stem and the factor of its unit suffix to SI (`None` without suffix).
+    """Split a key into its name without unit suffix and the factor to SI; None without suffix.
 
     >>> split_unit("accuracy_mm")
     ('accuracy', 0.001)
@@ -159,7 +159,7 @@ _Loader.add_implicit_resolver(
 
 
 def _load_yaml(text: str) -> tuple[Any, Any]:
-    """Return the node and the value of a YAML text, after `_check_size`."""
+    """Parse a YAML text of limited size and return its root node and its value."""
     _check_size(text)
     loader = _Loader(text)
     try:
@@ -199,7 +199,10 @@ def _check_size(text: str) -> None:
 
 
 def _key_lines(root) -> dict[tuple, int]:
-    """Return the line of every key; keys from an alias have the line of the key with the alias."""
+    """Return key path -> line number from 1 of every key below a YAML node.
+
+    The keys of a node that aliases repeat are recorded at its first place only.
+    """
     lines: dict[tuple, int] = {(): root.start_mark.line + 1}
     opened: set = set()
     waiting: list[tuple[Any, tuple]] = [(root, ())]
@@ -251,7 +254,7 @@ def read_yaml(path: str | Path) -> tuple[dict, dict[tuple, int]]:
 
 
 def parse_yaml_value(text: str) -> Any:
-    """Parse a single YAML value with the same rules as for files.
+    """Parse a YAML text, such as the value of a command-line option, by the rules for files.
 
     Raises:
         yaml.YAMLError: the text is not valid YAML.
@@ -315,7 +318,18 @@ def replace_at_path(model: Model, path: str, value: Any, validate: bool = True) 
 
 
 def _replace_in_node(node: Any, words: list[str], parent: str, value: Any, validate: bool) -> Any:
-    """Replace the value at the path `words`, which starts at `node`; `parent` is the path of `node`."""
+    """Return a copy of a node of nested data with one value inside it replaced.
+
+    Args:
+        node: model, mapping or tuple.
+        words: path of the value from the node, split at its dots.
+        parent: path of the node, for messages.
+        value: the new value.
+        validate: check the new value.
+
+    Raises:
+        InputError: the path does not exist.
+    """
     if not words:
         return value
     children = _children_of_node(node)

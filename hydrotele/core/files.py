@@ -38,7 +38,9 @@ LIMITS: Mapping[str, tuple[float, str]] = MappingProxyType({
 
 
 def get_limit(name: str) -> float:
-    """Return a limit of `LIMITS`, or the value of its environment variable if that is set.
+    """Return the largest allowed amount of a quantity in `LIMITS`, such as "FILE_BYTES".
+
+    The environment variable `HYDROTELE_MAX_<name>` overrides it.
 
     Raises:
         InputError: the environment variable is not a positive number.
@@ -75,8 +77,13 @@ def describe_excess(name: str, amount: float) -> str | None:
 def check_limit(where: object, name: str, amount: float) -> None:
     """Raise an error if an amount exceeds its limit.
 
+    Args:
+        where: location for the message, such as a file.
+        name: key of `LIMITS`.
+        amount: the amount, in the unit of the limit.
+
     Raises:
-        InputError: the limit is exceeded; the message names the variable that raises it.
+        InputError: the limit is exceeded; the message names the environment variable that changes it.
     """
     if said := describe_excess(name, amount):
         raise InputError(where, f"has {said}")

@@ -38,12 +38,18 @@ class Callee:
         _callees[self.location] = self
 
     def compile(self, args: tuple) -> Any:
-        """Compile for the given argument types, or load from the cache; return numba's result."""
+        """Compile the function for some argument types, or load its code from the cache.
+
+        Returns:
+            numba's `CompileResult`.
+        """
         self.dispatcher.compile(args)
         return self.dispatcher.overloads[args]
 
     def call_template(self, args: tuple, keywords: dict) -> tuple:
-        """Compile the callee and return its template; replaces `Dispatcher.get_call_template`.
+        """Compile the function for a call and return numba's template of it, which states its types.
+
+        It replaces `Dispatcher.get_call_template` of numba.
 
         A literal argument gets its non-literal type, so that a function is not compiled for each
         constant.
@@ -55,7 +61,11 @@ class Callee:
         return make_concrete_template(f"CallTemplate({name})", name, [signature]), pysig, args, {}
 
     def overload_key(self, args: tuple) -> Any:
-        """Return the key of the callee's entry point; replaces `Dispatcher.get_overload`."""
+        """Return the key by which numba's code generator finds the compiled function.
+
+        It replaces `Dispatcher.get_overload` of numba. For a separately compiled function the key refers to
+        its symbol.
+        """
         result = self.dispatcher.overloads[tuple(args)]
         if not self.is_separate:
             return result.entry_point
@@ -89,7 +99,14 @@ def external_callees(result: Any) -> dict[str, tuple[tuple, tuple]]:
 
 
 def load_callees(needed: dict[str, tuple[tuple, tuple]]) -> bool:
-    """Load the functions that cached code refers to; return False if a symbol has changed."""
+    """Compile or load the functions that cached code refers to by symbol.
+
+    Args:
+        needed: result of `external_callees` when the code was stored.
+
+    Returns:
+        False if the symbol of a function has changed, so that the cached code cannot be used.
+    """
     for symbol, (place, args) in needed.items():
         importlib.import_module(place[0])
         callee = _callees[place]

@@ -31,7 +31,7 @@ def float64_view(address, count):
 
 @compiled
 def matrix_view(address, rows, columns):
-    """Return a (rows, columns) view of the 64-bit floats at an address."""
+    """Return a (rows, columns) view of the 64-bit floats at an address, row by row."""
     return float64_view(address, rows * columns).reshape((rows, columns))
 
 
@@ -65,7 +65,7 @@ def int32_view(address, count):
 
 
 def address_record(kind: np.dtype, arrays: dict[str, np.ndarray]) -> np.ndarray:
-    """Create a record with the addresses of arrays, for compiled code that needs many arrays.
+    """Create a record (NumPy structure) with the addresses of arrays, for compiled code with many arrays.
 
     To unbox a named tuple of arrays takes numba about a microsecond per array; a record avoids it.
 
@@ -90,5 +90,11 @@ def address_record(kind: np.dtype, arrays: dict[str, np.ndarray]) -> np.ndarray:
 
 @compiled
 def struct_field_view(base, offset, count):
-    """Return a (count,) view of the floats that the pointer at `base + offset` points to."""
+    """Return a (count,) view of the 64-bit floats to which a pointer field of a C structure points.
+
+    Args:
+        base: address of the structure.
+        offset: offset of the field [bytes].
+        count: number of floats.
+    """
     return float64_view(carray(address_to_pointer(base + offset), (1,), np.int64)[0], count)

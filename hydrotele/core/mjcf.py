@@ -77,7 +77,7 @@ class MjcfDocument:
         return ElementTree.tostring(self.root, encoding="unicode")
 
     def flatten(self) -> str:
-        """Return the XML text with the bodies of nested models in place of `attach`.
+        """Return one XML text in which the bodies of nested models replace the `attach` elements.
 
         Raises:
             InputError: as `load_spec`.
@@ -110,11 +110,14 @@ class MjcfDocument:
             return spec.compile()
 
     def model_texts(self) -> dict[str, bytes]:
-        """Return the nested models by the names that the text uses."""
+        """Return name -> XML text of the nested models; `text` refers to them by these names."""
         return {name: model.text.encode() for name, model in self.models.items()}
 
     def find_origin(self, line: int) -> tuple[Path, int] | None:
-        """Return file and line of the element that starts on or last before a line of `text`."""
+        """Return file and line of the user's element that a line of `text` contains.
+
+        It is the last element that starts on or before that line; None if there is none.
+        """
         starts: list[int] = []
         parser = expat.ParserCreate()
         parser.StartElementHandler = lambda *_: starts.append(parser.CurrentLineNumber)
@@ -144,7 +147,7 @@ def load_model(path: str | Path) -> mujoco.MjModel:
 
 @contextlib.contextmanager
 def translate_mujoco_errors(where: object, document: MjcfDocument | None = None) -> Iterator[None]:
-    """Raise every error of MuJoCo as an InputError with one sentence.
+    """Context in which an error of MuJoCo becomes an InputError with one sentence.
 
     Args:
         where: location for the message.
@@ -225,12 +228,12 @@ def _copy_assets(root: Element, copies: dict[str, str], folder: Path, prefix: st
 
 
 def _file_references(root: Element) -> list[tuple[Element, str]]:
-    """Return all elements and attributes that name a file."""
+    """Return (element, attribute) of all attributes below a root element that name a file."""
     return [(element, key) for element in root.iter() for key in _FILE_ATTRIBUTES if element.get(key)]
 
 
 class _Reader:
-    """Read the documents behind one file; the limits hold for all of them together."""
+    """Reader of one file and all documents that it names; size limits hold for all of them together."""
 
     def __init__(self) -> None:
         self.origins: dict[Element, tuple[Path, int]] = {}
@@ -338,7 +341,16 @@ class _Reader:
             raise InputError(self._describe(element, attribute), f"{file}: {error.message}") from None
 
     def _read_model(self, element: Element, path: Path, parents: tuple[Path, ...]) -> tuple[str, MjcfDocument, float]:
-        """Read the document of a `model` asset once; return its name, content and size."""
+        """Read the document of a `model` asset, or return it if it was read before.
+
+        Args:
+            element: the asset.
+            path: file of the document with the asset.
+            parents: files of the documents that it is nested in, outermost first.
+
+        Returns:
+            Generated unique name, document, and number of its elements with all copies.
+        """
         where = self._describe(element, "file")
         file = _find_file(_portable_path(element.attrib["file"]), self.origins[element][0].parent, path.parent)
         key = file.resolve()
@@ -354,7 +366,10 @@ class _Reader:
         return self.models[key]
 
     def _resolve_urdf_meshes(self, root: Element, path: Path) -> None:
-        """Make the paths of a URDF's meshes absolute; those of visuals may be missing."""
+        """Make the mesh paths of a URDF absolute, and check the total size of the existing files.
+
+        Missing files are accepted here, since those of visual meshes may be missing.
+        """
         compiler = root.find("mujoco/compiler")
         if compiler is None:
             compiler = ElementTree.SubElement(ElementTree.SubElement(root, "mujoco"), "compiler")
@@ -384,7 +399,7 @@ def _portable_path(name: str) -> PurePosixPath:
 
 
 def _find_file(name: PurePosixPath, first: Path, second: Path) -> Path:
-    """Return the path of a file in the first of two folders that has it."""
+    """Return the path of a file in the first of two folders that has it, otherwise in the first one."""
     try:
         return next((folder / name for folder in (first, second) if (folder / name).exists()), first / name)
     except (OSError, ValueError) as error:  # a name that no file can have
@@ -403,7 +418,7 @@ def _count_elements(
     root: Element, path: Path, origins: Mapping[Element, tuple[Path, int]], models: Mapping[str, float],
     vertices: Mapping[Element, float], values: float,
 ) -> float:  # fmt: skip
-    """Count the elements of a document with all copies, and check the limits of a document.
+    """Count the elements and stored values of a document with all copies, and check their limits.
 
     Args:
         root: root element.
@@ -426,7 +441,7 @@ def _count_elements(
     most_values: dict[Element, float] = {}
 
     def locate(amounts: Mapping[Element, float]) -> str:
-        """Return the place of the element with the largest amount."""
+        """Return file, line and tag of the element with the largest amount, as text."""
         element = max(amounts, key=lambda element: amounts[element])
         file, line = origins.get(element, (path, 0))
         return f"{file}:{line}: <{element.tag}>"

@@ -123,7 +123,7 @@ def check_output_folder(target: str | Path, kind: str) -> None:
 
 
 def _is_match(name: str, pattern: str) -> bool:
-    """Return whether a path matches a pattern or is a parent folder of such a path."""
+    """Return whether a relative path matches a pattern such as `runs/*/*`, or may be a parent folder of it."""
     parts, wanted = name.split("/"), pattern.split("/")
     return len(parts) <= len(wanted) and all(map(fnmatch.fnmatch, parts, wanted))
 
@@ -140,7 +140,7 @@ _TEMPORARY_NAME = re.compile(r"\.(\d+)\.[a-z0-9_]{8}(?:\.old)?\.part$")  # proce
 
 
 def _is_temporary_folder(part: Path) -> bool:
-    """Return whether a path is a temporary folder of this module; only these are removed."""
+    """Return whether a path is a temporary folder that `atomic_folder` created."""
     return bool(_TEMPORARY_NAME.search(part.name)) and part.is_dir() and not part.is_symlink()
 
 

@@ -80,7 +80,10 @@ def argument_type(kind: Any) -> Any:
 
 
 def count_arguments(kind: Any) -> int:
-    """Count the native arguments of a type when it is passed by value."""
+    """Return the number of machine-level arguments for a value of a numba type passed by value.
+
+    A scalar has 1, an array 5 plus 2 per dimension, a tuple the sum of its items.
+    """
     if isinstance(kind, types.BaseTuple) and not isinstance(kind, Reference):
         return sum(count_arguments(part) for part in _item_types(kind))
     return 5 + 2 * kind.ndim if isinstance(kind, types.Array) else 1
@@ -104,7 +107,7 @@ def check_result_type(kind: Any, name: str) -> None:
 
 
 def _item_types(kind: Any) -> tuple:
-    """Return the types of the items of a tuple."""
+    """Return the types of the items of a numba tuple type."""
     return tuple(kind)
 
 
@@ -115,13 +118,13 @@ class _ReferenceModel(OpaqueModel):
 
 @lower_getattr_generic(Reference)
 def _read_attribute(context, builder, kind, address, attr):
-    """Read a field by its name."""
+    """Emit code that reads a field of a referenced named tuple by its name."""
     return _read_field(context, builder, kind, address, kind.fields.index(attr))
 
 
 @lower_builtin("static_getitem", Reference, types.IntegerLiteral)
 def _read_item(context, builder, sig, args):
-    """Read a field by its index; unpacking a named tuple uses this, too."""
+    """Emit code that reads a field of a referenced named tuple by its index, also for unpacking."""
     return _read_field(context, builder, sig.args[0], args[0], args[1])
 
 
@@ -144,7 +147,7 @@ def _read_field(context, builder, kind, address, index):
 @lower_cast(types.NamedTuple, Reference)
 @lower_cast(types.NamedUniTuple, Reference)
 def _store_named_tuple(context, builder, fromty, toty, value):
-    """Store a named tuple on the stack of the calling function."""
+    """Emit code that stores a named tuple on the caller's stack and returns its address as a reference."""
     memory = context.data_model_manager[fromty].get_data_type()
     space = cgutils.alloca_once(builder, memory)
     _store_fields(context, builder, fromty, value, space)
@@ -163,7 +166,7 @@ def _store_fields(context, builder, record, value, space) -> None:
 
 
 def _hide_origin(builder, space):
-    """Hide the origin of an address from LLVM.
+    """Emit code that returns the same address, such that LLVM cannot tell where it comes from.
 
     Otherwise LLVM could move the reads marked as invariant before the writes after inlining.
     """
@@ -174,7 +177,7 @@ def _hide_origin(builder, space):
 
 @unbox(Reference)
 def _unbox_reference(kind, value, c):
-    """Store a Python named tuple in memory and return its address."""
+    """Emit code that converts a Python named tuple to native values in memory and returns their address."""
     native = c.unbox(kind.record, value)
     memory = c.context.data_model_manager[kind.record].get_data_type()
     space = cgutils.alloca_once(c.builder, memory)

@@ -105,7 +105,9 @@ def canonical_unit(text: str) -> str:
 
 
 def to_si(unit: str) -> tuple[str, float]:
-    """Return the SI unit and the factor to it [SI unit per `unit`]; factor 1 for an unknown unit.
+    """Return the SI unit that corresponds to a unit, and the factor by which values are multiplied.
+
+    An unknown unit is returned unchanged with factor 1.
 
     >>> to_si("bar")
     ('Pa', 100000.0)
@@ -115,7 +117,7 @@ def to_si(unit: str) -> tuple[str, float]:
 
 
 def axis_unit(unit: str) -> tuple[str, float]:
-    """Return the unit used on plot axes for an SI unit, and the factor to it.
+    """Return the unit used on the axes of plots for an SI unit, and the factor to multiply values by.
 
     >>> axis_unit("Pa")
     ('MPa', 1e-06)
@@ -127,7 +129,7 @@ def axis_unit(unit: str) -> tuple[str, float]:
 
 
 def display_unit(unit: str, magnitude: float, parameter: str = "") -> tuple[str, float]:
-    """Return the display unit for values of a given magnitude, and the factor to it.
+    """Return the unit in which reports show values of a given magnitude, and the factor to it.
 
     Args:
         unit: SI unit.

@@ -85,7 +85,15 @@ def add_effects_from_file(path: Path, library: dict[str, Effect]) -> tuple[str, 
 
 
 def _execute_file(path: Path, digest: str) -> tuple[Any, ...]:
-    """Run an effect file as a module and return its effects."""
+    """Run an effect file as a module and return its effects.
+
+    Args:
+        path: the file.
+        digest: hash of its content, which becomes a part of the module's name.
+
+    Raises:
+        InputError: the file raised an exception; the message gives file and line.
+    """
     name = f"hydrotele_effects_{path.stem}_{digest[:8]}"
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec and spec.loader
@@ -107,14 +115,14 @@ _effect_files: dict[str, Path] = {}  # absolute path of every effect file that w
 
 
 def describe_user_error(error: BaseException) -> InputError | None:
-    """Return the error of a user's effect file with its traceback, cut to that file.
+    """Find the line of a user's effect file that caused an exception.
 
     Args:
         error: exception of any kind.
 
     Returns:
-        The error with file and line; None if no effect file raised the exception or called the
-        function that raised it.
+        An error with that file and line, whose message contains the traceback lines of effect files
+        only. None if no effect file raised the exception or called the function that raised it.
     """
     frames = [f for f in traceback.extract_tb(error.__traceback__) if f.filename in _effect_files]
     message = _describe_exception(error)
@@ -131,7 +139,10 @@ def _describe_exception(error: BaseException) -> str:
 
 
 def _collect_effects(content: Any) -> tuple[Any, ...]:
-    """Return the effects of a module or of an entry point that is an effect or a collection."""
+    """Return the effects that a module defines as `EFFECT` or `EFFECTS`.
+
+    The content may also be an effect or a collection of effects, as entry points provide them.
+    """
     if isinstance(content, ModuleType):
         content = getattr(content, "EFFECT", None) or getattr(content, "EFFECTS", ())
     return tuple(content) if isinstance(content, Iterable) else (content,)
@@ -154,7 +165,7 @@ def _add_to_library(library: dict[str, Effect], family: tuple[Any, ...], where: 
 
 
 def _export_to_children(path: Path) -> None:
-    """Add a file to the environment variable from which child processes load effects."""
+    """Add an effect file to the environment variable from which child processes load their effects."""
     known = os.environ.get(ENVIRONMENT_VARIABLE, "").split(os.pathsep)
     if str(resolve_path(path)) not in known:
         paths = [*filter(None, known), str(resolve_path(path))]
@@ -162,7 +173,10 @@ def _export_to_children(path: Path) -> None:
 
 
 def add_plugin_effects(library: dict[str, Effect]) -> None:
-    """Add the effects of installed packages.
+    """Add the effects that installed packages provide as entry points to a library.
+
+    Args:
+        library: effects by name; updated in place.
 
     Raises:
         InputError: an entry point cannot be loaded; the message names the package.
@@ -180,7 +194,10 @@ def add_plugin_effects(library: dict[str, Effect]) -> None:
 
 
 def add_environment_effects(library: dict[str, Effect]) -> None:
-    """Add to a library the custom effects of the files that the parent process loaded (`--effects`)."""
+    """Add the custom effects that the parent process loaded to a library, updated in place.
+
+    The environment variable `HYDROTELE_EFFECTS` lists the files, which are run again.
+    """
     for path in filter(None, os.environ.get(ENVIRONMENT_VARIABLE, "").split(os.pathsep)):
         add_effects_from_file(Path(path), library)
 

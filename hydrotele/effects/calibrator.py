@@ -1,7 +1,8 @@
-"""Effects of a calibrator arm: link bending, misaligned sensor couplings and coupling backlash.
+"""Effects of a calibrator, a passive measuring arm with sensors in its joints.
 
-Khoshzaban 1992, sections 3.4.2 and 3.7.3: joint flexibility and misaligned sensors spoil a
-calibration most; backlash and looseness less.
+The effects are bending of links, misaligned couplings of joint sensors, and their backlash. Khoshzaban
+1992, sections 3.4.2 and 3.7.3: joint flexibility and misaligned sensors spoil a calibration most;
+backlash and looseness less.
 """
 
 import math
@@ -27,9 +28,9 @@ def _with_sensor_error(machine: Machine, joint: str, **numbers: float) -> Machin
 
 
 def _bending_parameters(machine: Machine, joint: str) -> dict[str, Parameter]:
-    """Specify the compliance across a joint.
+    """Return nominal value, bounds and prior of the angular compliance of a link across a joint's axis.
 
-    One degree under 200 N m, the weight of an extended calibrator, is 9e-5 rad/(N m).
+    One degree of bending by 200 N m, the weight torque of an extended calibrator, is 9e-5 rad/(N m).
     """
     present = machine.joints[joint].bending
     high = max(5.0e-4, present)
@@ -41,10 +42,10 @@ def _set_bending(machine: Machine, joint: str, values: Values) -> Machine:
 
 
 def _misalignment_parameters(machine: Machine, joint: str) -> dict[str, Parameter]:
-    """Specify the tilt of a sensor coupling.
+    """Return nominal value, bounds and prior of the tilt between a joint and its angle sensor.
 
-    Couplings are aligned to a few degrees. A tilt of 3 degrees causes an error of 0.04 degrees
-    twice per revolution.
+    Couplings are aligned to a few degrees. A tilt of 3 degrees causes an angle error with an
+    amplitude of 0.04 degrees and two periods per revolution.
     """
     one = math.radians(1.0)
     present = _sensor_error(machine, joint).tilt
@@ -57,7 +58,7 @@ def _set_misalignment(machine: Machine, joint: str, values: Values) -> Machine:
 
 
 def _backlash_parameters(machine: Machine, joint: str) -> dict[str, Parameter]:
-    """Specify the backlash of a sensor coupling.
+    """Return nominal value, bounds and prior of the backlash between a joint and its angle sensor.
 
     A loose coupling has some tenths of a degree; the resolver resolves one tenth.
     """

@@ -1,6 +1,7 @@
-"""Effects of the pressure chambers: laminar and turbulent leakage, hose and oil compliance.
+"""Effects of the pressure chambers of drives: leakage, and compliance of hoses and oil.
 
-Turbulent leakage is the flow through a short gap, as of a torn seal or a cracked piston.
+Laminar leakage is proportional to the pressure difference. Turbulent leakage, proportional to its
+square root, is the flow through a short gap, as of a torn seal or a cracked piston.
 """
 
 import math
@@ -23,9 +24,10 @@ _MIN_BULK_MODULUS_PA = 1.0e7  # Pa, oil full of air: the smallest bulk modulus t
 
 
 def _leakage_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the leakage coefficient, scaled by rated flow over highest pressure.
+    """Return nominal value, bounds and prior of the leakage coefficient between a drive's chambers.
 
-    A good seal leaks 1 % of the rated flow at full pressure.
+    Bounds and prior are proportional to the rated flow divided by the highest pressure. A good seal
+    leaks 1 % of the rated flow at full pressure.
     """
     whole = machine.axes[location].rated_flow / machine.max_feed_pressure(location)
     present = machine.axes[location].hydraulic_drive.leakage
@@ -34,10 +36,11 @@ def _leakage_parameters(machine: Machine, location: str) -> dict[str, Parameter]
 
 
 def _tank_leakage_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the leakage coefficient of a spool, scaled by rated flow over highest pressure.
+    """Return nominal value, bounds and prior of a spool's leakage coefficient from work port to tank.
 
-    By `laws.chamber_flows`, 0.01 % corresponds to a 25 mm spool with 7 um of radial clearance,
-    0.05 % to 12 um, and 0.5 % to 26 um.
+    Bounds and prior are proportional to the rated flow divided by the highest pressure. By
+    `laws.chamber_flows`, 0.01 % of it corresponds to a 25 mm spool with 7 um of radial clearance, 0.05 %
+    to 12 um, and 0.5 % to 26 um.
     """
     valve = machine.axes[location].valve
     assert valve
@@ -52,9 +55,10 @@ def _set_tank_leakage(machine: Machine, location: str, values: Values) -> Machin
 
 
 def _hose_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the hose compliance, scaled by the compliance of the oil at mid-stroke.
+    """Return nominal value, bounds and prior of the volume that a hose gains per pressure.
 
-    5 % is the scatter of a hose's rating.
+    Bounds and prior are proportional to the compliance of the oil (volume over bulk modulus) at
+    mid-stroke. The smallest relevant change is 5 % of it, the scatter of a hose's rating.
     """
     drive, cylinder = machine.axes[location].hydraulic_drive, machine.axes[location].cylinder
     assert machine.supply
@@ -79,7 +83,7 @@ def _oil_location(machine: Machine) -> tuple[str, ...]:
 
 
 def _bulk_modulus_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the bulk modulus of the oil.
+    """Return nominal value, bounds and prior of the bulk modulus of the oil.
 
     Entrained air reduces it by tens of per cent; a pressure change of 1 MPa changes it by 5 %.
     """
@@ -95,7 +99,7 @@ def _set_bulk_modulus(machine: Machine, location: str, values: Values) -> Machin
 
 
 def _entrained_air_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the volume fraction of air in the oil.
+    """Return nominal value, bounds and prior of the volume fraction of air in the oil.
 
     Oil of a working machine carries 0.5 to 5 %; 0.2 % is hardly measurable above 2 MPa.
     """
@@ -138,15 +142,18 @@ NAME = "orifice_leakage"
 
 
 def _root_relief_pressure(machine: Machine) -> float:
-    """Return the square root of the relief pressure [sqrt(Pa)], at which the flow is stated."""
+    """Return the square root of the relief pressure [sqrt(Pa)].
+
+    The parameter of turbulent leakage is the flow at this pressure; flow over root is the law's gain.
+    """
     assert machine.supply
     return math.sqrt(machine.supply.relief_pressure)
 
 
 def _orifice_leakage_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the leakage flow at the relief pressure, scaled by the rated flow.
+    """Return nominal value, bounds and prior of the turbulent leakage flow at the relief pressure.
 
-    The fractions are those of laminar leakage.
+    Bounds and prior are the same fractions of the valve's rated flow as for laminar leakage.
     """
     valve = machine.axes[location].valve
     assert valve
@@ -157,7 +164,7 @@ def _orifice_leakage_parameters(machine: Machine, location: str) -> dict[str, Pa
 
 
 def _set_orifice_leakage(machine: Machine, location: str, values: Values) -> Machine:
-    """Add the leakage flow to the rod side and subtract it from the head side."""
+    """Return the machine with turbulent leakage between the head and the rod chamber of a drive."""
     valve, gain = machine.axes[location].valve, values["flow"] / _root_relief_pressure(machine)
     assert valve
     numbers = {"smoothing": valve.smoothing}

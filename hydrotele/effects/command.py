@@ -24,9 +24,10 @@ def _nominal_delay(machine: Machine, location: str) -> float:
 
 
 def _delay_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the command delay.
+    """Return nominal value, bounds and prior of the command delay.
 
-    A bus delays by milliseconds, pilot hydraulics by a tenth of a second; 3 ms is one bus cycle.
+    A fieldbus delays by milliseconds, pilot hydraulics by a tenth of a second. The smallest relevant
+    change is 3 ms, one bus cycle.
     """
     present = _nominal_delay(machine, location)
     high = max(0.5, present)
@@ -34,7 +35,11 @@ def _delay_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
 
 
 def _set_delay(machine: Machine, location: str, values: Values) -> Machine:
-    """Set the delay of one axis, or at `all` the shortest one and shift the others equally."""
+    """Return the machine with another command delay of an axis.
+
+    At the location `all` the value becomes the shortest delay, and all other delays change by the same
+    time, but not below 0.
+    """
     more = values["delay"] - _nominal_delay(machine, location)
     for name in machine.axes if location == ALL_AXES else (location,):
         delay = max(0.0, machine.axes[name].command_delay + more)
@@ -52,9 +57,10 @@ NAME = "command_offset"
 
 
 def _offset_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the command offset.
+    """Return nominal value, bounds and prior of an offset that is added to the received command.
 
-    A valve's null shifts by a few per cent; its hysteresis is 0.2 % of the full command.
+    The null position of a valve shifts by a few per cent of the full command. The smallest relevant
+    change is 0.2 %, the hysteresis of a valve.
     """
     drive = machine.axes[location].force
     full, unit = (drive.command_limit, drive.command_unit) if drive else (1.0, "1")
@@ -71,9 +77,9 @@ def _set_offset(machine: Machine, location: str, values: Values) -> Machine:
 
 
 def _proportional_axes(machine: Machine) -> tuple[str, ...]:
-    """Return the axes whose null can shift.
+    """Return the names of the axes for which an offset of the command can be simulated.
 
-    Axes with their own pump are excluded: at command 0 their switching valve is closed.
+    Axes with an own pump are excluded, because at command 0 their switching valve is closed.
     """
     return tuple(name for name, axis in machine.axes.items() if not axis.pump)
 

@@ -14,7 +14,10 @@ _TYPICAL_DROP_RATIO = 0.5  # of the relief pressure: drop at which a compensator
 
 
 def _max_inlet_drop(machine: Machine, location: str) -> float:
-    """Return the largest pressure drop across the inlet edge [Pa]."""
+    """Return the largest pressure drop across the inlet edge of a valve [Pa].
+
+    It is the drop that a pressure compensator holds, otherwise the relief pressure.
+    """
     valve = machine.axes[location].valve
     assert valve and machine.supply
     most = machine.supply.relief_pressure
@@ -22,10 +25,11 @@ def _max_inlet_drop(machine: Machine, location: str) -> float:
 
 
 def _regulation_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the fraction of the relief pressure that a compensator absorbs.
+    """Return nominal value, bounds and prior of the effect of a pressure compensator.
 
-    Compensators absorb 90 to 98 % (estimate). A fraction of 0.1 affects only an unloaded arm at
-    full supply pressure.
+    The parameter is the fraction of the relief pressure that the compensator absorbs; 0 means no
+    compensator. Usual are 90 to 98 % (estimate). A fraction of 0.1 affects only an unloaded arm at full
+    supply pressure.
     """
     assert machine.supply
     present = 1.0 - _max_inlet_drop(machine, location) / machine.supply.relief_pressure
@@ -34,7 +38,11 @@ def _regulation_parameters(machine: Machine, location: str) -> dict[str, Paramet
 
 
 def _set_compensation(machine: Machine, location: str, values: Values) -> Machine:
-    """Limit the pressure drop and enlarge the inlets so that the typical flow does not change."""
+    """Return the machine with a pressure compensator in a valve.
+
+    The drop across the inlet edge is limited to (1 - `regulation`) times the relief pressure. The inlet
+    edges are enlarged so that the flow at a drop of half the relief pressure does not change.
+    """
     valve, supply = machine.axes[location].valve, machine.supply
     assert valve and supply
     before = _max_inlet_drop(machine, location)
@@ -68,7 +76,7 @@ def _installed_valve(machine: Machine, location: str) -> Counterbalance | None:
 
 
 def _setting_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the pressure setting of a counterbalance valve; 0 without a valve.
+    """Return nominal value, bounds and prior of a counterbalance valve's setting; 0 means no valve.
 
     Valves are set to 1.3 times the load pressure, at most to the port relief pressure. With the
     usual pilot ratio, a tank line at 0.5 MPa opens a valve at the smallest relevant setting.

@@ -1,9 +1,9 @@
-"""Types and helpers for defining effects.
+"""Types and helpers for defining effects: physical effects that the model of a machine may omit.
 
 `Effect` and `Parameter` describe an effect, its locations and its parameters. Helper functions list
 the axes of a machine at which an effect may occur. Others compute reference values, such as the
-largest force, for the scales of parameters. `with_terms` and `term_parameter` write and read the terms
-that an effect adds to a machine.
+largest force, from which the bounds of parameters follow. `with_terms` and `term_parameter` write and
+read terms: additional force, flow or command laws that an effect adds to the equations of a drive.
 """
 
 import dataclasses
@@ -74,8 +74,8 @@ class Effect:
 def with_value(machine: Machine, path: str, value: Any) -> Machine:
     """Return a copy of a machine with the value at a dotted path replaced, without checking the value.
 
-    See `Machine.replace`. A function that applies an effect may replace several values one after
-    another; the machines in between need not be valid.
+    A path is for example `axes.boom.valve.deadband`. The value is not checked, because an effect may
+    replace several values one after another, and the machines in between need not be valid.
 
     Raises:
         InputError: the path does not exist; the message lists the valid paths.
@@ -88,12 +88,12 @@ _FULL_TRAVEL_TIME_S = 2.0  # s for the full range of a force drive, which has no
 
 
 def all_axes(machine: Machine) -> tuple[str, ...]:
-    """Return the names of all axes."""
+    """Return the names of all driven axes of a machine."""
     return tuple(machine.axes)
 
 
 def valve_axes(machine: Machine) -> tuple[str, ...]:
-    """Return the names of the axes with a valve."""
+    """Return the names of the axes whose drive is controlled by a valve."""
     return tuple(machine.valve_axes)
 
 
@@ -103,23 +103,24 @@ def hydraulic_axes(machine: Machine) -> tuple[str, ...]:
 
 
 def cylinder_axes(machine: Machine) -> tuple[str, ...]:
-    """Return the names of the axes with a cylinder."""
+    """Return the names of the axes that a hydraulic cylinder drives."""
     return tuple(name for name, axis in machine.axes.items() if axis.cylinder)
 
 
 def linkage_axes(machine: Machine) -> tuple[str, ...]:
-    """Return the names of the axes whose cylinder is not parallel to a slide that it drives.
+    """Return the names of the cylinder axes whose length depends on the positions of the pins.
 
-    For a cylinder parallel to its slide, length equals position and lateral pin offsets have no
-    effect.
+    These are all cylinder axes except those whose cylinder is parallel to the sliding joint that it
+    drives. There, the length equals the position, and lateral pin offsets have no effect.
     """
     return tuple(name for name in cylinder_axes(machine) if not _is_parallel_to_slide(machine, name))
 
 
 def lateral_directions(machine: Machine, axis: str) -> str:
-    """Return the two coordinates perpendicular to the joint of an axis, such as `xz`.
+    """Return the two coordinates perpendicular to the joint of an axis, such as "xz".
 
-    Pin offsets in these directions change the linkage.
+    Offsets of a cylinder's pin in these directions change the ratio between cylinder length and
+    joint position. A sliding joint is taken to move in the plane of x and z.
     """
     joint = machine.joints[machine.axes[axis].joint]
     way = joint.axis if joint.type == "hinge" else (0.0, 1.0, 0.0)
@@ -153,22 +154,26 @@ def drive_kind(machine: Machine, axis: str) -> str:
 
 
 def is_rotary_drive(machine: Machine, axis: str) -> bool:
-    """Return whether the drive is rotary, so that its forces are torques."""
+    """Return whether the drive of an axis is rotary, so that its force is a torque [N m]."""
     return machine.axes[axis].cylinder is None and machine.position_kind(axis) == "angle"
 
 
 def force_unit(machine: Machine, axis: str) -> str:
-    """Return the unit of the drive's force."""
+    """Return the unit of the drive's force: "N m" for a rotary drive, otherwise "N"."""
     return "N m" if is_rotary_drive(machine, axis) else "N"
 
 
 def speed_unit(machine: Machine, axis: str) -> str:
-    """Return the unit of the drive's velocity."""
+    """Return the unit of the drive's velocity: "rad/s" for a rotary drive, otherwise "m/s"."""
     return "rad/s" if is_rotary_drive(machine, axis) else "m/s"
 
 
 def max_drive_force(machine: Machine, axis: str) -> float:
-    """Return the force of a drive at the highest pressure, or at full command [N] or [N m]."""
+    """Return the largest force or torque of a drive [N] or [N m].
+
+    For a hydraulic drive it is the highest feed pressure times the head area; for a force drive the
+    force at full command.
+    """
     facts = machine.axes[axis]
     if facts.force:
         return abs(facts.force.gain) * facts.force.command_limit
@@ -178,7 +183,7 @@ def max_drive_force(machine: Machine, axis: str) -> float:
 def typical_speed(machine: Machine, axis: str) -> float:
     """Return the speed of a drive at the rated flow of its valve or pump [m/s] or [rad/s].
 
-    A force drive has no flow rating and is assumed to travel its range in two seconds.
+    A force drive has no flow rating; it is assumed to travel the range of its joint in two seconds.
     """
     facts = machine.axes[axis]
     if facts.is_hydraulic:
@@ -188,7 +193,7 @@ def typical_speed(machine: Machine, axis: str) -> float:
 
 
 def outboard_links(machine: Machine, link: str) -> list[str]:
-    """Return a link and all links that it carries."""
+    """Return the names of a link and of all links that it carries, directly or indirectly."""
     found = [link]
     for name in found:  # the list grows during the loop
         found += [n for n, other in machine.links.items() if other.parent == name]
@@ -196,7 +201,11 @@ def outboard_links(machine: Machine, link: str) -> list[str]:
 
 
 def outboard_child(machine: Machine, link: str) -> str | None:
-    """Return the child link towards the arm's tip, or the farthest child; None at the tip."""
+    """Return the name of the next link outwards, None for the last link.
+
+    It is the child link that carries the arm's tip. If none does, it is the child whose joint is
+    farthest from the link's own joint.
+    """
     if machine.arm and machine.arm.tip.link != "world":
         step = machine.arm.tip.link
         while step != "world":
@@ -211,9 +220,9 @@ def outboard_child(machine: Machine, link: str) -> str | None:
 
 
 def outboard_point(machine: Machine, link: str) -> np.ndarray | None:
-    """Return the origin of the next link in a link's frame (3,) [m], for the last link the tip.
+    """Return the origin of the next link outwards (3,) [m], in the frame of the given link.
 
-    Returns None if no link follows.
+    For the link with the arm's tip it is the position of the tip; None if no link follows.
     """
     if machine.arm and machine.arm.tip.link == link:
         return np.array(machine.arm.tip.position)
@@ -222,9 +231,10 @@ def outboard_point(machine: Machine, link: str) -> np.ndarray | None:
 
 
 def link_size(machine: Machine, link: str) -> float:
-    """Return the distance from a link's joint to the next joint or to its centre of mass [m].
+    """Return the size of a link [m], at least 1 mm.
 
-    The larger distance counts, at least 1 mm.
+    It is the larger of two distances from the link's joint: to the next joint (or the arm's tip), and
+    to the centre of mass.
     """
     point = outboard_point(machine, link)
     far = 0.0 if point is None else float(np.linalg.norm(point))
@@ -232,14 +242,14 @@ def link_size(machine: Machine, link: str) -> float:
 
 
 def term_parameter(machine: Machine, name: str, axis: str, balance: Balance, parameter: str, default: float) -> float:
-    """Return a parameter of the term that an effect added to a drive.
+    """Return a parameter of the term that an effect added to the equations of a drive.
 
     Args:
         machine: the machine.
         name: name of the effect.
         axis: axis of the drive.
-        balance: balance of the term.
-        parameter: name of the law's parameter.
+        balance: equation that contains the term, such as "force", "flow_rod" or "command".
+        parameter: name of the parameter of the term's law.
         default: value to return if there is no such term.
 
     Returns:

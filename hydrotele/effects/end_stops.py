@@ -6,15 +6,15 @@ from hydrotele.machine.machine import Machine
 
 
 def _end_stop_axes(machine: Machine) -> tuple[str, ...]:
-    """Return the axes whose drives have end stops."""
+    """Return the names of the axes whose drives have end stops."""
     return tuple(name for name in machine.axes if machine.end_stop(name))
 
 
 def _stiffness_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the end stop stiffness.
+    """Return nominal value, bounds and prior of the stiffness of a drive's end stops.
 
-    A cushion is fifty times more compliant than steel; the lever arm of a pin changes the stiffness
-    by 10 %.
+    A cushion is fifty times more compliant than steel. The smallest relevant change is 10 %, by which
+    the lever arm of a pin changes the stiffness.
     """
     stop = machine.end_stop(location)
     assert stop
@@ -24,7 +24,10 @@ def _stiffness_parameters(machine: Machine, location: str) -> dict[str, Paramete
 
 
 def _set_stiffness(machine: Machine, location: str, values: Values) -> Machine:
-    """Set the stiffness and scale the damping with it, so that their time constant stays."""
+    """Return the machine with another end stop stiffness.
+
+    The damping changes in proportion, so that the time constant damping / stiffness remains.
+    """
     stop = machine.end_stop(location)
     assert stop
     if values["stiffness"] == stop.stiffness:

@@ -28,9 +28,10 @@ _DRAG_UNITS = {"N": "N s^2/m^2", "N m": "N m s^2/rad^2"}
 
 
 def _force_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the constant force, scaled by the drive's largest force.
+    """Return nominal value, bounds and prior of a constant force on a drive.
 
-    The smallest relevant force is a thousandth of the largest one, as for friction.
+    Bounds and prior are fractions of the drive's largest force; the smallest relevant change is a
+    thousandth of it, as for friction.
     """
     present = term_parameter(machine, CONSTANT_FORCE, location, "force", "value", 0.0)
     whole = max_drive_force(machine, location)
@@ -46,10 +47,10 @@ def _set_force(machine: Machine, location: str, values: Values) -> Machine:
 
 
 def _pulse_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify amplitude, start and duration of a force pulse.
+    """Return nominal values, bounds and priors of amplitude, start and duration of a force pulse.
 
     The smallest relevant amplitude is three times that of a constant force, so that a pulse of one
-    second is detectable. A pulse without amplitude has no time: see `_PULSE_START_S`.
+    second is detectable. Without a pulse, start and duration are 5 s, as start values of a search.
     """
 
     def present_value(parameter: str, absent: float) -> float:
@@ -73,9 +74,10 @@ def _set_pulse(machine: Machine, location: str, values: Values) -> Machine:
 
 
 def _drag_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the drag coefficient, scaled by the drive's largest force at its typical speed.
+    """Return nominal value, bounds and prior of the coefficient of drag, force over speed squared.
 
-    The fractions are those of viscous friction.
+    Bounds and prior are the same fractions as for viscous friction, here of the drive's largest force
+    over the square of its typical speed.
     """
     present = term_parameter(machine, SPEED_DEPENDENT_FORCE, location, "force", "coefficient", 0.0)
     whole = max_drive_force(machine, location) / typical_speed(machine, location) ** 2

@@ -27,11 +27,17 @@ from hydrotele.terms.law import Term
 
 
 def _make_friction_parameters(field: str, scale: float, high: float):
-    """Return a function that gives a friction parameter, scaled by the drive's largest force.
+    """Return a function (machine, location) -> nominal value, bounds and prior of a friction parameter.
 
-    The smallest relevant deviation is a thousandth of that force, or a tenth of the given friction.
-    The first is 20 to 30 kPa over the piston, the error of a good transducer. The second is the
-    change by warm oil within a shift.
+    The smallest relevant change is the larger of two values. A thousandth of the drive's largest force
+    is 20 to 30 kPa on the piston, the error of a good transducer. A tenth of the given friction is the
+    change by warm oil within a working shift.
+
+    Args:
+        field: field of the machine's friction: `coulomb`, `viscous` or `stribeck_extra`.
+        scale: smallest standard deviation of the prior as a fraction of the drive's largest force [1]; for
+            viscous friction that force is divided by the typical speed.
+        high: largest increase as a fraction of the same force [1].
     """
 
     def parameters(machine: Machine, location: str) -> dict[str, Parameter]:
@@ -59,15 +65,16 @@ def _set_friction(machine: Machine, location: str, values: Values) -> Machine:
 
 
 def _friction_axes(machine: Machine) -> tuple[str, ...]:
-    """Return the axes with friction, which can be asymmetric."""
+    """Return the names of the axes with any friction, to which an asymmetry can be added."""
     present = {name: machine.axes[name].drive.friction for name in machine.axes}
     return tuple(n for n, f in present.items() if f.coulomb + f.stribeck_extra + f.viscous > 0)
 
 
 def _asymmetry_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the asymmetries of dry and viscous friction.
+    """Return nominal values, bounds and priors of the direction dependence of a drive's friction.
 
-    Lip seals differ by tens of per cent between the directions.
+    There is one asymmetry for dry and one for viscous friction, each only if the drive has such
+    friction. The friction of lip seals differs by tens of per cent between the directions.
     """
     friction = machine.axes[location].drive.friction
     sizes = {}
@@ -102,9 +109,9 @@ LOAD_FRICTION, POSITION_FRICTION = "load_dependent_friction", "position_dependen
 
 
 def _load_friction_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the coefficient of load-dependent friction.
+    """Return nominal value, bounds and prior of the ratio of dry friction to the load of a drive.
 
-    Friction of seals and guides is some per cent of the load.
+    The friction of seals and guides is some per cent of the load.
     """
     present = term_parameter(machine, LOAD_FRICTION, location, "force", "coefficient", 0.0)
     return {"coefficient": Parameter("1", present, 0.0, max(0.4, present), 0.03, 0.005)}
@@ -121,7 +128,10 @@ def _set_load_friction(machine: Machine, location: str, values: Values) -> Machi
 
 
 def _position_range(machine: Machine, location: str) -> tuple[float, float]:
-    """Return the range of a drive's position [m] or [rad]; one revolution if it is unlimited."""
+    """Return lowest and highest position of a drive [m] or [rad].
+
+    For an unlimited joint they are one revolution or 1 m apart.
+    """
     axis = machine.axes[location]
     if axis.cylinder:
         return 0.0, axis.cylinder.stroke
@@ -131,10 +141,10 @@ def _position_range(machine: Machine, location: str) -> tuple[float, float]:
 
 
 def _bump_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify height, centre and width of additional friction at one position.
+    """Return nominal values, bounds and priors of additional dry friction at one position of a drive.
 
-    The height is scaled as Coulomb friction. A bent rod or a worn tooth spans a tenth of the
-    travel.
+    The parameters are its height (as for Coulomb friction), centre and width. A bent rod or a worn
+    tooth spans a tenth of the travel.
     """
 
     def present_value(parameter: str, absent: float) -> float:
@@ -189,14 +199,18 @@ _MIN_COMPLIANCE_RATIO = 0.02  # of the smallest relevant compliance: below it, f
 
 
 def _presliding_axes(machine: Machine) -> tuple[str, ...]:
-    """Return the axes with dry friction; drives with an own pump have no presliding model."""
+    """Return the names of the axes with dry friction, without those driven by an own pump.
+
+    The model of the latter has no presliding.
+    """
     found = {name: axis.drive.friction for name, axis in machine.axes.items() if not axis.pump}
     return tuple(name for name, f in found.items() if f.coulomb + f.stribeck_extra > 0.0)
 
 
 def _compliance_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the compliance of the bristles; 0 is friction without bristles.
+    """Return nominal value, bounds and prior of the compliance of dry friction before sliding.
 
+    The friction acts as a spring (bristles of seals and guides) up to breakaway; 0 means no spring.
     Metal surfaces deflect by some micrometres before they slide, rubber seals by up to a tenth of a
     millimetre. The smallest relevant deflection at the breakaway force is 10 um or 40 urad.
     """
@@ -213,7 +227,10 @@ def _compliance_parameters(machine: Machine, location: str) -> dict[str, Paramet
 
 
 def _set_presliding(machine: Machine, location: str, values: Values) -> Machine:
-    """Set the bristle stiffness; remove the bristles if they are too stiff to be distinguished."""
+    """Return the machine with a friction stiffness of 1 / compliance before sliding.
+
+    Below 2 % of the smallest relevant compliance the friction gets no spring, as in the rigid model.
+    """
     compliance = values["compliance"]
     number = _compliance_parameters(machine, location)["compliance"]
     if compliance == number.nominal:

@@ -19,7 +19,10 @@ from hydrotele.machine.machine import Machine
 
 
 def _link_length_axes(machine: Machine) -> tuple[str, ...]:
-    """Return the revolute axes whose link extends across the axis: boom, stick, not swing."""
+    """Return the names of the revolute axes whose link extends sideways from the joint axis.
+
+    The line to the next joint is more than 60 degrees from the axis: boom and stick, but not swing.
+    """
     places = []
     for axis in hinge_axes(machine):
         joint = machine.axes[axis].joint
@@ -33,9 +36,9 @@ def _link_length_axes(machine: Machine) -> tuple[str, ...]:
 
 
 def _link_length_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the change of a link's length.
+    """Return nominal value (0), bounds and prior of the change of a link's length.
 
-    Welded structures are built to a thousandth of their length, 5 mm for a boom.
+    The smallest relevant change is a thousandth of the length, the accuracy of welded structures.
     """
     point = outboard_point(machine, machine.link_of(machine.axes[location].joint))
     assert point is not None
@@ -44,7 +47,7 @@ def _link_length_parameters(machine: Machine, location: str) -> dict[str, Parame
 
 
 def _set_link_length(machine: Machine, location: str, values: Values) -> Machine:
-    """Move everything at the outboard joint by `length` along the line from the link's own joint.
+    """Return the machine with a link longer by `length` [m], along the line from its joint to the next.
 
     The moved parts are the next link, the base pin of the next link's cylinder if it is on this
     link, and a four-bar rocker on this link. For the last link they are the arm's tip and a payload
@@ -82,7 +85,13 @@ def _set_link_length(machine: Machine, location: str, values: Values) -> Machine
 
 
 def _move_tip(machine: Machine, name: str, shift: np.ndarray) -> Machine:
-    """Move the arm's tip on the last link and a payload that is welded there."""
+    """Return the machine with the arm's tip, and links welded at the tip such as a payload, shifted.
+
+    Args:
+        machine: the machine.
+        name: link with the tip.
+        shift: (3,) displacement in the frame of that link [m].
+    """
     assert machine.arm
     tip = machine.arm.tip.position
     for other, link in machine.links.items():
@@ -110,9 +119,10 @@ LINK_LENGTH = Effect(
 
 
 def _pin_offset_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the offsets of a base pin.
+    """Return nominal values (0), bounds and priors of the offsets of a cylinder's base pin.
 
-    The play of a worn pin is a thousandth of the closed length, 1.5 mm.
+    There is one offset for each coordinate perpendicular to the joint axis. The smallest relevant
+    offset is a thousandth of the cylinder's closed length, the play of a worn pin.
     """
     cylinder = machine.axes[location].cylinder
     assert cylinder
@@ -122,7 +132,10 @@ def _pin_offset_parameters(machine: Machine, location: str) -> dict[str, Paramet
 
 
 def _set_pin_offset(machine: Machine, location: str, values: Values) -> Machine:
-    """Move the base pin in its link's frame; the closed length does not change."""
+    """Return the machine with a cylinder's base pin moved in the frame of its link.
+
+    The closed length of the cylinder does not change.
+    """
     cylinder = machine.axes[location].cylinder
     assert cylinder
     way = zip("xyz", cylinder.base_pin.position, strict=True)
@@ -143,18 +156,19 @@ def _base_location(machine: Machine) -> tuple[str, ...]:
 
 
 def _base_tilt_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the tilt angles of the base.
+    """Return nominal values (0), bounds and priors of roll and pitch of the machine's base.
 
-    Ground is level to a few degrees; a builder's level resolves 3 mrad.
+    Ground is level to a few degrees. The smallest relevant angle is 3 mrad, as a spirit level resolves.
     """
     tilt = Parameter("rad", 0.0, -0.2, 0.2, 0.03, 0.003)
     return {"roll": tilt, "pitch": tilt}
 
 
 def _set_base_tilt(machine: Machine, location: str, values: Values) -> Machine:
-    """Rotate gravity into the frame of a base tilted by pitch about y, then by roll about its x.
+    """Return the machine with gravity rotated into the frame of a tilted base.
 
-    Positive pitch lowers the front (x), positive roll lowers the right-hand side (-y).
+    The base is rotated by `pitch` about y, then by `roll` about its own x axis. Positive pitch lowers
+    the front (x), positive roll lowers the right-hand side (-y).
     """
     roll, pitch = values["roll"], values["pitch"]
     c, s = math.cos(roll), math.sin(roll)

@@ -17,7 +17,10 @@ _COORDINATES = "xyz"
 
 
 def _is_vertical(machine: Machine, axis: str) -> bool:
-    """Return whether an axis at the base is parallel to gravity: weight then causes no torque."""
+    """Return whether an axis of a link on the world is parallel to gravity (within 18 degrees).
+
+    Weight then causes no torque about the axis.
+    """
     link = machine.links[machine.link_of(machine.axes[axis].joint)]
     assert link.joint
     gravity = np.array(machine.gravity)
@@ -26,16 +29,20 @@ def _is_vertical(machine: Machine, axis: str) -> bool:
 
 
 def _lateral_directions(machine: Machine, axis: str) -> list[str]:
-    """Return the two coordinates perpendicular to the joint axis; the third one has no effect."""
+    """Return the two coordinates perpendicular to a joint axis, such as ["x", "z"].
+
+    An offset of the centre of mass in the third one does not change the motion of the joint.
+    """
     axis_direction = np.abs(machine.joints[machine.axes[axis].joint].axis)
     return [_COORDINATES[k] for k in range(3) if k != int(np.argmax(axis_direction))]
 
 
 def _com_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the offsets of a link's centre of mass, scaled by the size of the link.
+    """Return nominal values (0), bounds and priors of the offsets of a link's centre of mass.
 
-    An offset of 0.5 % of a boom, about 25 mm, changes its pressure by 40 kPa. For a vertical axis
-    only the moment of inertia changes, so that the smallest relevant offset is six times larger.
+    They are fractions of the size of the link. An offset of 0.5 % of a boom, about 25 mm, changes its
+    pressure by 40 kPa. For a vertical axis only the moment of inertia changes, so that the smallest
+    relevant offset is six times larger.
     """
     size = link_size(machine, machine.link_of(machine.axes[location].joint))
     least = (0.03 if _is_vertical(machine, location) else 0.005) * size
@@ -51,7 +58,7 @@ def _move_com(machine: Machine, location: str, values: Values) -> Machine:
 
 
 def _inertia_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the ratio of true to given moments of inertia.
+    """Return nominal value (1), bounds and prior of the ratio of true to given moments of inertia.
 
     A model from drawings is accurate to about 20 %, with typical rounding of 5 %. The bounds
     include attachments, ballast, and a wrong unit in the drawings.
@@ -90,9 +97,10 @@ def _tool_location(machine: Machine) -> tuple[str, ...]:
 
 
 def _payload_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the payload mass, scaled by the mass that the boom moves.
+    """Return nominal value (0), bounds and prior of the mass of a payload at the arm's tip.
 
-    Seal friction hides a payload below 15 kg at a moved mass of 2.5 t.
+    They are fractions of the mass that the boom joint moves. Seal friction hides a payload below 15 kg
+    at a moved mass of 2.5 t.
     """
     assert machine.arm
     arm = outboard_links(machine, machine.link_of(machine.arm.boom))
@@ -101,7 +109,7 @@ def _payload_parameters(machine: Machine, location: str) -> dict[str, Parameter]
 
 
 def _set_payload(machine: Machine, location: str, values: Values) -> Machine:
-    """Add a point mass at the arm's tip as a welded link; repeated payloads add up."""
+    """Return the machine with a point mass welded to the arm's tip, added to an existing payload."""
     assert machine.arm
     tip, mass = machine.arm.tip, values["mass"]
     if mass < _MIN_PAYLOAD_KG:

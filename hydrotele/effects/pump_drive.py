@@ -1,7 +1,8 @@
 """Effects of drives with an own pump: pump, motor, lines, accumulator and load cylinder.
 
-Most effects change one parameter, so that a gap search can name the wrong parameter. Catalogue
-values are scaled by themselves; losses that catalogues omit are scaled by the motor's capability.
+Most effects change one parameter, so that a search for wrong parameters can name it. Bounds and
+priors of catalogue parameters are fractions of their values. For losses that catalogues omit, they are
+fractions of the motor's stall torque or the pump's rated flow.
 """
 
 from hydrotele.effects.effect import Effect, Parameter, Values, with_value
@@ -11,17 +12,17 @@ _SIDES = ("head", "rod")
 
 
 def _pump_axes(machine: Machine) -> tuple[str, ...]:
-    """Return the axes with an own pump."""
+    """Return the names of the axes that are driven by an own pump."""
     return tuple(name for name, axis in machine.axes.items() if axis.pump)
 
 
 def _pump_motor_axes(machine: Machine) -> tuple[str, ...]:
-    """Return the axes whose pump has a motor."""
+    """Return the names of the axes whose own pump has an electric motor in the model."""
     return tuple(n for n in _pump_axes(machine) if (p := machine.axes[n].pump) and p.motor)
 
 
 def _relief_load_axes(machine: Machine) -> tuple[str, ...]:
-    """Return the axes that push against a load cylinder with a relief valve."""
+    """Return the names of the axes that push against a load cylinder with a relief valve."""
     return tuple(n for n in machine.loads if machine.loads[n].relief_pressure > 0.0)
 
 
@@ -38,13 +39,21 @@ def _motor(machine: Machine, axis: str):
 
 
 def _ratio_parameter(unit: str, present: float, scale: float, least: float, widest: float) -> Parameter:
-    """Specify a positive catalogue parameter with bounds of 1/widest and widest times its value."""
+    """Return a positive parameter whose bounds and prior are proportional to its nominal value.
+
+    Args:
+        unit: SI unit.
+        present: nominal value [unit].
+        scale: standard deviation of the prior over the nominal value [1].
+        least: smallest relevant change over the nominal value [1].
+        widest: upper bound over the nominal value, and nominal value over the lower bound [1].
+    """
     sizes = present / widest, present * widest, scale * present, least * present
     return Parameter(unit, present, *sizes)
 
 
 def _displacement_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the pump displacement.
+    """Return nominal value, bounds and prior of the displacement of an axis pump.
 
     Gear pumps of one size scatter by some per cent; a flow meter resolves 1 %.
     """
@@ -53,9 +62,9 @@ def _displacement_parameters(machine: Machine, location: str) -> dict[str, Param
 
 
 def _leakage_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the pump leakage, scaled by rated flow over highest pressure.
+    """Return nominal value, bounds and prior of the leakage coefficient of an axis pump.
 
-    10 % is typical, 1 % is detectable.
+    They are fractions of the rated flow over the highest pressure: 10 % is typical, 1 % detectable.
     """
     pump = _pump(machine, location)
     whole = pump.rated_flow / machine.max_feed_pressure(location)
@@ -65,7 +74,7 @@ def _leakage_parameters(machine: Machine, location: str) -> dict[str, Parameter]
 
 
 def _torque_loss_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the torque loss of the pump.
+    """Return nominal value, bounds and prior of the torque loss of an axis pump, relative to its torque.
 
     Small gear pumps lose 10 to 60 % of their torque; warm oil changes the loss by 3 %.
     """
@@ -74,7 +83,7 @@ def _torque_loss_parameters(machine: Machine, location: str) -> dict[str, Parame
 
 
 def _motor_constant_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the motor constant.
+    """Return nominal value, bounds and prior of the torque constant of a pump motor.
 
     Magnets and windings scatter by 10 %; heating reduces the constant by 2 %.
     """
@@ -83,7 +92,7 @@ def _motor_constant_parameters(machine: Machine, location: str) -> dict[str, Par
 
 
 def _inertia_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the inertia of motor and pump.
+    """Return nominal value, bounds and prior of the common inertia of motor and pump.
 
     It is known to tens of per cent; a wrong unit causes errors of powers of ten.
     """
@@ -97,9 +106,9 @@ def _stall_torque(machine: Machine, location: str) -> float:
 
 
 def _drag_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify dry drag and breakaway torque, scaled by the stall torque.
+    """Return nominal values, bounds and priors of dry drag and breakaway torque of motor and pump.
 
-    Brushes and seals cause 5 %.
+    They are fractions of the stall torque, of which brushes and seals cause 5 %.
     """
     motor, whole = _motor(machine, location), _stall_torque(machine, location)
     return {
@@ -109,9 +118,9 @@ def _drag_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
 
 
 def _viscous_drag_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the viscous drag, scaled by stall torque over rated speed.
+    """Return nominal value, bounds and prior of the viscous drag of motor and pump.
 
-    The fractions are those of dry drag.
+    They are the same fractions as for dry drag, here of stall torque over rated speed.
     """
     present = _motor(machine, location).viscous
     whole = _stall_torque(machine, location) / _pump(machine, location).rated_speed
@@ -124,10 +133,11 @@ def _line_locations(machine: Machine) -> tuple[str, ...]:
 
 
 def _line_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify line compliance and air volume, relative to the oil at mid-stroke.
+    """Return nominal values, bounds and priors of compliance and air volume of a line.
 
-    Hoses are several times more compliant than their oil. The air volume is stated at atmospheric
-    pressure; a few per cent of the oil volume are typical.
+    They are proportional to compliance and volume of the oil at mid-stroke. Hoses are several times more
+    compliant than their oil. The air volume is stated at atmospheric pressure; a few per cent of the oil
+    volume are typical.
     """
     axis, _, side = location.partition(".")
     drive, pump = machine.axes[axis].cylinder, _pump(machine, axis)
@@ -149,7 +159,7 @@ def _set_lines(machine: Machine, location: str, values: Values) -> Machine:
 
 
 def _accumulator_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the charge pressure of the accumulator.
+    """Return nominal value, bounds and prior of the charge pressure of an axis' accumulator.
 
     It is set manually to tens of per cent; the finest mark of a gauge is 2 %.
     """
@@ -158,7 +168,7 @@ def _accumulator_parameters(machine: Machine, location: str) -> dict[str, Parame
 
 
 def _load_relief_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the relief pressure of the load cylinder.
+    """Return nominal value, bounds and prior of the relief pressure of a load cylinder.
 
     Low settings are made manually to tens of per cent; the finest mark of a gauge is 2 %.
     """
@@ -168,9 +178,9 @@ def _load_relief_parameters(machine: Machine, location: str) -> dict[str, Parame
 
 
 def _load_friction_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the packing friction of the load cylinder as a fraction of the load's force.
+    """Return nominal value, bounds and prior of the packing friction of a load cylinder.
 
-    Packings cause up to some tens of per cent.
+    It is stated as a fraction of the load's force; packings cause up to some tens of per cent.
     """
     present = machine.loads[location].friction
     return {"friction": Parameter("1", present, 0.0, max(1.0, present), 0.1, 0.02)}

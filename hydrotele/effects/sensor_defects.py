@@ -33,7 +33,7 @@ def _with_sensor_error(machine: Machine, channel: str, **numbers: float) -> Mach
 
 
 def _angle_offset_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the offset of a position sensor.
+    """Return nominal value, bounds and prior of the offset of a position sensor.
 
     Resolvers are mounted to half a degree or worse and resolve a twentieth of a degree. Slides use
     corresponding fractions of their range.
@@ -57,9 +57,9 @@ def _make_position_setter(field: str, parameter: str):
 
 
 def _angle_drift_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify drift and warm-up time constant of a position sensor.
+    """Return nominal values, bounds and priors of drift and warm-up time constant of a position sensor.
 
-    The drift of the warm sensor has the scale and bounds of an offset.
+    The drift is the offset that the warm sensor has gained; it has the bounds and prior of an offset.
     """
     error = _sensor_error(machine, _position_channel(machine, location))
     sizes = _angle_offset_parameters(machine, location)["offset"]
@@ -72,7 +72,10 @@ def _angle_drift_parameters(machine: Machine, location: str) -> dict[str, Parame
 
 
 def _set_angle_drift(machine: Machine, location: str, values: Values) -> Machine:
-    """Set drift and time constant; without drift the time constant has no effect and is omitted."""
+    """Return the machine with another drift and warm-up time constant of a position sensor.
+
+    Without drift the time constant has no effect and is not set.
+    """
     numbers = {"drift": values["drift"]}
     if values["drift"] and "time_constant" in values:
         numbers["drift_time_constant"] = values["time_constant"]
@@ -80,7 +83,7 @@ def _set_angle_drift(machine: Machine, location: str, values: Values) -> Machine
 
 
 def _angle_scale_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the scale of a position sensor.
+    """Return nominal value, bounds and prior of the scale factor of a position sensor.
 
     It is wrong with a wrong gear or reference voltage. The linearity of a resolver is 0.3 % over
     one radian.
@@ -91,7 +94,7 @@ def _angle_scale_parameters(machine: Machine, location: str) -> dict[str, Parame
 
 
 def _delay_parameters(present: float) -> dict[str, Parameter]:
-    """Specify a sensor delay.
+    """Return nominal value (`present` [s]), bounds and prior of a sensor delay.
 
     Filters and buses delay by about 10 ms; 3 ms is one bus cycle.
     """
@@ -104,7 +107,7 @@ def _angle_delay_parameters(machine: Machine, location: str) -> dict[str, Parame
 
 
 def _lag_parameters(present: float) -> dict[str, Parameter]:
-    """Specify the time constant of a first-order lag.
+    """Return nominal value (`present` [s]), bounds and prior of the first-order time constant of a sensor.
 
     Transducers and their filters have 1 to 50 ms.
     """
@@ -117,9 +120,10 @@ def _angle_lag_parameters(machine: Machine, location: str) -> dict[str, Paramete
 
 
 def _length_offset_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the offset of a length sensor, scaled by the stroke.
+    """Return nominal value, bounds and prior of the offset of a cylinder's length sensor.
 
-    Length sensors are mounted to a centimetre; the smallest relevant offset is a millimetre.
+    They are fractions of the stroke. Length sensors are mounted to a centimetre; the smallest relevant
+    offset is a millimetre.
     """
     cylinder = machine.axes[location].cylinder
     assert cylinder
@@ -142,7 +146,7 @@ def _transducer_channel(location: str) -> str:
 
 
 def _pressure_offset_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the zero offset of a pressure transducer.
+    """Return nominal value, bounds and prior of the zero offset of a pressure transducer.
 
     The accuracy class is 0.5 % of the span, the repeatability better than 0.1 %.
     """
@@ -157,7 +161,7 @@ def _set_pressure_offset(machine: Machine, location: str, values: Values) -> Mac
 
 
 def _pressure_scale_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the scale of a pressure transducer.
+    """Return nominal value, bounds and prior of the scale factor of a pressure transducer.
 
     It is wrong with a wrong span setting or supply voltage. A calibrated transducer is accurate to
     0.25 %.
@@ -176,12 +180,23 @@ def _transducer_channels(axis: str) -> tuple[str, ...]:
 
 
 def _common_value(machine: Machine, channels: tuple[str, ...], field: str) -> float:
-    """Return the delay or time constant common to all channels [s], the smallest of them."""
+    """Return the smallest delay or time constant of several sensor channels [s].
+
+    It counts as the part that all of them have in common.
+
+    Args:
+        machine: the machine.
+        channels: channel names.
+        field: `delay` or `time_constant`.
+    """
     return min(getattr(_sensor_error(machine, channel), field) for channel in channels)
 
 
 def _with_common_value(machine: Machine, channels: tuple[str, ...], field: str, value: float) -> Machine:
-    """Set the smallest of the channels' values and shift the others equally."""
+    """Return the machine with another common delay or time constant of several sensor channels.
+
+    The smallest one becomes `value` [s], and all others change by the same time, but not below 0.
+    """
     more = value - _common_value(machine, channels, field)
     for channel in channels:
         shifted = getattr(_sensor_error(machine, channel), field) + more
@@ -206,9 +221,10 @@ def _set_pressure_lag(machine: Machine, location: str, values: Values) -> Machin
 
 
 def _clock_groups(machine: Machine) -> dict[str, tuple[str, ...]]:
-    """Return the groups of channels that one logger may have time-stamped.
+    """Return the groups of sensor channels that may have been recorded with a separate clock.
 
-    A group needs more than one axis; a single axis is covered by its sensor delays.
+    The groups are `positions` and `pressures`, each only if several axes have such sensors. For a single
+    axis, an offset of the clock is the same as a delay of its sensors.
     """
     pressures = tuple(c for c in machine.sensed_channels if c.startswith("pressure"))
     positions = tuple(c for c in machine.sensed_channels if not c.startswith("pressure"))
@@ -221,11 +237,11 @@ def _clock_groups(machine: Machine) -> dict[str, tuple[str, ...]]:
 
 
 def _clock_offset_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the time by which a group of sensors is late relative to commands and other sensors.
+    """Return nominal value, bounds and prior of the time by which a group of sensors is recorded late.
 
-    A group is never early, because that would be a response before its command. Between the two
-    groups either sign is possible, as an offset of one or the other. Loggers are off by about 10
-    ms.
+    The time is relative to commands and other sensors. A group is never early, because that would be a
+    response before its command. Between the two groups either sign is possible, as an offset of one or
+    the other. Loggers are off by about 10 ms.
     """
     present = _common_value(machine, _clock_groups(machine)[location], "delay")
     high = max(0.5, present)

@@ -9,15 +9,19 @@ def _supply_location(machine: Machine) -> tuple[str, ...]:
 
 
 def _limited_flow_location(machine: Machine) -> tuple[str, ...]:
-    """Return the supply if its pump limits the flow; a constant-pressure supply does not."""
+    """Return the location ("supply",), or () for machines whose pump does not limit the flow.
+
+    A supply of constant pressure has no such limit.
+    """
     supply = machine.supply
     return _supply_location(machine) if supply and supply.kind != "constant_pressure" else ()
 
 
 def _pump_flow_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the flow of the pump.
+    """Return nominal value, bounds and prior of the largest flow of the supply pump.
 
-    Engine speed and wear change it by tens of per cent; an engine governor has a droop of 2 %.
+    Engine speed and wear change it by tens of per cent. The smallest relevant change is 2 %, by which
+    an engine governor lets the speed fall under load.
     """
     assert machine.supply
     q = machine.supply.pump_flow
@@ -25,7 +29,7 @@ def _pump_flow_parameters(machine: Machine, location: str) -> dict[str, Paramete
 
 
 def _droop_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the decrease of pump flow with pressure.
+    """Return nominal value, bounds and prior of the decrease of pump flow per pressure.
 
     Leakage and engine governor reduce the flow by 5 % at full pressure; a new pump loses 1 %.
     """
@@ -41,7 +45,7 @@ def _set_droop(machine: Machine, location: str, values: Values) -> Machine:
 
 
 def _lag_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the time constant of the pump.
+    """Return nominal value, bounds and prior of the first-order time constant of the pump flow.
 
     Swash plates respond in 50 to 300 ms, fast ones in 20 ms.
     """
@@ -52,10 +56,11 @@ def _lag_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
 
 
 def _relief_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify relief pressure and pressure override of the main relief valve.
+    """Return nominal values, bounds and priors of pressure and override of the main relief valve.
 
-    The pressure is set manually to a few per cent; the finest mark of a gauge is 0.3 %. From
-    opening to full pump flow the pressure rises by about 10 %, for a pilot-operated valve by 1 %.
+    The override is the pressure rise per flow through the open valve; only a pump of constant flow has
+    it as a parameter. The pressure is set manually to a few per cent; the finest mark of a gauge is
+    0.3 %. Up to full pump flow the pressure rises by about 10 %, for a pilot-operated valve by 1 %.
     """
     supply = machine.supply
     assert supply

@@ -28,10 +28,10 @@ _DEFAULT_DAMPING_RATIO = 0.3  # damping ratio of the drive on its spring: oil an
 
 
 def rigid_transmission(machine: Machine, axis: str) -> Transmission:
-    """Return the transmission of a rigid drive, before a backlash or a compliance is added.
+    """Return a nearly rigid transmission of a drive, to which backlash or compliance can be added.
 
-    Its inertia is the rod's mass, or 3 % of a motor's load inertia at home. Its spring is as stiff
-    as steps of 1 ms resolve well (40 Hz).
+    Its drive-side inertia is the rod's mass, or for a motor 3 % of the load inertia in the home pose.
+    Its spring is as stiff as steps of 1 ms resolve well: inertia and spring vibrate at 40 Hz.
     """
     cylinder = machine.axes[axis].cylinder
     inertia = cylinder.rod.mass if cylinder else _DRIVE_INERTIA_FRACTION * load_inertia(machine, axis)
@@ -45,20 +45,34 @@ def rigid_transmission(machine: Machine, axis: str) -> Transmission:
 
 
 def spring_damping(inertia: float, stiffness: float) -> float:
-    """Return the damping of the spring [N s/m] or [N m s/rad] for a damping ratio of 0.3."""
+    """Return the damping of a spring for a damping ratio of 0.3 [N s/m] or [N m s/rad].
+
+    Args:
+        inertia: mass [kg] or moment of inertia [kg m^2] on the spring.
+        stiffness: stiffness of the spring [N/m] or [N m/rad].
+    """
     return 2.0 * _DEFAULT_DAMPING_RATIO * math.sqrt(stiffness * inertia)
 
 
 def min_resolvable_inertia(machine: Machine, axis: str, inertia: float, stiffness: float) -> float:
-    """Return the drive inertia, increased if needed to simulate spring and oil with 1 ms steps.
+    """Return the drive-side inertia, increased if steps of 1 ms could not resolve its vibration.
 
-    The oil is stiffest at the end of the stroke: the sum of `beta A^2 / V` of both chambers.
+    The result is at least (spring + oil stiffness) / w^2 with w = 2 pi 150 rad/s.
+
+    Args:
+        machine: the machine.
+        axis: name of the axis.
+        inertia: desired inertia [kg] or [kg m^2].
+        stiffness: stiffness of the spring between drive and load [N/m] or [N m/rad].
     """
     return max(inertia, (stiffness + _oil_stiffness(machine, axis)) / _MAX_FREQUENCY_RAD_S**2)
 
 
 def natural_frequency(machine: Machine, axis: str) -> float:
-    """Return the natural frequency of a drive on its transmission spring and oil [rad/s]."""
+    """Return the natural frequency of the drive-side inertia of an axis [rad/s].
+
+    The inertia vibrates between the spring of the transmission and, for a hydraulic drive, the oil.
+    """
     facts = machine.axes[axis]
     assert facts.transmission
     oil = _oil_stiffness(machine, axis) if facts.is_hydraulic else 0.0
@@ -66,7 +80,10 @@ def natural_frequency(machine: Machine, axis: str) -> float:
 
 
 def _oil_stiffness(machine: Machine, axis: str) -> float:
-    """Return the stiffness of both chambers at the end of the stroke [N/m] or [N m/rad]."""
+    """Return the stiffness of the oil in both chambers at the end of the stroke [N/m] or [N m/rad].
+
+    It is the sum of bulk modulus times squared area over volume, largest where one chamber is empty.
+    """
     drive, cylinder = machine.axes[axis].hydraulic_drive, machine.axes[axis].cylinder
     assert machine.supply
     head, rod = drive.areas
@@ -96,9 +113,9 @@ def with_transmission(machine: Machine, axis: str, transmission: Transmission) -
 
 
 def load_inertia(machine: Machine, axis: str) -> float:
-    """Return the inertia [kg m^2] or mass [kg] moved by the joint of an axis at home.
+    """Return the inertia [kg m^2] or mass [kg] that the joint of an axis moves in the home pose.
 
-    Cylinders are not included.
+    It is that of the links about the joint axis, without the cylinders.
     """
     joint = machine.axes[axis].joint
     first = machine.link_of(joint)
@@ -118,7 +135,7 @@ def load_inertia(machine: Machine, axis: str) -> float:
 
 
 def _link_pose(machine: Machine, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the world position (3,) [m] and rotation (3, 3) of a link at home."""
+    """Return position (3,) [m] and rotation matrix (3, 3) of a link in the world frame, in the home pose."""
     if name == "world":
         return np.zeros(3), np.eye(3)
     link = machine.links[name]
@@ -147,12 +164,13 @@ def _backlash_axes(machine: Machine) -> tuple[str, ...]:
 
 
 def _backlash_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify backlash, drive-side inertia, damping ratio and contact frequency.
+    """Return nominal values, bounds and priors of the backlash between a motor and its load.
 
-    A worn slewing ring has half a degree of backlash, a new one 1 mrad, which is also the
-    resolution of a resolver. Drive inertia and contact frequency are known only to a factor; they
-    matter only for chatter resolved sample by sample. Steel teeth vibrate at 30 to 100 Hz. Faster
-    contact of oil and teeth cannot be simulated with 1 ms steps.
+    The parameters are backlash, drive-side inertia, damping ratio and contact frequency, the natural
+    frequency of the drive on closed teeth. A worn slewing ring has half a degree of backlash, a new one
+    1 mrad, which is also the resolution of a resolver. Drive inertia and contact frequency are known
+    only to a factor; they matter only for chatter resolved sample by sample. Steel teeth vibrate at 30
+    to 100 Hz. Faster contact of oil and teeth cannot be simulated with 1 ms steps.
     """
     drive = _current_transmission(machine, location)
     present, rings = drive.backlash, _spring_frequency(drive)
@@ -165,10 +183,15 @@ def _backlash_parameters(machine: Machine, location: str) -> dict[str, Parameter
 
 
 def _inertia_parameter(unit: str, own: float, least: float = 0.0, usual: float = 0.0) -> Parameter:
-    """Specify the drive-side inertia as an optional parameter.
+    """Return nominal value, bounds and prior of the drive-side inertia, an optional parameter.
 
-    It is known only to a factor and does not identify a defect. The lower bound is not below the
-    inertia `least` that the simulation can resolve; the scale is at least `usual`.
+    It is known only to a factor and does not indicate a defect.
+
+    Args:
+        unit: unit of the inertia, "kg" or "kg m^2".
+        own: nominal value [unit].
+        least: smallest inertia that the simulation can resolve; limits the lower bound [unit].
+        usual: smallest standard deviation of the prior [unit].
     """
     scale, low = max(own, usual), min(own, max(0.1 * own, least))
     return Parameter(unit, own, low, own + 4.0 * scale, scale, scale, optional=True)
@@ -193,7 +216,10 @@ def _transmission_damping_ratio(drive: Transmission) -> float:
 
 
 def _set_backlash(machine: Machine, location: str, values: Values) -> Machine:
-    """Add a motor-side inertia, taken from the link, and a stiff spring with backlash."""
+    """Return the machine with backlash in an axis: a motor-side inertia behind a stiff spring with a gap.
+
+    The inertia is subtracted from the driven link. Nothing changes for a gap below 1 urad.
+    """
     gap, before = values["gap"], machine.axes[location].transmission
     if gap < _MIN_BACKLASH_RAD and before is None:
         return machine
@@ -222,20 +248,21 @@ _MOTOR_DEFLECTION_RAD = 0.015  # rad, deflection of a slewing drive's gears and 
 
 
 def _typical_deflection(machine: Machine, location: str) -> float:
-    """Return the typical deflection of a flexible joint at full force [m] or [rad].
+    """Return the typical deflection between a drive and its load at full force [m] or [rad].
 
-    For cylinders it is 1 % of the stroke.
+    It is 1 % of the stroke for cylinders and 15 mrad for motors.
     """
     cylinder = machine.axes[location].cylinder
     return 0.01 * cylinder.stroke if cylinder else _MOTOR_DEFLECTION_RAD
 
 
 def _flexibility_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify compliance, drive-side inertia and damping ratio.
+    """Return nominal values, bounds and priors of the compliance between a drive and its load.
 
-    The smallest relevant deflection at full pressure is 2 mm for a stroke of 1 m, or 2 mrad.
-    Inertia and damping are known only to a factor. The inertia is never below the value that the
-    oil alone needs for 1 ms steps; a stiff spring may need more than the stated inertia.
+    The parameters are compliance, drive-side inertia and damping ratio. The smallest relevant deflection
+    at full pressure is 2 mm for a stroke of 1 m, or 2 mrad. Inertia and damping are known only to a
+    factor. The inertia is never below the value that the oil alone needs for 1 ms steps; a stiff spring
+    may need more than the stated inertia.
     """
     usual = _typical_deflection(machine, location) / max_drive_force(machine, location)
     transmission = machine.axes[location].transmission
@@ -256,11 +283,11 @@ def _flexibility_parameters(machine: Machine, location: str) -> dict[str, Parame
 
 
 def _set_flexibility(machine: Machine, location: str, values: Values) -> Machine:
-    """Set the spring stiffness to 1 / compliance; an existing backlash is kept.
+    """Return the machine with a spring of stiffness 1 / compliance between a drive and its load.
 
-    A cylinder's spring is in line with it, between piston and rod pin, so that length sensor and
-    oil follow the piston. The drive-side inertia is the stated value, otherwise the rod's mass or 3
-    % of a motor's load. It is increased if a stiff spring needs it for 1 ms steps.
+    An existing backlash is kept. A cylinder's spring is in line with it, between piston and rod pin, so
+    that length sensor and oil follow the piston. The drive-side inertia is the stated value, otherwise
+    the rod's mass or 3 % of a motor's load. It is increased if a stiff spring needs it for 1 ms steps.
     """
     compliance, before = values["compliance"], machine.axes[location].transmission
     table = _flexibility_parameters(machine, location)

@@ -19,7 +19,7 @@ def _valve(machine: Machine, location: str) -> Valve:
 
 
 def _common_deadband_axes(machine: Machine) -> tuple[str, ...]:
-    """Return the valves whose common deadband applies to at least one direction."""
+    """Return the axes with a valve whose deadband is not stated separately for both directions."""
     return tuple(
         name for name in valve_axes(machine)
         if any(way.deadband is None
@@ -28,9 +28,10 @@ def _common_deadband_axes(machine: Machine) -> tuple[str, ...]:
 
 
 def _deadband_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the common deadband.
+    """Return nominal value, bounds and prior of a valve's deadband, common to both directions.
 
-    Overlaps are a few per cent of the stroke; the typical hysteresis of a spool is 0.4 %.
+    The deadband is the fraction of the spool's stroke without flow, a few per cent. The smallest
+    relevant change is 0.4 %, the typical hysteresis of a spool.
     """
     present = _valve(machine, location).deadband
     return {"deadband": Parameter("1", present, 0.0, max(0.3, present), 0.03, 0.004)}
@@ -41,7 +42,7 @@ def _set_deadband(machine: Machine, location: str, values: Values) -> Machine:
 
 
 def _gain_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the ratio of true to given flow gain.
+    """Return nominal value (1), bounds and prior of the ratio of true to given flow gain of a valve.
 
     A manufacturer's flow rating is accurate to 5 or 10 %, the linearity of a spool is 2 %. The
     bounds include a different spool in the same body.
@@ -55,7 +56,7 @@ def _scale_gain(machine: Machine, location: str, values: Values) -> Machine:
 
 
 def _bandwidth_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the bandwidth of the spool.
+    """Return nominal value, bounds and prior of the bandwidth of a valve's spool.
 
     The smallest relevant deviation is 8 %. At 8 Hz it changes the lag by 3 ms, the smallest
     relevant delay.
@@ -102,7 +103,10 @@ DIRECTIONS = ("positive", "negative")
 
 
 def _direction_gain_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the flow gain ratio of each direction, scaled as the common one."""
+    """Return the ratio of true to given flow gain for each direction of a valve.
+
+    Nominal value (1), bounds and prior are those of the ratio common to both directions.
+    """
     return dict.fromkeys(DIRECTIONS, Parameter("1", 1.0, 0.05, 5.0, 0.15, 0.02))
 
 
@@ -116,7 +120,10 @@ def _scale_direction_gains(machine: Machine, location: str, values: Values) -> M
 
 
 def _direction_deadband_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the deadband of each direction, with larger bounds for a spool off its centre."""
+    """Return nominal value, bounds and prior of a valve's deadband for each direction.
+
+    The bounds are wider than for a common deadband, because a spool may rest off its centre.
+    """
     present = _valve(machine, location).deadbands
     return {
         direction: Parameter("1", band, 0.0, max(0.6, band), 0.03, 0.004)
@@ -150,9 +157,10 @@ _DIRECTIONS = ("positive", "negative")
 
 
 def _progression_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the progression of each direction.
+    """Return nominal value (0), bounds and prior of the flow curve's progression for each direction.
 
-    A progression of 0.3 gives an opening of 42 % at half travel. Estimates: spools for fine control
+    The progression says how much less a valve opens over its first travel than a linear one; see
+    `bend_flow_curve`. For 0.3 the opening at half travel is 42 %. Estimates: spools for fine control
     reach 0.6, notches cause 0.04.
     """
     return dict.fromkeys(_DIRECTIONS, Parameter("1", 0.0, -0.9, 0.9, 0.3, 0.04))
@@ -169,12 +177,13 @@ def _set_progression(machine: Machine, location: str, values: Values) -> Machine
 
 
 def bend_flow_curve(present: Metering, progression: float) -> FlowCurve:
-    """Return the flow curve of a direction multiplied by `1 - c + c t`, t being the travel.
+    """Return a valve's flow curve (opening over travel) for one direction, with added progression.
 
-    The full opening does not change.
+    The opening is multiplied by 1 - c + c t, where t is the travel from 0 to 1 and c the progression. The
+    full opening does not change.
 
     Args:
-        present: the direction; linear without a curve.
+        present: metering of the direction; its opening is linear if it has no curve.
         progression: c, from -1 (steep at first) to 1 (flat at first) [1].
 
     Returns:
@@ -200,9 +209,10 @@ EDGE_FIELDS = {
 
 
 def _edge_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the gain of each metering edge.
+    """Return nominal value, bounds and prior of the relative gain of each metering edge of a valve.
 
-    Estimates: spools for single-rod cylinders differ by tens of per cent; a notch changes 3 %.
+    The edges connect pump P, tank T and the work ports A and B: `p_a`, `b_t`, `p_b`, `a_t`. Estimates:
+    spools for single-rod cylinders differ by tens of per cent; a notch changes 3 %.
     """
     valve = machine.axes[location].valve
     assert valve
@@ -228,10 +238,11 @@ METERING_EDGES = Effect(
 
 
 def _travel_time_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the time from centre to full opening, scaled by the spool's 1 / w; 0 without a limit.
+    """Return nominal value, bounds and prior of the time in which the spool opens fully.
 
-    A step to full opening moves an unlimited spool with damping ratio 0.9 at 0.38 w at most. A
-    limit therefore has an effect for travel times above 2.6 / w. The scales are estimates.
+    The spool moves at its largest speed for this time; 0 means no speed limit. With the bandwidth w of
+    the spool [rad/s], a full step without limit moves at most 0.38 w of the travel per second (damping
+    ratio 0.9). A limit therefore has an effect for times above 2.6 / w. Prior and bounds are estimates.
     """
     valve = machine.axes[location].valve
     assert valve

@@ -9,13 +9,13 @@ _WARMING_TIME_S = 300.0  # s, time constant of warming of a tank of some hundred
 
 
 def _viscous_friction(machine: Machine) -> dict[str, float]:
-    """Return the viscous friction of the axes that have any."""
+    """Return axis -> coefficient of viscous friction [N s/m] or [N m s/rad], if it is not 0."""
     found = {name: axis.drive.friction.viscous for name, axis in machine.axes.items()}
     return {name: viscous for name, viscous in found.items() if viscous}
 
 
 def _leakage_coefficients(machine: Machine) -> dict[str, float]:
-    """Return the leakage of the axes that have any."""
+    """Return axis -> leakage coefficient between the chambers [m^3/(s Pa)], if it is not 0."""
     found = {n: axis.hydraulic_drive.leakage for n, axis in machine.hydraulic_axes.items()}
     return {name: leakage for name, leakage in found.items() if leakage}
 
@@ -25,9 +25,10 @@ def _oil_location(machine: Machine) -> tuple[str, ...]:
 
 
 def _warming_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
-    """Specify the ratio of final to initial viscosity and the time constant of warming.
+    """Return nominal values, bounds and priors of the viscosity change by warming during a run.
 
-    Warming by 20 K halves the viscosity; a change of 5 % corresponds to 2 K.
+    The parameters are the ratio of final to initial viscosity and the time constant. Warming by 20 K
+    halves the viscosity; a change of 5 % corresponds to 2 K.
     """
     term = next((term for term in machine.terms if term.name == NAME), None)
     present = dict(term.parameters) if term else {"ratio": 1.0, "time_constant": _WARMING_TIME_S}
@@ -40,7 +41,10 @@ def _warming_parameters(machine: Machine, location: str) -> dict[str, Parameter]
 
 
 def _set_warming(machine: Machine, location: str, values: Values) -> Machine:
-    """Add terms that change the symmetric part of the machine's viscous friction and leakage."""
+    """Return the machine with viscous friction and leakage that change over time as the oil warms up.
+
+    The change applies to the part of the friction that is equal in both directions.
+    """
     if values["ratio"] == 1.0:
         return with_terms(machine, NAME, [])
     numbers = dict(values)

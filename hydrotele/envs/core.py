@@ -92,8 +92,8 @@ class TaskCore:
         reward: (n,).
         terminated: (n,) uint8.
         truncated: (n,) uint8.
-        measures: (n, MEASURES) task measures of the step, reported in `info`.
-        final_measures: (n, MEASURES) the same before an autoreset in the same step.
+        measures: (n, MAX_MEASURES) task measures of the step, reported in `info`.
+        final_measures: (n, MAX_MEASURES) the same before an autoreset in the same step.
     """
 
     def __init__(

@@ -62,7 +62,7 @@ class MachineEnvironment(dm_env.Environment):
         self, task_name: str, random: int | np.random.RandomState | None, flat: bool,
         options: Mapping[str, Any],
     ) -> None:  # fmt: skip
-        """Compile the machine; arguments as of `load`."""
+        """Compile the machine; the arguments are those of `load`, `flat` is its `flat_observation`."""
         self.core = make_core(task_name, dict(options), 1, 1, DISABLED)
         if random is None:
             random = int(np.random.default_rng().integers(2**62))
@@ -128,7 +128,7 @@ class MachineEnvironment(dm_env.Environment):
         return specs.BoundedArray((count,), np.float32, -1.0, 1.0, name)
 
     def control_timestep(self) -> float:
-        """Return the time between steps [s]."""
+        """Return the time between environment steps [s]."""
         return 1.0 / self.core.setup.options.control_rate
 
     def last_info(self) -> dict[str, Any]:
@@ -220,5 +220,5 @@ def group_indices(keys: list[str]) -> collections.OrderedDict[str, np.ndarray]:
 
 
 def split_by_key(values: np.ndarray, places: Mapping[str, np.ndarray]) -> collections.OrderedDict[str, np.ndarray]:
-    """Return a copy of the values of every key."""
+    """Return a copy of the values of every key; `places` holds the indices of each key in `values`."""
     return collections.OrderedDict((key, values[some]) for key, some in places.items())

@@ -1,7 +1,7 @@
 """Episode state and task parameters as C-like records, and the random generator of an episode.
 
 Compiled functions receive both records and read their fields by name. In Python, `state["joint"]`
-is an (n, AXES) array. The random generator is SplitMix64, with one 64-bit state per episode.
+is an (n, MAX_AXES) array. The random generator is SplitMix64, with one 64-bit state per episode.
 """
 
 import numpy as np
@@ -104,9 +104,9 @@ TASK_PARAMETERS = np.dtype(
         ("ranges", _F, (MAX_AXES, 2)),  # joint ranges of the axes [rad], [m]
         ("servo", _F, (MAX_AXES, 14)),  # see control.servo.servo_parameters
         ("feedforward", _F),
-        ("grid", _F, (MAX_AXES, 2)),  # see control.servo.drive_tables
+        ("grid", _F, (MAX_AXES, 2)),  # see control.servo.tabulate_drives
         ("accuracy", _F, MAX_CHANNELS),  # bound of the uniform random error of every sensor
-        ("converters", _F, (3, MAX_CHANNELS)),  # see machine.machine.converter
+        ("converters", _F, (3, MAX_CHANNELS)),  # see machine.machine.channel_converter
         ("parameters", _F, MAX_PARAMETERS),  # task parameters
         ("delayed_command", _I),  # control periods in the command ring buffer, 0 without delays
         ("delayed_sensor", _I),  # physics steps in the sensor ring buffer, 0 without delays
@@ -124,20 +124,20 @@ TASK_PARAMETERS = np.dtype(
         ("reward", _I),  # (n,)
         ("terminated", _I),  # (n,) uint8
         ("truncated", _I),
-        ("measures", _I),  # (n, MEASURES)
-        ("final_measures", _I),  # (n, MEASURES) before an autoreset in the same step
-        ("table", _I),  # (k, POINTS, 3) of control.servo.drive_tables
+        ("measures", _I),  # (n, MAX_MEASURES)
+        ("final_measures", _I),  # (n, MAX_MEASURES) before an autoreset in the same step
+        ("table", _I),  # (k, TABLE_POINTS, 3) of control.servo.tabulate_drives
         ("starts", _I),  # (v, states)
         ("start_tips", _I),  # (v, 3)
-        ("users", _I),  # (v, k SLOTS) actuator parameters
-        ("scales", _I),  # (v, CHANNELS) sensor scale factors
-        ("offsets", _I),  # (v, CHANNELS) sensor offsets
-        ("lags", _I),  # (v, CHANNELS, 2) sensor delays: whole physics steps, fraction of a step
-        ("ratios", _I),  # (v, CHANNELS) physics step divided by the sensor time constant
-        ("delays", _I),  # (v, AXES, 2) command delays: whole physics steps, fraction of a step
-        ("commands", _I),  # (n, delayed_command, AXES) ring buffer
-        ("sensed", _I),  # (n, delayed_sensor, CHANNELS) ring buffer
-        ("sensed_before", _I),  # (n, CHANNELS) true values after the last physics step
+        ("users", _I),  # (v, k SLOT_COUNT) actuator parameters
+        ("scales", _I),  # (v, MAX_CHANNELS) sensor scale factors
+        ("offsets", _I),  # (v, MAX_CHANNELS) sensor offsets
+        ("lags", _I),  # (v, MAX_CHANNELS, 2) sensor delays: whole physics steps, fraction of a step
+        ("ratios", _I),  # (v, MAX_CHANNELS) physics step divided by the sensor time constant
+        ("delays", _I),  # (v, MAX_AXES, 2) command delays: whole physics steps, fraction of a step
+        ("commands", _I),  # (n, delayed_command, MAX_AXES) ring buffer
+        ("sensed", _I),  # (n, delayed_sensor, MAX_CHANNELS) ring buffer
+        ("sensed_before", _I),  # (n, MAX_CHANNELS) true values after the last physics step
         ("places", _I),  # (fields, 3): address of all variants, address of all n, floats per row
         ("terrain", _I),  # (n, width)
         ("eq_rows", _I),  # (n, neq eq_width) equality data, 0 if no task writes them
@@ -196,7 +196,7 @@ def draw_uniform(e):
     Returns:
         The number, scalar [1].
 
-    Source: see the module.
+    Source: SplitMix64.
     """
     e.random += _INCREMENT
     return (mix64(e.random) >> _SHIFT_11) * _UNIT_SCALE
@@ -214,7 +214,7 @@ def draw_uniform_between(e, low, high):
     Returns:
         The number, scalar.
 
-    Source: see the module.
+    Source: SplitMix64.
     """
     return low + (high - low) * draw_uniform(e)
 

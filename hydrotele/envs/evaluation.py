@@ -110,7 +110,10 @@ def _find_unit(core: TaskCore, name: str) -> str:
 
 
 def compare_scores(scores: Sequence[tuple[str, Scores]], names: Sequence[str]) -> str:
-    """Return a Markdown table that compares results of several controllers."""
+    """Return a Markdown table of results, mean ± standard error, with one row per controller.
+
+    `scores` holds (label, scores) of each controller; `names` selects the results of the columns.
+    """
     first = scores[0][1]
     heads = [f"{name} [{first.units[name]}]" for name in names]
     rows = ["| | " + " | ".join(heads) + " |", "| --- |" + " --- |" * len(heads)]

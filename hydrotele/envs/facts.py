@@ -72,7 +72,7 @@ class TaskSetup(NamedTuple):
         arm_axes: number of arm axes, which come first in `axes`.
         variants: machines and starts of the episodes.
         fields: fields of the observation.
-        drive_table: (k, POINTS, 3) of `control.servo.drive_tables`.
+        drive_table: (k, TABLE_POINTS, 3) of `control.servo.tabulate_drives`.
     """
 
     task: Task
@@ -219,7 +219,7 @@ def _write_sensors(facts: np.ndarray, setup: TaskSetup) -> None:
 
 
 def _write_layout(facts: np.ndarray) -> None:
-    """Write the offsets of MuJoCo's members and the addresses of its functions."""
+    """Write the byte offsets of members of mjData and mjModel and the addresses of MuJoCo functions."""
     verify_layout()
     facts["mj_step"] = function_address("mj_step")
     facts["mj_set_state"] = function_address("mj_setState")

@@ -49,7 +49,7 @@ PLATE_QPOS, PLATE_DOF, PLATE_JOINT, CENTRE_X, CENTRE_Y, HALF_X, HALF_Y = range(7
 
 
 def force_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
-    """Return the fields that `observe_force` writes: measured and reference force, time."""
+    """Return the observation fields that `observe_force` writes: measured and reference force, time."""
     return [
         ObservationField("force", "N", -_CELL_RANGE, _CELL_RANGE),
         ObservationField("reference_force", "N", 0.0, MAX_FORCE),
@@ -59,11 +59,11 @@ def force_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationFie
 
 @compiled
 def plate_force(f, w):
-    """Return the force in the spring and damper of the plate, positive when pressed down.
+    """Return the force that the spring and the damper under the plate carry, positive when it is pressed down.
 
     Args:
         f: record of TASK_PARAMETERS.
-        w: World.
+        w: SimulationView.
 
     Returns:
         The force, scalar [N].
@@ -80,12 +80,12 @@ def plate_force(f, w):
 
 @compiled
 def begin_force(f, e, w):
-    """Draw the two reference forces and the time of the change.
+    """Draw the goal of an episode: two reference forces, and the time of the change from one to the other.
 
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE; `goal` is written.
-        w: World.
+        w: SimulationView.
 
     Returns:
         Nothing.
@@ -94,7 +94,7 @@ def begin_force(f, e, w):
     """
     g = e.goal
     g[_FIRST_FORCE] = draw_uniform_between(e, MIN_FORCE, MAX_FORCE)
-    # uniform over all forces that differ from the first by at least _CHANGE
+    # uniform over all forces that differ from the first by at least _MIN_FORCE_CHANGE
     below = max(0.0, g[_FIRST_FORCE] - _MIN_FORCE_CHANGE - MIN_FORCE)
     above = max(0.0, MAX_FORCE - g[_FIRST_FORCE] - _MIN_FORCE_CHANGE)
     place = draw_uniform_between(e, 0.0, below + above)
@@ -115,12 +115,12 @@ def _sample_force(f, e, w):
 
 @compiled
 def update_force(f, e, w):
-    """Read the load cell and update the maximum force of this step.
+    """Update the true force, the load cell reading and the maximum force of this step, after a control period.
 
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE; `goal` is written.
-        w: World.
+        w: SimulationView.
 
     Returns:
         Nothing.
@@ -133,10 +133,10 @@ def update_force(f, e, w):
 
 @compiled
 def reference_force(g, time):
-    """Return the reference force, and the time since its last change.
+    """Return the reference force at a time, and the time since it last changed or the episode started.
 
     Args:
-        g: (GOAL,) goal of the episode.
+        g: (GOAL_SIZE,) task values of the episode (`goal` of EPISODE_STATE).
         time: since the start, scalar [s].
 
     Returns:
@@ -151,13 +151,13 @@ def reference_force(g, time):
 
 @compiled
 def observe_force(f, e, out, at):
-    """Write the measured force, the reference force and the time since its last change.
+    """Write the measured force, the reference force and the time since its last change to the observation.
 
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE.
         out: (observations,) float32, written from index `at` on.
-        at: scalar.
+        at: index of the first value to write, scalar.
 
     Returns:
         Nothing.
@@ -175,7 +175,7 @@ def reward_force(f, e, w):
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE.
-        w: World; `measures` receives the force error [N] and, as 0 or 1, contact with the plate, an
+        w: SimulationView; `measures` receives the force error [N] and, as 0 or 1, contact with the plate, an
             overload, and a tip that is no longer over the plate.
 
     Returns:
@@ -207,12 +207,12 @@ _START_HEIGHTS = (0.05, 0.15)  # m, initial height of the tip above the plate
 
 
 def _draw_start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
-    """Draw a start with the bucket over the centre of the plate, teeth down."""
+    """Draw random arm positions with the bucket over the centre of the plate, teeth down."""
     return draw_start(machine, rng, (5.6, -0.05, 0.2, -1.92), (6.4, 0.05, 0.9, -1.57))
 
 
 def _make_plate(machine: Machine, rng: np.random.Generator, start: dict[str, float]) -> tuple[SurroundingObject, ...]:
-    """Draw the stiffness and height of a plate below the tip."""
+    """Return a spring-mounted plate below the tip, with random stiffness and height."""
     numbers, axes, _ = arm_specification(machine)
     pose = np.zeros(5)
     task_forward(numbers, np.array([start[name] for name in axes]), pose)
@@ -258,7 +258,11 @@ HOLD_FORCE = Task(
 
 @callback(TASK_SIGNATURE)
 def task_code(part, m, d, number, argument, out):
-    """Run one part of the task in native code; see `simulation_view`."""
+    """Run one part of the task for one simulation, in native code; return the reward for REWARD, otherwise 0.
+
+    The arguments are those of `world.TASK_SIGNATURE`: part (BEGIN, TICK, OBSERVE or REWARD), addresses of
+    mjModel and mjData, index of the simulation, addresses of TASK_PARAMETERS and of the observation.
+    """
     f = parameters_view(argument)[0]
     e, w = episode_records(f)[number], simulation_view(f, m, d, number, argument)
     if part == BEGIN:

@@ -1,6 +1,6 @@
 """The task `Grade`: cut a low bank of soil with mounds down to a plane and carry the soil away.
 
-The module also couples the soil model to the simulation. `World.terrain` stores the soil state of
+The module also couples the soil model to the simulation. `SimulationView.terrain` stores the soil state of
 one episode in slices: the profile, the state of the bucket, the result of the last step and the
 soil parameters, which may differ between episodes. The profile lies in the vertical plane of the
 arm and rotates with it.
@@ -60,14 +60,14 @@ TERRAIN_SIZE = _SOIL_OFFSET + _PARAMETER_COUNT
 
 
 def bed_parameters(soils: Sequence[Soil], bucket: Bucket = CAT215) -> np.ndarray:
-    """Return the task parameters of a bed of soil.
+    """Pack the parameters of bucket, soil profile and one to three soils as task parameters.
 
     Args:
         soils: the soils from which an episode draws one.
         bucket: the bucket that digs.
 
     Returns:
-        (at most PARAMETERS,) parameters of the first soil with bucket and profile, then the soil
+        (at most MAX_PARAMETERS,) parameters of the first soil with bucket and profile, then the soil
         parameters of the other soils.
 
     Raises:
@@ -86,10 +86,10 @@ def surface_view(w):
     """Return a view of the surface heights of the profile.
 
     Args:
-        w: World.
+        w: SimulationView.
 
     Returns:
-        (CELLS,) [m].
+        (CELL_COUNT,) [m].
 
     Source: this module.
     """
@@ -101,10 +101,10 @@ def loose_view(w):
     """Return a view of the thickness of the loose soil on the profile.
 
     Args:
-        w: World.
+        w: SimulationView.
 
     Returns:
-        (CELLS,) [m].
+        (CELL_COUNT,) [m].
 
     Source: this module.
     """
@@ -113,13 +113,13 @@ def loose_view(w):
 
 @compiled
 def bucket_view(w):
-    """Return a view of the bucket state; see `soil.facts`.
+    """Return a view of the soil state of the bucket, indexed by CARRIED_VOLUME to DEPTH of `soil.facts`.
 
     Args:
-        w: World.
+        w: SimulationView.
 
     Returns:
-        (STATE,).
+        (STATE_SIZE,).
 
     Source: this module.
     """
@@ -128,13 +128,13 @@ def bucket_view(w):
 
 @compiled
 def result_view(w):
-    """Return a view of the result of the last soil step; see `soil.facts`.
+    """Return a view of the result of the last soil step: force, moment, and mass carried with its centre.
 
     Args:
-        w: World.
+        w: SimulationView.
 
     Returns:
-        (OUT,).
+        (RESULT_SIZE,).
 
     Source: this module.
     """
@@ -143,10 +143,10 @@ def result_view(w):
 
 @compiled
 def soil_view(w):
-    """Return a view of the soil parameters of the episode; see `soil.facts`.
+    """Return a view of the episode's parameters of soil, bucket and profile, from `pack_soil_parameters`.
 
     Args:
-        w: World.
+        w: SimulationView.
 
     Returns:
         (k,).
@@ -162,7 +162,7 @@ def init_bed(f, w, soil):
 
     Args:
         f: record of TASK_PARAMETERS; its parameters are those of `bed_parameters`.
-        w: World; `terrain` is written.
+        w: SimulationView; `terrain` is written.
         soil: index of the soil, scalar [1].
 
     Returns:
@@ -190,7 +190,7 @@ def compute_edge_rates(f, e, w, rates):
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE.
-        w: World.
+        w: SimulationView.
         rates: (2,) written [m/s].
 
     Returns:
@@ -215,13 +215,13 @@ def step_bed(f, e, w):
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE.
-        w: World after a physics step; `terrain` and the row of the tip's body in `xfrc` are
+        w: SimulationView after a physics step; `terrain` and the row of the tip's body in `xfrc` are
             written.
 
     Returns:
         Nothing.
 
-    Source: `soil.step.soil_step`, `compute_bucket_wrench`. Positions come from MuJoCo, so that the geometry
+    Source: `soil.step.step_soil`, `compute_bucket_wrench`. Positions come from MuJoCo, so that the geometry
         of every variant is exact.
     """
     body = f.tip_body
@@ -272,7 +272,7 @@ def section_radii() -> list[float]:
 
 
 def grade_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
-    """Return the fields that `observe_grade` writes: profile errors, edge height, mass, plane."""
+    """Return the observation fields that `observe_grade` writes: profile errors, edge height, mass, plane."""
     far = max_reach(machine)
     fields = [ObservationField(f"profile_error.{p}", "m", -1.0, 2.0) for p in range(SECTION_COUNT)]
     return [
@@ -289,7 +289,7 @@ def plane_height(g, r):
     """Return the height of the target plane at a radius.
 
     Args:
-        g: (GOAL,) goal of the episode.
+        g: (GOAL_SIZE,) task values of the episode (`goal` of EPISODE_STATE).
         r: radius, scalar [m].
 
     Returns:
@@ -305,8 +305,8 @@ def profile_error(g, surface, first, last):
     """Return the mean and RMS height of the ground above the target plane in a range of cells.
 
     Args:
-        g: (GOAL,) goal of the episode.
-        surface: (CELLS,) heights [m].
+        g: (GOAL_SIZE,) task values of the episode (`goal` of EPISODE_STATE).
+        surface: (CELL_COUNT,) heights [m].
         first: index of the first cell, scalar [1].
         last: index after the last cell, scalar [1].
 
@@ -334,12 +334,12 @@ def _add_mound(surface, middle, half, height):
 
 @compiled
 def begin_grade(f, e, w):
-    """Draw the soil, the ground with two mounds, and the target plane.
+    """Draw the goal and terrain of an episode: soil, ground with two mounds, and target plane.
 
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE; `goal` is written.
-        w: World; `terrain` and the first `measures` are written.
+        w: SimulationView; `terrain` and the first `measures` are written.
 
     Returns:
         Nothing.
@@ -378,14 +378,14 @@ def begin_grade(f, e, w):
 
 @compiled
 def observe_grade(f, e, w, out, at):
-    """Write the profile errors, the height of the edge above the ground, the mass and the plane.
+    """Write profile errors, height of the edge above ground, mass carried and plane to the observation.
 
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE.
-        w: World.
+        w: SimulationView.
         out: (observations,) float32, written from index `at` on.
-        at: scalar.
+        at: index of the first value to write, scalar.
 
     Returns:
         Nothing.
@@ -415,7 +415,7 @@ def reward_grade(f, e, w):
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE; `goal` is written.
-        w: World; `measures` receives the RMS error [m], mass carried [kg], soil force [N], index of
+        w: SimulationView; `measures` receives the RMS error [m], mass carried [kg], soil force [N], index of
             the soil, and, as 0 or 1, whether the ground is graded and whether it was spoiled.
 
     Returns:
@@ -455,12 +455,12 @@ _MAX_START_POSE = (6.4, 0.5, 1.5, math.radians(-90.0))
 
 
 def _draw_start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
-    """Draw a start with the bucket above the far end of the ground, ready to dig."""
+    """Draw random arm positions with the bucket above the far end of the ground, ready to dig."""
     return draw_start(machine, rng, _MIN_START_POSE, _MAX_START_POSE)
 
 
 def _make_parameters(machine: Machine, model: mujoco.MjModel) -> tuple[float, ...]:
-    """Return the parameters of the bed of soil; the last one is the number of soils."""
+    """Return the MAX_PARAMETERS task parameters: bucket, profile and soils, and last the number of soils."""
     bed = bed_parameters([SOILS[name] for name in GRADE_SOILS]).tolist()
     return (*bed, *[0.0] * (MAX_PARAMETERS - 1 - len(bed)), float(len(GRADE_SOILS)))
 
@@ -498,7 +498,11 @@ GRADE = Task(
 
 @callback(TASK_SIGNATURE)
 def task_code(part, m, d, number, argument, out):
-    """Run one part of the task in native code; see `simulation_view`."""
+    """Run one part of the task for one simulation, in native code; return the reward for REWARD, otherwise 0.
+
+    The arguments are those of `world.TASK_SIGNATURE`: part (BEGIN, TICK, OBSERVE or REWARD), addresses of
+    mjModel and mjData, index of the simulation, addresses of TASK_PARAMETERS and of the observation.
+    """
     f = parameters_view(argument)[0]
     e, w = episode_records(f)[number], simulation_view(f, m, d, number, argument)
     if part == BEGIN:

@@ -66,7 +66,7 @@ _RATE_BOUND = 1.0  # m/s, rad/s: bound of the reference rates
 
 
 def line_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
-    """Return the fields that `observe_line` writes: reference pose, rates, preview, errors."""
+    """Return the observation fields that `observe_line` writes: reference pose, rates, preview, errors."""
     k, far = len(axes), max_reach(machine)
     fields = pose_fields(machine, k, "reference")
     fields += [ObservationField(f"reference_rate.{c}", unit, -_RATE_BOUND, _RATE_BOUND)
@@ -82,7 +82,7 @@ def line_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationFiel
 
 @compiled
 def begin_line(f, e):
-    """Draw a line that starts at the current tip position.
+    """Draw the goal of an episode: a straight line from the present tip position, with speed and acceleration.
 
     Args:
         f: record of TASK_PARAMETERS.
@@ -126,10 +126,10 @@ def begin_line(f, e):
 
 @compiled
 def line_travel(g, time):
-    """Return the distance travelled along the line, and the speed.
+    """Return the distance that the reference has travelled along the line at a time, and its speed.
 
     Args:
-        g: (GOAL,) goal of the episode.
+        g: (GOAL_SIZE,) task values of the episode (`goal` of EPISODE_STATE).
         time: since the start, scalar [s].
 
     Returns:
@@ -152,13 +152,13 @@ def line_travel(g, time):
 
 @compiled
 def compute_line_pose(g, time, pose, rate):
-    """Compute the reference pose and its rate.
+    """Compute the reference pose on the line at a time, and its rate.
 
     Args:
-        g: (GOAL,) goal of the episode.
+        g: (GOAL_SIZE,) task values of the episode (`goal` of EPISODE_STATE).
         time: since the start, scalar [s].
-        pose: (ARM,) written: r [m], theta [rad], z [m], attitude [rad], 0.
-        rate: (ARM,) written, per second.
+        pose: (MAX_ARM_AXES,) written: r [m], theta [rad], z [m], attitude [rad], 0.
+        rate: (MAX_ARM_AXES,) written, per second.
 
     Returns:
         Nothing.
@@ -178,8 +178,8 @@ def line_errors(g, reference, r, theta, z):
     """Return the along-track and cross-track errors of the tip.
 
     Args:
-        g: (GOAL,) goal of the episode.
-        reference: (ARM,) reference pose.
+        g: (GOAL_SIZE,) task values of the episode (`goal` of EPISODE_STATE).
+        reference: (MAX_ARM_AXES,) reference pose.
         r: radius of the tip, scalar [m].
         theta: angle of the tip about the swing axis, modulo 2 pi, scalar [rad].
         z: height of the tip, scalar [m].
@@ -199,13 +199,13 @@ def line_errors(g, reference, r, theta, z):
 
 @compiled
 def observe_line(f, e, out, at):
-    """Write the reference pose now and ahead, and the errors from the measured joint positions.
+    """Write the reference pose now and ahead, and the measured tracking errors, to the observation.
 
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE.
         out: (observations,) float32, written from index `at` on.
-        at: scalar.
+        at: index of the first value to write, scalar.
 
     Returns:
         Nothing.
@@ -234,19 +234,19 @@ def observe_line(f, e, out, at):
 
 @compiled
 def reward_from_errors(across, along, attitude):
-    """Return the reward, scalar from -1 to 1, for errors [m], [m] and [rad]."""
+    """Return 1 minus the weighted errors across [m] and along [m] the line and in attitude [rad], at least -1."""
     costs = across / CROSS_ERROR_SCALE + abs(along) / ALONG_ERROR_SCALE + abs(attitude) / ATTITUDE_ERROR_SCALE
     return max(-1.0, 1.0 - costs)
 
 
 @compiled
 def reward_line(f, e, w):
-    """Compute the reward from the true tip position.
+    """Compute the reward of a step from the errors of the true tip position.
 
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE.
-        w: World; `measures` receives the cross-track and along-track errors [m] and the attitude
+        w: SimulationView; `measures` receives the cross-track and along-track errors [m] and the attitude
             error [rad].
 
     Returns:
@@ -264,7 +264,7 @@ def reward_line(f, e, w):
 
 
 def _draw_start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
-    """Draw a start with the bucket in the air, about as in Zhu 1994, Figs 6.45-6.48."""
+    """Draw random arm positions with the bucket in the air, about as in Zhu 1994, Figs 6.45-6.48."""
     return draw_start(machine, rng, (4.8, -0.5, 0.4, -1.9), (6.5, 0.5, 2.4, -1.2))
 
 
@@ -295,7 +295,11 @@ STRAIGHT_LINE = Task(
 
 @callback(TASK_SIGNATURE)
 def task_code(part, m, d, number, argument, out):
-    """Run one part of the task in native code; see `simulation_view`."""
+    """Run one part of the task for one simulation, in native code; return the reward for REWARD, otherwise 0.
+
+    The arguments are those of `world.TASK_SIGNATURE`: part (BEGIN, TICK, OBSERVE or REWARD), addresses of
+    mjModel and mjData, index of the simulation, addresses of TASK_PARAMETERS and of the observation.
+    """
     f = parameters_view(argument)[0]
     e, w = episode_records(f)[number], simulation_view(f, m, d, number, argument)
     if part == BEGIN:

@@ -67,7 +67,7 @@ _MAX_REFERENCE_LEAD = 0.2  # rad or m, maximum lead of a reference over its join
 
 @compiled
 def _clip_action(f, action, a):
-    """Return an action clipped to +-1; 0 for the locked action."""
+    """Return element `a` of the action clipped to +-1, or 0 if the task locks this action."""
     return 0.0 if a == f.locked else min(1.0, max(-1.0, action[a]))
 
 
@@ -78,7 +78,10 @@ def _limit_change(now, goal, change):
 
 @compiled
 def _integrate_joint_rates(f, e, action, first):
-    """Move the references of axes by joint rates, from action `first` on."""
+    """Integrate rate actions, from index `first` on, to the joint references of the servo.
+
+    Acceleration, joint range and lead over the measured joint are limited.
+    """
     for a in range(first, f.actions):
         i = f.driven_axis[a]
         goal = _clip_action(f, action, a) * f.fastest[i]
@@ -93,7 +96,7 @@ def _integrate_joint_rates(f, e, action, first):
 
 @compiled
 def _integrate_pose_rates(f, e, action):
-    """Move the references of the arm by pose rates (resolved motion)."""
+    """Integrate tip rate actions to the tip pose, and convert it to the joint references (resolved motion)."""
     k, wanted = f.arm_axes, np.empty(MAX_ARM_AXES)
     for c in range(MAX_ARM_AXES):
         goal = 0.0
@@ -201,7 +204,7 @@ _SIGNATURE = types.void(types.int64, types.int64, types.intc, types.int64)
 
 @compiled
 def _make_simulation(f, e, w):
-    """Return the simulation record of an episode for `simulate.stepping`."""
+    """Collect the arrays of an episode's simulation, with its delay lines, in a record for `simulate.stepping`."""
     ring = float64_view(f.commands + 8 * w.index * f.delayed_command * MAX_AXES, f.delayed_command * MAX_AXES).reshape(
         (f.delayed_command, MAX_AXES)
     )
@@ -226,7 +229,7 @@ def _make_simulation(f, e, w):
 
 @compiled
 def _run_control_period(f, e, sim):
-    """Run the servo and the physics for one control period."""
+    """Run the joint servo and then the physics steps of one control period."""
     k, none = f.axes, np.zeros(f.axes)
     controller = Controller(f.servo[:k], f.closed[:k], e.load[:k], e.command[:k])
     drive = DriveReference(e.drive[0, :k], e.drive[1, :k], e.drive[2, :k], e.drive[3, :k])
@@ -287,7 +290,7 @@ def _begin_episode(f, e, w):
 
 @compiled
 def _write_observation(f, e, w, address):
-    """Write the observation, clipped to its bounds."""
+    """Write the observation of a simulation to an array at `address`, clipped to its bounds."""
     n = f.observations
     out = carray(address_to_pointer(address + 4 * w.index * n), (n,), np.float32)
     low = carray(address_to_pointer(f.low), (n,), np.float32)
@@ -349,5 +352,9 @@ def _advance_simulation(m, d, sim, argument):
 
 @callback(_SIGNATURE)
 def advance(m, d, sim, argument):
-    """Step or reset one simulation: mjModel*, mjData*, index, TASK_PARAMETERS*."""
+    """Step or reset one simulation.
+
+    The arguments are the addresses of mjModel and mjData, the index of the simulation and the address of
+    TASK_PARAMETERS, whose `call` selects step or reset.
+    """
     _advance_simulation(m, d, sim, argument)

@@ -118,7 +118,7 @@ def _validate_options(choices: dict[str, Any]) -> Options:
 
 
 def make_observation_space(core: TaskCore) -> Box:
-    """Return the observation space, (o,) float32 in SI units, at whose bounds values saturate."""
+    """Return the observation space, (o,) float32 in SI units; observations are clipped to its bounds."""
     return Box(core.observation_low, core.observation_high, dtype=np.float32)
 
 
@@ -232,7 +232,7 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     Attributes:
         core: the running task with machine, axes, observation fields and variants.
         observation_space: (o,) float32 in SI units; `core.setup.fields` names the values.
-        action_space: (a,) float32 from -1 to 1; `core.coordinates` names the actions.
+        action_space: (a,) float32 from -1 to 1; `core.action_names` names the actions.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array", "human"], "render_fps": 50}
@@ -337,7 +337,7 @@ class MachineEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._stage
 
     def _show_step(self) -> None:
-        """Show the current step with `render_mode="human"`."""
+        """Show the current step in the window if `render_mode` is "human"."""
         if self.render_mode != "human":
             return
         if self._window is None:

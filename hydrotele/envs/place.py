@@ -59,7 +59,7 @@ def grapple_parameters(machine: Machine, model: mujoco.MjModel, log: LogOnGround
         log: the log.
 
     Returns:
-        (GRIP + 11,): parameters of `simulate.surroundings.grip_step`, then the ids of the grapple's
+        (GRIP_SIZE + 11,): parameters of `simulate.surroundings.grip_step`, then the ids of the grapple's
         body, the log's body and the weld, the indices in `qpos` of jaw and log, the radius and half
         length of the log [m], and the indices of the free joints in `qpos` and `qvel`.
     """
@@ -80,7 +80,7 @@ def is_held(f, w):
 
     Args:
         f: record of TASK_PARAMETERS.
-        w: World.
+        w: SimulationView.
 
     Returns:
         bool.
@@ -92,7 +92,7 @@ def is_held(f, w):
 
 @compiled
 def _body_values(values, count, at):
-    """Return the `count` values of the body with index `at`."""
+    """Return the `count` values of the body with index `at` from an array of all bodies."""
     return values[count * at : count * at + count]
 
 
@@ -118,17 +118,17 @@ def _update_grip(f, w):
 
 @compiled
 def measure_free_joints(f, e, w):
-    """Measure the angles and rates of the free joints, if a sensor sample is due.
+    """Measure the angles and rates of the two joints from which the grapple swings, if a sample is due.
 
     Args:
         f: record of TASK_PARAMETERS.
-        e: record of EPISODE_STATE; `goal` is written from READ on.
-        w: World, with staggered positions and velocities, see `simulate.record`.
+        e: record of EPISODE_STATE; `goal` is written from MEASURED_START on.
+        w: SimulationView, with staggered positions and velocities, see `simulate.record`.
 
     Returns:
         Nothing.
 
-    Source: like `envs.loop.sense`, with the error and resolution of the sensor of the first axis.
+    Source: like `envs.loop.update_sensors`, with the error and resolution of the sensor of the first axis.
     """
     if e.tick % f.every != 0:
         return
@@ -148,12 +148,12 @@ def measure_free_joints(f, e, w):
 
 @compiled
 def update_grapple(f, e, w):
-    """Grip or release the log, and measure the free joints.
+    """Grip or release the log according to the jaw angle, and measure the swing joints of the grapple.
 
     Args:
         f: record of TASK_PARAMETERS; its parameters are those of `grapple_parameters`.
         e: record of EPISODE_STATE; `goal` is written.
-        w: World after a physics step; the weld is written.
+        w: SimulationView after a physics step; the weld is written.
 
     Returns:
         Nothing.
@@ -170,7 +170,7 @@ def grip_distance(f, w):
 
     Args:
         f: record of TASK_PARAMETERS.
-        w: World after a physics step.
+        w: SimulationView after a physics step.
 
     Returns:
         (distance from the centre of the pocket to the part of the log's axis that can be gripped
@@ -204,7 +204,7 @@ def tilt_angle(f, w):
 
     Args:
         f: record of TASK_PARAMETERS.
-        w: World after a physics step.
+        w: SimulationView after a physics step.
 
     Returns:
         The angle, scalar [rad].
@@ -247,7 +247,7 @@ _RATE_BOUND = 10.0  # rad/s, bound of the difference quotient of noisy samples
 
 
 def place_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
-    """Return the fields that `observe_place` writes: log, goal, held, free joints."""
+    """Return the observation fields that `observe_place` writes: log, goal, held, free joints."""
     far = 2.0 * max_reach(machine)
     fields = []
     for what, high in (("log", ("z",)), ("goal", ())):
@@ -271,7 +271,7 @@ def begin_place(f, e, w):
     Args:
         f: record of TASK_PARAMETERS; its parameters are those of `grapple_parameters`.
         e: record of EPISODE_STATE; `goal` is written.
-        w: World; the log's coordinates are written.
+        w: SimulationView; the log's coordinates are written.
 
     Returns:
         Nothing.
@@ -304,11 +304,11 @@ def _draw_with_random_sign(e, size):
 
 @compiled
 def log_pose(f, w):
-    """Return the position and direction of the log.
+    """Return the position and the direction of the wooden log.
 
     Args:
         f: record of TASK_PARAMETERS.
-        w: World.
+        w: SimulationView.
 
     Returns:
         (x [m], y [m], z [m], sine and cosine of twice the yaw of the axis, sine of the angle
@@ -346,14 +346,14 @@ def yaw_difference(sine, cosine, yaw):
 
 @compiled
 def observe_place(f, e, w, out, at):
-    """Write the poses of log and goal, whether the log is held, and the measured free joints.
+    """Write the poses of log and goal, whether the log is held, and the swing of the grapple to the observation.
 
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE.
-        w: World.
+        w: SimulationView.
         out: (observations,) float32, written from index `at` on.
-        at: scalar.
+        at: index of the first value to write, scalar.
 
     Returns:
         Nothing.
@@ -373,12 +373,12 @@ def observe_place(f, e, w, out, at):
 
 @compiled
 def reward_place(f, e, w):
-    """Compute the reward for moving the grapple to the log and the log to its goal.
+    """Compute the reward of a step for moving the grapple to the log and the log to its goal.
 
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE; `goal` is written.
-        w: World; `measures` receives the distance [m] and yaw error [rad] of the log, whether it is
+        w: SimulationView; `measures` receives the distance [m] and yaw error [rad] of the log, whether it is
             held, success, and the angle of the grapple to the vertical [rad].
 
     Returns:
@@ -427,7 +427,7 @@ _MIN_START_POSE, _MAX_START_POSE = (
 
 
 def _draw_start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
-    """Draw a start with the open grapple hanging vertically above the height of a log."""
+    """Draw random joint positions with the open grapple hanging vertically above the height of a log."""
     joints = draw_start(machine, rng, _MIN_START_POSE, _MAX_START_POSE)
     plumb = -0.5 * math.pi - joints["boom"] - joints["stick"]
     turned = float(rng.uniform(-0.5, 0.5) * math.pi)
@@ -477,7 +477,11 @@ PLACE_LOG = Task(
 
 @callback(TASK_SIGNATURE)
 def task_code(part, m, d, number, argument, out):
-    """Run one part of the task in native code; see `simulation_view`."""
+    """Run one part of the task for one simulation, in native code; return the reward for REWARD, otherwise 0.
+
+    The arguments are those of `world.TASK_SIGNATURE`: part (BEGIN, TICK, OBSERVE or REWARD), addresses of
+    mjModel and mjData, index of the simulation, addresses of TASK_PARAMETERS and of the observation.
+    """
     f = parameters_view(argument)[0]
     e, w = episode_records(f)[number], simulation_view(f, m, d, number, argument)
     if part == BEGIN:

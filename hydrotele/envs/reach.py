@@ -54,7 +54,7 @@ _TARGET, _TIME_HELD, _REMAINING_DISTANCE = 0, 5, 6  # indices in `goal`
 
 
 def reach_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
-    """Return the fields that `observe_reach` writes: goal pose, measured distance, time held."""
+    """Return the observation fields that `observe_reach` writes: goal pose, measured distance, time held."""
     return [
         *pose_fields(machine, len(axes), "reference"),
         ObservationField("distance", "m", 0.0, 2.0 * max_reach(machine)),
@@ -99,11 +99,11 @@ def reach_errors(target, x, y, z, attitude, head):
     """Return the position and angle errors of the tip with respect to the goal pose.
 
     Args:
-        target: (ARM,) goal pose: r [m], theta [rad], z [m], attitude, head [rad].
+        target: (MAX_ARM_AXES,) goal pose: r [m], theta [rad], z [m], attitude, head [rad].
         x: position of the tip, scalar [m].
-        y: scalar [m].
-        z: scalar [m].
-        attitude: of the tilt link, scalar [rad].
+        y: position of the tip, scalar [m].
+        z: position of the tip, scalar [m].
+        attitude: angle of the tilt link to the horizontal, scalar [rad].
         head: angle of the head, scalar [rad].
 
     Returns:
@@ -119,7 +119,7 @@ def reach_errors(target, x, y, z, attitude, head):
 
 @compiled
 def remaining_distance(distance, angle):
-    """Return the remaining distance, scalar [m]: position error plus `ANGLE_WEIGHT` times angle error."""
+    """Return position error [m] plus `ANGLE_WEIGHT` [m/rad] times angle error [rad] as one distance [m]."""
     return distance + ANGLE_WEIGHT * angle
 
 
@@ -132,13 +132,13 @@ def _true_errors(f, e):
 
 @compiled
 def observe_reach(f, e, out, at):
-    """Write the goal pose, the distance from the measured joint positions, and the time held.
+    """Write the goal pose, the measured distance to it, and the time it has been held to the observation.
 
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE.
         out: (observations,) float32, written from index `at` on.
-        at: scalar.
+        at: index of the first value to write, scalar.
 
     Returns:
         Nothing.
@@ -157,12 +157,14 @@ def observe_reach(f, e, out, at):
 
 @compiled
 def reward_reach(f, e, w):
-    """Compute the reward from the decrease of the remaining distance; holding the pose ends it.
+    """Compute the reward of a step from the decrease of the remaining distance to the goal pose.
+
+    Holding the pose for `HOLD_TIME` pays an extra reward and ends the episode.
 
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE; `goal` is written.
-        w: World; `measures` receives the distance [m], the larger error of attitude and head [rad],
+        w: SimulationView; `measures` receives the distance [m], the larger error of attitude and head [rad],
             and success.
 
     Returns:
@@ -184,7 +186,7 @@ def reward_reach(f, e, w):
 
 
 def _draw_start(machine: Machine, rng: np.random.Generator) -> dict[str, float]:
-    """Draw a start with the head in the air in front of the machine, about level."""
+    """Draw random arm positions with the head in the air in front of the machine, about level."""
     return draw_start(
         machine, rng, (5.0, -0.5, 0.8, -0.4, -0.3), (8.0, 0.5, 3.0, 0.4, 0.3)
     )  # fmt: skip
@@ -213,7 +215,11 @@ REACH_FELLER = Task(
 
 @callback(TASK_SIGNATURE)
 def task_code(part, m, d, number, argument, out):
-    """Run one part of the task in native code; see `simulation_view`."""
+    """Run one part of the task for one simulation, in native code; return the reward for REWARD, otherwise 0.
+
+    The arguments are those of `world.TASK_SIGNATURE`: part (BEGIN, TICK, OBSERVE or REWARD), addresses of
+    mjModel and mjData, index of the simulation, addresses of TASK_PARAMETERS and of the observation.
+    """
     f = parameters_view(argument)[0]
     e, w = episode_records(f)[number], simulation_view(f, m, d, number, argument)
     if part == BEGIN:

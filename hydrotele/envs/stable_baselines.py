@@ -72,7 +72,7 @@ class AgentInterface:
         self.observation_size = history * self._step_size + (self._actions if controller else 0)
 
     def begin(self, count: int) -> None:
-        """Allocate the state of `count` episodes."""
+        """Allocate the history of `count` parallel episodes, and the state of the controller."""
         self._stacked_steps = np.zeros((count, self._history, self._step_size), np.float32)
         self._base_action = np.zeros((count, self._actions), np.float32)
         self._is_new = np.ones(count, bool)
@@ -94,7 +94,10 @@ class AgentInterface:
         return np.concatenate([flat, base], axis=1) if self._controller else flat.copy()
 
     def observe(self, observation: np.ndarray) -> np.ndarray:
-        """Return the agent's observation (n, size) for environment observations (n, o)."""
+        """Return the agent's observation (n, size) for environment observations (n, o).
+
+        It holds the last steps with their reference errors and, with a controller, the controller's action.
+        """
         now = self._append_errors(observation)
         self._stacked_steps[:, 1:] = self._stacked_steps[:, :-1]
         self._stacked_steps[:, 0] = now
@@ -220,7 +223,7 @@ class StableVecEnv(_VecEnvBase):
         return seen, core.reward.astype(np.float32), over, self._infos
 
     def _write_final_infos(self, ended: np.ndarray, last: np.ndarray) -> None:
-        """Write the infos of the episodes that ended."""
+        """Write the infos of the episodes that ended: task measures, last observation, return and length."""
         names = [name for name, _ in self.core.setup.task.measures]
         for row, i in enumerate(ended):
             figures = dict(zip(names, self.core.final_measures[i].tolist(), strict=False))
@@ -244,11 +247,11 @@ class StableVecEnv(_VecEnvBase):
         return [getattr(self, attr_name)] * self._count_indices(indices)
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Raise InputError: the environments are one object."""
+        """Raise InputError: an attribute of a single environment of the batch cannot be set."""
         raise InputError(attr_name, "cannot be set: all environments of a batch share it")
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any):
-        """Raise InputError: the environments are one object."""
+        """Raise InputError: a method of a single environment of the batch cannot be called."""
         raise InputError(method_name, "cannot be called: the environments are one object")
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:

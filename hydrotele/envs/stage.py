@@ -133,7 +133,7 @@ def goal_markers(core: TaskCore, number: int) -> list[Marker]:
 
 
 def pose_position(pose: np.ndarray) -> np.ndarray:
-    """Return the position (3,) [m] of a pose (r, theta, z, ...)."""
+    """Return the Cartesian position (3,) [m] of a tip pose (r [m], theta [rad], z [m], ...)."""
     return np.array([pose[0] * math.cos(pose[1]), pose[0] * math.sin(pose[1]), pose[2]])
 
 

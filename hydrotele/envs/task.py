@@ -30,7 +30,7 @@ class Task:
 
     Attributes:
         name: as in `hydrotele/<Name>-v0`.
-        kind: name of its native code in `envs.facts.KINDS`.
+        kind: name of its native code in `envs.facts.TASK_CODES`.
         description: description of the task.
         reward: description of the reward and the termination.
         machine: name of the machine.
@@ -43,7 +43,7 @@ class Task:
         measures: name and unit of every task measure in `info`.
         surroundings: (machine, random generator, start) -> objects around the machine.
         ground: whether there is a hard ground.
-        parameters: (machine, MuJoCo model) -> up to PARAMETERS values for the native code.
+        parameters: (machine, MuJoCo model) -> up to MAX_PARAMETERS values for the native code.
         terrain_size: number of terrain values per episode, 0 without terrain.
         swing_locked: whether the action of the swing has no effect.
         written_fields: model fields that the native code writes; they are restored for every episode.
@@ -154,8 +154,8 @@ def path_effort(f, start, change):
 
     Args:
         f: record of TASK_PARAMETERS.
-        start: (ARM,) start pose: r [m], theta [rad], z [m], attitude, head [rad].
-        change: (ARM,) difference between end pose and start pose, same units.
+        start: (MAX_ARM_AXES,) start pose: r [m], theta [rad], z [m], attitude, head [rad].
+        change: (MAX_ARM_AXES,) difference between end pose and start pose, same units.
 
     Returns:
         The maximum effort, scalar [s]; infinite if the path leaves the workspace. Divide it by the
@@ -190,7 +190,7 @@ def measure_pose(f, e, pose):
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE.
-        pose: (ARM,) written.
+        pose: (MAX_ARM_AXES,) written: r [m], theta [rad], z [m], attitude [rad], head [rad].
 
     Returns:
         Nothing.

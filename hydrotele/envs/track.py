@@ -46,7 +46,7 @@ _COSINE = _SINE + _HARMONIC_COUNT * MAX_AXES
 
 
 def track_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationField]:
-    """Return the fields that `observe_track` writes: references, their rates and previews."""
+    """Return the observation fields that `observe_track` writes: references, their rates and previews."""
     fields = [position_field(machine, name, "reference") for name in axes]
     fields += [rate_field(machine, name, "reference_rate") for name in axes]
     for ahead in PREVIEW_TIMES:
@@ -57,7 +57,7 @@ def track_fields(machine: Machine, axes: tuple[str, ...]) -> list[ObservationFie
 
 @compiled
 def begin_track(f, e):
-    """Draw references that the machine can follow.
+    """Draw the goal of an episode: random Fourier references within the ranges and rates of the axes.
 
     Args:
         f: record of TASK_PARAMETERS.
@@ -92,10 +92,10 @@ def begin_track(f, e):
 
 @compiled
 def track_reference(g, i, time):
-    """Return the reference position of an axis and its rate.
+    """Return the reference position of an axis at a time, and its rate.
 
     Args:
-        g: (GOAL,) goal of the episode.
+        g: (GOAL_SIZE,) task values of the episode (`goal` of EPISODE_STATE).
         i: index of the axis, scalar.
         time: since the start, scalar [s].
 
@@ -125,13 +125,13 @@ def track_reference(g, i, time):
 
 @compiled
 def observe_track(f, e, out, at):
-    """Write the references, their rates and the references ahead.
+    """Write the references of all axes, their rates and the references ahead to the observation.
 
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE.
         out: (observations,) float32, written from index `at` on.
-        at: scalar.
+        at: index of the first value to write, scalar.
 
     Returns:
         Nothing.
@@ -153,7 +153,7 @@ def reward_track(f, e, w):
     Args:
         f: record of TASK_PARAMETERS.
         e: record of EPISODE_STATE.
-        w: World; `measures` receives the distance of the tip from its reference [m].
+        w: SimulationView; `measures` receives the distance of the tip from its reference [m].
 
     Returns:
         (reward, False), scalars.
@@ -174,7 +174,11 @@ def reward_track(f, e, w):
 
 @callback(TASK_SIGNATURE)
 def task_code(part, m, d, number, argument, out):
-    """Run one part of the task in native code; see `simulation_view`."""
+    """Run one part of the task for one simulation, in native code; return the reward for REWARD, otherwise 0.
+
+    The arguments are those of `world.TASK_SIGNATURE`: part (BEGIN, TICK, OBSERVE or REWARD), addresses of
+    mjModel and mjData, index of the simulation, addresses of TASK_PARAMETERS and of the observation.
+    """
     f = parameters_view(argument)[0]
     e, w = episode_records(f)[number], simulation_view(f, m, d, number, argument)
     if part == BEGIN:

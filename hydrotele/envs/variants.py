@@ -37,14 +37,14 @@ class Variants:
         plant: plant of the first variant.
         machines: the machines.
         surroundings: objects around each machine.
-        states: (v, s) complete start states after `start_leapfrog`.
+        states: (v, s) complete MuJoCo start states, staggered in time by `start_leapfrog`.
         start_tips: (v, 3) tip positions at the start [m].
         fields: model field -> (v, size) values, for fields that differ or that the task writes.
-        sensor_scales: (v, CHANNELS) sensor scale factors [1].
-        sensor_offsets: (v, CHANNELS) sensor offsets.
-        sensor_delays: (v, CHANNELS, 2) sensor delays: whole physics steps, fraction of a step [1].
-        lag_ratios: (v, CHANNELS) physics step divided by the sensor time constant [1]; 0 without lag.
-        command_delays: (v, AXES, 2) command delays: whole physics steps, fraction of a step [1].
+        sensor_scales: (v, MAX_CHANNELS) sensor scale factors [1].
+        sensor_offsets: (v, MAX_CHANNELS) sensor offsets.
+        sensor_delays: (v, MAX_CHANNELS, 2) sensor delays: whole physics steps, fraction of a step [1].
+        lag_ratios: (v, MAX_CHANNELS) physics step divided by the sensor time constant [1]; 0 without lag.
+        command_delays: (v, MAX_AXES, 2) command delays: whole physics steps, fraction of a step [1].
     """
 
     plant: Plant
@@ -66,7 +66,7 @@ def make_variants(task: Task, options: Options, nominal: Machine) -> Variants:
     Args:
         task: the task.
         options: the user's options, whose effects are applied.
-        nominal: machine without these effects.
+        nominal: machine without the effects.
 
     Returns:
         The variants.
@@ -117,7 +117,7 @@ def _to_joint_names(machine: Machine, places: Mapping[str, float]) -> dict[str, 
 
 
 def _apply_effects(nominal: Machine, options: Options, rng: np.random.Generator) -> Machine:
-    """Return the machine with the given effects and the randomised ones."""
+    """Return the machine with the effects of the options, those of `randomise` with random parameters."""
     machine = nominal
     for effect in options.effects:
         machine = apply_effect(machine, *_parse_effect(effect), dict(effect.get("parameters", {})))
@@ -131,7 +131,7 @@ def _apply_effects(nominal: Machine, options: Options, rng: np.random.Generator)
 
 
 def _parse_effect(effect: Mapping[str, Any]) -> tuple[str, str]:
-    """Check the keys of an effect and return its name and location."""
+    """Check the keys of an effect entry and return the effect's name and location."""
     keys = ("name", "location", "parameters")
     if not isinstance(effect, Mapping) or "name" not in effect or set(effect) - set(keys):
         raise InputError("effects", f"each needs {', '.join(keys)}, not {effect!r}")
@@ -151,7 +151,10 @@ def _parse_range(effect: Mapping[str, Any], key: str, value: Any) -> tuple[float
 
 
 def _find_differing_fields(plants: list[Plant], also: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Return the model fields that differ between plants, and the fields `also`."""
+    """Return the values (v, size) of the model fields that differ between plants, and of the fields `also`.
+
+    A difference in the structure of the model raises InputError.
+    """
     first, fields = plants[0].model, {}
     distinct = list({id(plant): plant for plant in plants}.values())
     for name in sorted(MODEL_FIELDS):

@@ -50,7 +50,7 @@ class SimulationView(NamedTuple):
         eq_data: (neq eq_width,) data of the equality constraints during this call.
         eq_rows: the same from the next call on; empty unless the task writes it.
         terrain: (width,) terrain state of the episode; empty for tasks without terrain.
-        measures: (MEASURES,) task measures of this step, for `info`.
+        measures: (MAX_MEASURES,) task measures of this step, for `info`.
         model: address of mjModel.
         data: address of mjData.
         index: index of the simulation.
@@ -92,7 +92,7 @@ def episode_records(f):
 
 @compiled
 def simulation_view(f, m, d, number, argument):
-    """Return views of the arrays of a simulation.
+    """Return views of the arrays of one simulation in MuJoCo's and the task's memory.
 
     Args:
         f: record of TASK_PARAMETERS.
@@ -102,7 +102,7 @@ def simulation_view(f, m, d, number, argument):
         argument: address of `f`, scalar.
 
     Returns:
-        World.
+        SimulationView.
 
     Source: `simulate.layout`.
     """
@@ -135,7 +135,7 @@ def simulation_view(f, m, d, number, argument):
 
 @intrinsic
 def _call_address(typingctx, function, part, model, data, number, argument, out):
-    """Call a function with the signature TASK_CODE by its address."""
+    """Call a function with the signature TASK_SIGNATURE by its address."""
 
     def codegen(context, builder, signature, args):
         kind = ir.FunctionType(ir.DoubleType(), [ir.IntType(64)] * 6)
@@ -146,11 +146,11 @@ def _call_address(typingctx, function, part, model, data, number, argument, out)
 
 @compiled
 def call_task(f, w, part, out):
-    """Call one part of the task's native code.
+    """Call one part of the task's native code for a simulation.
 
     Args:
         f: record of TASK_PARAMETERS.
-        w: World.
+        w: SimulationView.
         part: BEGIN, TICK, OBSERVE or REWARD, scalar.
         out: address of the float32 output of OBSERVE, scalar; 0 for the other parts.
 
@@ -178,7 +178,7 @@ def observation_view(f, out):
 
 @compiled
 def store_outcome(e, outcome):
-    """Store whether an episode ends, and return the reward.
+    """Store in the episode record whether the episode ends, and return the reward.
 
     Args:
         e: record of EPISODE_STATE; `over` is written.
@@ -218,7 +218,10 @@ class ObservationField(NamedTuple):
 
 
 def position_field(machine: Machine, axis: str, what: str = "") -> ObservationField:
-    """Return the field of an axis position; `what` defaults to `angle` or `position`."""
+    """Return the observation field (name, unit, bounds) of an axis position.
+
+    `what` is the quantity in the name; the default is `angle` or `position`.
+    """
     low, high = machine.joints[machine.axes[axis].joint].range or (-_SWING_BOUND, _SWING_BOUND)
     kind = machine.position_kind(axis)
     unit = "rad" if kind == "angle" else "m"
@@ -226,13 +229,13 @@ def position_field(machine: Machine, axis: str, what: str = "") -> ObservationFi
 
 
 def rate_field(machine: Machine, axis: str, what: str = "rate") -> ObservationField:
-    """Return the field of an axis rate."""
+    """Return the observation field (name, unit, bounds) of an axis rate; `what` is the quantity in its name."""
     unit = "rad/s" if machine.position_kind(axis) == "angle" else "m/s"
     return ObservationField(f"{what}.{axis}", unit, -_RATE_BOUND, _RATE_BOUND)
 
 
 def pose_fields(machine: Machine, arm_axes: int, what: str = "tip") -> list[ObservationField]:
-    """Return the fields of a tip pose: r, theta, z, attitude, and head for a five-axis arm."""
+    """Return the observation fields of a tip pose: r, theta, z, attitude, and head for a five-axis arm."""
     far = max_reach(machine)
     fields = [
         ObservationField(f"{what}.r", "m", 0.0, far),
@@ -252,7 +255,7 @@ def max_reach(machine: Machine) -> float:
 
 
 def machine_fields(machine: Machine, axes: tuple[str, ...], arm_axes: int) -> list[ObservationField]:
-    """Return the fields that `observe_machine` writes.
+    """Return the observation fields that `observe_machine` writes.
 
     Args:
         machine: the machine.
@@ -281,7 +284,7 @@ def machine_fields(machine: Machine, axes: tuple[str, ...], arm_axes: int) -> li
 
 @compiled
 def observe_machine(f, e, out):
-    """Write the measured values of the machine, the tip pose and the commands.
+    """Write the measured values of the machine, the tip pose and the commands to the observation.
 
     Args:
         f: record of TASK_PARAMETERS.

@@ -67,7 +67,7 @@ HINGES = ("alpha", "beta")
 
 @cache
 def load_complete_setup() -> RegressorSetup:
-    """Return the regressor setup with separate dry and viscous friction in every passive hinge."""
+    """Return the regressor setup with separate dry and viscous friction parameters of every passive hinge."""
     mapping, folder = load_robot().mechanism.mapping, models_folder() / "palida"
     complete = ColumnMapping(
         position=mapping.position, force=mapping.force, coordinates=mapping.coordinates,
@@ -79,19 +79,23 @@ def load_complete_setup() -> RegressorSetup:
 
 
 def build_complete_regressor(motion: np.ndarray) -> Regressor:
-    """Return the regressor of `load_complete_setup` along a motion of the pose.
+    """Compute the regressor with separate friction parameters of every passive hinge along a motion.
 
     Args:
-        motion: (3, n, 6) poses, rates and accelerations.
+        motion: (3, n, 6) poses, rates and accelerations of the platform.
+
+    Returns:
+        The regressor of the drive forces, with the setup of `load_complete_setup`.
     """
     setup = load_complete_setup()
     return setup.compute_regressor(project_on_drives(setup.chain, setup.given_joints, *motion))
 
 
 def measure_reduction(seed: int, changes: Changes) -> Sample:
-    """Remove the friction parameters of the passive joints that the data cannot identify.
+    """Reduce the friction model of the passive joints to the parameters that the data can identify.
 
-    The reduction starts from 24 friction parameters.
+    The passive joints start with 24 parameters of dry and viscous friction. Insignificant parameters
+    are dropped, and strongly correlated parameters of one kind are merged.
 
     Args:
         seed: seed of the measurement noise.
@@ -99,8 +103,8 @@ def measure_reduction(seed: int, changes: Changes) -> Sample:
             mean of its kind, with alternating sign.
 
     Returns:
-        Counts of parameters before and after, and whether exactly one dry friction parameter per
-        kind of joint remains.
+        Numbers of all parameters before and after (`start`, `stop`), and `reached`: whether exactly one
+        dry friction parameter per kind of passive joint remains.
     """
     settings = merge_settings({"hinge_scatter": 0.0}, changes)
     cycle = simulate_excitation()
@@ -149,7 +153,10 @@ def _is_passive(name: str) -> bool:
 
 
 def evaluate_reduction(samples: Sequence[Sample]) -> Evaluation:
-    """Check how often the reduction gives the friction model of the document."""
+    """Check that most simulated data sets lead to the published friction model of the passive joints.
+
+    In this model all joints of one kind share one dry friction parameter.
+    """
     check = check_fraction(
         "fraction of the data sets that lead to these 14 friction parameters",
         collect_values(samples, "reached") > 0.5, reason="more than half; the document had one data set",
@@ -182,16 +189,18 @@ REDUCTION = Experiment(
 
 
 def measure_design(seed: int, changes: Changes) -> Sample:
-    """Compare the designed excitation with a random one that is scaled to the same limits.
+    """Compare the precision of the designed excitation motion with that of a random one.
+
+    The random motion is scaled to the same limits of pose and drives.
 
     Args:
         seed: seed of the random excitation.
         changes: `amplitude`: factor applied to the designed excitation.
 
     Returns:
-        `ratio`: standard deviation with the random excitation divided by that with the designed
-        one (geometric mean over the axes of the confidence ellipsoid). `use`: utilization of the
-        most restrictive limit by the designed excitation.
+        `ratio`: standard deviation of the parameters with the random excitation over that with the
+        designed one (geometric mean over the axes of the confidence ellipsoid). `use`: utilization of
+        the most restrictive limit by the designed excitation.
     """
     settings = merge_settings({"amplitude": 1.0}, changes)
     best, bounds = load_excitation(), make_drive_limits()
@@ -222,7 +231,12 @@ def measure_design(seed: int, changes: Changes) -> Sample:
 
 
 def compute_limit_utilization(motion: Excitation, time: np.ndarray) -> float:
-    """Return the largest utilization of any pose or drive limit; 1 means at the limit."""
+    """Return the largest utilization of any pose or drive limit along a motion; 1 means at the limit.
+
+    Args:
+        motion: periodic motion of the pose.
+        time: (n,) instants at which the motion is evaluated [s].
+    """
     whole = motion.evaluate(time)
     inside = np.clip(whole[0], POSE_LOW, POSE_HIGH)
     return float(make_drive_limits().compute_utilisation(whole, np.stack([inside, whole[1], whole[2]])).max())
@@ -236,7 +250,7 @@ def _compute_log_information(motion: Excitation, time: np.ndarray) -> float:
 
 
 def evaluate_design(samples: Sequence[Sample]) -> Evaluation:
-    """Check the precision and the limit utilization of the designed excitation."""
+    """Check that the designed excitation is more precise than random ones and stays within its limits."""
     return Evaluation(
         (
             check_statistic(
@@ -272,7 +286,10 @@ PATH_PLANNERS: dict[str, Callable[..., np.ndarray]] = {"circle": plan_circle, "s
 
 
 def measure_control(seed: int, changes: Changes) -> Sample:
-    """Track both paths at all speeds with each control strategy.
+    """Simulate path tracking with three control strategies on a circle and a square at four speeds.
+
+    The strategies are linear control alone, with feedforward of nominal parameters, and with
+    feedforward of identified parameters.
 
     Args:
         seed: seed of the identification and of the encoder noise.
@@ -320,7 +337,15 @@ def measure_control(seed: int, changes: Changes) -> Sample:
 
 
 def evaluate_actuator_errors(samples: Sequence[Sample], path: str) -> Evaluation:
-    """Compare the RMS actuator errors of the three strategies on one path."""
+    """Compare the RMS actuator errors of the three control strategies on one path.
+
+    The error of linear control must increase with speed. Nominal feedforward must reduce it, and
+    feedforward of identified parameters must reduce it further.
+
+    Args:
+        samples: samples of `measure_control`.
+        path: `circle` or `square`.
+    """
     if collect_values(samples, "warnings").any():
         return Evaluation(unavailable="MuJoCo warned of an unstable simulation")
     curves = samples[0].panels[[p.label for p in samples[0].panels].index(
@@ -348,17 +373,22 @@ def evaluate_actuator_errors(samples: Sequence[Sample], path: str) -> Evaluation
 
 
 def evaluate_circle_errors(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the RMS actuator errors on the circle."""
+    """Compare the RMS actuator errors of the three control strategies on the circle."""
     return evaluate_actuator_errors(samples, "circle")
 
 
 def evaluate_square_errors(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the RMS actuator errors on the square."""
+    """Compare the RMS actuator errors of the three control strategies on the square."""
     return evaluate_actuator_errors(samples, "square")
 
 
 def evaluate_highest_speed(samples: Sequence[Sample], quantity: str) -> Evaluation:
-    """Compare an error at the highest speed between the identified and the nominal model."""
+    """Check that identified feedforward gives smaller errors than nominal feedforward at the highest speed.
+
+    Args:
+        samples: samples of `measure_control`.
+        quantity: tracking error to compare on both paths: `error of actuator 5` or `Cartesian error`.
+    """
     checks, notes = [], []
     for path in PATH_PLANNERS:
         label = f"{quantity} on the {path} [mm]"
@@ -370,12 +400,12 @@ def evaluate_highest_speed(samples: Sequence[Sample], quantity: str) -> Evaluati
 
 
 def evaluate_drive_error(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the errors of actuator 5 between both models."""
+    """Check that identified feedforward reduces the RMS tracking error of actuator 5 against nominal feedforward."""
     return evaluate_highest_speed(samples, "error of actuator 5")
 
 
 def evaluate_tool_error(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the Cartesian errors of the tool between both models."""
+    """Check that identified feedforward reduces the RMS position error of the tool against nominal feedforward."""
     return evaluate_highest_speed(samples, "Cartesian error")
 
 

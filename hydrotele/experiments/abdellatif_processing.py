@@ -78,13 +78,13 @@ def average_periods(record: IdentificationRecord, period: float) -> AveragedPeri
 
 
 def average_force(force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean over the periods, and the noise covariance of one force reading.
+    """Average repeated periods of the drive forces, and estimate the noise covariance of one reading.
 
     Args:
         force: (p, n, 6) forces of p periods [N].
 
     Returns:
-        ((n, 6) mean force [N], (6, 6) covariance [N^2]).
+        ((n, 6) mean force over the periods [N], (6, 6) covariance of the noise [N^2]).
     """
     mean = force.mean(axis=0)
     rest = (force - mean).reshape(-1, 6)
@@ -92,16 +92,16 @@ def average_force(force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def process_lengths(record: IdentificationRecord, period: float, method: str, harmonics: int = HARMONICS) -> np.ndarray:
-    """Compute poses, rates and accelerations from measured leg lengths.
+    """Compute poses, rates and accelerations of the platform from measured leg lengths.
 
     Args:
         record: record with the leg lengths.
         period: period of the motion [s].
-        method: `raw`, `zero_phase` (time domain) or `periodic` (frequency domain).
+        method: `raw` (no filter), `zero_phase` (time domain) or `periodic` (frequency domain).
         harmonics: number of harmonics that `periodic` keeps.
 
     Returns:
-        (3, n, 6) motion in coordinates of the pose.
+        (3, n, 6) poses, rates and accelerations.
     """
     pose = convert_coordinates(record, load_robot().setup)
     found = estimate_resolution(pose.position, pose.period, pose.position_noise)
@@ -115,7 +115,10 @@ def process_lengths(record: IdentificationRecord, period: float, method: str, ha
 
 @cache
 def simulate_circle() -> RepeatedMotion:
-    """Simulate one lap of a horizontal circle at constant speed."""
+    """Compute leg lengths and drive forces along one lap of a horizontal circle at constant speed.
+
+    The circle has a radius of 0.1 m and a tool speed of 0.5 m/s. It validates the identified models.
+    """
     rows = round(2.0 * np.pi * CIRCLE_RADIUS / CIRCLE_SPEED * SAMPLE_RATE)
     angle = 2.0 * np.pi * np.arange(rows) / rows
     speed = 2.0 * np.pi * SAMPLE_RATE / rows
@@ -129,15 +132,18 @@ def simulate_circle() -> RepeatedMotion:
 
 
 def measure_processing(seed: int, changes: Changes) -> Sample:
-    """Reconstruct the motion and identify a model with each of the three processing methods.
+    """Compare unfiltered, time-domain and frequency-domain processing of measured leg lengths.
+
+    With each method the motion is reconstructed and a model is identified, which then predicts the
+    drive forces on a circle.
 
     Args:
         seed: seed of the measurement noise.
         changes: `harmonics`: number of harmonics in the frequency-domain window.
 
     Returns:
-        Relative RMS errors of y and its derivatives, and error variances of the force predicted
-        on the circle.
+        Relative RMS errors of the reconstructed y coordinate and its derivatives, and error variances
+        of the predicted force [N^2].
     """
     settings = merge_settings({"harmonics": HARMONICS}, changes)
     cycle, lap, own, periods = simulate_excitation(), simulate_circle(), load_robot(), 2
@@ -171,7 +177,7 @@ def _draw_reconstruction(
     rebuilt: dict[str, np.ndarray], true: np.ndarray, force: np.ndarray, period: float,
     harmonics: int,
 ) -> list[Panel]:  # fmt: skip
-    """Draw the spectra of the measured pose with the window, and the reconstructed signals."""
+    """Draw amplitude spectra of measured motion and force, and the reconstructed y coordinate with its errors."""
     lines = np.arange(1, 6 * HARMONICS + 1)
     frequency = lines / period
     panels, spectrum = [], 2.0 * np.fft.rfft(rebuilt["raw"][0])[lines] / true.shape[1]
@@ -207,7 +213,7 @@ def _draw_prediction(predicted: dict[str, np.ndarray], force: np.ndarray) -> lis
 
 
 def evaluate_reconstruction(samples: Sequence[Sample]) -> Evaluation:
-    """Check the errors of y and its derivatives after frequency-domain filtering."""
+    """Check that frequency-domain filtering reconstructs y, its rate and acceleration to 1 % (RMS)."""
     checks = tuple(
         check_mean(f"relative RMS error of {label.partition(' [')[0]}",
                    collect_values(samples, f"periodic {order}"), (0.0, MAX_VISIBLE_ERROR),
@@ -221,7 +227,11 @@ def evaluate_reconstruction(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_prediction(samples: Sequence[Sample]) -> Evaluation:
-    """Check that the error variances have the order of the document."""
+    """Check that frequency-domain processing predicts forces best and unfiltered processing worst.
+
+    The criterion is the error variance of the drive forces on a circle that the models were not
+    identified from.
+    """
     checks = tuple(
         check_statistic(
             f"error variance, {METHOD_NAMES[one]} over {METHOD_NAMES[other]}",

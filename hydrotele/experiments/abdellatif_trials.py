@@ -81,14 +81,14 @@ _IS_FRICTION = np.array([one.column.startswith(("coulomb", "viscous")) for one i
 
 
 class NormalEquations:
-    """Normal equations of one regressor, reusable for any forces and any drive covariance.
+    """Least-squares normal equations of one regressor, reused for many force records and drive covariances.
 
     Attributes:
-        matrix: (n, 6, 24) regressor.
+        matrix: (n, 6, 24) regressor: n samples, 6 drives, 24 parameters.
     """
 
     def __init__(self, matrix: np.ndarray):
-        """Precompute the products of the columns of all pairs of drives.
+        """Precompute the products of the regressor columns for all pairs of drives.
 
         Args:
             matrix: (n, 6, 24) regressor.
@@ -99,7 +99,7 @@ class NormalEquations:
         self._products = products.transpose(0, 2, 1, 3)
 
     def information(self, weight: np.ndarray) -> np.ndarray:
-        """Return the (24, 24) information matrix, the inverse of P in (28).
+        """Return the (24, 24) information matrix: the inverse of the parameter covariance P in (28).
 
         Args:
             weight: (6, 6) weight of the drives, the inverse of their noise covariance [1/N^2].
@@ -109,11 +109,11 @@ class NormalEquations:
     def solve(
         self, weight: np.ndarray, correlations: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-        """Estimate the parameters of t trials by weighted least squares (21).
+        """Estimate the parameters of t trials by weighted least squares, Abdellatif 2008, (21).
 
         Args:
             weight: (t, 6, 6) weight of the drives in each trial, or (1, 6, 6) for all trials.
-            correlations: (t, 6, 6, 24) products of columns and forces; see `correlate`.
+            correlations: (t, 6, 6, 24) products of regressor columns and forces; see `correlate`.
 
         Returns:
             Estimates (t, 24) and their information matrices (t, 24, 24).
@@ -123,7 +123,14 @@ class NormalEquations:
         return np.linalg.solve(information, right[..., None])[..., 0], information
 
     def correlate(self, force: np.ndarray) -> np.ndarray:
-        """Return the (6, 6, 24) products of each drive's columns with each drive's force (n, 6)."""
+        """Return the products of each drive's regressor columns with each drive's force, summed over samples.
+
+        Args:
+            force: (n, 6) drive forces [N].
+
+        Returns:
+            (6, 6, 24): drive of the columns, drive of the force, parameter.
+        """
         return (self._columns @ force).reshape(6, 24, 6).transpose(0, 2, 1)
 
 
@@ -206,7 +213,7 @@ def simulate_trials(seed: int, settings: Changes) -> TrialEstimates:
 
 
 def measure_trials(seed: int, changes: Changes) -> Sample:
-    """Simulate one series of trials and summarize its estimates.
+    """Simulate one series of identification trials and compute statistics of its estimates.
 
     Args:
         seed: seed of the series.
@@ -214,8 +221,8 @@ def measure_trials(seed: int, changes: Changes) -> Sample:
 
     Returns:
         Arrays `value` and `least_squares` (t, 24), `std` (24,), and `distance` (t,), the squared
-        distance from the mean of all trials after the first. The values describe the first trial
-        and the fractions of estimates inside intervals.
+        Mahalanobis distance of each estimate from the mean of all trials after the first. The values
+        describe the first trial and the fractions of estimates inside intervals.
     """
     trials = simulate_trials(seed, merge_settings(TRIAL_SETTINGS, changes))
     later = trials.value[1:]
@@ -242,7 +249,15 @@ def measure_trials(seed: int, changes: Changes) -> Sample:
 
 
 def compute_square_distance(error: np.ndarray, information: np.ndarray) -> np.ndarray:
-    """Return the squared Mahalanobis distance (...) of errors (..., 24), by (29)."""
+    """Return the squared Mahalanobis distance of parameter errors, Abdellatif 2008, (29).
+
+    Args:
+        error: (..., 24) parameter errors.
+        information: (..., 24, 24) inverse of their covariance.
+
+    Returns:
+        (...) squared distances [1].
+    """
     return np.einsum("...p,...pq,...q->...", error, information, error)
 
 
@@ -267,7 +282,7 @@ def _draw_distance(distance: np.ndarray) -> Panel:
 
 
 def evaluate_printed_intervals(samples: Sequence[Sample]) -> Evaluation:
-    """Check how many estimates lie inside the printed intervals."""
+    """Check that at least 90 % of the simulated estimates lie inside the printed 95 % intervals."""
     check = check_mean(
         "fraction of the estimates within the printed 95 % intervals", collect_values(samples, "printed"),
         (1.0 - MAX_EXCEPTIONS, 1.0), "at most twice the 5 % expected outside a 95 % interval",
@@ -276,7 +291,7 @@ def evaluate_printed_intervals(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_standard_deviations(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the standard deviations with those of the printed intervals."""
+    """Check that the standard deviations of the 24 parameters are within a factor of two of the printed ones."""
     ratio = np.mean([sample.arrays["std"] for sample in samples], axis=0) / _PRINTED_DEVIATIONS
     low, high = int(np.argmin(ratio)), int(np.argmax(ratio))
     words = "standard deviation over the printed one, "
@@ -291,7 +306,11 @@ def evaluate_standard_deviations(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_history(samples: Sequence[Sample]) -> Evaluation:
-    """Check how many estimates lie inside their own intervals about the mean of the series."""
+    """Check which estimates lie inside their own 95 % intervals about the mean of the series of trials.
+
+    At most 10 % of the estimates of later trials may lie outside. More than 10 % of those of the first
+    trial must, because friction is not yet stationary.
+    """
     return Evaluation((
         check_mean(
             "fraction of the estimates after the first trial within their intervals",
@@ -305,7 +324,7 @@ def evaluate_history(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_first_parameter(samples: Sequence[Sample]) -> Evaluation:
-    """Check whether estimates of p1 are outside their intervals more often than others."""
+    """Check whether more than 10 % of the estimates of the first parameter p1 lie outside their 95 % intervals."""
     check = check_mean(
         "fraction of the estimates of p1 outside their intervals", collect_values(samples, "p1"),
         (MAX_EXCEPTIONS, 1.0),
@@ -322,7 +341,10 @@ def evaluate_first_parameter(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_first_trial(samples: Sequence[Sample]) -> Evaluation:
-    """Check whether the friction excess moves the first trial out of the ellipsoid."""
+    """Check that the friction excess at the start moves the first trial out of the 95 % confidence ellipsoid.
+
+    With the same noise but stationary friction, less than half of the first trials may lie outside.
+    """
     cold, warm = (collect_values(samples, name) for name in ("first distance", "warm first distance"))
     return Evaluation(
         (
@@ -338,7 +360,10 @@ def evaluate_first_trial(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_ellipsoid(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the fraction of trials within the ellipsoid with 99 of 99 in the document."""
+    """Compare the fraction of trials within the 95 % confidence ellipsoid with the published 99 of 99.
+
+    The first trial of each series does not count.
+    """
     distance = np.concatenate([sample.arrays["distance"][1:] for sample in samples])
     published = TRIALS_PER_SERIES - 1
     low = float(binomtest(published, published).proportion_ci(CONFIDENCE, "exact").low)
@@ -360,10 +385,10 @@ def evaluate_ellipsoid(samples: Sequence[Sample]) -> Evaluation:
 
 
 def check_bias(quantity: str, mean: np.ndarray, covariance: np.ndarray, count: int) -> Check:
-    """Return a check of an estimator's bias, in standard deviations of one estimate.
+    """Return a check whether an estimator's bias is at least one standard deviation of one estimate.
 
     For a bias of length d, n times the squared mean error has a noncentral chi-squared distribution
-    with p degrees of freedom and noncentrality n d^2. Its quantiles give the interval.
+    with p degrees of freedom and noncentrality n d^2. Its quantiles give the interval of d.
 
     Args:
         quantity: name of the bias.
@@ -372,7 +397,7 @@ def check_bias(quantity: str, mean: np.ndarray, covariance: np.ndarray, count: i
         count: number of estimates n.
 
     Returns:
-        The check of d.
+        The check of d [standard deviations].
     """
     degrees = len(mean)
     squared = count * float(mean @ np.linalg.solve(covariance, mean))
@@ -392,7 +417,7 @@ def check_bias(quantity: str, mean: np.ndarray, covariance: np.ndarray, count: i
 
 
 def evaluate_least_squares(samples: Sequence[Sample]) -> Evaluation:
-    """Check the bias of least squares for cross-correlated forces of the drives."""
+    """Check whether unweighted least squares is biased if the force noise of the drives is cross-correlated."""
     truth = load_robot().truth
     value = np.concatenate([sample.arrays["least_squares"][1:] for sample in samples])
     equations = NormalEquations(simulate_excitation().matrix)
@@ -419,7 +444,7 @@ METHODS = {
 
 
 def measure_encoder_feedback(seed: int, changes: Changes) -> Sample:
-    """Estimate the parameters if controllers feed encoder noise back into the forces.
+    """Measure the parameter errors of three methods when controllers feed encoder noise into the forces.
 
     Args:
         seed: seed of the measurement noise.
@@ -448,7 +473,7 @@ def measure_encoder_feedback(seed: int, changes: Changes) -> Sample:
 
 
 def evaluate_encoder_feedback(samples: Sequence[Sample]) -> Evaluation:
-    """Check which methods are biased by noise common to regressor and forces."""
+    """Check that encoder noise in regressor and forces biases estimates from samples, but not from mean periods."""
     checks = []
     for name, words in METHODS.items():
         biased = name.startswith("samples")

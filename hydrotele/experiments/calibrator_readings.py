@@ -1,9 +1,10 @@
 """Simulate calibrator readings with sensor errors, bent joints, drift and manufacturing errors.
 
-The module uses only the kinematics of the closed chain, which is fast enough for many seeds. The
-same chain with masses and hydraulics in MuJoCo is `models/calibrator`. The module also computes the
-tip error of an arm positioned with a nominal or a calibrated machine. Ground truth is used only to
-generate readings and to evaluate estimates.
+The calibrator is a passive arm with angle sensors. It connects the manipulator's tool to a ball
+joint on the chassis, which closes the kinematic chain. The module uses only the kinematics of this
+chain, which is fast enough for many seeds. The same chain with masses and hydraulics in MuJoCo is
+`models/calibrator`. The module also computes the tip error of an arm positioned with a nominal or a
+calibrated machine. Ground truth is used only to generate readings and to evaluate estimates.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,11 +30,11 @@ def simulate_readings(
     loop: CalibrationLoop, clean: SweepPoses, rng: np.random.Generator | None, accuracy: float = MAX_RESOLVER_ERROR,
     extra_errors: np.ndarray | None = None,
 ) -> Poses:  # fmt: skip
-    """Simulate the sensor readings of one calibration stage.
+    """Simulate the sensor readings of one calibration stage, in which one link moves.
 
     Args:
         loop: true chain; its offsets are the sensor offsets.
-        clean: true poses.
+        clean: true poses (M poses of N joints).
         rng: random generator of the errors, uniform within +-accuracy; None for no errors.
         accuracy: largest error of every angle sensor [rad].
         extra_errors: (M, N) additional errors, such as those of bent joints [rad].
@@ -55,10 +56,10 @@ def simulate_readings(
 
 
 def draw_sweeps(rng: np.random.Generator, drift: bool = True, pose_fraction: float = 1.0) -> dict[str, Sweep]:
-    """Draw a random sweep of every link within the ranges of Khoshzaban 1992, Figs 16 to 18.
+    """Draw a random back-and-forth motion of every link within the ranges of Khoshzaban 1992, Figs 16 to 18.
 
-    The scan does not show the motion over time. The number of cycles is therefore uniform in 1 to
-    3, and the phase of the first pose is uniform.
+    The scanned figures do not show the motion over time. The number of cycles is therefore uniform in
+    1 to 3, and the phase of the first pose is uniform.
 
     Args:
         rng: random generator of cycles and phase.
@@ -82,14 +83,14 @@ def draw_gravity_bends(
     bent_fraction: float = 0.35,
     constant: bool = False,
 ) -> np.ndarray:  # fmt: skip
-    """Draw errors of joints bent by gravity, as in Khoshzaban 1992, section 3.7.3 (p. 61).
+    """Draw random angle errors of joints bent by gravity, as in Khoshzaban 1992, section 3.7.3 (p. 61).
 
     N(0, `deviation_deg`) is added to the grapple and yoke angles in the poses in which gravity bends them
     most. In these poses the calibrator's arm is closest to horizontal.
 
     Args:
         loop: true chain.
-        clean: true poses.
+        clean: true poses (M poses of N joints).
         rng: random generator of the errors.
         deviation_deg: standard deviation of the errors [deg].
         bent_fraction: fraction of the poses in which joints bend; the document gives none.
@@ -114,14 +115,14 @@ def compute_retraction_bends(
     max_errors: Mapping[str, float],
     bent_fraction: float = 0.28,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute errors of joints that bend when the stick is retracted (Khoshzaban 1992, p. 69).
+    """Compute angle errors of joints that bend when the stick is retracted (Khoshzaban 1992, p. 69).
 
     The error increases linearly with the stick angle, from zero at the edge of the bent region to
     its largest value at the largest angle.
 
     Args:
         loop: true chain.
-        clean: true poses of the stick's stage; the errors of another stage are zero.
+        clean: true poses (M poses of N joints); the errors are zero unless the stick moves.
         max_errors: calibrator joint -> largest error [rad].
         bent_fraction: fraction of the poses in the bent region.
 
@@ -145,9 +146,18 @@ def perturb_loop(
 ) -> CalibrationLoop:  # fmt: skip
     """Draw a true chain with manufacturing and wear errors relative to the nominal chain.
 
-    The manipulator's lengths and the ball position get errors N(0, length) [m]. Its twists and the
-    offsets of grapple, yoke and twist get errors N(0, angle) [deg]. The manipulator's sensors get
-    offsets N(0, sensors) [deg]. The calibrator's links are known and get no errors.
+    All errors are normal with mean zero. The calibrator's links are known and get no errors.
+
+    Args:
+        loop: nominal chain.
+        rng: random generator of the errors.
+        length_deviation: standard deviation of the manipulator's lengths and of the ball position [m].
+        angle_deviation: standard deviation of the manipulator's twists and of the sensor offsets of
+            grapple, yoke and twist joint [deg].
+        sensor_offset: standard deviation of the offsets of the manipulator's sensors [deg].
+
+    Returns:
+        The true chain.
     """
     values, m = loop.values.copy(), loop.powered_count
     for k in range(m + 1):
@@ -170,11 +180,11 @@ def find_true_parameters(
     names: Sequence[str],
     clean: Sequence[SweepPoses],
 ) -> np.ndarray:
-    """Return the true values of identified parameters.
+    """Return the true values of the parameters that a calibration identifies.
 
     Args:
         loop: true chain.
-        nominal: nominal chain; its d is the reference of a stage's p_z.
+        nominal: nominal chain; a stage's ball height p_z is computed with its length d.
         names: (p) names of the parameters.
         clean: true poses; the true value of a held angle is its mean in its stage.
 
@@ -204,7 +214,7 @@ TIP_TARGETS = tuple((r, z, theta) for r in (4.2, 5.0, 5.8) for z in (1.8, 2.6, 3
 def compute_tip_errors(
     nominal: Machine, true: Machine, loop: CalibrationLoop, stages: Sequence[Poses]
 ) -> tuple[float, float]:
-    """Return the RMS distance of the true arm's tip from the `TIP_TARGETS`.
+    """Return the RMS distance of the true arm's tip from the `TIP_TARGETS`, before and after calibration.
 
     Resolved motion converts each target to joint angles with the nominal or the calibrated machine.
     The true joints are set so that the sensors, corrected by the known offsets, read these angles.
@@ -236,7 +246,7 @@ def compute_tip_errors(
 def _compute_square_error(
     machine: Machine, known: CalibrationLoop, loop: CalibrationLoop, model, data, target
 ) -> float:
-    """Return the squared distance of the tip from a target [m^2]."""
+    """Return the squared distance of the true tip from a target that a machine model commands [m^2]."""
     r, z, theta = target
     here = {name: machine.home.get(axis.joint, 0.0) for name, axis in machine.axes.items()}
     joints = pose_to_joints(machine, Pose(r=r, z=z, theta=theta), here, "target")

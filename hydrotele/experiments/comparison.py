@@ -187,7 +187,7 @@ class Comparison(NamedTuple):
 
     @property
     def verdict(self) -> Verdict:
-        """Verdict of the judgement; `no verdict` if only a caption is published."""
+        """Verdict of the evaluation; `no verdict` if only a caption is published."""
         return self.evaluation.verdict
 
     @property
@@ -248,7 +248,7 @@ class Claim:
             the statement of this project.
         item: table, figure, equation or section, with its page.
         kind: see `Kind`.
-        evaluate: samples of all repetitions -> judgement.
+        evaluate: samples of all repetitions -> evaluation.
         fault: fault (changed settings) for which the verdict must be `differs`; None if the claim
             has no verdict.
         fault_description: description of the fault.
@@ -294,7 +294,7 @@ class Experiment:
     fixed_repetitions: int = 0
 
     def repetitions(self, requested: int) -> int:
-        """Return the number of repetitions to run for a requested number."""
+        """Return the number of repetitions to run: the fixed number, or the requested one up to the maximum."""
         return self.fixed_repetitions or min(requested, self.max_repetitions)
 
 
@@ -320,7 +320,7 @@ class Series:
 
     @property
     def claims(self) -> dict[str, Claim]:
-        """All claims by name."""
+        """All claims of the document's experiments, by name."""
         return {claim.name: claim for one in self.experiments for claim in one.claims}
 
 
@@ -353,9 +353,9 @@ def compare_by_seeds(
     series: Series, counts: Sequence[int], jobs: int | None = None,
     progress: Progress | None = None,
 ) -> dict[int, list[Comparison]]:  # fmt: skip
-    """Evaluate a document for several numbers of repetitions.
+    """Compare a document with its simulation for several numbers of repetitions.
 
-    The smaller numbers of repetitions use the first seeds of the largest one.
+    The experiments run once with the largest number; smaller numbers use its first seeds.
 
     Args:
         series: document.
@@ -382,7 +382,7 @@ def run_with_faults(
     series: Series, names: Sequence[str] = (), jobs: int | None = None,
     progress: Progress | None = None,
 ) -> list[tuple[Claim, Comparison]]:  # fmt: skip
-    """Evaluate claims with runs into which their fault is introduced.
+    """Evaluate claims in runs with a deliberate fault, to show that the criterion can fail.
 
     Args:
         series: document.

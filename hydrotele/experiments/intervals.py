@@ -27,7 +27,7 @@ def collect_values(samples: Sequence[Sample], name: str) -> np.ndarray:
 
 
 def check_exact(quantity: str, value: float, accepted: tuple[float, float], reason: str, **more: Any) -> Check:
-    """Return a check of a quantity that is not random; its interval is its value."""
+    """Return a check of a quantity without random error: its confidence interval is its value."""
     return Check(quantity, float(value), float(value), float(value), accepted, reason, **more)
 
 

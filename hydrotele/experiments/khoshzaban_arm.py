@@ -1,8 +1,10 @@
 """Simulated calibrations of Khoshzaban 1992, sections 3.7 and 5.1: Tables 4 to 6.
 
-The true machine is the nominal machine of the thesis, as in its own simulations (p. 56). The thesis
-gives only the ranges and drifts of the trajectories in Figs 16 to 18. Every repetition therefore
-draws new link motions and sensor errors; the published values belong to one trajectory.
+A calibrator, a passive arm with angle sensors, closes the chain from the tool to the chassis. The
+links stick, boom and swing (3, 2, 1) are identified one after the other. The true machine is the
+nominal machine of the thesis, as in its own simulations (p. 56). The thesis gives only the ranges
+and drifts of the trajectories in Figs 16 to 18. Every repetition therefore draws new link motions
+and sensor errors; the published values belong to one trajectory.
 """
 
 from collections.abc import Mapping, Sequence
@@ -85,7 +87,14 @@ PUBLISHED_ITERATIONS = {"drift": (6, 11, 5), "sensor": (6, 14, 7), "flexible": (
 
 
 def find_published_error(case: str, name: str) -> float:
-    """Return the error of a length in Khoshzaban 1992, Tables 4 to 6 relative to Table 2 [m]."""
+    """Return the identification error of a length that Khoshzaban 1992 publishes [m].
+
+    It is the value of Tables 4 to 6 minus the nominal length of Table 2.
+
+    Args:
+        case: `drift` (Table 4), `sensor` (Table 5) or `flexible` (Table 6).
+        name: one of `LENGTH_PARAMETERS`.
+    """
     return PUBLISHED_LENGTHS[case][LENGTH_PARAMETERS.index(name)] - NOMINAL_LENGTHS[name]
 
 
@@ -107,12 +116,12 @@ def merge_settings(defaults: Mapping[str, Any], changes: Changes) -> dict[str, A
 
 
 class Disturbance(NamedTuple):
-    """Disturbances of a simulated calibration.
+    """Disturbances of the readings in a simulated calibration.
 
     Attributes:
         drift: whether held links drift.
         accuracy: largest sensor error [rad].
-        bend: standard deviation of the errors of bent joints [deg].
+        bend: standard deviation of the angle errors of joints that bend under gravity [deg].
         constant_bends: whether a joint has the same error in all of its bent poses.
     """
 
@@ -146,7 +155,7 @@ def identify_with_disturbance(
     pose_fraction: float = 1.0,
     bent_fraction: float = 0.35,
 ) -> dict[str, float]:
-    """Identify links 3 to 1 from disturbed readings of the nominal machine.
+    """Identify stick, boom and swing of the nominal machine from readings with disturbances.
 
     Args:
         loop: nominal chain, which is also the true one.
@@ -179,7 +188,16 @@ def identify_with_disturbance(
 
 
 def measure_simulations(seed: int, changes: Changes) -> Sample:
-    """Identify the arm under every condition, with the same trajectories."""
+    """Identify the arm from the same trajectories under five combinations of drift, sensor errors and bends.
+
+    Args:
+        seed: seed of trajectories and errors.
+        changes: changes of `SETTINGS`.
+
+    Returns:
+        For each combination, the errors of all parameters [m] or [rad], their RMS values, and the
+        numbers of solver iterations.
+    """
     chosen = merge_settings(SETTINGS, changes)
     loop = build_loop(load_machine("calibrator"))
     drift, accuracy = chosen["drift"], chosen["accuracy"]
@@ -215,7 +233,15 @@ INITIAL_ESTIMATE_SETTINGS = {"length": 0.2, "angle": 10.0, "starts": 4, "poses":
 
 
 def measure_initial_estimates(seed: int, changes: Changes) -> Sample:
-    """Identify the arm from the same readings with several initial estimates."""
+    """Identify the arm from the same readings with several random initial estimates.
+
+    Args:
+        seed: seed of readings and initial estimates.
+        changes: changes of `INITIAL_ESTIMATE_SETTINGS`.
+
+    Returns:
+        `spread`: largest difference of any identified parameter [m] or [rad].
+    """
     chosen = merge_settings(INITIAL_ESTIMATE_SETTINGS, changes)
     loop = build_loop(load_machine("calibrator"))
     rng = np.random.default_rng([7, seed])
@@ -240,7 +266,7 @@ def measure_initial_estimates(seed: int, changes: Changes) -> Sample:
 
 
 def measure_exact_readings(seed: int, changes: Changes) -> Sample:
-    """Identify the arm from readings without errors."""
+    """Identify the arm from readings without errors, and return its largest parameter error."""
     chosen = merge_settings({"accuracy": 0.0}, changes)
     loop = build_loop(load_machine("calibrator"))
     found = identify_with_disturbance(loop, Disturbance(False, chosen["accuracy"]), seed)
@@ -249,7 +275,14 @@ def measure_exact_readings(seed: int, changes: Changes) -> Sample:
 
 
 def check_lengths(samples: Sequence[Sample], case: str) -> list[Check]:
-    """Return checks whether the published link-length errors lie within those of the repeated simulations."""
+    """Return one check per link length: whether its published error is typical of the simulated errors.
+
+    A published error agrees if it lies in the central 95 % of the repetitions.
+
+    Args:
+        samples: samples of `measure_simulations`.
+        case: `drift` or `sensor`.
+    """
     return [
         check_population(
             f"error of {LENGTH_SYMBOLS[name]}", 1e3 * collect_values(samples, f"{case}.error.{name}"),
@@ -259,7 +292,7 @@ def check_lengths(samples: Sequence[Sample], case: str) -> list[Check]:
 
 
 def check_largest_error(samples: Sequence[Sample], case: str) -> Check:
-    """Return a check of the fraction of trajectories in which d0 has the largest length error."""
+    """Return a check whether length d0 has the largest error of all lengths in most simulated trajectories."""
     leads = [abs(s.values[f"{case}.error.p_z.swing"]) >= s.values[f"{case}.largest"]
              for s in samples]  # fmt: skip
     return check_fraction(
@@ -269,7 +302,7 @@ def check_largest_error(samples: Sequence[Sample], case: str) -> Check:
 
 
 def describe_lengths(samples: Sequence[Sample], case: str) -> str:
-    """Return the RMS errors of the lengths over the repetitions as text."""
+    """Return the RMS identification error of each link length over the repetitions as text."""
     sizes = [f"{LENGTH_SYMBOLS[n]} {1e3 * compute_rms(collect_values(samples, f'{case}.error.{n}')):.0f}"
              for n in LENGTH_PARAMETERS]  # fmt: skip
     return f"RMS errors in mm: {', '.join(sizes)}"
@@ -279,7 +312,16 @@ def check_rms_ratio(
     quantity: str, samples: Sequence[Sample], names: tuple[str, str], accepted: tuple[float, float],
     reason: str, published: float | None = None,
 ) -> Check:  # fmt: skip
-    """Return a check of the ratio of the RMS values of two results over the repetitions."""
+    """Return a check of the RMS value of one result over that of another; each RMS is over all repetitions.
+
+    Args:
+        quantity: name of the ratio.
+        samples: samples of all repetitions.
+        names: names of both results, numerator first.
+        accepted: lowest and highest ratio that agree.
+        reason: source of the accepted range.
+        published: published ratio, if there is one.
+    """
     rows = np.column_stack([collect_values(samples, name) for name in names])
 
     def ratio(values: np.ndarray) -> float:
@@ -295,7 +337,10 @@ A3_ERROR_REASON = (
 
 
 def evaluate_drift(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the errors under drift alone with Khoshzaban 1992, Table 4."""
+    """Compare the parameter errors that drift of held links causes with Khoshzaban 1992, Table 4.
+
+    Length d0 must have the largest error, and each published error must be typical of the repetitions.
+    """
     # alpha 1 is the only twist that drift changes; it is printed as -90.0 deg.
     twist = check_population(
         "error of alpha 1", np.degrees(collect_values(samples, "drift.error.alpha.swing")), 0.0, "deg",
@@ -309,7 +354,10 @@ def evaluate_drift(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_sensor_errors(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the errors under drift and sensor errors with Khoshzaban 1992, Table 5."""
+    """Compare the parameter errors that drift and sensor errors cause with Khoshzaban 1992, Table 5.
+
+    The twist errors (alpha and beta) must also be proportional to the sensor errors.
+    """
     twists = check_population(
         "RMS error of alpha and beta", np.degrees(collect_values(samples, "sensor.twists")),
         compute_rms(PUBLISHED_TWISTS["sensor"]), "deg",
@@ -331,7 +379,10 @@ def evaluate_sensor_errors(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_bent_joints(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the errors under drift and bent joints with Khoshzaban 1992, Table 6."""
+    """Compare the parameter errors that drift and bent joints cause with Khoshzaban 1992, Table 6.
+
+    Bent joints must increase the length errors as published, and errors must grow from stick to boom.
+    """
     largest = {case: max(abs(find_published_error(case, n)) for n in LENGTH_PARAMETERS)
                for case in ("flexible", "sensor")}  # fmt: skip
     ratio = largest["flexible"] / largest["sensor"]
@@ -367,9 +418,10 @@ def evaluate_bent_joints(samples: Sequence[Sample]) -> Evaluation:
 
 
 def check_constant_bend_ratio(samples: Sequence[Sample]) -> Check:
-    """Check the largest length error when all bent poses of a stage have the same angle error.
+    """Return a check of the largest length error if each bent joint keeps one angle error in a stage.
 
-    It is divided by the largest length error with sensor errors and drift only.
+    It is divided by the largest length error with sensor errors and drift, and compared with the
+    published ratio (838 mm over 73 mm) within a factor of 2.
     """
     ratio = 838.0 / 73.0
     return check_rms_ratio(
@@ -380,12 +432,18 @@ def check_constant_bend_ratio(samples: Sequence[Sample]) -> Check:
 
 
 def evaluate_constant_bends(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the errors under drift and constantly bent joints with Khoshzaban 1992, Table 6."""
+    """Compare the growth of the largest length error with Table 6 if each bent joint keeps one angle error.
+
+    The table is that of Khoshzaban 1992, whose bends may differ from pose to pose.
+    """
     return Evaluation((check_constant_bend_ratio(samples),), note=describe_lengths(samples, "lasting"))
 
 
 def evaluate_relative_error(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the relative error of a1 with Khoshzaban 1992, p. 60."""
+    """Compare the relative error of the swing's length a1 with 2.5 % and 10 % in Khoshzaban 1992, p. 60.
+
+    2.5 % is published for sensors within 0.05 deg without drift, 10 % for 0.1 deg with drift.
+    """
     size = NOMINAL_LENGTHS["a.swing"]
     half = 100.0 * collect_values(samples, "half.error.a.swing") / size
     both = 100.0 * np.abs(collect_values(samples, "sensor.error.a.swing")) / size
@@ -401,7 +459,10 @@ def evaluate_relative_error(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_sensor_fraction(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the fraction of a1's error due to the sensors with Khoshzaban 1992, p. 60."""
+    """Check whether sensor errors cause half of the error of the swing's length a1.
+
+    Khoshzaban 1992, p. 60, says so for sensors within 0.1 deg with drift.
+    """
     rows = np.column_stack([collect_values(samples, f"{case}.error.a.swing")
                             for case in ("half", "sensor", "drift")])  # fmt: skip
 
@@ -418,7 +479,7 @@ def evaluate_sensor_fraction(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_iterations(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the numbers of iterations with Khoshzaban 1992, p. 62."""
+    """Check that solver iterations increase with noise and are most for link 2, as in Khoshzaban 1992, p. 62."""
     totals = {case: sum(counts) for case, counts in PUBLISHED_ITERATIONS.items()}
     checks = []
     for case in ("sensor", "flexible"):
@@ -445,7 +506,10 @@ def evaluate_iterations(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_all_relative_errors(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the relative errors under drift and sensor errors of 0.1 deg with Khoshzaban 1992, p. 122."""
+    """Check that usually more than half of the six identified lengths have errors below 5 %.
+
+    Khoshzaban 1992, p. 122, says so for resolvers of 0.1 deg; held links drift.
+    """
     errors = np.array([[abs(s.values[f"sensor.error.{n}"] / NOMINAL_LENGTHS[n]) for n in LENGTH_PARAMETERS]
                        for s in samples])  # fmt: skip
     rms = [f"{LENGTH_SYMBOLS[n]} {100 * compute_rms(errors[:, k]):.1f}" for k, n in enumerate(LENGTH_PARAMETERS)]
@@ -457,7 +521,10 @@ def evaluate_all_relative_errors(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_initial_estimates(samples: Sequence[Sample]) -> Evaluation:
-    """Check that all initial estimates give the same result (pp. 62 and 121)."""
+    """Check that all initial estimates lead to the same identified parameters.
+
+    Khoshzaban 1992 says so on pp. 62 and 121.
+    """
     return Evaluation((
         check_exact("largest difference of the results", float(collect_values(samples, "spread").max()),
                     (0.0, 5e-4), "half of the last printed digit of a length", unit="m or rad"),
@@ -465,7 +532,7 @@ def evaluate_initial_estimates(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_exact_readings(samples: Sequence[Sample]) -> Evaluation:
-    """Check that readings without errors give the true parameters."""
+    """Check that the calibration identifies the true parameters from readings without errors."""
     return Evaluation((
         check_exact("largest error of a parameter", float(collect_values(samples, "worst").max()),
                     (0.0, 1e-9), "rounding only", unit="m or rad"),

@@ -1,9 +1,11 @@
 """Simulate the calibration of the machine in Khoshzaban 1992, section 3.8.
 
-The nominal machine is the true one, as in the thesis: "we consider the nominal model to behave like
-the actual system" (p. 67). The calibrator's joints 5 and 6 bend when the stick is retracted (p.
-69); the thesis does not give the size. As in the thesis, poses whose readings differ visibly from
-the nominal model are excluded before the arm is identified again.
+A calibrator, a passive arm with angle sensors, closes the chain from the tool to the chassis. In
+each stage one link moves, and the others are held. The nominal machine is the true one, as in the
+thesis: "we consider the nominal model to behave like the actual system" (p. 67). The calibrator's
+joints 5 and 6 bend when the stick is retracted (p. 69); the thesis does not give the size. As in
+the thesis, poses whose readings differ visibly from the nominal model are excluded before the arm
+is identified again.
 """
 
 from collections.abc import Mapping
@@ -87,12 +89,12 @@ _TAPED_DISTANCES = 19  # number of taped distances, p. 65
 
 
 class ArmModel(NamedTuple):
-    """Kinematic parameters that determine the end points.
+    """Kinematic parameters of the closed chain, from which the positions of end points are computed.
 
     Attributes:
-        values: (N, 5) rows of `CalibrationLoop.values`.
-        ball: (3,) position of the ball [m].
-        pitch: angle at which joint 4 is held [rad].
+        values: (N, 5) offset [rad], alpha [rad], a [m], d [m], beta [rad] of each link.
+        ball: (3,) position of the ball joint in frame 0 [m].
+        pitch: angle at which joint 4, which has no sensor, is held [rad].
     """
 
     values: np.ndarray
@@ -124,7 +126,16 @@ class Calibration(NamedTuple):
 
 
 def simulate_stages(seed: int, settings: Mapping[str, Any], rng: np.random.Generator) -> Calibration:
-    """Simulate the readings of all calibration stages and exclude visibly bent poses."""
+    """Simulate the readings of all calibration stages, and exclude poses in which joints visibly bend.
+
+    Args:
+        seed: seed of the poses.
+        settings: values of `SETTINGS`.
+        rng: random generator of manufacturing errors, sweeps, bends and sensor errors.
+
+    Returns:
+        True poses and readings, without results.
+    """
     loop = build_loop(load_machine("calibrator"))
     built = settings["built"]
     true = perturb_loop(loop, rng, built, built / 0.03) if built else loop
@@ -143,7 +154,7 @@ def simulate_stages(seed: int, settings: Mapping[str, Any], rng: np.random.Gener
 
 
 def identify_both_models(calibration: Calibration) -> dict[str, ArmFit]:
-    """Identify the arm once from all poses and once from the kept poses."""
+    """Identify the arm from all poses (`identified`) and without the bent poses (`reidentified`)."""
     used = {"identified": calibration.stages, "reidentified": calibration.kept_stages}
     return {
         name: identify_arm(calibration.loop, [replace(s, drift=None) for s in poses], weighted=False,
@@ -153,10 +164,14 @@ def identify_both_models(calibration: Calibration) -> dict[str, ArmFit]:
 
 
 def exclude_bent_poses(loop: CalibrationLoop, stage: Poses) -> Poses:
-    """Exclude poses in which the readings differ by 1 deg or more from the nominal model.
+    """Return a stage without the poses in which the readings differ by 1 deg or more from the nominal model.
 
     A pose is excluded if the closure error of the chain exceeds the displacement of the ball that a
-    yoke rotation of 1 deg causes. All poses of joint 4, which has no sensor, are kept.
+    yoke rotation of 1 deg causes. Poses in which joint 4 moves, which has no sensor, are all kept.
+
+    Args:
+        loop: nominal chain.
+        stage: readings while one link moves.
     """
     if stage.link not in SIMULATED_STAGES:
         return stage
@@ -167,7 +182,7 @@ def exclude_bent_poses(loop: CalibrationLoop, stage: Poses) -> Poses:
 
 
 def measure_calibration(seed: int, changes: Changes) -> Sample:
-    """Calibrate the machine with and without bent poses, and compare the results.
+    """Calibrate a machine with and without the poses of bent joints, and compute the errors of both results.
 
     Args:
         seed: seed of sweeps, bends and sensor errors.
@@ -192,15 +207,15 @@ def measure_calibration(seed: int, changes: Changes) -> Sample:
 
 
 def measure_bend_detection(seed: int, changes: Changes) -> Sample:
-    """Detect bent joints from the closure equations alone, and with the nominal model.
+    """Find poses with bent joints by the closure equations alone, and by comparison with the nominal model.
 
     Args:
         seed: seed of sweeps, bends and sensor errors.
         changes: changes of `SETTINGS`.
 
     Returns:
-        `overlap` of detected and bent poses (intersection over union), `blamed` (whether only bent
-        joints are detected), and the fraction `left out` of the bent poses.
+        By the equations: `overlap` of detected and bent poses (intersection over union), and `blamed`
+        (whether only bent joints are detected). By the model: fraction `left out` of the bent poses.
     """
     chosen = merge_settings(SETTINGS, changes)
     done = simulate_stages(seed, chosen, np.random.default_rng([38, seed]))
@@ -223,7 +238,7 @@ def measure_bend_detection(seed: int, changes: Changes) -> Sample:
 
 
 def _compute_parameter_errors(calibration: Calibration, model: str, fit: ArmFit) -> dict[str, float]:
-    """Return the errors of the identified parameters and the iterations of the stages."""
+    """Return the errors of one model's identified parameters [m] or [rad], with RMS values and iterations."""
     truth = dict(zip(fit.names, find_true_parameters(calibration.true_loop, calibration.loop, fit.names,
     calibration.true_poses),
                      strict=True))  # fmt: skip
@@ -241,7 +256,11 @@ def _compute_parameter_errors(calibration: Calibration, model: str, fit: ArmFit)
 
 
 def _compare_sensors(calibration: Calibration) -> Sample:
-    """Compare the calibrator's readings with those predicted from the manipulator's sensors."""
+    """Compare each calibrator reading of the stick's stage with that predicted from the other sensors.
+
+    The prediction uses the nominal model. The RMS differences [deg] are computed for poses inside and
+    outside the bent region.
+    """
     loop, inside = calibration.loop, calibration.bent_poses
     stage = next(one for one in calibration.stages if one.link == "stick")
     predicted = predict_readings(loop, stage, _find_nominal_parameters(loop, stage))
@@ -272,7 +291,7 @@ def _compare_sensors(calibration: Calibration) -> Sample:
 
 
 def _find_nominal_parameters(loop: CalibrationLoop, stage: Poses) -> dict[str, float]:
-    """Return a stage's parameters from the nominal chain and the manipulator's sensors."""
+    """Return the parameters of one stage that follow from the nominal chain and the manipulator's sensors."""
     theta = loop.home[None].copy()
     place = loop.links.index(stage.link)
     for k, link in enumerate(loop.links[:place]):
@@ -292,9 +311,10 @@ def _find_model(calibration: Calibration, name: str) -> ArmModel:
 
 
 def _compute_joint_angles(loop: CalibrationLoop, model: ArmModel, stage: Poses) -> np.ndarray:
-    """Return (M, N) joint angles from all sensors with a model's offsets [rad].
+    """Return (M, N) joint angles: the readings of all sensors plus their offsets [rad].
 
-    Joint 4 has no sensor; its angle is that of the model.
+    Joint 4 has no sensor; its angle is that of the model. The calibrator's offsets are the model's, the
+    manipulator's are the nominal ones.
     """
     theta = np.empty((len(stage), len(loop)))
     for k, link in enumerate(loop.links[: loop.powered_count]):
@@ -305,7 +325,7 @@ def _compute_joint_angles(loop: CalibrationLoop, model: ArmModel, stage: Poses) 
 
 
 def compute_end_position(model: ArmModel, theta: np.ndarray, side: str, links: int) -> np.ndarray:
-    """Return the position of an end point relative to the ball.
+    """Return the position of an end point relative to the calibrator's ball joint.
 
     Args:
         model: kinematic parameters.
@@ -324,7 +344,7 @@ def compute_end_position(model: ArmModel, theta: np.ndarray, side: str, links: i
 
 
 def _compare_end_points(calibration: Calibration) -> Sample:
-    """Compare the end points of the identified models with those of the nominal model."""
+    """Compute RMS differences of end-point positions between both identified models and the nominal one [m]."""
     nominal, values, panels = _find_model(calibration, "nominal"), {}, []
     used = {"identified": calibration.stages, "reidentified": calibration.kept_stages}
     for name, stages in used.items():
@@ -353,7 +373,7 @@ def _compare_end_points(calibration: Calibration) -> Sample:
 
 
 def _compare_distances(calibration: Calibration, tape: float, rng: np.random.Generator) -> Sample:
-    """Compare computed distances between end points and ball with tape measurements."""
+    """Compare distances from end points to the ball by each model with simulated tape measurements."""
     pairs = [(one, stage) for one, stage in zip(calibration.true_poses, calibration.stages, strict=True)
              if stage.link in SIMULATED_STAGES]  # fmt: skip
     truth = np.concatenate([one.theta for one, _ in pairs])
@@ -387,7 +407,10 @@ def _compare_distances(calibration: Calibration, tape: float, rng: np.random.Gen
 
 
 def _identify_minor_links(calibration: Calibration, settings: Mapping[str, Any], rng: np.random.Generator) -> Sample:
-    """Identify the cylinder triangles from measured angles and from the re-identified arm."""
+    """Identify the triangles of the boom and stick cylinders from measured and from computed joint angles.
+
+    Computed angles follow from the calibrator's readings and the re-identified arm.
+    """
     machine, values, panels = load_machine("calibrator"), {}, []
     transducer, accuracy = settings["transducer"], settings["accuracy"]
     sigma = max(accuracy, 1e-9) / np.sqrt(3.0), max(transducer, 1e-9) / np.sqrt(3.0)
@@ -420,7 +443,7 @@ def _identify_minor_links(calibration: Calibration, settings: Mapping[str, Any],
 
 
 def _compute_true_displacement(machine: Machine, axis: str, angle: np.ndarray) -> np.ndarray:
-    """Return the piston displacement of the machine's cylinder triangle at joint angles [m]."""
+    """Return the piston displacement of the machine's cylinder at joint angles [m]."""
     linkage, cylinder = axis_linkage(machine, axis), machine.axes[axis].cylinder
     assert cylinder
     return np.asarray(linkage.length(angle)) - cylinder.closed_length

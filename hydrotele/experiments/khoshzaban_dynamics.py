@@ -1,8 +1,9 @@
 """Chapter 4 of Khoshzaban 1992: dynamic calibration of a hydraulic machine with minor links.
 
-The module compares forces of the complete and the reduced model (4.4.1) and classifies the
-identifiability of the parameters (4.4.2). Sensor accuracy (4.4.3) is in `khoshzaban_sensors`, and
-the measured machine (4.6) is in `khoshzaban_prediction`.
+Minor links are the tubes and rods of the cylinders; the reduced model neglects them. The module
+compares forces of the complete and the reduced model (4.4.1) and classifies the identifiability of
+the parameters (4.4.2). Sensor accuracy (4.4.3) is in `khoshzaban_sensors`, and the measured machine
+(4.6) is in `khoshzaban_prediction`.
 """
 
 from collections.abc import Sequence
@@ -60,14 +61,14 @@ _MIN_FORCE_FRACTION = 0.5  # fraction of the peak force above which the factor b
 
 
 def measure_forces(seed: int, changes: Changes) -> Sample:
-    """Compare the forces of the complete and the reduced model along a random motion.
+    """Compare drive forces along a random motion with and without the inertia of the cylinders.
 
     Args:
         seed: seed of the motion.
         changes: changes of `FORCE_SETTINGS`.
 
     Returns:
-        Factors between the forces of both models, and their RMS differences.
+        Factors between the forces of the complete and the reduced model, and their RMS differences.
     """
     settings = merge_settings(FORCE_SETTINGS, changes)
     motion = draw_motion(np.random.default_rng(seed))
@@ -120,7 +121,10 @@ def _draw_forces(motion: Motion, complete: np.ndarray, reduced: np.ndarray) -> t
 
 
 def evaluate_force_factor(samples: Sequence[Sample]) -> Evaluation:
-    """Check whether the factor between the models' forces reaches two at large forces."""
+    """Check whether neglecting the cylinders' inertia changes a drive's force by a factor of two or more.
+
+    Only instants with more than half of the peak force count.
+    """
     largest = np.max([collect_values(samples, f"factor.{drive}") for drive in DRIVES], axis=0)
     check = check_mean(
         "largest factor between both models' forces, of three drives, at instants with more than"
@@ -146,7 +150,10 @@ def evaluate_force_factor(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_proximal_error(samples: Sequence[Sample]) -> Evaluation:
-    """Check that the boom's force error exceeds its sensor error and the stick's force error."""
+    """Check that neglecting the cylinders' inertia causes a larger force error at the boom than at the stick.
+
+    The boom's RMS error must also exceed its sensor error.
+    """
     rows = np.stack([collect_values(samples, f"difference.{d}") for d in ("boom", "stick")], axis=1)
     checks = (
         check_mean(
@@ -171,7 +178,10 @@ def evaluate_proximal_error(samples: Sequence[Sample]) -> Evaluation:
 
 
 def describe_motions(samples: Sequence[Sample]) -> Evaluation:
-    """Describe the drawn motions; only the axis ticks of the published ones are legible."""
+    """Return a note on the random motions that were simulated, without a verdict.
+
+    Only the axis ticks of the published motions are legible.
+    """
     rates = ", ".join(f"{d} {format_values(samples, f'peak_rate.{d}', digits=2)}" for d in DRIVES)
     return Evaluation(note=f"a new random motion in every repetition; largest rates {rates} rad/s")
 
@@ -219,7 +229,7 @@ PIN_COUNTS = {"deleted": 37, "combined": 25, "full": 20}
 
 
 def count_parameters(classification: Identifiability) -> dict[str, int]:
-    """Count the parameters in the document's three classes.
+    """Count the unidentifiable, linearly identifiable and fully identifiable parameters.
 
     Columns without effect and columns that depend linearly on others are deleted and count as
     unidentifiable. The number of remaining columns is the rank.
@@ -237,7 +247,7 @@ def count_parameters(classification: Identifiability) -> dict[str, int]:
 
 
 def measure_identifiability(seed: int, changes: Changes) -> Sample:
-    """Classify the 82 parameters of the complete model with ball joints and with pins.
+    """Classify the 82 dynamic parameters for cylinders that end in ball joints and in pins.
 
     Args:
         seed: seed of the random states.
@@ -268,7 +278,7 @@ def measure_identifiability(seed: int, changes: Changes) -> Sample:
 
 
 def evaluate_table_13(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the counts with Khoshzaban 1992, Table 13."""
+    """Compare the numbers of unidentifiable and identifiable parameters with Khoshzaban 1992, Table 13."""
     values = samples[0].values
     words = {"deleted": "unidentifiable", "combined": "linearly identifiable",
              "full": "fully identifiable"}  # fmt: skip
@@ -289,7 +299,7 @@ def evaluate_table_13(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_pin_counts(samples: Sequence[Sample]) -> Evaluation:
-    """Check the counts for cylinders with pins."""
+    """Check the numbers of unidentifiable and identifiable parameters for cylinders that end in pins."""
     values = samples[0].values
     return Evaluation(
         tuple(
@@ -300,7 +310,7 @@ def evaluate_pin_counts(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_swing_parameters(samples: Sequence[Sample]) -> Evaluation:
-    """Check that nine swing parameters have no effect and the tenth appears in a combination."""
+    """Check that nine inertial parameters of the swing have no effect and Izz appears in a combination."""
     values = samples[0].values
     return Evaluation(
         (

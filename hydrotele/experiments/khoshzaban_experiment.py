@@ -1,6 +1,7 @@
 """Claims of Khoshzaban 1992, section 3.8: Tables 7 to 10 and Figs 19 to 25.
 
-The thesis calibrates one machine once. Published values are compared with the scatter of the
+The thesis calibrates one machine once: Table 7 from all poses (`identified`), and Table 9 without
+the poses of bent joints (`reidentified`). Published values are compared with the scatter of the
 simulated calibrations (`khoshzaban_calibration`); published changes are compared by their ratio.
 """
 
@@ -75,12 +76,20 @@ PUBLISHED_DISTANCE_ERRORS = {
 
 
 def find_printed_length_errors(model: str) -> dict[str, float]:
-    """Return the printed lengths minus those of Khoshzaban 1992, Table 2 [m]."""
+    """Return the printed identified lengths minus the nominal ones of Khoshzaban 1992, Table 2 [m].
+
+    Args:
+        model: `identified` (Table 7) or `reidentified` (Table 9).
+    """
     return {n: v - NOMINAL_LENGTHS[n] for n, v in zip(LENGTH_PARAMETERS, _PRINTED_LENGTHS[model], strict=True)}
 
 
 def compute_accepted_change(ratio: float) -> tuple[float, float]:
-    """Return the range of ratios whose decrease is half to twice that of a published ratio."""
+    """Return the range of error ratios whose decrease is half to twice the published one.
+
+    Args:
+        ratio: published error after over error before.
+    """
     return max(0.0, 1.0 - 2.0 * (1.0 - ratio)), 1.0 - 0.5 * (1.0 - ratio)
 
 
@@ -88,7 +97,17 @@ CHANGE_REASON = "half to twice the published decrease of one measurement"
 
 
 def measure_printed_parameters(seed: int, changes: Changes) -> Sample:
-    """Compare end points of the printed parameters with nominal ones for exact joint angles."""
+    """Compute how far end points with the printed parameters are from those of the nominal model.
+
+    Joint angles are exact.
+
+    Args:
+        seed: not used.
+        changes: `table_9`: model whose printed parameters are used for Table 9.
+
+    Returns:
+        RMS position errors per model, side and end point [m].
+    """
     chosen = merge_settings({"table_9": "reidentified"}, changes)
     loop = build_loop(load_machine("calibrator"))
     theta = np.concatenate(
@@ -116,7 +135,7 @@ def measure_printed_parameters(seed: int, changes: Changes) -> Sample:
 
 
 def evaluate_printed_parameters(samples: Sequence[Sample]) -> Evaluation:
-    """Check whether the printed parameters give the printed position errors."""
+    """Check whether the printed parameters reproduce the printed position errors of the end points."""
     checks = []
     for (model, side), ends in PUBLISHED_POSITION_ERRORS.items():
         for end, published in ends.items():
@@ -138,7 +157,10 @@ def evaluate_printed_parameters(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_parameters(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the sizes of the parameter errors with Khoshzaban 1992, Table 7."""
+    """Compare the parameter errors identified from all poses with Khoshzaban 1992, Table 7.
+
+    Published RMS errors must be typical of the repetitions.
+    """
     outer = np.array([[s.values[f"identified.error.{n}"] for n in _PRINTED_OUTER] for s in samples])
     offsets = np.array([[s.values[f"identified.error.{n}"] for n in _OFFSET_PARAMETERS] for s in samples])
     checks = (
@@ -159,7 +181,7 @@ def evaluate_parameters(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_iterations(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the iterations of links 2 and 3 with Khoshzaban 1992, Table 7."""
+    """Compare the ratio of solver iterations of links 2 and 3 (boom, stick) with Khoshzaban 1992, Table 7."""
     return Evaluation((check_rms_ratio(
         "iterations of link 2 over those of link 3", samples,
         ("identified.iterations.boom", "identified.iterations.stick"),
@@ -172,7 +194,7 @@ def _compute_row_rms(rows: np.ndarray) -> np.ndarray:
 
 
 def _check_links(samples: Sequence[Sample], model: str) -> list[Check]:
-    """Return checks of the RMS errors of lengths and twists of links 0 to 3."""
+    """Return checks whether published RMS errors of lengths and twists of links 0 to 3 are typical."""
     lengths = compute_rms(list(find_printed_length_errors(model).values()))
     return [
         check_population("RMS error of the six lengths of links 0 to 3",
@@ -196,7 +218,7 @@ def _describe_links(samples: Sequence[Sample], model: str) -> str:
 
 
 def evaluate_error_change(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the change of the parameter errors from Khoshzaban 1992, Table 7 to Table 9."""
+    """Compare how parameter errors change without the bent poses: Khoshzaban 1992, Table 7 to Table 9."""
     before, after = (find_printed_length_errors(m) for m in ("identified", "reidentified"))
     checks = []
     for name in ("a.swing", "d.boom"):
@@ -223,7 +245,10 @@ def evaluate_error_change(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_remaining_errors(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the sizes of the remaining parameter errors with Khoshzaban 1992, Table 9."""
+    """Compare the parameter errors without the bent poses with Khoshzaban 1992, Table 9.
+
+    Published RMS errors must be typical of the repetitions.
+    """
     return Evaluation(
         tuple(_check_links(samples, "reidentified")),
         "after the removal only sensor noise affects alpha and beta here; the thesis also names"
@@ -238,7 +263,7 @@ def _compute_printed_twist_rms(model: str, kind: str) -> float:
 
 
 def _check_rms_errors(samples: Sequence[Sample], model: str, side: str, published: dict, name: str) -> list[Check]:
-    """Return checks whether the published RMS errors agree with the repetitions."""
+    """Return checks whether the published RMS error of each end point is typical of the repetitions."""
     return [
         check_population(f"{end}'s end, {model}, {side} side",
                          1e3 * collect_values(samples, name.format(model=model, side=side, end=end)),
@@ -253,7 +278,7 @@ _POSITION_KEY, _DISTANCE_KEY = "{model}.position.{side}.{end}", "{model}.{side}.
 def _check_decrease(
     samples: Sequence[Sample], names: tuple[str, str], published: dict, side: str, name: str
 ) -> list[Check]:
-    """Return checks whether errors decrease from one model to another as published."""
+    """Return checks whether end-point errors decrease from one model to another as much as published."""
     checks = []
     for end in END_POINT_LINKS:
         before, after = (published[model, side][end] for model in names)
@@ -267,7 +292,10 @@ def _check_decrease(
 
 
 def evaluate_end_points(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the position errors from the manipulator side with pp. 66 and 71."""
+    """Compare position errors of end points, computed from the manipulator's joints, with the thesis.
+
+    The errors are relative to the nominal model (Khoshzaban 1992, pp. 66 and 71).
+    """
     return Evaluation(
         tuple(check for model in ("identified", "reidentified")
               for check in _check_rms_errors(samples, model, "manipulator", PUBLISHED_POSITION_ERRORS, _POSITION_KEY)),
@@ -277,7 +305,10 @@ def evaluate_end_points(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_position_decrease(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the decrease of the position errors from Khoshzaban 1992, Table 7 to Table 9."""
+    """Compare how much excluding the bent poses reduces the position errors of the end points.
+
+    The published decrease is that from Table 7 to Table 9 of Khoshzaban 1992.
+    """
     names = ("identified", "reidentified")
     return Evaluation(
         tuple(_check_decrease(samples, names, PUBLISHED_POSITION_ERRORS, "manipulator", _POSITION_KEY)),
@@ -286,7 +317,10 @@ def evaluate_position_decrease(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_calibrator_ends(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the position errors from the calibrator side with pp. 67 and 71."""
+    """Compare position errors of end points, computed from the calibrator's joints, with the thesis.
+
+    The errors are relative to the nominal model (Khoshzaban 1992, pp. 67 and 71).
+    """
     models = ("identified", "reidentified")
     checks = [
         check
@@ -320,7 +354,11 @@ def evaluate_calibrator_ends(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_distances(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the distance errors from the manipulator side with Khoshzaban 1992, Table 8 and Fig. 19."""
+    """Compare the errors of distances from end points to the ball with Khoshzaban 1992, Table 8.
+
+    The nominal and the identified model compute the distances from the manipulator's joints; the
+    reference is a tape measurement.
+    """
     checks = [
         check
         for model in ("nominal", "identified")
@@ -337,7 +375,10 @@ def evaluate_distances(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_model_order(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the distance errors of the nominal and the identified model with Khoshzaban 1992, Fig. 19."""
+    """Check that the identified model has larger distance errors than the nominal one, as in Fig. 19.
+
+    Its error must also decrease with the distance from the end point to the ball (Khoshzaban 1992).
+    """
     checks = []
     for end in END_POINT_LINKS:
         ratio = (
@@ -362,7 +403,7 @@ def evaluate_model_order(samples: Sequence[Sample]) -> Evaluation:
 
 
 def _describe_vaf(samples: Sequence[Sample], side: str) -> str:
-    """Return the mean variance accounted for (VAF) of all models as text."""
+    """Return the mean variance accounted for (VAF) of the distances of all models as text."""
     parts = []
     for model in ("nominal", "identified", "reidentified"):
         means = [collect_values(samples, f"{model}.{side}.{end}.vaf").mean() for end in END_POINT_LINKS]
@@ -371,7 +412,10 @@ def _describe_vaf(samples: Sequence[Sample], side: str) -> str:
 
 
 def evaluate_calibrator_distances(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the distance errors from the calibrator side with Khoshzaban 1992, Table 8."""
+    """Compare the errors of distances, computed from the calibrator's joints, with Khoshzaban 1992, Table 8.
+
+    The distances are those from end points to the ball, for the nominal and the identified model.
+    """
     checks = [
         check
         for model in ("nominal", "identified")
@@ -398,7 +442,7 @@ def evaluate_calibrator_distances(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_new_distances(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the sizes of the distance errors with Khoshzaban 1992, Table 10."""
+    """Compare the distance errors of the model identified without bent poses with Khoshzaban 1992, Table 10."""
     return Evaluation(
         tuple(_check_rms_errors(samples, "reidentified", "manipulator", PUBLISHED_DISTANCE_ERRORS, _DISTANCE_KEY)),
         "after the bent poses are excluded, the drift of held links is the only large error here",
@@ -407,7 +451,11 @@ def evaluate_new_distances(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_distance_decrease(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the change of the distance errors from Khoshzaban 1992, Table 8 to Table 10."""
+    """Compare how excluding the bent poses changes the distance errors: Khoshzaban 1992, Tables 8 and 10.
+
+    Errors computed from the manipulator's joints must decrease as published; those computed from the
+    calibrator's joints must stay the same.
+    """
     models = ("identified", "reidentified")
     checks = _check_decrease(samples, models, PUBLISHED_DISTANCE_ERRORS, "manipulator", _DISTANCE_KEY)
     for end in END_POINT_LINKS:
@@ -420,7 +468,10 @@ def evaluate_distance_decrease(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_sensor_outputs(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the differences between predicted and actual readings with Figs 20 and 21."""
+    """Check that predicted and actual readings differ at joints 5 and 6 when the stick is retracted.
+
+    Joints 7 and 8 must agree (Khoshzaban 1992, Figs 20 and 21).
+    """
     checks = []
     for joint in (5, 6):
         checks.append(check_rms_ratio(
@@ -453,7 +504,10 @@ def _compute_worst_ratio(rows: np.ndarray) -> float:
 
 
 def evaluate_bend_detection(samples: Sequence[Sample]) -> Evaluation:
-    """Check how often `identify_without_bad_data` finds the bent joints."""
+    """Check how often `identify_without_bad_data` finds the poses and joints that bend.
+
+    It uses only the closure equations, not the nominal model.
+    """
     found = [s.values["overlap"] > 0.5 and s.values["blamed"] > 0.5 for s in samples]
     visible = collect_values(samples, "left out").mean()
     return Evaluation(

@@ -1,7 +1,9 @@
 """Claims of Khoshzaban 1992, section 3.8.3: cylinder triangles, Tables 11 and 12.
 
-The claims are evaluated with the calibrations of `khoshzaban_calibration`. Joint angles are either
-measured by the joint's sensor or computed from the calibrator's readings and the re-identified arm.
+A cylinder forms a triangle with the joint: l_l and l_u are the distances of its pins from the
+joint, l_c is its closed length. The claims are evaluated with the calibrations of
+`khoshzaban_calibration`. Joint angles are either measured by the joint's sensor (`measured`) or
+computed from the calibrator's readings and the re-identified arm (`identified`).
 """
 
 from collections.abc import Sequence
@@ -32,7 +34,12 @@ _PRINTED_RMS_ERRORS = {("boom", "measured"): 0.0004, ("boom", "identified"): 0.0
 
 
 def evaluate_triangles(samples: Sequence[Sample], kind: str) -> Evaluation:
-    """Compare the cylinder triangles from measured or computed angles with Khoshzaban 1992, Table 11."""
+    """Compare the identified lengths of the cylinder triangles with Khoshzaban 1992, Table 11.
+
+    Args:
+        samples: samples of `measure_calibration`.
+        kind: source of the joint angles, `measured` or `identified` (computed from the calibrator).
+    """
     checks = []
     for axis in ("boom", "stick"):
         checks += [
@@ -49,7 +56,7 @@ def evaluate_triangles(samples: Sequence[Sample], kind: str) -> Evaluation:
 
 
 def _describe_angles(samples: Sequence[Sample]) -> str:
-    """Return the errors of the computed angles as text."""
+    """Return the errors of joint angles that are computed from the calibrator as text."""
     boom, stick = (collect_values(samples, f"{axis}.angle").mean() for axis in ("boom", "stick"))
     return (
         f"the standard deviations of the errors of computed angles are {boom:.2f} deg (boom) and"
@@ -59,7 +66,7 @@ def _describe_angles(samples: Sequence[Sample]) -> str:
 
 
 def _describe_triangles(samples: Sequence[Sample], kind: str) -> str:
-    """Return the mean deviations of the triangles with their 95 % intervals as text."""
+    """Return the mean deviations of the triangles from the taped ones, with 95 % intervals, as text."""
     parts = []
     for axis in ("boom", "stick"):
         for name in PARAMETER_NAMES:
@@ -72,7 +79,10 @@ def _describe_triangles(samples: Sequence[Sample], kind: str) -> str:
 
 
 def evaluate_angle_sources(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the triangle errors from measured and from computed angles (p. 77)."""
+    """Check that measured joint angles give more accurate cylinder triangles than computed angles.
+
+    Khoshzaban 1992, p. 77, says so; computed angles follow from the calibrator's readings.
+    """
     checks = []
     for axis in ("boom", "stick"):
         rows = np.array([
@@ -97,7 +107,12 @@ def evaluate_angle_sources(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_displacements(samples: Sequence[Sample], kind: str) -> Evaluation:
-    """Compare the displacement errors from measured or computed angles with Khoshzaban 1992, Table 12."""
+    """Compare the RMS errors of computed piston displacements with Khoshzaban 1992, Table 12.
+
+    Args:
+        samples: samples of `measure_calibration`.
+        kind: source of the joint angles, `measured` or `identified` (computed from the calibrator).
+    """
     checks = [
         check_statistic(f"RMS error of the {axis}", 1e3 * collect_values(samples, f"{axis}.{kind}.rms"),
                         compute_rms, (0.5e3 * published, 2e3 * published),

@@ -1,6 +1,7 @@
 """Machine and calibrator of Khoshzaban 1992, chapters 2 and 3.3 to 3.6, and drift of held links.
 
-Rows of kind `input` check published values from which the model was built.
+The calibrator is a passive arm with angle sensors that connects the tool to the chassis. Rows of
+kind `input` check published values from which the model was built.
 """
 
 import math
@@ -91,7 +92,7 @@ def measure_machine(seed: int, changes: Changes) -> Sample:
 
 
 def _measure_pin_distances(machine: Machine) -> dict[str, float]:
-    """Return the distances [m] and angles [deg] between the pins of Figs 5 and 6."""
+    """Return the distances [m] and angles [deg] between pins of boom and stick, Khoshzaban 1992, Figs 5 and 6."""
     boom_axis, stick_axis = machine.axes["boom"].cylinder, machine.axes["stick"].cylinder
     assert boom_axis and stick_axis
     stick_pin = np.array(machine.links["stick"].position)
@@ -114,7 +115,17 @@ def _compute_angle(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def _count_extra_links(dof: int, powered: int, moving: int, task: int, mobility: int) -> int:
-    """Return the required number of extra links by Eq. 3.5: l = (6 + m) - [(n - p) + d + t]."""
+    """Return the number of calibrator links that are needed, l = (6 + m) - [(n - p) + d + t].
+
+    Args:
+        dof: number n of the machine's joints.
+        powered: number p of powered joints.
+        moving: number d of joints that move during a measurement.
+        task: number t of degrees of freedom of the ball joint.
+        mobility: required mobility m of the closed chain.
+
+    Source: Khoshzaban 1992, Eq. 3.5.
+    """
     return (6 + mobility) - ((dof - powered) + moving + task)
 
 
@@ -126,7 +137,7 @@ def _check_published_value(
 
 
 def evaluate_masses(samples: Sequence[Sample]) -> Evaluation:
-    """Compare masses and centres of mass with Khoshzaban 1992, Table 1."""
+    """Compare masses and centres of mass of the model's links with Khoshzaban 1992, Table 1."""
     values = samples[0].values
     checks = [_check_published_value(f"mass of the {n}", values[f"mass.{n}"], v, 0.5, "last digit", "kg")
               for n, v in _PUBLISHED_MASSES.items()]  # fmt: skip
@@ -143,7 +154,7 @@ def evaluate_masses(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_plates(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the pin distances with Figs 5 and 6."""
+    """Compare the pin distances of the model's boom and stick with Khoshzaban 1992, Figs 5 and 6."""
     values, digit = samples[0].values, "last printed digit"
     # The model uses L1 = 5.180 m of Table 2; Fig. 5 has 5.190 m, which changes L3 by 9.5 mm.
     wanted = (
@@ -163,7 +174,10 @@ def evaluate_plates(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_triangles(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the cylinder triangles with Figs 9 and 10 and Tables 3 and 11."""
+    """Compare the dimensions of the model's cylinder triangles with Khoshzaban 1992.
+
+    The values are those of Figs 9 and 10 and Tables 3 and 11.
+    """
     checks = [
         _check_published_value(f"{quantity} of the {name}", samples[0].values[f"{quantity}.{name}"], published,
                     0.05 if quantity == "offset" else 0.0005, "last printed digit",
@@ -178,7 +192,7 @@ def evaluate_triangles(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_mobility(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the numbers of extra links and the mobility with Khoshzaban 1992, Eq. 3.5."""
+    """Compare the mobility of the closed chain and the needed calibrator links with Khoshzaban 1992, Eq. 3.5."""
     wanted = (("extra links of the machine with grapple", "links_machine", 1.0),
               ("extra links of the excavator", "links_excavator", 3.0),
               ("mobility with one moving and four sensed links", "mobility", 2.0))  # fmt: skip
@@ -189,7 +203,7 @@ def evaluate_mobility(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_chain(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the Denavit-Hartenberg parameters with Khoshzaban 1992, Table 2."""
+    """Compare the model's Denavit-Hartenberg parameters with Khoshzaban 1992, Table 2."""
     return Evaluation((check_exact(
         "largest difference of 36 numbers", samples[0].values["table_2"], (0.0, 5e-4),
         "last printed digit of a length", unit="m or deg",
@@ -197,7 +211,7 @@ def evaluate_chain(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_pressures(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the errors of torque and forces with Khoshzaban 1992, Eq. 4.61."""
+    """Compare the torque and force errors due to pressure errors of 25 psi with Khoshzaban 1992, Eq. 4.61."""
     return Evaluation(tuple(
         _check_published_value(f"error of the {name}", samples[0].values[f"torque.{name}"], published, 60.0,
                     "5747 N is printed as 5700", "N m" if name == "swing" else "N")
@@ -206,14 +220,14 @@ def evaluate_pressures(samples: Sequence[Sample]) -> Evaluation:
 
 
 def measure_identifiable_lists(seed: int, changes: Changes) -> Sample:
-    """Find the parameters identified in each stage.
+    """Find which parameters are identifiable in each calibration stage, and compare them with the thesis.
 
     Args:
         seed: not used.
         changes: `wander`: rotation of the grapple during a stage [deg].
 
     Returns:
-        Per stage, the number of parameters that are in only one of found list and document's list.
+        `different.LINK`: number of parameters that are in only one of the found and the published list.
     """
     chosen = merge_settings({"wander": None}, changes)
     loop = build_loop(load_machine("calibrator"))
@@ -235,7 +249,7 @@ def measure_identifiable_lists(seed: int, changes: Changes) -> Sample:
 
 
 def evaluate_identifiable_lists(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the lists of identifiable parameters with section 3.6.4."""
+    """Check that the identifiable parameters of each stage are those of Khoshzaban 1992, section 3.6.4."""
     return Evaluation(tuple(
         check_exact(f"parameters of the {link} stage that are in one list only",
                     samples[0].values[f"different.{link}"], (0.0, 0.0), "the same lists",
@@ -245,14 +259,14 @@ def evaluate_identifiable_lists(samples: Sequence[Sample]) -> Evaluation:
 
 
 def measure_drift(seed: int, changes: Changes) -> Sample:
-    """Simulate the measurement of each link in MuJoCo and record the drift of held links.
+    """Simulate each calibration stage in MuJoCo, and record how far the held links drift.
 
     Args:
         seed: not used.
         changes: scenario keys, or parameters of Table 2's chain such as `a.boom` [m].
 
     Returns:
-        Largest drift of each held link [deg] and largest closure error `gap` [m].
+        Largest drift of each held link [deg] and largest closure error `gap` of the chain [m].
     """
     loop = build_loop(load_machine("calibrator"))
     loop = loop.with_values({name: changes[name] for name in loop.parameter_names if name in changes})
@@ -275,7 +289,7 @@ def measure_drift(seed: int, changes: Changes) -> Sample:
 
 
 def _compute_closure_error(loop: CalibrationLoop, truth) -> float:
-    """Return the largest closure error of Khoshzaban 1992, Table 2's chain for simulated angles [m]."""
+    """Return the largest gap of the closed chain for joint angles simulated in MuJoCo [m]."""
     angles = np.stack([truth[c] * s for c, s in zip(loop.channels, loop.signs, strict=True)], 1)
     return float(np.abs(closure_error(loop, angles + loop.values[:, 0])[0]).max())
 
@@ -288,7 +302,7 @@ _PUBLISHED_DRIFT = {
 
 
 def evaluate_drift(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the drift of held links with Figs 16 to 18."""
+    """Compare how far held links drift while one link moves with Khoshzaban 1992, Figs 16 to 18."""
     values = samples[0].values
     checks = [
         check_exact(f"drift of the {name}", values[name], (0.2, 1.6),
@@ -312,7 +326,7 @@ def evaluate_drift(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_closure(samples: Sequence[Sample]) -> Evaluation:
-    """Check the closure error of the kinematic chain with angles of the MuJoCo model."""
+    """Check that the chain of Khoshzaban 1992, Table 2 closes for joint angles of the MuJoCo model."""
     return Evaluation((
         check_exact("largest gap", 1e6 * float(collect_values(samples, "gap").max()), (0.0, 10.0),
                     "0.01 mm, much smaller than all errors in this study", unit="um"),

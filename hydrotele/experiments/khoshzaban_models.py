@@ -62,7 +62,7 @@ def merge_settings(settings: Mapping[str, Any], changes: Changes) -> dict[str, A
 def make_document_setup(
     model: DynamicModel = "complete", ball_joints: bool = True, tilt_deg: float = 0.0
 ) -> RegressorSetup:
-    """Return the setup of the document's regressor.
+    """Return the setup of the regressor in Khoshzaban 1992, chapter 4, for the CAT 215.
 
     Args:
         model: `complete` (82 parameters) or `reduced` to the major links (36).
@@ -87,12 +87,12 @@ def make_document_setup(
 
 
 def make_regressor(setup: RegressorSetup, motion: Motion) -> Regressor:
-    """Return the regressor along a motion."""
+    """Compute the regressor of the drive forces along a motion."""
     return setup.compute_regressor(setup.project(*motion))
 
 
 def stack_rows(table: Regressor) -> np.ndarray:
-    """Return the regressor of n samples as a (3 n, m) matrix."""
+    """Return the regressor of n samples and three drives as a (3 n, m) matrix."""
     return table.matrix.reshape(-1, len(table.names))
 
 
@@ -114,7 +114,7 @@ def draw_states(count: int, seed: int = 0) -> Motion:
 
 
 def draw_motion(rng: np.random.Generator) -> Motion:
-    """Draw a random motion within the axis limits of Figs 30 to 32.
+    """Draw a random motion of swing, boom and stick within the axis limits of Khoshzaban 1992, Figs 30 to 32.
 
     The curves are not legible in the available text. Start, end and largest rate are drawn within
     the axis limits. All links move from rest to rest by fifth-order polynomials and then hold their
@@ -147,7 +147,7 @@ def join_motions(motions: Sequence[Motion]) -> Motion:
 
 
 def scale_cylinders(table: Regressor, scale: float, bodies: Sequence[str] | None = None):
-    """Return the parameters (m,) with the inertial parameters of tubes and rods scaled.
+    """Return the parameters (m,) with the inertial parameters of the cylinders' tubes and rods scaled.
 
     Args:
         table: regressor with the nominal parameters.
@@ -163,7 +163,7 @@ def scale_cylinders(table: Regressor, scale: float, bodies: Sequence[str] | None
 
 @dataclass(frozen=True)
 class BaseParameters:
-    """Base parameters of a model.
+    """Base parameters of a model: a minimal set that determines the drive forces.
 
     Attributes:
         setup: setup of the regressor.
@@ -209,7 +209,7 @@ _RANDOM_STATES = 300  # random states; each gives three equations for at most 82
 
 @cache
 def find_base(model: DynamicModel, ball_joints: bool = True) -> BaseParameters:
-    """Find the base parameters of a model from random states.
+    """Find the base parameters of the complete or the reduced model from its regressor at random states.
 
     Args:
         model: `complete` or `reduced`.

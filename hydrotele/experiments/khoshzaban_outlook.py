@@ -32,18 +32,18 @@ LINKAGE_SETTINGS = {"axial_offset": 0.05}
 
 
 def measure_linkage(seed: int, changes: Changes) -> Sample:
-    """Count the parameters of a spatial linkage that its sensors do not determine.
+    """Count the geometric parameters of a cylinder with ball joints that its sensors do not determine.
 
     The sensors are the piston displacement and zero, one or two angles of the cylinder at its base
     joint: in the plane normal to the joint axis, and out of this plane. Each angle sensor has an
-    unknown offset.
+    unknown offset. The count is the rank deficiency of the Jacobian.
 
     Args:
         seed: not used.
         changes: changes of `LINKAGE_SETTINGS`.
 
     Returns:
-        Number of undetermined parameters per set of sensors, and `needed` angle sensors.
+        Number of undetermined parameters per set of sensors, and number of angle sensors `needed`.
     """
     chosen = merge_settings(LINKAGE_SETTINGS, changes)
     machine = load_machine("cat215", "none")
@@ -85,7 +85,7 @@ def measure_linkage(seed: int, changes: Changes) -> Sample:
 
 
 def evaluate_linkage(samples: Sequence[Sample]) -> Evaluation:
-    """Check the number of additional sensors that the parameters require."""
+    """Check that two angle sensors are needed to identify a cylinder with ball joints (Khoshzaban 1992, p. 43)."""
     v = samples[0].values
     check = check_exact(
         "angle sensors needed in addition to the displacement", v["needed"], (2.0, 2.0),
@@ -108,7 +108,16 @@ and whether the noise model is estimated."""
 
 
 def measure_flexibility(seed: int, changes: Changes) -> Sample:
-    """Identify an arm with bent joints, without and with the noise model of flexible joints."""
+    """Identify an arm with bent joints, without and with a noise model of flexible joints.
+
+    Args:
+        seed: seed of poses, bends and sensor errors.
+        changes: changes of `FLEXIBILITY_SETTINGS`.
+
+    Returns:
+        Mean squared length errors [m^2] and coverage of the 95 % intervals of both fits, and the
+        estimated flexibility of grapple and yoke at full load [deg].
+    """
     chosen = merge_settings(FLEXIBILITY_SETTINGS, changes)
     loop = build_loop(load_machine("calibrator"))
     rng = np.random.default_rng([124, seed])
@@ -134,7 +143,7 @@ def measure_flexibility(seed: int, changes: Changes) -> Sample:
 
 
 def evaluate_flexibility(samples: Sequence[Sample]) -> Evaluation:
-    """Check the ratio of the length errors and the coverage of the 95 % intervals."""
+    """Check that the noise model of flexible joints reduces length errors and gives correct 95 % intervals."""
     squares = np.column_stack([collect_values(samples, f"{n}_square") for n in ("modelled", "plain")])
     ratio = check_statistic(
         "RMS error of the lengths, with over without the noise model", squares,

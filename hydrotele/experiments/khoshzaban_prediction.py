@@ -79,9 +79,9 @@ _PSI = 6894.757  # Pa
 def measure_prediction(seed: int, changes: Changes) -> Sample:
     """Identify the complete and the reduced model, and predict the forces of a held-out motion.
 
-    The models are identified with the method of `hydrotele identify`. For comparison they are also
-    identified with the document's method: least squares of all base parameters with an optimal
-    smoother.
+    The complete model includes the cylinders' inertia. The models are identified with the method of
+    `hydrotele identify`. For comparison they are also identified with the document's method: least
+    squares of all base parameters with an optimal smoother.
 
     Args:
         seed: seed of the sensor errors and of the nominal model's errors.
@@ -140,7 +140,7 @@ def measure_prediction(seed: int, changes: Changes) -> Sample:
 def _simulate_records(
     swing_friction: float,
 ) -> tuple[list[IdentificationRecord], list[IdentificationRecord]]:
-    """Simulate records without sensor errors: those for identification and the held-out one."""
+    """Simulate records without sensor errors: several for identification and one held-out record."""
     numbers = f"{{coulomb: {swing_friction}}}"
     friction = f"{{name: coulomb_friction, location: swing, parameters: {numbers}}}"
     own, files = {"sensors": "ideal", "effects": f"[{friction}]"}, []
@@ -159,7 +159,7 @@ def _select_rows(record: IdentificationRecord, rows: int) -> IdentificationRecor
 def _add_errors(
     record: IdentificationRecord, settings: Mapping[str, Any], rng: np.random.Generator
 ) -> IdentificationRecord:
-    """Add uniform errors of angles and pressures to a record."""
+    """Return a record with uniform random errors of joint angles and cylinder pressures added."""
     machine, shape = load_machine("cat215"), record.position.shape
     angle = np.deg2rad(settings["angle_error_deg"])
     pressure = _PSI * settings["pressure_error_psi"]
@@ -175,13 +175,13 @@ def _add_errors(
 
 
 def _differentiate_record(record: IdentificationRecord) -> Motion:
-    """Compute positions, rates and accelerations with the optimal smoother (p. 112)."""
+    """Compute positions, rates and accelerations of a record with the optimal smoother (p. 112)."""
     found = smooth(record.position, record.period, record.position_noise)
     return found.value, found.rate, found.acceleration
 
 
 def _add_model_errors(setup: RegressorSetup, mass_error: float, rng: np.random.Generator) -> RegressorSetup:
-    """Return the nominal model with errors of masses and centres of mass, without friction."""
+    """Return the nominal model with random errors of masses and centres of mass, and without friction."""
     inertia = setup.chain.inertia.copy()
     inertia *= rng.uniform(1.0 - mass_error, 1.0 + mass_error, (len(inertia), 1))
     inertia[:, 1:4] *= rng.uniform(1.0 - mass_error, 1.0 + mass_error, (len(inertia), 1))
@@ -190,9 +190,9 @@ def _add_model_errors(setup: RegressorSetup, mass_error: float, rng: np.random.G
 
 
 def _find_plant_parameters(base: BaseParameters, swing_friction: float) -> np.ndarray:
-    """Return the base parameters (p,) of the simulated machine.
+    """Return the base parameters (p,) of the simulated machine, including its Coulomb friction.
 
-    Unlike Table 13, the simulated machine has Coulomb friction.
+    The machine of Table 13 has no friction.
     """
     machine = load_machine("cat215")
     dry = {
@@ -204,7 +204,7 @@ def _find_plant_parameters(base: BaseParameters, swing_friction: float) -> np.nd
 
 
 def _find_unexplained_fraction(motion: Motion) -> dict[str, float]:
-    """Return the fraction of the cylinders' forces that the reduced model cannot reproduce."""
+    """Return the RMS fraction of the forces due to the cylinders' inertia that the reduced model cannot fit."""
     complete, reduced = find_base("complete"), find_base("reduced")
     table = make_regressor(complete.setup, motion)
     bars = [name.endswith(("_tube", "_rod")) and "coulomb" not in name for name in table.names]
@@ -239,7 +239,7 @@ FORCE_LABELS = tuple(
 
 
 def _check_rms_ratio(samples: Sequence[Sample], one: str, other: str, k: int, accepted, reason):
-    """Return a check of the ratio of two models' RMS errors of drive k over all repetitions."""
+    """Return a check of the ratio of two models' RMS force errors of drive k over all repetitions."""
     drive = DRIVES[k]
     rows = np.array([[s.values[f"{m}.{drive}"] for m in (one, other)] for s in samples])
     return check_statistic(
@@ -250,7 +250,10 @@ def _check_rms_ratio(samples: Sequence[Sample], one: str, other: str, k: int, ac
 
 
 def evaluate_reduced_model(samples: Sequence[Sample]) -> Evaluation:
-    """Check that the complete model is better by at least half of the published gain."""
+    """Check that the complete model predicts forces better than the reduced one.
+
+    For swing and stick, at least half of the published gain is required.
+    """
     checks = []
     for k in range(3):
         ratio = PUBLISHED_RMS["reduced"][k] / PUBLISHED_RMS["complete"][k]
@@ -274,7 +277,7 @@ def evaluate_reduced_model(samples: Sequence[Sample]) -> Evaluation:
 
 
 def _describe_rms_errors(samples: Sequence[Sample]) -> str:
-    """Return the RMS errors of all models as text."""
+    """Return the RMS force errors of all models as text."""
     parts = []
     for model in samples[0].values:
         name, _, drive = model.rpartition(".")
@@ -285,7 +288,10 @@ def _describe_rms_errors(samples: Sequence[Sample]) -> str:
 
 
 def evaluate_nominal_model(samples: Sequence[Sample]) -> Evaluation:
-    """Check that the nominal model is worse by half of the smallest published excess."""
+    """Check that the nominal model predicts forces worse than the identified complete model.
+
+    Each drive must reach at least half of the smallest published excess.
+    """
     ratios = np.divide(PUBLISHED_RMS["nominal"], PUBLISHED_RMS["complete"])
     checks = tuple(
         _check_rms_ratio(
@@ -304,7 +310,10 @@ def evaluate_nominal_model(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_sensor_accuracy(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the complete model's errors with the sensors' accuracy."""
+    """Check that the force errors of the complete model are almost within the accuracy of the sensors.
+
+    The limit is the largest published ratio that the document calls almost within.
+    """
     ratios = np.divide(PUBLISHED_RMS["complete"], SENSOR_ACCURACY)
     checks = [
         check_mean(
@@ -319,7 +328,7 @@ def evaluate_sensor_accuracy(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_parameter_errors(samples: Sequence[Sample]) -> Evaluation:
-    """Check that most estimates have errors above the size of the parameter."""
+    """Check that most identified base parameters have errors larger than the parameter itself."""
     check = check_mean(
         "fraction of base parameters with estimation errors above the parameter's size",
         np.array([s.values["unrealistic"] for s in samples]), (0.5, 1.0),
@@ -330,7 +339,10 @@ def evaluate_parameter_errors(samples: Sequence[Sample]) -> Evaluation:
 
 
 def describe_motions(samples: Sequence[Sample]) -> Evaluation:
-    """Describe the joint angles; only the axes of the published figures are legible."""
+    """Return a note on the joint angles of the identification and held-out motions, without a verdict.
+
+    Only the axes of the published figures are legible.
+    """
     angles = {panel.label: panel.curves for panel in samples[0].panels}
     ranges = "; ".join(
         f"{label}: " + ", ".join(f"{d} {v.min():.0f} to {v.max():.0f}" for d, v in curves.items())

@@ -97,7 +97,7 @@ SYMBOLS = tuple(one.symbol for one in PUBLISHED_PARAMETERS)
 
 @dataclass(frozen=True)
 class Robot:
-    """The model of the robot and its parameters in the order of Table 2.
+    """The model of the robot PaLiDA and its parameters in the order of Table 2.
 
     Attributes:
         mechanism: mechanism as loaded by `hydrotele identify --mjcf`, with equal legs and 19
@@ -118,7 +118,11 @@ class Robot:
         return self.mechanism.setup
 
     def matrix(self, motion: np.ndarray) -> np.ndarray:
-        """Return the regressor (n, 6, 24) of Table 2's parameters along a motion (3, n, 6)."""
+        """Compute the regressor (n, 6, 24): drive forces per parameter of Table 2.
+
+        Args:
+            motion: (3, n, 6) poses, rates and accelerations.
+        """
         out, start = [], None
         for first in range(0, motion.shape[1], _MAX_ROWS):
             some = motion[:, first : first + _MAX_ROWS]
@@ -145,7 +149,10 @@ def merge_settings(defaults: Changes, changes: Changes) -> dict[str, Any]:
 
 
 def draw_states() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Draw poses, rates and accelerations (100, 6) that excite all parameters, with fixed seed."""
+    """Draw 100 random poses, rates and accelerations, each (100, 6), that excite all parameters.
+
+    The seed is fixed.
+    """
     rng = np.random.default_rng(0)
     poses = 0.5 * (POSE_LOW + POSE_HIGH)
     poses = poses + 0.4 * (POSE_HIGH - POSE_LOW) * rng.uniform(-1.0, 1.0, (100, 6))
@@ -154,7 +161,7 @@ def draw_states() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @cache
 def load_robot() -> Robot:
-    """Load the shipped model and find its base parameters from 100 random states."""
+    """Load the shipped robot model and find its base parameters from 100 random states."""
     folder = models_folder() / "palida"
     mechanism = load_mechanism(folder / "palida.xml", folder / "columns.yaml")
     setup = mechanism.setup
@@ -190,7 +197,7 @@ def load_excitation() -> Excitation:
 
 
 def make_drive_limits() -> DriveLimits:
-    """Return the limits of pose and drives for the design of motions."""
+    """Return the limits of pose, stroke, speed and acceleration for the design of motions."""
     return DriveLimits(
         load_robot().setup,
         POSE_LOW,
@@ -220,7 +227,12 @@ class RepeatedMotion(NamedTuple):
 
 
 def simulate_motion(motion: np.ndarray, period: float) -> RepeatedMotion:
-    """Compute leg lengths and drive forces along one period of a motion (3, n, 6)."""
+    """Compute leg lengths, regressor and drive forces along one period of a motion.
+
+    Args:
+        motion: (3, n, 6) poses, rates and accelerations.
+        period: length of the period [s].
+    """
     own = load_robot()
     matrix = own.matrix(motion)
     return RepeatedMotion(period, motion, own.compute_leg_lengths(motion[0]), matrix, matrix @ own.truth)
@@ -228,14 +240,14 @@ def simulate_motion(motion: np.ndarray, period: float) -> RepeatedMotion:
 
 @cache
 def simulate_excitation() -> RepeatedMotion:
-    """Simulate the designed excitation at `SAMPLE_RATE`."""
+    """Compute leg lengths and drive forces along the designed excitation motion at `SAMPLE_RATE`."""
     motion = load_excitation()
     time = np.arange(round(motion.period * SAMPLE_RATE)) / SAMPLE_RATE
     return simulate_motion(motion.evaluate(time), motion.period)
 
 
 def draw_force_noise(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-    """Draw force noise (*shape, 6) [N] with covariance `compute_force_covariance`."""
+    """Draw random force noise (*shape, 6) of the drives [N] with covariance `compute_force_covariance`."""
     return rng.standard_normal((*shape, 6)) @ np.linalg.cholesky(compute_force_covariance()).T
 
 
@@ -254,7 +266,7 @@ def simulate_measurement(
         length_noise: standard deviation of a measured leg length [m].
 
     Returns:
-        A record of leg lengths and drive forces.
+        A record of measured leg lengths [m] and drive forces [N].
     """
     n = len(cycle.length) * periods
     error = length_noise * rng.standard_normal((n, 6))
@@ -276,7 +288,7 @@ _ACCELERATION_TIME = 1.0  # time to reach full speed on a circle [s]
 
 
 def compute_control_gains() -> tuple[float, float]:
-    """Return the stiffness [N/m] and damping [N s/m] of every drive's controller."""
+    """Return the proportional gain [N/m] and the damping gain [N s/m] of every drive's controller."""
     turn = 2.0 * np.pi * BANDWIDTH
     return DRIVE_MASS * turn**2, 2.0 * DAMPING_RATIO * DRIVE_MASS * turn
 

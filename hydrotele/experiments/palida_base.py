@@ -1,7 +1,9 @@
 """Base parameters of PaLiDA by three methods: Table 1, regrouping rules, and null space.
 
-Table 1 lists ten combinations. The rules of section 2.1 regroup the parameters body by body and
-need only the geometry. The null space of the regressor needs random states and no rules.
+Base parameters are the minimal combinations of body parameters that determine the drive forces.
+Table 1 of Abdellatif 2008 lists ten combinations. The rules of section 2.1 regroup the parameters
+body by body and need only the geometry. The null space of the regressor needs random states and no
+rules.
 """
 
 from collections.abc import Iterator, Sequence
@@ -35,7 +37,7 @@ precision.
 
 
 class Relation(NamedTuple):
-    """A regressor column that is a linear combination of other columns, by (10).
+    """A linear dependence of one regressor column on other columns, Abdellatif 2008, (10).
 
     Attributes:
         parameter: parameter of the column, such as `inertia_yy.stator_1`.
@@ -119,13 +121,20 @@ def list_relations(chain: Chain, platform_rule: bool = True) -> Iterator[Relatio
 
 
 def _name_weights(matrix: np.ndarray, kind: str, body: str, *more: str) -> dict[str, float]:
-    """Return the weights of the parent's parameters for a parameter, or a sum, of the body."""
+    """Return the coefficients by which parameters of the parent body replace a body's parameter, or a sum.
+
+    Args:
+        matrix: (10, 10) transformation from the body's to the parent's parameters.
+        kind: parameter of the body.
+        body: name of the parent body.
+        *more: parameters added to `kind`.
+    """
     column = matrix[:, [_KINDS.index(one) for one in (kind, *more)]].sum(axis=1)
     return {f"{k}.{body}": float(c) for k, c in zip(_KINDS, column, strict=True) if abs(c) > 1e-12}
 
 
 def regroup_parameters(names: Sequence[str], relations: Iterator[Relation]) -> np.ndarray:
-    """Return the regrouped parameters as combinations of all parameters, by (11).
+    """Apply relations one after the other, to express regrouped parameters by all parameters, (11).
 
     Args:
         names: names of the m inertial parameters.
@@ -145,7 +154,7 @@ def regroup_parameters(names: Sequence[str], relations: Iterator[Relation]) -> n
 
 
 def list_table_1(joints: np.ndarray) -> dict[str, dict[str, float]]:
-    """Return the ten combinations of Table 1 with the parameter names of the model's first leg.
+    """Return the ten combinations of Abdellatif 2008, Table 1, with parameter names of the model's first leg.
 
     Args:
         joints: (6, 3) positions of the platform joints r_B in the platform's frame [m].
@@ -184,7 +193,7 @@ in Table 1.
 
 
 def measure_structure(seed: int, changes: Changes) -> Sample:
-    """Find the base parameters by all three methods and compare them.
+    """Find the base parameters by printed table, regrouping rules and null space, and compare the results.
 
     Args:
         seed: not used.
@@ -236,7 +245,11 @@ def measure_structure(seed: int, changes: Changes) -> Sample:
 
 
 def _compute_singular_values(matrix: np.ndarray) -> np.ndarray:
-    """Return relative singular values of the nonzero columns (n, k, m), scaled to unit length."""
+    """Return the singular values of a regressor over the largest one.
+
+    Args:
+        matrix: (n, k, m) regressor; its nonzero columns are scaled to unit length.
+    """
     rows = matrix.reshape(-1, matrix.shape[2])
     length = np.linalg.norm(rows, axis=0)
     kept = length > MAX_ROUNDING
@@ -245,7 +258,7 @@ def _compute_singular_values(matrix: np.ndarray) -> np.ndarray:
 
 
 def _reduce_inertial(table: Regressor) -> tuple[Identifiability, list[int]]:
-    """Return the base of the inertial columns, and their indices in the regressor."""
+    """Find the base parameters of the inertial columns; return them and the columns' indices."""
     kept = [k for k, name in enumerate(table.names) if name.partition(".")[0] in _KINDS]
     names, units = [table.names[k] for k in kept], [table.units[k] for k in kept]
     rows = table.matrix[:, :, kept].reshape(-1, len(kept))
@@ -254,7 +267,7 @@ def _reduce_inertial(table: Regressor) -> tuple[Identifiability, list[int]]:
 
 
 def _build_sum_matrix(bodies: Sequence[str], names: Sequence[str], equal_bodies: Sequence[Sequence[str]]) -> np.ndarray:
-    """Return the matrix (190, m) from the m distinct parameters to those of all bodies."""
+    """Return the matrix (190, m) that copies m distinct parameters to all bodies with equal parameters."""
     first = {body: group[0] for group in equal_bodies for body in group}
     sums = np.zeros((len(bodies), len(names)))
     for k, name in enumerate(bodies):
@@ -266,10 +279,14 @@ def _build_sum_matrix(bodies: Sequence[str], names: Sequence[str], equal_bodies:
 
 
 def _find_largest_difference(rules: np.ndarray, structure: Identifiability) -> float:
-    """Return the largest difference of coefficients between rules (r, m) and null space.
+    """Return the largest difference of coefficients between regrouping rules and null space.
 
     The null space may represent the same combinations by other members, so that the rules are first
     solved for its representatives. The result is infinite if the numbers of combinations differ.
+
+    Args:
+        rules: (r, m) combinations by the rules.
+        structure: base parameters from the null space.
     """
     if len(rules) != len(structure.base):
         return np.inf
@@ -278,7 +295,7 @@ def _find_largest_difference(rules: np.ndarray, structure: Identifiability) -> f
 
 
 def _compare_with_table_1(structure: Identifiability, printed: dict[str, dict[str, float]]) -> dict[str, float]:
-    """Count the parameters, and the combinations whose coefficients agree with Table 1."""
+    """Count the base parameters, and the combinations whose coefficients agree with Table 1."""
     names, same = [structure.names[k] for k in structure.base], 0
     for symbol, members in printed.items():
         column = PUBLISHED_PARAMETERS[SYMBOLS.index(symbol)].column
@@ -293,7 +310,7 @@ def _compare_with_table_1(structure: Identifiability, printed: dict[str, dict[st
 
 
 def evaluate_table_1(samples: Sequence[Sample]) -> Evaluation:
-    """Compare number and members of the base parameters with Table 1."""
+    """Compare number, members and coefficients of the base parameters with Abdellatif 2008, Table 1."""
     values = samples[0].values
     return Evaluation(
         (
@@ -311,7 +328,7 @@ def evaluate_table_1(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_regrouping_rules(samples: Sequence[Sample]) -> Evaluation:
-    """Compare number and coefficients of the regrouped parameters with the null space."""
+    """Check that the regrouping rules give the same base parameters as the null space of the regressor."""
     values, checks = samples[0].values, []
     for stage in _BODY_ASSUMPTIONS:
         rank = values[f"rank, {stage}"]
@@ -325,7 +342,7 @@ def evaluate_regrouping_rules(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_parameter_values(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the model's base parameters with the printed estimates."""
+    """Check that the model's base parameters equal the estimates of Abdellatif 2008, Table 2."""
     worst = float(collect_values(samples, "values").max())
     check = check_exact("largest difference from the estimates of Table 2", worst, (0.0, 1e-9),
                         "rounding of the decimals in the MJCF", unit="SI")  # fmt: skip

@@ -9,7 +9,7 @@ from hydrotele.scenario.scenario import Scenario, load_scenario
 
 
 def run_shipped(name: str, overrides: Mapping[str, str] | None = None) -> tuple[Scenario, Run]:
-    """Run a shipped scenario with changed values.
+    """Simulate a scenario that is shipped with the package, with changed settings.
 
     Args:
         name: name of the scenario.
@@ -23,12 +23,15 @@ def run_shipped(name: str, overrides: Mapping[str, str] | None = None) -> tuple[
 
 
 def read_true_channel(run: Run, channel: str) -> np.ndarray:
-    """Return the (n,) samples of a truth channel, or zeros if the run has no such channel."""
+    """Return the (n,) samples of a channel of the simulated truth, or zeros if the run has no such channel."""
     return run.truth.columns.get(channel, np.zeros(len(run.truth.time)))
 
 
 def compute_cylindrical_pose(run: Run) -> dict[str, np.ndarray]:
-    """Return the true tip pose: r, z [m], theta and attitude [rad], each (n,)."""
+    """Return the true tip pose over time: r, z [m], theta and attitude [rad], each (n,).
+
+    r and theta are cylindrical coordinates about the swing axis.
+    """
     x, y, z = (read_true_channel(run, f"truth.tip.{c}") for c in "xyz")
     arm = run.plant.machine.arm
     assert arm is not None
@@ -39,7 +42,7 @@ def compute_cylindrical_pose(run: Run) -> dict[str, np.ndarray]:
 
 
 def make_operator_changes(seed: int) -> dict[str, str]:
-    """Return scenario changes that draw an operator of the published population and set the seed.
+    """Return scenario settings that draw a random operator of the published population and set the seed.
 
     Args:
         seed: seed of the operator and of the sensor noise.

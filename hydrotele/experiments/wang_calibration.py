@@ -54,7 +54,7 @@ POSE_LABEL = "pose [1]"
 
 
 def _draw_errors(label: str, before: np.ndarray, after: np.ndarray) -> Panel:
-    """Draw errors before and after calibration; the latter also have a separate axis."""
+    """Draw errors before and after calibration; those after it also have an axis of their own."""
     return Panel(
         label, np.arange(1, len(before) + 1), {"before": 1e3 * before, "after": 1e3 * after},
         POSE_LABEL, discrete=True, errors={"after": 1e3 * after}, error_label=label,
@@ -74,7 +74,7 @@ def _describe_change(samples: Sequence[Sample], name: str, unit: str = "mm") -> 
 
 
 def measure_refined_model(seed: int, changes: Changes) -> Sample:
-    """Calibrate a robot with errors in the 36 parameters by least squares from 25 poses.
+    """Calibrate the 36 parameters of a robot's refined D-H model by least squares from 25 poses.
 
     Args:
         seed: seed of the robot and the noise.
@@ -83,8 +83,8 @@ def measure_refined_model(seed: int, changes: Changes) -> Sample:
             noise factor of the measurement without noise.
 
     Returns:
-        RMS position errors at test poses, fraction of errors inside their intervals, and largest
-        parameter error without noise.
+        RMS position errors at test poses [m], fraction of true errors inside their 95 % intervals, and
+        largest parameter error without noise.
     """
     settings = merge_settings({"document": True, "noise": 1.0, "stated_noise": 1.0, "exact_noise": 0.0}, changes)
     nominal = load_hybrid("iwr")
@@ -148,14 +148,14 @@ def _evaluate_exact_readings(samples: Sequence[Sample]) -> Evaluation:
 
 
 def measure_poe_model(seed: int, changes: Changes) -> Sample:
-    """Calibrate a robot with errors in all 54 parameters of the POE model from 25 poses.
+    """Calibrate all 54 parameters of a robot's product-of-exponentials (POE) model from 25 poses.
 
     Args:
         seed: seed of the robot and the noise.
         changes: `noise`: factor of the sensor noise.
 
     Returns:
-        Rank, RMS position errors at measured and test poses, and RMS parameter errors.
+        Rank, RMS position errors at measured and test poses [m], and RMS parameter errors.
     """
     settings = merge_settings({"noise": 1.0}, changes)
     nominal = load_hybrid("iwr")
@@ -214,7 +214,8 @@ def measure_wire_calibration(seed: int, changes: Changes) -> Sample:
         changes: `noise`: factor of the sensor noise.
 
     Returns:
-        Leg, pose and parameter errors, and errors of positions commanded by inverse kinematics.
+        Errors of legs, poses and parameters before and after calibration, and errors of positions that
+        are commanded by inverse kinematics.
     """
     settings = merge_settings({"noise": 1.0}, changes)
     nominal = load_hybrid("iwr")
@@ -255,10 +256,10 @@ def measure_wire_calibration(seed: int, changes: Changes) -> Sample:
 
 
 def _reach_desired_poses(simulated: SimulatedRobot, robot: HybridRobot) -> np.ndarray:
-    """Return the position errors when a model's inverse kinematics command the true robot.
+    """Return the position errors of the true robot when a model's inverse kinematics commands it.
 
     Args:
-        simulated: true robot with its test commands.
+        simulated: true robot with its M test commands.
         robot: model that computes the commands.
 
     Returns:
@@ -298,15 +299,15 @@ def _describe_range(name: str, words: str):
 
 
 def measure_wire_method(seed: int, changes: Changes) -> Sample:
-    """Compute poses from exact and from noisy wire lengths.
+    """Measure the errors of platform poses that are computed from exact and from noisy wire lengths.
 
     Args:
         seed: seed of poses and noise.
         changes: `noise`: factor of the wires' noise.
 
     Returns:
-        Largest pose error with exact lengths; with noisy lengths, the normalized squared pose error
-        and median position and orientation errors.
+        Largest pose error with exact lengths; with noisy lengths, the squared pose error over its
+        expectation, and median errors of position [m] and orientation [rad].
     """
     settings = merge_settings({"noise": 1.0}, changes)
     robot, wires, rng = load_hybrid("iwr"), default_wires(), np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""Wang 2012, chapter 4: parameter redundancy, differential evolution (DE) and MCMC."""
+"""Wang 2012, chapter 4: redundant parameters, differential evolution (DE), and posterior sampling (MCMC)."""
 
 from collections.abc import Sequence
 
@@ -80,7 +80,7 @@ def _select_samples(posterior: Posterior) -> np.ndarray:
 
 
 def measure_redundancy(seed: int, changes: Changes) -> Sample:
-    """Sample the posterior of the 54 parameters, and compare it with the null space by QR.
+    """Compare the sampled posterior of the 54 parameters with the null space of the Jacobian by QR.
 
     The prior is normal with the standard deviations of the manufacturing errors. Along a parameter
     direction with singular value s of the scaled Jacobian, the posterior standard deviation is
@@ -186,7 +186,7 @@ REFINED_NAMES = ("a4", "theta4", "b1x", "b6z")
 
 
 def measure_refined_posterior(seed: int, changes: Changes) -> Sample:
-    """Sample the posterior of the 36 parameters, and compare it with least squares.
+    """Compare the sampled posterior of the 36 refined parameters with their least-squares estimate.
 
     Args:
         seed: seed of robot, noise and chains.
@@ -242,7 +242,7 @@ def _evaluate_refined_posterior(samples: Sequence[Sample]) -> Evaluation:
 
 
 def measure_rank(seed: int, changes: Changes) -> Sample:
-    """Count independent parameters, and calibrate 36 or all parameters of a robot.
+    """Count the independent parameters of the error models, and calibrate 36 or all parameters of a robot.
 
     All 54 parameters of the robot have errors.
 
@@ -251,7 +251,7 @@ def measure_rank(seed: int, changes: Changes) -> Sample:
         changes: `tilt`: largest tilt of the platform [rad].
 
     Returns:
-        Ranks, singular values, and RMS position errors at test poses.
+        Ranks of the Jacobians, singular values, and RMS position errors at test poses [m].
     """
     settings = merge_settings({"tilt": PLATFORM_TILT}, changes)
     nominal, simulated = load_hybrid("iwr"), simulate_robot(600 + seed, 25, refined_only=False)

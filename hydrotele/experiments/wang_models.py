@@ -54,7 +54,9 @@ MAX_ROUNDING = 1e-9  # [m] or [rad]: below the resolution of any sensor, above r
 
 
 def measure_kinematics(seed: int, changes: Changes) -> Sample:
-    """Compare the product of the D-H matrices with Wang 2012, Eq. 7, and count the parameter errors.
+    """Compare the carriage's D-H matrices with the printed position, Wang 2012, Eq. 7.
+
+    The parameter errors of carriage and hexapod are counted as well.
 
     Args:
         seed: seed of the poses.
@@ -62,7 +64,7 @@ def measure_kinematics(seed: int, changes: Changes) -> Sample:
             joint.
 
     Returns:
-        Largest difference [m], and counts of parameter errors.
+        Largest difference of a coordinate [m], and counts of parameter errors.
     """
     settings = merge_settings({"third_twist": 0.5 * np.pi, "second_joint": "prismatic"}, changes)
     robot, rng = load_hybrid("iwr"), np.random.default_rng(seed)
@@ -108,7 +110,9 @@ _BALL: JointKind = "spherical"
 
 
 def build_hybrid_robot(straight: bool) -> Mechanism:
-    """Build the IWR: a measured PPRR carriage in series with a hexapod of six S-P-S legs.
+    """Build the robot IWR: a measured PPRR carriage in series with a hexapod of six S-P-S legs.
+
+    P, R and S are prismatic, revolute and spherical joints.
 
     Args:
         straight: whether the slide axes pass through both spherical joints, as in Wang Eq. 27.
@@ -139,7 +143,7 @@ _SERIAL_ROBOTS: dict[str, tuple[JointKind, ...]] = {
 
 
 def measure_parameter_counts(seed: int, changes: Changes) -> Sample:
-    """Compare parameter counts by Eqs 4 and 5 with ranks of identification Jacobians.
+    """Compare parameter counts by the formulas of Wang 2012, Eqs 4 and 5, with ranks of Jacobians.
 
     Args:
         seed: seed of dimensions and poses.
@@ -147,7 +151,7 @@ def measure_parameter_counts(seed: int, changes: Changes) -> Sample:
             poses.
 
     Returns:
-        Count and rank of every mechanism.
+        Count by the formula and rank of the identification Jacobian of every mechanism.
     """
     settings = merge_settings({"locked_joints": 0, "poses": 30}, changes)
 
@@ -193,7 +197,7 @@ def _evaluate_hexapod(samples: Sequence[Sample]) -> Evaluation:
 
 
 def measure_first_order(seed: int, changes: Changes) -> Sample:
-    """Compute the second-order position error of the carriage's end.
+    """Compute the position error of the carriage's end that a first-order error model leaves.
 
     Args:
         seed: seed of errors and poses.
@@ -250,14 +254,16 @@ def _evaluate_error_growth(samples: Sequence[Sample]) -> Evaluation:
 
 
 def measure_proportionality(seed: int, changes: Changes) -> Sample:
-    """Compute the change of D-H and POE parameters if the second of two axes is tilted.
+    """Compute how much the D-H and POE parameters change when the second of two axes is tilted.
+
+    A model is proportional if a small tilt changes its parameters by a proportional amount.
 
     Args:
         seed: seed of the geometry.
         changes: `parallel`: whether the axes are parallel before the tilt, else perpendicular.
 
     Returns:
-        Exponents of the change over tilts of 0.1 to 10 mrad.
+        Exponents of the change over tilts of 0.1 to 10 mrad; 1 is proportional.
     """
     settings = merge_settings({"parallel": True}, changes)
     rng = np.random.default_rng(seed)
@@ -299,14 +305,16 @@ def _evaluate_proportionality(samples: Sequence[Sample]) -> Evaluation:
 
 
 def measure_forward_kinematics(seed: int, changes: Changes) -> Sample:
-    """Solve the forward kinematics at one pose by DE, Newton's method and the MuJoCo mechanism.
+    """Compare solutions of the forward kinematics by DE, Newton's method and the MuJoCo mechanism.
+
+    DE is differential evolution. One random pose is solved.
 
     Args:
         seed: seed of pose and search.
-        changes: `reach`: half the width of DE's search region.
+        changes: `reach`: half the width of DE's search region [m].
 
     Returns:
-        Differences of DE, MuJoCo and inverse kinematics from Newton's method.
+        Differences of DE, MuJoCo and inverse kinematics from Newton's method [m] or [rad].
     """
     settings = merge_settings({"reach": 0.35}, changes)
     robot, rng = load_hybrid("iwr"), np.random.default_rng(seed)

@@ -72,12 +72,14 @@ class SimulatedRobot(NamedTuple):
 def simulate_robot(
     seed: int, poses: int, kind: ErrorModelKind = "dh", refined_only: bool = True, noise: float = 1.0,
 ) -> SimulatedRobot:  # fmt: skip
-    """Simulate a robot with errors of 1 mm and 1 mrad (standard deviations) and measure it.
+    """Simulate a robot with manufacturing errors and measure its poses with wires.
+
+    The errors have standard deviations of 1 mm and 1 mrad.
 
     Args:
         seed: seed of errors, poses and noise.
         poses: number of poses for the calibration.
-        kind: kind of the error model.
+        kind: kind of the error model, D-H or POE.
         refined_only: whether only the 36 parameters of the document's refined model have errors.
         noise: factor of `SENSOR_NOISE`; 0 for exact measurements.
 
@@ -99,7 +101,7 @@ def simulate_robot(
 
 
 def measure_nominal_robot(poses: int, seed: int, tilt: float = PLATFORM_TILT) -> Measurement:
-    """Measure the nominal robot without sensor noise.
+    """Simulate a measurement of the nominal robot without sensor noise.
 
     Args:
         poses: number of poses.
@@ -116,7 +118,11 @@ def measure_nominal_robot(poses: int, seed: int, tilt: float = PLATFORM_TILT) ->
 
 
 def compute_test_errors(simulated: SimulatedRobot, robot: HybridRobot) -> tuple[np.ndarray, np.ndarray]:
-    """Return the errors of a model's forward kinematics at the test poses.
+    """Return the pose errors of a calibrated model at the M held-out poses of a simulated robot.
+
+    Args:
+        simulated: true robot with its held-out commands.
+        robot: model whose forward kinematics is tested.
 
     Returns:
         ((M,) position errors [m], (M,) orientation errors [rad]).
@@ -129,7 +135,10 @@ def compute_test_errors(simulated: SimulatedRobot, robot: HybridRobot) -> tuple[
 
 
 def count_covered_errors(seed: int) -> tuple[int, int]:
-    """Count the true errors within the 95 % intervals of least squares.
+    """Count how many true parameter errors lie within the 95 % intervals of a least-squares calibration.
+
+    Args:
+        seed: seed of the simulated robot.
 
     Returns:
         (number inside, number of parameters).
@@ -163,12 +172,12 @@ Drawing = Callable[[Sequence[Sample]], tuple[tuple[Panel, ...], Marginals | None
 
 @dataclass(frozen=True)
 class DrawnClaim(Claim):
-    """A claim whose curves are computed by `draw` from all samples."""
+    """A claim whose curves are computed from all samples by the function `draw`."""
 
     draw: Drawing | None = None
 
     def compare(self, samples: Sequence[Sample]) -> Comparison:
-        """Evaluate the claim and draw its curves."""
+        """Evaluate the claim, and replace its curves by those that `draw` computes."""
         row = super().compare(samples)
         panels, marginals = self.draw(samples) if self.draw else ((), None)
         return row._replace(panels=panels, marginals=marginals)
@@ -178,7 +187,7 @@ def make_caption_claim(
     name: str, item: str, quote: str, note: Callable[[Sequence[Sample]], str],
     draw: Drawing | None = None,
 ) -> Claim:  # fmt: skip
-    """Return a claim for a table or figure of which only the caption is available.
+    """Return a claim without verdict for a table or figure of which only the caption is available.
 
     Args:
         name: name of the claim.

@@ -1,8 +1,9 @@
 """Zhu 1994, 6.3.3: false endpoint force that a model estimates from pressures in free motion.
 
-Both models are identified from logs of the feller-buncher's sensors. The static model is identified
-by least squares from slow moves, as in the thesis (6.1.3); the dynamic model is identified from an
-excitation motion. The identification starts from a machine with wrong masses and friction.
+Without contact the true endpoint force is zero. Both models are identified from logs of the
+feller-buncher's sensors. The static model (gravity only) is identified by least squares from slow
+moves, as in the thesis (6.1.3); the dynamic model is identified from an excitation motion. The
+identification starts from a machine with wrong masses and friction.
 """
 
 import tempfile
@@ -48,7 +49,7 @@ def _perturb_machine(machine: Machine) -> Machine:
 
 @cache
 def identify_models(seed_offset: int) -> tuple[Machine, GravityModel]:
-    """Identify the feller-buncher and its static model from logs of simulated sensors.
+    """Identify the feller-buncher's dynamic and static model from logs of simulated sensors.
 
     Args:
         seed_offset: number added to the seeds of the logs.
@@ -74,7 +75,7 @@ def identify_models(seed_offset: int) -> tuple[Machine, GravityModel]:
 
 
 def measure_false_force(seed: int, changes: Changes) -> Sample:
-    """Estimate the endpoint force in free motion with the static and the dynamic model.
+    """Estimate the endpoint force in free motion, where it is zero, with the static and the dynamic model.
 
     The machine is at rest and then follows joint steps or joystick steps.
 

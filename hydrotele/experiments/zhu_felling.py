@@ -33,7 +33,7 @@ _EVENT_WORDS = {"cut": "is cut", "held": "holds", "let_go": "lets"}
 
 
 def measure_felling(seed: int, changes: Changes) -> Sample:
-    """Simulate contact with a tree, sawing, grabbing and laying down.
+    """Simulate felling a tree: contact of the head with the stem, sawing, grabbing and laying down.
 
     `touched` is the time of the first contact of 0.5 kN or more between head and stem; contact with
     the stump does not count. The scenario's first saw button starts the saw.
@@ -43,7 +43,8 @@ def measure_felling(seed: int, changes: Changes) -> Sample:
         changes: scenario keys.
 
     Returns:
-        Event times, contact forces, joystick stiffness and final pose of the stem.
+        Event times [s], contact forces [N], joystick stiffness [N/m], and attitude and swing angle of
+        the head when it lets go of the stem [deg].
     """
     scenario, run = run_shipped("fell_tree", make_operator_changes(seed) | dict(changes))
     pose, time, m = compute_cylindrical_pose(run), run.truth.time, run.measured
@@ -176,17 +177,17 @@ _SOFT_SOIL = "[{kind: plate, position: [6.8, 0.0, 0.3], size: [1.0, 1.0], stiffn
 
 
 def _compute_tipping_fraction(run: Run, facts: TipOver) -> np.ndarray:
-    """Return the moment of the contact force as a fraction of the tipping moment, (n,)."""
+    """Return the moment of the vertical contact force as a fraction of that which tips the machine, (n,)."""
     pose, force = compute_cylindrical_pose(run), read_true_channel(run, "truth.contact_force.z")
     pairs = zip(pose["r"], force, strict=True)
     return np.array([tipping_ratio(facts, r, f) for r, f in pairs])
 
 
 def measure_pushing(seed: int, changes: Changes) -> Sample:
-    """Push the feller-buncher's head down with constant hand force, with and without reflection.
+    """Simulate an operator who pushes the feller-buncher's head down with constant hand force.
 
-    The hand keeps the force that displaces the handle by 3.5 mm. Further conditions are softer
-    ground and a stiff hand that keeps its position instead of its force.
+    The run is repeated without force reflection, on softer ground, and with a stiff hand that keeps its
+    position instead of its force. The hand force is that which displaces the handle by 3.5 mm.
 
     Args:
         seed: seed of operator and sensor noise.
@@ -254,7 +255,9 @@ def _evaluate_tip_over(samples: Sequence[Sample]) -> Evaluation:
 
 
 def measure_protection(seed: int, changes: Changes) -> Sample:
-    """Press with a target force of 60 kN, which tips the machine, with and without added spring.
+    """Simulate pressing with a target force of 60 kN, with and without the added tip-over spring.
+
+    Without this spring in the joystick, the force tips the machine.
 
     Args:
         seed: seed of operator and sensor noise.

@@ -48,7 +48,7 @@ _PUBLISHED_FORCE_RATIO = _PUBLISHED_HAND_FORCE / _TARGET_FORCE
 
 
 def find_task(scenario: Scenario) -> RegulateForce | TrackForce:
-    """Return the task of the scenario's operator, which contains the target force."""
+    """Return the force task of a scenario's operator model, which contains the target force over time."""
     assert isinstance(scenario.pilot, TeleopPilot)
     behaviour = scenario.pilot.operator
     assert isinstance(behaviour, RegulateForce | TrackForce)
@@ -69,19 +69,22 @@ def _draw_panels(scenario: Scenario, run: Run, title: str = "") -> tuple[Panel, 
 
 
 def _compute_line_error(x: np.ndarray, force: np.ndarray, slope: np.ndarray | float) -> float:
-    """Return the RMS deviation of a force from slope times displacement, relative to its RMS."""
+    """Return the RMS deviation of a force from slope times displacement, over the RMS force [1]."""
     return float(np.sqrt(np.mean((force - slope * x) ** 2) / np.mean(force**2)))
 
 
 def measure_stiffness_feedback(seed: int, changes: Changes) -> Sample:
-    """Hold 20 kN and then 35 kN with the joystick's stiffness as the only force feedback.
+    """Simulate an operator who holds 20 kN and then 35 kN and feels only the joystick's stiffness.
+
+    The stiffness changes with the contact force.
 
     Args:
         seed: seed of operator and sensor noise.
         changes: scenario keys.
 
     Returns:
-        Held forces [N], relative errors, and deviations of the hand force from proportionality.
+        Held forces [N], errors relative to the targets, and deviations of the hand force from
+        proportionality to the handle's displacement.
     """
     keys = make_operator_changes(seed) | _FORCE_ESTIMATE_CHANGES | dict(changes)
     scenario, run = run_shipped("press_stiffness", keys)
@@ -108,15 +111,16 @@ def measure_stiffness_feedback(seed: int, changes: Changes) -> Sample:
 
 
 def measure_direct_feedback(ratio: float, seed: int, changes: Changes) -> Sample:
-    """Hold 25 kN with direct force feedback.
+    """Simulate an operator who holds 25 kN while the contact force is reflected to the hand.
 
     Args:
-        ratio: hand force over contact force [N/N].
+        ratio: reflected hand force over contact force [N/N].
         seed: seed of operator and sensor noise.
         changes: scenario keys.
 
     Returns:
-        Mean forces [N], ripple, and handle displacements [m] in the last 40 % of the run.
+        Mean forces [N], ripple (standard deviation over mean), and handle displacements [m] in the last
+        40 % of the run.
     """
     keys = {
         "pilot.ratio": str(ratio), "pilot.operator.target.force": f"[{_TARGET_FORCE}]"
@@ -223,7 +227,7 @@ _SEARCH_ERROR = 1.2  # uncertainty factor of the limit after the halvings
 
 
 def search_limit(number: int, changes: Changes) -> Sample:
-    """Search for the largest stable ratio of direct feedback under a condition, to 20 %.
+    """Search for the largest stable ratio of hand force to contact force in direct feedback, to 20 %.
 
     Args:
         number: number of the condition in `FEEDBACK_CONDITIONS`, from 1 on.
@@ -249,7 +253,7 @@ def search_limit(number: int, changes: Changes) -> Sample:
 
 
 def _is_stable(ratio: float, keys: Changes) -> bool:
-    """Return whether the handle stays within twice its dead band in the last 40 % of the run."""
+    """Return whether direct feedback keeps the handle within twice its dead band in the last 40 % of a run."""
     values = measure_direct_feedback(ratio, 1, keys).values
     return values["max_displacement"] < 2.0 * _DEADBAND
 
@@ -316,7 +320,7 @@ _MIN_IMPROVEMENT = 2.0  # error ratio
 
 
 def measure_tracking(seed: int, changes: Changes) -> Sample:
-    """Track a force trajectory on a rock with the contact force displayed on a screen.
+    """Simulate an operator who tracks a force trajectory on a rock and sees the contact force on a screen.
 
     The four conditions are with and without force reflection, each with and without the detents of
     Table 6.11.

@@ -1,8 +1,9 @@
 """Zhu 1994, 6.1.3: parameters of the static models by recursive least squares, and bad data.
 
-The machines move slowly from one configuration to another in simulation; pressures and angles come
-from their simulated sensors. As many samples as in the document's figures are estimated from: 250
-of the excavator, 400 of the feller-buncher.
+A static model gives the joint torques due to gravity. The machines move slowly from one
+configuration to another in simulation; pressures and angles come from their simulated sensors. As
+many samples as in the document's figures are estimated from: 250 of the excavator, 400 of the
+feller-buncher.
 """
 
 from collections.abc import Callable, Sequence
@@ -46,7 +47,7 @@ def _compute_scaled_error(found: np.ndarray, true: np.ndarray) -> float:
 
 
 def measure_convergence(name: str, seed: int, changes: Changes) -> Sample:
-    """Estimate the static model's parameters recursively and record their convergence.
+    """Estimate a machine's gravity parameters by recursive least squares and record their convergence.
 
     Args:
         name: `excavator` or `feller-buncher`.
@@ -80,7 +81,10 @@ def measure_convergence(name: str, seed: int, changes: Changes) -> Sample:
 
 
 def describe_parameters(samples: Sequence[Sample]) -> Evaluation:
-    """Describe the parameters; the available text does not contain the published curves."""
+    """Return a note with the estimated and true gravity parameters, without a verdict.
+
+    The available text does not contain the published curves.
+    """
     count = sum(name.startswith("true P") for name in samples[0].values)
     words = [
         f"P{i} {format_values(samples, f'P{i}', 1e-3)} (masses {samples[0].values[f'true P{i}'] / 1e3:.1f})"
@@ -90,7 +94,10 @@ def describe_parameters(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_convergence(samples: Sequence[Sample]) -> Evaluation:
-    """Check the change in the second half of the samples, and the final error."""
+    """Check that the gravity parameters change by less than 1 % in the second half, and err by less than 2 %.
+
+    Both are relative to the largest parameter.
+    """
     reason = "converged to 1 % of the largest parameter"
     return Evaluation((
         check_mean("largest change of a parameter in the second half of the samples, over the"
@@ -102,7 +109,7 @@ def evaluate_convergence(samples: Sequence[Sample]) -> Evaluation:
 
 
 def fail_sensors(log: Log, axes: Sequence[str], failures: int, rng: np.random.Generator) -> Log:
-    """Set readings of random sensors to zero for 0.5 to 3 s each.
+    """Return a log in which readings of random sensors are zero for 0.5 to 3 s each.
 
     Args:
         log: measured log.
@@ -125,7 +132,7 @@ def fail_sensors(log: Log, axes: Sequence[str], failures: int, rng: np.random.Ge
 
 
 def measure_outliers(seed: int, changes: Changes) -> Sample:
-    """Compute errors of the excavator's parameters without and with sensor failures.
+    """Compute errors of the excavator's gravity parameters without and with sensor failures.
 
     Args:
         seed: seed of sensor noise and failures.
@@ -176,7 +183,7 @@ def _collect_errors(samples: Sequence[Sample], name: str) -> np.ndarray:
 
 
 def evaluate_outlier_effect(samples: Sequence[Sample]) -> Evaluation:
-    """Check how much sensor failures increase the error."""
+    """Check that sensor failures at least double the error of the gravity parameters."""
     return Evaluation(
         (check_statistic("error with over error without sensor failures",
                          _collect_errors(samples, "spoilt"), _compute_mean_ratio, (2.0, np.inf),
@@ -187,7 +194,7 @@ def evaluate_outlier_effect(samples: Sequence[Sample]) -> Evaluation:
 
 
 def _compute_removed_fraction(rows: np.ndarray) -> float:
-    """Return the fraction of the error due to failures that the removal eliminates.
+    """Return the fraction of the parameter error due to sensor failures that removing outliers eliminates.
 
     Args:
         rows: (n, 3) errors with failures, after the removal, and without failures.
@@ -197,7 +204,7 @@ def _compute_removed_fraction(rows: np.ndarray) -> float:
 
 
 def evaluate_outlier_removal(samples: Sequence[Sample]) -> Evaluation:
-    """Check which fraction of the error due to failures the removal of outliers eliminates."""
+    """Check that removing outliers eliminates 75 % of the parameter error that sensor failures cause."""
     rows = np.column_stack([collect_values(samples, name) for name in ("spoilt", "kept", "clean")])
     return Evaluation(
         (check_statistic("fraction of the error due to failures that the removal eliminates",

@@ -48,7 +48,11 @@ _MAX_REPETITIONS = 6  # repetitions of a scenario
 
 
 def _load_arm(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the geometric parameters (9,) of an arm and its joint ranges (k, 2) [rad]."""
+    """Return the geometric parameters (9,) of a machine's arm and the joint ranges (k, 2) [rad].
+
+    Args:
+        name: `excavator` or `feller-buncher`.
+    """
     machine, tool = _MACHINE_TOOLS[name]
     numbers, _, ranges = arm_specification(load_machine(machine, tool) if tool else load_machine(machine))
     ranges = ranges.copy()
@@ -57,7 +61,7 @@ def _load_arm(name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _build_link_transform(turn: float, along: float, length: float, twist: float) -> np.ndarray:
-    """Return the homogeneous transformation of a link with given Denavit-Hartenberg parameters."""
+    """Return the homogeneous transformation (4, 4) of a link with given Denavit-Hartenberg parameters."""
     ct, st, ca, sa = math.cos(turn), math.sin(turn), math.cos(twist), math.sin(twist)
     return np.array([
         [ct, -st * ca, st * sa, length * ct],
@@ -68,10 +72,10 @@ def _build_link_transform(turn: float, along: float, length: float, twist: float
 
 
 def compute_tool_position(g: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return the position of the tool by the chains of Zhu 1994, Tables 2.1 and 2.2.
+    """Compute the tool position from the Denavit-Hartenberg chains of Zhu 1994, Tables 2.1 and 2.2.
 
     Args:
-        g: (9,) parameters as in `kinematics.task.arm_parameters`.
+        g: (9,) geometric parameters as in `kinematics.task.arm_parameters`.
         q: (4,) or (5,) joint angles [rad].
 
     Returns:
@@ -91,7 +95,9 @@ def compute_tool_position(g: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def measure_inverse_kinematics(changes: Changes) -> Sample:
-    """Compare closed-form kinematics with the chains of the tables, in and out of reach.
+    """Compare the closed-form forward and inverse kinematics with the chains of the printed tables.
+
+    Random poses in and out of reach are tested for both machines.
 
     Args:
         changes: `stick`: factor of the stick's length in the closed form.
@@ -127,7 +133,12 @@ def measure_inverse_kinematics(changes: Changes) -> Sample:
 
 
 def _is_reachable(g: np.ndarray, pose: np.ndarray) -> bool:
-    """Return whether a pose is in reach, by a search over the elbow angle."""
+    """Return whether the arm can reach a pose, by a search over the elbow angle.
+
+    Args:
+        g: (9,) geometric parameters of the arm.
+        pose: (5,) r [m], theta [rad], z [m], attitude and head angle [rad].
+    """
     head, attitude = pose[4], pose[3]
     ahead = math.sqrt(pose[0] ** 2 - (g[LATERAL_OFFSET] - g[HEAD_RADIUS] * math.sin(head)) ** 2) - g[BASE_RADIUS]
     bar, rise = g[TOOL_ALONG] + g[HEAD_RADIUS] * math.cos(head), g[TOOL_UP]
@@ -139,7 +150,7 @@ def _is_reachable(g: np.ndarray, pose: np.ndarray) -> bool:
 
 
 def evaluate_forward_kinematics(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the forward kinematics with the chains of the tables."""
+    """Check that the closed-form forward kinematics agrees with the chains of Zhu 1994, Tables 2.1 and 2.2."""
     return Evaluation(tuple(
         check_exact(f"largest difference of position, {name}", samples[0].values[f"chain {name}"],
                     ROUNDING_RANGE, "rounding", unit="m") for name in _MACHINE_TOOLS
@@ -147,7 +158,7 @@ def evaluate_forward_kinematics(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_inverse_kinematics(samples: Sequence[Sample]) -> Evaluation:
-    """Check the closed-form solution for poses in reach."""
+    """Check that the closed-form inverse kinematics reaches all poses within the workspace."""
     return Evaluation(tuple(
         check_exact(f"largest position error over {_POSE_COUNT} poses in reach, {name}",
                     samples[0].values[f"back {name}"], (0.0, 1e-6), "closed form: rounding, which"
@@ -156,7 +167,7 @@ def evaluate_inverse_kinematics(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_reachability(samples: Sequence[Sample]) -> Evaluation:
-    """Check that a solution exists if and only if the pose is in reach."""
+    """Check that inverse kinematics finds a solution if and only if the pose is in reach."""
     return Evaluation(tuple(
         check_exact(f"fraction of {_POSE_COUNT} poses, many of them out of reach, for which the closed"
                     f" form and a search over the elbow agree, {name}",
@@ -166,7 +177,7 @@ def evaluate_reachability(samples: Sequence[Sample]) -> Evaluation:
 
 
 def measure_solutions(changes: Changes) -> Sample:
-    """Count candidates and solutions of both approaches for the feller-buncher's tool.
+    """Count the inverse kinematics solutions of the feller-buncher by both approaches of Zhu 1994.
 
     A candidate is extraneous if the end of the tilt link lies behind the swing axis. Its azimuth
     is then not that of the arm plane (2.14, 2.32).
@@ -217,7 +228,10 @@ def measure_solutions(changes: Changes) -> Sample:
 
 
 def evaluate_solutions(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the numbers of solutions and extraneous candidates with the document."""
+    """Check that the approaches give at most two and four solutions of the inverse kinematics.
+
+    Approach 1 must have fewer extraneous candidates than approach 2 (Zhu 1994, p. 24).
+    """
     v = samples[0].values
     return Evaluation((
         check_exact("largest number of solutions, approach 1", v["first"], (1.0, 2.0),
@@ -247,7 +261,7 @@ _METHOD_CHANGES = {
 
 
 def measure_motion_methods(seed: int, changes: Changes) -> Sample:
-    """Move the bucket twice up and down with both methods of resolved motion.
+    """Simulate the bucket moving up and down twice with inverse kinematics and with the inverse Jacobian.
 
     Each method is simulated with closed and with open joint loops.
 
@@ -291,7 +305,10 @@ def _collect_pairs(samples: Sequence[Sample], first: str, second: str) -> np.nda
 
 
 def evaluate_accumulation(samples: Sequence[Sample]) -> Evaluation:
-    """Check the growth of the reference error and the accuracy of the bucket."""
+    """Check that position errors of the inverse Jacobian method accumulate from cycle to cycle.
+
+    The bucket must also deviate at least twice as much as with inverse kinematics.
+    """
     return Evaluation(
         (
             check_statistic("error of the references' radius after two cycles over that after one",
@@ -314,7 +331,10 @@ def evaluate_accumulation(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_accuracy(samples: Sequence[Sample]) -> Evaluation:
-    """Compare inverse kinematics with closed joint loops to joint rates alone."""
+    """Check that inverse kinematics with closed joint loops is at least twice as accurate as joint rates alone.
+
+    The joint rates are those of the inverse Jacobian with open joint loops.
+    """
     return Evaluation(
         (check_statistic("largest deviation of the radius by joint rates of the inverse Jacobian"
                          " alone, over that by inverse kinematics with closed joint loops",
@@ -342,7 +362,7 @@ _EDGE_TIME, _REVERSAL_START, _REVERSAL_END = (
 
 
 def measure_edge(seed: int, changes: Changes) -> Sample:
-    """Command the feller-buncher's head beyond the edge of the workspace and back.
+    """Simulate the feller-buncher's head commanded beyond the edge of the workspace and back.
 
     Args:
         seed: seed of operator and sensor noise.
@@ -378,7 +398,7 @@ def measure_edge(seed: int, changes: Changes) -> Sample:
 
 
 def evaluate_edge(samples: Sequence[Sample]) -> Evaluation:
-    """Check the stop at the edge, the constant height, and the return."""
+    """Check that the head stops at the edge of the workspace, keeps its height, and leaves it on command."""
     way = "2 % of the travel of 2.9 m, as in the rows of straight lines"
     turned = _REVERSAL_END - _REVERSAL_START
     return Evaluation((

@@ -52,7 +52,16 @@ _HORIZONTAL_QUOTE = (
 
 
 def measure_line(direction: str, seed: int, changes: Changes) -> Sample:
-    """Move the tip along a straight line under operator control: up, down, out or in."""
+    """Simulate an operator who moves the tip along a straight line.
+
+    Args:
+        direction: `up`, `down`, `out` or `in`.
+        seed: seed of operator and sensor noise.
+        changes: scenario keys.
+
+    Returns:
+        Travel and deviations from the line [m], their ratio, and rotation of the bucket [deg].
+    """
     _, axis, sign, held, start = _LINES[direction]
     push = 0.004 * sign
     keys = {f"start.pose.{k}": v for k, v in start.items()}
@@ -116,7 +125,7 @@ _FAST_COORDINATES = "{r: {speed: 3.0, scale: 120.0}, theta: {speed: 0.75, scale:
 
 
 def measure_step_response(run: Run) -> tuple[float, int]:
-    """Return the largest overshoot of the tip and the number of reversals about its goals.
+    """Return the largest overshoot of the tip and the number of reversals about the goals of a steering run.
 
     Args:
         run: run of the scenario `steer`.
@@ -139,10 +148,17 @@ def measure_step_response(run: Run) -> tuple[float, int]:
 
 
 def measure_steering(seed: int, changes: Changes) -> Sample:
-    """Steer the tip visually to the same goals under rate and under position control.
+    """Simulate an operator who steers the tip to goals by sight, under rate and under position control.
 
     For the first operators the possible causes of an oscillation are varied: no tremor, a machine
     five times as fast, and a slower operator.
+
+    Args:
+        seed: seed of operator and sensor noise.
+        changes: scenario keys.
+
+    Returns:
+        Overshoot over the step and number of reversals per condition.
     """
     cases = {
         "rate": {"pilot.mode": "rate"},
@@ -217,7 +233,16 @@ _DEADBAND_EDGE = 1.5  # mm, Table 6.9
 
 
 def measure_handle_ramp(detent: str, seed: int, changes: Changes) -> Sample:
-    """Measure the hand force while the handle moves slowly from its centre to its stop."""
+    """Measure the hand force over displacement while the handle moves slowly from its centre to its stop.
+
+    Args:
+        detent: `true` or `false`, whether the joystick has detents.
+        seed: seed of operator and sensor noise.
+        changes: scenario keys.
+
+    Returns:
+        Stiffness [N/mm], nonlinearity, and force drop at the edge of the dead band [N] per axis.
+    """
     keys = {"pilot.detent": detent} | make_operator_changes(seed) | dict(changes)
     _, run = run_shipped("handle_ramp", keys)
     m, values, panels = run.measured, {}, []
@@ -282,10 +307,17 @@ _MAX_RINGING = 0.02  # amplitude of the remaining oscillation over the step
 
 
 def measure_joint_steps(seed: int, changes: Changes) -> Sample:
-    """Step boom, stick and tilt by 0.1 rad and back, and record angles and pressures.
+    """Simulate steps of boom, stick and tilt by 0.1 rad and back, and measure angles and pressures.
 
     The first repetition is also simulated with half the position gain, which shows whether the
     servo causes the oscillation.
+
+    Args:
+        seed: seed of the sensor noise.
+        changes: scenario keys.
+
+    Returns:
+        Pressure oscillation, overshoot, remaining error and oscillation of the angle per joint.
     """
     values, panels = _measure_joint_steps(seed, changes)
     if seed == 1:
@@ -371,7 +403,15 @@ _MAX_CROSS_MOTION = 0.1  # motion of another coordinate over the step of that co
 
 
 def measure_resolved_steps(seed: int, changes: Changes) -> Sample:
-    """Step the joystick in all five task coordinates and measure the pose."""
+    """Simulate joystick steps in each of the five task coordinates, and measure the pose.
+
+    Args:
+        seed: seed of operator and sensor noise.
+        changes: scenario keys.
+
+    Returns:
+        Step, overshoot, remaining error, and motion of the other coordinates per coordinate.
+    """
     _, run = run_shipped("feller_steps", make_operator_changes(seed) | dict(changes))
     m, values, panels = run.measured, {}, []
     for name, start in _COORDINATE_STEPS.items():

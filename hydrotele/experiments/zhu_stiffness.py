@@ -33,13 +33,16 @@ _DAMPING = 6.1  # 1/s
 
 
 def measure_counter_example(changes: Changes) -> Sample:
-    """Integrate motions with exponentially (4.6) and with slowly (4.7) increasing damping.
+    """Integrate a mass on a spring whose damping increases exponentially (4.6) or slowly (4.7).
+
+    With exponential damping the mass stops before it reaches its rest position.
 
     Args:
         changes: `stiffness`: K [1/s^2].
 
     Returns:
-        `end`: x after 12 s with the former; `slow`: |x| after 100 s with the latter.
+        `end`: x after 12 s with exponential damping; `slow`: |x| after 100 s with slowly increasing
+        damping.
     """
     given = merge_settings(changes, stiffness=1.0)
 
@@ -61,7 +64,10 @@ def measure_counter_example(changes: Changes) -> Sample:
 
 
 def evaluate_counter_example(samples: Sequence[Sample]) -> Evaluation:
-    """Check the final displacement of both motions."""
+    """Check that a mass with exponentially increasing damping stops at x = 1 instead of 0 (Zhu 1994, 4.6).
+
+    With slowly increasing damping it must return to 0.
+    """
     v = samples[0].values
     return Evaluation((
         check_exact("x after 12 s", v["end"], (1.0 - 1e-4, 1.0 + 1e-4),
@@ -73,7 +79,9 @@ def evaluate_counter_example(samples: Sequence[Sample]) -> Evaluation:
 
 
 def measure_worst_switching(changes: Changes) -> Sample:
-    """Compute the growth per half swing with K_max inwards and K_min outwards.
+    """Compute how much the speed grows per half swing if the stiffness switches in the worst way.
+
+    The stiffness is K_max towards the equilibrium and K_min away from it.
 
     Args:
         changes: `ratio`: damping ratio with K_max.
@@ -92,7 +100,7 @@ def measure_worst_switching(changes: Changes) -> Sample:
 
 
 def evaluate_worst_switching(samples: Sequence[Sample]) -> Evaluation:
-    """Check that the motion grows."""
+    """Check that the motion of a slightly damped mass grows under the worst switching of its stiffness."""
     return Evaluation((
         check_exact("speed after half a swing over that before, damping ratio 0.02, K_max 9 times"
                     " K_min", samples[0].values["growth"], (1.0 + 1e-9, np.inf),
@@ -102,14 +110,14 @@ def evaluate_worst_switching(samples: Sequence[Sample]) -> Evaluation:
 
 @compiled
 def integrate_motion(damping, stiffness, position, speed, step, path):
-    """Integrate `x'' = -B x' - K(t) x` by the Runge-Kutta method, with constant K in each step.
+    """Integrate `x'' = -B x' - K(t) x` of a unit mass by the Runge-Kutta method, with constant K in each step.
 
     Args:
         damping: B, scalar [1/s].
         stiffness: (n,) K [1/s^2].
         position: x at the start, scalar.
         speed: x' at the start, scalar.
-        step: scalar [s].
+        step: length of a time step, scalar [s].
         path: (n + 1, 2) output: x, x'.
 
     Returns:
@@ -132,7 +140,10 @@ def integrate_motion(damping, stiffness, position, speed, step, path):
 
 
 def draw_switched_stiffness(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Draw (count,) stiffness with jumps at random times to random values in [K_min, K_max]."""
+    """Draw (count,) random stiffness values [1/s^2], constant between jumps at random times.
+
+    All values are within [K_min, K_max].
+    """
     jumps = rng.random(count) < _TIME_STEP / 10.0 ** rng.uniform(-1.5, 0.5)
     jumps[0] = True
     values = rng.choice(
@@ -150,7 +161,7 @@ def _integrate_path(damping: float, stiffness: np.ndarray, start: tuple[float, f
 
 
 def measure_theorem(seed: int, changes: Changes) -> Sample:
-    """Integrate motions from random states with randomly switched stiffness.
+    """Integrate motions with randomly switched stiffness, to test the stability theorem 4-2 of Zhu 1994.
 
     Args:
         seed: seed of 20 motions.
@@ -200,7 +211,10 @@ def _interpolate_speed(path: np.ndarray, grid: np.ndarray) -> np.ndarray:
 
 
 def _measure_bound_violation(path: np.ndarray, bounds: dict[str, np.ndarray]) -> float:
-    """Return how far a path in quadrant IV lies outside the paths of K_min and K_max."""
+    """Return how far a path in the (x, x') plane lies outside the paths of constant K_min and K_max.
+
+    All paths are in quadrant IV (x > 0, x' < 0).
+    """
     grid = np.linspace(0.02, 0.98, 200)
     speed = _interpolate_speed(path, grid)
     upper, lower = (
@@ -211,7 +225,7 @@ def _measure_bound_violation(path: np.ndarray, bounds: dict[str, np.ndarray]) ->
 
 
 def evaluate_stability(samples: Sequence[Sample]) -> Evaluation:
-    """Check the final distance of the motions and their crossings of the x axis."""
+    """Check that motions with randomly switched stiffness decay and cross the x axis at most once."""
     return Evaluation((
         check_mean("largest distance from the origin after 40 s over that at the start",
                    collect_values(samples, "left"), (-np.inf, 1e-2), "asymptotically stable: the slowest"
@@ -222,7 +236,7 @@ def evaluate_stability(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_path_bounds(samples: Sequence[Sample]) -> Evaluation:
-    """Check whether paths stay between those of K_min and K_max."""
+    """Check that paths in the (x, x') plane stay between those of constant K_min and K_max."""
     return Evaluation((
         check_exact("largest distance by which a path lies outside",
                     float(collect_values(samples, "outside").max()), (0.0, 1e-3),
@@ -240,13 +254,13 @@ _PUBLISHED_GAINS = {
 
 
 def measure_published_gains(changes: Changes) -> Sample:
-    """Evaluate condition (4.14) and the worst switching with the published gains.
+    """Evaluate the stability condition (4.14) and the worst stiffness switching for the published gains.
 
     Args:
         changes: `damping`: factor of the damping.
 
     Returns:
-        `margin`: largest B^2 - 4 M K_max; `growth`: largest growth per half swing.
+        `margin`: largest B^2 - 4 M K_max [(N s/m)^2]; `growth`: largest growth per half swing.
     """
     given = merge_settings(changes, damping=1.0)
     joystick = load_joystick()
@@ -262,7 +276,7 @@ def measure_published_gains(changes: Changes) -> Sample:
 
 
 def evaluate_published_gains(samples: Sequence[Sample]) -> Evaluation:
-    """Check that no axis satisfies (4.14) and that the worst switching decays."""
+    """Check that no joystick axis satisfies (4.14) but all decay under the worst stiffness switching."""
     v = samples[0].values
     return Evaluation((
         check_exact("largest B^2 - 4 M K_max over the axes, with and without hand", v["margin"],
@@ -273,7 +287,7 @@ def evaluate_published_gains(samples: Sequence[Sample]) -> Evaluation:
 
 
 def measure_joystick(changes: Changes) -> Sample:
-    """Compute the condition number of the coil matrix and the resolution of the pose.
+    """Compute the condition number of the levitated joystick's coil matrix and its pose resolution.
 
     Args:
         changes: `step`: factor of the photodiodes' step; `radius`: lever that scales torques [m].
@@ -295,7 +309,7 @@ def measure_joystick(changes: Changes) -> Sample:
 
 
 def evaluate_condition(samples: Sequence[Sample]) -> Evaluation:
-    """Check the condition number of the coil matrix."""
+    """Check that the matrix from coil currents to forces and torques is well conditioned (below 10)."""
     return Evaluation((
         check_exact("condition number of M, torques divided by the coils' radius",
                     samples[0].values["condition"], (1.0, 10.0),
@@ -304,7 +318,7 @@ def evaluate_condition(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_resolution(samples: Sequence[Sample]) -> Evaluation:
-    """Check the pose resolution for photodiodes with steps of 1 um."""
+    """Check that the joystick resolves about 1 um and 0.001 deg with photodiodes of 1 um steps."""
     v, reason = samples[0].values, "approximately: up to the printed figure"
     return Evaluation((
         check_exact("standard deviation of the position", v["translation"], (0.0, 1.0), reason,

@@ -22,7 +22,7 @@ _KHOSHZABAN_TOLERANCE = 1.0  # tolerance [mm]: Khoshzaban 1992 prints the same p
 
 
 def _compute_distance(a: Sequence[float], b: Sequence[float], *axes: int) -> float:
-    """Return the distance [mm] of two points [m] in the given axes."""
+    """Return the distance [mm] of two points [m] in the plane or space of the given axes (0, 1, 2)."""
     return 1e3 * math.dist([a[k] for k in axes], [b[k] for k in axes])
 
 
@@ -37,7 +37,7 @@ def _compare_cylinder_areas(machine: Machine, printed: dict[str, tuple[float, fl
 
 
 def _compare_cylinder_diameters(machine: Machine, printed: dict[str, tuple[int, float, float]]) -> TableEntries:
-    """Return the entries of piston diameters.
+    """Return the model's piston and rod diameters with the printed ones.
 
     Args:
         machine: machine.
@@ -56,7 +56,7 @@ def _compare_cylinder_diameters(machine: Machine, printed: dict[str, tuple[int, 
 
 
 def _compare_two_bar(machine: Machine, name: str, a: float, b: float, half: float = 0.05) -> TableEntries:
-    """Return the entries of a two-bar linkage: distances of both pins from the joint.
+    """Return the model's pin distances of a two-bar linkage from its joint with the printed ones.
 
     Args:
         machine: machine.
@@ -82,7 +82,7 @@ def _compare_two_bar(machine: Machine, name: str, a: float, b: float, half: floa
 
 
 def _compare_four_bar(machine: Machine, name: str, closure: str, printed: Sequence[float]) -> TableEntries:
-    """Return the entries of a four-bar linkage.
+    """Return the model's dimensions of a four-bar linkage with the printed ones.
 
     Args:
         machine: machine.
@@ -173,7 +173,10 @@ def _compare_joystick_gains(name: str, printed: dict[str, tuple[float, ...]]) ->
 
 
 def _compare_force_limits(name: str, force: float) -> TableEntries:
-    """Return the entries of force limits: `force` [kN] in translation, 40 kN m in rotation."""
+    """Return the model's largest reflected forces with the printed ones.
+
+    The latter are `force` [kN] in translation and 40 kN m in rotation.
+    """
     return {
         axis: (gains.force_limit / 1e3, force if len(axis) == 1 else 40.0, 0.5)
         for axis, gains in load_joystick().gains[name].items()
@@ -221,7 +224,7 @@ _TABLE_ROWS: dict[str, tuple[str, str, Callable[[], TableEntries]]] = {
 
 
 def measure_tables(seed: int, changes: Changes) -> Sample:
-    """Compare parameters of the shipped models with the printed values.
+    """Compare parameters of the shipped machines and joystick with the printed tables of Zhu 1994.
 
     Args:
         seed: not used.

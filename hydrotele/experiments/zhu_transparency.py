@@ -1,6 +1,7 @@
 """Zhu 1994, pages 37 to 49: transparency under position and under rate control.
 
-The results are computed from the two-port model, as in `zhu_two_port`.
+A teleoperator is transparent if the operator feels the impedance of the task. The results are
+computed from the two-port model, as in `zhu_two_port`.
 """
 
 import dataclasses
@@ -46,20 +47,20 @@ from hydrotele.teleop.two_port import (
 
 
 def draw_impedance(rng: np.random.Generator, base: Impedance) -> Impedance:
-    """Draw a passive impedance whose parameters are 0.1 to 10 times those of another one."""
+    """Draw a random passive impedance whose mass, damping and stiffness are 0.1 to 10 times those of another."""
     factors = 10.0 ** rng.uniform(-1.0, 1.0, 3)
     return Impedance(*(factors * (base.mass, base.damping, base.stiffness)))
 
 
 def measure_transparency(changes: Changes) -> Sample:
-    """Analyse the four-channel structure under position control.
+    """Compute transparency, passivity and stability of the four-channel structure under position control.
 
     Args:
         changes: `mass_error`: relative error of the slave's mass; `delay`: delay each way [s].
 
     Returns:
-        Error of the hybrid matrix, scattering norm, slowest pole of the position error, and the
-        stable fraction of loops with random hands and tasks.
+        Largest error of the hybrid matrix, largest scattering norm, slowest pole of the position error
+        [1/s], and the stable fraction of loops with random hands and tasks.
     """
     given = merge_settings(changes, mass_error=0.0, delay=0.0)
     case = load_shipped_case().with_delay(given["delay"])
@@ -86,7 +87,7 @@ def measure_transparency(changes: Changes) -> Sample:
 
 
 def evaluate_transparency(samples: Sequence[Sample]) -> Evaluation:
-    """Check the hybrid matrix and the error dynamics."""
+    """Check that the four-channel hybrid matrix is [[0, 1], [-1, 0]] and the position error decays."""
     v = samples[0].values
     return Evaluation((
         check_exact("largest difference of the hybrid matrix from [[0, 1], [-1, 0]], relative to"
@@ -97,7 +98,7 @@ def evaluate_transparency(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_passivity(samples: Sequence[Sample]) -> Evaluation:
-    """Check the scattering norm and the stability with random passive hands and tasks."""
+    """Check that the four-channel two-port has scattering norm 1 and is stable with any passive hand and task."""
     v = samples[0].values
     return Evaluation((
         check_exact("largest scattering norm", v["norm"], (1.0 - 1e-9, PASSIVE_NORM), "1 (3.33)",
@@ -108,7 +109,7 @@ def evaluate_passivity(samples: Sequence[Sample]) -> Evaluation:
 
 
 def build_intervening_port(case: TeleoperatorAxis) -> TwoPort:
-    """Return the four-channel two-port with an intervening impedance (3.37).
+    """Return the four-channel two-port whose operator feels an additional impedance, Zhu 1994, (3.37).
 
     Its channels need no acceleration signals.
 
@@ -126,13 +127,14 @@ def build_intervening_port(case: TeleoperatorAxis) -> TwoPort:
 
 
 def measure_intervening(changes: Changes) -> Sample:
-    """Compute the felt impedance for identical sides with added damper and spring.
+    """Compute the impedance felt through four channels if identical sides have an added damper and spring.
 
     Args:
         changes: `slave_mass`: factor of the slave's mass.
 
     Returns:
-        Relative error of the felt impedance, and the stable fraction of random loops.
+        Relative error of the felt impedance against master plus task, and the stable fraction of loops
+        with random hands and tasks.
     """
     given = merge_settings(changes, slave_mass=1.0)
     case = make_identical_case()
@@ -153,7 +155,7 @@ def measure_intervening(changes: Changes) -> Sample:
 
 
 def evaluate_intervening(samples: Sequence[Sample]) -> Evaluation:
-    """Check the felt impedance (3.39) and the stability of (3.45) and (3.47)."""
+    """Check that the operator feels the sum of master and task impedance (3.39), and that loops are stable."""
     v = samples[0].values
     return Evaluation((
         check_exact("largest relative difference of the felt impedance and Z_m + Z_e (3.39)",
@@ -229,7 +231,7 @@ def measure_force_error(changes: Changes) -> Sample:
 
 
 def evaluate_force_error(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the smallest destabilizing error with the reported 5 %."""
+    """Check whether an error of 5 % of the force feed-forward destabilizes the four-channel structure."""
     v = samples[0].values
     return Evaluation(
         (check_exact("smallest relative error of the force feed-forward that is unstable",
@@ -248,13 +250,13 @@ def evaluate_force_error(samples: Sequence[Sample]) -> Evaluation:
 
 
 def measure_rate_force_extremes(changes: Changes) -> Sample:
-    """Compute the felt impedance of the rate-force structure for very stiff and soft tasks.
+    """Compute the impedance felt under rate control with force feedback for very stiff and very soft tasks.
 
     Args:
         changes: `structure_with_task`: 1 for the transparent four-channel structure.
 
     Returns:
-        Relative differences from (3.50) and (3.51).
+        Relative differences from Zhu 1994, (3.50) for stiff and (3.51) for soft tasks.
     """
     given = merge_settings(changes, structure_with_task=0.0)
     case, s = load_shipped_case(), 1j * HAND_FREQUENCIES
@@ -273,7 +275,10 @@ def measure_rate_force_extremes(changes: Changes) -> Sample:
 
 
 def evaluate_rate_force_extremes(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the felt impedance with (3.50) and (3.51)."""
+    """Check that the impedance felt for very stiff and very soft tasks does not depend on the task.
+
+    It must be that of (3.50) and (3.51), which contain only master and slave.
+    """
     v, reason = samples[0].values, "the task is 10^8 times stiffer or softer; 10^-4 remains"
     return Evaluation((
         check_exact("relative difference from (3.50), stiff task", v["stiff"], (0.0, 1e-4), reason),
@@ -282,7 +287,7 @@ def evaluate_rate_force_extremes(samples: Sequence[Sample]) -> Evaluation:
 
 
 def build_rate_port(case: TeleoperatorAxis, velocity_gain: float = 1.0) -> TwoPort:
-    """Return the practical four-channel structure under rate control (3.59).
+    """Return the practical four-channel two-port under rate control, Zhu 1994, (3.59).
 
     Args:
         case: master and slave with damper and spring added to their masses.
@@ -299,7 +304,7 @@ def build_rate_port(case: TeleoperatorAxis, velocity_gain: float = 1.0) -> TwoPo
 
 
 def measure_rate_transparency(changes: Changes) -> Sample:
-    """Compute felt impedance and slave velocity of four channels under rate control.
+    """Compute felt impedance and slave velocity of the four-channel structure under rate control.
 
     Args:
         changes: `slave_mass`: factor of the slave's mass.
@@ -322,7 +327,10 @@ def measure_rate_transparency(changes: Changes) -> Sample:
 
 
 def evaluate_rate_transparency(samples: Sequence[Sample]) -> Evaluation:
-    """Compare felt impedance and velocity with (3.61) and (3.64)."""
+    """Check that under rate control the operator feels master plus task impedance (3.61).
+
+    The slave's velocity must be proportional to the master's position (3.64).
+    """
     v = samples[0].values
     return Evaluation((
         check_exact("largest relative difference of the felt impedance and Z_m + Z_e (3.61)",
@@ -333,14 +341,14 @@ def evaluate_rate_transparency(samples: Sequence[Sample]) -> Evaluation:
 
 
 def measure_master_damping(changes: Changes) -> Sample:
-    """Compute the stability of the master's polynomial (3.72) and of the whole loop.
+    """Test whether rate control is stable if the master has no damping, Zhu 1994, (3.72).
 
     Args:
         changes: `damping`: damping of the master [N s/m].
 
     Returns:
-        Unstable fraction of random polynomials, number of unstable poles, and whether a simulated
-        kick decays.
+        Unstable fraction of random characteristic polynomials (3.72), number of unstable poles of the
+        whole loop, and whether its simulated impulse response decays.
     """
     given = merge_settings(changes, damping=0.0)
     rng = np.random.default_rng(372)
@@ -364,7 +372,10 @@ def measure_master_damping(changes: Changes) -> Sample:
 
 
 def evaluate_master_damping(samples: Sequence[Sample]) -> Evaluation:
-    """Check the instability of the polynomial without damping and of the loop without a hand."""
+    """Check that rate control without damping of the master is unstable.
+
+    Both the polynomial (3.72) and the whole loop without a hand must have unstable poles.
+    """
     v = samples[0].values
     return Evaluation((
         check_exact("unstable fraction of 200 random masters without damping", v["unstable"],
@@ -433,7 +444,7 @@ def measure_task_identification(seed: int, changes: Changes) -> Sample:
 
 
 def evaluate_task_identification(samples: Sequence[Sample]) -> Evaluation:
-    """Check the stiffness estimates of both tasks."""
+    """Check that the estimated stiffness of a changing task errs by less than 23 % before and after the change."""
     reason = "23 % of a compliance is not noticeable (Tan 1995); no size is published"
     return Evaluation(
         tuple(

@@ -1,8 +1,9 @@
 """Zhu 1994, pages 28 to 37: the two-port, its passivity and stability, direct force.
 
-All rows except that of a pressing excavator use the parameters of `teleop/cat215_axis.yaml`. If the
-document assumes identical sides, both have the master's parameters. Random cases have a fixed seed,
-so that most experiments have one repetition.
+A two-port relates force and velocity of the operator's hand to those of the task. All rows except
+that of a pressing excavator use the parameters of `teleop/cat215_axis.yaml`. If the document
+assumes identical sides, master and slave both have the master's parameters. Random cases have a
+fixed seed, so that most experiments have one repetition.
 """
 
 import dataclasses
@@ -75,23 +76,23 @@ def _measure_once(measure: Callable[[Changes], Sample], seed: int, changes: Chan
 
 
 def load_shipped_case() -> TeleoperatorAxis:
-    """Load the teleoperator axis of `cat215_axis.yaml` without delay."""
+    """Load the teleoperator axis of `cat215_axis.yaml`, without communication delay."""
     return load_teleop_case().to_axis().with_delay(0.0)
 
 
 def make_identical_case() -> TeleoperatorAxis:
-    """Return the shipped case with the master's parameters on both sides."""
+    """Return the shipped teleoperator axis with the master's parameters for master and slave."""
     case = load_shipped_case()
     return dataclasses.replace(case, slave=case.master, slave_control=case.master_control)
 
 
 def make_constant_block(value: float) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a constant transfer function."""
+    """Return a transfer function that has the same value at all frequencies."""
     return lambda s: np.full_like(s, value)
 
 
 def compute_relative_error(found: np.ndarray, expected: np.ndarray) -> float:
-    """Return the largest difference relative to the largest expected magnitude."""
+    """Return the largest absolute difference of two arrays over the largest expected magnitude."""
     return float(np.abs(found - expected).max() / np.abs(expected).max())
 
 
@@ -99,7 +100,10 @@ def compute_relative_error(found: np.ndarray, expected: np.ndarray) -> float:
 
 
 def measure_hybrid_matrix(changes: Changes) -> Sample:
-    """Compare hybrid matrix and felt impedance with a numerical solution of Zhu 1994, Fig. 3.13.
+    """Compare formulas of hybrid matrix and felt impedance with a numerical solution of the equations.
+
+    The equations are those of the general two-port structure, Zhu 1994, Fig. 3.13, with random
+    impedances.
 
     Args:
         changes: `velocity_back_sign`: sign of the returned velocity in the numerical solution.
@@ -133,7 +137,7 @@ def measure_hybrid_matrix(changes: Changes) -> Sample:
 
 
 def evaluate_hybrid_matrix(samples: Sequence[Sample]) -> Evaluation:
-    """Check both formulas."""
+    """Check that the formulas of hybrid matrix (3.11) and felt impedance (3.12) solve the equations."""
     values, reason = samples[0].values, "rounding: two solutions of the same equations"
     return Evaluation((
         check_exact("largest relative error of the hybrid matrix (3.11)", values["matrix"],
@@ -144,6 +148,8 @@ def evaluate_hybrid_matrix(samples: Sequence[Sample]) -> Evaluation:
 
 def measure_delayed_channel(changes: Changes) -> Sample:
     """Compute the scattering norm of a channel that only delays force and velocity.
+
+    A norm above 1 means that the channel is not passive.
 
     Args:
         changes: `wave_impedance`: 1 for a lossless transmission line instead.
@@ -171,7 +177,10 @@ def measure_delayed_channel(changes: Changes) -> Sample:
 
 
 def evaluate_delayed_channel(samples: Sequence[Sample]) -> Evaluation:
-    """Check that the norm exceeds 1 for all delays."""
+    """Check that a channel with delayed force and velocity is not passive for any delay.
+
+    Its scattering norm must exceed 1.
+    """
     values = samples[0].values
     return Evaluation(
         (check_exact("smallest over six delays from 1 ms to 5 s of the largest scattering norm",
@@ -184,13 +193,15 @@ _DELAYS, _GAIN_FACTORS = np.array([0.0, 0.02, 0.1]), np.array([0.1, 1.0, 5.0, 30
 
 
 def measure_nyquist(changes: Changes) -> Sample:
-    """Compare stability by the argument principle with a simulated kick for four structures.
+    """Compare predicted stability with the simulated impulse response of four teleoperator structures.
+
+    The prediction applies the argument principle to the loop transfer functions.
 
     Args:
         changes: `simulated_task`: stiffness factor of the simulated task.
 
     Returns:
-        `fraction` of loops that agree, and number of loops `cells`.
+        `fraction` of loops in which both agree, and number of loops `cells`.
     """
     given = merge_settings(changes, simulated_task=1.0)
     case, right, cells = load_shipped_case(), 0, 0
@@ -206,7 +217,7 @@ def measure_nyquist(changes: Changes) -> Sample:
 
 
 def evaluate_nyquist(samples: Sequence[Sample]) -> Evaluation:
-    """Check that criterion and simulation agree for all loops."""
+    """Check that the Nyquist criterion and the simulated impulse response agree for all loops."""
     values = samples[0].values
     return Evaluation((
         check_exact(f"fraction of {values['cells']:.0f} loops (four structures, three delays, four"
@@ -219,7 +230,7 @@ def evaluate_nyquist(samples: Sequence[Sample]) -> Evaluation:
 
 
 def measure_coordinating_force(changes: Changes) -> Sample:
-    """Compare the position-position structure with its mechanical equivalent.
+    """Compare the position-position structure with two masses joined by a spring and a damper.
 
     Args:
         changes: `slave_gain`: gain of the slave's over the master's controller; `coupling_gain`:
@@ -247,7 +258,7 @@ def measure_coordinating_force(changes: Changes) -> Sample:
 
 
 def evaluate_passivity(samples: Sequence[Sample]) -> Evaluation:
-    """Check the passivity by the scattering norm."""
+    """Check that the position-position structure is passive: its scattering norm is at most 1."""
     return Evaluation((
         check_exact("largest scattering norm, 1 mHz to 1 kHz", samples[0].values["norm"],
                     (0.0, PASSIVE_NORM), "passive (3.6), with rounding"),
@@ -255,7 +266,7 @@ def evaluate_passivity(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_mechanical_equivalent(samples: Sequence[Sample]) -> Evaluation:
-    """Check that both hybrid matrices are equal."""
+    """Check that the position-position structure has the hybrid matrix of two masses joined by a spring."""
     return Evaluation((
         check_exact("largest relative difference of the hybrid matrices",
                     samples[0].values["difference"], ROUNDING_RANGE, "rounding"),
@@ -301,7 +312,7 @@ def measure_contact_error(seed: int, changes: Changes) -> Sample:
 
 
 def evaluate_position_error(samples: Sequence[Sample]) -> Evaluation:
-    """Check that the position error is smaller than the noise."""
+    """Check that the position error due to a contact force is smaller than the measurement noise."""
     return Evaluation(
         (check_mean("position error due to contact over the RMS noise of the measured"
                     " position", collect_values(samples, "ratio"), (-np.inf, 1.0),
@@ -313,7 +324,10 @@ def evaluate_position_error(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_stiffness_law(samples: Sequence[Sample]) -> Evaluation:
-    """Compare the joystick's stiffness with (4.1) and the values of Zhu 1994, Tables 6.7 and 6.8."""
+    """Check that the joystick's stiffness changes with the contact force by Zhu 1994, (4.1).
+
+    Its parameters are those of Tables 6.7 and 6.8.
+    """
     return Evaluation((
         check_mean("RMS difference of the stiffness along z from (4.1), relative",
                    collect_values(samples, "law"), (-np.inf, 0.05),
@@ -322,13 +336,13 @@ def evaluate_stiffness_law(samples: Sequence[Sample]) -> Evaluation:
 
 
 def measure_direct_force(changes: Changes) -> Sample:
-    """Compute the largest stable factor of the reflected force under rate and position control.
+    """Compute the gain margins of direct force feedback under rate and under position control.
 
     Args:
         changes: `task`: factor of the task's impedance.
 
     Returns:
-        Gain margins without delay and with 20 ms each way.
+        Largest stable factors of the reflected force, without delay and with 20 ms each way.
     """
     given = merge_settings(changes, task=1.0)
     case, k = load_shipped_case(), given["task"]
@@ -344,7 +358,10 @@ def measure_direct_force(changes: Changes) -> Sample:
 
 
 def evaluate_rate_force(samples: Sequence[Sample]) -> Evaluation:
-    """Check that rate control has a limit without delay that is below that of position control."""
+    """Check that rate control with direct force feedback has a stability limit even without delay.
+
+    It must be below that of position control.
+    """
     v = samples[0].values
     ratio = v["rate"] / v["position"]
     return Evaluation(
@@ -362,7 +379,10 @@ def evaluate_rate_force(samples: Sequence[Sample]) -> Evaluation:
 
 
 def evaluate_position_force(samples: Sequence[Sample]) -> Evaluation:
-    """Check that position control with direct force is unstable but stable with a smaller gain."""
+    """Check that position control with direct force feedback becomes stable if its gain is reduced.
+
+    With the shipped gain and a delay of 20 ms each way it is unstable.
+    """
     v = samples[0].values
     return Evaluation(
         (check_exact("largest stable factor of the reflected force under position control, 20 ms"
@@ -373,13 +393,13 @@ def evaluate_position_force(samples: Sequence[Sample]) -> Evaluation:
 
 
 def measure_impedance_difference(changes: Changes) -> Sample:
-    """Compute the relative difference of felt and task impedance at hand frequencies.
+    """Compute how much the felt impedance differs from the task's impedance at hand frequencies.
 
     Args:
         changes: `transparent`: 1 for the transparent four-channel structure.
 
     Returns:
-        Largest relative difference of each structure.
+        Largest relative difference of each of three structures that are not transparent.
     """
     given = merge_settings(changes, transparent=0.0)
     case, s, values, curves = load_shipped_case(), 1j * HAND_FREQUENCIES, {}, {}
@@ -414,7 +434,7 @@ def make_claim(
     name: str, quote: str, item: str, evaluate: Callable[[Sequence[Sample]], Evaluation],
     fault: Changes | None, fault_description: str, kind: Kind = "document",
 ) -> Claim:  # fmt: skip
-    """Return a claim; the arguments have the order name, statement, source, evaluation, fault."""
+    """Return a claim of Zhu 1994; its arguments have another order than those of `Claim`."""
     return Claim(name, quote, item, kind, evaluate, fault, fault_description)
 
 

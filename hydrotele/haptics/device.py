@@ -212,7 +212,10 @@ class SimulatedDevice:
 
 @compiled
 def _integrate_handle(parameters, reference, wrench, period, state):
-    """Integrate handle and arm over one period, axis by axis, with semi-implicit Euler steps."""
+    """Integrate the motion of handle and operator's arm over one period with semi-implicit Euler steps.
+
+    The six axes are independent. `state` (2, 6) holds positions and rates and is updated.
+    """
     mass, friction, hand_mass, hand_damping, hand_stiffness, stop = parameters
     step = period / _SUBSTEPS
     for _ in range(_SUBSTEPS):
@@ -299,7 +302,7 @@ class ForceDimension:
 
 
 def _import_dhd() -> Any:
-    """Import the module `dhd` of the binding."""
+    """Import the Python binding of Force Dimension's DHD library; raise InputError if it is not installed."""
     try:
         from forcedimension_core import dhd  # pyright: ignore[reportMissingImports] - optional
     except ImportError as error:
@@ -436,7 +439,7 @@ class Haption:
 
 
 def _load_virtuose_library() -> Any:
-    """Load the vendor's library."""
+    """Load Haption's library VirtuoseAPI; raise InputError if it is missing."""
     name = os.environ.get(LIBRARY_VARIABLE) or ctypes.util.find_library("VirtuoseAPI")
     if not name:
         message = f"needs the vendor's libVirtuoseAPI: install it, or set {LIBRARY_VARIABLE} to its path"
@@ -448,7 +451,7 @@ def _load_virtuose_library() -> Any:
 
 
 def _declare_signatures(library: Any) -> Any:
-    """Declare the argument and return types of the library functions that are called."""
+    """Declare the argument and return types of the VirtuoseAPI functions; return the library."""
     for name, arguments in _VIRTUOSE_SIGNATURES.items():
         try:
             function = getattr(library, name)

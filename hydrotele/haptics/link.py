@@ -86,7 +86,7 @@ FORCE_GAIN, POSITION_SCALE, ROTATION_SCALE = range(3)
 
 
 class LinkBuffers(NamedTuple):
-    """Buffers, counters and recorded times of the thread.
+    """Packets, counters and recorded times of the thread that answers the poses of the device.
 
     Attributes:
         pose: (21,) received packet as integers.
@@ -116,16 +116,19 @@ class LinkBuffers(NamedTuple):
 
 
 class Mailbox(NamedTuple):
-    """Memory shared by thread and simulation; an odd `turn` marks a part that is being written.
+    """Memory shared by the thread that answers the device and the machine simulation.
+
+    Each part has one writer, who increments `turn` before and after writing. An odd value marks a part
+    that is being written; the reader then tries again.
 
     Attributes:
         turn: (2,) version counters of the handle's part and of the machine's.
         stamp: (2,) time at which a part was written [ns]; 0 before the first time.
         handle: (8,) position in joystick scale [m], quaternion, buttons.
         packet: (rows, k) packet from the machine, see `teleop.master`.
-        share: (1,) factor on the packet.
+        share: (1,) factor on the packet, 0 to 1.
         extra: (6,) additional force on the handle [N], [N m].
-        parameters: flat Master.
+        parameters: flat MasterParameters.
         state: flat MasterState of the thread.
     """
 
@@ -149,7 +152,10 @@ _MONOTONIC = clock.CLOCK_MONOTONIC
 
 @compiled
 def _read_clock(two):
-    """Return the time of `time.monotonic_ns` [ns] and prevent caching of the shared memory."""
+    """Return the time of `time.monotonic_ns` [ns]; `two` (2,) is work space.
+
+    The system call also makes the compiler read shared memory again instead of using cached values.
+    """
     _gettime(np.int32(_MONOTONIC), two.ctypes.data)
     return two[0] * 1_000_000_000 + two[1]
 
@@ -185,16 +191,18 @@ def scale_pose(position, quaternion, scale, rotation_scale, out):
 
 @compiled
 def answer_pose(line, box, now, two):
-    """Compute the wrench that answers a pose, with the joystick's control law.
+    """Check a received pose packet, count it, and compute the wrench packet that answers it.
+
+    The wrench follows from the joystick's control law and the machine's latest packet.
 
     Args:
-        line: Line with the received `pose`. `reply`, `count` and `ramp` are written.
+        line: LinkBuffers with the received `pose`. `reply`, `count` and `ramp` are written.
         box: Mailbox; the handle's part and `state` are written.
         now: arrival time, scalar [ns].
         two: (2,) work space of the clock.
 
     Returns:
-        Whether `reply` must be sent.
+        Whether `reply` must be sent; false for a malformed or late packet.
 
     Source: `teleop.master`; this module.
     """
@@ -255,7 +263,11 @@ def answer_pose(line, box, now, two):
 
 @compiled
 def _compute_reflection(line, box, now, two, first, period):
-    """Write the pose into the mailbox and compute the handle's force in the thread's state."""
+    """Write the handle's pose into the mailbox and compute the force on the handle.
+
+    The force is stored in `box.state`. Without data from the machine or a valid pose, its factor
+    `line.ramp[FORCE_GAIN]` is 0.
+    """
     real = line.pose_real
     scale = line.reach[0] / real[TRAVEL] if real[TRAVEL] > 0.0 else 0.0
     turns = line.reach[1] / real[TRAVEL + 1] if real[TRAVEL + 1] > 0.0 else 0.0
@@ -289,7 +301,10 @@ def _compute_reflection(line, box, now, two, first, period):
 
 @compiled
 def _answer_poses(handle, line, box):
-    """Answer poses until `count[STOP]` is set."""
+    """Receive pose packets from a socket and answer each with a wrench until `count[STOP_FLAG]` is set.
+
+    While no pose arrives, connection requests are sent to the server.
+    """
     two, count = np.zeros(2, np.int64), line.count
     size, answer = np.uint64(8 * POSE_WORDS), np.uint64(8 * WRENCH_WORDS)
     while count[STOP_FLAG] == 0:
@@ -327,7 +342,7 @@ def read_pose(mail, now, pose):
     """Read the handle's pose from the mailbox.
 
     Args:
-        mail: (1,) record of a Mailbox and of the dead bands.
+        mail: (1,) record with the addresses of the mailbox arrays and of the dead bands.
         now: current time, scalar [ns].
         pose: (8,) written: position in joystick scale [m], quaternion, buttons.
 
@@ -354,9 +369,10 @@ def exchange_with_mailbox(mail, qpos, packet, packet_gain, extra, engaged, now):
     """Write the machine's data into the mailbox and read the handle's pose.
 
     Args:
-        mail: see `read_pose`.
-        qpos: (7,) written, see `HapticLink.exchange`.
-        packet: (rows, k) see `HapticLink.exchange`.
+        mail: (1,) record with the addresses of the mailbox arrays and of the dead bands.
+        qpos: (7,) written: handle position in joystick scale [m] and quaternion; NaN if the result is
+            false.
+        packet: (rows, k) packet from the machine.
         packet_gain: factor on the packet, scalar.
         extra: (6,) additional force on the handle [N], [N m].
         engaged: whether the handle has been in its dead bands, scalar.
@@ -385,7 +401,7 @@ def exchange_with_mailbox(mail, qpos, packet, packet_gain, extra, engaged, now):
 
 @compiled
 def _is_centred(pose, dead):
-    """Return whether all axes of the joystick are in their dead bands."""
+    """Return whether the handle is inside the dead bands `dead` (6,) [m], [rad] of all axes."""
     for i in range(3):
         if not (abs(pose[i]) <= dead[i] and 2.0 * abs(pose[4 + i]) <= dead[3 + i]):
             return False
@@ -393,7 +409,7 @@ def _is_centred(pose, dead):
 
 
 class HapticLink:
-    """Connect to a device; the thread answers poses from `start` until `close`."""
+    """Connection to the server of a haptic device; a thread answers its poses from `start` until `close`."""
 
     def __init__(self, host: str, port: int) -> None:
         """Open a socket; the server is contacted later.
@@ -433,7 +449,7 @@ class HapticLink:
             packet_shape: shape of the machine's packets.
 
         Raises:
-            InputError: the structure needs more data than a pose and the machine's packet.
+            InputError: the kind of force reflection does not support haptic devices.
         """
         kind = REFLECTION_KINDS[int(parameters.kind[0])]
         if kind not in REFLECTIONS:
@@ -498,7 +514,11 @@ class HapticLink:
         self._counters_at_restart = line.pose[[MISSED, UNANSWERED]]
 
     def statistics(self) -> dict[str, Any]:
-        """Return the statistics: counts, and times as from `timing.summarise_durations`."""
+        """Return statistics of the connection.
+
+        They contain the counts of received, lost, late and malformed poses, server starts and periods that
+        the device missed. Answer, round-trip and interval times are as from `summarise_durations`.
+        """
         line, count = self.buffers, self.buffers.count
         return {
             "poses": int(count[RECEIVED]),
@@ -524,7 +544,7 @@ class HapticLink:
 
 
 def _pack_timeval(seconds: int, microseconds: int) -> bytes:
-    """Pack a C `struct timeval`."""
+    """Pack a time as a C `struct timeval`, for the receive timeout of a socket."""
     import struct
 
     return struct.pack("@ll", seconds, microseconds)

@@ -134,7 +134,7 @@ class DeviceSession:
         self._forces_on, self.answered = False, -1
 
     def update_pose(self, now: int) -> None:
-        """Apply the wrench and read the handle into `pose`, which can then be sent.
+        """Run one period: check the timeouts, apply the wrench, and write the handle's pose into the packet `pose`.
 
         Args:
             now: current time [ns].
@@ -278,7 +278,10 @@ def _run_periods(
 
 
 def _receive_packet(line: socket.socket, exchange: DeviceSession, view: memoryview, trip, now) -> int:
-    """Receive one packet, if any, and return whether it answered the pose of this period."""
+    """Receive one packet, if any; return 1 if it answers the pose of this period, otherwise 0.
+
+    For such an answer, `trip[0]` receives the time since the pose was sent [ns].
+    """
     try:
         size, sender = line.recvfrom_into(view)
     except OSError:  # no packet, or the previous one could not be delivered
@@ -305,7 +308,7 @@ def open_haptic_device(kind: str, period: float) -> HapticDevice:
     """Open a device for its server.
 
     Args:
-        kind: one of KINDS; `haption:HOST#PORT` for a device at another address.
+        kind: one of DEVICE_KINDS; `haption:HOST#PORT` for a device at another address.
         period: period of the server [s].
 
     Returns:

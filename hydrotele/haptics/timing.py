@@ -62,7 +62,7 @@ def summarise_durations(nanoseconds: np.ndarray) -> dict:
 class RealTimePacer:
     """Synchronise simulated time with the wall clock, with a deadline for every tick.
 
-    Small delays are caught up. After a delay of more than `patience`, simulated time is set back.
+    Small delays are caught up. After a delay of more than `max_delay`, simulated time is set back.
 
     Attributes:
         pauses: number of times that simulated time was set back.
@@ -76,7 +76,7 @@ class RealTimePacer:
         self, max_ticks: int, priority_level: int = 0, max_delay: float = 0.25,
         now: Callable[[], int] = clock.monotonic_ns, sleep: Callable[[float], None] = clock.sleep,
     ) -> None:  # fmt: skip
-        """Prepare the deadlines; time starts with the first call of `wait`, after compilation.
+        """Prepare the deadlines; time starts with the first call of `wait_for_tick`, after compilation.
 
         Args:
             max_ticks: maximum number of ticks whose delay is recorded.
@@ -133,7 +133,7 @@ class RealTimePacer:
         return 0.0
 
     def close(self) -> None:
-        """Return to normal priority."""
+        """Return the process to normal scheduling priority and normal garbage collection."""
         self._priority_stack.close()
 
     def delays(self) -> np.ndarray:
@@ -146,7 +146,7 @@ def measure_idle_deadlines(
     seconds: float, rate: float, level: int = 0, now: Callable[[], int] = clock.monotonic_ns,
     sleep: Callable[[float], None] = clock.sleep,
 ) -> dict:  # fmt: skip
-    """Measure the deadlines that an empty loop misses, as a baseline of computer and system.
+    """Measure how many deadlines a loop without work misses, and by how much, as a baseline of the computer.
 
     Args:
         seconds: duration [s].
@@ -156,7 +156,8 @@ def measure_idle_deadlines(
         sleep: function that waits for a time [s].
 
     Returns:
-        seconds, ticks, missed, late (see `summarise_durations`), and priority.
+        Dictionary: seconds, ticks, missed, lateness (see `summarise_durations`), and whether priority
+        was granted.
     """
     ticks = max(1, round(seconds * rate))
     pacer = RealTimePacer(ticks, level, now=now, sleep=sleep)
@@ -189,7 +190,7 @@ def read_steal_time(stat: Path = _STAT_FILE) -> float | None:
 
 
 def load_of_machine() -> list[float] | None:
-    """Return the load averages over 1, 5 and 15 minutes, None if unknown."""
+    """Return the computer's load averages over 1, 5 and 15 minutes, None if unknown."""
     try:
         return [round(v, 2) for v in os.getloadavg()]
     except OSError:
@@ -248,6 +249,6 @@ def reduced_jitter(level: int) -> Iterator[bool]:
 
 
 def _set_process_option(option: int, value: int) -> None:
-    """Set an option of this process or thread where it exists (Linux, prctl(2))."""
+    """Set an option of this process or thread with Linux's prctl(2); do nothing on other systems."""
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(option, value, 0, 0, 0)

@@ -1,13 +1,15 @@
 """Forces of an actuator: friction, presliding friction, end stops, and an axis with its own pump.
 
-Actuator parameters are at `user[u + Slot]`, those of a pump drive at `user[u + PUMP + PumpSlot]`.
+The parameters of an actuator are at `user[u + Slot]`, and those of its pump at
+`user[u + PUMP_OFFSET + PumpSlot]`, where u is the index of the actuator's first parameter.
 
 Presliding friction is the bristle model of Canudas de Wit et al. (LuGre):
 `F = sigma_0 z + sigma_1 z'` with the deflection rate `z' = v - sigma_0 |v| z / g(v)` and the
 sliding friction g of Coulomb and Stribeck. Without Stribeck friction and bristle damping it is
-Dahl's model. In steady sliding it equals `laws.friction` without the smoothing of the sign. The
+Dahl's model. In steady sliding it equals `laws.friction_force` without the smoothing of the sign. The
 state of a drive is the fraction of its breakaway force that the bristles carry,
-`r = sigma_0 z / (F_c + F_s)` [1], which is of order one in any machine.
+`r = sigma_0 z / (F_c + F_s)` [1] with Coulomb friction F_c and Stribeck friction F_s. It is of
+order one in any machine.
 
 The bristle stiffness is limited so that an explicit step can resolve the resulting vibration.
 
@@ -36,17 +38,17 @@ _PUMPED = float(ActuatorKind.PUMP_DRIVE)
 
 @inlined
 def actuator_friction(user, u, velocity):
-    """Return the friction force of an actuator at a velocity, see `laws.friction`.
+    """Return the Coulomb, Stribeck and viscous friction force of an actuator at a velocity.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         u: index of the first parameter of this actuator in `user`.
         velocity: scalar [m/s] or [rad/s].
 
     Returns:
         Friction force, scalar [N] or [N m], with the sign of the velocity.
 
-    Source: nominal model, "Piston force".
+    Source: nominal model, "Piston force"; formula of `laws.friction_force`.
     """
     return friction_force(
         velocity,
@@ -62,10 +64,10 @@ def actuator_friction(user, u, velocity):
 
 @allocation_free
 def actuator_friction_slope(user, u, velocity):
-    """Return the derivative of `actuator_friction` with respect to the velocity.
+    """Return the derivative of an actuator's friction force with respect to its velocity.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         u: index of the first parameter of this actuator in `user`.
         velocity: scalar [m/s] or [rad/s].
 
@@ -85,7 +87,7 @@ def actuator_stop(user, u, position, velocity):
     """Return the force of an actuator's end stops, its stiffness and its damping.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         u: index of the first parameter of this actuator in `user`.
         position: position of the load side, scalar [m] or [rad].
         velocity: velocity of the load side, scalar [m/s] or [rad/s].
@@ -110,15 +112,15 @@ def actuator_stop(user, u, position, velocity):
 
 @allocation_free
 def pump_drive_volumes(user, u, x):
-    """Return the volumes of both chambers and the oil volume taken from the accumulator.
+    """Return, for an axis with its own pump, both chamber volumes and the oil taken from the accumulator.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         u: index of the first parameter of this axis in `user`.
         x: piston displacement, scalar [m].
 
     Returns:
-        (V_A, V_B, oil volume taken relative to the retracted piston) [m^3].
+        (head-side volume, rod-side volume, oil volume taken relative to the retracted piston) [m^3].
 
     Source: geometry of the cylinder.
     """
@@ -133,21 +135,21 @@ def pump_drive_volumes(user, u, x):
 
 @allocation_free
 def pump_drive_pressure_rates(user, u, speed, p_head, p_rod, x, v, added):
-    """Compute the pressure rates of an axis with its own pump, as `circuit.pressure_rates`.
+    """Compute the pressure rates of both chambers of an axis with its own pump, and their slopes.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         u: index of the first parameter of this axis in `user`.
         speed: signed speed of its pump, scalar [rad/s].
-        p_head: scalar [Pa].
-        p_rod: scalar [Pa].
+        p_head: head-side pressure, scalar [Pa].
+        p_rod: rod-side pressure, scalar [Pa].
         x: piston displacement, scalar [m].
         v: piston velocity, scalar [m/s].
-        added: flows of the terms and their slopes, see `pump.pump_pressure_rates` [m^3/s],
-            [m^3/(s Pa)].
+        added: (4,) flows that terms add to the head and the rod side [m^3/s], and their slopes with
+            respect to the pressures [m^3/(s Pa)].
 
     Returns:
-        (p_head', p_rod' [Pa/s], d p_head'/d p_head, d p_rod'/d p_rod [1/s]).
+        (p_head', p_rod' [Pa/s], d p_head'/d p_head, d p_rod'/d p_rod [1/s]), where ' is d/dt.
 
     Source: `pump.pump_pressure_rates`.
     """
@@ -163,14 +165,14 @@ def pump_drive_force(user, u, p_load, p_head, p_rod, v, other_force, dt):
     """Return the net force of an axis with its own pump, after load cylinder and friction.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         u: index of the first parameter of this actuator in `user`.
         p_load: pressure in the load cylinder, scalar [Pa].
-        p_head: scalar [Pa].
-        p_rod: scalar [Pa].
+        p_head: head-side pressure, scalar [Pa].
+        p_rod: rod-side pressure, scalar [Pa].
         v: piston velocity, scalar [m/s].
-        other_force: all other force on the piston, scalar [N].
-        dt: time step of the friction, scalar [s]; see `pump_piston_friction`.
+        other_force: all other force on the piston, scalar [N]; static friction resists it.
+        dt: time step over which the friction acts, scalar [s]; 0 for the friction at velocity v.
 
     Returns:
         Force, scalar [N].
@@ -186,10 +188,10 @@ def pump_drive_force(user, u, p_load, p_head, p_rod, v, other_force, dt):
 
 @allocation_free
 def force_after_friction(user, u, drive_force, other_force, act, velocity, dt):
-    """Return the force of an actuator after friction, and the friction slope for an implicit step.
+    """Return the force of an actuator minus its friction, and the friction slope for an implicit step.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         u: index of the first parameter of this actuator in `user`.
         drive_force: force before friction, scalar [N] or [N m]; not used for an axis with its own pump.
         other_force: all other force on the drive, scalar [N] or [N m]. It is not part of the result; the
@@ -217,7 +219,7 @@ _MAX_PHASE_SQUARED = 0.5  # largest (w dt)^2 of a drive on its bristles; the sta
 
 @allocation_free
 def sliding_friction(velocity, coulomb, stribeck, stribeck_velocity, asymmetry):
-    """Return the dry friction of a sliding drive, without smoothing of the sign.
+    """Return the dry (Coulomb and Stribeck) friction of a sliding drive, with a discontinuous sign.
 
     `g = (F_c + F_s exp(-(v/v_s)^2)) s (1 + a s)` with `s = sgn v`.
 
@@ -243,14 +245,14 @@ def sliding_friction(velocity, coulomb, stribeck, stribeck_velocity, asymmetry):
 
 @allocation_free
 def bristle_step(force, velocity, level, stiffness, dt):
-    """Return the bristle force after a time at constant velocity, by the exact exponential.
+    """Return the elastic bristle force (presliding friction) after a time at constant velocity.
 
-    `F' = g + (F - g) exp(-sigma_0 |v| dt / |g|)`.
+    The exact solution is `F' = g + (F - g) exp(-sigma_0 |v| dt / |g|)`.
 
     Args:
         force: F, scalar [N] or [N m].
         velocity: v, scalar [m/s] or [rad/s].
-        level: g of `sliding_friction`, scalar [N] or [N m].
+        level: g, friction in steady sliding (`sliding_friction`), scalar [N] or [N m].
         stiffness: sigma_0, scalar [N/m] or [N m/rad].
         dt: duration, scalar [s].
 
@@ -273,13 +275,16 @@ def bristle_step(force, velocity, level, stiffness, dt):
 
 @allocation_free
 def _actuator_sliding_friction(user, u, velocity):
-    """Return the `sliding_friction` of an actuator."""
+    """Return the dry friction of an actuator that slides at a velocity, see `sliding_friction`."""
     return sliding_friction(velocity, user[u + _FC], user[u + _FS], user[u + _VS], user[u + _AC])
 
 
 @allocation_free
 def _resolved_stiffness(user, u, inertia, dt):
-    """Return the bristle stiffness of an actuator, limited as described in `bristle_rate`."""
+    """Return the bristle stiffness of an actuator, limited so that an explicit step is stable.
+
+    The limit is 0.5 inertia / dt^2; an inertia or time step of 0 means no limit.
+    """
     stiffness = user[u + _BRISTLE_STIFFNESS]
     if inertia > 0.0 and dt > 0.0:
         stiffness = min(stiffness, _MAX_PHASE_SQUARED * inertia / (dt * dt))
@@ -288,10 +293,12 @@ def _resolved_stiffness(user, u, inertia, dt):
 
 @allocation_free
 def bristle_rate(user, u, fraction, velocity, inertia, dt):
-    """Return the mean rate over a step of the breakaway force fraction carried by the bristles.
+    """Return the mean rate, over a time step, of the bristle state of an actuator (presliding friction).
+
+    The state r is the elastic bristle force divided by the breakaway force.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         u: index of the first parameter of this actuator in `user`.
         fraction: r at the start of the step, scalar [1].
         velocity: velocity of the drive over the step, scalar [m/s] or [rad/s].
@@ -315,13 +322,14 @@ def bristle_rate(user, u, fraction, velocity, inertia, dt):
 
 @allocation_free
 def bristle_friction(user, u, fraction, velocity, inertia, dt):
-    """Return the friction of a drive with bristles, and its derivatives.
+    """Return the friction of an actuator with presliding (bristle) friction, and its derivatives.
 
-    `F = r (F_c + F_s) + sigma_1 z' + b v (1 + a_v t)`, where z is the bristle deflection,
-    a_v the asymmetry of the viscous friction and `t = tanh(v/v_0)`; see `laws.friction`.
+    `F = r (F_c + F_s) + sigma_1 z' + b v (1 + a_v t)` with the breakaway force F_c + F_s, bristle
+    damping sigma_1, bristle deflection z, viscous friction b, its asymmetry a_v and
+    `t = tanh(v/v_0)`.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         u: index of the first parameter of this actuator in `user`.
         fraction: r, elastic bristle force relative to the breakaway friction, scalar [1].
         velocity: v, scalar [m/s] or [rad/s].
@@ -351,10 +359,10 @@ def bristle_friction(user, u, fraction, velocity, inertia, dt):
 
 @allocation_free
 def implicit_bristle_friction(user, u, fraction, velocity, other_force, inertia, dt):
-    """Return `bristle_friction` at the end of an implicit step of a free body.
+    """Return the friction of an actuator with bristles at the end of an implicit step of a free body.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         u: index of the first parameter of this actuator in `user`.
         fraction: r, elastic bristle force relative to the breakaway friction, scalar [1].
         velocity: at the start of the step, scalar [m/s] or [rad/s].

@@ -1,7 +1,7 @@
 """Time step of the hydraulic circuit: several valves and chambers with one shared supply.
 
 Pure functions on flat arrays in MuJoCo's layout, so that the native callbacks, the tests and the
-estimator run the same code. The parameters of axis `i` are at `user[i * SLOTS + Slot]`. Its
+estimator run the same code. The parameters of axis `i` are at `user[i * SLOT_COUNT + Slot]`. Its
 activations `spool, spool_rate, p_head, p_rod` are at `act[4 i ...]`, counted from the first
 hydraulic axis. The states of bristles, of a pump with a time constant and of terms follow after all
 axes. An axis with its own pump (`ActuatorKind.PUMP_DRIVE`, see `pump`) has pump speed and load cylinder
@@ -109,7 +109,10 @@ _COMMAND, _SUPPLY, _FORCE = (VARIABLES[n] for n in ("command", "pressure_supply"
 
 @inlined
 def _chamber_stiffness(user, u, x, p_head, p_rod):
-    """Return the stiffness of both chambers, including hose and air in the oil [Pa/m^3]."""
+    """Return the pressure rise per added oil volume of the head and the rod chamber [Pa/m^3].
+
+    It includes the compliance of hoses and of air bubbles in the oil. x is the piston displacement [m].
+    """
     beta = user[u + _BETA]
     volume_head, volume_rod = user[u + _VH], user[u + _VR]
     if user[u + 1] == 1.0:  # Kind.CYLINDER
@@ -125,30 +128,31 @@ def _chamber_stiffness(user, u, x, p_head, p_rod):
 
 @inlined
 def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead, added):
-    """Return the pressure rates of both chambers, and their slopes.
+    """Return the pressure rates of both chambers of an axis, and their slopes.
 
-    `p_A' = (beta / V_A)(q_A - A_h v - q_l + r_A)`, `p_B' = (beta / V_B)(q_B + A_r v + q_l + r_B)`.
-    A hose of compliance C_h counts as additional volume `beta C_h`, and air bubbles in the oil as
-    beta times their compliance (`laws.air_compliance`). Beyond an end of the stroke the volumes are
-    constant. The rates are those without released air; `laws.pressure_with_air` converts pressures
-    below atmosphere.
+    `p_A' = (beta / V_A)(q_A - A_h v - q_l + r_A)`, `p_B' = (beta / V_B)(q_B + A_r v + q_l + r_B)`
+    with bulk modulus beta, volumes V, valve flows q, areas A, piston leakage q_l, and flows r of port
+    relief, make-up valve and terms. A hose of compliance C_h counts as additional volume `beta C_h`, and
+    air bubbles in the oil as beta times their compliance (`laws.air_compliance`). Beyond an end of the
+    stroke the volumes are constant. The rates are those without released air; `laws.pressure_with_air`
+    converts pressures below atmosphere.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         u: index of the first parameter of this axis in `user`.
-        opening: o, scalar [1]; for an axis with its own pump the pump speed [rad/s].
-        p_supply: scalar [Pa].
-        p_head: scalar [Pa].
-        p_rod: scalar [Pa].
+        opening: signed valve opening, scalar [1]; for an axis with its own pump the pump speed [rad/s].
+        p_supply: supply pressure, scalar [Pa].
+        p_head: head-side pressure p_A, scalar [Pa].
+        p_rod: rod-side pressure p_B, scalar [Pa].
         x: piston displacement, scalar [m] (0 for a motor, whose volumes are constant).
         v: piston velocity, scalar [m/s] or [rad/s].
         ahead: time over which the slopes are used, scalar [s]: a relief or make-up valve that
             would open within it counts as open in the slope (not in the rate).
         added: flows of the machine's terms into both chambers [m^3/s] and their slopes with
-            respect to the pressures of these chambers [m^3/(s Pa)], see `terms.table.added_flows`.
+            respect to the pressures of these chambers [m^3/(s Pa)], see `terms.table.sum_flow_terms`.
 
     Returns:
-        (p_head', p_rod' [Pa/s], d p_head'/d p_head, d p_rod'/d p_rod [1/s]).
+        (p_head', p_rod' [Pa/s], d p_head'/d p_head, d p_rod'/d p_rod [1/s]), where ' is d/dt.
 
     Source: nominal model, "Chambers".
     """
@@ -177,9 +181,13 @@ def pressure_rates(user, u, opening, p_supply, p_head, p_rod, x, v, ahead, added
 
 @allocation_free
 def _term_flows(terms, i, user, time, x, oil, supply, drives):
-    """Return the flows that terms add to the chambers of an axis, see `terms.table.added_flows`.
+    """Return the flows that a machine's terms (additional laws) add to the chambers of axis i.
 
-    `oil` contains spool, spool rate and both pressures of the axis.
+    `oil` contains spool, spool rate and both pressures of the axis, and x is its position.
+
+    Returns:
+        (flow into head side, into rod side [m^3/s], their slopes with respect to the pressures of
+        these chambers [m^3/(s Pa)]).
     """
     if not (has_term(terms, FLOW_HEAD, i) or has_term(terms, FLOW_ROD, i)):
         return _NO_FLOWS
@@ -192,9 +200,9 @@ def _term_flows(terms, i, user, time, x, oil, supply, drives):
 
 @allocation_free
 def _term_delivery(user, first, drives, terms, time, supply, dt):
-    """Return the fraction of the maximum pump flow that terms add after a step, scalar [1].
+    """Return the flow that terms add to the supply at the end of a step, per maximum pump flow [1].
 
-    The pump follows the terms' values at the start of the step, by the exact exponential.
+    It follows the terms' values at the start of the step with a first-order lag.
     """
     at = int(user[first * SLOT_COUNT + _ADDED])
     if at == 0:
@@ -215,7 +223,7 @@ def _term_delivery(user, first, drives, terms, time, supply, dt):
 
 @allocation_free
 def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, extra_states):
-    """Advance spools and chamber pressures of all axes that share a supply by one step.
+    """Advance spools (or pump speeds) and chamber pressures of all hydraulic axes by one time step.
 
     Spools follow their exact exponential. Pressures take one step of the L-stable second-order
     Rosenbrock method ROS2, with constant piston velocities over the step. Its Jacobian is diagonal
@@ -226,7 +234,7 @@ def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, extra_s
     demands at both ends of the step, by its exact exponential.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         first: index of the first hydraulic actuator.
         drives: Drives: number of hydraulic actuators, <= MAX_AXES; their spool [1], spool rate
             [1/s] and pressures [Pa] at the start of the step, followed by the additional states of
@@ -236,7 +244,7 @@ def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, extra_s
         dt: time step, scalar [s].
         act_dot: (>= 4 count,) written: mean rates over the step, in the unit of `drives.act` per
             [s]; of the additional states only those of the pump.
-        scratch: (SCRATCH,) work space.
+        scratch: (SCRATCH_SIZE,) work space.
         terms: (n,) table of the machine's terms, `NO_TERMS` for none [SI].
         time: time at the start of the step, scalar [s]; used by terms only.
         extra_states: number of additional states after the activations, scalar [1]; `NO_EXTRA_STATES` skips
@@ -342,10 +350,12 @@ def step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, extra_s
 
 @allocation_free
 def advance_term_states(user, terms, drives, act_dot, dt, time, supply):
-    """Write the rates of the internal states of terms, after those of all other activations.
+    """Write the rates of the internal states of terms with hysteresis over a step.
+
+    It must be called after the rates of all other activations are written.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         terms: (n,) table of the machine's terms [SI].
         drives: Drives with the activations at the start of the step, positions at its end and
             velocities over it, and the commands that arrive [SI, commands in 1].
@@ -358,7 +368,7 @@ def advance_term_states(user, terms, drives, act_dot, dt, time, supply):
     Returns:
         Nothing.
 
-    Source: `terms.table.remembered`.
+    Source: `terms.table.update_term_state`.
     """
     act, count = drives.act, drives.count
     for term in range(int(terms[COUNT_INDEX])):
@@ -406,7 +416,11 @@ def _relief_limited_rate(margin, rate, relief_rate, dt):
 
 @inlined
 def _rate_with_air(user, u, pressure, rate, dt):
-    """Convert a mean pressure rate without released air to that with released air [Pa/s]."""
+    """Convert a mean pressure rate of oil without released air to that with released air [Pa/s].
+
+    `pressure` is the chamber pressure with air at the start of the step. Only pressures below
+    atmosphere are affected.
+    """
     release, onset = user[u + _AIR], user[u + _ONSET]
     if (pressure >= -onset and pressure + dt * rate >= -onset) or release == 0.0:
         return rate
@@ -416,7 +430,11 @@ def _rate_with_air(user, u, pressure, rate, dt):
 
 @inlined
 def _predicted_softening(user, u, pressure, rate, dt):
-    """Return the softening for the slopes of a step; 1 if the step would refill the chamber."""
+    """Return the factor by which released air reduces the pressure slopes of a chamber in a step [1].
+
+    It is 1 above atmosphere, and also if the step would refill the chamber. `rate` is the pressure rate
+    without released air [Pa/s].
+    """
     release, onset = user[u + _AIR], user[u + _ONSET]
     if pressure >= -onset or release == 0.0:
         return 1.0
@@ -455,7 +473,10 @@ def _prepare_coupling(user, first, count, act, length, velocity, dt, gamma_h, sc
 
 @inlined
 def _apply_coupling(count, rate, scratch):
-    """Add the coupling through the supply to the stage rates of uncoupled chambers."""
+    """Correct the stage rates of uncoupled chambers for the coupling through the supply, in place.
+
+    It applies the Sherman-Morrison factors of `_prepare_coupling` to `rate` (4 count,).
+    """
     pull = 0.0
     for a in range(0, 4 * count, 4):
         f = _FACTOR_OFFSET + a
@@ -470,13 +491,13 @@ def _apply_coupling(count, rate, scratch):
 
 @allocation_free
 def axis_flows_and_force(user, i, supply, act, x, v, bristle_fraction=0.0):
-    """Return the flows and the force of one axis in a state, for logs and balances.
+    """Return the flows into both chambers and the force of one axis in a state, for logs and balances.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         i: index of the actuator.
         supply: supply pressure, scalar [Pa].
-        act: (4,) spool [1], spool rate [1/s], p_head, p_rod [Pa].
+        act: (4,) spool [1], spool rate [1/s], head-side and rod-side pressure [Pa].
         x: piston displacement, scalar [m].
         v: piston velocity, scalar [m/s] or [rad/s].
         bristle_fraction: fraction of the breakaway force that the bristles carry, scalar [1].
@@ -500,7 +521,7 @@ def axis_flows_and_force(user, i, supply, act, x, v, bristle_fraction=0.0):
 
 
 def circuit_scratch() -> np.ndarray:
-    """Return a work space for `step_circuit`, shape (SCRATCH,)."""
+    """Allocate the work space (SCRATCH_SIZE,) of `step_circuit`, filled with zeros."""
     return np.zeros(SCRATCH_SIZE)
 
 
@@ -510,12 +531,12 @@ _RELATIVE_TOLERANCE = 1.0e-13
 
 @allocation_free
 def implicit_friction(user, u, velocity, other_force, inertia, dt):
-    """Return the friction at the end of an implicit step of a free body.
+    """Return the friction of an actuator at the end of an implicit step of a free body.
 
     Solves `v' = v + dt / J (F - F_f(v'))` by Newton's method inside a bracket.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         u: index of the first parameter of this actuator in `user`.
         velocity: v at the start of the step, scalar [m/s] or [rad/s].
         other_force: F, all other force, scalar [N] or [N m].
@@ -553,13 +574,13 @@ _OFFSET = int(Slot.OFFSET)
 
 @allocation_free
 def drive_state(user, i, count, act, supply, time, x, v, command, gain):
-    """Return the state of one drive, which is the input of the laws of terms.
+    """Collect the state of one drive, which is the input of the laws of terms.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         i: index of the actuator.
         count: number of hydraulic axes, which come first.
-        act: (>= 4 count,) spool [1], spool rate [1/s] and pressures [Pa].
+        act: (>= 4 count,) spool [1], spool rate [1/s] and two pressures [Pa] of every hydraulic axis.
         supply: supply pressure, scalar [Pa].
         time: scalar [s].
         x: position of the drive, scalar [m] or [rad].
@@ -582,19 +603,19 @@ def drive_state(user, i, count, act, supply, time, x, v, command, gain):
 
 @allocation_free
 def add_command_terms(user, terms, drives, dt, time, scratch, out):
-    """Add the command terms to the commands of the valves, evaluated at the middle of a step.
+    """Add the terms that act on commands to the commands of the valves, evaluated at the middle of a step.
 
     Positions and time are those at the middle of the step. Spools and pressures are those at its
     start; their effect on a command is therefore late by half a step.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         terms: (n,) table of terms [SI].
         drives: Drives with the activations at the start of the step, positions at its end and
             velocities over it, and the commands that arrive [SI, commands in 1].
         dt: time step, scalar [s].
         time: time at the start of the step, scalar [s].
-        scratch: (SCRATCH,) work space.
+        scratch: (SCRATCH_SIZE,) work space.
         out: (>= count,) commands with terms, written [1].
 
     Returns:

@@ -75,16 +75,17 @@ def orifice_flow(pressure_drop, flow_gain, smoothing):
 
 @inlined
 def port_flow(pressure, port_relief, relief_gain, tank_pressure, makeup_gain):
-    """Return the flow into a chamber through port relief and make-up valve, and its slope.
+    """Return the flow into a chamber through its port relief valve and make-up valve, and its slope.
 
-    `r = -k_r max(0, p - p_port) + k_m max(0, p_t - p)`.
+    `r = -k_r max(0, p - p_port) + k_m max(0, p_t - p)`. The relief valve limits the pressure, and the
+    make-up valve refills the chamber from the tank.
 
     Args:
         pressure: chamber pressure p, scalar [Pa].
-        port_relief: p_port, scalar [Pa].
-        relief_gain: k_r, scalar [m^3/(s Pa)].
+        port_relief: p_port, setting of the relief valve, scalar [Pa].
+        relief_gain: k_r, its flow per excess pressure, scalar [m^3/(s Pa)].
         tank_pressure: p_t, scalar [Pa].
-        makeup_gain: k_m, scalar [m^3/(s Pa)].
+        makeup_gain: k_m, flow of the make-up valve per pressure deficit, scalar [m^3/(s Pa)].
 
     Returns:
         (flow into the chamber [m^3/s], d flow / d p [m^3/(s Pa)] <= 0).
@@ -112,8 +113,8 @@ def pressure_with_air(oil, release, onset=0.0):
 
     Args:
         oil: P, pressure without released air, scalar [Pa] above atmosphere.
-        release: R = a beta, with the volume a of dissolved air at atmosphere per volume of oil,
-            scalar [Pa]; 0 for oil without air.
+        release: R = a beta, with the volume a of dissolved air at atmosphere per volume of oil and
+            the bulk modulus beta, scalar [Pa]; 0 for oil without air.
         onset: pressure deficit at which the release starts, scalar [Pa]; 0 in a simulation, the
             noise level of the pressure sensors in an estimator.
 
@@ -164,12 +165,12 @@ def pressure_without_air(pressure, release, onset=0.0):
     """Return the pressure that oil would have without released air; inverts `pressure_with_air`.
 
     Args:
-        pressure: p, scalar [Pa] above atmosphere; limited to slightly above vacuum.
-        release: R, scalar [Pa].
-        onset: scalar [Pa].
+        pressure: p, with released air, scalar [Pa] above atmosphere; limited to slightly above vacuum.
+        release: R of `pressure_with_air`: dissolved air fraction times bulk modulus, scalar [Pa].
+        onset: pressure deficit at which the release starts, scalar [Pa].
 
     Returns:
-        P, scalar [Pa].
+        P, pressure without released air, scalar [Pa] above atmosphere; equal to p if p >= -onset.
 
     Source: inverse of `pressure_with_air`.
 
@@ -185,12 +186,14 @@ def pressure_without_air(pressure, release, onset=0.0):
 
 @inlined
 def air_softening_factor(pressure, release, onset=0.0):
-    """Return the derivative of the pressure with released air by the pressure without it.
+    """Return the factor by which air released below atmosphere softens the oil in a chamber.
+
+    It is the derivative of the pressure p with released air by the pressure P without it.
 
     Args:
         pressure: p, scalar [Pa] above atmosphere.
-        release: R, scalar [Pa].
-        onset: scalar [Pa].
+        release: R of `pressure_with_air`: dissolved air fraction times bulk modulus, scalar [Pa].
+        onset: pressure deficit at which the release starts, scalar [Pa].
 
     Returns:
         dp/dP, scalar [1]; 1 if p >= -onset.
@@ -212,14 +215,15 @@ def air_softening_factor(pressure, release, onset=0.0):
 def counterbalance_opening(pressure, pilot, setting, pilot_ratio, override):
     """Return the relative opening of a counterbalance valve, and its slope.
 
-    `(p + R p_pilot - p_set) / p_o`, limited to 0 .. 1. Flow into the chamber passes the valve's
+    `(p + R p_pilot - p_set) / p_o`, limited to 0 .. 1. The valve holds a load until the pressure of
+    the opposite chamber opens it. Flow into the chamber passes the valve's
     check valve without resistance.
 
     Args:
         pressure: p of the held chamber, scalar [Pa].
         pilot: p_pilot of the opposite chamber, scalar [Pa].
-        setting: p_set, scalar [Pa].
-        pilot_ratio: R, scalar [1].
+        setting: p_set, opening pressure without pilot pressure, scalar [Pa].
+        pilot_ratio: R, weight of the pilot pressure, scalar [1].
         override: p_o, pressure above the setting at which the valve is fully open, scalar [Pa],
             > 0.
 
@@ -250,8 +254,8 @@ def stop_force(position, velocity, low, high, stiffness, damping):
     Args:
         position: x, scalar [m] or [rad].
         velocity: v, scalar [m/s] or [rad/s].
-        low: x_low, scalar [m] or [rad].
-        high: x_high, scalar [m] or [rad].
+        low: x_low, lower end of the travel, scalar [m] or [rad].
+        high: x_high, upper end of the travel, scalar [m] or [rad].
         stiffness: k, scalar [N/m] or [N m/rad].
         damping: c, scalar [N s/m] or [N m s/rad].
 
@@ -317,16 +321,16 @@ def friction_slope(
 
     Args:
         velocity: v, scalar [m/s] or [rad/s].
-        coulomb: F_c, scalar [N] or [N m].
-        stribeck: F_s, scalar [N] or [N m].
-        stribeck_velocity: v_s, scalar [m/s] or [rad/s], > 0.
-        viscous: b, scalar [N s/m] or [N m s/rad].
-        coulomb_velocity: v_0, scalar [m/s] or [rad/s], > 0.
-        coulomb_asymmetry: a_c, scalar [1].
-        viscous_asymmetry: a_v, scalar [1].
+        coulomb: Coulomb friction, scalar [N] or [N m].
+        stribeck: additional friction at rest, scalar [N] or [N m].
+        stribeck_velocity: velocity at which it decays, scalar [m/s] or [rad/s], > 0.
+        viscous: viscous coefficient, scalar [N s/m] or [N m s/rad].
+        coulomb_velocity: smoothing of the sign function, scalar [m/s] or [rad/s], > 0.
+        coulomb_asymmetry: relative excess of the dry friction in positive direction, scalar [1].
+        viscous_asymmetry: the same for the viscous friction, scalar [1].
 
     Returns:
-        dF_f/dv, scalar [N s/m] or [N m s/rad].
+        Derivative, scalar [N s/m] or [N m s/rad].
 
     Source: derivative of the nominal model's "Piston force".
 
@@ -349,11 +353,12 @@ def friction_slope(
 
 @allocation_free
 def spool_step(spool, spool_rate, command, bandwidth, damping, dt, slew_limit=0.0):
-    """Advance the spool `s'' = w^2 (u - s) - 2 z w s'`, `|s'| <= s_max`, by one step.
+    """Advance position and speed of a valve spool by one time step of its second-order dynamics.
 
-    The command is constant over the step. The exponential is truncated after the fourth power of
-    `w dt`: for z <= 1 the error per step is below `(w dt)^5 / 30` of `u - s` (1.1e-8 for 8 Hz and
-    1 ms). For `w dt > 0.5` the step is subdivided.
+    `s'' = w^2 (u - s) - 2 z w s'` with `|s'| <= s_max`, where ' is d/dt. The command is constant
+    over the step. The exponential is truncated after the fourth power of `w dt`: for z <= 1 the
+    error per step is below `(w dt)^5 / 30` of `u - s` (1.1e-8 for 8 Hz and 1 ms). For
+    `w dt > 0.5` the step is subdivided.
 
     Args:
         spool: s, scalar [1].
@@ -402,13 +407,13 @@ _CURVES, _TANK_LEAK = int(Slot.CURVES), int(Slot.TANK_LEAKAGE)
 
 @inlined
 def axis_opening(user, u, spool):
-    """Return the opening of an axis' valve from dead band and flow curve of its direction.
+    """Return the signed opening of an axis' valve at a spool position, from dead band and flow curve.
 
     `o = c(t)` with the travel beyond the dead band `t = (|s| - db) / (1 - db)`. The curve c is
     linear between its knots and is extrapolated beyond the last one. Without a curve `o = t`.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         u: index of the first parameter of this axis in `user`.
         spool: spool position s, scalar [1].
 
@@ -437,12 +442,12 @@ def inlet_gain(user, u, opening):
     """Return the flow gain of the metering edge that feeds a chamber.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         u: index of the first parameter of this axis in `user`.
-        opening: o, scalar [1].
+        opening: o, signed valve opening, scalar [1].
 
     Returns:
-        k of P-A (o > 0) or P-B, scalar [m^3/(s sqrt(Pa))].
+        Flow per root of the pressure drop of the edge P-A (o > 0) or P-B, scalar [m^3/(s sqrt(Pa))].
 
     Source: nominal model, "Orifice".
     """
@@ -456,13 +461,13 @@ def inlet_flow(drop, gain, smoothing, compensated):
 
     Args:
         drop: pressure drop, scalar [Pa], > 0.
-        gain: k, scalar [m^3/(s sqrt(Pa))].
-        smoothing: d, scalar [Pa].
+        gain: flow per root of the pressure drop, scalar [m^3/(s sqrt(Pa))].
+        smoothing: pressure drop below which the root law is smoothed, scalar [Pa].
         compensated: largest drop over the edge that the compensator allows, scalar [Pa]; 0 without
             compensator.
 
     Returns:
-        (q [m^3/s], dq/d(drop) [m^3/(s Pa)] >= 0).
+        (flow [m^3/s], its derivative by the drop [m^3/(s Pa)] >= 0).
 
     Source: pressure-compensated flow control, an orifice with a held drop (Merritt 1967).
 
@@ -476,14 +481,24 @@ def inlet_flow(drop, gain, smoothing, compensated):
 
 @inlined
 def _outlet_flow(user, u, holding, gain, pressure, pilot):
-    """Return the flow out of a chamber through the open edge to tank, and its slope."""
+    """Return the flow out of a chamber through the valve's open edge to tank, and its slope.
+
+    `gain` is that of the edge, `holding` the slot of the chamber's counterbalance valve, and `pilot` the
+    pressure of the opposite chamber [Pa].
+
+    Returns:
+        (flow [m^3/s], its derivative by the chamber pressure [m^3/(s Pa)]).
+    """
     flow, slope = orifice_flow(pressure - user[u + _TANK], gain, user[u + _D])
     return _counterbalanced_flow(user, u, holding, flow, slope, pressure, pilot)
 
 
 @inlined
 def _tank_leakage(user, u, holding, pressure, pilot):
-    """Return the flow out of a chamber through the spool's clearance to tank, and its slope."""
+    """Return the leakage out of a chamber through the spool's clearance to tank, and its slope.
+
+    The arguments and units are those of `_outlet_flow`.
+    """
     leak = user[u + _TANK_LEAK]
     flow = leak * (pressure - user[u + _TANK])
     return _counterbalanced_flow(user, u, holding, flow, leak, pressure, pilot)
@@ -491,7 +506,10 @@ def _tank_leakage(user, u, holding, pressure, pilot):
 
 @inlined
 def _counterbalanced_flow(user, u, holding, flow, slope, pressure, pilot):
-    """Return a flow to tank after the chamber's counterbalance valve, and its slope."""
+    """Reduce a flow to tank, and its slope, by the opening of the chamber's counterbalance valve.
+
+    Without such a valve, or for flow into the chamber, both are returned unchanged.
+    """
     if user[u + holding] == 0.0 or flow <= 0.0:
         return flow, slope
     share, steep = counterbalance_opening(
@@ -513,12 +531,12 @@ def chamber_flows(user, u, opening, p_supply, p_head, p_rod):
     into a chamber is not modelled.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         u: index of the first parameter of this axis in `user`.
-        opening: o, scalar [1].
-        p_supply: scalar [Pa].
-        p_head: scalar [Pa].
-        p_rod: scalar [Pa].
+        opening: o, signed valve opening, scalar [1].
+        p_supply: supply pressure, scalar [Pa].
+        p_head: head-side pressure, scalar [Pa].
+        p_rod: rod-side pressure, scalar [Pa].
 
     Returns:
         (q_head, q_rod [m^3/s], d q_head/d p_head, d q_rod/d p_rod [m^3/(s Pa)]).
@@ -535,7 +553,10 @@ def chamber_flows(user, u, opening, p_supply, p_head, p_rod):
 
 @inlined
 def _edge_flows(user, u, opening, p_supply, p_head, p_rod):
-    """Return the `chamber_flows` through the open edges of the spool, without leakage."""
+    """Return the valve flows into both chambers through the open edges of the spool, without leakage.
+
+    Arguments and result are those of `chamber_flows`.
+    """
     if opening == 0.0:
         return 0.0, 0.0, 0.0, 0.0
     gain, smoothing, drop = user[u + _K] * abs(opening), user[u + _D], user[u + _DROP]

@@ -20,7 +20,7 @@ class Slot(enum.IntEnum):
     """Indices of an actuator's parameters in `actuator_user`, all in SI units.
 
     For optional effects, 0 disables the effect (for metering ratios, 1 does). BRISTLE, DELIVERY and
-    ADDED_DELIVERY are indices of activations, counted from the first hydraulic axis. MEMORY is the
+    ADDED_DELIVERY are indices of activations, counted from the first hydraulic axis. EXTRA_STATES is the
     number of additional activations after those of the hydraulic axes (see `extra_state_names`).
     CURVES, the last, is the start of two flow curves, for the positive and the negative direction.
     Each has the number of knots (0: linear), CURVE_KNOTS travels and CURVE_KNOTS openings.
@@ -142,7 +142,7 @@ SLOT_COUNT = PUMP_OFFSET + len(PumpSlot)
 class ActuatorKind(enum.IntEnum):
     """Kinds of actuators: cylinder, rotary motor, force drive with friction, or pump drive.
 
-    PUMPED is a cylinder with its own pump instead of a valve.
+    PUMP_DRIVE is a cylinder with its own pump instead of a valve.
     """
 
     CYLINDER = 1
@@ -188,7 +188,7 @@ def actuator_parameters(machine: Machine) -> dict[str, np.ndarray]:
         machine: the machine.
 
     Returns:
-        Axis name -> (SLOTS,) parameters in SI, with the indices of `Slot`.
+        Axis name -> (SLOT_COUNT,) parameters in SI, with the indices of `Slot`.
     """
     count = len(machine.hydraulic_axes)
     memory = {name: 4 * count + k for k, name in enumerate(extra_state_names(machine))}
@@ -293,7 +293,7 @@ def _write_end_stop(numbers: np.ndarray, machine: Machine, name: str) -> None:
 
 
 def _write_hydraulics(numbers: np.ndarray, axis: Axis, supply: Supply) -> None:
-    """Write the parameters of an axis with a valve."""
+    """Write areas, volumes, valve and supply of an axis with a valve to its parameters (SLOT_COUNT,)."""
     valve = axis.valve
     assert valve is not None
     drive = axis.hydraulic_drive
@@ -319,7 +319,7 @@ def _write_hydraulics(numbers: np.ndarray, axis: Axis, supply: Supply) -> None:
 
 
 def _write_pump_drive(numbers: np.ndarray, machine: Machine, name: str) -> None:
-    """Write the parameters of an axis with its own pump."""
+    """Write cylinder, pump and load cylinder of an axis with its own pump to its parameters (SLOT_COUNT,)."""
     axis = machine.axes[name]
     cylinder, pump = axis.cylinder, axis.pump
     assert cylinder and pump
@@ -393,7 +393,7 @@ def _write_curve(numbers: np.ndarray, first: int, curve: FlowCurve | None) -> No
 
 
 def _write_counterbalance(numbers: np.ndarray, first: int, valve: Counterbalance | None) -> None:
-    """Write setting, pilot ratio and override pressure to consecutive slots."""
+    """Write setting, pilot ratio and override pressure of a counterbalance valve to the slots from `first` on."""
     if valve:
         override = valve.override * valve.setting
         numbers[first : first + 3] = valve.setting, valve.pilot_ratio, override

@@ -43,18 +43,20 @@ _LOAD_FRICTION, _LOAD_RETURN = PumpSlot.LOAD_FRICTION.value, PumpSlot.LOAD_RETUR
 def pump_speed_step(user, p, speed, command, p_head, p_rod, dt):
     """Return the pump speed after a step, signed by the side that the valve selects.
 
-    `J w' = k (u U - k w) / R - D dp (1 + l) - T_c - T_s exp(-(w/w_s)^2) - b w`, with w >= 0. The
+    `J w' = k (u U - k w) / R - D dp - l |D dp| - T_c - T_s exp(-(w/w_s)^2) - b w`, with speed w >= 0,
+    inertia J, torque constant k, duty cycle u, voltage U, resistance R, displacement D, pressure rise
+    dp, torque loss l, drag T_c, breakaway torque T_s that decays at w_s, and viscous drag b. The
     current is quasi-static, because `L/R` is shorter than the time scale of the speed. `b w` and
     `k^2 w / R` are taken at the end of the step. Without a motor the speed is the command times the
     rated speed.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         p: index of the pump parameters of this axis in `user`.
         speed: signed speed at the start, scalar [rad/s].
         command: u, signed by the side, scalar [1].
-        p_head: scalar [Pa].
-        p_rod: scalar [Pa].
+        p_head: head-side pressure, scalar [Pa].
+        p_rod: rod-side pressure, scalar [Pa].
         dt: time step, scalar [s].
 
     Returns:
@@ -134,15 +136,16 @@ def accumulator_pressure(pressure, gas_volume, removed_volume):
 def pump_flows(user, p, speed, p_head, p_rod, removed_volume):
     """Return the flows of pump and accumulator line into both chambers, and their slopes.
 
-    The pump moves `D w - k dp` from one line to the other, the accumulator adds
-    `(p_a - p) / R` to the line that the pump draws from.
+    The pump moves `D w - k dp` from one line to the other, with displacement D, speed w, leakage k and
+    pressure rise dp. The accumulator at pressure p_a adds `(p_a - p) / R` through the resistance R to
+    the line at pressure p that the pump draws from.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         p: index of the pump parameters of this axis in `user`.
-        speed: signed speed, scalar [rad/s]; 0: valve closed.
-        p_head: scalar [Pa].
-        p_rod: scalar [Pa].
+        speed: pump speed, positive if it feeds the head side, scalar [rad/s]; 0: valve closed.
+        p_head: head-side pressure, scalar [Pa].
+        p_rod: rod-side pressure, scalar [Pa].
         removed_volume: oil volume that the piston has taken from the accumulator, scalar [m^3].
 
     Returns:
@@ -164,7 +167,7 @@ def pump_flows(user, p, speed, p_head, p_rod, removed_volume):
 
 @allocation_free
 def oil_compliance(volume, bulk_modulus, compliance, air, pressure):
-    """Return the compliance of a chamber: oil, walls, and air that follows Boyle's law.
+    """Return the compliance (volume per pressure) of a chamber: oil, walls, and air by Boyle's law.
 
     `C = V / beta + C_w + V_air p_atm / (p + p_atm)^2`.
 
@@ -191,22 +194,23 @@ def oil_compliance(volume, bulk_modulus, compliance, air, pressure):
 def pump_pressure_rates(user, p, speed, p_head, p_rod, volumes, swept, leakage, added):
     """Return the pressure rates of both chambers of a pump drive, and their slopes.
 
-    `C_A p_A' = q_A - A_h v - q_l + a_A`, `C_B p_B' = q_B + A_r v + q_l + a_B`.
+    `C_A p_A' = q_A - A_h v - q_l + a_A`, `C_B p_B' = q_B + A_r v + q_l + a_B` with compliances C, flows q
+    of pump and accumulator, areas A, piston velocity v, piston leakage q_l, and flows a of terms.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         p: index of the pump parameters of this axis in `user`.
-        speed: signed pump speed, scalar [rad/s].
-        p_head: scalar [Pa].
-        p_rod: scalar [Pa].
+        speed: pump speed, positive if it feeds the head side, scalar [rad/s].
+        p_head: head-side pressure p_A, scalar [Pa].
+        p_rod: rod-side pressure p_B, scalar [Pa].
         volumes: (V_A, V_B, oil volume taken from the accumulator) [m^3].
         swept: (A_h v, A_r v) [m^3/s].
         leakage: leakage of the piston, scalar [m^3/(s Pa)].
         added: flows a_A, a_B of the machine's terms [m^3/s] and their slopes with respect to the
-            pressures of these chambers [m^3/(s Pa)], see `terms.table.added_flows`.
+            pressures of these chambers [m^3/(s Pa)], see `terms.table.sum_flow_terms`.
 
     Returns:
-        (p_head', p_rod' [Pa/s], d p_head'/d p_head, d p_rod'/d p_rod [1/s]).
+        (p_head', p_rod' [Pa/s], d p_head'/d p_head, d p_rod'/d p_rod [1/s]), where ' is d/dt.
 
     Source: volume balance of the chambers.
     """
@@ -225,15 +229,15 @@ def pump_pressure_rates(user, p, speed, p_head, p_rod, volumes, swept, leakage, 
 
 @allocation_free
 def load_pressure_step(user, p, pressure, velocity, dt):
-    """Return the pressure in the load cylinder after a step.
+    """Return the pressure in the load cylinder, which pushes against a pump drive, after a time step.
 
     The chamber is compressed by `s = d p / (p_v + p) + A p / k`: a void of width d that contains
     air at pressure p_v, in series with oil of stiffness k. The piston adds `v dt` to s. s does not
     fall below 0, because the chamber refills without pressure. p does not exceed the relief
-    pressure `p_s + r A max(0, v)`.
+    pressure `p_s + r A max(0, v)`, with setting p_s, override r and piston area A.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         p: index of the pump parameters of this axis in `user`.
         pressure: p at the start, scalar [Pa].
         velocity: v, positive against the load, scalar [m/s].
@@ -264,7 +268,9 @@ def load_pressure_step(user, p, pressure, velocity, dt):
 
 @allocation_free
 def load_force(user, p, pressure):
-    """Return the force of the load cylinder against extension, without friction, scalar [N].
+    """Return the force of the load cylinder against extension of a pump drive, without friction [N].
+
+    `p` is the index of the pump parameters in `user`, and `pressure` that in the load cylinder [Pa].
 
     Source: pressure times area.
     """
@@ -276,12 +282,12 @@ def pump_piston_friction(user, p, seal, velocity, push, load_pressure, dt):
     """Return the friction of a pump drive's piston at the end of a step, including sticking.
 
     The dry friction is `F_c + F_s exp(-(v/v_s)^2) + m A p_load`, plus `F_r` while the load cylinder
-    retracts. If the dry friction can make the velocity after the step,
-    `v' = v + dt/M (F - F_f)`, zero, it does. With dt = 0 the friction is that at the current
-    velocity; at rest it balances F as far as possible.
+    retracts. m is the friction coefficient of the load cylinder, A its area and F_r its return force. If
+    the dry friction can make the velocity after the step, `v + dt/M (F - F_f)`, zero, it does. With dt = 0 the
+    friction is that at the current velocity; at rest it balances F as far as possible.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         p: index of the pump parameters of this axis in `user`.
         seal: seal friction (F_c, F_s [N], v_s [m/s], b [N s/m], asymmetry of F_c + F_s, asymmetry
             of b [1]).

@@ -28,8 +28,8 @@ _KIND, _PUMPED = int(Slot.KIND), float(ActuatorKind.PUMP_DRIVE)
 def supply_pressure(ports, count, smoothing, relief, pump_flow, droop=0.0, override=0.0):
     """Solve for the supply pressure at which the pump flow equals the flows of valves and relief.
 
-    Solves `sum_i k_i g(min(p_s - p_i, d_i)) = Q_pump - c_p p_s` over the valves whose load check is
-    open, by Newton's method in `sqrt(p_s - min p_i)` with bisection as a fallback. A relief valve
+    Solves `sum_i k_i g(min(p_s - p_i, d_i)) = Q_pump - c_p p_s` with the smoothed root g over the valves
+    whose load check is open, by Newton's method in `sqrt(p_s - min p_i)` with bisection as a fallback. A relief valve
     with an override r opens at its setting p_r and passes the flow `(p_s - p_r) / r`. Without
     override the pressure is limited to the setting.
 
@@ -96,21 +96,22 @@ def supply_pressure(ports, count, smoothing, relief, pump_flow, droop=0.0, overr
 
 @inlined
 def compute_ports(user, act, spool, ports, first, count, ahead, rate):
-    """Compute opening, inlet gain and fed chamber pressure of every axis for `supply_pressure`.
+    """Compute, for the supply pressure, valve opening, inlet gain and fed chamber pressure of every axis.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         act: (4 count,) activations; pressures [Pa].
         spool: (4 count,) array with the spool position of every axis at index 0 of its four [1].
-        ports: (>= 4 count,) written: `k_i` [m^3/(s sqrt(Pa))], `p_i` and `d_i` [Pa], opening
-            [1].
+        ports: (>= 4 count,) written, four values per axis: inlet gain [m^3/(s sqrt(Pa))], fed chamber
+            pressure [Pa], pressure drop set by the compensator [Pa], opening [1]. The last is the pump
+            speed [rad/s] for an axis with its own pump.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
         ahead: time by which the pressures are extrapolated with `rate`, scalar [s].
         rate: (4 count,) array with pressure rates at indices 2 and 3 of every axis [Pa/s].
 
     Returns:
-        Nothing; `ports` is filled.
+        Nothing.
 
     Source: nominal model, "Orifice".
     """
@@ -135,9 +136,9 @@ def delivered_flow_fraction(user, first, act):
     It is 1 for a pump without time constant and without terms.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         first: index of the first hydraulic actuator.
-        act: (>= 4 count + MEMORY,) activations; DELIVERY is read if the pump has a time constant,
+        act: (>= 4 count + EXTRA_STATES,) activations; DELIVERY is read if the pump has a time constant,
             ADDED_DELIVERY if terms add to the flow [1].
 
     Returns:
@@ -153,12 +154,14 @@ def delivered_flow_fraction(user, first, act):
 
 @allocation_free
 def pump_flow_fraction(user, first, act):
-    """Return the fraction of its maximum flow that the pump delivers, without terms.
+    """Return the fraction of its maximum flow that the pump itself delivers, without terms.
+
+    It is 1 for a pump without time constant; otherwise it is a state of the simulation.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         first: index of the first hydraulic actuator.
-        act: (>= 4 count + MEMORY,) activations [1].
+        act: (>= 4 count + EXTRA_STATES,) activations [1].
 
     Returns:
         Fraction, scalar [1].
@@ -189,13 +192,13 @@ def add_flow_fractions(fraction, added):
 
 @allocation_free
 def pump_response(user, first, demanded, fraction, dt):
-    """Return the pump's flow fraction after a time, by the exact exponential of its lag.
+    """Return the flow fraction of a pump with first-order lag after a time, by the exact exponential.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         first: index of the first hydraulic actuator.
-        demanded: demanded fraction of `demanded_flow_fraction`, constant over the time, scalar [1].
-        fraction: fraction at the start, scalar [1].
+        demanded: fraction of the maximum flow that the valves demand, constant over the time, scalar [1].
+        fraction: delivered fraction at the start, scalar [1].
         dt: duration, scalar [s].
 
     Returns:
@@ -211,16 +214,18 @@ def pump_response(user, first, demanded, fraction, dt):
 def demanded_flow_fraction(user, first, count, ports):
     """Return the fraction of the maximum pump flow that the valves demand.
 
-    `q = (sum_i q_i + c_p p_s) / Q_pump` at the pressure p_s of a pump without time constant. A pump
-    with time constant T follows `T q' = q_demanded - q` and delivers at most q Q_pump. While its
+    `q = (sum_i q_i + c_p p_s) / Q_pump` with valve flows q_i, pump leakage c_p and maximum flow Q_pump,
+    at the pressure p_s of a pump without time constant. A pump with time constant T delivers at most
+    the fraction r with `T dr/dt = q - r`. While its
     displacement increases, the pressure drops until the valves draw no more than that. While it
     decreases, the excess flow passes the relief or unloading valve.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
-        ports: (>= 4 count,) as `compute_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
+        ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], fed pressure [Pa], compensated drop [Pa] and
+            opening [1] of every axis, as `compute_ports` writes them.
 
     Returns:
         q, scalar [1], 0 .. 1.
@@ -233,17 +238,18 @@ def demanded_flow_fraction(user, first, count, ports):
 
 @allocation_free
 def drawn_flow(user, first, count, ports, supply):
-    """Return the flow of all valves and the pump's internal leakage at a supply pressure.
+    """Return the flow that all valves and the pump's internal leakage draw at a supply pressure.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
-        ports: (>= 4 count,) as `compute_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
+        ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], fed pressure [Pa], compensated drop [Pa] and
+            opening [1] of every axis, as `compute_ports` writes them.
         supply: p_s, scalar [Pa].
 
     Returns:
-        `sum_i q_i + c_p p_s`, scalar [m^3/s].
+        `sum_i q_i + c_p p_s` with valve flows q_i and leakage coefficient c_p, scalar [m^3/s].
 
     Source: nominal model, "Supply".
     """
@@ -261,10 +267,11 @@ def max_supply_pressure(user, first, count, ports):
     """Return the upper limit of the supply pressure: relief setting or load-sensing pressure.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
-        ports: (>= 4 count,) as `compute_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
+        ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], fed pressure [Pa], compensated drop [Pa] and
+            opening [1] of every axis, as `compute_ports` writes them.
 
     Returns:
         p_s, scalar [Pa].
@@ -290,10 +297,11 @@ def circuit_supply_pressure(user, first, count, ports, fraction):
     load), within the limits of relief setting and flow.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
-        ports: (>= 4 count,) as `compute_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
+        ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], fed pressure [Pa], compensated drop [Pa] and
+            opening [1] of every axis, as `compute_ports` writes them.
         fraction: fraction of its maximum flow that the pump delivers, scalar [1], > 0.
 
     Returns:
@@ -317,10 +325,11 @@ def supply_coupling(user, first, count, ports, supply, out):
     derivative of an inlet's flow with respect to its pressure drop.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) parameters of all actuators, see `parameters.Slot`.
         first: index of the first hydraulic actuator.
         count: number of hydraulic actuators.
-        ports: (>= 4 count,) as `compute_ports` writes it, [m^3/(s sqrt(Pa))], [Pa], [Pa], [1].
+        ports: (>= 4 count,) inlet gain [m^3/(s sqrt(Pa))], fed pressure [Pa], compensated drop [Pa] and
+            opening [1] of every axis, as `compute_ports` writes them.
         supply: p_s of `circuit_supply_pressure`, scalar [Pa].
         out: (>= 4 count,) written at indices 2 and 3 of every axis: g_i [m^3/(s Pa)] and
             dp_s/dp_i [1].

@@ -44,7 +44,7 @@ class Equations:
         name: name of the run.
         band: cutoff of the low-pass filter [Hz].
         matrix: (n, k, m) regressor.
-        force: (n, k) drive forces minus the forces of stated joint damping and springs [N] or
+        force: (n, k) measured drive forces minus the forces of stated joint damping and springs [N] or
             [N m]; NaN where unknown.
         time: (n,) time from the start of the run [s].
         spacing: time between equations [s]; an integer fraction of a repeated motion's period.
@@ -65,7 +65,10 @@ class Equations:
     motion_noise: np.ndarray
 
     def noise_rms(self, value: np.ndarray) -> np.ndarray:
-        """Return the RMS error (k,) [N] or [N m] of a perfect model with parameters (m,)."""
+        """Return the RMS force error (k,) [N] or [N m] that sensor noise alone would cause.
+
+        It holds for a perfect model with parameters (m,); NaN if motion errors were not computed.
+        """
         if not self.motion_noise.size:
             return np.full(len(self.force_noise), np.nan)
         moved = np.einsum("m,kml,l->k", value, self.motion_noise, value)
@@ -73,7 +76,7 @@ class Equations:
 
 
 class RateErrors(NamedTuple):
-    """Independent errors of the rates of the measured joints.
+    """Standard deviations of the rates (velocities) of the measured joints, whose errors are independent.
 
     Attributes:
         axes: names of the k joints.
@@ -84,7 +87,7 @@ class RateErrors(NamedTuple):
     std: np.ndarray
 
     def select_rows(self, rows: slice) -> "RateErrors":
-        """Return the errors of some rows."""
+        """Return the rate errors of the rows of a slice."""
         return self._replace(std=self.std[rows])
 
 
@@ -92,7 +95,7 @@ def build_equations(
     record: IdentificationRecord, setup: RegressorSetup, processing: Processing, position_resolution: Resolution,
     with_noise: bool = False, rate_errors: RateErrors | None = None,
 ) -> tuple[Equations, Regressor]:  # fmt: skip
-    """Build the low-pass filtered equations of a run.
+    """Build the low-pass filtered equations `regressor @ parameters = force` of a run.
 
     Args:
         record: the run.
@@ -154,7 +157,7 @@ def build_equations(
 def _compute_motion(
     record: IdentificationRecord, position_resolution: Resolution, processing: Processing
 ) -> SmoothedSignal:
-    """Return the motion of the joints.
+    """Filter and differentiate the positions of a record: position, rate and acceleration of the joints.
 
     Raises:
         InputError: a gap in the positions is too long for the filter; the message says what to do.
@@ -179,9 +182,10 @@ def _compute_motion_noise(
     record: IdentificationRecord, setup: RegressorSetup, position_resolution: Resolution, motions: np.ndarray,
     errors: RateErrors, low: np.ndarray, thin: int,
 ) -> np.ndarray:  # fmt: skip
-    """Return second moments (k, m, m) of the force errors caused by motion errors.
+    """Return second moments (k, m, m) of regressor errors of k drives caused by motion errors.
 
-    Possible true motions are sampled about that of the optimal smoother. See `Equations`.
+    With parameters p, p' M_k p is the mean squared force error of drive k. Possible true motions are
+    sampled about that of the optimal smoother.
     """
     rows = slice(0, max(_MAX_NOISE_ROWS, 4 * len(low)))
     smoothed = smooth(record.position[rows], record.period, position_resolution.noise)
@@ -200,7 +204,7 @@ def predict_forces(
     value: np.ndarray,
     rate_std: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Compute the drive forces along a motion.
+    """Predict the drive forces along a motion with given parameters.
 
     Args:
         setup: definition of the regressor.
@@ -226,11 +230,17 @@ def _evaluate_rows(
     errors: RateErrors | None,
     start: np.ndarray | None,
 ):
-    """Evaluate the regressor for some rows (3, n, k) of a motion.
+    """Evaluate the regressor for n rows of a motion, positions, rates and accelerations (3, n, k).
+
+    Args:
+        setup: definition of the regressor.
+        motions: (3, n, k) motion of the given joints.
+        errors: standard deviations of the rates, or None.
+        start: (v,) joint positions near those of the first row, or None.
 
     Returns:
-        The regressor, the uncertainty of the friction signs, the drive forces of damping and
-        springs, and the last pose.
+        The regressor, the uncertainty (n, drives) of the sign of dry friction, the drive forces (n,
+        drives) of stated damping and springs, and the joint positions (v,) of the last row.
     """
     chain = setup.chain
     found = setup.project(*motions, start=start)
@@ -252,7 +262,7 @@ def _evaluate_rows(
 
 
 def design_low_pass(band: float, period: float, cycle: float | None = None) -> tuple[np.ndarray, int]:
-    """Design a low-pass filter without lag and its downsampling factor.
+    """Design a symmetric FIR low-pass filter (no lag) and choose its downsampling factor.
 
     Args:
         band: cutoff [Hz].
@@ -327,7 +337,7 @@ def low_pass_forces(force: np.ndarray, period: float, filter_weights: np.ndarray
 
 
 def concatenate_field(parts: Sequence[Equations], of: Callable[[Equations], np.ndarray]) -> np.ndarray:
-    """Concatenate a field of the equations of several runs."""
+    """Concatenate an array of the equations of several runs; `of` returns the array of one run."""
     return np.concatenate([of(part) for part in parts])
 
 
@@ -385,7 +395,9 @@ class StackedEquations:
         return out[:, self.run_starts[run] : self.run_starts[run + 1]]
 
     def shift_by_period(self, values: np.ndarray, period: float) -> np.ndarray:
-        """Return the values one period later, or one period earlier near the end of a run.
+        """Shift values by one period of a repeated motion, within each run.
+
+        A row gets the value one period later, or near the end of a run one period earlier.
 
         Args:
             values: (n, ...) values of every row.
@@ -417,7 +429,10 @@ class StackedEquations:
 
 
 def shift_by_rows(values: np.ndarray, step: int) -> np.ndarray:
-    """Return values (n, ...) of `step` rows later, near the end of `step` rows earlier, or NaN."""
+    """Replace each row of values (n, ...) by that `step` rows later, or earlier where there is none.
+
+    Rows without either are NaN.
+    """
     later, earlier = np.full((2, *values.shape), np.nan)
     later[:-step], earlier[step:] = values[step:], values[:-step]
     return np.where(np.isnan(later), earlier, later)
@@ -428,7 +443,7 @@ def stack_equations(
     setup: RegressorSetup,
     processing: Processing,
 ) -> StackedEquations:
-    """Build and stack the equations of all runs.
+    """Build the force equations of all runs and stack those in which all drive forces are known.
 
     Args:
         runs: records and the resolution of their positions.

@@ -42,8 +42,8 @@ class Estimate:
         gain: (p, n, k) derivative of the estimates with respect to each force; 0 for omitted rows.
         condition: condition number of the weighted, scaled equations.
         whitening: (k, k) matrix that weighted the equations.
-        inverse_normal_matrix: (p, p) inverse of the weighted normal equations: with weighted Y (or Z) and F,
-            `value = prior + normal Y' (F - Y prior)`.
+        inverse_normal_matrix: (p, p) inverse N of the weighted normal equations: with weighted Y (or Z)
+            and F, `value = prior + N Y' (F - Y prior)`.
         rank: number of directions left by truncation.
     """
 
@@ -58,7 +58,7 @@ class Estimate:
 
     @property
     def std(self) -> np.ndarray:
-        """Standard deviations (p,)."""
+        """Standard deviations (p,) of the estimates."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
@@ -72,7 +72,7 @@ class Estimate:
 
     @property
     def ci95(self) -> np.ndarray:
-        """95 % intervals (p, 2)."""
+        """95 % confidence intervals (p, 2) of the estimates, lower and upper bound."""
         reach = self.interval_factor * self.std
         return np.column_stack([self.value - reach, self.value + reach])
 
@@ -92,7 +92,7 @@ def estimate(
     instruments: np.ndarray | None = None, ridge: float = 0.0, truncation: float = 0.0,
     prior: np.ndarray | None = None, order: int | None = None,
 ) -> Estimate:  # fmt: skip
-    """Estimate parameters by least squares with errors correlated in time and between drives.
+    """Estimate the parameters p in Y p = F by least squares; errors may correlate in time and over drives.
 
     With the covariance of the drives' errors this is the Gauss-Markov estimate. Without it, each
     drive is weighted by its residuals. An autoregression of the residuals models their correlation
@@ -115,7 +115,7 @@ def estimate(
         order: order of the autoregression; None to choose it, 0 for uncorrelated errors.
 
     Returns:
-        The estimate.
+        The estimate with its covariance and residuals.
 
     Raises:
         InputError: shapes do not match, fewer equations than parameters, or a column is zero.
@@ -152,8 +152,8 @@ class _SolverOptions(NamedTuple):
 
     Attributes:
         prior: (p,) values towards which ridge and truncation move the estimate.
-        ridge: see `estimate`.
-        truncation: see `estimate`.
+        ridge: added to the squared singular values, as a fraction of the largest one squared.
+        truncation: fraction of the largest singular value below which directions keep the prior.
         weight_by_residuals: whether drives are weighted by their residuals.
     """
 
@@ -172,7 +172,9 @@ class _SolutionProperties(NamedTuple):
 
 
 def _solve(x, y, z, shape: _SolverOptions) -> tuple[np.ndarray, np.ndarray, _SolutionProperties, np.ndarray]:
-    """Solve the equations, weighting the drives by their residuals if requested.
+    """Solve y = x @ parameters by least squares, or with instruments z if given.
+
+    If requested, the drives are weighted by their residuals and the equations solved again.
 
     Returns:
         Estimates (p,), their derivative with respect to the forces (p, n, k), the solution
@@ -205,7 +207,10 @@ def _solve_once(x, y, z, shape: _SolverOptions):
 
 
 def _propagate_covariance(inverse: np.ndarray, error: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-    """Return the covariance (p, p) of `inverse @ errors` for autoregressive errors `coefficients`."""
+    """Return the covariance (p, p) of estimates that are `inverse` (p, n, k) times correlated errors.
+
+    The errors follow the autoregression with `coefficients` (q, k), fitted to the residuals `error` (n, k).
+    """
     p, _, k = inverse.shape
     fresh, late = np.empty_like(error), np.empty_like(inverse)
     for c in range(k):
@@ -219,7 +224,7 @@ def _propagate_covariance(inverse: np.ndarray, error: np.ndarray, coefficients: 
 
 
 def autoregression(error: np.ndarray, order: int | None = None) -> np.ndarray:
-    """Fit an autoregression to errors.
+    """Fit an autoregressive model, which predicts each error from previous ones, to time series of errors.
 
     Args:
         error: (n, k) errors.
@@ -253,7 +258,7 @@ def autoregression(error: np.ndarray, order: int | None = None) -> np.ndarray:
 
 
 def _pseudo_inverse(x: np.ndarray, ridge: float, truncation: float) -> tuple[np.ndarray, _SolutionProperties]:
-    """Return the regularised pseudo-inverse (p, N) of normalised columns, and its properties."""
+    """Return the pseudo-inverse (p, N) of x (N, p), regularised by ridge and truncation, and its properties."""
     u, s, v = np.linalg.svd(x, full_matrices=False)
     kept = s > max(truncation, 1e-14) * s[0]
     squares = np.where(kept, 1.0 / (s**2 + ridge * s[0] ** 2), 0.0)
@@ -295,7 +300,7 @@ class Estimator:
     """Options for estimating the base parameters.
 
     Attributes:
-        method: `weight_equations`: least squares in which each drive is weighted by its residuals, and
+        method: `weighted`: least squares in which each drive is weighted by its residuals, and
             equations with an uncertain sign of dry friction have less weight. `gauss_markov`: the
             same with the covariance between the drives, from repeated periods if there are any.
             `least_squares`: equal weights. `instruments`: weighted, with the regressor of another
@@ -360,9 +365,9 @@ class WeightedEquations:
         """Estimate the base parameters; undetermined combinations keep their given values.
 
         Args:
-            identifiability: the base parameters.
-            ridge: see `Estimator`.
-            truncation: see `Estimator`.
+            identifiability: the base parameters, as combinations of all parameters.
+            ridge: added to the squared singular values, as a fraction of the largest one squared.
+            truncation: fraction of the largest singular value below which directions keep given values.
             order: order of the errors' autoregression; None to choose it.
 
         Returns:
@@ -381,7 +386,9 @@ class WeightedEquations:
 def weight_equations(
     data: StackedEquations, structure: Identifiability, method: Method, period: float | None
 ) -> WeightedEquations:
-    """Weight the equations for an estimator.
+    """Weight the force equations as an estimation method requires.
+
+    Equations with an uncertain sign of dry friction get less weight, except for `least_squares`.
 
     Args:
         data: equations.
@@ -461,10 +468,11 @@ def find_identifiable_parameters(
 
 
 def compute_weights(error_variances: np.ndarray, sign_uncertainty: np.ndarray) -> np.ndarray:
-    """Return weights that decrease with the uncertainty of the friction sign.
+    """Compute weights of force equations that decrease with the uncertainty of the friction sign.
 
     Args:
-        error_variances: (k, 2) as in `WeightedEquations`.
+        error_variances: (k, 2) error variance of each drive, and the variance added by an uncertain
+            friction sign.
         sign_uncertainty: (n, k) uncertainty of the signs.
 
     Returns:
@@ -474,14 +482,14 @@ def compute_weights(error_variances: np.ndarray, sign_uncertainty: np.ndarray) -
 
 
 def estimate_error_variances(residual: np.ndarray, sign_uncertainty: np.ndarray) -> np.ndarray:
-    """Estimate the additional error variance of equations with an uncertain friction sign.
+    """Estimate each drive's error variance, and the variance added by an uncertain friction sign.
 
     Args:
         residual: (n, k) residuals of a first estimate.
         sign_uncertainty: (n, k) uncertainty of the signs of dry friction.
 
     Returns:
-        (k, 2) as in `WeightedEquations`.
+        (k, 2) both variances of each drive, by non-negative least squares on squared residuals.
     """
     out = np.tile([1.0, 0.0], (sign_uncertainty.shape[1], 1))
     for k in range(sign_uncertainty.shape[1]):
@@ -494,7 +502,10 @@ def estimate_error_variances(residual: np.ndarray, sign_uncertainty: np.ndarray)
 
 
 def _long_run_std(residual: np.ndarray) -> np.ndarray:
-    """Return standard deviations (k,) of independent errors with the same low-frequency power."""
+    """Return standard deviations (k,) of independent errors with the low-frequency power of residuals (n, k).
+
+    They are at least those of the residuals.
+    """
     follow = autoregression(residual)
     fresh = residual.copy()
     for q, kept in enumerate(follow, start=1):
@@ -551,7 +562,7 @@ def reduce_parameters(
     matrix: np.ndarray, forces: np.ndarray, covariance: np.ndarray, names: Sequence[str],
     candidates: Sequence[Sequence[str]],
 ) -> Reduction:  # fmt: skip
-    """Drop and merge candidate parameters one after the other.
+    """Simplify a model: drop insignificant candidate parameters and merge those that do not differ.
 
     The least significant candidate is dropped first, until all remaining ones are significant. The
     threshold is a normal deviate. If no candidate has an effect, at least one exceeds it with a

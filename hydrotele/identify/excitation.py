@@ -40,7 +40,7 @@ _ERROR_CONTEXT = "excitation"
 
 @dataclass(frozen=True)
 class Excitation:
-    """A periodic motion of k axes with H harmonics.
+    """A periodic excitation motion of k axes, a Fourier series with H harmonics.
 
     Attributes:
         axes: names of the k axes.
@@ -63,7 +63,7 @@ class Excitation:
     parameters: int
 
     def evaluate(self, time: np.ndarray) -> np.ndarray:
-        """Return positions, rates and accelerations (3, n, k) at times (n,) [s]."""
+        """Compute positions, rates and accelerations (3, n, k) of the motion at times (n,) [s]."""
         h = np.arange(1, self.sin.shape[1] + 1)
         turn = 2.0 * math.pi * h / self.period
         s, c = np.sin(np.outer(time, turn)), np.cos(np.outer(time, turn))
@@ -109,7 +109,7 @@ def compute_information(
     setup: RegressorSetup, motions: np.ndarray, noise: np.ndarray, base: Sequence[int] | np.ndarray,
     sizes: np.ndarray | None = None,
 ) -> np.ndarray:  # fmt: skip
-    """Compute the Fisher information (p, p) per row of a motion about the base parameters.
+    """Compute the Fisher information (p, p) that a motion gives about the base parameters, per row.
 
     Args:
         setup: definition of the regressor.
@@ -135,7 +135,7 @@ def compute_information(
 def select_informative_base(
     machine: Machine, setup: RegressorSetup, noise: np.ndarray, period: float = 20.0, seed: int = 0
 ) -> np.ndarray:
-    """Select the base parameters that a random, not optimised motion determines despite noise.
+    """Select the base parameters that a random motion of the machine determines despite force noise.
 
     Args:
         machine: the machine.
@@ -164,7 +164,7 @@ def select_informative_base(
 
 
 class MotionLimits(Protocol):
-    """Motion limits of k given joints and of the drives.
+    """Interface of motion limits of k given joints and of the drives.
 
     Attributes:
         axes: names of the k joints or of their axes.
@@ -181,11 +181,11 @@ class MotionLimits(Protocol):
     half_range: np.ndarray
 
     def compute_utilisation(self, motions: np.ndarray, clipped: np.ndarray) -> np.ndarray:
-        """Compute the utilisation of every limit at every row.
+        """Compute how far each limit is used at each row of a motion, 1 at the limit.
 
         Args:
             motions: (3, n, k) positions, rates and accelerations.
-            clipped: the same with positions clipped to `low` and `high`.
+            clipped: the same with positions clipped to `lower` and `upper`.
 
         Returns:
             (n, l) utilisation, 1 at the limit.
@@ -274,7 +274,10 @@ def design_motion(
 
 
 def _scale_into_limits(x: np.ndarray, measure: Callable, step: float = 0.97) -> np.ndarray:
-    """Scale the parameters of a motion down until it satisfies all limits."""
+    """Reduce the parameters of a motion by the factor `step`, up to 60 times, until it is within all limits.
+
+    `measure` returns (criterion, utilisation of the limits) of a motion.
+    """
     for _ in range(60):
         if measure(x)[1].max() <= 1.0:
             return x
@@ -283,7 +286,7 @@ def _scale_into_limits(x: np.ndarray, measure: Callable, step: float = 0.97) -> 
 
 
 def _parameter_scales(setup: RegressorSetup, base: Sequence[int] | np.ndarray, middle: np.ndarray) -> np.ndarray:
-    """Return scales of the base parameters that make the determinant independent of units.
+    """Return scales (p,) of the base parameters, so that the information's determinant is free of units.
 
     They are the magnitudes of the given values, at least 1.
     """
@@ -324,7 +327,7 @@ class DriveLimits:
         self.drives = [setup.chain.index(d) for d in setup.chain.drives]
 
     def compute_utilisation(self, motions: np.ndarray, clipped: np.ndarray) -> np.ndarray:
-        """Return the utilisation of every limit at every row (n, l), 1 at the limit."""
+        """Return the utilisation (n, l) of joint ranges, strokes, speeds and accelerations, 1 at the limit."""
         found = self.setup.project(*clipped)
         return np.concatenate(
             [
@@ -375,7 +378,7 @@ class MachineLimits:
         self.drives = [setup.chain.index(d) for d in setup.chain.drives]
 
     def compute_utilisation(self, motions: np.ndarray, clipped: np.ndarray) -> np.ndarray:
-        """Return the utilisation of every limit at every row (n, l), 1 at the limit."""
+        """Return the utilisation (n, l) of joint ranges, drives and pump flow at each row, 1 at the limit."""
         parts = [
             1.0 + (motions[0] - self.upper) / self.half_range,
             1.0 + (self.lower - motions[0]) / self.half_range,
@@ -394,7 +397,10 @@ class MachineLimits:
     def _drive_utilisation(
         self, axis: str, i: int, projection: Projection, force: np.ndarray, flow: np.ndarray
     ) -> np.ndarray:
-        """Return the utilisation (n,) of a drive's limits; add its flow to `flow` (n,) [m^3/s]."""
+        """Return how far a drive's force, valve flow and stroke limits are used at each row (n,).
+
+        The drive's flow is added to `flow` (n,) [m^3/s] in place.
+        """
         facts, supply = self.machine.axes[axis], self.machine.supply
         j = self.drives[i]
         if facts.force:

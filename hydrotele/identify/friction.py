@@ -1,6 +1,6 @@
 """Friction near zero speed: deviations from the friction law, drives at rest, and the friction force by speed.
 
-`adapt_friction_terms` adds parameters for the error of a friction law near zero speed. Without them an error of the
+`add_deviations` adds parameters for the error of a friction law near zero speed. Without them an error of the
 law there, such as that of a smooth or elastic contact, biases the friction at all speeds. `compute_friction_forces`
 evaluates the identified friction at round speeds, with its standard deviation.
 """
@@ -44,7 +44,7 @@ class FrictionForce(NamedTuple):
 
 
 def compute_speeds(fit: Sequence[IdentificationRecord], setup: RegressorSetup) -> dict[str, tuple[float, float]]:
-    """Return the RMS and the maximum speed of each moving drive [rad/s] or [m/s].
+    """Compute the RMS and the maximum speed of each moving drive over all runs [rad/s] or [m/s].
 
     Args:
         fit: the fitted runs.
@@ -74,14 +74,16 @@ def compute_speeds(fit: Sequence[IdentificationRecord], setup: RegressorSetup) -
 
 
 def set_rest_speeds(setup: RegressorSetup, speeds: dict[str, tuple[float, float]]) -> RegressorSetup:
-    """Return a setup in which drives much slower than in the fitted runs are at rest, without a known dry friction.
+    """Set the speed below which each drive counts as at rest, 0.2 % of its RMS speed.
+
+    At rest the dry friction of a drive is unknown.
 
     Args:
         setup: definition of the regressor.
-        speeds: as returned by `compute_speeds`.
+        speeds: drive -> RMS and maximum speed [rad/s] or [m/s].
 
     Returns:
-        The setup.
+        The setup with these rest speeds.
     """
     terms = tuple(
         replace(term, rest_speed=_REST_SPEED * speeds[term.location][0]) if term.location in speeds else term
@@ -91,14 +93,14 @@ def set_rest_speeds(setup: RegressorSetup, speeds: dict[str, tuple[float, float]
 
 
 def add_deviations(setup: RegressorSetup, speeds: dict[str, tuple[float, float]]) -> RegressorSetup:
-    """Return a setup with deviations of the drives' friction near zero speed.
+    """Add parameters for deviations of the drives' friction from its law near zero speed.
 
     Args:
         setup: definition of the regressor.
-        speeds: as returned by `compute_speeds`.
+        speeds: drive -> RMS and maximum speed [rad/s] or [m/s], which set the widths of the deviations.
 
     Returns:
-        The setup.
+        The setup with these parameters, whose given values are 0.
     """
     terms = []
     for term in setup.friction_terms:
@@ -114,11 +116,13 @@ def compute_friction_forces(
     setup: RegressorSetup, speeds: dict[str, tuple[float, float]], names: Sequence[str], value: np.ndarray,
     base: np.ndarray, estimate: Estimate,
 ) -> tuple[FrictionForce, ...]:  # fmt: skip
-    """Compute the friction force of the drives at round speeds within those of the fitted runs.
+    """Compute the identified friction force of each drive at round speeds, with 95 % intervals.
+
+    The speeds are those of 1, 3, 10, ... within the range of the fitted runs.
 
     Args:
         setup: definition of the regressor.
-        speeds: as returned by `compute_speeds`.
+        speeds: drive -> RMS and maximum speed in the fitted runs [rad/s] or [m/s].
         names: names of the m parameters.
         value: (m,) identified values.
         base: (r,) indices of the base parameters.

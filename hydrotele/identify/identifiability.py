@@ -151,7 +151,10 @@ def classify_noisy_parameters(
 
 
 def _select_columns_above_noise(scaled: np.ndarray, length: np.ndarray, candidates: np.ndarray) -> np.ndarray:
-    """Return the indices of columns whose parameters have standard deviations of at most 1."""
+    """Select candidate columns so that the parameters of the selected ones have standard deviations <= 1.
+
+    Columns are scaled such that 1 is the accuracy required; `length` are their norms (m,).
+    """
     chosen: list[int] = []
     span = np.zeros((len(scaled), 0))
     for k in np.flatnonzero(candidates & (length > 1.0)):
@@ -170,7 +173,11 @@ def _select_columns_above_noise(scaled: np.ndarray, length: np.ndarray, candidat
 
 
 def _select_base(triangle, size, nonzero, rank, preferred):
-    """Return the indices of independent columns and the combinations of all parameters in them."""
+    """Select `rank` independent columns, preferred ones first, to represent the base parameters.
+
+    Returns:
+        (indices (r,) of the columns, combinations (r, m) of all parameters that they represent).
+    """
     order = [k for k in preferred if nonzero[k]] + [k for k in np.flatnonzero(nonzero) if k not in preferred]
     chosen: list[int] = []
     span = np.zeros((len(triangle), 0))
@@ -204,7 +211,7 @@ _PIN_LEVER_ARM_M = 0.1  # m: friction of a pin acts at its radius, a tenth of th
 def reference_sizes(
     table: Regressor, setup: RegressorSetup, forces: np.ndarray, drives: Sequence[str] | None = None
 ) -> np.ndarray:
-    """Return the reference sizes of all parameters.
+    """Return a typical magnitude of each parameter, with which its standard deviation is compared.
 
     Sizes of a body follow from its given mass and radius of gyration. Sizes of friction are the
     given values, at least a fraction of the drive force. Deviations of friction near zero speed have

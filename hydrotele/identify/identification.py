@@ -77,7 +77,7 @@ def propagate_noise(
     record: IdentificationRecord, position_resolution: Resolution, gain: np.ndarray, setup: RegressorSetup,
     processing: Processing, value: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Propagate the sensor noise of one run to the covariance of an estimate.
+    """Compute the covariance of an estimate that the sensor noise of one run causes.
 
     Args:
         record: the run.
@@ -119,7 +119,7 @@ def propagate_noise(
 
 
 def _compute_sensitivities(motion: SmoothedSignal, count: int, setup: RegressorSetup, value: np.ndarray) -> np.ndarray:
-    """Return sensitivities (3, n, k, j) of drive forces to positions, rates and accelerations.
+    """Return derivatives (3, n, k, j) of k drive forces by positions, rates and accelerations of j joints.
 
     In long runs they are computed at every few rows and interpolated, since they change slowly.
     """
@@ -210,7 +210,7 @@ def _simulate_record(
     processing: Processing,
     value: np.ndarray,
 ) -> IdentificationRecord:
-    """Return a record with smoothed positions and the forces of that motion.
+    """Return a record with smoothed positions and the forces that the parameters predict for them.
 
     Forces that were unknown stay unknown.
     """
@@ -294,7 +294,7 @@ def identify_dynamics(
     processing: Processing | None = None, estimator: Estimator | None = None, *,
     notes: Sequence[str] = (),
 ) -> Identification:  # fmt: skip
-    """Identify the parameters of a mechanism.
+    """Identify inertial and friction parameters of a mechanism, and validate them on a held-out run.
 
     Args:
         fit: records to fit.
@@ -364,16 +364,17 @@ def fit_runs(
     """Fit the base parameters to runs, without bias correction and validation.
 
     Args:
-        fit: records.
+        fit: records of the runs.
         setup: definition of the regressor.
-        processing: as in `identify_dynamics`.
-        estimator: as in `identify_dynamics`.
+        processing: method to differentiate the positions, and the band.
+        estimator: options of the estimator.
 
     Returns:
         The fit.
 
     Raises:
-        InputError: as in `identify_dynamics`.
+        InputError: no drive has a known force, there are too few rows, or the estimator needs a
+            period.
     """
     if estimator.method == "instruments":
         if not processing.period:
@@ -404,7 +405,7 @@ def fit_runs(
 
 
 def _count_cycles(record: IdentificationRecord, processing: Processing) -> int:
-    """Return the number of cycles that are averaged."""
+    """Return the number of cycles that the periodic filter averages; 1 for other methods."""
     if processing.method != "periodic" or not processing.period:
         return 1
     return round(len(record.force) * record.period / processing.period)
@@ -417,7 +418,7 @@ def _expand_parameters(told: Identifiability, nominal: np.ndarray, found: Estima
 
 
 def _residual_rms(fitted: UncorrectedFit) -> dict[str, float]:
-    """Return the RMS of the unweighted residuals of each drive [N] or [N m]."""
+    """Return drive -> RMS of the unweighted residuals of its force [N] or [N m]."""
     residual = fitted.estimate.residual / fitted.equations.weights
     return dict(zip(fitted.data.drives, np.sqrt(np.mean(residual**2, axis=0)).tolist(), strict=True))
 
@@ -431,7 +432,7 @@ def _has_stated_noise(data: StackedEquations) -> bool:
 
 
 def _compute_covariance(fitted: UncorrectedFit, setup: RegressorSetup) -> np.ndarray:
-    """Return the covariance (r, r) from sensor noise, increased if the residuals are larger.
+    """Return the covariance (r, r) of the base parameters from sensor noise, scaled up for larger residuals.
 
     For long logs, and for the smoother, which adapts to the data, it follows from the residuals
     only.
@@ -459,25 +460,26 @@ def identify_with_friction_shapes(
     processing: Processing | None = None, estimator: Estimator | None = None, *,
     notes: Sequence[str] = (),
 ) -> Identification:  # fmt: skip
-    """Identify with the form of dry friction near zero speed that the data select, without wild readings.
+    """Identify a mechanism's parameters with the form of dry friction that fits best, without wild readings.
 
     Dry friction is as smooth as the machine states, or changes its sign sharply: the smoothing velocity of a machine
     often serves only the simulation. Deviations near zero speed are added if they improve Schwarz's criterion. They
     need a wider band than the motion, which is also the band of the result.
 
     Args:
-        fit: as in `identify_dynamics`.
-        heldout: as in `identify_dynamics`.
-        setup: as in `identify_dynamics`.
-        processing: as in `identify_dynamics`.
-        estimator: as in `identify_dynamics`.
-        notes: as in `identify_dynamics`.
+        fit: records to fit.
+        heldout: record for validation.
+        setup: definition of the regressor.
+        processing: method to differentiate the positions, and the band.
+        estimator: options of the estimator.
+        notes: notes to include in the result.
 
     Returns:
         The identification with the best criterion; notes name the selected form and wild readings.
 
     Raises:
-        InputError: as in `identify_dynamics`.
+        InputError: no drive has a known force, there are too few rows, or the estimator needs a
+            period.
 
     Source: Schwarz 1978, Estimating the dimension of a model.
     """
@@ -506,7 +508,10 @@ def identify_with_friction_shapes(
 
 
 def _widen_band(fit: Sequence[IdentificationRecord], processing: Processing) -> Processing:
-    """Return the processing with a band that contains the changes of dry friction, if the user states no band."""
+    """Return the processing options with a band wide enough for the sign changes of dry friction.
+
+    Options with a stated band, or with the periodic method, are returned unchanged.
+    """
     if processing.band or processing.method == "periodic":
         return processing
     found = [estimate_resolution(r.position, r.period, r.position_noise) for r in fit]
@@ -514,7 +519,7 @@ def _widen_band(fit: Sequence[IdentificationRecord], processing: Processing) -> 
 
 
 def _select_first_runs(fit: Sequence[IdentificationRecord], period: float | None) -> list[IdentificationRecord]:
-    """Return the first runs with a total length of 600 s; a longer run is cut."""
+    """Return the first runs up to a total length of about 600 s; a run longer than that is cut."""
     some, seconds = [], 0.0
     for record in fit:
         some.append(cut_beginning(record, _SHAPE_SELECTION_DURATION_S, period))
@@ -530,13 +535,15 @@ def compute_schwarz_criterion(
     processing: Processing,
     estimator: Estimator,
 ) -> float:
-    """Return Schwarz's criterion of a fit, per row and without constants; infinite if there are too few rows.
+    """Fit the runs and return Schwarz's criterion (BIC) per row; a smaller value is a better model.
+
+    It is infinite if there are too few rows.
 
     Args:
-        fit: as in `identify_dynamics`.
-        setup: as in `identify_dynamics`.
-        processing: as in `identify_dynamics`.
-        estimator: as in `identify_dynamics`.
+        fit: records to fit.
+        setup: definition of the regressor.
+        processing: method to differentiate the positions, and the band.
+        estimator: options of the estimator.
 
     Source: McQuarrie and Tsai 1998, Regression and time series model selection (correction for few rows).
     """

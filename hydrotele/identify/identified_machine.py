@@ -56,7 +56,9 @@ class AllowedDeformation:
 def find_consistent_parameters(
     found: Identification, deformations: Mapping[str, AllowedDeformation] | None = None
 ) -> ConsistentParameters:
-    """Find the physically consistent parameters nearest to an estimate.
+    """Find the physically consistent parameters that fit an identification best.
+
+    Masses are positive, inertias belong to a mass distribution, and friction dissipates energy.
 
     Args:
         found: the identification; its given bodies must have mass.
@@ -121,7 +123,10 @@ class _DeformableBody:
         self.variable_count = 4 + len(self.shift_directions) + (3 if freedom.can_rotate_axes else 0)
 
     def inertial_parameters(self, x: np.ndarray) -> np.ndarray:
-        """Return the inertial parameters (10,) of the deformed body."""
+        """Return mass, moments and inertia (10,) of the body deformed by the variables x.
+
+        x holds the logarithms of four scales, the shift of the centre of mass and, if allowed, shear.
+        """
         shift = self.scale * x[4 : 4 + len(self.shift_directions)] @ self.shift_directions
         deform = np.diag(np.exp(x[:4]))
         deform[:3, 3] = shift
@@ -131,9 +136,9 @@ class _DeformableBody:
 
 
 def _to_pseudo_inertia(p: np.ndarray) -> np.ndarray:
-    """Return the pseudo-inertia (4, 4) of a body with inertial parameters (10,).
+    """Convert inertial parameters (10,) to the pseudo-inertia (4, 4).
 
-    It holds the second moments, first moments and mass.
+    This matrix holds second moments, first moments and mass; it is positive definite for any real body.
     """
     inertia = np.array([[p[4], p[5], p[6]], [p[5], p[7], p[8]], [p[6], p[8], p[9]]])
     out = np.empty((4, 4))
@@ -144,7 +149,7 @@ def _to_pseudo_inertia(p: np.ndarray) -> np.ndarray:
 
 
 def _from_pseudo_inertia(pseudo: np.ndarray) -> np.ndarray:
-    """Return the inertial parameters (10,) of a pseudo-inertia (4, 4)."""
+    """Convert a pseudo-inertia (4, 4) to mass, first moments and inertia matrix elements (10,)."""
     second = pseudo[:3, :3]
     inertia = np.trace(second) * np.eye(3) - second
     return np.concatenate([[pseudo[3, 3]], pseudo[:3, 3], inertia[np.triu_indices(3)]])
@@ -161,7 +166,7 @@ def _add_min_extent(pseudo: np.ndarray) -> np.ndarray:
 
 
 def _parameter_scales(found: Identification, others: np.ndarray) -> np.ndarray:
-    """Return scales (o,) of the parameters that do not belong to a body."""
+    """Return typical magnitudes (o,) of the parameters at indices `others` (o,), which are not of a body."""
     spread = {k: s for k, s in zip(found.data_identifiability.base, found.estimate.std, strict=True)}
     return np.array([max(abs(found.nominal[k]), abs(found.value[k]), spread.get(k, 0.0), 1e-9) for k in others])
 
@@ -173,7 +178,7 @@ _FRICTION_FIELDS = {"coulomb": "coulomb", "stribeck": "stribeck_extra", "viscous
 def build_identified_machine(
     machine: Machine, found: Identification, bars: dict[str, tuple[str, str]]
 ) -> tuple[Machine, ConsistentParameters]:
-    """Return a machine with the identified bodies, friction and offsets.
+    """Return a machine with identified masses, inertias, friction and force offsets.
 
     Links of a `Machine` have principal axes parallel to their frames, and tubes and rods have their
     centre of mass on their axis. The result is the machine of this form with the best fit.
@@ -217,7 +222,7 @@ def _bar_axis(found: Identification, body: str) -> np.ndarray:
 
 
 def _friction_joint(found: Identification, joint: str, axis: str) -> str | None:
-    """Return the joint in the names of an axis' friction: its cylinder's rod or its joint."""
+    """Return the location in the parameter names of an axis' friction: `AXIS_rod` or its joint, or None."""
     for place in (f"{axis}_rod", joint):
         if f"coulomb.{place}" in found.names:
             return place
@@ -290,7 +295,7 @@ def build_identify_document(
 
     Returns:
         Keys `parameters`, `condition`, `heldout`, `friction`, `counts`, `status`, `seconds`, `band_hz`,
-        `whiteness`, `given`, `find_consistent_parameters`, `notes`; `hydraulics` if requested.
+        `whiteness`, `nominal`, `consistent`, `notes`; `hydraulics` if requested.
     """
     distance, limit = found.squared_distance(found.nominal) if found else (None, None)
     rows = parameter_rows(found) if found else []

@@ -103,7 +103,7 @@ class Mechanism:
 
 
 def load_mechanism(mjcf: str | Path, mapping: str | Path | ColumnMapping | None = None) -> Mechanism:
-    """Read a mechanism and its column mapping.
+    """Read a mechanism from an MJCF file, with the mapping of log columns to its joints.
 
     Args:
         mjcf: the MJCF file.
@@ -165,7 +165,11 @@ def load_mechanism(mjcf: str | Path, mapping: str | Path | ColumnMapping | None 
 
 
 def _match_names(known: Sequence[str], patterns, source: str, label: str) -> list[str]:
-    """Return the names that match patterns, in the order of the patterns."""
+    """Return the known names that match wildcard patterns, in the order of the patterns.
+
+    Raises:
+        InputError: a pattern matches no name.
+    """
     out: list[str] = []
     for pattern in patterns:
         found = fnmatch.filter(known, pattern)
@@ -179,7 +183,7 @@ def load_mechanism_records(
     paths: Sequence[str | Path], mechanism: Mechanism, heldout: str | None = None,
     period: float | None = None, keep_measured_joints: bool = False,
 ) -> tuple[tuple[IdentificationRecord, ...], IdentificationRecord, tuple[str, ...]]:  # fmt: skip
-    """Read logs of a mechanism.
+    """Read logs of a mechanism as identification records: runs to fit, and one held-out run.
 
     Args:
         paths: log files (.csv, .parquet), folders of them, run folders.
@@ -187,7 +191,8 @@ def load_mechanism_records(
         heldout: name of the held-out run. By default it is the first one that begins with `test`,
             otherwise the last. A single run is split in time.
         period: period of a repeated motion [s]; a single run is then split at a whole period.
-        keep_measured_joints: whether to keep positions of the measured joints.
+        keep_measured_joints: whether to keep positions of the measured joints, instead of converting
+            them to the joints in which the mechanism's motion is described.
 
     Returns:
         Records of the fitted runs, of the held-out run, and notes.
@@ -232,7 +237,11 @@ class _Column(NamedTuple):
 
 
 def _load_with_columns(path: Path, mechanism: Mechanism) -> tuple[Log, dict[tuple[str, str], _Column]]:
-    """Read a log, and return it with the columns by (`position` or `force`, joint)."""
+    """Read a log and find its columns of positions and forces.
+
+    Returns:
+        (the log, (`position` or `force`, joint) -> column with sign).
+    """
     mapping, chain, source = mechanism.mapping, mechanism.setup.chain, mechanism.source
     raw, columns = read_table(path, missing=True), {}
     names, ours = raw.names, "hydrotele" in raw.metadata  # logs of hydrotele keep their names
@@ -324,14 +333,14 @@ def _build_record(
 
 
 def _expand_noise(stated: float | dict[str, float] | None, joints: Sequence[str]) -> np.ndarray:
-    """Return the noise (k,) of readings, NaN where it is not stated."""
+    """Expand noise stated for all joints or by joint to an array (k,), NaN where it is not stated."""
     if isinstance(stated, dict):
         return np.array([stated.get(joint, np.nan) for joint in joints])
     return np.full(len(joints), np.nan if stated is None else stated)
 
 
 def convert_coordinates(record: IdentificationRecord, setup: RegressorSetup) -> IdentificationRecord:
-    """Convert the positions of a record to the given joints of a setup.
+    """Convert a record's measured joint positions to the joints that describe the motion in a setup.
 
     Args:
         record: record of the measured joints, which determine all other joints.

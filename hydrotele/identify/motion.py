@@ -119,13 +119,13 @@ class Processing:
     """Options for differentiating positions, and the frequency band of the equations.
 
     Attributes:
-        method: `filter_zero_phase` filter, `optimal` smoother, `filter_periodic` (frequency domain) or `raw`
+        method: `zero_phase` filter, `optimal` smoother, `periodic` (frequency domain) or `raw`
             differences. A smoother attenuates sharp corners of a motion, which reduces estimated
             inertia and friction near reversals; a filter with twice the bandwidth does not.
         band: cutoff of the low-pass filter of regressor and forces [Hz]; None to derive it from the
             resolution of the positions.
         period: period of a repeated motion [s], otherwise None.
-        harmonics: number of harmonics kept by `filter_periodic`; 0 for those within the bandwidth of the
+        harmonics: number of harmonics kept by the method `periodic`; 0 for those within the bandwidth of the
             zero-phase filter.
     """
 
@@ -167,17 +167,17 @@ class Resolution:
 
     @property
     def band(self) -> float:
-        """Band of the equations [Hz]."""
+        """Cutoff of the low-pass filter of the force equations that suits these positions [Hz]."""
         return min(_BAND_OVER_BANDWIDTH * self.bandwidth, self.acceleration_bandwidth)
 
     @property
     def friction_band(self) -> float:
-        """Band that also contains the changes of dry friction near reversals [Hz]."""
+        """Cutoff of the force equations that also passes sign changes of dry friction at reversals [Hz]."""
         return min(_BAND_OVER_BANDWIDTH * self.bandwidth, _FRICTION_HARMONICS * self.acceleration_bandwidth)
 
 
 def estimate_resolution(positions: np.ndarray, period: float, noise: np.ndarray, cycles: int = 1) -> Resolution:
-    """Estimate bandwidth and noise of positions.
+    """Estimate the bandwidth and noise of measured positions, and which joints move.
 
     The gain of the optimal smoother is `1 / (1 + (f/f_h)^(2 order))`. The mean of many cycles has
     less noise and thus a larger bandwidth.
@@ -238,13 +238,13 @@ def compute_joint_motion(
 def apply_adjoint(
     gain: np.ndarray, period: float, position_resolution: Resolution, processing: Processing
 ) -> np.ndarray:
-    """Apply the adjoint of filtering and differentiation to gains on a motion.
+    """Convert gains on filtered positions, rates and accelerations to gains on measured positions.
 
-    It holds for all methods except the optimal smoother: the filters are symmetric in time, the
+    This is the adjoint of filtering and differentiation. It holds for all methods except the optimal smoother: the filters are symmetric in time, the
     first derivative is antisymmetric.
 
     Args:
-        gain: (3, p, n, k) gains of p sums on positions, rates and accelerations.
+        gain: (3, p, n, k) gains of p results on positions, rates and accelerations of k joints.
         period: time between rows [s].
         position_resolution: resolution of the positions.
         processing: method to differentiate the positions.
@@ -263,7 +263,7 @@ def _apply_linear_filter(
     positions: np.ndarray, period: float, position_resolution: Resolution, processing: Processing,
     noise: np.ndarray | None,
 ) -> SmoothedSignal:  # fmt: skip
-    """Apply the linear filter of the method to any number of columns, and differentiate."""
+    """Filter and differentiate columns by the zero-phase, periodic or raw method, which are linear."""
     if processing.method == "zero_phase":
         cutoff = min(_CUTOFF_OVER_BANDWIDTH * position_resolution.bandwidth, 0.4 / period)
         return filter_zero_phase(positions, period, cutoff, noise, max_gap=round(MAX_GAP_S / period))
@@ -299,7 +299,10 @@ def propagate_rate_std(projection: Projection, given_joints: list[int], rate_std
 
 
 def _replace_resting_joints(moving: SmoothedSignal, smoothed: SmoothedSignal, is_moving: np.ndarray) -> SmoothedSignal:
-    """Use the smoother's motion for joints at rest: a filter would turn their noise into motion."""
+    """Return the filtered motion, with that of the optimal smoother for joints at rest.
+
+    A filter would turn the noise of resting joints into motion.
+    """
     return SmoothedSignal(*(
         np.where(is_moving, getattr(moving, part.name), getattr(smoothed, part.name))
         for part in fields(SmoothedSignal)
@@ -307,5 +310,5 @@ def _replace_resting_joints(moving: SmoothedSignal, smoothed: SmoothedSignal, is
 
 
 def _stated_noise(noise: np.ndarray) -> np.ndarray | None:
-    """Return the stated noise, or None to estimate it, also for a stated noise of 0."""
+    """Return the noise (k,) if it is stated (positive) for all joints; None, to estimate it, otherwise."""
     return noise if (np.isfinite(noise) & (noise > 0.0)).all() else None

@@ -50,7 +50,7 @@ class IdentificationRecord:
 def build_records(
     dataset: Dataset,
 ) -> tuple[tuple[IdentificationRecord, ...], IdentificationRecord, tuple[str, ...]]:
-    """Compute positions and forces of all runs.
+    """Compute joint positions and drive forces of all runs from the logs of a machine.
 
     For a joint with an own sensor and a cylinder length sensor, both readings are averaged with
     weights according to their noise.
@@ -93,7 +93,7 @@ def build_records(
 
 
 def compute_force_noise(machine: Machine, sensors: str) -> np.ndarray:
-    """Compute the force noise of all drives for a sensor set of the machine.
+    """Compute the noise of all drive forces from that of the pressure sensors in a sensor set.
 
     Args:
         machine: the machine.
@@ -171,7 +171,7 @@ def check_periodicity(record: IdentificationRecord, period: float, noise: np.nda
 
 
 def cut_beginning(record: IdentificationRecord, seconds: float, period: float | None = None) -> IdentificationRecord:
-    """Cut a record to its first part.
+    """Keep only the first part of a record, at most `seconds` long.
 
     Args:
         record: the record.
@@ -231,7 +231,10 @@ def _position_channels(dataset: Dataset, axis: str) -> list[str]:
 
 
 def _compute_position(dataset: Dataset, run: RunData, axis: str) -> tuple[np.ndarray, float]:
-    """Return the joint position (n,) of an axis and its noise."""
+    """Compute the joint position (n,) of an axis from its sensors in a run, and its noise.
+
+    Readings of an angle and a length sensor are averaged; the noise is a standard deviation, or NaN.
+    """
     machine = dataset.machine
     values, noises = [], []
     for channel in _position_channels(dataset, axis):
@@ -258,7 +261,7 @@ def _compute_position(dataset: Dataset, run: RunData, axis: str) -> tuple[np.nda
 
 
 def _compute_joint_position(machine: Machine, axis: str, linkage: DriveLinkage, length: np.ndarray) -> np.ndarray:
-    """Return the joint positions (n,) at piston displacements (n,) [m]."""
+    """Convert piston displacements (n,) [m] to joint positions (n,) by a cylinder's linkage."""
     cylinder = machine.axes[axis].cylinder
     assert cylinder is not None
     out, known = np.full(len(length), np.nan), np.isfinite(length)
@@ -270,7 +273,10 @@ def _compute_joint_position(machine: Machine, axis: str, linkage: DriveLinkage, 
 
 
 def _force_channels(dataset: Dataset, axis: str) -> tuple[str, ...] | None:
-    """Return the channels of a drive's force, () for a force drive, None if one is missing."""
+    """Return the pressure channels that give a drive's force.
+
+    The result is empty for a force drive, and None if a channel is missing.
+    """
     if not dataset.machine.axes[axis].is_hydraulic:
         return ()
     names = (f"pressure_head.{axis}", f"pressure_rod.{axis}")
@@ -278,7 +284,7 @@ def _force_channels(dataset: Dataset, axis: str) -> tuple[str, ...] | None:
 
 
 def _compute_force(dataset: Dataset, run: RunData, axis: str) -> tuple[np.ndarray, float]:
-    """Return the drive force (n,) of an axis and its noise."""
+    """Compute the drive force (n,) of an axis from pressures or command, and its noise [N] or [N m]."""
     machine = dataset.machine
     channels = _force_channels(dataset, axis)
     facts = machine.axes[axis]
@@ -295,7 +301,7 @@ def _compute_force(dataset: Dataset, run: RunData, axis: str) -> tuple[np.ndarra
 
 
 def _correct_reading(dataset: Dataset, run: RunData, channel: str) -> tuple[np.ndarray, float]:
-    """Return the readings (n,) corrected for the machine's sensor defects, and their noise."""
+    """Return a channel's readings (n,) corrected for the machine's known sensor errors, and their noise."""
     column = dataset.channels.index(channel)
     error = dataset.machine.sensor_errors.get(channel, SensorError())
     values = correct_sensor_error(run.reading[:, column], error, run.period, run.start)
@@ -303,7 +309,7 @@ def _correct_reading(dataset: Dataset, run: RunData, channel: str) -> tuple[np.n
 
 
 def correct_sensor_error(values: np.ndarray, error: SensorError, period: float, start: float = 0.0) -> np.ndarray:
-    """Correct readings for a known sensor defect.
+    """Remove a known sensor error (offset, drift, scale, delay, lag) from readings.
 
     Args:
         values: (n,) readings, NaN where missing.

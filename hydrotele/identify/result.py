@@ -210,5 +210,5 @@ def parameter_rows(found: Identification) -> list[ParameterRow]:
 
 
 def count_statuses(rows: list[ParameterRow]) -> dict[str, int]:
-    """Count the parameters of each status."""
+    """Return status -> number of parameters: unidentifiable, combination, full or weak."""
     return {status: sum(row.status == status for row in rows) for status in STATUSES}

@@ -26,7 +26,7 @@ from hydrotele.multibody.inverse_dynamics import (
 
 
 def drive_friction_terms(machine: Machine, chain: Chain) -> list[FrictionTerm]:
-    """Return the friction terms of all drives with the machine's parameters.
+    """Build the friction terms of all drives, with the machine's friction parameters as given values.
 
     Coulomb and viscous friction are always included. Stribeck friction and the asymmetries
     `coulomb_asymmetry` (F_c a_c), `stribeck_asymmetry` (F_s a_c) and `viscous_asymmetry` (b a_v)
@@ -96,7 +96,7 @@ class RegressorSetup:
         self, position: np.ndarray, rate: np.ndarray, acceleration: np.ndarray,
         start: np.ndarray | None = None,
     ) -> Projection:  # fmt: skip
-        """Project the chain on its drives along a motion of the given joints.
+        """Compute the motion of all joints, and how inertia and friction map to drive forces along it.
 
         Args:
             position: (n, k) positions of the given joints [rad] or [m].
@@ -105,10 +105,10 @@ class RegressorSetup:
             start: (v,) initial guess of all joint positions; by default that of the chain.
 
         Returns:
-            The projection.
+            The projection of the mechanism on its drives.
 
         Raises:
-            InputError: as in `hydrotele.multibody.inverse_dynamics.project`.
+            InputError: a shape is wrong, a value is missing, or closed loops cannot follow the motion.
         """
         return project_on_drives(
             self.chain, self.given_joints, position, rate, acceleration, start=start,
@@ -116,7 +116,7 @@ class RegressorSetup:
         )  # fmt: skip
 
     def compute_regressor(self, projection: Projection, rate_std: np.ndarray | None = None) -> Regressor:
-        """Compute the regressor along a motion.
+        """Compute the regressor, the matrix of drive forces per unit of each parameter, along a motion.
 
         Args:
             projection: matrices that map body wrenches to drive forces, for every row of the motion.
@@ -171,7 +171,7 @@ def machine_setup(
     machine: Machine, chain: Chain, model: DynamicModel = "complete", *, pins: bool = False,
     asymmetry: bool = False, ball_joints: bool = False,
 ) -> RegressorSetup:  # fmt: skip
-    """Define the regressor of a machine.
+    """Define which parameters of a machine (bodies, friction, offsets) enter its regressor.
 
     Args:
         machine: the machine.
@@ -181,8 +181,7 @@ def machine_setup(
         asymmetry: whether viscous friction of the drives may depend on the direction. Asymmetric
             dry friction cannot be distinguished from a force offset.
         ball_joints: whether cylinders have ball joints instead of pins at their ends and transmit
-        no
-            moment about their own axes. Tube and rod still rotate as with pins, which is exact if
+            no moment about their own axes. Tube and rod still rotate as with pins, which is exact if
             their inertia about that axis is negligible.
 
     Returns:
@@ -209,7 +208,7 @@ def machine_setup(
 
 
 def cylinder_bars(machine: Machine) -> dict[str, tuple[str, str]]:
-    """Return a dict from the body of a cylinder's tube or rod to (axis, `tube` or `rod`)."""
+    """Return body name -> (axis, `tube` or `rod`) for the tubes and rods of all cylinders."""
     return {
         f"{name}_{part}": (name, part)
         for name, axis in machine.axes.items()
@@ -223,7 +222,7 @@ def mechanism_setup(
     offsets: bool = True, equal_groups: Sequence[Sequence[str]] = (), zero_parameters: Sequence[str] = (),
     friction: Mapping[str, Mapping[str, float]] | None = None,
 ) -> RegressorSetup:  # fmt: skip
-    """Define the regressor of any mechanism, without a machine.
+    """Define which parameters enter the regressor of any mechanism, without a machine file.
 
     Drives and the named passive joints have dry and viscous friction, with `damping` and
     `frictionloss` of the MJCF file as given values.
@@ -233,8 +232,8 @@ def mechanism_setup(
         given_joints: joints whose motion is measured; the drives by default.
         passive: joints and closures without drive that have friction.
         offsets: whether the drives may have constant forces.
-        equal_groups: as in `RegressorSetup`.
-        zero_parameters: as in `RegressorSetup`.
+        equal_groups: groups of bodies, joints or closures with the same parameters.
+        zero_parameters: parameters known to be 0, such as `moment_x.stator`.
         friction: joint -> further friction parameters, which an MJCF cannot state; see
             `FRICTION_TERMS`, and `stribeck_velocity`.
 

@@ -16,8 +16,8 @@ dimensionless: time is in samples, and the k-th state is `dt^k` times the k-th d
 and backward recursions of information matrices need no initial guess.
 
 Source: Trujillo and Busby 1983, J. Math. Anal. Appl. 94, "Investigation of a technique for the
-differentiation of empirical data" (dynamic programming); likelihood: the integral of exp(-(1)/2)
-over all inputs and, with a flat prior, over the initial state.
+differentiation of empirical data" (dynamic programming); likelihood: the integral, over all
+inputs and (with a flat prior) the initial state, of exp(-J/2) with the sum J of equation (1).
 """
 
 import math
@@ -131,7 +131,9 @@ _STATIONARITY_TOLERANCE = 1.0e-12  # relative change of the information matrix p
 
 @compiled
 def transition_matrices(order):
-    """Return the matrices of an exact step of m integrators with constant input.
+    """Return the matrices of one step of a chain of m integrators with constant input.
+
+    The states c become T c + b g with input g; time is in samples.
 
     Args:
         order: number m of integrators [1].
@@ -157,9 +159,9 @@ def transition_matrices(order):
 
 @compiled
 def _marginalise_input(info, drive, ratio, order, column):
-    """Remove the input from an information matrix: R - R b (1/r + b'R b)^-1 b'R, in place.
+    """Marginalise the random input out of a state's information matrix R, in place.
 
-    Writes the gain (1/r + b'R b)^-1 R b into `column` and returns 1/r + b'R b.
+    R becomes R - R b (1/r + b'R b)^-1 b'R, with `drive` b and `ratio` r. Writes the gain (1/r + b'R b)^-1 R b into `column` and returns 1/r + b'R b.
     """
     total = 1.0 / ratio
     for i in range(order):
@@ -177,7 +179,7 @@ def _marginalise_input(info, drive, ratio, order, column):
 
 @compiled
 def _congruence_transform(info, matrix, order, work, out):
-    """Write M' R M into `out`."""
+    """Write M' R M into `out`, with `info` R and `matrix` M; `work` is overwritten."""
     for i in range(order):
         for j in range(order):
             work[i, j] = 0.0
@@ -202,7 +204,7 @@ def _is_stationary(old, new, order):
 
 @compiled
 def backward_pass(known, ratio, order, infos, gains, totals):
-    """Run the backward recursion of the information matrices.
+    """Compute, backwards in time, the information about each state from its own and all later samples.
 
     It depends on which samples are known, but not on their values.
 
@@ -242,7 +244,9 @@ def backward_pass(known, ratio, order, infos, gains, totals):
 
 @compiled
 def smooth_states(samples, known, ratio, order, infos, gains, totals, states):
-    """Compute the states that minimise (1), the minimum, and the log determinant of the likelihood.
+    """Compute the smoothed states of a column, and the terms of its log likelihood.
+
+    The states minimise sum (d - c[0])^2 + (1/r) sum g^2 over samples d, states c and inputs g.
 
     Args:
         samples: (n,) samples over the noise standard deviation [1]; any value where missing.
@@ -309,7 +313,7 @@ def state_variances(known, ratio, order, infos, variances):
         known: (n,) 1 where a sample is known, 0 where it is missing [1].
         ratio: r, scalar [1].
         order: number m of integrators [1].
-        infos: (n, m, m) as written by `backward_pass`.
+        infos: (n, m, m) information of samples j .. n-1 about state j, from `backward_pass`.
         variances: (n, m) written [1].
 
     Returns:
@@ -447,7 +451,7 @@ def smooth(
 
 
 def sample_errors(smoothed: OptimallySmoothed, count: int, seed: int = 0) -> np.ndarray:
-    """Sample random errors of smoothed signals.
+    """Draw random errors (smoothed minus true) that smoothed signals may have.
 
     A signal of the integrator chain with input `input_std` is simulated, noise is added, and the
     signal is smoothed with the same parameters and the same missing samples. The error does not
@@ -483,7 +487,7 @@ def sample_errors(smoothed: OptimallySmoothed, count: int, seed: int = 0) -> np.
 def _normalise_samples(
     samples: np.ndarray, known: np.ndarray, noises: np.ndarray | None, k: int
 ) -> tuple[np.ndarray, float, float]:
-    """Subtract the mean and divide by the noise, or by the scatter of the steps if it is unknown.
+    """Make samples dimensionless: subtract the mean, divide by the noise or, if unknown, the step scatter.
 
     Returns:
         The scaled samples, the mean, and the divisor.
@@ -527,7 +531,7 @@ def _simulate_chain(inputs, order):
 
 @compiled
 def _evaluate_objective(samples, known, exponent, order, use_likelihood, noise_known, work):
-    """Return the objective of the variance ratio 10^exponent, to be minimised."""
+    """Return the objective for the variance ratio 10^exponent: minus log likelihood, or cross-validation."""
     infos, gains, totals, states, variances = work
     ratio = 10.0**exponent
     residuals, inputs, logs = smooth_states(samples, known, ratio, order, infos, gains, totals, states)
@@ -543,7 +547,10 @@ def _evaluate_objective(samples, known, exponent, order, use_likelihood, noise_k
 
 @compiled
 def _find_best_exponent(samples, known, order, use_likelihood, noise_known, work):
-    """Find the best log10 of the ratio on a grid of two decades, refined by golden sections."""
+    """Find the log10 of the variance ratio with the smallest objective.
+
+    The search uses a grid of two decades, refined by golden sections.
+    """
     best, middle = math.inf, 0.0
     for decade in range(_MIN_LOG_RATIO, _MAX_LOG_RATIO + 1, 2):
         cost = _evaluate_objective(samples, known, float(decade), order, use_likelihood, noise_known, work)
@@ -683,7 +690,10 @@ def _interpolate_gaps(samples: np.ndarray, max_gap: int) -> np.ndarray:
 
 
 def _derivatives(x: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return x (n, k) and two derivatives by five-point differences, three-point at the ends."""
+    """Return x (n, k) and its first and second time derivatives by central differences.
+
+    They use five points, and three near the ends.
+    """
     rate = np.gradient(x, dt, axis=0, edge_order=2)
     acceleration = np.empty_like(x)
     acceleration[1:-1] = (x[2:] - 2.0 * x[1:-1] + x[:-2]) / dt**2

@@ -28,7 +28,7 @@ def compute_heldout_errors(
     columns: list[int],
     setup: RegressorSetup,
 ) -> dict[str, HeldOutError]:
-    """Return the prediction errors of the held-out run for each drive at `columns`.
+    """Compute the force prediction errors of each drive on the held-out run.
 
     Args:
         equations: equations of the held-out run.
@@ -67,7 +67,7 @@ def _rms(values: np.ndarray) -> float:
 
 
 def _is_better_than_zero(force: np.ndarray, error: np.ndarray, equations: Equations) -> bool:
-    """Return whether errors are significantly smaller than the force itself.
+    """Return whether prediction errors are significantly smaller than those of predicting zero force.
 
     A band b [Hz] over a duration T holds 2 b T independent values.
     """
@@ -77,7 +77,9 @@ def _is_better_than_zero(force: np.ndarray, error: np.ndarray, equations: Equati
 
 
 def compute_heldout_forces(equations: Equations, table: Regressor, value: np.ndarray) -> HeldOutForces:
-    """Return measured and predicted forces of the held-out run.
+    """Compute the forces of the held-out run predicted with identified and given parameters.
+
+    They are returned with the measured forces.
 
     Args:
         equations: equations of the held-out run.
@@ -91,7 +93,7 @@ def compute_heldout_forces(equations: Equations, table: Regressor, value: np.nda
 
 
 def compare_with_given_forces(forces: HeldOutForces, heldout: dict[str, HeldOutError]) -> tuple[str, ...]:
-    """Find forces with the wrong sign or unit by comparison with the given model.
+    """Find measured forces with a wrong sign or unit by comparison with those of the given model.
 
     Args:
         forces: forces of the held-out run.
@@ -166,7 +168,7 @@ def describe_heldout_errors(heldout: dict[str, HeldOutError], run: str) -> tuple
 
 
 def residual_autocorrelation(residual: np.ndarray) -> np.ndarray:
-    """Return the correlation (k,) of successive residuals (n, k)."""
+    """Return the correlation (k,) of successive rows of residuals (n, k): 0 for white noise."""
     error = residual - residual.mean(axis=0)
     return np.sum(error[1:] * error[:-1], axis=0) / np.sum(error**2, axis=0)
 
@@ -178,7 +180,7 @@ def describe_status(
     setup: RegressorSetup,
     findings: tuple[str, ...] = (),
 ) -> str:
-    """Evaluate the result of an identification.
+    """Assess an identification: return `ok`, or the most important problem with its remedy.
 
     Args:
         heldout: prediction errors of the held-out run.

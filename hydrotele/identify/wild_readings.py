@@ -56,7 +56,7 @@ def find_wild_readings(values: np.ndarray) -> np.ndarray:
 def remove_wild_readings(
     record: IdentificationRecord, drives: Sequence[str]
 ) -> tuple[IdentificationRecord, tuple[str, ...]]:
-    """Return a record without wild readings, and notes on them.
+    """Remove single readings far outside their neighbours from a record's forces and positions.
 
     Wild forces become unknown; wild positions are replaced by interpolation between their neighbours.
 
@@ -65,7 +65,7 @@ def remove_wild_readings(
         drives: names of the drives of its forces.
 
     Returns:
-        The record, and one note per column with wild readings.
+        The corrected record, and one note per column with wild readings.
     """
     force, position, notes = record.force.copy(), record.position.copy(), []
     rows = np.arange(len(force))

@@ -59,7 +59,7 @@ class ArmGeometry:
 
 
 def forward_kinematics(geometry: ArmGeometry, q: Sequence[float]) -> tuple[float, ...]:
-    """Compute the pose of the controlled point in cylindrical coordinates.
+    """Compute the arm's pose from its joint angles, in cylindrical coordinates about the swing axis.
 
     x = a1 + a2 cos(q2) + a3 cos(q2 + q3) + tool, z likewise with sines; r = sqrt(x^2 + d2^2),
     theta = q1 + atan2(d2, x), phi = q2 + q3 + q4.
@@ -84,7 +84,7 @@ def forward_kinematics(geometry: ArmGeometry, q: Sequence[float]) -> tuple[float
 
 
 def forward_cartesian(geometry: ArmGeometry, q: Sequence[float]) -> tuple[float, float, float]:
-    """Compute the Cartesian position of the controlled point (Zhu Eq. 2.2).
+    """Compute the Cartesian position of the arm's controlled point from its joint angles (Zhu Eq. 2.2).
 
     (x, y) = Rot(q1) (x of the arm plane, d2).
 
@@ -107,7 +107,7 @@ def forward_cartesian(geometry: ArmGeometry, q: Sequence[float]) -> tuple[float,
 
 
 def inverse_kinematics(geometry: ArmGeometry, pose: Sequence[float], elbow: int = 1) -> tuple[float, ...]:
-    """Compute the joint angles for a pose (Zhu Eqs 2.3-2.6).
+    """Compute the joint angles of an excavator arm for a pose (Zhu Eqs 2.3-2.6).
 
     x = sqrt(r^2 - d2^2), q1 = theta - atan2(d2, x). The tool offset, rotated by phi, is subtracted.
     With l the distance from boom pin to tool pin, A = (a2 + a3)^2 - l^2, B = l^2 - (a2 - a3)^2:
@@ -131,7 +131,7 @@ def inverse_kinematics(geometry: ArmGeometry, pose: Sequence[float], elbow: int 
         and tool not wrapped.
 
     Raises:
-        Unreachable: the pose is out of reach; the message gives the requested distance and the
+        UnreachableError: the pose is out of reach; the message gives the requested distance and the
             reachable interval.
 
     >>> cat215 = ArmGeometry(
@@ -160,7 +160,7 @@ def inverse_kinematics(geometry: ArmGeometry, pose: Sequence[float], elbow: int 
 
 
 def jacobian(geometry: ArmGeometry, q: Sequence[float]) -> np.ndarray:
-    """Compute the Jacobian of `forward_kinematics`.
+    """Compute the derivatives of the arm's cylindrical pose (r, theta, z, phi) by its joint angles.
 
     dr = (x/r) dx, dtheta = dq1 - (d2/r^2) dx; dz and dphi are the derivatives of z and phi.
 
@@ -189,7 +189,9 @@ def jacobian(geometry: ArmGeometry, q: Sequence[float]) -> np.ndarray:
 
 
 def cartesian_jacobian(geometry: ArmGeometry, q: Sequence[float]) -> np.ndarray:
-    """Compute the Jacobian of `forward_cartesian`; its transpose maps a force to joint torques.
+    """Compute the derivatives of the arm's Cartesian position by its joint angles.
+
+    The transpose maps a force on the controlled point to joint torques.
 
     Args:
         geometry: the arm.
@@ -220,7 +222,11 @@ def cartesian_jacobian(geometry: ArmGeometry, q: Sequence[float]) -> np.ndarray:
 def _plane_chain(
     geometry: ArmGeometry, q: Sequence[float]
 ) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
-    """Return the point (x from swing axis, z from boom pin), and dx/dq and dz/dq for q[1:]."""
+    """Compute the controlled point in the arm's vertical plane, and its derivatives.
+
+    Returns:
+        ((x from the swing axis, z from the boom pin) [m], dx/dq, dz/dq by the angles q[1:], without swing).
+    """
     if len(q) != 3 + geometry.has_tool_joint:
         raise ValueError(f"this arm has {3 + geometry.has_tool_joint} joints, got {len(q)} angles")
     along, up = geometry.tool_offset
@@ -253,7 +259,7 @@ def outer_bar_end(geometry: ArmGeometry, pose: Sequence[float]) -> tuple[float, 
         x ahead, z up [m], length of the outer bar [m], angle from the stick to that bar [rad].
 
     Raises:
-        Unreachable: the radius is less than the lateral offset of the arm plane.
+        UnreachableError: the radius is less than the lateral offset of the arm plane.
 
     >>> arm = ArmGeometry(base_radius=0.3, lateral_offset=0.0, boom_length=5.2, stick_length=1.8)
     >>> outer_bar_end(arm, (5.3, 0.0, 1.0, 0.0))
@@ -273,7 +279,11 @@ def outer_bar_end(geometry: ArmGeometry, pose: Sequence[float]) -> tuple[float, 
 
 
 def _plane_x(geometry: ArmGeometry, r: float) -> float:
-    """Return the distance of the controlled point ahead of the swing axis, in the arm plane."""
+    """Return the distance x ahead of the swing axis, in the arm plane, of a point at radius r [m].
+
+    Raises:
+        UnreachableError: the radius is less than the lateral offset of the arm plane.
+    """
     side = abs(geometry.lateral_offset)
     if not r >= side:
         raise UnreachableError(

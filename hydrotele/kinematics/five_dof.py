@@ -78,7 +78,7 @@ class JointSolution(NamedTuple):
 
 
 def forward_kinematics(geometry: FellerGeometry, q: Sequence[float]) -> FellerPose:
-    """Compute the pose of the tool.
+    """Compute the pose of a feller-buncher's tool from the five joint angles.
 
     Args:
         geometry: the arm.
@@ -120,7 +120,7 @@ def tool_direction(q: Sequence[float]) -> np.ndarray:
 
 
 def inverse_kinematics(geometry: FellerGeometry, pose: FellerPose) -> JointSolution:
-    """Compute the joint angles for position, attitude and head angle, with the stick hanging down.
+    """Compute the joint angles for a tool position, attitude and head angle, with the stick hanging down.
 
     The tool is offset from the arm's plane by head radius times sine of the head angle, so that the
     plane's azimuth solves `A cos + B sin = C`. The solution in which the arm reaches backwards over
@@ -194,7 +194,7 @@ def inverse_for_direction(
 
 
 def jacobian(geometry: FellerGeometry, q: Sequence[float]) -> np.ndarray:
-    """Compute the derivatives (5, 5) of (x, y, z, attitude, head) by the joint angles.
+    """Compute the derivatives (5, 5) of the tool's pose (x, y, z, attitude, head) by the joint angles.
 
     Args:
         geometry: the arm.
@@ -228,7 +228,11 @@ def jacobian(geometry: FellerGeometry, q: Sequence[float]) -> np.ndarray:
 
 
 def _inverse_in_plane(geometry: FellerGeometry, r: float, z: float, attitude: float, head: float) -> JointSolution:
-    """Compute boom, stick and tilt for the tool's radius and height in the arm plane; swing 0."""
+    """Compute boom, stick and tilt angle for a tool position and attitude in the arm's plane.
+
+    `r` and `z` are distance ahead of the swing axis and height [m]. The result has swing 0 and the given
+    head angle; a position out of reach is clamped.
+    """
     g = geometry
     out = g.tilt_length + g.head_radius * math.cos(head)
     across = r - g.base_radius - out * math.cos(attitude) - g.head_depth * math.sin(attitude)

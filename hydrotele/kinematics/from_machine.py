@@ -64,15 +64,15 @@ DriveLinkage = TwoBar | FourBar | SliderLinkage | DirectDrive
 
 
 def axis_linkage(machine: Machine, name: str) -> DriveLinkage:
-    """Return the linkage between an axis' drive and its joint.
+    """Build the linkage that relates an axis' drive coordinate to its joint angle.
 
     Args:
         machine: the machine.
         name: axis name.
 
     Returns:
-        Two-bar, four-bar or slider with `length`, `rate`, `angle` of the pin-to-pin length;
-        `DirectDrive` for motors and force drives.
+        Two-bar, four-bar or slider, with the pin-to-pin length by joint coordinate, its derivative,
+        and the inverse; `DirectDrive` for motors and force drives.
 
     Raises:
         InputError: the pins of the cylinder are not on the two links that the joint connects.
@@ -111,7 +111,7 @@ def axis_linkage(machine: Machine, name: str) -> DriveLinkage:
 
 
 def has_ball_ends(machine: Machine, name: str) -> bool:
-    """Return whether an axis' cylinder has ball joints at its ends.
+    """Return whether an axis' cylinder needs ball joints at its ends instead of pins.
 
     A cylinder between pins parallel to the joint's axis moves in a plane perpendicular to it. Pins
     with an offset along the axis would bend the cylinder, so it has ball ends.
@@ -126,7 +126,7 @@ def has_ball_ends(machine: Machine, name: str) -> bool:
 
 
 def range_at_drive(machine: Machine, name: str) -> tuple[float, float] | None:
-    """Return the range of an axis' joint in the coordinate of its drive.
+    """Convert the range of an axis' joint to the range of its drive, such as piston displacement.
 
     Args:
         machine: the machine.
@@ -217,7 +217,7 @@ def pin_axis(machine: Machine, name: str) -> tuple[float, float, float]:
 
 
 def check_strokes(machine: Machine) -> None:
-    """Raise an error if a cylinder's stroke does not span the range of its joint.
+    """Raise InputError if a cylinder's stroke does not span the range of its joint.
 
     Args:
         machine: the machine; joints without a range are not checked.
@@ -242,13 +242,13 @@ def check_strokes(machine: Machine) -> None:
 
 
 def arm_geometry(machine: Machine) -> ArmGeometry:
-    """Return the dimensions of the machine's arm, with heights above the ground.
+    """Return the dimensions of an excavator's arm from its machine, with heights above the ground.
 
     Args:
         machine: a machine with an `arm`.
 
     Returns:
-        The geometry of `kinematics.arm`.
+        Lengths and offsets, as `kinematics.arm` needs them.
 
     Raises:
         InputError: the machine has no arm, or an arm with a head, for which `feller_geometry`
@@ -283,7 +283,7 @@ def arm_geometry(machine: Machine) -> ArmGeometry:
 
 
 def is_planar_arm(machine: Machine) -> bool:
-    """Return whether swing, boom and stick rotate about z and -y, as the closed forms require."""
+    """Return whether swing rotates about z, and boom and stick about -y, as `kinematics.arm` requires."""
     assert machine.arm
     wanted = ((0, 0, 1), (0, -1, 0), (0, -1, 0))
     joints = (machine.arm.swing, machine.arm.boom, machine.arm.stick)
@@ -294,7 +294,7 @@ def is_planar_arm(machine: Machine) -> bool:
 
 
 def tip_position(machine: Machine, joints: np.ndarray) -> np.ndarray:
-    """Compute the position of the arm's tip.
+    """Compute the position of the arm's tip in the world from swing, boom and stick angle.
 
     Args:
         machine: a machine with an `arm`.
@@ -319,7 +319,9 @@ def tip_position(machine: Machine, joints: np.ndarray) -> np.ndarray:
 
 
 def solve_tip_position(machine: Machine, place: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Compute joint angles for a tip position, for any joint axes, by Newton's method.
+    """Compute swing, boom and stick angle for a tip position, for any joint axes, by Newton's method.
+
+    It takes at most 8 steps; convergence is not checked.
 
     Args:
         machine: a machine with an `arm` of three joints.
@@ -349,7 +351,7 @@ def feller_geometry(machine: Machine) -> FellerGeometry:
         machine: a machine with an `arm` that has a head.
 
     Returns:
-        The geometry of `kinematics.five_dof`.
+        Lengths, as `kinematics.five_dof` needs them.
 
     Raises:
         InputError: the arm has no head, or its joints do not have the form of
@@ -376,7 +378,10 @@ def feller_geometry(machine: Machine) -> FellerGeometry:
 
 
 def _check_feller(machine: Machine, joints: Sequence[str], aside: Sequence[float]) -> None:
-    """Raise an error if an arm's pins or axes do not have the form of `kinematics.five_dof`."""
+    """Raise InputError if an arm's pins or axes do not fit the closed form for a feller-buncher's arm.
+
+    `aside` are the pin coordinates that must be 0 [m].
+    """
     where = f"machine {machine.name}: arm"
     axes = ((0, 0, 1), (0, -1, 0), (0, -1, 0), (0, -1, 0), (0, 0, -1))
     for name, axis in zip(joints, axes, strict=True):

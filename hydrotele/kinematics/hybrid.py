@@ -178,7 +178,7 @@ class HybridRobot:
 
 
 def load_hybrid(name: str | Path) -> HybridRobot:
-    """Read a hybrid robot.
+    """Read a hybrid robot (a serial carriage that carries a hexapod) by name or from a file.
 
     Args:
         name: a shipped robot, a file in the format of `models/iwr/iwr.yaml`, or a folder with
@@ -261,7 +261,7 @@ def dh_transform(theta, d, a, alpha) -> np.ndarray:
 
 
 def axis_frames(axes: Sequence[AxisRow]) -> np.ndarray:
-    """Return frames F_i (n, 4, 4) in frame 0, with z along each axis and the origin on it."""
+    """Build a frame (n, 4, 4) for each joint axis: z along the axis, origin on it, in frame 0."""
     frames = np.tile(np.eye(4), (len(axes), 1, 1))
     for frame, row in zip(frames, axes, strict=True):
         z = np.array(row.direction) / np.linalg.norm(row.direction)
@@ -282,7 +282,9 @@ def _platform_at_zero(facts: HybridSpec) -> np.ndarray:
 
 
 def constants_from_axes(frames: np.ndarray, at_zero: np.ndarray) -> np.ndarray:
-    """Return the constants C_0 to C_n of a product of exponentials from its axis frames.
+    """Compute the constant transforms between the joints of a carriage that is given by its axes.
+
+    With these C_0 to C_n the pose is C_0 M(q_1) C_1 ... C_n, with motions M about or along z.
 
     Args:
         frames: (..., n, 4, 4) axis frames F_i.
@@ -307,7 +309,7 @@ def inverse_transform(transform: np.ndarray) -> np.ndarray:
 
 
 def zero_frames(robot: HybridRobot) -> tuple[np.ndarray, np.ndarray]:
-    """Return frames of the joint axes and the connecting platform in frame 0, joints at zero.
+    """Compute the frames of joint axes and connecting platform in frame 0 with all joints at zero.
 
     Returns:
         ((n, 4, 4) frames with each joint's axis along z, (4, 4) frame of the connecting platform).
@@ -343,7 +345,7 @@ def convert_to_axes(robot: HybridRobot) -> HybridRobot:
 
 
 def carriage_pose(robot: HybridRobot, joints: np.ndarray) -> np.ndarray:
-    """Compute the poses of the connecting platform.
+    """Compute the poses of the carriage's last link, the connecting platform, from its joints.
 
     Args:
         robot: the robot.
@@ -368,7 +370,9 @@ def carriage_pose(robot: HybridRobot, joints: np.ndarray) -> np.ndarray:
 
 
 def leg_vectors(robot: HybridRobot, joints: np.ndarray, pose: PlatformPose) -> np.ndarray:
-    """Compute the vectors from A_i to B_i in the connecting platform's frame (Wang Eqs 8 and 10).
+    """Compute the vectors along the six legs, from universal joint A_i to spherical joint B_i.
+
+    They are in the connecting platform's frame (Wang Eqs 8 and 10).
 
     Args:
         robot: the robot.
@@ -413,7 +417,7 @@ def inverse_kinematics(robot: HybridRobot, pose: PlatformPose, joints: np.ndarra
         (..., 6) readings [m].
 
     Raises:
-        Unreachable: a leg reading is out of range.
+        UnreachableError: a leg reading is out of range.
     """
     readings = leg_readings(robot, joints, pose)
     low, high = robot.leg_range
@@ -424,14 +428,22 @@ def inverse_kinematics(robot: HybridRobot, pose: PlatformPose, joints: np.ndarra
 
 
 def home_pose(robot: HybridRobot, joints: np.ndarray) -> PlatformPose:
-    """Return the home pose of the moving platform for carriage positions (..., n)."""
+    """Return the pose of the moving platform at its home position on the carriage.
+
+    Args:
+        robot: the robot.
+        joints: (..., n) positions of the carriage joints [m] or [rad].
+
+    Returns:
+        (...) poses in frame 0, with the orientation of the connecting platform.
+    """
     carriage = carriage_pose(robot, joints)
     place = np.einsum("...ij,j->...i", carriage[..., :3, :3], robot.home)
     return PlatformPose(carriage[..., :3, :3], place + carriage[..., :3, 3])
 
 
 def leg_jacobian(robot: HybridRobot, joints: np.ndarray, pose: PlatformPose) -> np.ndarray:
-    """Compute the derivatives of the leg readings by position [m] and rotation vector [rad].
+    """Compute the derivatives of leg readings by the platform's position [m] and rotation vector [rad].
 
     The rotation is that of exp(w) R in frame 0.
 
@@ -454,7 +466,7 @@ def leg_jacobian(robot: HybridRobot, joints: np.ndarray, pose: PlatformPose) -> 
 def forward_kinematics(
     robot: HybridRobot, joints: np.ndarray, readings: np.ndarray, start: PlatformPose | None = None
 ) -> PlatformPose:
-    """Compute forward kinematics by Newton's method on the six leg lengths.
+    """Compute the platform's pose from leg readings and carriage joints by Newton's method.
 
     Up to 40 poses have the same lengths; the result is the one on the start's branch.
 
@@ -468,7 +480,7 @@ def forward_kinematics(
         The poses, (N,) or a single one.
 
     Raises:
-        Unreachable: Newton's method does not converge.
+        UnreachableError: Newton's method does not converge.
     """
     joints, readings = np.asarray(joints, float), np.asarray(readings, float)
     rotation, position = home_pose(robot, joints) if start is None else start
@@ -501,7 +513,7 @@ def forward_by_evolution(
     robot: HybridRobot, joints: np.ndarray, readings: np.ndarray, seed: int = 0,
     reach: float = 0.35, turn: float = 0.6, polish: bool = False,
 ) -> PlatformPose:  # fmt: skip
-    """Compute forward kinematics by differential evolution, without start or Jacobian.
+    """Compute the platform's pose from leg readings by differential evolution, without a start pose.
 
     The sum of squared errors of the leg lengths is minimised over position and rotation vector in
     a box about the home pose.
@@ -575,7 +587,7 @@ def pose_difference(found: PlatformPose, true: PlatformPose) -> np.ndarray:
 
 @compiled
 def batch_readings(constants, kinds, universal, spherical, offsets, joints, rotation, position):
-    """Compute leg readings of W robots at N poses each, for least squares, DE and MCMC.
+    """Compute the leg readings of W robots with different geometry at N platform poses each.
 
     Args:
         constants: (W, n + 1, 4, 4) transforms of each robot's carriage.
@@ -588,7 +600,7 @@ def batch_readings(constants, kinds, universal, spherical, offsets, joints, rota
         position: (N, 3) positions of the moving platform [m].
 
     Returns:
-        (W, N, 6) readings [m], as `leg_readings`.
+        (W, N, 6) readings [m]: distance of A_i and B_i minus the leg's offset.
 
     Source: Wang 2012, Eqs 10, 11 and 29.
     """
@@ -659,7 +671,7 @@ class GeometryBatch(NamedTuple):
 
 @dataclass(frozen=True)
 class ErrorModel:
-    """Parameters of an error model about a nominal robot.
+    """Error model: which geometric errors of a nominal robot are parameters, with units and scales.
 
     Attributes:
         kind: `dh` or `poe`.
@@ -695,11 +707,12 @@ class ErrorModel:
 
 
 def build_error_model(robot: HybridRobot, kind: ErrorModelKind) -> ErrorModel:
-    """Build an error model about a robot.
+    """Define the error parameters of a hybrid robot for calibration.
 
     Args:
         robot: the nominal robot.
-        kind: `dh` or `poe`; `dh` needs a robot given by D-H rows.
+        kind: `dh` for errors of D-H rows, which the robot must have, or `poe` for errors of axis lines;
+            both with errors of the legs.
 
     Raises:
         InputError: the kind is unknown, or the robot has no D-H rows.
@@ -748,7 +761,7 @@ def refined_model_parameters(model: ErrorModel) -> tuple[str, ...]:
 
 
 def build_geometries(model: ErrorModel, errors: np.ndarray) -> GeometryBatch:
-    """Build geometries with errors.
+    """Add sets of errors to a robot's nominal geometry: carriage, leg joints and leg offsets.
 
     Args:
         model: the error model.
@@ -773,7 +786,7 @@ def predict_leg_readings(
     model: ErrorModel, errors: np.ndarray, joints: np.ndarray, rotation: np.ndarray,
     position: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Compute leg readings at measured poses for given errors (Wang Eq. 29).
+    """Predict the leg readings at measured poses for sets of geometric errors (Wang Eq. 29).
 
     Args:
         model: the error model.
@@ -828,7 +841,7 @@ def apply_errors(model: ErrorModel, errors: np.ndarray) -> HybridRobot:
 
 
 def first_order_carriage_pose(robot: HybridRobot, errors: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """Compute the carriage pose by the document's linear error model (Wang Eqs 12 to 26).
+    """Compute the carriage pose with errors by the publication's linear model (Wang Eqs 12 to 26).
 
     dT = sum_i (0T_{i-1}) (d Ai) (iT4), with d Ai = A_i delta_i and delta_i = D_theta dtheta + D_d
     dd + D_a da + D_alpha dalpha (Eq. 18).
@@ -870,7 +883,10 @@ def _to_point_tuples(points: np.ndarray) -> tuple:
 
 
 def _dh_error_table(robot: HybridRobot, errors: np.ndarray) -> np.ndarray:
-    """Return the errors (W, n, 4) of theta, d, a, alpha of every row; zero if not modelled."""
+    """Arrange carriage errors (W, parameters) as errors (W, n, 4) of theta, d, a, alpha per D-H row.
+
+    Entries that are no parameters are zero.
+    """
     table, at = np.zeros((len(errors), len(robot.kinds), 4)), 0
     for i, kind in enumerate(robot.kinds):
         columns = [0, 1, 2, 3] if kind == REVOLUTE else [0, 3]
@@ -888,7 +904,7 @@ def _dh_constants(robot: HybridRobot, errors: np.ndarray) -> np.ndarray:
 
 
 def _poe_frames(robot: HybridRobot, errors: np.ndarray) -> np.ndarray:
-    """Return the frames (W, n, 4, 4) of the axes with errors, joints at zero."""
+    """Compute the joint axis frames (W, n, 4, 4) displaced by W sets of errors, with joints at zero."""
     nominal = axis_frames(robot.specification.axes)
     motion, at = np.zeros((len(errors), len(nominal), 4, 4)), 0
     motion[..., 3, 3] = 1.0

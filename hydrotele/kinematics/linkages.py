@@ -29,14 +29,13 @@ class LoopOpenError(ValueError):
 
 
 def math_module(value: Scalar) -> ModuleType:
-    """Return the module for a value: NumPy for an array, the faster math module for a float.
+    """Return the module with the functions for a value: numpy for an array, the faster math for a float.
 
     Args:
         value: any shape [any unit].
 
     Returns:
-        The module numpy or math; both have sin, cos, sqrt, atan2 and floor under these names (NumPy
-        2).
+        The module numpy or math; both have sin, cos, sqrt, atan2 and floor.
 
     >>> math_module(1.0).__name__, math_module(np.ones(2)).__name__
     ('math', 'numpy')
@@ -45,7 +44,7 @@ def math_module(value: Scalar) -> ModuleType:
 
 
 def subtract_points(a: Point, b: Point) -> Point:
-    """Return the vector a - b in the plane.
+    """Return the vector from point b to point a in the plane.
 
     Args:
         a: (x, z), coordinates of any one shape [m].
@@ -90,7 +89,7 @@ def apex_angle(left: float, right: float, opposite: Scalar) -> Scalar:
         Angle B, shape of opposite [rad], in [0, pi].
 
     Raises:
-        LoopOpen: a length is outside [|a - b|, a + b].
+        LoopOpenError: a length is outside [|a - b|, a + b].
 
     >>> round(math.degrees(apex_angle(3.0, 4.0, 5.0)), 9)
     90.0
@@ -105,7 +104,7 @@ def apex_angle(left: float, right: float, opposite: Scalar) -> Scalar:
 def intersect_bars(first_pin: Point, second_pin: Point, first_bar: Scalar, second_bar: Scalar, side: int) -> Point:
     """Return the pin that joins two bars, an intersection of the circles about `first_pin` and `second_pin`.
 
-    With D = |far - near|, the pin is at (n^2 - f^2 + D^2) / (2 D) along the line from `first_pin` to
+    With D = |second_pin - first_pin|, the pin is at (n^2 - f^2 + D^2) / (2 D) along the line from `first_pin` to
     `second_pin`, at the distance 2 A / D from it, with the triangle's area A (Heron).
 
     Args:
@@ -119,7 +118,7 @@ def intersect_bars(first_pin: Point, second_pin: Point, first_bar: Scalar, secon
         (x, z) of the shared pin [m].
 
     Raises:
-        LoopOpen: the bars are too short, or too unequal, to meet.
+        LoopOpenError: the bars are too short, or too unequal, to meet.
 
     >>> [round(v, 9) for v in intersect_bars((0.0, 0.0), (5.0, 0.0), 3.0, 4.0, 1)]
     [1.8, 2.4]
@@ -136,7 +135,7 @@ def intersect_bars(first_pin: Point, second_pin: Point, first_bar: Scalar, secon
 
 
 def clip_to_bars(value: Scalar, low: Scalar, high: Scalar, quantity: str) -> Scalar:
-    """Return a length clipped to the range of the bars; an excess above 1e-12 m raises an error.
+    """Clip a length to the range that two bars allow; raise an error if it exceeds that by 1e-12 m.
 
     Args:
         value: requested length, any shape [m].
@@ -148,7 +147,7 @@ def clip_to_bars(value: Scalar, low: Scalar, high: Scalar, quantity: str) -> Sca
         The length, within [low, high] [m].
 
     Raises:
-        LoopOpen: a length is outside [low, high] or NaN.
+        LoopOpenError: a length is outside [low, high] or NaN.
 
     >>> clip_to_bars(2.0 + 1e-15, 1.0, 2.0, "cylinder length")
     2.0
@@ -197,9 +196,9 @@ class TwoBar:
             raise ValueError(f"two-bar direction must be +1 or -1, got {self.direction}")
 
     def length(self, theta: Scalar) -> Scalar:
-        """Return the pin-to-pin length c = sqrt((a - b)^2 + h^2 + 4 a b sin(B/2)^2).
+        """Return the cylinder's pin-to-pin length c = sqrt((a - b)^2 + h^2 + 4 a b sin(B/2)^2).
 
-        For h = 0 this is K Eq. 3.26.
+        a and b are `lower` and `upper`, h is `axial_offset`, B the included angle at theta.
 
         Args:
             theta: joint angle, any shape [rad].
@@ -217,7 +216,9 @@ class TwoBar:
         return m.sqrt(constant + self.lower * self.upper * chord**2)
 
     def rate(self, theta: Scalar) -> Scalar:
-        """Return the signed moment arm dc/dtheta = direction a b sin(B) / c (Zhu Eq. 6.13).
+        """Return the moment arm dc/dtheta = direction a b sin(B) / c of the cylinder (Zhu Eq. 6.13).
+
+        a and b are `lower` and `upper`, B the included angle, c the pin-to-pin length.
 
         Args:
             theta: joint angle, any shape [rad].
@@ -233,10 +234,10 @@ class TwoBar:
         return self.direction * self.lower * self.upper * m.sin(included) / self.length(theta)
 
     def angle(self, length: Scalar) -> Scalar:
-        """Return the joint angle theta = direction (B - angle_offset), on the branch B in [0, pi].
+        """Return the joint angle theta = direction (B - angle_offset) at a pin-to-pin length.
 
-        tan(B/2)^2 = (p^2 - (a - b)^2) / ((a + b)^2 - p^2) with the length p = sqrt(c^2 - h^2) in
-        the plane perpendicular to the axis; this needs no arc cosine.
+        The included angle B is in [0, pi]: tan(B/2)^2 = (p^2 - (a - b)^2) / ((a + b)^2 - p^2) with the
+        length p = sqrt(c^2 - h^2) in the plane perpendicular to the axis.
 
         Args:
             length: pin-to-pin length c, any shape [m], with p in [|a - b|, a + b].
@@ -245,7 +246,7 @@ class TwoBar:
             Joint angle, shape of length [rad].
 
         Raises:
-            LoopOpen: a length is outside [|a - b|, a + b].
+            LoopOpenError: a length is outside [|a - b|, a + b].
 
         >>> boom = TwoBar(0.625, 2.000, math.radians(78.6), 1)
         >>> round(math.degrees(boom.angle(2.2575379)), 4)
@@ -260,7 +261,7 @@ class TwoBar:
 def two_bar_from_points(
     base_pin: Point, rod_pin: Point, working_angle: float = 0.0, axial_offset: float = 0.0
 ) -> TwoBar:
-    """Build a two-bar linkage from its two cylinder pins, relative to the joint.
+    """Build a two-bar linkage (cylinder across a joint) from the positions of its two pins.
 
     B = |polar(rod) + theta - polar(base)|; the direction is the sign of the difference at the
     working angle.
@@ -357,7 +358,7 @@ class FourBar:
             theta.
 
         Raises:
-            LoopOpen: rocker and coupler cannot meet at a requested angle.
+            LoopOpenError: rocker and coupler cannot meet at a requested angle.
 
         >>> bucket = FourBar((1.8, 0.0), (1.5, 0.1), (-0.1, 0.2), 0.55, 0.48, (-0.2, 0.35))
         >>> q, r = bucket.pin_positions(-1.0)
@@ -371,7 +372,7 @@ class FourBar:
         return q, intersect_bars(self.rocker_pivot, q, self.rocker, self.coupler, self.assembly)
 
     def pose(self, theta: Scalar) -> FourBarPose:
-        """Return rocker angle, coupler angle and cylinder length.
+        """Compute rocker angle, coupler angle and cylinder length at an angle of the output link.
 
         Args:
             theta: output angle, any shape [rad].
@@ -380,7 +381,7 @@ class FourBar:
             rocker_angle [rad], coupler_angle [rad], length [m], each with the shape of theta.
 
         Raises:
-            LoopOpen: rocker and coupler cannot meet at a requested angle.
+            LoopOpenError: rocker and coupler cannot meet at a requested angle.
 
         >>> bucket = FourBar((1.8, 0.0), (1.5, 0.1), (-0.1, 0.2), 0.55, 0.48, (-0.2, 0.35))
         >>> [round(v, 4) for v in bucket.pose(-1.0)]
@@ -397,7 +398,7 @@ class FourBar:
         )
 
     def length(self, theta: Scalar) -> Scalar:
-        """Return the pin-to-pin length c = |R - B|.
+        """Return the cylinder's pin-to-pin length c, the distance of rod pin R and cylinder base B.
 
         Args:
             theta: output angle, any shape [rad].
@@ -406,7 +407,7 @@ class FourBar:
             Pin-to-pin length, shape of theta [m].
 
         Raises:
-            LoopOpen: rocker and coupler cannot meet at a requested angle.
+            LoopOpenError: rocker and coupler cannot meet at a requested angle.
 
         >>> bucket = FourBar((1.8, 0.0), (1.5, 0.1), (-0.1, 0.2), 0.55, 0.48, (-0.2, 0.35))
         >>> round(bucket.length(-1.0), 4)
@@ -415,9 +416,10 @@ class FourBar:
         return self.pose(theta).length
 
     def rate(self, theta: Scalar) -> Scalar:
-        """Return the signed moment arm dc/dtheta = ratio ((R - P) x (R - B)) / c.
+        """Return the moment arm dc/dtheta = ratio ((R - P) x (R - B)) / c of cylinder on output link.
 
-        ratio = d(rocker angle)/dtheta = ((Q - O) x (R - Q)) / ((R - P) x (R - Q)), because the
+        R is the rod pin, P the rocker pivot, B the cylinder base, Q and O the output link's pin and
+        pivot. ratio = d(rocker angle)/dtheta = ((Q - O) x (R - Q)) / ((R - P) x (R - Q)), because the
         coupler keeps its length.
 
         Args:
@@ -428,7 +430,7 @@ class FourBar:
             point).
 
         Raises:
-            LoopOpen: rocker and coupler cannot meet at a requested angle.
+            LoopOpenError: rocker and coupler cannot meet at a requested angle.
 
         >>> bucket = FourBar((1.8, 0.0), (1.5, 0.1), (-0.1, 0.2), 0.55, 0.48, (-0.2, 0.35))
         >>> round(bucket.rate(-1.0), 4)
@@ -441,7 +443,10 @@ class FourBar:
         return ratio * cross_product(rocker, rod) / math_module(theta).sqrt(rod[0] ** 2 + rod[1] ** 2)
 
     def angle(self, length: Scalar) -> Scalar:
-        """Return the output angle: triangle B-P-R gives R, then triangle O-R-Q gives Q.
+        """Return the angle of the output link at a pin-to-pin length of the cylinder.
+
+        The triangle of cylinder base, rocker pivot and rod pin gives the rod pin; that of output
+        pivot, rod pin and output pin gives the output pin.
 
         Of the two solutions of each triangle, the one on the branch of the working angle is used.
 
@@ -452,7 +457,7 @@ class FourBar:
             Output angle, shape of length [rad], within pi of the working angle.
 
         Raises:
-            LoopOpen: the rocker cannot reach the length, the output arm cannot reach the rocker, or
+            LoopOpenError: the rocker cannot reach the length, the output arm cannot reach the rocker, or
                 rocker and coupler would have passed their dead point.
 
         >>> bucket = FourBar((1.8, 0.0), (1.5, 0.1), (-0.1, 0.2), 0.55, 0.48, (-0.2, 0.35))

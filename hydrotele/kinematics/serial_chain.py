@@ -107,7 +107,7 @@ class SerialChain:
 
 
 def chain_poses(chain: SerialChain, joints: np.ndarray, parameters: np.ndarray | None = None) -> ChainPoses:
-    """Compute poses of the end; accepts complex arguments for complex-step derivatives.
+    """Compute the poses of the chain's end; accepts complex arguments for complex-step derivatives.
 
     Args:
         chain: chain with k joints and p parameters.
@@ -135,7 +135,7 @@ def chain_poses(chain: SerialChain, joints: np.ndarray, parameters: np.ndarray |
 def chain_poses_and_rates(
     chain: SerialChain, joints: np.ndarray, parameters: np.ndarray | None = None
 ) -> PosesAndRates:
-    """Compute poses of the end with exact derivatives by constants and joint coordinates.
+    """Compute poses of the chain's end, and their derivatives by constants and joint coordinates.
 
     An element rotates or translates everything beyond it about or along its axis u through its
     origin o: a rotation moves the end by u x (p - o) and rotates it by u, a translation moves it
@@ -303,10 +303,10 @@ def chain_from_frames(
 
 
 def exponential(twist: np.ndarray) -> np.ndarray:
-    """Return the motion of a screw, a rotation by |w| about w with pitch and point of v.
+    """Compute the exponential of twists: the transforms of screw motions.
 
     Args:
-        twist: (..., 6) v [m] and w [rad] of the screw, real or complex.
+        twist: (..., 6) translation part v [m], then rotation vector w [rad], real or complex.
 
     Returns:
         (..., 4, 4) homogeneous transforms.
@@ -337,12 +337,12 @@ def exponential(twist: np.ndarray) -> np.ndarray:
 
 
 def product_of_exponentials(twists: np.ndarray, home: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """Return the poses exp(t1 q1) ... exp(tk qk) home, for real or complex arguments.
+    """Compute the poses exp(t1 q1) ... exp(tk qk) home of a serial robot with joint twists t1 ... tk.
 
     Args:
-        twists: (k, 6) v, w of the joints' screws in the base frame.
+        twists: (k, 6) v, w of each joint's unit twist in the base frame.
         home: (4, 4) pose at joint coordinates zero.
-        joints: (n, k) joint coordinates.
+        joints: (n, k) joint coordinates [rad] or [m], real or complex.
 
     Returns:
         (n, 4, 4) poses.
@@ -373,7 +373,7 @@ def _check_joints(chain: SerialChain, joints: np.ndarray, constants: np.ndarray)
 
 
 def _element_coordinates(chain: SerialChain, joints: np.ndarray, constants: np.ndarray):
-    """Yield every element with its coordinate, a number or (n,)."""
+    """Yield each element of a chain with its rotation angle or displacement, a number or (n,)."""
     place = 0
     for element in chain.elements:
         amount = element.value
@@ -386,7 +386,7 @@ def _element_coordinates(chain: SerialChain, joints: np.ndarray, constants: np.n
 
 
 def _apply_element(element: Element, amount, position: np.ndarray, rotation: np.ndarray):
-    """Return position (n, 3) and rotation (n, 3, 3) after an element."""
+    """Return the position (n, 3) and rotation (n, 3, 3) of frames after one more elementary transform."""
     if element.kind == "fixed":
         assert element.matrix is not None
         return position + rotation @ element.matrix[:3, 3], rotation @ element.matrix[:3, :3]
@@ -402,7 +402,7 @@ def _apply_element(element: Element, amount, position: np.ndarray, rotation: np.
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return cross products (n, 3), five times faster than `np.cross`."""
+    """Return the cross products (n, 3) of the rows of a and b; faster than `np.cross`."""
     return np.stack(
         [a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1], a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2],
          a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]], axis=1,

@@ -122,7 +122,7 @@ class JointCoupling(NamedTuple):
 
 
 def couple_joints(robot: SerialRobot) -> JointCoupling:
-    """Return the map from the independent joints of a robot to all its joints.
+    """Build the map from the independent joints of a robot to all joints, which may follow others.
 
     Raises:
         InputError: a joint follows a joint that the robot does not have, or follows itself.
@@ -171,7 +171,9 @@ def expand_joints(robot: SerialRobot, readings: np.ndarray) -> np.ndarray:
 
 
 def robot_chain(robot: SerialRobot) -> SerialChain:
-    """Build the chain of a robot with six errors in front of every joint and the ball position.
+    """Build a robot's kinematic chain for calibration.
+
+    Its parameters are six small errors in front of every joint and the ball position.
 
     Args:
         robot: robot with joints along any axes.
@@ -196,7 +198,7 @@ def robot_chain(robot: SerialRobot) -> SerialChain:
 
 
 def correct_robot(robot: SerialRobot, values: Mapping[str, float], corrections: Mapping[str, float]) -> SerialRobot:
-    """Return a robot whose origins and ball position include calibrated parameters.
+    """Return a robot whose joint origins and ball position include calibrated parameters.
 
     Args:
         robot: the robot that was calibrated.
@@ -204,7 +206,7 @@ def correct_robot(robot: SerialRobot, values: Mapping[str, float], corrections: 
         corrections: joint corrections by name.
 
     Returns:
-        The robot; its `robot_chain` gives the poses of the calibrated chain at zero errors.
+        The robot; with zero errors it has the poses of the calibrated chain.
     """
     joints = []
     for joint in robot.joints:
@@ -221,7 +223,7 @@ def correct_robot(robot: SerialRobot, values: Mapping[str, float], corrections: 
 
 
 def correction_names(robot: SerialRobot, gravity: bool, eccentricity: bool) -> tuple[str, ...]:
-    """Return the names of a robot's joint correction parameters.
+    """Return the names of a robot's joint corrections: deflection under gravity, encoder eccentricity.
 
     Args:
         robot: the robot.
@@ -260,9 +262,10 @@ def correction_names(robot: SerialRobot, gravity: bool, eccentricity: bool) -> t
 
 
 def correction_derivatives(robot: SerialRobot, joints: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """Return the deviations of joints from their encoder readings per unit of each parameter.
+    """Compute how far joints deviate from their encoder readings per unit of each joint correction.
 
-    A mass m at r rotates a joint at o with axis u by c m u . (r - o) x g.
+    Under gravity g, a mass m at r rotates a joint of compliance c at o, with axis u, by
+    c m u . (r - o) x g. An eccentric encoder errs by the sine and cosine of the reading.
 
     Args:
         robot: the robot; nominal geometry is sufficient.
@@ -300,7 +303,7 @@ def correction_derivatives(robot: SerialRobot, joints: np.ndarray, names: Sequen
 
 
 def robot_poses(robot: SerialRobot, joints: np.ndarray) -> ChainPoses:
-    """Compute poses of the ball with all corrections of a robot.
+    """Compute the poses of the ball from encoder readings, with the robot's joint corrections.
 
     Args:
         robot: nominal or calibrated robot.
@@ -313,7 +316,7 @@ def robot_poses(robot: SerialRobot, joints: np.ndarray) -> ChainPoses:
 
 
 class PositionSolution(NamedTuple):
-    """Joint coordinates for ball positions; `remaining_distance` is the remaining distance [m]."""
+    """Encoder readings (n, k) that bring the ball to n positions, and the remaining distances (n,) [m]."""
 
     joints: np.ndarray
     remaining_distance: np.ndarray
@@ -323,7 +326,7 @@ def solve_ball_positions(
     robot: SerialRobot, places: np.ndarray, start: np.ndarray, iterations: int = 50,
     idle: int | None = None,
 ) -> PositionSolution:  # fmt: skip
-    """Compute encoder readings that bring the ball to given positions, by resolved motion.
+    """Compute encoder readings that bring the ball to given positions, by damped least squares.
 
     Every step is a damped minimum-norm step with the robot's Jacobian; the damping vanishes with
     the remaining distance.
@@ -368,7 +371,7 @@ def _apply_corrections(robot: SerialRobot, joints: np.ndarray) -> np.ndarray:
 
 
 def frame_from_rpy(position: Sequence[float], rpy: Sequence[float] = (0.0, 0.0, 0.0)) -> np.ndarray:
-    """Return the transform (4, 4) of a position [m] and roll, pitch, yaw [rad].
+    """Build the transform (4, 4) with a position [m] and roll, pitch and yaw angles [rad].
 
     The rotation is Rz(yaw) Ry(pitch) Rx(roll).
     """
@@ -379,7 +382,7 @@ def frame_from_rpy(position: Sequence[float], rpy: Sequence[float] = (0.0, 0.0, 
 
 
 def rotation_to_rpy(rotation: np.ndarray) -> np.ndarray:
-    """Return roll, pitch, yaw [rad] of a rotation (3, 3); yaw is 0 if the pitch is +-pi/2."""
+    """Convert a rotation (3, 3) to roll, pitch and yaw angles [rad]; yaw is 0 if the pitch is +-pi/2."""
     sine = -rotation[2, 0]
     cosine = math.hypot(rotation[2, 1], rotation[2, 2])
     pitch = math.atan2(sine, cosine)
@@ -400,7 +403,7 @@ def _axis_rotation(axis: str, angle: float) -> np.ndarray:
 
 
 def _rotation_from_z(axis: np.ndarray) -> np.ndarray:
-    """Return the smallest rotation from z to an axis; half a turn about x for -z."""
+    """Return the smallest rotation (3, 3) that takes z to a unit vector `axis`; half a turn about x for -z."""
     x, y, z = axis
     if z < -1.0 + _AXIS_TOLERANCE:
         return np.diag([1.0, -1.0, -1.0])
@@ -431,7 +434,7 @@ def shipped_robots() -> list[str]:
 
 
 def load_robot(name_or_path: str | Path, joints: int | None = None) -> SerialRobot:
-    """Read a robot.
+    """Read a serial robot: a shipped one by name, or from a YAML, URDF or MJCF file.
 
     Args:
         name_or_path: a shipped robot, or a file: YAML, URDF or MJCF (.yaml, .urdf, .xml).
@@ -439,9 +442,9 @@ def load_robot(name_or_path: str | Path, joints: int | None = None) -> SerialRob
             for any number.
 
     Returns:
-        The robot. The chain of a URDF or MJCF ends at the link, body or site that `_BALL_NAMES`
-        name, whatever `joints` is. If there is no such name, it ends at the last link of the
-        branch with this number of joints, or of the longest branch.
+        The robot. The chain of a URDF or MJCF ends at the link, body or site with a usual name of
+        a tool, such as `ball`, `tcp` or `flange`, whatever `joints` is. If there is no such name, it
+        ends at the last link of the branch with this number of joints, or of the longest branch.
 
     Raises:
         InputError: there is no such robot, its file is invalid, or its number of joints differs.
@@ -559,7 +562,7 @@ def robot_to_yaml(robot: SerialRobot, source: str) -> str:
 
 
 def correct_urdf(robot: SerialRobot, text: str) -> str:
-    """Return a URDF with the origins of a calibrated robot.
+    """Return the text of a URDF in which joint origins and ball are those of a calibrated robot.
 
     Fixed joints keep their origins; the errors in front of a moving joint are added to its origin.
     The ball is the child `calibrated_ball` of the last moving link.
@@ -632,7 +635,10 @@ def _choose_end(path: Path, ends: Sequence[_End], columns: int | None) -> _End:
 
 
 def _rank_ball_name(name: str) -> int:
-    """Return the place in `_BALL_NAMES` of the first of its words in a name, else the number of words."""
+    """Return how well a name denotes the tool end: index of the first word of `_BALL_NAMES` that it contains.
+
+    A smaller rank is better; the number of words is returned if it contains none.
+    """
     words = (rf"(?<![a-z]){word}(?![a-z])" for word in _BALL_NAMES)
     return next((k for k, word in enumerate(words) if re.search(word, name.lower())), len(_BALL_NAMES))
 
@@ -677,7 +683,7 @@ def _read_urdf(path: Path, root: ElementTree.Element, columns: int | None) -> Se
 
 
 def _read_mimic(path: Path, joint: ElementTree.Element) -> Mimic | None:
-    """Read the `mimic` element of a URDF joint."""
+    """Read the `mimic` element of a URDF joint: the joint that it follows; None without the element."""
     element = joint.find("mimic")
     if element is None:
         return None
@@ -801,7 +807,7 @@ def _read_joint_equalities(path: Path, model: Any, chain: Sequence[int]) -> dict
 
 
 def _is_ancestor(model: Any, ancestor: int, body: int) -> bool:
-    """Return whether a body is another body or between it and the world."""
+    """Return whether body `ancestor` is `body` itself or one of its parents up to the world."""
     while body and body != ancestor:
         body = int(model.body_parentid[body])
     return body == ancestor

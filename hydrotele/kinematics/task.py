@@ -30,14 +30,14 @@ _MIN_ELBOW_SINE = 1e-3  # sine of the elbow, or radius [m], below which rates ar
 
 
 def arm_parameters(geometry: ArmGeometry | FellerGeometry) -> np.ndarray:
-    """Return the parameters (9,) of an arm for the functions of this module [m], [rad].
+    """Pack the dimensions of an arm into the array (9,) that the compiled functions need [m], [rad].
 
     Args:
         geometry: an excavator's arm, with or without a tool joint, or a feller-buncher's arm.
 
     Returns:
-        BASE_RADIUS, BASE_HEIGHT, SIDE, BOOM, STICK, BEND (angle from the stick to the outer bar),
-        ALONG, UP, HEAD (radius).
+        Elements BASE_RADIUS, BASE_HEIGHT, LATERAL_OFFSET, BOOM_LENGTH, STICK_LENGTH, BEND_ANGLE (from
+        the stick to the bar from stick pin to tip), TOOL_ALONG, TOOL_UP, HEAD_RADIUS.
     """
     g = geometry
     if isinstance(g, FellerGeometry):
@@ -58,7 +58,7 @@ def arm_parameters(geometry: ArmGeometry | FellerGeometry) -> np.ndarray:
 
 @compiled
 def task_forward(g, q, pose):
-    """Compute the pose of the tip.
+    """Compute the pose of an arm's tip from its joint angles (forward kinematics).
 
     Args:
         g: (9,) output of `arm_parameters`.
@@ -89,7 +89,7 @@ def task_forward(g, q, pose):
 
 @compiled
 def task_inverse(g, pose, present_swing, q):
-    """Compute the joint angles for a pose, with the elbow above and the tip ahead.
+    """Compute the joint angles for a pose of the tip, with the elbow above and the tip ahead.
 
     Args:
         g: (9,) output of `arm_parameters`.
@@ -98,7 +98,7 @@ def task_inverse(g, pose, present_swing, q):
         q: (k,) joint angles [rad], written unless the pose is out of reach.
 
     Returns:
-        REACHED or BEYOND (the workspace).
+        REACHED (0), or OUT_OF_REACH (1).
 
     Source: Zhu 1994, 2.3-2.6 and 2.17-2.25.
     """
@@ -131,7 +131,7 @@ def task_inverse(g, pose, present_swing, q):
 
 @compiled
 def task_rates(g, q, pose, rate, out):
-    """Compute the joint rates for a rate of the pose.
+    """Compute the joint rates that give a rate of the tip's pose.
 
     Args:
         g: (9,) output of `arm_parameters`.
@@ -141,7 +141,7 @@ def task_rates(g, q, pose, rate, out):
         out: (k,) joint rates [rad/s], written unless the status is SINGULAR.
 
     Returns:
-        REACHED or SINGULAR (a straight elbow, or a tip on the swing axis).
+        REACHED (0), or SINGULAR (2): a straight elbow, or a tip on the swing axis.
 
     Source: closed-form solution of the derivative of `task_forward`.
     """
@@ -174,7 +174,7 @@ def task_rates(g, q, pose, rate, out):
 
 @compiled
 def task_jacobian(g, q, out):
-    """Compute the Jacobian of `task_forward`.
+    """Compute the derivatives of the tip's pose by the joint angles.
 
     Args:
         g: (9,) output of `arm_parameters`.

@@ -39,7 +39,7 @@ class NoIntersectionError(ValueError):
 
 
 def wire_lengths(wires: WireGeometry, pose: PlatformPose) -> np.ndarray:
-    """Compute the lengths of the six wires at poses.
+    """Compute the lengths of the six measuring wires at poses of the platform.
 
     Args:
         wires: geometry of the wires.
@@ -53,7 +53,7 @@ def wire_lengths(wires: WireGeometry, pose: PlatformPose) -> np.ndarray:
 
 
 def trilaterate(centres: np.ndarray, radii: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Compute the intersection of three spheres.
+    """Compute the point at given distances from three centres (intersection of three spheres).
 
     In the frame with x from centre 1 to 2 and y in the centres' plane, with d = |c2 - c1| and
     centre 3 at (i, j): x = (r1^2 - r2^2 + d^2) / 2d, y = (r1^2 - r3^2 + i^2 + j^2) / 2j - i x / j,
@@ -68,7 +68,7 @@ def trilaterate(centres: np.ndarray, radii: np.ndarray, near: np.ndarray) -> np.
         (..., 3) intersections [m].
 
     Raises:
-        NoIntersection: the spheres do not meet.
+        NoIntersectionError: the spheres do not meet.
 
     >>> c = np.eye(3) * 2.0
     >>> trilaterate(c, np.linalg.norm(c - 1.0, axis=-1), np.array([0.9, 1.0, 1.0])).round(12)
@@ -107,7 +107,7 @@ def pose_from_wires(wires: WireGeometry, lengths: np.ndarray, near: PlatformPose
         The poses.
 
     Raises:
-        NoIntersection: the lengths are inconsistent.
+        NoIntersectionError: the lengths are inconsistent.
     """
     lengths = np.asarray(lengths, float)
     anchors, points = np.array(wires.anchors), np.array(wires.points)
@@ -129,7 +129,7 @@ def pose_from_wires(wires: WireGeometry, lengths: np.ndarray, near: PlatformPose
 
 
 def _triad(first, second, third) -> np.ndarray:
-    """Return axes (..., 3, 3) of three points: x from first to second, z normal to their plane."""
+    """Build the axes (..., 3, 3) of a frame from three points: x from first to second, z normal to the plane."""
     x = second - first
     x = x / np.linalg.norm(x, axis=-1, keepdims=True)
     z = np.cross(x, third - first)
@@ -138,14 +138,15 @@ def _triad(first, second, third) -> np.ndarray:
 
 
 def wire_jacobian(wires: WireGeometry, pose: PlatformPose) -> np.ndarray:
-    """Compute the derivatives of the wire lengths by position [m] and rotation vector [rad].
+    """Compute the derivatives of wire lengths by the platform's position [m] and rotation vector [rad].
 
     Args:
         wires: geometry of the wires.
         pose: (...) poses of the moving platform.
 
     Returns:
-        (..., 6, 6): row k is (u_k, (R p_k) x u_k), u_k the direction of wire k.
+        (..., 6, 6): row k is (u_k, (R p_k) x u_k), with the direction u_k of wire k from its anchor to
+        the platform point p_k and the platform's rotation R.
     """
     arms = np.einsum("...ij,kj->...ki", pose.rotation, np.array(wires.points)[list(_POINT_OF_WIRE)])
     away = arms + pose.position[..., None, :] - np.array(wires.anchors)
@@ -154,9 +155,9 @@ def wire_jacobian(wires: WireGeometry, pose: PlatformPose) -> np.ndarray:
 
 
 def pose_covariance(wires: WireGeometry, pose: PlatformPose, sigma: float) -> np.ndarray:
-    """Compute the covariance of poses from wires whose lengths have independent errors.
+    """Compute the covariance of platform poses due to independent errors of the wire lengths.
 
-    The covariance is J^-1 sigma^2 J^-T with J of `wire_jacobian`, because the pose reproduces all
+    It is J^-1 sigma^2 J^-T with the derivatives J of the wire lengths by the pose, because the pose reproduces all
     six lengths.
 
     Args:

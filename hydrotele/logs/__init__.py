@@ -1,1 +1,1 @@
-"""Machine logs: channels, files, cleaning, and data sets for identification."""
+"""Logs of machines: reading and writing files, cleaning, and data sets for identification."""

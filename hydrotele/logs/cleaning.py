@@ -5,10 +5,10 @@ a slow channel repeats between two updates. For example, a 1 kHz logger writes a
 arrives every 20 ms 20 times. If all were used, one error would count 20 times, and the age of the
 value would appear as a delay between 0 and 20 ms.
 
-A noisy sensor rarely gives the same value twice in a row. With a uniform error of +-a and a
-converter step q, the probability is at most q / 2a. With a normal error the density is at most
-1 / (sigma sqrt(2 pi)), and the bound follows in the same way. A long repetition is then not random.
-This applies only to a sensor with its stated noise. Otherwise repetitions at rest are normal, and
+A noisy sensor rarely gives the same value twice in a row. If its error is uniform in +-a and the
+converter rounds to steps of q, the probability is at most q / 2a. If its error is normal with standard
+deviation sigma, it is at most q / (sigma sqrt(2 pi)). A long repetition is then not random. This applies
+only if the sensor is as noisy as its data sheet states. Otherwise repetitions at rest are normal, and
 only the motion of other channels can prove that a sensor is frozen.
 """
 
@@ -34,7 +34,9 @@ _SATURATION_MARGIN_STDS = 3.46  # standard deviations from the limit within whic
 
 
 def plausible_range(machine: Machine, channel: str) -> tuple[float, float]:
-    """Return the plausible range of readings of a channel, with a tolerance.
+    """Return the range in which readings of a channel are plausible for a machine.
+
+    It follows from joint ranges, strokes and relief pressures, each with a tolerance.
 
     Args:
         machine: the machine.
@@ -89,11 +91,11 @@ def check_range(machine: Machine, channel: str, reading: np.ndarray, where: str)
 
 
 def find_saturated(sensor: Sensor, channel: str, reading: np.ndarray, period: float) -> np.ndarray:
-    """Find saturated readings and readings close to the limit near a saturated one.
+    """Find readings at the limit of the sensor's span, and those close to it in time and value.
 
-    Saturation cuts off half of the noise. Removing only the saturated readings would keep those
-    that the noise moved inwards and bias the channel. Therefore all readings within the noise of
-    the limit are removed near a saturated reading.
+    While a sensor is saturated, noise moves some readings inwards. Keeping these would bias the
+    channel. Therefore readings within 0.1 s of a saturated one are also found, if they are closer to the
+    limit than the noise of the sensor.
 
     Args:
         sensor: sensor of the channel, with its span.
@@ -102,7 +104,7 @@ def find_saturated(sensor: Sensor, channel: str, reading: np.ndarray, period: fl
         period: time between rows [s].
 
     Returns:
-        (n,) bool.
+        (n,) whether a reading is saturated or close to it.
     """
     step, low, high = channel_converter(sensor, channel)
     at_end = np.zeros(len(reading), dtype=bool)
@@ -134,7 +136,7 @@ def find_spikes(machine: Machine, channel: str, reading: np.ndarray, period: flo
         noise: noise standard deviation [channel's unit]; NaN: estimated from the readings.
 
     Returns:
-        (n,) bool.
+        (n,) whether a reading is impossible.
     """
     low, high = plausible_range(machine, channel)
     with np.errstate(invalid="ignore"):
@@ -193,16 +195,16 @@ def readings_per_update(reading: np.ndarray) -> float:
 
 
 def find_repeated(reading: np.ndarray, per_update: float) -> np.ndarray:
-    """Find readings that repeat the previous one because the channel was not updated.
+    """Find readings that repeat the previous one only because the channel was not updated.
 
-    A value that lasts longer than one update period was updated with the same value.
+    If a value lasts longer than one update period, the readings at which an update is due count as new.
 
     Args:
         reading: (n,) readings, NaN where missing.
-        per_update: number of readings per update.
+        per_update: number of readings per update, the result of `readings_per_update`.
 
     Returns:
-        (n,) bool.
+        (n,) whether a reading is such a repetition.
 
     >>> find_repeated(np.array([1.0, 1.0, 2.0, 2.0, 2.0, 2.0]), 2.0).tolist()
     [False, True, False, True, False, True]
@@ -238,9 +240,10 @@ class Interval(NamedTuple):
 
 
 def repeat_probability(sensor: Sensor, channel: str) -> float | None:
-    """Return the largest probability that two noisy readings of one value are equal [1].
+    """Return the largest probability that a noisy sensor gives the same reading twice [1].
 
-    The result is None if the noise is unknown or too small to exclude repetitions.
+    The result is None if the noise is unknown or less than the converter step, so that equal readings
+    of a constant value are normal.
 
     >>> repeat_probability(Sensor(accuracy=0.002, bits=12, span=1.024), "length.boom")
     0.0625
@@ -253,7 +256,12 @@ def repeat_probability(sensor: Sensor, channel: str) -> float | None:
 
 
 def min_suspicious_repeat(probability: float, count: int) -> int:
-    """Return the number of consecutive equal readings that is not random in `count` readings.
+    """Return how many consecutive equal readings are too improbable to be random.
+
+    Args:
+        probability: probability that two consecutive readings are equal [1].
+        count: number of readings in the data set, in which such a repetition may occur by chance with a
+            probability of 1e-6.
 
     >>> min_suspicious_repeat(0.1, 90_000)
     12
@@ -278,7 +286,10 @@ def find_repeats(reading: np.ndarray, min_length: int) -> list[Interval]:
 
 
 def is_saturated(reading: np.ndarray, intervals: Sequence[Interval]) -> bool:
-    """Return whether all repetitions of a channel are at one value, its minimum or maximum.
+    """Return whether a channel is saturated rather than frozen.
+
+    It is if it repeats readings in several intervals, all at the same value, and this value is the
+    minimum or maximum of the run.
 
     >>> reading = np.array([1.0, 2.0, 2.0, 1.5, 2.0, 2.0, 1.0])
     >>> is_saturated(reading, find_repeats(reading, 2))
@@ -294,10 +305,11 @@ def is_saturated(reading: np.ndarray, intervals: Sequence[Interval]) -> bool:
 
 
 def estimate_noise(reading: np.ndarray) -> float:
-    """Estimate the noise standard deviation of a channel at rest [channel's unit].
+    """Estimate the standard deviation of the noise of a channel [channel's unit].
 
-    The estimate is the 10th percentile of the standard deviations from second differences, over
-    windows of 20 rows. Windows of constant readings are excluded; NaN if none remain.
+    Second differences of the readings remove slow motion. Their standard deviation is computed in windows
+    of 20 rows; the 10th percentile of all windows excludes those with fast motion. Windows of constant
+    readings are excluded; the result is NaN if none remain.
     """
     values = reading[np.isfinite(reading)]
     bend = np.diff(values, 2)
@@ -308,13 +320,13 @@ def estimate_noise(reading: np.ndarray) -> float:
 
 
 def has_stated_noise(sensor: Sensor, channel: str, floors: Sequence[float]) -> bool:
-    """Return whether the measured noise of a sensor is close to its stated noise.
+    """Return whether the measured noise of a sensor is at least half of the stated noise.
 
     Args:
-        sensor: the sensor.
+        sensor: the sensor, with its stated noise.
         channel: channel name.
-        floors: `estimate_noise` of this channel and others with an equal sensor, in order of
-            preference; the first finite one is used.
+        floors: noise estimates of this channel and of others with an equal sensor, in order of
+            preference; the first finite one is used [channel's unit].
     """
     stated = math.hypot(sensor.error_rms, channel_converter(sensor, channel).step / 12**0.5)
     known = [floor for floor in floors if math.isfinite(floor)]
@@ -322,11 +334,11 @@ def has_stated_noise(sensor: Sensor, channel: str, floors: Sequence[float]) -> b
 
 
 def find_frozen_by_noise(reading: np.ndarray, probability: float, count: int, period: float) -> list[Interval]:
-    """Find intervals of equal readings that are longer than noise allows.
+    """Find intervals of equal readings that are longer than the noise of the sensor allows.
 
     Args:
         reading: (n,) readings of one run, NaN where missing.
-        probability: result of `repeat_probability`.
+        probability: probability that two consecutive readings are equal [1].
         count: number of readings in the whole data set.
         period: time between rows [s].
     """
@@ -338,10 +350,11 @@ def find_frozen_position(
     reading: np.ndarray, partner: np.ndarray | None, command: np.ndarray, others: np.ndarray,
     step: float, ranges: tuple[float, float], period: float,
 ) -> list[Interval]:  # fmt: skip
-    """Find intervals in which a position is constant although the axis must have moved.
+    """Find intervals of at least 1 s in which a position is constant although the axis must have moved.
 
-    Either the second position sensor of the axis (length or angle) changed; or the axis had large
-    commands in both directions, other axes moved, and the value is not an end of the range.
+    There are two proofs of motion. The second position sensor of the axis (length or angle) changed. Or
+    the axis had large commands in both directions, other axes moved, and the value is not at an end
+    of its range.
 
     Args:
         reading: (n,) positions, NaN where missing [channel's unit].
@@ -381,7 +394,8 @@ def find_frozen_pressure(reading: np.ndarray, partner: np.ndarray, lowest: float
     Args:
         reading: (n,) pressures, NaN where missing [Pa].
         partner: (n,) pressures of the other chamber [Pa].
-        lowest: pressure below which the make-up valve may keep a pressure constant [Pa].
+        lowest: pressure below which a make-up valve, which refills the chamber, may keep the pressure
+            constant [Pa].
         period: time between rows [s].
     """
     return [
@@ -403,11 +417,12 @@ def find_duplicated_rows(reading: np.ndarray, probability: Sequence[float | None
 
     Args:
         reading: (n, c) readings, NaN where missing.
-        probability: result of `repeat_probability` per channel; None to ignore a channel.
+        probability: per channel the probability that two consecutive readings are equal [1]; None to
+            ignore a channel.
         count: number of readings in the whole data set.
 
     Returns:
-        (n,) bool.
+        (n,) whether a row is such a duplicate.
     """
     noisy = [c for c, p in enumerate(probability) if p is not None]
     if not noisy:
@@ -431,7 +446,17 @@ _STARVED_PRESSURE = 0.5e6  # [Pa] above tank pressure, range in which a make-up 
 
 
 class _CleaningData(NamedTuple):
-    """All runs of one machine, with its sensors and noise, and the number of removed readings by reason."""
+    """All runs of one machine, with its sensors and noise, and the number of removed readings by reason.
+
+    Attributes:
+        machine: the machine.
+        sensors: sensors of the machine, None if unknown.
+        axes: the nu axes, in the order of the commands.
+        channels: the c channels, in the order of the readings.
+        noise: (c,) noise standard deviation of one reading, NaN if unknown.
+        runs: run -> rows; the readings are changed in place.
+        removed: (channel, run) -> reason -> number of removed readings.
+    """
 
     machine: Machine
     sensors: SensorSet | None
@@ -442,24 +467,24 @@ class _CleaningData(NamedTuple):
     removed: dict[tuple[str, str], dict[str, int]]
 
     def count_removed(self, channel: str, run: str, reason: str, count: int) -> None:
-        """Count removed readings of a channel in a run by reason."""
+        """Add to the number of readings of a channel that were removed from a run for a reason."""
         counts = self.removed.setdefault((channel, run), {})
         counts[reason] = counts.get(reason, 0) + count
 
     def column(self, channel: str, run: str) -> np.ndarray | None:
-        """Return the readings (n,) of a channel in a run; None if the channel is unknown."""
+        """Return the readings (n,) of a channel in a run; None if the data have no such channel."""
         if channel not in self.channels:
             return None
         return self.runs[run].reading[:, list(self.channels).index(channel)]
 
     def span(self, channel: str) -> float:
-        """Return the range of a channel over all runs [channel's unit], 0 without readings."""
+        """Return maximum minus minimum of a channel over all runs [channel's unit]; 0 without readings."""
         every = [self.column(channel, run) for run in self.runs]
         values = np.concatenate([v[np.isfinite(v)] for v in every if v is not None] or [[]])
         return float(np.ptp(values)) if len(values) else 0.0
 
     def sensor(self, channel: str) -> Sensor:
-        """Return the sensor of a channel, with its span."""
+        """Return the properties of a channel's sensor: noise, resolution and span."""
         return channel_sensor(self.machine, self.sensors, channel)
 
 
@@ -512,7 +537,12 @@ def remove_faults(
 
 
 def _list_unused_channels(data: _CleaningData, before: Mapping[str, RunRows]) -> tuple[str, ...]:
-    """Return one sentence per channel and reason for which a run has no usable reading of it."""
+    """Return one sentence per channel of which runs have no usable reading, with the reasons.
+
+    Args:
+        data: the cleaned runs.
+        before: the same runs before cleaning.
+    """
     reasons: dict[tuple[str, str], list[str]] = {}
     for column, channel in enumerate(data.channels):
         for run, rows in data.runs.items():
@@ -554,7 +584,7 @@ def _remove_impossible_readings(data: _CleaningData, run: str, channel: str, noi
 
 
 def _remove_repeated_readings(data: _CleaningData, run: str, channel: str) -> list[str]:
-    """Remove readings that repeat the last value of a channel with a slower update rate."""
+    """Replace readings by NaN that only repeat the last update of a slow channel; return a note."""
     reading, period = data.column(channel, run), data.runs[run].period
     assert reading is not None
     every = readings_per_update(reading)
@@ -574,7 +604,10 @@ def _count_readings(data: _CleaningData) -> int:
 
 
 def _find_frozen_intervals(data: _CleaningData, run: str, channel: str) -> list[Interval]:
-    """Find the intervals in which a channel is frozen, with the strictest applicable test."""
+    """Find the intervals in which a channel is frozen.
+
+    If its noise is known, long repetitions are a proof. Otherwise another sensor must show motion.
+    """
     reading, sensor, period = data.column(channel, run), data.sensor(channel), data.runs[run].period
     assert reading is not None
     probability = repeat_probability(sensor, channel)
@@ -614,7 +647,10 @@ def _find_frozen_positions(data: _CleaningData, run: str, channel: str, axis: st
 
 
 def _noise_estimates(data: _CleaningData, run: str, channel: str) -> list[float]:
-    """Return the first finite noise floor: this run, other runs, channels with an equal sensor."""
+    """Return a list of one noise estimate of a channel, NaN if there is none.
+
+    The first finite estimate is taken: of this run, of other runs, of channels with an equal sensor.
+    """
     sensor, witnesses = data.sensor(channel), [(channel, run)]
     witnesses += [(channel, other) for other in data.runs if other != run]
     kind = channel.partition("_")[0].partition(".")[0]

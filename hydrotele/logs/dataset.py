@@ -48,7 +48,10 @@ _NAMES_WITHOUT_ACCURACY = (
 
 
 def predicted_channels(machine: Machine) -> tuple[str, ...]:
-    """Return all channels that the model predicts, in the order of a dataset."""
+    """Return the names of all channels that the model of a machine predicts, in the order of a dataset.
+
+    They are the positions of the axes, cylinder lengths, chamber pressures and the supply pressure.
+    """
     order = actuator_order(machine)
     valves = [name for name in order if machine.axes[name].is_hydraulic]
     return (
@@ -61,7 +64,7 @@ def predicted_channels(machine: Machine) -> tuple[str, ...]:
 
 
 def common_channels(files: Sequence[RunFiles], machine: Machine) -> tuple[str, ...]:
-    """Return the predicted channels that at least one run contains.
+    """Return the channels that the model of a machine predicts and at least one run contains.
 
     Raises:
         InputError: there is no such channel; the message lists the predicted channels.
@@ -80,12 +83,16 @@ def common_channels(files: Sequence[RunFiles], machine: Machine) -> tuple[str, .
 def determine_sensors(
     files: Sequence[RunFiles], machine: Machine, name: str | None
 ) -> tuple[SensorSet | None, list[str]]:
-    """Return the sensors of the logs (None if their noise is unknown), and notes.
+    """Return the set of sensors with which logs were recorded, and notes.
 
     Args:
         files: the runs.
-        machine: the machine.
-        name: name of the sensor set, or None to use that of the metadata.
+        machine: the machine, which defines one or several sets of sensors.
+        name: name of the set; None to use the one that the metadata of the logs name, or else the
+            first one of the machine.
+
+    Returns:
+        (sensors, None if their noise is unknown; notes).
 
     Raises:
         InputError: the machine has no such sensors, or the logs have different ones.
@@ -121,7 +128,7 @@ def channel_noise(machine: Machine, sensors: SensorSet | None, channel: str) -> 
 
 
 def note_unknown_columns(files: Sequence[RunFiles], machine: Machine) -> list[str]:
-    """Return notes on channels that the machine does not have."""
+    """Return a note for each logged channel that the machine does not have, with similar names."""
     valid = (*predicted_channels(machine), *(f"command.{axis}" for axis in machine.axes))
     kinds = {name.partition(".")[0] for name in valid} | {"angle", "position"}
     notes = []
@@ -133,7 +140,7 @@ def note_unknown_columns(files: Sequence[RunFiles], machine: Machine) -> list[st
 
 
 def note_empty_columns(files: Sequence[RunFiles], channels: Sequence[str]) -> list[str]:
-    """Return notes on channels whose columns have no reading."""
+    """Return a note for each channel whose column has no reading in some runs."""
     notes = []
     for channel in channels:
         empty = [r.name for r in files for log in r.logs if channel in log and np.isnan(log[channel]).all()]
@@ -143,7 +150,7 @@ def note_empty_columns(files: Sequence[RunFiles], channels: Sequence[str]) -> li
 
 
 def note_averaged_commands(files: Sequence[RunFiles]) -> list[str]:
-    """Return a note on runs whose commands are means."""
+    """Return a note on runs whose logged commands are means over a row instead of held values."""
     averaged = [r.name for r in files if r.logs[0].metadata.get("command", "held") != "held"]
     if not averaged:
         return []
@@ -152,7 +159,7 @@ def note_averaged_commands(files: Sequence[RunFiles]) -> list[str]:
 
 
 def note_runs_without_motion(runs: Mapping[str, RunRows], channels: Sequence[str], noise: np.ndarray) -> list[str]:
-    """Return notes on runs in which no position changes."""
+    """Return a note for each run in which no position changes by more than ten noise deviations."""
     notes = []
     places = [c for c, name in enumerate(channels) if not name.startswith("pressure")]
     for name, rows in runs.items():
@@ -165,7 +172,7 @@ def note_runs_without_motion(runs: Mapping[str, RunRows], channels: Sequence[str
 
 
 def note_unmeasured_axes(machine: Machine, axes: Sequence[str], channels: Sequence[str]) -> list[str]:
-    """Return notes on axes without a position sensor."""
+    """Return a note for each axis of which neither position nor cylinder length is measured."""
     return [
         f"neither {machine.position_kind(axis)} nor length of {axis} is measured; parameters that"
         " affect only its position are not identifiable."
@@ -200,7 +207,7 @@ class RunPart(NamedTuple):
 
 
 class Split(NamedTuple):
-    """Runs to fit and the held-out run."""
+    """Runs whose parameters are fitted, and the run that is held out for validation."""
 
     fit: tuple[RunPart, ...]
     heldout: RunPart
@@ -273,7 +280,10 @@ def split_runs(
 
 
 def _last_piece(runs: Mapping[str, RunRows]) -> str:
-    """Return the last piece of medium length of a run (fractions `_HELD_OUT_FRACTIONS`), or the last piece."""
+    """Return the name of the piece of a run to hold out for validation.
+
+    It is the last piece with 15 to 60 % of the total duration; without one, the last piece.
+    """
     total = sum(map(run_duration, runs.values()))
     low, high = _HELD_OUT_FRACTIONS
     fair = [name for name, rows in runs.items() if low * total <= run_duration(rows) <= high * total]
@@ -301,10 +311,11 @@ def _split_in_time(name: str, rows: RunRows) -> Split:
 
 
 def _fit_rows(rows: RunRows) -> int:
-    """Return how many rows of a single run to fit: three quarters, or less if the rest is idle.
+    """Return the number of first rows of a single run to fit; the others are held out.
 
-    A machine at rest cannot validate a model. If too few command changes are in the last quarter,
-    the held-out part contains a quarter of the command changes, and at most half of the run.
+    They are three quarters of the rows. A machine at rest cannot validate a model: if less than 10 % of
+    the command changes are in the last quarter, the held-out part begins earlier. It then contains a
+    quarter of the command changes, but at most half of the run.
     """
     n = len(rows.command)
     passed = np.cumsum(np.abs(np.diff(rows.command, axis=0, prepend=rows.command[:1])).sum(axis=1))
@@ -333,6 +344,8 @@ def make_piece_log(
     as_logged: bool = True,
 ) -> Log:  # fmt: skip
     """Return the log of a run or of a piece of it.
+
+    The rows of several files are on a common clock; see `merge_runs`.
 
     Args:
         logs: the log files of the run.
@@ -422,7 +435,7 @@ class RunData:
     readings_per_mean: np.ndarray | None = None
 
     def select_rows(self, first: int, last: int) -> "RunData":
-        """Return the rows first .. last - 1; the log remains that of the whole run."""
+        """Return a copy of the run with the rows first .. last - 1; its log remains that of the whole run."""
         rows = slice(first, last)
         return replace(
             self, start=self.start + first * self.period, command=self.command[rows],
@@ -473,7 +486,7 @@ def load_dataset(
     force: bool = False,
     mask: str | Path | None = None,
 ) -> Dataset:
-    """Read logs and prepare them for identification; the notes list removed and repaired data.
+    """Read logs and prepare them for identification; the notes list all removed and repaired data.
 
     The noise is that of the sensors of the machine. A sensor without a stated accuracy has noise
     NaN, even if its converter step is known, because the noise may be larger than the step.
@@ -512,12 +525,12 @@ def make_dataset(
     Args:
         files: the runs, sorted by name.
         machine: the model.
-        sensors: see `load_dataset`.
-        heldout: see `load_dataset`.
-        masks: masked intervals.
+        sensors: name of the sensors of the machine; None for those that the metadata name.
+        heldout: name of the run for validation; None to choose one (`split_runs`).
+        masks: time intervals whose readings are not used.
 
     Raises:
-        InputError: see `load_dataset`.
+        InputError: the logs do not fit the machine, or the runs are too short.
     """
     files = [remove_truth(run) for run in files]
     for run in files:
@@ -582,10 +595,15 @@ class MergedRuns(NamedTuple):
 
 
 def merge_runs(files: Sequence[RunFiles], machine: Machine, masks: Sequence[MaskedInterval] = ()) -> MergedRuns:
-    """Put runs on uniform clocks and check them against a machine.
+    """Resample runs to uniform clocks and check that their channels and values fit a machine.
 
-    This is the rule by which all commands accept or refuse logs of a machine. Some need more: a command of
-    every axis, or a minimum duration.
+    All commands of the program accept or refuse logs by this function. Some require more: a command
+    of every axis, or a minimum duration.
+
+    Args:
+        files: the runs.
+        machine: the machine.
+        masks: time intervals whose readings are not used.
 
     Raises:
         InputError: no channel is of the machine, the time stamps follow no clock, too many rows are
@@ -613,10 +631,10 @@ def merge_runs(files: Sequence[RunFiles], machine: Machine, masks: Sequence[Mask
 
 
 def merge_runs_without_machine(path: Path) -> tuple[tuple[Log, ...], tuple[str, ...]]:
-    """Read the logs of a path and put each on a clock, if no machine is known.
+    """Read the logs of a path and check that each fits a uniform clock, without a machine model.
 
     Returns:
-        (logs, notes on repairs).
+        (logs as read, notes on repairs of the reader and of the clocks).
 
     Raises:
         InputError: a log is invalid, or its time stamps follow no clock.
@@ -632,7 +650,11 @@ def merge_runs_without_machine(path: Path) -> tuple[tuple[Log, ...], tuple[str, 
 
 
 def _remove_short_runs(merged: MergedRuns) -> tuple[dict[str, RunRows], list[str]]:
-    """Return the runs that are long enough to identify parameters, and notes on the others."""
+    """Return the runs and pieces that are long enough to identify parameters, and notes on the others.
+
+    Raises:
+        InputError: an undivided run is too short, or no run is long enough.
+    """
     runs, notes = {}, []
     whole = [name for name, run in merged.origin.items() if name == run]
     for name, rows in merged.pieces.items():
@@ -657,10 +679,10 @@ MAX_FIT_SECONDS = 150.0  # s, maximum total duration of the fit runs: about four
 
 
 def select_exciting_segments(data: Dataset, max_seconds: float = MAX_FIT_SECONDS) -> Dataset:
-    """Limit the total duration of the fit runs to their most exciting segments.
+    """Shorten the fit runs to the segments with the largest command changes.
 
-    Each run is cut by the same factor to the segment with the largest command changes, and a note
-    states the segment. The held-out run is not changed.
+    Every run is shortened by the same factor, so that their total duration is at most the maximum. A
+    note states each segment. The held-out run is not changed.
 
     Args:
         data: the dataset.
@@ -683,10 +705,10 @@ def select_exciting_segments(data: Dataset, max_seconds: float = MAX_FIT_SECONDS
 
 
 def downsample(data: Dataset) -> Dataset:
-    """Downsample a dataset to a rate that resolves its valves; each row is a mean of several.
+    """Reduce the sample rate of all runs of a dataset by averaging rows.
 
-    Higher rates add little information, because effects of mass, friction and leakage on the
-    readings are slower than the valves.
+    The rate is six times the bandwidth of the fastest valve, at least 100 Hz. Higher rates add little
+    information, because mass, friction and leakage act more slowly than the valves.
     """
     bandwidths = [a.valve.bandwidth / (2.0 * np.pi) for a in data.machine.axes.values() if a.valve]
     rate = max(_MIN_RATE, _ROWS_PER_CYCLE * max(bandwidths, default=0.0))
@@ -709,7 +731,11 @@ def downsample(data: Dataset) -> Dataset:
 
 
 def find_exciting_segment(run: RunData, rows: int) -> slice:
-    """Return the segment of `rows` rows with the largest command changes, or the whole run."""
+    """Return the `rows` consecutive rows of a run with the largest command changes, as a slice.
+
+    The changes of each command are divided by its standard deviation in the run. A shorter run is
+    returned as a whole.
+    """
     if rows >= len(run.command):
         return slice(0, len(run.command))
     spread = np.std(run.command, axis=0)

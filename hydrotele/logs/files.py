@@ -73,7 +73,11 @@ def read_runs(
 
 
 def align_origins(logs: Sequence[Log]) -> tuple[Log, ...]:
-    """Return logs whose times have the same origin, if all or none of them have stamps of calendar time."""
+    """Return the logs of one run with times counted from the same instant.
+
+    Times of a log are counted from its `origin`, if its stamps are calendar time. If some logs of the run
+    have calendar time and others have not, all are returned unchanged.
+    """
     origins = [log.origin for log in logs]
     first = min(origins, key=abs)
     if len(set(origins)) == 1 or first == 0.0:
@@ -82,7 +86,10 @@ def align_origins(logs: Sequence[Log]) -> tuple[Log, ...]:
 
 
 def command_ranges(machine: Machine) -> dict[str, CommandRange]:
-    """Return the ranges of the command columns that are not fractions in [-1, 1]."""
+    """Return command channel -> range and unit, for commands that are not fractions in [-1, 1].
+
+    Logs contain these commands for example in volts; the ranges are stated in the machine file.
+    """
     return {
         f"command.{name}": CommandRange(axis.command_unit, *axis.command_range)
         for name, axis in machine.axes.items()

@@ -93,9 +93,9 @@ def normalise_commands(table: Table, ranges: Mapping[str, CommandRange]) -> Tabl
 
 
 def check_table(table: Table, required: Sequence[str]) -> Table:
-    """Check names, units and finite values, and return the table in SI units.
+    """Check column names, units and magnitudes of a table, and return it in SI units.
 
-    Columns without a unit get the usual one. NaN is accepted in every column except time.
+    Columns without a unit get the usual one of their channel. NaN is accepted except in the time.
 
     Args:
         table: content of a file.
@@ -146,7 +146,12 @@ def _check_names(table: Table, required: Sequence[str]) -> None:
 
 
 def missing_channels_message(names: Sequence[str], present: Sequence[str] | Mapping[str, object]) -> str:
-    """Return the message for missing channels, with the channels that are present."""
+    """Return the error message for missing channels, which lists those present and similar names.
+
+    Args:
+        names: the missing channels.
+        present: the channels of the log.
+    """
     columns = "columns" if len(names) > 1 else "column"
     hints = [f"{other!r} may be {name}" for name in names for other in present if name in close_matches(other)[:1]]
     hint = f" ({'; '.join(hints)}: rename it, or give it an alias in log_columns)" if hints else ""
@@ -154,7 +159,11 @@ def missing_channels_message(names: Sequence[str], present: Sequence[str] | Mapp
 
 
 def _to_si_units(table: Table) -> Table:
-    """Return the table in SI units."""
+    """Return the table in SI units.
+
+    Raises:
+        InputError: a column has a unit that its channel cannot have.
+    """
     columns, units, present = [], [], set(table.names)
     for name, values, stated in zip(table.names, table.values, table.units, strict=True):
         if stated is None or (stated == DATE_UNIT and name == "time"):
@@ -185,7 +194,10 @@ def _check_finite(table: Table, missing: bool) -> None:
 
 
 def count_missing_samples(time: np.ndarray) -> np.ndarray:
-    """Return the number of missing samples per step (n-1,); 1 for steps below half the median."""
+    """Return how many samples are missing in each step between time stamps (n,) [s]; result (n-1,).
+
+    A step that differs from the median by at most half of it has none; a shorter one counts as one.
+    """
     with np.errstate(all="ignore"):
         step = np.diff(time)
         deviation = np.abs(step / np.median(step) - 1.0) if len(step) else step
@@ -193,7 +205,18 @@ def count_missing_samples(time: np.ndarray) -> np.ndarray:
 
 
 def _check_magnitude(table: Table, name: str, values: np.ndarray, unit: str, stated: bool) -> None:
-    """Check that magnitudes are plausible for the unit; limits are wider for a stated unit."""
+    """Check that the magnitudes of a column are plausible for its unit, to find wrong units.
+
+    Args:
+        table: table of the column, for messages.
+        name: channel.
+        values: (n,) values [unit].
+        unit: SI unit.
+        stated: whether the file states the unit; the limits are then wider.
+
+    Raises:
+        InputError: they are not; the message names the unit that the values probably have.
+    """
     size = np.abs(values[np.isfinite(values)])
     if not len(size):
         return
@@ -302,7 +325,7 @@ class Log:
 
     @property
     def gaps(self) -> np.ndarray:
-        """Rows (k,) before which samples are missing, or whose time is off by half a step."""
+        """Rows (k,) before which the time step differs from the median step by more than half of it."""
         return np.flatnonzero(count_missing_samples(self.time)) + 1
 
     def __repr__(self) -> str:
@@ -325,13 +348,13 @@ class Log:
         return pa.Table.from_arrays([pa.array(values) for values in columns.values()], schema=schema)
 
     def without_truth(self) -> "Log":
-        """Return the log with measured channels only, as identification code may use them."""
+        """Return the log without the `truth.*` channels, which only a simulator knows."""
         kept = [name for name in self.columns if not signals.parse_channel(name).truth]
         return replace(self, columns={k: self.columns[k] for k in kept}, units={k: self.units[k] for k in kept})
 
 
 def find_log_in_folder(folder: Path, stem: str = MEASURED_STEM) -> Path | None:
-    """Return the log called `stem` in a run folder, or None for other folders."""
+    """Return the file `<stem>.parquet` or `<stem>.csv` of a run folder, or None for other folders."""
     return next((file for kind in LOG_SUFFIXES if (file := folder / f"{stem}{kind}").is_file()), None)
 
 
@@ -392,7 +415,12 @@ def load_log(
 
 
 def _apply_aliases(table: Table, aliases: Mapping[str, str]) -> Table:
-    """Rename columns, convert signs, state units and skip columns."""
+    """Rename the columns of a table by aliases, which may also invert, multiply or skip columns.
+
+    Args:
+        table: table with the column names of the file.
+        aliases: column name -> channel; see `load_log`.
+    """
     for product in aliases:
         factors = product.split(" * ")
         if len(factors) == 2 and set(factors) <= set(table.names):

@@ -40,7 +40,8 @@ class Clock(NamedTuple):
         period: time between ticks [s].
         row: (n,) used rows of the log, increasing.
         tick: (n,) tick of each used row, increasing, starting at 0.
-        hold: maximum number of ticks for which the command of a row is held.
+        hold: maximum number of ticks for which the command of a row is held; later ticks without a
+            row count as missing.
     """
 
     start: float
@@ -51,7 +52,7 @@ class Clock(NamedTuple):
 
 
 def fit_clock(time: np.ndarray, where: str) -> tuple[Clock, tuple[str, ...]]:
-    """Fit a uniform clock to time stamps.
+    """Fit a uniform clock to time stamps, and assign each row to a tick of the clock.
 
     The period is estimated by least squares, so that a slightly fast or slow clock loses no row.
     If two rows have the same tick, the closer one is used. Stamps with jitter about the ticks are
@@ -140,7 +141,10 @@ def _make_clock(time, tick, off, start, period, where) -> tuple[Clock, tuple[str
 
 
 def _track_ticks(time: np.ndarray, period: float) -> np.ndarray:
-    """Return the ticks (n,) of time stamps from a clock that is corrected row by row."""
+    """Return the ticks (n,) of time stamps (n,) [s], for irregular stamps and a slightly wrong period.
+
+    The predicted time of the next row is corrected by a tenth of each stamp's deviation.
+    """
     tick = np.zeros(len(time), dtype=int)
     at = time[0]
     for row in range(1, len(time)):
@@ -152,7 +156,10 @@ def _track_ticks(time: np.ndarray, period: float) -> np.ndarray:
 
 
 def _round_period(period: float, rows: int) -> float:
-    """Round to a whole rate [Hz] or period [us] if the time error over all rows is negligible."""
+    """Round a period [s] to a whole rate in Hz or a whole number of us.
+
+    It is returned unchanged if rounding would shift the last of the rows by more than 0.5 % of a period.
+    """
     for even in (1.0 / max(round(1.0 / period), 1), round(1e6 * period) * 1e-6):
         if abs(even - period) * rows < _MAX_ROUNDING_ERROR * period:
             return even
@@ -199,14 +206,26 @@ def estimate_clock_offset(clock: Clock, command: np.ndarray, other: Clock, other
 
 
 def _hold_values(clock: Clock, values: np.ndarray, step: float) -> np.ndarray:
-    """Resample values (n, k) to a uniform step, holding each until the next one."""
+    """Resample values (n, k) at the rows of a clock to a uniform step [s] by zero-order hold.
+
+    Between two rows the result repeats the earlier one.
+    """
     time = clock.tick * clock.period
     at = np.arange(round(time[-1] / step) + 1) * step
     return values[np.searchsorted(time, at + 1e-6 * step, side="right") - 1]
 
 
 def _correlate_commands(a: np.ndarray, b: np.ndarray, least: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the correlation of a[i + lag] and b[i] by lag; 0 where the overlap is too short."""
+    """Return the normalised correlation of two command histories for every shift between them.
+
+    Args:
+        a: (n, k) first history, at a uniform step.
+        b: (m, k) second history, at the same step.
+        least: smallest number of overlapping rows.
+
+    Returns:
+        (correlation of a[i + lag] and b[i], 0 where the overlap is too short; lags [steps]).
+    """
     columns = range(a.shape[1])
     ones_a, ones_b = np.ones(len(a)), np.ones(len(b))
     from scipy.signal import correlate  # slow to import, and most runs have only one file
@@ -261,7 +280,10 @@ _MASK_HEADER = ("run", "begin", "end")
 
 
 class MaskedInterval(NamedTuple):
-    """Masked interval from begin to end [s] of a run's time stamps; "" means all runs."""
+    """Interval of a run whose readings are not used, from `begin` to `end` [s] of its time stamps.
+
+    An empty run name means all runs.
+    """
 
     run: str
     begin: float
@@ -428,7 +450,15 @@ def merge_run(
 
 
 def _apply_masks(run: RunFiles, logs, clocks, rows: RunRows, masks: Sequence[MaskedInterval]) -> RunRows:
-    """Set the readings of masked and invalid rows to NaN."""
+    """Return the rows with readings set to NaN in masked intervals and where `valid` is not 1.
+
+    Args:
+        run: the files of the run.
+        logs: their logs, the one with the commands first.
+        clocks: clocks of the logs.
+        rows: the merged rows.
+        masks: masked intervals.
+    """
     time = rows.start + rows.period * np.arange(len(rows.command))
     valid = find_unmasked_rows(masks, run.name, time + logs[0].origin)
     for log, clock in zip(logs, clocks, strict=True):
@@ -441,7 +471,7 @@ def _apply_masks(run: RunFiles, logs, clocks, rows: RunRows, masks: Sequence[Mas
 
 
 def _split_at_masks(rows: RunRows) -> list[RunRows]:
-    """Split a run at its long masked intervals."""
+    """Split a run at masked intervals of more than 0.2 s and return the parts between them."""
     edges = np.flatnonzero(np.diff(rows.valid, prepend=True, append=True))
     begin, end = edges[::2], edges[1::2]
     long = (end - begin) * rows.period > MAX_MASK_SECONDS
@@ -460,7 +490,7 @@ def slice_rows(rows: RunRows, first: int, last: int) -> RunRows:
 
 
 def _note_nan_cells(run: RunFiles, logs: Sequence[Log], channels: Sequence[str]) -> list[str]:
-    """Return a note on cells without a number."""
+    """Return a note on the number of NaN or empty cells per channel; an empty list without any."""
     counts = {
         name: int(np.isnan(log[name]).sum())
         for log in logs for name in log.columns
@@ -475,7 +505,19 @@ def _log_label(run: RunFiles, log: Log) -> str:
 
 
 def _align_clock(run: RunFiles, main: Log, clock: Clock, log: Log, other: Clock, commands):
-    """Return the clock offset of an additional file [s] and notes."""
+    """Return the offset to add to the times of an additional file of a run [s], and notes.
+
+    Args:
+        run: the run.
+        main: log with the commands, whose clock is the reference.
+        clock: clock of that log.
+        log: log of the additional file.
+        other: clock of the additional file.
+        commands: names of the command channels; those in both logs determine the offset.
+
+    Returns:
+        The offset, 0 if it cannot be determined.
+    """
     both = [name for name in commands if name in main and name in log]
     named = f"{run.name}: {log.source}"
     offset = None
@@ -508,7 +550,11 @@ def _are_disjoint(clock: Clock, other: Clock) -> bool:
 
 
 def _common_period(clocks: Sequence[Clock]) -> tuple[float, int, float]:
-    """Return the longest period with a tick for every row, its refinement, and the error [s]."""
+    """Find a common clock with a tick for every row of several clocks.
+
+    Returns:
+        (period [s], ticks per period of the first clock, largest time error of a row [s]).
+    """
     tried = []
     for fine in range(1, _MAX_REFINEMENT + 1):
         period = clocks[0].period / fine
@@ -529,7 +575,18 @@ def _common_ticks(clock: Clock, start: float, period: float) -> np.ndarray:
 
 
 def _place_on_ticks(logs, clocks, ticks, every, names) -> np.ndarray:
-    """Return columns (n, k) of all files at the common ticks, NaN where missing."""
+    """Return the columns of all files at the ticks of the common clock.
+
+    Args:
+        logs: logs of the files.
+        clocks: their clocks.
+        ticks: common ticks of the rows of each log.
+        every: (n,) all common ticks, increasing.
+        names: the k channels.
+
+    Returns:
+        (n, k) values, NaN where missing; of several files with a channel the first is used.
+    """
     values = np.full((len(every), len(names)), np.nan)
     for column, name in enumerate(names):
         holder = next((i for i, log in enumerate(logs) if name in log), None)
@@ -540,7 +597,17 @@ def _place_on_ticks(logs, clocks, ticks, every, names) -> np.ndarray:
 
 
 def _fill_ticks(start, period, fine, tick, command, commanded, reading) -> RunRows:
-    """Return rows at every tick; a command is held and known until the next row is due."""
+    """Return rows at every tick of a uniform clock from rows at some ticks.
+
+    Args:
+        start: time of tick 0 [s].
+        period: time between ticks [s].
+        fine: number of ticks for which the command of a row counts as known.
+        tick: (m,) ticks of the rows, increasing.
+        command: (m, nu) commands, NaN where missing; each is held until the next one.
+        commanded: (m,) whether the commands of a row were logged.
+        reading: (m, c) readings, NaN where missing.
+    """
     n = int(tick[-1] - tick[0]) + 1
     place = tick - tick[0]
     full = np.full((n, reading.shape[1]), np.nan)
@@ -565,7 +632,7 @@ _RATE_TOLERANCE = 0.1  # of a row: rates such as 1.05 kHz are not reduced
 
 
 def average_rows(rows: RunRows, max_rate: float = MAX_RATE) -> tuple[RunRows, np.ndarray, int]:
-    """Reduce the rate of a run by averaging a fixed number of logged rows into one row.
+    """Reduce the sample rate of a run by averaging a fixed number of logged rows into one row.
 
     Commands are means over the new row, for which they are held. Readings are means over the same
     number of logged rows before and after the time of the new row, so that they are not delayed;
@@ -577,7 +644,8 @@ def average_rows(rows: RunRows, max_rate: float = MAX_RATE) -> tuple[RunRows, np
         max_rate: maximum rate [Hz].
 
     Returns:
-        (the run, (c,) effective number of logged readings per reading, logged rows per row).
+        (the averaged run; (c,) effective number of independent logged readings in one mean; number of
+        logged rows per row, 1 if the rate is low enough).
     """
     count = math.ceil(1.0 / (max_rate * rows.period) - _RATE_TOLERANCE)
     ones = np.ones(rows.reading.shape[1])

@@ -1,7 +1,8 @@
-"""Repair the time stamps of a log so that they increase: order, repeats, set clocks, calendar time.
+"""Repair the time stamps of a log so that they increase.
 
-Each repair is reported in a note. No reading is moved to another moment: where the clock was set, the
-run is cut instead, by a pause at which every analysis splits a run.
+The stamps may be out of order, repeat, be calendar time, or jump where the clock of the logger was set.
+Each repair is reported in a note. At such a jump, the elapsed time is unknown. A pause of 2 s is
+inserted there, at which every analysis splits the run.
 """
 
 import math
@@ -22,17 +23,17 @@ _MAX_DISCARDED_FRACTION = 0.5  # of the readings: more rows per stamp mean that 
 def repair_time(table: Table, minimum_rows: int) -> tuple[Table, float, tuple[str, ...]]:
     """Return a table with increasing time stamps.
 
-    Rows out of order are sorted, unless the sorted rows would mix two moments. Rows with the same
-    stamp become one row with the last value of each column. Where the clock was set back, or forward
-    by more than 11 days, the later rows are moved so that a pause of at least 2 s cuts the run. Stamps
-    of calendar time are counted from the first row.
+    Rows out of order are sorted, unless a clock that was set back is the more likely cause. Rows with
+    the same stamp become one row with the last value of each column. Where the clock was set back, or
+    forward by more than 11 days, a pause of at least 2 s is inserted: the later rows are shifted in
+    time. Stamps of calendar time are counted from the first row.
 
     Args:
         table: table in SI units with the column `time`, finite.
-        minimum_rows: minimum number of rows between two set-backs.
+        minimum_rows: minimum number of rows between two jumps of the clock.
 
     Returns:
-        (table, stamp that corresponds to time 0 [s], notes).
+        (table, original stamp that corresponds to time 0 [s], notes).
 
     Raises:
         InputError: the stamps are too coarse for the rows or not in seconds, or the clock is set back
@@ -66,7 +67,11 @@ def _select_rows(table: Table, rows: np.ndarray) -> Table:
 
 
 def _sort_rows(table: Table) -> tuple[Table, tuple[str, ...]]:
-    """Sort rows by time, unless the sorted rows would mix two moments."""
+    """Return the table sorted by time, and notes.
+
+    It is not sorted if the sorted rows would be irregular. The clock was then set back, and sorting would
+    mix rows of different moments.
+    """
     time = _time(table)
     step = np.diff(time)
     if not (step < 0.0).any():
@@ -84,7 +89,10 @@ def _sort_rows(table: Table) -> tuple[Table, tuple[str, ...]]:
 
 
 def _merge_repeats(table: Table) -> tuple[Table, tuple[str, ...]]:
-    """Merge neighbouring rows with the same stamp: the last value of each column, the worst `valid`."""
+    """Return the table with one row for consecutive rows of the same time stamp, and notes.
+
+    The row has the last number of each column; its `valid` is 0 if that of any merged row is.
+    """
     time = _time(table)
     repeats = np.diff(time) == 0.0
     if not repeats.any():
@@ -118,7 +126,7 @@ def _merge_repeats(table: Table) -> tuple[Table, tuple[str, ...]]:
 
 
 def _check_step(table: Table) -> None:
-    """Check that the median step is that of a log in seconds."""
+    """Check that the median time step is below 1 s; otherwise the stamps are probably not in seconds."""
     step = np.diff(_time(table))
     period = float(np.median(step[step > 0.0])) if (step > 0.0).any() else 0.0
     if period >= _MAX_STEP:
@@ -127,7 +135,11 @@ def _check_step(table: Table) -> None:
 
 
 def _cut_at_set_clock(table: Table, minimum_rows: int) -> tuple[Table, tuple[str, ...]]:
-    """Move the rows after a set clock so that a pause of whole steps precedes them."""
+    """Shift the rows after each jump of the clock in time, so that a pause of at least 2 s precedes them.
+
+    Returns:
+        (table, notes).
+    """
     time = _time(table)
     step = np.diff(time)
     set_clock = (step < 0.0) | (step > _MAX_START_SECONDS)

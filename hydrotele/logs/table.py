@@ -76,7 +76,7 @@ def parse_label(text: str) -> tuple[str, str | None]:
 
 
 def check_file(path: Path) -> None:
-    """Check that a path is an existing file with the ending of a log.
+    """Check that a path is an existing file that ends in `.parquet` or `.csv`.
 
     Raises:
         InputError: it is not; the message gives the reason.
@@ -154,7 +154,10 @@ def read_csv(path: Path, missing: bool = False) -> Table:
 
 
 def _iterate_lines(path: Path, max_line: int) -> Iterator[tuple[int, str]]:
-    """Iterate over the lines of a text file: logs may be larger than the memory."""
+    """Yield (line number from 1, line) of a UTF-8 text file without holding all lines in memory.
+
+    A longer line is yielded in parts of `max_line` characters.
+    """
     with open_regular(path) as file:
         text = io.TextIOWrapper(file, encoding="utf-8-sig")
         try:
@@ -165,7 +168,7 @@ def _iterate_lines(path: Path, max_line: int) -> Iterator[tuple[int, str]]:
 
 
 class _CsvReader:
-    """Names, units, metadata and values read from the lines of a CSV file so far."""
+    """Parser of a CSV file that is given line by line; holds what it has read so far."""
 
     def __init__(self, source: str, missing: bool) -> None:
         self.source, self.missing = source, missing
@@ -255,7 +258,7 @@ class _CsvReader:
             self._parse_header(line)
 
     def _is_row_below(self, header: str, line: str) -> bool:
-        """Return whether a line has as many cells as a header and consists of numbers."""
+        """Return whether a line is a row of numbers with as many cells as a possible header above it."""
         separator = self.separator or _find_separator(header)
         cells = _split_line(line, separator)
         return len(cells) == len(_split_line(header, separator)) > 1 and all(
@@ -311,7 +314,15 @@ class _CsvReader:
         return InputError(format_location(self.source, column, row, self.lines), f"{reason}: {remedy}")
 
     def _parse_cell(self, place: int, cell: str, row: int) -> float:
-        """Return the number in a cell, NaN if it has none."""
+        """Return the number in a cell; a date becomes seconds since the first date of the column.
+
+        An empty cell and a cell of other text give NaN; the latter also gives the column a fault.
+
+        Args:
+            place: index of the column.
+            cell: text of the cell.
+            row: index of the row.
+        """
         text, name = cell.strip().strip('"').strip(), self.names[place]
         where = format_location(self.source, name, row, self.lines)
         if text.lower() in _MISSING_WORDS:

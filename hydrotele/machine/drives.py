@@ -20,7 +20,7 @@ class Pin(StrictModel):
 
 
 class Friction(StrictModel):
-    """Friction parameters of `hydraulics.friction`: [N] or [N m], velocities [m/s] or [rad/s].
+    """Friction parameters of a drive: forces [N] or [N m], velocities [m/s] or [rad/s].
 
     An asymmetry a multiplies the dry or the viscous friction by 1 + a in the positive direction
     and by 1 - a in the negative one. With a `presliding_stiffness` [N/m] or [N m/rad], dry friction
@@ -204,7 +204,7 @@ class Valve(StrictModel):
 
     @property
     def deadbands(self) -> tuple[float, float]:
-        """Dead bands in the positive and in the negative direction [1]."""
+        """Dead bands in the positive and the negative direction, as fractions of the spool travel [1]."""
         own = (self.positive.deadband, self.negative.deadband)
         forward, backward = (self.deadband if d is None else d for d in own)
         return forward, backward

@@ -32,7 +32,7 @@ class Workspace(StrictModel):
     """Travel of the coil centre in the gap, each direction [m], and rotation of the flotor [rad].
 
     A rotation about the handle is smaller, because the handle is off the coils; see
-    `Joystick.reach`.
+    `Joystick.handle_travel`.
     """
 
     translation: PositiveFloat
@@ -79,7 +79,7 @@ class Diodes(StrictModel):
 
 
 class UnheldDynamics(StrictModel):
-    """Closed-loop dynamics of x, y, z, rx, ry, rz without a hand: frequency [rad/s], ratio [1]."""
+    """Closed-loop frequency [rad/s] and damping ratio [1] of x, y, z, rx, ry, rz without a hand."""
 
     frequency: Annotated[tuple[PositiveFloat, ...], Field(min_length=6, max_length=6)]
     ratio: Annotated[tuple[PositiveFloat, ...], Field(min_length=6, max_length=6)]
@@ -115,7 +115,7 @@ class HandImpedance(StrictModel):
 
     @property
     def carried_mass(self) -> float:
-        """Mass whose weight the handle carries [kg]: the smallest over all directions."""
+        """Mass of the hand whose weight the handle carries [kg]: the smallest over all directions."""
         return self.mass * min(1.0, principal_values(self.mass_shape).min_value)
 
     def axis_impedance(self, axis: int) -> tuple[float, float, float]:
@@ -159,7 +159,7 @@ def principal_values(shape: SymmetricMatrix) -> PrincipalValues:
 
 
 class Detent(StrictModel):
-    """Perceptible edge of the dead band: force drop [N] or [N m], slope outside [N/m]."""
+    """Perceptible edge of the dead band: force drop [N] or [N m], stiffness outside [N/m] or [N m/rad]."""
 
     renamed = {"outside": "slope"}
 

@@ -203,7 +203,7 @@ class Supply(StrictModel):
 
     @property
     def max_pressure(self) -> float:
-        """Supply pressure with the whole pump flow through the relief valve [Pa]."""
+        """Maximum supply pressure [Pa]: that with the whole pump flow through the relief valve."""
         return self.relief_pressure + self.relief_override * self.pump_flow
 
     @model_validator(mode="after")
@@ -330,7 +330,7 @@ class Machine(StrictModel):
         return {name: axis for name, axis in self.axes.items() if axis.valve}
 
     def max_feed_pressure(self, axis: str) -> float:
-        """Return the maximum feed pressure of an axis [Pa]: supply limit or pump stall pressure."""
+        """Return the maximum feed pressure of an axis [Pa]: of the common supply, or stall pressure of its pump."""
         pump = self.axes[axis].pump
         if pump:
             return pump.stall_pressure
@@ -350,14 +350,14 @@ class Machine(StrictModel):
         return next(n for n, li in self.links.items() if li.joint and li.joint.name == joint)
 
     def position_kind(self, axis: str) -> str:
-        """Return `angle` for a hinge axis and `position` for a slide axis."""
+        """Return the kind of an axis's position channel: `angle` for a hinge, `position` for a slide."""
         return "angle" if self.joints[self.axes[axis].joint].type == "hinge" else "position"
 
     def end_stop(self, axis: str) -> EndStop | None:
         """Return the end stop of an axis, or None if its travel is unlimited.
 
-        If the machine file has none, the stiffness is the largest drive force divided by 1 mm or
-        2 mrad, the typical deformation of tube, gland and pins of a heavy cylinder at that force.
+        If the machine file has none, it is estimated. Its stiffness is the largest drive force divided by
+        1 mm or 2 mrad: the typical deformation of tube, gland and pins of a heavy cylinder at that force.
         """
         facts = self.axes[axis]
         joint = self.joints[facts.joint]
@@ -376,7 +376,7 @@ class Machine(StrictModel):
 
     @property
     def undriven_sensed_joints(self) -> tuple[str, ...]:
-        """Sensed joints without a drive; the others use the channel of their axis."""
+        """Joints in `sensed_joints` without a drive; driven joints use the channel of their axis."""
         driven = {axis.joint for axis in self.axes.values()}
         return tuple(joint for joint in self.sensed_joints if joint not in driven)
 
@@ -504,7 +504,7 @@ def _check_cycles(links: dict[str, Link]) -> None:
 
 
 def dependent_joints(machine: Machine) -> tuple[str, ...]:
-    """Return the names of the undriven joints that the closures determine."""
+    """Return the names of the undriven joints in closed kinematic loops; the loops determine their positions."""
     driven = {axis.joint for axis in machine.axes.values()}
     names: list[str] = []
     for closure in machine.closures.values():
@@ -516,7 +516,7 @@ def dependent_joints(machine: Machine) -> tuple[str, ...]:
 
 
 def loop_links(machine: Machine, a: str, b: str) -> list[str]:
-    """Return the links between two links of the tree, without their common parents."""
+    """Return the links on the path between two links of the kinematic tree, without their common ancestors."""
     chains = []
     for link in (a, b):
         chain = []
@@ -556,7 +556,10 @@ def get_sensors(machine: Machine, name: str) -> SensorSet | None:
 
 
 def channel_sensor(machine: Machine, sensors: SensorSet | None, channel: str) -> Sensor:
-    """Return the sensor of a channel; the default span of a length is the cylinder's stroke."""
+    """Return the sensor of a channel, an ideal one if `sensors` is None.
+
+    The default span of a length sensor is the cylinder's stroke.
+    """
     if sensors is None:
         return Sensor()
     kind, _, axis = channel.partition(".")
@@ -581,7 +584,7 @@ class Converter(NamedTuple):
 
 
 def channel_converter(sensor: Sensor, channel: str) -> Converter:
-    """Return the converter of a channel; lengths and pressures are limited to 0 .. span."""
+    """Return the analogue-to-digital converter of a channel; lengths and pressures are limited to 0 .. span."""
     if sensor.bits is None or sensor.span is None:
         return Converter(0.0, -math.inf, math.inf)
     step = sensor.span / 2.0**sensor.bits

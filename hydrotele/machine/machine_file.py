@@ -134,7 +134,7 @@ def save_machine(machine: Machine, path: str | Path) -> None:
 
 
 def _with_law_files(machine: Machine, folder: Path) -> Machine:
-    """Copy files that define laws of terms into a folder; return the machine with their names."""
+    """Copy user files that define laws of terms into a folder; return the machine with the names of the copies."""
     terms = []
     for term in machine.terms:
         source = LAWS[term.law].source
@@ -215,7 +215,7 @@ def _merge_tool(data: dict, tool: str, fragment: dict, path: Path, lines) -> dic
 
 
 def _section_entries(data: dict, section: str) -> dict:
-    """Return the named entries of a section; empty if the section is not a mapping."""
+    """Return the entries of a section of a machine file by name; empty if the section is not a mapping."""
     entries = data.get(section)
     if not isinstance(entries, dict):
         return {}
@@ -310,7 +310,11 @@ def _resolve_drives(data: dict, path: Path, lines) -> None:
 
 
 def _resolve_pin(pin: dict, data: dict, where: str) -> dict:
-    """Return the pin at `distance` and `angle` from the joint of link `from`, in the x-z plane."""
+    """Return a pin with its position computed from `distance` and `angle_deg` in the x-z plane.
+
+    They start at the joint of the link `from`, or at the frame's origin. A pin without `distance` is
+    returned unchanged.
+    """
     if "distance" not in pin:
         return pin
     pin = dict(pin)

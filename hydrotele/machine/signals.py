@@ -119,9 +119,9 @@ _COMMAND_LIMITS = MagnitudeLimits(0.0, 1.0 + 1e-3, "percent, counts or volts")
 
 
 def magnitude_limits(name: str, unit: str, *, stated: bool = True) -> MagnitudeLimits:
-    """Return the plausible range of the maximum magnitude of a channel [unit].
+    """Return the plausible range of a channel's maximum magnitude in a run [unit], to detect a wrong unit.
 
-    Values outside it indicate a wrong unit. The range is wider if the file states the unit.
+    The range is wider if the file states the unit (`stated`).
 
     >>> magnitude_limits("angle.boom", "rad").looks_like
     'degrees'
@@ -134,7 +134,7 @@ def magnitude_limits(name: str, unit: str, *, stated: bool = True) -> MagnitudeL
 
 
 def channel_name(kind: str, axis: str = "", *, truth: bool = False) -> str:
-    """Return the channel's name.
+    """Return the name of a channel in logs; `truth` marks a channel that only a simulator knows.
 
     >>> channel_name("flow_head", "boom", truth=True)
     'truth.flow_head.boom'
@@ -148,7 +148,7 @@ def channel_names(kind: str, axes: Iterable[str], *, truth: bool = False) -> tup
 
 
 def valid_kinds() -> tuple[str, ...]:
-    """Return all forms of channel names, such as `angle.<axis>`, measured channels first."""
+    """Return the forms of all valid channel names, such as `angle.<axis>`, measured channels first."""
     endings = {"free": ".<axis>", "xyz": ".x|y|z", "none": ""}
     measured = [kind + endings[spec.axes] for kind, spec in MEASURED_KINDS.items()]
     return tuple(measured + [_TRUTH_PREFIX + kind + endings[spec.axes] for kind, spec in TRUTH_KINDS.items()])

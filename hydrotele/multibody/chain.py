@@ -1,4 +1,4 @@
-"""Read a mechanism from MJCF as a joint tree with loops closed by `connect` and `is_weld` constraints.
+"""Read a mechanism from MJCF as a joint tree with loops closed by `connect` and `weld` constraints.
 
 Every joint of the tree is a hinge or a slide. A ball joint becomes three successive hinges about x,
 y and z (Cardan angles, singular if the second is 90 degrees). A free joint becomes three slides and
@@ -101,7 +101,7 @@ class Chain:
     source: str = ""
 
     def index(self, joint: str) -> int:
-        """Return the index of a joint.
+        """Return the index of a joint, given by its name, among all joints of the chain.
 
         Raises:
             InputError: the joint does not exist.
@@ -145,7 +145,7 @@ def load_chain(source: str | Path | mujoco.MjModel) -> Chain:
     Raises:
         InputError: the file does not exist, a ball or free joint has an actuator, damping,
             armature, friction or a spring, or there is an active constraint other than `connect`
-            and `is_weld`.
+            and `weld`.
 
     Source: MuJoCo manual, `mj_kinematics` and `mjData`.
     """
@@ -219,7 +219,10 @@ _AXES = tuple(enumerate("xyz"))
 
 
 def _split_joint(model: mujoco.MjModel, j: int, pose: np.ndarray) -> list[_Joint]:
-    """Convert a MuJoCo joint to hinges and slides, with start positions from a pose (nq,)."""
+    """Convert MuJoCo's joint j to hinges and slides, with start positions from a pose `qpos` (nq,).
+
+    A ball joint gives three hinges, and a free joint three slides and three hinges.
+    """
     name, kind = model.joint(j).name or f"joint{j}", model.jnt_type[j]
     body, anchor = int(model.jnt_bodyid[j]), tuple(model.jnt_pos[j])
     place, dof = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
@@ -258,10 +261,12 @@ def _split_joint(model: mujoco.MjModel, j: int, pose: np.ndarray) -> list[_Joint
 
 
 def cardan_angles(rotation: np.ndarray) -> np.ndarray:
-    """Return the angles (3,) [rad] of `R = R_x(a) R_y(b) R_z(c)`, with b from -90 to 90 degrees.
+    """Return the Cardan angles (a, b, c) of a rotation about successive x, y and z axes, (3,) [rad].
+
+    `R = R_x(a) R_y(b) R_z(c)` with b from -90 to 90 degrees.
 
     Args:
-        rotation: (3, 3) rotation R.
+        rotation: (3, 3) rotation matrix R.
 
     Source: Diebel 2006, Representing attitude, 8.4 (sequence 1-2-3).
 
@@ -287,7 +292,10 @@ class _Closure(NamedTuple):
 
 
 def _read_closures(model: mujoco.MjModel) -> list[_Closure]:
-    """Return the active `connect` and `is_weld` constraints."""
+    """Return the loop closures of a model: its active `connect` and `weld` constraints.
+
+    Raises InputError for an active constraint of another kind.
+    """
     out = []
     for e in range(model.neq):
         if not model.eq_active0[e]:
@@ -320,14 +328,15 @@ def _rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
 
 
 def body_inertia(model: mujoco.MjModel, body: int) -> list[float]:
-    """Return mass, first moments and inertia about the frame origin of a body.
+    """Return the inertial parameters of a body: mass, first moments, and inertia about its frame's origin.
 
     Args:
         model: compiled model.
         body: index of the body.
 
     Returns:
-        The ten inertial parameters in the order of `BODY_PARAMETERS`.
+        Ten values in the body frame: mass [kg], mass times centre of mass [kg m], and xx, xy, xz, yy, yz,
+        zz of the inertia [kg m^2].
     """
     mass, com, turn = (
         model.body_mass[body],

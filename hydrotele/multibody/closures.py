@@ -43,7 +43,7 @@ _ERROR_CONTEXT = "closures"
 
 @allocation_free
 def compute_loop_residuals(tree, frames, error, error_jacobian):
-    """Compute the residuals of the loop equations and their Jacobian.
+    """Compute the residuals of all loop closure equations and their Jacobian.
 
     Args:
         tree: Tree.
@@ -83,7 +83,10 @@ def compute_loop_residuals(tree, frames, error, error_jacobian):
 
 @allocation_free
 def _rotation_error(tree, frames, c):
-    """Return the sine of the rotation angle between both frames of a weld, times its axis."""
+    """Return the orientation error of a weld closure c as a vector in the world frame.
+
+    It is the sine of the rotation angle from its second to its first frame, times the rotation axis.
+    """
     one, two = (
         get_rotation(frames.rotation, tree.closure_bodies[c, 0]),
         get_rotation(frames.rotation, tree.closure_bodies[c, 1]),
@@ -99,7 +102,12 @@ def _rotation_error(tree, frames, c):
 
 @allocation_free
 def compute_closure_acceleration(tree, frames, out):
-    """Compute the acceleration of the loop residuals (r, 1) [m/s^2], [rad/s^2].
+    """Compute the second time derivative of the residuals of all loop equations.
+
+    Args:
+        tree: Tree.
+        frames: Frames after `compute_frames` with rates and accelerations.
+        out: (r, 1) written: accelerations, 3 or 6 per closure [m/s^2], [rad/s^2].
 
     Source: second derivative of the loop equations.
     """
@@ -147,7 +155,10 @@ class LoopWorkspace(NamedTuple):
 
 @compiled
 def make_loop_workspace(tree, unknowns, columns):
-    """Allocate the workspace for `unknowns` unknown joints and solutions with `columns` columns."""
+    """Allocate the work arrays for closing the loops of a tree.
+
+    `unknowns` is the number of unknown joints, and `columns` that of right-hand sides to be solved for.
+    """
     v, r = len(tree.reference_position), tree.first_equation[-1]
     return LoopWorkspace(
         np.zeros(v), np.zeros(3), make_frames(tree), np.zeros((r, 1)), np.zeros((r, v)),
@@ -157,17 +168,17 @@ def make_loop_workspace(tree, unknowns, columns):
 
 @allocation_free
 def close_loops_near(tree, q, unknowns, space):
-    """Close the loops from a nearby position, without allocation.
+    """Close the loops by Newton's method from a nearby position, without allocating memory.
 
     Args:
         tree: Tree.
         q: (v,) positions, changed in place [rad] or [m].
         unknowns: (m,) indices of the joints that may move.
-        space: LoopSpace of m unknown joints; receives frames, Jacobian and factors at the solution.
+        space: LoopWorkspace of m unknown joints; receives frames, Jacobian and factors at the solution.
 
     Returns:
-        False if it fails or the step indicates another branch; `close_loops_from` handles larger
-        distances.
+        Whether it succeeded. It fails at a singular position, or if a step is so large that it may lead
+        to another assembly; `close_loops_from` handles larger distances.
 
     Source: Gauss-Newton.
     """
@@ -220,7 +231,7 @@ def close_loops_from(tree: Tree, q: np.ndarray, unknowns: np.ndarray, tolerance:
 
 @compiled
 def _loop_residuals(tree, q):
-    """Return the loop residuals (r, 1) at positions (v,), and their Jacobian (r, v)."""
+    """Return the residuals (r, 1) of the loop equations at joint positions (v,), and their Jacobian (r, v)."""
     v, r = len(q), tree.first_equation[-1]
     frames, gap, slope, still = make_frames(tree), np.zeros((r, 1)), np.zeros((r, v)), np.zeros(v)
     compute_frames(tree, q, still, still, np.zeros(3), frames)
@@ -229,7 +240,7 @@ def _loop_residuals(tree, q):
 
 
 def compile_openings() -> None:
-    """Compile the functions that `close_loops_from` and `motion_basis` call, using a pendulum."""
+    """Compile, before they are needed, the functions that compute loop residuals, with a pendulum as input."""
     body = '<body><joint name="hinge"/><geom size="1"/></body>'
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
     tree = load_chain(model).tree
@@ -237,7 +248,7 @@ def compile_openings() -> None:
 
 
 def motion_basis(chain: Chain, q: np.ndarray, independent: np.ndarray) -> np.ndarray:
-    """Return the rates of all joints per unit rate of each independent joint.
+    """Return the rates of all joints of a closed chain per unit rate of each independent joint.
 
     Args:
         chain: the chain.
@@ -247,7 +258,8 @@ def motion_basis(chain: Chain, q: np.ndarray, independent: np.ndarray) -> np.nda
     Returns:
         (v, n), with `rates = basis @ rates[independent]`.
 
-    Source: `J_d r_d = -J_i r_i`, with the dependent and independent columns of the loop Jacobian.
+    Source: `J_d r_d = -J_i r_i` for rates r, with the dependent and independent columns of the Jacobian
+        of the loop equations.
     """
     others = np.setdiff1d(np.arange(len(q)), independent)
     basis = np.zeros((len(q), len(independent)))
@@ -265,6 +277,9 @@ def find_undetermined_joints(chain: Chain, q: np.ndarray, independent: np.ndarra
         chain: the chain.
         q: (v,) positions with closed loops [rad] or [m].
         independent: (n,) indices of the independent joints.
+
+    Returns:
+        Joint names; empty if all joints are determined.
     """
     others = np.setdiff1d(np.arange(len(q)), independent)
     _, s, v = np.linalg.svd(_loop_residuals(chain.tree, q)[1][:, others], full_matrices=True)
@@ -286,8 +301,9 @@ def find_start_pose(
 ) -> np.ndarray:
     """Return a pose with closed loops from which the motion of the given joints can be followed.
 
-    This is the start pose, with its loops closed by all joints. If they do not close there, or if
-    the pose is singular, it is the assembly at the first row, which must then be the only one.
+    This is the start pose, with its loops closed by moving all joints. If they do not close there, or if
+    the pose is singular, it is the pose that closes the loops at the first row. Only one such pose
+    (assembly) may then exist.
 
     Args:
         chain: the chain.
@@ -326,7 +342,7 @@ def find_start_pose(
 
 
 def describe_opening(chain: Chain, given: Sequence[str], position: np.ndarray, row: int) -> str:
-    """Describe by how much a loop stays open at a row, for an error message.
+    """Describe, for an error message, which loop stays open at given joint positions, and by how much.
 
     Args:
         chain: the chain.
@@ -370,7 +386,7 @@ def _largest_opening(chain: Chain, q: np.ndarray) -> tuple[str, float]:
 
 
 def _describe_choice(chain: Chain, start: np.ndarray, poses: Sequence[np.ndarray]) -> str:
-    """Describe that the start pose does not select one of several assemblies, for an error message."""
+    """Describe, for an error message, that the loops can be closed in several ways and list these poses."""
     closure, opening = _largest_opening(chain, start)
     state = f"{closure} is {1e3 * opening:.3g} mm open" if opening > CLOSURE_TOLERANCE else "the pose is singular"
     shown = "; or ".join(
@@ -395,12 +411,12 @@ def solve_joint_positions(
     Args:
         chain: the chain.
         given: the k joints with known positions; the closures must determine the others.
-        position: (n, k) [rad] or [m].
+        position: (n, k) their positions [rad] or [m].
         start: (v,) initial positions before the first row; those of the chain by default.
         seed: seed of the search for all assemblies.
 
     Returns:
-        (n, v) [rad] or [m].
+        (n, v) positions of all joints [rad] or [m].
 
     Raises:
         InputError: a shape is wrong, a value is missing, the closures do not determine the other
@@ -435,7 +451,19 @@ def solve_joint_positions(
 
 @compiled
 def _follow_motion(tree, given, position, others, q, out):
-    """Compute joint positions row by row; return the index of the failed row, or -1."""
+    """Close the loops row by row along given joint positions, each row from the previous one.
+
+    Args:
+        tree: Tree.
+        given: (k,) indices of the joints with known positions.
+        position: (n, k) these positions [rad] or [m].
+        others: (v - k,) indices of the joints that may move.
+        q: (v,) closed positions before the first row, updated.
+        out: (n, v) written: positions of all joints.
+
+    Returns:
+        Index of the first row where this fails, or -1.
+    """
     space = make_loop_workspace(tree, len(others), 1)
     for row in range(len(position)):
         far = 0.0
@@ -455,7 +483,7 @@ def find_assemblies(
     chain: Chain, given: Sequence[str], position: np.ndarray, *, body: str | None = None,
     starts: int = 400, seed: int = 0,
 ) -> np.ndarray:  # fmt: skip
-    """Find all assemblies of a chain for given positions of some joints.
+    """Find all assemblies (poses with closed loops) of a chain for given positions of some joints.
 
     Newton's method starts from random positions. All returned assemblies exist, but there is no
     proof that the list is complete. A Stewart-Gough platform has up to 40 assemblies.
@@ -463,7 +491,7 @@ def find_assemblies(
     Args:
         chain: the chain.
         given: the k joints with known positions.
-        position: (k,) [rad] or [m].
+        position: (k,) their positions [rad] or [m].
         body: body whose pose distinguishes assemblies; all bodies by default.
         starts: number of random start positions.
         seed: seed of the start positions.
@@ -499,7 +527,7 @@ def find_assemblies(
 
 
 def _flatten_frames(chain: Chain, q: np.ndarray, body: str | None) -> np.ndarray:
-    """Return the positions and orientations of bodies as one vector."""
+    """Return the position and the rotation matrix of one body, or of all bodies if None, as one vector."""
     frames, still = make_frames(chain.tree), np.zeros(len(q))
     compute_frames(chain.tree, q, still, still, np.zeros(3), frames)
     some = slice(1, None) if body is None else chain.bodies.index(body) + 1
@@ -507,7 +535,7 @@ def _flatten_frames(chain: Chain, q: np.ndarray, body: str | None) -> np.ndarray
 
 
 def joint_jacobian(chain: Chain, q: np.ndarray, outputs: Sequence[str], inputs: Sequence[str]) -> np.ndarray:
-    """Return the rates of some joints per unit rate of the independent joints.
+    """Return the Jacobian of some joints of a closed chain: their rates per unit rate of the input joints.
 
     Args:
         chain: the chain.

@@ -77,16 +77,17 @@ def project_on_drives(
     Args:
         chain: the chain.
         given: the k joints with known motion; the closures must determine the others.
-        position: (n, k) [rad] or [m].
-        rate: (n, k) [rad/s] or [m/s].
-        acceleration: (n, k) [rad/s^2] or [m/s^2].
+        position: (n, k) their positions [rad] or [m].
+        rate: (n, k) their rates [rad/s] or [m/s].
+        acceleration: (n, k) their accelerations [rad/s^2] or [m/s^2].
         drives: k joints whose forces are computed; the drives of the chain by default.
         start: (v,) initial positions before the first row; those of the chain by default.
         moment_free: body -> unit axis through the origin of its frame, in that frame, about which
             its neighbours transmit no moment. Its motion is not affected.
 
     Returns:
-        The projection. The drive forces are `bodies @ inertia.ravel()` plus the friction forces.
+        The projection. The drive forces are `body_projection @ chain.inertia.ravel()` plus the friction
+        forces.
 
     Raises:
         InputError: a shape is wrong, a value is missing, a body does not exist, the closures do not
@@ -158,7 +159,20 @@ class _GivenMotion(NamedTuple):
 
 @compiled
 def _project_rows(tree, given, others, drives, moment_free, q, out):
-    """Compute a `Projection` row by row; return the index of the failed row, or -1."""
+    """Compute motion and projected forces of a chain row by row, and write them to a `Projection`.
+
+    Args:
+        tree: Tree.
+        given: _GivenMotion of k joints.
+        others: (v - k,) indices of the other joints.
+        drives: (k,) indices of the driven joints.
+        moment_free: (b, 3) unit axis without moment of every body in its frame, or 0.
+        q: (v,) closed positions before the first row, updated.
+        out: Projection, written.
+
+    Returns:
+        Index of the first row where this fails, or -1.
+    """
     b, v, k = len(tree.parent), len(tree.reference_position), len(given.joints)
     hidden, space = len(others), make_loop_workspace(tree, len(others), k)
     frames, part, ground = space.frames, space.solution, -tree.gravity
@@ -221,7 +235,10 @@ def _project_rows(tree, given, others, drives, moment_free, q, out):
 
 @allocation_free
 def _remove_moment(frames, body, axis, torques):
-    """Remove the component along a unit axis from torques (3, 10); a zero axis has no effect."""
+    """Remove the component along a unit axis of a body's frame from torques (3, 10) in the world frame.
+
+    A zero axis has no effect.
+    """
     way = rotate(get_rotation(frames.rotation, body), axis)
     for m in range(10):
         along = way[0] * torques[0, m] + way[1] * torques[1, m] + way[2] * torques[2, m]
@@ -231,7 +248,17 @@ def _remove_moment(frames, body, axis, torques):
 
 @allocation_free
 def _project_wrench(tree, frames, body, forces, torques, share, out):
-    """Project the wrench of a body on the drives, through the joints that move it."""
+    """Project the wrench of a body on the drives by virtual work, through the joints that move it.
+
+    Args:
+        tree: Tree.
+        frames: Frames.
+        body: index of the body.
+        forces: (3, 10) force per unit of each inertial parameter, see `compute_wrenches`.
+        torques: (3, 10) torque, likewise.
+        share: (k, v) force of drive k per unit force or torque in joint v.
+        out: (k, 10 b) written in the columns of this body: drive forces.
+    """
     first, point = 10 * (body - 1), get_vector(frames.origin, body)
     for i in range(len(share)):
         for m in range(10):
@@ -250,7 +277,14 @@ def _project_wrench(tree, frames, body, forces, torques, share, out):
 
 @allocation_free
 def _project_closure_friction(tree, frames, closure, share, out):
-    """Project viscous friction in a closure on the drives; return its relative rotation rate."""
+    """Project viscous rotational friction in a closure on the drives, per unit of its coefficient.
+
+    `share` (k, v) is the force of drive k per unit force in joint v; column `closure` of `out` (k, c) is
+    written.
+
+    Returns:
+        Relative rotation rate of the two bodies of the closure [rad/s].
+    """
     one, two = tree.closure_bodies[closure, 0], tree.closure_bodies[closure, 1]
     spin = subtract(get_vector(frames.angular_velocity, one), get_vector(frames.angular_velocity, two))
     for i in range(len(share)):
@@ -305,7 +339,7 @@ class FrictionTerm:
     rest_speed: float = 0.0
 
     def unit_forces(self, velocity: np.ndarray, acceleration: np.ndarray | float = 0.0) -> dict[str, np.ndarray]:
-        """Return the friction per unit of each parameter.
+        """Return the friction force per unit of each parameter of this term at given velocities.
 
         Args:
             velocity: velocities of any shape [rad/s] or [m/s].
@@ -325,7 +359,7 @@ DEVIATION_TERMS = ("low_speed", "reversal")  # deviations near zero speed, with 
 
 
 def is_deviation(name: str) -> bool:
-    """Return whether a parameter, such as `low_speed_1.knee`, is a friction deviation near zero speed."""
+    """Return whether a parameter name, such as `low_speed_1.knee`, is a friction deviation near zero speed."""
     return name.partition(".")[0].rpartition("_")[0] in DEVIATION_TERMS
 
 
@@ -355,7 +389,9 @@ def make_regressor(
     offsets: Mapping[str, float] | bool = True, drive_inertia: Sequence[str] = (),
     rate_std: np.ndarray | None = None,
 ) -> Regressor:  # fmt: skip
-    """Assemble the regressor of inertial parameters, friction, drive inertia and offsets.
+    """Assemble the matrix that gives the drive forces as a linear function of the parameters.
+
+    The parameters are inertial parameters of bodies, friction, drive inertia and force offsets.
 
     Args:
         chain: the chain.
@@ -417,7 +453,7 @@ def sign_uncertainty(
     chain: Chain, projection: Projection, drives: Sequence[str], friction: Sequence[FrictionTerm],
     rate_std: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Return the standard deviation of the sign of the drive rates due to rate noise.
+    """Return how uncertain the sign of dry friction in the drives is, because their rates are noisy.
 
     Args:
         chain: the chain.
@@ -427,7 +463,7 @@ def sign_uncertainty(
         rate_std: (n, v) as in `make_regressor`.
 
     Returns:
-        (n, k) standard deviation of the sign of dry friction, 0 .. 1.
+        (n, k) standard deviation of the sign (-1 .. 1) of dry friction, 0 .. 1; 1 below the `rest_speed`.
     """
     out, weights = np.zeros((len(projection.rate), len(drives))), _WEIGHTS / _WEIGHTS.sum()
     for one in friction:
@@ -443,7 +479,11 @@ def sign_uncertainty(
 
 
 def _friction_columns(chain: Chain, projection: Projection, term: FrictionTerm, rate_std: np.ndarray | None):
-    """Return the columns of a friction term: parameter -> (column (n, k), unit)."""
+    """Return the regressor columns of a friction term: parameter -> (column (n, k), unit).
+
+    A column holds the forces of the k drives per unit of the parameter. With `rate_std` it is the
+    expected value over the uncertain rate.
+    """
     strange = [kind for kind in term.nominal if kind not in FRICTION_TERMS and not is_deviation(kind)]
     if strange:
         message = f"friction has no {strange[0]}; valid: {', '.join(FRICTION_TERMS)}"
@@ -468,7 +508,7 @@ def _friction_columns(chain: Chain, projection: Projection, term: FrictionTerm, 
 def _unit_friction(
     term: FrictionTerm, kind: str, velocity: np.ndarray, acceleration: np.ndarray | float = 0.0
 ) -> np.ndarray:
-    """Return the friction per unit of a parameter at velocities of any shape."""
+    """Return the friction per unit of one parameter of a term, such as `coulomb`, at velocities of any shape."""
     if kind == "viscous":
         return velocity
     way = np.tanh(velocity / term.smoothing) if term.smoothing else np.sign(velocity)
@@ -489,7 +529,10 @@ def _unit_friction(
 
 
 def _closure_friction_columns(closure: int, projection: Projection, term: FrictionTerm):
-    """Return the columns of friction in a closure, opposite to its relative rotation."""
+    """Return the regressor columns of friction in a closure: parameter -> (column (n, k), unit).
+
+    The friction opposes the relative rotation of the two bodies of the closure.
+    """
     twist, share = projection.closure_rate[:, closure], projection.closure_projection[:, :, closure]
     floor = term.smoothing or np.finfo(float).tiny
     slow = np.exp(-((twist / term.stribeck) ** 2))
@@ -505,7 +548,7 @@ def _closure_friction_columns(closure: int, projection: Projection, term: Fricti
 
 
 def passive_friction_terms(chain: Chain) -> list[FrictionTerm]:
-    """Return Coulomb friction terms for all passive hinges and closures.
+    """Create Coulomb friction terms for all hinges without drive and for all closures of a chain.
 
     Args:
         chain: the chain.

@@ -24,7 +24,7 @@ def factorise_cholesky(matrix):
     """Replace a symmetric positive definite matrix by its lower Cholesky factor.
 
     Args:
-        matrix: (>= n, n), overwritten in its lower triangle; further rows are not changed.
+        matrix: (>= n, n); the lower triangle of its first n rows is overwritten by the factor.
 
     Returns:
         Nothing.
@@ -41,7 +41,7 @@ def factorise_cholesky(matrix):
 
 @allocation_free
 def solve_cholesky(factor, right):
-    """Solve a linear system with a Cholesky factor, in place.
+    """Solve a linear system `L L' x = right` with the lower Cholesky factor L, in place.
 
     Args:
         factor: (>= n, n) result of `factorise_cholesky`.
@@ -65,15 +65,17 @@ def solve_cholesky(factor, right):
 
 @allocation_free
 def compute_bar_frames(tree, shape, first, frame, jacobian, bar):
-    """Compute the frames and Jacobians of all bars; x is along the bar, y along the pins.
+    """Compute the frames and Jacobians of all cylinders (bars between two pins).
+
+    The x axis of tube and rod points along the bar, and the y axis along the pins.
 
     Args:
-        tree: see `ReducedMechanism`.
-        shape: see `ReducedMechanism`.
+        tree: (f, 4) kinematic tree, see `ReducedMechanism`.
+        shape: (f, SHAPE_SIZE) geometry of the frames, see `ReducedMechanism`.
         first: index of the first tube.
-        frame: see `ReducedMotion`; written.
-        jacobian: see `ReducedMotion`; written.
-        bar: see `ReducedMotion`; LENGTH and LENGTH_ROW written.
+        frame: (f, FRAME_SIZE) orientation and origin of the frames, written; see `ReducedMotion`.
+        jacobian: (f, N, 6) their velocities per joint rate, written.
+        bar: (bars, 3 + N) lengths and their Jacobian, written.
 
     Returns:
         Nothing.
@@ -116,13 +118,15 @@ def compute_bar_frames(tree, shape, first, frame, jacobian, bar):
 
 @allocation_free
 def compute_bar_motion(tree, first, frame, bar):
-    """Compute the rates and accelerations of all bars, after `compute_bar_frames`.
+    """Compute the motion of all cylinders (bars): spin, accelerations, and rate of their length.
+
+    The accelerations are those at zero joint acceleration. `compute_bar_frames` comes first.
 
     Args:
-        tree: see `ReducedMechanism`.
+        tree: (f, 4) kinematic tree, see `ReducedMechanism`.
         first: index of the first tube.
-        frame: see `ReducedMotion`; written.
-        bar: see `ReducedMotion`; LENGTH_RATE and LENGTH_BIAS written.
+        frame: (f, FRAME_SIZE) motion of tubes and rods, written; see `ReducedMotion`.
+        bar: (bars, 3 + N) rate and acceleration of the lengths, written.
 
     Returns:
         Nothing.
@@ -194,7 +198,8 @@ def close_loops(mech, m, z):
     Returns:
         Maximum residual of a closure [m].
 
-    Source: Newton's method on the loop equations; J_b r_b = -J_f r_f for the rates.
+    Source: Newton's method on the loop equations; J_b r_b = -J_f r_f for the rates r, with the dependent
+        (b) and independent (f) columns of their Jacobian.
     """
     joint, free, bound = m.joint, mech.independent, mech.dependent
     n, nb, lost, far, worst = len(free), len(bound), False, 0.0, 0.0
@@ -239,7 +244,7 @@ def close_loops(mech, m, z):
 
 @allocation_free
 def compute_drift(mech, m):
-    """Compute the dependent accelerations at zero independent accelerations.
+    """Compute the accelerations of the dependent coordinates at zero independent accelerations.
 
     Args:
         mech: ReducedMechanism.
@@ -266,7 +271,14 @@ def compute_drift(mech, m):
 
 @allocation_free
 def _compute_residuals(tree, shape, first, frame, jacobian, loop):
-    """Compute the residuals of all closures and their Jacobian; return the maximum residual."""
+    """Compute the residuals of all closures and their Jacobian, and write them to `loop`.
+
+    `loop` (3 closures, N + 2) holds the Jacobian and, in column N, the residuals [m]. `first` is the frame
+    index of the first closure pin.
+
+    Returns:
+        Maximum residual [m].
+    """
     n, worst = loop.shape[1] - 2, 0.0
     for row in range(len(loop)):
         i, r = first + 2 * (row // 3), row % 3
@@ -282,7 +294,11 @@ def _compute_residuals(tree, shape, first, frame, jacobian, loop):
 
 @allocation_free
 def _factorise_loops(bound, loop, normal):
-    """Factorise `A' A` of the dependent columns, regularised by 1e-14 times its trace."""
+    """Factorise the normal matrix A'A of the loop equations for the dependent coordinates.
+
+    A are the columns `bound` of the Jacobian in `loop`. `normal` receives the Cholesky factor. The
+    diagonal is increased by 1e-14 times the trace, so that it stays positive definite.
+    """
     nb, trace = len(bound), 0.0
     for a in range(nb):
         for b in range(a + 1):
@@ -297,7 +313,11 @@ def _factorise_loops(bound, loop, normal):
 
 @allocation_free
 def _solve_loops(bound, loop, column, normal):
-    """Solve the loop equations for one column; write the result to the last row of `normal`."""
+    """Solve the loop equations `A x = -loop[:, column]` for the dependent coordinates by least squares.
+
+    A are the columns `bound` of `loop`, with the factor of `_factorise_loops` in `normal`. The solution
+    is written to the last row of `normal`.
+    """
     nb = len(bound)
     for a in range(nb):
         normal[nb, a] = 0.0
@@ -331,12 +351,12 @@ class ReducedMechanism(NamedTuple):
 
     Attributes:
         tree: (f, 4) columns PARENT (for a tube the link at its base pin, for a rod the link at its
-            rod pin), KIND, COORDINATE (tree coordinate of the joint, -1 without joint) and REACH
-            (only tree coordinates with a smaller index move the frame).
-        shape: (f, SHAPE) columns POSITION in the parent frame [m] (for tube and rod, of their
+            rod pin), KIND, COORDINATE (tree coordinate of the joint, -1 without joint) and
+            COORDINATE_END (only tree coordinates with a smaller index move the frame).
+        shape: (f, SHAPE_SIZE) columns POSITION in the parent frame [m] (for tube and rod, of their
             pins), AXIS of the joint (for tube and rod, of their pins, in the axes of the parent of
             the tube), COM [m] and INERTIA about it [kg m^2] in the frame's axes, MASS [kg], and
-            CLOSED, for a tube the pin-to-pin length at piston displacement 0 [m].
+            CLOSED_LENGTH, for a tube the pin-to-pin length at piston displacement 0 [m].
         link_count: l, number of links.
         bar_count: number of bars.
         joint: (2, N) rows DAMPING [N m s/rad] or [N s/m] and HOME [rad] or [m] of the tree
@@ -365,13 +385,16 @@ class ReducedMechanism(NamedTuple):
 
 
 def body_names(machine: Machine) -> list[str]:
-    """Return the body names of `make_reduced_mechanism(machine)`: world, links, `<axis>_tube`, `<axis>_rod`."""
+    """Return the names of the bodies of a reduced mechanism: world, links, `<axis>_tube`, `<axis>_rod`.
+
+    The order is that of the frames.
+    """
     bars = [n for n in actuator_order(machine) if machine.axes[n].cylinder]
     return ["world", *_sort_links(machine), *(f"{n}_{p}" for n in bars for p in ("tube", "rod"))]
 
 
 def coordinate_names(machine: Machine) -> list[str]:
-    """Return the names of the joints in the order of the tree coordinates."""
+    """Return the names of a machine's joints in the order of the coordinates of its reduced mechanism."""
     links = (machine.links[name] for name in _sort_links(machine))
     return [link.joint.name for link in links if link.joint]
 
@@ -438,7 +461,10 @@ def _shape_row(position=(0, 0, 0), axis=(0, 0, 1), com=(0, 0, 0), inertia=(0, 0,
 
 
 def _append_coordinate_end(tree: np.ndarray) -> np.ndarray:
-    """Append the column REACH to `tree`; tube and rod of a bar have the larger one of both."""
+    """Append the column COORDINATE_END to `tree` (f, 3): one plus the last coordinate that moves a frame.
+
+    Tube and rod of a bar have the larger value of both.
+    """
     reach = np.zeros(len(tree), int)
     for i, (parent, _, coordinate) in enumerate(tree[1:], start=1):
         reach[i] = max(reach[parent], coordinate + 1)
@@ -470,7 +496,7 @@ class ReducedMotion(NamedTuple):
     """Workspace and result of the functions of this module, for f frames and N coordinates.
 
     Attributes:
-        frame: (f, FRAME) columns TURN (9, row by row, rotation to the world), ORIGIN [m], SPIN
+        frame: (f, FRAME_SIZE) columns ROTATION (9, row by row, rotation to the world), ORIGIN [m], SPIN
             [rad/s], VELOCITY of the origin [m/s]; at zero joint acceleration SPIN_RATE [rad/s^2]
             and ACCELERATION of the origin minus gravity [m/s^2]; FORCE (6), force [N] and torque
             about the origin [N m] that this motion requires.
@@ -500,7 +526,7 @@ class ReducedMotion(NamedTuple):
 
 
 def make_reduced_motion(mech: ReducedMechanism) -> ReducedMotion:
-    """Allocate a workspace with the mechanism at home; the row of the world is constant."""
+    """Allocate the work arrays of a reduced mechanism, with its joints at home and the world at rest."""
     f, n, bound = len(mech.tree), mech.joint.shape[1], len(mech.dependent)
     frame = np.zeros((f, FRAME_SIZE))
     frame[:, ROTATION : ROTATION + 9] = np.eye(3).ravel()
@@ -541,14 +567,14 @@ def rotate_to_world(frame, i, x, y, z):
     """Rotate a vector from a frame to the axes of the world.
 
     Args:
-        frame: see `ReducedMotion`.
+        frame: (f, FRAME_SIZE) frames, see `ReducedMotion`.
         i: index of the frame.
-        x: scalar.
-        y: scalar.
-        z: scalar.
+        x: component along its x axis, scalar.
+        y: component along its y axis, scalar.
+        z: component along its z axis, scalar.
 
     Returns:
-        Its three components.
+        The three components in the world.
 
     Source: definition.
     """
@@ -561,13 +587,13 @@ def rotate_to_world(frame, i, x, y, z):
 
 @allocation_free
 def compute_origin(tree, shape, frame, jacobian, i):
-    """Compute the origin of a frame and its Jacobian, as a point fixed to the parent.
+    """Compute the world position of a frame's origin and its Jacobian, as a point fixed to the parent frame.
 
     Args:
-        tree: see `ReducedMechanism`.
-        shape: see `ReducedMechanism`.
-        frame: see `ReducedMotion`; written.
-        jacobian: see `ReducedMotion`; written, the spin part is that of the parent.
+        tree: (f, 4) kinematic tree, see `ReducedMechanism`.
+        shape: (f, SHAPE_SIZE) geometry of the frames, see `ReducedMechanism`.
+        frame: (f, FRAME_SIZE) frames, see `ReducedMotion`; the origin is written.
+        jacobian: (f, N, 6) velocities of the frames per joint rate; written, with the spin of the parent.
         i: index of the frame.
 
     Returns:
@@ -592,11 +618,11 @@ def compute_origin(tree, shape, frame, jacobian, i):
 
 @allocation_free
 def compute_origin_motion(tree, frame, i):
-    """Compute the rates and accelerations of a frame as if it were fixed to its parent.
+    """Compute velocity, spin and accelerations of a frame as if it were fixed to its parent.
 
     Args:
-        tree: see `ReducedMechanism`.
-        frame: see `ReducedMotion`; written, after `compute_origin`.
+        tree: (f, 4) kinematic tree, see `ReducedMechanism`.
+        frame: (f, FRAME_SIZE) frames after `compute_origin`; the motion of frame i is written.
         i: index of the frame.
 
     Returns:
@@ -625,7 +651,7 @@ def compute_origin_motion(tree, frame, i):
 
 @allocation_free
 def _rotate(frame, i, p, x, y, z, angle):
-    """Rotate frame i relative to frame p about an axis."""
+    """Set the orientation of frame i to that of frame p, rotated about an axis (x, y, z) of p by an angle [rad]."""
     c, s = np.cos(angle), np.sin(angle)
     k = 1.0 - c
     r00, r01, r02 = c + x * x * k, x * y * k - z * s, x * z * k + y * s
@@ -640,15 +666,15 @@ def _rotate(frame, i, p, x, y, z, angle):
 
 @allocation_free
 def compute_link_frames(tree, shape, links, joint, frame, jacobian):
-    """Compute the frames and Jacobians of the links.
+    """Compute pose and Jacobian of every link from the joint positions (forward kinematics).
 
     Args:
-        tree: see `ReducedMechanism`.
-        shape: see `ReducedMechanism`.
+        tree: (f, 4) kinematic tree, see `ReducedMechanism`.
+        shape: (f, SHAPE_SIZE) geometry of the frames, see `ReducedMechanism`.
         links: number of links.
-        joint: see `ReducedMotion`; the positions are read.
-        frame: see `ReducedMotion`; written.
-        jacobian: see `ReducedMotion`; written.
+        joint: (4, N) joint quantities, see `ReducedMotion`; the positions are read.
+        frame: (f, FRAME_SIZE) frames; orientations and origins are written.
+        jacobian: (f, N, 6) velocities of the frames per joint rate, written.
 
     Returns:
         Nothing.
@@ -681,14 +707,16 @@ def compute_link_frames(tree, shape, links, joint, frame, jacobian):
 
 @allocation_free
 def compute_link_motion(tree, links, joint, frame, jacobian):
-    """Compute the rates and accelerations of the links, after `compute_link_frames`.
+    """Compute velocity, spin and accelerations of every link from the joint rates.
+
+    The accelerations are those at zero joint acceleration. `compute_link_frames` comes first.
 
     Args:
-        tree: see `ReducedMechanism`.
+        tree: (f, 4) kinematic tree, see `ReducedMechanism`.
         links: number of links.
-        joint: see `ReducedMotion`; the rates are read.
-        frame: see `ReducedMotion`; written.
-        jacobian: see `ReducedMotion`; the joint axes are read.
+        joint: (4, N) joint quantities, see `ReducedMotion`; the rates are read.
+        frame: (f, FRAME_SIZE) frames; their motion is written.
+        jacobian: (f, N, 6) of `compute_link_frames`; the joint axes are read.
 
     Returns:
         Nothing.
@@ -717,7 +745,8 @@ def compute_link_motion(tree, links, joint, frame, jacobian):
 def compute_mass_and_bias(mech, m):
     """Compute the mass matrix and bias forces of the tree with its bars (Kane's projection).
 
-    `M = sum J' P` and `h = sum J' F` with the momenta P and the wrenches F of all bodies.
+    `M = sum J' P` and `h = sum J' F` over all bodies, with Jacobians J, momenta per unit rate P, and
+    wrenches F of inertia at zero joint acceleration and of gravity.
 
     Args:
         mech: ReducedMechanism.
@@ -752,7 +781,11 @@ def compute_mass_and_bias(mech, m):
 
 @allocation_free
 def _compute_body_wrench(shape, frame, jacobian, b, reach, momentum):
-    """Compute momentum per unit rate and the wrench of inertia and gravity about the origin."""
+    """Compute momentum per unit joint rate of body b, and its wrench of inertia and gravity.
+
+    Both are about the origin of its frame, in world axes; `momentum` and the FORCE columns of `frame` are
+    written. `reach` is the number of leading coordinates that can move the body.
+    """
     mass = shape[b, MASS]
     rx, ry, rz = rotate_to_world(frame, b, shape[b, COM], shape[b, COM + 1], shape[b, COM + 2])
     i0, i1, i2 = shape[b, INERTIA], shape[b, INERTIA + 1], shape[b, INERTIA + 2]

@@ -56,7 +56,10 @@ def cross(a, b):
 
 @allocation_free
 def point_acceleration(w, dw, arm):
-    """Return the acceleration `dw x r + w x (w x r)` of a point r of a rotating body."""
+    """Return the acceleration `dw x r + w x (w x r)` of a body's point at r = `arm` from its fixed origin.
+
+    w and dw are angular velocity [rad/s] and angular acceleration [rad/s^2].
+    """
     return add(cross(dw, arm), cross(w, cross(w, arm)))
 
 
@@ -80,13 +83,13 @@ def set_rotation(rows, k, r):
 
 @allocation_free
 def rotate(r, a):
-    """Return a vector rotated by r."""
+    """Return the vector a, rotated by the rotation matrix r (three row vectors)."""
     return dot(r[0], a), dot(r[1], a), dot(r[2], a)
 
 
 @allocation_free
 def rotate_back(r, a):
-    """Return a vector rotated by the inverse of r."""
+    """Return the vector a, rotated by the inverse (transpose) of the rotation matrix r."""
     return add(add(scale_vector(a[0], r[0]), scale_vector(a[1], r[1])), scale_vector(a[2], r[2]))
 
 
@@ -98,7 +101,7 @@ def compose_rotations(r, s):
 
 @allocation_free
 def axis_rotation(axis, angle):
-    """Return the rotation about a unit axis by an angle [rad] (Rodrigues)."""
+    """Return the rotation matrix (three row vectors) about a unit axis by an angle [rad] (Rodrigues)."""
     c, s = math.cos(angle), math.sin(angle)
     x, y, z = axis
     d = 1.0 - c
@@ -114,7 +117,13 @@ _MIN_RANK_RATIO = 1e-7  # minimum ratio of an orthogonalised column to the large
 
 @allocation_free
 def qr_factor(matrix, columns, q, r):
-    """Factorise selected columns by modified Gram-Schmidt, twice; False if rank deficient."""
+    """Compute the QR factorisation of selected columns of a matrix, by modified Gram-Schmidt done twice.
+
+    `q` (rows, count) and `r` (count, count) are written.
+
+    Returns:
+        Whether the columns are linearly independent.
+    """
     rows, count, size = len(matrix), len(columns), 0.0
     for j in range(count):
         total = 0.0
@@ -146,7 +155,10 @@ def qr_factor(matrix, columns, q, r):
 
 @allocation_free
 def qr_solve(q, r, count, right, column, answer, k):
-    """Solve least squares after `qr_factor`, from a column of `right` to column k of `answer`."""
+    """Solve a least-squares problem with the factors q and r of `qr_factor` for `count` unknowns.
+
+    The right-hand side is column `column` of `right`; the solution is written to column k of `answer`.
+    """
     for j in range(count - 1, -1, -1):
         total = 0.0
         for m in range(len(right)):
@@ -183,7 +195,7 @@ class Frames(NamedTuple):
 
 @compiled
 def make_frames(tree):
-    """Allocate the frames of a tree."""
+    """Allocate arrays for positions and motion of all bodies and joint axes of a joint tree."""
     b, v = len(tree.parent), len(tree.reference_position)
     return Frames(
         np.empty((b, 3)), np.empty((b, 3, 3)), np.empty((b, 3)), np.empty((b, 3)),
@@ -193,9 +205,15 @@ def make_frames(tree):
 
 @allocation_free
 def compute_frames(tree, q, rate, acceleration, ground, frames):
-    """Compute all frames from (v,) positions, rates and accelerations.
+    """Compute poses, velocities and accelerations of all bodies from the motion of the joints.
 
-    `ground` (3,) is the acceleration of the world, such as minus gravity.
+    Args:
+        tree: Tree of v joints.
+        q: (v,) joint positions [rad] or [m].
+        rate: (v,) joint rates [rad/s] or [m/s].
+        acceleration: (v,) joint accelerations [rad/s^2] or [m/s^2].
+        ground: (3,) acceleration of the world, such as minus gravity [m/s^2].
+        frames: Frames, written.
     """
     set_vector(frames.origin, 0, (0.0, 0.0, 0.0))
     set_vector(frames.angular_velocity, 0, (0.0, 0.0, 0.0))
@@ -241,17 +259,21 @@ def compute_frames(tree, q, rate, acceleration, ground, frames):
 
 @allocation_free
 def point_jacobian(tree, frames, j, point):
-    """Return the velocity of a point per unit rate of a joint that moves it."""
+    """Return the velocity of a point per unit rate of joint j, in the world frame.
+
+    This is a column of the point's Jacobian. The joint must move the point.
+    """
     way = get_vector(frames.axis, j)
     return way if tree.is_slide[j] else cross(way, subtract(point, get_vector(frames.anchor, j)))
 
 
 @allocation_free
 def compute_wrenches(frames, body, forces, torques):
-    """Compute force and torque (3, 10) at a body's origin per unit of the inertial parameters.
+    """Compute force and torque that a body's motion requires, per unit of its ten inertial parameters.
 
-    Forces and torques are in the world frame:
-    `f = m a + alpha x s + w x (w x s)` and `n = I alpha + w x I w + s x a` with s = m c.
+    `f = m a + alpha x s + w x (w x s)` and `n = I alpha + w x I w + s x a` with mass m, acceleration a of
+    the origin, s = m times the centre of mass, inertia I, angular velocity w and acceleration alpha.
+    `forces` and `torques` (3, 10) about the origin, in the world frame, are written.
     """
     t, a = get_rotation(frames.rotation, body), get_vector(frames.acceleration, body)
     w, dw = get_vector(frames.angular_velocity, body), get_vector(frames.angular_acceleration, body)

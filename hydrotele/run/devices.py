@@ -1,7 +1,9 @@
 """Input devices for interactive driving: keyboard, gamepad, SpaceMouse, or a script file.
 
-A device returns six handle axes (x out, y left, z up, rx the head, ry the tool, positive curls in,
-rz), the commands of additional machine axes, and whether to stop. The viewer window reports only
+A device replaces the joystick of the machine's operator. It returns six axes of the joystick's handle:
+x outwards, y to the left, z up, and the rotations rx (the head), ry (the tool; positive curls it in)
+and rz. It also returns commands of machine axes that the joystick does not move ("additional axes")
+and whether to stop. The viewer window reports only
 key presses, not releases. Each press therefore moves an axis by a fraction of its range, and the
 space bar centres all axes. Gamepad and SpaceMouse are read with pygame (the extra `drive`) through
 SDL, which treats both as joysticks.
@@ -43,8 +45,8 @@ class Reading(NamedTuple):
 
     Attributes:
         axes: x, y, z, rx, ry, rz of the handle, -1 .. 1 of its travel.
-        commands: commands of the axes that the joystick does not move, -1 .. 1, in the order of
-            the machine.
+        commands: commands of the machine axes that the joystick does not move, -1 .. 1, in the order
+            of the machine.
         quit: whether to stop the drive.
         user_message: message for the user, for example that the device was unplugged; empty without one.
     """
@@ -56,10 +58,10 @@ class Reading(NamedTuple):
 
 
 class Device(Protocol):
-    """An open input device."""
+    """An open input device; the interface of all devices in this module."""
 
     def read(self, time: float) -> Reading:
-        """Return the current input, `time` [s] after the start of the run."""
+        """Return the current input of the user at a time of the run [s]."""
         ...
 
     def close(self) -> None:
@@ -68,7 +70,7 @@ class Device(Protocol):
 
 
 def remove_dead_zone(value: float, dead_zone: float) -> float:
-    """Remove the dead zone from an axis value, keeping full scale at the end of its travel.
+    """Remove the dead zone around the centre from an axis value; full deflection still gives 1 or -1.
 
     Args:
         value: raw axis value of the device, -1 .. 1.
@@ -103,15 +105,18 @@ class SwitchedCommands:
         self.commands = [0.0] * count
 
     def step_up(self, number: int) -> None:
-        """Increase the command of an axis by one step: -1 to 0, or 0 to 1."""
+        """Increase the command of the axis with this index by one step: -1 to 0, or 0 to 1."""
         self._set(number, lambda now: min(1.0, now + 1.0))
 
     def step_down(self, number: int) -> None:
-        """Decrease the command of an axis by one step: 1 to 0, or 0 to -1."""
+        """Decrease the command of the axis with this index by one step: 1 to 0, or 0 to -1."""
         self._set(number, lambda now: max(-1.0, now - 1.0))
 
     def cycle_command(self, number: int) -> None:
-        """Advance the command of an axis in the cycle 0, 1, 0, -1, for a single button."""
+        """Advance the command of the axis with this index in the cycle 0, 1, 0, -1.
+
+        One button then suffices for the axis.
+        """
         if number < len(self.commands):
             now = self.commands[number]
             self._next_direction = -self._next_direction if now else self._next_direction
@@ -209,7 +214,7 @@ SPACEMOUSE_NAMES = ("space", "3dconnexion")
 
 
 class Keyboard:
-    """Keyboard input; `press` may be called from another thread."""
+    """Keyboard as an input device; another thread, such as the viewer's, may report key presses."""
 
     def __init__(self, n_additional_axes: int) -> None:
         """Start with all axes centred.
@@ -223,7 +228,7 @@ class Keyboard:
         self._quit = False
 
     def press(self, code: int) -> None:
-        """Queue a key press, given by its GLFW code."""
+        """Store a key press, given by its GLFW key code, until the next `read`."""
         self._pending_keys.append(code)
 
     def read(self, time: float) -> Reading:
@@ -257,7 +262,7 @@ class JoystickDevice:
 
         Args:
             kind: key of `LAYOUTS`.
-            sticks: object with the methods of `SdlJoysticks`: `find(kind)`, `changed()` and `close()`.
+            sticks: the connected devices: an `SdlJoysticks`, or an object with the same methods.
             further: number of axes that the joystick does not move.
 
         Raises:
@@ -289,7 +294,14 @@ class JoystickDevice:
         return Reading(axes, tuple(self._switches.commands), over, said)
 
     def _apply_buttons(self, held: set[str]) -> bool:
-        """Apply newly pressed buttons; return whether the quit button is among them."""
+        """Change the switched commands by newly pressed buttons.
+
+        Args:
+            held: buttons that are pressed, and directions of the hat.
+
+        Returns:
+            Whether the quit button is newly pressed.
+        """
         fresh, self._pressed_buttons = held - self._pressed_buttons, held
         switches, layout = self._switches, self._layout
         for way, act, number in (
@@ -325,7 +337,7 @@ def _read_handle_axes(stick: Any, layout: Layout) -> tuple[float, ...]:
 
 
 def _read_pressed_buttons(stick: Any, layout: Layout) -> set[str]:
-    """Return the numbers of the pressed buttons and the directions of the hat."""
+    """Return the numbers of the pressed buttons as text, and the directions of the hat (small cross)."""
     held = {str(b) for b in range(stick.get_numbuttons()) if stick.get_button(b)}
     if layout.uses_hat and stick.get_numhats():
         x, y = stick.get_hat(0)
@@ -364,7 +376,7 @@ class SdlJoysticks:
         return any(event.type in kinds for event in self._pygame.event.get())
 
     def find(self, kind: str) -> Any:
-        """Return the first device of a kind as a pygame joystick, or None."""
+        """Return the first connected device of a kind as a pygame joystick, or None."""
         for number in range(self._pygame.joystick.get_count()):
             stick = self._pygame.joystick.Joystick(number)
             named = any(part in stick.get_name().lower() for part in SPACEMOUSE_NAMES)
@@ -400,7 +412,7 @@ class Script(StrictModel):
 
 
 class ScriptedDevice:
-    """A device that plays a script."""
+    """An input device that plays the input of a script file."""
 
     def __init__(self, script: Script, further: tuple[str, ...], where: str) -> None:
         """Check the axes of the script.
@@ -439,7 +451,7 @@ class ScriptedDevice:
 
 
 def load_script(path: str | Path) -> Script:
-    """Read a script file.
+    """Read a script file: recorded or written input of a device over time.
 
     Args:
         path: a CSV or YAML file.

@@ -31,7 +31,7 @@ HAPTIC_CONTROL_RATE = 1000.0  # Hz, control rate with a haptic device; one physi
 
 
 def haptic_address(device: str) -> tuple[str, int]:
-    """Parse `haptic`, `haptic:HOST` or `haptic:HOST:PORT`.
+    """Return host and port of a haptic device from `haptic`, `haptic:HOST` or `haptic:HOST:PORT`.
 
     Args:
         device: value of the command-line option `--device`.
@@ -78,7 +78,10 @@ class HapticHandle:
         self._count, self._pressed_buttons, self._state = further, 0, "new"
 
     def attach(self, session: Session) -> None:
-        """Replace the simulated joystick of a session."""
+        """Replace the simulated joystick of a session by this haptic device.
+
+        From then on, the session sends its forces to the device and uses the measured handle motion.
+        """
         assert session.station
         station = session.station
         self.link.start(station.master_parameters, station.master_state, station.packet.shape)
@@ -96,7 +99,12 @@ class HapticHandle:
         return Reading(commands=tuple(self._switches.commands), user_message=said)
 
     def _connection_message(self, is_connected: bool, engaged: bool) -> str:
-        """Return a message if the state of the connection has changed, otherwise an empty text."""
+        """Return a message if the state of the connection has changed, otherwise an empty text.
+
+        Args:
+            is_connected: whether the device has answered recently.
+            engaged: whether the handle of the device moves the machine.
+        """
         before, self._state = (
             self._state,
             "gone" if not is_connected else "moves" if engaged else "waits",
@@ -137,7 +145,11 @@ class TimeKeeper(Protocol):
         ...
 
     def wait_for_tick(self, simulated: float) -> float:
-        """Wait until a simulated time is due; return the pause just inserted [s]."""
+        """Wait until the wall clock reaches a simulated time [s].
+
+        Returns:
+            The time by which the simulation was delayed because the computer is too slow [s].
+        """
         ...
 
     def close(self) -> None:
@@ -157,7 +169,7 @@ class Pacer:
         self, speed: float = 1.0, now: Callable[[], float] = clock.perf_counter,
         sleep: Callable[[float], None] = clock.sleep,
     ) -> None:  # fmt: skip
-        """Prepare the timer; it starts with the first call of `wait`.
+        """Prepare the timer; it starts with the first call of `wait_for_tick`.
 
         Args:
             speed: simulated time per real time [1]; 0 means as fast as possible.
@@ -169,7 +181,9 @@ class Pacer:
         self.pauses, self.total_delay = 0, 0.0
 
     def wait_for_tick(self, simulated: float) -> float:
-        """Wait until a simulated time is due.
+        """Wait until the wall clock reaches a simulated time.
+
+        If the simulation is more than 0.25 s late, simulated time is paused instead: it is not made up.
 
         Args:
             simulated: simulated time so far [s].
@@ -197,11 +211,11 @@ class Pacer:
 
 
 class LiveHandReference:
-    """Reference position of the handle from an input device, with the recorded input.
+    """Reference position of the joystick handle from an input device, with a record of the input.
 
     Attributes:
-        travel_range: (2, 6) dead-band edge and end of travel of every axis [m], [rad]; the range of a
-            device axis is mapped to the interval between them.
+        travel_range: (2, 6) edge of the dead band and end of travel of every handle axis [m], [rad]. The
+            range of a device axis is mapped to the interval between them.
     """
 
     def __init__(self, further: dict[str, float]) -> None:
@@ -221,7 +235,10 @@ class LiveHandReference:
         return self._reference
 
     def apply_reading(self, reading: Reading, session: Session) -> None:
-        """Apply a device reading from the next tick of the session on, and record it."""
+        """Set handle reference and commands of a session from a device reading, and record the changes.
+
+        They apply from the next control tick on.
+        """
         if reading.axes != self._before.axes:
             part, (dead, stop) = np.array(reading.axes), self.travel_range
             dead = np.where(dead < stop, dead, 0.0)
@@ -235,10 +252,10 @@ class LiveHandReference:
         self._before = reading
 
     def record_handle(self, handle: np.ndarray, time: float) -> None:
-        """Record the handle position (6,) [m], [rad] of a haptic device at a run time [s].
+        """Record the measured handle position (6,) [m], [rad] of a haptic device at a run time [s].
 
-        A repetition uses it as the reference of the simulated hand. The arm dynamics of that hand
-        make the repetition similar, but not bit-identical.
+        When the recorded scenario is simulated again, a simulated hand follows this position. Its arm
+        dynamics make the new run similar, but not bit-identical.
         """
         wanted = [round(value, _HANDLE_DECIMALS) for value in handle.tolist()]
         if wanted != self._reference.tolist():
@@ -253,7 +270,12 @@ class LiveHandReference:
         self._path.append(tuple(wanted.tolist()))
 
     def recorded_scenario(self, scenario: Scenario, duration: float) -> Scenario:
-        """Return the scenario that repeats the recorded input, with a duration [s]."""
+        """Return a copy of a scenario whose operator repeats the recorded input.
+
+        Args:
+            scenario: the scenario that was driven.
+            duration: duration of the copy [s].
+        """
         columns = zip(AXES, zip(*self._path, strict=True), strict=True)
         path = {name: list(values) for name, values in columns if any(values)}
         operator = FollowPath.model_validate(
@@ -303,7 +325,10 @@ TickCallback = Callable[[Session, Callable[[], Status], float], bool]
 
 
 def additional_axes(machine: Machine) -> dict[str, float]:
-    """Return the axes that the joystick does not move, with their command limits."""
+    """Return machine axis -> command limit, for the axes that the joystick does not move.
+
+    The limit is 1 for valves and in the unit of the drive for others.
+    """
     moved = arm_axes(machine)
     return {
         name: axis.force.command_limit if axis.force else 1.0
@@ -313,11 +338,11 @@ def additional_axes(machine: Machine) -> dict[str, float]:
 
 
 def with_live_operator(scenario: Scenario, further: Iterable[str]) -> Scenario:
-    """Replace the operator of a teleoperated scenario by a live one.
+    """Return a copy of a teleoperated scenario whose operator is a live user.
 
     Args:
         scenario: a scenario with `pilot.kind: teleop`.
-        further: axes that are commanded with buttons.
+        further: axes that the user commands with buttons, because the joystick does not move them.
 
     Raises:
         InputError: the scenario has no joystick.
@@ -335,7 +360,7 @@ def drive_scenario(
     scenario: Scenario, machine: Machine, device: Device, pacer: TimeKeeper,
     watch: TickCallback, say: Callable[[str], None],
 ) -> Run:  # fmt: skip
-    """Run a teleoperated scenario with an input device.
+    """Run a teleoperated scenario in which a user moves the machine with an input device.
 
     Args:
         scenario: the scenario; its duration is the maximum duration of the run.
@@ -395,7 +420,7 @@ def drive_scenario(
 
 
 class _MessageReporter:
-    """Passes on each note and event of a session once."""
+    """Reporter that passes each new note and event of a session to the user once."""
 
     def __init__(self, session: Session, say: Callable[[str], None]) -> None:
         assert session.station
@@ -410,7 +435,7 @@ class _MessageReporter:
             self._say(f"computer too slow for real time: paused, {pacer.total_delay:.2f} s in total")
 
     def report_new_messages(self) -> None:
-        """Report new notes and events."""
+        """Pass on the notes and events of the session since the last call."""
         notes, events = self._notes, self._events
         if self._count == [len(notes), len(events)]:
             return

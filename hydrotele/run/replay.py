@@ -146,7 +146,10 @@ def replay_log(
 
 
 def _used_rows(log: Log, channel: str) -> np.ndarray:
-    """Return (n,) whether a replay uses a row of a required channel: all commands, first positions."""
+    """Return (n,) whether a replay needs the value of a channel in a row of the log.
+
+    It needs the commands of all rows, and of other channels only the first row.
+    """
     return np.full(len(log), True) if channel.startswith("command.") else np.arange(len(log)) == 0
 
 
@@ -172,7 +175,7 @@ def _initial_state_from_log(plant: Plant, log: Log) -> dict[str, Any]:
 
 
 def _first_true_value(plant: Plant, log: Log, channel: str) -> float:
-    """Return the first reading of a channel, corrected for the sensor's offset and scale."""
+    """Return the true value at the first row of a log: the reading without the sensor's offset and scale."""
     error = plant.machine.sensor_errors.get(channel, SensorError())
     return (float(log[channel][0]) - error.offset) / error.scale
 
@@ -208,7 +211,16 @@ def _initial_state_from_metadata(plant: Plant, log: Log) -> dict[str, Any]:
 
 
 def _read_finite_vector(state: dict, key: str, *sizes: int) -> np.ndarray:
-    """Return a state entry as finite numbers of one of these sizes; a scalar without sizes."""
+    """Return the finite numbers of an entry of a state dictionary.
+
+    Args:
+        state: key -> number or list of numbers.
+        key: the entry.
+        *sizes: allowed lengths; without any, the entry must be a single number.
+
+    Raises:
+        ValueError: the entry has another shape, or a number is not finite.
+    """
     values = np.asarray(state[key], dtype=float)
     if values.shape not in ([(size,) for size in sizes] or [()]) or not np.isfinite(values).all():
         raise ValueError(f"{key} must be {sizes[0] if sizes else 1} finite numbers")
@@ -258,7 +270,10 @@ def _differences(log: Log, simulated: Log, machine: Machine) -> dict[str, Channe
 
 
 def _full_scale(machine: Machine, channel: str) -> float | None:
-    """Return the full scale: relief pressure for pressures, stroke for lengths, otherwise None."""
+    """Return the full scale of a channel, to which its errors are related.
+
+    It is the relief pressure for pressures [Pa] and the stroke for lengths [m], otherwise None.
+    """
     kind, _, axis = channel.partition(".")
     if kind.startswith("pressure") and machine.supply:
         return machine.supply.relief_pressure

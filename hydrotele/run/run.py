@@ -77,7 +77,7 @@ TICK_LOOP_RECORD = np.dtype(
 
 
 class TickLoop(NamedTuple):
-    """Arguments of the compiled tick loop, in addition to machine, plan and station.
+    """Arguments of the compiled loop over control ticks, in addition to machine, plan and station.
 
     Attributes:
         record: (1,) record of type `TICK_LOOP_RECORD`.
@@ -93,7 +93,7 @@ class TickLoop(NamedTuple):
 def make_tick_loop(
     model: mujoco.MjModel, data: mujoco.MjData, steps: int, every: int, rows: int, period: float
 ) -> TickLoop:  # fmt: skip
-    """Create the record of the compiled tick loop.
+    """Create the record that the compiled loop over control ticks needs.
 
     Args:
         model: MuJoCo model of the plant.
@@ -116,20 +116,21 @@ def make_tick_loop(
 
 @compiled
 def run_planned_ticks(ticks, simulated, planned, row, contacts, first, last, stopped):
-    """Simulate control ticks of a planned run.
+    """Simulate control ticks of a run in which the motion of all axes is planned.
 
     Args:
         ticks: `TickLoop.record`, modified.
-        simulated: record of `simulate.stepping.simulation_record`.
-        planned: record of `control.tick.planned_record`.
-        row: record of a `Recorder`.
-        contacts: record of `simulate.record.contact_record`.
+        simulated: record of the machine, from `simulate.stepping.simulation_record`.
+        planned: record of plan and controller, from `control.tick.planned_run_record`.
+        row: record of the log rows, from a `Recorder`.
+        contacts: record of contact forces, from `simulate.record.contact_record`.
         first: first control tick, scalar.
         last: control tick before which to stop, scalar.
         stopped: whether all commands are set to 0, scalar.
 
     Returns:
-        The next tick, scalar: `last`; or -1 - k if the log row of tick k is not finite.
+        The next tick, scalar: `last`; or -1 - k if the log row of tick k contains values that are not
+        finite, because the simulation is unstable.
 
     Source: `control.tick`.
     """
@@ -145,18 +146,19 @@ def run_planned_ticks(ticks, simulated, planned, row, contacts, first, last, sto
 def run_teleoperated_ticks(
     ticks, simulated, planned, row, contacts, station, flotor, first, last, stopped
 ):  # fmt: skip
-    """Simulate control ticks of a teleoperated run until Python must process the station.
+    """Simulate control ticks of a run in which an operator moves the machine with a joystick.
 
-    The loop stops before the physics of such a tick.
+    The loop stops before the physics of a tick at which Python must process the operator station, for
+    example to check its safety conditions.
 
     Args:
-        ticks: see `run_planned_ticks`, modified.
-        simulated: see `run_planned_ticks`.
-        planned: see `run_planned_ticks`.
-        row: see `run_planned_ticks`.
-        contacts: see `run_planned_ticks`.
-        station: see `teleop.round_trip`.
-        flotor: see `teleop.round_trip`.
+        ticks: `TickLoop.record`, modified.
+        simulated: record of the machine, as for `run_planned_ticks`.
+        planned: record of plan and controller, as for `run_planned_ticks`.
+        row: record of the log rows, as for `run_planned_ticks`.
+        contacts: record of contact forces, as for `run_planned_ticks`.
+        station: record of the operator station, see `teleop.round_trip`.
+        flotor: record of the moving part of the joystick, see `teleop.round_trip`.
         first: first control tick, already prepared by the station, scalar.
         last: control tick before which to stop, scalar.
         stopped: whether the machine has been stopped permanently, scalar.
@@ -179,7 +181,11 @@ def run_teleoperated_ticks(
 
 @compiled
 def _record_row(r, row, contacts, tick):
-    """Write the log row of a tick, if one is due; return False if it is not finite."""
+    """Write the log row of a control tick, if one is due.
+
+    Returns:
+        False if the row contains a value that is not finite, otherwise True.
+    """
     if tick % r.every != 0 or tick // r.every >= r.rows:
         return True
     return record_row(row, contacts, tick // r.every, tick * r.period)
@@ -187,7 +193,9 @@ def _record_row(r, row, contacts, tick):
 
 @compiled
 def update_max_pin_opening(ticks):
-    """Update the largest pin opening of the run.
+    """Update the largest pin opening of the run by that of the present state.
+
+    A pin joins two links of a closed kinematic loop; its opening is the distance of the two points.
 
     Args:
         ticks: `TickLoop.record`, modified.
@@ -224,13 +232,13 @@ def compile_ticks() -> None:
 
 
 class PreparedRun(NamedTuple):
-    """A scenario that is ready for its first step.
+    """A machine, its initial state and a plan: all that a scenario needs for its first step.
 
     Attributes:
         plant: the simulated machine.
         data: its MuJoCo data in the initial state.
-        plan: reference and commands over time.
-        sensor_feedback: sensor feedback of the controller.
+        plan: references and commands of the axes over time.
+        sensor_feedback: simulated sensor readings that the controller uses.
     """
 
     plant: Plant
@@ -268,7 +276,8 @@ class Session:
 
     Attributes:
         plant: the simulated machine.
-        data: its MuJoCo data, with positions and velocities staggered (`simulate.record`).
+        data: its MuJoCo data; positions and velocities are half a physics step apart, as in leapfrog
+            integration (`simulate.record`).
         scenario: the scenario.
         sensor_feedback: sensor feedback of the controller.
         station: operator station of a teleoperated run, otherwise None.
@@ -288,9 +297,9 @@ class Session:
         """Allocate the arrays of the whole run and prepare the first tick.
 
         Args:
-            prepared: result of `prepare`.
+            prepared: machine, initial state and plan.
             scenario: the scenario.
-            nominal: machine of the scenario without planted effects.
+            nominal: machine of the scenario without the effects that are hidden from the controller.
             hand: function that returns a live operator's reference position of the handle.
 
         Raises:
@@ -365,7 +374,11 @@ class Session:
                 self._begin = clock.perf_counter()
 
     def _run_ticks(self, end: int) -> None:
-        """Run compiled ticks until a given tick, or until Python must act."""
+        """Run control ticks in compiled code up to tick `end` or to one at which Python must act.
+
+        Python acts if surroundings change, sensor readings must be recorded, or the operator station needs
+        it. The current tick is advanced by at least one.
+        """
         first, station, stepper = self.tick, self.station, self._stepper
         if self._around.needs_update or not first:
             end = first + 1
@@ -413,7 +426,7 @@ class Session:
         return self._around.events
 
     def finish(self) -> SessionResult:
-        """Stop the run and return its result, cut to complete log rows.
+        """Stop the run and return its result, without an incomplete last log row.
 
         Raises:
             InputError: the run has fewer than the ten rows that a log needs.
@@ -491,7 +504,7 @@ def summarise(
 
 
 def _find_impossible_states(plant: Plant, record: Record) -> list[str]:
-    """Return warnings about physically impossible states."""
+    """Return a warning if a chamber pressure falls below absolute vacuum in a run, otherwise an empty list."""
     if not plant.hydraulic:
         return []
     act = record.act[:, : ACTIVATIONS_PER_AXIS * plant.hydraulic]
@@ -506,7 +519,11 @@ def _find_impossible_states(plant: Plant, record: Record) -> list[str]:
 
 
 def _tracking_errors(plant: Plant, plan: Plan, record: Record) -> dict[str, Any]:
-    """Return RMS and maximum tracking error of every closed-loop axis and of the tip pose."""
+    """Return RMS and maximum of the tracking errors of a run, as name -> rms, max and unit.
+
+    The errors are actual minus reference position of every closed-loop axis. If the plan gives a pose of
+    the arm's tip, those of radius, height and attitude are included.
+    """
     rows = np.searchsorted(plan.time, record.time - 1e-9)
     result: dict[str, Any] = {}
     for i, name in enumerate(plan.axes):
@@ -587,7 +604,7 @@ class Run:
 
 
 def load_nominal_machine(scenario: Scenario) -> Machine:
-    """Load the machine of a scenario without its planted effects.
+    """Load the machine of a scenario as its controller knows it, without the scenario's effects.
 
     Raises:
         InputError: unknown machine or tool.
@@ -596,7 +613,7 @@ def load_nominal_machine(scenario: Scenario) -> Machine:
 
 
 def load_simulated_machine(scenario: Scenario) -> Machine:
-    """Load the machine of a scenario with its planted effects.
+    """Load the machine of a scenario with the effects that the scenario adds to it.
 
     Raises:
         InputError: unknown machine, tool, effect or location.
@@ -608,7 +625,7 @@ def load_simulated_machine(scenario: Scenario) -> Machine:
 
 
 def prepare(scenario: Scenario) -> PreparedRun:
-    """Build the plant of a scenario, set its initial state and plan the run.
+    """Build the simulated machine of a scenario, set its initial state and plan the run.
 
     Raises:
         InputError: the scenario does not fit the machine.
@@ -627,7 +644,7 @@ def prepare(scenario: Scenario) -> PreparedRun:
 
 
 def run_scenario(scenario: Scenario, progress: Progress | None = None) -> Run:
-    """Simulate a scenario.
+    """Simulate a scenario from start to end.
 
     Args:
         scenario: the scenario.
@@ -701,14 +718,27 @@ def finish_run(session: Session, scenario: Scenario) -> Run:
 
 
 def _add_station_channels(log: Log, station: TeleoperationLog, scenario: Scenario) -> Log:
-    """Return a log with the channels of the operator station added."""
+    """Return a copy of a machine's log with the channels of the operator station added.
+
+    Args:
+        log: log of the machine.
+        station: record of the operator station, by control tick.
+        scenario: scenario with control rate and log rate.
+    """
     every = round(scenario.control_rate / scenario.log_rate)
     columns, units = station.channels(every, scenario.row_count)
     return dataclasses.replace(log, columns={**log.columns, **columns}, units={**log.units, **units})
 
 
 def _logs(plant: Plant, scenario: Scenario, record: Record, seen: Feedback) -> tuple[Log, Log]:
-    """Return the truth log and the measured log; the latter has the errors the controller saw."""
+    """Return the log of the true values and the log of the sensor readings of a run.
+
+    Args:
+        plant: the simulated machine.
+        scenario: the scenario.
+        record: states at the log rows.
+        seen: readings that the controller used; the second log has the same sensor errors.
+    """
     machine = plant.machine
     values, units = true_channels(plant, record)
     truth = _log(scenario, machine, record.time, values, units, "ideal")
@@ -799,7 +829,10 @@ def _initial_state(plant: Plant, record: Record) -> dict[str, Any]:
 
 
 def _internal_states(plant: Plant, record: Record) -> dict[str, dict[str, float]]:
-    """Return the internal states of bristles, pump and terms at the start, by kind and owner."""
+    """Return the states in addition to motion, spools and pressures at the first row of a run.
+
+    They belong to friction before sliding, pump and added effects: kind -> owner -> value.
+    """
     found: dict[str, dict[str, float]] = {}
     for name, place in plant.extra_states.items():
         kind, _, owner = name.partition(".")

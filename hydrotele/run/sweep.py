@@ -86,7 +86,7 @@ class SweepTable(NamedTuple):
 def make_table(
     sweep: Sweep, seed: int, entries: Mapping[int, JournalEntry], effect_units: Mapping[str, str]
 ) -> SweepTable:
-    """Create the table of all runs.
+    """Create the table of all runs of a sweep.
 
     Args:
         sweep: the sweep.
@@ -142,7 +142,12 @@ def save_table(table: SweepTable, name: str, path: Path) -> None:
 
 
 def _to_arrow_array(pa, values: Sequence[Any]):
-    """Return a column as booleans, integers, floats, or JSON text for all other values."""
+    """Return a column as an Arrow array of booleans, integers or floats; other values become JSON text.
+
+    Args:
+        pa: the module pyarrow.
+        values: values of the column, None where missing.
+    """
     kinds = {type(value) for value in values if value is not None}
     if kinds == {bool}:
         return pa.array(values, pa.bool_())
@@ -162,7 +167,10 @@ _FORCE_AND_BALANCE_FIGURES = (
 
 
 def choose_figures(table: SweepTable) -> list[str]:
-    """Return up to six numbers that differ between runs: tracking errors, forces, balances."""
+    """Return the names of up to six numbers to plot: tracking errors, forces, balances.
+
+    Only numbers that differ between the runs are chosen.
+    """
     axes = [n for n in table.number_names if n.startswith("tracking.") and n.endswith(".rms")]
     followed = [n for n in _TIP_FIGURES if n in axes] or axes
     ordered = dict.fromkeys([*followed, *(n for n in _FORCE_AND_BALANCE_FIGURES if n in table.number_names), *axes])
@@ -177,7 +185,15 @@ def _values_by_run(table: SweepTable, name: str) -> dict[int, float]:
 
 
 def compute_statistics(table: SweepTable, figures: list[str]) -> dict[str, dict[str, Any]]:
-    """Return minimum, median and maximum of numbers, with the runs of the extremes."""
+    """Return minimum, median and maximum over all runs of some columns.
+
+    Args:
+        table: table of the sweep.
+        figures: column names.
+
+    Returns:
+        Column name -> `unit`, `min`, `median`, `max`, and the runs `min_run` and `max_run`.
+    """
     found = {}
     for name in figures:
         known = _values_by_run(table, name)
@@ -254,7 +270,12 @@ def _run_on_client(client, distributed, waiting: Iterator[RunTask]) -> Iterator[
 
 
 def _future_outcome(distributed, future, run: int) -> Outcome:
-    """Return the outcome of a cluster task.
+    """Return the outcome of a run whose dask task has ended, also if its workers were lost.
+
+    Args:
+        distributed: the module dask.distributed.
+        future: the task.
+        run: number of the run.
 
     Raises:
         InputError: the cluster failed, not the run.
@@ -290,7 +311,7 @@ _RESULT_PACKAGES = (
 
 
 def result_versions() -> dict[str, str]:
-    """Return the versions of the packages that affect the results of a run."""
+    """Return package name -> version of hydrotele and of the packages that affect results of runs."""
     return {
         "hydrotele": hydrotele.__version__,
         **{name: version(name) for name in _RESULT_PACKAGES},
@@ -298,7 +319,10 @@ def result_versions() -> dict[str, str]:
 
 
 def sweep_identity(base: SweepBase, checked: CheckedSweep) -> dict[str, Any]:
-    """Return the data that must be equal for a sweep to continue in an existing folder."""
+    """Return the data that must be equal for a sweep to continue in an existing folder.
+
+    They are the content of the sweep file, a hash of all scenarios, and the package versions.
+    """
     facts = base.file.sweep.model_dump(mode="json", exclude=set(_KEYS_WITHOUT_EFFECT))
     return {"sweep": facts, "scenarios": checked.digest, "versions": result_versions()}
 
@@ -345,7 +369,7 @@ def sweep_folder(target: Path, base: SweepBase, checked: CheckedSweep, fresh: bo
 
 
 def write_summary(folder: Path, base: SweepBase, facts: dict[str, Any]) -> None:
-    """Write `summary.json` with the kind and the identity of the sweep folder."""
+    """Write `summary.json` of a sweep folder: kind, name, number of runs, and further entries."""
     summary = {"kind": KIND, "name": base.file.name, "runs": base.file.sweep.runs, **facts}
     with atomic_file(folder / "summary.json", ".json") as part:
         part.write_text(json.dumps(summary, indent=2) + "\n")
@@ -363,7 +387,13 @@ def _resolved_yaml(base: SweepBase) -> str:
 
 @contextlib.contextmanager
 def _lock_folder(target: Path) -> Iterator[None]:
-    """Lock the folder; the operating system releases the lock when the process ends."""
+    """Lock a sweep folder against other processes while the context is open.
+
+    The operating system releases the lock if the process dies.
+
+    Raises:
+        InputError: another process has locked it.
+    """
     handle = os.open(target, os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -377,7 +407,10 @@ def _lock_folder(target: Path) -> Iterator[None]:
 
 
 def _describe_differences(old: dict[str, Any], new: dict[str, Any]) -> Iterator[str]:
-    """Yield the differences between two identities; the digest only without other differences."""
+    """Yield the differences between two results of `sweep_identity` as sentences.
+
+    A changed hash of the scenarios is named only if nothing else differs.
+    """
     before, after = (_flatten({k: i.get(k) for k in ("sweep", "versions")}) for i in (old, new))
     found = False
     for key in dict.fromkeys([*before, *after]):
@@ -421,7 +454,10 @@ class _Worker:
         self.ready, self.task = False, None
 
     def send_task(self, task: RunTask) -> None:
-        """Send a run to the process; the next wait detects a dead process."""
+        """Send a run to the process.
+
+        If the process is dead, nothing is raised; the next wait for its answer detects it.
+        """
         self.task = task
         with contextlib.suppress(OSError):
             self.connection.send(task)
@@ -475,7 +511,7 @@ def run_in_processes(tasks: Iterable[RunTask], jobs: int) -> Generator[Outcome]:
 
 
 def _receive(worker: _Worker) -> Any:
-    """Return the next message of a worker, None if its process is dead."""
+    """Return the next message of a worker process (an outcome, or ready), None if it is dead."""
     try:
         return worker.connection.recv()
     except Exception:  # the process may have died while it sent a message
@@ -483,7 +519,11 @@ def _receive(worker: _Worker) -> Any:
 
 
 def _dead_worker_outcome(worker: _Worker) -> Outcome:
-    """Return the outcome of a run whose process died."""
+    """Return the outcome of the run whose worker process died, with the signal or exit status.
+
+    Raises:
+        InputError: the process died before it could accept a run.
+    """
     worker.stop()
     code = worker.process.exitcode or 0
     how = signal.Signals(-code).name if code < 0 else f"exit status {code}"
@@ -496,7 +536,10 @@ def _dead_worker_outcome(worker: _Worker) -> Outcome:
 
 @contextlib.contextmanager
 def _child_process_environment() -> Iterator[None]:
-    """Let child processes use one thread and ignore Ctrl-C, which this process handles."""
+    """Context in which started processes get one thread each and ignore Ctrl-C.
+
+    This process handles Ctrl-C for them.
+    """
     old = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
@@ -512,7 +555,7 @@ def _child_process_environment() -> Iterator[None]:
 
 
 def _worker_main(connection: Connection) -> None:
-    """Execute runs until the parent process ends."""
+    """Execute runs received over a connection and send back the outcomes, until the parent process ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     tasks: queue.SimpleQueue[RunTask] = queue.SimpleQueue()
     threading.Thread(target=_receive_tasks, args=(connection, tasks), daemon=True).start()
@@ -522,7 +565,7 @@ def _worker_main(connection: Connection) -> None:
 
 
 def _receive_tasks(connection: Connection, tasks: queue.SimpleQueue) -> None:
-    """Receive tasks; exit this process immediately when the parent process ends."""
+    """Put received runs into a queue; exit this process immediately when the parent process ends."""
     try:
         while True:
             tasks.put(connection.recv())
@@ -608,7 +651,13 @@ def run_sweep(
 
 
 def _find_missing_runs(base: SweepBase, journal: Journal, retry_failed: bool) -> dict[int, Point]:
-    """Return the runs to execute, by number."""
+    """Return run number -> point, for the runs that the journal does not contain.
+
+    Args:
+        base: the sweep.
+        journal: journal of the finished runs.
+        retry_failed: include the failed runs.
+    """
     if retry_failed:
         done = {run for run, entry in journal.entries.items() if entry.status == OK}
     else:
@@ -620,7 +669,17 @@ def _execute_runs(
     base: SweepBase, target: Path, journal: Journal, missing: dict[int, Point], how: SweepSettings,
     checked: CheckedSweep, progress: Progress | None,
 ) -> None:  # fmt: skip
-    """Execute the missing runs and write each to the journal."""
+    """Execute the missing runs of a sweep; write each to the journal, and its folder if logs are kept.
+
+    Args:
+        base: the sweep.
+        target: folder of the sweep.
+        journal: its open journal.
+        missing: run number -> point of the runs to execute.
+        how: execution settings.
+        checked: result of `check_points`.
+        progress: called after each run, see `run_sweep`.
+    """
     total, done = base.file.sweep.runs, base.file.sweep.runs - len(missing)
     failed = sum(e.status == FAILED for r, e in journal.entries.items() if r not in missing)
     tasks = (_make_task(base, target, how, checked, point) for point in missing.values())
@@ -652,7 +711,11 @@ def _make_task(base: SweepBase, target: Path, how: SweepSettings, checked: Check
 
 
 def _check_versions(outcome: Outcome) -> None:
-    """Check that a worker has the same software versions, so that results are comparable."""
+    """Check that the worker of a run had the same software versions as this process.
+
+    Raises:
+        InputError: a version differs, so that results would not be comparable.
+    """
     ours = result_versions()
     for name, theirs in outcome.versions.items():
         if ours.get(name, theirs) != theirs:
@@ -660,7 +723,7 @@ def _check_versions(outcome: Outcome) -> None:
 
 
 def _write_run_folder(base: SweepBase, target: Path, point: Point, outcome: Outcome) -> None:
-    """Write the folder of a run atomically."""
+    """Write the files of a run to its folder `runs/NUMBER` of a sweep: all or none."""
     name = f"{point.run:0{max(4, len(str(base.file.sweep.runs)))}d}"
     with atomic_folder(target / "runs" / name, "run") as folder:
         for file, content in outcome.files.items():

@@ -1,4 +1,4 @@
-"""Sweep files: which scenario keys are varied, and by which values.
+"""Sweep files: sets of runs of one scenario in which keys of the scenario are varied.
 
 Keys are those of `hydrotele run --set key=value`, for example `servo.position_gain` or
 `effects.0.parameters.mass`. The points of a sweep are the values of each run, in a fixed order.
@@ -153,7 +153,7 @@ class Sweep(StrictModel):
 
     @property
     def varied_keys(self) -> tuple[str, ...]:
-        """Keys that differ between runs, without the seed of repetitions."""
+        """Keys of the grid and of the samples; the seed of repetitions is not included."""
         return (*self.grid, *(self.sample.keys if self.sample else ()))
 
 
@@ -176,13 +176,13 @@ class SweepFile(NamedTuple):
         return self.sweep.name or self.path.stem
 
     def format_location(self, *keys: str | int) -> str:
-        """Return file, line and key path as text for messages."""
+        """Return file, line and key path as text for messages, for example `a.yaml:3: grid.seed`."""
         found = (self.lines[keys[:k]] for k in range(len(keys), 0, -1) if keys[:k] in self.lines)
         line = next(found, None)
         return f"{self.path}{f':{line}' if line else ''}: {'.'.join(map(str, keys))}"
 
     def locations_of(self, key: str) -> Iterator[str]:
-        """Yield the places in this file that set a scenario key."""
+        """Yield file, line and key path of the places in this file that set a scenario key."""
         sample = self.sweep.sample
         if key in self.sweep.grid:
             yield self.format_location("grid", key)
@@ -269,7 +269,7 @@ def iterate_points(sweep: Sweep) -> Iterator[Point]:
 
 
 def draw_samples(sweep: Sweep) -> list[dict[str, Any]]:
-    """Return the samples as varied key -> value; one empty sample if no key is sampled.
+    """Draw the random samples of a sweep, each as key -> value; one empty sample if the sweep has none.
 
     Each number depends only on the seed, the sample number and the key. Adding samples or keys
     therefore leaves the other numbers unchanged.
@@ -297,12 +297,17 @@ def _draw_value(seed: int, k: int, key: str, where: Distribution) -> Any:
 
 
 def override_text(value: Any) -> str:
-    """Return a value as YAML text for `--set`."""
+    """Return a value as text for the command-line option `--set key=value`."""
     return json.dumps(value, ensure_ascii=False)
 
 
 def point_overrides(sweep: Sweep, values: dict[str, Any]) -> dict[str, str]:
-    """Return the overrides of the base scenario: those of all runs, then those of one point."""
+    """Return scenario key -> value as text, by which a run differs from the base scenario.
+
+    Args:
+        sweep: the sweep, whose `set` applies to all runs.
+        values: varied key -> value of the run.
+    """
     return {key: override_text(value) for key, value in (sweep.set | values).items()}
 
 
@@ -311,12 +316,12 @@ _Machines = dict[tuple[str, str | None], Machine]
 
 
 class SweepBase(NamedTuple):
-    """A sweep with its base scenario and user machines.
+    """A sweep with the files that its runs need.
 
     Attributes:
         file: the sweep.
-        scenario: file of the base scenario.
-        machine_copies: user machines.
+        scenario: content of the base scenario, which the runs vary.
+        machine_copies: copies of the machines that are not shipped with the package.
     """
 
     file: SweepFile
@@ -357,7 +362,9 @@ def open_base(file: SweepFile) -> SweepBase:
 
 
 def scenario_of(base: SweepBase, point: Point) -> Scenario:
-    """Return the scenario of a point, with the paths of user machines in the sweep folder.
+    """Return the scenario of one run of a sweep.
+
+    It refers to the copies of user machines in the sweep folder.
 
     Raises:
         InputError: the scenario is invalid.
@@ -367,18 +374,24 @@ def scenario_of(base: SweepBase, point: Point) -> Scenario:
 
 
 def _repeat_scenario(base: SweepBase, scenario: Scenario, repetition_number: int) -> Scenario:
-    """Return a repetition of a scenario, with the paths of user machines in the sweep folder."""
+    """Return a copy of a scenario whose seed is increased by the number of the repetition.
+
+    It refers to the copies of user machines in the sweep folder.
+    """
     seed = scenario.seed + repetition_number
     return base.machine_copies.with_copied_paths(scenario.model_copy(update={"seed": seed}))
 
 
 def fingerprint(scenario: Scenario) -> bytes:
-    """Return a 16-byte hash of a scenario, independent of the folder of its files."""
+    """Return a 16-byte hash of a scenario, which shows whether its content has changed.
+
+    For a result of `scenario_of`, the folder of the scenario's files does not matter.
+    """
     return hashlib.sha256(scenario.model_dump_json().encode()).digest()[:16]
 
 
 def check_points(base: SweepBase, progress: Progress | None = None) -> CheckedSweep:
-    """Check the scenarios of all points of a sweep.
+    """Check the scenarios of all runs of a sweep, with machine, effects and sensors.
 
     Args:
         base: result of `open_base`.
@@ -412,7 +425,16 @@ def check_points(base: SweepBase, progress: Progress | None = None) -> CheckedSw
 
 
 def _check_values_of_point(base: SweepBase, values: dict[str, Any], machines: _Machines) -> Scenario:
-    """Return the scenario for some values after checking its machine, effects and sensors."""
+    """Return the scenario with some varied values, after checking its machine, effects and sensors.
+
+    Args:
+        base: the sweep.
+        values: varied key -> value.
+        machines: machines loaded so far, by name and tool; a new one is added.
+
+    Raises:
+        InputError: the scenario is invalid.
+    """
     scenario = make_scenario(base.scenario, point_overrides(base.file.sweep, values))
     machine = _machine_of(scenario, machines)
     get_sensors(machine, scenario.sensors)
@@ -429,7 +451,10 @@ def _machine_of(scenario: Scenario, machines: _Machines) -> Machine:
 
 
 def _locate_error(base: SweepBase, point: Point, machines: _Machines, error: InputError) -> InputError:
-    """Return the error of a point with the place in the sweep file that causes it."""
+    """Return the error of a run with the line of the sweep file that causes it.
+
+    The values of the run are checked one at a time; the first that gives the same error is the cause.
+    """
     file = base.file
     for values in ({}, *({key: value} for key, value in point.values.items())):
         try:
@@ -466,7 +491,7 @@ def _message_without_options(error: InputError) -> str:
 
 
 def _effect_units(scenario: Scenario, varied: tuple[str, ...], machines: _Machines) -> dict[str, str]:
-    """Return the units of the varied effect parameters."""
+    """Return key -> unit, for the varied keys that are parameters of effects."""
     units = {}
     for key in varied:
         parts = key.split(".")

@@ -56,7 +56,9 @@ _TIP_COORDINATES = ("tip_r", "tip_z", "tip_attitude")
 
 
 def flatten_summary(summary: dict[str, Any]) -> Numbers:
-    """Flatten the summary of a run to dotted name -> (number, unit), without timings and versions.
+    """Return the numbers of a run's summary as dotted name -> (number, unit).
+
+    Timings and versions, which differ between equal runs, are omitted.
 
     >>> flatten_summary({"scenario": "a", "tracking": {"boom": {"rms": 0.1, "unit": "rad"}}})
     {'tracking.boom.rms': (0.1, 'rad')}
@@ -78,7 +80,7 @@ def _flatten(part: dict[str, Any], above: str, unit: str | None):
 
 
 def key_unit(key: str) -> str | None:
-    """Return the unit of a scenario key, derived from its name; None if unknown."""
+    """Return the unit of a scenario key, from its suffix such as `_deg` or a table; None if unknown."""
     found = (unit for suffix, unit in KEY_SUFFIXES.items() if key.endswith(suffix))
     return next(found, None) or _UNIT_OF_SCENARIO_KEY.get(key)
 
@@ -127,13 +129,18 @@ class JournalEntry(NamedTuple):
 
 
 def count_finished_runs(path: Path) -> int:
-    """Return the number of finished runs in a journal file."""
+    """Return the number of finished runs in the journal file of a sweep; 0 if it does not exist."""
     lines = path.read_bytes().split(b"\n")[:-1] if path.is_file() else []
     return len({line.partition(b",")[0] for line in lines})
 
 
 class Journal:
-    """The open journal of a sweep; only one process may open it at a time."""
+    """The open file with one line per finished run of a sweep; only one process may open it at a time.
+
+    Attributes:
+        path: the file.
+        entries: run number -> entry.
+    """
 
     def __init__(self, path: Path) -> None:
         """Read the entries, remove incomplete lines and open the file for appending.
@@ -200,14 +207,16 @@ class CopiedMachine(NamedTuple):
 
 
 class MachineCopies:
-    """The user machines of a sweep, each read once."""
+    """Copies of the machine files of a sweep that are not shipped with the package, each read once."""
 
     def __init__(self) -> None:
         """Start without machines."""
         self._known: dict[Path, CopiedMachine] = {}
 
     def with_copied_paths(self, scenario: Scenario) -> Scenario:
-        """Return the scenario with user machines replaced by their paths in the sweep folder.
+        """Return the scenario with its user machines replaced by the paths of their copies.
+
+        The paths are relative to the sweep folder. Machines that are new are read.
 
         Raises:
             InputError: a machine file cannot be read.
@@ -222,11 +231,14 @@ class MachineCopies:
         return scenario.model_copy(update=changes)
 
     def files(self) -> Files:
-        """Return path in the sweep folder -> content, for all machines so far."""
+        """Return path in the sweep folder -> content of the files of all machines read so far."""
         return {name: text for copied in self._known.values() for name, text in copied.files.items()}
 
     def files_of(self, scenario: Scenario) -> Files:
-        """Return path -> content of the machines of one scenario, a result of `named`."""
+        """Return path in the sweep folder -> content of the machine files that one scenario uses.
+
+        The scenario is a result of `with_copied_paths`.
+        """
         names = {scenario.machine, scenario.servo.force_model}
         copied = [machine for machine in self._known.values() if machine.name in names]
         return {name: text for machine in copied for name, text in machine.files.items()}
@@ -265,7 +277,12 @@ def _copy_machine(file: Path) -> CopiedMachine:
 
 
 def with_resolved_paths(scenario: Scenario, folder: Path) -> Scenario:
-    """Resolve the machine paths of a scenario of `MachineCopies.named` relative to a folder."""
+    """Return the scenario with its machine paths, which are relative to a sweep folder, in that folder.
+
+    Args:
+        scenario: a result of `MachineCopies.with_copied_paths`.
+        folder: the folder that contains the copied machines.
+    """
     changes: dict = {"folder": str(folder)}
     model = scenario.servo.force_model
     if model and model.startswith(f"{INPUTS}/"):
@@ -275,7 +292,7 @@ def with_resolved_paths(scenario: Scenario, folder: Path) -> Scenario:
 
 
 def write_files(files: Files, folder: Path) -> None:
-    """Write files under a folder."""
+    """Write files (relative path -> content) under a folder, and create subfolders as needed."""
     for name, text in files.items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -291,7 +308,7 @@ class RunTask(NamedTuple):
 
     Attributes:
         run: run number.
-        scenario: scenario with machine paths of `MachineCopies.named`.
+        scenario: scenario whose machine paths are relative to `folder`.
         folder: folder that contains the user machines, None if `files` contains them.
         files: path -> content of the user machines.
         write_run_files: function that writes a run into a folder, as `cli.running.write_run`; None to keep no
@@ -322,7 +339,7 @@ class Outcome(NamedTuple):
 
 
 def execute_task(task: RunTask) -> Outcome:
-    """Execute a run; a failure gives an outcome with its reason instead of an exception."""
+    """Execute one run of a sweep; a failure gives an outcome with its reason instead of an exception."""
     try:
         with _RUN_LOCK, tempfile.TemporaryDirectory(prefix="sweep_", dir=task.scratch) as scratch:
             return _execute_task(task, Path(scratch))

@@ -20,7 +20,7 @@ _MAX_TIP_ERROR = 0.06  # m, upper limit of the colour scale of the designs
 
 
 def write_arm_report(fit: ArmFit, stages: Sequence[Poses], regions: Sequence[CorruptedRegion], path: Path) -> None:
-    """Write the report of an arm calibration.
+    """Write the HTML report of an arm calibration: parameters, corrupted samples and residuals.
 
     Args:
         fit: fitted parameters of the arm.
@@ -60,7 +60,11 @@ def write_arm_report(fit: ArmFit, stages: Sequence[Poses], regions: Sequence[Cor
 
 
 def draw_residuals(fit: ArmFit, stages: Sequence[Poses]) -> bytes:
-    """Draw the residuals of both equations over the poses as PNG, one panel per moving link."""
+    """Draw the residuals of an arm calibration over the poses as PNG, one panel per moving link.
+
+    Each pose has two loop-closure equations, for distance and height; their residuals are divided by
+    the standard deviation due to sensor noise.
+    """
     with report_figure(0.4 + 1.5 * len(stages)) as figure:
         places = figure.subplots(len(stages), 1, squeeze=False)[:, 0]
         for place, poses in zip(places, stages, strict=True):
@@ -74,7 +78,7 @@ def draw_residuals(fit: ArmFit, stages: Sequence[Poses]) -> bytes:
 
 
 def write_linkage_report(fits: Sequence[LinkageFit], path: Path) -> None:
-    """Write the report of the calibration of cylinder linkages.
+    """Write the HTML report of calibrated cylinder linkages: pin geometry and held-out errors per axis.
 
     Args:
         fits: fitted linkages, one per axis.
@@ -101,7 +105,7 @@ def write_linkage_report(fits: Sequence[LinkageFit], path: Path) -> None:
 
 
 def draw_linkage(fit: LinkageFit) -> bytes:
-    """Draw the error of the piston displacement over the joint angle as PNG."""
+    """Draw the error of the piston displacement [mm] of a fitted linkage over the joint angle as PNG."""
     with report_figure(2.4) as figure:
         place = figure.subplots()
         place.plot(np.degrees(fit.angle), 1e3 * fit.residual, ".", ms=2, color="#1769aa")
@@ -111,7 +115,11 @@ def draw_linkage(fit: LinkageFit) -> bytes:
 
 
 def draw_designs(survey: DesignSurvey, best: Design) -> bytes:
-    """Draw tip error, information and reached poses over both arm lengths of designs as PNG."""
+    """Draw figures of merit of calibrator designs as PNG: maps over the two link lengths.
+
+    The maps show the tip error of the calibrated arm, the information on its parameters and the
+    fraction of reached poses. The present and the best design are marked.
+    """
     shape = len(FOREARM_LENGTHS), len(ARM_LENGTHS)
     tip = np.array([d.tip_error for d in survey.designs]).reshape(shape)
     told = np.array([d.information for d in survey.designs]).reshape(shape)
@@ -150,8 +158,8 @@ def draw_pose_errors(errors: Mapping[str, tuple[np.ndarray, np.ndarray]], descri
     """Draw the errors of each pose before and after calibration on a logarithmic scale.
 
     Args:
-        errors: {title with unit: (errors before (n,), errors after (n,))}.
-        description: description of the poses.
+        errors: {title with unit: (errors before (n,), errors after (n,))}, in the unit of the title.
+        description: description of the poses, such as `held-out poses`.
 
     Returns:
         A PNG.
@@ -228,7 +236,7 @@ def draw_posterior(
 
 
 def _draw_contours(place, x: np.ndarray, y: np.ndarray) -> None:
-    """Draw contours that contain 39 % and 86 % of the samples."""
+    """Draw the two contours of the density of samples (x, y) that enclose 39 % and 86 % of them."""
     counts, xs, ys = np.histogram2d(x, y, 30)
     order = np.sort(counts.ravel())[::-1]
     share = np.cumsum(order) / order.sum()
@@ -241,10 +249,13 @@ NOMINAL_POINTS_COLOUR, CALIBRATED_POINTS_COLOUR = "#e07b00", "#1769aa"
 
 
 def draw_sockets(calibration: SocketCalibration, heldout_parts: Sequence[HeldOutPrediction]) -> bytes:
-    """Draw the distance of the ball from its mean position in the socket, and socket distances.
+    """Draw errors of a robot calibration with ball and sockets, before and after.
+
+    The upper plot shows the distance of the predicted ball from its mean position in the socket, the
+    lower one the distances of neighbouring sockets.
 
     Args:
-        calibration: the calibration.
+        calibration: result of the calibration.
         heldout_parts: predictions of held-out places; if empty, the fitted places are shown.
 
     Returns:

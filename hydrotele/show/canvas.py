@@ -44,33 +44,40 @@ class Marker(NamedTuple):
 
 
 def ball(middle, radius: float, colour) -> Marker:
-    """Return a sphere marker with a centre and a radius [m]."""
+    """Create a sphere to add to a rendered scene, with centre (3,) and radius [m] and RGBA colour."""
     return Marker(_Geom.mjGEOM_SPHERE, np.array(middle), None, np.full(3, radius), colour)
 
 
 def line(start, end, radius: float, colour) -> Marker:
-    """Return a marker for a line between two points, with a radius [m]."""
+    """Create a line to add to a rendered scene, between points (3,) [m], with radius [m] and RGBA colour."""
     return Marker(_Geom.mjGEOM_CAPSULE, np.array(start), np.array(end), np.array([radius]), colour)
 
 
 def arrow(start, end, radius: float, colour) -> Marker:
-    """Return an arrow marker between two points, with a radius [m]."""
+    """Create an arrow to add to a rendered scene, between points (3,) [m], with radius [m] and RGBA colour."""
     return Marker(_Geom.mjGEOM_ARROW, np.array(start), np.array(end), np.array([radius]), colour)
 
 
 def box(middle, half_sizes, colour, rotation: np.ndarray | None = None) -> Marker:
-    """Return a box marker with a centre and half sizes [m], and a rotation matrix (3, 3)."""
+    """Create a box to add to a rendered scene.
+
+    Args:
+        middle: (3,) centre in the world frame [m].
+        half_sizes: (3,) half of the edge lengths [m].
+        colour: (4,) red, green, blue, opacity, 0 .. 1.
+        rotation: (3, 3) rotation matrix to the world frame; default none.
+    """
     turn = np.eye(3) if rotation is None else rotation
     return Marker(_Geom.mjGEOM_BOX, np.array(middle), None, np.array(half_sizes), colour, turn.ravel())
 
 
 def polyline(points, radius: float, colour) -> list[Marker]:
-    """Return line markers that connect consecutive points (n, 3) [m]."""
+    """Create lines to add to a rendered scene that connect consecutive points (n, 3) [m]."""
     return [line(a, b, radius, colour) for a, b in zip(points[:-1], points[1:], strict=True)]
 
 
 def write_markers(scene: mujoco.MjvScene, markers: Sequence[Marker]) -> None:
-    """Add markers to a scene; markers beyond the capacity of the scene are omitted.
+    """Add shapes to a MuJoCo scene as decoration; those beyond its capacity are omitted.
 
     Args:
         scene: updated MuJoCo scene.
@@ -132,7 +139,7 @@ class Canvas:
         self, model: mujoco.MjModel, data: mujoco.MjData, camera: mujoco.MjvCamera,
         markers: Sequence[Marker] = (),
     ) -> np.ndarray:  # fmt: skip
-        """Render the current state of a model.
+        """Render an image of the current state of a model.
 
         Args:
             model: model with the same structure as that of the canvas.
@@ -178,7 +185,19 @@ def has_screen() -> bool:
 
 
 def _open(model: mujoco.MjModel, width: int, height: int):
-    """Return OpenGL context and MuJoCo render context of the first driver that works."""
+    """Open an off-screen OpenGL context with the first driver that works.
+
+    Args:
+        model: model to render.
+        width: image width [pixel].
+        height: image height [pixel].
+
+    Returns:
+        (OpenGL context, MuJoCo render context).
+
+    Raises:
+        InputError: no driver works; the message names the packages to install.
+    """
     reasons = []
     for name in _candidate_drivers():
         gl = None

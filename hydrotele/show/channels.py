@@ -91,7 +91,7 @@ class Trace(NamedTuple):
 
 
 def scaled_channel(log: Log, name: str) -> Trace:
-    """Return a channel of a log, scaled for a plot.
+    """Return a channel of a log, converted from SI to the unit of its plot, such as deg or mm.
 
     Raises:
         InputError: the log has no such channel.
@@ -104,9 +104,10 @@ def scaled_channel(log: Log, name: str) -> Trace:
 
 
 def group_channels(names: Iterable[str]) -> dict[str, list[str]]:
-    """Group channel names by kind, in the order of the signal path.
+    """Group channel names by kind (the part before the axis), ordered along the signal path.
 
-    A truth channel is in the group of its kind. It is omitted if the same channel was measured.
+    A channel of true values (`truth.`) is in the group of its kind. It is omitted if the same
+    channel was measured.
 
     >>> group_channels(["angle.boom", "truth.angle.boom", "command.boom", "truth.flow_head.boom"])
     {'command': ['command.boom'], 'flow_head': ['truth.flow_head.boom'], 'angle': ['angle.boom']}
@@ -120,7 +121,7 @@ def group_channels(names: Iterable[str]) -> dict[str, list[str]]:
 
 
 def colours(logs: Sequence[Log]) -> dict[str, tuple[int, int, int]]:
-    """Return the colour of each axis of the logs, sRGB 0 .. 255.
+    """Assign a plot colour to each axis in the logs: {axis: sRGB 0 .. 255}.
 
     The key "" is for channels without an axis. The measured axes come first, so that their colours
     do not depend on other channels.
@@ -138,12 +139,12 @@ def common_channels(first: Log, other: Log) -> list[str]:
 
 
 def difference(first: Log, other: Log, name: str) -> tuple[np.ndarray, Trace]:
-    """Return `first - other` of a channel at the times of the first log.
+    """Subtract a channel of two logs, `first - other`, at the times of the first log.
 
     The other log is interpolated linearly. Only the time interval common to both logs is used.
 
     Returns:
-        (time (k,) [s], trace (k,)).
+        (k times [s], difference at these times in the unit of its plot).
 
     Raises:
         InputError: a log does not have the channel, or the logs do not overlap in time.
@@ -162,7 +163,7 @@ def difference(first: Log, other: Log, name: str) -> tuple[np.ndarray, Trace]:
 
 
 def padded_range(values: Iterable[np.ndarray], unit: str) -> tuple[float, float]:
-    """Return axis limits with a margin around all values, and with a minimum range.
+    """Return limits of a plot axis with a margin around all values and a minimum range.
 
     Args:
         values: arrays [unit].

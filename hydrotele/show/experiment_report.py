@@ -53,7 +53,7 @@ def write_experiment_report(title: str, rows: Sequence[Comparison], drawings: Ma
     Args:
         title: title of the publication.
         rows: comparisons of published and simulated results.
-        drawings: {table or figure: reason why it contains no result to compare}.
+        drawings: {table or figure of the publication: reason why it has no result to compare}.
         folder: existing output folder.
     """
     figures = draw_figures(rows)
@@ -76,7 +76,7 @@ def write_experiment_report(title: str, rows: Sequence[Comparison], drawings: Ma
 
 
 def draw_figures(rows: Sequence[Comparison]) -> list[ReportFigure]:
-    """Draw the panels and posteriors of all comparisons, numbered consecutively."""
+    """Draw the figures of all comparisons: curves and posterior samples, numbered consecutively."""
     figures = []
     for row in rows:
         slug = re.sub(r"[^a-z0-9]+", "-", row.name.lower()).strip("-")
@@ -104,10 +104,12 @@ def _describe_panels(panels: Sequence[Panel]) -> str:
 
 
 def draw_panels(panels: Sequence[Panel]) -> tuple[bytes, bytes]:
-    """Draw panels below each other; panels with the same x quantity share its axis.
+    """Draw panels of curves below each other, with a further panel for the errors of each.
+
+    The panels share their x axis if they have the same x quantity.
 
     Args:
-        panels: panels with curves and their errors.
+        panels: panels with curves and, optionally, their errors.
 
     Returns:
         The figure as PNG and as SVG.

@@ -1,9 +1,12 @@
-"""Write a gap as a rerun recording: measurements, predictions and prediction errors.
+"""Write the result of a search for model errors (gap) as a rerun recording.
+
+The recording shows measurements, predictions and prediction errors of the held-out run. Whitened
+errors are prediction errors divided by their predicted standard deviation.
 
 Entities: `/measured` contains the measurements, `/nominal` and `/patched` the one-step predictions
-of the given and the patched model. `/residual/nominal` and `/residual/patched` contain the whitened
-errors, `/gap` their RMS over time and the intervals with significant errors (gap windows). The 3D
-machine moves as measured.
+of the given and the corrected (patched) model. `/residual/nominal` and `/residual/patched` contain
+the whitened errors, `/gap` their RMS over time and the intervals with significant errors (gap
+windows). The 3D machine moves as measured.
 """
 
 import os
@@ -34,7 +37,7 @@ _FALSE_ALARM_PROBABILITY = 1e-3  # probability that a perfect model has any gap 
 
 
 class WindowedErrors(NamedTuple):
-    """RMS of whitened prediction errors in windows of equal length.
+    """RMS of whitened prediction errors in w windows of about equal length, for c channels.
 
     Attributes:
         edges: (w + 1,) edges of the windows [s].
@@ -64,7 +67,15 @@ class GapWindow(NamedTuple):
 
 
 def windowed_errors(prediction: Prediction, window: float = WINDOW_DURATION) -> WindowedErrors:
-    """Return the RMS of the whitened errors in windows of about `window` seconds."""
+    """Compute the RMS of prediction errors, divided by their predicted noise, in windows of time.
+
+    Args:
+        prediction: one-step predictions of a run.
+        window: approximate duration of a window [s].
+
+    Returns:
+        RMS and number of measurements per window and channel.
+    """
     time = prediction.time
     period = float(np.median(np.diff(time)))
     rows = max(1, round(window / period))
@@ -82,7 +93,11 @@ def windowed_errors(prediction: Prediction, window: float = WINDOW_DURATION) -> 
 
 
 def channel_rms(prediction: Prediction) -> np.ndarray:
-    """Return the RMS of the whitened errors per channel (c,) [1], NaN without measurements."""
+    """Return the RMS over a run of the prediction errors divided by their predicted noise.
+
+    Returns:
+        (c,) value per channel [1]; 1 for a perfect model, NaN without measurements.
+    """
     present = np.isfinite(prediction.whitened)
     total = (np.where(present, prediction.whitened, 0.0) ** 2).sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -90,13 +105,13 @@ def channel_rms(prediction: Prediction) -> np.ndarray:
 
 
 def gap_windows(prediction: Prediction, noise_floor: float) -> list[GapWindow]:
-    """Return the intervals in which at least one channel has a significant error.
+    """Find the time intervals in which the prediction error of a channel is significant.
 
     The limit is a quantile of the chi-square distribution: a perfect model, whose errors have the
     RMS `noise_floor`, has any such interval in one of 1000 runs.
 
     Args:
-        prediction: prediction of the model.
+        prediction: one-step predictions of the model.
         noise_floor: RMS of the whitened errors of a perfect model [1].
 
     Returns:
@@ -126,9 +141,14 @@ def gap_windows(prediction: Prediction, noise_floor: float) -> list[GapWindow]:
 
 
 def most_changed_channels(before: Prediction, after: Prediction, count: int) -> list[str]:
-    """Return the `count` channels with the largest decrease of the mean square error.
+    """Return the channels whose mean square prediction error decreases most from one model to another.
 
     If both predictions are equal, the channels with the largest mean square error are returned.
+
+    Args:
+        before: predictions of the given model.
+        after: predictions of the corrected model.
+        count: maximum number of channels.
     """
     old, new = channel_rms(before) ** 2, channel_rms(after) ** 2
     weight = old - new if not np.array_equal(old, new, equal_nan=True) else old
@@ -146,7 +166,10 @@ def gap_blueprint(
     scene: Scene, before: Prediction, models: Mapping[str, tuple[Prediction, Any]],
     channels: Sequence[str],
 ) -> "rrb.Blueprint":  # fmt: skip
-    """Create the layout of a gap recording: machine and gap windows left, tabs of plots right.
+    """Create the layout of a recording of model errors for the rerun viewer.
+
+    The machine and the list of intervals with significant errors are on the left, tabs of plots on
+    the right.
 
     Args:
         scene: 3D view.
@@ -155,7 +178,7 @@ def gap_blueprint(
         channels: channels of the first tab.
 
     Returns:
-        The blueprint; the time panel is paused on the timeline `time`.
+        The layout; the time panel is paused on the timeline `time`.
     """
     import rerun.blueprint as rrb
 
@@ -236,7 +259,7 @@ _WIDTHS = {"measured": 3.0, "nominal": 1.4, "patched": 1.4}
 
 
 def write_gap_recording(path: str | os.PathLike, gap: Gap, run: RunData, axes: Sequence[str]) -> None:
-    """Write the held-out run of a gap to one `.rrd` file, completely or not at all.
+    """Write measurements and predictions of the held-out run to one `.rrd` file, completely or not at all.
 
     Args:
         path: file to write, with the suffix `.rrd`.
@@ -267,7 +290,7 @@ def write_gap_recording(path: str | os.PathLike, gap: Gap, run: RunData, axes: S
 
 
 def _interpolated_log(prediction: Prediction, run: RunData) -> Log:
-    """Return the measurements as a log; missing samples are interpolated for the 3D view."""
+    """Return the measurements of a run as a log, with missing samples interpolated for the 3D view."""
     columns = {}
     for k, channel in enumerate(prediction.channels):
         values = prediction.measured[:, k]
@@ -290,7 +313,12 @@ def _log_commands(out, run: RunData, axes: Sequence[str]) -> None:
 
 
 def _log_channels(out, models) -> None:
-    """Log measurements, predictions and whitened errors, without missing samples."""
+    """Add lines of measurements, predictions and whitened errors of all channels to a recording.
+
+    Args:
+        out: recording stream.
+        models: {`nominal` or `patched`: (prediction, RGB colour)}.
+    """
     before, _ = models["nominal"]
     for k, channel in enumerate(before.channels):
         unit, factor = axis_unit(default_unit(channel))
@@ -306,7 +334,13 @@ def _log_channels(out, models) -> None:
 
 
 def _log_rms(out, models, floor: float | None) -> None:
-    """Log the windowed RMS error over all channels, for each model and for a perfect model."""
+    """Add lines of the RMS error of all channels over time windows, per model, to a recording.
+
+    Args:
+        out: recording stream.
+        models: {`nominal` or `patched`: (prediction, RGB colour)}.
+        floor: RMS error of a perfect model, drawn as a constant line; None if unknown.
+    """
     for name, (prediction, colour) in models.items():
         found = windowed_errors(prediction)
         total = np.nansum(found.rms**2 * found.count, axis=1)
@@ -320,7 +354,7 @@ def _log_rms(out, models, floor: float | None) -> None:
 
 
 def _log_windows(out, gap: Gap, windows: Sequence[GapWindow], before: Prediction) -> None:
-    """Log the gap windows of the given model as a thick red line at zero and as texts."""
+    """Add the intervals with significant errors to a recording: a thick red line at zero, and texts."""
     import rerun as rr
 
     time = np.array([t for w in windows for t in (w.start, w.stop, w.stop + 1e-6)])

@@ -1,4 +1,4 @@
-"""Write the HTML report of a gap between a model and logs.
+"""Write the HTML report of a search for differences (gap) between a model and logs.
 
 The module formats the tables (effects, channels, laws, ranking, residual tests) for the template
 `gap.html.j2`. It draws the heat map of the prediction errors, the predictions of single channels
@@ -62,7 +62,7 @@ _VERDICT_LABELS = {
 
 
 def write_report(gap: Gap, path: str | Path) -> None:
-    """Write the report of a gap as one self-contained HTML file.
+    """Write the HTML report of a search for model errors as one self-contained file.
 
     Args:
         gap: result of the search.
@@ -107,7 +107,10 @@ _COMMANDS = {
 
 
 def _open_loop(gap: Gap) -> dict[str, Any] | None:
-    """Return text and table rows of the open-loop simulation errors of a mechanism."""
+    """Return text and table rows of the open-loop position errors of a mechanism, per drive.
+
+    The columns are the errors of the given and, if there is one, the corrected model.
+    """
     if not gap.open_loop:
         return None
     horizon, models = gap.open_loop["horizon"], [gap.open_loop["before"]]
@@ -156,7 +159,7 @@ def _effect_rows(gap: Gap) -> list[dict[str, Any]]:
 
 
 def _calibration_rows(gap: Gap) -> list[dict[str, Any]]:
-    """Return the calibrated parameters with their intervals, the largest changes first."""
+    """Return table rows of the calibrated parameters with their 95 % intervals, largest changes first."""
     rows = []
     for key in most_moved(gap) if gap.calibration else ():
         s = in_customary_units(gap.calibration[key], key)
@@ -189,7 +192,12 @@ def _unknown_content(gap: Gap) -> dict[str, Any] | None:
 
 
 def _residual_input_rows(gap: Gap) -> list[tuple[str, str, float]]:
-    """Return the residual forces, flows and commands of the patched model, the largest first."""
+    """Return table rows of the forces, flows and commands that the corrected model still misses.
+
+    Returns:
+        (name, percentage of the largest plausible value, bar length relative to the first row), the
+        largest first.
+    """
     return [
         (lack_words(lack), f"{100 * lack.part:.2g} %", lack.part / gap.lacks[0].part)
         for lack in gap.lacks if lack.part > 0
@@ -208,7 +216,10 @@ def _validation_content(gap: Gap) -> dict[str, Any]:
 
 
 def _channels(before: Prediction, after: Prediction | None) -> list[dict[str, Any]]:
-    """Return the RMS prediction errors of each channel before and after the patch."""
+    """Return table rows of the RMS prediction error of each channel, in multiples of sensor noise.
+
+    `before` is the prediction of the given model, `after` that of the corrected one, if there is one.
+    """
     old = channel_rms(before)
     new = channel_rms(after) if after else np.full(len(old), np.nan)
     finite_ones = [v for v in (*old, *new) if math.isfinite(v)]
@@ -224,7 +235,10 @@ def _channels(before: Prediction, after: Prediction | None) -> list[dict[str, An
 
 
 def _laws(gap: Gap, is_patched: bool) -> dict[str, Any]:
-    """Return the residuals of each law at each component, in multiples of the sensor noise."""
+    """Return the table of the residuals of each physical law at each component, relative to noise.
+
+    With a corrected model (`is_patched`), each component has two columns: given and patched.
+    """
     places = list(dict.fromkeys(place for by_place in gap.laws.values() for place in by_place))
     keys = {"before": "given", "after": "patched"} if is_patched else {"before": "given"}
     rows = []
@@ -250,7 +264,7 @@ def _law_cell(residual: Mapping[str, float] | None, key: str, unit: str) -> dict
 
 
 def _residual_colour(ratio: float) -> str:
-    """Return the cell colour of a residual: white at the noise level, then amber, then red."""
+    """Return the cell colour (#rrggbb) of a residual-to-noise ratio: white up to 1.2, amber, then red."""
     part = min(max(math.log(max(ratio, 1e-9) / 1.2) / math.log(_MAX_COLOUR_RATIO / 1.2), 0.0), 1.0)
     stops = ((255, 255, 255), (253, 226, 170), (240, 160, 110))
     low, high = (stops[0], stops[1]) if part < 0.5 else (stops[1], stops[2])
@@ -259,7 +273,10 @@ def _residual_colour(ratio: float) -> str:
 
 
 def _ranking(gap: Gap) -> list[dict[str, Any]]:
-    """Return the single effects, ordered by their net gain in log likelihood."""
+    """Return table rows of the 12 best single effects, in the order of the ranking.
+
+    The gain is the decrease of -2 log likelihood minus the complexity penalty.
+    """
     shown = gap.ranking[:_MAX_RANKED_EFFECTS]
     best = max((c.gain - c.charge for c in shown), default=1.0)
     named = {(effect.name, effect.location) for effect in gap.effects}
@@ -286,7 +303,7 @@ def _format_parameter(gap: Gap, candidate: Candidate, name: str) -> str:
 
 
 def _tests(gap: Gap) -> list[tuple[str, str, str, bool]]:
-    """Return name, value, limit and result of the residual tests of the final model."""
+    """Return table rows of the residual tests of the final model: name, value, limit, passed."""
     return [
         (
             name,
@@ -303,7 +320,7 @@ def _format_number(value: Any) -> str:
 
 
 def _noise(gap: Gap) -> list[tuple[str, str, str, str]]:
-    """Return the noise standard deviations per channel: estimated and stated by the machine."""
+    """Return table rows of sensor noise per channel: estimated and stated standard deviation, ratio."""
     rows = []
     for channel, (found, stated) in gap.noise.items():
         unit, known = default_unit(channel), math.isfinite(stated)
@@ -343,11 +360,11 @@ _MAX_HEAT_MAP_RATIO = 6.0  # times sensor noise, maximum upper limit of the colo
 
 
 def draw_heat_map(before: Prediction, after: Prediction, is_patched: bool) -> bytes:
-    """Channels over time: size of the whitened errors in windows, before and after.
+    """Draw the prediction errors of all channels over time windows as a heat map, relative to noise.
 
     Args:
-        before: predictions of the given model.
-        after: predictions of the patched model.
+        before: one-step predictions of the given model.
+        after: one-step predictions of the corrected model.
         is_patched: whether the models differ; otherwise only the first is drawn.
 
     Returns:
@@ -388,7 +405,7 @@ def draw_heat_map(before: Prediction, after: Prediction, is_patched: bool) -> by
 
 
 def draw_channel(before: Prediction, after: Prediction, channel: str, is_patched: bool) -> bytes:
-    """Draw measurements, predictions and errors of a channel, and an enlarged worst window.
+    """Draw measurements, one-step predictions and errors of a channel, and an enlarged worst interval.
 
     Args:
         before: predictions of the given model.
@@ -430,10 +447,10 @@ def draw_channel(before: Prediction, after: Prediction, channel: str, is_patched
 
 
 def draw_law(law: LearnedLaw) -> bytes:
-    """Draw a learned law over its variable, with a band of two standard deviations.
+    """Draw a law learned from the logs over its variable, with a band of two standard deviations.
 
     Args:
-        law: the law.
+        law: added force, flow or command as a function of a variable.
 
     Returns:
         A PNG.
@@ -480,7 +497,7 @@ def _set_limits(axes: "Axes", values: list[np.ndarray]) -> None:
 
 
 def _worst_interval(prediction: Prediction, column: int) -> tuple[float, float]:
-    """Return start and stop of the enlarged interval around the worst window of a channel [s]."""
+    """Return start and stop of 2 s around the window with the largest error of a channel (column) [s]."""
     found = windowed_errors(prediction)
     worst = int(np.argmax(np.nan_to_num(found.rms[:, column])))
     middle = 0.5 * (found.edges[worst] + found.edges[worst + 1])
@@ -490,7 +507,7 @@ def _worst_interval(prediction: Prediction, column: int) -> tuple[float, float]:
 
 
 def _heat_colour_map(top: float):
-    """Return a colour map: white for noise alone, amber, then dark red at `top` times noise."""
+    """Return a matplotlib colour map of errors: white for noise alone, amber, dark red at `top` times noise."""
     from matplotlib.colors import LinearSegmentedColormap
 
     stops = ((0.0, "#f9fafb"), (1.0, "#f3f5f7"), (1.35, "#f3ecdc"), (1.5, "#fbd68b"))

@@ -29,12 +29,12 @@ MEASURED_COLOUR, NOMINAL_COLOUR, IDENTIFIED_COLOUR = "#262b33", "#e07b00", "#176
 
 
 def draw_forces(forces: HeldOutForces, drive: str, judged: HeldOutError) -> bytes:
-    """Draw measured and predicted force of a drive, and the errors with the noise band.
+    """Draw measured and predicted force of a drive on the held-out run, and the errors with a noise band.
 
     Args:
-        forces: forces of the held-out run.
+        forces: measured forces, and forces predicted by the given and the identified model.
         drive: name of the drive.
-        judged: prediction errors of the drive.
+        judged: prediction errors of the drive, with the RMS noise.
 
     Returns:
         A PNG.
@@ -198,7 +198,7 @@ def _statuses(found: Identification) -> list[tuple[str, ...]]:
 
 
 def _shorten_combination(combination: str) -> str:
-    """Return a combination of parameters, shortened to `_MAX_MEMBERS` members."""
+    """Shorten a sum of parameters, written as text, to its first 6 members and `+ N more`."""
     parts = combination.replace(" - ", " + -").split(" + ")
     if len(parts) <= _MAX_MEMBERS:
         return combination

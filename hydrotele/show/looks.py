@@ -28,7 +28,7 @@ class Mesh(NamedTuple):
 
 
 def box(half_sizes) -> Mesh:
-    """Return the mesh of a box with half sizes (3,) [m] and flat faces.
+    """Create the triangle mesh of a box with half edge lengths (3,) [m] and flat faces.
 
     >>> box((1, 2, 3)).vertices.max(axis=0).tolist()
     [1.0, 2.0, 3.0]
@@ -48,7 +48,7 @@ def box(half_sizes) -> Mesh:
 
 
 def revolution_mesh(radii, heights, profile_normals, segments: int = 24) -> Mesh:
-    """Return the mesh of a surface of revolution about z.
+    """Create the triangle mesh of a surface of revolution about z from the points of its profile.
 
     Args:
         radii: (k,) radii of the profile points [m], from the lower to the upper end.
@@ -77,7 +77,7 @@ def revolution_mesh(radii, heights, profile_normals, segments: int = 24) -> Mesh
 
 
 def cylinder(radius: float, half_length: float, segments: int = 24) -> Mesh:
-    """Return the mesh of a closed cylinder along z, with radius and half length [m]."""
+    """Create the triangle mesh of a closed cylinder along z, with radius and half length [m]."""
     r, h = radius, half_length
     return revolution_mesh(
         (0, r, r, r, r, 0),
@@ -88,7 +88,7 @@ def cylinder(radius: float, half_length: float, segments: int = 24) -> Mesh:
 
 
 def capsule(radius: float, half_length: float, segments: int = 16) -> Mesh:
-    """Return the mesh of a capsule along z [m]; `half_length` excludes the hemispheres."""
+    """Create the triangle mesh of a capsule along z [m]; `half_length` excludes the hemispheres."""
     rise = np.linspace(-np.pi / 2, np.pi / 2, segments // 2 + 2)
     rise = np.sort(np.append(rise, (0.0, 0.0)))
     slopes = np.stack([np.cos(rise), np.sin(rise)], axis=1)
@@ -98,7 +98,7 @@ def capsule(radius: float, half_length: float, segments: int = 16) -> Mesh:
 
 
 def ellipsoid(radii, segments: int = 24) -> Mesh:
-    """Return the mesh of an ellipsoid with radii (3,) [m]."""
+    """Create the triangle mesh of an ellipsoid with radii (3,) [m] along x, y and z."""
     ball = capsule(1.0, 0.0, segments)
     normals = ball.normals / np.asarray(radii)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -106,9 +106,9 @@ def ellipsoid(radii, segments: int = 24) -> Mesh:
 
 
 def flat_triangles(corners: np.ndarray) -> Mesh:
-    """Return a mesh of flat triangles from corners (t, 3, 3) [m].
+    """Create a mesh with flat shading from the corners of t triangles (t, 3 corners, 3) [m].
 
-    The corners are counter-clockwise as seen from outside.
+    The corners of a triangle are counter-clockwise as seen from outside.
     """
     corners = np.asarray(corners, float)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -118,7 +118,7 @@ def flat_triangles(corners: np.ndarray) -> Mesh:
 
 
 def tiles(half_size: float, count: int) -> tuple[Mesh, np.ndarray]:
-    """Return the mesh of a square of count x count tiles in the plane z = 0.
+    """Create the mesh of a chequered square of count x count tiles in the plane z = 0.
 
     Args:
         half_size: half of the side length [m].
@@ -227,11 +227,14 @@ def geom_colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
 
 
 def visible_bounds(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and highest corner (3,) [m] of a box around all visible geoms but planes.
+    """Return two opposite corners of a box around all visible geoms except planes, in the world frame.
 
     Args:
         model: the model.
         data: state with updated kinematics.
+
+    Returns:
+        (lowest corner (3,), highest corner (3,)) [m].
     """
     seen = (model.geom_type != _Geom.mjGEOM_PLANE) & (model.geom_group < _HIDDEN_GROUP)
     if not seen.any():
@@ -245,13 +248,13 @@ def visible_bounds(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarr
 
 
 def ground_height(model: mujoco.MjModel) -> float | None:
-    """Return the height [m] of the first plane fixed to the world, or None."""
+    """Return the height [m] of the first plane that is fixed to the world, or None without one."""
     planes = (model.geom_type == _Geom.mjGEOM_PLANE) & (model.geom_bodyid == 0)
     return float(model.geom_pos[planes][0, 2]) if planes.any() else None
 
 
 def _n_segments(radius: float) -> int:
-    """Return the number of segments around the axis of a cylinder; thin ones need fewer."""
+    """Return the number of segments around the axis of a round mesh with a radius [m]; thin ones need fewer."""
     return 10 if radius < 0.06 else 24
 
 
@@ -265,7 +268,10 @@ def _geom_mesh(model: mujoco.MjModel, geom: int) -> Mesh | None:
 
 
 def _mesh_asset(model: mujoco.MjModel, mesh: int) -> Mesh:
-    """Return a mesh asset with separate vertices per triangle; normals are indexed separately."""
+    """Convert a mesh asset of a MuJoCo model, given by its index, to a mesh with flat triangles.
+
+    Triangles share no vertices, because MuJoCo indexes the normals separately.
+    """
     first = model.mesh_faceadr[mesh]
     faces = slice(first, first + model.mesh_facenum[mesh])
     corners = model.mesh_vert[model.mesh_vertadr[mesh] + model.mesh_face[faces]]

@@ -12,7 +12,7 @@ import numpy as np
 
 
 def main(folder: Path) -> None:
-    """Render the model of `folder` as described by `task.npz` and save the pixels."""
+    """Render the model in a folder with the pose, camera and size of `task.npz`; write `pixels.npy`."""
     model = mujoco.MjModel.from_binary_path(str(folder / "model.mjb"))
     task = np.load(folder / "task.npz")
     width, height = (int(n) for n in task["size"])

@@ -59,7 +59,7 @@ def plot_overlay(
     size: tuple[int, int] | None = None,
     title: str = "",
 ) -> None:
-    """Draw two logs in the same plots, one per channel, with the difference `first - other` below.
+    """Draw two logs as PNG, one plot per common channel, with the difference `first - other` below each.
 
     Args:
         first: log that defines the times of the difference.
@@ -97,7 +97,7 @@ def plot_overlay(
 
 
 def plot_log(log: Log, path: str | os.PathLike, size: tuple[int, int] | None = None, title: str = "") -> None:
-    """Draw all channels of a log, with one panel per kind of channel and one colour per axis.
+    """Draw all channels of a log as PNG, with one panel per kind of channel and one colour per axis.
 
     Args:
         log: the log.
@@ -128,7 +128,7 @@ def plot_log(log: Log, path: str | os.PathLike, size: tuple[int, int] | None = N
 
 
 def _draw_log_pair(figure: "Figure", place, first: Log, other: Log, name: str) -> None:
-    """Draw a channel of both logs and, below, their difference."""
+    """Draw a channel of two logs in a cell of the figure's grid and, below, their difference."""
     cell = place.subgridspec(2, 1, height_ratios=(3, 1.1), hspace=0.12)
     upper = figure.add_subplot(cell[0])
     lower = figure.add_subplot(cell[1], sharex=upper)
@@ -184,7 +184,7 @@ def _grid(figure: "Figure", rows: int, columns: int):
 
 
 def _heading(figure: "Figure", title: str, keys: Sequence[tuple[str, Any]]) -> None:
-    """Draw the title and the common legend of all plots."""
+    """Draw title and common legend at the top of a figure; `keys` are (name, colour) of the lines."""
     from matplotlib.lines import Line2D
 
     width, height = figure.get_size_inches() * _DPI
@@ -206,7 +206,7 @@ def draw_open_loop_predictions(
     time: np.ndarray, measured: np.ndarray, predicted: Mapping[str, np.ndarray],
     channels: Sequence[str], units: Sequence[str], title: str,
 ) -> bytes:  # fmt: skip
-    """Draw measurements and open-loop predictions over time, one panel per channel.
+    """Draw measurements and open-loop predictions of several models over time, one panel per channel.
 
     Args:
         time: (n,) times [s].

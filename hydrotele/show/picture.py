@@ -66,7 +66,8 @@ def render_model(
         model: compiled model.
         data: state of the model.
         path: PNG file, written completely or not at all.
-        camera: name of a camera, as for `render_picture`.
+        camera: name of a camera of the model, or `free` for a view of the whole model. `overview` is
+            replaced by `free` if the model has no such camera.
         size: width and height [pixel].
 
     Raises:
@@ -95,7 +96,11 @@ def save_png(path: Path, pixels: np.ndarray) -> None:
 
 
 def _free_view(model: mujoco.MjModel, data: mujoco.MjData, size: tuple[int, int]) -> dict:
-    """Return a camera in front, to the side and above that shows the whole machine."""
+    """Return settings of a free camera, obliquely from above, that shows the whole model.
+
+    Returns:
+        lookat (3,) and distance [m], azimuth and elevation [deg].
+    """
     low, high = visible_bounds(model, data)
     radius = 0.5 * float(np.linalg.norm(high - low))
     narrow = np.radians(0.5 * _FIELD_OF_VIEW) * min(1.0, size[0] / size[1])
@@ -106,7 +111,20 @@ def _free_view(model: mujoco.MjModel, data: mujoco.MjData, size: tuple[int, int]
 
 
 def _render_in_child(model: mujoco.MjModel, qpos: np.ndarray, view: dict, size: tuple[int, int]) -> np.ndarray:
-    """Render pixels (height, width, 3), uint8, with the first OpenGL driver that works."""
+    """Render an image in a child process with the first OpenGL driver that works.
+
+    Args:
+        model: compiled model.
+        qpos: (nq,) joint positions.
+        view: camera: `fixed` (its index), or lookat, distance, azimuth and elevation.
+        size: width and height [pixel].
+
+    Returns:
+        Pixels (height, width, 3), uint8.
+
+    Raises:
+        InputError: no driver works.
+    """
     wanted = os.environ.get("MUJOCO_GL", "").lower()
     backends = dict.fromkeys((*((wanted,) if wanted in _BACKENDS else ()), *_BACKENDS))
     reasons = []

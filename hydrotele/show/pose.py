@@ -49,7 +49,7 @@ def compile_visual_model(
 
 
 def logged_joints(machine: Machine, log: Log) -> dict[str, np.ndarray]:
-    """Return the logged motion of the independent joints.
+    """Return the logged motion of the joints of a machine that no closed loop determines.
 
     Measured channels are preferred. True channels are used for joints without a sensor, such as a
     hanging grapple.
@@ -77,7 +77,7 @@ def logged_joints(machine: Machine, log: Log) -> dict[str, np.ndarray]:
 
 
 def _hold_missing(values: np.ndarray) -> np.ndarray:
-    """Return values (n,) in which a missing value repeats the last one; 0 if there is none."""
+    """Fill missing values (NaN) with the last known value, at the start with the first; 0 if none is known."""
     known = np.flatnonzero(np.isfinite(values))
     if len(known) in (0, len(values)):
         return values if len(known) else np.zeros(len(values))
@@ -86,14 +86,23 @@ def _hold_missing(values: np.ndarray) -> np.ndarray:
 
 
 def logged_surroundings(log: Log) -> tuple[SurroundingObject, ...]:
-    """Return plates, trees, tree logs and soil of a log of true states; soil alone of other logs."""
+    """Return the objects around the machine from the metadata of a log.
+
+    A log of true states contains plates, trees, tree logs and soil, other logs only the soil.
+    """
     if "surroundings" in log.metadata:
         return tuple(_OBJECTS_ADAPTER.validate_json(log.metadata["surroundings"]))
     return logged_soil(log)
 
 
 def _write_object_positions(model: mujoco.MjModel, log: Log, rows: np.ndarray) -> None:
-    """Write the positions of surrounding objects from a log of true states to `rows` (n, nq)."""
+    """Copy the logged motion of objects around the machine into joint positions `rows` (n, nq).
+
+    Args:
+        model: model with these objects.
+        log: log of true states with n rows.
+        rows: (n, nq) joint positions, changed in place.
+    """
     for joint, place in object_joints(model):
         name, kind = model.joint(joint).name, model.jnt_type[joint]
         if kind == mujoco.mjtJoint.mjJNT_FREE:
@@ -117,13 +126,16 @@ def logged_positions(
     machine: Machine, model: mujoco.MjModel, joints: Mapping[str, np.ndarray],
     log: Log | None = None,
 ) -> np.ndarray:  # fmt: skip
-    """Return the positions (n, nq) of all joints, including those determined by closed loops.
+    """Compute the positions of all joints from those of the independent joints, by closing all loops.
 
     Args:
         machine: the machine.
         model: model of the machine from `compile_visual_model`.
         joints: {joint name: (n,) angles [rad] or positions [m]}; others are in the home pose.
         log: log of true states; required if the model contains surrounding objects.
+
+    Returns:
+        (n, nq) joint positions of the model.
 
     Raises:
         InputError: a linkage cannot be closed in at least one row.
@@ -138,7 +150,7 @@ def body_poses(
     machine: Machine, model: mujoco.MjModel, joints: Mapping[str, np.ndarray],
     log: Log | None = None,
 ) -> Poses:  # fmt: skip
-    """Compute the poses of all bodies, including cylinders, rockers and couplers of closed loops.
+    """Compute the world poses of all bodies along a motion, including those in closed loops.
 
     Args:
         machine: the machine.
@@ -156,7 +168,7 @@ def body_poses(
 
 
 def poses_at_positions(model: mujoco.MjModel, rows: np.ndarray) -> Poses:
-    """Return the poses of all bodies at joint positions (n, nq)."""
+    """Compute the world poses of all bodies of a model at n joint positions (n, nq)."""
     data = mujoco.MjData(model)
     position = np.empty((len(rows), model.nbody, 3))
     quaternion = np.empty((len(rows), model.nbody, 4))

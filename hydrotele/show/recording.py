@@ -56,7 +56,7 @@ _MAX_ID_LENGTH = 180  # maximum number of characters of an application id in rer
 
 @contextlib.contextmanager
 def open_recording(path: str | os.PathLike, application: str) -> Iterator["rr.RecordingStream"]:
-    """Record to memory and write the file at the end.
+    """Open a rerun recording stream that is kept in memory and written to a file at the end.
 
     The writer of rerun is not used, because its thread does not report a full disk.
 
@@ -144,7 +144,7 @@ def make_blueprint(
     scene: Scene,
     difference_name: str = "",
 ) -> "rrb.Blueprint":
-    """Create the layout of a recording: 3D view on the left, tabs of plots on the right.
+    """Create the layout of a recording for the rerun viewer: 3D view left, tabs of plots right.
 
     Args:
         plots: one plot per kind of channel.
@@ -153,7 +153,7 @@ def make_blueprint(
         difference_name: description of the differences, such as `measured - simulated`.
 
     Returns:
-        The blueprint; the time panel is paused on the timeline `time`.
+        The layout; the time panel is paused on the timeline `time`.
     """
     import rerun.blueprint as rrb
 
@@ -207,7 +207,14 @@ def _tabs(plots: Sequence[Plot], differences: Sequence[Plot], minus: str):
 
 
 def _column(title: str, plots: Sequence[Plot], minus: str, shares: Sequence[float] | None = None) -> "rrb.Vertical":
-    """Arrange plots in a column; show a legend only for lines that no plot above has named."""
+    """Arrange plots in a column; show a legend only for lines that no plot above has named.
+
+    Args:
+        title: title of the tab.
+        plots: plots from top to bottom.
+        minus: description of the differences, such as `measured - simulated`.
+        shares: relative heights of the plots, default equal.
+    """
     import rerun.blueprint as rrb
 
     named: set[str] = set()
@@ -258,13 +265,13 @@ def log_machine(
     clock: "rr.TimeColumn",
     ghost: bool = False,
 ) -> None:
-    """Log the meshes of a machine once, and the poses of its bodies for all times.
+    """Add a moving 3D machine to a recording: its meshes once, the poses of its bodies for all times.
 
     Args:
         stream: recording stream.
         root: parent entity of the bodies.
         model: model with visual geometry.
-        poses: n poses; a single pose is static.
+        poses: body poses at n times; a single pose is static.
         clock: n times.
         ghost: draw only moving bodies, tinted and transparent.
     """
@@ -281,7 +288,7 @@ def log_machine(
 
 
 def mesh_entity(look: BodyMesh, ghost: bool = False) -> "rr.Mesh3D":
-    """Convert a body mesh to a rerun mesh; a ghost is tinted and transparent."""
+    """Convert the mesh of a body to a rerun mesh; a ghost (second machine) is tinted and transparent."""
     import rerun as rr
 
     colours, opacity, vertices = look.colours, look.opacity, look.mesh.vertices
@@ -299,9 +306,12 @@ def mesh_entity(look: BodyMesh, ghost: bool = False) -> "rr.Mesh3D":
 
 
 def log_ground(stream: "rr.RecordingStream", model: mujoco.MjModel, soil: SoilHistory | None = None) -> bool:
-    """Log a chequered ground with tiles of 2 m; return whether the model has a ground plane.
+    """Add a chequered ground with tiles of 2 m to a recording, if the model has a ground plane.
 
-    Where the bucket can dig, the ground has a gap for the soil.
+    With soil, the ground has a gap for the strip in which the bucket digs.
+
+    Returns:
+        Whether the model has a ground plane.
     """
     height = ground_height(model)
     if height is None:
@@ -316,7 +326,9 @@ def log_ground(stream: "rr.RecordingStream", model: mujoco.MjModel, soil: SoilHi
 
 
 def log_soil(stream: "rr.RecordingStream", root: str, bucket: str, soil: SoilHistory, time: np.ndarray) -> None:
-    """Log trench and heaps at least `_SOIL_PERIOD` apart, and the soil in the bucket at every row that changes it.
+    """Add the changing soil to a recording: trench and heaps, and the soil in the bucket.
+
+    Trench and heaps are updated at most every 0.1 s, the soil in the bucket at every change.
 
     Args:
         stream: recording stream.
@@ -356,7 +368,7 @@ def log_tip(
     clock: "rr.TimeColumn",
     ghost: bool = False,
 ) -> None:
-    """Log the tip path (n, 3) [m]: the whole path, its latest part and the current point.
+    """Add the path of the tool tip (n, 3) [m] to a recording: whole path, latest part, current point.
 
     The entity `trail` has one line segment per row; the layout selects the displayed seconds.
     """
@@ -435,7 +447,7 @@ def write_recording(
 
 
 def time_column(time: np.ndarray) -> "rr.TimeColumn":
-    """Return times (n,) [s] as a column of the timeline `time`, rounded to nanoseconds."""
+    """Convert times (n,) [s] to rerun's column of the timeline `time`, rounded to nanoseconds."""
     import rerun as rr
 
     nanoseconds = np.round(np.asarray(time) * 1e9).astype("timedelta64[ns]")
@@ -443,7 +455,7 @@ def time_column(time: np.ndarray) -> "rr.TimeColumn":
 
 
 def entity_path(root: str, channel: str) -> str:
-    """Return the entity path of a channel.
+    """Return the path of a log channel in the tree of a rerun recording.
 
     >>> entity_path("measured", "truth.flow_head.boom")
     '/measured/truth/flow_head/boom'
@@ -495,7 +507,10 @@ def _scene_title(names: list[str]) -> str:
 
 
 def tip_path(machine: Machine, log: Log, poses: Poses) -> np.ndarray | None:
-    """Return the path (n, 3) of the tip [m], true if the log contains it; None without an arm."""
+    """Return the path of the tool tip (n, 3) in the world [m]; None for a machine without an arm.
+
+    It is the true path if the log contains it, else it is computed from the body poses.
+    """
     recorded = [f"truth.tip.{component}" for component in "xyz"]
     if all(name in log for name in recorded):
         return np.stack([log[name] for name in recorded], axis=1)
@@ -505,9 +520,12 @@ def tip_path(machine: Machine, log: Log, poses: Poses) -> np.ndarray | None:
 
 
 def view_of_machine(model: mujoco.MjModel, tip: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return camera position and target (3,) [m] that show the machine and its whole tip path.
+    """Compute a camera that shows the whole machine and, if given, the whole path of its tip (n, 3).
 
     The direction is that of the camera `overview` if the model has one.
+
+    Returns:
+        (position of the camera (3,), point that it looks at (3,)) in the world [m].
     """
     data = mujoco.MjData(model)
     mujoco.mj_fwdPosition(model, data)
@@ -573,7 +591,7 @@ def _plots(drawn: Mapping[str, list], is_difference: bool = False) -> list[Plot]
 
 
 def _line_style(colour: tuple[int, int, int], name: str, rank: int, width: float = 1.2):
-    """Return the line style of a log: wide and dark for the first, thin and pale for others."""
+    """Return rerun's line style of a channel; the colour is paler for all logs but the first (rank 0)."""
     import rerun as rr
 
     paler = [round(c + (_WHITE_FRACTION if rank else 0.0) * (255 - c)) for c in colour]

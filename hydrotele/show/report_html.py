@@ -45,7 +45,7 @@ def _choose_font() -> str:
 
 
 def show_dollar_signs(figure: "Figure") -> None:
-    """Show names that contain dollar signs as they are, not as mathematical formulas.
+    """Make a figure show dollar signs in its texts as they are, not as mathematical formulas.
 
     A name such as `$x` may be no valid formula. Only the labels of logarithmic axes are formulas.
     """
@@ -61,7 +61,7 @@ def show_dollar_signs(figure: "Figure") -> None:
 
 
 def png(figure: "Figure") -> bytes:
-    """Return a figure as PNG bytes."""
+    """Render a matplotlib figure and return it as PNG bytes."""
     show_dollar_signs(figure)
     stream = io.BytesIO()
     figure.savefig(stream, dpi=_DPI, format="png")
@@ -69,7 +69,7 @@ def png(figure: "Figure") -> bytes:
 
 
 def svg(figure: "Figure") -> bytes:
-    """Return a figure as SVG bytes, which are reproducible."""
+    """Render a matplotlib figure and return it as SVG bytes, equal for equal figures."""
     import matplotlib
 
     show_dollar_signs(figure)
@@ -81,7 +81,7 @@ def svg(figure: "Figure") -> bytes:
 
 @contextlib.contextmanager
 def report_figure(height: float) -> Iterator["Figure"]:
-    """Create a figure in the style and width of a report, with a height in inches."""
+    """Create a matplotlib figure in the style and width of a report, with a height [inch]."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -109,7 +109,7 @@ def _data_uri(png: bytes) -> str:
 
 
 def write_report(template: str, path: str | Path, **content: object) -> None:
-    """Render a template and write it as one self-contained HTML file.
+    """Fill a Jinja template with values and write it as one self-contained HTML file.
 
     Args:
         template: name of the template in `templates`, without `.html.j2`.
@@ -146,7 +146,7 @@ def write_sections(
     path: str | Path, overline: str, heading: str, lead: str, sections: Sequence[Section],
     figures: Sequence[tuple[str, str, str]] = (),
 ) -> None:  # fmt: skip
-    """Write a report of sections.
+    """Write an HTML report that consists of sections with tables and pictures.
 
     Args:
         path: HTML file to write.
@@ -173,7 +173,9 @@ class Interval(NamedTuple):
 
 
 def scale_interval(value: float, low: float, high: float, model: float) -> Interval | None:
-    """Return positions of a value, its interval and the model value; None if none is finite.
+    """Scale an estimate, its interval and the model value to positions in a small drawing [px].
+
+    Values that are not finite have the position None; the result is None if no value is finite.
 
     >>> scale_interval(1.5, 1.0, 2.0, 0.0)
     Interval(width=220, value=159.0, start=110.0, length=98.0, model=12.0)
@@ -201,7 +203,17 @@ class Dumbbell(NamedTuple):
 
 
 def scale_dumbbell(before: float, after: float | None, low: float, high: float) -> Dumbbell:
-    """Return the positions of 1 and of the values before and after on a scale `low` to `high`."""
+    """Scale error ratios before and after a correction to positions in a small drawing [px].
+
+    Args:
+        before: value of the given model.
+        after: value of the corrected model, or None.
+        low: value at the left end.
+        high: value at the right end.
+
+    Returns:
+        Positions of 1 (a perfect model) and of both values.
+    """
     width = 440
 
     def place(size: float) -> float:

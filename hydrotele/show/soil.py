@@ -58,13 +58,16 @@ class SoilHistory(NamedTuple):
 
 
 def soil_history(machine: Machine, ground: SoilGround, log: Log, poses: Poses) -> SoilHistory:
-    """Compute the soil at every row of a log from the motion of the bucket.
+    """Simulate the soil that a bucket digs, at every row of a log, from the logged motion of the bucket.
 
     Args:
         machine: machine with a bucket.
         ground: the soil.
         log: log of the machine.
         poses: poses of its bodies at the rows of the log.
+
+    Returns:
+        Height of the strip of soil and content of the bucket at every row.
 
     Raises:
         InputError: the machine has no bucket.
@@ -88,13 +91,28 @@ def soil_history(machine: Machine, ground: SoilGround, log: Log, poses: Poses) -
 
 
 def _side_of_axis(poses: Poses, link: str, axis: np.ndarray, azimuth: float) -> float:
-    """Return 1 if the axis of a link points to the left of the plane of the arm, -1 if to the right."""
+    """Return 1 if an axis of a link points to the left of the vertical plane of the arm, else -1.
+
+    Args:
+        poses: poses of the machine; the first is used.
+        link: name of the link.
+        axis: (3,) axis in the frame of the link.
+        azimuth: direction of the plane of the arm [rad].
+    """
     tip = point_trajectory(poses, link, axis)[0] - point_trajectory(poses, link, (0.0, 0.0, 0.0))[0]
     return 1.0 if tip @ [-math.sin(azimuth), math.cos(azimuth), 0.0] > 0.0 else -1.0
 
 
 def _load_outline(bed: SoilBed, attitude: float) -> np.ndarray:
-    """Return the side view (k, 2) of the soil in the bucket, filled to a level surface [m]."""
+    """Compute the side view of the soil in a bucket, which fills it up to a level surface.
+
+    Args:
+        bed: soil and bucket.
+        attitude: angle of the line from pin to edge above the horizontal [rad].
+
+    Returns:
+        (k, 2) corners in the frame of the bucket [m]; (0, 2) if the bucket is nearly empty.
+    """
     area = bed.state[CARRIED_VOLUME] / bed.parameters[INNER_WIDTH]
     if area < _MIN_DRAWN_AREA:
         return np.empty((0, 2))
@@ -114,7 +132,7 @@ def _load_outline(bed: SoilBed, attitude: float) -> np.ndarray:
 
 
 def _cut_above(polygon: np.ndarray, up: np.ndarray, level: float) -> np.ndarray:
-    """Return the part of a polygon (k, 2) whose height along `up` is at most `level`."""
+    """Cut off the part of a polygon (k, 2) above `level` along the unit vector `up`; return the rest."""
     corners = []
     for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
         over_a, over_b = a @ up - level, b @ up - level
@@ -131,7 +149,7 @@ def _polygon_area(corners: np.ndarray) -> float:
 
 
 def trench_mesh(bed: SoilBed, shape: SoilShape) -> tuple[Mesh, np.ndarray]:
-    """Return the surface of a strip of soil with its side walls down or up to the ground at height 0.
+    """Create the mesh of a dug strip of soil: its surface, and side walls to the ground at height 0.
 
     Returns:
         (mesh in the world frame, (v, 3) colours 0 .. 255).
@@ -157,7 +175,11 @@ def trench_mesh(bed: SoilBed, shape: SoilShape) -> tuple[Mesh, np.ndarray]:
 
 
 def load_mesh(history: SoilHistory, row: int) -> Mesh | None:
-    """Return the soil in the bucket in the frame of the bucket's link; None if there is none."""
+    """Create the mesh of the soil in the bucket at a row of the log, in the frame of the bucket's link.
+
+    Returns:
+        The mesh [m]; None if the bucket is empty.
+    """
     corners, axes = history.shapes[row].load, history.axes
     if len(corners) < 3:
         return None
@@ -174,7 +196,7 @@ def load_mesh(history: SoilHistory, row: int) -> Mesh | None:
 
 
 def surrounding_tiles(bed: SoilBed, half_size: float, tile: float) -> tuple[Mesh, np.ndarray]:
-    """Return a chequered ground at height 0 with a gap for the strip of soil.
+    """Create the mesh of a chequered ground at height 0 with a gap for the strip of soil.
 
     Args:
         bed: the strip of soil.
@@ -203,7 +225,7 @@ def surrounding_tiles(bed: SoilBed, half_size: float, tile: float) -> tuple[Mesh
 
 
 def soil_markers(history: SoilHistory, row: int, poses: Poses, machine: Machine) -> list[Marker]:
-    """Return boxes for the ground, the strip of soil and the soil in the bucket at a row.
+    """Create boxes for a rendered image: ground, strip of soil and soil in the bucket at a row of a log.
 
     Args:
         history: soil at the rows of a log.
@@ -241,7 +263,7 @@ def soil_markers(history: SoilHistory, row: int, poses: Poses, machine: Machine)
 
 
 def _load_markers(history: SoilHistory, row: int, poses: Poses, machine: Machine) -> list[Marker]:
-    """Return thin boxes that fill the side view of the soil in the bucket."""
+    """Create thin boxes that fill the side view of the soil in the bucket at a row, in the world frame."""
     corners = history.shapes[row].load
     if len(corners) < 3 or machine.arm is None:
         return []

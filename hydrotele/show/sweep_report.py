@@ -65,7 +65,7 @@ class DisplayedResult(NamedTuple):
 
 
 def distinct_values(values: Sequence[Any]) -> list[Any]:
-    """Return the distinct values; numbers are sorted, other values keep their order."""
+    """Return the distinct values; numbers are sorted, other values keep the order of occurrence."""
     found = list({json.dumps(value): value for value in values}.values())
     return sorted(found) if are_numbers(found) else found
 
@@ -76,7 +76,7 @@ def are_numbers(values: Sequence[Any]) -> bool:
 
 
 def displayed_result(study: Study, name: str) -> DisplayedResult:
-    """Return a result in display units: mm below 2 m, deg, kN from 2 kN."""
+    """Convert a result of all runs to a readable unit: mm if below 2 m, deg, kN from 2 kN."""
     given = study.columns[name]
     values = np.array([math.nan if v is None else float(v) for v in given])
     unit = study.units.get(name, "1")
@@ -93,12 +93,12 @@ def displayed_result(study: Study, name: str) -> DisplayedResult:
 
 
 def key_label(study: Study, key: str) -> str:
-    """Return a key with its unit."""
+    """Return a varied key with its unit for an axis label, such as `duration [s]`."""
     return f"{key} [{study.units[key]}]" if key in study.units else key
 
 
 def draw_main_effects(study: Study) -> bytes:
-    """Draw each result over each varied key: runs as dots, means as a line.
+    """Draw each result of a sweep over each varied key: runs as dots, means as a line.
 
     Args:
         study: data of the sweep.
@@ -147,7 +147,7 @@ def _draw_effect(place, study: Study, key: str, result: DisplayedResult) -> None
 
 
 def _axis_positions(values: Sequence[Any], steps: list[Any]) -> np.ndarray:
-    """Return axis positions: the value itself for numbers, else the index of the level."""
+    """Return positions on a plot axis: numbers themselves, else the index of each value in `steps`."""
     if are_numbers(steps):
         return np.array([float(value) for value in values])
     texts = [json.dumps(step) for step in steps]
@@ -155,9 +155,10 @@ def _axis_positions(values: Sequence[Any], steps: list[Any]) -> np.ndarray:
 
 
 def _mean_curve(binned: bool, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the means of y at each x, or over bins of x if few runs have the same x.
+    """Return a curve of means (x, y): at each x, or over bins of x if `binned` and few runs share an x.
 
-    Runs with the same x are in one bin, so that all values of the other keys contribute to it.
+    Runs with the same x are in one bin, so that all values of the other keys contribute to it. The
+    curve is empty if there are too few runs for two bins.
     """
     there = np.unique(x)
     if not binned or len(x) >= _MIN_RUNS_PER_BIN * len(there):
@@ -174,13 +175,13 @@ def _is_wide(values: np.ndarray) -> bool:
 
 
 def map_keys(study: Study) -> tuple[str, str] | None:
-    """Return the two varied keys of the grid, or None if there are more or fewer."""
+    """Return the two varied grid keys that span a heat map, or None if there are more or fewer."""
     keys = [key for key in study.grid if len(distinct_values(study.columns[key])) > 1]
     return (keys[0], keys[1]) if len(keys) == 2 else None
 
 
 def draw_heat_maps(study: Study, keys: tuple[str, str]) -> bytes:
-    """Draw a map of each result over two keys; a cell shows the mean of its runs.
+    """Draw a heat map of each result of a sweep over two varied keys; a cell is the mean of its runs.
 
     Args:
         study: data of the sweep.
@@ -217,7 +218,11 @@ def draw_heat_maps(study: Study, keys: tuple[str, str]) -> bytes:
 
 
 def _cells(study: Study, keys: tuple[str, str], values: np.ndarray) -> np.ndarray:
-    """Return mean values (levels of key 1, levels of key 2), NaN where no run succeeded."""
+    """Average the values (n,) of n runs over the cells that two keys span.
+
+    Returns:
+        (values of key 1, values of key 2) means, NaN where no run succeeded.
+    """
     texts = [[json.dumps(v) for v in distinct_values(study.columns[key])] for key in keys]
     cells = np.full((len(texts[0]), len(texts[1])), np.nan)
     places = [np.array([t.index(json.dumps(v)) for v in study.columns[key]])
@@ -334,7 +339,13 @@ def _range_rows(study: Study) -> list[dict[str, Any]]:
 
 
 def _run(study: Study, value: float, row: int) -> tuple[str, str]:
-    """Return a result as text, and the run it belongs to with its keys."""
+    """Format a result and the run it belongs to, with the first three varied keys of that run.
+
+    Args:
+        study: data of the sweep.
+        value: the result.
+        row: row of the run in the table.
+    """
     keys = ", ".join(f"{key} {_format_value(study.columns[key][row])}" for key in study.varied_keys[:3])
     return f"{value:.4g}", f"run {study.columns['run'][row]}: {keys}"
 

@@ -42,7 +42,7 @@ _NYQUIST_LIMITS = (-3.0, 1.5, -2.25, 2.25)
 
 
 def display_name(structure: str) -> str:
-    """Return the name of a structure for display.
+    """Format the name of a teleoperation structure (kind of control and feedback) for display.
 
     >>> display_name("four_channel_rate")
     'four-channel rate'
@@ -51,7 +51,10 @@ def display_name(structure: str) -> str:
 
 
 def draw_hybrid_matrix(found: TeleopFindings) -> bytes:
-    """Draw the magnitudes of the elements of the hybrid matrix over frequency.
+    """Draw the magnitudes of the elements of a teleoperator's hybrid matrix over frequency.
+
+    There is one curve per structure. The hybrid matrix maps hand velocity and task force to hand force
+    and slave velocity.
 
     Args:
         found: results of the analysis.
@@ -77,7 +80,10 @@ def draw_hybrid_matrix(found: TeleopFindings) -> bytes:
 
 
 def draw_transmitted_impedance(found: TeleopFindings) -> bytes:
-    """Draw magnitude and phase of the transmitted impedance and of the task impedance as PNG."""
+    """Draw the impedance that the operator feels over frequency, with that of the task, as PNG.
+
+    The panels are magnitude and phase, with one curve per structure.
+    """
     with report_figure(4.2) as figure:
         left, right = figure.subplots(1, 2, sharex=True)
         first = found.analyses[0]
@@ -99,7 +105,10 @@ def draw_transmitted_impedance(found: TeleopFindings) -> bytes:
 
 
 def draw_scattering(found: TeleopFindings) -> bytes:
-    """Draw the norm of the scattering matrix as PNG; above 1 the two-port can emit energy."""
+    """Draw the norm of a teleoperator's scattering matrix over frequency, per structure, as PNG.
+
+    Above 1, the teleoperator is not passive: it can emit energy.
+    """
     with report_figure(3.4) as figure:
         panel = figure.subplots()
         top = max(float(one.scattering_norms.max()) for one in found.analyses)
@@ -117,7 +126,10 @@ def draw_scattering(found: TeleopFindings) -> bytes:
 
 
 def draw_nyquist(found: TeleopFindings) -> bytes:
-    """Draw Nyquist curves of the loop gain with the task and in free motion as PNG."""
+    """Draw Nyquist curves of the force-reflection loop, with the task and in free motion, as PNG.
+
+    There is one panel per structure.
+    """
     with report_figure(3.1 * _rows(found)) as figure:
         for panel, one in zip(_panels(figure, found), found.analyses, strict=False):
             colour = _LINE_STYLES[one.structure][0]
@@ -138,7 +150,10 @@ def draw_nyquist(found: TeleopFindings) -> bytes:
 
 
 def draw_stability_maps(found: TeleopFindings) -> bytes:
-    """Draw the stability of each structure over delay and gain factor as PNG."""
+    """Draw where each structure is stable, over one-way delay and factor on the reflected signal, as PNG.
+
+    Crosses mark cells in which a simulation disagrees.
+    """
     with report_figure(2.9 * _rows(found)) as figure:
         seen = {one.structure: one.simulated for one in found.agreements}
         for panel, (name, cells) in zip(_panels(figure, found), found.maps.items(), strict=False):
@@ -158,7 +173,10 @@ def draw_stability_maps(found: TeleopFindings) -> bytes:
 
 
 def draw_stiffness(spring: StiffnessAxis, held: StiffnessAxis) -> bytes:
-    """Draw the stability margin of stiffness feedback and its worst-case stability.
+    """Draw the stability of a joystick with force-dependent stiffness over damping and maximum stiffness.
+
+    The left panel is the margin B^2 - 4 M K_max, the right one the stability by this margin or under
+    the worst-case switching of the stiffness.
 
     Args:
         spring: joystick without a hand.
@@ -197,7 +215,15 @@ def draw_stiffness(spring: StiffnessAxis, held: StiffnessAxis) -> bytes:
 
 
 def _draw_margin(figure: Any, panel: Any, damping: np.ndarray, stiffest: np.ndarray, margin: np.ndarray):
-    """Draw the margin in thousands, with a colour scale that is symmetric about 0."""
+    """Draw the stability margin over damping and stiffness, with a colour scale symmetric about 0.
+
+    Args:
+        figure: figure for the colour bar.
+        panel: axes to draw in.
+        damping: (n,) damping B [N s/m].
+        stiffest: (m,) maximum stiffness K [N/m].
+        margin: (m, n) values of B^2 - 4 M K [(N s/m)^2].
+    """
     reach = float(np.percentile(np.abs(margin), 80.0)) / 1e3
     shown = panel.pcolormesh(damping, stiffest, margin / 1e3, cmap="RdBu", vmin=-reach, vmax=reach, shading="nearest")
     figure.colorbar(shown, ax=panel, extend="both", pad=0.02)
@@ -205,7 +231,7 @@ def _draw_margin(figure: Any, panel: Any, damping: np.ndarray, stiffest: np.ndar
 
 
 def _cells(panel: Any, x: np.ndarray, y: np.ndarray, kinds: np.ndarray, colours: tuple) -> None:
-    """Draw a map of cells; each kind has its own colour."""
+    """Draw a map of cells over x (n,) and y (m,); the integer `kinds` (m, n) select the colours."""
     from matplotlib.colors import ListedColormap
 
     panel.pcolormesh(
@@ -215,7 +241,7 @@ def _cells(panel: Any, x: np.ndarray, y: np.ndarray, kinds: np.ndarray, colours:
 
 
 def _set_root_scale(panel: Any, delays: np.ndarray) -> None:
-    """Set a square-root scale of the delay axis, which enlarges short delays."""
+    """Give the delay axis [ms] a square-root scale, which enlarges short delays."""
     panel.set_xscale("function", functions=(lambda x: np.sqrt(np.maximum(x, 0.0)), np.square))
     panel.set_xlim(0.0, delays[-1])
     ticks = [tick for tick in (0, 5, 20, 50, 100, 200, 500, 1000, 2000) if tick <= delays[-1]]
@@ -242,7 +268,7 @@ def _legend(figure: Any, panel: Any) -> None:
 
 
 def _draw_map_legend(figure: Any) -> None:
-    """Draw the legend of the stability maps."""
+    """Draw the legend of the stability maps: stable, unstable, this case."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -258,7 +284,7 @@ def _rows(found: TeleopFindings) -> int:
 
 
 def _panels(figure: Any, found: TeleopFindings) -> list:
-    """Return the panels of a figure with three panels per row; hide unused panels."""
+    """Create one panel per structure, three per row; hide unused panels."""
     panels = list(figure.subplots(_rows(found), 3, squeeze=False).flat)
     for panel in panels[len(found.analyses) :]:
         panel.set_axis_off()
@@ -378,7 +404,9 @@ _RATIO_RANGE = (0.05, 20.0)  # range of the map, relative to the maximum stable 
 
 
 def draw_loop_map(found: ScenarioFindings) -> bytes:
-    """Draw the stability of a loop over delay and reflected force at the machine's force limit.
+    """Draw where the force-reflection loop of a scenario is stable, over delay and reflected force.
+
+    The vertical axis is the hand force when the machine exerts its maximum force.
 
     Args:
         found: results of the analysis.

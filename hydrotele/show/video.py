@@ -31,7 +31,7 @@ def write_video(
     machine: Machine, log: Log, path: str | os.PathLike, size: tuple[int, int] = (1280, 720),
     progress: Callable[[float, float], None] | None = None,
 ) -> None:  # fmt: skip
-    """Write a video of the motion in a log, in real time.
+    """Render a video of the machine that moves as in a log, with 25 frames per second in real time.
 
     Args:
         machine: machine of the log.

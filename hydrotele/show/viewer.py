@@ -33,7 +33,7 @@ class Viewer(NamedTuple):
     """A running rerun program.
 
     Attributes:
-        process: process, the leader of its own process group.
+        process: process, the leader of a separate process group.
         output: file with the output of the program.
     """
 
@@ -84,7 +84,7 @@ def find_free_port() -> int:
 
 @contextlib.contextmanager
 def run_rerun(arguments: Sequence[str], uses_temporary_home: bool = False) -> Iterator[Viewer]:
-    """Run the rerun program during the context, then end it with all its child processes.
+    """Run the rerun program with arguments during the context, then end it with all its child processes.
 
     Args:
         arguments: command-line arguments.
@@ -118,7 +118,10 @@ def run_rerun(arguments: Sequence[str], uses_temporary_home: bool = False) -> It
 
 
 def _parent_death_hook() -> Callable[[], object] | None:
-    """Return a function that makes a child on Linux end when this program is killed."""
+    """Return a function for a new child process that makes it end when this program is killed.
+
+    It exists on Linux only; on other systems the result is None.
+    """
     if sys.platform != "linux":
         return None
     prctl = ctypes.CDLL(None, use_errno=True).prctl
@@ -149,7 +152,7 @@ _POLL = 0.1  # s
 
 @contextlib.contextmanager
 def web_viewer(rrd: str | os.PathLike, port: int | None = None, timeout: float = 30.0) -> Iterator[str]:
-    """Serve a recording and the web viewer on this computer during the context.
+    """Serve a recording and rerun's web viewer by HTTP on this computer during the context.
 
     Args:
         rrd: recording file.
@@ -180,7 +183,7 @@ def web_viewer(rrd: str | os.PathLike, port: int | None = None, timeout: float =
 def serve_recording(
     rrd: str | os.PathLike, port: int | None = None, report_url: Callable[[str], object] = print
 ) -> None:
-    """Serve a recording until the program is interrupted.
+    """Serve a recording and rerun's web viewer by HTTP until the program is interrupted by Ctrl-C.
 
     Args:
         rrd: recording file.
@@ -197,7 +200,7 @@ def serve_recording(
 
 
 def open_viewer(rrd: str | os.PathLike) -> int:
-    """Show a recording in the native viewer until the user closes it.
+    """Show a recording in a window of the rerun viewer until the user closes it.
 
     Returns:
         Exit status of the viewer.
@@ -237,7 +240,7 @@ def take_screenshot(
     displayed_time: float | None = None,
     timeout: float = 90.0,
 ) -> tuple[str, ...]:
-    """Save a screenshot of the viewer with a recording, without opening a window.
+    """Save a screenshot of the rerun viewer with a recording, without opening a window.
 
     Args:
         rrd: recording file.
@@ -276,7 +279,12 @@ def _viewer_reports(client: "ViewerClient") -> tuple[str, ...]:
 def _run_headless_viewer(
     rrd: str | os.PathLike, size: tuple[int, int], deadline: float
 ) -> Iterator[tuple["ViewerClient", "ViewerState"]]:
-    """Run a headless viewer that has loaded the recording.
+    """Run the rerun viewer without a window, and wait until it has loaded the recording.
+
+    Args:
+        rrd: recording file.
+        size: width and height of the image [pixel].
+        deadline: value of `time.monotonic` at which waiting ends with an error [s].
 
     Yields:
         Client and state of the viewer.
@@ -333,7 +341,9 @@ def _check(viewer: Viewer, rrd: Path, deadline: float) -> None:
 
 
 def _take_settled_screenshot(client: "ViewerClient", rrd: str | os.PathLike, deadline: float) -> bytes:
-    """Return the first image that equals the previous one, when all data have been loaded.
+    """Take screenshots until two successive ones are equal, because then all data are displayed.
+
+    After the deadline, the latest image is returned.
 
     Raises:
         InputError: there is no image before the deadline.

@@ -57,7 +57,7 @@ class Window:
         self._painter.start()
 
     def show(self, qpos: np.ndarray, rows: Sequence[tuple[str, str]]) -> bool:
-        """Show joint positions (nq,) and a table of texts in the next frame.
+        """Display joint positions (nq,) and a table of texts in the next frame of the window.
 
         Returns:
             False if the user has closed the window.
@@ -69,7 +69,7 @@ class Window:
         return True
 
     def _draw_frames(self) -> None:
-        """Draw the latest state in a separate thread, so that a slow screen does not block."""
+        """Draw the latest state in a loop, run in a separate thread, so that a slow screen does not block."""
         while self._fresh.wait() and not self._over:
             self._fresh.clear()
             assert self._newest

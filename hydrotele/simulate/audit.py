@@ -22,25 +22,26 @@ _FULL_PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
 
 def full_physics_state(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Return the full physics state (nstate,) in the format of `mujoco.rollout`."""
+    """Return the full physics state (nstate,) (time, positions, velocities, activations) for `mujoco.rollout`."""
     state = np.empty(mujoco.mj_stateSize(model, _FULL_PHYSICS))
     mujoco.mj_getState(model, data, state, _FULL_PHYSICS)
     return state
 
 
 def compute_balance_errors(plant: Plant, start: np.ndarray, controls: np.ndarray) -> dict[str, float | None]:
-    """Compute the relative volume and energy balance errors over part of a run.
+    """Simulate part of a run again and compute its relative errors of oil volume and energy balance.
 
     Args:
-        plant: the plant.
+        plant: the plant of the run.
         start: (nstate,) full physics state at the start.
         controls: (nstep, nu) commands of every physics step.
 
     Returns:
-        `seconds`: simulated time [s]; `flow_balance`: largest |in - out - compressed| of a chamber,
-        relative to the volume that flowed through it; `energy_balance`: |work of the drives -
-        damping - change of mechanical energy|, relative to the work of all drives. It is None if
-        the machine touched something, reached a limit, or has drives without hydraulics.
+        `seconds`: simulated time [s]. `flow_balance` [1]: largest |in - out - compressed| of a chamber,
+        relative to the volume that flowed through it; None without hydraulic axes. `energy_balance` [1]:
+        |work of the drives - damping - change of mechanical energy|, relative to the work of all
+        drives. It is None if the machine touched something, reached a limit, or has drives without
+        hydraulics.
     """
     model = plant.model
     data = mujoco.MjData(model)
@@ -62,7 +63,13 @@ def compute_balance_errors(plant: Plant, start: np.ndarray, controls: np.ndarray
 
 
 def _hydraulic_balance(plant, x, v, act, more, dt):
-    """Return the work of the drives (n,) [J] and the largest relative volume error."""
+    """Compute the work of the hydraulic drives and the largest volume balance error of any chamber.
+
+    `more` (n, nu, 3) are the forces and flows of terms, as `evaluate_terms` returns them.
+
+    Returns:
+        (work since the first row (n,) [J], relative error [1] or None without hydraulic axes).
+    """
     user, count = plant.model.actuator_user, plant.hydraulic
     if not count:
         return np.zeros(len(x)), None
@@ -76,7 +83,10 @@ def _hydraulic_balance(plant, x, v, act, more, dt):
 
 
 def _volume_errors(plant, i, table, act, x, v, more, dt):
-    """Yield the relative volume balance error of both chambers of axis i."""
+    """Yield the relative oil volume balance error [1] of the head and the rod chamber of axis i.
+
+    `table` has the flows of `state_flows`, and `more` the forces and flows of terms.
+    """
     axis = plant.machine.axes[plant.axes[i]]
     if axis.pump:
         began = _flows_after_switching(plant, i, act, x, v)
@@ -109,7 +119,12 @@ def _volume_errors(plant, i, table, act, x, v, more, dt):
 
 @compiled
 def _chamber_laws(pressure, relief, gain, tank, makeup, air, release):
-    """Return port flows (n,), mid-step air compliances (n - 1,) and pressures without air (n,)."""
+    """Compute relief, make-up and air quantities of one chamber from its pressures (n,) [Pa].
+
+    Returns:
+        (n,) flow through port relief and make-up valve into the chamber [m^3/s], (n - 1,) compliance
+        of air bubbles at the mean pressure of two rows [1/Pa], (n,) pressure without released air [Pa].
+    """
     n = len(pressure)
     port, bubbles, oil = np.empty(n), np.empty(n - 1), np.empty(n)
     for row in range(n):
@@ -121,7 +136,10 @@ def _chamber_laws(pressure, relief, gain, tank, makeup, air, release):
 
 
 def _flows_after_switching(plant, i, act, x, v):
-    """Return `state_flows` at the start of every step, after the valve of axis i has switched."""
+    """Return the result of `state_flows` at the start of every step, with the valve of axis i switched.
+
+    The axis has its own pump. Its valve switches at the start of a step, while the pump keeps its speed.
+    """
     switched, a = act.copy(), ACTIVATIONS_PER_AXIS * i
     switched[:-1, a] = [
         speed_after_switching(speed, after) for speed, after in zip(act[:-1, a], act[1:, a], strict=True)
@@ -130,7 +148,10 @@ def _flows_after_switching(plant, i, act, x, v):
 
 
 def _pumped_volume_errors(axis, i, table, began, act, x, v, more, dt):
-    """Yield the relative volume balance errors of an axis with its own pump and aerated oil."""
+    """Yield the relative volume balance error [1] of both chambers of an axis with its own pump.
+
+    `table` has the flows of `state_flows` at the end of every step, and `began` those at its start.
+    """
     cylinder, pump = axis.cylinder, axis.pump
     p_head, p_rod = act[:, ACTIVATIONS_PER_AXIS * i + 2], act[:, ACTIVATIONS_PER_AXIS * i + 3]
     leak = cylinder.leakage * (p_head - p_rod)
@@ -154,7 +175,10 @@ def _pumped_volume_errors(axis, i, table, began, act, x, v, more, dt):
 
 
 def _energy_balance(plant, qpos, qvel, work, dt):
-    """Return the relative energy balance error; None if it is not defined (see `compute_balance_errors`)."""
+    """Compute |work of the drives - damping losses - change of mechanical energy| per work of the drives [1].
+
+    Returns None if a contact or joint limit was active, or if a drive is not hydraulic or did no work.
+    """
     if plant.hydraulic < len(plant.axes):
         return None
     model = plant.model

@@ -35,7 +35,7 @@ _MOTION_TOLERANCE = 1.0e-9  # the same for poses that are only displayed [m]
 
 
 def dependent_joints(machine: Machine) -> tuple[str, ...]:
-    """Return the names of the dependent joints: tubes, rods and undriven links in a loop."""
+    """Return the names of the joints whose positions follow from the loops: tubes, rods and undriven links."""
     cylinders = [name for name, axis in machine.axes.items() if axis.cylinder]
     bars = [f"{name}_{part}" for name in cylinders for part in ("tube", "rod")]
     tilts = [tilt_joint(name) for name in cylinders if has_ball_ends(machine, name)]
@@ -43,7 +43,11 @@ def dependent_joints(machine: Machine) -> tuple[str, ...]:
 
 
 def loop_shaping_joints(machine: Machine) -> list[str]:
-    """Return the names of the independent joints in a loop; others, as a saw's, affect no loop."""
+    """Return the names of the independent joints that change the shape of a loop.
+
+    These are the joints that a cylinder moves and those within a closure. The joint of a saw, for
+    example, is part of no loop.
+    """
     following = dependent_joints(machine)
     joints = [axis.joint for axis in machine.axes.values() if axis.cylinder]
     for closure in machine.closures.values():
@@ -54,24 +58,27 @@ def loop_shaping_joints(machine: Machine) -> list[str]:
 
 
 def count_pins(model: mujoco.MjModel) -> int:
-    """Return the number of `connect` pins; equalities of surrounding objects come after them."""
+    """Return the number of pins of the machine, which are `connect` constraints in its MuJoCo model."""
     return int(np.count_nonzero(model.eq_type == mujoco.mjtEq.mjEQ_CONNECT))
 
 
 def pin_opening(model: mujoco.MjModel, data: mujoco.MjData) -> float:
-    """Return the largest distance between the halves of a pin in the current `site_xpos` [m]."""
+    """Return the largest loop closure error: the distance between the two halves of a pin [m].
+
+    The positions are those of `data.site_xpos`, which are not recomputed.
+    """
     return max_pin_opening(data.site_xpos, *pin_sites(model))
 
 
 def pin_sites(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Return the site ids (p,) of the first half of every pin, and (p,) of the second half."""
+    """Return the MuJoCo site ids (p,) at the first half of each of p pins, and (p,) at its second half."""
     pins = model.eq_type == mujoco.mjtEq.mjEQ_CONNECT
     return model.eq_obj1id[pins], model.eq_obj2id[pins]
 
 
 @compiled
 def max_pin_opening(site_positions, first_sites, second_sites):
-    """Return the largest distance between the two halves of a pin.
+    """Return the largest distance between the two halves of any pin, which is 0 for closed loops.
 
     Args:
         site_positions: (nsite, 3) positions of all sites [m].
@@ -164,9 +171,13 @@ def _close_from_home(machine, model, data, target, linkage: _Linkage) -> None:
 
 
 def _solve_closure(linkage: _Linkage, data: mujoco.MjData, closed: float) -> bool:
-    """Close all loops by moving the dependent joints; return whether this succeeded.
+    """Close all loops by moving the dependent joints from their positions in `data.qpos`.
 
-    Updates the positions of bodies and sites in `data`.
+    Also updates the positions of bodies and sites in `data`. `closed` is the pin distance at which
+    Newton's method stops [m].
+
+    Returns:
+        Whether the loops are closed to 1000 times this distance.
     """
     _, chain, following = linkage
     if not len(following):
@@ -185,7 +196,7 @@ def close_along_motion(
     data: mujoco.MjData,
     joints: Mapping[str, np.ndarray],
 ) -> np.ndarray:
-    """Compute the poses of the whole machine along a motion of its independent joints.
+    """Compute the poses of the whole machine with closed loops along a motion of its independent joints.
 
     The first row, and each row after a jump, is closed from the home position. The other rows are
     closed by Newton's method from the previous row. Thus every linkage keeps its assembly mode.
@@ -197,7 +208,7 @@ def close_along_motion(
         joints: independent joint name -> (n,) angles [rad] or positions [m]; others stay at home.
 
     Returns:
-        qpos, (n, nq), with the pins closed to 1e-9 m.
+        (n, nq) values of `qpos` [m], [rad], with the pins closed to 1e-9 m.
 
     Raises:
         InputError: a joint is not independent, or a loop cannot be closed in some row.
@@ -229,7 +240,7 @@ def close_along_motion(
 
 
 def _aim_cylinders(machine, model, data) -> None:
-    """Point tubes and rods at each other as a start value for Newton's method."""
+    """Set tube angles and rod displacements from the pin positions, to start Newton's method near the solution."""
     for _ in range(2):
         for name, axis in machine.axes.items():
             if not axis.cylinder:
@@ -251,7 +262,7 @@ def _aim_cylinders(machine, model, data) -> None:
 def independent_dofs(machine: Machine, model: mujoco.MjModel) -> np.ndarray:
     """Return the indices in `qvel` of the independent joints, in ascending order.
 
-    Drive sides of transmissions are excluded: they count as locked to their loads.
+    The drive sides of transmissions are excluded, because here they move with their loads.
     """
     dependent = [model.joint(n).dofadr[0] for n in dependent_joints(machine)]
     drives, _ = drive_and_load_dofs(machine, model)
@@ -267,7 +278,8 @@ def motion_basis(machine: Machine, model: mujoco.MjModel, data: mujoco.MjData) -
         data: a configuration with closed loops.
 
     Returns:
-        N, (nv, n), with `qvel = N @ qvel[independent_dofs]`; drive sides move with their loads.
+        (nv, n) matrix N with `qvel = N @ qvel[independent_dofs(machine, model)]`. The drive sides of
+        transmissions move with their loads.
     """
     _, chain, following = _make_linkage(machine, model)
     free = np.setdiff1d(np.arange(len(chain.joints)), following)
@@ -283,7 +295,8 @@ def motion_basis(machine: Machine, model: mujoco.MjModel, data: mujoco.MjData) -
 def holding_forces(machine: Machine, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
     """Compute the actuator forces that hold the machine at rest in its pose, without contact.
 
-    Virtual work: `N^T (qfrc_bias - passive) = N^T M_act^T F`, solved in the least-squares sense.
+    By virtual work, `N^T (qfrc_bias - qfrc_passive) = N^T A^T F`, with N of `motion_basis` and the
+    actuator moment arms A (nu, nv) of MuJoCo. The equations are solved for F by least squares.
 
     Args:
         machine: the machine.

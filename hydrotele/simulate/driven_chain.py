@@ -23,8 +23,8 @@ def set_state(model: mujoco.MjModel, data: mujoco.MjData, chain: Chain, position
         model: compiled model.
         data: its data; reset and written.
         chain: kinematic chain of the same mechanism.
-        position: (v,) of all joints of the chain [rad] or [m].
-        rate: (v,) [rad/s] or [m/s].
+        position: (v,) positions of all joints of the chain [rad] or [m].
+        rate: (v,) their velocities [rad/s] or [m/s]; ball joints have Cardan angles and their rates.
 
     Source: MuJoCo manual, `mjtJoint`: a free joint's linear velocity is the world's, angular
     velocities are the body's.
@@ -59,7 +59,9 @@ def open_loop_errors(
     model: mujoco.MjModel, chain: Chain, known_joints: Sequence[str], motion: np.ndarray,
     force: np.ndarray, period: float, horizon: float = 0.25, starts: int = 30,
 ) -> Mapping[str, float]:  # fmt: skip
-    """Compute the error of open-loop simulations that are driven by measured forces.
+    """Compute the position errors of open-loop simulations of a mechanism driven by measured forces.
+
+    Each simulation starts from the measured state at another instant and lasts for `horizon`.
 
     The model's actuators are disabled; the measured forces act on the joints of the drives.
 

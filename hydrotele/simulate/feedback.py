@@ -28,7 +28,7 @@ from hydrotele.simulate.stepping import Stepper, apply_sensor_delays, true_senso
 
 
 def sensor_errors(sensor: Sensor, seed: int, channel: str, count: int) -> np.ndarray:
-    """Return the random errors of a channel for a whole run.
+    """Sample the random errors of a sensor channel for a whole run, reproducibly from the seed.
 
     Args:
         sensor: sensor with its accuracy or standard deviation [channel's unit].
@@ -49,11 +49,11 @@ def sensor_errors(sensor: Sensor, seed: int, channel: str, count: int) -> np.nda
 
 @compiled
 def quantise_reading(value, step, low, high):
-    """Return the quantised and clipped reading of an analogue-to-digital converter.
+    """Round a value to the steps of an analogue-to-digital converter and clip it to the converter's range.
 
     Args:
         value: converter input, scalar [channel's unit].
-        step: converter step, scalar [channel's unit]; 0 for none.
+        step: converter step, scalar [channel's unit]; 0 for no converter, which returns `value`.
         low: lowest reading, scalar [channel's unit].
         high: highest reading, scalar [channel's unit].
 
@@ -74,7 +74,7 @@ def quantise_reading(value, step, low, high):
 
 @compiled
 def _quantise_readings(values, step, low, high):
-    """Apply `quantise_reading` to every value (n,)."""
+    """Round (n,) values to converter steps and clip them to the range `low` to `high` (`quantise_reading`)."""
     readings = np.empty(len(values))
     for row in range(len(values)):
         readings[row] = quantise_reading(values[row], step, low, high)
@@ -82,9 +82,10 @@ def _quantise_readings(values, step, low, high):
 
 
 def apply_sensor_errors(machine: Machine, truth: Mapping[str, np.ndarray], time: np.ndarray) -> dict[str, np.ndarray]:
-    """Apply the machine's deterministic sensor errors to true values.
+    """Apply the machine's deterministic sensor errors (coupling, scale, offset, drift) to true values.
 
-    A tilted or loose coupling acts first (see `SensorError`), then `scale * value + offset`.
+    First acts the shaft coupling of an angle sensor, which can be tilted or have backlash. Then the
+    value becomes `scale * value + offset`, where the offset may change with time.
 
     Args:
         machine: the machine.
@@ -92,7 +93,7 @@ def apply_sensor_errors(machine: Machine, truth: Mapping[str, np.ndarray], time:
         time: (n,) time of the rows since the start of the run [s].
 
     Returns:
-        Channel -> (n,) values.
+        Channel -> (n,) values with errors; channels without an error are unchanged.
     """
     errors = machine.sensor_errors
     return {
@@ -104,7 +105,10 @@ def apply_sensor_errors(machine: Machine, truth: Mapping[str, np.ndarray], time:
 
 
 def _apply_coupling_errors(error: SensorError, values: np.ndarray) -> np.ndarray:
-    """Return the angles (n,) behind a coupling with tilt and initially centred backlash [rad]."""
+    """Return the angles (n,) [rad] that a sensor measures behind a shaft coupling with tilt and backlash.
+
+    The backlash is initially centred.
+    """
     if error.tilt:
         turned = np.arctan2(np.sin(values) * np.cos(error.tilt), np.cos(values))
         values = values + np.remainder(turned - values + np.pi, 2.0 * np.pi) - np.pi
@@ -122,14 +126,14 @@ def simulate_readings(
     machine: Machine, sensors: SensorSet | None, seed: int, truth: Mapping[str, np.ndarray],
     errors: Mapping[str, np.ndarray] | None = None, period: float = 0.0,
 ) -> dict[str, np.ndarray]:  # fmt: skip
-    """Simulate the sensor readings of true values.
+    """Convert true values to simulated sensor readings with jitter, errors and quantisation.
 
     Args:
         machine: the machine, with its sensor errors.
         sensors: the sensor set; None for ideal sensors.
         seed: the scenario's seed.
         truth: channel -> (n,) true values; for a sensor with delay or lag, the delayed values
-            (`record.late_channels`).
+            (`record.delayed_channels`).
         errors: channel -> (n,) random errors, if already sampled; others are sampled here.
         period: time between rows [s], for sampling jitter and drift; values are interpolated
             linearly between rows.
@@ -157,7 +161,7 @@ def simulate_readings(
 
 
 def _sampling_jitter(sensors: SensorSet, seed: int, count: int) -> np.ndarray:
-    """Return the sampling jitter (n,) of the rows [s], which is the same for all channels."""
+    """Sample the random timing errors [s] of `count` sampling instants, which are the same for all channels."""
     stream = np.random.Generator(np.random.PCG64([seed, zlib.crc32(b"jitter")]))
     return stream.normal(0.0, sensors.jitter, count)
 
@@ -200,10 +204,10 @@ class Readings(NamedTuple):
 
 @compiled
 def read_sensors(sensors, values, errors):
-    """Convert true values into readings: scale, offset, random error, converter.
+    """Convert true values into readings, in place: scale, offset, random error, converter.
 
     Args:
-        sensors: Sensors.
+        sensors: SensorParameters.
         values: (c,) true values, replaced by the readings [channel's unit].
         errors: (c,) random errors of this sample [channel's unit].
 
@@ -219,10 +223,11 @@ def read_sensors(sensors, values, errors):
 
 @compiled
 def store_readings(values, hydraulic, sample_time, readings):
-    """Store a new sample and compute the rates by finite differences.
+    """Store a new sample of all sensors and compute the joint rates by finite differences.
 
     Args:
-        values: (c,) readings of k positions, head and rod pressures, supply pressure.
+        values: (c,) new readings: k joint positions, head and rod pressure of every hydraulic axis,
+            supply pressure [rad] or [m], [Pa].
         hydraulic: number of hydraulic axes, scalar.
         sample_time: time since the last sample, scalar [s]; 0 for the first one, whose rates are 0.
         readings: Readings, written except for the supply pressure.
@@ -240,7 +245,7 @@ def store_readings(values, hydraulic, sample_time, readings):
 
 
 class FeedbackTable(NamedTuple):
-    """Sensors of a controller and their errors for a whole run.
+    """Sensors of a controller, their sampled errors for a whole run, and their last readings.
 
     Attributes:
         ticks_per_sample: control ticks per sample.

@@ -29,7 +29,10 @@ class _NativeBatch:
         self.library, self.handle, self.process = library, handle, os.getpid()
 
     def view_memory(self, address: int, shape: tuple[int, ...], kind: type = np.float64) -> np.ndarray:
-        """Return an array view of the batch's memory; the array keeps the batch alive."""
+        """Return an array view, of a shape and number type, of native memory at an address.
+
+        The array keeps the batch alive.
+        """
         size = int(np.prod(shape)) * np.dtype(kind).itemsize
         kept: Any = type("_Memory", (ctypes.c_char * size,), {})  # a subclass can have attributes
         memory = kept.from_address(address)
@@ -42,7 +45,7 @@ class _NativeBatch:
 
 
 class SimulationBatch:
-    """Simulations of copies of one model.
+    """Simulations of copies of one model, stepped in parallel by native code.
 
     Attributes:
         model: the model.
@@ -76,13 +79,13 @@ class SimulationBatch:
         self.state = self._native.view_memory(self._library.mjb_state(handle), (count, size))
 
     def expand_field(self, name: str) -> np.ndarray:
-        """Give a float field of the model a separate value for each simulation.
+        """Let the values of a float field of the model differ between the simulations.
 
         Args:
             name: name of an array of mjModel, or `opt.<name>`.
 
         Returns:
-            (n, size) view of the values; changes take effect with the next call.
+            (n, size) view of the values, one row per simulation. Changes take effect with the next `apply`.
 
         Raises:
             ValueError: MuJoCo does not support separate values for this field.
@@ -94,7 +97,9 @@ class SimulationBatch:
         return native.view_memory(place, (self.count, size.value))
 
     def apply(self, function: int, argument: int, chosen: np.ndarray | None = None) -> None:
-        """Call a C function `(mjModel*, mjData*, int simulation, void*)` for each simulation.
+        """Call a compiled function for each simulation, in parallel on the thread pool.
+
+        Its C signature is `(mjModel*, mjData*, int simulation, void* argument)`.
 
         Args:
             function: address of the function.
@@ -115,15 +120,15 @@ class SimulationBatch:
             raise RuntimeError(f"simulation {first}: {words}")
 
     def get_model(self, number: int, model: mujoco.MjModel) -> None:
-        """Write the model of one simulation into `model`, which has the same sizes."""
+        """Copy the model of simulation `number` into `model`, which must have the same sizes."""
         self._library.mjb_getModel(self._require_native().handle, number, model._address)
 
     def get_data(self, number: int, data: mujoco.MjData) -> None:
-        """Write the state of one simulation into `data`, which has the same sizes."""
+        """Copy the state of simulation `number` into `data`, which must have the same sizes."""
         self._library.mjb_getData(self._require_native().handle, number, data._address)
 
     def _require_native(self) -> _NativeBatch:
-        """Return the native batch; raise an error if it is closed or of a parent process."""
+        """Return the native batch; raise RuntimeError if it is closed or belongs to a parent process."""
         if self._native is None:
             raise RuntimeError("the simulations were closed: create new ones")
         if self._native.process != os.getpid():
@@ -146,7 +151,7 @@ class SimulationBatch:
 
 
 def _declare_signatures(library: ctypes.CDLL) -> None:
-    """Declare the function signatures of mjbatch.h to ctypes."""
+    """Declare the argument and result types of MuJoCo's batch functions (mjbatch.h) to ctypes."""
     place, number = ctypes.c_void_p, ctypes.c_int
     for name, result, *arguments in (
         ("mjb_makeBatch", place, place, number, place, place, number),

@@ -84,9 +84,10 @@ def sample_manufacturing_errors(
     model: ErrorModel, rng: np.random.Generator, names: tuple[str, ...] | None = None,
     size: float = 1.0,
 ) -> np.ndarray:  # fmt: skip
-    """Sample normal manufacturing errors (p,) with standard deviation `size` times `model.scales`.
+    """Sample the manufacturing errors (p,) of a robot from normal distributions of mean zero.
 
-    With `names`, only the errors of these names are sampled; all others are zero.
+    Their standard deviations are `size` times `model.scales`, in the units of `model`. With `names`,
+    only the errors of these names are sampled; all others are zero.
     """
     errors = rng.normal(size=len(model.names)) * model.scales * size
     if names is not None:
@@ -100,7 +101,7 @@ def sample_poses(
     robot: HybridRobot, count: int, rng: np.random.Generator, wires: WireGeometry | None = None,
     reach: float = PLATFORM_REACH, tilt: float = PLATFORM_TILT,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Sample random commands: carriage over its whole range, platform about its home pose.
+    """Sample random reachable poses: carriage over its whole range, platform about its home pose.
 
     Args:
         robot: nominal robot.
@@ -146,7 +147,8 @@ def simulate_measured_poses(
         joints: (N, n) true carriage positions [m] or [rad].
         legs: (N, 6) true leg readings [m].
         wires: geometry of the measuring wires.
-        noise: standard deviations `leg`, `slide`, `wire` [m], `turn` [rad].
+        noise: standard deviations of the readings `leg`, `prismatic`, `wire` [m], `revolute` [rad];
+            0 by default.
         rng: random generator of the noise.
 
     Returns:
@@ -222,7 +224,10 @@ def _add_servo(spec: mujoco.MjSpec, joint: str, stiffness: float) -> None:
 
 
 def _add_legs(spec, platform, lower, upper, home: PlatformPose, robot: HybridRobot) -> None:
-    """Add the legs, the moving platform on the first leg and the closures of the other legs."""
+    """Add the six legs, the moving platform on the first leg and `connect` constraints to the other legs.
+
+    `lower` and `upper` (6, 3) are the joint centres of the legs in frame 0 at home [m].
+    """
     up = home.rotation[:, 2]
     moving = None
     for leg, (a, b) in enumerate(zip(lower, upper, strict=True), 1):
@@ -339,7 +344,7 @@ def solve_mechanism_pose(
         The pose of the site `frame5` in frame 0.
 
     Raises:
-        Unreachable: the loops do not close.
+        UnreachableError: the loops do not close.
     """
     zero = leg_readings(robot, np.zeros(len(robot.joints)), home_pose(robot, np.zeros(len(joints))))
     driven = [*robot.joints, *(f"leg{k}" for k in range(1, LEG_COUNT + 1))]
@@ -364,7 +369,10 @@ def solve_mechanism_pose(
 
 
 def _loop_errors(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
-    """Return the openings (3 pins,) [m] of all connects and their Jacobian (3 pins, nv)."""
+    """Compute the loop closure errors (3 p,) [m] of p `connect` constraints and their Jacobian (3 p, nv).
+
+    An error is the vector between the two sites that the constraint makes coincide.
+    """
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     errors, slopes = [], []

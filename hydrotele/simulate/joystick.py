@@ -105,7 +105,11 @@ class SimulatedFlotor:
         self._spots = places + np.array(facts.flotor.handle)  # from the flotor's to the coils' frame
 
     def _fill_record(self, half_damping: np.ndarray, leaps: bool) -> None:
-        """Create the record for compiled code and keep the arrays that it points to."""
+        """Create the record of sizes and addresses for compiled code, and keep its arrays alive.
+
+        `half_damping` (6, 6) is half the damping matrix. `leaps` selects the leapfrog of the module
+        instead of MuJoCo's plain integration.
+        """
         model, data, coils = self.model, self.data, self.facts.coils
         body = model.body("flotor")
         mass, com, turn = float(body.mass[0]), body.ipos.copy(), np.zeros(9)
@@ -132,7 +136,7 @@ class SimulatedFlotor:
 
     @property
     def max_heat(self) -> float:
-        """Largest relative heat of any coil so far, see `heat_step`."""
+        """Largest temperature rise of any coil so far, relative to that at the continuous current [1]."""
         return float(self.record["hottest"][0])
 
     @property
@@ -145,7 +149,7 @@ class SimulatedFlotor:
         return float(self.record["allowed"][0])
 
     def step(self, currents: np.ndarray, muscles: np.ndarray) -> None:
-        """Advance by one control period with constant currents and muscle forces.
+        """Simulate one control period with constant coil currents and a constant force of the operator.
 
         Args:
             currents: (6,) coil currents [A].
@@ -160,11 +164,11 @@ class SimulatedFlotor:
         self, currents: np.ndarray, muscles: np.ndarray, mount: np.ndarray, spin: float,
         spin_rate: float,
     ) -> None:  # fmt: skip
-        """Advance like `step` in a cab that rotates about a vertical axis.
+        """Simulate one control period like `step`, but in a cab that rotates about a vertical axis.
 
         Args:
             currents: (6,) coil currents [A].
-            muscles: (6,) force and torque of the operator on the handle [N, N m].
+            muscles: (6,) force and torque of the operator on the handle [N], [N m].
             mount: (3,) position of the joystick relative to the cab's axis [m].
             spin: angular velocity of the cab [rad/s].
             spin_rate: its angular acceleration [rad/s^2].
@@ -176,7 +180,10 @@ class SimulatedFlotor:
         _step_record_in_cab(self.record, currents, muscles, float(spin), float(spin_rate))
 
     def weaken_coils(self) -> None:
-        """Reduce the force constants of the coils according to the flotor's pose."""
+        """Set the force per ampere of each coil according to the flotor's pose.
+
+        It decreases with the distance of a coil from its nominal position, where the field is weaker.
+        """
         turn, handle = np.empty(9), np.array(self.facts.flotor.handle)
         mujoco.mju_quat2Mat(turn, self.data.qpos[3:7])
         turn = turn.reshape(3, 3)
@@ -196,7 +203,7 @@ class SimulatedFlotor:
 
 
 def _damping_matrix(model: mujoco.MjModel) -> np.ndarray:
-    """Return the damping matrix (nv, nv) of joints and fixed tendons."""
+    """Return the viscous damping matrix (nv, nv) of joints and fixed tendons [N s/m], [N m s/rad]."""
     found, way = np.diag(model.dof_damping), np.zeros((model.ntendon, model.nv))
     for k in range(model.ntendon):
         at, many = model.tendon_adr[k], model.tendon_num[k]
@@ -227,10 +234,10 @@ def flotor_step(r, currents, muscles):
 
 @compiled
 def flotor_step_in_cab(r, currents, muscles, spin, spin_rate):
-    """Advance the flotor like `flotor_step` in a cab that rotates about a vertical axis.
+    """Advance the flotor by one control period in a cab that rotates about a vertical axis.
 
     Args:
-        r: see `flotor_step`.
+        r: `SimulatedFlotor.record[0]`; the heat and the MuJoCo state it points to are written.
         currents: (6,) coil currents [A].
         muscles: (6,) force and torque of the operator on the handle [N], [N m].
         spin: angular velocity of the cab, scalar [rad/s].
@@ -250,7 +257,10 @@ def flotor_step_in_cab(r, currents, muscles, spin, spin_rate):
 
 @compiled
 def _simulate_period(r, currents):
-    """Simulate one period with constant currents; applied forces and gravity are already set."""
+    """Update coil heat and current limit, and simulate one control period with currents (6,) [A].
+
+    Applied forces and gravity are already set in the MuJoCo state of the record.
+    """
     ctrl, heat = float64_view(r.ctrl, 6), float64_view(r.heat, 6)
     for i in range(6):
         ctrl[i] = currents[i]
@@ -284,7 +294,11 @@ def _simulate_period(r, currents):
 
 @compiled
 def _store_inputs(inputs, before):
-    """Move the second row of `before` (2, 15) to the first and store the inputs in the second."""
+    """Store the inputs of this period and keep those of the last one.
+
+    Row 0 of `before` (2, 15) receives the last inputs, and row 1 the new ones: coil currents, applied
+    forces and gravity.
+    """
     at = 0
     for part in inputs:
         for i in range(len(part)):
@@ -294,9 +308,10 @@ def _store_inputs(inputs, before):
 
 @compiled
 def _set_step_inputs(inputs, before, half_damping, speed, previous_weight):
-    """Set the inputs of a step: a weighted mean of the last and this period, and half the damping.
+    """Set currents, applied forces and gravity of a physics step, and apply half of the damping force.
 
-    `previous_weight` is the weight of the last period's inputs.
+    The inputs are a weighted mean of those of the last and of this period (`before`, see
+    `_store_inputs`). `previous_weight` is the weight of the last period.
     """
     at = 0
     for part in inputs:
@@ -321,9 +336,9 @@ def _step_record_in_cab(record, currents, muscles, spin, spin_rate):
 
 @compiled
 def heat_step(heat, currents, continuous, time_constant, period):
-    """Update the heat of the coils over a period of constant currents.
+    """Update the relative temperature rise ("heat") of the coils over a period of constant currents.
 
-    `heat' = ((I / I_c)^2 - heat) / T`, by its exact exponential: one thermal capacity heated by the
+    `d heat/dt = ((I / I_c)^2 - heat) / T`, by its exact exponential: one thermal capacity heated by the
     copper loss I^2 R. The steady state at the continuous current is 1.
 
     Args:
@@ -373,7 +388,19 @@ def coil_force_factors(
 
 @compiled
 def _cab_forces(mass, com, inertia, mount, w, a, muscles, gravity, out):
-    """Write the apparent gravity at the mount and the inertial forces in the rotating frame."""
+    """Compute apparent gravity and inertial forces of a flotor in a frame that rotates about the vertical.
+
+    Args:
+        mass: of the flotor, scalar [kg].
+        com: (3,) its centre of mass [m].
+        inertia: (3, 3) its inertia about the handle [kg m^2].
+        mount: (3,) position of the joystick relative to the axis of rotation [m].
+        w: angular velocity of the frame, scalar [rad/s].
+        a: its angular acceleration, scalar [rad/s^2].
+        muscles: (6,) force and torque of the operator [N], [N m].
+        gravity: (3,) written: gravity minus the acceleration of the mount [m/s^2].
+        out: (6,) written: operator's force and torque plus the inertial ones [N], [N m].
+    """
     gravity[0] = w * w * mount[0] + a * mount[1]
     gravity[1] = w * w * mount[1] - a * mount[0]
     gravity[2] = GRAVITY
@@ -386,7 +413,7 @@ def _cab_forces(mass, com, inertia, mount, w, a, muscles, gravity, out):
 
 
 def joystick_spec(facts: Joystick, hand: bool = True) -> mujoco.MjSpec:
-    """Load the joystick's MJCF and set its parameters.
+    """Load the joystick's MJCF and set its parameters: masses, coils, end stops and operator's arm.
 
     Args:
         facts: parameters of the joystick.
@@ -428,7 +455,7 @@ def joystick_spec(facts: Joystick, hand: bool = True) -> mujoco.MjSpec:
 
 
 def compile_joystick(facts: Joystick, spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compile a spec of `joystick_spec`.
+    """Compile a joystick specification, made by `joystick_spec`, to a MuJoCo model.
 
     Raises:
         InputError: MuJoCo refuses it; names file and line.
@@ -437,7 +464,7 @@ def compile_joystick(facts: Joystick, spec: mujoco.MjSpec) -> mujoco.MjModel:
 
 
 def _place_stops(spec: mujoco.MjSpec, facts: Joystick, path: Path) -> None:
-    """Place the six walls so that the ball at the coils' centre touches them at the gap's end."""
+    """Place the six end-stop walls so that the ball at the coils' centre touches them at the end of its travel."""
     ball, far = spec.geom("gap"), facts.workspace.translation
     walls = {f"gap_{axis}_{side}": (i, way) for i, axis in enumerate("xyz")
               for side, way in (("low", -1.0), ("high", 1.0))}  # fmt: skip

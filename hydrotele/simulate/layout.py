@@ -40,7 +40,7 @@ _PRIMITIVES = {
 
 
 def _size_and_alignment(node) -> tuple[int, int]:
-    """Return size and alignment of a C type [byte]."""
+    """Return size and alignment [byte] of a C type, given as a node of `mujoco.introspect`."""
     if isinstance(node, ast_nodes.PointerType):
         return 8, 8
     if isinstance(node, ast_nodes.ArrayType):
@@ -61,7 +61,7 @@ def _size_and_alignment(node) -> tuple[int, int]:
 
 
 def _struct_layout(fields) -> tuple[dict[str, int], int, int]:
-    """Return field offsets, size and alignment of a C struct [byte]."""
+    """Return the field offsets, the size and the alignment [byte] of a C struct with the given fields."""
     offsets: dict[str, int] = {}
     position, alignment = 0, 1
     for field in fields:
@@ -98,7 +98,7 @@ def struct_size(struct: str) -> int:
 
 
 def _read_number(address: int, dtype) -> float:
-    """Read a number of a numpy type at an address."""
+    """Read the number of a numpy type (float64, int64 or int32) that is stored at a memory address."""
     kinds = {np.float64: ctypes.c_double, np.int64: ctypes.c_int64, np.int32: ctypes.c_int32}
     kind = kinds[dtype]
     return kind.from_address(address).value
@@ -126,7 +126,7 @@ _PROBE_MODEL = """<mujoco><option timestep="0.0123"/><custom><numeric name="n" d
 
 @functools.cache
 def verify_layout() -> None:
-    """Check the computed offsets against the Python bindings on a small model.
+    """Check the computed offsets of MuJoCo's structs against the Python bindings on a small model.
 
     Raises:
         RuntimeError: the offset of a field is wrong; native hydraulics cannot run with this MuJoCo
@@ -182,7 +182,10 @@ def verify_layout() -> None:
 
 @intrinsic
 def call_step(typingctx, function, model, data):
-    """Call `mj_step(model, data)`, or another function of these arguments, by its address."""
+    """Call `mj_step(model, data)` from compiled code, or another C function of these arguments.
+
+    All arguments are addresses, given as integers.
+    """
 
     def codegen(context, builder, signature, args):
         kind = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t] * 2)
@@ -196,7 +199,10 @@ def call_step(typingctx, function, model, data):
 
 @intrinsic
 def call_contact_force(typingctx, function, model, data, contact, wrench):
-    """Call `mj_contactForce(model, data, contact, wrench)`; all are addresses except `contact`."""
+    """Call `mj_contactForce(model, data, contact, wrench)` from compiled code to get a contact wrench.
+
+    `contact` is the index of the contact; all other arguments are addresses, given as integers.
+    """
 
     def codegen(context, builder, signature, args):
         place, integer = cgutils.voidptr_t, ir.IntType(32)
@@ -213,7 +219,10 @@ def call_contact_force(typingctx, function, model, data, contact, wrench):
 
 @intrinsic
 def call_set_state(typingctx, function, model, data, state, spec):
-    """Call `mj_setState(model, data, state, spec)`; all arguments but `spec` are addresses."""
+    """Call `mj_setState(model, data, state, spec)` from compiled code to set the simulation state.
+
+    `spec` selects the parts of the state; all other arguments are addresses, given as integers.
+    """
 
     def codegen(context, builder, signature, args):
         integer = ir.IntType(32)
@@ -230,7 +239,7 @@ def call_set_state(typingctx, function, model, data, state, spec):
 
 @functools.cache
 def function_address(name: str) -> int:
-    """Return the address of a function of MuJoCo's library, such as `mj_step`."""
+    """Return the memory address of a C function of MuJoCo's library, such as `mj_step`."""
     import ctypes
 
     return ctypes.cast(getattr(mujoco_library(), name), ctypes.c_void_p).value or 0

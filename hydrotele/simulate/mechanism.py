@@ -54,7 +54,10 @@ TIP_SITE = f"{NAME_PREFIX}tip"
 
 
 def pin_site(closure: str, end: str) -> str:
-    """Return the name of the site at end a or b of a closure; a cylinder's is `<axis>_pin`."""
+    """Return the name of the MuJoCo site at one end (`a` or `b`) of a pin joint that closes a loop.
+
+    The rod pin of a cylinder has the closure name `<axis>_pin`.
+    """
     return f"{NAME_PREFIX}{closure}_{end}"
 
 
@@ -125,9 +128,9 @@ def _asset_name(element: Element) -> str:
 
 
 def name_geoms(root: Element) -> None:
-    """Give every unnamed geom a name derived from its body, in place.
+    """Give every unnamed geom of an MJCF tree a name derived from its body, in place.
 
-    For speed: `dm_control` searches the whole document for each unnamed element that it writes.
+    The reason is speed: `dm_control` searches the whole document for each unnamed element that it writes.
     """
     for body in root.iter("body"):
         for number, geom in enumerate(body.findall("geom")):
@@ -136,7 +139,7 @@ def name_geoms(root: Element) -> None:
 
 
 def _contacts_by_class(root: Element) -> dict[str, bool]:
-    """Map each default class to whether its geoms can have contacts by default."""
+    """Return for each default class of an MJCF whether its geoms can have contacts by default."""
     table: dict[str, bool] = {}
 
     def walk(element: Element, name: str, contype: int, conaffinity: int) -> None:
@@ -252,7 +255,10 @@ _MAX_NUMERIC_SIZE = 500  # largest size of a `numeric` element; larger ones over
 
 
 def _write_terms(root, table: np.ndarray) -> None:
-    """Add the table of terms as consecutive `numeric` elements; MuJoCo stores them contiguously."""
+    """Add the table of terms (additional force and flow laws) to the MJCF as custom `numeric` elements.
+
+    A long table is split over consecutive elements, which MuJoCo stores contiguously.
+    """
     for part, first in enumerate(range(0, len(table), _MAX_NUMERIC_SIZE), start=1):
         data = table[first : first + _MAX_NUMERIC_SIZE]
         name = "hydrotele_terms" + (f"_{part}" if part > 1 else "")
@@ -260,7 +266,10 @@ def _write_terms(root, table: np.ndarray) -> None:
 
 
 def add_element(parent, kind: str, **attributes):
-    """Add an MJCF element; type checkers do not know the run-time classes of `dm_control`."""
+    """Add an element of a kind, such as `site`, to a parent element of an MJCF document, and return it.
+
+    This hides the run-time classes of `dm_control` from type checkers.
+    """
     return parent.add(kind, **attributes)
 
 
@@ -299,7 +308,10 @@ def _attach_bodies(tree: Element, body: str, file: Path) -> None:
 
 
 def _reject_foreign_elements(root, machine: Machine) -> None:
-    """Reject elements that belong in the machine file or that logs would not contain."""
+    """Raise InputError if the MJCF has elements that belong in the machine file.
+
+    These are actuators, equality constraints, keyframes and joints that machine.yaml does not name.
+    """
     known = set(machine.joints)
     for name, axis in machine.axes.items():
         known |= {f"{name}_tube", f"{name}_rod", tilt_joint(name)} if axis.cylinder else set()
@@ -322,7 +334,7 @@ def _reject_foreign_elements(root, machine: Machine) -> None:
 
 
 def _set_options(root, machine: Machine, timestep: float) -> None:
-    """Set compiler and solver options."""
+    """Set the compiler, integrator and solver options of the MJCF, including time step and gravity."""
     root.compiler.angle = root.compiler.angle or "degree"  # degree: MuJoCo's default
     root.compiler.autolimits = True
     del root.compiler.boundmass, root.compiler.boundinertia  # a forgotten inertia is an error
@@ -344,7 +356,7 @@ def _find_body(root, name: str):
 
 
 def _write_link(root, name: str, link: Link) -> None:
-    """Write inertia, position and joint of a link; create its body if it is missing."""
+    """Write inertia, position and joint of a link to its MJCF body; create the body if it is missing."""
     body = root.find("body", name)
     if body is None:
         parent = _find_body(root, link.parent)
@@ -388,7 +400,10 @@ def _set_inertial(body, mass, com, inertia) -> None:
 
 
 def _write_cylinder(root, name: str, cylinder: Cylinder, pins: Vector, timestep: float) -> None:
-    """Write tube, rod and rod pin of a cylinder."""
+    """Write tube, rod and rod pin of a cylinder to the MJCF; missing bodies are created.
+
+    `pins` is the direction of the pin axes.
+    """
     tube = root.find("body", f"{name}_tube")
     if tube is None:
         base = _find_body(root, cylinder.base_pin.link)
@@ -407,7 +422,10 @@ def _write_cylinder(root, name: str, cylinder: Cylinder, pins: Vector, timestep:
 
 
 def _write_ball_end(root, name: str) -> None:
-    """Add a second hinge at the base of a tube, perpendicular to the first one and to the tube."""
+    """Add a second hinge at the base of a tube with ball ends, so that it can also tilt sideways.
+
+    Its axis is perpendicular to the first hinge and to the tube.
+    """
     if root.find("joint", tilt_joint(name)) is None:
         first = root.find("joint", f"{name}_tube")
         across = np.cross((1.0, 0.0, 0.0), first.axis)
@@ -422,7 +440,11 @@ def tilt_joint(axis: str) -> str:
 
 
 def _write_travel(root, machine: Machine, name: str) -> None:
-    """Set the travel limits of a cylinder at its rod only; a second stop would share the load."""
+    """Set the travel limits of a cylinder axis at the rod slide.
+
+    If the range of the axis' joint is defined there, the joint gets no limit, because two end stops
+    would share the load.
+    """
     root.find("joint", f"{name}_rod").range = drive_travel(machine, name)
     if range_at_drive(machine, name):
         root.find("joint", machine.axes[name].joint).limited = "false"
@@ -439,7 +461,7 @@ def _add_pin(root, name: str, a: Pin, b: Pin, timestep: float) -> None:
 
 
 def _write_actuators(root, machine: Machine) -> None:
-    """Add one actuator per axis, with its parameters as user data."""
+    """Add one MuJoCo actuator per axis, with its hydraulic and friction parameters as user data."""
     for name, numbers in actuator_parameters(machine).items():
         axis: Axis = machine.axes[name]
         actuator = root.actuator.add(
@@ -497,7 +519,7 @@ _MIN_DEFLECTION = 1.0e-9  # m or rad: smaller static deflections count as no loa
 
 
 def drive_joint(machine: Machine, axis: str) -> str:
-    """Return the name of the joint that the actuator of an axis acts on."""
+    """Return the name of the joint that the actuator of an axis acts on: the drive side of a transmission."""
     return f"{axis}_drive" if machine.axes[axis].transmission else load_joint(machine, axis)
 
 
@@ -508,7 +530,7 @@ def load_joint(machine: Machine, axis: str) -> str:
 
 
 def flexible_axes(machine: Machine) -> list[str]:
-    """Return the names of the axes with a transmission."""
+    """Return the names of the axes with a transmission, which is a spring and damper between drive and load."""
     return [name for name, axis in machine.axes.items() if axis.transmission]
 
 
@@ -549,14 +571,14 @@ def write_drive_side(root, machine: Machine, axis: str) -> None:
 
 
 def lock_drives(machine: Machine, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Set every drive side to the position of its load, with the spring at rest, in `qpos`."""
+    """Set the position of every drive side in `qpos` to that of its load, so that no transmission is deflected."""
     for axis in flexible_axes(machine):
         drive, load = drive_joint(machine, axis), load_joint(machine, axis)
         data.qpos[model.joint(drive).qposadr[0]] = data.qpos[model.joint(load).qposadr[0]]
 
 
 def drive_and_load_dofs(machine: Machine, model: mujoco.MjModel) -> tuple[list[int], list[int]]:
-    """Return the indices in `qvel` of the drive sides, and of the corresponding load sides."""
+    """Return the indices in `qvel` of the drive sides of all transmissions, and of their load sides."""
     axes = flexible_axes(machine)
     drives = [int(model.joint(drive_joint(machine, a)).dofadr[0]) for a in axes]
     loads = [int(model.joint(load_joint(machine, a)).dofadr[0]) for a in axes]

@@ -77,7 +77,10 @@ _kept_callbacks: list = []  # keeps the callbacks behind these symbols alive
 
 @intrinsic
 def _stack_space(typingctx, size):
-    """Return work space on the stack of the calling function, which is private to the thread."""
+    """Return the address of a work space on the stack of the calling compiled function.
+
+    It has room for 2 SCRATCH_SIZE numbers; `size` is not used. It is private to the thread.
+    """
 
     def codegen(context, builder, signature, args):
         space = cgutils.alloca_once(builder, cgutils.voidptr_t, size=2 * SCRATCH_SIZE)
@@ -88,7 +91,7 @@ def _stack_space(typingctx, size):
 
 @compiled
 def _passive_force(m, d, i, m_nu, m_nv, m_njnt, m_trnid, m_dofadr, d_passive):
-    """Return the spring and damper force on the joint of actuator i.
+    """Read MuJoCo's passive (spring and damper) force on the joint of actuator i [N] or [N m].
 
     `m` and `d` are the addresses of mjModel and mjData; all further arguments are field offsets.
     """
@@ -105,14 +108,20 @@ def _passive_force(m, d, i, m_nu, m_nv, m_njnt, m_trnid, m_dofadr, d_passive):
 
 @compiled
 def _read_gain(m, i, m_gainprm):
-    """Return the force per command of a force drive; 0 for a valve."""
+    """Read the force per command of actuator i from mjModel; it is 0 for a valve.
+
+    `m` is the address of mjModel, and `m_gainprm` the offset of `actuator_gainprm`.
+    """
     at_gain = carray(address_to_pointer(m + m_gainprm), (1,), np.int64)[0]
     return float64_view(at_gain + 8 * _GAIN_COUNT * i, 1)[0]
 
 
 @compiled
 def _read_terms(m, m_nnumeric, m_adr, m_size, m_data):
-    """Return the table of terms of a model (n,); empty without terms."""
+    """Return a view (n,) of the table of terms (additional force and flow laws) in mjModel; empty without.
+
+    `m` is the address of mjModel; the other arguments are offsets of its `numeric` fields.
+    """
     count = carray(address_to_pointer(m + m_nnumeric), (1,), np.int64)[0]
     if count > 0:
         data = carray(address_to_pointer(m + m_data), (1,), np.int64)[0]
@@ -142,7 +151,11 @@ class _DataOffsets(NamedTuple):
 
 @compiled
 def _read_drive_state(d, at, i, user, gain, dt, nu, scratch):
-    """Return the DriveState of drive i with end-of-step pressures, and the Drives."""
+    """Read the inputs of force terms from mjData: the DriveState of drive i, and the state of all Drives.
+
+    Activations are extrapolated to the end of the step. `d` is the address of mjData, `at` the offsets
+    of its fields, `user` the actuator parameters, `gain` the force per command, and `scratch` work space.
+    """
     count, act = int(user[_COUNT]), float64_view(d, 0)
     lengths = float64_view(carray(address_to_pointer(d + at.length), (1,), np.int64)[0], nu)
     velocities = float64_view(carray(address_to_pointer(d + at.velocity), (1,), np.int64)[0], nu)
@@ -164,14 +177,21 @@ def _read_drive_state(d, at, i, user, gain, dt, nu, scratch):
 
 @allocation_free
 def _advance_force_drive(user, u, act, rate, velocity, command, low, high, dt):
-    """Write the rates of the two activations of a force drive: bristle state and command."""
+    """Write the rates (2,) of the activations of a force drive with presliding friction.
+
+    The first is the bristle state, and the second the command, limited to `low` .. `high`. It reaches
+    its new value within the step.
+    """
     rate[0] = bristle_rate(user, u, act[0], velocity, user[u + _BRISTLE_INERTIA], dt)
     rate[1] = (min(high, max(low, command)) - act[1]) / dt
 
 
 @allocation_free
 def _advance_extra_states(user, first, drives, dt, act_dot, scratch, terms, time, arrived):
-    """Run `step_circuit` and write the rates of bristles and of the internal states of terms."""
+    """Step the hydraulic circuit, and write the rates of bristles and of terms with an internal state.
+
+    The arguments are those of `step_circuit`. `arrived` (nu,) are the commands before command terms.
+    """
     count, act, length, velocity, _ = drives
     memory = len(act) - 4 * count
     _, supply = step_circuit(user, first, drives, dt, act_dot, scratch, terms, time, memory)
@@ -187,10 +207,10 @@ def _advance_extra_states(user, first, drives, dt, act_dot, scratch, terms, time
 
 @allocation_free
 def _has_valid_indices(user, first, count, nu, free):
-    """Return whether the indices in the parameters of a group of axes are within bounds.
+    """Return whether all indices among the parameters of the hydraulic axes are within bounds.
 
-    User code can change these parameters in a model. `free` is the number of activations from the
-    first axis on. The comparisons reject NaN.
+    The check is needed because user code can change these parameters in a model. `nu` is the number of
+    actuators, and `free` that of activations from the first axis on. The comparisons reject NaN.
     """
     if not (0 <= first and 1 <= count <= MAX_AXES and first + count <= nu):
         return False
@@ -214,7 +234,7 @@ def _has_valid_indices(user, first, count, nu, free):
 
 @allocation_free
 def _command_or_zero(command, k):
-    """Return the command of actuator k, or 0 if any command is NaN, as MuJoCo does."""
+    """Return the command of actuator k, or 0 if any command (nu,) is NaN, as MuJoCo does."""
     for value in command:
         if value != value:
             return 0.0
@@ -223,7 +243,11 @@ def _command_or_zero(command, k):
 
 @functools.cache
 def _compile_callbacks():
-    """Compile the activation and force callbacks for this MuJoCo, or load them from the cache."""
+    """Compile MuJoCo's activation and force callbacks, or load them from the cache on disk.
+
+    Returns:
+        (callback for `mjcb_act_dyn`, callback for `mjcb_act_bias`).
+    """
     verify_layout()
     remembering = _make_callbacks(True)
     for symbol, function in zip((_ADVANCE_EXTENDED.symbol, _FORCE_EXTENDED.symbol), remembering, strict=True):
@@ -233,9 +257,10 @@ def _compile_callbacks():
 
 
 def _make_callbacks(has_extra_states):
-    """Create the activation and force callbacks.
+    """Create the callbacks for the activations and for the actuator forces.
 
-    With `has_extra_states`, they handle bristles and further states; otherwise they pass such drives on.
+    With `has_extra_states`, they handle drives with bristles or other additional states. Otherwise they
+    pass such drives on to the callbacks that do.
     """
     model_at, data_at = field_offsets("mjModel"), field_offsets("mjData")
     m_user, m_actadr = model_at["actuator_user"], model_at["actuator_actadr"]
@@ -256,7 +281,10 @@ def _make_callbacks(has_extra_states):
 
     @callback(_SIGNATURE)
     def advance(m, d, i):
-        """Write the rates of all activations of the hydraulic axes (callback `mjcb_act_dyn`)."""
+        """Write the rates of all activations of the hydraulic axes (callback `mjcb_act_dyn`).
+
+        `m` and `d` are the addresses of mjModel and mjData. The last hydraulic actuator i does the work.
+        """
         if carray(address_to_pointer(m + m_nuser), (1,), np.int64)[0] != SLOT_COUNT:
             return 0.0
         i = np.int64(i)
@@ -338,7 +366,10 @@ def _make_callbacks(has_extra_states):
 
     @callback(_SIGNATURE)
     def force(m, d, i):
-        """Return the bias force of actuator i after friction (callback `mjcb_act_bias`)."""
+        """Return the force of actuator i after friction and terms (callback `mjcb_act_bias`) [N] or [N m].
+
+        `m` and `d` are the addresses of mjModel and mjData.
+        """
         if carray(address_to_pointer(m + m_nuser), (1,), np.int64)[0] != SLOT_COUNT:
             return 0.0
         i = np.int64(i)
@@ -422,7 +453,7 @@ def _make_callbacks(has_extra_states):
 
 
 def stop_profiling_clock() -> None:
-    """Remove MuJoCo's profiling clock, which takes 14 % of a step of these small models.
+    """Remove MuJoCo's profiling clock, whose calls take 14 % of a step of these small models.
 
     `mjData.timer` then stays zero in this process; `mujoco.set_mjcb_time` sets a clock again.
     """
@@ -431,7 +462,7 @@ def stop_profiling_clock() -> None:
 
 
 def install_hydraulics() -> None:
-    """Install the actuator callbacks in this process; further calls have no effect.
+    """Install the hydraulic actuator callbacks of MuJoCo in this process; further calls have no effect.
 
     Raises:
         RuntimeError: another package has installed actuator callbacks, or the layout of MuJoCo's

@@ -56,7 +56,7 @@ from hydrotele.terms.table import COMMAND, FLOW_HEAD, FLOW_ROD, FORCE, sum_terms
 
 
 def set_bristle_inertias(machine: Machine, model: mujoco.MjModel) -> None:
-    """Write the effective inertia of each drive with presliding friction into a model.
+    """Compute the inertia that each drive with presliding friction moves at home, and write it into a model.
 
     Args:
         machine: the machine.
@@ -65,8 +65,8 @@ def set_bristle_inertias(machine: Machine, model: mujoco.MjModel) -> None:
     Raises:
         InputError: the linkages do not close at home.
 
-    Source: `(J M^-1 J')^-1` of a drive's Jacobian J, in independent coordinates; the drive side's
-        own inertia where there is a transmission.
+    Source: `(J M^-1 J')^-1` with a drive's Jacobian J and the mass matrix M, in independent
+        coordinates; the drive side's own inertia where there is a transmission.
     """
     order = actuator_order(machine)
     axes = [machine.axes[name] for name in order]
@@ -102,15 +102,16 @@ _IMPEDANCE_TRANSITION = (
 
 
 def stop_joints(machine: Machine) -> dict[str, str]:
-    """Return axis -> name of the joint whose limits are the end stops of the axis."""
+    """Return for each axis with an end stop the name of the joint whose limits are this end stop."""
     return {name: load_joint(machine, name) for name in machine.axes if machine.end_stop(name)}
 
 
 def set_end_stops(machine: Machine, model: mujoco.MjModel) -> None:
-    """Set the joint limits of a model to the stiffness and damping of the machine's end stops.
+    """Give the joint limits of a model the stiffness and damping of the machine's end stops.
 
-    MuJoCo computes `R = (1 - d) / d A_0` from the impedance d and the inverse inertia A_0 at the
-    reference pose, and `a_ref = -B v - K d r` from `solref = (-K d^2, -B d)`.
+    MuJoCo computes the regularisation `R = (1 - d) / d A_0` from the impedance d and the inverse inertia
+    A_0 at the reference pose. From `solref = (-K d^2, -B d)` it computes the reference acceleration
+    `a_ref = -B v - K d r` at velocity v and depth r. See the module for the choice of R and a_ref.
 
     Args:
         machine: the machine.
@@ -191,7 +192,7 @@ class Plant:
         return self._activations(data)[:, 2:]
 
     def _activations(self, data: mujoco.MjData) -> np.ndarray:
-        """Return the activations of the hydraulic axes as (h, 4)."""
+        """Return the activations (h, 4) of the h hydraulic axes: spool, spool rate, two pressures."""
         count = ACTIVATIONS_PER_AXIS * self.hydraulic
         return np.array(data.act[:count]).reshape(self.hydraulic, ACTIVATIONS_PER_AXIS)
 
@@ -285,9 +286,10 @@ def build_plant(
 
 
 def _extra_state_indices(machine: Machine, model: mujoco.MjModel) -> dict[str, int]:
-    """Map each name of `extra_state_names` to its activation index.
+    """Return for each additional state (`extra_state_names`) its index in `act`.
 
-    Bristle states of force drives are activations of their actuators.
+    The bristle state of a force drive is an activation of its own actuator; the others follow after
+    those of the hydraulic axes.
     """
     places, first = {}, ACTIVATIONS_PER_AXIS * len(machine.hydraulic_axes)
     for k, name in enumerate(extra_state_names(machine)):
@@ -388,12 +390,12 @@ def evaluate_terms(
     machine: Machine, time: np.ndarray, act: np.ndarray, x: np.ndarray, v: np.ndarray,
     command: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Compute the forces and flows that terms add in n states of a machine with nu drives.
+    """Compute the forces and flows that a machine's terms (additional laws) add in n states of nu drives.
 
     Args:
         machine: the machine.
         time: (n,) time [s].
-        act: (n, >= 4 count) activations.
+        act: (n, na) activations.
         x: (n, nu) drive positions [m] or [rad].
         v: (n, nu) drive velocities [m/s] or [rad/s].
         command: (n, nu) commands after their delay [1] or [V].
@@ -419,7 +421,11 @@ def evaluate_terms(
 
 @compiled
 def _evaluate_term_rows(user, terms, count, gain, time, act, x, v, command, out):
-    """Compute `evaluate_terms` for all rows and write the result to `out`."""
+    """Compute the forces and flows of terms for all rows and write them to `out`, see `evaluate_terms`.
+
+    `user` are the actuator parameters, `terms` the table of terms, `count` the number of hydraulic axes
+    and `gain` (nu,) the force per command of force drives, 0 for others.
+    """
     scratch = np.zeros(SCRATCH_SIZE)
     for row in range(len(time)):
         supply = 0.0

@@ -97,7 +97,7 @@ def start_leapfrog(model: mujoco.MjModel, data: mujoco.MjData) -> None:
 
 
 def aligned_positions(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Return the positions (nq,) at the time of the activations.
+    """Return the current positions (nq,), moved back by one step to the time of the activations.
 
     Positions from the first ball or free joint on (trees and logs) are not aligned.
     """
@@ -105,7 +105,10 @@ def aligned_positions(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
 
 
 def align_positions(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-    """Return staggered positions (..., nq) moved back by a step with velocities (..., nv)."""
+    """Return staggered positions (..., nq), moved back by one step with the velocities (..., nv).
+
+    This aligns them with the time of the activations, see the module.
+    """
     positions = np.array(qpos)
     rows, rates = positions.reshape(-1, model.nq), qvel.reshape(-1, model.nv)
     _move_back_one_step(rows, rates, model.opt.timestep, _count_alignable_positions(model))
@@ -114,14 +117,17 @@ def align_positions(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray) -
 
 @compiled
 def _move_back_one_step(positions, velocities, timestep, plain):
-    """Move the first `plain` positions of every row (n, nq) back by a step."""
+    """Subtract time step times velocity (n, nv) from the first `plain` positions of every row (n, nq)."""
     for row in range(len(positions)):
         for i in range(plain):
             positions[row, i] -= timestep * velocities[row, i]
 
 
 def _count_alignable_positions(model: mujoco.MjModel) -> int:
-    """Return the number of leading positions whose time derivatives are the velocities."""
+    """Return the number of leading elements of `qpos` whose time derivatives are those of `qvel`.
+
+    Quaternions of ball and free joints, which come last, have other derivatives.
+    """
     return model.nq if model.nq == model.nv else _count_single_dof_joints(model.jnt_type)
 
 
@@ -130,7 +136,10 @@ _BALL, _FREE = int(mujoco.mjtJoint.mjJNT_BALL), int(mujoco.mjtJoint.mjJNT_FREE)
 
 @compiled
 def _count_single_dof_joints(kinds):
-    """Count the joints of one degree of freedom before the first ball or free joint."""
+    """Return the number of joints of one degree of freedom that precede the first ball or free joint.
+
+    `kinds` (njnt,) are MuJoCo's joint types; 0 is returned if no such joint exists.
+    """
     for k in range(len(kinds)):
         if kinds[k] == _BALL or kinds[k] == _FREE:
             return k
@@ -138,7 +147,10 @@ def _count_single_dof_joints(kinds):
 
 
 def sensed_channels(plant: Plant) -> tuple[str, ...]:
-    """Return the channels with a sensor: positions, chamber pressures, supply pressure, lengths."""
+    """Return the log channels that a sensor measures: positions, chamber pressures, supply pressure, lengths.
+
+    The order is that of the sensor values in compiled code.
+    """
     machine = plant.machine
     names = [f"{machine.position_kind(axis)}.{axis}" for axis in plant.axes]
     for axis in plant.axes[: plant.hydraulic]:
@@ -256,7 +268,10 @@ class Recorder:
             self.late[row] = shown
 
     def native_records(self, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
-        """Return the records for `record_row`: that of the arrays and that of the contacts."""
+        """Return the records for `record_row`: that of the recorder's arrays and that of the contacts.
+
+        They are created anew if `data` differs from that of the last call.
+        """
         if data is not self._data:
             self._create_records(data)
         return self._row, self._contacts
@@ -283,7 +298,7 @@ class Recorder:
         self._contacts = contact_record(model, data, self.geom_groups)
 
     def instability_error(self, row: int) -> SimulationFailed:
-        """Create the exception for a row that is not finite, with the last states."""
+        """Create the exception for an unstable simulation; its message lists the states up to a row."""
         lines = [f"the simulation became unstable at {self.time[row]:.3f} s; the last states:"]
         for r in range(max(0, row - 3), row + 1):
             qpos, act = (np.array2string(a[r], precision=4) for a in (self.qpos, self.act))
@@ -309,7 +324,7 @@ def surrounding_bodies(plant: Plant) -> np.ndarray:
 
 
 def surrounding_geoms(plant: Plant) -> np.ndarray:
-    """Return whether each geom (ngeom,) belongs to such a body, as integers 0 and 1."""
+    """Return for each geom (ngeom,) 1 if it belongs to the ground or a surrounding object, else 0."""
     return _geom_flags(plant.model, surrounding_bodies(plant))
 
 
@@ -339,7 +354,7 @@ def _geom_flags(model: mujoco.MjModel, around: np.ndarray) -> np.ndarray:
 
 
 def total_contact_force(model: mujoco.MjModel, data: mujoco.MjData, around: np.ndarray) -> np.ndarray:
-    """Return the sum of all contact forces on the machine, (3,) [N] in the world frame.
+    """Return the sum (3,) of the contact forces of ground and objects on the machine, world frame [N].
 
     Args:
         model: the model.
@@ -384,11 +399,11 @@ def contact_record(model: mujoco.MjModel, data: mujoco.MjData, around: np.ndarra
 
 @compiled
 def sum_contact_forces(record, total):
-    """Compute the sum of all contact forces on the machine.
+    """Compute the sum of the contact forces of ground and objects on the machine, in compiled code.
 
     Args:
         record: record of `contact_record`.
-        total: (3,) written, world frame [N].
+        total: (3,) written: the sum, world frame [N].
 
     Returns:
         Nothing.
@@ -427,13 +442,13 @@ _SPOOL_CHANNELS = ("spool", "1"), ("spool_rate", "1/s")
 
 @compiled
 def state_supply(user, count, act, scratch):
-    """Compute the supply pressure in a state.
+    """Compute the supply pressure of the hydraulic circuit from the activations of a state.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) actuator parameters.
         count: number of hydraulic axes, which come first.
         act: (>= 4 count,) activations, and the state of a pump with a time constant.
-        scratch: (SCRATCH,) work space.
+        scratch: (SCRATCH_SIZE,) work space.
 
     Returns:
         p_s, scalar [Pa].
@@ -449,14 +464,15 @@ def state_flows(user, count, act, x, v):
     """Compute supply pressure, valve flows and drive forces of n states.
 
     Args:
-        user: (nu * SLOTS,) actuator parameters.
+        user: (nu * SLOT_COUNT,) actuator parameters.
         count: number of hydraulic axes.
         act: (n, >= 4 count) activations.
         x: (n, nu) drive positions [m] or [rad].
         v: (n, nu) drive velocities [m/s] or [rad/s].
 
     Returns:
-        (n, 1 + 3 count): p_s [Pa], then q_head, q_rod [m^3/s], force [N] or [N m] of every axis.
+        (n, 1 + 3 count): supply pressure [Pa]; then for every axis the valve flows into head and rod
+        chamber [m^3/s] and the force after friction [N] or [N m], without terms.
 
     Source: nominal model.
     """
@@ -505,7 +521,10 @@ def _measurable_channels(plant: Plant, record: Record):
 
 
 def _sensed_values(plant: Plant, qpos: np.ndarray, act: np.ndarray) -> dict[str, np.ndarray]:
-    """Return positions, lengths and chamber pressures from states (n, nq), (n, na)."""
+    """Return channel -> (n,) true positions, cylinder lengths and chamber pressures.
+
+    They are read from the positions (n, nq) and activations (n, na) of n states.
+    """
     values = {}
     for i, name in enumerate(plant.axes):
         values[f"{plant.machine.position_kind(name)}.{name}"] = qpos[:, plant.qpos[i]]
@@ -539,7 +558,7 @@ def delayed_channels(plant: Plant, record: Record) -> dict[str, np.ndarray]:
 
 
 def _unmeasured_channels(plant: Plant, record: Record):
-    """Return values and units of the `truth.*` channels, which have no sensor."""
+    """Return values and units of the channels without a sensor: `truth.*`, and the supply pressure."""
     machine, model = plant.machine, plant.model
     values: dict[str, np.ndarray] = {}
     units: dict[str, str] = {}
@@ -574,7 +593,10 @@ def _unmeasured_channels(plant: Plant, record: Record):
 
 
 def _add_object_poses(plant: Plant, record: Record, put) -> None:
-    """Add the poses of plates, trees and logs; rotations are rotation vectors."""
+    """Add channels with the poses of plates, trees and logs, by calls `put(name, column, unit)`.
+
+    Rotations are rotation vectors [rad].
+    """
     for joint, place in object_joints(plant.model):
         name, kind = plant.model.joint(joint).name, plant.model.jnt_type[joint]
         if kind == mujoco.mjtJoint.mjJNT_FREE:
@@ -588,7 +610,7 @@ def _add_object_poses(plant: Plant, record: Record, put) -> None:
 
 
 def _add_rotation(name: str, quaternions: np.ndarray, put) -> None:
-    """Add rotations, given as quaternions (n, 4), as rotation vectors [rad]."""
+    """Add three channels with the rotation vector [rad] of an object, given as quaternions (n, 4)."""
     vectors = np.empty((len(quaternions), 3))
     for vector, quaternion in zip(vectors, quaternions, strict=True):
         mujoco.mju_quat2Vel(vector, quaternion, 1.0)
@@ -597,7 +619,7 @@ def _add_rotation(name: str, quaternions: np.ndarray, put) -> None:
 
 
 def _add_hydraulic_channels(plant: Plant, record: Record, put) -> None:
-    """Add spools, flows, forces and supply pressure of the hydraulic axes."""
+    """Add channels with spools, flows, forces and supply pressure, by calls `put(name, column, unit)`."""
     count = plant.hydraulic
     if not count:
         return
@@ -628,7 +650,7 @@ def _add_hydraulic_channels(plant: Plant, record: Record, put) -> None:
 
 
 def drive_motion(plant: Plant, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the drive positions and velocities of n states.
+    """Select the drive positions and velocities from n complete states.
 
     Args:
         plant: the plant.
@@ -636,8 +658,8 @@ def drive_motion(plant: Plant, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.n
         qvel: (n, nv) velocities.
 
     Returns:
-        (x (n, nu), v (n, nu)): displacement and velocity of piston or rotor; without a transmission
-        they are those of the load.
+        (x (n, nu) [m] or [rad], v (n, nu) [m/s] or [rad/s]): displacement and velocity of piston or
+        rotor; without a transmission they are those of the load.
     """
     return (
         np.ascontiguousarray(qpos[:, plant.drive_qpos]),

@@ -34,7 +34,7 @@ _STRIP_START, _STRIP_END, _CELL_LENGTH = 1.0, 11.0, 0.05  # m, radii from the sw
 
 
 def machine_bucket(machine: Machine) -> Bucket:
-    """Return the bucket of a machine: that of the CAT 215, scaled to the distance from pin to edge.
+    """Return the digging bucket of a machine: that of the CAT 215, scaled to the distance from pin to edge.
 
     Raises:
         InputError: the machine has no bucket.
@@ -102,7 +102,7 @@ class SoilBed:
         return np.nan_to_num(force)
 
     def step(self, edge: np.ndarray, velocity: np.ndarray, ahead: np.ndarray, period: float) -> None:
-        """Move the bucket's edge through the soil.
+        """Advance the soil while the bucket's edge moves through it; updates profile, bucket and force.
 
         Args:
             edge: (3,) position of the edge in the world [m].
@@ -144,7 +144,9 @@ class BedInSimulation:
         self._motion = np.zeros(6)
 
     def update(self, data: mujoco.MjData, period: float) -> None:
-        """Advance the soil; its force acts on the bucket until the next call.
+        """Advance the soil with the bucket's motion and apply the soil's force to the bucket.
+
+        The force acts until the next call.
 
         Args:
             data: state of the machine; the wrench applied to the bucket is written.

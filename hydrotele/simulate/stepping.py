@@ -71,7 +71,7 @@ class Simulation(NamedTuple):
         joint_dof: (k or more,) the same in `qvel`.
         rod_qpos: (l,) indices in `qpos` of the cylinders with a length sensor.
         rod_dof: (l,) the same in `qvel`.
-        user: (k SLOTS,) parameters of the actuators.
+        user: (k SLOT_COUNT,) parameters of the actuators.
         command_line: delay line of the commands.
         sensor_history: past values of the sensors.
     """
@@ -110,7 +110,10 @@ SIMULATION_DTYPE = np.dtype(
 
 
 def simulation_record(sim: Simulation) -> np.ndarray:
-    """Return the (1,) record of a Simulation; the arrays must outlive the record."""
+    """Pack a Simulation into a (1,) record of sizes and array addresses, which is fast to pass.
+
+    The arrays must outlive the record. `read_simulation` unpacks it.
+    """
     line, past = sim.command_line, sim.sensor_history
     record = address_record(
         SIMULATION_DTYPE,
@@ -134,7 +137,7 @@ def simulation_record(sim: Simulation) -> np.ndarray:
 
 @compiled
 def read_simulation(r):
-    """Return the Simulation of a record of `simulation_record`."""
+    """Unpack a record of `simulation_record` to a Simulation whose arrays share its memory."""
     k, c = r.axes, r.channels
     line = CommandDelayLine(matrix_view(r.line_ring, r.ticks, k), matrix_view(r.line_delay, k, 2))
     past = SensorHistory(
@@ -178,10 +181,10 @@ def true_sensor_values(sim, out):
 
 @compiled
 def initialise_history(sim, command):
-    """Initialise the delay line and the sensors' past with the current values.
+    """Fill the delay line of the commands and the history of the sensors with the current values.
 
     Args:
-        sim: Simulation; its `line` and `past` are written.
+        sim: Simulation; its `command_line` and `sensor_history` are written.
         command: (nu,) commands before the first tick.
 
     Returns:
@@ -202,7 +205,7 @@ def commands_of_step(line, axes, tick, step, steps, out):
     """Compute the delayed commands that act in one physics step.
 
     Args:
-        line: CommandLine that contains the command of this tick.
+        line: CommandDelayLine that contains the command of this tick.
         axes: number of axes, scalar.
         tick: control tick, scalar.
         step: index of the physics step within the tick, scalar.
@@ -225,7 +228,11 @@ def commands_of_step(line, axes, tick, step, steps, out):
 
 @compiled
 def _ring_row(step, steps, tick, length):
-    """Return the ring's row with the command of a physics step; steps before the start map to 0."""
+    """Return the row of the delay line's ring buffer that holds the command of a physics step.
+
+    `steps` is the number of physics steps per tick, and `length` that of rows. Steps before the start of
+    the run map to row 0.
+    """
     return (min(max(step // steps, -1), tick) + 1) % length
 
 
@@ -261,7 +268,7 @@ def step_physics(sim, tick, steps, command):
 
 @compiled
 def _store_sensor_values(sim, number):
-    """Store the lagged sensor values after physics step `number` in the ring."""
+    """Store the sensor values after physics step `number`, with their first-order lags, in the history."""
     past, size = sim.sensor_history, len(sim.sensor_history.before)
     now, last = number % len(past.ring), (number - 1) % len(past.ring)
     values = np.empty(size)
@@ -276,10 +283,10 @@ def _store_sensor_values(sim, number):
 
 @compiled
 def apply_sensor_delays(past, number, values):
-    """Replace true values by delayed values, interpolated linearly between physics steps.
+    """Replace true sensor values by delayed values, interpolated linearly between physics steps.
 
     Args:
-        past: SensorPast.
+        past: SensorHistory.
         number: number of physics steps so far, scalar.
         values: (c,) true values; replaced for sensors with delay or lag [channel's unit].
 
@@ -302,7 +309,7 @@ def apply_sensor_delays(past, number, values):
 
 
 def command_delays(machine: Machine, axes: tuple[str, ...], timestep: float) -> np.ndarray:
-    """Return the command delays of k axes as whole physics steps and fraction of a step (k, 2)."""
+    """Return the command delays (k, 2) of k axes: whole physics steps, and the remaining fraction of a step."""
     return np.array([split_delay(machine.axes[n].command_delay, timestep) for n in axes], float)
 
 
@@ -325,14 +332,20 @@ def sensor_delays(machine: Machine, channels: tuple[str, ...], timestep: float) 
 
 
 def delay_line_length(delays: np.ndarray, steps: int) -> int:
-    """Return the number of ticks that a CommandLine must store; 0 without delays."""
+    """Return the number of control ticks that a CommandDelayLine must store; 0 without delays.
+
+    `delays` (..., 2) are whole physics steps and fractions; `steps` are the physics steps per tick.
+    """
     if not delays.any():
         return 0
     return int(np.ceil((delays[..., 0].max() + 1) / steps)) + 2
 
 
 def sensor_history_length(delays: np.ndarray, ratios: np.ndarray) -> int:
-    """Return the number of physics steps that a SensorPast must store; 0 without delay or lag."""
+    """Return the number of physics steps that a SensorHistory must store; 0 without delay or lag.
+
+    `delays` and `ratios` are those of `sensor_delays`.
+    """
     return int(delays[..., 0].max()) + 2 if delays.any() or ratios.any() else 0
 
 
@@ -346,7 +359,7 @@ def delayed_commands(plant: Plant, before: np.ndarray, held: np.ndarray, steps: 
         steps: physics steps per tick.
 
     Returns:
-        (ticks * steps, nu).
+        (ticks * steps, nu) commands [1], or in the drives' units.
     """
     delay = command_delays(plant.machine, plant.axes, plant.model.opt.timestep)
     out = np.repeat(np.asarray(held, float), steps, axis=0)
@@ -369,7 +382,7 @@ class Stepper:
 
     Args:
         plant: the plant.
-        data: staggered state at the start, after `begin_leapfrog`; its `ctrl` contains the
+        data: staggered state at the start, after `record.start_leapfrog`; its `ctrl` contains the
             commands before the start.
         steps: physics steps per tick.
 
@@ -418,12 +431,15 @@ class Stepper:
         initialise_history(self.sim, np.array(data.ctrl))
 
     def advance(self, command: np.ndarray) -> None:
-        """Advance by one tick with a constant command (nu,)."""
+        """Advance the simulation by one control tick with a constant command (nu,) [1] or in drive units."""
         _step_record(self.record, self.tick, self.steps, np.asarray(command, float))
         self.tick += 1
 
     def sensor_values(self) -> np.ndarray:
-        """Return the values (c,) of error-free sensors now, in the order of `sensed_channels`."""
+        """Return the present sensor values (c,), with delay and lag but no other errors.
+
+        The order is that of `record.sensed_channels`.
+        """
         values = np.empty(len(self.sim.sensor_history.before))
         true_sensor_values(self.sim, values)
         apply_sensor_delays(self.sim.sensor_history, self.tick * self.steps, values)

@@ -43,7 +43,7 @@ def grip_parameters(
     close_angle: float, open_angle: float, pocket_axis: int, max_angle: float, pocket_centre: Sequence[float],
     pocket_half_size: Sequence[float], object_axis: int, reach: tuple[float, float] = (-math.inf, math.inf),
 ) -> np.ndarray:  # fmt: skip
-    """Return the parameters of `grip_step` as an array.
+    """Return the conditions under which a grab takes or releases an object, as an array for `grip_step`.
 
     Args:
         close_angle: jaw angle above which an object is taken [rad].
@@ -56,7 +56,7 @@ def grip_parameters(
         reach: range along this axis in which the object can be held, from its origin [m].
 
     Returns:
-        (GRIP,) parameters.
+        (GRIP_SIZE,) parameters.
     """
     return np.array(
         [
@@ -81,18 +81,18 @@ def grip_step(grip, hand_position, hand_quaternion, position, quaternion, angle,
     plane of the pocket: inside the box, within the angle limit and within the object's reach.
 
     Args:
-        grip: (GRIP,) result of `grip_parameters`.
+        grip: (GRIP_SIZE,) result of `grip_parameters`.
         hand_position: (3,) position of the grab's body, `xpos` [m].
         hand_quaternion: (4,) its orientation, `xquat`.
         position: (3,) position of the object's body [m].
         quaternion: (4,) orientation of the object's body.
         angle: angle of the jaw [rad].
         held: whether the object is held.
-        row: (>= ROW,) `eq_data` of the weld with the grab as `body1` and the object as `body2`;
+        row: (>= WELD_SIZE,) `eq_data` of the weld with the grab as `body1` and the object as `body2`;
             written when the object is taken.
 
     Returns:
-        TAKEN, LET_GO or UNCHANGED.
+        TAKEN, RELEASED or UNCHANGED.
     """
     if held:
         return RELEASED if angle < grip[OPEN_ANGLE] else UNCHANGED
@@ -133,7 +133,7 @@ def grip_step(grip, hand_position, hand_quaternion, position, quaternion, angle,
 
 @allocation_free
 def _rotate_vector(w, x, y, z, vx, vy, vz):
-    """Rotate a vector by a unit quaternion."""
+    """Return the vector (vx, vy, vz), rotated by the unit quaternion (w, x, y, z)."""
     tx, ty, tz = 2.0 * (y * vz - z * vy), 2.0 * (z * vx - x * vz), 2.0 * (x * vy - y * vx)
     return (
         vx + w * tx + y * tz - z * ty,
@@ -218,7 +218,7 @@ def _grab_body(machine: Machine, grab: str) -> str:
 
 
 def _write_weld(root, machine: Machine, grab: str, name: str) -> None:
-    """Add the inactive weld between a grab and an object."""
+    """Add the weld constraint by which a grab holds an object, initially inactive, to the MJCF."""
     root.equality.add(
         "weld", name=f"{name}_held", body1=_grab_body(machine, grab), body2=name, active=False,
         solref=(0.01, 1.0), solimp=(0.99, 0.999, 0.001, 0.5, 2),
@@ -226,7 +226,10 @@ def _write_weld(root, machine: Machine, grab: str, name: str) -> None:
 
 
 def _write_log(root, name: str, log: LogOnGround, machine: Machine, where: str):
-    """Add a log on the ground and return its body."""
+    """Add a timber log on the ground to the MJCF and return its body.
+
+    Raises InputError if the axis `log.grab` or its pocket site is missing, or the log is too thick.
+    """
     _check_axis(machine, log.grab, f"{where}.grab")
     hand = _grab_body(machine, log.grab)
     pocket = root.find("site", f"{log.grab}_pocket")
@@ -252,7 +255,7 @@ def _write_log(root, name: str, log: LogOnGround, machine: Machine, where: str):
 
 
 def _draw_log(body, name: str, log: LogOnGround) -> None:
-    """Add the visual geometry of a log."""
+    """Add the visual geometry (bark and wood) of a timber log to its body."""
     radius, half = log.diameter / 2.0, log.length / 2.0
     for part, size, reach, colour in (
         ("bark", radius, half - 0.01, (0.36, 0.26, 0.17, 1)),
@@ -313,7 +316,7 @@ def is_surrounding_object(name: str) -> bool:
 
 
 def log_grip(model: mujoco.MjModel, log: LogOnGround) -> np.ndarray:
-    """Return the parameters of `grip_step` for a log.
+    """Return the conditions under which a grab takes or releases a timber log, for `grip_step`.
 
     Args:
         model: model of the machine. The box site `<grab>_pocket` is the space between the jaws:
@@ -322,7 +325,7 @@ def log_grip(model: mujoco.MjModel, log: LogOnGround) -> np.ndarray:
         log: the log.
 
     Returns:
-        (GRIP,) parameters.
+        (GRIP_SIZE,) parameters.
     """
     site, radius = model.site(f"{log.grab}_pocket"), log.diameter / 2.0
     low, high = site.pos - site.size + (radius, 0, radius), site.pos + site.size - (0, 0, radius)
@@ -384,7 +387,7 @@ class Surroundings:
         return sum((one.bed.force for one in self._beds), np.zeros(3))
 
     def update(self, time: float, data: mujoco.MjData, period: float) -> None:
-        """Update cutting and gripping; to be called once per control period.
+        """Update cutting of trees, gripping of objects and digging; call it once per control period.
 
         Args:
             time: current time [s].
@@ -403,7 +406,7 @@ class Surroundings:
             one.update(data, period)
 
     def restore_model(self) -> None:
-        """Undo the changes that cutting made to the model."""
+        """Undo the changes that cutting and gripping of trees made to the MuJoCo model."""
         for tree in self._trees:
             tree.restore_model()
 
@@ -417,7 +420,7 @@ class _Gripper:
         self._weld, self._rows, self._grip = model.equality(f"{name}_held").id, model.eq_data, grip
 
     def update(self, data: mujoco.MjData) -> int:
-        """Take or release the object; return TAKEN, LET_GO or UNCHANGED."""
+        """Activate or release the weld that holds the object; return TAKEN, RELEASED or UNCHANGED."""
         hand, thing, weld = self._hand, self._thing, self._weld
         change = grip_step(
             self._grip, data.xpos[hand], data.xquat[hand], data.xpos[thing], data.xquat[thing],
@@ -455,7 +458,7 @@ class _TreeState:
         self.depth, self.cut = 0.0, False
 
     def restore_model(self) -> None:
-        """Undo the changes that cutting made to the model."""
+        """Restore root stiffness, damping and contacts, which cutting and gripping of the tree changed."""
         self._model.jnt_stiffness[self._joints] = self._stiffness
         self._model.dof_damping[self._dofs] = self._damping
         self._set_disc_contacts(True)
@@ -487,7 +490,10 @@ class _TreeState:
         return said
 
     def _advance_cut(self, data: mujoco.MjData, period: float, spin: float) -> None:
-        """Advance the cut to the edge of the disc and apply cutting torque and feed force."""
+        """Deepen the cut up to the edge of the saw disc, and apply cutting torque and feed force to the saw.
+
+        Nothing happens if the disc is not at the height of the cut. `spin` is its speed [rad/s], > 0.
+        """
         stem, saw = data.xpos[self._body], data.xpos[self._saw]
         axis = data.xmat[self._saw].reshape(3, 3)[:, 2]
         height = saw[2] - (axis[:2] @ (stem[:2] - saw[:2])) / max(abs(axis[2]), 0.3)
@@ -512,7 +518,7 @@ class _TreeState:
         data.xfrc_applied[self._saw, 3:] = direction * torque * axis
 
     def _release_root(self) -> None:
-        """Remove the root's stiffness so that the tree can fall."""
+        """Remove the stiffness of the tree's root and most of its damping, so that the tree can fall."""
         self._model.jnt_stiffness[self._joints] = 0.0
         self._model.dof_damping[self._dofs] = (5.0, 5.0, 5.0, 50.0, 50.0, 50.0)
         self.cut = True

@@ -83,7 +83,9 @@ edge thickness is assumed. It holds 0.59 m^3 struck and 0.91 m^3 heaped at 35 de
 
 
 def outline_relative_to_edge(bucket: Bucket) -> np.ndarray:
-    """Return the outline (m, 2) of the interior relative to the edge [m].
+    """Return the corners (m, 2) of the bucket's interior in the side view, relative to the cutting edge [m].
+
+    The columns are x, from the pin towards the edge, and z, up.
 
     Raises:
         InputError: the outline has too few or too many corners.
@@ -195,7 +197,7 @@ def pack_soil_parameters(soil: Soil, bucket: Bucket, start: float, cell: float) 
         cell: length of a cell [m].
 
     Returns:
-        (k,) parameters in SI units.
+        (k,) parameters in SI units; the constants DENSITY to CORNER_COUNT are their indices.
 
     Raises:
         InputError: the cell length, the start or the outline of the bucket is out of range.
@@ -216,9 +218,10 @@ def pack_soil_parameters(soil: Soil, bucket: Bucket, start: float, cell: float) 
 
 
 def make_bucket_state() -> np.ndarray:
-    """Return the state (STATE,) of an empty bucket: zeros.
+    """Return the initial soil state (STATE_SIZE,) of an empty bucket: all zeros.
 
-    The first step initialises the positions. Setting the array to zero restarts the bucket.
+    The first call of `step_soil` stores the position of the bucket. Zeros written later start again with
+    an empty bucket.
     """
     return np.zeros(STATE_SIZE)
 
@@ -246,7 +249,7 @@ def soil_mass(parameters: np.ndarray, surface: np.ndarray, loose: np.ndarray,
               state: np.ndarray) -> float:  # fmt: skip
     """Return the soil mass [kg]: on the ground above height 0, in the bucket, and fallen off the ends of the profile.
 
-    `soil_step` conserves it up to rounding.
+    `step_soil` conserves it up to rounding.
     """
     n = parameters
     thickness = np.sum(surface - loose) + np.sum(loose) / n[SWELL]

@@ -73,7 +73,7 @@ from hydrotele.soil.terrain import cut_cells, find_cell, lay_down, slide_cells, 
 
 @allocation_free
 def compute_held_soil(n, attitude, level, out):
-    """Compute the volume of soil that a tilted bucket holds, and its centre.
+    """Compute the maximum volume of soil that a bucket holds at an attitude, and the centre of this soil.
 
     The soil fills the bucket below a surface at the angle of repose, which rises from the lower rim
     into the bucket. If the mouth is tilted less than the angle of repose, the bucket is full and a
@@ -81,8 +81,8 @@ def compute_held_soil(n, attitude, level, out):
     soil behind it: the surface then starts where the soil ahead meets the mouth.
 
     Args:
-        n: (k,) of `soil_parameters`.
-        attitude: of the bucket, scalar [rad].
+        n: (k,) parameters of soil, bucket and profile from `pack_soil_parameters`.
+        attitude: angle of the line from pin to edge above the horizontal, scalar [rad].
         level: height of the soil ahead of the mouth above the edge, scalar [m].
         out: (4,) written: volume [m^3]; centre outwards and up from the edge [m]; outward distance
             of the lower rim from the edge [m].
@@ -161,15 +161,16 @@ _MIN_SQUARE = 0.05  # lower bound that avoids jamming of nearly parallel blade a
 
 @allocation_free
 def failure_plane_angle(rake, slope, friction, tool_friction):
-    """Return the angle between surface and failure plane that minimises N_g.
+    """Return the angle between the surface and the plane along which a blade shears off the soil.
 
-    Setting the derivative of `N_g(cot beta)` to zero gives a quadratic equation.
+    Of all planes through the edge, soil fails along the one with the minimum weight factor N_g
+    (`wedge_weight_factor`). Setting the derivative of `N_g(cot beta)` to zero gives a quadratic equation.
 
     Args:
         rake: between blade and surface, scalar [rad].
         slope: of the surface, positive where it rises ahead of the blade, scalar [rad].
-        friction: phi, scalar [rad].
-        tool_friction: delta, scalar [rad].
+        friction: phi, angle of internal friction of the soil, scalar [rad].
+        tool_friction: delta, angle of friction between soil and blade, scalar [rad].
 
     Returns:
         beta, scalar [rad], within 5 .. 85 deg.
@@ -192,14 +193,16 @@ def failure_plane_angle(rake, slope, friction, tool_friction):
 
 @allocation_free
 def wedge_weight_factor(rake, slope, friction, tool_friction, plane):
-    """Return N_g, the blade force from the wedge weight per specific weight, width and depth^2.
+    """Return the factor N_g of the blade force that is due to the weight of the soil wedge.
+
+    This force is N_g times the specific weight of the soil, the blade width and the depth squared.
 
     Args:
         rake: between blade and surface, scalar [rad].
         slope: of the surface, scalar [rad].
-        friction: phi, scalar [rad].
-        tool_friction: delta, scalar [rad].
-        plane: beta, scalar [rad].
+        friction: phi, angle of internal friction of the soil, scalar [rad].
+        tool_friction: delta, angle of friction between soil and blade, scalar [rad].
+        plane: beta, angle between the surface and the failure plane, scalar [rad].
 
     Returns:
         N_g, scalar [1]; the depth is measured perpendicular to the surface.
@@ -218,14 +221,14 @@ def wedge_weight_factor(rake, slope, friction, tool_friction, plane):
 
 @allocation_free
 def surcharge_factor(rake, slope, friction, tool_friction, plane):
-    """Return N_q, the blade force per weight of the surcharge on the wedge.
+    """Return the factor N_q: blade force due to a load on the soil wedge, divided by this load.
 
     Args:
         rake: between blade and surface, scalar [rad].
         slope: of the surface, scalar [rad].
-        friction: phi, scalar [rad].
-        tool_friction: delta, scalar [rad].
-        plane: beta, scalar [rad].
+        friction: phi, angle of internal friction of the soil, scalar [rad].
+        tool_friction: delta, angle of friction between soil and blade, scalar [rad].
+        plane: beta, angle between the surface and the failure plane, scalar [rad].
 
     Returns:
         N_q, scalar [1].
@@ -237,13 +240,15 @@ def surcharge_factor(rake, slope, friction, tool_friction, plane):
 
 @allocation_free
 def cohesion_factor(rake, friction, tool_friction, plane):
-    """Return N_c, the blade force from cohesion on the plane per cohesion, width and depth.
+    """Return the factor N_c of the blade force that is due to cohesion on the failure plane.
+
+    This force is N_c times the cohesion, the blade width and the depth.
 
     Args:
         rake: between blade and surface, scalar [rad].
-        friction: phi, scalar [rad].
-        tool_friction: delta, scalar [rad].
-        plane: beta, scalar [rad].
+        friction: phi, angle of internal friction of the soil, scalar [rad].
+        tool_friction: delta, angle of friction between soil and blade, scalar [rad].
+        plane: beta, angle between the surface and the failure plane, scalar [rad].
 
     Returns:
         N_c, scalar [1].
@@ -256,13 +261,15 @@ def cohesion_factor(rake, friction, tool_friction, plane):
 
 @allocation_free
 def adhesion_factor(rake, friction, tool_friction, plane):
-    """Return N_ca, the blade force from adhesion to the blade per adhesion, width and depth.
+    """Return the factor N_ca of the blade force that is due to adhesion of soil to the blade.
+
+    This force is N_ca times the adhesion, the blade width and the depth.
 
     Args:
         rake: between blade and surface, scalar [rad].
-        friction: phi, scalar [rad].
-        tool_friction: delta, scalar [rad].
-        plane: beta, scalar [rad].
+        friction: phi, angle of internal friction of the soil, scalar [rad].
+        tool_friction: delta, angle of friction between soil and blade, scalar [rad].
+        plane: beta, angle between the surface and the failure plane, scalar [rad].
 
     Returns:
         N_ca, scalar [1]; it does not include the adhesion force along the blade itself.
@@ -277,9 +284,9 @@ def adhesion_factor(rake, friction, tool_friction, plane):
 def bearing_pressure(overburden, cohesion, friction, tilt):
     """Return the pressure at which soil yields under a smooth face that is pushed into it.
 
-    `p + c cot phi = (q + c cot phi) tan^2(45 deg + phi/2) e^(2 theta tan phi)`: a level face
-    rotates the principal stresses by theta = 90 deg (Prandtl and Reissner's strip footing, N_q =
-    18.4 for 30 deg), an upright face does not (Rankine's passive wall).
+    `p + c cot phi = (q + c cot phi) tan^2(45 deg + phi/2) e^(2 theta tan phi)`. A level face
+    rotates the principal stresses by theta = 90 deg, as in the strip footing of Prandtl and Reissner
+    (N_q = 18.4 for phi = 30 deg). An upright face does not rotate them, as in Rankine's passive wall.
 
     Args:
         overburden: q, vertical pressure next to the face, scalar [Pa].
@@ -300,7 +307,7 @@ def bearing_pressure(overburden, cohesion, friction, tilt):
 
 @allocation_free
 def limit_rake(rake, slope, friction, tool_friction):
-    """Return the effective rake relative to the surface, limited to the range of the equation.
+    """Return the rake of the blade relative to the surface, limited to the valid range of the wedge equation.
 
     A wedge of soil sticks to a blade that is steeper than upright, or too steep for its friction
     (Hettiaratchi and Reece 1975), and acts as the blade. A rake below 15 deg is replaced by 15 deg.
@@ -308,13 +315,13 @@ def limit_rake(rake, slope, friction, tool_friction):
     Args:
         rake: of the blade to the horizontal, scalar [rad].
         slope: of the surface, scalar [rad].
-        friction: phi, scalar [rad].
-        tool_friction: delta, scalar [rad].
+        friction: phi, angle of internal friction of the soil, scalar [rad].
+        tool_friction: delta, angle of friction between soil and blade, scalar [rad].
 
     Returns:
-        rake, scalar [rad].
+        rake relative to the surface, scalar [rad].
 
-    Source: see above.
+    Source: Hettiaratchi and Reece 1975.
     """
     steepest = min(MAX_RAKE, MAX_FAN_ANGLE - friction - tool_friction)
     return min(max(rake + slope, MIN_RAKE), steepest)
@@ -326,7 +333,7 @@ def limit_slope(slope, friction):
 
     Args:
         slope: of the surface, scalar [rad].
-        friction: phi, scalar [rad].
+        friction: phi, angle of internal friction of the soil, scalar [rad].
 
     Returns:
         slope, limited to +-0.6 phi, scalar [rad].
@@ -351,7 +358,7 @@ def compute_cutting_force(n, depth, loose, rake, slope, load, out):
     """Compute the force of the soil on a blade that is drawn towards the machine.
 
     Args:
-        n: (k,) of `soil_parameters`.
+        n: (k,) parameters of soil, bucket and profile from `pack_soil_parameters`.
         depth: of the edge below the surface ahead, scalar [m].
         loose: thickness of the loose soil in this depth, which has no cohesion, scalar [m].
         rake: of the blade to the horizontal, scalar [rad].
@@ -362,7 +369,7 @@ def compute_cutting_force(n, depth, loose, rake, slope, load, out):
     Returns:
         Nothing.
 
-    Source: see the module; adhesion along the blade as in McKyes 1985, chapter 3.
+    Source: Fundamental Equation of Earthmoving, see the module; adhesion along the blade as in McKyes 1985, chapter 3.
     """
     out[0], out[1] = 0.0, 0.0
     if depth <= 0.0:
@@ -388,13 +395,16 @@ def compute_cutting_force(n, depth, loose, rake, slope, load, out):
 
 @allocation_free
 def update_yielding_force(n, state, place, along, rate, low, high):
-    """Return the force of one surface along its direction, from a spring and damper that yield.
+    """Return the force of the soil on one surface of the bucket, from an elastic-plastic spring and a damper.
+
+    The spring deflects as the surface moves into the soil and yields at the limit forces of soil
+    mechanics. The force acts against the displacement.
 
     Args:
-        n: (k,) of `soil_parameters`.
-        state: (STATE,) of the bucket; its deflection is changed [m].
+        n: (k,) parameters of soil, bucket and profile from `pack_soil_parameters`.
+        state: (STATE_SIZE,) of the bucket; its deflection is changed [m].
         place: index of the deflection in the state, scalar [1].
-        along: displacement of the surface into the soil, against the force, scalar [m].
+        along: displacement of the surface into the soil since the last step, scalar [m].
         rate: rate of this displacement, scalar [m/s].
         low: minimum force, at most 0, scalar [N].
         high: maximum force, at least 0, scalar [N].
@@ -420,7 +430,7 @@ def _drop_soil(n, surface, loose, state, first, second, volume):
 
 @allocation_free
 def _mark_cells(state, low, high, count):
-    """Enlarge the range of cells that may slide."""
+    """Add the cells `low` to `high` and their neighbours to the range in which soil may slide."""
     low, high = max(low - 1, 0), min(high + 1, count - 1)
     if state[LAST_SLIDING_CELL] <= state[FIRST_SLIDING_CELL]:
         state[FIRST_SLIDING_CELL], state[LAST_SLIDING_CELL] = low, high
@@ -439,7 +449,7 @@ class EdgeMotion(NamedTuple):
         z: height [m].
         r_rate: outward speed [m/s].
         z_rate: upward speed [m/s].
-        attitude: attitude of the bucket [rad].
+        attitude: angle of the line from pin to edge above the horizontal [rad].
     """
 
     r: float
@@ -451,7 +461,11 @@ class EdgeMotion(NamedTuple):
 
 @allocation_free
 def _compute_forces(n, surface, loose, state, edge, dt, out):
-    """Compute the forces of all surfaces; return the edge depths on the inner and outer side."""
+    """Write the soil force on all surfaces of the bucket and its moment; return the depth of the edge in the soil.
+
+    Returns:
+        (depth below the soil on the machine's side, depth below the soil on the far side), scalars [m].
+    """
     r, z, r_rate, z_rate, attitude = edge
     phi, delta = n[FRICTION], n[TOOL_FRICTION]
     reach = DEPTH_READING_DISTANCE * n[CELL_LENGTH]
@@ -525,19 +539,19 @@ def _compute_forces(n, surface, loose, state, edge, dt, out):
 
 @allocation_free
 def step_soil(n, surface, loose, state, edge, dt, out):
-    """Move the bucket's edge through the soil and compute the force of the soil.
+    """Advance soil and bucket by one time step: force, cutting, filling, spilling and sliding.
 
     The function allocates nothing and changes only its arguments, so every environment can run in
     its own thread. The force changes smoothly with depth, also between cells.
 
     Args:
-        n: (k,) of `soil_parameters`, not changed.
+        n: (k,) parameters of soil, bucket and profile from `pack_soil_parameters`.
         surface: (m,) height of the profile, changed [m].
         loose: (m,) thickness of the loose layer, changed [m].
-        state: (STATE,) of the bucket, changed; see `facts`.
-        edge: EdgeMotion, position and velocity of the edge [m], [m/s], [rad].
+        state: (STATE_SIZE,) state of the bucket from `make_bucket_state`, changed.
+        edge: EdgeMotion: position [m], attitude [rad] and velocity [m/s] of the cutting edge.
         dt: time since the previous step, scalar [s].
-        out: (OUT,) written: force outwards and up [N], moment about the edge [N m], mass carried
+        out: (RESULT_SIZE,) written: force outwards and up [N], moment about the edge [N m], mass carried
             [kg] and its position relative to the edge [m]. The force does not include the weight of
             the soil carried.
 
@@ -609,7 +623,7 @@ def compute_bucket_wrench(out, edge, theta, centre, wrench):
     """Compute the wrench of the soil and of the carried load on the bucket's body.
 
     Args:
-        out: (OUT,) of `step_soil` [N], [N m], [kg], [m].
+        out: (RESULT_SIZE,) result of `step_soil` [N], [N m], [kg], [m].
         edge: (3,) position of the edge in the world [m].
         theta: azimuth of the edge about the swing axis, scalar [rad].
         centre: (3,) centre of mass of the bucket's body, `xipos` [m].

@@ -16,10 +16,12 @@ MIN_SLIDING_HEIGHT = 1e-4  # m, height difference above the stable one at which 
 
 @allocation_free
 def surface_height(n, surface, r):
-    """Return the height of the surface, linear between cell centres and constant at the ends.
+    """Return the height of the soil surface at a radius.
+
+    The height is linear between cell centres, and constant before the first and after the last one.
 
     Args:
-        n: (k,) of `soil_parameters`.
+        n: (k,) parameters of soil, bucket and profile from `pack_soil_parameters`.
         surface: (m,) heights [m].
         r: radius, scalar [m].
 
@@ -40,13 +42,13 @@ def surface_height(n, surface, r):
 
 @allocation_free
 def cut_cells(n, surface, loose, r0, z0, r1, z1):
-    """Remove the soil above the path of the edge in the cells that it sweeps.
+    """Remove the soil above the path of the bucket's edge from the cells that the edge sweeps in a step.
 
     A partly swept cell has the mean height of its cut and uncut parts. A further sweep removes the
     corresponding fraction of the uncut part.
 
     Args:
-        n: (k,) of `soil_parameters`.
+        n: (k,) parameters of soil, bucket and profile from `pack_soil_parameters`.
         surface: (m,) heights, changed [m].
         loose: (m,) loose part of them, changed [m].
         r0: radius of the edge before the step, scalar [m].
@@ -86,10 +88,10 @@ def cut_cells(n, surface, loose, r0, z0, r1, z1):
 
 @allocation_free
 def lay_down(n, surface, loose, cell, volume):
-    """Lay loose soil on a cell.
+    """Add a volume of loose soil to the top of a cell.
 
     Args:
-        n: (k,) of `soil_parameters`.
+        n: (k,) parameters of soil, bucket and profile from `pack_soil_parameters`.
         surface: (m,) heights, changed [m].
         loose: (m,) loose part of them, changed [m].
         cell: index of the cell, scalar [1].
@@ -110,10 +112,10 @@ def lay_down(n, surface, loose, cell, volume):
 
 @allocation_free
 def find_cell(n, r):
-    """Return the index of the cell at a radius; it may be outside the profile.
+    """Return the index of the cell at a radius; outside the profile it is negative or too large.
 
     Args:
-        n: (k,) of `soil_parameters`.
+        n: (k,) parameters of soil, bucket and profile from `pack_soil_parameters`.
         r: radius, scalar [m].
 
     Returns:
@@ -129,7 +131,7 @@ def slide_pair(n, surface, loose, upper, lower):
     """Let soil slide from one cell to its lower neighbour, at most to the stable slope.
 
     Args:
-        n: (k,) of `soil_parameters`.
+        n: (k,) parameters of soil, bucket and profile from `pack_soil_parameters`.
         surface: (m,) heights, changed [m].
         loose: (m,) loose part of them, changed [m].
         upper: index of the higher cell, scalar [1].
@@ -166,7 +168,7 @@ def slide_cells(n, surface, loose, low, high, wall):
     """Let the soil of a range of cells slide in one forward and one backward sweep.
 
     Args:
-        n: (k,) of `soil_parameters`.
+        n: (k,) parameters of soil, bucket and profile from `pack_soil_parameters`.
         surface: (m,) heights, changed [m].
         loose: (m,) loose part of them, changed [m].
         low: index of the first cell, scalar [1].

@@ -32,11 +32,11 @@ class Controller(Protocol):
     """Compute actions from observations, for n parallel episodes."""
 
     def begin(self, count: int) -> None:
-        """Allocate and initialise the state of `count` episodes."""
+        """Allocate and initialise the controller state for `count` parallel episodes."""
         ...
 
     def reset(self, mask: np.ndarray) -> None:
-        """Reset the state of the episodes that are over.
+        """Reset the controller state of the episodes that are over.
 
         Args:
             mask: (n,) bool, True for the episodes to reset.
@@ -98,7 +98,7 @@ def step_time(setup: TaskSetup) -> float:
 
 
 def find_columns(setup: TaskSetup, what: str, where: Iterable[str]) -> np.ndarray:
-    """Return the observation columns of the fields `what.where`.
+    """Return the columns of the observation that hold the fields named `<what>.<where>`.
 
     Args:
         setup: the task with its options.
@@ -127,15 +127,15 @@ def find_position_columns(setup: TaskSetup) -> np.ndarray:
 
 @compiled
 def compute_servo_commands(numbers, grid, table, reference, rate_ahead, measured, load, out):
-    """Compute the joint servo commands of n episodes.
+    """Compute the valve or drive commands of the joint servo for n episodes.
 
     Args:
         numbers: (k, 14) of `control.servo.servo_parameters`.
-        grid: (k, 2) of `control.servo.drive_tables`.
-        table: (k, POINTS, 3) of `control.servo.drive_tables`.
+        grid: (k, 2) of `control.servo.tabulate_drives`.
+        table: (k, TABLE_POINTS, 3) of `control.servo.tabulate_drives`.
         reference: (n, k) [rad] or [m].
         rate_ahead: (n, k) reference rates, advanced by the spool lag [rad/s] or [m/s].
-        measured: Measured with (n, k) arrays, (n,) supply pressures.
+        measured: MeasuredState with (n, k) arrays, (n,) supply pressures.
         load: (n, k) low-pass filtered drive forces, updated [N] or [N m].
         out: (n, k) commands, written [1] or in the drive's unit.
 
@@ -210,7 +210,7 @@ class ValveServo:
     """Joint servo that returns valve (or force drive) actions for axis references."""
 
     def __init__(self, setup: TaskSetup, servo: Servo, integral_gain: float = 0.0) -> None:
-        """Read the parameters of the nominal machine.
+        """Read the parameters of the controller from the nominal machine.
 
         Args:
             setup: the task with its options, with `valve` actions.
@@ -231,13 +231,13 @@ class ValveServo:
         self._supply = find_columns(setup, "pressure_supply", [""] if names else [])
 
     def begin(self, count: int) -> None:
-        """Allocate the state of `count` episodes."""
+        """Allocate the controller state for `count` parallel episodes."""
         shape = (count, len(self._axes))
         self._load, self._integral, self._commands = (np.zeros(shape) for _ in range(3))
         self._is_new = np.ones(count, bool)
 
     def reset(self, mask: np.ndarray) -> None:
-        """Reset the state of the episodes selected by the mask (n,)."""
+        """Reset the controller state of the episodes selected by the boolean mask (n,)."""
         self._is_new |= mask
 
     def __call__(self, observation: np.ndarray, reference: np.ndarray, rate_ahead: np.ndarray) -> np.ndarray:

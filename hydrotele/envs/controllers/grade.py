@@ -1,4 +1,4 @@
-"""Reference controller of the task `GradeController`: repeated passes that cut, curl, carry and dump.
+"""Reference controller of the task `Grade`: repeated passes that cut, curl, carry and dump.
 
 `GradeController` plans the tip pose with a state machine. `PoseFollower` converts the reference pose and its
 rate to actions of the chosen kind.
@@ -34,7 +34,7 @@ class PoseFollower:
     """Track a moving tip pose with an arm that has no further driven axes."""
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Read the parameters of the nominal machine."""
+        """Read the parameters of the controller from the nominal machine."""
         k = setup.arm_axes
         self._arm, _, self._ranges = arm_specification(setup.machine)
         self._dt, self._k = step_time(setup), k
@@ -54,12 +54,12 @@ class PoseFollower:
         self._uses_pose_rates = setup.options.action == "resolved_motion"
 
     def begin(self, count: int) -> None:
-        """Allocate the state of `count` episodes."""
+        """Allocate the controller state for `count` parallel episodes."""
         (self._valve_servo or self._rate_feedback).begin(count)  # pyright: ignore - one of them is there
         self._q, self._is_new = np.zeros((count, self._k)), np.ones(count, bool)
 
     def reset(self, mask: np.ndarray) -> None:
-        """Reset the state of the episodes selected by the mask (n,)."""
+        """Reset the controller state of the episodes selected by the boolean mask (n,)."""
         (self._valve_servo or self._rate_feedback).reset(mask)  # pyright: ignore - one of them is there
         self._is_new |= mask
 
@@ -68,7 +68,7 @@ class PoseFollower:
 
         Args:
             observation: (n, o).
-            pose: (n, k) reference pose of the tip.
+            pose: (n, k) reference pose of the tip: r [m], theta [rad], z [m], attitude [rad].
             rate: (n, k) rate of the reference pose.
 
         Returns:
@@ -132,7 +132,7 @@ class GradeController:
     """Grade the ground in passes along the plane, each at most 0.15 m deep."""
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Look up the observation columns."""
+        """Find the observation columns that the controller uses."""
         self._tip = find_columns(setup, "tip", COORDINATES[:4])
         self._errors = find_columns(setup, "profile_error", [str(p) for p in range(SECTION_COUNT)])
         self._mass, self._edge, self._plane, self._slope = (
@@ -143,7 +143,7 @@ class GradeController:
         self._radii = np.array(section_radii())
 
     def begin(self, count: int) -> None:
-        """Allocate the state of `count` episodes."""
+        """Allocate the controller state for `count` parallel episodes."""
         self._follower.begin(count)
         self._phase, self._phase_time = np.zeros(count, int), np.zeros(count)
         self._reference, self._reference_rate = np.zeros((count, 3)), np.zeros((count, 3))
@@ -151,12 +151,12 @@ class GradeController:
         self._is_new = np.ones(count, bool)
 
     def reset(self, mask: np.ndarray) -> None:
-        """Reset the state of the episodes selected by the mask (n,)."""
+        """Reset the controller state of the episodes selected by the boolean mask (n,)."""
         self._follower.reset(mask)
         self._is_new |= mask
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Return the actions (n, 4) for observations (n, o)."""
+        """Compute the actions (n, 4) of the next step from the observations (n, o) of n parallel episodes."""
         seen = observation.astype(float)
         tip, errors = seen[:, self._tip][:, [0, 2, 3]], seen[:, self._errors]
         fresh = self._is_new
@@ -203,7 +203,7 @@ class GradeController:
         self._phase_time[done] = 0.0
 
     def _compute_targets(self, seen: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the target (r, z, attitude) (n, 3) and the maximum rates (n, 3)."""
+        """Return the targets (n, 3) of the phase: r [m], z [m], attitude [rad], and the maximum rates (n, 3)."""
         phase, place = self._phase, self._reference
 
         def plane(r: np.ndarray) -> np.ndarray:
@@ -258,5 +258,5 @@ class GradeController:
 
 
 def make_grade_controller(setup: TaskSetup) -> Controller:
-    """Make the controller of the task `GradeController` for the chosen kind of actions."""
+    """Make the controller of the task `Grade` for the chosen kind of actions."""
     return GradeController(setup)

@@ -64,12 +64,12 @@ def move_fraction(time: np.ndarray, length: np.ndarray, ramp: np.ndarray) -> np.
 
 
 def _wrap_angle(angle: np.ndarray, period: float) -> np.ndarray:
-    """Return the angle modulo `period`, from -turn/2 to turn/2."""
+    """Return the angle modulo `period`, from -period/2 to period/2."""
     return angle - period * np.round(angle / period)
 
 
 def find_pin_columns(setup: TaskSetup) -> np.ndarray:
-    """Return the observation columns (5,) of pin r, theta, z, grapple rotation and jaw."""
+    """Return the observation columns (5,) of the pin at the stick's tip (r, theta, z), grapple rotation and jaw."""
     return np.concatenate([find_columns(setup, "tip", ("r", "theta", "z")), find_position_columns(setup)[3:]])
 
 
@@ -88,18 +88,18 @@ class MovePlanner:
         self._dt = step_time(setup)
 
     def begin(self, count: int) -> None:
-        """Allocate the state of `count` episodes."""
+        """Allocate the controller state for `count` parallel episodes."""
         self._phase = np.full(count, APPROACH)
         self._time, self._length, self._ramp = (np.zeros(count) for _ in range(3))
         self._move_start, self._move_end = np.zeros((count, 5)), np.zeros((count, 5))
         self._is_new = np.ones(count, bool)
 
     def reset(self, mask: np.ndarray) -> None:
-        """Reset the state of the episodes selected by the mask (n,)."""
+        """Reset the controller state of the episodes selected by the boolean mask (n,)."""
         self._is_new |= mask
 
     def update(self, seen: np.ndarray) -> None:
-        """Advance the plan by one step with observations (n, o)."""
+        """Advance the plan by one step; at the end of a move, start the next phase. `seen` (n, o) are observations."""
         fresh = self._is_new.copy()
         self._move_end[fresh], self._phase[fresh], self._is_new[:] = (
             seen[fresh][:, self._tip],
@@ -113,9 +113,9 @@ class MovePlanner:
         self._plan_moves(seen, over)
 
     def reference_at(self, ahead: float) -> np.ndarray:
-        """Return the reference (n, 5) `ahead` [s] from now: r, z [m], theta, rotation, jaw [rad].
+        """Return the reference (n, 5) `ahead` [s] from now.
 
-        The columns are r, theta, z, rotation, jaw.
+        The columns are r [m], theta [rad], z [m] of the pin, grapple rotation [rad] and jaw [rad].
         """
         share = move_fraction(self._time + ahead, self._length, self._ramp)[:, None]
         return self._move_start + share * (self._move_end - self._move_start)
@@ -127,7 +127,7 @@ class MovePlanner:
         return np.where(lost, RELEASE, following)
 
     def _plan_moves(self, seen: np.ndarray, which: np.ndarray) -> None:
-        """Plan the moves of the episodes selected by the mask (n,), from the last targets."""
+        """Plan the move of the present phase, from the last target, for the episodes of the mask `which` (n,)."""
         if not which.any():
             return
         phase, goes = self._phase[which], self._move_end[which].copy()
@@ -149,11 +149,11 @@ class MovePlanner:
         self._time[which] = 0.0
 
     def _swing_angle(self, r: np.ndarray, theta: np.ndarray) -> np.ndarray:
-        """Return the swing angle for a pin at r, theta; the arm has a lateral offset."""
+        """Return the swing axis angle [rad] for a pin at r [m], theta [rad]; the arm has a lateral offset."""
         return theta - np.arcsin(self._lateral_offset / r)
 
     def _target_over_log(self, seen: np.ndarray, goes: np.ndarray) -> np.ndarray:
-        """Return the target of the open grapple above the log, aligned with it."""
+        """Return the target (m, 5) of the open grapple above the log, aligned with it; `goes` is the last target."""
         r, theta, sine, cosine = seen[:, self._log].T
         to = goes.copy()
         swing = self._swing_angle(r, theta)
@@ -168,7 +168,7 @@ class MovePlanner:
         return to
 
     def _target_over_goal(self, seen: np.ndarray, goes: np.ndarray) -> np.ndarray:
-        """Return the target that brings the held log over its goal with the goal yaw."""
+        """Return the target (m, 5) that brings the held log over its goal with the goal yaw."""
         r, theta, sine, cosine = seen[:, self._log].T
         goal_r, goal_theta, goal_sine, goal_cosine = seen[:, self._goal].T
         now, to = seen[:, self._tip], goes.copy()
@@ -189,7 +189,7 @@ class PlaceByTip:
     """Track the planned moves by rates of the pin (`resolved_motion`)."""
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Read the parameters of the nominal machine."""
+        """Read the parameters of the controller from the nominal machine."""
         self.planner, self._tip, self._dt = (
             MovePlanner(setup),
             find_pin_columns(setup),
@@ -201,17 +201,17 @@ class PlaceByTip:
         self._rate_feedback = RateFeedback(setup, fastest, change, _FEEDBACK_GAINS)
 
     def begin(self, count: int) -> None:
-        """Allocate the state of `count` episodes."""
+        """Allocate the controller state for `count` parallel episodes."""
         self.planner.begin(count)
         self._rate_feedback.begin(count)
 
     def reset(self, mask: np.ndarray) -> None:
-        """Reset the state of the episodes selected by the mask (n,)."""
+        """Reset the controller state of the episodes selected by the boolean mask (n,)."""
         self.planner.reset(mask)
         self._rate_feedback.reset(mask)
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Return the actions (n, 5) for observations (n, o)."""
+        """Compute the actions (n, 5) of the next step from the observations (n, o) of n parallel episodes."""
         seen = observation.astype(float)
         self.planner.update(seen)
         now = self.planner.reference_at(0.0)
@@ -223,7 +223,7 @@ class PlaceByAxes:
     """Track the planned moves by axis rates (`joint_rate`) or valve commands (`valve`)."""
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Read the parameters of the nominal machine."""
+        """Read the parameters of the controller from the nominal machine."""
         self.planner, self._joint = MovePlanner(setup), find_position_columns(setup)
         (self._arm, _, self._ranges), self._dt = arm_specification(setup.machine), step_time(setup)
         fastest = np.array([full_action_rate(setup.machine, axis) for axis in setup.axes])
@@ -232,13 +232,13 @@ class PlaceByAxes:
         self._rate_feedback = RateFeedback(setup, fastest, np.full(len(fastest), MAX_ACCELERATION), _FEEDBACK_GAINS)
 
     def begin(self, count: int) -> None:
-        """Allocate the state of `count` episodes."""
+        """Allocate the controller state for `count` parallel episodes."""
         for part in (self.planner, self._rate_feedback, self._valve_servo):
             if part:
                 part.begin(count)
 
     def reset(self, mask: np.ndarray) -> None:
-        """Reset the state of the episodes selected by the mask (n,)."""
+        """Reset the controller state of the episodes selected by the boolean mask (n,)."""
         for part in (self.planner, self._rate_feedback, self._valve_servo):
             if part:
                 part.reset(mask)
@@ -252,7 +252,7 @@ class PlaceByAxes:
         return np.hstack([q, places[:, 3:]])
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Return the actions (n, 5) for observations (n, o)."""
+        """Compute the actions (n, 5) of the next step from the observations (n, o) of n parallel episodes."""
         seen = observation.astype(float)
         self.planner.update(seen)
         joint = seen[:, self._joint]

@@ -44,7 +44,7 @@ _DIFFERENCE_STEP = 0.02  # s, half width of the central difference quotient
 class ReferencePreview:
     """Interpolate the observed references in time by a polynomial.
 
-    The polynomial of fourth order matches the positions now and at the PREVIEWS, and the rate now.
+    The polynomial of fourth order matches the positions now and after the `PREVIEW_TIMES`, and the rate now.
     """
 
     def __init__(self, setup: TaskSetup) -> None:
@@ -56,7 +56,7 @@ class ReferencePreview:
         self._inverse = np.linalg.inv(np.array(rows + [[t**p for p in powers] for t in PREVIEW_TIMES]))
 
     def interpolate(self, observation: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the references and their rates, (n, k) each, `time` [s] from now."""
+        """Return the interpolated axis references and their rates, (n, k) each, `time` [s] from now."""
         powers = np.arange(len(self._columns))
         place = time**powers @ self._inverse
         rate = (powers[1:] * time ** (powers[1:] - 1)) @ self._inverse[1:]
@@ -74,7 +74,7 @@ class TrackByValves:
         integral: float = _INTEGRAL_GAIN,
         lead: float = _PHASE_LEAD,
     ) -> None:
-        """Read the parameters of the nominal machine.
+        """Read the parameters of the controller from the nominal machine.
 
         Args:
             setup: the task with its options.
@@ -90,7 +90,7 @@ class TrackByValves:
         self.begin, self.reset = self._valve_servo.begin, self._valve_servo.reset
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Return the actions (n, k) for observations (n, o)."""
+        """Compute the actions (n, k) of the next step from the observations (n, o) of n parallel episodes."""
         now, _ = self._preview.interpolate(observation, 0.0)
         _, rate = self._preview.interpolate(observation, self._lead)
         return self._valve_servo(observation, now, rate)
@@ -120,13 +120,13 @@ class RateFeedback:
         self._max_rate_change = accelerations * self._period
 
     def begin(self, count: int) -> None:
-        """Allocate the state of `count` episodes."""
+        """Allocate the controller state for `count` parallel episodes."""
         shape = (count, len(self._fastest))
         self._model_position, self._model_rate = np.zeros(shape), np.zeros(shape)
         self._is_new = np.ones(count, bool)
 
     def reset(self, mask: np.ndarray) -> None:
-        """Reset the state of the episodes selected by the mask (n,)."""
+        """Reset the controller state of the episodes selected by the boolean mask (n,)."""
         self._is_new |= mask
 
     def compute_rates(self, measured: np.ndarray, place: np.ndarray, rate: np.ndarray) -> np.ndarray:
@@ -159,23 +159,23 @@ class TrackByJointRates:
     """Track joint references by joint rates."""
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Read the parameters of the nominal machine."""
+        """Read the parameters of the controller from the nominal machine."""
         self._preview, self._joint = ReferencePreview(setup), find_position_columns(setup)
         fastest = np.array([full_action_rate(setup.machine, axis) for axis in setup.axes])
         self._rate_feedback = RateFeedback(setup, fastest, np.full(len(fastest), MAX_ACCELERATION), _JOINT_RATE_GAINS)
         self.begin, self.reset = self._rate_feedback.begin, self._rate_feedback.reset
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Return the actions (n, k) for observations (n, o)."""
+        """Compute the actions (n, k) of the next step from the observations (n, o) of n parallel episodes."""
         measured = observation[:, self._joint].astype(float)
         return self._rate_feedback.compute_rates(measured, *self._preview.interpolate(observation, 0.0))
 
 
 class TrackByResolvedMotion:
-    """Track the tip pose of the joint references by tip rates."""
+    """Track the tip pose that corresponds to the joint references by tip rates."""
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Read the parameters of the nominal machine.
+        """Read the parameters of the controller from the nominal machine.
 
         Raises:
             InputError: the task drives axes that do not belong to the arm.
@@ -190,14 +190,14 @@ class TrackByResolvedMotion:
         self.begin, self.reset = self._rate_feedback.begin, self._rate_feedback.reset
 
     def _pose(self, observation: np.ndarray, time: float) -> np.ndarray:
-        """Return the tip pose (n, k) of the references `time` [s] from now."""
+        """Return the tip pose (n, k) that the joint references have `time` [s] from now."""
         q = self._preview.interpolate(observation, time)[0]
         pose = np.zeros((len(q), MAX_ARM_AXES))
         compute_poses(self._arm, np.ascontiguousarray(q), pose)
         return pose[:, : q.shape[1]]
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Return the actions (n, k) for observations (n, o)."""
+        """Compute the actions (n, k) of the next step from the observations (n, o) of n parallel episodes."""
         after = self._pose(observation, _DIFFERENCE_STEP)
         before = self._pose(observation, -_DIFFERENCE_STEP)
         measured = observation[:, self._tip].astype(float)
@@ -222,7 +222,7 @@ class TipController:
     """Base of the controllers that track a tip pose with any kind of actions."""
 
     def __init__(self, setup: TaskSetup, integral: float = 0.0) -> None:
-        """Read the parameters of the nominal machine.
+        """Read the parameters of the controller from the nominal machine.
 
         Args:
             setup: the task with its options.
@@ -238,17 +238,17 @@ class TipController:
         self._valves = ValveServo(setup, setup.task.servo, integral) if self._kind == "valve" else None
 
     def begin(self, count: int) -> None:
-        """Allocate the state of `count` episodes."""
+        """Allocate the controller state for `count` parallel episodes."""
         if self._valves:
             self._valves.begin(count)
 
     def reset(self, mask: np.ndarray) -> None:
-        """Reset the state of the episodes selected by the mask (n,)."""
+        """Reset the controller state of the episodes selected by the boolean mask (n,)."""
         if self._valves:
             self._valves.reset(mask)
 
     def solve_joints(self, observation: np.ndarray, pose: np.ndarray) -> np.ndarray:
-        """Return the joint angles (n, k) for poses (n, k)."""
+        """Return the joint angles (n, k) for tip poses (n, k); for unreachable poses, the measured angles."""
         found = np.ascontiguousarray(observation[:, self._joint], float)
         whole = np.zeros((len(pose), MAX_ARM_AXES))
         whole[:, : self._k] = pose
@@ -260,7 +260,7 @@ class LineController(TipController):
     """Track a line by the reference rate shortly ahead and the current error."""
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Look up the observation columns."""
+        """Find the observation columns that the controller uses."""
         super().__init__(setup)
         self._reference_columns = find_columns(setup, "reference", COORDINATES[: self._k])
         self._preview_columns = [
@@ -268,7 +268,7 @@ class LineController(TipController):
         ]
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Return the actions (n, k) for observations (n, o)."""
+        """Compute the actions (n, k) of the next step from the observations (n, o) of n parallel episodes."""
         seen = observation.astype(float)
         wanted = seen[:, self._reference_columns]
         later = [np.concatenate([seen[:, c], wanted[:, 3:]], axis=1) for c in self._preview_columns]
@@ -287,7 +287,7 @@ class ReachController(TipController):
     """Move to a pose with a rate proportional to the remaining error."""
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Look up the observation columns."""
+        """Find the observation columns that the controller uses."""
         super().__init__(setup, _TIP_INTEGRAL)
         self._reference_columns = find_columns(setup, "reference", COORDINATES[: self._k])
         servo = setup.task.servo
@@ -295,7 +295,7 @@ class ReachController(TipController):
         self._position_gains = np.array(gains)
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Return the actions (n, k) for observations (n, o)."""
+        """Compute the actions (n, k) of the next step from the observations (n, o) of n parallel episodes."""
         seen = observation.astype(float)
         wanted = seen[:, self._reference_columns]
         if self._kind == "resolved_motion":
@@ -332,7 +332,7 @@ class PressController:
     """Set the vertical speed of the tip proportional to the force error."""
 
     def __init__(self, setup: TaskSetup) -> None:
-        """Look up the observation columns.
+        """Find the observation columns that the controller uses.
 
         Raises:
             InputError: the actions are not tip rates.
@@ -350,7 +350,7 @@ class PressController:
         """Do nothing: the controller has no state."""
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Return the actions (n, k) for observations (n, o)."""
+        """Compute the actions (n, k) of the next step from the observations (n, o) of n parallel episodes."""
         force, wanted = observation[:, self._force_column], observation[:, self._reference_column]
         speed = np.clip(_FORCE_GAIN * (force - wanted), -_MAX_PRESS_SPEED, _MAX_PRESS_SPEED)
         actions = np.zeros((len(observation), self._actions))
