@@ -358,12 +358,11 @@ class _SocketProblem:
         return np.concatenate([np.full(3 * len(self.joints), noise), gaps])
 
 
-def choose_robot(sockets: Sequence[Socket], options: SocketOptions) -> tuple[SerialRobot, dict[str, float]]:
+def choose_robot(sockets: Sequence[Socket]) -> tuple[SerialRobot, dict[str, float]]:
     """Select the shipped robot that puts the ball most consistently at one position per socket.
 
     Args:
         sockets: the measurements.
-        options: options of the calibration.
 
     Returns:
         The robot, and the median scatter [m] of every candidate with its ball fitted.

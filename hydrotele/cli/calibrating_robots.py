@@ -246,10 +246,10 @@ def _heldout_document(heldout_parts: Sequence[HeldOutPrediction], rows: dict[str
 
     distances = {k: v for one in heldout_parts for k, v in one.calibrated_errors.socket_distances.items()}
     return {
-        "rms_mm": rms_over_parts("calibrated_errors", "rms"),
-        "rms_without_outliers_mm": rms_over_parts("calibrated_errors", "rms_without_outliers"),
-        "nominal_rms_mm": rms_over_parts("nominal_errors", "rms"),
-        "given_rms_mm": rms_over_parts("given_errors", "rms"),
+        "rms_mm": rms_over_parts("calibrated", "rms"),
+        "rms_without_outliers_mm": rms_over_parts("calibrated", "rms_without_outliers"),
+        "nominal_rms_mm": rms_over_parts("nominal", "rms"),
+        "given_rms_mm": rms_over_parts("given", "rms"),
         "socket_distance_mm": _millimetres(distances),
         "parts": {
             one.name: {
@@ -279,7 +279,7 @@ def _find_robot(
     inside = [path for pattern in _ROBOT_FILES for path in sorted(data.glob(pattern))]
     if inside:
         return load_robot(inside[0], count), [f"robot: {inside[0]}, found in the data folder"]
-    robot, spreads = choose_robot(sockets, options)
+    robot, spreads = choose_robot(sockets)
     tried = ", ".join(f"{name} {1e3 * spread:.3g}" for name, spread in spreads.items())
     message = f"robot: {robot.name}, the shipped robot that fits best (scatter [mm]: {tried})"
     return robot, [message]
@@ -773,7 +773,7 @@ def _print_hybrid(result: dict[str, Any]) -> None:
     for words in told["explanations"][:12]:
         stdout_console.print(f"  {words}")
     if result["not_identifiable"]:
-        stdout_console.print(f"kept at their nominal values: {', '.join(result['unknown'])}")
+        stdout_console.print(f"kept at their nominal values: {', '.join(result['not_identifiable'])}")
     if told["poorly_identifiable"]:
         names = ", ".join(told["poorly_identifiable"])
         stdout_console.print(f"poorly identifiable at this noise: {names}")

@@ -1,9 +1,12 @@
 """Implement `hydrotele identify-operator`: fit the operator model to a log of a tracking task."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from hydrotele.teleop.operator_identification import OperatorFit
 
 IDENTIFY_OPERATOR_EPILOG = """\b
 Examples:  hydrotele identify-operator tracking.csv --out operator_7
@@ -73,13 +76,13 @@ def identify_operator(
         stderr_console.print(f"written to [bold]{out}[/]: operator.yaml, fit.json")
 
 
-def _print(fit, file: Path) -> None:
+def _print(fit: "OperatorFit", file: Path) -> None:
     from hydrotele.cli.console import make_table, stdout_console
 
     element = f", controlled element {fit.element}" if fit.element else ""
     title = (
         f"{file.name}: {fit.duration:.0f} s at {fit.rate:.3g} Hz, equalisation {fit.equalisation}"
-        f"{element}; the target explains {100 * fit.explained:.0f} % of the hand motion"
+        f"{element}; the target explains {100 * fit.explained_fraction:.0f} % of the hand motion"
     )
     rows = make_table(title, "parameter", "estimate", "95 % interval", "unit", "")
     for name, one in fit.estimates.items():

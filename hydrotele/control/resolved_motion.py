@@ -21,6 +21,7 @@ from hydrotele.kinematics.from_machine import (
     feller_geometry,
     is_planar_arm,
     solve_tip_position,
+    tip_position,
 )
 from hydrotele.kinematics.task import (
     REACHED,
@@ -269,6 +270,8 @@ def pose_to_joints(machine: Machine, pose: Pose, current: dict[str, float], wher
     if len(axes) == 3 and not is_planar_arm(machine):
         place = (pose.r * math.cos(pose.theta), pose.r * math.sin(pose.theta), pose.z)
         joints = solve_tip_position(machine, np.array(place), joints)
+        if not np.allclose(tip_position(machine, joints), place, rtol=0.0, atol=1e-6):
+            raise InputError(where, _describe_unreachable(machine, wanted[: len(axes)]))
     for name, q, (low, high) in zip(axes, joints.tolist(), ranges, strict=True):
         if not low <= q <= high:
             raise InputError(

@@ -28,26 +28,19 @@ def _is_vertical(machine: Machine, axis: str) -> bool:
     return link.parent == "world" and along > 0.95 * float(np.linalg.norm(gravity))
 
 
-def _lateral_directions(machine: Machine, axis: str) -> list[str]:
-    """Return the two coordinates perpendicular to a joint axis, such as ["x", "z"].
-
-    An offset of the centre of mass in the third one does not change the motion of the joint.
-    """
-    axis_direction = np.abs(machine.joints[machine.axes[axis].joint].axis)
-    return [_COORDINATES[k] for k in range(3) if k != int(np.argmax(axis_direction))]
-
-
 def _com_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
     """Return nominal values (0), bounds and priors of the offsets of a link's centre of mass.
 
-    They are fractions of the size of the link. An offset of 0.5 % of a boom, about 25 mm, changes its
+    They are fractions of the size of the link. An offset parallel to the joint axis is omitted, because it does not
+    change the motion of the joint. An offset of 0.5 % of a boom, about 25 mm, changes its
     pressure by 40 kPa. For a vertical axis only the moment of inertia changes, so that the smallest
     relevant offset is six times larger.
     """
     size = link_size(machine, machine.link_of(machine.axes[location].joint))
     least = (0.03 if _is_vertical(machine, location) else 0.005) * size
     number = Parameter("m", 0.0, -0.3 * size, 0.3 * size, max(0.05 * size, 2 * least), least)
-    return dict.fromkeys(_lateral_directions(machine, location), number)
+    axis = np.abs(machine.joints[machine.axes[location].joint].axis)
+    return {name: number for k, name in enumerate(_COORDINATES) if k != int(np.argmax(axis))}
 
 
 def _move_com(machine: Machine, location: str, values: Values) -> Machine:

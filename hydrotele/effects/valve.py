@@ -153,7 +153,6 @@ DIRECTION_EFFECTS = (
 
 
 _CURVE_KNOTS = tuple(float(t) for t in np.linspace(0.0, 1.0, 8))
-_DIRECTIONS = ("positive", "negative")
 
 
 def _progression_parameters(machine: Machine, location: str) -> dict[str, Parameter]:
@@ -163,13 +162,13 @@ def _progression_parameters(machine: Machine, location: str) -> dict[str, Parame
     `bend_flow_curve`. For 0.3 the opening at half travel is 42 %. Estimates: spools for fine control
     reach 0.6, notches cause 0.04.
     """
-    return dict.fromkeys(_DIRECTIONS, Parameter("1", 0.0, -0.9, 0.9, 0.3, 0.04))
+    return dict.fromkeys(DIRECTIONS, Parameter("1", 0.0, -0.9, 0.9, 0.3, 0.04))
 
 
 def _set_progression(machine: Machine, location: str, values: Values) -> Machine:
     valve = machine.axes[location].valve
     assert valve
-    for direction in _DIRECTIONS:
+    for direction in DIRECTIONS:
         if values[direction] != 0.0:
             curve = bend_flow_curve(getattr(valve, direction), values[direction])
             machine = with_value(machine, f"axes.{location}.valve.{direction}.curve", curve)

@@ -430,6 +430,7 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if seeds is not None and chosen is not None:
             seeds = seeds[chosen]
         self.core.reset(seeds, chosen)
+        self._is_started = True
         return self.core.observation.copy(), self._make_infos(chosen)
 
     def _select_environments(self, options: dict[str, Any] | None) -> np.ndarray | None:
@@ -444,7 +445,6 @@ class MachineVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def _seeds(self, seed: int | list[int | None] | None) -> np.ndarray | None:
         if seed is None and self._is_started:
             return None
-        self._is_started = True
         if isinstance(seed, (int, np.integer)):
             return np.array([int(seed) + k for k in range(self.num_envs)])
         drawn = self.np_random.integers(2**62, size=self.num_envs)

@@ -28,6 +28,7 @@ from hydrotele.experiments.comparison import (
     Panel,
     Sample,
     Series,
+    merge_settings,
 )
 from hydrotele.experiments.intervals import (
     check_exact,
@@ -46,7 +47,6 @@ from hydrotele.experiments.palida import (
     load_excitation,
     load_robot,
     make_drive_limits,
-    merge_settings,
     plan_circle,
     plan_square,
     simulate_excitation,

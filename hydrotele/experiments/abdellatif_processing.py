@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Panel, Sample
+from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Panel, Sample, merge_settings
 from hydrotele.experiments.intervals import check_mean, check_statistic, collect_values
 from hydrotele.experiments.palida import (
     PLOTTED_DRIVE,
@@ -21,7 +21,6 @@ from hydrotele.experiments.palida import (
     RepeatedMotion,
     compute_force_covariance,
     load_robot,
-    merge_settings,
     simulate_excitation,
     simulate_measurement,
     simulate_motion,

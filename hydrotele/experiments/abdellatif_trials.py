@@ -26,6 +26,7 @@ from hydrotele.experiments.comparison import (
     Experiment,
     Panel,
     Sample,
+    merge_settings,
 )
 from hydrotele.experiments.intervals import (
     CONFIDENCE,
@@ -44,7 +45,6 @@ from hydrotele.experiments.palida import (
     compute_force_covariance,
     draw_force_noise,
     load_robot,
-    merge_settings,
     simulate_excitation,
     simulate_measurement,
 )

@@ -15,6 +15,8 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from hydrotele.core.errors import InputError
+
 Kind = Literal["document", "caption", "input", "additional"]
 """Kind of a row.
 
@@ -220,6 +222,17 @@ class Comparison(NamedTuple):
 
 Changes = Mapping[str, Any]
 """Changes of an experiment's settings: setting or scenario key -> value."""
+
+
+def merge_settings(defaults: Mapping[str, Any], changes: Changes) -> dict[str, Any]:
+    """Return the default settings of an experiment with changes applied.
+
+    Raises:
+        InputError: a changed key is not a setting.
+    """
+    if unknown := [name for name in changes if name not in defaults]:
+        raise InputError(f"setting {unknown[0]}", f"is unknown; valid: {', '.join(defaults) or 'none'}")
+    return {**defaults, **changes}
 
 
 class Sample(NamedTuple):

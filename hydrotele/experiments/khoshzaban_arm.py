@@ -7,15 +7,14 @@ and drifts of the trajectories in Figs 16 to 18. Every repetition therefore draw
 and sensor errors; the published values belong to one trajectory.
 """
 
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from hydrotele.calibrate.arm import identify_arm
 from hydrotele.calibrate.design import generate_sweep_poses
 from hydrotele.calibrate.loop import CalibrationLoop, build_loop, unit_of
-from hydrotele.core.errors import InputError
 from hydrotele.experiments.calibrator_readings import (
     MAX_RESOLVER_ERROR,
     draw_gravity_bends,
@@ -30,6 +29,7 @@ from hydrotele.experiments.comparison import (
     Evaluation,
     Experiment,
     Sample,
+    merge_settings,
 )
 from hydrotele.experiments.intervals import (
     MAJORITY_RANGE,
@@ -101,18 +101,6 @@ def find_published_error(case: str, name: str) -> float:
 def compute_rms(values: np.ndarray | Sequence[float]) -> float:
     """Return the root mean square of all values."""
     return float(np.sqrt(np.mean(np.square(values))))
-
-
-def merge_settings(defaults: Mapping[str, Any], changes: Changes) -> dict[str, Any]:
-    """Return the default settings of an experiment with changes applied.
-
-    Raises:
-        InputError: a changed key is not a setting.
-    """
-    unknown = sorted(set(changes) - set(defaults))
-    if unknown:
-        raise InputError(f"setting {unknown[0]}", f"is unknown; valid: {', '.join(defaults)}")
-    return {**defaults, **changes}
 
 
 class Disturbance(NamedTuple):

@@ -40,7 +40,7 @@ from hydrotele.experiments.calibrator_readings import (
     perturb_loop,
     simulate_readings,
 )
-from hydrotele.experiments.comparison import Changes, Panel, Sample
+from hydrotele.experiments.comparison import Changes, Panel, Sample, merge_settings
 from hydrotele.experiments.khoshzaban_arm import (
     IDENTIFIABLE_PARAMETERS,
     LENGTH_PARAMETERS,
@@ -48,7 +48,6 @@ from hydrotele.experiments.khoshzaban_arm import (
     STAGE_PARAMETERS,
     TWIST_PARAMETERS,
     compute_rms,
-    merge_settings,
 )
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.kinematics.serial_chain import chain_poses

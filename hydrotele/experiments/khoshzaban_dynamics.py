@@ -18,6 +18,7 @@ from hydrotele.experiments.comparison import (
     Experiment,
     Panel,
     Sample,
+    merge_settings,
 )
 from hydrotele.experiments.intervals import (
     check_exact,
@@ -35,7 +36,6 @@ from hydrotele.experiments.khoshzaban_models import (
     draw_states,
     make_document_setup,
     make_regressor,
-    merge_settings,
     scale_cylinders,
     stack_rows,
 )

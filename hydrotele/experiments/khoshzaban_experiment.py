@@ -12,7 +12,7 @@ import numpy as np
 from hydrotele.calibrate.design import PUBLISHED_SWEEPS, generate_sweep_poses
 from hydrotele.calibrate.loop import build_loop
 from hydrotele.experiments import khoshzaban_linkages
-from hydrotele.experiments.comparison import Changes, Check, Claim, Evaluation, Experiment, Sample
+from hydrotele.experiments.comparison import Changes, Check, Claim, Evaluation, Experiment, Sample, merge_settings
 from hydrotele.experiments.intervals import (
     check_exact,
     check_fraction,
@@ -28,7 +28,6 @@ from hydrotele.experiments.khoshzaban_arm import (
     TWIST_PARAMETERS,
     check_rms_ratio,
     compute_rms,
-    merge_settings,
 )
 from hydrotele.experiments.khoshzaban_calibration import (
     END_POINT_LINKS,

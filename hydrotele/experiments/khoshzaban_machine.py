@@ -23,12 +23,12 @@ from hydrotele.experiments.comparison import (
     Experiment,
     Panel,
     Sample,
+    merge_settings,
 )
 from hydrotele.experiments.intervals import check_exact, collect_values
 from hydrotele.experiments.khoshzaban_arm import (
     IDENTIFIABLE_PARAMETERS,
     SIMULATED_STAGES,
-    merge_settings,
 )
 from hydrotele.experiments.scenario_runs import run_shipped
 from hydrotele.kinematics.from_machine import axis_linkage

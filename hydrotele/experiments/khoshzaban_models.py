@@ -5,15 +5,12 @@ friction of three drives and six pins, and three force offsets. The reduced mode
 major links: ten inertial parameters of each of three bodies, friction and offset of three drives.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 
-from hydrotele.core.errors import InputError
-from hydrotele.experiments.comparison import Changes
 from hydrotele.identify.identifiability import Identifiability, classify_parameters, reference_sizes
 from hydrotele.identify.setup import DynamicModel, RegressorSetup, machine_setup
 from hydrotele.machine.machine_file import load_machine
@@ -38,24 +35,6 @@ _QUINTIC_PEAK = 1.875  # largest rate of a fifth-order polynomial of unit travel
 
 Motion = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Positions, rates and accelerations (n, 3) of swing, boom and stick [rad], [rad/s], [rad/s^2]."""
-
-
-def merge_settings(settings: Mapping[str, Any], changes: Changes) -> dict[str, Any]:
-    """Return the default settings of an experiment with changes applied.
-
-    Args:
-        settings: all settings with their default values.
-        changes: settings to change.
-
-    Returns:
-        The changed settings.
-
-    Raises:
-        InputError: a changed key is not a setting.
-    """
-    if strange := [name for name in changes if name not in settings]:
-        raise InputError("experiment", f"no setting {strange[0]}: {', '.join(settings)}")
-    return {**settings, **changes}
 
 
 @cache

@@ -17,9 +17,9 @@ from hydrotele.experiments.calibrator_readings import (
     draw_gravity_bends,
     simulate_readings,
 )
-from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Sample
+from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Sample, merge_settings
 from hydrotele.experiments.intervals import check_exact, check_mean, check_statistic, collect_values
-from hydrotele.experiments.khoshzaban_arm import LENGTH_PARAMETERS, SIMULATED_STAGES, merge_settings
+from hydrotele.experiments.khoshzaban_arm import LENGTH_PARAMETERS, SIMULATED_STAGES
 from hydrotele.kinematics.from_machine import axis_linkage
 from hydrotele.kinematics.linkages import TwoBar
 from hydrotele.machine.machine_file import load_machine

@@ -18,6 +18,7 @@ from hydrotele.experiments.comparison import (
     Experiment,
     Panel,
     Sample,
+    merge_settings,
 )
 from hydrotele.experiments.intervals import check_mean, check_statistic, format_values
 from hydrotele.experiments.khoshzaban_models import (
@@ -29,7 +30,6 @@ from hydrotele.experiments.khoshzaban_models import (
     find_base,
     join_motions,
     make_regressor,
-    merge_settings,
 )
 from hydrotele.experiments.khoshzaban_sensors import SENSOR_ACCURACY
 from hydrotele.identify.equations import predict_forces

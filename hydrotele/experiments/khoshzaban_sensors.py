@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Sample
+from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Sample, merge_settings
 from hydrotele.experiments.intervals import check_exact, check_mean, check_statistic
 from hydrotele.experiments.khoshzaban_models import (
     DRIVES,
@@ -14,7 +14,6 @@ from hydrotele.experiments.khoshzaban_models import (
     draw_motion,
     find_base,
     make_regressor,
-    merge_settings,
 )
 from hydrotele.identify.smoothing import smooth
 from hydrotele.machine.machine_file import load_machine

@@ -7,13 +7,12 @@ measurements with force and encoder noise, and tracks paths in MuJoCo with feedf
 import json
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
 from hydrotele.core.files import models_folder
-from hydrotele.experiments.comparison import Changes
 from hydrotele.identify.excitation import DriveLimits, Excitation
 from hydrotele.identify.identifiability import Identifiability, classify_parameters
 from hydrotele.identify.mechanism import Mechanism, load_mechanism
@@ -135,17 +134,6 @@ class Robot:
         """Return the leg lengths (n, 6) [m] at poses (n, 6)."""
         q = solve_joint_positions(self.setup.chain, self.setup.given_joints, motion)
         return q[:, [self.setup.chain.index(name) for name in self.setup.chain.drives]]
-
-
-def merge_settings(defaults: Changes, changes: Changes) -> dict[str, Any]:
-    """Return the default settings of an experiment with changes applied.
-
-    Raises:
-        KeyError: a changed key is not a setting.
-    """
-    if unknown := set(changes) - set(defaults):
-        raise KeyError(f"{', '.join(sorted(unknown))}: valid are {', '.join(defaults)}")
-    return {**defaults, **changes}
 
 
 def draw_states() -> tuple[np.ndarray, np.ndarray, np.ndarray]:

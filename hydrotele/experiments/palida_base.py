@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Panel, Sample
+from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Panel, Sample, merge_settings
 from hydrotele.experiments.intervals import check_exact, collect_values
 from hydrotele.experiments.palida import (
     LEGS,
@@ -20,7 +20,6 @@ from hydrotele.experiments.palida import (
     SYMBOLS,
     draw_states,
     load_robot,
-    merge_settings,
 )
 from hydrotele.identify.identifiability import Identifiability, classify_parameters
 from hydrotele.multibody.chain import Chain

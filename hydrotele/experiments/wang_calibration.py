@@ -17,6 +17,7 @@ from hydrotele.experiments.comparison import (
     Experiment,
     Panel,
     Sample,
+    merge_settings,
 )
 from hydrotele.experiments.intervals import (
     check_fraction,
@@ -33,7 +34,6 @@ from hydrotele.experiments.wang_robots import (
     compute_rms,
     compute_test_errors,
     make_caption_claim,
-    merge_settings,
     simulate_robot,
 )
 from hydrotele.kinematics.hybrid import (

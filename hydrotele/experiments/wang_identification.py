@@ -21,6 +21,7 @@ from hydrotele.experiments.comparison import (
     Marginals,
     Panel,
     Sample,
+    merge_settings,
 )
 from hydrotele.experiments.intervals import (
     check_mean,
@@ -34,7 +35,6 @@ from hydrotele.experiments.wang_robots import (
     compute_test_errors,
     make_caption_claim,
     measure_nominal_robot,
-    merge_settings,
     simulate_robot,
 )
 from hydrotele.kinematics.hybrid import (

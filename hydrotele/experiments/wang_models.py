@@ -22,6 +22,7 @@ from hydrotele.experiments.comparison import (
     Experiment,
     Panel,
     Sample,
+    merge_settings,
 )
 from hydrotele.experiments.intervals import (
     check_exact,
@@ -29,7 +30,7 @@ from hydrotele.experiments.intervals import (
     check_statistic,
     format_values,
 )
-from hydrotele.experiments.wang_robots import REQUIRED_ACCURACY, merge_settings
+from hydrotele.experiments.wang_robots import REQUIRED_ACCURACY
 from hydrotele.kinematics.hybrid import (
     PlatformPose,
     apply_errors,

@@ -4,17 +4,15 @@ Dimensions, noise and manufacturing errors are assumptions (models/iwr/README.md
 available part of the thesis gives none.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from hydrotele.calibrate.hybrid import calibrate_hybrid_robot
 from hydrotele.calibrate.hybrid_data import Measurement, measurement_from_wires
-from hydrotele.core.errors import InputError
 from hydrotele.experiments.comparison import (
-    Changes,
     Claim,
     Comparison,
     Evaluation,
@@ -153,18 +151,6 @@ def count_covered_errors(seed: int) -> tuple[int, int]:
 def compute_rms(values: np.ndarray) -> float:
     """Return the root mean square of an array."""
     return float(np.sqrt(np.mean(np.square(values))))
-
-
-def merge_settings(defaults: Mapping[str, Any], changes: Changes) -> dict[str, Any]:
-    """Return the default settings of an experiment with changes applied.
-
-    Raises:
-        InputError: a changed key is not a setting.
-    """
-    for name in changes:
-        if name not in defaults:
-            raise InputError(f"setting {name!r}", f"valid: {', '.join(defaults)}")
-    return {**defaults, **changes}
 
 
 Drawing = Callable[[Sequence[Sample]], tuple[tuple[Panel, ...], Marginals | None]]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hydrotele.control.resolved_motion import arm_specification
-from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Panel, Sample
+from hydrotele.experiments.comparison import Changes, Claim, Evaluation, Experiment, Panel, Sample, merge_settings
 from hydrotele.experiments.intervals import (
     check_exact,
     check_fraction,
@@ -24,7 +24,6 @@ from hydrotele.experiments.zhu_two_port import (
     ROUNDING_RANGE,
     make_claim,
     make_exact_experiment,
-    merge_settings,
 )
 from hydrotele.kinematics.from_machine import feller_geometry
 from hydrotele.kinematics.task import (
@@ -105,7 +104,7 @@ def measure_inverse_kinematics(changes: Changes) -> Sample:
     Returns:
         Largest position errors [m], and the fraction of poses with the correct reachability.
     """
-    given = merge_settings(changes, stick=1.0)
+    given = merge_settings({"stick": 1.0}, changes)
     rng, values = np.random.default_rng(23), {}
     for name in _MACHINE_TOOLS:
         g, ranges = _load_arm(name)
@@ -188,7 +187,7 @@ def measure_solutions(changes: Changes) -> Sample:
     Returns:
         Largest numbers of solutions, and mean numbers of extraneous candidates.
     """
-    given = merge_settings(changes, check=1.0)
+    given = merge_settings({"check": 1.0}, changes)
     g, (numbers, ranges) = feller_geometry(load_machine("cat325")), _load_arm("feller-buncher")
     rng = np.random.default_rng(24)
     counts = {"first": [], "second": [], "extra_first": [], "extra_second": []}

@@ -16,9 +16,10 @@ from hydrotele.experiments.comparison import (
     Experiment,
     Panel,
     Sample,
+    merge_settings,
 )
 from hydrotele.experiments.intervals import check_exact, check_mean, collect_values
-from hydrotele.experiments.zhu_two_port import make_claim, make_exact_experiment, merge_settings
+from hydrotele.experiments.zhu_two_port import make_claim, make_exact_experiment
 from hydrotele.machine.joystick import load_joystick
 from hydrotele.teleop.coils import make_three_station_coils
 from hydrotele.teleop.levitation import pose_resolution
@@ -44,7 +45,7 @@ def measure_counter_example(changes: Changes) -> Sample:
         `end`: x after 12 s with exponential damping; `slow`: |x| after 100 s with slowly increasing
         damping.
     """
-    given = merge_settings(changes, stiffness=1.0)
+    given = merge_settings({"stiffness": 1.0}, changes)
 
     def solve(damping, last: float) -> tuple[np.ndarray, np.ndarray]:
         def motion(t: float, state: np.ndarray) -> list[float]:
@@ -89,7 +90,7 @@ def measure_worst_switching(changes: Changes) -> Sample:
     Returns:
         `growth`: speed after half a swing over that before.
     """
-    given = merge_settings(changes, ratio=0.02)
+    given = merge_settings({"ratio": 0.02}, changes)
     ratios = np.geomspace(0.01, 1.5, 25)
     growth = [worst_switching_growth(1.0, 2.0 * ratio * 3.0, _MIN_STIFFNESS, _MAX_STIFFNESS) for ratio in ratios]
     return Sample(
@@ -172,7 +173,7 @@ def measure_theorem(seed: int, changes: Changes) -> Sample:
         largest distance from the origin after 40 s over that at the start; `outside`: largest
         distance of paths from the x axis outside the region between those of K_min and K_max.
     """
-    given = merge_settings(changes, damping=_DAMPING)
+    given = merge_settings({"damping": _DAMPING}, changes)
     damping, rng, count = given["damping"], np.random.default_rng([seed, 42]), 40_000
     crossings, left, outside, panels = 0, 0.0, 0.0, ()
     from_axis = {
@@ -262,7 +263,7 @@ def measure_published_gains(changes: Changes) -> Sample:
     Returns:
         `margin`: largest B^2 - 4 M K_max [(N s/m)^2]; `growth`: largest growth per half swing.
     """
-    given = merge_settings(changes, damping=1.0)
+    given = merge_settings({"damping": 1.0}, changes)
     joystick = load_joystick()
     mass, hand = joystick.flotor.mass, joystick.hand.axis_impedance(0)
     margins, growths = [], []
@@ -295,7 +296,7 @@ def measure_joystick(changes: Changes) -> Sample:
     Returns:
         Condition number, and standard deviations of position [um] and rotation [deg].
     """
-    given = merge_settings(changes, step=1.0, radius=1.0)
+    given = merge_settings({"step": 1.0, "radius": 1.0}, changes)
     joystick = load_joystick()
     facts = joystick.coils
     coils = make_three_station_coils(facts.radius, facts.force_per_ampere, facts.max_current)

@@ -16,6 +16,7 @@ from hydrotele.experiments.comparison import (
     Experiment,
     Panel,
     Sample,
+    merge_settings,
 )
 from hydrotele.experiments.intervals import check_exact, check_mean, collect_values, format_values
 from hydrotele.experiments.zhu_two_port import (
@@ -30,7 +31,6 @@ from hydrotele.experiments.zhu_two_port import (
     make_constant_block,
     make_exact_experiment,
     make_identical_case,
-    merge_settings,
 )
 from hydrotele.teleop.analysis import TeleoperatorAxis, find_first_change, is_strictly_stable
 from hydrotele.teleop.findings import compare_stability
@@ -62,7 +62,7 @@ def measure_transparency(changes: Changes) -> Sample:
         Largest error of the hybrid matrix, largest scattering norm, slowest pole of the position error
         [1/s], and the stable fraction of loops with random hands and tasks.
     """
-    given = merge_settings(changes, mass_error=0.0, delay=0.0)
+    given = merge_settings({"mass_error": 0.0, "delay": 0.0}, changes)
     case = load_shipped_case().with_delay(given["delay"])
     port = case.make_port("four_channel_position")
     real = dataclasses.replace(case.slave, mass=case.slave.mass * (1.0 + given["mass_error"]))
@@ -136,7 +136,7 @@ def measure_intervening(changes: Changes) -> Sample:
         Relative error of the felt impedance against master plus task, and the stable fraction of loops
         with random hands and tasks.
     """
-    given = merge_settings(changes, slave_mass=1.0)
+    given = merge_settings({"slave_mass": 1.0}, changes)
     case = make_identical_case()
     side = Impedance(case.master.mass, 10.0, 100.0)
     slave = dataclasses.replace(side, mass=given["slave_mass"] * side.mass)
@@ -199,7 +199,7 @@ def measure_force_error(changes: Changes) -> Sample:
     Returns:
         Smallest destabilizing errors; gain factor and hand stiffness factor for which 5 % suffices.
     """
-    given = merge_settings(changes, scale=1.0)
+    given = merge_settings({"scale": 1.0}, changes)
     case = make_identical_case()
 
     def soften_controllers(scale: float) -> TeleoperatorAxis:
@@ -258,7 +258,7 @@ def measure_rate_force_extremes(changes: Changes) -> Sample:
     Returns:
         Relative differences from Zhu 1994, (3.50) for stiff and (3.51) for soft tasks.
     """
-    given = merge_settings(changes, structure_with_task=0.0)
+    given = merge_settings({"structure_with_task": 0.0}, changes)
     case, s = load_shipped_case(), 1j * HAND_FREQUENCIES
     port = case.make_port("four_channel_rate" if given["structure_with_task"] else "rate_force")
     master, control = case.master(s), case.master_control(s)
@@ -312,7 +312,7 @@ def measure_rate_transparency(changes: Changes) -> Sample:
     Returns:
         Relative errors of felt impedance and velocity.
     """
-    given = merge_settings(changes, slave_mass=1.0)
+    given = merge_settings({"slave_mass": 1.0}, changes)
     case, s = make_identical_case(), 1j * HAND_FREQUENCIES
     slave = dataclasses.replace(case.slave, mass=given["slave_mass"] * case.slave.mass)
     case = dataclasses.replace(case, slave=slave)
@@ -350,7 +350,7 @@ def measure_master_damping(changes: Changes) -> Sample:
         Unstable fraction of random characteristic polynomials (3.72), number of unstable poles of the
         whole loop, and whether its simulated impulse response decays.
     """
-    given = merge_settings(changes, damping=0.0)
+    given = merge_settings({"damping": 0.0}, changes)
     rng = np.random.default_rng(372)
     control, mass, unstable = (
         load_shipped_case().master_control,
@@ -408,7 +408,7 @@ def measure_task_identification(seed: int, changes: Changes) -> Sample:
     Returns:
         Largest relative stiffness errors before and after the task changes.
     """
-    given = merge_settings(changes, forgetting=0.99, reset=8.0, noise=0.02)
+    given = merge_settings({"forgetting": 0.99, "reset": 8.0, "noise": 0.02}, changes)
     rng = np.random.default_rng([seed, 374])
     step, n = 0.02, 1000
     time = step * np.arange(n)

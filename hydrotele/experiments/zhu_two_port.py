@@ -12,7 +12,6 @@ from functools import partial
 
 import numpy as np
 
-from hydrotele.core.errors import InputError
 from hydrotele.experiments.comparison import (
     Changes,
     Claim,
@@ -21,6 +20,7 @@ from hydrotele.experiments.comparison import (
     Kind,
     Panel,
     Sample,
+    merge_settings,
 )
 from hydrotele.experiments.intervals import check_exact, check_mean, collect_values, format_values
 from hydrotele.experiments.scenario_runs import (
@@ -45,25 +45,6 @@ HAND_FREQUENCIES = 2.0 * np.pi * np.geomspace(0.1, 5.0, 60)  # rad/s, bandwidth 
 WIDE_FREQUENCIES = 2.0 * np.pi * np.geomspace(1e-3, 1e3, 2000)  # rad/s
 NOTICEABLE_DIFFERENCE = 0.23  # just noticeable relative difference of a compliance; Tan 1995
 PASSIVE_NORM = 1.0 + 1e-9  # largest scattering norm of a passive two-port, with rounding
-
-
-def merge_settings(changes: Changes, **defaults: float) -> dict[str, float]:
-    """Return the default settings of an experiment with changes applied.
-
-    Args:
-        changes: changed setting -> value.
-        **defaults: all settings with their default values.
-
-    Returns:
-        Setting -> value.
-
-    Raises:
-        InputError: a changed key is not a setting.
-    """
-    if unknown := sorted(set(changes) - set(defaults)):
-        known = ", ".join(defaults) or "none"
-        raise InputError("changes", f"{', '.join(unknown)} unknown; valid: {known}")
-    return defaults | dict(changes)
 
 
 def make_exact_experiment(name: str, measure: Callable[[Changes], Sample], *claims: Claim) -> Experiment:
@@ -111,7 +92,7 @@ def measure_hybrid_matrix(changes: Changes) -> Sample:
     Returns:
         Relative errors of both formulas.
     """
-    given = merge_settings(changes, velocity_back_sign=1.0)
+    given = merge_settings({"velocity_back_sign": 1.0}, changes)
     rng = np.random.default_rng(313)
     errors = {"matrix": 0.0, "felt": 0.0}
     for _ in range(50):
@@ -157,7 +138,7 @@ def measure_delayed_channel(changes: Changes) -> Sample:
     Returns:
         `least`: smallest norm over the delays; `lossless`: largest norm of the lossless line.
     """
-    given = merge_settings(changes, wave_impedance=0.0)
+    given = merge_settings({"wave_impedance": 0.0}, changes)
     delays = np.array([1e-3, 1e-2, 5e-2, 0.2, 1.0, 5.0])
     s = 1j * np.geomspace(0.05, 500.0, 4001)
     norms, lossless = [], []
@@ -203,7 +184,7 @@ def measure_nyquist(changes: Changes) -> Sample:
     Returns:
         `fraction` of loops in which both agree, and number of loops `cells`.
     """
-    given = merge_settings(changes, simulated_task=1.0)
+    given = merge_settings({"simulated_task": 1.0}, changes)
     case, right, cells = load_shipped_case(), 0, 0
     real = dataclasses.replace(case, task=dataclasses.replace(case.task, stiffness=given["simulated_task"] * 36e3))
     for structure in ("position_position", "position_force", "rate_position", "rate_force"):
@@ -239,7 +220,7 @@ def measure_coordinating_force(changes: Changes) -> Sample:
     Returns:
         `norm`: largest scattering norm; `difference`: relative difference of hybrid matrices.
     """
-    given = merge_settings(changes, slave_gain=1.0, coupling_gain=1.0)
+    given = merge_settings({"slave_gain": 1.0, "coupling_gain": 1.0}, changes)
     case = make_identical_case()
     control, k = case.master_control, given["slave_gain"]
     held = Impedance(0.0, k * control.damping, k * control.stiffness)
@@ -344,7 +325,7 @@ def measure_direct_force(changes: Changes) -> Sample:
     Returns:
         Largest stable factors of the reflected force, without delay and with 20 ms each way.
     """
-    given = merge_settings(changes, task=1.0)
+    given = merge_settings({"task": 1.0}, changes)
     case, k = load_shipped_case(), given["task"]
     task = Impedance(0.0, k * case.task.damping, k * case.task.stiffness)
     case = dataclasses.replace(case, task=task)
@@ -401,7 +382,7 @@ def measure_impedance_difference(changes: Changes) -> Sample:
     Returns:
         Largest relative difference of each of three structures that are not transparent.
     """
-    given = merge_settings(changes, transparent=0.0)
+    given = merge_settings({"transparent": 0.0}, changes)
     case, s, values, curves = load_shipped_case(), 1j * HAND_FREQUENCIES, {}, {}
     names = {"position_position": "position_position", "position_force": "position_force",
              "rate_force": "rate_force"}  # fmt: skip

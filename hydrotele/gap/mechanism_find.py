@@ -337,7 +337,7 @@ def _searched(fit, mechanism, band, nominal, names, tell) -> _Found:
     found, about, shares = None, {}, _SHARES
     for turn in range(_ROUNDS):
         tell(f"compute the regressors of all effects, round {turn + 1}", 0.2 * turn)
-        errors = sensor_errors(known, mechanism.setup.chain, mechanism.measured)
+        errors = sensor_errors(known, mechanism.setup.chain, mechanism.measured_joints)
         columns = build_columns(fit, mechanism, band, errors, about)
         columns = undone(columns, applied, {one.key: one.columns[0] for one, _ in known})
         effects = mechanism_effects(mechanism.setup.chain, columns, nominal, applied)
@@ -355,7 +355,7 @@ def _searched(fit, mechanism, band, nominal, names, tell) -> _Found:
         known = [
             (one, value)
             for one, value in zip(found.fitted.effects, found.fitted.values, strict=True)
-            if sensor_errors([(one, value)], mechanism.setup.chain, mechanism.measured)
+            if sensor_errors([(one, value)], mechanism.setup.chain, mechanism.measured_joints)
         ]
         value = found.evidence.coefficients(found.fitted)
         about = {name: value[k] for k, name in enumerate(columns.names) if name in nominal}

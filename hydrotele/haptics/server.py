@@ -238,8 +238,11 @@ def run_server(
     exchange = DeviceSession(device, period, secrets.randbits(62) + 1)
     on_open(line.getsockname())
     with line, reduced_jitter(_PRIORITY) as priority:
-        wake, trips, periods = _run_periods(line, exchange, period, should_stop)
-        device.write(np.zeros(6), False)
+        try:
+            wake, trips, periods = _run_periods(line, exchange, period, should_stop)
+        finally:
+            with contextlib.suppress(OSError):  # a device that no longer answers applies no force either
+                device.write(np.zeros(6), False)
     return ServerSummary(
         periods, exchange.missed, exchange.unanswered, exchange.rejected_packets, exchange.watchdog_trips,
         summarise_durations(wake), summarise_durations(trips), priority, load_of_machine(),

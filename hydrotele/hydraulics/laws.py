@@ -347,8 +347,8 @@ def friction_slope(
     turn = (1.0 - way * way) / coulomb_velocity
     slope = steep * way * (1.0 + coulomb_asymmetry * way)
     slope += dry * turn * (1.0 + 2.0 * coulomb_asymmetry * way)
-    allocation_free = viscous_asymmetry * (way + velocity * turn)
-    return slope + viscous * (1.0 + allocation_free)
+    asymmetry = viscous_asymmetry * (way + velocity * turn)
+    return slope + viscous * (1.0 + asymmetry)
 
 
 @allocation_free

@@ -6,7 +6,7 @@ data determine; all other combinations keep their nominal values. `reduce_parame
 merges friction parameters, because poorly determined passive-joint friction degrades all estimates.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -326,12 +326,12 @@ class Estimator:
         if not (0.0 <= self.ridge < np.inf and 0.0 <= self.truncation < 1.0):
             raise InputError(
                 "estimator",
-                f"ridge must be 0 or more and cut in [0, 1), got {self.ridge} and {self.truncation}",
+                f"ridge must be 0 or more and truncation in [0, 1), got {self.ridge} and {self.truncation}",
             )
         if self.method == "instruments" and (self.ridge or self.truncation):
             raise InputError("estimator", "instruments cannot be combined with ridge or truncation")
         if self.noise_pairs < 0:
-            raise InputError("estimator", f"pairs must be 0 or more, got {self.noise_pairs}")
+            raise InputError("estimator", f"noise_pairs must be 0 or more, got {self.noise_pairs}")
 
 
 @dataclass(frozen=True)
@@ -427,7 +427,7 @@ def weight_equations(
 
 
 def find_identifiable_parameters(
-    data: WeightedEquations, structure: Identifiability, setup: RegressorSetup, resting: Sequence[str],
+    data: WeightedEquations, structure: Identifiability, setup: RegressorSetup, resting: Collection[str],
     drives: Sequence[str],
 ) -> Identifiability:  # fmt: skip
     """Select the base parameters that noisy data determine.

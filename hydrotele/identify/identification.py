@@ -397,7 +397,7 @@ def fit_runs(
     rows = data.matrix.reshape(-1, data.matrix.shape[2])
     structure = classify_parameters(rows, data.table.names, data.table.units)
     still = ~np.any([part.is_moving for part in resolved], axis=0)
-    resting = [d for d, stands in zip(data.table.drives, still, strict=True) if stands]
+    resting = {joint for joint, stands in zip(setup.given_joints, still, strict=True) if stands}
     equations = weight_equations(data, structure, estimator.method, processing.period)
     told = find_identifiable_parameters(equations, structure, setup, resting, data.drives)
     found = equations.estimate_base(told, estimator.ridge, estimator.truncation)

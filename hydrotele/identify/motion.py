@@ -240,8 +240,8 @@ def apply_adjoint(
 ) -> np.ndarray:
     """Convert gains on filtered positions, rates and accelerations to gains on measured positions.
 
-    This is the adjoint of filtering and differentiation. It holds for all methods except the optimal smoother: the filters are symmetric in time, the
-    first derivative is antisymmetric.
+    This is the adjoint of filtering and differentiation. It holds for all methods except the optimal smoother: the
+    filters are symmetric in time, the first derivative is antisymmetric.
 
     Args:
         gain: (3, p, n, k) gains of p results on positions, rates and accelerations of k joints.

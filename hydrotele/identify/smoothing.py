@@ -161,7 +161,8 @@ def transition_matrices(order):
 def _marginalise_input(info, drive, ratio, order, column):
     """Marginalise the random input out of a state's information matrix R, in place.
 
-    R becomes R - R b (1/r + b'R b)^-1 b'R, with `drive` b and `ratio` r. Writes the gain (1/r + b'R b)^-1 R b into `column` and returns 1/r + b'R b.
+    R becomes R - R b (1/r + b'R b)^-1 b'R, with `drive` b and `ratio` r. Writes the gain (1/r + b'R b)^-1 R b into
+    `column` and returns 1/r + b'R b.
     """
     total = 1.0 / ratio
     for i in range(order):
@@ -683,7 +684,7 @@ def _interpolate_gaps(samples: np.ndarray, max_gap: int) -> np.ndarray:
             raise InputError(
                 _ZERO_PHASE_CONTEXT,
                 f"column {k} has {missing} successive missing samples, at most {max_gap} are"
-                " interpolated: set bridge, or use the optimal smoother, which accepts gaps",
+                " interpolated: set max_gap, or use the optimal smoother, which accepts gaps",
             )
         samples[:, k] = np.interp(rows, known, samples[known, k])
     return samples

@@ -582,7 +582,7 @@ def correct_urdf(robot: SerialRobot, text: str) -> str:
         element = found[joint.name]
         before, link = np.eye(4), _link_name(element, "parent")
         while link in by_child and by_child[link].get("type") not in _MOVING_JOINT_KINDS:
-            before = _read_origin(by_child[link]) @ before
+            before = _read_origin(robot.source, by_child[link]) @ before
             link = _link_name(by_child[link], "parent")
         _set_origin(element, np.linalg.inv(before) @ joint.origin)
         last = _link_name(element, "child")
@@ -666,7 +666,7 @@ def _read_urdf(path: Path, root: ElementTree.Element, columns: int | None) -> Se
     way = _choose_end(path, ends, columns).way
     made, back = [], np.eye(4)
     for joint in way:
-        back = back @ _read_origin(joint)
+        back = back @ _read_origin(path, joint)
         stated, name = joint.get("type"), str(joint.get("name"))
         if stated == "fixed":
             continue
@@ -818,9 +818,8 @@ def _link_name(joint: ElementTree.Element, end: str) -> str:
     return "" if element is None else str(element.get("link"))
 
 
-def _read_origin(joint: ElementTree.Element) -> np.ndarray:
+def _read_origin(where: str | Path, joint: ElementTree.Element) -> np.ndarray:
     element = joint.find("origin")
-    where = f"joint {joint.get('name')}"
     return frame_from_rpy(
         _read_numbers(where, joint, element, "xyz", (0.0, 0.0, 0.0)),
         _read_numbers(where, joint, element, "rpy", (0.0, 0.0, 0.0)),

@@ -19,7 +19,6 @@ from typing import NamedTuple
 import numpy as np
 
 from hydrotele.core.errors import InputError
-from hydrotele.logs import cleaning as value_range
 from hydrotele.logs.rows import RunRows
 from hydrotele.machine.machine import Machine, Sensor, SensorSet, channel_converter, channel_sensor
 
@@ -569,9 +568,9 @@ def _remove_impossible_readings(data: _CleaningData, run: str, channel: str, noi
         data.count_removed(channel, run, "infinite", bad)
     for what, noted, rows in (
         ("at the limit of the sensor", _MAX_SATURATED_FRACTION,
-         value_range.find_saturated(data.sensor(channel), channel, reading, period)),
+         find_saturated(data.sensor(channel), channel, reading, period)),
         ("that are physically impossible", 0.0,
-         value_range.find_spikes(data.machine, channel, reading, period, noise)),
+         find_spikes(data.machine, channel, reading, period, noise)),
     ):  # fmt: skip
         if rows.mean() > noted:
             first = data.runs[run].start + period * int(np.flatnonzero(rows)[0])

@@ -135,12 +135,14 @@ def save_machine(machine: Machine, path: str | Path) -> None:
 
 def _with_law_files(machine: Machine, folder: Path) -> Machine:
     """Copy user files that define laws of terms into a folder; return the machine with the names of the copies."""
-    terms = []
+    terms, copied = [], {}
     for term in machine.terms:
         source = LAWS[term.law].source
         file = Path(source)
         if source and file.is_file():
             source = file.name
+            if not file.samefile(other := copied.setdefault(source, file)):
+                raise InputError(file, f"must not have the same name as {other}: both are copied to one folder")
             if not (folder / source).exists() or not file.samefile(folder / source):
                 shutil.copyfile(file, folder / source)
         terms.append(term.model_copy(update={"source": source}))

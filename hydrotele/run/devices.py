@@ -279,7 +279,7 @@ class JoystickDevice:
     def read(self, time: float) -> Reading:
         """Return the current input; the handle is centred while the device is unplugged."""
         said = ""
-        if self._sticks.changed():
+        if self._sticks.poll_connections():
             before, self._stick = self._stick, self._sticks.find(self._kind)
             if self._stick is None and before is not None:
                 said = f"the {self._kind} is unplugged: the handle returns to its centre"

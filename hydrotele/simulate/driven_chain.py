@@ -87,22 +87,23 @@ def open_loop_errors(
         raise InputError(_ERROR_LOCATION, f"the run is shorter than {horizon:g} s")
     firsts = np.unique(np.linspace(0, motion.shape[1] - rows - 1, starts).astype(int))
     found = project_on_drives(chain, tuple(known_joints), *motion)
-    flags = model.opt.disableflags
-    model.opt.disableflags = flags | int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
     data, drives = mujoco.MjData(model), [chain.index(name) for name in chain.drives]
     dofs = [int(chain.dof_indices[j]) for j in drives]
     places = [int(chain.qpos_indices[j]) for j in drives]
     times = np.arange(motion.shape[1]) * period
-    total = np.zeros(len(drives))
-    for first in firsts:
-        set_state(model, data, chain, found.position[first], found.rate[first])
-        at = times[first] + (np.arange(steps) + 0.5) * model.opt.timestep
-        driving = np.column_stack([np.interp(at, times, column) for column in force.T])
-        for row in driving:
-            data.qfrc_applied[dofs] = row
-            mujoco.mj_step(model, data)
-        if not np.isfinite(data.qpos).all() or data.warning.number.any():
-            raise InputError(_ERROR_LOCATION, "the simulation of the mechanism became unstable")
-        total += (data.qpos[places] - found.position[first + rows, drives]) ** 2
-    model.opt.disableflags = flags
+    total, flags = np.zeros(len(drives)), model.opt.disableflags
+    model.opt.disableflags = flags | int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
+    try:
+        for first in firsts:
+            set_state(model, data, chain, found.position[first], found.rate[first])
+            at = times[first] + (np.arange(steps) + 0.5) * model.opt.timestep
+            driving = np.column_stack([np.interp(at, times, column) for column in force.T])
+            for row in driving:
+                data.qfrc_applied[dofs] = row
+                mujoco.mj_step(model, data)
+            if not np.isfinite(data.qpos).all() or data.warning.number.any():
+                raise InputError(_ERROR_LOCATION, "the simulation of the mechanism became unstable")
+            total += (data.qpos[places] - found.position[first + rows, drives]) ** 2
+    finally:
+        model.opt.disableflags = flags
     return dict(zip(chain.drives, np.sqrt(total / len(firsts)).tolist(), strict=True))

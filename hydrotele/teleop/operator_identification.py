@@ -89,13 +89,13 @@ class OperatorFit(NamedTuple):
         estimates: name -> estimate: gain (hand per error), delay, time_constant of lead or lag,
             neuromuscular_frequency, neuromuscular_damping, remnant; crossover, phase_margin and
             gain_margin if the controlled element is one of the known forms.
-            element: form of the controlled element, such as `K/s`; empty if it is not a known form.
-            explained_fraction: fraction of the hand's variance that the model predicts from the target [1].
-            rate: sampling rate of the analysis [Hz].
-            duration: analysed duration [s].
-            notes: warnings for the user.
-            frequencies: (m,) frequencies of the describing function [rad/s].
-            response: (m,) complex describing function Yp of the model.
+        element: form of the controlled element, such as `K/s`; empty if it is not a known form.
+        explained_fraction: fraction of the hand's variance that the model predicts from the target [1].
+        rate: sampling rate of the analysis [Hz].
+        duration: analysed duration [s].
+        notes: warnings for the user.
+        frequencies: (m,) frequencies of the describing function [rad/s].
+        response: (m,) complex describing function Yp of the model.
     """
 
     equalisation: str
@@ -136,7 +136,7 @@ def read_tracking(path: Path, names: Mapping[str, str] | None = None) -> tuple[T
         if key == "hand" and name is None and "force" in lower:
             name = lower["force"]
             notes.append("no column hand: the force is used as the operator's output")
-        if name not in table.names:
+        if name is None or name not in table.names:
             has = ", ".join(table.names)
             message = f"has no column {name or key!r}; columns: {has}; name it with --{key} COLUMN"
             raise InputError(path, message)

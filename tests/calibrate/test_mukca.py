@@ -58,7 +58,7 @@ def test_without_noise_unseen_places_are_exact():
 @pytest.mark.parametrize("robot", ["panda", "ur5e"])
 def test_noise_leaves_less_than_it_is_itself(robot):
     nominal, true, _, sockets = simulated(robot)
-    chosen, _ = choose_robot(sockets, SocketOptions())
+    chosen, _ = choose_robot(sockets)
     assert chosen.name == robot
     found = calibrate_sockets(nominal, sockets)
     unseen = simulate_sockets(true, UNSEEN, 20, RobotErrors(play=0.0), np.random.default_rng(0))
@@ -124,7 +124,7 @@ def test_rows_with_the_ball_elsewhere_are_named_and_left_out(noisy):
 @needs_real
 def test_measured_panda_reaches_the_published_accuracy():
     sockets, _ = load_sockets(MEASURED)
-    robot, _ = choose_robot(sockets, SocketOptions())
+    robot, _ = choose_robot(sockets)
     assert robot.name == "panda"
     (one,) = predict_held_out_places(robot, sockets, ["backleft"])
     # The data's authors: 0.2 to 0.3 mm; asked for: 0.25 mm, and 0.1 mm of the sockets' distance.

@@ -36,7 +36,7 @@ def test_degrees_read_as_radians_are_refused_with_a_hint():
     with pytest.raises(InputError, match="read as degrees, the ball of ur5 .*: give --unit deg$"):
         check_robot(load_robot("ur5"), sockets)
     with pytest.raises(InputError, match="no shipped robot fits .*: give --unit deg$"):
-        choose_robot(sockets, SocketOptions())
+        choose_robot(sockets)
 
 
 @pytest.mark.parametrize("fault", ["sign", "order", "constant"])

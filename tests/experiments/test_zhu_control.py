@@ -8,8 +8,8 @@ import pytest
 
 from hydrotele.core.errors import InputError
 from hydrotele.experiments import zhu_control, zhu_identification
+from hydrotele.experiments.comparison import merge_settings
 from hydrotele.experiments.zhu_identification import fail_sensors, measure_outliers
-from hydrotele.experiments.zhu_two_port import merge_settings
 from hydrotele.logs.log import Log
 
 EXPERIMENTS = (*zhu_control.EXPERIMENTS, *zhu_identification.EXPERIMENTS)
@@ -94,7 +94,7 @@ def test_unknown_changes_are_refused():
     with pytest.raises(InputError, match="valid: failures, remove"):
         measure_outliers(1, {"remove_outliers": True})
     with pytest.raises(InputError, match="unknown"):
-        merge_settings({"delay": 1.0}, damping=2.0)
+        merge_settings({"damping": 2.0}, {"delay": 1.0})
 
 
 def test_failed_sensors_read_zero_for_a_while():

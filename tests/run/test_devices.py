@@ -54,7 +54,7 @@ class Sticks:
     def find(self, kind):
         return self.stick
 
-    def changed(self):
+    def poll_connections(self):
         news, self.news = self.news, False
         return news
 

@@ -437,7 +437,7 @@ REFUSED = {
     "time_late": ({"pilot": TABLE | {"time": [1.0, 2.0]}}, "start at 0 and rise"),
     "no_table": ({"pilot": {"kind": "table"}}, "either columns"),
     "two_tables": ({"pilot": TABLE | {"file": "a.csv"}}, "either columns"),
-    "no_file": ({"pilot": {"kind": "table", "file": "a.csv"}}, r":\d+: pilot\.file: .*not a file"),
+    "no_file": ({"pilot": {"kind": "table", "file": "a.csv"}}, r":\d+: pilot\.file: .*does not exist"),
     "command": ({"pilot": {"kind": "constant", "commands": {"boom": 3}}}, "command of boom is 3.*-1 .. 1"),
     "command_nan": ({"pilot": {"kind": "constant", "commands": {"boom": NAN}}}, "finite"),
     "command_volts": (
@@ -575,7 +575,7 @@ def effects_of(draw, machine):
     for effect in chosen:
         place = draw(st.sampled_from(effect.locations(machine)))
         numbers = effect.parameters(machine, place)
-        values = {name: draw(st.floats(p.low, p.high)) for name, p in numbers.items()}
+        values = {name: draw(st.floats(p.lower_bound, p.upper_bound)) for name, p in numbers.items()}
         planted.append({"name": effect.name, "location": place, "parameters": values})
     return planted
 

@@ -243,7 +243,7 @@ from hydrotele.hydraulics.circuit import Slot
 from hydrotele.machine.machine_file import load_machine
 from hydrotele.simulate.plant import build_plant, rest_state
 random = np.random.default_rng(0)
-INDICES = [Slot.FIRST, Slot.COUNT, Slot.MEMORY, Slot.BRISTLE, Slot.DELIVERY, Slot.CURVES]
+INDICES = [Slot.FIRST, Slot.COUNT, Slot.EXTRA_STATES, Slot.BRISTLE, Slot.DELIVERY, Slot.CURVES]
 SWITCHES = [Slot.BRISTLE_STIFFNESS, Slot.PUMP_TIME_CONSTANT, Slot.KIND, Slot.DRIVE_INERTIA]
 for name in ("cat215", "emps", "rig"):
     plant = build_plant(load_machine(name))

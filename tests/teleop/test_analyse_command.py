@@ -97,8 +97,8 @@ def test_a_case_that_makes_no_sense(case, line, new, message):
     [
         (["none.yaml"], "none.yaml: cannot be read"),
         (["--structure", "rate_farce"], "--structure: no structure .*did you mean 'rate_force'"),
-        (["--delay", "-1"], "--delay: must be from 0 to 10 s"),
-        (["--delay", "nan"], "--delay: must be from 0 to 10 s"),
+        (["--delay", "-1"], "'--delay': Input should be greater than or equal to 0"),
+        (["--delay", "nan"], "'--delay': Input should be greater than or equal to 0"),
     ],
 )
 def test_wrong_words(words, message):
@@ -139,7 +139,7 @@ def test_robust_has_waves_and_passivity_control(case, tmp_path):
     [
         (["--structure", "wave_variables"], "--structure: no structure 'wave_variables'"),
         (["--robust", "--period", "9"], "--period: must be from 0.0001 to 0.1 s"),
-        (["--robust", "--operators", "0"], "--operators: must be from 1"),
+        (["--robust", "--operators", "0"], "'--operators': Input should be greater than or equal to 1"),
         (["--robust", "--delays", "none.csv"], "none.csv: cannot be read"),
     ],
 )

@@ -148,7 +148,7 @@ class GradeController:
         self._phase, self._phase_time = np.zeros(count, int), np.zeros(count)
         self._reference, self._reference_rate = np.zeros((count, 3)), np.zeros((count, 3))
         self._pass_start, self._pass_end, self._theta = (np.zeros(count) for _ in range(3))
-        self._is_new = np.ones(count, bool)
+        self._is_new, self._goal = np.ones(count, bool), np.full((count, 3), np.inf)
 
     def reset(self, mask: np.ndarray) -> None:
         """Reset the controller state of the episodes selected by the boolean mask (n,)."""
@@ -177,7 +177,7 @@ class GradeController:
         uneven = errors > np.maximum(_MIN_SECTION_ERROR, 0.3 * errors.max(axis=1, keepdims=True) - 0.03)
         first = np.where(uneven.any(1), self._radii[SECTION_COUNT - 1 - uneven[:, ::-1].argmax(1)], MAX_RADIUS)
         last = np.where(uneven.any(1), self._radii[uneven.argmax(1)], MIN_RADIUS)
-        near = np.abs(tip - self._goal) if hasattr(self, "_goal") else np.ones_like(tip)
+        near = np.abs(tip - self._goal)
         moved = self._phase_time > 0.5
         late = self._phase_time > 12.0
         stalled = (self._phase_time > _STALL_TIME) & (np.abs(tip - place)[:, R] > 0.9 * _MAX_REFERENCE_LEAD[R])
